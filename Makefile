@@ -14,7 +14,7 @@ PIP = $(BIN)/python -m pip install --quiet
 NUMERICAL := tests/dyntorch tests/battery tests/test_readme.py tests/indexing/action tests/indexing/archive tests/indexing/brightness tests/indexing/phase tests/indexing/recordings tests/indexing/sync \
   tests/indexing/test_estimators.py dyntorch
 
-.PHONY: install demo test portable lint bench fuzz tables docs clean
+.PHONY: install demo test test-slow test-all portable lint bench fuzz tables docs clean
 
 install: $(STAMP)
 
@@ -38,14 +38,20 @@ demo: install
 
 # one worker per core, one thread each
 test: install
-	@echo "All tests: a few minutes on two quiet cores, a quarter of an hour on busy ones; dots and percents show how far they are."
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
+	@echo "The fast tests: under four minutes on two quiet cores.  Everything, a quarter of an hour: make test-all"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow"
 
-# the numerical tests with the arithmetic of another processor, then with two threads in each worker
+test-slow: install
+	@echo "The slow tests: about eight minutes on two quiet cores."
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m slow
+
+test-all: test test-slow
+
+# the fast numerical tests with the arithmetic of another processor, then with two threads in each worker
 portable: install
 	ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 MKL_CBWR=COMPATIBLE OMP_NUM_THREADS=1 \
-	  $(BIN)/python -m pytest -n auto $(NUMERICAL)
-	OMP_NUM_THREADS=2 $(BIN)/python -m pytest -n auto $(NUMERICAL)
+	  $(BIN)/python -m pytest -n auto -m "not slow" $(NUMERICAL)
+	OMP_NUM_THREADS=2 $(BIN)/python -m pytest -n auto -m "not slow" $(NUMERICAL)
 
 lint: install
 	$(BIN)/ruff check .

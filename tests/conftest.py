@@ -16,4 +16,6 @@ if threading.current_thread() is threading.main_thread():
 
 from tests.battery.pretend_device import register
 
+pytest_plugins = ["tests.tiers"]
+
 register()

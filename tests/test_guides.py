@@ -15,6 +15,7 @@ GUIDES = sorted(path for path in (DOCS / "guide").glob("*.md") if path.stem != "
 PAGES = sorted(path for room in ("guide", "explanation", "results") for path in (DOCS / room).glob("*.md"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda path: path.stem)
 def test_everything_a_guide_shows_happens(guide, tmp_path):
     pytest.importorskip("av")  # the videos of the examples

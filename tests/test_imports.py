@@ -42,10 +42,12 @@ def within(module, package):
     return module == package or module.startswith(package + ".")
 
 
+@pytest.mark.slow
 def test_dyntorch_never_imports_indexing():
     assert offenders("dyntorch", lambda module, names: within(module, "indexing")) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["dyntorch", "indexing"])
 def test_packages_do_not_import_what_stands_on_them(package):
     assert offenders(package, lambda module, names: any(within(module, p) for p in ("experiments", "tests", "benchmarks"))) == []
@@ -62,6 +64,7 @@ def room_of(module):
     return parts[1] if parts[0] == "dyntorch" and len(parts) > 1 else None
 
 
+@pytest.mark.slow
 def test_the_rooms_of_dyntorch_import_downwards():
     level = {room: number for number, rooms in enumerate(LAYERS) for room in rooms}
     wrong, seen = [], set()
@@ -78,6 +81,7 @@ def test_the_rooms_of_dyntorch_import_downwards():
     assert seen == set(level)
 
 
+@pytest.mark.slow
 def test_no_imports_run_in_a_circle():
     """Imports anywhere in a file count, those inside functions too; what only the type checker reads does not."""
     for package in ("dyntorch", "indexing"):
@@ -124,6 +128,7 @@ def test_counting_stands_alone():
     assert {module.split(".")[0] for module in outside if not within(module, "dyntorch.counting")} == {"numpy"}
 
 
+@pytest.mark.slow
 def test_indexing_uses_only_public_names_of_dyntorch():
     """Those of the top level, and those that the faces of its rooms hand on."""
 
@@ -153,6 +158,7 @@ def test_names_that_moved_into_rooms_are_found_at_their_old_place_with_a_warning
     assert len([name for name in dyntorch._HOME if not name.endswith("Options")]) <= 50
 
 
+@pytest.mark.slow
 def test_only_the_demo_and_the_background_use_the_actors():
     inside = (
         "indexing/action/background",
@@ -182,6 +188,7 @@ def test_importing_a_package_loads_nothing_heavy(package):
     assert done.stdout.split() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["dyntorch", "indexing"])
 def test_a_class_name_occurs_once_in_a_package(package):
     places = {}

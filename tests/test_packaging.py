@@ -30,6 +30,7 @@ def test_the_wheel_holds_both_packages_and_nothing_else(tmp_path: Path) -> None:
     assert {"dyntorch/py.typed", "indexing/py.typed", "indexing/report/base.css", "indexing/report/base.html.j2"} <= held
 
 
+@pytest.mark.slow
 def test_the_sdist_holds_the_sources_and_nothing_else(tmp_path: Path) -> None:
     sdist = pytest.importorskip("hatchling.builders.sdist", reason="needs hatchling, which 'make install' brings")
     (made,) = sdist.SdistBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])

@@ -45,6 +45,7 @@ def test_steps_of_a_document():
     assert (code.python, code.typed, code.shown) == (True, "print(1)\n", "1\n")
 
 
+@pytest.mark.slow
 def test_everything_the_readme_shows_happens(tmp_path):
     pytest.importorskip("av")  # the README's videos
     assert run(README, tmp_path) == []

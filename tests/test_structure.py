@@ -189,6 +189,7 @@ def loose(package):
                 yield file, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", LOOSE)
 def test_numbers_that_decide_are_options(package):
     found = list(loose(package))
@@ -209,6 +210,7 @@ def damps(loop):
     return False
 
 
+@pytest.mark.slow
 def test_levenberg_and_marquardt_loop_once():
     found = set()
     for path in sorted(path for package in LOOSE for path in (ROOT / package).rglob("*.py")):
@@ -218,6 +220,7 @@ def test_levenberg_and_marquardt_loop_once():
     assert found == DAMPED, "a problem of numerics.least_squares only accumulates: minimize() loops"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EXPLAINED)
 def test_what_is_explained_is_there(kind):
     for file, names in kind.items():
@@ -244,6 +247,7 @@ def fields(node):
     return {item.target.id for item in node.body if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name)}
 
 
+@pytest.mark.slow
 def test_every_result_is_an_outcome():
     found = {node.name: node for _, node in classes("dyntorch")}
     assert set(found) >= RESULTS
@@ -273,6 +277,7 @@ def test_what_verbs_return_is_an_outcome():
     assert all(issubclass(names[name], Outcome) for name in results)
 
 
+@pytest.mark.slow
 def test_notices_have_codes_of_their_task_and_a_sentence():
     codes = {node.name: node for package in ("dyntorch", "indexing") for _, node in classes(package) if based(node, "NoticeCode")}
     assert len(codes) >= 8
@@ -289,6 +294,7 @@ WORDS = ("text", "reason", "message", "notes", "notices", "warnings")
 """Attributes that hold what the library says."""
 
 
+@pytest.mark.slow
 def test_nobody_parses_what_the_library_says():
     """No regular expression is applied to a sentence of the library: notices and messages carry their data."""
     wrong = []

@@ -140,6 +140,7 @@ USES: dict[str, tuple[Callable[[], Any], Callable[..., Any]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", USES)
 def test_results_are_used_where_they_are(name: str) -> None:
     home, (make, use) = pretend_device(), USES[name]

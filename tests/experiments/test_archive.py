@@ -120,6 +120,7 @@ def test_questions_longer_than_every_take_are_refused(people: scenes.Takes) -> N
 
 
 # ---- everything with everything ----------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_rankings_are_those_of_every_window(people: scenes.Takes) -> None:
     rng = np.random.default_rng(6)
     clips = scenes.every_take(people, rng)[:3]
@@ -191,6 +192,7 @@ def test_figures_of_hits_by_hand() -> None:
 
 
 # ---- the scripts, once -------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_moments_among_distractors_are_found(people: scenes.Takes, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     moments.run(moments.Config(windows=900, queries=6, durations=(1.0,), candidates=(30,), out=tmp_path))
     first, others, options = tables(tmp_path).values()
@@ -202,6 +204,7 @@ def test_moments_among_distractors_are_found(people: scenes.Takes, tmp_path: Pat
     assert "recall@10, .95 of exhaustive" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_other_people_are_found(people: scenes.Takes, tmp_path: Path) -> None:
     performances.run(performances.Config(sets=("utkinect",), changes=(), dtw=False, most=6, out=tmp_path))
     found = tables(tmp_path)
@@ -231,6 +234,7 @@ def test_an_archive_is_multiplied_whole(people: scenes.Takes, tmp_path: Path) ->
     np.testing.assert_array_equal(copied.joints, archive.clip("take 2").joints)
 
 
+@pytest.mark.slow
 def test_growth_is_measured(people: scenes.Takes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "HOUR", 60.0)
     growth.run(growth.Config(hours=(1, 3), durations=(1.0,), queries=1, cold=1, out=tmp_path))
@@ -243,6 +247,7 @@ def test_growth_is_measured(people: scenes.Takes, tmp_path: Path, monkeypatch: p
         growth.run(growth.Config(hours=(3, 1), out=tmp_path))
 
 
+@pytest.mark.slow
 def test_adding_is_timed_and_workers_agree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = benchmark.Config(hours=0.005, frames=60, files=2, minutes=0.4, queries=2, rounds=1, dask=False)
     rows = benchmark.adding(config)

@@ -62,6 +62,7 @@ def test_null_spaces_are_as_accurate_as_the_goal_says(case):
     assert figure.angle <= 1e-10 and figure.reference > 0 and figure.ours > 0
 
 
+@pytest.mark.slow
 def test_all_ways_to_evaluate_shifts_find_the_true_one():
     config = synchronization.Config(quick=True)
     rows = [*synchronization.same_points(config), *synchronization.different_points(config), *synchronization.long_takes(config)]
@@ -69,6 +70,7 @@ def test_all_ways_to_evaluate_shifts_find_the_true_one():
     assert errors and all(value == 0 for value in errors.values()), errors
 
 
+@pytest.mark.slow
 def test_first_answers_and_busy_neighbours_are_measured(capsys):
     first_answers.answer("fit")
     first, warm = json.loads(capsys.readouterr().out)

@@ -36,6 +36,7 @@ def test_cuts_stay_in_place_or_cross(data):
     assert np.ptp(still[:, 0, 0]) < 0.5 and np.ptp(across[:, 0, 0]) > 1.5
 
 
+@pytest.mark.slow
 def test_pairs_show_the_same_moment_at_the_shift():
     pairs = experiment.pairs(experiment.acted, 40, 0.0, 0.0, 3.4, 3, seed=4)
     for pair in pairs:
@@ -69,6 +70,7 @@ def test_figures_count_right_believed_and_wrong(data, monkeypatch):
     assert rows[0].goal == 0.95 and rows[3].reached and not rows[4].reached
 
 
+@pytest.mark.slow
 def test_everything_is_written(data, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(experiment, "figures", lambda config, name: [Row(name, "", 1.0)])
     monkeypatch.setattr(experiment, "recorded", lambda path: (np.zeros((60, 20, 20), np.uint8), 30.0))

@@ -35,6 +35,7 @@ def test_the_share_within_one() -> None:
     assert shares[:2] == [1.0, 0.5] and np.isnan(shares[2])
 
 
+@pytest.mark.slow
 def test_sets_of_squats_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(counting, "MOST", 6)
     few = {"people": (1,), "seeds": 1, "actions": ("squat", "bow")}

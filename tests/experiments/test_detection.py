@@ -108,6 +108,7 @@ def test_finds_in_strange_actions_are_left_out() -> None:
     assert detection.outside([seg("a", 4.5, 6.4), seg("b", 5.5, 8)], strange) == [seg("b", 5.5, 8)]
 
 
+@pytest.mark.slow
 def test_streams_of_actors_are_found(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(detection, "ACTIONS", ("squat", "wave", "jumping_jack", "kick"))
     monkeypatch.setattr(detection, "PEOPLE", 2)

@@ -212,6 +212,7 @@ def test_open_set_runs(folder: Path, monkeypatch, capsys) -> None:
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_ways_to_tell_unknown_actions() -> None:
     clips = dataset(4, ACTIONS, takes=2, azimuth=0.0, fps=12.0, rng=0)
     taught, asked = [c for c in clips if c.label != "punch" and c.meta["subject"] < 3], list(clips.select(subject=3))

@@ -169,6 +169,7 @@ def test_without_data_a_script_stops_with_one_line(monkeypatch, capsys, tmp_path
         protocol.data_folder()
 
 
+@pytest.mark.slow
 def test_one_command_writes_tables_and_configuration(people: ClipSet, monkeypatch, capsys, tmp_path: Path) -> None:
     people.save(tmp_path / "utkinect.npz")
     monkeypatch.setenv(protocol.DATA, str(tmp_path))

@@ -29,6 +29,7 @@ def test_a_part_is_labelled_with_what_fills_it_from_begin_to_end() -> None:
     assert suggesting.annotated(one, 0, 0.0, 0.25)[1] == "" and suggesting.annotated(one, 0, 7.0, 8.0)[1] == ""
 
 
+@pytest.mark.slow
 def test_all_ways_begin_alike_and_label_as_many(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     monkeypatch.setattr(suggesting, "ACTIONS", ("squat", "wave", "kick"))
@@ -48,6 +49,7 @@ def test_corrections_are_the_true_labels() -> None:
     assert story.agreement(truth, truth, 10.0) == [1.0, 1.0, 1.0, pytest.approx(1.0)]
 
 
+@pytest.mark.slow
 def test_the_story_of_a_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(story, "ACTIONS", ("squat", "wave"))
     monkeypatch.setattr(story, "BESIDES", ("kick",))

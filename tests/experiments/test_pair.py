@@ -29,6 +29,7 @@ def data(tmp_path, monkeypatch):
     return joints
 
 
+@pytest.mark.slow
 def test_tables_are_written(data, tmp_path, capsys):
     config = pair_reconstruction.Config(scenes=1, quick=True, out=tmp_path / "out.json")
     pair_reconstruction.run(config)

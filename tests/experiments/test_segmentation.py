@@ -141,6 +141,7 @@ def test_refinement_starts_where_it_is_told():
     assert misclassification(labels, scene.labels).max() < 0.05
 
 
+@pytest.mark.slow
 def test_all_methods_are_better_than_guessing():
     scene = scenes.bodies((60, 60), batch=4, sigma=0.05, interleaved=True, generator=seeded())
     methods = segmentation_matrix_noise.methods(scene)

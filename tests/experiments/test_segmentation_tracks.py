@@ -98,6 +98,7 @@ def test_tables_count_errors_and_bodies(told, tmp_path, capsys):
     assert "Not verified" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_other_streets_are_of_other_kinds(told, tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "OTHERS", {"night": (120, StreetOptions(texture=0.15))})
     experiment.run(experiment.Config(only=("other_streets",), scenes=6, quick=True, out=tmp_path / "out.json"))

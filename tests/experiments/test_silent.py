@@ -58,6 +58,7 @@ def test_mirrored_films_show_left_as_right(folder):
     assert [silent.SWAPPED[k] for k in silent.SWAPPED] == list(range(17))
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_stopped(folder, tmp_path, monkeypatch, capsys):
     asked = []
 

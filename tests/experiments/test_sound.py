@@ -24,6 +24,7 @@ def test_the_truth_is_where_the_clocks_are():
     assert pair.a.rate == 48_000 and pair.b.rate == 44_100 and abs(pair.rate - 1) <= experiment.DRIFT
 
 
+@pytest.mark.slow
 def test_rows_count_believed_and_wrong(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "LONG", 8.0)
     monkeypatch.setattr(experiment, "NOISES", (10,))

@@ -162,6 +162,7 @@ def test_baselines_find_a_shift_of_whole_frames():
     assert found.correlations[found.lags == 7] == pytest.approx(np.corrcoef(x[:-7], y[7:])[0, 1])
 
 
+@pytest.mark.slow
 def test_tables_of_virtual_cameras(folder, told, tmp_path, capsys):
     synchronization.run(synchronization.Config(trials=3, quick=True, out=tmp_path / "out.json"))
     tables = json.loads((tmp_path / "out.json").read_text())["tables"]

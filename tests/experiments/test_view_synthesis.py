@@ -41,6 +41,7 @@ def test_tracks_are_the_corners_and_vanish_below_cars():
     torch.testing.assert_close(tracks[1, :4], apply(camera((0.0, -20.0, 40.0)), CARS[0].corners(1.0)))
 
 
+@pytest.mark.slow
 def test_a_view_that_was_taken_comes_back():
     view = camera((-5.0, -25.0, 38.0))
     found = synthesize(render(view, 1.0)[None], (1.0,), truth(view[None]), view, 1.0)
@@ -49,6 +50,7 @@ def test_a_view_that_was_taken_comes_back():
     assert psnr(found.image, render(view, 1.0), found.covered) > 35
 
 
+@pytest.mark.slow
 def test_another_time_and_camera_come_near_the_truth():
     cameras = torch.stack([camera(place) for place in ((-10.0, -27.0, 36.0), (8.0, -28.0, 37.0))])
     images = torch.stack([render(view, time) for view, time in zip(cameras, (0.0, 2.0), strict=True)])

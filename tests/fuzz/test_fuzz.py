@@ -23,17 +23,20 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Seed]:
     return {seed.name: seed for seed in make(tmp_path_factory.mktemp("fuzz") / "seeds")}
 
 
+@pytest.mark.slow
 def test_sound_files_are_read(seeds: dict[str, Seed]) -> None:
     for seed in seeds.values():
         seed.read(seed.path)
 
 
+@pytest.mark.slow
 def test_damaged_files_are_read_or_refused(seeds: dict[str, Seed], tmp_path: Path) -> None:
     tries = [tried(seed, number, tmp_path / "in") for seed in seeds.values() for number in range(FILES // seed.slow)]
     assert [one for one in tries if one.kind not in GOOD] == []
     assert {one.kind for one in tries} == set(GOOD)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands_say_one_line_about_damaged_files(name: str, seeds: dict[str, Seed], tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     seed = seeds[name]
@@ -56,6 +59,7 @@ def test_a_number_always_makes_the_same_file(seeds: dict[str, Seed], tmp_path: P
         assert made[0] == made[1]
 
 
+@pytest.mark.slow
 def test_what_must_not_be_is_seen(seeds: dict[str, Seed], tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     assert poor(ValueError(f"{path}: the file is empty; export it again"), path) == []

@@ -201,6 +201,7 @@ def test_many_labels_are_compared_with_those_near_them_only(monkeypatch):
     assert len(sizes) == 2 * 2000 and sum(sizes) <= 3 * 2 * 2000
 
 
+@pytest.mark.slow
 def test_blocks_change_nothing_and_bound_what_is_held():
     rng = np.random.default_rng(0)
     starts = np.sort(rng.uniform(0, 1000, size=(2, 1500)))

@@ -19,6 +19,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return where
 
 
+@pytest.mark.slow
 def test_the_commands_name_files_that_are_there(folder: Path) -> None:
     lines = (folder / "commands.txt").read_text().splitlines()
     made = {"three.safetensors", "moves.safetensors", "learned.safetensors", "seen.safetensors"}
@@ -45,6 +46,7 @@ def test_videos_are_written_where_they_can_be(folder: Path) -> None:
     assert (".mp4" in commands) == (find_spec("av") is not None) == (folder / "filmed.mp4").exists()
 
 
+@pytest.mark.slow
 def test_the_examples_can_be_read(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

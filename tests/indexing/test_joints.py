@@ -49,6 +49,7 @@ def as_body25(clip):
     return clip.replace(joints=joints, confidence=None, skeleton=BODY25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [ActionIndexer, PhaseIndexer])
 def test_the_order_of_the_joints_does_not_matter(lesson, recording, kind):
     indexer = kind().fit(lesson, lesson.labels)

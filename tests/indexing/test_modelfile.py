@@ -136,6 +136,7 @@ def test_parts_that_do_not_belong_together_are_refused(name: str, tensor: str, v
     refused(name, changed(models[name], tmp_path / "m.safetensors", tensor, value), "not a model that can be used")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "header"),
     [

@@ -129,6 +129,7 @@ def test_what_does_not_look_like_one(value):
     assert not is_dataset(value)
 
 
+@pytest.mark.slow
 def test_indexers_and_synchronize_take_datasets():
     clips = list(dataset([Person.random(0)], ("squat", "wave", "kick"), azimuth=0.0, rng=0))
     given = [poses(clip.joints.transpose(0, 2, 1)[..., None], fps=30.0, time_unit="seconds") for clip in clips]

@@ -44,6 +44,7 @@ def test_a_car_that_turns_is_not_on_a_straight_path() -> None:
     assert one.error < 2
 
 
+@pytest.mark.slow
 def test_points_that_all_move_on_a_board_give_its_homographies() -> None:
     seen = real_data.board()
     views = max(real_planar.instants(seen, (1, 1, 1), 2), key=lambda v: float((v[2] - v[0]).norm(dim=-1).median()))
@@ -73,6 +74,7 @@ def test_lens_distortion_is_inverted() -> None:
     np.testing.assert_allclose(real_data.undistorted(pixels, matrix, distortions), expected, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["straight", "constant_velocity"])
 def test_pose_of_a_car_from_boxes_in_traffic(motion: str) -> None:
     errors = []
@@ -98,6 +100,7 @@ def test_projective_tensors_say_that_traffic_is_degenerate() -> None:
             assert dyn.fit(invariant, *views).status in (dyn.Status.DEGENERATE, dyn.Status.AMBIGUOUS)
 
 
+@pytest.mark.slow
 def test_rigid_sensors_among_bodies_that_all_move() -> None:
     pool = real_data.takes()[1::2]
     draw = torch.Generator().manual_seed(0)
@@ -116,6 +119,7 @@ def test_rigid_sensors_among_bodies_that_all_move() -> None:
     assert np.median(ours) < 0.05 < 0.2 < np.median(none)
 
 
+@pytest.mark.slow
 def test_one_command_writes_figures_and_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(real_space, "STEPS", (3,))
     monkeypatch.setattr(real_space, "SHARES", (0.0, 1.0))

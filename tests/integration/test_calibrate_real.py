@@ -37,6 +37,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
     return json.loads((folder / "out" / "calibration.json").read_text()), folder / "out"
 
 
+@pytest.mark.slow
 def test_the_cameras_are_those_of_the_board(calibrated):
     said, _ = calibrated
     known = np.load(FILE)

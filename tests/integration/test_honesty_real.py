@@ -18,6 +18,7 @@ pytestmark = pytest.mark.skipif(not FOLDER, reason="DYNTORCH_DATA is not set: no
 DATA = Path(FOLDER or ".")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["utkinect", "florence3d", "cmu_mocap_60fps"])
 def test_depth_is_never_taken_for_confidence(name: str) -> None:
     """Nor where it goes from 0 to 1: brought to a cube, upright in metres, of a few joints, and far from the origin."""
@@ -44,6 +45,7 @@ def test_confidence_of_pixels_is_seen() -> None:
                 Clip(one / [*size, 1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".trc", ".c3d"])
 def test_markers_come_back(tmp_path: Path, suffix: str) -> None:
     found = np.load(DATA / "pose2sim/pose2sim_balancing.npz")

@@ -32,6 +32,7 @@ def recording() -> tuple[list[list[Clip]], np.ndarray]:
     return cameras, one
 
 
+@pytest.mark.slow
 def test_the_balancing_person_is_one_in_all_cameras() -> None:
     cameras, one = recording()
     found = associate(cameras, [0.0] * 4)

@@ -25,6 +25,7 @@ SETS = {  # clips, frames, joints, dims, classes
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_clip_sets(name: str, tmp_path: Path) -> None:
     clips = read(DATA / f"{name}.npz")

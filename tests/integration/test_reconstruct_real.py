@@ -19,6 +19,7 @@ from experiments.reconstruction.data import declared, predicted
 pytestmark = pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data")
 
 
+@pytest.mark.slow
 def test_cars_are_where_constant_velocity_puts_them_in_a_frame_that_was_not_used() -> None:
     sequences = {one.name: one for one in real_data.traffic()}
     ours, still, background = [], [], []
@@ -33,6 +34,7 @@ def test_cars_are_where_constant_velocity_puts_them_in_a_frame_that_was_not_used
     assert np.median(background) < 1
 
 
+@pytest.mark.slow
 def test_cars_and_roads_are_two_bodies() -> None:
     right = []
     for one in lifted_data.pairs():
@@ -43,6 +45,7 @@ def test_cars_and_roads_are_two_bodies() -> None:
     assert len(right) == 4 and np.median(right) > 0.95
 
 
+@pytest.mark.slow
 def test_people_who_move_almost_straight_before_a_virtual_drone() -> None:
     pool = real_data.takes()[1::2]
     errors, held, still = [], [], []
@@ -57,6 +60,7 @@ def test_people_who_move_almost_straight_before_a_virtual_drone() -> None:
     assert np.median(held) < 0.5 * np.median(still)
 
 
+@pytest.mark.slow
 def test_boxes_of_traffic_are_predicted_better_than_if_they_stood_still() -> None:
     held: dict[str, list[float]] = {"constant_velocity_planes_3d": [], "static_3d": []}
     for log in lifted_data.boxes():

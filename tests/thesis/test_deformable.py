@@ -70,6 +70,7 @@ def test_what_one_camera_misses_follows_from_the_basis_and_batch_is_loop() -> No
     assert deformable_shapes(x1[0].float(), x2[0].float(), 2).points.dtype == torch.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_constant_lengths_make_it_metric_though_everything_turns(orthographic: bool) -> None:
     """Bones of constant length decide the metric; the basis then explains what is no rotation, and lowers the noise."""

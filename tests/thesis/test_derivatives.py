@@ -79,6 +79,7 @@ def test_torch_func_in_any_nesting_on_the_tensors_of_chapter_3():
         torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["joint", "basis"])
 def test_dynamic_shape_tensors_follow_their_points_and_times(form):
     """Chapter 4: a shape of 7 points at constant velocities, every view another affine camera."""
@@ -121,6 +122,7 @@ def test_a_missing_point_does_not_spoil_the_gradient_of_the_others():
         assert slopes[0][torch.isnan(x)].eq(0).all() and slopes[0][7].eq(0).all()
 
 
+@pytest.mark.slow
 def test_hessian_of_the_noise_that_refinement_leaves():
     """Chapter 2's criterion at its minimum: the second derivative of the least cost, by finite differences of the first."""
     y = drawn(7, 1)

@@ -54,6 +54,7 @@ def shift(a, b, **different):
     return dyn.synchronize(a, b, correspondence=False, fps=FPS, max_shift=1.4, options=options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("planar", "offset"), [(False, 0.48), (False, -0.733), (True, 0.61)])
 def test_fixed_affine_cameras_exact(planar, offset):
     found = shift(*films(1, offset, planar=planar))
@@ -61,6 +62,7 @@ def test_fixed_affine_cameras_exact(planar, offset):
     assert abs(found.offset - offset) * FPS < 0.01
 
 
+@pytest.mark.slow
 def test_fixed_affine_cameras_with_noise():
     errors = []
     for seed in range(2):
@@ -70,6 +72,7 @@ def test_fixed_affine_cameras_with_noise():
     assert max(errors) < 0.1
 
 
+@pytest.mark.slow
 def test_cameras_that_pan_and_zoom():
     """A ratio of zooms is found with the shift: without, exact data would be off by a quarter of a frame."""
     found = shift(*films(3, 0.37, moving=True))
@@ -97,6 +100,7 @@ def test_the_rank_falls_at_the_right_lag_alone():
     assert abs(found.offset * FPS - 10) < 0.5
 
 
+@pytest.mark.slow
 def test_two_tracks_of_nine_that_have_no_part():
     for seed in range(1):
         found = shift(*films(20 + seed, 0.52, noise=0.5, foreign=2))

@@ -50,6 +50,7 @@ def test_differences_lie_in_the_space_of_the_motions(cameras):
             assert np.trace(outside @ kernels[tau]) < 0.05  # of trace 1; a random subspace of 3 leaves 10 of 13
 
 
+@pytest.mark.slow
 def test_two_cameras_by_the_window_alone(cameras):
     motions = courses(112, 2, 0.22)
     first, second = (filmed(motions, camera, seed) for camera, seed in zip(cameras, (4, 5), strict=True))

@@ -86,6 +86,7 @@ def test_points_in_planes_take_256_unknowns_and_255_matches():
     assert apart(refined.motion, A) < 0.5 * apart(rough.motion, A)
 
 
+@pytest.mark.slow
 def test_matches_of_known_kinds_say_more():
     """A point of j dimensions fulfils the form whatever stands in k - j of the slots."""
     invariant = dyn.DynamicTensor(3, 4, 3)

@@ -47,6 +47,7 @@ def off(found, true):
     return torch.minimum((a - b).norm(dim=(-2, -1)), (a + b).norm(dim=(-2, -1)))
 
 
+@pytest.mark.slow
 def test_a_plane_in_five_views_with_labels():
     sigma, still, wrong = 0.5, 20, 12
     views, A = plane(5, 80, sigma, static=still, wrong=wrong)
@@ -60,6 +61,7 @@ def test_a_plane_in_five_views_with_labels():
     assert (off(result.collineations, A) < 4 * deviation).all()
 
 
+@pytest.mark.slow
 def test_noise_falls_with_the_number_of_views():
     """Of the same first three views: the more views lie on the lines, the better these are known, and with them A and B."""
     takes = [plane(5, 210, 0.5, seed=seed) for seed in range(12)]
@@ -75,6 +77,7 @@ def test_noise_falls_with_the_number_of_views():
     assert errors[0] > 1.03 * errors[1] > 1.03**2 * errors[2], errors
 
 
+@pytest.mark.slow
 def test_space_in_four_views_without_a_threshold():
     sigma = 2e-3
     views, A = space(4, 80, sigma, static=20)

@@ -94,6 +94,7 @@ def test_both_bodies_are_metric_and_turn_together(name: str) -> None:
         assert float((found.rotations @ found.rotations[:1].mT - R @ R[:1].mT).abs().max()) < 1e-8
 
 
+@pytest.mark.slow
 def test_directions_between_points_that_no_affine_frame_tells() -> None:
     """Without K constant velocity leaves angles open; with it they are right, and at half a pixel nearly so."""
     x, X, _, _ = filmed("constant_velocity_3d", 6, 60, 1)
@@ -118,6 +119,7 @@ def test_batch_with_a_calibration_of_each_view_is_its_loop() -> None:
         assert apart(tracked(one, 4), scene[1]) < 1e-8 and apart(place, scene[1]) < 1e-8
 
 
+@pytest.mark.slow
 def test_two_views_of_a_plane_leave_two_slants_and_a_third_decides() -> None:
     """The two decompositions of a calibrated homography (Faugeras and Lustman): one is given, and the other is said to exist."""
     kinds = set()
@@ -132,6 +134,7 @@ def test_two_views_of_a_plane_leave_two_slants_and_a_third_decides() -> None:
     assert kinds == {True, False}  # where half of the points would be behind a camera the other is none
 
 
+@pytest.mark.slow
 def test_what_has_no_metric_frame_says_why_and_stays_as_it_is() -> None:
     """A camera that only turns tells no slant of a plane; a wrong K is refused, each with its notice."""
     x, _, _, _ = filmed("static_2d", 4, 20, 2, turning=True)

@@ -60,6 +60,7 @@ def test_points_of_space_on_a_plane_or_line_moving_or_not(name, sizes):
         assert found[option].missing == full - alone
 
 
+@pytest.mark.slow
 def test_they_are_dimensions_of_v():
     found = {c.option: c.rank for c in counting.capacities("dynamic", dim=2, poses=4, within=2)}
     assert (found["moving"], found["static"]) == (counting.dim_v(3, 4, 2), counting.dim_v(3, 4, 1))

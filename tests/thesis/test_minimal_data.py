@@ -118,6 +118,7 @@ def test_matches_of_few_digits_are_not_looked_at_more_closely():
 
 
 # ---- planar constant velocity (chapter 3): P^4 -> P^2, four views, ten points -----------------------------------------
+@pytest.mark.slow
 def test_ten_points_at_constant_velocity_in_four_views():
     family, g = dyn.GrassmannTensor(4, (2, 1, 1, 1)), draw(1)
     at = torch.stack([torch.cat([torch.eye(3), t * torch.eye(3)[:, :2]], 1) for t in range(4)]).double()

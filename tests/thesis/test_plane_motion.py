@@ -58,6 +58,7 @@ def error(found: Alignment, R: Tensor, t: Tensor, n: Tensor) -> float:
     return max(float(part.abs().max()) for part in parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [3, 5])
 def test_exact_views_give_rotations_translations_and_the_normal(views: int) -> None:
     """To rounding, in units of the distance of the plane; each camera with its own K."""
@@ -71,6 +72,7 @@ def test_exact_views_give_rotations_translations_and_the_normal(views: int) -> N
         assert found.other_motion is not None and float(found.other_motion.normal.abs().max()) == 0
 
 
+@pytest.mark.slow
 def test_labels_and_homographies_are_those_without_a_calibration() -> None:
     """Bit for bit."""
     seen, *_ = filmed(3, sigma=0.5)
@@ -81,6 +83,7 @@ def test_labels_and_homographies_are_those_without_a_calibration() -> None:
     assert plain.rotations is None and plain.translations is None and plain.normal is None and plain.other_motion is None
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_the_matches_and_their_noise() -> None:
     """Medians of three scenes: about as the root of n, and as the noise."""
 
@@ -141,6 +144,7 @@ def test_derivatives_of_the_conditions_against_differences() -> None:
     torch.testing.assert_close(turn.norm(dim=-1), from_turns.norm(dim=-1))
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_loop() -> None:
     """With a calibration for each problem and view; a problem without motion says nothing."""
     scenes = [filmed(seed, sigma=0.3) for seed in (0, 40)]
@@ -185,6 +189,7 @@ def test_a_camera_at_two_places_leaves_two_planes() -> None:
     assert error(aligned(seen), R, t, n) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_wrong_calibration_is_told() -> None:
     """The homographies of two motions have more conditions than unknowns."""
     seen, *_ = filmed(0, n=100, sigma=0.2, views=4)

@@ -128,6 +128,7 @@ def pair(scene, frames, offset=0.0, noise=0.0):
     return scene.film(0, clock(frames), noise), scene.film(1, clock(frames) - offset, noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "within"), [(0.0, 1e-4), (0.5, 0.1)])
 def test_synchronized_by_the_motion_that_both_have_seen(noise, within):
     a, b = pair(Scene(1), 70, offset=0.217, noise=noise)
@@ -136,6 +137,7 @@ def test_synchronized_by_the_motion_that_both_have_seen(noise, within):
     assert abs(shift.offset - 0.217) * FPS < within and shift.sigma * FPS < 0.1
 
 
+@pytest.mark.slow
 def test_another_motion_is_refused():
     a, b = Scene(1).film(0, clock(60), 0.5), Scene(2).film(1, clock(60), 0.5)
     shift = dyn.synchronize(a, b, correspondence=False, fps=FPS, camera="projective")
@@ -150,6 +152,7 @@ def affine_error(found, truth):
     return float((x @ torch.linalg.lstsq(x, y).solution - y).square().mean().sqrt() / y.std())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "within"), [(0.0, 1e-6), (1.0, 0.03)])
 def test_both_point_sets_in_one_frame(noise, within):
     scene, frames = Scene(3), 50
@@ -168,6 +171,7 @@ def test_both_point_sets_in_one_frame(noise, within):
     assert float((seen[1] @ found.fundamental * seen[0]).sum(-1).abs().max()) < 1e-6
 
 
+@pytest.mark.slow
 def test_points_of_something_else_are_told():
     scene, frames = Scene(4, n=9, m=8, foreign=1), 60
     a, b = pair(scene, frames, noise=0.5)

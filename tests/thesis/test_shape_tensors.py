@@ -1,6 +1,7 @@
 """Chapter 4 and section 9.2: shape tensors "for any kind of projection matrix", on data written from the definitions."""
 
 import numpy as np
+import pytest
 import torch
 
 import dyntorch as dyn
@@ -24,6 +25,7 @@ def moving(draw, n, times):
     return [np.hstack([start + t * velocity, np.ones((n, 1))]) for t in times]
 
 
+@pytest.mark.slow
 def test_points_of_constant_velocity_are_a_shape_of_p6_whatever_the_times_and_cameras():
     draw = np.random.default_rng(0)
     x = images(moving(draw, 12, draw.uniform(-1, 1, 80)), draw)

@@ -66,6 +66,7 @@ def test_least_error_of_all_motions(invariant, views):
     assert 1 - (again.tensor * found.tensor).flatten(1).sum(-1).abs().min() < 1e-8
 
 
+@pytest.mark.slow
 def test_p6_needs_it():
     """Half a pixel of noise: the constrained motion shows the images better than what the linear tensor decomposes into."""
     views, _, true = scene("constant_velocity_3d", (0, 1, 2, 3), 60, 0.5, batch=8)

@@ -174,6 +174,7 @@ def test_several_hyperplanes_have_no_single_vector(d):
             call(HyperplanesThrough(d))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("primitive", "x"), ALL)
 def test_what_is_free_when_the_match_is_static(primitive, x):
     free = primitive.free(x)
@@ -195,6 +196,7 @@ def test_cameras_of_normalized_points_are_well_conditioned():
     assert parallel(camera.raw(x) @ camera.action(frame).mT, new.raw(camera.move(x, frame)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("primitive", "x"), ALL)
 def test_freedom_is_the_rank_of_the_derivative_of_the_direction(primitive, x):
     """How many dimensions the vectors of all measurements have, up to scale."""

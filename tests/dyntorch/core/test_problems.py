@@ -51,6 +51,7 @@ def takes():
     return [one.a for one in scenes], [one.b for one in scenes]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correspondence", [True, False])
 def test_synchronize_in_batches(takes, correspondence):
     a, b = takes
@@ -80,6 +81,7 @@ def test_misuse_of_all_problems_is_raised(takes):
         dyn.reconstruct_pair(torch.zeros(0, 20, 4, 2), torch.zeros(0, 20, 4, 2), 0.0, fps=30.0)
 
 
+@pytest.mark.slow
 def test_reconstruct_pair_in_batches():
     scenes = [nonrigid_pair(6, 5, frames, sigma=0.2, offset=0.1, generator=seeded(frames)) for frames in (50, 40)]
     a, b = ([getattr(one, name) for one in scenes] for name in "ab")
@@ -95,6 +97,7 @@ def test_reconstruct_pair_in_batches():
     assert whole.status.tolist()[2] == Status.TOO_FEW and "batch=(3,)" in repr(whole) and not bool(whole.labels[2].any())
 
 
+@pytest.mark.slow
 def test_fit_distortion_in_batches():
     views = dyn.scenes.two_view(80, generator=seeded(0)).views
     lens = Division.of(views[0], (640, 480), strength=-0.2)

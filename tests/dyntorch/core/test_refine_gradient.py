@@ -34,6 +34,7 @@ def refined(x: Tensor, y: Tensor, weights: Tensor | None = None) -> Tensor:
     return torch.stack([*(matrix / matrix[1, 1]).flatten()[:3], solution.sigma])
 
 
+@pytest.mark.slow
 def test_the_minimum_is_that_of_a_brute_force_descent_and_follows_like_it():
     """The Sampson error written out for a map of the line, minimized by Newton's method of automatic differentiation alone."""
     x, y = line()
@@ -58,6 +59,7 @@ def test_the_minimum_is_that_of_a_brute_force_descent_and_follows_like_it():
     torch.testing.assert_close(found, torch.func.hessian(lambda x: (newton(x, y) * weight).sum())(x), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_by_matches_and_weights_up_to_the_second():
     x, y = line()
     weights = torch.linspace(0.5, 1.5, 8, dtype=torch.float64)
@@ -66,6 +68,7 @@ def test_derivatives_by_matches_and_weights_up_to_the_second():
     assert torch.autograd.gradgradcheck(refined, inputs, fast_mode=True, eps=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("labelled", [False, True])
 def test_torch_func_agrees_with_autograd(labelled):
     views = scenes.planar(40, sigma=0.5, batch=2, static=0.3, generator=seeded()).views

@@ -66,6 +66,7 @@ def test_minimum_is_that_of_another_optimizer():
     assert metrics.relative_error(refined.motion[0], theta.detach()) < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "scene"),
     [

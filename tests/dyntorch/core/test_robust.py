@@ -51,6 +51,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("invariant", "scene", "sigma", "outliers", "n"), CASES, ids=lambda v: repr(v)[:20])
 def test_true_matches_are_kept_and_the_model_is_accurate(
     invariant: Invariant, scene: Any, sigma: float, outliers: float, n: int
@@ -101,6 +102,7 @@ def test_one_threshold_per_problem() -> None:
     assert bool(((solution.sigma / torch.tensor([0.5, 0.005])) - 1).abs().max() < 0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("invariant", "scene", "sigma"),
     [(dyn.HomographyTensor(), scenes.planar, 0.5), (dyn.Collineation(2), scenes.collineation, 0.002)],
@@ -115,6 +117,7 @@ def test_noise_is_estimated(invariant: Invariant, scene: Any, sigma: float) -> N
     assert float(kept.mean()) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", KNOWN, ids=repr)
 def test_estimated_threshold_for_every_invariant(case: Case) -> None:
     scale = case.units[0] if case.units else 1.0
@@ -137,6 +140,7 @@ def shown_noise(case: Case, made: scenes.Scene) -> Tensor:
     return ((square * right).sum(-1) / right.sum(-1)).sqrt()
 
 
+@pytest.mark.slow
 def test_translating_lines_with_many_outliers() -> None:
     (case,) = [case for case in KNOWN if isinstance(case.invariant, dyn.TranslatingLinesMatrix)]
     made = case.scene(200, batch=4, seed=31, outliers=0.3, sigma=1e-3)
@@ -170,6 +174,7 @@ def test_constrained_tensors_of_motions_are_themselves() -> None:
         assert torch.allclose(inside, basis, atol=1e-6), case
 
 
+@pytest.mark.slow
 def test_random_matches_have_no_consensus() -> None:
     for invariant in (dyn.HomographyTensor(), dyn.FundamentalMatrix(), dyn.Collineation(2)):
         views = [500 * torch.rand(3, 80, 2, generator=seeded(v), dtype=torch.float64) for v in range(len(invariant.primitives))]
@@ -369,6 +374,7 @@ def test_an_infinite_threshold_is_refused() -> None:
         dyn.robust_fit(dyn.HomographyTensor, *views, threshold=math.inf)
 
 
+@pytest.mark.slow
 def test_more_starts_are_not_tried_where_a_quarter_of_them_agree(monkeypatch):
     """A tight bound leaves doubt whatever is found; what most of 16 starts find, 256 would find again."""
     counts, solve = [], Search._solve

@@ -63,6 +63,7 @@ def test_closed_forms_equal_the_sum():
     assert checked == 6 * (6 + 5 + 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", range(1, 6))
 def test_dimension_equals_brute_force_rank(n):
     for m in range(1, 6):
@@ -311,6 +312,7 @@ def test_labelled_static_points_save_moving_ones_in_space(labelled, moving):
     assert count("join", labelled_static=labelled, moving=0).missing == moving
 
 
+@pytest.mark.slow
 def test_synthetic_constraints_of_the_shape_tensor_leave_nine_dimensions():
     counted = count("shape_tensor", synthetic=True)
     assert counted.rank == 80 and counted.minimal == 2

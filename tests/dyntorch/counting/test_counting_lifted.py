@@ -112,6 +112,7 @@ def test_rank_of_degenerate_views_and_motions(name, options, rank):
     assert counted.full == (rank if "velocity" not in "".join(options) else counted.width - 1)
 
 
+@pytest.mark.slow
 def test_points_that_move_in_fewer_dimensions_need_others():
     assert [count("constant_velocity_3d", **{f"{kind}_velocity": 100}).missing for kind in ("equal", "linear", "planar")] == [
         18,
@@ -135,6 +136,7 @@ def test_second_body_needs_two_points(name, profile, alone):
     assert [kind.name for kind in counted[3].kinds] == ["object", "object"]
 
 
+@pytest.mark.slow
 def test_models_and_profiles_are_those_of_the_library():
     times = [0.0, 1.0, 3.0, 4.0, 6.0, 7.0, 9.0]
     assert set(MOTIONS) <= set(CONFIGURATIONS)
@@ -160,6 +162,7 @@ def test_grassmann_tensor_by_numbers_takes_the_matches_of_its_closed_form(k, pro
     assert (counted.width, counted.rank, counted.minimal) == (engine.width(), engine.width() - 1, engine.minimal())
 
 
+@pytest.mark.slow
 def test_profile_has_measures_as_its_limits():
     for profile, measure in (((2, 2), "join"), ((1,) * 4, "hyper"), ((2, 1, 1), ["join", "hyper", "hyper"])):
         k = 3

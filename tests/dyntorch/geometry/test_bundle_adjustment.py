@@ -91,6 +91,7 @@ def test_the_gradient_of_the_cost_vanishes(name):
     assert max(float(t.grad.abs().max()) for t in at) < 1e-5 * cost.sqrt()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plane, constant velocity", "static"])
 def test_the_cost_is_that_of_a_dense_minimization(name):
     x, cameras, structure, lifts = scene(name, noise=0.002, off=0.002)
@@ -135,6 +136,7 @@ def test_a_step_solves_the_dense_damped_equations(name, loss):
     torch.testing.assert_close(gain[0], 2 * gradient @ expected - expected @ model @ expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", ["huber", "geman_mcclure"])
 def test_outliers_do_not_move_the_robust_minimum(loss):
     x, cameras, structure, lifts = scene("static", noise=1e-3)

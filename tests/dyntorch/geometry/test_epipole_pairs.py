@@ -114,6 +114,7 @@ def test_failures_leave_the_others_alone():
         factor_product(torch.zeros(5, 6))
 
 
+@pytest.mark.slow
 def test_gradients():
     f, g = rank_two(2), rank_two(2, seed=1)
 

@@ -59,6 +59,7 @@ def test_nothing_is_nearer(profile, sizes):
     assert jacobian(each(cosine), problem.joined(found))[1].abs().max() < 1e-12
 
 
+@pytest.mark.slow
 def test_the_hessian_is_the_second_derivative_at_a_minimum():
     profile, sizes = (2, 2, 1), (3, 3, 3)
     tensor = noisy(profile, sizes, 2, sigma=0.1).flatten(1)
@@ -164,6 +165,7 @@ def test_zero_and_not_finite_tensors():
     torch.testing.assert_close(gradient[1], expected[0], rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_tensors_far_from_any_projection_stay_finite():
     for profile, sizes in (((2, 2, 1), (3, 3, 3)), LINE):
         shape = noisy(profile, sizes, 20).shape

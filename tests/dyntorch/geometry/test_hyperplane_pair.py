@@ -152,6 +152,7 @@ def test_order_and_larger_body():
     assert hyperplane_pair(even).labels[0] == 1
 
 
+@pytest.mark.slow
 def test_gradients():
     points = pairs(n=20, size=4)[0] + 0.01 * random(20, 4, seed=3)
 

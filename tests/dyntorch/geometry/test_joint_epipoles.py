@@ -152,6 +152,7 @@ def test_batch_is_loop_and_nan_stays_alone():
     assert epipoles(views[..., :4].unbind(-3)).isfinite().all()
 
 
+@pytest.mark.slow
 def test_gradients():
     views = random(2, 3, 3, 5, seed=15).requires_grad_()
     assert torch.autograd.gradcheck(lambda v: joint_epipoles(v.unbind(-3)).epipoles, views, atol=1e-4)

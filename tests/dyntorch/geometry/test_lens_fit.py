@@ -28,6 +28,7 @@ def seen(strengths, n=400, noise=0.0, seed=0):
     return [x + noise * torch.randn(x.shape, generator=generator, dtype=x.dtype) for x in bent]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strengths", [(-0.2, -0.1), (0.0, -0.3), (-0.5, -0.45), (0.1, 0.05)])
 def test_exact_matches_give_the_lenses(strengths):
     fit = fit_distortion(*seen(strengths), sizes=(SIZE, SIZE))
@@ -35,6 +36,7 @@ def test_exact_matches_give_the_lenses(strengths):
     assert fit.significant and fit.gain > 0.9
 
 
+@pytest.mark.slow
 def test_noisy_matches_give_the_lenses_within_their_sigmas():
     truth = torch.tensor([-0.15, -0.08], dtype=torch.float64)
     fits = [fit_distortion(*seen(truth.tolist(), noise=1.0, seed=seed), sizes=(SIZE, SIZE)) for seed in range(5)]
@@ -44,6 +46,7 @@ def test_noisy_matches_give_the_lenses_within_their_sigmas():
     assert all(fit.significant for fit in fits)
 
 
+@pytest.mark.slow
 def test_ideal_cameras_are_left_alone():
     fits = [fit_distortion(*seen((0.0, 0.0), noise=1.0, seed=seed), sizes=(SIZE, SIZE)) for seed in range(6)]
     assert not any(fit.significant for fit in fits)
@@ -90,6 +93,7 @@ def test_too_few_matches_decide_nothing():
     assert (fit.lambda_a, fit.gain, fit.significant) == (0.0, 0.0, False)
 
 
+@pytest.mark.slow
 def test_the_note_tells_what_to_give():
     note = fit_distortion(*seen((-0.2, -0.1)), sizes=(SIZE, SIZE)).note
     assert note.startswith("lens distortion fitted, lambda = -0.200 and -0.100") and "give calibration" in note
@@ -140,6 +144,7 @@ def test_misuse_is_named(arguments, words):
         fit_distortion(*arguments)
 
 
+@pytest.mark.slow
 def test_options_decide():
     matches, shipped = seen((-0.2, -0.1)), LensOptions()
     assert fit_distortion(*matches, sizes=(SIZE, SIZE)).significant

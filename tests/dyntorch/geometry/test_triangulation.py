@@ -132,6 +132,7 @@ def test_batch_is_loop_and_dtype_stays():
     assert triangulate(projections.float(), x.float()).dtype == resect(structure.float(), x.float()).dtype == torch.float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [0, 1])
 def test_gradients(steps):
     projections, structure, x = scene(3, 2, 3, n=7)

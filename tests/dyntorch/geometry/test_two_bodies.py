@@ -149,6 +149,7 @@ def test_batch_is_loop():
                     torch.testing.assert_close(getattr(batch, part)[i, j], getattr(alone, part), atol=1e-8, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_images():
     projections, structure, _, _ = scene(d=3)
     pair = hyperplane_pair(structure)

@@ -159,6 +159,7 @@ def test_jacobian_is_continuous_along_a_path():
     assert turned.sum(0).max() <= 1 and turned.double().mean() < 0.005
 
 
+@pytest.mark.slow
 def test_gradcheck_for_motion_views_and_scales():
     scene, views, _ = noisy((0.05,) * 3, n=3, seed=10)
     inputs = [*scene.motion, *views, *(ONE * s for s in (0.5, 1.0, 2.0))]
@@ -225,6 +226,7 @@ def test_motion_of_two_forms_or_more(count):
         torch.testing.assert_close(got, unit(true), atol=1e-11, rtol=0)
 
 
+@pytest.mark.slow
 def test_motion_of_forms_is_differentiable():
     a, b = random(4, 4, seed=23), random(4, 4, seed=24)
     eye = torch.eye(4, dtype=torch.float64)

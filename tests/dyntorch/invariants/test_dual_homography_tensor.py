@@ -210,6 +210,7 @@ def test_misuse_is_refused():
         DualHomographyTensor.transfer(torch.zeros(3, 3, 3), torch.zeros(1, 3), 1, 1)
 
 
+@pytest.mark.slow
 def test_gradients_and_forward_mode():
     motion = [m.requires_grad_() for m in near_identity(2)]
 

@@ -132,6 +132,7 @@ def test_points_that_stand_still_have_a_distance_as_well():
     torch.testing.assert_close(still, point, rtol=0.05, atol=0.05)
 
 
+@pytest.mark.slow
 def test_robust_estimation_finds_static_points_among_outliers():
     scene = scenes.dynamic(2, 4, 1, 80, sigma=1e-3, outliers=0.3, generator=torch.Generator().manual_seed(8))
     found = dyn.robust_fit(

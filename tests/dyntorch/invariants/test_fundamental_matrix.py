@@ -134,6 +134,7 @@ def test_degenerate_matrices_are_never_nan():
     assert torch.equal(at_epipole, torch.zeros(1, 3))
 
 
+@pytest.mark.slow
 def test_gradients_and_forward_mode():
     A, e2 = random(2, 3, 3).requires_grad_(), random(2, 3, seed=1).requires_grad_()
 

@@ -243,6 +243,7 @@ def test_misuse_is_refused():
         HomographyTensor.decompose(torch.zeros(3, 3))
 
 
+@pytest.mark.slow
 def test_gradients():
     A, B = (m.requires_grad_() for m in motions(2))
     x, y = (0.3 * random(2, 3, 2, seed=6)).requires_grad_(), (0.3 * random(2, 3, 2, seed=7)).requires_grad_()

@@ -126,6 +126,7 @@ def test_family_holds_all_determinants_and_is_orthonormal():
     torch.testing.assert_close((values @ weights)[..., 0], determinants, atol=1e-10, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_cone_of_the_family_has_dimension_thirty():
     """Tangent rank of the projector onto the family: (A, B) without their two scales."""
     a, b = random(4, 4, seed=13), random(4, 4, seed=14)
@@ -217,6 +218,7 @@ def test_linear_accuracy_with_noise(n, sigma, reach):
     assert grid_error(motion, scene).median() < reach
 
 
+@pytest.mark.slow
 def test_compose_and_decompose_are_differentiable():
     a, b = random(4, 4, seed=25).requires_grad_(), random(4, 4, seed=26).requires_grad_()
     fixed = random(64, 3, seed=37)
@@ -225,6 +227,7 @@ def test_compose_and_decompose_are_differentiable():
     assert torch.autograd.gradcheck(lambda t: torch.stack(JoinTensor.decompose(t)), (noisy,))
 
 
+@pytest.mark.slow
 def test_transfer_and_trajectory_are_differentiable():
     scene = moving_points(2, generator=generator(28))
     tensor = (JoinTensor.compose(*scene.motion) + 0.01 * random(4, 4, 4, 4, seed=29)).requires_grad_()

@@ -245,6 +245,7 @@ def test_forty_seven_exact_matches_give_the_motion():
     assert error(fitted(MinimalJoinTensor(), scene.views), scene).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_compose_and_decompose_are_differentiable():
     a, b = random(4, 4, seed=50).requires_grad_(), random(4, 4, seed=51).requires_grad_()
     options = {"check_forward_ad": True, "check_batched_forward_grad": True}

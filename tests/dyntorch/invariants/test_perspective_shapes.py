@@ -36,6 +36,7 @@ def exact():
     return x, times, shapes, dyn.fit(NEAR, *x[:20].unbind(1), times=times[:20]).check()
 
 
+@pytest.mark.slow
 def test_exact_views_give_exact_times_and_scores(exact):
     x, times, shapes, solution = exact
     inv = solution.invariant
@@ -68,6 +69,7 @@ def test_counts(exact):
     assert int((values > 1e-7 * values[0]).sum()) == inv.dof
 
 
+@pytest.mark.slow
 def test_near_views_are_dated_better_than_by_affine_cameras_and_far_ones_no_worse():
     errors = {}
     for distance in (4.0, 30.0):
@@ -81,6 +83,7 @@ def test_near_views_are_dated_better_than_by_affine_cameras_and_far_ones_no_wors
     assert errors[30.0, "projective"] < 1.1 * errors[30.0, "affine"]
 
 
+@pytest.mark.slow
 def test_refinement_lowers_the_distances_and_its_derivative_is_right():
     x, times, _ = scene(8, 30, 6.0, seed=2, sigma=0.005)
     solution = dyn.fit(NEAR, *x.unbind(1), times=times).check()
@@ -135,6 +138,7 @@ def test_the_descent_has_the_gradient_of_its_cost(prior, off):
     torch.testing.assert_close(matrix, matrix.mT)
 
 
+@pytest.mark.slow
 def test_batch_is_loop_and_bad_problems_are_statuses(exact):
     x, times, _, solution = exact
     bad = torch.stack([x[:20], torch.full_like(x[:20], torch.nan), x[:20]])

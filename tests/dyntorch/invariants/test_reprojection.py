@@ -85,6 +85,7 @@ def test_it_is_the_least_reprojection_error(invariant):
     torch.testing.assert_close(inhomogeneous(at.structure @ motion[0].mT), inhomogeneous(y @ motion[0].mT), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("invariant", PROFILES, ids=repr)
 def test_derivative_by_finite_differences(invariant):
     motion, structure = scene(invariant, 12, 2)

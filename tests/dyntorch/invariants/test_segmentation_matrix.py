@@ -130,6 +130,7 @@ def test_reweighted_is_the_inverse_square_of_the_gradient():
     torch.testing.assert_close(SM.reweighted(S, *found.views), expected, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_reweighted_fit_and_refinement_label_better():
     found = scene(100, batch=12, sigma=0.3)
     linear = dyn.fit(SM, *found.views)

@@ -144,6 +144,7 @@ def test_a_mistake_is_the_callers():
         table(3)
 
 
+@pytest.mark.slow
 def test_no_other_function_caches_tensors():
     listed = {table.__name__ for table, _ in TABLES}
     decorated, cached = set(), set()

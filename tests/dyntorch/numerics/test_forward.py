@@ -141,6 +141,7 @@ CALLS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", CALLS)
 def test_first_answers_do_not_wait_for_torchs_compiler(verb):
     """Importing it takes longer than any of these verbs."""

@@ -159,6 +159,7 @@ def test_nobody_drives_through_anybody():
     assert any(cars is not None for cars in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("call", "message"),
     [

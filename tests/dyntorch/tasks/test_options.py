@@ -88,6 +88,7 @@ def test_options_of_another_verb_are_refused(call):
         call(options=dyn.SegmentOptions())
 
 
+@pytest.mark.slow
 def test_options_of_the_alignment_decide():
     scene = scenes.planar(60, sigma=0.3, static=0.5, generator=torch.Generator().manual_seed(0))
     shipped = dyn.AlignOptions()

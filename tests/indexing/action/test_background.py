@@ -40,6 +40,7 @@ def session():
     return detect(clip, azimuth=20.0, rng=6), truth
 
 
+@pytest.mark.slow
 def test_one_action_is_told_from_everything_else(alone, others):
     assert alone.classes_.tolist() == ["squat"] and alone.model_.hidden > 3
     said = alone.predict(others)
@@ -54,6 +55,7 @@ def test_scores_are_of_the_known_actions(alone, others):
     assert likely[others.labels == "squat"].min() > np.median(likely[others.labels != "squat"])
 
 
+@pytest.mark.slow
 def test_a_recording_holds_the_one_action(alone, session):
     clip, truth = session
     told = alone.explain(clip)
@@ -68,6 +70,7 @@ def test_a_recording_holds_the_one_action(alone, session):
     assert told.background is not None and (told.background >= 0).all() and (told.background <= 1).all()
 
 
+@pytest.mark.slow
 def test_the_rate_sets_the_level(squat):
     strict, usual, loose = (
         ActionIndexer(scorer="nearest", virtual_views=0, reject=rate).fit([squat], ["squat"]).reject_threshold_
@@ -114,6 +117,7 @@ def test_several_actions_and_a_recording_of_something_else(others, session):
     assert {event.label for event in indexer.find(session[0])} <= {"squat", "wave"}
 
 
+@pytest.mark.slow
 def test_a_second_action_can_be_added(squat, others):
     indexer = ActionIndexer(scorer="nearest", virtual_views=0).fit([squat], ["squat"])
     hidden = indexer.model_.hidden

@@ -286,6 +286,7 @@ def slow_residuals(model, query, crops, chosen):
     return epipolar + model.options.nearest.turned * turned - model.hub[chosen]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learned", [False, True])
 def test_a_model_scores_as_if_it_kept_nothing(fitted, learned):
     _, model, _ = fitted

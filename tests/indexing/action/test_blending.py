@@ -84,6 +84,7 @@ def test_blended_is_the_weighted_sum():
     assert torch.allclose(blended(evidence, Blend(2.0, 0.5)), 2 * evidence[0] + 0.5 * evidence[1])
 
 
+@pytest.mark.slow
 def test_a_learned_indexer_knows_who_performs(learned, lesson):
     assert learned.groups_.tolist() == [str(clip.meta["subject"]) for clip in lesson]
     alone = ActionIndexer(weights="learned", virtual_views=2).fit([clip.replace(meta={}) for clip in lesson])
@@ -134,6 +135,7 @@ def test_the_rate_of_the_next_unknown_action_counts_classes():
     assert reject_threshold(0.1, wrong, 5) == 99.0 and reject_threshold(-2.0, wrong, 5) == -2.0
 
 
+@pytest.mark.slow
 def test_evidence_is_what_rejection_stands_on(lesson):
     evidence = ActionIndexer(virtual_views=2).fit(lesson).evidence(lesson)
     threshold = 1.5 + float(np.abs(evidence).max())

@@ -20,6 +20,7 @@ def few():
 
 
 # ---- recognition -------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_one_example_recognizes_other_people_from_other_viewpoints(indexer, lesson, others, windows_of):
     accuracy = indexer.score(others, others.labels)
     assert accuracy > 0.9  # chance is 1 / 13
@@ -28,6 +29,7 @@ def test_one_example_recognizes_other_people_from_other_viewpoints(indexer, less
     assert accuracy > view_bound + 0.05
 
 
+@pytest.mark.slow
 def test_each_scorer_is_what_it_says(lesson, others):
     from indexing.action.bank import Windows
 
@@ -56,6 +58,7 @@ def test_same_view(lesson):
     assert same.score(seen, seen.labels) > 0.9
 
 
+@pytest.mark.slow
 def test_learned_weights(few):
     train, test = few
     learned = ActionIndexer(weights="learned").fit(train)
@@ -65,12 +68,14 @@ def test_learned_weights(few):
     assert not single.model_.parts.learned and single.model_.blend == ActionIndexer().fit(train[:4]).model_.blend
 
 
+@pytest.mark.slow
 def test_3d_exemplars_recognize_2d_queries(lesson_3d, others):
     solid = ActionIndexer().fit(lesson_3d)
     assert solid.score(others, others.labels) > 0.85
     assert solid.score(lesson_3d, lesson_3d.labels) > 0.9  # 3D queries are seen along z
 
 
+@pytest.mark.slow
 def test_2d_and_3d_exemplars_together(few):
     train, test = few
     mixed = [*train[:4], *(perform(action, Person.random(30), rng=3) for action in FEW)]
@@ -116,6 +121,7 @@ def test_a_four_axis_array_holds_views(few):
     assert ActionIndexer().fit(shown, FEW).score(test, test.labels) == 1.0
 
 
+@pytest.mark.slow
 def test_missing_joints(indexer, others):
     rng = np.random.default_rng(0)
     holed = []
@@ -129,6 +135,7 @@ def test_missing_joints(indexer, others):
     assert (indexer.classes_[scores.argmax(axis=1)] == others.labels).mean() > 0.8
 
 
+@pytest.mark.slow
 def test_joints_never_seen_in_the_exemplars(lesson, others):
     learned = []
     for i, clip in enumerate(lesson):

@@ -119,6 +119,7 @@ def test_a_planted_joint_is_found_and_pays_with_new_people(plain):
     assert accuracy(learned, query, truth, bank, labels, metric) >= accuracy(equal, query, truth, bank, labels, metric) + 0.1
 
 
+@pytest.mark.slow
 def test_each_action_gets_the_joint_that_tells_it():
     def own_joints(people, seed):
         """Joint c draws the curve of action c; in other actions it wanders."""

@@ -18,6 +18,7 @@ def crowd():
 
 
 # ---- partial_fit -------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("scorer", ["both", "nearest", "kernel"])
 def test_partial_fit_is_as_good_as_fit_on_all(crowd, scorer):
     train, test = (clips.select(action=FEW) for clips in crowd)
@@ -81,6 +82,7 @@ def strangers(crowd):
     return [(one, one.evidence(test[test.labels == action])) for one, action in zip(fitted, ACTIONS, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.1, 0.3])
 def test_unknown_actions_are_not_taken_for_known_ones_more_often_than_asked_for(strangers, rate):
     def taken(classes):
@@ -92,6 +94,7 @@ def test_unknown_actions_are_not_taken_for_known_ones_more_often_than_asked_for(
     assert taken(counted) <= taken(None)
 
 
+@pytest.mark.slow
 def test_a_stricter_rate_refuses_more_and_known_actions_pass(crowd):
     train, test = crowd
     indexer = ActionIndexer(scorer="nearest", none_label="none")
@@ -102,6 +105,7 @@ def test_a_stricter_rate_refuses_more_and_known_actions_pass(crowd):
     assert (answers[1] == test.labels).mean() > 0.85
 
 
+@pytest.mark.slow
 def test_reject_only_ever_replaces_answers(crowd):
     train, test = crowd
     train = train.select(subject=[0, 1])
@@ -113,6 +117,7 @@ def test_reject_only_ever_replaces_answers(crowd):
     np.testing.assert_array_equal(kept, bound.evidence(test) >= bound.reject_threshold_)
 
 
+@pytest.mark.slow
 def test_a_threshold_is_taken_as_it_is(crowd):
     train, test = (clips.select(action=FEW) for clips in crowd)
     evidence = ActionIndexer().fit(train).evidence(test)

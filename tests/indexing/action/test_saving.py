@@ -88,6 +88,7 @@ def test_parameters_that_no_file_can_hold_are_refused(train, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_loaded_model_learns_on(saved, train, test):
     lunges = dataset([Person.random(0)], ["lunge"], azimuth=0.0, rng=5)
     loaded = ActionIndexer.load(saved).partial_fit(lunges)

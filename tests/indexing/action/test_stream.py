@@ -39,6 +39,7 @@ def hits(found, truth):
     return [any(e.label == label and e.start <= (a + b) / 2 <= e.end for e in found) for label, a, b in truth]
 
 
+@pytest.mark.slow
 def test_score_frames(indexer, recordings):
     clips, truth = recordings
     for clip in clips:
@@ -48,6 +49,7 @@ def test_score_frames(indexer, recordings):
         assert frame_accuracy(indexer, clip, truth) > 0.7
 
 
+@pytest.mark.slow
 def test_find_contract(indexer, recordings):
     clips, _ = recordings
     for clip in clips:
@@ -74,6 +76,7 @@ def test_labels_keep_their_type(recordings):
     assert found and {e.label for e in found} <= set(range(10, 16))
 
 
+@pytest.mark.slow
 def test_the_clock_of_the_recording_does_not_matter(indexer, recordings):
     clip = recordings[0][0]
     late = clip.replace(times=clip.times + 500.0, fps=None)
@@ -82,6 +85,7 @@ def test_the_clock_of_the_recording_does_not_matter(indexer, recordings):
         assert (a.label, a.start, a.end) == (b.label, pytest.approx(b.start - 500, abs=0.02), pytest.approx(b.end - 500, abs=0.02))
 
 
+@pytest.mark.slow
 def test_the_frame_rate_does_not_matter(indexer, recordings):
     clip, truth = recordings[0][0], recordings[1]
     half = clip.replace(joints=clip.joints[::2], times=clip.times[::2], confidence=None, fps=None)
@@ -198,6 +202,7 @@ def test_reject_threshold():
 
 
 # ---- nobody there, nothing done ------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_nothing_is_found_while_nobody_is_seen(indexer, recordings):
     clip = recordings[0][0]
     half = len(clip) // 2
@@ -211,6 +216,7 @@ def test_nothing_is_found_while_nobody_is_seen(indexer, recordings):
         assert np.isfinite(indexer.score_frames(one)).all()
 
 
+@pytest.mark.slow
 def test_a_resting_person_is_mostly_left_alone():
     lesson = dataset([Person.random(10)], ACTIONS, azimuth=0.0, rng=10)
     indexer = ActionIndexer(scorer="nearest").fit(lesson)
@@ -222,6 +228,7 @@ def test_a_resting_person_is_mostly_left_alone():
 
 
 # ---- gaps: what a recording costs is told by its frames, not by its clock ------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [20.0, 86400.0, 2.6e6, 1e9, 1e12])
 def test_gaps_of_any_length_part_a_recording(indexer, recordings, gap):
     clip = recordings[0][0]

@@ -129,6 +129,7 @@ def test_segments_of_nothing_go_and_those_of_little_are_written_anew(three: Arch
     assert list((three.path / "segments").iterdir()) == [] and len(three) == 0 and three.verify().ok
 
 
+@pytest.mark.slow
 def test_small_segments_are_put_together_unchanged(tmp_path: Path, moves) -> None:
     archive = Archive(tmp_path / "a", EAGER)
     for number in range(3):
@@ -153,6 +154,7 @@ def test_small_segments_are_put_together_unchanged(tmp_path: Path, moves) -> Non
     assert left == {path.name for path in segments(archive)}
 
 
+@pytest.mark.slow
 def test_who_asks_while_segments_are_put_together_gets_an_answer(tmp_path: Path, moves) -> None:
     archive, other = Archive(tmp_path / "a", EAGER), Archive(tmp_path / "a", EAGER)
     for number in range(3):

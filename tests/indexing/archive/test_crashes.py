@@ -50,16 +50,19 @@ def unharmed(trials: Sequence[Trial]) -> None:
 
 
 # ---- adders --------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_killed_adders_leave_an_archive(stage: Stage) -> None:
     trials = killed.killed(stage, 3, np.random.default_rng(1))
     unharmed(trials)
     assert any(trial.disturbed for trial in trials)
 
 
+@pytest.mark.slow
 def test_interrupted_adders_leave_an_archive(stage: Stage) -> None:
     unharmed(killed.interrupted(stage, 1, np.random.default_rng(2)))
 
 
+@pytest.mark.slow
 def test_an_adder_killed_between_segment_and_catalogue_leaves_a_file(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     from indexing.archive import adding
 
@@ -76,6 +79,7 @@ def test_an_adder_killed_between_segment_and_catalogue_leaves_a_file(stage: Stag
     unharmed([aftermath(stage, folder, disturbed=True)])
 
 
+@pytest.mark.slow
 def test_an_adder_killed_while_tidying_leaves_both(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     from indexing.archive import adding
 
@@ -100,6 +104,7 @@ def test_two_adders_at_once_add_everything_once(stage: Stage) -> None:
     unharmed(killed.at_once(stage, 1, np.random.default_rng(3)))
 
 
+@pytest.mark.slow
 def test_who_asks_while_somebody_adds_is_answered(stage: Stage) -> None:
     unharmed(killed.asked_meanwhile(stage, 1, np.random.default_rng(4)))
 
@@ -113,6 +118,7 @@ def test_a_killed_adder_lets_go_of_the_archive(stage: Stage) -> None:
 
 
 # ---- a full disk ---------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_full_disk_is_one_line(stage: Stage) -> None:
     try:
         trials = killed.disk_full(stage, 2, np.random.default_rng(5))
@@ -122,6 +128,7 @@ def test_a_full_disk_is_one_line(stage: Stage) -> None:
     assert trials[0].disturbed and trials[0].kept == 0
 
 
+@pytest.mark.slow
 def test_files_that_may_not_grow_are_one_line(stage: Stage) -> None:
     """As on a full disk, where nobody may mount one: no file may be larger than one segment is."""
     folder, before = stage.copy(), resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -259,11 +266,13 @@ def _same(
     assert len(answers[1]) >= 6  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_processes_answer_the_same(tmp_path: Path, laboratory, in_process) -> None:
     with workers.QuietProcesses(1) as pool:
         _same(tmp_path / "a", pool, laboratory, in_process)
 
 
+@pytest.mark.slow
 def test_threads_answer_the_same(tmp_path: Path, laboratory, in_process) -> None:
     before = torch.get_num_threads()
     with ThreadPoolExecutor(3) as threads:

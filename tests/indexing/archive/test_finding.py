@@ -34,6 +34,7 @@ def alike(one, others):
     )
 
 
+@pytest.mark.slow
 def test_events_are_those_of_the_recordings(archive, recordings, indexer):
     found = archive.find(indexer)
     kept, right = [], []
@@ -45,6 +46,7 @@ def test_events_are_those_of_the_recordings(archive, recordings, indexer):
     assert found == sorted(found, key=lambda one: (one.source, one.person, one.start, one.end))
 
 
+@pytest.mark.slow
 def test_a_model_file_does(archive, indexer, tmp_path):
     indexer.save(tmp_path / "moves.safetensors")
     assert archive.find(tmp_path / "moves.safetensors") == archive.find(indexer)

@@ -42,6 +42,7 @@ def shows(hit, streams):
     return label if shared[label] > 0.5 * (hit.end - hit.start) else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("azimuth", [0.0, 90.0, 200.0])
 def test_the_same_action_from_elsewhere(archive, streams, azimuth):
     right = moment = 0
@@ -59,6 +60,7 @@ def rolled(clip, degrees):
     return clip.replace(joints=clip.joints @ np.array([[c, s], [-s, c]]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [30.0, 90.0])
 def test_a_camera_may_be_rolled(archive, streams, degrees):
     points, intervals = streams[1]
@@ -66,6 +68,7 @@ def test_a_camera_may_be_rolled(archive, streams, degrees):
     assert sum(hit.source == "stream 1" for hit in found) >= 3
 
 
+@pytest.mark.slow
 def test_joints_may_be_missing(archive, streams):
     points, intervals = streams[2]
     clip = filmed(points, 20.0, 9)

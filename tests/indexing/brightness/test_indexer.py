@@ -40,6 +40,7 @@ def asked():
     return videos(3)
 
 
+@pytest.mark.slow
 def test_another_person_is_recognized(indexer, asked):
     assert indexer.predict(asked).tolist() == list(ACTIONS)
     assert np.allclose(indexer.predict_proba(asked).sum(1), 1)
@@ -106,6 +107,7 @@ def test_events_are_found(indexer, asked):
     assert 0.8 < best.start < best.end < len(asked[0]) / 15 + 1.4
 
 
+@pytest.mark.slow
 def test_files_of_models_are_exact(indexer, asked, tmp_path):
     path = tmp_path / "model.safetensors"
     fitted = clone(indexer).set_params(reject=0.2, region=(2, 0, 46, 36)).fit(asked, [3, 1, 2])
@@ -138,6 +140,7 @@ def test_files_from_before_the_window_kernel_went_are_read_where_it_had_no_weigh
         BrightnessIndexer.load(path)
 
 
+@pytest.mark.slow
 def test_order_and_parts_of_the_exemplars_do_not_matter(indexer, learned, asked):
     expected = indexer.decision_function(asked[:1])
     turned = clone(indexer).fit(learned[::-1], (ACTIONS * 2)[::-1])
@@ -205,12 +208,14 @@ def test_bad_queries_are_named(indexer):
         stream.push(np.zeros((40, 48), np.uint8))
 
 
+@pytest.mark.slow
 def test_an_accelerator_says_the_same(indexer, learned, asked):
     for device in accelerators():
         there = clone(indexer).set_params(device=device).fit(learned, ACTIONS * 2)
         np.testing.assert_allclose(there.decision_function(asked), indexer.decision_function(asked), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_options_are_kept_where_they_are_not_the_defaults(learned, asked, tmp_path):
     plain, usual, other = (tmp_path / f"{name}.safetensors" for name in ("plain", "usual", "other"))
     BrightnessIndexer(fps=15.0).fit(learned, ACTIONS * 2).save(plain)

@@ -58,6 +58,7 @@ def scene():
     return rig, tracks, truth, seen
 
 
+@pytest.mark.slow
 def test_exchanged_numbers_are_mended_and_clocks_found(scene):
     rig, tracks, truth, seen = scene
     found = associate([clips(one, name=f"cam{k}") for k, one in enumerate(tracks)])
@@ -73,6 +74,7 @@ def test_exchanged_numbers_are_mended_and_clocks_found(scene):
     assert all(len(found.clips(k)) == 2 and found.clips(k)[1].meta["person"] == 1 for k in range(3))
 
 
+@pytest.mark.slow
 def test_fundamental_matrices_are_those_of_the_cameras(scene):
     rig, tracks, _, _ = scene
     found = associate([clips(one) for one in tracks], clocks=rig.clocks.offsets.numpy())
@@ -128,6 +130,7 @@ def test_distances_are_sampsons():
         assert found[0, a, b, k] == pytest.approx(q @ F @ p / below)
 
 
+@pytest.mark.slow
 def test_false_detections_are_nobody_and_people_come_and_go(scene):
     rig, tracks, truth, seen = scene
     rng = np.random.default_rng(5)
@@ -146,6 +149,7 @@ def test_false_detections_are_nobody_and_people_come_and_go(scene):
     assert away[80:110].sum() == 30 and (found.tracks[1][80:110] == -1).sum() == 30
 
 
+@pytest.mark.slow
 def test_other_layouts_are_compared_by_name(scene):
     rig, tracks, truth, _ = scene
     order = np.random.default_rng(2).permutation(len(NAMES))
@@ -173,6 +177,7 @@ def test_two_who_do_the_same_side_by_side_before_far_cameras_are_refused():
         found.check()
 
 
+@pytest.mark.slow
 def test_a_camera_of_other_people_is_named(scene):
     tracks = scene[1]
     strangers = filmed(crossing(np.random.default_rng(99)), cameras((0.4, 2.0)), seed=7)[0]

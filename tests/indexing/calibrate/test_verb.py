@@ -33,6 +33,7 @@ def library(monkeypatch):
     return asked
 
 
+@pytest.mark.slow
 def test_folders_clips_and_arrays_are_the_same(library, tmp_path):
     folder = write_cameras(tmp_path)
     clips = [own[0] for own in filmed()]
@@ -90,6 +91,7 @@ def test_somebody_who_never_stands_straight_is_measured_by_trunk_and_legs():
     assert "farthest apart" in in_metres(replace(base, points=base.points[:, kept]), stature, bare)[1].measured
 
 
+@pytest.mark.slow
 def test_two_people_are_matched_whatever_their_order(library):
     cameras = filmed(2)
     rig = calibrate([cameras[0], cameras[1][::-1], cameras[2]], sizes=SIZE, clocks=[-late / FPS for late in LATE])
@@ -106,6 +108,7 @@ def test_two_people_are_matched_whatever_their_order(library):
     assert one.persons == 1 and one.identities is None
 
 
+@pytest.mark.slow
 def test_left_taken_for_right_is_mended_before_the_last_word(library, tmp_path):
     clips = [own[0] for own in filmed()]
     swapped = np.array(clips[1].joints)

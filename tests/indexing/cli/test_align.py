@@ -76,6 +76,7 @@ def read(folder: str | Path = "out") -> dict:
 
 
 # ---- what is found -------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_planar_from_csv(run, planar, tmp_path):
     code, out, err = run("@/a.csv @/b.csv @/c.csv --model planar --threshold 1.5 --out out/")
     assert (code, err) == (0, "")
@@ -104,6 +105,7 @@ def test_planar_from_csv(run, planar, tmp_path):
     assert Path("out/alignment.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_model_follows_from_the_files_and_the_output_says_so(run, data):
     code, out, _ = run("@/rigid.npz --out out")
     assert code == 0 and "note: model rigid, because the files hold 3D points; if their scale" in out
@@ -114,6 +116,7 @@ def test_the_model_follows_from_the_files_and_the_output_says_so(run, data):
     assert "A turn by" in Path("out/report.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_result(run):
     for name in ("one", "two"):
         assert run(f"@/rigid.npz --seed 3 --out {name}")[0] == 0
@@ -123,6 +126,7 @@ def test_the_same_seed_gives_the_same_result(run):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["join", "minimal_join"])
 def test_projective_points(run, tmp_path, model):
     # a bound of six times the noise: the search is over at its first starts
@@ -132,6 +136,7 @@ def test_projective_points(run, tmp_path, model):
     assert np.linalg.norm(np.array(read()["B"]) - scene.motion[1].numpy()) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "sensors"), [("constant_velocity", "projective"), ("affine_constant_velocity", "affine")])
 def test_constant_velocity(run, tmp_path, model, sensors):
     scene = scenes.constant_velocity(80, sigma=0.002, static=0.3, sensors=sensors, generator=draw(5))
@@ -143,6 +148,7 @@ def test_constant_velocity(run, tmp_path, model, sensors):
     assert np.array(found["velocities"]).shape == (80, 3)
 
 
+@pytest.mark.slow
 def test_lines_with_static_points(run, data):
     code, out, _ = run("@/l1.csv @/l2.csv --model lines --threshold 0.006 --static-points @/p1.csv @/p2.csv --out out")
     assert code == 0 and "B: view 3" not in out
@@ -150,6 +156,7 @@ def test_lines_with_static_points(run, data):
     assert np.linalg.norm(np.array(read()["A"]) - truth) < 0.05 and "B" not in read()
 
 
+@pytest.mark.slow
 def test_pluecker_lines(run, data, tmp_path):
     views = [np.loadtxt(data / f"l{i}.csv", delimiter=",", skiprows=1).reshape(-1, 2, 3) for i in (1, 2)]
     ends = [np.concatenate([view, np.ones((len(view), 2, 1))], axis=2) for view in views]
@@ -163,6 +170,7 @@ def test_pluecker_lines(run, data, tmp_path):
     assert np.abs(across).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_rows_are_matched_by_name_and_missing_ones_said(run, data, tmp_path):
     rows = (data / "b.csv").read_text().splitlines()
     mixed = [rows[0], *reversed(rows[4:]), "p1,,7", "stranger,1,2"]  # p0 and p2 are absent, p1 is missing
@@ -181,6 +189,7 @@ def test_without_a_folder_nothing_is_written(run, tmp_path):
     assert code == 0 and "report" not in out and list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_frames_of_one_file(run, data, tmp_path):
     archive = np.load(data / "rigid.npz")
     views = [archive[f"P{i}"] for i in (1, 2, 3)]
@@ -190,6 +199,7 @@ def test_frames_of_one_file(run, data, tmp_path):
     assert read("one")["A"] == read("two")["A"] and read("one")["views"][1] == "walk.npy frame 2"
 
 
+@pytest.mark.slow
 def test_a_calibration_tells_how_the_camera_moved_and_the_plane(run, tmp_path):
     """Numbers and a file with the same say the same; the page and the JSON have it."""
     side = torch.tensor([[0.8, 0.0], [0.0, 1.0], [0.6, 0.0]], dtype=torch.float64)
@@ -217,6 +227,7 @@ def test_a_calibration_tells_how_the_camera_moved_and_the_plane(run, tmp_path):
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path):
     equal = table(tmp_path / "e.csv", np.full((40, 2), 5.0))
     code, out, err = run(f"{equal} {equal} {equal} --model planar --out out")
@@ -228,6 +239,7 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, tmp_path):
     assert sorted(path.name for path in Path("out").iterdir()) == sorted(FILES)
 
 
+@pytest.mark.slow
 def test_more_than_three_views_of_a_plane(run, tmp_path):
     scene = scenes.planar(50, sigma=0.5, static=0.4, views=5, generator=torch.Generator().manual_seed(3))
     for name, view in zip("abcde", scene.views, strict=True):
@@ -240,6 +252,7 @@ def test_more_than_three_views_of_a_plane(run, tmp_path):
     assert all(f"{name}, row 1" in page for name in "ABCD")
 
 
+@pytest.mark.slow
 def test_noise_alone_is_refused(run, tmp_path):
     rng = np.random.default_rng(0)
     for name in "abc":
@@ -306,6 +319,7 @@ def test_an_input_is_not_overwritten(run, data, tmp_path):
     assert code == 2 and "labels.csv: is an input" in err and (tmp_path / "labels.csv").read_text() == before
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_heavy_and_names_the_models():
     code = (
         "import sys; from indexing.cli import main; main(['align', '--help']); main(['--help'])\n"
@@ -342,6 +356,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_every_kind_of_data_can_be_drawn(tmp_path):
     lines = np.random.default_rng(0).normal(size=(5, 2, 3))
     for i, changes in enumerate((

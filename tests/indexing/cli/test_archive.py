@@ -81,6 +81,7 @@ def refuse(run):
 
 
 # ---- add -----------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_add_says_what_became_of_each(run, data: Path, tmp_path: Path) -> None:
     code, out, err = run("add", "@/a", "week", "squat.json", "broken.json")
     assert code == 0 and re.search(r"added +4 +[\d,]+ +\d", out) and re.search(r"failed +1", out)
@@ -95,6 +96,7 @@ def test_add_says_what_became_of_each(run, data: Path, tmp_path: Path) -> None:
     assert len(archive.add(data / "week").of("known")) == 3  # read alike from Python and from here
 
 
+@pytest.mark.slow
 def test_exit_codes_of_add(run) -> None:
     assert run("add", "@/a", "week/monday.npz", "broken.json", "--strict")[0] == 2
     assert run("add", "@/a", "week", "broken.json")[0] == 0  # two are new
@@ -102,6 +104,7 @@ def test_exit_codes_of_add(run) -> None:
     assert run("add", "@/a", "week", "--strict")[0] == 0
 
 
+@pytest.mark.slow
 def test_processes_add_the_same(run, tmp_path: Path) -> None:
     assert run("add", "@/a", "week", "--workers", "2")[0] == 0
     pooled, alone = Archive(tmp_path / "a"), Archive("lab.archive")
@@ -128,6 +131,7 @@ def test_an_interruption_keeps_what_was_read(run, tmp_path: Path, monkeypatch: p
     assert main(["archive", "add", str(tmp_path / "a"), str(Path(verbs.__file__).parent / "nothing.json")]) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs groups of processes")
 def test_ctrl_c_ends_the_workers_and_leaves_an_archive(data: Path, tmp_path: Path) -> None:
     many = tmp_path / "many"
@@ -175,6 +179,7 @@ def test_add_refuses_bad_input(refuse, tmp_path: Path) -> None:
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "expected"), [(("week", "nope.json"), 0), (("week", "nope.json", "--strict"), 2), (("nope.json",), 2)]
 )
@@ -200,6 +205,7 @@ def test_search_prints_hits_and_writes_the_report(run, data: Path, tmp_path: Pat
     assert made["archive"]["sources"] == 3 and made["timings"]["search"] > 0
 
 
+@pytest.mark.slow
 def test_search_of_a_clip_of_a_set_and_of_its_mirror_image(run) -> None:
     code, out, _ = run("search", "lab.archive", "lesson.npz", "--select", "action=kick", "-k", "2", "--mirror", "--workers", "1")
     assert code == 0 and "2 hits" in out and "assumed" not in out
@@ -213,6 +219,7 @@ def test_a_search_says_what_was_cut(run) -> None:
     assert code == 0 and "squat.json: the recording runs from 0 to" in out and "of it are asked for" in out
 
 
+@pytest.mark.slow
 def test_search_refuses_bad_input(refuse, run, data: Path, tmp_path: Path) -> None:
     search = ("search", "lab.archive")
     refuse(*search, "nope.json", says=("nope.json", "no such file"))
@@ -230,6 +237,7 @@ def test_search_refuses_bad_input(refuse, run, data: Path, tmp_path: Path) -> No
 
 
 # ---- find ----------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_find_prints_events_and_writes_the_report(run, data: Path, tmp_path: Path) -> None:
     code, out, err = run("find", "lab.archive", "-m", "moves.safetensors", "--report", "@/out")
     assert code == 0 and err == "" and "margin" in out and "of 3 sources" in out
@@ -249,6 +257,7 @@ def test_find_prints_events_and_writes_the_report(run, data: Path, tmp_path: Pat
     assert made["arguments"]["command"] == "archive find" and list(made["inputs"]) == ["moves.safetensors"]
 
 
+@pytest.mark.slow
 def test_many_events_are_counted(run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verbs, "SHOWN", 2)
     code, out, _ = run("find", "lab.archive", "-m", "moves.safetensors")
@@ -271,6 +280,7 @@ def test_info_counts_and_lists(run) -> None:
     assert code == 0 and out.index("week/friday.npz") < out.index("week/monday.npz") < out.index("week/tuesday.npz")
 
 
+@pytest.mark.slow
 def test_verify_says_what_is_wrong(run, data: Path, tmp_path: Path) -> None:
     code, out, err = run("verify", "lab.archive")
     assert code == 0 and err == "" and "all there, whole, and once" in out
@@ -340,6 +350,7 @@ def test_the_bar_says_how_many_and_how_fast(monkeypatch: pytest.MonkeyPatch) -> 
     assert "adding" in shown.getvalue() and "20/40" in shown.getvalue()
 
 
+@pytest.mark.slow
 def test_help_starts_without_the_heavy_libraries() -> None:
     code = """
 import sys
@@ -352,6 +363,7 @@ print("RESULT", codes, sorted({"torch", "sklearn", "matplotlib", "scipy", "dask"
     assert "tcp://head:8786" in done.stdout and done.stderr == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "said"),
     [

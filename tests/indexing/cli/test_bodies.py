@@ -116,6 +116,7 @@ def table(path):
 
 
 # ---- what is found -------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_table_of_tracks(run, solved):
     code, out, err = run("@/t.csv --out out/")
     assert (code, err) == (0, "") and "report: out/report.html" in out
@@ -149,6 +150,7 @@ def test_the_same_from_other_files(run, solved):
     assert "misclassified: 0.00 %" in run("@/t.npz")[1]
 
 
+@pytest.mark.slow
 def test_what_is_written_is_read_again(run, solved):
     run("@/t.npz --out out")
     before = solved["tracks"]
@@ -163,6 +165,7 @@ def test_flags_reach_the_library(run, solved):
     assert solved["tracks"].shape[0] == 4 and re.search(r"body 1 \(static\).* 1\.00 ", out)  # a frame is a frame of the file
 
 
+@pytest.mark.slow
 def test_a_whole_video(run, solved):
     code, out, err = run("@/room.mp4 --out out --title Room")
     assert (code, err) == (0, "") and "note: frames 0 to 11 of the 12 that were read (0.00 to 0.44 s)" in out
@@ -176,6 +179,7 @@ def test_a_whole_video(run, solved):
     assert {row["frame"] for row in table("out/tracks.csv")} == {"0", "5", "10"}
 
 
+@pytest.mark.slow
 def test_pictures(run, solved):
     code, out, _ = run("@/room --out out")
     assert code == 0 and "frames 0 to 11 of the 12 that were read" in out and " s)" not in out and Path("out", FILM).is_file()
@@ -189,6 +193,7 @@ def test_a_stretch(run, solved):
     assert code == 0 and "note: frames 6 to 11 of the 12 that were read" in out and solved["tracks"].shape[0] == 6
 
 
+@pytest.mark.slow
 def test_tracks_are_drawn_over_images(run, solved):
     for images in ("@/room.mp4", "@/room/*.png"):
         code, _, err = run(f"@/t.csv --images {images} --out out")
@@ -198,6 +203,7 @@ def test_tracks_are_drawn_over_images(run, solved):
     assert run("@/t.csv --out out")[0] == 0 and not Path("out", FILM).exists()  # that of an earlier run is not that of this one
 
 
+@pytest.mark.slow
 def test_two_frames_are_two_images(run, monkeypatch):
     asked = []
 
@@ -221,6 +227,7 @@ class Told(NoticeCode):
     CUT = "cut", "the scene changes at frame {frame}; give one of both parts", dyntorch.Status.AMBIGUOUS
 
 
+@pytest.mark.slow
 def test_a_scene_that_changes_is_refused_with_its_frame(run, solved, monkeypatch):
     solve, notice = dyntorch.segment_tracks, Notice(Told.CUT, 0.1, {"frame": 2})
     monkeypatch.setattr(
@@ -301,6 +308,7 @@ def test_an_input_is_not_overwritten(run, data, solved):
     assert code == 2 and "tracks.csv: is an input" in err and Path("tracks.csv").read_text() == before
 
 
+@pytest.mark.slow
 def test_the_library_itself(run):
     code, out, _ = run("@/room.mp4 --bodies 2 --out out")
     assert code in (0, 3) and Path("out", FILM).is_file() and "body 2" in out

@@ -52,6 +52,7 @@ def listed(folder: str) -> list[str]:
 
 
 # ---- what is found -------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_three_folders(run, library):
     code, out, err = run(f"{THREE} --height 1.75 --out calib")
     assert (code, err) == (0, "") and "report: calib/report.html" in out
@@ -71,6 +72,7 @@ def test_three_folders(run, library):
     assert {"versions", "inputs", "timings"} <= json.loads(Path("calib/calibration.json").read_text())["manifest"].keys()
 
 
+@pytest.mark.slow
 def test_flags_reach_the_library(run, library):
     assert run(f"{THREE} --focal 1500,1510,1520 --synchronized --length left_hip left_knee 0.42")[0] == 0
     assert run(f"{THREE} --one-lens --max-shift 2 --no-rate --min-confidence 0.5")[0] == 0
@@ -81,6 +83,7 @@ def test_flags_reach_the_library(run, library):
     assert second["one_lens"] and second["max_shift"] == 2 and second["rate"] == 1.0
 
 
+@pytest.mark.slow
 def test_known_lenses_and_clocks_from_files(run, library):
     section = "[{}]\nmatrix = [[900, 0, 900], [0, 900, 500], [0, 0, 1]]\ndistortions = [-0.1, 0, 0, 0]\nsize = [1920, 1080]\n"
     Path("lens.toml").write_text("".join(section.format(f"cam{i}") for i in (1, 2, 3)))
@@ -105,6 +108,7 @@ def test_rates_that_nobody_said_are_mentioned(run, library):
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_what_does_not_decide_is_refused(run, library):
     assert run(f"{THREE} --height 1.75 --out calib")[0] == 0
     library["ok"] = False
@@ -193,6 +197,7 @@ def test_foreign_files_stay(run, library):
     assert listed("out") == ["Calib_dyntorch.toml"] and Path("out/Calib_dyntorch.toml").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_heavy():
     code = (
         "import sys; from indexing.cli import main; main(['calibrate', '--help'])\n"
@@ -203,6 +208,7 @@ def test_help_loads_nothing_heavy():
 
 
 # ---- the library itself --------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_three_cameras_from_files_to_files(run):
     code, _, err = run(f"{THREE} --focal {FOCAL:g} --height 1.75 --out calib")
     assert (code, err) == (0, "")

@@ -89,6 +89,7 @@ def refuse(run, tmp_path: Path):
 
 
 # ---- the program ---------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_help_starts_without_the_heavy_libraries() -> None:
     code = """
 import sys
@@ -103,6 +104,7 @@ print("RESULT", codes, sorted(heavy))
     assert "evaluate" in done.stdout and "dyntorch 0." in done.stdout and done.stderr == ""
 
 
+@pytest.mark.slow
 def test_help_starts_in_half_a_second_of_work() -> None:
     code = "import time; from indexing.cli import main; main(['index', '--help']); print(time.process_time())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -119,6 +121,7 @@ def test_a_broken_pipe_is_quiet() -> None:
     assert err == b""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [["synchronise"], ["index", "foo"], ["index", "fit", "a=b", "--ouput", "m"], ["index", "scan", "x"], ["demo", "--people", "x"]],
@@ -182,6 +185,7 @@ def test_examples_are_read_from_words(tmp_path: Path, monkeypatch: pytest.Monkey
     assert parse_example("lr=3.npz") == Example(Path("lr=3.npz"))
 
 
+@pytest.mark.slow
 def test_fit_refuses_bad_input(refuse, data: Path, tmp_path: Path) -> None:
     (tmp_path / "empty.json").touch()
     (tmp_path / "clip.mp4").write_bytes(b"x" * 99)
@@ -213,6 +217,7 @@ def test_fit_refuses_bad_input(refuse, data: Path, tmp_path: Path) -> None:
 
 
 # ---- scan ----------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_scan_prints_hits_and_writes_the_report(run, tmp_path: Path) -> None:
     code, out, err = run(
         "index", "scan", "@/session.json", "-m", "@/moves.safetensors", "--report", "a/out", "--truth", "@/truth.csv"
@@ -237,6 +242,7 @@ def test_scan_prints_hits_and_writes_the_report(run, tmp_path: Path) -> None:
     assert {Path(name).name for name in made["inputs"]} == {"session.json", "moves.safetensors", "truth.csv"}
 
 
+@pytest.mark.slow
 def test_scan_of_several_recordings_tells_them_apart(run, data: Path, tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "session.json").write_bytes((data / "session.json").read_bytes())
@@ -245,6 +251,7 @@ def test_scan_of_several_recordings_tells_them_apart(run, data: Path, tmp_path: 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b"]
 
 
+@pytest.mark.slow
 def test_labels_are_escaped_in_the_page(run) -> None:
     words = [f"{SCRIPT}=@/kick.json", "[red]=@/wave.json", "squat=@/squat.json"]
     assert run("index", "fit", *words, "-o", "m.safetensors")[0] == 0
@@ -254,6 +261,7 @@ def test_labels_are_escaped_in_the_page(run) -> None:
     assert page.count("<script") == 1 and "&lt;script&gt;" in page  # the player's
 
 
+@pytest.mark.slow
 def test_scan_refuses_bad_input(refuse, run, data: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "bad.csv").write_text("label,start,end\nsquat,2,1\n")
@@ -312,6 +320,7 @@ def test_evaluate_writes_accuracy(run, tmp_path: Path) -> None:
     assert f"accuracy {measured['accuracy']:.3f}" in out
 
 
+@pytest.mark.slow
 def test_evaluate_through_virtual_cameras_leaving_groups_out(run) -> None:
     code, out, _ = run(
         "index", "evaluate", "@/solid.npz", "--leave-out", "subject", "--camera", "virtual", "--azimuth", "0,90",
@@ -333,6 +342,7 @@ def test_evaluate_in_camera_coordinates(run, data: Path, tmp_path: Path) -> None
     assert code == 0 and "(3 clips" in out  # learned from all others
 
 
+@pytest.mark.slow
 def test_evaluate_says_what_makes_the_numbers_wrong(run, data: Path, tmp_path: Path) -> None:
     clips = [
         clip.replace(label="bow") if clip.meta["subject"] == 2 and clip.label == "kick" else clip
@@ -351,6 +361,7 @@ def test_evaluate_says_what_makes_the_numbers_wrong(run, data: Path, tmp_path: P
     assert "accuracy 0.000" in out and "(rejected)" in out
 
 
+@pytest.mark.slow
 def test_evaluate_refuses_bad_input(refuse, data: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     evaluate = ("index", "evaluate")
@@ -412,6 +423,7 @@ def test_virtual_cameras_depend_on_the_seed_and_nothing_else(data: Path) -> None
 
 
 # ---- demo ----------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_demo_reports_recognition_from_other_viewpoints(run) -> None:
     code, out, err = run("demo", "--out", "shown", "--people", "2")
     assert code == 0 and err == ""

@@ -93,6 +93,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", BAD)
 def test_bad_input_leaves_nothing(run, words):
     np.savez("set.npz", joints=np.concatenate([BODY, BODY]), offsets=[0, 40, 80], fps=30.0)

@@ -95,6 +95,7 @@ def test_shape_tensors(run, words, expected):
     assert (code, err) == (0, "") and expected in out
 
 
+@pytest.mark.slow
 def test_lifted_and_moving_shapes(run):
     assert "rank 20 of 30, nullity 10, from 10 matches" in run("lifted-shape")[1]
     assert "rank 119 of 120, nullity 1, from 4 matches\nenough" in run("lifted_shape", "--points", "10", "--synthetic")[1]
@@ -107,6 +108,7 @@ def test_dimension(run):
     assert json.loads(run("--dim-v", "3", "4", "2", "--json")[1]) == {"n": 3, "m": 4, "k": 2, "dim_v": 72}
 
 
+@pytest.mark.slow
 def test_table_of_all(run):
     code, out, _ = run()
     assert code == 0
@@ -164,6 +166,7 @@ def test_bad_input_is_one_line_and_code_2(run, words, message):
     assert err.startswith("dyntorch: ") and err.count("\n") == 1 and message in err
 
 
+@pytest.mark.slow
 def test_nothing_heavy_is_loaded():
     code = (
         "import sys; from indexing.cli import main; main(['count', 'join']); print(*{'torch', 'sklearn'} & set(sys.modules), 'end')"
@@ -182,6 +185,7 @@ def test_how_many_of_a_kind_count_at_most(run):
     assert "rank 72 of 81, nullity 9" in run("dynamic", "--dim", "2", "--poses", "4", "--within", "2")[1]
 
 
+@pytest.mark.slow
 def test_the_page_of_minimal_conditions_is_right():
     from experiments.alignment.minimal_conditions import rows
     from experiments.common.results import RESULTS

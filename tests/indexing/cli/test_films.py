@@ -33,6 +33,7 @@ def films():
     return {(action, who): acted(action, who) for action in ACTIONS for who in (1, 2)}
 
 
+@pytest.mark.slow
 def test_fit_and_scan_files(films, tmp_path, capsys):
     squat, jack = (written(tmp_path / f"{action}.mkv", films[action, 1]) for action in ACTIONS)
     both = written(tmp_path / "both.mkv", np.concatenate([films["jumping_jack", 2], films["squat", 2]]))

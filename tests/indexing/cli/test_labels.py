@@ -93,6 +93,7 @@ def table(path: Path, *rows: str, head: str = "label,start,end") -> Path:
 
 
 # ---- fit -------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["session.boris", "session.eaf", "session.csv"])
 def test_what_is_marked_is_cut_out_and_learned(run, name: str) -> None:
     code, out, err = run(f"index fit @/session.json --labels @/{name} -o m.st")
@@ -113,6 +114,7 @@ def test_labels_that_cannot_be_learned_from_are_said(run, tmp_path: Path) -> Non
     assert ActionIndexer.load("m.st").classes_.tolist() == ["kick", "squat", "wave"]
 
 
+@pytest.mark.slow
 def test_several_recordings_each_with_its_labels(run, data: Path) -> None:
     for labels in ("--labels @/session.csv --labels @/later.csv", "--labels @/both.csv"):
         assert run(f"index fit @/session.json @/later.json {labels} -o m.st")[0] == 0
@@ -122,6 +124,7 @@ def test_several_recordings_each_with_its_labels(run, data: Path) -> None:
     assert ActionIndexer.load("m.st").classes_.tolist() == ["bow", "kick", "squat", "wave"]
 
 
+@pytest.mark.slow
 def test_what_lies_between_labels_is_background_where_that_is_said(run, data: Path, tmp_path: Path) -> None:
     table(tmp_path / "session.csv", *(f"{one.label},{one.start},{one.end}" for one in session(3)[1] if one.label == "kick"))
     code, out, _ = run("index fit @/session.json --labels session.csv --unlabelled-is-background -o m.st")
@@ -133,6 +136,7 @@ def test_what_lies_between_labels_is_background_where_that_is_said(run, data: Pa
     assert {event.label for event in events} <= {"kick"}
 
 
+@pytest.mark.slow
 def test_a_subject_is_the_person_of_that_name(run, tmp_path: Path) -> None:
     people = {"ann": session(3)[0], "ben": session(4)[0]}
     people["ben"] = people["ben"].replace(joints=people["ben"].joints + np.array([700.0, 0.0]))
@@ -158,6 +162,7 @@ def test_suggestions_that_nobody_confirmed_are_not_learned(run, tmp_path: Path) 
     assert ActionIndexer.load("m.st").classes_.tolist() == ["kick", "wave"]
 
 
+@pytest.mark.slow
 def test_fit_refuses_bad_labels(refuse, data: Path, tmp_path: Path) -> None:
     fit = "index fit @/session.json -o m.st"
     table(tmp_path / "far.csv", "kick,100,102", "wave,103,105")
@@ -206,6 +211,7 @@ def test_people_who_are_not_there_are_refused(refuse, tmp_path: Path) -> None:
 
 
 # ---- scan ------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".eaf", *SEVERAL])
 def test_what_is_found_is_written_and_read_again(run, suffix: str) -> None:
     code, out, _ = run(f"index scan @/session.json -m @/m.st --write deep/found{suffix} --report out")
@@ -219,6 +225,7 @@ def test_what_is_found_is_written_and_read_again(run, suffix: str) -> None:
     assert found.machine or suffix in (".csv", ".tsv", ".json")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".eaf", ".boris"])
 def test_what_is_found_stands_beside_what_a_person_marked(run, data: Path, tmp_path: Path, suffix: str) -> None:
     mine = tmp_path / f"session{suffix}"
@@ -231,6 +238,7 @@ def test_what_is_found_stands_beside_what_a_person_marked(run, data: Path, tmp_p
     assert len(open_labels(mine).labels) == len(after.labels)
 
 
+@pytest.mark.slow
 def test_detections_of_several_recordings_in_one_file(run, refuse) -> None:
     for suffix in SEVERAL:
         assert run(f"index scan @/session.json @/later.json -m @/m.st --write found{suffix}")[0] == 0
@@ -239,12 +247,14 @@ def test_detections_of_several_recordings_in_one_file(run, refuse) -> None:
     refuse("index scan @/session.json @/later.json -m @/m.st --write two.eaf", "an ELAN file is of one recording", "two.boris")
 
 
+@pytest.mark.slow
 def test_labels_are_what_is_known(run) -> None:
     code, out, _ = run("index scan @/session.json -m @/m.st --labels @/session.csv --report out")
     assert code == 0 and "of 6 known actions found" in out
     assert json.loads(Path("out/metrics.json").read_text())["known_events"] == 6
 
 
+@pytest.mark.slow
 def test_scan_refuses_before_it_begins(refuse, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ActionIndexer, "explain", None)  # whoever gets so far fails
     (tmp_path / "broken.eaf").write_text("<ANNOTATION_DOCUMENT>")
@@ -260,6 +270,7 @@ def test_scan_refuses_before_it_begins(refuse, data: Path, tmp_path: Path, monke
     refuse(f"{scan} --write file.csv/found.csv", "is a file")
 
 
+@pytest.mark.slow
 def test_corrections_are_not_written_over(refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ActionIndexer, "explain", None)  # said before anything is searched
     found = [Label(1, 3, "kick", score=2.0), Label(4, 6, "wave", score=1.0)]
@@ -283,6 +294,7 @@ def test_corrections_are_not_written_over(refuse, tmp_path: Path, monkeypatch: p
 
 
 # ---- evaluate --------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_model_is_compared_with_what_a_person_marked(run, tmp_path: Path) -> None:
     code, out, err = run("index evaluate @/later.json -m @/m.st --labels @/later.eaf --report out")
     assert code == 0 and err == "" and "Cohen's kappa over time 0." in out and "F1@0.5" in out
@@ -307,6 +319,7 @@ def test_two_files_of_labels_are_compared(run, tmp_path: Path) -> None:
     assert "compared from 0 to 4 s, where the last label of either side ends" in out
 
 
+@pytest.mark.slow
 def test_what_a_program_found_is_compared_with_the_person_in_the_same_file(run, data: Path, tmp_path: Path) -> None:
     (tmp_path / "later.eaf").write_bytes((data / "later.eaf").read_bytes())
     assert run("index scan @/later.json -m @/m.st --write later.eaf")[0] == 0
@@ -325,6 +338,7 @@ def test_people_are_compared_each_with_their_own(run, refuse, tmp_path: Path) ->
     assert code == 0 and "kappa over time 1.000" in out
 
 
+@pytest.mark.slow
 def test_recordings_are_compared_each_with_their_own(run, refuse, tmp_path: Path) -> None:
     assert run("index evaluate @/both.csv --labels @/session.csv")[0] == 2
     code, out, _ = run("index evaluate @/session.csv --labels @/both.csv")
@@ -351,6 +365,7 @@ def test_where_nothing_was_found_everything_was_missed(run, suffix: str, tmp_pat
     assert measured["seconds_compared"] == 8 and measured["agreement"] == 0.75 and measured["kappa"] == pytest.approx(0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".boris", ".eaf", ".csv", ".json"])
 def test_nothing_found_at_all_is_compared(run, refuse, suffix: str, tmp_path: Path) -> None:
     table(tmp_path / "mine.csv", *HAND[1:], head="label,start,end,media")
@@ -382,6 +397,7 @@ def test_an_empty_tier_beside_those_of_a_person_says_that_nothing_was_found(run,
     assert code == 0 and "0.5 2 2 2" in out
 
 
+@pytest.mark.slow
 def test_evaluate_refuses_what_makes_no_sense(refuse, data: Path, tmp_path: Path) -> None:
     table(tmp_path / "points.csv", "kick,1,1")
     labels = "--labels @/session.csv"
@@ -399,6 +415,7 @@ def test_evaluate_refuses_what_makes_no_sense(refuse, data: Path, tmp_path: Path
     refuse("index evaluate out/confusion.csv --labels @/session.csv --report out", "confusion.csv", "is an input")
 
 
+@pytest.mark.slow
 def test_a_name_within_a_name_is_the_recording_only_where_none_is_called_so(run, refuse, data: Path, tmp_path: Path) -> None:
     for name in ("session_2.json", "sessionDLC_resnet.json"):
         (tmp_path / name).write_bytes((data / "later.json").read_bytes())

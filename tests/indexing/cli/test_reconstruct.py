@@ -69,6 +69,7 @@ def read(folder: str | Path = "out") -> dict:
 
 
 # ---- what is found -------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_plane_from_a_table(run, scene):
     code, out, err = run("@/plane.csv --motion constant_velocity_2d --threshold none --out out/")
     assert (code, err) == (0, "") and "report: out/report.html" in out and "open: known up to an affinity" in out
@@ -96,6 +97,7 @@ def test_a_plane_from_a_table(run, scene):
     assert page.count("data:image/png;base64,") == 2 and "each at its own constant velocity" in page
 
 
+@pytest.mark.slow
 def test_a_calibration_makes_it_metric(run, data, tmp_path):
     """Numbers and a file with the same say the same; poses are written; what is no calibration is refused."""
     draw_ = draw(3)
@@ -122,6 +124,7 @@ def test_a_calibration_makes_it_metric(run, data, tmp_path):
         assert code == 2 and says in err.lower()
 
 
+@pytest.mark.slow
 def test_the_same_from_other_files(run, scene):
     results = []
     for i, files in enumerate((
@@ -139,6 +142,7 @@ def test_the_same_from_other_files(run, scene):
     assert abs(float(results[0]) - 0.3) < abs(float(results[2]) - 0.3) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "times", "says"),
     [
@@ -158,6 +162,7 @@ def test_numbers_of_frames_are_times_where_there_are_no_others(run):
     assert code in (0, 3) and "note: times are the numbers of the frames" in out
 
 
+@pytest.mark.slow
 def test_two_bodies(run, tmp_path):
     scene = scenes.lifted("two_bodies_3d", 60, views=4, sigma=0.3, generator=draw(1))
     table(tmp_path / "t.csv", scene.tracks.numpy(), range(4))
@@ -168,6 +173,7 @@ def test_two_bodies(run, tmp_path):
     assert "are on body 1" in Path("out/report.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_model_is_chosen_and_the_others_listed(run, tmp_path):
     scene = scenes.lifted("static_2d", 40, views=3, sigma=0.3, generator=draw(2))
     table(tmp_path / "t.csv", scene.tracks.numpy(), range(3))
@@ -180,6 +186,7 @@ def test_the_model_is_chosen_and_the_others_listed(run, tmp_path):
     assert "Which motion" in Path("out/report.html").read_text()
 
 
+@pytest.mark.slow
 def test_missing_observations_and_tracks_seen_once(run, scene, tmp_path):
     tracks = scene.tracks.numpy().copy()
     tracks[1, 3] = np.nan
@@ -204,6 +211,7 @@ def test_times_of_day_are_counted_from_the_first_view_and_kept_in_full(run, scen
     np.testing.assert_allclose(read()["times"], 0.1 * np.array(TIMES), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_known_static_points_have_no_velocity_at_all(run, scene):
     run("@/plane.csv --motion constant_velocity_2d --threshold none --out out")
     assert not np.load("out/reconstruction.npz")["velocities"][(scene.labels == 1).numpy()].any()

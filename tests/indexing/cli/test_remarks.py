@@ -56,6 +56,7 @@ def openpose(folder, people, numbers=None, scale=1.0):
     return folder
 
 
+@pytest.mark.slow
 def test_examples(run, clips):
     openpose(Path("still"), [clips["wave"].replace(joints=np.repeat(clips["wave"].joints[:1], len(clips["wave"]), axis=0))])
     code, out, _ = run("index fit squat=squat@0.5-99 wave=wave still=still --fps 30 -o m.safetensors")
@@ -98,6 +99,7 @@ def test_seconds_that_are_none(run, capsys, seconds):
     assert RANGES[seconds] in err and err.count("\n") == 1 and not Path("m.safetensors").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["index scan wave@1-2 -m m.safetensors", "sync wave@1-2 squat", "convert wave@1-2 -o a.trc"])
 def test_seconds_of_recordings(run, command):
     run("index fit squat=squat wave=wave --fps 30 -o m.safetensors")
@@ -133,6 +135,7 @@ def test_notes_of_readers(clips):
     assert any("may be smoothed by MediaPipe" in text for text in notices)
 
 
+@pytest.mark.slow
 def test_recordings(run, clips):
     assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     wave = clips["wave"]
@@ -163,6 +166,7 @@ def test_recordings(run, clips):
     assert code == 2 and "clip 'far': times reach 3e+14 s, where numbers are" in err and err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_joints_by_name_and_a_recording_by_its_file(run, clips):
     ClipSet([clip.replace(name=name) for name, clip in clips.items()]).save("all.npz")
     assert run("index fit all.npz -o m.safetensors")[0] == 0
@@ -190,6 +194,7 @@ def people(path, frames):
     path.write_text(json.dumps(rows))
 
 
+@pytest.mark.slow
 def test_everybody_in_view_is_scanned(run, clips):
     assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     left = np.concatenate([clips["wave"].joints, clips["wave"].joints[::-1]])
@@ -216,6 +221,7 @@ def test_everybody_in_view_is_scanned(run, clips):
     assert page.count('class="player"') == 1 and "timeline-2.png" in {path.name for path in Path("out").iterdir()}
 
 
+@pytest.mark.slow
 def test_whose_the_known_events_are(run, clips):
     assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     both = zip(clips["wave"].joints, clips["squat"].joints * 0.5 + 900.0, strict=False)
@@ -235,6 +241,7 @@ def test_whose_the_known_events_are(run, clips):
     assert code == 2 and "odd.csv: column 'person' names person Anna" in err
 
 
+@pytest.mark.slow
 def test_what_is_held_back_is_said_with_its_reason(run):
     assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     code, out, _ = run("index scan wave -m m.safetensors --fps 30 --reject 100 --report out")
@@ -243,6 +250,7 @@ def test_what_is_held_back_is_said_with_its_reason(run):
     assert "Held back" in page and "below the level" in page and json.loads(Path("out/metrics.json").read_text())["withheld"]
 
 
+@pytest.mark.slow
 def test_how_strictly_rest_is_judged(run, monkeypatch):
     assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     original, asked = ActionIndexer.explain, []
@@ -263,6 +271,7 @@ def test_how_strictly_rest_is_judged(run, monkeypatch):
     assert code == 2 and "--rest often: " in err and "off, strict, usual" in err
 
 
+@pytest.mark.slow
 def test_nobody_in_view_is_an_answer(run, tmp_path):
     assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     openpose(Path("empty"), [Clip(np.full((40, 17, 2), np.nan))])

@@ -63,6 +63,7 @@ def table(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_align_a_video(run):
     code, out, err = run("align @/wall.mp4 --frames 0,4,9 --out out")
     assert code == 0 and err == "" and "note: frames 0, 4, 9 of the 10 that were read (0.00 to 0.36 s)" in out
@@ -77,6 +78,7 @@ def test_align_a_video(run):
     assert code in (0, 3) and "frames 0, 4, 9 of the 10" in out and "0.36 s" not in out
 
 
+@pytest.mark.slow
 def test_segment_a_video(run, data):
     code, out, _ = run("segment @/wall.mp4 --at 0,0.3 --out out")
     assert code in (0, 3) and "frames 0, 8 of the" in out
@@ -85,6 +87,7 @@ def test_segment_a_video(run, data):
     assert str(data / "wall.mp4") in json.dumps(found["manifest"])
 
 
+@pytest.mark.slow
 def test_reconstruct_pictures(run):
     line = "reconstruct @/wall/*.png --every 2 --fps 25 --motion constant_velocity_2d"
     code, out, _ = run(f"{line} --out out")

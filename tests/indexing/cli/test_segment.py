@@ -161,6 +161,7 @@ def test_flags_reach_the_library(run, solved):
     assert solved["generator"].initial_seed() == 7 and solved["x1"].dtype == torch.float64
 
 
+@pytest.mark.slow
 def test_on_photographs(run, solved):
     code, out, _ = run("@/m.npz --images @/left.png @/right.jpg --out out --title Desk")
     assert code == 0 and "lie outside" not in out and "<h1>Desk</h1>" in Path("out/report.html").read_text()

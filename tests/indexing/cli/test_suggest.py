@@ -43,6 +43,7 @@ def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     return call
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".eaf", ".boris", ".csv", ".tsv", ".json"])
 def test_parts_are_written_for_the_program_in_which_people_label(run, suffix: str) -> None:
     code, out, err = run(f"@/session.json -m @/m.st --labels @/session.csv --number 2 --write todo{suffix}")
@@ -54,6 +55,7 @@ def test_parts_are_written_for_the_program_in_which_people_label(run, suffix: st
     assert {one.tier or one.observation for one in found} <= {"to label", "to label session.json", ""}
 
 
+@pytest.mark.slow
 def test_what_is_corrected_is_learned_and_the_rest_is_not(run, data: Path, tmp_path: Path) -> None:
     assert run("@/session.json -m @/m.st --labels @/session.csv --number 2 --write todo.csv")[0] == 0
     lines = (tmp_path / "todo.csv").read_text().splitlines()
@@ -69,12 +71,14 @@ def test_nothing_is_left_where_all_is_labelled(run) -> None:
     assert code == 0 and ("part to label" in out or "nothing to label: nobody moves in what is left" in out)
 
 
+@pytest.mark.slow
 def test_suggestions_are_replaced_by_those_of_the_next_round(run, tmp_path: Path) -> None:
     for _ in range(2):
         assert run("@/session.json -m @/m.st --number 3 --write todo.eaf")[0] == 0
     assert len(open_labels(tmp_path / "todo.eaf").labels) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "words"),
     [

@@ -75,6 +75,7 @@ def listed(folder: str) -> list[str]:
 
 
 # ---- what is found -------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_two_folders(run, library, data):
     code, out, err = run("@/pose/cam01_json @/pose/cam02_json --fps 30 --out out/")
     assert (code, err) == (0, "") and "report: out/report.html" in out and len(out.splitlines()) <= 10
@@ -101,6 +102,7 @@ def test_two_folders(run, library, data):
     assert Path("out/curve.png").read_bytes()[:4] == b"\x89PNG" and "cam02" in Path("out/report.html").read_text()
 
 
+@pytest.mark.slow
 def test_one_folder_of_all_and_a_file(run, library):
     code, out, _ = run("@/pose --fps 30,30,30 --out out --title Kitchen")
     assert code == 0 and "cycle error: 10.00 ms" in out and "clock against cam01" in out
@@ -110,6 +112,7 @@ def test_one_folder_of_all_and_a_file(run, library):
     assert code == 0 and (Path("two/pose-sync/cam02_json/cam02_000012.json")).is_file()
 
 
+@pytest.mark.slow
 def test_flags_reach_the_library(run, library, tmp_path):
     section = "[{}]\nmatrix = [[900, 0, 320], [0, 900, 240], [0, 0, 1]]\ndistortions = [-0.1, 0, 0, 0]\n"
     Path("c.toml").write_text(section.format("cam01") + section.format("cam02"))
@@ -124,6 +127,7 @@ def test_rates_that_nobody_said_are_mentioned(run, library):
     assert "note: 30 frames per second assumed for cam01, cam02; --fps says otherwise" in out
 
 
+@pytest.mark.slow
 def test_a_pair_that_contradicts_the_others_is_named(run, library):
     library[0, 2] = {"offset": 1.5, "peaks": torch.tensor([[1.5, 9.0]], dtype=torch.float64), "confidence": 0.6}
     code, out, _ = run("@/pose --fps 30 --out out")
@@ -132,6 +136,7 @@ def test_a_pair_that_contradicts_the_others_is_named(run, library):
     assert code in (0, 3) and (code == 0) == found["ok"] == Path("out/pose-sync").exists()
 
 
+@pytest.mark.slow
 def test_check_videos(run, library):
     pytest.importorskip("av")
     code, out, _ = run("@/pose/cam01_json @/pose/cam02_json --fps 30 --check --out out")
@@ -144,6 +149,7 @@ def test_check_videos(run, library):
     assert "note: check.mp4 was not written: " in out and "no moment in common" in out and code == 3
 
 
+@pytest.mark.slow
 def test_frames_before_the_reference_are_mentioned(run, library):
     code, out, _ = run("@/pose/cam02_json @/pose/cam01_json --fps 30 --out out")
     assert code == 0 and "note: 12 frames of cam01 left out of pose-sync: taken before number 0 of cam02" in out
@@ -152,6 +158,7 @@ def test_frames_before_the_reference_are_mentioned(run, library):
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_what_does_not_decide_is_refused_and_writes_no_files(run, library):
     line = "@/pose/cam01_json @/pose/cam02_json --fps 30 --out out"
     assert run(line)[0] == 0 and Path("out/pose-sync").is_dir()
@@ -166,6 +173,7 @@ def test_what_does_not_decide_is_refused_and_writes_no_files(run, library):
     assert "do not decide" in page and "not to be relied on" in page
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_lost(run, library, data, tmp_path):
     line = "@/pose/cam01_json @/pose/cam02_json --fps 30 --out out"
     Path("out/pose-sync").mkdir(parents=True)
@@ -233,6 +241,7 @@ def films(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_sound_alone_and_videos_of_equal_frames(run, films):
     code, out, err = run(f"{films}/left.mp4 {films}/right.mp4 --by sound --videos --out out")
     assert (code, err) == (0, "") and "right began 1.4" in out
@@ -255,6 +264,7 @@ def test_sound_that_does_not_decide(run, films):
     assert "mute has no sound" in run(f"{films}/left.mp4 {films}/mute.mp4 --by sound")[2]
 
 
+@pytest.mark.slow
 def test_sound_is_a_witness(run, films, monkeypatch):
     said: dict = {"offset": -1.39}
     monkeypatch.setattr("indexing.sync.synchronize.synchronize_videos", lambda *_, **__: shift(**said))
@@ -275,6 +285,7 @@ def test_sound_is_a_witness(run, films, monkeypatch):
     assert code == 3 and "too still" in err and "the sound says -1.400 ± 0.017 s; --method sound takes its word" in out
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_heavy():
     code = (
         "import sys; from indexing.cli import main; main(['sync', '--help'])\n"
@@ -285,6 +296,7 @@ def test_help_loads_nothing_heavy():
 
 
 # ---- the library itself --------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_three_cameras_from_files_to_files(run):
     for name, clip in zip(NAMES, filmed(), strict=True):
         write_openpose(Path("pose") / f"{name}_json", [cut(clip, 0, 130)])
@@ -293,6 +305,7 @@ def test_three_cameras_from_files_to_files(run):
     assert Path("out/curve.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_check_videos_of_an_earlier_run_are_removed(run, library):
     pytest.importorskip("av")
     code, _, _ = run("@/pose --fps 30 --check --out out")

@@ -52,6 +52,7 @@ def fit(where, *more: str) -> int:
     return main(["index", "fit", f"nod={where / 'nod.mp4'}", f"hop={where / 'hop.mp4'}", "-o", str(where / "m.safetensors"), *more])
 
 
+@pytest.mark.slow
 def test_learned_and_found_by_the_people_in_videos(films, model, capsys):
     assert fit(films) == 0
     said = capsys.readouterr().out
@@ -69,12 +70,14 @@ def test_learned_and_found_by_the_people_in_videos(films, model, capsys):
     assert (out / "pose" / "session.npz").exists() and "session.mp4" in (out / "events.csv").read_text()
 
 
+@pytest.mark.slow
 def test_seconds_of_a_video(films, model, capsys):
     words = [f"nod={films / 'session.mp4'}@0-1.3", f"hop={films / 'session.mp4'}@1.4-", "-o", str(films / "m.safetensors")]
     assert main(["index", "fit", *words]) == 0
     assert "people in 1 video" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_pixels_where_they_are_asked_for_or_no_model_is_there(films, seeing, monkeypatch, capsys):
     monkeypatch.setattr("indexing.pose.available", lambda models=None: None)
     assert fit(films) == 0
@@ -87,6 +90,7 @@ def test_pixels_where_they_are_asked_for_or_no_model_is_there(films, seeing, mon
     assert "learned from pixels" in said and "no pose model" not in said and not (films / "pose").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -103,6 +107,7 @@ def test_what_is_asked_for_and_cannot_be(films, capsys, monkeypatch, words, said
     assert not (films / "m.safetensors").exists() and not (films / "pose").exists()
 
 
+@pytest.mark.slow
 def test_a_model_and_a_recording_of_two_kinds(films, model, monkeypatch, capsys):
     session, keypoints, pixels = films / "session.mp4", films / "m.safetensors", films / "p.safetensors"
     assert fit(films) == 0
@@ -118,6 +123,7 @@ def test_a_model_and_a_recording_of_two_kinds(films, model, monkeypatch, capsys)
     assert main(["index", "scan", str(session), str(films / "pose" / "nod.npz"), "-m", str(keypoints)]) == 0
 
 
+@pytest.mark.slow
 def test_numbers_that_make_no_sense(films, model, capsys):
     for words, said in (
         (["--people", "0"], "--people 0: expected 1 or more"),
@@ -127,6 +133,7 @@ def test_numbers_that_make_no_sense(films, model, capsys):
         assert said in capsys.readouterr().err and not (films / "pose").exists()
 
 
+@pytest.mark.slow
 def test_videos_of_one_name_are_kept_apart(films, model):
     for name in ("one", "two"):
         (films / name).mkdir()
@@ -136,6 +143,7 @@ def test_videos_of_one_name_are_kept_apart(films, model):
     assert (films / "pose" / "one" / "cam.npz").exists() and (films / "pose" / "two" / "cam.npz").exists()
 
 
+@pytest.mark.slow
 def test_nobody_in_a_recording_is_an_answer(films, model, capsys):
     assert fit(films) == 0
     empty = film(films, [[]] * 20, "empty.mp4", fps=30)
@@ -146,6 +154,7 @@ def test_nobody_in_a_recording_is_an_answer(films, model, capsys):
     assert "empty.mp4: no person was found" in capsys.readouterr().err and not (films / "n.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_the_reader_of_videos(films, model):
     two = film(films, [[nod(i, 80), person(250, 170, 40)] for i in range(20)], "two.mp4", fps=30)
     assert len(read(two, person="everyone")) == 2 and len(read(two, person="everyone", watching=WatchOptions(people=1))) == 1
@@ -159,6 +168,7 @@ def test_the_reader_of_videos(films, model):
         read(two, watching=3)
 
 
+@pytest.mark.slow
 def test_who_is_meant_of_the_people_in_a_set(films, model):
     two = film(films, [[nod(i, 80), person(250, 170, 40)] for i in range(20)], "two.mp4", fps=30)
     everyone = read(two, person="everyone")
@@ -171,6 +181,7 @@ def test_who_is_meant_of_the_people_in_a_set(films, model):
     assert len(read(films / "set.npz")) == 2
 
 
+@pytest.mark.slow
 def test_cameras_are_compared_by_the_people_in_them(films, model, capsys):
     code = main(["sync", str(films / "nod.mp4"), str(films / "session.mp4"), "--out", str(films / "sync")])
     said = capsys.readouterr()
@@ -180,6 +191,7 @@ def test_cameras_are_compared_by_the_people_in_them(films, model, capsys):
     assert "--by keypoints: --method tracks compares the pixels" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_takes_of_videos(films, model):
     path = films / "session.mp4"
     take = take_of(path)
@@ -192,6 +204,7 @@ def test_takes_of_videos(films, model):
         take_of(empty, by="keypoints")
 
 
+@pytest.mark.slow
 def test_what_pixels_say_where_keypoints_do_not_decide(films, model, monkeypatch):
     verb = importlib.import_module("indexing.sync.synchronize")
     a, b = (take_of(films / name) for name in ("nod.mp4", "session.mp4"))
@@ -207,6 +220,7 @@ def test_what_pixels_say_where_keypoints_do_not_decide(films, model, monkeypatch
     assert not verb.pair(a, b, "keypoints").shift.ok
 
 
+@pytest.mark.slow
 def test_an_archive_takes_videos_and_keeps_their_keypoints(films, model, capsys):
     folder, archive = films / "recordings", films / "lab"
     folder.mkdir()
@@ -225,6 +239,7 @@ def test_an_archive_takes_videos_and_keeps_their_keypoints(films, model, capsys)
     assert "an archive holds keypoints" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_archive_without_a_model_leaves_videos_out(films, seeing, monkeypatch, capsys):
     for place in ("indexing.pose.available", "indexing.archive.sources.available"):
         monkeypatch.setattr(place, lambda models=None: None)
@@ -233,6 +248,7 @@ def test_an_archive_without_a_model_leaves_videos_out(films, seeing, monkeypatch
     assert "nod.mp4: is a video, and there is no pose model" in error and "dyntorch pose --get-models" in error
 
 
+@pytest.mark.slow
 def test_an_archive_takes_a_video_anew_that_has_changed(films, model):
     archive = Archive(films / "lab")
     archive.add(films / "nod.mp4")

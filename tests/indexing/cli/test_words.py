@@ -51,6 +51,7 @@ def openpose(folder: Path, frames: int = 3) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["@abc", "@1,5-3,5", "@1:05-1:10", "@-1-4", "@-"])
 def test_a_range_that_is_none_says_what_one_is(
     wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

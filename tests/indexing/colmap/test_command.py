@@ -25,6 +25,7 @@ def quick(found, monkeypatch):
     monkeypatch.setattr(indexing.colmap, "find_static", lambda database, *_, **__: replace(found, database=database))
 
 
+@pytest.mark.slow
 def test_everything_is_written(given, quick, tmp_path, capsys):
     before = sha256(given)
     (tmp_path / "images").mkdir()
@@ -86,6 +87,7 @@ def test_bad_input_is_one_line(given, tmp_path):
     assert set(tmp_path.iterdir()) == before
 
 
+@pytest.mark.slow
 def test_relative_names_and_home(given, quick, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -93,6 +95,7 @@ def test_relative_names_and_home(given, quick, tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a-report", "a.db", "black"]
 
 
+@pytest.mark.slow
 def test_the_command(given, quick, tmp_path, capsys):
     out = tmp_path / "static.db"
     assert main(["segment", "--colmap", str(given), "--out", str(out)]) == 0

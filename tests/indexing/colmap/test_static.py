@@ -63,6 +63,7 @@ def test_colmap_alone_is_wrong_and_right_afterwards(scene, given, static):
     assert mapped(given, scene).error > 1
 
 
+@pytest.mark.slow
 def test_several_bodies(tmp_path):
     scene = photographs(images=4, bodies=2, matches=130, seed=1)
     found = find_static(read_database(write_scene(tmp_path / "a.db", scene, verify=False)))
@@ -70,6 +71,7 @@ def test_several_bodies(tmp_path):
     assert precision > 0.97 and recall > 0.85
 
 
+@pytest.mark.slow
 def test_a_scene_in_which_nothing_moves_stays_whole(tmp_path):
     scene = photographs(images=3, bodies=0, matches=120, seed=3)
     found = find_static(read_database(write_scene(tmp_path / "a.db", scene, verify=False)))
@@ -165,6 +167,7 @@ def test_the_error_of_a_path_is_that_after_a_similarity():
     assert worst(path * np.array([1.0, 1, -1]), path) > 0.01  # no similarity mirrors
 
 
+@pytest.mark.slow
 def test_whoever_divides_the_pairs_gives_the_same(tmp_path):
     """What a pair gives hangs on nothing but the pair."""
     database = read_database(write_scene(tmp_path / "a.db", photographs(images=3, matches=80, seed=2), verify=False))

@@ -143,6 +143,7 @@ def test_files_that_were_damaged(name: str, tmp_path: Path) -> None:
 NOTHING: list[Any] = [None, True, 0, -1, 1.5, float("nan"), float("inf"), 10**400, "", "x", [], {}, [[]], [None], {"a": 1}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["boris", "activitynet, both parts", "label_studio", "via"])
 def test_every_value_of_a_json_file_may_be_something_else(name: str, tmp_path: Path) -> None:
     path = SEEDS[name](tmp_path)

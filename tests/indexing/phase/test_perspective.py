@@ -47,6 +47,7 @@ def walker(distance, azimuth, seed):
     return image, phase % 1.0
 
 
+@pytest.mark.slow
 def test_phases_near_by_are_nearer_and_from_afar_no_further_off():
     train = [walker(4.5, azimuth, seed) for seed, azimuth in enumerate((0, 70, 140, 220, 300))]
     errors = {}
@@ -64,6 +65,7 @@ def test_phases_near_by_are_nearer_and_from_afar_no_further_off():
     assert errors["projective", 10.0] < 1.1 * errors["affine", 10.0]
 
 
+@pytest.mark.slow
 def test_the_camera_is_a_parameter_that_files_keep(tmp_path):
     clips = dataset(2, ["walk", "squat"], azimuth=0, rng=0)
     indexer = PhaseIndexer(1, camera="projective").fit(clips, clips.labels)

@@ -194,6 +194,7 @@ def test_five_joints_tell_no_phase(train):
         PhaseIndexer().fit(few)
 
 
+@pytest.mark.slow
 def test_options_are_kept_where_they_are_not_the_defaults(tmp_path):
     clips = dataset(2, ["walk", "squat"], azimuth=0.0, rng=0)
     plain, usual, other = (tmp_path / f"{name}.safetensors" for name in ("plain", "usual", "other"))

@@ -84,6 +84,7 @@ def test_every_other_frame_is_every_other_frame_of_the_file(tmp_path, seeing, ev
     assert error_of(clip, truth[::every]) < 2.0 and clip.meta["every"] == every
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 3])
 def test_the_result_does_not_depend_on_who_works(tmp_path, seeing, workers):
     path = film(tmp_path, [[walk(i, speed=2.0), person(280, 200, 45)] for i in range(60)], gop=7)
@@ -130,6 +131,7 @@ def test_work_side_by_side_gives_the_threads_of_opencv_back(monkeypatch):
     assert counting.threads == 8
 
 
+@pytest.mark.slow
 def test_pieces_of_a_video_say_what_the_whole_says(tmp_path, seeing):
     truth = [walk(i) for i in range(60)]
     path = film(tmp_path, [[one] for one in truth])
@@ -138,6 +140,7 @@ def test_pieces_of_a_video_say_what_the_whole_says(tmp_path, seeing):
     np.testing.assert_allclose(whole.joints, cut.joints, atol=1.5)
 
 
+@pytest.mark.slow
 def test_several_people_are_the_largest_first_and_each_once(tmp_path, seeing):
     scenes = [[person(50 + i, 180, 40), person(160, 160, 80 + 0.1 * i), person(280 - i, 190, 50)] for i in range(30)]
     clips = detect(film(tmp_path, scenes), people=5)
@@ -155,6 +158,7 @@ def test_one_of_several_is_the_largest_and_the_others_are_said(tmp_path, seeing)
     assert clip.meta["people"] == 2
 
 
+@pytest.mark.slow
 def test_a_larger_person_who_comes_later_takes_over(tmp_path, seeing):
     scenes = [[person(60, 180, 40)] + ([person(320 - 3 * i, 170, 90)] if i >= 20 else []) for i in range(80)]
     (clip,) = detect(film(tmp_path, scenes))
@@ -162,6 +166,7 @@ def test_a_larger_person_who_comes_later_takes_over(tmp_path, seeing):
     assert error_of(clip.between(40 / 30, 9), [scene[1] for scene in scenes[40:]]) < 3
 
 
+@pytest.mark.slow
 def test_people_who_pass_each_other_keep_their_names(tmp_path, seeing):
     scenes = [[person(30 + 5 * i, 80, 40), person(290 - 5 * i, 210, 50)] for i in range(50)]
     clips = detect(film(tmp_path, scenes), people=2)
@@ -170,6 +175,7 @@ def test_people_who_pass_each_other_keep_their_names(tmp_path, seeing):
     assert error_of(clips[1], [scene[0] for scene in scenes]) < 2.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gone", "back", "names"), [(10, 140, 1), (80, 140, 2), (10, 280, 2)])
 def test_who_is_lost_is_the_same_where_it_returns_soon_and_nearby(tmp_path, seeing, gone, back, names):
     still = person(40, 200, 40)
@@ -183,6 +189,7 @@ def test_who_is_lost_is_the_same_where_it_returns_soon_and_nearby(tmp_path, seei
         assert np.isnan(other.joints[21:29]).all() and (other.confidence[21:29] == 0).all() and len(other) == 50
 
 
+@pytest.mark.slow
 def test_two_tracks_never_sit_on_one_person(tmp_path, seeing):
     """Two people become one: the front one hides the other."""
     scenes = [[person(100 + 2 * i, 150, 60), *([person(200, 150, 60)] if i < 20 else [])] for i in range(60)]
@@ -215,12 +222,14 @@ def test_nobody_in_a_video_is_one_line(tmp_path, seeing):
     assert "\n" not in str(caught.value) and isinstance(caught.value, ValueError) and len(caught.value.times) == 12
 
 
+@pytest.mark.slow
 def test_frames_without_the_person_are_empty(tmp_path, seeing):
     scenes = [[walk(i)] if i < 10 or i >= 30 else [] for i in range(45)]
     (clip,) = detect(film(tmp_path, scenes))
     assert len(clip) == 45 and clip.seen[:10].all() and not clip.seen[10:30].any() and clip.seen[30:].all()
 
 
+@pytest.mark.slow
 def test_a_file_that_ends_early_gives_what_is_there(tmp_path, seeing):
     pytest.importorskip("av")
     path = film(tmp_path, [[walk(i)] for i in range(90)], name="a.mkv")

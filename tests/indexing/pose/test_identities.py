@@ -106,6 +106,7 @@ def test_who_may_return_is_found_as_among_everybody(seed):
     assert [rows.tolist() for rows in identities(seen, options)] == every_pair(seen, options)
 
 
+@pytest.mark.slow
 def test_thousands_of_tracks_are_not_compared_with_each_other(monkeypatch):
     """Looks at two tracks and looks at two moments are counted."""
     number, looks = 20_000, count(1)

@@ -176,6 +176,7 @@ def test_files_of_others_are_left_alone(tmp_path, seeing):
         keypoint_file(path, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("marked", ["", "{", "[]", "3", '{"made_from": "x"}'])
 def test_a_folder_of_others_is_never_replaced(tmp_path, seeing, marked):
     path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
@@ -199,6 +200,7 @@ def test_a_folder_of_others_is_never_replaced(tmp_path, seeing, marked):
     assert keypoint_file(path, folder, every=2).folder is None and theirs.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_folder_that_somebody_makes_meanwhile_is_not_replaced(tmp_path, seeing):
     path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
 
@@ -230,6 +232,7 @@ def test_a_folder_of_json_that_cannot_be_made_is_one_line(tmp_path, seeing):
         write_json_folder(clips, np.arange(5), clips[0].times, tmp_path / "none" / "a_json")
 
 
+@pytest.mark.slow
 def test_an_interrupted_video_goes_on_where_it_was_and_comes_out_the_same(tmp_path, seeing):
     path = film(tmp_path, [[walk(i), person(280, 200, 45)] for i in range(50)])
     expected, folder = detect(path, people=2, options=SHORT), tmp_path / "pose"
@@ -253,6 +256,7 @@ def test_what_was_killed_before_the_clip_set_was_written_goes_on(tmp_path, seein
     assert sorted(entry.name for entry in (tmp_path / "pose").iterdir()) == ["a.npz", "a_json"]
 
 
+@pytest.mark.slow
 def test_kept_pieces_of_other_arguments_or_cut_off_ones_are_not_used(tmp_path, seeing):
     path = film(tmp_path, [[walk(i)] for i in range(50)])
     for every in (2, 1):
@@ -264,6 +268,7 @@ def test_kept_pieces_of_other_arguments_or_cut_off_ones_are_not_used(tmp_path, s
     assert same(made.clips, detect(path, options=SHORT))
 
 
+@pytest.mark.slow
 def test_a_piece_that_cannot_be_kept_ends_the_video_and_the_next_run_completes_it(tmp_path, seeing, monkeypatch):
     path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
     expected, put, failed = detect(path, options=SHORT), Store.put, []
@@ -282,6 +287,7 @@ def test_a_piece_that_cannot_be_kept_ends_the_video_and_the_next_run_completes_i
     assert not made.reused and same(made.clips, expected) and not made.found.notes
 
 
+@pytest.mark.slow
 def test_networks_that_fail_make_nothing_final(tmp_path, seeing, monkeypatch):
     path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
     interrupted(path, folder)
@@ -293,6 +299,7 @@ def test_networks_that_fail_make_nothing_final(tmp_path, seeing, monkeypatch):
     assert same(keypoint_file(path, folder, options=SHORT).clips, detect(path, options=SHORT))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("becomes", [None, b"another"])
 def test_a_video_that_is_gone_or_changed_meanwhile_makes_nothing_final(tmp_path, seeing, becomes):
     path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
@@ -327,6 +334,7 @@ def test_pieces_that_cannot_be_decoded_are_left_out_and_said(tmp_path, seeing, m
     assert keypoint_file(path, tmp_path / "pose", options=SHORT).reused
 
 
+@pytest.mark.slow
 def test_a_video_that_cannot_be_read_now_keeps_its_pieces(tmp_path, seeing):
     path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
     interrupted(path, folder)
@@ -338,6 +346,7 @@ def test_a_video_that_cannot_be_read_now_keeps_its_pieces(tmp_path, seeing):
     assert same(keypoint_file(path, folder, options=SHORT).clips, detect(path, options=SHORT))
 
 
+@pytest.mark.slow
 def test_a_clip_set_that_cannot_be_written_ends_only_its_video(tmp_path, seeing, monkeypatch):
     paths = [film(tmp_path, [[walk(i)] for i in range(50)], name) for name in ("a.mp4", "b.mp4")]
     save, folder = ClipSet.save, tmp_path / "pose"

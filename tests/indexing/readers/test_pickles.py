@@ -303,6 +303,7 @@ PROGRAMS: dict[str, tuple[bytes, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_programs_that_do_harm_are_refused(program: str, tmp_path: Path) -> None:
     data, word = PROGRAMS[program]

@@ -54,6 +54,7 @@ def plain(events):
     return [(event.label, event.start, event.end, event.score, event.margin, event.exemplar) for event in events]
 
 
+@pytest.mark.slow
 def test_a_stream_finds_what_is_found_in_the_whole(indexer, seen):
     clip, truth = seen
     times, scores, events, rest, _ = pushed(indexer.stream(up=clip.up), clip, 10)
@@ -66,6 +67,7 @@ def test_a_stream_finds_what_is_found_in_the_whole(indexer, seen):
     assert (scores.argmax(axis=1) == whole.scores.argmax(axis=1))[acting].mean() > 0.9
 
 
+@pytest.mark.slow
 def test_what_comes_at_once_changes_nothing(indexer, seen):
     clip, _ = seen
     answers = [pushed(indexer.stream(up=clip.up), clip, chunk) for chunk in (1, 7, 100, len(clip))]
@@ -74,6 +76,7 @@ def test_what_comes_at_once_changes_nothing(indexer, seen):
         assert plain(events + rest) == plain(answers[0][2] + answers[0][3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag", [None, 8.0])
 def test_an_event_is_told_when_the_lag_is_over(lag, indexer, seen):
     clip, _ = seen
@@ -84,6 +87,7 @@ def test_an_event_is_told_when_the_lag_is_over(lag, indexer, seen):
     assert all(event.end > clip.times[-1] - live.lag - 0.04 for event in rest)
 
 
+@pytest.mark.slow
 def test_what_is_said_of_the_latest_frames_changes_nothing(indexer, seen):
     clip, _ = seen
     live, other = indexer.stream(up=clip.up), indexer.stream(up=clip.up)
@@ -99,6 +103,7 @@ def test_what_is_said_of_the_latest_frames_changes_nothing(indexer, seen):
     assert plain(events) == plain(same + rest) and {event.label for event in events} <= set(early)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow(indexer, seen):
     clip, truth = seen
     live, kept, found = indexer.stream(up=clip.up), [], []
@@ -113,6 +118,7 @@ def test_memory_does_not_grow(indexer, seen):
     assert all(len(array) <= max(kept) for array in arrays)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pause", [2.0, 86400.0, 30 * 365.25 * 86400.0], ids=["seconds", "a day", "thirty years"])
 def test_nothing_reaches_across_a_pause(pause, indexer, seen):
     clip, truth = seen
@@ -126,6 +132,7 @@ def test_nothing_reaches_across_a_pause(pause, indexer, seen):
     assert any(event.end <= before for event in found) and any(event.start >= after for event in found)
 
 
+@pytest.mark.slow
 def test_a_clock_that_began_long_ago_changes_nothing(indexer, seen):
     clip, _ = seen
     later = clip.replace(times=clip.times + 1.7e9)
@@ -135,6 +142,7 @@ def test_a_clock_that_began_long_ago_changes_nothing(indexer, seen):
     assert [event.start - 1.7e9 for event in events + rest] == pytest.approx([event.start for event in mine + left], abs=0.02)
 
 
+@pytest.mark.slow
 def test_nobody_is_no_action_and_missing_joints_are_filled(indexer, seen):
     clip, truth = seen
     joints = np.array(clip.joints)
@@ -162,6 +170,7 @@ def test_few_frames_are_nothing_or_an_honest_answer(count, indexer, seen):
     assert len(again.times) == 0 and live.latest().times == pytest.approx(np.arange(3) / 30)
 
 
+@pytest.mark.slow
 def test_joints_are_taken_by_their_names_and_depth_is_looked_along(indexer, seen):
     clip, _ = seen
     turned = replace(clip.skeleton, joints=clip.skeleton.joints[::-1], bones=())
@@ -172,6 +181,7 @@ def test_joints_are_taken_by_their_names_and_depth_is_looked_along(indexer, seen
     assert plain(found) == plain(events + rest)
 
 
+@pytest.mark.slow
 def test_what_a_level_refuses_is_not_told(indexer, seen):
     clip, _ = seen
     strict = ActionIndexer(scorer="nearest", reject=1e6).fit(dataset([Person.random(0)], KNOWN, azimuth=0.0, rng=0))

@@ -37,6 +37,7 @@ def names(found, truth):
     return out
 
 
+@pytest.mark.slow
 def test_what_is_not_known_comes_first_and_not_twice(learned, recording) -> None:
     clip, truth = recording
     found = suggest(learned, [clip], 3)
@@ -54,6 +55,7 @@ def test_what_is_labelled_is_not_suggested_again(learned, recording) -> None:
     assert suggest(learned, [clip], 9, [[(-1.0, 1e6)]]) == []
 
 
+@pytest.mark.slow
 def test_nobody_who_stands_still_or_is_not_seen_is_suggested(learned, recording) -> None:
     clip, _ = recording
     still = clip.replace(joints=np.repeat(clip.joints[:1], len(clip), axis=0))
@@ -64,6 +66,7 @@ def test_nobody_who_stands_still_or_is_not_seen_is_suggested(learned, recording)
         assert max(0.0, min(one.end, 12) - max(one.start, 4)) <= 0.6 * (one.end - one.start)
 
 
+@pytest.mark.slow
 def test_several_recordings_and_their_clocks(learned, recording) -> None:
     clip, truth = recording
     quiet = clip.replace(joints=np.repeat(clip.joints[:1], len(clip), axis=0))

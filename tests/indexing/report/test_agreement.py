@@ -39,6 +39,7 @@ def test_everything_is_written_and_says_the_same(tmp_path: Path) -> None:
     assert f"{both.kappa:.3f}" in text and "a note" in text
 
 
+@pytest.mark.slow
 def test_what_an_earlier_report_left_is_removed(tmp_path: Path) -> None:
     write_agreement(tmp_path, report())
     (tmp_path / "mine.txt").touch()

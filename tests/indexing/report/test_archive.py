@@ -106,6 +106,7 @@ def test_every_hit_is_drawn_and_plays_beside_the_query(lab, tmp_path):
     assert set(listed) == names
 
 
+@pytest.mark.slow
 def test_many_hits_are_listed_and_the_rest_is_in_the_file(lab, tmp_path):
     hits = [Hit("week/monday.npz", "", 1.0, 2.0, -float(i)) for i in range(1200)]
     path = write_search(tmp_path, searched(lab, hits))
@@ -162,6 +163,7 @@ def test_few_recordings_are_played(lab, tmp_path):
     assert measured["recordings_with_events"] == 3 and measured["recordings_by_class"]["kick"] == 3
 
 
+@pytest.mark.slow
 def test_thousands_of_recordings_are_a_light_page(lab, tmp_path):
     archive, truth, examples = lab
 

@@ -60,6 +60,7 @@ def photographs(wide: int = 100, tall: int = 80) -> dict[int, Photograph]:
     return {view: Photograph(SCRIPT, gray, (float(wide), float(tall))) for view in (1, 3, 5)}
 
 
+@pytest.mark.slow
 def test_what_comes_from_files_is_escaped(tmp_path):
     page = write_bodies(tmp_path, report(photographs=photographs())).read_text()
     assert SCRIPT not in page and "&lt;script&gt;" in page
@@ -76,6 +77,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_every_kind_of_data_can_be_drawn(tmp_path):
     for i, made in enumerate((
         report(1, 12),
@@ -151,6 +153,7 @@ def test_tracks_keep_their_names_and_times():
     assert named.startswith("time,id,x,y,label\n0,") and "\n0.2," in named
 
 
+@pytest.mark.slow
 def test_wide_pictures_are_stacked():
     wide, square = (Image.open(BytesIO(picture_of(report(photographs=photographs(*size))))) for size in ((300, 60), (100, 80)))
     assert wide.height > 0.5 * wide.width and square.width > square.height

@@ -53,6 +53,7 @@ def test_everything_is_written_and_said(tmp_path):
     assert {notice["code"] for notice in said["notices"]} == {"note"} and said["manifest"]["arguments"]["command"] == "calibrate"
 
 
+@pytest.mark.slow
 def test_a_refusal_leaves_nothing_that_could_be_taken_for_good(tmp_path):
     write_calibration(tmp_path, CalibrationReport(rig()))
     assert listed(tmp_path) == GOOD
@@ -78,6 +79,7 @@ def test_nothing_found_is_a_page_too(tmp_path):
     assert [row[1:] for row in residual_rows(report)] == [["n/a", "none", "none"]] * 3
 
 
+@pytest.mark.slow
 def test_what_is_somebody_elses_stays(tmp_path):
     for name in (*outputs(1), "pose-associated"):
         folder = tmp_path / name.replace(".", "_")
@@ -101,6 +103,7 @@ def test_what_is_somebody_elses_stays(tmp_path):
         check_folder_of(tmp_path / "good", [tmp_path / "good"])
 
 
+@pytest.mark.slow
 def test_what_cannot_be_known_is_said(tmp_path):
     open_ = [Notice(CalibrationNotice.UNKNOWN_SCALE), Notice(CalibrationNotice.CAMERA_UP, 12.0)]
     found = rig(metric=False, upright=False, notices=tuple(open_))

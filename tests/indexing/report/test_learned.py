@@ -19,6 +19,7 @@ def folder(tmp_path_factory):
     return where
 
 
+@pytest.mark.slow
 def test_the_report_says_what_was_learned(folder):
     assert sorted(path.name for path in (folder / "out").iterdir()) == [
         "body_parts.png",

@@ -96,6 +96,7 @@ def test_a_full_report(tmp_path):
     assert kept["files"] == names and kept["seed"] == 1
 
 
+@pytest.mark.slow
 def test_names_cannot_break_out_of_the_page(tmp_path):
     evil = ['"><img src=x onerror=alert(1)>', SCRIPT, "a\x00b\x1b", "深蹲 приседание नमस्ते", "=1+1", "</style>$title"]
     events = [Hit(name, i, i + 1) for i, name in enumerate(evil)]
@@ -131,6 +132,7 @@ def test_odd_scores_and_videos_without_joints(tmp_path):
     assert rows[0]["score"] == rows[0]["margin"] == "" and float(rows[1]["score"]) == 12345.6
 
 
+@pytest.mark.slow
 def test_many_events_are_counted_not_drawn(tmp_path):
     events = [Hit("squat", i / 20, i / 20 + 0.04) for i in range(1200)]
     report = RecognitionReport(

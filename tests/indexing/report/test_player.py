@@ -145,6 +145,7 @@ def test_without_joints_there_is_no_player(tmp_path):
     assert "<script" not in text and "script-src" not in text and 'class="player"' not in text
 
 
+@pytest.mark.slow
 def test_ten_minutes_stay_below_a_megabyte(tmp_path):
     rng, frames = np.random.default_rng(0), 18_000
     phase = np.arange(frames)[:, None, None] / 30 * rng.uniform(2, 6, (17, 1)) + rng.uniform(0, 6, (17, 2))

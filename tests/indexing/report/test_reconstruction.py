@@ -76,6 +76,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     assert [row[2] for row in rows[1:]] == ["static", "moving", "outlier", "moving", "missing"] and rows[5][3:5] == ["", ""]
 
 
+@pytest.mark.slow
 def test_every_kind_of_data_can_be_drawn(tmp_path):
     nothing = np.full((5, 2), np.nan)
     for i, made in enumerate((
@@ -120,6 +121,7 @@ def test_a_point_without_a_position_is_missing_where_too_few_views_show_it_and_a
     assert ",0,missing,," in points_csv(report())
 
 
+@pytest.mark.slow
 def test_what_a_refused_report_says_and_does_not(tmp_path):
     write_reconstruction(tmp_path, report())
     assert (tmp_path / "scene.png").exists()

@@ -109,6 +109,7 @@ def test_manifest_hashes_files_and_folders(tmp_path):
         manifest({}, [tmp_path / "missing"])
 
 
+@pytest.mark.slow
 def test_importing_reports_is_light_and_pictures_need_no_pyplot():
     code = (
         "import sys, indexing.report as r; r.manifest({}); print({'torch', 'sklearn', 'matplotlib'} & set(sys.modules)); "
@@ -118,6 +119,7 @@ def test_importing_reports_is_light_and_pictures_need_no_pyplot():
     assert done.stdout.split() == ["set()", "False"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 2, 60])
 def test_confusion_draws_any_number_of_classes(number):
     counts = np.eye(number, dtype=int) * 1234
@@ -173,6 +175,7 @@ def test_events_and_truth_change_what_is_drawn(tmp_path):
     assert 0.1 < bar.mean() < 0.4  # two of ten seconds, and the chip beside the name
 
 
+@pytest.mark.slow
 def test_odd_timelines_are_drawn():
     size(pictures.timeline([0.0], np.full((1, 1), np.nan), ["深蹲 🏋"], [Hit("$\\frac{", 0, 0)], []))
     size(pictures.timeline([0.0, 1.0], np.zeros((2, 0)), []))

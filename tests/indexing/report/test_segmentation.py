@@ -60,6 +60,7 @@ def photograph(wide: int = 100, tall: int = 80) -> Photograph:
     return Photograph(SCRIPT, np.random.default_rng(1).random((tall, wide), dtype=np.float32), (float(wide), float(tall)))
 
 
+@pytest.mark.slow
 def test_what_comes_from_files_is_escaped(tmp_path):
     page = write_segmentation(tmp_path, report(photographs=[photograph(), photograph()])).read_text()
     assert SCRIPT not in page and "&lt;script&gt;" in page
@@ -69,6 +70,7 @@ def test_what_comes_from_files_is_escaped(tmp_path):
     assert rows[2][7:] == ["0.9667", "0.5"] and rows[8][3:6] == ["", "", "0"] and rows[8][7:] == ["", ""]
 
 
+@pytest.mark.slow
 def test_every_kind_of_data_can_be_drawn(tmp_path):
     for i, made in enumerate((
         report(1, 12),
@@ -124,6 +126,7 @@ def test_what_is_known_is_compared_and_what_is_refused_is_said_once(tmp_path):
     assert "Compared" not in write_segmentation(tmp_path, report()).read_text()
 
 
+@pytest.mark.slow
 def test_outliers_are_counted_in_words(tmp_path):
     page = write_segmentation(tmp_path, report(count=300)).read_text()
     assert "100 outliers<" in page and "100 outlier<" not in page
@@ -143,6 +146,7 @@ def test_panels_are_never_slim():
     assert image.width > 0.4 * image.height
 
 
+@pytest.mark.slow
 def test_photographs_are_faded_and_wide_ones_stacked():
     from io import BytesIO
 

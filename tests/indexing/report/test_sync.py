@@ -63,6 +63,7 @@ def test_what_two_cameras_say_in_words():
     assert "do not decide" in describe(report(first=shift(ok=False, reason="too still")))
 
 
+@pytest.mark.slow
 def test_more_cameras_have_a_cycle_error_and_an_outlier():
     three = report(3, outliers=[(0, 2)])
     html = page(three, picture_of(three), ["check.mp4"])

@@ -106,6 +106,7 @@ def test_people_who_are_seen_in_some_frames_only(clips):
     assert np.allclose(moved.everyone[1].times, moved.times)
 
 
+@pytest.mark.slow
 def test_what_is_written_is_in_step(library, clips, tmp_path, monkeypatch, capsys):
     pytest.importorskip("av")
     monkeypatch.setattr("indexing.report.sync.picture_of", lambda report: b"\x89PNG".ljust(16, b"\0") + bytes([0, 0, 0, 9]) * 2)
@@ -146,6 +147,7 @@ def doubtful(library, monkeypatch):
     return library
 
 
+@pytest.mark.slow
 def test_a_break_that_nothing_confirms_is_said_and_not_mended(doubtful, clips, tmp_path, monkeypatch, capsys):
     for name in "abc":
         write_openpose(tmp_path / "pose" / f"{name}_json", [clips[0]])

@@ -10,6 +10,7 @@ from tests.battery.pretend_device import counted, moved, pretend_device
 FPS = (30.0, 30.0)
 
 
+@pytest.mark.slow
 def test_known_shift_is_found_and_believed(films):
     a, b = films
     shift = brightness_shift(a[25:], b[:-10], fps=FPS)
@@ -22,6 +23,7 @@ def test_known_shift_is_found_and_believed(films):
     assert other_way.ok and other_way.offset == pytest.approx(-shift.offset, abs=0.02)
 
 
+@pytest.mark.slow
 def test_streams_sizes_rates_and_clocks(films):
     a, b = (video[:110] for video in films)
     times = 100 + np.arange(0, 110, 2) / 30.0
@@ -44,6 +46,7 @@ def test_videos_on_an_accelerator(films):
     assert torch.equal(there.peaks.cpu(), here.peaks)
 
 
+@pytest.mark.slow
 def test_unrelated_and_reversed_videos_are_refused(films, other):
     a, b = films
     for second in (other, b[::-1].copy()):

@@ -81,6 +81,7 @@ def test_joints_of_the_same_names_are_the_same_points_in_any_order():
     assert shift.method == "camera" and any(f"share {len(names)} joints" in note for note in shift.notes)
 
 
+@pytest.mark.slow
 def test_markers_of_other_names_are_different_points():
     recorded = scene()[0]
     other = Skeleton("markers", tuple(f"M{k}" for k in range(recorded.joints.shape[1] - 1)))
@@ -98,6 +99,7 @@ def test_two_motion_captures_are_no_cameras(data):
         synchronize(data / "vicon.c3d", data / "vicon.trc")
 
 
+@pytest.mark.slow
 def test_the_command_writes_motion_capture_on_the_clock_of_the_camera(data, tmp_path, capsys):
     assert main(["sync", str(data / "cam1"), str(data / "vicon.c3d"), "--fps", "30", "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
@@ -119,6 +121,7 @@ def test_the_command_writes_motion_capture_on_the_clock_of_the_camera(data, tmp_
     assert abs(int(frames[0].name.split("_")[1]) - LATE) <= 1  # frame k is at k / 30 s of the motion capture
 
 
+@pytest.mark.slow
 def test_a_table_of_points_in_space_is_motion_capture(data, tmp_path):
     out = tmp_path / "out"
     assert main(["sync", str(data / "cam1"), str(data / "points.csv"), "--fps", "30", "--out", str(out)]) == 0

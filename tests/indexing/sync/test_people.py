@@ -124,6 +124,7 @@ def test_stretches_of_another_person_are_noticed():
     assert disagreements(one, other, shift(0.7)) == []
 
 
+@pytest.mark.slow
 def test_the_right_people_among_several(tmp_path):
     scenes = filmed(seed=1, skipped=(0, 12)), filmed(seed=7, skipped=(0, 12), actions=("punch", "bow"))
     first, second = ([cut(clip, 0, 95) for clip in scene] for scene in scenes)

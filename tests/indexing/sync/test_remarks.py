@@ -16,6 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated
 STRETCHED = "coordinates from 0 to 1, so the shape of the image is not known and people may be stretched; give size="
 
 
+@pytest.mark.slow
 def test_somebody_else_in_view_is_said_where_one_is_followed(cameras, tmp_path):
     small = cut(cameras[0], 0, 25)
     small = small.replace(joints=small.joints / 4 + 900.0)  # too short in view to be tried, and too long to be a ghost

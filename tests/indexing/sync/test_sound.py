@@ -56,6 +56,7 @@ def test_noise_and_levels(scene):
     assert found.ok and found.offset == pytest.approx(LATER, abs=3e-3)
 
 
+@pytest.mark.slow
 def test_a_clock_that_drifts(scene):
     gained = 1 + 1.5e-4
     second = microphone(scene, STARTS[1], 30.0, 1)
@@ -70,6 +71,7 @@ def test_a_clock_that_drifts(scene):
     assert held.rate == 1 and held.rate_sigma == 0
 
 
+@pytest.mark.slow
 def test_a_long_recording_whose_ends_are_many_steps_apart():
     scene, gained = noises(140.0, 4), 1 + 2e-4
     slower = np.interp(np.arange(int(130 * RATE)) / gained, np.arange(len(scene)), scene)
@@ -77,6 +79,7 @@ def test_a_long_recording_whose_ends_are_many_steps_apart():
     assert found.ok and found.rate == pytest.approx(gained, abs=5e-6) and found.offset == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_max_shift_bounds_the_search(scene):
     pair = heard(scene, STARTS[0]), heard(scene, STARTS[1], seed=1)
     assert sound_shift(*pair, max_shift=4.5).offset == pytest.approx(LATER, abs=1e-3)
@@ -87,6 +90,7 @@ def test_max_shift_bounds_the_search(scene):
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_unrelated_sounds_are_refused():
     sounds = [heard(noises(12.0, 10 + seed), 0.0, 10.0, seed) for seed in range(6)]
     found = [sound_shift(a, b) for i, a in enumerate(sounds) for b in sounds[:i]]
@@ -102,6 +106,7 @@ def test_one_clap_fits_any_other_clap():
     assert not sound_shift(*made).ok
 
 
+@pytest.mark.slow
 def test_a_metronome_is_refused_and_says_why():
     click = clicks(40.0)
     found = sound_shift(heard(click, 3.0, noise=1e-3), heard(click, 7.1, seed=1, noise=1e-3))
@@ -145,6 +150,7 @@ def films(tmp_path_factory: pytest.TempPathFactory, scene):
     return folder
 
 
+@pytest.mark.slow
 def test_sound_is_placed_on_the_clock_of_the_pictures(films):
     a, b, late = (hear(films / f"{name}.mp4") for name in ("a", "b", "late"))
     assert a is not None and b is not None and late is not None
@@ -182,6 +188,7 @@ CONTAINERS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "codec", "rate", "off"), CONTAINERS)
 def test_other_containers_and_codecs(films, scene, tmp_path, name, codec, rate, off):
     import av

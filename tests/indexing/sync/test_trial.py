@@ -130,6 +130,7 @@ def pose2sim_sees(trial: Path) -> list[list[int]]:
     return [sorted(int(re.split(r"(\d+)", file.name)[-2]) for file in (trial / "pose-sync" / name).iterdir()) for name in folders]
 
 
+@pytest.mark.slow
 def test_a_session_is_written_in_place_of_pose2sims_own_step(session, library, capsys):
     assert main(["sync", str(session), "--no-breaks"]) == 0
     out = capsys.readouterr().out
@@ -149,6 +150,7 @@ def test_a_session_is_written_in_place_of_pose2sims_own_step(session, library, c
     assert main(["sync", str(session / "Trial_1"), "--no-breaks"]) == 0  # what this command wrote is written again
 
 
+@pytest.mark.slow
 def test_what_pose2sim_wrote_is_not_replaced(session, library, tmp_path, capsys):
     trial = session / "Trial_3"
     (trial / "sync.json").unlink(missing_ok=True)

@@ -61,6 +61,7 @@ def test_a_camera_on_a_tripod_stands_still(scene):
     np.testing.assert_allclose(camera.path, np.broadcast_to(np.eye(3), (45, 3, 3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "kind", "start", "stop", "pixels"),
     [(pan, "pan", 1.0, 2.0, 40), (knock, "knock", 1.0, 1.25, 12)],
@@ -77,6 +78,7 @@ def test_when_and_by_how_much_it_moves(motion_of, path, kind, start, stop, pixel
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "frames", "kind"), [(pan, 75, "pan"), (handheld, 50, "handheld"), (lambda i: turn(0.004 * i), 50, "pan")]
 )
@@ -90,6 +92,7 @@ def test_the_path_is_the_cameras(motion_of, path, frames, kind):
     assert camera.moves and camera.kind == kind
 
 
+@pytest.mark.slow
 def test_a_slow_slide_is_a_drift(scene):
     slow = camera_motion(scene(90, camera=lambda i: shift(0.035 * i, 0))[0])
     assert slow.kind == "drift" and slow.moments[0].pixels == pytest.approx(3.1, abs=0.5)
@@ -117,6 +120,7 @@ def test_tracks_lose_the_cameras_motion(motion_of):
     np.testing.assert_allclose(camera.still(seen[::2], camera.times[::2] + 0.001), camera.still(seen)[::2])
 
 
+@pytest.mark.slow
 def test_a_cut_is_named(scene):
     (first, _), (second, _) = scene(30, chunk=30), scene(30, seed=7, chunk=30)
     camera = camera_motion([*first, Chunk(second[0].frames, second[0].times + 1.0)])
@@ -129,6 +133,7 @@ def test_without_texture_nothing_is_claimed():
     assert not camera.moves and "too little background" in camera.notes[0] and np.isfinite(camera.path).all()
 
 
+@pytest.mark.slow
 def test_pixels_are_those_of_the_video(scene, write):
     chunks, _ = scene(30, camera=lambda i: pan(20 + 1.5 * i), noise=0.0)
     frames = np.concatenate([c.frames for c in chunks]).repeat(3, 1).repeat(3, 2)

@@ -23,6 +23,7 @@ def riders(points, centres, radius=24.0):
     return blob, relative, np.nanmedian(apart, axis=0).min(-1) < radius
 
 
+@pytest.mark.slow
 def test_tracks_ride_on_what_moves(scene):
     chunks, centres = scene(60)
     tracks = track_points(chunks)
@@ -37,6 +38,7 @@ def test_tracks_ride_on_what_moves(scene):
     assert not tracks.camera.moves and tracks.notes == ()
 
 
+@pytest.mark.slow
 def test_a_moving_camera_is_taken_out(scene):
     chunks, centres = scene(60, camera=lambda i: shift(-0.5 * i, 4 * np.sin(i / 5)))
     tracks = track_points(chunks)
@@ -46,6 +48,7 @@ def test_a_moving_camera_is_taken_out(scene):
     assert np.median(np.nanstd(relative, axis=0).max(-1)) < 0.6
 
 
+@pytest.mark.slow
 def test_complete_keep_and_motion_choose(scene):
     chunks, _ = scene(30)
     assert track_points(chunks, keep=5).points.shape[1] == 5
@@ -61,6 +64,7 @@ def test_nothing_moves(scene):
     assert tracks.points.shape == (30, 0, 2) and "nothing moves" in tracks.notes[0]
 
 
+@pytest.mark.slow
 def test_points_that_come_late_are_found(scene):
     chunks, centres = scene(45)
     first = np.repeat(chunks[0].frames[:1], 40, 0)
@@ -72,6 +76,7 @@ def test_points_that_come_late_are_found(scene):
     assert on.mean() > 0.9 and np.median(np.nanstd(relative, axis=0).max(-1)) < 0.4
 
 
+@pytest.mark.slow
 def test_pixels_are_those_of_the_video(scene, write):
     chunks, centres = scene(20)
     frames = np.concatenate([c.frames for c in chunks]).repeat(4, 1).repeat(4, 2)  # 1280 x 960: tracked at 960

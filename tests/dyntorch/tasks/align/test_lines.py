@@ -22,6 +22,7 @@ def draw(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
+@pytest.mark.slow
 def test_exact_from_the_fewest_lines() -> None:
     scene = scenes.translating_lines(35, batch=1, generator=draw())
     found = align_lines(*scene.views, threshold=1e-3, generator=draw(1)).check()
@@ -29,6 +30,7 @@ def test_exact_from_the_fewest_lines() -> None:
     assert found.B is None and bool((found.labels == MOVING).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("threshold", "batch"), [(0.015, 3), (None, 1)])
 def test_noise_and_static_lines(threshold: float | None, batch: int) -> None:
     scene = scenes.translating_lines(90, batch=batch, sigma=0.005, static=0.3, generator=draw(2))
@@ -46,6 +48,7 @@ def test_a_few_outliers() -> None:
     assert float((found.labels == OUTLIER)[scene.labels == OUTLIER].double().mean()) > 0.9
 
 
+@pytest.mark.slow
 def test_static_lines_help_where_samples_of_many_lines_are_never_clean() -> None:
     scene = scenes.translating_lines(120, batch=6, sigma=0.005, static=0.4, outliers=0.2, generator=draw(0))
     scene = replace(scene, views=tuple(v[1:3] for v in scene.views), motion=(scene.motion[0][1:3],), labels=scene.labels[1:3])
@@ -83,6 +86,7 @@ class TestPureTranslation:
         found = align_lines(*scene.views, static_points=points, threshold=1e-3, generator=draw(11)).check()
         assert bool((relative_error(found.A, scene.motion[0]) < 1e-6).all())
 
+    @pytest.mark.slow
     def test_noise_does_not_decide_what_the_lines_leave_open(self) -> None:
         kind = {"motion": "objects", "objects": 1, "static_points": 2}
         for sigma in (0.0, 0.001):
@@ -107,6 +111,7 @@ def test_labelled_static_lines_and_missing_ones() -> None:
     assert int(found.labels[0, 3]) == OUTLIER
 
 
+@pytest.mark.slow
 def test_degenerate_data_have_a_status() -> None:
     same = torch.ones(40, 2, 3, dtype=F64) + torch.tensor([[0.0], [1.0]], dtype=F64)
     found = align_lines(same, same, threshold=0.01, generator=draw(16))

@@ -30,6 +30,7 @@ def visible(scene):
     return (scene.labels > 0) | scene.extras["moving"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("static", "outliers"), [(0.3, 0.2), (0.1, 0.3)])
 @pytest.mark.parametrize("threshold", [1.5, None])
 def test_outliers_are_found_and_the_motion_survives_them(static, outliers, threshold):
@@ -43,6 +44,7 @@ def test_outliers_are_found_and_the_motion_survives_them(static, outliers, thres
     assert (result.sigma - 0.5).abs().max() < 0.2
 
 
+@pytest.mark.slow
 def test_all_moving_and_forty_percent_outliers():
     draw = generator(2)
     scene = scenes.planar(200, batch=2, sigma=0.5, outliers=0.4, generator=draw)
@@ -51,6 +53,7 @@ def test_all_moving_and_forty_percent_outliers():
     assert (result.labels == scene.labels).double().mean() > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "sigma"), [(50, 0.5), (80, 2.0)])
 def test_labels_and_accuracy_are_those_of_known_labels(n, sigma):
     draw = generator(3)
@@ -69,6 +72,7 @@ def test_labels_and_accuracy_are_those_of_known_labels(n, sigma):
     assert error(result, scene.motion).median() < 0.8 * unlabelled.amax(0).median()
 
 
+@pytest.mark.slow
 def test_exact_matches_give_the_exact_motion():
     scene = scenes.planar(60, batch=2, static=0.3, generator=generator(4))
     for threshold in (0.5, None):
@@ -101,6 +105,7 @@ def test_static_scenes_with_noise_are_flagged_and_as_good_as_two_homographies():
     assert error(result, scene.motion).median() < 1.05 * direct.median()
 
 
+@pytest.mark.slow
 def test_a_scene_that_moves_is_not_called_static():
     scene = scenes.planar(100, batch=2, sigma=0.5, generator=generator(7))
     result = align_planar(*scene.views, generator=generator())
@@ -124,6 +129,7 @@ def on_lines(count, n, sigma, seed):
     return noisy, scene.motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "expected"), [(1, True), (3, True), (4, False)])
 def test_few_trajectory_lines_are_counted(count, expected):
     views, motion = on_lines(count, 80, 0.3, 8)
@@ -143,6 +149,7 @@ def test_few_moving_points_are_counted():
     assert AlignNotice.FEW_MOVING.value in repr(result)
 
 
+@pytest.mark.slow
 def test_mismatches_of_static_points_are_reported_as_unverified():
     scene = scenes.planar(100, sigma=0.3, static=0.5, generator=generator(10))
     x3 = scene.views[2].clone()
@@ -168,6 +175,7 @@ def test_labelled_static_matches_are_never_called_moving():
     assert result.labels[0, first] == 0 and (result.labels == 0).sum() <= 3
 
 
+@pytest.mark.slow
 def test_a_batch_is_solved_problem_by_problem_and_one_bad_problem_harms_no_other():
     scene = scenes.planar(60, batch=(2, 2), sigma=0.5, static=0.4, generator=generator(12))
     views = [x.clone() for x in scene.views]
@@ -190,6 +198,7 @@ def test_a_batch_is_solved_problem_by_problem_and_one_bad_problem_harms_no_other
     assert all(isinstance(notice, Notice) and len(notice.problem) == 2 for notice in result.warnings)
 
 
+@pytest.mark.slow
 def test_covariance_is_the_spread_over_repeated_noise():
     exact = scenes.planar(60, static=0.4, generator=generator(13))
     draw = generator(14)
@@ -203,6 +212,7 @@ def test_covariance_is_the_spread_over_repeated_noise():
     assert ratio.min() > 0.6 and ratio.max() < 1.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 0.5])
 def test_points_on_a_line_determine_nothing(sigma):
     draw = generator(15)
@@ -215,6 +225,7 @@ def test_points_on_a_line_determine_nothing(sigma):
     assert result.A.isfinite().all() and result.covariance.isfinite().all()
 
 
+@pytest.mark.slow
 def test_equal_points_and_duplicates_are_degenerate():
     same = torch.full((40, 2), 3.0, dtype=torch.float64)
     assert align_planar(same, same, same, generator=generator()).status == Status.DEGENERATE
@@ -223,6 +234,7 @@ def test_equal_points_and_duplicates_are_degenerate():
     assert align_planar(*twice, generator=generator()).status != Status.OK
 
 
+@pytest.mark.slow
 def test_random_matches_are_refused():
     draw = generator(17)
     views = torch.rand(3, 1, 40, 2, generator=draw, dtype=torch.float64) * 500
@@ -231,6 +243,7 @@ def test_random_matches_are_refused():
         assert (result.status != Status.OK).all()
 
 
+@pytest.mark.slow
 def test_weights_of_zero_and_missing_matches_are_left_out():
     scene = scenes.planar(60, sigma=0.5, static=0.4, generator=generator(18))
     views = [x.clone() for x in scene.views]
@@ -293,6 +306,7 @@ def test_what_is_no_distance_is_refused(threshold):
         align_planar(*views, threshold=threshold)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threshold", [1.5, None])
 def test_equal_steps_without_static_points_are_never_ok(threshold):
     draw = torch.Generator().manual_seed(0)
@@ -300,6 +314,7 @@ def test_equal_steps_without_static_points_are_never_ok(threshold):
     assert result.status == dyn.Status.AMBIGUOUS and result.flagged("other_solution")
 
 
+@pytest.mark.slow
 def test_static_points_choose_among_the_cameras_that_equal_steps_leave():
     draw = torch.Generator().manual_seed(1)
     result = dyn.align_planar(*equal_steps(60, still=0.4, generator=draw), generator=draw)

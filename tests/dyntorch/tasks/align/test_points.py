@@ -149,6 +149,7 @@ class TestRigid:
         assert found.velocities is not None
         assert float(found.velocities.mean(-2).norm(dim=-1).max()) < 1e-6
 
+    @pytest.mark.slow
     def test_covariance_matches_the_scatter_over_noise(self) -> None:
         scene = scenes.moving_points(30, sensors="rigid", generator=draw(12))
         noise = 0.005 * torch.randn(3, 60, 30, 3, generator=draw(13), dtype=F64)
@@ -201,6 +202,7 @@ class TestAffineConstantVelocity:
         last = found.A / found.A[..., 3:, 3:]
         torch.testing.assert_close(last[..., 3, :3], torch.zeros(4, 3, dtype=F64), atol=1e-9, rtol=0)
 
+    @pytest.mark.slow
     def test_outliers_and_background(self) -> None:
         scene = scenes.constant_velocity(40, batch=3, sigma=0.005, static=0.4, outliers=0.2, sensors="affine", generator=draw(2))
         found = align_points(*scene.views, model="affine_constant_velocity", threshold=0.015, generator=draw(3)).check()
@@ -218,6 +220,7 @@ class TestAffineConstantVelocity:
 
 
 class TestProjective:
+    @pytest.mark.slow
     def test_constant_velocity(self) -> None:
         scene = scenes.constant_velocity(60, batch=1, sigma=0.002, static=0.3, generator=draw())
         found = align_points(*scene.views, model="constant_velocity", threshold=0.006, generator=draw(1)).check()
@@ -234,6 +237,7 @@ class TestProjective:
         assert int(found.status) != Status.OK
         assert bool(found.flagged(code))
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("model", ["join", "minimal_join"])
     def test_join(self, model: str) -> None:
         # a bound of six times the noise: the search is over at its first starts
@@ -244,11 +248,13 @@ class TestProjective:
         assert float((found.labels == scene.labels).double().mean()) > 0.95
         assert found.covariance.shape == (1, 32, 32)
 
+    @pytest.mark.slow
     def test_fewer_matches_than_the_tensor_needs_with_labels(self) -> None:
         scene = scenes.moving_points(20, sigma=0.001, static=0.5, generator=draw(6))
         found = align_points(*scene.views, static=scene.labels == STATIC, threshold=0.003, generator=draw(7))
         assert bool((point_error(found.A, scene.motion[0], scene.exact[1]) < 0.05).all())
 
+    @pytest.mark.slow
     def test_one_trajectory_line_is_flagged(self) -> None:
         eye = torch.eye(4, dtype=F64)
         t = torch.linspace(-2, 2, 48, dtype=F64)[:, None] * torch.tensor([1.0, 0.5, 0.2], dtype=F64)
@@ -288,6 +294,7 @@ def test_misuse_of_the_views() -> None:
         align_points(x1, x2[:49], x3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["join", "rigid", "constant_velocity", "affine_constant_velocity"])
 def test_random_matches_are_refused_with_the_noise_unknown(model: Model) -> None:
     views = [100 * torch.randn(60, 3, generator=draw(i), dtype=torch.float64) for i in range(3)]
@@ -306,6 +313,7 @@ def test_empty_batch_and_float32() -> None:
     assert bool(rotation_error(single.A, scene.motion[0]) < 1.5)
 
 
+@pytest.mark.slow
 def test_the_full_tensor_is_only_searched_for_where_the_minimal_one_leaves_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
     searched: list[tuple[str, Tensor]] = []
 
@@ -324,6 +332,7 @@ def test_the_full_tensor_is_only_searched_for_where_the_minimal_one_leaves_doubt
     assert (found.status == Status.OK).all() and ((found.labels != OUTLIER).sum(-1) > 65).all()
 
 
+@pytest.mark.slow
 def test_random_clouds_leave_no_labels_and_no_noise():
     clouds = torch.randn(3, 60, 3, generator=torch.Generator().manual_seed(50), dtype=torch.float64)
     found = align_points(*clouds, generator=torch.Generator().manual_seed(51))

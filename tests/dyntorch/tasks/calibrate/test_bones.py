@@ -29,6 +29,7 @@ def two_bodies(frames=80):
     return points, shapes
 
 
+@pytest.mark.slow
 def test_noise_lengthens_as_it_says():
     g = torch.Generator().manual_seed(1)
     points = torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.2, -0.3], [0.1, 0.9, 0.5]]], dtype=F64)

@@ -29,6 +29,7 @@ def codes(rig):
     return {notice.code for notice in rig.notices}
 
 
+@pytest.mark.slow
 def test_unknown_clocks_and_lenses():
     take = filmed(Motion(), offsets=[0.0, 0.25, -0.31, 0.1], focals=[1500.0, 1300.0, 1700.0, 1400.0], frames=130)
     rig = calibrated(take, max_shift=1.0, rate=1.0)
@@ -38,6 +39,7 @@ def test_unknown_clocks_and_lenses():
     assert all(part.dtype == F64 for part in (rig.K, rig.R, rig.points, rig.covariance))
 
 
+@pytest.mark.slow
 def test_lens_clocks_given_and_projection():
     take = filmed(Motion(seed=1), k1=-0.1, offsets=[0.0, 0.2, -0.1, 0.3])
     forms = ([0.0, 0.2, -0.1, 0.3], torch.tensor([[0.0, 1.0], [0.2, 1.0], [-0.1, 1.0], [0.3, 1.0]], dtype=F64))
@@ -59,6 +61,7 @@ def test_lens_clocks_given_and_projection():
     assert float((seen[0] - truth).norm(dim=-1).nanmedian()) < 2.0
 
 
+@pytest.mark.slow
 def test_given_lenses_with_pixels_that_are_not_square():
     take = filmed(Motion(seed=2), k1=-0.15, cameras=3)
     wide = torch.tensor([1.0, 1.04], dtype=F64)
@@ -72,6 +75,7 @@ def test_given_lenses_with_pixels_that_are_not_square():
     assert torch.allclose(rig.K[1], stretched) and torch.allclose(rig.distortion, dist.expand(3, 5))
 
 
+@pytest.mark.slow
 def test_noise_gaps_weights_float32_and_uneven_times():
     draw = torch.Generator().manual_seed(5)
     times = [torch.arange(110, dtype=F64) / 30 + 0.004 * (torch.rand(110, generator=draw, dtype=F64) - 0.5) for _ in range(4)]
@@ -88,6 +92,7 @@ def test_noise_gaps_weights_float32_and_uneven_times():
     assert 0.05 < float(rig.residuals.nanmedian()) < 1.5 and float(rig.inliers.min()) > 0.9
 
 
+@pytest.mark.slow
 def test_several_people_and_a_length_that_is_known():
     one, two = Motion(4, 4), Motion(4, 5, (0.8, 0.0, 0.3))
     take = filmed(lambda t: torch.cat([one(t), two(t), one(t)[:, :1] + torch.tensor([0.0, 0.5, 0.0])], 1), cameras=3)
@@ -96,6 +101,7 @@ def test_several_people_and_a_length_that_is_known():
     assert rig.metric and float(torch.pdist(rig.centers).max()) == pytest.approx(float(torch.pdist(take.centers).max()), rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_order_of_cameras_and_points_changes_nothing():
     take = filmed(Motion(seed=6), cameras=3, noise=0.3)
     rig = calibrated(take, clocks=[0.0] * 3)
@@ -114,6 +120,7 @@ def refused(rig, *expected):
     return rig
 
 
+@pytest.mark.slow
 def test_two_cameras_need_a_focal_length():
     take = filmed(Motion(seed=1), cameras=2)
     refused(calibrated(take, clocks=[0.0, 0.0]), Told.TWO_FOCALS)
@@ -129,18 +136,21 @@ def test_nobody_moves():
     assert bool(rig.R.isnan().all()) and bool(rig.K.isnan().all()) and len(rig.times) == 0
 
 
+@pytest.mark.slow
 def test_motion_in_a_plane():
     flat, turn = Motion(seed=2, flat=True), exponential(torch.tensor([-0.6, 0.7, 0.0]))  # no camera sees the plane from its edge
     take = filmed(lambda t: flat(t) @ turn.mT, cameras=3, noise=2.0)
     refused(calibrated(take, clocks=[0.0] * 3), Told.PLANE)
 
 
+@pytest.mark.slow
 def test_a_camera_that_shows_something_else():
     take = filmed(Motion(seed=3), cameras=4, noise=0.5)
     take.tracks[2] = filmed(Motion(seed=9), cameras=4, noise=0.5).tracks[2]
     refused(calibrated(take, clocks=[0.0] * 4), Told.DISAGREES, Told.RIVAL, Told.FOCAL, Told.ROTATION)
 
 
+@pytest.mark.slow
 def test_a_camera_that_moved():
     take = filmed(Motion(seed=4), cameras=4, frames=240, noise=0.5)
     turn = exponential(torch.tensor([0.0, 0.08, 0.0]))
@@ -149,6 +159,7 @@ def test_a_camera_that_moved():
     refused(calibrated(take, clocks=[0.0] * 4, focal=1500.0), Told.MOVED, Told.DISAGREES)
 
 
+@pytest.mark.slow
 def test_clocks_that_nothing_decides():
     still = Motion(8)(torch.zeros(1, dtype=F64))
     take = filmed(lambda t: still.expand(len(t), 8, 3), cameras=3, frames=60, noise=1.0)

@@ -52,6 +52,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRONG)
 def test_bad_input_is_one_clear_line(name):
     change, said = WRONG[name]

@@ -42,6 +42,7 @@ def affine_error(points, truth):
     return rms(y - x @ torch.linalg.lstsq(x, y).solution)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("planar", "shapes"), [(False, 3), (False, 5), (True, 3)])
 def test_exact_tracks_are_transferred_exactly(planar, shapes):
     scene = nonrigid_pair(N, M, FRAMES, shapes=shapes, planar=planar, generator=seeded(1))
@@ -57,6 +58,7 @@ def test_exact_tracks_are_transferred_exactly(planar, shapes):
     assert float(((values @ found.fundamental) * other).sum(-1).abs().max()) < 1e-6 * motion
 
 
+@pytest.mark.slow
 def test_directions_are_those_of_the_cameras():
     scene = nonrigid_pair(N, M, FRAMES, generator=seeded(2))
     found = reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps)
@@ -67,6 +69,7 @@ def test_directions_are_those_of_the_cameras():
         assert abs(float(true @ estimated)) > 1 - 1e-12
 
 
+@pytest.mark.slow
 def test_noise_is_amplified_little():
     errors = []
     for seed in range(3):
@@ -77,6 +80,7 @@ def test_noise_is_amplified_little():
     assert sum(errors) / 3 < 1.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["shift", "times", "other rate"])
 def test_clocks(kind):
     scene = nonrigid_pair(N, M, FRAMES, offset=0.4137, generator=seeded(3))
@@ -96,6 +100,7 @@ def test_clocks(kind):
     assert max(transfer_errors(found, scene)) < (0.05 if kind != "other rate" else 2.0)
 
 
+@pytest.mark.slow
 def test_tracks_of_something_else_are_outliers():
     scene = nonrigid_pair(N, M, FRAMES, sigma=0.05, generator=seeded(4))
     walk = normal(FRAMES, 2, 2, seed=5).cumsum(0) * 8
@@ -109,6 +114,7 @@ def test_tracks_of_something_else_are_outliers():
     assert rms(difference) < 1.0
 
 
+@pytest.mark.slow
 def test_tracks_that_both_cameras_see_are_matched():
     scene = nonrigid_pair(N, M, FRAMES, sigma=0.1, generator=seeded(6))
     twice = scene.images[1, :, [7, 2]] + 0.1 * normal(FRAMES, 2, 2)
@@ -117,6 +123,7 @@ def test_tracks_that_both_cameras_see_are_matched():
     assert found.distances.shape == (N, M + 2) and float(found.distances[7, M]) < 3
 
 
+@pytest.mark.slow
 def test_a_point_tracked_twice_is_matched_to_neither():
     scene = nonrigid_pair(N, M, FRAMES, sigma=0.1, generator=seeded(6))
     a = torch.cat([scene.a, scene.a[:, 7:8] + 0.1 * normal(FRAMES, 1, 2)], dim=1)
@@ -124,6 +131,7 @@ def test_a_point_tracked_twice_is_matched_to_neither():
     assert found.matches.tolist() == [-1] * (M + 1)
 
 
+@pytest.mark.slow
 def test_missing_positions():
     scene = nonrigid_pair(N, M, FRAMES, sigma=0.05, generator=seeded(7))
     a, b = scene.a.clone(), scene.b.clone()
@@ -137,6 +145,7 @@ def test_missing_positions():
     assert rms((found.images() - scene.images)[:, :, kept]) < 0.05 * rms(scene.images[0] - scene.images[0].mean(0))
 
 
+@pytest.mark.slow
 def test_free_mean_places_are_noticed():
     scene = nonrigid_pair(N, M, FRAMES, shapes=3, generator=seeded(8))
     moved = scene.b + 60 * normal(1, M, 2)
@@ -149,6 +158,7 @@ def test_free_mean_places_are_noticed():
     assert rms(scale * seen - truth) < 1e-5 * rms(truth)
 
 
+@pytest.mark.slow
 def test_results_follow_the_input():
     scene = nonrigid_pair(N, M, FRAMES, sigma=0.2, generator=seeded(9))
     found = reconstruct_pair(scene.a.float(), scene.b.float(), 0.0, fps=scene.fps)
@@ -282,6 +292,7 @@ def test_failed_results_are_frozen_and_short():
     assert replace(found, status=Status.OK).status == Status.OK
 
 
+@pytest.mark.slow
 def test_unrelated_bodies_are_not_explained_by_each_other():
     # smooth motions of many points explain any smooth motion: all but one in a hundred of it, in stretches that were left out
     def wandering(points, generator):
@@ -309,6 +320,7 @@ def test_coordinates_of_any_size_are_a_status(scale: float, camera: int) -> None
     assert [notice.code for notice in found.warnings] == [PairNotice.FEW_POINTS]
 
 
+@pytest.mark.slow
 def test_options_decide():
     scene, shipped = nonrigid_pair(N, M, FRAMES, sigma=0.3, generator=seeded(3)), PairOptions()
     assert int(reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps).status) == Status.OK

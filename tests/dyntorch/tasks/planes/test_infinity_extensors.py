@@ -119,6 +119,7 @@ def test_batch_is_loop():
                 torch.testing.assert_close(spectrum[i, j], alone[1], atol=1e-9, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_gradients():
     homographies = planes(n=5)[0] + 0.01 * normal(5, 3, 3, seed=5)
     assert torch.autograd.gradcheck(lambda h: infinity_linear(h)[0], (homographies.requires_grad_(),), atol=1e-4, rtol=1e-3)

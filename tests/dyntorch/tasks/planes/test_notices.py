@@ -60,6 +60,7 @@ def test_what_several_solutions_fit_is_refused(options, planes):
         found.check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("planes", "shared"), [(4, 3), (8, 8)])
 @pytest.mark.parametrize("matched", [False, True])
 def test_noise_does_not_hide_a_single_body(planes, shared, matched):
@@ -89,12 +90,14 @@ def test_five_planes_stand_parallel_motion_of_vertical_planes():
     assert codes == {PlanesNotice.COLLINEAR_EPIPOLES, PlanesNotice.COPLANAR_NORMALS}
 
 
+@pytest.mark.slow
 def test_one_residual_to_spare_does_not_vouch_for_three_planes():
     found, _, _ = solved(3, 60, 23, sigma=0.3)
     # with the cost over 1 as the variance 38 are OK, of a median error of 0.13 in normalized coordinates
     assert int((found.status == Status.OK).sum()) < 30
 
 
+@pytest.mark.slow
 def test_few_noisy_planes_are_not_trusted():
     found, _, _ = solved(3, 8, 10, matched=True, sigma=2.0)
     assert int((found.status == Status.AMBIGUOUS).sum()) >= 6
@@ -112,6 +115,7 @@ def unrelated(count, batch, seed, spread=0.3):
     return H, x1, x2
 
 
+@pytest.mark.slow
 def test_matches_tell_homographies_that_have_nothing_in_common():
     _, x1, x2 = unrelated(8, 4, 31)
     found = translating_planes(x1=x1, x2=x2)
@@ -123,6 +127,7 @@ def test_matches_tell_homographies_that_have_nothing_in_common():
         found.check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("planes", "least"), [(5, 0.6), (8, 0.9)])
 def test_homographies_alone_tell_less_often(planes, least):
     drawn = torch.randn(20, planes, 3, 3, generator=torch.Generator().manual_seed(32), dtype=torch.float64)
@@ -133,6 +138,7 @@ def test_homographies_alone_tell_less_often(planes, least):
     assert translating_planes(drawn, refine=False, method="linear").status.eq(Status.NO_CONSENSUS).sum() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("matched", [False, True])
 @pytest.mark.parametrize(("planes", "sigma"), [(3, 1.0), (4, 0.5), (8, 1.0)])
 def test_noise_is_no_lack_of_a_common_homography(planes, sigma, matched):
@@ -146,6 +152,7 @@ def test_the_same_homography_many_times_is_not_said_to_differ():
     assert PlanesNotice.NO_COMMON_INFINITY not in {w.code for w in translating_planes(H).warnings}
 
 
+@pytest.mark.slow
 def test_a_calibration_that_contradicts_is_named():
     scene = scenes.translating_planes(5, batch=6, generator=torch.Generator().manual_seed(36))
     wrong = scene.calibration.clone()
@@ -165,6 +172,7 @@ def test_a_calibration_that_contradicts_is_named():
     assert {w.code for w in translating_planes(scene.homographies, calibration=pair).warnings} == {PlanesNotice.CALIBRATION}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planes", [3, 4, 5, 8])
 def test_noise_does_not_contradict_the_calibration(planes):
     scene = scenes.translating_planes(planes, batch=20, sigma=0.5, generator=torch.Generator().manual_seed(37))
@@ -173,6 +181,7 @@ def test_noise_does_not_contradict_the_calibration(planes):
     assert PlanesNotice.CALIBRATION not in {w.code for w in found.warnings}
 
 
+@pytest.mark.slow
 def test_messages_count_and_say_what_three_planes_lack_only_of_three():
     generator = torch.Generator().manual_seed(38)
     four = translating_planes(scenes.translating_planes(4, shared=2, generator=generator).homographies)
@@ -196,6 +205,7 @@ def test_random_homographies_decide_nothing(size):
     assert named & {PlanesNotice.NO_COMMON_INFINITY, PlanesNotice.CHANCE}
 
 
+@pytest.mark.slow
 def test_random_matches_decide_nothing():
     draw = torch.Generator().manual_seed(41)
     x1, x2 = 500 * torch.rand(2, 3, 6, 30, 2, generator=draw, dtype=torch.float64)
@@ -204,6 +214,7 @@ def test_random_matches_decide_nothing():
     assert PlanesNotice.INCOHERENT in {w.code for w in found.warnings}
 
 
+@pytest.mark.slow
 def test_planes_that_turn_by_themselves_are_refused():
     scene = scenes.translating_planes(6, batch=3, generator=torch.Generator().manual_seed(42))
     # a turn of the picture by 3 degrees about the middle of every patch, each the other way round
@@ -216,6 +227,7 @@ def test_planes_that_turn_by_themselves_are_refused():
     assert Status.OK not in translating_planes(x1=x1, x2=x2).status.tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planes", [6, 8])
 def test_planes_that_only_translate_stay_certain(planes):
     scene = scenes.translating_planes(planes, batch=4, sigma=0.5, generator=torch.Generator().manual_seed(44))

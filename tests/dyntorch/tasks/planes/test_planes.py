@@ -34,6 +34,7 @@ def measured(scene):
     return dyn.fit(dyn.Collineation(2), scene.x2, scene.x1).tensor
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planes", [3, 4, 5, 8])
 @pytest.mark.parametrize("matched", [False, True])
 def test_exact_planes_give_everything(planes, matched):
@@ -76,6 +77,7 @@ def test_bodies_with_known_fundamental_matrices(planes, bodies, method):
     assert errors(full, scene).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_matches_beat_matrices_and_matrices_the_thesis():
     scene = scenes.translating_planes(8, batch=12, sigma=0.5, generator=draw(3))
     H = measured(scene)
@@ -88,6 +90,7 @@ def test_matches_beat_matrices_and_matrices_the_thesis():
     assert float(full.residual.median()) == pytest.approx(0.5, rel=0.1)
 
 
+@pytest.mark.slow
 def test_bodies_help_planes():
     scene = scenes.translating_planes(3, 1, batch=8, sigma=0.5, generator=draw(4))
     alone = translating_planes(x1=scene.x1, x2=scene.x2)
@@ -113,6 +116,7 @@ def test_the_covariance_is_that_of_the_error():
     assert 6 < float(mahalanobis.mean()) < 11  # 8 degrees of freedom
 
 
+@pytest.mark.slow
 def test_batch_equals_loop_and_order_is_no_matter():
     scene = scenes.translating_planes(4, batch=(2, 2), sigma=0.1, generator=draw(11))
     H = measured(scene)
@@ -124,6 +128,7 @@ def test_batch_equals_loop_and_order_is_no_matter():
     assert torch.allclose(one.epipoles, turned.epipoles.flip(0), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-300, 1e300])
 @pytest.mark.parametrize("given", ["matrices", "matches", "both"])
 def test_tiny_and_huge_problems_leave_their_neighbours_alone(given, scale):
@@ -139,6 +144,7 @@ def test_tiny_and_huge_problems_leave_their_neighbours_alone(given, scale):
     assert int(found.status[1]) != Status.OK and bool(found.homography_at_infinity.isfinite().all())
 
 
+@pytest.mark.slow
 def test_units_of_the_image_are_no_matter():
     scene = scenes.translating_planes(5, sigma=0.1, generator=draw(12))
     H = measured(scene)
@@ -166,6 +172,7 @@ def test_missing_planes_are_left_out():
     assert bool((found.homography_at_infinity[2] == 0).all()) and bool((found.epipoles[0, 0] == 0).all())
 
 
+@pytest.mark.slow
 def test_matches_in_lists_and_missing_ones():
     scene = scenes.translating_planes(4, n=12, generator=draw(14))
     first, second = [x.clone() for x in scene.x1], [x.clone() for x in scene.x2]
@@ -286,6 +293,7 @@ def test_nonsense_gets_a_status():
     assert bool(found.homography_at_infinity.isfinite().all()) and bool(found.fundamentals.isfinite().all())
 
 
+@pytest.mark.slow
 def test_options_decide():
     scene, shipped = scenes.translating_planes(5, sigma=0.5, generator=torch.Generator().manual_seed(0)), dyn.PlanesOptions()
     matches = {"x1": scene.x1, "x2": scene.x2}

@@ -21,6 +21,7 @@ from dyntorch.tasks.reconstruct.result import Reconstruction
 from dyntorch.tasks.reconstruct.solver import LiftedFit, _lacks, least, penalized
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["static_3d", "constant_velocity_2d", "constant_direction_3d", "two_bodies_3d"])
 def test_the_model_of_the_scene(name: str) -> None:
     scene = scenes.lifted(name, 80, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
@@ -56,6 +57,7 @@ def test_formula() -> None:
     assert math.log(2) > ReconstructOptions().models.label
 
 
+@pytest.mark.slow
 def test_models_that_were_not_tried_say_why() -> None:
     scene = scenes.lifted("constant_direction_2d", 30, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
     found = dyn.reconstruct(scene.tracks, "auto", threshold=math.inf)
@@ -73,6 +75,7 @@ def test_fewest_tracks_of_two_bodies() -> None:
     assert least(MOTIONS["two_bodies_3d"], torch.arange(5.0)) == (3, 14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("wrong", "all_tried"), [(0, False), (1, False), (3, True)])
 def test_models_are_all_fitted_robustly_only_where_outliers_mislead_least_squares(
     monkeypatch: pytest.MonkeyPatch, wrong: int, all_tried: bool

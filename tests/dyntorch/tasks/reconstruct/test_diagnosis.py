@@ -35,6 +35,7 @@ def test_sound_scenes_raise_no_doubt(name: str) -> None:
 STILL = ["constant_direction_2d", "constant_velocity_2d", "constant_direction_3d", "constant_velocity_3d"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 0.5])
 @pytest.mark.parametrize("name", STILL)
 def test_static_scenes(name: str, sigma: float) -> None:
@@ -54,6 +55,7 @@ CAMERAS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 0.5])
 @pytest.mark.parametrize("name", CAMERAS)
 def test_cameras_that_stand_still_or_move_uniformly(name: str, sigma: float) -> None:
@@ -63,6 +65,7 @@ def test_cameras_that_stand_still_or_move_uniformly(name: str, sigma: float) -> 
     assert sum(code in codes(found, i) for i in range(3)) >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["two_bodies_2d", "two_bodies_3d"])
 def test_one_body(name: str) -> None:
     found = solved(name, static=1.0)
@@ -70,6 +73,7 @@ def test_one_body(name: str) -> None:
     assert all(ReconstructNotice.ONE_BODY in codes(found, i) for i in range(3))
 
 
+@pytest.mark.slow
 def test_collinear_images() -> None:
     scene = scenes.lifted("constant_velocity_2d", 40, views=4, generator=torch.Generator().manual_seed(0))
     tracks = scene.tracks.clone()

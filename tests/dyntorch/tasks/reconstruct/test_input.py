@@ -76,6 +76,7 @@ def test_nothing_fits_for_auto() -> None:
         dyn.reconstruct(tracks()[:1], "auto")
 
 
+@pytest.mark.slow
 def test_problems_with_too_little_are_statuses_with_reasons() -> None:
     x = tracks()
     once, few = x.clone(), x.clone()
@@ -100,6 +101,7 @@ def test_transposed_tracks() -> None:
         dyn.reconstruct(tracks().transpose(0, 1), CV, UNIX)
 
 
+@pytest.mark.slow
 def test_times_keep_their_digits() -> None:
     x = tracks()
     found = [dyn.reconstruct(x, CV, times) for times in (UNIX, UNIX.tolist(), UNIX.numpy(), list(UNIX.numpy()))]
@@ -122,6 +124,7 @@ def test_times_do_not_matter_where_nothing_moves() -> None:
     assert dyn.reconstruct(x, "static_2d", UNIX[:2].float()).status == Status.OK
 
 
+@pytest.mark.slow
 def test_static_of_any_kind() -> None:
     scene = scenes.lifted(CV, 30, views=4, sigma=0.3, static=0.3, generator=torch.Generator().manual_seed(0))
     known = scene.velocities.norm(dim=-1) < 1e-12

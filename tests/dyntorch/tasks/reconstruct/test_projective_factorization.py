@@ -126,6 +126,7 @@ def test_any_coordinates_of_the_images_give_the_same():
     torch.testing.assert_close((second - shift) / scale, first, rtol=0, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_problems_and_a_bad_one_stays_alone():
     tracks = scene(3, views=8, n=40)[0]
     clean = projective_factorization(tracks, 5)

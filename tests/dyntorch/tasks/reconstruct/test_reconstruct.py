@@ -68,6 +68,7 @@ def test_cameras_points_and_velocities_agree(name: str) -> None:
     torch.testing.assert_close(found.image(found.cameras[2], 0.5), scene.tracks[2], rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_direction_3d", "two_bodies_2d"])
 def test_batch_is_loop(name: str) -> None:
     scene = scene_of(name, batch=(3,), sigma=0.5)
@@ -79,6 +80,7 @@ def test_batch_is_loop(name: str) -> None:
             assert float(metrics.lifted_error(one.structure, whole.structure[i], scene.lifts).position) < 1e-4
 
 
+@pytest.mark.slow
 def test_a_lost_problem_leaves_the_others_alone() -> None:
     scene = scene_of("constant_direction_3d", batch=(3,))
     tracks = scene.tracks.clone()
@@ -170,6 +172,7 @@ def test_custom_lifts(lift) -> None:
     assert bool((found.points.norm(dim=-1) < 100).all())
 
 
+@pytest.mark.slow
 def test_known_static_points_determine_what_the_tensor_does_not() -> None:
     """Two columns of cars on a road: two velocities leave the tensor degenerate, the cameras follow from the road."""
     scene = scene_of("constant_velocity_2d", static=0.5)
@@ -216,6 +219,7 @@ def test_a_moving_point_said_to_stand_still_is_named() -> None:
     assert float(error(found, scene)) < 0.01
 
 
+@pytest.mark.slow
 def test_tracks_shorter_than_the_recording_lead_from_view_to_view() -> None:
     times = [0.4 * i for i in range(16)]
     scene = scenes.lifted("constant_velocity_2d", 160, times=times, sigma=0.2, jitter=0.1, drift=2.0, generator=draw(2))
@@ -227,6 +231,7 @@ def test_tracks_shorter_than_the_recording_lead_from_view_to_view() -> None:
     assert float(metrics.lifted_error(found.structure, scene.structure, scene.lifts).position) < 0.05
 
 
+@pytest.mark.slow
 def test_wrong_observations_in_most_tracks_cost_only_themselves() -> None:
     scene = scenes.lifted("constant_velocity_2d", 80, times=[0.5 * i for i in range(10)], sigma=0.5, generator=draw(1))
     wrong = torch.rand(10, 80, generator=draw(4)) < 0.1

@@ -9,6 +9,7 @@ import dyntorch as dyn
 from dyntorch import scenes
 
 
+@pytest.mark.slow
 def test_repr_of_one_and_of_a_batch() -> None:
     scene = scenes.lifted("constant_velocity_2d", 30, views=4, batch=2, generator=torch.Generator().manual_seed(0))
     one = repr(dyn.reconstruct(scene.tracks[0], "constant_velocity_2d"))

@@ -43,6 +43,7 @@ def kept_and_let_in(scene, fewer):
     return (seen & right).sum(-1) / right.sum(-1), (fewer.weights > 0).all(1) & ~right
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [1.5, None])
 @pytest.mark.parametrize("motion", ["constant_velocity_2d", "constant_direction_3d"])
 def test_a_third_of_the_tracks_may_be_wrong(motion, limit):
@@ -60,6 +61,7 @@ def test_a_third_of_the_tracks_may_be_wrong(motion, limit):
     assert bool(apart[seen].median() <= 1.2 * best[seen].median())
 
 
+@pytest.mark.slow
 def test_points_of_p5_in_planes():
     scene, tracks, invariant, lifting = problem("constant_velocity_planes_3d", 60, outliers=0.1)
     found, fewer = robust_projections(tracks, invariant, lifting, 1.5, generator(1), options=ReconstructOptions())
@@ -78,6 +80,7 @@ def test_an_outlier_in_one_of_many_views_costs_that_observation_only():
     assert float((fewer.weights > 0)[~hit].double().mean()) > 0.97
 
 
+@pytest.mark.slow
 def test_no_consensus_among_mixed_tracks():
     scene, _, invariant, lifting = problem("constant_velocity_2d", 30, batch=1)
     mixed = torch.stack([scene.tracks[:, v].roll(7 * v, 1) for v in range(3)], dim=1)
@@ -89,6 +92,7 @@ def test_no_consensus_among_mixed_tracks():
         assert bool(found.projections.isfinite().all())
 
 
+@pytest.mark.slow
 def test_exact_tracks_with_outliers_are_solved_exactly():
     scene, tracks, invariant, lifting = problem("constant_velocity_2d", 40, batch=1, sigma=0.0, outliers=0.2)
     found, fewer = robust_projections(tracks, invariant, lifting, None, generator(1), options=ReconstructOptions())

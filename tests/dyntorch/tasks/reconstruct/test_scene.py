@@ -41,6 +41,7 @@ def from_truth(truth, tracks, lifting):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOVING)
 def test_the_fewest_noise_free_tracks_give_the_scene(name):
     views, n = MOTIONS[name].minimal(torch.arange(6.0))
@@ -51,6 +52,7 @@ def test_the_fewest_noise_free_tracks_give_the_scene(name):
     assert float(apart.velocity.median()) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "n", "views"),
     [
@@ -74,6 +76,7 @@ def test_weak_acceleration_is_lost_by_the_tensor_alone():
     assert (scene.cost > 2 * from_truth(truth, tracks, lifting).cost).sum() >= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["constant_velocity_3d", "constant_acceleration_2d"])
 def test_where_no_views_share_enough_points_the_scene_is_found_without_a_tensor(name):
     truth, tracks, lifting, found, scene = solved(name, 50, views=9, sigma=0.5, missing=0.25, batch=(2,))
@@ -92,6 +95,7 @@ def test_no_scene_costs_infinity_and_leaves_the_others_alone():
     torch.testing.assert_close(again.cost[[0, 2]], scene.cost[[0, 2]], rtol=1e-6, atol=0)
 
 
+@pytest.mark.slow
 def test_batch_equals_loop():
     _, tracks, lifting, found, scene = solved("constant_velocity_3d", 60, views=4, sigma=0.2, batch=(2,))
     for i in range(2):

@@ -88,6 +88,7 @@ def optimum(tracks, times, truth):
     return (residuals(theta).square().sum() / tracks[..., 0].numel()).sqrt()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dim", "views"), [(3, 6), (2, 4)])
 def test_noise_ends_in_the_optimum_of_the_image_distances(dim, views):
     tracks, *truth = scene(5, views=views, n=30, dim=dim)

@@ -40,6 +40,7 @@ def wrong(found, true):
     return torch.minimum(error, 1 - error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("counts", [(7, 7), (10, 4), (9, 5), (4, 10), (60, 20)])
 def test_exact_bodies_at_minimal_counts_too(counts):
     x1, x2, labels, matrices = bodies(100, counts=counts)
@@ -67,6 +68,7 @@ def test_ranks_of_the_quadric(counts, rank):
     assert bool(affine_segmentation(x1, x2).degenerate) == (rank < 14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "most"), [(14, 0.05), (60, 0.01)])
 def test_noise(n, most):
     x1, x2, labels, _ = bodies(100, counts=(n // 2, n // 2), sigma=0.5)

@@ -90,6 +90,7 @@ def dense(links: Links) -> torch.Tensor:
     return links.pull(torch.eye(len(links.index), dtype=F64)).mT
 
 
+@pytest.mark.slow
 def test_formula_one_match_at_a_time():
     x1, x2 = mixed(26)
     found = coherence(x1, x2, SCALE, options=SegmentOptions())

@@ -161,6 +161,7 @@ def test_copies_of_one_match_may_be_the_majority(unit):
     assert float(misclassification(found.labels[300:], scene.labels)) <= 0.03
 
 
+@pytest.mark.slow
 def test_a_body_that_got_lost_is_no_spare_one():
     scene = scene_of(80, 1)
     for bodies in range(2, 9):
@@ -186,6 +187,7 @@ def test_empty_batches(batch):
     assert found.models == ((),) * batch[0]
 
 
+@pytest.mark.slow
 def test_one_bad_problem_leaves_the_others_alone():
     scene = scenes.bodies(60, 2, batch=(2, 3), sigma=0.5, generator=draw(2))
     x1, x2 = (x.clone() for x in scene.views)
@@ -197,6 +199,7 @@ def test_one_bad_problem_leaves_the_others_alone():
     assert [[len(models) for models in row] for row in found.models] == found.bodies.tolist() == [[2, 0, 2], [0, 2, 2]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spatial", [True, False])
 def test_far_origins_and_garbage(spatial):
     scene = scene_of(80, 2)

@@ -28,6 +28,7 @@ def segmented(scene, bodies):
     return found, float(misclassification(found.labels, scene.labels))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "bodies", "outliers"), [((60, 60), 2, 0.0), ((60, 60), None, 0.2), ((60, 60, 60), 3, 0.2)])
 def test_interleaved_bodies_are_found(n, bodies, outliers):
     scene = scenes.bodies(n, sigma=0.3, outliers=outliers, interleaved=True, generator=generator())
@@ -37,6 +38,7 @@ def test_interleaved_bodies_are_found(n, bodies, outliers):
     assert error < 0.06
 
 
+@pytest.mark.slow
 def test_two_fifths_of_outliers_do_no_harm():
     scene = scenes.bodies((100, 100), sigma=0.3, outliers=0.4, interleaved=True, generator=generator(1))
     assert segmented(scene, 2)[1] < 0.06
@@ -48,6 +50,7 @@ def test_one_body_is_one(outliers):
     assert int(segmented(scene, None)[0].bodies) == 1
 
 
+@pytest.mark.slow
 def test_the_same_numbers_give_the_same_bodies():
     scene = scenes.bodies((30, 30), sigma=0.3, interleaved=True, generator=generator(3))
     first, second = (segmented(scene, 2)[0] for _ in range(2))
@@ -55,6 +58,7 @@ def test_the_same_numbers_give_the_same_bodies():
     assert torch.equal(first.fundamentals, second.fundamentals)
 
 
+@pytest.mark.slow
 def test_candidates_are_ordered_and_cost_their_distances():
     scene = scenes.bodies((40, 40), sigma=0.3, outliers=0.2, interleaved=True, generator=generator(4))
     view = view_of(scene)

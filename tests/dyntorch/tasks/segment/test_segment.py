@@ -34,6 +34,7 @@ def error(found, scene) -> float:
     return float(misclassification(found.labels, scene.labels).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize(
     ("bodies", "outliers", "worst"), [(1, 0.5, 0.03), (2, 0.0, 0.0), (2, 0.3, 0.03), (2, 0.5, 0.04), (3, 0.2, 0.05)]
@@ -102,6 +103,7 @@ def test_parts_of_the_result_fit_together():
     assert float(found.residuals[found.labels > 0].max()) < 3 * 2.5
 
 
+@pytest.mark.slow
 def test_batches_are_loops():
     scene = scenes.bodies(60, 2, batch=(2, 2), sigma=0.5, outliers=0.1, generator=draw(4))
     x1, x2 = scene.views
@@ -138,12 +140,14 @@ def test_tiny_and_huge_matches_fail_alone(views, scale):
     assert all(bool(getattr(found, name).isfinite().all()) for name in NAMES)
 
 
+@pytest.mark.slow
 def test_generator_is_the_only_randomness():
     scene = two_bodies(5)
     first, second = segmented(scene, 1), segmented(scene, 1)
     assert all(torch.equal(getattr(first, name), getattr(second, name)) for name in NAMES)
 
 
+@pytest.mark.slow
 def test_order_of_matches_and_of_views_do_not_matter():
     scene = two_bodies(6)
     x1, x2 = scene.views
@@ -159,6 +163,7 @@ def test_order_of_matches_and_of_views_do_not_matter():
     assert float(cross.amin(1).max()) < 0.02
 
 
+@pytest.mark.slow
 def test_unit_and_origin_of_the_coordinates_do_not_matter():
     scene = two_bodies(7)
     x1, x2 = scene.views
@@ -181,6 +186,7 @@ def test_dtype_of_the_input_is_that_of_the_result(dtype):
     assert not any(getattr(found, name).requires_grad for name in NAMES)
 
 
+@pytest.mark.slow
 def test_missing_matches_and_those_without_weight_are_absent():
     scene = two_bodies(9)
     x1, x2 = scene.views
@@ -200,6 +206,7 @@ def test_missing_matches_and_those_without_weight_are_absent():
         assert bool((result.coherence[:20] == 0).all())
 
 
+@pytest.mark.slow
 def test_weights_are_relative():
     scene = two_bodies(10, planar=(1,))
     found = segmented(scene)
@@ -217,6 +224,7 @@ def test_threshold_is_estimated(sigma):
     assert error(found, scene) <= 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.1, 1.0])
 def test_threshold_is_estimated_from_planes(sigma):
     """The distance from a homography has two components, that from an epipolar line one."""
@@ -227,6 +235,7 @@ def test_threshold_is_estimated_from_planes(sigma):
     assert float(found.threshold) == pytest.approx(5 * sigma, rel=0.25)
 
 
+@pytest.mark.slow
 def test_check_repr_and_notices():
     scene = two_bodies(12)
     found = segmented(scene)
@@ -256,12 +265,14 @@ def test_linked_matches_without_a_body_are_one_body_more():
     assert float(misclassification(found.labels, scene.labels)) < 0.03
 
 
+@pytest.mark.slow
 def test_very_many_matches_are_labelled_by_what_some_of_them_show():
     scene = scenes.bodies(3000, sigma=0.5, outliers=0.2, generator=draw(3))
     found = segmented(scene)
     assert int(found.bodies) == 2 and error(found, scene) < 0.03
 
 
+@pytest.mark.slow
 def test_options_decide():
     scene, shipped = two_bodies(), dyn.SegmentOptions()
     assert int(segmented(scene).bodies) == 2

@@ -55,6 +55,7 @@ def test_bodies_are_believed_and_accidents_are_not():
     assert not significant(view, random, scene.labels, options=SegmentOptions()).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [8, 20, 60])
 @pytest.mark.parametrize("bodies", [None, 1])
 def test_random_matches_have_no_bodies(n, bodies):

@@ -45,6 +45,7 @@ def same(one, other, **tolerance) -> None:
 
 
 # ---- labels ------------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("counts", [(45, 25, 20), (40, 20, 20, 20)], ids=str)
 def test_bodies_of_a_known_number(counts):
     scene = shot(counts, seed=1)
@@ -54,6 +55,7 @@ def test_bodies_of_a_known_number(counts):
     assert int(found.static_body) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("counts", [(70,), (50, 30), (45, 25, 20)], ids=str)
 def test_the_number_of_bodies_is_found(counts):
     scene = shot(counts, seed=2)
@@ -63,6 +65,7 @@ def test_the_number_of_bodies_is_found(counts):
     assert (TrackNotice.ONE_BODY in codes(found)) == (len(counts) == 1)
 
 
+@pytest.mark.slow
 def test_a_street():
     street = scenes.streets(2, frames=10, tracks=150, sigma=0.1, generator=draw(5))
     found = segmented(street.tracks, 2, cameras=street.cameras)
@@ -80,6 +83,7 @@ def partial() -> Shot:
     return replace(scene, tracks=torch.where(there[..., None], scene.tracks, torch.nan))
 
 
+@pytest.mark.slow
 def test_partial_tracks_and_a_body_that_appears_late():
     scene = partial()
     found = segmented(scene.tracks, 3).check()
@@ -90,6 +94,7 @@ def test_partial_tracks_and_a_body_that_appears_late():
     assert bool((found.geometries[~gone, late - 1].norm(dim=(-2, -1)) > 0.9).any())
 
 
+@pytest.mark.slow
 def test_bodies_that_never_meet():
     scene = shot((50, 30, 25), frames=12, seed=3)
     scene.tracks[6:, 50:80] = torch.nan
@@ -98,6 +103,7 @@ def test_bodies_that_never_meet():
     assert wrong(found, scene.labels) <= 0.05
 
 
+@pytest.mark.slow
 def test_tracks_that_follow_nothing_are_outliers():
     scene = shot((50, 30))
     chance = draw(5)
@@ -108,6 +114,7 @@ def test_tracks_that_follow_nothing_are_outliers():
     assert bool((found.probabilities[:5, 0] == 1).all()) and bool((found.residuals[:5] > 2.5).all())
 
 
+@pytest.mark.slow
 def test_tracks_that_are_not_searched_follow():
     scene = shot((70, 50), seed=4)
     few = replace(QUICK, preferences=replace(QUICK.preferences, searched=60))
@@ -116,6 +123,7 @@ def test_tracks_that_are_not_searched_follow():
     assert bool((found.labels > 0).all())
 
 
+@pytest.mark.slow
 def test_short_and_missing_tracks_among_others():
     scene = shot((50, 30))
     tracks = scene.tracks.clone()
@@ -126,6 +134,7 @@ def test_short_and_missing_tracks_among_others():
     assert bool((found.residuals[:2] == 0).all()) and bool((found.probabilities[:2, 1:] == 0).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bodies", [2, None])
 def test_before_a_camera_that_stands(bodies):
     scene = shot((50, 30), frames=6)
@@ -142,6 +151,7 @@ def test_two_or_three_frames(frames):
     assert wrong(found, scene.labels) <= 0.05
 
 
+@pytest.mark.slow
 def test_frames_that_show_nothing():
     scene = shot((50, 30), frames=8)
     scene.tracks[[0, 4]] = torch.nan
@@ -151,6 +161,7 @@ def test_frames_that_show_nothing():
 
 
 # ---- parts of the result -----------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_parts_of_the_result_fit_together():
     scene = shot((50, 30), planar=(2,))
     found = segmented(scene.tracks, 2)
@@ -176,6 +187,7 @@ def test_parts_of_the_result_fit_together():
     assert "body 1: 50 tracks, stands still" in repr(found) and "outliers: 0" in repr(found)
 
 
+@pytest.mark.slow
 def test_declared_cameras_name_what_rests():
     scene = shot((40, 36))
     found = segmented(scene.tracks, 2)
@@ -190,6 +202,7 @@ def test_declared_cameras_name_what_rests():
 
 
 # ---- what it must not depend on ----------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_order_of_tracks_permutes_labels_only():
     scene = shot((50, 30))
     order = torch.randperm(80, generator=draw(7))
@@ -197,6 +210,7 @@ def test_the_order_of_tracks_permutes_labels_only():
     assert other.labels.tolist() == one.labels[order].tolist()
 
 
+@pytest.mark.slow
 def test_shift_and_scale_of_pixels_change_nothing():
     scene = shot((50, 30))
     one = segmented(scene.tracks, 2)
@@ -205,11 +219,13 @@ def test_shift_and_scale_of_pixels_change_nothing():
     torch.testing.assert_close(other.residuals, 0.01 * one.residuals, rtol=0.05, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_same_generator_gives_the_same():
     scene = partial()
     same(segmented(scene.tracks, 3), segmented(scene.tracks, 3), rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_without_a_generator_the_global_one_decides():
     scene = shot((50, 30), frames=4)
     found = []
@@ -219,6 +235,7 @@ def test_without_a_generator_the_global_one_decides():
     same(*found, rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_loop_and_one_bad_problem_harms_no_other():
     first, second = shot((50, 30), frames=6), shot((80,), frames=6, seed=5)
     nothing = torch.full_like(first.tracks, torch.nan)
@@ -238,6 +255,7 @@ def test_a_batch_is_a_loop_and_one_bad_problem_harms_no_other():
         torch.testing.assert_close(both.residuals[place], one.residuals)
 
 
+@pytest.mark.slow
 def test_cameras_of_a_batch():
     scene = shot((40, 36), frames=6)
     cameras = torch.stack([scene.cameras, scene.projections[:, 1]])
@@ -246,6 +264,7 @@ def test_cameras_of_a_batch():
     assert found.static_body.tolist() == rests
 
 
+@pytest.mark.slow
 def test_single_precision_in_and_out():
     scene = shot((50, 30), frames=6)
     one, other = segmented(scene.tracks, 2), segmented(scene.tracks.float(), 2)
@@ -254,6 +273,7 @@ def test_single_precision_in_and_out():
     assert float((one.labels == other.labels).double().mean()) > 0.95
 
 
+@pytest.mark.slow
 def test_the_result_is_where_the_tracks_are():
     home = pretend_device()
     scene = shot((50, 30), frames=6)
@@ -324,6 +344,7 @@ def test_fewer_bodies_than_were_asked_for():
         assert TrackNotice.FEWER_BODIES in codes(found) and "3 bodies were asked for" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_spare_body_is_said():
     found = segmented(shot((80,), seed=2).tracks, 2)
     assert TrackNotice.SPARE_BODY in codes(found) or int(found.bodies) < 2

@@ -51,6 +51,7 @@ def pair():
     return film(course, 0.0), film(course, 1.0, OFFSET, seed=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("which", "change", "count", "loser"), [("b", without, 6, 1), ("a", without, 2, 0), ("b", twice, 3, 0)])
 def test_one_break(pair, which, change, count, loser):
     a, b = pair
@@ -73,6 +74,7 @@ def test_one_break(pair, which, change, count, loser):
     assert f"{count} frames lost" in repr(found)
 
 
+@pytest.mark.slow
 def test_times_are_those_of_a_clock_that_keeps_time(pair):
     a, b = pair
     found = breaks(a, without(b, 95, 6), fps=FPS, max_shift=1.0, options=SHORT)
@@ -83,6 +85,7 @@ def test_times_are_those_of_a_clock_that_keeps_time(pair):
     assert bool((found.times[1].diff() > 0).all())
 
 
+@pytest.mark.slow
 def test_several_breaks(pair):
     a, b = pair
     found = breaks(a, without(without(b, 140, 4), 65, 7), fps=FPS, max_shift=1.0, options=SHORT)
@@ -97,6 +100,7 @@ def test_nothing_broke(pair):
     assert found.times[1].tolist() == pytest.approx((torch.arange(FRAMES) / FPS).tolist())
 
 
+@pytest.mark.slow
 def test_another_frame_rate_is_no_break():
     course = motion(3)
     a, b = film(course, 0.0), film(lambda t: course(t * 1.005), 1.0, seed=2)
@@ -104,6 +108,7 @@ def test_another_frame_rate_is_no_break():
     assert found.breaks == ()
 
 
+@pytest.mark.slow
 def test_films_that_have_nothing_in_common_are_refused(pair):
     found = breaks(pair[0], film(motion(9), 1.0, seed=4), fps=FPS, max_shift=1.0, options=SHORT)
     assert not found.ok
@@ -119,6 +124,7 @@ def three():
     return [film(course, turn, offset, seed=k) for k, (turn, offset) in enumerate([(0.0, 0.0), (1.0, OFFSET), (2.1, -0.2)])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("camera", "change", "sign"), [(2, without, -1), (0, twice, 1)])
 def test_three_cameras_tell_which(three, camera, change, sign):
     films = [change(x, 100, 5) if k == camera else x for k, x in enumerate(three)]
@@ -136,6 +142,7 @@ def test_three_cameras_tell_which(three, camera, change, sign):
     assert "break: " in repr(clocks)
 
 
+@pytest.mark.slow
 def test_good_cameras_have_no_breaks(three):
     clocks = dyn.synchronize_cameras(three, fps=FPS, max_shift=1.0)
     found = camera_breaks(three, clocks, fps=FPS, max_shift=1.0, options=SHORT)

@@ -92,6 +92,7 @@ def test_least_squares_equal_the_normal_equations():
     assert torch.allclose(clocks.sigmas[1:], (torch.linalg.inv(normal).diagonal() * scale).sqrt(), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_sigmas_are_those_of_repeated_trials():
     truth = torch.tensor([0.0, 1.0, -2.0, 0.5, 3.0], dtype=torch.float64)
     trials = [combine_shifts(network(truth.tolist(), noise=0.01, seed=seed), 5) for seed in range(20)]
@@ -198,6 +199,7 @@ def test_refused_pairs_that_agree_nowhere_leave_the_camera_undecided():
     assert clocks.offsets.isfinite().all()
 
 
+@pytest.mark.slow
 def test_random_peaks_are_never_taken_for_an_answer():
     """Of refused pairs whose peaks are anywhere, few agree by chance."""
     answered = 0

@@ -124,6 +124,7 @@ def test_exact_cameras_give_the_fundamental_matrix_in_pixels():
     assert fit.offset == pytest.approx(0.3, abs=0.005 * FRAME)
 
 
+@pytest.mark.slow
 def test_sigma_is_the_scatter_of_repeated_draws():
     scene = filmed(12, seconds=2.5, offset=0.123, generator=seeded(6))
     fits = [ShiftDescent(*tracks_of(scene, 1.5, seed), FRAME, options=SynchronizeOptions()).run(0.123) for seed in range(30)]
@@ -136,6 +137,7 @@ def test_sigma_is_the_scatter_of_repeated_draws():
     assert torch.tensor([fit.residual for fit in fits]).mean().item() == pytest.approx(1.5 * smooth, rel=0.15)
 
 
+@pytest.mark.slow
 def test_fractions_of_a_frame_do_not_draw_the_estimate():
     scenes = {phase: filmed(12, seconds=2.5, offset=phase * FRAME, generator=seeded(7)) for phase in (0.0, 0.25, 0.5)}
     for phase, scene in scenes.items():

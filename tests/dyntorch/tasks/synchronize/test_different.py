@@ -51,6 +51,7 @@ def synced(a, b, **more):
     return synchronize(a, b, correspondence=False, **{"fps": 30.0} | more)
 
 
+@pytest.mark.slow
 def test_the_same_tracks_get_the_same_digits():
     """Least squares by the default driver would read memory that nobody wrote."""
     scene = scenes.nonrigid_pair(10, 8, 90, sigma=0.3, offset=0.2, generator=torch.Generator().manual_seed(1))
@@ -65,6 +66,7 @@ def test_the_same_tracks_get_the_same_digits():
     assert all(np.array(found(turn)).tobytes() == first.tobytes() for turn in range(1, 20))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [0.0, 1.417, -0.75])
 def test_the_offset_is_found(offset):
     shift = synced(*pair(offset))
@@ -78,6 +80,7 @@ def test_the_offset_is_found(offset):
     assert float(shift.lags[best]) == pytest.approx(offset, abs=FRAME)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fps", [(30.0, 25.0), (25.0, 50.0)])
 def test_frame_rates_differ(fps):
     shift = synced(*pair(0.6, fps=fps), fps=fps)
@@ -85,6 +88,7 @@ def test_frame_rates_differ(fps):
     assert shift.fps == pytest.approx(fps)
 
 
+@pytest.mark.slow
 def test_times_since_1970_with_dropped_frames():
     a, b = pair(0.4)
     ta, tb = clock(8.0, 30.0) + 1.7e9, clock(8.0, 30.0) + 1.7e9 + 5
@@ -94,6 +98,7 @@ def test_times_since_1970_with_dropped_frames():
     assert 1.7e9 < shift.center < 1.7e9 + 8
 
 
+@pytest.mark.slow
 def test_later_clocks_shift_the_offset_and_nothing_else():
     a, b = pair(0.4)
     t = clock(8.0, 30.0)
@@ -101,11 +106,13 @@ def test_later_clocks_shift_the_offset_and_nothing_else():
     assert two.offset == pytest.approx(one.offset - 7, abs=1e-6) and two.sigma == pytest.approx(one.sigma)
 
 
+@pytest.mark.slow
 def test_exchanged_cameras_have_the_inverse_clock():
     a, b = pair(-0.8)
     assert synced(b, a).offset == pytest.approx(-synced(a, b).offset, abs=0.1 * FRAME)
 
 
+@pytest.mark.slow
 def test_neither_pixels_nor_order_nor_precision_matter():
     a, b = pair(0.9)
     shift = synced(a, b)
@@ -113,6 +120,7 @@ def test_neither_pixels_nor_order_nor_precision_matter():
         assert other.ok and other.offset == pytest.approx(shift.offset, abs=0.02 * FRAME)
 
 
+@pytest.mark.slow
 def test_outliers_and_gaps():
     a, b = pair(0.9)
     a, b = a.clone(), b.clone()
@@ -124,6 +132,7 @@ def test_outliers_and_gaps():
     assert shift.ok and shift.offset == pytest.approx(0.9, abs=0.4 * FRAME)
 
 
+@pytest.mark.slow
 def test_a_clock_rate_is_found():
     shift = synced(*pair(0.5, rate=1.012, seconds=24.0), max_shift=2.0)
     assert shift.ok and shift.rate == pytest.approx(1.012, abs=1e-3)
@@ -131,6 +140,7 @@ def test_a_clock_rate_is_found():
     assert abs(shift.rate - 1.012) < 5 * shift.rate_sigma
 
 
+@pytest.mark.slow
 def test_a_given_rate_is_held():
     shift = synced(*pair(0.5, rate=0.95), rate=0.95)
     assert shift.ok and shift.rate == 0.95 and shift.rate_sigma == 0
@@ -142,6 +152,7 @@ def test_the_search_ends_at_the_largest_shift():
     assert shift.ok and float(shift.lags.abs().max()) < 1.0 + 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_unrelated_motion_is_refused(seed):
     a, b = pair(0.0, seed=seed)[0], pair(0.0, seed=seed + 100)[1]
@@ -151,6 +162,7 @@ def test_unrelated_motion_is_refused(seed):
         shift.check()
 
 
+@pytest.mark.slow
 def test_periodic_motion_is_refused():
     body = Body(4)
     t = clock(8.0, 30.0)
@@ -189,6 +201,7 @@ def test_a_shift_that_is_not_known_to_a_frame_of_fast_cameras_is_refused():
     assert not fast.ok and "uncertain by 0.017 s" in fast.reason and fast.position == found.position
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 0.5])
 def test_straight_lines_at_constant_velocity_carry_no_time(sigma):
     # the size of the whole grows and shrinks about the middle of either take, which looked like one event

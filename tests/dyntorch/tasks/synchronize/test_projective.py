@@ -33,6 +33,7 @@ def test_quaternions_are_the_rotations_and_neighbours_stay_near():
     assert bool(((q[1:] * q[:-1]).sum(-1) > 0).all())
 
 
+@pytest.mark.slow
 def test_attitudes_at_all_lags_are_those_of_a_search():
     x, y = (rotation_exponential(normal(seed, 3)) for seed in (1, 2))
     a = attitudes(40)
@@ -109,6 +110,7 @@ def smooth(x):
     return torch.nn.functional.avg_pool1d(x.flatten(1).T[:, None], 9, 1, 4)[:, 0].T.unflatten(1, (-1, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tracks", "code"),
     [
@@ -124,6 +126,7 @@ def test_what_a_camera_alone_is_refused_for(tracks, code):
     assert str(found.text)
 
 
+@pytest.mark.slow
 def test_gaps_and_lost_points_are_left_out():
     x = body_tracks(0.3 * normal(0, 8, 3), frames=60)
     whole = motion_of(x)
@@ -133,6 +136,7 @@ def test_gaps_and_lost_points_are_left_out():
     assert int(found.seen.sum()) == 54 and found.residual == pytest.approx(whole.residual, rel=0.1)
 
 
+@pytest.mark.slow
 def test_misuse_and_names():
     x = body_tracks()
     with pytest.raises(ValueError, match="camera='projective' is for different points"):

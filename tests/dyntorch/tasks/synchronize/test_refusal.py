@@ -38,6 +38,7 @@ def assert_refused(shift, *words):
         shift.check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "seed", "calibration"), [(0.0, 0, STRAIGHT), (1.0, 1, None)])
 def test_exactly_periodic_motion(noise, seed, calibration):
     scene = film(seed, noise=noise, period=0.6, walk=0.0, offset=0.13)
@@ -67,6 +68,7 @@ def test_a_gait_that_crosses_the_room_is_refused_or_right():
     assert not shift.ok or shift.offset == pytest.approx(0.23, abs=0.1 * FRAME)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_nothing_moves(noise):
     still = film(2).exact
@@ -75,6 +77,7 @@ def test_nothing_moves(noise):
     assert_refused(shift, "motion is too small", "nothing moves", "repeats itself or is too small", "halves of the take")
 
 
+@pytest.mark.slow
 def test_unrelated_motion():
     a, b = film(0).a, film(50).b
     shift = synchronize(a, b, fps=30.0, max_shift=0.4)
@@ -82,6 +85,7 @@ def test_unrelated_motion():
     assert shift.confidence < 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "offset", "backwards"), [(0, 1.5, False), (8, 0.0, True)])
 def test_wrong_shifts_are_not_made_to_fit_by_leaving_points_out(seed, offset, backwards):
     scene = film(seed, n=12, seconds=4.0, offset=offset)
@@ -125,6 +129,7 @@ def test_nothing_is_seen(name):
     assert synchronize(scene.a, scene.b, fps=30.0, weights=weights).reason == shift.reason
 
 
+@pytest.mark.slow
 def test_the_halves_of_a_take_disagree():
     one, other = (film(9, seconds=3.0, offset=offset) for offset in (0.1, 0.5))
     b = torch.cat([one.b[:48], other.b[48:]])

@@ -94,6 +94,7 @@ def test_unit_axes_and_origin_of_the_space_do_not_matter(change):
     assert changed.sigma == pytest.approx(plain.sigma, rel=0.05)
 
 
+@pytest.mark.slow
 def test_gaps_outliers_and_a_wrong_point_do_not_matter():
     film, space = taken(4)
     generator = seeded(5)
@@ -126,6 +127,7 @@ def test_times_of_any_era_and_a_lens_that_is_known():
         synchronize(film, space, fps=(FPS, RECORDED), calibration=(None, (K, None)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [7, 8])
 def test_films_of_something_else_are_refused(seed):
     film, space = taken(seed)
@@ -134,6 +136,7 @@ def test_films_of_something_else_are_refused(seed):
     assert not synchronize(film, other, fps=(FPS, RECORDED)).ok
 
 
+@pytest.mark.slow
 def test_what_repeats_itself_or_stands_is_refused():
     film, space = taken(9, period=1.0)
     shift = synchronize(film, space, fps=(FPS, RECORDED))
@@ -144,6 +147,7 @@ def test_what_repeats_itself_or_stands_is_refused():
         assert not synchronize(tracks, space, fps=(FPS, RECORDED)).ok
 
 
+@pytest.mark.slow
 def test_different_points_in_any_axes():
     """Points of both hang on the same six that move: none of one is one of the other."""
     generator, six = seeded(10), motion_of(10, points=6)

@@ -119,6 +119,7 @@ def test_exchanged_cameras_have_the_inverse_clock():
     assert abs(float((back.fundamental.mT * F).sum())) == pytest.approx(1, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_neither_pixels_nor_order_nor_precision_matter():
     scene = film(8, offset=0.2)
     shift = synced(scene)
@@ -144,6 +145,7 @@ def test_cameras_that_start_and_end_at_different_times():
     assert shift.ok and shift.offset == pytest.approx(0.3 + 20 * FRAME, abs=0.05 * FRAME)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "seconds"), [(30 / 29.83, 60.0), (1.0002, 30.0), (0.985, 12.0)])
 def test_clock_rates_are_found(rate, seconds):
     scene = film(11, seconds=seconds, n=8, rate=rate, offset=0.7)
@@ -186,6 +188,7 @@ def test_gross_outliers():
     assert_found(synced(scene), scene, 0.1 * FRAME)
 
 
+@pytest.mark.slow
 def test_wrong_points_are_named_and_left_out():
     scene = film(0, n=17, wrong=2, offset=-0.6)
     shift = synced(scene, generator=seeded(0))
@@ -244,6 +247,7 @@ def test_calibration_is_applied():
     same(one, synced(scene), 1e-5)
 
 
+@pytest.mark.slow
 def test_lenses_that_nobody_calibrated_are_straightened_with_a_note():
     scene = film(9, n=10, seconds=5.0, noise=0.3, walk=1.2, lens=-0.35, offset=0.7)
     shift = synced(scene)

@@ -85,6 +85,7 @@ def test_static_cameras_need_not_be_many(centres):
     assert (alone.kinds == LineStatus.AMBIGUOUS).all()  # one centre: all lines of a plane
 
 
+@pytest.mark.slow
 def test_noise_is_estimated_and_the_uncertainty_is_honest():
     cameras, x, points, lines = scene(8, 100, (5,), sigma=0.5)
     found = triangulate_trajectories(cameras, x)
@@ -199,6 +200,7 @@ def collineation(points, truth):
     return torch.linalg.svd(torch.cat(rows), full_matrices=False).Vh[-1].view(4, 4)
 
 
+@pytest.mark.slow
 def test_six_uncalibrated_views_from_728_trajectories():
     _, x, points, _ = scene(6, 728)
     linear = trajectory_cameras(x, bundle=False)
@@ -211,6 +213,7 @@ def test_six_uncalibrated_views_from_728_trajectories():
     assert (found - points).abs().max() < 1e-7
 
 
+@pytest.mark.slow
 def test_bundle_adjustment_reaches_the_noise():
     _, x, _, _ = scene(6, 1000, sigma=0.05)
     best = trajectory_cameras(x)
