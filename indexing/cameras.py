@@ -15,10 +15,7 @@ NOISE = 0.015  # metres: standard deviation of the noise on every 3D joint coord
 
 
 def y_up(clip: Clip) -> FloatArray:
-    """``(frames, joints, dims)`` the clip's joints turned so that y points up (by a rotation: handedness is kept in 3D).
-
-    A 2D clip with ``up="-y"`` is flipped, which is what turning an image's axes upright means there.
-    """
+    """``(frames, joints, dims)`` the clip's joints turned so that y points up (by a rotation: handedness is kept in 3D)."""
     joints = clip.joints
     if clip.up == "y":
         return joints
@@ -30,11 +27,7 @@ def y_up(clip: Clip) -> FloatArray:
 
 
 def perspective(clip: Clip) -> Clip:
-    """The image of a clip whose 3D joints are in camera coordinates: ``(x / z, y / z)``.
-
-    Raises:
-        ValueError: the clip is not 3D, or a joint lies behind the camera.
-    """
+    """The image of a clip whose 3D joints are in camera coordinates: ``(x / z, y / z)``."""
     _need_3d(clip, "a perspective camera")
     if clip.up.endswith("z"):
         raise ValueError(f"clip {clip.name!r}: camera coordinates have z along the optical axis, but the clip says up={clip.up!r}")

@@ -37,11 +37,7 @@ T = TypeVar("T", bound=Labelled)
 
 
 class LabelledSet(Sequence[T]):
-    """Recordings, their labels, and selection by field.
-
-    Args:
-        clips: the recordings; name: what to call the set in messages.
-    """
+    """Recordings, their labels, and selection by field."""
 
     def __init__(self, clips: Iterable[T], name: str = "") -> None:
         self.clips: tuple[T, ...] = tuple(clips)
@@ -93,11 +89,7 @@ class LabelledSet(Sequence[T]):
         return tuple(names)
 
     def column(self, name: str) -> NDArray[Any]:
-        """``(clips, ...)`` one field of every clip; ``"action"`` or ``"label"`` gives the labels.
-
-        Raises:
-            ValueError: the field is unknown to some clip; the message lists the known ones.
-        """
+        """``(clips, ...)`` one field of every clip; ``"action"`` or ``"label"`` gives the labels."""
         if name in ("action", "label") and name not in self.fields:
             return self.labels
         missing = [i for i, clip in enumerate(self.clips) if name not in clip.meta]
@@ -106,11 +98,7 @@ class LabelledSet(Sequence[T]):
         return np.asarray([clip.meta[name] for clip in self.clips])
 
     def select(self, **criteria: Any) -> Self:
-        """The clips whose fields equal the given value, or one of the given values.
-
-        Raises:
-            ValueError: an unknown field.
-        """
+        """The clips whose fields equal the given value, or one of the given values."""
         keep = np.ones(len(self), dtype=bool)
         for name, wanted in criteria.items():
             column = self.column(name)
@@ -363,19 +351,8 @@ def as_clip(value: Clip | ArrayLike, fps: float = 30.0, name: str = "") -> Clip:
 
 
 def stretches(times: FloatArray, gap: float = GAP) -> NDArray[np.intp]:
-    """A recording cut where it has no frames for long: the one place where gaps of a clock are told from its steps.
-
-    Args:
-        times: ``(frames,)`` seconds, increasing.
-        gap: seconds; shorter ones are bridged by interpolation.
-
-    Returns:
-        ``(stretches, 2)`` first frame of each, and the one after its last.
-
-    Example:
-        >>> stretches(np.array([0.0, 0.1, 0.2, 86400.0, 86400.1])).tolist()
-        [[0, 3], [3, 5]]
-    """
+    """A recording cut where it has no frames for long: the one place where gaps of a clock are told from its steps. times
+    ``(frames,)`` -> ``(stretches, 2)``."""
     steps = np.diff(times)
     usual = float(np.median(steps)) if len(steps) else 0.0
     cuts = np.flatnonzero(steps > max(gap, RARE * usual)) + 1
@@ -383,11 +360,7 @@ def stretches(times: FloatArray, gap: float = GAP) -> NDArray[np.intp]:
 
 
 def check_fps(fps: Any, who: str = "") -> float:
-    """A frame rate that a recording can have.
-
-    Raises:
-        ValueError: no number, or one that no camera has.
-    """
+    """A frame rate that a recording can have."""
     number = isinstance(fps, (int, float, np.integer, np.floating)) and not isinstance(fps, bool) and np.isfinite(fps)
     if not (number and fps > 0):
         raise ValueError(f"{who}fps must be a positive number of frames per second, got {fps!r}")
@@ -410,11 +383,7 @@ def _float_array(value: Any, what: str) -> FloatArray:
 
 
 def _check_depth(joints: FloatArray, who: str) -> None:
-    """Raise where what should be depth is surely the confidence of pixels, and warn where it may be.
-
-    No body is ten times as wide as it is deep: what goes over pixels in x and y, and from 0 to 1 in z, is flat.  Where x and y go
-    from 0 to 1 as well, only the values themselves tell: a confidence is 0 where the joint is at (0, 0), and often 1 or nearly so.
-    """
+    """Raise where what should be depth is surely the confidence of pixels, and warn where it may be."""
     if joints.shape[2] != 3:
         return
     least, most = (float(edge.reduce(joints[..., 2], axis=None)) for edge in (np.fmin, np.fmax))

@@ -56,10 +56,7 @@ class ComparingOptions:
 
 @dataclass(frozen=True)
 class ComparedSpan:
-    """The time of one person in one recording, and the labels of both sides in it.
-
-    start, end: seconds that are compared; known, found: ``(label, start, end)``, in any order; person: empty where there is one.
-    """
+    """The time of one person in one recording, and the labels of both sides in it."""
 
     name: str
     start: float
@@ -109,11 +106,7 @@ class LabelAgreement:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How far two sets of labels agree.
-
-    labels: ``n``, in the order of the table, whose last row and column are no label; seconds: ``(n + 1, n + 1)``; by_label: what
-    holds of each; segments: over all labels, at each overlap.
-    """
+    """How far two sets of labels agree."""
 
     labels: tuple[str, ...]
     seconds: FloatArray
@@ -165,22 +158,7 @@ def _at_overlap(segments: Mapping[float, SegmentCounts]) -> dict[str, Any]:
 
 
 def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = ComparingOptions()) -> Agreement:
-    """How far what was found agrees with what is known, over all spans together.
-
-    Labels of different people are compared each with their own; intervals are cut at the ends of their span, and those without
-    duration (points in time) or outside of it count for nothing.
-
-    Raises:
-        ValueError: a span or an interval that is none, or more different labels than a table can show.
-
-    Example:
-        >>> known, found = [("squat", 0.0, 4.0), ("jump", 6.0, 8.0)], [("squat", 1.0, 5.0)]
-        >>> both = compare([ComparedSpan("a", 0.0, 10.0, known, found)])
-        >>> both.labels, both.seconds.tolist()
-        (('jump', 'squat'), [[0.0, 0.0, 2.0], [0.0, 3.0, 1.0], [0.0, 1.0, 3.0]])
-        >>> round(both.kappa, 3), both.segments[0.5].f1
-        (0.333, 0.667)
-    """
+    """How far what was found agrees with what is known, over all spans together."""
     inside = [(_inside(one.known, one), _inside(one.found, one)) for one in spans]
     names = sorted({str(label) for sides in inside for side in sides for label, _, _ in side})
     if len(names) > options.labels:
@@ -254,16 +232,7 @@ def _changes(edges: FloatArray, side: Sequence[Interval], number: Mapping[str, i
 
 
 def time_table(lengths: FloatArray, known: NDArray[np.bool_], found: NDArray[np.bool_]) -> FloatArray:
-    r"""``(n + 1, n + 1)`` seconds, rows known, columns found, the last of both no label; it sums to the sum of the lengths.
-
-    Args:
-        lengths: ``(M,)`` seconds of each moment; known, found: ``(M, n)`` which labels hold in it.
-
-    Example:
-        >>> two = np.array([[True, True]])
-        >>> time_table(np.array([1.0]), two, np.array([[True, False]])).tolist()
-        [[0.5, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]]
-    """
+    r"""``(n + 1, n + 1)`` seconds, rows known, columns found, the last of both no label; it sums to the sum of the lengths."""
     both = known & found
     each = np.maximum(np.maximum(known.sum(axis=1), found.sum(axis=1)), 1)
     apart = each - both.sum(axis=1)
@@ -279,12 +248,7 @@ def time_table(lengths: FloatArray, known: NDArray[np.bool_], found: NDArray[np.
 
 
 def kappa(table: FloatArray) -> float:
-    """Cohen's kappa of a square table of counts or seconds; NaN where chance alone explains everything.
-
-    Example:
-        >>> kappa(np.array([[20.0, 5.0], [10.0, 15.0]]))
-        0.4
-    """
+    """Cohen's kappa of a square table of counts or seconds; NaN where chance alone explains everything."""
     total = float(table.sum())
     if not total > 0:
         return math.nan
@@ -320,17 +284,7 @@ def _by_label(side: Sequence[Interval]) -> dict[str, list[tuple[float, float]]]:
 
 
 def right_segments(found: Sequence[tuple[float, float]], known: Sequence[tuple[float, float]], overlap: float) -> int:
-    """How many segments found of one label are right: each of a known one of its own, with which it shares enough of the time.
-
-    Segments found are taken in order of time; each is compared with the known one that it shares most with.
-
-    Args:
-        found, known: starts and ends; overlap: least intersection over union.
-
-    Example:
-        >>> right_segments([(0.0, 1.1), (1.1, 2.0)], [(0.0, 2.0)], 0.1)
-        1
-    """
+    """How many segments found of one label are right: each of a known one of its own, with which it shares enough of the time."""
     ends = np.array(sorted(known), dtype=np.float64).reshape(-1, 2)
     # sorted by their begins, those that can share time with a segment stand together: from the first one up to which anything ends
     # behind its start, to the last one that begins before its end

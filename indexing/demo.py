@@ -29,10 +29,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False)
 class Demonstration:
-    """What the demonstration found.
-
-    evaluations: one per viewpoint, each with the baseline's answers; exemplars: label -> the clip learned from; timings: seconds.
-    """
+    """What the demonstration found."""
 
     BASELINE: ClassVar[str] = (
         f"the clip at the least distance, after both are resampled to {STEPS} poses centred on the hips and scaled to one size"
@@ -65,22 +62,7 @@ class Demonstration:
 def demonstrate(
     *, people: int = 12, seed: int = 0, actions: Sequence[str] = ACTIONS, progress: Progress | None = None
 ) -> Demonstration:
-    """Learn from one synthetic person in one view; recognize others from elsewhere; search an untrimmed recording.
-
-    Args:
-        people: how many others.
-        seed: of everything random.
-        actions: of :data:`indexing.actors.ACTIONS`, at least two.
-        progress: called with the share done.
-
-    Raises:
-        ValueError: fewer than one person.
-
-    Example:
-        >>> shown = demonstrate(people=1, actions=["squat", "jumping_jack", "kick"])
-        >>> list(shown.accuracy())
-        ['turned 0°', 'turned 45°', 'turned 90°', 'turned 150°']
-    """
+    """Learn from one synthetic person in one view; recognize others from elsewhere; search an untrimmed recording."""
     if people < 1:
         raise ValueError(f"people must be 1 or more, got {people}")
     tell = progress or (lambda share: None)
@@ -126,10 +108,7 @@ def _search(
 
 
 def nearest_2d(examples: Sequence[Clip], labels: Sequence[Any] | NDArray[Any], queries: Sequence[Clip]) -> NDArray[Any]:
-    """Labels of the nearest examples by plain 2D shape: the baseline that is bound to the viewpoint.
-
-    Clips of COCO-17 joints are resampled to 12 poses; each is centred on the hips, and the clip scaled to unit norm.
-    """
+    """Labels of the nearest examples by plain 2D shape: the baseline that is bound to the viewpoint."""
     known, asked = _shapes(examples), _shapes(queries)
     nearest = ((asked[:, None] - known[None]) ** 2).sum(axis=2).argmin(axis=1)
     return np.asarray(np.asarray(labels)[nearest])
@@ -143,11 +122,7 @@ def _shapes(clips: Sequence[Clip]) -> NDArray[np.float64]:
 
 
 def report(shown: Demonstration, made: Mapping[str, Any]) -> RecognitionReport:
-    """The page about it.
-
-    Args:
-        made: of :func:`indexing.files.manifest`.
-    """
+    """The page about it."""
     others = "one other person" if shown.people == 1 else f"{shown.people} other people"
     return RecognitionReport(
         "One example per action is enough",

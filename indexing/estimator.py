@@ -44,12 +44,7 @@ def is_whole(value: Any) -> bool:
 
 
 def one_of(*accepted: Any) -> Rule:
-    """A rule for a choice.
-
-    Example:
-        >>> one_of("any", "same").wanted
-        "one of 'any', 'same'"
-    """
+    """A rule for a choice."""
     return Rule(
         lambda value: isinstance(value, (str, int, np.bool_)) and value in accepted, f"one of {', '.join(map(repr, accepted))}"
     )
@@ -78,13 +73,7 @@ def check_device(device: str) -> None:
 
 
 def changed_options(options: Any) -> dict[str, Any]:
-    """The fields of options that differ from their defaults, stage by stage, as JSON holds them.
-
-    Example:
-        >>> from indexing.action.options import ActionOptions, EventOptions
-        >>> changed_options(ActionOptions(events=EventOptions(step=0.3)))
-        {'events': {'step': 0.3}}
-    """
+    """The fields of options that differ from their defaults, stage by stage, as JSON holds them."""
     usual = type(options)()
     found: dict[str, Any] = {}
     for name in (field.name for field in fields(options)):
@@ -95,11 +84,7 @@ def changed_options(options: Any) -> dict[str, Any]:
 
 
 def read_options(kind: type[Options], header: Mapping[str, Any]) -> Options | None:
-    """The options of a model file: ``None`` where all of them were the defaults, as in files that know none.
-
-    Raises:
-        ValueError: a field that there is not, or a value of another kind.
-    """
+    """The options of a model file: ``None`` where all of them were the defaults, as in files that know none."""
     changed = header["parameters"].get("options")
     return None if changed is None else _replaced(kind(), changed, "options")
 
@@ -138,20 +123,13 @@ def _tuples(value: Any) -> Any:
 
 
 class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-    """A classifier of recordings that can be written to a file.
-
-    A subclass names the attribute that fitting sets, and writes and reads its parts.
-    """
+    """A classifier of recordings that can be written to a file."""
 
     FITTED: ClassVar[str]
     RULES: ClassVar[Mapping[str, Rule]]
 
     def check_parameters(self) -> None:
-        """Raise on parameters that make no sense, naming the parameter and what it accepts.
-
-        Raises:
-            ValueError: the first parameter that breaks its rule, or a device that is not there.
-        """
+        """Raise on parameters that make no sense, naming the parameter and what it accepts."""
         for name, rule in self.RULES.items():
             if not rule.accepts(getattr(self, name)):
                 raise ValueError(f"{name} must be {rule.wanted}, got {shown(getattr(self, name))}")
@@ -178,11 +156,7 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Self:
-        """Read what :meth:`save` wrote, for computing on ``device`` (the file does not say where).
-
-        Raises:
-            ValueError: the file is missing, or is not such a model.
-        """
+        """Read what :meth:`save` wrote, for computing on ``device`` (the file does not say where)."""
         check_device(device)
         return cls._read(Path(path), device)
 

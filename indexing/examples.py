@@ -52,14 +52,7 @@ FILM_FPS = 15
 
 
 def write_examples(folder: str | Path) -> list[str]:
-    """Write all example files into a folder; the videos only where PyAV is installed.
-
-    Returns:
-        the commands that use them, to be typed in that folder; they are in ``commands.txt``, too.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write all example files into a folder; the videos only where PyAV is installed."""
     where = files.prepare(folder)
     _geometry(where)
     _cameras(where)

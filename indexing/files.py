@@ -52,14 +52,7 @@ def prepare(folder: str | Path) -> Path:
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[IO[bytes]]:
-    """A stream to a file that appears whole or not at all: under a temporary name beside it, then renamed.
-
-    Whoever is killed while writing leaves the older file of this name as it was; of several who write at once one is the last, and
-    the file is whole in any case.
-
-    Raises:
-        ValueError: the file cannot be written (no such folder, no rights, a full disk); the older one is then still as it was.
-    """
+    """A stream to a file that appears whole or not at all: under a temporary name beside it, then renamed."""
     target = Path(path)
     temporary = _temporary(target.parent)
     try:
@@ -77,14 +70,7 @@ def replacing(path: str | Path) -> Iterator[IO[bytes]]:
 
 
 def replace_folder(building: Path, target: Path) -> None:
-    """Put a finished folder in the place of another one, of this file system.
-
-    Of several who do so at once one is the last; whoever is killed between the two renames leaves the older folder beside it, which
-    :func:`recover_folder` brings back.
-
-    Raises:
-        ValueError: it cannot be put there; the older one is then still as it was.
-    """
+    """Put a finished folder in the place of another one, of this file system."""
     old = target.with_name(f".{target.name}-{secrets.token_hex(8)}.old")
     try:
         for _ in range(ATTEMPTS):
@@ -146,12 +132,7 @@ def write_json(path: str | Path, value: Any) -> Path:
 
 
 def plain(value: Any) -> Any:
-    """The value in the types that JSON knows; what has no such form becomes its ``str``.
-
-    Example:
-        >>> plain({1: np.float32(0.5), "t": (float("nan"), Path("a"))})
-        {'1': 0.5, 't': [None, 'a']}
-    """
+    """The value in the types that JSON knows; what has no such form becomes its ``str``."""
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()
     if value is None or isinstance(value, (bool, int, str)):
@@ -210,10 +191,7 @@ def manifest(
 
 
 def remove_stale(folder: Path, written: Iterable[str], ours: str) -> None:
-    """Delete what an earlier run wrote here and this one did not, so that no old picture lies beside a new report.
-
-    Only files that the folder's own manifest lists under ``files``, and whose name matches the pattern ``ours``, are touched.
-    """
+    """Delete what an earlier run wrote here and this one did not, so that no old picture lies beside a new report."""
     try:
         listed = parse_json(folder, read_text(folder / MANIFEST), "")["files"]
         stale = {str(name) for name in listed} - set(written)

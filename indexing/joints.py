@@ -59,23 +59,7 @@ def layout_of(clips: Sequence[Clip]) -> Skeleton | None:
 
 
 def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, str]:
-    """The clip with its joints in the order of those known, and what to say about it.
-
-    Both with names: matched by name whatever their order; a joint that the clip does not have counts as not seen, one that is
-    not known is left out.  Without names joints are taken in their order, which bones that differ speak against.
-
-    Args:
-        known: of the clips learned from; ``None``: nothing is known of theirs.
-        who: what to call the clip in messages.
-
-    Raises:
-        ValueError: too few joints have the same names, or the layouts contradict each other.
-
-    Example:
-        >>> clip = Clip(np.array([[[1.0, 0], [2, 0], [3, 0]]]), skeleton=Skeleton("a", ("hip", "knee", "toe")))
-        >>> matched(clip, Skeleton("b", ("Toe", "hip", "knee")))[0].joints[0, :, 0].tolist()
-        [3.0, 1.0, 2.0]
-    """
+    """The clip with its joints in the order of those known, and what to say about it."""
     own, who = clip.skeleton, who or f"clip {clip.name!r}"
     if known is None or own is None or not (named(known) and named(own)):
         return clip, _unnamed(clip, known, who)
@@ -107,12 +91,7 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
 
 
 def places(own: Skeleton, known: Skeleton) -> list[int]:
-    """Where each joint known is among one's own, by name; -1 where it is not.
-
-    Example:
-        >>> places(Skeleton("a", ("hip", "knee", "toe")), Skeleton("b", ("Toe", "hand")))
-        [2, -1]
-    """
+    """Where each joint known is among one's own, by name; -1 where it is not."""
     index = {_plain(joint): i for i, joint in enumerate(own.joints)}
     words = [canonical(joint) for joint in own.joints]
     wanted = [canonical(joint) for joint in known.joints]
@@ -123,12 +102,7 @@ def places(own: Skeleton, known: Skeleton) -> list[int]:
 
 
 def canonical(joint: str) -> str:
-    """What a joint is, whatever it is called.
-
-    Example:
-        >>> [canonical(name) for name in ("LShoulder", "shoulder.L", "Left Shoulder", "mid_hip", "hip", "l_hip", "Ear")]
-        ['leftshoulder', 'leftshoulder', 'leftshoulder', 'midhip', 'midhip', 'lefthip', 'ear']
-    """
+    """What a joint is, whatever it is called."""
     plain = _plain(joint)
     if plain in SAME:
         return SAME[plain]

@@ -38,15 +38,7 @@ def write_model(
     about: Mapping[str, Any],
     tensors: Mapping[str, Tensor],
 ) -> None:
-    """Write a fitted estimator, atomically.
-
-    Args:
-        kind: of the model, for example ``"dyntorch.action-indexer"``; parameters: of the estimator, less ``device``.
-        about: whatever else is no tensor.
-
-    Raises:
-        ValueError: the file cannot be written, or a parameter is neither text, number, nor a list of these.
-    """
+    """Write a fitted estimator, atomically."""
     from safetensors.torch import save as to_bytes
 
     kept = {name: _plain(value) for name, value in parameters.items() if name != "device"}
@@ -62,11 +54,7 @@ def write_model(
 
 
 def read_model(path: str | Path, kind: str, version: int) -> tuple[dict[str, Any], Parts]:
-    """What :func:`write_model` wrote: the header, and the tensors.
-
-    Raises:
-        ValueError: no such file, no model file, or one of another kind or version.
-    """
+    """What :func:`write_model` wrote: the header, and the tensors."""
     header, tensors = _opened(Path(path), with_tensors=True)
     if header.get("format") != kind:
         found = header.get("format", "nothing that dyntorch wrote")
@@ -78,31 +66,19 @@ def read_model(path: str | Path, kind: str, version: int) -> tuple[dict[str, Any
 
 
 def model_kind(path: str | Path) -> str:
-    """What kind of model a file holds, empty where it does not say.
-
-    Raises:
-        ValueError: no such file, or no model file.
-    """
+    """What kind of model a file holds, empty where it does not say."""
     return str(_opened(Path(path), with_tensors=False)[0].get("format", ""))
 
 
 def labels_to_json(classes: NDArray[Any]) -> dict[str, Any]:
-    """Class labels for the header.
-
-    Raises:
-        ValueError: they are neither text nor numbers.
-    """
+    """Class labels for the header."""
     if classes.dtype.kind not in "Uiufb" and not (classes.dtype.kind == "O" and all(isinstance(c, str) for c in classes)):
         raise ValueError(f"labels of type {classes.dtype} cannot be saved; use text or numbers")
     return {"values": classes.tolist(), "dtype": classes.dtype.str}
 
 
 def labels_from_json(found: Mapping[str, Any]) -> NDArray[Any]:
-    """What :func:`labels_to_json` made, in the dtype it had.
-
-    Raises:
-        ValueError: they are no different labels, of one kind.
-    """
+    """What :func:`labels_to_json` made, in the dtype it had."""
     values, dtype = found["values"], np.dtype(found["dtype"])
     text = dtype.kind in "UO"
     one_kind = all(isinstance(v, str) if text else isinstance(v, (int, float)) and abs(v) < np.inf for v in values)
@@ -120,11 +96,7 @@ def skeleton_to_json(skeleton: Skeleton | None) -> list[Any] | None:
 
 
 def skeleton_from_json(found: Any, joints: int) -> Skeleton | None:
-    """What :func:`skeleton_to_json` made.
-
-    Raises:
-        ValueError: it has other joints than the model.
-    """
+    """What :func:`skeleton_to_json` made."""
     if found is None:
         return None
     name, names, bones = found
@@ -134,22 +106,14 @@ def skeleton_from_json(found: Any, joints: int) -> Skeleton | None:
 
 
 def number(value: Any, name: str, least: float = -LARGE, most: float = LARGE) -> float:
-    """A number of the header.
-
-    Raises:
-        ValueError: it is none, or out of its range.
-    """
+    """A number of the header."""
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a number from {least:g} to {most:g}, got {shown(value)}")
     return float(value)
 
 
 def whole(value: Any, name: str, least: int, most: int) -> int:
-    """A whole number of the header.
-
-    Raises:
-        ValueError: it is none, or out of its range.
-    """
+    """A whole number of the header."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {shown(value)}")
     return value
@@ -157,11 +121,7 @@ def whole(value: Any, name: str, least: int, most: int) -> int:
 
 @contextmanager
 def usable(path: str | Path) -> Iterator[None]:
-    """Whatever does not belong together in a file is said in one line.
-
-    Raises:
-        ValueError: naming the file, and what does not fit.
-    """
+    """Whatever does not belong together in a file is said in one line."""
     try:
         yield
     except MISFITS as problem:
@@ -179,44 +139,28 @@ class Parts:
         return name in self.tensors
 
     def real(self, name: str, *shape: int | None, least: float = -LARGE, most: float = LARGE) -> Tensor:
-        """Finite numbers of 32 or 64 bits; ``None`` in ``shape`` stands for any number.
-
-        Raises:
-            ValueError: other values, or another shape.
-        """
+        """Finite numbers of 32 or 64 bits; ``None`` in ``shape`` stands for any number."""
         found = self._shaped(name, shape, torch.float32, torch.float64)
         if not bool(((found >= least) & (found <= most)).all()):
             raise ValueError(f"{name}: expected numbers from {least:g} to {most:g}")
         return found
 
     def whole(self, name: str, *shape: int | None, below: int = 2**62) -> Tensor:
-        """Whole numbers from 0, and below a limit.
-
-        Raises:
-            ValueError: other values, or another shape.
-        """
+        """Whole numbers from 0, and below a limit."""
         found = self._shaped(name, shape, torch.int64)
         if not bool(((found >= 0) & (found < below)).all()):
             raise ValueError(f"{name}: expected whole numbers from 0 to {below - 1}")
         return found
 
     def every(self, name: str, *shape: int | None, below: int) -> Tensor:
-        """Whole numbers below a limit, each of which comes.
-
-        Raises:
-            ValueError: other values, or another shape.
-        """
+        """Whole numbers below a limit, each of which comes."""
         found = self.whole(name, *shape, below=below)
         if len(found.unique()) != below:
             raise ValueError(f"{name}: expected each of the numbers from 0 to {below - 1}")
         return found
 
     def truth(self, name: str, *shape: int | None) -> Tensor:
-        """Truth values.
-
-        Raises:
-            ValueError: other values, or another shape.
-        """
+        """Truth values."""
         return self._shaped(name, shape, torch.bool).view(torch.uint8) != 0  # a file may hold other bytes than 0 and 1
 
     def _shaped(self, name: str, shape: tuple[int | None, ...], *kinds: torch.dtype) -> Tensor:
@@ -240,24 +184,13 @@ class Stored:
 
 
 def stored(kind: str, *shape: int | str | None, name: str | None = None, **limits: float | str) -> dict[str, Stored]:
-    """The metadata of a dataclass's field that is a tensor of the model's file.
-
-    Args:
-        kind: the method of :class:`Parts` that takes it.
-        shape: numbers or names of sizes, None = any.  A name is bound by the first tensor that has it; all others must agree.
-        name: in the file, by default that of the field.
-        limits: of its values; a name stands for a size.
-    """
+    """The metadata of a dataclass's field that is a tensor of the model's file."""
     return {"stored": Stored(kind, shape, limits, name)}
 
 
 def part(name: str | None = None, **sizes: int | str) -> dict[str, Stored]:
-    """The metadata of a field that is a dataclass with such fields itself; theirs stand behind ``name.``, or beside the others.
-
-    Args:
-        name: in the file, by default that of the field; ``""`` = beside the others.
-        sizes: what a size of the part's is called outside of it, or how large it is.
-    """
+    """The metadata of a field that is a dataclass with such fields itself; theirs stand behind ``name.``, or beside the
+    others."""
     return {"stored": Stored("part", (), sizes, name)}
 
 
@@ -272,14 +205,7 @@ def tensors_of(model: Any, before: str = "") -> dict[str, Tensor]:
 
 
 def read_fields(kind: type, parts: Parts, sizes: dict[str, int], before: str = "") -> dict[str, Any]:
-    """The stored fields of a model, as its file has them; those that may be None are where the file lacks them.
-
-    Args:
-        sizes: those that are known; those that tensors bind are added.
-
-    Raises:
-        ValueError: a tensor that is not what its field must be.
-    """
+    """The stored fields of a model, as its file has them; those that may be None are where the file lacks them."""
     out: dict[str, Any] = {}
     for name, each, hint, how in _stored(kind, before):
         kinds = get_args(hint) or (hint,)

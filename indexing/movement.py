@@ -30,42 +30,14 @@ NEEDED = "give a dataset of poses, as movement.io.load_poses gives it"
 
 
 def is_dataset(value: Any) -> bool:
-    """Whether a value looks like a dataset of movement: it has ``position`` with named axes.
-
-    Example:
-        >>> is_dataset(np.zeros((9, 3, 2))), is_dataset(Clip(np.zeros((9, 3, 2))))
-        (False, False)
-    """
+    """Whether a value looks like a dataset of movement: it has ``position`` with named axes."""
     return not isinstance(value, (Clip, ClipSet, np.ndarray, str, bytes, Path)) and hasattr(
         getattr(value, "position", None), "dims"
     )
 
 
 def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, name: str = "") -> ClipSet:
-    """A clip of each individual of a dataset of poses.
-
-    Args:
-        dataset: with ``position (time, space, keypoints[, individuals])`` and perhaps ``confidence`` without space; NaN = not
-            seen.  A confidence that is NaN where the joint has coordinates, as of labels that a person made, counts as 1.
-        fps: frames per second where the dataset says nothing of time but frames; without it 30 is assumed.
-        up: the direction that points up, as of a :class:`~indexing.Clip`; by default what :meth:`Clip.to_movement` has noted, else
-            ``"-y"`` (pixels) in 2D and ``"z"`` in 3D, as where files of movement are read.
-        name: of the clips; by default that of the dataset's ``source_file``.
-
-    Returns:
-        clips in the order of the individuals, without those never seen.  Of several, ``meta["person"]`` says which one it is.
-
-    Raises:
-        ValueError: no poses (bounding boxes have no keypoints), no Cartesian coordinates, nobody seen, or times that do not
-            increase.
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> axes = ("time", "space", "keypoints", "individuals")
-        >>> position = SimpleNamespace(dims=axes, values=np.ones((4, 2, 3, 2)), shape=(4, 2, 3, 2))
-        >>> clips_of(SimpleNamespace(position=position, attrs={"fps": 50.0}))[1]
-        Clip('dataset#1', 4 frames x 3 joints x 2D, 0.06 s)
-    """
+    """A clip of each individual of a dataset of poses."""
     attrs = getattr(dataset, "attrs", None)
     attrs = attrs if isinstance(attrs, Mapping) else {}
     source = attrs.get("source_file")
@@ -109,11 +81,7 @@ def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, n
 
 
 def clip_of(dataset: Any, *, fps: float | None = None, name: str = "") -> Clip:
-    """The only individual of a dataset of poses.
-
-    Raises:
-        ValueError: as :func:`clips_of`, and where there are several.
-    """
+    """The only individual of a dataset of poses."""
     clips = clips_of(dataset, fps=fps, name=name)
     if len(clips) > 1:
         people = listed(clip.meta["person"] for clip in clips)

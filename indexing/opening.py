@@ -50,12 +50,7 @@ def error(path: str | Path, what: object, remedy: str) -> ValueError:
 
 
 def clipped(text: object, most: int = SAID) -> str:
-    """Text on one line, without control characters, and without its middle where it is long.
-
-    Example:
-        >>> clipped("no such\\n file"), clipped("a" * 99, 9)
-        ('no such file', 'aaa...aaa')
-    """
+    """Text on one line, without control characters, and without its middle where it is long."""
     plain = " ".join(str(text).split())
     if not plain.isprintable():
         plain = "".join(c if c.isprintable() else "?" for c in plain)
@@ -90,23 +85,13 @@ def count(number: int, one: str, many: str = "") -> str:
 
 
 def listed(names: Iterable[object], most: int = LISTED) -> str:
-    """The first names, each clipped.
-
-    Example:
-        >>> listed("abcd", 3), listed([])
-        ('a, b, c, ...', 'none')
-    """
+    """The first names, each clipped."""
     found = [clipped(name, VALUE // 3) or "(unnamed)" for name, _ in zip(names, range(most + 1), strict=False)]
     return ", ".join(found[:most]) + ", ..." * (len(found) > most) or "none"
 
 
 def repeated(names: Iterable[Any]) -> Any:
-    """The first that comes again later, None where none does.
-
-    Example:
-        >>> repeated("abcb")
-        'b'
-    """
+    """The first that comes again later, None where none does."""
     names = list(names)
     counts = Counter(names)
     return next((name for name in names if counts[name] > 1), None)
@@ -114,11 +99,7 @@ def repeated(names: Iterable[Any]) -> Any:
 
 # ---- files ---------------------------------------------------------------------------------------------------------------
 def size_of(path: str | Path, remedy: str = "check the path", what: str = "file") -> int:
-    """Bytes of a regular file.
-
-    Raises:
-        ValueError: there is none, a link leads nowhere or back to itself, or it is a folder, a pipe or a device.
-    """
+    """Bytes of a regular file."""
     try:
         found = os.stat(path)
     except OSError as problem:
@@ -153,11 +134,7 @@ def _unreachable(path: str | Path, problem: OSError, remedy: str, what: str) -> 
 
 
 def entries(folder: Path) -> list[Path]:
-    """What a folder holds, sorted by name, less what is hidden.
-
-    Raises:
-        ValueError: it cannot be listed.
-    """
+    """What a folder holds, sorted by name, less what is hidden."""
     try:
         return sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     except OSError as problem:
@@ -166,11 +143,7 @@ def entries(folder: Path) -> list[Path]:
 
 @contextmanager
 def opened(path: str | Path, remedy: str = "check the path") -> Iterator[BinaryIO]:
-    """A regular file, to be read; an error of the disk while it is read names the file, too.
-
-    Raises:
-        ValueError: as :func:`size_of`, or it cannot be read.
-    """
+    """A regular file, to be read; an error of the disk while it is read names the file, too."""
     size_of(path, remedy)
     try:
         with open(path, "rb") as file:
@@ -181,11 +154,7 @@ def opened(path: str | Path, remedy: str = "check the path") -> Iterator[BinaryI
 
 
 def head_of(path: str | Path, length: int = 512) -> bytes:
-    """The first bytes of a file.
-
-    Raises:
-        ValueError: it cannot be read, or is empty.
-    """
+    """The first bytes of a file."""
     with opened(path) as file:
         head = file.read(length)
     if not head.strip():
@@ -194,11 +163,7 @@ def head_of(path: str | Path, length: int = 512) -> bytes:
 
 
 def read_bytes(path: str | Path, remedy: str = "check the path") -> bytes:
-    """All of a file.
-
-    Raises:
-        ValueError: as :func:`opened`, or it is larger than any such file is.
-    """
+    """All of a file."""
     with opened(path, remedy) as file:
         size = os.fstat(file.fileno()).st_size
         if size > LARGEST:
@@ -207,11 +172,7 @@ def read_bytes(path: str | Path, remedy: str = "check the path") -> bytes:
 
 
 def read_text(path: str | Path, remedy: str = TEXT_REMEDY, missing: str = "check the path") -> str:
-    """All of a file as text in UTF-8.
-
-    Raises:
-        ValueError: as :func:`read_bytes`, or other bytes than text.
-    """
+    """All of a file as text in UTF-8."""
     try:
         return read_bytes(path, missing).decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -232,14 +193,7 @@ def uncollected() -> Iterator[None]:
 
 # ---- JSON and TOML -------------------------------------------------------------------------------------------------------
 def parse_json(path: str | Path, text: str, remedy: str, where: str = "") -> Any:
-    """Parsed JSON (``NaN`` allowed).
-
-    Args:
-        where: what of the file it is, for messages.
-
-    Raises:
-        ValueError: not JSON, with line and column; nested too deeply; or a number that is too long to be one.
-    """
+    """Parsed JSON (``NaN`` allowed)."""
     before = f"{where}: " if where else ""
     try:
         return json.loads(text)
@@ -253,11 +207,7 @@ def parse_json(path: str | Path, text: str, remedy: str, where: str = "") -> Any
 
 
 def parse_toml(path: str | Path, text: str, remedy: str) -> dict[str, Any]:
-    """Parsed TOML.
-
-    Raises:
-        ValueError: not TOML, nested too deeply, or a number that is too long to be one.
-    """
+    """Parsed TOML."""
     # Python's parser recurs into brackets, and takes time that grows with the square of the number of dotted keys
     if len(text) > LONGEST_TOML:
         raise error(path, "is larger than any such TOML file", remedy)
@@ -287,14 +237,7 @@ def _depth(text: str) -> int:
 
 # ---- tables --------------------------------------------------------------------------------------------------------------
 def read_rows(path: str | Path, remedy: str = TABLE_REMEDY, missing: str = "check the path", numbers: bool = True) -> Iterator[Row]:
-    """Line number (1-based) and cells of every row of a table that is not blank; commas, semicolons or tabs separate cells.
-
-    Args:
-        numbers: whether a comma within a cell is a decimal one, as spreadsheets write it where semicolons separate.
-
-    Raises:
-        ValueError: it cannot be read, is no text in UTF-8, or is no table.
-    """
+    """Line number (1-based) and cells of every row of a table that is not blank; commas, semicolons or tabs separate cells."""
     with opened(path, missing) as file:
         if os.fstat(file.fileno()).st_size > LARGEST:
             raise error(path, "is larger than any table of points", "split the recording")
@@ -315,11 +258,7 @@ def read_rows(path: str | Path, remedy: str = TABLE_REMEDY, missing: str = "chec
 
 
 def check_dense(path: str | Path, cells: int, filled: int, what: str, remedy: str) -> None:
-    """Refuse a table that is nearly empty before it is laid out: sixty thousand names of each other thing take gigabytes.
-
-    Raises:
-        ValueError: it is large, and next to nothing of it is filled.
-    """
+    """Refuse a table that is nearly empty before it is laid out: sixty thousand names of each other thing take gigabytes."""
     most, share = DENSE
     if cells > most and filled < share * cells:
         raise error(path, f"its {filled} rows would fill {100 * filled / cells:.2g} % of a table of {what}", remedy)

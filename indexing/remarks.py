@@ -31,17 +31,7 @@ FOLLOWED = {"largest": "the largest", "confident": "the one that the detector tr
 
 
 def remarks_on(clips: Sequence[Clip], sized: bool = False) -> list[Message]:
-    """What to know of clips besides who is in them: shape of the image, layout of the joints, clock.
-
-    Args:
-        clips: as they were read.
-        sized: the size of the image was given.
-
-    Example:
-        >>> point = Clip(np.full((9, 3, 2), 0.5), name="a.csv", up="-y")
-        >>> print(*remarks_on([point]))
-        a.csv: coordinates from 0 to 1, so the shape of the image is not known and people may be stretched; give size=
-    """
+    """What to know of clips besides who is in them: shape of the image, layout of the joints, clock."""
     found = [] if sized else _grouped(clips, lambda clip: _STRETCHED if is_normalized(clip) else "")
     found += _grouped(clips, _layout)
     found += _grouped(clips, _lag)
@@ -92,13 +82,8 @@ def _names(found: list[str]) -> str:
 
 
 def same_clips(clips: Sequence[Clip]) -> list[tuple[int, int]]:
-    """Pairs of clips that hold the same joints, each later one with its first: one recording given twice, whatever it is called.
-
-    Example:
-        >>> a, b = np.zeros((4, 3, 2)), np.ones((4, 3, 2))
-        >>> same_clips([Clip(a), Clip(b), Clip(a, fps=60.0)])
-        [(0, 2)]
-    """
+    """Pairs of clips that hold the same joints, each later one with its first: one recording given twice, whatever it is
+    called."""
     first: dict[tuple[tuple[int, ...], bytes], int] = {}
     found = []
     for i, clip in enumerate(clips):

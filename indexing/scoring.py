@@ -42,13 +42,7 @@ class Event:
 
 
 def probabilities(scores: Array, sharpness: float = DecisionOptions.sharpness) -> Array:
-    """``(N, classes)`` softmax of ``sharpness`` times the scores, after standardizing each row.
-
-    Example:
-        >>> import numpy as np
-        >>> probabilities(np.array([[2.0, 0.0, 0.0]])).round(2).tolist()
-        [[0.97, 0.01, 0.01]]
-    """
+    """``(N, classes)`` softmax of ``sharpness`` times the scores, after standardizing each row."""
     centred = scores - scores.mean(axis=1, keepdims=True)
     spread = np.maximum(centred.std(axis=1, keepdims=True), 1e-9) if scores.shape[1] > 2 else 0.5
     exponent = sharpness * centred / spread
@@ -57,14 +51,7 @@ def probabilities(scores: Array, sharpness: float = DecisionOptions.sharpness) -
 
 
 def reject_threshold(reject: float | None, wrong: Tensor, classes: int | None = None) -> float | None:
-    """The least evidence that is accepted.
-
-    Args:
-        reject: ``None``; a false-alarm rate in (0, 1); or, outside that interval, the threshold itself.
-        wrong: ``(N,)`` the evidence that clips of one class find in the other classes.
-        classes: from how many classes they come.  The next unknown action is one more draw of a class, not of a clip: as in
-            conformal prediction the level rises by 1 / classes; rates below 1 / (classes + 1) nobody can promise.
-    """
+    """The least evidence that is accepted. wrong ``(N,)``."""
     if reject is None or not 0 < reject < 1:
         return reject
     level = (1 - reject) * (1 if classes is None else (classes + 1) / classes)
@@ -72,17 +59,7 @@ def reject_threshold(reject: float | None, wrong: Tensor, classes: int | None = 
 
 
 def event_levels(wrong: Array, rate: float, extent: float, least: tuple[float, float]) -> tuple[float, float]:
-    """What an event must reach somewhere, and throughout.
-
-    Args:
-        wrong: what moments of one class reach in the others.
-        rate: at which these may reach the first level; outside 0..1 it is both levels itself.
-        extent: times that rate for the second; least: of both.
-
-    Example:
-        >>> event_levels(np.arange(101.0), 0.1, 2.0, (0.0, 85.0))
-        (90.0, 85.0)
-    """
+    """What an event must reach somewhere, and throughout."""
     if not 0 < rate < 1:
         return float(rate), float(rate)
     if not len(wrong):
@@ -92,11 +69,7 @@ def event_levels(wrong: Array, rate: float, extent: float, least: tuple[float, f
 
 
 def smooth(scores: Array, times: Array, seconds: float) -> Array:
-    """``(T, classes)`` mean of the scores over a centred interval of time.
-
-    Args:
-        scores: ``(T, classes)``; times: ``(T,)`` increasing.
-    """
+    """``(T, classes)`` mean of the scores over a centred interval of time."""
     total = np.vstack([np.zeros((1, scores.shape[1])), np.cumsum(scores, axis=0)])
     low = np.searchsorted(times, times - seconds / 2 - 1e-9)
     high = np.searchsorted(times, times + seconds / 2 + 1e-9)
@@ -112,17 +85,8 @@ def events(
     blocked: Array | None = None,
     options: DecisionOptions = DecisionOptions(),
 ) -> list[Event]:
-    """Runs of samples whose best class is the same: at least ``floor`` throughout and ``peak`` somewhere.
-
-    Args:
-        scores: ``(T, classes)``; times: ``(T,)`` seconds; blocked: ``(T,)`` bool, where nothing may be found.
-
-    Example:
-        >>> import numpy as np
-        >>> found = events(np.array([[0, 1], [5, 1], [6, 2], [0, 1.0]]), np.arange(4.0), ["a", "b"], 6.0, 3.0)
-        >>> [(e.label, e.start, e.end, e.score, e.margin) for e in found]
-        [('a', 0.5, 2.5, 5.5, 4.0)]
-    """
+    """Runs of samples whose best class is the same: at least ``floor`` throughout and ``peak`` somewhere. scores
+    ``(T, classes)``."""
     top = scores.max(axis=1)
     open_ = top >= floor if blocked is None else (top >= floor) & ~blocked
     state = np.where(open_, scores.argmax(axis=1), -1)

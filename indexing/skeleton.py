@@ -29,35 +29,18 @@ def from_names(name: str, joints: Sequence[str], bones: Sequence[tuple[str, str]
 
 
 def known(joints: int) -> Skeleton | None:
-    """The usual layout with this number of joints: what pose estimators write where they say no more than the number.
-
-    17: COCO, 25: OpenPose, 26: Halpe, 33: MediaPipe, 133: COCO-WholeBody, 136: Halpe with face and hands.  Others have 17, 20 and
-    25 joints, too: :func:`candidates`, told apart by :mod:`indexing.readers.layouts`.
-    """
+    """The usual layout with this number of joints: what pose estimators write where they say no more than the number."""
     return {17: COCO17, 25: BODY25, 26: HALPE26, 33: MEDIAPIPE33, 133: WHOLEBODY133, 136: HALPE136}.get(joints)
 
 
 def candidates(joints: int) -> tuple[Skeleton, ...]:
-    """The layouts of whole bodies that have this number of joints.
-
-    Example:
-        >>> [layout.name for layout in candidates(25)]
-        ['BODY_25', 'BODY_25B', 'NTU-25']
-    """
+    """The layouts of whole bodies that have this number of joints."""
     others = (HAND21, BLAZEPOSE33)  # no body, and the joints of MediaPipe
     return tuple(layout for layout in LAYOUTS.values() if len(layout.joints) == joints and layout not in others)
 
 
 def layout_named(name: str) -> Skeleton:
-    """A layout by its name, whatever its capitals and hyphens.
-
-    Raises:
-        ValueError: there is none of this name; the message lists them.
-
-    Example:
-        >>> layout_named("body25b").name, len(layout_named("halpe_136").joints)
-        ('BODY_25B', 136)
-    """
+    """A layout by its name, whatever its capitals and hyphens."""
     plain = {re.sub(r"[\W_]+", "", known_name.lower()): layout for known_name, layout in LAYOUTS.items()}
     found = plain.get(re.sub(r"[\W_]+", "", str(name).lower()))
     if found is None:

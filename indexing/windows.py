@@ -63,32 +63,8 @@ REPAIR_CHUNK = 20_000  # sightings at once: bounds memory
 def wrong_joints(
     joints: FloatArray, times: FloatArray, starts: NDArray[np.intp], options: RepairOptions = RepairOptions()
 ) -> NDArray[np.bool_]:
-    r"""Sightings that do not lie on their joint's path.
-
-    With :math:`x_k, t_k` the nine sightings of a joint around one of them, a robust line is laid through them (the median of
-    the slopes :math:`(x_b - x_a) / (t_b - t_a)`, then of the remainders :math:`r_k`), and a sighting is wrong where
-
-    .. math:: |r - \operatorname{med} r| > 4 \cdot 1.48 \operatorname{med}_k |r_k - \operatorname{med} r| + 8 q + 0.01 s
-
-    in any coordinate; :math:`q` is the deviation that four fifths of the clip's sightings stay below, :math:`s` the size of
-    the body.  Times are real: neither a varying frame rate nor gaps make a movement look like a jump.
-
-    Args:
-        joints: ``(frames of all, joints, dims)`` of clips end to end, NaN = missing.
-        times: ``(frames of all,)`` seconds, increasing within a clip.
-        starts: ``(clips + 1,)`` the first frame of each clip, and the number of frames.
-
-    Returns:
-        ``(frames of all, joints)``; missing joints are not wrong.
-
-    Source: Hampel 1974 (deviation from a running median); Sen 1968 (median of slopes).
-
-    Example:
-        >>> walk = np.linspace(0, 1, 20)[:, None, None] * np.ones((1, 3, 2)) + np.arange(3)[:, None]
-        >>> walk[7, 1] = 5.0
-        >>> np.argwhere(wrong_joints(walk, np.arange(20) / 30, np.array([0, 20]))).tolist()
-        [[7, 1]]
-    """
+    r"""Sightings that do not lie on their joint's path. joints ``(frames of all, joints, dims)``, times ``(frames of all,)``,
+    starts ``(clips + 1,)`` -> ``(frames of all, joints)``."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
     clip_of = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     floor = options.floor * _sizes(joints, there, starts)
@@ -133,12 +109,8 @@ def mended(clip: Clip, options: RepairOptions = RepairOptions()) -> Clip:
 
 
 def _around(path: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """``(sightings, 2)`` the first and the end of the nearest sightings on the same path, ``width`` where it has so many; and how
-    many it has.
-
-    Args:
-        path: ``(sightings,)`` which path each lies on, in order.
-    """
+    """``(sightings, 2)`` the first and the end of the nearest sightings on the same path, ``width`` where it has so many; and
+    how many it has."""
     cuts = np.concatenate([[0], np.flatnonzero(np.diff(path)) + 1, [len(path)]])
     lengths = np.diff(cuts)
     begin, end, counts = (one.repeat(lengths) for one in (cuts[:-1], cuts[1:], lengths))
@@ -147,10 +119,7 @@ def _around(path: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArr
 
 
 def _near_leaving(places: FloatArray, times: FloatArray, floor: FloatArray, options: RepairOptions) -> NDArray[np.bool_]:
-    """``(sightings,)`` whether one that leaves the middle of those before and after it is among the neighbours compared.
-
-    A wrong sighting leaves it, and so do the first and the last of several; what no such one is near needs no closer look.
-    """
+    """``(sightings,)`` whether one that leaves the middle of those before and after it is among the neighbours compared."""
     count = len(places)
     if count < 3:
         return np.ones(count, dtype=bool)
@@ -170,11 +139,7 @@ def _near_leaving(places: FloatArray, times: FloatArray, floor: FloatArray, opti
 def _deviations(
     places: FloatArray, times: FloatArray, rows: NDArray[np.intp], around: NDArray[np.intp], width: int
 ) -> tuple[FloatArray, FloatArray]:
-    """``(rows, dims)`` distance of sightings from the robust line through their neighbours, and the neighbours' spread.
-
-    Args:
-        around: ``(rows, 2)`` the first and the end of each one's neighbours, ``width`` at most.
-    """
+    """``(rows, dims)`` distance of sightings from the robust line through their neighbours, and the neighbours' spread."""
     far, spread = (np.empty((len(rows), places.shape[1]), places.dtype) for _ in range(2))
     x, clock = torch.from_numpy(places), torch.from_numpy(times)
     steps, lags = torch.arange(width), range(2, width)  # neighbours further apart than one step
@@ -241,16 +206,7 @@ class Ragged:
 
 
 def ragged(clips: Sequence[Clip], repair: RepairOptions | None = None) -> Ragged:
-    """Lay clips end to end and fill what is missing by linear interpolation in time, joint by joint.
-
-    Before its first and after its last sighting a joint keeps the nearest seen position.  A joint never seen in a clip is
-    marked in ``seen`` and left out of every comparison.
-
-    Args:
-        clips: checked by :func:`check_clips`.
-        repair: by which wrong joints are taken out first (:func:`~indexing.windows.wrong_joints`); joints that were right are left
-            as they are, all of them where it is ``None``.
-    """
+    """Lay clips end to end and fill what is missing by linear interpolation in time, joint by joint."""
     joints = np.concatenate([y_up(clip) for clip in clips]).astype(np.float32)
     times = np.concatenate([clip.times for clip in clips])
     lengths = np.array([len(clip) for clip in clips])
@@ -295,16 +251,7 @@ def check_clips(
     fewest: int = 2,
     recordings: bool = False,
 ) -> None:
-    """Raise where a clip cannot be compared.
-
-    Args:
-        items: the numbers that the user knows the clips by; fewest: frames of each.
-        recordings: these are not one performance each: they may have gaps of any length.
-
-    Raises:
-        ValueError: naming the clip: fewer than two frames, no joint ever seen, all joints at one place, or a number of
-            joints other than that of the others (or ``joints``), a gap that is longer than the rest, or times that are no seconds.
-    """
+    """Raise where a clip cannot be compared."""
     for i, clip in enumerate(clips):
         who = f"clip {i if items is None else items[i]}" + (f" ({clip.name!r})" if clip.name else "")
         expected = joints if joints is not None else clips[0].joints.shape[1]
@@ -354,16 +301,8 @@ def unusable(clip: Clip, fewest: int = 2, point: bool = False) -> str | None:
 
 
 def sample(source: Ragged, owner: NDArray[np.intp], start: FloatArray, end: FloatArray, length: int) -> Tensor:
-    """Windows resampled to ``length`` steps, each the box average of its time slot.
-
-    Args:
-        owner: ``(windows,)`` index of the clip that each window is cut from.
-        start, end: ``(windows,)`` seconds on the clip's clock; times outside the clip repeat its first or last frame.
-        length: steps per window.
-
-    Returns:
-        ``(windows, length, joints, dims)`` float32.
-    """
+    """Windows resampled to ``length`` steps, each the box average of its time slot. owner ``(windows,)``, start, end
+    ``(windows,)`` -> ``(windows, length, joints, dims)``."""
     joints, dims = source.joints.shape[1:]
     # one increasing clock for all clips: clip i lives in [2 i, 2 i + 1], so that one search serves every window
     begin, finish = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]

@@ -33,10 +33,7 @@ FAR = 1e30  # squared distance in place of one that is no number
 
 @dataclass(frozen=True)
 class Bundle:
-    """Matches of a block of problems in normalized coordinates, with everything that does not depend on their weights.
-
-    Axes: problems b, copies c (1 where the invariant has none), starts K, tensors of one null space a, matches n.
-    """
+    """Matches of a block of problems in normalized coordinates, with everything that does not depend on their weights."""
 
     invariant: Invariant
     """In these coordinates, for tensors ``(b, K, ..)``."""
@@ -92,11 +89,7 @@ class Bundle:
         return unpack(weights @ self.moments, tuple(p.width for p in self.primitives))
 
     def distances(self, basis: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Squared Sampson distances ``(b, K, n)`` in the unit of the measurements, and row weights ``(b, c, K, n)``.
-
-        Of several tensors, rows or copies, :math:`d^2 = k \sum h^2 / \sum \|\nabla h\|^2` with k conditions per match: right in
-        the mean, without the motion behind the tensors.
-        """
+        r"""Squared Sampson distances ``(b, K, n)`` in the unit of the measurements, and row weights ``(b, c, K, n)``."""
         slot = transfer_slot(self.primitives)
         square, rows = self._form(basis) if slot is None else self._transfer(basis, slot)
         return square.nan_to_num(nan=FAR, posinf=FAR).clamp(max=FAR), rows.nan_to_num(nan=0.0, posinf=0.0)
@@ -143,10 +136,7 @@ class Bundle:
         return whiten(error, covariance).square().sum(-1)[:, 0], 1 / (size + SINGULAR)
 
     def _slopes(self, view: int, gradient: Tensor) -> Tensor:
-        """Derivatives by the measured coordinates ``(b, c, .., d, n)`` from those by the vectors ``(b, c, .., width, n)``.
-
-        Of several hyperplanes [I | -x] each moves with some coordinates only: these are all of their derivatives.
-        """
+        """Derivatives by the measured coordinates ``(b, c, .., d, n)`` from those by the vectors ``(b, c, .., width, n)``."""
         primitive = self.primitives[view]
         if isinstance(primitive, HyperplanesThrough):
             return primitive.slopes(gradient)
@@ -193,23 +183,8 @@ def transfer_slot(primitives: Sequence[Primitive]) -> int | None:
 
 
 def anneal(data: Bundle, basis: Tensor, end: Tensor | None, iterations: int, *, guided: bool = False) -> Tensor:
-    r"""Graduated non-convexity: weights :math:`(a / (a + d^2))^2` (Geman-McClure) with a scale a that shrinks to ``end``.
-
-    The scale starts at four times the median squared distance of each start (a mean would be that of the outliers).
-
-    Args:
-        data: matches.
-        basis: ``(b, c, K, a, D)``.
-        end: ``(b,)`` squared scale at the end; None: the scale is the median squared distance itself, all the time.
-        iterations: reweightings; the last 30 % are at the final scale.
-        guided: measure the distances, until the scale is final, to the tensor of a motion, which has fewer degrees of freedom,
-            so that fewer outliers can bend it; costs a decomposition per reweighting.
-
-    Returns:
-        The tensors, same shape.
-
-    Source: Black and Rangarajan 1996; Yang, Antonante, Tzoumas and Carlone 2020.
-    """
+    r"""Graduated non-convexity: weights :math:`(a / (a + d^2))^2` (Geman-McClure) with a scale a that shrinks to ``end``. basis
+    ``(b, c, K, a, D)``, end ``(b,)``."""
     start: Tensor | None = None
     shrinking = data.options.annealing.shrinking * iterations
     for i in range(iterations):
@@ -443,16 +418,7 @@ class Search:
 
 
 def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Evidence and doubt ``(b,)`` of one tensor per problem.
-
-    Among n random matches, each an inlier with chance p, the expected number of tensors through m matches with k inliers is
-
-    .. math:: (n - m) \binom{n}{k} \binom{k}{m} p^{k - m} ,
-
-    with p measured on matches whose views were mixed up.
-
-    Source: Moisan and Stival 2004 (a contrario detection).
-    """
+    r"""Evidence and doubt ``(b,)`` of one tensor per problem."""
     present = work.weights > 0
     n, k = present.sum(-1).to(square), ((square <= limit[:, None]) & present).sum(-1).to(square)
     m = torch.full_like(n, float(work.invariant.minimal()))

@@ -280,21 +280,7 @@ def _status(few: Tensor, degenerate: Tensor, ambiguous: Tensor) -> Tensor:
 
 def _decided(gram: Tensor, dim: int, factor: Callable[[Tensor], Tensor], tolerance: Tensor) -> tuple[GramNullSpace, Tensor]:
     r"""``gram_null_space`` whose ``degenerate`` does not depend on the device, and is what the rows say, not their squares.
-
-    Singular values below 1e-7 of the largest are lost in the rounding of a Gram, but not in the rows.  So problems that a Gram
-    calls degenerate, and these alone, are looked at again: their rows decide.  An accelerator waits, once, for the certificates;
-    Grams whose certificate fails there go to the solvers of the CPU first, which look further before they give up.
-
-    Args:
-        gram: ``(b, ..., D, D)``.
-        dim: dimension of the null space.
-        factor: of the problems ``(k,)`` a triangular factor of the rows ``(k, ..., rows, D)``, at most D rows each.
-        tolerance: ``(b, ...)`` singular value, of the largest, up to which it is one of the null space; infinity: do not look.
-
-    Returns:
-        The null space, and which problems ``(k,)`` the rows took up again: ``residual``, ``competing`` and ``degenerate`` of these
-        are right, ``basis`` is that of the Gram.
-    """
+    gram ``(b, ..., D, D)``, factor ``(k,)``, tolerance ``(b, ...)`` -> ``(k,)``."""
     found = gram_null_space(gram, dim)
     asked = tolerance.isfinite().expand_as(found.degenerate)
     doubted = _some(found.degenerate & asked)
@@ -334,16 +320,8 @@ def _singular_values(factor: Tensor, size: int) -> Tensor:
 def _with_matrix(
     basis: Tensor, exact: Tensor, solve: Callable[[Tensor, int], Tensor], rows: EstimationRows, invariant: Invariant, *, host: bool
 ) -> Tensor:
-    """Replace the null spaces of the chosen problems by those of their estimation matrices, which are not squared.
-
-    Args:
-        basis: ``(*batch, nullity, D)``.
-        exact: ``(*batch,)`` bool: the problems.
-        solve: rows ``(k, rows, D)`` and the nullity -> null space.
-        rows: of all problems.
-        invariant: of the rows.
-        host: whether the CPU computes it: the solvers of an accelerator start from a Gram.
-    """
+    """Replace the null spaces of the chosen problems by those of their estimation matrices, which are not squared. basis
+    ``(*batch, nullity, D)``, exact ``(*batch,)``, solve ``(k, rows, D)``."""
     place = exact.nonzero(as_tuple=True)
     matrix = estimation_matrix(*rows.of(place).parts) if invariant.copies is None else estimation_matrix(*rows.parts)[place]
     found = solve(matrix.cpu() if host else matrix, invariant.nullity)
@@ -356,12 +334,7 @@ def _followed(x: Tensor) -> bool:
 
 
 def _levelled(matrix: Tensor, dim: int) -> Tensor:
-    r"""``null_space`` of rows that hardly tell some vectors from null ones.
-
-    In the coordinates :math:`y = \Sigma V^T x` of their own singular value decomposition, which are taken as given, all directions
-    but those of the null space weigh the same.  Rows that are fulfilled have the same null space there, with the same derivatives:
-    those of ``null_space`` come from a Gram, and lose twice the digits.
-    """
+    r"""``null_space`` of rows that hardly tell some vectors from null ones."""
     with torch.no_grad():
         finite = torch.isfinite(matrix).flatten(1).all(-1)[:, None, None]
         values, frame = torch.linalg.svd(torch.where(finite, matrix, 0.0), full_matrices=matrix.shape[-2] < matrix.shape[-1])[1:]

@@ -57,22 +57,8 @@ def matches(
     *,
     mapped: bool = False,
 ) -> Matches:
-    """Check the views of one invariant and put them into float64.
-
-    A match with a coordinate that is NaN or infinite in any view (beyond 1e60 is infinite), or a weight that is, weighs nothing.
-
-    Args:
-        invariant: says what is measured.
-        views: one per primitive.
-        weights: ``(*batch, n)``.
-        static: ``(*batch, n)`` bool.
-        dimensions: ``(*batch, n)`` integers in place of it.
-        mapped: whether what follows may be mapped over by ``torch.func.vmap``.
-
-    Raises:
-        ValueError: another number of views, shapes that do not agree, mixed dtypes or devices, negative weights, ``static`` or
-            ``dimensions`` for an invariant that knows no labelled static matches, both of them, or other dimensions.
-    """
+    """Check the views of one invariant and put them into float64. weights ``(*batch, n)``, static ``(*batch, n)``, dimensions
+    ``(*batch, n)``."""
     check_views(invariant, views)
     for v, x in enumerate(() if mapped else views, start=1):
         refuse_vmap(f"view {v}", x)
@@ -181,14 +167,7 @@ def check_views(invariant: Invariant, views: Sequence[Tensor]) -> None:
 
 
 def constellations(invariant: Invariant, points: Sequence[Tensor], dim: int = 2) -> Tensor:
-    """Points p1, p2, ... ``(*batch, views, dim)``, each seen in the same views, as one measurement per view.
-
-    Returns:
-        ``(*batch, views, points, dim + 1)``: (x, y, 1), and (0, 0, 0) where a point is missing (NaN or infinite).
-
-    Raises:
-        ValueError: shapes that do not agree, mixed dtypes or devices.
-    """
+    """Points p1, p2, ... ``(*batch, views, dim)``, each seen in the same views, as one measurement per view."""
     _check_measured(invariant, (Point(dim),) * len(points), points, "point")
     x = torch.stack(list(points), dim=-2)
     seen = x.isfinite().all(-1, keepdim=True)

@@ -21,20 +21,8 @@ CHUNK = 1 << 18
 def estimation_matrix(
     primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None = None
 ) -> Tensor:
-    r"""Rows :math:`\sqrt w\; u_1 \otimes u_2 \otimes \dots` of all matches, with the vectors u of the primitives.
-
-    A match labelled static puts, for every slot in turn, all the vectors that a static match allows there; one with several
-    free slots does so for every choice of so many.
-
-    Args:
-        primitives: one per view.
-        views: ``(*batch, n, ...)`` finite matches.
-        weights: ``(*batch, n)``.
-        static: ``(*batch, n)`` bool, or numbers of free slots.
-
-    Returns:
-        ``(*batch, rows, width)``.
-    """
+    r"""Rows :math:`\sqrt w\; u_1 \otimes u_2 \otimes \dots` of all matches, with the vectors u of the primitives. views
+    ``(*batch, n, ...)``, weights ``(*batch, n)``, static ``(*batch, n)`` -> ``(*batch, rows, width)``."""
     vectors = [p.vectors(x) for p, x in zip(primitives, views, strict=True)]
     if static is None:
         return _kronecker(vectors, weights)
@@ -60,11 +48,7 @@ def _kronecker(vectors: Sequence[Tensor], weights: Tensor) -> Tensor:
 def triangular_factor(
     primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None = None
 ) -> Tensor:
-    """Triangular factor R of :func:`estimation_matrix`, ``(*batch, at most width, width)``, whose Gram is the same.
-
-    It is of orthogonal steps, so its singular values are right down to the rounding of the largest one; those of a Gram are lost
-    below 1e-8 of it.  The rows are written in pieces.
-    """
+    """Triangular factor R of :func:`estimation_matrix`, ``(*batch, at most width, width)``, whose Gram is the same."""
     width, n = math.prod(p.width for p in primitives), weights.shape[-1]
     per_match = width * math.prod(p.rows for p in primitives) * max(1, weights.numel() // max(1, n))
     step = max(2 * width, CHUNK // per_match)
@@ -81,22 +65,8 @@ def triangular_factor(
 
 
 def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None = None) -> Tensor:
-    r"""Gram matrix of :func:`estimation_matrix` without building it:
-
-    .. math:: G = \sum_n w_n\, S_1(n) \otimes S_2(n) \otimes \dots, \qquad S_v = \sum_r u_r u_r^T .
-
-    Each :math:`S_v` is symmetric, so the sum is one product of its packed entries: 216 numbers instead of 729 for three
-    points of P^2, and no row of the estimation matrix is ever written.
-
-    Args:
-        primitives: one per view.
-        views: ``(*batch, n, ...)`` finite matches.
-        weights: ``(*batch, n)``.
-        static: ``(*batch, n)`` bool.
-
-    Returns:
-        ``(*batch, width, width)``.
-    """
+    r"""Gram matrix of :func:`estimation_matrix` without building it: views ``(*batch, n, ...)``, weights ``(*batch, n)``,
+    static ``(*batch, n)`` -> ``(*batch, width, width)``."""
     if len(primitives) == 1:
         # nothing to multiply: a match gives its rows as they are
         if torch.is_grad_enabled() and weights.requires_grad:  # weights of 0 have derivatives, but their roots do not
@@ -207,28 +177,8 @@ errors of 4 to 32 px)."""
 def within_noise(
     primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None, basis: Tensor, resolves: bool
 ) -> Tensor:
-    r"""Whether the residual of the second best tensor is explained by the noise that the best one shows.
-
-    Points that nearly fulfil many tensors at once (all static, all velocities in one plane) give the best tensor a residual
-    of second order in the noise and the others one of first order.  The ratio of singular values then looks healthy, but the
-    best tensor is not the true one.  The noise is read off the best tensor, :math:`\sigma^2 = |R v|^2 / |\partial R v|^2`, and
-    the second one, u, is refuted only if :math:`|R u|^2` exceeds :math:`\sigma^2 |\partial R u|^2` clearly; the derivatives are
-    probed by one small random change of all measurements.
-
-    A tensor that singular points fulfil to second order, as the homography tensor static ones, is the best of all by far in spite
-    of that; points with equal steps fulfil four homography tensors to first order, and the best is one of a family by accident.
-
-    Args:
-        primitives: one per view.
-        views: ``(b, n, ...)`` normalized matches.
-        weights: ``(b, n)``.
-        static: ``(b, n)`` bool.
-        basis: ``(b, nullity, D)`` the null space found.
-        resolves: whether the best tensor is the true one where its residual is smaller by far.
-
-    Returns:
-        ``(b,)`` bool.
-    """
+    r"""Whether the residual of the second best tensor is explained by the noise that the best one shows. views ``(b, n, ...)``,
+    weights ``(b, n)``, static ``(b, n)``, basis ``(b, nullity, D)`` -> ``(b,)``."""
     g = gram(primitives, views, weights, static)
     # a part of very many matches tells as much about the noise
     step = -(-weights.shape[1] // ENOUGH)

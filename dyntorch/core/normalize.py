@@ -42,16 +42,8 @@ class Normalization:
 
 
 def normalization(invariant: Invariant, views: Sequence[Tensor], weights: Tensor) -> Normalization:
-    r"""Hartley's similarity of each view: the weighted centroid goes to 0, the RMS distance from it to :math:`\sqrt d`.
-
-    Without it a null vector from noisy pixels does not even improve with more matches (measured, homography tensor: 1.5 to 8
-    times less accurate from twice the minimal count on); see Hartley 1997, "In defense of the eight-point algorithm".
-
-    Args:
-        invariant: says what is measured.
-        views: ``(*batch, n, ...)`` finite matches.
-        weights: ``(*batch, n)``.
-    """
+    r"""Hartley's similarity of each view: the weighted centroid goes to 0, the RMS distance from it to :math:`\sqrt d`. views
+    ``(*batch, n, ...)``, weights ``(*batch, n)``."""
     points = [p.points(x, weights) for p, x in zip(invariant.primitives, views, strict=True)]
     if len({x.shape for x in points}) == 1:
         # all views in one pass: a copy costs less than two more rounds of small operations
@@ -81,16 +73,8 @@ def hartley(points: Tensor, weights: Tensor) -> Tensor:
 
 
 def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor]) -> Tensor:
-    r"""The tensor of the measured coordinates, :math:`T_{ijk} = \hat T_{abc} (M_1)_{ai} (M_2)_{bj} (M_3)_{ck}`, norm 1.
-
-    Args:
-        invariant: says which view an axis belongs to.
-        tensor: ``(*batch, *axes)`` or ``(*batch, nullity, *axes)`` of normalized matches.
-        actions: ``(*batch, width, width)`` per view.
-
-    Returns:
-        The same shape; several tensors are orthonormal again.
-    """
+    r"""The tensor of the measured coordinates, :math:`T_{ijk} = \hat T_{abc} (M_1)_{ai} (M_2)_{bj} (M_3)_{ck}`, norm 1. tensor
+    ``(*batch, *axes)``, actions ``(*batch, width, width)``."""
     if invariant.motion_alone:
         return torch.stack(denormalize_motion(invariant, tensor.unbind(-3), actions), dim=-3)
     rank = len(invariant.shape())

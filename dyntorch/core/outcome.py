@@ -124,15 +124,7 @@ class Notice:
 
 
 def notices(code: NoticeCode, values: Tensor, flagged: Tensor, batch: tuple[int, ...], **more: Any) -> list[Notice]:
-    """A notice for every flagged problem.
-
-    Args:
-        code: what it is about.
-        values: ``(b,)`` figures.
-        flagged: ``(b,)`` bool.
-        batch: shape that the flat dimension b comes from.
-        more: what else the sentence speaks of, the same for all.
-    """
+    """A notice for every flagged problem. values ``(b,)``, flagged ``(b,)``."""
     # one copy: an accelerator would wait for every number
     figures = torch.where(flagged, values.detach().double(), torch.nan), flagged.double()
     found = []
@@ -244,17 +236,7 @@ class Outcome:
 
 
 def check_status(what: str, status: Tensor, said: Sequence[Notice] = (), remedies: Mapping[Status, str] = REMEDY) -> None:
-    """Raise where any problem failed.
-
-    Args:
-        what: was tried.
-        status: ``(*batch,)`` of :class:`Status`.
-        said: what is known about single problems.
-        remedies: what to do, as templates of messages.
-
-    Raises:
-        ValueError: says which problems failed, how, and what to do.
-    """
+    """Raise where any problem failed. status ``(*batch,)``."""
     refuse_vmap("status", status, "return what is needed from the function that is mapped, and look at its status behind that")
     flat = status.reshape(-1)
     places = np.arange(len(flat)).reshape(tuple(status.shape))

@@ -17,24 +17,7 @@ Result = TypeVar("Result")
 
 
 def one_by_one(batch: Sequence[int], solve: Callable[[int], Result], spare: Callable[[str], Result]) -> Result:
-    """The results of all problems, as :func:`stacked` makes one of them.
-
-    What is wrong with all problems is misuse, and raised; what is wrong with some is their own.
-
-    Args:
-        batch: shape of the batch, of one problem at least.
-        solve: the result of a problem by its place in the flat batch.
-        spare: the result of a problem that raised, by what was said.
-
-    Raises:
-        ValueError: no problems, or the first error where all raise.
-
-    Example:
-        >>> import torch
-        >>> one_by_one((2,), lambda i: torch.full((i + 1,), 1.0), lambda said: torch.zeros(0))
-        tensor([[1., nan],
-                [1., 1.]])
-    """
+    """The results of all problems, as :func:`stacked` makes one of them."""
     if not prod(batch):
         raise ValueError(f"the batch {tuple(batch)} holds no problem; give one at least")
     found: list[Result | str] = []
@@ -51,15 +34,7 @@ def one_by_one(batch: Sequence[int], solve: Callable[[int], Result], spare: Call
 
 
 def stacked(found: Sequence[Result], batch: Sequence[int]) -> Result:
-    """One result of several: tensors with the batch in front, numbers as tensors ``(*batch,)``, the notices of all problems.
-
-    Tensors of different sizes are filled up at the end: with NaN, bool ones with False, whole numbers with -1.  None among tensors
-    is nothing but filling.  What is the same for all stays as it is; words that differ come as a tuple in the order of the batch.
-
-    Args:
-        found: results of one kind, in the order of the flat batch.
-        batch: its shape.
-    """
+    """One result of several: tensors with the batch in front, numbers as tensors ``(*batch,)``, the notices of all problems."""
     first = next((one for one in found if one is not None), None)
     if first is None:
         return found[0]

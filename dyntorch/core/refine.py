@@ -416,14 +416,7 @@ def _noise(invariant: Invariant, data: Matches, cost: Tensor) -> Tensor:
 
 
 def _covariance(moved: Callable[[Tensor], Tensor], found: Minimum, dof: int, scale: Tensor) -> Tensor:
-    r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof.
-
-    Args:
-        moved: the motion in the coordinates of the matches, whose derivative is D.
-        found: where refinement ended.
-        dof: degrees of freedom of the motion.
-        scale: ``(b,)`` noise of a coordinate of a match of weight 1.
-    """
+    r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof."""
     values, vectors = spectrum(found.terms[1])
     count = min(dof, values.shape[-1])
     values, vectors = values[..., -count:], vectors[..., -count:]

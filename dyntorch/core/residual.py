@@ -171,13 +171,7 @@ def multilinear(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor], s
 def multilinear_derivative(
     invariant: Invariant, tensor: Tensor, views: Sequence[Tensor], scales: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:
-    r"""Signed Sampson residual ``(*batch, n)`` and its derivative ``(*batch, n, D)`` by the entries of the tensor.
-
-    With :math:`r = h / \sqrt g` and :math:`d_v = J_v (s_v^2 J_v^T \partial h / \partial u_v)\, h / g`,
-
-    .. math:: \frac{\partial r}{\partial T} = \frac{1}{\sqrt g} \Big( \bigotimes_v u_v
-              - \sum_v u_1 \otimes \dots \otimes d_v \otimes \dots \Big).
-    """
+    r"""Signed Sampson residual ``(*batch, n)`` and its derivative ``(*batch, n, D)`` by the entries of the tensor."""
     value, slopes, square = _sampson_terms(invariant, tensor, views, scales)
     vectors = [p.raw(x) for p, x in zip(invariant.primitives, views, strict=True)]
     share = (value / square)[..., None]
@@ -226,23 +220,8 @@ def _form(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor]) -> tupl
 
 
 def whiten(error: Tensor, covariance: Tensor) -> Tensor:
-    r"""Solve :math:`L w = e` with the Cholesky factor :math:`L L^T = Q` of each small covariance.
-
-    Written out coordinate by coordinate, so that it is one pass over the whole batch (a batched factorization loops over
-    hundreds of thousands of tiny matrices) and differentiable in forward mode.
-
-    Args:
-        error: ``(..., c)``.
-        covariance: ``(..., c, c)`` symmetric positive definite; a pivot that is not positive is raised to a tiny one.
-
-    Returns:
-        ``(..., c)``.
-
-    Example:
-        >>> import torch
-        >>> whiten(torch.tensor([2.0, 3.0]), torch.diag(torch.tensor([4.0, 9.0]))).tolist()
-        [1.0, 1.0]
-    """
+    r"""Solve :math:`L w = e` with the Cholesky factor :math:`L L^T = Q` of each small covariance. error ``(..., c)``,
+    covariance ``(..., c, c)`` -> ``(..., c)``."""
     entries = [[covariance[..., i, j] for j in range(i + 1)] for i in range(error.shape[-1])]
     return torch.stack(whiten_entries(error.unbind(-1), entries), dim=-1)
 

@@ -109,17 +109,7 @@ class Field:
 
 
 class Echelon:
-    """Reduced row echelon form that grows as rows arrive; whether a row raises the rank depends on the rows before it only.
-
-    Args:
-        field: of the entries.
-        width: length of a row.
-
-    Example:
-        >>> echelon = Echelon(Field(7), width=3)
-        >>> echelon.add(np.array([[1, 2, 3], [2, 4, 6], [0, 0, 5]])).tolist(), echelon.rank
-        ([True, False, True], 2)
-    """
+    """Reduced row echelon form that grows as rows arrive; whether a row raises the rank depends on the rows before it only."""
 
     def __init__(self, field: Field, width: int) -> None:
         self.field, self.width = field, width
@@ -132,10 +122,7 @@ class Echelon:
         return len(self.pivots)
 
     def add(self, rows: IntArray) -> NDArray[np.bool_]:
-        """Add rows, already reduced modulo the prime, and say which of them raised the rank.
-
-        The rows so far act through two matrix products; only within the new rows is elimination one by one.
-        """
+        """Add rows, already reduced modulo the prime, and say which of them raised the rank."""
         prime = self.field.prime
         rows = (rows - self.field.product(rows[:, self.pivots], self.basis)) % prime
         raised = np.zeros(len(rows), dtype=bool)
@@ -162,15 +149,7 @@ class Echelon:
 
 @dataclass(frozen=True)
 class Step:
-    """Matches of one kind.
-
-    Args:
-        kind: its name.
-        matches: how many; None: as many as raise the rank.
-        draw: gives the rows ``(rows, width)`` of the next match.
-        constraint: these rows hold without any match.
-        patience: matches in a row that add nothing before no more are drawn; in general position the first one tells.
-    """
+    """Matches of one kind. draw ``(rows, width)``."""
 
     kind: str
     matches: int | None
@@ -193,20 +172,7 @@ CAMERAS = 1 << 17  # entries of all projections
 
 
 class Views:
-    r"""Random projections :math:`P^k \to P^{l_v}`, and what is measured in each.
-
-    Primitives are given as the points that span them, ``(m, k + 1)``.  A view measures either their ``join``, the Pluecker
-    coordinates of their extensor (a point stays a point), every ``hyper`` plane that contains them, or, given a number, every
-    intersection of so many of these, as the Pluecker coordinates of the hyperplanes (a Grassmann tensor takes k + 1 in all).
-
-    Args:
-        field: where random elements come from.
-        k: projective dimension of the space.
-        views: projective dimensions ``l_v`` of the views.
-        measure: ``"join"``, ``"hyper"`` or a number of hyperplanes, per view.
-        cameras: the projections ``(l_v + 1, k + 1)``, where they are not random.
-        points: that span a primitive.
-    """
+    r"""Random projections :math:`P^k \to P^{l_v}`, and what is measured in each. cameras ``(l_v + 1, k + 1)``."""
 
     def __init__(
         self,
@@ -312,11 +278,7 @@ class Kind:
 
 
 class Tally:
-    """Counts the ranks of steps of matches, one step after the other.
-
-    Args:
-        field: of the rows.
-    """
+    """Counts the ranks of steps of matches, one step after the other."""
 
     def __init__(self, field: Field) -> None:
         self.field = field

@@ -128,21 +128,7 @@ MOTIONS: tuple[Configuration, ...] = (
 
 
 class _Lifted:
-    r"""Random views :math:`x_i \sim P_i B_i Y` of a motion model, uncalibrated, with the lift :math:`B_i` of each time.
-
-    The position of a point is a polynomial of the time, :math:`B(t) = [I \mid tE_1 \mid t^2E_2 \dots]` with E the first columns
-    of I, or, of two bodies, :math:`B_i = [I \mid d_i]` with an arbitrary translation of the second one.
-
-    Args:
-        field: where random elements come from.
-        dim: of the world.
-        directions: coordinates that change, for each power of the time.
-        profile: hyperplanes used of each view.
-        times: of the views; none: random.
-        camera: how its centre moves; one of :data:`CAMERAS`.
-        sensor: dimension of a view.
-        bodies: 2 for two bodies.
-    """
+    r"""Random views :math:`x_i \sim P_i B_i Y` of a motion model, uncalibrated, with the lift :math:`B_i` of each time."""
 
     def __init__(
         self, field: Field, dim: int, directions: Sequence[int], profile: Sequence[int], times: Sequence[int] = (),

@@ -84,13 +84,7 @@ def _across(field: Field, x: IntArray) -> IntArray:
 
 
 class Partitions:
-    """The ordered partitions of the basis into sets of given sizes: what a view puts before each of the unknowns.
-
-    Args:
-        field: of the numbers.
-        size: points of the basis.
-        profile: how many hyperplanes through each further point are taken at once; their sum is ``size``.
-    """
+    """The ordered partitions of the basis into sets of given sizes: what a view puts before each of the unknowns."""
 
     def __init__(self, field: Field, size: int, profile: Sequence[int]) -> None:
         self.field, self.size, self.profile = field, size, tuple(profile)

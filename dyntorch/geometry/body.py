@@ -47,11 +47,7 @@ class FilmedBody(NamedTuple):
 
 @dataclass(frozen=True)
 class BodyProblem(LeastSquares):
-    r"""Minimize :math:`\sum w_{tj} |x_{tj} - \pi(\ldots)|^2` over a block of problems, the motions of the frames eliminated.
-
-    Calibration, sights and points are few and common to all frames, a frame has six unknowns of its own: the Schur complement is as
-    large as what is common, however long the take.  The gauge (a similarity of space, one of the body) is free, damping holds it.
-    """
+    r"""Minimize :math:`\sum w_{tj} |x_{tj} - \pi(\ldots)|^2` over a block of problems, the motions of the frames eliminated."""
 
     x: Tensor
     """``(b, frames, n, 2)`` of order 1, any finite value where the weight is 0."""

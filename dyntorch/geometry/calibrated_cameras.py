@@ -15,11 +15,8 @@ TINY = 1e-300
 
 @dataclass(frozen=True)
 class CalibratedCameras:
-    r"""Cameras :math:`P \sim K\,[R_{:d} \mid *]` of known K: their first d columns are those of a rotation, the others are free.
-
-    A static or moving scene of the plane or of space has d = 2 or 3 and one further column t; two bodies that translate have one
-    for each.  Sensors that measure points (l = 3) have the last row (0, 0, 0, 1).
-    """
+    r"""Cameras :math:`P \sim K\,[R_{:d} \mid *]` of known K: their first d columns are those of a rotation, the others are
+    free."""
 
     matrices: Tensor
     """``(b, v, l + 1, l + 1)``."""
@@ -27,10 +24,8 @@ class CalibratedCameras:
     """d."""
 
     def parts(self, cameras: Tensor) -> tuple[Tensor, Tensor]:
-        """The orthonormal columns ``(b, v, 3, d)`` next to a camera and the others ``(b, v, 3, *)``, in units of the same scale.
-
-        Of space they are a rotation or minus one: the camera may have either sign.
-        """
+        """The orthonormal columns ``(b, v, 3, d)`` next to a camera and the others ``(b, v, 3, *)``, in units of the same
+        scale."""
         seen = torch.linalg.solve_ex(self.matrices, cameras)[0]
         if cameras.shape[-2] == 4:
             last = seen[..., -1:, -1:]
@@ -75,18 +70,7 @@ class CalibratedCameras:
 
 
 def calibrations(calibration: Tensor, batch: tuple[int, ...], views: int, like: Tensor, size: int = 2) -> Tensor:
-    """K of every view, ``(b, views, size + 1, size + 1)``, from one for all, one for each view, or also for each problem.
-
-    Args:
-        calibration: ``(size + 1, size + 1)``, ``(views, size + 1, size + 1)`` or ``(*batch, views, size + 1, size + 1)``.
-        batch: leading dimensions of the problems; b is their product.
-        views: how many.
-        like: a tensor of the dtype and device of the result.
-        size: coordinates of a point of a view.
-
-    Raises:
-        ValueError: another shape, a matrix that is singular or not finite, or of a camera without the last row (0, 0, 1).
-    """
+    """K of every view, ``(b, views, size + 1, size + 1)``, from one for all, one for each view, or also for each problem."""
     want = (*batch, views, size + 1, size + 1)
     shapes = ((size + 1, size + 1), want[-3:], want)
     if not isinstance(calibration, Tensor) or tuple(calibration.shape) not in shapes:

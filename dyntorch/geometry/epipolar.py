@@ -21,23 +21,8 @@ SQUARINGS = 4
 
 
 def sampson_squared(F: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
-    r"""Squared Sampson distances of matches: :math:`(x_2^T F x_1)^2 / (\|(F x_1)_{12}\|^2 + \|(F^T x_2)_{12}\|^2)`.
-
-    Args:
-        F: ``(*batch, 3, 3)`` of any scale.
-        x1, x2: ``(n, 2)``.
-
-    Returns:
-        ``(*batch, n)`` in the squared unit of the matches; 0 where F is 0.
-
-    Source: Hartley and Zisserman, Multiple View Geometry, section 11.4.3.
-
-    Example:
-        >>> import torch
-        >>> F = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-        >>> sampson_squared(F, torch.tensor([[0.0, 1.0]]), torch.tensor([[5.0, 3.0]])).tolist()
-        [2.0]
-    """
+    r"""Squared Sampson distances of matches: :math:`(x_2^T F x_1)^2 / (\|(F x_1)_{12}\|^2 + \|(F^T x_2)_{12}\|^2)`. F
+    ``(*batch, 3, 3)``, x1, x2 ``(n, 2)`` -> ``(*batch, n)``."""
     value, square = PairMonomials(x1, x2).terms(F)
     return value.square() / square
 
@@ -91,14 +76,8 @@ def polar(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def null_vector(gram: Tensor) -> Tensor:
-    r"""Unit vectors to the smallest eigenvalue of small Gram matrices, as a start: accurate where it stands apart.
-
-    Args:
-        gram: ``(*batch, D, D)`` symmetric, finite, not negative.
-
-    Returns:
-        ``(*batch, D)``; some unit vector where the matrix does not decide.
-    """
+    r"""Unit vectors to the smallest eigenvalue of small Gram matrices, as a start: accurate where it stands apart. gram
+    ``(*batch, D, D)`` -> ``(*batch, D)``."""
     # microseconds per matrix of D = 9 in batches of 1, 30, 1000: 130, 6, 2.6; by gram_null_space 281, 13, 9.4
     trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
@@ -123,30 +102,8 @@ def rank_two(F: Tensor) -> Tensor:
 
 
 def eight_point(x1: Tensor, x2: Tensor, weights: Tensor, rounds: int = 0) -> Tensor:
-    r"""Linear fits of weighted matches, each in Hartley's coordinates of its own weights, then rank two.
-
-    .. math:: \min_F \sum_i w_i\,(x_{2i}^T F x_{1i})^2 / g_i^2, \qquad \|\hat F\| = 1,
-
-    with :math:`g_i = 1` at first, and the gradient of the last F in further rounds.
-
-    Args:
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative.
-        rounds: how often to weigh again by the gradient.
-
-    Returns:
-        ``(B, 3, 3)`` of norm 1 and rank two; some such matrix where the weights leave too few matches.
-
-    Source: Hartley 1997, In defense of the eight-point algorithm.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> x2 = x1 + torch.tensor([1.0, 0.0]) * torch.rand(20, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        >>> F = eight_point(x1, x2, torch.ones(1, 20, dtype=torch.float64))
-        >>> bool(sampson_squared(F, x1, x2).max() < 1e-20)
-        True
-    """
+    r"""Linear fits of weighted matches, each in Hartley's coordinates of its own weights, then rank two. x1, x2 ``(n, 2)``,
+    weights ``(B, n)`` -> ``(B, 3, 3)``."""
     return eight_point_of(PairMonomials(x1, x2), weights, rounds)
 
 
@@ -189,24 +146,8 @@ def hartley(moments: Tensor) -> Tensor:
 
 
 def affine_fundamental(x1: Tensor, x2: Tensor, weights: Tensor) -> Tensor:
-    r"""Affine epipolar geometry: the hyperplane of least squares of the points :math:`(x_2, x_1)` of four-space.
-
-    Args:
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative.
-
-    Returns:
-        ``(B, 3, 3)`` of norm 1, zero but for the last row and column.
-
-    Source: Shapiro, Zisserman and Brady 1995, 3D motion recovery via affine epipolar geometry.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> F = affine_fundamental(x1, x1 + torch.tensor([[1.0, 0.0]]) * x1[:, :1].square(), torch.ones(1, 9, dtype=torch.float64))
-        >>> (F / F[0, 1, 2]).round(decimals=6).abs()[0, 1].tolist()
-        [0.0, 0.0, 1.0]
-    """
+    r"""Affine epipolar geometry: the hyperplane of least squares of the points :math:`(x_2, x_1)` of four-space. x1, x2
+    ``(n, 2)``, weights ``(B, n)`` -> ``(B, 3, 3)``."""
     joint = torch.cat([x2, x1], dim=-1)
     total = weights.sum(-1, keepdim=True).clamp(min=TINY)
     centre = weights @ joint / total
@@ -232,19 +173,8 @@ per cent, where nobody looks."""
 
 
 def gradient_moments(moments: Tensor, noise: tuple[float, float] = (1.0, 1.0)) -> Tensor:
-    r"""Mean squared gradients of the epipolar constraint, as quadratic forms of F.
-
-    .. math:: f^T N f = \sum \sigma_1^2 |(F^T x_2)_{1,2}|^2 + \sigma_2^2 |(F x_1)_{1,2}|^2
-
-    Its entries are among those of the moments: the products of one camera's coordinates with the other's 1.
-
-    Args:
-        moments: ``(*batch, 9, 9)`` of :math:`x_2 \otimes x_1`, as :func:`dyntorch.numerics.lags.epipolar_moments` gives them.
-        noise: standard deviations of the coordinates of view 1 and view 2, in their units.
-
-    Returns:
-        ``(*batch, 9, 9)``; row and column 8 are 0.
-    """
+    r"""Mean squared gradients of the epipolar constraint, as quadratic forms of F. moments ``(*batch, 9, 9)`` ->
+    ``(*batch, 9, 9)``."""
     parts = moments.unflatten(-1, (3, 3)).unflatten(-3, (3, 3))  # x2, x1, x2, x1
     first = parts[..., 2, :, 2, :]  # x1 x1^T
     second = parts[..., :, 2, :, 2]  # x2 x2^T
@@ -256,36 +186,7 @@ def gradient_moments(moments: Tensor, noise: tuple[float, float] = (1.0, 1.0)) -
 
 def epipolar_variance(moments: Tensor, noise: tuple[float, float] = (1.0, 1.0)) -> tuple[Tensor, Tensor]:
     r"""The least ratio of squared epipolar residuals to their squared gradients, and the fundamental matrix that has it.
-
-    .. math:: \lambda = \min_f \frac{f^T M f}{f^T N f}
-
-    With isotropic noise the residual's variance is :math:`f^T N f`, so that the ratio is about the variance of the noise in
-    units of
-    ``noise``, whatever the scale and the place of the points; the plain smallest eigenvalue of M, which fixes :math:`|f| = 1`
-    instead, prefers where F costs little.  N has no entry for :math:`f_9`; it is eliminated, which centres the products.
-
-    Args:
-        moments: ``(*batch, 9, 9)``, sums or means; coordinates should be normalized.
-        noise: as in :func:`gradient_moments`.
-
-    Returns:
-        ``(*batch,)`` variances, infinite where there are no moments, and ``(*batch, 3, 3)`` fundamental matrices of norm 1
-        (rank 2 is not imposed), 0 there.
-
-    Source: Taubin 1991, Estimation of planar curves, surfaces and nonplanar space curves.
-
-    Example:
-        >>> import torch
-        >>> g = torch.Generator().manual_seed(0)
-        >>> space = torch.rand(50, 3, generator=g, dtype=torch.float64)
-        >>> x1, x2 = space[:, :2] / (2 + space[:, 2:]), space[:, :2] / (3 + space[:, :1])
-        >>> x1, x2 = x1 + 0.01 * torch.randn(50, 2, generator=g), x2 + 0.01 * torch.randn(50, 2, generator=g)
-        >>> one = torch.ones(50, 1)
-        >>> z = torch.einsum("ni,nj->nij", torch.cat([x2, one], 1), torch.cat([x1, one], 1)).flatten(1)
-        >>> variance, _ = epipolar_variance(z.T @ z)
-        >>> 0.007 < float(variance.sqrt()) < 0.013
-        True
-    """
+    moments ``(*batch, 9, 9)`` -> ``(*batch,)``."""
     total = moments[..., 8, 8]
     present = total > 0
     unit = torch.eye(9, dtype=moments.dtype, device=moments.device)
@@ -303,22 +204,8 @@ def epipolar_variance(moments: Tensor, noise: tuple[float, float] = (1.0, 1.0)) 
 
 
 def least_ratio(inner: Tensor, form: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The least :math:`f^T A f / f^T N f` of positive definite A and positive semidefinite N, by inverse iteration.
-
-    Args:
-        inner: ``(*batch, D, D)`` A.
-        form: ``(*batch, D, D)`` N.
-        present: ``(*batch,)`` bool: elsewhere there is nothing to find.
-
-    Returns:
-        ``(*batch,)`` ratios, infinite where there is none, and ``(*batch, D)`` unit vectors f, arbitrary there.
-
-    Example:
-        >>> import torch
-        >>> ratio, f = least_ratio(torch.diag(torch.tensor([2.0, 3.0])), torch.diag(torch.tensor([0.0, 2.0])), torch.tensor(True))
-        >>> float(ratio), f.abs().tolist()
-        (1.5, [0.0, 1.0])
-    """
+    r"""The least :math:`f^T A f / f^T N f` of positive definite A and positive semidefinite N, by inverse iteration. inner
+    ``(*batch, D, D)``, form ``(*batch, D, D)``, present ``(*batch,)`` -> ``(*batch,)``."""
     factor, failed = torch.linalg.cholesky_ex(inner)
     bad = ~present | (failed > 0)
     factor = torch.where(bad[..., None, None], torch.eye(inner.shape[-1], dtype=inner.dtype, device=inner.device), factor)
@@ -348,22 +235,7 @@ def _plane(device: torch.device) -> Tensor:
 
 
 def check_matches(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> None:
-    """Refuse what is not two views of the same points.
-
-    Args:
-        x1: ``(*batch, n, 2)`` points of view 1.
-        x2: ``(*batch, n, 2)`` points of view 2.
-        weights: ``(*batch, n)``; only its type is checked.
-
-    Raises:
-        ValueError: no tensors, no floating point numbers, or other shapes.
-
-    Example:
-        >>> check_matches([[1.0, 2.0]], [[1.0, 2.0]])
-        Traceback (most recent call last):
-            ...
-        ValueError: x1 must be a torch.Tensor, got list; use torch.as_tensor(...)
-    """
+    """Refuse what is not two views of the same points. x1 ``(*batch, n, 2)``, x2 ``(*batch, n, 2)``, weights ``(*batch, n)``."""
     for name, value in (("x1", x1), ("x2", x2), ("weights", x1 if weights is None else weights)):
         if not isinstance(value, Tensor):
             raise ValueError(f"{name} must be a torch.Tensor, got {type(value).__name__}; use torch.as_tensor(...)")
@@ -375,20 +247,8 @@ def check_matches(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> None
 
 
 def described(result: object, labels: Tensor, degenerate: Tensor, bodies: int) -> str:
-    """Shape, how many matches each label has, and how many problems are degenerate, in two lines.
-
-    Args:
-        result: whose class names it.
-        labels: ``(*batch, n)``, 0 = no body.
-        degenerate: ``(*batch,)`` bool.
-        bodies: largest label.
-
-    Example:
-        >>> import torch
-        >>> print(described(0, torch.tensor([1, 1, 2, 0]), torch.tensor(True), 2))
-        int(matches=4, bodies=2, batch=(): degenerate)
-          labels: 2 of body 1, 1 of body 2, 1 unlabelled
-    """
+    """Shape, how many matches each label has, and how many problems are degenerate, in two lines. labels ``(*batch, n)``,
+    degenerate ``(*batch,)``."""
     counts = labels.flatten().bincount(minlength=bodies + 1).tolist()
     state = "degenerate" if not degenerate.ndim else f"{int(degenerate.sum())} of {degenerate.numel()} degenerate"
     state = state if degenerate.ndim or bool(degenerate) else "not degenerate"

@@ -26,12 +26,7 @@ LEAST = 1e-100  # scale, whose square still has an inverse
 
 @dataclass(frozen=True)
 class Frames:
-    r"""Matrices of rank two and norm 1, :math:`F = U\,\mathrm{diag}(B, 0)\,V^T`, in a chart without singularities.
-
-    The seven parameters turn the two null vectors (two each, :math:`\exp [\omega]_\times` to second order) and move the 2 x 2
-    matrix B on its sphere (three): as a quaternion, to which a step multiplies another.  So equal singular values are nothing
-    special, and no angle of B has to be found.
-    """
+    r"""Matrices of rank two and norm 1, :math:`F = U\,\mathrm{diag}(B, 0)\,V^T`, in a chart without singularities."""
 
     turns: Tensor  # (b, 2, 3, 3): U and V
     core: Tensor  # (b, 4): B, of norm 1
@@ -70,11 +65,7 @@ class Frames:
 
 @constant
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """What is linear in the parts of frames.
-
-    Tangents ``(4, 63)`` of B, steps to quaternions ``(7, 12)``, products of quaternions to rotations ``(16, 9)``, and of B and a
-    quaternion to the new B ``(16, 4)``; and three quaternions ``(12,)`` that turn nothing.
-    """
+    """What is linear in the parts of frames."""
     # B = (b0, b1, b2, b3) times 1, i, j, k: an orthonormal basis, as (unit, new entry, old entry)
     units = torch.zeros(4, 4, 4, dtype=dtype)
     for unit, code in enumerate(("+0+1+2+3", "-1+0-3+2", "-2+3+0-1", "-3-2+1+0")):
@@ -108,32 +99,8 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, T
 
 
 def descend(F: Tensor, x1: Tensor, x2: Tensor, weights: Tensor, scale: float, steps: int = 3) -> Tensor:
-    r"""Levenberg-Marquardt steps towards the least truncated Sampson distance:
-
-    .. math:: \min_{\operatorname{rank} F = 2} \sum_i w_i \min(r_i^2 / T^2,\ 2.25), \qquad r = \text{Sampson distance}.
-
-    A step weighs the matches by :math:`w\,\mathrm{clip}(1 - r^2 / (2.25\,T^2), 0, 1)` and is taken if the sum falls.
-
-    Args:
-        F: ``(B, 3, 3)`` starts of any scale.
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative.
-        scale: T, in the unit of the matches.
-        steps: number of steps, the refused ones included.
-
-    Returns:
-        ``(B, 3, 3)`` of norm 1 and rank two, at no higher cost than the nearest such matrices to the starts.
-
-    Example:
-        >>> import torch
-        >>> from dyntorch.geometry.epipolar import sampson_squared
-        >>> x1 = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> x2 = x1 + torch.tensor([1.0, 0.0]) * torch.rand(20, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        >>> start = torch.tensor([[[0.0, 0.01, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.02]]], dtype=torch.float64)
-        >>> F = descend(start, x1, x2, torch.ones(1, 20, dtype=torch.float64), scale=0.1, steps=6)
-        >>> bool(sampson_squared(F, x1, x2).max() < 1e-12)
-        True
-    """
+    r"""Levenberg-Marquardt steps towards the least truncated Sampson distance: F ``(B, 3, 3)``, x1, x2 ``(n, 2)``, weights
+    ``(B, n)`` -> ``(B, 3, 3)``."""
     return _descend(PairMonomials(x1, x2), F, weights, (scale,), steps)[0]
 
 
@@ -197,11 +164,7 @@ def _msac(value: Tensor, square: Tensor, weights: Tensor, inverse: float) -> Ten
 
 
 class Products:
-    """Products of the monomials, whose weighted sums over the matches give the normal equations.
-
-    A step then needs three weights per match, and one product of matrices as wide as the matches are many; the Jacobian, seven
-    numbers per match, is never formed (microseconds per step and fit, 300 matches, 400 fits: 14 instead of 22).
-    """
+    """Products of the monomials, whose weighted sums over the matches give the normal equations."""
 
     def __init__(self, data: PairMonomials) -> None:
         """Of the matches of ``data``."""
@@ -239,12 +202,7 @@ def _pairs(device: torch.device) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, T
 def _normal_equations(
     tables: Products, frames: Frames, f: Tensor, value: Tensor, square: Tensor, weights: Tensor, inverse: float
 ) -> tuple[Tensor, Tensor]:
-    r"""Gauss-Newton matrix ``(b, 7, 7)`` and gradient ``(b, 7)`` of the weighted distances :math:`r = e / g`.
-
-    .. math:: dr = \frac{1}{g} \Big(de - \frac{e}{g^2} \frac{d(g^2)}{2}\Big)
-
-    The gradient needs no sum over the matches of its own, as e is linear in F as well.
-    """
+    r"""Gauss-Newton matrix ``(b, 7, 7)`` and gradient ``(b, 7)`` of the weighted distances :math:`r = e / g`."""
     ratio = value / square
     a = (weights * (1 - (value * ratio).mul_(inverse / CAP)).clamp_(min=0)).div_(square)
     b = a * ratio
@@ -258,32 +216,8 @@ def _normal_equations(
 def fit_fundamental(
     x1: Tensor, x2: Tensor, weights: Tensor, scales: Sequence[float], starts: Tensor | None = None, steps: int = 3
 ) -> tuple[Tensor, Tensor]:
-    r"""The best of several descents: from the linear fit, from the affine one, and from given matrices.
-
-    Every start takes ``steps`` steps at each of the scales, from coarse to fine, and the least truncated cost at the last one,
-    :math:`\sum_i w_i \min(r_i^2 / T^2,\ 2.25)`, wins; a given start is never made worse.
-
-    Args:
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative.
-        scales: T of each round, in the unit of the matches.
-        starts: ``(B, S, 3, 3)`` further starts.
-        steps: per scale.
-
-    Returns:
-        F ``(B, 3, 3)`` of norm 1 and rank two, and its cost ``(B,)``.
-
-    Raises:
-        ValueError: no scale, or one that is not positive.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> x2 = x1 + torch.tensor([1.0, 0.0]) * torch.rand(20, 1, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-        >>> F, cost = fit_fundamental(x1, x2, torch.ones(1, 20, dtype=torch.float64), scales=(0.06, 0.02))
-        >>> bool(cost < 1e-12)
-        True
-    """
+    r"""The best of several descents: from the linear fit, from the affine one, and from given matrices. x1, x2 ``(n, 2)``,
+    weights ``(B, n)``, starts ``(B, S, 3, 3)`` -> ``(B, 3, 3)``."""
     if not scales or min(scales) <= 0:
         raise ValueError(
             f"scales must be positive thresholds in the unit of the matches, got {tuple(scales)}: pass e.g. (0.02, 0.01)"
@@ -314,26 +248,8 @@ SAMPLES_BLOCK = 4096
 
 
 def seven_point(x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Fundamental matrices of seven matches each: :math:`x_2^T F x_1 = 0,\ \det F = 0`, one or three of them.
-
-    Args:
-        x1, x2: ``(*batch, 7, 2)``.
-
-    Returns:
-        F ``(*batch, 3, 3, 3)`` of norm 1, zero where there is none, and which exist ``(*batch, 3)``.
-
-    Raises:
-        ValueError: not seven matches.
-
-    Source: Hartley and Zisserman, Multiple View Geometry, section 11.1.2.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(7, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> F, valid = seven_point(x1, x1 + torch.tensor([0.1, 0.0]) * x1.square())
-        >>> F.shape, int(valid.sum()) in (1, 3)
-        (torch.Size([3, 3, 3]), True)
-    """
+    r"""Fundamental matrices of seven matches each: :math:`x_2^T F x_1 = 0,\ \det F = 0`, one or three of them. x1, x2
+    ``(*batch, 7, 2)`` -> ``(*batch, 3, 3, 3)``."""
     if x1.shape[-2:] != (7, 2) or x2.shape != x1.shape:
         raise ValueError(f"x1 and x2 must be (*batch, 7, 2), got {tuple(x1.shape)} and {tuple(x2.shape)}")
     design = torch.nan_to_num(bilinear(x1, x2)).mT
@@ -348,25 +264,8 @@ def seven_point(x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
 def sample_fundamentals(
     x1: Tensor, x2: Tensor, weights: Tensor, samples: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Fundamental matrices of samples of seven matches, drawn without replacement, with probabilities by weight.
-
-    Args:
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative: the pools.
-        samples: per pool.
-        generator: source of all randomness.
-
-    Returns:
-        F ``(B, 3 samples, 3, 3)`` of norm 1, zero where there is none, and which exist ``(B, 3 samples)``: none in a pool of
-        fewer than seven matches.
-
-    Example:
-        >>> import torch
-        >>> x = torch.rand(2, 20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> F, valid = sample_fundamentals(x[0], x[1], torch.ones(4, 20, dtype=torch.float64), 5, torch.Generator().manual_seed(0))
-        >>> F.shape, valid.shape
-        (torch.Size([4, 15, 3, 3]), torch.Size([4, 15]))
-    """
+    """Fundamental matrices of samples of seven matches, drawn without replacement, with probabilities by weight. x1, x2
+    ``(n, 2)``, weights ``(B, n)`` -> ``(B, 3 samples, 3, 3)``."""
     chosen = draw(weights, 7, samples, generator)
 
     def block(chosen: Tensor) -> tuple[Tensor, Tensor]:
@@ -378,11 +277,7 @@ def sample_fundamentals(
 
 
 def draw(weights: Tensor, size: int, samples: int, generator: torch.Generator | None = None) -> Tensor:
-    """Indices ``(B, samples, size)`` drawn without replacement, one after the other, with probabilities by weight.
-
-    Each draw is a position on the line of cumulated weights from which the stretches drawn before are cut out.  The random keys
-    of ``torch.multinomial`` cost n numbers per sample.  Repeats occur only where fewer weights than ``size`` are positive.
-    """
+    """Indices ``(B, samples, size)`` drawn without replacement, one after the other, with probabilities by weight."""
     ends = weights.double().cumsum(-1)
     numbers = uniform(len(weights), samples, size, generator=generator, device=weights.device)
     left = ends[:, -1:].clone().expand(-1, samples)
@@ -416,10 +311,7 @@ def _pencil(one: Tensor, two: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _roots(c3: Tensor, c2: Tensor, c1: Tensor, c0: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors ``(*batch, 3, 2)`` at which a binary cubic is 0, and which of them are real ``(*batch, 3)``.
-
-    The form is turned by 0, 45, 90 or 135 degrees to a large leading coefficient, so that no root is near infinity.
-    """
+    """Unit vectors ``(*batch, 3, 2)`` at which a binary cubic is 0, and which of them are real ``(*batch, 3)``."""
     plus, minus = c3 + c1, c2 + c0
     size = torch.stack([c3, 0.5**1.5 * (plus + minus), c0, 0.5**1.5 * (plus - minus)], dim=-1).abs()
     turn = (pi / 4) * size.argmax(-1).to(c3.dtype)

@@ -30,28 +30,8 @@ class JointEpipoles:
 
 
 def epipoles(projections: Sequence[Tensor]) -> Tensor:
-    r"""Images of centres that are points: :math:`e_{ij} = M_i c_j,\ M_j c_j = 0`.
-
-    Two views of points of the plane that move in one direction are :math:`P^3 \to P^2`, and have the two epipoles of their
-    :math:`3 \times 3` tensor.
-
-    Args:
-        projections: v projections ``(*batch, m, m + 1)``.
-
-    Returns:
-        ``(*batch, v, v, m)`` unit vectors, view i (row) and the centre of view j; zero for i = j, and where the views share it.
-
-    Raises:
-        ValueError: no projections with a point for centre, or of different shapes.
-
-    Source: thesis sections 3 and 10.1.
-
-    Example:
-        >>> import torch
-        >>> first, second = torch.eye(3, 4), torch.eye(3, 4).roll(1, 1)  # centres (0, 0, 0, 1) and (1, 0, 0, 0)
-        >>> epipoles([first, second])[0, 1].abs().tolist(), epipoles([first, second])[1, 0].abs().tolist()
-        ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    """
+    r"""Images of centres that are points: :math:`e_{ij} = M_i c_j,\ M_j c_j = 0`. projections ``(*batch, m, m + 1)`` ->
+    ``(*batch, v, v, m)``."""
     shapes = {tuple(m.shape[-2:]) for m in projections}
     if len(shapes) != 1 or next(iter(shapes))[0] + 1 != next(iter(shapes))[1]:
         raise ValueError(f"projections must all be (*batch, m, m + 1), whose centre is a point; got {sorted(shapes)}")
@@ -106,38 +86,7 @@ def joint_epipoles(projections: Sequence[Tensor]) -> JointEpipoles:
 
 
 def joint_epipoles_of_tensor(tensor: Tensor) -> JointEpipoles:
-    r"""The joint epipoles of a Grassmann tensor of profile (2, 2, 1), without its projections.
-
-    As a map of two points, :math:`l_k\, p^i p'^j A_{ij}{}^k = 0` where l passes through the third image.  A slice
-    :math:`p^i A_i` is a homography from view 2 to view 3 through the plane that p back-projects to.  All these planes meet the
-    centre :math:`L_1`, so the slices agree, up to scale, on the line :math:`\psi = M_2 L_1`: they share a generalized
-    eigenspace.  The same holds in view 1 for :math:`\varphi = M_1 L_2`.  Hence
-
-    .. math:: A(p, p') = (\varphi \cdot p)\, B\, p' + (\psi \cdot p')\, C\, p, \qquad
-              \det A(p, \cdot) = (\varphi \cdot p)^2\ (\chi \cdot p), \quad \chi = M_1 L_3:
-
-    the null vectors of slices over view 3 lie on :math:`\varphi` and :math:`\psi`, three determinants give :math:`\chi`.
-
-    Args:
-        tensor: ``(*batch, 3, 3, 3)`` of :func:`~dyntorch.geometry.grassmann.grassmann_tensor`, any scale, best in normalized
-            image coordinates.
-
-    Returns:
-        epipoles, lines and definedness, here of the angles in the given coordinates.
-
-    Raises:
-        ValueError: not 3 x 3 x 3.
-
-    Source: thesis section 10.1; the slices are those of the trilinear tensor.
-
-    Example:
-        >>> import torch
-        >>> from dyntorch.geometry.grassmann import grassmann_tensor
-        >>> M = torch.randn(3, 3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> found = joint_epipoles_of_tensor(grassmann_tensor(M, (2, 2, 1)))
-        >>> bool(torch.allclose(found.epipoles, joint_epipoles(M).epipoles))
-        True
-    """
+    r"""The joint epipoles of a Grassmann tensor of profile (2, 2, 1), without its projections. tensor ``(*batch, 3, 3, 3)``."""
     if tensor.shape[-3:] != (3, 3, 3):
         raise ValueError(f"tensor must be (*batch, 3, 3, 3), of profile (2, 2, 1), got {tuple(tensor.shape)}")
     # pairs of rows -> points, in both views

@@ -14,22 +14,7 @@ from dyntorch.numerics.nullspace import null_space
 
 
 def levi_civita(n: int, *, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
-    r"""The alternating tensor :math:`\epsilon_{i_1 \dots i_n}`: the sign of the permutation, 0 where an index repeats.
-
-    Args:
-        n: its order and size, 1 to 6.
-
-    Returns:
-        ``(n, ..., n)`` with ``n`` dimensions.  The tensor is cached and shared: do not write into it.
-
-    Raises:
-        ValueError: ``n`` outside 1 to 6 (n^n entries).
-
-    Example:
-        >>> e = levi_civita(3)
-        >>> float(e[0, 1, 2]), float(e[1, 0, 2]), float(e[0, 0, 2])
-        (1.0, -1.0, 0.0)
-    """
+    r"""The alternating tensor :math:`\epsilon_{i_1 \dots i_n}`: the sign of the permutation, 0 where an index repeats."""
     if not 1 <= n <= 6:
         raise ValueError(f"n must be 1 to 6, got {n}")
     return _levi_civita(n, dtype, torch.empty(0, device=device).device)
@@ -49,28 +34,8 @@ def _parity(order: tuple[int, ...]) -> int:
 
 
 def compound(matrix: Tensor, order: int) -> Tensor:
-    r"""The compound matrix :math:`C_k(A)`: all minors of order k, rows and columns in lexicographic order.
-
-    It is how a collineation acts on extensors, :math:`C_k(A)\,(p_1 \wedge \dots \wedge p_k) = A p_1 \wedge \dots \wedge A p_k`,
-    so that :math:`C_k(AB) = C_k(A)\,C_k(B)` (Cauchy-Binet).
-
-    Args:
-        matrix: ``(*batch, r, c)``.
-        order: k, from 1 to ``min(r, c)``.
-
-    Returns:
-        ``(*batch, binomial(r, k), binomial(c, k))``.  Polynomials of the entries (Laplace), so gradients are exact at any rank.
-
-    Raises:
-        ValueError: an order for which there are no minors.
-
-    Source: thesis section 8.4 (the compound of A maps lines).
-
-    Example:
-        >>> import torch
-        >>> compound(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), 2).tolist()
-        [[-2.0]]
-    """
+    r"""The compound matrix :math:`C_k(A)`: all minors of order k, rows and columns in lexicographic order. matrix
+    ``(*batch, r, c)`` -> ``(*batch, binomial(r, k), binomial(c, k))``."""
     if matrix.ndim < 2 or not 1 <= order <= min(matrix.shape[-2:]):
         raise ValueError(f"order must be 1 to min(rows, columns) of the matrix, got {order} for {tuple(matrix.shape)}")
     result = matrix
@@ -93,11 +58,7 @@ def _expand(matrix: Tensor, smaller: Tensor, order: int) -> Tensor:
 
 @constant
 def _laplace(n: int, order: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Index tables of a Laplace expansion of the minors of ``order`` among ``n`` lines.
-
-    For every combination: its first line, where the rest stands among the smaller combinations, and, for each j, its j-th
-    line ``(order, count)`` and where the combination without it stands ``(order, count)``.
-    """
+    """Index tables of a Laplace expansion of the minors of ``order`` among ``n`` lines."""
     place = {c: i for i, c in enumerate(combinations(range(n), order - 1))}
     sets = list(combinations(range(n), order))
     taken = [[c[j] for c in sets] for j in range(order)]
@@ -107,25 +68,8 @@ def _laplace(n: int, order: int, device: torch.device) -> tuple[Tensor, Tensor, 
 
 
 def join(*points: Tensor) -> Tensor:
-    r"""The extensor :math:`p_1 \wedge \dots \wedge p_k` that the points span: their k-minors in lexicographic order.
-
-    Two points give the Pluecker coordinates :math:`p_i q_j - p_j q_i` of their line, in space in the order 01, 02, 03, 12,
-    13, 23; ``d + 1`` points give their determinant.  It is 0 where the points are dependent.
-
-    Args:
-        points: k tensors ``(*batch, d + 1)``, homogeneous, k from 1 to ``d + 1``; batch dimensions broadcast.
-
-    Returns:
-        ``(*batch, binomial(d + 1, k))``.
-
-    Raises:
-        ValueError: no points, more than ``d + 1``, or of different dimensions.
-
-    Example:
-        >>> import torch
-        >>> join(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0])).tolist()
-        [1.0, 0.0, 0.0]
-    """
+    r"""The extensor :math:`p_1 \wedge \dots \wedge p_k` that the points span: their k-minors in lexicographic order. points
+    ``(*batch, d + 1)`` -> ``(*batch, binomial(d + 1, k))``."""
     sizes = sorted({p.shape[-1] for p in points})
     if len(sizes) != 1 or len(points) > sizes[0]:
         raise ValueError(f"join takes 1 to d + 1 points (*batch, d + 1), got {len(points)} of sizes {sizes}")
@@ -134,23 +78,7 @@ def join(*points: Tensor) -> Tensor:
 
 def dual(extensor: Tensor, size: int, step: int) -> Tensor:
     r"""The complementary extensor: :math:`e_S \mapsto \pm e_{\bar S}`, with the sign of the permutation :math:`(S, \bar S)`.
-
-    Args:
-        extensor: ``(*batch, binomial(size, step))``, lexicographic.
-        size: number of homogeneous coordinates, ``d + 1``.
-        step: number of points (or hyperplanes) the extensor was joined from, 0 to ``size``.
-
-    Returns:
-        ``(*batch, binomial(size, size - step))``.
-
-    Raises:
-        ValueError: a step outside 0 to ``size``, or the length is not the binomial coefficient.
-
-    Example:
-        >>> import torch
-        >>> dual(torch.tensor([1.0, 2.0, 3.0]), 3, 2).tolist()
-        [3.0, -2.0, 1.0]
-    """
+    extensor ``(*batch, binomial(size, step))`` -> ``(*batch, binomial(size, size - step))``."""
     check_extensor(extensor, size, step)
     # lexicographic order reverses under taking complements
     return (extensor * _dual_signs(size, step, extensor.device).to(extensor.dtype)).flip(-1)
@@ -171,24 +99,7 @@ def _dual_signs(size: int, step: int, device: torch.device) -> Tensor:
 
 def meet(*hyperplanes: Tensor) -> Tensor:
     r"""The extensor of the intersection of hyperplanes: :math:`h_1 \cap \dots \cap h_k = *(h_1 \wedge \dots \wedge h_k)`.
-
-    Two lines of the plane give their common point (the cross product), two planes of space the Pluecker coordinates of
-    their line, three planes their point.  It is 0 where the hyperplanes are dependent.
-
-    Args:
-        hyperplanes: k tensors ``(*batch, d + 1)``, k from 1 to ``d``; batch dimensions broadcast.
-
-    Returns:
-        ``(*batch, binomial(d + 1, d + 1 - k))``, up to scale a :func:`join` of points of the intersection.
-
-    Raises:
-        ValueError: no hyperplanes, more than ``d``, or of different dimensions.
-
-    Example:
-        >>> import torch
-        >>> meet(torch.tensor([1.0, 0.0, -2.0]), torch.tensor([0.0, 1.0, -3.0])).tolist()
-        [2.0, 3.0, 1.0]
-    """
+    hyperplanes ``(*batch, d + 1)`` -> ``(*batch, binomial(d + 1, d + 1 - k))``."""
     sizes = sorted({h.shape[-1] for h in hyperplanes})
     if len(sizes) != 1 or len(hyperplanes) >= sizes[0]:
         raise ValueError(f"meet takes 1 to d hyperplanes (*batch, d + 1), got {len(hyperplanes)} of sizes {sizes}")
@@ -197,21 +108,7 @@ def meet(*hyperplanes: Tensor) -> Tensor:
 
 def plucker(points: Tensor) -> Tensor:
     r"""Pluecker coordinates of lines given by two points: :math:`l = (P, 1) \wedge (Q, 1)`, order 01, 02, 03, 12, 13, 23.
-
-    Args:
-        points: ``(*batch, n, 2, 3)`` inhomogeneous.
-
-    Returns:
-        ``(*batch, n, 6)``; the direction of the line, negated, is in 03, 13, 23.
-
-    Raises:
-        ValueError: not two points of space per line.
-
-    Example:
-        >>> import torch
-        >>> plucker(torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])).tolist()
-        [[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]]
-    """
+    points ``(*batch, n, 2, 3)`` -> ``(*batch, n, 6)``."""
     if points.shape[-2:] != (2, 3):
         raise ValueError(f"points must be (*batch, n, 2, 3), two points of each line, got {tuple(points.shape)}")
     first, second = homogeneous(points).unbind(-2)
@@ -219,17 +116,7 @@ def plucker(points: Tensor) -> Tensor:
 
 
 def plucker_form(*, dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
-    r"""The symmetric form J of lines: :math:`l_1^T J l_2 = \det[P_1, Q_1, P_2, Q_2]`, 0 iff the two lines meet.
-
-    Returns:
-        ``(6, 6)``, its own inverse; :math:`C_2(A)^T J\, C_2(A) = \det(A)\, J`.
-
-    Example:
-        >>> import torch
-        >>> l = plucker(torch.rand(1, 2, 3, dtype=torch.float64))[0]
-        >>> abs(float(l @ plucker_form() @ l)) < 1e-12
-        True
-    """
+    r"""The symmetric form J of lines: :math:`l_1^T J l_2 = \det[P_1, Q_1, P_2, Q_2]`, 0 iff the two lines meet."""
     signs = torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0, 1.0], dtype=dtype, device=device)
     return torch.diag(signs).flip(-1)
 
@@ -241,30 +128,8 @@ def plucker_form(*, dtype: torch.dtype = torch.float64, device: torch.device | s
 
 
 def wedge(left: Tensor, right: Tensor, size: int, steps: tuple[int, int]) -> Tensor:
-    r"""The join of two extensors, :math:`(A \vee B)_K = \sum_{I \cup J = K} \mathrm{sign}(I, J)\, A_I B_J`.
-
-    It spans both subspaces, and is 0 iff they meet.  :math:`A \vee B = (-1)^{ab} B \vee A`.
-
-    Args:
-        left: ``(*batch, binomial(size, a))``, lexicographic.
-        right: ``(*batch, binomial(size, b))``; batch dimensions broadcast.
-        size: number of homogeneous coordinates n.
-        steps: a and b, with :math:`a + b \le n`.
-
-    Returns:
-        ``(*batch, binomial(size, a + b))``.  A polynomial of the entries: derivatives of any order and mode exist everywhere.
-
-    Raises:
-        ValueError: steps that do not fit into the space, or extensors of another length.
-
-    Source: Barnabei, Brini and Rota 1985.
-
-    Example:
-        >>> import torch
-        >>> point, line = torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])  # e_0, and e_1 v e_2
-        >>> wedge(point, line, 3, (1, 2)).tolist()
-        [1.0]
-    """
+    r"""The join of two extensors, :math:`(A \vee B)_K = \sum_{I \cup J = K} \mathrm{sign}(I, J)\, A_I B_J`. left
+    ``(*batch, binomial(size, a))``, right ``(*batch, binomial(size, b))`` -> ``(*batch, binomial(size, a + b))``."""
     for extensor, step in zip((left, right), steps, strict=True):
         check_extensor(extensor, size, step)
     if sum(steps) > size:
@@ -274,36 +139,8 @@ def wedge(left: Tensor, right: Tensor, size: int, steps: tuple[int, int]) -> Ten
 
 
 def regressive(left: Tensor, right: Tensor, size: int, steps: tuple[int, int]) -> Tensor:
-    r"""The meet of two extensors, the regressive product: :math:`*(A \wedge B) = *A \vee *B`.
-
-    It spans the intersection of both subspaces where together they span the space, and is 0 where they do not: planes of
-    P^4 that share a line, say.  With :math:`c = a + b - n`
-
-    .. math:: A \wedge B = (-1)^{c (n - c)}\, {*({*A} \vee {*B})} = (-1)^{(n - a)(n - b)}\, B \wedge A,
-
-    which is associative, agrees without a sign with :func:`~dyntorch.geometry.extensors.meet` of hyperplanes, and for c = 0 is
-    the scalar :math:`A \vee B`.
-
-    Args:
-        left: ``(*batch, binomial(size, a))``, lexicographic.
-        right: ``(*batch, binomial(size, b))``; batch dimensions broadcast.
-        size: number of homogeneous coordinates n.
-        steps: a and b, with :math:`a + b \ge n`.
-
-    Returns:
-        ``(*batch, binomial(size, a + b - size))``, a polynomial of the entries.
-
-    Raises:
-        ValueError: steps too small to meet in general position, or extensors of another length.
-
-    Source: Barnabei, Brini and Rota 1985.
-
-    Example:
-        >>> import torch
-        >>> floor, wall = torch.tensor([1.0, 0.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 0.0, 1.0])  # e_0 e_1 e_2 and e_1 e_2 e_3
-        >>> regressive(floor, wall, 4, (3, 3)).int().tolist()  # the line e_1 v e_2
-        [0, 0, 0, 1, 0, 0]
-    """
+    r"""The meet of two extensors, the regressive product: :math:`*(A \wedge B) = *A \vee *B`. left
+    ``(*batch, binomial(size, a))``, right ``(*batch, binomial(size, b))`` -> ``(*batch, binomial(size, a + b - size))``."""
     for extensor, step in zip((left, right), steps, strict=True):
         check_extensor(extensor, size, step)
     c = sum(steps) - size
@@ -315,49 +152,16 @@ def regressive(left: Tensor, right: Tensor, size: int, steps: tuple[int, int]) -
 
 
 def extensor_of(basis: Tensor) -> Tensor:
-    r"""The extensor of a subspace: the join of its basis, all minors of order a.
-
-    Args:
-        basis: ``(*batch, a, n)``, one vector per row, a from 1 to n.
-
-    Returns:
-        ``(*batch, binomial(n, a))``, lexicographic; another basis of the subspace only scales it, and it is 0 where the rows
-        are dependent.
-
-    Raises:
-        ValueError: no rows, or more rows than columns.
-
-    Example:
-        >>> import torch
-        >>> extensor_of(torch.tensor([[1.0, 2.0, 0.0], [0.0, 1.0, 3.0]])).tolist()
-        [1.0, 3.0, 6.0]
-    """
+    r"""The extensor of a subspace: the join of its basis, all minors of order a. basis ``(*batch, a, n)`` ->
+    ``(*batch, binomial(n, a))``."""
     if basis.ndim < 2 or not 1 <= basis.shape[-2] <= basis.shape[-1]:
         raise ValueError(f"basis must be (*batch, a, n) with 1 <= a <= n, got {tuple(basis.shape)}")
     return join(*basis.unbind(-2))
 
 
 def subspace_of(extensor: Tensor, size: int, step: int) -> Tensor:
-    r"""The subspace of an extensor: all u with :math:`A \vee u = 0`, in the least squares sense where A is no join.
-
-    Args:
-        extensor: ``(*batch, binomial(size, step))``, lexicographic, of any scale; not 0, for which every subspace would do.
-        size: number of homogeneous coordinates n.
-        step: dimension of the subspace, 1 to ``size``.
-
-    Returns:
-        ``(*batch, step, size)`` orthonormal rows, NaN where the extensor is not finite.  Differentiable.  Rounding may decide
-        which of the bases it is.
-
-    Raises:
-        ValueError: a step that is no dimension of a subspace, or an extensor of another length.
-
-    Example:
-        >>> import torch
-        >>> line = extensor_of(torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0]], dtype=torch.float64))
-        >>> subspace_of(line, 4, 2).square().sum(-2).round(decimals=6).tolist()
-        [1.0, 0.0, 1.0, 0.0]
-    """
+    r"""The subspace of an extensor: all u with :math:`A \vee u = 0`, in the least squares sense where A is no join. extensor
+    ``(*batch, binomial(size, step))`` -> ``(*batch, step, size)``."""
     if not 1 <= step <= size:
         raise ValueError(f"step must be 1 to {size}, the number of coordinates, got {step}")
     check_extensor(extensor, size, step)
@@ -385,19 +189,8 @@ def _splits(size: int, a: int, b: int, device: torch.device) -> tuple[Tensor, Te
 
 
 def adjugate(matrix: Tensor) -> Tensor:
-    r"""The adjugate, :math:`A\,\mathrm{adj}(A) = \det(A)\, I`: the inverse up to scale, finite and smooth at any rank.
-
-    Args:
-        matrix: ``(*batch, n, n)``, n from 2 to 4 in this library.
-
-    Returns:
-        ``(*batch, n, n)``, polynomials of the entries.
-
-    Example:
-        >>> import torch
-        >>> adjugate(torch.tensor([[1.0, 2.0], [3.0, 4.0]])).tolist()
-        [[4.0, -2.0], [-3.0, 1.0]]
-    """
+    r"""The adjugate, :math:`A\,\mathrm{adj}(A) = \det(A)\, I`: the inverse up to scale, finite and smooth at any rank. matrix
+    ``(*batch, n, n)`` -> ``(*batch, n, n)``."""
     n = matrix.shape[-1]
     # minors in lexicographic order: the last one is without the first row
     minors = compound(matrix, n - 1).flip(-1, -2)
@@ -406,56 +199,22 @@ def adjugate(matrix: Tensor) -> Tensor:
 
 
 def project(matrix: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Images :math:`y = \pi(A (x, 1))` of points, and the Jacobian :math:`\partial y / \partial x` of each.
-
-    Args:
-        matrix: ``(*batch, e + 1, d + 1)`` collineation or projection of any scale and sign.
-        points: ``(*batch, n, d)``.
-
-    Returns:
-        ``(*batch, n, e)``, images at infinity as in :func:`~dyntorch.geometry.homogeneous.inhomogeneous`, and
-        ``(*batch, n, e, d)``.
-
-    Example:
-        >>> import torch
-        >>> camera = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-        >>> image, jacobian = project(camera, torch.tensor([[6.0, 2.0]]))
-        >>> image.tolist(), jacobian.tolist()
-        ([[3.0]], [[[0.5, -1.5]]])
-    """
+    r"""Images :math:`y = \pi(A (x, 1))` of points, and the Jacobian :math:`\partial y / \partial x` of each. matrix
+    ``(*batch, e + 1, d + 1)``, points ``(*batch, n, d)`` -> ``(*batch, n, e)``."""
     return dehomogenized(points @ matrix[..., :-1].mT + matrix[..., None, :, -1], matrix[..., None, :, :-1])
 
 
 def dehomogenized(p: Tensor, derivative: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Points :math:`\pi(p)` and the derivative of their coordinates.
-
-    Args:
-        p: ``(*batch, n, e + 1)`` homogeneous points of any scale.
-        derivative: ``(*batch, n, e + 1, d)`` of p, at the same scale; multiples of p in it do not matter.
-
-    Returns:
-        ``(*batch, n, e)`` and ``(*batch, n, e, d)``.
-    """
+    r"""Points :math:`\pi(p)` and the derivative of their coordinates. p ``(*batch, n, e + 1)``, derivative
+    ``(*batch, n, e + 1, d)`` -> ``(*batch, n, e)``."""
     depth = finite_depth(p)
     y = p[..., :-1] / depth
     return y, (derivative[..., :-1, :] - y[..., :, None] * derivative[..., -1:, :]) / depth[..., None]
 
 
 def back_project(matrix: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Positions :math:`\pi(A^{-1} (x, 1))` of what a sensor measured, and their Jacobians, by way of the adjugate.
-
-    Args:
-        matrix: ``(*batch, d + 1, d + 1)`` world to sensor, of any scale and sign.
-        x: ``(*batch, n, d)`` measurements.
-
-    Returns:
-        ``(*batch, n, d)`` and ``(*batch, n, d, d)``.
-
-    Example:
-        >>> import torch
-        >>> back_project(torch.diag(torch.tensor([2.0, 4.0, 1.0])), torch.tensor([[2.0, 4.0]]))[0].tolist()
-        [[1.0, 1.0]]
-    """
+    r"""Positions :math:`\pi(A^{-1} (x, 1))` of what a sensor measured, and their Jacobians, by way of the adjugate. matrix
+    ``(*batch, d + 1, d + 1)``, x ``(*batch, n, d)`` -> ``(*batch, n, d)``."""
     return project(adjugate(matrix), x)
 
 
@@ -468,31 +227,8 @@ TRIPLES = ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3))
 
 
 def compound_root(matrix: Tensor) -> Tensor:
-    r"""The collineation whose second compound matrix is given up to scale: :math:`\Lambda = c\, C_2(A)`.
-
-    Row (i, j) of the compound matrix is the line through the rows i and j of A, taken as points.  Row i of A is thus the
-    common point :math:`a_i` of three lines, up to a scale :math:`\rho_i`.  These scales follow from
-
-    .. math:: k_{ij} = \langle a_i \wedge a_j, \Lambda_{ij} \rangle / \|a_i \wedge a_j\|^2 = c\, \rho_i \rho_j :
-
-    the sign of c is that of :math:`k_{ij} k_{jl} k_{il}`, the rest is linear in the logarithms.
-
-    Args:
-        matrix: ``(*batch, 6, 6)`` of any scale and sign; with noise least squares in each step.
-
-    Returns:
-        ``(*batch, 4, 4)`` A of norm 1 and canonical sign; 0 for a matrix that is 0 or not finite.
-
-    Raises:
-        ValueError: another shape.
-
-    Source: thesis section 8.4; the scales and signs, without which the rows are no collineation, are derived here.
-
-    Example:
-        >>> import torch
-        >>> compound_root(-3 * torch.eye(6)).diagonal().tolist()
-        [0.5, 0.5, 0.5, 0.5]
-    """
+    r"""The collineation whose second compound matrix is given up to scale: :math:`\Lambda = c\, C_2(A)`. matrix
+    ``(*batch, 6, 6)`` -> ``(*batch, 4, 4)``."""
     if matrix.ndim < 2 or matrix.shape[-2:] != (6, 6):
         raise ValueError(f"matrix must be (*batch, 6, 6), got {tuple(matrix.shape)}")
     good = (matrix.isfinite().flatten(-2).all(-1) & (matrix.abs().amax((-1, -2)) > 0))[..., None, None]
@@ -503,16 +239,8 @@ def compound_root(matrix: Tensor) -> Tensor:
 
 
 def compound_rows(lines: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    r"""The rows of a matrix, up to a scale each, from its second compound matrix, up to scale as well.
-
-    Args:
-        lines: ``(*batch, size (size - 1) / 2, 6)``, the lines that pairs of rows span, in lexicographic order.
-        size: number of rows.
-
-    Returns:
-        rows :math:`a_i` of norm 1 ``(*batch, size, 4)``, and :math:`k_{ij} = \langle a_i \wedge a_j, \Lambda_{ij} \rangle /
-        \|a_i \wedge a_j\|^2`, one for each line.
-    """
+    r"""The rows of a matrix, up to a scale each, from its second compound matrix, up to scale as well. lines
+    ``(*batch, size (size - 1) / 2, 6)`` -> ``(*batch, size, 4)``."""
     pairs = list(combinations(range(size), 2))
     shared = torch.tensor([[p for p, pair in enumerate(pairs) if i in pair] for i in range(size)], device=lines.device)
     rows = common_point(lines[..., shared, :])

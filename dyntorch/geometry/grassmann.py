@@ -66,23 +66,7 @@ def _joined(parts: Sequence[Tensor], steps: Sequence[int], size: int) -> tuple[T
 
 def grassmann_derivative(projections: Sequence[Tensor], profile: Sequence[int]) -> tuple[Tensor, Tensor]:
     r"""The Grassmann tensor and its derivative by the entries of all projections, several times cheaper than forward mode.
-
-    With W the join of all other views, :math:`A = C_{\alpha_i}(M_i)\, W^T`, and minors have minors as derivatives.
-
-    Args:
-        projections: ``(*batch, m_i, k + 1)``.
-        profile: as in :func:`grassmann_tensor`.
-
-    Returns:
-        ``(*batch, D)`` and ``(*batch, p, D)``, p the entries of the first projection, the second, and so on, row by row.
-
-    Example:
-        >>> import torch
-        >>> M = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> value, derivative = grassmann_derivative(M, (2, 2))
-        >>> bool(torch.allclose(derivative[:12].T @ M[0].flatten(), 2 * value))  # homogeneous, of degree two in each view
-        True
-    """
+    projections ``(*batch, m_i, k + 1)`` -> ``(*batch, D)``."""
     size = _check(projections, profile)
     parts = [compound(m, a) for m, a in zip(projections, profile, strict=True)]
     derivatives, lengths = [], [int(p.shape[-2]) for p in parts]
@@ -110,10 +94,8 @@ def _check(projections: Sequence[Tensor], profile: Sequence[int]) -> int:
 
 
 def _minor_slopes(matrix: Tensor, order: int, weight: Tensor) -> Tensor:
-    r"""Derivative ``(*batch, rows * K, sets I, rest)`` of :math:`C_a(M) W^T` by the entries of M, for W ``(*batch, rest, sets S)``.
-
-    :math:`\partial \det M_{IS} / \partial M_{rc} = \pm \det M_{I \setminus r, S \setminus c}` for r in I and c in S.
-    """
+    r"""Derivative ``(*batch, rows * K, sets I, rest)`` of :math:`C_a(M) W^T` by the entries of M, for W
+    ``(*batch, rest, sets S)``."""
     rows, columns = matrix.shape[-2:]
     place, sign = _removals(columns, order, matrix.device)
     taken = (weight[..., place] * sign.to(matrix.dtype)).movedim(-3, -1)  # (.., c, T, rest)
@@ -154,40 +136,7 @@ POWER_STEPS = 3
 
 
 def candidates(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int], tries: int = 5) -> tuple[Tensor, ...]:
-    r"""Projections :math:`M_i` with the given Grassmann tensor, :math:`A(M_1, \dots, M_n) \sim T`, one set per random rotation.
-
-    The images are rotated, and the rows that the largest minor takes become unit vectors (a collineation of the space).  Minors
-    with one of these rows replaced then are the entries of the others in their own block of columns; with two, products
-    :math:`b_t c_j` of rank one, which leave one scale :math:`\lambda` per pair of views; with three,
-    :math:`\lambda X + Y / \lambda = Z`, whose least squares solution is a root of a quartic.  Where T is exact, so is every
-    candidate; from a noisy T they differ, and none is the nearest (:func:`~dyntorch.geometry.grassmann_nearest.projections_of`).
-
-    Args:
-        tensor: ``(*batch, binomial(m_1, alpha_1), ..., binomial(m_n, alpha_n))``, of any scale and sign.
-        profile: :math:`\alpha_i`, from 1 to :math:`m_i`, at least two views; their sum is :math:`K = k + 1`.
-        sizes: :math:`m_i`, the homogeneous coordinates of each image.
-        tries: number of fixed random rotations of all images.
-
-    Returns:
-        For every view ``(tries, *batch, m_i, K)``, of Frobenius norm 1, unique up to a common collineation (where
-        :math:`\alpha_i = m_i`, also up to :math:`M_q + X M_i`; three views :math:`P^2 \to P^1` have two solutions).  Zero where
-        the tensor is zero or not finite.  Not differentiable.
-
-    Raises:
-        ValueError: a profile, sizes and tensor that do not fit, or no tries.
-
-    Source: Hartley and Schaffalitzky 2004 (uniqueness); thesis chapter 3 and section 10.1, which leaves the recovery open.
-
-    Example:
-        >>> import torch
-        >>> from dyntorch.geometry.grassmann import grassmann_tensor
-        >>> M = torch.rand(3, 3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> T = grassmann_tensor(M, (2, 2, 1))
-        >>> again = grassmann_tensor([m[0] for m in candidates(T, (2, 2, 1), (3, 3, 3))], (2, 2, 1))
-        >>> ratio = again / T
-        >>> bool(torch.allclose(ratio, ratio[0, 0, 0].expand_as(ratio)))
-        True
-    """
+    r"""Projections :math:`M_i` with the given Grassmann tensor, :math:`A(M_1, \dots, M_n) \sim T`, one set per random rotation."""
     check(tensor, profile, sizes)
     if tries < 1:
         raise ValueError(f"tries must be at least 1, got {tries}")
@@ -350,11 +299,7 @@ def _rank_one(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _scale(minors: Tensor, block: dict[tuple[int, int], Tensor], i: int, q: int) -> Tensor:
-    r"""The factor of block (i, q) relative to those of view 0, ``(b,)``.
-
-    With extra rows b, c, d of views 0, i, q and columns j, g, t of their blocks, the minor is the determinant of
-    ``(b_j b_g b_t; c_j c_g c_t; d_j d_g d_t)``, of which c_t and d_g have the unknown factors.
-    """
+    r"""The factor of block (i, q) relative to those of view 0, ``(b,)``."""
     # all with the dimensions (batch, b, j, c, g, d, t)
     (bj, bg, bt), (cj, cg, ct), (dj, dg, dt) = (
         [_axes(block[u, v], a, b) for b, v in enumerate((0, i, q))] for a, u in enumerate((0, i, q))

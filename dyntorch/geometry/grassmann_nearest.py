@@ -32,36 +32,7 @@ tensor the first missed the lowest minimum in up to 8, 20 and 38 % of 60 scenes 
 
 
 def projections_of(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int]) -> tuple[Tensor, ...]:
-    r"""Projections of the Grassmann tensor nearest to T: :math:`\max_M \langle A(M), T \rangle^2 / (|A(M)|^2 |T|^2)`.
-
-    The best of the :func:`~dyntorch.geometry.grassmann.candidates`, improved by Levenberg-Marquardt and Newton steps to
-    convergence; several of them where the tensor is far from all of its kind.  Unlike a candidate, the tensor of the result follows
-    every orthogonal change of coordinates of the images also with noise.
-
-    Args:
-        tensor: ``(*batch, binomial(m_1, alpha_1), ..., binomial(m_n, alpha_n))``, of any scale and sign.
-        profile: :math:`\alpha_i`, from 1 to :math:`m_i`, at least two views; their sum is :math:`K = k + 1`.
-        sizes: :math:`m_i`, the homogeneous coordinates of each image.
-
-    Returns:
-        For every view ``(*batch, m_i, K)``, all of the same Frobenius norm, such that their tensor has norm 1 and a fixed sign;
-        zero where the tensor is zero or not finite.  The projections themselves are one choice among those that a collineation of
-        the space relates.  First derivatives exist (implicit function theorem) and leave that choice as it is; they are zero
-        where there is no strict minimum.
-
-    Raises:
-        ValueError: a profile, sizes and tensor that do not fit.
-
-    Source: Hartley and Schaffalitzky 2004; thesis chapter 3.
-
-    Example:
-        >>> import torch
-        >>> M = torch.rand(3, 3, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> T = grassmann_tensor(M, (2, 2, 1))
-        >>> again = grassmann_tensor(projections_of(T, (2, 2, 1), (3, 3, 3)), (2, 2, 1))
-        >>> round(abs(float((again * T).sum() / T.norm())), 12)
-        1.0
-    """
+    r"""Projections of the Grassmann tensor nearest to T: :math:`\max_M \langle A(M), T \rangle^2 / (|A(M)|^2 |T|^2)`."""
     check(tensor, profile, sizes)
     batch = tensor.shape[: tensor.ndim - len(sizes)]
     scaled, sound = unit(tensor.reshape(prod(batch), *tensor.shape[len(batch) :]))
@@ -109,10 +80,7 @@ class _Nearest:
         return self.joined(balanced(self.parts(theta)))
 
     def followed(self, theta: Tensor, target: Tensor) -> Tensor:
-        """The minimum as a function of the target: the value that it has, with its first derivative and its second.
-
-        Each Newton step from a fixed place and with a fixed Hessian makes one more order right.
-        """
+        """The minimum as a function of the target: the value that it has, with its first derivative and its second."""
         sided = self.sided(theta, target)
         step = self.newton_step(theta, sided)[0]
         first = theta - (step - step.detach())
@@ -146,11 +114,7 @@ class _Nearest:
         return u, slope, slope @ slope.mT - along @ along.mT
 
     def free(self, theta: Tensor) -> Tensor:
-        r"""The Gram :math:`N N^T` of all directions that leave u alone, ``(b, p, p)``; u is known to have no others.
-
-        They are :math:`M_i G` in all views at once, the scale of each view and, where :math:`\alpha_i = m_i`, :math:`X M_i` added
-        to any view.
-        """
+        r"""The Gram :math:`N N^T` of all directions that leave u alone, ``(b, p, p)``; u is known to have no others."""
         stack = theta.unflatten(-1, (-1, self.width))
         eye = torch.eye(self.width, dtype=theta.dtype, device=theta.device)
         rows = stack @ stack.mT
@@ -205,12 +169,7 @@ class _Nearest:
         return _solved(hessian + self.free(theta), -(slope @ _across(target, u)[..., None])[..., 0])
 
     def hessian(self, theta: Tensor, target: Tensor, u: Tensor, matrix: Tensor) -> Tensor:
-        r"""Second derivative of f where its gradient vanishes ``(b, p, p)``.
-
-        :math:`\nabla^2 f = c J_u J_u^T - \nabla^2 \langle A, w \rangle / |A|` with :math:`c = \langle u, T \rangle,
-        w = T - c u`.  With the inverse G of the chosen rows,
-        :math:`\partial^2 \det / \partial_{rc} \partial_{sd} = \det\, (G_{cr} G_{ds} - G_{cs} G_{dr})`.
-        """
+        r"""Second derivative of f where its gradient vanishes ``(b, p, p)``."""
         weight = _across(target, u) * u
         rows, stack = _chosen(self.profile, self.sizes, theta.device), theta.unflatten(-1, (-1, self.width))
         inverse = torch.linalg.inv_ex(stack[:, rows]).inverse.nan_to_num(0.0, 0.0, 0.0)

@@ -11,42 +11,13 @@ from dyntorch.numerics.blocks import constant
 
 
 def homogeneous(x: Tensor) -> Tensor:
-    r"""Append the coordinate 1: :math:`p = (x, 1)`.
-
-    Args:
-        x: ``(..., d)`` inhomogeneous points, in any unit.
-
-    Returns:
-        ``(..., d + 1)``.
-
-    Example:
-        >>> import torch
-        >>> homogeneous(torch.tensor([2.0, 3.0])).tolist()
-        [2.0, 3.0, 1.0]
-    """
+    r"""Append the coordinate 1: :math:`p = (x, 1)`. x ``(..., d)`` -> ``(..., d + 1)``."""
     return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
 
 
 def inhomogeneous(p: Tensor) -> Tensor:
-    r"""Divide by the last coordinate: :math:`x = (p_1, \dots, p_d) / p_{d+1}`, with finite values and gradients everywhere.
-
-    A point at infinity, :math:`|p_{d+1}| \le \epsilon \max_i |p_i|` with the precision :math:`\epsilon` of the dtype, is put
-    where its direction meets the distance :math:`1/\epsilon`; its value then does not depend on :math:`p_{d+1}` (gradient
-    0).  The zero vector, which is no point at all, gives 0.  So one bad point of a batch never spoils a gradient of another.
-
-    Args:
-        p: ``(..., d + 1)`` homogeneous points of any scale and sign.
-
-    Returns:
-        ``(..., d)``, no coordinate above :math:`1/\epsilon` for finite input.
-
-    Example:
-        >>> import torch
-        >>> inhomogeneous(torch.tensor([4.0, 6.0, 2.0])).tolist()
-        [2.0, 3.0]
-        >>> bool(inhomogeneous(torch.tensor([4.0, 6.0, 0.0])).isfinite().all())
-        True
-    """
+    r"""Divide by the last coordinate: :math:`x = (p_1, \dots, p_d) / p_{d+1}`, with finite values and gradients everywhere. p
+    ``(..., d + 1)`` -> ``(..., d)``."""
     return p[..., :-1] / finite_depth(p)
 
 
@@ -59,24 +30,8 @@ def finite_depth(p: Tensor) -> Tensor:
 
 
 def apply(collineation: Tensor, points: Tensor) -> Tensor:
-    r"""Map points by a collineation or a projection and return them inhomogeneous: :math:`\pi(A (x, 1))`.
-
-    Args:
-        collineation: ``(*batch, e, d + 1)`` of any scale and sign.
-        points: ``(*batch, n, d)``.
-
-    Returns:
-        ``(*batch, n, e - 1)``; images at infinity as in :func:`inhomogeneous`.
-
-    Raises:
-        ValueError: the matrix does not take ``d + 1`` coordinates.
-
-    Example:
-        >>> import torch
-        >>> shift = torch.tensor([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        >>> apply(shift, torch.tensor([[1.0, 2.0]])).tolist()
-        [[6.0, 2.0]]
-    """
+    r"""Map points by a collineation or a projection and return them inhomogeneous: :math:`\pi(A (x, 1))`. collineation
+    ``(*batch, e, d + 1)``, points ``(*batch, n, d)`` -> ``(*batch, n, e - 1)``."""
     d = points.shape[-1]
     if points.ndim < 2 or collineation.ndim < 2 or collineation.shape[-1] != d + 1:
         raise ValueError(
@@ -88,26 +43,8 @@ def apply(collineation: Tensor, points: Tensor) -> Tensor:
 
 
 def unit(matrix: Tensor) -> Tensor:
-    r"""The canonical representative of a matrix up to scale: :math:`\|A\|_F = 1` and a fixed sign.
-
-    A square matrix of odd size is given a positive determinant; every other one, and one that is singular to working
-    precision, a positive entry of largest magnitude.  (With even size the sign of the determinant does not depend on the
-    scale, so it cannot fix the sign.)  The zero matrix is returned unchanged.
-
-    Args:
-        matrix: ``(*batch, rows, columns)``.
-
-    Returns:
-        ``(*batch, rows, columns)``.
-
-    Raises:
-        ValueError: fewer than two dimensions.
-
-    Example:
-        >>> import torch
-        >>> unit(-3 * torch.eye(4)).diagonal().tolist()
-        [0.5, 0.5, 0.5, 0.5]
-    """
+    r"""The canonical representative of a matrix up to scale: :math:`\|A\|_F = 1` and a fixed sign. matrix
+    ``(*batch, rows, columns)`` -> ``(*batch, rows, columns)``."""
     if matrix.ndim < 2:
         raise ValueError(f"matrix must be (*batch, rows, columns), got {tuple(matrix.shape)}; unsqueeze a vector first")
     norm = torch.linalg.matrix_norm(matrix, keepdim=True)
@@ -129,45 +66,18 @@ def _sign(matrix: Tensor) -> Tensor:
 
 
 def unit_vectors(vectors: Tensor) -> Tensor:
-    """Vectors ``(..., d)`` at norm 1 with the sign that they have; the zero vector stays, with finite gradients.
-
-    Example:
-        >>> import torch
-        >>> unit_vectors(torch.tensor([[0.0, -2.0], [0.0, 0.0]])).tolist()
-        [[0.0, -1.0], [0.0, 0.0]]
-    """
+    """Vectors ``(..., d)`` at norm 1 with the sign that they have; the zero vector stays, with finite gradients."""
     length = vectors.norm(dim=-1, keepdim=True)
     return vectors / torch.where(length > 0, length, 1.0)
 
 
 def nonzero_sign(values: Tensor) -> Tensor:
-    """-1 where values are negative, 1 elsewhere: a factor that may turn a vector, but never removes it.
-
-    Example:
-        >>> import torch
-        >>> nonzero_sign(torch.tensor([-2.0, 0.0, 3.0])).tolist()
-        [-1.0, 1.0, 1.0]
-    """
+    """-1 where values are negative, 1 elsewhere: a factor that may turn a vector, but never removes it."""
     return torch.where(values < 0, -1.0, 1.0).to(values.dtype)
 
 
 def skew(v: Tensor) -> Tensor:
-    r"""The matrix of the cross product: :math:`[v]_\times w = v \times w`.
-
-    Args:
-        v: ``(*batch, 3)``.
-
-    Returns:
-        ``(*batch, 3, 3)``.
-
-    Raises:
-        ValueError: the last dimension is not 3.
-
-    Example:
-        >>> import torch
-        >>> (skew(torch.tensor([0.0, 0.0, 1.0])) @ torch.tensor([1.0, 0.0, 0.0])).tolist()
-        [0.0, 1.0, 0.0]
-    """
+    r"""The matrix of the cross product: :math:`[v]_\times w = v \times w`. v ``(*batch, 3)`` -> ``(*batch, 3, 3)``."""
     if v.shape[-1:] != (3,):
         raise ValueError(f"v must be (*batch, 3), got {tuple(v.shape)}")
     x, y, z = v.unbind(-1)
@@ -176,20 +86,8 @@ def skew(v: Tensor) -> Tensor:
 
 
 def similarity(scale: Tensor, centre: Tensor) -> Tensor:
-    r"""The similarity :math:`x \mapsto s\,(x - c)` as a collineation: it moves the centre to the origin, then scales.
-
-    Args:
-        scale: ``(*batch,)``.
-        centre: ``(*batch, d)``.
-
-    Returns:
-        ``(*batch, d + 1, d + 1)``, last row ``(0, ..., 0, 1)``.
-
-    Example:
-        >>> import torch
-        >>> apply(similarity(torch.tensor(2.0), torch.tensor([1.0, 1.0])), torch.tensor([[3.0, 1.0]])).tolist()
-        [[4.0, 0.0]]
-    """
+    r"""The similarity :math:`x \mapsto s\,(x - c)` as a collineation: it moves the centre to the origin, then scales. scale
+    ``(*batch,)``, centre ``(*batch, d)`` -> ``(*batch, d + 1, d + 1)``."""
     d = centre.shape[-1]
     eye = torch.eye(d + 1, dtype=centre.dtype, device=centre.device)
     upper = torch.cat([eye[:d, :d].expand(*centre.shape, d), -centre[..., None]], dim=-1) * scale[..., None, None]
@@ -197,25 +95,8 @@ def similarity(scale: Tensor, centre: Tensor) -> Tensor:
 
 
 def hyperplanes_through(x: Tensor) -> Tensor:
-    r"""Orthonormal basis of the hyperplanes through each point: :math:`N (x, 1) = 0`, :math:`N N^T = I`.
-
-    The Householder reflection that takes the homogeneous point to the last axis, without its last row:
-
-    .. math:: N = \left[\, I - \frac{x x^T}{s (s + 1)} \;\Big|\; -\frac{x}{s} \,\right], \qquad s = \sqrt{1 + \|x\|^2}.
-
-    It is smooth in x everywhere, which a basis from an SVD is not.
-
-    Args:
-        x: ``(*batch, n, d)``; conditioned best where the coordinates are of order 1.
-
-    Returns:
-        ``(*batch, n, d, d + 1)``: ``d`` hyperplanes per point.
-
-    Example:
-        >>> import torch
-        >>> hyperplanes_through(torch.zeros(1, 2)).abs().tolist()
-        [[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]
-    """
+    r"""Orthonormal basis of the hyperplanes through each point: :math:`N (x, 1) = 0`, :math:`N N^T = I`. x ``(*batch, n, d)``
+    -> ``(*batch, n, d, d + 1)``."""
     s = (1 + x.square().sum(-1, keepdim=True)).sqrt()
     eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
     outer = (x / s)[..., :, None] * (x / (s + 1))[..., None, :]
@@ -223,21 +104,8 @@ def hyperplanes_through(x: Tensor) -> Tensor:
 
 
 def two_sided(A: Tensor, B: Tensor) -> Tensor:
-    r"""The matrix of :math:`X \mapsto A X B` on entries row by row, :math:`A \otimes B^T`.
-
-    Args:
-        A: ``(*batch, i, j)``.
-        B: ``(*batch, l, k)``.
-
-    Returns:
-        ``(*batch, i k, j l)``.
-
-    Example:
-        >>> import torch
-        >>> A, X, B = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(0)).unbind()
-        >>> bool(torch.allclose(two_sided(A, B) @ X.flatten(), (A @ X @ B).flatten()))
-        True
-    """
+    r"""The matrix of :math:`X \mapsto A X B` on entries row by row, :math:`A \otimes B^T`. A ``(*batch, i, j)``, B
+    ``(*batch, l, k)`` -> ``(*batch, i k, j l)``."""
     return torch.einsum("...ij,...lk->...ikjl", A, B).flatten(-2).flatten(-3, -2)
 
 
@@ -251,24 +119,8 @@ the leading vector of a matrix of rank about one to (s_2 / s_1)^64."""
 
 
 def cofactors(matrix: Tensor) -> Tensor:
-    r"""The matrix of cofactors, :math:`\det(M)\, M^{-T}`: how lines map where M maps points.
-
-    It exists for every matrix, so one singular matrix in a batch raises nothing.
-
-    Args:
-        matrix: ``(*batch, 3, 3)``.
-
-    Returns:
-        ``(*batch, 3, 3)``.
-
-    Raises:
-        ValueError: not 3 x 3.
-
-    Example:
-        >>> import torch
-        >>> cofactors(torch.diag(torch.tensor([2.0, 3.0, 5.0]))).diagonal().tolist()
-        [15.0, 10.0, 6.0]
-    """
+    r"""The matrix of cofactors, :math:`\det(M)\, M^{-T}`: how lines map where M maps points. matrix ``(*batch, 3, 3)`` ->
+    ``(*batch, 3, 3)``."""
     if matrix.shape[-2:] != (3, 3):
         raise ValueError(f"matrix must be (*batch, 3, 3), got {tuple(matrix.shape)}")
     a, b, c = matrix.unbind(-1)
@@ -277,28 +129,8 @@ def cofactors(matrix: Tensor) -> Tensor:
 
 
 def null_vectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Left and right null vector of a 3 x 3 matrix of rank two: :math:`y^T M = 0,\ M z = 0`.
-
-    The cofactors of such a matrix are :math:`c\, y z^T`.  For a matrix that noise has made regular, the result is the pair of
-    singular vectors to its smallest singular value: the leading ones of the cofactors, found by repeated squaring.  Where
-    the rank is exactly two, the units of the coordinates (pixels beside the constant 1) cost no accuracy, as they do in an
-    orthogonal decomposition.
-
-    Args:
-        matrix: ``(*batch, 3, 3)`` of any scale.
-
-    Returns:
-        Unit vectors y and z ``(*batch, 3)``, of any sign; zero where the rank is below two and the cofactors vanish.
-
-    Raises:
-        ValueError: not 3 x 3.
-
-    Example:
-        >>> import torch
-        >>> left, right = null_vectors(torch.diag(torch.tensor([2.0, 0.0, 5.0])))
-        >>> left.abs().tolist(), right.abs().tolist()
-        ([0.0, 1.0, 0.0], [0.0, 1.0, 0.0])
-    """
+    r"""Left and right null vector of a 3 x 3 matrix of rank two: :math:`y^T M = 0,\ M z = 0`. matrix ``(*batch, 3, 3)`` ->
+    ``(*batch, 3)``."""
     adjoint = cofactors(_scaled(matrix))
     power = adjoint @ _scaled(adjoint).mT
     for _ in range(SQUARINGS):
@@ -323,14 +155,7 @@ def _nonzero(size: Tensor) -> Tensor:
 
 
 def rank_one(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vector u ``(*batch, r)`` and v ``(*batch, c)`` for which u v^T is nearest to a matrix; v = 0 for the zero matrix.
-
-    Example:
-        >>> import torch
-        >>> left, right = rank_one(torch.tensor([[0.0, 0.0], [3.0, 4.0]]))
-        >>> (left[:, None] * right).tolist()
-        [[0.0, 0.0], [3.0, 4.0]]
-    """
+    """Unit vector u ``(*batch, r)`` and v ``(*batch, c)`` for which u v^T is nearest to a matrix; v = 0 for the zero matrix."""
     scaled, _ = unit_size(matrix)
     power = scaled @ scaled.mT
     for _ in range(SQUARINGS):
@@ -355,13 +180,7 @@ def unit_size(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def monomials(p: Tensor, degree: int) -> Tensor:
-    """All monomials ``(*batch, width, n)`` of one degree of vectors ``(*batch, d + 1, n)``, which need not end in 1.
-
-    Example:
-        >>> import torch
-        >>> monomials(torch.tensor([[2.0], [3.0], [-1.0]]), 2).flatten().tolist()
-        [4.0, 6.0, -2.0, 9.0, -3.0, 1.0]
-    """
+    """All monomials ``(*batch, width, n)`` of one degree of vectors ``(*batch, d + 1, n)``, which need not end in 1."""
     table = factors(degree, p.shape[-2] - 1, p.device).unbind(-1)
     product = p.index_select(-2, table[0])
     for factor in table[1:]:
@@ -370,13 +189,7 @@ def monomials(p: Tensor, degree: int) -> Tensor:
 
 
 def monomial_derivatives(p: Tensor, degree: int, count: int) -> Tensor:
-    r"""Derivatives ``(*batch, n, width, count)`` of the monomials of vectors ``(*batch, n, d + 1)`` by their first coordinates.
-
-    Example:
-        >>> import torch
-        >>> monomial_derivatives(torch.tensor([[2.0, 3.0, -1.0]]), 2, 3)[0, 1].tolist()  # of x y
-        [3.0, 2.0, 0.0]
-    """
+    r"""Derivatives ``(*batch, n, width, count)`` of the monomials of vectors ``(*batch, n, d + 1)`` by their first coordinates."""
     table = factors(degree, p.shape[-1] - 1, p.device)
     eye = torch.eye(p.shape[-1], count, dtype=p.dtype, device=p.device)
     total = torch.zeros_like(p[..., :1, None])
@@ -406,10 +219,7 @@ def factors(degree: int, dim: int, device: torch.device) -> Tensor:
 
 @constant
 def collecting(degree: int, dim: int, device: torch.device) -> Tensor:
-    r"""Which products of coordinates are which monomial: C with :math:`p \otimes \dots \otimes p = C^T \nu(p)`, 0 and 1.
-
-    The coefficients of a product of linear forms are :math:`C (a \otimes b \otimes \dots)`.  ``(width, (dim + 1)^degree)``.
-    """
+    r"""Which products of coordinates are which monomial: C with :math:`p \otimes \dots \otimes p = C^T \nu(p)`, 0 and 1."""
     grids = torch.meshgrid(*[torch.arange(dim + 1)] * degree, indexing="ij")
     every = torch.stack([grid.flatten() for grid in grids], dim=-1).sort(-1).values
     table = torch.tensor(list(combinations_with_replacement(range(dim + 1), degree)))

@@ -23,24 +23,8 @@ BLOCK = 1 << 15
 
 
 def homography_sampson_squared(H: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
-    r"""Squared Sampson distances of matches from a homography, in both views:
-
-    .. math:: d^2 = c^T (J J^T)^{-1} c, \quad c = (h_1 - x_2 h_3,\ h_2 - y_2 h_3)(x_1, 1), \ J = \partial c / \partial (x_1, x_2).
-
-    Args:
-        H: ``(*batch, 3, 3)`` of any scale, view 1 to view 2.
-        x1, x2: ``(n, 2)``.
-
-    Returns:
-        ``(*batch, n)`` in the squared unit of the matches.
-
-    Source: Hartley and Zisserman, Multiple View Geometry, section 4.2.6.
-
-    Example:
-        >>> import torch
-        >>> homography_sampson_squared(torch.eye(3), torch.tensor([[0.0, 1.0]]), torch.tensor([[2.0, 1.0]])).tolist()
-        [2.0]
-    """
+    r"""Squared Sampson distances of matches from a homography, in both views: H ``(*batch, 3, 3)``, x1, x2 ``(n, 2)`` ->
+    ``(*batch, n)``."""
 
     def block(H: Tensor) -> Tensor:
         return _terms(H, x1, x2).distance
@@ -50,24 +34,8 @@ def homography_sampson_squared(H: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
 
 
 def linear_homography(x1: Tensor, x2: Tensor, weights: Tensor) -> Tensor:
-    r"""Linear fits of weighted matches, :math:`\min_{\|\hat H\|=1} \sum_i w_i \|c_i\|^2`, in Hartley's coordinates of each.
-
-    Args:
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative.
-
-    Returns:
-        ``(B, 3, 3)`` of norm 1, view 1 to view 2; some matrix where the weights leave too few matches.
-
-    Source: Hartley and Zisserman, Multiple View Geometry, section 4.1.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> H = linear_homography(x1, 2 * x1 + 1, torch.ones(1, 9, dtype=torch.float64))
-        >>> (H / H[:, 2:, 2:]).round(decimals=6).abs()[0, :2].tolist()
-        [[2.0, 0.0, 1.0], [0.0, 2.0, 1.0]]
-    """
+    r"""Linear fits of weighted matches, :math:`\min_{\|\hat H\|=1} \sum_i w_i \|c_i\|^2`, in Hartley's coordinates of each. x1,
+    x2 ``(n, 2)``, weights ``(B, n)`` -> ``(B, 3, 3)``."""
     first = homogeneous(x1)
     outer = (first[:, :, None] * first[:, None, :])[:, None]  # (n, 1, 3, 3)
     factors = torch.cat([torch.ones_like(x1[:, :1]), x2, x2.square().sum(-1, keepdim=True)], dim=-1)
@@ -87,21 +55,7 @@ def linear_homography(x1: Tensor, x2: Tensor, weights: Tensor) -> Tensor:
 
 
 def affine_homography(x1: Tensor, x2: Tensor, weights: Tensor) -> Tensor:
-    r"""Affine maps :math:`x_2 = A x_1 + b` of least squares in view 2.
-
-    Args:
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative.
-
-    Returns:
-        ``(B, 3, 3)`` with last row (0, 0, 1), view 1 to view 2; the translation alone where the points are one.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> affine_homography(x1, 2 * x1 + 1, torch.ones(1, 9, dtype=torch.float64)).round(decimals=6)[0, 0].tolist()
-        [2.0, 0.0, 1.0]
-    """
+    r"""Affine maps :math:`x_2 = A x_1 + b` of least squares in view 2. x1, x2 ``(n, 2)``, weights ``(B, n)`` -> ``(B, 3, 3)``."""
     joint = torch.cat([x1, x2], dim=-1)
     total = weights.sum(-1, keepdim=True).clamp(min=TINY)
     centre = weights @ joint / total
@@ -120,24 +74,8 @@ def affine_homography(x1: Tensor, x2: Tensor, weights: Tensor) -> Tensor:
 
 
 def homography(x1: Tensor, x2: Tensor, weights: Tensor, scale: float | None = None, steps: int = 3) -> tuple[Tensor, Tensor]:
-    r"""The better of two descents, from the linear and from the affine fit.
-
-    Args:
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative.
-        scale: T of :func:`descend_homography`, in the unit of the matches; None: every match counts in full.
-        steps: number of steps.
-
-    Returns:
-        H ``(B, 3, 3)`` of norm 1, view 1 to view 2, and its cost ``(B,)``.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> H, cost = homography(x1, 2 * x1 + 1, torch.ones(1, 9, dtype=torch.float64))
-        >>> bool(cost < 1e-20)
-        True
-    """
+    r"""The better of two descents, from the linear and from the affine fit. x1, x2 ``(n, 2)``, weights ``(B, n)`` ->
+    ``(B, 3, 3)``."""
     starts = torch.cat([linear_homography(x1, x2, weights), affine_homography(x1, x2, weights)])
     H, cost = descend_homography(starts, x1, x2, weights.repeat(2, 1), scale, steps)
     (H, other), (cost, second) = H.chunk(2), cost.chunk(2)
@@ -148,28 +86,8 @@ def homography(x1: Tensor, x2: Tensor, weights: Tensor, scale: float | None = No
 def descend_homography(
     H: Tensor, x1: Tensor, x2: Tensor, weights: Tensor, scale: float | None = None, steps: int = 3
 ) -> tuple[Tensor, Tensor]:
-    r"""Levenberg-Marquardt steps towards the least truncated Sampson distance, :math:`\sum_i w_i \min(d_i^2 / T^2,\ 2.25)`.
-
-    A step weighs the matches by :math:`w\,\mathrm{clip}(1 - d^2 / (2.25\,T^2), 0, 1)` and is taken if the sum falls.
-
-    Args:
-        H: ``(B, 3, 3)`` starts of any scale, view 1 to view 2.
-        x1, x2: ``(n, 2)``.
-        weights: ``(B, n)``, not negative.
-        scale: T, in the unit of the matches; None: T = 1 and no truncation.
-        steps: number of steps, the refused ones included.
-
-    Returns:
-        H ``(B, 3, 3)`` of norm 1, at no higher cost than the starts, and the cost ``(B,)``.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(9, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> start = torch.eye(3, dtype=torch.float64)[None]
-        >>> H, cost = descend_homography(start, x1, 1.1 * x1, torch.ones(1, 9, dtype=torch.float64))
-        >>> bool(cost < 1e-12)
-        True
-    """
+    r"""Levenberg-Marquardt steps towards the least truncated Sampson distance, :math:`\sum_i w_i \min(d_i^2 / T^2,\ 2.25)`. H
+    ``(B, 3, 3)``, x1, x2 ``(n, 2)``, weights ``(B, n)`` -> ``(B, 3, 3)``."""
     inverse, cap = (1.0, inf) if scale is None else (1 / scale**2, CAP)
     size = max(1, BLOCK // max(1, weights.shape[-1]))
 
@@ -252,12 +170,7 @@ def _msac(terms: _Terms, weights: Tensor, inverse: float, cap: float) -> Tensor:
 
 
 def _normal_equations(H: Tensor, terms: _Terms, x1: Tensor, x2: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Matrix ``(b, 9, 9)`` and the exact gradient ``(b, 9)`` of half the weighted sum of squared distances.
-
-    With :math:`\lambda = (J J^T)^{-1} c` and the correction :math:`\delta = J^T \lambda` of the match,
-    :math:`\nabla d^2 / 2 = \lambda^T (\nabla c - \nabla J\, \delta)`: the derivative of c at the corrected match, but for the
-    product of two corrections.
-    """
+    r"""Matrix ``(b, 9, 9)`` and the exact gradient ``(b, 9)`` of half the weighted sum of squared distances."""
     a0, a1, b0, b1 = _slopes(H, x2)
     one, two = terms.one, terms.two
     corrected = torch.stack([x1[:, 0] - a0 * one - b0 * two, x1[:, 1] - a1 * one - b1 * two, torch.ones_like(one)], dim=1)

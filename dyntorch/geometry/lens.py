@@ -98,24 +98,8 @@ def undistort(x: Tensor, K: Tensor, dist: Tensor) -> Tensor:
 
 
 def undistorted(x: Tensor, calibration: Any) -> Tensor:
-    """A camera's points without the distortion of its lens: :func:`undistort` for what a user hands over.
-
-    Args:
-        x: ``(*batch, n, 2)`` px, NaN = missing.
-        calibration: None (x is returned), or ``(K, dist)``, tensors, arrays or lists: K ``(3, 3)``, dist ``(4,)``, ``(5,)`` or
-            ``(8,)`` in OpenCV's order; dist may be None.
-
-    Returns:
-        The shape and dtype of x.
-
-    Raises:
-        ValueError: no such pair, or numbers that are no calibration.
-
-    Example:
-        >>> import torch
-        >>> undistorted(torch.tensor([[3.0, 4.0]]), ([[100, 0, 3], [0, 100, 4], [0, 0, 1]], [-0.1, 0, 0, 0])).tolist()
-        [[3.0, 4.0]]
-    """
+    """A camera's points without the distortion of its lens: :func:`undistort` for what a user hands over. x
+    ``(*batch, n, 2)``, calibration ``(K, dist)``."""
     if calibration is None:
         return x
     if not isinstance(calibration, Sequence) or len(calibration) != 2:
@@ -133,23 +117,7 @@ def undistorted(x: Tensor, calibration: Any) -> Tensor:
 
 @dataclass(frozen=True)
 class Division:
-    r"""The division model: one parameter for the lens of a camera that nobody calibrated.
-
-    .. math:: x_u = c + \frac{x_d - c}{1 + \lambda\,\|x_d - c\|^2 / R^2}
-
-    Attributes:
-        strength: :math:`\lambda`; negative = barrel.  At distance R from the centre the picture grows by 1 / (1 + lambda).
-        centre: ``(2,)`` px.
-        radius: R, px: half the picture's diagonal.
-
-    Source: Fitzgibbon 2001, Simultaneous linear estimation of multiple view geometry and lens distortion.
-
-    Example:
-        >>> import torch
-        >>> lens = Division(-0.2, torch.tensor([320.0, 240.0]), 400.0)
-        >>> lens.undistort(torch.tensor([[720.0, 240.0]])).tolist()
-        [[820.0, 240.0]]
-    """
+    r"""The division model: one parameter for the lens of a camera that nobody calibrated."""
 
     strength: float
     centre: Tensor
@@ -264,19 +232,12 @@ NEAR = 1e-5
 
 @dataclass(frozen=True)
 class LensFit:
-    """Lenses of two cameras.
+    """Lenses of two cameras."""
 
-    Attributes:
-        lenses: the division models of a and b, which straighten points.
-        sigmas: standard deviations of the two lambda, as if errors were independent.
-        gain: share of the median Sampson distance that distortion explains, in [0, 1].
-        significant: whether distortion is really there.
-    """
-
-    lenses: tuple[Division, Division]
-    sigmas: tuple[float, float]
-    gain: float
-    significant: bool
+    lenses: tuple[Division, Division]  # the division models of a and b, which straighten points
+    sigmas: tuple[float, float]  # standard deviations of the two lambda, as if errors were independent
+    gain: float  # share of the median Sampson distance that distortion explains, in [0, 1]
+    significant: bool  # whether distortion is really there
 
     @property
     def lambda_a(self) -> float:

@@ -27,28 +27,7 @@ def kernel(lifts: Tensor) -> Tensor:
 
 def gauge_algebra(lifts: Tensor) -> Tensor:
     r"""The changes of :math:`P^k` that no view can tell from a change of the cameras:
-    :math:`\{S : B_i S \ker(B_i) = 0 \text{ for all } i\}`.
-
-    Its invertible members form the ambiguity of a reconstruction (less one dimension, the scale).
-
-    Args:
-        lifts: :math:`B_i`, ``(views, a + 1, K)``.
-
-    Returns:
-        ``(dim, K, K)`` orthonormal; all matrices where the lifts are invertible.
-
-    Raises:
-        ValueError: no stack of lifts with a + 1 <= K.
-
-    Source: thesis section 3; the equations of the affine upgrade.
-
-    Example:
-        >>> import torch
-        >>> t, eye = torch.arange(3.0, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
-        >>> lifts = torch.stack([torch.cat([eye, s * eye[:, :2]], dim=1) for s in t])  # constant velocity in a plane
-        >>> gauge_algebra(lifts).shape
-        torch.Size([9, 5, 5])
-    """
+    :math:`\{S : B_i S \ker(B_i) = 0 \text{ for all } i\}`. lifts ``(views, a + 1, K)`` -> ``(dim, K, K)``."""
     if lifts.ndim != 3 or lifts.shape[-2] > lifts.shape[-1]:
         raise ValueError(f"lifts must be (views, a + 1, K) with a + 1 <= K, got {tuple(lifts.shape)}")
     even, root = balanced(lifts)
@@ -67,10 +46,7 @@ def balanced_algebra(lifts: Tensor) -> Tensor:
 
 
 def balanced(lifts: Tensor) -> tuple[Tensor, Tensor]:
-    """Lifts ``(views, a + 1, K)`` whose stack has orthonormal columns, and the root R with ``lifts = balanced @ R``.
-
-    Neither the unit nor the origin of time matters to them.  Columns that no view sees stay zero.
-    """
+    """Lifts ``(views, a + 1, K)`` whose stack has orthonormal columns, and the root R with ``lifts = balanced @ R``."""
     stack = lifts.double().flatten(0, 1)
     _, values, vh = torch.linalg.svd(stack, full_matrices=False)
     if vh.shape[0] < vh.shape[1]:
@@ -82,30 +58,7 @@ def balanced(lifts: Tensor) -> tuple[Tensor, Tensor]:
 
 def upgrade(projections: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
     r"""From a projective frame to one in which :math:`M_i T = P_i B_i`: solve :math:`M_i T \ker(B_i) = 0`, which is linear.
-
-    Args:
-        projections: ``(*batch, views, m, K)``, of any scale each.
-        lifts: ``(views, a + 1, K)``.
-
-    Returns:
-        T ``(*batch, K, K)``, the best conditioned one of the solutions (which differ by the ambiguity of the scene), and the
-        cameras :math:`P_i = M_i T B_i^+`, ``(*batch, views, m, a + 1)``.
-
-    Raises:
-        ValueError: too few views for a unique solution; see :func:`least_views`.
-
-    Source: thesis section 3.
-
-    Example:
-        >>> import torch
-        >>> draw = torch.Generator().manual_seed(0)
-        >>> P, H = (torch.randn(*size, generator=draw, dtype=torch.float64) for size in ((3, 3, 3), (5, 5)))
-        >>> eye = torch.eye(3, dtype=torch.float64)
-        >>> lifts = torch.stack([torch.cat([eye, t * eye[:, :2]], dim=1) for t in range(3)])
-        >>> T, cameras = upgrade(P @ lifts @ H, lifts)
-        >>> bool(torch.allclose(P @ lifts @ H @ T, cameras @ lifts))
-        True
-    """
+    projections ``(*batch, views, m, K)``, lifts ``(views, a + 1, K)`` -> ``(*batch, K, K)``."""
     size, batch = lifts.shape[-1], projections.shape[:-3]
     algebra, vectors = gauge_algebra(lifts), kernel(lifts)
     if not vectors.shape[-1]:
@@ -126,11 +79,7 @@ def upgrade(projections: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def least_views(lifts: Tensor, rows: int) -> int:
-    """Fewest of these views from which cameras with so many rows, otherwise arbitrary, are upgraded without doubt.
-
-    Measured on random cameras: the equations of the upgrade have no more solutions than the ambiguity of these lifts.  One
-    more than the number of lifts where they do not suffice.
-    """
+    """Fewest of these views from which cameras with so many rows, otherwise arbitrary, are upgraded without doubt."""
     lifts = balanced(lifts)[0]
     draw = torch.Generator().manual_seed(0)
     total, width = lifts.shape[0], lifts.shape[-1]
@@ -162,35 +111,14 @@ FRAMES_DRAWS = 16
 
 
 def moved(G: Tensor, cameras: Tensor, structure: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Cameras :math:`P_i B_i G^{-1} B_i^+` and points :math:`G Y` after a change of frame, for any scale of both.
-
-    Args:
-        G: ``(*batch, K, K)`` from the ambiguity of the lifts.
-        cameras: ``(*batch, views, m, a + 1)``.
-        structure: ``(*batch, n, K)``.
-        lifts: ``(views, a + 1, K)``.
-    """
+    r"""Cameras :math:`P_i B_i G^{-1} B_i^+` and points :math:`G Y` after a change of frame, for any scale of both. G
+    ``(*batch, K, K)``, cameras ``(*batch, views, m, a + 1)``, structure ``(*batch, n, K)``, lifts ``(views, a + 1, K)``."""
     inverse = torch.linalg.inv_ex(G)[0]
     return cameras @ lifts @ inverse[..., None, :, :] @ torch.linalg.pinv(lifts), structure @ G.mT
 
 
 def finite(cameras: Tensor, structure: Tensor, lifts: Tensor, algebra: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""A frame in which all points are finite and before the cameras, as nearly affine as the ambiguity allows.
-
-    Signs of points and cameras are chosen so that all depths are positive where that is possible.  The homogeneous coordinate
-    of the world becomes the linear function f of Y, among those that the ambiguity allows, that fits :math:`f(Y) = 1` best
-    for points scaled to a mean depth of 1.
-
-    Args:
-        cameras: ``(*batch, views, m, a + 1)``.
-        structure: ``(*batch, n, K)``; a zero point is not counted.
-        lifts: ``(views, a + 1, K)``.
-        algebra: ``(dim, K, K)`` of :func:`~dyntorch.geometry.lift.gauge_algebra`.
-        weights: ``(*batch, views, n)``.
-
-    Returns:
-        G ``(*batch, K, K)``, cameras and structure with their signs and scales (before G is applied).
-    """
+    r"""A frame in which all points are finite and before the cameras, as nearly affine as the ambiguity allows."""
     size = lifts.shape[-1]
     eye = torch.eye(size, dtype=lifts.dtype, device=lifts.device)
     cameras, structure = _before(cameras, structure, lifts, weights)
@@ -260,32 +188,15 @@ def _before(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) 
 
 
 def behind(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) -> Tensor:
-    """Points ``(b, n)`` that are behind one of the cameras that see them, or beyond infinity, in a frame of :func:`finite`.
-
-    Args:
-        cameras: ``(b, views, m, a + 1)``.
-        structure: ``(b, n, K)``.
-        lifts: ``(views, a + 1, K)``.
-        weights: ``(b, views, n)``.
-    """
+    """Points ``(b, n)`` that are behind one of the cameras that see them, or beyond infinity, in a frame of :func:`finite`."""
     world = structure @ lifts[0, -1]
     depth = (structure[:, None] @ (cameras @ lifts)[..., -1, :, None])[..., 0] * (weights > 0) * world.sign()[:, None]
     return (torch.where(depth.sign().sum(-1, keepdim=True) < 0, -depth, depth) < 0).any(1)
 
 
 def steady(structure: Tensor, lifts: Tensor, start: Tensor, algebra: Tensor, weights: Tensor) -> Tensor:
-    r"""The frame in which the chosen points move least: a motion common to all, which no view can tell, is taken off.
-
-    Members :math:`I + S` of the ambiguity with :math:`B(0) S = 0` leave the positions at time 0 alone; of these the one that
-    minimizes the displacements of the chosen points between the views.
-
-    Args:
-        structure: ``(*batch, n, K)``, the homogeneous coordinate of the world positive.
-        lifts: ``(views, a + 1, K)``.
-        start: B(0), ``(a + 1, K)``.
-        algebra: ``(dim, K, K)``.
-        weights: ``(*batch, n)``: which points count; static ones are brought to rest.
-    """
+    r"""The frame in which the chosen points move least: a motion common to all, which no view can tell, is taken off. structure
+    ``(*batch, n, K)``, lifts ``(views, a + 1, K)``, start ``(a + 1, K)``, algebra ``(dim, K, K)``, weights ``(*batch, n)``."""
     size = lifts.shape[-1]
     eye = torch.eye(size, dtype=lifts.dtype, device=lifts.device)
     G = eye.expand(*structure.shape[:-2], size, size)
@@ -309,15 +220,7 @@ def steady(structure: Tensor, lifts: Tensor, start: Tensor, algebra: Tensor, wei
 
 def centred(structure: Tensor, lifts: Tensor, weights: Tensor) -> Tensor:
     r"""A frame in which the positions over all views have mean 0 and rms distance from it :math:`\sqrt d`, if possible round.
-
-    Whitens by an upper triangular matrix (which keeps the first coordinate directions, those of the motion), or scales the
-    coordinates alike, whatever the ambiguity allows.
-
-    Args:
-        structure: ``(*batch, n, K)``, the homogeneous coordinate of the world positive.
-        lifts: ``(views, a + 1, K)``.
-        weights: ``(*batch, n)``.
-    """
+    structure ``(*batch, n, K)``, lifts ``(views, a + 1, K)``, weights ``(*batch, n)``."""
     homogeneous = structure[..., None, :, :] @ lifts.mT
     depth = homogeneous[..., -1:]
     good = (depth > 1e-9) & (weights[..., None, :, None] > 0)

@@ -22,22 +22,7 @@ INDEPENDENT = 1e-10  # smallest over largest entry on the diagonal of the stack'
 
 
 def nearest_line(vector: Tensor) -> Tensor:
-    r"""The line that is nearest to a vector of R^6, of norm 1.
-
-    J has the eigenvalues 1 and -1, each three times.  A vector is a line iff its two parts :math:`(v \pm J v)/2` are equally
-    long; the nearest line has both at the length :math:`1/\sqrt 2`.
-
-    Args:
-        vector: ``(*batch, 6)`` in the order 01, 02, 03, 12, 13, 23, of any scale.
-
-    Returns:
-        ``(*batch, 6)``; 0 where one of the parts vanishes (all lines are equally near).
-
-    Example:
-        >>> import torch
-        >>> nearest_line(torch.tensor([3.0, 0.0, 0.0, 0.0, 0.0, 0.0])).round().tolist()
-        [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    """
+    r"""The line that is nearest to a vector of R^6, of norm 1. vector ``(*batch, 6)`` -> ``(*batch, 6)``."""
     turned = vector @ plucker_form(dtype=vector.dtype, device=vector.device)
     plus, minus = vector + turned, vector - turned
     size, other = plus.norm(dim=-1, keepdim=True), minus.norm(dim=-1, keepdim=True)
@@ -47,25 +32,8 @@ def nearest_line(vector: Tensor) -> Tensor:
 
 
 def lines_of_pencil(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The two lines among :math:`\cos\theta\, e_1 + \sin\theta\, e_2`: where a line of P^5 meets the Klein quadric.
-
-    .. math:: \cos(2\theta - \varphi) = -m / r, \quad m = \frac{q_{11} + q_{22}}2, \quad
-              r\, e^{i\varphi} = \frac{q_{11} - q_{22}}2 + i\, q_{12}, \quad q_{ij} = e_i^T J e_j.
-
-    Args:
-        first: ``(*batch, 6)`` of norm 1.
-        second: ``(*batch, 6)`` of norm 1, orthogonal to the first.
-
-    Returns:
-        lines ``(*batch, 2, 6)`` of norm 1, and ``(*batch,)`` bool, whether they are real.  Where they are not, both are the line
-        nearest to that vector of the pencil at which the form is smallest.
-
-    Example:
-        >>> import torch
-        >>> lines, real = lines_of_pencil(torch.eye(6)[0], torch.eye(6)[5])
-        >>> lines.abs().round().sum(-2).tolist(), bool(real)
-        ([1.0, 0.0, 0.0, 0.0, 0.0, 1.0], True)
-    """
+    r"""The two lines among :math:`\cos\theta\, e_1 + \sin\theta\, e_2`: where a line of P^5 meets the Klein quadric. first
+    ``(*batch, 6)``, second ``(*batch, 6)`` -> ``(*batch, 2, 6)``."""
     form = plucker_form(dtype=first.dtype, device=first.device)
     q11, q12, q22 = (((a @ form) * b).sum(-1) for a, b in ((first, first), (first, second), (second, second)))
     middle, half = (q11 + q22) / 2, (q11 - q22) / 2
@@ -79,38 +47,8 @@ def lines_of_pencil(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def klein_frame(projections: Tensor) -> Tensor:
-    r"""The collineation G of P^5 that makes line cameras of projections known up to one: :math:`M_i G`.
-
-    The rows of a line camera are isotropic, :math:`M J M^T = 0`: they are, up to J, lines through one point, the centre.  Of
-    :math:`M_i = \mu_i\, C(P_i)\, H` the symmetric :math:`S = H^{-1} J H^{-T}` follows from equations that are linear in it,
-
-    .. math:: M_i\, S\, M_i^T = 0, \qquad \text{6 per view, 20 independent ones from five views},
-
-    and G from :math:`S = \pm G J G^T`, by eigenvalues.  G is then determined up to the isometries of J, which are the
-    collineations and the correlations of space.  A correlation would make the lines through a centre lines in a plane; G J
-    instead of G undoes it.
-
-    Args:
-        projections: ``(*batch, views, 3, 6)`` P^5 to P^2, of any scale and sign each, five or more views.
-
-    Returns:
-        ``(*batch, 6, 6)`` up to a collineation of space; 0 for projections that are not finite or have a common null vector.
-
-    Raises:
-        ValueError: another shape or fewer than five views.
-
-    Source: derived here; thesis section 1.3 and chapter 10 leave the way back from the tensor open.
-
-    Example:
-        >>> import torch
-        >>> from dyntorch.geometry.lines import line_camera
-        >>> g = torch.Generator().manual_seed(0)
-        >>> cameras, H = torch.randn(5, 3, 4, generator=g).double(), torch.randn(6, 6, generator=g).double()
-        >>> seen = line_camera(cameras) @ H
-        >>> image = seen @ klein_frame(seen)
-        >>> bool((image @ plucker_form() @ image.mT).abs().max() < 1e-9 * image.square().sum((-2, -1)).max())
-        True
-    """
+    r"""The collineation G of P^5 that makes line cameras of projections known up to one: :math:`M_i G`. projections
+    ``(*batch, views, 3, 6)`` -> ``(*batch, 6, 6)``."""
     if projections.ndim < 3 or projections.shape[-2:] != (3, 6) or projections.shape[-3] < VIEWS:
         raise ValueError(
             f"projections must be (*batch, views, 3, 6) with {VIEWS} or more views, got {tuple(projections.shape)}; "
@@ -191,28 +129,8 @@ def line_camera(camera: Tensor) -> Tensor:
 
 
 def camera_of_lines(matrix: Tensor) -> Tensor:
-    r"""The camera of points whose line camera is given up to scale: the inverse of :func:`line_camera`.
-
-    Row i of P, a plane, is common to the two lines in which it meets the other rows.  The scales follow from
-    :math:`k_{ij} = \langle p_i \wedge p_j, C_{ij} \rangle / \|p_i \wedge p_j\|^2 = c\, \rho_i \rho_j`: up to a common factor
-    :math:`\rho_i = k_{ij} k_{il}`, also where c is negative.
-
-    Args:
-        matrix: ``(*batch, 3, 6)`` of any scale and sign; with noise least squares in each step.
-
-    Returns:
-        ``(*batch, 3, 4)`` of norm 1; 0 for a matrix that is 0 or not finite.
-
-    Raises:
-        ValueError: another shape.
-
-    Source: derived here.
-
-    Example:
-        >>> import torch
-        >>> (camera_of_lines(-2 * line_camera(torch.eye(3, 4))) * 3**0.5).abs().round().int().tolist()
-        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
-    """
+    r"""The camera of points whose line camera is given up to scale: the inverse of :func:`line_camera`. matrix
+    ``(*batch, 3, 6)`` -> ``(*batch, 3, 4)``."""
     if matrix.ndim < 2 or matrix.shape[-2:] != (3, 6):
         raise ValueError(f"matrix must be (*batch, 3, 6), lines of space to lines of the image, got {tuple(matrix.shape)}")
     good = (matrix.isfinite().flatten(-2).all(-1) & (matrix.abs().amax((-1, -2)) > 0))[..., None, None]
@@ -227,28 +145,5 @@ def camera_of_lines(matrix: Tensor) -> Tensor:
 
 def cameras_of_lines(projections: Tensor) -> Tensor:
     r"""Cameras from projections P^5 to P^2 of lines that are known up to one collineation of P^5, as a tensor gives them.
-
-    :math:`M_i = \mu_i\, C(P_i)\, H` with unknown H: the images of at least five views show where H has put the Klein quadric
-    (:func:`~dyntorch.geometry.lines.klein_frame`).
-
-    Args:
-        projections: ``(*batch, views, 3, 6)``, five or more views, of any scale and sign each.
-
-    Returns:
-        ``(*batch, views, 3, 4)`` of norm 1, up to a collineation of space; 0 where the projections are not finite or have a
-        common null vector.
-
-    Raises:
-        ValueError: another shape or fewer than five views.
-
-    Source: derived here; thesis section 1.3 leaves it open.
-
-    Example:
-        >>> import torch
-        >>> g = torch.Generator().manual_seed(0)
-        >>> cameras, H = torch.randn(6, 3, 4, generator=g).double(), torch.randn(6, 6, generator=g).double()
-        >>> found = cameras_of_lines(line_camera(cameras) @ H)
-        >>> found.shape
-        torch.Size([6, 3, 4])
-    """
+    projections ``(*batch, views, 3, 6)`` -> ``(*batch, views, 3, 4)``."""
     return camera_of_lines(projections @ klein_frame(projections)[..., None, :, :])

@@ -261,19 +261,8 @@ PAIRS_RIDGE = 1e-15  # of the trace: leaves equations of coinciding epipoles sol
 
 
 def product_matrix(*forms: Tensor) -> Tensor:
-    r"""The matrix S of the product of bilinear forms, for two of them :math:`S_{\{ac\}\{bd\}} = \sum F_{ab} G_{cd}`, not scaled.
-
-    Args:
-        forms: K matrices ``(*batch, 3, 3)``.
-
-    Returns:
-        ``(*batch, M, M)``, M the number of monomials of degree K; 6 for two forms.
-
-    Example:
-        >>> import torch
-        >>> product_matrix(torch.eye(3), torch.eye(3)).diagonal().tolist()  # (p2 . p1)^2
-        [1.0, 2.0, 2.0, 1.0, 2.0, 1.0]
-    """
+    r"""The matrix S of the product of bilinear forms, for two of them :math:`S_{\{ac\}\{bd\}} = \sum F_{ab} G_{cd}`, not
+    scaled. forms ``(*batch, 3, 3)`` -> ``(*batch, M, M)``."""
     product = forms[0]
     for form in forms[1:]:
         product = (product[..., :, None, :, None] * form[..., None, :, None, :]).flatten(-4, -3).flatten(-2)
@@ -282,32 +271,8 @@ def product_matrix(*forms: Tensor) -> Tensor:
 
 
 def factor_product(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The two matrices of rank two whose product a 6 x 6 matrix is, through its null spaces: the epipoles.
-
-    :math:`F_k e_k = 0` gives :math:`S\, \nu(e_k) = 0`: the null space of S holds the two symmetric matrices
-    :math:`e_k e_k^T` of rank one, that of :math:`S^T` those of the epipoles of view 2.  With a basis :math:`B_k` across
-    :math:`e'_k` and :math:`A_k` across :math:`e_k`, :math:`F_k = B_k G_k A_k^T`, and S is linear in
-    :math:`G_1 \otimes G_2`, which has to be of rank one.  Of the two ways to pair the epipoles the one that leaves less of S
-    is right.
-
-    Args:
-        matrix: ``(*batch, 6, 6)`` of any scale; the nearest null spaces where it has full rank.  The epipoles must differ in
-            both views.
-
-    Returns:
-        F and G ``(*batch, 3, 3)`` of norm 1, in an order that depends on nothing but them; 0 for a matrix that is 0.
-
-    Raises:
-        ValueError: not 6 x 6.
-
-    Example:
-        >>> import torch
-        >>> F = torch.tensor([[0.0, 1.0, 0.0], [-1.0, 0.0, 2.0], [0.0, 2.0, 0.0]], dtype=torch.float64)
-        >>> G = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 3.0], [-1.0, -2.0, 1.0]], dtype=torch.float64)
-        >>> both = factor_product(product_matrix(F, G))
-        >>> bool(torch.allclose(product_matrix(*both), product_matrix(F, G) / (F.norm() * G.norm())))
-        True
-    """
+    r"""The two matrices of rank two whose product a 6 x 6 matrix is, through its null spaces: the epipoles. matrix
+    ``(*batch, 6, 6)`` -> ``(*batch, 3, 3)``."""
     if matrix.shape[-2:] != (6, 6):
         raise ValueError(f"matrix must be (*batch, 6, 6), got {tuple(matrix.shape)}")
     size = torch.linalg.matrix_norm(matrix.detach(), keepdim=True)
@@ -326,10 +291,8 @@ def factor_product(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _balanced(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The isometric matrix in units in which the points of both views are of order 1, and the scales ``(b, 3)`` of the forms' axes.
-
-    In pixels its entries are 1e-10 and 1 side by side, and the null spaces would be rounding.
-    """
+    """The isometric matrix in units in which the points of both views are of order 1, and the scales ``(b, 3)`` of the forms'
+    axes."""
     scales = []
     for axis in (2, 1):
         square = matrix.square().sum(axis)
@@ -643,22 +606,8 @@ def _gauge(points: Tensor, frame: Tensor, pair: Tensor, bodies: Tensor, *, toget
 
 
 def order_of_bodies(members: Tensor) -> Tensor:
-    r"""Order in which bodies are numbered: the larger first, of equally large ones that of the earliest match.
-
-    Two non-empty bodies never tie, since a match belongs to one of them at most; so the numbers depend on the partition alone and
-    not on which start of a search happened to win by a last digit.
-
-    Args:
-        members: ``(*batch, K, n)`` bool, disjoint: whether match n belongs to body k.
-
-    Returns:
-        ``(*batch, K)`` int64: which body comes first, second, ...; empty ones last, in the order given.
-
-    Example:
-        >>> import torch
-        >>> order_of_bodies(torch.tensor([[0, 0, 1, 0, 1], [1, 1, 0, 0, 0], [0, 0, 0, 1, 0]], dtype=torch.bool)).tolist()
-        [1, 0, 2]
-    """
+    r"""Order in which bodies are numbered: the larger first, of equally large ones that of the earliest match. members
+    ``(*batch, K, n)`` -> ``(*batch, K)``."""
     count = members.shape[-1]
     places = torch.arange(count, device=members.device)
     first = torch.where(members, places, count).amin(-1) if count else members.new_zeros(members.shape[:-1], dtype=torch.long)

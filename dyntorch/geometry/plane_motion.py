@@ -72,12 +72,7 @@ def plane_motions(H: Tensor) -> PlaneMotion:
 
 
 def motion_over(H: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """The rotation and translation ``(*batch, 3, 3)``, ``(*batch, 3)`` next to homographies of a plane of known normal.
-
-    Args:
-        H: ``(*batch, 3, 3)`` as of :func:`plane_motions`.
-        normal: ``(*batch, 3)`` of length 1.
-    """
+    """The rotation and translation ``(*batch, 3, 3)``, ``(*batch, 3)`` next to homographies of a plane of known normal."""
     within = tangent_basis(normal)
     seen = H @ within
     size = (seen.square().sum((-2, -1)) / 2).sqrt().clamp(min=TINY)[..., None, None]
@@ -97,16 +92,7 @@ def tangent_basis(normal: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class CommonPlane(NormalEquations):
-    r"""The normal n ``(b, 3)`` of one plane behind homographies :math:`H_v` from view 1 to each of ``v`` others.
-
-    A homography is :math:`R + t n^T` where it keeps angles and ratios of lengths across n: with E an orthonormal basis of these
-    directions and :math:`g = E^T H^T H E`,
-
-    .. math:: r_v = \left(\tfrac{g_{11} - g_{22}}{2},\ g_{12}\right) \Big/ \tfrac{g_{11} + g_{22}}{2} = 0.
-
-    The cost is :math:`r^T S^{-1} r`, S the covariance of r that follows from that of the homographies: chi-square of
-    :math:`2 v - 2` degrees of freedom.
-    """
+    r"""The normal n ``(b, 3)`` of one plane behind homographies :math:`H_v` from view 1 to each of ``v`` others."""
 
     inverse: Tensor
     """``(b, v, 3, 3)``: N, the inverses of H (view v to view 1)."""

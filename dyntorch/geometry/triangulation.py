@@ -154,20 +154,8 @@ def resect(structure: Tensor, x: Tensor, weights: Tensor | None = None, *, lifts
 
 
 def observed(x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Images and weights in float64, with 0 for both where an image is missing.
-
-    Args:
-        x: ``(*batch, views, n, l)``, NaN = missing.
-        weights: ``(*batch, views, n)``, 0 = missing, or None.
-
-    Raises:
-        ValueError: images of fewer than three dimensions, weights of another shape, or negative ones.
-
-    Example:
-        >>> import torch
-        >>> observed(torch.tensor([[[1.0, 2.0], [float("nan"), 0.0]]]), None)[1].tolist()
-        [[1.0, 0.0]]
-    """
+    """Images and weights in float64, with 0 for both where an image is missing. x ``(*batch, views, n, l)``, weights
+    ``(*batch, views, n)``."""
     check_tensor("x", x, "views", "n", "l")
     if weights is not None and not isinstance(weights, Tensor):
         raise ValueError(f"weights must be a torch.Tensor, got {type(weights).__name__}; use torch.as_tensor(...)")

@@ -16,31 +16,8 @@ from dyntorch.numerics.nullspace import gram_null_space, null_space
 
 
 def static_residual(motion: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor]) -> Tensor:
-    r"""Whitened disagreement of the views of static points, in view 1:
-
-    .. math:: e = \big(\pi(A p_2) - x_1,\ \pi(B p_3) - x_1,\ \dots\big), \qquad w = Q^{-1/2} e,
-
-    with the covariance :math:`Q` of e for noise of standard deviation :math:`s_v` in every coordinate of view v: blocks
-    :math:`s_1^2 I` everywhere (all parts share :math:`x_1`), plus :math:`s_v^2 J_v J_v^T` on the diagonal.  For a static
-    point :math:`\|w\|^2` follows :math:`\chi^2` with d degrees of freedom per collineation, to first order.
-
-    Args:
-        motion: collineations ``(*batch, d + 1, d + 1)`` from view 2, 3, ... to view 1, any scale.
-        views: points ``(*batch, n, d)`` of view 1, 2, 3, ...
-        scales: standard deviations ``(*batch,)`` of the noise of each view, in the unit of the points.
-
-    Returns:
-        ``(*batch, n, d * collineations)``.
-
-    Source: Hartley and Zisserman, section 4.2.6 (Sampson error), for several views at once.
-
-    Example:
-        >>> import torch
-        >>> shift = torch.tensor([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        >>> x2, one = torch.tensor([[1.0, 2.0]]), torch.tensor(1.0)
-        >>> round(float(static_residual([shift], [x2 + torch.tensor([5.0, 2.0]), x2], [one, one]).norm()), 4)
-        1.4142
-    """
+    r"""Whitened disagreement of the views of static points, in view 1: motion ``(*batch, d + 1, d + 1)``, views
+    ``(*batch, n, d)``, scales ``(*batch,)`` -> ``(*batch, n, d * collineations)``."""
     # coordinate by coordinate: four times faster than matrices of size 2 or 3 (measured, forward mode over 18 parameters)
     first = views[0].unbind(-1)
     shared = scales[0].square()[..., None]
@@ -91,15 +68,8 @@ def point_error(image: Tensor, derivative: Tensor, x: Tensor) -> tuple[Tensor, T
 
 
 def whitened_agreement(parts: Sequence[tuple[Tensor, Tensor]], scales: Sequence[Tensor]) -> Tensor:
-    """Whiten errors that share the noise of view 1.
-
-    Args:
-        parts: error ``(*batch, n, d)`` against view 1 and its derivative ``(*batch, n, d, d)`` by the other view, for each.
-        scales: standard deviations ``(*batch,)`` of view 1, then of the other views.
-
-    Returns:
-        ``(*batch, n, d * parts)``.
-    """
+    """Whiten errors that share the noise of view 1. parts ``(*batch, n, d)``, scales ``(*batch,)`` ->
+    ``(*batch, n, d * parts)``."""
     variances = [s.square()[..., None, None, None] for s in scales]
     covariances = [variance * _outer(jacobian) for (_, jacobian), variance in zip(parts, variances[1:], strict=True)]
     eye = torch.eye(covariances[0].shape[-1], dtype=covariances[0].dtype, device=covariances[0].device)
@@ -126,10 +96,7 @@ def static_map(tensor: Tensor, vectors: Tensor, source: int, target: int) -> Ten
 
 
 def static_map_derivative(tensor: Tensor, vectors: Tensor, source: int, target: int) -> tuple[Tensor, Tensor]:
-    r"""Image y of :func:`static_map` and its derivative ``(*batch, n, 3, 3)`` by the source vector, up to multiples of y.
-
-    From :math:`y^T M = 0`: :math:`dy^T M = -y^T dM`, solved with M completed to full rank by its null vectors.
-    """
+    r"""Image y of :func:`static_map` and its derivative ``(*batch, n, 3, 3)`` by the source vector, up to multiples of y."""
     matrix = _contraction(tensor, vectors, source, target)
     left, right = null_vectors(matrix)
     size = torch.linalg.matrix_norm(matrix, keepdim=True)
@@ -171,50 +138,16 @@ def unit_normal(line: Tensor) -> Tensor:
 
 
 def join_forms(a: Tensor, b: Tensor, v: Tensor) -> Tensor:
-    r"""The forms :math:`J_{ijk} = \epsilon_{ilmu} A_{lj} B_{mk} V_u`, that is :math:`J(p, q, r) = \det[p, A q, B r, V]`.
-
-    Args:
-        a: ``(*batch, 4, columns of A)``.
-        b: ``(*batch, 4, columns of B)``.
-        v: ``(*batch, 4)``; all batch dimensions broadcast.
-
-    Returns:
-        ``(*batch, 4, columns of A, columns of B)``.
-
-    Source: thesis section 8.2 (join tensors).
-
-    Example:
-        >>> eye = torch.eye(4, dtype=torch.float64)
-        >>> float(join_forms(eye, eye, eye[3])[0, 1, 2])
-        1.0
-    """
+    r"""The forms :math:`J_{ijk} = \epsilon_{ilmu} A_{lj} B_{mk} V_u`, that is :math:`J(p, q, r) = \det[p, A q, B r, V]`. a
+    ``(*batch, 4, columns of A)``, b ``(*batch, 4, columns of B)``, v ``(*batch, 4)`` ->
+    ``(*batch, 4, columns of A, columns of B)``."""
     epsilon = levi_civita(4, dtype=a.dtype, device=a.device)
     return torch.einsum("ilmu,...u,...lj,...mk->...ijk", epsilon, v, a, b)
 
 
 def motion_of_forms(forms: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The motion (A, B) behind several forms :math:`\det[p, A q, B r, V_c]`, linearly and uniquely.
-
-    A slice :math:`S = J_c(\cdot, \cdot, e_k)` is a skew matrix times A, and :math:`J_c(\cdot, e_j, \cdot)` one times B, so that
-
-    .. math:: A^T S + S^T A = 0
-
-    is 10 linear equations on A for each slice.  Two points :math:`V_c` suffice; one leaves A + V w^T for every w.
-
-    Args:
-        forms: ``(*batch, c, 4, 4, 4)``, two or more of about equal norm.
-
-    Returns:
-        (A, B), each ``(*batch, 4, 4)``, Frobenius norm 1, canonical sign.
-
-    Source: thesis section 8.2.
-
-    Example:
-        >>> A, B = torch.randn(2, 4, 4, dtype=torch.float64)
-        >>> found, _ = motion_of_forms(join_forms(A, B, torch.eye(4, dtype=torch.float64)))
-        >>> bool(torch.allclose(found, unit(A)))
-        True
-    """
+    r"""The motion (A, B) behind several forms :math:`\det[p, A q, B r, V_c]`, linearly and uniquely. forms
+    ``(*batch, c, 4, 4, 4)`` -> ``(*batch, 4, 4)``."""
     slices = torch.stack([forms.movedim(-1, -3), forms.movedim(-2, -3)])
     A, B = skew_partner(slices.flatten(-4, -3)).unbind(0)
     return A, B
@@ -234,33 +167,8 @@ def skew_partner(slices: Tensor) -> Tensor:
 
 
 def collinearity(motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
-    r"""Whitened distance of each match from lying on one straight line: 3 coordinates of a vector normal to that line.
-
-    With :math:`x_1, x_2, x_3` carried into view 1, the combinations :math:`u = (x_1 - x_3) / \sqrt 2` and
-    :math:`v = (x_1 - 2 x_2 + x_3) / \sqrt 6` are turned until they are orthogonal: the longer one is along the line (unit
-    vector d), the shorter one is the error :math:`e = \sum_v w_v x_v`.  To first order its noise is
-    :math:`K = \sum_v w_v^2 s_v^2 J_v J_v^T`, of which the plane normal to d sees :math:`Q = P K P`, and
-
-    .. math:: Q^{-1/2} e = \frac{(\operatorname{tr} Q + \delta)\,e - P K e}{\delta \sqrt{\operatorname{tr} Q + 2 \delta}},
-              \qquad \delta^2 = \det Q = d^T \operatorname{adj}(K)\, d .
-
-    The symmetric root needs no basis of the plane, so the residual is smooth in motion and matches but for its sign (which
-    turns over where a point comes back to where it was) and where the three points have no direction at all.
-
-    Args:
-        motion: (A, B), each ``(*batch, 4, 4)``.
-        views: three ``(*batch, n, 3)``.
-        scales: three ``(*batch,)`` standard deviations of the noise.
-
-    Returns:
-        ``(*batch, n, 3)``; the square sum follows :math:`\chi^2_2` for moving points and has half its mean for static ones.
-
-    Example:
-        >>> eye, one = torch.eye(4), torch.ones(())
-        >>> x = torch.tensor([[0.0, 0.0, 0.0]])
-        >>> collinearity((eye, eye), (x, x + 1, x + 2), (one, one, one)).abs().max().item() < 1e-6
-        True
-    """
+    r"""Whitened distance of each match from lying on one straight line: 3 coordinates of a vector normal to that line. motion
+    ``(*batch, 4, 4)``, views ``(*batch, n, 3)``, scales ``(*batch,)`` -> ``(*batch, n, 3)``."""
     # x2 - x1 and x3 - x1 in view 1, with their derivatives by the coordinates of view 2 and 3
     (two, ja), (three, jb) = (
         point_error(homogeneous(x) @ matrix.mT, matrix[..., None, :, :], views[0])
@@ -345,13 +253,8 @@ class Linearization(NamedTuple):
 
 
 def linearize(projections: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor]) -> Linearization:
-    r"""Triangulate every match and linearize its images :math:`\pi(M_v Y)`.
-
-    Args:
-        projections: :math:`M_v`, ``(*batch, l_v + 1, K)``.
-        views: ``(*batch, n, l_v)``.
-        scales: ``(*batch,)`` noise of each view.
-    """
+    r"""Triangulate every match and linearize its images :math:`\pi(M_v Y)`. projections ``(*batch, l_v + 1, K)``, views
+    ``(*batch, n, l_v)``, scales ``(*batch,)``."""
     x = torch.cat(list(views), dim=-1)
     top = torch.cat([m[..., :-1, :] for m in projections], dim=-2)[..., None, :, :]
     sizes = [m.shape[-2] - 1 for m in projections]
@@ -378,21 +281,13 @@ def linearize(projections: Sequence[Tensor], views: Sequence[Tensor], scales: Se
 
 
 def residual(projections: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor]) -> Tensor:
-    r"""The error that no displacement of the point takes away, :math:`(I - J V^{-1} J^T)\, e`, ``(*batch, n, c)``.
-
-    To first order the least reprojection error in standard deviations; its square sum follows :math:`\chi^2` with
-    :math:`\sum_v l_v - k` degrees of freedom.
-    """
+    r"""The error that no displacement of the point takes away, :math:`(I - J V^{-1} J^T)\, e`, ``(*batch, n, c)``."""
     at = linearize(projections, views, scales)
     return at.error - (at.slope @ (at.inverse @ (at.slope.mT @ at.error[..., None])))[..., 0]
 
 
 def residual_derivative(projections: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    r""":func:`residual`, flat ``(b, n c)``, and its derivative ``(b, p, n c)`` by all entries of the projections.
-
-    With the points following the projections, :math:`\partial r = (I - J V^{-1} J^T)\, \partial e` (Kaufman's form of
-    variable projection), the Schur complement of bundle adjustment.
-    """
+    r""":func:`residual`, flat ``(b, n c)``, and its derivative ``(b, p, n c)`` by all entries of the projections."""
     at = linearize(projections, views, scales)
     root = at.inverse @ at.slope.mT
     value = at.error - (at.slope @ (root @ at.error[..., None]))[..., 0]

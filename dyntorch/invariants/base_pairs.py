@@ -20,11 +20,7 @@ FLOOR = 1e-3
 
 
 class RelationPair(Invariant):
-    r"""Base of the 6 x 6 matrices of a product, :math:`\nu(p_2)^T S\, \nu(p_1) = (p_2^T F_1 p_1)(p_2^T F_2 p_1)`.
-
-    :math:`\nu` has the six monomials 00, 01, 02, 11, 12, 22 of a point; :math:`F_1` and :math:`F_2` have rank two.  What motion
-    is behind them is said by the subclasses.
-    """
+    r"""Base of the 6 x 6 matrices of a product, :math:`\nu(p_2)^T S\, \nu(p_1) = (p_2^T F_1 p_1)(p_2^T F_2 p_1)`."""
 
     primitives = (Monomials(),) * 2
     layout = (1, 0)
@@ -49,64 +45,15 @@ class RelationPair(Invariant):
 
     @staticmethod
     def fundamentals(tensor: Tensor) -> tuple[Tensor, Tensor]:
-        r"""The fundamental matrices of both bodies, from the null spaces of S, which are spanned by the epipoles.
-
-        See :func:`~dyntorch.geometry.pairs.factor_product`.  Exact for the matrix of a motion whose bodies have
-        different epipoles in either view; under noise a start for :func:`dyntorch.refine`.
-
-        Args:
-            tensor: ``(*batch, 6, 6)`` of any scale.
-
-        Returns:
-            :math:`F_1, F_2` ``(*batch, 3, 3)`` of norm 1 and rank two, :math:`p_2^T F_k p_1 = 0`; which is the first depends on
-            nothing but the two.  0 for a zero matrix.
-
-        Raises:
-            ValueError: not 6 x 6.
-
-        Example:
-            >>> import torch
-            >>> from dyntorch import SegmentationMatrix
-            >>> from dyntorch.scenes import two_view
-            >>> F1, F2 = two_view(1, batch=2, generator=torch.Generator().manual_seed(0)).motion[0]
-            >>> found = SegmentationMatrix.fundamentals(SegmentationMatrix.compose(F1, F2))
-            >>> bool(min((found[0].abs() - F.abs()).norm() for F in (F1, F2)) < 1e-9)
-            True
-        """
+        r"""The fundamental matrices of both bodies, from the null spaces of S, which are spanned by the epipoles. tensor
+        ``(*batch, 6, 6)`` -> ``(*batch, 3, 3)``."""
         first, second = factor_product(tensor.double())
         return first.to(tensor.dtype), second.to(tensor.dtype)
 
     @staticmethod
     def decompose_by_derivatives(tensor: Tensor, x1: Tensor, x2: Tensor) -> tuple[Tensor, Tensor]:
-        r"""The fundamental matrices by another way, with the matches: the derivative of the form at a match is its epipolar line.
-
-        :math:`l = \partial (\nu(p_2)^T S\, \nu(p_1)) / \partial p_1 \sim F_k^T p_2` for the body k of the match, and all these
-        lines pass through one of two epipoles, :math:`(e_1 \cdot l)(e_2 \cdot l) = 0`.  That labels the matches; eight of a body
-        determine its F.  Less accurate under noise than :meth:`fundamentals`, and a check of it.
-
-        Args:
-            tensor: ``(*batch, 6, 6)`` of any scale.
-            x1, x2: ``(*batch, n, 2)`` matches; one that is not finite is left out.
-
-        Returns:
-            :math:`F_1, F_2` ``(*batch, 3, 3)`` of norm 1 and rank two, the body with more matches first; any matrix for a body
-            with fewer than 8 of them.
-
-        Raises:
-            ValueError: shapes that do not fit, fewer than 5 matches.
-
-        Source: Vidal, Ma, Soatto and Sastry, IJCV 2006.
-
-        Example:
-            >>> import torch
-            >>> from dyntorch import SegmentationMatrix
-            >>> from dyntorch.scenes import bodies
-            >>> scene = bodies(40, interleaved=True, generator=torch.Generator().manual_seed(0))
-            >>> S = SegmentationMatrix.compose(*scene.motion)
-            >>> F1, _ = SegmentationMatrix.decompose_by_derivatives(S, *scene.views)
-            >>> bool(min((F1.abs() - F.abs()).norm() for F in scene.motion) < 1e-6)
-            True
-        """
+        r"""The fundamental matrices by another way, with the matches: the derivative of the form at a match is its epipolar
+        line. tensor ``(*batch, 6, 6)``, x1, x2 ``(*batch, n, 2)`` -> ``(*batch, 3, 3)``."""
         finite = x1.isfinite().all(-1) & x2.isfinite().all(-1)
         views = [torch.where(finite[..., None], x, 0.0).double() for x in (x1, x2)]
         weights = finite.double()
@@ -124,53 +71,16 @@ class RelationPair(Invariant):
 
     @staticmethod
     def labels(first: Tensor, second: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
-        r"""Which of two bodies each match moves with: the one to whose epipolar geometry its Sampson distance is less.
-
-        Args:
-            first, second: fundamental matrices ``(*batch, 3, 3)``.
-            x1, x2: ``(*batch, n, 2)`` matches.
-
-        Returns:
-            ``(*batch, n)`` int64, 1 or 2; 0 where a coordinate is not finite.
-
-        Example:
-            >>> import torch
-            >>> F1 = FundamentalMatrix.compose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))  # sideways
-            >>> F2 = FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 1.0, 0.0]))
-            >>> x = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
-            >>> RelationPair.labels(F1, F2, x, x + torch.tensor([[0.0, 3.0], [3.0, 0.1]])).tolist()
-            [2, 1]
-        """
+        r"""Which of two bodies each match moves with: the one to whose epipolar geometry its Sampson distance is less. first,
+        second ``(*batch, 3, 3)``, x1, x2 ``(*batch, n, 2)`` -> ``(*batch, n)``."""
         distances = torch.stack([sampson(FundamentalMatrix, f, x1, x2) for f in (first, second)])
         finite = distances.isfinite().all(0)
         return torch.where(finite, 1 + distances.argmin(0), 0)
 
     @staticmethod
     def reweighted(tensor: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
-        r"""Weights :math:`1 / \|\nabla h_n\|^2` of the matches for the next fit: the algebraic error becomes that in the images.
-
-        The gradient of the product, :math:`f_1 \nabla f_2` at a match of body 1, is far from the same for all matches, which
-        the plain fit does not know.
-
-        Args:
-            tensor: ``(*batch, 6, 6)`` of any scale.
-            x1, x2: ``(*batch, n, 2)`` matches, best in pixels as measured.
-
-        Returns:
-            ``(*batch, n)``, of median about 1 and at most 1000 (a match on both bodies has no gradient); 0 where a coordinate is
-            not finite.
-
-        Example:
-            >>> import torch, dyntorch as dyn
-            >>> from dyntorch.scenes import bodies
-            >>> scene = bodies(120, sigma=0.3, interleaved=True, generator=torch.Generator().manual_seed(0))
-            >>> solution = dyn.fit(dyn.SegmentationMatrix, *scene.views)
-            >>> for _ in range(5):
-            ...     weights = dyn.SegmentationMatrix.reweighted(solution.tensor, *scene.views)
-            ...     solution = dyn.fit(dyn.SegmentationMatrix, *scene.views, weights=weights)
-            >>> tuple(weights.shape), round(float(weights.median()), 1)
-            ((120,), 1.0)
-        """
+        r"""Weights :math:`1 / \|\nabla h_n\|^2` of the matches for the next fit: the algebraic error becomes that in the
+        images. tensor ``(*batch, 6, 6)``, x1, x2 ``(*batch, n, 2)`` -> ``(*batch, n)``."""
         value, distance = algebraic(RelationPair, tensor, x1, x2), sampson(RelationPair, tensor, x1, x2)
         square = torch.where(distance > 0, value / torch.where(distance > 0, distance, 1.0), 0.0).square()
         size = square.masked_fill(~(distance > 0), torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num(nan=1.0)

@@ -27,28 +27,8 @@ NEWTON_STEPS = 4
 
 
 def constant_velocity_tensor(first: Tensor, second: Tensor, third: Tensor) -> Tensor:
-    r"""The tensor of three maps from the world, :math:`T(P_0, P_1, \cdot) \sim P_2`, of norm 1.
-
-    It is the Cramer solution of the thesis, the 8 x 8 minors of the equations of :math:`P_0` and :math:`P_1` in
-    :math:`P^6`, without the square of a determinant that these carry.
-
-    Args:
-        first: ``(*batch, 4, 4)`` world to sensor at time 0, of any scale and sign.
-        second: ``(*batch, 4, 4)`` at time 1.
-        third: ``(*batch, 4, 4)`` at time 2, or ``(*batch, 3, 4)`` for a camera.
-
-    Returns:
-        ``(*batch, 4, 4, 4)`` or ``(*batch, 4, 4, 3)``; 0 where both of the first two maps are singular.
-
-    Source: thesis section 8.3.
-
-    Example:
-        >>> import torch
-        >>> T = constant_velocity_tensor(*torch.eye(4).expand(3, 4, 4))
-        >>> p2 = torch.einsum("ijk,i,j->k", T, torch.tensor([1.0, 0.0, 0.0, 1.0]), torch.tensor([2.0, 0.0, 0.0, 1.0]))
-        >>> (p2 / p2[3]).tolist()
-        [3.0, 0.0, 0.0, 1.0]
-    """
+    r"""The tensor of three maps from the world, :math:`T(P_0, P_1, \cdot) \sim P_2`, of norm 1. first ``(*batch, 4, 4)``,
+    second ``(*batch, 4, 4)``, third ``(*batch, 4, 4)`` -> ``(*batch, 4, 4, 4)``."""
     back0, back1 = adjugate(first), adjugate(second)
     moved = torch.einsum("...i,...kj->...ijk", back0[..., 3, :], 2 * third @ back1)
     return _unit(moved - torch.einsum("...ki,...j->...ijk", third @ back0, back1[..., 3, :]))
@@ -56,26 +36,7 @@ def constant_velocity_tensor(first: Tensor, second: Tensor, third: Tensor) -> Te
 
 def infinity_planes(tensor: Tensor) -> tuple[Tensor, Tensor]:
     r"""The planes at infinity of the first two frames: :math:`T \approx \alpha \otimes Q + K \otimes \beta`, least squares.
-
-    Contracted with any plane of the third frame the tensor has rank 2, with :math:`\alpha` in its column space: the common
-    vector of these spaces starts the minimization of :math:`\|T(\alpha^\perp, \beta^\perp, \cdot)\|`, by alternation and
-    then by Newton's method.  The last Newton step carries the derivative (of the implicit function, so first derivatives
-    only).
-
-    Args:
-        tensor: ``(*batch, 4, 4, m)``.
-
-    Returns:
-        two ``(*batch, 4)``, of norm 1, the last coordinate not negative.
-
-    Source: thesis section 8.3.1: epipoles as generalized eigenvectors, but these are 4-fold and defective, and lose the digits.
-
-    Example:
-        >>> import torch
-        >>> alpha, beta = infinity_planes(constant_velocity_tensor(*torch.eye(4, dtype=torch.float64).expand(3, 4, 4)))
-        >>> alpha.round(decimals=9).abs().tolist()
-        [0.0, 0.0, 0.0, 1.0]
-    """
+    tensor ``(*batch, 4, 4, m)`` -> ``(*batch, 4)``."""
     with torch.no_grad():
         alpha = _common_column(tensor)
         beta = spectrum(_gram(tensor.transpose(-2, -3), alpha))[1][..., -1]
@@ -91,22 +52,8 @@ def infinity_planes(tensor: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def structure(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""The parts of :math:`T_{ijk} \approx \alpha_i Q_{kj} + K_{ki} \beta_j` with :math:`K \alpha = 0`.
-
-    Q and K are defined up to :math:`Q + q \beta^T, K - q \alpha^T` for any vector q; the condition chooses one.
-
-    Args:
-        tensor: ``(*batch, 4, 4, m)``.
-
-    Returns:
-        alpha and beta ``(*batch, 4)``, Q and K ``(*batch, m, 4)``.
-
-    Example:
-        >>> import torch
-        >>> parts = structure(constant_velocity_tensor(*torch.eye(4, dtype=torch.float64).expand(3, 4, 4)))
-        >>> [tuple(part.shape) for part in parts]
-        [(4,), (4,), (4, 4), (4, 4)]
-    """
+    r"""The parts of :math:`T_{ijk} \approx \alpha_i Q_{kj} + K_{ki} \beta_j` with :math:`K \alpha = 0`. tensor
+    ``(*batch, 4, 4, m)`` -> ``(*batch, 4)``."""
     alpha, beta = infinity_planes(tensor)
     q = torch.einsum("...ijk,...i->...kj", tensor, alpha)
     k = torch.einsum("...ijk,...j->...ki", tensor, beta)
@@ -114,42 +61,14 @@ def structure(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def third_infinity(alpha: Tensor, beta: Tensor, q: Tensor, k: Tensor) -> Tensor:
-    r"""The equations of the plane at infinity of the third frame: :math:`\gamma^T Q \sim \beta^T, \gamma^T K \sim \alpha^T`.
-
-    Args:
-        alpha, beta, q, k: as returned by :func:`structure`, for a third view in space.
-
-    Returns:
-        ``(*batch, 8, 4)``, of rank 3 if there is such a plane.
-    """
+    r"""The equations of the plane at infinity of the third frame: :math:`\gamma^T Q \sim \beta^T, \gamma^T K \sim \alpha^T`."""
     rest = q - (q @ beta[..., None]) * beta[..., None, :]
     return torch.cat([rest.mT, (k - (k @ alpha[..., None]) * alpha[..., None, :]).mT], dim=-2)
 
 
 def constant_velocity_maps(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""The maps :math:`A_0, A_1, A_2` of a tensor in closed form, up to an affinity of the world and a common velocity.
-
-    With the structure of the tensor and :math:`\gamma` from :func:`third_infinity`, the free vector q follows from
-    :math:`\gamma^T Q : \gamma^T K = 2 \beta^T : -\alpha^T`; then
-
-    .. math:: A_0^{-1} = \begin{pmatrix} R \\ \alpha^T \end{pmatrix}, \qquad A_2 = -K A_0, \qquad A_1 \sim Q^{-1} A_2
-
-    with a basis R of the complement of :math:`\alpha`.  For a camera q is free: it is the common velocity.
-
-    Args:
-        tensor: ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` of a camera with a finite centre.
-
-    Returns:
-        ``(*batch, 4, 4)`` twice and ``(*batch, 4 | 3, 4)``, of norm 1.  Zero matrices for a tensor that is 0.
-
-    Source: thesis section 8.3.1; closed form and scale derived here.
-
-    Example:
-        >>> import torch
-        >>> maps = constant_velocity_maps(constant_velocity_tensor(*torch.eye(4, dtype=torch.float64).expand(3, 4, 4)))
-        >>> bool(torch.allclose(maps[0].abs(), torch.eye(4, dtype=torch.float64) / 2, atol=1e-9))
-        True
-    """
+    r"""The maps :math:`A_0, A_1, A_2` of a tensor in closed form, up to an affinity of the world and a common velocity. tensor
+    ``(*batch, 4, 4, 4)`` -> ``(*batch, 4, 4)``."""
     alpha, beta, q, k = structure(tensor)
     first = complement_frame(alpha)
     if tensor.shape[-1] == 3:
@@ -166,11 +85,7 @@ def constant_velocity_maps(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def unit_tensor(tensor: Tensor) -> Tensor:
-    """The tensor in float64 and of norm 1, with 0 in place of one that is not finite.
-
-    Raises:
-        ValueError: another shape than ``(*batch, 4, 4, 4)`` or ``(*batch, 4, 4, 3)``.
-    """
+    """The tensor in float64 and of norm 1, with 0 in place of one that is not finite."""
     if tensor.ndim < 3 or tuple(tensor.shape[-3:]) not in ((4, 4, 4), (4, 4, 3)):
         raise ValueError(f"tensor must be (*batch, 4, 4, 4), or (*batch, 4, 4, 3) of a camera, got {tuple(tensor.shape)}")
     good = tensor.isfinite().flatten(-3).all(-1)[..., None, None, None]
@@ -179,12 +94,7 @@ def unit_tensor(tensor: Tensor) -> Tensor:
 
 
 def balanced(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-    r"""Bring each view to a unit in which its points are of order 1: :math:`T_{ijk} = \hat T_{ijk}\, d_i e_j f_k`.
-
-    A tensor of points far from 1 has entries 1e-9 and 1 side by side, and would lose the small ones.  All coordinates of a
-    view share one scale, the one for which the norms of the slices are related as for three equal sensors: scaling every
-    slice to norm 1 instead doubles the noise of the maps.
-    """
+    r"""Bring each view to a unit in which its points are of order 1: :math:`T_{ijk} = \hat T_{ijk}\, d_i e_j f_k`."""
     scales = []
     for axis, like in ((-3, 13**-0.5), (-2, 1.0), (-1, 5**0.5)):
         size = torch.linalg.vector_norm(tensor, dim=[a for a in (-3, -2, -1) if a != axis]).square()
@@ -279,28 +189,8 @@ def _unit(tensor: Tensor) -> Tensor:
 
 
 def constant_velocity_maps_p6(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""The same maps by way of a projective reconstruction in :math:`P^6`, the route of the thesis.
-
-    .. math:: w_0 = [I \mid 0], \quad w_1 = [H \mid E], \quad H^T \beta = \alpha, \quad E = \beta^\perp,
-
-    :math:`w_2` linearly from the tensor; then columns :math:`g, g'` with :math:`w_t g' = t\, w_t g` turn the three into
-    :math:`[A_t \mid t A_t^{1..3}]`.
-
-    Args:
-        tensor: ``(*batch, 4, 4, 4)`` or ``(*batch, 4, 4, 3)``.
-
-    Returns:
-        as :func:`constant_velocity_maps`, in another gauge.
-
-    Source: thesis section 8.3.1.
-
-    Example:
-        >>> from dyntorch.invariants.constant_velocity_algebra import constant_velocity_tensor
-        >>> T = constant_velocity_tensor(*torch.eye(4, dtype=torch.float64).expand(3, 4, 4))
-        >>> again = constant_velocity_tensor(*constant_velocity_maps_p6(T))
-        >>> bool(torch.allclose(again * (again * T).sum().sign(), T, atol=1e-9))
-        True
-    """
+    r"""The same maps by way of a projective reconstruction in :math:`P^6`, the route of the thesis. tensor
+    ``(*batch, 4, 4, 4)``."""
     alpha, beta = infinity_planes(tensor)
     turn = complement_frame(beta) @ complement_frame(alpha).mT
     plane = complement_frame(beta)[..., :3]

@@ -196,24 +196,8 @@ class ConvergentMotionMatrix(RelationPair):
 
 
 def plane_of(first: Tensor, second: Tensor) -> Tensor:
-    r"""The homography that two fundamental matrices share, :math:`F = [e]_\times H,\ G = [v]_\times H`: of a plane, or at infinity.
-
-    Exact, and in coordinates of any unit, for matrices that share one; for others
-    :func:`~dyntorch.tasks.planes.closed_forms.infinity_from_fundamentals` has the one of least squares.
-
-    Args:
-        first: F ``(*batch, 3, 3)`` of any scale.
-        second: G ``(*batch, 3, 3)`` of any scale.
-
-    Returns:
-        H ``(*batch, 3, 3)``, norm 1; where the epipoles are the same any homography of F, and 0 where a matrix is 0.
-
-    Example:
-        >>> import torch
-        >>> F, G = skew(torch.tensor([0.0, 0.0, 1.0])), skew(torch.tensor([1.0, 0.0, 1.0]))
-        >>> (plane_of(F, G) * 3**0.5).abs().round(decimals=5).tolist()
-        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    """
+    r"""The homography that two fundamental matrices share, :math:`F = [e]_\times H,\ G = [v]_\times H`: of a plane, or at
+    infinity. first ``(*batch, 3, 3)``, second ``(*batch, 3, 3)`` -> ``(*batch, 3, 3)``."""
     epipole, vertex = FundamentalMatrix.epipoles(first)[1], FundamentalMatrix.epipoles(second)[1]
     part = -skew(epipole) @ first  # a homography of F, singular
     moved = skew(vertex) @ part

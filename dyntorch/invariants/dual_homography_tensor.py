@@ -239,26 +239,8 @@ class DualHomographyTensor(Invariant):
 
 
 def quadrifocal(P1: Tensor, P2: Tensor, P3: Tensor, P4: Tensor) -> Tensor:
-    r"""The quadrifocal tensor of four cameras: :math:`Q^{ijkl}` is the determinant of row i of P1, j of P2, k of P3 and l of P4.
-
-    Args:
-        P1: ``(*batch, 3, 4)``; P2, P3, P4 likewise.
-
-    Returns:
-        ``(*batch, 3, 3, 3, 3)``; lines s, r, q, t of the views through the images of one point fulfil
-        :math:`Q^{ijkl} s_i r_j q_k t_l = 0`.
-
-    Raises:
-        ValueError: not 3 x 4.
-
-    Source: Hartley and Zisserman, section 17.1.
-
-    Example:
-        >>> import torch
-        >>> P = torch.rand(4, 3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> bool(torch.isclose(quadrifocal(*P)[0, 1, 2, 0], torch.linalg.det(torch.stack([P[0, 0], P[1, 1], P[2, 2], P[3, 0]]))))
-        True
-    """
+    r"""The quadrifocal tensor of four cameras: :math:`Q^{ijkl}` is the determinant of row i of P1, j of P2, k of P3 and l of
+    P4. P1 ``(*batch, 3, 4)`` -> ``(*batch, 3, 3, 3, 3)``."""
     for P in (P1, P2, P3, P4):
         if P.shape[-2:] != (3, 4):
             raise ValueError(f"cameras must be (*batch, 3, 4), got {tuple(P.shape)}")
@@ -270,16 +252,8 @@ def quadrifocal(P1: Tensor, P2: Tensor, P3: Tensor, P4: Tensor) -> Tensor:
 
 def _line_error(image: Tensor, derivative: Tensor, source: Tensor, line: Tensor) -> tuple[Tensor, Tensor]:
     """Angle and offset of image lines against measured ones, and their derivative by the angle and the offset of the source.
-
-    Args:
-        image: ``(*batch, n, 3)`` lines, any scale.
-        derivative: ``(*batch, n, 3, 3)`` of the image by the source line with unit normal.
-        source: ``(*batch, n, 3)`` lines that the image came from.
-        line: ``(*batch, n, 3)`` lines to compare with.
-
-    Returns:
-        ``(*batch, n, 2)`` and ``(*batch, n, 2, 2)``.
-    """
+    image ``(*batch, n, 3)``, derivative ``(*batch, n, 3, 3)``, source ``(*batch, n, 3)``, line ``(*batch, n, 3)`` ->
+    ``(*batch, n, 2)``."""
     reference, start = unit_normal(line), unit_normal(source)
     # the line at infinity has no normal: a short one stands in for it
     floor = torch.finfo(image.dtype).eps * image.detach().abs().amax(dim=-1, keepdim=True)

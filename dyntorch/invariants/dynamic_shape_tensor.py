@@ -48,20 +48,8 @@ def arranged(n: int, base: Base, device: torch.device) -> Tensor:
 
 
 def graph_rows(measured: Tensor, trajectory: Trajectory, base: Base) -> Tensor:
-    r"""Rows of :math:`D(t) x_j = \sum_{i=1}^4 N_{ij}(t) x_i` with :math:`\sum_i N_{ij} = D` eliminated.
-
-    Differences from the fourth basis point leave :math:`D(t)(x_j - x_4) = \sum_{i \le 3} N_{ij}(t) (x_i - x_4)`, in which the
-    sums are gone.
-
-    Args:
-        measured: ``(*batch, views, n, 4)``: x, y, 1 where seen (else three zeros), and the time.
-        trajectory: of the points; D and N are products of three of its functions, K in number.
-        base: the basis points.
-
-    Returns:
-        ``(*batch, views, 2 (n - 4), K (1 + 3 (n - 4)))``; unknowns: D, then :math:`N_{1j}, N_{2j}, N_{3j}` point by point.
-        Zero rows for points that the view misses, all of them where it misses a basis point.
-    """
+    r"""Rows of :math:`D(t) x_j = \sum_{i=1}^4 N_{ij}(t) x_i` with :math:`\sum_i N_{ij} = D` eliminated. measured
+    ``(*batch, views, n, 4)`` -> ``(*batch, views, 2 (n - 4), K (1 + 3 (n - 4)))``."""
     n = measured.shape[-2]
     order = arranged(n, base, measured.device)
     seen = measured[..., order, 2] > 0
@@ -92,16 +80,8 @@ def span_residual(measured: Tensor, basis: Tensor) -> Tensor:
 
 
 def annihilator(unknowns: Tensor, n: int, base: Base) -> Tensor:
-    r"""The polynomial matrix N(t) with :math:`N(t)^T x = 0` and :math:`N(t)^T 1 = 0`.
-
-    Args:
-        unknowns: ``(*batch, K (1 + 3 m))`` of :func:`graph_rows`, m = n - 4.
-        n: number of points.
-        base: the basis points.
-
-    Returns:
-        ``(*batch, K, n, m)`` coefficients of the basis functions.
-    """
+    r"""The polynomial matrix N(t) with :math:`N(t)^T x = 0` and :math:`N(t)^T 1 = 0`. unknowns ``(*batch, K (1 + 3 m))`` ->
+    ``(*batch, K, n, m)``."""
     m = n - 4
     scale, slopes = _split(unknowns, m)
     size = scale.shape[-1]

@@ -316,17 +316,8 @@ class DynamicTensor(Invariant):
 
 @dataclass(frozen=True, repr=False)
 class DynamicMotion(DynamicTensor):
-    r"""The motion of a :class:`DynamicTensor` by itself, for any number of views: no form is composed, so nothing grows with them.
-
-    What the tasks refine, from motions of a few views each.  Static points are measured like moving ones, by their exact distance
-    from one point.
-
-    Example:
-        >>> import torch
-        >>> twenty = DynamicMotion(2, 20, 2)
-        >>> twenty.compose(*torch.rand(19, 3, 3)).shape, twenty.codim
-        (torch.Size([19, 3, 3]), 18)
-    """
+    r"""The motion of a :class:`DynamicTensor` by itself, for any number of views: no form is composed, so nothing grows with
+    them."""
 
     nullity = 1
     motion_alone = True

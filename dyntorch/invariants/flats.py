@@ -29,28 +29,7 @@ SMALL = 1e-9
 
 @constant
 def vanishing_forms(size: int, views: int, step: int, device: torch.device) -> Tensor:
-    r"""Orthonormal basis of all forms on ``views`` vectors that vanish where these span no more than ``step`` dimensions.
-
-    They are spanned by determinants of step + 1 of the vectors against fixed ones, times any coordinates of the others: the
-    complement of :math:`V(n, m, k)`.  Such a form keeps the indices that occur, so that each set of indices is a small problem of
-    its own, and those that differ by names have the same solution.
-
-    Args:
-        size: dimension n of the vectors.
-        views: how many vectors, m.
-        step: k.
-        device: where the table is kept.
-
-    Returns:
-        ``(nullity, size, ..., size)`` float64.
-
-    Source: thesis section 9.4 (claim 1).
-
-    Example:
-        >>> import torch
-        >>> vanishing_forms(3, 3, 2, torch.device("cpu")).mul(6**0.5).round().flatten().nonzero().flatten().tolist()
-        [5, 7, 11, 15, 19, 21]
-    """
+    r"""Orthonormal basis of all forms on ``views`` vectors that vanish where these span no more than ``step`` dimensions."""
     if size == views == step + 1:
         epsilon = levi_civita(size, device=device)
         return (epsilon / epsilon.norm())[None]
@@ -129,20 +108,8 @@ class Flats(NamedTuple):
 
 
 def nearest_flats(maps: Tensor, points: Tensor, scales: Tensor, step: int) -> Flats:
-    r"""The flats of ``step`` - 1 dimensions of least distance from all views of a match.
-
-    A flat is given by c hyperplanes L of view 1, which are :math:`L A_v` in view v.  The distance of x in that view is
-
-    .. math:: e_v^T Q_v^{-1} e_v, \qquad e_v = L A_v (x, 1), \quad Q_v = s_v^2 (L A_v)_{1..n} (L A_v)_{1..n}^T,
-
-    exactly, because the flat of a view has affine coordinates; only the choice of L is iterated.
-
-    Args:
-        maps: ``(b, m, N, N)`` collineations of every view to view 1 (the identity first).
-        points: ``(b, n, m, N - 1)``.
-        scales: ``(b, m)`` noise of each view.
-        step: k, dimension of the vectors of the flat.
-    """
+    r"""The flats of ``step`` - 1 dimensions of least distance from all views of a match. maps ``(b, m, N, N)``, points
+    ``(b, n, m, N - 1)``, scales ``(b, m)``."""
     p, s = homogeneous(points), scales[:, None, :, None, None]
     carried = torch.nn.functional.normalize((maps[:, None] @ p[..., None])[..., 0], dim=-1)
     carried = torch.nan_to_num(carried)
@@ -196,11 +163,7 @@ def whitened_incidence(hyperplanes: Tensor, maps: Tensor, p: Tensor, s: Tensor) 
 
 
 def flat_residual(maps: Tensor, views: Sequence[Tensor], scales: Sequence[Tensor], step: int) -> Tensor:
-    r"""Whitened distances of matches from the flats they stay in, ``(b, n, m c)``, whose square sum is the least possible.
-
-    With noise it follows :math:`\chi^2` with :math:`(m - k)(N - k)` degrees of freedom.  Where gradients are recorded the flats
-    follow what they are the nearest ones of, so that derivatives of every order are right.
-    """
+    r"""Whitened distances of matches from the flats they stay in, ``(b, n, m c)``, whose square sum is the least possible."""
     points, noise = torch.stack(list(views), dim=-2), torch.stack(list(scales), dim=-1)
     with torch.no_grad():
         hyperplanes = nearest_flats(maps, points, noise, step).hyperplanes
@@ -231,11 +194,8 @@ def _followed(hyperplanes: Tensor, maps: Tensor, points: Tensor, noise: Tensor, 
 
 
 def flat_residual_derivative(maps: Tensor, views: Sequence[Tensor], scales: Sequence[Tensor], step: int) -> tuple[Tensor, Tensor]:
-    r""":func:`flat_residual`, flat ``(b, n m c)``, and its derivative ``(b, p, n m c)`` by the entries of all maps but the first.
-
-    A map moves the incidences by :math:`Q^{-1/2} L\, \partial A_v\, \hat p_v` at the feet :math:`\hat p`; what displacements of the
-    flat take away is projected out (variable projection in Kaufman's form, as in bundle adjustment).
-    """
+    r""":func:`flat_residual`, flat ``(b, n m c)``, and its derivative ``(b, p, n m c)`` by the entries of all maps but the
+    first."""
     at = nearest_flats(maps, torch.stack(list(views), dim=-2), torch.stack(list(scales), dim=-1), step)
     b, n, m, c = at.residual.shape
     size = maps.shape[-1]
@@ -254,20 +214,8 @@ def flat_residual_derivative(maps: Tensor, views: Sequence[Tensor], scales: Sequ
 
 
 def forms_of_views(basis: Tensor, views: int, slots: Sequence[int], step: int) -> Tensor:
-    r"""The forms on ``step`` + 1 of the views alone, from an orthonormal basis of those on all views.
-
-    A form T on some of the views is one of them if T times any coordinates of the others is a form on all: these T are the
-    largest eigenvectors, of eigenvalue :math:`N^{m - k - 1}`, of the partial trace of the projector over the other views.
-
-    Args:
-        basis: ``(*batch, nullity, N, ..., N)``.
-        views: m.
-        slots: numbers of the views, ``step`` + 1 of them.
-        step: k.
-
-    Returns:
-        ``(*batch, forms, N, ..., N)`` orthonormal, as many as minors of that order.
-    """
+    r"""The forms on ``step`` + 1 of the views alone, from an orthonormal basis of those on all views. basis
+    ``(*batch, nullity, N, ..., N)`` -> ``(*batch, forms, N, ..., N)``."""
     if views == len(slots):
         return basis
     size, lead = basis.shape[-1], basis.ndim - views
@@ -281,19 +229,8 @@ def forms_of_views(basis: Tensor, views: int, slots: Sequence[int], step: int) -
 
 
 def collineations(basis: Tensor, views: int, step: int) -> tuple[Tensor, ...]:
-    r"""The collineations from every view but the first to the first, linearly and uniquely, from the vanishing forms.
-
-    With vectors in all slots but two, a form on step + 1 views leaves :math:`p_1^T K A_v p_v` with a skew matrix K, and all K
-    occur: :math:`A_v` is the only matrix X, up to scale, for which :math:`X^T S` is skew for all these slices S.
-
-    Args:
-        basis: ``(*batch, nullity, N, ..., N)`` orthonormal.
-        views: m.
-        step: k.
-
-    Returns:
-        One ``(*batch, N, N)`` for each view after the first, Frobenius norm 1, canonical sign.
-    """
+    r"""The collineations from every view but the first to the first, linearly and uniquely, from the vanishing forms. basis
+    ``(*batch, nullity, N, ..., N)`` -> ``(*batch, N, N)``."""
     lead = basis.ndim - views
     slices: list[list[Tensor]] = [[] for _ in range(views)]
     for slots in combinations(range(1, views), step):

@@ -278,14 +278,7 @@ class HomographyTensor(Invariant):
 
 
 def _balanced(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-    r"""Scale the homogeneous coordinates of each view so that all slices of the tensor are of similar size.
-
-    :math:`H_{ijk} = \hat H_{ijk}\, d_i e_j f_k`.  A tensor in pixels has entries 1e-6 and 1 side by side, and the linear
-    systems for A and B would lose the small ones.
-
-    Returns:
-        The balanced tensor, and d, e, f ``(*batch, 3)``.
-    """
+    r"""Scale the homogeneous coordinates of each view so that all slices of the tensor are of similar size."""
     if tensor.shape[-3:] != (3, 3, 3):
         raise ValueError(f"tensor must be (*batch, 3, 3, 3), got {tuple(tensor.shape)}")
     scales = [torch.ones(*tensor.shape[:-3], 3, dtype=tensor.dtype, device=tensor.device) for _ in range(3)]
@@ -301,10 +294,7 @@ def _balanced(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
 
 
 def _skew_system(slices: Tensor) -> Tensor:
-    r"""Equations ``(*batch, 27, 9)`` on X: :math:`X^T G_k` is skew-symmetric for the slices ``G_k = slices[..., k]``.
-
-    The nine entries of :math:`X^T G_k + G_k^T X` are kept, not the six different ones, so that rotations change nothing.
-    """
+    r"""Equations ``(*batch, 27, 9)`` on X: :math:`X^T G_k` is skew-symmetric for the slices ``G_k = slices[..., k]``."""
     eye = torch.eye(3, dtype=slices.dtype, device=slices.device)
     half = torch.einsum("ac,...ibk->...kabic", eye, slices)
     return (half + half.transpose(-4, -3)).flatten(-5, -3).flatten(-2)

@@ -16,10 +16,7 @@ LETTERS = "ijk"  # indices of the three views
 
 
 class CollinearPoints(Invariant):
-    """Points of space that move on straight lines, in three poses: what the join tensors have in common.
-
-    A subclass says with :meth:`forms` which forms :math:`\\det[P, A P', B P'', V_c]` its tensor holds.
-    """
+    """Points of space that move on straight lines, in three poses: what the join tensors have in common."""
 
     motion = (Frame(0, 1), Frame(0, 2))
     dof = 30
@@ -40,32 +37,7 @@ class CollinearPoints(Invariant):
 
     @on_class
     def transfer(self, tensor: Tensor, x: Tensor, source: int, target: int) -> Tensor:
-        r"""Map static points from one view to another without A and B.
-
-        The image is the common null vector of the forms with the point in its slot and every vector in that of the third
-        view: from view 2 to 1, :math:`J_c(P, P', e_k) = 0` for all c and k.
-
-        Args:
-            tensor: as :func:`dyntorch.fit` gives it.
-            x: ``(*batch, n, 3)`` points of the view ``source``.
-            source: 1, 2 or 3.
-            target: another one of them.
-
-        Returns:
-            ``(*batch, n, 3)`` points of the view ``target``.
-
-        Raises:
-            ValueError: views other than two different ones of 1, 2, 3; a single given camera.
-
-        Source: thesis section 8.1 (ii).
-
-        Example:
-            >>> shift = torch.eye(4, dtype=torch.float64)
-            >>> shift[0, 3] = 5.0
-            >>> tensor = JoinTensor.compose(shift, shift @ shift)
-            >>> JoinTensor.transfer(tensor, torch.zeros(1, 3, dtype=torch.float64), 3, 1).abs().round(decimals=9).tolist()
-            [[10.0, 0.0, 0.0]]
-        """
+        r"""Map static points from one view to another without A and B. x ``(*batch, n, 3)`` -> ``(*batch, n, 3)``."""
         if source == target or {source, target} - {1, 2, 3}:
             raise ValueError(f"source and target must be two different views of 1, 2, 3, got {source} and {target}")
         forms = self._several(tensor)
@@ -76,30 +48,8 @@ class CollinearPoints(Invariant):
 
     @on_class
     def trajectory_planes(self, tensor: Tensor, x_a: Tensor, x_b: Tensor, view: int = 1) -> Tensor:
-        r"""Planes through the trajectory of each point, in the frame of one view, from the other two: :math:`J_c(\cdot, P', P'')`.
-
-        They form a pencil (rank 2), and vanish if and only if the point did not move between the two views.
-
-        Args:
-            tensor: as :func:`dyntorch.fit` gives it.
-            x_a: ``(*batch, n, 3)`` points of the first of the other two views.
-            x_b: ``(*batch, n, 3)`` points of the second of them.
-            view: 1, 2 or 3, in whose frame the planes are.
-
-        Returns:
-            ``(*batch, n, c, 4)`` homogeneous planes, one per form.
-
-        Raises:
-            ValueError: another view.
-
-        Source: thesis section 8.1 (iii).
-
-        Example:
-            >>> eye = torch.eye(4)
-            >>> planes = JoinTensor.trajectory_planes(JoinTensor.compose(eye, eye), torch.rand(5, 3), torch.rand(5, 3))
-            >>> planes.shape, torch.linalg.matrix_rank(planes, rtol=1e-3).tolist()
-            (torch.Size([5, 4, 4]), [2, 2, 2, 2, 2])
-        """
+        r"""Planes through the trajectory of each point, in the frame of one view, from the other two:
+        :math:`J_c(\cdot, P', P'')`. x_a ``(*batch, n, 3)``, x_b ``(*batch, n, 3)`` -> ``(*batch, n, c, 4)``."""
         if view not in (1, 2, 3):
             raise ValueError(f"view must be 1, 2 or 3, got {view}")
         wanted = LETTERS[view - 1]
@@ -109,29 +59,8 @@ class CollinearPoints(Invariant):
 
     @on_class
     def trajectory(self, tensor: Tensor, x_a: Tensor, x_b: Tensor, view: int = 1) -> Tensor:
-        r"""The line each point moves on, in the frame of one view, from its positions in the other two.
-
-        Args:
-            tensor: as :func:`dyntorch.fit` gives it.
-            x_a: ``(*batch, n, 3)`` points of the first of the other two views.
-            x_b: ``(*batch, n, 3)`` points of the second of them.
-            view: 1, 2 or 3, in whose frame the line is.
-
-        Returns:
-            ``(*batch, n, 6)`` Pluecker coordinates (order 01, 02, 03, 12, 13, 23) of norm 1; of no meaning where the point
-            did not move.
-
-        Raises:
-            ValueError: another view; a single given camera.
-
-        Source: thesis section 8.1 (iii).
-
-        Example:
-            >>> eye, start = torch.eye(4, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
-            >>> tensor = JoinTensor.compose(eye, eye)
-            >>> JoinTensor.trajectory(tensor, start, start + torch.eye(3)[0]).abs().round(decimals=9).tolist()  # along x
-            [[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]
-        """
+        r"""The line each point moves on, in the frame of one view, from its positions in the other two. x_a ``(*batch, n, 3)``,
+        x_b ``(*batch, n, 3)`` -> ``(*batch, n, 6)``."""
         self._several(tensor)
         planes = self.trajectory_planes(tensor, x_a, x_b, view)
         first, second = null_space(planes, 2).unbind(-2)
@@ -139,26 +68,8 @@ class CollinearPoints(Invariant):
 
     @on_class
     def static_distance(self, tensor: Tensor, x1: Tensor, x2: Tensor, x3: Tensor) -> Tensor:
-        r"""How far each match is from a static point: :math:`\sqrt{e^T Q^{-1} e}` of the disagreement e of its views.
-
-        Args:
-            tensor: as :func:`dyntorch.fit` gives it.
-            x1: ``(*batch, n, 3)`` points of view 1.
-            x2: ``(*batch, n, 3)`` points of view 2.
-            x3: ``(*batch, n, 3)`` points of view 3.
-
-        Returns:
-            ``(*batch, n)`` in the unit of the points; its square over that of the noise follows :math:`\chi^2_6`.
-
-        Raises:
-            ValueError: a single given camera.
-
-        Example:
-            >>> eye, x = torch.eye(4, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
-            >>> tensor = JoinTensor.compose(eye, eye)
-            >>> JoinTensor.static_distance(tensor, x, x, x + torch.eye(3)[0] * 3).round(decimals=6).tolist()
-            [2.44949]
-        """
+        r"""How far each match is from a static point: :math:`\sqrt{e^T Q^{-1} e}` of the disagreement e of its views. x1
+        ``(*batch, n, 3)``, x2 ``(*batch, n, 3)``, x3 ``(*batch, n, 3)`` -> ``(*batch, n)``."""
         motion = motion_of_forms(self._several(tensor))
         one = torch.ones((), dtype=x1.dtype, device=x1.device)
         return self.whitened_static(motion, (x1, x2, x3), (one, one, one)).norm(dim=-1)

@@ -105,25 +105,8 @@ def multibody_matrix(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None
 
 
 def multibody_lines(matrix: Tensor, p1: Tensor, p2: Tensor, bodies: int) -> tuple[Tensor, Tensor]:
-    r"""The epipolar lines of every match, each of its own body: the derivatives of :math:`\nu(p_2)^T M\, \nu(p_1)`.
-
-    By the product rule, at a match of body k the derivative in :math:`p_2` is :math:`F_k p_1` times the other factors.
-
-    Args:
-        matrix: ``(*batch, M, M)``.
-        p1: ``(*batch, n, 3)`` homogeneous points of view 1.
-        p2: ``(*batch, n, 3)`` homogeneous points of view 2.
-        bodies: how many, the degree in either view.
-
-    Returns:
-        The lines in view 1 and in view 2, ``(*batch, n, 3)`` each, long where the other bodies are far; 0 on two bodies.
-
-    Example:
-        >>> import torch
-        >>> p = torch.tensor([[1.0, 2.0, 1.0]])
-        >>> multibody_lines(torch.eye(3), p, p, 1)[1].tolist()
-        [[1.0, 2.0, 1.0]]
-    """
+    r"""The epipolar lines of every match, each of its own body: the derivatives of :math:`\nu(p_2)^T M\, \nu(p_1)`. matrix
+    ``(*batch, M, M)``, p1 ``(*batch, n, 3)``, p2 ``(*batch, n, 3)`` -> ``(*batch, n, 3)``."""
     l1 = _gradient(monomials(p2.mT, bodies).mT @ matrix, p1, bodies)
     l2 = _gradient(monomials(p1.mT, bodies).mT @ matrix.mT, p2, bodies)
     return l1, l2

@@ -23,16 +23,7 @@ LEAST = 6
 
 
 def six_rows(measured: Tensor, trajectory: Trajectory, places: tuple[int, ...]) -> Tensor:
-    r"""Rows of :math:`p_5^T F(t)\, p_6 = 0` of six of the points, ``(*batch, views, 1, 5 K)``; zero where one is missing.
-
-    In the frame of four of them F is their dual fundamental matrix, 5 numbers that are products of nine of the functions of the
-    trajectory: :math:`5 (9 r + 1)` unknowns for polynomials of degree r, 49 views for constant velocity.
-
-    Args:
-        measured: ``(*batch, views, n, 4)``: x, y, 1 where seen (else three zeros), and the time.
-        trajectory: of the points.
-        places: of the six.
-    """
+    r"""Rows of :math:`p_5^T F(t)\, p_6 = 0` of six of the points, ``(*batch, views, 1, 5 K)``; zero where one is missing."""
     row = general_rows(measured[..., list(places), :3])
     return (trajectory.power(9).rows(measured[..., 0, 3])[..., None, :, None] * row[..., None, :]).flatten(-2)
 

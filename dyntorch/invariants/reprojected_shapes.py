@@ -32,28 +32,15 @@ class CameraKind:
 
 
 def reprojection_residual(structure: Tensor, x: Tensor, scale: Tensor, cameras: CameraKind) -> Tensor:
-    r"""Reprojection error that no camera takes away, in standard deviations of noise, to first order.
-
-    Args:
-        structure: ``(*batch, n, k + 1)`` homogeneous points, or ``(*batch, views, n, k + 1)`` of each view.
-        x: ``(*batch, views, n, l + 1)`` measurements; last coordinate 0 where missing.
-        scale: ``(*batch,)`` standard deviation of the noise of one coordinate.
-        cameras: which there are.
-
-    Returns:
-        ``(*batch, views, l n)``, whose square sum follows chi squared with l n less the cameras' degrees of freedom; NaN where a
-        view shows no more than its camera takes.
-    """
+    r"""Reprojection error that no camera takes away, in standard deviations of noise, to first order. structure
+    ``(*batch, n, k + 1)``, x ``(*batch, views, n, l + 1)``, scale ``(*batch,)`` -> ``(*batch, views, l n)``."""
     at, known, _ = _linearized(structure, x, scale, cameras)
     error = at.error - (at.slope @ (at.inverse @ (at.slope.mT @ at.error[..., None])))[..., 0]
     return torch.where(known[..., None], error[..., 0, :], torch.nan)
 
 
 def reprojection_derivative(structure: Tensor, x: Tensor, scale: Tensor, cameras: CameraKind) -> tuple[Tensor, Tensor]:
-    """The residual and its derivative ``(*batch, views, l n, n, k + 1)`` by the points; both 0 where a view says nothing.
-
-    The camera follows the points (Kaufman's form of variable projection), as the points follow the cameras in reconstruction.
-    """
+    """The residual and its derivative ``(*batch, views, l n, n, k + 1)`` by the points; both 0 where a view says nothing."""
     at, known, length = _linearized(structure, x, scale, cameras)
     known = known[..., None, None]
     project = torch.eye(at.error.shape[-1], dtype=x.dtype, device=x.device) - (at.slope @ at.inverse @ at.slope.mT)[..., 0, :, :]

@@ -23,19 +23,7 @@ CAMERA = {GENERAL: CameraKind(), PLANE: CameraKind(), AFFINE: CameraKind(affine=
 
 
 def view_score(structure: Tensor, x: Tensor, frame: str) -> Tensor:
-    r"""How nearly the equations of the camera of each view are dependent, ``(*batch, views)`` in [0, 1].
-
-    :math:`\sigma_4 / \|E\|_F`, E the equations :math:`l^T \hat P_i m = 0` of the points in the frame of the basis; for affine
-    cameras the error of the centred points over their size.
-
-    Args:
-        structure: ``(*batch, n, 4)`` in the standard frame.
-        x: ``(*batch, views, n, 3)`` measurements.
-        frame: which cameras there are.
-
-    Returns:
-        NaN where a view shows no more than its camera takes.
-    """
+    r"""How nearly the equations of the camera of each view are dependent, ``(*batch, views)`` in [0, 1]."""
     seen = looked_at(x).to(x)
     x = torch.cat([torch.where(seen[..., None] > 0, x[..., :2], 0.0), seen[..., None]], dim=-1)
     if frame == AFFINE:

@@ -21,14 +21,7 @@ FARTHEST = 1e60
 
 
 def check_tensor(name: str, value: object, *shape: int | str, precise: bool = True) -> None:
-    """Raise a ``ValueError`` unless ``value`` is a real floating point tensor ``(*batch, *shape)``.
-
-    Args:
-        name: of the argument.
-        value: what was given.
-        *shape: trailing dimensions: a number is the size that is needed, a name stands for any.
-        precise: whether float16 and bfloat16 are refused.
-    """
+    """Raise a ``ValueError`` unless ``value`` is a real floating point tensor ``(*batch, *shape)``."""
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a torch.Tensor, got {type(value).__name__}; use torch.as_tensor(...)")
     check_precision(name, value.dtype, precise=precise)
@@ -58,11 +51,7 @@ def refuse_vmap(name: str, value: Tensor, remedy: str = "give all problems at on
 
 
 def check_threshold(threshold: float | None, estimated: bool = True) -> None:
-    """Refuse what is not one distance, or None where that means that it is ``estimated``.
-
-    Raises:
-        ValueError: not a number, not positive, or not finite.
-    """
+    """Refuse what is not one distance, or None where that means that it is ``estimated``."""
     try:
         value = 1.0 if threshold is None and estimated else float(threshold)  # type: ignore[arg-type]
     except (TypeError, ValueError, RuntimeError):
@@ -73,32 +62,14 @@ def check_threshold(threshold: float | None, estimated: bool = True) -> None:
 
 
 def check_weights(weights: Tensor | None, what: str) -> None:
-    """Raise a ``ValueError`` for a negative weight; within ``torch.func`` values are not at hand, and not looked at.
-
-    Args:
-        weights: of any shape, NaN = missing; or None.
-        what: is left out by a weight of 0.
-
-    Example:
-        >>> import torch
-        >>> check_weights(torch.tensor([1.0, -2.0]), "a point")
-        Traceback (most recent call last):
-        ValueError: weights must not be negative, got -2; use 0 to leave a point out
-    """
+    """Raise a ``ValueError`` for a negative weight; within ``torch.func`` values are not at hand, and not looked at."""
     if weights is None or torch._C._functorch.is_functorch_wrapped_tensor(weights) or not bool((weights < 0).any()):
         return
     raise ValueError(f"weights must not be negative, got {float(weights[weights < 0].min()):g}; use 0 to leave {what} out")
 
 
 def check_together(**tensors: tuple[Tensor, int]) -> torch.Size:
-    """The batch of several tensors: raise a ``ValueError`` unless they have one dtype, one device and batches that agree.
-
-    Args:
-        **tensors: by name, each with the number of its trailing dimensions.
-
-    Returns:
-        The leading dimensions, broadcast.
-    """
+    """The batch of several tensors: raise a ``ValueError`` unless they have one dtype, one device and batches that agree."""
     names = ", ".join(tensors)
     for what, kinds in (("dtype", [x.dtype for x, _ in tensors.values()]), ("device", [x.device for x, _ in tensors.values()])):
         if len(set(kinds)) > 1:

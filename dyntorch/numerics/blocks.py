@@ -162,36 +162,18 @@ def map_blocks(function: Callable[..., Record], *data: Any, size: int) -> Record
 
 
 def each(function: Callable[[Tensor], Tensor], record: Record) -> Record:
-    """The record with a function of each of its tensors in its place; what is a record says :func:`map_blocks`.
-
-    Example:
-        >>> import torch
-        >>> each(lambda x: x[1:], (torch.arange(3), (torch.ones(2), None)))
-        (tensor([1, 2]), (tensor([1.]), None))
-    """
+    """The record with a function of each of its tensors in its place; what is a record says :func:`map_blocks`."""
     return rebuilt(record, map(function, tensors_of(record)))
 
 
 def put(record: Record, at: Tensor, new: Record) -> Record:
-    """The record with the problems ``at (k,)`` replaced by those of another record of k problems, in memory of its own.
-
-    Example:
-        >>> import torch
-        >>> put((torch.zeros(3), None), torch.tensor([2]), (torch.ones(1), None))
-        (tensor([0., 0., 1.]), None)
-    """
+    """The record with the problems ``at (k,)`` replaced by those of another record of k problems, in memory of its own."""
     pairs = zip(tensors_of(record), tensors_of(new), strict=True)
     return rebuilt(record, (old.index_put((at,), part) for old, part in pairs))
 
 
 def select(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:
-    """``new`` where the mask is true, which has the leading dimensions alone, elsewhere ``old``.
-
-    Example:
-        >>> import torch
-        >>> select(torch.tensor([True, False]), torch.ones(2, 3), 0.0).tolist()
-        [[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]
-    """
+    """``new`` where the mask is true, which has the leading dimensions alone, elsewhere ``old``."""
     return torch.where(mask[(..., *[None] * (new.ndim - mask.ndim))], new, old)
 
 
@@ -261,22 +243,7 @@ Table = TypeVar("Table")
 
 
 def constant(make: Callable[Sizes, Table]) -> _lru_cache_wrapper[Table]:
-    """Cache the tensors that a function of sizes, and of the device, makes; whoever gets them must not write into them.
-
-    The first call may come from anywhere, but a tensor made within ``torch.inference_mode``, a transformation of ``torch.func``,
-    a fake mode or for another default device belongs there, and in the cache it would break later calls.  All of these hold for
-    one thread: a thread of its own makes the tensors.
-
-    Example:
-        >>> import torch
-        >>> @constant
-        ... def steps(n, device):
-        ...     return torch.arange(n, device=device)
-        >>> with torch.inference_mode():
-        ...     first = steps(3, torch.device("cpu"))
-        >>> first.is_inference(), steps(3, torch.device("cpu")) is first
-        (False, True)
-    """
+    """Cache the tensors that a function of sizes, and of the device, makes; whoever gets them must not write into them."""
 
     @lru_cache(maxsize=256)
     @wraps(make)
@@ -292,20 +259,7 @@ def constant(make: Callable[Sizes, Table]) -> _lru_cache_wrapper[Table]:
 
 
 class Draws:
-    """A stream of random numbers for each problem of a batch: what one gets does not depend on how the others fare.
-
-    Args:
-        count: problems.
-        generator: source of the seeds, one for each problem in their order; None is torch's global one.
-        device: of the results.
-
-    Example:
-        >>> import torch
-        >>> def draws():
-        ...     return Draws(3, torch.Generator().manual_seed(0), torch.device("cpu"))
-        >>> bool(torch.equal(draws()(torch.arange(3), 4)[2], draws()(torch.tensor([2]), 4)[0]))
-        True
-    """
+    """A stream of random numbers for each problem of a batch: what one gets does not depend on how the others fare."""
 
     def __init__(self, count: int, generator: torch.Generator | None, device: torch.device) -> None:
         home, self.device = device if generator is None else generator.device, device
@@ -322,17 +276,6 @@ class Draws:
 
 
 def uniform(*shape: int, generator: torch.Generator | None, device: torch.device) -> Tensor:
-    """Numbers in [0, 1), float64, drawn on the device of the generator (None: on ``device``) and moved to ``device``.
-
-    Args:
-        *shape: of the result.
-        generator: source of the numbers; None is torch's global one.
-        device: of the result.
-
-    Example:
-        >>> import torch
-        >>> uniform(2, 3, generator=torch.Generator().manual_seed(0), device=torch.device("cpu")).shape
-        torch.Size([2, 3])
-    """
+    """Numbers in [0, 1), float64, drawn on the device of the generator (None: on ``device``) and moved to ``device``."""
     home = device if generator is None else generator.device
     return torch.rand(*shape, generator=generator, dtype=torch.float64, device=home).to(device)

@@ -10,12 +10,7 @@ from scipy.special import chdtri
 
 @cache
 def quantile(probability: float, degrees: float) -> float:
-    """The value that chi-square with so many degrees of freedom stays below with this probability.
-
-    Example:
-        >>> round(quantile(0.99, 2), 3)
-        9.21
-    """
+    """The value that chi-square with so many degrees of freedom stays below with this probability."""
     return float(chdtri(degrees, 1 - probability))
 
 

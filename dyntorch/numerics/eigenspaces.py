@@ -123,17 +123,7 @@ def _generic(size: int, count: int, device: torch.device) -> Tensor:
 
 
 def by_inverse_iteration(gram: Tensor, dim: int) -> Eigenspace:
-    r"""Subspace iteration with :math:`(G + \mu I)^{-1}`, then Newton corrections with a certificate.
-
-    One vector more than ``dim`` is carried along: its Ritz value estimates the next eigenvalue.  With the largest Ritz value
-    :math:`\sigma` of the ``dim`` others, a successful Cholesky factorization of :math:`S = G - \sigma I + V V^T` proves that
-    no more than ``dim`` eigenvalues are below :math:`\sigma`, and :math:`V - S^{-1}(G V - V V^T G V)` contracts the error by
-    :math:`|\sigma - \rho_j| / (\lambda_{dim+1} - \sigma)`, which for one vector is the square of the error before.
-
-    Args:
-        gram: ``(b, D, D)`` symmetric, finite, trace 1.
-        dim: below D.
-    """
+    r"""Subspace iteration with :math:`(G + \mu I)^{-1}`, then Newton corrections with a certificate. gram ``(b, D, D)``."""
     size, host = gram.shape[-1], on_host(gram)
     factor, indefinite = torch.linalg.cholesky_ex(shifted(gram.clone(), size * EPS))
     # half an iteration: any start is as good as any other
@@ -162,17 +152,8 @@ def by_inverse_iteration(gram: Tensor, dim: int) -> Eigenspace:
 
 
 def by_squaring(gram: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""The smallest eigenvalue by k squarings of the inverse: every column is multiplied by :math:`G^{-2^k}`.
-
-    The purity :math:`\mathrm{tr}(Y^2) / \mathrm{tr}(Y)^2 = 1 - 2 \sum_i (\lambda_D / \lambda_i)^{2^k}` certifies that one direction
-    is left: nothing can be missed, as all directions take part.
-
-    Args:
-        gram: ``(b, D, D)`` symmetric, finite, trace 1.
-
-    Returns:
-        Vectors ``(b, D, 1)``, values ``(b, 1)``, the sum of 1 / eigenvalue over the others ``(b,)``, and which are certified.
-    """
+    r"""The smallest eigenvalue by k squarings of the inverse: every column is multiplied by :math:`G^{-2^k}`. gram
+    ``(b, D, D)`` -> ``(b, D, 1)``."""
     size = gram.shape[-1]
     factor, indefinite = torch.linalg.cholesky_ex(shifted(gram.clone(), size * EPS))
     inverse = torch.cholesky_inverse(factor)

@@ -21,13 +21,7 @@ Tensors = tuple[Tensor, ...]
 
 
 def transformed(*data: Any) -> bool:
-    """Whether a tensor of some records is inside of a transformation of ``torch.func``, so that its values are not at hand.
-
-    Example:
-        >>> import torch
-        >>> torch.func.vmap(lambda x: x + transformed(x))(torch.zeros(2)).tolist(), transformed(torch.zeros(2))
-        ([1.0, 1.0], False)
-    """
+    """Whether a tensor of some records is inside of a transformation of ``torch.func``, so that its values are not at hand."""
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
     return any(wrapped(tensor) for tensor in tensors_of(data))
 
@@ -44,26 +38,7 @@ def mapped_over(value: Tensor) -> bool:
 
 def over_problems(function: Callable[..., Record], *data: Any) -> Record:
     """``function(*data)`` of batches of independent problems; within ``torch.func`` too, in whatever order it is transformed.
-
-    Outside it is just that call.  Inside of ``grad``, ``vmap``, ``jvp`` and what is made of them (``jacrev``, ``hessian``, ...) the
-    function gets plain tensors: what is mapped over has become part of the batch, and may be looked at.  Its derivatives are those
-    of autograd, of every order, and cost another call.
-
-    Args:
-        function: of records of tensors ``(b, ...)``, as :func:`~dyntorch.numerics.blocks.map_blocks` takes them, to such a record.
-            It must not hold any other tensor that is transformed.
-        *data: the records.
-
-    Returns:
-        What the function returns.
-
-    Example:
-        >>> import torch
-        >>> def root(x):
-        ...     return x.sqrt() if bool((x > 0).all()) else x
-        >>> torch.func.vmap(torch.func.grad(lambda x: over_problems(root, x[None])[0]))(torch.tensor([1.0, 4.0])).tolist()
-        [0.5, 0.25]
-    """
+    function ``(b, ...)``."""
     if not transformed(*data):
         return function(*data)
     made: list[Record] = []
@@ -146,10 +121,7 @@ def _moving(value: Tensor) -> bool:
 
 
 def _leaves(inputs: Tensors) -> tuple[Tensors, Tensors]:
-    """The inputs as variables, each of its own, and those of floating point.
-
-    Where gradients are recorded what is differentiated by them can be differentiated by the inputs, too.
-    """
+    """The inputs as variables, each of its own, and those of floating point."""
     again = torch.is_grad_enabled()
 
     def variable(x: Tensor) -> Tensor:

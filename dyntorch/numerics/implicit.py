@@ -26,28 +26,8 @@ HESSIAN_BLOCK = 1 << 21
 
 
 def follow_minimum(cost: Cost, theta: Tensor, free: Tensor, *data: Tensor) -> Tensor:
-    """A minimum as a function of the data: its value, with derivatives of every order by autograd.
-
-    Args:
-        cost: of parameters ``(b, p)`` and data ``(b, ...)`` each, ``(b,)``: one problem each, in operations that autograd
-            differentiates three times.
-        theta: ``(b, p)`` where the gradient of the cost vanishes.
-        free: ``(b, p, g)`` orthonormal, the directions in which the cost never changes.
-        *data: those by which gradients are wanted require them.
-
-    Returns:
-        ``(b, p)``; gradients of 0 for problems with numbers that are not finite.
-
-    Example:
-        >>> import torch
-        >>> y = torch.tensor([[2.0], [8.0]], dtype=torch.float64, requires_grad=True)
-        >>> def cost(theta, y):
-        ...     return (theta[:, 0] ** 2 - y[:, 0]) ** 2
-        >>> root = follow_minimum(cost, y.detach().sqrt(), torch.zeros(2, 1, 0, dtype=torch.float64), y)
-        >>> (slope,) = torch.autograd.grad(root.sum(), y, create_graph=True)  # 1 / (2 sqrt y)
-        >>> torch.autograd.grad(slope.sum(), y)[0].mul(64).round(decimals=6).tolist()  # -1 / (4 sqrt y^3)
-        [[-5.656854], [-0.707107]]
-    """
+    """A minimum as a function of the data: its value, with derivatives of every order by autograd. cost ``(b, p)``, theta
+    ``(b, p)``, free ``(b, p, g)`` -> ``(b, p)``."""
     found: Tensor = _Minimum.apply(cost, theta.detach(), free.detach(), *data)  # type: ignore[no-untyped-call]
     return found
 

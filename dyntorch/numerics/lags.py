@@ -28,31 +28,8 @@ ELEMENTS = 2**24  # numbers in one piece of work: 128 MB
 
 
 def correlate(a: Tensor, b: Tensor, lags: Lags, lift: Lift, per_point: bool = False) -> Tensor:
-    r"""Products of two lifted sequences, summed over the frames that overlap and over points, at all lags.
-
-    .. math:: C_{pq}(s) = \sum_{ij} u_{jp}(a_i)\, u_{jq}(b_{i+s})
-
-    Frames of one block of the first sequence meet the frames of the second within the lags; the transforms of the blocks add up
-    before the one way back.
-
-    Args:
-        a: ``(b, T1, n, c)`` float64.
-        b: ``(b, T2, n, c')``.
-        lags: first and last lag, in frames.
-        lift: takes frames ``(b, t, n, c)`` to what is multiplied, ``(b, n, p, t)``: of one block at a time.
-        per_point: no sum over the points.
-
-    Returns:
-        ``(b, [n,] p, q, L)``, 0 where nothing overlaps.  Rounding is relative to the norms of whole sequences.
-
-    Source: the correlation theorem; overlap-save for long sequences.
-
-    Example:
-        >>> import torch
-        >>> a = torch.tensor([1.0, 2.0], dtype=torch.float64)[None, :, None, None]
-        >>> correlate(a, a, (-1, 2), lambda x: x.movedim(1, -1)).flatten().abs().round(decimals=9).tolist()
-        [2.0, 5.0, 2.0, 0.0]
-    """
+    r"""Products of two lifted sequences, summed over the frames that overlap and over points, at all lags. a ``(b, T1, n, c)``,
+    b ``(b, T2, n, c')``, lift ``(b, t, n, c)`` -> ``(b, [n,] p, q, L)``."""
     frames1, frames2 = a.shape[1], b.shape[1]
     lo, hi = max(lags[0], 1 - frames1), min(lags[1], frames2 - 1)
     p, q = lift(a[:1, :1]).shape[2], lift(b[:1, :1]).shape[2]
@@ -141,25 +118,8 @@ LEAST = 64  # frames in one piece of running sums
 
 
 def compress(rows: Tensor, rank: int | None = None, noise: float | None = None) -> Tensor:
-    r"""Coordinates of frames in the leading principal directions of their rows: fewer and uncorrelated.
-
-    Args:
-        rows: ``(*batch, T, p)`` finite.
-        rank: how many directions; None to count those whose standard deviation is above ``noise``.
-        noise: standard deviation of the noise in each row, in the unit of ``rows``.
-
-    Returns:
-        ``(*batch, T, r)`` float64 of mean 0; r is the largest count of the batch, at least 1.
-
-    Raises:
-        ValueError: neither or both of rank and noise, or a rank outside 1 to p.
-
-    Example:
-        >>> import torch
-        >>> time = torch.linspace(0, 1, 20)[:, None]
-        >>> compress(torch.cat([time, 2 * time, 3 * time + 1], dim=-1), noise=1e-3).shape
-        torch.Size([20, 1])
-    """
+    r"""Coordinates of frames in the leading principal directions of their rows: fewer and uncorrelated. rows ``(*batch, T, p)``
+    -> ``(*batch, T, r)``."""
     p = rows.shape[-1]
     if (rank is None) == (noise is None):
         raise ValueError(f"compress needs either rank or noise, got rank {rank} and noise {noise}: give one")
@@ -173,24 +133,8 @@ def compress(rows: Tensor, rank: int | None = None, noise: float | None = None) 
 
 
 def window_covariances(x: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Covariances and means of the frames of a window, for many windows, by running sums.
-
-    .. math:: C = \frac1m \sum_{start \le i < end} x_i x_i^T - \mu \mu^T, \qquad \mu = \frac1m \sum_{start \le i < end} x_i
-
-    Args:
-        x: ``(b, T, p)`` float64, best of mean 0: what lies before a window cancels.
-        start: ``(L,)`` first frames.
-        end: ``(L,)`` the frames past the last.
-
-    Returns:
-        ``(b, L, p, p)`` and ``(b, L, p)``, windows last in memory; 0 where a window is empty.
-
-    Example:
-        >>> import torch
-        >>> x = torch.tensor([[[1.0], [3.0], [7.0]]])
-        >>> window_covariances(x, torch.tensor([0, 1]), torch.tensor([2, 3]))[0].flatten().tolist()
-        [1.0, 4.0]
-    """
+    r"""Covariances and means of the frames of a window, for many windows, by running sums. x ``(b, T, p)``, start ``(L,)``, end
+    ``(L,)`` -> ``(b, L, p, p)``."""
     p = x.shape[-1]
     both = _sums_before(torch.cat([x.new_ones(*x.shape[:-1], 1), x], dim=-1), torch.cat([start, end]))
     sums = both[..., len(start) :] - both[..., : len(start)]
@@ -241,29 +185,8 @@ def _packing(size: int, device: torch.device) -> Tensor:
 
 
 def lag_products(a: Tensor, b: Tensor, lags: Lags | None = None) -> Tensor:
-    r"""Products of two sequences of vectors, summed over the frames that overlap, at all lags.
-
-    .. math:: C_{pq}(s) = \sum_i a_{ip}\, b_{i+s,q}
-
-    Args:
-        a: ``(*batch, T1, p)`` finite.
-        b: ``(*batch, T2, q)`` finite.
-        lags: first and last lag, in frames; None for all from -(T1 - 1) to T2 - 1.
-
-    Returns:
-        ``(*batch, L, p, q)`` float64, 0 where nothing overlaps.  Rounding is relative to the energies of whole sequences.
-
-    Raises:
-        ValueError: shapes that do not match, no frames, or lags in the wrong order.
-
-    Source: the correlation theorem; overlap-save for long sequences.
-
-    Example:
-        >>> import torch
-        >>> a, b = torch.tensor([[1.0], [2.0]]), torch.tensor([[3.0], [4.0], [5.0]])
-        >>> [round(value, 9) + 0.0 for value in lag_products(a, b)[:, 0, 0].tolist()]
-        [6.0, 11.0, 14.0, 5.0]
-    """
+    r"""Products of two sequences of vectors, summed over the frames that overlap, at all lags. a ``(*batch, T1, p)``, b
+    ``(*batch, T2, q)`` -> ``(*batch, L, p, q)``."""
     span = _span(a, b, lags, 2)
     shape, first, second = _flat(a, b, 2)
     return _batched(correlate(first[:, :, None], second[:, :, None], span, _channels).movedim(-1, 1), shape)
@@ -272,38 +195,8 @@ def lag_products(a: Tensor, b: Tensor, lags: Lags | None = None) -> Tensor:
 def epipolar_moments(
     x1: Tensor, x2: Tensor, lags: Lags | None = None, weights: tuple[Tensor, Tensor] | None = None, per_point: bool = False
 ) -> tuple[Tensor, Tensor]:
-    r"""Moment matrices of the epipolar constraint of the same points in two cameras, at all lags.
-
-    .. math:: M(s) = \sum_{ij} w_{1,ij}\, w_{2,(i+s)j}\; z z^T, \qquad z = \tilde x_{2,(i+s)j} \otimes \tilde x_{1,ij},
-
-    with :math:`\tilde x = (x, y, 1)`, so that :math:`z \cdot \mathrm{vec} F = \tilde x_2^T F \tilde x_1` for F by rows.  The 81
-    entries are sums of 6 x 6 products of a monomial of each camera, added up over the points before the inverse transform.
-
-    Args:
-        x1: ``(*batch, T1, n, 2)``, best normalized (mean 0, size 1: fourth powers of pixels lose digits); NaN where weight is 0.
-        x2: ``(*batch, T2, n, 2)``.
-        lags: first and last lag, in frames; None for all.
-        weights: ``(*batch, T1, n)`` and ``(*batch, T2, n)``, not negative, 0 = missing; None for 1.  Where a
-            coordinate is not finite it counts as 0.
-        per_point: moments of each point rather than of all together.
-
-    Returns:
-        Moments ``(*batch, [n,] L, 9, 9)`` float64, not divided by the counts, and counts ``(*batch, [n,] L)``, the sums of the
-        products of weights.  Both 0 where nothing overlaps.
-
-    Raises:
-        ValueError: shapes that do not match, or a weight that is negative or not finite.
-
-    Source: thesis, chapter 7; Hartley 1997, In defense of the eight-point algorithm.
-
-    Example:
-        >>> import torch
-        >>> x1 = torch.rand(30, 4, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> x2 = torch.cat([torch.zeros(5, 4, 2, dtype=torch.float64), x1 + 1.0])  # b shows a's frame i at i + 5
-        >>> moments, counts = epipolar_moments(x1, x2, (0, 9))
-        >>> int((torch.linalg.eigvalsh(moments)[:, 0] / counts).argmin())
-        5
-    """
+    r"""Moment matrices of the epipolar constraint of the same points in two cameras, at all lags. x1 ``(*batch, T1, n, 2)``, x2
+    ``(*batch, T2, n, 2)``, weights ``(*batch, T1, n)`` -> ``(*batch, [n,] L, 9, 9)``."""
     found, counts = _camera_moments(x1, x2, lags, weights, per_point)
     return _places(found, _epipolar_places(found.device)), counts
 
@@ -311,40 +204,8 @@ def epipolar_moments(
 def resection_moments(
     x: Tensor, points: Tensor, lags: Lags | None = None, weights: tuple[Tensor, Tensor] | None = None, per_point: bool = False
 ) -> tuple[Tensor, Tensor]:
-    r"""Moment matrices of the projection of the same points in space into one camera, at all lags.
-
-    .. math:: M_k(s) = \sum_{ij} w_{1,ij}\, w_{2,(i+s)j}\; c_k(x_{ij})\, \tilde X_{(i+s)j} \tilde X_{(i+s)j}^T, \qquad
-              c(x) = (1,\; u,\; v,\; u^2 + v^2), \quad x = (u, v),
-
-    with :math:`\tilde X = (X, 1)`.  The 12 x 12 moments of the two rows :math:`P_1 \tilde X - u P_3 \tilde X` and
-    :math:`P_2 \tilde X - v P_3 \tilde X` in the entries of the camera P are made of them:
-
-    .. math:: \begin{pmatrix} M_0 & 0 & -M_1 \\ 0 & M_0 & -M_2 \\ -M_1 & -M_2 & M_3 \end{pmatrix}.
-
-    Args:
-        x: ``(*batch, T1, n, 2)`` what the camera sees, best normalized (mean 0, size 1); NaN where weight is 0.
-        points: ``(*batch, T2, n, 3)`` in space, best normalized, too.
-        lags: first and last lag, in frames; None for all.
-        weights: ``(*batch, T1, n)`` and ``(*batch, T2, n)``, not negative, 0 = missing; None for 1.
-        per_point: moments of each point rather than of all together.
-
-    Returns:
-        Moments ``(*batch, [n,] L, 4, 4, 4)`` float64, k first, not divided by the counts, and counts ``(*batch, [n,] L)``.  Both 0
-        where nothing overlaps.
-
-    Raises:
-        ValueError: shapes that do not match, or a weight that is negative or not finite.
-
-    Source: Hartley and Zisserman 2004, section 7.1, for the rows; the correlation theorem.
-
-    Example:
-        >>> import torch
-        >>> points = torch.rand(30, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> moments, counts = resection_moments(points[5:, :, :2], points, (0, 9))
-        >>> whole = (points[5:, :, :2, None] * points[5:, :, None]).sum((0, 1))  # at lag 5: products of x and y with X, Y, Z
-        >>> bool((moments[5, 1:3, 3, :3] - whole).abs().max() < 1e-12), int(counts[5])
-        (True, 100)
-    """
+    r"""Moment matrices of the projection of the same points in space into one camera, at all lags. x ``(*batch, T1, n, 2)``,
+    points ``(*batch, T2, n, 3)``, weights ``(*batch, T1, n)`` -> ``(*batch, [n,] L, 4, 4, 4)``."""
     if x.ndim < 3 or points.ndim < 3 or x.shape[-2] != points.shape[-2] or (x.shape[-1], points.shape[-1]) != (2, 3):
         raise ValueError(
             f"the same points are (*batch, frames, n, 2) in a camera and (*batch, frames, n, 3) in space, got {tuple(x.shape)} and "
@@ -358,32 +219,8 @@ def resection_moments(
 def lag_covariances(
     a: Tensor, b: Tensor, lags: Lags | None = None, weights: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""Covariances of two sequences of vectors over the frames that overlap, about the means there, at all lags.
-
-    .. math:: C_{ab}(s) = \frac{1}{m} \sum_i (a_i - \bar a(s)) (b_{i+s} - \bar b(s))^T
-
-    Args:
-        a: ``(*batch, T1, p)`` finite (where the weight is not 0).
-        b: ``(*batch, T2, q)``.
-        lags: first and last lag, in frames; None for all.
-        weights: ``(*batch, T1)`` and ``(*batch, T2)``, not negative, 0 = the frame is absent; None for 1.
-
-    Returns:
-        C_aa ``(*batch, L, p, p)``, C_bb ``(*batch, L, q, q)``, C_ab ``(*batch, L, p, q)`` and the counts m, ``(L,)``, with weights
-        ``(*batch, L)``; float64, 0 where nothing overlaps.
-
-    Raises:
-        ValueError: shapes that do not match, no frames, lags in the wrong order, or a bad weight.
-
-    Source: Wolf and Zomet 2006, Wide baseline matching between unsynchronized video sequences.
-
-    Example:
-        >>> import torch
-        >>> a = torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> aa, bb, ab, counts = lag_covariances(a, a, (-1, 1))
-        >>> bool((ab[1] - torch.cov(a.T, correction=0)).abs().max() < 1e-15), counts.tolist()
-        (True, [49.0, 50.0, 49.0])
-    """
+    r"""Covariances of two sequences of vectors over the frames that overlap, about the means there, at all lags. a
+    ``(*batch, T1, p)``, b ``(*batch, T2, q)``, weights ``(*batch, T1)`` -> ``(*batch, L, p, p)``."""
     lo, hi = _span(a, b, lags, 2)
     shape, first, second = _flat(a, b, 2)
     if weights is not None:

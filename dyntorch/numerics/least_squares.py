@@ -157,15 +157,8 @@ def parts_of(theta: Tensor, shapes: Sequence[torch.Size]) -> tuple[Tensor, ...]:
 
 
 def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor | None = None, ridge: float = 0.0) -> Tensor:
-    r"""The step of Levenberg and Marquardt, :math:`(H + \mu\,\mathrm{diag}\,H)^{-1} g`, to be subtracted; 0 where it is not finite.
-
-    Args:
-        gradient: ``(b, p)``.
-        matrix: ``(b, p, p)``.
-        damping: ``(b,)``.
-        free: ``(p,)``, 0 for parameters that stay as they are.
-        ridge: share of the largest diagonal entry that is added to all, whatever the damping.
-    """
+    r"""The step of Levenberg and Marquardt, :math:`(H + \mu\,\mathrm{diag}\,H)^{-1} g`, to be subtracted; 0 where it is not
+    finite. gradient ``(b, p)``, matrix ``(b, p, p)``, damping ``(b,)``, free ``(p,)``."""
     if free is not None:
         gradient, matrix = gradient * free, matrix * free * free[:, None]
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
@@ -183,15 +176,7 @@ def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor 
 
 
 def minimize(problem: LeastSquares, start: Iterate, options: LeastSquaresOptions) -> Minimum:
-    """The minimum next to given parameters, of every problem of a block, by Levenberg-Marquardt.
-
-    The cost never rises.  Where gradients are recorded they go through all the steps.
-
-    Args:
-        problem: says costs and steps.
-        start: what the problem says of the parameters to start from; with a tolerance of None ``b`` may be several dimensions.
-        options: see :class:`LeastSquaresOptions`.
-    """
+    """The minimum next to given parameters, of every problem of a block, by Levenberg-Marquardt."""
     at, damping = start, torch.full_like(start.cost, options.damping)
     steps = torch.full_like(start.cost, options.iterations, dtype=torch.long)
     if options.tolerance is None:
@@ -249,27 +234,8 @@ def _settled(problem: LeastSquares, at: Iterate, options: LeastSquaresOptions) -
 
 
 def derivatives(function: Callable[[Tensor], Tensor], theta: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
-    """Value and directional derivatives by one pass over all tangents.
-
-    By reverse mode alone: what it pulls back is linear in the cotangent, and pulling back through that carries tangents forward.
-    Dual numbers would do it in one pass, but torch's first product of one with a constant imports its compiler, as does the first
-    backward pass of ``torch.func``, and gradients given to autograd import sympy: that takes longer (1.5 s, 0.5 s) than most verbs.
-    Only sums are differentiated here.
-
-    Args:
-        function: ``(k, *batch, p)`` to ``(k, *batch, rows)``, each problem of each k by itself.  Tensors that were made in
-            inference mode cannot take part.
-        theta: ``(*batch, p)``.
-        tangents: ``(k, *batch, p)``.
-
-    Returns:
-        ``(*batch, rows)`` and ``(*batch, k, rows)``.
-
-    Example:
-        >>> import torch
-        >>> derivatives(torch.square, torch.tensor([[3.0, 4.0]]), torch.tensor([[[1.0, 0.5]]]))[1].tolist()
-        [[[6.0, 4.0]]]
-    """
+    """Value and directional derivatives by one pass over all tangents. function ``(k, *batch, p)``, theta ``(*batch, p)``,
+    tangents ``(k, *batch, p)`` -> ``(*batch, rows)``."""
     count = len(tangents)
     with torch.inference_mode(False), torch.enable_grad():
         several = theta.detach().expand(tangents.shape).clone().requires_grad_()
@@ -299,26 +265,8 @@ def by_match(
     problems: tuple[Tensor, ...],
     matches: tuple[Tensor, ...],
 ) -> tuple[Tensor, Tensor]:
-    """Value and transposed Jacobian of a function of the matches: a few values per match, many parameters.
-
-    Every match gets its own copy of the parameters, so that one backward pass per value serves all matches.
-
-    Args:
-        function: parameters ``(b, n, p)``, what belongs to a problem ``(b, n, ...)`` and to a match ``(b, n, 1, ...)`` to
-            ``(b, n, 1, c)``.
-        theta: ``(b, p)``.
-        problems: ``(b, ...)`` each.
-        matches: ``(b, n, ...)`` each.
-
-    Returns:
-        ``(b, n c)`` and ``(b, p, n c)``.
-
-    Example:
-        >>> import torch
-        >>> x = torch.tensor([[1.0, 2.0]])
-        >>> by_match(lambda t, p, m: t[..., None, :] * m[0][..., None], torch.tensor([[3.0]]), (), (x,))[1].tolist()
-        [[[1.0, 2.0]]]
-    """
+    """Value and transposed Jacobian of a function of the matches: a few values per match, many parameters. function
+    ``(b, n, p)``, theta ``(b, p)``, problems ``(b, ...)``, matches ``(b, n, ...)`` -> ``(b, n c)``."""
     count = matches[0].shape[1]
     # copies: what was made in inference mode may not be saved for a backward pass
     with torch.inference_mode(False), torch.enable_grad():
@@ -330,16 +278,7 @@ def by_match(
 
 
 def normalized_derivative(value: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
-    r""":math:`v / |v|` and its transposed Jacobian, from values ``(*batch, rows)`` and their own ``(*batch, p, rows)``.
-
-    Values that are 0 stay so.
-
-    Example:
-        >>> import torch
-        >>> value, slope = normalized_derivative(torch.tensor([0.0, 2.0]), torch.eye(2))
-        >>> value.tolist(), slope.tolist()
-        ([0.0, 1.0], [[0.5, 0.0], [0.0, 0.0]])
-    """
+    r""":math:`v / |v|` and its transposed Jacobian, from values ``(*batch, rows)`` and their own ``(*batch, p, rows)``."""
     norm = value.norm(dim=-1, keepdim=True)
     norm = norm.where(norm > 0, 1.0)
     value = value / norm

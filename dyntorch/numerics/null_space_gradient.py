@@ -20,16 +20,8 @@ OfRows = Callable[[Tensor, int, bool], tuple[Tensor, Tensor]]
 
 
 def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
-    r""":math:`w_j = (G - \rho_j I)^+ (I - V V^T) g_j` for each Ritz vector; rotations inside the eigenspace are left out.
-
-    One Cholesky factorization of :math:`G - \rho_j I + V V^T` each.  Where the eigenspace is not separated from the rest the
-    result is large, but finite.
-
-    Args:
-        gram: ``(b, D, D)`` of trace 1.
-        vectors: ``(b, D, k)`` Ritz vectors.
-        gradient: ``(b, D, k)``.
-    """
+    r""":math:`w_j = (G - \rho_j I)^+ (I - V V^T) g_j` for each Ritz vector; rotations inside the eigenspace are left out. gram
+    ``(b, D, D)``, vectors ``(b, D, k)``, gradient ``(b, D, k)``."""
     values = (vectors * (gram @ vectors)).sum(-2)
     gradient = gradient - vectors @ (vectors.mT @ gradient)
     deflated = raised(gram, vectors)
@@ -42,19 +34,8 @@ def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
 
 
 def turned(gram: Tensor, vectors: Tensor, image: Tensor) -> Tensor:
-    r"""How an eigenspace turns, :math:`dV = -W` where G changes by dG: the solution of a Sylvester equation.
-
-    .. math:: G W - W V^T G V = (I - V V^T)\, dG\, V, \qquad V^T W = 0
-
-    For Ritz vectors these are the columns of :func:`resolvent`.  Here nothing is decided and nothing is written in place, so
-    that every derivative of it exists; a rotation R of the vectors makes W R of W, so that the derivative of a function that is
-    blind to rotations inside the eigenspace stays blind to them.
-
-    Args:
-        gram: ``(b, D, D)``; where it is not finite the result is 0.
-        vectors: ``(b, D, k)`` orthonormal.
-        image: ``(b, D, k)``, dG V.
-    """
+    r"""How an eigenspace turns, :math:`dV = -W` where G changes by dG: the solution of a Sylvester equation. gram
+    ``(b, D, D)``, vectors ``(b, D, k)``, image ``(b, D, k)``."""
     size, dim = vectors.shape[-2:]
     trace = gram.detach().diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     usable = torch.isfinite(gram.detach().sum((-2, -1), keepdim=True)) & (trace > 1e-300)

@@ -32,15 +32,7 @@ UNDERFLOW = 1e-250  # of the order of the entries: squares and products of what 
 
 
 def eigh(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues, ascending, and vectors of symmetric matrices whose entries are of the order of 1.
-
-    Entries that underflow stop the iteration of some builds of LAPACK, and the error is that of the whole batch: they count as 0.
-
-    Example:
-        >>> import torch
-        >>> eigh(torch.tensor([[1.0, 1e-310], [1e-310, 2.0]], dtype=torch.float64))[0].tolist()
-        [1.0, 2.0]
-    """
+    """Eigenvalues, ascending, and vectors of symmetric matrices whose entries are of the order of 1."""
     values, vectors = torch.linalg.eigh(_without(matrix, UNDERFLOW))
     return values, vectors
 
@@ -52,14 +44,7 @@ def _without(matrix: Tensor, limit: float) -> Tensor:
 
 
 def spectrum(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """:func:`eigh` of symmetric matrices of any size; entries that are not finite, which stop the batch as well, count as 0.
-
-    Example:
-        >>> import torch
-        >>> matrices = torch.tensor([[[3e-280, 0.0], [0.0, 1e-280]], [[1.0, torch.nan], [torch.nan, 1.0]]], dtype=torch.float64)
-        >>> spectrum(matrices)[0].tolist()
-        [[1e-280, 3e-280], [1.0, 1.0]]
-    """
+    """:func:`eigh` of symmetric matrices of any size; entries that are not finite, which stop the batch as well, count as 0."""
     even, size = _even(matrix)
     values, vectors = eigh(even)
     return values * size, vectors
@@ -73,16 +58,7 @@ def eigenvalues(matrix: Tensor) -> Tensor:
 
 
 def real_eigenvalues(matrix: Tensor) -> Tensor:
-    """Real parts of the eigenvalues of square matrices of any size, not symmetric; entries that are not finite count as 0.
-
-    Entries as far apart as 1e150 stop that iteration in every build of LAPACK: against the largest, 1e-100 counts as 0.
-
-    Example:
-        >>> import torch
-        >>> matrices = torch.tensor([[[1e200, 1.0], [0.0, 3e200]], [[1.0, torch.inf], [0.0, 1.0]]], dtype=torch.float64)
-        >>> real_eigenvalues(matrices).tolist()
-        [[1e+200, 3e+200], [1.0, 1.0]]
-    """
+    """Real parts of the eigenvalues of square matrices of any size, not symmetric; entries that are not finite count as 0."""
     even, size = _even(matrix)
     values: Tensor = torch.linalg.eigvals(_without(even, 1e-100)).real
     return values * size
@@ -165,24 +141,7 @@ def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
 
 
 def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
-    r"""Eigenspace of the ``dim`` smallest eigenvalues of Gram matrices :math:`G = A^T A`.
-
-    Args:
-        gram: ``(*batch, D, D)`` symmetric positive semidefinite.
-        dim: dimension of the null space.
-
-    Returns:
-        basis, residual, competing and degenerate; a matrix that is not finite gets a zero basis and ``degenerate``.
-
-    Raises:
-        ValueError: no square floating point matrices, or ``dim`` outside 1..D.
-
-    Example:
-        >>> import torch
-        >>> found = gram_null_space(torch.diag(torch.tensor([4.0, 1e-6, 2.0], dtype=torch.float64)))
-        >>> found.basis.abs().round(decimals=6).tolist(), round(float(found.competing), 3), bool(found.degenerate)
-        ([[0.0, 1.0, 0.0]], 0.75, False)
-    """
+    r"""Eigenspace of the ``dim`` smallest eigenvalues of Gram matrices :math:`G = A^T A`. gram ``(*batch, D, D)``."""
     _check(gram, "gram", dim)
     size = gram.shape[-1]
     if gram.shape[-2] != size:

@@ -61,19 +61,12 @@ def rotations(heading: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Drive:
-    """A car on its way.
+    """A car on its way."""
 
-    Attributes:
-        kind: what it does.
-        place: ``(frames, 3)`` metres, the middle of its floor.
-        heading: ``(frames,)`` radians, 0 = z, to the right positive.
-        size: length, height, width, metres.
-    """
-
-    kind: Kind
-    place: Tensor
-    heading: Tensor
-    size: tuple[float, float, float] = CAR
+    kind: Kind  # what it does
+    place: Tensor  # ``(frames, 3)`` metres, the middle of its floor
+    heading: Tensor  # ``(frames,)`` radians, 0 = z, to the right positive
+    size: tuple[float, float, float] = CAR  # length, height, width, metres
 
     def motion(self) -> Tensor:
         """``(frames, 3, 4)`` from frame 0 to every frame."""
@@ -165,21 +158,13 @@ def _meet(a: Drive, b: Drive) -> bool:
 
 @dataclass(frozen=True)
 class Boxes:
-    """What rays meet, besides the road.
+    """What rays meet, besides the road."""
 
-    Attributes:
-        place: ``(frames, b, 3)`` metres, the middle of the lower side.
-        heading: ``(frames, b)`` radians.
-        size: ``(b, 3)`` width, height, length, metres.
-        relief: ``(b,)`` metres that points lie behind the sides, at most.
-        body: ``(b,)`` 0 what stands, 1.. the cars.
-    """
-
-    place: Tensor
-    heading: Tensor
-    size: Tensor
-    relief: Tensor
-    body: Tensor
+    place: Tensor  # ``(frames, b, 3)`` metres, the middle of the lower side
+    heading: Tensor  # ``(frames, b)`` radians
+    size: Tensor  # ``(b, 3)`` width, height, length, metres
+    relief: Tensor  # ``(b,)`` metres that points lie behind the sides, at most
+    body: Tensor  # ``(b,)`` 0 what stands, 1.. the cars
 
     def joined(self, cars: Sequence[Drive]) -> Boxes:
         """With cars that drive."""

@@ -150,11 +150,7 @@ Trajectory = Polynomial | Fourier
 
 
 def times_of_views(times: Tensor, points: Tensor) -> Tensor:
-    """Times ``(*batch, views)`` of points ``(*batch, views, n, d)``, in the wider dtype of the two.
-
-    Raises:
-        ValueError: another shape.
-    """
+    """Times ``(*batch, views)`` of points ``(*batch, views, n, d)``, in the wider dtype of the two."""
     given = torch.as_tensor(times, device=points.device)
     try:
         return given.to(torch.promote_types(given.dtype, points.dtype)).expand(points.shape[:-2])

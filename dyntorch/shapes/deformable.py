@@ -292,15 +292,7 @@ def _by_lengths(
 
 
 def _of_any_cameras(ways: _Ways, options: DeformableOptions) -> tuple[Tensor, Tensor]:
-    r"""The metric Q ``(b, 3, 3)`` by lengths alone: with the monomials :math:`m(d)`, :math:`d^T Q\, d = q \cdot m(d)`,
-
-    .. math:: \min_q \sum_{kt} \frac{(q \cdot (m_{kt} - \bar m_k))^2}{\operatorname{var}(q \cdot m_{kt})}
-
-    by a sequence of generalized eigenvectors: the noise of the points is the same in all directions, that of the monomials is not,
-    and the plain null vector would shrink the direction that the noise fills.  Whether one is decided: ``(b,)``.
-
-    Source: Leedan and Meer 2000 (heteroscedastic errors in variables).
-    """
+    r"""The metric Q ``(b, 3, 3)`` by lengths alone: with the monomials :math:`m(d)`, :math:`d^T Q\, d = q \cdot m(d)`,"""
     way, seen = ways.way, ways.seen
     i, j = torch.triu_indices(3, 3, device=way.device)
     twice = torch.where(i == j, 1.0, 2.0).to(way)

@@ -75,13 +75,7 @@ def partitions(k: int, profile: Profile, device: torch.device) -> tuple[Tensor, 
 
 
 def products(basis: Tensor, hyperplanes: Tensor, profile: Profile) -> Tensor:
-    """What one view puts before the entries of the tensor: ``(..., r, N)``, a row for every choice of hyperplanes.
-
-    Args:
-        basis: ``(..., k + 1, l + 1)`` images of the basis points.
-        hyperplanes: ``(..., m, h, l + 1)`` through the others.
-        profile: how many of them are taken at once.
-    """
+    """What one view puts before the entries of the tensor: ``(..., r, N)``, a row for every choice of hyperplanes."""
     index, signs, _ = partitions(basis.shape[-2] - 1, profile, basis.device)
     incidence = hyperplanes @ basis[..., None, :, :].mT  # (.., m, h, k + 1)
     rows = signs.to(basis.dtype).expand(*basis.shape[:-2], 1, -1)
@@ -100,11 +94,7 @@ def view_rows(x: Tensor, profile: Profile) -> Tensor:
 
 
 def spread(p: Tensor) -> Tensor:
-    r"""Points ``(..., n, l + 1)`` of each view after the collineation that spreads their directions evenly, of norm 1.
-
-    :math:`\sum_i u_i u_i^T / n \to I / (l + 1)` for :math:`u_i = H p_i / |H p_i|` (Tyler's scatter matrix).  It multiplies all rows
-    of a view alike, so it changes no equation, but which of them counts how much: views are then the same in all coordinates.
-    """
+    r"""Points ``(..., n, l + 1)`` of each view after the collineation that spreads their directions evenly, of norm 1."""
     size = p.shape[-1]
     eye = torch.eye(size, dtype=p.dtype, device=p.device)
     unit = unit_vectors(p)
@@ -118,12 +108,7 @@ def spread(p: Tensor) -> Tensor:
 
 @constant
 def free(k: int, l: int, profile: Profile, device: torch.device) -> Tensor:  # noqa: E741
-    r"""Orthonormal basis ``(width, N)`` of what views can say of a tensor: the rows of points anywhere, of no shape.
-
-    What is across to it vanishes in every view (all X alike: the stack of the :math:`S_j B` has rank l + 1 only), the synthetic
-    constraints.  As functions of k + 1 points the rows are the parts of the induced representation of the symmetric group whose
-    Young diagrams have up to l + 1 rows, so :math:`\mathrm{width} = \sum_\lambda K_{\lambda' \alpha} f^\lambda` (Schur and Weyl).
-    """
+    r"""Orthonormal basis ``(width, N)`` of what views can say of a tensor: the rows of points anywhere, of no shape."""
     draw = torch.Generator().manual_seed(0)
     count = partitions(k, profile, torch.device("cpu"))[0].shape[1]
     each = _rows_of_a_view(l, profile)
@@ -143,10 +128,7 @@ def _rows_of_a_view(l: int, profile: Profile) -> int:  # noqa: E741
 
 @constant
 def counted(k: int, l: int, profile: Profile) -> tuple[int, int]:  # noqa: E741
-    """Independent rows of one view, and fewest views that determine the tensor: ranks of views of a random shape.
-
-    The views have rows in common, so that more may be needed than (width - 1) / rows.
-    """
+    """Independent rows of one view, and fewest views that determine the tensor: ranks of views of a random shape."""
     draw = torch.Generator().manual_seed(1)
     basis = free(k, l, profile, torch.device("cpu"))
     width, n = len(basis), k + 1 + len(profile)
@@ -173,16 +155,9 @@ def composed(points: Tensor, profile: Profile) -> Tensor:
 
 
 def multilinear(tensor: Tensor, basis: Tensor, profile: Profile) -> Tensor:
-    r"""The tensor of the points behind the basis for given images of it: the Grassmann tensor of the :math:`B\,\mathrm{diag}(X_j)`.
-
-    Args:
-        tensor: ``(*batch, N)``.
-        basis: ``(k + 1, l + 1)`` images of the basis.
-        profile: of the tensor.
-
-    Returns:
-        ``(*batch, binomial(l + 1, alpha_1), ...)``, the form that vanishes on the compounds of hyperplanes through the images.
-    """
+    r"""The tensor of the points behind the basis for given images of it: the Grassmann tensor of the
+    :math:`B\,\mathrm{diag}(X_j)`. tensor ``(*batch, N)``, basis ``(k + 1, l + 1)`` ->
+    ``(*batch, binomial(l + 1, alpha_1), ...)``."""
     size = basis.shape[-1]
     eye = torch.eye(size, dtype=basis.dtype, device=basis.device).expand(len(profile), size, size)
     rows = products(basis, eye, profile)
@@ -199,12 +174,7 @@ def chosen_basis(k: int, l: int, device: torch.device) -> Tensor:  # noqa: E741
 
 
 def points_of(tensor: Tensor, k: int, l: int, profile: Profile) -> Tensor:  # noqa: E741
-    r"""Points ``(*batch, n, k + 1)`` of a tensor ``(*batch, N)``, in closed form for a tensor that is one; 0 for none.
-
-    For images B of the basis chosen here the tensor is the Grassmann tensor of :math:`M_j \sim B\,\mathrm{diag}(X_j)\,H`, which
-    gives the :math:`M_j`.  Basis point i is what all of them see at :math:`B_i`: triangulated it is column i of :math:`H^{-1}`,
-    and :math:`X_{ji}` the depth at which projection j sees it.
-    """
+    r"""Points ``(*batch, n, k + 1)`` of a tensor ``(*batch, N)``, in closed form for a tensor that is one; 0 for none."""
     basis = chosen_basis(k, l, tensor.device)
     form = multilinear(tensor, basis, profile)
     sizes = (l + 1,) * len(profile)
@@ -239,10 +209,8 @@ def _from_projections(projections: tuple[Tensor, ...], basis: Tensor) -> tuple[T
 
 
 def plane_rows(x: Tensor) -> Tensor:
-    r"""Rows of points beside a reference hyperplane, ``(..., l m, (l + 1) (m - 1))``: :math:`p_j \sim v_j + c`, c projected out.
-
-    The coordinates are those of the v without their mean.
-    """
+    r"""Rows of points beside a reference hyperplane, ``(..., l m, (l + 1) (m - 1))``: :math:`p_j \sim v_j + c`, c projected
+    out."""
     size = x.shape[-1]
     p, seen = local(x)[0], x[..., -1:]
     corners = p[..., :size, :]
@@ -265,14 +233,7 @@ def plane_rows(x: Tensor) -> Tensor:
 
 
 def camera_score(structure: Tensor, x: Tensor, freedom: int, affine: bool) -> Tensor:
-    r""":math:`\sigma_{\min} / \|E\|_F` of the equations of each view for its camera, ``(*batch, views)``; NaN: too few.
-
-    Args:
-        structure: ``(*batch, n, k + 1)``.
-        x: ``(*batch, views, n, l + 1)``.
-        freedom: of a camera.
-        affine: whether the last row of the camera is (0, ..., 0, s).
-    """
+    r""":math:`\sigma_{\min} / \|E\|_F` of the equations of each view for its camera, ``(*batch, views)``; NaN: too few."""
     seen = x[..., -1:] > 0
     p = unit_vectors(local(torch.cat([torch.where(seen, x[..., :-1], 0.0), seen.to(x)], dim=-1))[0])
     known = unit_vectors(structure)[..., None, :, :]

@@ -28,19 +28,12 @@ RIDGE_EPSILON = 1e-12
 
 @dataclass(frozen=True)
 class AffineViews:
-    """Centred single views, one row of the problem each.
+    """Centred single views, one row of the problem each."""
 
-    Attributes:
-        x: ``(b, views, n, 2)`` finite, weighted centroid 0, weighted energy 1 (0 where a view says nothing).
-        weights: ``(b, views, n)``, the sum over a view is n (or 0): missing points weigh nothing.
-        share: ``(b, views)`` weight of each view.
-        scale: ``(b, views)`` what the coordinates were divided by.
-    """
-
-    x: Tensor
-    weights: Tensor
-    share: Tensor
-    scale: Tensor
+    x: Tensor  # ``(b, views, n, 2)`` finite, weighted centroid 0, weighted energy 1 (0 where a view says nothing)
+    weights: Tensor  # ``(b, views, n)``, the sum over a view is n (or 0): missing points weigh nothing
+    share: Tensor  # ``(b, views)`` weight of each view
+    scale: Tensor  # ``(b, views)`` what the coordinates were divided by
 
     def repeated(self, count: int) -> AffineViews:
         """The same problems ``count`` times, one after the other."""
@@ -52,10 +45,7 @@ class AffineViews:
 
 
 def centred_views(x: Tensor, weights: Tensor | None = None, share: Tensor | None = None) -> AffineViews:
-    """Views ``(b, views, n, 2)`` at their centroids, each with energy 1; NaN and weight 0 are missing points.
-
-    A view with fewer than five points, or all in one place, says nothing about the shape and weighs 0.
-    """
+    """Views ``(b, views, n, 2)`` at their centroids, each with energy 1; NaN and weight 0 are missing points."""
     present = x.isfinite().all(-1)
     weight = present.to(x.dtype)
     if weights is not None:
@@ -78,19 +68,12 @@ def centred_views(x: Tensor, weights: Tensor | None = None, share: Tensor | None
 
 @dataclass(frozen=True)
 class ProjectedShapes:
-    """Views projected onto a shape at each view.
+    """Views projected onto a shape at each view."""
 
-    Attributes:
-        residual: ``(..., n, 2)`` weighted by the root of the weights.
-        cameras: ``(..., 3, 2)`` least squares A of :math:`x = X A + 1 b`.
-        basis: ``(..., n, 3)`` orthonormal basis of the centred weighted shape.
-        inverse: ``(..., 3, 3)`` what makes the shape that basis.
-    """
-
-    residual: Tensor
-    cameras: Tensor
-    basis: Tensor
-    inverse: Tensor
+    residual: Tensor  # ``(..., n, 2)`` weighted by the root of the weights
+    cameras: Tensor  # ``(..., 3, 2)`` least squares A of :math:`x = X A + 1 b`
+    basis: Tensor  # ``(..., n, 3)`` orthonormal basis of the centred weighted shape
+    inverse: Tensor  # ``(..., 3, 3)`` what makes the shape that basis
 
 
 def project(x: Tensor, weights: Tensor, shape: Tensor) -> ProjectedShapes:
@@ -110,16 +93,8 @@ def project(x: Tensor, weights: Tensor, shape: Tensor) -> ProjectedShapes:
 
 
 def slopes(found: ProjectedShapes, weights: Tensor, rows: Tensor) -> Tensor:
-    r"""Derivative of the residuals by the shapes (Golub and Pereyra): :math:`dr = -\Pi^\perp dX A - (X^+)^T dX^T r`.
-
-    Args:
-        found: by :func:`project` at ``shapes_at(shapes, rows)``.
-        weights: ``(..., views, n)``.
-        rows: ``(..., views, B)``.
-
-    Returns:
-        ``(..., views, n, B, 3, n, 2)``: of the last two by the three before.
-    """
+    r"""Derivative of the residuals by the shapes (Golub and Pereyra): :math:`dr = -\Pi^\perp dX A - (X^+)^T dX^T r`. weights
+    ``(..., views, n)``, rows ``(..., views, B)`` -> ``(..., views, n, B, 3, n, 2)``."""
     root = weights.sqrt()
     mean = (root / weights.sum(-1, keepdim=True).clamp(min=1e-300))[..., None] * root[..., None, :]
     away = torch.eye(weights.shape[-1], dtype=rows.dtype, device=rows.device) - mean - found.basis @ found.basis.mT
@@ -161,18 +136,10 @@ def _cost(views: AffineViews, found: ProjectedShapes) -> Tensor:
 
 @dataclass(frozen=True)
 class ShapeDescent(NormalEquations):
-    r"""The shapes that leave the least, the cameras eliminated.
+    r"""The shapes that leave the least, the cameras eliminated."""
 
-    Gauss-Newton with Kaufman's Jacobian :math:`dr = -\Pi^\perp\,dX(t_v)\,A_v`: its normal matrix is a sum of Kronecker products
-    :math:`(c c^T) \otimes (A A^T) \otimes \Pi^\perp`, one product of two matrices whatever the number of views.
-
-    Attributes:
-        views: see :class:`AffineViews`.
-        rows: ``(b, views, B)`` values of the basis functions.
-    """
-
-    views: AffineViews
-    rows: Tensor
+    views: AffineViews  # see :class:`AffineViews`
+    rows: Tensor  # ``(b, views, B)`` values of the basis functions
 
     def shapes(self, theta: Tensor) -> Tensor:
         """Shapes ``(b, B, n, 3)`` of parameters ``(b, 3 n B)``."""
@@ -207,19 +174,8 @@ class ShapeDescent(NormalEquations):
 
 
 def descend(views: AffineViews, rows: Tensor, shapes: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
-    r"""Minimize :math:`\sum_v w_v \|(I - \Pi(t_v))\,x_v\|^2` over the shapes (variable projection).
-
-    Args:
-        views: see :class:`AffineViews`.
-        rows: ``(b, views, B)`` values of the basis functions.
-        shapes: ``(b, B, n, 3)`` start.
-        iterations: at most so many steps.
-
-    Returns:
-        Shapes in canonical form, and the cost ``(b,)``, which never rises.
-
-    Source: Golub and Pereyra 1973; Kaufman 1975.
-    """
+    r"""Minimize :math:`\sum_v w_v \|(I - \Pi(t_v))\,x_v\|^2` over the shapes (variable projection). rows ``(b, views, B)``,
+    shapes ``(b, B, n, 3)`` -> ``(b,)``."""
     problem = ShapeDescent(views, rows)
     found = minimize(problem, problem.evaluate((shapes.flatten(1),)), LeastSquaresOptions(iterations=iterations))
     return canonical(found.theta[0].unflatten(1, shapes.shape[1:])), found.cost
@@ -231,17 +187,11 @@ def descend(views: AffineViews, rows: Tensor, shapes: Tensor, iterations: int) -
 
 @dataclass(frozen=True)
 class Graph:
-    r"""The subspace as a graph over three coordinates: :math:`D(t)\, z_j = \sum_i N_{ij}(t)\, y_i`.
+    r"""The subspace as a graph over three coordinates: :math:`D(t)\, z_j = \sum_i N_{ij}(t)\, y_i`."""
 
-    Attributes:
-        scale: ``(b, K)`` coefficients of D, norm 1.
-        slopes: ``(b, K, 3, m)`` coefficients of N.
-        degenerate: ``(b,)`` bool: more than one such graph fulfils the equations.
-    """
-
-    scale: Tensor
-    slopes: Tensor
-    degenerate: Tensor
+    scale: Tensor  # ``(b, K)`` coefficients of D, norm 1
+    slopes: Tensor  # ``(b, K, 3, m)`` coefficients of N
+    degenerate: Tensor  # ``(b,)`` bool: more than one such graph fulfils the equations
 
     def bases(self, powers: Tensor) -> Tensor:
         """Columns that span the subspace ``(b, views, 3 + m, 3)`` at ``powers (b, views, K)``: y above, z below."""
@@ -252,22 +202,8 @@ class Graph:
 
 
 def graph(y: Tensor, z: Tensor, powers: Tensor, share: Tensor) -> Graph:
-    r"""Solve :math:`D(t_v)\, z_j = \sum_i N_{ij}(t_v)\, y_i` for the coefficients of D and N, linear for known times.
-
-    All points share D, each has its own N: what the columns of y explain is projected out of the columns of every z, and D is
-    the null vector of what remains, K numbers instead of :math:`K (1 + 3 m)`.
-
-    Args:
-        y: ``(b, views, 3, 2)`` differences of four basis points, or other three coordinates of the subspace.
-        z: ``(b, views, m, 2)`` the same of the other points.
-        powers: ``(b, views, K)`` basis of the products of three of the functions of the trajectories.
-        share: ``(b, views)`` weights of the views.
-
-    Returns:
-        A :class:`Graph`.
-
-    Source: theory of brackets: D and N are 4 x 4 determinants of the moving basis points.
-    """
+    r"""Solve :math:`D(t_v)\, z_j = \sum_i N_{ij}(t_v)\, y_i` for the coefficients of D and N, linear for known times. y
+    ``(b, views, 3, 2)``, z ``(b, views, m, 2)``, powers ``(b, views, K)``, share ``(b, views)``."""
     root = share.sqrt()[..., None, None, None]
     known = (powers[..., :, None, None] * y[..., None, :, :] * root).flatten(-3, -2)  # (b, v, 3 K, 2)
     known = known.mT.flatten(1, 2)
@@ -322,16 +258,8 @@ def products(rows: Tensor, options: ShapesOptions) -> Tensor:
 
 
 def shapes_through(bases: Tensor, rows: Tensor, share: Tensor) -> Tensor:
-    r"""The shapes whose span is nearest to given subspaces: :math:`(I - \Pi_v) \sum_b c_{vb} X_b = 0`, a null space of dimension 3.
-
-    Args:
-        bases: ``(b, views, k, 3)`` columns that span the subspace at each view.
-        rows: ``(b, views, B)``.
-        share: ``(b, views)``.
-
-    Returns:
-        ``(b, B, k, 3)``.
-    """
+    r"""The shapes whose span is nearest to given subspaces: :math:`(I - \Pi_v) \sum_b c_{vb} X_b = 0`, a null space of
+    dimension 3. bases ``(b, views, k, 3)``, rows ``(b, views, B)``, share ``(b, views)`` -> ``(b, B, k, 3)``."""
     q = torch.linalg.qr(torch.where(bases.isfinite(), bases, 0.0))[0]
     eye = torch.eye(q.shape[-2], dtype=q.dtype, device=q.device)
     away = (eye - q @ q.mT).flatten(2)
@@ -369,11 +297,7 @@ def window_start(x: Tensor, rows: Tensor, share: Tensor, options: ShapesOptions 
 
 
 def pooled_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor | None:
-    r"""Shapes ``(b, B, n, 3)`` by the span of all positions, of dimension 3 B; None where that is the whole space.
-
-    With coordinates :math:`x_v = U y_v` in the span, :math:`c_a(t) W_b y_v = c_b(t) W_a y_v` is linear in the inverse W of the
-    shapes: three null vectors.
-    """
+    r"""Shapes ``(b, B, n, 3)`` by the span of all positions, of dimension 3 B; None where that is the whole space."""
     size, n = rows.shape[-1], x.shape[-2]
     if n - 1 < 3 * size or 2 * x.shape[1] * (size - 1) < 3 * size * size - 3:
         return None
@@ -484,14 +408,7 @@ def fit_shapes(
 
 
 def followed_shapes(shapes: Tensor, measured: Tensor, rows: Tensor, share: Tensor) -> Tensor:
-    """The shapes ``(b, B, n, 3)`` of least squares as a function of what they were fitted to, in the same form.
-
-    Args:
-        shapes: by :func:`fit_shapes`.
-        measured: ``(b, views, n, 3)`` or wider: x, y, 1 where seen.
-        rows: ``(b, views, B)``.
-        share: ``(b, views)``.
-    """
+    """The shapes ``(b, B, n, 3)`` of least squares as a function of what they were fitted to, in the same form."""
     theta = shapes.detach().flatten(1)
     with torch.no_grad():
         matrix = ShapeDescent(_views_of(measured, share), rows).normal_equations(theta)[2]

@@ -45,24 +45,14 @@ RIDGE = 1e-13
 
 @dataclass(frozen=True)
 class PerspectiveViews:
-    """Views beside the best perspective images of a shape at each view.
-
-    Attributes:
-        residual: ``(..., 3 n)`` of each point measurement minus image, two numbers, and its relative depth by the root of the
-            prior; all by the root of the weights.
-        cost: ``(...)`` its square sum without the prior.
-        slopes: ``(..., n, 3, 3)`` of the three numbers of the image of each point by the point.
-        columns: ``(..., 3 n, 11)`` of them by the camera.
-        inverse: ``(..., 11, 11)`` of their Gram.
-        depth: ``(..., n)`` the depths of the points, 1 in the middle.
-    """
+    """Views beside the best perspective images of a shape at each view."""
 
     residual: Tensor
-    cost: Tensor
-    slopes: Tensor
-    columns: Tensor
-    inverse: Tensor
-    depth: Tensor
+    cost: Tensor  # ``(...)`` its square sum without the prior
+    slopes: Tensor  # ``(..., n, 3, 3)`` of the three numbers of the image of each point by the point
+    columns: Tensor  # ``(..., 3 n, 11)`` of them by the camera
+    inverse: Tensor  # ``(..., 11, 11)`` of their Gram
+    depth: Tensor  # ``(..., n)`` the depths of the points, 1 in the middle
 
     def across(self, x: Tensor) -> Tensor:
         """What no camera takes away of columns ``(..., 3 n, k)``."""
@@ -70,14 +60,8 @@ class PerspectiveViews:
 
 
 def perspective(x: Tensor, weights: Tensor, shape: Tensor, prior: Tensor | float, options: PerspectiveOptions) -> PerspectiveViews:
-    r"""The best perspective image of a shape in each view: a linear solution, then Gauss-Newton steps.
-
-    Args:
-        x: ``(..., n, 2)`` views, finite; weights: ``(..., n)``.
-        shape: ``(..., n, 3)``.
-        prior: noise variance over that of the relative depths; its cost is :math:`\kappa \sum_i w_i (m^T X_i)^2 / n`.
-        options: how many steps, and how near to the camera a point may be.
-    """
+    r"""The best perspective image of a shape in each view: a linear solution, then Gauss-Newton steps. x ``(..., n, 2)``, shape
+    ``(..., n, 3)``."""
     root = weights.sqrt()
     total = weights.sum(-1)[..., None, None].clamp(min=1e-300)
     points = shape - (shape * weights[..., None]).sum(-2, keepdim=True) / total
@@ -126,19 +110,12 @@ def _camera(
 
 @dataclass(frozen=True)
 class PerspectiveDescent(NormalEquations):
-    """The shapes that leave the least, the perspective cameras eliminated (variable projection, Kaufman's Jacobian).
+    """The shapes that leave the least, the perspective cameras eliminated (variable projection, Kaufman's Jacobian)."""
 
-    Attributes:
-        views: see :class:`~dyntorch.shapes.moving.AffineViews`.
-        rows: ``(b, views, B)`` values of the basis functions.
-        prior: ``(b,)`` see :func:`perspective`.
-        options: of the cameras.
-    """
-
-    views: AffineViews
-    rows: Tensor
-    prior: Tensor
-    options: PerspectiveOptions
+    views: AffineViews  # see :class:`~dyntorch.shapes.moving.AffineViews`
+    rows: Tensor  # ``(b, views, B)`` values of the basis functions
+    prior: Tensor  # ``(b,)`` see :func:`perspective`
+    options: PerspectiveOptions  # of the cameras
 
     def at(self, theta: Tensor) -> PerspectiveViews:
         """All views beside the shapes of parameters ``(b, 3 n B)``."""

@@ -32,16 +32,8 @@ RIDGE = 1e-14
 
 
 def canonical(x: Tensor) -> tuple[Tensor, Tensor]:
-    r"""The points of each view in the frame in which the first four are :math:`e_1, e_2, e_3` and :math:`(1, 1, 1)`.
-
-    Args:
-        x: ``(*batch, views, n, 3)`` points (x, y, 1), (0, 0, 0) where missing.
-
-    Returns:
-        ``(*batch, views, n - 4, 3)`` unit vectors of the others, 0 where the point is missing or the four have no frame (three
-        of them on a line); and ``(*batch, views, n - 4)`` how noise of the view turns each of them, about, in units of its RMS
-        extent: :math:`q_k` is a ratio of triangles, and a corner moves an area by the length of the side across.
-    """
+    r"""The points of each view in the frame in which the first four are :math:`e_1, e_2, e_3` and :math:`(1, 1, 1)`. x
+    ``(*batch, views, n, 3)`` -> ``(*batch, views, n - 4, 3)``."""
     p = local(x)[0]
     corners, others = p[..., :3, :], p[..., 3:, :]
     sides = torch.linalg.cross(corners[..., [1, 2, 0], :], corners[..., [2, 0, 1], :])
@@ -61,11 +53,7 @@ def canonical(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def local(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Points ``(..., n, l + 1)`` of each view about the mean of those that are seen, at unit RMS distance; missing ones 0.
-
-    Returns:
-        the points, and by what they were multiplied, ``(...)``.
-    """
+    """Points ``(..., n, l + 1)`` of each view about the mean of those that are seen, at unit RMS distance; missing ones 0."""
     xy, seen = x[..., :-1], x[..., -1:]
     count = seen.sum(-2, keepdim=True).clamp(min=1.0)
     centred = (xy - (xy * seen).sum(-2, keepdim=True) / count) * seen
@@ -75,10 +63,7 @@ def local(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def lines_through(q: Tensor) -> Tensor:
-    """Two orthonormal lines through each point ``(..., 3)`` of norm 1, ``(..., 2, 3)``; 0 through a zero one.
-
-    In other dimensions l hyperplanes through points ``(..., l + 1)``, ``(..., l, l + 1)``.
-    """
+    """Two orthonormal lines through each point ``(..., 3)`` of norm 1, ``(..., 2, 3)``; 0 through a zero one."""
     # all rows but the last of the reflection that takes the point to the last axis
     size = q.shape[-1] - 1
     shifted = torch.cat([q[..., :-1], q[..., -1:] + torch.where(q[..., -1:] < 0, -1.0, 1.0)], dim=-1)
@@ -104,12 +89,7 @@ def general_rows(x: Tensor) -> Tensor:
 
 
 def plane_rows(x: Tensor) -> Tensor:
-    r"""Rows of points beside a reference plane, in the coordinates of :func:`centred`: ``(..., 2 (n - 4), 3 (n - 5))``.
-
-    With the four coplanar points as the frame :math:`p_i \sim v_i + c`, so :math:`l (v_i + c) = 0` for lines l through
-    :math:`p_i` is linear in the points v and the camera c at once.  The camera of the view is projected out.  Each point
-    weighs as much as it is sure: with 8 points, 20 views and noise of 1 px new views are 2.5 px off, not 4.5 (true shape: 2.1).
-    """
+    r"""Rows of points beside a reference plane, in the coordinates of :func:`centred`: ``(..., 2 (n - 4), 3 (n - 5))``."""
     q, noise = canonical(x)
     count = q.shape[-2]
     camera = (lines_through(q) / noise[..., None, None]).flatten(-3, -2)  # (.., 2 m, 3)
@@ -143,11 +123,8 @@ def centred(count: int, device: torch.device) -> Tensor:
 
 @constant
 def free(points: int, device: torch.device) -> Tensor:
-    r"""Orthonormal basis ``(5 | 11 | 23, 3^k)`` of the tensors of six, seven or eight points that fulfil the synthetic constraints.
-
-    These hold for all shapes: a camera whose centre is the basis point :math:`P_b` shows all others wherever it likes, so the
-    form vanishes with all points equal to :math:`u \in \{e_1, e_2, e_3, (1, 1, 1)\}`.
-    """
+    r"""Orthonormal basis ``(5 | 11 | 23, 3^k)`` of the tensors of six, seven or eight points that fulfil the synthetic
+    constraints."""
     special = torch.cat([torch.eye(3, dtype=torch.float64), torch.full((1, 3), 3**-0.5, dtype=torch.float64)])
     rows = _products(special[:, None].expand(4, points - 4, 3)).flatten(0, 1)
     return null_space(rows, rows.shape[-1] - int(torch.linalg.matrix_rank(rows))).to(device)
@@ -155,10 +132,7 @@ def free(points: int, device: torch.device) -> Tensor:
 
 @constant
 def plane_map(points: int, device: torch.device) -> Tensor:
-    r"""The tensor of six, seven or eight points, four of them coplanar, as a linear function ``(3^k, 3 k)`` of v5, v6, ...
-
-    It takes a common shift to 0; its image is the space in which all synthetic constraints hold.
-    """
+    r"""The tensor of six, seven or eight points, four of them coplanar, as a linear function ``(3^k, 3 k)`` of v5, v6, ..."""
     count = points - 4
     v = torch.eye(3 * count, dtype=torch.float64).unflatten(-1, (count, 3))
     return form(finite_cameras(v)).mT.to(device)
@@ -171,19 +145,13 @@ def finite_cameras(v: Tensor) -> list[Tensor]:
 
 
 def form(cameras: list[Tensor]) -> Tensor:
-    """The tensor, flat ``(*batch, 3^k)``, of matrices ``(*batch, 3, 4)`` that take a camera to each point's image.
-
-    A slot of two lines is written for their meet, the point itself.
-    """
+    """The tensor, flat ``(*batch, 3^k)``, of matrices ``(*batch, 3, 4)`` that take a camera to each point's image."""
     profile = PROFILES[len(cameras) + 4]
     return by_lines(grassmann_tensor(cameras, profile), profile).flatten(-len(profile))
 
 
 def by_lines(tensor: Tensor, profile: tuple[int, ...]) -> Tensor:
-    """From the form of :func:`form` to a Grassmann tensor ``(*batch, 3, 3, ...)``, and back.
-
-    Minors 01, 02, 12 of two lines are the coordinates 2, -1, 0 of their meet.
-    """
+    """From the form of :func:`form` to a Grassmann tensor ``(*batch, 3, 3, ...)``, and back."""
     sign = torch.tensor([1.0, -1.0, 1.0], dtype=tensor.dtype, device=tensor.device)
     for slot, a in enumerate(profile):
         if a == 2:
@@ -198,19 +166,7 @@ THIN = 1e-12
 
 
 def standard(points: Tensor, frame: str) -> Tensor:
-    r"""Points in the frame that a shape tensor leaves open.
-
-    - ``general``: :math:`P_1 \dots P_4 = e_1 \dots e_4` (any scale of the four coordinates is left);
-    - ``plane``: :math:`P_1, P_2, P_3 = e_1, e_2, e_3` and :math:`P_4 = (1, 1, 1, 0)`, which is first moved onto their plane;
-    - ``affine``: last coordinate 1.
-
-    Args:
-        points: ``(*batch, n, 4)`` homogeneous, of any scale; ``(*batch, n, k + 1)`` of P^k, with k + 1 in the place of 4.
-        frame: one of the three.
-
-    Returns:
-        the same shape; not finite where the basis points have no frame.
-    """
+    r"""Points in the frame that a shape tensor leaves open. points ``(*batch, n, 4)``."""
     k = points.shape[-1] - 1
     if frame == AFFINE:
         return points / points[..., k:]
@@ -254,11 +210,8 @@ def reference_cameras(others: Tensor) -> list[Tensor]:
 
 
 def general_points(tensor: Tensor, order: int) -> Tensor:
-    r"""Points ``(*batch, n, 4)`` of a tensor ``(*batch, 3, 3, ...)`` of so many axes in the general frame with P5 = (1, 1, 1, 1).
-
-    The tensor is the dual of a multi-view one: its cameras see each other's centres, :math:`\hat P_i c_5 \sim (X - W, Y - W,
-    Z - W)` and :math:`\hat P_5 c_i \sim ((X - W) / X, \dots)` for :math:`P_i = (X, Y, Z, W)`, whose ratio is (X, Y, Z).
-    """
+    r"""Points ``(*batch, n, 4)`` of a tensor ``(*batch, 3, 3, ...)`` of so many axes in the general frame with P5 = (1, 1, 1,
+    1)."""
     profile = PROFILES[4 + order]
     cameras = projections_of(by_lines(tensor, profile), profile, (3,) * order)
     sound = torch.stack([m.flatten(-2).abs().amax(-1) for m in cameras]).amin(0) > 0
@@ -320,29 +273,8 @@ COMPLETION_FLAT = 1e-8
 
 
 def completed(x: Tensor, seen: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Fill in the missing points of affine views of one shape.
-
-    In the views that show four basis points every other point is a constant affine combination of these, linear equations in
-    which views that do not show it have no part; the basis is the one that these views show best.  From that shape on, cameras
-    from points and points from cameras are least squares of what is seen, in turns.
-
-    Args:
-        x: ``(b, views, n, 2)`` of order 1, finite.
-        seen: ``(b, views, n)`` bool.
-        weights: ``(b, views)``; views of weight 0 have no say.
-
-    Returns:
-        ``(b, views, n, 2)``, the points that are seen as they were, and ``(b, views)`` bool: where a view is whole now.
-
-    Example:
-        >>> import torch
-        >>> draw = torch.Generator().manual_seed(0)
-        >>> shape, cameras = (torch.randn(*size, generator=draw).double() for size in ((7, 3), (9, 3, 2)))
-        >>> x, seen = shape @ cameras, torch.rand(9, 7, generator=draw) < 0.9
-        >>> filled, whole = completed((x * seen[..., None])[None], seen[None], torch.ones(1, 9).double())
-        >>> bool(whole.all()), bool(torch.allclose(filled[0], x))
-        (True, True)
-    """
+    r"""Fill in the missing points of affine views of one shape. x ``(b, views, n, 2)``, seen ``(b, views, n)``, weights
+    ``(b, views)`` -> ``(b, views, n, 2)``."""
     with torch.no_grad():
         share = seen * (weights / weights.amax(-1, keepdim=True).clamp(min=1e-300))[..., None]
         space, known = _start(x, share)

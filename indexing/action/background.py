@@ -36,11 +36,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class OtherMovement:
-    """Clips that are not the action, and of which kind each is: kinds are classes of the model that are never reported.
-
-    clips: as exemplars; kinds: name of each clip's kind; sure: ``(clips,)`` bool, whether somebody said that they are not the
-    action (the others are left out where they are too much like it).
-    """
+    """Clips that are not the action, and of which kind each is: kinds are classes of the model that are never reported."""
 
     clips: tuple[Clip, ...] = ()
     kinds: tuple[str, ...] = ()
@@ -68,16 +64,7 @@ ORDERS = ("backwards", "halves exchanged", "another order")
 def played_otherwise(
     clips: Sequence[Clip], ordered: bool, options: BackgroundOptions, random_state: np.random.Generator
 ) -> OtherMovement:
-    """The clips with the movement of each joint done by another one, and in another order.
-
-    Args:
-        ordered: in another order, too; within a short window that is still the action, so only where there is nothing better.
-
-    Example:
-        >>> clip = Clip(np.random.default_rng(0).normal(size=(8, 5, 2)))
-        >>> sorted(set(played_otherwise([clip], True, BackgroundOptions(), np.random.default_rng(0)).kinds))
-        ['another order', 'backwards', 'halves exchanged', 'other joints 0', 'other joints 1']
-    """
+    """The clips with the movement of each joint done by another one, and in another order."""
     found = []
     for clip in clips:
         frames = np.arange(len(clip))
@@ -97,11 +84,7 @@ def played_otherwise(
 
 
 def performed(skeleton: Skeleton | None, dims: int, options: BackgroundOptions, random_state: np.random.Generator) -> OtherMovement:
-    """Synthetic people who do everyday actions, each seen from somewhere; nothing where the joints cannot be told by name.
-
-    Args:
-        skeleton: of the clips that are learned from; dims: 3 gives the actors in 3D.
-    """
+    """Synthetic people who do everyday actions, each seen from somewhere; nothing where the joints cannot be told by name."""
     if not named(skeleton):
         return OtherMovement()
     azimuth = None if dims == 3 else [float(a) for a in random_state.uniform(0.0, 360.0, options.views)]
@@ -117,15 +100,7 @@ def performed(skeleton: Skeleton | None, dims: int, options: BackgroundOptions, 
 def recorded(
     background: Iterable[Any], fps: float, joints: int, skeleton: Skeleton | None, seconds: float, options: BackgroundOptions
 ) -> OtherMovement:
-    """Recordings of other movement, cut into pieces as long as an action.
-
-    Args:
-        background: clips or arrays, of any length; joints, skeleton: how many, and which, those of the action are.
-        seconds: that an ordinary action lasts.
-
-    Raises:
-        ValueError: naming the clip: other joints, no frames, nobody seen.
-    """
+    """Recordings of other movement, cut into pieces as long as an action."""
     try:
         clips = [part for item in as_clips(background, fps) for part in (item if isinstance(item, tuple) else (item,))]
         clips = matched_all(clips, skeleton)
@@ -164,14 +139,7 @@ def _pieces(clip: Clip, number: int, seconds: float, options: BackgroundOptions)
 
 
 def alike(exemplars: Exemplars, numbers: Array, kinds: Sequence[str], options: ActionOptions) -> Array:
-    """``(kinds,)`` bool, which of the made exemplars are of a kind that may be the action itself.
-
-    A kind is compared with the action as two actions are, by the mean residual to the nearest exemplars; joints count as they do
-    among all of them.  Of a cycle every order is the same.
-
-    Args:
-        numbers: ``(N,)`` classes; 0 is the action, whose exemplars come first; kinds: names of those of the others, in order.
-    """
+    """``(kinds,)`` bool, which of the made exemplars are of a kind that may be the action itself."""
     labels = torch.from_numpy(np.asarray(numbers))
     classes = int(labels.max()) + 1
     model = learn(exemplars, labels, classes, Lesson(scorer="nearest", hidden=classes - 1), options)
@@ -185,11 +153,7 @@ def alike(exemplars: Exemplars, numbers: Array, kinds: Sequence[str], options: A
 
 
 def event_level(model: ShapeModel, rate: float | None) -> float:
-    """The least score of an event, at which other movement is reported at the rate that is asked for.
-
-    Every exemplar is asked as if its class were not known: what its short windows say, on average, for the known class that they
-    say most for.  Where they say more for background it would not be reported at all.
-    """
+    """The least score of an event, at which other movement is reported at the rate that is asked for."""
     if rate is None:
         return -np.inf
     if not 0 < rate < 1:
@@ -220,12 +184,7 @@ def segment_evidence(model: ShapeModel, clip: Clip, events: Sequence[Event], len
 def without_background(
     told: Explanation, classes: Sequence[Any], least: float, enough: Callable[[Sequence[Event]], NDArray[np.bool_]]
 ) -> Explanation:
-    """What is said of the known actions: other movement is left out, or told as held back where it has their evidence.
-
-    Args:
-        told: its last classes are background; classes: the known labels; least: score of an event; enough: which events of
-            known actions have the evidence that is asked for.
-    """
+    """What is said of the known actions: other movement is left out, or told as held back where it has their evidence."""
     known = len(classes)
     scores = told.scores[:, :known]
     likely = np.exp(scores).sum(axis=1).clip(0.0, 1.0)

@@ -33,21 +33,8 @@ CHANNELS = ("clip", "frame", "motion", "velocity")
 
 
 def channel(windows: Tensor, name: str) -> Tensor:
-    """One channel of every window.
-
-    Args:
-        windows: ``(*batch, length, joints, dims)`` without NaN.
-        name: one of :data:`CHANNELS`.
-
-    Returns:
-        ``(*batch, length or length - 2, joints, dims)``.
-
-    Example:
-        >>> import torch
-        >>> still = torch.rand(5, 3, 2)[:1].expand(4, 3, 2)
-        >>> bool(channel(still, "motion").abs().max() < 1e-6)
-        True
-    """
+    """One channel of every window. windows ``(*batch, length, joints, dims)`` ->
+    ``(*batch, length or length - 2, joints, dims)``."""
     if name == "clip":
         return windows - windows.mean(dim=(-3, -2), keepdim=True)
     if name == "frame":
@@ -60,20 +47,8 @@ def channel(windows: Tensor, name: str) -> Tensor:
 
 
 def order_free(windows: Tensor, whole_image: bool = False) -> Tensor:
-    r"""Three moments of the joints that forget when in the window something happened.
-
-    With :math:`f_t` the frame-centred coordinates, :math:`m_t = f_t - \bar f` and :math:`v_t = f_{t+1} - f_t`, they are
-    :math:`\sum_t f_t f_t^T`, :math:`\sum_t m_t m_t^T` and :math:`\sum_t v_t v_t^T`.
-
-    Args:
-        windows: ``(batch, length, joints, 2)``.
-        whole_image: use both coordinates; otherwise heights alone, which a turn about the vertical leaves as they are.
-
-    Returns:
-        ``(3, batch, size * size)`` with size = joints, or 2 joints; not normalized.
-
-    Source: covariance descriptors of joints, Hussein et al. 2013.
-    """
+    r"""Three moments of the joints that forget when in the window something happened. windows ``(batch, length, joints, 2)`` ->
+    ``(3, batch, size * size)``."""
     still = channel(windows, "frame")
     still = still.flatten(-2) if whole_image else still[..., 1]
     moving = still - still.mean(dim=-2, keepdim=True)
@@ -83,12 +58,7 @@ def order_free(windows: Tensor, whole_image: bool = False) -> Tensor:
 
 @dataclass(frozen=True)
 class JointMetric:
-    r"""How much each direction of joint space counts, per channel: :math:`W = (\Sigma + \lambda I)^{-\alpha}`.
-
-    Sigma is the joints' covariance over all fitted windows, scaled to mean diagonal 1.  Head, neck and shoulders move as
-    one and would be counted many times; a mild whitening (alpha 1/4) counts them once and lets hands speak.  W acts on
-    the rows (joints) of both coordinates alike, so the rank conditions between views stay exact.
-    """
+    r"""How much each direction of joint space counts, per channel: :math:`W = (\Sigma + \lambda I)^{-\alpha}`."""
 
     covariance: Tensor = field(metadata=stored("real", "channels", "joints", "joints", name="metric"))  # float64
     power: float = field(metadata=stored("real", name="metric_power", least=0, most=10))  # alpha
@@ -141,10 +111,7 @@ KEPT_BLOCK = 2**25  # bytes of the descriptions that a bank keeps: 32 MB; those 
 
 @dataclass(frozen=True)
 class Windows:
-    """Batched windows and the joints that were seen in each.
-
-    values: ``(N, length, joints, dims)`` float32 without NaN; seen: ``(N, joints)`` bool.
-    """
+    """Batched windows and the joints that were seen in each."""
 
     values: Tensor = field(metadata=stored("real", "rows", "length", "joints", 2))
     seen: Tensor = field(metadata=stored("truth", "rows", "joints"))
@@ -179,11 +146,7 @@ COMMON = 3  # joints that two windows must share: two always fit one another
 
 
 def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Tensor | slice], Tensor], worst: float) -> Tensor:
-    """Fill a ``(queries, bank)`` table from ``compare(queries, bank, joints)`` of values, on the joints both sides saw.
-
-    Windows are grouped by which joints were seen, so that a comparison is always exact on the joints it has; pairs that
-    share fewer than three joints get the value ``worst``.
-    """
+    """Fill a ``(queries, bank)`` table from ``compare(queries, bank, joints)`` of values, on the joints both sides saw."""
     groups = list(patterns(bank.seen))
     out = query.values.new_empty(len(query), len(bank))
     for rows, seen in patterns(query.seen):
@@ -236,10 +199,7 @@ Compare = Callable[[Described, Described], Sequence[Tensor]]  # ``(Q, E)`` table
 
 @dataclass(frozen=True)
 class Copy:
-    """Images of exemplars that are compared as these: crops, mirror images.
-
-    windows: of all exemplars; numbers: of those that count, ``None`` for all; symmetry: joints of the mirror image, if it is one.
-    """
+    """Images of exemplars that are compared as these: crops, mirror images."""
 
     windows: Windows
     numbers: Tensor | None = None
@@ -265,11 +225,7 @@ class Copy:
 
 @dataclass(frozen=True)
 class Facing:
-    """Windows of a copy that show the same joints, as they face queries that show the same joints.
-
-    numbers: of their exemplars, ``None`` for all in order; described: among the joints that both sides saw, ``None`` where these
-    are too few; describe: makes the same of queries, and the same of all that have the same ``key``.
-    """
+    """Windows of a copy that show the same joints, as they face queries that show the same joints."""
 
     numbers: Tensor | None
     described: Described | None = None
@@ -292,15 +248,7 @@ class Facing:
 
 
 class Bank:
-    """Exemplars that queries are compared with again and again, described on first use and kept.
-
-    Each set of joints that queries saw needs a description of its own; the least recently used are dropped where they take more
-    than ``KEPT_BLOCK`` bytes.
-
-    Args:
-        copies: of the same exemplars, the nearest of which counts.
-        describer: makes what describes windows among some joints.
-    """
+    """Exemplars that queries are compared with again and again, described on first use and kept."""
 
     def __init__(self, copies: Sequence[Copy], describer: Describer) -> None:
         self._copies, self._describer = copies, describer
@@ -342,15 +290,7 @@ def _among(joints: Tensor | slice, describe: Describe, values: Tensor) -> Descri
 def least(
     query: Windows, banks: Sequence[Bank], compare: Compare, worst: Sequence[float], chosen: Tensor | None = None
 ) -> list[Tensor]:
-    """``(queries, exemplars)`` tables, each the least over the exemplars' copies of what ``compare`` says.
-
-    Windows are grouped by which joints were seen, so that a comparison is always exact on the joints that both sides saw.
-
-    Args:
-        banks: of the same exemplars.
-        worst: in each table, of pairs that share fewer than three joints.
-        chosen: numbers of the exemplars that are asked; all by default.
-    """
+    """``(queries, exemplars)`` tables, each the least over the exemplars' copies of what ``compare`` says."""
     total = max((len(bank) for bank in banks), default=0)
     place = None
     if chosen is not None and not torch.equal(chosen, torch.arange(total, device=chosen.device)):
@@ -415,22 +355,7 @@ def fused_residual(
     weights: Tensor | None = None,
     terms: tuple[str, ...] = ("epi",),
 ) -> Tensor:
-    r"""Residual of every query to every exemplar, the best over the exemplar's copies (crops, mirror images).
-
-    .. math:: D(q, e) = \min_{\text{copies}} \sum_{c} w_c \sum_{\text{terms}} \log(r_c(q, e) + \epsilon)
-
-    Terms: ``epi`` :math:`1 - s_1(U_q, U_e)`, the largest canonical correlation between the channel spaces under the joint
-    metric (any viewpoint); ``nn`` :math:`1 - \cos(X_q, X_e)`, the whole image (one viewpoint); ``turned``
-    :math:`1 - \max_R \cos(X_q R, X_e)` over turns R of flat cards about the vertical.
-
-    Args:
-        query: ``Q`` windows of images; copies: each with the same ``E`` exemplars; weights: ``(channels,)``, 1 by default.
-
-    Returns:
-        ``(Q, E)``; very negative = the two can be views of one action.
-
-    Source: thesis chapter 7 (rank of stacked measurements).
-    """
+    r"""Residual of every query to every exemplar, the best over the exemplar's copies (crops, mirror images)."""
     if not copies:
         raise ValueError("no exemplar to compare with")
     bank = Bank([Copy(windows) for windows in copies], planes_of(metric, channels))
@@ -477,13 +402,7 @@ def _flat(x: Tensor) -> Tensor:
 
 @dataclass
 class Kernels:
-    r"""Mean of Gaussian-like kernels :math:`K = \tfrac1k \sum_k \exp(-d_k / s_k)` on cosine distances :math:`d_k`.
-
-    The distances: heights in each channel, the whole image in each channel, and the order-free moments of the heights; all
-    are one GEMM of unit vectors, and the kernel is positive definite.  ``one_side`` adds what helps where all cameras stand
-    on one side: the moments of the whole image, and the (indefinite) epipolar and affine-invariant distances (JHMDB .81 ->
-    .87).  :math:`s_k` is half the median distance between training windows (twice that costs 1-2 %).
-    """
+    r"""Mean of Gaussian-like kernels :math:`K = \tfrac1k \sum_k \exp(-d_k / s_k)` on cosine distances :math:`d_k`."""
 
     metric: JointMetric
     one_side: bool = False

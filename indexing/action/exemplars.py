@@ -34,12 +34,7 @@ class ExemplarPlan:
 
 @dataclass(frozen=True)
 class Exemplars:
-    """Windows of ``N`` exemplars.
-
-    crops: ``C * N`` windows, crop by crop; views: ``V * N``, view by view; moments: short windows of all exemplars, with
-    ``owner`` telling whose they are; solid: ``(N,)`` which exemplars had depth; seconds: ``(N,)`` how long each lasts; cyclic:
-    ``(N,)`` how much it repeats itself (:func:`recurrence`).  Model files written before these were kept have neither.
-    """
+    """Windows of ``N`` exemplars."""
 
     crops: Windows = field(metadata=part(rows="crops"))
     views: Windows = field(metadata=part(rows="views"))
@@ -129,14 +124,8 @@ def moment_window(longest: float, seconds: torch.Tensor | None, options: Exempla
 
 
 def recurrence(source: Ragged, options: ExemplarOptions) -> torch.Tensor:
-    r"""``(N,)`` how much each exemplar repeats itself within its first half: near 1 for two cycles or more, .3 or less for none.
-
-    The greatest autocorrelation of the frame-centred motion :math:`x`, at lags up to half the exemplar, after it first fell:
-
-    .. math:: R(k) = \frac{\sum_t x_t \cdot x_{t+k}}{\sqrt{\sum_t |x_t|^2 \sum_t |x_{t+k}|^2}}
-
-    It is measured by that of steps that nearly touch: what keeps these from being alike is noise, which lowers all others as much.
-    """
+    r"""``(N,)`` how much each exemplar repeats itself within its first half: near 1 for two cycles or more, .3 or less for
+    none."""
     count, fine = len(source.starts) - 1, options.recurrence_steps
     begin, end = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
     found = torch.zeros(count)

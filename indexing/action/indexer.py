@@ -236,12 +236,7 @@ class ActionIndexer(SavedClassifier):
         return other
 
     def _unlike(self, exemplars: Exemplars, numbers: Array, known: int, new: Array, other: OtherMovement | None = None) -> Array:
-        """``(N,)`` bool, all exemplars but the background that comes out too much like new ones.
-
-        Args:
-            numbers: ``(N,)`` classes, the first ``known`` of which are no background; new: ``(N,)`` bool; other: the background,
-                where it was made just now.
-        """
+        """``(N,)`` bool, all exemplars but the background that comes out too much like new ones."""
         hidden = numbers >= known
         asked = torch.from_numpy(new | hidden)
         own = np.where(hidden, numbers - known + 1, 0)[new | hidden]

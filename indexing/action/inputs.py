@@ -30,14 +30,7 @@ from indexing.windows import check_clips, ragged, sample, torn
 
 
 def combine(views: tuple[Clip, ...], options: ActionOptions = ActionOptions()) -> list[Clip]:
-    """A 3D clip from three or more views that decide it; otherwise the views themselves, each an exemplar of its own.
-
-    The views are factored (Tomasi-Kanade, affine cameras fixed over the clip) and upgraded to a metric shape whose vertical
-    is that of the images, so cameras should stand upright.
-
-    Raises:
-        ValueError: views with different numbers of joints, with depth, or without common time.
-    """
+    """A 3D clip from three or more views that decide it; otherwise the views themselves, each an exemplar of its own."""
     first = views[0]
     for i, view in enumerate(views):
         if view.joints.shape[1:] != first.joints.shape[1:] or view.dims != 2:
@@ -113,11 +106,7 @@ def gather(
     *,
     options: ActionOptions = ActionOptions(),
 ) -> tuple[list[Clip], list[int]]:
-    """Checked training clips and, for each, the item it came from (views that do not decide the shape stay apart).
-
-    Args:
-        joints, skeleton: how many, and which, those of clips are that were learned before.
-    """
+    """Checked training clips and, for each, the item it came from (views that do not decide the shape stay apart)."""
     found: list[Clip] = []
     owners: list[int] = []
     items = as_clips(clips, fps)
@@ -140,12 +129,7 @@ def check_queries(
     fewest: int = 2,
     recordings: bool = False,
 ) -> list[Clip]:
-    """Checked query clips of at least ``fewest`` frames, as images; 3D queries are seen along z.
-
-    Args:
-        joints, skeleton: how many were learned, and which; by these the queries' are matched.
-        recordings: they are untrimmed, or looked at frame by frame, and may have gaps.
-    """
+    """Checked query clips of at least ``fewest`` frames, as images; 3D queries are seen along z."""
     found = []
     for i, item in enumerate(as_clips(clips, fps)):
         if isinstance(item, tuple):
@@ -157,11 +141,7 @@ def check_queries(
 
 
 def check_common(clips: list[Clip], seen: NDArray[np.bool_], known: NDArray[np.bool_]) -> None:
-    """Raise where a query shares too few joints with every exemplar to be compared at all.
-
-    Args:
-        seen: ``(clips, joints)`` joints seen in the queries; known: ``(sets, joints)`` in exemplars.
-    """
+    """Raise where a query shares too few joints with every exemplar to be compared at all. seen ``(clips, joints)``."""
     most = (seen.astype(int) @ known.astype(int).T).max(axis=1)
     few = np.flatnonzero(most < min(COMMON, seen.shape[1]))
     if len(few):
@@ -189,11 +169,7 @@ def gather_labels(clips: list[Clip], owners: list[int], labels: ArrayLike | None
 
 
 def check_contradictions(clips: list[Clip], owners: list[int], labels: Array) -> None:
-    """Raise where one recording has two labels, and warn where it is given twice.
-
-    Raises:
-        ValueError: naming both clips and their labels.
-    """
+    """Raise where one recording has two labels, and warn where it is given twice."""
     twice = []
     for other, i in same_clips(clips):
         both = f"{owners[other]} ({clips[other].name!r}) and {owners[i]} ({clips[i].name!r})"

@@ -47,11 +47,7 @@ ABSENT = -100.0  # score of a class with no exemplar in another group
 
 @dataclass(frozen=True)
 class Evidence:
-    """Products of every joint's coordinates, for queries and the exemplars nearest to them.
-
-    cross, left, right: ``(channels, classes, Q, K, 2, 2, joints)``: of query with exemplar, and of each with itself; hub:
-    ``(classes, Q, K)``, taken off each residual; valid: the same shape, which exist; labels, groups: ``(Q,)``.
-    """
+    """Products of every joint's coordinates, for queries and the exemplars nearest to them."""
 
     cross: Tensor
     left: Tensor
@@ -62,14 +58,8 @@ class Evidence:
     groups: Tensor
 
     def scores(self, joints: Tensor, channels: Tensor) -> Tensor:
-        """Minus the mean log residual to the nearest exemplars, for ``B`` sets of weights at once.
-
-        Args:
-            joints: ``(B, channels, classes or 1, joints)``; channels: ``(B, channels)``.
-
-        Returns:
-            ``(B, Q, classes)``.
-        """
+        """Minus the mean log residual to the nearest exemplars, for ``B`` sets of weights at once. joints
+        ``(B, channels, classes or 1, joints)`` -> ``(B, Q, classes)``."""
         weights = joints.expand(-1, -1, self.cross.shape[1], -1).permute(1, 2, 3, 0)
         shape = (*self.cross.shape[:-1], len(joints))
         tables = (self.cross, self.left, self.right)
@@ -84,26 +74,7 @@ class Evidence:
 
 
 def epipolar(cross: Entries, left: Entries, right: Entries) -> Tensor:
-    r"""Residual :math:`1 - s_1` of two images from their products: differentiable, closed form.
-
-    .. math:: s_1^2 = \tfrac12\bigl(t + \sqrt{t^2 - 4d}\bigr),\quad t = \operatorname{tr}(L^{-1} C R^{-1} C^T),
-        \quad d = \frac{\det(C)^2}{\det L \det R}
-
-    Args:
-        cross, left, right: entries of the 2x2 matrices :math:`C = X^T Y`, :math:`L = X^T X`, :math:`R = Y^T Y`, any shape.
-
-    Returns:
-        as one entry, in [0, 1].
-
-    Source: thesis chapter 7 (rank of stacked measurements); canonical correlation.
-
-    Example:
-        >>> x = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
-        >>> y = torch.tensor([[0.0, 1.0], [0.6, 0.0], [0.8, 0.0]])
-        >>> one, other, both = (m.flatten().unbind() for m in (x.mT @ x, y.mT @ y, x.mT @ y))
-        >>> round(float(epipolar(both, one, other)), 2), round(float(epipolar(one, one, one)), 2)
-        (0.0, 0.0)
-    """
+    r"""Residual :math:`1 - s_1` of two images from their products: differentiable, closed form."""
     c00, c01, c10, c11 = cross
     l00, l01, l11, left_det = _ridged(left)
     r00, r01, r11, right_det = _ridged(right)
@@ -138,12 +109,7 @@ def gather(
     hub: Tensor,
     options: ActionOptions = ActionOptions(),
 ) -> Evidence:
-    """The tables of queries and, of each class, the exemplars of other groups that are nearest to them.
-
-    Args:
-        metrics: of the tables, and by which the nearest exemplars are found; channels: weights by which these are found.
-        others: as in :func:`~indexing.action.joint_weights.learn_joint_weights`.
-    """
+    """The tables of queries and, of each class, the exemplars of other groups that are nearest to them."""
     metric, found_by = metrics
     table = fused_residual(query, copies[:1], found_by, NEAREST, channels)
     which = torch.zeros_like(table, dtype=torch.long)
@@ -188,10 +154,7 @@ def _filled(windows: Windows) -> Tensor:
 
 @dataclass(frozen=True)
 class WeightedMetric(JointMetric):
-    """A joint metric whose whitened joints are then weighted.
-
-    roots: ``(CHANNELS, joints)`` square roots of the weights.
-    """
+    """A joint metric whose whitened joints are then weighted."""
 
     roots: Tensor
 
@@ -204,11 +167,7 @@ class WeightedMetric(JointMetric):
 
 @dataclass(frozen=True)
 class JointWeights:
-    """What was learned; everything is 1 where learning did not pay.
-
-    joints: ``(channels, joints)``, mean 1 in each channel; channels: ``(channels,)``, mean 1; by_class: ``(classes, joints)``
-    factors on top, or ``None``; gain, sigma: held-out log likelihood per query won over equal weights, and its standard error.
-    """
+    """What was learned; everything is 1 where learning did not pay."""
 
     joints: Tensor = field(metadata=stored("real", "nearest", "joints", least=0, most=MOST_WEIGHT))
     channels: Tensor = field(metadata=stored("real", "nearest", least=0, most=MOST_WEIGHT))
@@ -268,37 +227,8 @@ def learn_joint_weights(
     seed: int = 0,
     options: ActionOptions = ActionOptions(),
 ) -> JointWeights:
-    r"""Weights :math:`w \ge 0` of joints and channels under which exemplars of other groups name the queries best.
-
-    .. math:: \max_w \sum_i \log p(c_i | i) - \lambda\|\log w\|^2, \quad p(c|i) \propto \exp(\beta S_{ic}),
-        \quad S_{ic} = -\operatorname*{mean}_{e \in N_c(i)} \Bigl[\sum_x v_x \log(1 - s_1^x(i, e; w_x) + \epsilon) - h_e\Bigr]
-
-    :math:`N_c(i)`: the nearest exemplars of class c outside the query's group.  :math:`\lambda` and whether to learn at all
-    are decided on held-out groups: the strongest pull within a standard error of the best, and equal weights unless the
-    likelihood grows by more than that error.
-
-    Args:
-        query: ``Q`` windows, virtual views of the exemplars; owner: ``(Q,)`` whose view each is.
-        copies: each the same ``N`` exemplars; metric: their joint metric; labels: ``(N,)`` class numbers.
-        groups: ``(N,)`` who performed each exemplar (by default each exemplar is its own group).
-        hub: ``(N,)`` taken off the residuals (0).
-        symmetry: ``(joints,)`` mirror image of every joint; both get the same weight.
-        seed: of the choice of queries where there are too many.
-
-    Returns:
-        Equal weights where fewer than two classes have exemplars in two groups, or learning does not pay.
-
-    Raises:
-        ValueError: lengths that do not fit.
-
-    Source: Wolf 2003, section 10.1 (use the examples twice); neighbourhood components analysis, Goldberger et al. 2004.
-
-    Example:
-        >>> x = Windows(torch.rand(2, 6, 5, 2), torch.ones(2, 5, dtype=torch.bool))
-        >>> metric = JointMetric.learn(x.values, x.seen, 0.25)
-        >>> learn_joint_weights(x, torch.arange(2), [x], metric, torch.tensor([0, 1])).learned  # one example per class
-        False
-    """
+    r"""Weights :math:`w \ge 0` of joints and channels under which exemplars of other groups name the queries best. groups
+    ``(N,)``, hub ``(N,)``, symmetry ``(joints,)``."""
     home = labels.device
     groups = torch.arange(len(labels), device=home) if groups is None else groups
     hub = torch.zeros(len(labels), device=home) if hub is None else hub
@@ -345,10 +275,7 @@ Weights = tuple[Tensor, Tensor]  # (B, channels, classes or 1, joints) and (B, c
 
 @dataclass(frozen=True)
 class _Together:
-    """Weights of all actions together: logarithms of each joint's, of each joint's in each channel, and of the channels'.
-
-    Mirror joints are ``tied``; ``joints`` ``(channels, 1, joints)`` and ``channels`` ``(channels,)`` are where learning starts.
-    """
+    """Weights of all actions together: logarithms of each joint's, of each joint's in each channel, and of the channels'."""
 
     tied: Tensor
     joints: Tensor
@@ -408,11 +335,8 @@ def _choose(evidence: Evidence, stage: _Together, seed: int, options: ActionOpti
 
 
 def _descend(evidence: Evidence, stage: _Together, train: Tensor, options: ActionOptions) -> tuple[Tensor, Weights]:
-    """Every pull on every part of the queries at once: ``(parts, 1 + pulls, Q)`` losses, and the weights; first without learning.
-
-    Args:
-        train: ``(parts, Q)`` bool, which queries each part learns from.
-    """
+    """Every pull on every part of the queries at once: ``(parts, 1 + pulls, Q)`` losses, and the weights; first without
+    learning."""
     pulls = evidence.hub.new_tensor(options.joints.pulls)
     shape = len(train), 1 + len(pulls)
     learning = torch.ones(shape, device=pulls.device)

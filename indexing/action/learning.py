@@ -41,10 +41,7 @@ def leave_out(groups: Tensor, options: ActionOptions = ActionOptions()) -> Tenso
 
 @dataclass(frozen=True)
 class Trained:
-    """What a kernel machine was trained on.
-
-    rows: the exemplars, their virtual views and mirror images; owner: ``(rows,)`` whose they are; gram: ``(rows, rows)``.
-    """
+    """What a kernel machine was trained on."""
 
     rows: Windows
     owner: Tensor
@@ -52,16 +49,7 @@ class Trained:
 
 
 def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> Blend:
-    """The blend that serves people best who were left out.
-
-    Args:
-        model: with every scorer learned from all exemplars.
-        groups: ``(N,)`` who performs each exemplar.
-        trained: what the kernel machine was trained on; ``None`` without one.
-
-    Returns:
-        the model's own blend where nothing can be left out.
-    """
+    """The blend that serves people best who were left out. groups ``(N,)``."""
     labels, folds = model.labels, leave_out(groups, options=model.options)
     # only those are asked whose action somebody in another fold performs, too
     usable = ((folds[:, None] != folds[None]) & (labels[:, None] == labels[None])).any(dim=1)
@@ -96,10 +84,7 @@ def _out(residuals: Tensor, model: ShapeModel, folds: Tensor) -> Tensor:
 
 
 def asked_views(model: ShapeModel) -> list[Windows]:
-    """The exemplars as they are and in some virtual views, each a bit wrong, as a detector's are.
-
-    Whole exemplars, as queries are: asked of their crops, which the machine was trained on, it looks too good.
-    """
+    """The exemplars as they are and in some virtual views, each a bit wrong, as a detector's are."""
     rng, whole = np.random.default_rng(0), model.exemplars.crop(0)
     count = len(whole)
     asked = [whole]
@@ -153,10 +138,7 @@ def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend, options: Act
 
 
 def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int, options: ActionOptions) -> Blend:
-    """The blend with the sharpness that makes the answers most likely, were one more of the exemplars asked a mistake.
-
-    Without that mistake, people who are all recognized would make every answer certain.
-    """
+    """The blend with the sharpness that makes the answers most likely, were one more of the exemplars asked a mistake."""
     even, count = standardized(scores), scores.shape[1]
     doubt = 1 / (exemplars + 2)
     losses = []
@@ -169,16 +151,7 @@ def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int, opti
 
 @dataclass(frozen=True)
 class Lesson:
-    """How to learn.
-
-    Args:
-        view: ``"any"`` or ``"same"``; scorer: ``"nearest"``, ``"kernel"`` or ``"both"``.
-        learned: weigh the scorers by what serves people who were left out (else by fixed weights).
-        groups: ``(N,)`` number of the person who performs each exemplar; ``None`` = not known, and nothing can be left out.
-        symmetry: joint permutation of the mirror image, or ``None`` to go without mirror images.
-        guard: leave out mirror images of classes that they would turn into one another.
-        hidden: how many of the last classes are background.
-    """
+    """How to learn. groups ``(N,)``."""
 
     view: str = "any"
     scorer: str = "both"
@@ -192,13 +165,7 @@ class Lesson:
 def learn(
     exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson, options: ActionOptions = ActionOptions()
 ) -> ShapeModel:
-    """Learn everything from the exemplars' windows.
-
-    It is computed where the exemplars and labels are; support vector machines are trained on the CPU.
-
-    Args:
-        labels: ``(N,)`` class numbers.
-    """
+    """Learn everything from the exemplars' windows. labels ``(N,)``."""
     originals = exemplars.crop(0)
     nothing = torch.zeros(len(labels), device=labels.device)
     metric = JointMetric.learn(originals.values, originals.seen, options.nearest.whitening, options.nearest.floor)
@@ -248,11 +215,7 @@ def _parts(model: ShapeModel, lesson: Lesson) -> JointWeights:
 
 
 def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
-    """``(N,)`` whether the mirror image of an exemplar is still the same action.
-
-    Where left and right are different actions, the mirror images of each look like the other: two classes most of whose
-    mirror images are nearest to one another are not mirrored.  (One direction alone is ordinary confusion.)
-    """
+    """``(N,)`` whether the mirror image of an exemplar is still the same action."""
     if model.symmetry is None:
         return model.mirrored
     flipped = mirror_some(originals, model.symmetry, torch.ones_like(model.mirrored))
@@ -293,11 +256,8 @@ def _profiles(tables: list[Tensor], labels: Tensor, classes: int, hidden: int, o
 
 
 def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
-    """The evidence that exemplars would have for other classes, were their own class unknown; of all that could be taken for one.
-
-    Neither hubs nor profiles must know the class: with it in the hubs, 10 % asked for were 18 to 21 % (14 % so; 30 %: 53, now 35).
-    Who resembles background most is refused whatever the evidence, and counts as the least.
-    """
+    """The evidence that exemplars would have for other classes, were their own class unknown; of all that could be taken for
+    one."""
     if model.known == 1:
         return _between_kinds(tables[0], model)
     found, refused = [], []
@@ -322,10 +282,7 @@ def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
 
 
 def _between_kinds(residual: Tensor, model: ShapeModel) -> Tensor:
-    """How near exemplars of background come to every kind that is not theirs: as near another movement comes to the action.
-
-    Kinds among themselves, since they are of one sort: synthetic people come nearer to one another than to whoever is recorded.
-    """
+    """How near exemplars of background come to every kind that is not theirs: as near another movement comes to the action."""
     rows = model.labels >= model.known
     scores = class_scores(residual[rows], model.labels, model.classes, options=model.options)
     foreign = torch.nn.functional.one_hot(model.labels[rows], model.classes) == 0
@@ -374,23 +331,7 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
 
 
 def importance(model: ShapeModel, groups: Tensor | None = None, seed: int = 0) -> Tensor:
-    r"""Linear share of every joint in the margin of every action.
-
-    .. math:: \operatorname{margin}_c(m) \approx a_c + \sum_j b_{cj} m_j, \quad m \in \{0, 1\}^n \text{, half of it 1}
-
-    The margin, in nats of the residual, is how much nearer the nearest exemplar of the true class is than that of any other,
-    averaged over the exemplars of the class, none compared with exemplars of its own group.  An action that only this group
-    shows keeps its exemplars: then joints matter by how well they set it apart from the others.
-
-    Args:
-        model: fitted; groups: ``(N,)`` who performed each exemplar (by default each exemplar is its own group).
-        seed: of the halves and of the exemplars that are asked, where there are many.
-
-    Returns:
-        ``(classes, joints)`` b, float64; negative where a joint misleads.
-
-    Source: Banzhaf value of cooperative games, fitted by least squares (Hammer and Holzman 1992).
-    """
+    r"""Linear share of every joint in the margin of every action. model ``(N,)`` -> ``(classes, joints)``."""
     originals, labels = model.exemplars.crop(0), model.labels
     groups = torch.arange(len(labels), device=labels.device) if groups is None else groups.to(labels.device)
     generator = torch.Generator().manual_seed(seed)

@@ -35,11 +35,7 @@ from indexing.scoring import DecisionOptions
 
 @dataclass(frozen=True)
 class PairwiseMachine:
-    """One support vector machine per pair of classes, over a precomputed kernel.
-
-    support: ``(S,)`` rows of the training windows, sorted by class; dual: ``(classes - 1, S)``; intercept:
-    ``(classes (classes - 1) / 2,)``; counts: ``(classes,)`` support vectors per class.
-    """
+    """One support vector machine per pair of classes, over a precomputed kernel."""
 
     support: Tensor = field(metadata=stored("whole", "rows"))
     dual: Tensor = field(metadata=stored("real", "others", "rows"))
@@ -60,14 +56,7 @@ class PairwiseMachine:
         )
 
     def __call__(self, kernel: Tensor) -> Tensor:
-        """Votes per class, ordered among equals by the summed margins.
-
-        Args:
-            kernel: ``(Q, S)`` of queries to the support rows.
-
-        Returns:
-            ``(Q, classes)``, larger is better: the one-against-one vote plus a confidence below one half.
-        """
+        """Votes per class, ordered among equals by the summed margins. kernel ``(Q, S)`` -> ``(Q, classes)``."""
         classes, dual = len(self.counts), self.dual.to(kernel)
         parts = zip(kernel.split(self.counts.tolist(), dim=1), dual.split(self.counts.tolist(), dim=1), strict=True)
         # (Q, classes, classes - 1): what the support vectors of each class say against each of the others
@@ -91,26 +80,7 @@ def evidence(
     hidden: int = 0,
     options: ActionOptions = ActionOptions(),
 ) -> Tensor:
-    r"""``(Q,)`` evidence for a known action: how good the best class score is, how far it stands out, how usual the others are.
-
-    .. math:: e = s_1 + (s_1 - \bar s) + (s_1 - s_2) - w\, m
-
-    of the sorted class scores, with m the distance from the profiles of the exemplars (:class:`ClassProfiles`).  AUROC of known
-    against unknown actions, UTKinect and Florence3D, camera turned 0 / 90 degrees: the best score alone .78 / .74, .80 / .78; the
-    first three terms .76 / .72, .83 / .78; all .86 / .82, .87 / .84.
-
-    Args:
-        scores: ``(Q, classes)``, or one column less where a class was left out.
-        classes: of the model; with fewer than ``options.nearest.classes`` the best score stands alone.
-        unusual: ``(Q,)`` m, where the exemplars tell.
-        hidden: how many of the last classes are background: nothing is evidence for them.
-
-    Example:
-        >>> evidence(torch.tensor([[1.0, 5.0, 2.0, 0.0]]), 4).tolist()
-        [11.0]
-        >>> evidence(torch.tensor([[1.0, 5.0, 2.0, 0.0]]), 4, hidden=3).tolist()
-        [-4.0]
-    """
+    r"""``(Q,)`` evidence for a known action: how good the best class score is, how far it stands out, how usual the others are."""
     best, at = scores[:, : scores.shape[1] - hidden].max(dim=1)
     if classes >= options.nearest.classes or hidden:
         second = scores.scatter(1, at[:, None], -torch.inf).max(dim=1).values
@@ -123,10 +93,7 @@ MOMENT_TERMS = ("epi", "nn")  # on short windows what is bound to the view helps
 
 @dataclass(frozen=True)
 class Blend:
-    """How much each scorer counts once it is standardized over the classes of a query, and how sure the sum is.
-
-    kernel, nearest: weights of B and A; sharpness: of the softmax over the sum, again standardized.
-    """
+    """How much each scorer counts once it is standardized over the classes of a query, and how sure the sum is."""
 
     kernel: float = 1.0
     nearest: float = BlendOptions.balance
@@ -151,10 +118,7 @@ class Kept:
 
 @dataclass(frozen=True)
 class ShapeModel:
-    """Learned state; ``classes`` are numbers 0..C-1 and ``labels`` holds one per exemplar.
-
-    The last ``hidden`` classes are background: scored like the others, and never an answer.
-    """
+    """Learned state; ``classes`` are numbers 0..C-1 and ``labels`` holds one per exemplar."""
 
     exemplars: Exemplars = field(metadata=part(""))
     labels: Tensor = field(metadata=stored("every", "exemplars", below="classes"))
@@ -272,11 +236,7 @@ class ShapeModel:
         return self.machine(self.kernels(query, self.kept.get("support", partial(self.kernels.bank, self.support))))
 
     def scores(self, query: Windows, nearest: Tensor | None = None) -> Tensor:
-        """``(Q, classes)`` larger is better: A, B, or the blend, standardized over the classes of each query.
-
-        Args:
-            nearest: :meth:`nearest_scores` of the query, where they are known already.
-        """
+        """``(Q, classes)`` larger is better: A, B, or the blend, standardized over the classes of each query."""
         if self.scorer == "kernel":
             return self.machine_scores(query)
         nearest = self.nearest_scores(query) if nearest is None else nearest
@@ -296,10 +256,7 @@ class ShapeModel:
         return evidence(nearest, self.classes, unusual, self.hidden, options=self.options)
 
     def plain_scores(self, query: Windows) -> Tensor:
-        """``(Q, classes)`` scorer A without the hubs, comparable between classes: of one action alone that is its evidence.
-
-        How far it stands out tells nothing then: synthetic people are far from whoever is recorded, whatever they do.
-        """
+        """``(Q, classes)`` scorer A without the hubs, comparable between classes: of one action alone that is its evidence."""
         return class_scores(self.residuals(query) + self.hub, self.labels, self.classes, options=self.options)
 
     def kernel_scores(self, query: Windows) -> Tensor:

@@ -20,26 +20,8 @@ Entries = tuple[Tensor, Tensor, Tensor, Tensor]  # 00, 01, 10, 11 of 2x2 matrice
 
 
 def factorize(images: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Orthonormal rows and triangular factor of each image: :math:`X / \|X\| = U L^T`.
-
-    As in :func:`dyntorch.numerics.orthonormal_basis`, a flat direction comes out short instead of amplified.
-
-    Args:
-        images: ``(N, 2, rows)``, x and y.
-
-    Returns:
-        U ``(N, 2, rows)`` and the entries 00, 10, 11 of L ``(N, 3)``; U is zero where an image is, or holds a number that is not
-        finite.
-
-    Example:
-        >>> x = torch.tensor([[[3.0, 0.0, 4.0], [1.0, 2.0, 0.0]]])
-        >>> u, l = factorize(x)
-        >>> bool(torch.allclose(u @ u.mT, torch.eye(2), atol=1e-4))
-        True
-        >>> triangle = torch.tensor([[l[0, 0], 0.0], [l[0, 1], l[0, 2]]])
-        >>> bool(torch.allclose(triangle @ u[0], x[0] / x.norm(), atol=1e-6))
-        True
-    """
+    r"""Orthonormal rows and triangular factor of each image: :math:`X / \|X\| = U L^T`. images ``(N, 2, rows)`` ->
+    ``(N, 2, rows)``."""
     # the unit is that of the largest entry: no square of it leaves the range
     largest = images.abs().amax((1, 2), keepdim=True)
     usable = largest.isfinite()
@@ -67,11 +49,7 @@ def entries(left: Tensor, right: Tensor) -> Entries:
 
 
 def epipolar_correlation(c: Entries) -> Tensor:
-    r"""``(Q, E)`` the largest singular value of C, the correlation of two images of one shape: 1 whatever the viewpoints.
-
-    .. math:: \sigma_1 = \tfrac12 \left(\sqrt{(c_{00} + c_{11})^2 + (c_{01} - c_{10})^2}
-        + \sqrt{(c_{00} - c_{11})^2 + (c_{01} + c_{10})^2}\right)
-    """
+    r"""``(Q, E)`` the largest singular value of C, the correlation of two images of one shape: 1 whatever the viewpoints."""
     c00, c01, c10, c11 = c
     one, other = c00 + c11, c01 - c10
     total = one.square_().addcmul_(other, other).sqrt_()
@@ -117,13 +95,7 @@ class Fusion:
 
 
 def fused(left: Sequence[Tensor], right: Sequence[Tensor], fusions: Sequence[Fusion], epsilon: float) -> list[Tensor]:
-    r"""``(Q, E)`` products :math:`\prod_c \prod_{\text{terms}} (r_c + \epsilon)^{w_c}` of residuals, of each fusion.
-
-    Args:
-        left, right: U and L of each channel, as :func:`factorize` gives them, one after the other.
-
-    A residual is 1 less a correlation.
-    """
+    r"""``(Q, E)`` products :math:`\prod_c \prod_{\text{terms}} (r_c + \epsilon)^{w_c}` of residuals, of each fusion."""
     found: list[Tensor | None] = [None] * len(fusions)
     for i in range(len(left) // 2):
         (u, own), (v, other) = left[2 * i : 2 * i + 2], right[2 * i : 2 * i + 2]

@@ -21,28 +21,14 @@ DEFAULTS = NearestOptions()
 
 @dataclass(frozen=True)
 class ClassProfiles:
-    r"""The profiles of the exemplars of each class: their mean, and how they scatter about it.
-
-    A profile holds the class scores of each scorer, one after the other.
-
-    centres: ``(known, columns)`` mean profiles of the known classes; precision: ``(columns, columns)``
-    :math:`P = (\Sigma + \lambda \operatorname{diag} \Sigma)^{-1}` of the scatter :math:`\Sigma` within all of them.
-    """
+    r"""The profiles of the exemplars of each class: their mean, and how they scatter about it."""
 
     centres: Tensor = field(metadata=stored("real", "known", "columns"))
     precision: Tensor = field(metadata=stored("real", "columns", "columns"))
 
     @classmethod
     def learn(cls, profiles: Tensor, labels: Tensor, known: int, options: NearestOptions = DEFAULTS) -> Self | None:
-        """From the profiles of the exemplars, each asked without itself.
-
-        Args:
-            profiles: ``(N, columns)``, not finite where nothing was left to ask; labels: ``(N,)``.
-            known: how many of the first classes are actions; the others are background, which no clip is to resemble.
-
-        Returns:
-            ``None`` where fewer than two exemplars of some action can say anything.
-        """
+        """From the profiles of the exemplars, each asked without itself. profiles ``(N, columns)``."""
         usable = profiles.isfinite().all(dim=1) & (labels < known)
         own = torch.nn.functional.one_hot(labels[usable], known).to(profiles)
         counts = own.sum(dim=0)
@@ -55,22 +41,7 @@ class ClassProfiles:
         return cls(centres, torch.linalg.inv(scatter + ridge.diag()).to(profiles))
 
     def distance(self, profiles: Tensor, classes: int) -> Tensor:
-        r"""``(Q,)`` how unusual profiles ``(Q, columns)`` are, in standard deviations of the class whose they resemble most.
-
-        .. math:: m(p) = \min_c \sqrt{(p - \mu_c)^T P (p - \mu_c)}
-
-        Own scores above the mean count as the mean.
-
-        Args:
-            classes: how many columns each scorer has.
-
-        Source: Lee et al. 2018 (Mahalanobis distance from the nearest class, pooled covariance).
-
-        Example:
-            >>> profiles = ClassProfiles(torch.tensor([[0.0, -4.0], [-4.0, 0.0]]), torch.eye(2))
-            >>> profiles.distance(torch.tensor([[0.0, -4.0], [-4.0, -3.0], [0.0, 0.0], [9.0, -4.0]]), 2).tolist()
-            [0.0, 3.0, 4.0, 0.0]
-        """
+        r"""``(Q,)`` how unusual profiles ``(Q, columns)`` are, in standard deviations of the class whose they resemble most."""
         apart = profiles[:, None] - self.centres
         # who is nearer to a class than usual, as the same person is, is not unusual for it
         known, columns = self.centres.shape

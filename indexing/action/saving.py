@@ -43,11 +43,7 @@ Indexer = TypeVar("Indexer", bound="ActionIndexer")
 
 
 def save(indexer: ActionIndexer, path: str | Path) -> None:
-    """Write a fitted indexer.
-
-    Raises:
-        ValueError: the file cannot be written, or the labels are neither text nor numbers.
-    """
+    """Write a fitted indexer."""
     kernels = indexer.model_.kernels
     tensors = tensors_of(indexer.model_)
     if kernels is not None and kernels.scales is not None:
@@ -86,11 +82,7 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
 
 
 def _sizes(parts: Parts, indexer: ActionIndexer, hidden: int) -> dict[str, int]:
-    """How many there are of what the tensors of a model are about.
-
-    Raises:
-        ValueError: the parameters and the tensors contradict each other.
-    """
+    """How many there are of what the tensors of a model are about."""
     classes, exemplars = len(indexer.classes_) + hidden, len(parts.truth("solid", None))
     if classes < 2 or exemplars < classes:
         raise ValueError(f"{exemplars} exemplars of {classes} classes")
@@ -102,11 +94,7 @@ def _sizes(parts: Parts, indexer: ActionIndexer, hidden: int) -> dict[str, int]:
 
 
 def _known(header: dict[str, Any]) -> dict[str, Any]:
-    """The parameters of a model file, of which older ones hold one more.
-
-    Raises:
-        ValueError: its exemplars were given a guessed depth, which is no longer done.
-    """
+    """The parameters of a model file, of which older ones hold one more."""
     if header.get("layout") is not None:
         raise ValueError("layout: depth of 2D examples is no longer guessed")
     return {name: value for name, value in header["parameters"].items() if name not in ("depth", "options")}

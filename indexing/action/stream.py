@@ -34,11 +34,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class StreamScan:
-    """What the windows along a recording say, not pooled.
-
-    times ``(T,)``, class scores ``(T, classes)``, motion ``(T,)``, whether anybody was there ``(T,)``, and in which of the
-    stretches ``(S, 2)``, first frame and end, a window lies ``(T,)``.
-    """
+    """What the windows along a recording say, not pooled."""
 
     times: Array
     scores: Array
@@ -71,11 +67,7 @@ def _centres(clip: Clip, stretches: Array, options: ActionOptions) -> tuple[Arra
 
 
 def check_rate(clip: Clip, window: float) -> None:
-    """Raise where no window of a recording can hold two frames.
-
-    Raises:
-        ValueError: naming the clip, how far its frames are apart, and what to do.
-    """
+    """Raise where no window of a recording can hold two frames."""
     step = float(np.median(np.diff(clip.times)))
     if step > window:
         raise ValueError(
@@ -129,11 +121,7 @@ def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, o
 
 
 def around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> tuple[Ragged, Array]:
-    """The frames that windows centred at some times can touch, and some more to interpolate missing joints from.
-
-    Returns:
-        the frames, stretch by stretch; and for each window, in which of these it lies.
-    """
+    """The frames that windows centred at some times can touch, and some more to interpolate missing joints from."""
     margin = max(stream.tempi) * stream.window + options.events.margin
     used, own = np.unique(owner, return_inverse=True)
     pieces = []

@@ -30,12 +30,7 @@ def mirror_permutation(
 
 
 def from_names(names: tuple[str, ...]) -> Tensor | None:
-    """From names that say left and right (``left_knee``, ``LKnee``, ``knee.r``...); ``None`` where no pair is found.
-
-    Example:
-        >>> from_names(("nose", "left_hand", "right_hand")).tolist()
-        [0, 2, 1]
-    """
+    """From names that say left and right (``left_knee``, ``LKnee``, ``knee.r``...); ``None`` where no pair is found."""
     index = {name: i for i, name in enumerate(names)}
     swap = list(range(len(names)))
     for name, i in index.items():
@@ -96,15 +91,8 @@ _LAYOUTS: dict[int, tuple[tuple[tuple[int, int], ...], ...]] = {
 
 
 def from_data(windows: Tensor, seen: Tensor | None = None, *, options: ActionOptions = ActionOptions()) -> Tensor | None:
-    r"""The common layout with this number of joints whose mirror image keeps the distances between joints.
-
-    A permutation :math:`\pi` is a mirror symmetry where the mean distances obey :math:`D_{ij} = D_{\pi(i)\pi(j)}`; the
-    layout that distorts them least is taken, and none where even that distorts by more than a quarter,
-    or by half as much as shuffled joints (then the distances tell nothing).
-
-    Args:
-        windows: ``(N, length, joints, 2)``; seen: ``(N, joints)`` which joints count in each (all).
-    """
+    r"""The common layout with this number of joints whose mirror image keeps the distances between joints. windows
+    ``(N, length, joints, 2)``."""
     joints = windows.shape[2]
     if joints not in _LAYOUTS:
         return None
@@ -147,15 +135,8 @@ def from_data(windows: Tensor, seen: Tensor | None = None, *, options: ActionOpt
 
 
 def turn(windows: Tensor, azimuth: FloatArray, pitch: FloatArray) -> Tensor:
-    """Flat cards turned about the vertical and pitched, seen orthographically.
-
-    Args:
-        windows: ``(N, length, joints, 2)``, y up.
-        azimuth, pitch: ``(N,)`` radians.
-
-    Returns:
-        ``(N, length, joints, 2)``.
-    """
+    """Flat cards turned about the vertical and pitched, seen orthographically. windows ``(N, length, joints, 2)``, azimuth,
+    pitch ``(N,)`` -> ``(N, length, joints, 2)``."""
     rotations = torch.tensor(np.stack([rotation(a, p) for a, p in zip(azimuth, pitch, strict=True)]))
     rotations = rotations.to(windows)
     centred = windows - windows.mean(dim=(1, 2), keepdim=True)

@@ -116,10 +116,7 @@ def mirrored(angles: FloatArray) -> FloatArray:
 
 
 def joints(angles: FloatArray, person: Person) -> FloatArray:
-    """``(frames, 17, 3)`` COCO joints in metres of the poses ``(frames, channels)``.
-
-    The lowest ankle of each frame is at height ``air`` (0 on the floor), the first frame's feet are about the origin.
-    """
+    """``(frames, 17, 3)`` COCO joints in metres of the poses ``(frames, channels)``."""
     col = {name: angles[:, i] for name, i in INDEX.items()}
     heading = _about("y", col["turn"])
     trunk = heading @ _about("y", col["twist"]) @ _about("z", col["side"]) @ _about("x", -col["lean"])
@@ -157,11 +154,7 @@ def _arm(trunk: FloatArray, limb: Mapping[str, FloatArray], side: float) -> tupl
 
 
 def _leg(limb: Mapping[str, FloatArray], side: float) -> tuple[FloatArray, FloatArray]:
-    """Knee and ankle relative to the hip.
-
-    The leg bends in the sagittal plane, then swivels about the line from hip to ankle (knee outward), then tilts until the
-    ankle is as far out as ``spread`` asks: so feet that stand keep their place however deep the knees bend.
-    """
+    """Knee and ankle relative to the hip."""
     knee = _sagittal(_THIGH, limb["hip"])
     ankle = knee + _sagittal(_SHANK, limb["hip"] - limb["knee"])
     axis = ankle / np.linalg.norm(ankle, axis=1, keepdims=True)
@@ -182,11 +175,7 @@ def _sagittal(length: float, degrees: FloatArray) -> FloatArray:
 
 
 def root(ankles: FloatArray, grip: FloatArray, air: FloatArray) -> FloatArray:
-    """``(*batch, frames, 3)`` where the pelvis is, given ankles relative to it: the feet that grip stay where they are.
-
-    Args:
-        ankles: ``(*batch, frames, 2, 3)``; grip: ``(*batch, frames, 2)`` share of each foot; air: ``(*batch, frames)`` metres.
-    """
+    """``(*batch, frames, 3)`` where the pelvis is, given ankles relative to it: the feet that grip stay where they are."""
     out = np.empty((*ankles.shape[:-2], 3))
     out[..., 1] = air - ankles[..., 1].min(axis=-1)
     flat = ankles[..., [0, 2]]

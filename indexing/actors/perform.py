@@ -38,16 +38,7 @@ def pose(base: Mapping[str, float] | None = None, **values: float) -> FloatArray
 
 @dataclass(frozen=True)
 class ActorMove:
-    """One action as key poses.
-
-    Args:
-        keys: (seconds since the previous key, pose); the first key's time is not used, except in a cycle.
-        loop: (first, end) of the keys that are repeated.
-        repeats: fewest and most repetitions in one natural execution.
-        cycle: the keys are one period of a cycle that has neither start nor end (gait).
-        legs, reach: how strongly a person's amplitude changes the legs, and the trunk and arms (1 = fully; nearly 0 where the
-            world says how far to go: a chair's height, the floor).
-    """
+    """One action as key poses."""
 
     keys: tuple[tuple[float, FloatArray], ...]
     loop: tuple[int, int] = (0, 0)
@@ -73,11 +64,8 @@ class ActorMove:
 def _gait(
     period: float, hip: list[float], knee: list[float], swing: float, elbow: tuple[float, float], air: float, **rest: float
 ) -> tuple[tuple[float, FloatArray], ...]:
-    """One period from thigh and knee angles of the left leg at equal steps from its heel strike; the right is half a period late.
-
-    Each arm swings with the opposite leg, ``swing`` degrees to either side of ``flex``, its elbow between two angles; ``air``
-    metres above the floor just before each heel strike.
-    """
+    """One period from thigh and knee angles of the left leg at equal steps from its heel strike; the right is half a period
+    late."""
     n, centre, bend = len(hip), rest.pop("flex"), (elbow[1] - elbow[0]) / 2
     keys = []
     for i in range(n):
@@ -415,11 +403,7 @@ def _retimed(times: FloatArray, bias: float, ripple: float) -> FloatArray:
 
 
 def interpolate(times: FloatArray, values: FloatArray, at: FloatArray) -> FloatArray:
-    """``(len(at), channels)``: piecewise cubic through the keys that never leaves the range of two neighbouring keys.
-
-    Hermite cubics with harmonic-mean tangents (monotone, after Fritsch and Butland): a joint that reaches its turning point at
-    a key does not overshoot it.  Held at the first and last key outside ``times``.
-    """
+    """``(len(at), channels)``: piecewise cubic through the keys that never leaves the range of two neighbouring keys."""
     steps = np.diff(times)[:, None]
     slopes = np.diff(values, axis=0) / steps
     before, after = slopes[:-1], slopes[1:]

@@ -19,35 +19,17 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A textured parallelogram.
+    """A textured parallelogram."""
 
-    Attributes:
-        texture: ``(h, w)`` grey 0..1.
-        place: ``(3, 3)`` columns a, b, o: the texture's pixel (u, v) is at :math:`a u + b v + o` of its body, in metres.
-        body: which motion carries it.
-    """
-
-    texture: Tensor
-    place: Floats
-    body: int = 0
+    texture: Tensor  # ``(h, w)`` grey 0..1
+    place: Floats  # ``(3, 3)`` columns a, b, o: the texture's pixel (u, v) is at :math:`a u + b v + o` of its body, in metres
+    body: int = 0  # which motion carries it
 
 
 def sheet(
     corner: Sequence[float], right: Sequence[float], down: Sequence[float], pixels: int, body: int, generator: torch.Generator
 ) -> Sheet:
-    """A sheet with smooth noise on it, whose smallest features are about six pixels of its texture.
-
-    Args:
-        corner: upper left, metres, in the frame of the body.
-        right, down: its edges from there, metres.
-        pixels: of the texture along the longer edge.
-        body: which motion carries it.
-        generator: of the texture.
-
-    Example:
-        >>> sheet((0, 0, 4), (2, 0, 0), (0, 1, 0), 64, 0, torch.Generator().manual_seed(0)).texture.shape
-        torch.Size([32, 64])
-    """
+    """A sheet with smooth noise on it, whose smallest features are about six pixels of its texture."""
     edges = np.array([right, down], dtype=np.float64)
     lengths = np.linalg.norm(edges, axis=1)
     width, height = (max(8, round(pixels * length / lengths.max())) for length in lengths)
@@ -58,19 +40,12 @@ def sheet(
 
 @dataclass(frozen=True, eq=False)
 class RenderedVideo:
-    """A video and its truth.
+    """A video and its truth."""
 
-    Attributes:
-        frames: ``(T, h, w)`` uint8.
-        seen: ``(T, h, w)`` int: which sheet every pixel shows; -1: none.
-        maps: ``(T, sheets, 3, 3)`` texture pixels -> image pixels (pixel centres are whole numbers).
-        bodies: ``(sheets,)`` which motion carries each.
-    """
-
-    frames: NDArray[np.uint8]
-    seen: NDArray[np.int64]
-    maps: Floats
-    bodies: NDArray[np.int64]
+    frames: NDArray[np.uint8]  # ``(T, h, w)`` uint8
+    seen: NDArray[np.int64]  # ``(T, h, w)`` int: which sheet every pixel shows; -1: none
+    maps: Floats  # ``(T, sheets, 3, 3)`` texture pixels -> image pixels (pixel centres are whole numbers)
+    bodies: NDArray[np.int64]  # ``(sheets,)`` which motion carries each
 
     def shown(self, points: Floats, frame: int) -> NDArray[np.int64]:
         """``(n,)`` the sheet that is seen at points ``(n, 2)`` of a frame; -1 where there is none, or an edge within two pixels."""
@@ -105,24 +80,7 @@ def render(
     noise: float = 0.0,
     generator: torch.Generator | None = None,
 ) -> RenderedVideo:
-    """Film sheets: the nearest one is seen at every pixel.
-
-    Args:
-        sheets: at least one.
-        cameras: ``(T, 3, 4)``, metres -> pixels, third row scaled to depth.
-        motions: ``(T, bodies, 4, 4)`` of the bodies, to the world.
-        size: width and height in pixels.
-        noise: standard deviation in grey levels.
-        generator: of the noise.
-
-    Example:
-        >>> wall = sheet((-2, -1.5, 4), (4, 0, 0), (0, 3, 0), 80, 0, torch.Generator().manual_seed(0))
-        >>> camera = np.diag([40.0, 40.0, 1.0]) @ np.eye(3, 4) + np.array([[0, 0, 20.0, 0], [0, 0, 15.0, 0], [0, 0, 0, 0]])
-        >>> moved = np.stack([camera, camera + [[0, 0, 0, 4.0], [0, 0, 0, 0], [0, 0, 0, 0]]])  # the camera goes to the left
-        >>> video = render([wall], moved, np.tile(np.eye(4), (2, 1, 1, 1)), (40, 30))
-        >>> video.followed(np.array([[20.0, 15.0]]), 0, 1).round(6).tolist()
-        [[21.0, 15.0]]
-    """
+    """Film sheets: the nearest one is seen at every pixel. cameras ``(T, 3, 4)``, motions ``(T, bodies, 4, 4)``."""
     width, height = size
     places = np.stack([np.vstack([one.place, [0.0, 0.0, 1.0]]) for one in sheets])
     bodies = np.array([one.body for one in sheets])

@@ -38,30 +38,7 @@ def film(
     noise: float = 2.0,
     rng: np.random.Generator | int = 0,
 ) -> Frames:
-    """A grey video of a 3D clip: own texture, own background, perspective, sensor noise.
-
-    Every bone is a capsule (for COCO-17 also the trunk and the head), painted from the farthest to the nearest.
-
-    Args:
-        clip: 3D, metres.
-        azimuth, elevation, distance: of the camera, as in :func:`indexing.actors.detect`: degrees, radians, metres.
-        roll: degrees by which the camera is turned about its axis.
-        image: width and height in pixels.
-        noise: standard deviation in grey levels, per pixel and frame.
-        rng: of the textures and the noise.
-
-    Returns:
-        ``(frames, height, width)`` uint8.
-
-    Raises:
-        ValueError: not a 3D clip with bones, missing joints, a joint behind the camera, negative noise.
-
-    Example:
-        >>> from indexing.actors import Person, perform
-        >>> video = film(perform("wave", Person(), fps=10.0), azimuth=20.0, image=(40, 30))
-        >>> video.shape[1:], video.dtype.name
-        ((30, 40), 'uint8')
-    """
+    """A grey video of a 3D clip: own texture, own background, perspective, sensor noise."""
     joints, bones = _figure(clip)
     if not (noise >= 0 and distance > 0):
         raise ValueError(f"noise must be at least 0 and distance positive (metres), got {noise!r} and {distance!r}")

@@ -111,11 +111,7 @@ class PreparedSegment:
 
 
 class Adder:
-    """Takes what was read, and commits it batch by batch.
-
-    Args:
-        catalogue: held alone by the caller.
-    """
+    """Takes what was read, and commits it batch by batch."""
 
     def __init__(self, catalogue: Catalogue, options: ArchiveOptions, reading: Mapping[str, Any]) -> None:
         self.catalogue, self.options, self.reading = catalogue, options, reading_key(reading)
@@ -148,11 +144,7 @@ class Adder:
             connection.execute("UPDATE sources SET size = ?, modified = ? WHERE id = ?", (now.size, now.modified, row.id))
 
     def commit(self) -> None:
-        """Write what is staged as segments, and let the catalogue know: all of it or nothing.
-
-        Raises:
-            ValueError: it cannot be written; the archive is then as it was before.
-        """
+        """Write what is staged as segments, and let the catalogue know: all of it or nothing."""
         staged, self.staged = self.staged, Staged(since=time.monotonic())
         if not staged.sources:
             return
@@ -181,11 +173,7 @@ class Adder:
     def _layout(
         self, key: str, tracks: Sequence[Track], skeleton: Skeleton | None
     ) -> tuple[Layout, tuple[SegmentRow, ...], list[Track]]:
-        """What a layout's codes are, and which segments are written anew for that, with what is in them.
-
-        What was learned of little is learned again of more: codes from one short clip find .86 of the moments among ten, those of
-        all .96.
-        """
+        """What a layout's codes are, and which segments are written anew for that, with what is in them."""
         storage, search = self.storage, self.options.search
         if key not in self.layouts:
             return Layout.learn(tracks, skeleton, storage, search), (), []
@@ -270,11 +258,7 @@ def clear(catalogue: Catalogue) -> None:
 
 
 def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
-    """Put small segments together, and write those anew of which much was removed.
-
-    Whoever searches meanwhile has the old files or the new ones: the change is one step of the catalogue.  A segment that is
-    damaged stays as it is, so that verifying finds it; where the disk is full all stay, for the next time.
-    """
+    """Put small segments together, and write those anew of which much was removed."""
     contents, grown = catalogue.contents(), options.growth
     for number, layout in contents.layouts.items():
         mine = [row for row in contents.segments if row.layout == number]
@@ -305,11 +289,7 @@ def _join(catalogue: Catalogue, rows: Sequence[SegmentRow], layout: Layout, stor
 
 
 def live_tracks(catalogue: Catalogue, row: SegmentRow) -> list[Track]:
-    """What is in a segment, without what was removed.
-
-    Raises:
-        ValueError: it is damaged: written anew, under a hash of its own, nobody would find that any more.
-    """
+    """What is in a segment, without what was removed."""
     live = {one.id for one in catalogue.recordings(row.id)}
     if not live:
         return []

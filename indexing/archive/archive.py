@@ -272,11 +272,7 @@ class Archive:
             raise ValueError(f"{problem.filename}: is missing; dyntorch archive verify says what is lost") from None
 
     def _opened(self) -> Snapshot:
-        """As it is now; what was mapped before and has not changed stays mapped.
-
-        Raises:
-            FileNotFoundError: a segment is no longer there.
-        """
+        """As it is now; what was mapped before and has not changed stays mapped."""
         catalogue = self._catalogue()
         if self._snapshot is not None and self._snapshot.contents.generation == catalogue.generation():
             return self._snapshot

@@ -97,14 +97,7 @@ class Contents:
 
 
 class Catalogue:
-    """The catalogue of the archive in a folder.
-
-    Args:
-        folder: of the archive.
-
-    Raises:
-        ValueError: the folder is no archive, or one of a newer version.
-    """
+    """The catalogue of the archive in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -128,11 +121,7 @@ class Catalogue:
 
     @classmethod
     def make(cls, folder: Path, options: StorageOptions) -> Catalogue:
-        """The catalogue of a folder, a new one where there is none.
-
-        Raises:
-            ValueError: other files are in the folder.
-        """
+        """The catalogue of a folder, a new one where there is none."""
         path = folder / CATALOGUE
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -169,11 +158,7 @@ class Catalogue:
             connection.execute("COMMIT")
 
     def _reader(self) -> sqlite3.Connection:
-        """A connection to what is committed; of a catalogue that was begun and never made, to an empty one.
-
-        SQLite writes beside a file that it reads.  Where it cannot (no rights, a full disk) the file is read as it lies, which is
-        all of it unless somebody was killed while writing.
-        """
+        """A connection to what is committed; of a catalogue that was begun and never made, to an empty one."""
         connection = _connect(self.path)
         try:
             made = connection.execute("SELECT name FROM sqlite_master").fetchone()
@@ -249,14 +234,7 @@ class Catalogue:
             return contents, left
 
     def moment(self, checked: bool = False) -> tuple[Contents, list[RecordingRow], list[SourceRow]]:
-        """Contents, recordings and sources, all of one moment, whoever writes meanwhile.
-
-        Args:
-            checked: whether SQLite looks at the whole file first.
-
-        Raises:
-            ValueError: the file is damaged.
-        """
+        """Contents, recordings and sources, all of one moment, whoever writes meanwhile."""
         with self.reading() as connection:
             (said,) = connection.execute("PRAGMA integrity_check(1)").fetchone() if checked else ("ok",)
             if said != "ok":
@@ -300,11 +278,7 @@ class Catalogue:
     # ---- writing -----------------------------------------------------------------------------------------------------
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """Hold the archive against others who write; whoever dies lets go of it.
-
-        Raises:
-            ValueError: another process writes.
-        """
+        """Hold the archive against others who write; whoever dies lets go of it."""
         with contextlib.ExitStack() as stack:
             try:
                 lock = stack.enter_context(
@@ -332,12 +306,7 @@ class Catalogue:
 
 
 def storable(text: str) -> str:
-    r"""Text as SQLite takes it: bytes of a file name that are no UTF-8 (Python's lone surrogates) are written out.
-
-    Example:
-        >>> storable("caf\udce9.json")
-        'caf\\udce9.json'
-    """
+    r"""Text as SQLite takes it: bytes of a file name that are no UTF-8 (Python's lone surrogates) are written out."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 

@@ -36,11 +36,7 @@ class Places:
 def residuals(
     example: Windows, image: NDArray[np.intp], places: Places, segments: Sequence[ArchiveSegment], metric: JointMetric, length: int
 ) -> FloatArray:
-    """``(places,)`` fused residual between each window and the image of the example that it is compared with.
-
-    Args:
-        example: its images; image: ``(places,)`` which of them; metric: of the joints; length: steps that windows are resampled to.
-    """
+    """``(places,)`` fused residual between each window and the image of the example that it is compared with."""
     if not len(places):
         return np.zeros(0)
     windows = cut(places, segments, length)

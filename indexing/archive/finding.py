@@ -43,10 +43,7 @@ MODEL = "model.safetensors"
 
 @dataclass(frozen=True)
 class FindTask:
-    """Some recordings of a segment, what tells where to look in them, and the model as bytes of its file.
-
-    recordings: the number of each, and the tracks of its first image.
-    """
+    """Some recordings of a segment, what tells where to look in them, and the model as bytes of its file."""
 
     path: Path
     recordings: tuple[tuple[int, tuple[int, ...]], ...]

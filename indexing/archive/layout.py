@@ -31,12 +31,7 @@ EIGHT = 127  # largest whole number of 8 bits
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Joints that recordings share, and what was learned of them.
-
-    joints: how many; skeleton: their names and bones, where known; covariance: ``(joints, joints)`` of centred poses, mean diagonal
-    1; basis: ``(joints, dimensions)`` B; metric: ``(channels, joints, joints)`` covariances for the exact comparison; poses: from
-    how many all this was learned; swap: ``(joints,)`` each joint's mirror image, where that can be told.
-    """
+    """Joints that recordings share, and what was learned of them."""
 
     joints: int
     skeleton: Skeleton | None
@@ -73,11 +68,7 @@ class Layout:
 
     # ---- codes -------------------------------------------------------------------------------------------------------
     def project(self, poses: FloatArray) -> NDArray[np.float32]:
-        """``(poses, 2, dimensions)`` codes of ``(poses, joints, 2)``, NaN = not seen; 0 where nearly nothing was.
-
-        A joint that was not seen is what the others make most likely, given the covariance.
-
-        """
+        """``(poses, 2, dimensions)`` codes of ``(poses, joints, 2)``, NaN = not seen; 0 where nearly nothing was."""
         seen: NDArray[np.bool_] = np.asarray(~np.isnan(poses).any(axis=2))
         out = np.zeros((len(poses), 2, self.basis.shape[1]), dtype=np.float32)
         known = np.where(seen[..., None], poses, 0.0).astype(np.float32)
@@ -149,12 +140,7 @@ class Layout:
 
 
 def layout_key(joints: int, skeleton: Skeleton | None) -> str:
-    """What tells layouts apart: names in their order, or how many joints, with their bones where these are known.
-
-    Example:
-        >>> layout_key(2, Skeleton("a", ("hip", "knee"))), layout_key(2, None), layout_key(2, Skeleton("b", ("0", "1"), ((0, 1),)))
-        ('hip,knee', '2', '2:0-1')
-    """
+    """What tells layouts apart: names in their order, or how many joints, with their bones where these are known."""
     if skeleton is not None and named(skeleton):
         return ",".join(joint.replace(",", " ") for joint in skeleton.joints)
     bones = "" if skeleton is None else " ".join(f"{min(bone)}-{max(bone)}" for bone in sorted(skeleton.bones))

@@ -21,10 +21,7 @@ from indexing.windows import Ragged, mended, ragged, sample, unusable, whole
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An example as it faces the recordings of one layout.
-
-    windows: its images; probes: made of them for the scan; fine: the same with more samples and at all tempos, for what it finds.
-    """
+    """An example as it faces the recordings of one layout."""
 
     windows: Windows
     probes: tuple[Probe, ...]
@@ -32,11 +29,7 @@ class Query:
 
 
 def checked(clip: Clip, shortest: float, options: SearchOptions) -> Clip:
-    """An example that can be searched.
-
-    Raises:
-        ValueError: too short or too long, or nobody is in it.
-    """
+    """An example that can be searched."""
     who = f"{clip.name!r}" if clip.name else "the example"
     there = np.flatnonzero(clip.seen.any(axis=1))
     if not len(there):
@@ -58,11 +51,7 @@ def checked(clip: Clip, shortest: float, options: SearchOptions) -> Clip:
 
 
 def queries_of(clip: Clip, contents: Contents, options: SearchOptions, mirrored: bool = False) -> dict[int, Query]:
-    """The example, for each layout that it has enough joints of.
-
-    Raises:
-        ValueError: it has joints in common with none.
-    """
+    """The example, for each layout that it has enough joints of."""
     found: dict[int, Query] = {}
     for number, layout in contents.layouts.items():
         facing = layout.facing(clip)
@@ -119,11 +108,7 @@ def probe_of(
     mirrored: bool = False,
     moving: bool = False,
 ) -> Probe | None:
-    """One image of an example at one tempo; ``None`` where hardly any joint was seen.
-
-    Args:
-        source: all images; mirrored: whether this is a mirror image; moving: only how poses differ from their mean.
-    """
+    """One image of an example at one tempo; ``None`` where hardly any joint was seen."""
     first, last = source.starts[image], source.starts[image + 1] - 1
     begin, end = float(source.times[first]), float(source.times[last])
     seconds = (end - begin) * tempo

@@ -37,11 +37,7 @@ class ArchivedEvent(Event):
 
 @dataclass(frozen=True)
 class SourceOutcome:
-    """What became of one source that was to be added.
-
-    reason: of one that failed, one line; of others what a reader should know, or nothing; windows, seconds: what is in the archive
-    of it now.
-    """
+    """What became of one source that was to be added."""
 
     source: str
     outcome: Outcome
@@ -78,11 +74,7 @@ class Addition:
 
 @dataclass(frozen=True)
 class ArchivedRecording:
-    """One person of a recording in an archive.
-
-    source: its name; path: the file it came from, empty for clips from memory; person: empty where only one is in view; start, end:
-    seconds from its first stored moment to its last; seconds: what is stored of that; layout: name of the joint layout.
-    """
+    """One person of a recording in an archive."""
 
     source: str
     path: str
@@ -95,11 +87,7 @@ class ArchivedRecording:
 
 @dataclass(frozen=True)
 class ArchiveInfo:
-    """What is in an archive.
-
-    seconds: of recordings, every person counted; dead: windows of removed sources that still lie in segments; size: bytes on disk;
-    layouts: name of each joint layout, how many joints, and seconds of it.
-    """
+    """What is in an archive."""
 
     sources: int
     recordings: int
@@ -114,10 +102,7 @@ class ArchiveInfo:
 
 @dataclass(frozen=True)
 class Verification:
-    """What :meth:`indexing.Archive.verify` found: one line for each problem, none where all is well.
-
-    orphans: files of interrupted additions, which hold nothing that is missed; the next addition takes them away.
-    """
+    """What :meth:`indexing.Archive.verify` found: one line for each problem, none where all is well."""
 
     windows: int
     segments: int

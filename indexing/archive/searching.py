@@ -66,11 +66,7 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class Shortlist:
-    """Windows that may be hits, each a row of all arrays.
-
-    places: where they are; probe: which probe of the layout's example they resemble; score: the squared correlation of sketches,
-    then minus the residual; mirrored: whether that is a mirror image.
-    """
+    """Windows that may be hits, each a row of all arrays."""
 
     places: Places
     probe: NDArray[np.int64]
@@ -120,11 +116,7 @@ def _opened(path: str) -> ArchiveSegment:
 
 
 def candidates(tasks: Sequence[ScanTask], executor: Executor | None, progress: Progress) -> list[tuple[int, Candidates]]:
-    """``(segment, candidates)`` of every task; as many threads of this process as torch has do it where there is no executor.
-
-    Raises:
-        FileNotFoundError: a segment is no longer there; ValueError: a task's workers died.
-    """
+    """``(segment, candidates)`` of every task; as many threads of this process as torch has do it where there is no executor."""
     found: list[tuple[int, Candidates]] = []
     with contextlib.ExitStack() as stack:
         threads = torch.get_num_threads()

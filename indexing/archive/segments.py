@@ -47,11 +47,7 @@ class WrittenSegment:
 
 
 def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, options: StorageOptions) -> WrittenSegment:
-    """Write tracks of one layout as a new file, on disk before this returns.
-
-    Raises:
-        ValueError: it cannot be written (a full disk, no rights); nothing is left of it then.
-    """
+    """Write tracks of one layout as a new file, on disk before this returns."""
     rows = np.cumsum([0, *map(len, tracks)])
     each = [layout.codes(track.positions()) for track in tracks]
     table = [(track.recording, track.view, rows[i], len(track)) for i, track in enumerate(tracks)]
@@ -116,12 +112,7 @@ class ArchiveSegment:
 
     @classmethod
     def open(cls, path: Path) -> ArchiveSegment:
-        """Map a file.
-
-        Raises:
-            ValueError: it is no segment, damaged, or of a newer version.
-            FileNotFoundError: it is not there (any more).
-        """
+        """Map a file."""
         size = path.stat().st_size
         with open(path, "rb") as stream:
             if hasattr(os, "posix_fadvise"):  # only what is asked for is read of the table of tracks

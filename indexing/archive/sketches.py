@@ -29,12 +29,7 @@ GRAM_EPSILON = 1e-6  # of the trace of G, added to its diagonal: planes that are
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """An example as it is slid along the codes.
-
-    image: which image of the example; mirrored: whether it is the mirror image; seconds: duration of the windows; stride: poses
-    from one sample to the next; codes: ``(2, samples, k)`` orthonormal, of x and y; moved: share of movement in the energy of its
-    poses; everywhere: whether all windows are compared with it, or only those at the ends of short tracks; longest: poses of these.
-    """
+    """An example as it is slid along the codes."""
 
     image: int
     mirrored: bool
@@ -58,10 +53,7 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Windows that resemble an example, best first, each a row of all arrays.
-
-    score: the squared correlation; track, row: where the first pose compared is; probe: which probe it resembles.
-    """
+    """Windows that resemble an example, best first, each a row of all arrays."""
 
     score: NDArray[np.float32]
     track: NDArray[np.int64]
@@ -92,13 +84,7 @@ class Candidates:
 
 
 def orthonormal(codes: NDArray[np.float32]) -> NDArray[np.float32] | None:
-    """``(2, samples, k)`` the same plane with orthonormal axes; ``None`` where it is no plane (nothing was seen).
-
-    Example:
-        >>> plane = orthonormal(np.random.default_rng(0).normal(size=(2, 5, 3)).astype(np.float32))
-        >>> bool(np.allclose(plane.reshape(2, -1) @ plane.reshape(2, -1).T, np.eye(2), atol=1e-6))
-        True
-    """
+    """``(2, samples, k)`` the same plane with orthonormal axes; ``None`` where it is no plane (nothing was seen)."""
     flat = codes.reshape(2, -1).astype(np.float64)
     gram = flat @ flat.T
     trace = np.trace(gram)
@@ -109,17 +95,7 @@ def orthonormal(codes: NDArray[np.float32]) -> NDArray[np.float32] | None:
 
 
 def correlation(c: Tensor, gram: Tensor) -> Tensor:
-    r"""``(probes, n)`` squared largest canonical correlations.
-
-    Args:
-        c: ``(2, probes, 2, n)`` products of the windows' axes (first) with the orthonormal ones of each probe; gram: ``(3, n)`` the
-            entries 00, 01, 11 of G.
-
-    Example:
-        >>> c = torch.eye(2).reshape(2, 1, 2, 1)
-        >>> correlation(c, torch.tensor([[1.0], [0.0], [1.0]])).item()
-        1.0
-    """
+    r"""``(probes, n)`` squared largest canonical correlations."""
     trace = gram[0] + gram[2]
     g00, g01, g11 = gram[0] + GRAM_EPSILON * trace, gram[1], gram[2] + GRAM_EPSILON * trace
     determinant = g00 * g11 - g01 * g01
@@ -167,12 +143,7 @@ def scan(
 
 
 def settled(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Probe], found: Candidates) -> Candidates:
-    """Candidates of a scan, at every tempo moved by less than a step of it to where they resemble the example best.
-
-    Args:
-        coarse: the probes of the scan; fine: the same images with more samples and at all tempos, by which rows, scores and probes
-            are meant from now on.
-    """
+    """Candidates of a scan, at every tempo moved by less than a step of it to where they resemble the example best."""
     parts: list[Candidates] = []
     for number in np.unique(found.probe).tolist():
         mine = np.flatnonzero(found.probe == number)
@@ -224,12 +195,7 @@ def _take_ends(
 
 
 def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float, quiet: float = 0.0) -> NDArray[np.bool_]:
-    """``(rows,)`` the poses of windows that move as an example does, well enough.
-
-    Args:
-        probes: of how poses differ from their mean; least: squared correlation; quiet: share of an example's movement, by energy,
-            below which a window rests.
-    """
+    """``(rows,)`` the poses of windows that move as an example does, well enough."""
     marks = np.zeros(len(segment.codes) + 1, dtype=np.int64)
     none = np.zeros(len(segment), dtype=bool)
     for stride, samples in sorted({(probe.stride, probe.samples) for probe in probes}):
@@ -265,12 +231,7 @@ def _gram(x: Tensor) -> Tensor:
 
 
 def _scores(x: Tensor, gram: Tensor, probes: Sequence[Probe], resting: Tensor | None = None) -> Tensor:
-    """``(probes, windows)`` of all windows whose poses are there, of probes with as many samples.
-
-    Args:
-        resting: ``(3, windows)`` what G has of the mean pose, where it does not count; the probes' codes have mean 0 then, so
-            that C knows nothing of it.
-    """
+    """``(probes, windows)`` of all windows whose poses are there, of probes with as many samples."""
     codes = torch.from_numpy(np.stack([probe.codes for probe in probes]))  # (probes, 2, samples, k)
     samples = codes.shape[2]
     count = x.shape[2] - samples + 1

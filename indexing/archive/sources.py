@@ -39,11 +39,7 @@ Taken = Clip | LabelledSet[Clip] | str | os.PathLike[str]
 
 @dataclass(frozen=True, eq=False)
 class ArchiveSource:
-    """One thing to add.
-
-    key: what it is known by in the archive; name: what to call it; path: of a file or folder; clip: from memory; poses: of a video,
-    the folder in which the keypoints are kept that are found in it.
-    """
+    """One thing to add."""
 
     key: str
     name: str
@@ -63,10 +59,7 @@ class Stamp:
 
 @dataclass(frozen=True, eq=False)
 class ReadRecording:
-    """One person of a recording, as it is stored.
-
-    begins, ends: seconds, from the first stored pose to the last.
-    """
+    """One person of a recording, as it is stored."""
 
     name: str
     person: str
@@ -103,14 +96,7 @@ class ReadSource:
 
 
 def gather(given: Taken | Iterable[Taken]) -> list[ArchiveSource]:
-    """All sources, folders walked, each once.
-
-    Videos in folders are taken where a pose model is there, unless keypoints of theirs lie beside them: ``cam1.json``,
-    ``cam1_json/``, ``cam1DLC_resnet50.csv`` of ``cam1.mp4``.
-
-    Raises:
-        ValueError: nothing to add, or what is no file, clip or set of clips.
-    """
+    """All sources, folders walked, each once."""
     single = isinstance(given, (Clip, str, os.PathLike)) or is_dataset(given)
     listed: list[Any] = [given] if single else list(given)  # type: ignore[arg-type]
     found: list[ArchiveSource] = []
@@ -203,10 +189,7 @@ def _resolved(path: Path) -> str:
 
 
 def is_recording(folder: Path) -> bool:
-    """Whether a folder is one recording, with a file for each frame, and not a collection of recordings.
-
-    It holds text or JSON files with frame numbers and nothing to walk into, and its first JSON file is one frame.
-    """
+    """Whether a folder is one recording, with a file for each frame, and not a collection of recordings."""
     try:
         files = sorted(one for one in folder.iterdir() if not one.name.startswith("."))
     except OSError:
@@ -254,11 +237,7 @@ def _once(found: Sequence[ArchiveSource]) -> list[ArchiveSource]:
 
 
 def stamp(source: ArchiveSource) -> Stamp:
-    """Size and last change, without reading a file; of a clip, the hash of what it holds.
-
-    Raises:
-        OSError, ValueError: it cannot be reached.
-    """
+    """Size and last change, without reading a file; of a clip, the hash of what it holds."""
     if source.clip is not None:
         return Stamp(source.clip.joints.nbytes, 0, _hash_of(source.clip))
     assert source.path is not None
@@ -278,15 +257,7 @@ def content(source: ArchiveSource) -> str:
 
 
 def reading_key(reading: Mapping[str, Any]) -> str:
-    """How files are read, as text that is the same for the same: what is said as it is anyway counts as not said.
-
-    Raises:
-        ValueError: no reader knows what is asked.
-
-    Example:
-        >>> reading_key({"fps": 25.0}), reading_key({"person": "everyone", "fps": None})
-        ('{"fps": 25.0}', '{}')
-    """
+    """How files are read, as text that is the same for the same: what is said as it is anyway counts as not said."""
     from indexing.readers import read
 
     usual = {name: one.default for name, one in inspect.signature(read).parameters.items() if one.kind is one.KEYWORD_ONLY}
@@ -318,11 +289,7 @@ def _hash_of(clip: Clip) -> str:
 
 
 def read_source(source: ArchiveSource, reading: Mapping[str, Any], options: StorageOptions) -> ReadSource:
-    """Movement of one source as it is stored; whatever is wrong with it becomes a reason, never an exception.
-
-    Args:
-        reading: arguments of :func:`indexing.readers.read`; everybody in view by default.
-    """
+    """Movement of one source as it is stored; whatever is wrong with it becomes a reason, never an exception."""
     try:
         before = stamp(source)
         people, note = _people(source, reading)

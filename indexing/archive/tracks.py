@@ -22,12 +22,7 @@ LARGEST = 2**15 - 2  # of the others
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A stretch of one person's movement.
-
-    recording: number of the recording it belongs to; view: 0, or which image of movement in 3D; start: seconds, of the first pose;
-    joints: ``(rows, joints, 2)`` int16, y up, :data:`MISSING` where not seen; origin: ``(2,)`` and scale: what a coordinate of 0
-    is, and a step of 1, in the unit of the source.
-    """
+    """A stretch of one person's movement."""
 
     recording: int
     view: int
@@ -45,12 +40,7 @@ class Track:
 
 
 def positions(stored: NDArray[np.int16], origin: FloatArray, scale: float | FloatArray) -> NDArray[np.float32]:
-    """Stored joints in the unit of their source.
-
-    Example:
-        >>> positions(np.array([[[MISSING, 0], [10, -10]]], np.int16), np.array([5.0, 0.0]), 0.1).tolist()
-        [[[nan, nan], [6.0, -1.0]]]
-    """
+    """Stored joints in the unit of their source."""
     found = (stored * scale + origin).astype(np.float32)
     found[(stored == MISSING).any(axis=-1)] = np.nan
     return found
@@ -58,18 +48,7 @@ def positions(stored: NDArray[np.int16], origin: FloatArray, scale: float | Floa
 
 @one_thread
 def tracks_of(clip: Clip, options: StorageOptions, recording: int = 0) -> list[Track]:
-    """One person's recording as tracks; none where nobody is in view for long enough.
-
-    Args:
-        clip: 2D, or 3D, of which two images are kept (``options.views``).
-        recording: number to give them.
-
-    Example:
-        >>> way = np.array([[0.0, 0.0], [40.0, 0.0], [20.0, 90.0]]) + np.arange(90)[:, None, None] * [1.0, 0.0]
-        >>> (track,) = tracks_of(Clip(way, fps=30.0), StorageOptions())
-        >>> len(track), track.joints.dtype.name, bool(np.abs(track.positions()[10, 0] - [20.0, 0.0]).max() < 0.6)
-        (45, 'int16', True)
-    """
+    """One person's recording as tracks; none where nobody is in view for long enough."""
     found: list[Track] = []
     clip = mended(clip, options.repair)
     for view, image in enumerate(images(clip, options.views)):
@@ -136,16 +115,7 @@ def _without_slips(joints: FloatArray, options: StorageOptions) -> FloatArray:
 
 
 def seen_around(seen: NDArray[np.bool_], times: FloatArray, at: FloatArray, bridged: float) -> NDArray[np.bool_]:
-    """``(moments, joints)``: which joints are known at moments, from sightings on both sides that are not too far apart.
-
-    Args:
-        seen: ``(frames, joints)``; times: ``(frames,)``; at: ``(moments,)`` seconds; bridged: seconds between two sightings.
-
-    Example:
-        >>> seen = np.array([[True], [False], [False], [True]])
-        >>> seen_around(seen, np.arange(4.0), np.array([0.0, 1.5, 3.0]), 2.0)[:, 0].tolist()
-        [True, False, True]
-    """
+    """``(moments, joints)``: which joints are known at moments, from sightings on both sides that are not too far apart."""
     found = np.zeros((len(at), seen.shape[1]), dtype=bool)
     step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     for joint in range(seen.shape[1]):

@@ -28,11 +28,7 @@ class WorkerLost(Exception):
 
 
 class QuietProcesses(ProcessPoolExecutor):
-    """Processes of one thread each, started afresh, that leave an interruption to the process that asked, which ends them.
-
-    Args:
-        workers: how many; by default as many as there are cores.
-    """
+    """Processes of one thread each, started afresh, that leave an interruption to the process that asked, which ends them."""
 
     def __init__(self, workers: int | None = None) -> None:
         super().__init__(workers or os.cpu_count() or 1, multiprocessing.get_context("spawn"), initializer=_alone)
@@ -78,13 +74,7 @@ class _Pending(Generic[Task]):
 
 
 class InOrder(Generic[Task, Result]):
-    """Tasks done by an executor, results in the order of the tasks.
-
-    Args:
-        function: of one task; what it raises is a failure of the worker, not of the task.
-        executor: ``None``: this process does it, one after the other.
-        ahead: tasks under way per worker; tries: of a task whose worker dies, the last ones by itself.
-    """
+    """Tasks done by an executor, results in the order of the tasks."""
 
     def __init__(self, function: Callable[[Task], Result], executor: Executor | None, ahead: int = 4, tries: int = 3) -> None:
         self._function, self._executor, self._tries = function, executor, tries

@@ -69,22 +69,6 @@ def _difference_table(length: int, dtype: torch.dtype, device: torch.device) -> 
 
 
 def weighted_differences(gx: Tensor, gy: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Horizontal and vertical brightness change per gradient.
-
-    .. math:: (u, v) = -\frac{I_t\,(I_x, I_y)}{\|\nabla I\| + \epsilon}
-
-    the thesis's :math:`h = I_t \nabla I` divided by the contrast once: the sign of the contrast drops out, its size enters once.
-
-    Args:
-        gx, gy, gt: ``(..., h, w)`` gradients, grey 0..1 per pixel and frame.
-
-    Returns:
-        u and v, same shape; positive to the right and downwards.
-
-    Example:
-        >>> u, v = weighted_differences(torch.tensor([[-0.2]]), torch.tensor([[0.0]]), torch.tensor([[0.1]]))
-        >>> round(u.item(), 3)  # darker to the right and getting brighter: the bright side moves right
-        0.091
-    """
+    r"""Horizontal and vertical brightness change per gradient. gx, gy, gt ``(..., h, w)``."""
     weight = -gt / ((gx * gx + gy * gy).sqrt() + GRADIENT_EPSILON)
     return weight * gx, weight * gy

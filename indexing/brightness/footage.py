@@ -26,17 +26,11 @@ Times = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Footage:
-    """A video that can be read any number of times.
+    """A video that can be read any number of times."""
 
-    Attributes:
-        source: an array, the path of a file, a :class:`indexing.video.Video`, or a list of chunks (frames, times).
-        name: for messages.
-        fps: frames per second of arrays.
-    """
-
-    source: Any
-    name: str
-    fps: float
+    source: Any  # an array, the path of a file, a :class:`indexing.video.Video`, or a list of chunks (frames, times)
+    name: str  # for messages
+    fps: float  # frames per second of arrays
 
     def __iter__(self) -> Iterator[tuple[Any, Times]]:
         """Chunks of frames as they are, and the seconds at which they were taken."""
@@ -84,11 +78,7 @@ class Footage:
 
 
 def gather(videos: Any, fps: float) -> list[Footage]:
-    """The videos of a list.
-
-    Raises:
-        ValueError: no list, an empty one, or an item that is no video.
-    """
+    """The videos of a list."""
     if isinstance(videos, (str, bytes, Path)) or not isinstance(videos, Iterable):
         raise ValueError(f"videos: expected a list of arrays or paths, got {type(videos).__name__}; use a list: [video]")
     found = [footage(video, f"video {i}", fps) for i, video in enumerate(videos)]
@@ -98,11 +88,7 @@ def gather(videos: Any, fps: float) -> list[Footage]:
 
 
 def footage(video: Any, name: str, fps: float) -> Footage:
-    """One video.
-
-    Raises:
-        ValueError: neither a path, nor frames.
-    """
+    """One video."""
     if isinstance(video, (str, Path)):
         return Footage(Path(video), f"{name} ({str(video)!r})", fps)
     if _is_read(video):
@@ -131,12 +117,7 @@ def _is_read(video: Any) -> bool:
 
 
 class Resampler:
-    """Frames at the times of an even grid, interpolated between the frame before and the one after.
-
-    Args:
-        rate: frames per second of the grid.
-        fps: of the video: ``None`` where it is that of the grid, NaN where it varies.
-    """
+    """Frames at the times of an even grid, interpolated between the frame before and the one after."""
 
     def __init__(self, rate: float, fps: float | None, options: RateOptions = RateOptions()) -> None:
         self.step, self.made, self.pause = 1 / rate, 0, options.pause
@@ -174,16 +155,7 @@ LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
 class Shrinker:
-    """Turns chunks of one video into small grey frames; all chunks must have frames of one size and kind.
-
-    Args:
-        name: of the video, for messages.
-        largest: pixels of the longer side kept; smaller frames stay as they are.
-        smallest: pixels of the shorter side, below which a video is refused.
-
-    Attributes:
-        count: frames so far.  size: height and width of the small frames.  scale: pixels there per pixel of the video.
-    """
+    """Turns chunks of one video into small grey frames; all chunks must have frames of one size and kind."""
 
     def __init__(self, name: str, largest: int, smallest: int) -> None:
         self.name, self.largest, self.smallest = name, largest, smallest
@@ -191,11 +163,7 @@ class Shrinker:
         self.white: float | None = None
 
     def __call__(self, frames: Any) -> Tensor:
-        """``(n, h, w)`` float32 in 0..255 of a chunk of grey or colour frames.
-
-        Raises:
-            ValueError: naming the video: wrong shape, type or size, NaN, grey levels out of range.
-        """
+        """``(n, h, w)`` float32 in 0..255 of a chunk of grey or colour frames."""
         chunk = torch.as_tensor(frames)
         begins = range(0, max(len(chunk), 1), SHRINKING_BLOCK)
         return torch.cat([self._small(chunk[begin : begin + SHRINKING_BLOCK]) for begin in begins])
@@ -249,14 +217,7 @@ class Shrinker:
 
 
 def binned(frames: Tensor, cell: int) -> Tensor:
-    """``(n, h // cell, w // cell)`` means over cells of ``cell`` pixels; what fills no cell is left out.
-
-    Rows are summed in integers first: 640 x 480 to 80 x 60 takes a third of `avg_pool2d`'s time.
-
-    Example:
-        >>> binned(torch.arange(8, dtype=torch.uint8).view(1, 2, 4), 2).tolist()
-        [[[2.5, 4.5]]]
-    """
+    """``(n, h // cell, w // cell)`` means over cells of ``cell`` pixels; what fills no cell is left out."""
     height, width = (n // cell for n in frames.shape[1:])
     rows = frames[:, : height * cell, : width * cell].unflatten(1, (height, cell))
     total = rows.sum(2) if frames.is_floating_point() else rows.sum(2, dtype=torch.int32)

@@ -320,11 +320,7 @@ Indexer = TypeVar("Indexer", bound="BrightnessIndexer")
 
 
 def save(indexer: BrightnessIndexer, path: str | Path) -> None:
-    """Write a fitted indexer.
-
-    Raises:
-        ValueError: the file cannot be written, or labels or parameters are neither text nor numbers.
-    """
+    """Write a fitted indexer."""
     write_model(
         path,
         KIND,
@@ -347,11 +343,7 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
 
 
 def _known(parameters: dict[str, Any]) -> dict[str, Any]:
-    """The parameters of a model file, of which older ones hold one more.
-
-    Raises:
-        ValueError: it mixed window kernels into the scores, which is no longer done.
-    """
+    """The parameters of a model file, of which older ones hold one more."""
     known = {name: value for name, value in parameters.items() if name != "temporal_weight"}
     weight = parameters.get("temporal_weight", 0.0)
     if weight != 0.0:

@@ -18,17 +18,11 @@ GAP = 2  # empty rows before each track: no step leads from one track into the n
 
 @dataclass(frozen=True)
 class VideoExemplars:
-    """Learned videos, one after the other.
-
-    Attributes:
-        motion: ``(M, 560)`` descriptors.
-        lengths: ``(videos,)`` frames.
-        labels: ``(videos,)`` numbers of classes.
-    """
+    """Learned videos, one after the other."""
 
     motion: Tensor = field(metadata=stored("real", "frames", "descriptor", least=-LONGEST, most=LONGEST))
-    lengths: Tensor = field(metadata=stored("whole", "videos", below=FRAMES))
-    labels: Tensor = field(metadata=stored("every", "videos", below="classes"))
+    lengths: Tensor = field(metadata=stored("whole", "videos", below=FRAMES))  # ``(videos,)`` frames
+    labels: Tensor = field(metadata=stored("every", "videos", below="classes"))  # ``(videos,)`` numbers of classes
 
     @classmethod
     def of(cls, videos: list[Tensor], labels: Tensor) -> VideoExemplars:
@@ -50,19 +44,12 @@ class VideoExemplars:
 
 @dataclass(frozen=True)
 class Library:
-    """Exemplar frames, track after track, tracks of one class together; GAP rows of zeros before each track.
+    """Exemplar frames, track after track, tracks of one class together; GAP rows of zeros before each track."""
 
-    Attributes:
-        rows: ``(M, K)`` coordinates of rows of at most unit length.
-        gaps: ``(2 tracks,)`` rows of zeros.
-        bounds: ``(classes + 1,)`` where each class begins.
-        basis: ``(D, K)`` directions in which the exemplars differ most, orthonormal.
-    """
-
-    rows: Tensor
-    gaps: Tensor
-    bounds: tuple[int, ...]
-    basis: Tensor
+    rows: Tensor  # ``(M, K)`` coordinates of rows of at most unit length
+    gaps: Tensor  # ``(2 tracks,)`` rows of zeros
+    bounds: tuple[int, ...]  # ``(classes + 1,)`` where each class begins
+    basis: Tensor  # ``(D, K)`` directions in which the exemplars differ most, orthonormal
 
 
 def library(exemplars: VideoExemplars, classes: int, flip: bool, kept: int = DescriptorOptions.kept) -> Library:

@@ -18,11 +18,7 @@ from indexing.brightness.options import BrightnessOptions, DescriptorOptions, Mo
 
 
 class MotionMaps:
-    """Keeps the last two blurred frames of a stream; gives ``(n, 4, h, w)`` maps for ``n`` more frames.
-
-    The maps of frame t need the frames up to t alone: brightness changes from t - 2 to t about frame t - 1.
-
-    """
+    """Keeps the last two blurred frames of a stream; gives ``(n, 4, h, w)`` maps for ``n`` more frames."""
 
     def __init__(self, options: MotionMapOptions = MotionMapOptions()) -> None:
         self.sigma, self.quiet = options.sigma, options.quiet
@@ -52,16 +48,7 @@ NOTHING_EPSILON = 1e-12  # brightness change of every pixel in a box: where noth
 
 
 class MotionBox:
-    r"""Square box about what has moved, frame by frame.
-
-    .. math:: A_t = \max\bigl((1 - \tfrac{1}{m}) A_{t-1},\; \max(|I_t| - .006, 0)\bigr)
-
-    and the box encloses the 2 % to 98 % quantiles of the marginals of A.  It knows the frames up to t alone.
-
-    Args:
-        memory: m, frames.
-        seen: ``(h, w)`` A before the first frame; nothing by default.
-    """
+    r"""Square box about what has moved, frame by frame. seen ``(h, w)``."""
 
     def __init__(self, memory: float, seen: Tensor | None = None, *, options: MotionBoxOptions = MotionBoxOptions()) -> None:
         self.decay, self.seen, self.options = 1 - 1 / memory, seen, options
@@ -93,19 +80,7 @@ def boxes_about(seen: Tensor, options: MotionBoxOptions) -> Tensor:
 
 
 def together(seen: list[Tensor], options: MotionBoxOptions = MotionBoxOptions()) -> list[Tensor]:
-    """Of each video, what moved in it and in all videos of its size that were taken at its place.
-
-    Where the box about one holds at least half of the other's, somebody stands at one place in both.
-
-    Args:
-        seen: ``(h, w)`` what moved in each video.
-
-    Example:
-        >>> arm, legs = torch.zeros(2, 20, 20)
-        >>> arm[4:8, 4:8], legs[6:16, 6:10] = 1.0, 2.0
-        >>> [int(one.sum()) for one in together([arm, legs, torch.ones(5, 5)])]
-        [92, 92, 25]
-    """
+    """Of each video, what moved in it and in all videos of its size that were taken at its place. seen ``(h, w)``."""
     out = list(seen)
     for shape in {one.shape for one in seen}:
         of = [i for i, one in enumerate(seen) if one.shape == shape]
@@ -128,11 +103,7 @@ CELLS = 8
 
 
 def overlaps(centre: Tensor, side: Tensor, pixels: int, cells: int = CELLS) -> Tensor:
-    """``(..., cells, pixels)`` share of each cell's interval that lies in each pixel; neighbouring cells overlap by half.
-
-    Args:
-        centre, side: ``(...)`` of the interval that the cells divide, in pixels.
-    """
+    """``(..., cells, pixels)`` share of each cell's interval that lies in each pixel; neighbouring cells overlap by half."""
     places, pixel, after = _positions(cells, pixels, side.dtype, side.device)
     step = (side / cells)[..., None, None]
     middle = centre[..., None, None] + step * places
@@ -163,15 +134,7 @@ def described(cells: Tensor, soft: float = DescriptorOptions.soft) -> Tensor:
 
 
 def profile(cells: Tensor, count: int = CELLS) -> Tensor:
-    """``(..., 3 * count)`` motion sideways, down and up in each row of cells ``(..., 4 * count * count)``.
-
-    Cameras that stand upright share the height of what they see, not its place across, and the sign of sideways motion depends
-    on the side from which a camera looks.
-
-    Example:
-        >>> profile(torch.arange(1.0, 17.0).view(1, 16), 2).tolist()
-        [[14.0, 22.0, 19.0, 23.0, 27.0, 31.0]]
-    """
+    """``(..., 3 * count)`` motion sideways, down and up in each row of cells ``(..., 4 * count * count)``."""
     right, left, down, up = cells.unflatten(-1, (4, count, count)).sum(-1).unbind(-2)
     return torch.cat([right + left, down, up], dim=-1)
 
@@ -192,30 +155,17 @@ Region = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Optics:
-    """How videos are looked at.
+    """How videos are looked at."""
 
-    Attributes:
-        fps: frames per second at which everything is compared.
-        size: px of the longer side of the work image.
-        region: ``"motion"``, ``None`` (the whole image) or ``(x0, y0, x1, y1)`` in pixels of the video.
-        device: where to compute.
-        options: every number that decides.
-    """
-
-    fps: float
-    size: int
-    region: str | Region | None
-    device: str
-    options: BrightnessOptions = BrightnessOptions()
+    fps: float  # frames per second at which everything is compared
+    size: int  # px of the longer side of the work image
+    region: str | Region | None  # ``"motion"``, ``None`` (the whole image) or ``(x0, y0, x1, y1)`` in pixels of the video
+    device: str  # where to compute
+    options: BrightnessOptions = BrightnessOptions()  # every number that decides
 
 
 class Sight:
-    """Descriptors of one video, chunk by chunk; those of frame t need the frames up to t alone.
-
-    Args:
-        name: of the video, for messages.
-        seen: ``(h, w)`` where something has moved before the first frame.
-    """
+    """Descriptors of one video, chunk by chunk; those of frame t need the frames up to t alone. seen ``(h, w)``."""
 
     def __init__(self, optics: Optics, name: str, seen: Tensor | None = None) -> None:
         self.optics = optics

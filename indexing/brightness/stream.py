@@ -30,12 +30,7 @@ BLOCK = 32  # frames compared at once: library rows are read once per block
 
 
 class Warping:
-    """The state of one stream against a library.
-
-    Args:
-        window: frames of memory.
-        slack: price of a step other than 1.
-    """
+    """The state of one stream against a library."""
 
     def __init__(self, source: Library, window: float, slack: float = MatchingOptions.slack) -> None:
         self.source, self.keep, self.slack = source, 1 - 1 / window, slack
@@ -91,16 +86,7 @@ class Recognizer:
 
 
 class Pool:
-    r"""Running mean of scores over frames in which something moves.
-
-    .. math:: P_c(t) = \frac{1}{20} \log \frac{\sum_\tau g^{t-\tau}\,|f_\tau|^2\,e^{20 s_c(\tau)}}{\sum_\tau g^{t-\tau}\,|f_\tau|^2}
-
-    with g = 1 - 1/pool.
-
-    Args:
-        frames: memory; infinite for the mean over a whole video.
-        sharp: 20 above.
-    """
+    r"""Running mean of scores over frames in which something moves."""
 
     def __init__(self, classes: int, frames: float, sharp: float = MatchingOptions.sharp) -> None:
         self.sharp = sharp
@@ -126,10 +112,7 @@ def _mean(total: Array, weight: Any, sharp: float) -> Array:
 
 
 class BrightnessStream:
-    """Scores of one video, as its frames come in.  Made by :meth:`indexing.BrightnessIndexer.stream`.
-
-    Memory is one number per library frame and a few small images, whatever the length of the stream.
-    """
+    """Scores of one video, as its frames come in. Made by :meth:`indexing.BrightnessIndexer.stream`."""
 
     def __init__(self, source: Recognizer, classes: int, name: str, fps: float | None) -> None:
         self.source, self.fps = source, fps
@@ -144,19 +127,7 @@ class BrightnessStream:
         self.energy = 0.0
 
     def push(self, frames: Any, times: Any = None) -> Array:
-        """Scores of one more frame, or of several.
-
-        Args:
-            frames: ``(height, width)`` or ``(height, width, 3)``: one frame; with a leading axis: several.
-                Several at once are several times as fast.
-            times: ``(n,)`` seconds; by default the stream's frame rate says them.
-
-        Returns:
-            ``(classes,)``, or ``(n, classes)`` for several: larger is better, from the frames up to each alone.
-
-        Raises:
-            ValueError: frames of another size or kind than before.
-        """
+        """Scores of one more frame, or of several. frames ``(height, width)``, times ``(n,)`` -> ``(classes,)``."""
         frames = torch.as_tensor(frames)
         single = frames.ndim == 2 or (frames.ndim == 3 and frames.shape[-1] == 3)
         scores, _ = self.scan(frames[None] if single else frames, times)
@@ -197,14 +168,7 @@ def recognize(stream: BrightnessStream, video: Footage) -> Array:
 
 
 def learned(videos: list[Footage], optics: Optics) -> list[list[Tensor]]:
-    """Descriptors of videos to learn from: what a stream of each would give, and what a stream would give that began earlier.
-
-    Where only an arm moves, a stream that has just begun knows the arm's place alone.  One that has seen the same person do other
-    things knows the person's: there, the box starts from what moved in all the videos that were taken at the same place.
-
-    Raises:
-        ValueError: fewer than three frames, or nothing moves.
-    """
+    """Descriptors of videos to learn from: what a stream of each would give, and what a stream would give that began earlier."""
     first = [_looked_at(video, optics, None) for video in videos]
     moved = [seen for _, seen in first if seen is not None]
     if not moved:
@@ -243,11 +207,7 @@ def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch
 
 
 def mirrors_matter(source: Recognizer, exemplars: VideoExemplars) -> bool:
-    """Whether some exemplar's mirror image looks clearly more like another action than like its own.
-
-    Args:
-        source: without mirrored exemplars.
-    """
+    """Whether some exemplar's mirror image looks clearly more like another action than like its own."""
     for i in _asked(exemplars, source.options.events.asked):
         stream, seen = _fresh(source), exemplars.videos()[i]
         stream.compare(mirrored(seen).to(source.optics.device))

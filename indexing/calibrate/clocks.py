@@ -19,20 +19,7 @@ REMEDY = "give the sync.json of dyntorch sync, or the word known for recordings 
 
 
 def given_clocks(value: Any, names: Sequence[str]) -> Tensor | None:
-    """``(cameras, 2)`` offset in seconds and rate of each camera's clock against the first one's; None where nothing is given.
-
-    Args:
-        value: ``"known"``: equal times are equal moments; the path of a ``sync.json``; :class:`dyntorch.Clocks`; ``(cameras,)``
-            offsets or ``(cameras, 2)`` offsets and rates.
-        names: of the cameras.
-
-    Raises:
-        ValueError: a file that is none, that was refused, or that lacks a camera; other numbers.
-
-    Example:
-        >>> given_clocks("known", ["a", "b"]).tolist()
-        [[0.0, 1.0], [0.0, 1.0]]
-    """
+    """``(cameras, 2)`` offset in seconds and rate of each camera's clock against the first one's; None where nothing is given."""
     if value is None:
         return None
     if isinstance(value, str) and value == KNOWN:

@@ -24,21 +24,13 @@ FOCAL_35 = 41989  # the EXIF tag FocalLengthIn35mmFilm
 
 @dataclass(frozen=True, eq=False)
 class KnownLenses:
-    """What is held of the lenses.
+    """What is held of the lenses."""
 
-    Attributes:
-        focals: pixels, of each camera; None = they are found.
-        one_lens: all cameras have the same focal length.
-        lenses: matrix and distortions of each camera, which are held; None = not given.
-        source: in a few words, where the focal lengths come from.
-        notes: what to say about it.
-    """
-
-    focals: tuple[float, ...] | None = None
-    one_lens: bool = False
-    lenses: tuple[Lens, ...] | None = None
-    source: str = "found from the movement"
-    notes: tuple[str, ...] = ()
+    focals: tuple[float, ...] | None = None  # pixels, of each camera; None = they are found
+    one_lens: bool = False  # all cameras have the same focal length
+    lenses: tuple[Lens, ...] | None = None  # matrix and distortions of each camera, which are held; None = not given
+    source: str = "found from the movement"  # in a few words, where the focal lengths come from
+    notes: tuple[str, ...] = ()  # what to say about it
 
     @property
     def given(self) -> list[tuple[Tensor, Tensor | None]] | None:
@@ -57,18 +49,7 @@ def known_lenses(
     calibration: Any = None,
     exif: bool = False,
 ) -> KnownLenses:
-    """What is known of the lenses of some cameras.
-
-    Args:
-        takes: what the cameras recorded; sizes: of their pictures.
-        focal: pixels, of all cameras or of each.
-        one_lens: the same, unknown focal length in all.
-        calibration: path of a file with a section for each camera, or its lenses.
-        exif: the 35 mm equivalent that a phone wrote into its video, or into a photo beside the keypoints.
-
-    Raises:
-        ValueError: more than one of these, no focal length, or a camera that is not in the file.
-    """
+    """What is known of the lenses of some cameras."""
     given = [
         name
         for name, there in (

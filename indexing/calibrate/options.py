@@ -35,12 +35,7 @@ class ViewOptions:
 
 @dataclass(frozen=True)
 class Share:
-    """How high a joint of somebody who stands upright is, in body heights.
-
-    Args:
-        height: mean of adults.
-        spread: standard deviation between people and between detectors.
-    """
+    """How high a joint of somebody who stands upright is, in body heights."""
 
     height: float
     spread: float

@@ -63,39 +63,24 @@ class SideNotice(NoticeCode):
 
 @dataclass(frozen=True)
 class SideExchange:
-    """A stretch in which a camera shows left as right.
+    """A stretch in which a camera shows left as right."""
 
-    Attributes:
-        camera: its number.
-        person: the number of the person.
-        limb: ``"body"`` (everything), ``"trunk"``, ``"arms"`` or ``"legs"``.
-        start, end: seconds on the camera's clock, of the first and the last frame.
-        evidence: nats for it.
-    """
-
-    camera: int
-    person: int
-    limb: str
-    start: float
+    camera: int  # its number
+    person: int  # the number of the person
+    limb: str  # ``"body"`` (everything), ``"trunk"``, ``"arms"`` or ``"legs"``
+    start: float  # seconds on the camera's clock, of the first and the last frame
     end: float
-    evidence: float
+    evidence: float  # nats for it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Sides(Outcome):
-    """Left and right, as all cameras together see them.
+    """Left and right, as all cameras together see them."""
 
-    Attributes:
-        tracks: per camera ``(frames, n, 2)`` px as given, with what was exchanged put right.
-        weights: per camera ``(frames, n)``, None where none were given.
-        exchanged: per camera ``(frames, people, 3)`` bool of :data:`LIMBS`.
-        exchanges: the same as stretches, by camera and time.
-    """
-
-    tracks: tuple[Floats, ...]
-    weights: tuple[Floats, ...] | None
-    exchanged: tuple[Booleans, ...]
-    exchanges: tuple[SideExchange, ...]
+    tracks: tuple[Floats, ...]  # per camera ``(frames, n, 2)`` px as given, with what was exchanged put right
+    weights: tuple[Floats, ...] | None  # per camera ``(frames, n)``, None where none were given
+    exchanged: tuple[Booleans, ...]  # per camera ``(frames, people, 3)`` bool of :data:`LIMBS`
+    exchanges: tuple[SideExchange, ...]  # the same as stretches, by camera and time
 
     TASK = "sides"
 
@@ -120,56 +105,8 @@ def sides(
     weights: Sequence[ArrayLike] | None = None,
     options: SideOptions = SideOptions(),
 ) -> Sides:
-    r"""Which cameras show left as right, when, and of which limb; and the tracks with that put right.
-
-    Three cameras that agree on left and right see one point in space; where one of them exchanges the sides, the point that fits
-    best is off in all three.  With :math:`z_c(t) \in \{0, 1\}` whether camera c exchanges a limb, the likeliest reading is
-
-    .. math:: \min_z \sum_t \sum_{abc} E_{abc}(t; z_a, z_b, z_c) + \lambda \sum_t \sum_c z_c(t)
-              + \mu \sum_t \sum_c |z_c(t) - z_c(t - 1)|,
-
-    E the robust reprojection error of left and right points triangulated from cameras a, b and c: exact by dynamic programming
-    over all readings of a frame.  All cameras exchanged fit as well as none: fewer exchanges are likelier, so that the others
-    outvote a camera that is mirrored for the whole take.  First the body as a whole, then trunk, arms and legs by themselves.
-
-    Args:
-        tracks: per camera ``(frames, n, 2)`` px, NaN = missing; several people side by side, n = people * joints.
-        cameras: :class:`dyntorch.Calibration`, or anything with its ``K``, ``R``, ``t``, ``distortion`` and ``clocks``.
-        joints: names of the joints of a person: ``left_knee`` and ``right_knee`` are the two sides of one.
-        times: per camera ``(frames,)`` seconds on its own clock; by default frame / fps.
-        fps: frames per second of all cameras or of each, where there are no times.
-        weights: per camera ``(frames, n)`` confidences, 0 = ignore; exchanged with the positions.
-        options: every number that decides.
-
-    Returns:
-        Tracks with the sides put right, and what was exchanged.  With two cameras, or as many that exchange as do not, nothing
-        tells who is wrong, and all stays as it is.
-
-    Raises:
-        ValueError: tracks, times or weights that do not fit the cameras or the joints.
-
-    Source:
-        Viterbi 1967, Error bounds for convolutional codes; triangulation: Hartley and Zisserman, chapter 12.
-
-    Example:
-        >>> import torch
-        >>> from types import SimpleNamespace
-        >>> turn = torch.tensor([0.0, 1.0, 2.5], dtype=torch.float64)  # three cameras around two knees, 4 m away
-        >>> c, s, one, none = turn.cos(), turn.sin(), torch.ones_like(turn), torch.zeros_like(turn)
-        >>> R = torch.stack([c, s, none, none, none, -one, -s, c, none], -1).reshape(3, 3, 3)
-        >>> K = torch.diag(torch.tensor([1000.0, 1000.0, 1.0], dtype=torch.float64)).repeat(3, 1, 1)
-        >>> t, clocks = torch.stack([none, none, 4 * one], -1), SimpleNamespace(offsets=none, rates=one)
-        >>> rig = SimpleNamespace(K=K, R=R, t=t, distortion=torch.zeros(3, 5, dtype=torch.float64), clocks=clocks)
-        >>> step = 0.2 * torch.arange(30, dtype=torch.float64)[:, None].sin()
-        >>> across, along = torch.cat([step - 0.15, step + 0.15], 1), torch.cat([step, -step], 1)
-        >>> knees = torch.stack([across, along, torch.full_like(along, 0.5)], -1)
-        >>> seen = torch.einsum("cij,tnj->ctni", R, knees) + t[:, None, None]
-        >>> x = 1000 * seen[..., :2] / seen[..., 2:]
-        >>> x[1, 10:20] = x[1, 10:20].flip(1)  # the second camera takes one knee for the other
-        >>> found = sides(list(x), rig, ("left_knee", "right_knee"))
-        >>> [(e.camera, e.limb, round(e.start, 2), round(e.end, 2)) for e in found.exchanges]
-        [(1, 'body', 0.33, 0.63)]
-    """
+    r"""Which cameras show left as right, when, and of which limb; and the tracks with that put right. tracks
+    ``(frames, n, 2)``, times ``(frames,)``, weights ``(frames, n)``."""
     check_options(options, SideOptions)
     x, w, moments, people = _checked(tracks, cameras, joints, times, fps, weights)
     pairs = sided(joints)
@@ -208,12 +145,7 @@ def sides(
 
 
 def sided(joints: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
-    """The joints that have a left and a right one, as pairs of numbers, by limb.
-
-    Example:
-        >>> sided(("nose", "left_hip", "right_hip", "LKnee", "RKnee", "left_wrist"))
-        {'trunk': [(1, 2)], 'arms': [], 'legs': [(3, 4)]}
-    """
+    """The joints that have a left and a right one, as pairs of numbers, by limb."""
     words = [canonical(joint) for joint in joints]
     out: dict[str, list[tuple[int, int]]] = {limb: [] for limb in LIMBS}
     for left, word in enumerate(words):
@@ -282,10 +214,7 @@ def _projections(cameras: KnownCameras) -> Floats:
 def _together(
     x: Sequence[Floats], w: Sequence[Floats], moments: Sequence[Floats], cameras: KnownCameras, options: SideOptions
 ) -> tuple[Floats, Floats, Floats]:
-    """Common moments ``(T,)``, undistorted positions ``(T, c, n, 2)`` px and trust ``(T, c, n)`` there, by the nearest frames.
-
-    Interpolation between a frame with exchanged sides and one without would make points that nobody saw, so a frame stays a frame.
-    """
+    """Common moments ``(T,)``, undistorted positions ``(T, c, n, 2)`` px and trust ``(T, c, n)`` there, by the nearest frames."""
     import torch
 
     from dyntorch.geometry import undistort
@@ -330,12 +259,7 @@ def _speeds(x: Floats, times: Floats) -> Floats:
 def _readings(
     x: Floats, w: Floats, projections: Floats, pairs: dict[str, list[tuple[int, int]]], grid: Floats, options: SideOptions
 ) -> tuple[Booleans, Floats]:
-    """Who exchanges what ``(T, c, limbs)``, and the nats that speak for it, ``(T, c, limbs)``.
-
-    Args:
-        x: ``(T, c, joints, 2)`` undistorted px of one person.
-        w: ``(T, c, joints)``.
-    """
+    """Who exchanges what ``(T, c, limbs)``, and the nats that speak for it, ``(T, c, limbs)``."""
     count = x.shape[1]
     step = float(grid[1] - grid[0]) if len(grid) > 1 else 1.0
     states = np.array(list(product((0, 1), repeat=count)), dtype=np.int64)
@@ -401,12 +325,7 @@ def _size(x: Floats) -> float:
 
 
 def _misfit(x: Floats, w: Floats, projections: Floats, size: float, options: SideOptions) -> Floats:
-    """Nats ``(T,)``: robust reprojection error of points triangulated from three cameras, over the joints that all three see.
-
-    Args:
-        x: ``(T, 3, joints, 2)``; w: ``(T, 3, joints)``.
-        size: px, of the body.
-    """
+    """Nats ``(T,)``: robust reprojection error of points triangulated from three cameras, over the joints that all three see."""
     known: Booleans = np.asarray(np.isfinite(x).all((1, 3)) & (w > 0).all(1))
     filled = np.where(np.isfinite(x), x, 0.0)
     rows = filled[..., None] * projections[None, :, None, None, 2] - projections[None, :, None, :2]

@@ -26,22 +26,14 @@ UNITS = (("millimetres", 1000.0), ("centimetres", 100.0), ("inches", 39.37), ("f
 
 @dataclass(frozen=True)
 class Stature:
-    """The extent of the joints of somebody who stands upright.
+    """The extent of the joints of somebody who stands upright."""
 
-    Attributes:
-        extent: metres from the lowest joint to the highest.
-        sigma: metres, one standard deviation: people's proportions differ, and so do detectors.
-        tops, bottoms: the names of those joints, left and right.
-        height: metres, of the person.
-        measured: how the extent was found in a rig, in a few words.
-    """
-
-    extent: float
-    sigma: float
-    tops: tuple[str, ...]
+    extent: float  # metres from the lowest joint to the highest
+    sigma: float  # metres, one standard deviation: people's proportions differ, and so do detectors
+    tops: tuple[str, ...]  # the names of those joints, left and right
     bottoms: tuple[str, ...]
-    height: float
-    measured: str = ""
+    height: float  # metres, of the person
+    measured: str = ""  # how the extent was found in a rig, in a few words
 
     @property
     def note(self) -> str:
@@ -55,19 +47,7 @@ class Stature:
 
 
 def check_height(height: float, options: StatureOptions = StatureOptions()) -> float:
-    """A standing height in metres.
-
-    Raises:
-        ValueError: no height of a person; says which unit it may be in.
-
-    Example:
-        >>> check_height(1.75)
-        1.75
-        >>> check_height(1750.0)
-        Traceback (most recent call last):
-        ...
-        ValueError: height must be that of a standing person in metres, 0.4 to 2.6, got 1750; in millimetres? give 1.75
-    """
+    """A standing height in metres."""
     value = float(height)
     if math.isfinite(value) and options.smallest <= value <= options.tallest:
         return value
@@ -85,30 +65,7 @@ def check_height(height: float, options: StatureOptions = StatureOptions()) -> f
 
 
 def standing(names: Sequence[str], height: float, options: StatureOptions = StatureOptions()) -> Stature:
-    r"""The extent of a body's joints when it stands upright, from its height :math:`H`.
-
-    .. math:: e = (s_{\max} - s_{\min}) H, \qquad \sigma = H \sqrt{\sigma_{\max}^2 + \sigma_{\min}^2},
-
-    with the share s of the body height at which the table (:data:`indexing.calibrate.options.SHARES`) has the highest and the
-    lowest of the joints that are there.
-
-    Args:
-        names: of the joints.
-        height: metres, of the person standing, without shoes.
-
-    Raises:
-        ValueError: no height of a person, or joints that do not reach from the head or shoulders to the feet.
-
-    Source: R. Drillis and R. Contini, Body segment parameters, 1966; Winter, Biomechanics, figure 4.1.
-
-    Example:
-        >>> from indexing.skeleton import BODY25, COCO17
-        >>> found = standing(COCO17.joints, 1.75)
-        >>> found.tops, found.bottoms, round(found.extent, 3), round(found.sigma, 3)
-        (('left_eye', 'right_eye'), ('left_ankle', 'right_ankle'), 1.57, 0.018)
-        >>> standing(BODY25.joints, 1.75).bottoms[0]
-        'left_big_toe'
-    """
+    r"""The extent of a body's joints when it stands upright, from its height :math:`H`."""
     height = check_height(height, options)
     known: list[tuple[Share, str]] = [(share, name) for name in names if (share := _share(name, options)) is not None]
     levels = sorted(known, key=lambda one: (one[0].height, one[1]))
@@ -135,25 +92,7 @@ def _share(name: str, options: StatureOptions) -> Share | None:
 def in_metres(
     found: Calibration, stature: Stature, names: Sequence[str], options: StatureOptions = StatureOptions()
 ) -> tuple[Calibration, Stature | None]:
-    r"""A rig in metres, by the tallest of its people.
-
-    In a frame in which somebody stands straight, the shoulders about as far above an ankle as trunk and leg are long, the way up
-    from the lower foot to the head is
-
-    .. math:: e(t) = \mathrm{mean}_{k \in \text{tops}} z_k(t) - \min_{k \in \text{bottoms}} z_k(t),
-
-    whatever the arms do; its median is the extent of the standing body.  Of somebody who never stands straight, trunk and leg
-    themselves are .779 of the height.
-
-    Args:
-        found: a calibration of any scale, z up.
-        stature: what it measures in metres.
-        names: of the joints of one person; the points of people stand side by side.
-
-    Returns:
-        the calibration, and the stature with how it was measured; None where nothing says how tall anybody is, and the calibration
-        is as it was.
-    """
+    r"""A rig in metres, by the tallest of its people."""
     points = np.asarray(found.points.numpy(), dtype=np.float64)
     people = points.reshape(len(points), -1, len(names), 3)
     sizes = [size for who in range(people.shape[1]) if (size := _size(people[:, who], stature, names, options)) is not None]

@@ -219,11 +219,7 @@ def _on_takes(takes: Sequence[Take]) -> list[str]:
 
 
 def sizes_of(sizes: Any, cameras: int) -> list[Size | None]:
-    """The pictures' sizes of all cameras, where they were given.
-
-    Raises:
-        ValueError: no width and height, or other than one pair per camera.
-    """
+    """The pictures' sizes of all cameras, where they were given."""
     if sizes is None:
         return [None] * cameras
     alone = len(sizes) == 2 and not any(isinstance(part, Sequence) for part in sizes)
@@ -246,11 +242,7 @@ def _stature(joints: Joints, height: float, options: RigOptions) -> Stature:
 
 
 def _lengths(joints: Joints, lengths: Mapping[tuple[str, str], float], options: RigOptions) -> dict[tuple[int, int], float]:
-    """Known lengths by the numbers of their joints.
-
-    Raises:
-        ValueError: a joint that is not there, twice the same, or no length.
-    """
+    """Known lengths by the numbers of their joints."""
     names = () if joints.skeleton is None else joints.skeleton.joints
     index = {canonical(name): i for i, name in enumerate(names)}
     out = {}

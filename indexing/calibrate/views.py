@@ -26,19 +26,12 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera's part in a calibration.
+    """One camera's part in a calibration."""
 
-    Attributes:
-        take: what it recorded.
-        people: one clip for each person, in an order that all cameras share; None: this one does not show that person.
-        size: width and height of its picture, pixels.
-        times: ``(frames,)`` seconds on its own clock: all moments at which one of the people may be seen.
-    """
-
-    take: Take
-    people: tuple[Clip | None, ...]
-    size: Size
-    times: FloatArray
+    take: Take  # what it recorded
+    people: tuple[Clip | None, ...]  # one clip for each person, in an order that all cameras share
+    size: Size  # width and height of its picture, pixels
+    times: FloatArray  # ``(frames,)`` seconds on its own clock: all moments at which one of the people may be seen
 
     @property
     def name(self) -> str:
@@ -46,11 +39,7 @@ class View:
         return self.take.name
 
     def table(self, places: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Positions ``(frames, people * n, 2)`` and confidences ``(frames, people * n)``; NaN and 0 where there are none.
-
-        Args:
-            places: where each of the n joints is among those of a clip; -1 = it has none.
-        """
+        """Positions ``(frames, people * n, 2)`` and confidences ``(frames, people * n)``; NaN and 0 where there are none."""
         shape = len(self.times), len(self.people), len(places)
         tracks, trust = np.full((*shape, 2), np.nan), np.zeros(shape)
         here = np.flatnonzero(np.array(places) >= 0)
@@ -92,37 +81,16 @@ class View:
 
 @dataclass(frozen=True)
 class Joints:
-    """The joints that two cameras or more have.
+    """The joints that two cameras or more have."""
 
-    Attributes:
-        skeleton: their names and bones; None where nobody knows which is which.
-        places: for each camera, where each of them is among the camera's own; -1 = it has none.
-        note: what to say about layouts that differ.
-    """
-
-    skeleton: Skeleton | None
+    skeleton: Skeleton | None  # their names and bones; None where nobody knows which is which
     count: int
-    places: tuple[tuple[int, ...], ...]
-    note: str = ""
+    places: tuple[tuple[int, ...], ...]  # for each camera, where each of them is among the camera's own; -1 = it has none
+    note: str = ""  # what to say about layouts that differ
 
 
 def common(clips: Sequence[Clip], names: Sequence[str], options: ViewOptions = ViewOptions()) -> Joints:
-    """The joints of many layouts by their names: those that two cameras or more have.
-
-    Args:
-        clips: one of each camera.
-        names: of the cameras.
-
-    Raises:
-        ValueError: a camera shares too few with any other one, or layouts without names that differ in number.
-
-    Example:
-        >>> from indexing.skeleton import BODY25, COCO17
-        >>> a, b = (Clip(np.zeros((1, len(s.joints), 2)), skeleton=s) for s in (COCO17, BODY25))
-        >>> found = common([a, b], ["left", "right"])
-        >>> found.count, found.places[1][:3]
-        (17, (0, 16, 15))
-    """
+    """The joints of many layouts by their names: those that two cameras or more have."""
     layouts = [clip.skeleton or known(clip.joints.shape[1]) for clip in clips]
     sizes = [clip.joints.shape[1] for clip in clips]
     alike = all(layout is None or layouts[0] is None or layout.joints == layouts[0].joints for layout in layouts)
@@ -174,14 +142,7 @@ def _by_name(layouts: Sequence[Skeleton], names: Sequence[str], options: ViewOpt
 
 
 def sized(take: Take, size: Size | None) -> tuple[Take, Size]:
-    """A take in pixels, and how large its picture is.
-
-    Args:
-        size: as it was given; without one, what the file or the video says.
-
-    Raises:
-        ValueError: nobody knows, or joints lie outside of the picture by far.
-    """
+    """A take in pixels, and how large its picture is."""
     own = _own_size(take)
     size = size or own
     if size is None:
@@ -214,11 +175,7 @@ def _own_size(take: Take) -> Size | None:
 
 
 def check_size(take: Take, clips: Sequence[Clip], size: Size, options: ViewOptions = ViewOptions()) -> None:
-    """Raise where joints lie outside of the picture by far.
-
-    Raises:
-        ValueError: the size contradicts the keypoints; says whether the picture was turned.
-    """
+    """Raise where joints lie outside of the picture by far."""
     places = np.concatenate([clip.joints[clip.seen] for clip in clips]) if clips else np.zeros((0, 2))
     if not len(places):
         return
@@ -243,11 +200,7 @@ def _outside(places: NDArray[np.floating], size: Size, options: ViewOptions) -> 
 
 
 def view_of(take: Take, people: Sequence[Clip | None], size: Size, options: ViewOptions = ViewOptions()) -> View:
-    """A camera with who is seen by it.
-
-    Raises:
-        ValueError: its clock runs over far more than its frames; joints outside of its picture.
-    """
+    """A camera with who is seen by it."""
     seen = [clip for clip in people if clip is not None]
     check_size(take, seen, size, options)
     times = np.unique(np.concatenate([clip.times for clip in seen])) if seen else take.times
@@ -263,11 +216,7 @@ def view_of(take: Take, people: Sequence[Clip | None], size: Size, options: View
 
 
 def check_cameras(takes: Sequence[Take], options: ViewOptions = ViewOptions()) -> None:
-    """Raise where recordings cannot be those of one rig.
-
-    Raises:
-        ValueError: too few or too many, one without keypoints, or one given twice.
-    """
+    """Raise where recordings cannot be those of one rig."""
     if not 2 <= len(takes) <= options.cameras:
         remedy = "add a camera" if len(takes) < 2 else "leave some out, the others share what is measured"
         raise ValueError(
@@ -284,14 +233,7 @@ def check_cameras(takes: Sequence[Take], options: ViewOptions = ViewOptions()) -
 
 
 def check_overlap(views: Sequence[View], clocks: Tensor) -> None:
-    """Raise where cameras whose clocks are known have no moment in common with any other one.
-
-    Args:
-        clocks: ``(cameras, 2)`` offset and rate of each against the first one's.
-
-    Raises:
-        ValueError: naming two of them.
-    """
+    """Raise where cameras whose clocks are known have no moment in common with any other one. clocks ``(cameras, 2)``."""
     starts, ends = (
         [(float(view.times[at]) - offset) / rate for view, (offset, rate) in zip(views, clocks.tolist(), strict=True)]
         for at in (0, -1)

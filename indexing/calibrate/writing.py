@@ -27,16 +27,7 @@ OTHERS = ("metadata", "capture_volume", "charuco", "checkerboard")
 
 
 def toml_of(rig: CameraRig) -> str:
-    """A section for each camera, in the order in which Pose2Sim has their folders, with all digits of every number.
-
-    A point X of the world (z up, where that is known) has the image
-
-    .. math:: x \\sim K\\,\\mathrm{distort}(R X + t),
-
-    with R as the vector of its axis times its angle (Rodrigues, as OpenCV has it), in radians, t in metres (in the unit of
-    the rig, where the scale is unknown: ``units`` in ``[metadata]`` says so), K and the distortions k1, k2, p1, p2 (and k3) of
-    OpenCV, in pixels.
-    """
+    """A section for each camera, in the order in which Pose2Sim has their folders, with all digits of every number."""
     found = rig.calibration
     turns = rotation_vectors(found.R.numpy())
     order = sorted(range(len(rig.names)), key=lambda i: _natural(rig.names[i]))
@@ -98,14 +89,7 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 
 
 def write_associated(folder: Path, rig: CameraRig) -> dict[str, dict[str, Any]]:
-    """Write ``pose-associated/<camera>_json/`` for every camera: all of them, or nothing.
-
-    Frames have the numbers of the first camera's clock, as in ``pose-sync``, and people come in one order; one who is not seen
-    has zeros.  Files are OpenPose JSON, under the names of the input where that was such a folder.
-
-    Returns:
-        by the camera's name, what was written: folder, files, the greatest distance in seconds from the exact moment.
-    """
+    """Write ``pose-associated/<camera>_json/`` for every camera: all of them, or nothing."""
     target = folder / ASSOCIATED
     recover_folder(target)
     building = folder / f".{ASSOCIATED}-{secrets.token_hex(8)}.tmp"

@@ -82,14 +82,7 @@ class Runnable(Protocol):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    Args:
-        argv: words after ``dyntorch``; by default those of the process.
-
-    Returns:
-        0 done, 2 bad input (one line on stderr), 3 refused, 130 interrupted, 141 when nobody reads the output any more.
-    """
+    """Run one command."""
     words = list(sys.argv[1:] if argv is None else argv)
     # Threads that wait must not spin: where other programs use the cores, the demo takes 12 s instead of 52 s (two cores, two
     # other programs), and nothing changes where it is alone.  Read by OpenMP when torch is loaded.

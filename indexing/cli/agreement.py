@@ -109,10 +109,8 @@ def _called(known: Path, found: Path, command: Evaluate) -> tuple[str, str]:
 
 
 def _side(labelling: Labelling, path: Path, command: Evaluate, detections: bool) -> tuple[list[Label], list[str], list[str]]:
-    """The labels of one hand, the media that they are of, and what to know; of detections those of a program, where one looked.
-
-    That nothing was found says something, too: then there are media without labels.
-    """
+    """The labels of one hand, the media that they are of, and what to know; of detections those of a program, where one
+    looked."""
     from indexing.cli.suggest import TIER
     from indexing.labels import choose_labels
 
@@ -174,14 +172,7 @@ def _paired(
 def _recordings(
     known: Sequence[Label], found: Sequence[Label], searched: Sequence[str], paths: tuple[Path, Path]
 ) -> tuple[dict[str, tuple[list[Label], list[Label]]], list[str]]:
-    """The labels of both sides by recording, and the recordings that are known only.
-
-    Args:
-        searched: the media that were looked through, also those in which nothing was found.
-
-    Raises:
-        ValueError: what was found is of other recordings.
-    """
+    """The labels of both sides by recording, and the recordings that are known only."""
     media = [list(dict.fromkeys(one.media for one in known)), searched]
     if len(media[0]) == 1 and (len(media[1]) == 1 and "" in (*media[0], *media[1])):
         name = media[0][0] or media[1][0] or paths[0].name
@@ -207,11 +198,7 @@ def _recordings(
 def _subjects(
     known: Sequence[Label], found: Sequence[Label], paths: tuple[Path, Path]
 ) -> dict[str, tuple[list[Label], list[Label]]]:
-    """The labels of both sides by subject; all together where one side does not say whose they are.
-
-    Raises:
-        ValueError: both say it, and have no subject in common.
-    """
+    """The labels of both sides by subject; all together where one side does not say whose they are."""
     sides = [{one.subject.casefold(): one.subject for one in side} for side in (known, found)]
     if any(set(side) <= {""} for side in sides):
         return {"": (list(known), list(found))}

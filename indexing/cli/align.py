@@ -118,11 +118,7 @@ class Align:
             raise ValueError(f"--seed must be a whole number from 0, got {self.seed}")
 
     def _read(self, asked: Asked | None) -> tuple[Matched, SceneTracks | None]:
-        """The matches, and the tracks that they are where ``asked`` says frames of a video.
-
-        Raises:
-            ValueError: what cannot be read, or does not fit together.
-        """
+        """The matches, and the tracks that they are where ``asked`` says frames of a video."""
         from indexing.readers.matches import read_matches
 
         if asked is None:
@@ -135,11 +131,7 @@ class Align:
         return as_matches(tracks), tracks
 
     def _model(self, matched: Matched) -> tuple[str, list[str]]:
-        """The model, and what to say about it.
-
-        Raises:
-            ValueError: the files do not hold what it needs.
-        """
+        """The model, and what to say about it."""
         dims, kind = matched.dims, "lines" if matched.lines else f"{matched.dims[0]}D points"
         given = self.model or ("lines" if matched.lines else "planar" if dims[0] == 2 else "rigid")
         odd = next((i for i, d in enumerate(dims) if d != dims[0]), None)
@@ -175,11 +167,7 @@ class Align:
         return None if self.threshold in ("auto", None) else float(self.threshold)
 
     def _solve(self, matched: Matched, model: str, threshold: float | None) -> Any:
-        """The alignment, by the library.
-
-        Raises:
-            ValueError: too few matches, with the files' names.
-        """
+        """The alignment, by the library."""
         import torch
 
         import dyntorch
@@ -205,11 +193,7 @@ class Align:
 
 
 def frame_numbers(text: str | None) -> tuple[int, ...] | None:
-    """``10,20,30`` as numbers.
-
-    Raises:
-        ValueError: something else.
-    """
+    """``10,20,30`` as numbers."""
     if text is None:
         return None
     try:

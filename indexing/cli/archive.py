@@ -344,11 +344,7 @@ def check_workers(workers: int | None, dask: str | None) -> None:
 def workforce(
     workers: int | None, dask: str | None, tasks: int | None = None, threads: bool = False
 ) -> AbstractContextManager[Executor | None]:
-    """Who does the work: a cluster, threads or processes; ``None`` where this process is as quick by itself.
-
-    Args:
-        tasks: how many there are; threads: instead of processes, and only where a number was asked for.
-    """
+    """Who does the work: a cluster, threads or processes; ``None`` where this process is as quick by itself."""
     if dask is not None:
         return _cluster(dask)
     if threads:
@@ -385,11 +381,7 @@ def _processes(workers: int) -> Iterator[Executor]:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[Executor]:
-    """The workers of a Dask cluster.
-
-    Raises:
-        ValueError: nobody answers at the address, or Dask is not installed.
-    """
+    """The workers of a Dask cluster."""
     try:
         from dask.distributed import Client
     except ImportError:
@@ -455,11 +447,7 @@ def _example(text: str) -> Example:
 
 
 def read_query(example: Example, reading: Reading, select: Sequence[str]) -> tuple[Clip, list[str]]:
-    """The one clip that is asked for, named as it was given, and what a reader should know of it.
-
-    Raises:
-        ValueError: it cannot be read, is several clips, or has no frame in the seconds given.
-    """
+    """The one clip that is asked for, named as it was given, and what a reader should know of it."""
     from indexing.cli.protocol import choose, known
 
     clips = every = reading.read(example.path)

@@ -27,15 +27,10 @@ UNTIMED = 10.0  # frames per second of the video that is written where nobody sa
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """Tracks, and where they come from.
+    """Tracks, and where they come from."""
 
-    Attributes:
-        tracks: through two frames at least.
-        followed: points of a video or of pictures; None where a file has the tracks.
-    """
-
-    tracks: TrackSet
-    followed: SceneTracks | None = None
+    tracks: TrackSet  # through two frames at least
+    followed: SceneTracks | None = None  # points of a video or of pictures; None where a file has the tracks
 
     def as_pair(self) -> MatchedPair:
         """Two frames, as a file of matches would give them."""
@@ -51,27 +46,16 @@ class Given:
 
 @dataclass(frozen=True)
 class BodiesJob:
-    """What is asked for.
+    """What is asked for."""
 
-    Attributes:
-        files: that were given.
-        images: a video, a folder, a pattern or pictures, of files of tracks; empty = none.
-        bodies: how many; None = as many as there are.
-        threshold: pixels.
-        size: width and height of the pictures; None = not known.
-        out: folder of the report; None = print only.
-        title: heading of the report.
-        seed: of the random samples.
-    """
-
-    files: Sequence[Path]
-    images: Sequence[Path] = ()
-    bodies: int | None = None
-    threshold: float = 2.5
-    size: tuple[float, float] | None = None
-    out: Path | None = None
-    title: str = ""
-    seed: int = 0
+    files: Sequence[Path]  # that were given
+    images: Sequence[Path] = ()  # a video, a folder, a pattern or pictures, of files of tracks; empty = none
+    bodies: int | None = None  # how many; None = as many as there are
+    threshold: float = 2.5  # pixels
+    size: tuple[float, float] | None = None  # width and height of the pictures; None = not known
+    out: Path | None = None  # folder of the report; None = print only
+    title: str = ""  # heading of the report
+    seed: int = 0  # of the random samples
 
     @property
     def inputs(self) -> list[Path]:
@@ -80,11 +64,7 @@ class BodiesJob:
 
 
 def read_given(files: Sequence[Path], scene: bool, asked: Asked, key: str | None) -> Given:
-    """The tracks of a video, of pictures, or of files.
-
-    Raises:
-        ValueError: one line with the file, what is wrong and what to do.
-    """
+    """The tracks of a video, of pictures, or of files."""
     if scene:
         followed = follow_whole(files, asked)
         return Given(as_tracks(followed, files[0], is_video(files[0])), followed)
@@ -98,11 +78,7 @@ def read_given(files: Sequence[Path], scene: bool, asked: Asked, key: str | None
 
 
 def _within(tracks: TrackSet, span: tuple[int, int]) -> TrackSet:
-    """The views whose numbers, or times, are in a span.
-
-    Raises:
-        ValueError: fewer than two are.
-    """
+    """The views whose numbers, or times, are in a span."""
     views = [name for name in tracks.views if re.fullmatch(r"-?\d+(\.\d+)?", name) and span[0] <= float(name) <= span[1]]
     if len(views) < 2:
         said = f"{tracks.path}: --frames {span[0]}-{span[1]}: {count(len(views), 'frame')} of it, and 2 are needed"
@@ -111,28 +87,14 @@ def _within(tracks: TrackSet, span: tuple[int, int]) -> TrackSet:
 
 
 def flat(tracks: TrackSet) -> Any:
-    """Positions ``(views, n, 2)`` as a camera sees them.
-
-    Raises:
-        ValueError: points in space.
-    """
+    """Positions ``(views, n, 2)`` as a camera sees them."""
     if tracks.values.shape[-1] != 2:
         raise ValueError(f"{tracks.path}: holds 3D points, and segment takes what a camera sees; give columns x, y alone")
     return tracks.values
 
 
 def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str, Any]) -> int:
-    """Segment, draw, write, and say what was found.
-
-    Args:
-        job: what is asked for.
-        given: the tracks.
-        read: seconds that reading took.
-        arguments: of the command line, for the manifest.
-
-    Raises:
-        ValueError: one line, with what to do.
-    """
+    """Segment, draw, write, and say what was found."""
     from indexing.files import manifest
     from indexing.report.bodies import WRITTEN, BodiesReport, write_bodies
 
@@ -165,11 +127,7 @@ def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str
 
 
 def checked(tracks: TrackSet, job: BodiesJob) -> list[str]:
-    """What to say about the input.
-
-    Raises:
-        ValueError: points in space, too few tracks, or a threshold larger than all that they cover.
-    """
+    """What to say about the input."""
     import numpy as np
 
     values = flat(tracks)
@@ -191,17 +149,7 @@ def checked(tracks: TrackSet, job: BodiesJob) -> list[str]:
 
 
 def unit_notes(path: str, extent: float, threshold: float | None, auto: bool = True) -> list[str]:
-    """That points are hardly pixels.
-
-    Args:
-        path: of the file.
-        extent: of the points, in their unit.
-        threshold: in the same; None = estimated.
-        auto: whether it can be estimated.
-
-    Raises:
-        ValueError: a threshold within which anything would fit anything.
-    """
+    """That points are hardly pixels."""
     if threshold is None or extent >= SMALL * threshold:
         return []
     said = f"the points lie within {extent:.3g}, and --threshold is {threshold:g}"
@@ -259,23 +207,14 @@ def stretches(tracks: TrackSet, result: Any) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Where pictures come from, and which of them belong to the views.
+    """Where pictures come from, and which of them belong to the views."""
 
-    Attributes:
-        source: a video, a folder, a pattern, or pictures.
-        frames: number of the picture of each view.
-    """
-
-    source: Any
-    frames: tuple[int, ...]
+    source: Any  # a video, a folder, a pattern, or pictures
+    frames: tuple[int, ...]  # number of the picture of each view
 
     @staticmethod
     def of(job: BodiesJob, given: Given) -> Pictures | None:
-        """Those of the job, if there are any.
-
-        Raises:
-            ValueError: other pictures than those of the tracks.
-        """
+        """Those of the job, if there are any."""
         if given.followed is not None:
             return Pictures(source_of(job.files), given.followed.frames)
         if not job.images or job.out is None:

@@ -135,11 +135,7 @@ class Calibrate:
         return clocks
 
     def _numbers(self, flag: str, cameras: int | None) -> list[float | None]:
-        """One number for each camera.
-
-        Raises:
-            ValueError: not positive numbers, or other than one per camera.
-        """
+        """One number for each camera."""
         given: str | None = getattr(self, flag)
         if given is None:
             return [None] * (cameras or 0)
@@ -155,11 +151,7 @@ class Calibrate:
         return values * ((cameras or 1) if len(values) == 1 else 1)
 
     def _sizes(self, cameras: int | None) -> list[tuple[int, int]] | None:
-        """Width and height of each camera's pictures; None where they are not given.
-
-        Raises:
-            ValueError: no such sizes, or other than one per camera.
-        """
+        """Width and height of each camera's pictures; None where they are not given."""
         if self.size is None:
             return None
         words = [re.fullmatch(r"\s*(\d{1,6})\s*[xX*]\s*(\d{1,6})\s*", word) for word in self.size.split(",")]
@@ -212,11 +204,7 @@ class Calibrate:
 
 
 def show(report: CalibrationReport, folder: Path | None = None) -> None:
-    """Print the result.
-
-    Args:
-        folder: that it was written to.
-    """
+    """Print the result."""
     from indexing.report.calibration import agrees_text, focal_text, offset_text, place_text
 
     rig = report.rig

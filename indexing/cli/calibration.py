@@ -27,11 +27,7 @@ def _inner(given: str) -> list[float] | None:
 
 
 def calibrated(given: str | None, tracks: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Tracks ``(views, n, 2)`` without lens distortion, and K of all views or of each; None without a calibration.
-
-    Raises:
-        ValueError: no four numbers and no sound file, or other than one section or one for each view.
-    """
+    """Tracks ``(views, n, 2)`` without lens distortion, and K of all views or of each; None without a calibration."""
     import torch
 
     if given is None:

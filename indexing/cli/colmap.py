@@ -21,39 +21,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ColmapJob:
-    """What ``--colmap`` and the flags beside it ask for.
+    """What ``--colmap`` and the flags beside it ask for."""
 
-    Attributes:
-        database: to read.
-        out: the database to write; the report goes into the folder ``NAME-report`` beside it.
-        images: folder of the images, to draw on; None = none.
-        masks: folder of the masks; None = ``NAME-masks`` beside ``out``.
-        threshold: of ``segment``, pixels; None estimates it.
-        spatial: whether neighbours tend to move alike.
-        seed: of the random samples.
-        title: heading of the report.
-    """
-
-    database: Path
-    out: Path | None
-    images: Path | None = None
-    masks: Path | None = None
-    threshold: float | None = 2.5
-    spatial: bool = True
-    seed: int = 0
-    title: str = ""
+    database: Path  # to read
+    out: Path | None  # the database to write; the report goes into the folder ``NAME-report`` beside it
+    images: Path | None = None  # folder of the images, to draw on; None = none
+    masks: Path | None = None  # folder of the masks; None = ``NAME-masks`` beside ``out``
+    threshold: float | None = 2.5  # of ``segment``, pixels; None estimates it
+    spatial: bool = True  # whether neighbours tend to move alike
+    seed: int = 0  # of the random samples
+    title: str = ""  # heading of the report
 
 
 def run_colmap(job: ColmapJob, arguments: Mapping[str, Any]) -> int:
-    """Read, divide, vote, write, and say what was found.
-
-    Args:
-        job: what is asked for.
-        arguments: of the command line, for the manifest.
-
-    Raises:
-        ValueError: one line, with what to do.
-    """
+    """Read, divide, vote, write, and say what was found."""
     from indexing.colmap import check_target, find_static, read_database
     from indexing.colmap.dividing import colmap
     from indexing.colmap.masks import write_masks

@@ -30,12 +30,7 @@ Progress = Callable[[float], None]
 
 
 def one_line(text: object) -> str:
-    """Text without line breaks and control characters.
-
-    Example:
-        >>> one_line("no such\\n  file")
-        'no such file'
-    """
+    """Text without line breaks and control characters."""
     return " ".join("".join(c if c.isprintable() or c.isspace() else "?" for c in str(text)).split())
 
 
@@ -60,19 +55,7 @@ def ended(page: object, refusal: str | None) -> int:
 
 
 def flags(*names: str, **own: str) -> Callable[[str, str | None], str]:
-    """What the command line calls the arguments that a message of the library speaks of.
-
-    Args:
-        names: of the arguments that are flags.
-        own: what an argument is called that is another flag, or none.
-
-    Example:
-        >>> words = flags("times", "motion", "threshold", "spatial", static="a column static")
-        >>> [words("times", ""), words("motion", "'auto'"), words("threshold", "None"), words("spatial", "False")]
-        ['--times', '--motion auto', '--threshold auto', '--no-spatial']
-        >>> words("static", ""), words("weights", "")
-        ('a column static', 'weights=')
-    """
+    """What the command line calls the arguments that a message of the library speaks of."""
 
     def words(name: str, value: str | None) -> str:
         if name in own:
@@ -87,12 +70,7 @@ def flags(*names: str, **own: str) -> Callable[[str, str | None], str]:
 
 
 def names(values: Sequence[object]) -> str:
-    """The first few, and how many more.
-
-    Example:
-        >>> names(["a", "b", "c", "d", "e"])
-        'a, b, c and 2 more'
-    """
+    """The first few, and how many more."""
     more = f" and {len(values) - SHOWN} more" if len(values) > SHOWN else ""
     return ", ".join(map(str, values[:SHOWN])) + more
 
@@ -131,11 +109,7 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]], title: str =
 
 @contextmanager
 def progress(what: str, steps: bool = True) -> Iterator[Progress]:
-    """A bar on the terminal, moved by calling what this yields with the share done; nothing where stderr is no terminal.
-
-    Args:
-        steps: whether the share done will be told; otherwise the bar only shows that work goes on.
-    """
+    """A bar on the terminal, moved by calling what this yields with the share done; nothing where stderr is no terminal."""
     if not sys.stderr.isatty():
         yield lambda share: None
         return
@@ -152,14 +126,7 @@ def progress(what: str, steps: bool = True) -> Iterator[Progress]:
 
 @contextmanager
 def counted(what: str, unit: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on the terminal with how many are done in a second and the time that is left; None where stderr is no terminal.
-
-    Args:
-        unit: what stands behind how many, such as ``"frames/s"``.
-
-    Yields:
-        what is called with how many are done, and of how many.
-    """
+    """A bar on the terminal with how many are done in a second and the time that is left; None where stderr is no terminal."""
     if not sys.stderr.isatty():
         yield None
         return
@@ -189,11 +156,7 @@ REPORT_FILES = ("report.html", "metrics.json", "manifest.json", "events.csv", "c
 
 
 def check_folder(folder: Path) -> Path:
-    """The folder, if files can be written in it; it is not made yet, so that a failure later leaves nothing behind.
-
-    Raises:
-        ValueError: something is in the way, or it cannot be written.
-    """
+    """The folder, if files can be written in it; it is not made yet, so that a failure later leaves nothing behind."""
     folder = folder.expanduser()
     there = next((part for part in (folder, *folder.absolute().parents) if part.exists()), Path.cwd())
     if not there.is_dir():
@@ -213,11 +176,7 @@ def check_folder(folder: Path) -> Path:
 
 
 def check_file(path: Path, inputs: Iterable[Path]) -> Path:
-    """The file to write, if it can be written.
-
-    Raises:
-        ValueError: it is a folder or one of the inputs, or its folder cannot be written.
-    """
+    """The file to write, if it can be written."""
     path = path.expanduser()
     if path.is_dir():
         raise ValueError(f"{path}: is a folder; name the file to write in it, e.g. -o {path / 'moves.safetensors'}")

@@ -82,11 +82,7 @@ class Convert:
         return 0
 
     def _single(self) -> bool:
-        """Whether the output is one file.
-
-        Raises:
-            ValueError: it does not say which format, or two.
-        """
+        """Whether the output is one file."""
         suffix = self.output.suffix.lower()
         if suffix in SUFFIXES and not self.output.expanduser().is_dir():
             if self.to is not None and f".{self.to}" != suffix:
@@ -154,11 +150,7 @@ class Convert:
 
 
 def _sharing(clip: Clip, clips: Sequence[Clip], whole: bool) -> Clip:
-    """The clip with what is known of all of them, as a clip set has a column for each field.
-
-    Args:
-        whole: they are the people of one recording, which is known of nobody where several recordings are put together.
-    """
+    """The clip with what is known of all of them, as a clip set has a column for each field."""
     fields = [key for key in clip.meta if all(other.meta.get(key) is not None for other in clips)]
     kept = fields if whole and "person" in fields else [key for key in fields if key not in ("followed", "untracked", "people")]
     return clip.replace(meta={key: clip.meta[key] for key in kept})

@@ -31,11 +31,7 @@ class Pixels:
     """of videos: motion (the box about what moves), all (the whole image), or x0,y0,x1,y1 in pixels"""
 
     def indexer(self, fps: float, **options: Any) -> BrightnessIndexer:
-        """A new indexer of videos.
-
-        Raises:
-            ValueError: the region makes no sense.
-        """
+        """A new indexer of videos."""
         from indexing.brightness.indexer import BrightnessIndexer
 
         return BrightnessIndexer(fps=fps, region=self._region(), **options)
@@ -66,11 +62,7 @@ class Watching:
     """where the keypoints of videos are kept; by default in the folder pose beside the output"""
 
     def as_keypoints(self, paths: Sequence[Path]) -> bool:
-        """Whether inputs are read as keypoints: files of keypoints, and videos unless their pixels are meant.
-
-        Raises:
-            ValueError: they are of two kinds, or of one that --by does not go with.
-        """
+        """Whether inputs are read as keypoints: files of keypoints, and videos unless their pixels are meant."""
         from indexing.readers.clipset import holds_frames
 
         videos = [path for path in paths if is_video(path)]
@@ -97,14 +89,7 @@ class Watching:
         return self.by == "keypoints" or (self.by == "auto" and available() is not None)
 
     def watch(self, paths: Iterable[Path], beside: Path | None, fps: float | None = None) -> Watched:
-        """Find the keypoints of all videos among some inputs, or find them where they were kept.
-
-        Args:
-            beside: the folder of the output; without one they are kept until the command ends.
-
-        Raises:
-            ValueError: no pose model is there, or a video cannot be read.
-        """
+        """Find the keypoints of all videos among some inputs, or find them where they were kept."""
         videos = list(dict.fromkeys(path for path in paths if is_video(path)))
         if not videos:
             return Watched({})
@@ -205,11 +190,7 @@ def refuse_film_flags(pixels: Pixels) -> None:
 
 
 def are_films(paths: Sequence[Path]) -> bool:
-    """Whether the inputs are videos or film sets, not keypoints.
-
-    Raises:
-        ValueError: some are and some are not.
-    """
+    """Whether the inputs are videos or film sets, not keypoints."""
     from indexing.readers.clipset import holds_frames
     from indexing.readers.files import VIDEOS
 
@@ -246,11 +227,7 @@ class AsTheyAre:
 
 
 def read_examples(examples: Sequence[Example], reading: Reading, select: Sequence[str]) -> tuple[list[Any], list[str], list[float]]:
-    """Sources of frames, their labels, and their seconds.
-
-    Raises:
-        ValueError: naming the file: it cannot be read, or has no label.
-    """
+    """Sources of frames, their labels, and their seconds."""
     from indexing.readers.clipset import holds_frames
 
     sources: list[Any] = []
@@ -275,11 +252,7 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
 
 
 def read_set(path: Path, reading: Reading, select: Sequence[str] = ()) -> FilmSet:
-    """The labelled films of a set that meet the criteria.
-
-    Raises:
-        ValueError: no film has a label, or none meets them.
-    """
+    """The labelled films of a set that meet the criteria."""
     from indexing.cli.protocol import choose
     from indexing.readers.clipset import read_film_set
 

@@ -92,10 +92,7 @@ class Following(Reading):
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """What is scanned by itself: one person of a recording.
-
-    name: the recording; person: empty where only one is in view; clip: ``None`` where nobody is; times: ``(F,)`` seconds.
-    """
+    """What is scanned by itself: one person of a recording."""
 
     name: str
     person: str
@@ -114,17 +111,7 @@ class Example:
 
 
 def parse_example(text: str) -> Example:
-    """``label=file``, ``label=file@1.5-4`` (seconds; an end may be left open) or ``set.npz``.
-
-    The label ends at the first ``=``.  A file whose whole name looks like a trim is taken for what it is.
-
-    Raises:
-        ValueError: no label or no file before or after ``=``, or seconds in the wrong order.
-
-    Example:
-        >>> parse_example("raise arm=take=2.json@1.5-4")
-        Example(path=PosixPath('take=2.json'), label='raise arm', start=1.5, end=4.0)
-    """
+    """``label=file``, ``label=file@1.5-4`` (seconds; an end may be left open) or ``set.npz``."""
     label, equals, rest = text.partition("=")
     if not equals or (Path(text).expanduser().exists() and not _trimmed(rest).path.expanduser().exists()):
         return _trimmed(text)
@@ -152,22 +139,14 @@ def _trimmed(text: str) -> Example:
 
 
 def refuse_range(path: Path) -> None:
-    """Raise where a path that is not there ends in seconds: these are for examples, and all of a recording is looked at.
-
-    Raises:
-        ValueError: naming the file that is there.
-    """
+    """Raise where a path that is not there ends in seconds: these are for examples, and all of a recording is looked at."""
     file, at, seconds = str(path).rpartition("@")
     if at and not path.expanduser().exists() and Path(file).expanduser().exists():
         raise ValueError(f"{path}: seconds (@{seconds}) are for examples, and recordings are read as a whole; give {file}")
 
 
 def read_examples(examples: Sequence[Example], reading: Reading, select: Sequence[str]) -> tuple[list[Clip], list[str]]:
-    """Labelled clips, and what a person should know about them.
-
-    Raises:
-        ValueError: naming the file: it cannot be read, has no labels, or its clip cannot be learned from.
-    """
+    """Labelled clips, and what a person should know about them."""
     from indexing.cli.protocol import choose
     from indexing.joints import layout_of
 
@@ -237,11 +216,7 @@ def on_range(example: Example, first: float, last: float) -> list[str]:
 
 
 def on_overlaps(examples: Sequence[Example]) -> list[str]:
-    """On seconds of one file, keypoints or video, that are given to two actions.
-
-    Raises:
-        ValueError: one example is given to two actions.
-    """
+    """On seconds of one file, keypoints or video, that are given to two actions."""
     found = []
     files: dict[Path, list[Example]] = {}
     for example in examples:
@@ -282,11 +257,7 @@ def _checked(clips: Sequence[Clip], path: Path) -> list[Clip]:
 
 
 def usable(clips: ClipSet, path: Path) -> tuple[ClipSet, list[str]]:
-    """The clips with a label that can be compared, and a note on those left out.
-
-    Raises:
-        ValueError: none is left.
-    """
+    """The clips with a label that can be compared, and a note on those left out."""
     import numpy as np
 
     from indexing.windows import unusable
@@ -311,14 +282,8 @@ def assumed(clips: Sequence[Clip], path: Path | None = None) -> list[str]:
 def read_recordings(
     paths: Sequence[Path], reading: Reading, joints: int, model: Path, skeleton: Skeleton | None = None
 ) -> tuple[list[Lane], list[str]]:
-    """Recordings with names that differ, person by person, checked against the model, and what a reader should know about them.
-
-    Args:
-        joints, skeleton: how many the model knows, and which.
-
-    Raises:
-        ValueError: naming the file: unreadable, unusable, or with other joints than the model.
-    """
+    """Recordings with names that differ, person by person, checked against the model, and what a reader should know about
+    them."""
     found: list[list[Lane]] = []
     notes: list[str] = []
     for path in paths:
@@ -399,15 +364,7 @@ def read_truth(
     path: Path, recordings: Sequence[str], people: Sequence[str] | None = None
 ) -> tuple[list[list[KnownEvent] | None], list[str]]:
     """Known events of each recording from a CSV with the columns ``label,start,end``, for several recordings ``file``, and
-    ``person`` where who does it is known.
-
-    Args:
-        recordings: their names; people: who of them, the largest first.  Of several people of a recording, those that nothing
-            is known of have ``None``.
-
-    Raises:
-        ValueError: naming file, row and column.
-    """
+    ``person`` where who does it is known."""
     rows = _rows(path)
     people = people or [""] * len(recordings)
     if len(set(recordings)) > 1 and rows and "file" not in rows[0][1]:

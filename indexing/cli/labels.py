@@ -82,15 +82,8 @@ def _why_nothing(notes: Sequence[str]) -> str:
 
 
 def read_marked(labelling: Labelling, lanes: Sequence[Any], reading: Reading) -> tuple[list[list[Label] | None], list[str]]:
-    """The labels of each lane, those of moments left out; ``None`` where nothing is known of a person; and what to know of them.
-
-    Args:
-        lanes: recordings, person by person, the largest first: with ``name``, and ``person`` where there are several.
-
-    Raises:
-        ValueError: naming the file: unreadable, of other recordings, of several observations none of which was chosen, or of
-            subjects who are not in the recording.
-    """
+    """The labels of each lane, those of moments left out; ``None`` where nothing is known of a person; and what to know of
+    them."""
     found: list[list[Label] | None] = [None] * len(lanes)
     notes: list[str] = []
     recordings = list(dict.fromkeys(lane.name for lane in lanes))
@@ -142,11 +135,7 @@ def lasting(path: Path, labels: Sequence[Label]) -> tuple[list[Label], list[str]
 
 
 def _of_recordings(labelling: Labelling, recordings: Sequence[str], reading: Reading) -> dict[str, list[Path]]:
-    """The files of labels of each recording.
-
-    Raises:
-        ValueError: a file is of none of them, or says not of which, or a recording has no file.
-    """
+    """The files of labels of each recording."""
     if len(recordings) == 1:
         return {recordings[0]: list(labelling.labels)}
     if labelling.media is not None:
@@ -244,11 +233,7 @@ class Examples:
 
 
 def check_labelling(labelling: Labelling, examples: Sequence[Example], throughout: bool) -> None:
-    """Raise where flags about labels make no sense beside what is learned from.
-
-    Args:
-        throughout: whether what lies between labels is background.
-    """
+    """Raise where flags about labels make no sense beside what is learned from."""
     unnamed = [example for example in examples if example.label is None]
     given = [f"--{name}" for name in ("observation", "tier", "subject", "media") if getattr(labelling, name)]
     given += ["--unlabelled-is-background"] * throughout
@@ -271,15 +256,7 @@ def labelled_examples(
     others: Sequence[Clip] = (),
     options: CuttingOptions = CuttingOptions(),
 ) -> Examples:
-    """What is marked in recordings, cut out.
-
-    Args:
-        paths: of the recordings; throughout: whether what lies between labels is learned as background; others: clips that are
-            learned from, too, whose joints decide.
-
-    Raises:
-        ValueError: naming the file: unreadable, or nothing of it can be learned from.
-    """
+    """What is marked in recordings, cut out."""
     lanes, notes = _lanes_of(paths, reading, others)
     several = any(lane.clip is not None and lane.clip.meta.get("people") for lane in lanes)
     if several and any(
@@ -430,15 +407,7 @@ WRITTEN = (".eaf", *SEVERAL)
 def check_write(
     path: Path | None, inputs: Sequence[Path], recordings: Sequence[Path], media: str | None = None, tier: str = "dyntorch"
 ) -> Path | None:
-    """The file that labels will be written to, if it can be, said before anything is searched.
-
-    Args:
-        media: how the file that is there calls the recording; tier: that labels will be written into.
-
-    Raises:
-        ValueError: no format of labels, a format of one recording for several, an input, or what is there cannot be read, or would
-            be lost although somebody made or corrected it.
-    """
+    """The file that labels will be written to, if it can be, said before anything is searched."""
     if path is None:
         return None
     kind = path.suffix.lower()
@@ -501,11 +470,7 @@ def write_to(
     labelling: Labelling,
     tier: str = "dyntorch",
 ) -> list[str]:
-    """Write labels into a tier (or observation) of their own; what the format does not keep.
-
-    Args:
-        recordings: that they are of; duration: seconds, where it is one; tier: its name.
-    """
+    """Write labels into a tier (or observation) of their own; what the format does not keep."""
     from indexing.files import prepare
     from indexing.labels import write_labels
 

@@ -25,22 +25,7 @@ LISTED = 20  # values named in a message
 
 
 def choose(clips: LabelledSet[Any], criteria: Sequence[str], flag: str) -> IntArray:
-    """Indices of the clips that meet all criteria.
-
-    Args:
-        criteria: ``"view=1,2"``; numbers match whatever their form (``90`` finds ``90.0``).
-        flag: the option they came from, for messages.
-
-    Raises:
-        ValueError: an unknown field or value, or no clip meets them all; what is known is listed.
-
-    Example:
-        >>> import numpy as np
-        >>> from indexing.clip import Clip, ClipSet
-        >>> clips = ClipSet([Clip(np.zeros((5, 3, 2)), label="walk", meta={"view": v}) for v in (1, 2, 3)])
-        >>> choose(clips, ["view=1,3"], "--train").tolist()
-        [0, 2]
-    """
+    """Indices of the clips that meet all criteria."""
     keep = np.ones(len(clips), dtype=bool)
     for text in criteria:
         field, equals, wanted = text.partition("=")
@@ -58,11 +43,7 @@ def choose(clips: LabelledSet[Any], criteria: Sequence[str], flag: str) -> IntAr
 
 
 def column(clips: LabelledSet[Any], field: str, flag: str) -> NDArray[Any]:
-    """One value per clip.
-
-    Raises:
-        ValueError: the field is unknown, or has several values per clip.
-    """
+    """One value per clip."""
     if field not in (*clips.fields, "action", "label"):
         raise ValueError(f"{flag}: {clips.name} has no field {field!r}; {known(clips)}")
     values = clips.column(field)
@@ -141,10 +122,7 @@ class Viewing(Protocol):
 
 @dataclass(frozen=True)
 class Cameras:
-    """Through which cameras clips are seen: ``"none"`` (as they are), ``"perspective"`` or ``"virtual"``.
-
-    azimuths: degrees, of queries; solid: exemplars stay 3D; seed: of noise and elevations.
-    """
+    """Through which cameras clips are seen: ``"none"`` (as they are), ``"perspective"`` or ``"virtual"``."""
 
     kind: str
     azimuths: tuple[float, ...]
@@ -190,11 +168,7 @@ def check_dims(clips: Sequence[Clip], cameras: Cameras) -> list[str]:
 def splits(
     clips: LabelledSet[Any], train: Sequence[str], test: Sequence[str], leave_out: str | None
 ) -> tuple[list[Fold], list[str]]:
-    """The folds that the options ask for, and what a person should know about them.
-
-    Raises:
-        ValueError: no or contradictory options, an unknown field or value, or nothing left to learn from or to ask about.
-    """
+    """The folds that the options ask for, and what a person should know about them."""
     if leave_out is not None:
         if train or test:
             raise ValueError("--leave-out makes its own training and test sets; leave --train and --test out")
@@ -223,11 +197,7 @@ def _leave_out(clips: LabelledSet[Any], field: str) -> list[Fold]:
 
 
 def draw_shots(fold: Fold, labels: NDArray[np.str_], shots: int, seed: int) -> tuple[Fold, list[str]]:
-    """The fold with at most ``shots`` training clips per class, drawn at random; classes with fewer keep all they have.
-
-    Raises:
-        ValueError: ``shots`` is not positive.
-    """
+    """The fold with at most ``shots`` training clips per class, drawn at random; classes with fewer keep all they have."""
     if shots < 1:
         raise ValueError(f"--shots must be 1 or more, got {shots}")
     rng = np.random.default_rng(seed)

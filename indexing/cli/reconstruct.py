@@ -149,11 +149,7 @@ class Reconstruct:
         return is_video(self.files[0])
 
     def _limit(self) -> float | None:
-        """The threshold as the library takes it: None = estimated, inf = all tracks fit.
-
-        Raises:
-            ValueError: something else.
-        """
+        """The threshold as the library takes it: None = estimated, inf = all tracks fit."""
         if self.threshold in ("auto", "none"):
             return None if self.threshold == "auto" else math.inf
         try:
@@ -166,11 +162,7 @@ class Reconstruct:
         return limit
 
     def _timed(self, tracks: TrackSet) -> TrackSet:
-        """The tracks with times that begin at 0, and what to say about them.
-
-        Raises:
-            ValueError: other than one time per view.
-        """
+        """The tracks with times that begin at 0, and what to say about them."""
         import numpy as np
 
         from indexing.readers.tracks import exact
@@ -194,11 +186,7 @@ class Reconstruct:
         return dataclasses.replace(timed, notes=(*timed.notes, *notes))
 
     def _solve(self, tracks: TrackSet) -> Any:
-        """The reconstruction, by the library.
-
-        Raises:
-            ValueError: too few views or tracks, with the name of the file.
-        """
+        """The reconstruction, by the library."""
         import torch
 
         import dyntorch
@@ -227,11 +215,7 @@ def unfixed(tracks: TrackSet, result: Any) -> list[str]:
 
 
 def numbers(text: str, expected: int) -> Any:
-    """``0,0.5,1.2`` as numbers, one per view.
-
-    Raises:
-        ValueError: something else.
-    """
+    """``0,0.5,1.2`` as numbers, one per view."""
     import numpy as np
 
     try:

@@ -19,11 +19,7 @@ LEFT_OUT = "it is for a video or a sequence of pictures"
 
 
 def is_scene(paths: Sequence[Path]) -> bool:
-    """Whether the inputs are pixels: a video, a folder, a pattern, or nothing but pictures.
-
-    Raises:
-        ValueError: several videos, or a video and something else.
-    """
+    """Whether the inputs are pixels: a video, a folder, a pattern, or nothing but pictures."""
     kinds = [_kind(path) for path in paths]
     if not any(kinds):
         return False
@@ -79,19 +75,11 @@ class Asked:
         return first, last
 
     def numbers(self) -> list[int] | None:
-        """Those of ``--frames``.
-
-        Raises:
-            ValueError: something else than whole numbers that increase.
-        """
+        """Those of ``--frames``."""
         return None if self.frames is None else [int(value) for value in _increasing("frames", self.frames, int, "0,20,40")]
 
     def moments(self) -> list[float] | None:
-        """Those of ``--at``, in seconds.
-
-        Raises:
-            ValueError: something else than numbers that increase.
-        """
+        """Those of ``--at``, in seconds."""
         return None if self.at is None else [float(value) for value in _increasing("at", self.at, float, "0,0.8,1.6")]
 
 
@@ -114,19 +102,7 @@ def follow(
     missing: bool = False,
     fps: float | None = None,
 ) -> SceneTracks:
-    """Points of a video or of pictures, in the frames asked for.
-
-    Args:
-        paths: one video, folder or pattern; or pictures.
-        asked: by flags.
-        views: frames that are taken; None = any number, and some where no flag says which.
-        more: whether flags may ask for more.
-        missing: whether a point may be missing in some.
-        fps: of pictures.
-
-    Raises:
-        ValueError: flags that make no sense, or as :func:`indexing.video.track_scene`.
-    """
+    """Points of a video or of pictures, in the frames asked for."""
     from indexing.video.options import SceneOptions
     from indexing.video.scene import track_scene
 
@@ -144,11 +120,7 @@ def follow(
 
 
 def follow_whole(paths: Sequence[Path], asked: Asked) -> SceneTracks:
-    """Points of a whole video or of all pictures, from where they appear to where they are lost.
-
-    Raises:
-        ValueError: flags that make no sense, or as :func:`indexing.video.track_whole`.
-    """
+    """Points of a whole video or of all pictures, from where they appear to where they are lost."""
     from indexing.video.whole import track_whole
 
     span = asked.span()

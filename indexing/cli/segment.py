@@ -117,11 +117,7 @@ class Segment:
         return self._two_views(files, scene, asked, given)
 
     def _from_colmap(self) -> int:
-        """The static matches of a database.
-
-        Raises:
-            ValueError: flags that do not fit.
-        """
+        """The static matches of a database."""
         from indexing.cli.colmap import ColmapJob, run_colmap
 
         if self.colmap is None:
@@ -210,11 +206,7 @@ class Segment:
         return read_pair(files[0], self.pair), None
 
     def _images(self, tracked: bool) -> list[Photograph]:
-        """Both images.
-
-        Raises:
-            ValueError: other than two.
-        """
+        """Both images."""
         from indexing.readers.pairs import read_image
 
         images = self.images or ()
@@ -272,11 +264,7 @@ class Segment:
             raise ValueError("--no-spatial is of two images, and more frames are given; leave it out")
 
     def _notes(self, pair: MatchedPair, shown: list[Photograph]) -> list[str]:
-        """What to say about the input.
-
-        Raises:
-            ValueError: too few matches, or a threshold larger than all that they cover.
-        """
+        """What to say about the input."""
         import numpy as np
 
         seen = pair.seen
@@ -302,11 +290,7 @@ class Segment:
         return notes
 
     def _solve(self, pair: MatchedPair) -> Any:
-        """The segmentation, by the library.
-
-        Raises:
-            ValueError: naming the file.
-        """
+        """The segmentation, by the library."""
         import torch
 
         import dyntorch

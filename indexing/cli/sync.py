@@ -178,11 +178,7 @@ class Sync:
         self._rates(None)
 
     def _rates(self, cameras: int | None) -> list[float | None]:
-        """Frames per second of each camera.
-
-        Raises:
-            ValueError: not positive numbers, or other than one per camera.
-        """
+        """Frames per second of each camera."""
         if self.fps is None:
             return [None] * (cameras or 0)
         try:
@@ -196,11 +192,7 @@ class Sync:
         return rates * ((cameras or 1) if len(rates) == 1 else 1)
 
     def _by(self) -> By:
-        """What of videos is compared.
-
-        Raises:
-            ValueError: --method and --by contradict each other.
-        """
+        """What of videos is compared."""
         from indexing.sync.synchronize import BY
 
         of_method, by = BY[self.method], self.footage.by
@@ -415,11 +407,7 @@ def _shifted(one: Plan) -> dict[str, Any]:
 
 
 def show(report: SyncReport, folder: Path | None = None) -> None:
-    """Print the result.
-
-    Args:
-        folder: that it was written to.
-    """
+    """Print the result."""
     _show_pairs(report)
     if len(report.clocks) > 2:
         _show_clocks(report)

@@ -239,19 +239,8 @@ def check_target(path: str | Path, source: Path) -> Path:
 def write_database(
     source: MatchDatabase, path: str | Path, matches: Mapping[int, IntArray], geometries: Mapping[int, PairGeometry]
 ) -> Path:
-    """Write a copy of a database with other matches and geometries of its pairs; everything else is as it was.
-
-    The file appears whole or not at all.
-
-    Args:
-        source: the database.
-        path: of the copy.
-        matches: rows of keypoints ``(m, 2)`` by the pair's number, for every pair.
-        geometries: the same of what was verified.
-
-    Raises:
-        ValueError: the file is there already, or cannot be written.
-    """
+    """Write a copy of a database with other matches and geometries of its pairs; everything else is as it was. matches
+    ``(m, 2)``."""
     path = check_target(path, source.path)
     with (
         _appearing(path) as temporary,

@@ -19,25 +19,15 @@ INSTALL = "install it with pip install 'dyntorch[colmap]'"
 
 @dataclass(frozen=True, eq=False)
 class PairBodies:
-    """A pair, divided.
+    """A pair, divided."""
 
-    Attributes:
-        labels: ``(m,)`` 0 = of no body or not divided, 1..K the bodies.
-        distances: ``(K, m)`` epipolar (Sampson) distances from each body's motion, pixels.
-        state: how the division ended, ``"OK"`` or the name of a status; ``""`` where it was left to the votes.
-    """
-
-    labels: IntArray
-    distances: FloatArray
-    state: str = ""
+    labels: IntArray  # ``(m,)`` 0 = of no body or not divided, 1..K the bodies
+    distances: FloatArray  # ``(K, m)`` epipolar (Sampson) distances from each body's motion, pixels
+    state: str = ""  # how the division ended, ``"OK"`` or the name of a status; ``""`` where it was left to the votes
 
 
 def colmap() -> Any:
-    """pycolmap.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+    """pycolmap."""
     try:
         import pycolmap
     except ImportError as problem:
@@ -55,11 +45,7 @@ class SeenImage:
 
 
 def seen(database: MatchDatabase) -> list[SeenImage]:
-    """The images of a database.
-
-    Raises:
-        ValueError: pycolmap is not installed, or it cannot use a camera.
-    """
+    """The images of a database."""
     return [_seen(database, image) for image in database.images]
 
 

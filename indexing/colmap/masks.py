@@ -19,15 +19,7 @@ BLACK, WHITE = 0, 255
 
 
 def mask_name(path: Path, name: str) -> PurePosixPath:
-    """Where the mask of an image stands, within the folder of masks.
-
-    Raises:
-        ValueError: the image's name leads out of any folder.
-
-    Example:
-        >>> str(mask_name(Path("a.db"), "left/001.jpg"))
-        'left/001.jpg.png'
-    """
+    """Where the mask of an image stands, within the folder of masks."""
     parts = PurePosixPath(name.replace("\\", "/"))
     if parts.is_absolute() or PureWindowsPath(name).drive or ".." in parts.parts or not parts.name or "\0" in name:
         said = f"the name of image {clipped(repr(name))} leads out of the folder of images"
@@ -38,21 +30,7 @@ def mask_name(path: Path, name: str) -> PurePosixPath:
 def draw_mask(
     moving: NDArray[np.float64], static: NDArray[np.float64], size: tuple[int, int], options: MaskOptions = MaskOptions()
 ) -> Mask:
-    """The mask ``(height, width)`` of one image: 0 around moving keypoints, 255 elsewhere.
-
-    Black are the places within a radius of a moving keypoint that are nearer to it than to any static one.  The radius follows how
-    far moving keypoints are apart, so that the discs of a body close up.
-
-    Args:
-        moving: ``(n, 2)`` pixels, 0.5 = middle of the first one.
-        static: ``(m, 2)``.
-        size: width and height.
-
-    Example:
-        >>> mask = draw_mask(np.array([[20.0, 20.0]]), np.array([[80.0, 20.0]]), (100, 50))
-        >>> mask.shape, int(mask[20, 20]), int(mask[20, 80])
-        ((50, 100), 0, 255)
-    """
+    """The mask ``(height, width)`` of one image: 0 around moving keypoints, 255 elsewhere."""
     from scipy.ndimage import distance_transform_edt
 
     width, height = size
@@ -87,14 +65,7 @@ def _radius(moving: NDArray[np.float64], size: tuple[int, int], options: MaskOpt
 
 
 def write_masks(folder: str | Path, found: StaticPoints, options: MaskOptions = MaskOptions()) -> Path:
-    """Write the mask of every image of a database, each whole or not at all.
-
-    Returns:
-        the folder, as ``--ImageReader.mask_path`` of ``colmap feature_extractor`` takes it.
-
-    Raises:
-        ValueError: an image's name leads out of the folder, or a file cannot be written.
-    """
+    """Write the mask of every image of a database, each whole or not at all."""
     images = found.database.images
     names = [mask_name(found.database.path, image.name) for image in images]
     where = prepare(folder)

@@ -145,11 +145,7 @@ def _cells(points: NDArray[np.float64], width: int, height: int, options: Spread
 
 
 def _kept(database: MatchDatabase, place: int, bodies: PairBodies, votes: Votes, starts: IntArray, reach: float) -> IntArray:
-    """The static matches of a pair.
-
-    Those of its static bodies, unless their keypoints move; and of what is in no body, what both keypoints say stands still and
-    the motion of a static body agrees with.  Where the pair has no static body, keypoints alone decide.
-    """
+    """The static matches of a pair."""
     pair, signs = database.pairs[place], votes.signs[place]
     first, second = (votes.keypoints[starts[image] + pair.matches[:, k]] for k, image in enumerate((pair.first, pair.second)))
     moves, stands = np.minimum(first, second) < 0, np.minimum(first, second) > 0

@@ -23,16 +23,11 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class DividedPair:
-    """Matches of two images, divided.
+    """Matches of two images, divided."""
 
-    Attributes:
-        first, second: ``(m,)`` keypoints, numbered through all images.
-        labels: ``(m,)`` 0 = of no body, 1..K the bodies.
-    """
-
-    first: IntArray
+    first: IntArray  # ``(m,)`` keypoints, numbered through all images
     second: IntArray
-    labels: IntArray
+    labels: IntArray  # ``(m,)`` 0 = of no body, 1..K the bodies
 
     @property
     def bodies(self) -> int:
@@ -42,40 +37,17 @@ class DividedPair:
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """The answer.
-
-    Attributes:
-        keypoints: ``(q,)`` mean vote in [-1, 1] on every keypoint: positive stands still, negative moves, 0 nothing is known.
-        signs: for each pair the signs ``(K,)`` of its bodies: 1 static, -1 moving, 0 undecided.
-        lead: spread of the answer over that of the next one, the least of all parts of the graph; infinite where there is no other.
-        spread: ``(images,)`` in [0, 1] how far the static keypoints spread over each image.
-        open: the images of parts in which another body spreads as widely, so that nothing has a sign there.
-    """
+    """The answer."""
 
     keypoints: FloatArray
-    signs: tuple[IntArray, ...]
-    lead: float
-    spread: FloatArray
-    open: tuple[int, ...] = ()
+    signs: tuple[IntArray, ...]  # for each pair the signs ``(K,)`` of its bodies: 1 static, -1 moving, 0 undecided
+    lead: float  # spread of the answer over that of the next one, the least of all parts of the graph
+    spread: FloatArray  # ``(images,)`` in [0, 1] how far the static keypoints spread over each image
+    open: tuple[int, ...] = ()  # the images of parts in which another body spreads as widely, so that nothing has a sign there
 
 
 def vote(pairs: Sequence[DividedPair], cells: IntArray, image: IntArray, vote: VoteOptions, spread: SpreadOptions) -> Votes:
-    """Decide what stands still.
-
-    Args:
-        pairs: as divided.
-        cells: ``(q,)`` cell of its image's grid that a keypoint is in, from 0, row by row.
-        image: ``(q,)`` image of a keypoint, from 0.
-        vote: how bodies agree.
-        spread: how the static one is chosen.
-
-    Example:
-        >>> q = np.arange(64)
-        >>> pair = DividedPair(q, q + 64, np.where(q % 8 < 6, 1, 2))  # body 2: two columns at the right
-        >>> found = vote([pair], np.tile(q, 2), np.repeat([0, 1], 64), VoteOptions(), SpreadOptions())
-        >>> found.signs[0].tolist(), bool(found.lead > 2)
-        ([1, -1], True)
-    """
+    """Decide what stands still. cells ``(q,)``, image ``(q,)``."""
     graph = _Graph(pairs, cells, image, vote, spread)
     signs = np.zeros(graph.nodes, dtype=np.int64)
     lead, undecided = np.inf, list[int]()
@@ -219,11 +191,7 @@ class _Graph:
         return signs
 
     def _one(self, signs: IntArray, support: FloatArray) -> IntArray:
-        """At most one static body in a pair, the one with most support: the pair says that they move apart.
-
-        A body that moves with the scene between some images gets their votes, but those of all pairs in which it does not.  A
-        part of the scene that some pairs take for a body has the votes of all others.
-        """
+        """At most one static body in a pair, the one with most support: the pair says that they move apart."""
         static = np.flatnonzero(signs > 0)
         order = static[np.lexsort((-support[static], self.pair[static]))]
         first = np.unique(self.pair[order], return_index=True)[1]
@@ -239,10 +207,7 @@ class _Graph:
         return np.where(again, 1, signs)
 
     def agreement(self, signs: IntArray) -> tuple[FloatArray, IntArray]:
-        """``(nodes,)`` how far the other pairs agree on the keypoints of a body, in [-1, 1], and on how many there is a vote.
-
-        Keypoints on which they contradict each other count less: the mean vote over the mean of its absolute values.
-        """
+        """``(nodes,)`` how far the other pairs agree on the keypoints of a body, in [-1, 1], and on how many there is a vote."""
         votes, total = self._sums(signs)
         weight = self.weights * np.abs(signs)
         others = total[self.keypoint] - weight[self.node]

@@ -23,11 +23,7 @@ TEXTS = ("subject", "tier", "observation", "comment")
 
 
 def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
-    """Read a file of annotations or results.
-
-    Raises:
-        ValueError: naming video and segment.
-    """
+    """Read a file of annotations or results."""
     out = Gathering(asked, "activitynet")
     for video, number, segment in _segments(out, data):
         where = f"video {video!r}, segment {number}"

@@ -40,11 +40,7 @@ def detect(path: Path) -> tuple[str, Any]:
 
 
 def detect_json(path: Path, data: Any) -> str:
-    """The format of parsed JSON.
-
-    Raises:
-        ValueError: none that a reader knows.
-    """
+    """The format of parsed JSON."""
     if isinstance(data, dict):
         if isinstance(data.get("observations"), dict):
             return "boris"
@@ -65,11 +61,7 @@ def detect_json(path: Path, data: Any) -> str:
 
 
 def detect_table(path: Path, rows: list[tuple[int, list[str]]]) -> str:
-    """The format of a table.
-
-    Raises:
-        ValueError: none that a reader knows.
-    """
+    """The format of a table."""
     for number, (_, cells) in enumerate(rows):
         if number not in HEADER_ROWS:
             break

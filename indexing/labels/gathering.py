@@ -47,15 +47,7 @@ class Gathering:
         self._nameless: list[Label] = []
 
     def add(self, label: str, start: Any, end: Any, where: str, **fields: Any) -> None:
-        """A label with the times that the file says.
-
-        Args:
-            where: of the file, for messages.
-            fields: of :class:`Label`.
-
-        Raises:
-            ValueError: a time is no finite number of seconds, or it ends before it starts.
-        """
+        """A label with the times that the file says."""
         begin, stop = self.seconds(start, where, "start"), self.seconds(end, where, "end")
         if stop < begin:
             raise error(self.asked.path, f"{where}: ends at {stop:g} s, but starts at {begin:g} s", "give start first")
@@ -74,11 +66,7 @@ class Gathering:
                 known.setdefault(name)
 
     def seconds(self, value: Any, where: str, what: str) -> float:
-        """A time of the file as seconds: a number, digits, or ``hh:mm:ss.sss``.
-
-        Raises:
-            ValueError: it is none.
-        """
+        """A time of the file as seconds: a number, digits, or ``hh:mm:ss.sss``."""
         if type(value) is float or type(value) is int:
             number = _number(value)
         else:
@@ -118,12 +106,7 @@ class Gathering:
 
 
 def parse_seconds(text: str) -> float:
-    """Seconds from digits or ``hh:mm:ss.sss``; NaN where it is neither.
-
-    Example:
-        >>> parse_seconds("12.5"), parse_seconds("00:01:02.500"), parse_seconds("12,5"), parse_seconds("soon")
-        (12.5, 62.5, 12.5, nan)
-    """
+    """Seconds from digits or ``hh:mm:ss.sss``; NaN where it is neither."""
     sign = -1.0 if text.strip().startswith("-") else 1.0
     parts = text.strip().lstrip("+-").replace(",", ".").split(":")
     if len(parts) > 3 or "_" in text:
@@ -138,12 +121,7 @@ def parse_seconds(text: str) -> float:
 
 
 def whole(value: Any) -> int | None:
-    """A whole number of a file, None where it is none.
-
-    Example:
-        >>> whole("12"), whole(3.0), whole(2.5), whole(True)
-        (12, 3, None, None)
-    """
+    """A whole number of a file, None where it is none."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return None
     number = _number(value)

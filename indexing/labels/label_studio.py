@@ -27,11 +27,7 @@ TEXTS = ("subject", "tier")
 
 
 def read(data: Any, asked: Request) -> LabelFile:
-    """Read an export.
-
-    Raises:
-        ValueError: naming task and region; also where frames are counted and nobody says how many a second has.
-    """
+    """Read an export."""
     out = Gathering(asked, "label_studio")
     other: Counter[str] = Counter()
     for number, task in enumerate(data if isinstance(data, list) else [data], start=1):
@@ -150,13 +146,7 @@ def _list(out: Gathering, value: Any, where: str) -> list[Any]:
 
 
 def write(labels: Sequence[Label], target: Target) -> list[str]:
-    """Write tasks to import: what has no observation as predictions of ``tier``, the rest as annotations of its observation.
-
-    Times become those of the nearest frames.
-
-    Raises:
-        ValueError: nobody says how many frames a second has.
-    """
+    """Write tasks to import: what has no observation as predictions of ``tier``, the rest as annotations of its observation."""
     if target.fps is None:
         raise error(target.path, "Label Studio counts frames, and nobody says how many a second has", "give them (--fps)")
     tasks: dict[str, dict[str, list[dict[str, Any]]]] = {media: {} for media in target.media}

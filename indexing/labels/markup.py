@@ -33,11 +33,7 @@ Taken = Callable[[Placed, Element], bool]
 def parse_xml(
     path: Path, data: bytes, taken: Taken = lambda placed, parent: False, options: LabelOptions = LabelOptions()
 ) -> tuple[Element, list[Placed]]:
-    """The root of a document, and where its children stand.
-
-    Raises:
-        ValueError: not XML (with line and column), a document type or entities, too deep, or too many elements.
-    """
+    """The root of a document, and where its children stand."""
     return _Parser(path, data, taken, options).parse()
 
 

@@ -18,12 +18,7 @@ REMEDY = "name the recording as its video is named, or say which it is (--media 
 
 @dataclass(frozen=True)
 class Span:
-    """A stretch of a clock on which one file is played.
-
-    Args:
-        media: the file.
-        begin, end: on that clock, in seconds; where nobody knows the end it is infinite.
-    """
+    """A stretch of a clock on which one file is played."""
 
     media: str
     begin: float = 0.0
@@ -31,14 +26,7 @@ class Span:
 
 
 def cut_up(start: float, end: float, spans: Sequence[Span]) -> list[tuple[str, float, float]]:
-    """A stretch of a clock, by the files that are played then: each file with start and end on its own clock.
-
-    What lies before the first span or after the last belongs to that one.
-
-    Example:
-        >>> cut_up(55.0, 70.0, [Span("a.mp4", 0.0, 60.0), Span("b.mp4", 60.0, 90.0)])
-        [('a.mp4', 55.0, 60.0), ('b.mp4', 0.0, 10.0)]
-    """
+    """A stretch of a clock, by the files that are played then: each file with start and end on its own clock."""
     found = []
     for number, span in enumerate(spans):
         first = -math.inf if number == 0 else span.begin
@@ -50,25 +38,13 @@ def cut_up(start: float, end: float, spans: Sequence[Span]) -> list[tuple[str, f
 
 
 def base_name(name: str) -> str:
-    """The name of a file without folders, whatever system or address it was written on.
-
-    Example:
-        >>> base_name("C:\\\\films\\\\a.mp4"), base_name("file:///films/my%20film.mp4"), base_name("a/b.mp4")
-        ('a.mp4', 'my film.mp4', 'b.mp4')
-    """
+    """The name of a file without folders, whatever system or address it was written on."""
     plain = unquote(name) if "://" in name or name.startswith("file:") else name
     return re.split(r"[\\/]", plain.rstrip("\\/"))[-1]
 
 
 def of_recording(names: Iterable[str], asked: Request) -> set[str] | None:
-    """Those of the files in a label file that are the recording at hand; None where none is at hand.
-
-    The whole path decides, else the name of the file, else what stands before its last dot, else that one of the two stands in the
-    other as a word: ``session_keypoints.json`` and ``sessionDLC_resnet50.csv`` are ``session.mp4``.
-
-    Raises:
-        ValueError: it is none of them, or may be several.
-    """
+    """Those of the files in a label file that are the recording at hand; None where none is at hand."""
     known = list(dict.fromkeys(name for name in names if name))
     if asked.media is not None:
         same = {name for name in known if name == asked.media} or {name for name in known if base_name(name) == asked.media}
@@ -90,12 +66,7 @@ def of_recording(names: Iterable[str], asked: Request) -> set[str] | None:
 
 
 def same_recording(name: str, other: str) -> bool:
-    """Whether two files are called alike, but for their folders and suffixes: a video and its keypoints.
-
-    Example:
-        >>> same_recording("films/session.mp4", "session.json"), same_recording("session.mp4", "session_2.json")
-        (True, False)
-    """
+    """Whether two files are called alike, but for their folders and suffixes: a video and its keypoints."""
     return SUFFIX.sub("", base_name(name)).casefold() == SUFFIX.sub("", base_name(other)).casefold()
 
 

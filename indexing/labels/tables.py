@@ -39,11 +39,7 @@ WRITTEN = ("label", "start", "end", "subject", "media", "tier", "observation", "
 
 
 def read(rows: list[Row], asked: Request) -> LabelFile:
-    """Read a table.
-
-    Raises:
-        ValueError: naming row and column; also where frames are counted and nobody says how many a second has.
-    """
+    """Read a table."""
     out = Gathering(asked, "tables")
     columns = _columns(asked.path, rows[0][1])
     framed = "start" not in columns
@@ -119,11 +115,7 @@ def _score(path: Path, text: str, where: str) -> float | None:
 
 
 def write(path: Path, labels: Sequence[Label], delimiter: str) -> list[str]:
-    """Write a table: ``label,start,end`` and the columns that some label fills; seconds to the microsecond.
-
-    Returns:
-        what is not kept.
-    """
+    """Write a table: ``label,start,end`` and the columns that some label fills; seconds to the microsecond."""
     filled = [name for name in WRITTEN if name in WRITTEN[:3] or any(getattr(one, name) not in ("", (), None) for one in labels)]
     stream = io.StringIO()
     table = csv.writer(stream, delimiter=delimiter, lineterminator="\n")

@@ -11,14 +11,7 @@ from indexing.opening import error
 
 @dataclass(frozen=True)
 class Target:
-    """A file to write labels into; the arguments are those of :func:`indexing.labels.write_labels`.
-
-    Args:
-        media: the recordings that are written, also those without labels.
-        into: a file whose content is taken over; None where there is none.
-        name: how that file calls the recording, where somebody says so.
-        dry: whether nothing is written, and only said what would be refused.
-    """
+    """A file to write labels into; the arguments are those of :func:`indexing.labels.write_labels`."""
 
     path: Path
     media: tuple[str, ...] = ()
@@ -32,14 +25,8 @@ class Target:
 
 
 def seal(*parts: object) -> str:
-    """A mark of what was written into a tier or an observation: it stands beside it, and tells whether somebody changed it since.
-
-    Spaces count as one, so that what an annotation program saves again is the same.
-
-    Example:
-        >>> seal(1000, "a  squat"), seal(1000, "a squat"), seal(1001, "a squat")
-        ('5d30b6f2', '5d30b6f2', '34602cf8')
-    """
+    """A mark of what was written into a tier or an observation: it stands beside it, and tells whether somebody changed it
+    since."""
     text = "\x1f".join(" ".join(str(part).split()) for part in parts)
     return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:8]
 

@@ -40,11 +40,7 @@ Attributes = dict[str, dict[str, Any]]
 
 
 def read(data: Mapping[str, Any] | list[Row], asked: Request) -> LabelFile:
-    """Read a project or an export.
-
-    Raises:
-        ValueError: naming the segment.
-    """
+    """Read a project or an export."""
     out = Gathering(asked, "via")
     if isinstance(data, list):
         _read_table(out, data)

@@ -104,11 +104,7 @@ def write_labels(
 
 
 def _format(path: Path, name: str | None) -> str:
-    """What is written.
-
-    Raises:
-        ValueError: neither the suffix nor ``format`` says so.
-    """
+    """What is written."""
     known = [*FORMATS.values(), *BY_NAME]
     if name is not None:
         if name not in known:
@@ -130,11 +126,7 @@ def _check(path: Path, duration: float | None, fps: float | None, tier: str) -> 
 
 
 def _source(path: Path, into: str | Path | None, name: str) -> Path | None:
-    """The file whose content is taken over, if any.
-
-    Raises:
-        ValueError: there is none, or the format has no place for others' labels.
-    """
+    """The file whose content is taken over, if any."""
     if into is not None and name not in BESIDE:
         said = f"labels cannot be written beside those of {into}"
         raise error(path, said, f"write a .boris or an .eaf ({listed(BESIDE)})")

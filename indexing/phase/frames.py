@@ -73,13 +73,7 @@ def image_distance(query: Windows, bank: Windows) -> Tensor:
 
 
 def shape_distance(query: Windows, shapes: Windows) -> Tensor:
-    r""":math:`\|(I - \Pi_g)\bar x\|^2`: the part of each frame ``(Q, shapes)`` that no affine image of a shape explains.
-
-    :math:`\Pi_g` projects onto :math:`\mathrm{span}[1, X_g]` in Gr(4, n), on the joints that are seen.
-
-    Args:
-        shapes: ``values (G, 1, n, 3)``.
-    """
+    r""":math:`\|(I - \Pi_g)\bar x\|^2`: the part of each frame ``(Q, shapes)`` that no affine image of a shape explains."""
 
     def compare(a: Tensor, b: Tensor, joints: Tensor | slice) -> Tensor:
         if a.shape[2] < LEAST:

@@ -72,21 +72,7 @@ Array = NDArray[Any]
 
 
 def smooth_phases(phase: Array, times: Array, seconds: float, periodic: Array, options: PhaseOptions = PhaseOptions()) -> Array:
-    r"""``(T, classes)`` phases, each from its neighbours too.
-
-    A cycle's: the argument of :math:`\sum_j e^{2\pi i(\phi_j - \rho(t_j - t))}` at the rate with the largest modulus; a course's:
-    the median.
-
-    Args:
-        phase: ``(T, classes)``, NaN = not known; times: ``(T,)`` seconds; periodic: ``(classes,)``.
-
-    Example:
-        >>> import numpy as np
-        >>> t = np.arange(20) / 10
-        >>> noisy = ((t + 0.02 * (-1.0) ** np.arange(20)) % 1)[:, None]
-        >>> bool(abs(smooth_phases(noisy, t, 1.0, np.array([True]))[15, 0] - 0.5) < 0.01)
-        True
-    """
+    r"""``(T, classes)`` phases, each from its neighbours too."""
     out = np.full_like(phase, np.nan)
     rates = np.linspace(-options.evidence.fastest, options.evidence.fastest, options.evidence.rates)
     for i, time in enumerate(times):

@@ -71,13 +71,7 @@ def _local(x: Tensor, seconds: Tensor, options: PhaseOptions) -> list[tuple[slic
 
 @on_cpu
 def in_step(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions = PhaseOptions()) -> list[Tensor] | None:
-    """Phases in [0, 1) of the frames of clips of one action that repeats; ``None`` where it does not.
-
-    A search over a few seconds at a time: it computes on the CPU.
-
-    Args:
-        clips: frames ``(F, n, 2)`` and seconds ``(F,)`` of each.
-    """
+    """Phases in [0, 1) of the frames of clips of one action that repeats; ``None`` where it does not. clips ``(F, n, 2)``."""
     local = [_local(*clip, options=options) for clip in clips]
     depths = sorted(min(depth for _, _, depth in parts) for parts in local)
     if depths[len(depths) // 2] > options.period.deep:
@@ -139,11 +133,8 @@ def _shifts(cycles: Tensor, options: PhaseOptions) -> list[float]:
 def followed(
     course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Tensor, options: PhaseOptions = PhaseOptions()
 ) -> Tensor:
-    """Phases of one clip's frames that go forward at about the clip's rate and leave least, by dynamic programming.
-
-    Args:
-        phase: ``(F,)`` where each frame was thought to be; only its mean rate is used.
-    """
+    """Phases of one clip's frames that go forward at about the clip's rate and leave least, by dynamic programming. phase
+    ``(F,)``."""
     if len(x) < 3:
         return phase
     # one comparison of all frames at once, and then one step after the other, which only the CPU is quick at
@@ -182,12 +173,7 @@ def learn_model(
     camera: str = "affine",
     options: PhaseOptions = PhaseOptions(),
 ) -> tuple[PhaseModel, list[bool]]:
-    """The model, on the CPU, and which classes are their own mirror image half a cycle later.
-
-    Args:
-        clips: images; label: ``(clips,)``; phases: of each clip, or ``None``; swap: the joints' mirror images from windows and the
-            joints seen; device: where frames are compared and shapes estimated.
-    """
+    """The model, on the CPU, and which classes are their own mirror image half a cycle later. clips ``(clips,)``."""
     learned = training_frames(clips)
     some = learned.frames[: options.views.mirror_windows]
     twin = swap(some.values, some.seen) if mirror else None

@@ -29,10 +29,7 @@ from indexing.phase.perspective import perspective_distance
 
 @dataclass(frozen=True)
 class Course:
-    """The shapes of an action.
-
-    shapes: ``(styles, B, n, 3)`` float64; periodic: whether phase 1 is phase 0 again; seen: ``(n,)`` joints that are known.
-    """
+    """The shapes of an action."""
 
     shapes: Tensor = field(metadata=stored("real", None, "basis", "joints", 3))
     periodic: bool
@@ -74,16 +71,7 @@ def _argument(phase: Tensor, periodic: bool) -> Tensor:
 def learn_course(
     x: Tensor, seen: Tensor, phase: Tensor, clip: Tensor, *, harmonics: int, periodic: bool, options: PhaseOptions = PhaseOptions()
 ) -> Course:
-    r"""Alternate between cameras and shapes, each a linear problem; then give every clip a style a and repeat.
-
-    .. math:: \min \sum_f w_f \Big\|x_f - \sum_b c_b(\phi_f)\,(X_b + a_{k(f)} X'_b)\,A_f - 1 b_f^T\Big\|^2
-        + \lambda(\|X\|^2 + \|X'\|^2)
-
-    Args:
-        x: ``(F, n, 2)`` frames; seen: ``(F, n)``; phase: ``(F,)`` in [0, 1]; clip: ``(F,)`` whose frame it is (every clip counts
-            the same).
-        harmonics: of a cycle; the degree of a course is twice as high.
-    """
+    r"""Alternate between cameras and shapes, each a linear problem; then give every clip a style a and repeat. x ``(F, n, 2)``."""
     rows = basis_of(periodic, 2 * harmonics + 1).rows(_argument(phase, periodic))
     _, owner, counts = clip.unique(return_inverse=True, return_counts=True)
     weight = seen.to(x) * (len(x) / (len(counts) * counts[owner].to(x)))[:, None]
@@ -162,11 +150,7 @@ PAIR_BLOCK = 4_000_000  # of frames compared at once: bounds memory whatever the
 
 @dataclass(frozen=True)
 class PhaseModel:
-    """Training frames of all classes and the courses of their shapes.
-
-    bank: frames ``(E, 1, n, 2)``; label ``(E,)``; phase ``(E,)`` in [0, 1]; courses: one per class; wrong: ``(seconds,)`` the best
-    score of training seconds whose class was left out, empty where there are fewer than three classes.
-    """
+    """Training frames of all classes and the courses of their shapes."""
 
     bank: Windows = field(metadata=part(rows="frames", length=1))
     label: Tensor = field(metadata=stored("every", "frames", below="classes"))
@@ -195,14 +179,7 @@ class PhaseModel:
         )
 
     def evidence(self, query: Windows) -> tuple[Tensor, Tensor]:
-        r"""Score and phase of every frame for every class, ``(Q, classes)`` each.
-
-        .. math:: s_c = \max_\phi\big[-\tfrac12\log r_c(\phi) - \tfrac12 \log d_c(\phi)\big] + \log d_{\bar c}
-
-        with r the residual outside span[1, X(phi)], d the distance from the nearest training image at that phase, and the last
-        term that from the nearest images of the other actions.  A frame that shows fewer than six joints scores 0 everywhere, at
-        phase NaN.
-        """
+        r"""Score and phase of every frame for every class, ``(Q, classes)`` each."""
         step = max(1, PAIR_BLOCK // max(1, len(self.bank)))
         parts = [self._evidence(query[at : at + step]) for at in range(0, len(query), step)]
         return torch.cat([scores for scores, _ in parts]), torch.cat([phase for _, phase in parts])
@@ -265,11 +242,7 @@ Array = NDArray[Any]
 
 
 def wrong_scores(model: PhaseModel, learned: Learned, label: Tensor) -> Tensor:
-    """``(seconds,)`` the best mean score of training seconds in a model that their class was left out of.
-
-    Args:
-        learned: the frames of all clips; label: ``(clips,)``.
-    """
+    """``(seconds,)`` the best mean score of training seconds in a model that their class was left out of."""
     if len(model.courses) < model.options.events.classes:
         return torch.zeros(0, dtype=torch.float64)
     whole = (learned.times / model.options.events.second).floor().long()
@@ -293,11 +266,7 @@ def _spread(values: Tensor, most: int) -> Tensor:
 
 
 def event_levels(wrong: Tensor, rate: float | None, options: PhaseOptions = PhaseOptions()) -> tuple[float, float]:
-    """Scores that an event needs somewhere and throughout, for a rate of wrong actions that may reach them.
-
-    Args:
-        rate: 0.1 by default; a number outside 0..1 is the level itself.
-    """
+    """Scores that an event needs somewhere and throughout, for a rate of wrong actions that may reach them."""
     return scoring.event_levels(
         wrong.cpu().numpy(), options.events.false_alarms if rate is None else rate, options.events.extent, options.events.least
     )

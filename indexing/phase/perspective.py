@@ -22,16 +22,7 @@ PAIR_BLOCK = 200_000  # frames times shapes at once: bounds memory
 
 
 def leaning(x: Tensor, basis: Tensor, kappa: float) -> Tensor:
-    r"""What images of shapes by leaning cameras leave of frames, ``(Q, E)``, with what the prior adds.
-
-    All sums over joints are products of the frames, or of the coefficients :math:`c = U^T x` of their affine images, with
-    moments of the shapes alone: :math:`G^T \Pi^\perp G` is linear in :math:`c c^T`.
-
-    Args:
-        x: ``(Q, n, 2)`` frames about the middle of their joints, Frobenius norm 1.
-        basis: ``(E, n, 3)`` orthonormal coordinates U of shapes about their middle.
-        kappa: see above, for frames of norm 1 and the RMS of relative depths.
-    """
+    r"""What images of shapes by leaning cameras leave of frames, ``(Q, E)``, with what the prior adds."""
     n, count = x.shape[1], len(basis)
     pairs = (basis[..., :, None] * basis[..., None, :]).flatten(-2)  # (E, n, 9)
     third = (basis.mT @ pairs).unflatten(-1, (3, 3))  # (E, 3, 3, 3) of U_a U_b U_c

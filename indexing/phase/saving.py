@@ -41,11 +41,7 @@ Indexer = TypeVar("Indexer", bound="PhaseIndexer")
 
 
 def save(indexer: PhaseIndexer, path: str | Path) -> None:
-    """Write a fitted indexer.
-
-    Raises:
-        ValueError: the file cannot be written, or the labels are neither text nor numbers.
-    """
+    """Write a fitted indexer."""
     model = indexer.model_
     about = {
         "classes": labels_to_json(indexer.classes_),
@@ -72,11 +68,7 @@ def load(kind: type[Indexer], path: str | Path, device: str = "cpu") -> Indexer:
 
 
 def _restore(indexer: PhaseIndexer, header: dict[str, Any], parts: Parts) -> None:
-    """The fitted attributes.
-
-    Raises:
-        ValueError: parts that do not belong together.
-    """
+    """The fitted attributes."""
     classes, joints = labels_from_json(header["classes"]), whole(header["joints"], "joints", LEAST, JOINTS)
     periodic, mirrored = (_flags(header[name], name, len(classes)) for name in ("periodic", "mirrored"))
     sizes = {"classes": len(classes), "joints": joints, "basis": 2 * indexer.harmonics + 1}

@@ -49,11 +49,7 @@ def sigmoid(logits: Any) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PersonCandidates:
-    """People in a picture, the surest first, in parts of it.
-
-    scores: ``(k,)``; boxes: ``(k, 4)`` left, top, right, bottom; points: ``(k, 4, 2)``: hips, a point of the circle about the body
-    that lies above the head, and the same two of the upper body.
-    """
+    """People in a picture, the surest first, in parts of it."""
 
     scores: Floats
     boxes: Floats
@@ -64,12 +60,7 @@ class PersonCandidates:
 
 
 def candidates(raw: Floats, logits: Floats, options: DetectorOptions = DetectorOptions()) -> PersonCandidates:
-    """People from the detector's outputs.
-
-    Args:
-        raw: ``(2254, 12)`` pixels of the network's picture, from each anchor's centre: middle and size of the box, and four points.
-        logits: ``(2254,)`` or ``(2254, 1)``.
-    """
+    """People from the detector's outputs. raw ``(2254, 12)``, logits ``(2254,)``."""
     scores = sigmoid(logits).reshape(-1)
     chosen = np.flatnonzero(scores >= options.score)
     values = np.asarray(raw, dtype=np.float64)[chosen].reshape(-1, 2 + POINTS, 2) / PICTURE
@@ -80,10 +71,7 @@ def candidates(raw: Floats, logits: Floats, options: DetectorOptions = DetectorO
 
 
 def merged(found: PersonCandidates, overlap: float) -> PersonCandidates:
-    """One candidate of each group whose boxes overlap: the mean of their coordinates, weighted by their scores.
-
-    A group is the surest candidate that is left and all that overlap with it by more than ``overlap``; its score is the highest.
-    """
+    """One candidate of each group whose boxes overlap: the mean of their coordinates, weighted by their scores."""
     left = np.argsort(-found.scores, kind="stable")
     scores, boxes, points = [], [], []
     while len(left):
@@ -109,42 +97,22 @@ def overlaps(box: Floats, boxes: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """One person in a region.
+    """One person in a region."""
 
-    Attributes:
-        present: probability that there is a person.
-        places: ``(39, 2)`` in parts of the region; the first 33 are the joints.
-        confidence: ``(39,)`` the lower one of two probabilities: that the joint can be seen (nothing hides it), and that it lies in
-            the region at all.
-    """
-
-    present: float
-    places: Floats
+    present: float  # probability that there is a person
+    places: Floats  # ``(39, 2)`` in parts of the region; the first 33 are the joints
     confidence: Floats
 
 
 def landmarks(values: Floats, present: float, heatmap: Floats, options: LandmarkOptions = LandmarkOptions()) -> Landmarks:
-    """A person from the outputs of the network of landmarks.
-
-    Args:
-        values: ``(39, 5)``: x, y, z in pixels of the region, and the logits of being visible and of being there.
-        present: probability that there is a person.
-        heatmap: ``(h, w, 39)`` logits of where each landmark is.
-    """
+    """A person from the outputs of the network of landmarks. values ``(39, 5)``, heatmap ``(h, w, 39)``."""
     table = np.asarray(values, dtype=np.float64).reshape(LANDMARKS, -1)
     places = refined(table[:, :2] / REGION, heatmap, options)
     return Landmarks(float(present), places, sigmoid(table[:, 3:5]).min(axis=1))
 
 
 def refined(places: Floats, heatmap: Floats, options: LandmarkOptions = LandmarkOptions()) -> Floats:
-    """Places moved to the mean of the heatmap's cells about them, where one of these is sure.
-
-    Args:
-        places: ``(n, 2)`` x, y in parts of the region.
-        heatmap: ``(h, w, n)`` logits.
-
-    A landmark outside of the region stays where it is.
-    """
+    """Places moved to the mean of the heatmap's cells about them, where one of these is sure."""
     rows, columns, count = heatmap.shape
     column, row = np.nan_to_num(np.floor(places * [columns, rows]), nan=-1).clip(-1, max(rows, columns)).astype(np.intp).T
     reach = np.arange(options.kernel) - (options.kernel - 1) // 2

@@ -166,11 +166,7 @@ class _Job:
 def run(
     tasks: Sequence[VideoTask], networks: NetworkMaker, workers: int = 1, progress: FrameProgress | None = None
 ) -> Iterator[tuple[VideoTask, Detected | ValueError]]:
-    """Work on videos; each comes out as soon as it is done, in order, or with what is wrong with it.
-
-    Args:
-        networks: makes the networks of one thread.
-    """
+    """Work on videos; each comes out as soon as it is done, in order, or with what is wrong with it."""
     av(), cv2()
     jobs = [_planned(task) for task in tasks]
     meter = _Meter(sum(job.plan.frames for job in jobs if job.plan is not None), progress)
@@ -225,11 +221,7 @@ def _planned(task: VideoTask) -> _Job:
 
 
 def _outcome(job: _Job) -> Detected | ValueError:
-    """What became of a video, when all of its pieces are done.
-
-    Pieces that cannot be decoded are left out, and that is said; whatever else went wrong with one may go well the next time, and
-    nothing is made of the others.
-    """
+    """What became of a video, when all of its pieces are done."""
     if job.plan is None:
         assert job.problem is not None
         return job.problem
@@ -323,11 +315,7 @@ def made_by(models: ModelSet) -> NetworkMaker:
 
 
 def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0, linking: LinkOptions = LinkOptions()) -> Detected:
-    """The people of a video as clips.
-
-    Raises:
-        NobodyInVideo: there is none.
-    """
+    """The people of a video as clips."""
     if not len(seen.at):
         raise NobodyInVideo(task.path, np.arange(len(seen.times)), seen.times, seen.notes)
     people = identities(seen, task.options.identity)
@@ -351,18 +339,7 @@ def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0, linking: Li
 
 
 def in_view(joints: Floats, confidence: Floats, size: tuple[int, int]) -> tuple[Floats, Floats]:
-    """Joints less those that lie outside of the picture, where the network can only guess.
-
-    Of 18 grey videos of arm raises that end above the knees, .67 are recognized by those of another person with these guesses, and
-    all without (``heavy``; ``python -m experiments.pose.videos``).
-
-    Args:
-        joints: ``(..., n, 2)`` pixels; confidence: ``(..., n)``; size: width and height of the picture.
-
-    Example:
-        >>> in_view(np.array([[5.0, 5.0], [5.0, 25.0]]), np.ones(2), (20, 20))[1].tolist()
-        [1.0, 0.0]
-    """
+    """Joints less those that lie outside of the picture, where the network can only guess. joints ``(..., n, 2)``."""
     out = np.asarray(((joints < 0) | (joints > np.asarray(size))).any(axis=-1))
     return np.where(out[..., None], np.nan, joints), np.where(out, 0.0, confidence)
 

@@ -20,24 +20,15 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Everybody in every frame of a video or a part of it.
+    """Everybody in every frame of a video or a part of it."""
 
-    Attributes:
-        times: ``(frames,)`` seconds.
-        at: ``(m,)`` the frame of each sighting, not decreasing.
-        tracks: ``(m,)`` which track it belongs to.
-        joints: ``(m, n, 2)`` pixels; confidence: ``(m, n)``.
-        crowd: ``(s,)`` how many people were in view, whenever the detector looked.
-        notes: what a user should know.
-    """
-
-    times: Floats
-    at: Indices
-    tracks: Indices
-    joints: Floats
+    times: Floats  # ``(frames,)`` seconds
+    at: Indices  # ``(m,)`` the frame of each sighting, not decreasing
+    tracks: Indices  # ``(m,)`` which track it belongs to
+    joints: Floats  # ``(m, n, 2)`` pixels; confidence: ``(m, n)``
     confidence: Floats
     crowd: Indices = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what a user should know
 
 
 def joined(parts: Sequence[Sightings]) -> Sightings:
@@ -71,18 +62,7 @@ class _Stretch:
 
 
 def identities(seen: Sightings, options: IdentityOptions = IdentityOptions()) -> list[Indices]:
-    """The sightings of each person, the largest person first.
-
-    A track that begins soon after another one has ended, and near, goes on with the same person; of several the nearest pairs
-    are joined first.  Sizes are areas of boxes, summed over all frames; of equals, who comes first.
-
-    Example:
-        >>> box = np.array([[0.0, 0.0], [10.0, 20.0]])
-        >>> joints, tracks = np.stack([box, box, box + 1]), np.array([0, 0, 1])
-        >>> seen = Sightings(np.arange(4) / 10, np.array([0, 1, 3]), tracks, joints, np.ones((3, 2)))
-        >>> [rows.tolist() for rows in identities(seen)]
-        [[0, 1, 2]]
-    """
+    """The sightings of each person, the largest person first."""
     order = np.argsort(seen.tracks, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(seen.tracks[order])) + 1) if len(order) else []
     tracks = sorted((_stretch(seen, rows) for rows in groups), key=lambda one: (one.begin, -one.size))

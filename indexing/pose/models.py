@@ -116,21 +116,7 @@ def needs(problem: object) -> ValueError:
 
 
 def load_models(name: str | None = None, models: str | Path | None = None) -> ModelSet:
-    """The networks of a name, checked.
-
-    Args:
-        name: ``"heavy"``, ``"full"`` or ``"lite"``; by default the sharpest that is there.
-        models: folder of the model files; by default the one in which they are kept.
-
-    Raises:
-        ValueError: an unknown name, a missing package, a missing file, or one that is another than it should be.
-
-    Example:
-        >>> load_models("large")
-        Traceback (most recent call last):
-        ...
-        ValueError: pose: no model is called 'large'; choose heavy, full or lite
-    """
+    """The networks of a name, checked."""
     if name is not None and name not in LANDMARK_FILES:
         raise ValueError(f"pose: no model is called {name!r}; choose heavy, full or lite")
     missing = missing_parts()

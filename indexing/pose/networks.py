@@ -38,11 +38,7 @@ NetworkMaker = Callable[[], Networks]
 
 
 class LiteNetworks:
-    """The networks of a set of model files.
-
-    Raises:
-        ValueError: the runtime is not installed, or a file is no such network.
-    """
+    """The networks of a set of model files."""
 
     def __init__(self, models: ModelSet) -> None:
         self._detector = _interpreter(models.detector, str(models.paths[0]))
@@ -98,18 +94,8 @@ def _interpreter(model: bytes, name: str) -> _Interpreter:
 
 
 def pruned(model: bytes, wanted: Collection[int]) -> bytes:
-    """A network without the operators that only lead to outputs that nobody asks for; what is left computes the same, bit for bit.
-
-    BlazePose's networks of landmarks also draw the person's outline, at the full size of the region: without it ``full`` takes 11
-    instead of 18 ms and ``heavy`` 54 instead of 61 (one core of a busy machine).
-
-    Args:
-        model: the bytes of a file of LiteRT's.
-        wanted: how many values the wanted outputs have.
-
-    Returns:
-        the network; as it was, where it cannot be read so.
-    """
+    """A network without the operators that only lead to outputs that nobody asks for; what is left computes the same, bit for
+    bit."""
     data = bytearray(model)
     try:
         graph = import_module("ai_edge_litert.schema_py_generated").Model.GetRootAs(data, 0).Subgraphs(0)
@@ -129,15 +115,7 @@ def pruned(model: bytes, wanted: Collection[int]) -> bytes:
 
 
 def _needed(flow: Sequence[tuple[list[int], list[int]]], outputs: Sequence[int]) -> set[int]:
-    """Which operators lead to some tensors.
-
-    Args:
-        flow: tensors that go into each operator, and that come out of it.
-
-    Example:
-        >>> sorted(_needed([([0], [1]), ([1], [2]), ([1], [3])], [3]))
-        [0, 2]
-    """
+    """Which operators lead to some tensors."""
     maker = {tensor: i for i, (_, made) in enumerate(flow) for tensor in made}
     found: set[int] = set()
     left = list(outputs)

@@ -39,42 +39,28 @@ Stop = Callable[[], bool]
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Frames of a video that one worker looks at.
+    """Frames of a video that one worker looks at."""
 
-    Attributes:
-        number: of the piece.
-        frames: numbers of the frames that count, from 0.
-        lead: numbers of frames before these that are looked at, too.
-    """
-
-    number: int
-    frames: NDArray[np.int64]
-    lead: NDArray[np.int64]
+    number: int  # of the piece
+    frames: NDArray[np.int64]  # numbers of the frames that count, from 0
+    lead: NDArray[np.int64]  # numbers of frames before these that are looked at, too
 
 
 @dataclass(frozen=True, eq=False)
 class VideoPlan:
-    """A video and how it is cut.
-
-    Attributes:
-        times: ``(frames,)`` seconds of every frame that the file announces.
-        model: name of the networks.
-        pieces: in order; together they hold every frame that is looked at.
-        content: of the video, as a hash.
-        made_from: what the result depends on, as a short hash: the video's content, the networks, and every option.
-    """
+    """A video and how it is cut."""
 
     path: Path
     info: VideoInfo
     fps: float | None
-    times: Floats
+    times: Floats  # ``(frames,)`` seconds of every frame that the file announces
     people: int
     every: int
-    model: str
-    pieces: tuple[Piece, ...]
+    model: str  # name of the networks
+    pieces: tuple[Piece, ...]  # in order; together they hold every frame that is looked at
     options: PoseOptions
-    content: str
-    made_from: str
+    content: str  # of the video, as a hash
+    made_from: str  # what the result depends on, as a short hash: the video's content, the networks, and every option
 
     @property
     def frames(self) -> int:
@@ -83,14 +69,7 @@ class VideoPlan:
 
 
 def plan(path: Path, people: int, every: int, fps: float | None, model: str, options: PoseOptions) -> VideoPlan:
-    """Look at a video file, and cut it.
-
-    Args:
-        model: name of the networks.
-
-    Raises:
-        ValueError: the file cannot be read as a video, or ``fps`` is no frame rate.
-    """
+    """Look at a video file, and cut it."""
     if fps is not None:
         check_fps(fps, f"{path}: ")
     info, times = frame_times(path, fps=fps)
@@ -106,12 +85,7 @@ def plan(path: Path, people: int, every: int, fps: float | None, model: str, opt
 
 
 def cut(times: Floats, options: PieceOptions = PieceOptions()) -> list[tuple[int, int, int]]:
-    """Where each piece's lead begins, where it begins, and where it ends.
-
-    Example:
-        >>> cut(np.arange(0, 70, 10.0), PieceOptions(seconds=30, lead=10))
-        [(0, 0, 3), (2, 3, 6), (5, 6, 7)]
-    """
+    """Where each piece's lead begins, where it begins, and where it ends."""
     if not len(times):
         return []
     number = np.floor((times - times[0]) / options.seconds + 1e-9).astype(np.int64)
@@ -141,17 +115,7 @@ class PieceLost(ValueError):
 
 
 def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], None], stop: Stop = lambda: False) -> Sightings:
-    """Look at the frames of a piece.
-
-    Args:
-        moved: called after every frame that counts.
-        stop: asked before every frame.
-
-    Raises:
-        PieceLost: no frame of it can be decoded.
-        ValueError: the file is gone, or has become another one.
-        Stopped: ``stop`` said so.
-    """
+    """Look at the frames of a piece."""
     tracker, kept = Tracker(networks, task.people, task.options), _Gathered()
     both = np.concatenate([piece.lead, piece.frames])
     edge = np.diff(task.times).min(initial=1.0) / 2
@@ -195,12 +159,7 @@ def _unchanged(task: VideoPlan) -> None:
 
 
 def nearest(times: Floats, time: float) -> int:
-    """Which of increasing times is the nearest one.
-
-    Example:
-        >>> nearest(np.array([0.0, 1.0, 2.0]), 1.4)
-        1
-    """
+    """Which of increasing times is the nearest one."""
     after = int(np.searchsorted(times, time))
     if after == 0 or (after < len(times) and times[after] - time < time - times[after - 1]):
         return after
@@ -232,11 +191,7 @@ class _Gathered:
 
 
 class Store:
-    """Finished pieces of one video.
-
-    Args:
-        folder: made when it is needed; what another video, another model or other options have left there is taken away.
-    """
+    """Finished pieces of one video."""
 
     def __init__(self, folder: Path, task: VideoPlan) -> None:
         self.folder, self.task = folder, task
@@ -257,11 +212,7 @@ class Store:
         return found if len(found.joints) == len(found.at) == len(found.tracks) == len(found.confidence) else None
 
     def put(self, piece: Piece, seen: Sightings) -> None:
-        """Keep a finished piece.
-
-        Raises:
-            ValueError: it cannot be written.
-        """
+        """Keep a finished piece."""
         with self._lock:
             if not self.folder.is_dir():
                 prepare(self.folder)

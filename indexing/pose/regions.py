@@ -30,12 +30,7 @@ class Region:
     turn: float = 0.0
 
     def to_picture(self, places: Floats) -> Floats:
-        """``(..., 2)`` pixels of the picture, from parts of the region (0 to 1).
-
-        Example:
-            >>> Region(100, 50, 20, math.pi / 2).to_picture(np.array([0.5, 0.0]))
-            array([110.,  50.])
-        """
+        """``(..., 2)`` pixels of the picture, from parts of the region (0 to 1)."""
         c, s = math.cos(self.turn), math.sin(self.turn)
         return np.asarray((places - 0.5) * self.side @ np.array([[c, s], [-s, c]]) + [self.x, self.y])
 
@@ -53,22 +48,14 @@ class Region:
 
 
 def about(centre: Floats, circle: Floats, expand: float) -> Region:
-    """The region about a body: its hips, and a point of the circle that holds it, which lies above the head of who stands upright.
-
-    Args:
-        centre, circle: ``(2,)`` pixels.
-        expand: side of the region in diameters of the circle.
-    """
+    """The region about a body: its hips, and a point of the circle that holds it, which lies above the head of who stands
+    upright. centre, circle ``(2,)``."""
     (x, y), (u, v) = centre.tolist(), circle.tolist()
     return Region(x, y, 2 * expand * math.hypot(u - x, v - y), math.remainder(math.atan2(u - x, y - v), 2 * math.pi))
 
 
 def of_candidates(found: PersonCandidates, window: Region, expand: float) -> list[Region]:
-    """The regions about detected people.
-
-    Args:
-        window: what the detector has looked at.
-    """
+    """The regions about detected people."""
     points = window.to_picture(found.points)
     return [about(one[0], one[1], expand) for one in points]
 
@@ -80,15 +67,7 @@ def of_landmarks(found: Landmarks, region: Region, expand: float) -> Region:
 
 
 class VideoPicture:
-    """One frame of a video, from which regions are cut; colours are converted once, and shrunk as far as a region allows.
-
-    Frames of phones are not turned: what is cut out is.
-
-    Args:
-        frame: PyAV's.
-        size: pixels, as stored, that all frames are brought to.
-        reformat: PyAV's ``VideoReformatter.reformat``, one for all frames: a new one takes 4 ms of a frame of 1080x1920.
-    """
+    """One frame of a video, from which regions are cut; colours are converted once, and shrunk as far as a region allows."""
 
     def __init__(self, frame: Any, size: tuple[int, int] | None = None, reformat: Callable[..., Any] | None = None) -> None:
         self.upright: Orientation = orientation(frame)
@@ -110,11 +89,7 @@ class VideoPicture:
         return self._levels[shrunk]
 
     def cut(self, region: Region, side: int, fill: bool = False) -> Image:
-        """``(side, side, 3)`` the region, upright.
-
-        Args:
-            fill: black outside of the picture; otherwise its edge goes on.
-        """
+        """``(side, side, 3)`` the region, upright."""
         scale = region.side / side
         most = max(0, min(self.stored).bit_length() - 2)  # levels that have two pixels at least
         shrunk = min(max(0, math.floor(math.log2(scale))), most) if scale > 1 else 0

@@ -45,22 +45,13 @@ class _Followed:
 
 @dataclass
 class Tracker:
-    """Follows up to so many people from frame to frame.
-
-    Args:
-        networks: of one thread.
-        people: at most, at once.
-
-    Attributes:
-        crowd: how many people were in view, whenever the detector looked.
-        begun: tracks so far.
-    """
+    """Follows up to so many people from frame to frame."""
 
     networks: Networks
     people: int
     options: PoseOptions
-    crowd: list[int] = field(default_factory=list)
-    begun: int = 0
+    crowd: list[int] = field(default_factory=list)  # how many people were in view, whenever the detector looked
+    begun: int = 0  # tracks so far
     _followed: list[_Followed] = field(default_factory=list)
     _searched: float = -math.inf
     _looked_closer: float = -math.inf

@@ -124,11 +124,7 @@ def keypoint_files(
     json: bool = True,
     own: bool = False,
 ) -> Iterator[tuple[VideoTask, KeypointFile | ValueError]]:
-    """The keypoint files of many videos, in their order, each as soon as it is written, or what is wrong with it.
-
-    Raises:
-        ValueError: two videos of one name, or a folder that cannot be written.
-    """
+    """The keypoint files of many videos, in their order, each as soon as it is written, or what is wrong with it."""
     targets = targets_of([task.path for task in tasks], folder)
     there: dict[int, KeypointFile | ValueError] = {}
     for number, (task, target) in enumerate(zip(tasks, targets, strict=True)):
@@ -161,17 +157,7 @@ def keypoint_files(
 
 
 def targets_of(videos: Sequence[Path], folder: Path) -> list[Path]:
-    """The clip set of each video.
-
-    Raises:
-        ValueError: two of them would have one name.
-
-    Example:
-        >>> targets_of([Path("a/s.mp4"), Path("b/s.mov")], Path("pose"))
-        Traceback (most recent call last):
-        ...
-        ValueError: b/s.mov: would be written to pose/s.npz, as a/s.mp4; rename one of them, or give two folders
-    """
+    """The clip set of each video."""
     owners: dict[str, Path] = {}
     for video in videos:
         other = owners.setdefault(video.stem.lower(), video)
@@ -190,11 +176,7 @@ def _json(target: Path) -> Path:
 
 
 def _there(task: VideoTask, target: Path, json: bool, own: bool) -> KeypointFile | None:
-    """The file that was written before, if it is what would be written now.
-
-    Raises:
-        ValueError: the video cannot be read, or a file or folder of that name is not ours, or is of another video.
-    """
+    """The file that was written before, if it is what would be written now."""
     folder = _json(target)
     recover_folder(folder)
     kept, beside = _of_file(target), _of_folder(folder)
@@ -221,10 +203,7 @@ def _there(task: VideoTask, target: Path, json: bool, own: bool) -> KeypointFile
 
 
 def _written(task: VideoTask, found: Detected, target: Path, json: bool) -> KeypointFile | ValueError:
-    """Write what was found; the clip set last, so that it says that all is there.
-
-    A folder of JSON that an earlier run left beside it is written again even if none is asked for, as the two must agree.
-    """
+    """Write what was found; the clip set last, so that it says that all is there."""
     folder = _json(target)
     with_json = json or _of_video(_of_folder(folder), str(found.clips[0].meta[CONTENT]))
     try:
@@ -252,11 +231,7 @@ class _Origin:
 
 
 def _of_file(target: Path) -> _Origin | None:
-    """Of a clip set; None where there is none.
-
-    Raises:
-        ValueError: it is not ours.
-    """
+    """Of a clip set; None where there is none."""
     if not target.exists():
         return None
     try:
@@ -295,19 +270,8 @@ def _refuse(folder: Path) -> None:
 
 
 def write_json_folder(clips: Sequence[Clip], numbers: Indices, times: Floats, folder: Path) -> Path:
-    """Write a file per frame, as OpenPose does and Pose2Sim reads: ``NAME_000000000000_keypoints.json``.
-
-    Each has ``people`` with ``pose_keypoints_2d`` (x, y, confidence of every joint; zeros where it was not seen) and ``person_id``,
-    and besides what OpenPose has, ``time`` in seconds.  The folder appears whole or not at all; a hidden file in it says that it is
-    ours.
-
-    Args:
-        clips: one per person.
-        numbers: ``(frames,)`` that the files are called by; times: ``(frames,)`` seconds.
-
-    Raises:
-        ValueError: it cannot be written, or what is there is not ours.
-    """
+    """Write a file per frame, as OpenPose does and Pose2Sim reads: ``NAME_000000000000_keypoints.json``. numbers
+    ``(frames,)``."""
     _refuse(folder)
     rows: list[dict[int, int]] = [{nearest(times, time): row for row, time in enumerate(clip.times)} for clip in clips]
     ids = [clip.meta["person"] if clip.meta["followed"] == "ids" else -1 for clip in clips]

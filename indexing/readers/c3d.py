@@ -56,11 +56,7 @@ class Parameters:
 
 
 def read(path: Path) -> PointSequence:
-    """The markers of all frames; NaN where a marker was not seen.
-
-    Raises:
-        ValueError: it is no C3D file, is cut short, or has no markers.
-    """
+    """The markers of all frames; NaN where a marker was not seen."""
     data = read_bytes(path)
     if len(data) < 2 * BLOCK or data[1] != 0x50 or not data[0]:
         raise error(path, "has no C3D header", "the file may be truncated: export it again")

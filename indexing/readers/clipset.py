@@ -43,22 +43,7 @@ Array = NDArray[Any]
 
 
 def write_clip_set(clips: Sequence[Clip], path: str | Path) -> None:
-    """Write clips to one ``.npz``: joints, times (seconds), labels, confidences, names and every ``meta`` field.
-
-    The file appears whole or not at all: it is written under another name and moved into place.
-
-    Raises:
-        ValueError: no clips, clips that differ in joints, dimensions or skeleton, labels that are not all text or all
-            integers from 0, a field that some clips lack, or a folder that does not exist.
-
-    Example:
-        >>> import pathlib, tempfile
-        >>> from indexing.clip import Clip, ClipSet
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "set.npz"
-        >>> write_clip_set([Clip(np.ones((4, 3, 2)), fps=25.0, label="jump", name="a", meta={"view": 2})], path)
-        >>> ClipSet.load(path).select(view=2)[0]
-        Clip('a', label='jump', 4 frames x 3 joints x 2D, 0.12 s)
-    """
+    """Write clips to one ``.npz``: joints, times (seconds), labels, confidences, names and every ``meta`` field."""
     path = Path(path)
     clips = list(clips)
     if not clips:
@@ -315,26 +300,7 @@ def read_clip_set(
     min_confidence: float = 0.0,
     layout: str | None = None,
 ) -> ClipSet:
-    """Read a clip-set ``.npz`` (its keys are listed above), without pickle.
-
-    Args:
-        fps: frames per second where the file has neither ``times`` nor ``fps``; without it 30 is assumed.
-        label: replaces the labels of all clips.
-        min_confidence: joints below it become NaN.
-        layout: which joint is which, as of :func:`indexing.readers.read`.  A set that names no joints has names only where the
-            body shows without doubt which layout it is (Kinect-20, COCO-17 ...).
-
-    Raises:
-        ValueError: not such a file, truncated, or inconsistent; the message names the file, the key and the clip.
-
-    Example:
-        >>> import pathlib, tempfile
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "set.npz"
-        >>> np.savez(path, joints=np.ones((9, 3, 2)), offsets=[0, 4, 9], action=[0, 1], action_names=["run", "sit"], fps=10.0)
-        >>> clips = read_clip_set(path)
-        >>> clips.labels.tolist(), clips[1].duration
-        (['run', 'sit'], 0.4)
-    """
+    """Read a clip-set ``.npz`` (its keys are listed above), without pickle."""
     path = Path(path)
     data = NumpyArchive(path)
     joints = need(path, data, "joints", 3)
@@ -442,11 +408,7 @@ def _whole(values: Array, ndim: int) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A short grey video in memory.
-
-    Args:
-        frames: ``(F, height, width)`` uint8; times: ``(F,)`` seconds; label, name, meta: as of a :class:`indexing.Clip`.
-    """
+    """A short grey video in memory. frames ``(F, height, width)``."""
 
     frames: NDArray[np.uint8]
     times: NDArray[np.float64]
@@ -480,23 +442,7 @@ def holds_frames(path: str | Path) -> bool:
 
 
 def read_film_set(path: str | Path, *, fps: float | None = None) -> FilmSet:
-    """Read a film set, without pickle.
-
-    Args:
-        fps: frames per second where the file has neither ``times`` nor ``fps``; without it 30 is assumed.
-
-    Raises:
-        ValueError: not such a file, truncated, or inconsistent; the message names the file, the key and the film.
-
-    Example:
-        >>> import pathlib, tempfile
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "films.npz"
-        >>> films = np.zeros((9, 24, 32), np.uint8)
-        >>> np.savez(path, frames=films, offsets=[0, 4, 9], action=["run", "sit"], subject=[1, 2], fps=10.0)
-        >>> found = read_film_set(path)
-        >>> holds_frames(path), found.labels.tolist(), len(found.select(subject=2)[0])
-        (True, ['run', 'sit'], 5)
-    """
+    """Read a film set, without pickle."""
     path = Path(path).expanduser()
     data = NumpyArchive(path)
     frames = need(path, data, "frames", 3)

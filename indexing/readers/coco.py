@@ -22,11 +22,7 @@ IDENTITIES = ("track_id", "tracking_id", "person_id", "idx")
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read COCO keypoints; the frame number is ``image_id``, or the number in the image's name.
-
-    Raises:
-        ValueError: a person without ``image_id`` or ``keypoints``, or two images with the same number.
-    """
+    """Read COCO keypoints; the frame number is ``image_id``, or the number in the image's name."""
     source.need("coco", "json", "json folder")
     people, images, names, bones = _parts(source)
     frames: dict[Hashable, list[Detection]] = {image: [] for image in images}

@@ -25,11 +25,7 @@ REMEDY = "export with deeplabcut.analyze_videos(..., save_as_csv=True) or analyz
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read a DeepLabCut CSV or HDF5; times are frame number / fps.
-
-    Raises:
-        ValueError: a header row is missing, or a body part lacks x or y.
-    """
+    """Read a DeepLabCut CSV or HDF5; times are frame number / fps."""
     source.need("deeplabcut", "csv", "hdf5")
     if source.kind == "hdf5":
         with opened_hdf5(source.path) as file:

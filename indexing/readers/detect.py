@@ -50,12 +50,7 @@ def detect(source: Source) -> str:
 
 
 def detect_json(data: Any) -> str | None:
-    """The format of parsed JSON, or None.
-
-    Example:
-        >>> detect_json({"version": 1.3, "people": []}), detect_json([{"image_id": 0, "keypoints": [1, 2, 0.5]}])
-        ('openpose', 'coco')
-    """
+    """The format of parsed JSON, or None."""
     if isinstance(data, dict):
         if "people" in data or "bodies" in data:
             return "openpose"

@@ -34,15 +34,7 @@ class FrameFile(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """An opened input.
-
-    Args:
-        path: as the caller gave it.
-        kind: ``"npz"``, ``"json"``, ``"csv"``, ``"trc"``, ``"c3d"``, ``"hdf5"``, ``"npy"``, ``"pickle"``, or ``"json folder"``,
-            ``"txt folder"``, ``"npy folder"``.
-        data: nothing, the parsed JSON, the first rows, a list of :class:`FrameFile` (JSON parsed; text not yet read), the paths of
-            the arrays of a folder.
-    """
+    """An opened input."""
 
     path: Path
     kind: str
@@ -151,23 +143,14 @@ def _nothing(path: Path) -> None:
 
 
 def frame_number(name: str) -> int | None:
-    """The frame number in a file name: before ``_keypoints``, else the last number before the suffix.
-
-    Example:
-        >>> frame_number("squat2_000000000012_keypoints.json"), frame_number("7.jpg"), frame_number("a.jpg")
-        (12, 7, None)
-    """
+    """The frame number in a file name: before ``_keypoints``, else the last number before the suffix."""
     stem = re.sub(r"\.\w+$", "", name)
     found = re.search(r"(\d{1,18})_keypoints", stem) or re.search(r"(\d{1,18})\D*$", stem)  # 18 digits fit int64
     return int(found.group(1)) if found else None
 
 
 def load_json(path: Path) -> Any:
-    """Parsed JSON (``NaN`` allowed).
-
-    Raises:
-        ValueError: empty, not text, or not JSON; the message has line and column.
-    """
+    """Parsed JSON (``NaN`` allowed)."""
     text = read_text(path, KEYPOINTS)
     if not text.strip():
         raise error(path, "the file is empty", "export it again")
@@ -175,19 +158,7 @@ def load_json(path: Path) -> Any:
 
 
 def read_columns(path: Path, skip: int, numeric: Sequence[int], text: Sequence[int] = ()) -> tuple[FloatArray, list[list[str]]]:
-    """Some columns of a CSV file.
-
-    Args:
-        skip: header rows; the last of them names the columns in messages.
-        numeric: indices of the columns to convert; empty cells are NaN.
-        text: indices of the columns to keep as text.
-
-    Returns:
-        ``(rows, len(numeric))`` values and, per text column, its cells.
-
-    Raises:
-        ValueError: no rows, a short row, or a cell that is not a number; the message has row and column.
-    """
+    """Some columns of a CSV file."""
     header: list[str] = []
     values: list[FloatArray] = []
     words: list[list[str]] = [[] for _ in text]

@@ -28,12 +28,7 @@ LEVELS = {3: ("scorer", "bodyparts", "coords"), 4: ("scorer", "individuals", "bo
 
 @dataclass(frozen=True, eq=False)
 class HdfFrame:
-    """A table of numbers.
-
-    Args:
-        header: rows of column names by their name, a name per column.
-        values: ``(rows, columns)``; index: a name or number per row.
-    """
+    """A table of numbers. values ``(rows, columns)``."""
 
     header: dict[str, list[str]]
     values: FloatArray
@@ -46,11 +41,7 @@ def holds_frame(file: Hdf5) -> bool:
 
 
 def read_frame(file: Hdf5) -> HdfFrame:
-    """The one frame of a file, or the one that DeepLabCut means.
-
-    Raises:
-        ValueError: there is none, or several; its parts do not fit each other.
-    """
+    """The one frame of a file, or the one that DeepLabCut means."""
     keys = _keys(file)
     key = KEY if KEY in keys else keys[0] if len(keys) == 1 else None
     if key is None:

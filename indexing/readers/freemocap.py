@@ -40,21 +40,12 @@ REMEDY = "give the folder of a recording, with output_data in it"
 
 
 def rank(name: str) -> int | None:
-    """How good an array with this name is, 0 the best; None where FreeMoCap does not name one so.
-
-    Example:
-        >>> rank("mediapipe_body_3d_xyz.npy"), rank("mediapipe_face_3d_xyz.npy")
-        (0, None)
-    """
+    """How good an array with this name is, 0 the best; None where FreeMoCap does not name one so."""
     return next((i for i, pattern in enumerate(NAMES) if pattern.fullmatch(name)), None)
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read the body of a recording; of 2D data, a clip per camera.
-
-    Raises:
-        ValueError: no array of a body, or one of other axes.
-    """
+    """Read the body of a recording; of 2D data, a clip per camera."""
     source.need("freemocap", "npy folder", "npy")
     files: list[Path] = [source.path] if source.kind == "npy" else list(source.data)
     ranked = sorted((place, str(file), file) for file in files if (place := rank(file.name)) is not None)

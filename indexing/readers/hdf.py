@@ -38,11 +38,7 @@ T = TypeVar("T")
 
 
 class Hdf5:
-    """What an open HDF5 file holds; every failure is one line that names the file and the part.
-
-    Args:
-        path: of the file; handle: of h5py.
-    """
+    """What an open HDF5 file holds; every failure is one line that names the file and the part."""
 
     def __init__(self, path: Path, handle: Any, size: int) -> None:
         self.path, self._handle, self._size = path, handle, size
@@ -64,14 +60,7 @@ class Hdf5:
         return self._sure(inside, group)
 
     def array(self, name: str, ndim: int | None = None, kinds: str = "biuf") -> Array:
-        """The values of a dataset.
-
-        Args:
-            ndim: how many axes it must have; kinds: of numpy, that its values may be of.
-
-        Raises:
-            ValueError: there is none, or it is larger than what is stored of it, kept elsewhere, or of other values.
-        """
+        """The values of a dataset."""
         data = self._dataset(name)
         if data.dtype.kind not in kinds or (ndim is not None and data.ndim != ndim):
             what = f"{data.ndim} axes of {data.dtype}" if data.dtype.kind != "O" else "text"
@@ -79,11 +68,7 @@ class Hdf5:
         return np.asarray(self._sure(lambda: data[()], name))
 
     def records(self, name: str, fields: tuple[str, ...]) -> dict[str, Array]:
-        """Fields of a table of records, a column each; a field may be a row of numbers itself.
-
-        Raises:
-            ValueError: as :meth:`array`, or a field is not there.
-        """
+        """Fields of a table of records, a column each; a field may be a row of numbers itself."""
         data = self._dataset(name)
         there = data.dtype.names or ()
         missing = [field for field in fields if field not in there]
@@ -118,10 +103,8 @@ class Hdf5:
         return [_text(value) for value in np.atleast_1d(self._sure(lambda: data[()], name))]
 
     def _check_lengths(self, data: Any, name: str) -> None:
-        """Refuse texts that say they are longer than the file, alone or together: the library would make room for each of them.
-
-        Each is written to a heap by itself, so that together they fit the file, unless it sends several to the same piece.
-        """
+        """Refuse texts that say they are longer than the file, alone or together: the library would make room for each of
+        them."""
         total = 0
         with opened(self.path) as file:
             for offset, size, packed in self._sure(lambda: _places(data), name):
@@ -188,11 +171,7 @@ class Hdf5:
 
 @contextmanager
 def opened_hdf5(path: Path) -> Iterator[Hdf5]:
-    """An HDF5 file, to be read.
-
-    Raises:
-        ValueError: it is none, is damaged, or h5py is not installed.
-    """
+    """An HDF5 file, to be read."""
     size = size_of(path)
     try:
         import h5py
@@ -211,13 +190,7 @@ def opened_hdf5(path: Path) -> Iterator[Hdf5]:
 
 
 def _check_heaps(path: Path) -> None:
-    """Refuse a heap of texts with an empty piece of free space: the library would go from it to itself without end.
-
-    A heap is ``GCOL``, its version and size, and pieces: index (0 = free), references, size, each a multiple of 8 bytes.
-
-    Raises:
-        ValueError: there is one, or the file cannot be read.
-    """
+    """Refuse a heap of texts with an empty piece of free space: the library would go from it to itself without end."""
     with opened(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         at = data.find(HEAP)
         while at >= 0:
@@ -235,11 +208,7 @@ def _check_heaps(path: Path) -> None:
 
 
 def _places(data: Any) -> list[tuple[int, int, bool]]:
-    """Where a dataset keeps its values: offset and size of each block, and whether it is packed.
-
-    Raises:
-        ValueError: they are not where programs that write text of any length put it, or went through other filters.
-    """
+    """Where a dataset keeps its values: offset and size of each block, and whether it is packed."""
     whole = data.file.id.get_create_plist()
     if whole.get_sizes() != (8, 8) or whole.get_userblock():
         raise ValueError("text is kept in an uncommon way")
@@ -261,11 +230,7 @@ def _places(data: Any) -> list[tuple[int, int, bool]]:
 
 
 def _lengths(raw: bytes, packed: bool) -> Array:
-    """Lengths of the texts of a block.
-
-    Raises:
-        ValueError: the block is damaged, or larger than one of so many texts.
-    """
+    """Lengths of the texts of a block."""
     if packed:
         most = ENTRY * MOST_TEXTS_BLOCK
         try:

@@ -67,12 +67,7 @@ class LayoutFit(NamedTuple):
 def fits(
     joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()
 ) -> list[LayoutFit]:
-    """Each layout's fit, best first.
-
-    Args:
-        joints: ``(frames, n, 2 | 3)``, NaN = not seen.
-        up: the direction that is up, as of a clip; None where that is not known either.
-    """
+    """Each layout's fit, best first. joints ``(frames, n, 2 | 3)``."""
     some = np.asarray(joints[np.unique(np.linspace(0, len(joints) - 1, options.frames).round().astype(int))], dtype=np.float64)
     some = np.where(np.abs(some) <= LARGEST, some, np.nan)
     ups = [axis for axis in UP_AXES if "xyz".index(axis[-1]) < joints.shape[2]] if up is None else [up]
@@ -87,18 +82,7 @@ def fits(
 def recognized(
     joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()
 ) -> LayoutFit | None:
-    """The layout that the joints are of, where that is clear.
-
-    Example:
-        >>> standing = {"nose": 9, "eye": 9.5, "ear": 9.4, "shoulder": 8, "elbow": 6.5, "wrist": 5, "hip": 5, "knee": 3, "ankle": 0}
-        >>> side = {"left": 1.0, "right": -1.0, "nose": 0.0}
-        >>> names = [joint.split("_") for joint in layout_named("COCO-17").joints]
-        >>> body = np.array([[(side[name[0]], standing[name[-1]]) for name in names]])
-        >>> recognized(body, candidates(17), "y").layout.name
-        'COCO-17'
-        >>> recognized(np.random.default_rng(0).normal(size=(9, 17, 2)), candidates(17), "y") is None
-        True
-    """
+    """The layout that the joints are of, where that is clear."""
     could = [
         fit for fit in fits(joints, layouts, up, options) if fit.bones <= options.longest_bones and fit.posture >= options.posture
     ]
@@ -112,16 +96,7 @@ def settled(
     up: str | None,
     options: LayoutOptions = LayoutOptions(),
 ) -> tuple[Skeleton | None, dict[str, str], str | None]:
-    """The layout of joints whose number alone is known.
-
-    Args:
-        usual: what the number means where the body does not say; None: its joints have no names then.
-        layouts: that it may be.
-
-    Returns:
-        the layout, what to say of it (``{"layout": ...}``, for the meta of clips; empty where nothing is to be said), and the
-        direction that is up, where it was asked for and the body says so.
-    """
+    """The layout of joints whose number alone is known."""
     found = recognized(joints, layouts, up, options) if len(joints) else None
     if found is not None:
         said = {} if found.layout is usual else {"layout": f"recognized: {found.layout.name}"}
@@ -133,14 +108,7 @@ def settled(
 
 
 def upward(joints: FloatArray, names: Sequence[str], usual: str, options: LayoutOptions = LayoutOptions()) -> str:
-    """The direction that is up for a body whose joints have names; the usual one where the body does not show it.
-
-    Example:
-        >>> names = ("Nose", "LShoulder", "RShoulder", "LHip", "RHip", "LKnee", "RKnee", "LAnkle", "RAnkle")
-        >>> z = np.array([9.0, 8, 8, 5, 5, 3, 3, 0, 0])
-        >>> upward(np.stack([z * 0, np.arange(9.0), z], axis=1)[None], names, "y")
-        'z'
-    """
+    """The direction that is up for a body whose joints have names; the usual one where the body does not show it."""
     words = [canonical(name) for name in names]
     plain = {word.replace("_", ""): word for word in HEIGHT}
     known = [plain.get(word, plain.get(re.sub("^(left|right)", "", word), f"joint {i}")) for i, word in enumerate(words)]
@@ -149,14 +117,7 @@ def upward(joints: FloatArray, names: Sequence[str], usual: str, options: Layout
 
 
 def told(path: Path, name: str, joints: int, own: Skeleton | None = None) -> Skeleton:
-    """The layout that a person names.
-
-    Args:
-        own: what the file itself calls its joints, if it does.
-
-    Raises:
-        ValueError: none has this name, it has another number of joints, or the file has its names in other places.
-    """
+    """The layout that a person names."""
     layout = layout_named(name)
     if len(layout.joints) != joints:
         same = ", ".join(one.name for one in candidates(joints)) or "none"

@@ -25,13 +25,7 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 def of_markers(
     path: Path, points: FloatArray, names: list[str], frames: IntArray, times: FloatArray | None, units: str, up: str
 ) -> Recording:
-    """A recording of named markers.
-
-    Args:
-        points: ``(frames, markers, 3)``, NaN = not seen; with z = 0 everywhere they are 2D.
-        units: of the points, of which lengths become metres; up: the direction that is up, as the file says it.  Empty = it says
-            nothing.
-    """
+    """A recording of named markers. points ``(frames, markers, 3)``."""
     people, joints = people_of(names)
     unit = next((unit for unit, words in UNITS.items() if units.lower() in words), "")
     values = METRES.get(unit, 1.0) * points.reshape(len(points) * len(people), len(joints), 3)
@@ -53,12 +47,7 @@ def of_markers(
 
 
 def people_of(names: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Who is in a file of markers, and the markers of each.
-
-    Example:
-        >>> people_of(("a:hip", "a:knee", "b:hip", "b:knee")), people_of(("a:hip", "a:knee")), people_of(("hip", "x:knee"))
-        ((['a', 'b'], ['hip', 'knee']), ([''], ['hip', 'knee']), ([''], ['hip', 'x:knee']))
-    """
+    """Who is in a file of markers, and the markers of each."""
     parts = [name.partition(":") for name in names]
     if not all(before and colon and after for before, colon, after in parts):
         return [""], list(names)

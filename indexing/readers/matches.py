@@ -18,25 +18,15 @@ SHOWN = 5  # names listed in a message
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """Views whose rows correspond.
+    """Views whose rows correspond."""
 
-    Attributes:
-        views: ``(n, 2 | 3)`` points or ``(n, 2, 3)`` or ``(n, 6)`` lines each, float64, NaN = missing.
-        ids: ``n`` names; numbers of the rows, from 1, where the files have none.
-        names: where each view comes from.
-        weights: ``(n,)``; None = all equal.
-        static: ``(n,)`` known not to move; None = not known of any.
-        static_points: static points ``(m, 3)`` of both views of lines; empty = none.
-        notes: what a reader should know, a sentence each.
-    """
-
-    views: tuple[FloatArray, ...]
-    ids: tuple[str, ...]
-    names: tuple[str, ...]
-    weights: FloatArray | None = None
-    static: BoolArray | None = None
-    static_points: tuple[FloatArray, ...] = ()
-    notes: tuple[str, ...] = ()
+    views: tuple[FloatArray, ...]  # ``(n, 2 | 3)`` points or ``(n, 2, 3)`` or ``(n, 6)`` lines each, float64, NaN = missing
+    ids: tuple[str, ...]  # ``n`` names; numbers of the rows, from 1, where the files have none
+    names: tuple[str, ...]  # where each view comes from
+    weights: FloatArray | None = None  # ``(n,)``; None = all equal
+    static: BoolArray | None = None  # ``(n,)`` known not to move; None = not known of any
+    static_points: tuple[FloatArray, ...] = ()  # static points ``(m, 3)`` of both views of lines; empty = none
+    notes: tuple[str, ...] = ()  # what a reader should know, a sentence each
 
     @property
     def lines(self) -> bool:
@@ -52,25 +42,7 @@ class Matched:
 def read_matches(
     paths: Several[str | Path], *, frames: tuple[int, ...] | None = None, static_points: Several[str | Path] = ()
 ) -> Matched:
-    """Read the views of an alignment.
-
-    Args:
-        paths: a file per view, or one that holds all: ``.npz``, or ``.c3d`` or a 3D ``.npy`` with ``frames``.
-        frames: numbers of the frames that are the views.
-        static_points: for lines, a file of points that stand still for each view.
-
-    Raises:
-        ValueError: one line with the file, the field, what is wrong and what to do.
-
-    Example:
-        >>> import pathlib, tempfile
-        >>> folder = pathlib.Path(tempfile.mkdtemp())
-        >>> _ = (folder / "a.csv").write_text("id,x,y\\np,1,2\\nq,3,4\\n")
-        >>> _ = (folder / "b.csv").write_text("id,x,y\\nq,5,6\\nr,7,8\\np,9,\\n")
-        >>> found = read_matches([folder / "a.csv", folder / "b.csv"])
-        >>> found.ids, found.views[1].tolist()
-        (('p', 'q'), [[9.0, nan], [5.0, 6.0]])
-    """
+    """Read the views of an alignment."""
     if not paths:
         raise ValueError("no files; give a file of points for each view, or one .npz or .c3d with all of them")
     views, resting = _views([Path(path).expanduser() for path in paths], frames)
@@ -96,11 +68,7 @@ def read_matches(
 
 
 def open_points(path: Path) -> PointSet | PointSequence:
-    """One file of points, by its content.
-
-    Raises:
-        ValueError: it does not exist, is empty, of no known format, or holds what it should not.
-    """
+    """One file of points, by its content."""
     head = opening(path)
     if head.startswith(b"ply"):
         return ply.read(path)
@@ -114,11 +82,7 @@ def open_points(path: Path) -> PointSet | PointSequence:
 
 
 def opening(path: Path) -> bytes:
-    """The first bytes of a file of points.
-
-    Raises:
-        ValueError: there is none, or nothing in it.
-    """
+    """The first bytes of a file of points."""
     if os.path.isdir(path):
         raise error(path, "is a folder", "give a file of points")
     return head_of(path)
@@ -146,11 +110,7 @@ def _views(paths: Several[Path], frames: tuple[int, ...] | None) -> tuple[list[P
 
 
 def match(views: Several[PointSet]) -> Matched:
-    """Rows that correspond: by name where all views have names, otherwise by row.
-
-    Raises:
-        ValueError: points and lines, or views without names and of different lengths.
-    """
+    """Rows that correspond: by name where all views have names, otherwise by row."""
     first = views[0]
     other = next((view for view in views if view.lines != first.lines), None)
     if other is not None:

@@ -76,14 +76,7 @@ class Table(NamedTuple):
 
 
 def find_columns(header: Sequence[str]) -> Columns | None:
-    """The columns of a landmark table, or None where the header is not one.
-
-    Example:
-        >>> list(find_columns(["frame", "nose_x", "nose_y", "nose_z", "nose_visibility"]).joints)
-        ['nose']
-        >>> find_columns(["date", "price"]) is None
-        True
-    """
+    """The columns of a landmark table, or None where the header is not one."""
     names = [cell.strip().lower() for cell in header]
     place = {name: i for i, name in reversed(list(enumerate(names)))}
     landmark = next((place[name] for name in LANDMARK if name in place), None)
@@ -110,11 +103,7 @@ def find_columns(header: Sequence[str]) -> Columns | None:
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read a landmark CSV; times come from the time column where there is one, else from frame number / fps.
-
-    Raises:
-        ValueError: no landmark columns, a cell that is not a number, or frames and times that do not increase.
-    """
+    """Read a landmark CSV; times come from the time column where there is one, else from frame number / fps."""
     source.need("mediapipe", "csv")
     columns = find_columns(source.data[0])
     if columns is None:
@@ -132,11 +121,7 @@ def read(source: Source, options: Options) -> ClipSet:
 
 
 def read_table(source: Source, columns: Columns, axes: str, recorded: bool) -> Table:
-    """The rows of a table, of which values are the axes (``"xy"`` or ``"xyz"``) and, where it is recorded, the confidence.
-
-    Raises:
-        ValueError: a cell that is not a number, or frames and times that do not increase.
-    """
+    """The rows of a table, of which values are the axes (``"xy"`` or ``"xyz"``) and, where it is recorded, the confidence."""
     kinds = (*axes, "v") if recorded else tuple(axes)
     numeric = [place for place in (columns.frame, columns.time) if place is not None]
     numeric += [joint[kind] for joint in columns.joints.values() for kind in kinds]
@@ -158,14 +143,7 @@ def read_table(source: Source, columns: Columns, axes: str, recorded: bool) -> T
 
 
 def may_lag(clip: Clip, options: SmoothingOptions = SmoothingOptions()) -> bool:
-    """Whether MediaPipe may have smoothed a body as it was recorded: unless its noise shows that it did not.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> noisy = rng.normal(size=(90, 33, 2))
-        >>> may_lag(Clip(noisy)), may_lag(Clip(np.cumsum(noisy, axis=0)))
-        (False, True)
-    """
+    """Whether MediaPipe may have smoothed a body as it was recorded: unless its noise shows that it did not."""
     steps = np.diff(clip.joints, axis=0)
     joints = np.isfinite(steps).all(axis=(0, 2))
     if len(steps) < options.frames or not joints.any():
@@ -182,10 +160,7 @@ def may_lag(clip: Clip, options: SmoothingOptions = SmoothingOptions()) -> bool:
 
 
 def _frames(source: Source, columns: Columns, keys: FloatArray) -> tuple[IntArray, IntArray, FloatArray | None]:
-    """Frame numbers, the frame of each row, and the time of each frame (None: no time column).
-
-    Rows without a frame column are one frame each; where only times tell rows of a frame together, equal times do.
-    """
+    """Frame numbers, the frame of each row, and the time of each frame (None: no time column)."""
     several = columns.landmark is not None or columns.person is not None
     number = keys[:, 0] if columns.frame is not None else None
     stamp = keys[:, -1] if columns.time is not None else None

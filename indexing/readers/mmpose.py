@@ -22,11 +22,7 @@ REMEDY = "export with MMPoseInferencer(..., pred_out_dir=...) or a demo script's
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read MMPose predictions.
-
-    Raises:
-        ValueError: an instance without ``keypoints``, or scores that do not fit them.
-    """
+    """Read MMPose predictions."""
     source.need("mmpose", "json", "json folder")
     people = [
         (number, [_detection(source, number, i, instance) for i, instance in enumerate(instances)])

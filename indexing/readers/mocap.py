@@ -13,13 +13,7 @@ from indexing.readers.spatial import read_spatial
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read the markers of a C3D file, or of a table (:mod:`indexing.readers.spatial`).
-
-    Times of a C3D file are frame number / its rate, from 0 where the recording begins.
-
-    Raises:
-        ValueError: it is no C3D file, is cut short, or has no markers; or it is a table without x, y and z of every point.
-    """
+    """Read the markers of a C3D file, or of a table (:mod:`indexing.readers.spatial`)."""
     source.need("mocap", "c3d", "csv")
     if source.kind == "csv":
         return read_spatial(source, options)

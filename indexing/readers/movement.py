@@ -28,11 +28,7 @@ def holds_poses(file: Hdf5) -> bool:
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read a data set of poses.
-
-    Raises:
-        ValueError: an axis is missing, or an array does not fit them.
-    """
+    """Read a data set of poses."""
     source.need("movement", "hdf5")
     with opened_hdf5(source.path) as file:
         recording = _recording(file, options)
@@ -85,10 +81,8 @@ def _axes(file: Hdf5, name: str, wanted: tuple[str, ...]) -> tuple[Array, list[s
 
 
 def _names(file: Hdf5, name: str) -> list[str]:
-    """What the axes of an array are called: by the numbers that netCDF gives them, else in the order in which movement has them.
-
-    The scales of HDF5 say the same by references, which a damaged file can send the library after without end.
-    """
+    """What the axes of an array are called: by the numbers that netCDF gives them, else in the order in which movement has
+    them."""
     numbers = file.attribute(name, "_Netcdf4Coordinates")
     axes = {_whole(file.attribute(axis, "_Netcdf4Dimid")): axis for axis in AXES if axis in file}
     if isinstance(numbers, np.ndarray) and numbers.ndim == 1 and numbers.dtype.kind in "iu" and None not in axes:

@@ -22,11 +22,7 @@ REMEDY = "save (frames, joints, 2 or 3), or a clip set: np.savez(file, joints=ar
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read an array of joints over time; times are frame number / fps.
-
-    Raises:
-        ValueError: it has other axes, or the third number may be depth or confidence.
-    """
+    """Read an array of joints over time; times are frame number / fps."""
     source.need("npy", "npy")
     values = read_npy(source.path)
     if values.dtype.kind not in "fiu" or values.ndim != 3 or values.shape[2] not in (2, 3) or not values.size:
@@ -47,11 +43,7 @@ def recording_of(joints: FloatArray, confidence: FloatArray | None = None) -> Re
 
 
 def trusted(path: Path, values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-    """Joints, and their confidence where that is what the third number is.
-
-    Raises:
-        ValueError: it may be either.
-    """
+    """Joints, and their confidence where that is what the third number is."""
     if values.shape[2] == 2:
         return values, None
     third, rest = values[..., 2], values[..., :2]

@@ -60,20 +60,7 @@ class Header(NamedTuple):
 
 
 class NumpyArchive(Mapping[str, Array]):
-    """The arrays of an ``.npz``, each read when it is asked for.
-
-    Raises:
-        ValueError: it is no such file, or its directory is damaged; on reading an array, that array is no array, is encrypted,
-            packed as numpy never does, larger than it can be, or of Python objects.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "a.npz"
-        >>> np.savez(path, x=np.arange(3), y=np.zeros((4, 2)))
-        >>> archive = NumpyArchive(path)
-        >>> list(archive), archive.shape("y"), archive["x"].tolist()
-        (['x', 'y'], (4, 2), [0, 1, 2])
-    """
+    """The arrays of an ``.npz``, each read when it is asked for."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -104,11 +91,7 @@ class NumpyArchive(Mapping[str, Array]):
         return name in self._members  # without reading it
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """The shape of an array, which is not read.
-
-        Raises:
-            ValueError: it has none.
-        """
+        """The shape of an array, which is not read."""
         return _header(self.path, f"array {shown(name)}", self._opened(name), self._members[name].file_size).shape
 
     def _opened(self, name: str) -> Take:
@@ -135,11 +118,7 @@ class NumpyArchive(Mapping[str, Array]):
 
 
 def read_npy(path: Path) -> Array:
-    """The array of an ``.npy`` file.
-
-    Raises:
-        ValueError: it is none, or declares other than it holds.
-    """
+    """The array of an ``.npy`` file."""
     with opened(path) as file:
         header = _header(path, "the array", file.read, size_of(path))
         return _values(path, "the array", file.read, header)

@@ -25,11 +25,7 @@ RIVALS = {25: (skeleton.BODY25, skeleton.BODY25B)}
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read OpenPose JSON; the frame number is the one in the file's name.
-
-    Raises:
-        ValueError: a file without ``people``, or keypoints that are not triples.
-    """
+    """Read OpenPose JSON; the frame number is the one in the file's name."""
     source.need("openpose", "json folder", "json")
     recording = gather(source.path, [(number, _people(source, number, frame)) for number, frame in _frames(source)])
     joints = recording.joints.shape[1]

@@ -31,27 +31,16 @@ FRAMES = "it seems to hold tracks (frames, n, 2): leave --pair out, or say which
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """Matches of two images.
+    """Matches of two images."""
 
-    Attributes:
-        path: the file.
-        name: of the pair: its key in a file of several, otherwise the file's name.
-        x1: ``(n, 2)`` of image 1, NaN = missing.
-        x2: ``(n, 2)`` of image 2.
-        ids: ``n`` names; numbers of the rows, from 1, where the file has none.
-        weights: ``(n,)`` not negative; None = all equal.
-        known: ``(n,)`` known labels, 0 outlier, 1.. the bodies; None = not known.
-        size: width and height of the images; None = the file does not say.
-    """
-
-    path: str
-    name: str
-    x1: FloatArray
-    x2: FloatArray
-    ids: tuple[str, ...]
-    weights: FloatArray | None = None
-    known: NDArray[np.int64] | None = None
-    size: tuple[float, float] | None = None
+    path: str  # the file
+    name: str  # of the pair: its key in a file of several, otherwise the file's name
+    x1: FloatArray  # ``(n, 2)`` of image 1, NaN = missing
+    x2: FloatArray  # ``(n, 2)`` of image 2
+    ids: tuple[str, ...]  # ``n`` names; numbers of the rows, from 1, where the file has none
+    weights: FloatArray | None = None  # ``(n,)`` not negative; None = all equal
+    known: NDArray[np.int64] | None = None  # ``(n,)`` known labels, 0 outlier, 1.. the bodies; None = not known
+    size: tuple[float, float] | None = None  # width and height of the images; None = the file does not say
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -60,23 +49,7 @@ class MatchedPair:
 
 
 def read_pair(path: str | Path, pair: str | None = None) -> MatchedPair:
-    """Read the matches of two images.
-
-    Args:
-        path: ``.npz`` with ``x1, x2`` (or ``NAME/x1, NAME/x2``), ``.npy (n, 4)``, or a table with columns ``x1,y1,x2,y2``.
-        pair: NAME, in an ``.npz`` of several.
-
-    Raises:
-        ValueError: one line with the file, the field, what is wrong and what to do.
-
-    Example:
-        >>> import pathlib, tempfile
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "m.csv"
-        >>> _ = path.write_text("1,2,3,4\\n5,6,7,\\n")
-        >>> found = read_pair(path)
-        >>> found.ids, found.x2.tolist(), found.seen.tolist()
-        (('1', '2'), [[3.0, 4.0], [7.0, nan]], [True, False])
-    """
+    """Read the matches of two images."""
     path = Path(path).expanduser()
     head = opening(path)
     if head.startswith(b"PK"):
@@ -240,25 +213,15 @@ SIDE = 1600  # pixels kept along the longer side: a panel of a report shows fewe
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph.
+    """A photograph."""
 
-    Attributes:
-        name: of the file.
-        gray: ``(h, w)`` in [0, 1], perhaps smaller than the file's.
-        size: width and height in pixels of the file, in which points are measured.
-    """
-
-    name: str
-    gray: NDArray[np.float32]
-    size: tuple[float, float]
+    name: str  # of the file
+    gray: NDArray[np.float32]  # ``(h, w)`` in [0, 1], perhaps smaller than the file's
+    size: tuple[float, float]  # width and height in pixels of the file, in which points are measured
 
 
 def read_image(path: str | Path) -> Photograph:
-    """Read a photograph, turned as its EXIF entry says (as OpenCV does).
-
-    Raises:
-        ValueError: no such file, or none that can be read.
-    """
+    """Read a photograph, turned as its EXIF entry says (as OpenCV does)."""
     from PIL import Image, ImageOps
 
     path = Path(path).expanduser()

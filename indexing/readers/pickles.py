@@ -167,11 +167,7 @@ class _Reader(pickle._Unpickler):
         raise Refused("more steps than its size allows")
 
     def find_class(self, module: str, name: str) -> Any:
-        """A stand-in, whatever the file names.
-
-        Raises:
-            Refused: it is not one of those known.
-        """
+        """A stand-in, whatever the file names."""
         found = self._known.get((module.replace("__builtin__", "builtins"), name))
         if found is None:
             raise Refused(f"the name {clipped(f'{module}.{name}', VALUE)}")
@@ -232,11 +228,7 @@ class _Reader(pickle._Unpickler):
 
 
 def _fill(into: Any, items: list[Any]) -> None:
-    """Put keys and values, which take turns, into a dictionary.
-
-    Raises:
-        Refused: it is none, or a key is neither text nor a number.
-    """
+    """Put keys and values, which take turns, into a dictionary."""
     if type(into) is not dict or len(items) % 2:
         raise Refused("keys and values without a dictionary")
     for key, value in zip(items[::2], items[1::2], strict=True):
@@ -278,29 +270,12 @@ _OTHER = {_CODES[name]: OTHERS.get(name, f"the step {name}") for name in _CODES 
 
 
 def read_pickle(path: Path) -> Any:
-    """What a pickle holds: numpy arrays, numbers, text, lists, tuples and dictionaries.
-
-    Raises:
-        ValueError: it is none, is truncated, or holds anything else; the message names it.
-    """
+    """What a pickle holds: numpy arrays, numbers, text, lists, tuples and dictionaries."""
     return unpickled(path, read_bytes(path), "")
 
 
 def unpickled(path: Path, data: bytes, where: str) -> Any:
-    """The same of bytes in a file.
-
-    Args:
-        where: what of the file it is, for messages; empty for all of it.
-
-    Example:
-        >>> unpickled(Path("a.pkl"), pickle.dumps({"label": 3, "xy": np.arange(4.0).reshape(2, 2)}), "")["xy"].tolist()
-        [[0.0, 1.0], [2.0, 3.0]]
-        >>> try:
-        ...     unpickled(Path("a.pkl"), pickle.dumps(print), "")
-        ... except ValueError as problem:
-        ...     print(str(problem).partition(";")[0])
-        a.pkl: the pickle holds the name builtins.print, which is not read from a file
-    """
+    """The same of bytes in a file."""
     who = f"{where}: the pickle" if where else "the pickle"
     try:
         return _finished(_Reader(data).load(), {})

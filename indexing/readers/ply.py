@@ -28,11 +28,7 @@ class Element:
 
 
 def read(path: Path) -> PointSet:
-    """The vertices; a property ``id`` names them.
-
-    Raises:
-        ValueError: no PLY header, no vertices with x, y, z, or fewer of them than the header says.
-    """
+    """The vertices; a property ``id`` names them."""
     data = read_bytes(path)
     order, elements, start = _header(path, data)
     before: list[Element] = []

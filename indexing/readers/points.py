@@ -22,22 +22,13 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
-    """Points or lines of one view.
+    """Points or lines of one view."""
 
-    Attributes:
-        path: where they come from, with the frame or the key where the file holds several views.
-        values: ``(n, d)`` points, ``(n, 2, 3)`` lines by two points each, or ``(n, 6)`` lines in Pluecker coordinates; NaN =
-            missing.
-        ids: a name for each; None = they have none.
-        weights: ``(n,)`` not negative; None = all equal.
-        static: ``(n,)`` known not to move; None = not known of any.
-    """
-
-    path: str
-    values: FloatArray
-    ids: tuple[str, ...] | None = None
-    weights: FloatArray | None = None
-    static: BoolArray | None = None
+    path: str  # where they come from, with the frame or the key where the file holds several views
+    values: FloatArray  # ``(n, d)`` points, ``(n, 2, 3)`` lines by two points each, or ``(n, 6)`` lines in Pluecker coordinates
+    ids: tuple[str, ...] | None = None  # a name for each; None = they have none
+    weights: FloatArray | None = None  # ``(n,)`` not negative; None = all equal
+    static: BoolArray | None = None  # ``(n,)`` known not to move; None = not known of any
 
     @property
     def lines(self) -> bool:
@@ -46,11 +37,7 @@ class PointSet:
 
 
 def as_view(values: Any, path: str | Path, lines: bool = False) -> FloatArray:
-    """An array of a file as points ``(n, 2 | 3)`` or lines ``(n, 2, 3)`` or ``(n, 6)``, float64.
-
-    Raises:
-        ValueError: another shape, no rows, values that are no real numbers, or infinite.
-    """
+    """An array of a file as points ``(n, 2 | 3)`` or lines ``(n, 2, 3)`` or ``(n, 6)``, float64."""
     array = np.asarray(values)
     expected = "lines are (n, 2, 3), two points each, or (n, 6), Pluecker" if lines else "points are (n, 2) or (n, 3)"
     if array.dtype.kind not in "fiu":
@@ -74,31 +61,18 @@ def as_view(values: Any, path: str | Path, lines: bool = False) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class PointSequence:
-    """Points over time.
+    """Points over time."""
 
-    Attributes:
-        path: the file.
-        values: ``(frames, n, d)``, NaN = missing.
-        ids: ``n`` names; None = none.
-        first: number of the first frame.
-        rate: frames per second; 0 = not known.
-        units: of the values; up: the direction that is up, as of a clip.  Empty = not known.
-    """
-
-    path: str
-    values: FloatArray
-    ids: tuple[str, ...] | None = None
-    first: int = 0
-    rate: float = 0.0
-    units: str = ""
+    path: str  # the file
+    values: FloatArray  # ``(frames, n, d)``, NaN = missing
+    ids: tuple[str, ...] | None = None  # ``n`` names; None = none
+    first: int = 0  # number of the first frame
+    rate: float = 0.0  # frames per second; 0 = not known
+    units: str = ""  # of the values; up: the direction that is up, as of a clip. Empty = not known
     up: str = ""
 
     def views(self, frames: tuple[int, ...] | None) -> list[PointSet]:
-        """The frames of these numbers; without numbers, all, where there are two or three.
-
-        Raises:
-            ValueError: no numbers and more than three frames, or a frame that is not there.
-        """
+        """The frames of these numbers; without numbers, all, where there are two or three."""
         count = len(self.values)
         last = self.first + count - 1
         if frames is None:
@@ -126,11 +100,7 @@ EXPECTED = "name the columns x,y or x,y,z, of lines x1,y1,z1,x2,y2,z2, and a col
 
 
 def read(path: Path) -> PointSet:
-    """The points of a CSV file; ``;`` and tabs separate, too.
-
-    Raises:
-        ValueError: no rows, unknown columns, a short row, or a cell that is not a number: with row, column and value.
-    """
+    """The points of a CSV file; ``;`` and tabs separate, too."""
     rows = read_rows(path)
     if not rows:
         raise error(path, "the file is empty", "export it again")
@@ -161,11 +131,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def check_widths(path: Path, rows: Sequence[Row], names: Sequence[str]) -> None:
-    """Raise on a row with other than a cell per column.
-
-    Raises:
-        ValueError: naming the row.
-    """
+    """Raise on a row with other than a cell per column."""
     for line, cells in rows:
         if len(cells) != len(names):
             raise error(path, f"row {line} has {len(cells)} cells, the first row {len(names)}", "correct the row")
@@ -211,11 +177,7 @@ def column_values(path: Path, rows: Sequence[Row], names: Sequence[str], columns
 
 
 def row_names(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str] = IDS) -> tuple[str, ...] | None:
-    """The names of the rows, from the first column that is known to hold such; None = no column does.
-
-    Raises:
-        ValueError: a row without a name, or two of the same.
-    """
+    """The names of the rows, from the first column that is known to hold such; None = no column does."""
     column = next((names.index(name) for name in known if name in names), None)
     if column is None:
         return None
@@ -255,11 +217,7 @@ EXTRA = ("ids", "weights", "static", "static1", "static2")
 
 
 def read_npy(path: Path) -> PointSet | PointSequence:
-    """One view ``(n, d)``, lines ``(n, 2, 3)`` or ``(n, 6)``, or several views ``(views, n, d)``.
-
-    Raises:
-        ValueError: no such array.
-    """
+    """One view ``(n, d)``, lines ``(n, 2, 3)`` or ``(n, 6)``, or several views ``(views, n, d)``."""
     array = read_npy_file(path)
     if array.ndim == 3 and array.shape[1:] != (2, 3) and array.shape[-1] in (2, 3):
         return PointSequence(str(path), as_view(array.reshape(-1, array.shape[-1]), path).reshape(array.shape))
@@ -268,11 +226,7 @@ def read_npy(path: Path) -> PointSet | PointSequence:
 
 
 def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
-    """All views, and for lines the static points of both.
-
-    Raises:
-        ValueError: no known keys, a view is missing, or arrays that do not fit.
-    """
+    """All views, and for lines the static points of both."""
     archive = NumpyArchive(path)
     names = list(archive)
     prefix = next((prefix for prefix in ("x", "P", "l") if f"{prefix}1" in names), None)

@@ -26,11 +26,7 @@ GROWTH_BLOCK = 2**24, 64  # bytes, and times the bytes of the file, that its cli
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read a set; a label is a number, as it is in the file, and ``split`` says which parts of the set a clip is in.
-
-    Raises:
-        ValueError: no annotations, or one without joints over time; the message names it.
-    """
+    """Read a set; a label is a number, as it is in the file, and ``split`` says which parts of the set a clip is in."""
     source.need("pyskl", "pickle")
     data = read_pickle(source.path)
     annotations = data.get("annotations") if isinstance(data, dict) else data

@@ -47,19 +47,7 @@ IntArray = NDArray[np.int64]
 def choose(
     path: Path, recording: Recording, person: str, linking: LinkOptions = LinkOptions()
 ) -> list[tuple[Hashable | None, IntArray]]:
-    """The detections that make each clip.
-
-    Args:
-        recording: joints not seen are NaN, and every detection has at least one joint.
-        person: the rule (see the module).
-        linking: how people are followed where the file has no ids.
-
-    Returns:
-        per clip, the identity (None where people are not tracked) and its rows of the recording, one per frame.
-
-    Raises:
-        ValueError: ``"all"`` without ids, or ``"confident"`` without confidences.
-    """
+    """The detections that make each clip."""
     ids, names, repeated = _given(recording)
     if person == "all" and ids is None:
         why = f"its person ids repeat in frame {repeated}" if repeated is not None else "it has no person ids"
@@ -110,26 +98,8 @@ def _given(recording: Recording) -> tuple[IntArray | None, list[Hashable], int |
 
 
 def link(at: IntArray, joints: FloatArray, options: LinkOptions = LinkOptions()) -> IntArray:
-    """Identities by position: each detection continues the nearest identity, nearest pairs first.
-
-    An identity is expected one step farther along its last movement (people who cross would swap otherwise), and waits there
-    until ``options.waiting`` others have been seen since.  Distance is the mean over the joints that both show, in units of the
-    larger box's diagonal; beyond ``options.reach`` a new identity begins.  Tracked points have no box: one alone in every frame is
-    always the same one.
-
-    Args:
-        at: ``(m,)`` frame of each detection.
-        joints: ``(m, n, 2 | 3)``, NaN = not seen.
-
-    Returns:
-        ``(m,)`` identities 0, 1, ...
-
-    Example:
-        >>> import numpy as np
-        >>> box = np.array([[0.0, 0.0], [10.0, 20.0]])
-        >>> link(np.array([0, 0, 1, 1]), np.stack([box, box + 100, box + 101, box + 1])).tolist()
-        [0, 1, 1, 0]
-    """
+    """Identities by position: each detection continues the nearest identity, nearest pairs first. at ``(m,)``, joints
+    ``(m, n, 2 | 3)`` -> ``(m,)``."""
     identity = np.full(len(at), -1, dtype=np.int64)
     count, waiting = 0, np.zeros(0, dtype=np.int64)
     last = np.zeros(len(at), dtype=np.int64)  # per identity, its latest detection,
@@ -200,19 +170,8 @@ class Detection(NamedTuple):
 
 @dataclass(frozen=True)
 class Recording:
-    """Everything one file says: ``m`` detections in ``f`` frames.
-
-    Args:
-        frames: ``(f,)`` the frame numbers that the file names, increasing, with or without people.
-        at: ``(m,)`` which of the frames each detection is in.
-        joints: ``(m, n, 2 | 3)``.
-        confidence: ``(m, n)``, or None where the file has none.
-        tracks: one identity per detection (None = not tracked), or None where the file has none.
-        times: ``(f,)`` seconds, where the file has them; otherwise times are frame number / fps.
-        up: as in :class:`indexing.clip.Clip`.
-        layouts: that the joints may be of, where their number alone speaks for ``skeleton``.
-        meta: what else is known of everybody in it.
-    """
+    """Everything one file says: ``m`` detections in ``f`` frames. frames ``(f,)``, at ``(m,)``, joints ``(m, n, 2 | 3)``,
+    confidence ``(m, n)``, times ``(f,)``."""
 
     frames: IntArray
     at: IntArray
@@ -227,11 +186,7 @@ class Recording:
 
 
 def numbers(path: Path, where: str, value: Any) -> FloatArray:
-    """An array of float64 from parsed JSON (``null`` = NaN).
-
-    Raises:
-        ValueError: it holds something else than numbers, or rows of different lengths.
-    """
+    """An array of float64 from parsed JSON (``null`` = NaN)."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # of whole numbers of hundreds of digits
@@ -239,11 +194,7 @@ def numbers(path: Path, where: str, value: Any) -> FloatArray:
 
 
 def frame_numbers(path: Path, values: FloatArray) -> IntArray:
-    """Frame numbers from a column of a table.
-
-    Raises:
-        ValueError: a row has none, or one that no frame can have.
-    """
+    """Frame numbers from a column of a table."""
     bad = np.flatnonzero(~(np.abs(values) < LAST_FRAME))
     if bad.size:
         raise error(path, f"data row {bad[0] + 1} has no frame number ({values[bad[0]]:g})", "number every row")
@@ -260,11 +211,7 @@ def track_id(value: Any) -> Hashable | None:
 
 
 def flat(path: Path, where: str, value: Any, width: int = 3) -> tuple[FloatArray, FloatArray]:
-    """``(n, width - 1)`` joints and ``(n,)`` confidences from a flat list ``x, y, c, x, y, c, ...``.
-
-    Raises:
-        ValueError: the length is not a multiple of ``width``.
-    """
+    """``(n, width - 1)`` joints and ``(n,)`` confidences from a flat list ``x, y, c, x, y, c, ...``."""
     array = numbers(path, where, value)
     if array.ndim == 2 and array.shape[1] == width:  # some exporters keep one row per joint
         array = array.ravel()
@@ -279,14 +226,7 @@ def flat(path: Path, where: str, value: Any, width: int = 3) -> tuple[FloatArray
 
 
 def gather(path: Path, frames: Sequence[tuple[int, Sequence[Detection]]]) -> Recording:
-    """A recording from the people of each frame.
-
-    Args:
-        frames: frame number and detections, in any order.
-
-    Raises:
-        ValueError: no person at all, or people with different numbers of joints.
-    """
+    """A recording from the people of each frame."""
     frames = sorted(frames, key=lambda frame: frame[0])
     if frames and max(abs(frames[0][0]), abs(frames[-1][0])) >= LAST_FRAME:
         raise error(path, f"frame number {shown(frames[-1][0])} is beyond any recording", "number images by frame")
@@ -314,11 +254,7 @@ def gather(path: Path, frames: Sequence[tuple[int, Sequence[Detection]]]) -> Rec
 
 
 def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
-    """Choose people by ``options.person`` and make their clips.
-
-    Raises:
-        ValueError: nobody was seen, frames or times do not increase, a confidence is NaN, or the person rule does not apply.
-    """
+    """Choose people by ``options.person`` and make their clips."""
     recording = _named(path, _mask(path, _scale(path, recording, options), options.min_confidence), options)
     times, fps = _times(path, recording, options.fps)
     name = path.name or path.resolve().name

@@ -33,11 +33,7 @@ WIDEST_BLOCK = 2**27  # values of all animals in all frames of an export: a day 
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read SLEAP's files; times are ``frame_idx`` / fps, the project's own fps where it knows it.
-
-    Raises:
-        ValueError: no frames or nodes, several videos or skeletons in a project, tables that do not fit each other.
-    """
+    """Read SLEAP's files; times are ``frame_idx`` / fps, the project's own fps where it knows it."""
     source.need("sleap", "csv", "hdf5")
     if source.kind == "csv":
         return to_clips(source.path, _csv(source), options)
@@ -190,11 +186,7 @@ def _about(file: Hdf5) -> dict[str, Any]:
 
 
 def _one_video(file: Hdf5, video: Array) -> float | None:
-    """The frame rate of the only video with labels, where the project knows it.
-
-    Raises:
-        ValueError: there are several: a recording is one of them.
-    """
+    """The frame rate of the only video with labels, where the project knows it."""
     used = sorted(set(video.tolist()))
     try:
         about = [json.loads(text) for text in file.texts("videos_json")] if "videos_json" in file else []
@@ -260,11 +252,7 @@ def _points(file: Hdf5, instances: dict[str, Array], which: Array, nodes: int) -
 def _own_points(
     file: Hdf5, table: str, code: int, instances: dict[str, Array], which: Array, nodes: int
 ) -> tuple[dict[str, Array], Array]:
-    """A table of points, and where those of each animal begin; no two animals share points.
-
-    Raises:
-        ValueError: an animal has other points than its skeleton has nodes, or all of them have more than there are.
-    """
+    """A table of points, and where those of each animal begin; no two animals share points."""
     found = file.records(table, ("x", "y", "visible", *(("score",) if code == PREDICTED else ())))
     start, end = (instances[name][which].astype(np.int64) for name in ("point_id_start", "point_id_end"))
     if (end - start != nodes).any() or start.min() < 0 or end.max() > len(found["x"]):

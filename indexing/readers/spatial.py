@@ -47,11 +47,7 @@ class SpatialOptions:
 
 
 def is_spatial(source: Source, columns: Columns, options: SpatialOptions = SpatialOptions()) -> bool:
-    """Whether a table holds points in space rather than landmarks in an image.
-
-    Raises:
-        ValueError: its names and values may be either's; the message says what to give.
-    """
+    """Whether a table holds points in space rather than landmarks in an image."""
     joints = columns.joints
     flat = [joint for joint, kinds in joints.items() if "z" not in kinds]
     if len(flat) == len(joints) or any("v" in kinds and _visibility(source, kinds["v"]) for kinds in joints.values()):
@@ -71,11 +67,7 @@ def is_spatial(source: Source, columns: Columns, options: SpatialOptions = Spati
 
 
 def read_spatial(source: Source, options: Options) -> ClipSet:
-    """Read a table of points in space; times come from the time column where there is one, else from frame number / fps.
-
-    Raises:
-        ValueError: a point without x, y and z, a cell that is not a number, or frames and times that do not increase.
-    """
+    """Read a table of points in space; times come from the time column where there is one, else from frame number / fps."""
     columns = find_columns(source.data[0])
     flat = None if columns is None else [joint or "the points" for joint, kinds in columns.joints.items() if "z" not in kinds]
     if columns is None or flat:

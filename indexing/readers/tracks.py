@@ -35,42 +35,22 @@ from indexing.readers.points import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSet:
-    """Points followed through views.
+    """Points followed through views."""
 
-    Attributes:
-        path: the file, or the first of several.
-        values: ``(views, n, 2 | 3)``, NaN = missing.
-        ids: ``n`` names.
-        views: names of the views: frame numbers, times, or files.
-        times: ``(views,)``; None = the files say nothing of time.
-        weights: ``(views, n)`` not negative; None = all equal.
-        static: ``(n,)`` known to stand still; None = not known of any.
-        notes: what a reader should know, a sentence each.
-        by_time: whether the views are named by their times.
-        start: the time from which ``times`` count, in full: that of the first view where they begin at 0.
-        known: ``(n,)`` known labels, 0 outlier, 1.. the bodies; None = not known.
-    """
-
-    path: str
-    values: FloatArray
-    ids: tuple[str, ...]
-    views: tuple[str, ...]
-    times: FloatArray | None = None
-    weights: FloatArray | None = None
-    static: BoolArray | None = None
-    notes: tuple[str, ...] = field(default=())
-    by_time: bool = False
-    start: float = 0.0
-    known: NDArray[np.int64] | None = None
+    path: str  # the file, or the first of several
+    values: FloatArray  # ``(views, n, 2 | 3)``, NaN = missing
+    ids: tuple[str, ...]  # ``n`` names
+    views: tuple[str, ...]  # names of the views: frame numbers, times, or files
+    times: FloatArray | None = None  # ``(views,)``; None = the files say nothing of time
+    weights: FloatArray | None = None  # ``(views, n)`` not negative; None = all equal
+    static: BoolArray | None = None  # ``(n,)`` known to stand still; None = not known of any
+    notes: tuple[str, ...] = field(default=())  # what a reader should know, a sentence each
+    by_time: bool = False  # whether the views are named by their times
+    start: float = 0.0  # the time from which ``times`` count, in full: that of the first view where they begin at 0
+    known: NDArray[np.int64] | None = None  # ``(n,)`` known labels, 0 outlier, 1.. the bodies; None = not known
 
     def since_first(self) -> TrackSet:
-        """The same with times that begin at 0; views that are named by their times are named by the new ones.
-
-        Example:
-            >>> tracks = TrackSet("t.csv", np.zeros((2, 1, 2)), ("a",), ("1e9", "1e9"), np.array([1e9, 1e9 + 0.2]), by_time=True)
-            >>> tracks.since_first().views, tracks.since_first().start
-            (('0', '0.2'), 1000000000.0)
-        """
+        """The same with times that begin at 0; views that are named by their times are named by the new ones."""
         if self.times is None:
             return self
         first = float(self.times[0])
@@ -78,11 +58,7 @@ class TrackSet:
         return replace(self, views=views, times=self.times - first, start=self.start + first)
 
     def select(self, frames: Sequence[str]) -> TrackSet:
-        """The views of these names, in this order.
-
-        Raises:
-            ValueError: no view has such a name, or one is asked for twice.
-        """
+        """The views of these names, in this order."""
         twice = next((frame for i, frame in enumerate(frames) if frame in frames[:i]), None)
         if twice is not None:
             raise error(self.path, f"frame {twice} is asked for twice", "name each view once")
@@ -119,34 +95,19 @@ class TrackSet:
 
 
 def since(times: FloatArray) -> tuple[str, ...]:
-    """Times since the first, in as many decimals as they have; in full where that would give two the same name.
-
-    Example:
-        >>> since(np.array([1700000000.25, 1700000000.45, 1700000001.25]))
-        ('0', '0.2', '1')
-    """
+    """Times since the first, in as many decimals as they have; in full where that would give two the same name."""
     finest = float(np.spacing(np.abs(times).max()))
     short = tuple(f"{step:.10g}" for step in np.round(times - times[0], int(np.floor(-np.log10(finest)))))
     return short if len(set(short)) == len(short) else tuple(exact(time - times[0]) for time in times)
 
 
 def exact(value: float) -> str:
-    """A number with all the digits that it has, and no more.
-
-    Example:
-        >>> exact(1700000000.25), exact(3.0)
-        ('1700000000.25', '3')
-    """
+    """A number with all the digits that it has, and no more."""
     return repr(float(value)).removesuffix(".0")
 
 
 def numbered(count: int) -> tuple[str, ...]:
-    """Names of tracks that have none.
-
-    Example:
-        >>> numbered(3)
-        ('1', '2', '3')
-    """
+    """Names of tracks that have none."""
     return tuple(str(i + 1) for i in range(count))
 
 
@@ -172,11 +133,7 @@ def is_long(names: Sequence[str]) -> bool:
 
 
 def check_headings(path: Path) -> None:
-    """Raise on a table that is neither of tracks nor of the points of one view, with the columns that tracks need.
-
-    Raises:
-        ValueError: rows without headings, or headings without x and y.
-    """
+    """Raise on a table that is neither of tracks nor of the points of one view, with the columns that tracks need."""
     names = heading(path)
     if not names and read_rows(path):
         raise error(path, "row 1 holds numbers, and no row names the columns", EXPECTED)
@@ -185,11 +142,7 @@ def check_headings(path: Path) -> None:
 
 
 def read_long(path: Path) -> TrackSet:
-    """The tracks of a table; rows that are absent and cells that are empty are missing observations.
-
-    Raises:
-        ValueError: columns that are absent, cells that are no numbers, a point twice in a view, a view with several times.
-    """
+    """The tracks of a table; rows that are absent and cells that are empty are missing observations."""
     rows, names = read_rows(path)[1:], heading(path)
     if not rows:
         raise error(path, "the file has a header but no rows", "export it again")
@@ -298,11 +251,7 @@ KNOWN = ("label", "labels", "s")  # the last one as in the files of Hopkins 155
 
 
 def read_arrays(path: Path, key: str | None) -> TrackSet:
-    """Tracks of an ``.npz``.
-
-    Raises:
-        ValueError: no tracks in it, several without a key, arrays that do not fit.
-    """
+    """Tracks of an ``.npz``."""
     archive = NumpyArchive(path)
     before, name = _chosen(path, list(archive), key)
     values, extra = archive[name], {kind: archive[before + kind] for kind in EXTRA if before + kind in archive}
@@ -376,26 +325,7 @@ FORMATS = "give a table with columns frame, id, x, y, an array (views, n, 2 or 3
 def read_tracks(
     paths: Sequence[str | Path], *, frames: Sequence[str] | None = None, key: str | None = None, static: Path | None = None
 ) -> TrackSet:
-    """Read tracks.
-
-    Args:
-        paths: a table with a column ``frame`` or ``time``, an ``.npz``, ``.npy`` or ``.c3d``; or a file of points for each view.
-        frames: names of the views to take; all by default.
-        key: of an ``.npz`` with several sequences ``key/y``, or several arrays, the one to take.
-        static: a file that names the points known to stand still, in a column ``id``; where it has a column ``static``, those
-            marked 1.
-
-    Raises:
-        ValueError: one line with the file, the field, what is wrong and what to do.
-
-    Example:
-        >>> import pathlib, tempfile
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "tracks.csv"
-        >>> _ = path.write_text("time,id,x,y\\n0,p,1,2\\n0,q,3,4\\n0.5,p,2,2\\n1.5,q,3,5\\n1.5,p,4,2\\n")
-        >>> found = read_tracks([path])
-        >>> found.ids, found.times.tolist(), found.values[:, 1].tolist()
-        (('p', 'q'), [0.0, 0.5, 1.5], [[3.0, 4.0], [nan, nan], [3.0, 5.0]])
-    """
+    """Read tracks."""
     files = [Path(path).expanduser() for path in paths]
     if not files:
         raise ValueError(f"no files; {FORMATS}")

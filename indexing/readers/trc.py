@@ -37,11 +37,7 @@ class ClockOptions:
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read a marker file; times are those of its column ``Time``, or frame number / ``DataRate``.
-
-    Raises:
-        ValueError: a header line is missing, its names do not fit its columns, or a cell is no number.
-    """
+    """Read a marker file; times are those of its column ``Time``, or frame number / ``DataRate``."""
     source.need("trc", "trc")
     path = source.path
     lines = [line.rstrip("\r") for line in read_text(path, REMEDY).split("\n")]
@@ -68,12 +64,7 @@ def read(source: Source, options: Options) -> ClipSet:
 
 
 def unrounded(times: FloatArray, frames: IntArray, rate: float, options: ClockOptions = ClockOptions()) -> FloatArray:
-    """Times that are those of frames at a steady rate but for the digits that were written, exactly so; others as they are.
-
-    Example:
-        >>> unrounded(np.array([0.0, 0.017, 0.033]), np.arange(3), 60.0).tolist()
-        [0.0, 0.0166667, 0.0333333]
-    """
+    """Times that are those of frames at a steady rate but for the digits that were written, exactly so; others as they are."""
     even = times[0] + (frames - frames[0]) / rate
     apart = np.abs(times - even).max() * rate if np.isfinite(times).all() else np.inf
     return even if options.exact < apart <= options.rounded else times

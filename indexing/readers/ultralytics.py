@@ -25,11 +25,7 @@ NEARLY = 0.05  # box sizes: joints guessed a little outside their box say nothin
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Read Ultralytics results; frames of a JSON list count from 0, those of label files from the number in their name.
-
-    Raises:
-        ValueError: people without keypoints, or label lines that no pose layout explains.
-    """
+    """Read Ultralytics results; frames of a JSON list count from 0, those of label files from the number in their name."""
     source.need("ultralytics", "json", "json folder", "txt folder")
     if source.kind == "txt folder":
         frames = _labels(source)
@@ -119,11 +115,7 @@ def _last_is_id(table: FloatArray, extras: int) -> bool:
 
 
 def _layout(source: Source, table: FloatArray) -> tuple[int, int]:
-    """``(2 | 3, 0 | 1 | 2)``: numbers per joint and numbers after the joints, for all lines of the recording.
-
-    Each reading that the number of columns allows is scored by how far its joints lie outside the boxes (in box sizes);
-    among nearly equal ones a known joint layout wins, then the reading with v, then fewer numbers after the joints.
-    """
+    """``(2 | 3, 0 | 1 | 2)``: numbers per joint and numbers after the joints, for all lines of the recording."""
     columns = table.shape[1] - 5
     readings: list[tuple[float, int, int]] = []
     for dims in (3, 2):

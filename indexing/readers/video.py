@@ -11,11 +11,7 @@ from indexing.readers.recording import NobodySeen, of_people, to_clips
 
 
 def read(source: Source, options: Options) -> ClipSet:
-    """Find the people in a video; ``person`` says who of them is meant, as for files of keypoints.
-
-    Raises:
-        ValueError: no pose model is there, the video cannot be read, or it shows nobody.
-    """
+    """Find the people in a video; ``person`` says who of them is meant, as for files of keypoints."""
     from indexing.pose import available, detect
     from indexing.pose.models import FETCH
 

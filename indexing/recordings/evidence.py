@@ -21,12 +21,7 @@ BLOCK = 2000  # windows compared at once: bounds memory whatever the length of t
 
 @dataclass(frozen=True)
 class Durations:
-    """How long the actions of a model last, and which of them are cycles.
-
-    seconds: ``(exemplars,)``, NaN for one that lasts so much longer or shorter than is usual for its class that it must hold more
-    or less than the action: it is not compared as a whole; typical: ``(classes,)`` the median of each; cyclic: ``(classes,)``
-    0 = performed once, 1 = a cycle.
-    """
+    """How long the actions of a model last, and which of them are cycles."""
 
     seconds: Array
     typical: Array
@@ -68,10 +63,7 @@ class Durations:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where segments of one stretch of a recording may begin and end.
-
-    edges: ``(cells + 1,)`` seconds; windows: ``(W, 2)`` first and last edge, sorted by the last.
-    """
+    """Where segments of one stretch of a recording may begin and end."""
 
     edges: Array
     windows: Array

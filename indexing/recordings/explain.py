@@ -31,11 +31,7 @@ from indexing.windows import Ragged, ragged
 
 @dataclass(frozen=True)
 class Stretch:
-    """One stretch of a recording without gaps: its lattice, and what is known of its cells.
-
-    contrast: ``(cells, classes)`` of the moments, in standard deviations; motion ``(cells,)``; present ``(cells,)``; whole
-    ``(W, classes)``; frames: first frame, and the one after the last.
-    """
+    """One stretch of a recording without gaps: its lattice, and what is known of its cells."""
 
     source: Ragged
     lattice: Lattice
@@ -54,13 +50,7 @@ class Stretch:
 def explain(
     model: ShapeModel, clip: Clip, stream: Stream, classes: Sequence[Any], rate: float | None, progress: Progress = None
 ) -> Explanation:
-    """The segments of a recording, and what they say of its frames.
-
-    Args:
-        clip: times from 0 on; stream: how moments are scanned, ``window`` at most; classes: labels.
-        rate: at which the contrast of wrong actions may reach the level that an event needs, or, outside 0..1, the least score;
-            ``None``: what is worth more than the background is reported.
-    """
+    """The segments of a recording, and what they say of its frames."""
     options = model.options.recordings
     stream = dataclasses.replace(stream, window=moment_window(stream.window, model.exemplars.seconds, model.options.exemplars))
     durations = Durations.of(model, stream.window, 0.3 * stream.window, options)
@@ -136,11 +126,7 @@ def _stretches(
 
 @dataclass(frozen=True)
 class _Worth:
-    """What windows are worth as segments of each class ``(W, classes)``, while nearest exemplars speak for the kernel machine.
-
-    told: the same without what the machine says; share: of ``told``, by which that is weighed; background: ``(cells,)`` what
-    a cell is worth in no segment; absent: ``(W, 1)`` of ``values``, what is taken off where nobody is seen.
-    """
+    """What windows are worth as segments of each class ``(W, classes)``, while nearest exemplars speak for the kernel machine."""
 
     values: Array
     told: Array
@@ -177,11 +163,8 @@ def _worth(
 def segment_values(
     model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], length: int, options: ExplanationOptions
 ) -> tuple[Array, Array, Array]:
-    """``(W, classes)`` what windows are worth as segments of each class, ``(cells,)`` what background is worth, ``(W, 1)`` what
-    absence takes off.
-
-    The kernel machine is asked of windows only that good explanations hold; until then the nearest exemplars speak for it.
-    """
+    """``(W, classes)`` what windows are worth as segments of each class, ``(cells,)`` what background is worth, ``(W, 1)``
+    what absence takes off."""
     worth = _worth(model, one, durations, wholes, options)
     if model.kernels is not None:
         total = through(one.lattice.windows, worth.values, worth.background)
@@ -215,11 +198,7 @@ def _joined(model: ShapeModel, one: Stretch, segments: list[TiledSegment], durat
 
 
 def _goes_on(model: ShapeModel, one: Stretch, before: TiledSegment, after: TiledSegment, length: int) -> bool:
-    """Whether the pose between two segments is one from within the action, and not one that it begins or ends with.
-
-    Poses are compared by the heights of their joints, which hardly depend on where the camera stands, with the exemplar of the
-    class that is most like both segments.
-    """
+    """Whether the pose between two segments is one from within the action, and not one that it begins or ends with."""
     seen = _heights(one.cut(np.array([before.window, after.window]), length).values.to(model.labels.device))
     mine = (model.labels == before.label).nonzero()[:, 0]
     shown = model.exemplars.crop(0)[mine].values

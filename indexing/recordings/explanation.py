@@ -24,12 +24,7 @@ class Withheld:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A recording of one person as segments.
-
-    times: ``(F,)`` seconds of its frames; scores: ``(F, classes)``, larger is better, what the segments say of each frame;
-    events: one per performance, in order of time; withheld: what is not reported; background: ``(F,)`` how likely a frame is no
-    action at all, 0..1.
-    """
+    """A recording of one person as segments."""
 
     times: Array
     classes: tuple[Any, ...]
@@ -39,12 +34,5 @@ class Explanation:
     background: Array | None = None
 
     def seconds(self, label: Any) -> float:
-        """How long one action lasts in all.
-
-        Example:
-            >>> import numpy as np
-            >>> one = Explanation(np.arange(3.0), ("squat",), np.zeros((3, 1)), [Event("squat", 0.5, 2.0, 1.0, 1.0)])
-            >>> one.seconds("squat"), one.seconds("lunge")
-            (1.5, 0)
-        """
+        """How long one action lasts in all."""
         return sum(event.end - event.start for event in self.events if event.label == label)

@@ -38,11 +38,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class LiveAnswer:
-    """What became known with the latest frames.
-
-    times: ``(F,)`` seconds of the frames that it is about; scores: ``(F, classes)``, larger is better, as
-    :meth:`indexing.ActionIndexer.score_frames` gives them; events: in order of time.
-    """
+    """What became known with the latest frames."""
 
     times: Array
     scores: Array
@@ -51,11 +47,7 @@ class LiveAnswer:
 
 @dataclass(frozen=True)
 class LiveSource:
-    """All that a stream needs of its indexer: the model, its labels, how moments are looked at, which joints frames have.
-
-    rate: at which events are asked for, as ``reject`` of the indexer; least: evidence of a segment, asked for where there is a
-    background; repair: of wrong joints; fps: of frames without times.
-    """
+    """All that a stream needs of its indexer: the model, its labels, how moments are looked at, which joints frames have."""
 
     model: ShapeModel
     classes: tuple[Any, ...]
@@ -70,10 +62,7 @@ class LiveSource:
 
 @dataclass(frozen=True)
 class _Cells:
-    """What is known of a run of cells: of its moment, and of the windows of every length that end with it.
-
-    raw: ``(cells, classes)`` contrast; motion, present: ``(cells,)``; whole: ``(cells, lengths, classes)``, NaN: no such window.
-    """
+    """What is known of a run of cells: of its moment, and of the windows of every length that end with it."""
 
     raw: Array
     motion: Array
@@ -145,25 +134,7 @@ class RunningLevel:
 
 
 class ActionStream:
-    """Actions in one person's recording, as its frames come in.  Made by :meth:`indexing.ActionIndexer.stream`.
-
-    Attributes:
-        lag: seconds; an event is told when a frame this much later than its end is there, and is final then.
-        classes: labels; columns of scores.
-
-    Example:
-        >>> from indexing import ActionIndexer
-        >>> from indexing.actors import Person, dataset, detect, stream
-        >>> indexer = ActionIndexer(scorer="nearest").fit(dataset([Person.random(0)], ["squat", "wave", "kick"], azimuth=0, rng=0))
-        >>> seen = detect(stream(["wave", "squat"], Person.random(1), rng=3)[0], azimuth=30, rng=5)
-        >>> live = indexer.stream(up=seen.up, skeleton=seen.skeleton)
-        >>> found = []
-        >>> for joints, time in zip(seen.joints, seen.times):
-        ...     found += live.push(joints, time).events
-        >>> found += live.finish().events
-        >>> [str(event.label) for event in found]
-        ['wave', 'squat']
-    """
+    """Actions in one person's recording, as its frames come in. Made by :meth:`indexing.ActionIndexer.stream`."""
 
     def __init__(self, source: LiveSource, lag: float | None, up: str, skeleton: Skeleton | None) -> None:
         self.source, self.up, self.skeleton, self.classes = source, up, skeleton, source.classes
@@ -212,18 +183,7 @@ class ActionStream:
 
     @one_thread
     def push(self, joints: Any, times: Any = None) -> LiveAnswer:
-        """One more frame, or several.
-
-        Args:
-            joints: ``(joints, 2 | 3)``: one frame; with a leading axis: several.  NaN: not seen.  Depth is looked along, from afar.
-            times: seconds, of each frame; by default the stream's frame rate says them.
-
-        Returns:
-            the frames and the events that were decided with these: every frame and every event once.
-
-        Raises:
-            ValueError: frames of another layout, times that do not increase, or too far apart for any window.
-        """
+        """One more frame, or several. joints ``(joints, 2 | 3)``."""
         frames, at, steps = self._checked(joints, times)
         fresh = steps > self._look.window
         parts = np.concatenate([[0], np.flatnonzero(fresh[1:]) + 1, [len(at)]])
@@ -385,10 +345,7 @@ class ActionStream:
         return [told]
 
     def _tell(self, tiled: _Tiled, count: int | None) -> tuple[LiveAnswer, int, _Running | None]:
-        """What begins in the first ``count`` cells, the edge that it reaches to, and the event that may go on there.
-
-        ``None``: in all cells, after which nothing goes on.
-        """
+        """What begins in the first ``count`` cells, the edge that it reaches to, and the event that may go on there."""
         options, known, edge, running = self.source.model.options.recordings, len(self.classes), 0, self._running
         done: list[Event] = []
         while edge < (len(self._cells) if count is None else count):

@@ -55,10 +55,7 @@ class TrackedPerson:
 
 @dataclass(frozen=True)
 class Appearance:
-    """A person who comes into view at ``at`` seconds after ``left`` was last seen at ``since``: perhaps the same.
-
-    near: whether one appears about where the other left.
-    """
+    """A person who comes into view at ``at`` seconds after ``left`` was last seen at ``since``: perhaps the same."""
 
     person: str
     at: float
@@ -87,11 +84,7 @@ class Exchange:
 
 @dataclass(frozen=True, eq=False)
 class Crowd:
-    """Who is in a recording.
-
-    people: largest first (boxes summed over time); ghosts: how many tracks were left out, by reason; by_ids: whether the file
-    itself says who is who; untracked: detections without an id, in a file that has ids.
-    """
+    """Who is in a recording."""
 
     people: tuple[TrackedPerson, ...]
     ghosts: dict[GhostReason, int]
@@ -127,28 +120,7 @@ def of_recording(clips: Sequence[Clip]) -> bool:
 
 
 def tracked_people(clips: Sequence[Clip], name: str = "", options: PresenceOptions = PresenceOptions()) -> Crowd:
-    """The people of one recording from its identities.
-
-    By ids each id is a person, away or not, called by its id.  By position an identity ends where it is out of view for long, and
-    people are numbered from 1 by size, then by their first appearance; where never two of them are in view at once, all is taken
-    for one recording of one person, as if nobody had been tracked.
-
-    Args:
-        clips: one per identity, with ``meta`` ``person`` (``None``: never two in one frame) and ``followed`` (``"ids"`` or
-            ``"position"``), as :func:`indexing.readers.read` gives them with ``person="everyone"``.
-        name: of the recording.
-
-    Example:
-        >>> def seen(start, place, person):
-        ...     box = np.array([[0.0, 0.0], [40.0, 0.0], [20.0, 90.0]]) + [place, 0.0]
-        ...     way = box + np.arange(90)[:, None, None] * [0.1, 0.0]
-        ...     return Clip(way, times=start + np.arange(90) / 30, meta={"person": person, "followed": "position"})
-        >>> crowd = tracked_people([seen(0.0, 100, 0), seen(1.0, 600, 1), seen(6.0, 620, 2)])
-        >>> [person.name for person in crowd.people]
-        ['1', '2', '3']
-        >>> crowd.appearances[0]
-        Appearance(person='3', at=6.0, left='2', since=3.966666666666667, near=True)
-    """
+    """The people of one recording from its identities."""
     by_ids = clips[0].meta["followed"] == "ids"
     whole = by_ids or clips[0].meta["person"] is None
     parts = list(clips) if whole else [part for clip in clips for part in _parted(clip, options)]

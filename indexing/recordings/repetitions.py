@@ -83,11 +83,7 @@ class RepetitionOptions:
 
 @dataclass(frozen=True)
 class Repetition:
-    """One performance or cycle: start and end in seconds; range: the farthest that any joint goes up or down meanwhile.
-
-    The unit of the range is the median upright extent of the body in the recording.  Only heights count, which hardly depend on
-    where the camera stands; what moves towards it or sideways, at one height, is not in it.
-    """
+    """One performance or cycle: start and end in seconds; range: the farthest that any joint goes up or down meanwhile."""
 
     start: float
     end: float
@@ -129,25 +125,7 @@ def count_repetitions(
     exemplars: Mapping[Any, Sequence[Clip]] = {},
     options: RepetitionOptions = RepetitionOptions(),
 ) -> list[RepetitionCount]:
-    """Count what was found in a recording, one entry per label in order of the labels' first performance.
-
-    Args:
-        clip: the recording.
-        events: of one label they may be one per performance, or cover several, or parts of one.
-        exemplars: by label, clips with true times; where a label has none, its own events stand for them.
-        options: every number that decides.
-
-    Raises:
-        ValueError: an exemplar has other joints than the recording.
-
-    Example:
-        >>> from indexing.actors import Person, detect, perform
-        >>> seen = detect(perform("squat", Person.random(3), repeats=6, rng=1), azimuth=90.0, rng=1)
-        >>> shown = detect(perform("squat", Person.random(4), rng=2), azimuth=0.0, rng=2)
-        >>> found = count_repetitions(seen, [Event("squat", 0.0, seen.duration, 1.0, 1.0)], {"squat": [shown]})
-        >>> found[0].count, found[0].unit
-        (6, 'performance')
-    """
+    """Count what was found in a recording, one entry per label in order of the labels' first performance."""
     if not events:
         return []
     found, repaired = [], _Repaired.of(clip)

@@ -48,12 +48,7 @@ SuggestReason = Literal["unlike what is known", "either of two", "much else is l
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A part of a recording that is worth a label.
-
-    recording: its number among those given; start, end: seconds on its clock; guess, other: the two actions that it may be most
-    likely (None where there is no second, or none that is known); margin: between their probabilities, 0..1; unlike: residual to
-    the nearest example, 0..1; reason: why it was chosen.
-    """
+    """A part of a recording that is worth a label."""
 
     recording: int
     start: float
@@ -67,11 +62,7 @@ class Suggestion:
 
 @dataclass(frozen=True, eq=False)
 class RecordingParts:
-    """RecordingParts of recordings, and what is known of them.
-
-    owner: ``(N,)`` number of the recording; spans: ``(N, 2)`` seconds; windows: of all, resampled; worth: ``(N,)`` bool, whether
-    somebody is seen to move there.
-    """
+    """RecordingParts of recordings, and what is known of them."""
 
     owner: Array
     spans: Array
@@ -139,10 +130,7 @@ def suggest(
 
 
 def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span], options: SuggestOptions) -> RecordingParts | None:
-    """A recording cut into parts; None where there are none.
-
-    What was found is a part each, long ones are cut; what lies between them is cut into parts as long as an ordinary example.
-    """
+    """A recording cut into parts; None where there are none."""
     model, settings = indexer.model_, indexer.options or ActionOptions()
     (image,) = check_queries([clip], indexer.fps, indexer.n_joints_, indexer.skeleton_, recordings=True)
     begin = float(image.times[0])
@@ -205,11 +193,8 @@ def _together(found: Sequence[RecordingParts | None], options: SuggestOptions) -
 
 
 def compared(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Array, float]:
-    """``(N, classes)`` probabilities, ``(N,)`` residual to the nearest example, ``(N, N)`` residuals between parts, and how far
-    examples of different actions are apart, which is far.
-
-    Residuals are geometric means over the channels of 1 - the largest canonical correlation: 0 for two views of one movement.
-    """
+    """``(N, classes)`` probabilities, ``(N,)`` residual to the nearest example, ``(N, N)`` residuals between parts, and how
+    far examples of different actions are apart, which is far."""
     model = indexer.model_
     likely = probabilities(model.scores(windows).cpu().numpy(), model.blend.sharpness)
     known = model.exemplars.crop(0)
@@ -229,18 +214,7 @@ def compared(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Ar
 
 def chosen(near: Array, apart: Array, margin: Array, number: int, worth: Array, options: SuggestOptions) -> list[int]:
     """Numbers of parts, one after the other: each leaves the least that is unlike what is known and what was chosen before.
-
-    Args:
-        near: ``(N,)`` distance to what is known; apart: ``(N, N)``; margin: ``(N,)`` 0..1; worth: ``(N,)`` bool, which may be
-            chosen, and count.
-
-    Example:
-        >>> near = np.array([0.5, 0.3, 0.3, 0.3])
-        >>> apart = np.array([[0.0, 0.4, 0.4, 0.4], [0.4, 0.0, 0.1, 0.2], [0.4, 0.1, 0.0, 0.1], [0.4, 0.2, 0.1, 0.0]])
-        >>> some = np.zeros(4), 2, np.ones(4, dtype=bool)
-        >>> chosen(near, apart, *some, SuggestOptions()), chosen(near, apart, *some, SuggestOptions(alike=False))
-        ([2, 0], [0, 1])
-    """
+    near ``(N,)``."""
     free, distance = worth.copy(), near.astype(np.float64)
     weight = (1.0 + options.unsure * (1.0 - margin)) * worth
     out: list[int] = []

@@ -32,16 +32,7 @@ class TiledSegment:
 
 
 def best_tiling(windows: Array, values: Array, background: Array) -> tuple[list[TiledSegment], float]:
-    """The segments of the best explanation, in order, and its value.
-
-    Args:
-        windows: ``(W, 2)`` first and last edge, sorted by the last; values: ``(W, classes)``; background: ``(cells,)``.
-
-    Example:
-        >>> windows, values = np.array([[0, 2], [2, 3]]), np.array([[5.0, 1.0], [0.0, -1.0]])
-        >>> [(s.first, s.last, s.label) for s in best_tiling(windows, values, np.full(3, 1.0))[0]]
-        [(0, 2, 0)]
-    """
+    """The segments of the best explanation, in order, and its value. windows ``(W, 2)``."""
     label = values.argmax(axis=1) if len(values) else np.empty(0, dtype=np.intp)
     best = values.max(axis=1) if len(values) else np.empty(0)
     total, chosen = _forward(windows, best, background)
@@ -66,15 +57,7 @@ def through(windows: Array, values: Array, background: Array) -> Array:
 
 
 def posterior(windows: Array, values: Array, background: Array, temperature: float) -> Array:
-    r"""``(cells, classes)`` how likely each cell belongs to each class, 0..1; what is left to 1 is background.
-
-    Explanations are as likely as :math:`\exp(\text{value} / \text{temperature})`; all of them are summed.
-
-    Example:
-        >>> windows, values = np.array([[0, 2], [2, 3]]), np.array([[5.0, 1.0], [0.0, -1.0]])
-        >>> posterior(windows, values, np.full(3, 1.0), 0.5).round(2).tolist()
-        [[1.0, 0.0], [1.0, 0.0], [0.12, 0.02]]
-    """
+    r"""``(cells, classes)`` how likely each cell belongs to each class, 0..1; what is left to 1 is background."""
     cells, classes = len(background), values.shape[1]
     if not len(windows):
         return np.zeros((cells, classes))

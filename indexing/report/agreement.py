@@ -24,16 +24,7 @@ OURS = r"confusion\.(png|csv)|timeline(-\d+)?\.png|events\.csv|repetitions\.csv"
 
 @dataclass(frozen=True, eq=False)
 class AgreementReport:
-    """Two sets of labels, compared.
-
-    Args:
-        title: heading of the page.
-        agreement: of all spans together.
-        spans: what was compared, recording by recording and person by person.
-        sides: what the known labels and the found ones are called.
-        notes: what a reader must know to judge the numbers, a sentence each.
-        manifest: of :func:`indexing.files.manifest`.
-    """
+    """Two sets of labels, compared."""
 
     title: str
     agreement: Agreement
@@ -55,22 +46,9 @@ class _Bar:
 
 
 def write_agreement(folder: str | Path, report: AgreementReport) -> Path:
-    """Write a report into a folder: ``report.html``, ``metrics.json``, ``manifest.json``, ``confusion.png``, ``confusion.csv`` and
-    ``timeline.png`` (``timeline-2.png``... of further recordings and people), each whole or not at all, ``report.html`` last.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> span = ComparedSpan("a.json", 0.0, 9.0, [("squat", 1.0, 4.0)], [("squat", 1.5, 4.0)])
-        >>> path = write_agreement(tempfile.mkdtemp(), AgreementReport("Two hands", compare([span]), [span]))
-        >>> sorted(file.name for file in path.parent.iterdir())
-        ['confusion.csv', 'confusion.png', 'manifest.json', 'metrics.json', 'report.html', 'timeline.png']
-    """
+    """Write a report into a folder: ``report.html``, ``metrics.json``, ``manifest.json``, ``confusion.png``, ``confusion.csv``
+    and ``timeline.png`` (``timeline-2.png``... of further recordings and people), each whole or not at all, ``report.html``
+    last."""
     where = files.prepare(folder)
     both = report.agreement
     names = [*both.labels, NONE]

@@ -37,14 +37,7 @@ PURPOSE = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AlignmentReport(ResultReport):
-    """Everything that the report on an alignment says.
-
-    Args:
-        read: the matches.
-        model: how points may move, and what the sensor may do.
-        threshold: greatest distance of an inlier; None = estimated.
-        photographs: of the views; empty = none.
-    """
+    """Everything that the report on an alignment says."""
 
     read: Matched
     model: str
@@ -156,16 +149,7 @@ def describe(report: AlignmentReport) -> str:
 
 
 def write_alignment(folder: str | Path, report: AlignmentReport) -> Path:
-    """Write a report into a folder: ``report.html``, ``alignment.json``, ``labels.csv`` and ``alignment.png``.
-
-    Every file is written whole or not at all, ``report.html`` last.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write a report into a folder: ``report.html``, ``alignment.json``, ``labels.csv`` and ``alignment.png``."""
     drawn = picture_of(report)
     picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
     turns = []
@@ -237,11 +221,7 @@ def labels_csv(report: AlignmentReport) -> str:
 
 
 def display_scale(matrix: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
-    """A collineation scaled so that its last entry is 1 (where that is not near 0), with the standard deviations that follow.
-
-    Returns:
-        matrix, standard deviations, and whether it was scaled.
-    """
+    """A collineation scaled so that its last entry is 1 (where that is not near 0), with the standard deviations that follow."""
     flat, last = matrix.ravel(), float(matrix[-1, -1])
     if abs(last) < 1e-9 * float(np.abs(flat).max()):
         return matrix, np.sqrt(np.clip(np.diagonal(covariance), 0, None)).reshape(matrix.shape), False
@@ -270,13 +250,8 @@ def turn_of(rotation: FloatArray) -> float:
 
 
 def figures(value: float, spread: float) -> tuple[str, str]:
-    """A number and its standard deviation, with as many decimals as the deviation supports (two figures of it); empty where it is
-    zero or unknown.
-
-    Example:
-        >>> figures(0.98765432, 0.00123), figures(412.3456, 1.5), figures(2.0, 0.0), figures(-3.2e-06, 4.5e-08)
-        (('0.9877', '0.0012'), ('412.3', '1.5'), ('2', ''), ('-3.200e-06', '4.5e-08'))
-    """
+    """A number and its standard deviation, with as many decimals as the deviation supports (two figures of it); empty where it
+    is zero or unknown."""
     if not (math.isfinite(spread) and spread > 0 and math.isfinite(value)):
         return f"{value:.6g}", ""
     places = 1 - math.floor(math.log10(spread))
@@ -335,13 +310,7 @@ def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
 
 
 def _layout(ratios: list[float]) -> tuple[float, list[Box]]:
-    """Height of the figure, and left, top, width and height of every panel, in inches.
-
-    View 1 is large: above the others where it is wide, left of them otherwise.
-
-    Args:
-        ratios: height over width of what each panel shows.
-    """
+    """Height of the figure, and left, top, width and height of every panel, in inches."""
 
     def fitted(left: float, top: float, width: float, ratio: float, limit: float) -> Box:
         tall = min(limit, max(0.6, width * ratio))
@@ -404,14 +373,8 @@ def _widened(box: Box, report: AlignmentReport, kinds: NDArray[Any], shown: list
 
 
 def as_segments(lines: FloatArray) -> FloatArray:
-    """Two points ``(n, 2, 3)`` of lines in Pluecker coordinates ``(n, 6)`` (01, 02, 03, 12, 13, 23), around their common middle.
-
-    Example:
-        >>> a, b = np.array([0.0, 2.0, 3.0, 1.0]), np.array([4.0, 2.0, 3.0, 1.0])  # along x, through (., 2, 3)
-        >>> pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-        >>> as_segments(np.array([[a[i] * b[j] - a[j] * b[i] for i, j in pairs]]))[0, :, 1:].tolist()
-        [[2.0, 3.0], [2.0, 3.0]]
-    """
+    """Two points ``(n, 2, 3)`` of lines in Pluecker coordinates ``(n, 6)`` (01, 02, 03, 12, 13, 23), around their common
+    middle."""
     direction = -lines[:, [2, 4, 5]]
     moment = np.stack([lines[:, 3], -lines[:, 1], lines[:, 0]], axis=1)
     square = np.square(direction).sum(axis=1, keepdims=True)

@@ -54,15 +54,7 @@ class Keeper(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SearchReport:
-    """What resembles a query.
-
-    Args:
-        query: what was asked for; its name is shown.
-        hits: best first.
-        archive: which holds them; info: what is in it.
-        notes: what a reader should know, a sentence each.
-        manifest: of :func:`indexing.files.manifest`.
-    """
+    """What resembles a query."""
 
     query: Clip
     hits: Sequence[Hit]
@@ -79,17 +71,7 @@ class SearchReport:
 
 @dataclass(frozen=True, eq=False)
 class FindReport:
-    """Where learned actions were found in an archive.
-
-    Args:
-        classes: the actions that the model knows.
-        events: in the order of source, person and start; ``exemplar`` is the number among those of its label.
-        recordings: all that were searched.
-        archive: which holds them.
-        exemplars: label -> the clips it was learned from.
-        notes: what a reader should know, a sentence each.
-        manifest: of :func:`indexing.files.manifest`.
-    """
+    """Where learned actions were found in an archive."""
 
     classes: Sequence[Hashable]
     events: Sequence[ArchivedEvent]
@@ -106,14 +88,7 @@ class FindReport:
 
 
 def write_search(folder: str | Path, report: SearchReport) -> Path:
-    """Write what resembles a query: ``report.html``, ``hits.csv``, ``metrics.json`` and ``manifest.json``.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write what resembles a query: ``report.html``, ``hits.csv``, ``metrics.json`` and ``manifest.json``."""
     measured = measure_search(report)
     rows = _hit_rows(report)
     scores = even([hit.score for hit in report.hits[:ROWS]])
@@ -130,17 +105,7 @@ def write_search(folder: str | Path, report: SearchReport) -> Path:
 
 
 def write_finds(folder: str | Path, report: FindReport) -> Path:
-    """Write where actions were found: ``report.html``, ``events.csv``, ``metrics.json`` and ``manifest.json``.
-
-    The page has a table of the actions, one of the recordings with a line of marks for when, and drawings of the surest and the
-    most doubtful finds of each action; where the recordings are few, it plays them.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write where actions were found: ``report.html``, ``events.csv``, ``metrics.json`` and ``manifest.json``."""
     measured = measure_finds(report)
     paint = colours([*report.classes, *(event.label for event in report.events)])
     played = _played(report)
@@ -155,13 +120,7 @@ def write_finds(folder: str | Path, report: FindReport) -> Path:
 
 
 def hits_csv(hits: Sequence[Hit]) -> str:
-    """All hits as CSV, best first: ``rank,file,start,end,score,person,mirrored``; seconds with 3 decimals.
-
-    Example:
-        >>> from indexing.archive.results import Hit
-        >>> hits_csv([Hit("monday.json", "", 2.0, 3.5, -0.25)]).splitlines()[1]
-        '1,monday.json,2.000,3.500,-0.25,,no'
-    """
+    """All hits as CSV, best first: ``rank,file,start,end,score,person,mirrored``; seconds with 3 decimals."""
     rows = [
         [
             number, cell(hit.source), f"{hit.start:.3f}", f"{hit.end:.3f}", _number(hit.score), cell(hit.person),
@@ -259,22 +218,13 @@ def _sides(rows: Sequence[Sequence[Any]]) -> bool:
 
 
 def frames_of(seconds: float) -> int:
-    """Frames of a film that lasts so long.
-
-    Example:
-        >>> [frames_of(seconds) for seconds in (0.5, 1.4, 9.0)]
-        [8, 14, 24]
-    """
+    """Frames of a film that lasts so long."""
     least, most, rate = FILM
     return min(max(round(seconds * rate), least), most)
 
 
 def film(drawing: str, seconds: float, mirrored: bool = False) -> Any:
-    """A strip as a film that plays when its row is pointed at: the strip slides by behind a window of one frame.
-
-    Args:
-        drawing: of :func:`indexing.report.canvas.strip`; seconds: that it takes; mirrored: shown as in a mirror, left for right.
-    """
+    """A strip as a film that plays when its row is pointed at: the strip slides by behind a window of one frame."""
     found = re.search(r'viewBox="0 0 ([\d.]+) ', drawing)
     if found is None:
         return ""
@@ -297,11 +247,7 @@ class _Drawing:
         return self.weight >= WEIGHT
 
     def beside(self, found: Hit | ArchivedEvent, model: Any, seconds: float, what: str) -> list[Any]:
-        """Key frames of what was found, and its film beside that of what it resembles, at the same pace.
-
-        Args:
-            model: drawing of what it resembles; seconds: that this lasts; what: for those who do not see it.
-        """
+        """Key frames of what was found, and its film beside that of what it resembles, at the same pace."""
         try:
             clip = self.archive.clip(found.source, found.start - AROUND, found.end + AROUND, found.person)
         except ValueError:  # removed since it was found

@@ -42,13 +42,7 @@ GEOMETRY = {False: "with depth: fundamental matrices", True: "a plane, or under 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodiesReport(LabelledReport):
-    """Everything that the report on bodies through many frames says.
-
-    Args:
-        tracks: what was given.
-        photographs: pictures of some of the views, by their places.
-        size: width and height of the pictures; None = not known.
-    """
+    """Everything that the report on bodies through many frames says."""
 
     tracks: TrackSet
     photographs: Mapping[int, Photograph] = field(default_factory=dict)
@@ -176,14 +170,7 @@ def rows_of(report: BodiesReport) -> list[list[str]]:
 
 
 def write_bodies(folder: str | Path, report: BodiesReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
     drawn = picture_of(report)
     picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
     doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
@@ -274,10 +261,7 @@ def as_json(report: BodiesReport) -> dict[str, Any]:
 
 
 def labels_csv(report: BodiesReport) -> str:
-    """``id, label, name, probability, residual, frames, first, last`` of every track; label 0 is an outlier, or too short.
-
-    The probability is that of the label, the residual the rms distance from the own body over the pairs of frames.
-    """
+    """``id, label, name, probability, residual, frames, first, last`` of every track; label 0 is an outlier, or too short."""
     rows: list[list[Any]] = []
     views = report.tracks.views
     for i, (name, kind, sure) in enumerate(zip(report.tracks.ids, report.kinds, report.certainty, strict=True)):

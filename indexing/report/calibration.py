@@ -44,15 +44,7 @@ FOCAL, K1, OFFSET, RATE = 6, 7, 9, 10
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """Everything that the report on a rig says.
-
-    Args:
-        rig: what was found.
-        heading: of the page; by default what was found.
-        manifest: of :func:`indexing.files.manifest`.
-        afterwards: on the files written, a sentence each.
-        associated: by the camera's name, what was written of it.
-    """
+    """Everything that the report on a rig says."""
 
     rig: CameraRig
     heading: str = ""
@@ -88,22 +80,13 @@ class CalibrationReport:
 
 
 def outputs(persons: int) -> list[str]:
-    """The names of all files of a calibration of so many people.
-
-    Example:
-        >>> outputs(1)[-3:], len(outputs(2))
-        (['keypoints_3d.npz', 'keypoints_3d.trc', 'keypoints_3d.c3d'], 10)
-    """
+    """The names of all files of a calibration of so many people."""
     several = [f"{PEOPLE}_person{i + 1}" for i in range(persons)] if persons > 1 else [PEOPLE]
     return [*REPORT, CALIBRATION, f"{PEOPLE}.npz", *(f"{name}{suffix}" for suffix in (".trc", ".c3d") for name in several)]
 
 
 def check_folder_of(folder: Path, inputs: Iterable[Path], persons: int = 1) -> None:
-    """Raise where the files would replace an input, or anything that an earlier calibration did not write.
-
-    Raises:
-        ValueError: naming what is in the way.
-    """
+    """Raise where the files would replace an input, or anything that an earlier calibration did not write."""
     given, ours = [path.resolve() for path in inputs], earlier(folder)
     if any(path == folder.resolve() and path.is_dir() for path in given):
         raise ValueError(f"{folder}: is an input, and files of the report among its frames would spoil it; choose another --out")
@@ -130,17 +113,7 @@ def earlier(folder: Path) -> set[str]:
 
 
 def write_calibration(folder: str | Path, report: CalibrationReport) -> tuple[Path, CalibrationReport]:
-    """Write the report, and where the data decide, the cameras and the movement.
-
-    Of a refusal there are the page, ``calibration.json`` and the pictures, which say so, and no file that could be taken for a
-    good one; those of an earlier run are removed.
-
-    Returns:
-        the path of ``report.html``, and the report with what is to be said of the files.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written, or is somebody else's.
-    """
+    """Write the report, and where the data decide, the cameras and the movement."""
     where, rig = Path(folder).expanduser(), report.rig
     check_folder_of(where, [], rig.persons)
     if not report.manifest:

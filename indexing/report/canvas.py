@@ -47,22 +47,12 @@ DARK = Theme("#181c1f", "#e8ecef", "#a3adb6", "#3a4248", ("#181c1f", "#1f3a45", 
 
 
 def columns(text: str) -> int:
-    """Width of a text in letters: those of Chinese, Japanese and Korean are two wide.
-
-    Example:
-        >>> columns("squat"), columns("深蹲")
-        (5, 4)
-    """
+    """Width of a text in letters: those of Chinese, Japanese and Korean are two wide."""
     return sum(1 + (unicodedata.east_asian_width(letter) in "WF") for letter in text)
 
 
 def shorten(value: object, limit: int) -> str:
-    """One line at most ``limit`` letters wide; the middle goes, because variants of a name differ at its ends.
-
-    Example:
-        >>> shorten("lateral raise, left arm, slow", 15)
-        'lateral…m, slow'
-    """
+    """One line at most ``limit`` letters wide; the middle goes, because variants of a name differ at its ends."""
     text = re.sub(r"[\x00-\x1f\x7f-\x9f]", " ", str(value)).encode("utf-8", "replace").decode()
     text = " ".join(text.split())
     if columns(text) <= limit:
@@ -78,12 +68,7 @@ def shorten(value: object, limit: int) -> str:
 
 
 def shorten_all(values: Sequence[object], limit: int) -> list[str]:
-    """Names of at most ``limit`` characters that can still be told apart.
-
-    Example:
-        >>> shorten_all(["raise the left arm, variant A", "raise the right arm, variant A"], 12)
-        ['left a…ant A', 'right…ant A']
-    """
+    """Names of at most ``limit`` characters that can still be told apart."""
     names = [shorten(value, limit) for value in values]
     if len(set(names)) == len(set(map(str, values))):
         return names
@@ -164,21 +149,7 @@ WIDTH, HEIGHT = 40.0, 64.0  # of one key frame, in SVG units
 
 
 def strip(clip: Clip, start: float | None = None, end: float | None = None, *, frames: int = FRAMES, alt: str = "") -> str:
-    """A row of key frames of a clip, evenly spaced in time, as one inline ``<svg>``.
-
-    Every frame is centred on the person and all share one scale, so walking does not shrink the figures and a jump stays
-    visible.  3D joints are shown from the front.  Joints that were not seen, and those that a detector put in the wrong place,
-    are left out with their bones.
-
-    Args:
-        clip: the recording.
-        start, end: seconds, on the clip's own clock; by default the whole clip.
-        frames: number of key frames.
-        alt: description for those who do not see the picture.
-
-    Returns:
-        SVG markup, or ``""`` where no joint was seen in any key frame.
-    """
+    """A row of key frames of a clip, evenly spaced in time, as one inline ``<svg>``."""
     first = clip.times[0] if start is None else start
     last = clip.times[-1] if end is None else end
     wanted = np.linspace(first, last, frames)

@@ -113,21 +113,11 @@ class LabelledReport(ResultReport):
 
 
 def share(part: int, whole: int) -> str:
-    """A share in whole percents.
-
-    Example:
-        >>> share(1, 3), share(1, 300)
-        ('33 %', 'under 1 %')
-    """
+    """A share in whole percents."""
     percent = 100 * part / max(1, whole)
     return "under 1 %" if 0 < percent < 1 else f"{percent:.0f} %"
 
 
 def colour_of(label: int) -> str:
-    """The colour of a body.
-
-    Example:
-        >>> colour_of(1), colour_of(9) == colour_of(1)
-        ('#2f7fb8', True)
-    """
+    """The colour of a body."""
     return COLOURS[(label - 1) % len(COLOURS)]

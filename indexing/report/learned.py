@@ -39,16 +39,7 @@ NAMED = 3  # joints per action that the table names
 
 @dataclass(frozen=True, eq=False)
 class BodyParts:
-    """How much every joint matters for every action, and a clip that shows each.
-
-    Args:
-        classes: ``C`` labels.
-        importance: ``(C, joints)`` share of the joint in the margin of the action (any unit); negative = it misleads.
-        examples: ``C`` clips; skeleton: names and bones, by default the clips' own.
-
-    Raises:
-        ValueError: shapes do not fit.
-    """
+    """How much every joint matters for every action, and a clip that shows each. importance ``(C, joints)``."""
 
     classes: Sequence[Hashable]
     importance: Array
@@ -75,14 +66,7 @@ class BodyParts:
 
 
 def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) -> BodyParts:
-    """What a fitted indexer says: how much the margin of an action grows when a joint is seen.
-
-    Measured on the model, not read from its weights (see :mod:`indexing.action.learning`), so it holds for any fit.
-
-    Args:
-        groups: ``(exemplars,)`` who performed each, by default what the indexer knows; exemplars of the same person are not
-            compared.
-    """
+    """What a fitted indexer says: how much the margin of an action grows when a joint is seen. groups ``(exemplars,)``."""
     import torch
 
     from indexing.action.learning import importance, typical
@@ -96,13 +80,7 @@ def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) 
 
 
 def body_parts(parts: BodyParts, *, columns: int = COLUMNS) -> bytes:
-    """PNG: a skeleton per action, in its most telling pose; strong colour and thick lines where a joint matters.
-
-    Thin lines are the paths of the joints that matter most.  Without bones the joints are dots.
-
-    Args:
-        columns: skeletons in a row at most.
-    """
+    """PNG: a skeleton per action, in its most telling pose; strong colour and thick lines where a joint matters."""
     number = len(parts.classes)
     rows = -(-number // max(1, columns))
     columns = -(-number // rows)  # rows of about the same length
@@ -133,18 +111,8 @@ def telling_joints(parts: BodyParts) -> list[list[Any]]:
 
 
 def telling_pose(points: Array, usual: Array, share: Array) -> int:
-    """Index of the frame in which the joints that matter are furthest from where they usually are.
-
-    Args:
-        points: ``(frames, joints, 2)`` in body coordinates (see :func:`in_body`); usual: ``(joints, 2)``, the same, of all
-            actions; share: ``(joints,)`` how much each joint matters.
-
-    Example:
-        >>> raised = np.zeros((3, 4, 2))
-        >>> raised[1, 2, 1] = 1.0  # joint 2 is up in frame 1
-        >>> telling_pose(raised, np.zeros((4, 2)), np.array([0.0, 0.0, 1.0, 0.0]))
-        1
-    """
+    """Index of the frame in which the joints that matter are furthest from where they usually are. points
+    ``(frames, joints, 2)``."""
     return int((np.nan_to_num(np.square(points - usual)).sum(axis=2) @ (share + 1e-3)).argmax())
 
 
@@ -252,17 +220,7 @@ NOBODY = "Nobody could be left out (the clips have no field 'subject', or it is 
 def write_learned(
     folder: str | Path, indexer: ActionIndexer, clips: Sequence[Clip], notes: Sequence[str], manifest: Mapping[str, Any]
 ) -> Path:
-    """Write a report into a folder: ``report.html``, ``body_parts.png``, ``metrics.json`` and ``manifest.json``.
-
-    Args:
-        indexer: fitted to ``clips``; manifest: of :func:`indexing.files.manifest`.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write a report into a folder: ``report.html``, ``body_parts.png``, ``metrics.json`` and ``manifest.json``."""
     parts = measure_body_parts(indexer)
     drawn = body_parts(parts)
     names = [PICTURE, "metrics.json", files.MANIFEST, "report.html"]

@@ -47,11 +47,7 @@ class Tip:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG on white paper, and places on it that say something when pointed at.
-
-    On a dark screen the style sheet turns the paper dark and keeps the hues; a photograph would be a negative, so a picture that
-    holds one has ``dark``, the same on dark paper.
-    """
+    """A PNG on white paper, and places on it that say something when pointed at."""
 
     png: bytes
     dark: bytes | None = None
@@ -98,16 +94,7 @@ class Script:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResultReport:
-    """What the reports on a result of the library share.
-
-    Args:
-        result: as the library returned it, of one problem.
-        heading: of the page; by default one that says whether the data decide.
-        notes: what a reader should know about the input, a sentence each.
-        words: what whoever reads the report calls the arguments that sentences of the library speak of.
-        manifest: of :func:`indexing.files.manifest`.
-        besides: further files of the report, by their names.
-    """
+    """What the reports on a result of the library share."""
 
     result: Any
     heading: str = ""
@@ -173,22 +160,12 @@ HEADINGS = {"weak_stack": "views too alike", "behind": "points behind a camera"}
 
 
 def heading(code: str) -> str:
-    """What a notice is about.
-
-    Example:
-        >>> heading("weak_stack"), heading("static_scene")
-        ('views too alike', 'static scene')
-    """
+    """What a notice is about."""
     return HEADINGS.get(code, code.replace("_", " "))
 
 
 def remarks(reason: str, warnings: Iterable[tuple[str, float, str]] = (), notes: Iterable[str] = ()) -> list[tuple[str, str, str]]:
-    """What a reader should note: CSS class and words of the heading (or none), and the sentence; refusals first.
-
-    Example:
-        >>> remarks("it is open", [("uncertain", 1.0, "it is open"), ("few_points", 2.0, "two are few")], ["a note"])
-        [('bad', 'Refused: uncertain.', 'It is open.'), ('', 'Few points.', 'Two are few.'), ('', '', 'A note.')]
-    """
+    """What a reader should note: CSS class and words of the heading (or none), and the sentence; refusals first."""
     warnings = list(warnings)
     told = [text for _, _, text in warnings if text in reason]
     out = [("bad", "Refused.", sentence(reason))] if reason and not told else []
@@ -217,21 +194,12 @@ def _environment() -> Environment:
 
 
 def render(template: str, report: Any, **values: Any) -> str:
-    """The page of a report, from the template ``NAME.html.j2``.
-
-    Args:
-        report: with ``title`` and ``manifest``; values: whatever else the template shows, among them ``summary``, one paragraph.
-    """
+    """The page of a report, from the template ``NAME.html.j2``."""
     return _environment().get_template(f"{template}.html.j2").render(report=report, **values)
 
 
 def markup(html: str, **values: object) -> Markup:
-    """Markup with values in it, which are escaped, so that it may stand in a table's cell.
-
-    Example:
-        >>> str(markup("<b>{name}</b>", name="<i>"))
-        '<b>&lt;i&gt;</b>'
-    """
+    """Markup with values in it, which are escaped, so that it may stand in a table's cell."""
     from markupsafe import Markup
 
     return Markup(html).format(**{name: clean(value) for name, value in values.items()})
@@ -255,15 +223,7 @@ def bar(fraction: float, mark: float | None = None) -> Markup:
 def listed(
     ids: Sequence[str], kinds: Sequence[str], order: Sequence[str], several: Mapping[str, str] | None = None
 ) -> list[tuple[str, list[str]]]:
-    """How many there are of each kind, and their names.
-
-    Args:
-        several: what more than one of a kind are called, where that is something else.
-
-    Example:
-        >>> listed(["a", "b", "c"], ["body 1", "outlier", "outlier"], ["body 1", "outlier", "missing"], {"outlier": "outliers"})
-        [('body 1: 1', ['a']), ('2 outliers', ['b', 'c'])]
-    """
+    """How many there are of each kind, and their names."""
     out = []
     for kind in order:
         mine = [name for name, other in zip(ids, kinds, strict=True) if other == kind]
@@ -274,33 +234,20 @@ def listed(
 
 
 def sentence(text: str) -> str:
-    """Text with a capital letter and a full stop.
-
-    Example:
-        >>> sentence("no motion fits ")
-        'No motion fits.'
-    """
+    """Text with a capital letter and a full stop."""
     text = text.strip()
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "?", "!")) else ".") if text else ""
 
 
 def even(values: Sequence[float]) -> list[str]:
-    """Numbers of one column with the same number of decimals: two, or more where all are small; n/a for what is no number.
-
-    Example:
-        >>> even([4.34, 3.4, 12.0]), even([0.0213, 0.4]), even([0.00123])
-        (['4.34', '3.40', '12.00'], ['0.021', '0.400'], ['0.00123'])
-    """
+    """Numbers of one column with the same number of decimals: two, or more where all are small; n/a for what is no number."""
     largest = max((abs(value) for value in values if math.isfinite(value)), default=1.0)
     decimals = 2 if largest == 0 else min(max(2, 2 - math.floor(math.log10(largest))), 9)
     return [f"{value:,.{decimals if abs(value) < 1000 else 0}f}" if math.isfinite(value) else "n/a" for value in values]
 
 
 def settings(values: Mapping[str, Any], before: str = "") -> list[tuple[str, object]]:
-    """Nested settings as name and value, ``a.b`` for ``b`` in ``a``.
-
-    A folder's files and their hashes are one line: a recording may have a file for each of its frames.
-    """
+    """Nested settings as name and value, ``a.b`` for ``b`` in ``a``."""
     lines: list[tuple[str, object]] = []
     for name, value in values.items():
         path = f"{before}{name}"
@@ -344,16 +291,7 @@ def npz(arrays: Mapping[str, Any]) -> bytes:
 
 
 def write_files(folder: str | Path, contents: Mapping[str, Any]) -> Path:
-    """Write the files of a report: bytes, text, or values as JSON, each whole or not at all, in the order given.
-
-    A file without content is removed: that of an earlier run is not that of this one.
-
-    Returns:
-        the path of the last one.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write the files of a report: bytes, text, or values as JSON, each whole or not at all, in the order given."""
     where = files.prepare(folder)
     for name, content in contents.items():
         if content is None:

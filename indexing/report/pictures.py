@@ -33,12 +33,7 @@ Span = tuple[float, float]
 
 
 def colours(names: Sequence[object]) -> dict[str, str]:
-    """A colour for each name; beyond as many as the palette has they come again.
-
-    Example:
-        >>> list(colours(["squat", "lunge", "squat"]))
-        ['squat', 'lunge']
-    """
+    """A colour for each name; beyond as many as the palette has they come again."""
     return {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(dict.fromkeys(map(str, names)))}
 
 
@@ -129,16 +124,8 @@ def timeline_tips(
 
 
 def confusion(counts: ArrayLike, classes: Sequence[object], sides: tuple[str, str] = ("performed", "recognized as")) -> bytes:
-    """PNG of a confusion matrix: a row per true class and a column per predicted one; colour = share of the row.
-
-    Args:
-        counts: ``(classes, classes)`` numbers, written as they are.
-        classes: names, in the order of the rows.
-        sides: what rows and columns are.
-
-    Raises:
-        ValueError: shapes do not fit.
-    """
+    """PNG of a confusion matrix: a row per true class and a column per predicted one; colour = share of the row. counts
+    ``(classes, classes)``."""
     table = np.asarray(counts)
     names = shorten_all(classes, 26)
     if not names or table.shape != (len(names), len(names)):
@@ -179,19 +166,8 @@ def timeline(
     truth: Sequence[Truth] | None = None,
     span: Span | None = None,
 ) -> bytes:
-    """PNG of scores over time: a heat row per class, found events as labelled bars above, the known ones below those.
-
-    Args:
-        times: ``(F,)`` seconds, increasing.
-        scores: ``(F, C)``, higher is better; NaN = no score.  Long streams are drawn by the best score of each pixel.
-        classes: ``C`` names.
-        events: what was found.
-        truth: ``(label, start, end)`` of what is known to have happened; ``None`` = not known.
-        span: seconds that are shown at least, so that the timelines of several people have one axis.
-
-    Raises:
-        ValueError: shapes do not fit.
-    """
+    """PNG of scores over time: a heat row per class, found events as labelled bars above, the known ones below those. times
+    ``(F,)``, scores ``(F, C)``, truth ``(label, start, end)``."""
     seconds, values = np.asarray(times, dtype=np.float64), np.asarray(scores, dtype=np.float64)
     if values.shape != (len(seconds), len(classes)) or not len(seconds):
         raise ValueError(f"scores must be (frames, classes) = ({len(seconds)}, {len(classes)}), not empty, got {values.shape}")
@@ -215,10 +191,7 @@ def timeline(
 
 
 def downsample(times: NDArray[np.float64], scores: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(columns, C)`` the best score between each two of the ``columns + 1`` edges (seconds); NaN where nothing was scored.
-
-    The maximum, not the mean: an action of one second must stay visible in a stream of an hour.
-    """
+    """``(columns, C)`` the best score between each two of the ``columns + 1`` edges (seconds); NaN where nothing was scored."""
     begin = np.searchsorted(times, edges[:-1], side="left")
     end = np.append(begin[1:], np.searchsorted(times, edges[-1], side="right"))
     scores = np.where(np.isfinite(scores), scores, np.nan)
@@ -271,12 +244,7 @@ def _write(axes: Any, text: str, x: float, y: float, room: float) -> None:
 
 
 def _in_two(text: str) -> str:
-    """A name in two lines of about the same length, parted where its words are.
-
-    Example:
-        >>> _in_two("jumping_jack")
-        'jumping_\\njack'
-    """
+    """A name in two lines of about the same length, parted where its words are."""
     places = [match.end() for match in re.finditer(r"[ _\-/]", text[:-1])] or [len(text)]
     at = min(places, key=lambda place: max(place, len(text) - place))
     return f"{text[:at].rstrip()}\n{text[at:]}" if at < len(text) else text

@@ -64,10 +64,7 @@ class PlayerOptions:
 
 @dataclass(frozen=True)
 class Player:
-    """What one recording's player shows.
-
-    data: JSON for the script; rates: poses per second at events and between; unlisted: events that the strip leaves out.
-    """
+    """What one recording's player shows."""
 
     data: str
     rates: tuple[float, float]
@@ -117,11 +114,7 @@ class _Part:
 def players(
     groups: Sequence[Sequence[RecordingResult]], report: RecognitionReport, options: PlayerOptions = PlayerOptions()
 ) -> list[Player | None]:
-    """A player for each recording, person by person; ``None`` where there are no joints to show.
-
-    Args:
-        groups: of :func:`indexing.report.results.by_recording`; report: whose examples are shown beside events.
-    """
+    """A player for each recording, person by person; ``None`` where there are no joints to show."""
     parts = [_parts(people, options) for people in groups]
     rates, share = _rates([part for several in parts for part in several], options)
     examples = _Examples(report, options)
@@ -240,14 +233,7 @@ class _Examples:
 
 # ---- packing -------------------------------------------------------------------------------------------------------------
 def packed(joints: Array, unit: float, middle: Array) -> bytes:
-    """Places on a grid as bytes, frame by frame.
-
-    Of each coordinate its difference from the last frame in which it was seen, as a whole number of grid steps: 0 = missing, and
-    else :math:`1 + 2 d` or :math:`-2 d` for a difference :math:`d \\ge 0` or :math:`d < 0`, seven bits a byte, the lowest first.
-
-    Args:
-        joints: ``(frames, joints, 2)``, NaN = missing; unit: of the grid; middle: ``(2,)`` its origin.
-    """
+    """Places on a grid as bytes, frame by frame. joints ``(frames, joints, 2)``."""
     with np.errstate(invalid="ignore"):
         places = np.clip(np.round((joints - middle) / unit), -32000, 32000).reshape(len(joints), -1)
     seen = np.isfinite(places)

@@ -210,11 +210,7 @@ def counting(people: Sequence[RecordingResult]) -> dict[str, Any]:
 
 
 def of_recording(report: RecognitionReport, recording: RecordingResult, before: int) -> dict[str, Any]:
-    """What the page says of one person in a recording.
-
-    Args:
-        before: how many events the recordings before it have: so many are listed, and drawn, over all.
-    """
+    """What the page says of one person in a recording."""
     events = sorted(recording.events, key=lambda event: event.start)
     draw = max(0, min(len(events), STRIPS - before)) if recording.clip is not None else 0
     listed = max(0, min(len(events), ROWS - before))
@@ -292,12 +288,7 @@ def by_class(measured: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as a reader says them.
-
-    Example:
-        >>> duration(12.34), duration(75), duration(7500)
-        ('12.3 s', '1 min 15 s', '2 h 5 min')
-    """
+    """Seconds as a reader says them."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes = round(seconds / 60) if seconds >= 3600 else int(seconds) // 60

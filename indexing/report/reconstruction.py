@@ -41,13 +41,7 @@ PURPOSE = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReconstructionReport(ResultReport):
-    """Everything that the report on a reconstruction says.
-
-    Args:
-        tracks: what was given, with times from 0.
-        threshold: as given; None = estimated, or no outliers.
-        photograph: of the first view; None = none.
-    """
+    """Everything that the report on a reconstruction says."""
 
     tracks: TrackSet
     threshold: float | None = None
@@ -176,14 +170,7 @@ def describe(report: ReconstructionReport) -> str:
 
 
 def write_reconstruction(folder: str | Path, report: ReconstructionReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
     tracks = tracks_picture(report)
     scene = scene_picture(report) if report.drawable else None
     picture = Picture(tracks, dark=tracks_picture(report, DARK) if report.photograph is not None else None)
@@ -257,12 +244,7 @@ def as_json(report: ReconstructionReport) -> dict[str, Any]:
 
 
 def rested(velocities: FloatArray | None, points: FloatArray, span: float) -> FloatArray | None:
-    """Velocities without what is nothing but rounding: ways, from first to last view, that are no part of the scene's size.
-
-    Example:
-        >>> rested(np.array([[1e-17, 0.0], [1e-3, 1e-17]]), np.array([[0.0, 0.0], [1.0, 2.0]]), 1.0).tolist()
-        [[0.0, 0.0], [0.001, 0.0]]
-    """
+    """Velocities without what is nothing but rounding: ways, from first to last view, that are no part of the scene's size."""
     if velocities is None:
         return None
     size = float(np.nan_to_num(np.abs(points)).max(initial=0.0))

@@ -27,14 +27,7 @@ def kinds_of(report: ReconstructionReport) -> NDArray[Any]:
 
 
 def layout(boxes: list[tuple[FloatArray, FloatArray]], tall: float, edge: float, gap: float) -> tuple[Any, list[Any]]:
-    """A figure of panels side by side, as wide as they need to be, and the panels.
-
-    Args:
-        boxes: low and high that each shows.
-        tall: greatest height of a panel, inches.
-        edge: at the left.
-        gap: between panels.
-    """
+    """A figure of panels side by side, as wide as they need to be, and the panels."""
     wide = (WIDTH - edge - gap * (len(boxes) - 1)) / len(boxes)
     ratios = [float(np.clip((high - low)[1] / (high - low)[0], 0.05, 20)) for low, high in boxes]
     sizes = [(min(wide, tall / ratio), min(tall, wide * ratio)) for ratio in ratios]
@@ -59,13 +52,7 @@ def size_of(count: int) -> float:
 
 
 def limits(points: FloatArray, share: float = 1.0) -> tuple[FloatArray, FloatArray]:
-    """Low and high ``(d,)`` around the points ``(..., d)``, but for a share of strays, with room around.
-
-    Example:
-        >>> low, high = limits(np.array([[0.0, 0.0], [1.0, 2.0]]))
-        >>> low.round(2).tolist(), high.round(2).tolist()
-        ([-0.12, -0.12], [1.12, 2.12])
-    """
+    """Low and high ``(d,)`` around the points ``(..., d)``, but for a share of strays, with room around."""
     flat = points.reshape(-1, points.shape[-1])
     flat = flat[np.isfinite(flat).all(axis=1)]
     if not len(flat):
@@ -76,14 +63,7 @@ def limits(points: FloatArray, share: float = 1.0) -> tuple[FloatArray, FloatArr
 
 
 def around(paths: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
-    """Low and high ``(d,)`` around whole paths ``(views, n, d)``, from dot to arrow head, but for those that stray far away.
-
-    Example:
-        >>> starts = np.linspace(0.0, 1.0, 100)[:, None] * np.ones(2)
-        >>> low, high = around(np.stack([starts, starts + np.eye(100)[:, -1:]]), 0.99)  # the last one goes to (2, 2)
-        >>> high.round(2).tolist()
-        [2.12, 2.12]
-    """
+    """Low and high ``(d,)`` around whole paths ``(views, n, d)``, from dot to arrow head, but for those that stray far away."""
     low, high = limits(paths, share)
     with np.errstate(invalid="ignore"):
         near = ((paths > low - (high - low)) & (paths < high + (high - low))).all(axis=(0, 2))
@@ -154,10 +134,8 @@ def scene_picture(report: ReconstructionReport) -> bytes:
 
 
 def nearest_frame(report: ReconstructionReport) -> FloatArray:
-    """Positions ``(views, n, d)`` carried by the affinity that brings the first ones nearest to their images in the first view.
-
-    Of space, the depth is what is left: scaled to the spread across, along the direction that says least about the image.
-    """
+    """Positions ``(views, n, d)`` carried by the affinity that brings the first ones nearest to their images in the first
+    view."""
     image = report.tracks.values[0, :, :2]
     fits = np.isfinite(image).all(axis=1) & report.placed & (report.labels > 0)
     dim = report.found.points.shape[1]

@@ -161,16 +161,7 @@ class RecognitionReport:
 
 
 def measure(report: RecognitionReport) -> dict[str, Any]:
-    """All numbers of a report, in JSON types (NaN where a number does not exist).
-
-    Returns:
-        the report's own ``metrics``, and
-        for evaluations ``clips, accuracy, accuracy_interval, macro_f1, accuracy_by_setting, per_class, confusion``;
-        for recordings ``recordings, people, seconds, events, events_by_class, withheld`` (by reason), ``repetitions`` (by action,
-        where they were counted), and where some actions are known ``known_events, missed_events, false_events`` (finds of which
-        nothing of their name is known there), ``right_events, precision, recall`` (see :func:`matched`), ``frame_accuracy,
-        frame_agreement``.
-    """
+    """All numbers of a report, in JSON types (NaN where a number does not exist)."""
     out = dict(report.metrics)
     if report.notes:
         out["notes"] = list(report.notes)
@@ -235,12 +226,7 @@ def _baseline(report: RecognitionReport) -> dict[str, Any]:
 
 
 def wilson(share: float, number: int) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson's; it also holds near 0 and 1, where the usual one is empty).
-
-    Example:
-        >>> [round(end, 3) for end in wilson(1.0, 10)]
-        [0.722, 1.0]
-    """
+    """95 % interval of a proportion (Wilson's; it also holds near 0 and 1, where the usual one is empty)."""
     z = 1.959964
     middle = (share + z * z / (2 * number)) / (1 + z * z / number)
     half = z / (1 + z * z / number) * math.sqrt(share * (1 - share) / number + z * z / (4 * number * number))
@@ -300,21 +286,7 @@ def confused_with(confusion: Mapping[str, Any], label: str) -> tuple[str, int] |
 
 
 def matched(recording: RecordingResult, overlap: float = 0.5) -> int:
-    r"""How many events are right: each of a known action of its own, of the same name, with which it shares enough of the time,
-
-    .. math:: \frac{|event \cap known|}{|event \cup known|} \ge overlap .
-
-    Pairs are taken in order of what they share, so no known action makes two events right.
-
-    Args:
-        overlap: share of the time of both together; half of it is what benchmarks of detection ask.
-
-    Example:
-        >>> from indexing.scoring import Event
-        >>> halves = [Event("squat", 0.0, 1.1, 1.0, 1.0), Event("squat", 1.1, 2.0, 1.0, 1.0)]
-        >>> matched(RecordingResult("a", None, np.arange(3.0), ["squat"], np.zeros((3, 1)), halves, [("squat", 0.0, 2.0)]))
-        1
-    """
+    r"""How many events are right: each of a known action of its own, of the same name, with which it shares enough of the time,"""
     pairs = []
     for i, event in enumerate(recording.events):
         for j, (label, start, end) in enumerate(recording.truth or ()):

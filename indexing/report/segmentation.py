@@ -38,13 +38,7 @@ MOTION = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentationReport(LabelledReport):
-    """Everything that the report on a segmentation says.
-
-    Args:
-        pair: what was given.
-        photographs: of both images; empty = none.
-        size: width and height of the images; None = not known.
-    """
+    """Everything that the report on a segmentation says."""
 
     pair: MatchedPair
     photographs: Sequence[Photograph] = ()
@@ -89,14 +83,7 @@ def describe(report: SegmentationReport) -> str:
 
 
 def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
     drawn = picture_of(report)
     picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
     doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
@@ -173,10 +160,7 @@ def as_json(report: SegmentationReport) -> dict[str, Any]:
 
 
 def labels_csv(report: SegmentationReport) -> str:
-    """``id, x1, y1, x2, y2, label, name, probability, residual`` of every match; label 0 is an outlier, or missing.
-
-    The probability is that of the label, the residual the distance from the own body's model, for outliers from the nearest.
-    """
+    """``id, x1, y1, x2, y2, label, name, probability, residual`` of every match; label 0 is an outlier, or missing."""
     rows: list[list[Any]] = []
     columns = zip(report.pair.ids, report.pair.x1, report.pair.x2, report.kinds, report.certainty, strict=True)
     for i, (name, first, second, kind, sure) in enumerate(columns):

@@ -27,16 +27,7 @@ COLOURS = {1: "#2f7fb8", -1: "#e8741e"}
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StaticReport:
-    """Everything that the report on a database says.
-
-    Args:
-        found: what stands still.
-        written: name of the database that was written; empty = none.
-        masks: name of the folder of masks; empty = none.
-        photographs: of the images, by their places; those of a folder that has some of them.
-        notes: what a reader should know about the input, a sentence each.
-        manifest: of :func:`indexing.files.manifest`.
-    """
+    """Everything that the report on a database says."""
 
     found: StaticPoints
     written: str = ""
@@ -128,14 +119,7 @@ def as_json(report: StaticReport) -> dict[str, Any]:
 
 
 def write_report(folder: str | Path, report: StaticReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
     drawn = picture_of(report)
     images, pairs = image_rows(report), pair_rows(report)
     values = {

@@ -43,14 +43,7 @@ UNKNOWN = 1e3  # seconds of standard deviation that say nothing
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """One camera: its clock is the reference's times ``rate`` plus ``offset``.
-
-    Args:
-        take: what the camera recorded.
-        offset, sigma: seconds.
-        rate, rate_sigma: of this clock against the reference's.
-        shifted: what was written of it: folder, files, frame shift, rest in seconds, frames repeated and left out.
-    """
+    """One camera: its clock is the reference's times ``rate`` plus ``offset``."""
 
     take: Take
     offset: float
@@ -85,14 +78,7 @@ class Clock:
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """Two cameras, and what their comparison says.
-
-    Args:
-        a, b: what they recorded; the shift is of b's clock against a's.
-        pairing: what was compared, and what it says.
-        residual: seconds that the pair is off the common solution of all cameras; NaN for two cameras.
-        reason: why the pair does not decide, in the words of whoever reads it.
-    """
+    """Two cameras, and what their comparison says."""
 
     a: Take
     b: Take
@@ -136,21 +122,8 @@ class Compared:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SyncReport:
-    """Everything that the report on two cameras says, from their pair, or on more, from the clocks of all.
-
-    Args:
-        takes: what the cameras recorded, the reference first.
-        compared: ``(i, j)`` to what the comparison of these two says.
-        together: of :func:`dyntorch.synchronize_cameras`; None for two cameras.
-        remarks: on the recordings, a sentence each.
-        afterwards: what a user should know of the files written, a sentence each.
-        shifted: by the number of the camera, what was written of it.
-        videos: the videos that were cut: of :func:`indexing.sync.trimming.told`.
-        mended: the takes with the times at which their frames were taken, where clocks broke; clocks and pairs are of these.
-        heading: of the page; by default what was found.
-        words: what whoever reads the report calls the arguments that sentences of the library speak of.
-        manifest: of :func:`indexing.files.manifest`.
-    """
+    """Everything that the report on two cameras says, from their pair, or on more, from the clocks of all. compared
+    ``(i, j)``."""
 
     takes: Sequence[Take]
     compared: Mapping[tuple[int, int], Pairing]
@@ -271,12 +244,7 @@ def describe(report: SyncReport) -> str:
 
 
 def drift_of(rate: float) -> str:
-    """Seconds that a clock of this rate gains on the reference in an hour.
-
-    Example:
-        >>> drift_of(1.00001)
-        '+0.036'
-    """
+    """Seconds that a clock of this rate gains on the reference in an hour."""
     return f"{3600 * (rate - 1):+.3g}"
 
 
@@ -286,12 +254,7 @@ def sigma_text(seconds: float) -> str:
 
 
 def ppm(rate: float, sigma: float | None = None) -> str:
-    """How much faster a clock runs than another, in millionths.
-
-    Example:
-        >>> ppm(1.00002, 3e-6), ppm(1.0), ppm(1 - 1e-12)
-        ('+20 ± 3', '0', '0')
-    """
+    """How much faster a clock runs than another, in millionths."""
     much = round(PPM * (rate - 1))
     return "0" if rate == 1 or not (much or sigma) else f"{much:+d}" + ("" if sigma is None else f" ± {PPM * sigma:.0f}")
 
@@ -366,17 +329,7 @@ def _state(pair: Compared) -> Any:
 
 
 def write_sync(folder: str | Path, report: SyncReport, videos: Sequence[str] = ()) -> Path:
-    """Write the report into a folder: ``curve.png``, ``sync.json`` and ``report.html``, each whole or not at all.
-
-    Args:
-        videos: names of the check videos in the folder.
-
-    Returns:
-        the path of ``report.html``.
-
-    Raises:
-        ValueError: the folder or a file in it cannot be written.
-    """
+    """Write the report into a folder: ``curve.png``, ``sync.json`` and ``report.html``, each whole or not at all."""
     drawn = picture_of(report)
     return write_files(folder, {"curve.png": drawn, "sync.json": as_json(report), "report.html": page(report, drawn, videos)})
 
@@ -536,20 +489,12 @@ def _finish(panel: Any, title: str) -> None:
 
 
 def names_of(cameras: Sequence[str]) -> list[str]:
-    """The files' names: ``check.mp4`` for two cameras, one for each but the reference for more.
-
-    Example:
-        >>> names_of(["left", "right"]), names_of(["cam1", "cam2", "cam3"])
-        (['check.mp4'], ['check-cam2.mp4', 'check-cam3.mp4'])
-    """
+    """The files' names: ``check.mp4`` for two cameras, one for each but the reference for more."""
     return ["check.mp4"] if len(cameras) == 2 else [f"check-{name}.mp4" for name in cameras[1:]]
 
 
 def write_checks(folder: Path, report: SyncReport) -> tuple[list[str], list[str]]:
-    """Write the videos: the names of those written, and notes on those that could not be.
-
-    Keypoints are drawn as stick figures.
-    """
+    """Write the videos: the names of those written, and notes on those that could not be."""
     from indexing.video import write_check_video
 
     written, notes, takes, found = [], [], report.takes, report.compared

@@ -28,13 +28,7 @@ MEANING = {
 
 
 def count_row(one: RepetitionCount) -> list[str]:
-    """Of one action: how often, seconds of each (mean, shortest to longest), mean pause between, mean range.
-
-    Example:
-        >>> from indexing.recordings.repetitions import Repetition, RepetitionCount
-        >>> count_row(RepetitionCount("squat", (Repetition(0.0, 2.0, 0.4), Repetition(3.0, 5.5, 0.5))))
-        ['squat', '2', '2.25', '2.00-2.50', '1.00', '0.45']
-    """
+    """Of one action: how often, seconds of each (mean, shortest to longest), mean pause between, mean range."""
     if not one.count:
         return [str(one.label), "0", "", "", "", ""]
     shortest, longest = min(one.durations), max(one.durations)
@@ -45,13 +39,7 @@ def count_row(one: RepetitionCount) -> list[str]:
 
 
 def repetition_rows(one: RepetitionCount) -> list[list[str]]:
-    """Of one action, for each performance: number, start, end, seconds, pause before (empty for the first), range.
-
-    Example:
-        >>> from indexing.recordings.repetitions import Repetition, RepetitionCount
-        >>> repetition_rows(RepetitionCount("squat", (Repetition(0.0, 2.0, 0.4), Repetition(3.0, 5.5, 0.5))))[1]
-        ['2', '3.000', '5.500', '2.500', '1.000', '0.500']
-    """
+    """Of one action, for each performance: number, start, end, seconds, pause before (empty for the first), range."""
     pauses = ["", *(f"{pause:.3f}" for pause in one.pauses)]
     return [
         [f"{number}", f"{part.start:.3f}", f"{part.end:.3f}", f"{part.end - part.start:.3f}", pause, f"{part.range:.3f}"]
@@ -100,15 +88,7 @@ def held_times(where: Sequence[tuple[RecordingResult, float]], recordings: Seque
 
 
 def held_sentences(recordings: Sequence[RecordingResult]) -> list[str]:
-    """What was held back, a sentence for each reason.
-
-    Example:
-        >>> from indexing.recordings.explanation import Withheld
-        >>> from indexing.scoring import Event
-        >>> held = [Withheld(Event("wave", float(t), t + 1.0, 1.0, 1.0), "at rest") for t in range(5)]
-        >>> held_sentences([RecordingResult("a", None, np.arange(9.0), ["wave"], np.zeros((9, 1)), withheld=held)])
-        ['held back, at rest: 5 wave (0.00 s, 1.00 s, 2.00 s and 2 more)']
-    """
+    """What was held back, a sentence for each reason."""
     out = []
     for reason, labels in held_back(recordings).items():
         each = [f"{len(where)} {label} ({held_times(where, recordings)})" for label, where in list(labels.items())[:TIMES]]

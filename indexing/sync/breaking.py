@@ -29,12 +29,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Mended:
-    """Recordings whose clocks broke, with times as if they had not.
-
-    Args:
-        found: of ``dyntorch.tasks.breaks`` or ``dyntorch.tasks.camera_breaks``: what broke; its notices call cameras by name.
-        takes: the recordings with these times.
-    """
+    """Recordings whose clocks broke, with times as if they had not."""
 
     found: Any
     takes: tuple[Take, ...]
@@ -66,16 +61,8 @@ def find_breaks(
     max_shift: float | None = None,
     options: SyncOptions = SyncOptions(),
 ) -> Mended | None:
-    """Where the clocks of cameras broke; None where they did not, or where nothing tells: other joints in each, or no keypoints.
-
-    Args:
-        takes: of all cameras.
-        compared: ``(i, j)`` to what the comparison of these two says, and whom it is about.
-        together: of :func:`dyntorch.synchronize_cameras`, for more than two cameras.
-        calibration: as of :func:`indexing.sync.synchronize.pair`.
-        max_shift: seconds.
-        options: every number that decides; those of ``options.points.breaks`` are of this.
-    """
+    """Where the clocks of cameras broke; None where they did not, or where nothing tells: other joints in each, or no
+    keypoints. compared ``(i, j)``."""
     import dyntorch
 
     people = _people(takes, compared, options)
@@ -129,17 +116,7 @@ def _trust(clip: Clip) -> Floats:
 
 
 def retimed(take: Take, times: Floats, by: Floats) -> Take:
-    """A recording whose clock is changed.
-
-    Args:
-        times: ``(k,)`` seconds of its clock, increasing.
-        by: ``(k,)`` seconds that are added from each of these on; before the first, as at the first.
-
-    Example:
-        >>> take = Take("cam1", "keypoints", times=np.arange(5) / 10)
-        >>> retimed(take, np.array([0.0, 0.3]), np.array([0.0, 0.2])).times.round(1).tolist()
-        [0.0, 0.1, 0.2, 0.5, 0.6]
-    """
+    """A recording whose clock is changed. times ``(k,)``, by ``(k,)``."""
 
     def new(old: Floats) -> Floats:
         rows = np.clip(np.searchsorted(times, old + 1e-9, side="right") - 1, 0, len(times) - 1)

@@ -88,22 +88,7 @@ class Curve:
 
 
 def score_curve(a: Tensor, b: Tensor, least: float, options: SyncOptions = SyncOptions()) -> Curve:
-    r"""Scores at all lags.
-
-    .. math:: score(s) = \bar c(s)\,\Bigl(\frac{m(s)}{\max m}\Bigr)^{.35}
-
-    with the mean cosine :math:`\bar c` of the m(s) pairs of frames that overlap.
-
-    Args:
-        a, b: ``(n, D)`` and ``(m, D)`` unit rows, 0 where a frame is missing.
-        least: frames of overlap below which there is no score.
-
-    Example:
-        >>> rows = torch.eye(6, dtype=torch.float64)
-        >>> curve = score_curve(rows[:4], rows[1:], 2)
-        >>> curve.best, round(curve.at(-1), 3)
-        (-1, 0.904)
-    """
+    r"""Scores at all lags. a, b ``(n, D)``."""
     counts = lag_sums(*(x.abs().sum(1, keepdim=True).gt(0).double() for x in (a, b))).round()
     known = counts >= max(least, 1.0)
     mean = lag_sums(a, b) / counts.clamp(min=1.0)
@@ -144,18 +129,8 @@ def windows(a: Tensor, b: Tensor, lag: int, options: SyncOptions = SyncOptions()
 
 
 def evidence(a: Tensor, b: Tensor, lag: int, options: SyncOptions = SyncOptions()) -> float:
-    r"""Nats that the windows of the overlap speak for ``lag`` (within one) rather than for any of the lags around it.
-
-    .. math:: \sum_w \log\Bigl((1 - \epsilon)\,\frac{\sum_{|d| \le 1} p_w(d)}{3 / 25} + \epsilon\Bigr),\quad
-        p_w = softmax(10\,\bar c_w)
-
-    Args:
-        a, b: ``(n, D)`` and ``(m, D)`` unit rows, 0 where a frame is missing.
-        lag: the candidate.
-
-    Returns:
-        At most 2.1 per window, at least -3; 0 where nothing is known.
-    """
+    r"""Nats that the windows of the overlap speak for ``lag`` (within one) rather than for any of the lags around it. a, b
+    ``(n, D)``."""
     means = windows(a, b, lag, options=options)
     known = means.isfinite()
     share = torch.softmax(torch.where(known, options.windows.sharpness * means, -torch.inf), dim=1)
@@ -173,27 +148,16 @@ def evidence(a: Tensor, b: Tensor, lag: int, options: SyncOptions = SyncOptions(
 
 @dataclass(frozen=True)
 class Verdict:
-    """The curve, its best lag, and what speaks for and against it.
+    """The curve, its best lag, and what speaks for and against it."""
 
-    Attributes:
-        curve: scores of the profile, all lags.
-        best: its best lag.
-        halves: best lags of the two halves of the overlap.
-        kernel: best lag of the thesis's window kernel; None where the overlap is too short for it.
-        second: score of the next peak relative to the best.
-        backwards: score of the best lag of b played backwards, relative.
-        nats: evidence of short windows, profile and kernel.
-        options: what is enough.
-    """
-
-    curve: Curve
-    best: int
-    halves: tuple[int, int]
-    kernel: int | None
-    second: float
-    backwards: float
-    nats: float
-    options: VerdictOptions
+    curve: Curve  # scores of the profile, all lags
+    best: int  # its best lag
+    halves: tuple[int, int]  # best lags of the two halves of the overlap
+    kernel: int | None  # best lag of the thesis's window kernel; None where the overlap is too short for it
+    second: float  # score of the next peak relative to the best
+    backwards: float  # score of the best lag of b played backwards, relative
+    nats: float  # evidence of short windows, profile and kernel
+    options: VerdictOptions  # what is enough
 
     @property
     def weight(self) -> float:
@@ -241,10 +205,7 @@ def judge(
     measure: Measure = "profile",
     options: SyncOptions = SyncOptions(),
 ) -> Verdict:
-    """The best lag of two takes between ``lags``, with at least ``least`` rows of overlap, and what else speaks for it.
-
-    By the profile the window kernel is the second opinion; by the window kernel alone there is none.
-    """
+    """The best lag of two takes between ``lags``, with at least ``least`` rows of overlap, and what else speaks for it."""
     compare = whitened if measure == "profile" else kernel_descriptors
     needed = options.verdict if measure == "profile" else options.window_verdict
     one, two = compare(*_rows(a, b, measure), options=options)
@@ -310,61 +271,7 @@ def brightness_shift(
     measure: Measure = "profile",
     options: SyncOptions = SyncOptions(),
 ) -> Shift:
-    r"""How camera b's clock runs against camera a's, from brightness alone, or why that cannot be told.
-
-    Of the box in which something moves, every frame gives a profile: how much moves up, down and sideways in six bands of rows,
-
-    .. math:: z = W\Bigl(\sqrt{\langle v^- \rangle}, \sqrt{\langle v^+ \rangle}, \sqrt{\langle |u| \rangle}\Bigr),\quad
-        (u, v) = -I_t\,\nabla I / (\|\nabla I\| + \epsilon),
-
-    whitened (W) and of norm 1.  A shift scores the mean cosine of the profiles that it pairs.  The best one is believed only if
-    both halves of the overlap choose it, the thesis's window kernel chooses it, no other peak comes near, short windows ask for it
-    one by one, and it leads b played backwards clearly: takes of similar motion fail there.  Cameras should stand upright and
-    still; the more their views differ (90 degrees is worst), the longer a take is needed.
-
-    ``measure="window"`` is the thesis's own measure by itself.  Patches k of a reference frame :math:`\tau` have the differences
-
-    .. math:: h_k(t) = \sum_{patch_k} \nabla I(\tau)\,(I(t) - I(\tau)) = -G_k\,(u, v)_k(t) + \dots,\qquad |t - \tau| \le w,
-
-    so the rows of :math:`H_\tau` lie in the space of the motions, which both cameras share; a shift scores the mean cosine of the
-    whitened :math:`H_\tau^T H_\tau` that it pairs (the rank condition without a rank to choose).  It needs no upright cameras, and
-    decides less often: of 144 pairs of synthetic actors its best shift is within a frame in 129 (the profile's in 135), and it is
-    believed in 22 (68); ``python -m experiments.synchronization.brightness --measure window`` prints its table.
-
-    A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
-
-    Args:
-        a: grey video ``(frames, h, w)``, uint8 or float (0..1 or 0..255), array or tensor (colour: ``(frames, h, w, 3)``); or an
-            iterable of such chunks, or of pairs (chunk, seconds of its frames) as :func:`indexing.video.read_video` gives them.
-            A stream is read once, and its frames are not kept in memory.
-        b: the other camera's; sizes and lengths may differ.
-        fps: frames per second of a and b, where frames have no times.
-        times: seconds of each frame of a and of b.
-        max_shift: seconds; offsets beyond are not considered.
-        region: ``"motion"``: the box about what moves, found by itself, following a person who crosses the image;
-            ``(x0, y0, x1, y1)`` in pixels: about what moves in there, in both videos; None: whole images.
-        measure: ``"profile"``, which the window kernel must confirm, or ``"window"``, the window kernel alone.
-        options: every number that decides, by stage.
-
-    Returns:
-        :class:`dyntorch.Shift` with ``method="brightness"`` and rate 1 (clock rates are not fitted).  Where ``ok`` is false,
-        ``reason`` says why; the best candidate and all peaks are there all the same.
-
-    Raises:
-        ValueError: fewer than 20 frames, NaN, wrong shapes, no times, a ``max_shift`` that leaves no overlap, an unknown
-            measure, or takes that are shorter than its windows.
-
-    Source: thesis, chapter 7; Irani 1999 for the patch equations.
-
-    Example:
-        >>> from indexing.actors import Person, stream
-        >>> from indexing.actors.textured import film
-        >>> clip, _ = stream(["squat", "wave", "bow", "punch"], Person(), rng=1)
-        >>> first, second = (film(clip, azimuth=angle, image=(80, 60), rng=int(angle)) for angle in (10.0, 40.0))
-        >>> shift = brightness_shift(first[20:], second[:-10], fps=(30.0, 30.0))
-        >>> shift.ok, round(shift.frames)
-        (True, 20)
-    """
+    r"""How camera b's clock runs against camera a's, from brightness alone, or why that cannot be told. a ``(frames, h, w)``."""
     check_options(options, SyncOptions)
     if measure not in MEASURES:
         raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")

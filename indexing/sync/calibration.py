@@ -21,15 +21,7 @@ REMEDY = "give a .toml with matrix (3, 3) and distortions for every camera, as P
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """One camera of a calibration file.
-
-    Args:
-        name: its section.
-        matrix: ``(3, 3)``.
-        distortions: ``(k,)`` in OpenCV's order: k1, k2, p1, p2, k3, ...
-        fisheye: whether they are those of OpenCV's fisheye model.
-        size: width and height of its picture in pixels, where the file says.
-    """
+    """One camera of a calibration file. matrix ``(3, 3)``, distortions ``(k,)``."""
 
     name: str
     matrix: Tensor
@@ -47,15 +39,7 @@ class Lenses:
 
 
 def lenses(calibration: Any, names: Sequence[str]) -> Lenses | None:
-    """The lens of each camera; None where nothing is given.
-
-    Args:
-        calibration: path of a file, cameras from :func:`read_calibration`, or what :func:`dyntorch.synchronize` takes.
-        names: of the cameras.
-
-    Raises:
-        ValueError: the file cannot be read, or has no section for a camera.
-    """
+    """The lens of each camera; None where nothing is given."""
     if calibration is None:
         return None
     path = Path(calibration) if isinstance(calibration, (str, Path)) else None
@@ -70,18 +54,7 @@ def lenses(calibration: Any, names: Sequence[str]) -> Lenses | None:
 
 
 def read_calibration(path: str | Path) -> list[Lens]:
-    """The cameras of a calibration file, in its order.
-
-    Raises:
-        ValueError: not a TOML file, or a camera without a sound matrix and distortions.
-
-    Example:
-        >>> import pathlib, tempfile
-        >>> file = pathlib.Path(tempfile.mkdtemp()) / "Calib.toml"
-        >>> _ = file.write_text("[cam01]\\nmatrix = [[900, 0, 320], [0, 900, 240], [0, 0, 1]]\\ndistortions = [-0.1, 0, 0, 0]\\n")
-        >>> [lens.name for lens in read_calibration(file)]
-        ['cam01']
-    """
+    """The cameras of a calibration file, in its order."""
     path = Path(path).expanduser()
     content = parse_toml(path, read_text(path, REMEDY), REMEDY)
     found = []
@@ -105,24 +78,13 @@ def read_calibration(path: str | Path) -> list[Lens]:
 
 
 def named_lenses(path: str | Path, names: Sequence[str]) -> tuple[list[Lens], tuple[str, ...]]:
-    """The lens of each camera by its own name, whatever its section is called, and what to say about it.
-
-    Raises:
-        ValueError: the file cannot be read, or names and sections do not fit.
-    """
+    """The lens of each camera by its own name, whatever its section is called, and what to say about it."""
     chosen, notes = match(read_calibration(path), names, path)
     return [dataclasses.replace(lens, name=name) for lens, name in zip(chosen, names, strict=True)], notes
 
 
 def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tuple[list[Lens], tuple[str, ...]]:
-    """The lens of each name: the section of this name, else the only one whose name contains it, else by order.
-
-    Names are compared without case, punctuation and leading zeros: the folder cam01 is the section Cam_1.  By order only where
-    there are as many sections as names.
-
-    Raises:
-        ValueError: names and sections do not fit.
-    """
+    """The lens of each name: the section of this name, else the only one whose name contains it, else by order."""
     chosen: list[Lens | None] = []
     for name in names:
         sections = [(lens, _plain(lens.name)) for lens in cameras]
@@ -141,12 +103,7 @@ def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tu
 
 
 def _plain(name: str) -> str:
-    """A name without what people write in two ways.
-
-    Example:
-        >>> _plain("Cam_01"), _plain("cam-10.json")
-        ('cam 1', 'cam 10 json')
-    """
+    """A name without what people write in two ways."""
     words = re.findall(r"[^\W\d_]+|\d+", name.lower())
     return " ".join(word.lstrip("0") or "0" if word.isdigit() else word for word in words)
 

@@ -34,15 +34,7 @@ EMPTY = json.dumps({"version": 1.3, "people": []})  # a frame that shows nobody
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Which frame of a camera stands for which moment of the reference.
-
-    Args:
-        take: the camera.
-        numbers: ``(k,)`` frame numbers of the reference camera.
-        rows: ``(k,)`` the frame of this camera that is nearest to each, an index of ``take.times``.
-        rest: seconds, the greatest distance that is left.
-        before: frames left out because they were taken before the reference's number 0.
-    """
+    """Which frame of a camera stands for which moment of the reference. numbers ``(k,)``, rows ``(k,)``."""
 
     take: Take
     numbers: NDArray[np.int64]
@@ -63,25 +55,7 @@ class Plan:
 
 
 def plan(take: Take, offset: float, rate: float, fps: float, times: NDArray[np.float64] | None = None) -> Plan:
-    """Match a camera's frames with the frame numbers of the reference camera.
-
-    Args:
-        take: keypoints.
-        offset, rate: the camera's clock is the reference's times rate plus offset.
-        fps: frames per second of the reference.
-        times: ``(frames,)`` seconds of the camera's clock at which its frames were taken, where that is not what its files say,
-            because frames were lost in between.
-
-    Returns:
-        the plan; of a camera that ended before the reference's number 0 it has no frames.
-
-    Example:
-        >>> import numpy as np
-        >>> from indexing.sync.takes import take_of
-        >>> late = plan(take_of(np.ones((6, 3, 2)), fps=10.0), offset=0.21, rate=1.0, fps=10.0)
-        >>> late.numbers.tolist(), late.rows.tolist(), round(late.rest, 3), late.before
-        ([0, 1, 2, 3], [2, 3, 4, 5], 0.01, 2)
-    """
+    """Match a camera's frames with the frame numbers of the reference camera. times ``(frames,)``."""
     times = take.times if times is None else times
     nearest = np.floor((times - offset) / rate * fps).astype(np.int64)
     reach = int(np.ceil(NEAR * fps / (rate * take.fps)))  # numbers on either side that one frame may stand for
@@ -124,14 +98,7 @@ def ours(folder: Path) -> bool:
 
 
 def write_poses(folder: Path, plans: Sequence[Plan], count: int | None = None) -> Path:
-    """Write ``pose-sync/<camera>_json/`` for every camera: all of them, or nothing.
-
-    Frames of an OpenPose folder are copied as they are, under their new numbers; other formats are written as OpenPose JSON.
-
-    Args:
-        count: how many frame numbers every camera has a file for; one without people where it shows nothing, as Pose2Sim looks at
-            as many numbers as the camera with the fewest files has files.  None = files for the frames that are there.
-    """
+    """Write ``pose-sync/<camera>_json/`` for every camera: all of them, or nothing."""
     target = folder / FOLDER
     recover_folder(target)
     building = folder / f".{FOLDER}-{secrets.token_hex(8)}.tmp"
@@ -158,12 +125,7 @@ def drop_poses(folder: Path) -> bool:
 
 
 def folder_of(take: Take) -> str:
-    """The name of the folder of a camera's shifted files: that of its own files, by which Pose2Sim finds them again.
-
-    Example:
-        >>> folder_of(Take("cam1", "keypoints"))
-        'cam1_json'
-    """
+    """The name of the folder of a camera's shifted files: that of its own files, by which Pose2Sim finds them again."""
     own = take.path is not None and take.path.is_dir() and "json" in take.path.name
     return take.path.name if own and take.path is not None else f"{take.name}_json"
 
@@ -202,12 +164,7 @@ def openpose_files(path: Path | None) -> dict[int, Path]:
 
 
 def renumbered(name: str, number: int) -> str:
-    """A file name with another frame number, at least as many digits.
-
-    Example:
-        >>> renumbered("cam01_000000000012_keypoints.json", 7), renumbered("cam01.000123.json", 99)
-        ('cam01_000000000007_keypoints.json', 'cam01.000099.json')
-    """
+    """A file name with another frame number, at least as many digits."""
     stem, dot, suffix = name.rpartition(".")
     found = re.search(r"(\d{1,18})(?=_keypoints)", stem) or re.search(r"(\d{1,18})(?=\D*$)", stem)
     if found is None:

@@ -27,11 +27,7 @@ PROFILE_BLOCK = 32  # frames at once
 
 
 def row_profile(crops: Tensor, options: SyncOptions = SyncOptions()) -> Tensor:
-    """``(T, 3 * bands)`` motion upwards, downwards and sideways in bands of rows that overlap by half, of crops ``(T, s, s)``.
-
-    Square roots of means over the full width: cameras that stand upright share the height of what they see, not its place across,
-    and the sign of sideways motion depends on the side from which a camera looks.
-    """
+    """``(T, 3 * bands)`` motion upwards, downwards and sideways in bands of rows that overlap by half, of crops ``(T, s, s)``."""
     parts = []
     for begin in range(0, len(crops), PROFILE_BLOCK):
         first, end = max(begin - 1, 0), min(begin + PROFILE_BLOCK + 1, len(crops))
@@ -57,19 +53,7 @@ def _pooled(u: Tensor, v: Tensor, bands: int) -> Tensor:
 
 def whitened(first: Tensor, second: Tensor, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor]:
     r"""Both cameras' profiles in space and time: centred, whitened by the covariance that they share, of norm 1 per frame.
-
-    .. math:: z_t \leftarrow \frac{W (y_t - \bar y)}{\|\cdot\|},\quad y_t = (z_{t-3}, \dots, z_{t+3}),\quad
-        W = (C + \rho\,\lambda_{max} I)^{-1/2},\quad C = (C_a + C_b) / 2
-
-    Whitening takes the slow part away that all motion has in common; the ridge :math:`\rho` keeps short takes from blowing up
-    noise.  At the ends the first and the last profile are repeated; rows with NaN (missing frames) nearby become 0.
-
-    Args:
-        first, second: ``(T, D)``, of lengths of their own.
-
-    Returns:
-        ``(T, (2 reach + 1) D)`` each.
-    """
+    first, second ``(T, D)`` -> ``(T, (2 reach + 1) D)``."""
     around = torch.arange(-options.profile.reach, options.profile.reach + 1)
     stacked = [z[(torch.arange(len(z))[:, None] + around).clamp(0, len(z) - 1)].flatten(1) for z in (first, second)]
     known = [y.isfinite().all(1) for y in stacked]
@@ -93,19 +77,12 @@ def inverse_root(matrix: Tensor, ridge: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class GrayTake:
-    """What is kept of a video.
+    """What is kept of a video."""
 
-    Attributes:
-        frames: ``(T, h, w)`` uint8, the longer side at most ``largest``; of a stream, in a file that goes with the object.
-        times: ``(T,)`` float64 seconds, increasing.
-        scale: pixels here per pixel of the video.
-        name: for messages.
-    """
-
-    frames: Tensor
-    times: Tensor
-    scale: float
-    name: str
+    frames: Tensor  # ``(T, h, w)`` uint8, the longer side at most ``largest``; of a stream, in a file that goes with the object
+    times: Tensor  # ``(T,)`` float64 seconds, increasing
+    scale: float  # pixels here per pixel of the video
+    name: str  # for messages
 
     @property
     def fps(self) -> float:
@@ -114,18 +91,7 @@ class GrayTake:
 
 
 def take(source: Any, name: str, fps: float | None = None, times: Any = None, *, options: SyncOptions = SyncOptions()) -> GrayTake:
-    """Read a video once.
-
-    Args:
-        source: ``(frames, h, w)`` uint8 or float (0..1 or 0..255), an array or a tensor, colour as ``(frames, h, w, 3)``; or an
-            iterable of such chunks, or of pairs (chunk, times of its frames).
-        name: for messages.
-        fps: frames per second where there are no times.
-        times: ``(frames,)`` seconds.
-
-    Raises:
-        ValueError: something else, missing values, fewer than 20 frames, no times at all, or times that do not increase.
-    """
+    """Read a video once. source ``(frames, h, w)``, times ``(frames,)``."""
     spool = _Spool(name, options.gray.largest, options.gray.smallest)
     if not isinstance(source, (np.ndarray, Tensor)):
         with tempfile.TemporaryFile() as file:
@@ -203,17 +169,11 @@ def _times(times: Any, fps: float | None, frames: int, name: str) -> Tensor:
 
 @dataclass(frozen=True)
 class Drift:
-    """Motion of the background.
+    """Motion of the background."""
 
-    Attributes:
-        step: ``(T, 2)`` px per frame where it is followed, else 0.
-        lost: ``(T,)`` bool, where it cannot be.
-        often: share of the frames from which either counts.
-    """
-
-    step: Tensor
-    lost: Tensor
-    often: float
+    step: Tensor  # ``(T, 2)`` px per frame where it is followed, else 0
+    lost: Tensor  # ``(T,)`` bool, where it cannot be
+    often: float  # share of the frames from which either counts
 
     @property
     def moves(self) -> bool:
@@ -232,16 +192,7 @@ class Drift:
 
 
 def drift(gx: Tensor, gy: Tensor, gt: Tensor, options: SyncOptions = SyncOptions()) -> Drift:
-    r"""Translation of the border of each frame from gradients ``(T, h, w)``, by least squares.
-
-    .. math:: I_t = -(I_x, I_y)\,d + c
-
-    Args:
-        gx, gy, gt: gradients, grey 0..1 per pixel and frame.
-
-    Returns:
-        The motion per frame where one translation explains the change.
-    """
+    r"""Translation of the border of each frame from gradients ``(T, h, w)``, by least squares."""
     inside = torch.ones(gt.shape[1:], dtype=torch.bool, device=gt.device)
     rows, columns = (max(2, round(options.drift.border * n)) for n in gt.shape[1:])
     inside[rows:-rows, columns:-columns] = False
@@ -270,20 +221,13 @@ Region = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class GrayMotion:
-    """Where something moves.
+    """Where something moves."""
 
-    Attributes:
-        rows, columns: ``(T, h)`` and ``(T, w)`` sums of the brightness change above the noise.
-        changed: ``(T,)`` share of the pixels that change.
-        drift: how the background moves.
-        least_changed: share from which a frame shows motion.
-    """
-
-    rows: Tensor
+    rows: Tensor  # ``(T, h)`` and ``(T, w)`` sums of the brightness change above the noise
     columns: Tensor
-    changed: Tensor
-    drift: Drift
-    least_changed: float
+    changed: Tensor  # ``(T,)`` share of the pixels that change
+    drift: Drift  # how the background moves
+    least_changed: float  # share from which a frame shows motion
 
     @property
     def lively(self) -> Tensor:
@@ -326,10 +270,7 @@ def motion(frames: Tensor, region: Region | None = None, *, options: SyncOptions
 
 
 def boxes(found: GrayMotion, fps: float, options: SyncOptions = SyncOptions()) -> tuple[Tensor, bool]:
-    """``(T, 3)`` centre x, centre y and side in pixels of the square about what moves, frame by frame, and whether it moves.
-
-    One box for the take, or, where a person crosses the image, one of constant size that follows the person smoothly.
-    """
+    """``(T, 3)`` centre x, centre y and side in pixels of the square about what moves, frame by frame, and whether it moves."""
     height = found.rows.shape[1]
     path = found.drift.path if found.drift.moves else found.rows.new_zeros(len(found.rows), 2)
     across, along = (_quantiles(_smooth(m, options.box.follow * fps), options) for m in (found.columns, found.rows))
@@ -436,10 +377,7 @@ def _kernel(h: Tensor, rows: int) -> Tensor:
 
 
 def kernel_descriptors(first: Tensor, second: Tensor, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor]:
-    """Both cameras' kernels ``(n, L, L)`` as unit vectors ``(n, L * L)``: whitened by the mean kernel, the mean removed.
-
-    Kernels that hold NaN (missing frames) become 0.
-    """
+    """Both cameras' kernels ``(n, L, L)`` as unit vectors ``(n, L * L)``: whitened by the mean kernel, the mean removed."""
     kernels = torch.cat([first, second])
     known = kernels.isfinite().all(-1).all(-1)
     if not bool(known.any()):
@@ -456,17 +394,12 @@ BLOCK = 64  # grid frames at once
 
 @dataclass(frozen=True)
 class Sampled:
-    """A take on the grid: ``profile (T, D)``, ``kernels (T - 2 half, L, L)`` (the first at frame ``half``); NaN in gaps.
-
-    Attributes:
-        start: seconds, of the first frame of the grid.
-        rate: frames of the grid per second.
-    """
+    """A take on the grid: ``profile (T, D)``, ``kernels (T - 2 half, L, L)`` (the first at frame ``half``); NaN in gaps."""
 
     profile: Tensor
     kernels: Tensor
-    start: float
-    rate: float
+    start: float  # seconds, of the first frame of the grid
+    rate: float  # frames of the grid per second
 
     def backwards(self) -> Sampled:
         """The same take played backwards."""

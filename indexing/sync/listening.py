@@ -21,17 +21,7 @@ CHUNK = 20_000  # spectra at once: 20 MB
 
 @dataclass(frozen=True, eq=False)
 class Sound:
-    """What a camera's microphone recorded.
-
-    Args:
-        samples: ``(n,)`` one channel, -1 to 1.
-        rate: samples per second.
-        start: seconds of the first sample on the clock of the pictures, whose first has time 0.
-        options: of the comparison.
-
-    Raises:
-        ValueError: not one channel of numbers, or a rate that is not positive.
-    """
+    """What a camera's microphone recorded. samples ``(n,)``."""
 
     samples: NDArray[Any]
     rate: float
@@ -108,22 +98,8 @@ class Sound:
 
 
 def flattened(curves: Signal, rate: float, smooth: float, slowest: float) -> Signal:
-    """The phase transform of curves: each frequency divided by its magnitude, smoothed over its neighbours.
-
-    Args:
-        curves: ``(k, n)``.
-        rate: values per second.
-        smooth: hertz over which magnitudes are averaged.
-        slowest: hertz below which nothing is kept.
-
-    Returns:
-        ``(k, n)`` of variance 1; zeros of a curve that is constant.
-
-    Example:
-        >>> made = flattened(np.random.default_rng(0).normal(size=(1, 400)).cumsum(axis=1).astype(np.float32), 100.0, 0.5, 0.5)
-        >>> round(float((made**2).mean()), 3)
-        1.0
-    """
+    """The phase transform of curves: each frequency divided by its magnitude, smoothed over its neighbours. curves ``(k, n)``
+    -> ``(k, n)``."""
     from scipy import fft, ndimage
 
     length = curves.shape[1]
@@ -142,19 +118,7 @@ def flattened(curves: Signal, rate: float, smooth: float, slowest: float) -> Sig
 
 
 def hear(path: str | Path, options: SoundOptions = SoundOptions()) -> Sound | None:
-    """The sound of a video, on the clock of its pictures; None where it has none.
-
-    Packets are placed by their timestamps: a stream that begins later than the pictures, or has a gap, keeps its times.
-
-    Raises:
-        ValueError: the file cannot be read.
-
-    Example:
-        >>> hear("nothing.mp4")
-        Traceback (most recent call last):
-        ...
-        ValueError: video 'nothing.mp4': no such file; check the path
-    """
+    """The sound of a video, on the clock of its pictures; None where it has none."""
     from indexing.opening import size_of
 
     path = Path(path).expanduser()

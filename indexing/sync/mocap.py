@@ -26,15 +26,7 @@ FOLDER = "mocap-sync"
 
 @dataclass(frozen=True, eq=False)
 class Retimed:
-    """Motion capture from the reference's number 0 on.
-
-    Args:
-        take: as it was recorded.
-        people: the same on the reference's clock.
-        name: of the file.
-        first: number of the first frame that is kept, of those that were recorded.
-        rest: seconds that times in the file are off the clock at most.
-    """
+    """Motion capture from the reference's number 0 on."""
 
     take: Take
     people: tuple[Clip, ...]
@@ -49,18 +41,7 @@ class Retimed:
 
 
 def retimed(take: Take, offset: float, rate: float) -> Retimed | None:
-    """Motion capture on the reference's clock; None where it ended before the reference's number 0.
-
-    Args:
-        offset, rate: its clock is the reference's times rate plus offset.
-
-    Example:
-        >>> import numpy as np
-        >>> from indexing.sync.takes import take_of
-        >>> late = retimed(take_of(np.ones((40, 3, 3)), fps=100.0, name="vicon"), offset=0.101, rate=1.0)
-        >>> late.name, late.first, late.frames, late.people[0].times[:2].round(4).tolist()
-        ('vicon.trc', 10, 30, [-0.001, 0.009])
-    """
+    """Motion capture on the reference's clock; None where it ended before the reference's number 0."""
     half = 0.5 / take.fps
     kept = take.times >= offset - half
     if not kept.any():
@@ -91,11 +72,7 @@ def _moved(clip: Clip, offset: float, rate: float, since: float, more: float, mi
 
 
 def write_mocap(folder: Path, one: Retimed) -> list[str]:
-    """Write ``mocap-sync/NAME.trc`` or ``.c3d``, whole or not at all; what to know of it, a sentence each.
-
-    Raises:
-        ValueError: the file cannot be written.
-    """
+    """Write ``mocap-sync/NAME.trc`` or ``.c3d``, whole or not at all; what to know of it, a sentence each."""
     from indexing.writers import encode
 
     target = folder / FOLDER / one.name
@@ -108,11 +85,7 @@ def write_mocap(folder: Path, one: Retimed) -> list[str]:
 
 
 def check_mocap(folder: Path, takes: Sequence[Path]) -> None:
-    """Raise where the file would replace an input, or stand among files that this command did not write.
-
-    Raises:
-        ValueError: naming what is in the way.
-    """
+    """Raise where the file would replace an input, or stand among files that this command did not write."""
     target = folder / FOLDER
     inside = [path for path in takes if target.resolve() in path.resolve().parents]
     if inside:

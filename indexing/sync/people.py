@@ -26,14 +26,7 @@ Solve = Callable[[Clip, Clip], "Shift"]
 
 @dataclass(frozen=True, eq=False)
 class Pairing:
-    """One person of each camera, and what they say.
-
-    Args:
-        shift: of b's clock against a's.
-        people: the numbers of both among the people of their takes.
-        rivals: offsets at which other pairings are sure, too, best first.
-        sound: what the sound of both videos says by itself; None where there is none, or none was asked.
-    """
+    """One person of each camera, and what they say."""
 
     shift: Shift
     people: tuple[int, int]
@@ -42,16 +35,7 @@ class Pairing:
 
 
 def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None, *, options: SyncOptions = SyncOptions()) -> Pairing:
-    """The pairing of people on which the evidence is best.
-
-    Where people do different things at different times, a wrong pairing may look right, too: pairings that are sure of
-    different offsets make a refusal, unless one has far more confidence, or more people, behind it.
-
-    Args:
-        a, b: the cameras.
-        solve: compares a person of a with one of b.
-        trial: the same, faster, to find the pairing; ``solve`` then has the last word on it.
-    """
+    """The pairing of people on which the evidence is best."""
     every = sorted(((i, j) for i in range(len(a.people)) for j in range(len(b.people))), key=sum)
     if len(every) == 1:
         return Pairing(solve(a.people[0], b.people[0]), (0, 0))
@@ -107,11 +91,7 @@ def who(take: Take, index: int) -> str:
 
 
 def decide(found: Sequence[Pairing], frame: float, options: SyncOptions = SyncOptions()) -> tuple[Pairing, tuple[float, ...]]:
-    """The best pairing, and the offsets of those that contradict it.
-
-    Args:
-        frame: seconds.
-    """
+    """The best pairing, and the offsets of those that contradict it."""
     behind = {id(pairing): backing(pairing, found, frame, options=options) for pairing in found}
     ranked = sorted(found, key=lambda pairing: (-behind[id(pairing)], -pairing.shift.confidence))
     best = ranked[0]
@@ -148,14 +128,7 @@ def _only(clip: Clip, index: list[int], names: tuple[str, ...]) -> Clip:
 
 
 def disagreements(a: Clip, b: Clip, shift: Shift, options: SyncOptions = SyncOptions()) -> list[tuple[float, float, float]]:
-    """Stretches in which both do not show the same person: start and end on a's clock, and how many times the usual distance.
-
-    What is compared over time is the distance of a joint from the epipolar line of its partner,
-
-    .. math:: |x_b^T F x_a| / \\sqrt{(F x_a)_1^2 + (F x_a)_2^2 + (F^T x_b)_1^2 + (F^T x_b)_2^2},
-
-    as the median over the joints of a frame and over a quarter of a second.
-    """
+    """Stretches in which both do not show the same person: start and end on a's clock, and how many times the usual distance."""
     if shift.fundamental is None:
         return []
     distance = _running(_distances(a, b, shift, options), round(options.people.lasting / 2 * float(a.fps or 30.0)))

@@ -43,38 +43,7 @@ def sound_shift(
     rate: float | None = None,
     options: SoundOptions = SoundOptions(),
 ) -> Shift:
-    """How the clock of one camera runs against that of another, by what their microphones heard.
-
-    With :math:`e_k` the whitened envelope of band k, a shift :math:`\\tau` scores
-
-    .. math:: c(\\tau) = \\sum_k \\sum_t e^a_k(t)\\, e^b_k(t + \\tau),
-
-    and is believed where the sums :math:`c_w` of short stretches w have :math:`\\sum_w c_w \\ge T \\sqrt{\\sum_w c_w^2}`, and so
-    have their differences from those of every other peak.
-
-    Args:
-        a, b: of :func:`indexing.sync.listening.hear`; None = a camera without a microphone, which is refused.
-        fps: frames per second of both, for the result.
-        max_shift: seconds, the largest offset that is searched; by default as far as the recordings overlap enough.
-        rate: of b's clock against a's; None = searched where the overlap is long enough.
-        options: every number that decides.
-
-    Returns:
-        :class:`dyntorch.Shift` with ``method="sound"``.  Its sigma holds what the sound itself leaves open, how much nearer the
-        source may be to one camera, and how far sound and pictures of one file may be apart.
-
-    Source:
-        C. Knapp, G. Carter, The generalized correlation method for estimation of time delay, IEEE Trans. ASSP 24 (1976).
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> claps = np.zeros(16000 * 20, np.float32)
-        >>> for at in rng.integers(0, len(claps) - 400, 60):
-        ...     claps[at : at + 400] += rng.normal(size=400).astype(np.float32) * 0.1
-        >>> found = sound_shift(Sound(claps, 16000.0), Sound(claps[16000 * 2 :], 16000.0))  # b began two seconds later
-        >>> bool(found.ok), round(found.offset, 2)
-        (True, -2.0)
-    """
+    """How the clock of one camera runs against that of another, by what their microphones heard."""
     missing = [which for which, one in zip("ab", (a, b), strict=True) if one is None]
     if a is None or b is None:
         return _refused(fps, *(Notice(SoundNotice.NONE, 0.0, {"which": which}) for which in missing))
@@ -99,13 +68,7 @@ def _refused(fps: tuple[float, float], *limits: Notice) -> Shift:
 
 @dataclass(frozen=True)
 class SoundPeak:
-    """A shift that is worth a look.
-
-    Args:
-        lag: steps that b is later than a, in the middle of a.
-        drift: steps per step.
-        score: times the usual size of the curve.
-    """
+    """A shift that is worth a look."""
 
     lag: float
     drift: float
@@ -238,12 +201,7 @@ class SoundSearch:
 
 
 def ratio(values: Floats) -> float:
-    """The sum of values over the root of the sum of their squares; of values as likely positive as negative rarely above 4.
-
-    Example:
-        >>> ratio(np.ones(16)), ratio(np.array([9.0, 0.1, -0.1]))
-        (4.0, 1.0)
-    """
+    """The sum of values over the root of the sum of their squares; of values as likely positive as negative rarely above 4."""
     size = float(np.sqrt((values**2).sum()))
     return round(float(values.sum()) / size, 3) if size else 0.0
 
@@ -259,15 +217,7 @@ def _thinned(lags: Floats, scores: Floats, most: int) -> tuple[Floats, Floats]:
 
 
 class SoundFit:
-    """Offset and rate about a peak, to a fraction of a millisecond.
-
-    Every piece of the overlap has its own curve of scores near the peak; offset and rate are where the sum of the curves along
-    them is highest.  Their covariance is that of an M-estimator: the slopes of the single pieces between two inverse Hessians.
-
-    Attributes:
-        center: seconds on a's clock, the middle of the overlap.
-        offset, sigma, rate, rate_sigma: as of :class:`dyntorch.Shift`; sigma at the center.
-    """
+    """Offset and rate about a peak, to a fraction of a millisecond."""
 
     def __init__(self, search: SoundSearch, peak: SoundPeak):
         options, self.search = search.options, search
@@ -376,12 +326,7 @@ def apart(one: Shift, other: Shift) -> float:
 
 
 def witnessed(found: Shift, heard: Shift, options: SoundOptions = SoundOptions()) -> Shift:
-    """What keypoints or pixels say, with what the sound says to it: it agrees, contradicts (a refusal), or does not decide.
-
-    Args:
-        found: of keypoints or pixels.
-        heard: of :func:`sound_shift`, of the same two cameras.
-    """
+    """What keypoints or pixels say, with what the sound says to it: it agrees, contradicts (a refusal), or does not decide."""
     if not heard.ok:
         if all(notice.code is SoundNotice.NONE for notice in heard.notices):
             return found

@@ -195,11 +195,7 @@ def _compared(
 
 
 def listened(a: Take, b: Take, options: SyncOptions = SyncOptions(), **more: Any) -> Shift:
-    """What the sound of two cameras says.
-
-    Raises:
-        ValueError: a video cannot be read.
-    """
+    """What the sound of two cameras says."""
     from indexing.sync.listening import hear
     from indexing.sync.sound import sound_shift
 
@@ -343,11 +339,7 @@ if TYPE_CHECKING:
 def synchronize_videos(
     a: Take, b: Take, method: str, measure: Measure = "profile", options: SyncOptions = SyncOptions(), **more: Any
 ) -> Shift:
-    """Two recordings of which at least one is a video: by tracks, by brightness, or by both.
-
-    Raises:
-        ValueError: a video cannot be read.
-    """
+    """Two recordings of which at least one is a video: by tracks, by brightness, or by both."""
     more.pop("correspondence", None)  # tracks of two videos never correspond
     brightness = {name: value for name, value in more.items() if name == "max_shift"}
     if method == "brightness":
@@ -364,10 +356,7 @@ def synchronize_videos(
 
 
 def agreed(tracked: Shift, bright: Shift, options: SyncOptions = SyncOptions()) -> Shift:
-    """One answer from two methods: the tracks' where both are sure of the same, a refusal with both where they are not.
-
-    The two know nothing of each other's data, so that what one suspects and the other is sure of is taken, too.
-    """
+    """One answer from two methods: the tracks' where both are sure of the same, a refusal with both where they are not."""
     both = (tracked, bright)
     sure = [shift for shift in both if shift.ok]
     values = {"tracks": _told(tracked), "brightness": _told(bright)}

@@ -31,24 +31,7 @@ ASSUMED = 30.0  # frames per second where nobody says
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """One camera's recording.
-
-    Args:
-        name: of the camera, for tables and files.
-        kind: what it holds.
-        path: of the file or folder; None for data given as arrays.
-        people: who is tried as the person to compare, most promising first, with times on the camera's own clock
-            (``kind="keypoints"``).
-        everyone: all who were seen.
-        frames: ``(frames, height, width)`` gray values (``kind="frames"``).
-        fps: frames per second; for a video that of its file.
-        fps_assumed: nobody said how many.
-        times: ``(frames,)`` seconds, of all frames; of a video the first and the last.
-        count: how many frames there are.
-        notes: what a user should know, a sentence each.
-        video: what the people were found in by a pose model, if in a video: it may be compared by its pixels, too.
-        film: the video of keypoints that were found in it by others, where that is known: for its sound, and to be cut.
-    """
+    """One camera's recording. frames ``(frames, height, width)``, times ``(frames,)``."""
 
     name: str
     kind: Kind
@@ -91,16 +74,7 @@ def take_of(
     keypoints: Path | ValueError | None = None,
     options: SyncOptions = SyncOptions(),
 ) -> Take:
-    """A recording from whatever a user has of it: see :func:`indexing.sync.synchronize.synchronize`.
-
-    Args:
-        by: of a video: the keypoints that a pose model finds, or its pixels; ``"auto"``: keypoints where such a model is there, and
-            it finds somebody.
-        keypoints: of a video, where they were found already, or why there are none.
-
-    Raises:
-        ValueError: nothing usable; one line with the file, what is wrong and what to do.
-    """
+    """A recording from whatever a user has of it: see :func:`indexing.sync.synchronize.synchronize`."""
     if isinstance(value, Take):
         return value
     if fps is not None:
@@ -131,10 +105,7 @@ def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str,
 
 
 def _without_pauses(take: Take, options: SyncOptions) -> Take:
-    """The take with its people cut to the longest stretch of frames, where it is nearly all gap.
-
-    Clocks are searched frame by frame, which takes time and memory for every frame that is not there.
-    """
+    """The take with its people cut to the longest stretch of frames, where it is nearly all gap."""
     if take.kind != "keypoints" or take.count < 2:
         return take
     most = max(options.recording.sparse * take.count, options.recording.sparse_frames) / take.fps
@@ -153,12 +124,7 @@ def _without_pauses(take: Take, options: SyncOptions) -> Take:
 
 
 def camera_name(path: Path) -> str:
-    """A camera's name from its file or folder, as Pose2Sim names folders.
-
-    Example:
-        >>> camera_name(Path("pose/cam01_json")), camera_name(Path("videos/left.mp4"))
-        ('cam01', 'left')
-    """
+    """A camera's name from its file or folder, as Pose2Sim names folders."""
     path = path if path.name not in ("", "..") else path.resolve()
     return (path.name if path.is_dir() else path.stem).removesuffix("_json") or path.name
 
@@ -177,12 +143,7 @@ def _of_clips(name: str, path: Path | None, people: list[Clip], options: SyncOpt
 
 
 def frame_rate(times: FloatArray, about: float, options: SyncOptions = SyncOptions()) -> float:
-    """Frames per second over all of a take: by the median step of rounded times, frame numbers would drift from their frames.
-
-    Example:
-        >>> round(frame_rate(np.round(np.delete(np.arange(300), 7) / 30, 4), 30.03), 3)
-        30.0
-    """
+    """Frames per second over all of a take: by the median step of rounded times, frame numbers would drift from their frames."""
     steps = np.rint(np.diff(times) * about).sum()
     exact = float(steps / (times[-1] - times[0])) if steps > 0 else about
     return exact if abs(exact / about - 1) > options.recording.exact else about
@@ -204,11 +165,8 @@ def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[st
 
 
 def _noted(take: Take, options: SyncOptions, followed: str) -> Take:
-    """The recording with notes on frames that are missing, on those that show nobody, and on others in view than who is followed.
-
-    Args:
-        followed: who that is; empty where several are tried, which is said of those who are compared.
-    """
+    """The recording with notes on frames that are missing, on those that show nobody, and on others in view than who is
+    followed."""
     notes: list[str] = []
     people = take.people[0].meta.get("people")
     if people is not None and followed:
@@ -306,11 +264,7 @@ def _of_array(name: str, value: Any, fps: float | None, options: SyncOptions) ->
 
 
 def find_cameras(paths: Sequence[Path]) -> dict[str, Path]:
-    """Name and path of every camera; one folder may hold those of all (Pose2Sim's ``pose/cam01_json``, or a folder of videos).
-
-    Raises:
-        ValueError: fewer than two.
-    """
+    """Name and path of every camera; one folder may hold those of all (Pose2Sim's ``pose/cam01_json``, or a folder of videos)."""
     found = list(paths)
     if len(found) == 1:
         found = _inside(found[0])

@@ -30,15 +30,7 @@ REMEDY = "correct it, or give --fps"
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial folder.
-
-    Args:
-        folder: where it is.
-        cameras: name -> folder of keypoints, in the order of their last numbers, as Pose2Sim counts cameras.
-        films: name -> video, of those that have one.
-        fps: frames per second that the configuration gives; None where it leaves that to the videos.
-        calibration: the newest calibration file; None where there is none.
-    """
+    """A trial folder."""
 
     folder: Path
     cameras: dict[str, Path]
@@ -47,11 +39,7 @@ class Trial:
     calibration: Path | None
 
     def rates(self) -> list[float | None]:
-        """Frames per second of each camera: of its configuration, else of its video; None where nobody says.
-
-        Raises:
-            ValueError: a video cannot be read.
-        """
+        """Frames per second of each camera: of its configuration, else of its video; None where nobody says."""
         from indexing.video import probe
 
         films = [self.films.get(name) for name in self.cameras]
@@ -76,11 +64,7 @@ class Trial:
 
 
 def trial_of(folder: Path) -> Trial | None:
-    """The trial in a folder; None where it is none: no configuration, or fewer than two cameras in ``pose``.
-
-    Raises:
-        ValueError: a configuration that cannot be read, or a frame rate that is none.
-    """
+    """The trial in a folder; None where it is none: no configuration, or fewer than two cameras in ``pose``."""
     configs = [file for file in (folder.resolve().parent / CONFIG, folder / CONFIG) if file.is_file()]
     cameras = _cameras(folder / POSE)
     if not configs or len(cameras) < 2:
@@ -91,11 +75,7 @@ def trial_of(folder: Path) -> Trial | None:
 
 
 def trials_in(folder: Path) -> list[Path]:
-    """The trials of a session: folders below with a configuration and keypoints, but those that it excludes.
-
-    Raises:
-        ValueError: a configuration that cannot be read.
-    """
+    """The trials of a session: folders below with a configuration and keypoints, but those that it excludes."""
     if not (folder / CONFIG).is_file():
         return []
     project = _project(folder / CONFIG)
@@ -121,12 +101,7 @@ def _cameras(pose: Path) -> dict[str, Path]:
 
 
 def _last_number(name: str) -> tuple[bool, int]:
-    """By what Pose2Sim sorts.
-
-    Example:
-        >>> sorted(["cam10_json", "cam2_json", "side_json"], key=_last_number)
-        ['cam2_json', 'cam10_json', 'side_json']
-    """
+    """By what Pose2Sim sorts."""
     digits = "".join(letter if letter.isdecimal() else " " for letter in name).split()
     return (False, int(digits[-1])) if digits else (True, 0)
 
@@ -152,11 +127,7 @@ def _project(path: Path) -> dict[str, Any]:
 
 
 def _frame_rate(configs: Sequence[Path]) -> float | None:
-    """Of the configurations, the last of which counts most.
-
-    Raises:
-        ValueError: neither a positive number nor "auto".
-    """
+    """Of the configurations, the last of which counts most."""
     said: tuple[Path, Any] | None = None
     for path in configs:
         rate = _project(path).get("frame_rate")
@@ -170,12 +141,7 @@ def _frame_rate(configs: Sequence[Path]) -> float | None:
 
 
 def shortest(takes: Sequence[Take]) -> int:
-    """The camera whose frame numbers count: the one that recorded least, of equals the first.
-
-    Example:
-        >>> shortest([Take("a", "keypoints", count=50), Take("b", "keypoints", count=40), Take("c", "keypoints", count=40)])
-        1
-    """
+    """The camera whose frame numbers count: the one that recorded least, of equals the first."""
     return min(range(len(takes)), key=lambda i: takes[i].count)
 
 

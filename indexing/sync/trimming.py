@@ -41,14 +41,7 @@ class CameraClock(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class CameraFilm:
-    """A camera's video, and when its frames were taken.
-
-    Args:
-        name: of the camera.
-        path: of the video.
-        stamps: ``(frames,)`` seconds of every frame as the video file says.
-        times: ``(frames,)`` the same moments on the camera's clock, that of its keypoints.
-    """
+    """A camera's video, and when its frames were taken. stamps ``(frames,)``, times ``(frames,)``."""
 
     name: str
     path: Path
@@ -63,13 +56,7 @@ class CameraFilm:
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """Which frames of a video are written.
-
-    Args:
-        film: the video.
-        rows: ``(k,)`` the frame that is nearest to each moment.
-        rest: seconds, the greatest distance that is left.
-    """
+    """Which frames of a video are written. rows ``(k,)``."""
 
     film: CameraFilm
     rows: NDArray[np.int64]
@@ -101,13 +88,7 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class Trim:
-    """What all cameras recorded, frame by frame.
-
-    Args:
-        fps: frames per second of all files.
-        start: seconds on the reference's clock, of the first frame.
-        cuts: of each camera.
-    """
+    """What all cameras recorded, frame by frame."""
 
     fps: Fraction
     start: float
@@ -120,14 +101,8 @@ class Trim:
 
 
 def film_of(take: Take, times: Floats | None = None) -> CameraFilm:
-    """The video of a camera: what it is itself, what its keypoints were found in, or the one that lies beside them.
-
-    Args:
-        times: ``(frames,)`` of the keypoints, where they are not those of the take: of a clock that broke.
-
-    Raises:
-        ValueError: there is none, it cannot be read, or its frames are not those of the keypoints.
-    """
+    """The video of a camera: what it is itself, what its keypoints were found in, or the one that lies beside them. times
+    ``(frames,)``."""
     from indexing.video.reading import frame_times
 
     path = take.footage or beside(take)
@@ -155,16 +130,7 @@ def beside(take: Take) -> Path | None:
 
 
 def clock_of(take: Take, path: Path, stamps: Floats, mended: Floats | None = None, options: TrimOptions = TrimOptions()) -> Floats:
-    """When the frames of a video were taken, on the clock of a camera's keypoints.
-
-    Keypoints know their times (those of the video), or only numbers: then number / fps is the clock, whatever the video says.
-
-    Args:
-        mended: ``(frames,)`` of the keypoints, instead of those of the take.
-
-    Raises:
-        ValueError: there are keypoints of frames that the video does not have.
-    """
+    """When the frames of a video were taken, on the clock of a camera's keypoints. mended ``(frames,)``."""
     if take.kind != "keypoints":
         return stamps
     near = np.abs(stamps[np.clip(np.searchsorted(stamps, take.times), 1, len(stamps) - 1) - [[1], [0]]] - take.times).min(axis=0)
@@ -183,23 +149,7 @@ def clock_of(take: Take, path: Path, stamps: Floats, mended: Floats | None = Non
 def trim(
     films: Sequence[CameraFilm], clocks: Sequence[CameraClock], fps: float | None = None, options: TrimOptions = TrimOptions()
 ) -> Trim:
-    """Choose the frames of what all cameras recorded: at each moment the nearest one of each.
-
-    Args:
-        films: the reference's first.
-        clocks: of the cameras, told on the reference's.
-        fps: frames per second to write; by default those of the reference, whose own frames are then the moments.
-
-    Raises:
-        ValueError: the cameras have no moment in common.
-
-    Example:
-        >>> from indexing.report.sync import Clock
-        >>> films = [CameraFilm(name, Path(f"{name}.mp4"), np.arange(50) / 25, np.arange(50) / 25) for name in ("a", "b")]
-        >>> made = trim(films, [Clock(Take(name, "video"), offset, 0.0) for name, offset in (("a", 0.0), ("b", -0.4))])
-        >>> made.frames, [int(cut.rows[0]) for cut in made.cuts], made.fps
-        (40, [10, 0], Fraction(25, 1))
-    """
+    """Choose the frames of what all cameras recorded: at each moment the nearest one of each."""
     first = films[0]
     own = (len(first.times) - 1) / (first.times[-1] - first.times[0]) if len(first.times) > 1 else 0.0
     if fps is None and not own > 0:
@@ -236,11 +186,7 @@ def _cut(film: CameraFilm, wanted: Floats) -> Cut:
 
 
 def check_videos(folder: Path, inputs: Sequence[Path]) -> None:
-    """Raise where the trimmed videos would replace an input, or files that this command did not write.
-
-    Raises:
-        ValueError: naming what is in the way.
-    """
+    """Raise where the trimmed videos would replace an input, or files that this command did not write."""
     target = folder / FOLDER
     recover_folder(target)
     inside = [path for path in inputs if target.resolve() in (path.resolve(), *path.resolve().parents)]
@@ -278,16 +224,7 @@ def drop_videos(folder: Path) -> bool:
 def write_videos(
     folder: Path, chosen: Trim, done: Callable[[float], None] | None = None, options: TrimOptions = TrimOptions()
 ) -> Path:
-    """Write ``synchronized_videos/<camera>.mp4`` for every camera: all of them, or nothing.
-
-    H.264 where FFmpeg has it (else MPEG-4), upright, without sound.
-
-    Args:
-        done: is told the share that is written.
-
-    Raises:
-        ValueError: a video cannot be read, or the folder cannot be written.
-    """
+    """Write ``synchronized_videos/<camera>.mp4`` for every camera: all of them, or nothing."""
     from indexing.video.reading import av
 
     target = folder / FOLDER

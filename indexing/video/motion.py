@@ -27,12 +27,7 @@ Floats = NDArray[np.float64]
 
 
 class Background:
-    """Follows the background through grey frames of one size; :meth:`step` per frame, in order.
-
-    Attributes:
-        support: share of the background points that agree with the motion of the last frame; 0 where nothing could be said.
-        cut: whether the last frame shows nothing of the frame before it.
-    """
+    """Follows the background through grey frames of one size; :meth:`step` per frame, in order."""
 
     def __init__(self, options: CameraMotionOptions = CameraMotionOptions()) -> None:
         self.options = options
@@ -102,18 +97,7 @@ def robust_motion(
     source: Floats, target: Floats, guess: Floats, side: float, options: CameraMotionOptions = CameraMotionOptions()
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """That of the points that rest, where these are enough; else the similarity, or the homography, that maps most points.
-
-    .. math:: x' \\sim H x, \\qquad H = \\begin{pmatrix} a & -b & c \\\\ b & a & d \\\\ 0 & 0 & 1 \\end{pmatrix} \\text{ or any}
-
-    Args:
-        source: ``(n, 2)`` pixels.
-        target: ``(n, 2)`` pixels.
-        guess: ``(3, 3)`` motion of the frame before, tried first: where half the points agree, no sampling is needed.
-        side: the longest of the image, in pixels.
-
-    Returns:
-        the motion ``(3, 3)``, and which points agree with it; none where too few do to say.
-    """
+    source ``(n, 2)``, target ``(n, 2)``, guess ``(3, 3)`` -> ``(3, 3)``."""
     rests = np.linalg.norm(target - source, axis=1) < options.rest
     if rests.sum() >= options.fewest and rests.mean() * source[rests].std(0).max() > options.stands * side:
         return similarity(source[rests], target[rests]), rests
@@ -142,15 +126,7 @@ def robust_motion(
 
 
 def similarity(source: Floats, target: Floats) -> Floats:
-    """The similarity nearest to pairs of points, as ``(3, 3)``: least squares of :math:`z' = a z + b` in complex numbers.
-
-    Example:
-        >>> import numpy as np
-        >>> similarity(np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[1.0, 0], [1, 2], [-1, 0]])).round(6) + 0.0
-        array([[ 0., -2.,  1.],
-               [ 2.,  0.,  0.],
-               [ 0.,  0.,  1.]])
-    """
+    """The similarity nearest to pairs of points, as ``(3, 3)``: least squares of :math:`z' = a z + b` in complex numbers."""
     z, w = source @ [1, 1j], target @ [1, 1j]
     here, there = z.mean(), w.mean()
     scale = np.vdot(z - here, w - there) / max(np.vdot(z - here, z - here).real, 1e-12)

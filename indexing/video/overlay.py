@@ -33,49 +33,19 @@ SUBPIXEL = 4  # bits: OpenCV draws at sixteenths of a pixel
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """What is drawn over a video.
+    """What is drawn over a video."""
 
-    Attributes:
-        points: ``(views, n, 2)`` pixels of the video as shown, NaN = not seen.
-        frames: ``views`` numbers of the frames, which increase.
-        size: width and height of the video as shown, pixels.
-        groups: ``(n,)`` of each track: 0 = none of them, or 1.. into ``names``.
-        names: of the groups, for the legend.
-        colours: of the groups, RGB.
-        captions: ``views`` texts, one for each frame.
-    """
-
-    points: Floats
-    frames: Sequence[int]
-    size: tuple[float, float]
-    groups: NDArray[np.int64]
-    names: Sequence[str]
-    colours: Sequence[Colour]
-    captions: Sequence[str]
+    points: Floats  # ``(views, n, 2)`` pixels of the video as shown, NaN = not seen
+    frames: Sequence[int]  # ``views`` numbers of the frames, which increase
+    size: tuple[float, float]  # width and height of the video as shown, pixels
+    groups: NDArray[np.int64]  # ``(n,)`` of each track: 0 = none of them, or 1.. into ``names``
+    names: Sequence[str]  # of the groups, for the legend
+    colours: Sequence[Colour]  # of the groups, RGB
+    captions: Sequence[str]  # ``views`` texts, one for each frame
 
 
 def write_overlay(source: Source | Sequence[str | Path], overlay: Overlay, fps: float = 25.0) -> bytes:
-    """The frames in calm grey with the tracks over them, dots with short tails, as an MP4 of at most 960 pixels.
-
-    Args:
-        source: a video; a folder, a pattern or a list of pictures; or chunks of grey frames.
-        overlay: what is drawn.
-        fps: frames per second; 8 to 30 are used.
-
-    Returns:
-        H.264 where FFmpeg has it, else MPEG-4.
-
-    Raises:
-        ValueError: a source that cannot be read, or that ends before the last of the frames.
-
-    Example:
-        >>> import numpy as np
-        >>> from indexing.video import Chunk
-        >>> points = np.cumsum(np.ones((3, 1, 2)), axis=0)
-        >>> drawn = Overlay(points, range(3), (64, 48), np.array([1]), ["body 1"], [(47, 127, 184)], ["0", "1", "2"])
-        >>> write_overlay([Chunk(np.zeros((3, 48, 64), np.uint8), np.arange(3.0))], drawn)[4:8]
-        b'ftyp'
-    """
+    """The frames in calm grey with the tracks over them, dots with short tails, as an MP4 of at most 960 pixels."""
     return encoded(_drawn(source, overlay), float(np.clip(fps, SLOWEST, FASTEST)))
 
 

@@ -21,20 +21,12 @@ from indexing.opening import size_of
 
 
 def av() -> Any:
-    """PyAV: reads and writes video files.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+    """PyAV: reads and writes video files."""
     return _load("av", "PyAV")
 
 
 def cv2() -> Any:
-    """OpenCV: finds points, follows them, warps pictures.
-
-    Raises:
-        ValueError: it is not installed.
-    """
+    """OpenCV: finds points, follows them, warps pictures."""
     return _load("cv2", "OpenCV")
 
 
@@ -141,11 +133,7 @@ def orientation(frame: Any) -> Orientation:
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
-    """PyAV's container and its video stream.
-
-    Raises:
-        ValueError: there is no such file, it is no video, or nothing can be read of it.
-    """
+    """PyAV's container and its video stream."""
     name = repr(str(path))
     try:
         size = size_of(path)
@@ -204,11 +192,7 @@ def probe(path: str | Path, *, fps: float | None = None) -> VideoInfo:
 
 
 def frame_times(path: str | Path, *, fps: float | None = None) -> tuple[VideoInfo, NDArray[np.float64]]:
-    """What :func:`probe` says, and when every frame is shown: ``(frames,)`` seconds on the clock of :func:`read_video`.
-
-    Raises:
-        ValueError: as :func:`probe`.
-    """
+    """What :func:`probe` says, and when every frame is shown: ``(frames,)`` seconds on the clock of :func:`read_video`."""
     failed: list[str] = []
     stamps: list[int | None] = []
     first = None
@@ -249,19 +233,8 @@ def frame_times(path: str | Path, *, fps: float | None = None) -> tuple[VideoInf
 
 
 def evenness(times: NDArray[np.float64], tick: float = 0.0) -> tuple[float, int]:
-    """How far times lie off the even grid from first to last, in frames, and how many frames are missing in gaps.
-
-    Args:
-        times: ``(frames,)`` seconds, increasing.
-        tick: seconds to which they were rounded; up to that much is not held against them.
-
-    Example:
-        >>> import numpy as np
-        >>> evenness(np.array([0.0, 1, 2, 3, 5, 6, 7, 8]))[1]
-        1
-        >>> evenness(np.arange(10) / 30)[0] < 1e-9
-        True
-    """
+    """How far times lie off the even grid from first to last, in frames, and how many frames are missing in gaps. times
+    ``(frames,)``."""
     if len(times) < 3:
         return 0.0, 0
     grid = np.linspace(times[0], times[-1], len(times))

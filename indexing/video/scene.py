@@ -158,22 +158,14 @@ class Wanted:
 
     @staticmethod
     def enough(times: list[float], name: str) -> int:
-        """How many frames were read.
-
-        Raises:
-            ValueError: fewer than two.
-        """
+        """How many frames were read."""
         count = len(times)
         if count < 2:
             raise ValueError(f"{name}: has {count} frame{'s' * (count != 1)}, and motion needs at least 2; give a longer video")
         return count
 
     def taken(self, times: list[float], first: int, name: str) -> list[int]:
-        """Numbers of the frames that are taken, of those that were read, ``first`` being the first that was followed.
-
-        Raises:
-            ValueError: there are no such frames.
-        """
+        """Numbers of the frames that are taken, of those that were read, ``first`` being the first that was followed."""
         count = self.enough(times, name)
         if self.frames is not None:
             lost = next((k for k in self.frames if k >= count), None)
@@ -256,11 +248,8 @@ def _seen(positions: Floats, least: int) -> Floats:
 
 
 def _anchored(positions: Floats, pictures: Images, options: SceneOptions) -> Floats:
-    """Each point compared with the first picture that shows it, there and back from where it was followed to; NaN where it fails.
-
-    At the edge of what moves, and where something passes before it, a point is dragged along: frame by frame it looks like itself,
-    and from the first picture to the last it does not.
-    """
+    """Each point compared with the first picture that shows it, there and back from where it was followed to; NaN where it
+    fails."""
     views = len(positions)
     if views > options.anchors:
         return positions

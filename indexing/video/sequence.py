@@ -20,12 +20,7 @@ SEQUENCE_CHUNK = 16  # pictures at once
 
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
-    """Files by their names, numbers in these by their value.
-
-    Example:
-        >>> [str(path) for path in in_order([Path("f10.png"), Path("f9.png"), Path("f1.png")])]
-        ['f1.png', 'f9.png', 'f10.png']
-    """
+    """Files by their names, numbers in these by their value."""
 
     def key(path: Path) -> list[tuple[int, int, str]]:
         parts = re.split(r"(\d+)", path.name.lower())
@@ -45,11 +40,7 @@ def is_pattern(path: str | Path) -> bool:
 
 
 def pictures_of(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """The pictures of a folder, of a pattern such as ``frames/*.png``, or of a list, in order.
-
-    Raises:
-        ValueError: there are none.
-    """
+    """The pictures of a folder, of a pattern such as ``frames/*.png``, or of a list, in order."""
     if not isinstance(source, (str, Path)):
         return [Path(path).expanduser() for path in source]
     path = Path(source).expanduser()
@@ -112,16 +103,7 @@ class PictureSequence:
 
 
 def chunks(source: Source | Sequence[str | Path], size: int | None = None, fps: float | None = None) -> Iterable[Chunk]:
-    """The chunks of a video file, of a folder, a pattern or a list of pictures, or of what gives chunks by itself.
-
-    Args:
-        source: any of these.
-        size: longest side in pixels, of files.
-        fps: frames per second of files that do not say.
-
-    Raises:
-        ValueError: nothing that can be read.
-    """
+    """The chunks of a video file, of a folder, a pattern or a list of pictures, or of what gives chunks by itself."""
     if isinstance(source, (str, Path)):
         path = Path(source).expanduser()
         if path.is_dir() or is_pattern(path) or is_picture(path):

@@ -22,17 +22,7 @@ from indexing.video.sequence import chunks
 
 
 class MovingArea:
-    """Where something moves within a chunk, for each of its frames: a mask of the frame's size.
-
-    Example:
-        >>> import numpy as np
-        >>> from indexing.video import Chunk
-        >>> frames = np.zeros((8, 64, 64), np.uint8)
-        >>> frames[4:, 16:32, 16:32] = 200
-        >>> where = MovingArea(Chunk(frames, np.arange(8.0)), [np.eye(3)] * 8)
-        >>> bool(where(np.eye(3))[20, 20]), bool(where(np.eye(3))[60, 60])
-        (True, False)
-    """
+    """Where something moves within a chunk, for each of its frames: a mask of the frame's size."""
 
     def __init__(self, chunk: Chunk, path: list[Floats], change: float = TrackOptions.change):
         height, width = chunk.frames.shape[1:]
@@ -81,13 +71,7 @@ def patches(image: NDArray[np.uint8], points: NDArray[np.float32], options: Trac
 
 
 def extent(track: Floats, share: float = 0.9) -> float:
-    """Of positions ``(frames, 2)``: diagonal of the box of the middle ``share`` in x and y, in their unit.
-
-    Example:
-        >>> import numpy as np
-        >>> extent(np.stack([np.linspace(0, 10, 101), np.zeros(101)], 1))
-        9.0
-    """
+    """Of positions ``(frames, 2)``: diagonal of the box of the middle ``share`` in x and y, in their unit."""
     low, high = np.percentile(track, [50 - 50 * share, 50 + 50 * share], axis=0)
     return float(np.hypot(*(high - low)))
 

@@ -183,12 +183,7 @@ def _length(stream: Iterable[Chunk]) -> int:
 
 
 def keeping(lengths: NDArray[np.int_], most: int) -> NDArray[np.int_]:
-    """Places of the tracks that are kept, in order: the longest, and as many of the others, evenly.
-
-    Example:
-        >>> keeping(np.array([9, 1, 2, 1, 2, 1, 8]), 4).tolist()
-        [0, 1, 5, 6]
-    """
+    """Places of the tracks that are kept, in order: the longest, and as many of the others, evenly."""
     if len(lengths) <= most:
         return np.arange(len(lengths))
     order = np.argsort(-lengths, kind="stable")
@@ -197,12 +192,8 @@ def keeping(lengths: NDArray[np.int_], most: int) -> NDArray[np.int_]:
 
 
 def spread(views: int, most: int) -> list[int]:
-    """Places of some of the views, evenly to the last one; the first a little after the beginning, when points have gone somewhere.
-
-    Example:
-        >>> spread(101, 4), spread(2, 4)
-        ([10, 40, 70, 100], [0, 1])
-    """
+    """Places of some of the views, evenly to the last one; the first a little after the beginning, when points have gone
+    somewhere."""
     return np.unique(np.linspace(0.1 * (views - 1), views - 1, min(most, views)).round().astype(int)).tolist()
 
 
@@ -239,18 +230,7 @@ def _watched(pictures: Iterator[Picture], kept: list[int], out: Images) -> Itera
 
 def anchored(positions: Floats, pictures: Iterator[Picture], options: SceneOptions) -> Floats:
     """Each point compared with the first picture of every span that shows it, there and back from where it was followed to.
-
-    Where that fails the point is hidden; where it fails to the end of the span, its track ends, and what is followed there later is
-    a track of its own: at the edge of what moves a point is dragged along, and is a point of something else then.
-
-    Args:
-        positions: ``(views, n, 2)`` pixels.
-        pictures: of the views, in order; only those of one span are held.
-        options: of the scene.
-
-    Returns:
-        ``(views, m, 2)`` with the tracks that begin again behind the others.
-    """
+    positions ``(views, n, 2)`` -> ``(views, m, 2)``."""
     out = positions.copy()
     again: list[Floats] = []
     views = len(out)

@@ -29,29 +29,7 @@ UNITS = ("m", "cm", "mm", "px")
 
 
 def write(clips: Sequence[Clip], path: str | Path, units: str | None = None) -> list[str]:
-    """Write one recording, of one person or of several, in the format that the suffix says.
-
-    Args:
-        clips: the people of one recording.
-        path: ending in a suffix of :data:`FORMATS`; an older file of this name is replaced, whole or not at all.
-        units: of the coordinates, for ``.trc`` and ``.c3d``, of :data:`UNITS`; they are written as they are.  By default what the
-            clips say (``meta["units"]``), ``px`` in 2D, and in 3D what the size of the body speaks for.
-
-    Returns:
-        what a reader should know of what was lost or assumed, a sentence each.
-
-    Raises:
-        ValueError: another suffix, several recordings, or what the format cannot hold; nothing is written then.
-
-    Example:
-        >>> import pathlib, tempfile, numpy as np
-        >>> from indexing import Clip
-        >>> path = pathlib.Path(tempfile.mkdtemp()) / "a.trc"
-        >>> write([Clip(np.ones((4, 3, 3)) * np.arange(3)[:, None], fps=50.0)], path)
-        ['the units are not known: by the size of the body, m; units says otherwise']
-        >>> path.read_text().splitlines()[2].split()[:5]
-        ['50.0', '50.0', '4', '3', 'm']
-    """
+    """Write one recording, of one person or of several, in the format that the suffix says."""
     path = Path(path).expanduser()
     if not path.parent.is_dir():
         raise error(path, f"the folder {path.parent} does not exist", "create it first")
@@ -61,11 +39,7 @@ def write(clips: Sequence[Clip], path: str | Path, units: str | None = None) -> 
 
 
 def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple[bytes, list[str]]:
-    """What :func:`write` would write to a path, and its notes; nothing is written.
-
-    Raises:
-        ValueError: as :func:`write`.
-    """
+    """What :func:`write` would write to a path, and its notes; nothing is written."""
     module = FORMATS.get(path.suffix.lower())
     if module is None:
         raise error(path, f"no format ends in {path.suffix!r}", f"end the name in one of .npz, {', '.join(FORMATS)}")

@@ -31,13 +31,7 @@ KEEP_TIMES = "write .trc, .nc or .npz, which keep times"
 
 
 def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple[bytes, list[str]]:
-    """The people of one recording, frame by frame at one rate, and what the format has no place for.
-
-    Frames that are not there count as not seen.
-
-    Raises:
-        ValueError: uneven times, or names or numbers that the format has no room for.
-    """
+    """The people of one recording, frame by frame at one rate, and what the format has no place for."""
     found = markers_of(clips, path, units)
     spaced, first = _even(found, path)
     frames, count = spaced.places.shape[:2]
@@ -60,11 +54,7 @@ def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple
 
 
 def _even(found: Markers, path: Path) -> tuple[Markers, int]:
-    """All frames of a grid of even times, and the number of the first, from 1.
-
-    Raises:
-        ValueError: times that are no such grid.
-    """
+    """All frames of a grid of even times, and the number of the first, from 1."""
     rate, steps, off = _grid(found.times, found.rate)
     if off.max() > MARKERS.uneven:  # frames left out of a faster recording, as of one of which every fifth is kept, or so
         other = _grid(found.times, found.numbered)

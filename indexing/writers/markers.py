@@ -43,34 +43,20 @@ MARKERS = MarkerOptions()
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """Points over time.
+    """Points over time."""
 
-    Attributes:
-        names: of the points, each once; of several people ``person:joint``.
-        times: ``(frames,)`` seconds.
-        places: ``(frames, points, 3)``, NaN = not seen.
-        rate: frames per second; of uneven times, the usual.
-        numbered: frames per second by which frames are numbered, where some are left out.
-        units: of the places; up: as of a clip.
-        notes: what a reader should know, a sentence each.
-    """
-
-    names: tuple[str, ...]
-    times: FloatArray
-    places: FloatArray
-    rate: float
-    numbered: float
-    units: str
+    names: tuple[str, ...]  # of the points, each once; of several people ``person:joint``
+    times: FloatArray  # ``(frames,)`` seconds
+    places: FloatArray  # ``(frames, points, 3)``, NaN = not seen
+    rate: float  # frames per second; of uneven times, the usual
+    numbered: float  # frames per second by which frames are numbered, where some are left out
+    units: str  # of the places; up: as of a clip
     up: str
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = field(default=())  # what a reader should know, a sentence each
 
 
 def markers_of(clips: Sequence[Clip], path: Path, units: str | None = None) -> Markers:
-    """The people of one recording as points; 2D at z = 0.
-
-    Raises:
-        ValueError: no clips, clips of several recordings, or that differ in dimensions or in which way is up.
-    """
+    """The people of one recording as points; 2D at z = 0."""
     clips = list(clips)
     people = people_of(clips, path)
     first = clips[0]
@@ -107,11 +93,7 @@ def _rate(times: FloatArray, told: float) -> float:
 
 
 def people_of(clips: Sequence[Clip], path: Path) -> list[str]:
-    """What each clip's person is called; empty where there is one alone.
-
-    Raises:
-        ValueError: none, or clips that are not the people of one recording.
-    """
+    """What each clip's person is called; empty where there is one alone."""
     if not clips:
         raise error(path, "there are no clips to write", "give at least one")
     if len(clips) == 1:

@@ -22,11 +22,7 @@ INSTALL = "pip install xarray, and for .nc netCDF4, too"
 
 
 def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple[bytes, list[str]]:
-    """The people of one recording as netCDF 4, which ``xarray.open_dataset`` reads.
-
-    Raises:
-        ValueError: xarray, or what it writes netCDF with, is not installed; or several recordings.
-    """
+    """The people of one recording as netCDF 4, which ``xarray.open_dataset`` reads."""
     if units is not None:
         raise error(path, Message("{arg:units} is for .trc and .c3d"), "leave it out")
     dataset = dataset_of(clips, path)
@@ -45,11 +41,7 @@ def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple
 
 
 def dataset_of(clips: Sequence[Clip], path: Path = Path("dataset")) -> Any:
-    """The people of one recording as an ``xarray.Dataset`` of poses; see :meth:`indexing.Clip.to_movement`.
-
-    Raises:
-        ValueError: xarray is not installed; or clips that differ in joints, or are not the people of one recording.
-    """
+    """The people of one recording as an ``xarray.Dataset`` of poses; see :meth:`indexing.Clip.to_movement`."""
     try:
         import xarray
     except ImportError:

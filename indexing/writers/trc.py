@@ -15,13 +15,7 @@ if TYPE_CHECKING:
 
 
 def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple[bytes, list[str]]:
-    """The people of one recording as text, and what it has no place for.
-
-    Times are exact, even or not; numbers have all of their digits.
-
-    Raises:
-        ValueError: what :func:`indexing.writers.markers.markers_of` refuses.
-    """
+    """The people of one recording as text, and what it has no place for."""
     found = markers_of(clips, path, units)
     numbers = frame_numbers(found.times, found.rate)
     frames, count = found.places.shape[:2]

@@ -143,18 +143,8 @@ def chosen_plane(views: CalibratedViews, options: AlignMetricOptions) -> PlaneCh
 def euclidean(
     solution: Solution, data: Matches, labels: Tensor, K: Tensor, options: AlignMetricOptions
 ) -> tuple[PlaneMotion, PlaneMotion, list[Notice]]:
-    """Motion of calibrated cameras above a plane, another that explains the matches as well, and what limits both.
-
-    Args:
-        solution: A, B and those of further views, flat batch.
-        data: the matches.
-        labels: ``(b, n)``.
-        K: ``(b, views, 3, 3)``.
-        options: what decides.
-
-    Returns:
-        In the batch and dtype of the matches; zero where there is none.
-    """
+    """Motion of calibrated cameras above a plane, another that explains the matches as well, and what limits both. labels
+    ``(b, n)``, K ``(b, views, 3, 3)``."""
     views = CalibratedViews.of(solution, data, labels, K)
     choice = chosen_plane(views, options)
     free = views.fine & (choice.deviation > options.undetermined)

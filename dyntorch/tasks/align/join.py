@@ -112,10 +112,7 @@ def _improved(evidence: Evidence, starts: list[Tensor], sigma: Tensor, *, sample
 
 
 def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
-    """1 for problems ``(b,)`` whose motion fewer than half of the matches agree with, or fewer moving ones than determine one.
-
-    For the others a further start can only lead to the same motion: one that as many matches agree with shares some with it.
-    """
+    """1 for problems ``(b,)`` whose motion fewer than half of the matches agree with, or fewer moving ones than determine one."""
     labels, invariant = evidence.labels(theta, sigma), evidence.invariant
     moving, agreeing, present = ((labels == MOVING).sum(-1), (labels != OUTLIER).sum(-1), (evidence.data.weights > 0).sum(-1))
     return ((2 * agreeing <= present) | (moving * invariant.codim <= invariant.dof)).to(theta)
@@ -227,10 +224,7 @@ def _notices(
 
 
 def trajectory_lines(evidence: Evidence, best: Labelled, options: AlignOptions) -> Tensor:
-    """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES.
-
-    Greedy: the longest path determines its line best; all matches on that line go, and so on.
-    """
+    """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES."""
     parts = evidence.problem(best.labels).parts(best.theta)
     others = [inhomogeneous(homogeneous(x) @ m.mT) for m, x in zip(parts, evidence.views[1:], strict=True)]
     places = torch.stack([evidence.views[0], *others])

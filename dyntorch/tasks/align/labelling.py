@@ -99,11 +99,7 @@ class Evidence:
         return moving, self.invariant.whitened_static(motion, self.views, self.norm.scales)
 
     def cost(self, theta: Tensor, sigma: Tensor) -> Tensor:
-        """How badly the motion explains the matches, ``(b,)``.
-
-        A static match costs its chi^2; a moving one as much as the worst static match, plus its chi^2; an outlier as much as
-        the worst moving one.  So every match takes the simplest explanation that fits.
-        """
+        """How badly the motion explains the matches, ``(b,)``."""
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
         still, path = three_sigma(self.still), three_sigma(self.invariant.codim)
@@ -212,26 +208,8 @@ def static_consensus(
     generator: torch.Generator | None,
     options: AlignOptions,
 ) -> tuple[tuple[Tensor, ...], Tensor]:
-    r"""Collineations of view 2, 3, ... to view 1 on which the most matches agree, from samples of d + 2 matches.
-
-    A collineation that takes the points :math:`q_k` to :math:`p_k` is :math:`P\, \mathrm{diag}(c_k / e_k)\, Q^{-1}` where the
-    columns of P, Q are the first d + 1 of them and c, e the coordinates of the last one in these bases.
-
-    Args:
-        views: ``(b, n, d)`` each, of about unit size.
-        pool: ``(b, n)`` bool, matches to sample from and to count.
-        limit: ``(b,)`` square distance in view 1, summed over the other views, that is as bad as any larger one; None: least
-            median of squares.
-        samples: hypotheses per problem.
-        generator: source of the samples.
-
-    Returns:
-        One ``(b, d + 1, d + 1)`` per view after the first, and ``(b,)`` the median square distance of the pool, halved for the
-        noise of the two views that each distance has and divided by the median of :math:`\chi^2_4`: an estimate of the
-        variance of the noise where more than half of the pool stands still.
-
-    Source: Fischler and Bolles 1981; Rousseeuw 1984 (least median of squares); Hartley and Zisserman, section 4.7.
-    """
+    r"""Collineations of view 2, 3, ... to view 1 on which the most matches agree, from samples of d + 2 matches. views
+    ``(b, n, d)``, pool ``(b, n)``, limit ``(b,)`` -> ``(b, d + 1, d + 1)``."""
     b, n, d = views[0].shape
     device = views[0].device
     shuffled = (uniform(b, n, generator=generator, device=device) + 2.0 * ~pool).argsort(dim=-1)

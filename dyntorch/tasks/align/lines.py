@@ -41,21 +41,13 @@ DOF = TranslatingLinesMatrix.dof
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines as two points each, and static points, in normalized coordinates; flat batch.
+    """Lines as two points each, and static points, in normalized coordinates; flat batch."""
 
-    Attributes:
-        data: lines ``(b, n, 2, 3)`` as measured.
-        views: normalized.
-        points: normalized static points ``(b, k, 3)`` of both views, k may be 0.
-        norm: the similarities of both views.
-        floor: ``(b,)`` the least noise that the numbers allow, in the unit of the points.
-    """
-
-    data: Matches
-    views: tuple[Tensor, ...]
-    points: tuple[Tensor, ...]
-    norm: Normalization
-    floor: Tensor
+    data: Matches  # lines ``(b, n, 2, 3)`` as measured
+    views: tuple[Tensor, ...]  # normalized
+    points: tuple[Tensor, ...]  # normalized static points ``(b, k, 3)`` of both views, k may be 0
+    norm: Normalization  # the similarities of both views
+    floor: Tensor  # ``(b,)`` the least noise that the numbers allow, in the unit of the points
 
     @classmethod
     def of(cls, data: Matches, points: tuple[Tensor, Tensor] | None, norm: Normalization) -> Lines:
@@ -164,15 +156,7 @@ def _two_points(line: Tensor, present: Tensor) -> Tensor:
 def settle(
     lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain: bool, options: AlignOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Label and refine in turns: A ``(b, 16)`` in normalized coordinates, labels ``(b, n)``, noise ``(b,)``.
-
-    Args:
-        lines: the matches.
-        theta: ``(b, 16)`` to start from.
-        sigma: ``(b,)`` noise.
-        estimate: whether the noise is estimated anew in every round.
-        plain: whether no line is called an outlier before the first refinement.
-    """
+    """Label and refine in turns: A ``(b, 16)`` in normalized coordinates, labels ``(b, n)``, noise ``(b,)``."""
     present = lines.data.weights > 0
     labels = torch.where(present, MOVING, OUTLIER) if plain else _labels(lines, theta, sigma)
     for _ in range(options.lines.rounds):
@@ -351,12 +335,7 @@ def _align(
 
 
 def _from_static(lines: Lines, bound: Tensor, generator: torch.Generator | None, options: AlignOptions) -> Tensor:
-    r"""A ``(b, 16)`` that the most lines agree with that did not move, of those that five random lines determine.
-
-    A static line gives four equations, :math:`\pi^T A\, q = 0` for two planes through it and two of its points.  Four lines
-    would be enough to count, but collineations of one parameter keep any four lines (and their two transversals); five have
-    none.  A sample of 35 lines without an outlier is rare where one in five is one: .8^35 = .0004.
-    """
+    r"""A ``(b, 16)`` that the most lines agree with that did not move, of those that five random lines determine."""
     first, second = lines.views
     planes = torch.linalg.qr(homogeneous(first).mT, mode="complete").Q[..., 2:].mT  # (b, n, 2, 4) through the line in view 1
     planes = planes / planes[..., :3].norm(dim=-1, keepdim=True).clamp(min=1e-12)
@@ -468,12 +447,7 @@ def _rivals(
     doubtful: Tensor,
     options: AlignOptions,
 ) -> Tensor:
-    """Whether another motion ``(b,)``, far from this one, explains the lines about as well.
-
-    A space of linear solutions may hold several that are motions, each certain by itself: of the lines of one translating body with
-    two or three static points, exact ones, two to four.  Descents from the weakest directions of the matrix, and
-    from between them, find them.
-    """
+    """Whether another motion ``(b,)``, far from this one, explains the lines about as well."""
     found = torch.zeros_like(doubtful)
     if not bool(doubtful.any()):
         return found

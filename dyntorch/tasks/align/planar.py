@@ -65,10 +65,7 @@ def planar_notices(
 
 
 def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor, options: AlignOptions) -> tuple[Tensor, Tensor]:
-    """Numeric rank ``(b,)`` of the estimation matrix, and how far its 26th singular value is above the noise.
-
-    Of more than three views the three that say most: a motion that some of them determine leaves none of the others open.
-    """
+    """Numeric rank ``(b,)`` of the estimation matrix, and how far its 26th singular value is above the noise."""
     # a row of unit length changes by about the noise of the normalized coordinates
     noise = sigma * torch.stack(evidence.norm.scales).square().mean(0).sqrt() * inliers.weights.square().sum(-1).sqrt()
     ranks, strengths = [], []
@@ -80,11 +77,8 @@ def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor, options: Al
 
 
 def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], options: AlignOptions) -> Tensor:
-    """Where the moving matches leave a family of motions ``(b,)``, and no more are static than some motion of it makes by chance.
-
-    Points that make equal steps move as straight if the camera moves along at any velocity common to all.  The motion that makes
-    most of them static is the true one if these are many; else some happen to have about that velocity.
-    """
+    """Where the moving matches leave a family of motions ``(b,)``, and no more are static than some motion of it makes by
+    chance."""
     rank, strength = tensor
     used = (best.labels != OUTLIER).sum(-1)
     equations = HomographyTensor.width() - 1
@@ -119,10 +113,7 @@ def unverified(evidence: Evidence, best: Labelled) -> Tensor:
 
 
 def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor, options: AlignOptions) -> Tensor:
-    """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES.
-
-    Greedy: the longest path determines its line best; all matches on that line go, and so on.
-    """
+    """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES."""
     parts = evidence.problem(best.labels).parts(best.theta)
     places = torch.stack(
         [evidence.views[0], *(inhomogeneous(homogeneous(x) @ m.mT) for m, x in zip(parts, evidence.views[1:], strict=True))]

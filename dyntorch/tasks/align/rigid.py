@@ -39,19 +39,13 @@ DESCENT = LeastSquaresOptions(iterations=20, least_damping=1e-10, stuck_damping=
 
 @dataclass(frozen=True)
 class RigidSightings:
-    """Points of three poses in one common unit; leading dimensions broadcast against those of the motions.
+    """Points of three poses in one common unit; leading dimensions broadcast against those of the motions."""
 
-    Attributes:
-        x1, x2, x3: ``(..., n, 3)``.
-        weights: ``(..., n)``.
-        motion: one of :data:`MOTIONS`.
-    """
-
-    x1: Tensor
+    x1: Tensor  # ``(..., n, 3)``
     x2: Tensor
     x3: Tensor
-    weights: Tensor
-    motion: str
+    weights: Tensor  # ``(..., n)``
+    motion: str  # one of :data:`MOTIONS`
 
     @property
     def conditions(self) -> int:
@@ -78,12 +72,7 @@ class RigidSightings:
 
 
 def combinations(motions: Tensor, data: RigidSightings) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The combinations u and v of each match, and the points y2 and y3 in the frame of view 1, ``(..., n, 3)`` each.
-
-    Args:
-        motions: ``(..., 2, 4, 4)``, A and B.
-        data: the matches.
-    """
+    """The combinations u and v of each match, and the points y2 and y3 in the frame of view 1, ``(..., n, 3)`` each."""
     y2, y3 = (x @ motions[..., i, :3, :3].mT + motions[..., i, None, :3, 3] for i, x in ((0, data.x2), (1, data.x3)))
     return (data.x1 - y3) / math.sqrt(2), (data.x1 - 2 * y2 + y3) / math.sqrt(6), y2, y3
 
@@ -105,16 +94,7 @@ def squares(motions: Tensor, data: RigidSightings) -> tuple[Tensor, Tensor]:
 
 
 def normal_equations(motions: Tensor, data: RigidSightings, weights: Tensor, still: Tensor | None) -> tuple[Tensor, Tensor]:
-    r"""Gradient ``(..., 12)`` and Gauss-Newton matrix in the tangents :math:`(\omega_A, \tau_A, \omega_B, \tau_B)`.
-
-    The turn of u and v is held (variable projection): the gradient stays exact, because the residual is normal to the line.
-
-    Args:
-        motions: ``(..., 2, 4, 4)``.
-        data: the matches.
-        weights: ``(..., n)`` in place of those of the data.
-        still: ``(..., n)`` bool, static points.
-    """
+    r"""Gradient ``(..., 12)`` and Gauss-Newton matrix in the tangents :math:`(\omega_A, \tau_A, \omega_B, \tau_B)`."""
     u, v, y2, y3 = combinations(motions, data)
     cos, sin = turn(u, v, data.motion)
     error, along = cos * v - sin * u, cos * u + sin * v
@@ -140,18 +120,8 @@ def normal_equations(motions: Tensor, data: RigidSightings, weights: Tensor, sti
 def descend(
     motions: Tensor, data: RigidSightings, *, scale: Tensor | None = None, still: Tensor | None = None, iterations: int = 20
 ) -> tuple[Tensor, Tensor]:
-    r"""Levenberg-Marquardt over two rigid motions, for a whole batch of problems.
-
-    Args:
-        motions: ``(*lead, 2, 4, 4)`` to start from.
-        data: matches with leading dimensions that broadcast to ``lead``.
-        scale: ``(*lead,)``: residuals r count :math:`r^2 / (1 + r^2 / c^2)` (Geman and McClure); None: :math:`r^2`.
-        still: ``(*lead, n)`` bool, points held static.
-        iterations: steps.
-
-    Returns:
-        motions of a cost that is not higher, and the cost ``(*lead,)``.
-    """
+    r"""Levenberg-Marquardt over two rigid motions, for a whole batch of problems. motions ``(*lead, 2, 4, 4)``, scale
+    ``(*lead,)``, still ``(*lead, n)`` -> ``(*lead,)``."""
     lead = motions.shape[:-3]
     flat = data.flat(lead)
     square = None if scale is None else scale.expand(lead).reshape(-1, 1).square()
@@ -211,21 +181,13 @@ straight line (4) above the limit of chi-square with 2 degrees of freedom."""
 
 @dataclass(frozen=True)
 class Rigid:
-    """What the search found, in the coordinates it was given.
+    """What the search found, in the coordinates it was given."""
 
-    Attributes:
-        motions: ``(b, 2, 4, 4)``.
-        sigma: ``(b,)`` noise of one coordinate.
-        information: ``(b, 12, 12)`` Gauss-Newton matrix of the matches that belong to the model, per unit of noise.
-        inliers: ``(b, n)`` bool.
-        still: ``(b, n)`` bool.
-    """
-
-    motions: Tensor
-    sigma: Tensor
-    information: Tensor
-    inliers: Tensor
-    still: Tensor
+    motions: Tensor  # ``(b, 2, 4, 4)``
+    sigma: Tensor  # ``(b,)`` noise of one coordinate
+    information: Tensor  # ``(b, 12, 12)`` Gauss-Newton matrix of the matches that belong to the model, per unit of noise
+    inliers: Tensor  # ``(b, n)`` bool
+    still: Tensor  # ``(b, n)`` bool
     grounded: Tensor
     """``(b,)`` bool: whether static matches fix the common velocity (always, for straight lines)."""
 
@@ -378,10 +340,7 @@ def drifted(motions: Tensor, velocity: Tensor) -> Tensor:
 
 
 def common_velocity(found: Rigid, data: RigidSightings, options: AlignOptions) -> tuple[Tensor, Tensor]:
-    """The velocity ``(b, 3)`` that most matches share, in the frame of view 1 and per step, and how many do, ``(b,)``.
-
-    Where fewer than 3 share one it is the mean velocity of the inliers.
-    """
+    """The velocity ``(b, 3)`` that most matches share, in the frame of view 1 and per step, and how many do, ``(b,)``."""
     u, v, _, _ = combinations(found.motions, data)
     velocity = -u / 2**0.5
     step = max(1, velocity.shape[-2] // options.rigid.seeds)

@@ -35,17 +35,8 @@ def moving_points(dim: int, views: int) -> Invariant:
 def motion_of_all(
     evidence: Evidence, solve: Callable[[tuple[Tensor, ...]], Solution], given: Tensor | None, generator: torch.Generator | None
 ) -> tuple[tuple[Tensor, ...], Solution]:
-    """The normalized collineations ``(b, d + 1, d + 1)`` from every view to the first, and the solution of three views behind them.
-
-    Three views far apart give two of them, and with these the line on which each match moves, or the point where it stands still.
-    Every further view then sees its points on known lines, which is linear in its collineation: :func:`resected`.
-
-    Args:
-        evidence: matches of all views.
-        solve: three views, in the coordinates of the matches, to a solution.
-        given: ``(b,)`` noise, or None.
-        generator: source of the samples.
-    """
+    """The normalized collineations ``(b, d + 1, d + 1)`` from every view to the first, and the solution of three views behind
+    them."""
     count = len(evidence.views)
     three = (0, count // 2, count - 1)
     found = solve(tuple(evidence.data.views[v] for v in three))
@@ -64,10 +55,8 @@ def motion_of_all(
 
 
 def _flats_of(evidence: Evidence, three: tuple[int, ...], maps: Tensor, given: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Hyperplanes ``(b, n, d, d + 1)`` of view 1 that meet in the line or the point of each match, weights, and the noise ``(b,)``.
-
-    Of a line there is one hyperplane less: zero stands in its place.
-    """
+    """Hyperplanes ``(b, n, d, d + 1)`` of view 1 that meet in the line or the point of each match, weights, and the noise
+    ``(b,)``."""
     points = torch.stack([evidence.views[v] for v in three], dim=-2)
     scales = torch.stack([evidence.norm.scales[v] for v in three], dim=-1)
     dim = points.shape[-1]
@@ -89,23 +78,8 @@ def _flats_of(evidence: Evidence, three: tuple[int, ...], maps: Tensor, given: T
 def resected(
     planes: Tensor, x: Tensor, sigma: Tensor, weights: Tensor, generator: torch.Generator | None, options: AlignOptions
 ) -> Tensor:
-    r"""The collineation A of a view whose points lie on known flats of view 1: :math:`L_i A (x_i, 1) = 0`, robustly.
-
-    Samples of a few matches, each solved linearly; the one of least truncated distance is fitted again to what agrees.
-
-    Args:
-        planes: L, ``(b, n, d, d + 1)`` hyperplanes that meet in the flats; zero says nothing.
-        x: ``(b, n, d)``.
-        sigma: ``(b,)`` noise of x.
-        weights: ``(b, n)``.
-        generator: source of the samples.
-        options: how many samples of how many matches.
-
-    Returns:
-        ``(b, d + 1, d + 1)``.
-
-    Source: Fischler and Bolles 1981.
-    """
+    r"""The collineation A of a view whose points lie on known flats of view 1: :math:`L_i A (x_i, 1) = 0`, robustly. planes
+    ``(b, n, d, d + 1)``, x ``(b, n, d)``, sigma ``(b,)``, weights ``(b, n)`` -> ``(b, d + 1, d + 1)``."""
     b, n, _, size = planes.shape
     p = homogeneous(x)
     rows = (planes[..., :, None] * p[..., None, None, :]).flatten(-2)  # (b, n, d, N N)

@@ -36,19 +36,12 @@ ENTRIES = (12, 13, 14)  # of a 4 x 4 matrix: zero for an affine map
 
 @dataclass(frozen=True)
 class Velocities:
-    """Maps, labels and noise of a flat batch.
+    """Maps, labels and noise of a flat batch."""
 
-    Attributes:
-        theta: ``(b, 48)`` the three maps in normalized coordinates.
-        labels: ``(b, n)``.
-        sigma: ``(b,)`` in the unit of the matches.
-        grounded: ``(b,)`` bool, whether static matches fix the common velocity.
-    """
-
-    theta: Tensor
-    labels: Tensor
-    sigma: Tensor
-    grounded: Tensor
+    theta: Tensor  # ``(b, 48)`` the three maps in normalized coordinates
+    labels: Tensor  # ``(b, n)``
+    sigma: Tensor  # ``(b,)`` in the unit of the matches
+    grounded: Tensor  # ``(b,)`` bool, whether static matches fix the common velocity
 
 
 def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> Tensor:
@@ -60,15 +53,8 @@ def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> 
 
 
 def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estimate: bool, options: AlignOptions) -> Velocities:
-    """Label and refine in turns: first without a gauge, then with the static matches, if there are such.
-
-    Args:
-        evidence: the matches.
-        theta: ``(b, 48)`` first maps.
-        sigma: ``(b,)`` noise.
-        affine: whether the maps are affine.
-        estimate: whether the noise is estimated anew in every round.
-    """
+    """Label and refine in turns: first without a gauge, then with the static matches, if there are such. theta ``(b, 48)``,
+    sigma ``(b,)``."""
     known = evidence.data.static
     grounded = torch.zeros_like(sigma, dtype=torch.bool) if known is None else (known & (evidence.data.weights > 0)).any(-1)
     if known is not None:
@@ -87,13 +73,7 @@ def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estim
 
 
 def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """What the inliers tell about the sensor.
-
-    Returns:
-        the eigenvalues ``(b, 2)`` least and greatest of the information on theta, per unit of variance; the motions A and B
-        ``(b, 2, 4, 4)`` of the normalized matches, of norm 1; the covariance ``(b, 32, 32)`` of the entries of A and B in the
-        coordinates of the matches, for noise 1.
-    """
+    """What the inliers tell about the sensor."""
     _, _, matrix = evidence.problem(state.labels).normal_equations(state.theta)
     free = _free(state.theta, affine)
     values, vectors = spectrum(matrix * free * free[:, None])

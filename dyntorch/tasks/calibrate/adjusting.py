@@ -32,34 +32,18 @@ RAYLEIGH = 1.1774
 
 @dataclass(frozen=True)
 class Freedom:
-    """What of a rig is free, and what is known of it beforehand.
+    """What of a rig is free, and what is known of it beforehand."""
 
-    Attributes:
-        poses: ``(11 c, q)`` poses and focal lengths, from where a start is.
-        whole: ``(11 c, q)`` lenses and clocks as well.
-        shape: ``(11 c, q)`` the same with the pose of the first camera, for the covariance.
-        priors: of what is not geometry.
-    """
-
-    poses: Tensor
-    whole: Tensor
-    shape: Tensor
-    priors: Priors
+    poses: Tensor  # ``(11 c, q)`` poses and focal lengths, from where a start is
+    whole: Tensor  # ``(11 c, q)`` lenses and clocks as well
+    shape: Tensor  # ``(11 c, q)`` the same with the pose of the first camera, for the covariance
+    priors: Priors  # of what is not geometry
 
     @staticmethod
     def of(
         rig: Rig, clocks: Tensor, held_clocks: bool, held_rates: bool, rate_sigmas: Tensor, options: CalibrateOptions
     ) -> Freedom:
-        """Of a rig.
-
-        Args:
-            rig: as given.
-            clocks: ``(c, 2)`` as synchronization says.
-            held_clocks: whether they are held.
-            held_rates: whether their rates are.
-            rate_sigmas: ``(c,)`` of the rates.
-            options: see :class:`CalibrateOptions`.
-        """
+        """Of a rig. clocks ``(c, 2)``, rate_sigmas ``(c,)``."""
         c, adjust = len(rig.tracks), options.adjust
         side = rig.sizes.amax(1)
         mean, sigma = torch.zeros(c, 5, dtype=torch.float64), torch.full((c, 5), math.inf, dtype=torch.float64)
@@ -110,17 +94,11 @@ class Pose:
 
 @dataclass(frozen=True)
 class RigSolution:
-    """A solution.
+    """A solution."""
 
-    Attributes:
-        state: of one adjustment.
-        problem: what it solves.
-        covariance: ``(c, 11, 11)`` of the cameras, centres in place of translations.
-    """
-
-    state: RigState
-    problem: RigAdjustment
-    covariance: Tensor
+    state: RigState  # of one adjustment
+    problem: RigAdjustment  # what it solves
+    covariance: Tensor  # ``(c, 11, 11)`` of the cameras, centres in place of translations
 
     @property
     def pose(self) -> Pose:
@@ -137,11 +115,7 @@ def pose_of(state: RigState, place: int = 0) -> Pose:
 def compared_starts(
     rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, freedom: Freedom, options: CalibrateOptions
 ) -> tuple[RigState, Tensor]:
-    """The best starts, adjusted on some of the moments, best first, and by how much each is worse than the first.
-
-    Focal lengths that are not known are searched along the whole graph of pairs: each one tried gives rotations, centres and
-    points of its own, and these, adjusted with focal lengths free, say how well it explains the pictures.
-    """
+    """The best starts, adjusted on some of the moments, best first, and by how much each is worse than the first."""
     side = rig.sizes.amax(1)
     unknown = rig.focals.isnan()
     tried = options.start.focals if bool(unknown.any()) else options.start.focals[:1]
@@ -173,14 +147,7 @@ def compared_starts(
 
 
 def adjusted(views: RigViews, start: RigState, freedom: Freedom, options: CalibrateOptions) -> RigSolution:
-    """The solution next to a start, at all the moments of views.
-
-    Args:
-        views: of the cameras.
-        start: of one adjustment, at any moments.
-        freedom: what is free.
-        options: see :class:`CalibrateOptions`.
-    """
+    """The solution next to a start, at all the moments of views."""
     state = start._replace(points=met_points(views, start)[None], lengths=start.lengths[:, :0])
     problem = _problem(views, state, freedom.whole, freedom.priors, options)
     for k, steps in enumerate(options.adjust.rounds):
@@ -209,12 +176,7 @@ def _problem(views: RigViews, state: RigState, basis: Tensor, priors: Priors, op
 
 
 def _noise(state: RigState, problem: RigAdjustment, options: CalibrateOptions) -> Tensor:
-    """Robust standard deviation ``(b, c)`` px of each camera's noise.
-
-    Points take 3 of the 2 v coordinates that v cameras see of them, and leave errors that are smaller than the noise by
-    sqrt((2 v - 3) / 2 v).  How the noise of cameras compares is said by the tracks, not by these errors: a camera that is trusted
-    more draws the points to its rays, and is trusted even more.
-    """
+    """Robust standard deviation ``(b, c)`` px of each camera's noise."""
     seen = problem.views.at(state.clocks)
     known = problem.weights * seen.weights > 0
     far = (images(state, problem.views.centers) - seen.x).norm(dim=-1) / problem.views.noise[:, None, None]
@@ -243,10 +205,7 @@ def _with_bones(state: RigState, problem: RigAdjustment, options: CalibrateOptio
 
 
 def _repeats(problem: RigAdjustment, state: RigState, options: CalibrateOptions) -> float:
-    r"""By how much fewer residuals there are than it seems: :math:`1 + 2 \sum_k \rho_k` of how they repeat themselves in time.
-
-    Until the first lag at which they do not, a quarter of the moments at most; pooled over cameras, points and coordinates.
-    """
+    r"""By how much fewer residuals there are than it seems: :math:`1 + 2 \sum_k \rho_k` of how they repeat themselves in time."""
     error, weight = problem.agreement(state, problem.views.at(state.clocks))
     rows = (error * weight.sqrt()[..., None])[0].movedim(1, 0).flatten(1)  # (T, *)
     total, count = 1.0, len(rows)

@@ -65,10 +65,7 @@ class RigState(NamedTuple):
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known beforehand of log focal, k1, k2, offset and log rate, ``(c, 5)`` each.
-
-    Gauss's distribution, but for k1 Cauchy's: most lenses have next to none, and some have much.
-    """
+    """What is known beforehand of log focal, k1, k2, offset and log rate, ``(c, 5)`` each."""
 
     mean: Tensor
     scale: Tensor
@@ -303,13 +300,7 @@ def gauge(R: Tensor, t: Tensor) -> Tensor:
 
 
 def camera_covariance(reduced: Tensor, basis: Tensor, unseen: Tensor) -> Tensor:
-    """Covariance ``(11 c, 11 c)`` of the cameras from their information, in the world whose changes have no part in it.
-
-    Args:
-        reduced: ``(P, P)`` information of cameras and lengths, points eliminated.
-        basis: ``(11 c, q)`` free parameters.
-        unseen: ``(11 c, 7)`` changes of the world.
-    """
+    """Covariance ``(11 c, 11 c)`` of the cameras from their information, in the world whose changes have no part in it."""
     count = len(basis)
     if count < len(reduced):  # lengths are eliminated, too
         mixed, lengths = reduced[:count, count:], reduced[count:, count:]

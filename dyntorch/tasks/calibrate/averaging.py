@@ -34,38 +34,22 @@ from dyntorch.tasks.calibrate.options import RigStartOptions
 
 @dataclass(frozen=True)
 class PairGeometry:
-    """Epipolar geometry of two cameras.
+    """Epipolar geometry of two cameras."""
 
-    Attributes:
-        F: ``(3, 3)``, :math:`x_j^T F x_i = 0` in ``unit`` from the principal points.
-        x1, x2: ``(m, 2)`` matches in ``unit`` from the principal points.
-        weights: ``(m,)``, 1 for those that agree.
-        unit: pixels.
-        sigma: px, robust standard deviation of the Sampson distance.
-        matches: positions that both saw at once.
-    """
-
-    F: Tensor
-    x1: Tensor
+    F: Tensor  # ``(3, 3)``, :math:`x_j^T F x_i = 0` in ``unit`` from the principal points
+    x1: Tensor  # ``(m, 2)`` matches in ``unit`` from the principal points
     x2: Tensor
-    weights: Tensor
-    unit: float
-    sigma: float
-    matches: int
+    weights: Tensor  # ``(m,)``, 1 for those that agree
+    unit: float  # pixels
+    sigma: float  # px, robust standard deviation of the Sampson distance
+    matches: int  # positions that both saw at once
 
 
 Graph = Mapping[tuple[int, int], PairGeometry]
 
 
 def pair_graph(views: RigViews, clocks: Tensor, fewest: int, options: RigStartOptions) -> dict[tuple[int, int], PairGeometry]:
-    """Epipolar geometry of all pairs that see enough at once.
-
-    Args:
-        views: of c cameras.
-        clocks: ``(c, 2)``.
-        fewest: matches of a pair.
-        options: see :class:`RigStartOptions`.
-    """
+    """Epipolar geometry of all pairs that see enough at once. clocks ``(c, 2)``."""
     seen = views.at(clocks[None])
     x, weights = seen.x[0].flatten(1, 2), seen.weights[0].flatten(1, 2)
     unit = float(views.centers.max()) * 2
@@ -94,14 +78,7 @@ def _spread(F: Tensor, x1: Tensor, x2: Tensor) -> float:
 
 
 def relative_rotations(pair: PairGeometry, first: float, second: float) -> tuple[Tensor, Tensor]:
-    """The two rotations ``(2, 3, 3)`` from camera i to camera j, and the share ``(2,)`` of matches before both cameras.
-
-    Of the four pairs of a rotation and a direction those that differ in the sign of the direction share their rotation.
-
-    Args:
-        pair: with its F.
-        first, second: focal lengths, px.
-    """
+    """The two rotations ``(2, 3, 3)`` from camera i to camera j, and the share ``(2,)`` of matches before both cameras."""
     f1, f2 = first / pair.unit, second / pair.unit
     E = torch.tensor([f2, f2, 1.0], dtype=torch.float64)[:, None] * pair.F * torch.tensor([f1, f1, 1.0], dtype=torch.float64)
     U, _, Vt = torch.linalg.svd(E)
@@ -122,24 +99,7 @@ def relative_rotations(pair: PairGeometry, first: float, second: float) -> tuple
 def averaged_rotations(
     turns: Mapping[tuple[int, int], Tensor], weights: Mapping[tuple[int, int], float], cameras: int, options: RigStartOptions
 ) -> Tensor:
-    """Rotations ``(c, 3, 3)`` whose ratios :math:`R_j R_i^T` are nearest to given ones; the first is the identity.
-
-    Reweighted by how far each pair is off, so that a pair that is wrong drops out.
-
-    Args:
-        turns: (i, j) to ``(3, 3)``.
-        weights: of the pairs.
-        cameras: c.
-        options: see :class:`RigStartOptions`.
-
-    Example:
-        >>> import torch
-        >>> turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-        >>> R = averaged_rotations({(0, 1): turn, (1, 2): turn, (0, 2): turn @ turn}, {(0, 1): 1.0, (1, 2): 1.0, (0, 2): 1.0}, 3,
-        ...                        RigStartOptions())
-        >>> torch.allclose(R[2], turn @ turn)
-        True
-    """
+    """Rotations ``(c, 3, 3)`` whose ratios :math:`R_j R_i^T` are nearest to given ones; the first is the identity."""
     soft = dict.fromkeys(turns, 1.0)
     R = torch.eye(3, dtype=torch.float64).repeat(cameras, 1, 1)
     for _ in range(options.averaging):
@@ -167,27 +127,14 @@ def _across(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def meeting_points(R: Tensor, centers: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
-    """Points ``(m, 3)`` nearest to the rays of all cameras.
-
-    Args:
-        R: ``(c, 3, 3)``.
-        centers: ``(c, 3)``.
-        rays: ``(c, m, 3)`` in the cameras' frames.
-        weights: ``(c, m)``, 0 where not seen.
-    """
+    """Points ``(m, 3)`` nearest to the rays of all cameras."""
     _, across = _across(R, rays, weights)
     inverse = torch.linalg.pinv(across.sum(0), hermitian=True)
     return (inverse @ torch.einsum("amij,aj->mi", across, centers)[..., None])[..., 0]
 
 
 def positioned(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Centres ``(c, 3)`` and points ``(m, 3)`` from rotations and rays, as the equation of this file says.
-
-    Args:
-        R: ``(c, 3, 3)``.
-        rays: ``(c, m, 3)`` in the cameras' frames.
-        weights: ``(c, m)``, 0 where not seen.
-    """
+    """Centres ``(c, 3)`` and points ``(m, 3)`` from rotations and rays, as the equation of this file says."""
     c = len(R)
     weights = weights * ((weights > 0).sum(0) >= 2)
     d, across = _across(R, rays, weights)

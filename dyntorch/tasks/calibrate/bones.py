@@ -37,10 +37,8 @@ class Bones:
         return replace(self, **parts)
 
     def stretched(self, points: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithms ``(b, T, B)`` of bones over their lengths ``(b, B)``, and their derivatives by the first end ``(b, T, B, 3)``.
-
-        Logarithms do not change with the scale of the world: differences would make it shrink.
-        """
+        """Logarithms ``(b, T, B)`` of bones over their lengths ``(b, B)``, and their derivatives by the first end
+        ``(b, T, B, 3)``."""
         one, other = self.ends.unbind(-1)
         along = points[:, :, one] - points[:, :, other]
         square = along.square().sum(-1).clamp(min=1e-24)
@@ -48,21 +46,8 @@ class Bones:
 
 
 def noise_excess(points: Tensor, covariance: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    r"""By how much noise lengthens the logarithm of a distance d of direction u, in the mean.
-
-    .. math:: \operatorname{E} \log |d + \epsilon| - \log |d| \approx (\operatorname{tr} \Sigma - 2 u^T \Sigma u) / 2 |d|^2
-
-    Noise across a bone lengthens it, noise along it does not; as cameras see along some directions worse, bones would seem longer
-    in some directions of the room, and the room would be bent until they do not.
-
-    Args:
-        points: ``(T, n, 3)``.
-        covariance: ``(T, n, 3, 3)`` of each point.
-        one, other: ``(B,)`` ends.
-
-    Returns:
-        ``(T, B)``.
-    """
+    r"""By how much noise lengthens the logarithm of a distance d of direction u, in the mean. points ``(T, n, 3)``, covariance
+    ``(T, n, 3, 3)``, one, other ``(B,)`` -> ``(T, B)``."""
     along = points[:, one] - points[:, other]
     square = along.square().sum(-1).clamp(min=1e-24)
     spread = covariance[:, one] + covariance[:, other]
@@ -71,25 +56,7 @@ def noise_excess(points: Tensor, covariance: Tensor, one: Tensor, other: Tensor)
 
 
 def rigid_pairs(points: Tensor, known: Tensor, spread: float) -> tuple[Tensor, Tensor, Tensor]:
-    """The pairs of a spanning forest whose distances vary least.
-
-    Args:
-        points: ``(T, n, 3)``.
-        known: ``(T, n)`` bool.
-        spread: of a distance over itself, at most.
-
-    Returns:
-        ends ``(B, 2)``, median distances ``(B,)`` and their spreads ``(B,)``.
-
-    Example:
-        >>> import torch
-        >>> turn = torch.linspace(0, 6, 100, dtype=torch.float64)
-        >>> hip, knee = torch.zeros(100, 3, dtype=torch.float64), torch.stack([turn.cos(), turn.sin(), 0 * turn], dim=-1)
-        >>> points = torch.stack([hip, knee, knee * turn[:, None]], dim=1)
-        >>> ends, length, _ = rigid_pairs(points, torch.ones(100, 3, dtype=torch.bool), 0.1)
-        >>> ends.tolist(), round(float(length), 3)
-        ([[0, 1]], 1.0)
-    """
+    """The pairs of a spanning forest whose distances vary least. points ``(T, n, 3)``, known ``(T, n)`` -> ``(B, 2)``."""
     n = points.shape[1]
     if n < 2:
         return torch.zeros(0, 2, dtype=torch.long), points.new_zeros(0), points.new_zeros(0)
@@ -120,14 +87,8 @@ def rigid_pairs(points: Tensor, known: Tensor, spread: float) -> tuple[Tensor, T
 
 
 def learned(points: Tensor, known: Tensor, covariance: Tensor, options: RigAdjustOptions) -> Bones | None:
-    """The bones of points; None where no distance stays the same.
-
-    Args:
-        points: ``(T, n, 3)``.
-        known: ``(T, n)`` bool.
-        covariance: ``(T, n, 3, 3)`` of the points.
-        options: see :class:`RigAdjustOptions`.
-    """
+    """The bones of points; None where no distance stays the same. points ``(T, n, 3)``, known ``(T, n)``, covariance
+    ``(T, n, 3, 3)``."""
     ends, length, share = rigid_pairs(points, known, options.length_spread)
     if not len(ends):
         return None

@@ -166,10 +166,7 @@ def _told(clocks: Clocks) -> tuple[Notice, ...]:
 def _halves(
     views: RigViews, best: RigSolution, freedom: Freedom, options: CalibrateOptions
 ) -> tuple[RigSolution, RigSolution] | None:
-    """Both halves of the take by themselves, from the whole; None where a half has too little.
-
-    Lenses and clocks are those of the whole: only poses may differ.
-    """
+    """Both halves of the take by themselves, from the whole; None where a half has too little."""
     held = replace(freedom, whole=_only_poses(freedom.whole), shape=_only_poses(freedom.shape))
     found = []
     for part in (views.between(-math.inf, 0.0), views.between(0.0, math.inf)):

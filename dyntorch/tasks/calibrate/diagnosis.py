@@ -19,14 +19,8 @@ from dyntorch.tasks.calibrate.result import CalibrationNotice
 
 
 def differences(one: Pose, other: Pose) -> tuple[Tensor, Tensor]:
-    """By how much the cameras of two solutions differ, after the similarity that fits most: degrees, hundredths of the distance.
-
-    Args:
-        one, other: the same cameras.
-
-    Returns:
-        ``(c,)`` each.
-    """
+    """By how much the cameras of two solutions differ, after the similarity that fits most: degrees, hundredths of the
+    distance."""
     turns = one.R.mT @ other.R
     turn = nearest_rotation(turns.sum(0))
     for _ in range(10):  # the rotation with the least sum of angles: a camera that moved has no say
@@ -81,13 +75,7 @@ def _plane_residual(pair: PairGeometry, options: CalibrateOptions) -> float:
 
 
 def rival(best: Pose, others: Sequence[tuple[Pose, float]], options: CalibrateOptions) -> Notice | None:
-    """Another solution that differs and is hardly worse.
-
-    Args:
-        best: the solution.
-        others: solutions with twice the logarithm of how much less likely they are.
-        options: see :class:`CalibrateOptions`.
-    """
+    """Another solution that differs and is hardly worse."""
     for pose, worse in others:
         angle = float(differences(best, pose)[0].max())
         if worse < options.trust.rival and angle > options.trust.apart:

@@ -23,29 +23,17 @@ SAID_BLOCK = 1_000_000
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras as given.
+    """Cameras as given."""
 
-    Attributes:
-        x: per camera ``(frames, n, 2)`` px, without the distortion of lenses that are known.
-        tracks: the same, checked and cleaned, on their own clocks.
-        fps: frames per second.
-        sizes: ``(c, 2)`` px.
-        centers: ``(c, 2)`` px, principal points.
-        focals: ``(c,)`` px, NaN = unknown.
-        lenses: per camera K and distortion, or None.
-        one_lens: whether focal length and distortion are the same in all.
-        scale: metres that fix the scale, see :class:`Scale`.
-    """
-
-    x: list[Tensor]
-    tracks: list[Tracks]
-    fps: tuple[float, ...]
-    sizes: Tensor
-    centers: Tensor
-    focals: Tensor
-    lenses: list[tuple[Tensor, Tensor] | None]
-    one_lens: bool
-    scale: Scale
+    x: list[Tensor]  # per camera ``(frames, n, 2)`` px, without the distortion of lenses that are known
+    tracks: list[Tracks]  # the same, checked and cleaned, on their own clocks
+    fps: tuple[float, ...]  # frames per second
+    sizes: Tensor  # ``(c, 2)`` px
+    centers: Tensor  # ``(c, 2)`` px, principal points
+    focals: Tensor  # ``(c,)`` px, NaN = unknown
+    lenses: list[tuple[Tensor, Tensor] | None]  # per camera K and distortion, or None
+    one_lens: bool  # whether focal length and distortion are the same in all
+    scale: Scale  # metres that fix the scale, see :class:`Scale`
 
     @property
     def known_lens(self) -> Tensor:
@@ -73,11 +61,7 @@ def read_rig(
     scale: Scale,
     options: CalibrateOptions,
 ) -> Rig:
-    """The cameras of checked input.
-
-    Raises:
-        ValueError: which argument of which camera is wrong, and what to do.
-    """
+    """The cameras of checked input."""
     c = len(tracks)
     if not 2 <= c <= options.input.most_cameras:
         raise ValueError(f"tracks: {c} cameras given; give 2 to {options.input.most_cameras}")
@@ -118,11 +102,7 @@ def read_rig(
 
 
 def read_clocks(clocks: Any, cameras: int) -> Tensor:
-    """``(c, 2)`` offsets and rates of clocks that are given.
-
-    Raises:
-        ValueError: no clocks, or those of other cameras.
-    """
+    """``(c, 2)`` offsets and rates of clocks that are given."""
     if isinstance(clocks, Clocks):
         values = torch.stack([clocks.offsets, clocks.rates], dim=-1).double()
     else:

@@ -29,31 +29,17 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class RigViews:
-    """The tracks of c cameras, ready to be read at T moments of the reference clock.
+    """The tracks of c cameras, ready to be read at T moments of the reference clock."""
 
-    Attributes:
-        grids: of each camera.
-        centers: ``(c, 2)`` px, the principal points.
-        middle: the moment in the middle, seconds of the reference clock.
-        times: ``(T,)`` seconds from the middle.
-        frames: ``(c,)`` seconds from one frame to the next.
-        noise: ``(c,)`` of the tracks, over its geometric mean.
-    """
-
-    grids: tuple[Grid, ...]
-    centers: Tensor
-    middle: float
-    times: Tensor
-    frames: Tensor
-    noise: Tensor
+    grids: tuple[Grid, ...]  # of each camera
+    centers: Tensor  # ``(c, 2)`` px, the principal points
+    middle: float  # the moment in the middle, seconds of the reference clock
+    times: Tensor  # ``(T,)`` seconds from the middle
+    frames: Tensor  # ``(c,)`` seconds from one frame to the next
+    noise: Tensor  # ``(c,)`` of the tracks, over its geometric mean
 
     def at(self, clocks: Tensor, shift: float = 0.0) -> Seen:
-        """What is seen with clocks ``(b, c, 2)``: against the reference clock at the middle, and the logarithm of the rate.
-
-        Args:
-            clocks: of b starts.
-            shift: so many frames later.
-        """
+        """What is seen with clocks ``(b, c, 2)``: against the reference clock at the middle, and the logarithm of the rate."""
         shape = (len(clocks), len(self.times), self.grids[0].x.shape[1])
         parts = []
         for i, grid in enumerate(self.grids):
@@ -78,17 +64,8 @@ class RigViews:
 
 
 def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, options: CalibrateOptions) -> RigViews:
-    """Views at the moments at which two cameras at least run, a frame of the slowest camera apart.
-
-    Args:
-        tracks: of each camera, on its own clock.
-        centers: ``(c, 2)``.
-        clocks: ``(c, 2)`` offset and rate: a camera's clock = rate * reference clock + offset.
-        options: see :class:`CalibrateOptions`.
-
-    Raises:
-        ValueError: no moment is common to two cameras.
-    """
+    """Views at the moments at which two cameras at least run, a frame of the slowest camera apart. centers ``(c, 2)``, clocks
+    ``(c, 2)``."""
     runs = [((float(t.times[0]) - o) / r, (float(t.times[-1]) - o) / r) for t, (o, r) in zip(tracks, clocks.tolist(), strict=True)]
     start, end = sorted(run[0] for run in runs)[1], sorted(run[1] for run in runs)[-2]
     step = max(t.step / r for t, (_, r) in zip(tracks, clocks.tolist(), strict=True))

@@ -16,29 +16,16 @@ from dyntorch.tasks.calibrate.options import CalibrateOptions
 
 @dataclass(frozen=True)
 class Structure:
-    """Points and how well they agree with the pictures.
+    """Points and how well they agree with the pictures."""
 
-    Attributes:
-        points: ``(T, n, 3)``, NaN where two cameras do not tell.
-        sigmas: ``(T, n)`` root mean square of the standard deviations along the axes.
-        residuals: ``(c, n)`` px, root mean square of the positions that agree.
-        inliers: ``(c,)`` share of the positions that agree.
-    """
-
-    points: Tensor
-    sigmas: Tensor
-    residuals: Tensor
-    inliers: Tensor
+    points: Tensor  # ``(T, n, 3)``, NaN where two cameras do not tell
+    sigmas: Tensor  # ``(T, n)`` root mean square of the standard deviations along the axes
+    residuals: Tensor  # ``(c, n)`` px, root mean square of the positions that agree
+    inliers: Tensor  # ``(c,)`` share of the positions that agree
 
 
 def structure(views: RigViews, found: RigSolution, options: CalibrateOptions) -> Structure:
-    """Points of all moments of views, each the least squares of the positions that see it, with the noise of Student's t.
-
-    Args:
-        views: of the cameras.
-        found: the cameras.
-        options: see :class:`CalibrateOptions`.
-    """
+    """Points of all moments of views, each the least squares of the positions that see it, with the noise of Student's t."""
     n = views.grids[0].x.shape[1]
     step = max(1, options.points.block // n)
     parts = [_block(replace(views, times=times), found, options) for times in views.times.split(step)]

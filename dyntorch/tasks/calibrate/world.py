@@ -16,23 +16,14 @@ from dyntorch.tasks.calibrate.options import RigWorldOptions
 
 @dataclass(frozen=True)
 class World:
-    """A similarity from the coordinates of the adjustment: :math:`X' = s (Q X) + o`.
+    """A similarity from the coordinates of the adjustment: :math:`X' = s (Q X) + o`."""
 
-    Attributes:
-        turn: ``(3, 3)`` rotation Q.
-        scale: s.
-        origin: ``(3,)`` o.
-        metric: whether s makes metres.
-        upright: the share of the long axes of bodies that point up; NaN where there is none.
-        by_people: whether these decided.
-    """
-
-    turn: Tensor
-    scale: float
-    origin: Tensor
-    metric: bool
-    upright: float
-    by_people: bool
+    turn: Tensor  # ``(3, 3)`` rotation Q
+    scale: float  # s
+    origin: Tensor  # ``(3,)`` o
+    metric: bool  # whether s makes metres
+    upright: float  # the share of the long axes of bodies that point up; NaN where there is none
+    by_people: bool  # whether these decided
 
     def points(self, points: Tensor) -> Tensor:
         """Points ``(..., 3)`` in the world."""
@@ -45,15 +36,8 @@ class World:
 
 
 def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale, options: RigWorldOptions) -> World:
-    r"""Up from the long axes of upright bodies, the ground below them, the scale from a height or lengths.
-
-    Args:
-        R: ``(c, 3, 3)``.
-        centers: ``(c, 3)``.
-        points: ``(T, n, 3)``, NaN = unknown.
-        scale: what is known of lengths.
-        options: see :class:`RigWorldOptions`.
-    """
+    r"""Up from the long axes of upright bodies, the ground below them, the scale from a height or lengths. R ``(c, 3, 3)``,
+    centers ``(c, 3)``, points ``(T, n, 3)``."""
     points = points[:: max(1, len(points) // options.moments)]
     n = points.shape[1]
     # several people stand side by side: what keeps its distances is one body
@@ -77,16 +61,7 @@ def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale, options: 
 
 
 def upward(points: Tensor, groups: list[list[int]], guess: Tensor, options: RigWorldOptions) -> tuple[Tensor, float]:
-    """The direction ``(3,)`` that most long axes of bodies have, and the share of the axes that have it.
-
-    The middle of unit vectors is the one with the least sum of angles, by Weiszfeld's iteration.
-
-    Args:
-        points: ``(T, n, 3)``, NaN = unknown.
-        groups: the points of each body.
-        guess: ``(3,)`` roughly up: which end of an axis is meant.
-        options: see :class:`RigWorldOptions`.
-    """
+    """The direction ``(3,)`` that most long axes of bodies have, and the share of the axes that have it."""
     axes = []
     for group in groups:
         body = points[:, group]

@@ -24,29 +24,19 @@ from dyntorch.tasks.pair.options import PairOptions
 
 @dataclass(frozen=True)
 class Ridge:
-    """Regressions in g pairs of directions.
+    """Regressions in g pairs of directions."""
 
-    Attributes:
-        evidence: ``(g,)`` log likelihood of y with Q integrated out.
-        ridge: ``(g,)`` :math:`s^2 / \\tau^2`.
-        variance: ``(g,)`` s^2.
-        gauge: ``(g, 2)`` o and c; zero where the means were not given.
-        precision: ``(g, 2, 2)`` inverse covariance of o and c.
-    """
-
-    evidence: Tensor
-    ridge: Tensor
-    variance: Tensor
-    gauge: Tensor
-    precision: Tensor
+    evidence: Tensor  # ``(g,)`` log likelihood of y with Q integrated out
+    ridge: Tensor  # ``(g,)`` :math:`s^2 / \tau^2`
+    variance: Tensor  # ``(g,)`` s^2
+    gauge: Tensor  # ``(g, 2)`` o and c; zero where the means were not given
+    precision: Tensor  # ``(g, 2, 2)`` inverse covariance of o and c
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Regressors and what they are to explain, with the rows of the means: ``x (g, F, n)``, ``y (g, F, m)``, ``free (g, F, 2)``.
-
-    ``dropped`` rows were zero after a rotation of the rows, and left out.
-    """
+    """Regressors and what they are to explain, with the rows of the means: ``x (g, F, n)``, ``y (g, F, m)``,
+    ``free (g, F, 2)``."""
 
     x: Tensor
     y: Tensor
@@ -70,13 +60,7 @@ class Rows:
 
 
 def regress(rows: Rows, *, means: bool, options: PairOptions) -> Ridge:
-    """The ridge, common to all columns of y, of most evidence.
-
-    Args:
-        rows: of :meth:`Rows.of`.
-        means: whether the rows of the means are among them, and c and o unknown.
-        options: which ridges are tried.
-    """
+    """The ridge, common to all columns of y, of most evidence."""
     u, s, _ = torch.linalg.svd(rows.x, full_matrices=False)
     inside, outside = u.mT @ rows.y, rows.y - u @ (u.mT @ rows.y)
     free, beyond = u.mT @ rows.free, rows.free - u @ (u.mT @ rows.free)
@@ -118,17 +102,8 @@ def combinations(rows: Rows, ridge: Tensor, gauge: Tensor) -> Tensor:
 
 
 def predicted_apart(x: Tensor, y: Tensor, ridge: Tensor, options: PairOptions) -> Tensor:
-    r"""Residuals of y where every stretch of time is predicted from all others, :math:`(I - H_{BB})^{-1} (y - H y)_B`.
-
-    Args:
-        x: ``(T, n)``; y: ``(T, m)``; ridge: a number, or ``(m,)``.
-        options: how many stretches.
-
-    Returns:
-        ``(T, m)``.
-
-    Source: Allen 1974 (PRESS), for blocks.
-    """
+    r"""Residuals of y where every stretch of time is predicted from all others, :math:`(I - H_{BB})^{-1} (y - H y)_B`. x
+    ``(T, n)`` -> ``(T, m)``."""
     u, s, _ = torch.linalg.svd(x, full_matrices=False)
     energies = s.square()
     share = energies / (energies + ridge.reshape(-1, 1).clamp(min=1e-300))  # (1 or m, n)
@@ -176,20 +151,13 @@ def _grid(like: Tensor, options: PairOptions) -> Tensor:
 
 @dataclass(frozen=True)
 class Motions:
-    """Weighted motions of the points of both cameras over frequencies, of comparable units.
+    """Weighted motions of the points of both cameras over frequencies, of comparable units."""
 
-    Attributes:
-        x: ``(F, n, 2)``; y: ``(F, m, 2)``.
-        variance: of the noise of one coordinate.
-        samples: of independent noise in the F rows.
-        means: mean places ``(n, 2)``, ``(m, 2)`` about their centres.
-    """
-
-    x: Tensor
+    x: Tensor  # ``(F, n, 2)``; y: ``(F, m, 2)``
     y: Tensor
-    variance: float
-    samples: float
-    means: tuple[Tensor, Tensor]
+    variance: float  # of the noise of one coordinate
+    samples: float  # of independent noise in the F rows
+    means: tuple[Tensor, Tensor]  # mean places ``(n, 2)``, ``(m, 2)`` about their centres
     dropped: int = 0
 
     @property
@@ -219,10 +187,7 @@ def along(x: Tensor, angle: Tensor) -> Tensor:
 
 
 def information(motions: Motions, angles: Tensor, options: PairOptions) -> Tensor:
-    r"""What the coordinates along two directions say of each other, ``(g,)``.
-
-    .. math:: J = \tfrac12 \log\frac{|C_{yy} + \epsilon I|}{|C_{yy} + \epsilon I - C_{yx} (C_{xx} + \epsilon I)^{-1} C_{xy}|}
-    """
+    r"""What the coordinates along two directions say of each other, ``(g,)``."""
     floor = max(
         options.directions.noise_floor * motions.variance, 1e-14 * float(motions.x.square().sum(0).mean()) / motions.frequencies
     )
@@ -319,13 +284,8 @@ def frames_of(z: Tensor) -> Tensor:
 
 
 def motion_spectrum(z: Tensor, variance: float, options: PairOptions) -> Tensor:
-    """Power of the motion at each frequency, mean over points and coordinates, smoothed over an eighth of an octave, ``(T - 1,)``.
-
-    Args:
-        z: ``(T - 1, n, 2)`` of :func:`cosines`.
-        variance: of the noise of one coordinate.
-        options: the least motion.
-    """
+    """Power of the motion at each frequency, mean over points and coordinates, smoothed over an eighth of an octave,
+    ``(T - 1,)``."""
     power = z.square().mean((1, 2))
     total = torch.cat([power.new_zeros(1), power.cumsum(0)])
     place = torch.arange(len(power), device=z.device)
@@ -336,19 +296,12 @@ def motion_spectrum(z: Tensor, variance: float, options: PairOptions) -> Tensor:
 
 @dataclass(frozen=True)
 class Prior:
-    """The motion of the points of one camera.
+    """The motion of the points of one camera."""
 
-    Attributes:
-        spectrum: ``(T - 1,)`` S.
-        energies: ``(n,)`` eigenvalues of B.
-        modes: ``(n, n)`` its eigenvectors, as columns.
-        variance: of the noise.
-    """
-
-    spectrum: Tensor
-    energies: Tensor
-    modes: Tensor
-    variance: float
+    spectrum: Tensor  # ``(T - 1,)`` S
+    energies: Tensor  # ``(n,)`` eigenvalues of B
+    modes: Tensor  # ``(n, n)`` its eigenvectors, as columns
+    variance: float  # of the noise
 
     @staticmethod
     def of(z: Tensor, variance: float, options: PairOptions) -> Prior:
@@ -377,11 +330,7 @@ class Prior:
 
 
 def filled(x: Tensor, variance: float, options: PairOptions) -> Tensor:
-    r"""Tracks ``(T, n, 2)`` whose gaps (NaN) hold what the other points expect, and what these miss around the gap.
-
-    The points of a frame are taken as Gaussian, :math:`N(\mu, B + \sigma^2 I)`, with B of all frames by
-    expectation-maximization; how far a point is beside what the others expect is interpolated over its gap.
-    """
+    r"""Tracks ``(T, n, 2)`` whose gaps (NaN) hold what the other points expect, and what these miss around the gap."""
     seen = x.isfinite().all(-1)
     if bool(seen.all()):
         return x
@@ -425,35 +374,21 @@ def _lines(x: Tensor, seen: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Transfer:
-    """Epipolar geometry of two affine cameras, and each camera's points as combinations of the other's.
+    """Epipolar geometry of two affine cameras, and each camera's points as combinations of the other's."""
 
-    Attributes:
-        normals: ``(2, 2)`` unit normals of the epipolar lines of a and of b.
-        scale, offset: :math:`m_b \\cdot y = c\\, (m_a \\cdot x) + o`, of coordinates about the centres.
-        forward: ``(n, m)`` weights of a's points in b's; backward: ``(m, n)`` the other way round; their columns sum to 1 where
-            ``affine``.
-        affine: whether the mean places agree with affine combinations.
-        x: ``(T, n, 2)`` a's motions about their means, rid of noise; y: those of b.
-        r2: ``(n + m,)`` share of the motion of the epipolar coordinate that the other camera predicts.
-        good: ``(n + m,)`` bool.
-        residual: pixels, rms difference of the epipolar coordinate from what the other camera predicts.
-        noise: ``(2,)`` pixels, of a coordinate of a and of b.
-        beyond: how far the likelihood is above those of unrelated motions, in units of the range of these.
-    """
-
-    normals: Tensor
-    scale: float
+    normals: Tensor  # ``(2, 2)`` unit normals of the epipolar lines of a and of b
+    scale: float  # :math:`m_b \cdot y = c\, (m_a \cdot x) + o`, of coordinates about the centres
     offset: float
-    forward: Tensor
+    forward: Tensor  # ``(n, m)`` weights of a's points in b's
     backward: Tensor
-    affine: bool
-    x: Tensor
+    affine: bool  # whether the mean places agree with affine combinations
+    x: Tensor  # ``(T, n, 2)`` a's motions about their means, rid of noise; y: those of b
     y: Tensor
-    r2: Tensor
-    good: Tensor
-    residual: float
-    noise: tuple[float, float]
-    beyond: float = math.inf
+    r2: Tensor  # ``(n + m,)`` share of the motion of the epipolar coordinate that the other camera predicts
+    good: Tensor  # ``(n + m,)`` bool
+    residual: float  # pixels, rms difference of the epipolar coordinate from what the other camera predicts
+    noise: tuple[float, float]  # ``(2,)`` pixels, of a coordinate of a and of b
+    beyond: float = math.inf  # how far the likelihood is above those of unrelated motions, in units of the range of these
 
 
 def solve(x: Tensor, y: Tensor, noise: tuple[float, float], explained: float, options: PairOptions) -> Transfer | Tensor:
@@ -514,11 +449,7 @@ def _motions(x: Tensor, y: Tensor, noise: tuple[float, float], options: PairOpti
 
 
 def _beyond_chance(motions: Motions, angles: Tensor, options: PairOptions) -> float:
-    """How far the likelihood of what was found is above the highest of unrelated motions, over the range of theirs.
-
-    Smooth motions of many points explain any other smooth motion.  With a random sign for each frequency b's points move as
-    smoothly and as much together as before, but unrelated to a's; the same search is run on them.
-    """
+    """How far the likelihood of what was found is above the highest of unrelated motions, over the range of theirs."""
     # a generator of its own: the same tracks get the same answer
     generator = torch.Generator().manual_seed(0)
     levels = []
@@ -533,12 +464,7 @@ def _beyond_chance(motions: Motions, angles: Tensor, options: PairOptions) -> fl
 def judged(
     x: Tensor, y: Tensor, angles: Tensor, noise: tuple[float, float], good: Tensor, explained: float, options: PairOptions
 ) -> tuple[Tensor, Tensor]:
-    """How the other camera's good points predict every point's epipolar coordinate.
-
-    Returns:
-        the share of its motion that they predict ``(n + m,)``, and how strange a point is: 0 where it passes, else how much more
-        is missed than usual.
-    """
+    """How the other camera's good points predict every point's epipolar coordinate."""
     n = x.shape[1]
     u, v = (along(part - part.mean(0), angle[None])[0] for part, angle in zip((x, y), angles, strict=True))
     first = _judged(v[:, good[n:]], u, noise[0], good[:n], explained, options)

@@ -34,15 +34,7 @@ from dyntorch.tasks.synchronize.result import Shift
 def projective(
     seen: Overlap, threshold: float | None, explained: float, generator: torch.Generator | None, options: PairOptions
 ) -> PairReconstruction:
-    """The reconstruction of corresponding points.
-
-    Args:
-        seen: tracks of both cameras at the same moments.
-        threshold: pixels, of the Sampson distance; None estimates it.
-        explained: share of a point's frames that must be within it.
-        generator: of the random samples.
-        options: every number that decides.
-    """
+    """The reconstruction of corresponding points."""
     frames, n = seen.a.shape[:2]
     both = (seen.a.isfinite() & seen.b.isfinite()).all(-1)
     needed = options.corresponding.fewest

@@ -28,20 +28,7 @@ def body_pair(
     explained: float,
     options: PairOptions,
 ) -> PairReconstruction:
-    r"""One body, two cameras, points of either's own:
-
-    .. math:: x_{ti} \simeq K_a\,[R_t \mid T_t]\,X_i, \qquad y_{tj} \simeq K_b\,[R \mid \tau]\, \begin{bmatrix} R_t & T_t \\ 0 & 1
-       \end{bmatrix} Y_j.
-
-    Each camera alone gives the motion up to a similarity; that both motions are one, up to where the cameras are and how the axes
-    of the body were chosen, brings them into one frame; the reprojection error of both is minimized in all of it together.
-
-    Args:
-        seen: tracks of both cameras at the same moments.
-        threshold: pixels from a point's reprojection; None: three standard deviations of the noise.
-        explained: share of a point's frames that must be within it.
-        options: every number that decides about pairs; of one camera they are those of :func:`dyntorch.synchronize`.
-    """
+    r"""One body, two cameras, points of either's own:"""
     bodies = ProjectiveOptions()
     n, m = seen.a.shape[1], seen.b.shape[1]
     tracks = [_tracks(x, seen) for x in (seen.a, seen.b)]

@@ -160,13 +160,7 @@ class PairReconstruction(Outcome):
 def failure(
     points: tuple[int, int], times: Tensor, status: Status, notice: Notice, width: int, count: int | None = None
 ) -> PairReconstruction:
-    """Nothing found.
-
-    Args:
-        points: of a and of b.
-        width: coordinates of a point, 3 or 4.
-        count: points in all; None: those of both cameras, of corresponding points (width 4) those of one.
-    """
+    """Nothing found."""
     n, m = points
     count = count if count is not None else n + m if width == 3 else n
     like = {"dtype": torch.float64, "device": times.device}

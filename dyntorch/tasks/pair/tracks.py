@@ -17,19 +17,12 @@ from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks
 
 @dataclass(frozen=True)
 class Overlap:
-    """What both cameras saw in the frames of a within the overlap, NaN = missing.
+    """What both cameras saw in the frames of a within the overlap, NaN = missing."""
 
-    Attributes:
-        a: ``(frames, n, 2)`` float64.
-        b: ``(frames, m, 2)`` float64, at the same moments.
-        times: ``(frames,)`` of a's clock.
-        noise: pixels, of a coordinate of a and of b, as third differences show it; an upper bound where the motion is fast.
-    """
-
-    a: Tensor
-    b: Tensor
-    times: Tensor
-    noise: tuple[float, float]
+    a: Tensor  # ``(frames, n, 2)`` float64
+    b: Tensor  # ``(frames, m, 2)`` float64, at the same moments
+    times: Tensor  # ``(frames,)`` of a's clock
+    noise: tuple[float, float]  # pixels, of a coordinate of a and of b, as third differences show it
 
 
 def overlap(
@@ -41,19 +34,7 @@ def overlap(
     times: Sequence[Any] | None = None,
     options: PairOptions = PairOptions(),
 ) -> Overlap:
-    """Both cameras at a's frame times.
-
-    Args:
-        a: ``(frames, n, 2)`` pixels, NaN = missing.
-        b: ``(frames, m, 2)``.
-        shift: of b's clock against a's; or its offset in seconds.
-        fps: frames per second of both or of each; None: the shift's.
-        times: seconds of a's and of b's frames, instead of ``fps``.
-        options: how positions between frames are found.
-
-    Raises:
-        ValueError: misuse, naming the field.
-    """
+    """Both cameras at a's frame times. a ``(frames, n, 2)``, b ``(frames, m, 2)``."""
     rates, clocks = _clocks(shift, fps, times)
     tracks = [
         read_tracks(name, x, rate, clock, None, options=SynchronizeOptions())
@@ -107,25 +88,8 @@ def _unfilled(tracks: Tracks) -> Tensor:
 
 
 def interpolated(x: Tensor, times: Tensor, at: Tensor, options: PairOptions = PairOptions()) -> Tensor:
-    r"""Positions at any moments by Lagrange's polynomial through the frames around each: six where all are seen, else four or two.
-
-    .. math:: x(t) = \sum_k x_k \prod_{l \ne k} \frac{t - t_l}{t_k - t_l}
-
-    Args:
-        x: ``(frames, n, 2)``, NaN = missing.
-        times: ``(frames,)`` increasing.
-        at: ``(m,)``.
-        options: from how many frames, and where not.
-
-    Returns:
-        ``(m, n, 2)``; NaN outside the frames, in gaps, and where a neighbouring frame does not show the point.
-
-    Example:
-        >>> import torch
-        >>> t = torch.arange(8.0, dtype=torch.float64)
-        >>> interpolated(t.square()[:, None, None].expand(-1, 1, 2), t, torch.tensor([2.5], dtype=torch.float64)).tolist()
-        [[[6.25, 6.25]]]
-    """
+    r"""Positions at any moments by Lagrange's polynomial through the frames around each: six where all are seen, else four or
+    two. x ``(frames, n, 2)``, times ``(frames,)``, at ``(m,)`` -> ``(m, n, 2)``."""
     frames = len(times)
     result = torch.full((len(at), *x.shape[1:]), torch.nan, dtype=x.dtype, device=x.device)
     if not len(at) or not frames:
@@ -161,23 +125,7 @@ def _lagrange(x: Tensor, times: Tensor, at: Tensor, index: Tensor, gap: Tensor) 
 
 
 def match_tracks(points: Tensor, n: int, residual: float, options: PairOptions = PairOptions()) -> tuple[Tensor, Tensor]:
-    """Mutually nearest tracks that no other comes near to.
-
-    Args:
-        points: ``(frames, n + m, 3)``, the first coordinate seen by both cameras; NaN for points that were not found.
-        n: tracks of the first camera.
-        residual: rms difference of the first coordinate.
-        options: how near, and how alone.
-
-    Returns:
-        ``(m,)`` the track of the first camera, -1 = none, and rms distances ``(n, m)``.
-
-    Example:
-        >>> import torch
-        >>> walk = torch.randn(50, 4, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        >>> match_tracks(torch.cat([walk, walk[:, [2, 0]]], dim=1), 4, 0.01)[0].tolist()
-        [2, 0]
-    """
+    """Mutually nearest tracks that no other comes near to. points ``(frames, n + m, 3)`` -> ``(m,)``."""
     first, second = points[:, :n], points[:, n:]
     # track by track: all pairs of a long take at once do not fit into memory
     squares = [(first - track[:, None]).square().mean(0) for track in second.unbind(1)]

@@ -38,19 +38,8 @@ class PlaneParts:
 
 
 def unit_determinant(matrix: Tensor) -> Tensor:
-    r"""A 3 x 3 matrix up to scale with determinant 1; one that is singular gets norm 1 instead, and 0 stays.
-
-    Args:
-        matrix: ``(*batch, 3, 3)``.
-
-    Returns:
-        ``(*batch, 3, 3)``.
-
-    Example:
-        >>> import torch
-        >>> unit_determinant(-2 * torch.eye(3)).diagonal().tolist()
-        [1.0, 1.0, 1.0]
-    """
+    r"""A 3 x 3 matrix up to scale with determinant 1; one that is singular gets norm 1 instead, and 0 stays. matrix
+    ``(*batch, 3, 3)`` -> ``(*batch, 3, 3)``."""
     norm = torch.linalg.matrix_norm(matrix, keepdim=True)
     scaled = matrix / torch.where(norm > 0, norm, 1.0)
     det = torch.linalg.det(scaled)[..., None, None]
@@ -60,27 +49,8 @@ def unit_determinant(matrix: Tensor) -> Tensor:
 
 
 def rank_one_scale(first: Tensor, second: Tensor) -> Tensor:
-    r"""The :math:`\nu` for which :math:`A - \nu B` is nearest to rank one, relative to its size.
-
-    The 2-minors :math:`C_2(A - \nu B) = C_2(A) - \nu M + \nu^2 C_2(B)` vanish where the rank is one.  Their sum of squares is a
-    quartic in :math:`\nu`; its stationary points, the roots of a cubic, are the candidates, and with them the :math:`\nu` of least
-    squares, which is exact where A is a multiple of B.  The candidate with the least :math:`\|C_2(D)\| / \|D\|`, which is about
-    the second singular value of :math:`D = A - \nu B`, wins.
-
-    Args:
-        first: A ``(*batch, r, c)``, r and c from 2.
-        second: B, of the same shape or one that broadcasts.
-
-    Returns:
-        ``(*batch,)``, finite; where A or B is not finite or B is 0, it means nothing.
-
-    Example:
-        >>> import torch
-        >>> B = torch.tensor([[1.0, 2.0, 0.0], [0.0, 1.0, 1.0]], dtype=torch.float64)
-        >>> A = 3 * B + torch.tensor([[1.0], [2.0]], dtype=torch.float64) * torch.tensor([1.0, 0.0, -1.0], dtype=torch.float64)
-        >>> round(float(rank_one_scale(A, B)), 9)
-        3.0
-    """
+    r"""The :math:`\nu` for which :math:`A - \nu B` is nearest to rank one, relative to its size. first ``(*batch, r, c)`` ->
+    ``(*batch,)``."""
     a, size_a = unit_size(first)
     b, size_b = unit_size(second)
     a, b = torch.broadcast_tensors(a, b)
@@ -109,52 +79,15 @@ def _stationary(c0: Tensor, c1: Tensor, c2: Tensor, c3: Tensor) -> Tensor:
 
 
 def second_singular_value(matrix: Tensor) -> Tensor:
-    r"""About the second singular value, :math:`\|C_2(D)\| / \|D\|`: 0 where the rank is one, and for D = 0.
-
-    At rank two it is exact to :math:`(\sigma_2 / \sigma_1)^2`; with a third singular value it is about
-    :math:`\sqrt{\sigma_2^2 + \sigma_3^2}`.
-
-    Args:
-        matrix: ``(*batch, r, c)``.
-
-    Returns:
-        ``(*batch,)``.
-
-    Example:
-        >>> import torch
-        >>> round(float(second_singular_value(torch.diag(torch.tensor([4.0, 1e-3, 0.0])))), 6)
-        0.001
-    """
+    r"""About the second singular value, :math:`\|C_2(D)\| / \|D\|`: 0 where the rank is one, and for D = 0. matrix
+    ``(*batch, r, c)`` -> ``(*batch,)``."""
     size = torch.linalg.matrix_norm(matrix)
     return torch.linalg.matrix_norm(compound(matrix, 2)) / torch.where(size > 0, size, 1.0)
 
 
 def plane_parts(homographies: Tensor, infinity: Tensor) -> PlaneParts:
     r"""Scale, epipole and normal of planes, given the homography at infinity: :math:`H_i = \lambda_i (H_\infty + e_i n_i^T)`.
-
-    :math:`\lambda_i` is the :func:`rank_one_scale` of :math:`H_i` and :math:`H_\infty`; :math:`e_i n_i^T` is then the nearest
-    matrix of rank one.  The plane is :math:`n_i^T X = 1` in the affine frame where the cameras are :math:`[I \mid 0]` and
-    :math:`[H_\infty \mid e_i]`, and the body's fundamental matrix is :math:`[e_i]_\times H_\infty`.
-
-    Args:
-        homographies: H ``(*batch, n, 3, 3)``, view 1 to view 2, of any scale, in coordinates of size 1.
-        infinity: ``(*batch, 3, 3)``.
-
-    Returns:
-        the parts, in float64; zeros for a plane that is not finite.
-
-    Raises:
-        ValueError: shapes that do not fit.
-
-    Source: thesis chapter 5.
-
-    Example:
-        >>> import torch
-        >>> e, n = torch.tensor([0.6, 0.0, 0.8]).double(), torch.tensor([0.0, 0.3, 0.5]).double()
-        >>> parts = plane_parts(2 * (torch.eye(3) + e[:, None] * n)[None], torch.eye(3).double())
-        >>> parts.scale.round(decimals=6).tolist(), (parts.epipole[0, :, None] * parts.normal[0])[0].round(decimals=6).tolist()
-        ([2.0], [0.0, 0.18, 0.3])
-    """
+    homographies ``(*batch, n, 3, 3)``, infinity ``(*batch, 3, 3)``."""
     check_homographies(homographies, 1)
     if infinity.shape[-2:] != (3, 3):
         raise ValueError(f"infinity must be (*batch, 3, 3), got {tuple(infinity.shape)}")
@@ -203,41 +136,8 @@ RIDGE_EPSILON = 1e-14  # of the trace: what keeps normal equations invertible
 
 
 def infinity_closed_form(homographies: Tensor, options: PlanesOptions = PlanesOptions()) -> tuple[Tensor, Tensor]:
-    r"""The homography at infinity from three planes of translating bodies, or more, in closed form.
-
-    1. :math:`H_1 - t_j H_j` is singular for the right scale: :math:`t_j` is an eigenvalue of :math:`H_j^{-1} H_1`, one of three.
-    2. The choice of all :math:`t_j` for which all :math:`D_{ij}` are nearest to singular; the best few go on.
-    3. Planes in general position: :math:`e_i` is where the left null vectors of the :math:`D_{ij}` meet, :math:`n_i` the same of
-       the right ones, and :math:`H_\infty` the least squares solution of :math:`G_i = H_\infty + s_i e_i n_i^T`.  Collinear
-       epipoles, where the left null vectors are one line: linear equations for two rows of :math:`H_\infty`.  Coplanar
-       normals: the transposed problem.  A static plane is the solution itself.  All are solved, and the least residual of
-       :func:`~dyntorch.tasks.planes.closed_forms.plane_parts` wins.
-
-    It needs four planes where two are of one body, or one is static, and five where the epipoles are collinear and the normals
-    coplanar too.
-
-    Args:
-        homographies: H ``(*batch, n, 3, 3)``, view 1 to view 2, of any scale, in coordinates of size 1 (normalized, the same ones
-            for all planes).  A plane that is not finite is left out.
-        options: how many choices of scales are followed.
-
-    Returns:
-        :math:`H_\infty` ``(*batch, 3, 3)`` in float64, determinant 1, and the residual ``(*batch,)``, the root mean square over the
-        planes; a problem without solution has some finite matrix.
-
-    Raises:
-        ValueError: fewer than three planes, or shapes that do not fit.
-
-    Source: chapter 5 of the thesis asks for five planes; this is derived here.
-
-    Example:
-        >>> import torch
-        >>> rand = torch.Generator().manual_seed(0)
-        >>> e, n = torch.rand(2, 3, 3, generator=rand, dtype=torch.float64)
-        >>> found, residual = infinity_closed_form(torch.eye(3) + e[:, :, None] * n[:, None, :])
-        >>> found.round(decimals=6).abs().tolist(), float(residual) < 1e-9
-        ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], True)
-    """
+    r"""The homography at infinity from three planes of translating bodies, or more, in closed form. homographies
+    ``(*batch, n, 3, 3)`` -> ``(*batch, 3, 3)``."""
     check_homographies(homographies, 3)
     batch, count = homographies.shape[:-3], homographies.shape[-3]
     given, finite = finite_matrices(homographies.reshape(prod(batch), count, 3, 3))
@@ -258,10 +158,7 @@ def infinity_closed_form(homographies: Tensor, options: PlanesOptions = PlanesOp
 
 
 def _scaled_candidates(planes: Tensor) -> Tensor:
-    """``(b, n, 3, 3, 3)``: every plane with three scales, of which one goes with the first plane as it is.
-
-    H_1 - t H_j is singular for the eigenvalues t of H_j^-1 H_1; real parts serve where noise made a pair complex.
-    """
+    """``(b, n, 3, 3, 3)``: every plane with three scales, of which one goes with the first plane as it is."""
     inverse = cofactors(planes[:, 1:]).mT  # determinant 1
     ratios = real_eigenvalues(inverse @ planes[:, :1])
     ratios = torch.cat([torch.ones_like(planes[:, :1, 0]), ratios], dim=1)
@@ -309,11 +206,7 @@ def _general(planes: Tensor, present: Tensor) -> Tensor:
 
 
 def _collinear(planes: Tensor, present: Tensor) -> Tensor:
-    r"""The solution for epipoles on one line l, where :math:`l^T G_i = l^T H_\infty` for all planes.
-
-    The two other rows p, q of :math:`H_\infty` differ from those of :math:`G_i` by a matrix of rank one, so that
-    :math:`(p_i - p) \times (q_i - q) = 0`.  Subtracting this equation for the mean leaves linear ones in p and q.
-    """
+    r"""The solution for epipoles on one line l, where :math:`l^T G_i = l^T H_\infty` for all planes."""
     lines = _null_vectors(planes, present)[0].flatten(-3, -2)
     line, across = _leading(lines.mT @ lines)
     rows = across[..., None, :, :] @ planes
@@ -365,35 +258,8 @@ def ridge_solution(gram: Tensor, right: Tensor) -> Tensor:
 
 
 def infinity_from_fundamentals(fundamentals: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    r"""The homography at infinity from two fundamental matrices of translating bodies, or more.
-
-    :math:`F_k = [e_k]_\times H_\infty` makes :math:`H_\infty^T F_k` skew, six linear equations each:
-
-    .. math:: H_\infty^T F_k + F_k^T H_\infty = 0.
-
-    Their rank is 5 for one body and 8 for two whose epipoles differ.
-
-    Args:
-        fundamentals: F ``(*batch, m, 3, 3)``, x2^T F x1 = 0, of any scale, in coordinates of size 1.  One that is not finite is
-            left out.
-        weights: ``(*batch, m)``, not negative.
-
-    Returns:
-        :math:`H_\infty` ``(*batch, 3, 3)`` in float64, view 1 to view 2, determinant 1, and the singular values ``(*batch, 9)`` of
-        the equations, descending: the last but one is 0 where the epipoles are one point.  Differentiable.
-
-    Raises:
-        ValueError: fewer than two fundamental matrices, or shapes that do not fit.
-
-    Source: Manning and Dyer 1999 (stereo from translating bodies).
-
-    Example:
-        >>> import torch
-        >>> from dyntorch.geometry.homogeneous import skew
-        >>> found, _ = infinity_from_fundamentals(skew(torch.tensor([[0.0, 1.0, 0.5], [1.0, 0.0, 0.0]])))
-        >>> found.round(decimals=6).abs().tolist()
-        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    """
+    r"""The homography at infinity from two fundamental matrices of translating bodies, or more. fundamentals
+    ``(*batch, m, 3, 3)``, weights ``(*batch, m)`` -> ``(*batch, 3, 3)``."""
     if fundamentals.ndim < 3 or fundamentals.shape[-2:] != (3, 3) or fundamentals.shape[-3] < 2:
         raise ValueError(f"F must be (*batch, m, 3, 3) with m >= 2, got {tuple(fundamentals.shape)}")
     known = unit_vectors(finite_matrices(fundamentals)[0].flatten(-2))
@@ -413,43 +279,7 @@ def infinity_from_mixed(
     fundamental: Tensor, homographies: Tensor, options: PlanesOptions = PlanesOptions()
 ) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from one fundamental matrix and two planes of other bodies, or more, in closed form.
-
-    With the epipole e' of F, :math:`H_\infty = [e']_\times F + e' a^T` leaves three unknowns a.  Let N be two rows orthogonal to
-    e'.  For every plane, :math:`H_i = \lambda_i (H_\infty + e_i n_i^T)` says that
-
-    .. math::
-        N H_i - \lambda_i N [e']_\times F = \lambda_i (N e_i)\, n_i^T \quad\text{has rank one, and}\quad
-        e'^T H_i / \lambda_i - a^T = (e'^T e_i)\, n_i^T.
-
-    The first is a pencil of 2 x 3 matrices: three quadrics in :math:`\lambda_i` with one common root, which is unique
-    (:func:`~dyntorch.tasks.planes.closed_forms.rank_one_scale`), and one condition on the data besides.  The second puts a on a
-    line along :math:`n_i`: two planes that are not parallel give one a.  So the solution is unique; a third of the nine
-    equations are left over.  Planes of the body of F itself, and static planes, say nothing about a and weigh nothing.
-
-    Args:
-        fundamental: F ``(*batch, 3, 3)``, x2^T F x1 = 0, in coordinates of size 1.
-        homographies: H ``(*batch, n, 3, 3)``, view 1 to view 2, in the same coordinates, of any scale; one that is not finite is
-            left out.
-        options: how often the planes are weighed anew.
-
-    Returns:
-        :math:`H_\infty` ``(*batch, 3, 3)`` in float64, determinant 1, and the residual ``(*batch,)``: the root mean square of the
-        ones of :func:`~dyntorch.tasks.planes.closed_forms.plane_parts`, for planes of determinant 1.
-
-    Raises:
-        ValueError: fewer than two planes, or shapes that do not fit.
-
-    Source: thesis chapter 5; the mixed case is derived here.
-
-    Example:
-        >>> import torch
-        >>> from dyntorch.geometry.homogeneous import skew
-        >>> rand = torch.Generator().manual_seed(0)
-        >>> e, n = torch.rand(2, 2, 3, generator=rand, dtype=torch.float64)
-        >>> found, residual = infinity_from_mixed(skew(torch.tensor([0.0, 1.0, 0.5])), torch.eye(3) + e[:, :, None] * n[:, None])
-        >>> found.round(decimals=6).abs().tolist(), float(residual) < 1e-9
-        ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], True)
-    """
+    fundamental ``(*batch, 3, 3)``, homographies ``(*batch, n, 3, 3)`` -> ``(*batch, 3, 3)``."""
     check_homographies(homographies, 2)
     if fundamental.shape[-2:] != (3, 3):
         raise ValueError(f"F must be (*batch, 3, 3), got {tuple(fundamental.shape)}")
@@ -473,10 +303,7 @@ def infinity_from_mixed(
 
 
 def _nearest_to_lines(points: Tensor, directions: Tensor, strength: Tensor, scale: Tensor, reweightings: int) -> Tensor:
-    """The point ``(*batch, 3)`` nearest to lines through points ``(*batch, n, 3)``, each by what it is known with.
-
-    Entries of H with the error s put the line off by s / |scale|, and turn its direction by s / strength.
-    """
+    """The point ``(*batch, 3)`` nearest to lines through points ``(*batch, n, 3)``, each by what it is known with."""
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     weight = strength.square()
     for _ in range(1 + reweightings):
@@ -507,42 +334,8 @@ BLOCK = 1 << 19
 def infinity_linear(
     homographies: Tensor, weights: Tensor | None = None, fundamentals: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    r"""The homography at infinity from four planes of translating bodies, or more: 64 linear unknowns.
-
-    The extensors of all :math:`S(H)` span 64 of the 84 dimensions of :math:`\Lambda^3(R^3 \otimes R^3)`, and a is sought there:
-
-    .. math:: (a \vee \mathrm{ext}\, S(H_i))\, Q = 0,\quad a = Q\,v,\quad v \in R^{64}.
-
-    One plane gives 20 equations, generic planes have ranks 20, 39, 56, 63.  It works where all epipoles are collinear (all
-    bodies move on one ground plane) or all normals are coplanar, but not where both hold.  A known fundamental matrix lies in
-    :math:`S(H_\infty)` itself, :math:`F_k \vee a = 0`, which is linear as well.
-
-    Args:
-        homographies: H ``(*batch, n, 3, 3)``, view 1 to view 2, of any scale, in coordinates of size 1 (normalized, the same
-            ones for all planes).  A plane that is not finite is left out.
-        weights: ``(*batch, n)`` of the planes, not negative; 0 leaves one out.
-        fundamentals: F ``(*batch, m, 3, 3)`` of bodies, x2^T F x1 = 0, in the same coordinates, of any scale.
-
-    Returns:
-        :math:`H_\infty` ``(*batch, 3, 3)`` in float64, determinant 1, and the singular values ``(*batch, 64)``, descending: the
-        solution is unique where the last but one is well above 0.  A problem without solution has some finite matrix, and its
-        spectrum tells.  Differentiable.
-
-    Raises:
-        ValueError: shapes that do not fit, or fewer planes and fundamental matrices than determine it (4 planes; 2 planes and one
-            F; two F).
-
-    Source: after thesis chapter 5, whose 84 unknowns take five planes (:func:`infinity_thesis`).
-
-    Example:
-        >>> import torch
-        >>> rand = torch.Generator().manual_seed(0)
-        >>> e, n = torch.rand(2, 4, 3, generator=rand, dtype=torch.float64)
-        >>> H = torch.eye(3) + e[:, :, None] * n[:, None, :]
-        >>> found, spectrum = infinity_linear(H)
-        >>> found.round(decimals=6).abs().tolist(), spectrum.shape
-        ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], torch.Size([64]))
-    """
+    r"""The homography at infinity from four planes of translating bodies, or more: 64 linear unknowns. homographies
+    ``(*batch, n, 3, 3)``, weights ``(*batch, n)``, fundamentals ``(*batch, m, 3, 3)`` -> ``(*batch, 3, 3)``."""
     m = 0 if fundamentals is None else fundamentals.shape[-3]
     check_homographies(homographies, max(0, 4 - 2 * m))
     return _solve(homographies, weights, fundamentals, 64)
@@ -550,30 +343,7 @@ def infinity_linear(
 
 def infinity_thesis(homographies: Tensor) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from five planes or more, by the double algebra of the thesis: 84 linear unknowns.
-
-    :math:`a \vee \mathrm{ext}\, S(H_i) = 0` for any extensor a of three vectors of :math:`R^9`.  Generic planes have ranks
-    20, 39, 57, 74, 83; collinear epipoles leave several solutions for any number of planes.  For reference:
-    :func:`infinity_linear` takes four planes and errs less.
-
-    Args:
-        homographies: H ``(*batch, n, 3, 3)``, as there.
-
-    Returns:
-        :math:`H_\infty` ``(*batch, 3, 3)`` and the singular values ``(*batch, 84)``, as there.
-
-    Raises:
-        ValueError: fewer than five planes, or shapes that do not fit.
-
-    Source: thesis chapter 5.
-
-    Example:
-        >>> import torch
-        >>> rand = torch.Generator().manual_seed(0)
-        >>> e, n = torch.rand(2, 5, 3, generator=rand, dtype=torch.float64)
-        >>> found, _ = infinity_thesis(torch.eye(3) + e[:, :, None] * n[:, None, :])
-        >>> found.round(decimals=6).abs().tolist()
-        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    """
+    homographies ``(*batch, n, 3, 3)`` -> ``(*batch, 3, 3)``."""
     check_homographies(homographies, 5)
     return _solve(homographies, None, None, 84)
 
@@ -622,15 +392,7 @@ def _joins(step: int, unknowns: int, device: torch.device) -> Tensor:
 
 @constant
 def _invariant_basis(device: torch.device) -> Tensor:
-    r"""Orthonormal basis ``(64, 84)`` of what the extensors of all S(H) span.
-
-    .. math:: \Lambda^3(V \otimes W) = S^3 V \otimes \Lambda^3 W + S_{21} V \otimes S_{21} W + \Lambda^3 V \otimes S^3 W
-
-    of dimensions 10 + 64 + 10.  The extensors of the subspaces :math:`V \otimes w` span the last part, those of
-    :math:`v \otimes W` the first.  S(H) is orthogonal to both: the Gram of its basis :math:`[e_k]_\times H` with the
-    :math:`e_i w^T` is the skew :math:`[H w]_\times`, that with the :math:`v\, e_j^T` is :math:`[v]_\times H` up to sign, and both
-    have determinant 0.
-    """
+    r"""Orthonormal basis ``(64, 84)`` of what the extensors of all S(H) span."""
     grid = [(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]  # on which no cubic vanishes
     points = torch.tensor(grid, dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64)

@@ -24,31 +24,18 @@ PLANE_MATCHES, BODY_MATCHES = 4, 7
 
 @dataclass(frozen=True)
 class GivenPlanes:
-    """All that is given, in normalized coordinates, with one flat batch.
+    """All that is given, in normalized coordinates, with one flat batch."""
 
-    Attributes:
-        homographies: ``(b, p, 3, 3)`` of norm 1, zero where one is missing.
-        fundamentals: ``(b, m, 3, 3)``.
-        planes: matches of the planes.
-        bodies: matches of the bodies.
-        matched: whether there are matches.
-        frames: ``(b, 3, 3)`` from measured to normalized coordinates, of both views.
-        measured: ``(b, p, 3, 3)`` homographies as they came, zero where one is missing.
-        calibration: ``(b, 2, 3, 3)``.
-        batch: the leading dimensions that came in.
-        like: what the results are to be like.
-    """
-
-    homographies: Tensor
-    fundamentals: Tensor
-    planes: PlaneSightings
-    bodies: PlaneSightings
-    matched: bool
-    frames: Pair
-    measured: Tensor
-    calibration: Tensor | None
-    batch: tuple[int, ...]
-    like: Tensor
+    homographies: Tensor  # ``(b, p, 3, 3)`` of norm 1, zero where one is missing
+    fundamentals: Tensor  # ``(b, m, 3, 3)``
+    planes: PlaneSightings  # matches of the planes
+    bodies: PlaneSightings  # matches of the bodies
+    matched: bool  # whether there are matches
+    frames: Pair  # ``(b, 3, 3)`` from measured to normalized coordinates, of both views
+    measured: Tensor  # ``(b, p, 3, 3)`` homographies as they came, zero where one is missing
+    calibration: Tensor | None  # ``(b, 2, 3, 3)``
+    batch: tuple[int, ...]  # the leading dimensions that came in
+    like: Tensor  # what the results are to be like
 
     @staticmethod
     def of(
@@ -105,15 +92,10 @@ class GivenPlanes:
 
 @dataclass(frozen=True)
 class PlaneSightings:
-    """Matches of k planes or bodies.
+    """Matches of k planes or bodies."""
 
-    Attributes:
-        views: two of ``(b, k, n, 2)``, finite.
-        weights: ``(b, k, n)``, 0 where a match is missing.
-    """
-
-    views: Pair
-    weights: Tensor
+    views: Pair  # two of ``(b, k, n, 2)``, finite
+    weights: Tensor  # ``(b, k, n)``, 0 where a match is missing
 
     @staticmethod
     def none(batch: int, device: torch.device) -> PlaneSightings:
@@ -129,11 +111,7 @@ class PlaneSightings:
 
 
 def _matrices(name: str, value: Tensor) -> Tensor:
-    """Checked ``(*batch, k, 3, 3)``.
-
-    Raises:
-        ValueError: something else.
-    """
+    """Checked ``(*batch, k, 3, 3)``."""
     if not isinstance(value, Tensor):
         raise ValueError(f"{name} must be a torch.Tensor (*batch, n, 3, 3), got {type(value).__name__}; use torch.as_tensor(...)")
     if not value.is_floating_point() or value.ndim < 3 or value.shape[-2:] != (3, 3):
@@ -142,11 +120,7 @@ def _matrices(name: str, value: Tensor) -> Tensor:
 
 
 def padded(name: str, views: tuple[Points, Points]) -> Pair:
-    """Two views of the matches of k planes as ``(*batch, k, n, 2)``, filled up with NaN where a plane has fewer.
-
-    Raises:
-        ValueError: shapes that do not fit each other.
-    """
+    """Two views of the matches of k planes as ``(*batch, k, n, 2)``, filled up with NaN where a plane has fewer."""
     if len(views) != 2 or any(not isinstance(x, Tensor | Sequence) or isinstance(x, str) for x in views):
         kinds = ", ".join(type(x).__name__ for x in views)
         raise ValueError(f"{name} must be two views, each a tensor or a list of tensors, got {len(views)}: {kinds}")
@@ -174,11 +148,7 @@ def _stacked(name: str, points: Sequence[Tensor]) -> Tensor:
 
 
 def _sightings(name: str, views: Pair | None, batch: tuple[int, ...], count: int, least: int, home: torch.device) -> PlaneSightings:
-    """Matches of ``count`` planes or bodies with a flat batch; those with fewer than ``least`` weigh nothing.
-
-    Raises:
-        ValueError: another batch or number of planes than the matrices have.
-    """
+    """Matches of ``count`` planes or bodies with a flat batch; those with fewer than ``least`` weigh nothing."""
     if views is None:
         return PlaneSightings.none(prod(batch), home)
     if views[0].shape[:-2] != (*batch, count):
@@ -194,11 +164,7 @@ def _sightings(name: str, views: Pair | None, batch: tuple[int, ...], count: int
 
 
 def both(H: Tensor | None, F: Tensor | None) -> Pair:
-    """Homographies and fundamental matrices of one batch, dtype and device; none of a kind where it is not given.
-
-    Raises:
-        ValueError: neither is given, or they do not fit each other.
-    """
+    """Homographies and fundamental matrices of one batch, dtype and device; none of a kind where it is not given."""
     given = [_matrices(name, value) for name, value in (("H", H), ("fundamentals", F)) if value is not None]
     if not given:
         raise ValueError(
@@ -214,11 +180,7 @@ def both(H: Tensor | None, F: Tensor | None) -> Pair:
 
 
 def check_counts(planes: int, bodies: int, method: str) -> None:
-    """Refuse fewer planes and bodies than a method takes.
-
-    Raises:
-        ValueError: says how many are needed.
-    """
+    """Refuse fewer planes and bodies than a method takes."""
     if method != "auto" and method not in LEAST:
         raise ValueError(f"method must be 'auto' or one of {', '.join(LEAST)}, got {method!r}")
     if not bool(enough(torch.tensor(planes), torch.tensor(bodies), method)):
@@ -244,11 +206,7 @@ def enough(planes: Tensor, bodies: Tensor, method: str) -> Tensor:
 
 
 def cameras(calibration: Tensor | Pair, batch: tuple[int, ...], like: Tensor) -> Tensor:
-    """Calibration matrices of both views, ``(*batch, 2, 3, 3)``.
-
-    Raises:
-        ValueError: neither one matrix nor two.
-    """
+    """Calibration matrices of both views, ``(*batch, 2, 3, 3)``."""
     pair = (calibration, calibration) if not isinstance(calibration, Sequence) else tuple(calibration)
     if len(pair) != 2 or any(not isinstance(k, Tensor) or k.shape not in ((3, 3), (*batch, 3, 3)) for k in pair):
         given = pair if isinstance(calibration, Sequence) else pair[:1]

@@ -85,25 +85,15 @@ POSITIONS = (PlanesNotice.SHARED_BODY, PlanesNotice.STATIC_BODY)
 
 @dataclass(frozen=True)
 class Figures:
-    """What is known of the planes and bodies of a flat batch, in normalized coordinates.
+    """What is known of the planes and bodies of a flat batch, in normalized coordinates."""
 
-    Attributes:
-        epipoles: ``(b, c, 3)`` unit vectors.
-        epipole_covariance: ``(b, c, 3, 3)`` of them.
-        normals: ``(b, p, 3)`` unit vectors.
-        normal_covariance: ``(b, p, 3, 3)`` of them.
-        moving: ``(b, c)`` those that move, and count.
-        used: ``(b, c)`` those that count.
-        options: what is near, and how likely.
-    """
-
-    epipoles: Tensor
-    epipole_covariance: Tensor
-    normals: Tensor
-    normal_covariance: Tensor
-    moving: Tensor
-    used: Tensor
-    options: PlaneDegeneracyOptions
+    epipoles: Tensor  # ``(b, c, 3)`` unit vectors
+    epipole_covariance: Tensor  # ``(b, c, 3, 3)`` of them
+    normals: Tensor  # ``(b, p, 3)`` unit vectors
+    normal_covariance: Tensor  # ``(b, p, 3, 3)`` of them
+    moving: Tensor  # ``(b, c)`` those that move, and count
+    used: Tensor  # ``(b, c)`` those that count
+    options: PlaneDegeneracyOptions  # what is near, and how likely
 
     @cached_property
     def line(self) -> tuple[Tensor, Tensor]:
@@ -116,12 +106,7 @@ class Figures:
         return _flatness(self.normals, self.normal_covariance, self.moving[:, : self.normals.shape[1]], self.options)
 
     def several(self) -> Tensor:
-        """Where more than one homography at infinity fits the planes, by their position ``(b,)``.
-
-        All that moves alike is one body, and two planes of it are worth its fundamental matrix.  Three bodies are enough, two if
-        both fundamental matrices are known.  A static plane adds nothing: it may as well be one more plane of any of them.
-        Four planes with collinear epipoles and coplanar normals have two solutions.
-        """
+        """Where more than one homography at infinity fits the planes, by their position ``(b,)``."""
         planes = self.normals.shape[1]
         count, bodies = self.used[:, :planes].sum(-1), self.used[:, planes:].sum(-1)
         groups, known = self.groups
@@ -158,14 +143,7 @@ class Figures:
 def planes_notices(
     figures: Figures, enough: Tensor, said: Mapping[PlanesNotice, tuple[Tensor, Tensor]], given: GivenPlanes
 ) -> tuple[Notice, ...]:
-    """Notices on all problems, in their order.
-
-    Args:
-        figures: of the planes and bodies.
-        enough: ``(b,)`` whether there are enough of them.
-        said: further figures ``(b,)`` of the fit, and where they are worth a notice ``(b,)``.
-        given: what was fitted.
-    """
+    """Notices on all problems, in their order. enough ``(b,)``, said ``(b,)``."""
     used, still = figures.used.sum(-1), (figures.used & ~figures.moving).sum(-1)
     missing = figures.used.shape[1] - used
     line, collinear = figures.line
@@ -212,36 +190,19 @@ def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor, options: Plane
 
 @dataclass(frozen=True)
 class Misfit:
-    """What speaks against one homography at infinity for all, ``(b,)`` each.
-
-    Attributes:
-        ratio: with matches, the F ratio: what the cost grows by over that of their own matrices, per parameter less, over the
-            variance of the noise left under these.  With homographies alone, the noise that the residuals show over that which a
-            single homography for all would leave.
-        excess: variance of what one homography at infinity leaves over that of the noise, 1 where these may be the same.
-        apart: whether noise does not explain the ratio.
-        chance: whether random homographies would have it as well.  Three have one residual to spare, which says nothing.
-        vagueness: noise of the matches over the extent of what they are of; 0 without matches.
-        vague: whether they agree with any homographies and fundamental matrices as badly.
-    """
+    """What speaks against one homography at infinity for all, ``(b,)`` each."""
 
     ratio: Tensor
-    excess: Tensor
-    apart: Tensor
-    chance: Tensor
-    vagueness: Tensor
-    vague: Tensor
+    excess: Tensor  # variance of what one homography at infinity leaves over that of the noise, 1 where these may be the same
+    apart: Tensor  # whether noise does not explain the ratio
+    chance: Tensor  # whether random homographies would have it as well. Three have one residual to spare, which says nothing
+    vagueness: Tensor  # noise of the matches over the extent of what they are of; 0 without matches
+    vague: Tensor  # whether they agree with any homographies and fundamental matrices as badly
 
 
 def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor, options: PlanesOptions) -> Misfit:
-    r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it.
-
-    Args:
-        given: what was fitted.
-        cost: ``(b,)`` of the fit.
-        separate: ``(b,)`` cost of the matches under the given matrices; zero without matches.
-        options: what noise does not explain.
-    """
+    r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it. cost ``(b,)``,
+    separate ``(b,)``."""
     rows, spare = given.rows()
     sigma, used = (cost / spare.clamp(min=1)).sqrt(), given.used()
     p = given.homographies.shape[1]
@@ -267,10 +228,7 @@ def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor, options: PlanesOp
 
 
 def deviate(ratio: Tensor, above: Tensor, below: Tensor) -> Tensor:
-    """Normal deviate that an F ratio is exceeded as often as, by its degrees of freedom above and below.
-
-    Source: Paulson 1942, An approximate normalization of the analysis of variance distribution.
-    """
+    """Normal deviate that an F ratio is exceeded as often as, by its degrees of freedom above and below."""
     a, b = 2 / (9 * above), 2 / (9 * below)
     root = ratio.clamp(min=0).pow(1 / 3)
     return ((1 - b) * root - (1 - a)) / (b * root.square() + a).sqrt()
@@ -294,15 +252,7 @@ def _extent(given: GivenPlanes) -> Tensor:
 def turned(
     given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Tensor, options: PlanesOptions
 ) -> tuple[Tensor, Tensor]:
-    r"""Distance ``(b,)`` of :math:`K_2^{-1} H_\infty K_1`, of determinant 1, from a rotation, and whether noise is no reason.
-
-    Args:
-        given: with the calibration, or without one.
-        infinity: ``(b, 9)`` homography at infinity in normalized coordinates, of any scale.
-        covariance: ``(b, 9, 9)`` of it, its scale held.
-        status: ``(b,)``; only where it is OK anything is said.
-        options: what noise does not explain.
-    """
+    r"""Distance ``(b,)`` of :math:`K_2^{-1} H_\infty K_1`, of determinant 1, from a rotation, and whether noise is no reason."""
     if given.calibration is None:
         return torch.zeros_like(infinity[:, 0]), torch.zeros_like(status, dtype=torch.bool)
     first, second = given.calibration.unbind(1)

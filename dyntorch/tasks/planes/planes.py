@@ -193,15 +193,7 @@ def _centre(frames: Tensor) -> Tensor:
 
 
 def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined: bool, options: PlanesOptions) -> TranslatingPlanes:
-    """The result with a flat batch.
-
-    Args:
-        given: what was fitted.
-        found: what :func:`~dyntorch.tasks.planes.problem.solve` returns, for all problems, and the cost under the given matrices.
-        method: of the start.
-        refined: whether it was refined; a start as it is has a residual of its own.
-        options: every number that decides.
-    """
+    """The result with a flat batch."""
     theta, cost, covariance, undetermined, other, separate = found
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
     used = given.used()

@@ -89,15 +89,10 @@ class Layout:
 
 @dataclass(frozen=True)
 class Matrices:
-    r"""Measured matrices: the residual of M is what :math:`M / \langle M, G \rangle` differs from the given matrix G of norm 1.
+    r"""Measured matrices: the residual of M is what :math:`M / \langle M, G \rangle` differs from the given matrix G of norm 1."""
 
-    Attributes:
-        given: ``(b, c, 3, 3)`` of norm 1; zero where one is missing.
-        weights: ``(c,)`` inverse variances.
-    """
-
-    given: Tensor
-    weights: Tensor
+    given: Tensor  # ``(b, c, 3, 3)`` of norm 1; zero where one is missing
+    weights: Tensor  # ``(c,)`` inverse variances
 
     def normal(self, models: Tensor) -> Normal:
         """Cost and derivatives by the entries of the models ``(b, c, 3, 3)``."""
@@ -124,21 +119,13 @@ def _normal(weighted: Tensor, value: Tensor, slope: Tensor, weight: Tensor) -> N
 
 @dataclass(frozen=True)
 class PlaneMatches:
-    """Matches in normalized coordinates: Sampson distances in the unit of the measured points.
+    """Matches in normalized coordinates: Sampson distances in the unit of the measured points."""
 
-    Attributes:
-        planes: two views ``(b, p, n, 2)`` of the points of the planes, finite.
-        plane_weights: ``(b, p, n)``, 0 = missing.
-        bodies: two views ``(b, m, n', 2)`` of the points of the bodies.
-        body_weights: ``(b, m, n')``.
-        scales: two views ``(b,)``, the unit of the measured points in normalized coordinates.
-    """
-
-    planes: tuple[Tensor, Tensor]
-    plane_weights: Tensor
-    bodies: tuple[Tensor, Tensor]
-    body_weights: Tensor
-    scales: tuple[Tensor, Tensor]
+    planes: tuple[Tensor, Tensor]  # two views ``(b, p, n, 2)`` of the points of the planes, finite
+    plane_weights: Tensor  # ``(b, p, n)``, 0 = missing
+    bodies: tuple[Tensor, Tensor]  # two views ``(b, m, n', 2)`` of the points of the bodies
+    body_weights: Tensor  # ``(b, m, n')``
+    scales: tuple[Tensor, Tensor]  # two views ``(b,)``, the unit of the measured points in normalized coordinates
 
     def normal(self, models: Tensor) -> Normal:
         """Cost and derivatives by the entries of the models ``(b, p + m, 3, 3)``."""
@@ -252,19 +239,8 @@ def frames_of_calibration(calibration: tuple[Tensor, Tensor], options: PlanesOpt
 def frames_of_matrices(
     homographies: Tensor, fundamentals: Tensor, options: PlanesOptions = PlanesOptions()
 ) -> tuple[Tensor, Tensor]:
-    r"""Similarities for images that nothing is known of, from what homographies between them look like.
-
-    In the coordinates of calibrated cameras :math:`H_\infty` is a rotation, and a homography of determinant 1 has its least
-    norm there.  So the focal length, common to both views, is the one with the least :math:`\prod_i \|T H_i T^{-1}\|`.
-
-    Args:
-        homographies: ``(b, p, 3, 3)``, zero where one is missing.
-        fundamentals: ``(b, m, 3, 3)``; only where there are no homographies, by the sizes of their entries.
-        options: which focal lengths and centres are tried.
-
-    Returns:
-        ``(b, 3, 3)`` for view 1 and view 2, the same.
-    """
+    r"""Similarities for images that nothing is known of, from what homographies between them look like. homographies
+    ``(b, p, 3, 3)``, fundamentals ``(b, m, 3, 3)`` -> ``(b, 3, 3)``."""
     if not homographies.shape[1]:
         square = fundamentals.square()
         near, far = square[..., :2, :2].sum((-3, -2, -1)), square[..., :2, 2].sum((-2, -1)) + square[..., 2, :2].sum((-2, -1))
@@ -292,15 +268,8 @@ def _frames(options: PlaneFrameOptions, device: torch.device) -> tuple[Tensor, T
 def starts(
     method: str, homographies: Tensor, fundamentals: Tensor, several: bool = True, *, options: PlanesOptions = PlanesOptions()
 ) -> list[Tensor]:
-    """Homographies at infinity ``(b, 3, 3)`` of norm about 1 by one method, or by all that the numbers of planes and bodies allow.
-
-    Args:
-        method: a key of ``LEAST``, or ``"auto"``.
-        homographies: ``(b, p, 3, 3)`` in coordinates of order 1, zero where one is missing.
-        fundamentals: ``(b, m, 3, 3)``.
-        several: with ``"auto"``, each of a few planes besides, as if it stood still.
-        options: of the closed forms.
-    """
+    """Homographies at infinity ``(b, 3, 3)`` of norm about 1 by one method, or by all that the numbers of planes and bodies
+    allow."""
     planes, bodies = homographies.shape[1], fundamentals.shape[1]
     filled, known = _filled(homographies), _filled(fundamentals)
     chosen = AUTOMATIC if method == "auto" else (method,)
@@ -433,16 +402,8 @@ def _others(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor, options
 
 
 def noise_variance(cost: Tensor, spare: Tensor, options: PlanesOptions = PlanesOptions()) -> Tensor:
-    r"""Variance of the noise, :math:`c / q` with the lower quantile q of :math:`\chi^2`, which is near the number of residuals to
-    spare where that is large; 0 where none is.
-
-    Three planes have one to spare, which is often near 0 by chance: :math:`c / 1` would say so every time.
-
-    Args:
-        cost: c ``(b,)``.
-        spare: ``(b,)`` residuals beyond the degrees of freedom.
-        options: which quantile.
-    """
+    r"""Variance of the noise, :math:`c / q` with the lower quantile q of :math:`\chi^2`, which is near the number of residuals
+    to spare where that is large; 0 where none is. cost ``(b,)``, spare ``(b,)``."""
     share, degrees = options.ambiguity.underestimated, spare.clamp(min=1).flatten().tolist()
     limits = spare.new_tensor([quantile(share, free) for free in degrees]).reshape(spare.shape)
     return torch.where(spare > 0, cost / limits, 0.0)

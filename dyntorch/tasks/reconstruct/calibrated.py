@@ -76,17 +76,8 @@ def calibrated(
     calibration: Tensor,
     options: ReconstructOptions,
 ) -> Reconstruction:
-    """A reconstruction in the metric frame of its cameras, where there is one; elsewhere as it is, with the reason.
-
-    Args:
-        plain: the reconstruction before cameras of any calibration.
-        tracks: flat batch, weights 0 for outliers.
-        scene: its cameras and points, flat; of two bodies those of :func:`of_bodies`.
-        lifting: None for bodies.
-        labels: ``(b, n)`` the bodies.
-        calibration: K ``(b, views, l + 1, l + 1)``.
-        options: what decides.
-    """
+    """A reconstruction in the metric frame of its cameras, where there is one; elsewhere as it is, with the reason. labels
+    ``(b, n)``, calibration ``(b, views, l + 1, l + 1)``."""
     motion, batch = plain.motion, tuple(plain.status.shape)
     stage = Stage.of_bodies(motion, tracks.x, tracks.x.shape[1]) if lifting is None else Stage.of_lift(lifting)
     status = plain.status.reshape(-1)
@@ -191,17 +182,8 @@ class MetricScene:
 def metric_scene(
     tracks: ViewTracks, scene: LiftedState, stage: Stage, labels: Tensor, K: Tensor, solved: Tensor, options: ReconstructOptions
 ) -> MetricScene:
-    """The metric frame of solved problems, adjusted within cameras of the known calibrations.
-
-    Args:
-        tracks: flat batch.
-        scene: in a frame in which points are finite.
-        stage: of the motion.
-        labels: ``(b, n)`` the bodies; of one body anything.
-        K: ``(b, views, l + 1, l + 1)``, of normalized images.
-        solved: ``(b,)`` bool: where there is a scene at all.
-        options: what decides.
-    """
+    """The metric frame of solved problems, adjusted within cameras of the known calibrations. labels ``(b, n)``, K
+    ``(b, views, l + 1, l + 1)``, solved ``(b,)``."""
     b, views = tracks.x.shape[:2]
     d, wide = stage.motion.dim, stage.changes.worlds.shape[-1] - stage.motion.dim
     result = MetricScene(
@@ -383,16 +365,8 @@ def _posed(
 def metric_notices(
     found: MetricScene, worse: Tensor, stage: Stage, solved: Tensor, note: Note, options: ReconstructOptions
 ) -> None:
-    """Where no metric frame was found, where several were, and where the calibration does not fit.
-
-    Args:
-        found: the scene.
-        worse: ``(b,)`` noise that it leaves over that of the scene before cameras of any calibration.
-        stage: of the motion.
-        solved: ``(b,)`` where there is a scene.
-        note: takes the notices.
-        options: what decides.
-    """
+    """Where no metric frame was found, where several were, and where the calibration does not fit. worse ``(b,)``, solved
+    ``(b,)``."""
     case = "plane" if stage.motion.dim == 2 else "space"
     family = solved & ~found.found & (found.weakness <= options.metric.family)
     fits, poor = worse <= options.metric.refused, worse > options.metric.misfit

@@ -40,31 +40,7 @@ def point_uncertainty(
     *,
     options: ReconstructOptions,
 ) -> Tensor:
-    r"""Standard deviation of each point per unit of noise, when cameras and points are both unknown.
-
-    With the information on cameras :math:`U`, on a point :math:`V_j`, and between them :math:`W_j`, of the images,
-
-    .. math:: \mathrm{cov}(Y_j) = V_j^{+} + V_j^{+} W_j^T S^{+} W_j V_j^{+}, \qquad S = U - \sum_j W_j V_j^{+} W_j^T,
-
-    where :math:`S^{+}` leaves out the dimensions that no image can tell (``gauge``, scales, views without images): cameras as near
-    as possible to those given.
-
-    Args:
-        cameras: ``(b, views, m, a + 1)``.
-        structure: ``(b, n, K)``, zero where a point is not determined.
-        lifts: ``(b, views, a + 1, K)``.
-        depth: ``(K,)`` or ``(b, n, K)`` linear function of a point that gives it its scale.
-        weights: ``(b, views, n)``, 0 = missing.
-        gauge: dimension of what is open, without the scales of the cameras.
-        metric: ``(b, K, K)`` from these coordinates, best ones that the points fill, to those in which errors are measured.
-        step: distance of the points that are asked for; all of them tell about the cameras.
-
-    Returns:
-        ``(b, n)`` (fewer with ``step``): root of the trace of the covariance of a point scaled to depth 1, in the unit
-        of ``metric`` times ``structure`` over that of the images; infinite where a point, or the cameras, are not determined.
-
-    Source: Triggs et al. 2000, Bundle adjustment, section 9; Hartley and Zisserman, appendix A6.
-    """
+    r"""Standard deviation of each point per unit of noise, when cameras and points are both unknown."""
     b, views, n = weights.shape
     wide = structure.shape[-1] * cameras.shape[-2] * cameras.shape[-1] * views
     value = (structure * depth).sum(-1, keepdim=True)
@@ -194,21 +170,7 @@ def diagnose(
     batch: tuple[int, ...],
     options: ReconstructOptions,
 ) -> tuple[Tensor, tuple[Notice, ...]]:
-    """The status ``(b,)`` of every problem, judged by the scene, and the notices on all of them.
-
-    The linear fit of a tensor has more unknowns than the scene: what it calls ambiguous may be well determined.  A problem is
-    ambiguous where its points are uncertain by ``options.diagnosis.unknown`` of their extent, or a model with fewer unknowns
-    explains the tracks as well, which also tells the cause.
-
-    Args:
-        tracks: flat batch, weights 0 for outliers.
-        scene: in the frame that is shown, normalized images; bodies with their projections for cameras.
-        lifting: None for bodies.
-        motion: the model.
-        status: ``(b,)`` of the fit of the tensor.
-        sigma: ``(b,)`` noise in measured units.
-        batch: the shape that the flat dimension comes from.
-    """
+    """The status ``(b,)`` of every problem, judged by the scene, and the notices on all of them."""
     found, note = noting(batch)
     lost = (scene.cameras == 0).flatten(1).all(-1) | ~scene.cameras.isfinite().flatten(1).all(-1)
     status = torch.where(lost & ~failed(status), int(Status.DEGENERATE), status)
@@ -250,15 +212,8 @@ def diagnose(
 def conditions(
     tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor, options: ReconstructOptions
 ) -> tuple[Tensor, Tensor]:
-    """Least singular value of the stacked projections over the largest, in coordinates in which the points fill the space, and the
-    median expected error of the points over the size of the scene, ``(b,)`` each.
-
-    Args:
-        tracks: flat batch.
-        scene: normalized images.
-        lifting: None for bodies.
-        noise: ``(b,)`` of one coordinate, in normalized images.
-    """
+    """Least singular value of the stacked projections over the largest, in coordinates in which the points fill the space, and
+    the median expected error of the points over the size of the scene, ``(b,)`` each."""
     unit = torch.nn.functional.normalize(scene.structure.nan_to_num(), dim=-1)
     size = unit.shape[-1]
     eye = torch.eye(size, dtype=unit.dtype, device=unit.device)

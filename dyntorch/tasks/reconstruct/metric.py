@@ -140,20 +140,9 @@ class _Calibrating(NormalEquations):
 def metric_frames(
     cameras: Tensor, structure: Tensor, lifts: Tensor, changes: WorldChanges, world: Tensor, weights: Tensor, options: MetricOptions
 ) -> MetricFrames:
-    """The change of frame after which cameras, divided by their calibrations, are rotations and translations.
-
-    Every start (:func:`_starts`) descends on the conditions; of those that end as low as the lowest the one that has the fewest
-    points behind the cameras wins.
-
-    Args:
-        cameras: ``(b, views, m, a + 1)``, :math:`K_i^{-1} P_i`, 0 for views that do not count.
-        structure: ``(b, n, K)`` in a frame in which points are finite; 0 where a point is not determined.
-        lifts: ``(views, a + 1, K)``.
-        changes: of these lifts.
-        world: ``(K,)`` or ``(s, K)``: the homogeneous coordinate of the points (the sum of several, all but one of which are 0).
-        weights: ``(b, views, n)``.
-        options: what decides.
-    """
+    """The change of frame after which cameras, divided by their calibrations, are rotations and translations. cameras
+    ``(b, views, m, a + 1)``, structure ``(b, n, K)``, lifts ``(views, a + 1, K)``, world ``(K,)``, weights
+    ``(b, views, n)``."""
     b, d = len(cameras), changes.dim
     share = (cameras != 0).flatten(2).any(-1).to(cameras.dtype)
     derivatives = torch.einsum("bvma,vpad->bvpmd", cameras, changes.worlds[..., :d])

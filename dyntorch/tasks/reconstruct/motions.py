@@ -219,18 +219,7 @@ def _counted(profile: tuple[int, ...], sensor: int, lifts: tuple[tuple[tuple[flo
 
 
 def polynomial(dim: int, directions: int, degree: int = 1) -> Lift:
-    """The lift of points of a world of some dimension whose first coordinates are polynomials of the time.
-
-    Args:
-        dim: of the world.
-        directions: number of coordinates that change.
-        degree: of the polynomials.
-
-    Example:
-        >>> import torch
-        >>> polynomial(2, 1)(torch.tensor(3.0)).tolist()
-        [[1.0, 0.0, 0.0, 3.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
-    """
+    """The lift of points of a world of some dimension whose first coordinates are polynomials of the time."""
     eye = torch.eye(dim + 1, dtype=torch.float64)
 
     def lift(time: Tensor) -> Tensor:
@@ -240,19 +229,7 @@ def polynomial(dim: int, directions: int, degree: int = 1) -> Lift:
 
 
 def polynomial_shift(dim: int, directions: int, degree: int = 1) -> Callable[[float], Tensor]:
-    """The shift of :func:`polynomial`: the coefficients of a polynomial of t + c.
-
-    Args:
-        dim: of the world.
-        directions: number of coordinates that change.
-        degree: of the polynomials.
-
-    Example:
-        >>> import torch
-        >>> lift, shift = polynomial(2, 2, 2), polynomial_shift(2, 2, 2)
-        >>> bool(torch.allclose(lift(torch.tensor(5.0)), lift(torch.tensor(2.0)) @ shift(3.0)))
-        True
-    """
+    """The shift of :func:`polynomial`: the coefficients of a polynomial of t + c."""
     eye = torch.eye(dim + 1, dtype=torch.float64)[:, :directions]
 
     def shift(c: float) -> Tensor:
@@ -322,11 +299,7 @@ planes."""
 
 
 def as_motion(motion: str | Motion) -> Motion:
-    """The declared model of that name, or the model itself.
-
-    Raises:
-        ValueError: an unknown name.
-    """
+    """The declared model of that name, or the model itself."""
     if isinstance(motion, Motion):
         return motion
     if motion not in MOTIONS:

@@ -81,12 +81,8 @@ class Projections:
 
 
 def camera_unknowns(views: int, rows: int, columns: int, gauge: int | None = None) -> int:
-    """Entries of so many cameras up to scale, less the gauge: by default that of projections, the collineations of :math:`P^k`.
-
-    Example:
-        >>> camera_unknowns(3, 3, 5)  # constant velocity in a plane, 3 views
-        18
-    """
+    """Entries of so many cameras up to scale, less the gauge: by default that of projections, the collineations of
+    :math:`P^k`."""
     return views * (rows * columns - 1) - (columns**2 - 1 if gauge is None else gauge)
 
 
@@ -113,13 +109,7 @@ def choices(tracks: ViewTracks, size: int, options: ReconstructOptions) -> Tenso
 def projections_of_tracks(
     tracks: ViewTracks, invariant: GrassmannTensor, subsets: Tensor | None = None, *, options: ReconstructOptions
 ) -> Projections:
-    """Linear, constrained, resected, adjusted: the best of several choices of views.
-
-    Args:
-        tracks: flat batch.
-        invariant: of as many views as the tensor takes.
-        subsets: ``(b, s, size)`` choices of views; None: those of :func:`choices`.
-    """
+    """Linear, constrained, resected, adjusted: the best of several choices of views. subsets ``(b, s, size)``."""
     size = len(invariant.profile)
     subsets = choices(tracks, size, options) if subsets is None else subsets
     b, count, _ = subsets.shape
@@ -177,11 +167,7 @@ def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor,
 
 def _grown(tracks: ViewTracks, whole: Tensor, options: ReconstructOptions) -> tuple[Tensor, Tensor]:
     """All views and points from some of them, in turns: tracks shorter than the recording lead from views to their neighbours.
-
-    Args:
-        tracks: flat batch.
-        whole: ``(b, views, l + 1, K)``, zero where a view is not known yet.
-    """
+    whole ``(b, views, l + 1, K)``."""
     structure = triangulate(whole, tracks.x, _seen(tracks, whole))
     missing = _unknown(tracks, whole)
     left = (missing.any(-1) & (structure != 0).flatten(1).any(-1)).nonzero()[:, 0]

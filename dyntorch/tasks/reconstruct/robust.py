@@ -57,14 +57,7 @@ def _bounds(top: int, share: float) -> tuple[float, ...]:
 
 
 def noise(square: Tensor, free: Tensor, chosen: Tensor, part: float = 0.5) -> Tensor:
-    """Standard deviation ``(b,)`` of one coordinate from a quantile of the chosen points; 0 where there are none.
-
-    Args:
-        square: ``(b, n)`` squared distances.
-        free: ``(b, n)`` of :func:`freedom`.
-        chosen: ``(b, n)`` bool.
-        part: the quantile, the median by default.
-    """
+    """Standard deviation ``(b,)`` of one coordinate from a quantile of the chosen points; 0 where there are none."""
     relative = square / bound(free, part).clamp(min=torch.finfo(square.dtype).tiny)
     counted = chosen & (free >= 1)
     order = relative.masked_fill(~counted, torch.inf).sort(-1).values
@@ -77,16 +70,7 @@ def noise(square: Tensor, free: Tensor, chosen: Tensor, part: float = 0.5) -> Te
 def settled_noise(
     tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5, *, options: ReconstructOptions
 ) -> Tensor:
-    """Noise ``(b,)`` of one coordinate from a quantile of the chosen points, then the median of those within its threshold.
-
-    Args:
-        tracks: flat batch.
-        square: ``(b, n)`` squared distances.
-        free: ``(b, n)`` of :func:`freedom`.
-        chosen: ``(b, n)`` bool.
-        used: degrees of freedom of the projections, fitted to these points.
-        part: the first quantile.
-    """
+    """Noise ``(b,)`` of one coordinate from a quantile of the chosen points, then the median of those within its threshold."""
     least = options.noise.least / tracks.scales.amin(1)
     level = torch.maximum(noise(square, free, chosen, part), least)
     for _ in range(options.noise.rounds):
@@ -98,16 +82,7 @@ def settled_noise(
 
 
 def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor, options: ReconstructOptions) -> Tensor:
-    r"""Weights ``(b, views, n)``, 0 for all observations that do not agree with the projections.
-
-    A point agrees where its squared distance is below the quantile of :math:`\sigma^2 \chi^2`.  Of one that does not, the view
-    without which the others agree best is left out, and the next one, as long as enough remains to tell.
-
-    Args:
-        tracks: flat batch.
-        projections: ``(b, views, l + 1, K)``.
-        sigma: ``(b,)`` noise of one coordinate, measured unit.
-    """
+    r"""Weights ``(b, views, n)``, 0 for all observations that do not agree with the projections."""
     k, size = projections.shape[-1] - 1, tracks.x.shape[-1]
     free = freedom(tracks, k)
     agrees = (distance(tracks, projections, options) <= sigma.square()[:, None] * bound(free, options.noise.share)) & (free >= 1)
@@ -179,24 +154,7 @@ def consensus(
     generator: torch.Generator | None,
     options: ReconstructOptions,
 ) -> tuple[Consensus, Tensor, Tensor]:
-    r"""Projections of the tensor's views on whose points the most agree.
-
-    A start fits all points, or a random half of those near the best projections so far: linear, constrained, adjusted.  It then
-    fits those nearest to its own projections, and again.  The adjusted fit tells outliers where the linear tensor, which has
-    more freedom (80 against 32 in :math:`P^6`), bends to them.
-
-    Args:
-        tracks: flat batch.
-        invariant: of as many views as the tensor takes.
-        sigma: ``(b,)`` noise of one coordinate, measured unit; None: estimated.
-        generator: of the starts.
-
-    Returns:
-        The projections, the noise ``(b,)``, and where they are doubtful ``(b,)``.
-
-    Source: Rousseeuw and van Driessen 2006 (concentration steps of least trimmed squares); Chum, Matas and Kittler 2003
-        (starts from the inliers so far).
-    """
+    r"""Projections of the tensor's views on whose points the most agree. sigma ``(b,)`` -> ``(b,)``."""
     subsets = choices(tracks, len(invariant.profile), options)
     search = _Search(invariant, sigma, generator, options=options)
     everyone = torch.arange(len(tracks.x), device=tracks.x.device)
@@ -347,14 +305,7 @@ def _nearest(value: Tensor, count: Tensor) -> Tensor:
 def suspicious(
     tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None, options: ReconstructOptions
 ) -> Tensor:
-    """Which problems ``(b,)`` show outliers after least squares.
-
-    Args:
-        tracks: flat batch.
-        apart: ``(b, views, n)`` reprojection distances, NaN = missing.
-        unknowns: of every point, ``(b, n)`` or one number.
-        limit: three standard deviations of the noise, None: judged by the residuals alone.
-    """
+    """Which problems ``(b,)`` show outliers after least squares."""
     square, free, sigma = _misfit(tracks, apart, unknowns, limit, options)
     if not len(apart):
         return apart.new_zeros(0, dtype=torch.bool)
@@ -367,13 +318,7 @@ def suspicious(
 
 
 def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor, options: ReconstructOptions) -> Tensor:
-    """The points ``(b, n)`` said to stand still that fit by far the worst: they move.
-
-    Args:
-        tracks: flat batch, with ``static``.
-        apart: ``(b, views, n)`` reprojection distances, NaN = missing.
-        unknowns: of every point, ``(b, n)``.
-    """
+    """The points ``(b, n)`` said to stand still that fit by far the worst: they move."""
     assert tracks.static is not None
     square, free, sigma = _misfit(tracks, apart, unknowns, None, options)
     excess = torch.where(
@@ -387,16 +332,8 @@ def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor, options: Reco
 def trimmed(
     tracks: ViewTracks, scene: LiftedState, lifting: Lifting, unknowns: Tensor, limit: float | None, options: ReconstructOptions
 ) -> tuple[LiftedState, ViewTracks, Tensor]:
-    """The least squares scene after the few observations that disagree with it are taken away, the tracks without them, and whether
-    ``(b,)`` that is all there was to do: one wrong track in many does not need a search.
-
-    Args:
-        tracks: flat batch of suspected problems.
-        scene: of least squares.
-        lifting: the model.
-        unknowns: of every point, ``(b, n)``.
-        limit: three standard deviations of the noise, None: judged by the residuals alone.
-    """
+    """The least squares scene after the few observations that disagree with it are taken away, the tracks without them, and
+    whether ``(b,)`` that is all there was to do: one wrong track in many does not need a search."""
     fewer = tracks
     for _ in range(options.outliers.trims):
         projections = scene.cameras @ lifting.lifts
@@ -432,15 +369,7 @@ def robust_projections(
     generator: torch.Generator | None,
     options: ReconstructOptions,
 ) -> tuple[Projections, ViewTracks]:
-    """Projections from the tracks that agree, and the tracks with weight 0 for all other observations.
-
-    Args:
-        tracks: flat batch.
-        invariant: of as many views as the tensor takes.
-        lifting: the model, or None.
-        limit: three standard deviations of the noise of one coordinate, measured unit; None: estimated.
-        generator: of the random samples.
-    """
+    """Projections from the tracks that agree, and the tracks with weight 0 for all other observations."""
     given = None if limit is None else torch.full_like(tracks.scales[:, 0], limit / 3)
     best, sigma, _ = consensus(tracks, invariant, given, generator, options)
     cameras = _extended(tracks, best, sigma, options)

@@ -36,15 +36,8 @@ def resting_constants(lifts: Tensor, options: ReconstructOptions) -> Tensor:
 
 
 def resting(tracks: ViewTracks, sensor: int, dim: int, options: ReconstructOptions) -> Tensor:
-    """The cameras ``(b, views, l + 1, dim + 1)`` that explain tracks best if no point moves, points finite and of unit variance.
-
-    Where motion is slow against the extent of the scene they are near the truth, whatever the motion model.
-
-    Args:
-        tracks: flat batch.
-        sensor: dimension l of the views.
-        dim: dimension of the world.
-    """
+    """The cameras ``(b, views, l + 1, dim + 1)`` that explain tracks best if no point moves, points finite and of unit
+    variance."""
     eye = torch.eye(dim + 1, dtype=tracks.x.dtype, device=tracks.x.device)
     views = tracks.x.shape[1]
     still = Motion(lambda time: torch.eye(dim + 1, dtype=torch.float64), sensor=sensor, static=True)
@@ -129,19 +122,7 @@ def scene_of(
     tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Tensor | None = None, *, options: ReconstructOptions
 ) -> LiftedState:
     """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
-
-    The second start is taken in high spaces with few spare images (``options.scene.several``, ``options.scene.spare``), and where
-    no views have enough points in common for the tensor.
-
-    Args:
-        tracks: flat batch.
-        found: projections and points.
-        lifting: the model.
-        scale: ``(b,)`` robust scale of normalized, weighted images; None: least squares.
-
-    Returns:
-        Scene, of infinite cost where none was found.
-    """
+    scale ``(b,)``."""
     lost = failed(found.status)
     aided = _aided(tracks, lifting)
     coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
@@ -262,13 +243,7 @@ def adjusted(
 
 
 def framed(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedState:
-    """The scene in its frame: finite, with no motion common to all points (to the static ones), centred, of unit size.
-
-    Args:
-        tracks: flat batch.
-        scene: of :func:`scene_of`.
-        lifting: the model.
-    """
+    """The scene in its frame: finite, with no motion common to all points (to the static ones), centred, of unit size."""
     lifts, static = lifting.lifts, tracks.static
     known = (scene.structure != 0).any(-1)
     scene = _finite(tracks, scene, lifting)
@@ -316,16 +291,7 @@ def distances(tracks: ViewTracks, projections: Tensor, structure: Tensor) -> Ten
 
 
 def bodies_of(tracks: ViewTracks, scene: LiftedState, options: ReconstructOptions) -> tuple[Tensor, Tensor, Tensor, LiftedState]:
-    """Labels by the two hyperplanes of the points, and the affine structure of each body.
-
-    Args:
-        tracks: flat batch.
-        scene: projections (as cameras) and points in any projective frame.
-
-    Returns:
-        cameras of both bodies ``(b, 2, views, m, d + 1)``, points ``(b, n, d)``, labels ``(b, n)``, and the adjusted scene with
-        every point on the hyperplane of its body.
-    """
+    """Labels by the two hyperplanes of the points, and the affine structure of each body."""
     done = bundle_adjust(tracks.x, tracks.weights, scene.cameras, scene.structure, iterations=options.scene.final_steps)
     known = (done.structure != 0).any(-1)
     information = point_information(done.cameras, done.structure, tracks.weights)

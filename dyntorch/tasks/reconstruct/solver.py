@@ -236,32 +236,8 @@ def choose(
     options: ReconstructOptions,
     calibration: Tensor | None = None,
 ) -> Reconstruction:
-    r"""Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``.
-
-    .. math:: \mathrm{GRIC} = \sum_j \min\Big(\frac{|e_j|^2}{\sigma^2},\; \lambda_3 (r_j - d)\Big)
-        + \sum_j d \log r_j + c \log \sum_j r_j
-
-    with the residual :math:`e_j` of the :math:`r_j` observed coordinates of a point, d unknowns of a point and c of the cameras
-    less the ambiguity (the label of a point of two bodies counts as well, a little).  The noise :math:`\sigma` is what the models
-    leave that most observations agree with and that fit about equally well.  One model is chosen for a whole batch.  All are
-    fitted by least squares, robustly only where the best of these finds outliers.
-
-    Two planar bodies are also two planes of a static scene; the smaller of the two models that say so wins, two bodies.
-
-    Args:
-        tracks: flat batch.
-        static: ``(b, n)`` bool, or None.
-        limit: three standard deviations of the noise; None: estimated; infinite: no outliers.
-        generator: of random samples.
-        batch: the shape that the flat dimension comes from.
-        options: what decides.
-        calibration: K ``(b, views, l + 1, l + 1)``; None: cameras are any matrices.  The models are compared without it.
-
-    Raises:
-        ValueError: too few views or tracks for any model.
-
-    Source: Torr 2002, Bayesian model estimation and selection for epipolar geometry and generic manifold fitting (GRIC).
-    """
+    r"""Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``. static ``(b, n)``,
+    calibration ``(b, views, l + 1, l + 1)``."""
     views, n = tracks.weights.shape[1:]
     reasons = {m.name: _lacks(m, tracks.times, views, n) for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1]}
     models = [MOTIONS[name] for name, reason in reasons.items() if not reason]
@@ -314,13 +290,7 @@ class LiftedFit(NamedTuple):
 
 
 def least(motion: Motion, times: Tensor) -> tuple[int, int]:
-    """Fewest views and tracks that a model can be fitted to.
-
-    Example:
-        >>> import torch
-        >>> least(MOTIONS["two_bodies_2d"], torch.arange(3.0))
-        (2, 9)
-    """
+    """Fewest views and tracks that a model can be fitted to."""
     views, matches = motion.minimal(times)
     bodies = (motion.k + 1) * (motion.k + 2) // 2 - 1 if motion.bodies > 1 else 0
     return views, max(matches, bodies)
@@ -365,13 +335,7 @@ def _noise(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None, optio
 
 
 def penalized(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor, options: ReconstructOptions) -> Tensor:
-    """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only.
-
-    Args:
-        tracks: flat batch, all observations with weight.
-        fit: of the same problems.
-        sigma: ``(b,)`` noise in the unit of the tracks.
-    """
+    """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only."""
     motion, seen = fit.motion, tracks.weights > 0
     r = seen.sum(1).to(sigma.dtype) * motion.sensor
     free = motion.k - (motion.bodies > 1)

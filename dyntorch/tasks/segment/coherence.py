@@ -20,15 +20,10 @@ of a sparse one 1.2, 1.6, 4.8, but with two copies."""
 
 @dataclass(frozen=True)
 class Links:
-    """Symmetric weights between neighbouring matches.
+    """Symmetric weights between neighbouring matches."""
 
-    Attributes:
-        index: ``(n, d)`` the neighbours of each match.
-        weight: ``(n, d)`` in [0, 1], 0 where there are fewer than d.
-    """
-
-    index: Tensor
-    weight: Tensor
+    index: Tensor  # ``(n, d)`` the neighbours of each match
+    weight: Tensor  # ``(n, d)`` in [0, 1], 0 where there are fewer than d
 
     @cached_property
     def _matrices(self) -> dict[torch.dtype, Tensor]:
@@ -56,10 +51,8 @@ class Links:
         return Links(index.clamp(min=0), torch.where(index >= 0, self.weight[keep], 0.0))
 
     def components(self, least: float, among: Tensor) -> Tensor:
-        """Connected components of the links above ``least`` among some matches ``(n,)`` bool: ``(n,)``, the least index of each.
-
-        A match that is not among them is a component of its own.
-        """
+        """Connected components of the links above ``least`` among some matches ``(n,)`` bool: ``(n,)``, the least index of
+        each."""
         joined = (self.weight > least) & among[:, None] & among[self.index]
         found = torch.arange(len(self.index), device=self.index.device)
         target = torch.cat([found[:, None], torch.where(joined, self.index, found[:, None])], dim=-1)
@@ -74,35 +67,14 @@ class Links:
 
 @dataclass(frozen=True)
 class Coherence:
-    """The graph of one problem of n matches.
+    """The graph of one problem of n matches."""
 
-    Attributes:
-        values: ``(n,)`` in [0, 1], how well a match moves like its neighbours of both images.
-        links: how well two neighbours move alike.
-    """
-
-    values: Tensor
-    links: Links
+    values: Tensor  # ``(n,)`` in [0, 1], how well a match moves like its neighbours of both images
+    links: Links  # how well two neighbours move alike
 
 
 def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None, *, options: SegmentOptions) -> Coherence:
-    r"""Deviation of each match from the affine motion of its neighbours, in both directions.
-
-    For a match i and a neighbour j of it in image a, with the local motion :math:`L_i` from a to b,
-
-    .. math:: r_{ij} = \frac{|(b_j - b_i) - L_i (a_j - a_i)|}{\min(|a_j - a_i|, d) \sqrt{|\det G|} + s},
-        \qquad w_{ij} = e^{-(r_{ij}/\tau)^2},
-
-    where d is a few times the usual distance of neighbours (far from all others, any motion would be small beside it), G is the
-    zoom and rotation common to most neighbours, or to many others of which match i is one (a body that turns far), and
-    :math:`L_i` the weighted least squares towards it.
-
-    Args:
-        x1: ``(n, 2)`` matches.
-        x2: the same in view 2.
-        scale: s, noise of differences of matches, in their unit.
-        among: ``(n,)`` bool, the matches that can be neighbours; None: all.
-    """
+    r"""Deviation of each match from the affine motion of its neighbours, in both directions. x1 ``(n, 2)``, among ``(n,)``."""
     among = torch.ones_like(x1[:, 0], dtype=torch.bool) if among is None else among
     fresh = _first_of_copies(x1, x2, among, scale / 6)
     values = torch.ones_like(x1[:, 0])
@@ -142,17 +114,7 @@ def _judged(
 
 
 def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float, options: SegmentOptions) -> Tensor:
-    """How well every match moves like its nearest members of each body.
-
-    Args:
-        x1: ``(n, 2)`` matches.
-        x2: the same in view 2.
-        members: ``(K, n)`` bool.
-        scale: as of :func:`coherence`.
-
-    Returns:
-        ``(K, n)`` in [0, 1].
-    """
+    """How well every match moves like its nearest members of each body. x1 ``(n, 2)``, members ``(K, n)`` -> ``(K, n)``."""
     some = [_thinned(body, options) for body in members]
     fresh = _first_of_copies(x1, x2, torch.stack(some).any(0), scale / 6)
     return torch.stack([_judged(x1, x2, fresh & body, scale, options)[0] for body in some])
@@ -205,10 +167,7 @@ def _first_of_copies(x1: Tensor, x2: Tensor, among: Tensor, least: float) -> Ten
 
 
 def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float, options: SegmentOptions) -> tuple[Tensor, Tensor]:
-    """Indices ``(n, k)`` of the matches nearest in a, nearest first, of some of them (indices), and which of these exist.
-
-    A match that is the same, in both views, is no neighbour.
-    """
+    """Indices ``(n, k)`` of the matches nearest in a, nearest first, of some of them (indices), and which of these exist."""
     near, joint = a[among], torch.cat([a, b], dim=-1)
     count = min(options.coherence.neighbours, len(among))
     indices, exist = [], []

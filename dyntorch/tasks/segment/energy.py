@@ -15,18 +15,12 @@ from dyntorch.tasks.segment.options import SegmentOptions
 
 @dataclass(frozen=True)
 class View:
-    """The matches of one problem, centred and scaled alike in both views.
+    """The matches of one problem, centred and scaled alike in both views."""
 
-    Attributes:
-        x1, x2: ``(n, 2)``.
-        pixel: the threshold / ``options.units.threshold_in_pixels``, in these coordinates: a pixel at the default threshold.
-        links: between matches.
-    """
-
-    x1: Tensor
+    x1: Tensor  # ``(n, 2)``
     x2: Tensor
-    pixel: float
-    links: Links
+    pixel: float  # the threshold / ``options.units.threshold_in_pixels``, in these coordinates: a pixel at the default threshold
+    links: Links  # between matches
 
     def subset(self, keep: Tensor) -> View:
         """Some of the matches (indices)."""
@@ -34,21 +28,7 @@ class View:
 
 
 def energy(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> Tensor:
-    r"""Cost of labellings with their fundamental matrices:
-
-    .. math:: \sum_i \min(r_i^2 / \sigma^2, c) + \lambda \sum_{ij \text{ cut}} S_{ij}
-        + \mu \sum_i \Big[(\nu + 1) \log\big(1 + \tfrac{p_i^2}{\nu t_k^2}\big) + \log t_k^2\Big],
-
-    with the Sampson distance r and the parallax p from a plane of body k, whose scale :math:`t_k` is estimated.
-
-    Args:
-        view: matches.
-        fundamentals: ``(B, K, 3, 3)``.
-        member: ``(B, K, n)``, 0 or 1; empty bodies cost nothing.
-
-    Returns:
-        ``(B,)``.
-    """
+    r"""Cost of labellings with their fundamental matrices: fundamentals ``(B, K, 3, 3)``, member ``(B, K, n)`` -> ``(B,)``."""
     square = sampson_squared(fundamentals, view.x1, view.x2) / (options.energy.noise * view.pixel) ** 2
     distances = (square.clamp(max=options.energy.cap) * member).sum((-2, -1))
     cost = relief(view, fundamentals, member, options)
@@ -56,13 +36,8 @@ def energy(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOpt
 
 
 def relief(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> Tensor:
-    r"""Cost ``(B, K, n)`` of the parallax of every match beside every body: :math:`(\nu + 1) \log(1 + p^2 / \nu t^2) + \log t^2`.
-
-    Args:
-        view: matches.
-        fundamentals: ``(B, K, 3, 3)``.
-        member: ``(B, K, n)`` weights.
-    """
+    r"""Cost ``(B, K, n)`` of the parallax of every match beside every body:
+    :math:`(\nu + 1) \log(1 + p^2 / \nu t^2) + \log t^2`."""
     value, scale = parallax(view, fundamentals, member, options)
     freedom = options.energy.parallax_freedom
     return (freedom + 1) * torch.log1p(value.square() / (freedom * scale[..., None])) + scale.log()[..., None]
@@ -70,18 +45,7 @@ def relief(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOpt
 
 def parallax(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> tuple[Tensor, Tensor]:
     r"""Distances along the epipolar lines from the robust mean plane of each body, and their squared scale, in pixels.
-
-    With :math:`A = [e_2]_\times F` every match is :math:`x_2 \sim A x_1 + \rho\, e_2`, and a plane of the body makes
-    :math:`\rho = v^T x_1`, which is linear in v (Hartley and Zisserman, section 13.1).
-
-    Args:
-        view: matches.
-        fundamentals: ``(B, K, 3, 3)``.
-        member: ``(B, K, n)`` weights.
-
-    Returns:
-        ``(B, K, n)`` and ``(B, K)``.
-    """
+    fundamentals ``(B, K, 3, 3)``, member ``(B, K, n)`` -> ``(B, K, n)``."""
     first, second = homogeneous(view.x1), homogeneous(view.x2)
     epipole = null_vectors(fundamentals)[0]
     mapped = first @ (skew(epipole) @ fundamentals).mT
@@ -122,10 +86,7 @@ def parallax(view: View, fundamentals: Tensor, member: Tensor, options: SegmentO
 
 
 def mean_field(cost: Tensor, links: Links, cut: float, turns: int, start: Tensor | None = None) -> Tensor:
-    """Probabilities of labels ``(*batch, K, n)`` that cost so much, with ``cut`` times the links between different labels.
-
-    Turns are damped by half, from ``start`` or from the labels of each match alone.
-    """
+    """Probabilities of labels ``(*batch, K, n)`` that cost so much, with ``cut`` times the links between different labels."""
     member = torch.softmax(-cost, -2) if start is None else start
     for _ in range(turns):
         member = 0.5 * (member + torch.softmax(cut * links.pull(member) - cost, -2))

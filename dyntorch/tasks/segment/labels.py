@@ -19,15 +19,10 @@ from dyntorch.tasks.segment.options import SegmentOptions
 
 @dataclass(frozen=True)
 class Labelling:
-    """Labels of all matches.
+    """Labels of all matches."""
 
-    Attributes:
-        probabilities: ``(K + 1, n)``, the first of an outlier.
-        fundamentals: ``(K, 3, 3)``.
-    """
-
-    probabilities: Tensor
-    fundamentals: Tensor
+    probabilities: Tensor  # ``(K + 1, n)``, the first of an outlier
+    fundamentals: Tensor  # ``(K, 3, 3)``
 
     @property
     def labels(self) -> Tensor:
@@ -50,23 +45,7 @@ def label(
     share: float,
     options: SegmentOptions,
 ) -> Labelling:
-    r"""Labels and geometries in turns: a mean field of the costs
-
-    .. math:: \min(r_{ik}^2 / T^2, 9) + s\,(1 - c_{ik} / c_0)_+ - b\,[i \text{ found in } k],
-        \qquad \text{outlier: } 1 + \tfrac14 \log \tfrac{1 - \pi}{4 \pi},
-
-    with the conformity :math:`c_{ik}` of match i to body k and the share :math:`\pi` of outliers
-    (at most a fifth), and of labels that differ from those of the neighbours.
-
-    Args:
-        view: all matches.
-        found: ``(n,)`` bodies 1..K of the search, 0 elsewhere.
-        fundamentals: ``(K, 3, 3)`` of the search.
-        weights: ``(n,)`` of the matches in the fits.
-        threshold: T, in the coordinates of ``view``.
-        scale: as of :func:`~dyntorch.tasks.segment.coherence.coherence`; None: neighbours do not matter.
-        share: of outliers, roughly.
-    """
+    r"""Labels and geometries in turns: a mean field of the costs found ``(n,)``, fundamentals ``(K, 3, 3)``, weights ``(n,)``."""
     numbers = torch.arange(1, len(fundamentals) + 1, device=found.device)[:, None]
     members = found == numbers
     gain = options.labels.found * members.to(weights.dtype) if scale is not None else 0.0
@@ -125,33 +104,14 @@ TINY = 1e-30
 
 @dataclass(frozen=True)
 class Models:
-    """Models of K bodies.
+    """Models of K bodies."""
 
-    Attributes:
-        homographies: ``(K, 3, 3)`` of norm 1, best fits, whatever the choice.
-        planar: ``(K,)`` bool, the homography explains the body.
-    """
-
-    homographies: Tensor
-    planar: Tensor
+    homographies: Tensor  # ``(K, 3, 3)`` of norm 1, best fits, whatever the choice
+    planar: Tensor  # ``(K,)`` bool, the homography explains the body
 
 
 def choose(view: View, fundamentals: Tensor, members: Tensor, options: SegmentOptions) -> Models:
-    r"""The model with the smaller robust information criterion,
-
-    .. math:: \sum_i \min\!\Big(\frac{e_i^2}{\sigma^2},\ 2 (4 - d)\Big) + n\,d \log 4 + k \log 4n,
-
-    with dimension d = 3 and k = 7 parameters of a fundamental matrix, d = 2 and k = 8 of a homography.  The noise
-    :math:`\sigma` is that of all bodies.  The sum bears a few matches off the plane; but a body is no plane if more than
-    ``options.models.off_plane_share`` of it are farther than ``options.models.off_plane`` thresholds.
-
-    Args:
-        view: matches.
-        fundamentals: ``(K, 3, 3)``.
-        members: ``(K, n)`` weights, of any scale.
-
-    Source: Torr, Geometric motion segmentation and model selection, 1998.
-    """
+    r"""The model with the smaller robust information criterion,"""
     # weights are relative: they count as so many equal ones
     members = members * (members.sum(-1) / members.square().sum(-1).clamp(min=TINY))[:, None]
     epipolar = sampson_squared(fundamentals, view.x1, view.x2)
@@ -167,11 +127,7 @@ def choose(view: View, fundamentals: Tensor, members: Tensor, options: SegmentOp
 
 
 def _noise(square: Tensor, members: Tensor, options: SegmentOptions) -> Tensor:
-    """Variance ``()`` of a coordinate by the distances ``(K, n)`` from the epipolar lines of all bodies.
-
-    The homographies would overestimate it where there is depth.  The median alone is too uncertain (a plane of 100 matches was
-    recognized in 7 of 10 cases): it starts a truncated mean.
-    """
+    """Variance ``()`` of a coordinate by the distances ``(K, n)`` from the epipolar lines of all bodies."""
     every, weight = square.flatten(), members.flatten()
     order = every.argsort()
     share = weight[order].cumsum(0)
@@ -200,20 +156,7 @@ SAMPLE = 7
 
 
 def significant(view: View, fundamentals: Tensor, labels: Tensor, options: SegmentOptions) -> Tensor:
-    r"""Which bodies are no accident, ``(K,)`` bool: their expected number in random matches,
-
-    .. math:: (n - 7) \binom{n}{k} \binom{k}{7}\, p^{\,k - 7}, \qquad p = 2 T D / A,
-
-    is below ``options.models.false_alarms``, for k of n matches within T of their epipolar lines in an image of area A and
-    diagonal D.  What other bodies explain is left out.
-
-    Args:
-        view: matches, outliers among them.
-        fundamentals: ``(K, 3, 3)``.
-        labels: ``(n,)``, 0 outlier, 1..K.
-
-    Source: Moisan and Stival, A probabilistic criterion to detect rigid point matches, IJCV 2004.
-    """
+    r"""Which bodies are no accident, ``(K,)`` bool: their expected number in random matches,"""
     threshold = options.units.threshold_in_pixels * view.pixel
     near = sampson_squared(fundamentals, view.x1, view.x2) <= threshold**2
     chance = max(_chance(x, threshold) for x in (view.x1, view.x2))

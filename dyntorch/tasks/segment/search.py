@@ -24,20 +24,8 @@ from dyntorch.tasks.segment.options import SegmentOptions
 def affine_flows(
     x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: float, generator: torch.Generator | None, options: SegmentOptions
 ) -> Tensor:
-    r"""Labellings by robust affine flows :math:`x_2 = A_k x_1 + b_k`, smooth over the links.
-
-    Expectation maximization of Student's distributions with a mean field over the labels, many runs at a time, in single precision.
-
-    Args:
-        x1, x2: ``(n, 2)`` of about unit size.
-        links: between matches.
-        bodies: ``(runs,)`` number of flows of each run.
-        noise: least standard deviation of a flow.
-        generator: source of the patches.
-
-    Returns:
-        ``(runs, n)`` labels from 0; some below ``bodies`` may be empty.
-    """
+    r"""Labellings by robust affine flows :math:`x_2 = A_k x_1 + b_k`, smooth over the links. x1, x2 ``(n, 2)``, bodies
+    ``(runs,)`` -> ``(runs, n)``."""
     a = torch.cat([x1, torch.ones_like(x1[:, :1])], dim=-1).float()
     b = x2.float()
     width = int(bodies.max())
@@ -139,16 +127,7 @@ def fitted(view: View, labels: Tensor, count: int, options: SegmentOptions) -> S
 
 
 def best_sets(cost: Tensor, most: int, first: int | None = None, *, options: SegmentOptions) -> list[Tensor]:
-    """Sets ``(s, K)`` of geometries of least total cost, :math:`\\sum_i \\min_{k \\in \\text{set}} c_{ki}`, the best first.
-
-    Args:
-        cost: ``(P, n)``.
-        most: geometries of the largest sets; sets grow by one at a time.
-        first: how many of the best geometries the sets start from; None: all.
-
-    Returns:
-        The sets of one, two, ... ``most`` geometries; none where there are fewer.
-    """
+    """Sets ``(s, K)`` of geometries of least total cost, :math:`\\sum_i \\min_{k \\in \\text{set}} c_{ki}`, the best first."""
     single = cost.float()
     size = len(single)
     sets = single.sum(-1).argsort(stable=True)[: size if first is None else first, None]
@@ -197,10 +176,7 @@ def set_starts(pool: Tensor, cost: Tensor, sets: Tensor, options: SegmentOptions
 
 
 def matrix_pairs(view: View, groups: Tensor, rounds: int, options: SegmentOptions) -> Tensor:
-    """Geometries ``(2 g, 3, 3)`` of the segmentation matrices of groups ``(b, n)``, 0 and 1; those too small are left out.
-
-    The linear fits are weighed again by their gradients so many times.
-    """
+    """Geometries ``(2 g, 3, 3)`` of the segmentation matrices of groups ``(b, n)``, 0 and 1; those too small are left out."""
     groups = groups[groups.sum(-1) >= options.pool.matrix_matches]
     x1, x2 = (x.expand(len(groups), -1, -1) for x in (view.x1, view.x2))
     weights = groups
@@ -219,24 +195,15 @@ def matrix_pairs(view: View, groups: Tensor, rounds: int, options: SegmentOption
 
 @dataclass(frozen=True)
 class Candidate:
-    """A segmentation into bodies.
+    """A segmentation into bodies."""
 
-    Attributes:
-        energy: its cost.
-        labels: ``(n,)`` from 0.
-        fundamentals: ``(K, 3, 3)``.
-    """
-
-    energy: float
-    labels: Tensor
-    fundamentals: Tensor
+    energy: float  # its cost
+    labels: Tensor  # ``(n,)`` from 0
+    fundamentals: Tensor  # ``(K, 3, 3)``
 
 
 def descended(view: View, starts: Sequence[Starts], options: SegmentOptions) -> dict[int, list[Candidate]]:
-    """The segmentations that the starts lead to, by their number of bodies, the cheapest first.
-
-    One with a body of fewer than :data:`LEAST` matches is given up.
-    """
+    """The segmentations that the starts lead to, by their number of bodies, the cheapest first."""
     device = view.x1.device
     bodies = torch.cat([torch.full((len(s.labels),), s.fundamentals.shape[1], device=device) for s in starts])
     width = int(bodies.max()) if len(bodies) else 1
@@ -316,16 +283,7 @@ BLOCK = 1024
 def search_samples(
     view: View, counts: Sequence[int], generator: torch.Generator | None, options: SegmentOptions
 ) -> dict[int, list[Candidate]]:
-    """Segmentations into each number of bodies, the cheapest first.
-
-    Args:
-        view: matches, outliers among them; links do not matter.
-        counts: numbers of bodies.
-        generator: source of all randomness.
-
-    Returns:
-        Candidates for each number.
-    """
+    """Segmentations into each number of bodies, the cheapest first."""
     pool = _pool(view, min(counts), max(counts), generator, options)
     cost = rough_cost(view, pool, options)
     sets = best_sets(cost, max(counts), options.samples.first, options=options)
@@ -367,10 +325,7 @@ def _different(view: View, pool: Tensor, options: SegmentOptions) -> Tensor:
 
 
 def _pool(view: View, least: int, most: int, generator: torch.Generator | None, options: SegmentOptions) -> Tensor:
-    """Geometries ``(P, 3, 3)``: of samples from all matches, then from those that sets of one, two, ... leave unexplained.
-
-    Beyond the least number of bodies there are no further samples once another body explains little.
-    """
+    """Geometries ``(P, 3, 3)``: of samples from all matches, then from those that sets of one, two, ... leave unexplained."""
     left = torch.ones_like(view.x1[None, :, 0])
     pool = matrix_pairs(view, left[: most - 1], options.samples.matrix_rounds, options)  # none for a single body
     last = options.energy.cap * len(view.x1)

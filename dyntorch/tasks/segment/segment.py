@@ -36,15 +36,10 @@ Search = Callable[[Sequence[int]], dict[int, list[Candidate]]]
 
 @dataclass(frozen=True)
 class Best:
-    """The segmentation that was chosen.
+    """The segmentation that was chosen."""
 
-    Attributes:
-        candidate: itself.
-        spare: whether fewer bodies than were asked for cost less, penalties included.
-    """
-
-    candidate: Candidate
-    spare: bool = False
+    candidate: Candidate  # itself
+    spare: bool = False  # whether fewer bodies than were asked for cost less, penalties included
     further: Candidate | None = None
     """The best segmentation into one body more, where their number was open."""
     rival: float = inf
@@ -52,11 +47,7 @@ class Best:
 
 
 def best(search: Search, matches: int, bodies: int | None, penalty: float, options: SegmentOptions) -> Best | None:
-    """The best segmentation of so many matches into ``bodies``, or, for None, into the number of least penalized cost.
-
-    Fewer than were asked for where there are no segmentations into as many; None where there are none at all.  The penalty of a
-    body is in units of the root of the number of matches.
-    """
+    """The best segmentation of so many matches into ``bodies``, or, for None, into the number of least penalized cost."""
     room = max(1, matches // LEAST)
     known: dict[int, Candidate] = {}
     rivals: dict[int, float] = {}
@@ -107,32 +98,19 @@ def _rival(candidates: Sequence[Candidate], options: SegmentOptions) -> float:
 
 @dataclass(frozen=True)
 class GivenMatches:
-    """The matches of one problem, ready for the search.
+    """The matches of one problem, ready for the search."""
 
-    Attributes:
-        weights: ``(n,)`` of all matches, 0 = missing.
-        present: ``(m,)`` indices of those that are there.
-        view: these, normalized.
-        first, second: the similarities that did it, from the input.
-        scale: of both.
-        coherence: ``(m,)`` in [0, 1].
-        keep: indices among the m of those that may belong to a body.
-        groups: ``(k,)`` of the kept ones, linked groups from 0; empty where neighbours do not matter.
-        searched: indices among the kept ones of those that the search looks at.
-        repeated: share of matches that repeat others.
-    """
-
-    weights: Tensor
-    present: Tensor
-    view: View
-    first: Tensor
+    weights: Tensor  # ``(n,)`` of all matches, 0 = missing
+    present: Tensor  # ``(m,)`` indices of those that are there
+    view: View  # these, normalized
+    first: Tensor  # the similarities that did it, from the input
     second: Tensor
-    scale: float
-    coherence: Tensor
-    keep: Tensor
-    groups: Tensor
-    searched: Tensor
-    repeated: float
+    scale: float  # of both
+    coherence: Tensor  # ``(m,)`` in [0, 1]
+    keep: Tensor  # indices among the m of those that may belong to a body
+    groups: Tensor  # ``(k,)`` of the kept ones, linked groups from 0; empty where neighbours do not matter
+    searched: Tensor  # indices among the kept ones of those that the search looks at
+    repeated: float  # share of matches that repeat others
 
     @property
     def linked(self) -> float:
@@ -148,37 +126,22 @@ class GivenMatches:
 
 @dataclass(frozen=True)
 class SegmentedProblem:
-    """Result of one problem of n matches with K = ``count`` bodies.
+    """Result of one problem of n matches with K = ``count`` bodies."""
 
-    Attributes:
-        labels: ``(n,)``.
-        probabilities: ``(n, K + 1)``.
-        fundamentals, homographies: ``(K, 3, 3)``.
-        models: K of them.
-        residuals, coherence: ``(n,)``.
-        threshold: ``()``.
-        status: of the problem.
-        repeated: share of matches that repeat others.
-        linked: share of matches that move like neighbours of theirs.
-        spare: whether fewer bodies than were asked for explain the matches as well.
-        coarse: the threshold over the spread of the points, where it is too large to tell anything; else 0.
-        rival: what the best other segmentation costs more, in units of the root of the number of matches.
-    """
-
-    labels: Tensor
-    probabilities: Tensor
-    fundamentals: Tensor
+    labels: Tensor  # ``(n,)``
+    probabilities: Tensor  # ``(n, K + 1)``
+    fundamentals: Tensor  # ``(K, 3, 3)``
     homographies: Tensor
-    models: tuple[BodyModel, ...]
-    residuals: Tensor
+    models: tuple[BodyModel, ...]  # K of them
+    residuals: Tensor  # ``(n,)``
     coherence: Tensor
-    threshold: Tensor
-    status: Status
-    repeated: float
-    linked: float
-    spare: bool = False
-    coarse: float = 0.0
-    rival: float = inf
+    threshold: Tensor  # ``()``
+    status: Status  # of the problem
+    repeated: float  # share of matches that repeat others
+    linked: float  # share of matches that move like neighbours of theirs
+    spare: bool = False  # whether fewer bodies than were asked for explain the matches as well
+    coarse: float = 0.0  # the threshold over the spread of the points, where it is too large to tell anything; else 0
+    rival: float = inf  # what the best other segmentation costs more, in units of the root of the number of matches
 
     @property
     def count(self) -> int:

@@ -19,17 +19,11 @@ from dyntorch.tasks.segment_tracks.options import TrackSegmentOptions
 
 @dataclass(frozen=True)
 class Start:
-    """What the search for bodies starts from.
+    """What the search for bodies starts from."""
 
-    Attributes:
-        evidence: links and pairs of frames.
-        judge: of groups of tracks.
-        cuts: labels ``(n,)`` of the pieces, once for each number of pieces.
-    """
-
-    evidence: TrackEvidence
-    judge: Judge
-    cuts: Sequence[Tensor]
+    evidence: TrackEvidence  # links and pairs of frames
+    judge: Judge  # of groups of tracks
+    cuts: Sequence[Tensor]  # labels ``(n,)`` of the pieces, once for each number of pieces
 
     @cached_property
     def trees(self) -> list[dict[int, Tensor]]:
@@ -38,13 +32,7 @@ class Start:
         return [merged(self.judge, cut, range(1, most + 1)) for cut in self.cuts]
 
     def best(self, bodies: int, options: TrackSegmentOptions, thorough: bool = False) -> Candidates | None:
-        """The best segmentation into so many bodies: separate, and of little cost; None where there is none.
-
-        Args:
-            bodies: how many.
-            options: of all stages.
-            thorough: let the bodies exchange pieces first, and weigh relief less in the comparison.
-        """
+        """The best segmentation into so many bodies: separate, and of little cost; None where there is none."""
         starts = [tree[bodies] for tree in self.trees if bodies in tree]
         if not starts:
             return None
@@ -102,12 +90,7 @@ def bodies_of(start: Start, bodies: int | None, options: TrackSegmentOptions) ->
 
 
 def evidence_of_another(start: Start, fewer: Candidates, more: Candidates, options: TrackSegmentOptions) -> float:
-    r"""Logarithm of the odds that there is one body more,
-
-    .. math:: a_0 + a_1 \log\Big(1 + \frac{x}{o + f}\Big) - a_2 \log(l + l_0) + a_3 \log\Big(1 + \frac{\Delta E}{\sqrt n}\Big),
-
-    with the excess x, the own cost o and the links l of the two bodies that take the place of one, and the cost that it saves.
-    """
+    r"""Logarithm of the odds that there is one body more,"""
     how = options.choice
     member = one_hot(more.labels[0], more.bodies) > 0
     before = one_hot(fewer.labels[0], fewer.bodies) > 0

@@ -23,17 +23,11 @@ Geometry = list[Tensor]
 
 @dataclass(frozen=True)
 class TrackEvidence:
-    """Tracks in many pairs of frames.
+    """Tracks in many pairs of frames."""
 
-    Attributes:
-        pairs: of frames.
-        links: between tracks that move alike.
-        count: ``(n,)`` pairs that each track is in.
-    """
-
-    pairs: Sequence[FramePair]
-    links: Links
-    count: Tensor
+    pairs: Sequence[FramePair]  # of frames
+    links: Links  # between tracks that move alike
+    count: Tensor  # ``(n,)`` pairs that each track is in
 
     @staticmethod
     def of(pairs: Sequence[FramePair], links: Links) -> TrackEvidence:
@@ -50,21 +44,13 @@ class TrackEvidence:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Segmentations into the same number of bodies.
+    """Segmentations into the same number of bodies."""
 
-    Attributes:
-        labels: ``(B, n)`` from 0.
-        member: ``(B, K, n)`` probabilities.
-        geometry: of the bodies.
-        scale: ``(B,)`` standard deviation of a coordinate of a track at rest, pixels.
-        energy: ``(B,)``, infinite where a body has too few tracks.
-    """
-
-    labels: Tensor
-    member: Tensor
-    geometry: Geometry
-    scale: Tensor
-    energy: Tensor
+    labels: Tensor  # ``(B, n)`` from 0
+    member: Tensor  # ``(B, K, n)`` probabilities
+    geometry: Geometry  # of the bodies
+    scale: Tensor  # ``(B,)`` standard deviation of a coordinate of a track at rest, pixels
+    energy: Tensor  # ``(B,)``, infinite where a body has too few tracks
 
     @property
     def bodies(self) -> int:
@@ -84,14 +70,7 @@ def unlinked(count: int, device: torch.device) -> Links:
 
 
 def fitted(pairs: Sequence[FramePair], groups: Tensor, scales: Sequence[float], steps: int = 2) -> Geometry:
-    """Fundamental matrices ``(B, 3, 3)`` of groups of tracks ``(B, n)``, weights, for every pair of frames.
-
-    Args:
-        pairs: of frames.
-        groups: weights.
-        scales: of the fits, one after the other, pixels.
-        steps: at each of them.
-    """
+    """Fundamental matrices ``(B, 3, 3)`` of groups of tracks ``(B, n)``, weights, for every pair of frames."""
     return [
         fit_fundamental(
             pair.view.x1, pair.view.x2, pair.weighed(groups), [scale * pair.view.pixel for scale in scales], steps=steps
@@ -175,14 +154,7 @@ def _refitted(pair: FramePair, F: Tensor, member: Tensor, scale: float, options:
 
 
 def energy(evidence: TrackEvidence, geometry: Geometry, labels: Tensor, scale: Tensor, options: TrackSegmentOptions) -> Tensor:
-    r"""Cost ``(B,)`` of labellings ``(B, n)`` from 0:
-
-    .. math:: \sum_i \frac{m}{|P_i|} \sum_{p \in P_i} \Big[\rho\Big(\frac{r_{ip}^2}{\sigma^2 v_{ip}}\Big) + \log \sigma^2
-        + \mu\, \text{relief}_{ip}\Big] + \sum_{ij \text{ cut}} L_{ij}
-
-    with the Sampson distance r from the own body, the noise :math:`\sigma` of tracks at rest, and the growth v of its variance with
-    the motion of the track.
-    """
+    r"""Cost ``(B,)`` of labellings ``(B, n)`` from 0:"""
     member = one_hot(labels, geometry[0].shape[1])
     own = (costs(evidence, geometry, scale, member, options) * member).sum((-2, -1))
     seen = float((evidence.count > 0).sum())

@@ -19,15 +19,7 @@ Exchange = tuple[int, int, Body, Body]
 
 
 class Exchanges:
-    r"""Local search over the ways to make bodies of pieces.
-
-    Joining pieces one pair after the other never takes a wrong step back.  Here the cost is that of the descent without relief,
-
-    .. math:: \sum_i \frac{m}{|P_i|} \sum_{p \in P_i} \rho\Big(\frac{r_{ip}^2}{\sigma^2 v_{ip}}\Big)
-        + w \sum_{ij \text{ cut}} L_{ij},
-
-    with the most likely geometry of every body between near and far frames, fitted once for each set of pieces that is met.
-    """
+    r"""Local search over the ways to make bodies of pieces."""
 
     def __init__(self, evidence: TrackEvidence, cut: Tensor, options: TrackSegmentOptions) -> None:
         """Of pieces, labels ``(n,)`` from 0."""

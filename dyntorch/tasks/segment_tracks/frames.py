@@ -18,19 +18,12 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True)
 class FramePair:
-    """Two frames, and the tracks that both show.
+    """Two frames, and the tracks that both show."""
 
-    Attributes:
-        frames: their numbers, the earlier one first.
-        index: ``(m,)`` of these tracks.
-        view: their places, without links.
-        precision: ``(m,)`` in [0, 1]: the inverse variance of a track beside that of one that does not move.
-    """
-
-    frames: Pair
-    index: Tensor
-    view: View
-    precision: Tensor
+    frames: Pair  # their numbers, the earlier one first
+    index: Tensor  # ``(m,)`` of these tracks
+    view: View  # their places, without links
+    precision: Tensor  # ``(m,)`` in [0, 1]: the inverse variance of a track beside that of one that does not move
 
     def weighed(self, groups: Tensor) -> Tensor:
         """Weights ``(B, m)`` of these tracks in fits of groups ``(B, n)``: by their precision, of mean 1."""
@@ -39,19 +32,12 @@ class FramePair:
 
 @dataclass(frozen=True)
 class Film:
-    """The tracks of one problem, centred and of about unit size, all frames alike.
+    """The tracks of one problem, centred and of about unit size, all frames alike."""
 
-    Attributes:
-        x: ``(frames, n, 2)``, 0 where a track is missing.
-        seen: ``(frames, n)`` bool.
-        pixel: a pixel of the options, in these coordinates.
-        change: ``(3, 3)`` similarity from pixels to them.
-    """
-
-    x: Tensor
-    seen: Tensor
-    pixel: float
-    change: Tensor
+    x: Tensor  # ``(frames, n, 2)``, 0 where a track is missing
+    seen: Tensor  # ``(frames, n)`` bool
+    pixel: float  # a pixel of the options, in these coordinates
+    change: Tensor  # ``(3, 3)`` similarity from pixels to them
 
     @staticmethod
     def of(tracks: Tensor, pixel: float = 1.0) -> Film:
@@ -105,10 +91,7 @@ def pairs_near(film: Film, gaps: tuple[int, ...], starts: int, common: int) -> l
 
 
 def chosen_pairs(film: Film, options: FrameOptions) -> list[Pair]:
-    """The pairs of frames that bodies are judged by: wide ones, narrower ones for short tracks, all tracks in some of them.
-
-    They are taken one after the other, each for what it adds: tracks that are in few pairs so far, and motion.
-    """
+    """The pairs of frames that bodies are judged by: wide ones, narrower ones for short tracks, all tracks in some of them."""
     count = len(film.seen)
     common = min(options.common, max(8, film.x.shape[1] // 2))
     gap = int(min(count - 1, max(1.0, float(film.lengths.double().quantile(options.long)) - 1)))

@@ -29,14 +29,7 @@ def distances(pairs: Sequence[FramePair], geometry: Geometry, count: int) -> Ten
 
 
 def outliers(distance: Tensor, labels: Tensor, support: Tensor, options: StrayOptions) -> Tensor:
-    """``(n,)`` bool: tracks that are usually farther from their body than a track of it may be.
-
-    Args:
-        distance: ``(P, K, n)`` pixels.
-        labels: ``(n,)`` from 0.
-        support: ``(n,)`` share of the tracks that a track moves like that are of its body.
-        options: of the thresholds.
-    """
+    """``(n,)`` bool: tracks that are usually farther from their body than a track of it may be."""
     own = distance.gather(1, labels.expand(len(distance), 1, -1))[:, 0]
     usual = own.nanquantile(0.5, dim=0).nan_to_num(nan=0.0)
     return usual > torch.where(support > options.support, options.supported, options.farthest)
@@ -96,10 +89,7 @@ def resting(film: Film, member: Tensor, options: StaticOptions) -> int | None:
 
 
 def agreeing(tracks: Tensor, member: Tensor, cameras: Tensor, pairs: Sequence[FramePair]) -> Tensor:
-    """Median Sampson distances ``(K,)`` of bodies of members ``(K, n)`` from the motion of cameras ``(frames, 3, 4)``.
-
-    The fundamental matrix of two cameras is :math:`F = [e]_\\times P_b P_a^+`, with the image e of the first centre.
-    """
+    """Median Sampson distances ``(K,)`` of bodies of members ``(K, n)`` from the motion of cameras ``(frames, 3, 4)``."""
     found: list[list[Tensor]] = [[] for _ in member]
     for pair in pairs:
         first, second = cameras[pair.frames[0]], cameras[pair.frames[1]]

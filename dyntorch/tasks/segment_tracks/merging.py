@@ -20,10 +20,7 @@ from dyntorch.tasks.segment_tracks.options import FrameOptions, MergeOptions
 
 
 def pieces(sparse: Tensor, count: int) -> Tensor:
-    """Labels ``(n,)`` from 0 of so many pieces of a graph ``(n, n)``, by normalized cuts.
-
-    Source: Damle, Minden and Ying, Simple, direct and efficient multi-way spectral clustering, 2019.
-    """
+    """Labels ``(n,)`` from 0 of so many pieces of a graph ``(n, n)``, by normalized cuts."""
     # tracks without links are a piece's worth of trouble: all get a little of everything
     graph = sparse.double() + 1e-6 * float(sparse.max().clamp(min=1e-12))
     with warnings.catch_warnings():
@@ -36,17 +33,7 @@ def pieces(sparse: Tensor, count: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Separation:
-    """How separate pairs of groups are.
-
-    Attributes:
-        first, second: ``(q,)`` the groups of each pair.
-        excess: ``(q,)`` what their joint motion costs more than their own ones, for each sighting of the smaller group.
-        own: ``(q,)`` what a sighting costs in its own group.
-        links: ``(q,)`` links between them, for each track of the smaller group.
-        met: ``(q,)`` bool, whether they are ever seen together; only then can anything be said.
-
-    The smaller group is that with fewer tracks, or sightings, beside the other one.
-    """
+    """How separate pairs of groups are."""
 
     first: Tensor
     second: Tensor
@@ -67,11 +54,7 @@ class Separation:
 
 
 class NearPairs:
-    """Linear fits of many groups of tracks between many pairs of near frames at a time.
-
-    Between near frames these are good enough to say that two groups move differently, in a hundredth of the time of the most likely
-    fits.  No rank is enforced: a group that is a plane leaves a family of matrices, all of which fit.
-    """
+    """Linear fits of many groups of tracks between many pairs of near frames at a time."""
 
     def __init__(self, film: Film, pairs: Sequence[Pair], frames: FrameOptions, options: MergeOptions) -> None:
         """Of pairs of frames ``(p, 2)``."""
@@ -88,16 +71,7 @@ class NearPairs:
         self.count = self.seen.sum(0).double()
 
     def squares(self, group: Tensor, scale: float, rounds: int = 2) -> tuple[Tensor, Tensor]:
-        """Squared distances in pixels at rest of the tracks of a group ``(n,)`` bool from its motion.
-
-        Args:
-            group: of tracks.
-            scale: of the distances that count in the fits, pixels at rest.
-            rounds: of weights.
-
-        Returns:
-            ``(q, m)`` for the pairs that show some of its tracks, and which are seen there.
-        """
+        """Squared distances in pixels at rest of the tracks of a group ``(n,)`` bool from its motion."""
         index = group.nonzero().flatten()
         live = (self.seen[:, index].sum(-1) >= self.options.together).nonzero().flatten()
         member = self.seen[live][:, index].double()
@@ -140,19 +114,12 @@ class NearPairs:
 
 @dataclass
 class Judge:
-    """Costs of groups of tracks under one motion each, every group fitted once.
+    """Costs of groups of tracks under one motion each, every group fitted once."""
 
-    Attributes:
-        near: pairs of frames.
-        alike: ``(n, n)`` how alike tracks move, beyond chance.
-        scale: of the costs, pixels at rest.
-        options: of all stages.
-    """
-
-    near: NearPairs
-    alike: Tensor
-    scale: float
-    options: MergeOptions
+    near: NearPairs  # pairs of frames
+    alike: Tensor  # ``(n, n)`` how alike tracks move, beyond chance
+    scale: float  # of the costs, pixels at rest
+    options: MergeOptions  # of all stages
     known: dict[bytes, float] = field(default_factory=dict)
 
     @staticmethod
@@ -190,10 +157,7 @@ class Judge:
 
 
 def merged(judge: Judge, labels: Tensor, counts: Sequence[int]) -> dict[int, Tensor]:
-    """Labels ``(n,)`` from 0 with each number of bodies, from pieces ``(n,)`` that are joined one pair after the other.
-
-    The least separate pair of all is joined first.
-    """
+    """Labels ``(n,)`` from 0 with each number of bodies, from pieces ``(n,)`` that are joined one pair after the other."""
     groups = one_hot(labels, int(labels.max()) + 1) > 0
     groups = groups[groups.any(-1)]
     found: dict[int, Tensor] = {}

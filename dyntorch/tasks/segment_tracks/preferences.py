@@ -25,21 +25,7 @@ TINY = 1e-12
 def preference_kernel(
     film: Film, searched: Tensor, generator: torch.Generator | None, frames: FrameOptions, options: PreferenceOptions
 ) -> Tensor:
-    r"""How alike tracks move: the mean share of preferred hypotheses that they have in common,
-
-    .. math:: W_{ij} = \frac{1}{|P_{ij}|} \sum_{p \in P_{ij}} \frac{1}{3 h} \sum_{\text{models}} |\theta_{ip} \cap \theta_{jp}|,
-
-    over the pairs of frames :math:`P_{ij}` in which both are seen, with the h hypotheses :math:`\theta_{ip}` that fit track i best.
-
-    Args:
-        film: all tracks.
-        searched: ``(m,)`` indices of the tracks that make hypotheses and that others are compared with.
-        generator: of the samples.
-        frames, options: of the pairs and the hypotheses.
-
-    Returns:
-        ``(n, m)`` float32 in [0, 1]; 0 for a track and itself.
-    """
+    r"""How alike tracks move: the mean share of preferred hypotheses that they have in common, searched ``(m,)`` -> ``(n, m)``."""
     count = film.x.shape[1]
     place = torch.full((count,), -1, device=searched.device)
     place[searched] = torch.arange(len(searched), device=searched.device)
@@ -102,10 +88,7 @@ def affine_map(x1: Tensor, x2: Tensor) -> Tensor:
 
 
 def homography_of_four(x1: Tensor, x2: Tensor) -> Tensor:
-    """Homographies ``(*batch, 3, 3)`` of norm 1 that take four points ``(*batch, 4, 2)`` to four others.
-
-    Through the projective basis of the four points on either side (Hartley and Zisserman, section 4.1.4, in closed form).
-    """
+    """Homographies ``(*batch, 3, 3)`` of norm 1 that take four points ``(*batch, 4, 2)`` to four others."""
 
     def basis(x: Tensor) -> Tensor:
         points = homogeneous(x).mT

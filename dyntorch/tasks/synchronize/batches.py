@@ -24,16 +24,8 @@ def synchronize_batch(
     weights: tuple[Any, Any] | None,
     **more: Any,
 ) -> Shift:
-    """The shifts of all problems, one after the other: a search shares nothing between takes.
-
-    Args:
-        verb: solves one problem.
-        a: ``(*batch, frames_a, n, 2)``; frames at the end that show nothing only fill the batch.
-        b: ``(*batch, frames_b, m, 2)``.
-        times: ``(frames,)`` or ``(*batch, frames)`` of each camera.
-        weights: ``(*batch, frames, n)`` of each camera, None for 1.
-        more: the same for all problems.
-    """
+    """The shifts of all problems, one after the other: a search shares nothing between takes. a ``(*batch, frames_a, n, 2)``,
+    b ``(*batch, frames_b, m, 2)``, times ``(frames,)``, weights ``(*batch, frames, n)``."""
     batch = check_together(a=(a, 3), b=(b, 3))
 
     def solve(place: int) -> Shift:

@@ -24,27 +24,16 @@ from dyntorch.tasks.synchronize.tracks import Tracks
 
 @dataclass(frozen=True, eq=False)
 class BodyMotion:
-    """What one camera says of the body.
+    """What one camera says of the body."""
 
-    Attributes:
-        body: one problem, one camera, in normalized images: ``(x - centre) / scale``.
-        seen: ``(frames,)`` bool, frames whose motion is known.
-        points: ``(n,)`` bool, those on the body.
-        information: ``(frames, 6, 6)`` of the motions per square pixel of noise, 0 where they are not known.
-        residuals: ``(n,)`` rms reprojection error of a coordinate, pixels; NaN where a point could not be placed.
-        residual: the same of all points on the body.
-        centre: ``(2,)`` pixels.
-        scale: pixels.
-    """
-
-    body: FilmedBody
-    seen: Tensor
-    points: Tensor
-    information: Tensor
-    residuals: Tensor
-    residual: float
-    centre: Tensor
-    scale: float
+    body: FilmedBody  # one problem, one camera, in normalized images: ``(x - centre) / scale``
+    seen: Tensor  # ``(frames,)`` bool, frames whose motion is known
+    points: Tensor  # ``(n,)`` bool, those on the body
+    information: Tensor  # ``(frames, 6, 6)`` of the motions per square pixel of noise, 0 where they are not known
+    residuals: Tensor  # ``(n,)`` rms reprojection error of a coordinate, pixels; NaN where a point could not be placed
+    residual: float  # the same of all points on the body
+    centre: Tensor  # ``(2,)`` pixels
+    scale: float  # pixels
 
     @property
     def turned(self) -> float:
@@ -64,21 +53,7 @@ class BodyMotion:
 
 
 def body_motion(name: str, tracks: Tracks, options: ProjectiveOptions) -> BodyMotion | Notice:
-    r"""The motion of a rigid body before one camera, up to a similarity.
-
-    .. math:: \lambda_{tj}\,(x_{tj}, 1)^T = K\,[R_t \mid T_t]\,(X_j, 1)^T
-
-    Some frames are factored with their projective depths, and as affine ones, where depths hardly vary; both are brought to a
-    constant calibration from several focal lengths, all descend, the best one is taken.  The other frames follow by resection,
-    all together are adjusted.  Points that are not on the body are told by subsets of six.
-
-    Args:
-        name: of the camera, in notices.
-        tracks: ``(frames, n, 2)``.
-
-    Returns:
-        the motion, or why there is none.
-    """
+    r"""The motion of a rigid body before one camera, up to a similarity. tracks ``(frames, n, 2)``."""
     seen = tracks.weights > 0
     often = seen.double().mean(0) >= options.seen
     if int(often.sum()) < options.fewest_points:
@@ -281,12 +256,7 @@ def _camera(n: int, like: Tensor) -> Tensor:
 
 
 def started(x: Tensor, options: ProjectiveOptions) -> FilmedBody | None:
-    """The best body ``(1, ...)`` of tracks ``(views, n, 2)`` of order 1, without outliers; None where nothing descends.
-
-    Args:
-        x: the tracks.
-        options: the focal lengths to start from.
-    """
+    """The best body ``(1, ...)`` of tracks ``(views, n, 2)`` of order 1, without outliers; None where nothing descends."""
     focal = torch.tensor(options.focals, dtype=x.dtype, device=x.device)
     starts = [*_projective(x, focal), *_affine(x, focal)]
     body = FilmedBody(*(torch.cat(parts) for parts in zip(*starts, strict=True)))

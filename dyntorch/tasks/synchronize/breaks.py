@@ -178,17 +178,11 @@ def _notice(one: ClockBreak) -> Notice:
 
 @dataclass(frozen=True)
 class Blame:
-    """One break as one pair sees it.
+    """One break as one pair sees it."""
 
-    Attributes:
-        pair: (i, j).
-        time: of the reference clock, seconds.
-        one: as the pair tells it, with candidates 0 = i and 1 = j.
-    """
-
-    pair: tuple[int, int]
-    time: float
-    one: ClockBreak
+    pair: tuple[int, int]  # (i, j)
+    time: float  # of the reference clock, seconds
+    one: ClockBreak  # as the pair tells it, with candidates 0 = i and 1 = j
 
     def by(self, camera: int) -> float:
         """Seconds by which the clock of one of the two jumps if it was that one."""
@@ -363,22 +357,7 @@ def _of_camera(camera: int, mine: list[Blame], times: Sequence[Tensor], options:
 
 
 def mended_times(times: Tensor, camera: int, broken: Sequence[ClockBreak]) -> Tensor:
-    """Times ``(frames,)`` of a camera's frames, as a clock that does not break would have told them.
-
-    After lost frames all times are later by these.  Frames that are there twice share the time of one: they stand close together,
-    and all that follow are earlier.
-
-    Args:
-        times: as the file says, seconds.
-        camera: whose they are.
-        broken: of all cameras; of a break that nobody can tell apart, the camera that lost frames is mended.
-
-    Example:
-        >>> import torch
-        >>> lost = ClockBreak((0,), (0.25,), 0.0, -0.2, 0.0, 2, 99.0, (2.0, 1.0))
-        >>> mended_times(torch.arange(5) / 10.0, 0, [lost]).tolist()
-        [0.0, 0.10000000149011612, 0.20000000298023224, 0.5, 0.6000000238418579]
-    """
+    """Times ``(frames,)`` of a camera's frames, as a clock that does not break would have told them."""
     new = times.clone()
     step = float(times.diff().median()) if len(times) > 1 else 0.0
     for one in broken:

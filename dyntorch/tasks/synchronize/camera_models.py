@@ -33,18 +33,12 @@ KINDS: tuple[Kind, ...] = ("affine", "affine_moving", "perspective")
 
 @dataclass(frozen=True, eq=False)
 class Films:
-    """Two cameras' tracks on a common clock, smoothed alike, b at several moments between frames.
+    """Two cameras' tracks on a common clock, smoothed alike, b at several moments between frames."""
 
-    Attributes:
-        a, b: the tracks.
-        step: seconds of a's clock from frame to frame.
-        rate: of b's clock.
-    """
-
-    a: Tracks
+    a: Tracks  # the tracks
     b: Tracks
-    step: float
-    rate: float
+    step: float  # seconds of a's clock from frame to frame
+    rate: float  # of b's clock
     options: SynchronizeOptions
 
     @property
@@ -84,12 +78,7 @@ class Films:
         return max(tracks.noise, least, 1e-150) ** 2 * min(1.0, tracks.step / (2 * math.sqrt(math.pi) * width))
 
     def variances(self, energies: tuple[float, float]) -> tuple[float, float]:
-        """Of a's and of b's coordinates.
-
-        Args:
-            energies: mean squares of their rows.  Points in space count as no better known, over that, than a camera sees
-                them: they would agree with anything.
-        """
+        """Of a's and of b's coordinates."""
         found = self.variance(self.a, self.width), self.variance(self.b, self.width * self.rate)
         if not (self.spatial and min(energies) > 0):
             return found
@@ -117,11 +106,7 @@ class Films:
 
 
 def rows_of(x: Tensor, kind: Kind, slow: float) -> Tensor:
-    """Rows ``(T, d n)`` of mean 0 of points ``(T, n, d)`` as a camera of this kind needs them.
-
-    Args:
-        slow: frames that the size of the whole changes in.
-    """
+    """Rows ``(T, d n)`` of mean 0 of points ``(T, n, d)`` as a camera of this kind needs them."""
     if kind != "affine":
         x = x - x.mean(1, keepdim=True)
     if kind == "perspective":
@@ -133,25 +118,15 @@ def rows_of(x: Tensor, kind: Kind, slow: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """What one kind of camera, at one level of noise, says of all lags.
+    """What one kind of camera, at one level of noise, says of all lags."""
 
-    Attributes:
-        kind: of the cameras.
-        level: what the kind leaves unexplained, as share of the rms coordinate, beside the noise of the tracks.
-        lags: ``(L,)`` frames.
-        scores: ``(L,)`` nats per frame above chance, NaN where the overlap is too short.
-        counts: ``(L,)``.
-        samples: independent ones per frame.
-        apart: frames within which peaks are one.
-    """
-
-    kind: Kind
-    level: float
-    lags: Tensor
-    scores: Tensor
-    counts: Tensor
-    samples: float
-    apart: float
+    kind: Kind  # of the cameras
+    level: float  # what the kind leaves unexplained, as share of the rms coordinate, beside the noise of the tracks
+    lags: Tensor  # ``(L,)`` frames
+    scores: Tensor  # ``(L,)`` nats per frame above chance, NaN where the overlap is too short
+    counts: Tensor  # ``(L,)``
+    samples: float  # independent ones per frame
+    apart: float  # frames within which peaks are one
 
     @cached_property
     def totals(self) -> Tensor:
@@ -189,24 +164,16 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class KindMoments:
-    """Covariances of both cameras' rows as one kind of camera needs them, at all lags and with b played backwards.
-
-    Attributes:
-        kind: of the cameras.
-        moments, chance: of the films, and with b backwards.
-        judged, ruled: ``(L,)`` bool, lags of either that overlap enough.
-        lags: ``(L,)`` frames.
-        energies: mean squares of a's and of b's rows.
-    """
+    """Covariances of both cameras' rows as one kind of camera needs them, at all lags and with b played backwards."""
 
     films: Films
-    kind: Kind
-    moments: LagCovariances
+    kind: Kind  # of the cameras
+    moments: LagCovariances  # of the films, and with b backwards
     chance: LagCovariances
-    judged: Tensor
+    judged: Tensor  # ``(L,)`` bool, lags of either that overlap enough
     ruled: Tensor
-    lags: Tensor
-    energies: tuple[float, float]
+    lags: Tensor  # ``(L,)`` frames
+    energies: tuple[float, float]  # mean squares of a's and of b's rows
 
     @staticmethod
     def of(films: Films, kind: Kind, second: list[Tensor], lags: tuple[int, int]) -> KindMoments:
@@ -230,10 +197,7 @@ class KindMoments:
         return KindMoments(films, kind, moments, chance, moments.counts >= least, chance.counts >= least, places, energies)
 
     def only(self, a: Tensor, b: Tensor) -> KindMoments:
-        """Of these points ``(n,)`` and ``(m,)`` bool alone: their rows are combinations of all points' rows.
-
-        Points in space are all kept.
-        """
+        """Of these points ``(n,)`` and ``(m,)`` bool alone: their rows are combinations of all points' rows."""
         one, two = torch.eye(self.moments.aa.shape[-1], dtype=self.moments.aa.dtype, device=a.device), self._combined(b)
         one = one if self.films.spatial else self._combined(a)
         return replace(self, moments=self.moments.combined(one, two), chance=self.chance.combined(one, two))
@@ -292,19 +256,12 @@ def _line(values: Tensor, of: Tensor, at: Tensor, judged: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a hypothesis's best lag lies.
+    """Where a hypothesis's best lag lies."""
 
-    Attributes:
-        lag: frames.
-        sigma: its standard deviation, frames.
-        nats: that the rows tell about each other there.
-        zoom: ``(T,)`` logarithm of a's zoom over b's in a's frames; None where a common one explains as much.
-    """
-
-    lag: float
-    sigma: float
-    nats: float
-    zoom: Tensor | None = None
+    lag: float  # frames
+    sigma: float  # its standard deviation, frames
+    nats: float  # that the rows tell about each other there
+    zoom: Tensor | None = None  # ``(T,)`` logarithm of a's zoom over b's in a's frames; None where a common one explains as much
 
 
 def refined(films: Films, found: Hypothesis) -> Place:
@@ -341,10 +298,7 @@ def _climbed(score: _Between, place: float) -> Place:
 
 @dataclass(frozen=True)
 class _Between:
-    """Nats at any lag near one, by one kind of camera and level of noise; ``zoom`` as of :class:`Place`.
-
-    All are of the same frames of a: a frame more at one of the lags would count for more than where they lie.
-    """
+    """Nats at any lag near one, by one kind of camera and level of noise; ``zoom`` as of :class:`Place`."""
 
     films: Films
     kind: Kind
@@ -389,13 +343,7 @@ class _Between:
         return max(0, -low), max(min(first, second - high), 0)
 
     def freed(self, lag: float) -> Tensor:
-        r"""The ratio of the zooms that makes the row spaces meet best, by steps of least squares.
-
-        .. math:: \min_\theta \sum_k \frac{1}{1 - \rho_k^2} \sum_t (u_k(t)\,(1 - \phi(t)^T \theta) - \rho_k v_k(t))^2
-
-        :math:`u_k, v_k` are the canonical variates of the rows and :math:`\rho_k` their correlations; the ascent of the information
-        :math:`-\tfrac12 \sum_k \log (1 - \rho_k^2)` in the logarithm of the zoom, a sum of few polynomials :math:`\phi`.
-        """
+        r"""The ratio of the zooms that makes the row spaces meet best, by steps of least squares."""
         options = self.films.options.rows
         frames = len(self.films.first)
         zoom = self.films.first.new_zeros(frames) if self.zoom is None else self.zoom

@@ -175,14 +175,7 @@ def differing(net: Network, one: Reading, other: Reading, options: SynchronizeOp
 
 
 def _search(net: Network, reference: int, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
-    """Beam search: cameras join one by one, by any candidate of any pair with those before, or without a clock.
-
-    A second round lets each camera move to where any candidate of any of its pairs puts it: in the first, a camera could only
-    join by its pairs with those before, which may be the wrong ones.
-
-    Returns:
-        logs and starts ``(S, cameras)``.
-    """
+    """Beam search: cameras join one by one, by any candidate of any pair with those before, or without a clock."""
     logs = torch.zeros(1, net.cameras, dtype=torch.float64)
     starts = torch.full_like(logs, torch.nan)
     starts[:, reference] = 0.0

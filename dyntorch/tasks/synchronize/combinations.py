@@ -28,31 +28,18 @@ from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
 
 @dataclass(frozen=True, eq=False)
 class CombinedFit:
-    """A minimum.
+    """A minimum."""
 
-    Attributes:
-        offset: of the space's clock at time 0 of the camera's, seconds.
-        sigma: its standard deviation, robust against what residuals have in common over time.
-        residual: robust standard deviation of a coordinate, px.
-        camera: ``(3, 4)``, of normalized coordinates.
-        weights: ``(n, k)``.
-    """
-
-    offset: float
-    sigma: float
-    residual: float
-    camera: Tensor
-    weights: Tensor
+    offset: float  # of the space's clock at time 0 of the camera's, seconds
+    sigma: float  # its standard deviation, robust against what residuals have in common over time
+    residual: float  # robust standard deviation of a coordinate, px
+    camera: Tensor  # ``(3, 4)``, of normalized coordinates
+    weights: Tensor  # ``(n, k)``
 
 
 def combined_fit(film: Tracks, space: Tracks, offset: float, rate: float, options: SynchronizeOptions) -> CombinedFit | None:
-    """The shift near an offset at which combinations of the points in space are what the camera sees; None where none is found.
-
-    Args:
-        film: of the camera.
-        space: of points in space.
-        offset, rate: of the space's clock against the camera's, the offset good to a frame or two.
-    """
+    """The shift near an offset at which combinations of the points in space are what the camera sees; None where none is
+    found."""
     problem = _Problem.of(film, space, offset, rate, options)
     if problem is None:
         return None

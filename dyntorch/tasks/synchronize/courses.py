@@ -26,36 +26,22 @@ from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
 
 @dataclass(frozen=True)
 class Jump:
-    """Where the offset changes, on a's clock, as the frames' own times say.
+    """Where the offset changes, on a's clock, as the frames' own times say."""
 
-    Attributes:
-        moment: seconds of a's clock: the last moment before.
-        sigma: of the moment, seconds.
-        size: seconds by which the offset grows; negative where b lost frames.
-    """
-
-    moment: float
-    sigma: float
-    size: float
+    moment: float  # seconds of a's clock: the last moment before
+    sigma: float  # of the moment, seconds
+    size: float  # seconds by which the offset grows; negative where b lost frames
 
 
 @dataclass(frozen=True)
 class Course:
-    """An offset with jumps.
+    """An offset with jumps."""
 
-    Attributes:
-        rate: of b's clock that was taken out.
-        offset: of the first piece, seconds.
-        jumps: in order.
-        fit: of everything, with what was lost put back.
-        scale: ``(n,)`` standard deviation of each point's residuals, px.
-    """
-
-    rate: float
-    offset: float
-    jumps: tuple[Jump, ...]
-    fit: EpipolarFit
-    scale: Tensor
+    rate: float  # of b's clock that was taken out
+    offset: float  # of the first piece, seconds
+    jumps: tuple[Jump, ...]  # in order
+    fit: EpipolarFit  # of everything, with what was lost put back
+    scale: Tensor  # ``(n,)`` standard deviation of each point's residuals, px
 
     def at(self, moment: float) -> float:
         """The offset at a moment of a's clock, seconds."""
@@ -208,21 +194,7 @@ def _same(jumps: tuple[Jump, ...], known: tuple[Jump, ...] | None, step: float) 
 
 
 def cheapest(costs: NDArray[np.float64], penalty: float) -> NDArray[np.int64]:
-    r"""The course of states ``(T,)`` that costs least where every change costs the same.
-
-    .. math:: \min_{s_1 \dots s_T} \sum_t c_{t, s_t} + p\, |\{t : s_t \ne s_{t-1}\}|
-
-    Args:
-        costs: ``(T, S)``.
-        penalty: p.
-
-    Source: Viterbi 1967; Jackson et al. 2005, An algorithm for optimal partitioning of data on an interval.
-
-    Example:
-        >>> costs = np.array([[0.0, 3.0], [0.0, 3.0], [0.5, 0.0], [3.0, 0.0], [3.0, 0.0]])
-        >>> cheapest(costs, 1.0).tolist(), cheapest(costs, 9.0).tolist()
-        ([0, 0, 1, 1, 1], [1, 1, 1, 1, 1])
-    """
+    r"""The course of states ``(T,)`` that costs least where every change costs the same."""
     count, states = costs.shape
     total, here = costs[0].copy(), np.arange(states)
     came = np.empty((count, states), dtype=np.int64)
@@ -253,11 +225,7 @@ def _without_short(path: NDArray[np.int64], costs: NDArray[np.float64], shortest
 
 
 def _moment(left: NDArray[np.float64], right: NDArray[np.float64], lost: int) -> tuple[float, float]:
-    """Steps after the first at which the offset changes, mean and standard deviation, by the costs of both sides.
-
-    Args:
-        lost: steps of a's clock that b did not record: there neither side fits, which says nothing.
-    """
+    """Steps after the first at which the offset changes, mean and standard deviation, by the costs of both sides."""
     count = len(left)
     before = np.concatenate([[0.0], np.cumsum(left)])
     after = np.concatenate([np.cumsum(right[::-1])[::-1], [0.0]])

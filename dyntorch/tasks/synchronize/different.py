@@ -24,18 +24,7 @@ from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
 
 
 def resemblance(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
-    r"""How much the motion resembles itself at another time that fits as well: 0 not at all, 1 as much as at the same time.
-
-    .. math:: \max_\delta \frac{r_a(\delta) + r_b(\delta)}{r_a(0) + r_b(0)}
-
-    r is the evidence per frame between two halves of one camera's points, over the lags by which the best lag can be wrong.
-    Exactly periodic motion reaches .7 and more; of the answers that are right on motion capture 98 percent stay below .63.
-
-    Args:
-        curve: with its bodies.
-        best: entry of the best lag.
-        apart: frames below which lags are one.
-    """
+    r"""How much the motion resembles itself at another time that fits as well: 0 not at all, 1 as much as at the same time."""
     if curve.bodies is None:
         return 0.0
     judged = curve.scores.isfinite()
@@ -63,17 +52,7 @@ def _alike(body: Body, reach: int, options: SynchronizeOptions) -> Tensor:
 
 
 def wobble(curve: SubspaceCurve, lag: int, options: SynchronizeOptions) -> float:
-    r"""Standard deviation of the best lag in frames, by the jackknife over parts of the overlap.
-
-    .. math:: \sigma^2 = \frac{B - 1}{B} \sum_k (\hat s_{-k} - \bar s)^2, \qquad
-              \hat s_{-k} \approx -\frac{S'_{-k}}{\overline{S''}}
-
-    Noise of detectors keeps for some frames, which the curvature of the score does not know of.
-
-    Args:
-        curve: with its bodies.
-        lag: the best, frames.
-    """
+    r"""Standard deviation of the best lag in frames, by the jackknife over parts of the overlap."""
     if curve.bodies is None:
         return 0.0
     a, b = curve.bodies
@@ -113,23 +92,14 @@ def _without(moments: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SubspaceShift:
-    """Which frame of b goes with which of a.
+    """Which frame of b goes with which of a."""
 
-    Attributes:
-        position: frames: frame i of a is at i + position of b; 0 where nothing could be judged.
-        sigma: its standard deviation if the peak is the right one, frames.
-        peaks: ``(k, 2)`` position and score of local maxima, best first.
-        probability: that the position is right to within a frame.
-        margin: nats per frame over the next peak, times the frames that overlap at the best: periodic motion has none.
-        refusal: why the data do not decide; None where they do.
-    """
-
-    position: float
-    sigma: float
-    peaks: Tensor
-    probability: float
-    margin: float
-    refusal: Notice | None = None
+    position: float  # frames: frame i of a is at i + position of b; 0 where nothing could be judged
+    sigma: float  # its standard deviation if the peak is the right one, frames
+    peaks: Tensor  # ``(k, 2)`` position and score of local maxima, best first
+    probability: float  # that the position is right to within a frame
+    margin: float  # nats per frame over the next peak, times the frames that overlap at the best: periodic motion has none
+    refusal: Notice | None = None  # why the data do not decide; None where they do
 
     @property
     def ok(self) -> bool:
@@ -145,28 +115,7 @@ class SubspaceShift:
 def subspace_shift(
     curve: SubspaceCurve, *, start: float = 0.0, step: float = STEP, options: SynchronizeOptions = SynchronizeOptions()
 ) -> SubspaceShift:
-    r"""The best lag of a curve, by the parabola through its highest three scores, and whether to believe it.
-
-    The scores are logarithms of a posterior over lags, up to a constant: the probability is the share of the peak.  A score grows
-    with the overlap, which for a motion that repeats itself is no evidence for the lag of the longest overlap.  So peaks are also
-    compared by what they tell per frame, and the lower of both probabilities holds.
-
-    Args:
-        curve: of :func:`dyntorch.tasks.synchronize.subspace.subspace_curve`.
-        start: seconds that b is ahead of a at lag 0, for the reasons that are told.
-        step: seconds from frame to frame.
-
-    Returns:
-        The shift; refused where no lag was judged, where the motion is below the noise, or where other lags fit as well.
-
-    Example:
-        >>> import torch
-        >>> lags = torch.arange(-30.0, 31.0).double()
-        >>> scores, count = 40 - 3 * (lags - 4.25) ** 2, torch.full((61,), 90.0)
-        >>> shift = subspace_shift(SubspaceCurve(lags, scores, count, scores / 90, scores / 90, scores / 90, (8.0, 8.0)))
-        >>> round(shift.position, 2), shift.ok
-        (4.25, True)
-    """
+    r"""The best lag of a curve, by the parabola through its highest three scores, and whether to believe it."""
     judged = curve.scores.isfinite()
     if int(judged.sum()) < 3:
         return SubspaceShift(0.0, math.inf, curve.scores.new_zeros(0, 2), 0.0, 0.0, Notice(ShiftNotice.SHORT_OVERLAP))
@@ -246,14 +195,7 @@ def _refusal(
 
 
 def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
-    """The shift of cameras that see different points of one motion.
-
-    Args:
-        rate: of b's clock, where it is known.
-
-    Raises:
-        ValueError: a measure or a kind of camera that there is not.
-    """
+    """The shift of cameras that see different points of one motion."""
     for name, value, known in (
         ("measure", options.different.measure, MEASURES),
         ("camera", options.different.camera, ("auto", *KINDS)),
@@ -305,11 +247,7 @@ def _combined(body: Shift, spaces: RowSpaceShift | None, options: SynchronizeOpt
 
 
 def _between_frames(a: Tracks, b: Tracks, shift: Shift, options: SynchronizeOptions) -> Shift:
-    """Of a camera and points in space, which are seen as combinations of these, the place between frames that a camera tells.
-
-    Whether the shift decides is not asked again.  What both ways of looking differ by is uncertain as well: a detector errs in ways
-    that neither knows.
-    """
+    """Of a camera and points in space, which are seen as combinations of these, the place between frames that a camera tells."""
     blunt = any(notice.code == ShiftNotice.BLUNT for notice in shift.notices)
     if a.x.shape[-1] == b.x.shape[-1] or not (shift.ok or blunt):
         return shift

@@ -25,25 +25,16 @@ PIECE = 4096
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Smoothed, normalized points of both cameras at equal steps of a's clock.
+    """Smoothed, normalized points of both cameras at equal steps of a's clock."""
 
-    Attributes:
-        x1, x2: ``(m1, n, 2)`` and ``(m2, n, 2)``, 0 where missing.
-        w1, w2: weights.
-        step: seconds.
-        start: lag of the first of b against the first of a, seconds.
-        rate: of b's clock that was taken out.
-        noise: of both cameras in normalized coordinates, in px of a.
-    """
-
-    x1: Tensor
+    x1: Tensor  # ``(m1, n, 2)`` and ``(m2, n, 2)``, 0 where missing
     x2: Tensor
-    w1: Tensor
+    w1: Tensor  # weights
     w2: Tensor
-    step: float
-    start: float
-    rate: float
-    noise: tuple[float, float]
+    step: float  # seconds
+    start: float  # lag of the first of b against the first of a, seconds
+    rate: float  # of b's clock that was taken out
+    noise: tuple[float, float]  # of both cameras in normalized coordinates, in px of a
 
     @classmethod
     def of(cls, a: Tracks, b: Tracks, step: float, rate: float = 1.0, *, options: SynchronizeOptions) -> Self:
@@ -84,23 +75,14 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Scores over lags.
+    """Scores over lags."""
 
-    Attributes:
-        lags: ``(L,)`` seconds of a's clock: a moment t of a is at rate (t + lag) of b.
-        scores: ``(L,)`` nats, higher is better, NaN where not judged.
-        variance: ``(L,)`` of the residual, px^2 of a.
-        counts: ``(L,)`` pairs of positions.
-        rate: of b's clock.
-        level: the median of the variance where judged.
-    """
-
-    lags: Tensor
-    scores: Tensor
-    variance: Tensor
-    counts: Tensor
-    rate: float
-    level: float
+    lags: Tensor  # ``(L,)`` seconds of a's clock: a moment t of a is at rate (t + lag) of b
+    scores: Tensor  # ``(L,)`` nats, higher is better, NaN where not judged
+    variance: Tensor  # ``(L,)`` of the residual, px^2 of a
+    counts: Tensor  # ``(L,)`` pairs of positions
+    rate: float  # of b's clock
+    level: float  # the median of the variance where judged
 
     @property
     def offsets(self) -> Tensor:
@@ -137,20 +119,7 @@ class Curve:
 def epipolar_curve(
     samples: Samples, max_shift: float | None = None, overlap: float | None = None, *, options: SynchronizeOptions
 ) -> Curve:
-    r"""Scores at all lags.
-
-    .. math:: \text{score}(s) = -\tfrac12 \log \frac{\lambda(s)}{\operatorname{med} \lambda}
-              + \tfrac12 \log \frac{c(s)}{\max c},
-
-    with the residual's variance :math:`\lambda` of :func:`dyntorch.geometry.epipolar.epipolar_variance` over c(s) pairs of
-    positions.  The second term keeps short overlaps, whose variance scatters, from winning by chance: a shift by a period of a gait
-    with half the overlap has to fit with half the variance.
-
-    Args:
-        overlap: share of the largest overlap below which a lag is not judged; None: that of the options.
-
-    Source: thesis, chapter 7; Taubin 1991 for the normalization.
-    """
+    r"""Scores at all lags."""
     overlap = options.curve.least_overlap if overlap is None else overlap
     lo, hi = samples.lags(max_shift)
     found = [_piece(samples, first, min(first + PIECE - 1, hi)) for first in range(lo, hi + 1, PIECE)]
@@ -228,30 +197,18 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class EpipolarFit:
-    """A minimum.
+    """A minimum."""
 
-    Attributes:
-        offset, rate: b's clock = a's clock * rate + offset.
-        center: a's time in the middle of the residuals.
-        sigma: of the shift there, seconds; robust against what residuals have in common over time.
-        rate_sigma: of the rate.
-        residual: robust standard deviation of the Sampson distance, px of a.
-        fundamental: ``(3, 3)`` of norm 1, of the coordinates given; of a camera and points in space the camera ``(3, 4)``.
-        distances: ``(frames, n)`` signed Sampson distances over ``residual``; NaN where not both are seen.
-        times: ``(frames,)`` of a's clock.
-        effective: how many independent residuals there are.
-    """
-
-    offset: float
+    offset: float  # b's clock = a's clock * rate + offset
     rate: float
-    center: float
-    sigma: float
-    rate_sigma: float
-    residual: float
-    fundamental: Tensor
-    distances: Tensor
-    times: Tensor
-    effective: float
+    center: float  # a's time in the middle of the residuals
+    sigma: float  # of the shift there, seconds; robust against what residuals have in common over time
+    rate_sigma: float  # of the rate
+    residual: float  # robust standard deviation of the Sampson distance, px of a
+    fundamental: Tensor  # ``(3, 3)`` of norm 1, of the coordinates given; of a camera and points in space the camera ``(3, 4)``
+    distances: Tensor  # ``(frames, n)`` signed Sampson distances over ``residual``; NaN where not both are seen
+    times: Tensor  # ``(frames,)`` of a's clock
+    effective: float  # how many independent residuals there are
 
     @property
     def shift(self) -> float:
@@ -276,11 +233,7 @@ class ShiftDescent:
         self.noise = (float(a.change[0, 0]), float(b.change[0, 0]) * noise_ratio(a, b))  # one px of a, in normalized coordinates
 
     def run(self, offset: float, rate: float = 1.0, *, free_rate: bool = False, start: Tensor | None = None) -> EpipolarFit | None:
-        """Descend from a start; None where too little is seen there, or the rate runs away.
-
-        Args:
-            start: F of the normalized coordinates; by default the best for the start.
-        """
+        """Descend from a start; None where too little is seen there, or the rate runs away."""
         state = _State(offset, rate, start)
         stride = max(1, self.weights.numel() // self.options.descent.enough_rows)
         # most of the way on some of the rows, the rest on all
@@ -415,11 +368,8 @@ class ShiftDescent:
         )
 
     def jumps(self, fit: EpipolarFit, moments: Sequence[float]) -> tuple[Tensor, Tensor]:
-        """What the offset changes by, beyond the fit, after each of some moments of a's clock: seconds ``(k,)``, and their standard
-        deviations.
-
-        One step of least squares from the fit, of all jumps with F and the offset.
-        """
+        """What the offset changes by, beyond the fit, after each of some moments of a's clock: seconds ``(k,)``, and their
+        standard deviations."""
         first, second = self.changes
         F = torch.linalg.inv(second).mT @ fit.fundamental @ torch.linalg.inv(first)
         state = _State(fit.offset, fit.rate, F / F.norm(), fit.center)
@@ -526,13 +476,9 @@ def _tangent(F: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class PairModel:
-    """What is compared: the classes that score all shifts, and that descend from one.
+    """What is compared: the classes that score all shifts, and that descend from one."""
 
-    Attributes:
-        method: its name in results.
-    """
-
-    method: str
+    method: str  # its name in results
     samples: type[Samples]
     descent: type[ShiftDescent]
 

@@ -17,32 +17,20 @@ from dyntorch.tasks.synchronize.tracks import Tracks, image_of
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """The best shift found in one way, with its evidence.
+    """The best shift found in one way, with its evidence."""
 
-    Attributes:
-        a, b: the tracks it was found with.
-        fit: the best minimum, None where there is none.
-        curve: scores at the fit's rate.
-        step: seconds per lag.
-        max_shift: of the search, seconds.
-        points: ``(n,)`` bool, who takes part.
-        method: ``"epipolar"`` or ``"affine"``.
-        pruned: whether positions that did not fit were left out.
-        model: what is compared.
-    """
-
-    a: Tracks
+    a: Tracks  # the tracks it was found with
     b: Tracks
-    fit: EpipolarFit | None
-    curve: Curve
+    fit: EpipolarFit | None  # the best minimum, None where there is none
+    curve: Curve  # scores at the fit's rate
     samples: Samples
-    step: float
-    max_shift: float | None
-    points: Tensor
-    method: str
+    step: float  # seconds per lag
+    max_shift: float | None  # of the search, seconds
+    points: Tensor  # ``(n,)`` bool, who takes part
+    method: str  # ``"epipolar"`` or ``"affine"``
     options: SynchronizeOptions
-    pruned: bool = False
-    model: PairModel = EPIPOLAR
+    pruned: bool = False  # whether positions that did not fit were left out
+    model: PairModel = EPIPOLAR  # what is compared
 
     @property
     def frame(self) -> float:
@@ -91,13 +79,7 @@ class Attempt:
 
     @cached_property
     def forward(self) -> float:
-        r"""Nats by which the residual is smaller than with b played backwards, at whatever shift.
-
-        .. math:: \tfrac12 \log \min_s \lambda_{\text{backwards}}(s) - \tfrac12 \log \lambda
-
-        A film that somebody reversed fits for a while where a movement turns round, and far better the other way; so does a wrong
-        shift of films that have nothing in common, half of the time.
-        """
+        r"""Nats by which the residual is smaller than with b played backwards, at whatever shift."""
         if self.fit is None:
             return 0.0
         backwards = dataclasses.replace(self.samples, x2=self.samples.x2.flip(0), w2=self.samples.w2.flip(0))
@@ -221,11 +203,7 @@ class Attempt:
 
     @property
     def doubtful(self) -> float:
-        """0 where all points fit as well as their noise lets them; 1 where something may have been made to fit.
-
-        That is with a residual that the noise does not explain, or by leaving out what does not fit, unless b played backwards, or
-        every other shift with as long an overlap, fits far worse.
-        """
+        """0 where all points fit as well as their noise lets them; 1 where something may have been made to fit."""
         evidence = self.options.evidence
         rough = math.log(max(self.roughness, 1e-300) / evidence.usual_roughness)
         if not self.chosen and rough <= 0:
@@ -309,13 +287,8 @@ class Attempt:
 def consistent_points(
     a: Tracks, b: Tracks, found: Attempt, generator: Generator | None, options: SynchronizeOptions
 ) -> Tensor | None:
-    """Points ``(n,)`` bool whose epipolar residual agrees with the others' at one and the same shift; None where there are too few.
-
-    Subsets of six are drawn; each has its own best shift and geometry, by which all points are judged.  The subset
-    counts that is fitted best by 70 of 100 points: a plain fit starts at a wrong shift, from where no reweighting returns.
-
-    Source: Fischler and Bolles 1981, Random sample consensus, over points instead of matches.
-    """
+    """Points ``(n,)`` bool whose epipolar residual agrees with the others' at one and the same shift; None where there are too
+    few."""
     n = a.x.shape[1]
     lo, hi = found.samples.lags(found.max_shift)
     if n < options.points.fewest or lo > hi:

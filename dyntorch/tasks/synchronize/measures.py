@@ -30,19 +30,12 @@ MEASURES: tuple[Measure, ...] = ("auto", "rank", "log_determinant", "principal_a
 
 @dataclass(frozen=True)
 class LagCovariances:
-    """Covariances of a's and b's rows over the overlap of every lag, about its mean.
+    """Covariances of a's and b's rows over the overlap of every lag, about its mean."""
 
-    Attributes:
-        aa: ``(L, p, p)``.
-        bb: ``(L, q, q)``.
-        ab: ``(L, p, q)``.
-        counts: ``(L,)`` frames.
-    """
-
-    aa: Tensor
-    bb: Tensor
-    ab: Tensor
-    counts: Tensor
+    aa: Tensor  # ``(L, p, p)``
+    bb: Tensor  # ``(L, q, q)``
+    ab: Tensor  # ``(L, p, q)``
+    counts: Tensor  # ``(L,)`` frames
 
     @staticmethod
     def of(a: Tensor, b: Tensor, lags: tuple[int, int]) -> LagCovariances:
@@ -65,30 +58,7 @@ class LagCovariances:
 
 
 def shared(moments: LagCovariances, judged: Tensor, measure: Measure, above: float = RowSpaceOptions().above) -> Tensor:
-    r"""How much the rows share at every lag ``(L,)``, more is better; in units of noise of variance 1.
-
-    Args:
-        moments: at all lags.
-        judged: ``(L,)`` bool, lags that overlap enough; ranks are told from these.
-        measure: ``"rank"``, ``"log_determinant"`` or ``"principal_angles"``; ``"auto"`` is the second.
-        above: variance, over that of the noise, from which a direction belongs to a row space.
-
-    Returns:
-        Nats per frame of the first two (of the rank, :math:`-\tfrac12 \log` of what lies beyond the least rank); of the angles,
-        a number of directions.
-
-    Raises:
-        ValueError: another measure.
-
-    Example:
-        >>> import torch
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> rows = 50 * torch.randn(90, 6, generator=generator, dtype=torch.float64)
-        >>> a, b = rows[:80, :4], rows[5:85, 2:]  # two of four directions in common, frame i of a with frame i - 5 of b
-        >>> moments = LagCovariances.of(a, b, (-10, 10))
-        >>> [int(shared(moments, torch.ones(21, dtype=torch.bool), kind).argmax()) - 10 for kind in MEASURES]
-        [-5, -5, -5, -5]
-    """
+    r"""How much the rows share at every lag ``(L,)``, more is better; in units of noise of variance 1."""
     if measure == "rank":
         return _beyond_rank(moments, judged, above)
     if measure == "principal_angles":

@@ -59,28 +59,8 @@ def rotations_of(q: Tensor) -> Tensor:
 
 
 def attitude_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""How far two cameras disagree about the attitude of a body, at all lags.
-
-    .. math:: \theta^2(s) = 8\,(1 - \sigma_1(A(s)) / m), \qquad x^T A\, y = \sum_t q_b(t + s) \cdot (x\, q_a(t)\, y)
-
-    Args:
-        a: ``(Ta, 4)`` quaternions of the body before the first camera.
-        b: ``(Tb, 4)``.
-        wa: ``(Ta,)`` 0 or 1.
-        wb: ``(Tb,)``.
-        lags: first and last, frames.
-
-    Returns:
-        mean squared angles ``(L,)``, radians squared; frames ``(L,)``; the best x and y ``(L, 4)``.
-
-    Example:
-        >>> import torch
-        >>> turns = 0.3 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64).cumsum(0)
-        >>> q, one = quaternions(rotation_exponential(turns)), torch.ones(60)
-        >>> angles, counts, _, _ = attitude_curve(q[:50], q[5:], one[:50], one[5:], (-20, 20))
-        >>> int(angles.argmin()) - 20
-        -5
-    """
+    r"""How far two cameras disagree about the attitude of a body, at all lags. a ``(Ta, 4)``, b ``(Tb, 4)``, wa ``(Ta,)``, wb
+    ``(Tb,)`` -> ``(L,)``."""
     moments = lag_products(a * wa[:, None], b * wb[:, None], lags)  # (L, l, k)
     counts = lag_products(wa[:, None], wb[:, None], lags)[:, 0, 0].round()
     u, s, vt = torch.linalg.svd(torch.einsum("ijkl,slk->sij", _products(a.device), moments))
@@ -93,17 +73,11 @@ def attitude_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses of a body before one camera in time, and how well they are known.
+    """Poses of a body before one camera in time, and how well they are known."""
 
-    Attributes:
-        times: ``(frames,)`` seconds.
-        values: ``(frames, 7)`` quaternion and place, NaN where not known.
-        covariance: ``(frames, 6, 6)`` of turns about the origin and moves, 0 where not known.
-    """
-
-    times: Tensor
-    values: Tensor
-    covariance: Tensor
+    times: Tensor  # ``(frames,)`` seconds
+    values: Tensor  # ``(frames, 7)`` quaternion and place, NaN where not known
+    covariance: Tensor  # ``(frames, 6, 6)`` of turns about the origin and moves, 0 where not known
 
     @staticmethod
     def of(motion: BodyMotion, times: Tensor, options: ProjectiveOptions) -> Poses:
@@ -133,11 +107,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class SharedMotion(LeastSquares):
-    r"""Minimize what is left of :math:`R_b(\rho t + o) = X R_a(t) Y` and :math:`T_b(\rho t + o) = \sigma X T_a(t) + c + R_b d`.
-
-    In standard deviations of both poses; X turns camera a to b, Y the body's axes, :math:`\sigma, c, d` are the scale and the
-    places of the origins.  The parameters: ``(b, 2)`` offset and rate, ``(b, 3, 3)`` X and Y, ``(b, 7)`` :math:`\sigma, c, d`.
-    """
+    r"""Minimize what is left of :math:`R_b(\rho t + o) = X R_a(t) Y` and :math:`T_b(\rho t + o) = \sigma X T_a(t) + c + R_b d`."""
 
     a: Poses
     b: Poses
@@ -282,34 +252,8 @@ def common_motion(first: Poses, second: Poses, options: ProjectiveOptions) -> tu
 
 
 def rank_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    r"""What of the motions before two cameras is beyond one space of 13 dimensions, at all lags.
-
-    Scaled by its projective depth, a point's image :math:`\lambda_j(t)\, x_j(t) = P\, M(t)\, X_j` is linear in the 12 entries of
-    the motion and in 1: the rows of camera a span 12 dimensions of time, those of b 12, both lie in the same 13 and meet in 11.
-    At a wrong shift they meet in nothing, and span 24, with the constant 25.
-
-    Args:
-        a: ``(Ta, 3, 4)`` projections :math:`[R\ T]` of the body before the first camera, scaled alike in all frames.
-        b: ``(Tb, 3, 4)``.
-        wa: ``(Ta,)`` 0 or 1.
-        wb: ``(Tb,)``.
-        lags: first and last, frames.
-
-    Returns:
-        the share of the energy about the mean beyond 12 dimensions ``(L,)``, and frames ``(L,)``.
-
-    Source: thesis, chapter 7, for projective cameras.
-
-    Example:
-        >>> import torch
-        >>> g = torch.Generator().manual_seed(0)
-        >>> poses = torch.randn(90, 3, 4, generator=g, dtype=torch.float64)
-        >>> turn, seat, one = torch.randn(3, 3, generator=g).double(), torch.randn(4, 4, generator=g).double(), torch.ones(90)
-        >>> seat[3] = torch.tensor([0.0, 0.0, 0.0, 1.0])
-        >>> left, _ = rank_curve(poses[:80], (turn @ poses @ seat)[6:], one[:80], one[6:], (-20, 20))
-        >>> int(left.argmin()) - 20
-        -6
-    """
+    r"""What of the motions before two cameras is beyond one space of 13 dimensions, at all lags. a ``(Ta, 3, 4)``, b
+    ``(Tb, 3, 4)``, wa ``(Ta,)``, wb ``(Tb,)`` -> ``(L,)``."""
     rows = []
     for poses, w in ((a, wa), (b, wb)):
         known = w[:, None] > 0
@@ -338,19 +282,7 @@ MEASURES = ("attitude", "rank")
 
 
 def projective_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
-    """The shift of uncalibrated perspective cameras that see different points of one rigid body.
-
-    Fixed cameras before one moving body, or cameras that move together (a rig) before a static scene.  Each camera alone tells the
-    motion, up to the place and the axes of the body; at the right shift both motions are one.  It takes six points of each camera
-    and a body that turns.  ``python -m experiments.reconstruction.bodies`` prints what is reached: 8 points each, 4 s: .002 frame
-    at .3 px, .011 at 1 px; 2 s: .010 and .042.
-
-    Args:
-        rate: of b's clock, where it is known.
-
-    Raises:
-        ValueError: an unknown measure.
-    """
+    """The shift of uncalibrated perspective cameras that see different points of one rigid body."""
     if options.projective.measure not in MEASURES:
         raise ValueError(f"options.projective.measure must be {' or '.join(MEASURES)}, got {options.projective.measure!r}")
     motions = [body_motion(name, tracks, options.projective) for name, tracks in (("a", a), ("b", b))]

@@ -161,11 +161,7 @@ class ClockOutcome(Outcome):
         return told(self.notices)
 
     def check(self) -> Self:
-        """Raise where the data do not decide.
-
-        Raises:
-            ValueError: the reason.
-        """
+        """Raise where the data do not decide."""
         if self.status.ndim:
             return super().check()
         if not self.ok:
@@ -519,19 +515,11 @@ class ClockBreak:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Breaks(ClockOutcome):
-    """Clocks that broke, and times as if they had not.
+    """Clocks that broke, and times as if they had not."""
 
-    Attributes:
-        breaks: in the order of time; empty where nothing broke.
-        times: ``(frames,)`` seconds per camera: what to give as ``times`` from here on.
-        clocks: of two cameras the :class:`Shift` with these times; of several the :class:`Clocks` that were given.
-        status: OK where the data decide whether something broke.
-        notices: what happened, in words (``notes``), and what stands against a decision.
-    """
-
-    breaks: tuple[ClockBreak, ...]
-    times: tuple[Tensor, ...]
-    clocks: Shift | Clocks
+    breaks: tuple[ClockBreak, ...]  # in the order of time; empty where nothing broke
+    times: tuple[Tensor, ...]  # ``(frames,)`` seconds per camera: what to give as ``times`` from here on
+    clocks: Shift | Clocks  # of two cameras the :class:`Shift` with these times; of several the :class:`Clocks` that were given
 
     TASK = "breaks"
 

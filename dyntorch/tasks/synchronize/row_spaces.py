@@ -15,29 +15,17 @@ from dyntorch.tasks.synchronize.tracks import Tracks
 
 @dataclass(frozen=True, eq=False)
 class RowSpaceShift:
-    """The lag that stands out most of all kinds of cameras and levels of noise.
+    """The lag that stands out most of all kinds of cameras and levels of noise."""
 
-    Attributes:
-        lag: seconds of b's clock at time 0 of a's, at a rate of 1 after that.
-        sigma: its standard deviation, seconds.
-        kind: of the cameras.
-        clearness: margin of the best lag over the spread of the others.
-        votes: share of the kinds and levels that say the same lag.
-        margin: nats over any other lag.
-        curve: of that kind and level.
-        seconds: ``(L,)`` of its lags.
-        foreign: tracks of a and of b ``(n,)``, ``(m,)`` bool that were left out.
-    """
-
-    lag: float
-    sigma: float
-    kind: Kind
-    clearness: float
-    votes: float
-    margin: float
-    curve: Hypothesis
-    seconds: Tensor
-    foreign: tuple[Tensor, Tensor]
+    lag: float  # seconds of b's clock at time 0 of a's, at a rate of 1 after that
+    sigma: float  # its standard deviation, seconds
+    kind: Kind  # of the cameras
+    clearness: float  # margin of the best lag over the spread of the others
+    votes: float  # share of the kinds and levels that say the same lag
+    margin: float  # nats over any other lag
+    curve: Hypothesis  # of that kind and level
+    seconds: Tensor  # ``(L,)`` of its lags
+    foreign: tuple[Tensor, Tensor]  # tracks of a and of b ``(n,)``, ``(m,)`` bool that were left out
     options: SynchronizeOptions
 
     @property
@@ -90,14 +78,7 @@ def _sigmoid(x: float) -> float:
 def row_space_shift(
     a: Tracks, b: Tracks, *, step: float, rate: float, max_shift: float | None, around: float = 0.0, options: SynchronizeOptions
 ) -> RowSpaceShift | None:
-    """The clearest lag between two cameras' row spaces; None where none can be judged.
-
-    Args:
-        step: seconds of a's clock from frame to frame of the comparison.
-        rate: of b's clock.
-        max_shift: seconds.
-        around: seconds of b's clock at time 0 of a's, near which lags are looked at where there are too many.
-    """
+    """The clearest lag between two cameras' row spaces; None where none can be judged."""
     if a.still or b.still:
         return None
     if b.x.shape[-1] == 3:  # what is looked at between frames is the second, and a camera is the shorter take of fewer points
@@ -155,10 +136,8 @@ def _chosen(found: list[Hypothesis]) -> tuple[Hypothesis, float]:
 
 
 def _plainest(films: Films, found: list[Hypothesis], best: Hypothesis) -> tuple[Kind, Place]:
-    """Of the kinds that say the same lag, the one with most nats at its place: cameras as they are leave but noise unexplained.
-
-    Where others have nearly as many, none is what the cameras are, and what their places differ by is uncertain as well.
-    """
+    """Of the kinds that say the same lag, the one with most nats at its place: cameras as they are leave but noise
+    unexplained."""
     lag = float(best.lags[best.best])
     same = [one for one in found if abs(float(one.lags[one.best]) - lag) <= best.apart]
     fixed = [one for one in same if one.kind == "affine"]

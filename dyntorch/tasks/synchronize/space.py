@@ -24,34 +24,8 @@ from dyntorch.tasks.synchronize.tracks import Tracks, image_of, smoothed
 
 
 def camera_variance(moments: Tensor, noise: float = 1.0) -> tuple[Tensor, Tensor]:
-    r"""The least variance of what a camera leaves of its images, and the camera that has it.
-
-    .. math:: \lambda = \min_P \frac{\sum w\, [(P_1 \tilde X - u P_3 \tilde X)^2 + (P_2 \tilde X - v P_3 \tilde X)^2]}
-              {2 \sum w\, (P_3 \tilde X)^2}
-
-    The divisor makes it a variance in the image, whatever the unit of the space: each row is the error in the image times the
-    depth.  The first two rows of P are regressions of :math:`u P_3 \tilde X` and :math:`v P_3 \tilde X` on :math:`\tilde X`; what
-    is left is a ratio of two quadratic forms in :math:`P_3`, 4 x 4 each.
-
-    Args:
-        moments: ``(*batch, 4, 4, 4)`` of :func:`dyntorch.numerics.lags.resection_moments`, sums or means of normalized coordinates.
-        noise: standard deviation of a coordinate of the image, in its unit.
-
-    Returns:
-        ``(*batch,)`` variances in units of the noise's, infinite where there are no moments, and ``(*batch, 3, 4)`` cameras of
-        norm 1, 0 there.
-
-    Source: Hartley and Zisserman 2004, section 7.1, for the rows; Taubin 1991 for the divisor.
-
-    Example:
-        >>> import torch
-        >>> g = torch.Generator().manual_seed(0)
-        >>> X = torch.rand(200, 4, 3, generator=g, dtype=torch.float64)
-        >>> x = X[..., :2] / (2 + X[..., 2:]) + 0.01 * torch.randn(200, 4, 2, generator=g, dtype=torch.float64)
-        >>> moments, _ = resection_moments(x, X, (0, 0))
-        >>> 0.008 < float(camera_variance(moments)[0].sqrt()) < 0.011
-        True
-    """
+    r"""The least variance of what a camera leaves of its images, and the camera that has it. moments ``(*batch, 4, 4, 4)`` ->
+    ``(*batch,)``."""
     total = moments[..., 0, 3, 3]
     present = total > 0
     unit = torch.eye(4, dtype=moments.dtype, device=moments.device)

@@ -23,27 +23,16 @@ TINY = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One camera's points over time.
+    """One camera's points over time."""
 
-    Attributes:
-        rows: ``(T', d n)`` without the ends, coordinates about the body's middle over its size, smoothed, in units of noise; of
-            points in space combinations of them.
-        motion: ``(T', d)`` px per frame, the median velocity of the points.
-        weights: ``(T',)`` 1 where a frame is seen, else 0.
-        points: ``(T, n, d)`` px, what is missing filled in; d = 2, of points in space 3.
-        seen: ``(T, n)`` bool.
-        step: seconds from frame to frame.
-        noise: variance of a coordinate's noise, over the squared size of the body.
-    """
-
-    rows: Tensor
-    motion: Tensor
-    weights: Tensor
-    points: Tensor
-    seen: Tensor
-    step: float
+    rows: Tensor  # ``(T', d n)`` without the ends, coordinates about the body's middle over its size, smoothed, in units of noise
+    motion: Tensor  # ``(T', d)`` px per frame, the median velocity of the points
+    weights: Tensor  # ``(T',)`` 1 where a frame is seen, else 0
+    points: Tensor  # ``(T, n, d)`` px, what is missing filled in; d = 2, of points in space 3
+    seen: Tensor  # ``(T, n)`` bool
+    step: float  # seconds from frame to frame
     options: SynchronizeOptions
-    noise: float = TINY**2
+    noise: float = TINY**2  # variance of a coordinate's noise, over the squared size of the body
 
     @property
     def dims(self) -> int:
@@ -89,12 +78,7 @@ class Body:
 
 
 def body_of(x: Tensor, weights: Tensor, step: float = STEP, *, least: float = TINY**2, options: SynchronizeOptions) -> Body:
-    """Rows, motion and weights of tracks ``(T, n, d)`` with weights ``(T, n)``, 0 = missing; some frames less at each end.
-
-    Args:
-        least: variance of the noise over the squared size of the body, at least: what is known better than the other camera sees it
-            would agree with anything.
-    """
+    """Rows, motion and weights of tracks ``(T, n, d)`` with weights ``(T, n)``, 0 = missing; some frames less at each end."""
     seen = (weights > 0) & x.isfinite().all(-1)
     x = torch.where(seen[..., None], x, 0.0).double()
     whole = seen.sum(-1) >= min(2, seen.shape[1])
@@ -133,10 +117,8 @@ def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float, least: float, 
 
 
 def _fewer(places: Tensor) -> Tensor:
-    """As many combinations ``(T, k, d)`` of points ``(T, n, d)`` as move by more than noise of variance 1: what all tell, sooner.
-
-    They are orthonormal, and the same for every coordinate, so that the noise stays as it is and upright stays upright.
-    """
+    """As many combinations ``(T, k, d)`` of points ``(T, n, d)`` as move by more than noise of variance 1: what all tell,
+    sooner."""
     by_point = places.movedim(1, 0).flatten(1)
     values, vectors = torch.linalg.eigh(by_point @ by_point.mT / max(by_point.shape[1], 1))
     kept = max(int((values > 1).sum()), 1)
@@ -189,13 +171,7 @@ def _noise(x: Tensor, seen: Tensor) -> float:
 
 
 def completed(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
-    r"""Positions ``(T, n, d)``, those missing by regression on the other points of their frame, over and over.
-
-    .. math:: x_j \leftarrow x_j - K_{jj}^{-1} (K x)_j, \qquad K = (C + \sigma^2 I)^{-1}
-
-    is the regression of point j on the others under the covariance C of all coordinates.  What regression leaves of a point at
-    the nearest times that it is seen is added: half as much is wrong.
-    """
+    r"""Positions ``(T, n, d)``, those missing by regression on the other points of their frame, over and over."""
     if bool(seen.all()):
         return x
     mean = x.mean(0)
@@ -232,25 +208,15 @@ PIECE = 2048
 
 @dataclass(frozen=True, eq=False)
 class SubspaceCurve:
-    """Evidence over lags; frame i of a goes with frame i + lag of b.
+    """Evidence over lags; frame i of a goes with frame i + lag of b."""
 
-    Attributes:
-        lags: ``(L,)`` frames.
-        scores: ``(L,)`` nats, higher is better, NaN where the overlap is too short: logarithm of the posterior but for a constant.
-        counts: ``(L,)`` frames that overlap, but for the ends of each take.
-        shape: ``(L,)`` nats per frame that the shapes tell about each other, beyond chance.
-        height: ``(L,)`` the same of vertical coordinates alone.
-        motion: ``(L,)`` nats per frame that the motions of the whole tell.
-        signal: of either camera, directions in which the shape moves by more than noise.
-    """
-
-    lags: Tensor
+    lags: Tensor  # ``(L,)`` frames
     scores: Tensor
-    counts: Tensor
-    shape: Tensor
-    height: Tensor
-    motion: Tensor
-    signal: tuple[float, float]
+    counts: Tensor  # ``(L,)`` frames that overlap, but for the ends of each take
+    shape: Tensor  # ``(L,)`` nats per frame that the shapes tell about each other, beyond chance
+    height: Tensor  # ``(L,)`` the same of vertical coordinates alone
+    motion: Tensor  # ``(L,)`` nats per frame that the motions of the whole tell
+    signal: tuple[float, float]  # of either camera, directions in which the shape moves by more than noise
     bodies: tuple[Body, Body] | None = None
 
     @property
@@ -269,45 +235,8 @@ def subspace_curve(
     step: float = STEP,
     options: SynchronizeOptions = SynchronizeOptions(),
 ) -> SubspaceCurve:
-    r"""Evidence for every lag between the tracks of two static cameras that need not have a point in common.
-
-    .. math:: S(s) = m(s)\, [\, 2.4\, (J - J_0) + 2.25\, (J_y - J_{y0}) + 5.7\, J_v\, ],\qquad
-              J = \tfrac12 \log \frac{|C_{aa} + I|\, |C_{bb} + I|}{|C + I|}
-
-    J is the mutual information of Gaussian rows, coordinates of all points about the body's middle over its size in units of noise:
-    a scale-free count of the directions that row spaces share (Wolf and Zomet ask for the least rank of :math:`[A; B]`).
-    :math:`J_y` is that of the image's y alone, which upright cameras share most: half the rows, a quarter of the ways to agree by
-    chance.  What b played backwards tells, a line in 1/m, is subtracted from both.  :math:`J_v` is the information of the median
-    velocities, and m the seconds that overlap.
-
-    Args:
-        a: ``(Ta, n, 2)`` px, frames ``step`` apart; or points in space ``(Ta, n, 3)``, the second coordinate upright.
-        b: ``(Tb, m, 2)``, the same step; or points in space, where a is none.
-        wa: ``(Ta, n)``, 0 = missing.
-        wb: ``(Tb, m)``.
-        lags: first and last, frames.
-        step: seconds from frame to frame.
-
-    Returns:
-        The curve.
-
-    Raises:
-        ValueError: lags in the wrong order.
-
-    Source: thesis, chapter 7; Wolf and Zomet 2006, Wide baseline matching between unsynchronized video sequences.
-
-    Example:
-        >>> import torch
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> time = torch.arange(100, dtype=torch.float64)[:, None]
-        >>> pace = 0.05 + 0.15 * torch.rand(4, generator=generator, dtype=torch.float64)
-        >>> waves = torch.cat([(pace * time).sin(), (pace * time + 0.004 * time**2).cos()], dim=1)
-        >>> mix = lambda n: 50 * torch.randn(8, n, 2, generator=generator, dtype=torch.float64)
-        >>> a, b = (torch.einsum("tk,knd->tnd", part, mix(6)) for part in (waves[:90], waves[7:]))
-        >>> curve = subspace_curve(a, b, torch.ones(90, 6), torch.ones(93, 6), (-40, 40))
-        >>> int(curve.lags[curve.scores.nan_to_num(-torch.inf).argmax()])
-        -7
-    """
+    r"""Evidence for every lag between the tracks of two static cameras that need not have a point in common. a ``(Ta, n, 2)``,
+    b ``(Tb, m, 2)``, wa ``(Ta, n)``, wb ``(Tb, m)``."""
     if a.shape[-1] == 3:
         second = body_of(b, wb, step, options=options)
         first = body_of(a, wa, step, least=second.noise, options=options)

@@ -33,31 +33,18 @@ from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, frame_scaled, rea
 
 @dataclass(frozen=True)
 class ShiftSearch:
-    """How to search.
+    """How to search."""
 
-    Attributes:
-        step: seconds per lag; the slower camera's frame at least.
-        max_shift: seconds, None for all shifts with some overlap.
-        rates: of b's clock, to search at.
-        free_rate: whether the descent may change the rate.
-        method: ``"epipolar"``, ``"camera"`` or ``"affine"``: what the tracks were made for.
-        model: what is compared.
-    """
-
-    step: float = 0.0
-    max_shift: float | None = None
-    rates: tuple[float, ...] = (1.0,)
-    free_rate: bool = True
-    method: str = "epipolar"
-    model: PairModel = EPIPOLAR
+    step: float = 0.0  # seconds per lag; the slower camera's frame at least
+    max_shift: float | None = None  # seconds, None for all shifts with some overlap
+    rates: tuple[float, ...] = (1.0,)  # of b's clock, to search at
+    free_rate: bool = True  # whether the descent may change the rate
+    method: str = "epipolar"  # ``"epipolar"``, ``"camera"`` or ``"affine"``: what the tracks were made for
+    model: PairModel = EPIPOLAR  # what is compared
 
 
 def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None, *, options: SynchronizeOptions) -> Attempt:
-    """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate.
-
-    Args:
-        points: ``(n,)`` bool, who takes part; all by default.
-    """
+    """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate. points ``(n,)``."""
     points = torch.ones(a.x.shape[1], dtype=torch.bool, device=a.x.device) if points is None else points
     a, b = (a, b) if bool(points.all()) else (a.only(points), b.only(points))
     step = max(a.step, b.step, search.step)
@@ -126,15 +113,11 @@ def _settled(descent: ShiftDescent, fit: EpipolarFit, options: SynchronizeOption
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Result:
-    """The best attempt and what it took.
-
-    Attributes:
-        seen: ``(n,)`` bool, points that both cameras show at all.
-    """
+    """The best attempt and what it took."""
 
     found: Attempt
     notices: tuple[Notice, ...]
-    seen: Tensor
+    seen: Tensor  # ``(n,)`` bool, points that both cameras show at all
 
 
 def same_points(
@@ -149,14 +132,7 @@ def same_points(
     options: SynchronizeOptions,
     model: PairModel = EPIPOLAR,
 ) -> Result:
-    """The shift of cameras that see the same points, or of a camera and the same points in space.
-
-    Args:
-        model: which of the two.
-        rate: of b's clock, where it is known.
-        camera: ``"perspective"``, ``"affine"`` or ``"auto"``.
-        lenses: whether nobody calibrated the cameras, and distortion may be looked for.
-    """
+    """The shift of cameras that see the same points, or of a camera and the same points in space."""
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
     search = ShiftSearch(
         step=span / options.search.most_steps, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None,
@@ -414,11 +390,7 @@ def prepared(
     calibration: tuple[Any, Any] | None,
     options: SynchronizeOptions,
 ) -> tuple[Tracks, Tracks, float]:
-    """Tracks of checked input, without outliers, and the time that both clocks are counted from: a's first frame.
-
-    Raises:
-        ValueError: naming a or b, what is wrong with it, and what to do.
-    """
+    """Tracks of checked input, without outliers, and the time that both clocks are counted from: a's first frame."""
     pair: tuple[float | None, float | None] = (None, None)
     if fps is not None:
         pair = (float(fps[0]), float(fps[1])) if isinstance(fps, Sequence) else (float(fps), float(fps))
@@ -474,11 +446,7 @@ def _pairwise(calibration: Any) -> Sequence[Any]:
 
 
 def _spatial(tracks: Sequence[Tracks], camera: str) -> bool:
-    """Whether one of both is of points in space.
-
-    Raises:
-        ValueError: both are, or the kind of camera is one of two cameras.
-    """
+    """Whether one of both is of points in space."""
     count = sum(one.x.shape[-1] == 3 for one in tracks)
     if count == 2:
         text = "{camera:a} and {camera:b} both hold points in space (frames, points, 3): one must be a camera (frames, points, 2)"

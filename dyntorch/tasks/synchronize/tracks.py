@@ -83,11 +83,7 @@ class Tracks:
 def read_tracks(
     name: str, x: Tensor, fps: float | None, times: Tensor | None, weights: Tensor | None, options: SynchronizeOptions
 ) -> Tracks:
-    """Tracks of checked input, of a camera or of points in space.
-
-    Raises:
-        ValueError: naming a or b, what is wrong with it, and what to do.
-    """
+    """Tracks of checked input, of a camera or of points in space."""
     if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] not in (2, 3):
         got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
         text = "{camera:{which}} must be a tensor (frames, points, 2), got {got}; of motion capture (frames, points, 3)"
@@ -185,22 +181,8 @@ def image_of(a: Tracks, b: Tracks) -> Tracks:
 
 
 def smoothed(tracks: Tracks, at: Tensor, width: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Positions and velocities at any moments, by a line fitted to the frames around each, with Gaussian weights.
-
-    .. math:: \min_{p, v} \sum_k w_k\, e^{-(t_k - t)^2 / 2 \sigma^2}\; |x_k - p - v (t_k - t)|^2
-
-    The same kernel for both cameras, so that what it takes away is taken from both.  From a standard deviation of one frame on,
-    the noise that is left does not depend on where between frames a moment is: interpolation at fractions of frames would draw
-    an estimate of the shift to half frames.
-
-    Args:
-        at: ``(m,)`` seconds.
-        width: the standard deviation, seconds.
-
-    Returns:
-        positions and velocities per second ``(m, n, 2)``, 0 in gaps, and weights ``(m, n)``: the mean of those near, less
-        where frames on one side are missing, 0 in gaps.
-    """
+    r"""Positions and velocities at any moments, by a line fitted to the frames around each, with Gaussian weights. at ``(m,)``
+    -> ``(m, n, 2)``."""
     taps = 2 * (math.ceil(options.cleaning.kernel_end * width / tracks.step) + 1) + 1
     rows = max(1, PIECE // max(1, taps * tracks.x[0].numel()))
     pieces = [_smoothed(tracks, piece, width, taps // 2, options) for piece in at.split(rows)] or [
@@ -239,16 +221,7 @@ def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int, options: Sync
 
 def cleaned(tracks: Tracks, options: SynchronizeOptions) -> Tracks:
     r"""Without positions far from the median of their neighbours, then, one by one, without those far from a line through the
-    others.
-
-    .. math:: |x_t - m_t| > \tau\, 1.4826\, \mathrm{med}_{|k| \le K} |x_{t+k} - m_t|,\quad m_t = \mathrm{med}_{|k| \le K}\, x_{t+k}
-
-    The spread has floors, the track's own usual one and that of most tracks, without which a point at rest would lose good
-    positions.  The median leaves
-    5 of 100 outliers (of 15 mm of noise, 15 of 100 positions anywhere), often far away; the second pass leaves 2, near by.
-
-    Source: Hampel 1974, The influence curve and its role in robust estimation.
-    """
+    others."""
     if len(tracks.x) < 2 * options.cleaning.neighbours + 1:
         return tracks
     return _peeled(without(tracks, _far_from_median(tracks, options)), options)
@@ -322,15 +295,7 @@ def _correlated(rows: Tensor, kernel: Tensor) -> Tensor:
 
 
 def frame_scaled(tracks: Tracks, options: SynchronizeOptions) -> Tracks:
-    r"""Tracks with the strongest effects of perspective taken out.
-
-    .. math:: y_{ij} = \frac{x_{ij} - c_i}{\bar r_i}, \qquad c_i = \operatorname{med}_j x_{ij}, \quad r_i =
-    \operatorname{med}_j |x_{ij} - c_i|,
-
-    with the size smoothed over half a second, and its mean over the take restored.  Medians, which single wrong points do not move.
-
-    Source: Wolf and Zomet 2002 for affine cameras; Zelnik-Manor and Irani 2003.
-    """
+    r"""Tracks with the strongest effects of perspective taken out."""
     seen = tracks.weights > 0
     shown = torch.where(seen[..., None], tracks.x, torch.nan)
     middle = shown.nanmedian(1).values  # (frames, 2)

@@ -25,19 +25,12 @@ FLAT = 1e-12  # relative size of an image line, or a depth, below which an image
 
 @dataclass(frozen=True)
 class LineSightings:
-    """Points seen by cameras, each at its own time.
+    """Points seen by cameras, each at its own time."""
 
-    Attributes:
-        cameras: ``(*batch, views, 3, 4)``.
-        x: ``(*batch, views, n, 2)`` finite.
-        weights: ``(*batch, views, n)``.
-        unit: ``(*batch, views, n)``, the coordinates of x per pixel.
-    """
-
-    cameras: Tensor
-    x: Tensor
-    weights: Tensor
-    unit: Tensor
+    cameras: Tensor  # ``(*batch, views, 3, 4)``
+    x: Tensor  # ``(*batch, views, n, 2)`` finite
+    weights: Tensor  # ``(*batch, views, n)``
+    unit: Tensor  # ``(*batch, views, n)``, the coordinates of x per pixel
 
     def rays(self) -> Tensor:
         """The rows :math:`x^T M` that a line through the ray of x fulfils, of norm 1 times the root of the weight,
@@ -55,11 +48,7 @@ class LineSightings:
 
 
 def normalized(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[LineSightings, Tensor, Tensor]:
-    """Images about 0 and of size 1, in a world in which the stacked cameras are orthonormal.
-
-    Returns:
-        the sightings, the similarities of the images ``(*batch, views, 3, 3)``, and the way back to the world ``(*batch, 4, 4)``.
-    """
+    """Images about 0 and of size 1, in a world in which the stacked cameras are orthonormal."""
     known = (weights > 0)[..., None]
     x = torch.where(known, x, 0.0)
     cameras = torch.where(cameras.isfinite().flatten(-2).all(-1)[..., None, None], cameras, 0.0)
@@ -95,17 +84,8 @@ class FoundLines:
 
 
 def image_distances(data: LineSightings, lines: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Weighted distances of the points from the image lines, px, and their derivatives in the image lines.
-
-    .. math:: r = x^T l / \|l_{1:2}\|, \qquad l = M L.
-
-    Args:
-        data: ``n`` points.
-        lines: ``(*batch, n, 6)``.
-
-    Returns:
-        ``(*batch, views, n)`` and ``(*batch, views, n, 3)``.
-    """
+    r"""Weighted distances of the points from the image lines, px, and their derivatives in the image lines. lines
+    ``(*batch, n, 6)`` -> ``(*batch, views, n)``."""
     image = torch.einsum("...vik,...nk->...vni", line_camera(data.cameras), lines)
     # a line through the centre of a camera has no image there
     size = image[..., :2].norm(dim=-1).clamp(min=FLAT)
@@ -146,17 +126,11 @@ def best_points(data: LineSightings, starts: Tensor) -> FoundLines:
 
 @dataclass(frozen=True)
 class Surface(LeastSquares):
-    """Least squares on a surface of unit vectors ``(*batch, n, k)``: steps along it, then back to the nearest of its points.
+    """Least squares on a surface of unit vectors ``(*batch, n, k)``: steps along it, then back to the nearest of its points."""
 
-    Attributes:
-        measure: residuals ``(*batch, n, rows)`` of vectors and their derivative.
-        normals: orthonormal directions off the surface, ``(*batch, n, constraints, k)``.
-        nearest: the nearest point of the surface.
-    """
-
-    measure: Callable[[Tensor], tuple[Tensor, Tensor]]
-    normals: Callable[[Tensor], Tensor]
-    nearest: Callable[[Tensor], Tensor]
+    measure: Callable[[Tensor], tuple[Tensor, Tensor]]  # residuals ``(*batch, n, rows)`` of vectors and their derivative
+    normals: Callable[[Tensor], Tensor]  # orthonormal directions off the surface, ``(*batch, n, constraints, k)``
+    nearest: Callable[[Tensor], Tensor]  # the nearest point of the surface
 
     def evaluate(self, theta: Tensors) -> Iterate:
         """With gradient, Gauss-Newton matrix and its trace along the surface."""
@@ -240,19 +214,7 @@ class Adjustment(LeastSquares):
 
 
 def adjust(data: LineSightings, lines: Tensor) -> LineSightings:
-    r"""Cameras and lines of least distances of the points from the images of the lines.
-
-    With :math:`l = M(P) L` and :math:`g = \partial r / \partial l` the derivative of a distance in the camera is
-    :math:`[g]_\times P [L]`; along the collineations of space and the scales of the cameras, which change nothing, the damping
-    holds it.
-
-    Args:
-        data: normalized sightings, cameras to start from.
-        lines: ``(*batch, n, 6)`` on the Klein quadric.
-
-    Returns:
-        The sightings with the best cameras, each of norm 1.
-    """
+    r"""Cameras and lines of least distances of the points from the images of the lines. lines ``(*batch, n, 6)``."""
     problem = Adjustment(data)
     return replace(data, cameras=minimize(problem, problem.evaluate((data.cameras, lines)), ADJUSTMENT).theta[0])
 

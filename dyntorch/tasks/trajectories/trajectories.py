@@ -46,28 +46,15 @@ ENDED = torch.tensor([Status.OK, Status.TOO_FEW, Status.DEGENERATE, Status.AMBIG
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectories(Outcome):
-    """Result of :func:`triangulate_trajectories`.
+    """Result of :func:`triangulate_trajectories`."""
 
-    Attributes:
-        lines: ``(*batch, n, 6)`` Pluecker coordinates, order 01, 02, 03, 12, 13, 23, of norm 1, the largest positive; 0 where the
-            status says so.
-        second: ``(*batch, n, 6)`` the other solution where the status is ``TWO_FOLD``, otherwise 0; its points are
-            ``points_on_lines(cameras, x, second)``.
-        points: ``(*batch, views, n, 3)`` where the point was at each view, in the world of the cameras; 0 at views that miss it.
-        residual: ``(*batch, n)`` RMS distance of the points from the image lines (``STATIC``: from the image point), px.
-        uncertainty: ``(*batch, n)`` expected error of the line, as a unit vector with normalized cameras; 1 = nothing known.
-        sigma: ``(*batch,)`` noise of one image coordinate, px: as given, or as the residuals of all lines show.
-        kinds: ``(*batch, n)`` of :class:`LineStatus` values.
-        status: ``(*batch, n)``, of every line.
-    """
-
-    lines: Tensor
-    second: Tensor
-    points: Tensor
-    residual: Tensor
-    uncertainty: Tensor
-    sigma: Tensor
-    kinds: Tensor
+    lines: Tensor  # ``(*batch, n, 6)`` Pluecker coordinates, order 01, 02, 03, 12, 13, 23, of norm 1, the largest positive
+    second: Tensor  # ``(*batch, n, 6)`` the other solution where the status is ``TWO_FOLD``, otherwise 0
+    points: Tensor  # ``(*batch, views, n, 3)`` where the point was at each view, in the world of the cameras
+    residual: Tensor  # ``(*batch, n)`` RMS distance of the points from the image lines (``STATIC``: from the image point), px
+    uncertainty: Tensor  # ``(*batch, n)`` expected error of the line, as a unit vector with normalized cameras; 1 = nothing known
+    sigma: Tensor  # ``(*batch,)`` noise of one image coordinate, px: as given, or as the residuals of all lines show
+    kinds: Tensor  # ``(*batch, n)`` of :class:`LineStatus` values
 
     TASK = "triangulate_trajectories"
 
@@ -269,16 +256,10 @@ SIX = GrassmannTensor(5, (1,) * 6, dual=True)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TrajectoryCameras(Outcome):
-    """Result of :func:`trajectory_cameras`.
+    """Result of :func:`trajectory_cameras`."""
 
-    Attributes:
-        cameras: ``(*batch, 6, 3, 4)`` of norm 1, up to one collineation of space; 0 where the status says that there are none.
-        trajectories: lines and points in the same frame.
-        status: ``(*batch,)``, that of the tensor.
-    """
-
-    cameras: Tensor
-    trajectories: Trajectories
+    cameras: Tensor  # ``(*batch, 6, 3, 4)`` of norm 1, up to one collineation of space; 0 where the status says that there are none
+    trajectories: Trajectories  # lines and points in the same frame
 
     TASK = "trajectory_cameras"
 

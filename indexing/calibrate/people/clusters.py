@@ -9,29 +9,7 @@ from indexing.calibrate.people.tracklets import Booleans, Floats, Integers
 
 
 def clustered(scores: Floats, conflicts: Booleans, options: AssociationOptions, begins: Floats | None = None) -> Integers:
-    """Correlation clustering with conflicts:
-
-    .. math:: \\max_z \\sum_{p < q} [z_p = z_q]\\, s_{pq} \\quad\\text{where no two with } z_p = z_q \\text{ conflict.}
-
-    Starts by joining the two groups with most evidence between them, again and again, then lets pieces, and all that are in
-    their way, change places between two groups as long as the sum rises; and two groups exchange all that begins after a moment.
-
-    Args:
-        scores: ``(n, n)`` symmetric, nats for being one person.
-        conflicts: ``(n, n)`` symmetric, both cannot be.
-        options: every number that decides.
-        begins: ``(n,)`` when each piece begins, on one clock; None: nobody knows.
-
-    Returns:
-        ``(n,)`` labels from 0, groups of most evidence first.
-
-    Example:
-        >>> s = np.array([[0, 0, 5, 1], [0, 0, 1, 4], [5, 1, 0, 0], [1, 4, 0, 0.0]])
-        >>> c = np.zeros((4, 4), dtype=bool)
-        >>> c[0, 1] = c[1, 0] = c[2, 3] = c[3, 2] = True
-        >>> clustered(s, c, AssociationOptions()).tolist()
-        [0, 1, 0, 1]
-    """
+    """Correlation clustering with conflicts: scores ``(n, n)``, conflicts ``(n, n)``, begins ``(n,)`` -> ``(n,)``."""
     labels = _joined(scores, conflicts)
     for _ in range(options.clusters.sweeps):
         labels = _improved(scores, conflicts, labels, options)
@@ -112,11 +90,7 @@ def _blocked(conflicts: Booleans, labels: Integers, piece: int, other: int) -> b
 
 
 def exchanged(scores: Floats, conflicts: Booleans, labels: Integers, piece: int, other: int) -> tuple[Integers, float]:
-    """Labels after a piece went to another group, those in conflict with it to its own, those with these back, and so on.
-
-    Returns:
-        the labels, and the nats that are gained.
-    """
+    """Labels after a piece went to another group, those in conflict with it to its own, those with these back, and so on."""
     own = int(labels[piece])
     within = np.flatnonzero((labels == own) | (labels == other))
     local = labels[within] == other
@@ -138,11 +112,7 @@ def exchanged(scores: Floats, conflicts: Booleans, labels: Integers, piece: int,
 
 
 def _crossed(scores: Floats, conflicts: Booleans, labels: Integers, begins: Floats, options: AssociationOptions) -> Integers | None:
-    """Labels after the exchange of what two groups are from a moment on that gains most; None where none gains.
-
-    Of groups with first parts :math:`P_1, Q_1` and second parts :math:`P_2, Q_2` it gains
-    :math:`s(P_1, Q_2) + s(Q_1, P_2) - s(P_1, P_2) - s(Q_1, Q_2)`; an empty part makes of two groups one, or the other way round.
-    """
+    """Labels after the exchange of what two groups are from a moment on that gains most; None where none gains."""
     labels = _compact(labels)
     found, most = None, options.clusters.gain
     groups = int(labels.max()) + 1 if len(labels) else 0

@@ -19,16 +19,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PieceView:
-    """A camera whose detections are sorted by pieces.
-
-    Args:
-        seen: the detections.
-        pieces: how they are cut.
-        places: ``(frames, slots, joints, 2)`` px; a piece stays in one slot.
-        trust: ``(frames, slots, joints)``.
-        piece: ``(frames, slots)``, -1 = empty.
-        track: ``(frames, slots)`` where the detection is in ``seen``.
-    """
+    """A camera whose detections are sorted by pieces. places ``(frames, slots, joints, 2)``, trust
+    ``(frames, slots, joints)``, piece ``(frames, slots)``, track ``(frames, slots)``."""
 
     seen: CameraSightings
     pieces: Tracklets
@@ -71,11 +63,7 @@ def view(seen: CameraSightings, pieces: Tracklets) -> PieceView:
 
 
 def seen_at(one: PieceView, times: Floats, options: AssociationOptions) -> tuple[Floats, Floats, Integers]:
-    """What a camera saw at any times of its clock: linear between frames, the nearest frame where a piece has no other.
-
-    Returns:
-        places ``(T, slots, joints, 2)``, trust ``(T, slots, joints)`` and pieces ``(T, slots)``.
-    """
+    """What a camera saw at any times of its clock: linear between frames, the nearest frame where a piece has no other."""
     last = len(one.times) - 1
     after = np.clip(np.searchsorted(one.times, times), min(1, last), last)
     before = np.maximum(after - 1, 0)
@@ -97,15 +85,7 @@ def seen_at(one: PieceView, times: Floats, options: AssociationOptions) -> tuple
 
 @dataclass(frozen=True, eq=False)
 class Relation:
-    """How camera b relates to camera a.
-
-    Args:
-        offset, rate: b's clock = rate * a's clock + offset, seconds.
-        fundamental: ``(3, 3)``, x_b^T F x_a = 0.
-        sigma: px, of the distances of the same person.
-        shift: where the clock comes from a comparison, what that says.
-        held: the fundamental matrix is known, and no fit changes it.
-    """
+    """How camera b relates to camera a. fundamental ``(3, 3)``."""
 
     offset: float
     rate: float
@@ -117,15 +97,8 @@ class Relation:
 
 @dataclass(frozen=True, eq=False)
 class CommonMoments:
-    """What both cameras saw at the same times: those of the first camera's frames.
-
-    Args:
-        a, b: places ``(T, slots, joints, 2)`` px.
-        trust_a, trust_b: ``(T, slots, joints)``.
-        piece_a, piece_b: ``(T, slots)``.
-        fps: of a.
-        spread: px, how far two people usually are from each other's epipolar lines.
-    """
+    """What both cameras saw at the same times: those of the first camera's frames. a, b ``(T, slots, joints, 2)``, trust_a,
+    trust_b ``(T, slots, joints)``, piece_a, piece_b ``(T, slots)``."""
 
     a: Floats
     b: Floats
@@ -140,11 +113,7 @@ class CommonMoments:
 def common(
     a: PieceView, b: PieceView, offset: float, rate: float, options: AssociationOptions, most: int | None = None
 ) -> CommonMoments:
-    """Both cameras at the frames of the first one, as far as the second one runs.
-
-    Args:
-        most: frames that are taken at most, evenly.
-    """
+    """Both cameras at the frames of the first one, as far as the second one runs."""
     moments = rate * a.times + offset
     margin = options.geometry.nearest / b.seen.fps
     rows = np.flatnonzero((moments >= b.times[0] - margin) & (moments <= b.times[-1] + margin))
@@ -156,10 +125,7 @@ def common(
 
 
 def distances(fundamental: Floats, a: Floats, b: Floats) -> Floats:
-    """Sampson distances ``(T, slots_a, slots_b, joints)`` px of everybody from everybody; NaN where one is not seen.
-
-    .. math:: x_b^T F x_a / \\sqrt{(F x_a)_1^2 + (F x_a)_2^2 + (F^T x_b)_1^2 + (F^T x_b)_2^2}
-    """
+    """Sampson distances ``(T, slots_a, slots_b, joints)`` px of everybody from everybody; NaN where one is not seen."""
     of_a = a @ fundamental[:, :2].T + fundamental[:, 2]  # lines in b
     of_b = b @ fundamental[:2] + fundamental[2]  # lines in a
     square_a, square_b = np.square(of_a[..., :2]).sum(-1), np.square(of_b[..., :2]).sum(-1)
@@ -168,12 +134,7 @@ def distances(fundamental: Floats, a: Floats, b: Floats) -> Floats:
 
 
 def evidence(relation: Relation, both: CommonMoments, options: AssociationOptions) -> Floats:
-    """Nats for being the same person, ``(T, slots_a, slots_b)``; 0 where nothing can be compared.
-
-    A joint at distance r says :math:`\\log p_3(r / \\sigma) / \\sigma - \\log p_1(r / S) / S`: Student's t with 3 degrees of
-    freedom for the same person, Cauchy's with the usual spread S of other people.  Joints of one body and frames of one moment are
-    not independent: they count as ``options.geometry.joints`` and one in ``options.geometry.lasting`` seconds.
-    """
+    """Nats for being the same person, ``(T, slots_a, slots_b)``; 0 where nothing can be compared."""
     return _evidence_of(distances(relation.fundamental, both.a, both.b), relation.sigma, both, options)
 
 
@@ -205,16 +166,8 @@ def fitted(
     options: AssociationOptions,
     most: int | None = None,
 ) -> Relation | None:
-    """The relation with the fundamental matrix and sigma of those who are the same, by reweighted least squares.
-
-    Args:
-        matched: ``(pieces_a, pieces_b)`` bool.
-        rounds: steps.
-        most: points at most, evenly.
-
-    Returns:
-        None where too few points are the same.
-    """
+    """The relation with the fundamental matrix and sigma of those who are the same, by reweighted least squares. matched
+    ``(pieces_a, pieces_b)``."""
     import torch
 
     import dyntorch
@@ -267,14 +220,7 @@ def _sampson(fundamental: Floats, x1: Floats, x2: Floats) -> tuple[Floats, Float
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A relation with who is who by it.
-
-    Args:
-        relation: clock and geometry.
-        score: nats for everybody who was matched.
-        explained: of the frames of people that could have a partner, the share that has one.
-        size: px, of a body.
-    """
+    """A relation with who is who by it."""
 
     relation: Relation
     score: float
@@ -362,11 +308,7 @@ def _alone(one: PieceView, piece: int) -> tuple[Floats, Floats, Floats]:
 def compared(
     a: tuple[Floats, Floats, Floats], b: tuple[Floats, Floats, Floats], options: AssociationOptions, quick: bool = False
 ) -> Shift | None:
-    """:func:`dyntorch.synchronize` of times, places ``(frames, n, 2)`` and trust; None where it takes neither.
-
-    Args:
-        quick: looks for no lens distortion, drift, or weak perspective.
-    """
+    """:func:`dyntorch.synchronize` of times, places ``(frames, n, 2)`` and trust; None where it takes neither."""
     import torch
 
     import dyntorch
@@ -396,11 +338,7 @@ def synchronized(a: PieceView, b: PieceView, offset: float, rate: float, options
 
 
 def relate(a: PieceView, b: PieceView, options: AssociationOptions, clock: tuple[float, float] | None = None) -> Hypothesis | None:
-    """The relation of two cameras that explains most people, or None where there is none.
-
-    Args:
-        clock: offset and rate where they are known.
-    """
+    """The relation of two cameras that explains most people, or None where there is none."""
     how = options.geometry
     best: Hypothesis | None = None
     for start in unsynchronized(a, b, options) if clock is None else synchronized(a, b, *clock, options):

@@ -20,14 +20,8 @@ Booleans = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class CameraSightings:
-    """One camera: all detections of all frames.
-
-    Args:
-        name: of the camera.
-        times: ``(frames,)`` seconds of its own clock.
-        places: ``(frames, tracks, joints, 2)`` px, NaN = not seen.
-        trust: ``(frames, tracks, joints)`` from 0 to 1, 0 where not seen.
-    """
+    """One camera: all detections of all frames. times ``(frames,)``, places ``(frames, tracks, joints, 2)``, trust
+    ``(frames, tracks, joints)``."""
 
     name: str
     times: Floats
@@ -41,13 +35,7 @@ class CameraSightings:
 
 
 def sightings(clips: Sequence[Clip], name: str, joints: Sequence[int] | None = None) -> CameraSightings:
-    """The people of a camera on the common grid of its frames.
-
-    Args:
-        clips: one per track, times on the camera's clock.
-        name: of the camera.
-        joints: numbers of those that are kept, in this order; all by default.
-    """
+    """The people of a camera on the common grid of its frames."""
     times = np.unique(np.concatenate([clip.times for clip in clips]))
     chosen = list(range(clips[0].joints.shape[1])) if joints is None else list(joints)
     places = np.full((len(times), len(clips), len(chosen), 2), np.nan)
@@ -62,14 +50,7 @@ def sightings(clips: Sequence[Clip], name: str, joints: Sequence[int] | None = N
 
 @dataclass(frozen=True, eq=False)
 class Tracklets:
-    """Pieces of tracks of one camera.
-
-    Args:
-        number: ``(frames, tracks)`` which piece a detection belongs to; -1 nobody is there.
-        starts, ends: ``(pieces,)`` first and last frame.
-        links: ``(pieces, pieces)``: evidence in nats that the second goes on where the first ends; 0 = nothing known.
-        size: px, the usual diagonal of a body.
-    """
+    """Pieces of tracks of one camera. number ``(frames, tracks)``, starts, ends ``(pieces,)``, links ``(pieces, pieces)``."""
 
     number: Integers
     starts: Integers
@@ -103,19 +84,7 @@ class _End:
 
 
 def cut(seen: CameraSightings, options: AssociationOptions) -> Tracklets:
-    """Follow everybody from frame to frame by the joints, and cut where two people could be exchanged.
-
-    Somebody who is at :math:`x_k` in one frame is near :math:`x_k + v` in the next.  Of two people, who is who is clear where the
-    exchanged pairs cost more by ``options.pieces.clear``, with the cost of a pair
-
-    .. math:: c = m \\;\\mathrm{mean}_k\\; 2 \\log\\bigl(1 + |x'_k - x_k - v|^2 / 3 s^2\\bigr),
-
-    m joints' worth of independent evidence and s the usual step.  Where it is not clear, both pieces end.
-
-    Args:
-        seen: the camera.
-        options: every number that decides.
-    """
+    """Follow everybody from frame to frame by the joints, and cut where two people could be exchanged."""
     how = options.pieces
     there = (seen.trust > 0).sum(2) >= min(how.seen, seen.places.shape[2])
     number = np.full(there.shape, -1, dtype=np.int64)

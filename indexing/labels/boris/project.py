@@ -30,11 +30,7 @@ SCORE = re.compile(r"score (?P<score>-?\d[\d.e+-]*)(?:; (?P<comment>.*))?", re.D
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry of an observation.
-
-    Args:
-        key: subject, behaviour and modifiers: what START and STOP have in common.
-    """
+    """An entry of an observation."""
 
     time: float
     key: tuple[str, str, str]
@@ -52,11 +48,7 @@ class Interval:
 
 
 def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
-    """Read a project.
-
-    Raises:
-        ValueError: naming observation and event: a time, a code or a subject is none; or no observation is of the recording.
-    """
+    """Read a project."""
     out = Gathering(asked, "boris")
     observations = {str(name): _object(asked, value, f"observation {name!r}") for name, value in data["observations"].items()}
     called = _names(observations)
@@ -228,12 +220,7 @@ def joined(start: str, stop: str) -> str:
 
 
 def scored(comment: str) -> tuple[str, float | None]:
-    """A comment of ours without the score that it begins with, and the score.
-
-    Example:
-        >>> scored("score 4.4; from behind"), scored("from behind")
-        (('from behind', 4.4), ('from behind', None))
-    """
+    """A comment of ours without the score that it begins with, and the score."""
     found = SCORE.fullmatch(comment)
     number = parse_seconds(found["score"]) if found else math.nan
     return (found["comment"] or "", number) if found and math.isfinite(number) else (comment, None)
@@ -246,11 +233,8 @@ def _offset(out: Gathering, observation: Mapping[str, Any], where: str) -> float
 
 
 def clock(out: Gathering, observation: Mapping[str, Any], where: str, mine: set[str] | None) -> list[Span]:
-    """When which file is played, on the clock of the first player: those of the player that plays the recording, else of the first.
-
-    Raises:
-        ValueError: files are played after each other, and the project does not have their lengths.
-    """
+    """When which file is played, on the clock of the first player: those of the player that plays the recording, else of the
+    first."""
     players = _players(observation)
     if not players:
         return []

@@ -42,13 +42,7 @@ REMEDY = "export the events again from BORIS, or give its project (.boris)"
 
 @dataclass
 class Sitting:
-    """An observation.
-
-    Args:
-        files: of its first player, in order, as far as the table says; beside: those of other players.
-        lengths: of them, in seconds; as many as files where they are known.
-        machine: whether a program wrote it.
-    """
+    """An observation."""
 
     name: str
     offset: float = 0.0
@@ -63,11 +57,7 @@ class Sitting:
 
 
 def read(rows: list[Row], asked: Request) -> LabelFile:
-    """Read an exported table.
-
-    Raises:
-        ValueError: naming row and column; or it does not say where the recording begins.
-    """
+    """Read an exported table."""
     out = Gathering(asked, "boris_tables")
     at, columns, modifiers = _header(asked, rows)
     above = {cells[0].strip().lower(): cells[1].strip() for _, cells in rows[:at] if len(cells) > 1 and cells[0].strip()}

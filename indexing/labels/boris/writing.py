@@ -36,11 +36,7 @@ REMEDY = "save it again in BORIS, or write to another file"
 
 @dataclass
 class Draft:
-    """A project while it is written.
-
-    Args:
-        codes: the behaviour of each label, and whether it lasts.
-    """
+    """A project while it is written."""
 
     target: Target
     project: dict[str, Any]
@@ -49,17 +45,7 @@ class Draft:
 
 
 def write(labels: Sequence[Label], target: Target) -> list[str]:
-    """Write a project, or observations into one.
-
-    Args:
-        labels: each with its media.
-
-    Returns:
-        what is not kept.
-
-    Raises:
-        ValueError: the project that is there cannot be read, or somebody's observation has the name.
-    """
+    """Write a project, or observations into one."""
     text = "" if target.into is None else read_text(target.into, REMEDY)
     project = _empty() if target.into is None else _checked(target.into, parse_json(target.into, text, REMEDY))
     draft = Draft(target, project)
@@ -209,11 +195,7 @@ def _observations(draft: Draft, labels: Sequence[Label]) -> None:
 
 
 def _kept(target: Target, before: Mapping[str, Any], replaced: Sequence[list[str]]) -> dict[str, Any]:
-    """The observations that stay: all but those that dyntorch wrote of these files.
-
-    Raises:
-        ValueError: somebody has changed what would be replaced.
-    """
+    """The observations that stay: all but those that dyntorch wrote of these files."""
     old = {
         name: one
         for name, one in before.items()

@@ -22,12 +22,7 @@ from indexing.opening import clipped, error, listed, read_bytes, repeated, shown
 
 
 def read(_: Any, asked: Request) -> LabelFile:
-    """Read an ELAN file.
-
-    Raises:
-        ValueError: naming tier, annotation and slot: a reference leads nowhere or in a circle, a tier or an id is there twice, or a
-            time is none.
-    """
+    """Read an ELAN file."""
     out = Gathering(asked, "elan")
     parts = TierParts(asked)
     root, _ = parse_xml(asked.path, read_bytes(asked.path), parts.take, asked.options)
@@ -61,10 +56,7 @@ def read(_: Any, asked: Request) -> LabelFile:
 
 # ---- what the file has ---------------------------------------------------------------------------------------------------
 class TierParts:
-    """Time slots and annotations, taken out of the tree while it is read: elements of a million would take gigabytes.
-
-    ``slots`` are the milliseconds of each time slot, None where it has none, in order of the file.
-    """
+    """Time slots and annotations, taken out of the tree while it is read: elements of a million would take gigabytes."""
 
     def __init__(self, asked: Request) -> None:
         self.asked = asked

@@ -17,15 +17,7 @@ MACHINE = (
 
 @dataclass(slots=True, eq=False)
 class Annotation:
-    """An annotation.
-
-    Args:
-        name: its id.
-        slots: of its begin and end, where it has its own.
-        parent, previous: ids, where it has the time of another annotation, alone or together with that before it.
-        entry: of a controlled vocabulary, where its value is one.
-        time: begin and end in milliseconds on the clock of the document, as soon as they are known.
-    """
+    """An annotation."""
 
     name: str
     value: str

@@ -127,18 +127,7 @@ class Document:
 
 
 def write(labels: Sequence[Label], target: Target) -> list[str]:
-    """Write an ELAN file, or tiers into one.
-
-    Args:
-        labels: of one recording.
-
-    Returns:
-        what is not kept.
-
-    Raises:
-        ValueError: labels of several recordings; or the file that is there cannot be read, is of another recording, or has
-            somebody's tier of the name.
-    """
+    """Write an ELAN file, or tiers into one."""
     if len(target.media) > 1:
         said = f"an ELAN file is of one recording, and these labels are of {len(target.media)} ({listed(target.media)})"
         raise error(target.path, said, "write a file for each")
