@@ -11,10 +11,44 @@ from tests.battery.cases import CASES
 from tests.battery.properties import CHECKS
 from tests.battery.shape_cases import LIFTED_CASES, SHAPE_CASES
 
-PAIRS = [pytest.param(check, case, id=f"{check.__name__}-{case!r}") for check, applies in CHECKS for case in CASES if applies(case)]
+DIFFERENT = {
+    "FundamentalMatrix", "Collineation(2)", "DualHomographyTensor(lines)", "JoinTensor", "MinimalJoinTensor",
+    "ConstantVelocityTensor(image)", "SegmentationMatrix", "GrassmannTensor(4,(2,2,1))", "DynamicTensor(2,4,2)",
+}  # fmt: skip
+"""Cases that differ in code: the others go the same ways with other shapes."""
+ON_ALL = {
+    "tensor_is_the_null_space_of_the_brute_force_matrix", "exact_matches_give_the_true_motion",
+    "motion_of_composed_tensor_is_the_motion", "change_of_coordinates_commutes_with_exact_fit",
+}  # fmt: skip
+"""What catches a wrong row, factor, sign or order of views: fast, and run on every case."""
+STATISTICS = {"covariance_is_calibrated", "neighbours_do_not_matter", "an_accelerator_agrees"}
+"""Draws, or the whole of an invariant done twice: slow on every case."""
+SEARCHES = {
+    "robust_fit_survives_outliers", "hostile_scales_stay_finite", "refinement_never_raises_the_distances",
+    "refinement_finds_a_stationary_point",
+}  # fmt: skip
+"""Iterations: fast on the two smallest cases."""
+SMALLEST = {"FundamentalMatrix", "Collineation(2)"}
 
 
-@pytest.mark.parametrize(("check", "case"), PAIRS)
+def is_fast(check: str, case: str) -> bool:
+    """Whether `make test` runs a property on a case; `make test-all` runs every property on every case."""
+    if check in STATISTICS:
+        return False
+    return check in ON_ALL or case in (SMALLEST if check in SEARCHES else DIFFERENT)
+
+
+PAIRS = [
+    pytest.param(
+        check, case, id=f"{check.__name__}-{case!r}", marks=() if is_fast(check.__name__, repr(case)) else pytest.mark.slow
+    )
+    for check, applies in CHECKS
+    for case in CASES
+    if applies(case)
+]
+
+
+@pytest.mark.parametrize(("check", "case"), list(pairs()))
 def test_property(check, case):
     check(case)
 
@@ -37,3 +71,10 @@ def test_every_public_invariant_has_a_case():
 
 def test_cases_are_different():
     assert len({repr(case) for case in CASES}) == len(CASES)
+
+
+def test_tiers_name_what_there_is():
+    assert {repr(case) for case in CASES} >= DIFFERENT | SMALLEST
+    assert {check.__name__ for check, _ in CHECKS} >= ON_ALL | STATISTICS | SEARCHES
+    fast = {check for check in (check.__name__ for check, _ in CHECKS) if any(is_fast(check, case) for case in DIFFERENT)}
+    assert len(fast) >= len(CHECKS) - len(STATISTICS)

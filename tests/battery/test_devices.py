@@ -66,6 +66,7 @@ def same(here: Any, there: Any, path: str, tolerance: float) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("verb", VERBS, ids=repr)
 def test_a_verb_gives_the_same_there(verb: Verb, device: str) -> None:

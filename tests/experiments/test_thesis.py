@@ -7,12 +7,19 @@ import pytest
 from experiments.thesis.checked import CHAPTERS
 from experiments.thesis.statements import Chapter, Finding, Statement
 
-STATEMENTS = [(chapter, statement) for chapter in CHAPTERS for statement in chapter.statements]
+SLOW = {("3", "ambiguity"), ("6", "noise"), *(("7", name) for name in ("synchronization", "planar", "outliers", "reconstruction"))}
+"""Statements on noise and on whole tasks: chapter and measurement."""
 
 
-@pytest.mark.parametrize(
-    ("chapter", "statement"), STATEMENTS, ids=[f"{c.number}-{s.measure.__name__}-{k}" for k, (c, s) in enumerate(STATEMENTS)]
-)
+def statements():
+    every = [(chapter, statement) for chapter in CHAPTERS for statement in chapter.statements]
+    for number, (chapter, statement) in enumerate(every):
+        name = statement.measure.__name__
+        slow = pytest.mark.slow if (str(chapter.number), name) in SLOW else ()
+        yield pytest.param(chapter, statement, id=f"{chapter.number}-{name}-{number}", marks=slow)
+
+
+@pytest.mark.parametrize(("chapter", "statement"), list(statements()))
 def test_a_statement_comes_out_as_the_page_says(chapter: Chapter, statement: Statement) -> None:
     *_, measured, verdict = statement.row()
     assert verdict != "FAILS", f"{statement.place}: {statement.says}: {measured}"

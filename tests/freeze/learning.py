@@ -203,6 +203,20 @@ index evaluate solid.npz --camera virtual --azimuth 0,90 --leave-out subject
 index evaluate people.npz --leave-out subject
 index evaluate films.npz --leave-out subject
 demo --people 2 --out demo
+index scan week/monday.npz week/wednesday.npz week/friday.npz -m moves.safetensors --truth week.csv --report week-report
+index suggest session.npz --write parts.csv
+index scan session.npz -m moves.safetensors --write found.csv
+segment street.csv --bodies 3 --size 1242 375 --out street
+calibrate cam1 cam2 cam3 --size 1920x1080 --fps 30 --out calib
+convert squat.json lunge.json -o two.npz
+convert squat.json -o squat.trc --units px
+archive add lab lesson.npz session.npz week --workers 1
+archive info lab
+archive search lab squat.json -k 5 --report found
+archive find lab -m moves.safetensors --report acted
+archive verify lab
+archive remove lab session.npz
+archive search lab missing.json
 count
 count homography --moving 30 --static 2
 count constant_velocity_3d --static 100 --camera fixed
@@ -229,8 +243,22 @@ count homography --k 3
 fly
 index
 align --help
+segment --help
+reconstruct --help
 sync --help
+calibrate --help
+convert --help
+index fit --help
 index scan --help
+index evaluate --help
+index suggest --help
+archive --help
+archive add --help
+archive search --help
+pose --help
+calibrate cam1 cam2 --size 12
+convert squat.json -o squat.nothing
+index suggest nowhere.npz
 """.splitlines()
 
 
