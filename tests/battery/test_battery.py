@@ -38,14 +38,11 @@ def is_fast(check: str, case: str) -> bool:
     return check in ON_ALL or case in (SMALLEST if check in SEARCHES else DIFFERENT)
 
 
-PAIRS = [
-    pytest.param(
-        check, case, id=f"{check.__name__}-{case!r}", marks=() if is_fast(check.__name__, repr(case)) else pytest.mark.slow
-    )
-    for check, applies in CHECKS
-    for case in CASES
-    if applies(case)
-]
+def pairs():
+    for check, applies in CHECKS:
+        for case in filter(applies, CASES):
+            slow = () if is_fast(check.__name__, repr(case)) else pytest.mark.slow
+            yield pytest.param(check, case, id=f"{check.__name__}-{case!r}", marks=slow)
 
 
 @pytest.mark.parametrize(("check", "case"), list(pairs()))
