@@ -1,6 +1,6 @@
 """What else can be read off a video frame by frame: the same online warping, with other descriptors.  For comparison only.
 
-All look at the crop about what moves in the whole take (:mod:`indexing.sync.gray`; not causal, which favours them).
+All look at the crop about what moves in the whole take (:mod:`indexing.sync.brightness_features`; not causal, which favours them).
 
 *activity*: how much changes, in the second before: a curve, compared by correlation.
 *energy grid*: how much changes in each of 8 x 8 cells.  *HOG*: histograms of oriented gradients of what is not background.
@@ -25,7 +25,7 @@ from indexing.brightness.footage import Shrinker
 from indexing.brightness.library import VideoExemplars, library
 from indexing.brightness.sight import SMALLEST, described
 from indexing.brightness.stream import Warping
-from indexing.sync.gray import boxes, crop, inverse_root, motion, window_kernels
+from indexing.sync.brightness_features import boxes, crop, inverse_root, motion, window_kernels
 from indexing.sync.options import KernelOptions, SyncOptions
 from indexing.video import Chunk, track_points
 

@@ -38,7 +38,7 @@ from indexing import Clip
 from indexing.actors.textured import film
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.skeleton import COCO17
-from indexing.sync.gray import motion
+from indexing.sync.brightness_features import motion
 
 Method = Literal["ours", "whole image", "thesis kernel", "activity correlation", "energy grid", "HOG"]
 NAMES = {

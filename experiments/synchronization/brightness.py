@@ -34,7 +34,7 @@ from indexing.actors import ACTIONS, Person, stream
 from indexing.actors.textured import Frames, film
 from indexing.skeleton import Skeleton
 from indexing.sync.brightness import brightness_shift
-from indexing.sync.gray import motion
+from indexing.sync.brightness_features import motion
 from indexing.sync.options import Measure
 
 FPS = 30.0

@@ -20,8 +20,8 @@ from typing import Annotated
 import tyro
 
 import dyntorch as dyn
-from dyntorch.tasks.synchronize.measures import MEASURES
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.row_spaces import MEASURES
 from experiments.common.tables import Row, command, measured_on_one_thread
 from experiments.synchronization.data import Pair
 from experiments.synchronization.takes import Scene, drawn

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from dyntorch import Shift
 from experiments.benchmarks.interleaved import threads
 from experiments.common.tables import NoiseConfig, Row, command, measured
-from indexing.sync.listening import Sound
-from indexing.sync.sound import sound_shift
+from indexing.sync.sound import Sound, sound_shift
 
 Floats = NDArray[np.float64]
 HERTZ = 48_000  # at which sounds are made

@@ -15,7 +15,7 @@ from dyntorch.numerics import Message
 from indexing.calibrate.views import Size
 from indexing.opening import error, listed
 from indexing.sync.calibration import Lens, named_lenses
-from indexing.sync.takes import Take
+from indexing.sync.recordings import Take
 
 DIAGONAL = math.hypot(36.0, 24.0)
 PHOTOS = (".jpg", ".jpeg", ".tif", ".tiff")

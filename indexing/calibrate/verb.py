@@ -24,7 +24,7 @@ from indexing.calibrate.views import Joints, Size, View, check_cameras, check_ov
 from indexing.clip import Clip
 from indexing.joints import canonical
 from indexing.opening import listed
-from indexing.sync.takes import Take, find_cameras, take_of
+from indexing.sync.recordings import Take, find_cameras, take_of
 
 Progress = Callable[[str], None]
 NO_STATURE = Message("{arg:height} says nothing: nobody is seen from head to foot, so the scale stays unknown; give {arg:length}")

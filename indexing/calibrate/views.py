@@ -18,7 +18,7 @@ from indexing.joints import canonical, named
 from indexing.opening import listed
 from indexing.remarks import is_normalized, remarks_on, same_clips
 from indexing.skeleton import Skeleton, known
-from indexing.sync.takes import Take
+from indexing.sync.recordings import Take
 
 FloatArray = NDArray[np.float64]
 Size = tuple[int, int]

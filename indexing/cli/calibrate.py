@@ -20,7 +20,7 @@ from indexing.cli.inputs import Format, refuse_range
 if TYPE_CHECKING:
     from indexing.calibrate import CameraRig, Known
     from indexing.report.calibration import CalibrationReport
-    from indexing.sync.takes import Take
+    from indexing.sync.recordings import Take
 
 WORDS = flags(
     "fps", "size", "focal", "one_lens", "exif", "height", "length", "clocks", "rate", "max_shift", "person", "people",
@@ -86,7 +86,7 @@ class Calibrate:
             refuse_range(path)
         from indexing.files import manifest
         from indexing.report.calibration import CalibrationReport, check_folder_of, write_calibration
-        from indexing.sync.takes import find_cameras
+        from indexing.sync.recordings import find_cameras
 
         found = find_cameras([path.expanduser() for path in self.cameras])
         files = [self.calibration] if self.calibration is not None else []
@@ -163,7 +163,7 @@ class Calibrate:
         return sizes * ((cameras or 1) if len(sizes) == 1 else 1)
 
     def _read(self, found: dict[str, Path], watched: Watched) -> list[Take]:
-        from indexing.sync.takes import take_of
+        from indexing.sync.recordings import take_of
 
         options: dict[str, Any] = {"person": "auto" if self.person == "everyone" else self.person, "format": self.format}
         options |= {"min_confidence": self.min_confidence, "layout": self.layout, "by": "keypoints"}

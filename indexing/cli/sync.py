@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from indexing.report.sync import SyncReport
     from indexing.sync.files import Plan
     from indexing.sync.people import Pairing
+    from indexing.sync.pose2sim import Trial
+    from indexing.sync.recordings import By, Take
     from indexing.sync.synchronize import Method
-    from indexing.sync.takes import By, Take
-    from indexing.sync.trial import Trial
     from indexing.sync.trimming import CameraFilm
 
 WORDS = flags(
@@ -105,8 +105,8 @@ class Sync:
         self._check()
         for path in self.cameras:
             refuse_range(path)
-        from indexing.sync.takes import find_cameras
-        from indexing.sync.trial import trial_of, trials_in
+        from indexing.sync.pose2sim import trial_of, trials_in
+        from indexing.sync.recordings import find_cameras
 
         paths = [path.expanduser() for path in self.cameras]
         home = paths[0] if len(paths) == 1 and paths[0].is_dir() else None
@@ -214,7 +214,7 @@ class Sync:
         return [film_of(take) for take in takes if not take.spatial] if self.videos else None
 
     def _read(self, found: dict[str, Path], by: By, watched: Watched, trial: Trial | None = None) -> list[Take]:
-        from indexing.sync.takes import take_of
+        from indexing.sync.recordings import take_of
 
         rates = self._rates(len(found)) if trial is None or self.fps is not None else trial.rates()
         options: dict[str, Any] = {"person": self.person, "min_confidence": self.min_confidence, "by": by}
@@ -233,7 +233,7 @@ class Sync:
 
     def _mended(self, report: SyncReport, done: Any, trial: Trial | None = None) -> SyncReport:
         """The report, where clocks broke with what is found when they are mended."""
-        from indexing.sync.breaking import find_breaks
+        from indexing.sync.breaks import find_breaks
 
         if not self.breaks or self._method not in ("auto", "keypoints"):
             return report
@@ -339,7 +339,7 @@ class Sync:
 
 def _check_spatial(takes: list[Take], folder: Path | None, inputs: list[Path]) -> None:
     """Raise where there is more than one motion capture, or what is written of it would replace something."""
-    from indexing.sync.mocap import check_mocap
+    from indexing.sync.files import check_mocap
 
     spatial = [take for take in takes if take.spatial]
     if len(spatial) > 1:
@@ -351,19 +351,19 @@ def _check_spatial(takes: list[Take], folder: Path | None, inputs: list[Path]) -
 
 def _write_mocap(folder: Path, report: SyncReport) -> tuple[SyncReport, list[str]]:
     """``mocap-sync/``, if the data decide and its clock is not the reference itself, and what to say about it."""
-    from indexing.sync.mocap import FOLDER, drop_mocap, retimed, write_mocap
+    from indexing.sync.files import MOCAP_FOLDER, drop_mocap, retime_mocap, write_mocap
 
     spatial = [i for i, clock in enumerate(report.clocks) if clock.take.spatial]
     removed = drop_mocap(folder)
     if not report.ok or spatial in ([], [0]):
         why = "this one writes none" if report.ok else "this one does not decide"
-        return report, [f"{FOLDER} of an earlier run was removed, because {why}"] if removed else []
+        return report, [f"{MOCAP_FOLDER} of an earlier run was removed, because {why}"] if removed else []
     clock = report.clocks[spatial[0]]
-    one = retimed(clock.take, clock.offset, clock.rate)
+    one = retime_mocap(clock.take, clock.offset, clock.rate)
     if one is None:
         return report, [f"{clock.name} ended before number 0 of {report.reference.name}, so nothing is written of it"]
     notes = write_mocap(folder, one)
-    told = {"folder": f"{FOLDER}/{one.name}", "files": 1, "shift": one.first, "rest": one.rest, "repeated": 0}
+    told = {"folder": f"{MOCAP_FOLDER}/{one.name}", "files": 1, "shift": one.first, "rest": one.rest, "repeated": 0}
     told["left_out"] = one.first
     return dataclasses.replace(report, shifted={**report.shifted, spatial[0]: told}), notes
 
@@ -371,7 +371,7 @@ def _write_mocap(folder: Path, report: SyncReport) -> tuple[SyncReport, list[str
 def _write_poses(folder: Path, report: SyncReport, trial: bool) -> tuple[SyncReport, list[str]]:
     """``pose-sync/``, if the data decide, and what to say about it."""
     from indexing.sync.files import drop_poses, plan, write_poses
-    from indexing.sync.trial import numbers, shortest
+    from indexing.sync.pose2sim import numbers, shortest
 
     poses = {i: clock for i, clock in enumerate(report.clocks) if clock.take.kind == "keypoints" and not clock.take.spatial}
     if not (report.ok and poses):

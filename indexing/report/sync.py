@@ -19,10 +19,10 @@ from dyntorch.numerics import as_python, worded
 from indexing.clip import Clip
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 from indexing.report.page import Picture, markup, render, sentence, write_files
-from indexing.sync.breaking import Mended
+from indexing.sync.breaks import Mended
 from indexing.sync.notices import besides
 from indexing.sync.people import Pairing, joint_names, who
-from indexing.sync.takes import Take
+from indexing.sync.recordings import Take
 
 if TYPE_CHECKING:
     from dyntorch import Shift

@@ -1,7 +1,7 @@
 """Recordings on one clock, from files, clips, arrays and videos: keypoints, point tracks, or brightness alone.
 
-``synchronize`` holds the verb; ``takes`` reads what is given, ``people`` pairs the persons of two cameras, ``calibration`` and
-``files`` read and write what others' tools need, ``trial`` those of Pose2Sim, ``trimming`` cuts the videos; ``brightness`` compares
-videos without points, by the measurements of ``gray``, ``sound`` what ``listening`` hears in them; ``breaking`` mends clocks of
-cameras that lost frames.
+``synchronize`` is the verb; ``recordings`` reads what is given, ``people`` pairs the persons of two cameras.  ``brightness``
+compares videos without points by ``brightness_features``, ``sound`` what their microphones heard; ``breaks`` mends clocks of
+cameras that lost frames.  ``calibration``, ``files`` and ``pose2sim`` read and write what other tools need, ``trimming`` cuts
+the videos.
 """

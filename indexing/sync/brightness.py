@@ -13,7 +13,7 @@ from torch.nn.functional import max_pool1d
 from dyntorch import Shift
 from dyntorch.core import Notice, status_from
 from dyntorch.numerics import Message, check_options, on_cpu, one_thread
-from indexing.sync.gray import (
+from indexing.sync.brightness_features import (
     GrayTake,
     Region,
     Sampled,

@@ -1,8 +1,12 @@
-"""Keypoint files on one clock, as Pose2Sim's ``pose-sync`` has them: equal frame numbers are equal moments.
+"""Keypoint files and motion capture on one clock: equal frame numbers are equal moments, as Pose2Sim's ``pose-sync`` has them.
 
 Pose2Sim aligns cameras by copying the files under shifted frame numbers; a folder ``pose-sync`` beside ``pose`` is what its
 next step reads.  Here every frame number of the reference camera takes the nearest frame of each other camera: a shift by whole
 frames where the clocks run alike, and a frame repeated or left out now and then where they do not.
+
+Motion capture (``mocap-sync``) keeps its frames as they are, numbered from the camera's number 0: to interpolate would smooth what
+was measured.  Times of a TRC file are exact; a C3D file has but a rate and the number of its first frame, so that its frames are
+off by half a sample at most, which is said.  Analog channels and events stay in the original, whose offset is in ``sync.json``.
 """
 
 from __future__ import annotations
@@ -21,14 +25,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip
-from indexing.files import recover_folder, replace_folder
+from indexing.files import prepare, recover_folder, replace_folder, write_bytes
 from indexing.opening import error, parse_json, read_text
 from indexing.readers.detect import detect_json
 from indexing.readers.files import frame_number, load_json
-from indexing.sync.takes import Take
+from indexing.readers.markers import METRES
+from indexing.sync.recordings import Take
 
-FOLDER = "pose-sync"
+POSE_FOLDER = "pose-sync"
+
+
 NEAR = 0.5 + 1e-6  # frames: no other frame is nearer
+
+
 EMPTY = json.dumps({"version": 1.3, "people": []})  # a frame that shows nobody
 
 
@@ -77,18 +86,18 @@ def check_target(folder: Path, inputs: Sequence[Path]) -> None:
     Raises:
         ValueError: naming what is in the way.
     """
-    target = folder / FOLDER
+    target = folder / POSE_FOLDER
     same = [path for path in inputs if path.is_dir() and path.resolve() == folder.resolve()]
     if same:
         raise ValueError(f"{same[0]}: is an input, and files of the report among its frames would spoil it; choose another --out")
     inside = [path for path in inputs if target.resolve() in (path.resolve(), *path.resolve().parents)]
     if inside:
         raise ValueError(f"{inside[0]}: is an input, and {target} would be replaced; choose another folder for --out")
-    if target.exists() and not ours(folder):
+    if target.exists() and not owns_poses(folder):
         raise ValueError(f"{target}: is there, and not from this command; move it away, or choose another folder for --out")
 
 
-def ours(folder: Path) -> bool:
+def owns_poses(folder: Path) -> bool:
     """Whether an earlier run of this command wrote the folder's shifted files."""
     try:
         known = parse_json(folder, read_text(folder / "sync.json"), "")
@@ -99,9 +108,9 @@ def ours(folder: Path) -> bool:
 
 def write_poses(folder: Path, plans: Sequence[Plan], count: int | None = None) -> Path:
     """Write ``pose-sync/<camera>_json/`` for every camera: all of them, or nothing."""
-    target = folder / FOLDER
+    target = folder / POSE_FOLDER
     recover_folder(target)
-    building = folder / f".{FOLDER}-{secrets.token_hex(8)}.tmp"
+    building = folder / f".{POSE_FOLDER}-{secrets.token_hex(8)}.tmp"
     try:
         for one in (one for one in plans if len(one.rows)):
             _write_camera(building / folder_of(one.take), one, count)
@@ -117,8 +126,8 @@ def write_poses(folder: Path, plans: Sequence[Plan], count: int | None = None) -
 
 def drop_poses(folder: Path) -> bool:
     """Remove the shifted files of an earlier run, which a refusal has taken the ground from."""
-    target = folder / FOLDER
-    if not (target.is_dir() and ours(folder)):
+    target = folder / POSE_FOLDER
+    if not (target.is_dir() and owns_poses(folder)):
         return False
     shutil.rmtree(target)
     return True
@@ -189,3 +198,94 @@ def _flat(clip: Clip) -> list[list[float] | None]:
     trust = seen.astype(np.float64) if clip.confidence is None else np.asarray(clip.confidence, dtype=np.float64)
     table = np.where(seen[..., None], np.concatenate([clip.joints, trust[..., None]], axis=2), 0.0).reshape(len(clip), -1)
     return [row if there else None for row, there in zip(table.tolist(), np.asarray(seen.any(axis=1)).tolist(), strict=True)]
+
+
+MOCAP_FOLDER = "mocap-sync"
+
+
+@dataclass(frozen=True, eq=False)
+class RetimedMocap:
+    """Motion capture from the reference's number 0 on."""
+
+    take: Take
+    people: tuple[Clip, ...]
+    name: str
+    first: int
+    rest: float
+
+    @property
+    def frames(self) -> int:
+        """How many are kept."""
+        return self.take.count - self.first
+
+
+def retime_mocap(take: Take, offset: float, rate: float) -> RetimedMocap | None:
+    """Motion capture on the reference's clock; None where it ended before the reference's number 0."""
+    half = 0.5 / take.fps
+    kept = take.times >= offset - half
+    if not kept.any():
+        return None
+    first = int(np.argmax(kept))
+    c3d = take.path is not None and take.path.suffix.lower() == ".c3d"
+    begin = (float(take.times[first]) - offset) / rate
+    moved = -begin if c3d else 0.0  # its first frame is at number 0, whatever is left
+    return RetimedMocap(
+        take=take,
+        people=tuple(_retime_clip(clip, offset, rate, float(take.times[first]), moved, c3d) for clip in take.everyone),
+        name=f"{take.name}{'.c3d' if c3d else '.trc'}",
+        first=first,
+        rest=abs(moved),
+    )
+
+
+def _retime_clip(clip: Clip, offset: float, rate: float, since: float, more: float, millimetres: bool) -> Clip:
+    """A person on the reference's clock; in millimetres, as C3D files usually are, where the unit is known."""
+    kept = clip.times >= since - 1e-9
+    times = np.asarray((clip.times[kept] - offset) / rate + more, dtype=np.float64)
+    known = millimetres and clip.meta.get("units") == "m"
+    meta = {**clip.meta, "units": "mm"} if known else clip.meta
+    fps = None if clip.fps is None else clip.fps * rate
+    confidence = None if clip.confidence is None else clip.confidence[kept]
+    joints = clip.joints[kept] / (METRES["mm"] if known else 1.0)
+    return clip.replace(joints=joints, times=times, fps=fps, confidence=confidence, meta=meta)
+
+
+def write_mocap(folder: Path, one: RetimedMocap) -> list[str]:
+    """Write ``mocap-sync/NAME.trc`` or ``.c3d``, whole or not at all; what to know of it, a sentence each."""
+    from indexing.writers import encode
+
+    target = folder / MOCAP_FOLDER / one.name
+    data, notes = encode(one.people, target)
+    prepare(target.parent)
+    write_bytes(target, data)
+    if target.suffix == ".c3d":
+        notes.append("analog channels and events are left where they are")
+    return [f"{MOCAP_FOLDER}/{one.name}: {note}" for note in notes]
+
+
+def check_mocap(folder: Path, takes: Sequence[Path]) -> None:
+    """Raise where the file would replace an input, or stand among files that this command did not write."""
+    target = folder / MOCAP_FOLDER
+    inside = [path for path in takes if target.resolve() in path.resolve().parents]
+    if inside:
+        raise ValueError(f"{inside[0]}: is an input, and {target} would be replaced; choose another folder for --out")
+    if target.exists() and not _owns_mocap(folder):
+        raise ValueError(f"{target}: is there, and not from this command; move it away, or choose another folder for --out")
+
+
+def drop_mocap(folder: Path) -> bool:
+    """Remove what an earlier run of this command wrote there."""
+    target = folder / MOCAP_FOLDER
+    if not (target.is_dir() and _owns_mocap(folder)):
+        return False
+    shutil.rmtree(target)
+    return True
+
+
+def _owns_mocap(folder: Path) -> bool:
+    """Whether an earlier run wrote the folder's motion capture: its results name the file."""
+    try:
+        known = parse_json(folder, read_text(folder / "sync.json"), "")
+        return any(str((one.get("shifted") or {}).get("folder", "")).startswith(f"{MOCAP_FOLDER}/") for one in known["cameras"])
+    except (ValueError, KeyError, TypeError, AttributeError, json.JSONDecodeError):
+        return False

@@ -15,7 +15,7 @@ from indexing.joints import named, places
 from indexing.skeleton import Skeleton, known
 from indexing.sync.notices import SyncNotice, besides
 from indexing.sync.options import SyncOptions
-from indexing.sync.takes import FloatArray, Take
+from indexing.sync.recordings import FloatArray, Take
 
 if TYPE_CHECKING:
     from dyntorch import Shift

@@ -21,7 +21,7 @@ from indexing.remarks import is_normalized
 from indexing.sync.notices import SoundNotice, SyncNotice, besides, noted
 from indexing.sync.options import MEASURES, Measure, SyncOptions
 from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
-from indexing.sync.takes import By, Take, take_of
+from indexing.sync.recordings import By, Take, take_of
 
 if TYPE_CHECKING:
     from dyntorch import Shift
@@ -196,8 +196,7 @@ def _compared(
 
 def listened(a: Take, b: Take, options: SyncOptions = SyncOptions(), **more: Any) -> Shift:
     """What the sound of two cameras says."""
-    from indexing.sync.listening import hear
-    from indexing.sync.sound import sound_shift
+    from indexing.sync.sound import hear, sound_shift
 
     known = {name: value for name, value in more.items() if name in ("max_shift", "rate")}
     sounds = [None if take.footage is None else hear(take.footage, options.sound) for take in (a, b)]

@@ -23,7 +23,7 @@ from indexing.files import recover_folder, replace_folder
 from indexing.opening import entries, parse_json, read_text
 from indexing.readers.files import VIDEOS
 from indexing.sync.options import TrimOptions
-from indexing.sync.takes import Take
+from indexing.sync.recordings import Take
 
 FOLDER = "synchronized_videos"
 Floats = NDArray[np.float64]

@@ -6,7 +6,7 @@ import torch
 
 from indexing import synchronize
 from indexing.sync.brightness import brightness_shift
-from indexing.sync.gray import window_kernels
+from indexing.sync.brightness_features import window_kernels
 from indexing.sync.options import KernelOptions, SyncOptions
 
 FPS = (30.0, 30.0)

@@ -16,9 +16,9 @@ from dyntorch.numerics.least_squares import LeastSquaresOptions
 from dyntorch.tasks.pair.options import PairOptions
 from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
 from dyntorch.tasks.pair.tracks import Overlap
-from dyntorch.tasks.synchronize.body import BodyMotion, body_motion
 from dyntorch.tasks.synchronize.options import ProjectiveOptions
 from dyntorch.tasks.synchronize.projective import Poses, common_motion
+from dyntorch.tasks.synchronize.rigid_body import BodyMotion, body_motion
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 

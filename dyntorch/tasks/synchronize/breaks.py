@@ -17,8 +17,8 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.synchronize.courses import Course, Jump, JumpEvidence, mended
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.piecewise_offset import Course, Jump, JumpEvidence, mended
 from dyntorch.tasks.synchronize.result import BreakNotice, Breaks, ClockBreak, Clocks, Shift
 from dyntorch.tasks.synchronize.synchronize import prepared, synchronize
 from dyntorch.tasks.synchronize.tracks import Tracks

@@ -15,9 +15,9 @@ from dyntorch.numerics.blocks import constant
 from dyntorch.numerics.lags import lag_covariances, lag_products
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.tasks.pair.tracks import interpolated
-from dyntorch.tasks.synchronize.body import BodyMotion, body_motion
 from dyntorch.tasks.synchronize.options import ProjectiveOptions, SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
+from dyntorch.tasks.synchronize.rigid_body import BodyMotion, body_motion
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Two cameras that track different points of one motion: how much either tells about the other, over all time lags."""
+"""Two cameras that track different points of one motion: mutual information over all lags, and its best lag."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyntorch.core.outcome import Notice
 from dyntorch.numerics.lags import lag_covariances
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.result import ShiftNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What the points of one camera tell about time, whichever points they are: how the body changes and how it moves on the whole.
@@ -17,6 +19,8 @@ from dyntorch.tasks.synchronize.options import SynchronizeOptions
 
 STEP = 1 / 30
 """Seconds from frame to frame, unless told."""
+
+
 TINY = 1e-9
 """Of the size of the body: the least standard deviation of noise that is believed."""
 
@@ -345,3 +349,178 @@ def _correlated(aa: Tensor, bb: Tensor, ab: Tensor, *, options: SynchronizeOptio
 def _factor(c: Tensor) -> Tensor:
     low: Tensor = torch.linalg.cholesky_ex(c).L
     return low
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What speaks against a lag between different points: motion that repeats itself, and a peak that depends on single moments.
+
+
+def resemblance(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
+    r"""How much the motion resembles itself at another time that fits as well: 0 not at all, 1 as much as at the same time."""
+    if curve.bodies is None:
+        return 0.0
+    judged = curve.scores.isfinite()
+    rivals = judged.nonzero()[:, 0] - best
+    frames, step = min(len(body.rows) for body in curve.bodies), curve.bodies[0].step
+    reach = min(int(rivals.abs().max()), frames - math.ceil(options.subspace.least_seconds / step))
+    if reach <= apart:
+        return 0.0
+    both = sum((_alike(body, reach, options) for body in curve.bodies), curve.scores.new_zeros(2 * reach + 1))
+    both = both + both.flip(0)
+    padded = torch.nn.functional.pad(both, (1, 1), value=math.inf)
+    peak = (both >= padded[:-2]) & (both >= padded[2:])
+    rivals = rivals[(rivals.abs() <= reach) & (rivals.abs() > apart)] + reach
+    found = both[rivals[peak[rivals]]]
+    if not len(found):
+        return 0.0
+    own, other = float(both[reach]), float(found.max())
+    return other / own if own > 0 else math.inf
+
+
+def _alike(body: Body, reach: int, options: SynchronizeOptions) -> Tensor:
+    """Evidence per frame ``(2 reach + 1,)`` between halves of the points."""
+    first, second = halves(body, options)
+    return bodies_curve(first.blurred, second.blurred, (-reach, reach), body.step, options=options).rates.nan_to_num(-math.inf)
+
+
+def wobble(curve: SubspaceCurve, lag: int, options: SynchronizeOptions) -> float:
+    r"""Standard deviation of the best lag in frames, by the jackknife over parts of the overlap."""
+    if curve.bodies is None:
+        return 0.0
+    a, b = curve.bodies
+    start, end = max(0, 1 - lag), min(len(a.rows), len(b.rows) - lag - 1)
+    if end - start < options.different.blocks:
+        return math.inf
+    edges = torch.linspace(start, end, options.different.blocks + 1).round().long().tolist()
+    sizes = torch.tensor(edges).diff().tolist()
+    shapes: list[Tensor] = []
+    motions: list[Tensor] = []
+    for at in range(lag - 1, lag + 2):
+        w = a.weights[start:end] * b.weights[start + at : end + at]
+        for kept, x, y in ((shapes, a.rows, b.rows), (motions, a.motion, b.motion)):
+            both = torch.cat([x[start:end], y[start + at : end + at], torch.ones_like(w)[:, None]], dim=1) * w[:, None]
+            kept.append(torch.stack([part.mT @ part for part in both.split(sizes)]))
+    shape, motion = (_without(torch.stack(kept)) for kept in (shapes, motions))
+    before, here, after = information(shape, motion, (a, b), options).unflatten(0, (3, options.different.blocks))
+    bend = float((before - 2 * here + after).mean())
+    return (
+        math.sqrt((options.different.blocks - 1) * float(((after - before) / 2).var(correction=0))) / -bend
+        if bend < 0
+        else math.inf
+    )
+
+
+def _without(moments: Tensor) -> Tensor:
+    """Covariances ``(L B, d, d)`` of all parts but one, of moments ``(L, B, d + 1, d + 1)``."""
+    rest = (moments.sum(1, keepdim=True) - moments).flatten(0, 1)
+    count = rest[:, -1:, -1:].clamp(min=1.0)
+    mean = rest[:, :-1, -1:] / count
+    return rest[:, :-1, :-1] / count - mean @ mean.mT
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The lag between two cameras that track different points, between frames, with what speaks against it.
+
+
+@dataclass(frozen=True, eq=False)
+class SubspaceShift:
+    """Which frame of b goes with which of a."""
+
+    position: float  # frames: frame i of a is at i + position of b; 0 where nothing could be judged
+    sigma: float  # its standard deviation if the peak is the right one, frames
+    peaks: Tensor  # ``(k, 2)`` position and score of local maxima, best first
+    probability: float  # that the position is right to within a frame
+    margin: float  # nats per frame over the next peak, times the frames that overlap at the best: periodic motion has none
+    refusal: Notice | None = None  # why the data do not decide; None where they do
+
+    @property
+    def ok(self) -> bool:
+        """Whether the data decide."""
+        return self.refusal is None
+
+    @property
+    def reason(self) -> str:
+        """Why not, and what to do; empty where they do."""
+        return "" if self.refusal is None else self.refusal.text
+
+
+def subspace_shift(
+    curve: SubspaceCurve, *, start: float = 0.0, step: float = STEP, options: SynchronizeOptions = SynchronizeOptions()
+) -> SubspaceShift:
+    r"""The best lag of a curve, by the parabola through its highest three scores, and whether to believe it."""
+    judged = curve.scores.isfinite()
+    if int(judged.sum()) < 3:
+        return SubspaceShift(0.0, math.inf, curve.scores.new_zeros(0, 2), 0.0, 0.0, Notice(ShiftNotice.SHORT_OVERLAP))
+    scores = curve.scores.nan_to_num(-math.inf)
+    top = _maxima(scores, options.different.apart / step, options)
+    positions = [_between(scores, i) for i in top[: options.different.peaks]]
+    places = torch.tensor([p for p, _ in positions], dtype=scores.dtype, device=scores.device)
+    peaks = torch.stack([curve.lags[0] + places, scores[top[: options.different.peaks]]], dim=1)
+    best = top[0]
+    probability, margin = _probability(scores, best), _margin(curve, best, options.different.apart / step, options)
+    probability = min(probability, 1 / (1 + math.exp(-max(min(margin, 700.0), -700.0))))
+    position = float(peaks[0, 0])
+    sigma = math.hypot(options.different.blur / step, max(positions[0][1], wobble(curve, round(position), options)))
+    times = start + step * peaks[1:4, 0]
+    refusal = _refusal(curve, best, probability, margin, times, step, options)
+    if (
+        refusal is None
+        and margin < options.different.alone * float(scores[best])
+        and resemblance(curve, best, options.different.apart / step, options) > options.different.repeated
+    ):
+        refusal = Notice(ShiftNotice.REPEATED, margin, {"case": "itself"})
+    if refusal is None and sigma > options.different.sharp:
+        refusal = Notice(ShiftNotice.BLUNT, sigma * step, {"case": "known" if math.isfinite(sigma) else "rough"})
+    return SubspaceShift(position, sigma, peaks, probability, margin, refusal)
+
+
+def _maxima(scores: Tensor, apart: float, options: SynchronizeOptions) -> list[int]:
+    """Local maxima, best first, none within so many frames of a better one."""
+    padded = torch.nn.functional.pad(scores, (1, 1), value=-math.inf)
+    top = ((scores >= padded[:-2]) & (scores >= padded[2:]) & scores.isfinite()).nonzero()[:, 0]
+    kept: list[int] = []
+    for i in top[scores[top].argsort(descending=True)].tolist():
+        if all(abs(i - j) > apart + 1e-9 for j in kept):
+            kept.append(i)
+        if len(kept) > 4 * options.different.peaks:
+            break
+    return kept
+
+
+def _between(scores: Tensor, i: int) -> tuple[float, float]:
+    """Place of the maximum near entry i, and its standard deviation."""
+    around = scores[max(i - 1, 0) : i + 2].tolist()
+    bend = around[0] - 2 * around[1] + around[2] if len(around) == 3 else 0.0
+    if not (math.isfinite(bend) and bend < 0):
+        return float(i), 1.0
+    move = 0.5 * (around[0] - around[2]) / bend
+    return i + max(-0.5, min(0.5, move)), math.sqrt(-1 / bend)
+
+
+def _probability(scores: Tensor, best: int) -> float:
+    """Share of the posterior within a frame of the best."""
+    weight = (scores - scores[best]).exp()
+    return float(weight[max(best - 1, 0) : best + 2].sum() / weight.sum())
+
+
+def _margin(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
+    """Nats per frame over the best other maximum, times the best one's frames."""
+    rates = torch.where(curve.scores.isfinite(), curve.rates, -math.inf)
+    others = [i for i in _maxima(rates, apart, options) if abs(i - best) > apart + 1e-9]
+    return float((rates[best] - rates[others[0]]) * curve.counts[best]) if others else float(curve.scores[best])
+
+
+def _refusal(
+    curve: SubspaceCurve, best: int, probability: float, margin: float, times: Tensor, step: float, options: SynchronizeOptions
+) -> Notice | None:
+    """Why the data do not decide; empty where they do."""
+    if min(curve.signal) < 1 or float(curve.rates[best]) < options.different.telling * step:
+        return Notice(ShiftNotice.NOISY, min(curve.signal))
+    if curve.bodies is not None and min(body.bend for body in curve.bodies) < options.different.bent:
+        return Notice(ShiftNotice.STRAIGHT, min(body.bend for body in curve.bodies))
+    if probability >= options.different.sure and margin >= options.different.clear:
+        return None
+    others = ", ".join(f"{time:+.2f}" for time in times.tolist())
+    return Notice(
+        ShiftNotice.REPEATED, margin, {"case": "others" if margin < options.different.clear else "unclear", "rivals": others}
+    )

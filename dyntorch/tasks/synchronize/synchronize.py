@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any
 
@@ -13,257 +12,19 @@ import torch
 from torch import Generator, Tensor
 
 from dyntorch.core.outcome import Notice, status_from
-from dyntorch.geometry.lens import fit_distortion, undistorted
-from dyntorch.numerics.arguments import check_options, on_cpu
+from dyntorch.core.problems import of_problem, one_by_one, without_filling
+from dyntorch.geometry.lens import undistorted
+from dyntorch.numerics.arguments import check_options, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.messages import Message
-from dyntorch.tasks.synchronize.batches import synchronize_batch
-from dyntorch.tasks.synchronize.different import different_points
-from dyntorch.tasks.synchronize.epipolar import EPIPOLAR, Curve, EpipolarFit, PairModel, ShiftDescent, epipolar_curve
-from dyntorch.tasks.synchronize.evidence import Attempt, consistent_points
+from dyntorch.tasks.synchronize.different_points import different_points
+from dyntorch.tasks.synchronize.epipolar import EPIPOLAR
+from dyntorch.tasks.synchronize.motion_capture import CAMERA
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.projective import projective_points
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
-from dyntorch.tasks.synchronize.space import CAMERA
-from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, frame_scaled, read_tracks, smoothed, without
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The search for the best shift of corresponding points: all lags at some clock rates, then descents from the best of them.
-
-
-@dataclass(frozen=True)
-class ShiftSearch:
-    """How to search."""
-
-    step: float = 0.0  # seconds per lag; the slower camera's frame at least
-    max_shift: float | None = None  # seconds, None for all shifts with some overlap
-    rates: tuple[float, ...] = (1.0,)  # of b's clock, to search at
-    free_rate: bool = True  # whether the descent may change the rate
-    method: str = "epipolar"  # ``"epipolar"``, ``"camera"`` or ``"affine"``: what the tracks were made for
-    model: PairModel = EPIPOLAR  # what is compared
-
-
-def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None, *, options: SynchronizeOptions) -> Attempt:
-    """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate. points ``(n,)``."""
-    points = torch.ones(a.x.shape[1], dtype=torch.bool, device=a.x.device) if points is None else points
-    a, b = (a, b) if bool(points.all()) else (a.only(points), b.only(points))
-    step = max(a.step, b.step, search.step)
-    searched = [
-        (samples, epipolar_curve(samples, search.max_shift, options=options))
-        for samples in (search.model.samples.of(a, b, step, r, options=options) for r in search.rates)
-    ]
-    fit = _best(a, b, [curve for _, curve in searched], step, search, options)
-    samples, curve = min(searched, key=lambda found: abs(found[0].rate - (fit.rate if fit else 1.0)))
-    if fit is not None and abs(fit.rate - samples.rate) * (float(a.times[-1]) - float(a.times[0])) > 0.25 * step:
-        samples = search.model.samples.of(a, b, step, fit.rate, options=options)
-        curve = epipolar_curve(samples, search.max_shift, options=options)
-    return Attempt(a, b, fit, curve, samples, step, search.max_shift, points, search.method, options=options, model=search.model)
-
-
-def _best(
-    a: Tracks, b: Tracks, curves: list[Curve], step: float, search: ShiftSearch, options: SynchronizeOptions
-) -> EpipolarFit | None:
-    """The likeliest minimum near the peaks of the curves."""
-    free_rate = search.free_rate
-    frame = max(a.step, b.step)
-    starts = sorted(
-        ((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(options.evidence.peaks)),
-        reverse=True,
-    )
-    if not starts:
-        return None
-    apart = max(options.evidence.apart * frame, 1.5 * step)
-    rivals = [start for start in starts if abs(start[1] - starts[0][1]) > apart or start[2] != starts[0][2]]
-    several = len(curves) > 1 or not rivals or starts[0][0] - rivals[0][0] < options.search.clear
-    widths = [step]
-    while widths[-1] > frame:
-        widths.append(max(frame, widths[-1] / 3))
-    descent = search.model.descent(a, b, step, options=options)
-    found = []
-    for score, offset, rate in starts[: options.evidence.peaks if several else 1]:
-        fit = descent.run(offset, rate, free_rate=free_rate and step > frame)
-        if fit is not None:
-            # the curve's variance counts everything, the fit's robust residual nothing that is far: both have a say
-            found.append((score - math.log(max(fit.residual, 1e-300)) + 0.5 * math.log(fit.effective), fit))
-    if not found:
-        return None
-    best = max(found, key=lambda pair: pair[0])[1]
-    for width in widths[1:]:
-        descent = search.model.descent(a, b, width, options=options)
-        best = descent.run(best.offset, best.rate, free_rate=free_rate) or best
-    long = float(best.times[-1] - best.times[0]) > options.search.drifting
-    return _settled(descent, best, options) if free_rate and long else best
-
-
-def _settled(descent: ShiftDescent, fit: EpipolarFit, options: SynchronizeOptions) -> EpipolarFit:
-    """With its own rate where that differs from 1 beyond doubt, else with rate 1."""
-    free = descent.run(fit.offset, fit.rate, free_rate=True)
-    span = float(fit.times[-1] - fit.times[0])
-    if free is not None and options.search.largest_drift > abs(free.rate - 1) > max(
-        options.search.significant * free.rate_sigma, options.search.negligible * descent.frame / span
-    ):
-        return free
-    fixed = descent.run(fit.shift, 1.0) if fit.rate != 1 else fit
-    return fixed or fit
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Synchronization by points that both cameras see: plain first, then what may be wrong with the input, one thing at a time.
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Result:
-    """The best attempt and what it took."""
-
-    found: Attempt
-    notices: tuple[Notice, ...]
-    seen: Tensor  # ``(n,)`` bool, points that both cameras show at all
-
-
-def same_points(
-    a: Tracks,
-    b: Tracks,
-    *,
-    max_shift: float | None,
-    rate: float | None,
-    camera: str,
-    lenses: bool,
-    generator: Generator | None,
-    options: SynchronizeOptions,
-    model: PairModel = EPIPOLAR,
-) -> Result:
-    """The shift of cameras that see the same points, or of a camera and the same points in space."""
-    span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
-    search = ShiftSearch(
-        step=span / options.search.most_steps, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None,
-        method=model.method, model=model,
-    )  # fmt: skip
-    seen = (a.weights > 0).any(0) & (b.weights > 0).any(0)
-    if a.still or b.still:
-        return Result(dataclasses.replace(attempt(a, b, search, options=options), fit=None), (), seen)
-    if camera == "affine":
-        return Result(_affine(a, b, search, generator, options), (), seen)
-    found = _sorted_out(a, b, search, generator, options)
-    if not found.decided and rate is None:
-        found = _better(found, _over_rates(a, b, search, span, generator, options))
-    known: tuple[Notice, ...] = ()
-    if lenses and found.fit is not None and found.roughness > options.search.rough:
-        found, known = _straightened(found, a, b, search, generator, options)
-    if camera == "auto" and model is EPIPOLAR and not found.decided:
-        scaled = _affine(a, b, search, generator, options)
-        # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
-        if scaled.decided and _agree(scaled, found, options):
-            return Result(scaled, (Notice(ShiftNotice.AFFINE),), seen)
-    return Result(found, known if found.decided else (), seen)
-
-
-def _sorted_out(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions) -> Attempt:
-    """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
-    found = attempt(a, b, search, options=options)
-    pruned = _pruned(found, options)
-    if pruned is not None:
-        a, b = pruned
-        found = _better(found, dataclasses.replace(attempt(a, b, search, options=options), pruned=True))
-    if found.decided and not bool(_suspects(found, options).any()):
-        return found
-    points = consistent_points(a, b, found, generator, options)
-    if points is None or bool(points.all()):
-        return found
-    return _better(found, dataclasses.replace(attempt(a, b, search, points, options=options), pruned=pruned is not None))
-
-
-def _pruned(found: Attempt, options: SynchronizeOptions) -> tuple[Tracks, Tracks] | None:
-    """Tracks without the positions far from the fit, in both cameras: whose is wrong is not known; None where all is well."""
-    fit = found.fit
-    if fit is None or len(fit.times) != len(found.a.times):
-        return None
-    far = fit.distances.abs() > options.search.far
-    seen = fit.distances.isfinite()
-    # a point that is mostly elsewhere is another point, and is found as such
-    far = far & (far.sum(0) <= options.search.lost * seen.sum(0))
-    parts = [
-        (float(one.sum()), float(all_.sum()))
-        for one, all_ in zip(far.chunk(options.search.stretches), seen.chunk(options.search.stretches), strict=True)
-    ]
-    if found.decided and float(far.double().mean()) < options.search.rare:
-        return None  # the weights of the fit are enough
-    # a stretch that does not fit is no outlier: it contradicts
-    if not bool(far.any()) or any(lost > options.search.lost * whole for lost, whole in parts):
-        return None
-    frames, joints = far.nonzero().unbind(1)
-    there = fit.times[frames] * fit.rate + fit.offset
-    nearest = (there[:, None] - found.b.times).abs().argmin(1)
-    other = torch.zeros_like(found.b.weights, dtype=torch.bool)
-    other[nearest, joints] = True
-    return without(found.a, far), without(found.b, other)
-
-
-def _over_rates(
-    a: Tracks, b: Tracks, search: ShiftSearch, span: float, generator: Generator | None, options: SynchronizeOptions
-) -> Attempt | None:
-    """A search over clock rates too, where a wrong one would have smeared the motion."""
-    step = max(span / options.search.rate_steps, 0.1)
-    change = 2 * step / span  # moves the ends of the overlap by a step
-    count = math.ceil(options.input.frame_rate_error / change)
-    if span < options.search.drifting:
-        return None
-    rates = tuple(1 + k * change for k in range(-count, count + 1))
-    coarse = attempt(a, b, dataclasses.replace(search, step=step, rates=rates), options=options)
-    if coarse.fit is None:
-        return None
-    return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)), generator, options)
-
-
-def _affine(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions) -> Attempt:
-    return _sorted_out(
-        frame_scaled(a, options), frame_scaled(b, options), dataclasses.replace(search, method="affine"), generator, options
-    )
-
-
-def _better(one: Attempt, other: Attempt | None) -> Attempt:
-    """The decided one; where both are, the other, which had the more careful input; where none is, the one more likely right."""
-    if other is None or other.fit is None:
-        return one
-    if one.fit is None or other.decided:
-        return other
-    return one if one.decided or one.confidence >= other.confidence else other
-
-
-def _agree(one: Attempt, other: Attempt, options: SynchronizeOptions) -> bool:
-    """Whether the best shifts are the same."""
-    return (
-        one.fit is not None and other.fit is not None and abs(one.fit.shift - other.fit.shift) <= options.evidence.apart * one.frame
-    )
-
-
-def _suspects(found: Attempt, options: SynchronizeOptions) -> Tensor:
-    """``(n,)`` of the points that took part: whether their residual is out of all proportion."""
-    assert found.fit is not None
-    own = found.fit.distances.abs().nanmedian(0).values * 1.4826
-    return own.nan_to_num(0.0) > options.search.suspect
-
-
-def _straightened(
-    found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions
-) -> tuple[Attempt, tuple[Notice, ...]]:
-    """Once more with lenses fitted at the shift found, where they are significant."""
-    assert found.fit is not None
-    fit = found.fit
-    x1, _, w1 = smoothed(found.a, fit.times, found.frame, options)
-    x2, _, w2 = smoothed(found.b, fit.times * fit.rate + fit.offset, found.frame, options)
-    lens = fit_distortion(x1.flatten(0, 1), x2.flatten(0, 1), (w1 * w2).flatten())
-    if not lens.significant:
-        return found, ()
-    straight = []
-    for tracks, one in zip((a, b), lens.lenses, strict=True):
-        x = one.undistort(tracks.x)
-        seen = x.isfinite().all(-1)
-        straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
-    again = attempt(straight[0], straight[1], search, found.points, options=options)
-    better = again.fit is not None and again.fit.residual < fit.residual and _better(found, again) is again
-    values = {"a": lens.lambda_a, "b": lens.lambda_b}
-    return (again, (Notice(ShiftNotice.LENS, 0.0, values),)) if better else (found, ())
-
+from dyntorch.tasks.synchronize.same_points import search_same_points, shift_of
+from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, read_tracks
 
 CAMERAS = ("auto", "perspective", "affine", "projective")
 
@@ -299,7 +60,7 @@ def synchronize(
 
     .. math:: \min_{s, P} \sum_{ij} |x_{a,j}(t_i) - P X_{b,j}(t_i + s)|^2,
 
-    in the same two steps (:mod:`dyntorch.tasks.synchronize.space`); different points are combinations of those in space.
+    in the same two steps (:mod:`dyntorch.tasks.synchronize.motion_capture`); different points are combinations of those in space.
 
     A search: it computes on the CPU wherever its tensors are, and the result returns to their device.
 
@@ -366,7 +127,7 @@ def synchronize(
             "give the same ones in the same order, or {arg:correspondence=False}"
         )
         raise ValueError(Message(text, a=a.shape[1], b=b.shape[1]))
-    result = same_points(
+    result = search_same_points(
         first,
         second,
         max_shift=max_shift,
@@ -377,7 +138,7 @@ def synchronize(
         options=options,
         model=CAMERA if spatial else EPIPOLAR,
     )
-    return _shift(result, options).since(origin)
+    return shift_of(result, options).since(origin)
 
 
 def prepared(
@@ -469,76 +230,37 @@ def _straight(name: str, tracks: Tracks, lens: Any) -> Tracks:
     return dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=torch.where(seen, tracks.weights, 0.0))
 
 
-def _shift(result: Result, options: SynchronizeOptions) -> Shift:
-    """The result of an attempt."""
-    found, limits = result.found, result.notices
-    fps = 1 / found.a.step, 1 / found.b.step
-    fit = found.fit
-    points = found.points & result.seen
-    if fit is None:
-        none = torch.zeros(0, dtype=torch.float64)
-        limits = (_nothing(found),)
+def synchronize_batch(
+    verb: Callable[..., Shift],
+    a: Tensor,
+    b: Tensor,
+    *,
+    times: tuple[Any, Any] | None,
+    weights: tuple[Any, Any] | None,
+    **more: Any,
+) -> Shift:
+    """The shifts of all problems, one after the other: a search shares nothing between takes. a ``(*batch, frames_a, n, 2)``,
+    b ``(*batch, frames_b, m, 2)``, times ``(frames,)``, weights ``(*batch, frames, n)``."""
+    batch = check_together(a=(a, 3), b=(b, 3))
+
+    def solve(place: int) -> Shift:
+        takes = [without_filling(of_problem(x, place, batch, 3)) for x in (a, b)]
+        clocks = None if times is None else _own(times, takes, place, batch, 1)
+        trust = None if weights is None else _own(weights, takes, place, batch, 2)
+        return verb(*takes, times=clocks, weights=trust, **more)
+
+    def spare(said: str) -> Shift:
+        none = torch.zeros(0, dtype=torch.float64, device=a.device)
+        limits = (Notice(ShiftNotice.UNUSABLE, 0.0, {"said": said}),)
         return Shift(
-            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), found.method, fps, 0.0, none, none, result.seen,
+            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), "none", (math.nan, math.nan), 0.0, none, none,
             status=status_from(limits), notices=limits,
         )  # fmt: skip
-    if not found.decided:
-        limits = (_refusal(found, options), *limits)
-    wrong = (result.seen & ~found.points).nonzero()[:, 0].tolist()
-    if wrong:
-        which = ", ".join(str(point) for point in wrong)
-        limits = (*limits, Notice(ShiftNotice.LEFT_OUT, float(len(wrong)), {"points": len(points), "which": which}))
-    if found.decided and found.wander > options.evidence.wander:
-        limits = (*limits, Notice(ShiftNotice.MOVED, found.wander))
-    lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
-    return Shift(
-        offset=fit.offset,
-        sigma=found.sigma,
-        rate=fit.rate,
-        rate_sigma=fit.rate_sigma,
-        confidence=found.confidence,
-        peaks=torch.tensor(found.peaks, dtype=torch.float64),
-        method=found.method,
-        fps=fps,
-        center=fit.center,
-        lags=lags,
-        scores=found.curve.scores,
-        points=points,
-        fundamental=fit.fundamental if found.method == "epipolar" else None,
-        projection=fit.fundamental if found.method == "camera" else None,
-        status=status_from(limits),
-        notices=limits,
-    )
+
+    return one_by_one(batch, solve, spare)
 
 
-def _nothing(found: Attempt) -> Notice:
-    """Why no shift stands out."""
-    for name, tracks in (("a", found.a), ("b", found.b)):
-        if not bool((tracks.weights > 0).any()):
-            return Notice(ShiftNotice.NO_POINT, 0.0, {"which": name})
-        if tracks.still:
-            return Notice(ShiftNotice.STILL, 0.0, {"which": name})
-    return Notice(ShiftNotice.NOTHING)
-
-
-def _refusal(found: Attempt, options: SynchronizeOptions) -> Notice:
-    """Why the data do not decide."""
-    fit = found.fit
-    assert fit is not None
-    if fit.sigma > options.search.blind * found.frame:
-        return _nothing(found)
-    if found.agree and found.margin >= found.needed and found.forward < found.needed_forward:
-        return Notice(ShiftNotice.BACKWARDS, found.forward)
-    if found.edge:
-        return Notice(ShiftNotice.EDGE, fit.shift, {"best": fit.shift})
-    if not found.sharp:
-        return Notice(ShiftNotice.BLUNT, fit.sigma, {"case": "small", "best": fit.shift})
-    if found.margin < found.needed and len(found.peaks) > 1:
-        least = found.misfits[0] - found.needed
-        near = [shift for (shift, _), misfit in zip(found.peaks, found.misfits, strict=True) if misfit > least]
-        rivals = ", ".join(f"{shift:+.3g} s" for shift in near[1:4])
-        return Notice(ShiftNotice.REPEATED, found.margin, {"case": "rivals", "best": found.peaks[0][0], "rivals": rivals})
-    first, second = found.halves
-    shifts = (f"{fit.shift + away * found.frame:+.3g} s" for away in (first, second))
-    said = " and ".join("nothing" if "nan" in shift else shift for shift in shifts)
-    return Notice(ShiftNotice.HALVES, 0.0, {"halves": said, "apart": found.apart, "best": fit.shift})
+def _own(values: tuple[Any, Any], takes: list[Tensor], place: int, batch: Any, own: int) -> tuple[Any, Any]:
+    """What belongs to a problem, of the frames that its takes have."""
+    parts = [of_problem(value, place, batch, own) for value in values]
+    return tuple(None if x is None else x[: len(take)] for x, take in zip(parts, takes, strict=True))  # type: ignore[return-value]

@@ -19,7 +19,7 @@ from indexing.calibrate.people.sorting import Sorting, calibrated, everybody_clo
 from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Floats, Integers, cut, sightings
 from indexing.clip import Clip
 from indexing.joints import named, places
-from indexing.sync.takes import Take
+from indexing.sync.recordings import Take
 
 if TYPE_CHECKING:
     from dyntorch import Calibration, Clocks

@@ -8,7 +8,7 @@ from indexing import Clip
 from indexing.actors import Person, perform
 from indexing.actors.textured import film
 from indexing.skeleton import COCO17
-from indexing.sync.gray import boxes, motion
+from indexing.sync.brightness_features import boxes, motion
 
 CLIP = perform("wave", Person(), fps=15.0)
 

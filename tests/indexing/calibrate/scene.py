@@ -17,7 +17,7 @@ from indexing.calibrate.stature import standing
 from indexing.calibrate.views import common, view_of
 from indexing.clip import Clip
 from indexing.skeleton import COCO17
-from indexing.sync.takes import take_of
+from indexing.sync.recordings import take_of
 from tests.indexing.sync.scene import write_openpose
 
 FPS, SIZE, FOCAL = 30.0, (1920, 1080), 1500.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from indexing.calibrate.lenses import DIAGONAL, focal_35, known_lenses
-from indexing.sync.takes import take_of
+from indexing.sync.recordings import take_of
 from tests.indexing.calibrate.scene import SIZE, filmed, write_cameras
 
 SIZES = [SIZE] * 3

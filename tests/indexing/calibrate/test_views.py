@@ -9,7 +9,7 @@ import torch
 from indexing.calibrate.views import check_cameras, check_overlap, check_size, common, sized, view_of
 from indexing.clip import Clip
 from indexing.skeleton import BODY25, COCO17, HAND21, Skeleton
-from indexing.sync.takes import take_of
+from indexing.sync.recordings import take_of
 from tests.indexing.calibrate.scene import FPS, SIZE, filmed
 
 

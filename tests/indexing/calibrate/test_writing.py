@@ -15,7 +15,7 @@ from indexing.calibrate.views import view_of
 from indexing.calibrate.writing import toml_of, write_associated
 from indexing.readers import read
 from indexing.sync.calibration import read_calibration
-from indexing.sync.takes import take_of
+from indexing.sync.recordings import take_of
 from tests.indexing.calibrate.scene import FPS, LATE, SIZE, filmed, rig, truth, write_cameras
 
 BENT = torch.tensor([[-0.1, 0.02, 0.001, -0.002, 0.0], [-0.1, 0.02, 0.001, -0.002, 0.003], [0.0] * 5], dtype=torch.float64)

@@ -15,7 +15,7 @@ from indexing.readers import read
 from indexing.readers.files import WatchOptions
 from indexing.sync.notices import SyncNotice
 from indexing.sync.people import Pairing
-from indexing.sync.takes import take_of
+from indexing.sync.recordings import take_of
 from tests.indexing.pose.conftest import seeing as seeing
 from tests.indexing.pose.test_detection import film, person
 

@@ -17,7 +17,7 @@ from indexing import Clip
 from indexing.report.sync import Compared, SyncReport, as_json, describe, page, picture_of, title_of, write_sync
 from indexing.skeleton import Skeleton
 from indexing.sync.people import Pairing
-from indexing.sync.takes import Take
+from indexing.sync.recordings import Take
 from tests.indexing.sync.scene import shift
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-from indexing.sync.gray import boxes, crop, motion
+from indexing.sync.brightness_features import boxes, crop, motion
 from indexing.sync.options import BoxOptions
 
 SIDE = BoxOptions().side

@@ -10,7 +10,7 @@ import pytest
 from indexing.clip import Clip
 from indexing.readers import read
 from indexing.sync.files import openpose_frames, plan, renumbered, write_poses
-from indexing.sync.takes import take_of
+from indexing.sync.recordings import take_of
 from tests.indexing.sync.scene import FPS, cut, moved, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.sync.gray import take
+from indexing.sync.brightness_features import take
 from indexing.sync.options import GrayOptions
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (50, 24, 32), dtype=np.uint8)

@@ -15,8 +15,8 @@ from indexing.cli import main
 from indexing.clip import Clip
 from indexing.readers import read
 from indexing.skeleton import Skeleton
-from indexing.sync.mocap import FOLDER, retimed
-from indexing.sync.takes import take_of
+from indexing.sync.files import MOCAP_FOLDER, retime_mocap
+from indexing.sync.recordings import take_of
 from indexing.writers import write
 from tests.indexing.sync.scene import write_openpose
 
@@ -108,14 +108,14 @@ def test_the_command_writes_motion_capture_on_the_clock_of_the_camera(data, tmp_
     offset = results["cameras"][1]["offset"]
     assert offset == pytest.approx(LATE / FPS, abs=0.5 / FPS)
     assert results["pairs"][0]["method"] == "camera" and np.shape(results["pairs"][0]["projection"]) == (3, 4)
-    (moved,) = read(tmp_path / "out" / FOLDER / "vicon.c3d")
+    (moved,) = read(tmp_path / "out" / MOCAP_FOLDER / "vicon.c3d")
     first = round(offset * RECORDED)
     assert results["cameras"][1]["shifted"]["left_out"] == first and len(moved) == len(scene()[0]) - first
     assert moved.times[0] == 0 and moved.fps == pytest.approx(RECORDED)
     assert np.abs(moved.joints - scene()[0].joints[first:]).max() < 1e-5  # metres as read; nothing is interpolated
     # a run that writes none removes it
     assert main(["sync", str(data / "vicon.c3d"), str(data / "cam1"), "--fps", "30", "--out", str(tmp_path / "out")]) == 0
-    assert not (tmp_path / "out" / FOLDER).exists()
+    assert not (tmp_path / "out" / MOCAP_FOLDER).exists()
     assert "mocap-sync of an earlier run was removed" in capsys.readouterr().out
     frames = sorted((tmp_path / "out" / "pose-sync" / "cam1_json").iterdir())
     assert abs(int(frames[0].name.split("_")[1]) - LATE) <= 1  # frame k is at k / 30 s of the motion capture
@@ -128,11 +128,11 @@ def test_a_table_of_points_in_space_is_motion_capture(data, tmp_path):
     results = json.loads((out / "sync.json").read_text())
     assert results["pairs"][0]["method"] == "camera"
     assert results["cameras"][1]["offset"] == pytest.approx(LATE / FPS, abs=0.5 / FPS)
-    assert read(out / FOLDER / "points.trc")[0].dims == 3
+    assert read(out / MOCAP_FOLDER / "points.trc")[0].dims == 3
 
 
 def test_what_is_in_the_way_and_two_of_them_are_said_before_the_work(data, tmp_path, capsys):
-    foreign = tmp_path / "out" / FOLDER
+    foreign = tmp_path / "out" / MOCAP_FOLDER
     foreign.mkdir(parents=True)
     arguments = ["sync", str(data / "cam1"), str(data / "vicon.c3d"), "--fps", "30"]
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 2
@@ -145,9 +145,9 @@ def test_what_is_in_the_way_and_two_of_them_are_said_before_the_work(data, tmp_p
 def test_times_on_the_clock_of_the_reference(tmp_path, suffix):
     path = tmp_path / f"vicon.{suffix}"
     write([scene()[0]], path, "m")
-    one = retimed(take_of(path), offset=0.5037, rate=1.001)
+    one = retime_mocap(take_of(path), offset=0.5037, rate=1.001)
     times = one.people[0].times
     assert one.first == 50 and one.frames == len(times) and one.rest == pytest.approx(0.0037 / 1.001 if suffix == "c3d" else 0)
     assert np.diff(times) == pytest.approx(0.01 / 1.001)
     assert times[0] == pytest.approx(0.0 if suffix == "c3d" else (0.5 - 0.5037) / 1.001)
-    assert retimed(take_of(path), offset=1e3, rate=1.0) is None
+    assert retime_mocap(take_of(path), offset=1e3, rate=1.0) is None

@@ -10,8 +10,8 @@ import dyntorch
 from indexing.clip import Clip
 from indexing.readers import read
 from indexing.sync.people import Pairing, decide, disagreements, jumps, match_people
+from indexing.sync.recordings import Take, take_of
 from indexing.sync.synchronize import pair, synchronize
-from indexing.sync.takes import Take, take_of
 from tests.indexing.sync.scene import FPS, cut, filmed, moved, shift, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests

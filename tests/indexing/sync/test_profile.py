@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from indexing.brightness.features import blur, gradients, weighted_differences
-from indexing.sync.gray import inverse_root, reversed_profile, row_profile, whitened
+from indexing.sync.brightness_features import inverse_root, reversed_profile, row_profile, whitened
 from indexing.sync.options import ProfileOptions, SyncOptions
 
 USUAL = ProfileOptions()

@@ -9,7 +9,7 @@ from indexing import synchronize
 from indexing.clip import Clip, ClipSet
 from indexing.skeleton import Skeleton
 from indexing.sync.people import common_joints
-from indexing.sync.takes import take_of
+from indexing.sync.recordings import take_of
 from tests.indexing.sync.scene import FPS, cut, moved, write_openpose
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

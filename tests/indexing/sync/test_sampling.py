@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from indexing.brightness.footage import Resampler
-from indexing.sync.gray import common_rate, sampled, take
+from indexing.sync.brightness_features import common_rate, sampled, take
 from indexing.sync.options import KernelOptions
 
 
@@ -27,7 +27,7 @@ def test_blocks_do_not_show(films, monkeypatch):
     source = take(films[0][:80], "a", fps=30.0)
     found = sampled(source, whole(source), 30.0)
     assert found.profile.shape == (80, 18) and found.kernels.shape[0] == 80 - 2 * KernelOptions().half
-    monkeypatch.setattr("indexing.sync.gray.PROFILE_BLOCK", 1000)
+    monkeypatch.setattr("indexing.sync.brightness_features.PROFILE_BLOCK", 1000)
     once = sampled(source, whole(source), 30.0)
     assert torch.allclose(found.kernels, once.kernels, atol=1e-5)
     cosine = torch.nn.functional.cosine_similarity(found.profile, once.profile)

@@ -8,9 +8,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from indexing.sync.listening import Sound, flattened, hear
 from indexing.sync.options import SoundOptions
-from indexing.sync.sound import apart, sound_shift, witnessed
+from indexing.sync.sound import Sound, apart, flattened, hear, sound_shift, witnessed
 from indexing.sync.synchronize import synchronize
 from tests.indexing.sync.footage import RATE, clicks, microphone, noises, write_film
 from tests.indexing.sync.scene import shift, told

@@ -11,8 +11,8 @@ from indexing.clip import Clip
 from indexing.skeleton import COCO17, HALPE26, Skeleton
 from indexing.sync.options import RecordingOptions, SyncOptions
 from indexing.sync.people import common_joints
+from indexing.sync.recordings import take_of
 from indexing.sync.synchronize import remarks, synchronize
-from indexing.sync.takes import take_of
 from tests.indexing.sync.scene import FPS, SKIPPED, cut, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests

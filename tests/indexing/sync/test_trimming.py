@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from indexing.report.sync import Clock
-from indexing.sync.takes import Take, take_of
+from indexing.sync.recordings import Take, take_of
 from indexing.sync.trimming import (
     FOLDER,
     CameraFilm,

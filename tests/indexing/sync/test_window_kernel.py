@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from indexing.brightness.features import blur
-from indexing.sync.gray import kernel_descriptors, window_kernels
+from indexing.sync.brightness_features import kernel_descriptors, window_kernels
 from indexing.sync.options import KernelOptions, SyncOptions
 
 SIGMA = KernelOptions().sigma

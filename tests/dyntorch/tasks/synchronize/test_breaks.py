@@ -9,8 +9,8 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.tasks.synchronize.breaks import breaks, camera_breaks, mended_times
-from dyntorch.tasks.synchronize.courses import Jump, cheapest, mended
 from dyntorch.tasks.synchronize.options import BreakOptions, SynchronizeOptions
+from dyntorch.tasks.synchronize.piecewise_offset import Jump, cheapest, mended
 from dyntorch.tasks.synchronize.result import ClockBreak
 from dyntorch.tasks.synchronize.tracks import read_tracks
 

@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from dyntorch.tasks.synchronize.different import resemblance, subspace_shift, wobble
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.subspace import (
     SubspaceCurve,
@@ -16,8 +15,11 @@ from dyntorch.tasks.synchronize.subspace import (
     body_of,
     completed,
     halves,
+    resemblance,
     smooth,
     subspace_curve,
+    subspace_shift,
+    wobble,
 )
 
 

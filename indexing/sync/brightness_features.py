@@ -216,6 +216,7 @@ def drift(gx: Tensor, gy: Tensor, gt: Tensor, options: SyncOptions = SyncOptions
 
 BOX_BLOCK = 32
 
+
 Region = tuple[float, float, float, float]
 
 

@@ -8,7 +8,7 @@ import pytest
 from indexing.clip import Clip
 from indexing.readers.recording import link
 from indexing.sync.files import plan
-from indexing.sync.takes import find_cameras, take_of
+from indexing.sync.recordings import find_cameras, take_of
 from tests.indexing.sync.scene import cut, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests

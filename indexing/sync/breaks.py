@@ -19,7 +19,7 @@ from indexing.clip import Clip
 from indexing.sync.calibration import lenses
 from indexing.sync.options import SyncOptions
 from indexing.sync.people import Pairing, common_joints
-from indexing.sync.takes import Take
+from indexing.sync.recordings import Take
 
 if TYPE_CHECKING:
     from dyntorch import Clocks

@@ -1,4 +1,4 @@
-"""An offset that jumps: the cheapest course of lags under one fundamental matrix, and what speaks for each of its jumps."""
+"""An offset that jumps: piecewise constant by dynamic programming under one fundamental matrix, and the evidence for each jump."""
 
 from __future__ import annotations
 

@@ -1,197 +1,32 @@
-"""Synchronization by different points: common steps of time, then the shift at which the cameras share most information."""
+"""Synchronization by different points: the lag of most mutual information and the lag of the row spaces, and one decision."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Notice, Status, status_from
-from dyntorch.tasks.synchronize.camera_models import KINDS
-from dyntorch.tasks.synchronize.combinations import combined_fit
-from dyntorch.tasks.synchronize.measures import MEASURES
+from dyntorch.tasks.synchronize.motion_capture import combined_fit
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
-from dyntorch.tasks.synchronize.row_spaces import RowSpaceShift, row_space_shift
-from dyntorch.tasks.synchronize.subspace import STEP, Body, SubspaceCurve, bodies_curve, halves, information, subspace_curve
+from dyntorch.tasks.synchronize.row_spaces import (
+    KINDS,
+    MEASURES,
+    Films,
+    Hypothesis,
+    Kind,
+    KindMoments,
+    Place,
+    hypotheses,
+    kind_moments,
+    refined,
+)
+from dyntorch.tasks.synchronize.subspace import Body, SubspaceCurve, SubspaceShift, bodies_curve, subspace_curve, subspace_shift
 from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
-
-# ----------------------------------------------------------------------------------------------------------------------
-# What speaks against a lag between different points: motion that repeats itself, and a peak that depends on single moments.
-
-
-def resemblance(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
-    r"""How much the motion resembles itself at another time that fits as well: 0 not at all, 1 as much as at the same time."""
-    if curve.bodies is None:
-        return 0.0
-    judged = curve.scores.isfinite()
-    rivals = judged.nonzero()[:, 0] - best
-    frames, step = min(len(body.rows) for body in curve.bodies), curve.bodies[0].step
-    reach = min(int(rivals.abs().max()), frames - math.ceil(options.subspace.least_seconds / step))
-    if reach <= apart:
-        return 0.0
-    both = sum((_alike(body, reach, options) for body in curve.bodies), curve.scores.new_zeros(2 * reach + 1))
-    both = both + both.flip(0)
-    padded = torch.nn.functional.pad(both, (1, 1), value=math.inf)
-    peak = (both >= padded[:-2]) & (both >= padded[2:])
-    rivals = rivals[(rivals.abs() <= reach) & (rivals.abs() > apart)] + reach
-    found = both[rivals[peak[rivals]]]
-    if not len(found):
-        return 0.0
-    own, other = float(both[reach]), float(found.max())
-    return other / own if own > 0 else math.inf
-
-
-def _alike(body: Body, reach: int, options: SynchronizeOptions) -> Tensor:
-    """Evidence per frame ``(2 reach + 1,)`` between halves of the points."""
-    first, second = halves(body, options)
-    return bodies_curve(first.blurred, second.blurred, (-reach, reach), body.step, options=options).rates.nan_to_num(-math.inf)
-
-
-def wobble(curve: SubspaceCurve, lag: int, options: SynchronizeOptions) -> float:
-    r"""Standard deviation of the best lag in frames, by the jackknife over parts of the overlap."""
-    if curve.bodies is None:
-        return 0.0
-    a, b = curve.bodies
-    start, end = max(0, 1 - lag), min(len(a.rows), len(b.rows) - lag - 1)
-    if end - start < options.different.blocks:
-        return math.inf
-    edges = torch.linspace(start, end, options.different.blocks + 1).round().long().tolist()
-    sizes = torch.tensor(edges).diff().tolist()
-    shapes: list[Tensor] = []
-    motions: list[Tensor] = []
-    for at in range(lag - 1, lag + 2):
-        w = a.weights[start:end] * b.weights[start + at : end + at]
-        for kept, x, y in ((shapes, a.rows, b.rows), (motions, a.motion, b.motion)):
-            both = torch.cat([x[start:end], y[start + at : end + at], torch.ones_like(w)[:, None]], dim=1) * w[:, None]
-            kept.append(torch.stack([part.mT @ part for part in both.split(sizes)]))
-    shape, motion = (_without(torch.stack(kept)) for kept in (shapes, motions))
-    before, here, after = information(shape, motion, (a, b), options).unflatten(0, (3, options.different.blocks))
-    bend = float((before - 2 * here + after).mean())
-    return (
-        math.sqrt((options.different.blocks - 1) * float(((after - before) / 2).var(correction=0))) / -bend
-        if bend < 0
-        else math.inf
-    )
-
-
-def _without(moments: Tensor) -> Tensor:
-    """Covariances ``(L B, d, d)`` of all parts but one, of moments ``(L, B, d + 1, d + 1)``."""
-    rest = (moments.sum(1, keepdim=True) - moments).flatten(0, 1)
-    count = rest[:, -1:, -1:].clamp(min=1.0)
-    mean = rest[:, :-1, -1:] / count
-    return rest[:, :-1, :-1] / count - mean @ mean.mT
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The lag between two cameras that track different points, between frames, with what speaks against it.
-
-
-@dataclass(frozen=True, eq=False)
-class SubspaceShift:
-    """Which frame of b goes with which of a."""
-
-    position: float  # frames: frame i of a is at i + position of b; 0 where nothing could be judged
-    sigma: float  # its standard deviation if the peak is the right one, frames
-    peaks: Tensor  # ``(k, 2)`` position and score of local maxima, best first
-    probability: float  # that the position is right to within a frame
-    margin: float  # nats per frame over the next peak, times the frames that overlap at the best: periodic motion has none
-    refusal: Notice | None = None  # why the data do not decide; None where they do
-
-    @property
-    def ok(self) -> bool:
-        """Whether the data decide."""
-        return self.refusal is None
-
-    @property
-    def reason(self) -> str:
-        """Why not, and what to do; empty where they do."""
-        return "" if self.refusal is None else self.refusal.text
-
-
-def subspace_shift(
-    curve: SubspaceCurve, *, start: float = 0.0, step: float = STEP, options: SynchronizeOptions = SynchronizeOptions()
-) -> SubspaceShift:
-    r"""The best lag of a curve, by the parabola through its highest three scores, and whether to believe it."""
-    judged = curve.scores.isfinite()
-    if int(judged.sum()) < 3:
-        return SubspaceShift(0.0, math.inf, curve.scores.new_zeros(0, 2), 0.0, 0.0, Notice(ShiftNotice.SHORT_OVERLAP))
-    scores = curve.scores.nan_to_num(-math.inf)
-    top = _maxima(scores, options.different.apart / step, options)
-    positions = [_between(scores, i) for i in top[: options.different.peaks]]
-    places = torch.tensor([p for p, _ in positions], dtype=scores.dtype, device=scores.device)
-    peaks = torch.stack([curve.lags[0] + places, scores[top[: options.different.peaks]]], dim=1)
-    best = top[0]
-    probability, margin = _probability(scores, best), _margin(curve, best, options.different.apart / step, options)
-    probability = min(probability, 1 / (1 + math.exp(-max(min(margin, 700.0), -700.0))))
-    position = float(peaks[0, 0])
-    sigma = math.hypot(options.different.blur / step, max(positions[0][1], wobble(curve, round(position), options)))
-    times = start + step * peaks[1:4, 0]
-    refusal = _refusal(curve, best, probability, margin, times, step, options)
-    if (
-        refusal is None
-        and margin < options.different.alone * float(scores[best])
-        and resemblance(curve, best, options.different.apart / step, options) > options.different.repeated
-    ):
-        refusal = Notice(ShiftNotice.REPEATED, margin, {"case": "itself"})
-    if refusal is None and sigma > options.different.sharp:
-        refusal = Notice(ShiftNotice.BLUNT, sigma * step, {"case": "known" if math.isfinite(sigma) else "rough"})
-    return SubspaceShift(position, sigma, peaks, probability, margin, refusal)
-
-
-def _maxima(scores: Tensor, apart: float, options: SynchronizeOptions) -> list[int]:
-    """Local maxima, best first, none within so many frames of a better one."""
-    padded = torch.nn.functional.pad(scores, (1, 1), value=-math.inf)
-    top = ((scores >= padded[:-2]) & (scores >= padded[2:]) & scores.isfinite()).nonzero()[:, 0]
-    kept: list[int] = []
-    for i in top[scores[top].argsort(descending=True)].tolist():
-        if all(abs(i - j) > apart + 1e-9 for j in kept):
-            kept.append(i)
-        if len(kept) > 4 * options.different.peaks:
-            break
-    return kept
-
-
-def _between(scores: Tensor, i: int) -> tuple[float, float]:
-    """Place of the maximum near entry i, and its standard deviation."""
-    around = scores[max(i - 1, 0) : i + 2].tolist()
-    bend = around[0] - 2 * around[1] + around[2] if len(around) == 3 else 0.0
-    if not (math.isfinite(bend) and bend < 0):
-        return float(i), 1.0
-    move = 0.5 * (around[0] - around[2]) / bend
-    return i + max(-0.5, min(0.5, move)), math.sqrt(-1 / bend)
-
-
-def _probability(scores: Tensor, best: int) -> float:
-    """Share of the posterior within a frame of the best."""
-    weight = (scores - scores[best]).exp()
-    return float(weight[max(best - 1, 0) : best + 2].sum() / weight.sum())
-
-
-def _margin(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
-    """Nats per frame over the best other maximum, times the best one's frames."""
-    rates = torch.where(curve.scores.isfinite(), curve.rates, -math.inf)
-    others = [i for i in _maxima(rates, apart, options) if abs(i - best) > apart + 1e-9]
-    return float((rates[best] - rates[others[0]]) * curve.counts[best]) if others else float(curve.scores[best])
-
-
-def _refusal(
-    curve: SubspaceCurve, best: int, probability: float, margin: float, times: Tensor, step: float, options: SynchronizeOptions
-) -> Notice | None:
-    """Why the data do not decide; empty where they do."""
-    if min(curve.signal) < 1 or float(curve.rates[best]) < options.different.telling * step:
-        return Notice(ShiftNotice.NOISY, min(curve.signal))
-    if curve.bodies is not None and min(body.bend for body in curve.bodies) < options.different.bent:
-        return Notice(ShiftNotice.STRAIGHT, min(body.bend for body in curve.bodies))
-    if probability >= options.different.sure and margin >= options.different.clear:
-        return None
-    others = ", ".join(f"{time:+.2f}" for time in times.tolist())
-    return Notice(
-        ShiftNotice.REPEATED, margin, {"case": "others" if margin < options.different.clear else "unclear", "rivals": others}
-    )
 
 
 def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
@@ -472,3 +307,167 @@ def _result(a: Tracks, b: Tracks, samples: _Samples, curve: SubspaceCurve, best:
         status=status_from(limits),
         notices=limits,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class RowSpaceShift:
+    """The lag that stands out most of all kinds of cameras and levels of noise."""
+
+    lag: float  # seconds of b's clock at time 0 of a's, at a rate of 1 after that
+    sigma: float  # its standard deviation, seconds
+    kind: Kind  # of the cameras
+    clearness: float  # margin of the best lag over the spread of the others
+    votes: float  # share of the kinds and levels that say the same lag
+    margin: float  # nats over any other lag
+    curve: Hypothesis  # of that kind and level
+    seconds: Tensor  # ``(L,)`` of its lags
+    foreign: tuple[Tensor, Tensor]  # tracks of a and of b ``(n,)``, ``(m,)`` bool that were left out
+    options: SynchronizeOptions
+
+    @property
+    def ok(self) -> bool:
+        """Whether the lag is beyond doubt."""
+        return _decided(self.clearness, self.votes, self.options)
+
+    @property
+    def strength(self) -> float:
+        """Clearness over what its votes need: 1 decides."""
+        return _strength(self.clearness, self.votes, self.options)
+
+    @property
+    def peaks(self) -> Tensor:
+        """``(k, 2)`` lag in seconds and score of local maxima, best first, the first one between frames."""
+        scores, kept = self.curve.totals, list[int]()
+        for place in scores.argsort(descending=True)[: self.options.rows.looked_at].tolist():
+            away = all(abs(float(self.curve.lags[place] - self.curve.lags[other])) > self.curve.apart for other in kept)
+            if away and math.isfinite(float(scores[place])):
+                kept.append(place)
+        kept = kept[: self.options.different.peaks]
+        found = torch.stack([self.seconds[kept], scores[kept]], dim=1)
+        found[0, 0] = self.lag
+        return found
+
+    @property
+    def confidence(self) -> float:
+        """Probability that the lag is right, from how clear it is."""
+        return _sigmoid((_strength(self.clearness, self.votes, self.options) - 1) * self.options.rows.odds + math.log(19))
+
+    def turned(self, rate: float) -> RowSpaceShift:
+        """The same with a and b exchanged; ``rate`` of the new b's clock."""
+        lag, sigma, seconds = -self.lag * rate, self.sigma * rate, -self.seconds * rate
+        return replace(self, lag=lag, sigma=sigma, seconds=seconds, foreign=(self.foreign[1], self.foreign[0]))
+
+
+def _strength(clearness: float, votes: float, options: SynchronizeOptions) -> float:
+    """Clearness over what these votes need: 1 decides."""
+    return clearness / (options.rows.clear + (1 - votes) * options.rows.alone)
+
+
+def _decided(clearness: float, votes: float, options: SynchronizeOptions) -> bool:
+    return _strength(clearness, votes, options) >= 1
+
+
+def _sigmoid(x: float) -> float:
+    return 1 / (1 + math.exp(-max(min(x, 700.0), -700.0)))
+
+
+def row_space_shift(
+    a: Tracks, b: Tracks, *, step: float, rate: float, max_shift: float | None, around: float = 0.0, options: SynchronizeOptions
+) -> RowSpaceShift | None:
+    """The clearest lag between two cameras' row spaces; None where none can be judged."""
+    if a.still or b.still:
+        return None
+    if b.x.shape[-1] == 3:  # what is looked at between frames is the second, and a camera is the shorter take of fewer points
+        back = {"step": step * rate, "rate": 1 / rate, "around": -around / rate}
+        other = row_space_shift(b, a, max_shift=max_shift, options=options, **back)
+        return None if other is None else other.turned(rate)
+    films = Films(a, b, step, rate, options)
+    films = films.completed if films.spatial else films
+    ta, tb = films.times
+    if min(len(ta), len(tb)) < 3:
+        return None
+    start = float(tb[0]) / rate - float(ta[0])
+    lags = _span(films, start, max_shift, around / rate, options)
+    if lags is None:
+        return None
+    kinds = kind_moments(films, lags)
+    found = hypotheses(kinds)
+    if not found:
+        return None
+    best, votes = _chosen(found)
+    kept = tuple(torch.ones(x.x.shape[1], dtype=torch.bool, device=x.x.device) for x in (a, b))
+    if options.rows.hopeful < _strength(best.clearness, votes, options) < 1:
+        without = _left_out(kinds, best, options)
+        if without is not None:
+            fewer = hypotheses([one.only(*without) for one in kinds])
+            chosen, agree = _chosen(fewer)
+            if _strength(chosen.clearness, agree, options) > options.rows.gain * _strength(best.clearness, votes, options):
+                best, votes, kept, found = chosen, agree, without, fewer
+    kind, place = _plainest(films.only(*kept), found, best)
+    seconds = (start + best.lags * step) * rate
+    lag, sigma, foreign = (start + place.lag * step) * rate, place.sigma * step * rate, (~kept[0], ~kept[1])
+    return RowSpaceShift(lag, sigma, kind, best.clearness, votes, best.margin, best, seconds, foreign, options)
+
+
+def _span(
+    films: Films, start: float, max_shift: float | None, around: float, options: SynchronizeOptions
+) -> tuple[int, int] | None:
+    """First and last lag, frames."""
+    ta, tb = films.times
+    lo, hi = 1 - len(ta), len(tb) - 1
+    if max_shift is not None:
+        low, high = ((sign * max_shift / films.rate - start) / films.step for sign in (-1, 1))
+        lo, hi = max(lo, math.ceil(low - 1e-9)), min(hi, math.floor(high + 1e-9))
+    if hi - lo >= options.rows.most_lags:
+        middle = min(max(round((around - start) / films.step), lo), hi)
+        lo, hi = max(lo, middle - options.rows.most_lags // 2), min(hi, middle + options.rows.most_lags // 2)
+    return (lo, hi) if hi - lo >= 2 else None
+
+
+def _chosen(found: list[Hypothesis]) -> tuple[Hypothesis, float]:
+    """The clearest, and the share of all that say the same lag."""
+    best = max(found, key=lambda one: one.clearness)
+    place = float(best.lags[best.best])
+    return best, sum(abs(float(one.lags[one.best]) - place) <= best.apart for one in found) / len(found)
+
+
+def _plainest(films: Films, found: list[Hypothesis], best: Hypothesis) -> tuple[Kind, Place]:
+    """Of the kinds that say the same lag, the one with most nats at its place: cameras as they are leave but noise
+    unexplained."""
+    lag = float(best.lags[best.best])
+    same = [one for one in found if abs(float(one.lags[one.best]) - lag) <= best.apart]
+    fixed = [one for one in same if one.kind == "affine"]
+    chosen = [
+        max(part, key=lambda one: float(one.totals[one.best])) for part in (fixed, [x for x in same if x not in fixed]) if part
+    ]
+    places = [(one.kind, refined(films, one)) for one in chosen]
+    kind, first = max(places, key=lambda pair: pair[1].nats)
+    rivals = [place for _, place in places if place.nats > films.options.rows.nearly * first.nats]
+    apart = max((abs(place.lag - first.lag) for place in rivals), default=0.0) / 2
+    return kind, replace(first, sigma=math.hypot(first.sigma, apart))
+
+
+def _left_out(kinds: list[KindMoments], best: Hypothesis, options: SynchronizeOptions) -> tuple[Tensor, Tensor] | None:
+    """Tracks of a and of b ``(n,)``, ``(m,)`` bool that are left when those go, one by one, without which a lag stands out more."""
+    counts = [kinds[0].films.a.x.shape[1], kinds[0].films.b.x.shape[1]]
+    kept = [torch.ones(count, dtype=torch.bool) for count in counts]
+    tried = [one for one in kinds if one.kind == best.kind]
+    clearest = best.clearness
+    for _ in range(math.ceil(options.rows.foreign * max(counts))):
+        found: tuple[float, int, int] | None = None
+        for side in (1,) if kinds[0].films.spatial else (0, 1):
+            if int(kept[side].sum()) <= max(options.rows.fewest, (1 - options.rows.foreign) * counts[side]):
+                continue
+            for point in kept[side].nonzero()[:, 0].tolist():
+                rest = [mask.clone() for mask in kept]
+                rest[side][point] = False
+                clear = max(
+                    (h.clearness for one in tried if (h := one.only(*rest).hypothesis(best.level)) is not None), default=0.0
+                )
+                if found is None or clear > found[0]:
+                    found = clear, side, point
+        if found is None or found[0] < clearest * options.rows.gain:
+            break
+        clearest = found[0]
+        kept[found[1]][found[2]] = False
+    return (kept[0], kept[1]) if not all(bool(mask.all()) for mask in kept) else None

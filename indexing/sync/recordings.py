@@ -23,9 +23,17 @@ from indexing.remarks import FOLLOWED, remarks_on
 from indexing.sync.options import SyncOptions
 
 FloatArray = NDArray[np.float64]
+
+
 Kind = Literal["keypoints", "video", "frames"]
+
+
 By = Literal["auto", "keypoints", "pixels"]
+
+
 CHOICES = ("auto", *FOLLOWED)
+
+
 ASSUMED = 30.0  # frames per second where nobody says
 
 

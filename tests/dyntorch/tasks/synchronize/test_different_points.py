@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.tasks.synchronize.different import SubspaceShift, _to_a_frame
+from dyntorch.tasks.synchronize.different_points import _to_a_frame
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.subspace import SubspaceShift
 from dyntorch.tasks.synchronize.synchronize import synchronize
 
 FRAME = 1 / 30

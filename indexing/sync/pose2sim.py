@@ -22,9 +22,11 @@ from indexing.opening import error, parse_toml, read_text
 from indexing.readers.files import VIDEOS
 from indexing.sync.calibration import Lens, named_lenses
 from indexing.sync.files import Plan
-from indexing.sync.takes import Take, camera_name
+from indexing.sync.recordings import Take, camera_name
 
 CONFIG, POSE, FILMS = "Config.toml", "pose", "videos"
+
+
 REMEDY = "correct it, or give --fps"
 
 

@@ -9,9 +9,8 @@ from scipy.linalg import eigh
 
 from dyntorch import synchronize, synchronize_cameras
 from dyntorch.numerics.lags import resection_moments
-from dyntorch.tasks.synchronize.combinations import _Problem, combined_fit
+from dyntorch.tasks.synchronize.motion_capture import SpaceDescent, SpaceSamples, _Problem, camera_variance, combined_fit
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.space import SpaceDescent, SpaceSamples, camera_variance
 from dyntorch.tasks.synchronize.tracks import read_tracks
 
 FPS, RECORDED = 30.0, 120.0

@@ -14,7 +14,7 @@ import pytest
 import dyntorch
 from dyntorch.tasks.synchronize.cameras import synchronize_cameras
 from indexing.cli import main
-from indexing.sync.trial import numbers, trial_of, trials_in
+from indexing.sync.pose2sim import numbers, trial_of, trials_in
 from tests.indexing.sync.footage import write_film
 from tests.indexing.sync.scene import FPS, SKIPPED, cut, filmed, shift, write_openpose
 
