@@ -28,7 +28,6 @@ from dyntorch.geometry.epipolar import epipolar_variance
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics import lags
 from dyntorch.numerics.lags import Lags
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.subspace import subspace_curve
 from experiments.benchmarks.interleaved import interleaved
 from experiments.common.tables import Row, command, measured_on_one_thread
@@ -109,7 +108,7 @@ def subspace_scores(takes: Takes, window: Lags | None) -> Tensor:
     """The library's score of different points at every shift."""
     a, b = takes.a.unflatten(1, (-1, 2)), takes.b.unflatten(1, (-1, 2))
     window = window or (1 - len(a), len(b) - 1)
-    scores = subspace_curve(a, b, torch.ones(a.shape[:2]), torch.ones(b.shape[:2]), window, options=SynchronizeOptions()).scores
+    scores = subspace_curve(a, b, torch.ones(a.shape[:2]), torch.ones(b.shape[:2]), window).scores
     return scores.nan_to_num(-torch.inf)
 
 

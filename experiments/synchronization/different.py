@@ -76,7 +76,7 @@ def measures(config: Config) -> list[Row]:
         for measure in MEASURES:
             options = SynchronizeOptions()
             if measure != "auto":
-                options = replace(options, different=replace(options.different, measure=measure, camera="affine"))
+                options = replace(options, measure=measure, camera_model="affine")
             rows += row(measure, f"fixed affine cameras, {noise:g} px", pairs, options)
     return rows
 

@@ -84,13 +84,13 @@ def read_rig(
             x, lens = tracks[i].detach().double() if isinstance(tracks[i], Tensor) else tracks[i], lenses[i]
             own = None if times is None else times[i]
             given = None if weights is None else weights[i]
-            read = read_tracks(f"tracks[{i}]", x, None if own is not None else rates[i], own, given, options.synchronize)
+            read = read_tracks(f"tracks[{i}]", x, None if own is not None else rates[i], own, given)
             _check_inside(x, size[i], options)
             straight.append(x if lens is None else _ideal(undistorted(x, lens), lens[0]))
             if lens is not None:
                 own = read.times if own is None else own
-                read = read_tracks(f"tracks[{i}]", straight[-1], None, own, given, options.synchronize)
-            found.append(cleaned(read, options.synchronize))
+                read = read_tracks(f"tracks[{i}]", straight[-1], None, own, given)
+            found.append(cleaned(read))
         except ValueError as error:
             raise ValueError(f"camera {i}: {error}") from error
     centers = torch.stack([size[i] / 2 if lens is None else lens[0][:2, 2] for i, lens in enumerate(lenses)])

@@ -77,9 +77,7 @@ def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, opti
         )
     middle = 0.5 * (start + end)
     times = start - middle + step * torch.arange(math.floor((end - start) / step + 1e-9) + 1, dtype=torch.float64)
-    grids = tuple(
-        Grid.of(t, options.adjust.width * step * r, options.synchronize) for t, (_, r) in zip(tracks, clocks.tolist(), strict=True)
-    )
+    grids = tuple(Grid.of(t, options.adjust.width * step * r) for t, (_, r) in zip(tracks, clocks.tolist(), strict=True))
     frames, noise = torch.tensor([[t.step, t.noise] for t in tracks], dtype=torch.float64).unbind(-1)
     most = math.log(options.adjust.noise_ratio)
     noise = noise.clamp(min=options.adjust.least_noise).log()

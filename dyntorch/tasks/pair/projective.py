@@ -16,9 +16,8 @@ from dyntorch.numerics.least_squares import LeastSquaresOptions
 from dyntorch.tasks.pair.options import PairOptions
 from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
 from dyntorch.tasks.pair.tracks import Overlap
-from dyntorch.tasks.synchronize.options import ProjectiveOptions
-from dyntorch.tasks.synchronize.projective import Poses, common_motion
-from dyntorch.tasks.synchronize.rigid_body import BodyMotion, body_motion
+from dyntorch.tasks.synchronize.projective import MAX_MISFIT, Poses, common_motion
+from dyntorch.tasks.synchronize.rigid_body import MAX_ITERATIONS, MIN_RELATIVE_NOISE, BodyMotion, body_motion
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 
@@ -29,25 +28,24 @@ def body_pair(
     options: PairOptions,
 ) -> PairReconstruction:
     r"""One body, two cameras, points of either's own:"""
-    bodies = ProjectiveOptions()
     n, m = seen.a.shape[1], seen.b.shape[1]
     tracks = [_tracks(x, seen) for x in (seen.a, seen.b)]
     motions = []
     for name, one in zip("ab", tracks, strict=True):
-        motion = body_motion(name, one, bodies)
+        motion = body_motion(name, one)
         if isinstance(motion, Notice):
             return failure((n, m), seen.times, motion.code.refuses or Status.DEGENERATE, motion, 4, n + m)
         motions.append(motion)
     first, second = motions
-    poses = [Poses.of(motion, seen.times, bodies) for motion in motions]
-    shared, misfit = common_motion(poses[0], poses[1], bodies)
-    if not misfit <= bodies.agree:
+    poses = [Poses.of(motion, seen.times) for motion in motions]
+    shared, misfit = common_motion(poses[0], poses[1])
+    if not misfit <= MAX_MISFIT:
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, misfit), 4, n + m)
-    body, problem = _joint(first, second, shared, tracks, bodies)
-    body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=bodies.iterations, tolerance=1e-10))
+    body, problem = _joint(first, second, shared, tracks)
+    body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-10))
     if not bool(cost.isfinite().all()):
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, math.inf), 4, n + m)
-    return _assembled(seen, body, first, second, threshold, explained, options, bodies)
+    return _assembled(seen, body, first, second, threshold, explained, options)
 
 
 def _tracks(x: Tensor, seen: Overlap) -> Tracks:
@@ -57,7 +55,7 @@ def _tracks(x: Tensor, seen: Overlap) -> Tracks:
 
 
 def _joint(
-    first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, ...], tracks: list[Tracks], bodies: ProjectiveOptions
+    first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, ...], tracks: list[Tracks]
 ) -> tuple[FilmedBody, BodyProblem]:
     """The start in the frame of a, and the problem of both cameras' tracks, each in its own unit."""
     turn, seat, (scale, *rest) = shared[0], shared[1], shared[2].split([1, 3, 3])
@@ -74,7 +72,7 @@ def _joint(
     for k, (motion, one) in enumerate(zip((first, second), tracks, strict=True)):
         own = one.x[:, motion.points]
         x.append((own - motion.centre) / motion.scale)
-        noise = max(motion.residual, bodies.exact * motion.scale)
+        noise = max(motion.residual, MIN_RELATIVE_NOISE * motion.scale)
         known = (one.weights[:, motion.points] > 0) & (first.seen | second.seen)[:, None]
         weights.append(known * (motion.scale / noise) ** 2)
         camera.append(torch.full((own.shape[1],), k, device=own.device))
@@ -99,7 +97,6 @@ def _assembled(
     threshold: float | None,
     explained: float,
     options: PairOptions,
-    bodies: ProjectiveOptions,
 ) -> PairReconstruction:
     n, m, frames = seen.a.shape[1], seen.b.shape[1], len(seen.times)
     kept = torch.cat([first.points, second.points])
@@ -121,7 +118,7 @@ def _assembled(
     sigma = float(apart[:, kept].nanmedian()) / 1.1774
     limit = options.corresponding.sigmas * sigma if threshold is None else threshold
     counted = apart.isfinite()
-    share = (counted & (apart <= max(limit, bodies.exact * first.scale))).sum(0) / counted.sum(0).clamp(min=1)
+    share = (counted & (apart <= max(limit, MIN_RELATIVE_NOISE * first.scale))).sum(0) / counted.sum(0).clamp(min=1)
     good = kept & (share >= explained)
     matches, distances = _matched(both, good, n, float(apart[:, good].square().nanmean().sqrt()), options)
     rotation, place = body.sights[0, 1].split([3, 1], -1)

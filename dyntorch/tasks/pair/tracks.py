@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from dyntorch.tasks.pair.options import PairOptions
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift
 from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks
 
@@ -36,10 +35,7 @@ def overlap(
 ) -> Overlap:
     """Both cameras at a's frame times. a ``(frames, n, 2)``, b ``(frames, m, 2)``."""
     rates, clocks = _clocks(shift, fps, times)
-    tracks = [
-        read_tracks(name, x, rate, clock, None, options=SynchronizeOptions())
-        for name, x, rate, clock in zip("ab", (a, b), rates, clocks, strict=True)
-    ]
+    tracks = [read_tracks(name, x, rate, clock, None) for name, x, rate, clock in zip("ab", (a, b), rates, clocks, strict=True)]
     if a.device != b.device:
         raise ValueError(f"a and b must be on one device, got {a.device} and {b.device}; use b.to(a.device)")
     first, second = tracks

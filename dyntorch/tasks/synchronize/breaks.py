@@ -39,7 +39,7 @@ def breaks(
     max_shift: float | None = None,
     calibration: tuple[Any, Any] | None = None,
     weights: tuple[Tensor | None, Tensor | None] | None = None,
-    options: SynchronizeOptions = SynchronizeOptions(),
+    options: SynchronizeOptions | None = None,
 ) -> Breaks:
     r"""Where frames are missing, or twice, in one of two films of the same points whose frame numbers do not say so.
 
@@ -61,7 +61,7 @@ def breaks(
         max_shift: seconds; how far to search.
         calibration: per camera None or ``(K, dist)``.
         weights: per camera ``(frames, n)``, 0 = ignore.
-        options: every number that decides; those of ``options.breaks`` are of this function.
+        options: ``max_jump`` and those of :func:`dyntorch.synchronize`.
 
     Returns:
         The breaks with their evidence, mended times of both cameras, and the shift with these; refused where the data do not
@@ -86,6 +86,7 @@ def breaks(
         >>> [(one.frames, one.camera, round(one.jump, 1)) for one in found.breaks], round(found.clocks.offset, 2)
         ([(6, None, -0.2)], 0.4)
     """
+    options = SynchronizeOptions() if options is None else options
     check_options(options, SynchronizeOptions)
     given: dict[str, Any] = {"fps": fps, "times": times, "calibration": calibration, "weights": weights}
     if shift is None:
@@ -105,7 +106,7 @@ def breaks(
     if told is None or not told[0].jumps:
         return _unbroken(shift, clocks)
     course, nats, residuals = told
-    found = _found(course, nats, residuals, *evidence.sizes(course), (first, second), origin, options)
+    found = _found(course, nats, residuals, *evidence.sizes(course), (first, second), origin)
     a_times, b_times = mended(first, second, course.rate, course.offset, _snapped(course, found, (first.step, second.step)))
     new = a_times.times + origin, b_times.times + origin
     again = synchronize(a, b, times=new, max_shift=max_shift, calibration=calibration, weights=weights, options=options)
@@ -122,9 +123,12 @@ def _unbroken(shift: Shift, clocks: tuple[Tensor, Tensor]) -> Breaks:
     return Breaks((), clocks, shift, status=status_from(limits), notices=limits)
 
 
+WHOLE_FRAME_TOLERANCE = 0.3  # Frames by which a jump may differ from a whole number of frames.
+
+
 def _found(
     course: Course, nats: list[float], residuals: list[float], sizes: list[float], sigmas: list[float],
-    tracks: tuple[Tracks, Tracks], origin: float, options: SynchronizeOptions,
+    tracks: tuple[Tracks, Tracks], origin: float,
 ) -> tuple[ClockBreak, ...]:  # fmt: skip
     """The jumps as breaks of one or the other camera."""
     a, b = tracks
@@ -134,7 +138,7 @@ def _found(
         loser = 1 if size < 0 else 0  # it lost frames, or the other one has some twice
         lost = abs(size) / (b if loser else a).step / (1.0 if loser else course.rate)
         whole = round(lost)
-        fits = whole >= 1 and abs(lost - whole) <= max(options.breaks.whole, 3 * sigma / (b if loser else a).step)
+        fits = whole >= 1 and abs(lost - whole) <= max(WHOLE_FRAME_TOLERANCE, 3 * sigma / (b if loser else a).step)
         found.append(
             ClockBreak(
                 candidates=(loser, 1 - loser),
@@ -205,7 +209,7 @@ def camera_breaks(
     max_shift: float | None = None,
     calibration: Sequence[Any] | None = None,
     weights: Sequence[Tensor] | None = None,
-    options: SynchronizeOptions = SynchronizeOptions(),
+    options: SynchronizeOptions | None = None,
 ) -> Breaks:
     """Where frames are missing, or twice, in some of several films of the same points: :func:`breaks` of every pair, then the
     camera that all its pairs blame.
@@ -218,7 +222,7 @@ def camera_breaks(
         max_shift: seconds.
         calibration: per camera None or ``(K, dist)``.
         weights: per camera ``(frames, n)``.
-        options: every number that decides.
+        options: as of :func:`breaks`.
 
     Returns:
         The breaks, each with its camera where three or more cameras tell, and mended times of all.  ``clocks`` are those given:
@@ -268,7 +272,7 @@ def camera_breaks(
         for pair, told in sure.items()
         for one in told.breaks
     ]
-    broken = tuple(one for group in _together(blames, options) for one in _blamed(group, sorted(sure), count, options, own))
+    broken = tuple(one for group in _together(blames) for one in _blamed(group, sorted(sure), count, own))
     limits: tuple[Notice, ...] = tuple(_notice(one) for one in broken)
     if not sure:
         said = next((one.reason for one in found.values()), "no pair was compared")
@@ -291,20 +295,21 @@ def _reference(clocks: Clocks, camera: int, moment: float) -> float:
     return time if math.isfinite(time) else moment
 
 
-def _together(blames: list[Blame], options: SynchronizeOptions) -> list[list[Blame]]:
+MAX_BREAK_DISTANCE_SECONDS = 1.0  # Within this the breaks of several pairs are one.
+
+
+def _together(blames: list[Blame]) -> list[list[Blame]]:
     """Groups of breaks that may be one, by their moments."""
     groups: list[list[Blame]] = []
     for one in sorted(blames, key=lambda blame: blame.time):
-        if groups and one.time - groups[-1][-1].time <= options.breaks.together:
+        if groups and one.time - groups[-1][-1].time <= MAX_BREAK_DISTANCE_SECONDS:
             groups[-1].append(one)
         else:
             groups.append([one])
     return groups
 
 
-def _blamed(
-    group: list[Blame], pairs: Sequence[tuple[int, int]], count: int, options: SynchronizeOptions, times: Sequence[Tensor]
-) -> list[ClockBreak]:
+def _blamed(group: list[Blame], pairs: Sequence[tuple[int, int]], count: int, times: Sequence[Tensor]) -> list[ClockBreak]:
     """Cameras that broke at about one moment: as long as there is something to explain, the one that explains most of it."""
     left, found = list(group), []
     while left:
@@ -317,7 +322,7 @@ def _blamed(
         ranked.sort(key=lambda one: one[:2], reverse=True)
         best, second = ranked[0], ranked[1]
         if best[1] >= 2 and best[:2] > second[:2]:
-            found.append(_of_camera(best[2], best[3], times, options))
+            found.append(_of_camera(best[2], best[3], times))
             left = [one for one in left if one not in best[3]]
         else:
             one = max(left, key=lambda blame: blame.one.evidence)
@@ -335,7 +340,7 @@ def _agreeing(mine: list[Blame], camera: int, times: Sequence[Tensor]) -> list[B
     return max(sets, key=len, default=[])
 
 
-def _of_camera(camera: int, mine: list[Blame], times: Sequence[Tensor], options: SynchronizeOptions) -> ClockBreak:
+def _of_camera(camera: int, mine: list[Blame], times: Sequence[Tensor]) -> ClockBreak:
     """What all pairs of a camera say together."""
     w = torch.tensor([one.one.sigma**-2 for one in mine], dtype=torch.float64)
     moments = torch.tensor([one.moment(camera) for one in mine], dtype=torch.float64)
@@ -350,7 +355,7 @@ def _of_camera(camera: int, mine: list[Blame], times: Sequence[Tensor], options:
         sigma=float(w.sum() ** -0.5),
         jump=jump,
         jump_sigma=float(sharp.sum() ** -0.5),
-        frames=whole if whole >= 1 and abs(abs(jump) / step - whole) <= options.breaks.whole else None,
+        frames=whole if whole >= 1 and abs(abs(jump) / step - whole) <= WHOLE_FRAME_TOLERANCE else None,
         evidence=sum(one.one.evidence for one in mine),
         residuals=strongest.residuals,
     )

@@ -24,6 +24,9 @@ from dyntorch.tasks.synchronize.synchronize import synchronize
 # The shifts of pairs of cameras as numbers: candidates, times from the middle of what a camera shares with others, and costs.
 
 
+FIXED_RATE_SIGMA = 1e-9  # The same where no pair searched it.
+
+
 @dataclass(frozen=True)
 class Network:
     """The pairs as numbers: E pairs, K candidates each."""
@@ -50,18 +53,21 @@ class Network:
     """``(cameras,)``: -log of that density, once: a camera without a clock has no place to be explained."""
     weight: Tensor
     """``(E,)`` of the squared residual: the probability that the best peak is right."""
-    options: SynchronizeOptions
 
     @property
     def searched(self) -> bool:
         """Whether some pair searched its rate."""
-        return bool((self.rate_sigma > self.options.cameras.fixed_rate_sigma).any())
+        return bool((self.rate_sigma > FIXED_RATE_SIGMA).any())
 
 
-def network(shifts: Mapping[tuple[int, int], Shift], cameras: int, options: SynchronizeOptions) -> Network:
+PEAK_ERROR_FRAMES = 0.25  # Error of a right peak that the sigma of a pair does not include (view-dependent keypoints), frames.
+UNSEARCHED_RATE_SIGMA = 5e-5  # Sigma of the rate of a pair that did not search it, next to pairs that did: quartz clocks.
+
+
+def network(shifts: Mapping[tuple[int, int], Shift], cameras: int) -> Network:
     """The pairs' candidates, times and costs."""
     ends, every = torch.tensor(list(shifts)).reshape(-1, 2), list(shifts.values())
-    found = [_candidates(shift, options) for shift in every]
+    found = [_candidates(shift) for shift in every]
     offsets = torch.stack([offset for offset, _ in found])
     center = torch.tensor([_finite(shift.center, 0.0) for shift in every], dtype=torch.float64)
     moments = torch.cat([center[:, None], center[:, None] + offsets], dim=1)
@@ -72,37 +78,38 @@ def network(shifts: Mapping[tuple[int, int], Shift], cameras: int, options: Sync
         count = count.index_add(0, ends[:, column], known)
     means = total / count.clamp(min=1)
     moments = moments - torch.cat([means[ends[:, :1]], means[ends[:, 1:]].expand(-1, offsets.shape[1])], dim=1)
-    sigma = torch.tensor([max(_finite(shift.sigma, _span(shift, options)), 0.0) for shift in every], dtype=torch.float64)
-    slack = torch.tensor([options.cameras.peak_error / min(shift.fps) for shift in every], dtype=torch.float64)
+    sigma = torch.tensor([max(_finite(shift.sigma, _span(shift)), 0.0) for shift in every], dtype=torch.float64)
+    slack = torch.tensor([PEAK_ERROR_FRAMES / min(shift.fps) for shift in every], dtype=torch.float64)
     rate_sigma = torch.tensor([_finite(shift.rate_sigma, 1.0) for shift in every], dtype=torch.float64)
     rate_sigma = torch.where(
-        rate_sigma > 0, rate_sigma, options.cameras.rate_sigma if bool((rate_sigma > 0).any()) else options.cameras.fixed_rate_sigma
+        rate_sigma > 0, rate_sigma, UNSEARCHED_RATE_SIGMA if bool((rate_sigma > 0).any()) else FIXED_RATE_SIGMA
     )
-    gain = torch.tensor([_span(shift, options) for shift in every], dtype=torch.float64) / (2.5 * torch.hypot(sigma, slack))
+    gain = torch.tensor([_span(shift) for shift in every], dtype=torch.float64) / (2.5 * torch.hypot(sigma, slack))
     gain = gain.clamp(min=1).log()
     cost, none = (
         torch.stack([cost for _, cost in found]),
-        torch.tensor([_wrong(shift, options) for shift in every], dtype=torch.float64),
+        torch.tensor([_wrong(shift) for shift in every], dtype=torch.float64),
     )
     rate = torch.tensor([_finite(shift.rate, 1.0) for shift in every], dtype=torch.float64).log()
-    weight = torch.tensor([_trust(shift, options) for shift in every], dtype=torch.float64)
+    weight = torch.tensor([_trust(shift) for shift in every], dtype=torch.float64)
     saving = torch.tensor([float(gain[(ends == one).any(-1)].min()) if (ends == one).any() else 0.0 for one in range(cameras)])
-    return Network(
-        cameras, ends, moments, means, sigma, slack, rate, rate_sigma, cost, gain + none, saving, weight, options=options
-    )
+    return Network(cameras, ends, moments, means, sigma, slack, rate, rate_sigma, cost, gain + none, saving, weight)
 
 
-def _candidates(shift: Shift, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
+NUM_CANDIDATES = 8  # Candidates per pair.
+
+
+def _candidates(shift: Shift) -> tuple[Tensor, Tensor]:
     """Shifts at ``center`` of the best candidate and the other peaks, ``(PEAKS,)``, and their costs."""
     best = _finite(shift.center, 0.0) * (_finite(shift.rate, 1.0) - 1) + shift.offset
     others = shift.peaks[:, 0].double()
     # the best one is refined, and its own peak no other candidate
-    others = others[others.isfinite() & ((others - best).abs() > 1 / min(shift.fps))][: options.cameras.peaks - 1]
+    others = others[others.isfinite() & ((others - best).abs() > 1 / min(shift.fps))][: NUM_CANDIDATES - 1]
     share = 1 / torch.arange(1, len(others) + 1, dtype=torch.float64)
-    left = 0.5 * (1 - _trust(shift, options))
-    cost = torch.cat([torch.tensor([-log(_trust(shift, options))], dtype=torch.float64), -(left * share / share.sum()).log()])
+    left = 0.5 * (1 - _trust(shift))
+    cost = torch.cat([torch.tensor([-log(_trust(shift))], dtype=torch.float64), -(left * share / share.sum()).log()])
     offsets = torch.cat([torch.tensor([best], dtype=torch.float64), others])
-    cost, empty = torch.where(offsets.isfinite(), cost, torch.inf), options.cameras.peaks - len(offsets)
+    cost, empty = torch.where(offsets.isfinite(), cost, torch.inf), NUM_CANDIDATES - len(offsets)
     return torch.nn.functional.pad(offsets, (0, empty), value=torch.nan), torch.nn.functional.pad(cost, (0, empty), value=torch.inf)
 
 
@@ -111,19 +118,26 @@ def _finite(value: float, other: float) -> float:
     return value if isfinite(value) else other
 
 
-def _trust(shift: Shift, options: SynchronizeOptions) -> float:
-    low, high = options.cameras.sure if shift.ok else options.cameras.unsure
+ACCEPTED_PROBABILITY_RANGE = (0.95, 0.99)  # Range of the probability that the best peak of an accepted pair is right.
+REFUSED_PROBABILITY_RANGE = (0.05, 0.5)  # The same of a refused pair.
+
+
+def _trust(shift: Shift) -> float:
+    low, high = ACCEPTED_PROBABILITY_RANGE if shift.ok else REFUSED_PROBABILITY_RANGE
     return min(max(_finite(shift.confidence, 0.0), low), high)
 
 
-def _wrong(shift: Shift, options: SynchronizeOptions) -> float:
+def _wrong(shift: Shift) -> float:
     """-log of the probability that no candidate is right; at most that of the best one, by which a camera may have to hang."""
-    return -log(min((0.5 if len(shift.peaks) > 1 else 1.0) * (1 - _trust(shift, options)), _trust(shift, options)))
+    return -log(min((0.5 if len(shift.peaks) > 1 else 1.0) * (1 - _trust(shift)), _trust(shift)))
 
 
-def _span(shift: Shift, options: SynchronizeOptions) -> float:
+UNKNOWN_RANGE_SECONDS = 10.0  # Range of the offset of a pair without a curve.
+
+
+def _span(shift: Shift) -> float:
     lags = shift.lags[shift.lags.isfinite()]
-    return float(lags.max() - lags.min()) if len(lags) > 1 else options.cameras.unknown_range
+    return float(lags.max() - lags.min()) if len(lags) > 1 else UNKNOWN_RANGE_SECONDS
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -151,30 +165,33 @@ class Reading:
     """``(2 cameras, 2 cameras)`` of logs and starts; 0 for the reference, infinite where there is no clock."""
 
 
-def readings(net: Network, reference: int, options: SynchronizeOptions) -> list[Reading]:
+def readings(net: Network, reference: int) -> list[Reading]:
     """The likeliest readings that differ in some clock, best first."""
-    logs, starts = _search(net, reference, options)
+    logs, starts = _search(net, reference)
     found: dict[tuple[int, ...], Reading] = {}
     for one_log, one_start in zip(logs, starts, strict=True):
-        reading = refined(net, reference, one_log, one_start, options)
+        reading = refined(net, reference, one_log, one_start)
         if reading.labels not in found or reading.cost < found[reading.labels].cost:
             found[reading.labels] = reading
     different: list[Reading] = []
     for reading in sorted(found.values(), key=lambda one: one.cost):
-        if all(differing(net, reading, other, options) for other in different):
+        if all(differing(net, reading, other) for other in different):
             different.append(reading)
     return different
 
 
-def differing(net: Network, one: Reading, other: Reading, options: SynchronizeOptions) -> list[int]:
+def differing(net: Network, one: Reading, other: Reading) -> list[int]:
     """Cameras whose clocks differ by more than a frame and four standard deviations, or have none in one of the two."""
     variance = torch.minimum(one.covariance.diagonal(), other.covariance.diagonal())[net.cameras :]
-    allowed = torch.maximum(4 * variance.sqrt(), net.slack.max() / options.cameras.peak_error)
+    allowed = torch.maximum(4 * variance.sqrt(), net.slack.max() / PEAK_ERROR_FRAMES)
     apart = (one.starts - other.starts).abs()
     return ((apart > allowed) | (one.starts.isnan() != other.starts.isnan())).nonzero().flatten().tolist()
 
 
-def _search(net: Network, reference: int, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
+NUM_REFINED_STATES = 30  # States that are refined in the end.
+
+
+def _search(net: Network, reference: int) -> tuple[Tensor, Tensor]:
     """Beam search: cameras join one by one, by any candidate of any pair with those before, or without a clock."""
     logs = torch.zeros(1, net.cameras, dtype=torch.float64)
     starts = torch.full_like(logs, torch.nan)
@@ -190,11 +207,11 @@ def _search(net: Network, reference: int, options: SynchronizeOptions) -> tuple[
         logs, starts = _joined(net, logs, starts, camera, ties)
         within = torch.tensor([set(ends) <= set(joined) for ends in net.ends.tolist()])
         saved = (starts[:, joined].isnan() * net.saving[joined]).sum(-1)
-        cost = _costs(net, logs, starts, within, options)[0].sum(-1) - saved
-        keep = _distinct(starts, cost, allowed, options)
+        cost = _costs(net, logs, starts, within)[0].sum(-1) - saved
+        keep = _distinct(starts, cost, allowed)
         logs, starts = logs[keep], starts[keep]
     # in the order of _distinct, cheap and complete ones take turns
-    return logs[: options.cameras.final], starts[: options.cameras.final]
+    return logs[:NUM_REFINED_STATES], starts[:NUM_REFINED_STATES]
 
 
 def _between(ends: list[int], camera: int, placed: list[int]) -> bool:
@@ -228,7 +245,10 @@ def _joined(net: Network, logs: Tensor, starts: Tensor, camera: int, ties: Tenso
     return torch.cat(new_logs), torch.cat(new_starts)
 
 
-def _costs(net: Network, logs: Tensor, starts: Tensor, pairs: Tensor, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
+MAX_RATE_COST = 8.0  # Cap of the cost of contradicting rates.
+
+
+def _costs(net: Network, logs: Tensor, starts: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
     """Cost ``(S, chosen)`` of the pairs chosen ``(E,)`` in states ``(S, cameras)``, and the candidate behind it, -1 = none."""
     i, j = net.ends[pairs].unbind(-1)
     here = net.times[pairs, :1] / logs[:, i, None].exp() - starts[:, i, None]
@@ -236,46 +256,50 @@ def _costs(net: Network, logs: Tensor, starts: Tensor, pairs: Tensor, options: S
     spread = torch.hypot(net.sigma, net.slack)[pairs, None]
     fit, label = torch.nan_to_num(0.5 * (away / spread).square() + net.cost[pairs], nan=torch.inf).min(-1)
     # rates are compared more loosely than they were measured, like shifts
-    loose = torch.hypot(
-        net.rate_sigma, torch.tensor(options.cameras.rate_sigma if net.searched else options.cameras.fixed_rate_sigma)
-    )[pairs]
+    loose = torch.hypot(net.rate_sigma, torch.tensor(UNSEARCHED_RATE_SIGMA if net.searched else FIXED_RATE_SIGMA))[pairs]
     drift = (net.rate[pairs] - logs[:, j] + logs[:, i]) / loose
-    fit = fit + (0.5 * drift.square()).clamp(max=options.cameras.drift_cost)
+    fit = fit + (0.5 * drift.square()).clamp(max=MAX_RATE_COST)
     return torch.minimum(fit, net.none[pairs]), torch.where(fit <= net.none[pairs], label, -1)
 
 
-def _distinct(starts: Tensor, cost: Tensor, allowed: float, options: SynchronizeOptions) -> Tensor:
+BEAM_WIDTH = 100  # States that stay when a camera is added.
+
+
+def _distinct(starts: Tensor, cost: Tensor, allowed: float) -> Tensor:
     """States that differ in some clock, at most BEAM: in turns the cheapest, and the cheapest of those with the most clocks."""
-    cheap = cost.argsort(stable=True)[: 5 * options.cameras.beam]
-    complete = (starts.isnan().sum(-1) * (cost.max() - cost.min() + 1) + cost).argsort(stable=True)[: 5 * options.cameras.beam]
+    cheap = cost.argsort(stable=True)[: 5 * BEAM_WIDTH]
+    complete = (starts.isnan().sum(-1) * (cost.max() - cost.min() + 1) + cost).argsort(stable=True)[: 5 * BEAM_WIDTH]
     order = torch.stack([cheap, complete], dim=1).flatten()
     filled = torch.nan_to_num(starts[order], nan=1e15)
     close = torch.cdist(filled, filled, p=torch.inf) <= allowed
     kept: list[int] = []
     free = torch.ones(len(order), dtype=torch.bool)
     for index in range(len(order)):
-        if free[index] and len(kept) < options.cameras.beam:
+        if free[index] and len(kept) < BEAM_WIDTH:
             kept.append(index)
             free &= ~close[index]
     return order[kept]
 
 
-def refined(net: Network, reference: int, logs: Tensor, starts: Tensor, options: SynchronizeOptions) -> Reading:
+MAX_REWEIGHTINGS = 5  # Reweighted least squares of a state.
+
+
+def refined(net: Network, reference: int, logs: Tensor, starts: Tensor) -> Reading:
     """The weighted least squares of the candidates that a state agrees with, and these chosen again, until they stay."""
     every = torch.ones(len(net.ends), dtype=torch.bool)
     labels: tuple[int, ...] = ()
-    for _ in range(options.cameras.steps):
-        cost, chosen = _costs(net, logs[None], starts[None], every, options)
+    for _ in range(MAX_REWEIGHTINGS):
+        cost, chosen = _costs(net, logs[None], starts[None], every)
         if tuple(chosen[0].tolist()) == labels:
             break
         labels = tuple(chosen[0].tolist())
-        logs, starts, covariance = _least_squares(net, reference, labels, logs, starts, options)
+        logs, starts, covariance = _least_squares(net, reference, labels, logs, starts)
     saved = float((starts.isnan() * net.saving).sum())
     return Reading(labels, logs, starts, float(cost.sum()) - saved, covariance)
 
 
 def _least_squares(
-    net: Network, reference: int, labels: tuple[int, ...], logs: Tensor, starts: Tensor, options: SynchronizeOptions
+    net: Network, reference: int, labels: tuple[int, ...], logs: Tensor, starts: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gauss-Newton from a state: logs, starts and their covariance, scaled up where the residuals exceed their sigmas."""
     n, used = net.cameras, [edge for edge, label in enumerate(labels) if label >= 0]
@@ -294,7 +318,7 @@ def _least_squares(
     jacobian[rows, n + here], jacobian[rows, n + there] = weight, -weight
     jacobian[len(used) + rows, here], jacobian[len(used) + rows, there] = rate_weight, -rate_weight
     state = torch.cat([logs, starts])
-    for _ in range(options.cameras.steps):
+    for _ in range(MAX_REWEIGHTINGS):
         v_i, v_j = t_i / state[here].exp(), t_j / state[there].exp()
         jacobian[rows, here], jacobian[rows, there] = weight * v_i, -weight * v_j
         away = (v_j - state[n + there]) - (v_i - state[n + here])
@@ -324,7 +348,7 @@ def synchronize_cameras(
     pairs: Sequence[tuple[int, int]] | None = None,
     pair: Callable[..., Shift] | None = None,
     breaks: bool = False,
-    options: SynchronizeOptions = SynchronizeOptions(),
+    options: SynchronizeOptions | None = None,
     **further: Any,
 ) -> Clocks:
     """The clocks of several cameras that filmed the same motion: :func:`dyntorch.synchronize` on the pairs, then
@@ -345,7 +369,7 @@ def synchronize_cameras(
         pairs: which pairs of cameras to compare; all, by default.
         pair: what compares two cameras, with the arguments of ``dyntorch.synchronize`` (the default).
         breaks: whether to look for frames that a camera lost or wrote twice; the clocks are those of ``clocks.breaks.times``.
-        options: every number that decides, by stage, here and in ``dyntorch.synchronize``.
+        options: as of ``dyntorch.synchronize``.
         further: arguments of ``pair``.
 
     Returns:
@@ -366,6 +390,7 @@ def synchronize_cameras(
         >>> synchronize_cameras(tracks, fps=30.0, pair=pair).offsets.round(decimals=6).tolist()
         [0.0, 2.0, -0.5]
     """
+    options = SynchronizeOptions() if options is None else options
     check_options(options, SynchronizeOptions)
     count = len(tracks)
     if count < 2:
@@ -391,7 +416,7 @@ def synchronize_cameras(
             shifts[i, j] = pair(tracks[i], tracks[j], correspondence, max_shift=max_shift, **given, **further)
         except ValueError as error:
             raise ValueError(f"cameras {i} and {j}: {error}") from error
-    clocks = combine_shifts(shifts, count, reference, options=options)
+    clocks = combine_shifts(shifts, count, reference)
     if not breaks:
         return clocks
     found = camera_breaks(tracks, clocks, max_shift=max_shift, options=options, **every)
@@ -401,9 +426,7 @@ def synchronize_cameras(
 
 
 @on_cpu
-def combine_shifts(
-    shifts: Mapping[tuple[int, int], Shift], cameras: int, reference: int = 0, *, options: SynchronizeOptions = SynchronizeOptions()
-) -> Clocks:
+def combine_shifts(shifts: Mapping[tuple[int, int], Shift], cameras: int, reference: int = 0) -> Clocks:
     r"""All cameras' clocks from the shifts of pairs: weighted least squares over the peaks that agree.
 
     .. math:: \min \sum_{ij} \frac{w_{ij}}{\sigma_{ij}^2} \bigl(T_j(t_j) - T_i(t_i)\bigr)^2
@@ -444,8 +467,8 @@ def combine_shifts(
         raise ValueError("shifts: no pair of cameras is given; give one per camera but the reference at least")
     for ends in shifts:
         _check_pair(ends, cameras)
-    net = network(shifts, cameras, options)
-    ranked = readings(net, reference, options)
+    net = network(shifts, cameras)
+    ranked = readings(net, reference)
     # the answer gives every camera a clock that can have one; whether it decides is another question
     best = min(ranked, key=lambda one: (int(one.starts.isnan().sum()), one.cost))
     rivals = [one for one in ranked if one is not best]
@@ -457,7 +480,7 @@ def combine_shifts(
     center = float((net.times[used, 0] / rates[here] - best.starts[here]).mean()) if used else 0.0
     table = _pairs(net, shifts, best)
     cycles = _cycles(net, shifts, best, table)
-    refusal = _refusal(net, shifts, best, rivals, reference, options)
+    refusal = _refusal(net, shifts, best, rivals, reference)
     limits = (*(() if refusal is None else (refusal,)), *_notices(table, cameras, shifts))
     return Clocks(
         offsets=offsets,
@@ -527,28 +550,28 @@ def _cycles(
     return found
 
 
+MIN_LOG_ODDS = log(10)  # Log odds of the best reading over another that differs in cameras tied by accepted pairs.
+MIN_LOG_ODDS_OF_REFUSED = log(300)  # The same where they differ in others: refused pairs of one camera often fail together.
+
+
 def _refusal(
     net: Network,
     shifts: Mapping[tuple[int, int], Shift],
     best: Reading,
     rivals: Sequence[Reading],
     reference: int,
-    options: SynchronizeOptions,
 ) -> Notice | None:
     """Why the pairs do not decide; None where they do."""
     lost = best.starts.isnan().nonzero().flatten().tolist()
     if lost:
         return Notice(ClocksNotice.LOST, float(len(lost)), {"lost": tuple(lost)})
     ends, sure = list(shifts), _surely_tied(shifts, best, reference)
-    margins = [
-        options.cameras.decided if sure.issuperset(differing(net, best, one, options)) else options.cameras.confirmed
-        for one in rivals
-    ]
+    margins = [MIN_LOG_ODDS if sure.issuperset(differing(net, best, one)) else MIN_LOG_ODDS_OF_REFUSED for one in rivals]
     close = [one for one, margin in zip(rivals, margins, strict=True) if one.cost - best.cost < margin]
     if not close:
         return None
     rival = min(close, key=lambda one: one.cost)
-    undecided = tuple(differing(net, best, rival, options))
+    undecided = tuple(differing(net, best, rival))
     lost = rival.starts.isnan().nonzero().flatten().tolist()
     refused = [pair for pair, shift in shifts.items() if not shift.ok and (not lost or set(lost) & set(pair))]
     if refused:

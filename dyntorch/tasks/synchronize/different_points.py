@@ -25,70 +25,91 @@ from dyntorch.tasks.synchronize.row_spaces import (
     kind_moments,
     refined,
 )
-from dyntorch.tasks.synchronize.subspace import Body, SubspaceCurve, SubspaceShift, bodies_curve, subspace_curve, subspace_shift
-from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
+from dyntorch.tasks.synchronize.subspace import (
+    MAX_SIGMA_FRAMES,
+    MIN_PEAK_SEPARATION_SECONDS,
+    NUM_PEAKS,
+    Body,
+    SubspaceCurve,
+    SubspaceShift,
+    bodies_curve,
+    subspace_curve,
+    subspace_shift,
+)
+from dyntorch.tasks.synchronize.tracks import MAX_FRAME_RATE_ERROR, RATE_SIGNIFICANCE_SIGMAS, Tracks, smoothed
+
+MIN_STEP_SECONDS = 1 / 30  # Step of the search at least: faster videos say no more.
+MIN_SECONDS_FOR_RATE = 20.0  # Overlap from which clock rates are searched.
 
 
 def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
     """The shift of cameras that see different points of one motion."""
     for name, value, known in (
-        ("measure", options.different.measure, MEASURES),
-        ("camera", options.different.camera, ("auto", *KINDS)),
+        ("measure", options.measure, MEASURES),
+        ("camera_model", options.camera_model, ("auto", *KINDS)),
     ):
         if value not in known:
-            raise ValueError(f"options.different.{name} must be one of {', '.join(known)}, got {value!r}")
-    step = max(a.step, b.step, options.different.finest)
-    a, b = _upright(a, b, step, rate or 1.0, max_shift, options)
-    found = _Samples(a, b, step, rate or 1.0, options=options)
+            raise ValueError(f"options.{name} must be one of {', '.join(known)}, got {value!r}")
+    step = max(a.step, b.step, MIN_STEP_SECONDS)
+    a, b = _upright(a, b, step, rate or 1.0, max_shift)
+    found = _Samples(a, b, step, rate or 1.0)
     curve = found.curve(max_shift)
     best = found.shift(curve)
     rate_sigma = 0.0
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
-    if rate is None and span > options.different.drifting and math.isfinite(best.sigma):
+    if rate is None and span > MIN_SECONDS_FOR_RATE and math.isfinite(best.sigma):
         # a shift that is sure of itself is near enough everywhere; one that is not may be smeared by a wrong rate
-        settled = _drift(curve, best, step, options) if best.ok else _rate(a, b, step, span, found.lag(best.position), options)
+        settled = _drift(curve, best, step) if best.ok else _rate(a, b, step, span, found.lag(best.position))
         ratio, rate_sigma = settled
         if ratio != 1:
-            found = _Samples(a, b, step, ratio, options=options)
+            found = _Samples(a, b, step, ratio)
             curve = found.curve(max_shift)
             best = found.shift(curve)
-    body = _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step), options), rate_sigma)
+    body = _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step)), rate_sigma)
     spaces = row_space_shift(a, b, step=step, rate=body.rate, max_shift=max_shift, around=body.offset, options=options)
-    if options.different.measure == options.different.camera == "auto":
-        return _forwards(_between_frames(a, b, _combined(body, spaces, options), options), curve, options)
-    return _of_spaces(body, spaces, 1 / min(body.fps), options)
+    if options.measure == options.camera_model == "auto":
+        return _forwards(_between_frames(a, b, _combined(body, spaces)), curve)
+    return _of_spaces(body, spaces, 1 / min(body.fps))
 
 
-def _combined(body: Shift, spaces: RowSpaceShift | None, options: SynchronizeOptions) -> Shift:
+# From here on the lag is that of one kind of camera; below, sigma includes the difference of both methods.
+SELF_SUFFICIENT_CLEARNESS = 8.0
+PRECISE_SIGMA_FRAMES = 0.045  # Sigma up to which it is, too, frames.
+MIN_CONTRADICTING_STRENGTH = 0.3  # Relative clearness from which another lag than that of shape and motion refutes it.
+MIN_CONFIRMING_STRENGTH = 0.6  # The same above which a row-space peak that agrees with the shape-motion peak is accepted.
+MIN_SUPPORTING_STRENGTH = 0.15  # The same below which even an agreeing lag is refused.
+
+
+def _combined(body: Shift, spaces: RowSpaceShift | None) -> Shift:
     """What the body's shape and motion say, and what its row spaces say: both may decide, neither may contradict the other."""
     if spaces is None or body.status in (Status.TOO_FEW, Status.DEGENERATE):
         return body
     away = abs(spaces.lag - body.offset)
-    apart, frame = away > options.different.apart, 1 / min(body.fps)
-    if not apart and spaces.clearness < options.rows.beyond and spaces.sigma > options.rows.precise * frame:
+    apart, frame = away > MIN_PEAK_SEPARATION_SECONDS, 1 / min(body.fps)
+    if not apart and spaces.clearness < SELF_SUFFICIENT_CLEARNESS and spaces.sigma > PRECISE_SIGMA_FRAMES * frame:
         # cameras that are nearly of some kind bend a lag by a frame or two, each way of looking by as much as it is wrong
         spaces = dataclasses.replace(spaces, sigma=math.hypot(spaces.sigma, away))
     if spaces.ok:
-        return _refused(body, spaces) if apart and body.ok else _of_spaces(body, spaces, frame, options)
+        return _refused(body, spaces) if apart and body.ok else _of_spaces(body, spaces, frame)
     if not body.ok:  # the likelier candidate of two that do not decide
-        return _of_spaces(body, spaces, frame, options) if spaces.strength > options.rows.confirming else body
+        return _of_spaces(body, spaces, frame) if spaces.strength > MIN_CONFIRMING_STRENGTH else body
     if apart:
-        return _refused(body, spaces) if spaces.strength > options.rows.contradicting else body
-    if spaces.strength > options.rows.confirming:
-        return _of_spaces(body, spaces, frame, options, confirmed=True)
-    if spaces.strength < options.rows.heard:
+        return _refused(body, spaces) if spaces.strength > MIN_CONTRADICTING_STRENGTH else body
+    if spaces.strength > MIN_CONFIRMING_STRENGTH:
+        return _of_spaces(body, spaces, frame, confirmed=True)
+    if spaces.strength < MIN_SUPPORTING_STRENGTH:
         return _refused(body, spaces)
     return body if away <= frame else _blunt(body, math.hypot(body.sigma, away / 2), frame)
 
 
-def _between_frames(a: Tracks, b: Tracks, shift: Shift, options: SynchronizeOptions) -> Shift:
+def _between_frames(a: Tracks, b: Tracks, shift: Shift) -> Shift:
     """Of a camera and points in space, which are seen as combinations of these, the place between frames that a camera tells."""
     blunt = any(notice.code == ShiftNotice.BLUNT for notice in shift.notices)
     if a.x.shape[-1] == b.x.shape[-1] or not (shift.ok or blunt):
         return shift
     turned = a.x.shape[-1] == 3  # the fit goes from the camera to the space
     offset, rate = (-shift.offset / shift.rate, 1 / shift.rate) if turned else (shift.offset, shift.rate)
-    found = combined_fit(b, a, offset, rate, options) if turned else combined_fit(a, b, offset, rate, options)
+    found = combined_fit(b, a, offset, rate) if turned else combined_fit(a, b, offset, rate)
     if found is None:
         return shift
     place, sigma = (-found.offset * shift.rate, found.sigma * shift.rate) if turned else (found.offset, found.sigma)
@@ -100,18 +121,23 @@ def _between_frames(a: Tracks, b: Tracks, shift: Shift, options: SynchronizeOpti
     return dataclasses.replace(shift, offset=place, sigma=sigma, peaks=peaks)
 
 
-def _forwards(shift: Shift, curve: SubspaceCurve, options: SynchronizeOptions) -> Shift:
+# Nats above the time-reversed video: good pairs 7.7 and more, unrelated ones 0 +- 8 (experiments.synchronization.silent).
+MIN_FORWARD_MARGIN = 5.0
+CLEAR_MARGIN = 20.0  # Margin (nats) above which the time-reversal test is skipped.
+
+
+def _forwards(shift: Shift, curve: SubspaceCurve) -> Shift:
     """Refused where b played backwards tells about as much at its best lag: chance does that, and a film that somebody reversed."""
     if not shift.ok or curve.bodies is None:
         return shift
     first, second = curve.bodies
     lags = int(curve.lags[0]), int(curve.lags[-1])
-    other = bodies_curve(first, second.reversed, lags, first.step, options=options)
+    other = bodies_curve(first, second.reversed, lags, first.step)
     best, backwards = (float(one.scores.nan_to_num(-math.inf).max()) for one in (curve, other))
-    more = (best - backwards if backwards > -math.inf else math.inf) - options.different.forward
+    more = (best - backwards if backwards > -math.inf else math.inf) - MIN_FORWARD_MARGIN
     confidence = shift.confidence / (1 + math.exp(-max(min(more, 700.0), -700.0)))
     # a shift that is far clear of all others is no chance, whatever another film tells
-    clear = len(shift.peaks) < 2 or float(shift.peaks[0, 1] - shift.peaks[1, 1]) >= options.different.forward_clear
+    clear = len(shift.peaks) < 2 or float(shift.peaks[0, 1] - shift.peaks[1, 1]) >= CLEAR_MARGIN
     if more >= 0 or clear:
         return dataclasses.replace(shift, confidence=shift.confidence if clear else confidence)
     notice = Notice(ShiftNotice.BACKWARDS, best - backwards)
@@ -133,9 +159,7 @@ def _refused(body: Shift, spaces: RowSpaceShift) -> Shift:
     return dataclasses.replace(body, status=status_from((notice,)), notices=(notice,), confidence=min(body.confidence, 0.5))
 
 
-def _of_spaces(
-    body: Shift, spaces: RowSpaceShift | None, frame: float, options: SynchronizeOptions, *, confirmed: bool = False
-) -> Shift:
+def _of_spaces(body: Shift, spaces: RowSpaceShift | None, frame: float, *, confirmed: bool = False) -> Shift:
     """The answer of the row spaces, with the body's clock rate; ``confirmed`` by the evidence of shape and motion."""
     if spaces is None:
         notice = Notice(ShiftNotice.SHORT_OVERLAP)
@@ -163,19 +187,17 @@ def _of_spaces(
         notices=tuple(notices),
     )
     decided = spaces.ok or confirmed
-    return _blunt(found, found.sigma, frame) if decided and found.sigma > options.different.sharp_frames * frame else found
+    return _blunt(found, found.sigma, frame) if decided and found.sigma > MAX_SIGMA_FRAMES * frame else found
 
 
-def _to_a_frame(best: SubspaceShift, step: float, frame: float, options: SynchronizeOptions) -> SubspaceShift:
+def _to_a_frame(best: SubspaceShift, step: float, frame: float) -> SubspaceShift:
     """Refused where the shift is not known to a frame of the slower camera, though it may be to a step of the search."""
-    if not best.ok or best.sigma * step <= options.different.sharp_frames * frame:
+    if not best.ok or best.sigma * step <= MAX_SIGMA_FRAMES * frame:
         return best
     return dataclasses.replace(best, refusal=Notice(ShiftNotice.BLUNT, best.sigma * step, {"case": "frame", "frame": frame}))
 
 
-def _upright(
-    a: Tracks, b: Tracks, step: float, rate: float, max_shift: float | None, options: SynchronizeOptions
-) -> tuple[Tracks, Tracks]:
+def _upright(a: Tracks, b: Tracks, step: float, rate: float, max_shift: float | None) -> tuple[Tracks, Tracks]:
     """Both, points in space with that axis second which shares most with the y of the camera: files have y or z up."""
     if a.x.shape[-1] == b.x.shape[-1]:
         return a, b
@@ -183,19 +205,16 @@ def _upright(
     space, film = (a, b) if first else (b, a)
     rolled = [dataclasses.replace(space, x=space.x.roll(by, -1)) for by in range(3)]
     turned = [(one, film) if first else (film, one) for one in rolled]
-    best = [
-        float(_Samples(*both, step, rate, options=options).curve(max_shift).scores.nan_to_num(-math.inf).max()) for both in turned
-    ]
+    best = [float(_Samples(*both, step, rate).curve(max_shift).scores.nan_to_num(-math.inf).max()) for both in turned]
     return turned[best.index(max(best))]
 
 
 class _Samples:
     """Both cameras at equal steps of a's clock."""
 
-    def __init__(self, a: Tracks, b: Tracks, step: float, rate: float, options: SynchronizeOptions) -> None:
-        self.options = options
-        self.first, self.wa = _sampled(a, step, self.options)
-        self.second, self.wb = _sampled(b, step * rate, self.options)
+    def __init__(self, a: Tracks, b: Tracks, step: float, rate: float) -> None:
+        self.first, self.wa = _sampled(a, step)
+        self.second, self.wb = _sampled(b, step * rate)
         self.start = float(b.times[0]) / rate - float(a.times[0])
         self.step, self.rate = step, rate
 
@@ -205,36 +224,42 @@ class _Samples:
         if max_shift is not None:
             low, high = (((around + sign * max_shift) / self.rate - self.start) / self.step for sign in (-1, 1))
             lo, hi = min(max(lo, math.ceil(low - 1e-9)), hi), max(min(hi, math.floor(high + 1e-9)), lo)
-        return subspace_curve(self.first, self.second, self.wa, self.wb, (lo, max(lo, hi)), step=self.step, options=self.options)
+        return subspace_curve(self.first, self.second, self.wa, self.wb, (lo, max(lo, hi)), step=self.step)
 
     def shift(self, curve: SubspaceCurve) -> SubspaceShift:
-        return subspace_shift(curve, start=self.start, step=self.step, options=self.options)
+        return subspace_shift(curve, start=self.start, step=self.step)
 
     def lag(self, position: Tensor | float) -> Tensor | float:
         """Seconds of b's clock at time 0 of a's."""
         return (self.start + position * self.step) * self.rate
 
 
-def _sampled(tracks: Tracks, step: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
+def _sampled(tracks: Tracks, step: float) -> tuple[Tensor, Tensor]:
     if abs(tracks.step / step - 1) < 1e-6 and float((tracks.times.diff() / step - 1).abs().max()) < 1e-3:
         return tracks.x, tracks.weights  # its own frames: nothing to interpolate
-    x, _, weights = smoothed(tracks, tracks.every(step), max(0.5 * step, 0.5 * tracks.step), options)
+    x, _, weights = smoothed(tracks, tracks.every(step), max(0.5 * step, 0.5 * tracks.step))
     return x, weights
 
 
-def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float, options: SynchronizeOptions) -> tuple[float, float]:
+RATE_SEARCH_SECONDS = 1.0  # Range around the best shift in which rates are compared.
+RATE_WINDOW_SECONDS = 10.0  # Window that has a shift of its own.
+MIN_WINDOW_PROBABILITY = 0.5  # Probability from which the shift of a window counts.
+MIN_WINDOW_SIGMA_FRAMES = 0.3  # Error of the shift of a window at least, frames.
+
+
+def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[float, float]:
     """The clock rate by a line through the shifts of windows, and its sigma; 1 unless it differs significantly."""
     assert curve.bodies is not None
     first, second = curve.bodies
-    lag, reach = round(best.position), round(options.different.near / step)
+    lag, reach = round(best.position), round(RATE_SEARCH_SECONDS / step)
     begin, end = max(0, reach - lag), min(len(first.rows), len(second.rows) - lag)
-    size = min(round(options.different.window / step), (end - begin) // 4)
+    size = min(round(RATE_WINDOW_SECONDS / step), (end - begin) // 4)
     found = []
     for start in range(begin, end - size + 1, size):
         parts = _cut(first, start, start + size), _cut(second, start + lag - reach, start + lag + size + reach)
-        local = subspace_shift(bodies_curve(*parts, (0, 2 * reach), step, options=options), step=1.0, options=options)
-        if math.isfinite(local.sigma) and local.probability > options.different.likely and 1 < local.position < 2 * reach - 1:
-            found.append((start + size / 2, local.position, max(local.sigma, options.different.spread)))
+        local = subspace_shift(bodies_curve(*parts, (0, 2 * reach), step), step=1.0)
+        if math.isfinite(local.sigma) and local.probability > MIN_WINDOW_PROBABILITY and 1 < local.position < 2 * reach - 1:
+            found.append((start + size / 2, local.position, max(local.sigma, MIN_WINDOW_SIGMA_FRAMES)))
     if len(found) < 3:
         return 1.0, math.inf
     times, shifts, sigmas = torch.tensor(found, dtype=torch.float64).unbind(1)
@@ -249,7 +274,7 @@ def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float, options: Sync
     if total <= 0:
         return 1.0, math.inf
     drift, sigma = float((lever * shifts).sum()) / total, total**-0.5
-    return (1 + drift, sigma) if abs(drift) > options.different.significant * sigma else (1.0, sigma)
+    return (1 + drift, sigma) if abs(drift) > RATE_SIGNIFICANCE_SIGMAS * sigma else (1.0, sigma)
 
 
 def _cut(body: Body, start: int, end: int) -> Body:
@@ -257,18 +282,21 @@ def _cut(body: Body, start: int, end: int) -> Body:
     return dataclasses.replace(body, rows=body.rows[part], motion=body.motion[part], weights=body.weights[part])
 
 
-def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float, options: SynchronizeOptions) -> tuple[float, float]:
+MIN_RATE_GAIN = 8.0  # Nats by which another clock rate has to be better.
+
+
+def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float) -> tuple[float, float]:
     """The clock rate whose best score near a shift is highest, by the parabola over rates, and its sigma; 1 unless convincing."""
     change = 4 * step / span  # moves the ends of the overlap by two steps
-    count = math.ceil(options.input.frame_rate_error / change)
+    count = math.ceil(MAX_FRAME_RATE_ERROR / change)
     rates = [1 + k * change for k in range(-count, count + 1)]
     middle = span / 2
     best = []
     for rate in rates:
-        samples = _Samples(a, b, step, rate, options=options)
+        samples = _Samples(a, b, step, rate)
         # the moment in the middle keeps its place: (t + lag) of the old rate is rate (t + lag') of the new
         around = float(lag) - (rate - 1) * middle
-        best.append(float(samples.curve(options.different.near, around).scores.nan_to_num(-math.inf).max()))
+        best.append(float(samples.curve(RATE_SEARCH_SECONDS, around).scores.nan_to_num(-math.inf).max()))
     scores = torch.tensor(best, dtype=torch.float64)
     top = int(scores.argmax())
     bend = float(scores[top - 1] - 2 * scores[top] + scores[top + 1]) if 0 < top < len(rates) - 1 else 0.0
@@ -276,7 +304,7 @@ def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float, o
         return 1.0, 0.0
     sigma = change / math.sqrt(-bend)
     place = 0.5 * float(scores[top - 1] - scores[top + 1]) / bend
-    if best[top] - best[count] < options.different.convincing:
+    if best[top] - best[count] < MIN_RATE_GAIN:
         return 1.0, sigma
     return rates[top] + change * max(-0.5, min(0.5, place)), sigma
 
@@ -309,6 +337,10 @@ def _result(a: Tracks, b: Tracks, samples: _Samples, curve: SubspaceCurve, best:
     )
 
 
+CLEARNESS_ODDS = 4.0  # Log odds per relative clearness.
+MAX_RANKED_LAGS = 400  # Lags among which local maxima are searched.
+
+
 @dataclass(frozen=True, eq=False)
 class RowSpaceShift:
     """The lag that stands out most of all kinds of cameras and levels of noise."""
@@ -322,27 +354,26 @@ class RowSpaceShift:
     curve: Hypothesis  # of that kind and level
     seconds: Tensor  # ``(L,)`` of its lags
     foreign: tuple[Tensor, Tensor]  # tracks of a and of b ``(n,)``, ``(m,)`` bool that were left out
-    options: SynchronizeOptions
 
     @property
     def ok(self) -> bool:
         """Whether the lag is beyond doubt."""
-        return _decided(self.clearness, self.votes, self.options)
+        return _decided(self.clearness, self.votes)
 
     @property
     def strength(self) -> float:
         """Clearness over what its votes need: 1 decides."""
-        return _strength(self.clearness, self.votes, self.options)
+        return _strength(self.clearness, self.votes)
 
     @property
     def peaks(self) -> Tensor:
         """``(k, 2)`` lag in seconds and score of local maxima, best first, the first one between frames."""
         scores, kept = self.curve.totals, list[int]()
-        for place in scores.argsort(descending=True)[: self.options.rows.looked_at].tolist():
+        for place in scores.argsort(descending=True)[:MAX_RANKED_LAGS].tolist():
             away = all(abs(float(self.curve.lags[place] - self.curve.lags[other])) > self.curve.apart for other in kept)
             if away and math.isfinite(float(scores[place])):
                 kept.append(place)
-        kept = kept[: self.options.different.peaks]
+        kept = kept[:NUM_PEAKS]
         found = torch.stack([self.seconds[kept], scores[kept]], dim=1)
         found[0, 0] = self.lag
         return found
@@ -350,7 +381,7 @@ class RowSpaceShift:
     @property
     def confidence(self) -> float:
         """Probability that the lag is right, from how clear it is."""
-        return _sigmoid((_strength(self.clearness, self.votes, self.options) - 1) * self.options.rows.odds + math.log(19))
+        return _sigmoid((_strength(self.clearness, self.votes) - 1) * CLEARNESS_ODDS + math.log(19))
 
     def turned(self, rate: float) -> RowSpaceShift:
         """The same with a and b exchanged; ``rate`` of the new b's clock."""
@@ -358,17 +389,25 @@ class RowSpaceShift:
         return replace(self, lag=lag, sigma=sigma, seconds=seconds, foreign=(self.foreign[1], self.foreign[0]))
 
 
-def _strength(clearness: float, votes: float, options: SynchronizeOptions) -> float:
+MIN_CLEARNESS = 4.2  # Margin over the spread of other lags that decides where all hypotheses agree.
+LONE_CLEARNESS = 3.0  # How much more a single hypothesis needs; in proportion between.
+
+
+def _strength(clearness: float, votes: float) -> float:
     """Clearness over what these votes need: 1 decides."""
-    return clearness / (options.rows.clear + (1 - votes) * options.rows.alone)
+    return clearness / (MIN_CLEARNESS + (1 - votes) * LONE_CLEARNESS)
 
 
-def _decided(clearness: float, votes: float, options: SynchronizeOptions) -> bool:
-    return _strength(clearness, votes, options) >= 1
+def _decided(clearness: float, votes: float) -> bool:
+    return _strength(clearness, votes) >= 1
 
 
 def _sigmoid(x: float) -> float:
     return 1 / (1 + math.exp(-max(min(x, 700.0), -700.0)))
+
+
+MIN_STRENGTH_FOR_REJECTION = 0.35  # The same below which no track is rejected.
+MIN_CLEARNESS_GAIN = 1.15  # Factor by which a lag must stand out more without a track to reject it.
 
 
 def row_space_shift(
@@ -387,7 +426,7 @@ def row_space_shift(
     if min(len(ta), len(tb)) < 3:
         return None
     start = float(tb[0]) / rate - float(ta[0])
-    lags = _span(films, start, max_shift, around / rate, options)
+    lags = _span(films, start, max_shift, around / rate)
     if lags is None:
         return None
     kinds = kind_moments(films, lags)
@@ -396,31 +435,32 @@ def row_space_shift(
         return None
     best, votes = _chosen(found)
     kept = tuple(torch.ones(x.x.shape[1], dtype=torch.bool, device=x.x.device) for x in (a, b))
-    if options.rows.hopeful < _strength(best.clearness, votes, options) < 1:
-        without = _left_out(kinds, best, options)
+    if MIN_STRENGTH_FOR_REJECTION < _strength(best.clearness, votes) < 1:
+        without = _left_out(kinds, best)
         if without is not None:
             fewer = hypotheses([one.only(*without) for one in kinds])
             chosen, agree = _chosen(fewer)
-            if _strength(chosen.clearness, agree, options) > options.rows.gain * _strength(best.clearness, votes, options):
+            if _strength(chosen.clearness, agree) > MIN_CLEARNESS_GAIN * _strength(best.clearness, votes):
                 best, votes, kept, found = chosen, agree, without, fewer
     kind, place = _plainest(films.only(*kept), found, best)
     seconds = (start + best.lags * step) * rate
     lag, sigma, foreign = (start + place.lag * step) * rate, place.sigma * step * rate, (~kept[0], ~kept[1])
-    return RowSpaceShift(lag, sigma, kind, best.clearness, votes, best.margin, best, seconds, foreign, options)
+    return RowSpaceShift(lag, sigma, kind, best.clearness, votes, best.margin, best, seconds, foreign)
 
 
-def _span(
-    films: Films, start: float, max_shift: float | None, around: float, options: SynchronizeOptions
-) -> tuple[int, int] | None:
+MAX_LAGS = 1_200  # Lags; of longer searches those near the best one of shape and motion.
+
+
+def _span(films: Films, start: float, max_shift: float | None, around: float) -> tuple[int, int] | None:
     """First and last lag, frames."""
     ta, tb = films.times
     lo, hi = 1 - len(ta), len(tb) - 1
     if max_shift is not None:
         low, high = ((sign * max_shift / films.rate - start) / films.step for sign in (-1, 1))
         lo, hi = max(lo, math.ceil(low - 1e-9)), min(hi, math.floor(high + 1e-9))
-    if hi - lo >= options.rows.most_lags:
+    if hi - lo >= MAX_LAGS:
         middle = min(max(round((around - start) / films.step), lo), hi)
-        lo, hi = max(lo, middle - options.rows.most_lags // 2), min(hi, middle + options.rows.most_lags // 2)
+        lo, hi = max(lo, middle - MAX_LAGS // 2), min(hi, middle + MAX_LAGS // 2)
     return (lo, hi) if hi - lo >= 2 else None
 
 
@@ -429,6 +469,9 @@ def _chosen(found: list[Hypothesis]) -> tuple[Hypothesis, float]:
     best = max(found, key=lambda one: one.clearness)
     place = float(best.lags[best.best])
     return best, sum(abs(float(one.lags[one.best]) - place) <= best.apart for one in found) / len(found)
+
+
+EQUIVALENT_NATS_SHARE = 0.75  # Share of the nats of the best kind of camera from which another one is equivalent.
 
 
 def _plainest(films: Films, found: list[Hypothesis], best: Hypothesis) -> tuple[Kind, Place]:
@@ -442,21 +485,25 @@ def _plainest(films: Films, found: list[Hypothesis], best: Hypothesis) -> tuple[
     ]
     places = [(one.kind, refined(films, one)) for one in chosen]
     kind, first = max(places, key=lambda pair: pair[1].nats)
-    rivals = [place for _, place in places if place.nats > films.options.rows.nearly * first.nats]
+    rivals = [place for _, place in places if place.nats > EQUIVALENT_NATS_SHARE * first.nats]
     apart = max((abs(place.lag - first.lag) for place in rivals), default=0.0) / 2
     return kind, replace(first, sigma=math.hypot(first.sigma, apart))
 
 
-def _left_out(kinds: list[KindMoments], best: Hypothesis, options: SynchronizeOptions) -> tuple[Tensor, Tensor] | None:
+MAX_REJECTED_SHARE = 0.34  # Share of a camera's tracks that may be rejected.
+MIN_TRACKS = 3  # Tracks that stay at least.
+
+
+def _left_out(kinds: list[KindMoments], best: Hypothesis) -> tuple[Tensor, Tensor] | None:
     """Tracks of a and of b ``(n,)``, ``(m,)`` bool that are left when those go, one by one, without which a lag stands out more."""
     counts = [kinds[0].films.a.x.shape[1], kinds[0].films.b.x.shape[1]]
     kept = [torch.ones(count, dtype=torch.bool) for count in counts]
     tried = [one for one in kinds if one.kind == best.kind]
     clearest = best.clearness
-    for _ in range(math.ceil(options.rows.foreign * max(counts))):
+    for _ in range(math.ceil(MAX_REJECTED_SHARE * max(counts))):
         found: tuple[float, int, int] | None = None
         for side in (1,) if kinds[0].films.spatial else (0, 1):
-            if int(kept[side].sum()) <= max(options.rows.fewest, (1 - options.rows.foreign) * counts[side]):
+            if int(kept[side].sum()) <= max(MIN_TRACKS, (1 - MAX_REJECTED_SHARE) * counts[side]):
                 continue
             for point in kept[side].nonzero()[:, 0].tolist():
                 rest = [mask.clone() for mask in kept]
@@ -466,7 +513,7 @@ def _left_out(kinds: list[KindMoments], best: Hypothesis, options: SynchronizeOp
                 )
                 if found is None or clear > found[0]:
                     found = clear, side, point
-        if found is None or found[0] < clearest * options.rows.gain:
+        if found is None or found[0] < clearest * MIN_CLEARNESS_GAIN:
             break
         clearest = found[0]
         kept[found[1]][found[2]] = False

@@ -16,8 +16,11 @@ from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, rank
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.lags import epipolar_moments
 from dyntorch.numerics.least_squares import damped_step
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import Tracks, noise_ratio, smoothed
+
+MIN_PEAK_SEPARATION_FRAMES = 2.5  # Within this peaks are one, and halves of a take agree.
+MIN_HALF_OVERLAP_SHARE = 0.5  # Share of the largest overlap below which a half of the take does not score a lag.
+
 
 PIECE = 4096
 """Lags at a time: bounds the memory on long takes."""
@@ -37,10 +40,10 @@ class Samples:
     noise: tuple[float, float]  # of both cameras in normalized coordinates, in px of a
 
     @classmethod
-    def of(cls, a: Tracks, b: Tracks, step: float, rate: float = 1.0, *, options: SynchronizeOptions) -> Self:
+    def of(cls, a: Tracks, b: Tracks, step: float, rate: float = 1.0) -> Self:
         """b's clock goes ``rate`` seconds in one of a's.  The kernel is as wide as a step."""
-        first, w1 = _sampled(a, step, step, options)
-        second, w2 = _sampled(b, step * rate, step * rate, options)
+        first, w1 = _sampled(a, step, step)
+        second, w2 = _sampled(b, step * rate, step * rate)
         noise = float(a.change[0, 0]), float(b.change[0, 0]) * noise_ratio(a, b)
         start = float(b.times[0]) / rate - float(a.times[0])
         return cls(first, second, w1, w2, step, start, rate, noise)
@@ -116,18 +119,20 @@ class Curve:
         return lag + step * max(-0.5, min(0.5, 0.5 * (before - after) / bend))
 
 
-def epipolar_curve(
-    samples: Samples, max_shift: float | None = None, overlap: float | None = None, *, options: SynchronizeOptions
-) -> Curve:
+MIN_OVERLAP_SHARE = 0.25  # Share of the largest overlap below which a lag is not scored.
+MIN_CURVE_PAIRS = 24  # Pairs of positions below which a lag is not scored: three times the unknowns of F.
+
+
+def epipolar_curve(samples: Samples, max_shift: float | None = None, overlap: float | None = None) -> Curve:
     r"""Scores at all lags."""
-    overlap = options.curve.least_overlap if overlap is None else overlap
+    overlap = MIN_OVERLAP_SHARE if overlap is None else overlap
     lo, hi = samples.lags(max_shift)
     found = [_piece(samples, first, min(first + PIECE - 1, hi)) for first in range(lo, hi + 1, PIECE)]
     if not found:
         empty = samples.x1.new_zeros(0)
         return Curve(empty, empty, empty, empty, samples.rate, 1.0)
     variance, counts = (torch.cat(parts) for parts in zip(*found, strict=True))
-    judged = (counts >= overlap * counts.max()) & (counts >= options.curve.fewest_pairs) & variance.isfinite()
+    judged = (counts >= overlap * counts.max()) & (counts >= MIN_CURVE_PAIRS) & variance.isfinite()
     level = variance[judged].median() if bool(judged.any()) else variance.new_ones(())
     tiny = torch.finfo(variance.dtype).tiny
     scores = -0.5 * (variance / level.clamp(min=tiny)).clamp(min=tiny).log() + 0.5 * (counts / counts.max()).clamp(min=tiny).log()
@@ -140,14 +145,20 @@ def _piece(samples: Samples, lo: int, hi: int) -> tuple[Tensor, Tensor]:
     return samples.solved(moments)[0], counts
 
 
-def _sampled(tracks: Tracks, step: float, width: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
-    x, _, weights = smoothed(tracks, tracks.every(step), width, options)
+def _sampled(tracks: Tracks, step: float, width: float) -> tuple[Tensor, Tensor]:
+    x, _, weights = smoothed(tracks, tracks.every(step), width)
     linear, moved = tracks.change[:-1, :-1], tracks.change[:-1, -1]
     return torch.where((weights > 0)[..., None], x @ linear.mT + moved, 0.0), weights
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Smoothed tracks at equal steps, for positions and velocities at any moment between.
+
+
+# Extra width of the velocity kernel per noise-to-motion ratio: noise shared with the residuals would bias the shift.
+VELOCITY_WIDTH_SLOPE = 0.75
+MIN_VELOCITY_WIDTH = 1.25  # Smallest width of that kernel over the one of positions.
+MAX_VELOCITY_WIDTH = 2.5  # Largest width.
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,18 +173,18 @@ class Grid:
     weights: Tensor  # (m, n)
 
     @staticmethod
-    def of(tracks: Tracks, width: float, options: SynchronizeOptions) -> Grid:
+    def of(tracks: Tracks, width: float) -> Grid:
         """With steps of half the kernel's width: between them the polynomial is exact to thousandths of the noise."""
         step, start = width / 2, float(tracks.times[0])
         count = max(2, math.ceil((float(tracks.times[-1]) - start) / step) + 1)
         at = start + step * torch.arange(count, dtype=torch.float64, device=tracks.x.device)
-        x, v, weights = smoothed(tracks, at, width, options)
+        x, v, weights = smoothed(tracks, at, width)
         speed = float(torch.where(weights > 0, v.square().sum(-1), torch.nan).nanmedian()) ** 0.5
         wider = min(
-            max(1 + options.curve.calm_slope * tracks.noise / max(speed * width, 1e-300), options.curve.calm_least),
-            options.curve.calm_most,
+            max(1 + VELOCITY_WIDTH_SLOPE * tracks.noise / max(speed * width, 1e-300), MIN_VELOCITY_WIDTH),
+            MAX_VELOCITY_WIDTH,
         )
-        _, calm, _ = smoothed(tracks, at, wider * width, options)
+        _, calm, _ = smoothed(tracks, at, wider * width)
         return Grid(start, step, x, v, calm, weights)
 
     def at(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -216,17 +227,30 @@ class EpipolarFit:
         return self.offset + (self.rate - 1) * self.center
 
 
+SIGMA_INFLATION = 1.6  # True errors over the sigma of the residuals: 1.5 to 1.8 on motion capture with 5 to 60 mm of noise.
+MAX_ITERATIONS = 30  # Steps, on some of the rows and on all.
+STEP_TOLERANCE_FRAMES = 1e-5  # Step that ends the descent, frames.
+COARSE_STEP_TOLERANCE_FRAMES = 1e-3  # The same on some of the rows.
+NUM_COARSE_ROWS = 4_000  # Rows for most of the way.
+MAX_STEP_FRAMES = 2.0  # Largest step, frames.
+MIN_SIGMA_FRAMES = 0.003  # Error that smoothing leaves in exact data, frames.
+MAX_RATE_CHANGE = 0.03  # Change of the clock rate at which a descent has diverged.
+MAX_ROWS = 200_000  # Residuals of one descent; of longer takes at moments at equal distances.
+MIN_DESCENT_PAIRS = 16  # Pairs of positions below which there is no descent.
+MAX_CORRELATION_SECONDS = 2.0  # Time over which residuals depend on each other: errors of detectors last for so long.
+MIN_CORRELATION_BLOCKS = 6  # and at most the overlap over this number.
+
+
 class ShiftDescent:
     """The problem for two cameras: what does not depend on the start is smoothed once."""
 
-    def __init__(self, a: Tracks, b: Tracks, width: float, rows: int | None = None, *, options: SynchronizeOptions) -> None:
-        self.options = options
-        stride = max(1, math.ceil(len(a.times) * a.x.shape[1] / (self.options.descent.most_rows if rows is None else rows)))
+    def __init__(self, a: Tracks, b: Tracks, width: float, rows: int | None = None) -> None:
+        stride = max(1, math.ceil(len(a.times) * a.x.shape[1] / (MAX_ROWS if rows is None else rows)))
         step = max(a.step, b.step) * stride
         span = float(a.times[-1] - a.times[0])
         self.times = a.times[0] + step * torch.arange(int(span / step) + 1, dtype=torch.float64, device=a.x.device)
-        self.x, _, self.weights = smoothed(a, self.times, width, self.options)
-        self.grid = Grid.of(b, width, self.options)
+        self.x, _, self.weights = smoothed(a, self.times, width)
+        self.grid = Grid.of(b, width)
         self.frame = max(a.step, b.step)
         self.width = width
         self.changes = (a.change, b.change)
@@ -235,17 +259,17 @@ class ShiftDescent:
     def run(self, offset: float, rate: float = 1.0, *, free_rate: bool = False, start: Tensor | None = None) -> EpipolarFit | None:
         """Descend from a start; None where too little is seen there, or the rate runs away."""
         state = _State(offset, rate, start)
-        stride = max(1, self.weights.numel() // self.options.descent.enough_rows)
+        stride = max(1, self.weights.numel() // NUM_COARSE_ROWS)
         # most of the way on some of the rows, the rest on all
         for every in (stride, 1) if stride > 1 else (1,):
-            for _ in range(self.options.descent.iterations):
+            for _ in range(MAX_ITERATIONS):
                 rows = self._rows(state, every)
                 if rows is None:
                     return None
                 moved = self._step(state, rows, free_rate)
-                if abs(state.rate / rate - 1) > self.options.descent.largest_drift:
+                if abs(state.rate / rate - 1) > MAX_RATE_CHANGE:
                     return None
-                if moved < (self.options.descent.done if every == 1 else self.options.descent.nearly) * self.frame:
+                if moved < (STEP_TOLERANCE_FRAMES if every == 1 else COARSE_STEP_TOLERANCE_FRAMES) * self.frame:
                     break
         rows = self._rows(state)
         return None if rows is None else self._fit(state, rows, free_rate)
@@ -260,7 +284,7 @@ class ShiftDescent:
         x2, v2, w2 = self.grid.at(self.times[::every] * rate + offset)
         sure = self.weights[::every] * w2
         both = sure > 0
-        if int(both.sum()) < self.options.descent.fewest_pairs:
+        if int(both.sum()) < MIN_DESCENT_PAIRS:
             return None
         first, second = self.changes
         p, q = homogeneous(self.x[::every][both]) @ first.mT, homogeneous(x2[both]) @ second.mT
@@ -300,9 +324,7 @@ class ShiftDescent:
         gradient = (s1**2 * Fq[:, :2].square().sum(-1) + s2**2 * Fp[:, :2].square().sum(-1)).clamp(min=1e-300).sqrt()
         residual = (matched.q * Fp).sum(-1) / gradient
         along = (matched.speed * Fp).sum(-1) / gradient
-        return Residuals(
-            residual, matched.products / gradient[:, None], along, times, matched.both, matched.sure, options=self.options
-        )
+        return Residuals(residual, matched.products / gradient[:, None], along, times, matched.both, matched.sure)
 
     def _step(self, state: _State, rows: Residuals, free_rate: bool) -> float:
         """One step of iteratively reweighted least squares; its length in seconds, at the ends of the overlap."""
@@ -319,7 +341,7 @@ class ShiftDescent:
         step = damped_step((J.mT @ (w * rows.residual))[None], (J.mT @ (J * w[:, None]))[None], damping)[0]
         turns = len(tangent)
         moves = -step[turns:]
-        limit = self.options.descent.largest_step * self.frame
+        limit = MAX_STEP_FRAMES * self.frame
         share = min(1.0, limit / max(float(moves.abs().max()), 1e-300))
         state.F = self._nearest(state.F - share * (step[:turns] @ tangent).unflatten(0, state.F.shape))
         shift = share * float(moves[0])
@@ -345,9 +367,7 @@ class ShiftDescent:
         step = float(self.times[1] - self.times[0]) if len(self.times) > 1 else self.frame
         sigmas = long_run(
             frames,
-            round(
-                min(self.options.descent.memory, float(rows.times[-1] - rows.times[0]) / self.options.descent.memory_parts) / step
-            ),
+            round(min(MAX_CORRELATION_SECONDS, float(rows.times[-1] - rows.times[0]) / MIN_CORRELATION_BLOCKS) / step),
         )
         scale_of = rows.scale()
         F = self._given(state.F)
@@ -358,8 +378,8 @@ class ShiftDescent:
             offset=state.offset,
             rate=state.rate,
             center=state.center,
-            sigma=math.hypot(self.options.descent.optimism * float(sigmas[0]), self.options.descent.least_sigma * self.frame),
-            rate_sigma=self.options.descent.optimism * float(sigmas[1]) if free_rate else 0.0,
+            sigma=math.hypot(SIGMA_INFLATION * float(sigmas[0]), MIN_SIGMA_FRAMES * self.frame),
+            rate_sigma=SIGMA_INFLATION * float(sigmas[1]) if free_rate else 0.0,
             residual=scale_of,
             fundamental=F / F.norm(),
             distances=distances,
@@ -385,9 +405,9 @@ class ShiftDescent:
         influence = (J * (w * rows.residual)[:, None]) @ inverse[:, -len(later) :]
         frames = torch.zeros(len(self.times), len(later), dtype=J.dtype, device=J.device)
         frames.index_add_(0, rows.frames, influence)
-        memory = min(self.options.descent.memory, float(rows.times[-1] - rows.times[0]) / self.options.descent.memory_parts)
-        sigmas = self.options.descent.optimism * long_run(frames, round(memory / self.frame))
-        return -influence.sum(0), sigmas.hypot(torch.as_tensor(self.options.descent.least_sigma * self.frame))
+        memory = min(MAX_CORRELATION_SECONDS, float(rows.times[-1] - rows.times[0]) / MIN_CORRELATION_BLOCKS)
+        sigmas = SIGMA_INFLATION * long_run(frames, round(memory / self.frame))
+        return -influence.sum(0), sigmas.hypot(torch.as_tensor(MIN_SIGMA_FRAMES * self.frame))
 
     def _given(self, F: Tensor) -> Tensor:
         """The same F, of the coordinates given."""
@@ -419,6 +439,11 @@ class Matched:
         return torch.einsum("ni,nj->nij", self.q, self.p).flatten(1)
 
 
+ROBUST_CUTOFF_SIGMAS = 4.0  # Residual at which Geman and McClure's weight is a quarter, robust sigmas.
+SCALE_BLOCK_FRAMES = 30  # Frames that share one residual scale.
+SCALE_RANGE = (0.4, 6.0)  # Least and largest scale of a point or a block, over the pooled one.
+
+
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """Residuals at a state, with their derivatives."""
@@ -429,7 +454,6 @@ class Residuals:
     times: Tensor  # (m,)
     both: Tensor  # (frames, n) bool
     sure: Tensor  # (m,): weights of the positions
-    options: SynchronizeOptions
 
     @property
     def distances(self) -> Tensor:
@@ -450,21 +474,16 @@ class Residuals:
         every = torch.full(self.both.shape, torch.nan, dtype=torch.float64, device=self.residual.device)
         distances = self.distances
         every[self.both] = distances.abs() * (1.4826 / pooled)
-        point = every.nanmedian(0).values.nan_to_num(1.0).clamp(*self.options.descent.unequal)
-        pad = -len(every) % self.options.descent.block_frames
+        point = every.nanmedian(0).values.nan_to_num(1.0).clamp(*SCALE_RANGE)
+        pad = -len(every) % SCALE_BLOCK_FRAMES
         blocks = (
             torch.nn.functional.pad(every / point, (0, 0, 0, pad), value=torch.nan)
-            .unflatten(0, (-1, self.options.descent.block_frames))
+            .unflatten(0, (-1, SCALE_BLOCK_FRAMES))
             .flatten(1)
         )
-        moment = (
-            blocks.nanmedian(1)
-            .values.nan_to_num(1.0)
-            .clamp(*self.options.descent.unequal)
-            .repeat_interleave(self.options.descent.block_frames)[: len(every)]
-        )
+        moment = blocks.nanmedian(1).values.nan_to_num(1.0).clamp(*SCALE_RANGE).repeat_interleave(SCALE_BLOCK_FRAMES)[: len(every)]
         own = (moment[:, None] * point)[self.both]
-        return self.sure * (1 + (distances / (self.options.descent.cut * pooled * own)).square()).pow(-2) / own.square()
+        return self.sure * (1 + (distances / (ROBUST_CUTOFF_SIGMAS * pooled * own)).square()).pow(-2) / own.square()
 
 
 def _tangent(F: Tensor) -> Tensor:

@@ -10,9 +10,51 @@ from functools import cached_property
 import torch
 from torch import Generator, Tensor
 
-from dyntorch.tasks.synchronize.epipolar import EPIPOLAR, Curve, EpipolarFit, PairModel, Samples, epipolar_curve
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.epipolar import (
+    EPIPOLAR,
+    MIN_CURVE_PAIRS,
+    MIN_HALF_OVERLAP_SHARE,
+    MIN_OVERLAP_SHARE,
+    MIN_PEAK_SEPARATION_FRAMES,
+    Curve,
+    EpipolarFit,
+    PairModel,
+    Samples,
+    epipolar_curve,
+)
 from dyntorch.tasks.synchronize.tracks import Tracks, image_of
+
+NUM_PEAKS = 6  # Local maxima of the curve from which a descent may start.
+NUM_COMPARED_ROWS = 3_000  # Residuals that are enough to compare peaks.
+# Margin of affine cameras over that of perspective ones: their misfit differs from period to period of a gait.
+AFFINE_MARGIN_FACTOR = 2.5
+# Extra nats where outliers were removed or the residual is far above the noise (two walks of one person led by .53).
+ROUGH_MARGIN = 0.5
+USUAL_ROUGHNESS = 1.25  # Usual residual over the noise: .9 to 1.2 on virtual cameras.
+ROUGHNESS_LOG_RANGE = 0.25  # Logarithm of the residual over the usual one at which all of that margin is needed.
+USUAL_ROUGHNESS_CLEAR = 4.0  # Usual residual of affine cameras, and where the time-reversed video fits far worse.
+USUAL_ROUGHNESS_WITHOUT_OUTLIERS = 2.0  # The same where outliers were removed.
+# Extra nats where outliers were removed from an overlap of half SHORT_OVERLAP_SHARE (false fits led by up to 1.1).
+SHORT_OVERLAP_MARGIN = 0.6
+SHORT_OVERLAP_SHARE = 0.5  # Share of the longest overlap below which it is short.
+# Nats against the time-reversed video: false pairs -.9 to -1.9, good ones -.1 to 2.7 (experiments.synchronization.silent).
+MIN_FORWARD_MARGIN = -0.35
+DOUBTFUL_FORWARD_MARGIN = 0.55  # Extra nats of it where the fit is doubtful.
+CLEAR_FORWARD_MARGIN = 0.6  # Nats of it from which removed outliers are no reason for doubt (false fits had .2 and less).
+CLEAR_SCORE_MARGIN = 0.9  # Score above every other peak from which they are not, either (false fits had .3 and less).
+FORWARD_SCALE = 0.04  # Nats of it per unit of the log odds of the confidence.
+# Frames by which both halves may differ from the whole to the same side (good pairs .3; mirrored video 1.5).
+MAX_COMMON_HALF_SHIFT_FRAMES = 0.8
+NUM_COMPETING_PEAKS = 3  # Other peaks that are compared between frames.
+NUM_FRACTIONS = 5  # Places within a step of a peak at which it is compared.
+MAX_SIGMA_FRAMES = 0.25  # Sigma above which a shift decides nothing, frames: with motion near the noise it is a lower bound.
+MIN_FRAME_SECONDS = 1 / 30  # Duration that a frame counts for at least in it.
+EVEN_MARGIN = 0.6  # Margin over the required one at which right and wrong are as likely; set by hand, tests of refusals hold it.
+MARGIN_SCALE = 0.05  # Nats of margin per unit of those log odds.
+HOPELESS_MARGIN = -10  # Margin below which the confidence is 0, nats.
+CONFIDENCE_AGREEING_HALVES = 0.995  # Confidence of a shift on which both halves agree, all else being certain.
+CONFIDENCE_DISAGREEING_HALVES = 0.3  # The same where they do not.
+IMPRECISE_CONFIDENCE_FACTOR = 0.5  # Factor of the confidence of an imprecise shift, or one at the end of the search.
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +70,7 @@ class Attempt:
     max_shift: float | None  # of the search, seconds
     points: Tensor  # ``(n,)`` bool, who takes part
     method: str  # ``"epipolar"`` or ``"affine"``
-    options: SynchronizeOptions
+    min_margin: float  # nats for a decision, of perspective cameras
     pruned: bool = False  # whether positions that did not fit were left out
     model: PairModel = EPIPOLAR  # what is compared
 
@@ -42,12 +84,12 @@ class Attempt:
         """Shifts at the center and scores of the curve's peaks; the fit's own first."""
         if self.fit is None:
             return []
-        found = [(self._shift(lag), score) for lag, score in self.curve.peaks(4 * self.options.evidence.peaks)]
+        found = [(self._shift(lag), score) for lag, score in self.curve.peaks(4 * NUM_PEAKS)]
         here = [score for shift, score in found if self._near(shift)]
         own = here[0] if here else self._score(self.fit.shift)
         # a higher maximum of the curve that a descent found no better is none
         others = [(shift, min(score, own)) for shift, score in found if not self._near(shift)]
-        return [(self.fit.shift, own), *others[: self.options.evidence.peaks - 1]]
+        return [(self.fit.shift, own), *others[: NUM_PEAKS - 1]]
 
     @cached_property
     def margin(self) -> float:
@@ -62,18 +104,14 @@ class Attempt:
         if self.fit is None or len(rough) == 1:
             return rough
         width = max(self.frame, self.step)
-        descent = self.model.descent(self.a, self.b, width, rows=self.options.evidence.rows, options=self.options)
-        steps = self.step * torch.linspace(-1, 1, self.options.evidence.fractions, dtype=torch.float64)
+        descent = self.model.descent(self.a, self.b, width, rows=NUM_COMPARED_ROWS)
+        steps = self.step * torch.linspace(-1, 1, NUM_FRACTIONS, dtype=torch.float64)
         level = max(self.curve.level, 1e-300)
-        for k, (shift, _) in enumerate(self.peaks[: self.options.evidence.rivals + 1]):
+        for k, (shift, _) in enumerate(self.peaks[: NUM_COMPETING_PEAKS + 1]):
             offset = shift - (self.fit.rate - 1) * self.fit.center
             found = [descent.variance(offset + float(step), self.fit.rate) for step in steps]
             # exact data: a step of the own peak is as far from its bottom as the nearest step of a rival's may be
-            least = (
-                min(found)
-                if k
-                else min(found[self.options.evidence.fractions // 2 - 1], found[self.options.evidence.fractions // 2 + 1])
-            )
+            least = min(found) if k else min(found[NUM_FRACTIONS // 2 - 1], found[NUM_FRACTIONS // 2 + 1])
             rough[k] = -0.5 * math.log(max(least, 1e-300) / level)
         return rough
 
@@ -83,7 +121,7 @@ class Attempt:
         if self.fit is None:
             return 0.0
         backwards = dataclasses.replace(self.samples, x2=self.samples.x2.flip(0), w2=self.samples.w2.flip(0))
-        curve = epipolar_curve(backwards, self.max_shift, options=self.options)
+        curve = epipolar_curve(backwards, self.max_shift)
         judged = curve.scores.isfinite()
         if not bool(judged.any()) or not self.misfits:
             return 0.0
@@ -94,7 +132,7 @@ class Attempt:
     @property
     def needed_forward(self) -> float:
         """The same for a decision: more where something may have been made to fit."""
-        return self.options.evidence.forward + self.options.evidence.forward_doubtful * self.doubtful
+        return MIN_FORWARD_MARGIN + DOUBTFUL_FORWARD_MARGIN * self.doubtful
 
     @cached_property
     def halves(self) -> tuple[float, float]:
@@ -125,10 +163,7 @@ class Attempt:
         early = times < self.fit.center
         parts = [torch.where((shared & part)[:, None], w1, 0.0) for part in (early, ~early)]
         return [
-            epipolar_curve(
-                dataclasses.replace(self.samples, w1=part), self.max_shift, self.options.evidence.half_overlap, options=self.options
-            )
-            for part in parts
+            epipolar_curve(dataclasses.replace(self.samples, w1=part), self.max_shift, MIN_HALF_OVERLAP_SHARE) for part in parts
         ]
 
     @cached_property
@@ -141,11 +176,10 @@ class Attempt:
         """Frames by which halves of the overlap may differ from the whole, where one does by more, or both do to the same side; 0
         where they agree."""
         first, second = self.halves
-        evidence = self.options.evidence
-        if not (abs(first) <= evidence.apart and abs(second) <= evidence.apart):
-            return evidence.apart
-        leaning = first * second > 0 and min(abs(first), abs(second)) > evidence.leaning
-        return evidence.leaning if leaning else 0.0
+        if not (abs(first) <= MIN_PEAK_SEPARATION_FRAMES and abs(second) <= MIN_PEAK_SEPARATION_FRAMES):
+            return MIN_PEAK_SEPARATION_FRAMES
+        leaning = first * second > 0 and min(abs(first), abs(second)) > MAX_COMMON_HALF_SHIFT_FRAMES
+        return MAX_COMMON_HALF_SHIFT_FRAMES if leaning else 0.0
 
     @cached_property
     def wander(self) -> float:
@@ -167,22 +201,19 @@ class Attempt:
     @property
     def sharp(self) -> bool:
         """Whether the shift is known well enough to trust its sigma."""
-        return self.fit is not None and self.fit.sigma <= self.options.evidence.sharp * max(
-            self.frame, self.options.evidence.shortest_frame
-        )
+        return self.fit is not None and self.fit.sigma <= MAX_SIGMA_FRAMES * max(self.frame, MIN_FRAME_SECONDS)
 
     @property
     def needed(self) -> float:
         """Nats above the next peak, for a decision."""
-        evidence = self.options.evidence
         affine = self.method == "affine"
-        least = evidence.affine_margin if affine else evidence.margin
+        least = AFFINE_MARGIN_FACTOR * self.min_margin if affine else self.min_margin
         if affine or self.doubtful == 0:
             # with a residual far above the noise something may have been made to fit, the more so by leaving out what does not
-            usual = evidence.usual_roughness_pruned if self.chosen else evidence.usual_roughness_clear
+            usual = USUAL_ROUGHNESS_WITHOUT_OUTLIERS if self.chosen else USUAL_ROUGHNESS_CLEAR
             rough = math.log(max(self.roughness, 1e-300) / usual)
-            return least + evidence.rough_margin * min(max(rough, 0.0), 1.0) + evidence.short_margin * self.short
-        return least + evidence.rough_margin * self.doubtful + evidence.short_margin * self.short
+            return least + ROUGH_MARGIN * min(max(rough, 0.0), 1.0) + SHORT_OVERLAP_MARGIN * self.short
+        return least + ROUGH_MARGIN * self.doubtful + SHORT_OVERLAP_MARGIN * self.short
 
     @property
     def short(self) -> float:
@@ -193,8 +224,7 @@ class Attempt:
             return 0.0
         place = int((self.curve.lags - self._lag(self.fit.shift)).abs().argmin())
         share = float(counts[place] / counts.max().clamp(min=1e-300))
-        evidence = self.options.evidence
-        return min(max((evidence.short_overlap - share) / (0.5 * evidence.short_overlap), 0.0), 1.0)
+        return min(max((SHORT_OVERLAP_SHARE - share) / (0.5 * SHORT_OVERLAP_SHARE), 0.0), 1.0)
 
     @property
     def chosen(self) -> bool:
@@ -204,15 +234,14 @@ class Attempt:
     @property
     def doubtful(self) -> float:
         """0 where all points fit as well as their noise lets them; 1 where something may have been made to fit."""
-        evidence = self.options.evidence
-        rough = math.log(max(self.roughness, 1e-300) / evidence.usual_roughness)
+        rough = math.log(max(self.roughness, 1e-300) / USUAL_ROUGHNESS)
         if not self.chosen and rough <= 0:
             return 0.0
         own, *others = (score for _, score in self.peaks)
-        alone = own - max(others, default=-math.inf) >= evidence.score_clear
-        if self.short == 0 and (alone or self.forward >= evidence.forward_clear):
+        alone = own - max(others, default=-math.inf) >= CLEAR_SCORE_MARGIN
+        if self.short == 0 and (alone or self.forward >= CLEAR_FORWARD_MARGIN):
             return 0.0
-        return 1.0 if self.chosen else min(rough / evidence.rough_growth, 1.0)
+        return 1.0 if self.chosen else min(rough / ROUGHNESS_LOG_RANGE, 1.0)
 
     @property
     def roughness(self) -> float:
@@ -234,26 +263,22 @@ class Attempt:
             return 0.0
         own = math.erf(self.frame / max(math.sqrt(2) * self.sigma, 1e-12))
         rival = (
-            1
-            / (1 + math.exp(-(self.margin - self.options.evidence.even_margin * self.needed) / self.options.evidence.margin_scale))
-            if self.margin > self.options.evidence.hopeless_margin
-            else 0.0
+            1 / (1 + math.exp(-(self.margin - EVEN_MARGIN * self.needed) / MARGIN_SCALE)) if self.margin > HOPELESS_MARGIN else 0.0
         )
         return (
             own
             * rival
             * self._forward_share
-            * (self.options.evidence.agreeing if self.agree else self.options.evidence.disagreeing)
-            * (1.0 if self.sharp and not self.edge else self.options.evidence.blurred)
+            * (CONFIDENCE_AGREEING_HALVES if self.agree else CONFIDENCE_DISAGREEING_HALVES)
+            * (1.0 if self.sharp and not self.edge else IMPRECISE_CONFIDENCE_FACTOR)
         )
 
     @property
     def _forward_share(self) -> float:
         """Odds of a film that runs forwards, as a factor of the confidence; where the rest is hopeless that is not looked at."""
-        evidence = self.options.evidence
-        if self.margin < evidence.even_margin * self.needed:
+        if self.margin < EVEN_MARGIN * self.needed:
             return 1.0
-        return 1 / (1 + math.exp(-min((self.forward - self.needed_forward) / evidence.forward_scale, 700.0)))
+        return 1 / (1 + math.exp(-min((self.forward - self.needed_forward) / FORWARD_SCALE, 700.0)))
 
     def _shift(self, lag: float) -> float:
         """Of b's clock against a's at the center, of a lag of the curve."""
@@ -267,7 +292,7 @@ class Attempt:
 
     def _near(self, shift: float) -> bool:
         assert self.fit is not None
-        return abs(shift - self.fit.shift) <= max(self.options.evidence.apart * self.frame, 1.5 * self.step)
+        return abs(shift - self.fit.shift) <= max(MIN_PEAK_SEPARATION_FRAMES * self.frame, 1.5 * self.step)
 
     def _score(self, shift: float) -> float:
         assert self.fit is not None
@@ -284,35 +309,41 @@ class Attempt:
 # Which points are the same in both cameras: subsets vote, each at the shift it likes best.
 
 
-def consistent_points(
-    a: Tracks, b: Tracks, found: Attempt, generator: Generator | None, options: SynchronizeOptions
-) -> Tensor | None:
+SUBSET_SIZE = 6  # Points of a subset.
+NUM_SUBSETS = 60  # Subsets: one of 6 without 4 outliers of 17 is drawn in all but 1 of 10,000 trials.
+MIN_INLIER_SHARE = 0.7  # Share of the points that have to fit.
+MAX_RESIDUAL_RATIO = 3.0  # Residual over the median one of inliers beyond which a point is an outlier.
+MIN_POINTS_FOR_REJECTION = 8  # Points below which none can be rejected.
+MAX_SUBSET_LAGS = 800  # Lags of that search; longer ones go in coarser steps.
+
+
+def consistent_points(a: Tracks, b: Tracks, found: Attempt, generator: Generator | None = None) -> Tensor | None:
     """Points ``(n,)`` bool whose epipolar residual agrees with the others' at one and the same shift; None where there are too
     few."""
     n = a.x.shape[1]
     lo, hi = found.samples.lags(found.max_shift)
-    if n < options.points.fewest or lo > hi:
+    if n < MIN_POINTS_FOR_REJECTION or lo > hi:
         return None
-    step = found.step * max(1, -(-(hi - lo) // options.points.most_lags))
-    samples = found.model.samples.of(a, b, step, found.samples.rate, options=options)
+    step = found.step * max(1, -(-(hi - lo) // MAX_SUBSET_LAGS))
+    samples = found.model.samples.of(a, b, step, found.samples.rate)
     moments, counts = samples.moments(samples.lags(found.max_shift), per_point=True)
     total = counts.sum(0)
-    judged = (total >= options.curve.least_overlap * total.max()) & (total >= options.curve.fewest_pairs)
+    judged = (total >= MIN_OVERLAP_SHARE * total.max()) & (total >= MIN_CURVE_PAIRS)
     if not bool(judged.any()):
         return None
     moments, counts = moments[:, judged], counts[:, judged]
     generator = generator or torch.Generator().manual_seed(0)
     best: tuple[float, Tensor] | None = None
-    for _ in range(options.points.subsets):
-        chosen = torch.randperm(n, generator=generator)[: options.points.subset].to(moments.device)
+    for _ in range(NUM_SUBSETS):
+        chosen = torch.randperm(n, generator=generator)[:SUBSET_SIZE].to(moments.device)
         variance, geometry = samples.solved(moments[chosen].sum(0))
         lag = int((variance / counts[chosen].sum(0).clamp(min=1).sqrt()).argmin())
         each = samples.variances_by(geometry[lag], moments[:, lag])
-        cost = float(each.nanquantile(options.points.share))
+        cost = float(each.nanquantile(MIN_INLIER_SHARE))
         if best is None or cost < best[0]:
             best = cost, each
     assert best is not None
     each = best[1]
     level = each[each <= best[0]].median()
-    kept = ~(each > options.points.wrong**2 * level)
-    return kept if int(kept.sum()) >= options.points.share * n else None
+    kept = ~(each > MAX_RESIDUAL_RATIO**2 * level)
+    return kept if int(kept.sum()) >= MIN_INLIER_SHARE * n else None

@@ -27,8 +27,18 @@ from torch import Tensor
 from dyntorch.geometry.epipolar import RIDGE, least_ratio
 from dyntorch.numerics.lags import resection_moments
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, minimize
-from dyntorch.tasks.synchronize.epipolar import Grid, Matched, PairModel, Residuals, Samples, ShiftDescent, long_run
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.epipolar import (
+    MAX_CORRELATION_SECONDS,
+    MIN_CORRELATION_BLOCKS,
+    ROBUST_CUTOFF_SIGMAS,
+    Grid,
+    Matched,
+    PairModel,
+    Residuals,
+    Samples,
+    ShiftDescent,
+    long_run,
+)
 from dyntorch.tasks.synchronize.subspace import completed, filled
 from dyntorch.tasks.synchronize.tracks import Tracks, image_of, smoothed
 
@@ -66,9 +76,9 @@ class SpaceSamples(Samples):
     """Smoothed, normalized points of a camera ``(m, n, 2)`` and the same points in space ``(m, n, 3)``, in either order."""
 
     @classmethod
-    def of(cls, a: Tracks, b: Tracks, step: float, rate: float = 1.0, *, options: SynchronizeOptions) -> Self:
+    def of(cls, a: Tracks, b: Tracks, step: float, rate: float = 1.0) -> Self:
         """As of two cameras; the noise is that of the camera alone."""
-        found = super().of(a, b, step, rate, options=options)
+        found = super().of(a, b, step, rate)
         unit = float(image_of(a, b).change[0, 0])
         return replace(found, noise=(unit, unit))
 
@@ -98,15 +108,18 @@ class SpaceSamples(Samples):
 # Offset, clock rate and camera at once: robust least squares of the distances in the image.
 
 
+MIN_DEPTH_RATIO = 0.05  # Least depth before the camera, over the median one, that an image is computed from.
+
+
 class SpaceDescent(ShiftDescent):
     """The problem for a camera and points in space, in either order; the geometry is the camera ``(3, 4)``, of norm 1."""
 
-    def __init__(self, a: Tracks, b: Tracks, width: float, rows: int | None = None, *, options: SynchronizeOptions) -> None:
-        super().__init__(a, b, width, rows, options=options)
+    def __init__(self, a: Tracks, b: Tracks, width: float, rows: int | None = None) -> None:
+        super().__init__(a, b, width, rows)
         unit = float(image_of(a, b).change[0, 0])
         self.noise = (unit, unit)
         # velocities of the space are as good as exact, those of a camera are not
-        self.speed = None if image_of(a, b) is a else smoothed(a, self.times, width, options)[1]
+        self.speed = None if image_of(a, b) is a else smoothed(a, self.times, width)[1]
 
     def _matched(self, offset: float, rate: float, every: int = 1) -> Matched | None:
         """As of two cameras, the image as p and the space as q; the speed is that of the space by the offset."""
@@ -139,7 +152,7 @@ class SpaceDescent(ShiftDescent):
         depth = images[:, 2]
         side = 1.0 if float(depth.sum()) >= 0 else -1.0
         # a point near the camera's own plane, or behind, has no image: as if it were close, it is far off and weighs nothing
-        depth = side * (side * depth).clamp(min=self.options.descent.nearest * float(depth.abs().median()))
+        depth = side * (side * depth).clamp(min=MIN_DEPTH_RATIO * float(depth.abs().median()))
         seen = images[:, :2] / depth[:, None]
         residual = (seen - matched.p[:, :2]) / self.noise[0]
         along = (speed[:, :2] - seen * speed[:, 2:]) / (depth[:, None] * self.noise[0])
@@ -149,7 +162,7 @@ class SpaceDescent(ShiftDescent):
         products[:, :, 2] = -seen[..., None] * rays[:, None]
         return SpaceRows(
             residual.flatten(), products.flatten(0, 1).flatten(1), along.flatten(), times.repeat_interleave(2), matched.both,
-            matched.sure, options=self.options,
+            matched.sure,
         )  # fmt: skip
 
     def _given(self, F: Tensor) -> Tensor:
@@ -192,23 +205,38 @@ class CombinedFit:
     weights: Tensor  # ``(n, k)``
 
 
-def combined_fit(film: Tracks, space: Tracks, offset: float, rate: float, options: SynchronizeOptions) -> CombinedFit | None:
+NUM_REWEIGHTINGS = 4  # Robust reweightings.
+MAX_ITERATIONS = 30  # Steps of each.
+COST_TOLERANCE = 1e-7  # Relative decrease of the cost that ends them.
+
+
+def combined_fit(film: Tracks, space: Tracks, offset: float, rate: float) -> CombinedFit | None:
     """The shift near an offset at which combinations of the points in space are what the camera sees; None where none is
     found."""
-    problem = _Problem.of(film, space, offset, rate, options)
+    problem = _Problem.of(film, space, offset, rate)
     if problem is None:
         return None
     theta = problem.started()
     if theta is None:
         return None
-    chosen = options.combined
-    for _ in range(chosen.rounds):
+    for _ in range(NUM_REWEIGHTINGS):
         start = problem.evaluate(theta)
         if not bool(start.cost.isfinite()):
             return None
-        theta = minimize(problem, start, LeastSquaresOptions(iterations=chosen.iterations, tolerance=chosen.tolerance)).theta
+        theta = minimize(problem, start, LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=COST_TOLERANCE)).theta
         problem = problem.weighed(theta)
     return problem.fit(theta)
+
+
+NUM_START_COMBINATIONS = 4  # Those of the first affine camera.
+START_RIDGE = 1e-3  # Ridge of its regressions, mean squares of coordinates of order 1.
+WEIGHT_SIGMA = 1.0  # Standard deviation of a combination's weights.
+MAX_SHIFT_FRAMES = 3.0  # Range about the lag of the row spaces, frames.
+MIN_FRAMES = 24  # Frames per point.
+MAX_COMBINED_ROWS = 40_000  # Positions; of longer videos frames at equal distances.
+MIN_RESIDUAL = 1e-6  # Residual of normalized coordinates that is rounding.
+COMBINED_SIGMA_INFLATION = 3.0  # True errors over the sigma of the residuals: a joint is only nearly a combination.
+MIN_COMBINED_SIGMA_FRAMES = 0.05  # Error at least, frames.
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,36 +253,35 @@ class _Problem(LeastSquares):
     width: float
     unit: float  # normalized per px
     ridge: float
-    options: SynchronizeOptions
 
     @staticmethod
-    def of(film: Tracks, space: Tracks, offset: float, rate: float, options: SynchronizeOptions) -> _Problem | None:
+    def of(film: Tracks, space: Tracks, offset: float, rate: float) -> _Problem | None:
         frame = max(film.step, space.step)
-        stride = max(1, math.ceil(len(film.times) * film.x.shape[1] / options.combined.most_rows))
+        stride = max(1, math.ceil(len(film.times) * film.x.shape[1] / MAX_COMBINED_ROWS))
         times = film.every(frame * stride)
-        x, _, sure = smoothed(film, times, frame, options)
+        x, _, sure = smoothed(film, times, frame)
         change = film.change
         x = torch.where((sure > 0)[..., None], x @ change[:2, :2].mT + change[:2, 2], 0.0)
-        grid = Grid.of(_combinations(space, film.noise / max(film.scale, 1e-300), options), frame, options)
+        grid = Grid.of(_combinations(space, film.noise / max(film.scale, 1e-300)), frame)
         there = times * rate + offset
-        reach = options.combined.reach * frame
+        reach = MAX_SHIFT_FRAMES * frame
         first, last = grid.start + reach, grid.start + (len(grid.x) - 1) * grid.step - reach
         sure = torch.where(((there >= first) & (there <= last))[:, None], sure, 0.0)
-        if int((sure > 0).sum()) < options.combined.fewest * film.x.shape[1]:
+        if int((sure > 0).sum()) < MIN_FRAMES * film.x.shape[1]:
             return None
         unit = float(change[0, 0])
-        return _Problem(x, sure, torch.ones_like(sure), there, grid, frame, offset, frame, unit, unit**2, options)
+        return _Problem(x, sure, torch.ones_like(sure), there, grid, frame, offset, frame, unit, unit**2)
 
     def started(self) -> Tensors | None:
         """An affine camera and weights: regressions of all coordinates on those in space have the form :math:`w_i \\otimes A`."""
         places, _, _ = self.grid.at(self.times)
-        kept = min(places.shape[1] - 1, self.options.combined.start_combinations)
+        kept = min(places.shape[1] - 1, NUM_START_COMBINATIONS)
         design = torch.cat([places[:, : 1 + kept].flatten(1), torch.ones_like(places[:, 0, :1])], 1)
         weights = self.sure.mT  # (n, T)
         normal = torch.einsum("nt,ti,tj->nij", weights, design, design)
         size = weights.sum(-1)[:, None, None] * torch.eye(design.shape[1], dtype=design.dtype, device=design.device)
         right = torch.einsum("nt,ti,tnc->nic", weights, design, self.x)
-        found, failed = torch.linalg.solve_ex(normal + self.options.combined.start_ridge * size, right)
+        found, failed = torch.linalg.solve_ex(normal + START_RIDGE * size, right)
         if bool(failed.any()) or not bool(found.isfinite().all()):
             return None
         own = found[:, :3].mean(0)  # (3, 2) of the middle
@@ -292,7 +319,7 @@ class _Problem(LeastSquares):
         weight = self.sure * self.robust
         # depths are of one sign; the camera may have either
         front = bool(((depth > 0) | (weight == 0)).all()) or bool(((depth < 0) | (weight == 0)).all())
-        inside = float(shift.abs().max()) <= self.options.combined.reach
+        inside = float(shift.abs().max()) <= MAX_SHIFT_FRAMES
         cost = (weight * (images - self.x).square().sum(-1)).sum() + self.ridge * W.square().sum()
         return Iterate(theta, cost[None] if front and inside else torch.full_like(shift[:, 0], math.inf), ())
 
@@ -343,9 +370,9 @@ class _Problem(LeastSquares):
         """With robust weights at these parameters, and the ridge that the residual asks for."""
         distance = (self._images(theta)[0] - self.x).norm(dim=-1)
         scale = float(distance[self.sure > 0].median()) / 1.1774
-        scale = max(scale, self.options.combined.exact)
-        robust = (1 + (distance / (self.options.descent.cut * scale * math.sqrt(2))).square()).pow(-2)
-        return dataclasses.replace(self, robust=robust, ridge=(scale / self.options.combined.usual_weight) ** 2)
+        scale = max(scale, MIN_RESIDUAL)
+        robust = (1 + (distance / (ROBUST_CUTOFF_SIGMAS * scale * math.sqrt(2))).square()).pow(-2)
+        return dataclasses.replace(self, robust=robust, ridge=(scale / WEIGHT_SIGMA) ** 2)
 
     def fit(self, theta: Tensors) -> CombinedFit | None:
         """What is found, with the influence of every frame on the shift."""
@@ -358,32 +385,35 @@ class _Problem(LeastSquares):
         frames = influence.unflatten(1, (len(self.times), 2)).sum((0, 2))[:, None]
         step = float(self.times[1] - self.times[0])
         span = float(self.times[-1] - self.times[0])
-        descent = self.options.descent
-        memory = round(min(descent.memory, span / descent.memory_parts) / step)
-        sigma = self.frame * self.options.combined.optimism * float(long_run(frames, memory)[0])
+        memory = round(min(MAX_CORRELATION_SECONDS, span / MIN_CORRELATION_BLOCKS) / step)
+        sigma = self.frame * COMBINED_SIGMA_INFLATION * float(long_run(frames, memory)[0])
         if not math.isfinite(sigma):
             return None
         distance = (self._images(theta)[0] - self.x).norm(dim=-1)[self.sure > 0]
         shift = float(theta[2]) * self.frame
         return CombinedFit(
             offset=self.offset + shift,
-            sigma=math.hypot(sigma, self.options.combined.least_sigma * self.frame),
+            sigma=math.hypot(sigma, MIN_COMBINED_SIGMA_FRAMES * self.frame),
             residual=float(distance.median()) / 1.1774 / self.unit,
             camera=theta[0][0],
             weights=theta[1][0],
         )
 
 
-def _combinations(space: Tracks, noise: float, options: SynchronizeOptions) -> Tracks:
+MAX_COMBINATIONS = 8  # Combinations besides the mean: RMS error of 15 videos, 8 / 12 / 20: .25 / .26 / .26 frames.
+MIN_MOTION_RATIO = 1.0  # Motion of a combination over the noise from which it counts: RMS error at .5 / 1 / 2: .26 / .26 / .42.
+
+
+def _combinations(space: Tracks, noise: float) -> Tracks:
     """The middle of all points, then orthonormal combinations about it that move by more than the noise, in units of the size."""
     seen = space.weights > 0
-    x = completed(filled(space.x, seen, options), seen, options)
+    x = completed(filled(space.x, seen), seen)
     middle = x.mean(1, keepdim=True)
     about = (x - middle) / max(float((x - middle).square().sum((1, 2)).mean().sqrt()), 1e-300)
     by_point = about.movedim(1, 0).flatten(1)
     values, vectors = torch.linalg.eigh(by_point @ by_point.mT / len(x))
-    kept = int((values > (options.combined.above * noise) ** 2).sum())
-    kept = min(max(kept, options.combined.start_combinations), options.combined.most_combinations, len(values))
+    kept = int((values > (MIN_MOTION_RATIO * noise) ** 2).sum())
+    kept = min(max(kept, NUM_START_COMBINATIONS), MAX_COMBINATIONS, len(values))
     parts = torch.einsum("tnd,nk->tkd", about, vectors[:, len(values) - kept :].flip(-1))
     scale = max(float((x - middle).square().sum((1, 2)).mean().sqrt()), 1e-300)
     whole = torch.cat([(middle - middle.mean(0)) / scale, parts], dim=1)

@@ -16,7 +16,17 @@ from torch import Tensor
 
 from dyntorch.geometry.epipolar import epipolar_variance
 from dyntorch.numerics.lags import epipolar_moments
-from dyntorch.tasks.synchronize.epipolar import EpipolarFit, Grid, Samples, ShiftDescent, epipolar_curve
+from dyntorch.tasks.synchronize.epipolar import (
+    MIN_HALF_OVERLAP_SHARE,
+    MIN_PEAK_SEPARATION_FRAMES,
+    ROBUST_CUTOFF_SIGMAS,
+    SCALE_RANGE,
+    EpipolarFit,
+    Grid,
+    Samples,
+    ShiftDescent,
+    epipolar_curve,
+)
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
 
@@ -48,29 +58,40 @@ class Course:
         return self.offset + sum(jump.size for jump in self.jumps if jump.moment < moment)
 
 
+WINDOW_SECONDS = 4.0  # Window that has a best shift by itself, where the search starts.
+MAX_WINDOWS = 8  # Windows at most.
+MIN_WINDOW_OVERLAP_SHARE = 0.6  # Share of a window that has to overlap.
+HALF_FRAME_RANGE = 4.0  # Frames about the current offset within which half frames are compared, too.
+MIN_PIECE_SECONDS = 0.7  # Shortest piece.
+LAG_RESOLUTION_FRAMES = 0.2  # Image motion within this is no residual, frames.
+UNSEEN_COST = 1.0  # Nats of a position that the other camera does not show: twice those of one that fits.
+JUMP_PENALTY = 12.0  # Nats that a jump costs in the search.
+MAX_ALTERNATIONS = 6  # Alternations of search and fit.
+
+
 class CourseSearch:
     """Both cameras at equal steps of a's clock, for one rate of b's."""
 
     def __init__(self, a: Tracks, b: Tracks, rate: float, max_shift: float | None, options: SynchronizeOptions) -> None:
         self.a, self.b, self.rate, self.options = a, b, rate, options
         self.step = max(a.step, b.step)
-        self.samples = Samples.of(a, b, self.step, rate, options=options)
+        self.samples = Samples.of(a, b, self.step, rate)
         self.max_shift = max_shift
         self.times = a.every(self.step)
-        self.x, _, self.weights = smoothed(a, self.times, self.step, options)
-        self.grid = Grid.of(b, self.step, options)
+        self.x, _, self.weights = smoothed(a, self.times, self.step)
+        self.grid = Grid.of(b, self.step)
 
     def starts(self) -> list[tuple[float, float, Tensor]]:
         """Middle, offset and fundamental matrix (px) of windows of the take by themselves: within most of them nothing jumps."""
-        options, w1 = self.options.breaks, self.samples.w1
-        size = round(options.window / self.step)
-        count = min(options.most_windows, max(1, round(2 * len(w1) / size) - 1))
+        w1 = self.samples.w1
+        size = round(WINDOW_SECONDS / self.step)
+        count = min(MAX_WINDOWS, max(1, round(2 * len(w1) / size) - 1))
         found = []
         for first in np.linspace(0, max(0, len(w1) - size), count).round().astype(int).tolist():
             part = torch.zeros_like(w1)
             part[first : first + size] = w1[first : first + size]
             samples = dataclasses.replace(self.samples, w1=part)
-            best = epipolar_curve(samples, self.max_shift, options.window_overlap, options=self.options).peaks(1)
+            best = epipolar_curve(samples, self.max_shift, MIN_WINDOW_OVERLAP_SHARE).peaks(1)
             if best:
                 middle = float(self.times[min(first + size // 2, len(self.times) - 1)])
                 found.append((middle, best[0][0] * self.rate, self._fundamental(samples, best[0][0])))
@@ -100,37 +121,36 @@ class CourseSearch:
     def costs(self, F: Tensor, offsets: Tensor, scale: Tensor) -> NDArray[np.float64]:
         """Nats ``(T, L)`` that the residuals of every moment cost at each offset; a little more than usual where nothing is seen,
         or the course would go where that is so."""
-        unseen = self.options.breaks.unseen
-        return np.stack([_cost(self.residuals(F, one), scale, self.options, unseen) for one in offsets.tolist()], axis=1)
+        unseen = UNSEEN_COST
+        return np.stack([_cost(self.residuals(F, one), scale, unseen) for one in offsets.tolist()], axis=1)
 
     def scale(self, F: Tensor, offset: float) -> Tensor:
         """``(n,)`` robust standard deviation of each point's residuals at an offset, px."""
-        return torch.maximum(_spread(self.residuals(F, offset), self.options), self.finest(F, offset))
+        return torch.maximum(_spread(self.residuals(F, offset)), self.finest(F, offset))
 
     def finest(self, F: Tensor, offset: float) -> Tensor:
         """``(n,)`` px that a part of a frame makes: what lags that are frames apart cannot tell."""
         moved = self.residuals(F, offset + self.step) - self.residuals(F, offset)
-        return self.options.breaks.resolved * _spread(moved, self.options).clamp(min=1e-9 * self.a.scale)
+        return LAG_RESOLUTION_FRAMES * _spread(moved).clamp(min=1e-9 * self.a.scale)
 
     def course(self, offset: float, F: Tensor) -> Course | None:
         """From a start: the cheapest lags, what was lost put back, and one fit of all that, until the jumps stay."""
-        options = self.options.breaks
         scale, known, fit = self.scale(F, offset), None, None
-        for _ in range(options.rounds):
+        for _ in range(MAX_ALTERNATIONS):
             offsets = self._offsets(offset)
             if not len(offsets):
                 return None  # gone astray
             costs = self.costs(F, offsets, scale)
-            path = cheapest(costs, options.penalty)
+            path = cheapest(costs, JUMP_PENALTY)
             jumps = self._jumps(path, offsets, costs)
             first = float(offsets[path[0]])
             mended_a, mended_b = mended(self.a, self.b, self.rate, first, jumps)
-            fit = ShiftDescent(mended_a, mended_b, self.step, options=self.options).run(first, self.rate)
+            fit = ShiftDescent(mended_a, mended_b, self.step).run(first, self.rate)
             if fit is None:
                 return None
             same, known = _same(jumps, known, self.step), jumps
             offset, F = fit.offset, fit.fundamental
-            scale = torch.maximum(_spread(fit.distances * fit.residual, self.options), self.finest(F, offset))
+            scale = torch.maximum(_spread(fit.distances * fit.residual), self.finest(F, offset))
             if same:
                 break
         assert known is not None
@@ -139,18 +159,16 @@ class CourseSearch:
 
     def _offsets(self, middle: float) -> Tensor:
         """What is compared ``(L,)``: half frames near the middle, as one fit of two pieces lies between both, else whole ones."""
-        options = self.options.breaks
-        reach, near = round(options.longest / self.step), round(options.near)
+        reach, near = round(self.options.max_jump / self.step), round(HALF_FRAME_RANGE)
         whole = torch.arange(-reach, reach + 1, dtype=torch.float64)
         half = torch.arange(-near, near, dtype=torch.float64) + 0.5
         offsets = middle + self.step * torch.cat([whole, half]).sort().values
         # the clocks were started within ``max_shift``, and what was lost since adds to it
-        return offsets if self.max_shift is None else offsets[offsets.abs() <= self.max_shift + options.longest]
+        return offsets if self.max_shift is None else offsets[offsets.abs() <= self.max_shift + self.options.max_jump]
 
     def _jumps(self, path: NDArray[np.int64], offsets: Tensor, costs: NDArray[np.float64]) -> tuple[Jump, ...]:
         """Where the course changes, with the moments that the costs of both sides allow."""
-        options = self.options.breaks
-        path = _without_short(path, costs, round(options.shortest / self.step))
+        path = _without_short(path, costs, round(MIN_PIECE_SECONDS / self.step))
         at = np.flatnonzero(np.diff(path))
         found = []
         for place, (before, after) in enumerate(zip([0, *(at + 1)], [*(at + 1), len(path)], strict=True)):
@@ -171,20 +189,23 @@ def _mapped(x: Tensor, F: Tensor) -> Tensor:
     return x @ F[:, :2].mT + F[:, 2]
 
 
-def _cost(far: Tensor, scale: Tensor, options: SynchronizeOptions, unseen: float = 0.0) -> NDArray[np.float64]:
+CORRELATED_RESIDUALS = 2.0  # Residuals that count as one, beside those that smoothing correlates.
+
+
+def _cost(far: Tensor, scale: Tensor, unseen: float = 0.0) -> NDArray[np.float64]:
     """Nats per moment, of residuals ``(T, n)``: quadratic where they fit, bounded where they do not, ``unseen`` where there are
     none."""
     square = (far / scale).square()
-    cut = options.descent.cut**2
+    cut = ROBUST_CUTOFF_SIGMAS**2
     alike = 2 * math.sqrt(math.pi)  # frames that a kernel of one frame makes into one
-    return (0.5 * square / (1 + square / cut)).nan_to_num(unseen).sum(-1).div(alike * options.breaks.dependence).numpy()
+    return (0.5 * square / (1 + square / cut)).nan_to_num(unseen).sum(-1).div(alike * CORRELATED_RESIDUALS).numpy()
 
 
-def _spread(far: Tensor, options: SynchronizeOptions) -> Tensor:
+def _spread(far: Tensor) -> Tensor:
     """``(n,)`` robust standard deviation of each point's residuals ``(T, n)``."""
     pooled = max(1.4826 * float(far.abs().nanmedian().nan_to_num(0.0)), 1e-300)
     own = (1.4826 * far.abs().nanmedian(0).values / pooled).nan_to_num(1.0)
-    return pooled * own.clamp(*options.descent.unequal)
+    return pooled * own.clamp(*SCALE_RANGE)
 
 
 def _same(jumps: tuple[Jump, ...], known: tuple[Jump, ...] | None, step: float) -> bool:
@@ -259,6 +280,11 @@ def mended(a: Tracks, b: Tracks, rate: float, offset: float, jumps: Sequence[Jum
 # What speaks for every jump: against one offset, and of each piece by itself.
 
 
+MIN_JUMP_FRAMES = 0.7  # Smallest jump, frames.
+MIN_JUMP_EVIDENCE = 25.0  # Nats by which a jump must explain the residuals better than one offset.
+MIN_SECONDS_OF_OWN_SHIFT = 3.0  # Piece from which its own best shift must agree.
+
+
 class JumpEvidence:
     """The cheapest course of several, without the jumps that a fit without them explains nearly as well."""
 
@@ -285,7 +311,7 @@ class JumpEvidence:
         if not courses:
             return None
         scale = min(courses, key=lambda one: one.fit.residual).scale
-        penalty = self.options.breaks.penalty
+        penalty = JUMP_PENALTY
         return min(
             courses,
             key=lambda one: self._cost(one.fit, scale) + penalty * (len(one.jumps) + (one.rate != given)),
@@ -293,13 +319,13 @@ class JumpEvidence:
 
     def _cost(self, fit: EpipolarFit, scale: Tensor) -> float:
         """Nats of all residuals of a fit, for as many as there could be."""
-        cost = _cost(fit.distances * fit.residual, scale, self.options)
+        cost = _cost(fit.distances * fit.residual, scale)
         seen = float(fit.distances.isfinite().sum())
         return float(cost.sum()) / max(seen, 1.0) * float((self.a.weights > 0).sum())
 
     def _fit(self, jumps: Sequence[Jump], offset: float, rate: float) -> EpipolarFit | None:
         a, b = mended(self.a, self.b, rate, offset, jumps)
-        return ShiftDescent(a, b, self.frame, options=self.options).run(offset, rate)
+        return ShiftDescent(a, b, self.frame).run(offset, rate)
 
     def told(self) -> tuple[Course, list[float], list[float]] | None:
         """The course with the jumps that are beyond doubt, nats for each of them, and the residual without it, px."""
@@ -313,9 +339,9 @@ class JumpEvidence:
                 fit = min(worse, key=lambda one: self._cost(one, scale), default=None)
                 nats.append(math.inf if fit is None else self._cost(fit, scale) - own)
                 residuals.append(math.inf if fit is None else fit.residual)
-            least = self.options.breaks.least * min(self.a.step, self.b.step)
+            least = MIN_JUMP_FRAMES * min(self.a.step, self.b.step)
             sizes = [abs(jump.size) for jump in course.jumps]
-            weak = [k for k, one in enumerate(nats) if one < self.options.breaks.evidence or sizes[k] < least]
+            weak = [k for k, one in enumerate(nats) if one < MIN_JUMP_EVIDENCE or sizes[k] < least]
             if not weak:
                 return course, nats, residuals
             course = self._dropped(course, min(weak, key=nats.__getitem__))
@@ -344,22 +370,22 @@ class JumpEvidence:
         for jump in course.jumps:
             moments.append(jump.moment + gained)
             gained += max(jump.size, 0.0) / course.rate
-        descent = ShiftDescent(a, b, self.frame, options=self.options)
+        descent = ShiftDescent(a, b, self.frame)
         moved, sigmas = descent.jumps(course.fit, moments)
         return [jump.size + more for jump, more in zip(course.jumps, moved.tolist(), strict=True)], sigmas.tolist()
 
     def contradicted(self, course: Course) -> bool:
         """Whether a piece that is long enough to say so is elsewhere by itself, with a fundamental matrix of its own."""
         a, b = mended(self.a, self.b, course.rate, course.offset, course.jumps)
-        samples = Samples.of(a, b, self.frame, course.rate, options=self.options)
+        samples = Samples.of(a, b, self.frame, course.rate)
         times = float(a.times[0]) + self.frame * torch.arange(len(samples.x1), dtype=torch.float64)
         edges = [-math.inf, *(jump.moment for jump in course.jumps), math.inf]
         for low, high in itertools.pairwise(edges):
             inside = (times > low) & (times <= high)
-            if float(inside.sum()) * self.frame < self.options.breaks.alone:
+            if float(inside.sum()) * self.frame < MIN_SECONDS_OF_OWN_SHIFT:
                 continue
             part = dataclasses.replace(samples, w1=torch.where(inside[:, None], samples.w1, 0.0))
-            best = epipolar_curve(part, self.max_shift, self.options.evidence.half_overlap, options=self.options).peaks(1)
-            if best and abs(best[0][0] * course.rate - course.fit.offset) > self.options.evidence.apart * self.frame:
+            best = epipolar_curve(part, self.max_shift, MIN_HALF_OVERLAP_SHARE).peaks(1)
+            if best and abs(best[0][0] * course.rate - course.fit.offset) > MIN_PEAK_SEPARATION_FRAMES * self.frame:
                 return True
         return False

@@ -15,10 +15,16 @@ from dyntorch.numerics.blocks import constant
 from dyntorch.numerics.lags import lag_covariances, lag_products
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.tasks.pair.tracks import interpolated
-from dyntorch.tasks.synchronize.options import ProjectiveOptions, SynchronizeOptions
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
-from dyntorch.tasks.synchronize.rigid_body import BodyMotion, body_motion
-from dyntorch.tasks.synchronize.tracks import Tracks
+from dyntorch.tasks.synchronize.rigid_body import MAX_ITERATIONS, MIN_FRAMES, MIN_RELATIVE_NOISE, BodyMotion, body_motion
+from dyntorch.tasks.synchronize.subspace import (
+    MAX_SIGMA_FRAMES,
+    MIN_OVERLAP_SECONDS,
+    MIN_OVERLAP_SHARE,
+    MIN_PEAK_SEPARATION_SECONDS,
+)
+from dyntorch.tasks.synchronize.tracks import MAX_RATE_DEVIATION, MIN_SECONDS_FOR_RATE, RATE_SIGNIFICANCE_SIGMAS, Tracks
 
 # ----------------------------------------------------------------------------------------------------------------------
 # One body's attitude in time before two cameras, q_b = x q_a y in quaternions: at all lags by FFT.
@@ -80,9 +86,9 @@ class Poses:
     covariance: Tensor  # ``(frames, 6, 6)`` of turns about the origin and moves, 0 where not known
 
     @staticmethod
-    def of(motion: BodyMotion, times: Tensor, options: ProjectiveOptions) -> Poses:
+    def of(motion: BodyMotion, times: Tensor) -> Poses:
         """Of what one camera has seen."""
-        noise = max(motion.residual, options.exact * motion.scale)
+        noise = max(motion.residual, MIN_RELATIVE_NOISE * motion.scale)
         poses = motion.body.motions[0]
         eye = torch.eye(6, dtype=poses.dtype, device=poses.device)
         known = motion.seen[:, None, None]
@@ -233,7 +239,7 @@ def started_at(problem: SharedMotion, x: Tensor, y: Tensor) -> Tensors:
     return clock, x, y, rest
 
 
-def common_motion(first: Poses, second: Poses, options: ProjectiveOptions) -> tuple[tuple[Tensor, Tensor, Tensor], float]:
+def common_motion(first: Poses, second: Poses) -> tuple[tuple[Tensor, Tensor, Tensor], float]:
     """What turns a's motion to b's at the same moments: X, Y ``(3, 3)``, scale and places ``(7,)``; and what is left in sigmas."""
     attitudes = [torch.where(poses.values.isfinite(), poses.values, 0.0)[:, :4] for poses in (first, second)]
     known = [poses.values.isfinite().all(-1).double() for poses in (first, second)]
@@ -243,7 +249,7 @@ def common_motion(first: Poses, second: Poses, options: ProjectiveOptions) -> tu
     free[:2] = 0.0
     problem = SharedMotion(first, second, start, 0.0, free)
     theta = started_at(problem, rotations_of(x), rotations_of(y))
-    found = minimize(problem, problem.evaluate(theta), LeastSquaresOptions(iterations=options.iterations, tolerance=1e-9))
+    found = minimize(problem, problem.evaluate(theta), LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9))
     return (found.theta[1][0], found.theta[2][0], found.theta[3][0]), float((found.cost[0] / 6).sqrt())
 
 
@@ -283,16 +289,14 @@ MEASURES = ("attitude", "rank")
 
 def projective_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
     """The shift of uncalibrated perspective cameras that see different points of one rigid body."""
-    if options.projective.measure not in MEASURES:
-        raise ValueError(f"options.projective.measure must be {' or '.join(MEASURES)}, got {options.projective.measure!r}")
-    motions = [body_motion(name, tracks, options.projective) for name, tracks in (("a", a), ("b", b))]
+    if options.body_measure not in MEASURES:
+        raise ValueError(f"options.body_measure must be {' or '.join(MEASURES)}, got {options.body_measure!r}")
+    motions = [body_motion(name, tracks, options) for name, tracks in (("a", a), ("b", b))]
     wrong = tuple(motion for motion in motions if isinstance(motion, Notice))
     if wrong:
         return _nothing(a, b, wrong)
     poses = [
-        Poses.of(motion, tracks.times, options.projective)
-        for motion, tracks in zip(motions, (a, b), strict=True)
-        if isinstance(motion, BodyMotion)
+        Poses.of(motion, tracks.times) for motion, tracks in zip(motions, (a, b), strict=True) if isinstance(motion, BodyMotion)
     ]
     return match_motions(poses[0], poses[1], a, b, max_shift=max_shift, rate=rate, options=options)
 
@@ -302,22 +306,23 @@ def match_motions(
 ) -> Shift:
     """The shift at which two motions are those of one body."""
     curve = _curve(first, second, a, b, rate or 1.0, max_shift, options)
-    top = curve.maxima(options)
+    top = curve.maxima()
     if not top:
         return _nothing(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
     problem, theta = _starts(first, second, curve, top)
-    found = minimize(
-        problem, problem.evaluate(theta), LeastSquaresOptions(iterations=options.projective.iterations, tolerance=1e-9)
-    )
+    found = minimize(problem, problem.evaluate(theta), LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9))
     misfits = (found.cost / 6).sqrt()
     if not bool(misfits.isfinite().any()):
         return _nothing(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
     best = misfits.argmin()
     alone = replace(problem.subset(best[None]), start=found.theta[0][best][None])
     theta = tuple(part[best][None] for part in found.theta)
-    if rate is None and a.times[-1] - a.times[0] > options.search.drifting:
-        theta, alone = _with_rate(alone, theta, options)
-    return _judged(alone, theta, problem.start, found.theta[0], misfits, curve, a, b, options)
+    if rate is None and a.times[-1] - a.times[0] > MIN_SECONDS_FOR_RATE:
+        theta, alone = _with_rate(alone, theta)
+    return _judged(alone, theta, problem.start, found.theta[0], misfits, curve, a, b)
+
+
+NUM_PEAKS = 5  # Lags from which a descent starts.
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,16 +342,16 @@ class _Curve:
         """Negative logarithms of the misfit, NaN where the overlap is too short."""
         return torch.where(self.judged, -0.5 * self.squares.clamp(min=1e-16).log(), torch.nan)
 
-    def maxima(self, options: SynchronizeOptions) -> list[int]:
+    def maxima(self) -> list[int]:
         """Local maxima, the best first, none near a better one."""
         scores = self.scores.nan_to_num(nan=-math.inf)
         padded = torch.nn.functional.pad(scores, (1, 1), value=-math.inf)
         top = ((scores >= padded[:-2]) & (scores >= padded[2:]) & self.judged).nonzero()[:, 0]
         kept: list[int] = []
         for i in top[scores[top].argsort(descending=True, stable=True)].tolist():
-            if all(abs(i - j) * self.step > options.different.apart + 1e-9 for j in kept):
+            if all(abs(i - j) * self.step > MIN_PEAK_SEPARATION_SECONDS + 1e-9 for j in kept):
                 kept.append(i)
-        return kept[: options.projective.peaks]
+        return kept[:NUM_PEAKS]
 
 
 def _curve(
@@ -370,11 +375,11 @@ def _curve(
     lags = (lo, max(lo, hi))
     spins = [quaternions(part[..., :3].nan_to_num()) for part in rows]
     squares, counts, x, y = attitude_curve(spins[0], spins[1], weights[0], weights[1], lags)
-    if options.projective.measure == "rank":
+    if options.body_measure == "rank":
         squares, counts = rank_curve(rows[0], rows[1], weights[0], weights[1], lags)
-    least = max(options.subspace.least_overlap * min(float(w.sum()) for w in weights), options.subspace.least_seconds / step)
+    least = max(MIN_OVERLAP_SHARE * min(float(w.sum()) for w in weights), MIN_OVERLAP_SECONDS / step)
     offsets = (start + step * torch.arange(lags[0], lags[1] + 1, dtype=torch.float64, device=counts.device)) * rate
-    return _Curve(offsets, squares, counts, counts >= max(least, options.projective.fewest_frames), (x, y), rate, step)
+    return _Curve(offsets, squares, counts, counts >= max(least, MIN_FRAMES), (x, y), rate, step)
 
 
 def _starts(first: Poses, second: Poses, curve: _Curve, top: list[int]) -> tuple[SharedMotion, Tensors]:
@@ -387,13 +392,13 @@ def _starts(first: Poses, second: Poses, curve: _Curve, top: list[int]) -> tuple
     return problem, started_at(problem, *(rotations_of(turn[top]) for turn in curve.turns))
 
 
-def _with_rate(problem: SharedMotion, theta: Tensors, options: SynchronizeOptions) -> tuple[Tensors, SharedMotion]:
+def _with_rate(problem: SharedMotion, theta: Tensors) -> tuple[Tensors, SharedMotion]:
     """With a rate of its own where that is significant."""
     free = replace(problem, free=torch.ones_like(problem.free), reach=problem.reach)
-    found = minimize(free, free.evaluate(theta), LeastSquaresOptions(iterations=options.projective.iterations, tolerance=1e-9))
+    found = minimize(free, free.evaluate(theta), LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9))
     sigma = float(_covariance(free, found.theta)[1, 1].sqrt())
     away = abs(float(found.theta[0][0, 1]) - 1)
-    return (found.theta, free) if options.search.largest_drift > away > options.search.significant * sigma else (theta, problem)
+    return (found.theta, free) if MAX_RATE_DEVIATION > away > RATE_SIGNIFICANCE_SIGMAS * sigma else (theta, problem)
 
 
 def _covariance(problem: SharedMotion, theta: Tensors) -> Tensor:
@@ -405,6 +410,12 @@ def _covariance(problem: SharedMotion, theta: Tensors) -> Tensor:
     return max(misfit, 1.0) * torch.linalg.pinv(matrix, hermitian=True)
 
 
+MAX_MISFIT = 1.8  # Difference of two motions, sigmas, beyond which they are not one: .9 to 1.2 at the right shift.
+EVEN_MARGIN = 0.1  # The same at which right and wrong are as likely; set by hand.
+MARGIN_SCALE = 0.03  # The same per unit of the log odds.
+MIN_SIGMA_SECONDS = 1e-6  # Error of a shift at least: poses between frames are interpolated.
+
+
 def _judged(
     problem: SharedMotion,
     theta: Tensors,
@@ -414,7 +425,6 @@ def _judged(
     curve: _Curve,
     a: Tracks,
     b: Tracks,
-    options: SynchronizeOptions,
 ) -> Shift:
     offset, rate = theta[0][0].tolist()
     first = max(float(a.times[0]), (float(b.times[0]) - offset) / rate)
@@ -422,22 +432,22 @@ def _judged(
     center = (first + last) / 2
     at = torch.tensor([1.0, center], dtype=torch.float64, device=starts.device)
     clock = _covariance(problem, theta)[:2, :2]
-    sigma = max(float(at @ clock @ at) ** 0.5, options.projective.blur)
+    sigma = max(float(at @ clock @ at) ** 0.5, MIN_SIGMA_SECONDS)
     order = misfits.argsort(stable=True)
     order = order[misfits[order].isfinite()]
     shifts = clocks[order] @ at - center
     best = float(misfits[order[0]])
     # rounding is no evidence: exact motions agree to the last digits
     margin = math.log(max(float(misfits[order[1]]), 1.0) / max(best, 1.0)) if len(order) > 1 else math.inf
-    refused = _refusal(best, margin, sigma, shifts, curve, max(a.step, b.step), options)
+    refused = _refusal(best, margin, sigma, shifts, curve, max(a.step, b.step))
     limits = () if refused is None else (refused,)
-    likely = 1 / (1 + math.exp(-min((margin - options.projective.even) / options.projective.margin_scale, 700.0)))
+    likely = 1 / (1 + math.exp(-min((margin - EVEN_MARGIN) / MARGIN_SCALE, 700.0)))
     return Shift(
         offset=offset,
         sigma=sigma,
         rate=rate,
         rate_sigma=float(clock[1, 1].clamp(min=0).sqrt()) if rate != curve.rate else 0.0,
-        confidence=likely * min(1.0, (options.projective.agree / max(best, 1e-9)) ** 2),
+        confidence=likely * min(1.0, (MAX_MISFIT / max(best, 1e-9)) ** 2),
         peaks=torch.stack([shifts, -misfits[order].clamp(min=1e-16).log()], -1),
         method="projective",
         fps=(1 / a.step, 1 / b.step),
@@ -449,16 +459,17 @@ def _judged(
     )
 
 
-def _refusal(
-    best: float, margin: float, sigma: float, shifts: Tensor, curve: _Curve, frame: float, options: SynchronizeOptions
-) -> Notice | None:
+MIN_MARGIN = 0.2  # Logarithm of the misfit at the next lag over the best one, for a decision.
+
+
+def _refusal(best: float, margin: float, sigma: float, shifts: Tensor, curve: _Curve, frame: float) -> Notice | None:
     """Why the data do not decide; None where they do."""
-    if best > options.projective.agree:
+    if best > MAX_MISFIT:
         return Notice(ShiftNotice.NO_COMMON_MOTION, best)
-    if margin < options.projective.margin:
+    if margin < MIN_MARGIN:
         rivals = ", ".join(f"{shift:+.3g} s" for shift in shifts[1:4].tolist())
         return Notice(ShiftNotice.REPEATED, margin, {"case": "rivals", "best": float(shifts[0]), "rivals": rivals})
-    if sigma > options.different.sharp_frames * frame:
+    if sigma > MAX_SIGMA_FRAMES * frame:
         return Notice(ShiftNotice.BLUNT, sigma, {"case": "frame", "frame": frame})
     inner = curve.offsets[curve.judged]
     if not float(inner[0]) - 1e-9 <= float(shifts[0]) <= float(inner[-1]) + 1e-9:

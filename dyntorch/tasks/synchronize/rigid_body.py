@@ -17,7 +17,7 @@ from dyntorch.geometry.triangulation import resect, triangulate
 from dyntorch.numerics.least_squares import LeastSquaresOptions
 from dyntorch.numerics.subspaces import affine_factorization, metric_upgrade
 from dyntorch.tasks.reconstruct.factorization import projective_factorization
-from dyntorch.tasks.synchronize.options import ProjectiveOptions
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import ShiftNotice
 from dyntorch.tasks.synchronize.tracks import Tracks
 
@@ -52,16 +52,25 @@ class BodyMotion:
         return float(least * self.body.calibrations[0, 0, 0, 0] / depth.median()) * self.scale
 
 
-def body_motion(name: str, tracks: Tracks, options: ProjectiveOptions) -> BodyMotion | Notice:
+MIN_POINTS = 6  # Points on the body: fewer leave projective depths undecided.
+MIN_VISIBLE_SHARE = 0.5  # Share of the frames in which a point must be visible.
+MIN_RELATIVE_NOISE = 1e-6  # Floor of the noise over the RMS coordinate: rounding.
+MIN_THICKNESS_RATIO = 3.0  # Thickness of the body in the image, over the noise, below which it is planar.
+MIN_TURN_RATIO = 5.0  # RMS angle over the noise at the distance of the points below which the body does not turn.
+
+
+def body_motion(name: str, tracks: Tracks, options: SynchronizeOptions | None = None) -> BodyMotion | Notice:
     r"""The motion of a rigid body before one camera, up to a similarity. tracks ``(frames, n, 2)``."""
     seen = tracks.weights > 0
-    often = seen.double().mean(0) >= options.seen
-    if int(often.sum()) < options.fewest_points:
-        values = {"which": name, "needed": options.fewest_points}
+    often = seen.double().mean(0) >= MIN_VISIBLE_SHARE
+    if int(often.sum()) < MIN_POINTS:
+        values = {"which": name, "needed": MIN_POINTS}
         return Notice(ShiftNotice.FEW_ON_BODY, float(often.sum()), values)
     centre = tracks.x[seen].mean(0)
     scale = float((tracks.x[seen] - centre).square().mean().sqrt().clamp(min=1e-300))
-    take = _Take(torch.where(seen[..., None], (tracks.x - centre) / scale, 0.0), seen, tracks.noise / scale, options)
+    take = _Take(
+        torch.where(seen[..., None], (tracks.x - centre) / scale, 0.0), seen, tracks.noise / scale, options or SynchronizeOptions()
+    )
     found = take.fitted(often)
     if found is None or not found.agrees(often):
         found = take.without_strangers(often) or found
@@ -70,10 +79,10 @@ def body_motion(name: str, tracks: Tracks, options: ProjectiveOptions) -> BodyMo
     motion = _measured(take, found, centre, scale)
     if not found.agrees(found.points):
         return Notice(ShiftNotice.NO_BODY, motion.residual, {"which": name, "noise": tracks.noise})
-    noise = max(motion.residual, options.exact * scale)
-    if motion.thickness < options.thick * noise:
+    noise = max(motion.residual, MIN_RELATIVE_NOISE * scale)
+    if motion.thickness < MIN_THICKNESS_RATIO * noise:
         return Notice(ShiftNotice.FLAT_BODY, motion.thickness, {"which": name, "noise": noise})
-    if motion.turned < options.turned * noise / _extent(motion):
+    if motion.turned < MIN_TURN_RATIO * noise / _extent(motion):
         return Notice(ShiftNotice.NO_TURN, motion.turned, {"which": name})
     return motion
 
@@ -116,6 +125,15 @@ class _Fit:
         return bool((self.residuals[points] <= self.limit).all())
 
 
+MIN_POINTS_PER_FRAME = 4  # Points that place a known body in a frame.
+MIN_FRAMES = 10  # Frames with enough points.
+MAX_ITERATIONS = 60  # Steps of the adjustment of all frames.
+NUM_TRIANGULATION_STEPS = 3  # Gauss-Newton steps that place a point on a body of known motion.
+MAX_MISFIT_RATIO = 3.0  # RMS of a point about the body, over its noise, beyond which it is not on it.
+MAX_SUBSETS = 100  # Subsets of points that are ranked where some are not on the body.
+MAX_FITTED_SUBSETS = 8  # Of them those that are fitted.
+
+
 @dataclass(frozen=True, eq=False)
 class _Take:
     """Normalized tracks ``(frames, n, 2)``, which are seen ``(frames, n)``, and their noise."""
@@ -123,7 +141,7 @@ class _Take:
     x: Tensor
     seen: Tensor
     noise: float
-    options: ProjectiveOptions
+    options: SynchronizeOptions
 
     def problem(self, points: Tensor, frames: Tensor) -> BodyProblem:
         """All frames that count, of these points."""
@@ -133,7 +151,7 @@ class _Take:
     def fitted(self, points: Tensor) -> _Fit | None:
         """The body that these points ``(n,)`` bool are on, if there is one."""
         chosen, frames = self._start(points)
-        if len(frames) < self.options.fewest_frames:
+        if len(frames) < MIN_FRAMES:
             return None
         body = started(self.x[frames][:, chosen], self.options)
         if body is None:
@@ -144,13 +162,13 @@ class _Take:
     def _start(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Points and frames that see all of them, some, spread evenly: the points seen least are left out where they have to be."""
         count = torch.where(points, self.seen.sum(0), -1)
-        for left in range(int(points.sum()), self.options.fewest_points - 1, -1):
+        for left in range(int(points.sum()), MIN_POINTS - 1, -1):
             chosen = torch.zeros_like(points)
             chosen[count.argsort(descending=True, stable=True)[:left]] = True
             whole = self.seen[:, chosen].all(-1).nonzero()[:, 0]
-            if len(whole) >= self.options.fewest_frames:
+            if len(whole) >= MIN_FRAMES:
                 break
-        views = min(len(whole), self.options.views)
+        views = min(len(whole), self.options.num_views)
         return chosen, whole[torch.linspace(0, max(len(whole) - 1, 0), views).round().long()]
 
     def _posed(self, body: FilmedBody, chosen: Tensor, frames: Tensor) -> tuple[FilmedBody, Tensor] | None:
@@ -169,15 +187,15 @@ class _Take:
         images, depth = whole.images(_camera(x.shape[1], x))
         square = torch.where(seen, (images - x).square().sum(-1), 0.0).sum(-1)
         square = torch.where(((depth > 0) | ~seen).all(-1) & square.isfinite(), square, torch.inf)
-        usable = square.amin(0).isfinite() & (seen.sum(-1) >= self.options.fewest_in_frame)
-        if int(usable.sum()) < self.options.fewest_frames:
+        usable = square.amin(0).isfinite() & (seen.sum(-1) >= MIN_POINTS_PER_FRAME)
+        if int(usable.sum()) < MIN_FRAMES:
             return None
         best = torch.where((square[0] <= square[1])[:, None, None], both[0], both[1])
         return body._replace(motions=best[None]), usable
 
     def _adjusted(self, body: FilmedBody, usable: Tensor, points: Tensor, chosen: Tensor) -> _Fit | None:
         """All frames, then all points together; the others are placed on the body that they are compared with."""
-        options = LeastSquaresOptions(iterations=self.options.iterations, tolerance=1e-9)
+        options = LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9)
         body, cost = fit_body(self.problem(chosen, usable), body, options)
         if not bool(cost.isfinite().all()):
             return None
@@ -197,20 +215,20 @@ class _Take:
         rows = 2 * int(counted[:, points].sum())
         spare = rows - 6 * int(usable.sum()) - 3 * int(points.sum()) + 2
         rms = (square[:, points].sum() / max(spare, 1)).sqrt()
-        limit = max(self.options.misfit * self.noise, self.options.exact)
+        limit = max(MAX_MISFIT_RATIO * self.noise, MIN_RELATIVE_NOISE)
         return _Fit(body, points, usable, residuals.nan_to_num(nan=math.inf), rms, limit)
 
     def _placed(self, body: FilmedBody, usable: Tensor) -> Tensor:
         """All points ``(n, 3)`` on a body whose motion is known."""
         projections = body.calibrations[0] @ body.motions[0]
-        found = triangulate(projections, self.x, (self.seen & usable[:, None]).to(self.x), steps=self.options.placing_steps)
+        found = triangulate(projections, self.x, (self.seen & usable[:, None]).to(self.x), steps=NUM_TRIANGULATION_STEPS)
         return found[:, :3] / torch.where(found[:, 3:].abs() > 1e-12, found[:, 3:], 1e-12)
 
     def without_strangers(self, often: Tensor) -> _Fit | None:
         """The body of the most points: subsets of six that move most like affine views of one body are tried first."""
         index = often.nonzero()[:, 0].tolist()
         whole = self.seen[:, often].all(-1)
-        if len(index) <= self.options.fewest_points or int(whole.sum()) < self.options.fewest_frames:
+        if len(index) <= MIN_POINTS or int(whole.sum()) < MIN_FRAMES:
             return None
         sets = self._subsets(index)
         left = affine_factorization(torch.stack([self.x[whole][:, part] for part in sets]))
@@ -218,7 +236,7 @@ class _Take:
             [(self.x[whole][:, part] - self.x[whole][:, part].mean(1, keepdim=True)).square().sum() for part in sets]
         )
         best: _Fit | None = None
-        for i in (left[2] * energy).argsort(stable=True)[: self.options.tried].tolist():
+        for i in (left[2] * energy).argsort(stable=True)[:MAX_FITTED_SUBSETS].tolist():
             found = self.fitted(torch.zeros_like(often).index_fill(0, sets[i], True))
             if found is None or not found.agrees(found.points):
                 continue
@@ -231,15 +249,13 @@ class _Take:
         return best
 
     def _subsets(self, index: list[int]) -> list[Tensor]:
-        size = self.options.fewest_points
-        if math.comb(len(index), size) <= self.options.subsets:
+        size = MIN_POINTS
+        if math.comb(len(index), size) <= MAX_SUBSETS:
             parts = [list(part) for part in combinations(index, size)]
         else:
             # a generator of its own: the same tracks get the same answer
             generator = torch.Generator().manual_seed(0)
-            draws = (
-                torch.randperm(len(index), generator=generator)[:size].sort().values.tolist() for _ in range(self.options.subsets)
-            )
+            draws = (torch.randperm(len(index), generator=generator)[:size].sort().values.tolist() for _ in range(MAX_SUBSETS))
             parts = [[index[i] for i in part] for part in draws]
         return [torch.tensor(part, device=self.x.device) for part in parts]
 
@@ -255,15 +271,20 @@ def _camera(n: int, like: Tensor) -> Tensor:
 # A body from a few frames that see all of its points.
 
 
-def started(x: Tensor, options: ProjectiveOptions) -> FilmedBody | None:
+NUM_FIRST_ITERATIONS = 10  # Steps from each start.
+NUM_CONTINUED_STARTS = 3  # Starts that are continued.
+NUM_START_ITERATIONS = 50  # Further steps of these.
+
+
+def started(x: Tensor, options: SynchronizeOptions) -> FilmedBody | None:
     """The best body ``(1, ...)`` of tracks ``(views, n, 2)`` of order 1, without outliers; None where nothing descends."""
-    focal = torch.tensor(options.focals, dtype=x.dtype, device=x.device)
+    focal = torch.tensor(options.focal_lengths, dtype=x.dtype, device=x.device)
     starts = [*_projective(x, focal), *_affine(x, focal)]
     body = FilmedBody(*(torch.cat(parts) for parts in zip(*starts, strict=True)))
     count = len(body.points)
     weights = torch.ones(count, *x.shape[:2], dtype=x.dtype, device=x.device)
     problem = BodyProblem(x.expand(count, *x.shape), weights, _camera(x.shape[1], x))
-    for steps, kept in ((options.first_iterations, options.kept), (options.start_iterations, 1)):
+    for steps, kept in ((NUM_FIRST_ITERATIONS, NUM_CONTINUED_STARTS), (NUM_START_ITERATIONS, 1)):
         body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=steps, tolerance=1e-6))
         best = cost.argsort(stable=True)[:kept]
         body, problem = FilmedBody(*(part[best] for part in body)), problem.subset(best)

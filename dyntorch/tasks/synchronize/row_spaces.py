@@ -29,8 +29,16 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics.lags import compress, lag_covariances
-from dyntorch.tasks.synchronize.options import RowSpaceOptions, SynchronizeOptions
-from dyntorch.tasks.synchronize.subspace import completed, filled, smooth
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.subspace import (
+    MIN_OVERLAP_SECONDS,
+    MIN_OVERLAP_SHARE,
+    NOISE_FACTOR,
+    SIZE_KERNEL_SECONDS,
+    completed,
+    filled,
+    smooth,
+)
 from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
 
 Kind = Literal["affine", "affine_moving", "perspective"]
@@ -74,12 +82,15 @@ class LagCovariances:
         return torch.cat([torch.cat([self.aa, self.ab], dim=-1), torch.cat([self.ab.mT, self.bb], dim=-1)], dim=-2)
 
 
-def shared(moments: LagCovariances, judged: Tensor, measure: Measure, above: float = RowSpaceOptions().above) -> Tensor:
+MIN_SIGNAL_VARIANCE = 4.0  # Variance over the noise from which a direction belongs to a row space.
+
+
+def shared(moments: LagCovariances, judged: Tensor, measure: Measure) -> Tensor:
     r"""How much the rows share at every lag ``(L,)``, more is better; in units of noise of variance 1."""
     if measure == "rank":
-        return _beyond_rank(moments, judged, above)
+        return _beyond_rank(moments, judged)
     if measure == "principal_angles":
-        return _angles(moments, judged, above)
+        return _angles(moments, judged)
     if measure not in MEASURES:
         raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
     return 0.5 * (_log_determinant(moments.aa) + _log_determinant(moments.bb) - _log_determinant(moments.joint))
@@ -90,26 +101,31 @@ def _log_determinant(c: Tensor) -> Tensor:
     return 2 * low.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-def _beyond_rank(moments: LagCovariances, judged: Tensor, above: float) -> Tensor:
+def _beyond_rank(moments: LagCovariances, judged: Tensor) -> Tensor:
     """Less of what the least rank at any lag leaves is better."""
     values = torch.linalg.eigvalsh(moments.joint).clamp(min=0.0).flip(-1)
-    ranks = (values > above).sum(-1)
+    ranks = (values > MIN_SIGNAL_VARIANCE).sum(-1)
     rank = int(ranks[judged].min()) if bool(judged.any()) else 0
     rest = values[:, rank:].sum(-1) if rank < values.shape[1] else values.new_zeros(len(values))
     return -0.5 * (rest + 1).log()
 
 
-def _angles(moments: LagCovariances, judged: Tensor, above: float) -> Tensor:
+def _angles(moments: LagCovariances, judged: Tensor) -> Tensor:
     """Sum of squared cosines between the spaces of most motion, of as many dimensions as rise above the noise."""
-    one, two = (_basis(c, judged, above) for c in (moments.aa, moments.bb))
+    one, two = (_basis(c, judged) for c in (moments.aa, moments.bb))
     return (one.mT @ moments.ab @ two).square().sum((-2, -1))
 
 
-def _basis(c: Tensor, judged: Tensor, above: float) -> Tensor:
+def _basis(c: Tensor, judged: Tensor) -> Tensor:
     """``(L, p, k)`` combinations of rows that are orthonormal over time."""
     values, vectors = torch.linalg.eigh(c)
-    rank = int((values[judged] > above).sum(-1).max()) if bool(judged.any()) else 0
+    rank = int((values[judged] > MIN_SIGNAL_VARIANCE).sum(-1).max()) if bool(judged.any()) else 0
     return vectors[..., c.shape[-1] - rank :] * values[..., None, c.shape[-1] - rank :].clamp(min=1e-12).rsqrt()
+
+
+KERNEL_FRAMES = 1.0  # Kernel in frames of the slower camera: below 1 the noise would depend on the place between frames.
+EDGE_SIGMAS = 3.0  # Kernel widths left out at either end, where the kernel is one-sided.
+MIN_RELATIVE_NOISE = 1e-6  # Floor of the noise over the RMS distance of the points: rounding.
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +146,12 @@ class Films:
     @property
     def width(self) -> float:
         """Standard deviation of the kernel, seconds: from one frame on noise is alike at all moments."""
-        return self.options.rows.width * max(self.step, self.a.step, self.b.step)
+        return KERNEL_FRAMES * max(self.step, self.a.step, self.b.step)
 
     @cached_property
     def times(self) -> tuple[Tensor, Tensor]:
         """Of a's frames and of b's, on their clocks, ends left out: there the kernel is one-sided."""
-        edge = math.ceil(self.options.rows.edge * self.width / self.step)
+        edge = math.ceil(EDGE_SIGMAS * self.width / self.step)
         ta, tb = self.a.every(self.step), self.b.every(self.step * self.rate)
         return ta[edge : len(ta) - edge], tb[edge : len(tb) - edge - 1]
 
@@ -149,13 +165,13 @@ class Films:
         return self._points(self.b, self.times[1] + fraction * self.step * self.rate, self.width * self.rate)
 
     def _points(self, tracks: Tracks, times: Tensor, width: float) -> Tensor:
-        x, _, weights = smoothed(tracks, times, width, self.options)
+        x, _, weights = smoothed(tracks, times, width)
         seen = weights > 0
-        return completed(filled(x, seen, self.options), seen, self.options)
+        return completed(filled(x, seen), seen)
 
     def variance(self, tracks: Tracks, width: float) -> float:
         """Of a coordinate's noise after the kernel."""
-        least = self.options.rows.exact * tracks.scale
+        least = MIN_RELATIVE_NOISE * tracks.scale
         return max(tracks.noise, least, 1e-150) ** 2 * min(1.0, tracks.step / (2 * math.sqrt(math.pi) * width))
 
     def variances(self, energies: tuple[float, float]) -> tuple[float, float]:
@@ -177,7 +193,7 @@ class Films:
         whole = []
         for tracks in (self.a, self.b):
             seen = tracks.weights > 0
-            x = completed(filled(tracks.x, seen, self.options), seen, self.options)
+            x = completed(filled(tracks.x, seen), seen)
             whole.append(replace(tracks, x=x, weights=torch.ones_like(tracks.weights)))
         return replace(self, a=whole[0], b=whole[1])
 
@@ -243,6 +259,9 @@ class Hypothesis:
         return min(m for m, _ in found), min(c for _, c in found)
 
 
+MIN_PEAK_SEPARATION_SECONDS = 0.2  # Within this peaks are one.
+
+
 @dataclass(frozen=True, eq=False)
 class KindMoments:
     """Covariances of both cameras' rows as one kind of camera needs them, at all lags and with b played backwards."""
@@ -259,18 +278,17 @@ class KindMoments:
     @staticmethod
     def of(films: Films, kind: Kind, second: list[Tensor], lags: tuple[int, int]) -> KindMoments:
         """Of b's points at fractions of frames."""
-        options = films.options.rows
-        slow = films.options.subspace.size_width / films.step
+        slow = SIZE_KERNEL_SECONDS / films.step
         a, bs = rows_of(films.first, kind, slow), [rows_of(part, kind, slow) for part in second]
         energies = float(a.square().mean()), float(bs[0].square().mean())
         if films.spatial:
-            a = compress(a, noise=math.sqrt(films.variances(energies)[0] * options.noise))
+            a = compress(a, noise=math.sqrt(films.variances(energies)[0] * NOISE_FACTOR))
         parts = [LagCovariances.of(a, b, lags) for b in bs]
         moments = LagCovariances(
             *(torch.stack([getattr(part, name) for part in parts], dim=1).flatten(0, 1) for name in ("aa", "bb", "ab", "counts"))
         )
         chance = LagCovariances.of(a, bs[0].flip(0), lags)
-        least = max(options.least_overlap * min(len(a), len(bs[0])), options.least_seconds / films.step)
+        least = max(MIN_OVERLAP_SHARE * min(len(a), len(bs[0])), MIN_OVERLAP_SECONDS / films.step)
         places = torch.arange(lags[0], lags[1] + 1, dtype=a.dtype, device=a.device)[:, None]
         places = (places + torch.arange(len(bs), dtype=a.dtype, device=a.device) / len(bs)).flatten()
         within = places <= lags[1]  # fractions after the last lag are beyond the search
@@ -291,33 +309,39 @@ class KindMoments:
 
     def hypothesis(self, level: float) -> Hypothesis | None:
         """What all lags share at a level of noise; None without motion."""
-        options, measure = self.films.options.rows, self.films.options.different.measure
+        measure = self.films.options.measure
         first, second = (
-            v * options.noise + level**2 * energy
+            v * NOISE_FACTOR + level**2 * energy
             for v, energy in zip(self.films.variances(self.energies), self.energies, strict=True)
         )
         if not (0 < first < math.inf and 0 < second < math.inf and min(self.energies) > 0):
             return None
-        scores = shared(self.moments.scaled((first, second)), self.judged, measure, options.above)
+        scores = shared(self.moments.scaled((first, second)), self.judged, measure)
         if bool(self.ruled.any()):
-            chance = shared(self.chance.scaled((first, second)), self.ruled, measure, options.above).nan_to_num(0.0)
+            chance = shared(self.chance.scaled((first, second)), self.ruled, measure).nan_to_num(0.0)
             scores = scores - _line(chance, self.chance.counts, self.moments.counts, self.ruled)
         scores = torch.where(self.judged, scores, torch.nan)
-        apart = options.apart / self.films.step
+        apart = MIN_PEAK_SEPARATION_SECONDS / self.films.step
         return Hypothesis(self.kind, level, self.lags, scores, self.moments.counts, self.films.samples, apart)
+
+
+NUM_FRACTIONS = 2  # Places within a frame at which lags are scored.
 
 
 def kind_moments(films: Films, lags: tuple[int, int]) -> list[KindMoments]:
     """Of every kind of camera that the options allow."""
-    fractions = films.options.rows.fractions
-    asked = films.options.different.camera
+    fractions = NUM_FRACTIONS
+    asked = films.options.camera_model
     second = [films.second(k / fractions) for k in range(fractions)]
     return [KindMoments.of(films, kind, second, lags) for kind in KINDS if asked in ("auto", kind)]
 
 
+MODEL_ERRORS = (0.0, 0.03)  # What a kind of camera leaves unexplained, as shares of the RMS coordinate.
+
+
 def hypotheses(kinds: list[KindMoments]) -> list[Hypothesis]:
     """One of every kind of camera and level of noise, by the measure of the options."""
-    found = [one.hypothesis(level) for one in kinds for level in one.films.options.rows.levels]
+    found = [one.hypothesis(level) for one in kinds for level in MODEL_ERRORS]
     return [one for one in found if one is not None and bool(one.scores.isfinite().any())]
 
 
@@ -345,27 +369,34 @@ class Place:
     zoom: Tensor | None = None  # ``(T,)`` logarithm of a's zoom over b's in a's frames; None where a common one explains as much
 
 
+NUM_ZOOM_TERMS = 8  # Chebyshev polynomials in time of the log ratio of both cameras' zooms.
+NUM_ZOOM_ALTERNATIONS = 3  # Alternations of zoom and lag.
+
+
 def refined(films: Films, found: Hypothesis) -> Place:
     """Lag of most information near a hypothesis's best; of cameras that may zoom, with the ratio of their zooms."""
     start = float(found.lags[found.best])
     plain = _climbed(_Between(films, found.kind, found.level, around=start), start)
-    if found.kind == "affine" or films.options.different.measure not in ("auto", "log_determinant"):
+    if found.kind == "affine" or films.options.measure not in ("auto", "log_determinant"):
         return plain
     place = plain
-    rounds = films.options.rows.zoom_rounds
-    for level in [max(films.options.rows.levels)] + [found.level] * (rounds - 1):  # a wide optimum first
+    rounds = NUM_ZOOM_ALTERNATIONS
+    for level in [max(MODEL_ERRORS)] + [found.level] * (rounds - 1):  # a wide optimum first
         between = _Between(films, "affine_moving", level, place.zoom, around=start)
         place = _climbed(replace(between, zoom=between.freed(place.lag)), place.lag)
     # a function of time is fitted with so many numbers, each worth half the logarithm of the samples
-    price = 0.5 * films.options.rows.zoom_terms * math.log(max(len(films.first) * films.samples, 2.0))
+    price = 0.5 * NUM_ZOOM_TERMS * math.log(max(len(films.first) * films.samples, 2.0))
     return replace(place, nats=place.nats - price) if place.nats > plain.nats + price else plain
+
+
+MIN_SEARCH_STEP_FRAMES = 1 / 2048  # Step that ends the search between frames.
+CURVATURE_STEP_FRAMES = 0.125  # Step of the second difference of the score.
 
 
 def _climbed(score: _Between, place: float) -> Place:
     """The highest place near this one."""
-    options = score.films.options.rows
-    top, reach = score(place), 1.0 / options.fractions
-    while reach > options.finest:
+    top, reach = score(place), 1.0 / NUM_FRACTIONS
+    while reach > MIN_SEARCH_STEP_FRAMES:
         for other in (place - reach, place + reach):
             value = score(other)
             if value > top:
@@ -373,8 +404,12 @@ def _climbed(score: _Between, place: float) -> Place:
                 break
         else:
             reach /= 2
-    bend = (2 * top - score(place - options.bend) - score(place + options.bend)) / options.bend**2
+    bend = (2 * top - score(place - CURVATURE_STEP_FRAMES) - score(place + CURVATURE_STEP_FRAMES)) / CURVATURE_STEP_FRAMES**2
     return Place(place, 1 / math.sqrt(bend) if bend > 0 else math.inf, top, score.zoom)
+
+
+NUM_ZOOM_STEPS = 12  # Steps of least squares for it.
+MIN_UNSHARED_VARIANCE = 1e-6  # Floor of the share of a direction that is not common: rounding.
 
 
 @dataclass(frozen=True)
@@ -397,13 +432,13 @@ class _Between:
         c, p = (both.mT @ both / len(both))[None], a.shape[1]
         count = both.new_full((1,), len(both))
         moments = LagCovariances(c[:, :p, :p], c[:, p:, p:], c[:, :p, p:], count)
-        value = shared(moments, count > 0, self.films.options.different.measure, self.films.options.rows.above)
+        value = shared(moments, count > 0, self.films.options.measure)
         return float(value[0] * count[0]) * self.films.samples
 
     def rows(self, lag: float) -> tuple[Tensor, Tensor]:
         """Both cameras' rows in the overlap, in units of noise; of cameras with a zoom about no mean over time."""
         films, whole = self.films, math.floor(lag)
-        slow = films.options.subspace.size_width / films.step
+        slow = SIZE_KERNEL_SECONDS / films.step
         first, second = films.first, films.second(lag - whole)
         if self.zoom is None:
             a, b = rows_of(first, self.kind, slow), rows_of(second, self.kind, slow)
@@ -412,7 +447,7 @@ class _Between:
             b = (second - second.mean(1, keepdim=True)).flatten(1)
         spreads = [float((x - x.mean(0)).square().mean()) for x in (a, b)]
         units = [
-            math.sqrt(variance * films.options.rows.noise + self.level**2 * spread)
+            math.sqrt(variance * NOISE_FACTOR + self.level**2 * spread)
             for variance, spread in zip(films.variances((spreads[0], spreads[1])), spreads, strict=True)
         ]
         start, end = self.span(len(a), len(b), whole)
@@ -425,18 +460,17 @@ class _Between:
 
     def freed(self, lag: float) -> Tensor:
         r"""The ratio of the zooms that makes the row spaces meet best, by steps of least squares."""
-        options = self.films.options.rows
         frames = len(self.films.first)
         zoom = self.films.first.new_zeros(frames) if self.zoom is None else self.zoom
         time = (torch.arange(frames, dtype=zoom.dtype, device=zoom.device) + 0.5) / frames
-        order = torch.arange(1, options.zoom_terms + 1, dtype=zoom.dtype, device=zoom.device)
+        order = torch.arange(1, NUM_ZOOM_TERMS + 1, dtype=zoom.dtype, device=zoom.device)
         basis = torch.cos(torch.acos(2 * time - 1)[:, None] * order)  # Chebyshev polynomials
         start, _ = self.span(frames, len(self.films.times[1]), math.floor(lag))
-        for _ in range(options.zoom_steps):
+        for _ in range(NUM_ZOOM_STEPS):
             a, b = replace(self, zoom=zoom).rows(lag)
             u, v, rho = _canonical(a, b)
             here = basis[start : start + len(a)]
-            weight = rho / (1 - rho.square()).clamp(min=options.zoom_least).sqrt()
+            weight = rho / (1 - rho.square()).clamp(min=MIN_UNSHARED_VARIANCE).sqrt()
             design = (u * weight)[:, None, :] * here[:, :, None]  # (T, terms, pairs)
             rest = (u - v * rho) * weight
             normal = torch.einsum("tik,tjk->ij", design, design)

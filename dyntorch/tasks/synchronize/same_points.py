@@ -11,11 +11,28 @@ from torch import Generator, Tensor
 
 from dyntorch.core.outcome import Notice, status_from
 from dyntorch.geometry.lens import fit_distortion
-from dyntorch.tasks.synchronize.epipolar import EPIPOLAR, Curve, EpipolarFit, PairModel, ShiftDescent, epipolar_curve
-from dyntorch.tasks.synchronize.evidence import Attempt, consistent_points
+from dyntorch.tasks.synchronize.epipolar import (
+    EPIPOLAR,
+    MIN_PEAK_SEPARATION_FRAMES,
+    Curve,
+    EpipolarFit,
+    PairModel,
+    ShiftDescent,
+    epipolar_curve,
+)
+from dyntorch.tasks.synchronize.evidence import NUM_PEAKS, Attempt, consistent_points
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
-from dyntorch.tasks.synchronize.tracks import Tracks, frame_scaled, smoothed, without
+from dyntorch.tasks.synchronize.tracks import (
+    MAX_FRAME_RATE_ERROR,
+    MAX_RATE_DEVIATION,
+    MIN_SECONDS_FOR_RATE,
+    RATE_SIGNIFICANCE_SIGMAS,
+    Tracks,
+    frame_scaled,
+    smoothed,
+    without,
+)
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The search for the best shift of corresponding points: all lags at some clock rates, then descents from the best of them.
@@ -25,52 +42,57 @@ from dyntorch.tasks.synchronize.tracks import Tracks, frame_scaled, smoothed, wi
 class ShiftSearch:
     """How to search."""
 
+    options: SynchronizeOptions
     step: float = 0.0  # seconds per lag; the slower camera's frame at least
     max_shift: float | None = None  # seconds, None for all shifts with some overlap
     rates: tuple[float, ...] = (1.0,)  # of b's clock, to search at
     free_rate: bool = True  # whether the descent may change the rate
     method: str = "epipolar"  # ``"epipolar"``, ``"camera"`` or ``"affine"``: what the tracks were made for
     model: PairModel = EPIPOLAR  # what is compared
+    generator: Generator | None = None  # of the subsets of points
 
 
-def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None, *, options: SynchronizeOptions) -> Attempt:
+def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None) -> Attempt:
     """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate. points ``(n,)``."""
     points = torch.ones(a.x.shape[1], dtype=torch.bool, device=a.x.device) if points is None else points
     a, b = (a, b) if bool(points.all()) else (a.only(points), b.only(points))
     step = max(a.step, b.step, search.step)
     searched = [
-        (samples, epipolar_curve(samples, search.max_shift, options=options))
-        for samples in (search.model.samples.of(a, b, step, r, options=options) for r in search.rates)
+        (samples, epipolar_curve(samples, search.max_shift))
+        for samples in (search.model.samples.of(a, b, step, r) for r in search.rates)
     ]
-    fit = _best(a, b, [curve for _, curve in searched], step, search, options)
+    fit = _best(a, b, [curve for _, curve in searched], step, search)
     samples, curve = min(searched, key=lambda found: abs(found[0].rate - (fit.rate if fit else 1.0)))
     if fit is not None and abs(fit.rate - samples.rate) * (float(a.times[-1]) - float(a.times[0])) > 0.25 * step:
-        samples = search.model.samples.of(a, b, step, fit.rate, options=options)
-        curve = epipolar_curve(samples, search.max_shift, options=options)
-    return Attempt(a, b, fit, curve, samples, step, search.max_shift, points, search.method, options=options, model=search.model)
+        samples = search.model.samples.of(a, b, step, fit.rate)
+        curve = epipolar_curve(samples, search.max_shift)
+    return Attempt(
+        a, b, fit, curve, samples, step, search.max_shift, points, search.method, search.options.min_margin, model=search.model
+    )
 
 
-def _best(
-    a: Tracks, b: Tracks, curves: list[Curve], step: float, search: ShiftSearch, options: SynchronizeOptions
-) -> EpipolarFit | None:
+CLEAR_PEAK_MARGIN = 0.6  # Nats above the next peak from which that one needs no descent of its own.
+
+
+def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, search: ShiftSearch) -> EpipolarFit | None:
     """The likeliest minimum near the peaks of the curves."""
     free_rate = search.free_rate
     frame = max(a.step, b.step)
     starts = sorted(
-        ((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(options.evidence.peaks)),
+        ((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(NUM_PEAKS)),
         reverse=True,
     )
     if not starts:
         return None
-    apart = max(options.evidence.apart * frame, 1.5 * step)
+    apart = max(MIN_PEAK_SEPARATION_FRAMES * frame, 1.5 * step)
     rivals = [start for start in starts if abs(start[1] - starts[0][1]) > apart or start[2] != starts[0][2]]
-    several = len(curves) > 1 or not rivals or starts[0][0] - rivals[0][0] < options.search.clear
+    several = len(curves) > 1 or not rivals or starts[0][0] - rivals[0][0] < CLEAR_PEAK_MARGIN
     widths = [step]
     while widths[-1] > frame:
         widths.append(max(frame, widths[-1] / 3))
-    descent = search.model.descent(a, b, step, options=options)
+    descent = search.model.descent(a, b, step)
     found = []
-    for score, offset, rate in starts[: options.evidence.peaks if several else 1]:
+    for score, offset, rate in starts[: NUM_PEAKS if several else 1]:
         fit = descent.run(offset, rate, free_rate=free_rate and step > frame)
         if fit is not None:
             # the curve's variance counts everything, the fit's robust residual nothing that is far: both have a say
@@ -79,18 +101,21 @@ def _best(
         return None
     best = max(found, key=lambda pair: pair[0])[1]
     for width in widths[1:]:
-        descent = search.model.descent(a, b, width, options=options)
+        descent = search.model.descent(a, b, width)
         best = descent.run(best.offset, best.rate, free_rate=free_rate) or best
-    long = float(best.times[-1] - best.times[0]) > options.search.drifting
-    return _settled(descent, best, options) if free_rate and long else best
+    long = float(best.times[-1] - best.times[0]) > MIN_SECONDS_FOR_RATE
+    return _settled(descent, best) if free_rate and long else best
 
 
-def _settled(descent: ShiftDescent, fit: EpipolarFit, options: SynchronizeOptions) -> EpipolarFit:
+MIN_RATE_EFFECT_FRAMES = 0.1  # Frames over the take that a rate must amount to.
+
+
+def _settled(descent: ShiftDescent, fit: EpipolarFit) -> EpipolarFit:
     """With its own rate where that differs from 1 beyond doubt, else with rate 1."""
     free = descent.run(fit.offset, fit.rate, free_rate=True)
     span = float(fit.times[-1] - fit.times[0])
-    if free is not None and options.search.largest_drift > abs(free.rate - 1) > max(
-        options.search.significant * free.rate_sigma, options.search.negligible * descent.frame / span
+    if free is not None and MAX_RATE_DEVIATION > abs(free.rate - 1) > max(
+        RATE_SIGNIFICANCE_SIGMAS * free.rate_sigma, MIN_RATE_EFFECT_FRAMES * descent.frame / span
     ):
         return free
     fixed = descent.run(fit.shift, 1.0) if fit.rate != 1 else fit
@@ -110,6 +135,10 @@ class Result:
     seen: Tensor  # ``(n,)`` bool, points that both cameras show at all
 
 
+MAX_STEPS = 4_000  # Steps of a take; longer takes are searched in coarser steps.
+MIN_ROUGHNESS_FOR_LENSES = 1.25  # Residual over the noise from which lenses are fitted.
+
+
 def search_same_points(
     a: Tracks,
     b: Tracks,
@@ -125,60 +154,66 @@ def search_same_points(
     """The shift of cameras that see the same points, or of a camera and the same points in space."""
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
     search = ShiftSearch(
-        step=span / options.search.most_steps, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None,
+        step=span / MAX_STEPS, max_shift=max_shift, rates=(rate or 1.0,), free_rate=rate is None,
         method=model.method, model=model,
+        options=options, generator=generator,
     )  # fmt: skip
     seen = (a.weights > 0).any(0) & (b.weights > 0).any(0)
     if a.still or b.still:
-        return Result(dataclasses.replace(attempt(a, b, search, options=options), fit=None), (), seen)
+        return Result(dataclasses.replace(attempt(a, b, search), fit=None), (), seen)
     if camera == "affine":
-        return Result(_affine(a, b, search, generator, options), (), seen)
-    found = _sorted_out(a, b, search, generator, options)
+        return Result(_affine(a, b, search), (), seen)
+    found = _sorted_out(a, b, search)
     if not found.decided and rate is None:
-        found = _better(found, _over_rates(a, b, search, span, generator, options))
+        found = _better(found, _over_rates(a, b, search, span))
     known: tuple[Notice, ...] = ()
-    if lenses and found.fit is not None and found.roughness > options.search.rough:
-        found, known = _straightened(found, a, b, search, generator, options)
+    if lenses and found.fit is not None and found.roughness > MIN_ROUGHNESS_FOR_LENSES:
+        found, known = _straightened(found, a, b, search)
     if camera == "auto" and model is EPIPOLAR and not found.decided:
-        scaled = _affine(a, b, search, generator, options)
+        scaled = _affine(a, b, search)
         # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
-        if scaled.decided and _agree(scaled, found, options):
+        if scaled.decided and _agree(scaled, found):
             return Result(scaled, (Notice(ShiftNotice.AFFINE),), seen)
     return Result(found, known if found.decided else (), seen)
 
 
-def _sorted_out(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions) -> Attempt:
+def _sorted_out(a: Tracks, b: Tracks, search: ShiftSearch) -> Attempt:
     """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
-    found = attempt(a, b, search, options=options)
-    pruned = _pruned(found, options)
+    found = attempt(a, b, search)
+    pruned = _pruned(found)
     if pruned is not None:
         a, b = pruned
-        found = _better(found, dataclasses.replace(attempt(a, b, search, options=options), pruned=True))
-    if found.decided and not bool(_suspects(found, options).any()):
+        found = _better(found, dataclasses.replace(attempt(a, b, search), pruned=True))
+    if found.decided and not bool(_suspects(found).any()):
         return found
-    points = consistent_points(a, b, found, generator, options)
+    points = consistent_points(a, b, found, search.generator) if search.options.reject_points else None
     if points is None or bool(points.all()):
         return found
-    return _better(found, dataclasses.replace(attempt(a, b, search, points, options=options), pruned=pruned is not None))
+    return _better(found, dataclasses.replace(attempt(a, b, search, points), pruned=pruned is not None))
 
 
-def _pruned(found: Attempt, options: SynchronizeOptions) -> tuple[Tracks, Tracks] | None:
+OUTLIER_SIGMAS = 6.0  # Robust sigmas from the fit at which a position is an outlier.
+MAX_OUTLIER_SHARE = 0.3  # Share of the positions of a point, or of a stretch of the take, that may be outliers.
+NUM_STRETCHES = 8  # Stretches of the take that are tested for it.
+NEGLIGIBLE_OUTLIER_SHARE = 0.01  # Share of outliers that makes no difference to an accepted fit.
+
+
+def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
     """Tracks without the positions far from the fit, in both cameras: whose is wrong is not known; None where all is well."""
     fit = found.fit
     if fit is None or len(fit.times) != len(found.a.times):
         return None
-    far = fit.distances.abs() > options.search.far
+    far = fit.distances.abs() > OUTLIER_SIGMAS
     seen = fit.distances.isfinite()
     # a point that is mostly elsewhere is another point, and is found as such
-    far = far & (far.sum(0) <= options.search.lost * seen.sum(0))
+    far = far & (far.sum(0) <= MAX_OUTLIER_SHARE * seen.sum(0))
     parts = [
-        (float(one.sum()), float(all_.sum()))
-        for one, all_ in zip(far.chunk(options.search.stretches), seen.chunk(options.search.stretches), strict=True)
+        (float(one.sum()), float(all_.sum())) for one, all_ in zip(far.chunk(NUM_STRETCHES), seen.chunk(NUM_STRETCHES), strict=True)
     ]
-    if found.decided and float(far.double().mean()) < options.search.rare:
+    if found.decided and float(far.double().mean()) < NEGLIGIBLE_OUTLIER_SHARE:
         return None  # the weights of the fit are enough
     # a stretch that does not fit is no outlier: it contradicts
-    if not bool(far.any()) or any(lost > options.search.lost * whole for lost, whole in parts):
+    if not bool(far.any()) or any(lost > MAX_OUTLIER_SHARE * whole for lost, whole in parts):
         return None
     frames, joints = far.nonzero().unbind(1)
     there = fit.times[frames] * fit.rate + fit.offset
@@ -188,26 +223,25 @@ def _pruned(found: Attempt, options: SynchronizeOptions) -> tuple[Tracks, Tracks
     return without(found.a, far), without(found.b, other)
 
 
-def _over_rates(
-    a: Tracks, b: Tracks, search: ShiftSearch, span: float, generator: Generator | None, options: SynchronizeOptions
-) -> Attempt | None:
+MAX_RATE_STEPS = 2_000  # Steps of a take for a search over rates, of a tenth of a second at least.
+
+
+def _over_rates(a: Tracks, b: Tracks, search: ShiftSearch, span: float) -> Attempt | None:
     """A search over clock rates too, where a wrong one would have smeared the motion."""
-    step = max(span / options.search.rate_steps, 0.1)
+    step = max(span / MAX_RATE_STEPS, 0.1)
     change = 2 * step / span  # moves the ends of the overlap by a step
-    count = math.ceil(options.input.frame_rate_error / change)
-    if span < options.search.drifting:
+    count = math.ceil(MAX_FRAME_RATE_ERROR / change)
+    if span < MIN_SECONDS_FOR_RATE:
         return None
     rates = tuple(1 + k * change for k in range(-count, count + 1))
-    coarse = attempt(a, b, dataclasses.replace(search, step=step, rates=rates), options=options)
+    coarse = attempt(a, b, dataclasses.replace(search, step=step, rates=rates))
     if coarse.fit is None:
         return None
-    return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)), generator, options)
+    return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)))
 
 
-def _affine(a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions) -> Attempt:
-    return _sorted_out(
-        frame_scaled(a, options), frame_scaled(b, options), dataclasses.replace(search, method="affine"), generator, options
-    )
+def _affine(a: Tracks, b: Tracks, search: ShiftSearch) -> Attempt:
+    return _sorted_out(frame_scaled(a), frame_scaled(b), dataclasses.replace(search, method="affine"))
 
 
 def _better(one: Attempt, other: Attempt | None) -> Attempt:
@@ -219,28 +253,31 @@ def _better(one: Attempt, other: Attempt | None) -> Attempt:
     return one if one.decided or one.confidence >= other.confidence else other
 
 
-def _agree(one: Attempt, other: Attempt, options: SynchronizeOptions) -> bool:
+def _agree(one: Attempt, other: Attempt) -> bool:
     """Whether the best shifts are the same."""
     return (
-        one.fit is not None and other.fit is not None and abs(one.fit.shift - other.fit.shift) <= options.evidence.apart * one.frame
+        one.fit is not None
+        and other.fit is not None
+        and abs(one.fit.shift - other.fit.shift) <= MIN_PEAK_SEPARATION_FRAMES * one.frame
     )
 
 
-def _suspects(found: Attempt, options: SynchronizeOptions) -> Tensor:
+SUSPECT_RESIDUAL_RATIO = 3.0  # Residual over the usual one beyond which a point is suspected.
+
+
+def _suspects(found: Attempt) -> Tensor:
     """``(n,)`` of the points that took part: whether their residual is out of all proportion."""
     assert found.fit is not None
     own = found.fit.distances.abs().nanmedian(0).values * 1.4826
-    return own.nan_to_num(0.0) > options.search.suspect
+    return own.nan_to_num(0.0) > SUSPECT_RESIDUAL_RATIO
 
 
-def _straightened(
-    found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch, generator: Generator | None, options: SynchronizeOptions
-) -> tuple[Attempt, tuple[Notice, ...]]:
+def _straightened(found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch) -> tuple[Attempt, tuple[Notice, ...]]:
     """Once more with lenses fitted at the shift found, where they are significant."""
     assert found.fit is not None
     fit = found.fit
-    x1, _, w1 = smoothed(found.a, fit.times, found.frame, options)
-    x2, _, w2 = smoothed(found.b, fit.times * fit.rate + fit.offset, found.frame, options)
+    x1, _, w1 = smoothed(found.a, fit.times, found.frame)
+    x2, _, w2 = smoothed(found.b, fit.times * fit.rate + fit.offset, found.frame)
     lens = fit_distortion(x1.flatten(0, 1), x2.flatten(0, 1), (w1 * w2).flatten())
     if not lens.significant:
         return found, ()
@@ -249,13 +286,16 @@ def _straightened(
         x = one.undistort(tracks.x)
         seen = x.isfinite().all(-1)
         straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
-    again = attempt(straight[0], straight[1], search, found.points, options=options)
+    again = attempt(straight[0], straight[1], search, found.points)
     better = again.fit is not None and again.fit.residual < fit.residual and _better(found, again) is again
     values = {"a": lens.lambda_a, "b": lens.lambda_b}
     return (again, (Notice(ShiftNotice.LENS, 0.0, values),)) if better else (found, ())
 
 
-def shift_of(result: Result, options: SynchronizeOptions) -> Shift:
+MAX_CAMERA_MOTION_RATIO = 1.35  # Residual over that of each half by itself beyond which a camera may have moved.
+
+
+def shift_of(result: Result) -> Shift:
     """The result of an attempt."""
     found, limits = result.found, result.notices
     fps = 1 / found.a.step, 1 / found.b.step
@@ -269,12 +309,12 @@ def shift_of(result: Result, options: SynchronizeOptions) -> Shift:
             status=status_from(limits), notices=limits,
         )  # fmt: skip
     if not found.decided:
-        limits = (_refusal(found, options), *limits)
+        limits = (_refusal(found), *limits)
     wrong = (result.seen & ~found.points).nonzero()[:, 0].tolist()
     if wrong:
         which = ", ".join(str(point) for point in wrong)
         limits = (*limits, Notice(ShiftNotice.LEFT_OUT, float(len(wrong)), {"points": len(points), "which": which}))
-    if found.decided and found.wander > options.evidence.wander:
+    if found.decided and found.wander > MAX_CAMERA_MOTION_RATIO:
         limits = (*limits, Notice(ShiftNotice.MOVED, found.wander))
     lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
     return Shift(
@@ -307,11 +347,14 @@ def _nothing(found: Attempt) -> Notice:
     return Notice(ShiftNotice.NOTHING)
 
 
-def _refusal(found: Attempt, options: SynchronizeOptions) -> Notice:
+MAX_SIGMA_OF_PEAK_FRAMES = 10.0  # Sigma from which no shift stands out at all, frames.
+
+
+def _refusal(found: Attempt) -> Notice:
     """Why the data do not decide."""
     fit = found.fit
     assert fit is not None
-    if fit.sigma > options.search.blind * found.frame:
+    if fit.sigma > MAX_SIGMA_OF_PEAK_FRAMES * found.frame:
         return _nothing(found)
     if found.agree and found.margin >= found.needed and found.forward < found.needed_forward:
         return Notice(ShiftNotice.BACKWARDS, found.forward)

@@ -10,11 +10,13 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Notice
 from dyntorch.numerics.lags import lag_covariances
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import ShiftNotice
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What the points of one camera tell about time, whichever points they are: how the body changes and how it moves on the whole.
+
+
+MAX_SIGMA_FRAMES = 0.6  # The same in frames of the slower camera.
 
 
 STEP = 1 / 30
@@ -23,6 +25,9 @@ STEP = 1 / 30
 
 TINY = 1e-9
 """Of the size of the body: the least standard deviation of noise that is believed."""
+
+
+MIN_RELATIVE_BEND = 1e-6  # Floor of the noise over the extent of the points: rounding.
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +40,6 @@ class Body:
     points: Tensor  # ``(T, n, d)`` px, what is missing filled in; d = 2, of points in space 3
     seen: Tensor  # ``(T, n)`` bool
     step: float  # seconds from frame to frame
-    options: SynchronizeOptions
     noise: float = TINY**2  # variance of a coordinate's noise, over the squared size of the body
 
     @property
@@ -55,7 +59,7 @@ class Body:
         square = (w * t * t).sum(0)
         x = x - t * (w * t * x).sum(0) / torch.where(square > 0, square, 1.0)
         extent = float(self.points.flatten(0, 1).std(0).norm())
-        noise = max(_noise(self.points, self.seen), (self.options.subspace.rounding * extent) ** 2, 1e-300)
+        noise = max(_noise(self.points, self.seen), (MIN_RELATIVE_BEND * extent) ** 2, 1e-300)
         return float((w * x.square()).sum() / (x.shape[-1] * spare.sum()).clamp(min=1)) / noise
 
     @property
@@ -81,43 +85,48 @@ class Body:
         return float((values / (values + 1)).sum())
 
 
-def body_of(x: Tensor, weights: Tensor, step: float = STEP, *, least: float = TINY**2, options: SynchronizeOptions) -> Body:
+def body_of(x: Tensor, weights: Tensor, step: float = STEP, *, least: float = TINY**2) -> Body:
     """Rows, motion and weights of tracks ``(T, n, d)`` with weights ``(T, n)``, 0 = missing; some frames less at each end."""
     seen = (weights > 0) & x.isfinite().all(-1)
     x = torch.where(seen[..., None], x, 0.0).double()
     whole = seen.sum(-1) >= min(2, seen.shape[1])
-    edge = _edge(step, options)
+    edge = _edge(step)
     if not bool(whole.any()) or len(x) <= 2 * edge:
         rest = max(len(x) - 2 * edge, 1)
         rows, motion = x.new_zeros(rest, x[0].numel()), x.new_zeros(rest, x.shape[-1])
-        return Body(rows, motion, x.new_zeros(rest), x, seen, step, options=options)
-    return _body(completed(filled(x, seen, options), seen, options), seen, whole, step, least, options)
+        return Body(rows, motion, x.new_zeros(rest), x, seen, step)
+    return _body(completed(filled(x, seen), seen), seen, whole, step, least)
 
 
-def halves(body: Body, options: SynchronizeOptions) -> tuple[Body, Body]:
+def halves(body: Body) -> tuple[Body, Body]:
     """Bodies of either half of the points: their noise is independent."""
     n = body.points.shape[1]
     order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(body.points.device)
     whole = body.seen.sum(-1) >= min(2, n)
     first, second = (
-        _body(body.points[:, part], body.seen[:, part], whole, body.step, body.noise, options)
+        _body(body.points[:, part], body.seen[:, part], whole, body.step, body.noise)
         for part in (order[: (n + 1) // 2], order[n // 2 :])
     )
     return first, second
 
 
-def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float, least: float, options: SynchronizeOptions) -> Body:
+SIZE_KERNEL_SECONDS = 1 / 3  # The same for the size of the body in the image (half to six times as much are alike to 1 %).
+# Noise variance of the rows over that of third differences: cameras are not affine (1 to 4 are alike, 8 is 4 % worse).
+NOISE_FACTOR = 2.0
+
+
+def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float, least: float) -> Body:
     """The body of complete points."""
-    width, edge = _width(step, options), _edge(step, options)
-    size, middle = _frame(held, options.subspace.size_width / step, options)
+    width, edge = _width(step), _edge(step)
+    size, middle = _frame(held, SIZE_KERNEL_SECONDS / step)
     shape = (held - middle) / size[:, None, None]
     noise = max(_noise(shape, seen), least)
-    variance = noise * options.subspace.noise / (2 * math.sqrt(math.pi) * width)
+    variance = noise * NOISE_FACTOR / (2 * math.sqrt(math.pi) * width)
     inside = slice(edge, -edge)
     places = smooth(shape, width)[inside]
     places = (places - places.mean(0)) / math.sqrt(variance)
     rows = (places if held.shape[-1] == 2 else _fewer(places)).flatten(1)
-    return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step, options=options, noise=noise)
+    return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step, noise=noise)
 
 
 def _fewer(places: Tensor) -> Tensor:
@@ -129,12 +138,19 @@ def _fewer(places: Tensor) -> Tensor:
     return torch.einsum("tnd,nk->tkd", places, vectors[:, -kept:].flip(-1))
 
 
-def _width(step: float, options: SynchronizeOptions) -> float:
-    return max(options.subspace.width / step, options.subspace.narrowest)
+KERNEL_SECONDS = 1 / 30  # Standard deviation of the smoothing kernel (15 mm of noise: twice that finds 1 to 2 % less).
+MIN_KERNEL_FRAMES = 0.7  # Below, a sampled Gaussian is none.
 
 
-def _edge(step: float, options: SynchronizeOptions) -> int:
-    return math.ceil(options.subspace.edge * _width(step, options) - 1e-9)
+def _width(step: float) -> float:
+    return max(KERNEL_SECONDS / step, MIN_KERNEL_FRAMES)
+
+
+EDGE_SIGMAS = 2.0  # Kernel widths left out at either end: one-sided kernels of both cameras would speak for lag 0.
+
+
+def _edge(step: float) -> int:
+    return math.ceil(EDGE_SIGMAS * _width(step) - 1e-9)
 
 
 def smooth(x: Tensor, width: float) -> Tensor:
@@ -142,10 +158,13 @@ def smooth(x: Tensor, width: float) -> Tensor:
     return _convolved(x, width) / _convolved(x.new_ones(len(x), *[1] * (x.ndim - 1)), width)
 
 
-def filled(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
+GAP_KERNELS_FRAMES = (1.0, 2.5, 6.0, 15.0, 40.0)  # Ever wider kernels that fill gaps, frames.
+
+
+def filled(x: Tensor, seen: Tensor) -> Tensor:
     """Missing positions ``(T, n)`` from the same track's nearest times, by the narrowest Gaussian that sees some."""
     result, open_ = x, ~seen
-    for width in options.subspace.gap_widths:
+    for width in GAP_KERNELS_FRAMES:
         if not bool(open_.any()):
             return result
         share = _convolved(seen.double(), width)
@@ -157,11 +176,14 @@ def filled(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
     return torch.where(open_[..., None], mean, result)
 
 
-def _frame(x: Tensor, slow: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor]:
+MAX_DISTANCE_RATIO = 3.0  # Median distances from the centre beyond which a track has no part in centre and size.
+
+
+def _frame(x: Tensor, slow: float) -> tuple[Tensor, Tensor]:
     """Size ``(T,)`` and middle ``(T, 1, 2)`` of the body, of tracks that stay with it."""
     far = (x - x.median(1, keepdim=True).values).norm(dim=-1)
     ratio = (far / far.median(1, keepdim=True).values.clamp(min=1e-300)).median(0).values
-    kept = (ratio <= max(options.subspace.stray, float(ratio.min())))[None, :, None]
+    kept = (ratio <= max(MAX_DISTANCE_RATIO, float(ratio.min())))[None, :, None]
     middle = (x * kept).sum(1, keepdim=True) / kept.sum()
     spread = ((x - middle).square() * kept).sum((1, 2)) / kept.sum()
     size = smooth(spread.sqrt(), slow)
@@ -174,7 +196,10 @@ def _noise(x: Tensor, seen: Tensor) -> float:
     return (float(rough.median()) / 0.6745) ** 2 / 20 if rough.numel() else 0.0
 
 
-def completed(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
+NUM_FILL_PASSES = 12  # Regressions of missing positions on the other points.
+
+
+def completed(x: Tensor, seen: Tensor) -> Tensor:
     r"""Positions ``(T, n, d)``, those missing by regression on the other points of their frame, over and over."""
     if bool(seen.all()):
         return x
@@ -182,11 +207,11 @@ def completed(x: Tensor, seen: Tensor, options: SynchronizeOptions) -> Tensor:
     rows, (n, dims) = (x - mean).flatten(1), x.shape[1:]
     noise = max(_noise(x, seen), 1e-6 * float(rows.square().mean()), 1e-300)
     unit = torch.eye(dims * n, dtype=x.dtype, device=x.device)
-    for _ in range(options.subspace.fill_rounds):
+    for _ in range(NUM_FILL_PASSES):
         inverse = torch.linalg.inv(rows.mT @ rows / len(rows) + noise * unit)
         own = inverse.unflatten(0, (n, dims)).unflatten(2, (n, dims)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (n, d, d)
         change = torch.linalg.solve(own, (rows @ inverse).unflatten(1, (n, dims)).movedim(0, 2)).movedim(2, 0)
-        nearby = filled(torch.where(seen[..., None], change, 0.0), seen, options)
+        nearby = filled(torch.where(seen[..., None], change, 0.0), seen)
         rows = rows - torch.where(seen[..., None], 0.0, change - nearby).flatten(1)
     return rows.unflatten(1, (n, dims)) + mean
 
@@ -237,43 +262,43 @@ def subspace_curve(
     lags: tuple[int, int],
     *,
     step: float = STEP,
-    options: SynchronizeOptions = SynchronizeOptions(),
 ) -> SubspaceCurve:
     r"""Evidence for every lag between the tracks of two static cameras that need not have a point in common. a ``(Ta, n, 2)``,
     b ``(Tb, m, 2)``, wa ``(Ta, n)``, wb ``(Tb, m)``."""
     if a.shape[-1] == 3:
-        second = body_of(b, wb, step, options=options)
-        first = body_of(a, wa, step, least=second.noise, options=options)
+        second = body_of(b, wb, step)
+        first = body_of(a, wa, step, least=second.noise)
     else:
-        first = body_of(a, wa, step, options=options)
-        second = body_of(b, wb, step, least=first.noise if b.shape[-1] == 3 else TINY**2, options=options)
-    return bodies_curve(first, second, lags, step, options=options)
+        first = body_of(a, wa, step)
+        second = body_of(b, wb, step, least=first.noise if b.shape[-1] == 3 else TINY**2)
+    return bodies_curve(first, second, lags, step)
 
 
-def bodies_curve(
-    first: Body, second: Body, lags: tuple[int, int], step: float = STEP, *, options: SynchronizeOptions
-) -> SubspaceCurve:
+MIN_OVERLAP_SHARE = 0.35  # Share of the shorter take below which a lag is not scored.
+MIN_OVERLAP_SECONDS = 0.8  # Overlap below which a lag is not scored.
+SHAPE_SAMPLE_RATE = 2.4  # Independent samples per second of the shape; fitted, with the next two, to the posterior of the true lag.
+HEIGHT_SAMPLE_RATE = 2.25  # The same of its vertical coordinate.
+MOTION_SAMPLE_RATE = 5.7  # The same of the common motion.
+
+
+def bodies_curve(first: Body, second: Body, lags: tuple[int, int], step: float = STEP) -> SubspaceCurve:
     """The same of what is prepared."""
-    shape, height, motion, counts = _curves(first, second, lags, options)
+    shape, height, motion, counts = _curves(first, second, lags)
     judged = counts >= max(
-        options.subspace.least_overlap * min(float(first.weights.sum()), float(second.weights.sum())),
-        options.subspace.least_seconds / step - 1e-9,
+        MIN_OVERLAP_SHARE * min(float(first.weights.sum()), float(second.weights.sum())),
+        MIN_OVERLAP_SECONDS / step - 1e-9,
     )
     if bool(judged.any()):
-        chance = _chance(first, second.reversed, counts, judged, lags, options)
+        chance = _chance(first, second.reversed, counts, judged, lags)
         shape, height = shape - chance[:, 0], height - chance[:, 1]
-    scores = (
-        counts
-        * step
-        * (options.subspace.shape_rate * shape + options.subspace.height_rate * height + options.subspace.motion_rate * motion)
-    )
+    scores = counts * step * (SHAPE_SAMPLE_RATE * shape + HEIGHT_SAMPLE_RATE * height + MOTION_SAMPLE_RATE * motion)
     span = torch.arange(lags[0], lags[1] + 1, dtype=torch.float64, device=counts.device)
     return SubspaceCurve(
         span, torch.where(judged, scores, torch.nan), counts, shape, height, motion, (first.signal, second.signal), (first, second)
     )
 
 
-def _curves(a: Body, b: Body, lags: tuple[int, int], options: SynchronizeOptions) -> list[Tensor]:
+def _curves(a: Body, b: Body, lags: tuple[int, int]) -> list[Tensor]:
     """Information of shapes, of heights and of motions, and counts, at all lags."""
     weights = None if bool((a.weights > 0).all() and (b.weights > 0).all()) else (a.weights, b.weights)
     found = []
@@ -282,14 +307,17 @@ def _curves(a: Body, b: Body, lags: tuple[int, int], options: SynchronizeOptions
         aa, bb, ab, counts = lag_covariances(a.rows, b.rows, span, weights)
         *motion, _ = lag_covariances(a.motion, b.motion, span, weights)
         upright = _vertical((aa, bb, ab), (a.dims, b.dims))
-        found.append((_shared(aa, bb, ab), _shared(*upright), _correlated(*motion, options=options), counts))
+        found.append((_shared(aa, bb, ab), _shared(*upright), _correlated(*motion), counts))
     return [torch.cat(parts) for parts in zip(*found, strict=True)]
 
 
-def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, int], options: SynchronizeOptions) -> Tensor:
+NUM_CHANCE_LAGS = 40  # Lags at which the bias by chance is measured.
+
+
+def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, int]) -> Tensor:
     """What shapes and heights ``(L, 2)`` of different events tell about each other: a line in 1 / count, through some lags."""
     at = judged.nonzero()[:, 0]
-    at = at[torch.linspace(0, len(at) - 1, min(options.subspace.chance_lags, len(at))).round().long().to(at.device)]
+    at = at[torch.linspace(0, len(at) - 1, min(NUM_CHANCE_LAGS, len(at))).round().long().to(at.device)]
     told, inverse, n = [], [], a.rows.shape[1]
     for lag in (at + lags[0]).tolist():
         start, end = max(0, -lag), min(len(a.rows), len(b.rows) - lag)
@@ -307,12 +335,12 @@ def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, i
     return line[0] + line[1] / counts.clamp(min=1.0)[:, None]
 
 
-def information(shape: Tensor, motion: Tensor, bodies: tuple[Body, Body], options: SynchronizeOptions) -> Tensor:
+def information(shape: Tensor, motion: Tensor, bodies: tuple[Body, Body]) -> Tensor:
     """Evidence per second ``(L,)`` of joint covariances of the bodies' shapes and motions; chance is in it."""
     dims, n = (bodies[0].dims, bodies[1].dims), bodies[0].rows.shape[1]
     parts = _parts(shape, n)
-    told = options.subspace.shape_rate * _shared(*parts) + options.subspace.height_rate * _shared(*_vertical(parts, dims))
-    return told + options.subspace.motion_rate * _correlated(*_parts(motion, dims[0]), options=options)
+    told = SHAPE_SAMPLE_RATE * _shared(*parts) + HEIGHT_SAMPLE_RATE * _shared(*_vertical(parts, dims))
+    return told + MOTION_SAMPLE_RATE * _correlated(*_parts(motion, dims[0]))
 
 
 _Parts = tuple[Tensor, Tensor, Tensor]
@@ -339,9 +367,12 @@ def _shared(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
     return -_factor(left).diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
-def _correlated(aa: Tensor, bb: Tensor, ab: Tensor, *, options: SynchronizeOptions) -> Tensor:
+VELOCITY_NOISE_SHARE = 0.02  # Noise of a velocity as a share of its variance: medians of different points differ.
+
+
+def _correlated(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
     """Mutual information ``(L,)`` where each coordinate has noise in proportion to itself."""
-    one, two = (options.subspace.loading * c.diagonal(dim1=-2, dim2=-1) for c in (aa, bb))
+    one, two = (VELOCITY_NOISE_SHARE * c.diagonal(dim1=-2, dim2=-1) for c in (aa, bb))
     one, two = (v.clamp(min=1e-12 * float(v.max()) + 1e-300).rsqrt()[..., None] for v in (one, two))
     return _shared(one * aa * one.mT, two * bb * two.mT, one * ab * two.mT)
 
@@ -355,17 +386,17 @@ def _factor(c: Tensor) -> Tensor:
 # What speaks against a lag between different points: motion that repeats itself, and a peak that depends on single moments.
 
 
-def resemblance(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
+def resemblance(curve: SubspaceCurve, best: int, apart: float) -> float:
     r"""How much the motion resembles itself at another time that fits as well: 0 not at all, 1 as much as at the same time."""
     if curve.bodies is None:
         return 0.0
     judged = curve.scores.isfinite()
     rivals = judged.nonzero()[:, 0] - best
     frames, step = min(len(body.rows) for body in curve.bodies), curve.bodies[0].step
-    reach = min(int(rivals.abs().max()), frames - math.ceil(options.subspace.least_seconds / step))
+    reach = min(int(rivals.abs().max()), frames - math.ceil(MIN_OVERLAP_SECONDS / step))
     if reach <= apart:
         return 0.0
-    both = sum((_alike(body, reach, options) for body in curve.bodies), curve.scores.new_zeros(2 * reach + 1))
+    both = sum((_alike(body, reach) for body in curve.bodies), curve.scores.new_zeros(2 * reach + 1))
     both = both + both.flip(0)
     padded = torch.nn.functional.pad(both, (1, 1), value=math.inf)
     peak = (both >= padded[:-2]) & (both >= padded[2:])
@@ -377,21 +408,24 @@ def resemblance(curve: SubspaceCurve, best: int, apart: float, options: Synchron
     return other / own if own > 0 else math.inf
 
 
-def _alike(body: Body, reach: int, options: SynchronizeOptions) -> Tensor:
+def _alike(body: Body, reach: int) -> Tensor:
     """Evidence per frame ``(2 reach + 1,)`` between halves of the points."""
-    first, second = halves(body, options)
-    return bodies_curve(first.blurred, second.blurred, (-reach, reach), body.step, options=options).rates.nan_to_num(-math.inf)
+    first, second = halves(body)
+    return bodies_curve(first.blurred, second.blurred, (-reach, reach), body.step).rates.nan_to_num(-math.inf)
 
 
-def wobble(curve: SubspaceCurve, lag: int, options: SynchronizeOptions) -> float:
+NUM_JACKKNIFE_BLOCKS = 8  # Parts of the overlap that the jackknife leaves out in turn.
+
+
+def wobble(curve: SubspaceCurve, lag: int) -> float:
     r"""Standard deviation of the best lag in frames, by the jackknife over parts of the overlap."""
     if curve.bodies is None:
         return 0.0
     a, b = curve.bodies
     start, end = max(0, 1 - lag), min(len(a.rows), len(b.rows) - lag - 1)
-    if end - start < options.different.blocks:
+    if end - start < NUM_JACKKNIFE_BLOCKS:
         return math.inf
-    edges = torch.linspace(start, end, options.different.blocks + 1).round().long().tolist()
+    edges = torch.linspace(start, end, NUM_JACKKNIFE_BLOCKS + 1).round().long().tolist()
     sizes = torch.tensor(edges).diff().tolist()
     shapes: list[Tensor] = []
     motions: list[Tensor] = []
@@ -401,13 +435,9 @@ def wobble(curve: SubspaceCurve, lag: int, options: SynchronizeOptions) -> float
             both = torch.cat([x[start:end], y[start + at : end + at], torch.ones_like(w)[:, None]], dim=1) * w[:, None]
             kept.append(torch.stack([part.mT @ part for part in both.split(sizes)]))
     shape, motion = (_without(torch.stack(kept)) for kept in (shapes, motions))
-    before, here, after = information(shape, motion, (a, b), options).unflatten(0, (3, options.different.blocks))
+    before, here, after = information(shape, motion, (a, b)).unflatten(0, (3, NUM_JACKKNIFE_BLOCKS))
     bend = float((before - 2 * here + after).mean())
-    return (
-        math.sqrt((options.different.blocks - 1) * float(((after - before) / 2).var(correction=0))) / -bend
-        if bend < 0
-        else math.inf
-    )
+    return math.sqrt((NUM_JACKKNIFE_BLOCKS - 1) * float(((after - before) / 2).var(correction=0))) / -bend if bend < 0 else math.inf
 
 
 def _without(moments: Tensor) -> Tensor:
@@ -444,37 +474,44 @@ class SubspaceShift:
         return "" if self.refusal is None else self.refusal.text
 
 
-def subspace_shift(
-    curve: SubspaceCurve, *, start: float = 0.0, step: float = STEP, options: SynchronizeOptions = SynchronizeOptions()
-) -> SubspaceShift:
+NUM_PEAKS = 6  # Local maxima that are returned.
+MIN_PEAK_SEPARATION_SECONDS = 0.1  # Within this peaks are one.
+MAX_SIGMA_STEPS = 0.6  # Sigma above which a shift decides nothing, steps of the curve.
+# Margin over the score from which the motion is not compared with itself (425 periodic motions stay below .6).
+UNIQUE_PEAK_SHARE = 0.7
+MAX_SELF_SIMILARITY = 0.68  # Resemblance of the motion to itself from which a peak may be another period.
+MODEL_SIGMA_SECONDS = 1 / 150  # Error of a precise peak, because cameras are not affine.
+
+
+def subspace_shift(curve: SubspaceCurve, *, start: float = 0.0, step: float = STEP) -> SubspaceShift:
     r"""The best lag of a curve, by the parabola through its highest three scores, and whether to believe it."""
     judged = curve.scores.isfinite()
     if int(judged.sum()) < 3:
         return SubspaceShift(0.0, math.inf, curve.scores.new_zeros(0, 2), 0.0, 0.0, Notice(ShiftNotice.SHORT_OVERLAP))
     scores = curve.scores.nan_to_num(-math.inf)
-    top = _maxima(scores, options.different.apart / step, options)
-    positions = [_between(scores, i) for i in top[: options.different.peaks]]
+    top = _maxima(scores, MIN_PEAK_SEPARATION_SECONDS / step)
+    positions = [_between(scores, i) for i in top[:NUM_PEAKS]]
     places = torch.tensor([p for p, _ in positions], dtype=scores.dtype, device=scores.device)
-    peaks = torch.stack([curve.lags[0] + places, scores[top[: options.different.peaks]]], dim=1)
+    peaks = torch.stack([curve.lags[0] + places, scores[top[:NUM_PEAKS]]], dim=1)
     best = top[0]
-    probability, margin = _probability(scores, best), _margin(curve, best, options.different.apart / step, options)
+    probability, margin = _probability(scores, best), _margin(curve, best, MIN_PEAK_SEPARATION_SECONDS / step)
     probability = min(probability, 1 / (1 + math.exp(-max(min(margin, 700.0), -700.0))))
     position = float(peaks[0, 0])
-    sigma = math.hypot(options.different.blur / step, max(positions[0][1], wobble(curve, round(position), options)))
+    sigma = math.hypot(MODEL_SIGMA_SECONDS / step, max(positions[0][1], wobble(curve, round(position))))
     times = start + step * peaks[1:4, 0]
-    refusal = _refusal(curve, best, probability, margin, times, step, options)
+    refusal = _refusal(curve, best, probability, margin, times, step)
     if (
         refusal is None
-        and margin < options.different.alone * float(scores[best])
-        and resemblance(curve, best, options.different.apart / step, options) > options.different.repeated
+        and margin < UNIQUE_PEAK_SHARE * float(scores[best])
+        and resemblance(curve, best, MIN_PEAK_SEPARATION_SECONDS / step) > MAX_SELF_SIMILARITY
     ):
         refusal = Notice(ShiftNotice.REPEATED, margin, {"case": "itself"})
-    if refusal is None and sigma > options.different.sharp:
+    if refusal is None and sigma > MAX_SIGMA_STEPS:
         refusal = Notice(ShiftNotice.BLUNT, sigma * step, {"case": "known" if math.isfinite(sigma) else "rough"})
     return SubspaceShift(position, sigma, peaks, probability, margin, refusal)
 
 
-def _maxima(scores: Tensor, apart: float, options: SynchronizeOptions) -> list[int]:
+def _maxima(scores: Tensor, apart: float) -> list[int]:
     """Local maxima, best first, none within so many frames of a better one."""
     padded = torch.nn.functional.pad(scores, (1, 1), value=-math.inf)
     top = ((scores >= padded[:-2]) & (scores >= padded[2:]) & scores.isfinite()).nonzero()[:, 0]
@@ -482,7 +519,7 @@ def _maxima(scores: Tensor, apart: float, options: SynchronizeOptions) -> list[i
     for i in top[scores[top].argsort(descending=True)].tolist():
         if all(abs(i - j) > apart + 1e-9 for j in kept):
             kept.append(i)
-        if len(kept) > 4 * options.different.peaks:
+        if len(kept) > 4 * NUM_PEAKS:
             break
     return kept
 
@@ -503,24 +540,26 @@ def _probability(scores: Tensor, best: int) -> float:
     return float(weight[max(best - 1, 0) : best + 2].sum() / weight.sum())
 
 
-def _margin(curve: SubspaceCurve, best: int, apart: float, options: SynchronizeOptions) -> float:
+def _margin(curve: SubspaceCurve, best: int, apart: float) -> float:
     """Nats per frame over the best other maximum, times the best one's frames."""
     rates = torch.where(curve.scores.isfinite(), curve.rates, -math.inf)
-    others = [i for i in _maxima(rates, apart, options) if abs(i - best) > apart + 1e-9]
+    others = [i for i in _maxima(rates, apart) if abs(i - best) > apart + 1e-9]
     return float((rates[best] - rates[others[0]]) * curve.counts[best]) if others else float(curve.scores[best])
 
 
-def _refusal(
-    curve: SubspaceCurve, best: int, probability: float, margin: float, times: Tensor, step: float, options: SynchronizeOptions
-) -> Notice | None:
+MIN_POSTERIOR = 0.95  # Posterior of the best peak for a decision.
+MIN_MARGIN = 7.0  # Nats above the next peak for a decision: 98 of 100 periodic gaits stay below 3, sums of harmonics reach 13.
+MIN_INFORMATION_RATE = 1.5  # Nats per second below which nothing is shared.
+MIN_BEND = 1.5  # Variance about straight lines over the noise: 1.0 to 1.1 for constant velocities, 16 and more for bodies.
+
+
+def _refusal(curve: SubspaceCurve, best: int, probability: float, margin: float, times: Tensor, step: float) -> Notice | None:
     """Why the data do not decide; empty where they do."""
-    if min(curve.signal) < 1 or float(curve.rates[best]) < options.different.telling * step:
+    if min(curve.signal) < 1 or float(curve.rates[best]) < MIN_INFORMATION_RATE * step:
         return Notice(ShiftNotice.NOISY, min(curve.signal))
-    if curve.bodies is not None and min(body.bend for body in curve.bodies) < options.different.bent:
+    if curve.bodies is not None and min(body.bend for body in curve.bodies) < MIN_BEND:
         return Notice(ShiftNotice.STRAIGHT, min(body.bend for body in curve.bodies))
-    if probability >= options.different.sure and margin >= options.different.clear:
+    if probability >= MIN_POSTERIOR and margin >= MIN_MARGIN:
         return None
     others = ", ".join(f"{time:+.2f}" for time in times.tolist())
-    return Notice(
-        ShiftNotice.REPEATED, margin, {"case": "others" if margin < options.different.clear else "unclear", "rivals": others}
-    )
+    return Notice(ShiftNotice.REPEATED, margin, {"case": "others" if margin < MIN_MARGIN else "unclear", "rivals": others})

@@ -44,7 +44,7 @@ def synchronize(
     rate: float | None = None,
     camera: str = "auto",
     generator: Generator | None = None,
-    options: SynchronizeOptions = SynchronizeOptions(),
+    options: SynchronizeOptions | None = None,
 ) -> Shift:
     r"""How b's clock runs against a's, from what two static cameras saw move: :math:`t_b = \text{rate}\; t_a + \text{offset}`.
 
@@ -82,7 +82,7 @@ def synchronize(
             perspective cameras, six points or more each of one rigid body that turns (see
             :func:`dyntorch.tasks.synchronize.projective.projective_points`).
         generator: of the subsets that look for wrong points; a fixed one by default.
-        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
+        options: what is known of the data, and what is paid.
 
     Returns:
         offset, sigma, rate, confidence, all peaks, and whether it is ok; of a batch tensors ``(*batch, ...)``, and a problem that
@@ -113,6 +113,7 @@ def synchronize(
             synchronize, a, b, times=times, weights=weights, correspondence=correspondence, fps=fps, max_shift=max_shift,
             calibration=calibration, rate=rate, camera=camera, generator=generator, options=options,
         )  # fmt: skip
+    options = SynchronizeOptions() if options is None else options
     check_options(options, SynchronizeOptions)
     _check(correspondence, fps, times, weights, max_shift, rate, camera)
     first, second, origin = prepared(a, b, fps=fps, times=times, weights=weights, calibration=calibration, options=options)
@@ -138,7 +139,7 @@ def synchronize(
         options=options,
         model=CAMERA if spatial else EPIPOLAR,
     )
-    return shift_of(result, options).since(origin)
+    return shift_of(result).since(origin)
 
 
 def prepared(
@@ -157,18 +158,18 @@ def prepared(
         pair = (float(fps[0]), float(fps[1])) if isinstance(fps, Sequence) else (float(fps), float(fps))
     given = (None, None) if weights is None else weights
     tracks = [
-        read_tracks(name, x, one, None if times is None else times[i], given[i], options)
+        read_tracks(name, x, one, None if times is None else times[i], given[i])
         for i, (name, x, one) in enumerate(zip("ab", (a, b), pair, strict=True))
     ]
     for name, one in zip("ab", tracks, strict=True):
-        if len(one.times) < options.input.fewest_frames:
+        if len(one.times) < options.min_frames:
             text = "{camera:{which}} has {frames} frames, {needed} are needed at least"
-            raise ValueError(Message(text, which=name, frames=len(one.times), needed=options.input.fewest_frames))
+            raise ValueError(Message(text, which=name, frames=len(one.times), needed=options.min_frames))
     if calibration is not None:
         tracks = [_straight(name, one, lens) for name, one, lens in zip("ab", tracks, _pairwise(calibration), strict=True)]
     # both clocks count from a's first frame: timestamps may be of any era, and products of rates with them lose digits
     origin = float(tracks[0].times[0])
-    first, second = (cleaned(dataclasses.replace(one, times=one.times - origin), options) for one in tracks)
+    first, second = (cleaned(dataclasses.replace(one, times=one.times - origin)) for one in tracks)
     return first, second, origin
 
 

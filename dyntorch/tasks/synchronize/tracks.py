@@ -14,7 +14,13 @@ from torch.nn.functional import conv1d, pad
 from dyntorch.geometry.homogeneous import similarity
 from dyntorch.numerics.arguments import FARTHEST
 from dyntorch.numerics.messages import Message
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
+
+MAX_FRAME_RATE_ERROR = 0.02  # Largest relative error of a given frame rate: clock rates are searched within it.
+# Overlap from which a clock rate is estimated; in shorter ones 1 % is less than two frames at the ends.
+MIN_SECONDS_FOR_RATE = 10.0
+RATE_SIGNIFICANCE_SIGMAS = 3.0  # Deviation of a rate from 1, over its sigma, that is significant.
+MAX_RATE_DEVIATION = 0.022  # Estimated rates that differ from 1 by more are rejected.
+
 
 PIECE = 1 << 21
 """Numbers that one piece of a long take gathers at a time."""
@@ -80,9 +86,7 @@ class Tracks:
         return dataclasses.replace(self, x=self.x[:, points], weights=self.weights[:, points])
 
 
-def read_tracks(
-    name: str, x: Tensor, fps: float | None, times: Tensor | None, weights: Tensor | None, options: SynchronizeOptions
-) -> Tracks:
+def read_tracks(name: str, x: Tensor, fps: float | None, times: Tensor | None, weights: Tensor | None) -> Tracks:
     """Tracks of checked input, of a camera or of points in space."""
     if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] not in (2, 3):
         got = tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__
@@ -125,7 +129,7 @@ def read_tracks(
                 at=at,
             )
         )
-    _check_dense(name, clock, options)
+    _check_dense(name, clock)
     seen = (x.double().abs() <= FARTHEST).all(-1)
     if weights is None:
         given = seen.double()
@@ -138,13 +142,17 @@ def read_tracks(
     return Tracks(torch.where((given > 0)[..., None], x.double(), 0.0), given, clock, step)
 
 
-def _check_dense(name: str, times: Tensor, options: SynchronizeOptions) -> None:
+MAX_SPAN_PER_FRAME = 20  # A clock may run over so many times its frames: lags are searched frame by frame.
+MAX_SPAN_STEPS = 20_000  # Steps that a clock may run over in any case.
+
+
+def _check_dense(name: str, times: Tensor) -> None:
     """Raise where a take is nearly all gap."""
     steps = times.diff()
     if len(steps) == 0:
         return
     span, step = float(times[-1] - times[0]), float(steps.median())
-    if span <= step * max(options.input.longest_over_frames * len(times), options.input.longest_steps):
+    if span <= step * max(MAX_SPAN_PER_FRAME * len(times), MAX_SPAN_STEPS):
         return
     at = int(steps.argmax())
     raise ValueError(
@@ -180,18 +188,22 @@ def image_of(a: Tracks, b: Tracks) -> Tracks:
     return a if a.x.shape[-1] == 2 else b
 
 
-def smoothed(tracks: Tracks, at: Tensor, width: float, options: SynchronizeOptions) -> tuple[Tensor, Tensor, Tensor]:
+KERNEL_SIGMAS = 4.0  # Half width of the smoothing kernel, standard deviations.
+
+
+def smoothed(tracks: Tracks, at: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
     r"""Positions and velocities at any moments, by a line fitted to the frames around each, with Gaussian weights. at ``(m,)``
     -> ``(m, n, 2)``."""
-    taps = 2 * (math.ceil(options.cleaning.kernel_end * width / tracks.step) + 1) + 1
+    taps = 2 * (math.ceil(KERNEL_SIGMAS * width / tracks.step) + 1) + 1
     rows = max(1, PIECE // max(1, taps * tracks.x[0].numel()))
-    pieces = [_smoothed(tracks, piece, width, taps // 2, options) for piece in at.split(rows)] or [
-        _smoothed(tracks, at, width, taps // 2, options)
-    ]
+    pieces = [_smoothed(tracks, piece, width, taps // 2) for piece in at.split(rows)] or [_smoothed(tracks, at, width, taps // 2)]
     return tuple(torch.cat(parts) for parts in zip(*pieces, strict=True))  # type: ignore[return-value]
 
 
-def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int, options: SynchronizeOptions) -> tuple[Tensor, Tensor, Tensor]:
+MIN_KERNEL_WEIGHT = 0.4  # Share of the kernel's weight that must be visible; less is a gap.
+
+
+def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tensor, Tensor, Tensor]:
     frames = len(tracks.weights)
     near = torch.searchsorted(tracks.times, at.contiguous())[:, None] + torch.arange(-taps, taps + 1, device=at.device)
     index = near.clamp(0, frames - 1)
@@ -206,7 +218,7 @@ def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int, options: Sync
     determinant = s0 * s2 - s1.square()
     usual = torch.bmm(powers[:, :1], (w > 0).double())[:, 0]  # the kernel's weight on frames that show the point
     # two-sided: a line through frames on one side only would extrapolate
-    seen = (usual > options.cleaning.least_seen * full) & (determinant > 0.15 * s0.square())
+    seen = (usual > MIN_KERNEL_WEIGHT * full) & (determinant > 0.15 * s0.square())
     share = torch.where(seen, 1 / torch.where(seen, determinant, 1.0), 0.0)[..., None]
     position = (s2[..., None] * t0 - s1[..., None] * t1) * share
     velocity = (s0[..., None] * t1 - s1[..., None] * t0) * share / width
@@ -219,40 +231,52 @@ def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int, options: Sync
 # Positions that are elsewhere for a frame or a few: found by the track's own neighbouring frames.
 
 
-def cleaned(tracks: Tracks, options: SynchronizeOptions) -> Tracks:
+HAMPEL_HALF_WIDTH = 3  # Frames on either side of that median.
+
+
+def cleaned(tracks: Tracks) -> Tracks:
     r"""Without positions far from the median of their neighbours, then, one by one, without those far from a line through the
     others."""
-    if len(tracks.x) < 2 * options.cleaning.neighbours + 1:
+    if len(tracks.x) < 2 * HAMPEL_HALF_WIDTH + 1:
         return tracks
-    return _peeled(without(tracks, _far_from_median(tracks, options)), options)
+    return _peeled(without(tracks, _far_from_median(tracks)))
 
 
-def _far_from_median(tracks: Tracks, options: SynchronizeOptions) -> Tensor:
+HAMPEL_SIGMAS = 4.0  # Robust sigmas from the running median beyond which a position is an outlier (3 rejects turning points).
+MIN_RELATIVE_DEVIATION = 1e-3  # Floor of the robust scale over the RMS coordinate: keeps it above 0 for static points.
+
+
+def _far_from_median(tracks: Tracks) -> Tensor:
     seen = tracks.weights > 0
     x = torch.where(seen[..., None], tracks.x, torch.nan)
-    ends = [x[: options.cleaning.neighbours].flip(0), x[-options.cleaning.neighbours :].flip(0)]
-    window = torch.cat([ends[0], x, ends[1]]).unfold(0, 2 * options.cleaning.neighbours + 1, 1)  # (frames, n, 2, width)
+    ends = [x[:HAMPEL_HALF_WIDTH].flip(0), x[-HAMPEL_HALF_WIDTH:].flip(0)]
+    window = torch.cat([ends[0], x, ends[1]]).unfold(0, 2 * HAMPEL_HALF_WIDTH + 1, 1)  # (frames, n, 2, width)
     middle = window.nanmedian(-1).values
     far = (x - middle).abs()
     spread = 1.4826 * (window - middle[..., None]).abs().nanmedian(-1).values
     usual = 1.4826 * _usual(torch.where(seen[..., None], far, torch.nan))
-    usual = torch.maximum(usual, usual.nanmedian(0).values).clamp(min=options.cleaning.least_deviation * tracks.scale)
-    return (far > options.cleaning.outlying * torch.maximum(spread, usual)).any(-1)
+    usual = torch.maximum(usual, usual.nanmedian(0).values).clamp(min=MIN_RELATIVE_DEVIATION * tracks.scale)
+    return (far > HAMPEL_SIGMAS * torch.maximum(spread, usual)).any(-1)
 
 
-def _peeled(tracks: Tracks, options: SynchronizeOptions) -> Tracks:
+LINE_OUTLIER_SIGMAS = 6.0  # Robust sigmas from that line beyond which a position is an outlier.
+MIN_RESIDUAL_RATIO = 2.0  # and its residual over those of the neighbouring frames: sudden movements bend several frames alike.
+MAX_LINE_PASSES = 8  # Repetitions of the second pass.
+
+
+def _peeled(tracks: Tracks) -> Tracks:
     """The worst position of its neighbourhood goes first, then the line through what is left is fitted again."""
     kept = tracks.weights > 0
-    for _ in range(options.cleaning.line_rounds):
-        away = _from_line(tracks.x, kept, options)
+    for _ in range(MAX_LINE_PASSES):
+        away = _from_line(tracks.x, kept)
         scale = 1.4826 * _usual(away)
-        scale = scale.clamp(min=max(options.cleaning.least_deviation * tracks.scale, float(scale.nanmedian().nan_to_num(0.0))))
+        scale = scale.clamp(min=max(MIN_RELATIVE_DEVIATION * tracks.scale, float(scale.nanmedian().nan_to_num(0.0))))
         away = away.nan_to_num(0.0)
         rows = pad(away, (0, 0, 2, 2))
         near = torch.stack([rows[k : k + len(away)] for k in (0, 1, 3, 4)])
         bad = (
-            (away > options.cleaning.line_outlying * scale / 1.18)
-            & (away > options.cleaning.over_neighbours * near.median(0).values)
+            (away > LINE_OUTLIER_SIGMAS * scale / 1.18)
+            & (away > MIN_RESIDUAL_RATIO * near.median(0).values)
             & (away >= near.amax(0))
         )
         if not bool(bad.any()):
@@ -268,11 +292,14 @@ def _usual(far: Tensor) -> Tensor:
     return torch.where(usual > rounding, usual, other)
 
 
-def _from_line(x: Tensor, kept: Tensor, options: SynchronizeOptions) -> Tensor:
+LINE_KERNEL_FRAMES = 1.5  # Standard deviation of the kernel of the local line in the second pass, frames.
+
+
+def _from_line(x: Tensor, kept: Tensor) -> Tensor:
     """``(frames, n)`` distances from a line in time through the neighbouring frames but not the own one; NaN where there is
     none."""
-    reach = int(3 * options.cleaning.line_width)
-    u = torch.arange(-reach, reach + 1, dtype=x.dtype, device=x.device) / options.cleaning.line_width
+    reach = int(3 * LINE_KERNEL_FRAMES)
+    u = torch.arange(-reach, reach + 1, dtype=x.dtype, device=x.device) / LINE_KERNEL_FRAMES
     kernel = torch.exp(-0.5 * u.square())
     kernel[reach] = 0.0
     w = kept.to(x.dtype)
@@ -294,26 +321,29 @@ def _correlated(rows: Tensor, kernel: Tensor) -> Tensor:
 # Tracks about the middle of each frame, in units of how large they are there: what affine cameras would have seen.
 
 
-def frame_scaled(tracks: Tracks, options: SynchronizeOptions) -> Tracks:
+def frame_scaled(tracks: Tracks) -> Tracks:
     r"""Tracks with the strongest effects of perspective taken out."""
     seen = tracks.weights > 0
     shown = torch.where(seen[..., None], tracks.x, torch.nan)
     middle = shown.nanmedian(1).values  # (frames, 2)
     away = shown - middle[:, None]
     size = away.norm(dim=-1).nanmedian(1).values
-    slow = _slow(size, tracks.times, options)
+    slow = _slow(size, tracks.times)
     level = slow[slow > 0].median() if bool((slow > 0).any()) else slow.new_ones(())
     scaled = away / torch.where(slow > 0, slow / level, 1.0)[:, None, None]
     return dataclasses.replace(tracks, x=torch.where(seen[..., None], scaled, 0.0))
 
 
-def _slow(size: Tensor, times: Tensor, options: SynchronizeOptions) -> Tensor:
+SIZE_KERNEL_SECONDS = 0.5  # Standard deviation of the kernel for the size of a person in the image.
+
+
+def _slow(size: Tensor, times: Tensor) -> Tensor:
     """Gaussian means over time of what is known."""
     known = size.isfinite()
-    reach = max(1, int(3 * options.cleaning.distance_width / float(times.diff().median())) if len(times) > 1 else 1)
+    reach = max(1, int(3 * SIZE_KERNEL_SECONDS / float(times.diff().median())) if len(times) > 1 else 1)
     values = torch.where(known, size, 0.0)
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float64, device=size.device)
     step = float(times.diff().median()) if len(times) > 1 else 1.0
-    kernel = torch.exp(-0.5 * (offsets * step / options.cleaning.distance_width).square())[None, None]
+    kernel = torch.exp(-0.5 * (offsets * step / SIZE_KERNEL_SECONDS).square())[None, None]
     total, share = (torch.nn.functional.conv1d(row[None, None], kernel, padding=reach)[0, 0] for row in (values, known.double()))
     return torch.where(share > 1e-9, total / share.clamp(min=1e-9), 0.0)

@@ -317,7 +317,7 @@ def compared(
         return None
     more: dict[str, Any] = {"options": options.points}
     if quick:  # two people who are not the same have no points that are: nothing to look for
-        every = replace(options.points, points=replace(options.points.points, fewest=1 + a[1].shape[1]))
+        every = replace(options.points, reject_points=False)
         more = {"camera": "perspective", "rate": 1.0, "calibration": (None, None), "options": every}
     times, places, trust = ((torch.from_numpy(x), torch.from_numpy(y)) for x, y in zip(a, b, strict=True))
     shift: Shift = dyntorch.synchronize(places[0], places[1], times=times, weights=trust, correspondence=True, **more)

@@ -199,7 +199,7 @@ def everybody_clocks(
             shifts[i, j] = shift
     if not shifts:
         return None, clocks, [Notice(PeopleNotice.CLOCKS, 0.0, {"reason": "no two cameras show the same person for long enough"})]
-    found = combine_shifts(shifts, len(sorting.views), options=options.points)
+    found = combine_shifts(shifts, len(sorting.views))
     notices = []
     if not found.ok and not lost:
         notices.append(Notice(PeopleNotice.CLOCKS, 0.0, {"reason": found.reason}))

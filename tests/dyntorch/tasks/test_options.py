@@ -104,8 +104,8 @@ def test_options_of_the_synchronization_decide():
     g = torch.Generator().manual_seed(0)
     a = torch.randn(60, 10, 2, generator=g, dtype=torch.float64).cumsum(0)
     shipped = dyn.SynchronizeOptions()
-    longer = replace(shipped, input=replace(shipped.input, fewest_frames=100))
+    longer = replace(shipped, min_frames=100)
     with pytest.raises(ValueError, match="a has 60 frames, 100 are needed"):
         dyn.synchronize(a, a, fps=30.0, options=longer)
-    careful = replace(shipped, evidence=replace(shipped.evidence, margin=20.0, affine_margin=20.0))
+    careful = replace(shipped, min_margin=20.0)
     assert not dyn.synchronize(a, a, fps=30.0, options=careful).ok

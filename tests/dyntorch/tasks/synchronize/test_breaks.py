@@ -9,13 +9,13 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.tasks.synchronize.breaks import breaks, camera_breaks, mended_times
-from dyntorch.tasks.synchronize.options import BreakOptions, SynchronizeOptions
-from dyntorch.tasks.synchronize.piecewise_offset import Jump, cheapest, mended
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.piecewise_offset import MIN_JUMP_EVIDENCE, Jump, cheapest, mended
 from dyntorch.tasks.synchronize.result import ClockBreak
 from dyntorch.tasks.synchronize.tracks import read_tracks
 
 FPS, FRAMES, OFFSET = 30.0, 200, 0.31
-SHORT = SynchronizeOptions(breaks=BreakOptions(longest=0.4))  # of what is lost: a third of the work
+SHORT = SynchronizeOptions(max_jump=0.4)  # of what is lost: a third of the work
 
 
 def motion(seed=0, points=12):
@@ -66,7 +66,7 @@ def test_one_break(pair, which, change, count, loser):
     truth = (at - 0.5) / FPS
     moment = one.moments[one.candidates.index("ab".index(which))]
     assert abs(moment - truth) < max(0.12, 4 * one.sigma)
-    assert one.evidence > SynchronizeOptions().breaks.evidence
+    assert one.evidence > MIN_JUMP_EVIDENCE
     assert one.residuals[0] > one.residuals[1]
     assert one.jump == pytest.approx((-1 if loser else 1) * count / FPS, abs=0.5 / FPS)
     assert abs(found.clocks.offset - OFFSET) < 0.3 / FPS
@@ -165,8 +165,7 @@ def test_cheapest_is_the_cheapest_of_all():
 
 
 def test_mended_leaves_room_on_the_side_that_lost():
-    options = SynchronizeOptions()
-    tracks = [read_tracks("a", torch.ones(20, 1, 2).double(), 10.0, None, None, options) for _ in range(2)]
+    tracks = [read_tracks("a", torch.ones(20, 1, 2).double(), 10.0, None, None) for _ in range(2)]
     a, b = mended(*tracks, 1.0, 0.5, (Jump(0.45, 0.1, -0.3), Jump(1.05, 0.1, 0.2)))
     assert a.times[:11].tolist() == pytest.approx((torch.arange(11) / 10).tolist())
     assert a.times[11].item() == pytest.approx(1.3)

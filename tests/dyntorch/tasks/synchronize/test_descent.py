@@ -9,7 +9,6 @@ import torch
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import filmed
 from dyntorch.tasks.synchronize.epipolar import Grid, ShiftDescent
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import read_tracks, smoothed
 
 FRAME = 1 / 30
@@ -22,10 +21,7 @@ def seeded(seed=0):
 def tracks_of(scene, noise=0.0, seed=0):
     draw = seeded(seed)
     parts = (x + noise * torch.randn(x.shape, generator=draw, dtype=torch.float64) for x in (scene.a, scene.b))
-    return [
-        read_tracks(name, x, None, t, None, options=SynchronizeOptions())
-        for name, x, t in zip("ab", parts, scene.times, strict=True)
-    ]
+    return [read_tracks(name, x, None, t, None) for name, x, t in zip("ab", parts, scene.times, strict=True)]
 
 
 def sampson(F, p, q):
@@ -38,9 +34,9 @@ def test_positions_between_the_steps_of_a_grid_are_those_of_smoothing():
     scene = filmed(6, seconds=3.0, generator=seeded(1))
     for noise in (0.0, 2.0):
         tracks = tracks_of(scene, noise)[1]
-        grid = Grid.of(tracks, FRAME, options=SynchronizeOptions())
+        grid = Grid.of(tracks, FRAME)
         at = 0.2 + 2.5 * torch.rand(200, generator=seeded(2), dtype=torch.float64)
-        expected, _, sure = smoothed(tracks, at, FRAME, options=SynchronizeOptions())
+        expected, _, sure = smoothed(tracks, at, FRAME)
         x, v, weights = grid.at(at)
         assert bool((sure > 0).all()) and torch.allclose(weights, sure, atol=0.01)
         assert float((x - expected).abs().max()) < 0.01 + 0.02 * noise
@@ -55,10 +51,8 @@ def test_positions_between_the_steps_of_a_grid_are_those_of_smoothing():
 
 def test_noise_of_a_grid_does_not_depend_on_the_place_between_frames():
     frames = 3000
-    tracks = read_tracks(
-        "b", torch.randn(frames, 3, 2, generator=seeded(), dtype=torch.float64), 30.0, None, None, options=SynchronizeOptions()
-    )
-    grid, middle = Grid.of(tracks, FRAME, options=SynchronizeOptions()), torch.arange(10, frames - 10, dtype=torch.float64)
+    tracks = read_tracks("b", torch.randn(frames, 3, 2, generator=seeded(), dtype=torch.float64), 30.0, None, None)
+    grid, middle = Grid.of(tracks, FRAME), torch.arange(10, frames - 10, dtype=torch.float64)
     left = [float(grid.at((middle + phase) * FRAME)[0].square().mean()) for phase in torch.linspace(0, 1, 9).tolist()]
     assert max(left) / min(left) < 1.015
 
@@ -66,7 +60,7 @@ def test_noise_of_a_grid_does_not_depend_on_the_place_between_frames():
 def test_grids_have_no_weight_in_gaps_and_beyond_the_take():
     x = torch.zeros(60, 2, 2)
     x[20:40, 1] = torch.nan
-    grid = Grid.of(read_tracks("b", x, 30.0, None, None, options=SynchronizeOptions()), FRAME, options=SynchronizeOptions())
+    grid = Grid.of(read_tracks("b", x, 30.0, None, None), FRAME)
     _, _, weights = grid.at(torch.tensor([-0.1, 0.3, 1.0, 1.7, 2.5], dtype=torch.float64))
     assert (weights > 0).tolist() == [[False, False], [True, True], [True, False], [True, True], [False, False]]
 
@@ -74,14 +68,14 @@ def test_grids_have_no_weight_in_gaps_and_beyond_the_take():
 @pytest.mark.parametrize("seed", range(2))
 def test_the_minimum_is_that_of_a_general_solver(seed):
     a, b = tracks_of(filmed(9, seconds=1.5, offset=0.113, generator=seeded(seed)), 1.0, seed)
-    fit = ShiftDescent(a, b, FRAME, options=SynchronizeOptions()).run(0.113)
-    x1, _, w1 = smoothed(a, a.times, FRAME, options=SynchronizeOptions())
+    fit = ShiftDescent(a, b, FRAME).run(0.113)
+    x1, _, w1 = smoothed(a, a.times, FRAME)
     centre, size = torch.tensor([640.0, 480.0], dtype=torch.float64), 300.0
     own = (w1 > 0.5) & (a.times > 0.25)[:, None] & (a.times < 1.25)[:, None]  # seen in both whatever the shift
     p = homogeneous(((x1 - centre) / size)[own])
 
     def residuals(theta):
-        x2, _, _ = smoothed(b, a.times + float(theta[0]), FRAME, options=SynchronizeOptions())
+        x2, _, _ = smoothed(b, a.times + float(theta[0]), FRAME)
         A, B = torch.from_numpy(theta[1:]).reshape(2, 3, 2)  # of rank 2
         return (size * sampson(A @ B.mT, p, homogeneous(((x2 - centre) / size)[own]))).numpy()
 
@@ -95,7 +89,7 @@ def test_the_minimum_is_that_of_a_general_solver(seed):
 
 def test_the_minimum_is_that_of_a_scan():
     a, b = tracks_of(filmed(12, seconds=3.0, offset=-0.217, generator=seeded(3)), 1.5, 3)
-    descent = ShiftDescent(a, b, FRAME, options=SynchronizeOptions())
+    descent = ShiftDescent(a, b, FRAME)
     fit = descent.run(-0.2)
     offsets = fit.offset + torch.linspace(-0.5, 0.5, 41, dtype=torch.float64) * FRAME
     costs = [descent.variance(float(offset)) for offset in offsets]
@@ -106,15 +100,15 @@ def test_the_minimum_is_that_of_a_scan():
 @pytest.mark.parametrize("start", [-1.4, -0.5, 0.0, 0.8, 1.5])
 def test_starts_within_a_frame_or_two_lead_to_the_same_minimum(start):
     a, b = tracks_of(filmed(12, seconds=3.0, offset=0.4, generator=seeded(4)), 1.0)
-    fit = ShiftDescent(a, b, FRAME, options=SynchronizeOptions()).run(0.4 + start * FRAME)
+    fit = ShiftDescent(a, b, FRAME).run(0.4 + start * FRAME)
     assert fit.offset == pytest.approx(0.4, abs=0.03 * FRAME)
-    again = ShiftDescent(a, b, FRAME, options=SynchronizeOptions()).run(fit.offset)
+    again = ShiftDescent(a, b, FRAME).run(fit.offset)
     assert again.offset == pytest.approx(fit.offset, abs=1e-4 * FRAME)
 
 
 def test_exact_cameras_give_the_fundamental_matrix_in_pixels():
     scene = filmed(15, seconds=4.0, offset=0.3, generator=seeded(5))
-    fit = ShiftDescent(*tracks_of(scene), FRAME, options=SynchronizeOptions()).run(0.3)
+    fit = ShiftDescent(*tracks_of(scene), FRAME).run(0.3)
     F = fit.fundamental
     assert float(F.norm()) == pytest.approx(1.0)
     assert float(torch.linalg.svdvals(F)[2]) < 1e-12
@@ -127,7 +121,7 @@ def test_exact_cameras_give_the_fundamental_matrix_in_pixels():
 @pytest.mark.slow
 def test_sigma_is_the_scatter_of_repeated_draws():
     scene = filmed(12, seconds=2.5, offset=0.123, generator=seeded(6))
-    fits = [ShiftDescent(*tracks_of(scene, 1.5, seed), FRAME, options=SynchronizeOptions()).run(0.123) for seed in range(30)]
+    fits = [ShiftDescent(*tracks_of(scene, 1.5, seed), FRAME).run(0.123) for seed in range(30)]
     errors = torch.tensor([fit.offset - 0.123 for fit in fits], dtype=torch.float64)
     sigmas = torch.tensor([fit.sigma for fit in fits], dtype=torch.float64)
     assert 0.4 < float((errors / sigmas).square().mean().sqrt()) < 1.7
@@ -141,36 +135,34 @@ def test_sigma_is_the_scatter_of_repeated_draws():
 def test_fractions_of_a_frame_do_not_draw_the_estimate():
     scenes = {phase: filmed(12, seconds=2.5, offset=phase * FRAME, generator=seeded(7)) for phase in (0.0, 0.25, 0.5)}
     for phase, scene in scenes.items():
-        fits = [
-            ShiftDescent(*tracks_of(scene, 3.0, seed), FRAME, options=SynchronizeOptions()).run(phase * FRAME) for seed in range(7)
-        ]
+        fits = [ShiftDescent(*tracks_of(scene, 3.0, seed), FRAME).run(phase * FRAME) for seed in range(7)]
         errors = torch.tensor([fit.offset / FRAME - phase for fit in fits])
         assert abs(float(errors.mean())) < 3.5 * float(errors.std()) / 7**0.5 + 0.005  # splines: drawn by .1 to halves
 
 
 def test_the_rate_is_found_with_its_sigma():
     scene = filmed(10, seconds=12.0, rate=1.004, offset=0.3, generator=seeded(8))
-    fit = ShiftDescent(*tracks_of(scene, 1.0), FRAME, options=SynchronizeOptions()).run(0.32, 1.003, free_rate=True)
+    fit = ShiftDescent(*tracks_of(scene, 1.0), FRAME).run(0.32, 1.003, free_rate=True)
     assert abs(fit.rate - 1.004) < 4 * fit.rate_sigma < 1e-3
     assert fit.offset + fit.rate * fit.center == pytest.approx(0.3 + 1.004 * fit.center, abs=4 * fit.sigma)
     assert fit.shift == pytest.approx(fit.offset + (fit.rate - 1) * fit.center)
-    held = ShiftDescent(*tracks_of(scene, 1.0), FRAME, options=SynchronizeOptions()).run(0.32, 1.004)
+    held = ShiftDescent(*tracks_of(scene, 1.0), FRAME).run(0.32, 1.004)
     assert held.rate == 1.004 and held.rate_sigma == 0
 
 
 def test_outliers_hardly_move_the_minimum():
     clean = filmed(14, seconds=3.0, noise=1.0, offset=0.2, generator=seeded(9))
     dirty = filmed(14, seconds=3.0, noise=1.0, offset=0.2, outliers=0.03, generator=seeded(9))
-    fits = [ShiftDescent(*tracks_of(scene), FRAME, options=SynchronizeOptions()).run(0.2) for scene in (clean, dirty)]
+    fits = [ShiftDescent(*tracks_of(scene), FRAME).run(0.2) for scene in (clean, dirty)]
     assert fits[1].offset == pytest.approx(0.2, abs=5 * fits[0].sigma)
 
 
 def test_distances_are_those_of_each_frame_and_point():
     scene = filmed(8, seconds=2.0, offset=0.2, missing=0.2, generator=seeded(10))
     a, b = tracks_of(scene, 1.0)
-    fit = ShiftDescent(a, b, FRAME, options=SynchronizeOptions()).run(0.2)
-    x1, _, w1 = smoothed(a, fit.times, FRAME, options=SynchronizeOptions())
-    x2, _, w2 = smoothed(b, fit.times + fit.offset, FRAME, options=SynchronizeOptions())
+    fit = ShiftDescent(a, b, FRAME).run(0.2)
+    x1, _, w1 = smoothed(a, fit.times, FRAME)
+    x2, _, w2 = smoothed(b, fit.times + fit.offset, FRAME)
     seen = fit.distances.isfinite()
     assert int(seen.sum()) > 200
     assert float((((w1 * w2) > 0) == seen).double().mean()) > 0.95
@@ -182,15 +174,15 @@ def test_distances_are_those_of_each_frame_and_point():
 
 def test_too_little_in_common_is_none():
     a, b = tracks_of(filmed(12, seconds=2.0, generator=seeded()), 1.0)
-    assert ShiftDescent(a, b, FRAME, options=SynchronizeOptions()).run(3.0) is None
-    assert ShiftDescent(a, b, FRAME, options=SynchronizeOptions()).run(0.0).effective > 20
+    assert ShiftDescent(a, b, FRAME).run(3.0) is None
+    assert ShiftDescent(a, b, FRAME).run(0.0).effective > 20
 
 
 def test_long_takes_are_thinned():
     a, b = tracks_of(filmed(10, seconds=4.0, offset=0.2, generator=seeded(11)), 1.0)
     whole, thin = (
-        ShiftDescent(a, b, FRAME, options=SynchronizeOptions()).run(0.2),
-        ShiftDescent(a, b, FRAME, rows=300, options=SynchronizeOptions()).run(0.2),
+        ShiftDescent(a, b, FRAME).run(0.2),
+        ShiftDescent(a, b, FRAME, rows=300).run(0.2),
     )
     assert len(thin.times) <= 31 < len(whole.times)
     assert thin.offset == pytest.approx(whole.offset, abs=3 * (thin.sigma + whole.sigma))

@@ -1,6 +1,5 @@
 """A camera against motion capture: known offsets in either order, what must not matter, and what is refused."""
 
-import dataclasses
 import math
 
 import pytest
@@ -236,9 +235,8 @@ def test_points_in_a_plane_have_a_variance_and_nothing_has_none():
 
 def test_both_orders_have_the_same_moments():
     film, space = taken(16, seconds=2.0, recorded=3.0, fps=(FPS, FPS))
-    options = SynchronizeOptions()
-    a, b = (read_tracks(name, x, FPS, None, None, options) for name, x in zip("ab", (film, space), strict=True))
-    one, two = (SpaceSamples.of(*both, 1 / FPS, options=options) for both in ((a, b), (b, a)))
+    a, b = (read_tracks(name, x, FPS, None, None) for name, x in zip("ab", (film, space), strict=True))
+    one, two = (SpaceSamples.of(*both, 1 / FPS) for both in ((a, b), (b, a)))
     (first, counts), (second, back) = one.moments((-20, 30)), two.moments((-30, 20))
     assert torch.allclose(first, second.flip(0)) and torch.equal(counts, back.flip(0))
     variance, cameras = one.solved(first)
@@ -251,10 +249,9 @@ def test_both_orders_have_the_same_moments():
 @pytest.mark.parametrize("swapped", [False, True])
 def test_the_derivatives_are_those_of_the_residuals(swapped):
     film, space = taken(17, noise=0.0)
-    options = SynchronizeOptions()
-    a, b = (read_tracks(n, x, f, None, None, options) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
+    a, b = (read_tracks(n, x, f, None, None) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
     offset = -OFFSET if swapped else OFFSET
-    descent = SpaceDescent(*((b, a) if swapped else (a, b)), 1 / FPS, options=options)
+    descent = SpaceDescent(*((b, a) if swapped else (a, b)), 1 / FPS)
     at, ahead = (descent._matched(offset + d, 1.0) for d in (0.0, 1e-4))
     times = torch.zeros(len(at.p), dtype=torch.float64)
     _, camera = descent._moment_fit(at)
@@ -269,16 +266,15 @@ def test_the_derivatives_are_those_of_the_residuals(swapped):
 
 def test_options_are_those_of_two_cameras():
     film, space = taken(18)
-    strict = dataclasses.replace(SynchronizeOptions(), evidence=dataclasses.replace(SynchronizeOptions().evidence, margin=50.0))
+    strict = SynchronizeOptions(min_margin=50.0)
     assert not synchronize(film, space, fps=(FPS, RECORDED), options=strict).ok
 
 
 def test_the_steps_of_the_combined_fit_are_those_of_the_whole_problem():
     """The weights of every point are eliminated; camera, weights and shift at once have the same step."""
     film, space = taken(19, points=6, noise=1.0)
-    options = SynchronizeOptions()
-    a, b = (read_tracks(n, x, f, None, None, options) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
-    problem = _Problem.of(a, b, OFFSET, 1.0, options)
+    a, b = (read_tracks(n, x, f, None, None) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
+    problem = _Problem.of(a, b, OFFSET, 1.0)
     at = problem.evaluate(problem.started())
     damping = torch.full((1,), 0.1, dtype=torch.float64)
     camera, weights, shift = problem.step(at, damping)
@@ -304,10 +300,9 @@ def test_combinations_of_what_was_recorded_tell_the_place_between_frames(start):
     seen = motion_of(20, points=8)(OFFSET + torch.arange(120, dtype=torch.float64) / FPS)
     between = torch.stack([seen[:, [k, k + 1, k + 2]].mean(1) for k in range(6)], dim=1)
     film = seen_by(between, noise=2.0, generator=seeded(3))
-    options = SynchronizeOptions()
-    a, b = (read_tracks(n, x, f, None, None, options) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
-    found = combined_fit(a, b, OFFSET + start / FPS, 1.0, options)
+    a, b = (read_tracks(n, x, f, None, None) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
+    found = combined_fit(a, b, OFFSET + start / FPS, 1.0)
     assert abs(found.offset - OFFSET) < 0.2 / FPS and abs(found.offset - OFFSET) < 4 * found.sigma
     assert found.residual < 4 and found.weights.shape[0] == 6
-    nothing = read_tracks("a", torch.full((40, 3, 2), torch.nan), FPS, None, None, options)
-    assert combined_fit(nothing, b, 0.0, 1.0, options) is None
+    nothing = read_tracks("a", torch.full((40, 3, 2), torch.nan), FPS, None, None)
+    assert combined_fit(nothing, b, 0.0, 1.0) is None

@@ -8,14 +8,14 @@ import torch
 
 from dyntorch.core.outcome import Notice, Status
 from dyntorch.geometry.rigid import rotation_exponential
-from dyntorch.tasks.synchronize.options import ProjectiveOptions, SynchronizeOptions
+from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.projective import Poses, SharedMotion, attitude_curve, quaternions, rank_curve, rotations_of
 from dyntorch.tasks.synchronize.rigid_body import body_motion
 from dyntorch.tasks.synchronize.synchronize import synchronize
 from dyntorch.tasks.synchronize.tracks import read_tracks
 
 D = torch.float64
-FAST = ProjectiveOptions(focals=(9.0,), views=14)
+FAST = SynchronizeOptions(focal_lengths=(9.0,), num_views=14)
 
 
 def normal(seed, *shape):
@@ -103,7 +103,7 @@ def body_tracks(points=None, frames=40, turning=1.0, noise=0.3, seed=0):
 
 
 def motion_of(x):
-    return body_motion("a", read_tracks("a", x, 30.0, None, None, SynchronizeOptions()), FAST)
+    return body_motion("a", read_tracks("a", x, 30.0, None, None), FAST)
 
 
 def smooth(x):
@@ -144,4 +144,4 @@ def test_misuse_and_names():
     refused = synchronize(x[:, :4], x, correspondence=False, fps=30.0, camera="projective")
     assert not refused.ok and refused.status == Status.TOO_FEW and "6 on one body" in refused.reason
     with pytest.raises(ValueError, match="attitude or rank"):
-        synchronize(x, x, False, fps=30.0, camera="projective", options=SynchronizeOptions(projective=replace(FAST, measure="any")))
+        synchronize(x, x, False, fps=30.0, camera="projective", options=replace(FAST, body_measure="any"))

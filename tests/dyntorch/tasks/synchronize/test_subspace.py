@@ -6,8 +6,11 @@ import math
 import pytest
 import torch
 
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.subspace import (
+    HEIGHT_SAMPLE_RATE,
+    MOTION_SAMPLE_RATE,
+    NUM_JACKKNIFE_BLOCKS,
+    SHAPE_SAMPLE_RATE,
     SubspaceCurve,
     _correlated,
     _shared,
@@ -56,7 +59,7 @@ def full(x):
 
 
 def curve_of(a, b, lags=(-40, 40), step=1 / 30):
-    return subspace_curve(a, b, full(a), full(b), lags, step=step, options=SynchronizeOptions())
+    return subspace_curve(a, b, full(a), full(b), lags, step=step)
 
 
 def test_the_information_is_that_of_the_determinants():
@@ -72,8 +75,8 @@ def test_scores_are_those_of_every_overlap_by_itself():
     a, b = scene(80, 5)
     curve, one, two = (
         curve_of(a, b, (-20, 20)),
-        body_of(a, full(a), options=SynchronizeOptions()),
-        body_of(b, full(b), options=SynchronizeOptions()),
+        body_of(a, full(a)),
+        body_of(b, full(b)),
     )
     raw = []
     for lag in (-20, -3, 5, 20):
@@ -92,7 +95,7 @@ def test_scores_are_those_of_every_overlap_by_itself():
 @pytest.mark.parametrize("shift", [-17.0, -4.5, 0.0, 11.3, 23.75])
 def test_the_shift_of_different_points_is_found_between_frames(shift):
     a, b = scene(120, shift)
-    found = subspace_shift(curve_of(a, b), options=SynchronizeOptions())
+    found = subspace_shift(curve_of(a, b))
     assert found.ok
     assert not found.reason
     assert found.position == pytest.approx(shift, abs=0.3)
@@ -111,9 +114,7 @@ def test_neither_unit_nor_place_nor_order_matter():
 def test_exchanged_cameras_mirror_the_motion():
     a, b = scene(90, 7)
     assert torch.allclose(curve_of(a, b).motion, curve_of(b, a).motion.flip(0), atol=1e-9)
-    assert subspace_shift(curve_of(b, a), options=SynchronizeOptions()).position == pytest.approx(
-        -subspace_shift(curve_of(a, b), options=SynchronizeOptions()).position, abs=0.1
-    )
+    assert subspace_shift(curve_of(b, a)).position == pytest.approx(-subspace_shift(curve_of(a, b)).position, abs=0.1)
 
 
 @pytest.mark.parametrize("fps", [20, 24, 25, 60])
@@ -123,7 +124,7 @@ def test_other_frame_rates_need_their_step(fps):
     times = times[times < 118]
     before, share = times.long(), (times % 1)[:, None, None]
     coarse = [torch.lerp(x[before], x[before + 1], share) for x in (a, b)]
-    found = subspace_shift(curve_of(*coarse, (-fps, fps), step=1 / fps), step=1 / fps, options=SynchronizeOptions())
+    found = subspace_shift(curve_of(*coarse, (-fps, fps), step=1 / fps), step=1 / fps)
     assert found.position / fps == pytest.approx(9 / 30, abs=0.5 / 30)
     assert found.probability > 0.95
 
@@ -134,11 +135,7 @@ def test_evidence_is_per_second():
     counted = (
         curve.counts
         / 30
-        * (
-            SynchronizeOptions().subspace.shape_rate * curve.shape
-            + SynchronizeOptions().subspace.height_rate * curve.height
-            + SynchronizeOptions().subspace.motion_rate * curve.motion
-        )
+        * (SHAPE_SAMPLE_RATE * curve.shape + HEIGHT_SAMPLE_RATE * curve.height + MOTION_SAMPLE_RATE * curve.motion)
     )
     judged = curve.scores.isfinite()
     assert torch.allclose(curve.scores[judged], counted[judged], atol=1e-9)
@@ -152,8 +149,7 @@ def test_missing_blocks_are_filled_from_the_other_points():
         wb[12 * j + 5 : 12 * j + 30, j] = 0
     spoiled = torch.where(wa[..., None] > 0, a, torch.nan)
     found = subspace_shift(
-        subspace_curve(spoiled, b + 1e3 * (wb == 0)[..., None], wa, wb, (-40, 40), options=SynchronizeOptions()),
-        options=SynchronizeOptions(),
+        subspace_curve(spoiled, b + 1e3 * (wb == 0)[..., None], wa, wb, (-40, 40)),
     )
     assert found.ok
     assert found.position == pytest.approx(9.5, abs=0.4)
@@ -165,7 +161,7 @@ def test_completed_positions_are_near_the_true_ones():
     for j in range(10):
         seen[14 * j : 14 * j + 12, j] = False
     start = torch.where(seen[..., None], a, a.mean(0))
-    error = (completed(start, seen, options=SynchronizeOptions()) - a)[~seen].norm(dim=-1)
+    error = (completed(start, seen) - a)[~seen].norm(dim=-1)
     assert float(error.median()) < 0.05 * float((start - a)[~seen].norm(dim=-1).median())
 
 
@@ -173,9 +169,9 @@ def test_frames_that_nobody_is_seen_in_do_not_count():
     a, b = scene(130, 6)
     wa = full(a)
     wa[50:70] = 0
-    curve = subspace_curve(a, b, wa, full(b), (-30, 30), options=SynchronizeOptions())
+    curve = subspace_curve(a, b, wa, full(b), (-30, 30))
     assert curve.counts[30] == 106
-    assert subspace_shift(curve, options=SynchronizeOptions()).position == pytest.approx(6, abs=0.4)
+    assert subspace_shift(curve).position == pytest.approx(6, abs=0.4)
 
 
 def repeated(period, frames, points, key, start=0.0):
@@ -189,7 +185,7 @@ def repeated(period, frames, points, key, start=0.0):
 @pytest.mark.parametrize("seed", range(8))
 def test_motion_that_repeats_itself_is_refused(seed):
     a, b = repeated(20 + 2 * seed, 120, 8, 100 + seed), repeated(20 + 2 * seed, 120, 8, 200 + seed, start=-9.3)
-    found = subspace_shift(curve_of(a, b, (-60, 60)), options=SynchronizeOptions())
+    found = subspace_shift(curve_of(a, b, (-60, 60)))
     assert not found.ok
     assert "shifts" in found.reason or "motion" in found.reason
     assert len(found.peaks) > 1
@@ -199,18 +195,18 @@ def test_motion_that_repeats_itself_is_refused(seed):
 def test_repeated_motion_whose_periods_happen_to_differ_is_refused(seed):
     period = 18 + (seed % 29) * 1.13
     a, b = repeated(period, 120, 8, 100003 + 7 * seed), repeated(period, 120, 8, 500009 + 7 * seed, start=-9.3 + seed % 11)
-    assert not subspace_shift(curve_of(a, b, (-60, 60)), options=SynchronizeOptions()).ok
+    assert not subspace_shift(curve_of(a, b, (-60, 60))).ok
 
 
 def test_repeated_motion_resembles_itself_and_other_motion_does_not():
     moving, turning = curve_of(*scene(120, 5)), curve_of(repeated(30, 120, 8, 3), repeated(30, 120, 8, 4, start=-7))
-    assert resemblance(moving, 45, 3, options=SynchronizeOptions()) < 0.6
-    assert resemblance(turning, 47, 3, options=SynchronizeOptions()) > 0.8
+    assert resemblance(moving, 45, 3) < 0.6
+    assert resemblance(turning, 47, 3) > 0.8
 
 
 def test_halves_share_the_point_in_the_middle_only():
-    body = body_of(uniform(0, 40, 7, 2), full(uniform(0, 40, 7, 2)), options=SynchronizeOptions())
-    first, second = halves(body, options=SynchronizeOptions())
+    body = body_of(uniform(0, 40, 7, 2), full(uniform(0, 40, 7, 2)))
+    first, second = halves(body)
     assert first.points.shape[1] + second.points.shape[1] == 8
     assert len({tuple(p.tolist()) for half in (first, second) for p in half.points[0]}) == 7
 
@@ -219,7 +215,7 @@ def test_the_jackknife_is_that_of_blocks_left_out():
     a, b = scene(120, 5, noise=1.0)
     curve = curve_of(a, b)
     one, two = curve.bodies
-    edges = torch.linspace(0, 116 - 6, SynchronizeOptions().different.blocks + 1).round().long().tolist()
+    edges = torch.linspace(0, 116 - 6, NUM_JACKKNIFE_BLOCKS + 1).round().long().tolist()
     slopes, bends = [], []
     for start, end in itertools.pairwise(edges):
         told = []
@@ -228,24 +224,13 @@ def test_the_jackknife_is_that_of_blocks_left_out():
             parts = [torch.cat([x[kept], y[kept + lag]], dim=1) for x, y in ((one.rows, two.rows), (one.motion, two.motion))]
             shape, motion = (torch.cov(part.T, correction=0)[None] for part in parts)
             blocks = shape[:, :14, :14], shape[:, 14:, 14:], shape[:, :14, 14:]
-            told.append(
-                SynchronizeOptions().subspace.shape_rate * _shared(*blocks)
-                + SynchronizeOptions().subspace.height_rate * _shared(*_vertical(blocks, (2, 2)))
-            )
-            told[-1] = float(
-                told[-1]
-                + SynchronizeOptions().subspace.motion_rate
-                * _correlated(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:], options=SynchronizeOptions())
-            )
+            told.append(SHAPE_SAMPLE_RATE * _shared(*blocks) + HEIGHT_SAMPLE_RATE * _shared(*_vertical(blocks, (2, 2))))
+            told[-1] = float(told[-1] + MOTION_SAMPLE_RATE * _correlated(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:]))
         slopes.append((told[2] - told[0]) / 2)
         bends.append(told[0] - 2 * told[1] + told[2])
-    places = torch.tensor(slopes).double() / (-sum(bends) / SynchronizeOptions().different.blocks)
-    spread = math.sqrt(
-        (SynchronizeOptions().different.blocks - 1)
-        / SynchronizeOptions().different.blocks
-        * float((places - places.mean()).square().sum())
-    )
-    assert wobble(curve, 5, options=SynchronizeOptions()) == pytest.approx(spread, rel=1e-6)
+    places = torch.tensor(slopes).double() / (-sum(bends) / NUM_JACKKNIFE_BLOCKS)
+    spread = math.sqrt((NUM_JACKKNIFE_BLOCKS - 1) / NUM_JACKKNIFE_BLOCKS * float((places - places.mean()).square().sum()))
+    assert wobble(curve, 5) == pytest.approx(spread, rel=1e-6)
 
 
 def test_noise_that_keeps_for_some_frames_is_told_by_sigma():
@@ -253,7 +238,7 @@ def test_noise_that_keeps_for_some_frames_is_told_by_sigma():
     for seed in range(8):
         a, b = scene(120, 6.4, seed=100 * seed)
         slow = [3 * smooth(normal(7 + seed + k, *x.shape), 4.0) for k, x in enumerate((a, b))]
-        found = subspace_shift(curve_of(a + slow[0], b + slow[1], (-25, 25)), options=SynchronizeOptions())
+        found = subspace_shift(curve_of(a + slow[0], b + slow[1], (-25, 25)))
         errors.append(abs(found.position - 6.4))
         sigmas.append(found.sigma)
     ratio = torch.tensor(errors) / torch.tensor(sigmas)
@@ -264,14 +249,14 @@ def test_noise_that_keeps_for_some_frames_is_told_by_sigma():
 @pytest.mark.parametrize("seed", range(8))
 def test_noise_without_motion_is_refused(seed):
     a, b = (100 * normal(key, 1, 8, 2) + normal(key + 50, 100, 8, 2) for key in (seed, seed + 500))
-    found = subspace_shift(curve_of(a, b), options=SynchronizeOptions())
+    found = subspace_shift(curve_of(a, b))
     assert not found.ok
     assert found.reason
 
 
 def test_too_short_an_overlap_is_refused_without_a_number_that_is_not():
     a, b = scene(20, 0)
-    found = subspace_shift(curve_of(a, b, (-10, 10)), options=SynchronizeOptions())
+    found = subspace_shift(curve_of(a, b, (-10, 10)))
     assert (found.ok, found.position, len(found.peaks)) == (False, 0.0, 0)
     assert "overlap" in found.reason
 
@@ -279,22 +264,20 @@ def test_too_short_an_overlap_is_refused_without_a_number_that_is_not():
 @pytest.mark.parametrize("frames", [1, 2, 3, 30])
 def test_nothing_seen_is_refused(frames):
     x = torch.full((frames, 3, 2), torch.nan, dtype=torch.float64)
-    found = subspace_shift(
-        subspace_curve(x, x, full(x) * 0, full(x) * 0, (-5, 5), options=SynchronizeOptions()), options=SynchronizeOptions()
-    )
+    found = subspace_shift(subspace_curve(x, x, full(x) * 0, full(x) * 0, (-5, 5)))
     assert not found.ok
 
 
 def test_a_point_that_stands_still_is_no_evidence_and_no_trouble():
     a = torch.zeros(100, 5, 2, dtype=torch.float64)
-    found = subspace_shift(curve_of(a, a), options=SynchronizeOptions())
+    found = subspace_shift(curve_of(a, a))
     assert not found.ok
 
 
 def test_the_parabola_and_the_posterior_of_a_known_curve():
     lags = torch.arange(-30, 31).double()
     scores, counts = 30 - 0.5 * (lags - 3.4) ** 2 / 0.2, torch.full((61,), 100.0, dtype=torch.float64)
-    found = subspace_shift(SubspaceCurve(lags, scores, counts, scores, scores, scores, (5.0, 5.0)), options=SynchronizeOptions())
+    found = subspace_shift(SubspaceCurve(lags, scores, counts, scores, scores, scores, (5.0, 5.0)))
     assert found.position == pytest.approx(3.4, abs=1e-9)
     weights = torch.softmax(scores, 0)
     assert found.probability == pytest.approx(float(weights[32:35].sum()), abs=1e-9)
