@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from experiments.calibration.rigs import BODY, Motion, Rig, RigSpec, motions, virtual_rig
 from experiments.common.tables import NoiseConfig, command, noise_tables
-from indexing.calibrate.sides import LIMBS, sided, sides
+from indexing.calibrate.left_right import LIMBS, correct_sides, paired_joints
 
 WORDS = {
     "humerus": "elbow", "radius": "wrist", "wrist": "hand", "femur": "knee", "tibia": "ankle", "foot": "heel", "toes": "big_toe",
@@ -64,7 +64,7 @@ def turned(rig: Rig, exchanged: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
     for track, flags in zip(out, exchanged, strict=True):
         for k, limb in enumerate(LIMBS):
             rows = np.flatnonzero(flags[:, k])
-            for left, right in sided(JOINTS)[limb]:
+            for left, right in paired_joints(JOINTS)[limb]:
                 track[rows, left], track[rows, right] = track[rows, right].copy(), track[rows, left].copy()
     return out
 
@@ -72,7 +72,7 @@ def turned(rig: Rig, exchanged: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
 def line(cameras: int, case: str, config: Config, bodies: list[Motion]) -> Sequence[str]:
     """A line of the table."""
     given, mended, seconds = [], [], []
-    there = [k for k, limb in enumerate(LIMBS) if sided(JOINTS)[limb]]
+    there = [k for k, limb in enumerate(LIMBS) if paired_joints(JOINTS)[limb]]
     for seed in range(2 if config.quick else config.scenes):
         rig = virtual_rig(config.seed + seed, RigSpec(cameras=cameras), bodies)
         exchanged = drawn(np.random.default_rng([config.seed + seed, cameras]), case, cameras, len(rig.tracks[0]))
@@ -80,7 +80,7 @@ def line(cameras: int, case: str, config: Config, bodies: list[Motion]) -> Seque
             K=rig.K, R=rig.R, t=rig.t, distortion=rig.distortion, clocks=SimpleNamespace(offsets=rig.offsets, rates=rig.rates)
         )
         begun = time.process_time()
-        found = sides(turned(rig, exchanged), known, JOINTS)
+        found = correct_sides(turned(rig, exchanged), known, JOINTS)
         seconds.append(time.process_time() - begun)
         answer = np.stack([one[:, 0] for one in found.exchanged])
         given.append(float(exchanged[..., there].mean()))

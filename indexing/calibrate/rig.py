@@ -1,9 +1,13 @@
-"""What calibrate() returns: the cameras, the clocks and the movement in space, with the names of everything."""
+"""Cameras that were calibrated from the people in view: the result, and the files that other programs read."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import json
+import re
+import secrets
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,15 +17,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.numerics import as_python, worded
-from indexing.calibrate.lenses import KnownLenses
-from indexing.calibrate.stature import Stature
-from indexing.calibrate.views import Joints, View
+from indexing.calibrate.body_height import Stature
+from indexing.calibrate.camera_views import Joints, View
+from indexing.calibrate.priors import KnownLenses
 from indexing.clip import Clip, ClipSet
+from indexing.files import recover_folder, replace_folder, write_text
 from indexing.opening import count
+from indexing.sync.files import Plan, openpose_files, plan, renumbered
 
 if TYPE_CHECKING:
     from dyntorch import Calibration
-    from indexing.calibrate.sides import SideExchange
+    from indexing.calibrate.camera_views import View
+    from indexing.calibrate.left_right import SideExchange
 
 FloatArray = NDArray[np.float64]
 UNKNOWN_UNIT = "unknown"
@@ -67,7 +74,7 @@ class CameraRig:
     @property
     def reason(self) -> str:
         """Why not, and what to do; empty where they do."""
-        return "" if self.ok else str(self.spoken.refusal(self.words))
+        return "" if self.ok else str(self.with_camera_names.refusal(self.words))
 
     @property
     def state(self) -> str:
@@ -87,7 +94,7 @@ class CameraRig:
         return self
 
     @functools.cached_property
-    def spoken(self) -> Calibration:
+    def with_camera_names(self) -> Calibration:
         """The calibration, whose notices call the cameras by name."""
         names = {str(number): name for number, name in enumerate(self.names)}
         said = tuple(notice.named(names) for notice in self.calibration.notices)
@@ -124,14 +131,14 @@ class CameraRig:
     @functools.cached_property
     def notes(self) -> list[str]:
         """What a reader should know besides, a sentence each."""
-        own = [str(notice.worded(self.words).text) for notice in self.spoken.notices if _is_note(notice)]
+        own = [str(notice.worded(self.words).text) for notice in self.with_camera_names.notices if _is_note(notice)]
         known = [*self.remarks, *self.lenses.notes, *([self.stature.note] if self.stature is not None else [])]
         return list(dict.fromkeys([*(worded(note, self.words) for note in known), *own]))
 
     @functools.cached_property
     def unknown(self) -> list[str]:
         """What cannot be known from these recordings, a sentence each."""
-        open_ = [str(notice.worded(self.words).text) for notice in self.spoken.notices if notice.code.value in OPEN]
+        open_ = [str(notice.worded(self.words).text) for notice in self.with_camera_names.notices if notice.code.value in OPEN]
         return [
             *open_,
             f"where in the world the rig stands: the origin is on the ground below the people, y is ahead of {self.names[0]}",
@@ -182,28 +189,12 @@ class CameraRig:
         return ClipSet(self.check().people, "people in space").save(path, units)
 
     def save_cameras(self, path: str | Path) -> Path:
-        """Write the cameras as Pose2Sim and AniPose read them; see :mod:`indexing.calibrate.writing`.
+        """Write the cameras as Pose2Sim and AniPose read them; a section for each, with all digits of every number.
 
         Raises:
             ValueError: the data do not decide, or the file cannot be written.
         """
-        from indexing.calibrate.writing import toml_of
-        from indexing.files import write_text
-
         return write_text(path, toml_of(self.check()))
-
-    def write(self, folder: str | Path, title: str = "") -> Path:
-        """Write everything: cameras, movement, figures and the report; see :mod:`indexing.report.calibration`.
-
-        Returns:
-            the path of ``report.html``.
-
-        Raises:
-            ValueError: the folder or a file in it cannot be written, or is somebody else's.
-        """
-        from indexing.report.calibration import CalibrationReport, write_calibration
-
-        return write_calibration(folder, CalibrationReport(self, heading=title))[0]
 
     def __repr__(self) -> str:
         state = "ok" if self.ok else f"refused: {self.reason}"
@@ -216,3 +207,137 @@ class CameraRig:
 def _is_note(notice: Any) -> bool:
     """Whether a notice refuses nothing, and is not told with what cannot be known."""
     return notice.code.refuses is None and notice.code.value not in OPEN
+
+
+CALIBRATION = "Calib_dyntorch.toml"
+ASSOCIATED = "pose-associated"
+OTHERS = ("metadata", "capture_volume", "charuco", "checkerboard")
+"""Sections of such files that are no cameras."""
+
+
+def toml_of(rig: CameraRig) -> str:
+    """A section for each camera, in the order in which Pose2Sim has their folders, with all digits of every number."""
+    found = rig.calibration
+    turns = rotation_vectors(found.R.numpy())
+    order = sorted(range(len(rig.names)), key=lambda i: _natural(rig.names[i]))
+    lines: list[str] = []
+    for i in order:
+        bent = found.distortion[i].tolist()
+        lines += [
+            f"[{_key(rig.names[i])}]",
+            f"name = {_text(rig.names[i])}",
+            f"size = {_numbers(found.sizes[i].tolist())}",
+            f"matrix = [ {', '.join(_numbers(row) for row in found.K[i].tolist())} ]",
+            f"distortions = {_numbers(bent if any(bent[4:]) else bent[:4])}",
+            f"rotation = {_numbers(turns[i].tolist())}",
+            f"translation = {_numbers(found.t[i].tolist())}",
+            "fisheye = false",
+            "",
+        ]
+    error = float(found.residuals[found.residuals.isfinite()].median()) if bool(found.residuals.isfinite().any()) else 0.0
+    lines += [
+        "[metadata]", "adjusted = true", f"error = {error!r}", f"units = {_text(rig.units)}",
+        f"up = {_text('z' if found.upright else 'z, by the cameras')}", 'generated_by = "dyntorch calibrate"',
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def rotation_vectors(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``(cameras, 3)`` axes times angles in radians of rotations ``(cameras, 3, 3)``; NaN where there is none."""
+    from scipy.spatial.transform import Rotation
+
+    known = np.isfinite(R).all(axis=(1, 2))
+    out = np.full((len(R), 3), np.nan)
+    if known.any():
+        out[known] = Rotation.from_matrix(R[known]).as_rotvec()
+    return out
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return f"[ {', '.join(repr(float(value)) for value in values)} ]"
+
+
+def _key(name: str) -> str:
+    """A section's name, quoted where it is no bare word, and another one where it would be no camera."""
+    name = f"{name}_camera" if name in OTHERS else name
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _text(name)
+
+
+def _text(value: str) -> str:
+    """A string of TOML; what is no text in UTF-8 becomes a question mark."""
+    return json.dumps(value.encode("utf-8", "replace").decode(), ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """A key that sorts cam2 before cam10."""
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part.lower()) for part in re.split(r"(\d{1,18})", name) if part]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Keypoint files of all cameras: equal frame numbers are equal moments, and person 1 is the same one in all of them.
+
+
+def write_associated(folder: Path, rig: CameraRig) -> dict[str, dict[str, Any]]:
+    """Write ``pose-associated/<camera>_json/`` for every camera: all of them, or nothing."""
+    target = folder / ASSOCIATED
+    recover_folder(target)
+    building = folder / f".{ASSOCIATED}-{secrets.token_hex(8)}.tmp"
+    clocks = rig.calibration.clocks
+    done: dict[str, dict[str, Any]] = {}
+    try:
+        for i, view in enumerate(rig.views):
+            one = plan(view.take, float(clocks.offsets[i]), float(clocks.rates[i]), rig.views[0].take.fps)
+            name = f"{view.name}_json"
+            if len(one.rows):
+                _write_camera(building / name, view, one)
+            done[view.name] = {
+                "folder": f"{ASSOCIATED}/{name}",
+                "files": len(one.numbers),
+                "rest": one.rest,
+                "left_out": one.before,
+            }
+        replace_folder(building, target)
+    except OSError as problem:
+        raise ValueError(
+            f"cannot write {str(target)!r} ({problem.strerror or problem}); free the name or the disk, or choose another folder"
+        ) from problem
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+    return done
+
+
+def _write_camera(folder: Path, view: View, one: Plan) -> None:
+    folder.mkdir(parents=True)
+    texts = _frames(view)
+    sources = openpose_files(one.take.path)
+    by_row = {}
+    if sources:
+        by_number = {int(np.rint(time * one.take.fps)): row for row, time in enumerate(one.take.times)}
+        by_row = {by_number[number]: path.name for number, path in sources.items() if number in by_number}
+    for number, row in zip(one.numbers.tolist(), one.rows.tolist(), strict=True):
+        name = renumbered(by_row[row], number) if row in by_row else f"{view.name}_{number:06d}.json"
+        (folder / name).write_text(texts[row], encoding="utf-8")
+
+
+def _frames(view: View) -> list[str]:
+    """One text per frame of the recording, all people in each."""
+    times = view.take.times
+    joints = next(clip.joints.shape[1] for clip in view.people if clip is not None)
+    tables = np.zeros((len(times), len(view.people), joints, 3))
+    for who, clip in enumerate(view.people):
+        if clip is not None:
+            rows, seen = np.searchsorted(times, clip.times), clip.seen
+            trust = seen.astype(np.float64) if clip.confidence is None else np.asarray(clip.confidence, dtype=np.float64)
+            tables[rows, who] = np.where(seen[..., None], np.concatenate([clip.joints, trust[..., None]], axis=2), 0.0)
+    return [
+        json.dumps({
+            "version": 1.3,
+            "people": [{"person_id": [who], "pose_keypoints_2d": flat.ravel().tolist()} for who, flat in enumerate(frame)],
+        })
+        for frame in tables
+    ]  # fmt: skip
+
+
+def drop_associated(folder: Path) -> None:
+    """Remove the keypoint files of an earlier run, which this one did not write again."""
+    shutil.rmtree(folder / ASSOCIATED, ignore_errors=True)

@@ -18,7 +18,7 @@ from indexing.cli.films import Watched, Watching
 from indexing.cli.inputs import Format, refuse_range
 
 if TYPE_CHECKING:
-    from indexing.calibrate import CameraRig, Known
+    from indexing.calibrate import CameraRig, RigPriors
     from indexing.report.calibration import CalibrationReport
     from indexing.sync.recordings import Take
 
@@ -115,7 +115,7 @@ class Calibrate:
 
     def _check(self) -> str | None:
         """Raise on flags that make no sense by themselves, before any file is read; the clocks that were given."""
-        from indexing.calibrate.stature import check_height
+        from indexing.calibrate.body_height import check_height
 
         if self.max_shift is not None and not 0 < self.max_shift < math.inf:
             raise ValueError(f"--max-shift must be a positive number of seconds, got {self.max_shift:g}")
@@ -176,11 +176,11 @@ class Calibrate:
         except ValueError as problem:
             raise ValueError(worded(problem, WORDS)) from problem
 
-    def _known(self, cameras: int, clocks: str | None) -> Known:
-        from indexing.calibrate import Known
+    def _known(self, cameras: int, clocks: str | None) -> RigPriors:
+        from indexing.calibrate import RigPriors
 
         focal = self._numbers("focal", cameras)
-        return Known(
+        return RigPriors(
             focal=None if self.focal is None else [value for value in focal if value is not None],
             one_lens=self.one_lens,
             calibration=None if self.calibration is None else self.calibration.expanduser(),
@@ -193,11 +193,13 @@ class Calibrate:
         )
 
     def _solve(self, takes: list[Take], clocks: str | None, watched: Watched) -> CameraRig:
-        from indexing.calibrate import solve
+        from indexing.calibrate import calibrate_recordings
 
         people = self.footage.people if self.person == "everyone" else 1
         try:
-            rig = solve(takes, self._known(len(takes), clocks), sizes=self._sizes(len(takes)), people=people, words=WORDS)
+            rig = calibrate_recordings(
+                takes, self._known(len(takes), clocks), sizes=self._sizes(len(takes)), people=people, words=WORDS
+            )
         except ValueError as problem:
             raise ValueError(worded(problem, WORDS)) from problem
         return dataclasses.replace(rig, remarks=(*watched.notes, *rig.remarks))

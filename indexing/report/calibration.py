@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing import files
-from indexing.calibrate.writing import ASSOCIATED, CALIBRATION, drop_associated, rotation_vectors, toml_of, write_associated
+from indexing.calibrate.rig import ASSOCIATED, CALIBRATION, drop_associated, rotation_vectors, toml_of, write_associated
 from indexing.opening import parse_json, read_bytes, read_text
 from indexing.report.page import Picture, Script, even, markup, render, sentence, write_files
 from indexing.report.rig import array_of, heat_picture, plan_picture, scene
 
 if TYPE_CHECKING:
+    from indexing.calibrate.left_right import SideExchange
     from indexing.calibrate.rig import CameraRig
-    from indexing.calibrate.sides import SideExchange
 
 FloatArray = NDArray[np.float64]
 JSON, PAGE, PLAN, HEAT, PEOPLE = "calibration.json", "report.html", "rig.png", "residuals.png", "keypoints_3d"
@@ -185,7 +185,7 @@ def as_json(report: CalibrationReport, names: Sequence[str] = ()) -> dict[str, A
         "notices": [
             {"code": notice.code.value, "value": notice.value, "message": notice.worded(rig.words).text,
              "refuses": notice.code.refuses is not None}
-            for notice in rig.spoken.notices
+            for notice in rig.with_camera_names.notices
         ],
         "notes": report.notes,
         "files": sorted(names),

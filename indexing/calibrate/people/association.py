@@ -10,13 +10,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from dyntorch.core import Notice, status_from
-from dyntorch.numerics import check_options
-from indexing.calibrate.people.doubts import alike, certainties, cut_again, strangers
-from indexing.calibrate.people.options import AssociationOptions
-from indexing.calibrate.people.relations import PieceView, view
+from indexing.calibrate.people.assignment import (
+    Assignment,
+    assign,
+    calibrated_pairs,
+    certainties,
+    estimate_clocks,
+    estimate_spanning_tree,
+    find_ambiguous_people,
+    find_unrelated_cameras,
+    identities,
+    split_inconsistent,
+)
+from indexing.calibrate.people.pair_geometry import MIN_SEED_SECONDS, PieceView, arrange
 from indexing.calibrate.people.result import Association, PeopleNotice, TrackExchange
-from indexing.calibrate.people.sorting import Sorting, calibrated, everybody_clocks, identities, sorted_out, tree
-from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Floats, Integers, cut, sightings
+from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Floats, Integers, sightings, split_tracks
 from indexing.clip import Clip
 from indexing.joints import named, places
 from indexing.sync.recordings import Take
@@ -24,13 +32,17 @@ from indexing.sync.recordings import Take
 if TYPE_CHECKING:
     from dyntorch import Calibration, Clocks
 
+MIN_COMMON_JOINTS = 8  # of the same name in all cameras, as in synchronize
+MAX_SPLITS = 3  # times that tracklets are split where other cameras see two people in them
+MIN_REPORTED_SHARE = 0.02  # of the detections that are nobody
+MAX_LISTED_TIMES = 4  # in a notice
+
 
 def associate(
     takes: Sequence[Take | Clip | Sequence[Clip]],
     clocks: Clocks | ArrayLike | None = None,
     *,
     calibration: Calibration | None = None,
-    options: AssociationOptions = AssociationOptions(),
 ) -> Association:
     r"""Who is who in cameras that nobody calibrated, by the epipolar distance over time.
 
@@ -52,7 +64,6 @@ def associate(
         calibration: the cameras where they are known, for a second and surer pass: clocks (unless they are given) and fundamental
             matrices are theirs, and distances those of pixels without lens distortion.  The Sampson distance is then the
             reprojection error of the point that two cameras see, to first order.
-        options: every number that decides, by stage.
 
     Returns:
         The people of all cameras in one order; refused where clocks or identities are not decided.
@@ -76,37 +87,36 @@ def associate(
         >>> found.people, found.tracks[0][0].tolist() == found.tracks[1][0][::-1].tolist()
         (2, True)
     """
-    check_options(options, AssociationOptions)
     everyone, names = _people(takes)
-    joints = _common_joints(everyone, names, options)
+    joints = _common_joints(everyone, names)
     seen = [sightings(clips, name, places_) for clips, name, places_ in zip(everyone, names, joints, strict=True)]
     if calibration is not None:
         _check_cameras(calibration, len(seen))
-        seen = [_straight(one, calibration, camera) for camera, one in enumerate(seen)]
+        seen = [_undistort(one, calibration, camera) for camera, one in enumerate(seen)]
         clocks = calibration.clocks if clocks is None else clocks
     known = None if clocks is None else _clock_table(clocks, len(seen))
-    views = [view(one, cut(one, options)) for one in seen]
+    views = [arrange(one, split_tracks(one)) for one in seen]
     if not any(len(one.pieces) for one in views):
-        empty = Sorting(views, {}, np.zeros(0, dtype=np.int64))
-        return _result(everyone, empty, clocks, np.tile([0.0, 1.0], (len(seen), 1)), [_nobody(options)], options)
+        empty = Assignment(views, {}, np.zeros(0, dtype=np.int64))
+        return _result(everyone, empty, clocks, np.tile([0.0, 1.0], (len(seen), 1)), [_nobody_notice()])
     if calibration is None or known is None:
-        times, relations, lost = tree(views, known, options)
+        times, relations, lost = estimate_spanning_tree(views, known)
     else:
-        times, relations, lost = known, calibrated(views, known, calibration, options), []
-    sorting = sorted_out(views, times, relations, options)
+        times, relations, lost = known, calibrated_pairs(views, known, calibration), []
+    sorting = assign(views, times, relations)
     limits: list[Notice] = []
     if known is None:
-        clocks, times, limits = everybody_clocks(sorting, times, lost, options)
-        sorting = sorted_out(sorting.views, times, sorting.relations, options)
-    for _ in range(options.clusters.cuts):
-        views, changed = cut_again(sorting, options)
+        clocks, times, limits = estimate_clocks(sorting, times, lost)
+        sorting = assign(sorting.views, times, sorting.relations)
+    for _ in range(MAX_SPLITS):
+        views, changed = split_inconsistent(sorting)
         if not changed:
             break
-        sorting = sorted_out(views, times, sorting.relations, options)
+        sorting = assign(views, times, sorting.relations)
     if calibration is None:
-        lost = sorted({*lost, *strangers(sorting, options)})
-    limits += _lost(lost, names) + alike(sorting, names, options)
-    return _result(everyone, sorting, clocks, times, limits, options)
+        lost = sorted({*lost, *find_unrelated_cameras(sorting)})
+    limits += _unrelated_notice(lost, names) + find_ambiguous_people(sorting, names)
+    return _result(everyone, sorting, clocks, times, limits)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -137,7 +147,7 @@ def _people(takes: Sequence[Take | Clip | Sequence[Clip]]) -> tuple[list[list[Cl
     return people, names
 
 
-def _common_joints(everyone: Sequence[Sequence[Clip]], names: Sequence[str], options: AssociationOptions) -> list[list[int]]:
+def _common_joints(everyone: Sequence[Sequence[Clip]], names: Sequence[str]) -> list[list[int]]:
     """Per camera the places of the joints that all have, in one order."""
     first = [clips[0] for clips in everyone]
     for name, clips, one in zip(names, everyone, first, strict=True):
@@ -157,10 +167,10 @@ def _common_joints(everyone: Sequence[Sequence[Clip]], names: Sequence[str], opt
     layouts = [skeleton for skeleton in skeletons if skeleton is not None]
     rows = [places(own, layouts[0]) for own in layouts]
     shared = [k for k in range(len(layouts[0].joints)) if all(row[k] >= 0 for row in rows)]
-    if len(shared) < options.pieces.common:
+    if len(shared) < MIN_COMMON_JOINTS:
         layouts_ = ", ".join(sorted({layout.name for layout in layouts}))
         raise ValueError(
-            f"joints: the cameras ({layouts_}) have {len(shared)} joints of the same name, {options.pieces.common} are needed; "
+            f"joints: the cameras ({layouts_}) have {len(shared)} joints of the same name, {MIN_COMMON_JOINTS} are needed; "
             "use one pose model for all"
         )
     return [[row[k] for k in shared] for row in rows]
@@ -185,7 +195,7 @@ def _check_cameras(calibration: Calibration, cameras: int) -> None:
         raise ValueError(f"calibration: is of {len(calibration.K)} cameras, and there are {cameras} takes; give one for each")
 
 
-def _straight(seen: CameraSightings, calibration: Calibration, camera: int) -> CameraSightings:
+def _undistort(seen: CameraSightings, calibration: Calibration, camera: int) -> CameraSightings:
     """Without the distortion of the lens."""
     import torch
 
@@ -200,50 +210,49 @@ def _straight(seen: CameraSightings, calibration: Calibration, camera: int) -> C
     return replace(seen, places=np.where(known[..., None], straight, np.nan), trust=np.where(known, seen.trust, 0.0))
 
 
-def _nobody(options: AssociationOptions) -> Notice:
-    return Notice(PeopleNotice.NOBODY, options.geometry.shortest)
+def _nobody_notice() -> Notice:
+    return Notice(PeopleNotice.NOBODY, MIN_SEED_SECONDS)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What is returned.
 
 
-def _lost(lost: Sequence[int], names: Sequence[str]) -> list[Notice]:
+def _unrelated_notice(lost: Sequence[int], names: Sequence[str]) -> list[Notice]:
     return [Notice(PeopleNotice.LOST, float(len(lost)), {"names": ", ".join(names[k] for k in lost)})] if lost else []
 
 
 def _result(
     everyone: Sequence[Sequence[Clip]],
-    sorting: Sorting,
+    sorting: Assignment,
     clocks: Any,
     times: Floats,
     limits: list[Notice],
-    options: AssociationOptions,
 ) -> Association:
     from dyntorch import Clocks
 
-    kept = identities(sorting, options)
-    if not kept and not limits:
-        limits = [_nobody(options)]
-    certain = certainties(sorting, options) if len(sorting.labels) else np.zeros(0)
+    groups = identities(sorting)
+    if not groups and not limits:
+        limits = [_nobody_notice()]
+    certain = certainties(sorting) if len(sorting.labels) else np.zeros(0)
     joints, confidence, tracks, certainty, left_out, exchanges = [], [], [], [], [], []
-    said: list[Notice] = []
+    notices: list[Notice] = []
     for camera, (one, clips) in enumerate(zip(sorting.views, everyone, strict=True)):
         frames, own = len(one.times), sorting.of(camera)
         place = np.full(len(own) + 1, -1)
-        for k, group in enumerate(kept):
+        for k, group in enumerate(groups):
             place[:-1][own == group] = k
         person = place[one.piece]
         rows, slots = np.nonzero(person >= 0)
-        track = np.full((frames, len(kept)), -1, dtype=np.int64)
+        track = np.full((frames, len(groups)), -1, dtype=np.int64)
         track[rows, person[rows, slots]] = one.track[rows, slots]
-        sure = np.full((frames, len(kept)), np.nan)
+        sure = np.full((frames, len(groups)), np.nan)
         sure[rows, person[rows, slots]] = certain[sorting.starts[camera] :][one.piece[rows, slots]]
-        x, w = _of_tracks(one.seen, clips, track)
+        x, w = _gather_joints(one.seen, clips, track)
         missed: Booleans = np.asarray(one.seen.trust.any(2))
         missed[rows, one.track[rows, slots]] = False
-        moments = [TrackExchange(camera, k, *row) for k in range(len(kept)) for row in _exchanges(one.times, track[:, k])]
-        said += _told(one, camera, moments, missed, options)
+        moments = [TrackExchange(camera, k, *row) for k in range(len(groups)) for row in _exchanges(one.times, track[:, k])]
+        notices += _camera_notices(one, camera, moments, missed)
         joints.append(x)
         confidence.append(w)
         tracks.append(track)
@@ -252,7 +261,7 @@ def _result(
         exchanges += moments
     return Association(
         status=status_from(limits),
-        notices=(*limits, *said),
+        notices=(*limits, *notices),
         names=tuple(one.seen.name for one in sorting.views),
         times=tuple(one.times for one in sorting.views),
         joints=tuple(joints),
@@ -269,13 +278,13 @@ def _result(
     )
 
 
-def _of_tracks(seen: CameraSightings, clips: Sequence[Clip], track: Integers) -> tuple[Floats, Floats]:
+def _gather_joints(seen: CameraSightings, clips: Sequence[Clip], track: Integers) -> tuple[Floats, Floats]:
     """All joints of a camera's clips in the order of identities, and what the detector trusts them."""
     whole = sightings(clips, seen.name)
-    chosen = np.maximum(track, 0)
+    clip_index = np.maximum(track, 0)
     rows = np.arange(len(track))[:, None]
     there = (track >= 0)[..., None]
-    return np.where(there[..., None], whole.places[rows, chosen], np.nan), np.where(there, whole.trust[rows, chosen], 0.0)
+    return np.where(there[..., None], whole.places[rows, clip_index], np.nan), np.where(there, whole.trust[rows, clip_index], 0.0)
 
 
 def _exchanges(times: Floats, track: Integers) -> list[tuple[float, int, int]]:
@@ -284,18 +293,16 @@ def _exchanges(times: Floats, track: Integers) -> list[tuple[float, int, int]]:
     return [(float(times[rows[k]]), int(track[rows[k - 1]]), int(track[rows[k]])) for k in changed]
 
 
-def _told(
-    one: PieceView, camera: int, moments: Sequence[TrackExchange], missed: Booleans, options: AssociationOptions
-) -> list[Notice]:
+def _camera_notices(one: PieceView, camera: int, moments: Sequence[TrackExchange], missed: Booleans) -> list[Notice]:
     """What a user should know of a camera."""
-    found = []
+    notices = []
     name = one.seen.name
     if moments:
         when = sorted({round(moment.time, 2) for moment in moments})
-        most = options.verdict.listed
+        most = MAX_LISTED_TIMES
         listed = ", ".join(f"{time:.2f}" for time in when[:most]) + " s" + " and more" * (len(when) > most)
-        found.append(Notice(PeopleNotice.EXCHANGED, float(len(when)), {"name": name, "times": listed, "camera": camera}))
+        notices.append(Notice(PeopleNotice.EXCHANGED, float(len(when)), {"name": name, "times": listed, "camera": camera}))
     there = int(one.seen.trust.any(2).sum())
-    if there and missed.sum() > options.verdict.left * there:
-        found.append(Notice(PeopleNotice.ALONE, 100.0 * float(missed.sum()) / there, {"name": name, "camera": camera}))
-    return found
+    if there and missed.sum() > MIN_REPORTED_SHARE * there:
+        notices.append(Notice(PeopleNotice.ALONE, 100.0 * float(missed.sum()) / there, {"name": name, "camera": camera}))
+    return notices

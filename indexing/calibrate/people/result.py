@@ -123,7 +123,7 @@ class Association(Outcome):
         return self.tracks[0].shape[1] if self.tracks else 0
 
     @property
-    def sure(self) -> float:
+    def mean_certainty(self) -> float:
         """Mean certainty of everybody in every frame; NaN where nobody is."""
         every = np.concatenate([one.ravel() for one in self.certainty]) if self.certainty else np.zeros(0)
         known = every[np.isfinite(every)]
@@ -152,7 +152,7 @@ class Association(Outcome):
 
     def __repr__(self) -> str:
         state = "ok" if self.ok else f"refused: {self.reason}"
-        lines = [f"Association({self.people} people, {len(self.names)} cameras, certainty {self.sure:.3f}, {state})"]
+        lines = [f"Association({self.people} people, {len(self.names)} cameras, certainty {self.mean_certainty:.3f}, {state})"]
         for name, tracks in zip(self.names, self.tracks, strict=True):
             seen = (tracks >= 0).mean(0) if len(tracks) else np.zeros(self.people)
             lines.append(f"  {name}: in view " + ", ".join(f"{100 * share:.0f} %" for share in seen))

@@ -12,9 +12,9 @@ import torch
 from dyntorch import Calibration, Clocks, Status
 from dyntorch.core import Notice, NoticeCode, status_from
 from indexing.actors import Person, stream
+from indexing.calibrate.body_height import standing_extent
+from indexing.calibrate.camera_views import make_view, select_common_joints
 from indexing.calibrate.rig import CameraRig
-from indexing.calibrate.stature import standing
-from indexing.calibrate.views import common, view_of
 from indexing.clip import Clip
 from indexing.skeleton import COCO17
 from indexing.sync.recordings import take_of
@@ -130,6 +130,8 @@ def rig(people: int = 1, metric: bool = True, **changes: object) -> CameraRig:
     """The truth as :func:`indexing.calibrate.calibrate` would return it."""
     clips = filmed(people)
     takes = [take_of(own, name=f"cam{i}") for i, own in enumerate(clips, start=1)]
-    views = [view_of(take, own, SIZE) for take, own in zip(takes, clips, strict=True)]
-    stature = standing(COCO17.joints, 1.75) if metric else None
-    return CameraRig(solved(people, metric=metric, **changes), views, common([own[0] for own in clips], []), stature=stature)
+    views = [make_view(take, own, SIZE) for take, own in zip(takes, clips, strict=True)]
+    stature = standing_extent(COCO17.joints, 1.75) if metric else None
+    return CameraRig(
+        solved(people, metric=metric, **changes), views, select_common_joints([own[0] for own in clips], []), stature=stature
+    )

@@ -7,7 +7,7 @@ import json
 import pytest
 import torch
 
-from indexing.calibrate.clocks import given_clocks
+from indexing.calibrate.priors import given_clocks
 from tests.indexing.calibrate.scene import clocks_of
 
 

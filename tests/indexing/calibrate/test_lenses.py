@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing.calibrate.lenses import DIAGONAL, focal_35, known_lenses
+from indexing.calibrate.priors import DIAGONAL, focal_35, known_lenses
 from indexing.sync.recordings import take_of
 from tests.indexing.calibrate.scene import SIZE, filmed, write_cameras
 

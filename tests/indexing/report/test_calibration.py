@@ -35,7 +35,7 @@ def listed(folder):
 
 def test_everything_is_written_and_said(tmp_path):
     found = rig()
-    page = found.write(tmp_path / "out", "Kitchen")
+    page = write_calibration(tmp_path / "out", CalibrationReport(found, heading="Kitchen"))[0]
     assert listed(tmp_path / "out") == GOOD and page == tmp_path / "out" / "report.html"
     text, said = page.read_text(), json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert "<h1>Kitchen</h1>" in text and "data-rig=" in text and "script-src &#39;sha256-" in text
@@ -107,7 +107,7 @@ def test_what_is_somebody_elses_stays(tmp_path):
 def test_what_cannot_be_known_is_said(tmp_path):
     open_ = [Notice(CalibrationNotice.UNKNOWN_SCALE), Notice(CalibrationNotice.CAMERA_UP, 12.0)]
     found = rig(metric=False, upright=False, notices=tuple(open_))
-    text = found.write(tmp_path).read_text()
+    text = write_calibration(tmp_path, CalibrationReport(found))[0].read_text()
     assert "The scale is unknown" in text and "nobody stands upright" in text and "up to its scale" in text
     assert not any("scale is unknown" in note for note in found.notes) and len(found.unknown) == 3
     assert [lens.name for lens in read_calibration(tmp_path / "Calib_dyntorch.toml")] == ["cam1", "cam2", "cam3"]
@@ -116,5 +116,5 @@ def test_what_cannot_be_known_is_said(tmp_path):
 def test_a_hostile_name_stays_text(tmp_path):
     found = rig()
     object.__setattr__(found.views[0].take, "name", "</script><b>\x07")
-    text = found.write(tmp_path).read_text()
+    text = write_calibration(tmp_path, CalibrationReport(found))[0].read_text()
     assert "<b>\x07" not in text and "</script><b>" not in text.replace("</script>\n", "") and (tmp_path / "rig.png").is_file()

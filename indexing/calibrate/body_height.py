@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 
 from dyntorch.numerics import Message
-from indexing.calibrate.options import Share, StatureOptions
 from indexing.joints import canonical
 from indexing.opening import listed
 
@@ -22,6 +21,50 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 UNITS = (("millimetres", 1000.0), ("centimetres", 100.0), ("inches", 39.37), ("feet", 3.2808))
+
+MIN_HEIGHT_METRES = 0.4  # nobody who is filmed standing is smaller
+MAX_HEIGHT_METRES = 2.6  # nobody was ever taller than 2.72
+MIN_EXTENT = 0.6  # body heights between the highest and the lowest joint
+MIN_STRAIGHTNESS = 0.97  # shoulders above the ankle over trunk and leg: 14 degrees off the vertical
+MIN_STANDING_FRAMES = 10  # in which somebody stands straight, or is seen from head to foot
+CHAIN_SIGMA = 0.03  # of the height by trunk and legs alone: 2.7 % off for Pose2Sim's balancing person
+EXTENT_QUANTILE = 0.75  # of the distance from feet to head, where trunk and legs are unknown
+
+
+@dataclass(frozen=True)
+class Share:
+    """How high a joint of somebody who stands upright is, in body heights."""
+
+    height: float
+    spread: float
+
+
+SHARES: Mapping[str, Share] = {
+    "headtop": Share(1.0, 0.008),
+    "eye": Share(0.936, 0.008),
+    "eyeinner": Share(0.936, 0.008),
+    "eyeouter": Share(0.936, 0.008),
+    "ear": Share(0.930, 0.010),
+    "headcenter": Share(0.930, 0.015),
+    "nose": Share(0.915, 0.010),
+    "mouth": Share(0.890, 0.010),
+    "upperneck": Share(0.870, 0.015),
+    "neck": Share(0.818, 0.012),
+    "neckbase": Share(0.830, 0.015),
+    "thorax": Share(0.818, 0.015),
+    "shouldercenter": Share(0.818, 0.015),
+    "spineshoulder": Share(0.818, 0.015),
+    "shoulder": Share(0.818, 0.012),
+    "ankle": Share(0.039, 0.006),
+    "foot": Share(0.020, 0.010),
+    "heel": Share(0.015, 0.008),
+    "bigtoe": Share(0.010, 0.006),
+    "smalltoe": Share(0.010, 0.006),
+    "footindex": Share(0.010, 0.008),
+}
+"""Levels of eye, chin, shoulder, ankle and top of the head: Drillis and Contini (1966), as in D. A. Winter, Biomechanics and Motor
+Control of Human Movement, figure 4.1.  Ear, nose, mouth, heel and toes lie between these by the proportions of the face and
+the foot; the spread of a level between adults is about 0.6 % of the height, the rest is what detectors are off."""
 
 
 @dataclass(frozen=True)
@@ -46,30 +89,30 @@ class Stature:
         )
 
 
-def check_height(height: float, options: StatureOptions = StatureOptions()) -> float:
+def check_height(height: float) -> float:
     """A standing height in metres."""
     value = float(height)
-    if math.isfinite(value) and options.smallest <= value <= options.tallest:
+    if math.isfinite(value) and MIN_HEIGHT_METRES <= value <= MAX_HEIGHT_METRES:
         return value
     means = Message(
         "{arg:height} must be that of a standing person in metres, {low:g} to {high:g}, got {value:g}",
-        low=options.smallest, high=options.tallest, value=value,
+        low=MIN_HEIGHT_METRES, high=MAX_HEIGHT_METRES, value=value,
     )  # fmt: skip
     for unit, per_metre in UNITS:
         metres = value / per_metre
-        usual = 1.0 <= metres <= options.tallest
+        usual = 1.0 <= metres <= MAX_HEIGHT_METRES
         if usual:
             text = "{means}; in {unit}? give {metres:.3g}"
             raise ValueError(Message(text, means=means, unit=unit, metres=metres))
     raise ValueError(means)
 
 
-def standing(names: Sequence[str], height: float, options: StatureOptions = StatureOptions()) -> Stature:
+def standing_extent(names: Sequence[str], height: float) -> Stature:
     r"""The extent of a body's joints when it stands upright, from its height :math:`H`."""
-    height = check_height(height, options)
-    known: list[tuple[Share, str]] = [(share, name) for name in names if (share := _share(name, options)) is not None]
+    height = check_height(height)
+    known: list[tuple[Share, str]] = [(share, name) for name in names if (share := _height_share(name)) is not None]
     levels = sorted(known, key=lambda one: (one[0].height, one[1]))
-    if len(levels) < 2 or levels[-1][0].height - levels[0][0].height < options.least:
+    if len(levels) < 2 or levels[-1][0].height - levels[0][0].height < MIN_EXTENT:
         text = (
             "{arg:height}: the joints ({names}) do not reach from the head or the shoulders to the feet, so the height says "
             "nothing of them; give {arg:length} between two of them instead"
@@ -80,52 +123,50 @@ def standing(names: Sequence[str], height: float, options: StatureOptions = Stat
     return Stature((high.height - low.height) * height, height * math.hypot(low.spread, high.spread), tops, bottoms, height)
 
 
-def _share(name: str, options: StatureOptions) -> Share | None:
+def _height_share(name: str) -> Share | None:
     plain = re.sub(r"^(left|right)", "", canonical(name))
-    return options.shares.get(plain)
+    return SHARES.get(plain)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # From the extent of a standing body to metres of a rig.
 
 
-def in_metres(
-    found: Calibration, stature: Stature, names: Sequence[str], options: StatureOptions = StatureOptions()
-) -> tuple[Calibration, Stature | None]:
+def scale_to_metres(calibration: Calibration, stature: Stature, names: Sequence[str]) -> tuple[Calibration, Stature | None]:
     r"""A rig in metres, by the tallest of its people."""
-    points = np.asarray(found.points.numpy(), dtype=np.float64)
+    points = np.asarray(calibration.points.numpy(), dtype=np.float64)
     people = points.reshape(len(points), -1, len(names), 3)
-    sizes = [size for who in range(people.shape[1]) if (size := _size(people[:, who], stature, names, options)) is not None]
+    sizes = [size for who in range(people.shape[1]) if (size := _metres_per_unit(people[:, who], stature, names)) is not None]
     if not sizes:
-        return found, None
+        return calibration, None
     factor, sigma, how = min(sizes)
-    return scaled(found, factor), replace(stature, sigma=sigma, measured=how)
+    return scale_calibration(calibration, factor), replace(stature, sigma=sigma, measured=how)
 
 
-def _size(body: FloatArray, stature: Stature, names: Sequence[str], options: StatureOptions) -> tuple[float, float, str] | None:
+def _metres_per_unit(body: FloatArray, stature: Stature, names: Sequence[str]) -> tuple[float, float, str] | None:
     """Metres per unit of a body ``(frames, n, 3)``, the standard deviation of the extent, and how that was found."""
     tops, bottoms = ([i for i, name in enumerate(names) if name in wanted] for wanted in (stature.tops, stature.bottoms))
     head, feet = body[:, tops, 2], body[:, bottoms, 2]
     both = np.isfinite(head).any(axis=1) & np.isfinite(feet).all(axis=1)
     extent = np.full(len(body), np.nan)
     extent[both] = np.nanmean(head[both], axis=1) - feet[both].min(axis=1)
-    chain = _chain(body, names)
+    chain = _trunk_and_leg(body, names)
     if chain is None:
         known = extent[both]
-        usable = len(known) >= options.frames and float(np.quantile(known, options.extent)) > 0
+        usable = len(known) >= MIN_STANDING_FRAMES and float(np.quantile(known, EXTENT_QUANTILE)) > 0
         how = "measured where head and feet are farthest apart"
-        return (stature.extent / float(np.quantile(known, options.extent)), stature.sigma, how) if usable else None
+        return (stature.extent / float(np.quantile(known, EXTENT_QUANTILE)), stature.sigma, how) if usable else None
     length, above = chain
-    straight = both & (np.nan_to_num(above) >= options.straight * length)
-    if straight.sum() >= options.frames:
+    straight = both & (np.nan_to_num(above) >= MIN_STRAIGHTNESS * length)
+    if straight.sum() >= MIN_STANDING_FRAMES:
         how = f"measured in {straight.sum()} frames in which the body is straight"
         return stature.extent / float(np.median(extent[straight])), stature.sigma, how
-    share = options.shares["shoulder"].height - options.shares["ankle"].height
+    share = SHARES["shoulder"].height - SHARES["ankle"].height
     how = "by trunk and legs, as nobody stands straight"
-    return share * stature.height / length, options.chain_sigma * stature.extent, how
+    return share * stature.height / length, CHAIN_SIGMA * stature.extent, how
 
 
-def _chain(body: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray] | None:
+def _trunk_and_leg(body: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray] | None:
     """The length of trunk and leg, and ``(frames,)`` how far the shoulders are above an ankle; None where these are not known."""
     index = {canonical(name): i for i, name in enumerate(names)}
     wanted = [f"{side}{part}" for part in ("shoulder", "hip", "knee", "ankle") for side in ("left", "right")]
@@ -147,12 +188,12 @@ def _chain(body: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray] |
     return (length, above) if math.isfinite(length) and length > 0 else None
 
 
-def scaled(found: Calibration, factor: float) -> Calibration:
+def scale_calibration(calibration: Calibration, factor: float) -> Calibration:
     """A calibration of another unit, which is metres from now on."""
-    change = torch.eye(found.covariance.shape[-1], dtype=torch.float64)
+    change = torch.eye(calibration.covariance.shape[-1], dtype=torch.float64)
     change[3:6, 3:6] *= factor
-    notices = tuple(notice for notice in found.notices if notice.code.value != "unknown_scale")
+    notices = tuple(notice for notice in calibration.notices if notice.code.value != "unknown_scale")
     return replace(
-        found, t=factor * found.t, points=factor * found.points, sigmas=factor * found.sigmas, metric=True,
-        covariance=change @ found.covariance @ change.mT, notices=notices,
+        calibration, t=factor * calibration.t, points=factor * calibration.points, sigmas=factor * calibration.sigmas, metric=True,
+        covariance=change @ calibration.covariance @ change.mT, notices=notices,
     )  # fmt: skip

@@ -12,9 +12,11 @@ import torch
 
 import dyntorch
 from dyntorch.core import Notice, status_from
-from indexing.calibrate import CameraRig, calibrate, verb
+from indexing.calibrate import CameraRig, calibrate
+from indexing.calibrate import pipeline as verb
+from indexing.calibrate.body_height import scale_calibration, scale_to_metres, standing_extent
 from indexing.calibrate.people import PeopleNotice
-from indexing.calibrate.stature import in_metres, scaled, standing
+from indexing.report.calibration import CalibrationReport, write_calibration
 from indexing.skeleton import COCO17
 from tests.indexing.calibrate.scene import FPS, LATE, SIZE, Asked, filmed, solved, truth, write_cameras
 
@@ -27,7 +29,7 @@ def library(monkeypatch):
     def answer(tracks, **options):
         asked.append({"tracks": tracks, **options})
         n = tracks[0].shape[1] // 17
-        return replace(scaled(solved(n, notices=(Notice(Asked.NOTE, 0.0, {"text": "x"}),)), 0.2), metric=False)
+        return replace(scale_calibration(solved(n, notices=(Notice(Asked.NOTE, 0.0, {"text": "x"}),)), 0.2), metric=False)
 
     monkeypatch.setattr(dyntorch, "calibrate", answer, raising=False)
     return asked
@@ -48,6 +50,12 @@ def test_folders_clips_and_arrays_are_the_same(library, tmp_path):
     assert rigs[3].joints.skeleton is not None  # 17 joints are COCO's
 
 
+def test_options_are_those_of_the_library(library):
+    asked = dyntorch.CalibrateOptions()
+    calibrate([own[0] for own in filmed()], sizes=SIZE, options=asked)
+    assert library[0]["options"] is asked
+
+
 def test_a_height_gives_metres(library):
     clips = [own[0] for own in filmed()]
     rig = calibrate(clips, sizes=SIZE, height=1.62)
@@ -63,32 +71,32 @@ def test_a_height_gives_metres(library):
 
 
 def test_arms_above_the_head_do_not_make_anybody_smaller():
-    base, stature = solved(), standing(COCO17.joints, 1.75)
+    base, stature = solved(), standing_extent(COCO17.joints, 1.75)
     up = base.points.clone()
     up[:, 9:11, 2] += 3.0  # wrists
-    plain, raised = (in_metres(replace(base, points=points), stature, COCO17.joints)[0] for points in (base.points, up))
+    plain, raised = (scale_to_metres(replace(base, points=points), stature, COCO17.joints)[0] for points in (base.points, up))
     assert torch.allclose(plain.t, raised.t)
 
 
 def test_somebody_who_never_stands_straight_is_measured_by_trunk_and_legs():
-    base, stature = solved(), standing(COCO17.joints, 1.75)
-    tall = in_metres(base, stature, COCO17.joints)[0]
+    base, stature = solved(), standing_extent(COCO17.joints, 1.75)
+    tall = scale_to_metres(base, stature, COCO17.joints)[0]
     low = (base.points[:, 5, 2] < base.points[:, 5, 2].median() - 0.1).nonzero()[:, 0]
     bent = base.points[low]  # the knees bent
     assert len(bent) >= 10
-    short, how = in_metres(replace(base, points=bent), stature, COCO17.joints)
+    short, how = scale_to_metres(replace(base, points=bent), stature, COCO17.joints)
     assert "trunk and legs" in how.measured and how.sigma == pytest.approx(0.03 * stature.extent)
     assert float(short.t[0].norm()) == pytest.approx(float(tall.t[0].norm()), rel=0.12)
     gone = base.points.clone()
     gone[5:, 15:] = torch.nan
-    same, none = in_metres(replace(base, points=gone, metric=False), stature, COCO17.joints)
+    same, none = scale_to_metres(replace(base, points=gone, metric=False), stature, COCO17.joints)
     assert none is None or "trunk" in none.measured
     gone[:, 11:] = torch.nan
-    same, none = in_metres(replace(base, points=gone, metric=False), stature, COCO17.joints)
+    same, none = scale_to_metres(replace(base, points=gone, metric=False), stature, COCO17.joints)
     assert none is None and not same.metric
     bare = [name for name in COCO17.joints if "hip" not in name]
     kept = [i for i, name in enumerate(COCO17.joints) if "hip" not in name]
-    assert "farthest apart" in in_metres(replace(base, points=base.points[:, kept]), stature, bare)[1].measured
+    assert "farthest apart" in scale_to_metres(replace(base, points=base.points[:, kept]), stature, bare)[1].measured
 
 
 @pytest.mark.slow
@@ -121,7 +129,7 @@ def test_left_taken_for_right_is_mended_before_the_last_word(library, tmp_path):
     assert np.allclose(first, swapped) and (np.abs(last - clips[1].joints).max(axis=(1, 2)) < 1e-6).mean() > 0.95
     assert any(note.startswith("cam2: left and right exchanged 1 times (body; ") for note in rig.notes), rig.notes
     assert np.allclose(rig.views[1].people[0].joints, last)
-    rig.write(tmp_path)
+    write_calibration(tmp_path, CalibrationReport(rig))
     [said] = json.loads((tmp_path / "calibration.json").read_text())["exchanges"]
     assert said["camera"] == "cam2" and said["person"] == 1 and said["start"] == pytest.approx(1.0, abs=0.1)
 

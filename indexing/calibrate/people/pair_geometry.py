@@ -9,12 +9,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from indexing.calibrate.people.clusters import clustered
-from indexing.calibrate.people.options import AssociationOptions
-from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Floats, Integers, Tracklets
+from indexing.calibrate.people.tracklets import MIN_JOINTS, Booleans, CameraSightings, Floats, Integers, Tracklets, cluster
 
 if TYPE_CHECKING:
     from dyntorch import Shift
+
+MAX_DETECTION_DISTANCE = 0.6  # frames from a moment within which a detection stands for it
+MAX_INTERPOLATED_FRAMES = 2.5  # between two detections
+STRANGER_DISTANCE = 0.1  # body sizes: distance of different people from each other's epipolar lines
+INDEPENDENT_BODY_JOINTS = 4.0  # in one body: its joints are off together
+EVIDENCE_SECONDS = 0.1  # within which frames carry the same evidence
+MAX_SEARCH_FRAMES = 150  # at which two cameras are compared while their geometry is searched
+MAX_MATCH_ITERATIONS = 4  # matching people and refitting the geometry to them
+NUM_REWEIGHTINGS = 2  # steps of reweighted least squares each time
+MIN_RELATIVE_GAIN = 0.01  # of an iteration to go on
+MIN_MATCHES = 60  # points that a geometry is fitted to
+MIN_SIGMA = 0.05  # pixels
+INITIAL_SIGMA = 0.02  # body sizes: accuracy of the geometry of two people when applied to everybody
+NUM_SEEDS = 3  # tracklets of each camera that are compared to find a geometry
+MIN_SEED_SECONDS = 0.8  # that such a tracklet lasts
+MIN_SYNCHRONIZE_FRAMES = 12  # that dyntorch.synchronize takes
+MIN_EXPLAINED = 0.75  # share of the people with a partner, from which the search ends
+MAX_CONFIDENT_SIGMA = 0.015  # body sizes then: .008 to .010 with 6 px of noise; two different people .03 (pose2sim)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +56,7 @@ class PieceView:
         return np.bincount(self.piece[self.piece >= 0], minlength=len(self.pieces)).astype(np.int64)
 
 
-def view(seen: CameraSightings, pieces: Tracklets) -> PieceView:
+def arrange(seen: CameraSightings, pieces: Tracklets) -> PieceView:
     """Sort the detections of a camera by pieces: as few slots as hold all at once."""
     frames, joints = len(seen.times), seen.places.shape[2]
     free: list[int] = []
@@ -62,7 +78,7 @@ def view(seen: CameraSightings, pieces: Tracklets) -> PieceView:
     return PieceView(seen, pieces, places, trust, piece, track)
 
 
-def seen_at(one: PieceView, times: Floats, options: AssociationOptions) -> tuple[Floats, Floats, Integers]:
+def interpolate(one: PieceView, times: Floats) -> tuple[Floats, Floats, Integers]:
     """What a camera saw at any times of its clock: linear between frames, the nearest frame where a piece has no other."""
     last = len(one.times) - 1
     after = np.clip(np.searchsorted(one.times, times), min(1, last), last)
@@ -72,10 +88,10 @@ def seen_at(one: PieceView, times: Floats, options: AssociationOptions) -> tuple
     step = 1.0 / one.seen.fps
     nearest = np.where(share > 0.5, after, before)
     other = np.where(share > 0.5, before, after)
-    near = np.abs(times - one.times[nearest]) <= options.geometry.nearest * step
+    near = np.abs(times - one.times[nearest]) <= MAX_DETECTION_DISTANCE * step
     piece = np.where(near[:, None], one.piece[nearest], -1)
     weight = np.minimum(share, 1 - share)[:, None]
-    between = (one.piece[other] == piece) & (piece >= 0) & (weight >= 0) & (width <= options.geometry.between * step)[:, None]
+    between = (one.piece[other] == piece) & (piece >= 0) & (weight >= 0) & (width <= MAX_INTERPOLATED_FRAMES * step)[:, None]
     factor = np.where(between, weight, 0.0)[..., None, None]
     places = (1 - factor) * one.places[nearest] + np.where(between[..., None, None], factor * one.places[other], 0.0)
     trust = np.where(between[..., None], np.minimum(one.trust[nearest], one.trust[other]), one.trust[nearest])
@@ -84,7 +100,7 @@ def seen_at(one: PieceView, times: Floats, options: AssociationOptions) -> tuple
 
 
 @dataclass(frozen=True, eq=False)
-class Relation:
+class PairGeometry:
     """How camera b relates to camera a. fundamental ``(3, 3)``."""
 
     offset: float
@@ -96,7 +112,7 @@ class Relation:
 
 
 @dataclass(frozen=True, eq=False)
-class CommonMoments:
+class CommonFrames:
     """What both cameras saw at the same times: those of the first camera's frames. a, b ``(T, slots, joints, 2)``, trust_a,
     trust_b ``(T, slots, joints)``, piece_a, piece_b ``(T, slots)``."""
 
@@ -110,18 +126,16 @@ class CommonMoments:
     spread: float
 
 
-def common(
-    a: PieceView, b: PieceView, offset: float, rate: float, options: AssociationOptions, most: int | None = None
-) -> CommonMoments:
+def common_frames(a: PieceView, b: PieceView, offset: float, rate: float, most: int | None = None) -> CommonFrames:
     """Both cameras at the frames of the first one, as far as the second one runs."""
     moments = rate * a.times + offset
-    margin = options.geometry.nearest / b.seen.fps
+    margin = MAX_DETECTION_DISTANCE / b.seen.fps
     rows = np.flatnonzero((moments >= b.times[0] - margin) & (moments <= b.times[-1] + margin))
     every = 1 if most is None else max(1, math.ceil(len(rows) / most))
     rows = rows[::every]
-    places, trust, piece = seen_at(b, moments[rows], options)
-    spread = options.geometry.spread * math.sqrt(a.pieces.size * b.pieces.size)
-    return CommonMoments(a.places[rows], places, a.trust[rows], trust, a.piece[rows], piece, a.seen.fps / every, spread)
+    places, trust, piece = interpolate(b, moments[rows])
+    spread = STRANGER_DISTANCE * math.sqrt(a.pieces.size * b.pieces.size)
+    return CommonFrames(a.places[rows], places, a.trust[rows], trust, a.piece[rows], piece, a.seen.fps / every, spread)
 
 
 def distances(fundamental: Floats, a: Floats, b: Floats) -> Floats:
@@ -133,12 +147,12 @@ def distances(fundamental: Floats, a: Floats, b: Floats) -> Floats:
     return np.asarray(value / np.sqrt(np.maximum(square_a[:, :, None] + square_b[:, None], 1e-300)))
 
 
-def evidence(relation: Relation, both: CommonMoments, options: AssociationOptions) -> Floats:
+def evidence(relation: PairGeometry, both: CommonFrames) -> Floats:
     """Nats for being the same person, ``(T, slots_a, slots_b)``; 0 where nothing can be compared."""
-    return _evidence_of(distances(relation.fundamental, both.a, both.b), relation.sigma, both, options)
+    return _evidence_of(distances(relation.fundamental, both.a, both.b), relation.sigma, both)
 
 
-def _evidence_of(away: Floats, sigma: float, both: CommonMoments, options: AssociationOptions) -> Floats:
+def _evidence_of(away: Floats, sigma: float, both: CommonFrames) -> Floats:
     weight = np.sqrt(both.trust_a[:, :, None] * both.trust_b[:, None])
     known = np.isfinite(away) & (weight > 0)
     r = np.where(known, away, 0.0)
@@ -146,11 +160,11 @@ def _evidence_of(away: Floats, sigma: float, both: CommonMoments, options: Assoc
     other = -math.log(math.pi) - math.log(both.spread) - np.log1p(np.square(r / both.spread))
     each = np.where(known, weight * (same - other), 0.0)
     joints = known.sum(-1)
-    worth = options.geometry.joints / max(1, away.shape[-1]) / max(1.0, both.fps * options.geometry.lasting)
-    return np.asarray(np.where(joints >= options.pieces.seen, worth * each.sum(-1), 0.0))
+    worth = INDEPENDENT_BODY_JOINTS / max(1, away.shape[-1]) / max(1.0, both.fps * EVIDENCE_SECONDS)
+    return np.asarray(np.where(joints >= MIN_JOINTS, worth * each.sum(-1), 0.0))
 
 
-def table(found: Floats, both: CommonMoments, shape: tuple[int, int]) -> Floats:
+def sum_over_time(found: Floats, both: CommonFrames, shape: tuple[int, int]) -> Floats:
     """Evidence ``(T, slots_a, slots_b)`` summed over time for every two pieces."""
     first, second = np.broadcast_arrays(both.piece_a[:, :, None], both.piece_b[:, None])
     known = (first >= 0) & (second >= 0)
@@ -158,50 +172,49 @@ def table(found: Floats, both: CommonMoments, shape: tuple[int, int]) -> Floats:
     return np.asarray(flat.reshape(shape))
 
 
-def fitted(
-    relation: Relation,
-    both: CommonMoments,
+def fit_pair(
+    relation: PairGeometry,
+    both: CommonFrames,
     matched: Booleans,
     rounds: int,
-    options: AssociationOptions,
     most: int | None = None,
-) -> Relation | None:
+) -> PairGeometry | None:
     """The relation with the fundamental matrix and sigma of those who are the same, by reweighted least squares. matched
     ``(pieces_a, pieces_b)``."""
     import torch
 
     import dyntorch
 
-    x1, x2, weight = _pairs(both, matched)
+    x1, x2, weight = _matched_points(both, matched)
     every = 1 if most is None else max(1, math.ceil(len(x1) / most))
     x1, x2, weight = x1[::every], x2[::every], weight[::every]
-    if len(x1) < options.geometry.matches:
+    if len(x1) < MIN_MATCHES:
         return None
     first, second = torch.from_numpy(x1), torch.from_numpy(x2)
     fundamental, sigma = relation.fundamental, relation.sigma
     if relation.held:
-        return replace(relation, sigma=_usual(_sampson(fundamental, x1, x2)[0], options))
+        return replace(relation, sigma=_robust_sigma(_sampson(fundamental, x1, x2)[0]))
     for _ in range(rounds):
         if np.isfinite(fundamental).all():
             r, gradient = _sampson(fundamental, x1, x2)
             w = weight / (1 + np.square(r / sigma) / 3) / gradient
         else:
             w = weight
-        solved = dyntorch.fit(dyntorch.FundamentalMatrix, first, second, weights=torch.from_numpy(w / w.max()))
-        if int(solved.status) not in (dyntorch.Status.OK, dyntorch.Status.AMBIGUOUS):
+        solution = dyntorch.fit(dyntorch.FundamentalMatrix, first, second, weights=torch.from_numpy(w / w.max()))
+        if int(solution.status) not in (dyntorch.Status.OK, dyntorch.Status.AMBIGUOUS):
             return None
-        fundamental = solved.tensor.numpy()
+        fundamental = solution.tensor.numpy()
         r, _ = _sampson(fundamental, x1, x2)
-        sigma = _usual(r, options)
+        sigma = _robust_sigma(r)
     return replace(relation, fundamental=fundamental, sigma=sigma)
 
 
-def _usual(away: Floats, options: AssociationOptions) -> float:
+def _robust_sigma(away: Floats) -> float:
     """Sigma by the median distance, which for Student's t with 3 degrees of freedom is .765 of it."""
-    return max(float(np.median(np.abs(away))) / 0.7648923284, options.geometry.finest)
+    return max(float(np.median(np.abs(away))) / 0.7648923284, MIN_SIGMA)
 
 
-def _pairs(both: CommonMoments, matched: Booleans) -> tuple[Floats, Floats, Floats]:
+def _matched_points(both: CommonFrames, matched: Booleans) -> tuple[Floats, Floats, Floats]:
     """The points of those who are the same, ``(n, 2)`` each, and their weights."""
     same = matched[both.piece_a[:, :, None], both.piece_b[:, None]] & (both.piece_a >= 0)[:, :, None] & (both.piece_b >= 0)[:, None]
     t, i, j = np.nonzero(same)
@@ -222,131 +235,128 @@ def _sampson(fundamental: Floats, x1: Floats, x2: Floats) -> tuple[Floats, Float
 class Hypothesis:
     """A relation with who is who by it."""
 
-    relation: Relation
+    relation: PairGeometry
     score: float
     explained: float
     size: float
 
-    def sure(self, options: AssociationOptions) -> bool:
+    def confident(self) -> bool:
         """Whether nothing better is to be looked for."""
-        how = options.geometry
         decided = self.relation.shift is None or self.relation.shift.ok
-        return decided and self.explained >= how.explained and self.relation.sigma <= how.sure_sigma * self.size
+        return decided and self.explained >= MIN_EXPLAINED and self.relation.sigma <= MAX_CONFIDENT_SIGMA * self.size
 
 
-def settled(a: PieceView, b: PieceView, relation: Relation, options: AssociationOptions) -> Hypothesis | None:
+def match_and_refit(a: PieceView, b: PieceView, relation: PairGeometry) -> Hypothesis | None:
     """Match everybody by a relation that may come from two people only, and fit it to all who were matched."""
-    how = options.geometry
-    both = common(a, b, relation.offset, relation.rate, options, how.frames)
+    both = common_frames(a, b, relation.offset, relation.rate, MAX_SEARCH_FRAMES)
     if not len(both.a):
         return None
     shape, size = (len(a.pieces), len(b.pieces)), math.sqrt(a.pieces.size * b.pieces.size)
-    conflicts = _joined(a.pieces.conflicts, b.pieces.conflicts)
-    chosen: Hypothesis | None = None
-    for _ in range(how.rounds):
-        found = evidence(relation, both, options)
-        scores = table(found, both, shape)
-        labels = clustered(_joined_scores(scores), conflicts, options)
+    conflicts = _block_diagonal(a.pieces.conflicts, b.pieces.conflicts)
+    best: Hypothesis | None = None
+    for _ in range(MAX_MATCH_ITERATIONS):
+        nats = evidence(relation, both)
+        scores = sum_over_time(nats, both, shape)
+        labels = cluster(_symmetric_scores(scores), conflicts)
         matched = (labels[: shape[0], None] == labels[None, shape[0] :]) & (scores > 0)
-        one = Hypothesis(relation, float(scores[matched].sum()), _explained(both, matched), size)
-        if chosen is not None and one.score <= chosen.score * (1 + how.gain):
-            return chosen if chosen.score >= one.score else one
-        chosen = one
-        again = fitted(relation, both, matched, how.reweighted, options)
-        if again is None:
-            return chosen
-        relation = again
-    return chosen
+        hypothesis = Hypothesis(relation, float(scores[matched].sum()), _explained_share(both, matched), size)
+        if best is not None and hypothesis.score <= best.score * (1 + MIN_RELATIVE_GAIN):
+            return best if best.score >= hypothesis.score else hypothesis
+        best = hypothesis
+        refitted = fit_pair(relation, both, matched, NUM_REWEIGHTINGS)
+        if refitted is None:
+            return best
+        relation = refitted
+    return best
 
 
-def _joined(first: Booleans, second: Booleans) -> Booleans:
+def _block_diagonal(first: Booleans, second: Booleans) -> Booleans:
     n, m = len(first), len(second)
     out = np.zeros((n + m, n + m), dtype=bool)
     out[:n, :n], out[n:, n:] = first, second
     return out
 
 
-def _joined_scores(scores: Floats) -> Floats:
+def _symmetric_scores(scores: Floats) -> Floats:
     n, m = scores.shape
     out = np.zeros((n + m, n + m))
     out[:n, n:], out[n:, :n] = scores, scores.T
     return out
 
 
-def _explained(both: CommonMoments, matched: Booleans) -> float:
+def _explained_share(both: CommonFrames, matched: Booleans) -> float:
     first, second = both.piece_a, both.piece_b
     same = matched[first[:, :, None], second[:, None]] & (first >= 0)[:, :, None] & (second >= 0)[:, None]
     could = np.minimum((first >= 0).sum(1), (second >= 0).sum(1)).sum()
     return float(same.any(2).sum() / max(1, could))
 
 
-def seeds(a: PieceView, b: PieceView, options: AssociationOptions) -> list[tuple[int, int]]:
+def seed_pairs(a: PieceView, b: PieceView) -> list[tuple[int, int]]:
     """The pieces that are compared to find clock and geometry: the longest of both cameras, longest first."""
-    how = options.geometry
     longest = [
-        [k for k in np.argsort(-one.lengths, kind="stable")[: how.seeds].tolist() if one.lengths[k] >= how.shortest * one.seen.fps]
+        [
+            k
+            for k in np.argsort(-one.lengths, kind="stable")[:NUM_SEEDS].tolist()
+            if one.lengths[k] >= MIN_SEED_SECONDS * one.seen.fps
+        ]
         for one in (a, b)
     ]
     every = [(i, j) for i in longest[0] for j in longest[1]]
     return sorted(every, key=lambda both: -min(a.lengths[both[0]], b.lengths[both[1]]))
 
 
-def unsynchronized(a: PieceView, b: PieceView, options: AssociationOptions) -> Iterator[Relation]:
+def propose_unsynchronized(a: PieceView, b: PieceView) -> Iterator[PairGeometry]:
     """Relations by comparing pieces of people whose clocks nobody knows."""
-    for i, j in seeds(a, b, options):
-        shift = compared(_alone(a, i), _alone(b, j), options, quick=True)
+    for i, j in seed_pairs(a, b):
+        shift = synchronize_tracklets(_tracklet_points(a, i), _tracklet_points(b, j), quick=True)
         if shift is not None and shift.fundamental is not None and math.isfinite(shift.offset):
-            yield Relation(shift.offset, shift.rate, shift.fundamental.numpy().astype(np.float64), math.nan, shift)
+            yield PairGeometry(shift.offset, shift.rate, shift.fundamental.numpy().astype(np.float64), math.nan, shift)
 
 
-def _alone(one: PieceView, piece: int) -> tuple[Floats, Floats, Floats]:
+def _tracklet_points(one: PieceView, piece: int) -> tuple[Floats, Floats, Floats]:
     """Times, places and trust of one piece."""
     rows, slots = np.nonzero(one.piece == piece)
     return one.times[rows], one.places[rows, slots], one.trust[rows, slots]
 
 
-def compared(
-    a: tuple[Floats, Floats, Floats], b: tuple[Floats, Floats, Floats], options: AssociationOptions, quick: bool = False
-) -> Shift | None:
+def synchronize_tracklets(a: tuple[Floats, Floats, Floats], b: tuple[Floats, Floats, Floats], quick: bool = False) -> Shift | None:
     """:func:`dyntorch.synchronize` of times, places ``(frames, n, 2)`` and trust; None where it takes neither."""
     import torch
 
     import dyntorch
 
-    if min(len(a[0]), len(b[0])) < options.geometry.fewest:
+    if min(len(a[0]), len(b[0])) < MIN_SYNCHRONIZE_FRAMES:
         return None
-    more: dict[str, Any] = {"options": options.points}
+    more: dict[str, Any] = {}
     if quick:  # two people who are not the same have no points that are: nothing to look for
-        every = replace(options.points, reject_points=False)
+        every = dyntorch.SynchronizeOptions(reject_points=False)
         more = {"camera": "perspective", "rate": 1.0, "calibration": (None, None), "options": every}
     times, places, trust = ((torch.from_numpy(x), torch.from_numpy(y)) for x, y in zip(a, b, strict=True))
     shift: Shift = dyntorch.synchronize(places[0], places[1], times=times, weights=trust, correspondence=True, **more)
     return shift
 
 
-def synchronized(a: PieceView, b: PieceView, offset: float, rate: float, options: AssociationOptions) -> Iterator[Relation]:
+def propose_synchronized(a: PieceView, b: PieceView, offset: float, rate: float) -> Iterator[PairGeometry]:
     """Relations of people who may be the same, where the clocks are known."""
-    how = options.geometry
-    both = common(a, b, offset, rate, options, how.frames)
-    for i, j in seeds(a, b, options):
+    both = common_frames(a, b, offset, rate, MAX_SEARCH_FRAMES)
+    for i, j in seed_pairs(a, b):
         matched = np.zeros((len(a.pieces), len(b.pieces)), dtype=bool)
         matched[i, j] = True
-        start = Relation(offset, rate, np.full((3, 3), np.nan), both.spread)
-        found = fitted(start, both, matched, how.reweighted + 2, options) if len(both.a) else None
-        if found is not None:
-            yield found
+        start = PairGeometry(offset, rate, np.full((3, 3), np.nan), both.spread)
+        fitted = fit_pair(start, both, matched, NUM_REWEIGHTINGS + 2) if len(both.a) else None
+        if fitted is not None:
+            yield fitted
 
 
-def relate(a: PieceView, b: PieceView, options: AssociationOptions, clock: tuple[float, float] | None = None) -> Hypothesis | None:
+def estimate_pair(a: PieceView, b: PieceView, clock: tuple[float, float] | None = None) -> Hypothesis | None:
     """The relation of two cameras that explains most people, or None where there is none."""
-    how = options.geometry
     best: Hypothesis | None = None
-    for start in unsynchronized(a, b, options) if clock is None else synchronized(a, b, *clock, options):
-        first = how.first_sigma * math.sqrt(a.pieces.size * b.pieces.size)
+    for start in propose_unsynchronized(a, b) if clock is None else propose_synchronized(a, b, *clock):
+        first = INITIAL_SIGMA * math.sqrt(a.pieces.size * b.pieces.size)
         relation = start if math.isfinite(start.sigma) else replace(start, sigma=first)
-        found = settled(a, b, relation, options)
-        if found is not None and (best is None or found.score > best.score):
-            best = found
-        if best is not None and best.sure(options):
+        hypothesis = match_and_refit(a, b, relation)
+        if hypothesis is not None and (best is None or hypothesis.score > best.score):
+            best = hypothesis
+        if best is not None and best.confident():
             break
     return best

@@ -1,4 +1,4 @@
-"""What is known of the cameras' lenses: given focal lengths, one lens for all, a calibration file, or what a phone wrote."""
+"""What is known of the cameras beforehand: lenses (focal lengths, a calibration file, what a phone wrote) and clocks."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
+from dyntorch import Clocks
 from dyntorch.numerics import Message
-from indexing.calibrate.views import Size
-from indexing.opening import error, listed
+from indexing.calibrate.camera_views import Size
+from indexing.opening import error, listed, parse_json, read_text
 from indexing.sync.calibration import Lens, named_lenses
 from indexing.sync.recordings import Take
 
@@ -65,11 +67,11 @@ def known_lenses(
         raise ValueError(Message(text))
     if focal is not None:
         focals = _focals(focal, len(takes))
-        return KnownLenses(focals, source="given, and held", notes=_unusual(takes, focals, sizes))
+        return KnownLenses(focals, source="given, and held", notes=_focal_notes(takes, focals, sizes))
     if calibration is not None:
-        return _of_file(takes, sizes, calibration)
+        return _from_file(takes, sizes, calibration)
     if exif:
-        return _of_exif(takes, sizes)
+        return _from_exif(takes, sizes)
     return KnownLenses(one_lens=one_lens, source="found from the movement, one for all" if one_lens else KnownLenses.source)
 
 
@@ -84,22 +86,22 @@ def _focals(focal: float | Sequence[float], cameras: int) -> tuple[float, ...]:
     return tuple(values * (cameras if len(values) == 1 else 1))
 
 
-def _unusual(takes: Sequence[Take], focals: Sequence[float], sizes: Sequence[Size]) -> tuple[str, ...]:
+def _focal_notes(takes: Sequence[Take], focals: Sequence[float], sizes: Sequence[Size]) -> tuple[str, ...]:
     """On focal lengths that no camera has: millimetres, or those of another size of the picture."""
     odd = [
-        f"{take.name} ({f:g} px for pictures of {size[0]}x{size[1]}: a view of {_field(f, size):.0f} degrees)"
+        f"{take.name} ({f:g} px for pictures of {size[0]}x{size[1]}: a view of {_field_of_view(f, size):.0f} degrees)"
         for take, f, size in zip(takes, focals, sizes, strict=True)
-        if not 8 <= _field(f, size) <= 130
+        if not 8 <= _field_of_view(f, size) <= 130
     ]
     return (f"focal lengths are unusual, are they in pixels of these pictures? {', '.join(odd)}",) if odd else ()
 
 
-def _field(focal: float, size: Size) -> float:
+def _field_of_view(focal: float, size: Size) -> float:
     """Degrees from corner to corner."""
     return math.degrees(2 * math.atan2(math.hypot(*size) / 2, focal))
 
 
-def _of_file(takes: Sequence[Take], sizes: Sequence[Size], calibration: Any) -> KnownLenses:
+def _from_file(takes: Sequence[Take], sizes: Sequence[Size], calibration: Any) -> KnownLenses:
     names = [take.name for take in takes]
     path = calibration if isinstance(calibration, (str, Path)) else None
     if path is None:
@@ -129,21 +131,21 @@ def _of_file(takes: Sequence[Take], sizes: Sequence[Size], calibration: Any) -> 
 # What phones write into their videos and photos.
 
 
-def _of_exif(takes: Sequence[Take], sizes: Sequence[Size]) -> KnownLenses:
-    found = [focal_35(take) for take in takes]
-    lacking = [take.name for take, one in zip(takes, found, strict=True) if one is None]
+def _from_exif(takes: Sequence[Take], sizes: Sequence[Size]) -> KnownLenses:
+    focals_35 = [focal_35(take) for take in takes]
+    lacking = [take.name for take, one in zip(takes, focals_35, strict=True) if one is None]
     if lacking:
         text = (
             "{names}: no 35 mm equivalent is written in its video, nor in a photo beside its keypoints; "
             "leave {arg:exif} out, or give {arg:focal}"
         )
         raise ValueError(Message(text, names=listed(lacking)))
-    known = [one for one in found if one is not None]
+    known = [one for one in focals_35 if one is not None]
     focals = tuple(mm * math.hypot(*size) / DIAGONAL for (mm, _), size in zip(known, sizes, strict=True))
-    said = "; ".join(
+    listing = "; ".join(
         f"{take.name} {mm:g} mm ({where}): {f:.0f} px" for take, (mm, where), f in zip(takes, known, focals, strict=True)
     )
-    note = f"35 mm equivalents as written, and held: {said}; stabilized videos show up to a tenth less than photos"
+    note = f"35 mm equivalents as written, and held: {listing}; stabilized videos show up to a tenth less than photos"
     return KnownLenses(focals, source="35 mm equivalent, and held", notes=(note,))
 
 
@@ -152,14 +154,14 @@ def focal_35(take: Take) -> tuple[float, str] | None:
     if take.path is None:
         return None
     if take.video is not None:
-        return _of_video(take.path)
+        return _video_focal_35(take.path)
     beside = take.path if take.path.is_dir() else take.path.parent
     photos = [file for file in sorted(beside.iterdir()) if file.suffix.lower() in PHOTOS and file.is_file()]
     own = photos if take.path.is_dir() else [file for file in photos if file.stem == take.path.stem]
-    return next((found for photo in own if (found := _of_photo(photo)) is not None), None)
+    return next((found for photo in own if (found := _photo_focal_35(photo)) is not None), None)
 
 
-def _of_video(path: Path) -> tuple[float, str] | None:
+def _video_focal_35(path: Path) -> tuple[float, str] | None:
     from indexing.video.reading import av
 
     with av().open(str(path)) as container:
@@ -173,7 +175,7 @@ def _of_video(path: Path) -> tuple[float, str] | None:
     return None
 
 
-def _of_photo(path: Path) -> tuple[float, str] | None:
+def _photo_focal_35(path: Path) -> tuple[float, str] | None:
     from PIL import Image
 
     try:
@@ -182,3 +184,54 @@ def _of_photo(path: Path) -> tuple[float, str] | None:
     except (OSError, ValueError):
         return None
     return (float(value), path.name) if isinstance(value, (int, float)) and value > 0 else None
+
+
+KNOWN = "known"
+REMEDY = "give the sync.json of dyntorch sync, or the word known for recordings that are synchronized"
+
+
+def given_clocks(value: Any, names: Sequence[str]) -> Tensor | None:
+    """``(cameras, 2)`` offset in seconds and rate of each camera's clock against the first one's; None where nothing is given."""
+    if value is None:
+        return None
+    if isinstance(value, str) and value == KNOWN:
+        return torch.tensor([[0.0, 1.0]], dtype=torch.float64).repeat(len(names), 1)
+    if isinstance(value, (str, Path)):
+        return _clocks_from_sync(Path(value).expanduser(), names)
+    if isinstance(value, Clocks):
+        return _relative_to_first(torch.stack([value.offsets, value.rates], dim=1).double(), len(names))
+    numbers = torch.as_tensor(value, dtype=torch.float64)
+    if numbers.ndim == 1:
+        numbers = torch.stack([numbers, torch.ones_like(numbers)], dim=1)
+    return _relative_to_first(numbers, len(names))
+
+
+def _relative_to_first(clocks: Tensor, cameras: int) -> Tensor:
+    """Clocks against that of the first camera: :math:`t_i = r_i (t_0 - o_0) / r_0 + o_i`."""
+    if clocks.shape != (cameras, 2) or not bool(torch.isfinite(clocks).all()) or not bool((clocks[:, 1] > 0).all()):
+        text = "{arg:clocks} must be offset and rate of {cameras} cameras, finite and rates positive, got shape {shape}"
+        raise ValueError(Message(text, cameras=cameras, shape=tuple(clocks.shape)))
+    rates = clocks[:, 1] / clocks[0, 1]
+    return torch.stack([clocks[:, 0] - rates * clocks[0, 0], rates], dim=1)
+
+
+def _clocks_from_sync(path: Path, names: Sequence[str]) -> Tensor:
+    """What ``dyntorch sync`` wrote."""
+    content = parse_json(path, read_text(path, REMEDY), REMEDY)
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    if not isinstance(cameras, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str) for one in cameras):
+        raise error(path, "has no list of cameras with names", REMEDY)
+    if not content.get("ok"):
+        raise error(path, "the recordings did not decide on these clocks", "leave it out, or synchronize them in another way")
+    known = {one["name"]: one for one in cameras}
+    lacking = [name for name in names if name not in known]
+    if lacking:
+        raise error(path, f"has no clock of {listed(lacking)} (it has {listed(known)})", "synchronize the same recordings")
+    rows = []
+    for name in names:
+        offset, rate = known[name].get("offset"), known[name].get("rate")
+        numbers = all(isinstance(x, (int, float)) and math.isfinite(x) for x in (offset, rate))
+        if not numbers or rate <= 0:
+            raise error(path, f"{name}: offset and rate are no numbers", REMEDY)
+        rows.append([float(offset), float(rate)])
+    return _relative_to_first(torch.tensor(rows, dtype=torch.float64), len(names))

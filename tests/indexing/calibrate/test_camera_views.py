@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.calibrate.views import check_cameras, check_overlap, check_size, common, sized, view_of
+from indexing.calibrate.camera_views import check_cameras, check_overlap, check_size, make_view, select_common_joints, to_pixels
 from indexing.clip import Clip
 from indexing.skeleton import BODY25, COCO17, HAND21, Skeleton
 from indexing.sync.recordings import take_of
@@ -28,7 +28,7 @@ def test_frames_keep_their_times_and_joints_their_confidence():
     joints[7, 3] = np.nan
     trust = np.linspace(0.1, 1, 30 * 17).reshape(30, 17)
     one = clip(joints[kept], times=kept / FPS, confidence=trust[kept])
-    view = view_of(take_of(one, name="a"), [one], SIZE)
+    view = make_view(take_of(one, name="a"), [one], SIZE)
     tracks, weights = view.table(range(17))
     assert np.array_equal(view.times, kept / FPS)
     assert np.array_equal(tracks.numpy(), joints[kept], equal_nan=True) and float(weights[3, 3]) == 0
@@ -38,7 +38,7 @@ def test_frames_keep_their_times_and_joints_their_confidence():
 
 def test_people_stand_side_by_side_and_who_is_not_there_is_missing():
     a, b = clip(moving(seed=1)), clip(moving(20, seed=2), times=(np.arange(20) + 5) / FPS)
-    view = view_of(take_of([a, b], name="x"), [a, None, b], SIZE)
+    view = make_view(take_of([a, b], name="x"), [a, None, b], SIZE)
     tracks, weights = view.table(range(17))
     assert tracks.shape == (30, 51, 2) and weights.shape == (30, 51) and bool(tracks[:, 17:34].isnan().all())
     assert torch.equal(tracks[:, :17], torch.tensor(a.joints)) and torch.equal(tracks[5:25, 34:], torch.tensor(b.joints))
@@ -47,29 +47,29 @@ def test_people_stand_side_by_side_and_who_is_not_there_is_missing():
 def test_a_clock_that_runs_over_hardly_any_frames_is_refused():
     one = clip(moving(4, 3), times=np.array([0.0, 1 / FPS, 2 / FPS, 1e5]))
     with pytest.raises(ValueError, match="b: 11 frames show somebody, 12 are needed at least; film longer"):
-        view_of(take_of(clip(moving(11)), name="b"), [clip(moving(11))], SIZE)
+        make_view(take_of(clip(moving(11)), name="b"), [clip(moving(11))], SIZE)
     with pytest.raises(ValueError, match="a: 4 frames over 100000 s at 30 per second: nearly all gap"):
-        view_of(take_of(one, name="a"), [one], SIZE)
+        make_view(take_of(one, name="a"), [one], SIZE)
 
 
 # ---- joints --------------------------------------------------------------------------------------------------------------
 def test_layouts_are_joined_by_names():
     halves = Skeleton("upper", (*COCO17.joints[:13], "neck"), ((0, 13),))
     clips = [Clip(np.zeros((1, len(one.joints), 2)), skeleton=one) for one in (COCO17, BODY25, halves)]
-    found = common(clips, ["a", "b", "c"])
+    found = select_common_joints(clips, ["a", "b", "c"])
     assert found.skeleton.joints == (*COCO17.joints, "neck")  # all that two of them have
     for place, layout in zip(found.places, (COCO17, BODY25, halves), strict=True):
         for i, joint in zip(place, found.skeleton.joints, strict=True):
             assert (layout.joints[i] == joint) if i >= 0 else joint not in layout.joints
     assert "COCO-17, BODY_25, upper: 18 joints" in found.note and (17, 0) in found.skeleton.bones
-    same = common(clips[:1] * 3, ["a", "b", "c"])
+    same = select_common_joints(clips[:1] * 3, ["a", "b", "c"])
     assert same.skeleton is COCO17 and same.places == (tuple(range(17)),) * 3 and same.note == ""
 
 
 def test_joints_of_one_camera_that_another_lacks_are_missing_there():
     clips = [clip(moving(20, len(one.joints)), skeleton=one) for one in (COCO17, BODY25)]
-    found = common(clips, ["a", "b"])
-    tracks = [view_of(take_of(c, name="x"), [c], SIZE).table(p)[0] for c, p in zip(clips, found.places, strict=True)]
+    found = select_common_joints(clips, ["a", "b"])
+    tracks = [make_view(take_of(c, name="x"), [c], SIZE).table(p)[0] for c, p in zip(clips, found.places, strict=True)]
     assert found.count == 17 and torch.equal(tracks[1][:, 0], torch.tensor(clips[1].joints[:, 0]))
     assert torch.equal(tracks[1][:, 5], torch.tensor(clips[1].joints[:, BODY25.joints.index("left_shoulder")]))
 
@@ -79,25 +79,25 @@ def test_layouts_that_cannot_be_joined():
     with pytest.raises(
         ValueError, match=r"a: its joints \(nose, .*\) share 0 names with those of any other camera, and 8 are needed"
     ):
-        common([body, hand], ["a", "b"])
+        select_common_joints([body, hand], ["a", "b"])
     bare = [Clip(np.zeros((1, n, 2))) for n in (14, 15)]
     with pytest.raises(ValueError, match="a: has 14 joints without names, b has 15, so nobody knows which is which; give layout="):
-        common(bare, ["a", "b"])
-    assert common(bare[:1] * 2, ["a", "b"]).skeleton is None
+        select_common_joints(bare, ["a", "b"])
+    assert select_common_joints(bare[:1] * 2, ["a", "b"]).skeleton is None
 
 
 # ---- pictures ------------------------------------------------------------------------------------------------------------
 def test_sizes_from_wherever_they_are_known():
     named = take_of(clip(moving(), meta={"size": np.array([640, 480])}), name="a")
-    assert sized(named, None)[1] == (640, 480) and sized(named, (1920, 1080))[1] == (1920, 1080)
+    assert to_pixels(named, None)[1] == (640, 480) and to_pixels(named, (1920, 1080))[1] == (1920, 1080)
     with pytest.raises(ValueError, match="b: the size of its picture is not known; give size= such as 1920x1080"):
-        sized(take_of(clip(moving()), name="b"), None)
+        to_pixels(take_of(clip(moving()), name="b"), None)
 
 
 def test_coordinates_from_0_to_1_become_pixels():
     joints = moving()
     shares = clip(joints / np.array(SIZE), name="n")
-    take, size = sized(take_of(shares, name="n"), SIZE)
+    take, size = to_pixels(take_of(shares, name="n"), SIZE)
     assert np.allclose(take.people[0].joints, joints) and np.allclose(take.everyone[0].joints, joints) and size == SIZE
     assert not any("0 to 1" in str(note) for note in take.notes)
 
@@ -132,7 +132,7 @@ def test_cameras_that_are_none_of_one_rig():
 
 def test_cameras_without_a_common_time():
     a, b, c = clip(moving(seed=1)), clip(moving(seed=2)), clip(moving(seed=3), times=100 + np.arange(30) / FPS)
-    views = [view_of(take_of(one, name=name), [one], SIZE) for one, name in ((a, "a"), (b, "b"), (c, "c"))]
+    views = [make_view(take_of(one, name=name), [one], SIZE) for one, name in ((a, "a"), (b, "b"), (c, "c"))]
     known = torch.tensor([[0.0, 1.0]] * 3, dtype=torch.float64)
     check_overlap(views[:2], known[:2])
     with pytest.raises(

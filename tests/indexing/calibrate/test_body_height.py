@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from indexing.actors import Person, perform
-from indexing.calibrate.stature import check_height, standing
+from indexing.calibrate.body_height import check_height, standing_extent
 from indexing.skeleton import BODY25, BODY25B, COCO17, HAND21, MEDIAPIPE33
 
 
 def test_the_extent_is_that_of_winters_table():
-    assert standing(COCO17.joints, 2.0).extent == pytest.approx(2.0 * (0.936 - 0.039))
-    assert standing(BODY25B.joints, 1.8).extent == pytest.approx(1.8 * (1.0 - 0.01)) and standing(BODY25B.joints, 1.8).tops == (
-        "head_top",
-    )
-    assert standing(MEDIAPIPE33.joints, 1.8).bottoms == ("left_foot_index", "right_foot_index")
+    assert standing_extent(COCO17.joints, 2.0).extent == pytest.approx(2.0 * (0.936 - 0.039))
+    assert standing_extent(BODY25B.joints, 1.8).extent == pytest.approx(1.8 * (1.0 - 0.01)) and standing_extent(
+        BODY25B.joints, 1.8
+    ).tops == ("head_top",)
+    assert standing_extent(MEDIAPIPE33.joints, 1.8).bottoms == ("left_foot_index", "right_foot_index")
     no_face = [joint for joint in COCO17.joints if "shoulder" in joint or "ankle" in joint]
-    assert standing(no_face, 1.0).extent == pytest.approx(0.818 - 0.039) and standing(no_face, 1.0).sigma > 0.01
-    assert standing(["LAnkle", "REye", "hip"], 1.7).tops == ("REye",)
+    assert standing_extent(no_face, 1.0).extent == pytest.approx(0.818 - 0.039) and standing_extent(no_face, 1.0).sigma > 0.01
+    assert standing_extent(["LAnkle", "REye", "hip"], 1.7).tops == ("REye",)
     for layout in (COCO17, BODY25):
-        one = standing(layout.joints, 1.75)
+        one = standing_extent(layout.joints, 1.75)
         assert 0.005 < one.sigma / one.extent < 0.025 and f"{one.height:g} m" in one.note and "Drillis" in one.note
 
 
@@ -28,7 +28,7 @@ def test_a_body_that_stands_has_about_this_extent():
     """Synthetic people are built from lengths of their own: head to ankle within a few percent of the table."""
     solid = perform("wave", Person(), fps=30.0, rng=0)
     tall = np.ptp(solid.joints[0, :, 1])
-    assert standing(COCO17.joints, 1.7).extent == pytest.approx(tall, rel=0.12)
+    assert standing_extent(COCO17.joints, 1.7).extent == pytest.approx(tall, rel=0.12)
 
 
 @pytest.mark.parametrize(
@@ -48,6 +48,6 @@ def test_no_height_of_a_person(height, said):
 
 def test_joints_that_no_height_says_anything_of():
     with pytest.raises(ValueError, match="do not reach from the head or the shoulders to the feet"):
-        standing(HAND21.joints, 1.75)
+        standing_extent(HAND21.joints, 1.75)
     with pytest.raises(ValueError, match="do not reach"):
-        standing((), 1.75)
+        standing_extent((), 1.75)

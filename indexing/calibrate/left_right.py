@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from dyntorch import Status
 from dyntorch.core import Notice, NoticeCode, Outcome, status_from
-from dyntorch.numerics import check_options
-from indexing.calibrate.options import SideOptions
 from indexing.joints import canonical
 
 if TYPE_CHECKING:
@@ -28,6 +26,18 @@ LIMBS = ("trunk", "arms", "legs")
 """What may be exchanged by itself: shoulders, hips and face; elbows, wrists and hands; knees, ankles and feet."""
 _ARMS = re.compile(r"elbow|wrist|hand|thumb|index(?!toe)|middle|ring|pinky|radius|fingers")
 _LEGS = re.compile(r"knee|ankle|heel|foot|toe|tibia")
+
+JOINT_SIGMA = 0.015  # body sizes (diagonals in the picture): 6 to 8 px of 450
+DEGREES_OF_FREEDOM = 3.0  # of Student's t for these distances: detectors have outliers
+MAX_JOINT_EVIDENCE = 8.0  # nats of one joint of three cameras
+INDEPENDENT_LIMB_JOINTS = 3.0  # in one limb: its joints are exchanged, and off, together
+CORRELATION_SECONDS = 0.1  # within which frames carry the same evidence
+MAX_TRIPLES = 20  # of cameras; of 7 and 8 cameras every second or third one
+EXCHANGE_COST = 0.5  # nats per second of an exchanged camera: fewer exchanges are likelier
+LIMB_COST = 1.0  # nats per second of a limb whose state differs from that of the body
+SWITCH_COST = 4.0  # nats of a change in one camera: keeps single frames from flickering
+MAX_FRAME_DISTANCE = 0.6  # frames from a moment within which a camera's frame stands for it
+MIN_TIE_SECONDS = 0.2  # from which on a tie is reported
 
 
 class KnownCameras(Protocol):
@@ -74,7 +84,7 @@ class SideExchange:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Sides(Outcome):
+class SideCorrection(Outcome):
     """Left and right, as all cameras together see them."""
 
     tracks: tuple[Floats, ...]  # per camera ``(frames, n, 2)`` px as given, with what was exchanged put right
@@ -95,7 +105,7 @@ class Sides(Outcome):
         return "\n".join([*lines, *(f"  note: {notice.text}" for notice in self.notices if notice.code is not SideNotice.MENDED)])
 
 
-def sides(
+def correct_sides(
     tracks: Sequence[ArrayLike],
     cameras: KnownCameras,
     joints: Sequence[str],
@@ -103,48 +113,46 @@ def sides(
     times: Sequence[ArrayLike] | None = None,
     fps: float | Sequence[float] = 30.0,
     weights: Sequence[ArrayLike] | None = None,
-    options: SideOptions = SideOptions(),
-) -> Sides:
+) -> SideCorrection:
     r"""Which cameras show left as right, when, and of which limb; and the tracks with that put right. tracks
     ``(frames, n, 2)``, times ``(frames,)``, weights ``(frames, n)``."""
-    check_options(options, SideOptions)
-    x, w, moments, people = _checked(tracks, cameras, joints, times, fps, weights)
-    pairs = sided(joints)
+    x, w, moments, people = _check_tracks(tracks, cameras, joints, times, fps, weights)
+    pairs = paired_joints(joints)
     untouched = tuple(np.zeros((len(one), people, len(LIMBS)), dtype=bool) for one in x)
     given = None if weights is None else tuple(w)
     if not any(pairs.values()) or len(x) < 3:
-        said = [Notice(SideNotice.TWO if any(pairs.values()) else SideNotice.SIDELESS)]
-        return Sides(
-            status=status_from(()), notices=tuple(said), tracks=tuple(x), weights=given, exchanged=untouched, exchanges=()
+        notices = [Notice(SideNotice.TWO if any(pairs.values()) else SideNotice.SIDELESS)]
+        return SideCorrection(
+            status=status_from(()), notices=tuple(notices), tracks=tuple(x), weights=given, exchanged=untouched, exchanges=()
         )  # fmt: skip
-    grid, seen, trust = _together(x, w, moments, cameras, options)
-    found: list[SideExchange] = []
-    said = []
+    grid, positions, trust = _resample(x, w, moments, cameras)
+    exchanges: list[SideExchange] = []
+    notices = []
     for person in range(people):
         rows = slice(person * len(joints), (person + 1) * len(joints))
-        labels, costs = _readings(seen[:, :, rows], trust[:, :, rows], _projections(cameras), pairs, grid, options)
-        labels, tied = _untied(labels, grid, person, options)
-        said += tied
+        labels, costs = _decode_sides(positions[:, :, rows], trust[:, :, rows], _projections(cameras), pairs, grid)
+        labels, tied = _clear_ties(labels, grid, person)
+        notices += tied
         for camera, own in enumerate(moments):
             common = (own - _clock(cameras, camera)[0]) / _clock(cameras, camera)[1]
             place = np.clip(np.searchsorted(grid, common - 0.5 * (grid[1] - grid[0] if len(grid) > 1 else 1.0)), 0, len(grid) - 1)
             untouched[camera][:, person] = labels[place, camera]
-            found += _stretches(untouched[camera][:, person], costs[place, camera], own, camera, person, pairs)
-    mended, trusted = _mended(x, w, untouched, pairs, len(joints))
-    for one in found:
+            exchanges += _exchange_intervals(untouched[camera][:, person], costs[place, camera], own, camera, person, pairs)
+    mended, trusted = _exchange_joints(x, w, untouched, pairs, len(joints))
+    for one in exchanges:
         values = {"limb": one.limb, "person": one.person, "which": [one.camera], "start": one.start, "end": one.end}
-        said.append(Notice(SideNotice.MENDED, one.evidence, values))
-    return Sides(
+        notices.append(Notice(SideNotice.MENDED, one.evidence, values))
+    return SideCorrection(
         status=status_from(()),
-        notices=tuple(said),
+        notices=tuple(notices),
         tracks=tuple(mended),
         weights=None if weights is None else tuple(trusted),
         exchanged=untouched,
-        exchanges=tuple(found),
+        exchanges=tuple(exchanges),
     )
 
 
-def sided(joints: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
+def paired_joints(joints: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
     """The joints that have a left and a right one, as pairs of numbers, by limb."""
     words = [canonical(joint) for joint in joints]
     out: dict[str, list[tuple[int, int]]] = {limb: [] for limb in LIMBS}
@@ -160,7 +168,7 @@ def sided(joints: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
 # What is given, at common moments.
 
 
-def _checked(
+def _check_tracks(
     tracks: Sequence[ArrayLike],
     cameras: KnownCameras,
     joints: Sequence[str],
@@ -211,8 +219,8 @@ def _projections(cameras: KnownCameras) -> Floats:
     return np.asarray((cameras.K @ torch.cat([cameras.R, cameras.t[..., None]], dim=-1)).numpy(), dtype=np.float64)
 
 
-def _together(
-    x: Sequence[Floats], w: Sequence[Floats], moments: Sequence[Floats], cameras: KnownCameras, options: SideOptions
+def _resample(
+    x: Sequence[Floats], w: Sequence[Floats], moments: Sequence[Floats], cameras: KnownCameras
 ) -> tuple[Floats, Floats, Floats]:
     """Common moments ``(T,)``, undistorted positions ``(T, c, n, 2)`` px and trust ``(T, c, n)`` there, by the nearest frames."""
     import torch
@@ -233,7 +241,7 @@ def _together(
         before = np.maximum(after - 1, 0)
         nearest = np.where(grid - at[before] > at[after] - grid, after, before)
         off = grid - at[nearest]
-        near = np.abs(off) <= options.nearest * step
+        near = np.abs(off) <= MAX_FRAME_DISTANCE * step
         seen[:, k] = np.where(near[:, None, None], flat[nearest] + off[:, None, None] * _speeds(flat, at)[nearest], np.nan)
         trust[:, k] = np.where(near[:, None], w[k][nearest], 0.0)
     known = np.asarray(np.isfinite(seen).all(-1) & (trust > 0))
@@ -256,27 +264,27 @@ def _speeds(x: Floats, times: Floats) -> Floats:
 # The evidence of three cameras, and the likeliest reading over time.
 
 
-def _readings(
-    x: Floats, w: Floats, projections: Floats, pairs: dict[str, list[tuple[int, int]]], grid: Floats, options: SideOptions
+def _decode_sides(
+    x: Floats, w: Floats, projections: Floats, pairs: dict[str, list[tuple[int, int]]], grid: Floats
 ) -> tuple[Booleans, Floats]:
     """Who exchanges what ``(T, c, limbs)``, and the nats that speak for it, ``(T, c, limbs)``."""
     count = x.shape[1]
     step = float(grid[1] - grid[0]) if len(grid) > 1 else 1.0
     states = np.array(list(product((0, 1), repeat=count)), dtype=np.int64)
-    energy = {limb: _energy(x, w, projections, pairs[limb], states, step, options) for limb in LIMBS}
-    body = sum(energy.values()) + options.exchanged * step * states.sum(1)
-    whole = _viterbi(body, states, options.change)
+    energy = {limb: _energy(x, w, projections, pairs[limb], states, step) for limb in LIMBS}
+    body = sum(energy.values()) + EXCHANGE_COST * step * states.sum(1)
+    body_states = _viterbi(body, states, SWITCH_COST)
     labels = np.zeros((len(x), count, len(LIMBS)), dtype=bool)
     costs = np.zeros(labels.shape)
     for k, limb in enumerate(LIMBS):
-        apart = (states[None] != states[whole][:, None]).sum(2)
-        total = energy[limb] + options.exchanged * step * states.sum(1) + options.alone * step * apart
-        chosen = _viterbi(total, states, options.change) if pairs[limb] else whole
-        labels[:, :, k] = states[chosen] > 0
+        num_different = (states[None] != states[body_states][:, None]).sum(2)
+        total = energy[limb] + EXCHANGE_COST * step * states.sum(1) + LIMB_COST * step * num_different
+        limb_states = _viterbi(total, states, SWITCH_COST) if pairs[limb] else body_states
+        labels[:, :, k] = states[limb_states] > 0
         for camera in range(count):
-            turned = chosen ^ (1 << (count - 1 - camera))
+            turned = limb_states ^ (1 << (count - 1 - camera))
             rows = np.arange(len(x))
-            costs[:, camera, k] = energy[limb][rows, turned] - energy[limb][rows, chosen]
+            costs[:, camera, k] = energy[limb][rows, turned] - energy[limb][rows, limb_states]
     return labels, costs
 
 
@@ -287,7 +295,6 @@ def _energy(
     pairs: Sequence[tuple[int, int]],
     states: Integers,
     step: float,
-    options: SideOptions,
 ) -> Floats:
     """Nats ``(T, states)`` against each reading of all cameras, by all joints that have two sides."""
     out = np.zeros((len(x), len(states)))
@@ -296,16 +303,16 @@ def _energy(
     left, right = (np.array(side) for side in zip(*pairs, strict=True))
     sides_ = np.stack([x[:, :, left], x[:, :, right]]), np.stack([w[:, :, left], w[:, :, right]])
     triples = list(combinations(range(x.shape[1]), 3))
-    every = max(1, math.ceil(len(triples) / options.triples))
+    every = max(1, math.ceil(len(triples) / MAX_TRIPLES))
     triples = triples[::every]
-    worth = options.joints / max(1, len(pairs)) * min(1.0, step / options.lasting) / len(triples) * x.shape[1]
+    worth = INDEPENDENT_LIMB_JOINTS / max(1, len(pairs)) * min(1.0, step / CORRELATION_SECONDS) / len(triples) * x.shape[1]
     for triple in triples:
         size = _size(x[:, triple])
         costs = {}
         for sign in product((0, 1), repeat=3):  # which side each camera calls left
             points = np.stack([sides_[0][s, :, c] for s, c in zip(sign, triple, strict=True)], axis=1)
             trust = np.stack([sides_[1][s, :, c] for s, c in zip(sign, triple, strict=True)], axis=1)
-            costs[sign] = _misfit(points, trust, projections[list(triple)], size, options)
+            costs[sign] = _reprojection_cost(points, trust, projections[list(triple)], size)
         for sign in ((0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)):
             other = tuple(1 - s for s in sign)
             cost = worth * (costs[sign] + costs[other])
@@ -324,7 +331,7 @@ def _size(x: Floats) -> float:
     return float(np.median(seen)) if seen.size else 1.0
 
 
-def _misfit(x: Floats, w: Floats, projections: Floats, size: float, options: SideOptions) -> Floats:
+def _reprojection_cost(x: Floats, w: Floats, projections: Floats, size: float) -> Floats:
     """Nats ``(T,)``: robust reprojection error of points triangulated from three cameras, over the joints that all three see."""
     known: Booleans = np.asarray(np.isfinite(x).all((1, 3)) & (w > 0).all(1))
     filled = np.where(np.isfinite(x), x, 0.0)
@@ -338,8 +345,8 @@ def _misfit(x: Floats, w: Floats, projections: Floats, size: float, options: Sid
     square = np.square(flat - filled).sum(-1)
     # a point behind a camera is nowhere right
     square = np.asarray(np.where(seen[..., 2] > 0, square, np.inf)).sum(1) / 3
-    sigma = options.sigma * size
-    cost = np.minimum(np.log1p(square / (options.freedom * sigma**2)) * (options.freedom + 3) / 2, options.most)
+    sigma = JOINT_SIGMA * size
+    cost = np.minimum(np.log1p(square / (DEGREES_OF_FREEDOM * sigma**2)) * (DEGREES_OF_FREEDOM + 3) / 2, MAX_JOINT_EVIDENCE)
     trust = np.cbrt(np.where(known[:, None], w, 1.0).prod(1))
     return np.asarray(np.where(known, cost * trust, 0.0)).sum(1)
 
@@ -364,9 +371,9 @@ def _viterbi(energy: Floats, states: Integers, change: float) -> Integers:
     return out
 
 
-def _untied(labels: Booleans, grid: Floats, person: int, options: SideOptions) -> tuple[Booleans, list[Notice]]:
+def _clear_ties(labels: Booleans, grid: Floats, person: int) -> tuple[Booleans, list[Notice]]:
     """Without the exchanges that nothing tells from those of the other cameras: as many here as there, before and after, too."""
-    out, said = labels.copy(), []
+    out, notices = labels.copy(), []
     count = labels.shape[1]
     for k, limb in enumerate(LIMBS):
         for start, end in _runs(2 * labels[:, :, k].sum(1) == count):
@@ -375,10 +382,10 @@ def _untied(labels: Booleans, grid: Floats, person: int, options: SideOptions) -
             if sum(int(one.sum()) for one in ends) < sum(count - int(one.sum()) for one in ends):
                 continue
             out[start:end, :, k] = False
-            if grid[end - 1] - grid[start] >= options.told:
+            if grid[end - 1] - grid[start] >= MIN_TIE_SECONDS:
                 values = {"limb": limb, "person": person, "start": float(grid[start]), "end": float(grid[end - 1])}
-                said.append(Notice(SideNotice.TIED, float(end - start), values))
-    return out, said
+                notices.append(Notice(SideNotice.TIED, float(end - start), values))
+    return out, notices
 
 
 def _runs(there: Booleans) -> list[tuple[int, int]]:
@@ -386,24 +393,24 @@ def _runs(there: Booleans) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(steps[::2], steps[1::2], strict=True)]
 
 
-def _stretches(
+def _exchange_intervals(
     exchanged: Booleans, costs: Floats, times: Floats, camera: int, person: int, pairs: dict[str, list[tuple[int, int]]]
 ) -> list[SideExchange]:
     """Exchanges of a person in a camera ``(frames, limbs)`` as stretches; of all limbs together as those of the body."""
     there = [k for k, limb in enumerate(LIMBS) if pairs[limb]]
-    whole = exchanged[:, there].all(1)
-    found = []
+    body = exchanged[:, there].all(1)
+    exchanges = []
     for limb, which, chosen in (
-        ("body", whole, there),
-        *((LIMBS[k], exchanged[:, k] & ~whole, [k]) for k in there),
+        ("body", body, there),
+        *((LIMBS[k], exchanged[:, k] & ~body, [k]) for k in there),
     ):
         for start, end in _runs(np.asarray(which)):
             evidence = float(costs[start:end][:, chosen].sum())
-            found.append(SideExchange(camera, person, limb, float(times[start]), float(times[end - 1]), evidence))
-    return sorted(found, key=lambda one: (one.start, one.limb))
+            exchanges.append(SideExchange(camera, person, limb, float(times[start]), float(times[end - 1]), evidence))
+    return sorted(exchanges, key=lambda one: (one.start, one.limb))
 
 
-def _mended(
+def _exchange_joints(
     x: Sequence[Floats], w: Sequence[Floats], exchanged: Sequence[Booleans], pairs: dict[str, list[tuple[int, int]]], joints: int
 ) -> tuple[list[Floats], list[Floats]]:
     """Positions and weights with left and right in their places."""

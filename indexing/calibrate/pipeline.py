@@ -11,16 +11,23 @@ from typing import Any
 import numpy as np
 import torch
 
-from dyntorch import Calibration, Clocks
-from dyntorch.numerics import Message, as_python, check_options
-from indexing.calibrate.clocks import given_clocks
-from indexing.calibrate.lenses import KnownLenses, known_lenses
-from indexing.calibrate.options import RigOptions
+from dyntorch import CalibrateOptions, Calibration, Clocks
+from dyntorch.numerics import Message, as_python
+from indexing.calibrate.body_height import Stature, scale_to_metres, standing_extent
+from indexing.calibrate.camera_views import (
+    Joints,
+    Size,
+    View,
+    check_cameras,
+    check_overlap,
+    make_view,
+    select_common_joints,
+    to_pixels,
+)
+from indexing.calibrate.left_right import SideExchange, correct_sides
 from indexing.calibrate.people import Association, associate
+from indexing.calibrate.priors import KnownLenses, given_clocks, known_lenses
 from indexing.calibrate.rig import CameraRig
-from indexing.calibrate.sides import SideExchange, sides
-from indexing.calibrate.stature import Stature, in_metres, standing
-from indexing.calibrate.views import Joints, Size, View, check_cameras, check_overlap, common, sized, view_of
 from indexing.clip import Clip
 from indexing.joints import canonical
 from indexing.opening import listed
@@ -31,9 +38,11 @@ NO_STATURE = Message("{arg:height} says nothing: nobody is seen from head to foo
 ONE_PERSON = Message("who is who is not decided; {arg:person='largest'} uses the largest person of each frame instead")
 ASSUMED_RATE = "30 frames per second assumed for {names}; {arg:fps=} says otherwise"
 
+MAX_LENGTH_METRES = 100.0  # between two joints: nothing filmed whole is larger, and millimetres are
+
 
 @dataclass(frozen=True)
-class Known:
+class RigPriors:
     """What somebody knows of a rig besides the recordings; see :func:`calibrate`."""
 
     focal: float | Sequence[float] | None = None
@@ -47,7 +56,7 @@ class Known:
     lengths: Mapping[tuple[str, str], float] | None = None
 
     @property
-    def by_name(self) -> dict[tuple[str, str], float]:
+    def named_lengths(self) -> dict[tuple[str, str], float]:
         """The lengths, if there are any."""
         return dict(self.lengths or {})
 
@@ -68,7 +77,7 @@ def calibrate(
     max_shift: float | None = None,
     person: str = "everyone",
     people: int = 4,
-    options: RigOptions = RigOptions(),
+    options: CalibrateOptions | None = None,
     **reading: Any,
 ) -> CameraRig:
     r"""Cameras from the people in view: where each stands, its focal length, its clock, and the movement in space.
@@ -91,7 +100,7 @@ def calibrate(
         calibration: path of a calibration file: matrix and distortions of each camera, held.
         exif: focal lengths by the 35 mm equivalent that phones write into their files.
         height: metres, of the person standing (of several, the tallest): fixes the scale, by the joints' share of it
-            (:mod:`~indexing.calibrate.stature`).
+            (:mod:`~indexing.calibrate.body_height`).
         lengths: ``{("left_hip", "left_knee"): 0.43}``, metres, of the first person: fix the scale as well.
         clocks: ``"known"`` where frames of equal times were taken at once; the path of a ``sync.json``, whose clocks are held;
             or what :func:`dyntorch.calibrate` takes.
@@ -100,7 +109,7 @@ def calibrate(
         person: ``"everyone"``, or who is followed where several people are in view: ``"largest"``, ``"confident"``,
             ``"tracked"``.
         people: of ``"everyone"``, how many at most.
-        options: every number that decides about recordings; those of the cameras are ``options.cameras``.
+        options: of :func:`dyntorch.calibrate`.
         reading: for the reader: ``format=``, ``layout=``, ``min_confidence=``.
 
     Returns:
@@ -119,19 +128,17 @@ def calibrate(
         ...
         ValueError: 1 camera: two to 8 are calibrated together; add a camera
     """
-    check_options(options, RigOptions)
-    found = _named(cameras)
-    rates = _each("fps", fps, len(found))
+    recordings = _name_cameras(cameras)
+    rates = _per_camera("fps", fps, len(recordings))
     how = {"person": "auto" if person == "everyone" else person, **reading}
     takes = [
-        take_of(value, name=name, fps=one, options=options.recordings, by="keypoints", **how)
-        for (name, value), one in zip(found, rates, strict=True)
+        take_of(value, name=name, fps=one, by="keypoints", **how) for (name, value), one in zip(recordings, rates, strict=True)
     ]
-    known = Known(focal, one_lens, calibration, exif, clocks, rate, max_shift, height, lengths)
-    return solve(takes, known, sizes=sizes, people=people if person == "everyone" else 1, options=options)
+    known = RigPriors(focal, one_lens, calibration, exif, clocks, rate, max_shift, height, lengths)
+    return calibrate_recordings(takes, known, sizes=sizes, people=people if person == "everyone" else 1, options=options)
 
 
-def _named(cameras: Sequence[Any] | str | Path) -> list[tuple[str, Any]]:
+def _name_cameras(cameras: Sequence[Any] | str | Path) -> list[tuple[str, Any]]:
     """Name and recording of each camera."""
     values = [cameras] if isinstance(cameras, (str, Path)) else list(cameras)
     if values and all(isinstance(value, (str, Path)) for value in values):
@@ -140,7 +147,7 @@ def _named(cameras: Sequence[Any] | str | Path) -> list[tuple[str, Any]]:
     return list(zip(names, values, strict=True))
 
 
-def _each(name: str, value: Any, cameras: int) -> list[Any]:
+def _per_camera(name: str, value: Any, cameras: int) -> list[Any]:
     """One value for each camera."""
     values = [value] if value is None or isinstance(value, (int, float)) else list(value)
     if len(values) not in (1, cameras):
@@ -153,14 +160,14 @@ def _each(name: str, value: Any, cameras: int) -> list[Any]:
 # From recordings that were read to a rig.
 
 
-def solve(
+def calibrate_recordings(
     takes: Sequence[Take],
-    known: Known = Known(),
+    known: RigPriors = RigPriors(),
     *,
     sizes: Size | Sequence[Size | None] | None = None,
     people: int = 4,
     words: Callable[[str, str | None], str] = as_python,
-    options: RigOptions = RigOptions(),
+    options: CalibrateOptions | None = None,
 ) -> CameraRig:
     """:func:`calibrate` for recordings that were read.
 
@@ -175,44 +182,44 @@ def solve(
         ValueError: as :func:`calibrate`.
     """
     # 1. what was recorded, in pixels
-    check_cameras(takes, options.views)
-    in_pixels = [sized(take, size) for take, size in zip(takes, sizes_of(sizes, len(takes)), strict=True)]
+    check_cameras(takes)
+    in_pixels = [to_pixels(take, size) for take, size in zip(takes, sizes_of(sizes, len(takes)), strict=True)]
     takes, shapes = [take for take, _ in in_pixels], [size for _, size in in_pixels]
     lenses = known_lenses(takes, shapes, focal=known.focal, one_lens=known.one_lens, calibration=known.calibration, exif=known.exif)
     # 2. which joint is which, and what is known of the person
     if known.height is not None and known.lengths:
         raise ValueError(Message("{arg:height} and {arg:length} both fix the scale; give one of them"))
-    joints = common([take.people[0] for take in takes], [take.name for take in takes], options.views)
-    stature = None if known.height is None else _stature(joints, known.height, options)
-    lengths = _lengths(joints, known.by_name, options)
+    joints = select_common_joints([take.people[0] for take in takes], [take.name for take in takes])
+    stature = None if known.height is None else _body_height(joints, known.height)
+    lengths = _lengths(joints, known.named_lengths)
     clocks = given_clocks(known.clocks, [take.name for take in takes])
     # 3. who is who
-    clips, identities = _who(takes, clocks, people, options)
-    told: list[str] = [*_on_takes(takes), *([joints.note] if joints.note else [])]
+    clips, identities = _identify_people(takes, clocks, people)
+    remarks: list[str] = [*_recording_notes(takes), *([joints.note] if joints.note else [])]
     if clips is None:
-        views = [view_of(take, take.people[:1], size, options.views) for take, size in zip(takes, shapes, strict=True)]
-        nothing = _undecided(views, joints, identities)
-        return CameraRig(nothing, views, joints, lenses, None, known.by_name, identities, (), (*told, ONE_PERSON), words)
-    views = [view_of(take, own, size, options.views) for take, own, size in zip(takes, clips, shapes, strict=True)]
+        views = [make_view(take, take.people[:1], size) for take, size in zip(takes, shapes, strict=True)]
+        unknown = _unknown_calibration(views, joints, identities)
+        return CameraRig(unknown, views, joints, lenses, None, known.named_lengths, identities, (), (*remarks, ONE_PERSON), words)
+    views = [make_view(take, own, size) for take, own, size in zip(takes, clips, shapes, strict=True)]
     if clocks is not None:
         check_overlap(views, clocks)
     # 4. the cameras
-    given = (joints, lenses, known, clocks, lengths, options)
-    found = _cameras(views, *given)
+    arguments = (joints, lenses, known, clocks, lengths, options)
+    calibration = _calibrate_cameras(views, *arguments)
     # 5. left and right, which the cameras tell each other
-    views, exchanges = _sides(views, found, joints, options)
+    views, exchanges = _correct_sides(views, calibration, joints)
     if exchanges:
-        found = _cameras(views, *given)
-        told += _on_sides(views, exchanges)
+        calibration = _calibrate_cameras(views, *arguments)
+        remarks += _side_notes(views, exchanges)
     # 6. the scale
-    if stature is not None and len(found.points):
-        found, stature = in_metres(found, stature, joints.skeleton.joints if joints.skeleton else (), options.stature)
-        told += [NO_STATURE] if stature is None else []
-    told += [str(note) for note in getattr(identities, "notes", ())]
-    return CameraRig(found, views, joints, lenses, stature, known.by_name, identities, exchanges, tuple(told), words)
+    if stature is not None and len(calibration.points):
+        calibration, stature = scale_to_metres(calibration, stature, joints.skeleton.joints if joints.skeleton else ())
+        remarks += [NO_STATURE] if stature is None else []
+    remarks += [str(note) for note in getattr(identities, "notes", ())]
+    return CameraRig(calibration, views, joints, lenses, stature, known.named_lengths, identities, exchanges, tuple(remarks), words)
 
 
-def _on_takes(takes: Sequence[Take]) -> list[str]:
+def _recording_notes(takes: Sequence[Take]) -> list[str]:
     """What to know of the recordings."""
     rated = [take.name for take in takes if take.fps_assumed]
     return [*([Message(ASSUMED_RATE, names=listed(rated))] if rated else []), *(note for take in takes for note in take.notes)]
@@ -236,12 +243,12 @@ def sizes_of(sizes: Any, cameras: int) -> list[Size | None]:
     return out * (cameras if len(out) == 1 else 1)
 
 
-def _stature(joints: Joints, height: float, options: RigOptions) -> Stature:
+def _body_height(joints: Joints, height: float) -> Stature:
     names = () if joints.skeleton is None else joints.skeleton.joints
-    return standing(names, height, options.stature)
+    return standing_extent(names, height)
 
 
-def _lengths(joints: Joints, lengths: Mapping[tuple[str, str], float], options: RigOptions) -> dict[tuple[int, int], float]:
+def _lengths(joints: Joints, lengths: Mapping[tuple[str, str], float]) -> dict[tuple[int, int], float]:
     """Known lengths by the numbers of their joints."""
     names = () if joints.skeleton is None else joints.skeleton.joints
     index = {canonical(name): i for i, name in enumerate(names)}
@@ -252,30 +259,32 @@ def _lengths(joints: Joints, lengths: Mapping[tuple[str, str], float], options: 
             text = "{arg:length} {joint!r}: there is no such joint; the joints are {names}"
             raise ValueError(Message(text, joint=lacking[0], names=", ".join(names) or "not named"))
         i, j = (index[canonical(end)] for end in ends)
-        if i == j or not (math.isfinite(length) and 0 < length < options.views.longest_length):
+        if i == j or not (math.isfinite(length) and 0 < length < MAX_LENGTH_METRES):
             text = "{arg:length} {a} {b}: expected two joints and the metres between them, got {length:g}"
             raise ValueError(Message(text, a=ends[0], b=ends[1], length=length))
         out[i, j] = float(length)
     return out
 
 
-def _who(
-    takes: Sequence[Take], clocks: torch.Tensor | None, people: int, options: RigOptions
+def _identify_people(
+    takes: Sequence[Take], clocks: torch.Tensor | None, people: int
 ) -> tuple[list[list[Clip | None]] | None, Association | None]:
     """The clips of each camera, person by person (None: nobody knows who is who), and what says so."""
     if people < 2 or all(len(take.everyone) < 2 for take in takes):
         return [[take.people[0]] for take in takes], None
-    found = associate(takes, None if clocks is None else clocks.numpy(), options=options.people)
-    if not found.ok:
-        return None, found
-    seen = np.stack([(tracks >= 0).sum(axis=0) for tracks in found.tracks])
+    association = associate(takes, None if clocks is None else clocks.numpy())
+    if not association.ok:
+        return None, association
+    seen = np.stack([(tracks >= 0).sum(axis=0) for tracks in association.tracks])
     # who is seen by two cameras at least, the longest first
-    order = sorted((k for k in range(found.people) if (seen[:, k] > 0).sum() > 1), key=lambda k: -int(seen[:, k].sum()))[:people]
-    every = [found.clips(i) for i in range(len(takes))]
-    return [[own[k] if seen[i, k] else None for k in order] for i, own in enumerate(every)], found
+    order = sorted((k for k in range(association.people) if (seen[:, k] > 0).sum() > 1), key=lambda k: -int(seen[:, k].sum()))[
+        :people
+    ]
+    every = [association.clips(i) for i in range(len(takes))]
+    return [[own[k] if seen[i, k] else None for k in order] for i, own in enumerate(every)], association
 
 
-def _undecided(views: Sequence[View], joints: Joints, found: Any) -> Calibration:
+def _unknown_calibration(views: Sequence[View], joints: Joints, found: Any) -> Calibration:
     """What is known of the cameras where nobody knows who is who: nothing."""
     nowhere = torch.full((len(views),), math.nan, dtype=torch.float64)
     clocks = Clocks(
@@ -286,49 +295,46 @@ def _undecided(views: Sequence[View], joints: Joints, found: Any) -> Calibration
     return Calibration.unknown(sizes, joints.count, clocks, tuple(view.take.fps for view in views), found.notices)
 
 
-def _sides(
-    views: list[View], found: Calibration, joints: Joints, options: RigOptions
-) -> tuple[list[View], tuple[SideExchange, ...]]:
+def _correct_sides(views: list[View], found: Calibration, joints: Joints) -> tuple[list[View], tuple[SideExchange, ...]]:
     """The views with left and right as most cameras see them, and where they were exchanged."""
     if joints.skeleton is None or len(views) < 3 or not bool(found.K.isfinite().all()):
         return views, ()
     tables = [view.table(places) for view, places in zip(views, joints.places, strict=True)]
-    seen = sides(
+    corrected = correct_sides(
         [tracks.numpy() for tracks, _ in tables],
         found,
         joints.skeleton.joints,
         times=[view.times for view in views],
         weights=[trust.numpy() for _, trust in tables],
-        options=options.sides,
     )
-    if not seen.exchanges or seen.weights is None:
+    if not corrected.exchanges or corrected.weights is None:
         return views, ()
-    parts = zip(views, seen.tracks, seen.weights, joints.places, strict=True)
-    return [view.mended(tracks, trust, places) for view, tracks, trust, places in parts], seen.exchanges
+    parts = zip(views, corrected.tracks, corrected.weights, joints.places, strict=True)
+    return [view.with_joints(tracks, trust, places) for view, tracks, trust, places in parts], corrected.exchanges
 
 
-def _on_sides(views: Sequence[View], exchanges: Sequence[SideExchange]) -> list[str]:
+def _side_notes(views: Sequence[View], exchanges: Sequence[SideExchange]) -> list[str]:
     """Where left and right were exchanged, a sentence for each camera."""
-    found = []
+    notes = []
     for i, view in enumerate(views):
         own = [one for one in exchanges if one.camera == i]
         if own:
             lasts = sum(one.end - one.start + 1 / view.take.fps for one in own)
             limbs = listed(dict.fromkeys(one.limb for one in own))
-            found.append(
+            notes.append(
                 f"{view.name}: left and right exchanged {len(own)} times ({limbs}; {lasts:.2f} s in all), mended by the others"
             )
-    return found
+    return notes
 
 
-def _cameras(
+def _calibrate_cameras(
     views: Sequence[View],
     joints: Joints,
     lenses: KnownLenses,
-    known: Known,
+    known: RigPriors,
     clocks: torch.Tensor | None,
     lengths: Mapping[tuple[int, int], float],
-    options: RigOptions,
+    options: CalibrateOptions | None,
 ) -> Calibration:
     """The library's calibration, on the seconds of the files."""
     import dyntorch
@@ -348,7 +354,7 @@ def _cameras(
             one_lens=lenses.one_lens,
             max_shift=known.max_shift,
             rate=None if known.rate else 1.0,
-            options=options.cameras,
+            options=options or CalibrateOptions(),
         )
     except ValueError as problem:  # which speaks of cameras by number
         numbers = ", ".join(f"{i} is {view.name}" for i, view in enumerate(views))

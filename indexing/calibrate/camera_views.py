@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dyntorch.numerics import Message
-from indexing.calibrate.options import ViewOptions
 from indexing.clip import Clip
 from indexing.joints import canonical, named
 from indexing.opening import listed
@@ -22,6 +21,14 @@ from indexing.sync.recordings import Take
 
 FloatArray = NDArray[np.float64]
 Size = tuple[int, int]
+
+MAX_CAMERAS = 8  # two at least
+MIN_FRAMES = 12  # of each camera that show somebody: what clocks are estimated from
+MIN_SHARED_JOINTS = 8  # that a camera shares with another one, as for two layouts in synchronize
+PICTURE_MARGIN = 0.1  # of width or height; detectors guess cut-off joints up to .05 outside (RTMPose)
+MAX_OUTSIDE_SHARE = 0.05  # of the joints beyond that margin before the size is wrong
+MAX_CLOCK_SPAN = 20.0  # times its frames that a recording's clock may run over
+MAX_CLOCK_FRAMES = 20_000  # that it may run over in any case
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +61,7 @@ class View:
         flat = (shape[0], shape[1] * shape[2])
         return torch.from_numpy(tracks.reshape(*flat, 2)), torch.from_numpy(trust.reshape(flat))
 
-    def mended(self, tracks: FloatArray, trust: FloatArray, places: Sequence[int]) -> View:
+    def with_joints(self, tracks: FloatArray, trust: FloatArray, places: Sequence[int]) -> View:
         """The same with other positions, as :meth:`table` has them, of the joints that are in both."""
         here = np.flatnonzero(np.array(places) >= 0)
         own = np.array(places)[here]
@@ -89,7 +96,7 @@ class Joints:
     note: str = ""  # what to say about layouts that differ
 
 
-def common(clips: Sequence[Clip], names: Sequence[str], options: ViewOptions = ViewOptions()) -> Joints:
+def select_common_joints(clips: Sequence[Clip], names: Sequence[str]) -> Joints:
     """The joints of many layouts by their names: those that two cameras or more have."""
     layouts = [clip.skeleton or known(clip.joints.shape[1]) for clip in clips]
     sizes = [clip.joints.shape[1] for clip in clips]
@@ -106,10 +113,10 @@ def common(clips: Sequence[Clip], names: Sequence[str], options: ViewOptions = V
             "give {arg:layout=}, or files of one pose estimator"
         )
         raise ValueError(Message(text, name=names[i], own=sizes[i], other=names[other], many=sizes[other]))
-    return _by_name([layout for layout in layouts if layout is not None], names, options)
+    return _match_joint_names([layout for layout in layouts if layout is not None], names)
 
 
-def _by_name(layouts: Sequence[Skeleton], names: Sequence[str], options: ViewOptions) -> Joints:
+def _match_joint_names(layouts: Sequence[Skeleton], names: Sequence[str]) -> Joints:
     words = [{canonical(joint): i for i, joint in reversed(list(enumerate(layout.joints)))} for layout in layouts]
     called: dict[str, str] = {}
     for layout in layouts:
@@ -118,12 +125,12 @@ def _by_name(layouts: Sequence[Skeleton], names: Sequence[str], options: ViewOpt
     kept = [word for word in called if sum(word in own for own in words) > 1]
     for name, own, layout in zip(names, words, layouts, strict=True):
         most = max(len(own.keys() & other.keys()) for other in words if other is not own)
-        if most < options.joints:
+        if most < MIN_SHARED_JOINTS:
             text = (
                 "{name}: its joints ({own}) share {most} names with those of any other camera, and {needed} are needed; "
                 "use files of one kind of pose estimator"
             )
-            raise ValueError(Message(text, name=name, own=listed(layout.joints), most=most, needed=options.joints))
+            raise ValueError(Message(text, name=name, own=listed(layout.joints), most=most, needed=MIN_SHARED_JOINTS))
     index = {word: i for i, word in enumerate(kept)}
     bones: dict[tuple[int, int], None] = {}
     for layout in layouts:
@@ -141,7 +148,7 @@ def _by_name(layouts: Sequence[Skeleton], names: Sequence[str], options: ViewOpt
 # Cameras from recordings: their pictures' sizes, their grids, and whether they make sense together.
 
 
-def sized(take: Take, size: Size | None) -> tuple[Take, Size]:
+def to_pixels(take: Take, size: Size | None) -> tuple[Take, Size]:
     """A take in pixels, and how large its picture is."""
     own = _own_size(take)
     size = size or own
@@ -149,14 +156,14 @@ def sized(take: Take, size: Size | None) -> tuple[Take, Size]:
         text = "{name}: the size of its picture is not known; give {arg:size=} such as 1920x1080, of all cameras or of each"
         raise ValueError(Message(text, name=take.name))
     if take.people and is_normalized(take.people[0]):
-        told = {str(note) for note in remarks_on(take.people[:1])}
-        people, everyone = (tuple(_scaled(clip, size) for clip in clips) for clips in (take.people, take.everyone))
-        kept = tuple(note for note in take.notes if str(note) not in told and "from 0 to 1" not in str(note))
-        take = dataclasses.replace(take, people=people, everyone=everyone, notes=kept)
+        scale_remarks = {str(note) for note in remarks_on(take.people[:1])}
+        people, everyone = (tuple(_scale_clip(clip, size) for clip in clips) for clips in (take.people, take.everyone))
+        notes = tuple(note for note in take.notes if str(note) not in scale_remarks and "from 0 to 1" not in str(note))
+        take = dataclasses.replace(take, people=people, everyone=everyone, notes=notes)
     return take, size
 
 
-def _scaled(clip: Clip, size: Size) -> Clip:
+def _scale_clip(clip: Clip, size: Size) -> Clip:
     return clip.replace(joints=clip.joints * np.asarray(size, dtype=np.float64))
 
 
@@ -174,17 +181,17 @@ def _own_size(take: Take) -> Size | None:
     return None
 
 
-def check_size(take: Take, clips: Sequence[Clip], size: Size, options: ViewOptions = ViewOptions()) -> None:
+def check_size(take: Take, clips: Sequence[Clip], size: Size) -> None:
     """Raise where joints lie outside of the picture by far."""
     places = np.concatenate([clip.joints[clip.seen] for clip in clips]) if clips else np.zeros((0, 2))
     if not len(places):
         return
-    share = _outside(places, size, options)
-    if share <= options.strays:
+    share = _outside_share(places, size)
+    if share <= MAX_OUTSIDE_SHARE:
         return
     low, high = np.percentile(places, [1, 99], axis=0)
     turned = size[::-1]
-    hint = f"is it {turned[0]}x{turned[1]}? " if _outside(places, turned, options) <= options.strays else ""
+    hint = f"is it {turned[0]}x{turned[1]}? " if _outside_share(places, turned) <= MAX_OUTSIDE_SHARE else ""
     text = (
         "{name}: its picture of {size} does not hold its keypoints, which go from {low} to {high} "
         "({share:.0f} % of them are far outside); {hint}give the size of the pictures in which they were found ({arg:size=})"
@@ -194,34 +201,32 @@ def check_size(take: Take, clips: Sequence[Clip], size: Size, options: ViewOptio
     raise ValueError(Message(text, **values, hint=hint))
 
 
-def _outside(places: NDArray[np.floating], size: Size, options: ViewOptions) -> float:
-    room = options.outside * np.array(size)
+def _outside_share(places: NDArray[np.floating], size: Size) -> float:
+    room = PICTURE_MARGIN * np.array(size)
     return float(((places < -room) | (places > np.array(size) + room)).any(axis=1).mean())
 
 
-def view_of(take: Take, people: Sequence[Clip | None], size: Size, options: ViewOptions = ViewOptions()) -> View:
+def make_view(take: Take, people: Sequence[Clip | None], size: Size) -> View:
     """A camera with who is seen by it."""
     seen = [clip for clip in people if clip is not None]
-    check_size(take, seen, size, options)
+    check_size(take, seen, size)
     times = np.unique(np.concatenate([clip.times for clip in seen])) if seen else take.times
     span = float(times[-1] - times[0])
-    if span * take.fps > max(options.longest * len(times), options.longest_frames):
+    if span * take.fps > max(MAX_CLOCK_SPAN * len(times), MAX_CLOCK_FRAMES):
         text = "{name}: {count} frames over {span:.0f} s at {fps:g} per second: nearly all gap; cut it to the part that all share"
         raise ValueError(Message(text, name=take.name, count=len(times), span=span, fps=take.fps))
     there = len(np.unique(np.concatenate([clip.times[clip.seen.any(axis=1)] for clip in seen]))) if seen else 0
-    if there < options.frames:
+    if there < MIN_FRAMES:
         text = "{name}: {count:# frame shows|# frames show} somebody, {needed} are needed at least; film longer, or give all frames"
-        raise ValueError(Message(text, name=str(take.path or take.name), count=there, needed=options.frames))
+        raise ValueError(Message(text, name=str(take.path or take.name), count=there, needed=MIN_FRAMES))
     return View(take, tuple(people), size, np.asarray(times, dtype=np.float64))
 
 
-def check_cameras(takes: Sequence[Take], options: ViewOptions = ViewOptions()) -> None:
+def check_cameras(takes: Sequence[Take]) -> None:
     """Raise where recordings cannot be those of one rig."""
-    if not 2 <= len(takes) <= options.cameras:
+    if not 2 <= len(takes) <= MAX_CAMERAS:
         remedy = "add a camera" if len(takes) < 2 else "leave some out, the others share what is measured"
-        raise ValueError(
-            f"{len(takes)} camera{'s' * (len(takes) != 1)}: two to {options.cameras} are calibrated together; {remedy}"
-        )
+        raise ValueError(f"{len(takes)} camera{'s' * (len(takes) != 1)}: two to {MAX_CAMERAS} are calibrated together; {remedy}")
     bare = next((take for take in takes if take.kind != "keypoints" or not take.people), None)
     if bare is not None:
         text = "{name}: has no keypoints, and cameras are calibrated from people's joints; find them with dyntorch pose first"

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from indexing import ActionIndexer, ClipSet
-from indexing.calibrate.views import view_of
-from indexing.calibrate.writing import toml_of, write_associated
+from indexing.calibrate.camera_views import make_view
+from indexing.calibrate.rig import toml_of, write_associated
 from indexing.readers import read
 from indexing.sync.calibration import read_calibration
 from indexing.sync.recordings import take_of
@@ -122,6 +122,6 @@ def test_files_of_the_input_keep_their_names(tmp_path):
     found = rig()
     takes = [take_of(tmp_path / name, fps=FPS) for name in found.names]
     (tmp_path / "out").mkdir()
-    write_associated(tmp_path / "out", replace(found, views=[view_of(take, [take.people[0]], SIZE) for take in takes]))
+    write_associated(tmp_path / "out", replace(found, views=[make_view(take, [take.people[0]], SIZE) for take in takes]))
     files = sorted(path.name for path in (tmp_path / "out" / "pose-associated" / "cam2_json").iterdir())
     assert files[0] == "cam2_000000000012_keypoints.json" and len(files) == 98

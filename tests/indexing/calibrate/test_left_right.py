@@ -1,17 +1,16 @@
 """Left and right exchanged: found by what the other cameras see."""
 
-from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
 import pytest
 
-from indexing.calibrate.options import SideOptions
-from indexing.calibrate.sides import LIMBS, SideNotice, _misfit, _viterbi, sided, sides
+from indexing.calibrate import left_right
+from indexing.calibrate.left_right import LIMBS, SideNotice, _reprojection_cost, _viterbi, correct_sides, paired_joints
 from tests.indexing.calibrate.crowd import NAMES, cameras, crossing, filmed
 
 AROUND = (0.2, 1.5, 3.1, 4.6)
-PAIRS = sided(NAMES)
+PAIRS = paired_joints(NAMES)
 
 
 def turned(tracks, rows, limbs=LIMBS, person=0):
@@ -33,7 +32,7 @@ def scene(count=1, azimuths=AROUND, noise=4.0, frames=90):
 def test_a_mirrored_camera_is_outvoted():
     rig, truth = scene()
     given = [*truth[:2], turned(truth[2], slice(None)), truth[3]]
-    found = sides(given, rig, NAMES)
+    found = correct_sides(given, rig, NAMES)
     assert found.ok and [e.limb for e in found.exchanges] == ["body"]
     assert found.exchanges[0].camera == 2 and found.exchanges[0].start == 0.0 and found.exchanges[0].evidence > 0
     for own, right in zip(found.tracks, truth, strict=True):
@@ -43,7 +42,7 @@ def test_a_mirrored_camera_is_outvoted():
 
 def test_three_cameras_outvote_one():
     rig, truth = scene(azimuths=AROUND[:3])
-    found = sides([turned(truth[0], slice(None)), *truth[1:]], rig, NAMES)
+    found = correct_sides([turned(truth[0], slice(None)), *truth[1:]], rig, NAMES)
     assert all(np.array_equal(own, right) for own, right in zip(found.tracks, truth, strict=True))
 
 
@@ -54,7 +53,7 @@ def test_stretches_of_a_limb_are_mended_within_a_few_frames():
     given[3] = turned(given[3], slice(60, 80), ["arms"])
     weights = [np.where(np.isfinite(one).all(2), 1.0, 0.0) for one in given]
     weights[1][30, PAIRS["legs"][0][0]] = 0.25
-    found = sides(given, rig, NAMES, weights=weights)
+    found = correct_sides(given, rig, NAMES, weights=weights)
     wrong = [(own != right).any(2) for own, right in zip(found.tracks, truth, strict=True)]
     assert sum(int(one.any(1).sum()) for one in wrong) <= 4  # at the ends of stretches noise decides
     assert {(e.camera, e.limb) for e in found.exchanges} == {(1, "legs"), (3, "arms")}
@@ -68,7 +67,7 @@ def test_stretches_of_a_limb_are_mended_within_a_few_frames():
 def test_nothing_is_exchanged_where_nothing_is():
     rig, truth = scene(noise=8.0)
     truth[0][10:30, 4:9] = np.nan
-    found = sides(truth, rig, NAMES)
+    found = correct_sides(truth, rig, NAMES)
     assert not found.exchanges
     assert all(np.array_equal(own, right, equal_nan=True) for own, right in zip(found.tracks, truth, strict=True))
 
@@ -76,7 +75,7 @@ def test_nothing_is_exchanged_where_nothing_is():
 def test_people_side_by_side():
     rig, truth = scene(2)
     given = [turned(truth[0], slice(30, 70), person=1), *truth[1:]]
-    found = sides(given, rig, NAMES)
+    found = correct_sides(given, rig, NAMES)
     assert {(e.camera, e.person) for e in found.exchanges} == {(0, 1)}
     assert (found.tracks[0] != truth[0]).any(2).any(1).sum() <= 3
 
@@ -84,7 +83,7 @@ def test_people_side_by_side():
 def test_two_cameras_are_left_as_they_are():
     rig, truth = scene(azimuths=AROUND[:2])
     given = [turned(truth[0], slice(None)), truth[1]]
-    found = sides(given, rig, NAMES)
+    found = correct_sides(given, rig, NAMES)
     assert found.ok and found.notices[0].code is SideNotice.TWO
     assert np.array_equal(found.tracks[0], given[0]) and not found.exchanges
 
@@ -92,7 +91,7 @@ def test_two_cameras_are_left_as_they_are():
 def test_as_many_for_as_against_are_left_and_said():
     rig, truth = scene()
     given = [turned(truth[0], slice(None)), turned(truth[1], slice(None)), *truth[2:]]
-    found = sides(given, rig, NAMES)
+    found = correct_sides(given, rig, NAMES)
     assert {notice.code for notice in found.notices} == {SideNotice.TIED}
     assert all(np.array_equal(own, one) for own, one in zip(found.tracks, given, strict=True))
 
@@ -105,26 +104,26 @@ def test_lenses_and_frame_rates():
         for k, f in enumerate(rates)
     ]
     given = [truth[0], turned(truth[1], slice(None)), *truth[2:]]
-    found = sides(given, rig, NAMES, fps=rates)
+    found = correct_sides(given, rig, NAMES, fps=rates)
     assert (found.tracks[1] == truth[1]).all(2).all(1).mean() > 0.97
     assert all((own == right).all(2).all(1).mean() > 0.97 for own, right in zip(found.tracks, truth, strict=True))
 
 
 def test_joints_without_sides():
     rig, truth = scene()
-    found = sides(truth, rig, [f"joint_{k}" for k in range(len(NAMES))])
+    found = correct_sides(truth, rig, [f"joint_{k}" for k in range(len(NAMES))])
     assert [notice.code for notice in found.notices] == [SideNotice.SIDELESS] and not found.exchanges
 
 
 def test_limbs_of_layouts():
     from indexing.skeleton import BODY25, COCO17
 
-    coco = sided(COCO17.joints)
+    coco = paired_joints(COCO17.joints)
     assert len(coco["trunk"]) == 4 and len(coco["arms"]) == 2 and len(coco["legs"]) == 2  # eyes, ears, shoulders and hips
-    for pairs in (coco, sided(BODY25.joints)):
+    for pairs in (coco, paired_joints(BODY25.joints)):
         every = [joint for limb in LIMBS for pair in pairs[limb] for joint in pair]
         assert len(set(every)) == len(every)
-    assert len(sided(BODY25.joints)["legs"]) == 5
+    assert len(paired_joints(BODY25.joints)["legs"]) == 5
 
 
 def test_viterbi_is_the_best_of_all_ways():
@@ -142,19 +141,19 @@ def test_viterbi_is_the_best_of_all_ways():
         assert cost(found) == pytest.approx(min(cost(way) for way in product(range(4), repeat=5)))
 
 
-def test_misfit_of_what_is_right_is_none():
+def test_misfit_of_what_is_right_is_none(monkeypatch):
     rig = cameras(AROUND[:3])
     points = np.random.default_rng(0).uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 1.6], (4, 6, 3))
     P = np.concatenate([(rig.K @ rig.R).numpy(), (rig.K @ rig.t[..., None]).numpy()], axis=2)
     seen = np.einsum("cij,tkj->tcki", P[..., :3], points) + P[None, :, None, :, 3]
     x = seen[..., :2] / seen[..., 2:]
     weight = np.ones(x.shape[:3])
-    options = SideOptions()
-    assert np.abs(_misfit(x, weight, P, 500.0, options)).max() < 1e-6
+    assert np.abs(_reprojection_cost(x, weight, P, 500.0)).max() < 1e-6
     x[0, 1, 2] += 60.0
-    off = _misfit(x, weight, P, 500.0, options)
+    off = _reprojection_cost(x, weight, P, 500.0)
     assert off[0] > 1.0 and np.abs(off[1:]).max() < 1e-6
-    assert _misfit(x, weight, P, 500.0, replace(options, most=0.5))[0] == 0.5
+    monkeypatch.setattr(left_right, "MAX_JOINT_EVIDENCE", 0.5)
+    assert _reprojection_cost(x, weight, P, 500.0)[0] == 0.5
 
 
 @pytest.mark.parametrize(
@@ -172,4 +171,4 @@ def test_bad_input(change, said):
     rig, truth = scene()
     given = {"tracks": truth, "cameras": rig, "joints": NAMES, **change(truth)}
     with pytest.raises(ValueError, match=said):
-        sides(**given)
+        correct_sides(**given)

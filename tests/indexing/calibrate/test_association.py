@@ -1,6 +1,5 @@
 """Who is who in cameras that nobody calibrated."""
 
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -8,18 +7,15 @@ import pytest
 import torch
 
 from dyntorch import Status
-from indexing.calibrate.people import AssociationOptions, PeopleNotice, associate
-from indexing.calibrate.people.clusters import clustered
-from indexing.calibrate.people.options import ClusterOptions
-from indexing.calibrate.people.relations import common, distances, view
-from indexing.calibrate.people.sorting import calibrated
-from indexing.calibrate.people.tracklets import cut, sightings
+from indexing.calibrate.people import PeopleNotice, associate, tracklets
+from indexing.calibrate.people.assignment import calibrated_pairs
+from indexing.calibrate.people.pair_geometry import arrange, common_frames, distances
+from indexing.calibrate.people.tracklets import cluster, sightings, split_tracks
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton
 from tests.indexing.calibrate.crowd import LAYOUT, NAMES, Person, cameras, clips, crossing, filmed
 
 AROUND = (0.2, 1.5, 3.6)
-OPTIONS = AssociationOptions()
 
 
 def exchanged(tracks, frames):
@@ -70,7 +66,7 @@ def test_exchanged_numbers_are_mended_and_clocks_found(scene):
         there = np.isfinite(own[:, 0, 0, 0])
         assert np.array_equal(own[there, 0], one[there, first])
     assert {(e.camera, round(e.time * 30)) for e in found.exchanges} >= {(0, 60), (1, 40), (1, 100), (2, 75)}
-    assert found.sure > 0.9
+    assert found.mean_certainty > 0.9
     assert all(len(found.clips(k)) == 2 and found.clips(k)[1].meta["person"] == 1 for k in range(3))
 
 
@@ -109,10 +105,10 @@ def test_known_cameras():
 def test_relations_of_known_cameras_hold_for_every_point():
     rig = cameras(AROUND)
     views = [
-        view(one, cut(one, OPTIONS))
+        arrange(one, split_tracks(one))
         for one in (sightings(clips(x), "") for x in filmed(crossing(np.random.default_rng(0)), rig, 20))
     ]
-    relations = calibrated(views, np.tile([0.0, 1.0], (3, 1)), rig, OPTIONS)
+    relations = calibrated_pairs(views, np.tile([0.0, 1.0], (3, 1)), rig)
     assert set(relations) == {(0, 1), (0, 2), (1, 2)}
     for (i, j), relation in relations.items():
         x, y = image(rig, i, STANDING_POINTS), image(rig, j, STANDING_POINTS)
@@ -190,7 +186,7 @@ def test_nobody():
     nothing = clips(np.full((50, 1, len(NAMES), 2), np.nan))
     found = associate([nothing, nothing])
     assert not found.ok and found.people == 0 and found.status == Status.TOO_FEW
-    assert "nobody is seen" in found.reason and np.isnan(found.sure)
+    assert "nobody is seen" in found.reason and np.isnan(found.mean_certainty)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +199,6 @@ def test_nobody():
         (lambda x: [x, [Clip(np.zeros((20, 5, 2)), fps=30.0)]], {}, "have no names"),
         (lambda x: [x, x], {"clocks": [0.0]}, "for each of 2 cameras"),
         (lambda x: [x, x], {"clocks": [[0.0, 1.0], [0.0, -1.0]]}, "for each of 2 cameras"),
-        (lambda x: [x, x], {"options": ClusterOptions()}, "options"),
     ],
 )
 def test_bad_input(takes, more, said):
@@ -218,7 +213,7 @@ def test_bad_input(takes, more, said):
 
 def test_pieces_follow_the_body_whatever_number_it_has():
     seen = filmed(crossing(np.random.default_rng(3)), cameras(AROUND))[0]
-    pieces = cut(sightings(clips(exchanged(seen, [50])), "a"), OPTIONS)
+    pieces = split_tracks(sightings(clips(exchanged(seen, [50])), "a"))
     assert len(pieces) == 2
     assert pieces.number[0, 0] == pieces.number[149, 1] and pieces.number[0, 1] == pieces.number[149, 0]
     assert pieces.conflicts.tolist() == [[False, True], [True, False]]
@@ -229,7 +224,7 @@ def test_pieces_end_where_two_bodies_are_one():
     body = filmed(crossing(np.random.default_rng(3)), cameras(AROUND), 61, noise=0.0)[0][:1, 0]
     way = np.linspace(-150, 150, 61)[:, None, None] * [1.0, 0.0]
     both = np.stack([body + way, body - way], axis=1) + rng.standard_normal((61, 2, len(NAMES), 2))
-    pieces = cut(sightings(clips(both), "a"), OPTIONS)
+    pieces = split_tracks(sightings(clips(both), "a"))
     assert len(pieces) > 2
     first, last = pieces.number[0], pieces.number[-1]
     assert not set(first.tolist()) & set(last.tolist())
@@ -241,8 +236,8 @@ def test_pieces_end_where_two_bodies_are_one():
 
 def test_common_moments_of_another_clock():
     seen = filmed([Person(np.random.default_rng(0), [0, 0], [1, 0])], cameras((0.0, 1.0), offsets=[0.0, 0.25]), noise=0.0)
-    a, b = (view(one, cut(one, OPTIONS)) for one in (sightings(clips(x), "") for x in seen))
-    both = common(a, b, 0.25, 1.0, OPTIONS)
+    a, b = (arrange(one, split_tracks(one)) for one in (sightings(clips(x), "") for x in seen))
+    both = common_frames(a, b, 0.25, 1.0)
     # what b saw a quarter of a second later by its own clock, between two of its frames
     expected = 0.5 * (seen[1][7:9, 0] + seen[1][8:10, 0])
     assert np.abs(both.b[:2, 0] - expected).max() < 1e-9
@@ -272,7 +267,7 @@ def test_clusters_are_nearly_always_the_best_of_all():
     every = [np.array(one) for one in partitions(7)]
     for seed in range(12):
         scores, conflicts = random_scores(seed)
-        labels = clustered(scores, conflicts, OPTIONS, np.arange(7.0))
+        labels = cluster(scores, conflicts, np.arange(7.0))
         assert not (conflicts & (labels[:, None] == labels)).any()
         most = max(total(scores, one) for one in every if not (conflicts & (one[:, None] == one)).any())
         best_of_all += total(scores, labels) > most - 1e-9
@@ -280,19 +275,20 @@ def test_clusters_are_nearly_always_the_best_of_all():
 
 
 def test_no_clusters_of_nothing():
-    assert clustered(np.zeros((0, 0)), np.zeros((0, 0), dtype=bool), OPTIONS).shape == (0,)
-    labels = clustered(np.full((3, 3), -1.0), np.zeros((3, 3), dtype=bool), OPTIONS)
+    assert cluster(np.zeros((0, 0)), np.zeros((0, 0), dtype=bool)).shape == (0,)
+    labels = cluster(np.full((3, 3), -1.0), np.zeros((3, 3), dtype=bool))
     assert sorted(labels.tolist()) == [0, 1, 2]
 
 
-def test_two_groups_exchange_what_comes_after():
+def test_two_groups_exchange_what_comes_after(monkeypatch):
+    monkeypatch.setattr(tracklets, "MAX_SWEEPS", 1)
     # 0, 1 then 2, 3: the pieces of both moments were put together the wrong way round
     scores = np.zeros((4, 4))
     for p, q, s in ((0, 2, -2.0), (1, 3, -2.0), (0, 3, 2.0), (1, 2, 2.0)):
         scores[p, q] = scores[q, p] = s
     conflicts = np.zeros((4, 4), dtype=bool)
     conflicts[0, 1] = conflicts[1, 0] = conflicts[2, 3] = conflicts[3, 2] = True
-    labels = clustered(scores, conflicts, replace(OPTIONS, clusters=ClusterOptions(sweeps=1)), np.array([0.0, 0.0, 1.0, 1.0]))
+    labels = cluster(scores, conflicts, np.array([0.0, 0.0, 1.0, 1.0]))
     assert labels[0] == labels[3] != labels[1] == labels[2]
 
 
