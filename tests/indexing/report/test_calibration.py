@@ -33,6 +33,7 @@ def listed(folder):
     return sorted(str(path.relative_to(folder)) for path in Path(folder).rglob("*") if path.is_file())
 
 
+@pytest.mark.slow
 def test_everything_is_written_and_said(tmp_path):
     found = rig()
     page = write_calibration(tmp_path / "out", CalibrationReport(found, heading="Kitchen"))[0]
@@ -113,6 +114,7 @@ def test_what_cannot_be_known_is_said(tmp_path):
     assert [lens.name for lens in read_calibration(tmp_path / "Calib_dyntorch.toml")] == ["cam1", "cam2", "cam3"]
 
 
+@pytest.mark.slow
 def test_a_hostile_name_stays_text(tmp_path):
     found = rig()
     object.__setattr__(found.views[0].take, "name", "</script><b>\x07")
