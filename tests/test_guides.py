@@ -22,10 +22,12 @@ def test_everything_a_guide_shows_happens(guide, tmp_path):
     assert run(guide, tmp_path) == []
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
-def test_what_a_page_points_to_is_there(page):
-    for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists() or "auto_gallery" in target, target
+def test_what_pages_point_to_is_there():
+    targets = [(page, target) for page in PAGES for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))]
+    assert len(targets) > 20
+    assert [
+        (page.name, target) for page, target in targets if not (page.parent / target).exists() and "auto_gallery" not in target
+    ] == []
 
 
 def test_scripts_that_pages_name_are_there():
