@@ -291,7 +291,7 @@ class Clip:
         Raises:
             ValueError: xarray is not installed.
         """
-        from indexing.writers.netcdf import dataset_of
+        from indexing.writers.formats.nc import dataset_of
 
         return dataset_of([self])
 
@@ -327,7 +327,7 @@ class ClipSet(LabelledSet[Clip]):
         Raises:
             ValueError: what the format cannot hold; nothing is written then.
         """
-        from indexing.readers.clipset import write_clip_set
+        from indexing.readers.formats.clipset import write_clip_set
         from indexing.writers import FORMATS, write
 
         if Path(path).suffix.lower() in FORMATS:

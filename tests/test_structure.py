@@ -64,7 +64,7 @@ FORMATS = {
     "indexing/cli/__init__.py": {"DONE", "BAD_INPUT", "REFUSED", "INTERRUPTED", "BROKEN_PIPE"},
     "indexing/cli/console.py": {"REFUSED"},
     "indexing/colmap/masks.py": {"BLACK", "WHITE"},
-    "indexing/labels/via.py": {"TEXT", "CHECKBOX", "SELECT", "VIDEO", "LOCAL"},
+    "indexing/labels/formats/via.py": {"TEXT", "CHECKBOX", "SELECT", "VIDEO", "LOCAL"},
     "indexing/phase/saving.py": {"VERSION"},
     "indexing/pose/blazepose.py": {
         *("PICTURE", "REGION", "HEATMAP", "GRIDS", "POINTS", "LANDMARKS", "JOINTS", "HIPS", "CIRCLE", "CLIPPED"),
@@ -72,15 +72,15 @@ FORMATS = {
     "indexing/pose/networks.py": {"OUTPUTS_FIELD", "OPERATORS_FIELD"},
     "indexing/pose/pieces.py": {"VERSION"},
     "indexing/readers/c3d.py": {"INTEL", "DEC", "MIPS", "MOST", "WORD"},
-    "indexing/readers/clipset.py": {"LAST"},
+    "indexing/readers/formats/clipset.py": {"LAST"},
     "indexing/readers/hdf.py": {"ENTRY", "GZIP", "TEXT"},
     "indexing/readers/pickles.py": {"LONGEST_CODE", "WHOLE"},
-    "indexing/readers/sleap.py": {"SHIFTED", "HAND", "PREDICTED"},
+    "indexing/readers/formats/sleap.py": {"SHIFTED", "HAND", "PREDICTED"},
     "indexing/readers/npz.py": {"HEADER", "AXES", "LAST_LETTER", "PACKED", "ENCRYPTED"},
     "indexing/readers/recording.py": {"LAST_FRAME"},
     "indexing/report/rig.py": {"MISSING"},
     "indexing/report/sync.py": {"PPM"},
-    "indexing/writers/c3d.py": {"KEY", "INTEL", "WORD", "LETTERS", "LABELS", "BLOCKS"},
+    "indexing/writers/formats/c3d.py": {"KEY", "INTEL", "WORD", "LETTERS", "LABELS", "BLOCKS"},
 }
 """What a file format, an operating system or a unit prescribes."""
 SCENES = ("dyntorch/scenes/", "indexing/actors/", "indexing/cameras.py")

@@ -190,7 +190,7 @@ def forkserver() -> Any:
     """Where processes come from: one that has imported everything, and has no threads."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["experiments.common.book", "indexing.archive.archive", "indexing.readers.clipset", "indexing.recordings.people"]
+        ["experiments.common.book", "indexing.archive.archive", "indexing.readers.formats.clipset", "indexing.recordings.people"]
     )
     return context
 

@@ -16,12 +16,17 @@ from indexing.cli.console import check_file, check_folder, count, flags, keep, n
 from indexing.cli.inputs import Following, assumed
 from indexing.cli.remarks import remarks
 from indexing.opening import repeated
+from indexing.registry import format_names
 
 if TYPE_CHECKING:
     from indexing.clip import Clip
 
 WORDS = flags("fps", "units")
-SUFFIXES = (".npz", ".trc", ".c3d", ".nc")
+SUFFIXES = (".npz", *(f".{name}" for name in format_names("writers")))
+if TYPE_CHECKING:
+    Written = str
+else:
+    Written = Literal[tuple(suffix[1:] for suffix in SUFFIXES)]
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ class Convert:
     """keypoint files of any format that is read, folders with one file per frame, clip sets, or videos"""
     output: Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE|FOLDER")]
     """the file to write, whose end says the format; or a folder, for a file of each recording"""
-    to: Annotated[Literal["npz", "trc", "c3d", "nc"] | None, tyro.conf.arg(help_behavior_hint="")] = None
+    to: Annotated[Written | None, tyro.conf.arg(help_behavior_hint="")] = None
     """the format of files in a folder"""
     units: Annotated[Literal["m", "cm", "mm", "px"] | None, tyro.conf.arg(help_behavior_hint="")] = None
     """of the coordinates, written into .trc and .c3d; coordinates stay as they are"""
@@ -48,13 +53,15 @@ class Convert:
     def run(self) -> int:
         """Read all, write all or nothing, and say what the format does not hold."""
         from indexing.files import prepare
+        from indexing.writers import suffixes_with_units
 
         if not self.recordings:
             raise ValueError("no recordings; give at least one keypoint file or folder")
         single = self._single()
         target = check_file(self.output, self.recordings) if single else check_folder(self.output)
-        if self.units is not None and (self.to or target.suffix[1:].lower()) not in ("trc", "c3d"):
-            raise ValueError(f"--units {self.units}: of .trc and .c3d only; leave it out")
+        suffixes = suffixes_with_units()
+        if self.units is not None and f".{self.to or target.suffix[1:].lower()}" not in suffixes:
+            raise ValueError(f"--units {self.units}: of {' and '.join(suffixes)} only; leave it out")
         with progress("reading", steps=False):
             read = [(path, *self._read(path)) for path in self.recordings]
         found, notes = [(path, clips) for path, clips, _ in read], [note for *_, said in read for note in said]
@@ -115,7 +122,7 @@ class Convert:
         """What writes a file, and what is not in it: a format that cannot hold the clips is found before anything is written."""
         from indexing.clip import ClipSet
         from indexing.files import write_bytes
-        from indexing.writers import encode
+        from indexing.writers import encode, suffixes_with_units
 
         if path.suffix.lower() == ".npz":
             whole = len(self.recordings) == 1 or self.to is not None
@@ -124,7 +131,7 @@ class Convert:
             lost = sorted(given - set(kept[0].meta) - {"followed", "untracked", "people"})
             notes = [f"left out, as it is not known of all: {', '.join(lost)}"] if lost else []
             return partial(ClipSet(kept, path.name).save, path), notes
-        if path.suffix.lower() in (".trc", ".c3d"):
+        if path.suffix.lower() in suffixes_with_units():
             clips = [clip.replace(fps_assumed=False) for clip in clips]  # which was said of the recording
         try:
             data, notes = encode(clips, path, self.units)

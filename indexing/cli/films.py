@@ -16,8 +16,8 @@ from indexing.cli.console import check_folder, count, counted, names
 if TYPE_CHECKING:
     from indexing.brightness.indexer import BrightnessIndexer
     from indexing.cli.inputs import Example, Reading
-    from indexing.readers.clipset import Film, FilmSet
     from indexing.readers.files import WatchOptions
+    from indexing.readers.formats.clipset import Film, FilmSet
 
 NO_MODEL = "there is no pose model, so videos count as pixels; dyntorch pose --get-models fetches one"
 FASTEST = 30.0  # frames per second that are compared at most: the window of the method was chosen at 15 and 30
@@ -63,7 +63,7 @@ class Watching:
 
     def as_keypoints(self, paths: Sequence[Path]) -> bool:
         """Whether inputs are read as keypoints: files of keypoints, and videos unless their pixels are meant."""
-        from indexing.readers.clipset import holds_frames
+        from indexing.readers.formats.clipset import holds_frames
 
         videos = [path for path in paths if is_video(path)]
         frames = [path for path in paths if holds_frames(path)]
@@ -191,8 +191,8 @@ def refuse_film_flags(pixels: Pixels) -> None:
 
 def are_films(paths: Sequence[Path]) -> bool:
     """Whether the inputs are videos or film sets, not keypoints."""
-    from indexing.readers.clipset import holds_frames
     from indexing.readers.files import VIDEOS
+    from indexing.readers.formats.clipset import holds_frames
 
     kinds = [path.suffix.lower() in VIDEOS or holds_frames(path) for path in paths]
     if any(kinds) and not all(kinds):
@@ -228,7 +228,7 @@ class AsTheyAre:
 
 def read_examples(examples: Sequence[Example], reading: Reading, select: Sequence[str]) -> tuple[list[Any], list[str], list[float]]:
     """Sources of frames, their labels, and their seconds."""
-    from indexing.readers.clipset import holds_frames
+    from indexing.readers.formats.clipset import holds_frames
 
     sources: list[Any] = []
     labels: list[str] = []
@@ -254,7 +254,7 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
 def read_set(path: Path, reading: Reading, select: Sequence[str] = ()) -> FilmSet:
     """The labelled films of a set that meet the criteria."""
     from indexing.cli.protocol import choose
-    from indexing.readers.clipset import read_film_set
+    from indexing.readers.formats.clipset import read_film_set
 
     films = read_film_set(path, fps=reading.fps)
     known = films[[i for i, film in enumerate(films) if film.label is not None]]
@@ -283,7 +283,7 @@ class FilmRecording:
 
 def read_films(paths: Sequence[Path], reading: Reading) -> tuple[list[FilmRecording], list[str]]:
     """Videos, and the films of sets, with names that differ, and what a person should know about them."""
-    from indexing.readers.clipset import holds_frames
+    from indexing.readers.formats.clipset import holds_frames
     from indexing.video import read_video
 
     found: list[FilmRecording] = []

@@ -329,7 +329,7 @@ class Scan:
     def _of_films(self) -> bool:
         """Whether the model was learned from pixels; the recordings must be of the same kind."""
         from indexing.modelfile import model_kind
-        from indexing.readers.clipset import holds_frames
+        from indexing.readers.formats.clipset import holds_frames
 
         of_films, by = model_kind(self.model) == "dyntorch.brightness-indexer", self.reading.footage.by
         has = "the pixels of videos" if of_films else "keypoints"

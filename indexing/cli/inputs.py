@@ -18,15 +18,16 @@ from indexing.cli.console import count, names
 from indexing.cli.films import Watched, Watching
 from indexing.cli.remarks import WORDS, few, on_examples, on_gaps, on_people, remarks
 from indexing.opening import clipped, read_rows, shown
+from indexing.registry import format_names
 
 if TYPE_CHECKING:
     from indexing.clip import Clip, ClipSet, FloatArray
     from indexing.skeleton import Skeleton
 
-Format = Literal[
-    "clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap", "trc", "mocap", "freemocap", "npy",
-    "pyskl", "movement",
-]  # fmt: skip
+if TYPE_CHECKING:
+    Format = str
+else:
+    Format = Literal[format_names("readers")]
 People = Literal["largest", "confident", "tracked", "all", "everyone"]
 TRIM = re.compile(r"(?P<path>.+)@(?P<start>\d+(\.\d*)?|\.\d+)?-(?P<end>\d+(\.\d*)?|\.\d+)?")
 CUT = 0.1  # seconds that an example may end before it was said to: nobody counts frames

@@ -169,7 +169,7 @@ def of_medium(medium: str, recordings: Sequence[str]) -> list[str]:
 
 
 def _is_word_of(medium: str, recording: str) -> bool:
-    from indexing.labels.gathering import Request
+    from indexing.labels.format import Request
     from indexing.labels.media import of_recording
 
     try:

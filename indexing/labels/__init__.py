@@ -1,10 +1,9 @@
 """What people mark in recordings, and what was found there: files of BORIS, ELAN, Label Studio, VIA, ActivityNet, and tables.
 
 ``label`` is what all share (:class:`Label`, :class:`LabelFile`, :func:`within`), ``reading`` and ``writing`` are the verbs,
-``detect`` tells the formats apart by what a file holds, ``options`` has the numbers that decide.  One file or room a format:
-``boris/``, ``elan/``, ``tables``, ``activitynet``, ``label_studio``, ``via``.  ``gathering`` collects what a reader finds,
-``target`` is where a writer writes, ``media`` knows which file of the labels is which recording and whose clock runs when,
-``markup`` reads XML that may be hostile.
+``detect`` asks the formats whose a file is.  A format is a file or room in ``formats/`` and registers itself there as
+``format.LabelFormat``.  ``media`` knows which file of the labels is which recording and whose clock runs when, ``markup`` reads
+XML that may be hostile.
 """
 
 from __future__ import annotations
@@ -12,12 +11,11 @@ from __future__ import annotations
 from indexing.labels.label import Label as Label
 from indexing.labels.label import LabelFile as LabelFile
 from indexing.labels.label import within as within
-from indexing.labels.options import LabelOptions as LabelOptions
 from indexing.labels.reading import choose_labels as choose_labels
 from indexing.labels.reading import open_labels as open_labels
 from indexing.labels.reading import read_labels as read_labels
 from indexing.labels.writing import write_labels as write_labels
 
 __all__ = [
-    *("Label", "LabelFile", "LabelOptions", "choose_labels", "open_labels", "read_labels", "within", "write_labels"),
+    *("Label", "LabelFile", "choose_labels", "open_labels", "read_labels", "within", "write_labels"),
 ]

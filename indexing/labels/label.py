@@ -9,8 +9,11 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from indexing.labels.options import LabelOptions
 from indexing.opening import clipped, count
+
+MAX_OVERHANG_SECONDS = 0.1
+"""That a label may reach beyond its recording without a word: players stop some frames before or after the last one."""
+NUM_NAMED = 3  # examples that a notice names
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -84,7 +87,7 @@ class LabelFile:
 
     Args:
         path: the file.
-        format: one of :data:`indexing.labels.detect.FORMATS`.
+        format: the name of a file in ``indexing/labels/formats``.
         labels: sorted by start; times on the clock of the medium that each is of.
         observations, tiers, subjects, media: all names that the file has, also those without labels, in its order.
         machine: of the observations and tiers, those that a program wrote: found, and confirmed by nobody.
@@ -109,14 +112,12 @@ def within(
     begin: float,
     end: float,
     name: str = "the recording",
-    options: LabelOptions = LabelOptions(),
 ) -> tuple[list[Label], list[str]]:
     """The labels of a recording that lie in it, cut where it begins and ends, and what was left out or cut.
 
     Args:
         begin, end: times of the first and the last frame, in seconds.
         name: of the recording, for the notices.
-        options: how far a label may reach beyond without a word.
 
     Example:
         >>> kept, notices = within([Label(1, 3, "squat"), Label(9, 12, "squat"), Label(70, 71, "squat")], 0, 10, "a.json")
@@ -131,7 +132,7 @@ def within(
     outside: list[Label] = []
     cut: list[Label] = []
     for label in labels:
-        if label.end < begin - options.slack or label.start > end + options.slack:
+        if label.end < begin - MAX_OVERHANG_SECONDS or label.start > end + MAX_OVERHANG_SECONDS:
             outside.append(label)
             continue
         inside = replace(label, start=min(max(label.start, begin), end), end=max(min(label.end, end), begin))
@@ -139,21 +140,21 @@ def within(
             outside.append(label)
             continue
         kept.append(inside)
-        if label.start < begin - options.slack or label.end > end + options.slack:
+        if label.start < begin - MAX_OVERHANG_SECONDS or label.end > end + MAX_OVERHANG_SECONDS:
             cut.append(label)
     runs = f"runs from {begin:.6g} to {end:.6g} s"
     notices = []
     if outside:
-        notices.append(f"{count(len(outside), 'label')} left out: outside {name}, which {runs} ({spots(outside, options)})")
+        notices.append(f"{count(len(outside), 'label')} left out: outside {name}, which {runs} ({spots(outside)})")
     if cut:
-        notices.append(f"{count(len(cut), 'label')} cut: {name} {runs} ({spots(cut, options)})")
+        notices.append(f"{count(len(cut), 'label')} cut: {name} {runs} ({spots(cut)})")
     return kept, notices
 
 
-def spots(labels: Iterable[Label], options: LabelOptions = LabelOptions()) -> str:
+def spots(labels: Iterable[Label]) -> str:
     """The first of some labels, for a notice."""
-    found = [spot(label) for label in islice(labels, options.named + 1)]
-    return ", ".join(found[: options.named]) + ", ..." * (len(found) > options.named)
+    found = [spot(label) for label in islice(labels, NUM_NAMED + 1)]
+    return ", ".join(found[:NUM_NAMED]) + ", ..." * (len(found) > NUM_NAMED)
 
 
 def spot(label: Label) -> str:

@@ -9,9 +9,10 @@ from typing import Any
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
-from indexing.labels.options import LabelOptions
 from indexing.opening import error
 
+MAX_DEPTH = 64  # elements of an ELAN file inside each other: ELAN writes five
+MAX_ELEMENTS = 20_000_000  # of an ELAN file: a million annotations take five million
 REMEDY = "save it again in ELAN"
 WORDED = frozenset(("ANNOTATION_VALUE", "CVE_VALUE", "CV_ENTRY", "PROPERTY"))
 """Elements whose text counts; that between others is indentation, and takes half of the memory."""
@@ -30,21 +31,18 @@ Taken = Callable[[Placed, Element], bool]
 """What looks at each grandchild of the root, with its parent, as soon as it is read; True: the tree need not keep it."""
 
 
-def parse_xml(
-    path: Path, data: bytes, taken: Taken = lambda placed, parent: False, options: LabelOptions = LabelOptions()
-) -> tuple[Element, list[Placed]]:
+def parse_xml(path: Path, data: bytes, taken: Taken = lambda placed, parent: False) -> tuple[Element, list[Placed]]:
     """The root of a document, and where its children stand."""
-    return _Parser(path, data, taken, options).parse()
+    return _Parser(path, data, taken).parse()
 
 
 class _Parser:
     """Expat, with a guard at every door."""
 
-    def __init__(self, path: Path, data: bytes, taken: Taken, options: LabelOptions) -> None:
+    def __init__(self, path: Path, data: bytes, taken: Taken) -> None:
         self.path = path
         self.data = data
         self.taken = taken
-        self.options = options
         self.elements = 0
         self.children: list[Placed] = []
         self.builder = TreeBuilder()
@@ -72,10 +70,10 @@ class _Parser:
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         self.elements += 1
-        if len(self.open) >= self.options.deepest:
+        if len(self.open) >= MAX_DEPTH:
             raise error(self.path, f"its XML has elements {len(self.open) + 1} deep", REMEDY)
-        if self.elements > self.options.elements:
-            raise error(self.path, f"has more than {self.options.elements:,} XML elements", "split it")
+        if self.elements > MAX_ELEMENTS:
+            raise error(self.path, f"has more than {MAX_ELEMENTS:,} XML elements", "split it")
         self.open.append((self.builder.start(tag, attributes), self.parser.CurrentByteIndex))
         if tag in WORDED:
             self.parser.CharacterDataHandler = self.builder.data

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from urllib.parse import unquote
 
-from indexing.labels.gathering import Request
+from indexing.labels.format import Request
 from indexing.opening import error, listed
 
 SUFFIX = re.compile(r"\.\w{1,8}$")

@@ -7,18 +7,13 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
-from indexing.labels.detect import FORMATS, detect
-from indexing.labels.gathering import Request, few
+from indexing.labels.detect import detect, registered_formats
+from indexing.labels.format import Request, few
 from indexing.labels.label import Label, LabelFile
 from indexing.labels.media import of_recording
-from indexing.labels.options import LabelOptions
 from indexing.opening import count, error, listed, shown, uncollected
-
-READERS = {"boris": "boris.project", "boris_tables": "boris.tables", "elan": "elan.reading"}
-"""Where formats are read that have a room."""
 
 
 def open_labels(
@@ -31,7 +26,6 @@ def open_labels(
     tier: str | None = None,
     fps: float | None = None,
     format: str | None = None,  # noqa: A002  (the word users type)
-    options: LabelOptions = LabelOptions(),
 ) -> LabelFile:
     """All labels of a file, or those asked for, with notices of what was left out, dropped and assumed.
 
@@ -46,8 +40,7 @@ def open_labels(
         media: the name that the recording has in the file, where it has another one there.
         observation, subject, tier: only those of this name.
         fps: frames per second of the recording, for files that count frames (Label Studio, tables with ``start_frame``).
-        format: one of :data:`indexing.labels.detect.FORMATS`; by default the content decides.
-        options: where reading stops, and how much a notice names.
+        format: the name of a file in ``indexing/labels/formats``; by default the content decides.
 
     Returns:
         labels with times in seconds on the clock of the file that each is of.
@@ -65,18 +58,18 @@ def open_labels(
         >>> found.notices
         ('1 label without a name left out ((no name) at 5-6 s)',)
     """
-    if format is not None and format not in FORMATS:
-        raise error(path, f"unknown format={shown(format)}", f"use one of {', '.join(FORMATS)}, or leave it out to detect it")
+    if format is not None and format not in registered_formats():
+        names = ", ".join(sorted(registered_formats()))
+        raise error(path, f"unknown format={shown(format)}", f"use one of {names}, or leave it out to detect it")
     if fps is not None and not 0 < fps < math.inf:
         raise error(path, f"fps={shown(fps)} is no frame rate", "give frames per second, such as 29.97")
-    asked = Request(Path(path), recording, media, observation, subject, tier, fps, options)
+    asked = Request(Path(path), recording, media, observation, subject, tier, fps)
     with uncollected():
         detected, data = detect(asked.path)
         if format is not None and format != detected:
             said = f"is of the format {detected!r}, not {format!r}"
             raise error(path, said, "leave format= out to detect it")
-        found: LabelFile = import_module(f"indexing.labels.{READERS.get(detected, detected)}").read(data, asked)
-        return _asked_for(found, asked)
+        return _asked_for(registered_formats()[detected].read(data, asked), asked)
 
 
 def choose_labels(found: LabelFile) -> LabelFile:
@@ -123,7 +116,6 @@ def read_labels(
     tier: str | None = None,
     fps: float | None = None,
     format: str | None = None,  # noqa: A002
-    options: LabelOptions = LabelOptions(),
 ) -> list[Label]:
     """The labels of one hand, sorted by start: what is to be learned from, or compared with.
 
@@ -150,7 +142,6 @@ def read_labels(
             tier=tier,
             fps=fps,
             format=format,
-            options=options,
         )
     )
     for notice in found.notices:
@@ -179,5 +170,5 @@ def _asked_for(found: LabelFile, asked: Request) -> LabelFile:
         labels = [label for label in labels if not label.media or label.media in mine]
         if others:
             total = sum(others.values())
-            notices.append(f"{count(total, 'label')} left out: of other recordings ({few(others, asked.options)})")
+            notices.append(f"{count(total, 'label')} left out: of other recordings ({few(others)})")
     return replace(found, labels=tuple(labels), watched=tuple(watched), notices=tuple(notices))

@@ -7,25 +7,15 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from indexing.labels import tables
+from indexing.labels.detect import registered_formats
+from indexing.labels.format import LabelFormat, Target
 from indexing.labels.label import Label
 from indexing.labels.media import base_name, same_recording
-from indexing.labels.target import Target
 from indexing.opening import count, error, is_regular, listed, shown
 
-FORMATS = {
-    ".boris": "boris",
-    ".eaf": "elan",
-    ".csv": "csv",
-    ".tsv": "tsv",
-    ".json": "activitynet",
-}
-BY_NAME = ("label_studio", "via")
-BESIDE = ("boris", "elan")
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".wav")
 """What annotation programs play."""
 UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")  # what XML has no way to write
@@ -82,39 +72,34 @@ def write_labels(
         [Label(1.5, 4.0, 'squat', media='session.mp4', observation='dyntorch session.mp4', score=4.4)]
     """
     target = Path(path)
-    name = _format(target, format)
+    name, known = _format(target, format)
     _check(target, duration, fps, tier)
-    source = _source(target, into, name)
+    source = _source(target, into, known)
     own = str(recording) if recording is not None else ""
     if own:  # labels may name the video, and the recording be its keypoints
         own = next((label.media for label in labels if label.media and same_recording(label.media, own)), _film(own, target, name))
     sound, notices = _sound(labels, own)
-    if own and name in BESIDE and source is None and Path(own).suffix.lower() not in FILMS:
-        asks = {"boris": "BORIS", "elan": "ELAN"}[name]
-        notices.append(f"{base_name(own)} is no video: {asks} asks for one when you open {target.name}")
+    if own and known.program and source is None and Path(own).suffix.lower() not in FILMS:
+        notices.append(f"{base_name(own)} is no video: {known.program} asks for one when you open {target.name}")
     recordings = dict.fromkeys(([own] if own else []) + [label.media for label in sound])
-    where = Target(target, tuple(recordings), source, tier, duration, fps, annotator, media, dry)
-    if dry and name not in BESIDE:
+    if (dry and not known.program) or known.write is None:
         return notices
-    if name in ("csv", "tsv"):
-        return notices + tables.write(target, sound, "," if name == "csv" else "\t")
-    module = import_module(f"indexing.labels.{name}.writing" if name in BESIDE else f"indexing.labels.{name}")
-    said: list[str] = module.write(sound, where)
-    return notices + said
+    where = Target(target, tuple(recordings), source, tier, duration, fps, annotator, media, dry, name)
+    return notices + known.write(sound, where)
 
 
-def _format(path: Path, name: str | None) -> str:
+def _format(path: Path, name: str | None) -> tuple[str, LabelFormat]:
     """What is written."""
-    known = [*FORMATS.values(), *BY_NAME]
-    if name is not None:
-        if name not in known:
-            raise error(path, f"unknown format={shown(name)}", f"use one of {', '.join(known)}")
-        return name
-    found = FORMATS.get(path.suffix.lower())
-    if found is None:
+    written = {each: (suffix, known) for known in registered_formats().values() for each, suffix in known.written.items()}
+    if name is not None and name not in written:
+        raise error(path, f"unknown format={shown(name)}", f"use one of {', '.join(sorted(written))}")
+    if name is None:
+        name = next((each for each, (suffix, _) in written.items() if suffix and suffix == path.suffix.lower()), None)
+    if name is None:
+        suffixes = sorted(suffix for suffix, _ in written.values() if suffix)
         said = f"the suffix {path.suffix!r} does not say which format to write"
-        raise error(path, said, f"end the name in one of {', '.join(FORMATS)}, or give format=")
-    return found
+        raise error(path, said, f"end the name in one of {', '.join(suffixes)}, or give format=")
+    return name, written[name][1]
 
 
 def _check(path: Path, duration: float | None, fps: float | None, tier: str) -> None:
@@ -125,14 +110,14 @@ def _check(path: Path, duration: float | None, fps: float | None, tier: str) -> 
         raise error(path, f"tier={shown(tier)} is no name", "give a name of letters")
 
 
-def _source(path: Path, into: str | Path | None, name: str) -> Path | None:
+def _source(path: Path, into: str | Path | None, known: LabelFormat) -> Path | None:
     """The file whose content is taken over, if any."""
-    if into is not None and name not in BESIDE:
-        said = f"labels cannot be written beside those of {into}"
-        raise error(path, said, f"write a .boris or an .eaf ({listed(BESIDE)})")
+    if into is not None and not known.program:
+        kept = [suffix for each in registered_formats().values() if each.program for suffix in each.written.values()]
+        raise error(path, f"labels cannot be written beside those of {into}", f"write {listed(kept)}")
     if into is not None:
         return Path(into)
-    return path if name in BESIDE and is_regular(path) else None
+    return path if known.program and is_regular(path) else None
 
 
 def _film(recording: str, target: Path, name: str) -> str:

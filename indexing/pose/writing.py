@@ -35,7 +35,7 @@ from indexing.pose.models import load_models
 from indexing.pose.networks import NetworkMaker
 from indexing.pose.options import PoseOptions
 from indexing.pose.pieces import clear, content_of, nearest, plan
-from indexing.readers.clipset import read_clip_set
+from indexing.readers.formats.clipset import read_clip_set
 from indexing.readers.npz import NumpyArchive
 
 MADE_FROM, CONTENT = "made_from", "content"  # the fields by which a file of ours is known

@@ -1,23 +1,18 @@
-"""Keypoint files of any common pose estimator -> clips: one file per format, chosen here by name.
-
-Adding a format is one new module with ``read(source, options) -> ClipSet``, its name below, and a line in ``detect.py``.
-"""
+"""Keypoint files of any common pose estimator -> clips.  A format is a file in ``formats/``, and registers itself there."""
 
 from __future__ import annotations
 
 from collections.abc import Hashable
-from importlib import import_module
 from pathlib import Path
 
 from indexing.clip import Clip, ClipSet
 from indexing.opening import error, shown, uncollected
-from indexing.readers.detect import detect
+from indexing.readers.detect import detect, registered_formats
 from indexing.readers.files import LinkOptions, Options, WatchOptions, open_source
+from indexing.readers.video import read_video
+from indexing.registry import format_names
 
-FORMATS = (
-    *("clipset", "openpose", "coco", "mediapipe", "deeplabcut", "mmpose", "ultralytics", "sleap"),
-    *("trc", "mocap", "freemocap", "npy", "pyskl", "movement"),
-)
+FORMATS = format_names("readers")
 
 
 def read(
@@ -43,9 +38,11 @@ def read(
         raise ValueError(f"{path}: unknown format={shown(format)}; use one of {', '.join(FORMATS)}, or leave it out to detect it")
     with uncollected():
         source = open_source(path)
-        module = import_module(f"{__name__}.{format or detect(source)}")
-        clips: ClipSet = module.read(source, options)
-    return clips
+        name = format or detect(source)
+        if name == "video":
+            return read_video(source, options)
+        source.need(name, *registered_formats()[name].kinds)
+        return registered_formats()[name].read(source, options)
 
 
 def read_clip(

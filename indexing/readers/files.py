@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from indexing.clip import FloatArray, check_fps
+from indexing.clip import ClipSet, FloatArray, check_fps
 from indexing.opening import VALUE, clipped, entries, error, head_of, listed, parse_json, read_rows, read_text, shown, size_of
 from indexing.skeleton import layout_named
 
@@ -48,6 +48,22 @@ class Source:
                 f"is a {self.kind}, but the format {name!r} is a {' or a '.join(kinds)}",
                 "leave format= out to detect it",
             )
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of keypoint files, declared as ``FORMAT`` in the file of ``indexing/readers/formats`` that has its name."""
+
+    programs: tuple[str, ...]
+    """That write it, as errors list them."""
+    kinds: tuple[str, ...]
+    """Of files, as :func:`open_source` tells them apart."""
+    read: Callable[[Source, Options], ClipSet]
+    matches: Callable[[Source], bool] = lambda source: True
+    """Whether a file of these kinds is of the format.  ``source.data`` holds the rows with which a table begins, the open file of
+    HDF5, and of JSON the object that the file is, or a list of one of its elements.  Some file of a folder has to match."""
+    order: int = 50
+    """Among formats of one kind, those with the stricter telltale are asked first."""
 
 
 def open_source(path: str | Path) -> Source:

@@ -10,12 +10,11 @@ from indexing.readers.files import Options, Source
 from indexing.readers.recording import NobodySeen, of_people, to_clips
 
 
-def read(source: Source, options: Options) -> ClipSet:
+def read_video(source: Source, options: Options) -> ClipSet:
     """Find the people in a video; ``person`` says who of them is meant, as for files of keypoints."""
     from indexing.pose import available, detect
     from indexing.pose.models import FETCH
 
-    source.need("video", "video")
     if options.size is not None:
         raise error(source.path, "size= does not apply to a video", "leave size out")
     if available() is None:

@@ -167,7 +167,7 @@ def openpose_files(path: Path | None) -> dict[int, Path]:
     if path is None or not path.is_dir():
         return {}
     found = [entry for entry in sorted(path.iterdir()) if entry.suffix.lower() == ".json" and not entry.name.startswith(".")]
-    if not found or next((kind for file in found if (kind := detect_json(load_json(file)))), None) != "openpose":
+    if not found or next((kind for file in found if (kind := detect_json(file, load_json(file)))), None) != "openpose":
         return {}
     return {number: file for file in found if (number := frame_number(file.name)) is not None}
 

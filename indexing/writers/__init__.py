@@ -1,4 +1,4 @@
-"""Clips as files of other programs, one file per format; clip sets are written by :mod:`indexing.readers.clipset`.
+"""Clips as files of other programs, one file per format; clip sets are written by :mod:`indexing.readers.formats.clipset`.
 
 ======== ============================= =====================================================================================
 ``.trc`` OpenSim, Pose2Sim, Sports2D   joints of everybody in a recording, exact times; 2D with z = 0
@@ -7,25 +7,39 @@
 ``.npz`` clip set                      everything
 ======== ============================= =====================================================================================
 
-A new format is a file with ``encode(clips, path, units) -> (bytes, notes)``, and a line in :data:`FORMATS`.
+A format is a file in ``formats/`` with the name of its suffix, and registers itself there as :class:`markers.Writer`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import import_module
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dyntorch.numerics import Message
 from indexing.files import write_bytes
 from indexing.opening import error
+from indexing.registry import format_names, load_formats
+from indexing.writers.markers import Writer
 
 if TYPE_CHECKING:
     from indexing.clip import Clip
 
-FORMATS = {".trc": "trc", ".c3d": "c3d", ".nc": "netcdf"}
-"""Suffix and module; the clip set ``.npz`` besides."""
+FORMATS = tuple(f".{name}" for name in format_names("writers"))
+"""Suffixes; the clip set ``.npz`` besides."""
 UNITS = ("m", "cm", "mm", "px")
+
+
+@cache
+def registered_formats() -> dict[str, Writer]:
+    """The formats by name, which is the suffix without its dot."""
+    return load_formats("writers")
+
+
+def suffixes_with_units() -> list[str]:
+    """Of the formats that say what their coordinates are in."""
+    return [f".{name}" for name, writer in sorted(registered_formats().items(), reverse=True) if writer.has_units]
 
 
 def write(clips: Sequence[Clip], path: str | Path, units: str | None = None) -> list[str]:
@@ -40,10 +54,11 @@ def write(clips: Sequence[Clip], path: str | Path, units: str | None = None) -> 
 
 def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple[bytes, list[str]]:
     """What :func:`write` would write to a path, and its notes; nothing is written."""
-    module = FORMATS.get(path.suffix.lower())
-    if module is None:
+    if path.suffix.lower() not in FORMATS:
         raise error(path, f"no format ends in {path.suffix!r}", f"end the name in one of .npz, {', '.join(FORMATS)}")
     if units is not None and units not in UNITS:
         raise error(path, f"units {units!r} are not known", f"give one of {', '.join(UNITS)}")
-    found: tuple[bytes, list[str]] = import_module(f"{__name__}.{module}").encode(clips, path, units)
-    return found
+    writer = registered_formats()[path.suffix.lower()[1:]]
+    if units is not None and not writer.has_units:
+        raise error(path, Message("{arg:units} is for {suffixes}", suffixes=" and ".join(suffixes_with_units())), "leave it out")
+    return writer.encode(clips, path, units)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,23 +22,23 @@ UNIT = re.compile(r"[^\W\d_]{1,12}")  # a word, as the headers of files have a p
 ONE = "give the clips of one recording, or a folder for a file of each"
 
 
+MAX_METRES = 10.0  # a body that extends over less is in metres, where nobody says
+MAX_CENTIMETRES = 500.0  # one over less than this, and no less than that, in centimetres; else in millimetres
+MAX_UNEVENNESS = 0.01
+"""Of the step between frames, by which times are off an even grid at most, in a format with a rate and no times."""
+
+
 @dataclass(frozen=True)
-class MarkerOptions:
-    """What is taken for granted of a recording that becomes markers."""
+class Writer:
+    """A format that is written, declared as ``FORMAT`` in the file of ``indexing/writers/formats`` that has its suffix as name."""
 
-    metres: float = 10.0
-    """A body that goes over less is in metres, where nobody says."""
-    centimetres: float = 500.0
-    """One that goes over less than this, and no less than that, is in centimetres; else in millimetres."""
-    uneven: float = 0.01
-    """Of the step between frames, by which times are off an even grid at most, in a format with a rate and no times."""
-    gaps: float = 10.0
-    """Times its frames that the grid of a recording may have, in such a format."""
-    gap_frames: int = 10_000
-    """Frames that it may have in any case."""
-
-
-MARKERS = MarkerOptions()
+    programs: tuple[str, ...]
+    """That read it."""
+    encode: Callable[[Sequence[Clip], Path, str | None], tuple[bytes, list[str]]]
+    """From the clips of a recording, the path, and the units or None: what the file holds, and what the format has no place for."""
+    has_units: bool = False
+    """Whether a file says what its coordinates are in."""
+    order: int = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def markers_of(clips: Sequence[Clip], path: Path, units: str | None = None) -> M
 def _rate(times: FloatArray, told: float) -> float:
     """Frames per second: as they are told, where the times agree."""
     usual = 1 / float(np.median(np.diff(times))) if len(times) > 1 else told
-    return told if abs(usual / told - 1) < MARKERS.uneven else usual
+    return told if abs(usual / told - 1) < MAX_UNEVENNESS else usual
 
 
 def people_of(clips: Sequence[Clip], path: Path) -> list[str]:
@@ -144,4 +144,4 @@ def _units(clips: Sequence[Clip], asked: str | None) -> tuple[str, bool]:
         low, high = (edge(np.where(np.isnan(joints), fill, joints), axis=1) for edge, fill in ((np.min, np.inf), (np.max, -np.inf)))
         sizes += [float(np.median((high - low).max(axis=1)))] if len(joints) else []
     size = max(sizes, default=1.0)
-    return "m" if size < MARKERS.metres else "cm" if size < MARKERS.centimetres else "mm", True
+    return "m" if size < MAX_METRES else "cm" if size < MAX_CENTIMETRES else "mm", True

@@ -220,7 +220,7 @@ def _sets(folder: Path) -> list[Seed]:
 
 def films_read(path: Path) -> Any:
     """Read a film set, and look at every film."""
-    from indexing.readers.clipset import holds_frames, read_film_set
+    from indexing.readers.formats.clipset import holds_frames, read_film_set
 
     holds_frames(path)
     return [(film.duration, len(film), film.label, film.frames) for film in read_film_set(path)]

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from indexing.labels import Label, LabelOptions, choose_labels, open_labels, write_labels
+from indexing.labels import Label, choose_labels, markup, open_labels, write_labels
 from tests.fuzz import mutations
 from tests.indexing.labels import test_boris, test_elan
 
@@ -201,7 +201,8 @@ def test_no_file_at_all(tmp_path: Path) -> None:
             write_labels(tmp_path / "out.eaf", LABELS, recording="session.mp4", into=path)
 
 
-def test_a_limit_to_the_size_of_a_tree(tmp_path: Path) -> None:
+def test_a_limit_to_the_size_of_a_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(markup, "MAX_ELEMENTS", 10)
     path = elan(tmp_path)
     with pytest.raises(ValueError, match="has more than 10 XML elements; split it"):
-        open_labels(path, options=LabelOptions(elements=10))
+        open_labels(path)

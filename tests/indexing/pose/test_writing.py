@@ -15,7 +15,7 @@ from indexing.pose.options import PieceOptions
 from indexing.pose.pieces import Store
 from indexing.pose.writing import keypoint_files, write_json_folder
 from indexing.readers import read
-from indexing.readers.clipset import read_clip_set
+from indexing.readers.formats.clipset import read_clip_set
 from indexing.video.reading import Video
 from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
 from tests.indexing.pose.test_detection import HEIGHT, WIDTH, film, person, walk

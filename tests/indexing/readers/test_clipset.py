@@ -10,7 +10,7 @@ import pytest
 
 from indexing.clip import Clip, ClipSet
 from indexing.readers import read
-from indexing.readers.clipset import read_clip_set, write_clip_set
+from indexing.readers.formats.clipset import read_clip_set, write_clip_set
 from indexing.skeleton import COCO17, Skeleton
 
 

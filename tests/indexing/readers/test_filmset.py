@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from indexing.readers.clipset import FilmSet, holds_frames, read_film_set
+from indexing.readers.formats.clipset import FilmSet, holds_frames, read_film_set
 
 FRAMES = np.arange(9 * 4 * 5, dtype=np.uint8).reshape(9, 4, 5)
 WHOLE = {"frames": FRAMES, "offsets": [0, 4, 9], "action": [1, 0], "action_names": ["run", "sit"], "subject": [7, 8], "fps": 10.0}

@@ -18,7 +18,7 @@ from indexing.cli.inputs import read_truth
 from indexing.opening import clipped, parse_json, read_text, shown
 from indexing.readers import npz as npz_gate
 from indexing.readers import read
-from indexing.readers.clipset import read_film_set
+from indexing.readers.formats.clipset import read_film_set
 from indexing.readers.matches import open_points, read_matches
 from indexing.readers.pairs import read_image, read_pair
 from indexing.readers.tracks import read_tracks

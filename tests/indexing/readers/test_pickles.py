@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from indexing.readers import pyskl as reader
 from indexing.readers import read
+from indexing.readers.formats import pyskl as reader
 from indexing.readers.pickles import _Reader, read_pickle, unpickled
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17, NTU25

@@ -194,7 +194,7 @@ def test_what_headers_have_no_place_for(tmp_path, suffix):
 
 
 def test_unknown_formats_and_folders(tmp_path):
-    with pytest.raises(ValueError, match=r"no format ends in '.abc'; end the name in one of .npz, .trc, .c3d, .nc"):
+    with pytest.raises(ValueError, match=r"no format ends in '.abc'; end the name in one of .npz, .c3d, .nc, .trc"):
         write([body()], tmp_path / "a.abc")
     for suffix in (*FORMATS, ".npz"):
         with pytest.raises(ValueError, match=r"the folder .* does not exist; create it first"):

@@ -1,1 +1,0 @@
-"""ELAN: ``reading`` reads tiers, ``times`` gives their annotations times, ``writing`` puts tiers into a file."""

@@ -1,0 +1,1 @@
+"""One file or room a format of labels: it declares ``FORMAT`` (:class:`indexing.labels.label.LabelFormat`)."""
