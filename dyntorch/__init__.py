@@ -22,7 +22,6 @@ The public names are imported lazily, so that ``import dyntorch`` costs nothing 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
@@ -90,7 +89,6 @@ _HOME = {
     "PairOptions": "dyntorch.tasks.pair.options",
     "PlanesOptions": "dyntorch.tasks.planes.options",
     "ReconstructOptions": "dyntorch.tasks.reconstruct.options",
-    "RobustOptions": "dyntorch.core.options",
     "SegmentOptions": "dyntorch.tasks.segment.options",
     "SynchronizeOptions": "dyntorch.tasks.synchronize.options",
     "TrackSegmentOptions": "dyntorch.tasks.segment_tracks.options",
@@ -108,31 +106,13 @@ _MODULES = {
     "shapes": "dyntorch.shapes",
     "tasks": "dyntorch.tasks",
 }
-_MOVED = {
-    "core": ("algebraic",),
-    "numerics": ("one_thread", "on_cpu", "canonical_correlation", "orthonormal_basis", "affine_factorization", "metric_upgrade"),
-    "geometry": (
-        "undistort", "distort", "fit_distortion", "line_camera", "triangulate", "resect", "reproject", "bundle_adjust",
-        "structure_covariance", "grassmann_tensor", "joint_epipoles", "hyperplane_pair", "two_bodies",
-    ),
-    "shapes": ("fit_shapes", "MovingShapes", "recover_times", "Recovery"),
-    "invariants": ("multibody_matrix",),
-    "tasks": (
-        "affine_segmentation", "projective_factorization", "velocity_factorization", "LineStatus", "points_on_lines", "BodyModel",
-    ),
-}  # fmt: skip
-"""Names that stood here and now stand in their rooms; for one release they are found here, with a warning."""
 __all__ = sorted([*_HOME, *_MODULES])
 
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
         return import_module(_MODULES[name])
-    room = next((room for room, names in _MOVED.items() if name in names), None)
-    if room is None:
-        return _lazily(__name__, _HOME, name)
-    warnings.warn(f"dyntorch.{name} is dyntorch.{room}.{name} from now on", DeprecationWarning, stacklevel=2)
-    return getattr(import_module(f"dyntorch.{room}"), name)
+    return _lazily(__name__, _HOME, name)
 
 
 def _lazily(package: str, home: Mapping[str, str], name: str) -> Any:

@@ -148,12 +148,8 @@ def test_every_name_that_a_room_hands_on_exists(room):
     assert all(getattr(face, name) is not None for name in face.__all__)
 
 
-def test_names_that_moved_into_rooms_are_found_at_their_old_place_with_a_warning():
+def test_the_top_level_has_some_fifty_names():
     dyntorch = import_module("dyntorch")
-    with pytest.warns(DeprecationWarning, match=r"dyntorch\.geometry\.triangulate"):
-        assert dyntorch.triangulate is dyntorch.geometry.triangulate
-    for room, names in dyntorch._MOVED.items():
-        assert set(names) <= set(import_module(f"dyntorch.{room}").__all__)
     # what a verb decides with stands beside the verb, one class each
     assert len([name for name in dyntorch._HOME if not name.endswith("Options")]) <= 50
 

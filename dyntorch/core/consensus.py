@@ -14,7 +14,6 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
 from dyntorch.core.matrix import unpack
 from dyntorch.core.normalize import Normalization, normalization, relative
-from dyntorch.core.options import RobustOptions
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, triangle
 from dyntorch.core.residual import SINGULAR, whiten
 from dyntorch.core.solution import copied
@@ -29,6 +28,43 @@ from dyntorch.numerics.nullspace import gram_null_space
 
 SHIFT_EPSILON = 1e-14  # of the trace: keeps the factor of an exactly singular Gram finite
 FAR = 1e30  # squared distance in place of one that is no number
+MAX_SEARCHED = 1000
+"""Matches among which is searched, at least 10 for every column; of more, a random part (all are used for the final fit)."""
+GROSS_OUTLIER = 5.0
+"""Distance from the median of the matches, over the median distance, beyond which one has no say in the normalization."""
+MAX_MINIMAL_SAMPLE = 8
+"""Largest minimal sample for which samples of that size are drawn; other starts take 2.5 times the minimal number."""
+SAMPLES_PER_START = 32
+"""Minimal samples drawn per start."""
+STARTS_PER_ANNEALED_SAMPLE = 4
+NUM_SCALE_STARTS = 16
+"""Random starts of the estimate of the threshold, beside that from all matches."""
+REWEIGHTINGS = {"all": 30, "many": 20, "minimal": 10}
+"""Of the start from all matches, from 2.5 times the minimal number, and from a minimal sample."""
+GUIDED_REWEIGHTINGS = 60
+"""Of a start from many matches, with a motion as guide."""
+STARTS_PER_UNGUIDED = 4
+"""One start of so many is not guided.  Successes per start, not guided and guided: homography tensor (100 matches, 50 % outliers)
+0.48 and 0.70, translating lines (175, 30 %) 0.01 and 0.20, constant velocity tensor (150, 35 %) 0.53 and 0.52."""
+SHRINKING_SHARE = 0.7
+"""Share of the reweightings during which the scale shrinks."""
+NUM_CONCENTRATIONS = 5
+"""Refits to the matches within the threshold, or to the nearer half, at the end."""
+SCALE_REWEIGHTINGS = 20
+"""In the estimate of the threshold, with a motion as guide: hard halves alone are 40 to 70 times off for lines."""
+NUM_INVERSE_ITERATIONS = 2
+"""Per reweighting: the weights change more than what is left of the null vector's error."""
+NUM_SHUFFLES = 4
+"""Random sets of matches, made by mixing up the views, on which the chance of an inlier is measured."""
+MAX_NEAR_MISSES = 0.15
+"""Matches between one and three thresholds away, per inlier, above which the search goes on: a wrong model has many (constant
+velocity tensors, 20 % outliers: wrong 0.7 and more, right 0.03 at most; right homography tensors reach 0.15 at 60 %)."""
+MIN_STARTS_TO_COMPARE = 16
+"""Starts from which on their agreement decides when to stop."""
+MIN_AGREEING_STARTS = 0.25
+"""Share of such starts that must end at the least score so far: what attracts one start in five is missed once in thirty times."""
+SAME_SCORE = 0.01
+"""Relative difference, and weight of matches, up to which two scores are the same."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +84,6 @@ class Bundle:
     """``(b, c, n, m)`` packed outer squares of the rows of each match."""
     vectors: tuple[Tensor, ...]
     """``(b, c, width, rows, n)`` per view, of the length that the derivatives of the primitives suppose."""
-    options: RobustOptions
 
     def first(self, weights: Tensor) -> Tensor:
         """Null spaces ``(b, c, K, a, D)`` of the weightings ``(b, K, n)`` of rows of unit length."""
@@ -79,7 +114,7 @@ class Bundle:
         diagonal += diagonal.sum(-1, keepdim=True) * SHIFT_EPSILON + 1e-300
         factor, _ = torch.linalg.cholesky_ex(gram)
         columns = basis.mT
-        for _ in range(self.options.annealing.inverse_iterations):
+        for _ in range(NUM_INVERSE_ITERATIONS):
             columns = orthonormal(torch.cholesky_solve(columns, factor))
         found = columns.mT
         return torch.where(found.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), found, basis)
@@ -157,7 +192,6 @@ def bundle(
     views: tuple[Tensor, ...],
     scales: tuple[Tensor, ...],
     weights: Tensor,
-    options: RobustOptions,
 ) -> Bundle:
     """Prepare matches ``(b, 1, n, ...)`` in normalized coordinates, with weights ``(b, n)``."""
     packed, vectors = [], []
@@ -173,7 +207,7 @@ def bundle(
     moments = packed[0]
     for factor in packed[1:]:
         moments = (moments[..., :, None] * factor[..., None, :]).flatten(-2)
-    return Bundle(invariant, primitives, views, scales, weights, moments, tuple(vectors), options)
+    return Bundle(invariant, primitives, views, scales, weights, moments, tuple(vectors))
 
 
 def transfer_slot(primitives: Sequence[Primitive]) -> int | None:
@@ -186,7 +220,7 @@ def anneal(data: Bundle, basis: Tensor, end: Tensor | None, iterations: int, *, 
     r"""Graduated non-convexity: weights :math:`(a / (a + d^2))^2` (Geman-McClure) with a scale a that shrinks to ``end``. basis
     ``(b, c, K, a, D)``, end ``(b,)``."""
     start: Tensor | None = None
-    shrinking = data.options.annealing.shrinking * iterations
+    shrinking = SHRINKING_SHARE * iterations
     for i in range(iterations):
         square, rows = data.distances(data.constrained(basis) if guided and i < shrinking else basis)
         if guided and 2 * i < iterations:
@@ -281,12 +315,11 @@ class Search:
         invariant: Invariant,
         data: Matches,
         generator: torch.Generator | None,
-        options: RobustOptions = RobustOptions(),
     ) -> None:
-        self.invariant, self.data, self.options = invariant, data, options
+        self.invariant, self.data = invariant, data
         self.draws = Draws(len(data.weights), generator, data.weights.device)
         self.everyone = torch.arange(len(data.weights), device=data.weights.device)
-        near = data.weights * _near(invariant, data, options.starts.gross)
+        near = data.weights * _near(invariant, data)
         views, weights, _ = copied(invariant, data.views, near, None)
         self.norm: Normalization = normalization(invariant, views, weights)
         # the search measures in this unit, so that no limit of it depends on that of the matches
@@ -315,19 +348,18 @@ class Search:
             new = self._solve(left, cut, count)
             found = found.better(new, left)
             # more starts would find it again
-            settled[left] = (new.agreeing >= self.options.doubt.agreeing) & (new.score <= self._same(found.score[left]))
+            settled[left] = (new.agreeing >= MIN_AGREEING_STARTS) & (new.score <= self._same(found.score[left]))
         return found
 
     def scale(self) -> Tensor:
         """Threshold ``(b,)`` from the data: least median of squares (annealed), and what 99 % of the inliers then keep."""
-        inv, everyone, options = self.invariant, self.everyone, self.options.annealing
-        count = self.options.starts.scale_starts
+        inv, everyone, count = self.invariant, self.everyone, NUM_SCALE_STARTS
         chosen = torch.cat([self.weights[:, None], self._samples(everyone, count)], dim=1)
 
         def block(searched: Searched, chosen: Tensor) -> Tensor:
             work = self._bundle(searched)
             basis = _best(work, work.first(chosen), lambda square: median(square, work.weights), count + 1)
-            basis = concentrate(work, anneal(work, basis, None, options.scale_steps, guided=True), None, options.concentrations)
+            basis = concentrate(work, anneal(work, basis, None, SCALE_REWEIGHTINGS, guided=True), None, NUM_CONCENTRATIONS)
             return median(work.distances(basis)[0], work.weights).amin(1)
 
         middle = self._map(block, everyone, chosen)
@@ -350,9 +382,8 @@ class Search:
     def _solve(self, where: Tensor, cut: Tensor, count: int) -> Found:
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
         kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
-        options, many = self.options.annealing, self.options.doubt.many
-        steps = {"all": options.from_all, "many": options.from_many, "minimal": options.from_minimal}[kind]
-        keep = max(1, count // self.options.starts.drawn_per_annealed) if kind == "minimal" else count
+        steps = REWEIGHTINGS[kind]
+        keep = max(1, count // STARTS_PER_ANNEALED_SAMPLE) if kind == "minimal" else count
 
         def block(searched: Searched, chosen: Tensor, cut: Tensor) -> Found:
             work, limit = self._bundle(searched), cut.square()
@@ -361,16 +392,17 @@ class Search:
                 return msac(square, work.weights, limit)
 
             basis = _best(work, work.first(chosen), score, keep)
-            unguided = -(-keep // options.unguided)
+            unguided = -(-keep // STARTS_PER_UNGUIDED)
             free, led = basis[:, :, :unguided], basis[:, :, unguided:]
             if kind == "many":
-                led = anneal(work, led, limit, options.guided, guided=True)
+                led = anneal(work, led, limit, GUIDED_REWEIGHTINGS, guided=True)
                 basis = torch.cat([anneal(work, free, limit, steps), led], dim=2)
             else:
                 basis = anneal(work, basis, limit, steps)
             lost = score(work.distances(basis)[0])
-            agreeing = (lost <= self._same(lost.amin(-1, keepdim=True))).double().mean(-1) * (lost.shape[-1] >= many)
-            basis = concentrate(work, _chosen(basis, lost.argmin(-1, keepdim=True)), limit, options.concentrations)
+            agreeing = (lost <= self._same(lost.amin(-1, keepdim=True))).double().mean(-1)
+            agreeing = agreeing * (lost.shape[-1] >= MIN_STARTS_TO_COMPARE)
+            basis = concentrate(work, _chosen(basis, lost.argmin(-1, keepdim=True)), limit, NUM_CONCENTRATIONS)
             square = work.distances(basis)[0]
             evidence, doubt = judge(work, basis, square[:, 0], limit)
             return Found(basis[:, :, 0], score(square)[:, 0], evidence, doubt, square[:, 0] <= limit[:, None], agreeing)
@@ -379,14 +411,12 @@ class Search:
 
     def _same(self, score: Tensor) -> Tensor:
         """The score up to which two finds are the same one: the weight of a hundredth of a match is no difference."""
-        same = self.options.doubt.same
-        return score * (1 + same) + same
+        return score * (1 + SAME_SCORE) + SAME_SCORE
 
     def _samples(self, where: Tensor, count: int) -> Tensor:
         """Starts ``(problems, K, n)``: 1 for so many random matches with weight."""
         minimal = self.invariant.minimal()
-        options = self.options.starts
-        size, count = (minimal, count * options.drawn) if minimal <= options.smallest_samples else (-(-5 * minimal // 2), count)
+        size, count = (minimal, count * SAMPLES_PER_START) if minimal <= MAX_MINIMAL_SAMPLE else (-(-5 * minimal // 2), count)
         present = self.weights[where, None] > 0
         drawn = self.draws(where, count, self.weights.shape[-1]).masked_fill(~present, 2.0)
         last = drawn.kthvalue(min(size, drawn.shape[-1]), dim=-1, keepdim=True).values
@@ -394,7 +424,7 @@ class Search:
 
     def _some(self) -> Matches:
         """The matches to search among."""
-        data, limit = self.data, max(self.options.starts.searched, 10 * self.invariant.width())
+        data, limit = self.data, max(MAX_SEARCHED, 10 * self.invariant.width())
         if data.count <= limit:
             return data
         order = (self.draws(self.everyone, data.count) * (data.weights > 0)).topk(limit).indices
@@ -414,7 +444,7 @@ class Search:
         primitives = tuple(p.normalized(t) for p, t in zip(self.invariant.primitives, transforms, strict=True))
         base = self.invariant.normalized(tuple(t[:, None] for t in transforms))
         scales = relative([t.flatten(1)[:, 0] for t in transforms])[0]
-        return bundle(base, primitives, searched.views, scales, searched.weights, self.options)
+        return bundle(base, primitives, searched.views, scales, searched.weights)
 
 
 def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
@@ -430,14 +460,13 @@ def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[T
     chance = (hits + 1) / (trials + 1)
     evidence = (n - m).clamp(min=1).log() + _choose(n, k) + _choose(k, m) + (k - m) * chance.log()
     near = ((square > limit[:, None]) & (square <= 9 * limit[:, None]) & present).sum(-1)
-    return torch.where(k > m, evidence, torch.inf), (k <= m) | (evidence >= 0) | (near > work.options.doubt.just_beyond * k)
+    return torch.where(k > m, evidence, torch.inf), (k <= m) | (evidence >= 0) | (near > MAX_NEAR_MISSES * k)
 
 
 def _mixed(work: Bundle) -> list[Bundle]:
     """Random matches: view v shifted against the first one by v steps of several sizes."""
     n, count = work.weights.shape[-1], len(work.views)
-    sets = work.options.doubt.mixed
-    steps = sorted({max(1, (2 * j + 1) * n // (2 * sets * count)) for j in range(sets)})
+    steps = sorted({max(1, (2 * j + 1) * n // (2 * NUM_SHUFFLES * count)) for j in range(NUM_SHUFFLES)})
     mixed = []
     for step in steps:
         weights = work.weights
@@ -466,14 +495,14 @@ def _chosen(basis: Tensor, order: Tensor) -> Tensor:
     return basis.gather(2, order[:, None, :, None, None].expand(*basis.shape[:2], order.shape[-1], *basis.shape[3:]))
 
 
-def _near(invariant: Invariant, data: Matches, gross: float) -> Tensor:
+def _near(invariant: Invariant, data: Matches) -> Tensor:
     """Matches ``(b, n)`` without gross outliers, which would make the others small."""
     keep = data.weights > 0
     for primitive, x in zip(invariant.primitives, data.views, strict=True):
         points = primitive.points(x, data.weights).flatten(2).masked_fill((data.weights <= 0)[..., None], torch.nan)
         far = (points - points.nanmedian(1, keepdim=True).values).norm(dim=-1)
         middle = far.nanmedian(-1, keepdim=True).values
-        keep = keep & ((far <= gross * middle) | ~(middle > 0))
+        keep = keep & ((far <= GROSS_OUTLIER * middle) | ~(middle > 0))
     return keep
 
 

@@ -104,11 +104,6 @@ class Notice:
         template = self.code.templates[self.values.get("case", "")]
         return Message(template, self.words, self.names, **{"value": self.value, **self.values})
 
-    @property
-    def message(self) -> Message:
-        """The same, by its older name."""
-        return self.text
-
     def worded(self, words: Words) -> Notice:
         """The same, with what a surface calls the arguments."""
         return replace(self, words=words)

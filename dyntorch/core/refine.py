@@ -12,12 +12,10 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches, check_plain, largest_weights, matches, relative_weights
 from dyntorch.core.matrix import gram
 from dyntorch.core.normalize import Normalization, denormalize, denormalize_motion, relative
-from dyntorch.core.options import RefineOptions
 from dyntorch.core.outcome import failed, in_order
 from dyntorch.core.refine_gradient import followed, unfinished, wanted
 from dyntorch.core.residual import multilinear_derivative, residual_derivative
 from dyntorch.core.solution import Solution
-from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
 from dyntorch.numerics.function_transforms import over_problems, transformed
 from dyntorch.numerics.least_squares import LeastSquaresOptions, Minimum, NormalEquations, flattened, jacobian, minimize, parts_of
@@ -236,7 +234,6 @@ def refine(
     static: Tensor | None = None,
     dimensions: Tensor | None = None,
     iterations: int = ITERATIONS,
-    options: RefineOptions = RefineOptions(),
     **given: Tensor,
 ) -> Solution:
     r"""Refine the motion of a solution: minimize :math:`\sum_n w_n d_n^2` over its entries by Levenberg-Marquardt.
@@ -258,7 +255,6 @@ def refine(
         static: ``(*batch, n)`` bool, matches that do not move; default: those labelled in the fit.
         dimensions: ``(*batch, n)`` integers in place of it, as in :func:`dyntorch.fit`.
         iterations: at most so many steps.
-        options: when gradients are those of a minimum that was not reached.
         **given: what else the invariant takes.
 
     Returns:
@@ -280,7 +276,6 @@ def refine(
         >>> bool((refined.sigma - 0.5).abs() < 0.15)
         True
     """
-    check_options(options, RefineOptions)
     invariant, views = solution.invariant.prepared(views, **given)
     data = matches(invariant, views, weights, static, dimensions, mapped=True)
     old = solution.matches
@@ -295,7 +290,7 @@ def refine(
     if data.static is None and old.static is not None:
         data = replace(data, static=old.static)
     if not transformed(data.views, data.weights, data.static, solution.normalized, solution.normalization.transforms):
-        return refine_matches(solution, data, iterations, options)
+        return refine_matches(solution, data, iterations)
     return _of_transformed(solution, data, iterations)
 
 
@@ -336,9 +331,7 @@ def _of_transformed(solution: Solution, data: Matches, iterations: int) -> Solut
     )
 
 
-def refine_matches(
-    solution: Solution, data: Matches, iterations: int = ITERATIONS, options: RefineOptions = RefineOptions()
-) -> Solution:
+def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIONS) -> Solution:
     """:func:`refine` for checked matches."""
     invariant, motion, recorded = solution.invariant, solution.normalized_motion(), wanted(solution, data)
     starts = [flattened(motion).detach()]
@@ -369,7 +362,7 @@ def refine_matches(
         found = Minimum(found.theta, found.cost / unit.square(), (gradient, matrix), found.steps)
         if not recorded:
             return _refined(solution, data, motion, found)
-        open_ = unfinished(found, invariant.dof, data.batch, options.unfinished_decrease, options.unfinished_length)
+        open_ = unfinished(found, invariant.dof, data.batch)
     theta, cost = followed(solution, data, shapes, found)
     refined = _refined(solution, data, motion, Minimum((theta,), cost, found.terms, found.steps))
     return replace(refined, notices=in_order((*solution.notices, *open_)))

@@ -138,19 +138,6 @@ def wedge(left: Tensor, right: Tensor, size: int, steps: tuple[int, int]) -> Ten
     return (left[..., first] * right[..., second] * sign.to(left.dtype)).sum(-1)
 
 
-def regressive(left: Tensor, right: Tensor, size: int, steps: tuple[int, int]) -> Tensor:
-    r"""The meet of two extensors, the regressive product: :math:`*(A \wedge B) = *A \vee *B`. left
-    ``(*batch, binomial(size, a))``, right ``(*batch, binomial(size, b))`` -> ``(*batch, binomial(size, a + b - size))``."""
-    for extensor, step in zip((left, right), steps, strict=True):
-        check_extensor(extensor, size, step)
-    c = sum(steps) - size
-    if c < 0:
-        raise ValueError(f"steps {steps} do not meet in general position among {size} coordinates: their sum must reach {size}")
-    first, second = (dual(x, size, step) for x, step in zip((left, right), steps, strict=True))
-    product = dual(wedge(first, second, size, (size - steps[0], size - steps[1])), size, size - c)
-    return -product if c * (size - c) % 2 else product
-
-
 def extensor_of(basis: Tensor) -> Tensor:
     r"""The extensor of a subspace: the join of its basis, all minors of order a. basis ``(*batch, a, n)`` ->
     ``(*batch, binomial(n, a))``."""

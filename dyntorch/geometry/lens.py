@@ -13,8 +13,7 @@ from torch import Tensor
 from dyntorch.geometry.epipolar import TINY, eight_point
 from dyntorch.geometry.epipolar_fit import Frames
 from dyntorch.geometry.homogeneous import homogeneous
-from dyntorch.geometry.options import LensOptions
-from dyntorch.numerics.arguments import check_options, check_together, check_weights, on_cpu
+from dyntorch.numerics.arguments import check_together, check_weights, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Minimum, Tensors, damped_step, minimize
 from dyntorch.numerics.messages import Message
@@ -228,6 +227,22 @@ RANGE = (-0.8, 0.4)
 DESCENT = LeastSquaresOptions(increase=10.0, least_damping=1e-10, stuck_damping=1e3, tolerance=1e-6)
 NEAR = 1e-5
 """Of a parameter: the step of a difference."""
+STARTS = ((0.0, 0.0), (-0.15, -0.15), (-0.4, -0.4), (-0.3, 0.0), (0.0, -0.3))
+"""Strengths of distortion (lambda) of both lenses that the descent starts from; the first is that of no lenses."""
+START_ITERATIONS = 4
+"""Reweighted fits of the fundamental matrix of each start."""
+MAX_MATCHES = 1500
+"""Matches that are used: lambda is known to 1e-3 long before."""
+NUM_START_MATCHES = 300
+"""Matches that choose among the starts."""
+MIN_MATCHES = 40
+"""Matches below which nothing is said of lenses."""
+MAX_SQUARED_DISTANCE = 9.0
+"""Squared distance, over the squared scale, up to which it counts."""
+NUM_FOLDS = 4
+"""Parts of the matches, each of which lenses fitted to the others must explain better than no lenses do."""
+MIN_F_RATIO = 12.0
+"""F ratio of 2 and n - 9 degrees of freedom from which on distortion is there: 1e-5 of ideal cameras exceed it."""
 
 
 @dataclass(frozen=True)
@@ -261,9 +276,7 @@ def _number(value: Any) -> Any:
     return value[..., 0, 0] if isinstance(value, Tensor) else value
 
 
-def _fit_batch(
-    a: Tensor, b: Tensor, weights: Tensor | None, sizes: Sequence[Sequence[float] | None] | None, options: LensOptions
-) -> LensFit:
+def _fit_batch(a: Tensor, b: Tensor, weights: Tensor | None, sizes: Sequence[Sequence[float] | None] | None) -> LensFit:
     """All pairs of cameras one after the other: their descents share nothing."""
     batch = check_together(a=(a, 2), b=(b, 2))
     if not prod(batch) or a.shape[-2:] != b.shape[-2:] or a.shape[-1] != 2:
@@ -278,10 +291,7 @@ def _fit_batch(
     # where a pair shows nothing its lenses change nothing
     none = Division(0.0, x.new_zeros(2, dtype=torch.float64), 1.0)
     bare = LensFit((none, none), (torch.inf, torch.inf), 0.0, False)
-    found = [
-        fit_distortion(p, q, v, sizes, options=options) if bool(some.any()) else bare
-        for p, q, v, some in zip(x, y, w, seen, strict=True)
-    ]
+    found = [fit_distortion(p, q, v, sizes) if bool(some.any()) else bare for p, q, v, some in zip(x, y, w, seen, strict=True)]
 
     def numbers(values: Sequence[Any]) -> Any:
         return torch.tensor(values, dtype=torch.bool if isinstance(values[0], bool) else torch.float64, device=a.device).reshape(
@@ -304,8 +314,6 @@ def fit_distortion(
     b: Tensor,
     weights: Tensor | None = None,
     sizes: Sequence[Sequence[float] | None] | None = None,
-    *,
-    options: LensOptions = LensOptions(),
 ) -> LensFit:
     r"""One parameter of radial distortion per camera, and whether it is there:
 
@@ -321,7 +329,6 @@ def fit_distortion(
         a, b: ``(*batch, N, 2)`` px, matches in the order of time; NaN = none.
         weights: ``(*batch, N)``, 0 = ignore.
         sizes: (width, height) of the pictures; without, the boxes of the points stand in for them.
-        options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
         Lenses that straighten the two cameras' points; lambda = 0 and not significant where there are too few matches.  Of a batch
@@ -344,9 +351,8 @@ def fit_distortion(
         >>> round(fit.lambda_a, 4), round(fit.lambda_b, 4), fit.significant
         (-0.2, -0.2, True)
     """
-    check_options(options, LensOptions)
     if a.ndim > 2 or b.ndim > 2:
-        return _fit_batch(a, b, weights, sizes, options)
+        return _fit_batch(a, b, weights, sizes)
     if a.ndim != 2 or a.shape[-1] != 2 or a.shape != b.shape:
         raise ValueError(f"matches must be (N, 2) in both cameras, got {tuple(a.shape)} and {tuple(b.shape)}")
     weights = torch.ones(len(a)) if weights is None else weights
@@ -356,9 +362,9 @@ def fit_distortion(
     sizes = (None, None) if sizes is None else sizes
     chosen = (a.isfinite().all(-1) & b.isfinite().all(-1) & (weights > 0)).nonzero().flatten()
     ideal = Division.of(a[chosen].double(), sizes[0]), Division.of(b[chosen].double(), sizes[1])
-    if len(chosen) < options.fewest:
+    if len(chosen) < MIN_MATCHES:
         return LensFit(ideal, (torch.inf, torch.inf), 0.0, False)
-    data = LensMatches.of(a[chosen].double(), b[chosen].double(), weights[chosen].double(), ideal, options).subset(options.matches)
+    data = LensMatches.of(a[chosen].double(), b[chosen].double(), weights[chosen].double(), ideal).subset(MAX_MATCHES)
     plain, full = _fitted(data)
     scale = _scale(data, full)
     plain, full = plain.descended(data, scale, lens=False), full.descended(data, scale, lens=True)
@@ -366,8 +372,8 @@ def fit_distortion(
     free = float((data.weights / data.weights.max()).sum()) - 9
     strength = full.lens[0]
     inside = bool(((strength > RANGE[0]) & (strength < RANGE[1])).all())
-    clear = inside and free > 0 and (before - after) / 2 > options.significant * max(after, TINY) / free
-    significant = clear and all(_holds(data, plain, full, scale, fold) for fold in range(options.folds))
+    clear = inside and free > 0 and (before - after) / 2 > MIN_F_RATIO * max(after, TINY) / free
+    significant = clear and all(_holds(data, plain, full, scale, fold) for fold in range(NUM_FOLDS))
     lenses = tuple(Division(float(value), one.centre, one.radius) for value, one in zip(strength, ideal, strict=True))
     sigma = full.sigmas(data, scale) * max(after / max(free, 1.0), 0.0) ** 0.5
     gain = 1 - float(_median(full.distances(data), data.weights) / _median(plain.distances(data), data.weights))
@@ -385,25 +391,22 @@ class LensMatches:
     """``(N,)``."""
     radii: tuple[float, float]
     """px."""
-    options: LensOptions
 
     @staticmethod
-    def of(
-        a: Tensor, b: Tensor, weights: Tensor, ideal: tuple[Division, Division], options: LensOptions = LensOptions()
-    ) -> LensMatches:
+    def of(a: Tensor, b: Tensor, weights: Tensor, ideal: tuple[Division, Division]) -> LensMatches:
         """Of pixels."""
         first, second = ((x - lens.centre) / lens.radius for x, lens in zip((a, b), ideal, strict=True))
-        return LensMatches(first, second, weights, (ideal[0].radius, ideal[1].radius), options)
+        return LensMatches(first, second, weights, (ideal[0].radius, ideal[1].radius))
 
     def subset(self, count: int) -> LensMatches:
         """As many of them, evenly spread."""
         n = len(self.a)
         chosen = torch.arange(min(count, n), device=self.a.device) * n // min(count, n)
-        return LensMatches(self.a[chosen], self.b[chosen], self.weights[chosen], self.radii, self.options)
+        return LensMatches(self.a[chosen], self.b[chosen], self.weights[chosen], self.radii)
 
     def weighing(self, weights: Tensor) -> LensMatches:
         """The same matches with other weights."""
-        return LensMatches(self.a, self.b, weights, self.radii, self.options)
+        return LensMatches(self.a, self.b, weights, self.radii)
 
     def distances(self, F: Tensor, lens: Tensor) -> Tensor:
         """Signed Sampson distances ``(B, N)`` in px, of F ``(B, 3, 3)`` and lambda ``(B, 2)``."""
@@ -439,7 +442,7 @@ class LensDescent:
 
     def cost(self, data: LensMatches, scale: Tensor) -> Tensor:
         """Truncated squared distances ``(B,)`` in units of ``scale``."""
-        return ((self.distances(data) / scale).square().clamp(max=data.options.cap) * data.weights).sum(-1)
+        return ((self.distances(data) / scale).square().clamp(max=MAX_SQUARED_DISTANCE) * data.weights).sum(-1)
 
     def best(self, data: LensMatches, scale: Tensor) -> LensDescent:
         """The one with the least cost."""
@@ -462,7 +465,7 @@ class LensDescent:
         moved = LensDescent(Frames(turns, core), lens).moved(torch.cat([near, -near]).repeat(len(away), 1))
         ahead, behind = moved.distances(data).unflatten(0, (-1, 2, 9)).unbind(1)
         jacobian = ((ahead - behind) / (2 * NEAR)).mT / scale[..., None]
-        weighted = (data.weights * (away.square() < data.options.cap))[..., None] * jacobian
+        weighted = (data.weights * (away.square() < MAX_SQUARED_DISTANCE))[..., None] * jacobian
         return (weighted * away[..., None]).sum(1), weighted.mT @ jacobian
 
     def sigmas(self, data: LensMatches, scale: Tensor) -> Tensor:
@@ -509,8 +512,8 @@ class LensProblem(LeastSquares):
 
 def _fitted(data: LensMatches) -> tuple[LensDescent, LensDescent]:
     """The best fits without and with lenses."""
-    few = data.subset(data.options.start_matches)
-    lens = torch.tensor(data.options.starts, dtype=data.a.dtype, device=data.a.device)
+    few = data.subset(NUM_START_MATCHES)
+    lens = torch.tensor(STARTS, dtype=data.a.dtype, device=data.a.device)
     F = torch.cat([_start(few, one) for one in lens])
     every = LensDescent(Frames.of(F), lens)
     scale = _scale(few, every).min()
@@ -524,7 +527,7 @@ def _start(data: LensMatches, lens: Tensor) -> Tensor:
     """F ``(1, 3, 3)`` of straightened points, weighed again by the distances a few times."""
     p, q = _rays(data.a, lens[:1]), _rays(data.b, lens[1:])
     weights = data.weights[None]
-    for _ in range(data.options.start_rounds):
+    for _ in range(START_ITERATIONS):
         F = eight_point(p[:, :2] / p[:, 2:], q[:, :2] / q[:, 2:], weights, rounds=1)
         away = data.distances(F, lens[None])
         weights = data.weights / (1 + (away / _median(away, data.weights)[:, None]).square())
@@ -542,7 +545,7 @@ def _scale(data: LensMatches, fit: LensDescent) -> Tensor:
 
 def _holds(data: LensMatches, plain: LensDescent, full: LensDescent, scale: Tensor, fold: int) -> bool:
     """Whether lenses fitted without one part of the matches explain that part better than no lenses do."""
-    place = torch.arange(len(data.weights), device=data.weights.device) * data.options.folds // len(data.weights)
+    place = torch.arange(len(data.weights), device=data.weights.device) * NUM_FOLDS // len(data.weights)
     rest, part = (data.weighing(data.weights * own) for own in (place != fold, place == fold))
     costs = [fit.descended(rest, scale, lens=lens).cost(part, scale) for fit, lens in ((plain, False), (full, True))]
     return bool(costs[1] < costs[0])

@@ -186,26 +186,3 @@ def _unit(tensor: Tensor) -> Tensor:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The thesis's way from the constant velocity tensor to the maps of the sensors, over a projective reconstruction in P^6.
-
-
-def constant_velocity_maps_p6(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""The same maps by way of a projective reconstruction in :math:`P^6`, the route of the thesis. tensor
-    ``(*batch, 4, 4, 4)``."""
-    alpha, beta = infinity_planes(tensor)
-    turn = complement_frame(beta) @ complement_frame(alpha).mT
-    plane = complement_frame(beta)[..., :3]
-    # the least squares solution w2: the columns of its system are orthonormal
-    right = torch.einsum("...i,...ijk->...kj", alpha, tensor) @ plane
-    left = torch.einsum("...ijk,...j->...ki", tensor, beta) + right @ plane.mT @ turn
-    eye = torch.eye(4, dtype=tensor.dtype, device=tensor.device).expand_as(turn)
-    cameras = (
-        torch.cat([eye, torch.zeros_like(plane)], dim=-1),
-        torch.cat([turn, plane], dim=-1),
-        torch.cat([left, right], dim=-1),
-    )
-    equations = torch.cat([torch.cat([-t * w, w], dim=-1) for t, w in enumerate(cameras)], dim=-2)
-    pairs = null_space(equations, 3).unflatten(-1, (2, 7))
-    rest = null_space(pairs.flatten(-3, -2))
-    basis = torch.cat([pairs[..., 0, :], rest], dim=-2).mT
-    first, second, third = (unit(w @ basis) for w in cameras)
-    return first, second, third

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -18,7 +17,6 @@ from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.invariants.constant_velocity_algebra import (
     balanced,
     constant_velocity_maps,
-    constant_velocity_maps_p6,
     constant_velocity_tensor,
     structure,
     third_infinity,
@@ -161,12 +159,7 @@ class ConstantVelocityTensor(Invariant):
             >>> bool((y[:, 0] - 2 * y[:, 1] + y[:, 2]).abs().max() < 1e-9)
             True
         """
-        return _solve(tensor, constant_velocity_maps)
-
-    @staticmethod
-    def decompose_p6(tensor: Tensor) -> Motion:
-        r"""The same by way of a projective reconstruction in :math:`P^6`, as in the thesis, in another gauge: a cross-check."""
-        return _solve(tensor, constant_velocity_maps_p6)
+        return _solve(tensor)
 
     @staticmethod
     def diagnose(tensor: Tensor) -> VelocityDegeneracy:
@@ -359,10 +352,10 @@ def _drift(matrix: Tensor, shift: Tensor) -> Tensor:
     return torch.cat([matrix[..., :3], matrix[..., 3:] + matrix[..., :3] @ shift[..., None]], dim=-1)
 
 
-def _solve(tensor: Tensor, solver: Callable[[Tensor], Motion]) -> Motion:
-    """Run a decomposition in float64 and in coordinates of order 1."""
+def _solve(tensor: Tensor) -> Motion:
+    """The maps, decomposed in float64 and in coordinates of order 1."""
     even, (first, second, third) = balanced(unit_tensor(tensor))
-    maps = solver(even)
+    maps = constant_velocity_maps(even)
     scaled = (maps[0] / first[..., None], maps[1] / second[..., None], maps[2] * third[..., None])
     first, second, third = (unit(m).to(tensor.dtype) for m in scaled)
     return first, second, third

@@ -19,6 +19,7 @@ from dyntorch.numerics.blocks import constant, select
 from dyntorch.numerics.nullspace import null_space
 from dyntorch.shapes.basis import Polynomial, Trajectory, extremes, times_of_views
 from dyntorch.shapes.moving import (
+    MAX_UNCERTAINTY,
     ProjectedShapes,
     centred_views,
     fit_shapes,
@@ -29,7 +30,6 @@ from dyntorch.shapes.moving import (
     shapes_through,
     slopes,
 )
-from dyntorch.shapes.options import PerspectiveOptions, ShapesOptions
 from dyntorch.shapes.projective import recover_perspective_times
 from dyntorch.shapes.static import centred
 from dyntorch.shapes.times import Recovery, recover_times
@@ -352,13 +352,12 @@ class DynamicShapeTensor(Invariant):
         if self.form != "joint":
             return None
         if self.projective:
-            return perspective_shapes.estimate(views[0], weights, self.trajectory, PerspectiveOptions())
-        options = ShapesOptions()
+            return perspective_shapes.estimate(views[0], weights, self.trajectory)
         measured = views[0]
         rows = self.trajectory.rows(measured[..., 0, 3])
         with torch.no_grad():
-            found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights, options=options)
-        ambiguous = found.uncertainty > options.ambiguous
+            found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights)
+        ambiguous = found.uncertainty > MAX_UNCERTAINTY
         shapes = found.shapes
         if torch.is_grad_enabled() and (measured.requires_grad or weights.requires_grad):
             shapes = select(found.status == Status.OK, followed_shapes(shapes, measured, rows, weights), shapes)

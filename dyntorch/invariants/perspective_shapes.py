@@ -11,8 +11,7 @@ from dyntorch.core.invariant import Estimate
 from dyntorch.core.primitives import Equations
 from dyntorch.invariants.reprojected_shapes import CameraKind, reprojection_derivative, reprojection_residual
 from dyntorch.shapes.basis import Trajectory
-from dyntorch.shapes.moving import shapes_at
-from dyntorch.shapes.options import PerspectiveOptions
+from dyntorch.shapes.moving import MAX_UNCERTAINTY, shapes_at
 from dyntorch.shapes.projective import fit_perspective_shapes, gauge
 from dyntorch.shapes.static import general_rows
 
@@ -40,12 +39,12 @@ def freedom(n: int, trajectory: Trajectory) -> int:
     return 3 * trajectory.size * (n - 1) - gauge(trajectory.size)
 
 
-def estimate(measured: Tensor, weights: Tensor, trajectory: Trajectory, options: PerspectiveOptions) -> Estimate:
+def estimate(measured: Tensor, weights: Tensor, trajectory: Trajectory) -> Estimate:
     """The shapes of least squares over all points, side by side."""
     with torch.no_grad():
         rows = trajectory.rows(measured[..., 0, 3])
-        found = fit_perspective_shapes(measured[..., :2], rows, measured[..., 2], share=weights, options=options)
-    ambiguous = found.uncertainty > options.affine.ambiguous
+        found = fit_perspective_shapes(measured[..., :2], rows, measured[..., 2], share=weights)
+    ambiguous = found.uncertainty > MAX_UNCERTAINTY
     shapes = found.shapes.movedim(-3, -2).flatten(-2)
     return Estimate(shapes, found.few, found.degenerate, ambiguous, found.uncertainty)
 

@@ -14,14 +14,10 @@ from dyntorch import _lazily
 _HOME = {
     "deformable_shapes": "dyntorch.shapes.deformable",
     "DeformableShapes": "dyntorch.shapes.deformable",
-    "DeformableOptions": "dyntorch.shapes.options",
     "fit_shapes": "dyntorch.shapes.moving",
     "MovingShapes": "dyntorch.shapes.moving",
-    "ShapesOptions": "dyntorch.shapes.options",
-    "RecoveryOptions": "dyntorch.shapes.options",
     "fit_perspective_shapes": "dyntorch.shapes.projective",
     "recover_perspective_times": "dyntorch.shapes.projective",
-    "PerspectiveOptions": "dyntorch.shapes.options",
     "recover_times": "dyntorch.shapes.times",
     "Recovery": "dyntorch.shapes.times",
 }

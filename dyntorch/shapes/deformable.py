@@ -2,21 +2,50 @@ r"""Shapes that deform in ways nobody knows, before two cameras: basis shapes, t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from dyntorch.core.limits import MAX_SQUARED_DISTANCE, Stop
 from dyntorch.core.outcome import Outcome, Status, failed
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.numerics.arguments import check_options, check_tensor, check_together
+from dyntorch.numerics.arguments import check_tensor, check_together
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.nullspace import eigh, spectrum
-from dyntorch.shapes.options import DeformableOptions
 
 TINY = 1e-300
+MAX_ITERATIONS = 150
+"""Of alternating least squares; exact data with 20 % of the images missing need 20 to 100."""
+STOP = Stop(MAX_ITERATIONS, tolerance=1e-7)
+EXACT = 1e-26
+"""Mean squared error, of images of rms 1, that is rounding."""
+FILL_ITERATIONS = 30
+"""Iterations in which coordinates that only one camera saw, or none, are filled in from the shapes, before the first descent."""
+RIDGE = 1e-13
+"""Ridge of the normal equations, of their mean diagonal entry: what no image shows stays finite."""
+MIN_THIRD_VALUE = 1e-4
+"""Third singular value of the joint images of both cameras, over the first, below which both see one projection only: cameras that
+look the same way, or a flat scene."""
+MIN_OVER_NOISE = 3.0
+"""The same over the fourth, which is noise, below which the third may be noise as well."""
+MIN_METRIC = 1e-3
+"""Least eigenvalue of the metric that constant lengths give, over the largest, below which they decide none."""
+METRIC_ITERATIONS = 8
+"""Reweightings of the metric that constant lengths give; 4 leave up to 1 % of its entries."""
+MAX_METRIC_ERROR = 0.3
+"""Relative error of the metric within three standard deviations above which lengths decide none."""
+MIN_COST_RISE = 0.2
+"""Share of the cost by which a metric that is so far off has to cost more, too: the noise in the weights themselves makes some
+per cent where bones are a few times as long as the noise and nothing moves."""
+GRID = 120
+"""Members of the family of metrics of two scaled orthographic cameras that are tried at once."""
+NUM_ZOOMS = 5
+"""Times that the grid is laid closer about the best one: the last one is 1e-7 wide."""
+ROTATION_ITERATIONS = 5
+"""Rotations of all frames to the mean shape before the shapes are estimated."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -98,7 +127,7 @@ def deformable_shapes(
     lengths: Tensor | None = None,
     orthographic: bool = False,
     weights: Tensor | None = None,
-    options: DeformableOptions = DeformableOptions(),
+    iterations: int = MAX_ITERATIONS,
 ) -> DeformableShapes:
     r"""Basis shapes of a deforming thing, their share in every frame, and both cameras, from the images of its points in two
     synchronized affine cameras that are fixed to each other.
@@ -128,7 +157,7 @@ def deformable_shapes(
             are orthogonal and of one length, which leaves the metric one parameter for the lengths to decide.  Of walking people
             before noise of 2 px lengths alone leave errors of 2 to 30 %.
         weights: ``(*batch, 2, frames, n)`` not negative; 0 leaves an image out.
-        options: every number that decides.
+        iterations: of alternating least squares at most; 0 leaves the factorization as it is.
 
     Returns:
         A :class:`DeformableShapes`.
@@ -150,7 +179,6 @@ def deformable_shapes(
         >>> print(found.head(frames=15))
         DeformableShapes(frames=15, batch=(): 1 OK)
     """
-    check_options(options, DeformableOptions)
     batch, pairs = _checked(x1, x2, basis, lengths, weights)
     T, n = x1.shape[-3:-1]
     x = torch.stack([x1.detach().expand(*batch, T, n, 2), x2.detach().expand(*batch, T, n, 2)], dim=-4).double()
@@ -159,7 +187,7 @@ def deformable_shapes(
     count = prod(batch)
     x, w = torch.where(w[..., None] > 0, x, 0.0).reshape(count, 2, T, n, 2), w.reshape(count, 2, T, n)
     with torch.no_grad():
-        found = _solved(x, w, basis, pairs, orthographic, options)
+        found = _solved(x, w, basis, pairs, orthographic, replace(STOP, max_iterations=iterations))
     return _shaped(found, batch, x1)
 
 
@@ -197,7 +225,7 @@ class _Found(NamedTuple):
     scale: Tensor
 
 
-def _solved(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic: bool, options: DeformableOptions) -> _Found:
+def _solved(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic: bool, stop: Stop) -> _Found:
     """The stages in their order: size, cameras and points, metric, shapes, least squares, frame."""
     scale = _size(x, w)
     x = x / scale[:, None, None, None, None]
@@ -207,13 +235,13 @@ def _solved(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic
     turns = torch.eye(3, dtype=x.dtype, device=x.device).expand(b, T, 3, 3).clone()
     if pairs is not None:
         noise = values[:, 0].clamp(min=0) / (both.sum((1, 2)) - both.any(-1).sum(-1)).clamp(min=1)
-        change, metric = _by_lengths(points, both, cameras, noise, pairs.to(x.device), orthographic, options)
+        change, metric = _by_lengths(points, both, cameras, noise, pairs.to(x.device), orthographic)
         cameras, points = cameras @ torch.linalg.inv(change)[:, None], points @ change.mT
-        turned = _turned(points, both, options)
+        turned = _turned(points, both)
         turns = torch.where(metric[:, None, None, None], turned, turns)
-    coefficients, shapes = _low_rank(points @ turns, both, basis, options)
+    coefficients, shapes = _low_rank(points @ turns, both, basis)
     model = _Model(cameras, turns, coefficients, shapes, torch.zeros_like(x[:, :, :, 0]))
-    model, cost = _in_turn(x, w, model, metric, options)
+    model, cost = _in_turn(x, w, model, metric, stop)
     images = (w > 0).sum((1, 2, 3))
     turning = 3 * T * metric
     free = 12 + basis * (T + 3 * n) + 4 * T + turning - basis * (basis + 3) - torch.where(metric, 7, 9)
@@ -223,8 +251,8 @@ def _solved(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic
     third = (values[:, 1].clamp(min=0) / values[:, 3].clamp(min=TINY)).sqrt()
     fourth = (values[:, 1] / values[:, 0].clamp(min=TINY)).sqrt()
     status = torch.full_like(images, int(Status.OK))
-    status = torch.where(fourth < options.alike, int(Status.AMBIGUOUS), status)
-    status = torch.where(third < options.flat, int(Status.DEGENERATE), status)
+    status = torch.where(fourth < MIN_OVER_NOISE, int(Status.AMBIGUOUS), status)
+    status = torch.where(third < MIN_THIRD_VALUE, int(Status.DEGENERATE), status)
     status = torch.where((spare < 0) | ((both.sum(-1) > 3).sum(-1) < 1) | (both.sum((1, 2)) < 4), int(Status.TOO_FEW), status)
     finite = torch.stack([part.isfinite().flatten(1).all(-1) for part in model]).all(0)
     status = torch.where(~finite & ~failed(status), int(Status.DEGENERATE), status)
@@ -275,23 +303,23 @@ class _Ways(NamedTuple):
 
 
 def _by_lengths(
-    points: Tensor, both: Tensor, cameras: Tensor, noise: Tensor, pairs: Tensor, orthographic: bool, options: DeformableOptions
+    points: Tensor, both: Tensor, cameras: Tensor, noise: Tensor, pairs: Tensor, orthographic: bool
 ) -> tuple[Tensor, Tensor]:
     """The change of the world ``(b, 3, 3)`` that makes lengths constant, and whether they decide one ``(b,)``."""
     way = points[:, :, pairs[:, 0]] - points[:, :, pairs[:, 1]]
     seen = (both[:, :, pairs[:, 0]] & both[:, :, pairs[:, 1]]).to(points.dtype)
     size = way.square().sum(-1, keepdim=True).mean((1, 2))
-    ways = _Ways(way, seen, 2 * noise + options.exact * size[:, 0])
-    matrix, decided = _along_family(ways, cameras, options) if orthographic else _of_any_cameras(ways, options)
+    ways = _Ways(way, seen, 2 * noise + EXACT * size[:, 0])
+    matrix, decided = _along_family(ways, cameras) if orthographic else _of_any_cameras(ways)
     inner, axes = eigh(matrix)
-    sound = decided & (inner[:, 0] > options.metric * inner[:, 2])
+    sound = decided & (inner[:, 0] > MIN_METRIC * inner[:, 2])
     root = (inner.clamp(min=0).sqrt()[:, None] * axes) @ axes.mT
     root = root / torch.linalg.det(root).abs().clamp(min=TINY).pow(1 / 3)[:, None, None]
     eye = torch.eye(3, dtype=points.dtype, device=points.device)
     return torch.where(sound[:, None, None], root, eye.expand_as(root)), sound
 
 
-def _of_any_cameras(ways: _Ways, options: DeformableOptions) -> tuple[Tensor, Tensor]:
+def _of_any_cameras(ways: _Ways) -> tuple[Tensor, Tensor]:
     r"""The metric Q ``(b, 3, 3)`` by lengths alone: with the monomials :math:`m(d)`, :math:`d^T Q\, d = q \cdot m(d)`,"""
     way, seen = ways.way, ways.seen
     i, j = torch.triu_indices(3, 3, device=way.device)
@@ -302,13 +330,13 @@ def _of_any_cameras(ways: _Ways, options: DeformableOptions) -> tuple[Tensor, Te
     weight = seen / way.square().sum(-1).clamp(min=TINY) * (way.square().sum(-1) > TINY)
     best, least = eye.expand(len(way), 3, 3), torch.full_like(ways.noise, torch.inf)
     decided = torch.zeros_like(least, dtype=torch.bool)
-    for _ in range(options.lengths):
+    for _ in range(METRIC_ITERATIONS):
         share = weight / weight.sum(1, keepdim=True).clamp(min=TINY)
         off = (monomials - (monomials * share[..., None]).sum(1, keepdim=True)) * weight.sqrt()[..., None]
         flat, noise = off.flatten(1, 2), (slope * weight.sqrt()[..., None, None]).transpose(-2, -1).flatten(1, 3)
         spread = noise.mT @ noise
         size = spread.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=TINY)[:, None, None]
-        factor = torch.linalg.cholesky_ex(spread / size + options.ridge * torch.eye(6, dtype=flat.dtype, device=flat.device))[0]
+        factor = torch.linalg.cholesky_ex(spread / size + RIDGE * torch.eye(6, dtype=flat.dtype, device=flat.device))[0]
         white = torch.linalg.solve_triangular(factor, flat.mT, upper=False)
         values, vectors = spectrum(white @ white.mT / size)
         q = torch.linalg.solve_triangular(factor.mT, vectors[..., :1], upper=True)[..., 0]
@@ -320,14 +348,14 @@ def _of_any_cameras(ways: _Ways, options: DeformableOptions) -> tuple[Tensor, Te
         better = (cost < least) & (eigh(matrix)[0][:, 0] > 0)
         best, least = torch.where(better[:, None, None], matrix, best), torch.where(better, cost, least)
         # another metric that far off has to cost more than the noise does
-        clear = (values[:, 1] - values[:, 0]) * seen.sum((1, 2)) > options.chance / options.uncertain**2 * values[:, 0]
-        clear = clear & (values[:, 1] > (1 + options.hardly) * values[:, 0])
-        decided = torch.where(better, clear & (values[:, 1] > options.metric**2 * values[:, 5]), decided)
+        clear = (values[:, 1] - values[:, 0]) * seen.sum((1, 2)) > MAX_SQUARED_DISTANCE / MAX_METRIC_ERROR**2 * values[:, 0]
+        clear = clear & (values[:, 1] > (1 + MIN_COST_RISE) * values[:, 0])
+        decided = torch.where(better, clear & (values[:, 1] > MIN_METRIC**2 * values[:, 5]), decided)
         weight = ways.lengths(matrix[:, None])[1][:, 0] * (weight > 0)
     return best, decided
 
 
-def _along_family(ways: _Ways, cameras: Tensor, options: DeformableOptions) -> tuple[Tensor, Tensor]:
+def _along_family(ways: _Ways, cameras: Tensor) -> tuple[Tensor, Tensor]:
     r"""The metric Q ``(b, 3, 3)`` of scaled orthographic cameras: :math:`M_v Q^{-1} M_v^T \sim I` leaves a family of one parameter
     (Koenderink and van Doorn), of which the lengths choose one; and whether there is any, ``(b,)``."""
     i, j = torch.triu_indices(3, 3, device=cameras.device)
@@ -344,47 +372,47 @@ def _along_family(ways: _Ways, cameras: Tensor, options: DeformableOptions) -> t
     pair[:, :, j, i] = vh[:, 4:]
     middle = torch.zeros_like(ways.noise)
     width = torch.pi
-    steps = torch.linspace(-1, 1, options.grid, dtype=cameras.dtype, device=cameras.device)
+    steps = torch.linspace(-1, 1, GRID, dtype=cameras.dtype, device=cameras.device)
     decided = torch.zeros_like(ways.noise, dtype=torch.bool)
-    for zoom in range(options.zooms):
+    for zoom in range(NUM_ZOOMS):
         angle = middle[:, None] + width * steps
         trial = angle.cos()[..., None, None] * pair[:, None, 0] + angle.sin()[..., None, None] * pair[:, None, 1]
         values, axes = eigh(trial)
-        fine = values[..., 0] > options.metric * values[..., 2]
+        fine = values[..., 0] > MIN_METRIC * values[..., 2]
         inverse = (axes / values.clamp(min=TINY)[..., None, :]) @ axes.mT
         inverse = inverse / torch.linalg.matrix_norm(inverse, keepdim=True).clamp(min=TINY)
         cost = torch.where(fine, ways.spread(inverse), torch.inf)
         at = cost.argmin(-1, keepdim=True)
-        middle, width = angle.gather(1, at)[:, 0], 2 * width / options.grid
+        middle, width = angle.gather(1, at)[:, 0], 2 * width / GRID
         best = inverse.gather(1, at[..., None, None].expand(-1, 1, 3, 3))[:, 0]
         if not zoom:  # how far off the metrics are that cost hardly more
             far = torch.linalg.matrix_norm(inverse - best[:, None])
             decided = fine.any(-1) & (
-                torch.where(cost <= cost.amin(-1, keepdim=True) * (1 + options.hardly) + options.chance, far, 0.0).amax(-1)
-                <= options.uncertain
+                torch.where(cost <= cost.amin(-1, keepdim=True) * (1 + MIN_COST_RISE) + MAX_SQUARED_DISTANCE, far, 0.0).amax(-1)
+                <= MAX_METRIC_ERROR
             )
     return best, decided
 
 
-def _turned(points: Tensor, both: Tensor, options: DeformableOptions) -> Tensor:
+def _turned(points: Tensor, both: Tensor) -> Tensor:
     """Rotations ``(b, T, 3, 3)`` from a common frame to the frames, by turns with the mean shape."""
     weight = both.to(points.dtype)[..., None]
     shape = points.gather(1, both.sum(-1).argmax(-1)[:, None, None, None].expand(-1, 1, *points.shape[2:]))
     turn = nearest_rotation((points * weight).mT @ shape)
-    for _ in range(options.turns):
+    for _ in range(ROTATION_ITERATIONS):
         shape = (points @ turn * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp(min=1)
         turn = nearest_rotation((points * weight).mT @ shape)
     return turn
 
 
-def _low_rank(points: Tensor, both: Tensor, basis: int, options: DeformableOptions) -> tuple[Tensor, Tensor]:
+def _low_rank(points: Tensor, both: Tensor, basis: int) -> tuple[Tensor, Tensor]:
     """Coefficients ``(b, T, B)`` and shapes ``(b, B, n, 3)`` nearest to points ``(b, T, n, 3)``, gaps filled from them in turns."""
     known = both[..., None].expand_as(points).flatten(2)
     rows = points.flatten(2)
     mean = (rows * known).sum(1, keepdim=True) / known.sum(1, keepdim=True).clamp(min=1)
     filled = torch.where(known, rows, mean)
     rank = min(basis, *filled.shape[1:])
-    for _ in range(1 if bool(known.all()) else options.fills):
+    for _ in range(1 if bool(known.all()) else FILL_ITERATIONS):
         u, s, vh = torch.linalg.svd(filled, full_matrices=False)
         left, right = u[..., :rank] * s[:, None, :rank], vh[:, :rank]
         filled = torch.where(known, rows, left @ right)
@@ -398,24 +426,24 @@ def _low_rank(points: Tensor, both: Tensor, basis: int, options: DeformableOptio
 # Least squares in turn: every one of coefficients with offsets, rotations, shapes and cameras is linear given the others.
 
 
-def _in_turn(x: Tensor, w: Tensor, model: _Model, metric: Tensor, options: DeformableOptions) -> tuple[_Model, Tensor]:
+def _in_turn(x: Tensor, w: Tensor, model: _Model, metric: Tensor, stop: Stop) -> tuple[_Model, Tensor]:
     """The model after least squares in turn, and its cost ``(b,)``, which never rises."""
-    model = _deformed(x, w, model, options)
+    model = _deformed(x, w, model)
     cost = _cost(x, w, model)
     left = torch.arange(len(x), device=x.device)
-    floor = options.exact * w.sum((1, 2, 3))
-    for _ in range(options.rounds):
+    floor = EXACT * w.sum((1, 2, 3))
+    for _ in range(stop.max_iterations):
         some, images, weight, turning = _Model(*(part[left] for part in model)), x[left], w[left], metric[left]
-        fresh = _shaped_anew(images, weight, some, options)
-        fresh = _seen_anew(images, weight, fresh, turning, options)
-        fresh = _deformed(images, weight, fresh, options)
+        fresh = _shaped_anew(images, weight, some)
+        fresh = _seen_anew(images, weight, fresh, turning)
+        fresh = _deformed(images, weight, fresh)
         now = _cost(images, weight, fresh)
         better = now < cost[left]
         at = left[better]
         model = _Model(*(old.index_copy(0, at, new[better]) for old, new in zip(model, fresh, strict=True)))
-        gain = cost[left] - now
+        done = stop.reached(cost[left], now)
         cost = cost.index_copy(0, at, now[better])
-        left = left[better & (gain > options.tolerance * now) & (now > floor[left])]
+        left = left[better & ~done & (now > floor[left])]
         if not len(left):
             break
     return model, cost
@@ -425,13 +453,13 @@ def _cost(x: Tensor, w: Tensor, model: _Model) -> Tensor:
     return ((x - model.images()).square().sum(-1) * w).sum((1, 2, 3))
 
 
-def _solve(matrix: Tensor, right: Tensor, options: DeformableOptions) -> Tensor:
+def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     size = matrix.diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=TINY)[..., None, None]
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    return torch.linalg.solve_ex(matrix + options.ridge * size * eye, right[..., None])[0][..., 0]
+    return torch.linalg.solve_ex(matrix + RIDGE * size * eye, right[..., None])[0][..., 0]
 
 
-def _deformed(x: Tensor, w: Tensor, model: _Model, options: DeformableOptions) -> _Model:
+def _deformed(x: Tensor, w: Tensor, model: _Model) -> _Model:
     """The best coefficients and offsets of every frame."""
     b, _, T, n, _ = x.shape
     basis = model.coefficients.shape[-1]
@@ -442,12 +470,12 @@ def _deformed(x: Tensor, w: Tensor, model: _Model, options: DeformableOptions) -
     rows = torch.cat([design, place], dim=-1)
     flat, scaled = rows.flatten(2, 4), (rows * weight).flatten(2, 4)
     target = x.permute(0, 2, 1, 3, 4).flatten(2)
-    found = _solve(scaled.mT @ flat, (scaled.mT @ target[..., None])[..., 0], options)
+    found = _solve(scaled.mT @ flat, (scaled.mT @ target[..., None])[..., 0])
     offsets = found[..., basis:].unflatten(-1, (2, 2)).transpose(1, 2)
     return model._replace(coefficients=found[..., :basis], offsets=offsets)
 
 
-def _shaped_anew(x: Tensor, w: Tensor, model: _Model, options: DeformableOptions) -> _Model:
+def _shaped_anew(x: Tensor, w: Tensor, model: _Model) -> _Model:
     """The best place of every point in every basis shape."""
     basis = model.shapes.shape[1]
     views = model.cameras[:, :, None] @ model.turns[:, None]
@@ -458,17 +486,17 @@ def _shaped_anew(x: Tensor, w: Tensor, model: _Model, options: DeformableOptions
     matrix = (weight.mT @ outer).unflatten(-1, (size, size))
     away = ((x - model.offsets[..., None, :]) * w[..., None]).permute(0, 3, 1, 2, 4).flatten(2)  # (b, n, 2 T 2)
     right = away @ rows.flatten(1, 3)
-    found = _solve(matrix, right, options)
+    found = _solve(matrix, right)
     return model._replace(shapes=found.unflatten(-1, (basis, 3)).transpose(1, 2))
 
 
-def _seen_anew(x: Tensor, w: Tensor, model: _Model, turning: Tensor, options: DeformableOptions) -> _Model:
+def _seen_anew(x: Tensor, w: Tensor, model: _Model, turning: Tensor) -> _Model:
     """The best cameras; before a metric thing the best small turns of every frame, within cameras as they are."""
     points = model.points
     away = x - model.offsets[..., None, :]
     matrix = torch.einsum("bvtn,btni,btnj->bvij", w, points, points)
     right = torch.einsum("bvtn,btni,bvtnk->bvki", w, points, away)
-    cameras = _solve(matrix[:, :, None], right, options)
+    cameras = _solve(matrix[:, :, None], right)
     model = model._replace(cameras=torch.where(turning[:, None, None, None], model.cameras, cameras))
     if not bool(turning.any()):
         return model
@@ -477,7 +505,7 @@ def _seen_anew(x: Tensor, w: Tensor, model: _Model, turning: Tensor, options: De
     turned = torch.linalg.cross(eye[:, None, None, None], points[None], dim=-1)  # (3, b, T, n, 3)
     slope = torch.einsum("rbtnj,bvij->btvnir", turned, model.cameras)
     scaled = (slope * w.permute(0, 2, 1, 3)[..., None, None]).flatten(2, 4)
-    step = _solve(scaled.mT @ slope.flatten(2, 4), (scaled.mT @ rest.permute(0, 2, 1, 3, 4).flatten(2)[..., None])[..., 0], options)
+    step = _solve(scaled.mT @ slope.flatten(2, 4), (scaled.mT @ rest.permute(0, 2, 1, 3, 4).flatten(2)[..., None])[..., 0])
     skewed = torch.linalg.cross(step[..., None, :].expand(*step.shape[:-1], 3, 3), eye.expand(*step.shape[:-1], 3, 3), dim=-1).mT
     turns = nearest_rotation((eye + skewed) @ model.turns)
     return model._replace(turns=torch.where(turning[:, None, None, None], turns, model.turns))

@@ -10,12 +10,11 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import nonzero_sign
-from dyntorch.numerics.arguments import check_options, check_weights
+from dyntorch.numerics.arguments import check_weights
 from dyntorch.numerics.blocks import one_thread, select
 from dyntorch.numerics.implicit import flat_directions, follow_minimum
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
-from dyntorch.shapes.options import ShapesOptions
 from dyntorch.shapes.static import centred
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -24,6 +23,27 @@ from dyntorch.shapes.static import centred
 
 RIDGE_EPSILON = 1e-12
 """Ridge of the Gram of three coordinates, of its trace: a planar shape keeps the residual finite and exact to 1e-12."""
+SAME_FUNCTION = 1e-9
+"""Singular value, over the largest, below which products of basis functions are the same function at the times of the views."""
+MIN_WINDOW_VIEWS = 6
+"""Least number of views in a window in which the shape is taken to stand still."""
+MAX_WINDOWS = 200
+FILL_ITERATIONS = 3
+"""Iterations in which missing points are filled in from the mean shape."""
+FILL_RIDGE = 1e-3
+"""Ridge of the regression of a view's points on the mean shape, whose columns are of norm 1."""
+START_STEPS = 20
+"""Steps from every start before the best one goes on: of 240 scenes (degree 1 and 2, 1 and 2 harmonics, 8 and 14 points, noise 1
+and 3 %, 40 views) 3 go on from a start that does not lead to the least cost of all."""
+STEPS_PER_FUNCTION = 5
+"""Steps for each function that is added to the last start."""
+FREE_EIGENVALUE = 4e-12
+"""Eigenvalue of the normal matrix with all cameras at norm 1, over the largest, below which its direction is free: the affine frame
+1e-12 (the ridge of the Grams), points in a plane or at rest 1e-16 to 2e-12, five points of degree 2 from 7e-11."""
+MAX_UNCERTAINTY = 0.5
+"""Expected relative error of the shapes above which other shapes explain the views as well."""
+EXACT_NOISE = 1e-6
+"""Noise of views of norm 1 below which they are called exact; float32 leaves 1e-8 to 1e-7."""
 
 
 @dataclass(frozen=True)
@@ -221,24 +241,24 @@ def graph(y: Tensor, z: Tensor, powers: Tensor, share: Tensor) -> Graph:
     return Graph(scale, slopes, flat | found.degenerate)
 
 
-def complete(views: AffineViews, options: ShapesOptions = ShapesOptions()) -> Tensor:
+def complete(views: AffineViews) -> Tensor:
     """The centred views ``(b, views, n, 2)`` with missing points filled in from the mean shape of all views."""
     x, seen = views.x, (views.weights > 0)[..., None]
     if bool(seen.all()):
         return x
-    for _ in range(options.starts.fill_rounds):
+    for _ in range(FILL_ITERATIONS):
         mean = leading(x, views.share)[:, None]
         part = torch.where(seen, mean, 0.0)
-        filled = mean @ _regressed(part, torch.where(seen, x, 0.0), options.starts.fill_ridge)
+        filled = mean @ _regressed(part, torch.where(seen, x, 0.0))
         x = torch.where(seen, x, filled)
         x = x - x.mean(-2, keepdim=True)
     return x
 
 
-def _regressed(basis: Tensor, x: Tensor, ridge: float) -> Tensor:
+def _regressed(basis: Tensor, x: Tensor) -> Tensor:
     gram = basis.mT @ basis
     eye = torch.eye(basis.shape[-1], dtype=x.dtype, device=x.device)
-    return torch.linalg.solve_ex(gram + ridge * eye, basis.mT @ x)[0]
+    return torch.linalg.solve_ex(gram + FILL_RIDGE * eye, basis.mT @ x)[0]
 
 
 def leading(x: Tensor, share: Tensor, count: int = 3) -> Tensor:
@@ -247,14 +267,14 @@ def leading(x: Tensor, share: Tensor, count: int = 3) -> Tensor:
     return spectrum(scatter)[1][..., -count:].flip(-1)
 
 
-def products(rows: Tensor, options: ShapesOptions) -> Tensor:
+def products(rows: Tensor) -> Tensor:
     """Orthonormal basis ``(b, views, K)`` of all products of three of the functions ``(b, views, B)``, as seen at the views."""
     size = rows.shape[-1]
     places = torch.combinations(torch.arange(size), 3, with_replacement=True).to(rows.device)
     cubes = rows[..., places].prod(-1)
     u, s, _ = torch.linalg.svd(cubes, full_matrices=False)
     # one width for the whole batch: a function more than a problem can tell is one it cannot tell either
-    return u[..., : max((s > options.starts.same_function * s[..., :1]).sum(-1).clamp(min=1).tolist(), default=size)]
+    return u[..., : max((s > SAME_FUNCTION * s[..., :1]).sum(-1).clamp(min=1).tolist(), default=size)]
 
 
 def shapes_through(bases: Tensor, rows: Tensor, share: Tensor) -> Tensor:
@@ -269,9 +289,9 @@ def shapes_through(bases: Tensor, rows: Tensor, share: Tensor) -> Tensor:
     return gram_null_space(gram, 3).basis.mT.unflatten(1, (size, k))
 
 
-def graph_start(x: Tensor, rows: Tensor, share: Tensor, options: ShapesOptions = ShapesOptions()) -> Tensor | None:
+def graph_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor | None:
     """Shapes ``(b, B, n, 3)`` by the graph over the mean shape of centred views ``(b, views, n, 2)``; None with too few views."""
-    powers = products(rows, options)
+    powers = products(rows)
     helmert = centred(x.shape[-2], x.device)
     flat = helmert @ x
     if 2 * x.shape[1] < 3 * powers.shape[-1] + 1:
@@ -282,13 +302,13 @@ def graph_start(x: Tensor, rows: Tensor, share: Tensor, options: ShapesOptions =
     return helmert.mT @ scatter[:, None] @ shapes_through(found.bases(powers), rows, share)
 
 
-def window_start(x: Tensor, rows: Tensor, share: Tensor, options: ShapesOptions = ShapesOptions()) -> Tensor:
+def window_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor:
     """Shapes ``(b, B, n, 3)`` by the static shapes of windows of views at about one time."""
     helmert = centred(x.shape[-2], x.device)
     flat = helmert @ x
     count = x.shape[1]
-    anchors = torch.linspace(0, count - 1, min(count, options.starts.windows), device=x.device).round().long()
-    nearest = min(count, max(options.starts.window_views, count // (4 * rows.shape[-1])))
+    anchors = torch.linspace(0, count - 1, min(count, MAX_WINDOWS), device=x.device).round().long()
+    nearest = min(count, max(MIN_WINDOW_VIEWS, count // (4 * rows.shape[-1])))
     apart = torch.cdist(rows[:, anchors], rows) + torch.where(share > 0, 0.0, torch.inf)[:, None]
     window = apart.topk(nearest, largest=False).indices  # (b, anchors, nearest)
     problem = torch.arange(len(x), device=x.device)[:, None, None]
@@ -356,7 +376,6 @@ def fit_shapes(
     *,
     share: Tensor | None = None,
     iterations: int = 50,
-    options: ShapesOptions = ShapesOptions(),
 ) -> MovingShapes:
     r"""Learn how n points move from single affine views of them, all points at once, each view by another camera.
 
@@ -374,7 +393,6 @@ def fit_shapes(
         weights: ``(*batch, views, n)``, 0 = ignore.
         share: ``(*batch, views)`` weight of whole views.
         iterations: steps of the descent at most.
-        options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
         :class:`MovingShapes` in the dtype of x; zero shapes where ``few``.
@@ -394,11 +412,10 @@ def fit_shapes(
         >>> bool(found.residual.max() < 1e-12), bool(found.degenerate)
         (True, False)
     """
-    check_options(options, ShapesOptions)
     batch, views, times = checked_views(x, rows, weights, share)
     few = _few(views, times)
-    shapes, cost = _best(views, times, iterations, options)
-    uncertainty, noise, free = _uncertainty(views, times, shapes, cost, options)
+    shapes, cost = _best(views, times, iterations)
+    uncertainty, noise, free = _uncertainty(views, times, shapes, cost)
     found = project(views.x, views.weights, shapes_at(shapes, times))
     residual = found.residual.square().sum((-2, -1)).clamp(0, 1)
     none = few[:, None, None, None]
@@ -468,31 +485,29 @@ def _spare(views: AffineViews, rows: Tensor) -> Tensor:
     return 2 * seen.sum(-1) - (3 * rows.shape[-1] * (views.x.shape[-2] - 1) - GAUGE)
 
 
-def _best(views: AffineViews, rows: Tensor, iterations: int, options: ShapesOptions) -> tuple[Tensor, Tensor]:
+def _best(views: AffineViews, rows: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     """Shapes and cost of the best of all starts."""
-    filled = complete(views, options)
-    made = [make(filled, rows, views.share, options) for make in (graph_start, window_start)]
-    made += [pooled_start(filled, rows, views.share), _grown(views, filled, rows, options)]
+    filled = complete(views)
+    made = [make(filled, rows, views.share) for make in (graph_start, window_start)]
+    made += [pooled_start(filled, rows, views.share), _grown(views, filled, rows)]
     starts = [torch.where(start.isfinite(), start, 0.0) for start in made if start is not None]
-    shapes, cost = descend(views.repeated(len(starts)), rows.repeat(len(starts), 1, 1), torch.cat(starts), options.starts.steps)
+    shapes, cost = descend(views.repeated(len(starts)), rows.repeat(len(starts), 1, 1), torch.cat(starts), START_STEPS)
     cost = torch.where(cost.isfinite(), cost, torch.inf).unflatten(0, (len(starts), -1))
     best = cost.argmin(0)
     chosen = shapes.unflatten(0, (len(starts), -1))[best, torch.arange(len(best), device=best.device)]
-    return descend(views, rows, chosen, max(0, iterations - options.starts.steps))
+    return descend(views, rows, chosen, max(0, iterations - START_STEPS))
 
 
-def _grown(views: AffineViews, filled: Tensor, rows: Tensor, options: ShapesOptions) -> Tensor:
+def _grown(views: AffineViews, filled: Tensor, rows: Tensor) -> Tensor:
     """Shapes ``(b, B, n, 3)`` that start at rest and are given one function of the time after the other."""
     shapes = leading(filled, views.share)[:, None]
     for size in range(2, rows.shape[-1] + 1):
         wider = torch.nn.functional.pad(shapes, (0, 0, 0, 0, 0, 1))
-        shapes, _ = descend(views, rows[..., :size], wider, options.starts.steps_for_a_function)
+        shapes, _ = descend(views, rows[..., :size], wider, STEPS_PER_FUNCTION)
     return shapes
 
 
-def _uncertainty(
-    views: AffineViews, rows: Tensor, shapes: Tensor, cost: Tensor, options: ShapesOptions
-) -> tuple[Tensor, Tensor, Tensor]:
+def _uncertainty(views: AffineViews, rows: Tensor, shapes: Tensor, cost: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Expected relative error, noise, and whether another shape explains the views as well, exactly; ``(b,)`` each."""
     open_ = GAUGE + 3 * rows.shape[-1]  # affine frame, and a translation of every basis function
     rest = _eigenvalues(views, rows, shapes)[..., open_:]
@@ -503,7 +518,7 @@ def _uncertainty(
     # the weights of the views do not move the null space: none of them may be large because its shape is nearly flat
     size = project(views.x, views.weights, shapes_at(shapes, rows)).cameras.square().sum((-2, -1))
     even = _eigenvalues(replace(views, share=views.share / torch.where(size > 0, size, 1.0)), rows, shapes)
-    free = (even[..., open_] <= options.free * even[..., -1]) & (variance < options.exact**2)
+    free = (even[..., open_] <= FREE_EIGENVALUE * even[..., -1]) & (variance < EXACT_NOISE**2)
     return torch.where(free, torch.inf, (variance * inverse / 3).sqrt()), variance.sqrt(), free
 
 

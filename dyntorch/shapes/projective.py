@@ -18,12 +18,13 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import status_of
-from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
 from dyntorch.numerics.nullspace import eigenvalues
 from dyntorch.shapes.basis import Trajectory
 from dyntorch.shapes.moving import (
+    EXACT_NOISE,
+    FREE_EIGENVALUE,
     GAUGE,
     AffineViews,
     MovingShapes,
@@ -34,13 +35,24 @@ from dyntorch.shapes.moving import (
     framed,
     shapes_at,
 )
-from dyntorch.shapes.options import PerspectiveOptions, RecoveryOptions
-from dyntorch.shapes.times import Recovery, lowest_minima, tried_times
+from dyntorch.shapes.times import TIME_STEPS, Recovery, lowest_minima, tried_times
 
 CAMERA = 11
 CHUNK = 1 << 22
 """Numbers in the largest temporary."""
 RIDGE = 1e-13
+CAMERA_STEPS = 2
+"""Gauss-Newton steps from the linear camera."""
+MIN_DEPTH = 0.05
+"""Least depth of a point, in parts of that of the middle of the shape."""
+EXPECTED_DEPTH = 0.15
+"""Relative depths of points to expect, RMS: people before a camera at 2 m have .1 to .15, at 4.5 m .05."""
+FIRST_EXPECTED_DEPTH = 1.0
+"""The same in the first descent, whose noise is what affine cameras leave (.15: 1.5 to 2 times as many steps)."""
+MAX_DESCENTS = 8
+"""Each with the noise that the last one left: the cameras leave the affine ones step by step."""
+CONVERGED_NOISE = 0.8
+"""Of the noise of the last descent, above which it is the noise of the views and no more follow."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,7 @@ class PerspectiveViews:
         return x - self.columns @ (self.inverse @ (self.columns.mT @ x))
 
 
-def perspective(x: Tensor, weights: Tensor, shape: Tensor, prior: Tensor | float, options: PerspectiveOptions) -> PerspectiveViews:
+def perspective(x: Tensor, weights: Tensor, shape: Tensor, prior: Tensor | float) -> PerspectiveViews:
     r"""The best perspective image of a shape in each view: a linear solution, then Gauss-Newton steps. x ``(..., n, 2)``, shape
     ``(..., n, 3)``."""
     root = weights.sqrt()
@@ -75,12 +87,12 @@ def perspective(x: Tensor, weights: Tensor, shape: Tensor, prior: Tensor | float
         torch.as_tensor(prior, dtype=x.dtype, device=x.device).expand(x.shape[:-2]).sqrt()[..., None] * root / total[..., 0].sqrt()
     )
     camera = _camera(points, x, torch.ones_like(root), root, torch.nn.functional.pad(x * root[..., None], (0, 1)), pull)[0]
-    for step in range(options.steps + 1):
-        depth = (1 + (points @ camera[..., 8:, None])[..., 0]).clamp(min=options.nearest)
+    for step in range(CAMERA_STEPS + 1):
+        depth = (1 + (points @ camera[..., 8:, None])[..., 0]).clamp(min=MIN_DEPTH)
         image = (points @ camera[..., :6].unflatten(-1, (3, 2)) + camera[..., None, 6:8]) / depth[..., None]
         error = torch.cat([(x - image) * root[..., None], (pull * (1 - depth))[..., None]], dim=-1)
         change, columns, inverse = _camera(points, image, depth, root, error, pull)
-        if step < options.steps:
+        if step < CAMERA_STEPS:
             camera = camera + change
     affine, lean = camera[..., :6].unflatten(-1, (3, 2)).mT, camera[..., 8:]
     own = (affine[..., None, :, :] - image[..., None] * lean[..., None, None, :]) * (root / depth)[..., None, None]
@@ -115,12 +127,11 @@ class PerspectiveDescent(NormalEquations):
     views: AffineViews  # see :class:`~dyntorch.shapes.moving.AffineViews`
     rows: Tensor  # ``(b, views, B)`` values of the basis functions
     prior: Tensor  # ``(b,)`` see :func:`perspective`
-    options: PerspectiveOptions  # of the cameras
 
     def at(self, theta: Tensor) -> PerspectiveViews:
         """All views beside the shapes of parameters ``(b, 3 n B)``."""
         shapes = shapes_at(theta.unflatten(1, (self.rows.shape[-1], -1, 3)), self.rows)
-        return perspective(self.views.x, self.views.weights, shapes, self.prior[:, None], self.options)
+        return perspective(self.views.x, self.views.weights, shapes, self.prior[:, None])
 
     def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
         """The shapes in their canonical form: what no view can tell does not run away."""
@@ -128,7 +139,7 @@ class PerspectiveDescent(NormalEquations):
 
     def subset(self, keep: Tensor) -> PerspectiveDescent:
         """Some of the problems."""
-        return PerspectiveDescent(self.views.subset(keep), self.rows[keep], self.prior[keep], self.options)
+        return PerspectiveDescent(self.views.subset(keep), self.rows[keep], self.prior[keep])
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost ``(b,)``, gradient ``(b, p)`` and matrix ``(b, p, p)``."""
@@ -156,7 +167,6 @@ def fit_perspective_shapes(
     *,
     share: Tensor | None = None,
     iterations: int = 60,
-    options: PerspectiveOptions = PerspectiveOptions(),
 ) -> MovingShapes:
     r"""Learn how n points move from single perspective views of them, all points at once, each view by another camera.
 
@@ -174,7 +184,6 @@ def fit_perspective_shapes(
         weights: ``(*batch, views, n)``, 0 = ignore.
         share: ``(*batch, views)`` weight of whole views.
         iterations: steps of each descent at most.
-        options: every number that decides; ``dataclasses.replace`` changes some of them.
 
     Returns:
         :class:`~dyntorch.shapes.MovingShapes`: its shapes are up to a constant affine frame (a collineation where nothing moves).
@@ -195,24 +204,23 @@ def fit_perspective_shapes(
         >>> bool(found.residual.max() < 1e-12), found.counted()
         (True, '1 OK')
     """
-    check_options(options, PerspectiveOptions)
     if x.ndim > 2 and x.shape[-2] < 6:
         raise ValueError(f"x needs at least 6 points, five of which a camera takes anywhere, got {x.shape[-2]}")
     batch, views, times = checked_views(x, rows, weights, share)
     views = replace(views, share=views.share * ((views.weights > 0).sum(-1) > 5))
-    affine = fit_shapes(views.x, times, views.weights, share=views.share, iterations=iterations, options=options.affine)
+    affine = fit_shapes(views.x, times, views.weights, share=views.share, iterations=iterations)
     shapes, noise = affine.shapes, affine.noise
     few = _spare(views, times) < 0
-    for round_ in range(options.rounds):
+    for round_ in range(MAX_DESCENTS):
         # what affine cameras leave is perspective for the most part, no noise
-        descent = PerspectiveDescent(views, times, (noise / (options.depth if round_ else options.first_depth)).square(), options)
+        descent = PerspectiveDescent(views, times, (noise / (EXPECTED_DEPTH if round_ else FIRST_EXPECTED_DEPTH)).square())
         found = minimize(descent, descent.evaluate((shapes.flatten(1),)), LeastSquaresOptions(iterations=iterations))
         shapes, old = canonical(found.theta[0].unflatten(1, shapes.shape[1:])), noise
         noise = _noise(views, times, descent.at(shapes.flatten(1)).cost)
         # the noise that the next round believes: exact views have less every time, others the same
-        if round_ > 1 and bool((noise > options.settled * old).all()):
+        if round_ > 1 and bool((noise > CONVERGED_NOISE * old).all()):
             break
-    uncertainty, free = _uncertainty(descent, shapes, noise, options)
+    uncertainty, free = _uncertainty(descent, shapes, noise)
     none = few[:, None, None, None]
     residual = descent.at(shapes.flatten(1)).cost.clamp(0, 1)
     back = [torch.where(none, 0.0, framed(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty)]
@@ -237,14 +245,14 @@ def _noise(views: AffineViews, rows: Tensor, cost: Tensor) -> Tensor:
     return variance.sqrt()
 
 
-def _uncertainty(descent: PerspectiveDescent, shapes: Tensor, noise: Tensor, options: PerspectiveOptions) -> tuple[Tensor, Tensor]:
+def _uncertainty(descent: PerspectiveDescent, shapes: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Expected relative error, and whether another shape explains the views as well, exactly; ``(b,)`` each."""
     size = descent.rows.shape[-1]
     values = eigenvalues(replace(descent, prior=torch.zeros_like(descent.prior)).normal_equations(shapes.flatten(1))[2])
     rest = values[..., gauge(size) + 3 * size :]
     share = descent.views.share.sum(-1) / (descent.views.share > 0).sum(-1).clamp(min=1)
     inverse = (share[:, None] / rest.clamp(min=torch.finfo(rest.dtype).tiny)).sum(-1)
-    free = (rest[..., 0] <= options.affine.free * values[..., -1]) & (noise < options.affine.exact)
+    free = (rest[..., 0] <= FREE_EIGENVALUE * values[..., -1]) & (noise < EXACT_NOISE)
     return torch.where(free, torch.inf, (noise.square() * inverse / 3).sqrt()), free
 
 
@@ -262,8 +270,6 @@ def recover_perspective_times(
     grid: int = 64,
     interval: tuple[float, float] = (-1.0, 1.0),
     prior: float = 0.0,
-    options: RecoveryOptions = RecoveryOptions(),
-    cameras: PerspectiveOptions = PerspectiveOptions(),
 ) -> Recovery:
     r"""As :func:`~dyntorch.shapes.recover_times`, by perspective images of the shapes.
 
@@ -275,7 +281,6 @@ def recover_perspective_times(
         grid: times tried.
         interval: polynomial trajectories: times tried from and to.  Periodic ones are tried over the period.
         prior: noise variance of the normalized views over that of the relative depths of the points; 0 believes any perspective.
-        options: every number that decides about times; cameras: about cameras.
 
     Returns:
         :class:`~dyntorch.shapes.Recovery` in the dtype of x.
@@ -295,8 +300,6 @@ def recover_perspective_times(
         >>> bool(found.residual < 1e-12), round(float(found.times), 6)
         (True, 0.3)
     """
-    check_options(options, RecoveryOptions)
-    check_options(cameras, PerspectiveOptions)
     batch = np.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
     flat, count = prod(batch), x.shape[-3]
     times = tried_times(shapes, basis, x, grid, interval)
@@ -307,7 +310,7 @@ def recover_perspective_times(
     known = (views.share > 0) & ((views.weights > 0).sum(-1) > 5)
     step = max(1, CHUNK // (grid * 50 * x.shape[-2] * max(1, flat)))
     pieces = [slice(i, i + step) for i in range(0, max(1, count), step)]
-    dater = _Dater(wide, basis, times, prior, options, cameras)
+    dater = _Dater(wide, basis, times, prior)
     parts = [dater(views.x[:, p], views.weights[:, p]) for p in pieces]
     found = [torch.cat(part, dim=1) for part in zip(*parts, strict=True)]
     middle = times[len(times) // 2]
@@ -324,13 +327,11 @@ class _Dater:
     basis: Trajectory
     times: Tensor
     prior: float
-    options: RecoveryOptions
-    cameras: PerspectiveOptions
 
     def __call__(self, x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
         periodic, step = self.basis.period is not None, self.times[1] - self.times[0]
         curve = self.costs(x, weights, self.times.expand(*x.shape[:2], -1))
-        place, lone = lowest_minima(curve, periodic, self.options.minima)
+        place, lone = lowest_minima(curve, periodic)
         t, f, h = self.refined(x, weights, self.times[place], step)
         f = torch.where(lone, torch.inf, f)
         order = f.argsort(-1)
@@ -342,7 +343,7 @@ class _Dater:
         """Views ``(b, views, n, 2)`` at times ``(b, views, times)``."""
         shape = shapes_at(self.shapes, self.basis.rows(t).flatten(1, 2)).unflatten(1, t.shape[1:])
         many = (x[:, :, None].expand(*t.shape, *x.shape[-2:]), weights[:, :, None].expand(*t.shape, weights.shape[-1]))
-        return perspective(*many, shape, self.prior, self.cameras)
+        return perspective(*many, shape, self.prior)
 
     def costs(self, x: Tensor, weights: Tensor, t: Tensor) -> Tensor:
         """With what the prior adds, ``(b, views, times)``."""
@@ -363,7 +364,7 @@ class _Dater:
 
         t, size = start, torch.ones_like(start)
         f, gain, curvature = at(t)
-        for _ in range(self.options.steps):
+        for _ in range(TIME_STEPS):
             trial = (t + size * gain / curvature.clamp(min=1e-300)).clamp(low, high)
             fresh = at(trial)
             better = fresh[0] < f

@@ -137,9 +137,7 @@ def bones() -> Tensor:
 def two_views(images: Tensor) -> Tensor:
     """Points of every frame by factorization and the lengths of bones alone: as many shapes as there are coordinates."""
     most = min(images.shape[1], 3 * images.shape[2])
-    return deformable_shapes(
-        images[0], images[1], most, lengths=bones(), orthographic=True, options=dyn.shapes.DeformableOptions(rounds=0)
-    ).points
+    return deformable_shapes(images[0], images[1], most, lengths=bones(), orthographic=True, iterations=0).points
 
 
 def deformable(images: Tensor, shapes: int) -> Tensor:
@@ -235,9 +233,8 @@ def _once(basis: int, n: int, noise: float, missing: float, seed: int) -> tuple[
     images = points @ rig[:, None].mT
     images = images + noise * points.square().sum(-1).mean().sqrt() * normal(*images.shape)
     pairs = torch.combinations(torch.arange(n // 3))
-    alone = dyn.shapes.DeformableOptions(rounds=0)
     seen = gaps(images, missing, seed)
-    plain = deformable_shapes(images[0], images[1], FRAMES, lengths=pairs, options=alone).points
+    plain = deformable_shapes(images[0], images[1], FRAMES, lengths=pairs, iterations=0).points
     return error(plain, points), error(deformable_shapes(seen[0], seen[1], basis, lengths=pairs).points, points)
 
 

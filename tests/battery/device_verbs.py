@@ -421,7 +421,6 @@ VERBS: tuple[Verb, ...] = (
         lambda: (cameras_and_points()[2], cameras_and_points()[0] + 1e-3 * randn(3, 3, 4), cameras_and_points()[1]),
         lambda x, c, y: dyn.geometry.bundle_adjust(x, None, c, y),
     ),
-    Verb("structure_covariance", lambda: cameras_and_points()[:2], dyn.geometry.structure_covariance),
     Verb("grassmann_tensor", lambda: (cameras_and_points()[0][:2],), lambda p: dyn.geometry.grassmann_tensor(p, (2, 2))),
     Verb(
         "joint_epipoles",

@@ -12,7 +12,7 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.counting import count, dim_v
-from dyntorch.geometry.bundle import bundle_adjust, structure_covariance
+from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.multibody import multibody_matrix
 from dyntorch.numerics.blocks import Draws
@@ -43,7 +43,6 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], tuple[Tensor, ...]]] = {
     "resect": (resect, (POINTS, IMAGES)),
     "reproject": (reproject, (CAMERAS, POINTS)),
     "bundle_adjust": (lambda x, p, y: bundle_adjust(x, None, p, y, iterations=2), (IMAGES, CAMERAS, POINTS)),
-    "structure_covariance": (structure_covariance, (CAMERAS, POINTS)),
     "affine_segmentation": (affine_segmentation, (numbers(40, 2), numbers(40, 2, seed=1))),
     "multibody_matrix": (lambda a, b: multibody_matrix(a, b, 2), (numbers(60, 2), numbers(60, 2, seed=1))),
 }

@@ -275,7 +275,7 @@ def bundle() -> Any:
         "adjusted": dyn.geometry.bundle_adjust(x, None, *start), "robust": dyn.geometry.bundle_adjust(x, None, *start, scale=1e-3),
         "triangulated": dyn.geometry.triangulate(P, x), "steps": dyn.geometry.triangulate(P, x, steps=3),
         "resected": dyn.geometry.resect(Y, x),
-        "covariance": dyn.geometry.structure_covariance(P, Y, sigma=1e-3), "grassmann": dyn.geometry.grassmann_tensor(list(P[:2]),
+        "grassmann": dyn.geometry.grassmann_tensor(list(P[:2]),
         (2, 2)),
         "epipoles": tried(lambda: dyn.geometry.joint_epipoles(list(normal(3, 3, 5)))),
         "projective": dyn.tasks.projective_factorization(x, 4),

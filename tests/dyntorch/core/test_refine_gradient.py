@@ -10,7 +10,6 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.options import RefineOptions
 from dyntorch.core.refine_gradient import RefineNotice
 
 H = dyn.HomographyTensor
@@ -131,9 +130,6 @@ def test_a_descent_that_ended_early_says_so_where_gradients_are_wanted():
     assert dyn.refine(solution, *views).notices == ()
     with torch.no_grad():
         assert dyn.refine(solution, *views, iterations=1).notices == ()
-    assert dyn.refine(solution, *views, options=RefineOptions(unfinished_decrease=0.0, unfinished_length=0.0)).notices
-    with pytest.raises(ValueError, match="options must be RefineOptions"):
-        dyn.refine(solution, *views, options=3)  # type: ignore[arg-type]
 
 
 def test_exact_matches_have_finite_gradients_without_a_notice():

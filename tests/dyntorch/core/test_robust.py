@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from math import comb, log
 from typing import Any
 
@@ -13,6 +12,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import Status, scenes
+from dyntorch.core import consensus
 from dyntorch.core.consensus import Search, anneal, judge, msac
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import matches
@@ -384,24 +384,11 @@ def test_more_starts_are_not_tried_where_a_quarter_of_them_agree(monkeypatch):
         return solve(self, where, cut, count)
 
     monkeypatch.setattr(Search, "_solve", counted)
-    options = replace(dyn.RobustOptions(), doubt=replace(dyn.RobustOptions().doubt, just_beyond=-1.0))
+    monkeypatch.setattr(consensus, "MAX_NEAR_MISSES", -1.0)
     scene = scenes.planar(n=100, sigma=0.5, static=0.3, outliers=0.1, generator=seeded(1))
     views = tuple(x[None] for x in scene.views)
     data = matches(dyn.HomographyTensor(), views, None)
-    search = Search(dyn.HomographyTensor(), data, torch.Generator().manual_seed(0), options)
+    search = Search(dyn.HomographyTensor(), data, torch.Generator().manual_seed(0))
     with torch.no_grad():
         found = search.run(torch.tensor([1.5], dtype=torch.float64), (1, 4, 16, 64, 256))
     assert bool(found.doubt) and counts == [1, 4, 16]
-
-
-def test_options_decide():
-    scene, shipped = scenes.planar(n=100, sigma=0.5, static=0.3, outliers=0.2, generator=seeded(1)), dyn.RobustOptions()
-
-    def fitted(options):
-        return dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.5, generator=seeded(), options=options)
-
-    assert fitted(shipped).sigma == dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.5, generator=seeded()).sigma
-    rough = fitted(replace(shipped, finish=replace(shipped.finish, steps=())))
-    assert rough.sigma != fitted(shipped).sigma and not rough.refined
-    with pytest.raises(ValueError, match=r"options must be RobustOptions, got \{\}; use dataclasses\.replace"):
-        fitted({})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.geometry.bundle import BundleProblem, bundle_adjust, point_information, structure_covariance
+from dyntorch.geometry.bundle import BundleProblem, bundle_adjust, point_information
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.numerics.least_squares import Iterate
 from dyntorch.scenes import lifted
@@ -244,14 +244,10 @@ def test_the_information_is_the_gram_of_the_jacobian_of_each_point(name):
     weights[0, 1:, 4] = 0
     structure = structure / structure.norm(dim=-1, keepdim=True)
     found = point_information(cameras, 3 * structure, weights, lifts)
-    covariance = structure_covariance(cameras, 3 * structure, weights, lifts, sigma=torch.tensor([0.1, 0.2]).double())
     for b, j in ((0, 0), (1, 7)):
         jacobian = torch.func.jacrev(lambda y, b=b: reproject(cameras[b] @ lifts, y[None])[:, 0])(structure[b, j])
         expected = torch.einsum("v,vlk,vlm->km", weights[b, :, j], jacobian, jacobian)
         torch.testing.assert_close(found[b, j], expected)
-        sigma = 0.1 * (b + 1)
-        torch.testing.assert_close(covariance[b, j], sigma**2 * torch.linalg.pinv(expected, hermitian=True), rtol=1e-6, atol=1e-9)
-    assert covariance[0, 4].isinf().all() and covariance[0, :4].isfinite().all()
 
 
 def test_misuse():

@@ -1,14 +1,13 @@
 """Lenses fitted to matches: against scenes seen through known lenses, and finite differences."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
+from dyntorch.geometry import lens as lens_module
 from dyntorch.geometry.epipolar_fit import Frames
 from dyntorch.geometry.lens import Division, LensDescent, LensMatches, distort, fit_distortion
-from dyntorch.geometry.options import LensOptions
 from dyntorch.scenes import two_view
 
 SIZE = (640.0, 480.0)
@@ -145,12 +144,11 @@ def test_misuse_is_named(arguments, words):
 
 
 @pytest.mark.slow
-def test_options_decide():
-    matches, shipped = seen((-0.2, -0.1)), LensOptions()
+def test_what_decides_that_there_is_distortion(monkeypatch):
+    matches = seen((-0.2, -0.1))
     assert fit_distortion(*matches, sizes=(SIZE, SIZE)).significant
-    sure = replace(shipped, significant=math.inf)
-    assert not fit_distortion(*matches, sizes=(SIZE, SIZE), options=sure).significant
-    many = fit_distortion(*matches, sizes=(SIZE, SIZE), options=replace(shipped, fewest=10**6))
+    monkeypatch.setattr(lens_module, "MIN_F_RATIO", math.inf)
+    assert not fit_distortion(*matches, sizes=(SIZE, SIZE)).significant
+    monkeypatch.setattr(lens_module, "MIN_MATCHES", 10**6)
+    many = fit_distortion(*matches, sizes=(SIZE, SIZE))
     assert not many.significant and many.sigmas == (math.inf, math.inf)
-    with pytest.raises(ValueError, match=r"options must be LensOptions, got \{\}; use dataclasses\.replace"):
-        fit_distortion(*matches, options={})

@@ -1,7 +1,5 @@
 """Dynamic shape tensors of projective cameras: exactness, counts, derivatives, what they win near by, statuses."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -9,8 +7,8 @@ from scipy.optimize import least_squares
 
 import dyntorch as dyn
 from dyntorch.counting import count
+from dyntorch.shapes import projective
 from dyntorch.shapes.moving import centred_views
-from dyntorch.shapes.options import PerspectiveOptions
 from dyntorch.shapes.projective import PerspectiveDescent, perspective
 from tests.battery.references import rank
 from tests.battery.shape_cases import spread
@@ -102,7 +100,7 @@ def test_refinement_lowers_the_distances_and_its_derivative_is_right():
 
 
 @pytest.mark.parametrize("prior", [0.0, 0.02])
-def test_the_perspective_image_is_the_nearest_one(prior):
+def test_the_perspective_image_is_the_nearest_one(prior, monkeypatch):
     """Against scipy, whose camera has the same eleven numbers, and the prior of the relative depths."""
     x, _, shapes = scene(8, 3, 6.0, seed=4, sigma=0.01)
     views = centred_views(x[None])
@@ -118,16 +116,18 @@ def test_the_perspective_image_is_the_nearest_one(prior):
         return np.concatenate([(off * root[:, None]).ravel(), more])
 
     best = least_squares(residual, np.zeros(11), xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    found = perspective(x, weight, shapes[0], prior, replace(PerspectiveOptions(), steps=6))
+    monkeypatch.setattr(projective, "CAMERA_STEPS", 6)
+    found = perspective(x, weight, shapes[0], prior)
     np.testing.assert_allclose(found.residual.square().sum(), 2 * best.cost, rtol=1e-6)
     np.testing.assert_allclose(found.cost, np.square(residual(best.x)[:16]).sum(), rtol=1e-4)
 
 
 @pytest.mark.parametrize(("prior", "off"), [(0.0, 1e-6), (0.01, 5e-2)])  # what a shift of the middle does to the prior is left out
-def test_the_descent_has_the_gradient_of_its_cost(prior, off):
+def test_the_descent_has_the_gradient_of_its_cost(prior, off, monkeypatch):
     x, times, shapes = scene(7, 12, 6.0, seed=6, sigma=0.01)
     views, rows = centred_views(x[None]), dyn.Polynomial(1).rows(times)[None]
-    problem = PerspectiveDescent(views, rows, torch.tensor([prior]).double(), replace(PerspectiveOptions(), steps=8))
+    monkeypatch.setattr(projective, "CAMERA_STEPS", 8)
+    problem = PerspectiveDescent(views, rows, torch.tensor([prior]).double())
     theta = (shapes + 0.05).flatten()[None]
     _, gradient, matrix = problem.normal_equations(theta)
     steps = 1e-5 * torch.randn(4, theta.shape[1], generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -1,11 +1,12 @@
 """All joints of a moving shape at once: descent, starts, missing points, and the time of a single view."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
+from dyntorch.shapes import moving
+from dyntorch.shapes import times as shape_times
 from dyntorch.shapes.basis import Fourier, Polynomial
 from dyntorch.shapes.moving import (
     ShapeDescent,
@@ -19,7 +20,6 @@ from dyntorch.shapes.moving import (
     pooled_start,
     window_start,
 )
-from dyntorch.shapes.options import RecoveryOptions, ShapesOptions
 from dyntorch.shapes.times import recover_times
 from tests.dyntorch.shapes.moving_views import LINEAR, SQUARE, WAVE, draw, moving_views
 
@@ -290,24 +290,19 @@ def test_misuse(call, said):
         call(torch.rand(9, 6, 2), torch.rand(9, 2))
 
 
-def test_options_decide():
+def test_what_decides_the_shapes_and_their_times(monkeypatch):
     t = times(30)
     x, _ = moving_views(LINEAR, t, n=8, noise=0.02)
     rows = Polynomial(1).rows(t)
     found = fit_shapes(x, rows)
     assert not found.degenerate
-    everything = replace(ShapesOptions(), free=2.0, exact=1.0)
-    assert fit_shapes(x, rows, options=everything).degenerate
     seen = recover_times(found.shapes, Polynomial(1), x)
-    assert (seen.times != recover_times(found.shapes, Polynomial(1), x, options=RecoveryOptions(steps=0)).times).any()
-    one = recover_times(found.shapes, Polynomial(1), x, options=RecoveryOptions(minima=2))
-    torch.testing.assert_close(one.times, seen.times)
-
-
-def test_options_are_of_the_verb():
-    t = times(9)
-    x, _ = moving_views(LINEAR, t)
-    with pytest.raises(ValueError, match=r"options must be ShapesOptions, got \{\}; use dataclasses\.replace"):
-        fit_shapes(x, Polynomial(1).rows(t), options={})
-    with pytest.raises(ValueError, match=r"options must be RecoveryOptions, got ShapesOptions\("):
-        recover_times(torch.zeros(2, 8, 3), Polynomial(1), x, options=ShapesOptions())
+    with monkeypatch.context() as patch:
+        patch.setattr(moving, "FREE_EIGENVALUE", 2.0)
+        patch.setattr(moving, "EXACT_NOISE", 1.0)
+        assert fit_shapes(x, rows).degenerate
+    with monkeypatch.context() as patch:
+        patch.setattr(shape_times, "TIME_STEPS", 0)
+        assert (seen.times != recover_times(found.shapes, Polynomial(1), x).times).any()
+    monkeypatch.setattr(shape_times, "NUM_MINIMA", 2)
+    torch.testing.assert_close(recover_times(found.shapes, Polynomial(1), x).times, seen.times)
