@@ -8,6 +8,7 @@ import torch
 from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, least_ratio, sampson_squared
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import filmed
+from tests.grid import grid
 
 
 def matches(seed=0, noise=1.0, n=12):
@@ -51,8 +52,7 @@ def test_gradient_moments_are_the_squared_gradients_of_all_matches(noise):
         assert float(f @ form @ f) == pytest.approx(direct(f, x1, x2, noise)[1], rel=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("noise", [0.5, 3.0])
+@grid(("seed", range(4)), ("noise", [0.5, 3.0]))
 def test_the_variance_is_the_least_generalized_eigenvalue(seed, noise):
     x1, x2, sigmas = matches(seed, noise)
     moments = moments_of(x1, x2)

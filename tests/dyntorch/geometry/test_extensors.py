@@ -1,12 +1,26 @@
-"""Extensors against determinants one by one, Cauchy-Binet, incidence of points, lines and planes."""
+"""Extensors against determinants one by one, Cauchy-Binet, incidence of points, lines and planes, spans by the SVD."""
 
 from itertools import combinations, permutations
+from math import comb
 
 import pytest
 import torch
 
-from dyntorch.geometry.extensors import compound, dual, join, levi_civita, meet, plucker, plucker_form
+from dyntorch.geometry.extensors import (
+    check_extensor,
+    compound,
+    dual,
+    extensor_of,
+    join,
+    levi_civita,
+    meet,
+    plucker,
+    plucker_form,
+    subspace_of,
+    wedge,
+)
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
+from tests.grid import grid
 
 
 def random(*shape, seed=0, dtype=torch.float64):
@@ -19,7 +33,7 @@ def minors(matrix, order):
     return torch.tensor([[torch.linalg.det(matrix[list(r)][:, list(c)]) for c in columns] for r in rows], dtype=matrix.dtype)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 4])
+@grid(("n", [1, 2, 3, 4]))
 def test_levi_civita_computes_determinants(n):
     e, m = levi_civita(n), random(n, n)
     assert int(e.abs().sum()) == len(list(permutations(range(n))))
@@ -42,9 +56,7 @@ def test_levi_civita_is_cached_and_safe_for_gradients():
             levi_civita(n)
 
 
-@pytest.mark.parametrize(
-    ("rows", "columns", "order"), [(4, 4, 1), (4, 4, 2), (4, 4, 3), (4, 4, 4), (3, 5, 2), (6, 4, 3), (2, 7, 2)]
-)
+@grid((("rows", "columns", "order"), [(4, 4, 1), (4, 4, 2), (4, 4, 3), (4, 4, 4), (3, 5, 2), (6, 4, 3), (2, 7, 2)]))
 def test_compound_holds_every_minor(rows, columns, order):
     m = random(2, 3, rows, columns)
     c = compound(m, order)
@@ -82,7 +94,7 @@ def test_compound_refuses_orders_without_minors(order):
         compound(random(3, 5), order)
 
 
-@pytest.mark.parametrize("d", [1, 2, 3, 6])
+@grid(("d", [1, 2, 3, 6]))
 def test_join_of_two_points(d):
     p, q = random(4, 5, d + 1), random(4, 5, d + 1, seed=1)
     expected = torch.stack([p[..., i] * q[..., j] - p[..., j] * q[..., i] for i, j in combinations(range(d + 1), 2)], -1)
@@ -178,3 +190,135 @@ def test_plucker_refuses_other_shapes_and_keeps_the_dtype():
         plucker(random(5, 6))
     assert plucker(random(5, 2, 3, dtype=torch.float32)).dtype == torch.float32
     assert plucker_form(dtype=torch.float32).dtype == torch.float32
+
+
+# --- products of extensors of any step, and the subspaces they stand for
+
+
+def sine(first, second):
+    """Sine of the largest angle between two row spaces of one dimension."""
+    q, r = (torch.linalg.qr(x.mT).Q for x in (first, second))
+    return torch.linalg.matrix_norm(q - r @ (r.mT @ q), 2)
+
+
+def brute_wedge(left, right, size, a, b):
+    """Reference: the coefficients of the product of two forms, term by term."""
+    result = dict.fromkeys(combinations(range(size), a + b), 0.0)
+    for i, s in enumerate(combinations(range(size), a)):
+        for j, t in enumerate(combinations(range(size), b)):
+            if not set(s) & set(t):
+                sign = (-1) ** sum(x > y for x, y in combinations(s + t, 2))
+                result[tuple(sorted(s + t))] += sign * float(left[i] * right[j])
+    return torch.tensor(list(result.values()), dtype=torch.float64)
+
+
+def test_wedge_of_any_extensors_term_by_term():
+    for size, a, b in [(4, 2, 2), (5, 2, 1), (5, 1, 3), (6, 3, 2), (6, 2, 4), (4, 0, 2)]:
+        left, right = random(comb(size, a)), random(comb(size, b), seed=1)
+        torch.testing.assert_close(wedge(left, right, size, (a, b)), brute_wedge(left, right, size, a, b), msg=f"{size, a, b}")
+
+
+@pytest.mark.parametrize("size", range(4, 10))
+def test_join_spans_both(size):
+    others = sorted({1, 2, size // 2, size - 2, size - 1})
+    failures = []
+    for a, b in [(a, b) for a in range(1, size) for b in others if a + b <= size]:
+        first, second = random(2, a, size), random(2, b, size, seed=1)
+        both = torch.cat([first, second], -2)
+        product = wedge(extensor_of(first), extensor_of(second), size, (a, b))
+        exchanged = wedge(extensor_of(second), extensor_of(first), size, (b, a))
+        expected = {"minors": (product, compound(both, a + b)[..., 0, :]), "order": (exchanged, (-1) ** (a * b) * product)}
+        failures += [(size, a, b, name) for name, pair in expected.items() if not torch.allclose(*pair, rtol=1e-9, atol=1e-10)]
+        if not (sine(subspace_of(product, size, a + b), both) < 1e-9).all():
+            failures.append((size, a, b, "span"))
+    assert failures == []
+
+
+def test_complementary_steps_join_in_the_determinant():
+    for size, a, b in [(4, 2, 2), (5, 2, 3), (5, 4, 1), (6, 3, 3), (7, 3, 4)]:
+        first, second = random(a, size), random(b, size, seed=1)
+        det = torch.linalg.det(torch.cat([first, second]))
+        torch.testing.assert_close(wedge(extensor_of(first), extensor_of(second), size, (a, b)), det[None], msg=f"{size, a, b}")
+
+
+def test_joins_vanish_outside_general_position():
+    p, q = random(2, 5)
+    line, point = extensor_of(torch.stack([p, q])), p + 2 * q
+    assert wedge(line, point, 5, (2, 1)).abs().max() < 1e-12
+    assert extensor_of(torch.stack([p, q, p - q])).abs().max() < 1e-12
+
+
+def test_subspace_of_inverts_extensor_of():
+    basis = random(3, 2, 4, 7)
+    extensor = extensor_of(basis)
+    assert extensor.shape == (3, 2, 35)
+    found = subspace_of(extensor, 7, 4)
+    assert (sine(found, basis) < 1e-10).all()
+    again = extensor_of(found)
+    correlation = torch.nn.functional.cosine_similarity(again, extensor, dim=-1).abs()
+    torch.testing.assert_close(correlation, torch.ones(3, 2, dtype=torch.float64))
+    assert sine(subspace_of(extensor[1, 1], 7, 4), found[1, 1]) < 1e-10
+    torch.testing.assert_close(subspace_of(random(2, 1), 4, 4), torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
+    # the complement of the subspace has the dual extensor
+    assert (found @ subspace_of(dual(extensor, 7, 4), 7, 3).mT).abs().max() < 1e-10
+
+
+def test_only_joins_have_the_subspace_of_their_step():
+    """Decomposable iff u -> A v u has a null space of the step; for step 2 iff A v A = 0 (Grassmann-Pluecker)."""
+
+    def singular(extensor):
+        eye = torch.eye(6, dtype=torch.float64)
+        return torch.linalg.svdvals(wedge(extensor[None], eye, 6, (2, 1)))
+
+    line, other = extensor_of(random(2, 6)), extensor_of(random(2, 6, seed=1))
+    assert singular(line)[-2] < 1e-12 and wedge(line, line, 6, (2, 2)).abs().max() < 1e-12
+    assert singular(line + other)[-2] > 1e-2 and wedge(line + other, line + other, 6, (2, 2)).abs().max() > 1e-2
+
+
+def test_batches_broadcast_and_gradients_exist_in_every_mode():
+    left, right = random(3, 1, 10), random(4, 5, seed=1)  # steps 2 and 1 of 5
+    product = wedge(left, right, 5, (2, 1))
+    assert product.shape == (3, 4, 10)
+    torch.testing.assert_close(product[2, 1], wedge(left[2, 0], right[1], 5, (2, 1)))
+    x, y = left[0, 0].clone().requires_grad_(), right[0].clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x, y: wedge(x, y, 5, (2, 1)), (x, y), check_forward_ad=True)
+    basis = random(2, 4).requires_grad_()
+
+    def projector(b):
+        u = subspace_of(extensor_of(b), 4, 2)
+        return u.mT @ u
+
+    assert torch.autograd.gradcheck(projector, basis)
+
+
+def test_tables_made_in_inference_mode_serve_gradients():
+    with torch.inference_mode():
+        wedge(random(8), random(28, seed=1), 8, (1, 2))
+    x = random(8).requires_grad_()
+    wedge(x, random(28, seed=1), 8, (1, 2)).sum().backward()
+    assert x.grad.isfinite().all()
+
+
+def test_join_of_points_is_the_same_in_any_order_up_to_the_sign():
+    points = random(3, 5)
+    for order in permutations(range(3)):
+        product = wedge(wedge(points[order[0]], points[order[1]], 5, (1, 1)), points[order[2]], 5, (2, 1))
+        sign = (-1) ** sum(x > y for x, y in combinations(order, 2))
+        torch.testing.assert_close(product, sign * join(*points))
+
+
+def test_misuse_is_refused():
+    with pytest.raises(ValueError, match=r"steps \(3, 3\) do not fit into 5"):
+        wedge(random(10), random(10), 5, (3, 3))
+    with pytest.raises(ValueError, match="has 10 entries, got 9"):
+        check_extensor(random(9), 5, 2)
+    with pytest.raises(ValueError, match="has no entries"):
+        wedge(random(9), random(1), 5, (6, 1))
+    with pytest.raises(ValueError, match="has 10 entries"):
+        subspace_of(random(4), 5, 2)
+    for step in (0, 6):
+        with pytest.raises(ValueError, match="step must be 1 to 5"):
+            subspace_of(random(1), 5, step)
+    for shape in [(4, 3), (0, 3), (3,)]:
+        with pytest.raises(ValueError, match="basis must be"):
+            extensor_of(random(*shape))

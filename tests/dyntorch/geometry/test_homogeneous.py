@@ -15,6 +15,7 @@ from dyntorch.geometry.homogeneous import (
     unit,
     unit_vectors,
 )
+from tests.grid import grid
 
 
 def random(*shape, seed=0, dtype=torch.float64):
@@ -54,8 +55,7 @@ def test_gradients_of_the_division():
     assert torch.autograd.gradcheck(apply, (random(2, 3, 4, seed=2).requires_grad_(), random(2, 5, 3, seed=3).requires_grad_()))
 
 
-@pytest.mark.parametrize(("e", "d"), [(2, 1), (3, 2), (4, 3), (3, 3)])
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+@grid((("e", "d"), [(2, 1), (3, 2), (4, 3), (3, 3)]), ("batch", [(), (4,), (2, 3)]))
 def test_apply_is_the_division_of_the_product(e, d, batch):
     a, x = random(*batch, e, d + 1), random(*batch, 7, d, seed=1)
     y = apply(a, x)

@@ -13,6 +13,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.numerics.blocks import LARGE, each, map_blocks, one_thread, select, workers
+from tests.grid import grid
 
 
 @pytest.fixture
@@ -23,8 +24,7 @@ def two_threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("batch", [0, 1, 6, 7, 23])
-@pytest.mark.parametrize("threads", [1, 2])
+@grid(("batch", [0, 1, 6, 7, 23]), ("threads", [1, 2]))
 def test_blocks_equal_the_whole(batch, threads):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
@@ -281,6 +281,7 @@ ELEMENTWISE = {
 """Without a search or a factorization: torch starts threads for them only above 32,768 numbers, where they pay."""
 
 
+@pytest.mark.slow
 def test_every_public_verb_runs_on_one_thread():
     faces = [dyn, dyn.core, dyn.geometry, dyn.invariants, dyn.numerics, dyn.shapes, dyn.tasks]
     named = {name: getattr(face, name) for face in faces for name in face.__all__}

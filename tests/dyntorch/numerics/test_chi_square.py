@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dyntorch.numerics.chi_square import median, quantile, three_sigma
+from tests.grid import grid
 
 
 @pytest.mark.parametrize("probability", [1e-6, 0.1, 0.5, 0.99, 1 - 1e-6])
@@ -13,8 +14,7 @@ def test_two_degrees_have_a_closed_form(probability):
     assert quantile(probability, 2) == pytest.approx(-2 * math.log1p(-probability), rel=1e-9)
 
 
-@pytest.mark.parametrize("degrees", [1, 2, 3, 4, 6, 17, 300])
-@pytest.mark.parametrize("probability", [0.005, 0.1, 0.5, 0.9, 0.99, 0.9973])
+@grid(("degrees", [1, 2, 3, 4, 6, 17, 300]), ("probability", [0.005, 0.1, 0.5, 0.9, 0.99, 0.9973]))
 def test_the_distribution_function_gives_the_probability_back(degrees, probability):
     half = torch.tensor([degrees / 2, quantile(probability, degrees) / 2], dtype=torch.float64)
     assert float(torch.special.gammainc(half[0], half[1])) == pytest.approx(probability, rel=1e-8)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dyntorch.numerics import affine_factorization, metric_upgrade
+from tests.grid import grid
 
 
 def random(*shape, seed=0):
@@ -144,7 +145,7 @@ def test_two_distinct_cameras_are_undecided_however_often_repeated():
     assert not bool(metric_upgrade(affine, cameras)[1])
 
 
-@pytest.mark.parametrize("seed", range(8))
+@grid(("seed", range(8)))
 def test_a_flat_shape_is_undecided(seed):
     # the third row of every camera is then any vector of the null space, and nothing that it says can be believed
     shape = random(25, 3, seed=seed) * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)

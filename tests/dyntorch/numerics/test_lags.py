@@ -7,6 +7,7 @@ import torch
 from dyntorch.numerics import lags
 from dyntorch.numerics import lags as correlation
 from dyntorch.numerics.lags import correlate
+from tests.grid import grid
 
 WINDOWS = [
     (6, 6, None),
@@ -57,8 +58,9 @@ def test_products_equal_the_loop(frames1, frames2, window):
     assert_same(lags.lag_products(a[0, 0], b, window)[1, 1], products(a[0, 0], b[1, 1], window))  # batches broadcast
 
 
-@pytest.mark.parametrize("window", [(-40, 30), (20, 45), (-60, -7), (0, 0)])
-@pytest.mark.parametrize(("frames1", "frames2"), [(20000, 20000), (18000, 21000), (21000, 17500)])
+@grid(
+    ("window", [(-40, 30), (20, 45), (-60, -7), (0, 0)]), (("frames1", "frames2"), [(20000, 20000), (18000, 21000), (21000, 17500)])
+)
 def test_blocks_of_long_takes_equal_the_loop(frames1, frames2, window):
     a, b = normal(0, frames1, 2), normal(1, frames2, 2)
     assert correlation._lengths(frames1, frames2, *window)[1] < frames1 / 3
@@ -230,19 +232,21 @@ def test_compression_keeps_what_is_above_the_noise():
 X = torch.zeros(4, 3, 2)
 
 
-@pytest.mark.parametrize(
-    ("call", "match"),
-    [
-        (lambda: lags.lag_products(torch.zeros(0, 2), torch.zeros(3, 2)), r"at least one frame"),
-        (lambda: lags.lag_products(torch.zeros(3), torch.zeros(3, 2)), r"at least one frame"),
-        (lambda: lags.lag_products(torch.zeros(3, 2), torch.zeros(3, 2), (2, 1)), r"first <= last, got \(2, 1\)"),
-        (lambda: lags.epipolar_moments(X, X[:, :2]), r"same points in both cameras"),
-        (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), torch.ones(3, 3))), r"weights must be \(4, 3\)"),
-        (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), -torch.ones(4, 3))), r"not negative"),
-        (lambda: lags.lag_covariances(X[0], X[0], weights=(torch.ones(2), torch.ones(3))), r"weights must be .*one per frame"),
-        (lambda: lags.compress(X), r"either rank or noise"),
-        (lambda: lags.compress(X, rank=3), r"rank must be from 1 to the 2 rows, got 3"),
-    ],
+@grid(
+    (
+        ("call", "match"),
+        [
+            (lambda: lags.lag_products(torch.zeros(0, 2), torch.zeros(3, 2)), r"at least one frame"),
+            (lambda: lags.lag_products(torch.zeros(3), torch.zeros(3, 2)), r"at least one frame"),
+            (lambda: lags.lag_products(torch.zeros(3, 2), torch.zeros(3, 2), (2, 1)), r"first <= last, got \(2, 1\)"),
+            (lambda: lags.epipolar_moments(X, X[:, :2]), r"same points in both cameras"),
+            (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), torch.ones(3, 3))), r"weights must be \(4, 3\)"),
+            (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), -torch.ones(4, 3))), r"not negative"),
+            (lambda: lags.lag_covariances(X[0], X[0], weights=(torch.ones(2), torch.ones(3))), r"weights must be .*one per frame"),
+            (lambda: lags.compress(X), r"either rank or noise"),
+            (lambda: lags.compress(X, rank=3), r"rank must be from 1 to the 2 rows, got 3"),
+        ],
+    )
 )
 def test_misuse_says_what_to_do(call, match):
     with pytest.raises(ValueError, match=match):

@@ -6,6 +6,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from dyntorch.numerics import eigenspaces, null_space_gradient, nullspace
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
+from tests.grid import grid
 
 aten = torch.ops.aten
 
@@ -67,10 +68,7 @@ def accelerator(monkeypatch):
 # --- values
 
 
-@pytest.mark.parametrize("size", [4, 9, 27, 36])
-@pytest.mark.parametrize("extra", [0, 1, 7, 60])
-@pytest.mark.parametrize("dim", [1, 3])
-@pytest.mark.parametrize("batch", [1, 24])
+@grid(("size", [4, 9, 27, 36]), ("extra", [0, 1, 7, 60]), ("dim", [1, 3]), ("batch", [1, 24]))
 def test_spans_what_the_svd_spans(size, extra, dim, batch):
     matrix, expected = with_spectrum(noisy_spectrum(size, dim), size - dim + extra, batch, seed=size + extra)
     basis = null_space(matrix, dim)
@@ -92,8 +90,7 @@ def test_gram_gives_the_same_space_with_its_eigenvalues(dim):
     torch.testing.assert_close(found.basis @ gram, found.residual[..., None] * found.basis, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("ratio", [1e-8, 0.3, 0.6, 0.9, 0.99, 0.9999])
-@pytest.mark.parametrize("dim", [1, 4])
+@grid(("ratio", [1e-8, 0.3, 0.6, 0.9, 0.99, 0.9999]), ("dim", [1, 4]))
 def test_close_competitors_are_told_apart(ratio, dim):
     spectrum = noisy_spectrum(27, dim, kappa=30, ratio=ratio)
     matrix, expected = with_spectrum(spectrum, 60, batch=50, seed=3)
@@ -102,7 +99,7 @@ def test_close_competitors_are_told_apart(ratio, dim):
     assert angle(gram_null_space(matrix.mT @ matrix, dim).basis, expected[:, -dim:]).max() < limit
 
 
-@pytest.mark.parametrize(("kappa", "limit"), [(1e1, 1e-12), (1e3, 1e-10), (1e5, 1e-9), (1e7, 1e-7), (1e9, 1e-5)])
+@grid((("kappa", "limit"), [(1e1, 1e-12), (1e3, 1e-10), (1e5, 1e-9), (1e7, 1e-7), (1e9, 1e-5)]))
 def test_rows_lose_no_more_than_the_svd(kappa, limit):
     matrix, expected = with_spectrum(noisy_spectrum(27, 1, kappa), 54, batch=30, seed=4)
     assert angle(null_space(matrix), expected[:, -1:]).max() < limit
@@ -143,8 +140,7 @@ def test_no_rows_leave_everything():
     torch.testing.assert_close(projector(basis), torch.eye(4, dtype=torch.float64).expand(3, -1, -1))
 
 
-@pytest.mark.parametrize("scale", [1e-140, 1e-20, 1e20, 1e140, 1e200])
-@pytest.mark.parametrize("rows", [26, 40])
+@grid(("scale", [1e-140, 1e-20, 1e20, 1e140, 1e200]), ("rows", [26, 40]))
 def test_units_do_not_matter(scale, rows):
     matrix, expected = with_spectrum(noisy_spectrum(27, 1), rows)
     assert angle(null_space(matrix * scale), expected[:, -1:]).max() < 1e-10
@@ -161,8 +157,7 @@ def test_closed_form_of_a_plane():
 # --- the contract
 
 
-@pytest.mark.parametrize("rows", [8, 30])
-@pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 5), (2, 3, 4)])
+@grid(("rows", [8, 30]), ("batch", [(), (1,), (3,), (2, 5), (2, 3, 4)]))
 def test_batch_equals_loop_including_signs(rows, batch):
     matrix = random(*batch, rows, 9, seed=rows)
     basis = null_space(matrix)
@@ -221,8 +216,7 @@ def test_one_bad_problem_leaves_the_others_alone(value, rows, batch):
     assert found.residual.isfinite().all() and found.competing.isfinite().all()
 
 
-@pytest.mark.parametrize("batch", [2, 30])
-@pytest.mark.parametrize(("size", "rank"), [(9, 7), (27, 25), (27, 10), (64, 62), (64, 1)])
+@grid(("batch", [2, 30]), (("size", "rank"), [(9, 7), (27, 25), (27, 10), (64, 62), (64, 1)]))
 def test_a_null_space_that_is_larger_is_reported(batch, size, rank):
     matrix = random(batch, 100, rank, seed=1) @ random(batch, rank, size, seed=2)
     gram = matrix.mT @ matrix
@@ -232,8 +226,7 @@ def test_a_null_space_that_is_larger_is_reported(batch, size, rank):
     assert not gram_null_space(gram, size - rank).degenerate.any()
 
 
-@pytest.mark.parametrize("batch", [2, 30])
-@pytest.mark.parametrize("size", [9, 27, 64])
+@grid(("batch", [2, 30]), ("size", [9, 27, 64]))
 def test_bad_conditioning_is_not_a_larger_null_space(batch, size):
     spectra = [
         noisy_spectrum(size, 1, 1e6, ratio=1e-3),
@@ -314,10 +307,10 @@ def test_misuse_is_refused():
 # --- gradients
 
 
-@pytest.mark.parametrize(
-    ("rows", "size", "dim"), [(8, 9, 1), (12, 9, 1), (60, 27, 1), (26, 27, 1), (20, 12, 4), (8, 12, 4), (10, 12, 4)]
+@grid(
+    (("rows", "size", "dim"), [(8, 9, 1), (12, 9, 1), (60, 27, 1), (26, 27, 1), (20, 12, 4), (8, 12, 4), (10, 12, 4)]),
+    ("batch", [2, 6]),
 )
-@pytest.mark.parametrize("batch", [2, 6])
 def test_gradient_of_the_projector(rows, size, dim, batch):
     matrix = with_spectrum(noisy_spectrum(size, dim, kappa=5, ratio=0.3), rows, batch)[0].requires_grad_()
     assert gradient_holds(lambda a: projector(null_space(a, dim)), matrix)
@@ -405,8 +398,7 @@ def gauge_free(basis):
     return (projector(basis) @ fixed).square().sum(-2)
 
 
-@pytest.mark.parametrize("batch", [1, 4])
-@pytest.mark.parametrize(("rows", "size", "dim"), [(8, 9, 1), (12, 9, 1), (40, 27, 1), (8, 12, 4), (12, 8, 3)])
+@grid(("batch", [1, 4]), (("rows", "size", "dim"), [(8, 9, 1), (12, 9, 1), (40, 27, 1), (8, 12, 4), (12, 8, 3)]))
 def test_second_derivatives(rows, size, dim, batch):
     matrix = with_spectrum(noisy_spectrum(size, dim, kappa=5, ratio=0.3), rows, batch)[0].requires_grad_()
     for function in (lambda a: gauge_free(null_space(a, dim)), lambda a: gauge_free(gram_null_space(a.mT @ a, dim).basis)):
@@ -461,7 +453,7 @@ def test_torch_func_agrees_with_autograd(rows, dim):
 # --- accelerators
 
 
-@pytest.mark.parametrize(("rows", "dim"), [(26, 1), (60, 1), (60, 4), (23, 4)])
+@grid((("rows", "dim"), [(26, 1), (60, 1), (60, 4), (23, 4)]))
 def test_nothing_waits_for_an_accelerator(accelerator, rows, dim):
     matrix, expected = with_spectrum(noisy_spectrum(27, dim), rows)
     matrix[3, 0, 0] = torch.nan

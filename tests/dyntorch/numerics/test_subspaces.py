@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dyntorch.numerics import canonical_correlation, orthonormal_basis
+from tests.grid import grid
 
 
 def random(*shape, seed=0, dtype=torch.float64):
@@ -22,8 +23,7 @@ def affine_views(seed, count=2, points=40):
     return (shape - shape.mean(0)) @ random(count, 3, 2, seed=seed + 1000)
 
 
-@pytest.mark.parametrize("columns", [1, 2, 3])
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+@grid(("columns", [1, 2, 3]), ("batch", [(), (5,), (2, 3)]))
 def test_basis_spans_the_columns(batch, columns):
     matrix = random(*batch, 30, columns, seed=columns)
     basis = orthonormal_basis(matrix)

@@ -7,6 +7,7 @@ from torch.nn.functional import normalize
 from dyntorch.geometry.extensors import compound, plucker, plucker_form
 from dyntorch.geometry.homogeneous import apply, homogeneous, hyperplanes_through, unit
 from dyntorch.scenes import collineation, constant_velocity, lines_concurrent, moving_points, planar, translating_lines, two_view
+from tests.grid import grid
 
 THREE_VIEWS = [planar, lines_concurrent, moving_points, constant_velocity]
 LABELLED = [*THREE_VIEWS, translating_lines]
@@ -179,24 +180,26 @@ def design_of(name, scene):
     return rows(*x)
 
 
-@pytest.mark.parametrize(
-    ("name", "scene", "expected"),
-    [
-        ("homography", lambda g: planar(60, generator=g), 26),
-        ("homography", lambda g: planar(60, static=1.0, generator=g), 10),
-        ("homography", lambda g: planar(20, static=0.5, generator=g), 20),
-        ("join", lambda g: moving_points(120, generator=g), 60),
-        ("join", lambda g: moving_points(120, static=1.0, generator=g), 20),
-        ("minimal_join", lambda g: moving_points(120, generator=g), 47),
-        ("constant_velocity", lambda g: constant_velocity(60, generator=g), 63),
-        ("constant_velocity", lambda g: constant_velocity(21, generator=g), 63),
-        ("constant_velocity", lambda g: constant_velocity(60, camera=True, generator=g), 47),
-        ("constant_velocity", lambda g: constant_velocity(60, static=1.0, generator=g), 36),
-        ("constant_velocity", lambda g: constant_velocity(60, velocities="equal", generator=g), 36),
-        ("constant_velocity", lambda g: constant_velocity(60, velocities="linear", generator=g), 49),
-        ("constant_velocity", lambda g: constant_velocity(60, velocities="planar", generator=g), 58),
-        ("fundamental", lambda g: two_view(60, generator=g), 8),
-    ],
+@grid(
+    (
+        ("name", "scene", "expected"),
+        [
+            ("homography", lambda g: planar(60, generator=g), 26),
+            ("homography", lambda g: planar(60, static=1.0, generator=g), 10),
+            ("homography", lambda g: planar(20, static=0.5, generator=g), 20),
+            ("join", lambda g: moving_points(120, generator=g), 60),
+            ("join", lambda g: moving_points(120, static=1.0, generator=g), 20),
+            ("minimal_join", lambda g: moving_points(120, generator=g), 47),
+            ("constant_velocity", lambda g: constant_velocity(60, generator=g), 63),
+            ("constant_velocity", lambda g: constant_velocity(21, generator=g), 63),
+            ("constant_velocity", lambda g: constant_velocity(60, camera=True, generator=g), 47),
+            ("constant_velocity", lambda g: constant_velocity(60, static=1.0, generator=g), 36),
+            ("constant_velocity", lambda g: constant_velocity(60, velocities="equal", generator=g), 36),
+            ("constant_velocity", lambda g: constant_velocity(60, velocities="linear", generator=g), 49),
+            ("constant_velocity", lambda g: constant_velocity(60, velocities="planar", generator=g), 58),
+            ("fundamental", lambda g: two_view(60, generator=g), 8),
+        ],
+    )
 )
 def test_ranks_are_those_of_the_theory(name, scene, expected):
     assert rank(design_of(name, scene(seeded(3)))) == expected
@@ -299,19 +302,21 @@ def test_single_precision_is_the_rounded_scene(function):
     assert moved.extras["moving"].dtype == torch.bool
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: planar(0), "n >= 1"),
-        (lambda: planar(5, sigma=-1.0), "sigma must be"),
-        (lambda: planar(5, static=1.5), "static is a share"),
-        (lambda: two_view(5, outliers=-0.1), "outliers is a share"),
-        (lambda: moving_points(5, sensors="lens"), "sensors must be"),
-        (lambda: constant_velocity(5, velocities="fast"), "velocities must be"),
-        (lambda: translating_lines(5, motion="fast"), "motion must be"),
-        (lambda: translating_lines(5, objects=0), "objects must be"),
-        (lambda: collineation(0), "dim must be"),
-    ],
+@grid(
+    (
+        ("call", "message"),
+        [
+            (lambda: planar(0), "n >= 1"),
+            (lambda: planar(5, sigma=-1.0), "sigma must be"),
+            (lambda: planar(5, static=1.5), "static is a share"),
+            (lambda: two_view(5, outliers=-0.1), "outliers is a share"),
+            (lambda: moving_points(5, sensors="lens"), "sensors must be"),
+            (lambda: constant_velocity(5, velocities="fast"), "velocities must be"),
+            (lambda: translating_lines(5, motion="fast"), "motion must be"),
+            (lambda: translating_lines(5, objects=0), "objects must be"),
+            (lambda: collineation(0), "dim must be"),
+        ],
+    )
 )
 def test_misuse_is_named(call, message):
     with pytest.raises(ValueError, match=message):
