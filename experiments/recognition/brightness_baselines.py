@@ -25,8 +25,7 @@ from indexing.brightness.footage import Shrinker
 from indexing.brightness.library import VideoExemplars, library
 from indexing.brightness.sight import SMALLEST, described
 from indexing.brightness.stream import Warping
-from indexing.sync.brightness_features import boxes, crop, inverse_root, motion, window_kernels
-from indexing.sync.options import KernelOptions, SyncOptions
+from indexing.sync.brightness_features import CROP_SIDE, boxes, crop, inverse_root, motion, window_kernels
 from indexing.video import Chunk, track_points
 
 Frames = NDArray[np.uint8]
@@ -42,7 +41,7 @@ CEILING = 1.05  # of scores in the log: as for the brightness indexer
 def cropped(frames: Frames, fps: float) -> Tensor:
     """``(F, 96, 96)`` crops in 0..1."""
     source = torch.from_numpy(frames)
-    return crop(source, boxes(motion(source), fps)[0], SyncOptions().box.side)
+    return crop(source, boxes(motion(source), fps)[0], CROP_SIDE)
 
 
 def activity(frames: Frames, fps: float) -> Tensor:
@@ -155,6 +154,5 @@ class WindowKernels(FrameNearest):
 
     def _kernels(self, frames: Frames) -> Tensor:
         """``(F, 11, 11)`` about frame t - 5; 0 before frame 10."""
-        options = SyncOptions(kernel=KernelOptions(half=HALF, patch=PATCH))
-        found = window_kernels(Shrinker("video", SIZE, SMALLEST)(frames) / 255, options)
+        found = window_kernels(Shrinker("video", SIZE, SMALLEST)(frames) / 255, half=HALF, patch=PATCH)
         return torch.cat([found.new_zeros(len(frames) - len(found), *found.shape[1:]), found])

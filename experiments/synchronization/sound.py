@@ -7,7 +7,7 @@ A source (claps, speech-like noise in syllables, steps, music of random notes on
 microphones at 1 to 6 metres, each with its own reverberation (.2 to .8 s; direct sound 3 dB below to 6 dB above it), frequency
 response, level, noise at 10, 0 or -5 dB, and clock: one at 48 kHz, the other at 44.1 kHz and up to 50 ppm off, up to 20 s later or
 earlier.  Recordings last 60 s where nothing else is said.  *Unrelated* pairs are microphones that heard different sounds of one
-kind, or of two; none of them may be believed.  Seeds below 100 chose the constants of ``indexing.sync.options.SoundOptions``; the
+kind, or of two; none of them may be believed.  Seeds below 100 chose the constants of ``indexing.sync.sound``; the
 figures are of others.
 """
 

@@ -59,13 +59,13 @@ def find_breaks(
     *,
     calibration: Any = None,
     max_shift: float | None = None,
-    options: SyncOptions = SyncOptions(),
+    options: SyncOptions | None = None,
 ) -> Mended | None:
     """Where the clocks of cameras broke; None where they did not, or where nothing tells: other joints in each, or no
     keypoints. compared ``(i, j)``."""
     import dyntorch
 
-    people = _people(takes, compared, options)
+    people = _people(takes, compared)
     if people is None:
         return None
     lens = lenses(calibration, [take.name for take in takes])
@@ -75,7 +75,7 @@ def find_breaks(
         "weights": tuple(torch.from_numpy(_trust(clip)) for clip in people) if known else None,
         "calibration": lens.values if lens else None,
         "max_shift": max_shift,
-        "options": options.points,
+        "options": (options or SyncOptions()).of_points,
     }
     tracks = [torch.from_numpy(np.array(clip.joints, dtype=np.float64)) for clip in people]
     if together is None:
@@ -93,7 +93,7 @@ def find_breaks(
     )
 
 
-def _people(takes: Sequence[Take], compared: Mapping[tuple[int, int], Pairing], options: SyncOptions) -> list[Clip] | None:
+def _people(takes: Sequence[Take], compared: Mapping[tuple[int, int], Pairing]) -> list[Clip] | None:
     """The person of each camera, with joints that all of them have; None where they have other ones."""
     if any(take.kind != "keypoints" or take.spatial for take in takes):
         return None
@@ -103,10 +103,10 @@ def _people(takes: Sequence[Take], compared: Mapping[tuple[int, int], Pairing], 
         chosen.append(take.people[max(mine)[1]])
     first = chosen[0]
     for clip in chosen[1:]:
-        first, _, same, _ = common_joints(first, clip, options=options)
+        first, _, same, _ = common_joints(first, clip)
         if not same:
             return None
-    return [common_joints(first, clip, options=options)[1] for clip in chosen]
+    return [common_joints(first, clip)[1] for clip in chosen]
 
 
 def _trust(clip: Clip) -> Floats:

@@ -12,8 +12,10 @@ from torch.nn.functional import max_pool1d
 
 from dyntorch import Shift
 from dyntorch.core import Notice, status_from
-from dyntorch.numerics import Message, check_options, on_cpu, one_thread
+from dyntorch.numerics import Message, on_cpu, one_thread
 from indexing.sync.brightness_features import (
+    KERNEL_HALF_FRAMES,
+    MIN_FRAMES,
     GrayTake,
     Region,
     Sampled,
@@ -26,7 +28,7 @@ from indexing.sync.brightness_features import (
     whitened,
 )
 from indexing.sync.notices import BrightnessNotice
-from indexing.sync.options import MEASURES, Measure, SyncOptions, VerdictOptions
+from indexing.sync.options import MEASURES, Measure
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Two sequences of unit vectors against each other at all lags: scores, and the peaks of their curve.
@@ -87,20 +89,26 @@ class Curve:
         return max(-0.5, min(0.5, (left - right) / (2 * bend))) if -torch.inf < bend < 0 else 0.0
 
 
-def score_curve(a: Tensor, b: Tensor, least: float, options: SyncOptions = SyncOptions()) -> Curve:
+OVERLAP_POWER = 0.35  # Exponent of the overlap in the score: a mean alone (0) prefers chance agreement in short overlaps.
+
+
+def score_curve(a: Tensor, b: Tensor, least: float) -> Curve:
     r"""Scores at all lags. a, b ``(n, D)``."""
     counts = lag_sums(*(x.abs().sum(1, keepdim=True).gt(0).double() for x in (a, b))).round()
     known = counts >= max(least, 1.0)
     mean = lag_sums(a, b) / counts.clamp(min=1.0)
-    scores = mean * (counts / counts.max().clamp(min=1.0)) ** options.lags.power
+    scores = mean * (counts / counts.max().clamp(min=1.0)) ** OVERLAP_POWER
     lags = torch.arange(-(len(a) - 1), len(b), device=a.device)
     return Curve(lags, scores.masked_fill(~known, -torch.inf), counts)
 
 
-def part_curve(a: Tensor, b: Tensor, rows: slice, options: SyncOptions = SyncOptions()) -> Curve:
+MIN_HALF_OVERLAP_SHARE = 0.5  # Share of a half.
+
+
+def part_curve(a: Tensor, b: Tensor, rows: slice) -> Curve:
     """The curve of a part of the first sequence against all of the second."""
     part = a[rows]
-    curve = score_curve(part, b, options.lags.part_overlap * len(part), options=options)
+    curve = score_curve(part, b, MIN_HALF_OVERLAP_SHARE * len(part))
     return Curve(curve.lags - rows.start, curve.scores, curve.counts)
 
 
@@ -110,40 +118,63 @@ def part_curve(a: Tensor, b: Tensor, rows: slice, options: SyncOptions = SyncOpt
 # Two takes of similar motion have a best lag too, but moment by moment the best lag wanders; of one motion it stays.
 
 
-def windows(a: Tensor, b: Tensor, lag: int, options: SyncOptions = SyncOptions()) -> Tensor:
+WINDOW_FRAMES = 16  # Frames of a window.
+WINDOW_HOP_FRAMES = 8  # From one window to the next.
+WINDOW_LAG_RANGE = 12  # Lags on either side of the candidate.
+MIN_KNOWN_SHARE = 0.75  # Share of a window's pairs of frames that must be known.
+
+
+def windows(a: Tensor, b: Tensor, lag: int) -> Tensor:
     """``(windows, 2 reach + 1)`` mean cosines in windows of the overlap at lags about ``lag``; NaN: less than 3/4 known."""
     low, high = max(0, -lag), min(len(a), len(b) - lag)
     rows = torch.arange(low, max(high, low), device=a.device)
-    columns = rows[:, None] + lag + torch.arange(-options.windows.reach, options.windows.reach + 1, device=a.device)
+    columns = rows[:, None] + lag + torch.arange(-WINDOW_LAG_RANGE, WINDOW_LAG_RANGE + 1, device=a.device)
     inside = (columns >= 0) & (columns < len(b))
     seen_a, seen_b = (x.abs().sum(1) > 0 for x in (a, b))
     columns = columns.clamp(0, len(b) - 1)
     known = inside & seen_a[rows, None] & seen_b[columns]
-    values = torch.stack([(a[rows] * b[columns[:, k]]).sum(1) for k in range(2 * options.windows.reach + 1)], dim=1) * known
-    size = min(options.windows.size, len(rows))
+    values = torch.stack([(a[rows] * b[columns[:, k]]).sum(1) for k in range(2 * WINDOW_LAG_RANGE + 1)], dim=1) * known
+    size = min(WINDOW_FRAMES, len(rows))
     if size == 0:
-        return values.new_full((1, 2 * options.windows.reach + 1), torch.nan)
-    total = values.unfold(0, size, options.windows.hop).sum(-1)
-    count = known.double().unfold(0, size, options.windows.hop).sum(-1)
-    return torch.where(count >= options.windows.known * size, total / count.clamp(min=1), torch.nan)
+        return values.new_full((1, 2 * WINDOW_LAG_RANGE + 1), torch.nan)
+    total = values.unfold(0, size, WINDOW_HOP_FRAMES).sum(-1)
+    count = known.double().unfold(0, size, WINDOW_HOP_FRAMES).sum(-1)
+    return torch.where(count >= MIN_KNOWN_SHARE * size, total / count.clamp(min=1), torch.nan)
 
 
-def evidence(a: Tensor, b: Tensor, lag: int, options: SyncOptions = SyncOptions()) -> float:
+WINDOW_LAG_TOLERANCE = 1  # Lags within which a window speaks for the candidate.
+SOFTMAX_SHARPNESS = 10.0  # Of mean cosines (AUC of right against wrong candidates at 10 / 20 / 40: .926 / .904 / .892).
+OUTLIER_SHARE = 0.05  # Share of windows that may say anything.
+
+
+def evidence(a: Tensor, b: Tensor, lag: int) -> float:
     r"""Nats that the windows of the overlap speak for ``lag`` (within one) rather than for any of the lags around it. a, b
     ``(n, D)``."""
-    means = windows(a, b, lag, options=options)
+    means = windows(a, b, lag)
     known = means.isfinite()
-    share = torch.softmax(torch.where(known, options.windows.sharpness * means, -torch.inf), dim=1)
-    near = share[:, options.windows.reach - options.windows.tolerance : options.windows.reach + options.windows.tolerance + 1].sum(
-        1
-    )
-    chance = (2 * options.windows.tolerance + 1) / known.sum(1).clamp(min=1).double()
-    nats = torch.log((1 - options.windows.outlier) * near / chance + options.windows.outlier)
-    return float(nats[known.sum(1) > options.windows.reach].sum())
+    share = torch.softmax(torch.where(known, SOFTMAX_SHARPNESS * means, -torch.inf), dim=1)
+    near = share[:, WINDOW_LAG_RANGE - WINDOW_LAG_TOLERANCE : WINDOW_LAG_RANGE + WINDOW_LAG_TOLERANCE + 1].sum(1)
+    chance = (2 * WINDOW_LAG_TOLERANCE + 1) / known.sum(1).clamp(min=1).double()
+    nats = torch.log((1 - OUTLIER_SHARE) * near / chance + OUTLIER_SHARE)
+    return float(nats[known.sum(1) > WINDOW_LAG_RANGE].sum())
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Whether the best lag may be believed: what else must hold besides being the best.
+
+
+# Nats of evidence and lead that are enough: of 235 pairs of one event 67 right ones pass and 1 wrong one (by 2 frames), of 1,175
+# unrelated or reversed ones none; of the window kernel alone 22 of 144 and none of 576.
+MIN_EVIDENCE = {"profile": 31.0, "window": 25.0}
+# Centre and scale, in nats, of the logistic curve of confidence where halves and kernel agree, and where they do not.
+AGREED_LOGISTIC = {"profile": (16.5, 6.2), "window": (12.1, 4.0)}
+OPEN_LOGISTIC = {"profile": (23.3, 4.9), "window": (112.0, 38.0)}
+
+
+AGREEMENT_FRAMES = 2  # Within this halves and kernel agree with the best lag.
+MAX_SECOND_SCORE = 0.8  # Second peak over the best one above which the motion is periodic.
+MAX_REVERSED_SCORE = 0.95  # Score of the time-reversed video over the best one.
+LEAD_NATS = 30.0  # Nats for doing better than the time-reversed video by 100 %.
 
 
 @dataclass(frozen=True)
@@ -157,31 +188,31 @@ class Verdict:
     second: float  # score of the next peak relative to the best
     backwards: float  # score of the best lag of b played backwards, relative
     nats: float  # evidence of short windows, profile and kernel
-    options: VerdictOptions  # what is enough
+    measure: Measure = "profile"
 
     @property
     def weight(self) -> float:
-        """Evidence with the lead over the reversed take, in nats; ``options.enough`` is enough."""
-        return self.nats + self.options.lead * (1 - min(self.backwards, 2.0))
+        """Evidence with the lead over the reversed take, in nats; ``MIN_EVIDENCE`` is enough."""
+        return self.nats + LEAD_NATS * (1 - min(self.backwards, 2.0))
 
     @property
     def agreed(self) -> bool:
         """Whether halves and kernel agree with the best lag."""
-        tolerance = self.options.tolerance
+        tolerance = AGREEMENT_FRAMES
         halves = all(abs(half - self.best) <= tolerance for half in self.halves)
         return halves and self.kernel is not None and abs(self.kernel - self.best) <= tolerance
 
     @property
     def confidence(self) -> float:
         """Probability that the best lag is right to within a frame."""
-        options = self.options
-        centre, scale = options.agreed if self.agreed and self.second <= options.second else options.open
+        table = AGREED_LOGISTIC if self.agreed and self.second <= MAX_SECOND_SCORE else OPEN_LOGISTIC
+        centre, scale = table[self.measure]
         return 1 / (1 + math.exp(-max(-30.0, min(30.0, (self.weight - centre) / scale))))
 
     def refusal(self, rate: float) -> Notice | None:
         """Why the best lag is not to be believed; None where it is."""
-        tolerance = self.options.tolerance
-        if self.second > self.options.second:
+        tolerance = AGREEMENT_FRAMES
+        if self.second > MAX_SECOND_SCORE:
             return Notice(BrightnessNotice.REPEATED, 100 * self.second)
         if max(self.halves) - min(self.halves) > tolerance or any(abs(half - self.best) > tolerance for half in self.halves):
             first, second = ((half - self.best) / rate for half in self.halves)
@@ -190,11 +221,14 @@ class Verdict:
             return Notice(BrightnessNotice.KERNEL, 0.0, {"case": "short"})
         if abs(self.kernel - self.best) > tolerance:
             return Notice(BrightnessNotice.KERNEL, (self.kernel - self.best) / rate, {"case": "apart"})
-        if self.backwards > self.options.backwards:
+        if self.backwards > MAX_REVERSED_SCORE:
             return Notice(BrightnessNotice.BACKWARDS, self.backwards)
-        if self.weight < self.options.enough:
-            return Notice(BrightnessNotice.EVIDENCE, self.weight, {"needed": self.options.enough})
+        if self.weight < MIN_EVIDENCE[self.measure]:
+            return Notice(BrightnessNotice.EVIDENCE, self.weight, {"needed": MIN_EVIDENCE[self.measure]})
         return None
+
+
+MIN_PEAK_SEPARATION_FRAMES = 8  # From the best peak, for another answer.
 
 
 def judge(
@@ -203,32 +237,32 @@ def judge(
     lags: tuple[int, int],
     least: float,
     measure: Measure = "profile",
-    options: SyncOptions = SyncOptions(),
 ) -> Verdict:
     """The best lag of two takes between ``lags``, with at least ``least`` rows of overlap, and what else speaks for it."""
     compare = whitened if measure == "profile" else kernel_descriptors
-    needed = options.verdict if measure == "profile" else options.window_verdict
-    one, two = compare(*_rows(a, b, measure), options=options)
-    curve = score_curve(one, two, least, options=options).within(*lags)
+    one, two = compare(*_rows(a, b, measure))
+    curve = score_curve(one, two, least).within(*lags)
     if not bool(curve.scores.isfinite().any()):  # nothing moves in one of them
         nowhere = max(lags[0], min(0, lags[1]))
-        return Verdict(curve, nowhere, (nowhere, nowhere), None, 1.0, 1.0, 0.0, needed)
+        return Verdict(curve, nowhere, (nowhere, nowhere), None, 1.0, 1.0, 0.0, measure)
     best = curve.best
     others = [
-        float(curve.scores[k]) for k in curve.peaks(options.lags.apart // 2) if abs(int(curve.lags[k]) - best) > options.lags.apart
+        float(curve.scores[k])
+        for k in curve.peaks(MIN_PEAK_SEPARATION_FRAMES // 2)
+        if abs(int(curve.lags[k]) - best) > MIN_PEAK_SEPARATION_FRAMES
     ]
     top = max(curve.at(best), 1e-9)
-    kernel, nats = _kernel_opinion(a, b, lags, best, options) if measure == "profile" else (best, 0.0)
-    back = score_curve(*compare(*_rows(a, b.backwards(), measure), options=options), least, options=options)
+    kernel, nats = _kernel_opinion(a, b, lags, best) if measure == "profile" else (best, 0.0)
+    back = score_curve(*compare(*_rows(a, b.backwards(), measure)), least)
     return Verdict(
         curve=curve,
         best=best,
-        halves=_halves(one, two, best, lags, options),
+        halves=_halves(one, two, best, lags),
         kernel=kernel,
         second=max([*others, 0.0]) / top,
         backwards=float(back.scores.max()) / top,
-        nats=evidence(one, two, best, options=options) + nats,
-        options=needed,
+        nats=evidence(one, two, best) + nats,
+        measure=measure,
     )
 
 
@@ -237,25 +271,30 @@ def _rows(a: Sampled, b: Sampled, measure: Measure) -> tuple[Tensor, Tensor]:
     return (a.profile, b.profile) if measure == "profile" else (a.kernels, b.kernels)
 
 
-def _halves(one: torch.Tensor, two: torch.Tensor, best: int, lags: tuple[int, int], options: SyncOptions) -> tuple[int, int]:
+def _halves(one: torch.Tensor, two: torch.Tensor, best: int, lags: tuple[int, int]) -> tuple[int, int]:
     low, high = max(0, -best), min(len(one), len(two) - best)
     middle = (low + high) // 2
-    first, second = (
-        part_curve(one, two, rows, options=options).within(*lags).best for rows in (slice(low, middle), slice(middle, high))
-    )
+    first, second = (part_curve(one, two, rows).within(*lags).best for rows in (slice(low, middle), slice(middle, high)))
     return first, second
 
 
-def _kernel_opinion(a: Sampled, b: Sampled, lags: tuple[int, int], best: int, options: SyncOptions) -> tuple[int | None, float]:
+MIN_KERNEL_OVERLAP_SHARE = 0.3  # Share of its kernels.
+MIN_KERNELS = 5  # Pairs of kernels from which their windows count.
+
+
+def _kernel_opinion(a: Sampled, b: Sampled, lags: tuple[int, int], best: int) -> tuple[int | None, float]:
     """Best lag of the window kernels, and the evidence of their windows for ``best``."""
     shorter = min(len(a.kernels), len(b.kernels))
-    if shorter < options.kernel.half or not all(bool(x.kernels.isfinite().all(-1).all(-1).any()) for x in (a, b)):
+    if shorter < KERNEL_HALF_FRAMES or not all(bool(x.kernels.isfinite().all(-1).all(-1).any()) for x in (a, b)):
         return None, 0.0
-    one, two = kernel_descriptors(a.kernels, b.kernels, options=options)
-    curve = score_curve(one, two, options.lags.kernel_overlap * shorter, options=options).within(*lags)
+    one, two = kernel_descriptors(a.kernels, b.kernels)
+    curve = score_curve(one, two, MIN_KERNEL_OVERLAP_SHARE * shorter).within(*lags)
     found = curve.best if bool(curve.scores.isfinite().any()) else None
     overlap = min(len(one), len(two) - best) - max(0, -best)
-    return found, evidence(one, two, best, options=options) if overlap >= options.windows.fewest_kernels else 0.0
+    return found, evidence(one, two, best) if overlap >= MIN_KERNELS else 0.0
+
+
+MIN_OVERLAP_SHARE = 0.35  # Share of the shorter video.
 
 
 @on_cpu
@@ -269,32 +308,30 @@ def brightness_shift(
     max_shift: float | None = None,
     region: str | Region | None = "motion",
     measure: Measure = "profile",
-    options: SyncOptions = SyncOptions(),
 ) -> Shift:
     r"""How camera b's clock runs against camera a's, from brightness alone, or why that cannot be told. a ``(frames, h, w)``."""
-    check_options(options, SyncOptions)
     if measure not in MEASURES:
         raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
-    first, second = _takes(a, b, fps, times, options)
+    first, second = _takes(a, b, fps, times)
     if max_shift is not None and not (math.isfinite(max_shift) and max_shift >= 0):
         raise ValueError(f"max_shift must be seconds, 0 or more, got {max_shift!r}")
-    rate = common_rate(first, second, options=options)
-    (one, of_a), (two, of_b) = (_prepared(each, region, rate, options) for each in (first, second))
+    rate = common_rate(first, second)
+    (one, of_a), (two, of_b) = (_prepared(each, region, rate) for each in (first, second))
     base = two.start - one.start
     lengths = [len(rows) for rows in _rows(one, two, measure)]
-    if measure == "window" and min(lengths) < options.kernel.half:
+    if measure == "window" and min(lengths) < KERNEL_HALF_FRAMES:
         text = "{arg:measure='window'} needs {needed} frames at {rate:.3g} per second, the shorter video has {frames}; film longer"
         shorter = min(len(one.profile), len(two.profile))
-        raise ValueError(Message(text, needed=3 * options.kernel.half, rate=rate, frames=shorter))
+        raise ValueError(Message(text, needed=3 * KERNEL_HALF_FRAMES, rate=rate, frames=shorter))
     span = (1 - lengths[0], lengths[1] - 1)
     if max_shift is not None:
         span = (
             max(span[0], math.ceil((-max_shift - base) * rate - 1e-6)),
             min(span[1], math.floor((max_shift - base) * rate + 1e-6)),
         )
-    lags, shorter = options.lags, min(lengths)
-    by_kernel = max(float(options.windows.fewest_kernels), lags.kernel_overlap * shorter)
-    least = max(float(options.gray.fewest), lags.overlap * shorter) if measure == "profile" else by_kernel
+    shorter = min(lengths)
+    by_kernel = max(float(MIN_KERNELS), MIN_KERNEL_OVERLAP_SHARE * shorter)
+    least = max(float(MIN_FRAMES), MIN_OVERLAP_SHARE * shorter) if measure == "profile" else by_kernel
     longest = min(lengths[0], lengths[1] - span[0]) - max(0, -span[1])
     if span[0] > span[1] or longest < least:
         text = (
@@ -302,34 +339,33 @@ def brightness_shift(
             "allow larger shifts or give longer videos"
         )
         raise ValueError(Message(text, given=max_shift, least=least, rate=rate))
-    verdict = judge(one, two, span, least, measure, options=options)
-    return _shift((first, second), (one, two), verdict, (*of_a, *of_b), options)
+    verdict = judge(one, two, span, least, measure)
+    return _shift((first, second), (one, two), verdict, (*of_a, *of_b))
 
 
-def _takes(
-    a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, Any] | None, options: SyncOptions
-) -> tuple[GrayTake, GrayTake]:
+def _takes(a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, Any] | None) -> tuple[GrayTake, GrayTake]:
     for name, pair in (("fps", fps), ("times", times)):
         if pair is not None and not (isinstance(pair, (tuple, list)) and len(pair) == 2):
             raise ValueError(f"{name} must be a pair, one for each video, got {pair!r}")
     rates, stamps = fps or (None, None), times or (None, None)
-    return take(a, "a", rates[0], stamps[0], options=options), take(b, "b", rates[1], stamps[1], options=options)
+    return take(a, "a", rates[0], stamps[0]), take(b, "b", rates[1], stamps[1])
 
 
-def _prepared(
-    source: GrayTake, region: str | Region | None, rate: float, options: SyncOptions
-) -> tuple[Sampled, tuple[Notice, ...]]:
+MIN_MOVING_FRAMES = 10  # Frames in which something moves.
+
+
+def _prepared(source: GrayTake, region: str | Region | None, rate: float) -> tuple[Sampled, tuple[Notice, ...]]:
     """A take on the grid, and why it decides nothing, or what else to know of it."""
     height, width = source.frames.shape[1:]
-    found = motion(source.frames, None if region is None else _inside(region, source), options=options)
-    box, moving = boxes(found, source.fps, options=options)
+    found = motion(source.frames, None if region is None else _inside(region, source))
+    box, moving = boxes(found, source.fps)
     if region is None:
         whole = torch.tensor([[width / 2, height / 2, max(width, height)]], dtype=torch.float64)
         box, moving = whole.expand(len(source.frames), 3), False
-    on_grid, values = sampled(source, box, rate, options=options), {"which": source.name, "camera": source.name}
+    on_grid, values = sampled(source, box, rate), {"which": source.name, "camera": source.name}
     if found.drift.hopeless:
         return on_grid, (Notice(BrightnessNotice.FLICKER, 0.0, values),)
-    if int(found.lively.sum()) < options.box.liveliest:
+    if int(found.lively.sum()) < MIN_MOVING_FRAMES:
         return on_grid, (Notice(BrightnessNotice.STILL, float(found.lively.sum()), values),)
     if found.drift.moves:
         step = float(found.drift.step.norm(dim=1).mean()) / source.scale
@@ -352,16 +388,19 @@ def _inside(region: str | Region, source: GrayTake) -> Region | None:
     return x0, y0, x1, y1
 
 
+NUM_PEAKS = 10  # Peaks that are returned.
+MIN_SIGMA_FRAMES = 0.35  # Error of an accepted offset: .24 to .32 RMS on shifts by quarters of a frame.
+
+
 def _shift(
     takes: tuple[GrayTake, GrayTake],
     grids: tuple[Sampled, Sampled],
     verdict: Verdict,
     known: tuple[Notice, ...],
-    options: SyncOptions,
 ) -> Shift:
     (one, two), curve, best = grids, verdict.curve, verdict.best
     rate, base = one.rate, two.start - one.start
-    found = curve.peaks(options.lags.apart // 2)[: options.lags.peaks]
+    found = curve.peaks(MIN_PEAK_SEPARATION_FRAMES // 2)[:NUM_PEAKS]
     places = torch.tensor([int(curve.lags[k]) + curve.offset(int(curve.lags[k])) for k in found], dtype=torch.float64)
     unusable = any(notice.code.refuses is not None for notice in known)
     refusal = None if unusable else verdict.refusal(rate)
@@ -370,7 +409,7 @@ def _shift(
     spread = max(abs(half - best) for half in verdict.halves) / 2
     return Shift(
         offset=base + (best + curve.offset(best)) / rate,
-        sigma=math.hypot(options.lags.floor, spread) / rate,
+        sigma=math.hypot(MIN_SIGMA_FRAMES, spread) / rate,
         rate=1.0,
         rate_sigma=0.0,
         confidence=0.0 if unusable else verdict.confidence,

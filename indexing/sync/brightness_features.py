@@ -17,7 +17,6 @@ from dyntorch.numerics import Message
 from indexing.brightness.features import as_grey, blur, gradients, slopes, weighted_differences
 from indexing.brightness.footage import SHRINKING_BLOCK as FOOTAGE_BLOCK
 from indexing.brightness.footage import Shrinker
-from indexing.sync.options import SyncOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The row-band profile: how much moves up, down and sideways, at which height of the box, frame by frame.
@@ -26,15 +25,20 @@ from indexing.sync.options import SyncOptions
 PROFILE_BLOCK = 32  # frames at once
 
 
-def row_profile(crops: Tensor, options: SyncOptions = SyncOptions()) -> Tensor:
+PROFILE_BLUR = 1.5  # Pixels of the crop.
+NUM_BANDS = 6  # Bands of rows, overlapping by half; 4 to 12 do the same.
+PROFILE_NOISE_RATIO = 2.0  # Brightness change over the median below which it is noise (0 / 2 / 4: .78 / .88 / .82 within 1 frame).
+
+
+def row_profile(crops: Tensor) -> Tensor:
     """``(T, 3 * bands)`` motion upwards, downwards and sideways in bands of rows that overlap by half, of crops ``(T, s, s)``."""
     parts = []
     for begin in range(0, len(crops), PROFILE_BLOCK):
         first, end = max(begin - 1, 0), min(begin + PROFILE_BLOCK + 1, len(crops))
-        gx, gy, gt = gradients(blur(crops[first:end], options.profile.sigma))
-        gt = gt.sign() * (gt.abs() - options.profile.quiet * gt.abs().median()).clamp(min=0)
+        gx, gy, gt = gradients(blur(crops[first:end], PROFILE_BLUR))
+        gt = gt.sign() * (gt.abs() - PROFILE_NOISE_RATIO * gt.abs().median()).clamp(min=0)
         u, v = weighted_differences(gx, gy, gt)
-        parts.append(_pooled(u, v, options.profile.bands)[begin - first : begin - first + PROFILE_BLOCK])
+        parts.append(_pooled(u, v, NUM_BANDS)[begin - first : begin - first + PROFILE_BLOCK])
     return torch.cat(parts)
 
 
@@ -51,15 +55,21 @@ def _pooled(u: Tensor, v: Tensor, bands: int) -> Tensor:
     return pooled.sqrt().flatten(1).double()
 
 
-def whitened(first: Tensor, second: Tensor, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor]:
+WHITENING_HALF_WIDTH = 3  # Frames on either side that are whitened together (2 / 3 / 4 / 6: .89 / .90 / .90 / .90 within 1 frame).
+PROFILE_RIDGE = 0.05  # Ridge of the whitening over the largest eigenvalue (.03 / .2: .91 / .87).
+
+
+def whitened(
+    first: Tensor, second: Tensor, reach: int = WHITENING_HALF_WIDTH, ridge: float = PROFILE_RIDGE
+) -> tuple[Tensor, Tensor]:
     r"""Both cameras' profiles in space and time: centred, whitened by the covariance that they share, of norm 1 per frame.
     first, second ``(T, D)`` -> ``(T, (2 reach + 1) D)``."""
-    around = torch.arange(-options.profile.reach, options.profile.reach + 1)
+    around = torch.arange(-reach, reach + 1)
     stacked = [z[(torch.arange(len(z))[:, None] + around).clamp(0, len(z) - 1)].flatten(1) for z in (first, second)]
     known = [y.isfinite().all(1) for y in stacked]
     centred = [y - y[seen].mean(0) for y, seen in zip(stacked, known, strict=True)]
     a, b = (y[seen] for y, seen in zip(centred, known, strict=True))
-    root = inverse_root((a.T @ a / len(a) + b.T @ b / len(b)) / 2, options.profile.ridge)
+    root = inverse_root((a.T @ a / len(a) + b.T @ b / len(b)) / 2, ridge)
     one, two = (normalize((y @ root).nan_to_num(0.0), dim=1, eps=1e-9) for y in centred)
     return one, two
 
@@ -90,13 +100,17 @@ class GrayTake:
         return float(1 / self.times.diff().median())
 
 
-def take(source: Any, name: str, fps: float | None = None, times: Any = None, *, options: SyncOptions = SyncOptions()) -> GrayTake:
+MAX_IMAGE_SIDE = 320  # Longer side, pixels: a person a quarter as tall as a 1080p image keeps 45.
+MIN_IMAGE_SIDE = 16  # Shorter side, pixels.
+
+
+def take(source: Any, name: str, fps: float | None = None, times: Any = None) -> GrayTake:
     """Read a video once. source ``(frames, h, w)``, times ``(frames,)``."""
-    spool = _Spool(name, options.gray.largest, options.gray.smallest)
+    spool = _Spool(name, MAX_IMAGE_SIDE, MIN_IMAGE_SIDE)
     if not isinstance(source, (np.ndarray, Tensor)):
         with tempfile.TemporaryFile() as file:
             stamps = [stamp for stamp in (spool.add(part, file) for part in _parts(source, name)) if stamp is not None]
-            spool.check(options=options)
+            spool.check()
             file.flush()
             frames = torch.from_numpy(np.memmap(file, np.uint8, "r+", shape=(spool.count, *spool.size)))
         if stamps and times is None:
@@ -105,7 +119,7 @@ def take(source: Any, name: str, fps: float | None = None, times: Any = None, *,
         if source.ndim < 3:
             raise ValueError(f"{name}: expected grey frames (frames, h, w), got an array of shape {tuple(source.shape)}")
         small = [spool.bytes(source[begin : begin + FOOTAGE_BLOCK]) for begin in range(0, max(len(source), 1), FOOTAGE_BLOCK)]
-        spool.check(options=options)
+        spool.check()
         frames = torch.cat(small)
     return GrayTake(frames, _times(times, fps, len(frames), name), spool.scale, name)
 
@@ -117,6 +131,9 @@ def _parts(source: Any, name: str) -> Iterator[Any]:
             "read a file first, for example with indexing.video.read_video(path)"
         )
     return iter(source)
+
+
+MIN_FRAMES = 20  # Frames of a video.
 
 
 class _Spool(Shrinker):
@@ -141,11 +158,11 @@ class _Spool(Shrinker):
         """``(n, h, w)`` uint8 of a chunk."""
         return self(frames).round_().to(torch.uint8)
 
-    def check(self, options: SyncOptions = SyncOptions()) -> None:
+    def check(self) -> None:
         """Raise where there are too few frames."""
-        if self.count < options.gray.fewest:
+        if self.count < MIN_FRAMES:
             text = "{camera:{which}}: {frames} frames; at least {needed} are needed"
-            raise ValueError(Message(text, which=self.name, frames=self.count, needed=options.gray.fewest))
+            raise ValueError(Message(text, which=self.name, frames=self.count, needed=MIN_FRAMES))
 
 
 def _times(times: Any, fps: float | None, frames: int, name: str) -> Tensor:
@@ -191,10 +208,18 @@ class Drift:
         return self.step.cumsum(0)
 
 
-def drift(gx: Tensor, gy: Tensor, gt: Tensor, options: SyncOptions = SyncOptions()) -> Drift:
+BORDER_SHARE = 0.12  # Share of the image on each side whose flow tells whether the camera moves.
+MIN_EXPLAINED_SHARE = 0.5  # Share of the border's change that one translation must explain.
+MIN_DRIFT_PIXELS = 0.05  # Per frame; below, the camera is on a tripod.
+MIN_DRIFT_FRAMES_SHARE = 0.1  # Share of the frames in which it must move to count.
+MIN_CHANGE = 0.02  # Grey 0..1 per frame: 5 standard deviations of a noise of 8 grey levels, after the blur.
+MAX_UNEXPLAINED_SHARE = 0.3  # Share of the border that changes without one translation: a fast pan, a cut, flicker.
+
+
+def drift(gx: Tensor, gy: Tensor, gt: Tensor) -> Drift:
     r"""Translation of the border of each frame from gradients ``(T, h, w)``, by least squares."""
     inside = torch.ones(gt.shape[1:], dtype=torch.bool, device=gt.device)
-    rows, columns = (max(2, round(options.drift.border * n)) for n in gt.shape[1:])
+    rows, columns = (max(2, round(BORDER_SHARE * n)) for n in gt.shape[1:])
     inside[rows:-rows, columns:-columns] = False
     change = gt[:, inside].double()
     design = torch.stack([*(g[:, inside].double() for g in (gx, gy)), torch.ones_like(change)], dim=2)
@@ -205,9 +230,9 @@ def drift(gx: Tensor, gy: Tensor, gt: Tensor, options: SyncOptions = SyncOptions
     step = found[:, :2, 0]
     spread = change - change.mean(1, keepdim=True)
     explained = 1 - left.square().sum(1) / spread.square().sum(1).clamp(min=1e-12)
-    follows = (explained > options.drift.explained) & (step.norm(dim=1) > options.drift.least)
-    lost = ((left.abs() > options.drift.change).double().mean(1) > options.drift.changed) & ~follows
-    return Drift(step * follows[:, None], lost, options.drift.often)
+    follows = (explained > MIN_EXPLAINED_SHARE) & (step.norm(dim=1) > MIN_DRIFT_PIXELS)
+    lost = ((left.abs() > MIN_CHANGE).double().mean(1) > MAX_UNEXPLAINED_SHARE) & ~follows
+    return Drift(step * follows[:, None], lost, MIN_DRIFT_FRAMES_SHARE)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -241,16 +266,22 @@ class GrayMotion:
         return self.rows.sum(1) / (self.rows.shape[1] * self.columns.shape[1])
 
 
-def motion(frames: Tensor, region: Region | None = None, *, options: SyncOptions = SyncOptions()) -> GrayMotion:
+MOTION_FLOOR = 0.006  # Grey 0..1 per frame below which change is noise,
+MOTION_NOISE_RATIO = 6.0  # and in medians of the change: 4 standard deviations, 1 pixel in 16,000 by chance.
+BOX_BLUR = 1.5  # Pixels.
+MIN_MOVING_SHARE = 3e-4  # Share of the pixels that change in a frame that shows motion: 5 times what noise does.
+
+
+def motion(frames: Tensor, region: Region | None = None) -> GrayMotion:
     """What moves in frames ``(T, h, w)``, in a region ``(x0, y0, x1, y1)`` of their pixels, after the background's own motion."""
     rows, columns, changed, steps, lost = [], [], [], [], []
     for begin in range(0, len(frames), BOX_BLOCK):
         first, end = max(begin - 1, 0), min(begin + BOX_BLOCK + 1, len(frames))
-        gx, gy, gt = (g[begin - first :][:BOX_BLOCK] for g in gradients(blur(as_grey(frames[first:end]), options.box.sigma)))
-        camera = drift(gx, gy, gt, options=options)
+        gx, gy, gt = (g[begin - first :][:BOX_BLOCK] for g in gradients(blur(as_grey(frames[first:end]), BOX_BLUR)))
+        camera = drift(gx, gy, gt)
         dx, dy = camera.step.float().T[..., None, None]
         change = (gt + gx * dx + gy * dy).abs()
-        change = (change - max(options.box.quiet, options.box.noise * float(change.median()))).clamp(min=0)
+        change = (change - max(MOTION_FLOOR, MOTION_NOISE_RATIO * float(change.median()))).clamp(min=0)
         if region is not None:
             x0, y0, x1, y1 = (round(v) for v in region)
             mask = change.new_zeros(change.shape[1:])
@@ -265,42 +296,52 @@ def motion(frames: Tensor, region: Region | None = None, *, options: SyncOptions
         torch.cat(rows),
         torch.cat(columns),
         torch.cat(changed),
-        Drift(torch.cat(steps), torch.cat(lost), options.drift.often),
-        options.box.lively,
+        Drift(torch.cat(steps), torch.cat(lost), MIN_DRIFT_FRAMES_SHARE),
+        MIN_MOVING_SHARE,
     )
 
 
-def boxes(found: GrayMotion, fps: float, options: SyncOptions = SyncOptions()) -> tuple[Tensor, bool]:
+BOX_SMOOTHING_SECONDS = 0.2  # Over which a moving box is smoothed.
+MAX_BOX_RATIO = 1.6  # Box of the whole video over the moving one beyond which it moves.
+
+
+def boxes(found: GrayMotion, fps: float) -> tuple[Tensor, bool]:
     """``(T, 3)`` centre x, centre y and side in pixels of the square about what moves, frame by frame, and whether it moves."""
     height = found.rows.shape[1]
     path = found.drift.path if found.drift.moves else found.rows.new_zeros(len(found.rows), 2)
-    across, along = (_quantiles(_smooth(m, options.box.follow * fps), options) for m in (found.columns, found.rows))
-    following = _square(across, along, height, options)
-    seen = _smooth(found.lively.double()[:, None], options.box.follow * fps)[:, 0] > 0
+    across, along = (_quantiles(_smooth(m, BOX_SMOOTHING_SECONDS * fps)) for m in (found.columns, found.rows))
+    following = _square(across, along, height)
+    seen = _smooth(found.lively.double()[:, None], BOX_SMOOTHING_SECONDS * fps)[:, 0] > 0
     whole = _square(
-        _quantiles(found.columns.sum(0, keepdim=True), options),
-        _quantiles(found.rows.sum(0, keepdim=True), options),
+        _quantiles(found.columns.sum(0, keepdim=True)),
+        _quantiles(found.rows.sum(0, keepdim=True)),
         height,
-        options,
     )
     size = following[seen, 2].median() if bool(seen.any()) else whole[0, 2]
-    if found.drift.moves or whole[0, 2] > options.box.wider * size:
+    if found.drift.moves or whole[0, 2] > MAX_BOX_RATIO * size:
         following[~seen] = whole
-        centre = _smooth(following[:, :2] - path, options.box.follow * fps) + path
+        centre = _smooth(following[:, :2] - path, BOX_SMOOTHING_SECONDS * fps) + path
         return torch.cat([centre, size.expand(len(centre), 1)], dim=1), True
     return whole.expand(len(path), 3), False
 
 
-def _quantiles(marginals: Tensor, options: SyncOptions) -> Tensor:
-    """``(T, 2)`` positions between which ``options.box.inside`` of the sums of ``(T, n)`` lie."""
+BOX_QUANTILES = (0.02, 0.98)  # Quantiles of the motion that a box encloses.
+
+
+def _quantiles(marginals: Tensor) -> Tensor:
+    """``(T, 2)`` positions between which ``BOX_QUANTILES`` of the sums of ``(T, n)`` lie."""
     total = marginals.cumsum(1)
     share = total / total[:, -1:].clamp(min=1e-12)
-    return torch.stack([(share < q).sum(1).double() + end for q, end in zip(options.box.inside, (0.0, 1.0), strict=True)], dim=1)
+    return torch.stack([(share < q).sum(1).double() + end for q, end in zip(BOX_QUANTILES, (0.0, 1.0), strict=True)], dim=1)
 
 
-def _square(across: Tensor, along: Tensor, height: int, options: SyncOptions) -> Tensor:
-    size = torch.maximum(across[:, 1] - across[:, 0], along[:, 1] - along[:, 0]) * (1 + 2 * options.box.pad)
-    return torch.stack([across.mean(1), along.mean(1), size.clamp(min=options.box.smallest * height)], dim=1)
+BOX_PAD = 0.15  # Share of the box, added on each side.
+MIN_BOX_SIDE = 0.35  # Share of the image's height.
+
+
+def _square(across: Tensor, along: Tensor, height: int) -> Tensor:
+    size = torch.maximum(across[:, 1] - across[:, 0], along[:, 1] - along[:, 0]) * (1 + 2 * BOX_PAD)
+    return torch.stack([across.mean(1), along.mean(1), size.clamp(min=MIN_BOX_SIDE * height)], dim=1)
 
 
 def _smooth(values: Tensor, sigma: float) -> Tensor:
@@ -339,10 +380,16 @@ def crop(frames: Tensor, where: Tensor, side: int) -> Tensor:
 KERNEL_BLOCK = 4  # reference frames at once
 
 
-def window_kernels(crops: Tensor, options: SyncOptions = SyncOptions()) -> Tensor:
+KERNEL_BLUR = 2.0  # Pixels of the crop: motion within a window must be small against it.
+KERNEL_HALF_FRAMES = 10  # Frames on either side of the reference.
+PATCH_SIDE = 10  # Pixels of the crop.
+NUM_KERNEL_ROWS = 80  # Rows of most energy.
+GRADIENT_DAMPING = 0.05  # Share of the largest gradient energy of a frame that is added to that of each patch.
+
+
+def window_kernels(crops: Tensor, half: int = KERNEL_HALF_FRAMES, patch: int = PATCH_SIDE, rows: int = NUM_KERNEL_ROWS) -> Tensor:
     """``(T - 2 half, L, L)`` float64 of crops ``(T, s, s)``, trace 1 (0 if nothing moves); the first is frame ``half``."""
-    half, patch = options.kernel.half, options.kernel.patch
-    frames = blur(crops, options.kernel.sigma)
+    frames = blur(crops, KERNEL_BLUR)
     gx, gy = slopes(frames)
     gx[:, :, [0, -1]], gy[:, [0, -1]] = 0.0, 0.0  # with a neighbour on one side only, a difference is not central
     cells, slope = _patches(frames, patch), torch.stack([_patches(gx, patch), _patches(gy, patch)], dim=2)
@@ -355,8 +402,8 @@ def window_kernels(crops: Tensor, options: SyncOptions = SyncOptions()) -> Tenso
         h = steep @ windows
         h = h - h[..., half : half + 1]
         energy = steep.square().sum(-1, keepdim=True)
-        h = h / (energy + options.kernel.damping * energy.amax((1, 2, 3), keepdim=True)).clamp(min=1e-12).sqrt()
-        out[begin : begin + count] = _kernel(h.flatten(1, 2).double(), options.kernel.rows)
+        h = h / (energy + GRADIENT_DAMPING * energy.amax((1, 2, 3), keepdim=True)).clamp(min=1e-12).sqrt()
+        out[begin : begin + count] = _kernel(h.flatten(1, 2).double(), rows)
     return out
 
 
@@ -377,13 +424,16 @@ def _kernel(h: Tensor, rows: int) -> Tensor:
     return kernel / trace.clamp(min=1e-12)[:, None, None]
 
 
-def kernel_descriptors(first: Tensor, second: Tensor, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor]:
+KERNEL_RIDGE = 0.02  # Ridge of the whitening of kernels over the largest eigenvalue.
+
+
+def kernel_descriptors(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     """Both cameras' kernels ``(n, L, L)`` as unit vectors ``(n, L * L)``: whitened by the mean kernel, the mean removed."""
     kernels = torch.cat([first, second])
     known = kernels.isfinite().all(-1).all(-1)
     if not bool(known.any()):
         return torch.zeros_like(first).flatten(1), torch.zeros_like(second).flatten(1)
-    root = inverse_root(kernels[known].mean(0), options.kernel.ridge)
+    root = inverse_root(kernels[known].mean(0), KERNEL_RIDGE)
     white = root @ kernels @ root
     flat = (white - white[known].mean(0)).flatten(1).nan_to_num(0.0)
     flat = normalize(flat, dim=1, eps=1e-9)
@@ -407,30 +457,37 @@ class Sampled:
         return Sampled(reversed_profile(self.profile), self.kernels.flip(0, 1, 2), self.start, self.rate)
 
 
-def common_rate(first: GrayTake, second: GrayTake, options: SyncOptions = SyncOptions()) -> float:
+MAX_FPS = 45.0  # Faster videos are compared at a half, a third ... of their rate; windows were chosen at 30.
+
+
+def common_rate(first: GrayTake, second: GrayTake) -> float:
     """The rate of the slower video, or a whole fraction of it."""
     rate = min(first.fps, second.fps)
-    return rate / -(-rate // options.gray.fastest)
+    return rate / -(-rate // MAX_FPS)
 
 
-def sampled(source: GrayTake, where: Tensor, rate: float, options: SyncOptions = SyncOptions()) -> Sampled:
+def sampled(source: GrayTake, where: Tensor, rate: float) -> Sampled:
     """Profile and kernels of a take in boxes ``(T, 3)`` of its frames, block by block."""
     start = float(source.times[0])
     count = int((float(source.times[-1]) - start) * rate + 1e-6) + 1
     profiles, kernels = [], []
     for begin in range(0, count, BLOCK):
-        first, end = max(begin - options.kernel.half, 0), min(begin + BLOCK + options.kernel.half, count)
-        crops, known = _crops(source, where, start + torch.arange(first, end, dtype=torch.float64) / rate, options)
-        part = row_profile(crops, options=options)
+        first, end = max(begin - KERNEL_HALF_FRAMES, 0), min(begin + BLOCK + KERNEL_HALF_FRAMES, count)
+        crops, known = _crops(source, where, start + torch.arange(first, end, dtype=torch.float64) / rate)
+        part = row_profile(crops)
         part[~_around(known, 1)] = torch.nan
         profiles.append(part[begin - first :][: min(BLOCK, count - begin)])
-        found = window_kernels(crops, options=options).float()
-        found[~_around(known, options.kernel.half)[options.kernel.half : options.kernel.half + len(found)]] = torch.nan
+        found = window_kernels(crops).float()
+        found[~_around(known, KERNEL_HALF_FRAMES)[KERNEL_HALF_FRAMES : KERNEL_HALF_FRAMES + len(found)]] = torch.nan
         kernels.append(found)
     return Sampled(torch.cat(profiles), torch.cat(kernels), start, rate)
 
 
-def _crops(source: GrayTake, where: Tensor, times: Tensor, options: SyncOptions) -> tuple[Tensor, Tensor]:
+MAX_GAP_FRAMES = 2.5  # Over longer gaps nothing is interpolated.
+CROP_SIDE = 96  # Pixels.
+
+
+def _crops(source: GrayTake, where: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
     """Crops at any times, blended from the frames before and after, and whether these are near enough."""
     stamps = source.times
     after = torch.searchsorted(stamps, times - 1e-9).clamp(1, len(stamps) - 1)
@@ -441,13 +498,13 @@ def _crops(source: GrayTake, where: Tensor, times: Tensor, options: SyncOptions)
     box = torch.lerp(where[before], where[after], share[:, None])
     low, high = int(before[0]), int(after[-1]) + 1
     frames = source.frames[low:high]
-    out = crop(frames[torch.where(share < 1, before, after) - low], box, options.box.side)
+    out = crop(frames[torch.where(share < 1, before, after) - low], box, CROP_SIDE)
     mixed = ((share > 0) & (share < 1)).nonzero()[:, 0]
     if len(mixed):
         out[mixed] = torch.lerp(
-            out[mixed], crop(frames[after[mixed] - low], box[mixed], options.box.side), share[mixed].float()[:, None, None]
+            out[mixed], crop(frames[after[mixed] - low], box[mixed], CROP_SIDE), share[mixed].float()[:, None, None]
         )
-    known = (span <= options.gray.gap / source.fps) | (share == 0) | (share == 1)
+    known = (span <= MAX_GAP_FRAMES / source.fps) | (share == 0) | (share == 1)
     return out, known
 
 

@@ -14,7 +14,6 @@ from indexing.clip import Clip
 from indexing.joints import named, places
 from indexing.skeleton import Skeleton, known
 from indexing.sync.notices import SyncNotice, besides
-from indexing.sync.options import SyncOptions
 from indexing.sync.recordings import FloatArray, Take
 
 if TYPE_CHECKING:
@@ -34,7 +33,10 @@ class Pairing:
     sound: Shift | None = None
 
 
-def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None, *, options: SyncOptions = SyncOptions()) -> Pairing:
+NUM_THOROUGH_PAIRINGS = 3  # Pairings that are tried thoroughly where a fast look accepts none.
+
+
+def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> Pairing:
     """The pairing of people on which the evidence is best."""
     every = sorted(((i, j) for i in range(len(a.people)) for j in range(len(b.people))), key=sum)
     if len(every) == 1:
@@ -43,19 +45,17 @@ def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None, *, 
     found: list[Pairing] = []
     for i, j in every:
         found.append(Pairing((trial or solve)(a.people[i], b.people[j]), (i, j)))
-        if backing(found[-1], found, frame, options=options) > 1:  # two people of each camera say the same
+        if backing(found[-1], found, frame) > 1:  # two people of each camera say the same
             break
     if trial is not None:  # the last word on the winner, or where none is sure, on the likeliest
         ranked = sorted(found, key=lambda one: -one.shift.confidence)
         likely = (
-            [decide(found, frame, options=options)]
-            if any(one.shift.ok for one in found)
-            else [(one, ()) for one in ranked[: options.people.likeliest]]
+            [decide(found, frame)] if any(one.shift.ok for one in found) else [(one, ()) for one in ranked[:NUM_THOROUGH_PAIRINGS]]
         )
         again = [Pairing(solve(a.people[one.people[0]], b.people[one.people[1]]), one.people, rivals) for one, rivals in likely]
-        best, rivals = (again[0], again[0].rivals) if len(again) == 1 else decide(again, frame, options=options)
+        best, rivals = (again[0], again[0].rivals) if len(again) == 1 else decide(again, frame)
     else:
-        best, rivals = decide(found, frame, options=options)
+        best, rivals = decide(found, frame)
     shift = best.shift
     chosen = [f"{who(take, i)} of {take.name}" for take, i in zip((a, b), best.people, strict=True)]
     note = Notice(SyncNotice.PEOPLE, float(len(found)), {"first": chosen[0], "second": chosen[1]})
@@ -67,15 +67,19 @@ def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None, *, 
     return Pairing(shift, best.people, rivals)
 
 
-def backing(one: Pairing, found: Sequence[Pairing], frame: float, options: SyncOptions = SyncOptions()) -> int:
+def backing(one: Pairing, found: Sequence[Pairing], frame: float) -> int:
     """How many pairings of other people, and this one, are sure of its offset."""
     others = [other for other in found if not set(enumerate(one.people)) & set(enumerate(other.people))]
-    return one.shift.ok + sum(one.shift.ok and other.shift.ok and not apart(one, other, frame, options=options) for other in others)
+    return one.shift.ok + sum(one.shift.ok and other.shift.ok and not apart(one, other, frame) for other in others)
 
 
-def apart(one: Pairing, other: Pairing, frame: float, options: SyncOptions = SyncOptions()) -> bool:
+OFFSET_TOLERANCE_FRAMES = 2.0  # Within this two answers are the same,
+OFFSET_TOLERANCE_SIGMAS = 3  # beside the sum of their standard deviations times this.
+
+
+def apart(one: Pairing, other: Pairing, frame: float) -> bool:
     """Whether two answers differ by more than what both leave open."""
-    return abs(_middle(one) - _middle(other)) > options.people.tolerance * frame + options.people.sigmas * (
+    return abs(_middle(one) - _middle(other)) > OFFSET_TOLERANCE_FRAMES * frame + OFFSET_TOLERANCE_SIGMAS * (
         one.shift.sigma + other.shift.sigma
     )
 
@@ -90,22 +94,28 @@ def who(take: Take, index: int) -> str:
     return "the largest person of each frame" if person is None else f"person {person}"
 
 
-def decide(found: Sequence[Pairing], frame: float, options: SyncOptions = SyncOptions()) -> tuple[Pairing, tuple[float, ...]]:
+MIN_CONFIDENCE_RATIO = 0.5  # Confidence over that of the best pairing below which an answer is no rival.
+
+
+def decide(found: Sequence[Pairing], frame: float) -> tuple[Pairing, tuple[float, ...]]:
     """The best pairing, and the offsets of those that contradict it."""
-    behind = {id(pairing): backing(pairing, found, frame, options=options) for pairing in found}
+    behind = {id(pairing): backing(pairing, found, frame) for pairing in found}
     ranked = sorted(found, key=lambda pairing: (-behind[id(pairing)], -pairing.shift.confidence))
     best = ranked[0]
     rivals = [
         _middle(pairing)
         for pairing in ranked[1:]
         if behind[id(pairing)] >= max(1, behind[id(best)])
-        and pairing.shift.confidence >= options.people.weak * best.shift.confidence
-        and apart(best, pairing, frame, options=options)
+        and pairing.shift.confidence >= MIN_CONFIDENCE_RATIO * best.shift.confidence
+        and apart(best, pairing, frame)
     ]
     return best, tuple(rivals)
 
 
-def common_joints(a: Clip, b: Clip, options: SyncOptions = SyncOptions()) -> tuple[Clip, Clip, bool, str]:
+MIN_COMMON_JOINTS = 8  # Joints of the same name in two layouts, to compare them as the same points.
+
+
+def common_joints(a: Clip, b: Clip) -> tuple[Clip, Clip, bool, str]:
     """Both clips with the joints that they have in common, whether these correspond, and what to say about it."""
     first, second = a.skeleton, b.skeleton
     count = a.joints.shape[1], b.joints.shape[1]
@@ -114,7 +124,7 @@ def common_joints(a: Clip, b: Clip, options: SyncOptions = SyncOptions()) -> tup
             return a, b, True, ""
     else:
         there = [(i, j) for i, j in enumerate(places(second, first)) if j >= 0] if named(first) and named(second) else []
-        if len(there) >= options.people.joints:
+        if len(there) >= MIN_COMMON_JOINTS:
             both = tuple(first.joints[i] for i, _ in there)
             said = f"{first.name} and {second.name} share {len(there)} joints; these are compared"
             return _only(a, [i for i, _ in there], both), _only(b, [j for _, j in there], both), True, said
@@ -127,24 +137,33 @@ def _only(clip: Clip, index: list[int], names: tuple[str, ...]) -> Clip:
     return clip.replace(joints=clip.joints[:, index], confidence=confidence, skeleton=Skeleton("common joints", names))
 
 
-def disagreements(a: Clip, b: Clip, shift: Shift, options: SyncOptions = SyncOptions()) -> list[tuple[float, float, float]]:
+# Epipolar distance over the usual one that makes a stretch of another person: of one person it stays below 1.5.
+MAX_DISTANCE_RATIO = 2.0
+MIN_STRETCH_SECONDS = 0.25  # Duration of such a stretch.
+
+
+def disagreements(a: Clip, b: Clip, shift: Shift) -> list[tuple[float, float, float]]:
     """Stretches in which both do not show the same person: start and end on a's clock, and how many times the usual distance."""
     if shift.fundamental is None:
         return []
-    distance = _running(_distances(a, b, shift, options), round(options.people.lasting / 2 * float(a.fps or 30.0)))
+    distance = _running(_distances(a, b, shift), round(MIN_STRETCH_SECONDS / 2 * float(a.fps or 30.0)))
     usual = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 0.0
     if not usual > 0:
         return []
-    far = np.nan_to_num(distance / usual) > options.people.away
+    far = np.nan_to_num(distance / usual) > MAX_DISTANCE_RATIO
     steps = np.flatnonzero(np.diff(np.concatenate([[0], far.astype(int), [0]])))
     found = []
     for start, end in zip(steps[::2], steps[1::2], strict=True):
-        if a.times[end - 1] - a.times[start] >= options.people.lasting:
+        if a.times[end - 1] - a.times[start] >= MIN_STRETCH_SECONDS:
             found.append((float(a.times[start]), float(a.times[end - 1]), float(distance[start:end].max()) / usual))
     return found
 
 
-def jumps(clip: Clip, options: SyncOptions = SyncOptions()) -> list[float]:
+MIN_VISIBLE_JOINTS = 4  # Joints that must be visible for a frame to be judged.
+MAX_STEP_OF_BOX = 0.5  # Box diagonals from one frame to the next that make another person.
+
+
+def jumps(clip: Clip) -> list[float]:
     """When the person is somewhere else from one frame to the next, and not back at once: seconds."""
     steps = np.diff(clip.times) <= 1.5 / float(clip.fps or 30.0)
     apart = np.linalg.norm(np.diff(clip.joints, axis=0), axis=2)
@@ -152,10 +171,10 @@ def jumps(clip: Clip, options: SyncOptions = SyncOptions()) -> list[float]:
         edge(np.where(np.isfinite(clip.joints), clip.joints, fill), axis=1) for edge, fill in ((np.min, np.inf), (np.max, -np.inf))
     )
     size = np.linalg.norm(high - low, axis=1)
-    known = steps & (np.isfinite(apart).sum(axis=1) >= options.people.seen) & np.isfinite(size[1:]) & np.isfinite(size[:-1])
-    moved = np.nanmedian(apart[known], axis=1) > options.people.jump * np.maximum(size[1:], size[:-1])[known]
+    known = steps & (np.isfinite(apart).sum(axis=1) >= MIN_VISIBLE_JOINTS) & np.isfinite(size[1:]) & np.isfinite(size[:-1])
+    moved = np.nanmedian(apart[known], axis=1) > MAX_STEP_OF_BOX * np.maximum(size[1:], size[:-1])[known]
     times = clip.times[1:][known][moved]
-    alone = np.diff(times, prepend=-np.inf, append=np.inf) >= options.people.lasting  # a false detection leaves and comes back
+    alone = np.diff(times, prepend=-np.inf, append=np.inf) >= MIN_STRETCH_SECONDS  # a false detection leaves and comes back
     return [float(time) for time in times[alone[1:] & alone[:-1]]]
 
 
@@ -169,8 +188,8 @@ def _running(values: FloatArray, half: int) -> FloatArray:
     return out
 
 
-def _distances(a: Clip, b: Clip, shift: Shift, options: SyncOptions) -> FloatArray:
-    """``(frames,)`` of a; NaN where fewer than ``options.people.seen`` joints can be compared."""
+def _distances(a: Clip, b: Clip, shift: Shift) -> FloatArray:
+    """``(frames,)`` of a; NaN where fewer than ``MIN_VISIBLE_JOINTS`` joints can be compared."""
     assert shift.fundamental is not None
     matrix = shift.fundamental.detach().cpu().numpy().astype(np.float64)
     moments = shift.at(0.0).item() + shift.rate * a.times
@@ -186,17 +205,17 @@ def _distances(a: Clip, b: Clip, shift: Shift, options: SyncOptions) -> FloatArr
     la, lb = xb @ matrix, xa @ matrix.T
     size = np.square(la[..., :2]).sum(axis=2) + np.square(lb[..., :2]).sum(axis=2)
     distance = np.abs((xb * lb).sum(axis=2)) / np.sqrt(np.maximum(size, 1e-300))
-    enough = np.isfinite(distance).sum(axis=1) >= options.people.seen
+    enough = np.isfinite(distance).sum(axis=1) >= MIN_VISIBLE_JOINTS
     out = np.full(len(a), np.nan)
     if enough.any():
         out[enough] = np.nanmedian(distance[enough], axis=1)
     return out
 
 
-def joint_names(a: Take, b: Take, people: tuple[int, int], options: SyncOptions = SyncOptions()) -> tuple[str, ...]:
+def joint_names(a: Take, b: Take, people: tuple[int, int]) -> tuple[str, ...]:
     """Names of the joints that were compared; none where they do not correspond or nobody knows their names."""
     if not (a.people and b.people):
         return ()
-    first, _, same, _ = common_joints(a.people[people[0]], b.people[people[1]], options=options)
+    first, _, same, _ = common_joints(a.people[people[0]], b.people[people[1]])
     layout = first.skeleton or known(first.joints.shape[1])
     return layout.joints if same and layout is not None else ()

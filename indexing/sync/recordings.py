@@ -80,45 +80,51 @@ def take_of(
     layout: str | None = None,
     by: By = "auto",
     keypoints: Path | ValueError | None = None,
-    options: SyncOptions = SyncOptions(),
+    options: SyncOptions | None = None,
 ) -> Take:
     """A recording from whatever a user has of it: see :func:`indexing.sync.synchronize.synchronize`."""
     if isinstance(value, Take):
         return value
+    options = options or SyncOptions()
     if fps is not None:
         check_fps(fps)
     how = {"min_confidence": min_confidence, "format": format, "size": size, "layout": layout}
     take = _taken(value, name, fps, person, how, options)
     if take.kind == "video" and by != "pixels":
         take = _watched(take, by, keypoints, person, how, options)
-    return _without_pauses(take, options)
+    return _without_pauses(take)
 
 
 def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str, Any], options: SyncOptions) -> Take:
     if person not in CHOICES:
         raise ValueError(f"person must be one of {', '.join(CHOICES)}, got {person!r}")
     if isinstance(value, Clip):
-        return _of_clips(name or value.name, None, [value], options)
+        return _of_clips(name or value.name, None, [value])
     if is_dataset(value):
-        return _of_clips(name, None, list(clips_of(value, fps=fps, name=name)), options)
+        return _of_clips(name, None, list(clips_of(value, fps=fps, name=name)))
     if isinstance(value, Sequence) and value and all(isinstance(item, Clip) for item in value):
-        return _of_clips(name or value[0].name, None, list(value), options)
+        return _of_clips(name or value[0].name, None, list(value))
     if isinstance(value, (str, Path)):
         path = Path(value).expanduser()
         name = name or camera_name(path)
         if path.suffix.lower() in VIDEOS and not path.is_dir():
             return _of_video(name, path, fps)
         return _of_file(name, path, fps, person, how, options)
-    return _of_array(name, value, fps, options)
+    return _of_array(name, value, fps)
 
 
-def _without_pauses(take: Take, options: SyncOptions) -> Take:
+MAX_SPAN_PER_FRAME = 20  # A clock may run over so many times its frames, for its frames to be compared.
+MAX_SPAN_FRAMES = 20_000  # Frames that it may run over in any case.
+CUT_PAUSES_SECONDS = (60.0, 10.0, 1.0)  # Pauses at which a recording that is nearly all gap is cut: as few as will do.
+
+
+def _without_pauses(take: Take) -> Take:
     """The take with its people cut to the longest stretch of frames, where it is nearly all gap."""
     if take.kind != "keypoints" or take.count < 2:
         return take
-    most = max(options.recording.sparse * take.count, options.recording.sparse_frames) / take.fps
+    most = max(MAX_SPAN_PER_FRAME * take.count, MAX_SPAN_FRAMES) / take.fps
     first, end = 0, take.count
-    for pause in options.recording.pauses:
+    for pause in CUT_PAUSES_SECONDS:
         if take.times[end - 1] - take.times[first] <= most:
             break
         cuts = stretches(take.times, pause)
@@ -137,12 +143,12 @@ def camera_name(path: Path) -> str:
     return (path.name if path.is_dir() else path.stem).removesuffix("_json") or path.name
 
 
-def _of_clips(name: str, path: Path | None, people: list[Clip], options: SyncOptions) -> Take:
+def _of_clips(name: str, path: Path | None, people: list[Clip]) -> Take:
     first = people[0]
     if any(clip.dims != first.dims for clip in people):
         raise ValueError(f"{path or name or 'clip'}: holds 2D and 3D joints; give the people of one camera, or of motion capture")
     times = np.unique(np.concatenate([clip.times for clip in people]))
-    seen, rate = tuple(people), frame_rate(times, float(first.fps or ASSUMED), options=options)
+    seen, rate = tuple(people), frame_rate(times, float(first.fps or ASSUMED))
     known = [clip.replace(name=name) for clip in people[:1]] if name else people[:1]  # a camera goes by its own name
     return Take(
         name, "keypoints", path, seen, seen, fps=rate, fps_assumed=first.fps_assumed, times=times, count=len(times),
@@ -150,11 +156,14 @@ def _of_clips(name: str, path: Path | None, people: list[Clip], options: SyncOpt
     )  # fmt: skip
 
 
-def frame_rate(times: FloatArray, about: float, options: SyncOptions = SyncOptions()) -> float:
+FPS_TOLERANCE = 1e-9  # Relative difference by which a frame rate is still the one that was given.
+
+
+def frame_rate(times: FloatArray, about: float) -> float:
     """Frames per second over all of a take: by the median step of rounded times, frame numbers would drift from their frames."""
     steps = np.rint(np.diff(times) * about).sum()
     exact = float(steps / (times[-1] - times[0])) if steps > 0 else about
-    return exact if abs(exact / about - 1) > options.recording.exact else about
+    return exact if abs(exact / about - 1) > FPS_TOLERANCE else about
 
 
 def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[str, Any], options: SyncOptions) -> Take:
@@ -162,17 +171,21 @@ def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[st
 
     if person != "auto":
         clips = read(path, fps=fps, person=person, **how)
-        return _noted(_of_clips(name, path, [_single(path, list(clips))], options), options, FOLLOWED[person])
+        return _noted(_of_clips(name, path, [_single(path, list(clips))]), FOLLOWED[person])
     everyone = list(read(path, fps=fps, person="everyone", **how))
     if any(clip.label is not None for clip in everyone) or "person" not in everyone[0].meta:  # a set of clips, not a recording
-        return _noted(_of_clips(name, path, [_single(path, everyone)], options), options, "")
+        return _noted(_of_clips(name, path, [_single(path, everyone)]), "")
     largest = read(path, fps=fps, person="largest", **how)[0]  # this one has the frames without people, too
     tried = candidates(largest, everyone, options=options) if len(everyone) > 1 else []
-    found = dataclasses.replace(_of_clips(name, path, [largest, *tried], options), everyone=tuple(everyone))
-    return _noted(found, options, "" if tried else FOLLOWED["largest"])
+    found = dataclasses.replace(_of_clips(name, path, [largest, *tried]), everyone=tuple(everyone))
+    return _noted(found, "" if tried else FOLLOWED["largest"])
 
 
-def _noted(take: Take, options: SyncOptions, followed: str) -> Take:
+MAX_GRID_ERROR_FRAMES = 0.1  # Distance of times from an even grid, frames, up to which missing frames are counted.
+MAX_EMPTY_SHARE = 0.1  # Share of frames without a person above which it is said.
+
+
+def _noted(take: Take, followed: str) -> Take:
     """The recording with notes on frames that are missing, on those that show nobody, and on others in view than who is
     followed."""
     notes: list[str] = []
@@ -183,13 +196,13 @@ def _noted(take: Take, options: SyncOptions, followed: str) -> Take:
     steps = np.diff(take.times) * take.fps
     lost = (
         int(np.rint(steps - 1).clip(0).sum())
-        if len(steps) and not (np.abs(steps - np.rint(steps)) > options.recording.uneven).any()
+        if len(steps) and not (np.abs(steps - np.rint(steps)) > MAX_GRID_ERROR_FRAMES).any()
         else 0
     )
     if lost:
         notes.append(f"{take.name}: {lost} of {lost + take.count} frames are missing; the others keep their times")
     nobody = 1 - float(take.people[0].seen.any(axis=1).sum()) / max(1, take.count)
-    if nobody > options.recording.empty:
+    if nobody > MAX_EMPTY_SHARE:
         notes.append(f"{take.name}: {100 * nobody:.0f} % of the frames show nobody")
     return dataclasses.replace(take, notes=(*take.notes, *notes))
 
@@ -200,21 +213,25 @@ def _single(path: Path, clips: list[Clip]) -> Clip:
     return clips[0]
 
 
-def candidates(largest: Clip, everyone: Sequence[Clip], options: SyncOptions = SyncOptions()) -> list[Clip]:
+MIN_PRESENCE_SHARE = 0.2  # Share of the longest person's frames in which a person must be visible to be tried.
+DUPLICATE_SHARE = 0.9  # Share of the frames in which the largest person is this one from which both are one.
+
+
+def candidates(largest: Clip, everyone: Sequence[Clip], options: SyncOptions | None = None) -> list[Clip]:
     """The people worth a try besides the largest one of each frame: seen for long, and large."""
     longest = max(int(clip.seen.any(axis=1).sum()) for clip in everyone)
     found = []
     for clip in everyone:
         there = clip.seen.any(axis=1)
-        if there.sum() < options.recording.seen * longest:
+        if there.sum() < MIN_PRESENCE_SHARE * longest:
             continue
         rows = np.searchsorted(largest.times, clip.times[there])
         equal = (np.nan_to_num(largest.joints[rows]) == np.nan_to_num(clip.joints[there])).all(axis=(1, 2))
-        if equal.sum() >= options.recording.same * largest.seen.any(axis=1).sum():  # the largest one of each frame is this person
+        if equal.sum() >= DUPLICATE_SHARE * largest.seen.any(axis=1).sum():  # the largest one of each frame is this person
             continue
         extent = np.nanmax(clip.joints[there], axis=1) - np.nanmin(clip.joints[there], axis=1)
         found.append((float(extent.prod(axis=1).sum()), clip))
-    return [clip for _, clip in sorted(found, key=lambda entry: -entry[0])[: options.recording.candidates]]
+    return [clip for _, clip in sorted(found, key=lambda entry: -entry[0])[: (options or SyncOptions()).num_candidates]]
 
 
 def _of_video(name: str, path: Path, fps: float | None) -> Take:
@@ -223,6 +240,9 @@ def _of_video(name: str, path: Path, fps: float | None) -> Take:
     info = probe(path, fps=fps)
     notes = tuple(f"{path.name}: {note}" for note in info.notes)
     return Take(name, "video", path, fps=info.fps, times=np.array([0.0, info.duration]), count=info.frames, notes=notes)
+
+
+MAX_PEOPLE_IN_VIDEO = 4  # People that a pose model looks for in a video: pairings of more are not tried.
 
 
 def _watched(
@@ -239,7 +259,7 @@ def _watched(
         if isinstance(keypoints, ValueError):
             raise keypoints
         with tempfile.TemporaryDirectory(prefix="dyntorch-pose-") as passing:
-            file = keypoints or keypoint_file(video.path, passing, options.video.people).path
+            file = keypoints or keypoint_file(video.path, passing, MAX_PEOPLE_IN_VIDEO).path
             take = _of_file(video.name, file, None, person, how, options)
     except NobodySeen:
         if by == "keypoints":
@@ -250,7 +270,7 @@ def _watched(
     return dataclasses.replace(take, path=video.path, video=video, notes=(*video.notes, *take.notes, said))
 
 
-def _of_array(name: str, value: Any, fps: float | None, options: SyncOptions) -> Take:
+def _of_array(name: str, value: Any, fps: float | None) -> Take:
     try:
         array = np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value)
         if array.dtype.kind not in "fiub":
@@ -268,7 +288,7 @@ def _of_array(name: str, value: Any, fps: float | None, options: SyncOptions) ->
     if array.shape[2] > 3:
         times = np.arange(len(array)) / rate
         return Take(name, "frames", frames=array, fps=rate, fps_assumed=fps is None, times=times, count=len(times))
-    return _of_clips(name, None, [Clip(array, fps=fps, name=name)], options)
+    return _of_clips(name, None, [Clip(array, fps=fps, name=name)])
 
 
 def find_cameras(paths: Sequence[Path]) -> dict[str, Path]:

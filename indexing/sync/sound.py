@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from dyntorch.core import Notice, status_from
 from indexing.sync.notices import SoundNotice
-from indexing.sync.options import SoundOptions
 
 if TYPE_CHECKING:
     from dyntorch import Shift
@@ -39,6 +38,19 @@ Signal = NDArray[np.float32]
 CHUNK = 20_000  # spectra at once: 20 MB
 
 
+SAMPLE_RATE = 16_000  # Samples per second of all sound: the bands below need no more.
+SILENCE_AMPLITUDE = 3e-4  # Share of full scale: 10 steps of 16 bits are rounding.
+MIN_PITCH_HERTZ = 200.0  # Below are hum of the mains, wind and hands on the phone.
+MAX_PITCH_HERTZ = 7000.0  # What phones' noise suppression leaves.
+NUM_BANDS = 8  # Bands of pitch, of equal ratio.
+WINDOW_SECONDS = 0.01  # Window of a spectrum.
+HOP_SECONDS = 0.002  # From one spectrum to the next, of the envelopes that offset and rate are estimated from.
+STEP_SECONDS = 0.01  # Step of the envelopes in which shifts are searched.
+# Average of magnitudes in the phase transform (margin, music at 10 dB, 0 / .05 / .5 Hz: 7.3 / 7.4 / 5.0).
+SPECTRUM_SMOOTHING_HERTZ = 0.05
+MIN_MODULATION_HERTZ = 0.5  # Slower changes of loudness are those of automatic gain.
+
+
 @dataclass(frozen=True, eq=False)
 class Sound:
     """What a camera's microphone recorded. samples ``(n,)``."""
@@ -46,7 +58,6 @@ class Sound:
     samples: NDArray[Any]
     rate: float
     start: float = 0.0
-    options: SoundOptions = SoundOptions()
 
     def __post_init__(self) -> None:
         samples = np.asarray(self.samples)
@@ -65,30 +76,30 @@ class Sound:
         """Whether nothing but the rounding of its samples can be heard."""
         loudest = float(np.abs(self.samples.astype(np.float32)).max(initial=0.0))
         scale = 32768.0 if self.samples.dtype.kind == "i" else 1.0
-        return loudest / scale < self.options.quiet
+        return loudest / scale < SILENCE_AMPLITUDE
 
     @property
     def first(self) -> float:
         """Seconds of the middle of the first frame of :attr:`energy`."""
-        return self.start + self.options.window / 2
+        return self.start + WINDOW_SECONDS / 2
 
     @cached_property
     def energy(self) -> Signal:
-        """``(bands, frames)`` energy of each band of pitch, ``options.hop`` seconds apart."""
+        """``(bands, frames)`` energy of each band of pitch, ``HOP_SECONDS`` seconds apart."""
         from scipy import fft, signal
 
         made = self.samples.astype(np.float32) / (32768.0 if self.samples.dtype.kind == "i" else 1.0)
-        hertz = self.options.samples
+        hertz = SAMPLE_RATE
         if self.rate != hertz:
             share = math.gcd(round(self.rate), hertz)
             made = signal.resample_poly(made, hertz // share, round(self.rate) // share).astype(np.float32)
-        hop, width = round(self.options.hop * hertz), round(self.options.window * hertz)
+        hop, width = round(HOP_SECONDS * hertz), round(WINDOW_SECONDS * hertz)
         if len(made) < width:
-            return np.zeros((self.options.bands, 0), np.float32)
+            return np.zeros((NUM_BANDS, 0), np.float32)
         cut = np.lib.stride_tricks.sliding_window_view(made, width)[::hop]
         size = fft.next_fast_len(2 * width, real=True)
         pitch = fft.rfftfreq(size, 1 / hertz)
-        edges = np.geomspace(self.options.lowest, self.options.highest, self.options.bands + 1)
+        edges = np.geomspace(MIN_PITCH_HERTZ, MAX_PITCH_HERTZ, NUM_BANDS + 1)
         bands = [(pitch >= low) & (pitch < high) for low, high in pairwise(edges)]
         taper = np.hanning(width).astype(np.float32)
         found = np.empty((len(bands), len(cut)), np.float32)
@@ -100,21 +111,21 @@ class Sound:
 
     @cached_property
     def fine(self) -> Signal:
-        """``(bands, frames)`` envelopes of unit variance whose changes count alike at every rate, ``options.hop`` apart."""
-        return self._envelopes(self.energy, self.options.hop)
+        """``(bands, frames)`` envelopes of unit variance whose changes count alike at every rate, ``HOP_SECONDS`` apart."""
+        return self._envelopes(self.energy, HOP_SECONDS)
 
     @cached_property
     def coarse(self) -> Signal:
-        """The same, ``options.step`` seconds apart."""
-        many = round(self.options.step / self.options.hop)
+        """The same, ``STEP_SECONDS`` seconds apart."""
+        many = round(STEP_SECONDS / HOP_SECONDS)
         whole = self.energy[:, : self.energy.shape[1] // many * many]
-        return self._envelopes(whole.reshape(len(whole), -1, many).mean(axis=2), self.options.step)
+        return self._envelopes(whole.reshape(len(whole), -1, many).mean(axis=2), STEP_SECONDS)
 
     def _envelopes(self, energy: Signal, step: float) -> Signal:
         if not energy.shape[1]:
             return energy
         quiet = np.quantile(energy, 0.5, axis=1, keepdims=True) + 1e-9 * energy.max() + np.finfo(np.float32).tiny
-        return flattened(np.log(energy + quiet), 1 / step, self.options.smooth, self.options.slowest)
+        return flattened(np.log(energy + quiet), 1 / step, SPECTRUM_SMOOTHING_HERTZ, MIN_MODULATION_HERTZ)
 
 
 def flattened(curves: Signal, rate: float, smooth: float, slowest: float) -> Signal:
@@ -137,7 +148,7 @@ def flattened(curves: Signal, rate: float, smooth: float, slowest: float) -> Sig
 # Listening to a file.
 
 
-def hear(path: str | Path, options: SoundOptions = SoundOptions()) -> Sound | None:
+def hear(path: str | Path) -> Sound | None:
     """The sound of a video, on the clock of its pictures; None where it has none."""
     from indexing.opening import size_of
 
@@ -146,11 +157,11 @@ def hear(path: str | Path, options: SoundOptions = SoundOptions()) -> Sound | No
         changed = path.stat().st_mtime_ns, size_of(path)
     except (OSError, ValueError):
         changed = (0, 0)  # opening it says what is wrong
-    return _heard(path, changed, options)
+    return _heard(path, changed)
 
 
 @lru_cache(maxsize=16)
-def _heard(path: Path, changed: tuple[int, int], options: SoundOptions) -> Sound | None:
+def _heard(path: Path, changed: tuple[int, int]) -> Sound | None:
     from indexing.video.reading import opened
 
     with opened(path) as (container, pictures):
@@ -158,20 +169,23 @@ def _heard(path: Path, changed: tuple[int, int], options: SoundOptions) -> Sound
         if not streams:
             return None
         zero = float((pictures.start_time or 0) * pictures.time_base)
-        parts = list(_stretches(container, streams[0], options))
+        parts = list(_stretches(container, streams[0]))
     if not parts:
         return None
     start = min(began for began, _ in parts)
-    end = max(began + len(piece) / options.samples for began, piece in parts)
-    samples = np.zeros(math.ceil((end - start) * options.samples) + 1, np.int16)
+    end = max(began + len(piece) / SAMPLE_RATE for began, piece in parts)
+    samples = np.zeros(math.ceil((end - start) * SAMPLE_RATE) + 1, np.int16)
     for began, piece in parts:
-        at = round((began - start) * options.samples)
+        at = round((began - start) * SAMPLE_RATE)
         samples[at : at + len(piece)] = piece[: len(samples) - at]
-    return Sound(samples, float(options.samples), start - zero, options)
+    return Sound(samples, float(SAMPLE_RATE), start - zero)
 
 
-def _stretches(container: Any, stream: Any, options: SoundOptions) -> Iterator[tuple[float, NDArray[np.int16]]]:
-    """When each stretch of sound without a gap begins, and its samples at the rate of the options."""
+MAX_TIMESTAMP_ERROR_SECONDS = 0.02  # Timestamps that are farther off the samples are a gap; Matroska rounds to .001.
+
+
+def _stretches(container: Any, stream: Any) -> Iterator[tuple[float, NDArray[np.int16]]]:
+    """When each stretch of sound without a gap begins, and its samples at the common rate."""
     from indexing.video.reading import av
 
     pieces: list[NDArray[np.int16]] = []
@@ -186,11 +200,11 @@ def _stretches(container: Any, stream: Any, options: SoundOptions) -> Iterator[t
     for frame in _frames(container, stream):
         time = expected if frame.pts is None else float(frame.pts * frame.time_base)
         now = (frame.sample_rate, frame.layout.name, frame.format.name)
-        if resampler is None or abs(time - expected) > options.gap or now != form:
+        if resampler is None or abs(time - expected) > MAX_TIMESTAMP_ERROR_SECONDS or now != form:
             if resampler is not None:
                 yield began, closed()
             pieces, form, began = [], now, time
-            expected, resampler = time, av().AudioResampler(format="s16", layout="mono", rate=options.samples)
+            expected, resampler = time, av().AudioResampler(format="s16", layout="mono", rate=SAMPLE_RATE)
         pieces.extend(made.to_ndarray()[0] for made in resampler.resample(frame))
         expected += frame.samples / frame.sample_rate
     if resampler is not None:
@@ -212,6 +226,9 @@ def _frames(container: Any, stream: Any) -> Iterator[Any]:
 Floats = NDArray[np.float64]
 
 
+MIN_OVERLAP_SECONDS = 2.0  # Time that both must have recorded at once.
+
+
 def sound_shift(
     a: Sound | None,
     b: Sound | None,
@@ -219,7 +236,6 @@ def sound_shift(
     fps: tuple[float, float] = (30.0, 30.0),
     max_shift: float | None = None,
     rate: float | None = None,
-    options: SoundOptions = SoundOptions(),
 ) -> Shift:
     """How the clock of one camera runs against that of another, by what their microphones heard."""
     missing = [which for which, one in zip("ab", (a, b), strict=True) if one is None]
@@ -228,9 +244,9 @@ def sound_shift(
     dead = [Notice(SoundNotice.SILENT, 0.0, {"which": which}) for which, one in zip("ab", (a, b), strict=True) if one.silent]
     if dead:
         return _refused(fps, *dead)
-    search = SoundSearch(a, b, max_shift, 0.0 if rate is None else rate - 1, rate is None, options)
+    search = SoundSearch(a, b, max_shift, 0.0 if rate is None else rate - 1, rate is None)
     if not search.lags.size:
-        return _refused(fps, Notice(SoundNotice.SHORT, options.overlap))
+        return _refused(fps, Notice(SoundNotice.SHORT, MIN_OVERLAP_SECONDS))
     return search.shift(fps)
 
 
@@ -253,18 +269,32 @@ class SoundPeak:
     score: float
 
 
+MAX_RATE_DEVIATION = 2e-4  # Of one clock against the other: those of phones and cameras differ by 5e-5.
+MAX_PIECE_SECONDS = 30.0  # Within it a rate is neglected, 6 ms at most.
+NUM_PEAKS = 7  # Peaks that are compared.
+MIN_PEAK_SEPARATION_SECONDS = 0.1  # Within this a peak is the slope of a higher one: a band's envelope, and a room's first echoes.
+STRETCH_SECONDS = 0.03  # Time that speaks as one, a clap (experiments.synchronization.sound).
+MAX_CHANCE = 1e-2  # Bound of the probability of such evidence at any shift by chance.
+# Evidence for the best shift over another one: wrong answers to a metronome reach 1.9, right ones have 2.9 and more.
+MIN_EVIDENCE_OVER_PEAK = 3.0
+DISTANCE_SIGMA_METRES = 3.0  # How much nearer the sound is to one camera.
+SPEED_OF_SOUND = 343.0  # Metres per second at 20 degrees.
+LATENCY_SIGMA_SECONDS = 0.015  # Between sound and pictures of a file: three sigmas are the 45 ms of ITU-R BT.1359-1.
+MAX_CURVE_POINTS = 20_000  # Points of the curve that are returned.
+
+
 class SoundSearch:
     """Two sounds, and the score of every shift between them."""
 
-    def __init__(self, a: Sound, b: Sound, max_shift: float | None, drift: float, free: bool, options: SoundOptions):
-        self.a, self.b, self.options, self.free, self.given = a, b, options, free, drift
-        self.step = options.step
+    def __init__(self, a: Sound, b: Sound, max_shift: float | None, drift: float, free: bool):
+        self.a, self.b, self.free, self.given = a, b, free, drift
+        self.step = STEP_SECONDS
         self.between = b.first - a.first  # seconds between the clocks at a shift of 0 steps
         one, two = a.coarse.shape[1], b.coarse.shape[1]
         self.middle = (one - 1) / 2
         every = np.arange(1 - one, two)
         count = np.minimum(np.minimum(one, two - every), np.minimum(one + every, two))
-        keep = count >= options.overlap / self.step
+        keep = count >= MIN_OVERLAP_SECONDS / self.step
         if max_shift is not None:
             keep &= np.abs(every * self.step + self.between) <= max_shift
         self.lags, self.count, self._keep = every[keep], count[keep], keep
@@ -274,7 +304,7 @@ class SoundSearch:
         if not self.free:
             return np.array([self.given])
         length = min(self.a.coarse.shape[1], self.b.coarse.shape[1])
-        many = int(self.options.drift * length / 2)  # the ends of a stretch move by one step from one to the next
+        many = int(MAX_RATE_DEVIATION * length / 2)  # the ends of a stretch move by one step from one to the next
         return np.arange(-many, many + 1) * 2 / length
 
     @cached_property
@@ -286,7 +316,7 @@ class SoundSearch:
         size = fft.next_fast_len(one.shape[1] + two.shape[1], real=True)
         other = fft.rfft(two, size, axis=1)
         drifts = self._drifts()
-        length = one.shape[1] if len(drifts) == 1 and not drifts[0] else round(self.options.piece / self.step)
+        length = one.shape[1] if len(drifts) == 1 and not drifts[0] else round(MAX_PIECE_SECONDS / self.step)
         sums = np.zeros((len(drifts), len(self._keep)))
         for begin in range(0, one.shape[1], length):
             part = one[:, begin : begin + length]
@@ -305,8 +335,8 @@ class SoundSearch:
         scores, drifts = self.scored
         left = scores.copy()
         found: list[SoundPeak] = []
-        away = self.options.apart / self.step
-        while len(found) < self.options.peaks and np.isfinite(left).any():
+        away = MIN_PEAK_SEPARATION_SECONDS / self.step
+        while len(found) < NUM_PEAKS and np.isfinite(left).any():
             at = int(np.nanargmax(left))
             if not left[at] > 0:
                 break
@@ -322,7 +352,7 @@ class SoundSearch:
         there = (other >= 0) & (other < two.shape[1])
         products = np.zeros(len(rows))
         products[there] = np.einsum("kt,kt->t", one[:, there], two[:, other[there]])
-        size = max(1, round(self.options.stretch / self.step))
+        size = max(1, round(STRETCH_SECONDS / self.step))
         whole = np.pad(products, (0, -len(products) % size))
         return np.asarray(whole.reshape(-1, size).sum(axis=1), dtype=np.float64)
 
@@ -341,15 +371,14 @@ class SoundSearch:
         chance = len(self.lags) * len(self._drifts()) * math.exp(-(max(strength, 0.0) ** 2) / 2)
         rivals = sum(math.exp(-(max(value, 0.0) ** 2) / 2) for value in apart)
         fit = SoundFit(self, best)
-        close = [one for one, value in zip(peaks[1:], apart, strict=True) if value < self.options.apart_by]
+        close = [one for one, value in zip(peaks[1:], apart, strict=True) if value < MIN_EVIDENCE_OVER_PEAK]
         limits = self._limits(best, chance, close)
         scores, _ = self.scored
         lags = self.lags * self.step + self.between
-        kept = _thinned(lags, scores, self.options.shown)
-        near = self.options
+        kept = _thinned(lags, scores, MAX_CURVE_POINTS)
         return Shift(
             offset=fit.offset,
-            sigma=math.sqrt(fit.sigma**2 + (near.nearer / near.speed) ** 2 + near.latency**2),
+            sigma=math.sqrt(fit.sigma**2 + (DISTANCE_SIGMA_METRES / SPEED_OF_SOUND) ** 2 + LATENCY_SIGMA_SECONDS**2),
             rate=fit.rate,
             rate_sigma=fit.rate_sigma,
             confidence=1 / (1 + chance + rivals),
@@ -365,7 +394,7 @@ class SoundSearch:
 
     def _limits(self, best: SoundPeak, chance: float, rivals: list[SoundPeak]) -> tuple[Notice, ...]:
         """Why the best shift is not to be believed."""
-        if chance > self.options.chance:
+        if chance > MAX_CHANCE:
             return (Notice(SoundNotice.NOTHING, self.seconds(best)),)
         if rivals:
             said = ", ".join(f"{self.seconds(one):+.3f}" for one in rivals[:3])
@@ -394,12 +423,20 @@ def _thinned(lags: Floats, scores: Floats, most: int) -> tuple[Floats, Floats]:
     return lags[best], scores[best]
 
 
+MIN_PIECE_SECONDS = 2.0  # Pieces whose scatter gives sigma.
+MIN_PIECES = 12  # Number of them in an overlap that is long enough.
+SCORE_SMOOTHING_SECONDS = 0.003  # Standard deviation of the kernel of scores about the peak, for slope and curvature.
+MIN_SECONDS_FOR_RATE = 30.0  # Overlap from which a rate is estimated: 1e-4 moves the ends by 3 ms then.
+SIGNIFICANCE_SIGMAS = 3.0  # Significant difference of a rate from 1, and of two witnesses.
+MAX_NEWTON_STEPS = 8  # Newton's steps.
+
+
 class SoundFit:
     """Offset and rate about a peak, to a fraction of a millisecond."""
 
     def __init__(self, search: SoundSearch, peak: SoundPeak):
-        options, self.search = search.options, search
-        self.hop = options.hop
+        self.search = search
+        self.hop = HOP_SECONDS
         a, b = search.a, search.b
         self.between = search.between
         ends = [search.seconds(peak, a.first), search.seconds(peak, a.first + a.seconds)]
@@ -409,9 +446,9 @@ class SoundFit:
         lags = np.arange(self.curves.shape[1]) - (self.curves.shape[1] - 1) / 2
         self._at = lags
         drift = peak.drift
-        long = search.free and high - low >= options.long
+        long = search.free and high - low >= MIN_SECONDS_FOR_RATE
         place, slope, covariance = self._best(drift, free=long)
-        if long and abs(slope - 0.0) <= options.sure * math.sqrt(covariance[1, 1]):  # nothing speaks for a drift
+        if long and abs(slope - 0.0) <= SIGNIFICANCE_SIGMAS * math.sqrt(covariance[1, 1]):  # nothing speaks for a drift
             long, (place, slope, covariance) = False, self._best(0.0, free=False)
         self.rate = 1 + slope
         self.rate_sigma = math.sqrt(covariance[1, 1]) if long else 0.0
@@ -422,12 +459,12 @@ class SoundFit:
         """``(p,)`` seconds from the center, and ``(p, lags)`` smoothed scores about the peak's lag at the center."""
         from scipy import fft, ndimage
 
-        options, a, b = self.search.options, self.search.a.fine, self.search.b.fine
+        a, b = self.search.a.fine, self.search.b.fine
         about = self.search.seconds(peak, self.center)
         shift = round((about - self.between) / self.hop)
         self._whole = shift * self.hop + self.between - about
-        length = float(np.clip((high - low) / options.fewest_pieces, options.shortest_piece, options.piece))
-        reach = round((options.apart + options.drift * (high - low) / 2) / self.hop)
+        length = float(np.clip((high - low) / MIN_PIECES, MIN_PIECE_SECONDS, MAX_PIECE_SECONDS))
+        reach = round((MIN_PEAK_SEPARATION_SECONDS + MAX_RATE_DEVIATION * (high - low) / 2) / self.hop)
         first, last = round((low - self.search.a.first) / self.hop), round((high - self.search.a.first) / self.hop)
         size, times, curves = round(length / self.hop), [], []
         for begin in range(max(0, first), max(first + 1, last - size // 2), size):
@@ -440,7 +477,7 @@ class SoundFit:
             n = fft.next_fast_len(other.shape[1], real=True)
             found = fft.irfft((np.conj(fft.rfft(one, n, axis=1)) * fft.rfft(other, n, axis=1)).sum(axis=0), n)
             times.append((begin + end - 1) / 2 * self.hop + self.search.a.first - self.center)
-            curves.append(ndimage.gaussian_filter1d(found[: 2 * reach + 1], options.blur / self.hop))
+            curves.append(ndimage.gaussian_filter1d(found[: 2 * reach + 1], SCORE_SMOOTHING_SECONDS / self.hop))
         return np.array(times), np.array(curves, dtype=np.float64)
 
     def _along(self, place: float, slope: float) -> tuple[Floats, Floats, Floats]:
@@ -455,17 +492,16 @@ class SoundFit:
 
     def _best(self, drift: float, free: bool) -> tuple[float, float, Floats]:
         """Seconds from the peak, drift, and the covariance of both: a grid, then Newton's steps while they go up."""
-        options = self.search.options
-        reach = options.apart / 2
+        reach = MIN_PEAK_SEPARATION_SECONDS / 2
         places = np.arange(-reach, reach + self.hop / 2, self.hop)
         half = max(float(np.abs(self.times).max()), self.hop)
-        near = min(options.drift, 2 * options.step / half)  # what the search before could not tell apart
+        near = min(MAX_RATE_DEVIATION, 2 * STEP_SECONDS / half)  # what the search before could not tell apart
         steps = drift + np.arange(-near, near + 1e-12, self.hop / half) if free else np.array([drift])
         totals = [[float(self._along(place, slope)[0].sum()) for place in places.tolist()] for slope in steps.tolist()]
         row, column = np.unravel_index(int(np.argmax(totals)), np.shape(totals))
         found = np.array([places[column], steps[row]])
         both = 2 if free else 1
-        for _ in range(options.rounds):
+        for _ in range(MAX_NEWTON_STEPS):
             here, first, second = self._along(float(found[0]), float(found[1]))
             design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
             hessian = -(design * second[:, None]).T @ design
@@ -485,7 +521,7 @@ class SoundFit:
         design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
         hessian = -(design * second[:, None]).T @ design
         covariance = np.zeros((2, 2))
-        covariance[0, 0] = self.search.options.apart**2
+        covariance[0, 0] = MIN_PEAK_SEPARATION_SECONDS**2
         if np.linalg.eigvalsh(hessian).min() > 0:
             inverse = np.linalg.inv(hessian)
             slopes = design * first[:, None]
@@ -503,7 +539,7 @@ def apart(one: Shift, other: Shift) -> float:
     return float(other.at(one.center)) - float(one.at(one.center))
 
 
-def witnessed(found: Shift, heard: Shift, options: SoundOptions = SoundOptions()) -> Shift:
+def witnessed(found: Shift, heard: Shift) -> Shift:
     """What keypoints or pixels say, with what the sound says to it: it agrees, contradicts (a refusal), or does not decide."""
     if not heard.ok:
         if all(notice.code is SoundNotice.NONE for notice in heard.notices):
@@ -514,7 +550,7 @@ def witnessed(found: Shift, heard: Shift, options: SoundOptions = SoundOptions()
     if not found.ok:
         return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.ALONE, 0.0, said)))
     off = apart(found, heard)
-    if abs(off) <= options.sure * math.hypot(found.sigma, heard.sigma):
+    if abs(off) <= SIGNIFICANCE_SIGMAS * math.hypot(found.sigma, heard.sigma):
         return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.AGREES, off)))
     said["found"] = f"{found.at(found.center) - found.center:+.3f}"
     said["own"] = f"{found.sigma:.3f}"

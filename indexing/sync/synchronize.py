@@ -45,7 +45,7 @@ def synchronize(
     min_confidence: float = 0.0,
     measure: Measure = "profile",
     sound: bool = True,
-    options: SyncOptions = SyncOptions(),
+    options: SyncOptions | None = None,
     **more: Any,
 ) -> Shift:
     """Synchronize two cameras that filmed the same scene from different places, neither of them calibrated.
@@ -79,8 +79,7 @@ def synchronize(
             confirm; or ``"window"``, that kernel alone (see :func:`indexing.sync.brightness.brightness_shift`).
         sound: whether the sound of two videos is a witness: where it decides, what the pictures say must agree with it (see
             :func:`indexing.sync.sound.sound_shift`).
-        options: every number that decides about recordings, people, tracks and brightness, by stage; ``dataclasses.replace``
-            changes some of them.
+        options: what is known of the recordings, and what is paid.
         more: for the reader (``format=``, ``size=``, ``layout=``) and for :func:`dyntorch.synchronize`.
 
     Returns:
@@ -108,6 +107,7 @@ def synchronize(
     rates = fps if isinstance(fps, (tuple, list)) else (fps, fps)
     if len(rates) != 2:
         raise ValueError(f"fps must be one number, or one for each of two cameras, got {fps!r}")
+    options = SyncOptions() if options is None else options
     check_options(options, SyncOptions)
     how = {name: more.pop(name) for name in ("format", "size", "layout") if name in more}
     takes = [
@@ -138,12 +138,13 @@ def pair(
     calibration: Any = None,
     measure: Measure = "profile",
     sound: bool = True,
-    options: SyncOptions = SyncOptions(),
+    options: SyncOptions | None = None,
     **more: Any,
 ) -> Pairing:
     """:func:`synchronize` for recordings that were read, and which person of each it is about."""
     from indexing.sync.calibration import lenses
 
+    options = options or SyncOptions()
     _check(a, b, method, measure, options)
     lens = lenses(calibration, [take.name for take in (a, b) if not take.spatial])
     shapeless = [take for take in (a, b) if take.kind == "keypoints" and is_normalized(take.people[0])]
@@ -154,12 +155,12 @@ def pair(
     more = {**more, "calibration": _of_both(a, b, lens.values) if lens else None}
     try:
         if method == "sound":
-            heard = listened(a, b, options, **more)
+            heard = listened(a, b, **more)
             limits: list[Notice] = []
             found = Pairing(heard, (0, 0), sound=heard)
         else:
             found, limits = _compared(a, b, method, measure, more, options)
-            found = _witnessed(found, a, b, options, more) if sound else found
+            found = _witnessed(found, a, b, more) if sound else found
     except ValueError as problem:
         raise ValueError(named(problem, names)) from problem
     said = [notice.named(names) for notice in [*noted(lens.notes if lens else ()), *limits, *found.shift.notices]]
@@ -184,9 +185,8 @@ def _compared(
             b,
             partial(_keypoints, options=options, **more),
             partial(_keypoints, quick=True, options=options, **more),
-            options=options,
         )
-        limits = _swapped(a, b, found, options)
+        limits = _swapped(a, b, found)
         if found.shift.ok or method != "auto" or a.video is None or b.video is None:
             return found, limits
         return _second(found, synchronize_videos(a.video, b.video, method, **more, options=options)), limits
@@ -194,27 +194,27 @@ def _compared(
     return Pairing(synchronize_videos(a, b, method, measure, **more, options=options), (0, 0)), []
 
 
-def listened(a: Take, b: Take, options: SyncOptions = SyncOptions(), **more: Any) -> Shift:
+def listened(a: Take, b: Take, **more: Any) -> Shift:
     """What the sound of two cameras says."""
     from indexing.sync.sound import hear, sound_shift
 
     known = {name: value for name, value in more.items() if name in ("max_shift", "rate")}
-    sounds = [None if take.footage is None else hear(take.footage, options.sound) for take in (a, b)]
-    return sound_shift(sounds[0], sounds[1], fps=(a.fps, b.fps), options=options.sound, **known)
+    sounds = [None if take.footage is None else hear(take.footage) for take in (a, b)]
+    return sound_shift(sounds[0], sounds[1], fps=(a.fps, b.fps), **known)
 
 
-def _witnessed(found: Pairing, a: Take, b: Take, options: SyncOptions, more: dict[str, Any]) -> Pairing:
+def _witnessed(found: Pairing, a: Take, b: Take, more: dict[str, Any]) -> Pairing:
     """What was found, and what the sound of both cameras says to it, where they have any."""
     from indexing.sync.sound import witnessed
 
     if a.footage is None or b.footage is None:
         return found
     try:
-        heard = listened(a, b, options, **more)
+        heard = listened(a, b, **more)
     except ValueError as problem:  # the pictures could be read, and need no witness
         said = Notice(SoundNotice.OPEN, 0.0, {"why": problem.args[0] if problem.args else str(problem)})
         return dataclasses.replace(found, shift=dataclasses.replace(found.shift, notices=(*found.shift.notices, said)))
-    return dataclasses.replace(found, shift=witnessed(found.shift, heard, options.sound), sound=heard)
+    return dataclasses.replace(found, shift=witnessed(found.shift, heard), sound=heard)
 
 
 def _second(found: Pairing, seen: Shift) -> Pairing:
@@ -234,11 +234,11 @@ def _check(a: Take, b: Take, method: Method, measure: Measure, options: SyncOpti
         text = "{arg:measure={measure!r}} is a measure of brightness, and {arg:method={method!r}} was asked for; use "
         raise ValueError(Message(text + "{arg:method='brightness'}", measure=measure, method=method))
     for take in (a, b):
-        if take.kind == "keypoints" and take.count < options.recording.fewest:
+        if take.kind == "keypoints" and take.count < options.min_frames:
             remedy = "give the folder that holds all frames" if take.count == 1 else "film longer"
             frames = f"{take.count} frame{'' if take.count == 1 else 's'}"
             raise ValueError(
-                f"{take.path or take.name or 'recording'}: {frames}, {options.recording.fewest} are needed at least; {remedy}"
+                f"{take.path or take.name or 'recording'}: {frames}, {options.min_frames} are needed at least; {remedy}"
             )
         if method == "keypoints" and take.kind != "keypoints":
             text = "{path}: is a video, and {arg:method='keypoints'} needs keypoints; run a pose estimator first, or use "
@@ -259,7 +259,7 @@ def _keypoints(
 
     import dyntorch
 
-    first, second, same, note = common_joints(a, b, options=options)
+    first, second, same, note = common_joints(a, b)
     if correspondence is None:
         correspondence = same
     elif correspondence and not same:
@@ -282,7 +282,7 @@ def _keypoints(
         correspondence=correspondence,
         times=(torch.from_numpy(a.times.copy()), torch.from_numpy(b.times.copy())),
         weights=(torch.from_numpy(trust[0]), torch.from_numpy(trust[1])) if known else None,
-        options=options.points,
+        options=options.of_points,
         **more,
     )
     return dataclasses.replace(shift, notices=(*noted([note] if note else []), *shift.notices))
@@ -308,17 +308,17 @@ def _same(a: Take, b: Take) -> bool:
     return bool(np.array_equal(first, second, equal_nan=first.dtype.kind == "f"))
 
 
-def _swapped(a: Take, b: Take, found: Pairing, options: SyncOptions) -> list[Notice]:
+def _swapped(a: Take, b: Take, found: Pairing) -> list[Notice]:
     """Notes on moments at which somebody else is followed, and on stretches in which the two do not show the same person."""
     people = [take.people[i] for take, i in zip((a, b), found.people, strict=True)]
     found_notes = []
     for take, clip in zip((a, b), people, strict=True):
-        moments = jumps(clip, options=options)
+        moments = jumps(clip)
         if moments:
             listed = ", ".join(f"{moment:.2f}" for moment in moments[:LISTED]) + " and more" * (len(moments) > LISTED)
             found_notes += noted([f"{take.name}: whoever is followed jumps at {listed} s: people swapped, or a cut"], take.name)
-    first, second, same, _ = common_joints(people[0], people[1], options=options)
-    bad = disagreements(first, second, found.shift, options=options) if same and found.shift.ok else []
+    first, second, same, _ = common_joints(people[0], people[1])
+    bad = disagreements(first, second, found.shift) if same and found.shift.ok else []
     if bad:
         listed = ", ".join(f"{start:.2f} to {end:.2f} s" for start, end, _ in bad[:LISTED]) + " and more" * (len(bad) > LISTED)
         worst = max(times for *_, times in bad)
@@ -336,25 +336,28 @@ if TYPE_CHECKING:
 
 
 def synchronize_videos(
-    a: Take, b: Take, method: str, measure: Measure = "profile", options: SyncOptions = SyncOptions(), **more: Any
+    a: Take, b: Take, method: str, measure: Measure = "profile", options: SyncOptions | None = None, **more: Any
 ) -> Shift:
     """Two recordings of which at least one is a video: by tracks, by brightness, or by both."""
     more.pop("correspondence", None)  # tracks of two videos never correspond
     brightness = {name: value for name, value in more.items() if name == "max_shift"}
     if method == "brightness":
-        return _brightness(a, b, **brightness, measure=measure, options=options)
-    tracked = _tracks(a, b, **more, options=options)
+        return _brightness(a, b, **brightness, measure=measure)
+    tracked = _tracks(a, b, **more, options=options or SyncOptions())
     if method == "tracks" or "keypoints" in (a.kind, b.kind):
         return tracked
     try:
-        bright = _brightness(a, b, **brightness, options=options)
+        bright = _brightness(a, b, **brightness)
     except ValueError as problem:  # too short for it; the files can be read, as the tracks show
         said = problem.args[0] if problem.args else str(problem)
         bright = refused(a, b, Notice(SyncNotice.UNUSABLE, 0.0, {"text": said}), method="brightness")
-    return agreed(tracked, bright, options=options)
+    return agreed(tracked, bright)
 
 
-def agreed(tracked: Shift, bright: Shift, options: SyncOptions = SyncOptions()) -> Shift:
+AGREEMENT_FRAMES = 2.0  # Within this tracks and brightness say the same.
+
+
+def agreed(tracked: Shift, bright: Shift) -> Shift:
     """One answer from two methods: the tracks' where both are sure of the same, a refusal with both where they are not."""
     both = (tracked, bright)
     sure = [shift for shift in both if shift.ok]
@@ -363,7 +366,7 @@ def agreed(tracked: Shift, bright: Shift, options: SyncOptions = SyncOptions()) 
     other = bright if best is tracked else tracked
     known = [Notice(SyncNotice.METHODS, 0.0, values), *besides(best), *(one for one in besides(other) if one not in besides(best))]
     apart = min((abs(offset - _middle(best)) for offset in _candidates(other)), default=float("inf"))
-    if sure and apart <= options.video.agree / min(best.fps):
+    if sure and apart <= AGREEMENT_FRAMES / min(best.fps):
         return dataclasses.replace(best, notices=tuple(known))
     peaks = torch.cat([best.peaks, other.peaks])  # scores of two methods: each list is in order, and the best one's comes first
     refusal = Notice(SyncNotice.DISAGREE, 0.0, values)
@@ -394,15 +397,18 @@ def _candidates(shift: Shift) -> list[float]:
     return [_middle(shift)] if shift.ok else [_middle(shift), *shift.peaks[:, 0].tolist()]
 
 
+MIN_TRACKS = 4  # Moving points that must be followed in each video.
+
+
 def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, **more: Any) -> Shift:
     """Different points in both: trajectories that span meeting subspaces."""
     import dyntorch
 
-    found = [points_of(take, options) for take in (a, b)]
+    found = [points_of(take) for take in (a, b)]
     known = [notice for *_, more in found for notice in more]
-    few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < options.video.tracks]
+    few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < MIN_TRACKS]
     if few:
-        values = {"needed": options.video.tracks, "names": " and ".join(few)}
+        values = {"needed": MIN_TRACKS, "names": " and ".join(few)}
         return refused(a, b, Notice(SyncNotice.FEW_TRACKS, 0.0, values), *known)
     shift: Shift = dyntorch.synchronize(
         found[0][0],
@@ -410,20 +416,20 @@ def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, 
         correspondence=False,
         times=(found[0][1], found[1][1]),
         calibration=calibration,
-        options=options.points,
+        options=options.of_points,
         **more,
     )
     return dataclasses.replace(shift, notices=(*known, *shift.notices))
 
 
-def points_of(take: Take, options: SyncOptions = SyncOptions()) -> tuple[Tensor, Tensor, list[Notice]]:
+def points_of(take: Take) -> tuple[Tensor, Tensor, list[Notice]]:
     """``(frames, n, 2)`` of whatever moves, ``(frames,)`` seconds, and what to say about it."""
     if take.kind == "keypoints":
         clip = take.people[0]
         return torch.from_numpy(np.array(clip.joints, dtype=np.float64)), torch.from_numpy(clip.times.copy()), []
     from indexing.video import track_points
 
-    tracks = track_points(source_of(take), options=options.tracks)
+    tracks = track_points(source_of(take))
     return tracks.points, tracks.times, noted([f"{take.name}: {note}" for note in tracks.notes], take.name)
 
 
@@ -446,13 +452,14 @@ def gray_of(take: Take) -> Any:
     return (values * (255.0 if values.max(initial=0.0) <= 1.0 else 1.0)).clip(0, 255).astype(np.uint8)
 
 
-def _brightness(a: Take, b: Take, options: SyncOptions, **more: Any) -> Shift:
+def _brightness(a: Take, b: Take, **more: Any) -> Shift:
     """No points at all."""
     from indexing.sync.brightness import brightness_shift
+    from indexing.sync.brightness_features import MAX_IMAGE_SIDE
     from indexing.video import read_video
 
-    sources = [iter(source_of(take)) if take.path is None else read_video(take.path, size=options.video.size) for take in (a, b)]
-    shift: Shift = brightness_shift(*sources, **more, options=options)
+    sources = [iter(source_of(take)) if take.path is None else read_video(take.path, size=MAX_IMAGE_SIDE) for take in (a, b)]
+    shift: Shift = brightness_shift(*sources, **more)
     return shift
 
 

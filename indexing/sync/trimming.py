@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from indexing.files import recover_folder, replace_folder
 from indexing.opening import entries, parse_json, read_text
 from indexing.readers.files import VIDEOS
-from indexing.sync.options import TrimOptions
 from indexing.sync.recordings import Take
 
 FOLDER = "synchronized_videos"
@@ -129,13 +128,17 @@ def beside(take: Take) -> Path | None:
     return None
 
 
-def clock_of(take: Take, path: Path, stamps: Floats, mended: Floats | None = None, options: TrimOptions = TrimOptions()) -> Floats:
+TIME_TOLERANCE_FRAMES = 0.25  # Within this the times of keypoints are those of the video's frames.
+MAX_OVERRUN_FRAMES = 2.0  # Frames by which keypoints may run over the end of their video.
+
+
+def clock_of(take: Take, path: Path, stamps: Floats, mended: Floats | None = None) -> Floats:
     """When the frames of a video were taken, on the clock of a camera's keypoints. mended ``(frames,)``."""
     if take.kind != "keypoints":
         return stamps
     near = np.abs(stamps[np.clip(np.searchsorted(stamps, take.times), 1, len(stamps) - 1) - [[1], [0]]] - take.times).min(axis=0)
-    own = stamps if near.max(initial=0.0) <= options.same / take.fps else np.arange(len(stamps)) / take.fps
-    if take.times[-1] > own[-1] + options.longer / take.fps:
+    own = stamps if near.max(initial=0.0) <= TIME_TOLERANCE_FRAMES / take.fps else np.arange(len(stamps)) / take.fps
+    if take.times[-1] > own[-1] + MAX_OVERRUN_FRAMES / take.fps:
         raise ValueError(
             f"{path}: has {len(stamps)} frames, but there are keypoints of {take.name} up to frame "
             f"{round(take.times[-1] * take.fps)}; give the video that they were found in"
@@ -146,15 +149,16 @@ def clock_of(take: Take, path: Path, stamps: Floats, mended: Floats | None = Non
     return np.asarray(own + (mended - take.times)[rows], dtype=np.float64)
 
 
-def trim(
-    films: Sequence[CameraFilm], clocks: Sequence[CameraClock], fps: float | None = None, options: TrimOptions = TrimOptions()
-) -> Trim:
+MAX_FPS_DENOMINATOR = 1001  # Of the frame rate as a fraction: 30000/1001.
+
+
+def trim(films: Sequence[CameraFilm], clocks: Sequence[CameraClock], fps: float | None = None) -> Trim:
     """Choose the frames of what all cameras recorded: at each moment the nearest one of each."""
     first = films[0]
     own = (len(first.times) - 1) / (first.times[-1] - first.times[0]) if len(first.times) > 1 else 0.0
     if fps is None and not own > 0:
         raise ValueError(f"{first.path}: has one frame, and so no frame rate; give it (--videos-fps)")
-    exact = Fraction(own if fps is None else fps).limit_denominator(options.denominator)
+    exact = Fraction(own if fps is None else fps).limit_denominator(MAX_FPS_DENOMINATOR)
     half = [min(film.frame / 2, 1.0) for film in films]
     begins = [float(clock.inverse(film.times[0] - off)) for film, clock, off in zip(films, clocks, half, strict=True)]
     ends = [float(clock.inverse(film.times[-1] + off)) for film, clock, off in zip(films, clocks, half, strict=True)]
@@ -221,9 +225,10 @@ def drop_videos(folder: Path) -> bool:
     return True
 
 
-def write_videos(
-    folder: Path, chosen: Trim, done: Callable[[float], None] | None = None, options: TrimOptions = TrimOptions()
-) -> Path:
+PROGRESS_FRAMES = 20  # Frames from one report of progress to the next.
+
+
+def write_videos(folder: Path, chosen: Trim, done: Callable[[float], None] | None = None) -> Path:
     """Write ``synchronized_videos/<camera>.mp4`` for every camera: all of them, or nothing."""
     from indexing.video.reading import av
 
@@ -234,8 +239,8 @@ def write_videos(
         building.mkdir(parents=True)
         for i, cut in enumerate(chosen.cuts):
             written = 0
-            for written in _encoded(building / cut.file, cut, chosen.fps, options):
-                if done is not None and written % options.every == 0:
+            for written in _encoded(building / cut.file, cut, chosen.fps):
+                if done is not None and written % PROGRESS_FRAMES == 0:
                     done((i * chosen.frames + written) / total)
             if written < chosen.frames:
                 raise ValueError(
@@ -250,13 +255,18 @@ def write_videos(
     return target
 
 
-def _encoded(path: Path, cut: Cut, fps: Fraction, options: TrimOptions) -> Iterator[int]:
+H264_CRF = "17"  # Quality of H.264: no visible difference from 18 down, nor for a keypoint detector.
+H264_PRESET = "veryfast"  # Speed for size.
+MPEG4_QSCALE = "2"  # Quality of MPEG-4, where there is no H.264.
+
+
+def _encoded(path: Path, cut: Cut, fps: Fraction) -> Iterator[int]:
     """Write a file frame by frame; how many are written."""
     from indexing.video.reading import av
 
-    codec, how = "mpeg4", {"qscale": options.mpeg4}
+    codec, how = "mpeg4", {"qscale": MPEG4_QSCALE}
     if "libx264" in av().codecs_available:
-        codec, how = "libx264", {"crf": options.crf, "preset": options.preset}
+        codec, how = "libx264", {"crf": H264_CRF, "preset": H264_PRESET}
     with av().open(str(path), "w", format="mp4") as container:
         stream = container.add_stream(codec, rate=fps, options=how)
         stream.pix_fmt = "yuv420p"

@@ -7,7 +7,6 @@ import torch
 from indexing import synchronize
 from indexing.sync.brightness import brightness_shift
 from indexing.sync.brightness_features import window_kernels
-from indexing.sync.options import KernelOptions, SyncOptions
 
 FPS = (30.0, 30.0)
 SPOTS, SIDE = 24, 96
@@ -40,9 +39,8 @@ def cameras():
 def test_differences_lie_in_the_space_of_the_motions(cameras):
     """Patch k: h_k(t) = -G_k (u, v)_k(t): rows of H span the three functions, whatever the camera and the texture."""
     motions = courses(30, 1, 0.08)
-    small = KernelOptions(half=6, patch=12, rows=60)
     for camera, seed in zip(cameras, (4, 5), strict=True):
-        kernels = window_kernels(torch.from_numpy(filmed(motions, camera, seed)).float() / 255, SyncOptions(kernel=small)).numpy()
+        kernels = window_kernels(torch.from_numpy(filmed(motions, camera, seed)).float() / 255, half=6, patch=12, rows=60).numpy()
         for tau in (0, 8, 17):
             window = motions[:, tau : tau + 13]
             basis = np.linalg.qr((window - window.mean(axis=1, keepdims=True)).T)[0]

@@ -24,35 +24,22 @@ from dyntorch.tasks.synchronize.synchronize import synchronize
 # The shifts of pairs of cameras as numbers: candidates, times from the middle of what a camera shares with others, and costs.
 
 
-FIXED_RATE_SIGMA = 1e-9  # The same where no pair searched it.
-
-
 @dataclass(frozen=True)
 class Network:
     """The pairs as numbers: E pairs, K candidates each."""
 
     cameras: int
-    ends: Tensor
-    """``(E, 2)`` long."""
-    times: Tensor
-    """``(E, K + 1)``: u_i of the moment, then the candidates' u_j; NaN = no such candidate."""
-    means: Tensor
-    """``(cameras,)``: the times that all are counted from."""
-    sigma: Tensor
-    """``(E,)`` seconds."""
-    slack: Tensor
-    """``(E,)`` seconds: what a right peak may be off by, with ``sigma``."""
-    rate: Tensor
-    """``(E,)`` logarithms."""
+    ends: Tensor  # ``(E, 2)`` long
+    times: Tensor  # ``(E, K + 1)``: u_i of the moment, then the candidates' u_j; NaN = no such candidate
+    means: Tensor  # ``(cameras,)``: the times that all are counted from
+    sigma: Tensor  # ``(E,)`` seconds
+    slack: Tensor  # ``(E,)`` seconds: what a right peak may be off by, with ``sigma``
+    rate: Tensor  # ``(E,)`` logarithms
     rate_sigma: Tensor
-    cost: Tensor
-    """``(E, K)``: -log of the probability that a candidate is the right one; infinite where there is none."""
-    none: Tensor
-    """``(E,)``: the same of none, times the density of a shift anywhere by that of a right one."""
-    saving: Tensor
-    """``(cameras,)``: -log of that density, once: a camera without a clock has no place to be explained."""
-    weight: Tensor
-    """``(E,)`` of the squared residual: the probability that the best peak is right."""
+    cost: Tensor  # ``(E, K)``: -log of the probability that a candidate is the right one; infinite where there is none
+    none: Tensor  # ``(E,)``: the same of none, times the density of a shift anywhere by that of a right one
+    saving: Tensor  # ``(cameras,)``: -log of that density, once: a camera without a clock has no place to be explained
+    weight: Tensor  # ``(E,)`` of the squared residual: the probability that the best peak is right
 
     @property
     def searched(self) -> bool:
@@ -62,6 +49,7 @@ class Network:
 
 PEAK_ERROR_FRAMES = 0.25  # Error of a right peak that the sigma of a pair does not include (view-dependent keypoints), frames.
 UNSEARCHED_RATE_SIGMA = 5e-5  # Sigma of the rate of a pair that did not search it, next to pairs that did: quartz clocks.
+FIXED_RATE_SIGMA = 1e-9  # The same where no pair searched it.
 
 
 def network(shifts: Mapping[tuple[int, int], Shift], cameras: int) -> Network:
@@ -86,10 +74,8 @@ def network(shifts: Mapping[tuple[int, int], Shift], cameras: int) -> Network:
     )
     gain = torch.tensor([_span(shift) for shift in every], dtype=torch.float64) / (2.5 * torch.hypot(sigma, slack))
     gain = gain.clamp(min=1).log()
-    cost, none = (
-        torch.stack([cost for _, cost in found]),
-        torch.tensor([_wrong(shift) for shift in every], dtype=torch.float64),
-    )
+    cost = torch.stack([cost for _, cost in found])
+    none = torch.tensor([_wrong(shift) for shift in every], dtype=torch.float64)
     rate = torch.tensor([_finite(shift.rate, 1.0) for shift in every], dtype=torch.float64).log()
     weight = torch.tensor([_trust(shift) for shift in every], dtype=torch.float64)
     saving = torch.tensor([float(gain[(ends == one).any(-1)].min()) if (ends == one).any() else 0.0 for one in range(cameras)])
@@ -154,15 +140,11 @@ def _span(shift: Shift) -> float:
 class Reading:
     """One way to read the pairs: which candidate each of them is right with, and the clocks of that."""
 
-    labels: tuple[int, ...]
-    """Candidate per pair, -1 = none."""
-    logs: Tensor
-    """``(cameras,)`` logarithms of the rates."""
-    starts: Tensor
-    """``(cameras,)``: b; NaN = no clock."""
+    labels: tuple[int, ...]  # Candidate per pair, -1 = none
+    logs: Tensor  # ``(cameras,)`` logarithms of the rates
+    starts: Tensor  # ``(cameras,)``: b; NaN = no clock
     cost: float
-    covariance: Tensor
-    """``(2 cameras, 2 cameras)`` of logs and starts; 0 for the reference, infinite where there is no clock."""
+    covariance: Tensor  # ``(2 cameras, 2 cameras)`` of logs and starts; 0 for the reference, infinite where there is no clock
 
 
 def readings(net: Network, reference: int) -> list[Reading]:

@@ -406,7 +406,7 @@ def _sigmoid(x: float) -> float:
     return 1 / (1 + math.exp(-max(min(x, 700.0), -700.0)))
 
 
-MIN_STRENGTH_FOR_REJECTION = 0.35  # The same below which no track is rejected.
+MIN_STRENGTH_FOR_REJECTION = 0.35  # Relative clearness below which no track is rejected.
 MIN_CLEARNESS_GAIN = 1.15  # Factor by which a lag must stand out more without a track to reject it.
 
 

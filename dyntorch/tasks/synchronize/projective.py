@@ -411,7 +411,7 @@ def _covariance(problem: SharedMotion, theta: Tensors) -> Tensor:
 
 
 MAX_MISFIT = 1.8  # Difference of two motions, sigmas, beyond which they are not one: .9 to 1.2 at the right shift.
-EVEN_MARGIN = 0.1  # The same at which right and wrong are as likely; set by hand.
+EVEN_MARGIN = 0.1  # That logarithm at which right and wrong are as likely; set by hand.
 MARGIN_SCALE = 0.03  # The same per unit of the log odds.
 MIN_SIGMA_SECONDS = 1e-6  # Error of a shift at least: poses between frames are interpolated.
 

@@ -16,7 +16,7 @@ from dyntorch.tasks.synchronize.result import ShiftNotice
 # What the points of one camera tell about time, whichever points they are: how the body changes and how it moves on the whole.
 
 
-MAX_SIGMA_FRAMES = 0.6  # The same in frames of the slower camera.
+MAX_SIGMA_FRAMES = 0.6  # Sigma above which a shift is refused, frames of the slower camera.
 
 
 STEP = 1 / 30
@@ -110,7 +110,9 @@ def halves(body: Body) -> tuple[Body, Body]:
     return first, second
 
 
-SIZE_KERNEL_SECONDS = 1 / 3  # The same for the size of the body in the image (half to six times as much are alike to 1 %).
+SIZE_KERNEL_SECONDS = (
+    1 / 3
+)  # Standard deviation of the kernel for the size of the body in the image (half to six times as much are alike to 1 %).
 # Noise variance of the rows over that of third differences: cameras are not affine (1 to 4 are alike, 8 is 4 % worse).
 NOISE_FACTOR = 2.0
 

@@ -259,7 +259,7 @@ def _far_from_median(tracks: Tracks) -> Tensor:
     return (far > HAMPEL_SIGMAS * torch.maximum(spread, usual)).any(-1)
 
 
-LINE_OUTLIER_SIGMAS = 6.0  # Robust sigmas from that line beyond which a position is an outlier.
+LINE_OUTLIER_SIGMAS = 6.0  # Robust sigmas from the local line beyond which a position is an outlier.
 MIN_RESIDUAL_RATIO = 2.0  # and its residual over those of the neighbouring frames: sudden movements bend several frames alike.
 MAX_LINE_PASSES = 8  # Repetitions of the second pass.
 

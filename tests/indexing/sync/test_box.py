@@ -4,10 +4,9 @@ import numpy as np
 import torch
 from torch.nn.functional import interpolate
 
-from indexing.sync.brightness_features import boxes, crop, motion
-from indexing.sync.options import BoxOptions
+from indexing.sync.brightness_features import CROP_SIDE, boxes, crop, motion
 
-SIDE = BoxOptions().side
+SIDE = CROP_SIDE
 
 
 def wall(generator, height=60, width=90):

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from indexing.sync.brightness import Curve, lag_sums, part_curve, score_curve
-from indexing.sync.options import LagOptions
+from indexing.sync.brightness import OVERLAP_POWER, Curve, lag_sums, part_curve, score_curve
 
 
 def unit(rows, seed):
@@ -30,7 +29,7 @@ def test_scores_leave_out_missing_frames_and_short_overlaps():
             assert curve.at(lag) == -torch.inf
         else:
             mean = sum(products[i, j].item() for i, j in pairs) / len(pairs)
-            assert curve.at(lag) == pytest.approx(mean * (len(pairs) / float(curve.counts.max())) ** LagOptions().power, abs=1e-12)
+            assert curve.at(lag) == pytest.approx(mean * (len(pairs) / float(curve.counts.max())) ** OVERLAP_POWER, abs=1e-12)
 
 
 def test_part_of_the_first_keeps_the_lags():

@@ -4,11 +4,9 @@ import math
 
 import torch
 
-from indexing.sync.brightness import evidence, windows
-from indexing.sync.options import WindowOptions
+from indexing.sync.brightness import OUTLIER_SHARE, SOFTMAX_SHARPNESS, WINDOW_FRAMES, WINDOW_LAG_RANGE, evidence, windows
 
-USUAL = WindowOptions()
-REACH, WINDOW = USUAL.reach, USUAL.size
+REACH, WINDOW = WINDOW_LAG_RANGE, WINDOW_FRAMES
 
 
 def walk(rows, seed):
@@ -36,8 +34,8 @@ def test_agreement_adds_up_and_disagreement_too():
 def test_one_window_by_hand():
     a, b = walk(WINDOW + 2 * REACH, 0)[REACH:-REACH], walk(WINDOW + 2 * REACH, 1)
     means = torch.stack([(a * b[REACH + d : REACH + d + WINDOW]).sum(1).mean() for d in range(-REACH, REACH + 1)])
-    share = torch.softmax(USUAL.sharpness * means, dim=0)[REACH - 1 : REACH + 2].sum().item()
-    assert math.isclose(evidence(a, b, REACH), math.log((1 - USUAL.outlier) * share * 25 / 3 + USUAL.outlier), rel_tol=1e-9)
+    share = torch.softmax(SOFTMAX_SHARPNESS * means, dim=0)[REACH - 1 : REACH + 2].sum().item()
+    assert math.isclose(evidence(a, b, REACH), math.log((1 - OUTLIER_SHARE) * share * 25 / 3 + OUTLIER_SHARE), rel_tol=1e-9)
 
 
 def test_missing_frames_say_nothing():

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.sync.brightness_features import take
-from indexing.sync.options import GrayOptions
+from indexing.sync.brightness_features import MAX_IMAGE_SIDE, take
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (50, 24, 32), dtype=np.uint8)
 
@@ -35,7 +34,7 @@ def test_floats_and_colours_become_grey_levels():
 def test_large_frames_become_small():
     frames = np.repeat(np.repeat(FRAMES[:20], 40, axis=1), 40, axis=2)  # 1280 px wide
     small = take(chunks(frames), "a", fps=30.0)
-    assert small.frames.shape[2] == GrayOptions().largest and small.scale == GrayOptions().largest / 1280
+    assert small.frames.shape[2] == MAX_IMAGE_SIDE and small.scale == MAX_IMAGE_SIDE / 1280
     assert torch.equal(small.frames[:, 5::10, 5::10], torch.from_numpy(FRAMES[:20]))
 
 

@@ -9,6 +9,7 @@ import torch
 import dyntorch
 from indexing.clip import Clip
 from indexing.readers import read
+from indexing.sync.options import SyncOptions
 from indexing.sync.people import Pairing, decide, disagreements, jumps, match_people
 from indexing.sync.recordings import Take, take_of
 from indexing.sync.synchronize import pair, synchronize
@@ -36,6 +37,7 @@ def test_one_person_is_one_candidate_and_several_are_several(cameras, tmp_path):
     both = take_of(write_openpose(tmp_path / "both", [cameras[0], moved(other, 900.0)]), fps=FPS)
     assert len(alone.people) == len(alone.everyone) == 1 and len(both.everyone) == 2 and 2 <= len(both.people) <= 3
     assert len(take_of(tmp_path / "both", fps=FPS, person="largest").people) == 1
+    assert len(take_of(tmp_path / "both", fps=FPS, options=SyncOptions(num_candidates=0)).people) == 1
 
 
 def test_the_best_pairing_is_taken_and_named(monkeypatch, cameras):

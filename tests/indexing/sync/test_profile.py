@@ -4,27 +4,28 @@ import numpy as np
 import torch
 
 from indexing.brightness.features import blur, gradients, weighted_differences
-from indexing.sync.brightness_features import inverse_root, reversed_profile, row_profile, whitened
-from indexing.sync.options import ProfileOptions, SyncOptions
-
-USUAL = ProfileOptions()
-
-
-def over(**profile):
-    return SyncOptions(profile=ProfileOptions(**profile))
+from indexing.sync.brightness_features import (
+    NUM_BANDS,
+    PROFILE_BLUR,
+    PROFILE_NOISE_RATIO,
+    inverse_root,
+    reversed_profile,
+    row_profile,
+    whitened,
+)
 
 
 def test_profile_is_the_mean_motion_per_band(films):
     crops = torch.from_numpy(films[0][:12, :56, :56]).float() / 255
-    gx, gy, gt = gradients(blur(crops, USUAL.sigma))
-    gt = gt.sign() * (gt.abs() - USUAL.quiet * gt.abs().median()).clamp(min=0)
+    gx, gy, gt = gradients(blur(crops, PROFILE_BLUR))
+    gt = gt.sign() * (gt.abs() - PROFILE_NOISE_RATIO * gt.abs().median()).clamp(min=0)
     u, v = (m.numpy() for m in weighted_differences(gx, gy, gt))
     found = row_profile(crops)
-    for band in range(USUAL.bands):
+    for band in range(NUM_BANDS):
         rows = slice(8 * band, 8 * band + 16)
         parts = (np.maximum(-v, 0), np.maximum(v, 0), np.abs(u))
         want = [np.sqrt(part[:, rows].mean(axis=(1, 2))) for part in parts]
-        assert np.allclose(found.numpy()[:, band :: USUAL.bands], np.stack(want, axis=1), atol=1e-6)
+        assert np.allclose(found.numpy()[:, band::NUM_BANDS], np.stack(want, axis=1), atol=1e-6)
 
 
 def test_backwards_profile_is_that_of_the_backwards_video(films):
@@ -36,7 +37,7 @@ def test_whitening_equalizes_what_both_share(rng):
     mixing = rng.normal(size=(6, 6))
     first, second = (torch.from_numpy(rng.normal(size=(n, 6)) @ mixing) for n in (400, 300))
     first[5] = torch.nan
-    one, two = whitened(first, second, options=over(ridge=1e-9, reach=0))
+    one, two = whitened(first, second, ridge=1e-9, reach=0)
     assert (one[5] == 0).all() and torch.allclose(two.norm(dim=1), torch.ones(300, dtype=torch.float64))
     share = (one.T @ one / 399 + two.T @ two / 300) / 2
     assert (share - torch.eye(6) / 6).abs().max() < 0.03
@@ -45,7 +46,7 @@ def test_whitening_equalizes_what_both_share(rng):
 def test_neighbours_in_time_are_whitened_together(rng):
     first, second = (torch.from_numpy(rng.normal(size=(n, 3))) for n in (40, 30))
     stacked = [torch.cat([z[[0, *range(len(z) - 1)]], z, z[[*range(1, len(z)), -1]]], dim=1) for z in (first, second)]
-    for found, want in zip(whitened(first, second, options=over(reach=1)), whitened(*stacked, options=over(reach=0)), strict=True):
+    for found, want in zip(whitened(first, second, reach=1), whitened(*stacked, reach=0), strict=True):
         assert torch.allclose(found, want)
 
 

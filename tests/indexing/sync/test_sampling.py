@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from indexing.brightness.footage import Resampler
-from indexing.sync.brightness_features import common_rate, sampled, take
-from indexing.sync.options import KernelOptions
+from indexing.sync.brightness_features import KERNEL_HALF_FRAMES, common_rate, sampled, take
 
 
 def whole(source):
@@ -26,7 +25,7 @@ def test_rate_is_the_slower_or_a_fraction(films):
 def test_blocks_do_not_show(films, monkeypatch):
     source = take(films[0][:80], "a", fps=30.0)
     found = sampled(source, whole(source), 30.0)
-    assert found.profile.shape == (80, 18) and found.kernels.shape[0] == 80 - 2 * KernelOptions().half
+    assert found.profile.shape == (80, 18) and found.kernels.shape[0] == 80 - 2 * KERNEL_HALF_FRAMES
     monkeypatch.setattr("indexing.sync.brightness_features.PROFILE_BLOCK", 1000)
     once = sampled(source, whole(source), 30.0)
     assert torch.allclose(found.kernels, once.kernels, atol=1e-5)

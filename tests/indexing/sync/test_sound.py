@@ -8,7 +8,6 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from indexing.sync.options import SoundOptions
 from indexing.sync.sound import Sound, apart, flattened, hear, sound_shift, witnessed
 from indexing.sync.synchronize import synchronize
 from tests.indexing.sync.footage import RATE, clicks, microphone, noises, write_film
@@ -56,7 +55,7 @@ def test_noise_and_levels(scene):
 
 
 @pytest.mark.slow
-def test_a_clock_that_drifts(scene):
+def test_a_clock_that_drifts(scene, monkeypatch):
     gained = 1 + 1.5e-4
     second = microphone(scene, STARTS[1], 30.0, 1)
     moments = np.arange(int(28 * RATE)) / gained
@@ -64,9 +63,10 @@ def test_a_clock_that_drifts(scene):
     found = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE))
     middle = found.center
     assert found.at(middle) == pytest.approx(gained * (middle + LATER), abs=1e-3)
-    short = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE), options=SoundOptions(long=10.0))
+    monkeypatch.setattr("indexing.sync.sound.MIN_SECONDS_FOR_RATE", 10.0)
+    short = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE))
     assert short.rate == pytest.approx(gained, abs=4 * short.rate_sigma) and 0 < short.rate_sigma < 5e-5
-    held = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE), rate=1.0, options=SoundOptions(long=10.0))
+    held = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE), rate=1.0)
     assert held.rate == 1 and held.rate_sigma == 0
 
 

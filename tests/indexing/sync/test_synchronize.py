@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+import dyntorch
 import indexing
 from indexing.clip import Clip
 from indexing.skeleton import COCO17, HALPE26, Skeleton
-from indexing.sync.options import RecordingOptions, SyncOptions
+from indexing.sync.options import SyncOptions
 from indexing.sync.people import common_joints
 from indexing.sync.recordings import take_of
 from indexing.sync.synchronize import remarks, synchronize
@@ -144,9 +145,14 @@ def test_two_cameras_of_one_scene(cameras):
     assert found.ok and found.frames == pytest.approx(SKIPPED[0] - SKIPPED[1], abs=0.5), found
 
 
+def test_options_reach_the_library(cameras, library):
+    synchronize(cameras[0], cameras[1], options=SyncOptions(min_margin=0.7))
+    assert library[0]["options"] == dyntorch.SynchronizeOptions(min_margin=0.7)
+
+
 def test_options_reach_the_stages(rng):
     still = rng.normal(size=(30, 8, 2))
     with pytest.raises(ValueError, match="30 frames, 40 are needed"):
-        synchronize(still, still, fps=30.0, options=SyncOptions(recording=RecordingOptions(fewest=40)))
+        synchronize(still, still, fps=30.0, options=SyncOptions(min_frames=40))
     with pytest.raises(ValueError, match="options must be SyncOptions"):
-        synchronize(still, still, fps=30.0, options=RecordingOptions())
+        synchronize(still, still, fps=30.0, options=dyntorch.SynchronizeOptions())

@@ -4,10 +4,9 @@ import numpy as np
 import torch
 
 from indexing.brightness.features import blur
-from indexing.sync.brightness_features import kernel_descriptors, window_kernels
-from indexing.sync.options import KernelOptions, SyncOptions
+from indexing.sync.brightness_features import KERNEL_BLUR, kernel_descriptors, window_kernels
 
-SIGMA = KernelOptions().sigma
+SIGMA = KERNEL_BLUR
 
 
 def by_loops(crops, tau, half, patch, rows):
@@ -29,7 +28,7 @@ def by_loops(crops, tau, half, patch, rows):
 
 def test_kernel_is_its_definition(films):
     crops = torch.from_numpy(films[0][:20, 10:50, 20:60]).float() / 255
-    found = window_kernels(crops, options=SyncOptions(kernel=KernelOptions(half=3, patch=7, rows=20)))
+    found = window_kernels(crops, half=3, patch=7, rows=20)
     assert found.shape == (14, 7, 7)
     for tau in (3, 10, 16):
         assert np.allclose(found[tau - 3].numpy(), by_loops(crops, tau, 3, 7, 20), atol=1e-5)
