@@ -86,13 +86,13 @@ _HOME = {
     # the numbers that decide in a task
     "AlignOptions": "dyntorch.tasks.align.options",
     "CalibrateOptions": "dyntorch.tasks.calibrate.options",
-    "PairOptions": "dyntorch.tasks.pair.options",
+    "PairOptions": "dyntorch.tasks.pair.pair",
     "PlanesOptions": "dyntorch.tasks.planes.options",
     "ReconstructOptions": "dyntorch.tasks.reconstruct.options",
     "SegmentOptions": "dyntorch.tasks.segment.options",
     "SynchronizeOptions": "dyntorch.tasks.synchronize.options",
     "TrackSegmentOptions": "dyntorch.tasks.segment_tracks.options",
-    "TrajectoryOptions": "dyntorch.tasks.trajectories.options",
+    "TrajectoryOptions": "dyntorch.tasks.trajectories.trajectories",
 }
 _MODULES = {
     "core": "dyntorch.core",

@@ -16,22 +16,21 @@ The scenes are written from the definitions (points, velocities, K [R | t]), not
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.geometry.rigid import rotation_exponential
+from dyntorch.tasks.reconstruct import calibrated
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.options import MetricOptions, ReconstructOptions
 from dyntorch.tasks.reconstruct.result import Reconstruction
 from experiments.common.tables import command, note
 
 K = torch.tensor([[1300.0, 0.0, 500.0], [0.0, 1280.0, 480.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 AXES = {"constant_direction_2d": 1, "constant_direction_3d": 1, "constant_velocity_planes_3d": 2}
 POINTS, SCENES, QUICK, PIXELS, SENSOR = 60, 40, 5, 0.5, 1e-3
-UNADJUSTED = replace(ReconstructOptions(), metric=MetricOptions(adjustment_steps=0, refused=float("inf")))
 
 
 def scenes(motion: Motion, views: int, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -95,7 +94,8 @@ def row(name: str, views: int, count: int, seed: int) -> str:
     limit = float("inf")
     clean = dyn.reconstruct(x, name, threshold=limit, calibration=given)
     found = dyn.reconstruct(noisy, name, threshold=limit, calibration=given)
-    start = dyn.reconstruct(noisy, name, threshold=limit, calibration=given, options=UNADJUSTED)
+    with patch.object(calibrated, "METRIC_ITERATIONS", 0), patch.object(calibrated, "MAX_MISFIT", float("inf")):
+        start = dyn.reconstruct(noisy, name, threshold=limit, calibration=given)
     plain = dyn.reconstruct(noisy, name, threshold=limit)
     assert clean.metric is not None and found.metric is not None
     several = sum(one.code == "metric_several" for one in found.notices)

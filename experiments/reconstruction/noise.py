@@ -27,7 +27,6 @@ from dyntorch import metrics, scenes
 from dyntorch.geometry.lift import upgrade
 from dyntorch.geometry.triangulation import resect, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
 from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances
@@ -81,7 +80,7 @@ def stages(tracks: ViewTracks, motion: Motion) -> dict[str, tuple[Tensor, Tensor
     count = min(motion.views(tracks.times), motion.k + 1)
     chosen = torch.linspace(0, tracks.x.shape[1] - 1, count).round().long()
     linear = dyn.fit(motion.tensor(count), *tracks.x[:, chosen].unbind(1))
-    lifting = Lifting.of(motion, tracks.times, tracks.x, options=ReconstructOptions())
+    lifting = Lifting.of(motion, tracks.times, tracks.x)
     found = {}
     for name, solution in (("linear", linear), ("constrained", dyn.constrain(linear))):
         some = torch.stack(solution.motion, dim=1)
@@ -105,12 +104,11 @@ def cell(setting: Setting, count: int, seed: int) -> str:
     draw = torch.Generator().manual_seed(seed)
     scene = scenes.lifted(setting.motion, setting.points, setting.views, sigma=setting.sigma, batch=(count,), generator=draw)
     tracks = flat(scene.tracks, scene.times)
-    lifting = Lifting.of(motion, tracks.times, tracks.x, options=ReconstructOptions())
+    lifting = Lifting.of(motion, tracks.times, tracks.x)
     truth = adjusted(
         tracks,
         LiftedState(tracks.transforms @ scene.cameras, scene.structure @ lifting.root.mT, tracks.x[:, 0, 0, 0]),
         lifting,
-        options=ReconstructOptions(),
     )
     found = dyn.reconstruct(scene.tracks, setting.motion, scene.times, threshold=float("inf"))
     steps = stages(tracks, motion)

@@ -1,4 +1,4 @@
-"""From first cameras to the best ones: starts are compared, the best is adjusted, its noise and its bones learned on the way."""
+"""From first cameras to the best ones: starts are compared, the best is adjusted, its noise estimated on the way."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.numerics.least_squares import minimize
+from dyntorch.numerics.least_squares import LeastSquaresOptions, minimize
 from dyntorch.tasks.calibrate.adjustment import (
     CLOCK,
     LENS,
@@ -21,13 +21,17 @@ from dyntorch.tasks.calibrate.adjustment import (
     images,
 )  # fmt: skip
 from dyntorch.tasks.calibrate.averaging import Graph, first_cameras, meeting_points, viewing_rays
-from dyntorch.tasks.calibrate.bones import learned
 from dyntorch.tasks.calibrate.input import Rig
-from dyntorch.tasks.calibrate.observations import RigViews
-from dyntorch.tasks.calibrate.options import CalibrateOptions
+from dyntorch.tasks.calibrate.observations import MIN_NOISE, RigViews
 
 RAYLEIGH = 1.1774
 """Median of the length of an error in two coordinates of standard deviation 1."""
+
+
+PRIOR_FOCAL = 0.85  # over the longer side: 61 degrees across, a phone
+PRIOR_FOCAL_SIGMA = 0.7  # of its logarithm: a factor of two
+PRIOR_K1_SCALE = 0.015  # of Cauchy's distribution: most phones have less than .05, action cameras .3
+PRIOR_RATE_SIGMA = 1e-4  # of the logarithm of a clock rate: what quartz clocks differ by
 
 
 @dataclass(frozen=True)
@@ -40,18 +44,16 @@ class Freedom:
     priors: Priors  # of what is not geometry
 
     @staticmethod
-    def of(
-        rig: Rig, clocks: Tensor, held_clocks: bool, held_rates: bool, rate_sigmas: Tensor, options: CalibrateOptions
-    ) -> Freedom:
+    def of(rig: Rig, clocks: Tensor, held_clocks: bool, held_rates: bool, rate_sigmas: Tensor) -> Freedom:
         """Of a rig. clocks ``(c, 2)``, rate_sigmas ``(c,)``."""
-        c, adjust = len(rig.tracks), options.adjust
+        c = len(rig.tracks)
         side = rig.sizes.amax(1)
         mean, sigma = torch.zeros(c, 5, dtype=torch.float64), torch.full((c, 5), math.inf, dtype=torch.float64)
-        mean[:, 0], sigma[:, 0] = (adjust.focal * side).log(), adjust.focal_sigma
-        sigma[:, 1] = adjust.k1_scale
-        sigma[:, 2] = adjust.k2_sigma if adjust.k2_sigma > 0 else math.inf
-        mean[:, 3:], sigma[:, 4] = clocks, torch.hypot(rate_sigmas, torch.tensor(adjust.rate_sigma, dtype=torch.float64))
-        lens = torch.stack([rig.focals.isnan(), ~rig.known_lens, ~rig.known_lens & (adjust.k2_sigma > 0)], dim=-1)
+        mean[:, 0], sigma[:, 0] = (PRIOR_FOCAL * side).log(), PRIOR_FOCAL_SIGMA
+        sigma[:, 1] = PRIOR_K1_SCALE
+        mean[:, 3:], sigma[:, 4] = clocks, torch.hypot(rate_sigmas, torch.tensor(PRIOR_RATE_SIGMA, dtype=torch.float64))
+        # k2 is held at 0
+        lens = torch.stack([rig.focals.isnan(), ~rig.known_lens, torch.zeros_like(rig.known_lens)], dim=-1)
         free = torch.zeros(c, PARAMETERS, dtype=torch.bool)
         free[1:, :6] = True
         free[:, LENS.start] = lens[:, 0]
@@ -112,52 +114,56 @@ def pose_of(state: RigState, place: int = 0) -> Pose:
     return Pose(state.R[place], state.centers[place], points.median(0).values)
 
 
-def compared_starts(
-    rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, freedom: Freedom, options: CalibrateOptions
-) -> tuple[RigState, Tensor]:
+TRIED_FOCALS = (0.45, 0.6, 0.8, 1.05, 1.4, 1.9, 2.6)  # over the longer side of the picture: 96 to 22 degrees of view across
+NUM_KEPT_STARTS = 3  # that are adjusted to the end
+START_ITERATIONS = (8, 15, 15)  # of the rounds in which starts are compared; the noise is estimated between rounds
+
+
+def compared_starts(rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, freedom: Freedom) -> tuple[RigState, Tensor]:
     """The best starts, adjusted on some of the moments, best first, and by how much each is worse than the first."""
     side = rig.sizes.amax(1)
     unknown = rig.focals.isnan()
-    tried = options.start.focals if bool(unknown.any()) else options.start.focals[:1]
+    tried = TRIED_FOCALS if bool(unknown.any()) else TRIED_FOCALS[:1]
     starts = []
     for share in tried:
         focals = torch.where(unknown, share * side, rig.focals.nan_to_num(1.0))
-        R, centers, points = first_cameras(views, graph, clocks, focals, options.start)
+        R, centers, points = first_cameras(views, graph, clocks, focals)
         starts.append((R, -(R @ centers[..., None])[..., 0], focals.log(), points))
     R, t, logs, points = (torch.stack(part) for part in zip(*starts, strict=True))
-    b = len(starts)
     lens = torch.nn.functional.pad(logs[..., None], (0, 2))
-    state = RigState(R, t, lens, clocks.expand(b, -1, -1).clone(), points, points.new_zeros(b, 0))
-    for k, steps in enumerate(options.adjust.first_rounds):
-        problem = _problem(views, state, freedom.poses, freedom.priors, options)
-        state = _descended(problem, state, steps, options)
-        if k == 0 and len(state.R) > options.start.kept:
-            sigma = _noise(state, problem, options).log().sum(1)
-            state = state.of(sigma.argsort(stable=True)[: options.start.kept])
+    state = RigState(R, t, lens, clocks.expand(len(starts), -1, -1).clone(), points)
+    for k, steps in enumerate(START_ITERATIONS):
+        problem = _problem(views, state, freedom.poses, freedom.priors)
+        state = _descended(problem, state, steps)
+        if k == 0 and len(state.R) > NUM_KEPT_STARTS:
+            sigma = _noise(state, problem).log().sum(1)
+            state = state.of(sigma.argsort(stable=True)[:NUM_KEPT_STARTS])
     # all by the noise of the best one: what is more likely is then not what makes more noise
-    problem = _problem(views, state, freedom.poses, freedom.priors, options)
+    problem = _problem(views, state, freedom.poses, freedom.priors)
     best = problem.sigma.log().sum(1).argmin()
     problem = replace(
         problem, sigma=problem.sigma[best].expand_as(problem.sigma), weights=problem.weights[best].expand_as(problem.weights)
     )
     cost = problem.evaluate(tuple(state)).cost
     order = cost.argsort(stable=True)
-    repeats = _repeats(problem.subset(order[:1]), state.of(order[:1]), options)
+    repeats = _repeats(problem.subset(order[:1]), state.of(order[:1]))
     return state.of(order), (cost[order] - cost[order[0]]) / repeats
 
 
-def adjusted(views: RigViews, start: RigState, freedom: Freedom, options: CalibrateOptions) -> RigSolution:
+BUNDLE_ITERATIONS = (12, 12, 10)  # of the rounds of the last adjustment; the noise and who is seen are estimated between rounds
+
+
+def adjusted(views: RigViews, start: RigState, freedom: Freedom) -> RigSolution:
     """The solution next to a start, at all the moments of views."""
-    state = start._replace(points=met_points(views, start)[None], lengths=start.lengths[:, :0])
-    problem = _problem(views, state, freedom.whole, freedom.priors, options)
-    for k, steps in enumerate(options.adjust.rounds):
+    state = start._replace(points=met_points(views, start)[None])
+    problem = _problem(views, state, freedom.whole, freedom.priors)
+    for k, steps in enumerate(BUNDLE_ITERATIONS):
         if k:
-            problem = _problem(views, state, freedom.whole, freedom.priors, options)
-            state, problem = _with_bones(state, problem, options)
-        state = _descended(problem, state, steps, options)
+            problem = _problem(views, state, freedom.whole, freedom.priors)
+        state = _descended(problem, state, steps)
     normal = problem.linear(state)
     _, reduced, _ = normal.eliminated(torch.zeros(1, dtype=torch.float64))
-    covariance = _repeats(problem, state, options) * camera_covariance(reduced[0], freedom.shape, gauge(state.R[0], state.t[0]))
+    covariance = _repeats(problem, state) * camera_covariance(reduced[0], freedom.shape, gauge(state.R[0], state.t[0]))
     return RigSolution(state, problem, _of_centers(covariance, state.R[0]))
 
 
@@ -167,15 +173,18 @@ def met_points(views: RigViews, state: RigState) -> Tensor:
     return meeting_points(state.R[0], state.centers[0], rays, known).view(len(views.times), -1, 3)
 
 
-def _problem(views: RigViews, state: RigState, basis: Tensor, priors: Priors, options: CalibrateOptions) -> RigAdjustment:
+NOISE_FREEDOM = 4.0  # degrees of freedom of Student's t, the noise of a detector
+
+
+def _problem(views: RigViews, state: RigState, basis: Tensor, priors: Priors) -> RigAdjustment:
     """With positions that are seen now, and the noise that is left now."""
     b, c = state.R.shape[:2]
     unit = torch.ones(b, c, dtype=torch.float64)
-    start = RigAdjustment(views, views.steady(state.clocks), unit, options.adjust.freedom, priors, basis)
-    return replace(start, sigma=_noise(state, start, options))
+    start = RigAdjustment(views, views.steady(state.clocks), unit, NOISE_FREEDOM, priors, basis)
+    return replace(start, sigma=_noise(state, start))
 
 
-def _noise(state: RigState, problem: RigAdjustment, options: CalibrateOptions) -> Tensor:
+def _noise(state: RigState, problem: RigAdjustment) -> Tensor:
     """Robust standard deviation ``(b, c)`` px of each camera's noise."""
     seen = problem.views.at(state.clocks)
     known = problem.weights * seen.weights > 0
@@ -183,28 +192,22 @@ def _noise(state: RigState, problem: RigAdjustment, options: CalibrateOptions) -
     sigma = torch.where(known, far, torch.nan).flatten(1).nanmedian(-1).values.nan_to_num(1e6) / RAYLEIGH
     views = known.sum(1)
     mean = (views.sum((1, 2)) / (views > 0).sum((1, 2)).clamp(min=1)).clamp(min=2)
-    sigma = (sigma * (2 * mean / (2 * mean - 3)).sqrt()).clamp(min=options.adjust.least_noise)
+    sigma = (sigma * (2 * mean / (2 * mean - 3)).sqrt()).clamp(min=MIN_NOISE)
     return sigma[:, None] * problem.views.noise
 
 
-def _descended(problem: RigAdjustment, state: RigState, steps: int, options: CalibrateOptions) -> RigState:
-    settings = replace(options.descent, iterations=steps, tolerance=options.adjust.tolerance)
+COST_TOLERANCE = 1e-5  # relative gain of a step that ends a round
+
+
+def _descended(problem: RigAdjustment, state: RigState, steps: int) -> RigState:
+    settings = LeastSquaresOptions(iterations=steps, tolerance=COST_TOLERANCE)
     return RigState(*minimize(problem, problem.evaluate(tuple(state)), settings).theta)
 
 
-def _with_bones(state: RigState, problem: RigAdjustment, options: CalibrateOptions) -> tuple[RigState, RigAdjustment]:
-    """With the lengths that stay the same, where these are asked for."""
-    adjust = options.adjust
-    if not adjust.lengths or state.points.shape[2] > adjust.length_points:
-        return state._replace(lengths=state.lengths[:, :0]), problem
-    blocks = replace(problem, bones=None).linear(state._replace(lengths=state.lengths[:, :0])).matrix[0]
-    covariance = torch.linalg.pinv(blocks, hermitian=True).view(*state.points.shape[1:], 3)
-    bones = learned(state.points[0], (problem.weights[0] > 0).sum(0) >= 2, covariance, adjust)
-    lengths = state.lengths[:, :0] if bones is None else bones.lengths
-    return state._replace(lengths=lengths), replace(problem, bones=bones)
+MIN_AUTOCORRELATION = 0.02  # of residuals some moments apart, down to which it is summed
 
 
-def _repeats(problem: RigAdjustment, state: RigState, options: CalibrateOptions) -> float:
+def _repeats(problem: RigAdjustment, state: RigState) -> float:
     r"""By how much fewer residuals there are than it seems: :math:`1 + 2 \sum_k \rho_k` of how they repeat themselves in time."""
     error, weight = problem.agreement(state, problem.views.at(state.clocks))
     rows = (error * weight.sqrt()[..., None])[0].movedim(1, 0).flatten(1)  # (T, *)
@@ -212,7 +215,7 @@ def _repeats(problem: RigAdjustment, state: RigState, options: CalibrateOptions)
     power = float(rows.square().sum()) / max(count, 1)
     for lag in range(1, max(2, count // 4)):
         rho = float((rows[lag:] * rows[:-lag]).sum()) / max(count - lag, 1) / max(power, 1e-300)
-        if not rho > options.adjust.repeated:
+        if not rho > MIN_AUTOCORRELATION:
             break
         total += 2 * rho
     return total

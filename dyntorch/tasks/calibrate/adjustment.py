@@ -7,10 +7,10 @@ A point j at the moment U of the reference clock is seen by camera i at its own 
 and what is minimized over cameras, clocks and points is, with Student's t for the noise of the detector,
 
 .. math:: \sum_{ijU} w_{ijU}\, (\nu + 2) \log\Bigl(1 + \frac{|\pi_i(X_{jU}) - x_{ij}(\tau_i(U))|^2}{\nu\, \sigma_i^2}\Bigr)
-    + \sum_{bU} \frac{(\log |X_{aU} - X_{a'U}| - \log L_b)^2}{\sigma_b^2} + \text{priors},
+    + \text{priors},
 
-twice the negative logarithm of the likelihood.  Points are eliminated first, each by itself, or where bones tie them together all
-of a moment; what is left are the cameras' few parameters and the lengths.
+twice the negative logarithm of the likelihood.  Points are eliminated first, each by itself; what is left are the cameras' few
+parameters.
 
 Source: Triggs et al. 2000, Bundle adjustment: a modern synthesis; Lange et al. 1989 for Student's t; Albl et al. 2017, On the
 two-view geometry of unsynchronized cameras, for clocks as unknowns of the geometry of two views.
@@ -27,7 +27,6 @@ from torch import Tensor
 from dyntorch.geometry.homogeneous import cofactors, skew
 from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, Tensors, damped_step
-from dyntorch.tasks.calibrate.bones import Bones
 from dyntorch.tasks.calibrate.observations import RigViews, Seen
 
 TURN, MOVE, LENS, CLOCK = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
@@ -50,8 +49,6 @@ class RigState(NamedTuple):
     """``(b, c, 2)``: a camera's clock against the reference clock at the middle moment, seconds; logarithm of the rate."""
     points: Tensor
     """``(b, T, n, 3)``."""
-    lengths: Tensor
-    """``(b, B)`` logarithms, of the bones."""
 
     def of(self, keep: Tensor) -> RigState:
         """Of some of the adjustments."""
@@ -90,29 +87,27 @@ class Priors:
 
 @dataclass(frozen=True)
 class RigNormal:
-    """Normal equations of G groups of s coordinates of points, and of P = 11 c + B others."""
+    """Normal equations of G points, and of P = 11 c parameters of cameras."""
 
     matrix: Tensor
-    """``(b, G, s, s)``."""
+    """``(b, G, 3, 3)``."""
     mixed: Tensor
-    """``(b, G, s, P + 1)``; the last column is the gradient by the points."""
+    """``(b, G, 3, P + 1)``; the last column is the gradient by the points."""
     others: Tensor
     """``(b, P, P)``."""
     gradient: Tensor
     """``(b, P)``."""
 
     def eliminated(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Solutions ``(b, G, s, P + 1)`` of all columns by the points; matrix and gradient that are left of the others."""
+        """Solutions ``(b, G, 3, P + 1)`` of all columns by the points; matrix and gradient that are left of the cameras."""
         diagonal = self.matrix.diagonal(dim1=-2, dim2=-1)
         held = self.matrix.clone()
         # points that nobody sees have no equation: they stay
         floor = damping[:, None, None] * diagonal + torch.where(diagonal > 0, 0.0, 1.0)
         held.diagonal(dim1=-2, dim2=-1).add_(floor + 1e-12 * diagonal.amax(-1, keepdim=True))
-        if held.shape[-1] == 3:  # in closed form: LAPACK takes one small matrix after the other
-            inverse = cofactors(held) / torch.linalg.det(held).clamp(min=torch.finfo(held.dtype).tiny)[..., None, None]
-            solved = inverse @ self.mixed
-        else:
-            solved = torch.cholesky_solve(self.mixed, torch.linalg.cholesky_ex(held)[0])
+        # in closed form: LAPACK takes one small matrix after the other
+        inverse = cofactors(held) / torch.linalg.det(held).clamp(min=torch.finfo(held.dtype).tiny)[..., None, None]
+        solved = inverse @ self.mixed
         solved = torch.where(solved.isfinite(), solved, 0.0)
         product = self.mixed[..., :-1].flatten(1, 2).mT @ solved.flatten(1, 2)
         return solved, self.others - product[..., :-1], self.gradient - product[..., -1]
@@ -132,12 +127,10 @@ class RigAdjustment(LeastSquares):
     priors: Priors
     basis: Tensor
     """``(11 c, q)``: the q free parameters, each a column that says which of the cameras' parameters it changes."""
-    bones: Bones | None = None
 
     def subset(self, keep: Tensor) -> RigAdjustment:
         """Only some of the starts."""
-        bones = None if self.bones is None else self.bones.subset(keep)
-        return replace(self, weights=self.weights[keep], sigma=self.sigma[keep], bones=bones)
+        return replace(self, weights=self.weights[keep], sigma=self.sigma[keep])
 
     def evaluate(self, theta: Tensors) -> Iterate:
         """The cost ``(b,)``."""
@@ -148,9 +141,6 @@ class RigAdjustment(LeastSquares):
         known = self.weights * (seen.weights > 0)
         total = (known * (self.freedom + 2) * share.log1p()).sum((1, 2, 3))
         total = total + self.priors.costs(state)
-        if self.bones is not None:
-            away, _ = self.bones.stretched(state.points, state.lengths)
-            total = total + (self.bones.seen * (away / self.bones.sigma[:, None]).square()).sum((1, 2))
         return Iterate(theta, torch.where(total.isfinite(), total, torch.inf), ())
 
     def step(self, at: Iterate, damping: Tensor) -> Tensors:
@@ -158,23 +148,16 @@ class RigAdjustment(LeastSquares):
         state = RigState(*at.theta)
         normal = self.linear(state)
         solved, reduced, gradient = normal.eliminated(damping)
-        basis = self.whole_basis(state.lengths.shape[1])
-        if basis.shape[1]:
-            moves = damped_step(gradient @ basis, basis.mT @ reduced @ basis, damping) @ basis.mT
+        if self.basis.shape[1]:
+            moves = damped_step(gradient @ self.basis, self.basis.mT @ reduced @ self.basis, damping) @ self.basis.mT
         else:
             moves = torch.zeros_like(gradient)
         points = solved[..., -1] - (solved[..., :-1] @ moves[:, None, :, None])[..., 0]
-        count = len(self.basis)
-        cameras = moves[:, :count].unflatten(1, (-1, PARAMETERS))
-        return cameras, points.reshape(state.points.shape), moves[:, count:]
-
-    def whole_basis(self, lengths: int) -> Tensor:
-        """``basis`` with the lengths, which are all free."""
-        return torch.block_diag(self.basis, torch.eye(lengths, dtype=self.basis.dtype))
+        return moves.unflatten(1, (-1, PARAMETERS)), points.reshape(state.points.shape)
 
     def retract(self, theta: Tensors, step: Tensors) -> Tensors:
         """Cameras turn about their own centres."""
-        state, (cameras, points, lengths) = RigState(*theta), step
+        state, (cameras, points) = RigState(*theta), step
         turn = rotation_exponential(-cameras[..., TURN])
         return RigState(
             turn @ state.R,
@@ -182,7 +165,6 @@ class RigAdjustment(LeastSquares):
             state.lens - cameras[..., LENS],
             state.clocks - cameras[..., CLOCK],
             state.points - points,
-            state.lengths - lengths,
         )
 
     def agreement(self, state: RigState, seen: Seen) -> tuple[Tensor, Tensor]:
@@ -196,8 +178,8 @@ class RigAdjustment(LeastSquares):
     def linear(self, state: RigState) -> RigNormal:
         """The normal equations at a state."""
         b, T, n = state.points.shape[:3]
-        c, bones = state.R.shape[1], self.bones
-        total = c * PARAMETERS + state.lengths.shape[1]
+        c = state.R.shape[1]
+        total = c * PARAMETERS
         blocks = state.points.new_zeros(b, T, n, 3, 3)
         mixed = state.points.new_zeros(b, T, n, 3, total + 1)
         reduced, gradient = state.points.new_zeros(b, total, total), state.points.new_zeros(b, total)
@@ -214,12 +196,7 @@ class RigAdjustment(LeastSquares):
             reduced[:, place, place] = rows @ by_camera.flatten(1, 3)
             gradient[:, place] = (rows @ error.flatten(1, 3))[..., 0]
         self._add_priors(state, reduced, gradient)
-        if bones is None:
-            return RigNormal(blocks.flatten(1, 2), mixed.flatten(1, 2), reduced, gradient)
-        matrix = state.points.new_zeros(b, T, n, 3, n, 3)
-        matrix.diagonal(dim1=2, dim2=4).copy_(blocks.permute(0, 1, 3, 4, 2))
-        _add_bones(state, bones, c * PARAMETERS, matrix, mixed, reduced, gradient)
-        return RigNormal(matrix.reshape(b, T, 3 * n, 3 * n), mixed.flatten(2, 3), reduced, gradient)
+        return RigNormal(blocks.flatten(1, 2), mixed.flatten(1, 2), reduced, gradient)
 
     def _add_priors(self, state: RigState, reduced: Tensor, gradient: Tensor) -> None:
         weights, slopes = self.priors.equations(state)
@@ -267,23 +244,6 @@ def _derivatives(state: RigState, i: int, v: Tensor, times: Tensor) -> tuple[Ten
     return by_seen @ R, torch.cat([-by_seen @ skew(seen), by_seen, own], dim=-1)
 
 
-def _add_bones(state: RigState, bones: Bones, start: int, matrix: Tensor, mixed: Tensor, reduced: Tensor, gradient: Tensor) -> None:
-    """The equations of the lengths."""
-    away, along = bones.stretched(state.points, state.lengths)
-    weight = bones.seen / bones.sigma[:, None].square()
-    heavy = weight[..., None] * along
-    block = heavy[..., :, None] * along[..., None, :]
-    for k, (p, q) in enumerate(bones.ends.tolist()):
-        for one, other, sign in ((p, p, 1), (q, q, 1), (p, q, -1), (q, p, -1)):
-            matrix[:, :, one, :, other] += sign * block[:, :, k]
-        for point, sign in ((p, 1), (q, -1)):
-            mixed[:, :, point, :, start + k] -= sign * heavy[:, :, k]
-            mixed[:, :, point, :, -1] += sign * heavy[:, :, k] * away[:, :, k, None]
-    place = torch.arange(start, start + len(bones.ends))
-    reduced[:, place, place] += weight.sum(1)
-    gradient[:, place] -= (weight * away).sum(1)
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # What is known of the cameras in the end.
 
@@ -301,10 +261,6 @@ def gauge(R: Tensor, t: Tensor) -> Tensor:
 
 def camera_covariance(reduced: Tensor, basis: Tensor, unseen: Tensor) -> Tensor:
     """Covariance ``(11 c, 11 c)`` of the cameras from their information, in the world whose changes have no part in it."""
-    count = len(basis)
-    if count < len(reduced):  # lengths are eliminated, too
-        mixed, lengths = reduced[:count, count:], reduced[count:, count:]
-        reduced = reduced[:count, :count] - mixed @ torch.linalg.pinv(lengths, hermitian=True) @ mixed.mT
     inside = basis / basis.norm(dim=0)
     world = torch.linalg.qr(inside.mT @ unseen).Q
     allowed = inside @ torch.linalg.qr(world, mode="complete").Q[:, 7:]

@@ -29,7 +29,6 @@ from dyntorch.geometry.epipolar_fit import fit_fundamental
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.tasks.calibrate.observations import RigViews
-from dyntorch.tasks.calibrate.options import RigStartOptions
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,10 @@ class PairGeometry:
 Graph = Mapping[tuple[int, int], PairGeometry]
 
 
-def pair_graph(views: RigViews, clocks: Tensor, fewest: int, options: RigStartOptions) -> dict[tuple[int, int], PairGeometry]:
+MAX_PAIR_MATCHES = 3_000  # that the F of a pair is fitted to
+
+
+def pair_graph(views: RigViews, clocks: Tensor, fewest: int) -> dict[tuple[int, int], PairGeometry]:
     """Epipolar geometry of all pairs that see enough at once. clocks ``(c, 2)``."""
     seen = views.at(clocks[None])
     x, weights = seen.x[0].flatten(1, 2), seen.weights[0].flatten(1, 2)
@@ -57,19 +59,23 @@ def pair_graph(views: RigViews, clocks: Tensor, fewest: int, options: RigStartOp
     for i, j in combinations(range(len(x)), 2):
         both = ((weights[i] > 0) & (weights[j] > 0)).nonzero()[:, 0]
         if len(both) >= fewest:
-            some = both[:: max(1, len(both) // options.matches)]
+            some = both[:: max(1, len(both) // MAX_PAIR_MATCHES)]
             x1, x2 = (x[i, some] - views.centers[i]) / unit, (x[j, some] - views.centers[j]) / unit
-            found[i, j] = _fitted(x1, x2, unit, len(both), options)
+            found[i, j] = _fitted(x1, x2, unit, len(both))
     return found
 
 
-def _fitted(x1: Tensor, x2: Tensor, unit: float, matches: int, options: RigStartOptions) -> PairGeometry:
+FIRST_CUTOFFS = (40.0, 20.0, 10.0)  # of the fit of F, thousandths of the longer side
+LAST_CUTOFFS = (2.5, 1.5)  # of the fit of F, robust standard deviations of the residual
+
+
+def _fitted(x1: Tensor, x2: Tensor, unit: float, matches: int) -> PairGeometry:
     weights = torch.ones(1, len(x1), dtype=torch.float64)
-    F, _ = fit_fundamental(x1, x2, weights, [1e-3 * scale for scale in options.scales])
+    F, _ = fit_fundamental(x1, x2, weights, [1e-3 * scale for scale in FIRST_CUTOFFS])
     sigma = _spread(F[0], x1, x2)
-    F, _ = fit_fundamental(x1, x2, weights, [scale * sigma for scale in options.sigmas], F[:, None])
+    F, _ = fit_fundamental(x1, x2, weights, [scale * sigma for scale in LAST_CUTOFFS], F[:, None])
     sigma = _spread(F[0], x1, x2)
-    inside = sampson_squared(F[0], x1, x2) <= (options.sigmas[0] * sigma) ** 2
+    inside = sampson_squared(F[0], x1, x2) <= (LAST_CUTOFFS[0] * sigma) ** 2
     return PairGeometry(F[0], x1, x2, inside.double(), unit, sigma * unit, matches)
 
 
@@ -96,13 +102,15 @@ def relative_rotations(pair: PairGeometry, first: float, second: float) -> tuple
     return turns, torch.maximum(before, behind) / pair.weights.sum().clamp(min=1.0)
 
 
-def averaged_rotations(
-    turns: Mapping[tuple[int, int], Tensor], weights: Mapping[tuple[int, int], float], cameras: int, options: RigStartOptions
-) -> Tensor:
+AVERAGING_ITERATIONS = 6  # in which the weights of the pairs' rotations are learned
+HALF_WEIGHT_DISTANCE = 0.1  # Frobenius norm between two rotations (4 degrees) at which a pair's weight is a half
+
+
+def averaged_rotations(turns: Mapping[tuple[int, int], Tensor], weights: Mapping[tuple[int, int], float], cameras: int) -> Tensor:
     """Rotations ``(c, 3, 3)`` whose ratios :math:`R_j R_i^T` are nearest to given ones; the first is the identity."""
     soft = dict.fromkeys(turns, 1.0)
     R = torch.eye(3, dtype=torch.float64).repeat(cameras, 1, 1)
-    for _ in range(options.averaging):
+    for _ in range(AVERAGING_ITERATIONS):
         blocks = torch.zeros(cameras, 3, cameras, 3, dtype=torch.float64)
         degree = torch.zeros(cameras, dtype=torch.float64)
         for (i, j), turn in turns.items():
@@ -115,7 +123,7 @@ def averaged_rotations(
         stacked = leading.view(cameras, 3, 3) * root[:, None, None]
         R = nearest_rotation(stacked if float(torch.linalg.det(stacked).sum()) > 0 else -stacked)
         away = {(i, j): float((R[j] @ R[i].mT - turn).norm()) for (i, j), turn in turns.items()}
-        soft = {pair: 1 / (1 + (value / options.disagreement) ** 2) for pair, value in away.items()}
+        soft = {pair: 1 / (1 + (value / HALF_WEIGHT_DISTANCE) ** 2) for pair, value in away.items()}
     return R @ R[0].mT
 
 
@@ -150,16 +158,14 @@ def positioned(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor
     return sign * centers, sign * points
 
 
-def first_cameras(
-    views: RigViews, graph: Graph, clocks: Tensor, focals: Tensor, options: RigStartOptions
-) -> tuple[Tensor, Tensor, Tensor]:
+def first_cameras(views: RigViews, graph: Graph, clocks: Tensor, focals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rotations ``(c, 3, 3)``, centres ``(c, 3)`` and points ``(T, n, 3)`` for focal lengths ``(c,)`` px."""
     turns, weights = {}, {}
     for (i, j), pair in graph.items():
         both, share = relative_rotations(pair, float(focals[i]), float(focals[j]))
         best = int(share.argmax())
         turns[i, j], weights[i, j] = both[best], float(pair.weights.sum() * share[best])
-    R = averaged_rotations(turns, weights, len(focals), options)
+    R = averaged_rotations(turns, weights, len(focals))
     rays, known = viewing_rays(views, clocks, focals)
     centers, points = positioned(R, rays, known)
     return R, centers, points.view(len(views.times), -1, 3)

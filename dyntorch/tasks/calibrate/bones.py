@@ -7,52 +7,10 @@ side in one set of points and fall apart into trees of their own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from itertools import combinations
 
 import torch
 from torch import Tensor
-
-from dyntorch.tasks.calibrate.options import RigAdjustOptions
-
-
-@dataclass(frozen=True)
-class Bones:
-    """Pairs of points whose distance stays the same, of b adjustments."""
-
-    ends: Tensor
-    """``(B, 2)`` long."""
-    lengths: Tensor
-    """``(b, B)`` logarithms, a start."""
-    sigma: Tensor
-    """``(b, B)``: how much their logarithms vary."""
-    seen: Tensor
-    """``(b, T, B)``, 1 where both ends are seen by two cameras."""
-    excess: Tensor
-    """``(b, T, B)``: by how much noise makes the logarithm longer, see :func:`noise_excess`."""
-
-    def subset(self, keep: Tensor) -> Bones:
-        """Of some of the adjustments."""
-        parts = {name: getattr(self, name)[keep] for name in ("lengths", "sigma", "seen", "excess")}
-        return replace(self, **parts)
-
-    def stretched(self, points: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-        """Logarithms ``(b, T, B)`` of bones over their lengths ``(b, B)``, and their derivatives by the first end
-        ``(b, T, B, 3)``."""
-        one, other = self.ends.unbind(-1)
-        along = points[:, :, one] - points[:, :, other]
-        square = along.square().sum(-1).clamp(min=1e-24)
-        return 0.5 * square.log() - self.excess - lengths[:, None], along / square[..., None]
-
-
-def noise_excess(points: Tensor, covariance: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    r"""By how much noise lengthens the logarithm of a distance d of direction u, in the mean. points ``(T, n, 3)``, covariance
-    ``(T, n, 3, 3)``, one, other ``(B,)`` -> ``(T, B)``."""
-    along = points[:, one] - points[:, other]
-    square = along.square().sum(-1).clamp(min=1e-24)
-    spread = covariance[:, one] + covariance[:, other]
-    inside = (along[..., None, :] @ spread @ along[..., None])[..., 0, 0] / square
-    return (spread.diagonal(dim1=-2, dim2=-1).sum(-1) - 2 * inside) / (2 * square)
 
 
 def rigid_pairs(points: Tensor, known: Tensor, spread: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -84,20 +42,6 @@ def rigid_pairs(points: Tensor, known: Tensor, spread: float) -> tuple[Tensor, T
             chosen.append(k)
     kept = torch.tensor(sorted(chosen), dtype=torch.long)
     return torch.stack([one[kept], other[kept]], dim=-1), length[kept], share[kept]
-
-
-def learned(points: Tensor, known: Tensor, covariance: Tensor, options: RigAdjustOptions) -> Bones | None:
-    """The bones of points; None where no distance stays the same. points ``(T, n, 3)``, known ``(T, n)``, covariance
-    ``(T, n, 3, 3)``."""
-    ends, length, share = rigid_pairs(points, known, options.length_spread)
-    if not len(ends):
-        return None
-    one, other = ends.unbind(-1)
-    # what is hardly longer than its noise says nothing; exact data have no spread
-    excess = noise_excess(points, covariance, one, other)
-    seen = (known[:, one] & known[:, other] & (excess.abs() < options.length_excess)).double()
-    sigma = options.length_sigma * share.clamp(min=1e-3)
-    return Bones(ends, length[None].log(), sigma[None], seen[None], excess[None])
 
 
 def bodies(ends: Tensor, points: int) -> list[list[int]]:

@@ -26,6 +26,8 @@ from dyntorch.tasks.calibrate.world import World, world_of
 from dyntorch.tasks.synchronize.cameras import synchronize_cameras
 from dyntorch.tasks.synchronize.result import Clocks
 
+NUM_START_MOMENTS = 60  # evenly spread, at which starts and halves are adjusted
+
 
 @one_thread
 @on_cpu
@@ -44,7 +46,7 @@ def calibrate(
     one_lens: bool = False,
     max_shift: float | None = None,
     rate: float | None = None,
-    options: CalibrateOptions = CalibrateOptions(),
+    options: CalibrateOptions | None = None,
 ) -> Calibration:
     r"""Cameras, lenses and clocks from what moves before them: no board, no known lens, no common clock.
 
@@ -75,7 +77,7 @@ def calibrate(
         one_lens: whether focal length and distortion are the same in all cameras.
         max_shift: seconds that clocks differ by at most.
         rate: of all clocks against the first one's, which is held, such as 1 where one clock drives all cameras; by default found.
-        options: every number that decides, by stage.
+        options: :class:`~dyntorch.tasks.calibrate.options.CalibrateOptions`; None = the defaults.
 
     Returns:
         See :class:`dyntorch.Calibration`; ``ok`` is False, and ``reason`` says why, where the data do not decide.
@@ -103,43 +105,44 @@ def calibrate(
         >>> rig.ok, [round(f, -1) for f in rig.focals.tolist()]
         (True, [1500.0, 1500.0, 1500.0, 1500.0])
     """
+    options = CalibrateOptions() if options is None else options
     check_options(options, CalibrateOptions)
     if sizes is None:
         raise ValueError("sizes: give the width and height of the pictures in px, (w, h), or one pair per camera")
-    rig = read_rig(tracks, fps, times, sizes, focal, calibration, weights, one_lens, Scale(height, lengths), options)
+    rig = read_rig(tracks, fps, times, sizes, focal, calibration, weights, one_lens, Scale(height, lengths))
     # 1. clocks
-    found_clocks = _clocks(rig, clocks, max_shift, rate, options)
+    found_clocks = _clocks(rig, clocks, max_shift, rate)
     told = _told(found_clocks)
     if bool(found_clocks.offsets.isnan().any()):
         return _nothing(rig, found_clocks, told)
     # 2. first cameras
     values = torch.stack([found_clocks.offsets, found_clocks.rates], dim=-1)
-    views = common_views(rig.tracks, rig.centers, values, options)
+    views = common_views(rig.tracks, rig.centers, values)
     own = torch.stack([(values[:, 1] - 1) * views.middle + values[:, 0], values[:, 1].log()], dim=-1)
     n = rig.tracks[0].x.shape[1]
-    used = views.some(max(1, math.ceil(options.adjust.positions / n)))
-    graph = pair_graph(used, own, options.input.fewest_matches, options.start)
-    hopeless = diagnosis.unmatched(graph, rig, options) or diagnosis.still(rig, options)
+    used = views.some(max(1, math.ceil(options.max_positions / n)))
+    graph = pair_graph(used, own, options.min_matches)
+    hopeless = diagnosis.unmatched(graph, rig, options) or diagnosis.still(rig)
     if hopeless is not None:
         return _nothing(rig, found_clocks, (*told, hopeless))
-    freedom = Freedom.of(rig, own, clocks is not None, rate is not None, found_clocks.rate_sigmas, options)
-    few = used.some(options.start.moments)
-    starts, worse = compared_starts(rig, few, graph, own, freedom, options)
+    freedom = Freedom.of(rig, own, clocks is not None, rate is not None, found_clocks.rate_sigmas)
+    few = used.some(NUM_START_MOMENTS)
+    starts, worse = compared_starts(rig, few, graph, own, freedom)
     # 3. space and time at once
-    best = adjusted(used, starts.of(torch.tensor([0])), freedom, options)
-    halves = _halves(used, best, freedom, options)
+    best = adjusted(used, starts.of(torch.tensor([0])), freedom)
+    halves = _halves(used, best, freedom)
     # 4. the world, and the points of every frame
     others = [(pose_of(starts, k), float(worse[k])) for k in range(1, len(worse))]
     limits = [
-        diagnosis.planar(graph, options),
+        diagnosis.planar(graph),
         diagnosis.unsure(best, rig, options),
-        diagnosis.rival(pose_of(starts), others, options),
-        diagnosis.moved(halves, options),
+        diagnosis.rival(pose_of(starts), others),
+        diagnosis.moved(halves),
     ]
-    return _result(rig, views, best, found_clocks, [*told, *(limit for limit in limits if limit is not None)], options)
+    return _result(rig, views, best, found_clocks, [*told, *(limit for limit in limits if limit is not None)])
 
 
-def _clocks(rig: Rig, clocks: Any, max_shift: float | None, rate: float | None, options: CalibrateOptions) -> Clocks:
+def _clocks(rig: Rig, clocks: Any, max_shift: float | None, rate: float | None) -> Clocks:
     """As given, or as the tracks say."""
     c = len(rig.tracks)
     if clocks is not None:
@@ -150,7 +153,6 @@ def _clocks(rig: Rig, clocks: Any, max_shift: float | None, rate: float | None, 
         weights=[track.weights for track in rig.tracks],
         max_shift=max_shift,
         rate=rate,
-        options=options.synchronize,
     )
 
 
@@ -163,19 +165,21 @@ def _told(clocks: Clocks) -> tuple[Notice, ...]:
     return ()
 
 
-def _halves(
-    views: RigViews, best: RigSolution, freedom: Freedom, options: CalibrateOptions
-) -> tuple[RigSolution, RigSolution] | None:
+MIN_HALF_POSITIONS = 1_000  # that a half must have to be judged by itself
+MIN_HALF_SECONDS = 2.5  # a detector's error goes on for a second and looks like a camera that moved
+
+
+def _halves(views: RigViews, best: RigSolution, freedom: Freedom) -> tuple[RigSolution, RigSolution] | None:
     """Both halves of the take by themselves, from the whole; None where a half has too little."""
     held = replace(freedom, whole=_only_poses(freedom.whole), shape=_only_poses(freedom.shape))
     found = []
     for part in (views.between(-math.inf, 0.0), views.between(0.0, math.inf)):
-        if not len(part.times) or float(part.times.abs().max()) < options.trust.half_seconds:
+        if not len(part.times) or float(part.times.abs().max()) < MIN_HALF_SECONDS:
             return None
-        if int((part.steady(best.state.clocks) > 0).sum()) < options.trust.half:
+        if int((part.steady(best.state.clocks) > 0).sum()) < MIN_HALF_POSITIONS:
             return None
-        few = part.some(options.start.moments)
-        found.append(adjusted(few, best.state, held, options))
+        few = part.some(NUM_START_MOMENTS)
+        found.append(adjusted(few, best.state, held))
     return found[0], found[1]
 
 
@@ -185,15 +189,13 @@ def _only_poses(basis: Tensor) -> Tensor:
     return basis[:, other == 0]
 
 
-def _result(
-    rig: Rig, views: RigViews, best: RigSolution, clocks: Clocks, limits: list[Notice], options: CalibrateOptions
-) -> Calibration:
+def _result(rig: Rig, views: RigViews, best: RigSolution, clocks: Clocks, limits: list[Notice]) -> Calibration:
     """The solution in its world, with the points of all frames."""
     state, c = best.state, len(rig.tracks)
-    found = structure(views, best, options)
-    foreign = diagnosis.foreign(found.inliers, options)
+    found = structure(views, best)
+    foreign = diagnosis.foreign(found.inliers)
     limits += [foreign] if foreign is not None else []
-    world = world_of(state.R[0], state.centers[0], found.points, rig.scale, options.world)
+    world = world_of(state.R[0], state.centers[0], found.points, rig.scale)
     R, t = world.cameras(state.R[0], state.t[0])
     K = torch.eye(3, dtype=torch.float64).repeat(c, 1, 1)
     K[:, 0, 0] = K[:, 1, 1] = state.lens[0, :, 0].exp()
@@ -204,7 +206,7 @@ def _result(
         if lens is not None:
             K[i], distortion[i, : len(lens[1])] = lens
     if not any(limit.code.refuses for limit in limits):
-        limits += _besides(rig, world, state.centers[0], options)
+        limits += _besides(rig, world, state.centers[0])
     return Calibration(
         K=K, R=R, t=t, distortion=distortion, sizes=rig.sizes,
         clocks=_adjusted_clocks(clocks, best, views.middle),
@@ -218,12 +220,12 @@ def _result(
     )  # fmt: skip
 
 
-def _besides(rig: Rig, world: World, centers: Tensor, options: CalibrateOptions) -> list[Notice]:
+def _besides(rig: Rig, world: World, centers: Tensor) -> list[Notice]:
     """What to know beside a good result."""
     found = []
     if len(rig.tracks) == 2:
         found.append(Notice(CalibrationNotice.TWO))
-    if diagnosis.collinear(centers, options):
+    if diagnosis.collinear(centers):
         found.append(Notice(CalibrationNotice.LINE))
     if not world.metric:
         found.append(Notice(CalibrationNotice.UNKNOWN_SCALE))

@@ -11,9 +11,10 @@ from dyntorch.core.outcome import Notice
 from dyntorch.geometry.homography import homography, homography_sampson_squared
 from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.tasks.calibrate.adjusting import RAYLEIGH, Pose, RigSolution
-from dyntorch.tasks.calibrate.averaging import Graph, PairGeometry
+from dyntorch.tasks.calibrate.averaging import LAST_CUTOFFS, Graph, PairGeometry
 from dyntorch.tasks.calibrate.bones import bodies
 from dyntorch.tasks.calibrate.input import Rig
+from dyntorch.tasks.calibrate.observations import MIN_NOISE
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.calibrate.result import CalibrationNotice
 
@@ -44,51 +45,64 @@ def unmatched(graph: Graph, rig: Rig, options: CalibrateOptions) -> Notice | Non
     lost = tuple(sorted(set(range(len(rig.tracks))) - set(together[0] if together else [0])))
     if not lost:
         return None
-    return Notice(CalibrationNotice.APART, 0.0, {"cameras": lost, "needed": options.input.fewest_matches})
+    return Notice(CalibrationNotice.APART, 0.0, {"cameras": lost, "needed": options.min_matches})
 
 
-def still(rig: Rig, options: CalibrateOptions) -> Notice | None:
+MIN_MOTION_SIGMAS = 2.0  # motion of the points over their noise
+
+
+def still(rig: Rig) -> Notice | None:
     """Whether no camera sees anything move."""
     ratios = []
     for track in rig.tracks:
         x = torch.where((track.weights > 0)[..., None], track.x, torch.nan)
         away = (x - x.nanmedian(0).values).norm(dim=-1)
-        ratios.append(float(away.nanmedian()) / max(track.noise, options.adjust.least_noise))
+        ratios.append(float(away.nanmedian()) / max(track.noise, MIN_NOISE))
     ratio = max(ratios)
-    return Notice(CalibrationNotice.STILL, ratio) if ratio < options.trust.still else None
+    return Notice(CalibrationNotice.STILL, ratio) if ratio < MIN_MOTION_SIGMAS else None
 
 
-def planar(graph: Graph, options: CalibrateOptions) -> Notice | None:
+MIN_PLANE_RATIO = 2.0  # residual of the best homography over that of F
+
+
+def planar(graph: Graph) -> Notice | None:
     """Whether every pair of cameras sees one plane, as two cameras see people who walk along one line seen from the side."""
-    ratios = {pair: _plane_residual(geometry, options) / geometry.sigma for pair, geometry in graph.items()}
-    if not ratios or max(ratios.values()) > options.trust.plane:
+    ratios = {pair: _plane_residual(geometry) / geometry.sigma for pair, geometry in graph.items()}
+    if not ratios or max(ratios.values()) > MIN_PLANE_RATIO:
         return None
     return Notice(CalibrationNotice.PLANE, max(ratios.values()), {"pairs": tuple(ratios)})
 
 
-def _plane_residual(pair: PairGeometry, options: CalibrateOptions) -> float:
+def _plane_residual(pair: PairGeometry) -> float:
     """Robust standard deviation, px, of what the best homography leaves, in both pictures: of a plane it is what F leaves."""
-    scale = options.start.sigmas[0] * pair.sigma / pair.unit
+    scale = LAST_CUTOFFS[0] * pair.sigma / pair.unit
     H, _ = homography(pair.x1, pair.x2, pair.weights[None], scale)
     away = homography_sampson_squared(H[0], pair.x1, pair.x2).sqrt()
     return pair.unit * float(away[pair.weights > 0].median()) / RAYLEIGH
 
 
-def rival(best: Pose, others: Sequence[tuple[Pose, float]], options: CalibrateOptions) -> Notice | None:
+MIN_RIVAL_MARGIN = 10.0  # twice the logarithm of the likelihood ratio to another rig
+MIN_RIVAL_DEGREES = 2.0  # from which on two rigs are different
+
+
+def rival(best: Pose, others: Sequence[tuple[Pose, float]]) -> Notice | None:
     """Another solution that differs and is hardly worse."""
     for pose, worse in others:
         angle = float(differences(best, pose)[0].max())
-        if worse < options.trust.rival and angle > options.trust.apart:
+        if worse < MIN_RIVAL_MARGIN and angle > MIN_RIVAL_DEGREES:
             return Notice(CalibrationNotice.RIVAL, angle)
     return None
 
 
-def collinear(centers: Tensor, options: CalibrateOptions) -> bool:
+MAX_LINE_SPREAD = 0.06  # of the cameras across a line over that along it
+
+
+def collinear(centers: Tensor) -> bool:
     """Whether three cameras or more stand nearly in a line."""
     if len(centers) < 3:
         return False
     spread = torch.linalg.svdvals(centers - centers.mean(0))
-    return bool(spread[1] < options.trust.line * spread[0])
+    return bool(spread[1] < MAX_LINE_SPREAD * spread[0])
 
 
 def unsure(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | None:
@@ -98,28 +112,36 @@ def unsure(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | 
         return Notice(CalibrationNotice.TWO_FOCALS)
     focal = variance[:, 6].sqrt()
     pose = found.pose
-    if float(focal.max()) > options.trust.focal:
-        case = "line" if collinear(pose.centers, options) else ""
-        which = tuple((focal > options.trust.focal).nonzero().flatten().tolist())
+    if float(focal.max()) > options.max_focal_sigma:
+        case = "line" if collinear(pose.centers) else ""
+        which = tuple((focal > options.max_focal_sigma).nonzero().flatten().tolist())
         return Notice(CalibrationNotice.FOCAL, 100 * float(focal.max()), {"case": case, "cameras": which})
     turn = torch.rad2deg(variance[:, :3].sum(-1).sqrt())
-    if float(turn.max()) > options.trust.rotation:
-        which = tuple((turn > options.trust.rotation).nonzero().flatten().tolist())
+    if float(turn.max()) > options.max_rotation_sigma:
+        which = tuple((turn > options.max_rotation_sigma).nonzero().flatten().tolist())
         return Notice(CalibrationNotice.ROTATION, float(turn.max()), {"cameras": which})
     away = variance[:, 3:6].sum(-1).sqrt() / (pose.centers - pose.middle).norm(dim=-1)
-    if float(away.max()) > options.trust.center:
-        which = tuple((away > options.trust.center).nonzero().flatten().tolist())
+    if float(away.max()) > options.max_center_sigma:
+        which = tuple((away > options.max_center_sigma).nonzero().flatten().tolist())
         return Notice(CalibrationNotice.CENTER, 100 * float(away.max()), {"cameras": which})
     return None
 
 
-def foreign(inliers: Tensor, options: CalibrateOptions) -> Notice | None:
+MIN_INLIER_SHARE = 0.6  # of the positions of a camera
+
+
+def foreign(inliers: Tensor) -> Notice | None:
     """Cameras most of whose positions do not agree with the others."""
-    which = tuple((inliers < options.trust.agree).nonzero().flatten().tolist())
+    which = tuple((inliers < MIN_INLIER_SHARE).nonzero().flatten().tolist())
     return Notice(CalibrationNotice.DISAGREES, 100 * float(inliers.min()), {"cameras": which}) if which else None
 
 
-def moved(halves: tuple[RigSolution, RigSolution] | None, options: CalibrateOptions) -> Notice | None:
+MAX_MOVED_DEGREES = 1.5  # between the poses of a camera in both halves of the recording
+MAX_MOVED_PERCENT = 4.5  # the same of its place, hundredths of its distance from the people
+MAX_MOVED_SIGMAS = 5.0  # the same in standard deviations
+
+
+def moved(halves: tuple[RigSolution, RigSolution] | None) -> Notice | None:
     """Cameras whose poses in both halves of the take differ by more than they may."""
     if halves is None:
         return None
@@ -129,8 +151,8 @@ def moved(halves: tuple[RigSolution, RigSolution] | None, options: CalibrateOpti
     sigma = torch.rad2deg(variance[:, :3].sum(-1).sqrt())
     far = (one.pose.centers - one.pose.middle).norm(dim=-1)
     spread = 100 * variance[:, 3:6].sum(-1).sqrt() / far
-    turned = (angle > options.trust.moved) & (angle > options.trust.moved_sigmas * sigma)
-    went = (away > options.trust.went) & (away > options.trust.moved_sigmas * spread)
+    turned = (angle > MAX_MOVED_DEGREES) & (angle > MAX_MOVED_SIGMAS * sigma)
+    went = (away > MAX_MOVED_PERCENT) & (away > MAX_MOVED_SIGMAS * spread)
     which = turned | went
     if not bool(which.any()):
         return None

@@ -13,7 +13,6 @@ from torch import Tensor
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.lens import undistorted
 from dyntorch.numerics.arguments import FARTHEST
-from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.synchronize.result import Clocks
 from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, read_tracks
 
@@ -49,6 +48,9 @@ class Scale:
     lengths: Mapping[tuple[int, int], float] | None = None
 
 
+MAX_CAMERAS = 8  # the graph of their pairs is complete
+
+
 def read_rig(
     tracks: Sequence[Tensor],
     fps: float | Sequence[float],
@@ -59,12 +61,11 @@ def read_rig(
     weights: Sequence[Tensor] | None,
     one_lens: bool,
     scale: Scale,
-    options: CalibrateOptions,
 ) -> Rig:
     """The cameras of checked input."""
     c = len(tracks)
-    if not 2 <= c <= options.input.most_cameras:
-        raise ValueError(f"tracks: {c} cameras given; give 2 to {options.input.most_cameras}")
+    if not 2 <= c <= MAX_CAMERAS:
+        raise ValueError(f"tracks: {c} cameras given; give 2 to {MAX_CAMERAS}")
     points = {x.shape[1] for x in tracks if isinstance(x, Tensor) and x.ndim == 3}
     if len(points) > 1:
         raise ValueError(f"tracks: cameras have {sorted(points)} points; give the same points of every camera, NaN where missing")
@@ -85,7 +86,7 @@ def read_rig(
             own = None if times is None else times[i]
             given = None if weights is None else weights[i]
             read = read_tracks(f"tracks[{i}]", x, None if own is not None else rates[i], own, given)
-            _check_inside(x, size[i], options)
+            _check_inside(x, size[i])
             straight.append(x if lens is None else _ideal(undistorted(x, lens), lens[0]))
             if lens is not None:
                 own = read.times if own is None else own
@@ -183,13 +184,18 @@ def _ideal(x: Tensor, K: Tensor) -> Tensor:
     return x @ change[:2, :2].mT + change[:2, 2]
 
 
-def _check_inside(x: Tensor, size: Tensor, options: CalibrateOptions) -> None:
+MAX_OUTSIDE = 0.5  # share of the picture by which positions may lie outside of it
+MAX_SHARE_COORDINATE = 2.0  # largest coordinate up to which positions are shares of the picture and no pixels
+MAX_OUTSIDE_SHARE = 0.05  # of the positions that lie farther out
+
+
+def _check_inside(x: Tensor, size: Tensor) -> None:
     """Raise where positions and the size of the picture do not belong together."""
     seen = x[(x.abs() <= FARTHEST).all(-1)]
     if not len(seen):
         raise ValueError("no point is seen; check the detections")
-    far = ((seen < -options.input.outside * size) | (seen > (1 + options.input.outside) * size)).any(-1).double().mean()
-    if float(far) > options.input.outside_share:
+    far = ((seen < -MAX_OUTSIDE * size) | (seen > (1 + MAX_OUTSIDE) * size)).any(-1).double().mean()
+    if float(far) > MAX_OUTSIDE_SHARE:
         some = seen[:: max(1, len(seen) // SAID_BLOCK)]
         low, high = (some.quantile(q, dim=0).round().int().tolist() for q in (0.02, 0.98))
         width, height = size.int().tolist()
@@ -197,7 +203,7 @@ def _check_inside(x: Tensor, size: Tensor, options: CalibrateOptions) -> None:
             f"sizes say {width}x{height} px, but points lie from {low} to {high}: give the size of the pictures that they were "
             "found in"
         )
-    if float(seen.max()) <= options.input.shares:
+    if float(seen.max()) <= MAX_SHARE_COORDINATE:
         raise ValueError("points lie between 0 and 1, as shares of the picture: multiply them by its size in px")
 
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.synchronize.epipolar import Grid
 from dyntorch.tasks.synchronize.tracks import Tracks
 
@@ -63,7 +62,12 @@ class RigViews:
         return replace(self, times=self.times[(self.times >= start) & (self.times < end)])
 
 
-def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, options: CalibrateOptions) -> RigViews:
+KERNEL_FRAMES = 1.0  # standard deviation of the smoothing: below 1 clocks are drawn to half frames
+MAX_NOISE_RATIO = 2.0  # noise of a camera over the geometric mean of all, and its inverse
+MIN_NOISE = 0.05  # px: exact data have no scale
+
+
+def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor) -> RigViews:
     """Views at the moments at which two cameras at least run, a frame of the slowest camera apart. centers ``(c, 2)``, clocks
     ``(c, 2)``."""
     runs = [((float(t.times[0]) - o) / r, (float(t.times[-1]) - o) / r) for t, (o, r) in zip(tracks, clocks.tolist(), strict=True)]
@@ -77,9 +81,9 @@ def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor, opti
         )
     middle = 0.5 * (start + end)
     times = start - middle + step * torch.arange(math.floor((end - start) / step + 1e-9) + 1, dtype=torch.float64)
-    grids = tuple(Grid.of(t, options.adjust.width * step * r) for t, (_, r) in zip(tracks, clocks.tolist(), strict=True))
+    grids = tuple(Grid.of(t, KERNEL_FRAMES * step * r) for t, (_, r) in zip(tracks, clocks.tolist(), strict=True))
     frames, noise = torch.tensor([[t.step, t.noise] for t in tracks], dtype=torch.float64).unbind(-1)
-    most = math.log(options.adjust.noise_ratio)
-    noise = noise.clamp(min=options.adjust.least_noise).log()
+    most = math.log(MAX_NOISE_RATIO)
+    noise = noise.clamp(min=MIN_NOISE).log()
     noise = (noise - noise.mean()).clamp(-most, most).exp()
     return RigViews(grids, centers, middle, times, frames, noise)

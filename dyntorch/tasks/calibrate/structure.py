@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.numerics.least_squares import minimize
-from dyntorch.tasks.calibrate.adjusting import RAYLEIGH, RigSolution, met_points
+from dyntorch.numerics.least_squares import LeastSquaresOptions, minimize
+from dyntorch.tasks.calibrate.adjusting import COST_TOLERANCE, RAYLEIGH, RigSolution, met_points
 from dyntorch.tasks.calibrate.adjustment import RigAdjustment, RigState, images
 from dyntorch.tasks.calibrate.observations import RigViews
-from dyntorch.tasks.calibrate.options import CalibrateOptions
 
 
 @dataclass(frozen=True)
@@ -24,11 +23,14 @@ class Structure:
     inliers: Tensor  # ``(c,)`` share of the positions that agree
 
 
-def structure(views: RigViews, found: RigSolution, options: CalibrateOptions) -> Structure:
+BLOCK_POINTS = 20_000  # points times moments that are solved at a time
+
+
+def structure(views: RigViews, found: RigSolution) -> Structure:
     """Points of all moments of views, each the least squares of the positions that see it, with the noise of Student's t."""
     n = views.grids[0].x.shape[1]
-    step = max(1, options.points.block // n)
-    parts = [_block(replace(views, times=times), found, options) for times in views.times.split(step)]
+    step = max(1, BLOCK_POINTS // n)
+    parts = [_block(replace(views, times=times), found) for times in views.times.split(step)]
     points, sigmas = (torch.cat([part[k] for part in parts]) for k in (0, 1))
     square, agree, seen = (torch.stack([part[k] for part in parts]).sum(0) for k in (2, 3, 4))
     residuals = torch.where(agree > 0, (square / agree.clamp(min=1)).sqrt(), torch.nan)
@@ -36,22 +38,27 @@ def structure(views: RigViews, found: RigSolution, options: CalibrateOptions) ->
     return Structure(points, sigmas, residuals, inliers)
 
 
-def _block(views: RigViews, found: RigSolution, options: CalibrateOptions) -> tuple[Tensor, ...]:
+POINT_ITERATIONS = 8  # of their least squares
+MAX_POINT_SIGMA = 0.08  # over the distance of the cameras
+OUTLIER_SIGMAS = 4.0  # of the noise beyond which a position does not agree
+
+
+def _block(views: RigViews, found: RigSolution) -> tuple[Tensor, ...]:
     """Points, their standard deviations, and per camera and point: sum of squares and number of what agrees, number of all."""
-    state = found.state._replace(lengths=found.state.lengths[:, :0])
+    state = found.state
     weights = views.at(state.clocks).weights
     weights = weights * ((weights > 0).sum(1, keepdim=True) >= 2)
     held = found.problem.basis[:, :0]
     problem = RigAdjustment(views, weights, found.problem.sigma, found.problem.freedom, found.problem.priors, held)
     state = state._replace(points=met_points(views, state)[None])
-    settings = replace(options.descent, iterations=options.points.steps, tolerance=options.adjust.tolerance)
+    settings = LeastSquaresOptions(iterations=POINT_ITERATIONS, tolerance=COST_TOLERANCE)
     state = RigState(*minimize(problem, problem.evaluate(tuple(state)), settings).theta)
     sigmas = _sigmas(problem, state)
     far = (state.centers[0, :, None, None] - state.points[0]).norm(dim=-1).median(0).values
-    known = (weights[0] > 0).any(0) & (sigmas <= options.points.sigma * far)
+    known = (weights[0] > 0).any(0) & (sigmas <= MAX_POINT_SIGMA * far)
     error = (images(state, views.centers) - views.at(state.clocks).x)[0].norm(dim=-1)
     seen = (weights[0] > 0) & known
-    agree = seen & (error <= options.points.outlying * RAYLEIGH * problem.sigma[0, :, None, None])
+    agree = seen & (error <= OUTLIER_SIGMAS * RAYLEIGH * problem.sigma[0, :, None, None])
     return (
         torch.where(known[..., None], state.points[0], torch.nan),
         torch.where(known, sigmas, torch.nan),

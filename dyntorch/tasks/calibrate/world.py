@@ -11,7 +11,6 @@ from torch.nn.functional import normalize
 
 from dyntorch.tasks.calibrate.bones import bodies, rigid_pairs
 from dyntorch.tasks.calibrate.input import Scale
-from dyntorch.tasks.calibrate.options import RigWorldOptions
 
 
 @dataclass(frozen=True)
@@ -35,42 +34,54 @@ class World:
         return turned, self.scale * t - (turned @ self.origin[:, None])[..., 0]
 
 
-def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale, options: RigWorldOptions) -> World:
+MIN_UPRIGHT_SHARE = 0.4  # of the axes
+MAX_WORLD_MOMENTS = 2_000  # evenly spread
+GROUND_QUANTILE = 0.01  # of the points' heights
+MAX_BODY_SPREAD = 0.15  # of a distance over itself up to which two points belong to one body
+
+
+def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale) -> World:
     r"""Up from the long axes of upright bodies, the ground below them, the scale from a height or lengths. R ``(c, 3, 3)``,
     centers ``(c, 3)``, points ``(T, n, 3)``."""
-    points = points[:: max(1, len(points) // options.moments)]
+    points = points[:: max(1, len(points) // MAX_WORLD_MOMENTS)]
     n = points.shape[1]
     # several people stand side by side: what keeps its distances is one body
-    ends, _, _ = rigid_pairs(points.nan_to_num(0.0), points.isfinite().all(-1), options.body_spread)
+    ends, _, _ = rigid_pairs(points.nan_to_num(0.0), points.isfinite().all(-1), MAX_BODY_SPREAD)
     groups = bodies(ends, n) or [list(range(n))]
     from_cameras = normalize(-R[:, 1].sum(0), dim=0)
-    up, share = upward(points, groups, from_cameras, options)
-    by_people = share >= options.upright_share
+    up, share = upward(points, groups, from_cameras)
+    by_people = share >= MIN_UPRIGHT_SHARE
     up = up if by_people else from_cameras
     ahead = R[0, 2] - (R[0, 2] @ up) * up
     ahead = normalize(ahead, dim=0) if float(ahead.norm()) > 1e-6 else normalize(torch.linalg.cross(up, R[0, 0]), dim=0)
     turn = torch.stack([torch.linalg.cross(ahead, up), ahead, up])
     turned = points @ turn.mT
-    size, metric = _scale(turned, centers, points, groups[0], scale, options)
+    size, metric = _scale(turned, centers, points, groups[0], scale)
     known = turned.flatten(0, 1)
     known = known[known.isfinite().all(-1)]
     if not len(known):
         return World(turn, size, torch.zeros(3, dtype=torch.float64), metric, share, by_people)
-    low = torch.stack([*known[:, :2].median(0).values, known[:, 2].quantile(options.ground)])
+    low = torch.stack([*known[:, :2].median(0).values, known[:, 2].quantile(GROUND_QUANTILE)])
     return World(turn, size, -size * low, metric, share, by_people)
 
 
-def upward(points: Tensor, groups: list[list[int]], guess: Tensor, options: RigWorldOptions) -> tuple[Tensor, float]:
+UPRIGHT_DEGREES = 15.0  # from their middle within which long axes of bodies count as upright
+MIN_AXIS_POINTS = 0.6  # share of the points of a body that a long axis takes
+MIN_ELONGATION = 1.5  # ratio of the first two principal spreads
+MAX_CAMERA_TILT = 40.0  # degrees of the long axes from the cameras' own upward direction: nobody stands on a wall
+
+
+def upward(points: Tensor, groups: list[list[int]], guess: Tensor) -> tuple[Tensor, float]:
     """The direction ``(3,)`` that most long axes of bodies have, and the share of the axes that have it."""
     axes = []
     for group in groups:
         body = points[:, group]
         seen = body.isfinite().all(-1)
-        enough = seen.sum(1) >= max(3, math.ceil(options.seen * len(group)))
+        enough = seen.sum(1) >= max(3, math.ceil(MIN_AXIS_POINTS * len(group)))
         body, seen = body[enough].nan_to_num(0.0), seen[enough].double()[..., None]
         centred = (body - (body * seen).sum(1, keepdim=True) / seen.sum(1, keepdim=True)) * seen
         values, vectors = torch.linalg.eigh(centred.mT @ centred)
-        long = values[:, 2].clamp(min=0).sqrt() > options.elongation * values[:, 1].clamp(min=1e-300).sqrt()
+        long = values[:, 2].clamp(min=0).sqrt() > MIN_ELONGATION * values[:, 1].clamp(min=1e-300).sqrt()
         axes.append(vectors[long, :, 2])
     every = torch.cat(axes)
     if not len(every):
@@ -80,15 +91,17 @@ def upward(points: Tensor, groups: list[list[int]], guess: Tensor, options: RigW
     for _ in range(50):
         weight = 1 / (1 - every @ up).clamp(min=0).sqrt().clamp(min=1e-3)
         up = normalize((every * weight[:, None]).sum(0), dim=0)
-    near = every @ up > math.cos(math.radians(options.upright))
-    if float(up @ guess) < math.cos(math.radians(options.cameras)):
+    near = every @ up > math.cos(math.radians(UPRIGHT_DEGREES))
+    if float(up @ guess) < math.cos(math.radians(MAX_CAMERA_TILT)):
         return guess, 0.0
     return normalize(every[near].mean(0), dim=0) if bool(near.any()) else up, float(near.double().mean())
 
 
-def _scale(
-    turned: Tensor, centers: Tensor, points: Tensor, body: list[int], scale: Scale, options: RigWorldOptions
-) -> tuple[float, bool]:
+MIN_HEIGHT_POINTS = 0.9  # the same for its height, or as many as ever are
+STANDING_QUANTILE = 0.75  # of the extent upwards
+
+
+def _scale(turned: Tensor, centers: Tensor, points: Tensor, body: list[int], scale: Scale) -> tuple[float, bool]:
     """Units of the world per unit of the adjustment, and whether they are metres."""
     if scale.lengths:
         found = []
@@ -101,10 +114,10 @@ def _scale(
     if scale.height is not None:
         up = turned[:, body, 2]
         share = up.isfinite().double().mean(1)
-        whole = up[share >= min(options.whole, float(share.max()))]
+        whole = up[share >= min(MIN_HEIGHT_POINTS, float(share.max()))]
         extent = whole.nan_to_num(-math.inf).amax(1) - whole.nan_to_num(math.inf).amin(1)
         if len(extent):
-            return scale.height / float(extent.quantile(options.standing)), True
+            return scale.height / float(extent.quantile(STANDING_QUANTILE)), True
     seen = points.flatten(0, 1)
     seen = seen[seen.isfinite().all(-1)]
     middle = seen.median(0).values if len(seen) else centers.mean(0)

@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.tasks.pair.options import PairOptions
-
 # ----------------------------------------------------------------------------------------------------------------------
 # The epipolar coordinates of one camera's points as combinations of the other's, by ridge regression of most evidence.
 #
@@ -33,6 +31,9 @@ class Ridge:
     precision: Tensor  # ``(g, 2, 2)`` inverse covariance of o and c
 
 
+SUM_WEIGHT = 10.0  # of the row of sums, over the root of the sum of the squared singular values
+
+
 @dataclass(frozen=True)
 class Rows:
     """Regressors and what they are to explain, with the rows of the means: ``x (g, F, n)``, ``y (g, F, m)``,
@@ -44,13 +45,13 @@ class Rows:
     dropped: int = 0
 
     @staticmethod
-    def of(x: Tensor, y: Tensor, means: tuple[Tensor, Tensor] | None = None, dropped: int = 0, *, options: PairOptions) -> Rows:
+    def of(x: Tensor, y: Tensor, means: tuple[Tensor, Tensor] | None = None, dropped: int = 0) -> Rows:
         """``x (g, F, n)``, ``y (g, F, m)`` over time, and mean places ``(g, n)``, ``(g, m)`` where they count."""
         free = x.new_zeros(*x.shape[:2], 2)
         if means is None:
             return Rows(x, y, free, dropped)
         # the largest singular value to a factor of a few is all that is needed
-        firm = options.ridge.firmness * x.square().sum((1, 2)).sqrt()
+        firm = SUM_WEIGHT * x.square().sum((1, 2)).sqrt()
         free[..., 1] = x.mean(-1)
         unit = free.new_zeros(len(free), 2, 2)
         unit[:, 0, 0], unit[:, 0, 1] = 1.0, means[0].mean(-1)
@@ -59,7 +60,7 @@ class Rows:
         return Rows(x, y, torch.cat([free, unit], dim=1), dropped)
 
 
-def regress(rows: Rows, *, means: bool, options: PairOptions) -> Ridge:
+def regress(rows: Rows, *, means: bool) -> Ridge:
     """The ridge, common to all columns of y, of most evidence."""
     u, s, _ = torch.linalg.svd(rows.x, full_matrices=False)
     inside, outside = u.mT @ rows.y, rows.y - u @ (u.mT @ rows.y)
@@ -68,7 +69,7 @@ def regress(rows: Rows, *, means: bool, options: PairOptions) -> Ridge:
     small = torch.linalg.qr(torch.cat([beyond, outside], dim=-1)).R
     beyond, outside = small[..., :2], small[..., 2:]
     energies = s.square()
-    ridge = energies.amax(-1).clamp(min=1e-300)[:, None] * _grid(s, options)
+    ridge = energies.amax(-1).clamp(min=1e-300)[:, None] * _grid(s)
     share = 1 / (energies[:, None] / ridge[..., None] + 1)  # (g, L, n)
     # c and o are common to all columns: what they change of squares summed over columns is the mean of the columns
     columns = rows.y.shape[2]
@@ -101,7 +102,10 @@ def combinations(rows: Rows, ridge: Tensor, gauge: Tensor) -> Tensor:
     return found + gauge[:, 1, None, None] / rows.x.shape[2]
 
 
-def predicted_apart(x: Tensor, y: Tensor, ridge: Tensor, options: PairOptions) -> Tensor:
+NUM_FOLDS = 5  # stretches of time that are predicted from the others
+
+
+def predicted_apart(x: Tensor, y: Tensor, ridge: Tensor) -> Tensor:
     r"""Residuals of y where every stretch of time is predicted from all others, :math:`(I - H_{BB})^{-1} (y - H y)_B`. x
     ``(T, n)`` -> ``(T, m)``."""
     u, s, _ = torch.linalg.svd(x, full_matrices=False)
@@ -110,7 +114,7 @@ def predicted_apart(x: Tensor, y: Tensor, ridge: Tensor, options: PairOptions) -
     inside = u.mT @ y
     residual = y - u @ (share.mT * inside)
     pieces = []
-    for rows in torch.arange(len(x), device=x.device).chunk(options.ridge.stretches):
+    for rows in torch.arange(len(x), device=x.device).chunk(NUM_FOLDS):
         part = u[rows]
         eye = torch.eye(len(rows), dtype=x.dtype, device=x.device)
         hat = (part * share[:, None]) @ part.mT
@@ -120,22 +124,26 @@ def predicted_apart(x: Tensor, y: Tensor, ridge: Tensor, options: PairOptions) -
     return torch.cat(pieces)
 
 
-def ridges_apart(x: Tensor, y: Tensor, options: PairOptions) -> Tensor:
+def ridges_apart(x: Tensor, y: Tensor) -> Tensor:
     """The ridge of most evidence of every column of ``y (T, m)`` by itself, given ``x (T, n)``: ``(m,)``."""
     u, s, _ = torch.linalg.svd(x, full_matrices=False)
     inside = u.mT @ y
     rest = (y - u @ inside).square().sum(0)
     energies = s.square()
-    ridge = energies.amax().clamp(min=1e-300) * _grid(s, options)
+    ridge = energies.amax().clamp(min=1e-300) * _grid(s)
     share = 1 / (energies / ridge[:, None] + 1)
     cost = share @ inside.square() + rest
     level = -0.5 * len(y) * cost.clamp(min=1e-300).log() + 0.5 * share.log().sum(-1, keepdim=True)
     return ridge[level.argmax(0)]
 
 
-def _grid(like: Tensor, options: PairOptions) -> Tensor:
-    least = options.ridge.least
-    return torch.logspace(0, 1, options.ridge.steps, base=1 / least, dtype=like.dtype, device=like.device) * least
+MIN_RIDGE = 1e-22  # over the largest eigenvalue of the Gram
+NUM_RIDGES = 72  # tried from there to 1
+
+
+def _grid(like: Tensor) -> Tensor:
+    least = MIN_RIDGE
+    return torch.logspace(0, 1, NUM_RIDGES, base=1 / least, dtype=like.dtype, device=like.device) * least
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -186,11 +194,12 @@ def along(x: Tensor, angle: Tensor) -> Tensor:
     return torch.movedim(x @ direction(angle).mT, -1, 0)
 
 
-def information(motions: Motions, angles: Tensor, options: PairOptions) -> Tensor:
+NOISE_FLOOR = 0.1  # share of the noise's variance added to covariances; CMU joints at 3 mm: 1.6 degrees off for .1, 2.1 for 1
+
+
+def information(motions: Motions, angles: Tensor) -> Tensor:
     r"""What the coordinates along two directions say of each other, ``(g,)``."""
-    floor = max(
-        options.directions.noise_floor * motions.variance, 1e-14 * float(motions.x.square().sum(0).mean()) / motions.frequencies
-    )
+    floor = max(NOISE_FLOOR * motions.variance, 1e-14 * float(motions.x.square().sum(0).mean()) / motions.frequencies)
     x, y = (along(part, angle) for part, angle in zip((motions.x, motions.y), angles.unbind(-1), strict=True))
     n, m = x.shape[-1], y.shape[-1]
     both = torch.cat([x, y], dim=-1)
@@ -201,26 +210,30 @@ def information(motions: Motions, angles: Tensor, options: PairOptions) -> Tenso
     return (alone.log().sum(-1) - whole[:, n:].log().sum(-1)).nan_to_num(nan=-torch.inf)
 
 
-def peaks(motions: Motions, options: PairOptions) -> Tensor:
+NUM_DIRECTIONS = 36  # of each camera: information changes little over 5 degrees
+NUM_PEAKS = 3  # that are refined
+
+
+def peaks(motions: Motions) -> Tensor:
     """The best local maxima of :func:`information` on a grid over all directions, ``(k, 2)``, best first."""
-    grid = options.directions.grid
+    grid = NUM_DIRECTIONS
     steps = torch.arange(grid, dtype=motions.x.dtype, device=motions.x.device) * (torch.pi / grid)
-    values = torch.stack([information(motions, torch.stack([a.expand(grid), steps], dim=-1), options) for a in steps])
+    values = torch.stack([information(motions, torch.stack([a.expand(grid), steps], dim=-1)) for a in steps])
     around = [values.roll((i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     top = torch.where((values >= torch.stack(around).amax(0)), values, -torch.inf).flatten()
-    found, place = top.topk(options.directions.starts)
+    found, place = top.topk(NUM_PEAKS)
     place = place[found.isfinite()]
     return torch.stack([steps[place // grid], steps[place % grid]], dim=-1)
 
 
-def likelihood(motions: Motions, angles: Tensor, affine: bool = False, *, options: PairOptions) -> Tensor:
+def likelihood(motions: Motions, angles: Tensor, affine: bool = False) -> Tensor:
     """Log likelihood ``(g,)`` of each camera's coordinates given the other's, above their own; ``affine``: with the mean places."""
     both = [along(part, angle) for part, angle in zip((motions.x, motions.y), angles.unbind(-1), strict=True)]
     places = [along(part, angle) for part, angle in zip(motions.means, angles.unbind(-1), strict=True)]
-    there = Rows.of(both[0], both[1], (places[0], places[1]) if affine else None, motions.dropped, options=options)
-    back = Rows.of(both[1], both[0], (places[1], places[0]) if affine else None, motions.dropped, options=options)
-    level = regress(there, means=affine, options=options).evidence + regress(back, means=affine, options=options).evidence
-    floor = options.directions.noise_floor * motions.variance
+    there = Rows.of(both[0], both[1], (places[0], places[1]) if affine else None, motions.dropped)
+    back = Rows.of(both[1], both[0], (places[1], places[0]) if affine else None, motions.dropped)
+    level = regress(there, means=affine).evidence + regress(back, means=affine).evidence
+    floor = NOISE_FLOOR * motions.variance
     for z in both:
         own = z.mT @ z / motions.frequencies
         own = own + (floor + 1e-14 * own.diagonal(dim1=-2, dim2=-1).mean(-1))[:, None, None] * torch.eye(len(own[0])).to(own)
@@ -228,31 +241,30 @@ def likelihood(motions: Motions, angles: Tensor, affine: bool = False, *, option
     return level
 
 
+FINEST_STEP = 1e-10  # radians, to which the best one is
+STEP_SHRINKAGE = 0.4  # where no neighbour is better
+MIN_GAIN = 1e-3  # of log likelihood, below which noise decides
+
+
 def refined(
-    motions: Motions,
-    start: Tensor,
-    finest: float | None = None,
-    step: float | None = None,
-    *,
-    affine: bool = False,
-    options: PairOptions,
+    motions: Motions, start: Tensor, finest: float | None = None, step: float | None = None, *, affine: bool = False
 ) -> tuple[Tensor, float]:
     """The directions ``(2,)`` of most likelihood near the start, and its value, by a grid that shrinks from step to finest, if not
     given from half a step of the grid of :func:`peaks` to the finest one of the options."""
-    finest = options.directions.finest if finest is None else finest
-    step = 0.5 * torch.pi / options.directions.grid if step is None else step
+    finest = FINEST_STEP if finest is None else finest
+    step = 0.5 * torch.pi / NUM_DIRECTIONS if step is None else step
     offsets = torch.cartesian_prod(*(torch.tensor([-1.0, 0.0, 1.0], dtype=start.dtype, device=start.device),) * 2)
     angles, level = start, -torch.inf
     while step > finest:
-        values = likelihood(motions, angles + step * offsets, affine, options=options).nan_to_num(nan=-torch.inf)
+        values = likelihood(motions, angles + step * offsets, affine).nan_to_num(nan=-torch.inf)
         best = int(values.argmax())
         gain, level = float(values[best]) - level, max(level, float(values[best]))
         angles = angles + step * offsets[best]
         if best == len(offsets) // 2:
-            if float(values.max() - values.min()) < options.directions.least_gain:
+            if float(values.max() - values.min()) < MIN_GAIN:
                 break
-            step *= options.directions.shrinkage
-        elif gain < options.directions.least_gain:
+            step *= STEP_SHRINKAGE
+        elif gain < MIN_GAIN:
             break
     return angles, level
 
@@ -283,7 +295,10 @@ def frames_of(z: Tensor) -> Tensor:
     return torch.fft.irfft(torch.cat([zero, half, zero]), n=2 * frames, dim=0)[:frames]
 
 
-def motion_spectrum(z: Tensor, variance: float, options: PairOptions) -> Tensor:
+MIN_POWER_RATIO = 1e-6  # of the motion of any frequency over the noise, and of the noise in gaps over the motion
+
+
+def motion_spectrum(z: Tensor, variance: float) -> Tensor:
     """Power of the motion at each frequency, mean over points and coordinates, smoothed over an eighth of an octave,
     ``(T - 1,)``."""
     power = z.square().mean((1, 2))
@@ -291,7 +306,10 @@ def motion_spectrum(z: Tensor, variance: float, options: PairOptions) -> Tensor:
     place = torch.arange(len(power), device=z.device)
     low, high = (place - 1 - place // 8).clamp(min=0), (place + 2 + place // 8).clamp(max=len(power))
     smooth = (total[high] - total[low]) / (high - low)
-    return (smooth - variance).clamp(min=options.prior.faint * variance + 1e-300)
+    return (smooth - variance).clamp(min=MIN_POWER_RATIO * variance + 1e-300)
+
+
+EM_ITERATIONS = 20  # for the covariance of the points
 
 
 @dataclass(frozen=True)
@@ -304,13 +322,13 @@ class Prior:
     variance: float  # of the noise
 
     @staticmethod
-    def of(z: Tensor, variance: float, options: PairOptions) -> Prior:
+    def of(z: Tensor, variance: float) -> Prior:
         """Of ``(T - 1, n, 2)`` of :func:`cosines`, by expectation-maximization."""
-        spectrum = motion_spectrum(z, variance, options)
+        spectrum = motion_spectrum(z, variance)
         n = z.shape[1]
         found = Prior(spectrum, z.new_ones(n), torch.eye(n, dtype=z.dtype, device=z.device), variance)
         root = spectrum.sqrt()[:, None, None]
-        for _ in range(options.prior.rounds):
+        for _ in range(EM_ITERATIONS):
             hidden = (found.denoised(z) / root).mT.flatten(0, 1)
             left = (found.energies * (1 - found.shares())).sum(0) * 2
             moment = (hidden.mT @ hidden + found.modes @ torch.diag(left) @ found.modes.mT) / (2 * len(z))
@@ -329,7 +347,10 @@ class Prior:
         return self.modes @ ((self.modes.mT @ z) * shares)
 
 
-def filled(x: Tensor, variance: float, options: PairOptions) -> Tensor:
+FILL_ITERATIONS = 30  # each leaves about the share of the missing positions of the error
+
+
+def filled(x: Tensor, variance: float) -> Tensor:
     r"""Tracks ``(T, n, 2)`` whose gaps (NaN) hold what the other points expect, and what these miss around the gap."""
     seen = x.isfinite().all(-1)
     if bool(seen.all()):
@@ -339,8 +360,8 @@ def filled(x: Tensor, variance: float, options: PairOptions) -> Tensor:
     mean = found.mean(0)
     spread = (found - mean).mT.flatten(0, 1)
     B = spread.mT @ spread / len(spread)
-    level = max(variance, options.prior.faint * float(B.diagonal().mean()))
-    for _ in range(options.prior.fill_rounds):
+    level = max(variance, MIN_POWER_RATIO * float(B.diagonal().mean()))
+    for _ in range(FILL_ITERATIONS):
         shared = weights[:, :, None] * B * weights[:, None]
         # points that are missing have an equation of their own
         precision = torch.linalg.inv_ex(shared + torch.diag_embed(torch.where(seen, level, 1.0)))[0] * weights[:, None]
@@ -391,122 +412,136 @@ class Transfer:
     beyond: float = math.inf  # how far the likelihood is above those of unrelated motions, in units of the range of these
 
 
-def solve(x: Tensor, y: Tensor, noise: tuple[float, float], explained: float, options: PairOptions) -> Transfer | Tensor:
+MIN_POINTS = 2  # of a camera
+MAX_REJECTIONS = 8  # rounds in which points that the other camera does not explain are left out
+
+
+def solve(x: Tensor, y: Tensor, noise: tuple[float, float], explained: float, num_draws: int) -> Transfer | Tensor:
     """Everything of complete tracks.
 
     Args:
         x: ``(T, n, 2)`` positions about the centre of a's points; y: ``(T, m, 2)``.
         noise: of one coordinate; upper bounds.
         explained: share of a point's motion that the other camera must predict.
-        options: every number that decides.
+        num_draws: unrelated motions that the likelihood is compared with.
 
     Returns:
         Where too few points pass, only which do, ``(n + m,)``.
     """
     n = x.shape[1]
     good = torch.ones(n + y.shape[1], dtype=torch.bool, device=x.device)
-    for _ in range(options.explanation.rounds):
-        angles = _directions(x[:, good[:n]], y[:, good[n:]], noise, options)
-        r2, strange = judged(x, y, angles, noise, good, explained, options)
+    for _ in range(MAX_REJECTIONS):
+        angles = _directions(x[:, good[:n]], y[:, good[n:]], noise)
+        r2, strange = judged(x, y, angles, noise, good, explained)
         worst = (strange * good).argsort(descending=True)[: max(1, int((strange * good > 0).sum()) // 2)]
         left = good.scatter(0, worst, False)
         # points explained wrongly by one another have to go one after the other
-        if not bool((strange[worst] > 0).all()) or min(int(left[:n].sum()), int(left[n:].sum())) < options.input.fewest_points:
+        if not bool((strange[worst] > 0).all()) or min(int(left[:n].sum()), int(left[n:].sum())) < MIN_POINTS:
             break
         good = left
     good = strange == 0
-    if min(int(good[:n].sum()), int(good[n:].sum())) < options.input.fewest_points:
+    if min(int(good[:n].sum()), int(good[n:].sum())) < MIN_POINTS:
         return good
-    beyond = _beyond_chance(_motions(x[:, good[:n]], y[:, good[n:]], noise, options), angles, options)
-    found = _transferred(x, y, noise, angles, r2, good, options)
+    beyond = _beyond_chance(_motions(x[:, good[:n]], y[:, good[n:]], noise), angles, num_draws)
+    found = _transferred(x, y, noise, angles, r2, good)
     if found.affine:
         # the mean places tell the directions better than the motions alone
-        angles = _directions(x[:, good[:n]], y[:, good[n:]], noise, options, angles)
-        found = _transferred(x, y, noise, angles, r2, good, options)
+        angles = _directions(x[:, good[:n]], y[:, good[n:]], noise, angles)
+        found = _transferred(x, y, noise, angles, r2, good)
     return replace(found, beyond=beyond)
 
 
-def _directions(x: Tensor, y: Tensor, noise: tuple[float, float], options: PairOptions, start: Tensor | None = None) -> Tensor:
+COARSE_STEP = 3e-3  # radians, to which all peaks are refined
+
+
+def _directions(x: Tensor, y: Tensor, noise: tuple[float, float], start: Tensor | None = None) -> Tensor:
     """Angles ``(2,)`` of the epipolar normals; from a start, those that the mean places agree with as well."""
-    motions, coarse = _motions(x, y, noise, options).compressed(), options.directions.coarse
+    motions, coarse = _motions(x, y, noise).compressed(), COARSE_STEP
     if start is not None:
-        return refined(motions, start, step=2 * coarse, affine=True, options=options)[0]
-    found = [refined(motions, start, coarse, options=options) for start in peaks(motions, options)]
-    return refined(motions, max(found, key=lambda one: one[1])[0], step=2 * coarse, options=options)[0]
+        return refined(motions, start, step=2 * coarse, affine=True)[0]
+    found = [refined(motions, start, coarse) for start in peaks(motions)]
+    return refined(motions, max(found, key=lambda one: one[1])[0], step=2 * coarse)[0]
 
 
-def _motions(x: Tensor, y: Tensor, noise: tuple[float, float], options: PairOptions) -> Motions:
+def _motions(x: Tensor, y: Tensor, noise: tuple[float, float]) -> Motions:
     """The motions of both cameras, weighted by how much of each frequency is no noise."""
     z = [cosines(part - part.mean(0)) for part in (x, y)]
     sizes = [float(part.square().mean().sqrt()) for part in z]
     variance = 0.5 * sum((one / size) ** 2 for one, size in zip(noise, sizes, strict=True))
     z = [part / size for part, size in zip(z, sizes, strict=True)]
-    power = motion_spectrum(torch.cat(z, dim=1), variance, options)
+    power = motion_spectrum(torch.cat(z, dim=1), variance)
     share = power / (power + variance)
     root = share.sqrt()[:, None, None]
     places = [(part.mean(0) - part.mean((0, 1))) / size for part, size in zip((x, y), sizes, strict=True)]
     return Motions(z[0] * root, z[1] * root, variance, float(share.sum()), (places[0], places[1]))
 
 
-def _beyond_chance(motions: Motions, angles: Tensor, options: PairOptions) -> float:
+def _beyond_chance(motions: Motions, angles: Tensor, num_draws: int) -> float:
     """How far the likelihood of what was found is above the highest of unrelated motions, over the range of theirs."""
     # a generator of its own: the same tracks get the same answer
     generator = torch.Generator().manual_seed(0)
     levels = []
-    for _ in range(options.explanation.draws):
+    for _ in range(num_draws):
         signs = torch.randint(0, 2, (len(motions.y),), generator=generator).to(motions.y) * 2 - 1
         other = replace(motions, y=motions.y * signs[:, None, None]).compressed()
-        levels.append(refined(other, peaks(other, options)[0], options.directions.coarse, options=options)[1])
-    level = float(likelihood(motions.compressed(), angles[None], options=options)[0])
+        levels.append(refined(other, peaks(other)[0], COARSE_STEP)[1])
+    level = float(likelihood(motions.compressed(), angles[None])[0])
     return (level - max(levels)) / max(max(levels) - min(levels), 1e-9 * abs(level), 1e-300)
 
 
 def judged(
-    x: Tensor, y: Tensor, angles: Tensor, noise: tuple[float, float], good: Tensor, explained: float, options: PairOptions
+    x: Tensor, y: Tensor, angles: Tensor, noise: tuple[float, float], good: Tensor, explained: float
 ) -> tuple[Tensor, Tensor]:
     """How the other camera's good points predict every point's epipolar coordinate."""
     n = x.shape[1]
     u, v = (along(part - part.mean(0), angle[None])[0] for part, angle in zip((x, y), angles, strict=True))
-    first = _judged(v[:, good[n:]], u, noise[0], good[:n], explained, options)
-    second = _judged(u[:, good[:n]], v, noise[1], good[n:], explained, options)
+    first = _judged(v[:, good[n:]], u, noise[0], good[:n], explained)
+    second = _judged(u[:, good[:n]], v, noise[1], good[n:], explained)
     return torch.cat([first[0], second[0]]), torch.cat([first[1], second[1]])
 
 
-def _judged(x: Tensor, y: Tensor, noise: float, good: Tensor, explained: float, options: PairOptions) -> tuple[Tensor, Tensor]:
-    missed = predicted_apart(x, y, ridges_apart(x, y, options), options).square().mean(0)
-    small = missed <= (options.explanation.missed * noise) ** 2
+SURE_SHARE = 0.99  # of the motion that must be predicted of a point missed by an unusual distance
+UNUSUAL_RATIO = 4.0  # over the usual distance
+MAX_MISSED_SIGMAS = 3.0  # up to which a prediction speaks against no point: it hardly moves across the epipolar lines
+
+
+def _judged(x: Tensor, y: Tensor, noise: float, good: Tensor, explained: float) -> tuple[Tensor, Tensor]:
+    missed = predicted_apart(x, y, ridges_apart(x, y)).square().mean(0)
+    small = missed <= (MAX_MISSED_SIGMAS * noise) ** 2
     # noise is nobody's to predict
     power = y.square().mean(0) - noise**2
     share = 1 - (missed - noise**2).clamp(min=0) / power.clamp(min=1e-300)
     share = torch.where(power > noise**2, share.clamp(min=0.0), small.to(x))
     usual = missed[good].median().clamp(min=1e-300)
-    bad = (share < explained) | ((share < options.explanation.sure) & (missed > options.explanation.unusual**2 * usual))
+    bad = (share < explained) | ((share < SURE_SHARE) & (missed > UNUSUAL_RATIO**2 * usual))
     return share, torch.where(bad & ~small, missed / usual, 0.0)
 
 
-def _transferred(
-    x: Tensor, y: Tensor, noise: tuple[float, float], angles: Tensor, r2: Tensor, good: Tensor, options: PairOptions
-) -> Transfer:
+MAX_MEAN_COST = 3.0  # factor of the residual variance that the mean places may cost before they are taken for free
+VARIANCE_ROUNDING = 1e-11  # residual over the power of the motion
+
+
+def _transferred(x: Tensor, y: Tensor, noise: tuple[float, float], angles: Tensor, r2: Tensor, good: Tensor) -> Transfer:
     n = x.shape[1]
     left, right = good[:n], good[n:]
     means = (x.mean(0), y.mean(0))
     moving = [x - means[0], y - means[1]]
-    rows = _rows(moving, moving, means, angles, (left, right), options)
-    if float(regress(rows[0], means=True, options=options).gauge[0, 1]) < 0:
+    rows = _rows(moving, moving, means, angles, (left, right))
+    if float(regress(rows[0], means=True).gauge[0, 1]) < 0:
         angles = angles + angles.new_tensor([0.0, torch.pi])
-        rows = _rows(moving, moving, means, angles, (left, right), options)
-    free = [regress(_bare(one), means=False, options=options) for one in rows]
+        rows = _rows(moving, moving, means, angles, (left, right))
+    free = [regress(_bare(one), means=False) for one in rows]
     # third differences bound the noise from above, and so do the residuals
     sigma = _bounded(
         noise, free, [combinations(_bare(one), fit.ridge, one.x.new_zeros(1, 2))[0] for one, fit in zip(rows, free, strict=True)]
     )
-    clean = [_denoised(part, one, kept, options) for part, one, kept in zip(moving, sigma, (left, right), strict=True)]
-    rows = _rows(clean, moving, means, angles, (left, right), options)
-    free = [regress(_bare(one), means=False, options=options) for one in rows]
-    tied = [regress(one, means=True, options=options) for one in rows]
+    clean = [_denoised(part, one, kept) for part, one, kept in zip(moving, sigma, (left, right), strict=True)]
+    rows = _rows(clean, moving, means, angles, (left, right))
+    free = [regress(_bare(one), means=False) for one in rows]
+    tied = [regress(one, means=True) for one in rows]
     better = min(range(2), key=lambda i: float(free[i].variance) / float(rows[i].y.square().mean()))
-    exact = options.places.rounding * float(rows[better].y.square().mean())
-    affine = float(tied[better].variance) <= max(options.places.affine * float(free[better].variance), exact)
+    exact = VARIANCE_ROUNDING * float(rows[better].y.square().mean())
+    affine = float(tied[better].variance) <= max(MAX_MEAN_COST * float(free[better].variance), exact)
     if affine:
         scale, offset = _gauge(tied)
         gauges = angles.new_tensor([[offset, scale], [-offset / scale, 1 / scale]])
@@ -533,18 +568,13 @@ def _bounded(noise: tuple[float, float], free: list[Ridge], weights: list[Tensor
 
 
 def _rows(
-    regressors: list[Tensor],
-    explained: list[Tensor],
-    means: tuple[Tensor, Tensor],
-    angles: Tensor,
-    good: tuple[Tensor, Tensor],
-    options: PairOptions,
+    regressors: list[Tensor], explained: list[Tensor], means: tuple[Tensor, Tensor], angles: Tensor, good: tuple[Tensor, Tensor]
 ) -> list[Rows]:
     """b's epipolar coordinates by a's, and a's by b's."""
     u, v = (along(part[:, kept], angle[None]) for part, kept, angle in zip(regressors, good, angles, strict=True))
     s, t = (along(part[:, kept], angle[None]) for part, kept, angle in zip(explained, good, angles, strict=True))
     first, second = (along(part[kept], angle[None]) for part, kept, angle in zip(means, good, angles, strict=True))
-    return [Rows.of(u, t, (first, second), options=options), Rows.of(v, s, (second, first), options=options)]
+    return [Rows.of(u, t, (first, second)), Rows.of(v, s, (second, first))]
 
 
 def _bare(rows: Rows) -> Rows:
@@ -552,13 +582,13 @@ def _bare(rows: Rows) -> Rows:
     return Rows(rows.x[:, :-2], rows.y[:, :-2], torch.zeros_like(rows.free[:, :-2]))
 
 
-def _denoised(x: Tensor, noise: float, good: Tensor, options: PairOptions) -> Tensor:
+def _denoised(x: Tensor, noise: float, good: Tensor) -> Tensor:
     """Motions of good points rid of noise; others as they are."""
     if not noise > 0:
         return x
     z = cosines(x[:, good])
     found = x.clone()
-    found[:, good] = frames_of(Prior.of(z, noise**2, options).denoised(z))
+    found[:, good] = frames_of(Prior.of(z, noise**2).denoised(z))
     return found
 
 

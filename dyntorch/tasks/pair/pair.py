@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -20,31 +20,51 @@ from dyntorch.geometry.triangulation import triangulate
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.pair.affine import Transfer, filled, solve
-from dyntorch.tasks.pair.options import PairOptions
+from dyntorch.tasks.pair.affine import MIN_POINTS, Transfer, filled, solve
 from dyntorch.tasks.pair.projective import body_pair
 from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
-from dyntorch.tasks.pair.tracks import Overlap, match_tracks, overlap
+from dyntorch.tasks.pair.tracks import MAX_RESIDUAL_SIGMAS, Overlap, match_tracks, overlap
 from dyntorch.tasks.synchronize.result import Shift
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """Options of :func:`dyntorch.reconstruct_pair`."""
+
+    min_frames: int = 12
+    """Frames in common: fewer are explained by any tracks."""
+    min_seen_share: float = 0.5
+    """Share of the frames in which a track of different points must be seen; longer gaps would be guessed, not interpolated."""
+    max_samples: int = 4000
+    """Positions of corresponding points that the fundamental matrix is estimated from, about."""
+    num_chance_draws: int = 5
+    """Unrelated motions, of the same spectrum and covariance, that the likelihood of different points is compared with."""
+    min_chance_margin: float = 1.0
+    """Ranges of their likelihoods that the one of the cameras must be above the highest of them: two views of one scene have 2 to
+    16 (3 px of noise and less, 60 frames and more); of 12 pairs of unrelated bodies one is above 1."""
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Two static cameras that see the same points: one fundamental matrix for the whole take, and projective structure per frame.
 
 
+MIN_POSITIONS = 12  # in both cameras: with fewer, agreement with some fundamental matrix is no evidence
+
+
 def projective(
-    seen: Overlap, threshold: float | None, explained: float, generator: torch.Generator | None, options: PairOptions
+    seen: Overlap, threshold: float | None, explained: float, generator: torch.Generator | None, max_samples: int
 ) -> PairReconstruction:
     """The reconstruction of corresponding points."""
     frames, n = seen.a.shape[:2]
     both = (seen.a.isfinite() & seen.b.isfinite()).all(-1)
-    needed = options.corresponding.fewest
+    needed = MIN_POSITIONS
     if int(both.sum()) < needed or int(both.any(0).sum()) < 1:
         notice = Notice(PairNotice.FEW_OBSERVED, float(both.sum()), {"needed": needed})
         return failure((n, n), seen.times, Status.TOO_FEW, notice, 4)
     # of unit size: neither the solver's nor the triangulation's precision depends on the unit
     x1, x2 = seen.a.nan_to_num(), seen.b.nan_to_num()
     chosen = both.flatten().nonzero()[:, 0]
-    stride = -(-len(chosen) // options.corresponding.sampled)
+    stride = -(-len(chosen) // max_samples)
     part = chosen[::stride]
     fitted = robust_fit(FundamentalMatrix, x1.flatten(0, 1)[part], x2.flatten(0, 1)[part], threshold=threshold, generator=generator)
     status = Status(int(fitted.status))
@@ -54,10 +74,10 @@ def projective(
     distance = sampson(FundamentalMatrix, F, x1.flatten(0, 1), x2.flatten(0, 1)).unflatten(0, (frames, n))
     distance = torch.where(both, distance.abs(), torch.nan)
     sigma = 0.0 if fitted.sigma is None else float(fitted.sigma)
-    limit = threshold if threshold is not None else max(options.corresponding.sigmas * sigma, 1e-9 * float(x1.abs().max()))
+    limit = threshold if threshold is not None else max(MAX_RESIDUAL_SIGMAS * sigma, 1e-9 * float(x1.abs().max()))
     share = torch.where(both, distance <= limit, False).sum(0) / both.sum(0).clamp(min=1)
     good = (share >= explained) & (both.sum(0) > 0)
-    cameras, points = _structure(F, x1, x2, both, fitted.motion, options)
+    cameras, points = _structure(F, x1, x2, both, fitted.motion)
     points = torch.where((good & both)[..., None], points, torch.nan)
     residuals = distance.square().nanmean(0).sqrt()
     residual = float(distance[:, good].square().nanmean().sqrt())
@@ -79,9 +99,10 @@ def projective(
     )
 
 
-def _structure(
-    F: Tensor, x1: Tensor, x2: Tensor, both: Tensor, motion: tuple[Tensor, ...], options: PairOptions
-) -> tuple[Tensor, Tensor]:
+TRIANGULATION_ITERATIONS = 3  # then the reprojection error no longer falls
+
+
+def _structure(F: Tensor, x1: Tensor, x2: Tensor, both: Tensor, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """Cameras ``(2, 3, 4)`` and points ``(frames, n, 4)``: the frame of :math:`[I \\mid 0],\\ [A \\mid e_2]`, of unit size."""
     views = torch.stack([x1.flatten(0, 1), x2.flatten(0, 1)])
     weights = both.flatten().to(views)
@@ -92,7 +113,7 @@ def _structure(
     first = torch.eye(3, 4, dtype=F.dtype, device=F.device)
     normal = torch.stack([first, second])
     moved = views * T[:, None, :1, 0] + T[:, None, :2, 2]
-    points = triangulate(normal, moved, weights.expand(2, -1), steps=options.corresponding.triangulation_steps)
+    points = triangulate(normal, moved, weights.expand(2, -1), steps=TRIANGULATION_ITERATIONS)
     cameras = torch.linalg.inv(T) @ normal
     return cameras / torch.linalg.matrix_norm(cameras, keepdim=True), points.unflatten(0, both.shape)
 
@@ -111,7 +132,7 @@ def reconstruct_pair(
     threshold: float | None = None,
     camera: str = "auto",
     generator: torch.Generator | None = None,
-    options: PairOptions = PairOptions(),
+    options: PairOptions | None = None,
 ) -> PairReconstruction:
     r"""Trajectories in space of points that two static, uncalibrated cameras see, even where each camera tracks other points.
 
@@ -150,7 +171,7 @@ def reconstruct_pair(
             the reprojection; three standard deviations of the noise.  None estimates it.
         camera: ``"affine"`` or ``"projective"``; ``"auto"``: affine for different points, projective for corresponding ones.
         generator: of the random samples for corresponding points.
-        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
+        options: :class:`PairOptions`; None = the defaults.
 
     Returns:
         A :class:`~dyntorch.tasks.pair.result.PairReconstruction` in the frames of a that both cameras show, in the dtype and on the
@@ -178,18 +199,19 @@ def reconstruct_pair(
         )  # fmt: skip
     _check(a, b, correspondence, explained, camera)
     check_threshold(threshold)
+    options = PairOptions() if options is None else options
     check_options(options, PairOptions)
     with torch.no_grad():
-        seen = overlap(a, b, shift, fps=fps, times=times, options=options)
-        short = _short(seen, options.input.shortest)
+        seen = overlap(a, b, shift, fps=fps, times=times)
+        short = _short(seen, options.min_frames)
         if short is not None:
             count = a.shape[1] + (0 if correspondence else b.shape[1])
             width = 4 if correspondence or camera == "projective" else 3
             found = failure((a.shape[1], b.shape[1]), seen.times, Status.TOO_FEW, short, width, count)
         elif correspondence:
-            found = projective(seen, threshold, explained, generator, options)
+            found = projective(seen, threshold, explained, generator, options.max_samples)
         elif camera == "projective":
-            found = body_pair(seen, threshold, explained, options)
+            found = body_pair(seen, threshold, explained)
         else:
             found = _affine(seen, explained, options)
     return _in(found, a.dtype)
@@ -261,48 +283,53 @@ def _short(seen: Overlap, needed: int) -> Notice | None:
     return Notice(PairNotice.SHORT_OVERLAP, float(frames), {"needed": needed})
 
 
+MIN_SPARE_FRAMES = 6  # beyond the number of points of either camera: fewer are explained by any tracks
+
+
 def _affine(seen: Overlap, explained: float, options: PairOptions) -> PairReconstruction:
     """The reconstruction of different points."""
     n, m = seen.a.shape[1], seen.b.shape[1]
-    often = [x.isfinite().all(-1).double().mean(0) >= options.input.seen for x in (seen.a, seen.b)]
+    often = [x.isfinite().all(-1).double().mean(0) >= options.min_seen_share for x in (seen.a, seen.b)]
     for name, kept in zip("ab", often, strict=True):
-        if int(kept.sum()) < options.input.fewest_points:
-            values = {"case": "shown", "which": name, "needed": options.input.fewest_points}
+        if int(kept.sum()) < MIN_POINTS:
+            values = {"case": "shown", "which": name, "needed": MIN_POINTS}
             return failure((n, m), seen.times, Status.TOO_FEW, Notice(PairNotice.FEW_POINTS, float(kept.sum()), values), 3)
-    tracks = [filled(x[:, kept], s * s, options) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
+    tracks = [filled(x[:, kept], s * s) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
     most = max(x.shape[1] for x in tracks)
-    wrong = _short(seen, most + options.input.spare_frames) or _unusable(tracks, seen.noise, options)
+    wrong = _short(seen, most + MIN_SPARE_FRAMES) or _unusable(tracks, seen.noise)
     if wrong is not None:
         return failure((n, m), seen.times, wrong.code.refuses or Status.DEGENERATE, wrong, 3)
     centres = [x.mean((0, 1)) for x in tracks]
-    found = solve(tracks[0] - centres[0], tracks[1] - centres[1], seen.noise, explained, options)
+    found = solve(tracks[0] - centres[0], tracks[1] - centres[1], seen.noise, explained, options.num_chance_draws)
     split = int(often[0].sum())
     if isinstance(found, Tensor):
         counts = int(found[:split].sum()), int(found[split:].sum())
         notice = Notice(PairNotice.FEW_POINTS, float(min(counts)), {"case": "explained", "a": counts[0], "b": counts[1]})
         return failure((n, m), seen.times, Status.NO_CONSENSUS, notice, 3)
-    if found.beyond < options.explanation.beyond:
+    if found.beyond < options.min_chance_margin:
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.CHANCE, found.beyond), 3)
-    return _assembled(seen, found, tracks, centres, torch.cat(often), options)
+    return _assembled(seen, found, tracks, centres, torch.cat(often))
 
 
-def _unusable(tracks: list[Tensor], noise: tuple[float, float], options: PairOptions) -> Notice | None:
+MIN_ACROSS_SIGMAS = 3.0  # motion across a line, over the noise
+MOTION_ROUNDING = 1e-7  # motion over the extent of the points
+
+
+def _unusable(tracks: list[Tensor], noise: tuple[float, float]) -> Notice | None:
     """Why the motion of one camera cannot be used, if so."""
     for name, x, sigma in zip("ab", tracks, noise, strict=True):
         moved = (x - x.mean(0)).flatten(0, 1)
         least, most = torch.linalg.eigvalsh(moved.mT @ moved / len(moved)).clamp(min=0).sqrt().tolist()
         extent = float((x - x.mean((0, 1))).square().mean().sqrt())
         # third differences of a fast motion are no noise: it is at least seven times as large
-        if most <= max(options.input.exact * extent, math.sqrt(2) * sigma):
+        if most <= max(MOTION_ROUNDING * extent, math.sqrt(2) * sigma):
             return Notice(PairNotice.STATIC_SCENE, most, {"which": name, "noise": sigma})
-        if least <= max(options.input.exact * extent, min(options.input.still * sigma, 0.01 * most)):
+        if least <= max(MOTION_ROUNDING * extent, min(MIN_ACROSS_SIGMAS * sigma, 0.01 * most)):
             return Notice(PairNotice.COLLINEAR, least, {"which": name})
     return None
 
 
-def _assembled(
-    seen: Overlap, found: Transfer, tracks: list[Tensor], centres: list[Tensor], often: Tensor, options: PairOptions
-) -> PairReconstruction:
+def _assembled(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: list[Tensor], often: Tensor) -> PairReconstruction:
     """Cameras, trajectories, matches in the frame (u, w_a, w_b): along the common normal, and along the epipolar lines of each."""
     n, split = seen.a.shape[1], tracks[0].shape[1]
     kept = often.clone()
@@ -330,7 +357,7 @@ def _assembled(
     residuals, r2 = (points.new_full(often.shape, torch.nan) for _ in range(2))
     residuals[often] = torch.where(found.good, missed.square().mean(0).sqrt(), torch.nan)
     r2[often] = found.r2
-    matches, distances = match_tracks(points, n, found.residual, options)
+    matches, distances = match_tracks(points, n, found.residual)
     return PairReconstruction(
         cameras=cameras,
         points=points,

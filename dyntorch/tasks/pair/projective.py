@@ -13,20 +13,14 @@ from dyntorch.geometry.body import BodyProblem, FilmedBody, fit_body
 from dyntorch.geometry.homogeneous import homogeneous, similarity, skew
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.numerics.least_squares import LeastSquaresOptions
-from dyntorch.tasks.pair.options import PairOptions
 from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
-from dyntorch.tasks.pair.tracks import Overlap
+from dyntorch.tasks.pair.tracks import MAX_ALONG_EXTENT, MAX_ALONG_RATIO, MAX_DISTANCE_RATIO, MAX_RESIDUAL_SIGMAS, Overlap
 from dyntorch.tasks.synchronize.projective import MAX_MISFIT, Poses, common_motion
 from dyntorch.tasks.synchronize.rigid_body import MAX_ITERATIONS, MIN_RELATIVE_NOISE, BodyMotion, body_motion
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 
-def body_pair(
-    seen: Overlap,
-    threshold: float | None,
-    explained: float,
-    options: PairOptions,
-) -> PairReconstruction:
+def body_pair(seen: Overlap, threshold: float | None, explained: float) -> PairReconstruction:
     r"""One body, two cameras, points of either's own:"""
     n, m = seen.a.shape[1], seen.b.shape[1]
     tracks = [_tracks(x, seen) for x in (seen.a, seen.b)]
@@ -45,7 +39,7 @@ def body_pair(
     body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-10))
     if not bool(cost.isfinite().all()):
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, math.inf), 4, n + m)
-    return _assembled(seen, body, first, second, threshold, explained, options)
+    return _assembled(seen, body, first, second, threshold, explained)
 
 
 def _tracks(x: Tensor, seen: Overlap) -> Tracks:
@@ -96,7 +90,6 @@ def _assembled(
     second: BodyMotion,
     threshold: float | None,
     explained: float,
-    options: PairOptions,
 ) -> PairReconstruction:
     n, m, frames = seen.a.shape[1], seen.b.shape[1], len(seen.times)
     kept = torch.cat([first.points, second.points])
@@ -116,11 +109,11 @@ def _assembled(
     residuals = torch.where(kept, residuals, torch.where(strangers.isfinite(), strangers, math.nan))
     # 1.1774: the median length of a two-dimensional error of unit variance
     sigma = float(apart[:, kept].nanmedian()) / 1.1774
-    limit = options.corresponding.sigmas * sigma if threshold is None else threshold
+    limit = MAX_RESIDUAL_SIGMAS * sigma if threshold is None else threshold
     counted = apart.isfinite()
     share = (counted & (apart <= max(limit, MIN_RELATIVE_NOISE * first.scale))).sum(0) / counted.sum(0).clamp(min=1)
     good = kept & (share >= explained)
-    matches, distances = _matched(both, good, n, float(apart[:, good].square().nanmean().sqrt()), options)
+    matches, distances = _matched(both, good, n, float(apart[:, good].square().nanmean().sqrt()))
     rotation, place = body.sights[0, 1].split([3, 1], -1)
     F = torch.linalg.inv(inner[1]).mT @ skew(place[:, 0]) @ rotation @ torch.linalg.inv(inner[0])
     return PairReconstruction(
@@ -140,7 +133,7 @@ def _assembled(
     )
 
 
-def _matched(both: Tensor, good: Tensor, n: int, residual: float, options: PairOptions) -> tuple[Tensor, Tensor]:
+def _matched(both: Tensor, good: Tensor, n: int, residual: float) -> tuple[Tensor, Tensor]:
     """The track of a that a track of b is ``(m,)``, -1 = none, and rms distances ``(n, m)`` of all pairs in a's pixels."""
     apart = torch.stack([(x[:, :n, None] - x[:, None, n:]).square().sum(-1).nanmean(0).sqrt() for x in both])
     pairs = good[:n, None] & good[None, n:]
@@ -149,11 +142,11 @@ def _matched(both: Tensor, good: Tensor, n: int, residual: float, options: PairO
     if not worst.numel():
         return torch.full((worst.shape[1],), -1, dtype=torch.long, device=good.device), distances
     extent = float((both[0] - both[0].nanmean(1, keepdim=True)).square().sum(-1).nanmean().sqrt())
-    limit = max(options.matching.same * residual, options.matching.same_of_extent * extent)
+    limit = max(MAX_ALONG_RATIO * residual, MAX_ALONG_EXTENT * extent)
     best, track = worst.min(0)
     mutual = worst.argmin(1)[track] == torch.arange(worst.shape[1], device=good.device)
     others = worst.clone()
     others[track, torch.arange(worst.shape[1], device=good.device)] = math.inf
     second = torch.minimum(others.amin(0), others[track].amin(1))
-    sure = mutual & (best <= limit) & (best <= options.matching.ambiguous * second)
+    sure = mutual & (best <= limit) & (best <= MAX_DISTANCE_RATIO * second)
     return torch.where(sure, track, -1), distances

@@ -9,9 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyntorch.tasks.pair.options import PairOptions
 from dyntorch.tasks.synchronize.result import Shift
 from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks
+
+MAX_RESIDUAL_SIGMAS = 2.6  # of a coordinate, up to which a position agrees where no threshold is given
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,9 @@ class Overlap:
     noise: tuple[float, float]  # pixels, of a coordinate of a and of b, as third differences show it
 
 
+OVERLAP_ROUNDING = 1e-6  # share of a frame by which a moment may be outside of the overlap
+
+
 def overlap(
     a: Tensor,
     b: Tensor,
@@ -31,7 +35,6 @@ def overlap(
     *,
     fps: float | Sequence[float] | None = None,
     times: Sequence[Any] | None = None,
-    options: PairOptions = PairOptions(),
 ) -> Overlap:
     """Both cameras at a's frame times. a ``(frames, n, 2)``, b ``(frames, m, 2)``."""
     rates, clocks = _clocks(shift, fps, times)
@@ -45,14 +48,12 @@ def overlap(
     start, end = second.times[0], second.times[-1]
     # rounding moves no frame out of the overlap
     inside = (
-        (wanted - wanted.clamp(start, end)).abs() <= options.resampling.rounding * second.step
-        if len(second.times) > 1
-        else wanted == start
+        (wanted - wanted.clamp(start, end)).abs() <= OVERLAP_ROUNDING * second.step if len(second.times) > 1 else wanted == start
     )
     wanted = wanted.clamp(start, end)
     return Overlap(
         _unfilled(first)[inside],
-        interpolated(_unfilled(second), second.times, wanted[inside], options),
+        interpolated(_unfilled(second), second.times, wanted[inside]),
         first.times[inside],
         (first.noise, second.noise),
     )
@@ -83,7 +84,12 @@ def _unfilled(tracks: Tracks) -> Tensor:
     return torch.where((tracks.weights > 0)[..., None], tracks.x, torch.nan)
 
 
-def interpolated(x: Tensor, times: Tensor, at: Tensor, options: PairOptions = PairOptions()) -> Tensor:
+# around a moment, as many as are seen: six lose less of fast motion than two, and smooth noise less
+INTERPOLATION_FRAMES = (6, 4, 2)
+MAX_GAP_FRAMES = 2.5  # between two frames that are interpolated
+
+
+def interpolated(x: Tensor, times: Tensor, at: Tensor) -> Tensor:
     r"""Positions at any moments by Lagrange's polynomial through the frames around each: six where all are seen, else four or
     two. x ``(frames, n, 2)``, times ``(frames,)``, at ``(m,)`` -> ``(m, n, 2)``."""
     frames = len(times)
@@ -92,12 +98,12 @@ def interpolated(x: Tensor, times: Tensor, at: Tensor, options: PairOptions = Pa
         return result
     after = torch.searchsorted(times, at.contiguous(), right=True).clamp(1, max(frames - 1, 1))
     step = times.diff().median() if frames > 1 else times.new_tensor(1.0)
-    for order in reversed(options.resampling.orders):
+    for order in reversed(INTERPOLATION_FRAMES):
         if frames < order:
             continue
         start = (after - order // 2).clamp(0, frames - order)
         index = start[:, None] + torch.arange(order, device=x.device)
-        found = _lagrange(x, times, at, index, options.resampling.gap * step)
+        found = _lagrange(x, times, at, index, MAX_GAP_FRAMES * step)
         result = torch.where(found.isnan(), result, found)
     return result
 
@@ -120,7 +126,14 @@ def _lagrange(x: Tensor, times: Tensor, at: Tensor, index: Tensor, gap: Tensor) 
 # Which track of one camera is which of the other, once both are transferred into one frame.
 
 
-def match_tracks(points: Tensor, n: int, residual: float, options: PairOptions = PairOptions()) -> tuple[Tensor, Tensor]:
+MAX_DISTANCE_RATIO = 0.5  # to the second nearest track
+MAX_ALONG_RATIO = 4.0  # of one point seen twice, along the coordinate that both cameras see, over the residual
+MAX_APART_RATIO = 12.0  # in all: transfer amplifies noise three to five times
+MAX_ALONG_EXTENT = 0.005  # over the extent of the points, where that is more: mean places are known less well
+MAX_APART_EXTENT = 0.03  # over the extent of the points, where that is more
+
+
+def match_tracks(points: Tensor, n: int, residual: float) -> tuple[Tensor, Tensor]:
     """Mutually nearest tracks that no other comes near to. points ``(frames, n + m, 3)`` -> ``(m,)``."""
     first, second = points[:, :n], points[:, n:]
     # track by track: all pairs of a long take at once do not fit into memory
@@ -140,8 +153,6 @@ def match_tracks(points: Tensor, n: int, residual: float, options: PairOptions =
     other = ranked.clone()
     other[track, torch.arange(len(track), device=points.device)] = torch.inf
     second_best = torch.minimum(other.amin(0), other[track].amin(1))
-    same = along.nan_to_num(nan=torch.inf).gather(0, track[None])[0] <= max(
-        options.matching.same * residual, options.matching.same_of_extent * extent
-    )
-    near = best <= max(options.matching.near * residual, options.matching.near_of_extent * extent)
-    return torch.where(mutual & same & near & (best <= options.matching.ambiguous * second_best), track, none), distances
+    same = along.nan_to_num(nan=torch.inf).gather(0, track[None])[0] <= max(MAX_ALONG_RATIO * residual, MAX_ALONG_EXTENT * extent)
+    near = best <= max(MAX_APART_RATIO * residual, MAX_APART_EXTENT * extent)
+    return torch.where(mutual & same & near & (best <= MAX_DISTANCE_RATIO * second_best), track, none), distances

@@ -13,13 +13,12 @@ from dyntorch.geometry.calibrated_cameras import CalibratedCameras
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.geometry.lift import moved, steady
 from dyntorch.geometry.triangulation import unit_projections
-from dyntorch.tasks.reconstruct.diagnosis import unknowns
+from dyntorch.tasks.reconstruct.diagnosis import NOISE_ROUNDING, unknowns
 from dyntorch.tasks.reconstruct.metric import WorldChanges, metric_frames
 from dyntorch.tasks.reconstruct.motions import Motion
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
-from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, distances, positions, velocities
+from dyntorch.tasks.reconstruct.scene import COST_TOLERANCE, LiftedState, Lifting, distances, positions, velocities
 
 
 @dataclass(frozen=True)
@@ -67,14 +66,11 @@ class Stage:
         return views * (6 + 3 * (self.motion.bodies - 1)) - self.freedom
 
 
+MAX_MISFIT = 5.0  # the same from which on the scene stays without calibration
+
+
 def calibrated(
-    plain: Reconstruction,
-    tracks: ViewTracks,
-    scene: LiftedState,
-    lifting: Lifting | None,
-    labels: Tensor,
-    calibration: Tensor,
-    options: ReconstructOptions,
+    plain: Reconstruction, tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, labels: Tensor, calibration: Tensor
 ) -> Reconstruction:
     """A reconstruction in the metric frame of its cameras, where there is one; elsewhere as it is, with the reason. labels
     ``(b, n)``, calibration ``(b, views, l + 1, l + 1)``."""
@@ -82,7 +78,7 @@ def calibrated(
     stage = Stage.of_bodies(motion, tracks.x, tracks.x.shape[1]) if lifting is None else Stage.of_lift(lifting)
     status = plain.status.reshape(-1)
     solved = ~failed(status)
-    found = metric_scene(tracks, scene, stage, labels, tracks.transforms @ calibration, solved, options)
+    found = metric_scene(tracks, scene, stage, labels, tracks.transforms @ calibration, solved)
     projections = found.cameras @ stage.lifts
     apart = distances(tracks, projections, found.structure)
     counted = apart.isfinite()
@@ -92,11 +88,11 @@ def calibrated(
     spare = number * motion.sensor - points_free - stage.unknowns(counted.any(-1).sum(-1))
     sigma = (total / spare.clamp(min=1)).sqrt()
     before = plain.sigma.reshape(-1)
-    floor = options.diagnosis.exact / tracks.scale()
+    floor = NOISE_ROUNDING / tracks.scale()
     worse = (sigma + floor) / (before + floor)
     more, note = noting(batch)
-    metric_notices(found, worse, stage, solved, note, options)
-    found = replace(found, found=found.found & (worse <= options.metric.refused))
+    metric_notices(found, worse, stage, solved, note)
+    found = replace(found, found=found.found & (worse <= MAX_MISFIT))
     known = found.found.to(sigma.dtype)[:, None, None, None]
     found = replace(found, rotations=found.rotations * known, translations=found.translations * known)
     status = torch.where(found.found & (found.several > 1) & (status == Status.OK), int(Status.AMBIGUOUS), status)
@@ -179,9 +175,10 @@ class MetricScene:
     """``(b, views, 3, s)``."""
 
 
-def metric_scene(
-    tracks: ViewTracks, scene: LiftedState, stage: Stage, labels: Tensor, K: Tensor, solved: Tensor, options: ReconstructOptions
-) -> MetricScene:
+MIN_WEAKNESS = 1e-5  # singular value over the largest below which a family of frames is metric
+
+
+def metric_scene(tracks: ViewTracks, scene: LiftedState, stage: Stage, labels: Tensor, K: Tensor, solved: Tensor) -> MetricScene:
     """The metric frame of solved problems, adjusted within cameras of the known calibrations. labels ``(b, n)``, K
     ``(b, views, l + 1, l + 1)``, solved ``(b,)``."""
     b, views = tracks.x.shape[:2]
@@ -203,18 +200,16 @@ def metric_scene(
     some, K, cameras, structure = tracks.subset(left), K[left], scene.cameras[left], scene.structure[left]
     seen = (some.weights > 0).any(-1)[..., None, None]
     bare = unit_projections(torch.linalg.solve_ex(K, cameras)[0]) * seen
-    frames = metric_frames(bare, structure, stage.lifts, stage.changes, stage.world, some.weights, options.metric)
+    frames = metric_frames(bare, structure, stage.lifts, stage.changes, stage.world, some.weights)
     known = CalibratedCameras(K, d)
     inverse = torch.linalg.inv_ex(frames.change)[0]
     inverse = _lengths(bare, inverse, frames.change, stage) if stage.motion.sensor == 3 else inverse
     cameras, structure = moved(inverse, cameras, structure, stage.lifts)
-    cameras, structure = _adjusted(some, cameras, structure, stage, labels[left], known, options)
+    cameras, structure = _adjusted(some, cameras, structure, stage, labels[left], known)
     cameras, structure = _framed(some, cameras, structure, stage, labels[left], known)
     cameras, turn, rest = _posed(some, cameras, structure, stage, known)
-    good = (
-        cameras.isfinite().flatten(1).all(-1) & structure.isfinite().flatten(1).all(-1) & (frames.weakness > options.metric.family)
-    )
-    doubt = frames.misfit / frames.weakness.clamp(min=options.metric.family)
+    good = cameras.isfinite().flatten(1).all(-1) & structure.isfinite().flatten(1).all(-1) & (frames.weakness > MIN_WEAKNESS)
+    doubt = frames.misfit / frames.weakness.clamp(min=MIN_WEAKNESS)
     at = left[good]
     result.cameras[at], result.structure[at], result.found[at] = cameras[good], structure[good], True
     result.rotations[at], result.translations[at] = turn[good], rest[good]
@@ -238,14 +233,11 @@ def _of_world(world: Tensor, lifts: Tensor) -> Tensor:
     return torch.linalg.pinv(lifts.flatten(0, 1)) @ (world[:, None] @ lifts).flatten(1, 2)
 
 
+METRIC_ITERATIONS = 60  # of bundle adjustment with calibrated cameras
+
+
 def _adjusted(
-    tracks: ViewTracks,
-    cameras: Tensor,
-    structure: Tensor,
-    stage: Stage,
-    labels: Tensor,
-    known: CalibratedCameras,
-    options: ReconstructOptions,
+    tracks: ViewTracks, cameras: Tensor, structure: Tensor, stage: Stage, labels: Tensor, known: CalibratedCameras
 ) -> tuple[Tensor, Tensor]:
     """Bundle adjustment with calibrated cameras, from the nearest ones."""
     confined, subspace = None, None
@@ -262,8 +254,8 @@ def _adjusted(
         known.nearest(cameras),
         structure,
         stage.lifts,
-        iterations=options.metric.adjustment_steps,
-        tolerance=options.scene.tolerance,
+        iterations=METRIC_ITERATIONS,
+        tolerance=COST_TOLERANCE,
         confined=confined,
         subspace=subspace,
         calibration=known.matrices,
@@ -362,16 +354,18 @@ def _posed(
     return unit_projections(known.nearest(cameras)) * seen, turn * seen, rest * seen
 
 
-def metric_notices(
-    found: MetricScene, worse: Tensor, stage: Stage, solved: Tensor, note: Note, options: ReconstructOptions
-) -> None:
+NOTED_METRIC_DOUBT = 0.5  # of the entries before adjustment: below, points are off by .1 to .4 % after it, above by up to 10 %
+NOTED_MISFIT = 1.5  # noise with calibrated cameras over that without, from which on the calibration is doubted
+
+
+def metric_notices(found: MetricScene, worse: Tensor, stage: Stage, solved: Tensor, note: Note) -> None:
     """Where no metric frame was found, where several were, and where the calibration does not fit. worse ``(b,)``, solved
     ``(b,)``."""
     case = "plane" if stage.motion.dim == 2 else "space"
-    family = solved & ~found.found & (found.weakness <= options.metric.family)
-    fits, poor = worse <= options.metric.refused, worse > options.metric.misfit
+    family = solved & ~found.found & (found.weakness <= MIN_WEAKNESS)
+    fits, poor = worse <= MAX_MISFIT, worse > NOTED_MISFIT
     note(ReconstructNotice.METRIC_FAMILY, found.weakness, family, case=case)
-    note(ReconstructNotice.METRIC_UNCERTAIN, found.doubt, found.found & fits & ~poor & (found.doubt > options.metric.uncertain))
+    note(ReconstructNotice.METRIC_UNCERTAIN, found.doubt, found.found & fits & ~poor & (found.doubt > NOTED_METRIC_DOUBT))
     note(ReconstructNotice.METRIC_SEVERAL, found.several, found.found & fits & (found.several > 1), case=case)
     note(ReconstructNotice.CALIBRATION, worse, found.found & fits & poor)
     note(ReconstructNotice.CALIBRATION, worse, found.found & ~fits, case="none")

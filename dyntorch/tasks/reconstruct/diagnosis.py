@@ -29,16 +29,7 @@ BLOCK = 1 << 17
 
 
 def point_uncertainty(
-    cameras: Tensor,
-    structure: Tensor,
-    lifts: Tensor,
-    depth: Tensor,
-    weights: Tensor,
-    gauge: int,
-    metric: Tensor,
-    step: int = 1,
-    *,
-    options: ReconstructOptions,
+    cameras: Tensor, structure: Tensor, lifts: Tensor, depth: Tensor, weights: Tensor, gauge: int, metric: Tensor, step: int = 1
 ) -> Tensor:
     r"""Standard deviation of each point per unit of noise, when cameras and points are both unknown."""
     b, views, n = weights.shape
@@ -49,7 +40,7 @@ def point_uncertainty(
     functional = depth.expand(b, n, -1)
 
     def run(given: _Given) -> Tensor:
-        return _uncertainty(given, gauge, step, options)
+        return _uncertainty(given, gauge, step)
 
     given = _Given(cameras, unit, functional, weights * known[:, None], lifts, metric)
     found = map_blocks(run, given, size=max(1, BLOCK // (n * wide + 1)))
@@ -68,7 +59,10 @@ class _Given(NamedTuple):
     metric: Tensor
 
 
-def _uncertainty(given: _Given, gauge: int, step: int, options: ReconstructOptions) -> Tensor:
+EIGENVALUE_ROUNDING = 1e-10  # over the largest: sound scenes of 60 points have 3e-6 to .1, the gauge up to 1e-11
+
+
+def _uncertainty(given: _Given, gauge: int, step: int) -> Tensor:
     cameras, structure, depth, weights, lifts, metric = given
     by_camera, by_point = _derivatives(cameras, structure, weights, lifts)
     information = torch.einsum("bvnlk,bvnlj->bnkj", by_point, by_point)
@@ -88,7 +82,7 @@ def _uncertainty(given: _Given, gauge: int, step: int, options: ReconstructOptio
     open_ = seen + gauge + (weights.shape[1] - seen) * cameras.shape[-2] * cameras.shape[-1]
     free = torch.arange(values.shape[-1], device=values.device) >= open_[:, None]
     rounding = torch.where(free, -torch.inf, values).amax(-1, keepdim=True)
-    told = values > torch.maximum(options.diagnosis.rounding * values[:, -1:], 100 * rounding)
+    told = values > torch.maximum(EIGENVALUE_ROUNDING * values[:, -1:], 100 * rounding)
     spread = vectors * torch.where(free & told, values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt(), 0.0)[:, None]
     factor, whitened, structure, depth = factor[:, ::step], whitened[:, ::step], structure[:, ::step], depth[:, ::step]
     inverse = torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)
@@ -160,6 +154,13 @@ SMALLER: dict[str, tuple[Smaller, ...]] = {
 point is one of the plane, :math:`x \\sim p + t q` with p and q of three coordinates."""
 
 
+NOTED_UNCERTAINTY = 0.1  # expected error of the points over the size of the scene from which smaller models are tried
+SMALLER_NOISE_RATIO = 1.25  # noise of a smaller model over that of the model, up to which it explains the tracks
+NOISE_ROUNDING = 1e-7  # noise over the extent of the images that counts as none
+MIN_STACK = 3e-3  # least singular value of the stacked projections: .015 to .8 in sound scenes, below .005 with a fixed camera
+MAX_NOISE_OVER_STACK = 0.3  # noise over that value: up to .1 in sound scenes, above .3 with a fixed camera
+
+
 def diagnose(
     tracks: ViewTracks,
     scene: LiftedState,
@@ -178,40 +179,35 @@ def diagnose(
     status = torch.where(failed(status) & (enough < motion.tensor(size).minimal()), int(Status.TOO_FEW), status)
     solved = ~failed(status)
     noise = sigma * tracks.scale()
-    stack, doubt = conditions(tracks, scene, lifting, noise, options)
+    stack, doubt = conditions(tracks, scene, lifting, noise)
     stack, doubt = torch.where(solved, stack, 0.0), torch.where(solved, doubt, torch.inf)
     cheap = motion.k <= 4 or motion.bodies > 1
-    suspect = (
-        (status == Status.DEGENERATE) | (solved & (doubt > options.diagnosis.uncertain)) | ((status == Status.AMBIGUOUS) & cheap)
-    )
+    suspect = (status == Status.DEGENERATE) | (solved & (doubt > NOTED_UNCERTAINTY)) | ((status == Status.AMBIGUOUS) & cheap)
     explained = torch.zeros_like(solved)
     for smaller in SMALLER.get(motion.name, ()):
         asked = (suspect | (smaller.motion.static & (status == Status.AMBIGUOUS))) & ~explained
-        left = _noise_of(tracks, smaller.motion, asked, options)
-        same = asked & (left <= options.diagnosis.explained * torch.where(solved, noise, 0.0) + options.diagnosis.exact)
+        left = _noise_of(tracks, smaller.motion, asked)
+        same = asked & (left <= SMALLER_NOISE_RATIO * torch.where(solved, noise, 0.0) + NOISE_ROUNDING)
         note(smaller.code, left / tracks.scale(), same, case=smaller.case, smaller=smaller.motion.name)
         explained = explained | same
-    judged = torch.where((explained | (doubt > options.diagnosis.unknown)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
-    astray = torch.zeros_like(solved) if lifting is None else wild(tracks, scene, lifting, options)
+    judged = torch.where((explained | (doubt > options.max_uncertainty)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
+    astray = torch.zeros_like(solved) if lifting is None else wild(tracks, scene, lifting)
     judged = torch.where(solved & ~explained & ((noise > NOISY) | astray), int(Status.NO_CONSENSUS), judged)
     status = torch.where((status == Status.OK) | (status == Status.AMBIGUOUS), judged, status)
-    note(ReconstructNotice.UNCERTAIN, doubt, solved & (doubt > options.diagnosis.uncertain) & doubt.isfinite())
+    note(ReconstructNotice.UNCERTAIN, doubt, solved & (doubt > NOTED_UNCERTAINTY) & doubt.isfinite())
     note(ReconstructNotice.UNCERTAIN, doubt, solved & doubt.isinf(), case="family")
-    note(
-        ReconstructNotice.WEAK_STACK,
-        stack,
-        solved & ((stack < options.diagnosis.weak_stack) | (noise > options.diagnosis.noisy_stack * stack)),
-    )
+    note(ReconstructNotice.WEAK_STACK, stack, solved & ((stack < MIN_STACK) | (noise > MAX_NOISE_OVER_STACK * stack)))
     _observations(tracks, motion, status, note)
-    _images(tracks, scene, lifting, noise, solved, note, options)
+    _images(tracks, scene, lifting, noise, solved, note)
     if lifting is None:
-        status = _bodies(scene, status, noise, solved, note, options)
+        status = _bodies(scene, status, noise, solved, note)
     return status, in_order(found)
 
 
-def conditions(
-    tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor, options: ReconstructOptions
-) -> tuple[Tensor, Tensor]:
+NUM_SAMPLED_POINTS = 20  # whose median uncertainty is taken
+
+
+def conditions(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor) -> tuple[Tensor, Tensor]:
     """Least singular value of the stacked projections over the largest, in coordinates in which the points fill the space, and
     the median expected error of the points over the size of the scene, ``(b,)`` each."""
     unit = torch.nn.functional.normalize(scene.structure.nan_to_num(), dim=-1)
@@ -237,8 +233,8 @@ def conditions(
         lifts = torch.linalg.solve_triangular(axes[:, None], lifting.lifts @ spread[:, None], upper=False)
         depth, metric = (below @ spread)[:, None], spread
         gauge, extent = len(lifting.algebra) - 1, _extent(scene.structure.nan_to_num(), below, known)
-    step = -(-known.shape[-1] // options.diagnosis.asked)
-    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge, metric, step, options=options)
+    step = -(-known.shape[-1] // NUM_SAMPLED_POINTS)
+    found = point_uncertainty(cameras, points, lifts, depth, tracks.weights, gauge, metric, step)
     middle = torch.where(known[:, ::step], found, torch.nan).nanmedian(-1).values
     return stack, (middle * noise / extent).nan_to_num(nan=torch.inf, posinf=torch.inf)
 
@@ -251,17 +247,15 @@ def _extent(structure: Tensor, depth: Tensor, known: Tensor) -> Tensor:
     return off.nanmedian(-1).values.nan_to_num().clamp(min=torch.finfo(off.dtype).tiny)
 
 
-def least_squares(tracks: ViewTracks, motion: Motion, options: ReconstructOptions) -> tuple[Tensor, Tensor]:
+def least_squares(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, Tensor]:
     """Reprojection distances ``(b, views, n)`` of a model fitted to all observations, in the unit of the tracks, and its status."""
     size = min(motion.views(tracks.times), motion.k + 1)
-    found = projections_of_tracks(tracks, motion.tensor(size), options=options)
+    found = projections_of_tracks(tracks, motion.tensor(size))
     if motion.lift is None:
-        scene = bodies_of(tracks, LiftedState(found.projections, found.structure, torch.zeros_like(tracks.x[:, 0, 0, 0])), options)[
-            -1
-        ]
+        scene = bodies_of(tracks, LiftedState(found.projections, found.structure, torch.zeros_like(tracks.x[:, 0, 0, 0])))[-1]
         return distances(tracks, scene.cameras, scene.structure), found.status
-    lifting = Lifting.of(motion, tracks.times, tracks.x, options)
-    scene = scene_of(tracks, found, lifting, options=options)
+    lifting = Lifting.of(motion, tracks.times, tracks.x)
+    scene = scene_of(tracks, found, lifting)
     return distances(tracks, scene.cameras @ lifting.lifts, scene.structure), found.status
 
 
@@ -282,7 +276,7 @@ def unknowns(tracks: ViewTracks, motion: Motion) -> Tensor:
     return free if tracks.static is None or motion.lift is None else torch.where(tracks.static, motion.dim, free)
 
 
-def _noise_of(tracks: ViewTracks, motion: Motion, asked: Tensor, options: ReconstructOptions) -> Tensor:
+def _noise_of(tracks: ViewTracks, motion: Motion, asked: Tensor) -> Tensor:
     """Noise ``(b,)`` in normalized images that another model leaves; infinite where it was not asked for, or has no result."""
     left = torch.full_like(tracks.x[:, 0, 0, 0], torch.inf)
     chosen = asked.nonzero()[:, 0]
@@ -291,7 +285,7 @@ def _noise_of(tracks: ViewTracks, motion: Motion, asked: Tensor, options: Recons
     if not len(chosen) or need > views or n < motion.tensor(min(need, motion.k + 1)).minimal():
         return left
     some = tracks.subset(chosen)
-    apart, status = least_squares(some, motion, options)
+    apart, status = least_squares(some, motion)
     counted = apart.isfinite()
     mean = (apart.square().nansum((1, 2)) / spare(some, counted, motion).clamp(min=1)).sqrt() * some.scale()
     # a model that loses points explains nothing
@@ -318,35 +312,30 @@ def _through(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, int]:
     return ((tracks.weights > 0).sum(1) >= size).sum(-1), size
 
 
-def _images(
-    tracks: ViewTracks,
-    scene: LiftedState,
-    lifting: Lifting | None,
-    noise: Tensor,
-    solved: Tensor,
-    note: Note,
-    options: ReconstructOptions,
-) -> None:
+MIN_LINE_SIGMAS = 3.0  # standard deviations across a line of images below which they may lie on it
+
+
+def _images(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, noise: Tensor, solved: Tensor, note: Note) -> None:
     """Notices on images on a line, and on points behind the cameras."""
     seen = (tracks.weights > 0).to(tracks.x.dtype)
     number = seen.sum(-1).clamp(min=1)[..., None]
     off = (tracks.x - (seen[..., None] * tracks.x).sum(2, keepdim=True) / number[..., None]) * seen[..., None]
     across = eigenvalues(off.mT @ off / number[..., None])[..., -2].clamp(min=0).sqrt()
     across = torch.where(seen.sum(-1) > 2, across, torch.inf).amin(1)
-    thin = across / noise.nan_to_num(posinf=0.0).clamp(min=options.diagnosis.exact)
-    note(ReconstructNotice.COLLINEAR, thin, thin < options.diagnosis.thin)
+    thin = across / noise.nan_to_num(posinf=0.0).clamp(min=NOISE_ROUNDING)
+    note(ReconstructNotice.COLLINEAR, thin, thin < MIN_LINE_SIGMAS)
     if lifting is None or tracks.x.shape[-1] != 2:
         return
     count = behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights).sum(-1)
     note(ReconstructNotice.BEHIND, count, solved & (count > 0))
 
 
-def _bodies(scene: LiftedState, status: Tensor, noise: Tensor, solved: Tensor, note: Note, options: ReconstructOptions) -> Tensor:
+def _bodies(scene: LiftedState, status: Tensor, noise: Tensor, solved: Tensor, note: Note) -> Tensor:
     """The status where a body has too few points for its hyperplane, and a notice."""
     known = (scene.structure != 0).any(-1) & solved[:, None]
     pair = hyperplane_pair(scene.structure, known.to(scene.structure.dtype))
     least, size = torch.stack([(pair.labels == body).sum(-1) for body in (1, 2)]).amin(0), scene.structure.shape[-1]
     # a hyperplane of noisy points takes the nearest one of the others in
-    few = solved & (least < size - 1 + (noise > options.diagnosis.exact))
+    few = solved & (least < size - 1 + (noise > NOISE_ROUNDING))
     note(ReconstructNotice.ONE_BODY, least, few, case="few", needed=size - 1)
     return torch.where(few & (status == Status.OK), int(Status.AMBIGUOUS), status)

@@ -20,7 +20,6 @@ from torch import Tensor
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
 from dyntorch.numerics.nullspace import eigenvalues
-from dyntorch.tasks.reconstruct.options import MetricOptions
 
 SAME = 1e-9
 """Relative singular value below which a condition on changes of the world, made of lifts alone, is none."""
@@ -137,8 +136,14 @@ class _Calibrating(NormalEquations):
         return torch.where(cost.isfinite(), cost, torch.inf), (by @ flat[..., None])[..., 0], matrix + size * orbit @ orbit.mT
 
 
+DESCENT_ITERATIONS = 40  # of each descent
+MAX_COST_RATIO = 4.0  # over the least, up to which a frame fits as well
+COST_ROUNDING = 1e-16  # cost that is rounding
+MAX_EXTRA_BEHIND = 0.02  # share of points behind cameras beyond the least
+
+
 def metric_frames(
-    cameras: Tensor, structure: Tensor, lifts: Tensor, changes: WorldChanges, world: Tensor, weights: Tensor, options: MetricOptions
+    cameras: Tensor, structure: Tensor, lifts: Tensor, changes: WorldChanges, world: Tensor, weights: Tensor
 ) -> MetricFrames:
     """The change of frame after which cameras, divided by their calibrations, are rotations and translations. cameras
     ``(b, views, m, a + 1)``, structure ``(b, n, K)``, lifts ``(views, a + 1, K)``, world ``(K,)``, weights
@@ -146,21 +151,21 @@ def metric_frames(
     b, d = len(cameras), changes.dim
     share = (cameras != 0).flatten(2).any(-1).to(cameras.dtype)
     derivatives = torch.einsum("bvma,vpad->bvpmd", cameras, changes.worlds[..., :d])
-    starts = _starts(derivatives, share, cameras @ lifts, changes, d, options)
+    starts = _starts(derivatives, share, cameras @ lifts, changes, d)
     count = starts.shape[1]
     whole = _Calibrating(derivatives, share, changes.orbits)
     wide = whole.subset(torch.arange(b, device=cameras.device).repeat_interleave(count))
-    found = minimize(wide, wide.evaluate((starts.flatten(0, 1),)), LeastSquaresOptions(iterations=options.steps))
+    found = minimize(wide, wide.evaluate((starts.flatten(0, 1),)), LeastSquaresOptions(iterations=DESCENT_ITERATIONS))
     theta, cost = found.theta[0].view(b, count, -1), found.cost.view(b, count)
     change = torch.einsum("bsp,pij->bsij", theta, changes.algebra)
     wrong = _behind(cameras, structure, lifts, change, derivatives, theta, world, weights)
     least = cost.amin(-1, keepdim=True)
-    fits = cost <= options.as_good * least + options.exact
+    fits = cost <= MAX_COST_RATIO * least + COST_ROUNDING
     fewest = torch.where(fits, wrong, torch.inf).amin(-1, keepdim=True)
-    fits = fits & (wrong <= fewest + options.as_visible)
+    fits = fits & (wrong <= fewest + MAX_EXTRA_BEHIND)
     best = torch.where(fits, cost, torch.inf).argmin(-1)
     row = torch.arange(b, device=cameras.device)
-    several = _different(theta, changes, d, fits, best, options)
+    several = _different(theta, changes, d, fits, best)
     # what is open by itself, and the derivative of the conditions across it
     value, slope = whole.linear(theta[row, best])
     slope = slope.permute(0, 2, 1, 3).flatten(2)
@@ -179,7 +184,10 @@ def metric_frames(
     )
 
 
-def _different(theta: Tensor, changes: WorldChanges, d: int, fits: Tensor, best: Tensor, options: MetricOptions) -> Tensor:
+MIN_METRIC_DISTANCE = 0.03  # relative, points of unit variance, from which on two metrics are different
+
+
+def _different(theta: Tensor, changes: WorldChanges, d: int, fits: Tensor, best: Tensor) -> Tensor:
     """How many of the starts that fit lead to different metrics, ``(b,)``."""
     turned = torch.einsum("bsp,vpad->bsvad", theta, changes.worlds[..., :d])
     metric = (turned @ turned.mT).flatten(2)
@@ -190,7 +198,7 @@ def _different(theta: Tensor, changes: WorldChanges, d: int, fits: Tensor, best:
     while bool(left.any()):
         some = left.any(-1)
         number = number + some
-        near = (metric - metric[row, chosen][:, None]).norm(dim=-1) < options.other
+        near = (metric - metric[row, chosen][:, None]).norm(dim=-1) < MIN_METRIC_DISTANCE
         left = left & ~near & some[:, None]
         left[row, chosen] = False
         chosen = left.to(torch.int8).argmax(-1)
@@ -237,26 +245,28 @@ def _behind(
 # Where the descent starts: the quadric, linear in the cameras, and frames in which one camera already is calibrated.
 
 
-def _starts(
-    derivatives: Tensor, share: Tensor, projections: Tensor, changes: WorldChanges, d: int, options: MetricOptions
-) -> Tensor:
+def _starts(derivatives: Tensor, share: Tensor, projections: Tensor, changes: WorldChanges, d: int) -> Tensor:
     """Coordinates ``(b, s, dim)`` of the changes to start from."""
     seen = share.argmax(-1)
     first = derivatives[torch.arange(len(seen), device=seen.device), seen][..., :3, :]
-    targets = _targets(d, options).to(first)
-    found = [_calibrated_first(first, changes, targets, options)]
+    targets = _targets(d).to(first)
+    found = [_calibrated_first(first, changes, targets)]
     if d == 3 and derivatives.shape[-2] == 3 and changes.directions is not None:
-        found.append(_by_quadric(projections, share, changes, options))
+        found.append(_by_quadric(projections, share, changes))
     starts = torch.cat(found, dim=1)
     return torch.where(starts.isfinite(), starts, 1.0)
 
 
-def _targets(d: int, options: MetricOptions) -> Tensor:
+PLANE_TILTS = (0.6, 1.15)  # radians between the normal of a plane and the first camera's axis, next to 0
+NUM_AZIMUTHS = 6  # normals around the axis at each of these
+
+
+def _targets(d: int) -> Tensor:
     """First columns ``(s, 3, d)`` of rotations: of a plane with normals over the half sphere, of space the identity."""
     if d == 3:
         return torch.eye(3, dtype=torch.float64)[None]
     tilts = [(0.0, 0.0)]
-    tilts += [(tilt, 2 * torch.pi * k / options.around) for tilt in options.tilts for k in range(options.around)]
+    tilts += [(tilt, 2 * torch.pi * k / NUM_AZIMUTHS) for tilt in PLANE_TILTS for k in range(NUM_AZIMUTHS)]
     angle, around = torch.tensor(tilts, dtype=torch.float64).unbind(-1)
     normal = torch.stack([angle.sin() * around.cos(), angle.sin() * around.sin(), angle.cos()], dim=-1)
     # any two directions across the normal
@@ -264,29 +274,38 @@ def _targets(d: int, options: MetricOptions) -> Tensor:
     return across[..., 1:3]
 
 
-def _calibrated_first(first: Tensor, changes: WorldChanges, targets: Tensor, options: MetricOptions) -> Tensor:
+NUM_INFINITY_DRAWS = 7  # planes at infinity around that of the given frame
+DRAW_SPREAD = 0.5  # of these draws, over the change of frame
+ALTERNATIONS = 20  # between a factor of the quadric and the changes that the motion allows
+START_RIDGE = 1e-3  # weight with which a start stays where the frame is
+
+
+def _calibrated_first(first: Tensor, changes: WorldChanges, targets: Tensor) -> Tensor:
     """The changes ``(b, s, dim)`` next to the identity that make a camera ``(b, dim, 3, d)`` that of each target, up to a turn."""
     same = _still(changes)
     now = torch.einsum("bpmd,p->bmd", first, same)
     length = (now.square().sum((-2, -1)) / now.shape[-1]).sqrt()[:, None, None, None]
     rows = first.flatten(2).mT
-    ridge = options.ridge * rows.square().sum((-2, -1)) / rows.shape[-1]
+    ridge = START_RIDGE * rows.square().sum((-2, -1)) / rows.shape[-1]
     normal = rows.mT @ rows + ridge[:, None, None] * torch.eye(len(same), dtype=first.dtype, device=first.device)
     target = targets[None]
     turned = target @ _polar(target.mT @ now[:, None])
-    for _ in range(options.turns):
+    for _ in range(ALTERNATIONS):
         right = torch.einsum("bpr,bsr->bsp", rows.mT, (length * turned).flatten(2)) + ridge[:, None, None] * same
         theta = torch.linalg.solve_ex(normal[:, None], right[..., None])[0][..., 0]
         turned = target @ _polar(target.mT @ torch.einsum("bpmd,bsp->bsmd", first, theta))
     if target.shape[-1] == 2:
         return theta
     # of space the plane at infinity is open: some further ones
-    draw = torch.randn(options.draws, len(same), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(first)
-    around = theta + options.spread * theta.norm(dim=-1, keepdim=True) / len(same) ** 0.5 * draw
+    draw = torch.randn(NUM_INFINITY_DRAWS, len(same), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(first)
+    around = theta + DRAW_SPREAD * theta.norm(dim=-1, keepdim=True) / len(same) ** 0.5 * draw
     return torch.cat([theta, around], dim=1)
 
 
-def _by_quadric(projections: Tensor, share: Tensor, changes: WorldChanges, options: MetricOptions) -> Tensor:
+NUM_MIXTURES = 8  # of the two best quadrics: two views leave two
+
+
+def _by_quadric(projections: Tensor, share: Tensor, changes: WorldChanges) -> Tensor:
     r"""Changes ``(b, s, dim)`` from the quadrics Q that solve :math:`M_i Q M_i^T \sim I`, least squares, and their mixtures."""
     assert changes.directions is not None
     columns = changes.directions
@@ -304,7 +323,7 @@ def _by_quadric(projections: Tensor, share: Tensor, changes: WorldChanges, optio
     rows = (torch.cat([images[:, :, i, j], even], dim=2) / scale).flatten(1, 2)
     rows = torch.cat([rows, rows.new_zeros(len(rows), max(0, rows.shape[-1] - rows.shape[-2]), rows.shape[-1])], dim=1)
     null = torch.linalg.svd(rows, full_matrices=False).Vh[:, -2:].flip(1)
-    angle = torch.arange(options.mixtures, dtype=null.dtype, device=null.device) * (torch.pi / options.mixtures)
+    angle = torch.arange(NUM_MIXTURES, dtype=null.dtype, device=null.device) * (torch.pi / NUM_MIXTURES)
     mixed = angle.cos()[:, None] * null[:, None, 0] + angle.sin()[:, None] * null[:, None, 1]
     quadric = torch.einsum("bsr,rkj->bskj", mixed, basis)
     quadric = quadric * nonzero_sign(quadric.diagonal(dim1=-2, dim2=-1).sum(-1))[..., None, None]
@@ -314,7 +333,7 @@ def _by_quadric(projections: Tensor, share: Tensor, changes: WorldChanges, optio
     flat = columns.flatten(1).mT
     back = torch.linalg.pinv(flat)
     turned = factor
-    for _ in range(options.turns):
+    for _ in range(ALTERNATIONS):
         theta = torch.einsum("pr,bsr->bsp", back, turned.flatten(2))
         nearest = torch.einsum("rp,bsp->bsr", flat, theta).unflatten(-1, columns.shape[1:])
         turned = factor @ _polar(factor.mT @ nearest)

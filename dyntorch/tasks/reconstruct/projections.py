@@ -16,7 +16,6 @@ from dyntorch.core.refine import constrain_matches
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
 
 
 @dataclass(frozen=True)
@@ -86,14 +85,18 @@ def camera_unknowns(views: int, rows: int, columns: int, gauge: int | None = Non
     return views * (rows * columns - 1) - (columns**2 - 1 if gauge is None else gauge)
 
 
-def choices(tracks: ViewTracks, size: int, options: ReconstructOptions) -> Tensor:
+NUM_VIEW_SUBSETS = 6  # choices of views that a tensor is fitted to; the one of least error in all views wins
+NUM_SCORED_SUBSETS = 60  # choices of views that are scored by what they see and how far they spread
+
+
+def choices(tracks: ViewTracks, size: int) -> Tensor:
     """Indices ``(b, s, size)`` of views for the tensor: seen by many points in common, spread over the time."""
     views = tracks.weights.shape[1]
     device = tracks.x.device
-    if comb(views, size) <= options.projections.looked_at:
+    if comb(views, size) <= NUM_SCORED_SUBSETS:
         choices = torch.tensor(list(combinations(range(views), size)), device=device)
     else:
-        draw = torch.rand(options.projections.looked_at, views, generator=torch.Generator().manual_seed(0))
+        draw = torch.rand(NUM_SCORED_SUBSETS, views, generator=torch.Generator().manual_seed(0))
         choices = draw.argsort(-1)[:, :size].sort(-1).values.to(device)
         even = torch.linspace(0, views - 1, size).round().long().to(device)
         choices = torch.cat([even[None], choices]).unique(dim=0)
@@ -102,19 +105,17 @@ def choices(tracks: ViewTracks, size: int, options: ReconstructOptions) -> Tenso
     ordered = (tracks.times.to(device)[choices].sort(-1).values / span).to(tracks.x)
     gap = ordered.diff(dim=-1).amin(-1) * (size - 1)
     score = seen * gap.clamp(min=1e-6).sqrt()
-    best = score.topk(min(options.projections.subsets, len(choices)), dim=-1).indices
+    best = score.topk(min(NUM_VIEW_SUBSETS, len(choices)), dim=-1).indices
     return choices[best]
 
 
-def projections_of_tracks(
-    tracks: ViewTracks, invariant: GrassmannTensor, subsets: Tensor | None = None, *, options: ReconstructOptions
-) -> Projections:
+def projections_of_tracks(tracks: ViewTracks, invariant: GrassmannTensor, subsets: Tensor | None = None) -> Projections:
     """Linear, constrained, resected, adjusted: the best of several choices of views. subsets ``(b, s, size)``."""
     size = len(invariant.profile)
-    subsets = choices(tracks, size, options) if subsets is None else subsets
+    subsets = choices(tracks, size) if subsets is None else subsets
     b, count, _ = subsets.shape
     many = tracks.repeated(count)
-    found = _from_subset(many, invariant, subsets.flatten(0, 1), options)
+    found = _from_subset(many, invariant, subsets.flatten(0, 1))
     if count == 1:
         return found
     error = mean_error(many, found).nan_to_num(nan=torch.inf)
@@ -133,7 +134,12 @@ def mean_error(tracks: ViewTracks, found: Projections) -> Tensor:
     return (torch.where(known, error, 0.0) + missed).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
 
 
-def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor, options: ReconstructOptions) -> Projections:
+CONSTRAINED_ITERATIONS = 3  # enough to start the structured adjustment: 18 of 20 scenes of constant_velocity_3d, as with 30
+FREE_ITERATIONS = 3  # of free bundle adjustment
+FREE_TOLERANCE = 1e-2  # relative gain of a step that ends it
+
+
+def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor) -> Projections:
     """From one choice of views ``(b, size)`` each."""
     b, views, n, dim = tracks.x.shape
     x = tracks.x.gather(1, chosen[..., None, None].expand(-1, -1, n, dim))
@@ -141,31 +147,24 @@ def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor,
     parts = x.unbind(1)
     data = Matches(tuple(parts), seen.all(1).to(x.dtype), None, (b,), x.dtype, x.device)
     linear = fit_matches(invariant, data)
-    some = torch.stack(constrain_matches(linear, data, options.projections.constrained_steps).motion, dim=1)  # (b, size, l + 1, K)
+    some = torch.stack(constrain_matches(linear, data, CONSTRAINED_ITERATIONS).motion, dim=1)  # (b, size, l + 1, K)
     status = linear.status
     structure = triangulate(some, x, seen.to(x.dtype))
     if views > len(invariant.profile):
         whole = resect(structure, tracks.x, tracks.weights)
         whole = whole.scatter(1, chosen[..., None, None].expand(-1, -1, *some.shape[2:]), some)
-        whole, structure = _grown(tracks, whole, options)
+        whole, structure = _grown(tracks, whole)
         lost = _unknown(tracks, whole).any(-1)
         status = torch.where(lost & (status == Status.OK), int(Status.DEGENERATE), status)
     else:
         order = chosen.argsort(1)
         whole = some.gather(1, order[..., None, None].expand_as(some))
-    adjusted = bundle_adjust(
-        tracks.x,
-        tracks.weights,
-        whole,
-        structure,
-        iterations=options.projections.free_steps,
-        tolerance=options.projections.free_tolerance,
-    )
+    adjusted = bundle_adjust(tracks.x, tracks.weights, whole, structure, iterations=FREE_ITERATIONS, tolerance=FREE_TOLERANCE)
     bad = failed(status)[:, None, None]
     return Projections(torch.where(bad[..., None], 0.0, adjusted.cameras), torch.where(bad, 0.0, adjusted.structure), status)
 
 
-def _grown(tracks: ViewTracks, whole: Tensor, options: ReconstructOptions) -> tuple[Tensor, Tensor]:
+def _grown(tracks: ViewTracks, whole: Tensor) -> tuple[Tensor, Tensor]:
     """All views and points from some of them, in turns: tracks shorter than the recording lead from views to their neighbours.
     whole ``(b, views, l + 1, K)``."""
     structure = triangulate(whole, tracks.x, _seen(tracks, whole))
@@ -175,14 +174,7 @@ def _grown(tracks: ViewTracks, whole: Tensor, options: ReconstructOptions) -> tu
         some, before = tracks.subset(left), missing[left]
         # drift is adjusted away before it is built upon
         seen = _seen(some, whole[left])
-        done = bundle_adjust(
-            some.x,
-            seen,
-            whole[left],
-            structure[left],
-            iterations=options.projections.free_steps,
-            tolerance=options.projections.free_tolerance,
-        )
+        done = bundle_adjust(some.x, seen, whole[left], structure[left], iterations=FREE_ITERATIONS, tolerance=FREE_TOLERANCE)
         more = torch.where(before[..., None, None], resect(done.structure, some.x, some.weights), done.cameras)
         whole = whole.index_copy(0, left, more)
         structure = structure.index_copy(0, left, triangulate(more, some.x, _seen(some, more)))

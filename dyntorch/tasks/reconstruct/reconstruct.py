@@ -35,7 +35,7 @@ def reconstruct(
     weights: Tensor | None = None,
     calibration: Tensor | None = None,
     generator: torch.Generator | None = None,
-    options: ReconstructOptions = ReconstructOptions(),
+    options: ReconstructOptions | None = None,
 ) -> Reconstruction:
     r"""Cameras, points and velocities from tracks of moving points, seen by moving, uncalibrated cameras.
 
@@ -80,7 +80,7 @@ def reconstruct(
             direction, or within parallel planes, need cameras that move, a static plane three of them.  See ``metric``,
             ``rotations``, ``translations`` and ``ambiguity`` of the result.
         generator: source of the random samples of the robust estimate.
-        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
+        options: :class:`~dyntorch.tasks.reconstruct.options.ReconstructOptions`; None = the defaults.
 
     Returns:
         A :class:`~dyntorch.tasks.reconstruct.result.Reconstruction`: ``cameras (*batch, views, 3, d + 1)``,
@@ -106,12 +106,13 @@ def reconstruct(
         (True, True)
     """
     model = None if motion == "auto" else as_motion(motion)
+    options = ReconstructOptions() if options is None else options
     check_options(options, ReconstructOptions)
     if generator is not None and not isinstance(generator, torch.Generator):
         raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(...)")
     moment, x, w, batch = _checked(tracks, times, weights)
     if model is None or _moves(model):
-        _resolved(moment, times, tracks.dtype, options)
+        _resolved(moment, times, tracks.dtype)
     label = _static(static, batch, x)
     K = None if calibration is None else calibrations(calibration, batch, x.shape[1], x, x.shape[-1])
     limit = _limit(threshold)
@@ -162,7 +163,12 @@ def _times(times: Tensor | Sequence[float] | None, views: int, n: int) -> Tensor
     return moment.double()
 
 
-def _resolved(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: torch.dtype, options: ReconstructOptions) -> None:
+MAX_TIME_ROUNDING = 1e-3  # rounding of the times over the spacing of the views
+MAX_FRAME_ROUNDING = 1 / 16  # rounding below which whole numbers are exact frames
+MAX_TIME_DISTANCE = (1e4, 1e9)  # over the span of the times, for float32 and float64: beyond, the points at time 0 are noise
+
+
+def _resolved(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: torch.dtype) -> None:
     """Refuse times that were rounded before they came here, and those so far from 0 that the points at time 0 would be noise."""
     if not len(moment):
         return
@@ -171,14 +177,14 @@ def _resolved(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: tor
     if kind.is_floating_point and kind != torch.float64:
         rounding = torch.finfo(kind).eps / 2 * furthest
         spacing = float(different.diff().median()) if len(different) > 1 else 1.0
-        frames = bool((moment == moment.round()).all()) and rounding < options.times.frame
-        if rounding > options.times.rounded * spacing and not frames:
+        frames = bool((moment == moment.round()).all()) and rounding < MAX_FRAME_ROUNDING
+        if rounding > MAX_TIME_ROUNDING * spacing and not frames:
             raise ValueError(
                 f"times of {kind} near {furthest:g} are rounded by up to {rounding:.2g}, for views {spacing:.2g} apart; "
                 "give them as float64 (.double() before anything is added), or count them from the first view"
             )
     span = float(different[-1] - different[0])
-    far = options.times.far[dtype == torch.float64]
+    far = MAX_TIME_DISTANCE[dtype == torch.float64]
     if span and furthest > far * span:
         raise ValueError(
             f"times reach {furthest:g}, {furthest / span:.2g} times what they span: in {dtype} the points at time 0 would be noise "

@@ -82,15 +82,9 @@ class ReconstructNotice(NoticeCode):
         },
     )
     """Points seen in too few views."""
-    COLLINEAR = (
-        "collinear",
-        "the images of a view lie on a line, to {value:.2g} standard deviations; points off it are needed",
-    )
+    COLLINEAR = ("collinear", "the images of a view lie on a line, to {value:.2g} standard deviations; points off it are needed")
     """All images of a view lie on one line."""
-    BEHIND = (
-        "behind",
-        "{value:# point|# points} behind a camera or at infinity; noise, or tracks that do not follow the motion",
-    )
+    BEHIND = ("behind", "{value:# point|# points} behind a camera or at infinity; noise, or tracks that do not follow the motion")
     """Points behind cameras, or at infinity, in every frame."""
     UNUSED_VIEW = (
         "unused_view",

@@ -32,9 +32,12 @@ PAIRS = 1 << 14
 """Points that are looked at together with one view left out."""
 
 
-def distance(tracks: ViewTracks, projections: Tensor, options: ReconstructOptions) -> Tensor:
+TRIANGULATION_ITERATIONS = 2  # of a distance
+
+
+def distance(tracks: ViewTracks, projections: Tensor) -> Tensor:
     """Squared reprojection error of every point over its views, ``(b, n)``, measured units; :data:`FAR` where there is none."""
-    structure = triangulate(projections, tracks.x, tracks.weights, steps=options.noise.triangulation_steps)
+    structure = triangulate(projections, tracks.x, tracks.weights, steps=TRIANGULATION_ITERATIONS)
     error = (tracks.x - reproject(projections, structure)).square().sum(-1) / tracks.scales.square()[..., None]
     total = torch.where(tracks.weights > 0, error, 0.0).sum(1)
     return torch.where((structure != 0).any(-1), total, FAR).nan_to_num(nan=FAR, posinf=FAR).clamp(max=FAR)
@@ -67,36 +70,42 @@ def noise(square: Tensor, free: Tensor, chosen: Tensor, part: float = 0.5) -> Te
     return torch.where(number[:, 0] > 0, found, 0.0).sqrt()
 
 
-def settled_noise(
-    tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5, *, options: ReconstructOptions
-) -> Tensor:
+INLIER_QUANTILE = 0.997  # share of the inliers that agree: three standard deviations of one coordinate
+NOISE_CUTOFF = 1.5  # distance over the threshold up to which it counts when the noise is estimated
+NOISE_ITERATIONS = 4  # of that estimate
+MAX_VARIANCE_CORRECTION = 2.0  # for the degrees of freedom of the projections
+MIN_NOISE = 1e-8  # over the extent of the image
+
+
+def settled_noise(tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5) -> Tensor:
     """Noise ``(b,)`` of one coordinate from a quantile of the chosen points, then the median of those within its threshold."""
-    least = options.noise.least / tracks.scales.amin(1)
+    least = MIN_NOISE / tracks.scales.amin(1)
     level = torch.maximum(noise(square, free, chosen, part), least)
-    for _ in range(options.noise.rounds):
-        inside = chosen & (square <= (options.noise.wide * level).square()[:, None] * bound(free, options.noise.share))
+    for _ in range(NOISE_ITERATIONS):
+        inside = chosen & (square <= (NOISE_CUTOFF * level).square()[:, None] * bound(free, INLIER_QUANTILE))
         rows = (free * inside).sum(-1)
         small = rows / (rows - used).clamp(min=1)
-        level = torch.maximum(noise(square, free, inside) * small.clamp(min=1, max=options.noise.correction).sqrt(), least)
+        level = torch.maximum(noise(square, free, inside) * small.clamp(min=1, max=MAX_VARIANCE_CORRECTION).sqrt(), least)
     return level
 
 
-def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor, options: ReconstructOptions) -> Tensor:
+MIN_SPARE_EQUATIONS = 2  # that must remain to confirm a point that has lost a view
+
+
+def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor) -> Tensor:
     r"""Weights ``(b, views, n)``, 0 for all observations that do not agree with the projections."""
     k, size = projections.shape[-1] - 1, tracks.x.shape[-1]
     free = freedom(tracks, k)
-    agrees = (distance(tracks, projections, options) <= sigma.square()[:, None] * bound(free, options.noise.share)) & (free >= 1)
+    agrees = (distance(tracks, projections) <= sigma.square()[:, None] * bound(free, INLIER_QUANTILE)) & (free >= 1)
     kept = tracks.weights * agrees[:, None]
-    rest = (~agrees & (free - size >= options.noise.spare)).nonzero()
+    rest = (~agrees & (free - size >= MIN_SPARE_EQUATIONS)).nonzero()
     for some in rest.split(PAIRS):
         problem, point = some.unbind(-1)
-        kept[problem, :, point] = _without(tracks, projections, sigma, problem, point, options)
+        kept[problem, :, point] = _without(tracks, projections, sigma, problem, point)
     return kept
 
 
-def _without(
-    tracks: ViewTracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor, options: ReconstructOptions
-) -> Tensor:
+def _without(tracks: ViewTracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor) -> Tensor:
     """Weights ``(p, views)`` of single points, without the views that spoil them; all 0 where no views agree."""
     alone = ViewTracks(
         tracks.x[problem, :, point][:, :, None],
@@ -113,13 +122,13 @@ def _without(
     while len(left):
         seen = alone.weights[:, :, 0] > 0
         fewer = alone.repeated(views).only((alone.weights[:, None] * others[:, :, None]).flatten(0, 1))
-        square = distance(fewer, matrices.repeat_interleave(views, dim=0), options).unflatten(0, (-1, views))[..., 0]
+        square = distance(fewer, matrices.repeat_interleave(views, dim=0)).unflatten(0, (-1, views))[..., 0]
         least, worst = square.masked_fill(~seen, torch.inf).min(-1)
         alone = alone.only(alone.weights * others[worst][:, :, None])
         free = freedom(alone, k)[:, 0]
-        agrees = least <= limit * bound(free, options.noise.share)
+        agrees = least <= limit * bound(free, INLIER_QUANTILE)
         result[left[agrees]] = alone.weights[agrees][..., 0]
-        on = (~agrees & (free - size >= options.noise.spare)).nonzero()[:, 0]
+        on = (~agrees & (free - size >= MIN_SPARE_EQUATIONS)).nonzero()[:, 0]
         left, alone, matrices, limit = left[on], alone.subset(on), matrices[on], limit[on]
     return result
 
@@ -147,6 +156,14 @@ class Consensus:
         return put(self, at[wins], each(lambda x: x[wins], new))
 
 
+# parts of the points that the starts keep: the smaller the fewer outliers, the larger the better the fit
+START_SHARES = (0.5, 0.6, 0.7, 0.8)
+CONFIRMING_ROUNDS = 3  # without improvement, after which a solution of few conditions is taken
+IMPROVEMENT_RATIO = 0.97  # cost over the least so far below which a solution is better
+MIN_HOPELESS_ROUNDS = 4  # rounds before a search may end as hopeless
+HOPELESS_NOISE = 0.3  # over the extent of the images: shuffled tracks leave .45 to .7, scenes of 50 % outliers .17
+
+
 def consensus(
     tracks: ViewTracks,
     invariant: GrassmannTensor,
@@ -155,29 +172,36 @@ def consensus(
     options: ReconstructOptions,
 ) -> tuple[Consensus, Tensor, Tensor]:
     r"""Projections of the tensor's views on whose points the most agree. sigma ``(b,)`` -> ``(b,)``."""
-    subsets = choices(tracks, len(invariant.profile), options)
+    subsets = choices(tracks, len(invariant.profile))
     search = _Search(invariant, sigma, generator, options=options)
     everyone = torch.arange(len(tracks.x), device=tracks.x.device)
     first = torch.ones_like(tracks.weights[:, :1])
     stale = torch.zeros_like(everyone)
-    best, ranks = search.run(tracks, subsets[:, 0], first, (options.starts.shares[0],), sigma)
-    for turn in range(1, options.starts.rounds):
+    best, ranks = search.run(tracks, subsets[:, 0], first, (START_SHARES[0],), sigma)
+    for turn in range(1, options.max_search_rounds):
         level, doubt = search.judged(tracks, best)
-        hopeless = (best.square < FAR).any(-1) & (level * tracks.scales.amax(1) > options.starts.hopeless)
+        hopeless = (best.square < FAR).any(-1) & (level * tracks.scales.amax(1) > HOPELESS_NOISE)
         left = everyone[
-            (doubt | (search.weak(tracks, best) & (stale < options.starts.confirmed)))
-            & ~(hopeless & (turn >= options.starts.tried))
+            (doubt | (search.weak(tracks, best) & (stale < CONFIRMING_ROUNDS))) & ~(hopeless & (turn >= MIN_HOPELESS_ROUNDS))
         ]
         if not len(left):
             break
         views = subsets[left, turn % subsets.shape[1]]
         some = tracks.subset(left)
         starts = search.starts(some, views, best.square[left], ranks[left])
-        new, rank = search.run(some, views, starts, options.starts.shares, None if sigma is None else sigma[left])
-        stale[left] = torch.where(new.lost < options.starts.better * best.lost[left], 0, stale[left] + 1)
+        new, rank = search.run(some, views, starts, START_SHARES, None if sigma is None else sigma[left])
+        stale[left] = torch.where(new.lost < IMPROVEMENT_RATIO * best.lost[left], 0, stale[left] + 1)
         best = best.better(new, left)
         ranks[left] += rank
     return best, *search.judged(tracks, best)
+
+
+DRAWN_SHARE = 0.5  # of that part, that a start is drawn of
+MIN_KEPT_RATIO = 1.3  # points kept over the minimal number
+MIN_DRAWN_RATIO = 1.15  # points drawn over the minimal number
+CONCENTRATION_STEPS = 3  # fits per start, each to the points nearest to the one before
+START_ITERATIONS = 10  # of bundle adjustment per fit: without it half of the outliers stay
+SUFFICIENT_REDUNDANCY = 4.0  # conditions over degrees of freedom from which on a solution of known noise needs no confirmation
 
 
 @dataclass(frozen=True)
@@ -196,13 +220,11 @@ class _Search:
         level = None if sigma is None else sigma.repeat_interleave(count)
         share = torch.tensor(shares, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
         kept, best = starts.flatten(0, 1), None
-        for _ in range(self.options.starts.concentrations):
+        for _ in range(CONCENTRATION_STEPS):
             new = self._fitted(work, chosen, kept, level)
             best = new if best is None else best.better(new, torch.arange(len(kept), device=kept.device))
-            near = _nearest(new.square, _wanted(work, share, self.invariant.minimal(), self.options.starts.least_kept))
-            cut = self._level(work, new.square, level).square() * bound(
-                freedom(work, self.invariant.k), self.options.noise.share
-            ).amax(-1)
+            near = _nearest(new.square, _wanted(work, share, self.invariant.minimal(), MIN_KEPT_RATIO))
+            cut = self._level(work, new.square, level).square() * bound(freedom(work, self.invariant.k), INLIER_QUANTILE).amax(-1)
             kept = (near | (new.square <= cut[:, None])).to(kept.dtype)
         assert best is not None
         rank = best.square.argsort(-1).argsort(-1).to(kept.dtype).unflatten(0, (-1, count)).mean(1)
@@ -211,14 +233,14 @@ class _Search:
 
     def starts(self, tracks: ViewTracks, views: Tensor, square: Tensor, ranks: Tensor) -> Tensor:
         """Random parts ``(b, s, n)`` of the points near the best projections so far, or in the mean of all."""
-        count, minimal = len(self.options.starts.shares), self.invariant.minimal()
+        count, minimal = len(START_SHARES), self.invariant.minimal()
         work = _of_views(tracks, views).repeated(count)
-        share = torch.tensor(self.options.starts.shares, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
-        wanted = _wanted(work, share, minimal, self.options.starts.least_kept)
-        drawn = _wanted(work, self.options.starts.drawn * share, minimal, self.options.starts.least_drawn)
+        share = torch.tensor(START_SHARES, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
+        wanted = _wanted(work, share, minimal, MIN_KEPT_RATIO)
+        drawn = _wanted(work, DRAWN_SHARE * share, minimal, MIN_DRAWN_RATIO)
         order = torch.stack([square, ranks], dim=1).repeat(1, -(-count // 2), 1)[:, :count].flatten(0, 1)
         seen = (work.weights > 0).all(1)
-        pool = _nearest(order.masked_fill(~seen, torch.inf), torch.maximum(wanted, (self.options.starts.least_kept * drawn).long()))
+        pool = _nearest(order.masked_fill(~seen, torch.inf), torch.maximum(wanted, (MIN_KEPT_RATIO * drawn).long()))
         number = uniform(*order.shape, generator=self.generator, device=order.device)
         chosen = _nearest(number.masked_fill(~(pool & seen), torch.inf), drawn).to(square.dtype)
         return chosen.view(-1, count, chosen.shape[-1])
@@ -232,7 +254,7 @@ class _Search:
     def weak(self, tracks: ViewTracks, found: Consensus) -> Tensor:
         """Where only the search for better ones tells whether projections ``(b,)`` are right."""
         seen = (_of_views(tracks, found.chosen).weights > 0).all(1).sum(-1)
-        few = seen * self.invariant.codim < self.options.starts.sure * self.invariant.dof
+        few = seen * self.invariant.codim < SUFFICIENT_REDUNDANCY * self.invariant.dof
         return few | torch.full_like(few, self.sigma is None)
 
     def _fitted(self, tracks: ViewTracks, views: Tensor, kept: Tensor, sigma: Tensor | None) -> Consensus:
@@ -243,16 +265,14 @@ class _Search:
         linear = fit_matches(self.invariant, data)
         projections = torch.stack(constrain_matches(linear, data).motion, dim=1)
         structure = triangulate(projections, some.x, some.weights)
-        projections = bundle_adjust(
-            some.x, some.weights, projections, structure, iterations=self.options.starts.adjustment_steps
-        ).cameras
+        projections = bundle_adjust(some.x, some.weights, projections, structure, iterations=START_ITERATIONS).cameras
         whole = (tracks.weights > 0).all(1)
-        square = torch.where(whole, distance(tracks, projections, self.options), FAR)
+        square = torch.where(whole, distance(tracks, projections), FAR)
         free = freedom(tracks, self.invariant.k)
         if sigma is None:
             lost = noise(square, free, whole, _part(whole, self.invariant))
         else:
-            cut = sigma.square()[:, None] * bound(free, self.options.noise.share).clamp(min=torch.finfo(square.dtype).tiny)
+            cut = sigma.square()[:, None] * bound(free, INLIER_QUANTILE).clamp(min=torch.finfo(square.dtype).tiny)
             lost = torch.where(whole, (square / cut).clamp(max=1), 0.0).sum(-1) / whole.sum(-1).clamp(min=1)
         return Consensus(views, projections, square, lost)
 
@@ -262,20 +282,22 @@ class _Search:
             return sigma
         free = freedom(tracks, self.invariant.k)
         chosen = (tracks.weights > 0).all(1)
-        return settled_noise(tracks, square, free, chosen, self.invariant.dof, _part(chosen, self.invariant), options=self.options)
+        return settled_noise(tracks, square, free, chosen, self.invariant.dof, _part(chosen, self.invariant))
+
+
+MAX_NEAR_SHARE = 0.15  # points one to three thresholds away, per inlier: a wrong model has many
+MIN_REDUNDANCY = 1.25  # conditions of the inliers over the degrees of freedom of the projections
 
 
 def doubtful(tracks: ViewTracks, square: Tensor, sigma: Tensor, invariant: GrassmannTensor, options: ReconstructOptions) -> Tensor:
     """Whether projections ``(b,)`` may be wrong: few inliers, many points just outside, or noise as large as the scene."""
     free = freedom(tracks, invariant.k)
-    cut = sigma.square()[:, None] * bound(free, options.noise.share)
+    cut = sigma.square()[:, None] * bound(free, INLIER_QUANTILE)
     counted = (free >= 1) & (tracks.weights > 0).any(1)
     inside = (counted & (square <= cut)).sum(-1)
     near = (counted & (square > cut) & (square <= 9 * cut)).sum(-1)
-    few = (inside < options.starts.majority * counted.sum(-1)) | (
-        inside * invariant.codim < options.starts.redundant * invariant.dof
-    )
-    return few | (near > options.starts.doubt * inside) | (sigma * tracks.scales.amax(1) > NOISY)
+    few = (inside < options.min_inlier_share * counted.sum(-1)) | (inside * invariant.codim < MIN_REDUNDANCY * invariant.dof)
+    return few | (near > MAX_NEAR_SHARE * inside) | (sigma * tracks.scales.amax(1) > NOISY)
 
 
 def _part(chosen: Tensor, invariant: GrassmannTensor) -> float:
@@ -302,56 +324,65 @@ def _nearest(value: Tensor, count: Tensor) -> Tensor:
     return value.argsort(-1).argsort(-1) < count[:, None]
 
 
-def suspicious(
-    tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None, options: ReconstructOptions
-) -> Tensor:
+FALSE_ALARM_RATE = 0.05  # of problems without outliers, where few conditions are left for every unknown of the cameras
+RARE_FALSE_ALARM_RATE = 1e-4  # the same where there are plenty: a false alarm costs fifty times the time
+AMPLE_CONDITIONS = 6.0  # per unknown of the projections: from there on one outlier cannot hide
+LOUD_NOISE = 0.01  # over the extent of the images: least squares spreads wrong tracks over all
+
+
+def suspicious(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> Tensor:
     """Which problems ``(b,)`` show outliers after least squares."""
-    square, free, sigma = _misfit(tracks, apart, unknowns, limit, options)
+    square, free, sigma = _misfit(tracks, apart, unknowns, limit)
     if not len(apart):
         return apart.new_zeros(0, dtype=torch.bool)
     size = int(torch.as_tensor(unknowns).max()) + 1
     used = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, size)
-    plenty = size <= 5 and int(free.sum(-1).min()) >= options.outliers.plenty * used
-    share = (options.outliers.rare_alarms if plenty else options.outliers.alarms) / max(1, apart.shape[-1])
-    loud = sigma * tracks.scales.amax(1) > options.outliers.loud
+    plenty = size <= 5 and int(free.sum(-1).min()) >= AMPLE_CONDITIONS * used
+    share = (RARE_FALSE_ALARM_RATE if plenty else FALSE_ALARM_RATE) / max(1, apart.shape[-1])
+    loud = sigma * tracks.scales.amax(1) > LOUD_NOISE
     return loud | (square > sigma.square()[:, None] * bound(free, 1 - share)).logical_and(free >= 1).any(-1)
 
 
-def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor, options: ReconstructOptions) -> Tensor:
+STATIC_CUTOFF = 2.0  # over the threshold of the others, above which points given as static move
+
+
+def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor) -> Tensor:
     """The points ``(b, n)`` said to stand still that fit by far the worst: they move."""
     assert tracks.static is not None
-    square, free, sigma = _misfit(tracks, apart, unknowns, None, options)
+    square, free, sigma = _misfit(tracks, apart, unknowns, None)
     excess = torch.where(
         tracks.static,
-        square / (sigma.square()[:, None] * bound(free, options.noise.share)).clamp(min=torch.finfo(sigma.dtype).tiny),
+        square / (sigma.square()[:, None] * bound(free, INLIER_QUANTILE)).clamp(min=torch.finfo(sigma.dtype).tiny),
         0.0,
     )
-    return (excess > options.outliers.wrong**2) & (excess >= excess.amax(-1, keepdim=True) / 2)
+    return (excess > STATIC_CUTOFF**2) & (excess >= excess.amax(-1, keepdim=True) / 2)
+
+
+NUM_TRIMS = 2  # times that observations are taken from the least squares scene
+MIN_TRIMMED_SHARE = 0.9  # of the observations that has to stay then
 
 
 def trimmed(
-    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, unknowns: Tensor, limit: float | None, options: ReconstructOptions
+    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, unknowns: Tensor, limit: float | None
 ) -> tuple[LiftedState, ViewTracks, Tensor]:
     """The least squares scene after the few observations that disagree with it are taken away, the tracks without them, and
     whether ``(b,)`` that is all there was to do: one wrong track in many does not need a search."""
     fewer = tracks
-    for _ in range(options.outliers.trims):
+    for _ in range(NUM_TRIMS):
         projections = scene.cameras @ lifting.lifts
-        _, _, sigma = _misfit(fewer, distances(fewer, projections, scene.structure), unknowns, limit, options)
-        fewer = tracks.only(agreeing(tracks, projections, sigma, options))
+        _, _, sigma = _misfit(fewer, distances(fewer, projections, scene.structure), unknowns, limit)
+        fewer = tracks.only(agreeing(tracks, projections, sigma))
         structure = triangulate(projections, fewer.x, fewer.weights, steps=2)
-        scene = adjusted(fewer, LiftedState(scene.cameras, structure, scene.cost), lifting, options=options)
+        scene = adjusted(fewer, LiftedState(scene.cameras, structure, scene.cost), lifting)
     apart = distances(fewer, scene.cameras @ lifting.lifts, scene.structure)
-    return scene, fewer, ~suspicious(fewer, apart, unknowns, limit, options) & (_kept(fewer, tracks) >= options.outliers.least_left)
+    return scene, fewer, ~suspicious(fewer, apart, unknowns, limit) & (_kept(fewer, tracks) >= MIN_TRIMMED_SHARE)
 
 
-def _misfit(
-    tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None, options: ReconstructOptions
-) -> tuple[Tensor, Tensor, Tensor]:
+def _misfit(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> tuple[Tensor, Tensor, Tensor]:
     """Squared distance of every point, its conditions ``(b, n)``, and the noise ``(b,)``, a third of the limit or by the median."""
     square = apart.square().nansum(1)
     free = (apart.isfinite().sum(1) * tracks.x.shape[-1] - unknowns).clamp(min=0)
-    least = options.noise.least / tracks.scales.amin(1)
+    least = MIN_NOISE / tracks.scales.amin(1)
     sigma = noise(square, free, free >= 1) if limit is None else torch.full_like(least, limit / 3)
     return square, free, torch.maximum(sigma, least)
 
@@ -359,6 +390,11 @@ def _misfit(
 def _kept(fewer: ViewTracks, tracks: ViewTracks) -> Tensor:
     """Share ``(b,)`` of the observations that are left."""
     return (fewer.weights > 0).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
+
+
+SUFFICIENT_INLIER_SHARE = 0.7  # of the observations, with coordinates to spare: no more is asked
+AMPLE_COORDINATES = 4  # of a point beyond its unknowns: most observations do not agree by accident
+SELECTION_CUTOFFS = (6.0, 3.0, 1.5, 1.0, 1.0)  # over the final threshold, while all views converge
 
 
 def robust_projections(
@@ -372,33 +408,34 @@ def robust_projections(
     """Projections from the tracks that agree, and the tracks with weight 0 for all other observations."""
     given = None if limit is None else torch.full_like(tracks.scales[:, 0], limit / 3)
     best, sigma, _ = consensus(tracks, invariant, given, generator, options)
-    cameras = _extended(tracks, best, sigma, options)
-    cameras = _settled(tracks, cameras, None, sigma, options.outliers.widths, options)
-    sigma = _level(tracks, cameras, sigma, given, options)
+    cameras = _extended(tracks, best, sigma)
+    cameras = _settled(tracks, cameras, None, sigma, SELECTION_CUTOFFS)
+    sigma = _level(tracks, cameras, sigma, given)
     if lifting is not None:
-        cameras = _structured(tracks, cameras, lifting, sigma, given, options)
-        sigma = _level(tracks, cameras, sigma, given, options)
-    fewer = tracks.only(agreeing(tracks, cameras, sigma, options))
-    ample = tracks.x.shape[1] * tracks.x.shape[-1] >= cameras.shape[-1] + options.outliers.tolerant
-    doubt = doubtful(tracks, distance(tracks, cameras, options), sigma, invariant, options) & ~(
-        (_kept(fewer, tracks) >= options.outliers.trusted) & ample
+        cameras = _structured(tracks, cameras, lifting, sigma, given)
+        sigma = _level(tracks, cameras, sigma, given)
+    fewer = tracks.only(agreeing(tracks, cameras, sigma))
+    ample = tracks.x.shape[1] * tracks.x.shape[-1] >= cameras.shape[-1] + AMPLE_COORDINATES
+    doubt = doubtful(tracks, distance(tracks, cameras), sigma, invariant, options) & ~(
+        (_kept(fewer, tracks) >= SUFFICIENT_INLIER_SHARE) & ample
     )
     status = torch.where(doubt, int(Status.NO_CONSENSUS), int(Status.OK))
     return Projections(cameras, triangulate(cameras, fewer.x, fewer.weights, steps=2), status), fewer
 
 
-def _level(tracks: ViewTracks, cameras: Tensor, sigma: Tensor, given: Tensor | None, options: ReconstructOptions) -> Tensor:
+def _level(tracks: ViewTracks, cameras: Tensor, sigma: Tensor, given: Tensor | None) -> Tensor:
     """The noise ``(b,)``: as given, or that of the points that agree."""
     if given is not None:
         return given
-    fewer = tracks.only(agreeing(tracks, cameras, sigma, options))
+    fewer = tracks.only(agreeing(tracks, cameras, sigma))
     free = freedom(fewer, cameras.shape[-1] - 1)
-    return settled_noise(
-        tracks, distance(fewer, cameras, options), free, free >= 1, camera_unknowns(*cameras.shape[1:]), options=options
-    )
+    return settled_noise(tracks, distance(fewer, cameras), free, free >= 1, camera_unknowns(*cameras.shape[1:]))
 
 
-def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor, options: ReconstructOptions) -> Tensor:
+RESECTION_ITERATIONS = 10  # reweightings of the views that the tensor does not use
+
+
+def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor) -> Tensor:
     """Projections of all views: the others by resection from the points that agree, reweighted."""
     b, size = found.chosen.shape
     if size == tracks.x.shape[1]:
@@ -407,11 +444,11 @@ def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor, options: Reco
     some = (tracks.x[rows, found.chosen], tracks.weights[rows, found.chosen])
     structure = triangulate(found.projections, *some, steps=2)
     free = torch.full_like(found.square, size * tracks.x.shape[-1] - structure.shape[-1] + 1).long()
-    known = found.square <= sigma.square()[:, None] * bound(free, options.noise.share)
+    known = found.square <= sigma.square()[:, None] * bound(free, INLIER_QUANTILE)
     structure = torch.where(known[..., None], structure, 0.0)
     counted = (tracks.weights > 0) & known[:, None]
     weights, scale = tracks.weights, None
-    for _ in range(options.outliers.resections):
+    for _ in range(RESECTION_ITERATIONS):
         whole = resect(structure, tracks.x, weights)
         square = (tracks.x - reproject(whole, structure)).square().sum(-1) / tracks.scales.square()[..., None]
         middle = square.masked_fill(~counted, torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0)
@@ -421,26 +458,25 @@ def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor, options: Reco
     return whole.index_put((rows, found.chosen), found.projections)
 
 
-def _settled(
-    tracks: ViewTracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...], options: ReconstructOptions
-) -> Tensor:
+SELECTION_ITERATIONS = 10  # of bundle adjustment after each selection
+
+
+def _settled(tracks: ViewTracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...]) -> Tensor:
     """Projections adjusted to the observations that agree, which are chosen again after each time."""
     for width in widths:
         projections = cameras if lifts is None else cameras @ lifts
-        weights = agreeing(tracks, projections, width * sigma, options)
+        weights = agreeing(tracks, projections, width * sigma)
         structure = triangulate(projections, tracks.x, weights, steps=2)
-        cameras = bundle_adjust(tracks.x, weights, cameras, structure, lifts, iterations=options.outliers.adjustment_steps).cameras
+        cameras = bundle_adjust(tracks.x, weights, cameras, structure, lifts, iterations=SELECTION_ITERATIONS).cameras
     return cameras if lifts is None else cameras @ lifts
 
 
-def _structured(
-    tracks: ViewTracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None, options: ReconstructOptions
-) -> Tensor:
+def _structured(tracks: ViewTracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None) -> Tensor:
     """Projections that the lifts allow, where as many observations agree with them."""
-    weights = agreeing(tracks, cameras, sigma, options)
+    weights = agreeing(tracks, cameras, sigma)
     fewer = tracks.only(weights)
     found = Projections(cameras, triangulate(cameras, fewer.x, weights, steps=2), torch.zeros_like(sigma).long())
-    scene = scene_of(fewer, found, lifting, options=options)
-    better = _settled(tracks, scene.cameras, lifting.lifts, sigma, (1.0, 1.0), options)
-    more = (agreeing(tracks, better, sigma, options) > 0).sum((1, 2)) >= 0.98 * (weights > 0).sum((1, 2))
+    scene = scene_of(fewer, found, lifting)
+    better = _settled(tracks, scene.cameras, lifting.lifts, sigma, (1.0, 1.0))
+    more = (agreeing(tracks, better, sigma) > 0).sum((1, 2)) >= 0.98 * (weights > 0).sum((1, 2))
     return torch.where(more[:, None, None, None], better, cameras)

@@ -13,36 +13,44 @@ from dyntorch.geometry.lift import balanced, balanced_algebra, behind, centred, 
 from dyntorch.geometry.pairs import hyperplane_pair, two_bodies
 from dyntorch.geometry.triangulation import reproject, resect, triangulate, unit_projections
 from dyntorch.tasks.reconstruct.motions import Motion
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices, projections_of_tracks
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts of structured bundle adjustment that need no tensor: the scene as if it stood still, in several frames.
 
 
-def middle(times: Tensor, number: int = 0, *, options: ReconstructOptions) -> Tensor:
+WINDOW_VIEWS = (6, 5)  # views taken at once, in turn, where there are more
+
+
+def middle(times: Tensor, number: int = 0) -> Tensor:
     """Indices of the views in the middle of the time, during which nothing moves far; all, where they are few."""
-    count = len(times) if len(times) <= options.scene.windows[0] else options.scene.windows[number % len(options.scene.windows)]
+    count = len(times) if len(times) <= WINDOW_VIEWS[0] else WINDOW_VIEWS[number % len(WINDOW_VIEWS)]
     first = (len(times) - count) // 2
     return times.argsort()[first : first + count].sort().values
 
 
-def resting_constants(lifts: Tensor, options: ReconstructOptions) -> Tensor:
+STATIC_TOLERANCE = 1e-8  # share of the lifts below which constants of a point do not change its position
+
+
+def resting_constants(lifts: Tensor) -> Tensor:
     """Orthonormal ``(K, a + 1)`` constants of the points that do not move; of no columns where not all positions are theirs."""
     change = (lifts - lifts.mean(0)).flatten(0, 1)
     _, values, vh = torch.linalg.svd(change, full_matrices=True)
-    still = vh[int((values > options.scene.rest * lifts.norm()).sum()) :].mT
+    still = vh[int((values > STATIC_TOLERANCE * lifts.norm()).sum()) :].mT
     return still if still.shape[-1] >= lifts.shape[-2] else still[:, :0]
 
 
-def resting(tracks: ViewTracks, sensor: int, dim: int, options: ReconstructOptions) -> Tensor:
+STATIC_TENSOR_VIEWS = 4  # views of the tensor of the static scene in space
+
+
+def resting(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
     """The cameras ``(b, views, l + 1, dim + 1)`` that explain tracks best if no point moves, points finite and of unit
     variance."""
     eye = torch.eye(dim + 1, dtype=tracks.x.dtype, device=tracks.x.device)
     views = tracks.x.shape[1]
     still = Motion(lambda time: torch.eye(dim + 1, dtype=torch.float64), sensor=sensor, static=True)
-    invariant = still.tensor(min(views, options.scene.rest_views if dim + 1 > sensor + 1 else 2))
-    found = projections_of_tracks(tracks, invariant, choices(tracks, len(invariant.profile), options)[:, :1], options=options)
+    invariant = still.tensor(min(views, STATIC_TENSOR_VIEWS if dim + 1 > sensor + 1 else 2))
+    found = projections_of_tracks(tracks, invariant, choices(tracks, len(invariant.profile))[:, :1])
     lifts = eye.expand(views, -1, -1)
     known = (found.structure != 0).any(-1).to(tracks.x.dtype)
     G, cameras, structure = finite(found.projections, found.structure, lifts, gauge_algebra(lifts), tracks.weights)
@@ -51,15 +59,16 @@ def resting(tracks: ViewTracks, sensor: int, dim: int, options: ReconstructOptio
     return cameras
 
 
-def tilted(cameras: Tensor, number: int, options: ReconstructOptions) -> Tensor:
+INFINITY_TILT = 0.25  # standard deviation of the hyperplane at infinity of further starts, points of unit variance
+
+
+def tilted(cameras: Tensor, number: int) -> Tensor:
     """Cameras of the resting scene in one of many frames: the first as nearly affine as it can be, the others with the infinite
     tilted."""
     size = cameras.shape[-1]
     frame = torch.eye(size, dtype=torch.float64)
     if number:
-        frame[-1, :-1] = options.scene.tilt * torch.randn(
-            size - 1, generator=torch.Generator().manual_seed(number), dtype=torch.float64
-        )
+        frame[-1, :-1] = INFINITY_TILT * torch.randn(size - 1, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
     return cameras @ frame.to(cameras)
 
 
@@ -92,7 +101,7 @@ class Lifting:
     """``(K, a + 1)`` orthonormal: the constants of points that stand still; of no columns where none can."""
 
     @classmethod
-    def of(cls, motion: Motion, times: Tensor, like: Tensor, options: ReconstructOptions) -> Lifting:
+    def of(cls, motion: Motion, times: Tensor, like: Tensor) -> Lifting:
         """The motion at these times, on the device of ``like``."""
         span = float(times.max() - times.min()) / max(1, len(times) - 1)
         even, shift, origin = motion.centred(times)
@@ -102,7 +111,7 @@ class Lifting:
         middle = motion.lifts([float(times.mean()) - origin])[0] @ inverse
         # a shift is inverted exactly by the opposite one, however far
         back = (torch.eye(len(root), dtype=root.dtype) if motion.shift is None else motion.shift(-origin)) @ inverse
-        parts = (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts), resting_constants(lifts, options))
+        parts = (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts), resting_constants(lifts))
         return cls(motion, *(part.to(like) for part in parts))
 
 
@@ -118,9 +127,11 @@ class LiftedState:
     """``(b,)``."""
 
 
-def scene_of(
-    tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Tensor | None = None, *, options: ReconstructOptions
-) -> LiftedState:
+MULTISTART_SIZE = 7  # K from which on one start is not enough: in P^6 one of the tensor misses the minimum in 5 of 20 scenes
+MULTISTART_SPARE = 6  # spare coordinates per point beyond which it is enough there as well
+
+
+def scene_of(tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
     """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
     scale ``(b,)``."""
     lost = failed(found.status)
@@ -128,24 +139,27 @@ def scene_of(
     coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
     size = lifting.lifts.shape[-1]
     known = torch.where(lost[:, None], coordinates >= size - 1, (found.structure != 0).any(-1))
-    scene = _scene(tracks, _upgraded(found, lost, lifting), known & ~lost[:, None], lifting, scale, options)
+    scene = _scene(tracks, _upgraded(found, lost, lifting), known & ~lost[:, None], lifting, scale)
     scene = LiftedState(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
     spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
-    shaky = ~lost & (size >= options.scene.several) & (spare <= options.scene.spare * known.sum(-1))
-    shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting, options))
+    shaky = ~lost & (size >= MULTISTART_SIZE) & (spare <= MULTISTART_SPARE * known.sum(-1))
+    shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting))
     unknown = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, lifting.lifts.shape[1], len(lifting.algebra) - 1)
     unaided = (found.status == Status.TOO_FEW) & (spare > unknown)
     left = (shaky | unaided | aided).nonzero()[:, 0] if lifting.still.shape[-1] else lost.new_zeros(0, dtype=torch.long)
-    return _confirmed(tracks, scene, left, known, lifting, scale, options) if len(left) else scene
+    return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
 
 
-def wild(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, options: ReconstructOptions) -> Tensor:
+MAX_BEHIND_SHARE = 0.05  # of the points: wrong minima have a tenth to a half of them behind cameras
+
+
+def wild(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> Tensor:
     """Problems ``(b,)`` with so many points behind cameras that the scene, in a finite frame, is that of a wrong minimum."""
     if tracks.x.shape[-1] != 2:
         return torch.zeros_like(scene.cost, dtype=torch.bool)
     known = (scene.structure != 0).any(-1)
     count = (behind(scene.cameras, scene.structure, lifting.lifts, tracks.weights) & known).sum(-1)
-    return count > (options.scene.behind * known.sum(-1)).clamp(min=2)
+    return count > (MAX_BEHIND_SHARE * known.sum(-1)).clamp(min=2)
 
 
 def _aided(tracks: ViewTracks, lifting: Lifting) -> Tensor:
@@ -161,44 +175,40 @@ def _upgraded(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
     return upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
 
 
-def _scene(
-    tracks: ViewTracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None, options: ReconstructOptions
-) -> LiftedState:
+def _scene(tracks: ViewTracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> LiftedState:
     """The scene that adjustment finds from some cameras, with the known points ``(b, n)``."""
     structure = triangulate(cameras @ lifting.lifts, tracks.x, tracks.weights)
     start = LiftedState(cameras, torch.where(known[..., None], structure, 0.0), torch.zeros_like(tracks.x[:, 0, 0, 0]))
-    done = adjusted(tracks, start, lifting, scale, options=options)
+    done = adjusted(tracks, start, lifting, scale)
     # a point that was lost costs the extent of the image
     gone = known & (done.structure == 0).all(-1)
     return LiftedState(done.cameras, done.structure, done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
 
 
+NUM_STATIC_STARTS = 3  # static starts beside that from the tensor
+NUM_STATIC_STARTS_ALONE = 6  # static starts where the tensor gives none
+SAME_COST = 1e-2  # relative difference of the costs of one minimum
+COST_ROUNDING = 1e-22  # cost per observation that is rounding
+
+
 def _confirmed(
-    tracks: ViewTracks,
-    scene: LiftedState,
-    left: Tensor,
-    known: Tensor,
-    lifting: Lifting,
-    scale: Tensor | None,
-    options: ReconstructOptions,
+    tracks: ViewTracks, scene: LiftedState, left: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None
 ) -> LiftedState:
     """The scenes of least cost among those of several starts: further ones until two of them end in the same minimum."""
     cameras, structure, cost = scene.cameras.clone(), scene.structure.clone(), scene.cost.clone()
     seen = cost[left].isfinite().long()
     alone = left[seen == 0]
-    floor = options.scene.exact * (tracks.weights > 0).flatten(1).sum(-1)
-    for number in range(options.scene.frames_alone):
+    floor = COST_ROUNDING * (tracks.weights > 0).flatten(1).sum(-1)
+    for number in range(NUM_STATIC_STARTS_ALONE):
         some = None if scale is None else scale[left]
-        fresh = _scene(
-            tracks.subset(left), _started(tracks.subset(left), number, lifting, some, options), known[left], lifting, some, options
-        )
+        fresh = _scene(tracks.subset(left), _started(tracks.subset(left), number, lifting, some), known[left], lifting, some)
         least = cost[left]
-        near = fresh.cost <= least * (1 + options.scene.same) + floor[left]
-        seen = torch.where(fresh.cost * (1 + options.scene.same) + floor[left] < least, 1, seen + near)
+        near = fresh.cost <= least * (1 + SAME_COST) + floor[left]
+        seen = torch.where(fresh.cost * (1 + SAME_COST) + floor[left] < least, 1, seen + near)
         better = fresh.cost < least
         taken = left[better]
         cameras[taken], structure[taken], cost[taken] = fresh.cameras[better], fresh.structure[better], fresh.cost[better]
-        doubt = (seen < 2) & (torch.isin(left, alone) | (number + 1 < options.scene.frames))
+        doubt = (seen < 2) & (torch.isin(left, alone) | (number + 1 < NUM_STATIC_STARTS))
         left, seen = left[doubt], seen[doubt]
         if not len(left):
             break
@@ -207,24 +217,26 @@ def _confirmed(
     return LiftedState(cameras, structure, cost)
 
 
-def _started(tracks: ViewTracks, number: int, lifting: Lifting, scale: Tensor | None, options: ReconstructOptions) -> Tensor:
+def _started(tracks: ViewTracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
     """Cameras of all views from those of the scene at rest; of a part of many views: adjusted, the others by resection."""
     aided = bool(_aided(tracks, lifting).all())
-    window = middle(tracks.times, number, options=options)
+    window = middle(tracks.times, number)
     near = tracks.at(window)
     near = near.resting() if aided else near
-    cameras = tilted(resting(near, lifting.motion.sensor, lifting.motion.dim, options), number, options)
+    cameras = tilted(resting(near, lifting.motion.sensor, lifting.motion.dim), number)
     if len(window) == tracks.x.shape[1]:
         return cameras
     some = replace(lifting, lifts=lifting.lifts[window])
-    part = _scene(tracks.at(window), cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale, options)
+    part = _scene(tracks.at(window), cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale)
     whole = resect(part.structure, tracks.x, tracks.weights, lifts=lifting.lifts)
     return whole.index_copy(1, window.to(whole.device), part.cameras)
 
 
-def adjusted(
-    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Tensor | None = None, *, options: ReconstructOptions
-) -> LiftedState:
+MAX_ITERATIONS = 60  # of structured bundle adjustment
+COST_TOLERANCE = 1e-7  # relative gain of a step that ends it
+
+
+def adjusted(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
     """Structured bundle adjustment."""
     confined = tracks.static if lifting.still.shape[-1] else None
     done = bundle_adjust(
@@ -233,9 +245,9 @@ def adjusted(
         scene.cameras,
         scene.structure,
         lifting.lifts,
-        iterations=options.scene.steps,
+        iterations=MAX_ITERATIONS,
         scale=scale,
-        tolerance=options.scene.tolerance,
+        tolerance=COST_TOLERANCE,
         confined=confined,
         subspace=None if confined is None else lifting.still,
     )
@@ -290,9 +302,12 @@ def distances(tracks: ViewTracks, projections: Tensor, structure: Tensor) -> Ten
 # Two bodies in relative translation: labels, cameras of each, and their points.
 
 
-def bodies_of(tracks: ViewTracks, scene: LiftedState, options: ReconstructOptions) -> tuple[Tensor, Tensor, Tensor, LiftedState]:
+BODIES_ITERATIONS = 60  # of the bundle adjustment of two bodies
+
+
+def bodies_of(tracks: ViewTracks, scene: LiftedState) -> tuple[Tensor, Tensor, Tensor, LiftedState]:
     """Labels by the two hyperplanes of the points, and the affine structure of each body."""
-    done = bundle_adjust(tracks.x, tracks.weights, scene.cameras, scene.structure, iterations=options.scene.final_steps)
+    done = bundle_adjust(tracks.x, tracks.weights, scene.cameras, scene.structure, iterations=BODIES_ITERATIONS)
     known = (done.structure != 0).any(-1)
     information = point_information(done.cameras, done.structure, tracks.weights)
     pair = hyperplane_pair(done.structure, known.to(done.structure.dtype), information=information)

@@ -57,56 +57,55 @@ def solve(
         options: what decides.
         calibration: K ``(b, views, l + 1, l + 1)``; None: cameras are any matrices.
     """
-    lifting = None if motion.lift is None else Lifting.of(motion, tracks.times, tracks.x, options)
+    lifting = None if motion.lift is None else Lifting.of(motion, tracks.times, tracks.x)
     tracks = replace(tracks, static=static)
     views = motion.views(tracks.times)
     invariant = motion.tensor(min(views, motion.k + 1))
-    found = projections_of_tracks(tracks, invariant, options=options)
-    found, scene = _scene(tracks, found, lifting, options)
+    found = projections_of_tracks(tracks, invariant)
+    found, scene = _scene(tracks, found, lifting)
     if lifting is not None and static is not None and not motion.static:
-        tracks, scene = _corrected(tracks, scene, lifting, options)
+        tracks, scene = _corrected(tracks, scene, lifting)
     free = unknowns(tracks, motion)
-    doubt = suspicious(tracks, _distances(tracks, scene, lifting), free, limit, options) | failed(found.status)
+    doubt = suspicious(tracks, _distances(tracks, scene, lifting), free, limit) | failed(found.status)
     chosen = doubt.nonzero()[:, 0] if limit != float("inf") else doubt.nonzero()[:0, 0]
     if lifting is not None and len(chosen):
-        again, fewer, fine = trimmed(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit, options)
+        again, fewer, fine = trimmed(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit)
         fine = fine & ~failed(found.status[chosen])
         tracks = tracks.only(tracks.weights.index_copy(0, chosen[fine], fewer.weights[fine]))
         scene = _merged(scene, _part(again, fine), chosen[fine])
         chosen = chosen[~fine]
     if len(chosen):
         some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator, options)
-        some, again = _scene(fewer, some, lifting, options)
+        some, again = _scene(fewer, some, lifting)
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
         found = _merged(found, some, chosen)
         scene = _merged(scene, again, chosen)
     return _result(tracks, motion, lifting, found, scene, static, batch, options, calibration)
 
 
-def _corrected(
-    tracks: ViewTracks, scene: LiftedState, lifting: Lifting, options: ReconstructOptions
-) -> tuple[ViewTracks, LiftedState]:
+MAX_STATIC_CORRECTIONS = 4  # times that points given as static are checked
+
+
+def _corrected(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> tuple[ViewTracks, LiftedState]:
     """The scene without points said to stand still that move, a few at a time, and the tracks with the others."""
-    for _ in range(options.models.corrections):
+    for _ in range(MAX_STATIC_CORRECTIONS):
         assert tracks.static is not None
-        wrong = unfounded(tracks, _distances(tracks, scene, lifting), unknowns(tracks, lifting.motion), options)
+        wrong = unfounded(tracks, _distances(tracks, scene, lifting), unknowns(tracks, lifting.motion))
         left = (wrong.any(-1) & scene.cost.isfinite()).nonzero()[:, 0]
         if not len(left):
             break
         tracks = replace(tracks, static=tracks.static & ~wrong)
         some = tracks.subset(left)
         structure = triangulate(scene.cameras[left] @ lifting.lifts, some.x, some.weights)
-        again = adjusted(some, LiftedState(scene.cameras[left], structure, scene.cost[left]), lifting, options=options)
+        again = adjusted(some, LiftedState(scene.cameras[left], structure, scene.cost[left]), lifting)
         scene = _merged(scene, again, left)
     return tracks, scene
 
 
-def _scene(
-    tracks: ViewTracks, found: Projections, lifting: Lifting | None, options: ReconstructOptions
-) -> tuple[Projections, LiftedState]:
+def _scene(tracks: ViewTracks, found: Projections, lifting: Lifting | None) -> tuple[Projections, LiftedState]:
     """With a lift the scene in any of its frames; bodies stay in the projective one, with their projections for cameras."""
     if lifting is not None:
-        scene = scene_of(tracks, found, lifting, options=options)
+        scene = scene_of(tracks, found, lifting)
         # no tensor: too few points in common, or too like each other; but a scene was found without it
         status = torch.where(failed(found.status) & scene.cost.isfinite(), int(Status.OK), found.status)
         return Projections(found.projections, found.structure, status), scene
@@ -142,7 +141,7 @@ def _result(
     """Frame, labels, residuals and notices of solved problems, in the caller's batch."""
     bodies = None
     if lifting is None:
-        bodies, points, labels, scene = bodies_of(tracks, scene, options)
+        bodies, points, labels, scene = bodies_of(tracks, scene)
         cameras, speed, projections = bodies[:, 0], None, scene.cameras
         structure, status = scene.structure, found.status
     else:
@@ -151,7 +150,7 @@ def _result(
         known = (scene.structure != 0).any(-1)
         labels = torch.where(known, 2, 0)
         if tracks.static is not None:
-            rests = tracks.static.any(-1, keepdim=True) & _rests(tracks, scene, lifting, projections, options)
+            rests = tracks.static.any(-1, keepdim=True) & _rests(tracks, scene, lifting, projections)
             labels = torch.where(known & (tracks.static | rests), 1, labels)
         status = found.status
         cameras, structure = scene.cameras, scene.structure @ lifting.back.mT
@@ -195,10 +194,13 @@ def _result(
     if calibration is None:
         return plain
     start = scene if bodies is None else of_bodies(bodies, points, labels)
-    return calibrated(plain, tracks, start, lifting, labels, calibration, options)
+    return calibrated(plain, tracks, start, lifting, labels, calibration)
 
 
-def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections: Tensor, options: ReconstructOptions) -> Tensor:
+EXACT_VARIANCE = 1e-18  # of the noise of exact data, over the squared extent of the image
+
+
+def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections: Tensor) -> Tensor:
     """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
     still = lifting.still
     apart = distances(tracks, projections, scene.structure)
@@ -208,7 +210,7 @@ def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections
     free = spare(tracks, apart.isfinite(), lifting.motion).clamp(min=1)
     # rounding is noise as well
     extent = (1 / tracks.scales.amin(-1, keepdim=True)).square()
-    sigma = moving.sum(-1, keepdim=True) / free[:, None] + options.models.exact * extent
+    sigma = moving.sum(-1, keepdim=True) / free[:, None] + EXACT_VARIANCE * extent
     extra = lifting.lifts.shape[-1] - lifting.lifts.shape[1]
     return resting - moving <= quantile(0.99, extra) * sigma
 
@@ -225,6 +227,10 @@ def _open(motion: Motion, times: Tensor, static: Tensor | None) -> str:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The choice of a motion model by penalized cost.
+
+
+MAX_HARMLESS_NOISE_RATIO = 1.1  # noise of least squares over that of the robust fit: one outlier of 100 px raises it by 800 %
+MAX_CLEAR_NOISE = 0.02  # over the extent of the images: more may hide outliers
 
 
 def choose(
@@ -248,14 +254,14 @@ def choose(
         raise ValueError(
             f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
         )
-    plain = [LiftedFit.of(tracks, model, *least_squares(tracks, model, options)) for model in models]
-    listed = ranked(tracks, plain, limit, options)
+    plain = [LiftedFit.of(tracks, model, *least_squares(tracks, model)) for model in models]
+    listed = ranked(tracks, plain, limit)
     best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch, options, calibration)
     fit = next(fit for fit in plain if fit.motion is best.motion)
     whole = (best.inliers.reshape(fit.apart.shape) >= fit.apart.isfinite()).flatten(1).all(1)
     # what was left out did not mislead least squares where it hardly made the noise larger
     noise = best.sigma.reshape(-1)
-    harmless = (fit.sigma <= options.models.mild * noise) & (noise * tracks.scales.amax(1) <= options.models.clear)
+    harmless = (fit.sigma <= MAX_HARMLESS_NOISE_RATIO * noise) & (noise * tracks.scales.amax(1) <= MAX_CLEAR_NOISE)
     if bool((whole | harmless).all()):
         return replace(best, candidates=listed + untried)
     others = [model for model in models if model is not best.motion]
@@ -266,7 +272,7 @@ def choose(
         LiftedFit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1))
         for one in robust.values()
     ]
-    listed = ranked(tracks, fits, limit, options)
+    listed = ranked(tracks, fits, limit)
     return replace(robust[listed[0].motion], candidates=listed + untried)
 
 
@@ -311,38 +317,47 @@ def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
     return ""
 
 
-def ranked(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None, options: ReconstructOptions) -> tuple[Ranked, ...]:
+def ranked(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None) -> tuple[Ranked, ...]:
     """The models by their penalized costs over the whole batch, the least first."""
-    sigma = _noise(tracks, fits, limit, options)
+    sigma = _noise(tracks, fits, limit)
     found = []
     for fit in fits:
-        score = float("inf") if bool(fit.lost.all()) else float(penalized(tracks, fit, sigma, options).sum())
+        score = float("inf") if bool(fit.lost.all()) else float(penalized(tracks, fit, sigma).sum())
         rest = fit.apart[~fit.lost]
         found.append(Ranked(fit.motion.name, score, float(rest.square().nanmean().sqrt())))
     return tuple(sorted(found, key=lambda one: one.score))
 
 
-def _noise(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None, options: ReconstructOptions) -> Tensor:
+MIN_AGREEING_SHARE = 0.6  # of the observations, before the noise is taken from a model
+MAX_NOISE_RATIO = 1.8  # over the least of all models, up to which a model fits: too many unknowns may leave .6 of the noise
+MIN_RANKING_NOISE = 1e-9  # over the extent of the images: rounding
+
+
+def _noise(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None) -> Tensor:
     """The noise of every problem, ``(b,)``: a third of the limit, or what the models that fit leave in the middle."""
-    floor = options.models.floor / tracks.scales.square().mean(-1).sqrt()
+    floor = MIN_RANKING_NOISE / tracks.scales.square().mean(-1).sqrt()
     if limit is not None and math.isfinite(limit):
         return floor.clamp(min=limit / 3)
     count = (tracks.weights > 0).flatten(1).sum(-1)
-    sound = [(fit.apart.isfinite().flatten(1).sum(-1) >= options.models.agreed * count) & ~fit.lost for fit in fits]
+    sound = [(fit.apart.isfinite().flatten(1).sum(-1) >= MIN_AGREEING_SHARE * count) & ~fit.lost for fit in fits]
     sigma = torch.stack([torch.where(ok, fit.sigma, torch.nan) for ok, fit in zip(sound, fits, strict=True)])
-    near = sigma <= options.models.similar * sigma.nan_to_num(nan=torch.inf).amin(0)
+    near = sigma <= MAX_NOISE_RATIO * sigma.nan_to_num(nan=torch.inf).amin(0)
     return torch.where(near, sigma, torch.nan).nanmedian(0).values.nan_to_num(nan=1.0).maximum(floor)
 
 
-def penalized(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor, options: ReconstructOptions) -> Tensor:
+OUTLIER_COST = 2.0  # of a coordinate that does not fit, in variances of the noise: Torr's lambda 3
+LABEL_COST = 0.2  # of a point of two bodies: 0 takes one plane for two bodies in 1 of 5 scenes, log 2 a static scene for two planes
+
+
+def penalized(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor) -> Tensor:
     """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only."""
     motion, seen = fit.motion, tracks.weights > 0
     r = seen.sum(1).to(sigma.dtype) * motion.sensor
     free = motion.k - (motion.bodies > 1)
     square = (fit.apart / sigma[:, None, None]).square()
     # an observation that was left out costs as much as one can
-    square = torch.where(seen & square.isfinite(), square, torch.where(seen, options.models.outlier * motion.sensor, 0.0)).sum(1)
-    misfit = square.minimum(options.models.outlier * (r - free).clamp(min=0)).sum(-1)
+    square = torch.where(seen & square.isfinite(), square, torch.where(seen, OUTLIER_COST * motion.sensor, 0.0)).sum(1)
+    misfit = square.minimum(OUTLIER_COST * (r - free).clamp(min=0)).sum(-1)
     cameras = r.sum(-1) - (r > 0).sum(-1) * free - spare(tracks, seen, motion)
-    points = free * r.clamp(min=1).log() + options.models.label * (motion.bodies - 1) * (r > 0)
+    points = free * r.clamp(min=1).log() + LABEL_COST * (motion.bodies - 1) * (r > 0)
     return misfit + points.sum(-1) + cameras * r.sum(-1).clamp(min=1).log()

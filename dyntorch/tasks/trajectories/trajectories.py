@@ -20,7 +20,18 @@ from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.nullspace import gram_null_space
 from dyntorch.tasks.trajectories.descent import FoundLines, LineSightings, adjust, best_lines, best_points, normalized
-from dyntorch.tasks.trajectories.options import TrajectoryOptions
+
+
+@dataclass(frozen=True)
+class TrajectoryOptions:
+    """Options of :func:`dyntorch.triangulate_trajectories` and :func:`dyntorch.trajectory_cameras`."""
+
+    max_static_sigmas: float = 2.0
+    """Reprojection error as a static point, RMS per degree of freedom over the noise, up to which a point is called static."""
+    max_uncertainty: float = 0.1
+    """Expected error of the unit vector of a line, cameras normalized, above which it is AMBIGUOUS: at .03 to .1 nine of ten points
+    are within .04 of the scene's radius, at .1 to .3 within .13 (five views, .5 px)."""
+
 
 VIEWS = 4
 """Views of a point that leave finitely many lines: two."""
@@ -65,6 +76,9 @@ class Trajectories(Outcome):
         return f"Trajectories(views={views}, points={n}, batch={tuple(self.status.shape[:-1])}: {counts or 'empty'})"
 
 
+MIN_NOISE = 1e-10  # in units of the normalized images, even of exact data
+
+
 @one_thread
 def triangulate_trajectories(
     cameras: Tensor,
@@ -72,7 +86,7 @@ def triangulate_trajectories(
     weights: Tensor | None = None,
     *,
     sigma: float | None = None,
-    options: TrajectoryOptions = TrajectoryOptions(),
+    options: TrajectoryOptions | None = None,
 ) -> Trajectories:
     r"""The straight lines on which points move, seen one view at a time, and where on them they were.
 
@@ -95,7 +109,7 @@ def triangulate_trajectories(
         weights: ``(*batch, views, n)``, 0 = ignore.
         sigma: noise of one image coordinate, px; None takes it from the residuals of the lines of five or more views (with
             only four views every point that moves at all then counts as moving).
-        options: every number that decides; ``dataclasses.replace`` changes some of them.
+        options: :class:`TrajectoryOptions`; None = the defaults.
 
     Returns:
         :class:`Trajectories`, in the dtype and on the device of x.
@@ -117,19 +131,20 @@ def triangulate_trajectories(
         >>> bool(torch.allclose(found.points[:, 0], path)), LineStatus(int(found.kinds)).name
         (True, 'OK')
     """
+    options = TrajectoryOptions() if options is None else options
     check_options(options, TrajectoryOptions)
     weights = _checked(cameras, x, weights, sigma)
     data, _, back = normalized(cameras.double(), x.double(), weights)
     seen = (data.weights > 0).sum(-2)
-    line, second = _lines(data, options)
+    line, second = _lines(data)
     still = _points(data)
     noise = _noise(line.cost, seen) if sigma is None else torch.full_like(line.cost[..., 0], sigma)
-    least = torch.maximum(noise, options.least_noise / data.unit[..., 0, 0])[..., None]
-    static = (still.cost <= (least * options.static).square() * (2 * seen - 3)) & (seen >= VIEWS)
+    least = torch.maximum(noise, MIN_NOISE / data.unit[..., 0, 0])[..., None]
+    static = (still.cost <= (least * options.max_static_sigmas).square() * (2 * seen - 3)) & (seen >= VIEWS)
     few, two = seen < VIEWS, second.abs().amax(-1) > 0
     # four views without two lines: noise has made them one
     uncertainty = torch.where((seen == VIEWS) & ~two, 1.0, (line.spread.sqrt() * least).clamp(max=1.0))
-    single = torch.where(uncertainty > options.ambiguous, LineStatus.AMBIGUOUS, LineStatus.OK)
+    single = torch.where(uncertainty > options.max_uncertainty, LineStatus.AMBIGUOUS, LineStatus.OK)
     kinds = torch.where(two, LineStatus.TWO_FOLD, single)
     kinds = torch.where(few, LineStatus.TOO_FEW, torch.where(static, LineStatus.STATIC, kinds))
     none = (few | static)[..., None]
@@ -204,19 +219,22 @@ def _checked(cameras: Tensor, x: Tensor, weights: Tensor | None, sigma: float | 
     return torch.where(known, weights, 0.0).double()
 
 
-def fitted_lines(data: LineSightings, options: TrajectoryOptions) -> Tensor:
+def fitted_lines(data: LineSightings) -> Tensor:
     """The best lines ``(*batch, n, 6)`` of normalized sightings."""
-    return _lines(data, options)[0].vectors
+    return _lines(data)[0].vectors
 
 
-def _lines(data: LineSightings, options: TrajectoryOptions) -> tuple[FoundLines, Tensor]:
+MIN_LINE_ANGLE = 1e-12  # squared sine between the unit vectors of both lines of four views
+
+
+def _lines(data: LineSightings) -> tuple[FoundLines, Tensor]:
     """The best lines, and the second ones of four views (0 elsewhere)."""
     rays = data.rays()
     null = gram_null_space(rays.mT @ rays, 2).basis
     pencil, real = lines_of_pencil(null[..., 0, :], null[..., 1, :])
     found = best_lines(data, torch.stack([nearest_line(null[..., 0, :]), pencil[..., 0, :], pencil[..., 1, :]]))
-    cost = torch.where(_visible(data, found.vectors, options), found.cost, torch.inf)
-    apart = 1 - (found.vectors[1] * found.vectors[2]).sum(-1).square() > options.second_line_apart
+    cost = torch.where(_visible(data, found.vectors), found.cost, torch.inf)
+    apart = 1 - (found.vectors[1] * found.vectors[2]).sum(-1).square() > MIN_LINE_ANGLE
     two = ((data.weights > 0).sum(-2) == VIEWS) & real & apart & cost[1:].isfinite().all(0)
     best = torch.where(two, 1, cost.argmin(0))[None]
     vectors, least, spread = found.vectors.take_along_dim(best[..., None], 0), found.cost, found.spread
@@ -230,12 +248,15 @@ def _points(data: LineSightings) -> FoundLines:
     return best_points(data, gram_null_space(sides.mT @ sides).basis[..., 0, :])
 
 
-def _visible(data: LineSightings, lines: Tensor, options: TrajectoryOptions) -> Tensor:
+MIN_IMAGE_LENGTH = 1e-7  # of a line, line and camera of norm 1: below, it goes through the centre of the camera
+
+
+def _visible(data: LineSightings, lines: Tensor) -> Tensor:
     """Whether lines ``(*batch, n, 6)`` stay clear of the centres of the cameras that see their points: the join of two centres
     meets all rays, and has no image in them."""
     image = torch.einsum("...vik,...nk->...vni", line_camera(data.cameras), lines).norm(dim=-1)
     image = image / torch.linalg.matrix_norm(line_camera(data.cameras))[..., None].clamp(min=1e-300)
-    return (torch.where(data.weights > 0, image, 1.0) > options.visible).all(-2)
+    return (torch.where(data.weights > 0, image, 1.0) > MIN_IMAGE_LENGTH).all(-2)
 
 
 def _noise(cost: Tensor, seen: Tensor) -> Tensor:
@@ -275,7 +296,7 @@ def trajectory_cameras(
     *,
     bundle: bool = True,
     sigma: float | None = None,
-    options: TrajectoryOptions = TrajectoryOptions(),
+    options: TrajectoryOptions | None = None,
 ) -> TrajectoryCameras:
     r"""Six uncalibrated cameras and straight trajectories from points seen one view at a time.
 
@@ -295,7 +316,7 @@ def trajectory_cameras(
         weights: ``(*batch, n)``, 0 = ignore.
         bundle: follow up with bundle adjustment; without it the linear result.
         sigma: noise of one image coordinate, px, as in :func:`~dyntorch.tasks.trajectories.trajectories.triangulate_trajectories`.
-        options: every number that decides; ``dataclasses.replace`` changes some of them.
+        options: :class:`TrajectoryOptions`; None = the defaults.
 
     Returns:
         :class:`TrajectoryCameras`.
@@ -316,6 +337,7 @@ def trajectory_cameras(
         >>> int(found.status), bool(found.trajectories.residual.median() < 1e-9)
         (0, True)
     """
+    options = TrajectoryOptions() if options is None else options
     check_options(options, TrajectoryOptions)
     if x.ndim < 3 or x.shape[-3] != 6 or x.shape[-1] != 2:
         raise ValueError(f"x must be (*batch, 6, n, 2), six views, got {tuple(x.shape)}")
@@ -336,7 +358,7 @@ def trajectory_cameras(
     best = (found.residual.square() * mass).sum(-1).nan_to_num(nan=torch.inf).argmin(0)
     cameras = cameras[best, torch.arange(len(flat), device=x.device)]
     if bundle:
-        cameras = _adjusted(cameras, flat, each, options)
+        cameras = _adjusted(cameras, flat, each)
     trajectories = triangulate_trajectories(cameras, flat, each, sigma=sigma, options=options)
     cameras = torch.where(good[..., None, None, None], cameras, 0.0)
     lead = x.shape[:-3]
@@ -347,11 +369,14 @@ def trajectory_cameras(
     return TrajectoryCameras(cameras.reshape(*lead, 6, 3, 4).to(x.dtype), whole, status=solution.status.reshape(lead))
 
 
-def _adjusted(cameras: Tensor, x: Tensor, weights: Tensor, options: TrajectoryOptions) -> Tensor:
+NUM_ADJUSTMENTS = 3  # of the cameras, each from lines that are fitted anew
+
+
+def _adjusted(cameras: Tensor, x: Tensor, weights: Tensor) -> Tensor:
     """Cameras ``(b, 6, 3, 4)`` of least distances of the points from the images of their lines."""
     data, transform, _ = normalized(cameras, x, torch.where(x.isfinite().all(-1), weights, 0.0))
-    for _ in range(options.adjustments):
+    for _ in range(NUM_ADJUSTMENTS):
         # a line whose start from the first cameras was bad stays in a minimum of its own: all get a new start
-        data = adjust(data, fitted_lines(data, options))
+        data = adjust(data, fitted_lines(data))
     moved = torch.linalg.solve(transform, data.cameras)
     return unit(moved)

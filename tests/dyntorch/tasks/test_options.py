@@ -1,6 +1,7 @@
 """Options of the verbs: frozen, nested by stage, every field said in a sentence and read by its room."""
 
 import ast
+import inspect
 import re
 from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 from pathlib import Path
@@ -42,7 +43,7 @@ def test_options_are_frozen_and_nested_by_stage(kind):
 
 @pytest.mark.parametrize("kind", KINDS, ids=NAMES)
 def test_every_field_is_said_in_a_sentence(kind):
-    tree = ast.parse((room_of(kind) / "options.py").read_text(encoding="utf-8"))
+    tree = ast.parse(Path(inspect.getsourcefile(kind)).read_text(encoding="utf-8"))
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     for part in own_stages(kind).values():
         stage = classes[type(part).__name__]

@@ -8,7 +8,6 @@ import torch
 
 from dyntorch.numerics.least_squares import Iterate
 from dyntorch.tasks.calibrate.adjustment import PARAMETERS, Priors, RigAdjustment, RigState, camera_covariance, gauge, images
-from dyntorch.tasks.calibrate.bones import Bones
 from dyntorch.tasks.calibrate.observations import Seen
 from tests.dyntorch.tasks.calibrate.rigs import exponential, pictures
 
@@ -36,7 +35,7 @@ class Lines:
         return Seen(x, self.slope.expand_as(x), self.known.expand(x.shape[:-1]))
 
 
-def world(bones=False, seed=0):
+def world(seed=0):
     """A problem away from its minimum, and where it is."""
     g = torch.Generator().manual_seed(seed)
 
@@ -46,25 +45,19 @@ def world(bones=False, seed=0):
     R = torch.stack([exponential(0.3 * draw(3)) for _ in range(C)])
     t = torch.tensor([0.0, 0.0, 5.0], dtype=F64) + 0.3 * draw(1, C, 3)
     lens = torch.tensor([math.log(1400.0), -0.1, 0.02], dtype=F64) + torch.tensor([0.1, 0.05, 0.01], dtype=F64) * draw(1, C, 3)
-    state = RigState(R[None], t, lens, 0.1 * draw(1, C, 2), draw(1, T, N, 3), torch.zeros(1, 2 if bones else 0, dtype=F64))
-    limbs = None
-    if bones:
-        ends = torch.tensor([[0, 1], [1, 2]])
-        seen = (torch.rand(1, T, 2, generator=g, dtype=F64) > 0.2).double()
-        limbs = Bones(ends, torch.zeros(1, 2, dtype=F64), torch.tensor([[0.03, 0.05]], dtype=F64), seen, 0.02 * draw(1, T, 2))
-        state = state._replace(lengths=0.3 * draw(1, 2))
+    state = RigState(R[None], t, lens, 0.1 * draw(1, C, 2), draw(1, T, N, 3))
     scale = torch.tensor([0.7, 0.015, 0.05, math.inf, 1e-2], dtype=F64).repeat(C, 1)
     mean = torch.tensor([7.2, 0.0, 0.0, 0.05, 0.0], dtype=F64).repeat(C, 1)
     weights = torch.rand(1, C, T, N, generator=g, dtype=F64) + 0.2
     basis = torch.eye(COUNT, dtype=F64)[:, 6:]  # the first camera's pose is held
     sigma = torch.tensor([[40.0, 55.0, 70.0]], dtype=F64)
-    return RigAdjustment(Lines(g), weights, sigma, 4.0, Priors(mean, scale), basis, limbs), state
+    return RigAdjustment(Lines(g), weights, sigma, 4.0, Priors(mean, scale), basis), state
 
 
 def moved(state, change):
-    """The state after a change ``(33 + 36 + B,)``: cameras turn about their own centres, all else is added."""
+    """The state after a change ``(33 + 36,)``: cameras turn about their own centres, all else is added."""
     cameras = change[:COUNT].view(C, PARAMETERS)
-    points, lengths = change[COUNT : COUNT + T * N * 3].view(T, N, 3), change[COUNT + T * N * 3 :]
+    points = change[COUNT:].view(T, N, 3)
     zero = torch.zeros(C, dtype=F64)
     x, y, z = cameras[:, :3].unbind(-1)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(C, 3, 3)
@@ -75,12 +68,11 @@ def moved(state, change):
         state.lens + cameras[:, 6:9],
         state.clocks + cameras[:, 9:],
         state.points + points,
-        state.lengths + lengths,
     )
 
 
 def residuals(problem, state):
-    """All the errors ``(c, T, n, 2)`` px, and those of the bones ``(T, B)``, written out."""
+    """All the errors ``(c, T, n, 2)`` px, written out."""
     lines, errors = problem.views, []
     for i in range(C):
         own = state.clocks[0, i, 1].exp() * lines.times + state.clocks[0, i, 0]
@@ -88,24 +80,17 @@ def residuals(problem, state):
         lens = state.lens[0, i]
         seen = pictures(state.points[0], state.R[0, i], state.t[0, i], lens[0].exp(), lens[1], lens[2], CENTERS[i].tolist())
         errors.append(seen - track)
-    if problem.bones is None:
-        return torch.stack(errors), torch.zeros(T, 0, dtype=F64)
-    one, other = problem.bones.ends.T
-    far = (state.points[0, :, one] - state.points[0, :, other]).norm(dim=-1)
-    return torch.stack(errors), far.log() - problem.bones.excess[0] - state.lengths[0]
+    return torch.stack(errors)
 
 
 def cost(problem, state):
     """Twice the negative logarithm of the likelihood, as the head of the file says."""
-    errors, stretch = residuals(problem, state)
+    errors = residuals(problem, state)
     nu = problem.freedom
     share = errors.square().sum(-1) / (nu * problem.sigma[0, :, None, None] ** 2)
     total = (problem.weights[0] * problem.views.known * (nu + 2) * (1 + share).log()).sum()
     away = (torch.cat([state.lens[0], state.clocks[0]], -1) - problem.priors.mean) / problem.priors.scale
-    total = total + away[:, [0, 2, 3, 4]].square().sum() + 2 * (1 + away[:, 1].square()).log().sum()
-    if problem.bones is not None:
-        total = total + (problem.bones.seen[0] * (stretch / problem.bones.sigma[0]) ** 2).sum()
-    return total
+    return total + away[:, [0, 2, 3, 4]].square().sum() + 2 * (1 + away[:, 1].square()).log().sum()
 
 
 def dense(problem, normal):
@@ -117,23 +102,19 @@ def dense(problem, normal):
     return matrix, torch.cat([slope, normal.gradient[0]])
 
 
-def ordered(problem, state):
-    """Places of points, cameras and lengths in a change, in the order of :func:`dense`."""
-    count = T * N * 3
-    total = COUNT + count + state.lengths.shape[1]
-    return torch.cat([torch.arange(COUNT, COUNT + count), torch.arange(COUNT), torch.arange(COUNT + count, total)])
+def ordered():
+    """Places of points and cameras in a change, in the order of :func:`dense`."""
+    return torch.cat([torch.arange(COUNT, COUNT + T * N * 3), torch.arange(COUNT)])
 
 
-@pytest.mark.parametrize("bones", [False, True])
-def test_the_cost_is_the_formula(bones):
-    problem, state = world(bones)
+def test_the_cost_is_the_formula():
+    problem, state = world()
     assert float(problem.evaluate(tuple(state)).cost) == pytest.approx(float(cost(problem, state)), rel=1e-12)
 
 
-@pytest.mark.parametrize("bones", [False, True])
-def test_the_gradient_is_half_that_of_the_cost(bones):
-    problem, state = world(bones)
-    order = ordered(problem, state)
+def test_the_gradient_is_half_that_of_the_cost():
+    problem, state = world()
+    order = ordered()
     zero = torch.zeros(len(order), dtype=F64, requires_grad=True)
     (truth,) = torch.autograd.grad(cost(problem, moved(state, zero)), zero)
     _, found = dense(problem, problem.linear(state))
@@ -141,23 +122,20 @@ def test_the_gradient_is_half_that_of_the_cost(bones):
     assert torch.allclose(found / scale, truth[order] / 2 / scale, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("bones", [False, True])
-def test_the_matrix_is_that_of_gauss_and_newton(bones):
-    problem, state = world(bones, seed=1)
-    order = ordered(problem, state)
+@pytest.mark.slow
+def test_the_matrix_is_that_of_gauss_and_newton():
+    problem, state = world(seed=1)
+    order = ordered()
     zero = torch.zeros(len(order), dtype=F64)
 
     def rows(change):
-        errors, stretch = residuals(problem, moved(state, change))
-        return torch.cat([errors.flatten(), stretch.flatten()])
+        return residuals(problem, moved(state, change)).flatten()
 
     jacobian = torch.autograd.functional.jacobian(rows, zero, vectorize=True)[:, order]
-    errors, _ = residuals(problem, state)
+    errors = residuals(problem, state)
     nu, spread = problem.freedom, problem.sigma[0, :, None, None] ** 2
     weight = problem.weights[0] * problem.views.known * (nu + 2) / (nu * spread + errors.square().sum(-1))
     weight = weight[..., None].expand(C, T, N, 2).flatten()
-    if bones:
-        weight = torch.cat([weight, (problem.bones.seen[0] / problem.bones.sigma[0] ** 2).flatten()])
     truth = jacobian.mT @ (weight[:, None] * jacobian)
     away = torch.cat([state.lens[0], state.clocks[0]], -1) - problem.priors.mean
     prior = problem.priors.scale**-2
@@ -169,14 +147,13 @@ def test_the_matrix_is_that_of_gauss_and_newton(bones):
     assert torch.allclose(root[:, None] * found * root, root[:, None] * truth * root, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("bones", [False, True])
 @pytest.mark.parametrize("damping", [1e-3, 0.3])
-def test_a_step_solves_the_damped_equations_of_all_unknowns(bones, damping):
-    problem, state = world(bones, seed=2)
+def test_a_step_solves_the_damped_equations_of_all_unknowns(damping):
+    problem, state = world(seed=2)
     normal = problem.linear(state)
     matrix, gradient = dense(problem, normal)
     count = T * N * 3
-    basis = torch.block_diag(torch.eye(count, dtype=F64), problem.whole_basis(state.lengths.shape[1]))
+    basis = torch.block_diag(torch.eye(count, dtype=F64), problem.basis)
     inside, slope = basis.mT @ matrix @ basis, basis.mT @ gradient
     # points are damped by their own diagonal, cameras by that which is left once they are eliminated
     free = inside.clone()
@@ -185,32 +162,26 @@ def test_a_step_solves_the_damped_equations_of_all_unknowns(bones, damping):
     floor = 1e-9 * left.diagonal().max()  # damped_step lifts all by a billionth of the largest
     free[count:, count:].diagonal().add_(damping * (left.diagonal() + floor))
     truth = basis @ torch.linalg.solve(free, slope)
-    cameras, points, lengths = problem.step(
+    cameras, points = problem.step(
         Iterate(tuple(state), problem.evaluate(tuple(state)).cost, ()), torch.tensor([damping], dtype=F64)
     )
-    found = torch.cat([points.flatten(), cameras.flatten(), lengths.flatten()])
+    found = torch.cat([points.flatten(), cameras.flatten()])
     assert float((found - truth).norm() / truth.norm()) < 1e-7
     assert float(cameras[0, 0, :6].abs().max()) == 0.0
-    new = RigState(*problem.retract(tuple(state), (cameras, points, lengths)))
-    change = torch.cat([-cameras.flatten(), -points.flatten(), -lengths.flatten()])
+    new = RigState(*problem.retract(tuple(state), (cameras, points)))
+    change = torch.cat([-cameras.flatten(), -points.flatten()])
     for one, other in zip(new, moved(state, change), strict=True):
         assert torch.allclose(one, other, atol=1e-9)
 
 
 def test_descents_lower_the_cost_and_subsets_are_their_own():
-    problem, state = world(True, seed=3)
+    problem, state = world(seed=3)
     at = problem.evaluate(tuple(state))
     step = problem.step(at, torch.tensor([1e3], dtype=F64))
     assert float(problem.evaluate(problem.retract(tuple(state), step)).cost) < float(at.cost)
     two = RigState(*(torch.cat([part, part]) for part in state))
-    bones = problem.bones
-    doubled = {
-        name: getattr(bones, name).repeat(2, *[1] * (getattr(bones, name).ndim - 1))
-        for name in ("lengths", "sigma", "seen", "excess")
-    }
     both = dataclasses.replace(
-        problem, weights=problem.weights.repeat(2, 1, 1, 1), sigma=torch.cat([problem.sigma, 2 * problem.sigma]),
-        bones=dataclasses.replace(bones, **doubled),
+        problem, weights=problem.weights.repeat(2, 1, 1, 1), sigma=torch.cat([problem.sigma, 2 * problem.sigma])
     )  # fmt: skip
     keep = torch.tensor([0])
     assert float(both.subset(keep).evaluate(tuple(two.of(keep))).cost) == pytest.approx(float(at.cost), rel=1e-12)
@@ -219,7 +190,7 @@ def test_descents_lower_the_cost_and_subsets_are_their_own():
 def test_points_that_nobody_sees_stay():
     problem, state = world(seed=4)
     problem.weights[:, :, 1, 2] = 0.0
-    _, points, _ = problem.step(problem.evaluate(tuple(state)), torch.tensor([1e-3], dtype=F64))
+    _, points = problem.step(problem.evaluate(tuple(state)), torch.tensor([1e-3], dtype=F64))
     assert float(points[0, 1, 2].abs().max()) == 0.0 and bool(points.isfinite().all())
 
 
@@ -240,9 +211,8 @@ def test_changes_of_the_world_leave_every_image():
         assert float((ahead - back).abs().max()) < 1e-6 * float(alone.abs().max())
 
 
-@pytest.mark.parametrize("bones", [False, True])
-def test_covariances_are_those_of_the_whole_information_without_the_world(bones):
-    problem, state = world(bones, seed=6)
+def test_covariances_are_those_of_the_whole_information_without_the_world():
+    problem, state = world(seed=6)
     normal = problem.linear(state)
     _, reduced, _ = normal.eliminated(torch.zeros(1, dtype=F64))
     unseen = gauge(state.R[0], state.t[0])

@@ -165,3 +165,26 @@ def test_clocks_that_nothing_decides():
     take = filmed(lambda t: still.expand(len(t), 8, 3), cameras=3, frames=60, noise=1.0)
     rig = refused(calibrated(take, max_shift=0.5, rate=1.0), Told.CLOCKS)
     assert rig.R.shape == (3, 3, 3)
+
+
+@pytest.mark.slow
+def test_options_decide():
+    take = filmed(Motion(seed=2), cameras=3, frames=90, noise=0.5)
+
+    def rig(**options):
+        return calibrated(take, clocks=[0.0] * 3, options=dyn.CalibrateOptions(**options))
+
+    whole = rig()
+    assert whole.ok
+    for options, told in (
+        ({"min_matches": 10_000}, Told.APART),
+        ({"max_focal_sigma": 1e-9}, Told.FOCAL),
+        ({"max_rotation_sigma": 1e-9}, Told.ROTATION),
+        ({"max_center_sigma": 1e-9}, Told.CENTER),
+    ):
+        refused = rig(**options)
+        assert not refused.ok and told in codes(refused), options
+    # other cameras from a third of the moments, but the same rig
+    few = rig(max_positions=30 * 8)
+    near(few, take, degrees=0.3, focal=0.01, place=0.01)
+    assert not torch.equal(few.focals, whole.focals)

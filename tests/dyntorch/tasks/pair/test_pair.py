@@ -9,6 +9,7 @@ from dyntorch import PairOptions
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.homogeneous import skew
 from dyntorch.scenes.filmed import nonrigid_pair
+from dyntorch.tasks.pair import pair
 from dyntorch.tasks.pair.pair import reconstruct_pair
 from dyntorch.tasks.pair.result import PairNotice
 from dyntorch.tasks.synchronize.result import Shift
@@ -322,12 +323,37 @@ def test_coordinates_of_any_size_are_a_status(scale: float, camera: int) -> None
 
 @pytest.mark.slow
 def test_options_decide():
-    scene, shipped = nonrigid_pair(N, M, FRAMES, sigma=0.3, generator=seeded(3)), PairOptions()
-    assert int(reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps).status) == Status.OK
-    long = replace(shipped, input=replace(shipped.input, shortest=FRAMES + 1))
-    assert int(reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps, options=long).status) == Status.TOO_FEW
-    sure = replace(shipped, explanation=replace(shipped.explanation, beyond=1e9))
-    assert int(reconstruct_pair(scene.a, scene.b, 0.0, fps=scene.fps, options=sure).status) == Status.NO_CONSENSUS
+    scene = nonrigid_pair(N, M, FRAMES, sigma=0.3, generator=seeded(3))
+    hidden = scene.b.clone()
+    hidden[: FRAMES // 3, :2] = torch.nan
+
+    def status(b=scene.b, **options):
+        return int(reconstruct_pair(scene.a, b, 0.0, fps=scene.fps, options=PairOptions(**options)).status)
+
+    assert status() == Status.OK
+    assert status(min_frames=FRAMES + 1) == Status.TOO_FEW
+    assert status(min_chance_margin=1e9) == Status.NO_CONSENSUS
+    # the margin counts in ranges of the likelihoods that were drawn
+    assert status(num_chance_draws=2, min_chance_margin=1.0) == Status.OK
+    found = [
+        reconstruct_pair(scene.a, hidden, 0.0, fps=scene.fps, options=PairOptions(min_seen_share=share)) for share in (0.5, 0.9)
+    ]
+    assert bool(found[0].labels[N : N + 2].all()) and not bool(found[1].labels[N : N + 2].any())
+
+
+@pytest.mark.slow
+def test_the_fundamental_matrix_is_estimated_from_so_many_positions(monkeypatch):
+    scene, sizes = nonrigid_pair(N, N, FRAMES, sigma=0.3, generator=seeded(3)), []
+    search = pair.robust_fit
+
+    def counted(kind, x1, x2, **given):
+        sizes.append(len(x1))
+        return search(kind, x1, x2, **given)
+
+    monkeypatch.setattr(pair, "robust_fit", counted)
+    for count in (4000, 100):
+        reconstruct_pair(scene.a, scene.a + 1.0, 0.0, True, fps=scene.fps, options=PairOptions(max_samples=count))
+    assert sizes == [N * FRAMES, N * FRAMES // (-(-N * FRAMES // 100))]
 
 
 def test_options_are_of_the_verb():

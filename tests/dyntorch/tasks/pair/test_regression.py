@@ -5,6 +5,8 @@ import math
 import torch
 
 from dyntorch.tasks.pair.affine import (
+    NOISE_FLOOR,
+    NUM_FOLDS,
     Motions,
     Rows,
     combinations,
@@ -16,10 +18,7 @@ from dyntorch.tasks.pair.affine import (
     regress,
     ridges_apart,
 )
-from dyntorch.tasks.pair.options import PairOptions
 from dyntorch.tasks.pair.tracks import match_tracks
-
-OPTIONS = PairOptions()
 
 
 def normal(*shape, seed=0):
@@ -37,12 +36,12 @@ def log_likelihood(x, y, ridge):
 def test_evidence_is_the_marginal_likelihood():
     x, q = normal(30, 5), 0.3 * normal(5, 4, seed=1)
     y = x @ q + 0.4 * normal(30, 4, seed=2)
-    found = regress(Rows.of(x[None], y[None], options=OPTIONS), means=False, options=OPTIONS)
+    found = regress(Rows.of(x[None], y[None]), means=False)
     ridge = float(found.ridge[0])
     assert abs(float(found.evidence[0]) - log_likelihood(x, y, ridge)) < 1e-8
     assert all(log_likelihood(x, y, ridge * factor) <= float(found.evidence[0]) for factor in (0.3, 3.0))
     assert 0.1 < float(found.variance[0]) < 0.25 and 0.5 < ridge < 6
-    apart = ridges_apart(x, y, OPTIONS)
+    apart = ridges_apart(x, y)
     for k in range(4):
         own = log_likelihood(x, y[:, k : k + 1], float(apart[k]))
         assert all(log_likelihood(x, y[:, k : k + 1], float(apart[k]) * factor) <= own + 1e-9 for factor in (0.1, 10.0))
@@ -53,8 +52,8 @@ def test_scale_and_offset_of_affine_combinations():
     weights = weights + (1 - weights.sum(0)) / 6
     x, places = normal(40, 6, seed=1), 3 * normal(6, seed=2)
     y, other = 1.7 * x @ weights, 1.7 * places @ weights + 2.5
-    rows = Rows.of(x[None], y[None], (places[None], other[None]), options=OPTIONS)
-    found = regress(rows, means=True, options=OPTIONS)
+    rows = Rows.of(x[None], y[None], (places[None], other[None]))
+    found = regress(rows, means=True)
     torch.testing.assert_close(found.gauge, torch.tensor([[2.5, 1.7]], dtype=torch.float64))
     torch.testing.assert_close(combinations(rows, found.ridge, found.gauge)[0], 1.7 * weights)
 
@@ -62,8 +61,8 @@ def test_scale_and_offset_of_affine_combinations():
 def test_predictions_of_left_out_stretches():
     x, y = normal(23, 4), normal(23, 3, seed=1)
     ridge = torch.tensor([0.5, 2.0, 7.0], dtype=torch.float64)
-    found = predicted_apart(x, y, ridge, OPTIONS)
-    for rows in torch.arange(23).chunk(OPTIONS.ridge.stretches):
+    found = predicted_apart(x, y, ridge)
+    for rows in torch.arange(23).chunk(NUM_FOLDS):
         rest = torch.tensor([t for t in range(23) if t not in rows.tolist()])
         for k in range(3):
             gram = x[rest].T @ x[rest] + ridge[k] * torch.eye(4, dtype=torch.float64)
@@ -87,19 +86,19 @@ def test_information_is_that_of_the_covariances():
     angles = torch.tensor([[0.2, 1.1]], dtype=torch.float64)
     x, y = (part @ torch.stack([a.cos(), a.sin()]) for part, a in zip((motions.x, motions.y), angles[0], strict=True))
     both = torch.cat([x, y], dim=1)
-    C = both.T @ both / 80 + OPTIONS.directions.noise_floor * 0.09 * torch.eye(9, dtype=torch.float64)
+    C = both.T @ both / 80 + NOISE_FLOOR * 0.09 * torch.eye(9, dtype=torch.float64)
     expected = 0.5 * (torch.logdet(C[:5, :5]) + torch.logdet(C[5:, 5:]) - torch.logdet(C))
-    assert abs(float(information(motions, angles, OPTIONS)[0] - expected)) < 1e-9
+    assert abs(float(information(motions, angles)[0] - expected)) < 1e-9
 
 
 def test_common_directions_are_found():
     for sigma, allowed in ((0.0, 1e-8), (0.05, 0.05)):
         motions = pair(sigma)
-        best = peaks(motions, OPTIONS)[0]
-        found, level = refined(motions, best, options=OPTIONS)
+        best = peaks(motions)[0]
+        found, level = refined(motions, best)
         error = torch.sin(found - torch.tensor([0.7, 2.0], dtype=torch.float64)).abs().max()
         assert float(error) < allowed
-        assert level >= float(likelihood(motions, best[None], options=OPTIONS)[0])
+        assert level >= float(likelihood(motions, best[None])[0])
 
 
 def test_matches_need_to_be_near_and_alone():

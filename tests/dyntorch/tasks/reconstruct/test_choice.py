@@ -14,11 +14,10 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.tasks.reconstruct import solver as lifted_choice
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from dyntorch.tasks.reconstruct.solver import LiftedFit, _lacks, least, penalized
+from dyntorch.tasks.reconstruct.solver import LABEL_COST, OUTLIER_COST, LiftedFit, _lacks, least, penalized
 
 
 @pytest.mark.slow
@@ -43,18 +42,11 @@ def test_formula() -> None:
         tracks,
         LiftedFit(motion, apart, torch.tensor([False]), torch.ones(1)),
         torch.full((1,), 0.5, dtype=torch.float64),
-        options=ReconstructOptions(),
     )
     # 3 cameras of 8, less the ambiguity of 8; every good point leaves 3 sigma^2, but no more than that of 6 - 4 coordinates
-    expected = (
-        10 * min(3.0, ReconstructOptions().models.outlier * 2)
-        - 3.0
-        + ReconstructOptions().models.outlier * 2
-        + 10 * 4 * math.log(6)
-        + (24 - 8) * math.log(60)
-    )
+    expected = 10 * min(3.0, OUTLIER_COST * 2) - 3.0 + OUTLIER_COST * 2 + 10 * 4 * math.log(6) + (24 - 8) * math.log(60)
     assert abs(float(found) - expected) < 1e-9
-    assert math.log(2) > ReconstructOptions().models.label
+    assert math.log(2) > LABEL_COST
 
 
 @pytest.mark.slow

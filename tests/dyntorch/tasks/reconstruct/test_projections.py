@@ -7,7 +7,6 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.tasks.reconstruct.motions import MOTIONS
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, choices, mean_error, projections_of_tracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
 
@@ -31,7 +30,7 @@ def tensor_of(name, times):
 def test_noise_free_tracks_are_explained_exactly(name, more):
     views = MOTIONS[name].views(torch.arange(6.0)) + more
     _, tracks = tracks_of(name, views=views, batch=(2,))
-    found = projections_of_tracks(tracks, tensor_of(name, tracks.times), options=ReconstructOptions())
+    found = projections_of_tracks(tracks, tensor_of(name, tracks.times))
     assert found.status.tolist() == [Status.OK] * 2
     torch.testing.assert_close(reproject(found.projections, found.structure), tracks.x, rtol=0, atol=1e-9)
     assert bool((mean_error(tracks, found) < 1e-18).all())
@@ -43,26 +42,26 @@ def test_batch_equals_loop_and_a_failed_problem_stays_alone():
     weights[1, :, 5:] = 0  # too few for any tensor
     tracks = tracks.only(weights)
     invariant = tensor_of("constant_velocity_2d", tracks.times)
-    found = projections_of_tracks(tracks, invariant, options=ReconstructOptions())
+    found = projections_of_tracks(tracks, invariant)
     assert found.status.tolist() == [Status.OK, Status.TOO_FEW, Status.OK]
     assert not found.projections[1].any()
     assert not found.structure[1].any()
     for i in range(3):
-        alone = projections_of_tracks(tracks.subset(torch.tensor([i])), invariant, options=ReconstructOptions())
+        alone = projections_of_tracks(tracks.subset(torch.tensor([i])), invariant)
         images = reproject(alone.projections, alone.structure)
         torch.testing.assert_close(images[0], reproject(found.projections, found.structure)[i], rtol=1e-6, atol=1e-6)
 
 
 def test_choices_are_all_views_or_those_seen_most_and_spread():
     _, tracks = tracks_of("constant_velocity_2d", views=3)
-    assert choices(tracks, 3, options=ReconstructOptions()).tolist() == [[[0, 1, 2]]]
+    assert choices(tracks, 3).tolist() == [[[0, 1, 2]]]
     _, tracks = tracks_of("constant_velocity_2d", views=5)
-    assert choices(tracks, 3, options=ReconstructOptions())[0, 0].tolist() == [0, 2, 4]
+    assert choices(tracks, 3)[0, 0].tolist() == [0, 2, 4]
     weights = tracks.weights.clone()
     weights[:, 2, 10:] = 0
-    assert not (choices(tracks.only(weights), 3, options=ReconstructOptions())[0, :3] == 2).any()
+    assert not (choices(tracks.only(weights), 3)[0, :3] == 2).any()
     _, tracks = tracks_of("constant_velocity_3d", views=12)
-    few = choices(tracks, 4, options=ReconstructOptions())
+    few = choices(tracks, 4)
     assert few.shape == (1, 6, 4)
     assert bool((few.diff(dim=-1) > 0).all())
 

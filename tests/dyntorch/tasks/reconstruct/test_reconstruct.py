@@ -242,3 +242,22 @@ def test_wrong_observations_in_most_tracks_cost_only_themselves() -> None:
     far = wrong & (off.norm(dim=-1) > 5)
     assert not bool(found.inliers[far].any()) and float(found.inliers[~wrong].double().mean()) > 0.97
     assert float(error(found, scene)) < 0.01
+
+
+@pytest.mark.slow
+def test_options_decide() -> None:
+    scene = scenes.lifted("constant_velocity_2d", 60, views=4, outliers=0.3, sigma=0.3, generator=draw(3))
+
+    def found(**options: float) -> dyn.Reconstruction:
+        given = dyn.ReconstructOptions(**options)
+        return dyn.reconstruct(scene.tracks, "constant_velocity_2d", threshold=1.5, generator=source, options=given)
+
+    source = draw(5)
+    assert int(found().status) == Status.OK
+    assert int(found(min_inlier_share=0.9).status) == Status.NO_CONSENSUS
+    assert int(found(max_uncertainty=0.0).status) == Status.AMBIGUOUS
+    before = source.get_state()
+    found(max_search_rounds=1)  # the first start is all points: nothing is drawn
+    assert torch.equal(source.get_state(), before)
+    found(max_search_rounds=2, min_inlier_share=0.9)
+    assert not torch.equal(source.get_state(), before)

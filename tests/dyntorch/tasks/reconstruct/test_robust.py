@@ -34,7 +34,7 @@ def problem(motion, n, batch=2, seed=0, **options):
     model = MOTIONS[motion]
     tracks = tracks_of(scene.tracks, scene.times)
     invariant = model.tensor(min(model.views(scene.times), model.k + 1))
-    return scene, tracks, invariant, Lifting.of(model, scene.times, tracks.x, options=ReconstructOptions())
+    return scene, tracks, invariant, Lifting.of(model, scene.times, tracks.x)
 
 
 def kept_and_let_in(scene, fewer):
@@ -55,8 +55,8 @@ def test_a_third_of_the_tracks_may_be_wrong(motion, limit):
     assert int(wrong.sum()) <= 1
     truth = tracks.transforms @ scene.projections
     right = (scene.labels != 0).double()[:, None]
-    apart = distance(tracks.only(tracks.weights * right), found.projections, options=ReconstructOptions())
-    best = distance(tracks.only(tracks.weights * right), truth, options=ReconstructOptions())
+    apart = distance(tracks.only(tracks.weights * right), found.projections)
+    best = distance(tracks.only(tracks.weights * right), truth)
     seen = right[:, 0] > 0
     assert bool(apart[seen].median() <= 1.2 * best[seen].median())
 
@@ -99,7 +99,7 @@ def test_exact_tracks_with_outliers_are_solved_exactly():
     kept, _ = kept_and_let_in(scene, fewer)
     assert found.status.tolist() == [Status.OK]
     assert float(kept) == 1.0
-    assert float(distance(fewer, found.projections, options=ReconstructOptions())[scene.labels != 0].max()) < 1e-12
+    assert float(distance(fewer, found.projections)[scene.labels != 0].max()) < 1e-12
 
 
 def test_bodies_have_no_lift():
@@ -118,19 +118,19 @@ def _bodies():
 @pytest.mark.parametrize("sigma", [0.0, 0.5])
 def test_clean_tracks_are_not_suspected(sigma):
     _, tracks, invariant, _ = problem("constant_velocity_2d", 60, batch=24, sigma=sigma)
-    found = projections_of_tracks(tracks, invariant, options=ReconstructOptions())
+    found = projections_of_tracks(tracks, invariant)
     apart = distances(tracks, found.projections, found.structure)
-    assert float(suspicious(tracks, apart, 4, None, options=ReconstructOptions()).double().mean()) <= 0.2
-    assert float(suspicious(tracks, apart, 4, 1.5, options=ReconstructOptions()).double().mean()) <= 0.1
+    assert float(suspicious(tracks, apart, 4, None).double().mean()) <= 0.2
+    assert float(suspicious(tracks, apart, 4, 1.5).double().mean()) <= 0.1
 
 
 @pytest.mark.parametrize("outliers", [0.02, 0.1, 0.3])
 def test_outliers_are_suspected(outliers):
     _, tracks, invariant, _ = problem("constant_velocity_2d", 100, batch=8, outliers=outliers)
-    found = projections_of_tracks(tracks, invariant, options=ReconstructOptions())
+    found = projections_of_tracks(tracks, invariant)
     apart = distances(tracks, found.projections, found.structure)
-    assert bool(suspicious(tracks, apart, 4, None, options=ReconstructOptions()).all())
-    assert bool(suspicious(tracks, apart, 4, 1.5, options=ReconstructOptions()).all())
+    assert bool(suspicious(tracks, apart, 4, None).all())
+    assert bool(suspicious(tracks, apart, 4, 1.5).all())
 
 
 def test_distance_is_the_reprojection_error_of_the_triangulated_points():
@@ -138,7 +138,7 @@ def test_distance_is_the_reprojection_error_of_the_triangulated_points():
     projections = tracks.transforms @ scene.projections
     structure = triangulate(projections, tracks.x, tracks.weights, steps=2)
     expected = distances(tracks, projections, structure).square().sum(1)
-    assert torch.allclose(distance(tracks, projections, options=ReconstructOptions()), expected)
+    assert torch.allclose(distance(tracks, projections), expected)
     # in pixels: chi square with two degrees of freedom
     assert 0.3 < float(noise(expected, freedom(tracks, 4), torch.ones(2, 20).bool()).mean()) < 0.75
 
@@ -157,7 +157,7 @@ def test_agreeing_leaves_out_two_views_of_a_point():
     images[0, 1, 3] += 40
     images[0, 5, 3] -= 30
     spoiled = tracks_of(images, scene.times)
-    weights = agreeing(spoiled, spoiled.transforms @ scene.projections, torch.tensor([0.6]).double(), options=ReconstructOptions())
+    weights = agreeing(spoiled, spoiled.transforms @ scene.projections, torch.tensor([0.6]).double())
     assert (weights[0, :, 3] > 0).tolist() == [True, False, True, True, True, False, True]
     assert bool((weights[0, :, :3] > 0).all())
 
@@ -168,7 +168,7 @@ def test_agreeing_drops_points_that_nothing_confirms():
     images[0, 1, 3] += 60
     images[0, 2, 5] = torch.nan
     spoiled = tracks_of(images, scene.times)
-    weights = agreeing(spoiled, spoiled.transforms @ scene.projections, torch.tensor([0.6]).double(), options=ReconstructOptions())
+    weights = agreeing(spoiled, spoiled.transforms @ scene.projections, torch.tensor([0.6]).double())
     gone = (weights[0] == 0).all(0)
     assert bool(gone[3])
     assert bool(gone[5])  # two views of it say nothing but where it is

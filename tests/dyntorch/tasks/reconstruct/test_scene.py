@@ -7,8 +7,8 @@ import torch
 
 from dyntorch import metrics, scenes
 from dyntorch.core.outcome import Status
+from dyntorch.tasks.reconstruct import scene as module
 from dyntorch.tasks.reconstruct.motions import MOTIONS
-from dyntorch.tasks.reconstruct.options import ReconstructOptions, SceneOptions
 from dyntorch.tasks.reconstruct.projections import projections_of_tracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
 from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances, framed, positions, scene_of, velocities
@@ -16,16 +16,16 @@ from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, dis
 MOVING = [name for name, motion in MOTIONS.items() if motion.lift is not None and not motion.static]
 
 
-def solved(name, n, seed=0, decide=ReconstructOptions(), **options):
+def solved(name, n, seed=0, **options):
     """Truth, tracks, lifting, projections and scene."""
     options = {"batch": (1,), **options}
     truth = scenes.lifted(name, n, generator=torch.Generator().manual_seed(seed), **options)
     seen = truth.tracks.isfinite().all(-1).double()
     tracks = normalized(truth.tracks.nan_to_num(), seen, truth.times)
     motion = MOTIONS[name]
-    lifting = Lifting.of(motion, truth.times, tracks.x, options=ReconstructOptions())
-    found = projections_of_tracks(tracks, motion.tensor(min(motion.views(truth.times), motion.k + 1)), options=decide)
-    return truth, tracks, lifting, found, scene_of(tracks, found, lifting, options=decide)
+    lifting = Lifting.of(motion, truth.times, tracks.x)
+    found = projections_of_tracks(tracks, motion.tensor(min(motion.views(truth.times), motion.k + 1)))
+    return truth, tracks, lifting, found, scene_of(tracks, found, lifting)
 
 
 def error(truth, lifting, scene):
@@ -37,7 +37,6 @@ def from_truth(truth, tracks, lifting):
         tracks,
         LiftedState(tracks.transforms @ truth.cameras, truth.structure @ lifting.root.mT, None),
         lifting,
-        options=ReconstructOptions(),
     )
 
 
@@ -69,10 +68,11 @@ def test_noisy_tracks_lead_to_the_minimum_near_the_truth(name, n, views):
     assert bool((scene.cost < 1.01 * best.cost).all())
 
 
-def test_weak_acceleration_is_lost_by_the_tensor_alone():
+def test_weak_acceleration_is_lost_by_the_tensor_alone(monkeypatch):
     # neither a second start nor the look at what lies behind cameras: costs are 40 to 100,000 times the least one
-    alone = ReconstructOptions(scene=SceneOptions(several=99, behind=2.0))
-    truth, tracks, lifting, _, scene = solved("constant_acceleration_2d", 60, seed=1, decide=alone, views=4, sigma=1.0, batch=(4,))
+    monkeypatch.setattr(module, "MULTISTART_SIZE", 99)
+    monkeypatch.setattr(module, "MAX_BEHIND_SHARE", 2.0)
+    truth, tracks, lifting, _, scene = solved("constant_acceleration_2d", 60, seed=1, views=4, sigma=1.0, batch=(4,))
     assert (scene.cost > 2 * from_truth(truth, tracks, lifting).cost).sum() >= 3
 
 
@@ -89,8 +89,8 @@ def test_no_scene_costs_infinity_and_leaves_the_others_alone():
     weights = tracks.weights.clone()
     weights[1, :, 8:] = 0
     tracks = tracks.only(weights)
-    found = projections_of_tracks(tracks, MOTIONS["constant_velocity_3d"].tensor(4), options=ReconstructOptions())
-    again = scene_of(tracks, found, lifting, options=ReconstructOptions())
+    found = projections_of_tracks(tracks, MOTIONS["constant_velocity_3d"].tensor(4))
+    again = scene_of(tracks, found, lifting)
     assert bool(again.cost[1].isinf())
     torch.testing.assert_close(again.cost[[0, 2]], scene.cost[[0, 2]], rtol=1e-6, atol=0)
 
@@ -101,7 +101,7 @@ def test_batch_equals_loop():
     for i in range(2):
         one = torch.tensor([i])
         part = replace(found, projections=found.projections[one], structure=found.structure[one], status=found.status[one])
-        alone = scene_of(tracks.subset(one), part, lifting, options=ReconstructOptions())
+        alone = scene_of(tracks.subset(one), part, lifting)
         torch.testing.assert_close(alone.cost, scene.cost[one], rtol=1e-5, atol=0)
 
 
