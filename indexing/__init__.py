@@ -19,16 +19,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer as ActionIndexer
-    from indexing.action.options import ActionOptions as ActionOptions
+    from indexing.action.stream import ActionOptions as ActionOptions
     from indexing.archive.archive import Archive as Archive
     from indexing.archive.options import ArchiveOptions as ArchiveOptions
     from indexing.archive.results import Hit as Hit
     from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
-    from indexing.brightness.options import BrightnessOptions as BrightnessOptions
+    from indexing.brightness.sight import BrightnessOptions as BrightnessOptions
     from indexing.clip import Clip as Clip
     from indexing.clip import ClipSet as ClipSet
     from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
-    from indexing.phase.options import PhaseOptions as PhaseOptions
+    from indexing.phase.model import PhaseOptions as PhaseOptions
     from indexing.scoring import Event as Event
     from indexing.sync.options import SyncOptions as SyncOptions
     from indexing.sync.synchronize import synchronize as synchronize
@@ -44,10 +44,10 @@ _HOME = {
     "Event": "indexing.scoring",
     "synchronize": "indexing.sync.synchronize",
     # the numbers that decide in a verb
-    "ActionOptions": "indexing.action.options",
+    "ActionOptions": "indexing.action.stream",
     "ArchiveOptions": "indexing.archive.options",
-    "BrightnessOptions": "indexing.brightness.options",
-    "PhaseOptions": "indexing.phase.options",
+    "BrightnessOptions": "indexing.brightness.sight",
+    "PhaseOptions": "indexing.phase.model",
     "SyncOptions": "indexing.sync.options",
 }
 __all__ = sorted(_HOME)

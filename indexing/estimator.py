@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self, TypeVar, cast, get_args, get_type_hints
 
@@ -12,8 +12,10 @@ import torch
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
+from torch import Tensor
 
 from indexing.action.inputs import check_labels
+from indexing.modelfile import Parts, read_model, usable, write_model
 from indexing.opening import shown
 
 Options = TypeVar("Options")
@@ -73,37 +75,24 @@ def check_device(device: str) -> None:
 
 
 def changed_options(options: Any) -> dict[str, Any]:
-    """The fields of options that differ from their defaults, stage by stage, as JSON holds them."""
-    usual = type(options)()
-    found: dict[str, Any] = {}
-    for name in (field.name for field in fields(options)):
-        value = getattr(options, name)
-        if value != getattr(usual, name):
-            found[name] = changed_options(value) if is_dataclass(value) else value
-    return found
+    """The fields of options that differ from their defaults, as JSON holds them."""
+    return {each.name: getattr(options, each.name) for each in fields(options) if getattr(options, each.name) != each.default}
 
 
 def read_options(kind: type[Options], header: Mapping[str, Any]) -> Options | None:
     """The options of a model file: ``None`` where all of them were the defaults, as in files that know none."""
     changed = header["parameters"].get("options")
-    return None if changed is None else _replaced(kind(), changed, "options")
-
-
-def _replaced(options: Options, changed: Any, path: str) -> Options:
+    if changed is None:
+        return None
     if not isinstance(changed, dict):
-        raise ValueError(f"{path}: expected fields with their values, got {shown(changed)}")
-    hints, found = get_type_hints(type(options)), {}
+        raise ValueError(f"options: expected fields with their values, got {shown(changed)}")
+    hints, usual = get_type_hints(kind), kind()
     for name, value in changed.items():
         if name not in hints:
-            raise ValueError(f"{path}: there is no {shown(name)}")
-        old = getattr(options, name)
-        if is_dataclass(old):
-            found[name] = _replaced(old, value, f"{path}.{name}")
-        elif not _fits(value, hints[name]):
-            raise ValueError(f"{path}.{name}: expected a value like {old!r}, got {shown(value)}")
-        else:
-            found[name] = _tuples(value)
-    return cast("Options", replace(cast("Any", options), **found))
+            raise ValueError(f"options: there is no {shown(name)}")
+        if not _fits(value, hints[name]):
+            raise ValueError(f"options.{name}: expected a value like {getattr(usual, name)!r}, got {shown(value)}")
+    return replace(cast("Any", usual), **{name: _tuples(value) for name, value in changed.items()})
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -123,9 +112,12 @@ def _tuples(value: Any) -> Any:
 
 
 class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
-    """A classifier of recordings that can be written to a file."""
+    """A classifier of recordings that can be written to a file; subclasses say what of it is stored, and how it is read back."""
 
     FITTED: ClassVar[str]
+    FORMAT: ClassVar[str]
+    VERSION: ClassVar[int]
+    OPTIONS: ClassVar[type]
     RULES: ClassVar[Mapping[str, Rule]]
 
     def check_parameters(self) -> None:
@@ -152,19 +144,32 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def save(self, path: str | Path) -> None:
         """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
         check_is_fitted(self, self.FITTED)
-        self._write(Path(path))
+        about, tensors = self._stored()
+        write_model(Path(path), self.FORMAT, self.VERSION, self.saved_parameters(), about, tensors)
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu") -> Self:
         """Read what :meth:`save` wrote, for computing on ``device`` (the file does not say where)."""
         check_device(device)
-        return cls._read(Path(path), device)
-
-    def _write(self, path: Path) -> None:
-        raise NotImplementedError
+        header, parts = read_model(Path(path), cls.FORMAT, cls.VERSION)
+        with usable(path):
+            parameters = cls._stored_parameters(header)
+            indexer = cls(**{**parameters, "options": read_options(cls.OPTIONS, header), "device": device})
+            indexer.check_parameters()
+            indexer._restore(header, parts)
+        return indexer
 
     @classmethod
-    def _read(cls, path: Path, device: str) -> Self:
+    def _stored_parameters(cls, header: Mapping[str, Any]) -> dict[str, Any]:
+        """The parameters of a model file, without those of older versions."""
+        return dict(header["parameters"])
+
+    def _stored(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """What the header of the file says of a fitted indexer besides its parameters, and its tensors."""
+        raise NotImplementedError
+
+    def _restore(self, header: Mapping[str, Any], parts: Parts) -> None:
+        """Set the fitted attributes from a file."""
         raise NotImplementedError
 
     def __sklearn_is_fitted__(self) -> bool:

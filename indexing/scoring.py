@@ -13,16 +13,9 @@ from torch import Tensor
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class DecisionOptions:
-    """From scores to probabilities and events."""
-
-    sharpness: float = 2.0
-    """Of the softmax over standardized scores: leave-one-out likelihood peaks between 1.5 and 2.5 on UTKinect."""
-    shortest: float = 0.4
-    """Seconds: shorter finds are flicker."""
-    bridge: float = 0.5
-    """Seconds: a gap up to this between two finds of one class does not part them."""
+SHARPNESS = 2.0  # of the softmax over standardized scores: leave-one-out likelihood peaks between 1.5 and 2.5 on UTKinect
+MIN_EVENT_SECONDS = 0.4  # shorter finds are flicker
+MAX_GAP_SECONDS = 0.5  # between two finds of one class, which are then one
 
 
 @dataclass(frozen=True)
@@ -41,7 +34,7 @@ class Event:
     exemplar: int | None = None
 
 
-def probabilities(scores: Array, sharpness: float = DecisionOptions.sharpness) -> Array:
+def probabilities(scores: Array, sharpness: float = SHARPNESS) -> Array:
     """``(N, classes)`` softmax of ``sharpness`` times the scores, after standardizing each row."""
     centred = scores - scores.mean(axis=1, keepdims=True)
     spread = np.maximum(centred.std(axis=1, keepdims=True), 1e-9) if scores.shape[1] > 2 else 0.5
@@ -83,7 +76,6 @@ def events(
     peak: float,
     floor: float,
     blocked: Array | None = None,
-    options: DecisionOptions = DecisionOptions(),
 ) -> list[Event]:
     """Runs of samples whose best class is the same: at least ``floor`` throughout and ``peak`` somewhere. scores
     ``(T, classes)``."""
@@ -92,10 +84,10 @@ def events(
     state = np.where(open_, scores.argmax(axis=1), -1)
     middle = (times[1:] + times[:-1]) / 2
     edges = np.concatenate([times[:1], middle, times[-1:]])
-    runs = _bridged(_runs(state), state, edges, options.bridge)
+    runs = _bridged(_runs(state), state, edges, MAX_GAP_SECONDS)
     # once flicker is gone, what it parted is one again
-    long = [(a, b) for a, b in runs if edges[b + 1] - edges[a] >= options.shortest]
-    runs = _bridged(long, state, edges, options.bridge)
+    long = [(a, b) for a, b in runs if edges[b + 1] - edges[a] >= MIN_EVENT_SECONDS]
+    runs = _bridged(long, state, edges, MAX_GAP_SECONDS)
     found = []
     for first, last in runs:
         label, inside = int(state[first]), np.arange(first, last + 1)

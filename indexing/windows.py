@@ -24,65 +24,45 @@ from indexing.clip import GAP, RARE, Clip, FloatArray, stretches
 # own deviations, which grow with the noise, with the speed of the movement and with the gaps between frames.
 
 
-@dataclass(frozen=True)
-class RepairOptions:
-    """Which sightings of a joint are wrong.
+# How far windows are from those of uncorrupted clips, in % of their deviation, Florence3D at 90 degrees.  As they are: 5 % wrong
+# joints 33, 10 % 47, bursts of three 39, half the frames dropped 8.6.  Repaired so: 7.4, 14, 19, 8.9, and clean clips .09.
 
-    How far windows are from those of uncorrupted clips, in % of their deviation, Florence3D at 90 degrees.  As they are: 5 % wrong
-    joints 33, 10 % 47, bursts of three 39, half the frames dropped 8.6.  Repaired so: 7.4, 14, 19, 8.9, and clean clips .09.
-    """
-
-    width: int = 9
-    """Sightings of one joint compared: 7 finds more (6.2) and fails in bursts (23), 11 finds less (9.1)."""
-    limit: float = 4.0
-    """Spreads of the neighbours up to which a sighting is right: 6 finds less (8.6)."""
-    usual: float = 8.0
-    """Times the deviation that most joints stay below, added to that.  3 finds more (3.1), at the same accuracy (5 % wrong joints:
-    .862) but takes movement for error where frames are dropped: Florence3D .856 -> .817, 8 -> .843.  Chosen on that set."""
-    share: float = 0.8
-    """Share of all joints that stays below that deviation."""
-    floor: float = 0.01
-    """Of the body: smaller steps are the noise of every detector."""
-    least: int = 5
-    """Sightings: among fewer nobody can say which is wrong."""
-    passes: int = 2
-    """Times that all are judged: the second sees past what the first took out: bursts 21 -> 19; a third adds nothing."""
-    part: int = 9000
-    """Frames of a long recording that are judged together: 5 minutes at 30 per second."""
-    sampled: int = 1
-    """Of so many sightings one tells how far is usual; where it is more than 1, the others are judged only near those that leave
-    the middle of their neighbours.  8 takes a third of the time on clean clips and finds the same
-    but for .5 % (CMU, 5 % wrong)."""
-    leaving: float = 3.0
-    """Times the usual distance from that middle (of 80 %), by which such a sighting leaves it."""
-
-
+NUM_COMPARED = 9  # sightings of one joint: 7 finds more (6.2) and fails in bursts (23), 11 finds less (9.1)
+MAX_SPREADS = 4.0  # of the neighbours, up to which a sighting is right: 6 finds less (8.6)
+MAX_USUAL_FACTOR = 8.0  # times the deviation of most joints, added to that; 3 takes movement for error where frames are dropped
+USUAL_SHARE = 0.8  # of all joints, that stays below that deviation
+NOISE_FLOOR = 0.01  # of the body: smaller steps are the noise of every detector
+MIN_SIGHTINGS = 5  # among fewer nobody can say which is wrong
+NUM_PASSES = 2  # the second sees past what the first took out: bursts 21 -> 19; a third adds nothing
+MAX_FRAMES_JUDGED = 9000  # of a long recording at once: 5 minutes at 30 per second
+MAX_LEAVING_FACTOR = 3.0  # times the usual distance from the middle of its neighbours, in the faster test (``stride`` > 1)
 REPAIR_CHUNK = 20_000  # sightings at once: bounds memory
 
 
-def wrong_joints(
-    joints: FloatArray, times: FloatArray, starts: NDArray[np.intp], options: RepairOptions = RepairOptions()
-) -> NDArray[np.bool_]:
+def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp], stride: int = 1) -> NDArray[np.bool_]:
     r"""Sightings that do not lie on their joint's path. joints ``(frames of all, joints, dims)``, times ``(frames of all,)``,
-    starts ``(clips + 1,)`` -> ``(frames of all, joints)``."""
+    starts ``(clips + 1,)`` -> ``(frames of all, joints)``.
+
+    ``stride``: the usual deviation is taken from every n-th sighting; above 1, the others are judged only near those that leave the
+    middle of their neighbours.  8 takes a third of the time on clean clips and finds the same but for .5 %."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
     clip_of = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    floor = options.floor * _sizes(joints, there, starts)
+    floor = NOISE_FLOOR * _sizes(joints, there, starts)
     wrong, asked, usual = np.zeros_like(there), there, np.zeros_like(floor)
-    for once in range(options.passes):
+    for once in range(NUM_PASSES):
         # every joint's sightings in every clip, one path after the other
         joint, frame = np.nonzero((there & ~wrong).T)
         clip = clip_of[frame]
-        around, counts = _around(joint * len(starts) + clip, options.width)
-        judged, places = asked[frame, joint] & (counts >= options.least), joints[frame, joint]
-        if once == 0 and options.sampled > 1:
-            judged &= (np.arange(len(joint)) % options.sampled == 0) | _near_leaving(places, times[frame], floor[clip], options)
+        around, counts = _around(joint * len(starts) + clip, NUM_COMPARED)
+        judged, places = asked[frame, joint] & (counts >= MIN_SIGHTINGS), joints[frame, joint]
+        if once == 0 and stride > 1:
+            judged &= (np.arange(len(joint)) % stride == 0) | _near_leaving(places, times[frame], floor[clip])
         rows = np.flatnonzero(judged)
-        far, spread = _deviations(places, times[frame], rows, around[rows], options.width)
+        far, spread = _deviations(places, times[frame], rows, around[rows], NUM_COMPARED)
         if once == 0:
-            told = rows % options.sampled == 0
-            usual = options.usual * _share(far[told].max(axis=1), clip[rows[told]], len(starts) - 1, options.share)
-        bad = (far > options.limit * spread + (usual + floor)[clip[rows], None]).any(axis=1)
+            told = rows % stride == 0
+            usual = MAX_USUAL_FACTOR * _share(far[told].max(axis=1), clip[rows[told]], len(starts) - 1, USUAL_SHARE)
+        bad = (far > MAX_SPREADS * spread + (usual + floor)[clip[rows], None]).any(axis=1)
         if not bad.any():
             break
         wrong[frame[rows[bad]], joint[rows[bad]]] = True
@@ -95,12 +75,12 @@ def wrong_joints(
     return wrong
 
 
-def mended(clip: Clip, options: RepairOptions = RepairOptions()) -> Clip:
+def mended(clip: Clip, stride: int = 1) -> Clip:
     """A clip of any length without its wrong joints; judged in parts, which bounds memory, between gaps."""
-    part, cuts = options.part, stretches(clip.times).tolist()
+    part, cuts = MAX_FRAMES_JUDGED, stretches(clip.times).tolist()
     pieces = [np.arange(begin, max(end - part // 2, begin + 1), part) for begin, end in cuts]
     parts = np.append(np.concatenate(pieces), len(clip))
-    wrong = wrong_joints(clip.joints, clip.times, parts, options)
+    wrong = wrong_joints(clip.joints, clip.times, parts, stride)
     if not wrong.any():
         return clip
     joints = clip.joints.copy()
@@ -118,7 +98,7 @@ def _around(path: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArr
     return np.stack([first, np.minimum(first + width, end)], axis=1), counts
 
 
-def _near_leaving(places: FloatArray, times: FloatArray, floor: FloatArray, options: RepairOptions) -> NDArray[np.bool_]:
+def _near_leaving(places: FloatArray, times: FloatArray, floor: FloatArray) -> NDArray[np.bool_]:
     """``(sightings,)`` whether one that leaves the middle of those before and after it is among the neighbours compared."""
     count = len(places)
     if count < 3:
@@ -127,11 +107,11 @@ def _near_leaving(places: FloatArray, times: FloatArray, floor: FloatArray, opti
     inside = span > 0  # within one path: the clock of another one starts anew
     share = np.where(inside, (times[1:-1] - times[:-2]) / np.where(inside, span, 1.0), 0.0)[:, None].astype(places.dtype)
     leaves = np.abs(places[1:-1] - places[:-2] - share * (places[2:] - places[:-2])).max(axis=1)
-    usual = np.quantile(leaves[inside], options.share) if inside.any() else 0.0
+    usual = np.quantile(leaves[inside], USUAL_SHARE) if inside.any() else 0.0
     marked = np.ones(count, dtype=bool)
-    marked[1:-1] = ~inside | (leaves > options.leaving * usual + floor[1:-1] / 2)
+    marked[1:-1] = ~inside | (leaves > MAX_LEAVING_FACTOR * usual + floor[1:-1] / 2)
     total = np.concatenate([[0], np.cumsum(marked)])
-    reach = options.width // 2 + 1
+    reach = NUM_COMPARED // 2 + 1
     index = np.arange(count)
     return np.asarray(total[np.minimum(index + reach + 1, count)] > total[np.maximum(index - reach, 0)])
 
@@ -205,14 +185,14 @@ class Ragged:
     seen: NDArray[np.bool_]  # (clips, joints): seen at least once; the others are zeros in `joints`
 
 
-def ragged(clips: Sequence[Clip], repair: RepairOptions | None = None) -> Ragged:
+def ragged(clips: Sequence[Clip], repair: bool = False) -> Ragged:
     """Lay clips end to end and fill what is missing by linear interpolation in time, joint by joint."""
     joints = np.concatenate([y_up(clip) for clip in clips]).astype(np.float32)
     times = np.concatenate([clip.times for clip in clips])
     lengths = np.array([len(clip) for clip in clips])
     starts = np.concatenate([[0], np.cumsum(lengths)])
-    if repair is not None:
-        joints[wrong_joints(joints, times, starts, repair)] = np.nan
+    if repair:
+        joints[wrong_joints(joints, times, starts)] = np.nan
     return bridged(joints, times, starts)
 
 

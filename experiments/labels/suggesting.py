@@ -34,8 +34,7 @@ from experiments.recognition.detection_metrics import segments
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip
 from indexing.actors import ACTIONS, Person, detect, stream
-from indexing.recordings.options import SuggestOptions
-from indexing.recordings.suggesting import parts_of, suggest
+from indexing.recordings.suggesting import SuggestOptions, parts_of, suggest
 from indexing.scoring import Event
 
 SETS = Literal["exercises", "utkinect", "actors"]
@@ -46,8 +45,8 @@ FIRST = 2.5  # seconds of the two parts that everybody begins with
 WAYS: dict[str, SuggestOptions | None] = {
     "any": None,
     "suggested": SuggestOptions(),
-    "suggested, each part alone": SuggestOptions(alike=False),
-    "suggested, however sure": SuggestOptions(unsure=0.0),
+    "suggested, each part alone": SuggestOptions(coverage=False),
+    "suggested, however sure": SuggestOptions(doubt_weight=0.0),
 }
 Marked = tuple[int, str, float, float]
 """Number of the recording, label, start and end in seconds."""
@@ -183,7 +182,7 @@ def next_parts(
     if options is not None:
         found = suggest(indexer, [one.clip for one in pool], number, done, options)
         return [annotated(pool[one.recording], one.recording, one.start, one.end) for one in found]
-    parts = [parts_of(indexer, one.clip, spans, SuggestOptions()) for one, spans in zip(pool, done, strict=True)]
+    parts = [parts_of(indexer, one.clip, spans) for one, spans in zip(pool, done, strict=True)]
     spans = [(i, *span) for i, some in enumerate(parts) if some is not None for span in some.spans[some.worth].tolist()]
     if not spans:
         return []

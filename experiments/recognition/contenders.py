@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal, Self
+from unittest import mock
 
 import torch
 from torch import Tensor
@@ -13,11 +14,10 @@ from torch import Tensor
 from experiments.recognition.baselines import Array, ImageNearest, Nearest, WarpedNearest
 from experiments.recognition.protocol import Classifier
 from experiments.recognition.short_windows import ShortWindows
-from indexing import ActionIndexer, Clip
+from indexing import ActionIndexer, ActionOptions, Clip
 from indexing.action.bank import Windows
 from indexing.action.model import ShapeModel
-from indexing.action.options import ActionOptions
-from indexing.recordings.options import ExplanationOptions
+from indexing.recordings import decoding
 from indexing.scoring import Event
 
 Part = Literal["short windows", "whole exemplars", "kernel machine", "durations", "priors", "rest", "background"]
@@ -33,15 +33,15 @@ NAMES: dict[Method, str] = {
 OPTIONS: dict[Method, dict[str, Any]] = {"equal": {}, "learned": {"weights": "learned"}, "unrepaired": {"repair": False}}
 
 
-# what the explanation of a recording is without one of its parts
-WITHOUT: dict[Part, ExplanationOptions] = {
-    "short windows": ExplanationOptions(moments=0.0),
-    "whole exemplars": ExplanationOptions(whole=0.0),
-    "kernel machine": ExplanationOptions(machine=0.0),
-    "durations": ExplanationOptions(durations=2),  # the shortest and the longest alone
-    "priors": ExplanationOptions(duration=0.0),
-    "rest": ExplanationOptions(rest=0.0),
-    "background": ExplanationOptions(background=-100.0),
+# what the decoding of a recording is without one of its parts: options, or a constant of it
+WITHOUT: dict[Part, ActionOptions | tuple[str, float]] = {
+    "short windows": ("MOMENT_WEIGHT", 0.0),
+    "whole exemplars": ("WHOLE_WEIGHT", 0.0),
+    "kernel machine": ("MACHINE_WEIGHT", 0.0),
+    "durations": ActionOptions(num_durations=2),  # the shortest and the longest alone
+    "priors": ("DURATION_WEIGHT", 0.0),
+    "rest": ActionOptions(rest_weight=0.0),
+    "background": ActionOptions(min_quality=-100.0),
 }
 
 
@@ -54,7 +54,7 @@ def contender(method: Method, seed: int = 0, **options: Any) -> Callable[[], Cla
     return partial(ActionIndexer, random_state=seed, **OPTIONS[method], **options)
 
 
-def sliding(method: Method, seed: int = 0, without: Part | None = None) -> ActionIndexer | Sliding | ShortWindows:
+def sliding(method: Method, seed: int = 0, without: Part | None = None) -> ActionIndexer | WithoutPart | Sliding | ShortWindows:
     """A new scorer of the frames of a stream; of ours also without one part of the explanation."""
     if method == "windows":
         return ShortWindows(seed)
@@ -62,8 +62,10 @@ def sliding(method: Method, seed: int = 0, without: Part | None = None) -> Actio
         return Sliding(ImageNearest())
     if method == "dtw":
         return Sliding(WarpedNearest())
-    options = None if without is None else ActionOptions(recordings=WITHOUT[without])
-    return ActionIndexer(random_state=seed, options=options, **OPTIONS[method])
+    change = None if without is None else WITHOUT[without]
+    if isinstance(change, tuple):
+        return WithoutPart(ActionIndexer(random_state=seed, **OPTIONS[method]), *change)
+    return ActionIndexer(random_state=seed, options=change, **OPTIONS[method])
 
 
 def check_methods(methods: Sequence[Method]) -> None:
@@ -98,6 +100,32 @@ class _Nearest(ShapeModel):
         assert self.nearest is not None
         bank = self.nearest.describe(self.exemplars.crop(0)[chosen].values)
         return torch.from_numpy(self.nearest.between(self.nearest.describe(query.values), bank)).float()
+
+
+class WithoutPart:
+    """The action indexer, its recordings decoded with another value of one constant."""
+
+    def __init__(self, indexer: ActionIndexer, constant: str, value: float) -> None:
+        self.indexer, self.constant, self.value = indexer, constant, value
+
+    def fit(self, clips: Sequence[Clip], labels: Array) -> Self:
+        """Learn as it does."""
+        self.indexer.fit(clips, labels)
+        self.classes_: Array = self.indexer.classes_
+        return self
+
+    def scan(self, clip: Clip) -> tuple[Array, list[Event]]:
+        """Scores of frames, and events."""
+        with mock.patch.object(decoding, self.constant, self.value):
+            return self.indexer.scan(clip)
+
+    def score_frames(self, clip: Clip) -> Array:
+        """``(frames, classes)``."""
+        return self.scan(clip)[0]
+
+    def find(self, clip: Clip) -> list[Event]:
+        """Events."""
+        return self.scan(clip)[1]
 
 
 class Sliding:

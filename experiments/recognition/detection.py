@@ -14,8 +14,8 @@ Two readings of the same scores: *every frame* gets the class of its best score,
 exercises); *found* is what ``find`` says (rests are not to be found: made for the actors).  A segment's score is how far its class
 stands above the mean of all.  The baselines are given the same windows, tempi and explanation; only the distance differs.
 ``windows`` are short windows alone, without an explanation by segments.  ``--parts`` leaves one part of the explanation out at a
-time.  The weights of the explanation were chosen on these four sets together (see ``ExplanationOptions``), so figures on them are,
-if anything, too good.
+time.  The weights of the explanation (:mod:`indexing.recordings.decoding`) were chosen on these four sets together, so figures on
+them are, if anything, too good.
 """
 
 from __future__ import annotations

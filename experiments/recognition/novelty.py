@@ -14,8 +14,7 @@ from torch import Tensor
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip
 from indexing.action.bank import Windows
-from indexing.action.model import ShapeModel, class_scores, evidence, standardized
-from indexing.action.profiles import ClassProfiles
+from indexing.action.model import ClassProfiles, ShapeModel, class_scores, evidence, standardized
 from indexing.actors import dataset
 from indexing.joints import matched
 from indexing.joints import named as has_names

@@ -10,15 +10,16 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
+from unittest import mock
 
 import numpy as np
 import torch
 
 from experiments.recognition.protocol import Array
-from indexing import ActionIndexer, Clip
+from indexing import ActionIndexer, ActionOptions, Clip
+from indexing.action import exemplars
 from indexing.action.bank import stack
 from indexing.action.model import ShapeModel
-from indexing.action.options import ActionOptions, EventOptions, ExemplarOptions
 from indexing.action.stream import BLOCK, Stream, StreamScan, around, motion_levels, scan, windows_at, wrong_contrast
 from indexing.scoring import Event, event_levels, events, smooth
 from indexing.windows import mended
@@ -56,15 +57,16 @@ class ShortWindows:
 
     def fit(self, clips: Sequence[Clip], labels: Array) -> Self:
         """Learn as the action indexer does, with windows of a second however long the actions last."""
-        whole = ActionOptions(exemplars=ExemplarOptions(moment=np.inf), events=EventOptions(step=self.options.step))
-        self.indexer = ActionIndexer(random_state=self.seed, options=whole).fit(clips, labels)
+        with mock.patch.object(exemplars, "MAX_SHORT_WINDOW", np.inf):
+            self.indexer = ActionIndexer(random_state=self.seed).fit(clips, labels)
         self.classes_: Array = self.indexer.classes_
         return self
 
     def scan(self, clip: Clip) -> tuple[Array, list[Event]]:
         """Scores of frames, and events."""
         clip = mended(clip)
-        model, stream = self.indexer.model_, Stream(self.indexer.length, self.indexer.window, tuple(self.indexer.tempi), "cpu")
+        model, options = self.indexer.model_, ActionOptions(window_step=self.options.step)
+        stream = Stream(self.indexer.length, self.indexer.window, tuple(self.indexer.tempi), "cpu", options)
         found = scan(model, clip, stream)
         scores = frame_scores(clip, found, self.options.frames)
         return scores, find_events(model, clip, stream, found, self.classes_.tolist(), self.options)

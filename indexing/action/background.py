@@ -22,14 +22,26 @@ from indexing.action.exemplars import Exemplars
 from indexing.action.inputs import as_clips
 from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel, class_scores
-from indexing.action.options import ActionOptions, BackgroundOptions
 from indexing.actors import ACTIONS, dataset
 from indexing.clip import Clip, stretches
 from indexing.joints import FEWEST, matched, matched_all, named
-from indexing.recordings.explanation import Explanation, Withheld
+from indexing.recordings.decoding import Explanation, Withheld
+from indexing.recordings.evidence import MIN_CYCLIC
 from indexing.scoring import Event
 from indexing.skeleton import Skeleton
 from indexing.windows import check_clips, ragged, sample
+
+NUM_PEOPLE = 2  # synthetic people who perform other actions
+NUM_CAMERAS = 2  # that see each of their performances
+NUM_EXCHANGES = 2  # times that the clip is played with the movement of each joint done by another one
+# below it synthetic people may do the action itself: the same one by others stands at -10 to -16, another at -3.6 to -9.9
+SIMILAR_ACTION_RESIDUAL = -9.5
+# the same of clips played otherwise: symmetric in time -14 to -19 (jumping jack -9), others -6 to -11.7
+SIMILAR_REPLAY_RESIDUAL = -12.0
+MAX_PIECES = 60  # of recordings given as background: evenly spread
+MAX_KINDS = 6  # that the pieces of one recording make
+MIN_PIECE_SHOWN = 0.5  # share of a piece's frames that must show the person
+FALSE_ALARM_RATE = 0.1  # where one action is learned and reject is None
 
 Array = NDArray[Any]
 
@@ -61,9 +73,7 @@ def _made(found: Sequence[tuple[str, Clip]], sure: bool) -> OtherMovement:
 ORDERS = ("backwards", "halves exchanged", "another order")
 
 
-def played_otherwise(
-    clips: Sequence[Clip], ordered: bool, options: BackgroundOptions, random_state: np.random.Generator
-) -> OtherMovement:
+def played_otherwise(clips: Sequence[Clip], ordered: bool, random_state: np.random.Generator) -> OtherMovement:
     """The clips with the movement of each joint done by another one, and in another order."""
     found = []
     for clip in clips:
@@ -75,7 +85,7 @@ def played_otherwise(
         seen = np.asarray(clip.seen.any(axis=0))
         middle = np.zeros((1, *clip.joints.shape[1:]), dtype=clip.joints.dtype)
         middle[0, seen] = np.nanmean(clip.joints[:, seen], axis=0)
-        for number in range(options.exchanges):
+        for number in range(NUM_EXCHANGES):
             order = np.arange(len(seen))
             order[seen] = random_state.permutation(order[seen])
             joints = middle + (clip.joints - middle)[:, order]
@@ -83,13 +93,13 @@ def played_otherwise(
     return _made(found, False)
 
 
-def performed(skeleton: Skeleton | None, dims: int, options: BackgroundOptions, random_state: np.random.Generator) -> OtherMovement:
+def performed(skeleton: Skeleton | None, dims: int, random_state: np.random.Generator) -> OtherMovement:
     """Synthetic people who do everyday actions, each seen from somewhere; nothing where the joints cannot be told by name."""
     if not named(skeleton):
         return OtherMovement()
-    azimuth = None if dims == 3 else [float(a) for a in random_state.uniform(0.0, 360.0, options.views)]
+    azimuth = None if dims == 3 else [float(a) for a in random_state.uniform(0.0, 360.0, NUM_CAMERAS)]
     found = []
-    for clip in dataset(options.people, ACTIONS, azimuth=azimuth, rng=random_state):
+    for clip in dataset(NUM_PEOPLE, ACTIONS, azimuth=azimuth, rng=random_state):
         try:
             found.append((str(clip.label), matched(clip, skeleton)[0]))
         except ValueError:  # too few joints have these names
@@ -97,9 +107,7 @@ def performed(skeleton: Skeleton | None, dims: int, options: BackgroundOptions, 
     return _made(found, False)
 
 
-def recorded(
-    background: Iterable[Any], fps: float, joints: int, skeleton: Skeleton | None, seconds: float, options: BackgroundOptions
-) -> OtherMovement:
+def recorded(background: Iterable[Any], fps: float, joints: int, skeleton: Skeleton | None, seconds: float) -> OtherMovement:
     """Recordings of other movement, cut into pieces as long as an action."""
     try:
         clips = [part for item in as_clips(background, fps) for part in (item if isinstance(item, tuple) else (item,))]
@@ -107,16 +115,16 @@ def recorded(
         check_clips(clips, joints, recordings=True)
     except ValueError as problem:
         raise ValueError(f"background: {problem}") from None
-    found = [piece for number, clip in enumerate(clips) for piece in _pieces(clip, number, seconds, options)]
+    found = [piece for number, clip in enumerate(clips) for piece in _pieces(clip, number, seconds)]
     if not found:
         raise ValueError(
             f"background: no {seconds:.3g} s without a gap in {len(clips)} clips show anybody; give a recording of other movement"
         )
-    kept = np.unique(np.linspace(0, len(found) - 1, options.pieces).round().astype(int))
+    kept = np.unique(np.linspace(0, len(found) - 1, MAX_PIECES).round().astype(int))
     return _made([found[i] for i in kept], True)
 
 
-def _pieces(clip: Clip, number: int, seconds: float, options: BackgroundOptions) -> list[tuple[str, Clip]]:
+def _pieces(clip: Clip, number: int, seconds: float) -> list[tuple[str, Clip]]:
     """Pieces of a recording, half a piece apart; neighbours are of one kind, of which a recording gives a few."""
     found = []
     for first, end in stretches(clip.times).tolist():
@@ -126,10 +134,10 @@ def _pieces(clip: Clip, number: int, seconds: float, options: BackgroundOptions)
             inside = first + np.flatnonzero((times >= start - 1e-9) & (times <= start + seconds + 1e-9))
             joints = clip.joints[inside]
             shown = np.isfinite(joints).all(axis=2)
-            if len(inside) < 2 or int(shown.any(axis=0).sum()) < FEWEST or shown.any(axis=1).mean() < options.shown:
+            if len(inside) < 2 or int(shown.any(axis=0).sum()) < FEWEST or shown.any(axis=1).mean() < MIN_PIECE_SHOWN:
                 continue
             found.append(clip.replace(joints=joints, times=clip.times[inside], confidence=None))
-    parts = min(options.parts, len(found))
+    parts = min(MAX_KINDS, len(found))
     label = f"recording {number}" if clip.label is None else str(clip.label)
     return [(f"{label}, part {i * parts // len(found)}" if clip.label is None else label, one) for i, one in enumerate(found)]
 
@@ -138,18 +146,18 @@ def _pieces(clip: Clip, number: int, seconds: float, options: BackgroundOptions)
 # What of it is too much like the action, and what a recording tells once background is taken out.
 
 
-def alike(exemplars: Exemplars, numbers: Array, kinds: Sequence[str], options: ActionOptions) -> Array:
+def alike(exemplars: Exemplars, numbers: Array, kinds: Sequence[str]) -> Array:
     """``(kinds,)`` bool, which of the made exemplars are of a kind that may be the action itself."""
     labels = torch.from_numpy(np.asarray(numbers))
     classes = int(labels.max()) + 1
-    model = learn(exemplars, labels, classes, Lesson(scorer="nearest", hidden=classes - 1), options)
+    model = learn(exemplars, labels, classes, Lesson(scorer="nearest", hidden=classes - 1))
     own = labels == 0
-    scores = class_scores(model.residuals(exemplars.crop(0)[own]) + model.hub, labels, classes, options=options)
+    scores = class_scores(model.residuals(exemplars.crop(0)[own]) + model.hub, labels, classes)
     nearest = -scores.amax(dim=0)[labels[~own]].numpy()
-    again = exemplars.cyclic is not None and float(exemplars.cyclic[own].median()) > options.recordings.joined
+    again = exemplars.cyclic is not None and float(exemplars.cyclic[own].median()) > MIN_CYCLIC
     replayed = np.array([kind in ORDERS or kind.startswith("other joints") for kind in kinds])
     cycle = np.array([again and kind in ORDERS for kind in kinds])
-    return np.asarray((nearest < np.where(replayed, options.background.replayed, options.background.alike)) | cycle)
+    return np.asarray((nearest < np.where(replayed, SIMILAR_REPLAY_RESIDUAL, SIMILAR_ACTION_RESIDUAL)) | cycle)
 
 
 def event_level(model: ShapeModel, rate: float | None) -> float:

@@ -11,12 +11,25 @@ import torch
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows, stack
-from indexing.action.options import ActionOptions, ExemplarOptions
 from indexing.action.symmetry import turn
 from indexing.cameras import virtual
 from indexing.clip import Clip, stretches
 from indexing.modelfile import part, stored
-from indexing.windows import Ragged, RepairOptions, ragged, sample, whole
+from indexing.windows import Ragged, ragged, sample, whole
+
+# begin and end, in parts of the duration: extent and tempo search; the first is all of it
+CROPS = ((0.0, 1.0), (0.0, 0.85), (0.15, 1.0), (0.1, 0.9), (0.0, 0.7), (0.3, 1.0))
+NUM_VIEWS = 4  # virtual views per exemplar: of cards 8 give no more than 4
+NUM_VIEWS_SOLID = 12  # the same of exemplars with depth: +1 % over 4
+MAX_VIEW_CROP = 0.12  # part of the duration that a virtual view may lose at each end
+VIEW_ELEVATION = 0.1  # radians, of virtual cameras around 3D exemplars
+VIEW_ELEVATION_SIGMA = 0.15  # radians
+CARD_PITCH_SIGMA = 0.1  # radians, of turned cards
+MAX_SHORT_WINDOW = 0.5  # of the duration of an ordinary exemplar: a short window holds less than the action
+RECURRENCE_STEPS = 96  # steps in which an exemplar is compared with itself: eight of each cycle where it holds twelve
+SMOOTHED_STEPS = 2  # steps apart whose autocorrelation only noise keeps from 1: one step is smoothed into the next
+RECURRENCE_DROP = 0.3  # autocorrelation below which a movement has left the pose that it may come back to
+MAX_SAMPLED_MOMENTS = 500  # short windows that set the hub shares, and the levels of events
 
 
 @dataclass(frozen=True)
@@ -25,9 +38,9 @@ class ExemplarPlan:
 
     length: int = 12
     search: bool = True
-    views: int = ExemplarOptions.views
+    views: int = NUM_VIEWS
     turned: bool = True  # virtual views turn about the vertical; otherwise they are only cropped
-    repair: RepairOptions | None = None
+    repair: bool = False
     window: float = 1.0
     stride: float = 0.3
 
@@ -93,23 +106,19 @@ class Exemplars:
         )
 
 
-def cut(
-    clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Generator, options: ActionOptions = ActionOptions()
-) -> Exemplars:
+def cut(clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Generator) -> Exemplars:
     """Cut everything that is kept of the clips; 3D clips are rendered, first as seen along z, then from around."""
-    images = [_render(clip, 0.0, options.exemplars.elevation, random_state) for clip in clips]
+    images = [_render(clip, 0.0, VIEW_ELEVATION, random_state) for clip in clips]
     source = ragged(images, plan.repair)
     seen = torch.from_numpy(source.seen)
-    crops = options.exemplars.crops if plan.search else options.exemplars.crops[:1]
+    crops = CROPS if plan.search else CROPS[:1]
     cropped = stack([Windows(whole(source, plan.length, crop), seen) for crop in crops])
-    views = [_view(clips, source, plan, random_state, options) for _ in range(plan.views)]
+    views = [_view(clips, source, plan, random_state) for _ in range(plan.views)]
     seconds = torch.tensor([lasts(clip) for clip in images], dtype=torch.float32)
-    window = moment_window(plan.window, seconds, options.exemplars)
+    window = moment_window(plan.window, seconds)
     moments, owner = slide(source, plan.length, window, plan.stride * window / plan.window)
     solid = torch.tensor([clip.dims == 3 for clip in clips])
-    return Exemplars(
-        cropped, stack(views) if views else cropped[:0], moments, owner, solid, seconds, recurrence(source, options.exemplars)
-    )
+    return Exemplars(cropped, stack(views) if views else cropped[:0], moments, owner, solid, seconds, recurrence(source))
 
 
 def lasts(clip: Clip) -> float:
@@ -118,15 +127,15 @@ def lasts(clip: Clip) -> float:
     return float(clip.duration + (np.median(steps) if len(steps) else 0.0))
 
 
-def moment_window(longest: float, seconds: torch.Tensor | None, options: ExemplarOptions) -> float:
+def moment_window(longest: float, seconds: torch.Tensor | None) -> float:
     """Seconds of a short window: a part of an ordinary exemplar, and ``longest`` at most."""
-    return longest if seconds is None else min(longest, options.moment * float(seconds.median()))
+    return longest if seconds is None else min(longest, MAX_SHORT_WINDOW * float(seconds.median()))
 
 
-def recurrence(source: Ragged, options: ExemplarOptions) -> torch.Tensor:
+def recurrence(source: Ragged) -> torch.Tensor:
     r"""``(N,)`` how much each exemplar repeats itself within its first half: near 1 for two cycles or more, .3 or less for
     none."""
-    count, fine = len(source.starts) - 1, options.recurrence_steps
+    count, fine = len(source.starts) - 1, RECURRENCE_STEPS
     begin, end = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
     found = torch.zeros(count)
     for i in range(count):
@@ -138,8 +147,8 @@ def recurrence(source: Ragged, options: ExemplarOptions) -> torch.Tensor:
         curve = torch.stack([gram.diagonal(k).sum() for k in lags])
         norm = torch.stack([(energy[: fine - k].sum() * energy[k:].sum()).sqrt() for k in lags]).clamp(min=1e-30)
         curve = curve / norm
-        curve = (curve / curve[options.touching].clamp(min=options.fallen)).clamp(max=1.0)
-        fallen = (curve < options.fallen).nonzero()
+        curve = (curve / curve[SMOOTHED_STEPS].clamp(min=RECURRENCE_DROP)).clamp(max=1.0)
+        fallen = (curve < RECURRENCE_DROP).nonzero()
         if len(fallen):
             found[i] = float(curve[int(fallen[0]) :].max().clamp(min=0.0))
     return found
@@ -149,21 +158,19 @@ def _render(clip: Clip, azimuth: float, elevation: float, random_state: np.rando
     return virtual(clip, azimuth, elevation, random_state=random_state) if clip.dims == 3 else clip
 
 
-def _view(
-    clips: Sequence[Clip], source: Ragged, plan: ExemplarPlan, random_state: np.random.Generator, options: ActionOptions
-) -> Windows:
+def _view(clips: Sequence[Clip], source: Ragged, plan: ExemplarPlan, random_state: np.random.Generator) -> Windows:
     """One virtual view of every exemplar: rendered where it is 3D, the turned card where it is an image."""
     count = len(clips)
     azimuth = random_state.uniform(0, 2 * np.pi, count)
-    pitch = random_state.normal(scale=options.exemplars.pitch, size=count)
-    low, high = random_state.uniform(0, options.exemplars.edge, count), 1 - random_state.uniform(0, options.exemplars.edge, count)
+    pitch = random_state.normal(scale=CARD_PITCH_SIGMA, size=count)
+    low, high = random_state.uniform(0, MAX_VIEW_CROP, count), 1 - random_state.uniform(0, MAX_VIEW_CROP, count)
     solid = np.array([clip.dims == 3 for clip in clips])
     if solid.any() and plan.turned:
         lifted = [
             _render(
                 clip,
                 float(np.rad2deg(azimuth[i])),
-                options.exemplars.elevation + options.exemplars.elevation_spread * float(random_state.normal()),
+                VIEW_ELEVATION + VIEW_ELEVATION_SIGMA * float(random_state.normal()),
                 random_state,
             )
             if solid[i]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -13,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from dyntorch.numerics import one_thread
-from indexing.action import saving
 from indexing.action.background import (
+    FALSE_ALARM_RATE,
     OtherMovement,
     alike,
     event_level,
@@ -25,26 +24,27 @@ from indexing.action.background import (
     without_background,
 )
 from indexing.action.bank import Windows
-from indexing.action.exemplars import ExemplarPlan, Exemplars, cut, lasts
+from indexing.action.exemplars import CROPS, NUM_VIEWS, NUM_VIEWS_SOLID, ExemplarPlan, Exemplars, cut, lasts
 from indexing.action.inputs import check_common, check_plan, check_queries, gather, gather_groups, gather_labels
 from indexing.action.learning import Lesson, learn
-from indexing.action.model import ShapeModel
-from indexing.action.options import ActionOptions
-from indexing.action.stream import Stream
-from indexing.action.symmetry import mirror_permutation
+from indexing.action.model import ShapeModel, read_shape_model
+from indexing.action.stream import ActionOptions, Stream
+from indexing.action.symmetry import MAX_WINDOWS, mirror_permutation
 from indexing.clip import Clip, check_fps
-from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, SECONDS, Rule, SavedClassifier, is_positive, is_whole, one_of
+from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, Rule, SavedClassifier, is_positive, is_whole, one_of
 from indexing.joints import layout_of
-from indexing.recordings.explain import explain
-from indexing.recordings.explanation import Explanation, Withheld
+from indexing.modelfile import Parts, labels_from_json, labels_to_json, skeleton_from_json, skeleton_to_json, tensors_of
+from indexing.modelfile import whole as whole_number
+from indexing.recordings.decoding import Explanation, Withheld, explain
 from indexing.recordings.live import ActionStream, LiveSource
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
-from indexing.windows import RepairOptions, mended, ragged, whole
+from indexing.windows import mended, ragged, whole
 
 Array = NDArray[Any]
 
 
+MAX_KINDS_STORED = 10_000  # joints, or kinds of background, of a model file; the largest layouts have some hundred
 TEMPI = 100  # at most: a recording is compared once for each of them
 
 
@@ -76,10 +76,9 @@ class ActionIndexer(SavedClassifier):
             costs nothing on clean clips.
         window, stride, tempi: of the short windows of long recordings: seconds (half an ordinary exemplar at most), seconds between
             those of exemplars, speed factors tried.
-        pool: without effect: segments average by themselves; kept for programs and model files that have it.
         random_state: of the virtual views.
         device: where clips are compared, in ``fit`` too, e.g. ``"cuda"``; what was learned is kept on the CPU.
-        options: every other number that decides, by stage (:class:`~indexing.action.options.ActionOptions`); None: as measured.
+        options: how long recordings are read (:class:`~indexing.action.stream.ActionOptions`); None: the defaults.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  model_: the learned :class:`~indexing.action.model.ShapeModel`.
@@ -98,6 +97,9 @@ class ActionIndexer(SavedClassifier):
     """
 
     FITTED = "model_"
+    FORMAT = "dyntorch.action-indexer"
+    VERSION = 2
+    OPTIONS = ActionOptions
     RULES = {
         "view": one_of("any", "same"),
         "weights": one_of("equal", "learned"),
@@ -106,7 +108,6 @@ class ActionIndexer(SavedClassifier):
         "fps": POSITIVE,
         "window": POSITIVE,
         "stride": POSITIVE,
-        "pool": SECONDS,
         "tempi": Rule(
             lambda value: isinstance(value, Iterable) and 0 < len(list(value)) <= TEMPI and all(map(is_positive, value)),
             f"1 to {TEMPI} positive speed factors such as (0.7, 1.0, 1.4)",
@@ -135,7 +136,6 @@ class ActionIndexer(SavedClassifier):
         window: float = 1.0,
         stride: float = 0.3,
         tempi: Sequence[float] = (0.7, 1.0, 1.4),
-        pool: float = 2.1,
         random_state: int = 0,
         device: str = "cpu",
         options: ActionOptions | None = None,
@@ -154,25 +154,46 @@ class ActionIndexer(SavedClassifier):
         self.window = window
         self.stride = stride
         self.tempi = tempi
-        self.pool = pool
         self.random_state = random_state
         self.device = device
         self.options = options
 
-    @property
-    def _options(self) -> ActionOptions:
-        return ActionOptions() if self.options is None else self.options
-
-    @property
-    def _repair(self) -> RepairOptions | None:
-        return self._options.repair if self.repair else None
-
-    def _write(self, path: Path) -> None:
-        saving.save(self, path)
-
+    # ---- files -------------------------------------------------------------------------------------------------------
     @classmethod
-    def _read(cls, path: Path, device: str) -> Self:
-        return saving.load(cls, path, device)
+    def _stored_parameters(cls, header: Mapping[str, Any]) -> dict[str, Any]:
+        if header.get("layout") is not None:
+            raise ValueError("layout: depth of 2D examples is no longer guessed")
+        parameters = {name: value for name, value in header["parameters"].items() if name not in ("depth", "pool")}  # older files
+        return {**parameters, "tempi": tuple(parameters["tempi"])}
+
+    def _stored(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+        model, tensors = self.model_, tensors_of(self.model_)
+        if model.kernels is not None and model.kernels.scales is not None:
+            tensors["scales"] = model.kernels.scales
+        about = {
+            "classes": labels_to_json(self.classes_),
+            "hidden": model.hidden,
+            "joints": self.n_joints_,
+            "view": model.view,
+            "scorer": model.scorer,
+            "blend": dataclasses.asdict(model.blend),
+            "parts": [model.parts.gain, model.parts.sigma],
+            "groups": None if self.groups_ is None else self.groups_.tolist(),
+            "skeleton": skeleton_to_json(self.skeleton_),
+        }
+        return about, tensors
+
+    def _restore(self, header: Mapping[str, Any], parts: Parts) -> None:
+        self.classes_ = labels_from_json(header["classes"])
+        self.n_joints_ = whole_number(header["joints"], "joints", 1, MAX_KINDS_STORED)
+        self.skeleton_ = skeleton_from_json(header["skeleton"], self.n_joints_)
+        hidden = whole_number(header.get("hidden", 0), "hidden", 0, MAX_KINDS_STORED)  # older files know no background
+        crops = len(CROPS) if self.search else 1
+        self.model_: ShapeModel = read_shape_model(
+            parts, header, len(self.classes_), hidden, self.n_joints_, int(self.length), crops
+        )
+        self.groups_ = _groups(header["groups"], len(self.model_.labels))
+        self._calibrate()
 
     # ---- learning ----------------------------------------------------------------------------------------------------
     @one_thread
@@ -199,14 +220,14 @@ class ActionIndexer(SavedClassifier):
             ValueError: naming the clip or the parameter, what is wrong and what to do.
         """
         self.check_parameters()
-        found, owners = gather(clips, self.fps, options=self._options)
+        found, owners = gather(clips, self.fps)
         people = gather_groups(found, owners, groups)
         values = gather_labels(found, owners, labels)
         classes, numbers = np.unique(values, return_inverse=True)
         rng = np.random.default_rng(self.random_state)
         other = self._other_movement(found, len(classes) == 1, background)
-        plan = self._plan(_default_views(found, self._options))
-        exemplars = cut([*found, *other.clips], plan, rng, options=self._options)
+        plan = self._plan(_default_views(found))
+        exemplars = cut([*found, *other.clips], plan, rng)
         numbers = np.concatenate([numbers, len(classes) + other.numbers])
         if people is not None:
             people = np.concatenate([people, [f"background: {kind}" for kind in other.kinds]])
@@ -223,16 +244,16 @@ class ActionIndexer(SavedClassifier):
 
     def _other_movement(self, found: Sequence[Clip], alone: bool, background: Iterable[Any] | None) -> OtherMovement:
         """What is not one of the actions: what was given, and where there is one action alone what is made."""
-        options, skeleton = self._options.background, layout_of(found)
+        skeleton = layout_of(found)
         other = OtherMovement()
         if background is not None:
             lengths = [lasts(clip) for clip in found]
-            other += recorded(background, self.fps, found[0].joints.shape[1], skeleton, float(np.median(lengths)), options)
+            other += recorded(background, self.fps, found[0].joints.shape[1], skeleton, float(np.median(lengths)))
         if alone:
             # a generator of its own: what is made does not hang on how the exemplars are seen
             rng = np.random.default_rng(0)
-            people = performed(skeleton, 3 if all(clip.dims == 3 for clip in found) else 2, options, rng)
-            other += people + played_otherwise(found, not len(people), options, rng)
+            people = performed(skeleton, 3 if all(clip.dims == 3 for clip in found) else 2, rng)
+            other += people + played_otherwise(found, not len(people), rng)
         return other
 
     def _unlike(self, exemplars: Exemplars, numbers: Array, known: int, new: Array, other: OtherMovement | None = None) -> Array:
@@ -242,7 +263,7 @@ class ActionIndexer(SavedClassifier):
         own = np.where(hidden, numbers - known + 1, 0)[new | hidden]
         kinds = other.kinds if other is not None else ("",) * int(hidden.sum())
         kept = np.ones(len(numbers), dtype=bool)
-        kept[hidden] = ~alike(exemplars.only(asked), own, kinds, self._options)
+        kept[hidden] = ~alike(exemplars.only(asked), own, kinds)
         if other is not None:
             kept[hidden] |= np.array(other.sure)
         return kept
@@ -259,7 +280,7 @@ class ActionIndexer(SavedClassifier):
         if not hasattr(self, "model_"):
             return self.fit(clips, labels, groups)
         self.check_parameters()
-        found, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_, options=self._options)
+        found, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_)
         people = gather_groups(found, owners, groups)
         if self.weights == "learned" and (people is None) != (self.groups_ is None):
             here, there = ("these clips", "the earlier ones") if people is not None else ("the earlier clips", "these")
@@ -271,11 +292,11 @@ class ActionIndexer(SavedClassifier):
         known, fresh = np.unique(joined(self.classes_[before[named]], values), return_inverse=True)
         numbers = np.concatenate([before - self.model_.known + len(known), fresh[named.sum() :]])
         numbers[: len(before)][named] = fresh[: named.sum()]
-        check_plan(self, len(self._options.exemplars.crops) if self.search else 1, self.model_.exemplars)
+        check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
         plan = self._plan(len(self.model_.exemplars.views) // len(before))
         seed = 0 if self.random_state is None else self.random_state
         rng = np.random.default_rng([seed, len(before)])
-        extended = self.model_.exemplars.extended(cut(found, plan, rng, options=self._options))
+        extended = self.model_.exemplars.extended(cut(found, plan, rng))
         if self.model_.hidden:
             kept = self._unlike(extended, numbers, len(known), np.arange(len(numbers)) >= len(before))
             if len(known) > 1 or kept[numbers >= len(known)].any():
@@ -284,7 +305,7 @@ class ActionIndexer(SavedClassifier):
 
     def _plan(self, views: int) -> ExemplarPlan:
         views = views if self.virtual_views is None else self.virtual_views
-        return ExemplarPlan(self.length, self.search, views, self.view == "any", self._repair, self.window, self.stride)
+        return ExemplarPlan(self.length, self.search, views, self.view == "any", self.repair, self.window, self.stride)
 
     def _learn(
         self,
@@ -301,9 +322,8 @@ class ActionIndexer(SavedClassifier):
             originals = exemplars.crop(0)
             symmetry = mirror_permutation(
                 skeleton,
-                originals.values[: self._options.mirror.windows],
-                originals.seen[: self._options.mirror.windows],
-                options=self._options,
+                originals.values[:MAX_WINDOWS],
+                originals.seen[:MAX_WINDOWS],
             )
         if self.mirror is True and symmetry is None:
             raise ValueError(
@@ -322,11 +342,11 @@ class ActionIndexer(SavedClassifier):
             hidden=hidden,
         )
         there, labels = exemplars.to(self.device), torch.from_numpy(numbers).long().to(self.device)
-        model = learn(there, labels, len(classes) + hidden, lesson, options=self._options).to("cpu")
+        model = learn(there, labels, len(classes) + hidden, lesson).to("cpu")
         if len(classes) == 1 and given.stop > given.start:
             # these tell by themselves how near other movement comes to the action
             model = dataclasses.replace(model, evidence_out=model.evidence(exemplars.crop(0)[given]))
-        self.model_: ShapeModel = model
+        self.model_ = model
         self.groups_ = groups
         self.classes_ = classes
         self.n_joints_ = int(exemplars.crops.values.shape[2])
@@ -340,13 +360,13 @@ class ActionIndexer(SavedClassifier):
     @property
     def _rate(self) -> float | None:
         """The rate of false alarms that is asked for: of one action alone there is always one."""
-        return self._options.background.false_alarms if self.reject is None and len(self.classes_) == 1 else self.reject
+        return FALSE_ALARM_RATE if self.reject is None and len(self.classes_) == 1 else self.reject
 
     # ---- recognition -------------------------------------------------------------------------------------------------
     def _queries(self, clips: Iterable[Any]) -> Windows:
         check_is_fitted(self, "model_")
         found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_)
-        source = ragged(found, self._repair)
+        source = ragged(found, self.repair)
         check_common(found, source.seen, self.model_.shown())
         return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
 
@@ -393,7 +413,7 @@ class ActionIndexer(SavedClassifier):
 
     # ---- long recordings ---------------------------------------------------------------------------------------------
     def _stream(self) -> Stream:
-        return Stream(self.length, self.window, tuple(self.tempi), self.device)
+        return Stream(self.length, self.window, tuple(self.tempi), self.device, self.options or ActionOptions())
 
     @one_thread
     def explain(self, clip: Any, progress: Callable[[float], None] | None = None) -> Explanation:
@@ -407,10 +427,8 @@ class ActionIndexer(SavedClassifier):
         begin = float(found.times[0])
         times = found.times
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
-        found = mended(found, self._repair) if self._repair else found
+        found = mended(found) if self.repair else found
         model = self._model()
-        # nothing of this stage is learned: options set on a loaded model count
-        model = model.with_options(dataclasses.replace(model.options, recordings=self._options.recordings))
         rate = None if model.hidden else self.reject
         told = explain(
             model,
@@ -479,14 +497,13 @@ class ActionIndexer(SavedClassifier):
             ValueError: a frame rate that no camera has, or a lag that is shorter than an action.
         """
         model = self._model()
-        options = dataclasses.replace(model.options, recordings=self._options.recordings, live=self._options.live)
         source = LiveSource(
-            model.with_options(options),
+            model,
             tuple(self.classes_.tolist()),
             self._stream(),
             self._rate if model.hidden else self.reject,
             -np.inf if self.reject_threshold_ is None else self.reject_threshold_,
-            self._repair,
+            self.repair,
             self.n_joints_,
             self.skeleton_,
             check_fps(self.fps if fps is None else fps),
@@ -508,11 +525,19 @@ class ActionIndexer(SavedClassifier):
         return Clip(joints, label=label, skeleton=self.skeleton_, name=f"exemplar {index}", **timing)
 
 
-def _default_views(clips: Sequence[Clip], options: ActionOptions) -> int:
-    return options.exemplars.views_solid if any(clip.dims == 3 for clip in clips) else options.exemplars.views
+def _default_views(clips: Sequence[Clip]) -> int:
+    return NUM_VIEWS_SOLID if any(clip.dims == 3 for clip in clips) else NUM_VIEWS
 
 
 def _only(kept: Array, exemplars: Exemplars, numbers: Array, people: Array | None) -> tuple[Exemplars, Array, Array | None]:
     """Some exemplars, their classes numbered anew, and who performs them."""
     numbers = np.unique(numbers[kept], return_inverse=True)[1]
     return exemplars.only(torch.from_numpy(kept)), numbers, None if people is None else people[kept]
+
+
+def _groups(names: Any, exemplars: int) -> Array | None:
+    if names is None:
+        return None
+    if len(names) != exemplars or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"groups: {len(names)} names for {exemplars} exemplars")
+    return np.array(names, dtype=str)

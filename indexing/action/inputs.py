@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from dyntorch.numerics import affine_factorization, metric_upgrade
 from indexing.action.bank import COMMON
-from indexing.action.options import ActionOptions
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
 from indexing.joints import layout_of, matched_all
@@ -20,6 +19,9 @@ from indexing.movement import clip_of, clips_of, is_dataset
 from indexing.remarks import same_clips
 from indexing.skeleton import Skeleton
 from indexing.windows import check_clips, ragged, sample, torn
+
+# share of the energy; a detector's noise leaves .002-.005, views that lag by .3 s .006-.04, another action .01-.05
+MAX_UNEXPLAINED = 0.01
 
 # ----------------------------------------------------------------------------------------------------------------------
 # One performance seen by several synchronized cameras -> one exemplar in 3D, where the views decide its shape.
@@ -29,7 +31,7 @@ from indexing.windows import check_clips, ragged, sample, torn
 # .002-.005, views that lag by .3 s .006-.04, views of another action .01-.05.
 
 
-def combine(views: tuple[Clip, ...], options: ActionOptions = ActionOptions()) -> list[Clip]:
+def combine(views: tuple[Clip, ...]) -> list[Clip]:
     """A 3D clip from three or more views that decide it; otherwise the views themselves, each an exemplar of its own."""
     first = views[0]
     for i, view in enumerate(views):
@@ -54,7 +56,7 @@ def combine(views: tuple[Clip, ...], options: ActionOptions = ActionOptions()) -
     windows = sample(source, np.arange(len(views)), np.full(len(views), start), np.full(len(views), end), steps)
     shape, cameras, left = affine_factorization(windows[:, :, torch.from_numpy(seen)].flatten(1, 2))
     metric, decided = metric_upgrade(shape, cameras)
-    if not bool(decided) or float(left) > options.exemplars.unexplained:
+    if not bool(decided) or float(left) > MAX_UNEXPLAINED:
         why = (
             f"{float(left):.0%} of the motion is not one rigid space-time shape"
             if decided
@@ -99,12 +101,7 @@ def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
 
 
 def gather(
-    clips: Iterable[Any],
-    fps: float,
-    joints: int | None = None,
-    skeleton: Skeleton | None = None,
-    *,
-    options: ActionOptions = ActionOptions(),
+    clips: Iterable[Any], fps: float, joints: int | None = None, skeleton: Skeleton | None = None
 ) -> tuple[list[Clip], list[int]]:
     """Checked training clips and, for each, the item it came from (views that do not decide the shape stay apart)."""
     found: list[Clip] = []
@@ -114,7 +111,7 @@ def gather(
     for i, given in enumerate(items):
         views = matched_all(given if isinstance(given, tuple) else [given], skeleton)
         item = tuple(views) if isinstance(given, tuple) else views[0]
-        parts = combine(item, options=options) if isinstance(item, tuple) else [item]
+        parts = combine(item) if isinstance(item, tuple) else [item]
         found += parts
         owners += [i] * len(parts)
     check_clips(found, joints, owners)

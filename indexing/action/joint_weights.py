@@ -28,9 +28,19 @@ from indexing.action.bank import (
     fusion,
     planes_of,
 )
-from indexing.action.options import ActionOptions
 from indexing.action.planes import GRAM_EPSILON, Entries, Fusion
 from indexing.modelfile import stored
+
+NUM_CANDIDATES = 2  # nearest exemplars per class that a query is compared with: as many as the scorer averages
+PULLS = (1.0, 0.3, 0.1, 0.03)  # towards equal weights, that are tried, strongest first
+NUM_STEPS = 40  # of Adam; stopping early pulls, too: with junk joints 80 steps win .27, 40 win .34
+LEARNING_RATE = 0.1  # at the start; it falls to 0
+INITIAL_LOG_SHARPNESS = 1.0  # of the softmax over classes
+MAX_FOLDS = 4  # of the groups, each held out once
+MIN_GAIN_SIGMAS = 1.0  # standard errors over groups by which learning must beat equal weights
+NUM_ROUNDS = 2  # of finding the nearest exemplars and learning the weights
+MAX_QUERIES = 200
+MAX_ENTRIES = 60_000  # queries x classes x joints: 3.5 s of one core, 7 s where it learns
 
 MOST_WEIGHT = 1e6  # of a joint or a scorer, the mean being 1
 
@@ -107,7 +117,6 @@ def gather(
     labels: Tensor,
     groups: Tensor,
     hub: Tensor,
-    options: ActionOptions = ActionOptions(),
 ) -> Evidence:
     """The tables of queries and, of each class, the exemplars of other groups that are nearest to them."""
     metric, found_by = metrics
@@ -121,8 +130,8 @@ def gather(
     chosen, valid = [], []
     for action in range(int(labels.max()) + 1):
         mine = (labels == action).nonzero()[:, 0]
-        value, place = table[:, mine].topk(min(options.joints.candidates, len(mine)), dim=1, largest=False)
-        room = (0, options.joints.candidates - place.shape[1])
+        value, place = table[:, mine].topk(min(NUM_CANDIDATES, len(mine)), dim=1, largest=False)
+        room = (0, NUM_CANDIDATES - place.shape[1])
         chosen.append(torch.nn.functional.pad(mine[place], room))
         valid.append(torch.nn.functional.pad(value.isfinite(), room))
     index = torch.stack(chosen)  # (classes, Q, K)
@@ -225,7 +234,6 @@ def learn_joint_weights(
     hub: Tensor | None = None,
     symmetry: Tensor | None = None,
     seed: int = 0,
-    options: ActionOptions = ActionOptions(),
 ) -> JointWeights:
     r"""Weights :math:`w \ge 0` of joints and channels under which exemplars of other groups name the queries best. groups
     ``(N,)``, hub ``(N,)``, symmetry ``(joints,)``."""
@@ -241,24 +249,24 @@ def learn_joint_weights(
     usable = _usable(labels, groups)[owner].nonzero()[:, 0]
     if len(labels[owner[usable]].unique()) < 2:
         return JointWeights.equal(count, home)
-    limit = max(1, min(options.joints.queries, options.joints.entries // (count * classes)))
+    limit = max(1, min(MAX_QUERIES, MAX_ENTRIES // (count * classes)))
     rows = usable[torch.randperm(len(usable), generator=torch.Generator().manual_seed(seed))[:limit].to(home)]
     query, owner, tied = query[rows], owner[rows], torch.arange(count) if symmetry is None else symmetry
     found, tied = JointWeights.equal(count, home), tied.to(home)
-    for _ in range(options.joints.rounds):  # the nearest exemplars, by what was learned before
+    for _ in range(NUM_ROUNDS):  # the nearest exemplars, by what was learned before
         metrics = metric, found.metric(metric)
-        evidence = gather(query, owner, copies, metrics, found.channels, labels, groups, hub, options=options)
-        found = _from_evidence(evidence, tied, classes, seed, options)
+        evidence = gather(query, owner, copies, metrics, found.channels, labels, groups, hub)
+        found = _from_evidence(evidence, tied, classes, seed)
         if not found.learned:
             break
     return found
 
 
-def _from_evidence(evidence: Evidence, tied: Tensor, classes: int, seed: int, options: ActionOptions) -> JointWeights:
+def _from_evidence(evidence: Evidence, tied: Tensor, classes: int, seed: int) -> JointWeights:
     """For all actions together, and then for each."""
     equal = torch.ones(len(NEAREST), 1, len(tied), device=tied.device), torch.ones(len(NEAREST), device=tied.device)
-    together = _choose(evidence, _Together(tied, *equal), seed, options)
-    each = _choose(evidence, _Each(tied, together.joints, together.channels, classes), seed, options)
+    together = _choose(evidence, _Together(tied, *equal), seed)
+    each = _choose(evidence, _Each(tied, together.joints, together.channels, classes), seed)
     by_class = None if each.joints.shape[1] == 1 else _mean_one((each.joints / together.joints)[0])
     gain, sigma = together.gain + each.gain, (together.sigma**2 + each.sigma**2) ** 0.5
     return JointWeights(together.joints[:, 0], together.channels, by_class, gain, sigma)
@@ -313,31 +321,31 @@ class _Choice:
     sigma: float = 0.0
 
 
-def _choose(evidence: Evidence, stage: _Together, seed: int, options: ActionOptions) -> _Choice:
+def _choose(evidence: Evidence, stage: _Together, seed: int) -> _Choice:
     """Learn with the strongest pull that held-out groups cannot tell from the best; not at all where they gain nothing."""
     before = _Choice(stage.joints, stage.channels)
     names, group = evidence.groups.unique(return_inverse=True)
     if len(names) < 3:
         return before
-    folds = min(options.joints.folds, len(names))
+    folds = min(MAX_FOLDS, len(names))
     part = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed)).to(group.device)[group] % folds
     held = part == torch.arange(folds + 1, device=group.device)[:, None]  # in the last problem nothing is held out
-    losses, (joints, channels) = _descend(evidence, stage, ~held, options)
+    losses, (joints, channels) = _descend(evidence, stage, ~held)
     here = losses[part, :, torch.arange(len(part), device=part.device)]  # (Q, pulls) where a query was held out
     won = here[:, :1] - here[:, 1:]
     by_group = torch.stack([won[group == number].mean(dim=0) for number in range(len(names))])
     gain, sigma = by_group.mean(dim=0), by_group.std(dim=0) / len(names) ** 0.5
     best = int(gain.argmax())
-    if gain[best] <= options.joints.sigmas * sigma[best]:
+    if gain[best] <= MIN_GAIN_SIGMAS * sigma[best]:
         return before
     chosen = int((gain >= gain[best] - sigma[best]).nonzero()[0, 0])
     return _Choice(joints[-1, 1 + chosen], channels[-1, 1 + chosen], float(gain[chosen]), float(sigma[chosen]))
 
 
-def _descend(evidence: Evidence, stage: _Together, train: Tensor, options: ActionOptions) -> tuple[Tensor, Weights]:
+def _descend(evidence: Evidence, stage: _Together, train: Tensor) -> tuple[Tensor, Weights]:
     """Every pull on every part of the queries at once: ``(parts, 1 + pulls, Q)`` losses, and the weights; first without
     learning."""
-    pulls = evidence.hub.new_tensor(options.joints.pulls)
+    pulls = evidence.hub.new_tensor(PULLS)
     shape = len(train), 1 + len(pulls)
     learning = torch.ones(shape, device=pulls.device)
     learning[:, 0] = 0.0
@@ -345,8 +353,8 @@ def _descend(evidence: Evidence, stage: _Together, train: Tensor, options: Actio
     pull = torch.cat([pulls[:1], pulls]).repeat(len(train))
     share = (train.to(evidence.hub) / train.sum(dim=1, keepdim=True)).repeat_interleave(shape[1], dim=0)
     logs = [value.to(evidence.hub).expand(len(pull), *value.shape).clone().requires_grad_() for value in stage.start()]
-    sharp = torch.full((len(pull),), options.joints.sharp).to(evidence.hub).requires_grad_()
-    optimizer = torch.optim.Adam([sharp, *logs], lr=options.joints.rate)
+    sharp = torch.full((len(pull),), INITIAL_LOG_SHARPNESS).to(evidence.hub).requires_grad_()
+    optimizer = torch.optim.Adam([sharp, *logs], lr=LEARNING_RATE)
 
     def losses() -> tuple[Tensor, list[Tensor], Weights]:
         free = [value * learning.view(-1, *(1 for _ in value.shape[1:])) for value in logs]
@@ -354,8 +362,8 @@ def _descend(evidence: Evidence, stage: _Together, train: Tensor, options: Actio
         scores = sharp.exp()[:, None, None] * evidence.scores(*weights)
         return torch.nn.functional.cross_entropy(scores.mT, evidence.labels.expand(len(pull), -1), reduction="none"), free, weights
 
-    for step in range(options.joints.steps):
-        optimizer.param_groups[0]["lr"] = options.joints.rate * (1 - step / options.joints.steps)
+    for step in range(NUM_STEPS):
+        optimizer.param_groups[0]["lr"] = LEARNING_RATE * (1 - step / NUM_STEPS)
         optimizer.zero_grad()
         loss, free, _ = losses()
         penalty = sum(value.square().flatten(1).mean(dim=1) for value in free)

@@ -9,11 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from indexing.action.bank import JointMetric, Kernels, Windows, stack
-from indexing.action.exemplars import Exemplars
+from indexing.action.bank import COVARIANCE_FLOOR, MACHINE_WHITENING_POWER, WHITENING_POWER, JointMetric, Kernels, Windows, stack
+from indexing.action.exemplars import CARD_PITCH_SIGMA, MAX_SAMPLED_MOMENTS, Exemplars
 from indexing.action.joint_weights import JointWeights, learn_joint_weights
 from indexing.action.model import (
+    NEAREST_WEIGHT,
+    PENALTY,
     Blend,
+    ClassProfiles,
     PairwiseMachine,
     ShapeModel,
     class_scores,
@@ -21,9 +24,26 @@ from indexing.action.model import (
     mirror_some,
     standardized,
 )
-from indexing.action.options import ActionOptions
-from indexing.action.profiles import ClassProfiles
 from indexing.action.symmetry import turn
+from indexing.scoring import SHARPNESS
+
+MIN_MUTUAL_SHARE = 0.5  # of the mirror images of two classes that are nearest to the other one: neither is mirrored then
+HUB_SHARE = 0.5  # of an exemplar's closeness to other classes that is taken off: +2..3 %, one shot +4 %
+NUM_HUB_NEIGHBOURS = 5  # nearest windows of other classes that measure that closeness
+MAX_TRAINING_ROWS = 3000  # the fit of the kernel machine grows with their square
+MAX_TRAINING_ROWS_SOLID = 5000  # the same where exemplars have depth: true views are worth more
+NEAREST_WEIGHT_SOLID = 0.5  # the same for exemplars with depth: B then sees true views (1.5: -1.5 % on Florence3D)
+BLENDS = ((1.0, 0.0), (1.0, 0.25), (1.0, 0.5), (1.0, 1.0), (1.0, 1.5), (1.0, 3.0), (0.0, 1.0))  # weights of B and A that are tried
+SHARPNESSES = tuple(float(2 ** (k / 4)) for k in range(-4, 17))  # that are tried: .5 to 16
+MIN_EXAMPLES_TO_BLEND = 8  # per class; from 5 on it costs 1 to 2 % on UTKinect
+MAX_FOLDS = 5  # groups of people whose machines are trained
+NUM_QUERY_VIEWS = 4  # virtual views that ask per exemplar, besides the image itself
+QUERY_NOISE = 0.01  # of the body height, on these views: without it the kernel machine looks too good
+HALVES_PER_JOINT = 4  # random halves: importances from two seeds then correlate by .83-.98 on UTKinect
+MIN_HALVES = 32
+MAX_HALVES = 200
+MAX_IMPORTANCE_QUERIES = 120
+IMPORTANCE_RIDGE = 1.0  # of the regression on 0/1 masks, in masks: matters only with more joints than halves
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How the scorers are weighed, learned from people who were left out: once over the whole set, whatever its actions are.
@@ -33,10 +53,10 @@ from indexing.action.symmetry import turn
 # scorer looks perfect and nothing is learned (UTKinect .939 against .953 without): so groups must be known.
 
 
-def leave_out(groups: Tensor, options: ActionOptions = ActionOptions()) -> Tensor:
+def leave_out(groups: Tensor) -> Tensor:
     """``(N,)`` number of the fold of each exemplar: people are dealt to at most five folds."""
     _, number = groups.unique(return_inverse=True)
-    return number % min(options.blend.folds, int(number.max()) + 1)
+    return number % min(MAX_FOLDS, int(number.max()) + 1)
 
 
 @dataclass(frozen=True)
@@ -50,7 +70,7 @@ class Trained:
 
 def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> Blend:
     """The blend that serves people best who were left out. groups ``(N,)``."""
-    labels, folds = model.labels, leave_out(groups, options=model.options)
+    labels, folds = model.labels, leave_out(groups)
     # only those are asked whose action somebody in another fold performs, too
     usable = ((folds[:, None] != folds[None]) & (labels[:, None] == labels[None])).any(dim=1)
     if int(folds.max()) < 1 or not bool(usable.any()):
@@ -67,17 +87,15 @@ def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> B
     evidence = torch.cat([view[:, usable] for view in views], dim=1).double()
     truth = labels[usable].repeat(len(asked))
     if model.scorer != "both":
-        return _sharpened(model.blend, evidence[0], truth, int(usable.sum()), model.options)
-    few = int(torch.bincount(labels).median()) < model.options.blend.enough
-    blend = model.blend if few else _fewest_mistakes(evidence, truth, model.blend, model.options)
-    return _sharpened(blend, blended(evidence, blend), truth, int(usable.sum()), model.options)
+        return _sharpened(model.blend, evidence[0], truth, int(usable.sum()))
+    few = int(torch.bincount(labels).median()) < MIN_EXAMPLES_TO_BLEND
+    blend = model.blend if few else _fewest_mistakes(evidence, truth, model.blend)
+    return _sharpened(blend, blended(evidence, blend), truth, int(usable.sum()))
 
 
 def _out(residuals: Tensor, model: ShapeModel, folds: Tensor) -> Tensor:
     """``(N, classes)`` scores of every exemplar among those of the other folds."""
-    scores = class_scores(
-        residuals.masked_fill(folds[:, None] == folds[None], torch.inf), model.labels, model.classes, options=model.options
-    )
+    scores = class_scores(residuals.masked_fill(folds[:, None] == folds[None], torch.inf), model.labels, model.classes)
     known = scores.isfinite()
     least = torch.where(known, scores, torch.inf).amin(dim=1, keepdim=True)
     return torch.where(known, scores, least.nan_to_num(posinf=0.0))
@@ -88,8 +106,8 @@ def asked_views(model: ShapeModel) -> list[Windows]:
     rng, whole = np.random.default_rng(0), model.exemplars.crop(0)
     count = len(whole)
     asked = [whole]
-    for i in range(model.options.blend.views):
-        azimuth, pitch = rng.uniform(0, 2 * np.pi, count), rng.normal(scale=model.options.exemplars.pitch, size=count)
+    for i in range(NUM_QUERY_VIEWS):
+        azimuth, pitch = rng.uniform(0, 2 * np.pi, count), rng.normal(scale=CARD_PITCH_SIGMA, size=count)
         if bool(model.exemplars.solid.any()):
             if i >= len(model.exemplars.views) // count:
                 break
@@ -98,7 +116,7 @@ def asked_views(model: ShapeModel) -> list[Windows]:
             values = turn(whole.values, azimuth, pitch)
         size = (values[..., 1].amax(dim=2) - values[..., 1].amin(dim=2)).median(dim=1).values
         noise = torch.from_numpy(rng.normal(size=values.shape)).to(values)
-        asked.append(Windows(values + model.options.blend.noise * size[:, None, None, None] * noise, whole.seen))
+        asked.append(Windows(values + QUERY_NOISE * size[:, None, None, None] * noise, whole.seen))
     return asked
 
 
@@ -114,7 +132,7 @@ def _machine_out(model: ShapeModel, trained: Trained, asked: Windows, folds: Ten
         known, numbers = np.unique(model.labels[owner[kept]].cpu().numpy(), return_inverse=True)
         if len(known) < 2:
             continue
-        machine = PairwiseMachine.fit(trained.gram[kept][:, kept], numbers, model.options.machine.penalty)
+        machine = PairwiseMachine.fit(trained.gram[kept][:, kept], numbers, PENALTY)
         scores = machine(against[mine][:, kept[machine.support.to(kept.device)]])
         out[mine[:, None], torch.from_numpy(known).to(mine.device)[None]] = scores
     return out
@@ -125,10 +143,10 @@ def blended(evidence: Tensor, blend: Blend) -> Tensor:
     return blend.kernel * evidence[0] + blend.nearest * evidence[1]
 
 
-def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend, options: ActionOptions) -> Blend:
+def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend) -> Blend:
     """Among blends with the same number of mistakes, that next to the one that is used where nothing was learned."""
     best, chosen = (float("inf"), 0.0), prior
-    for kernel, nearest in options.blend.blends:
+    for kernel, nearest in BLENDS:
         blend = dataclasses.replace(prior, kernel=kernel, nearest=nearest)
         wrong = float((blended(evidence, blend).argmax(dim=1) != truth).sum())
         far = abs(nearest / (kernel + nearest) - prior.nearest / (prior.kernel + prior.nearest))
@@ -137,16 +155,16 @@ def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend, options: Act
     return chosen
 
 
-def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int, options: ActionOptions) -> Blend:
+def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int) -> Blend:
     """The blend with the sharpness that makes the answers most likely, were one more of the exemplars asked a mistake."""
     even, count = standardized(scores), scores.shape[1]
     doubt = 1 / (exemplars + 2)
     losses = []
-    for sharp in options.blend.sharpnesses:
+    for sharp in SHARPNESSES:
         chance = torch.log_softmax(sharp * even, dim=1)
         right = chance.gather(1, truth[:, None])[:, 0]
         losses.append(-float((1 - doubt) * right.mean() + doubt * chance.mean() * count / max(count - 1, 1)))
-    return dataclasses.replace(blend, sharpness=options.blend.sharpnesses[int(np.argmin(losses))])
+    return dataclasses.replace(blend, sharpness=SHARPNESSES[int(np.argmin(losses))])
 
 
 @dataclass(frozen=True)
@@ -162,22 +180,20 @@ class Lesson:
     hidden: int = 0
 
 
-def learn(
-    exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson, options: ActionOptions = ActionOptions()
-) -> ShapeModel:
+def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) -> ShapeModel:
     """Learn everything from the exemplars' windows. labels ``(N,)``."""
     originals = exemplars.crop(0)
     nothing = torch.zeros(len(labels), device=labels.device)
-    metric = JointMetric.learn(originals.values, originals.seen, options.nearest.whitening, options.nearest.floor)
+    metric = JointMetric.learn(originals.values, originals.seen, WHITENING_POWER, COVARIANCE_FLOOR)
     none, share = torch.zeros_like(labels, dtype=torch.bool), float(exemplars.solid.float().mean())
     model = ShapeModel(
         exemplars, labels, classes, lesson.view, lesson.scorer, metric, lesson.symmetry, none,
         JointWeights.equal(originals.values.shape[2], labels.device),
         nothing, torch.zeros_like(exemplars.owner, dtype=nothing.dtype), None, None, None,
         blend=Blend(
-            nearest=share * options.blend.balance_solid + (1 - share) * options.blend.balance, sharpness=options.decisions.sharpness
+            nearest=share * NEAREST_WEIGHT_SOLID + (1 - share) * NEAREST_WEIGHT, sharpness=SHARPNESS
         ),
-        options=options, hidden=lesson.hidden,
+        hidden=lesson.hidden,
     )  # fmt: skip
     if lesson.symmetry is not None:
         model = dataclasses.replace(model, mirrored=_mirror_is_same_action(model, originals) if lesson.guard else ~none)
@@ -202,15 +218,7 @@ def _parts(model: ShapeModel, lesson: Lesson) -> JointWeights:
     owner = torch.arange(len(model.labels), device=model.labels.device).repeat(len(asked))
     groups, symmetry = lesson.groups, lesson.symmetry
     return learn_joint_weights(
-        stack(asked),
-        owner,
-        model.copies(),
-        model.metric,
-        model.labels,
-        groups=groups,
-        hub=model.hub,
-        symmetry=symmetry,
-        options=model.options,
+        stack(asked), owner, model.copies(), model.metric, model.labels, groups=groups, hub=model.hub, symmetry=symmetry
     )
 
 
@@ -222,7 +230,7 @@ def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
     nearest = model.labels[model.residuals(flipped).argmin(dim=1)]
     own = torch.nn.functional.one_hot(model.labels, model.classes).float()
     lands = own.mT @ torch.nn.functional.one_hot(nearest, model.classes).float() / own.sum(dim=0).clamp(min=1)[:, None]
-    mutual = (lands > model.options.mirror.mutual) & (lands.mT > model.options.mirror.mutual)
+    mutual = (lands > MIN_MUTUAL_SHARE) & (lands.mT > MIN_MUTUAL_SHARE)
     mutual.fill_diagonal_(False)
     return ~mutual.any(dim=1)[model.labels]
 
@@ -230,12 +238,12 @@ def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
 def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
     """Measure, among the exemplars, how close each is to other classes."""
     residual, labels = model.residuals(originals), model.labels
-    model = dataclasses.replace(model, hub=_hub(residual, labels, labels, model.options))
-    step = max(1, len(model.exemplars.moments) // model.options.nearest.moments)
+    model = dataclasses.replace(model, hub=_hub(residual, labels, labels))
+    step = max(1, len(model.exemplars.moments) // MAX_SAMPLED_MOMENTS)
     sample = torch.arange(0, len(model.exemplars.moments), step, device=labels.device)
     labels = labels[model.exemplars.owner]
     residual = model.moment_residuals(model.exemplars.moments[sample])
-    return dataclasses.replace(model, moment_hub=_hub(residual, labels[sample], labels, model.options))
+    return dataclasses.replace(model, moment_hub=_hub(residual, labels[sample], labels))
 
 
 def _with_evidence(model: ShapeModel, originals: Windows) -> ShapeModel:
@@ -244,15 +252,15 @@ def _with_evidence(model: ShapeModel, originals: Windows) -> ShapeModel:
     if model.kernels is not None:
         tables.append(model.kernel_residuals(originals))
     labels = model.labels
-    profiles = _profiles([tables[0] - model.hub, *tables[1:]], labels, model.classes, model.hidden, model.options)
+    profiles = _profiles([tables[0] - model.hub, *tables[1:]], labels, model.classes, model.hidden)
     return dataclasses.replace(model, profiles=profiles, evidence_out=_evidence_out(tables, model))
 
 
-def _profiles(tables: list[Tensor], labels: Tensor, classes: int, hidden: int, options: ActionOptions) -> ClassProfiles | None:
+def _profiles(tables: list[Tensor], labels: Tensor, classes: int, hidden: int) -> ClassProfiles | None:
     """The profiles of exemplars, each asked as if it had not been learned; tables ``(N, N)`` of residuals among them."""
     itself = torch.eye(len(labels), dtype=torch.bool, device=labels.device)
-    scores = [class_scores(table.masked_fill(itself, torch.inf), labels, classes, options=options) for table in tables]
-    return ClassProfiles.learn(torch.cat(scores, dim=1), labels, classes - hidden, options.nearest)
+    scores = [class_scores(table.masked_fill(itself, torch.inf), labels, classes) for table in tables]
+    return ClassProfiles.learn(torch.cat(scores, dim=1), labels, classes - hidden)
 
 
 def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
@@ -268,12 +276,12 @@ def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
             continue
         labels = model.labels[rest] - (model.labels[rest] > c).long()
         among, asked = [table[rest][:, rest] for table in tables], [table[mine][:, rest] for table in tables]
-        hub = _hub(among[0], labels, labels, model.options)
+        hub = _hub(among[0], labels, labels)
         among[0], asked[0] = among[0] - hub, asked[0] - hub
-        profiles = _profiles(among, labels, classes, hidden, model.options)
-        scores = [class_scores(table, labels, classes, options=model.options) for table in asked]
+        profiles = _profiles(among, labels, classes, hidden)
+        scores = [class_scores(table, labels, classes) for table in asked]
         unusual = None if profiles is None else profiles.distance(torch.cat(scores, dim=1), classes)
-        found.append(evidence(scores[0], model.classes, unusual, hidden, options=model.options))
+        found.append(evidence(scores[0], model.classes, unusual, hidden))
         refused.append(scores[0].argmax(dim=1) >= classes - hidden)
     if not found:
         return tables[0].new_zeros(0)
@@ -284,28 +292,26 @@ def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
 def _between_kinds(residual: Tensor, model: ShapeModel) -> Tensor:
     """How near exemplars of background come to every kind that is not theirs: as near another movement comes to the action."""
     rows = model.labels >= model.known
-    scores = class_scores(residual[rows], model.labels, model.classes, options=model.options)
+    scores = class_scores(residual[rows], model.labels, model.classes)
     foreign = torch.nn.functional.one_hot(model.labels[rows], model.classes) == 0
     return scores[:, model.known :][foreign[:, model.known :]]
 
 
-def _hub(residual: Tensor, rows: Tensor, columns: Tensor, options: ActionOptions) -> Tensor:
+def _hub(residual: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     """``(columns,)`` half the mean residual from the nearest windows of other classes: near to everything = little evidence."""
     other = rows[:, None] != columns[None]
-    count = max(1, min(options.nearest.hub_neighbours, int(other.sum(dim=0).min())))
+    count = max(1, min(NUM_HUB_NEIGHBOURS, int(other.sum(dim=0).min())))
     foreign = torch.where(other, residual, torch.inf).topk(count, dim=0, largest=False).values.mean(dim=0)
     # a class that the sampled rows hold alone has nothing to compare with: it gets the usual share
     known = foreign.isfinite()
-    return options.nearest.hub_share * torch.where(
-        known, foreign, foreign[known].mean() if known.any() else foreign.new_tensor(0.0)
-    )
+    return HUB_SHARE * torch.where(known, foreign, foreign[known].mean() if known.any() else foreign.new_tensor(0.0))
 
 
 def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Trained]:
     """Train scorer B on the exemplars, their virtual views and mirror images, as many as the budget of rows allows."""
     exemplars, count = model.exemplars, len(model.exemplars)
     both = model.symmetry is not None and bool(model.mirrored.any())
-    rows_at_most = model.options.machine.rows_solid if bool(exemplars.solid.any()) else model.options.machine.rows
+    rows_at_most = MAX_TRAINING_ROWS_SOLID if bool(exemplars.solid.any()) else MAX_TRAINING_ROWS
     copies = max(1, rows_at_most // (count * (1 + both)))
     parts = [exemplars.crop(0)] + [exemplars.view(i) for i in range(min(copies - 1, len(exemplars.views) // count))]
     rows, owner = stack(parts), torch.arange(count, device=model.labels.device).repeat(len(parts))
@@ -313,11 +319,9 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
         chosen = model.mirrored[owner]
         rows = stack([rows, mirror_some(rows[chosen], model.symmetry, chosen[chosen])])
         owner = torch.cat([owner, owner[chosen]])
-    kernels = Kernels(
-        JointMetric(model.metric.covariance, model.options.machine.whitening, floor=model.metric.floor), one_side=one_side
-    )
-    gram = kernels.fit(rows, model.options.machine)
-    machine = PairwiseMachine.fit(gram, model.labels[owner].cpu().numpy().astype(np.int64), model.options.machine.penalty)
+    kernels = Kernels(JointMetric(model.metric.covariance, MACHINE_WHITENING_POWER, floor=model.metric.floor), one_side=one_side)
+    gram = kernels.fit(rows)
+    machine = PairwiseMachine.fit(gram, model.labels[owner].cpu().numpy().astype(np.int64), PENALTY)
     trained = Trained(rows, owner, gram)
     return dataclasses.replace(model, kernels=kernels, support=rows[machine.support.to(owner.device)], machine=machine), trained
 
@@ -335,17 +339,17 @@ def importance(model: ShapeModel, groups: Tensor | None = None, seed: int = 0) -
     originals, labels = model.exemplars.crop(0), model.labels
     groups = torch.arange(len(labels), device=labels.device) if groups is None else groups.to(labels.device)
     generator = torch.Generator().manual_seed(seed)
-    asked = _asked(labels, generator, model.options)
+    asked = _asked(labels, generator)
     query, truth = originals[asked], labels[asked]
     hidden = groups[asked][:, None] == groups[None]
     member = torch.nn.functional.one_hot(labels, model.classes).double()
     hidden &= ((~hidden).double() @ member > 0)[:, labels]
-    masks = halves(originals.seen.shape[1], generator, options=model.options).to(labels.device)
+    masks = halves(originals.seen.shape[1], generator).to(labels.device)
     margins = torch.stack([_margins(model, query, truth, hidden, mask) for mask in masks])  # (masks, queries)
     by_class = margins @ (member[asked] / member[asked].sum(dim=0).clamp(min=1))
     design = masks.double() - masks.double().mean(dim=0)
     gram = design.mT @ design
-    gram.diagonal().add_(model.options.importance.ridge)
+    gram.diagonal().add_(IMPORTANCE_RIDGE)
     return torch.linalg.solve(gram, design.mT @ (by_class - by_class.mean(dim=0))).mT
 
 
@@ -355,26 +359,24 @@ def typical(model: ShapeModel) -> Tensor:
     out = torch.zeros(model.classes, dtype=torch.long)
     for action in range(model.classes):
         mine = (labels == action).nonzero()[:, 0]
-        out[action] = mine[model.residuals(originals[mine[: model.options.importance.queries]])[:, mine].mean(dim=0).argmin()]
+        out[action] = mine[model.residuals(originals[mine[:MAX_IMPORTANCE_QUERIES]])[:, mine].mean(dim=0).argmin()]
     return out
 
 
-def halves(joints: int, generator: torch.Generator, options: ActionOptions = ActionOptions()) -> Tensor:
+def halves(joints: int, generator: torch.Generator) -> Tensor:
     """``(masks, joints)`` bool: random halves of the joints and, after each, the other half; of at least three joints."""
     size = max(min(3, joints), joints // 2)
     out = []
-    for _ in range(
-        min(options.importance.most_halves, max(options.importance.least_halves, options.importance.halves * joints)) // 2
-    ):
+    for _ in range(min(MAX_HALVES, max(MIN_HALVES, HALVES_PER_JOINT * joints)) // 2):
         order = torch.randperm(joints, generator=generator)
         for part in (order[:size], order[joints - size :]):
             out.append(torch.zeros(joints, dtype=torch.bool).index_fill_(0, part, True))
     return torch.stack(out)
 
 
-def _asked(labels: Tensor, generator: torch.Generator, options: ActionOptions) -> Tensor:
-    """At most ``options.importance.queries`` exemplars, as many of every class as there are or as fit."""
-    each = max(1, options.importance.queries // int(labels.max() + 1))
+def _asked(labels: Tensor, generator: torch.Generator) -> Tensor:
+    """At most ``MAX_IMPORTANCE_QUERIES`` exemplars, as many of every class as there are or as fit."""
+    each = max(1, MAX_IMPORTANCE_QUERIES // int(labels.max() + 1))
     order = torch.randperm(len(labels), generator=generator).to(labels.device)
     kept = [order[labels[order] == action][:each] for action in range(int(labels.max()) + 1)]
     return torch.cat(kept)

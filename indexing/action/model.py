@@ -9,10 +9,10 @@ on one side (``same``) B works alone.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -20,14 +20,35 @@ from numpy.typing import NDArray
 from sklearn.svm import SVC
 from torch import Tensor
 
-from indexing.action.bank import EPSILON, Bank, Copy, Describer, JointMetric, Kernels, Windows, fused_residuals, fusion, planes_of
+from indexing.action.bank import (
+    CHANNELS,
+    EPSILON,
+    MACHINE_WHITENING_POWER,
+    NEAREST,
+    Bank,
+    Copy,
+    Describer,
+    JointMetric,
+    Kernels,
+    Windows,
+    fused_residuals,
+    fusion,
+    planes_of,
+)
 from indexing.action.exemplars import Exemplars
-from indexing.action.joint_weights import JointWeights
-from indexing.action.options import ActionOptions, BlendOptions, MachineOptions
-from indexing.action.profiles import ClassProfiles
+from indexing.action.joint_weights import MOST_WEIGHT, JointWeights
 from indexing.action.symmetry import mirror
-from indexing.modelfile import part, stored
-from indexing.scoring import DecisionOptions
+from indexing.modelfile import Parts, number, part, read_fields, stored
+from indexing.opening import shown
+from indexing.scoring import SHARPNESS
+
+TURNED_CARD_WEIGHT = 0.3  # one shot +1.3 %, Florence3D +.8 %; .6 is too much
+NUM_NEIGHBOURS = 2  # exemplars per class that are averaged (1: -1 %)
+MIN_CLASSES_TO_COMPARE = 4  # from which evidence compares the best with the others: fewer are nothing to stand out from
+PROFILE_FLOOR = 0.3  # added to the variances of profiles, in parts of them (experiments.recognition.open_set)
+PROFILE_WEIGHT = 2.5  # of an unusual profile in evidence (experiments.recognition.open_set)
+PENALTY = 10.0  # C of the support vector machine; 2 and 30 differ by less than 1 % on three sets
+NEAREST_WEIGHT = 1.5  # of scorer A against B, standardized over classes; 1 .. 2 differ by 1 %
 
 # ----------------------------------------------------------------------------------------------------------------------
 # A trained kernel machine as plain arrays: scikit-learn fits it, this evaluates it, and a model file can hold it.
@@ -43,7 +64,7 @@ class PairwiseMachine:
     counts: Tensor = field(metadata=stored("whole", "classes", below=2**31))
 
     @classmethod
-    def fit(cls, kernel: Tensor, classes: np.ndarray, penalty: float = MachineOptions.penalty) -> PairwiseMachine:
+    def fit(cls, kernel: Tensor, classes: np.ndarray, penalty: float = PENALTY) -> PairwiseMachine:
         """From a ``(N, N)`` kernel matrix and class numbers 0..C-1."""
         machine = SVC(C=penalty, kernel="precomputed").fit(kernel.cpu().numpy().astype(np.float64), classes)
         # for two classes scikit-learn stores the decision negated
@@ -78,14 +99,53 @@ def evidence(
     classes: int,
     unusual: Tensor | None = None,
     hidden: int = 0,
-    options: ActionOptions = ActionOptions(),
 ) -> Tensor:
     r"""``(Q,)`` evidence for a known action: how good the best class score is, how far it stands out, how usual the others are."""
     best, at = scores[:, : scores.shape[1] - hidden].max(dim=1)
-    if classes >= options.nearest.classes or hidden:
+    if classes >= MIN_CLASSES_TO_COMPARE or hidden:
         second = scores.scatter(1, at[:, None], -torch.inf).max(dim=1).values
         best = best + (best - scores.mean(dim=1)) + (best - second)
-    return best if unusual is None else best - options.nearest.profile * unusual
+    return best if unusual is None else best - PROFILE_WEIGHT * unusual
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What a clip of a known action says of all actions, not of its own alone: profiles of class scores, and how usual one is.
+#
+# A clip of a known action is near to its own exemplars, about as far from those of each other action as its own exemplars are, and
+# these distances belong together.  A clip of an unknown action may be as near to some class as that, but hardly in such company.
+# So the exemplars, each asked as if it had not been learned, tell what the profiles of their class look like.
+
+
+@dataclass(frozen=True)
+class ClassProfiles:
+    r"""The profiles of the exemplars of each class: their mean, and how they scatter about it."""
+
+    centres: Tensor = field(metadata=stored("real", "known", "columns"))
+    precision: Tensor = field(metadata=stored("real", "columns", "columns"))
+
+    @classmethod
+    def learn(cls, profiles: Tensor, labels: Tensor, known: int) -> Self | None:
+        """From the profiles of the exemplars, each asked without itself. profiles ``(N, columns)``."""
+        usable = profiles.isfinite().all(dim=1) & (labels < known)
+        own = torch.nn.functional.one_hot(labels[usable], known).to(profiles)
+        counts = own.sum(dim=0)
+        if not known or int(counts.min()) < 2:
+            return None
+        centres = own.mT @ profiles[usable] / counts[:, None]
+        apart = (profiles[usable] - own @ centres).double()
+        scatter = apart.mT @ apart / len(apart)
+        ridge = (PROFILE_FLOOR * scatter.diagonal()).clamp(min=1e-9)
+        return cls(centres, torch.linalg.inv(scatter + ridge.diag()).to(profiles))
+
+    def distance(self, profiles: Tensor, classes: int) -> Tensor:
+        r"""``(Q,)`` how unusual profiles ``(Q, columns)`` are, in standard deviations of the class whose they resemble most."""
+        apart = profiles[:, None] - self.centres
+        # who is nearer to a class than usual, as the same person is, is not unusual for it
+        known, columns = self.centres.shape
+        own = torch.arange(columns, device=apart.device) % classes == torch.arange(known, device=apart.device)[:, None]
+        apart = torch.where(own, apart.clamp(max=0.0), apart)
+        squares = torch.einsum("qci,ij,qcj->qc", apart, self.precision, apart)
+        return squares.amin(dim=1).clamp(min=0.0).sqrt()
 
 
 MOMENT_TERMS = ("epi", "nn")  # on short windows what is bound to the view helps even at 90 degrees: .83/.82 -> .93/.85
@@ -96,8 +156,8 @@ class Blend:
     """How much each scorer counts once it is standardized over the classes of a query, and how sure the sum is."""
 
     kernel: float = 1.0
-    nearest: float = BlendOptions.balance
-    sharpness: float = DecisionOptions.sharpness
+    nearest: float = NEAREST_WEIGHT
+    sharpness: float = SHARPNESS
 
 
 class Kept:
@@ -137,7 +197,6 @@ class ShapeModel:
     # (N,) evidence of exemplars whose class was left out
     evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0), metadata=stored("real", None))
     blend: Blend = field(default_factory=lambda: Blend())
-    options: ActionOptions = ActionOptions()
     profiles: ClassProfiles | None = field(default=None, metadata=part())  # of the exemplars' class scores; older files have none
     hidden: int = 0
     kept: Kept = field(default_factory=lambda: Kept(), init=False, repr=False, compare=False)  # exemplars as they are compared
@@ -147,17 +206,11 @@ class ShapeModel:
         if torch.device(device) == self.labels.device:
             return self
         there: ShapeModel = self.kept.get(torch.device(device), lambda: self._there(device))
-        return there if there.options == self.options else there.with_options(self.options)
+        return there
 
     def _there(self, device: str | torch.device) -> ShapeModel:
         moved: dict[str, Any] = {f.name: _moved(getattr(self, f.name), device) for f in dataclasses.fields(self) if f.init}
         return dataclasses.replace(self, **moved)
-
-    def with_options(self, options: ActionOptions) -> ShapeModel:
-        """The same of what was learned, with other options; what was kept serves both."""
-        other = dataclasses.replace(self, options=options)
-        object.__setattr__(other, "kept", self.kept)
-        return other
 
     def shown(self) -> NDArray[np.bool_]:
         """``(sets, joints)`` the sets of joints that exemplars show."""
@@ -200,7 +253,7 @@ class ShapeModel:
         else:  # both from the same products
             near, card = fused_residuals(query, self._crops(False, crops), [epipolar, turned], chosen)
         hub = self.hub if chosen is None else self.hub[chosen]
-        return near.add_(card, alpha=self.options.nearest.turned).sub_(hub)
+        return near.add_(card, alpha=TURNED_CARD_WEIGHT).sub_(hub)
 
     def residuals(self, query: Windows) -> Tensor:
         """``(Q, N)`` fused epipolar residual to every exemplar, and that of turned cards, less the exemplar's hub share."""
@@ -227,7 +280,7 @@ class ShapeModel:
 
     def nearest_scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` scorer A: minus the mean residual to the nearest exemplars of each class."""
-        return class_scores(self.residuals(query), self.labels, self.classes, options=self.options)
+        return class_scores(self.residuals(query), self.labels, self.classes)
 
     def machine_scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` scorer B."""
@@ -253,15 +306,15 @@ class ShapeModel:
         if self.profiles is not None:
             alike = [self.kernel_scores(query)] if self.kernels is not None else []
             unusual = self.profiles.distance(torch.cat([nearest, *alike], dim=1), self.classes)
-        return evidence(nearest, self.classes, unusual, self.hidden, options=self.options)
+        return evidence(nearest, self.classes, unusual, self.hidden)
 
     def plain_scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` scorer A without the hubs, comparable between classes: of one action alone that is its evidence."""
-        return class_scores(self.residuals(query) + self.hub, self.labels, self.classes, options=self.options)
+        return class_scores(self.residuals(query) + self.hub, self.labels, self.classes)
 
     def kernel_scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` of the nearest exemplars by the kernel of scorer B, as :meth:`nearest_scores` are by the residual."""
-        return class_scores(self.kernel_residuals(query), self.labels, self.classes, options=self.options)
+        return class_scores(self.kernel_residuals(query), self.labels, self.classes)
 
     def kernel_residuals(self, query: Windows) -> Tensor:
         """``(Q, N)`` minus the logarithm of the kernel between queries and exemplars."""
@@ -281,13 +334,13 @@ class ShapeModel:
         return self.classes if self.known > 1 else self.hidden
 
 
-def class_scores(residuals: Tensor, labels: Tensor, classes: int, options: ActionOptions = ActionOptions()) -> Tensor:
+def class_scores(residuals: Tensor, labels: Tensor, classes: int) -> Tensor:
     """``(Q, classes)`` minus the mean of the smallest residuals in each class; -inf where a class has no (finite) exemplar."""
     out = residuals.new_full((len(residuals), classes), float("-inf"))
     for c in range(classes):
         mine = residuals[:, labels == c]
         if mine.shape[1]:
-            least = mine.topk(min(options.nearest.neighbours, mine.shape[1]), dim=1, largest=False).values
+            least = mine.topk(min(NUM_NEIGHBOURS, mine.shape[1]), dim=1, largest=False).values
             there = least.isfinite()
             mean = torch.where(there, least, 0.0).sum(dim=1) / there.sum(dim=1).clamp(min=1)
             out[:, c] = torch.where(there.any(dim=1), -mean, out[:, c])
@@ -316,3 +369,57 @@ def _moved(value: object, device: str | torch.device) -> object:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.replace(value, **{f.name: _moved(getattr(value, f.name), device) for f in dataclasses.fields(value)})
     return value
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Reading a model from its file.
+
+
+SCORERS = ("nearest", "kernel", "both")
+MIN_SCALE = 1e-7  # of a kernel, over distances from 0 to 2
+
+
+def read_shape_model(
+    parts: Parts, header: Mapping[str, Any], classes: int, hidden: int, joints: int, length: int, crops: int
+) -> ShapeModel:
+    """A model whose parts belong together; ``classes`` are the known ones, ``hidden`` the kinds of background."""
+    sizes = _sizes(parts, classes + hidden, joints, length, crops)
+    view, scorer, trained = header["view"], header["scorer"], "scales" in parts
+    if view != header["parameters"]["view"] or scorer not in SCORERS or trained != (scorer != "nearest"):
+        raise ValueError(f"view, scorer: {shown(view)} and {shown(scorer)} do not fit the rest")
+    stored_fields = read_fields(ShapeModel, parts, sizes)
+    if sizes["views"] % sizes["exemplars"]:
+        raise ValueError(f"views: {sizes['views']} windows of {sizes['exemplars']} exemplars")
+    if not trained:
+        stored_fields |= {"support": None, "machine": None}
+    metric, kernels = stored_fields.pop("metric"), None
+    if trained:
+        kernels = Kernels(JointMetric(metric.covariance, MACHINE_WHITENING_POWER), view == "same")
+        kernels.scales = parts.real("scales", kernels.count, least=MIN_SCALE)
+        counts = stored_fields["machine"].counts
+        if int(counts.sum()) != sizes["rows"]:
+            raise ValueError(f"machine.counts: {int(counts.sum())} support vectors, and {sizes['rows']} are there")
+    blend = {name: number(value, name, 0, MOST_WEIGHT) for name, value in header["blend"].items()}
+    weights = _read_joint_weights(stored_fields.pop("parts"), header["parts"])
+    about = {"classes": sizes["classes"], "view": view, "scorer": scorer, "kernels": kernels, "blend": Blend(**blend)}
+    return ShapeModel(**stored_fields, **about, metric=metric, parts=weights, hidden=hidden)
+
+
+def _sizes(parts: Parts, classes: int, joints: int, length: int, crops: int) -> dict[str, int]:
+    """How many there are of what the tensors of a model are about."""
+    exemplars = len(parts.truth("solid", None))
+    if classes < 2 or exemplars < classes:
+        raise ValueError(f"{exemplars} exemplars of {classes} classes")
+    return {
+        "classes": classes, "others": classes - 1, "pairs": classes * (classes - 1) // 2, "exemplars": exemplars,
+        "crops": exemplars * crops, "length": length, "joints": joints, "channels": len(CHANNELS), "nearest": len(NEAREST),
+    }  # fmt: skip
+
+
+def _read_joint_weights(stored_weights: JointWeights, learned: Any) -> JointWeights:
+    joints, by_class = stored_weights.joints, stored_weights.by_class
+    weights = joints if by_class is None else joints[:, None] * by_class
+    if not bool((weights.sum(-1) > 0).all()) or not bool(stored_weights.channels.sum() > 0):
+        raise ValueError("parts: no joint or no channel counts")
+    gain, sigma = (number(value, "parts") for value in learned)
+    return dataclasses.replace(stored_weights, gain=gain, sigma=sigma)

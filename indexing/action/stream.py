@@ -11,15 +11,42 @@ import torch
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows, channel, stack
+from indexing.action.exemplars import MAX_SAMPLED_MOMENTS
 from indexing.action.model import ShapeModel
-from indexing.action.options import ActionOptions
 from indexing.clip import Clip, stretches
 from indexing.windows import Ragged, ragged, sample
+
+MIN_SHOWN_SHARE = 0.3  # of a window's frames that must show the person
+INTERPOLATION_MARGIN = 2.0  # seconds of frames on both sides of a block from which missing joints are interpolated
+STILL_QUANTILE = 0.25  # of the motion of all exemplars' short windows: who moves less is still, as actions go
+CALM_QUANTILE = 0.1  # of the motion of one action's short windows: who moves less than its calm ones rests
 
 Array = NDArray[Any]
 Progress = Callable[[float], None] | None
 
 BLOCK = 1200  # windows compared at once: bounds memory whatever the length of the recording
+
+
+@dataclass(frozen=True)
+class ActionOptions:
+    """How long recordings are read by :class:`indexing.ActionIndexer`, :meth:`~indexing.ActionIndexer.stream` too.
+
+    Nothing of it is learned: options that are set on a loaded model count.
+    """
+
+    window_step: float = 0.2
+    """Seconds between the short windows of a recording; .1 takes twice the time and is as good."""
+    num_durations: int = 24
+    """Durations of windows that are looked through, at most: what a scan costs grows with them."""
+    min_quality: float = 3.0
+    """Quality that a segment must exceed to be an action rather than none: more for recordings full of other movement."""
+    rest_weight: float = 4.0
+    """Quality taken off where a person moves e times less than calm moments of the action do: 0 where people do not rest between
+    actions.  F1 of actors who rest 2 to 7 s, camera turned by 60 degrees: 3: .79, 4: .85, 6: .90, but then Florence3D loses .02."""
+    live_block: float = 0.5
+    """Seconds of frames that a stream looks at together: a part of its lag, and the fewer the more it costs."""
+    live_memory: float = 300.0
+    """Seconds of the past by which a stream scales its scores: less where cameras and people change."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +57,7 @@ class Stream:
     window: float
     tempi: tuple[float, ...]
     device: str
+    options: ActionOptions
 
 
 @dataclass(frozen=True)
@@ -57,13 +85,13 @@ class StreamScan:
         ]
 
 
-def _centres(clip: Clip, stretches: Array, options: ActionOptions) -> tuple[Array, Array]:
+def _centres(clip: Clip, stretches: Array, window_step: float) -> tuple[Array, Array]:
     """``(T,)`` times at which windows are centred, a step apart inside each stretch, and whose they are."""
     begin, end = clip.times[stretches[:, 0]], clip.times[stretches[:, 1] - 1]
-    counts = np.maximum(2, np.ceil((end - begin) / options.events.step).astype(np.intp) + 1)
+    counts = np.maximum(2, np.ceil((end - begin) / window_step).astype(np.intp) + 1)
     owner = np.repeat(np.arange(len(counts)), counts)
     step = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return np.asarray(begin[owner] + options.events.step * step), owner
+    return np.asarray(begin[owner] + window_step * step), owner
 
 
 def check_rate(clip: Clip, window: float) -> None:
@@ -88,15 +116,15 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
     check_rate(clip, stream.window)
     cuts = stretches(clip.times, stream.window)
     cuts = cuts[cuts[:, 1] - cuts[:, 0] > 1]  # a single frame says nothing of an action
-    at, owner = _centres(clip, cuts, model.options)
+    at, owner = _centres(clip, cuts, stream.options.window_step)
     scores, motion = np.empty((len(at), model.classes)), np.empty(len(at))
     for begin in range(0, len(at), BLOCK):
         part = slice(begin, begin + BLOCK)
-        source, own = around(clip, cuts, at[part], owner[part], stream, model.options)
+        source, own = around(clip, cuts, at[part], owner[part], stream)
         scores[part], motion[part] = moments(model, source, own, at[part], stream)
         if progress is not None:
             progress(min(1.0, (begin + BLOCK) / len(at)))
-    found_ = StreamScan(at, scores, motion, presence(clip, cuts, at, owner, stream, model.options), cuts, owner)
+    found_ = StreamScan(at, scores, motion, presence(clip, cuts, at, owner, stream), cuts, owner)
     scores[~found_.present] = found_.nothing  # where nobody is seen nothing is said
     return found_
 
@@ -109,7 +137,7 @@ def moments(model: ShapeModel, source: Ragged, owner: Array, at: Array, stream: 
     return found.amax(dim=0).cpu().numpy(), motion_of(windows_at(source, owner, at, stream.window, stream.length))
 
 
-def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> Array:
+def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -> Array:
     """Whether enough frames around each time show the person: interpolated poses are no evidence."""
     shown = clip.times[clip.seen.any(axis=1)]
     begin, end = clip.times[cuts[owner, 0]], clip.times[cuts[owner, 1] - 1]
@@ -117,12 +145,12 @@ def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, o
     middle = np.clip(at, begin + span / 2, end - span / 2)
     low, high = np.searchsorted(shown, middle - span / 2 - 1e-6), np.searchsorted(shown, middle + span / 2 + 1e-6)
     rate = 1.0 / float(np.median(np.diff(clip.times)))
-    return np.asarray(high - low >= np.maximum(2.0, options.events.shown * span * rate))
+    return np.asarray(high - low >= np.maximum(2.0, MIN_SHOWN_SHARE * span * rate))
 
 
-def around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream, options: ActionOptions) -> tuple[Ragged, Array]:
+def around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -> tuple[Ragged, Array]:
     """The frames that windows centred at some times can touch, and some more to interpolate missing joints from."""
-    margin = max(stream.tempi) * stream.window + options.events.margin
+    margin = max(stream.tempi) * stream.window + INTERPOLATION_MARGIN
     used, own = np.unique(owner, return_inverse=True)
     pieces = []
     for number, (low, high) in enumerate(cuts[used].tolist()):
@@ -152,7 +180,7 @@ def motion_of(windows: Windows) -> Array:
 def wrong_contrast(model: ShapeModel) -> Array:
     """The contrast that short windows of one class reach with other classes."""
     moments, labels = model.exemplars.moments, model.labels[model.exemplars.owner]
-    chosen = torch.arange(0, len(moments), max(1, len(moments) // model.options.nearest.moments))
+    chosen = torch.arange(0, len(moments), max(1, len(moments) // MAX_SAMPLED_MOMENTS))
     scores = model.moment_scores(moments[chosen]).cpu().numpy()
     scores[np.arange(len(chosen)), labels[chosen].cpu().numpy()] = np.nan
     return np.asarray(np.nanmax(scores, axis=1) - np.nanmean(scores, axis=1))
@@ -160,12 +188,11 @@ def wrong_contrast(model: ShapeModel) -> Array:
 
 def motion_levels(model: ShapeModel) -> tuple[float, Array]:
     """The motion of calm moments: of all classes together, and of each ``(classes,)``.  Kept: every stretch asks for it again."""
-    events = model.options.events
 
     def make() -> tuple[float, Array]:
         motion, labels = motion_of(model.exemplars.moments), model.labels[model.exemplars.owner].cpu().numpy()
-        each = np.array([np.quantile(motion[labels == c], events.calm) for c in range(model.classes)])
-        return float(np.quantile(motion, events.still)), each
+        each = np.array([np.quantile(motion[labels == c], CALM_QUANTILE) for c in range(model.classes)])
+        return float(np.quantile(motion, STILL_QUANTILE)), each
 
-    levels: tuple[float, Array] = model.kept.get(("motion levels", events.still, events.calm), make)
+    levels: tuple[float, Array] = model.kept.get(("motion levels", STILL_QUANTILE, CALM_QUANTILE), make)
     return levels

@@ -12,21 +12,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from indexing.action.options import ActionOptions
 from indexing.cameras import rotation
 from indexing.clip import FloatArray
 from indexing.skeleton import Skeleton
 
+MAX_WINDOWS = 500  # exemplars by whose distances between joints a layout is recognized
+MAX_DISTORTION = 0.25  # of the mean joint distance: the right layout fits to .02-.12 (one clip: .25), wrong ones to .34-.71
+NUM_SHUFFLES = 20  # random layouts that show what fits by chance
+MAX_CHANCE_RATIO = 0.5  # of their mean distortion, which the right layout stays below
 
-def mirror_permutation(
-    skeleton: Skeleton | None, windows: Tensor, seen: Tensor | None = None, *, options: ActionOptions = ActionOptions()
-) -> Tensor | None:
+
+def mirror_permutation(skeleton: Skeleton | None, windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
     """``(joints,)`` index of every joint's mirror image (itself on the midline), or ``None`` where it cannot be told."""
     if skeleton is not None:
         named = from_names(skeleton.joints)
         if named is not None:
             return named
-    return from_data(windows, seen, options=options)
+    return from_data(windows, seen)
 
 
 def from_names(names: tuple[str, ...]) -> Tensor | None:
@@ -90,7 +92,7 @@ _LAYOUTS: dict[int, tuple[tuple[tuple[int, int], ...], ...]] = {
 }  # fmt: skip
 
 
-def from_data(windows: Tensor, seen: Tensor | None = None, *, options: ActionOptions = ActionOptions()) -> Tensor | None:
+def from_data(windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
     r"""The common layout with this number of joints whose mirror image keeps the distances between joints. windows
     ``(N, length, joints, 2)``."""
     joints = windows.shape[2]
@@ -111,11 +113,8 @@ def from_data(windows: Tensor, seen: Tensor | None = None, *, options: ActionOpt
         return float((tables - tables[:, swap][:, :, swap]).abs().mean(0)[counted].mean())
 
     shuffles = torch.Generator().manual_seed(0)
-    chance = (
-        sum(distortion(torch.randperm(joints, generator=shuffles)) for _ in range(options.mirror.shuffles))
-        / options.mirror.shuffles
-    )
-    best, chosen = min(options.mirror.distortion, options.mirror.chance * chance), None
+    chance = sum(distortion(torch.randperm(joints, generator=shuffles)) for _ in range(NUM_SHUFFLES)) / NUM_SHUFFLES
+    best, chosen = min(MAX_DISTORTION, MAX_CHANCE_RATIO * chance), None
     for pairs in _LAYOUTS[joints]:
         swap = torch.arange(joints)
         for i, j in pairs:

@@ -20,7 +20,6 @@ from pathlib import Path
 from indexing.archive.layout import Layout, layout_key
 from indexing.archive.options import GrowthOptions, StorageOptions
 from indexing.skeleton import Skeleton
-from indexing.windows import RepairOptions
 
 VERSION = 1
 CATALOGUE, LOCK, SEGMENTS = "catalogue.sqlite", "writer.lock", "segments"
@@ -219,7 +218,8 @@ class Catalogue:
             segments = tuple(SegmentRow(*row) for row in connection.execute("SELECT * FROM segments ORDER BY id"))
             windows = sum(row.windows - row.dead for row in segments)
             stored = json.loads(facts["storage"])
-            options = StorageOptions(**{**stored, "views": tuple(stored["views"]), "repair": RepairOptions(**stored["repair"])})
+            stored.pop("repair", None)  # of older archives
+            options = StorageOptions(**{**stored, "views": tuple(stored["views"])})
             return Contents(int(facts["generation"]), options, layouts, segments, windows)
         except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as problem:
             raise _senseless(self.folder, problem) from problem

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from indexing.windows import RepairOptions
-
 
 @dataclass(frozen=True)
 class StorageOptions:
@@ -37,8 +35,6 @@ class StorageOptions:
     """Variance of where the middle of all joints is, in those of a joint, where some were not seen."""
     sure: float = 1e-3
     """Variance of a sighting, in the same: nearly none, a code is to be that of the joints that were seen."""
-    repair: RepairOptions = RepairOptions(sampled=8)
-    """By which wrong joints are told, as everywhere."""
     learned: int = 20_000
     """Poses from which the directions of a layout are learned, at most, and after which they stay: 22 minutes."""
 

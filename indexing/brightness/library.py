@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from indexing.brightness.options import DescriptorOptions
 from indexing.brightness.sight import mirrored
 from indexing.modelfile import stored
 
@@ -52,8 +51,8 @@ class Library:
     basis: Tensor  # ``(D, K)`` directions in which the exemplars differ most, orthonormal
 
 
-def library(exemplars: VideoExemplars, classes: int, flip: bool, kept: int = DescriptorOptions.kept) -> Library:
-    """Lay out the tracks of all exemplars, mirrored ones too where ``flip``, in ``kept`` directions."""
+def library(exemplars: VideoExemplars, classes: int, flip: bool, num_directions: int = 96) -> Library:
+    """Lay out the tracks of all exemplars, mirrored ones too where ``flip``, in so many directions."""
     videos, labels = exemplars.videos(), exemplars.labels.tolist()
     rows, gaps, bounds, at = [], [], [0] * (classes + 1), 0
     for i in sorted(range(len(videos)), key=labels.__getitem__):
@@ -63,7 +62,7 @@ def library(exemplars: VideoExemplars, classes: int, flip: bool, kept: int = Des
             at += GAP + len(track)
         bounds[labels[i] + 1] = at
     every = torch.cat(rows)
-    basis = principal(every, kept)
+    basis = principal(every, num_directions)
     return Library(every @ basis, torch.tensor(gaps), tuple(bounds), basis)
 
 

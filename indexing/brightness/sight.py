@@ -11,7 +11,15 @@ from torch import Tensor
 
 from indexing.brightness.features import blurred, inner_gradients, weighted_differences
 from indexing.brightness.footage import Shrinker
-from indexing.brightness.options import BrightnessOptions, DescriptorOptions, MotionBoxOptions, MotionMapOptions
+
+MIN_CHANGE = 0.006  # grey 0..1 per frame: less does not widen the box
+BOX_QUANTILES = (0.02, 0.98)  # of the motion that a box encloses
+BOX_PAD = 0.15  # of the box, added on each side
+MIN_BOX = 0.35  # of the image's height
+SOFT_NORM = 0.005  # added to a descriptor's norm: noise frames stay near 0 instead of being blown up
+# of the cells about what moves, of those of the image, and of the row profiles of body and image, in the likeness of two frames
+# (experiments.recognition.brightness_indexing, seeds 0, 3, 7)
+SHARES = (0.25, 0.07, 0.48, 0.2)
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Rectified motion maps of a stream: how much moves right, left, down and up, pixel by pixel, as fast as frames come in.
@@ -20,8 +28,8 @@ from indexing.brightness.options import BrightnessOptions, DescriptorOptions, Mo
 class MotionMaps:
     """Keeps the last two blurred frames of a stream; gives ``(n, 4, h, w)`` maps for ``n`` more frames."""
 
-    def __init__(self, options: MotionMapOptions = MotionMapOptions()) -> None:
-        self.sigma, self.quiet = options.sigma, options.quiet
+    def __init__(self, sigma: float, noise: float) -> None:
+        self.sigma, self.noise = sigma, noise
         self.last: Tensor | None = None
 
     def push(self, frames: Tensor) -> tuple[Tensor, Tensor]:
@@ -31,7 +39,7 @@ class MotionMaps:
         self.last = known[-2:]
         gx, gy, gt = inner_gradients(known)
         change = gt.abs()
-        u, v = weighted_differences(gx, gy, gt.sign() * (change - self.quiet).clamp(min=0))
+        u, v = weighted_differences(gx, gy, gt.sign() * (change - self.noise).clamp(min=0))
         return rectified(u, v), change
 
 
@@ -50,42 +58,42 @@ NOTHING_EPSILON = 1e-12  # brightness change of every pixel in a box: where noth
 class MotionBox:
     r"""Square box about what has moved, frame by frame. seen ``(h, w)``."""
 
-    def __init__(self, memory: float, seen: Tensor | None = None, *, options: MotionBoxOptions = MotionBoxOptions()) -> None:
-        self.decay, self.seen, self.options = 1 - 1 / memory, seen, options
+    def __init__(self, memory: float, seen: Tensor | None = None) -> None:
+        self.decay, self.seen = 1 - 1 / memory, seen
 
     def push(self, change: Tensor) -> Tensor:
         """``(n, 4)`` centre x, centre y, width and height in pixels for brightness changes ``(n, h, w)``."""
         n = len(change)
         age = self.decay ** torch.arange(1, n + 1, dtype=change.dtype, device=change.device)[:, None, None]
-        fresh = (change - self.options.lively).clamp_(min=NOTHING_EPSILON) / age
+        fresh = (change - MIN_CHANGE).clamp_(min=NOTHING_EPSILON) / age
         if self.seen is not None:
             fresh[0] = torch.maximum(fresh[0], self.seen)
         seen = fresh.cummax(0).values * age
         self.seen = seen[-1]
-        return boxes_about(seen, self.options)
+        return boxes_about(seen)
 
 
-def boxes_about(seen: Tensor, options: MotionBoxOptions) -> Tensor:
+def boxes_about(seen: Tensor) -> Tensor:
     """Square boxes ``(n, 4)`` about most of what is in maps ``(n, h, w)``."""
     n, height, width = seen.shape
     sums = seen.new_zeros(n, 2, max(height, width))
     torch.sum(seen, 1, out=sums[:, 0, :width])
     torch.sum(seen, 2, out=sums[:, 1, :height])
     total = sums.cumsum(2)
-    inside = torch.stack([q * total[:, :, -1:] for q in options.inside], dim=1)
+    inside = torch.stack([q * total[:, :, -1:] for q in BOX_QUANTILES], dim=1)
     ends = (total[:, None] < inside).sum(3).to(seen)  # (n, low or high, x or y)
     low, high = ends[:, 0], ends[:, 1] + 1
-    size = (high - low).amax(1, keepdim=True) * (1 + 2 * options.pad)
+    size = (high - low).amax(1, keepdim=True) * (1 + 2 * BOX_PAD)
     return torch.cat([(low + high) / 2, size, size], dim=1)
 
 
-def together(seen: list[Tensor], options: MotionBoxOptions = MotionBoxOptions()) -> list[Tensor]:
+def together(seen: list[Tensor]) -> list[Tensor]:
     """Of each video, what moved in it and in all videos of its size that were taken at its place. seen ``(h, w)``."""
     out = list(seen)
     for shape in {one.shape for one in seen}:
         of = [i for i, one in enumerate(seen) if one.shape == shape]
         maps = torch.stack([seen[i] for i in of])
-        boxes = boxes_about(maps, options)
+        boxes = boxes_about(maps)
         low, high = boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2
         common = (torch.minimum(high[:, None], high) - torch.maximum(low[:, None], low)).clamp(min=0).prod(2)
         area = boxes[:, 2:].prod(1)
@@ -127,7 +135,7 @@ def pooled(maps: Tensor, boxes: Tensor, cells: int = CELLS) -> Tensor:
     return (along[:, :, None, :, :height] @ bands).flatten(2)
 
 
-def described(cells: Tensor, soft: float = DescriptorOptions.soft) -> Tensor:
+def described(cells: Tensor, soft: float = SOFT_NORM) -> Tensor:
     r"""Descriptor :math:`f = s / (\|s\| + .005)` with :math:`s = \sqrt{cells}`: shorter than 1, and near 0 where nothing moves."""
     root = cells.sqrt()
     return root / (root.norm(dim=-1, keepdim=True) + soft)
@@ -154,6 +162,23 @@ Region = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
+class BrightnessOptions:
+    """What :class:`indexing.BrightnessIndexer` is to know of the videos, and what it costs."""
+
+    blur_sigma: float = 1.2
+    """Pixels of the work image (80 pixels wide): more for grainy videos."""
+    noise_level: float = 0.004
+    """Grey 0..1 per frame below which brightness change is noise (theory: .004; .008 at sensor noise 3/255)."""
+    motion_memory: float = 20.0
+    """Seconds over which the box forgets where somebody moved: less where people wander."""
+    max_pause: float = 10.0
+    """Seconds without a frame up to which frames are interpolated: what a video costs is told by its frames."""
+    num_directions: int = 96
+    """Principal directions in which frames are compared: all of 560 cost 4.3 ms per frame and 20,000 rows, these .2 ms; 32 name
+    .7 of a percent fewer frames."""
+
+
+@dataclass(frozen=True)
 class Optics:
     """How videos are looked at."""
 
@@ -161,7 +186,7 @@ class Optics:
     size: int  # px of the longer side of the work image
     region: str | Region | None  # ``"motion"``, ``None`` (the whole image) or ``(x0, y0, x1, y1)`` in pixels of the video
     device: str  # where to compute
-    options: BrightnessOptions = BrightnessOptions()  # every number that decides
+    options: BrightnessOptions
 
 
 class Sight:
@@ -171,8 +196,8 @@ class Sight:
         self.optics = optics
         self.shrink = Shrinker(name, optics.size, SMALLEST)
         options = optics.options
-        self.maps = MotionMaps(options.maps)
-        self.box = MotionBox(options.box.memory * optics.fps, seen, options=options.box)
+        self.maps = MotionMaps(options.blur_sigma, options.noise_level)
+        self.box = MotionBox(options.motion_memory * optics.fps, seen)
 
     def push(self, frames: Tensor) -> Tensor:
         """Descriptors ``(n, 560)`` of more small frames ``(n, h, w)``, grey 0..1, at the rate of the optics."""
@@ -184,16 +209,16 @@ class Sight:
 
     def _described(self, maps: Tensor, change: Tensor) -> Tensor:
         n, height, width = change.shape
-        region, options = self.optics.region, self.optics.options
+        region = self.optics.region
         x0, y0, x1, y1 = (v * self.shrink.scale for v in region) if isinstance(region, tuple) else (0.0, 0.0, width, height)
         boxes = change.new_tensor([(x0 + x1) / 2, (y0 + y1) / 2, x1 - x0, y1 - y0]).repeat(n, 3, 1)  # near, image, body
         if region == "motion":
             boxes[:, ::2] = self.box.push(change)[:, None]
-            boxes[:, 0, 2:].clamp_(min=options.box.near * height)
+            boxes[:, 0, 2:].clamp_(min=MIN_BOX * height)
             boxes[:, 2, 2:].clamp_(min=height)
         cells = pooled(maps, boxes)
-        grids, rows = (described(part, options.descriptor.soft) for part in (cells[:, :2], profile(cells.flip(1)[:, :2])))
-        weights = _weights(options.descriptor.shares, maps.dtype, maps.device)
+        grids, rows = (described(part, SOFT_NORM) for part in (cells[:, :2], profile(cells.flip(1)[:, :2])))
+        weights = _weights(SHARES, maps.dtype, maps.device)
         return torch.cat([grids.flatten(1), rows.flatten(1)], dim=1).mul_(weights)
 
 

@@ -14,9 +14,21 @@ from torch import Tensor
 from dyntorch.numerics import one_thread
 from indexing.brightness.footage import Footage, Resampler
 from indexing.brightness.library import Library, VideoExemplars
-from indexing.brightness.options import BrightnessOptions, MatchingOptions
 from indexing.brightness.sight import Optics, Sight, mirrored, together
 from indexing.scoring import Event, event_levels, events
+
+SLACK = 0.02  # price of a step other than 1
+# over frames: moments that fit an exemplar well count more than many that fit somewhat (plain mean: .76 / .59 for .80 / .62)
+MEAN_SHARPNESS = 20.0
+COLD_WEIGHT = 1e-3  # of a video's first window in its score: the warping has seen too little, but a short video has nothing else
+MIN_FRAMES = 3  # of an exemplar
+MIN_ENERGY = 0.1  # of a frame in which anything moves
+MAX_ASKED = 64  # exemplars: bounds the time of calibration
+QUIET_ENERGY = 0.7  # of a frame, below which nothing moves
+MIN_CONTRAST = 0.02  # of an event: two or three classes have little to stand out from
+FALSE_ALARM_RATE = 0.3  # at which a wrong action may reach an event's peak
+EXTENT_RATE = 1.7  # times that rate for the level that an event's ends reach
+MIRROR_MARGIN = 0.02  # of the score: mirrored exemplars that look so much more like another action make left and right matter
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Leaky online warping: every exemplar frame holds how well the last half second fits what led up to it.
@@ -32,7 +44,7 @@ BLOCK = 32  # frames compared at once: library rows are read once per block
 class Warping:
     """The state of one stream against a library."""
 
-    def __init__(self, source: Library, window: float, slack: float = MatchingOptions.slack) -> None:
+    def __init__(self, source: Library, window: float, slack: float = SLACK) -> None:
         self.source, self.keep, self.slack = source, 1 - 1 / window, slack
         self.state = source.rows.new_zeros(len(source.rows))
         self.held = 1.0
@@ -79,16 +91,11 @@ class Recognizer:
     window: float
     pool: float
 
-    @property
-    def options(self) -> BrightnessOptions:
-        """Every number that decides."""
-        return self.optics.options
-
 
 class Pool:
     r"""Running mean of scores over frames in which something moves."""
 
-    def __init__(self, classes: int, frames: float, sharp: float = MatchingOptions.sharp) -> None:
+    def __init__(self, classes: int, frames: float, sharp: float = MEAN_SHARPNESS) -> None:
         self.sharp = sharp
         self.keep = 1 - 1 / max(frames, 1.0)
         self.total, self.weight = np.zeros(classes), 0.0
@@ -117,11 +124,10 @@ class BrightnessStream:
     def __init__(self, source: Recognizer, classes: int, name: str, fps: float | None) -> None:
         self.source, self.fps = source, fps
         self.sight = Sight(source.optics, name)
-        matching = source.options.matching
-        self.resample = Resampler(source.optics.fps, fps, source.options.rate)
-        self.warping = Warping(source.library, source.window, matching.slack)
-        self.pool = Pool(classes, source.pool, matching.sharp)
-        self.whole = Pool(classes, float("inf"), matching.sharp)
+        self.resample = Resampler(source.optics.fps, fps, source.optics.options.max_pause)
+        self.warping = Warping(source.library, source.window)
+        self.pool = Pool(classes, source.pool, MEAN_SHARPNESS)
+        self.whole = Pool(classes, float("inf"), MEAN_SHARPNESS)
         self.pushed = self.compared = 0
         self.latest = np.zeros(classes)
         self.energy = 0.0
@@ -156,7 +162,7 @@ class BrightnessStream:
         energy = seen.square().sum(1).cpu().numpy().astype(float)
         warm = np.arange(self.compared, self.compared + len(seen)) >= self.source.window
         self.compared += len(seen)
-        self.whole.push(scores, energy * np.where(warm, 1.0, self.source.options.matching.cold))
+        self.whole.push(scores, energy * np.where(warm, 1.0, COLD_WEIGHT))
         return self.pool.push(scores, energy), energy
 
 
@@ -173,18 +179,17 @@ def learned(videos: list[Footage], optics: Optics) -> list[list[Tensor]]:
     moved = [seen for _, seen in first if seen is not None]
     if not moved:
         return [[one] for one, _ in first]
-    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, together(moved, optics.options.box), strict=True)]
+    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, together(moved), strict=True)]
     return [[one, other] for (one, _), other in zip(first, again, strict=True)]
 
 
 def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Descriptors of a whole video, and where something has moved in the end."""
-    sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate, optics.options.rate)
-    options = optics.options.matching
+    sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate, optics.options.max_pause)
     found = torch.cat([sight.push(resample.push(sight.small(frames), times)[0]) for frames, times in video]).cpu()
-    if len(found) < options.fewest:
-        raise ValueError(f"{video.name}: {len(found)} frames; motion needs at least {options.fewest}")
-    if not bool((found.square().sum(1) > options.moves).any()):
+    if len(found) < MIN_FRAMES:
+        raise ValueError(f"{video.name}: {len(found)} frames; motion needs at least {MIN_FRAMES}")
+    if not bool((found.square().sum(1) > MIN_ENERGY).any()):
         raise ValueError(f"{video.name}: nothing moves in it; leave it out, or give a video in which the action is seen")
     return found, sight.box.seen
 
@@ -196,11 +201,11 @@ def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Ten
 def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch.Tensor, Array]:
     """What exemplars find in other actions: the evidence of each ``(videos,)``, the contrast of moving frames ``(frames,)``."""
     best, contrasts = [], []
-    for i in _asked(exemplars, source.options.events.asked):
+    for i in _asked(exemplars, MAX_ASKED):
         stream, seen = _fresh(source), exemplars.videos()[i]
         label = int(exemplars.labels[i])
         scores, energy = stream.compare(seen.to(source.optics.device))
-        others = np.delete(scores, label, axis=1)[energy >= source.options.events.quiet]
+        others = np.delete(scores, label, axis=1)[energy >= QUIET_ENERGY]
         contrasts.append(others.max(axis=1) - others.mean(axis=1))
         best.append(float(np.delete(stream.whole.mean(), label).max()))
     return torch.tensor(best), np.concatenate(contrasts)
@@ -208,24 +213,21 @@ def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch
 
 def mirrors_matter(source: Recognizer, exemplars: VideoExemplars) -> bool:
     """Whether some exemplar's mirror image looks clearly more like another action than like its own."""
-    for i in _asked(exemplars, source.options.events.asked):
+    for i in _asked(exemplars, MAX_ASKED):
         stream, seen = _fresh(source), exemplars.videos()[i]
         stream.compare(mirrored(seen).to(source.optics.device))
         scores = stream.whole.mean()
         label = int(exemplars.labels[i])
-        if float(scores.max() - scores[label]) > source.options.events.clear:
+        if float(scores.max() - scores[label]) > MIRROR_MARGIN:
             return True
     return False
 
 
-def found_events(
-    scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None, options: BrightnessOptions
-) -> list[Event]:
+def found_events(scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None) -> list[Event]:
     """Events of scored frames: where the contrast of the best class exceeds what wrong actions reach at a rate."""
     contrast = scores - scores.mean(axis=1, keepdims=True)
-    of = options.events
-    peak, floor = event_levels(wrong, of.false_alarms if rate is None else rate, of.extent, (of.least, of.least))
-    return events(contrast, times, classes.tolist(), peak, floor, energy < of.quiet, options.decisions)
+    peak, floor = event_levels(wrong, FALSE_ALARM_RATE if rate is None else rate, EXTENT_RATE, (MIN_CONTRAST, MIN_CONTRAST))
+    return events(contrast, times, classes.tolist(), peak, floor, energy < QUIET_ENERGY)
 
 
 def _asked(exemplars: VideoExemplars, most: int) -> list[int]:

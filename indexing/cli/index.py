@@ -341,13 +341,13 @@ class Scan:
         return of_films
 
     def _clips(self) -> tuple[ActionIndexer, list[Lane], list[str]]:
+        from indexing import ActionOptions
         from indexing.action.indexer import ActionIndexer
-        from indexing.action.options import ActionOptions
 
         indexer = ActionIndexer.load(self.model.expanduser())
         options = indexer.options or ActionOptions()
-        told = dataclasses.replace(options.recordings, rest=RESTED[self.rest] * options.recordings.rest)
-        indexer.set_params(options=dataclasses.replace(options, recordings=told))
+        options = dataclasses.replace(options, rest_weight=RESTED[self.rest] * options.rest_weight)
+        indexer.set_params(options=options)
         reading = self.reading.watching(self.recordings, self.report or (None if self.write is None else self.write.parent))
         lanes, notes = read_recordings(self.recordings, reading, indexer.n_joints_, self.model, indexer.skeleton_)
         return indexer, lanes, [*reading.watched.notes, *notes, *on_classes([str(label) for label in indexer.classes_])]

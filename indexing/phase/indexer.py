@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -13,18 +13,31 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from dyntorch.numerics import one_thread
-from indexing.action.bank import stack
+from indexing.action.bank import Windows, stack
 from indexing.action.inputs import check_queries, gather, gather_labels
 from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip, stretches
 from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, SavedClassifier, is_whole, one_of
 from indexing.joints import layout_of
-from indexing.phase import saving
+from indexing.modelfile import (
+    Parts,
+    labels_from_json,
+    labels_to_json,
+    read_fields,
+    skeleton_from_json,
+    skeleton_to_json,
+    tensors_of,
+)
+from indexing.modelfile import whole as whole_number
+from indexing.opening import shown
 from indexing.phase.frames import LEAST, images, query_frames
 from indexing.phase.learning import learn_model
-from indexing.phase.model import PhaseModel, event_levels
-from indexing.phase.options import PhaseOptions
-from indexing.scoring import Event, events, probabilities, refuse, reject_threshold, same_label, smooth
+from indexing.phase.model import MIN_CALIBRATED_CLASSES, Course, PhaseModel, PhaseOptions, event_levels
+from indexing.scoring import SHARPNESS, Event, events, probabilities, refuse, reject_threshold, same_label, smooth
+
+MAX_JOINTS = 10_000  # of a model file; the largest layouts have some hundred
+MAX_CYCLE_RATE = 3.0  # per second, where phases are averaged over a window
+NUM_RATES = 61  # that are tried, from backwards to forwards
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Parameters and phases that users hand in, checked once.
@@ -36,7 +49,7 @@ def check_reject(indexer: PhaseIndexer, classes: list[Any]) -> None:
         return
     if any(same_label(value, indexer.none_label) for value in classes):
         raise ValueError(f"none_label={indexer.none_label!r} is one of the learned labels; choose another for rejected clips")
-    fewest = indexer._options.events.classes
+    fewest = MIN_CALIBRATED_CLASSES
     if 0 < indexer.reject < 1 and len(classes) < fewest:
         raise ValueError(
             f"reject={indexer.reject!r} is calibrated by leaving a class out, which takes {fewest} classes, got {len(classes)}; "
@@ -71,10 +84,10 @@ def check_phases(phases: Sequence[Any] | None, clips: list[Clip], owners: list[i
 Array = NDArray[Any]
 
 
-def smooth_phases(phase: Array, times: Array, seconds: float, periodic: Array, options: PhaseOptions = PhaseOptions()) -> Array:
+def smooth_phases(phase: Array, times: Array, seconds: float, periodic: Array) -> Array:
     r"""``(T, classes)`` phases, each from its neighbours too."""
     out = np.full_like(phase, np.nan)
-    rates = np.linspace(-options.evidence.fastest, options.evidence.fastest, options.evidence.rates)
+    rates = np.linspace(-MAX_CYCLE_RATE, MAX_CYCLE_RATE, NUM_RATES)
     for i, time in enumerate(times):
         near = np.abs(times - time) <= seconds / 2
         for c, turns in enumerate(periodic):
@@ -114,7 +127,7 @@ class PhaseIndexer(SavedClassifier):
             ``True``: in every action that repeats; ``False``: never.
         window: seconds of neighbours that a frame's score and phase are averaged over; 0: every frame from itself alone.
         device: where frames are compared, in ``fit`` too, e.g. ``"cuda"``; what was learned is kept on the CPU.
-        options: every other number that decides, by stage (:class:`~indexing.phase.options.PhaseOptions`); None: as measured.
+        options: what is learned from, and what it costs (:class:`~indexing.phase.model.PhaseOptions`); None: the defaults.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  periodic_: ``(classes,)`` which of them repeat.
@@ -134,6 +147,9 @@ class PhaseIndexer(SavedClassifier):
     """
 
     FITTED = "model_"
+    FORMAT = "dyntorch.phase-indexer"
+    VERSION = 1
+    OPTIONS = PhaseOptions
     RULES = {
         "course": one_of("auto", "periodic", "once"),
         "camera": one_of("affine", "projective"),
@@ -202,7 +218,7 @@ class PhaseIndexer(SavedClassifier):
         skeleton = layout_of(found)
         views, which = [], []
         for k, clip in enumerate(found):
-            seen_as = images(clip, options=self._options)
+            seen_as = images(clip)
             views += seen_as
             which += [k] * len(seen_as)
         order = sorted(range(len(views)), key=lambda i: (str(numbers[which[i]]), views[i].joints.tobytes()))
@@ -227,12 +243,36 @@ class PhaseIndexer(SavedClassifier):
         self.reject_threshold_ = reject_threshold(self.reject, model.wrong)
         return self
 
-    def _write(self, path: Path) -> None:
-        saving.save(self, path)
+    # ---- files -------------------------------------------------------------------------------------------------------
+    def _stored(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        about = {
+            "classes": labels_to_json(self.classes_),
+            "joints": self.n_joints_,
+            "mirrored": self.mirrored_.tolist(),
+            "periodic": self.periodic_.tolist(),
+            "skeleton": skeleton_to_json(self.skeleton_),
+        }
+        tensors = tensors_of(self.model_)
+        for c, course in enumerate(self.model_.courses):
+            tensors |= tensors_of(course, f"course.{c}.")
+        return about, tensors
 
-    @classmethod
-    def _read(cls, path: Path, device: str) -> Self:
-        return saving.load(cls, path, device)
+    def _restore(self, header: Mapping[str, Any], parts: Parts) -> None:
+        classes, joints = labels_from_json(header["classes"]), whole_number(header["joints"], "joints", LEAST, MAX_JOINTS)
+        periodic, mirrored = (_flags(header[name], name, len(classes)) for name in ("periodic", "mirrored"))
+        sizes = {"classes": len(classes), "joints": joints, "basis": 2 * self.harmonics + 1}
+        courses = tuple(
+            Course(**read_fields(Course, parts, sizes, f"course.{c}."), periodic=bool(periodic[c])) for c in range(len(classes))
+        )
+        courses = tuple(replace(course, shapes=course.shapes.double()) for course in courses)
+        if not all(len(course.shapes) for course in courses):
+            raise ValueError("course: an action without a shape")
+        fields = read_fields(PhaseModel, parts, sizes)
+        fields |= {"bank": Windows(fields["bank"].values.double(), fields["bank"].seen), "phase": fields["phase"].double()}
+        self.skeleton_ = skeleton_from_json(header["skeleton"], joints)
+        self.model_ = PhaseModel(**fields, courses=courses, options=self._options, camera=self.camera)
+        self.classes_, self.periodic_, self.n_joints_, self.mirrored_ = classes, periodic, joints, mirrored
+        self.reject_threshold_ = reject_threshold(self.reject, self.model_.wrong)
 
     # ---- single frames -----------------------------------------------------------------------------------------------
     @one_thread
@@ -242,7 +282,7 @@ class PhaseIndexer(SavedClassifier):
         (found,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, fewest=1, recordings=True)
         scores, phase = (part.cpu().numpy() for part in self._evidence([found]))
         if self.window > 0:
-            phase = smooth_phases(phase, found.times, self.window, self.periodic_, options=self._options)
+            phase = smooth_phases(phase, found.times, self.window, self.periodic_)
             scores = smooth(scores, found.times, self.window)
         return np.asarray(scores), np.asarray(phase)
 
@@ -280,7 +320,7 @@ class PhaseIndexer(SavedClassifier):
     def predict_proba(self, clips: Iterable[Any]) -> Array:
         """``(clips, classes)`` probabilities, rows sum to 1 (a softmax of the standardized scores)."""
         scores = self.decision_function(clips)
-        return probabilities(scores, self._options.decisions.sharpness) if scores.shape[1] > 1 else np.ones_like(scores)
+        return probabilities(scores, SHARPNESS) if scores.shape[1] > 1 else np.ones_like(scores)
 
     @one_thread
     def evidence(self, clips: Iterable[Any]) -> Array:
@@ -309,13 +349,17 @@ class PhaseIndexer(SavedClassifier):
         if len(self.classes_) < 2:
             raise ValueError("find needs two classes at least to tell one from the other; fit clips of ordinary movement too")
         scores = self._evidence([found])[0].cpu().numpy()
-        levels = event_levels(self.model_.wrong, self.reject, options=self._options)
-        second, decisions = self._options.events.second, self._options.decisions
+        levels = event_levels(self.model_.wrong, self.reject)
+        second = self._options.event_seconds
         parts = [slice(first, end) for first, end in stretches(found.times, second).tolist()]  # no event reaches across a gap
         return [
             event
             for part in parts
-            for event in events(
-                smooth(scores[part], found.times[part], second), found.times[part], list(self.classes_), *levels, options=decisions
-            )
+            for event in events(smooth(scores[part], found.times[part], second), found.times[part], list(self.classes_), *levels)
         ]
+
+
+def _flags(values: Any, name: str, count: int) -> NDArray[np.bool_]:
+    if not isinstance(values, list) or len(values) != count or not all(isinstance(value, bool) for value in values):
+        raise ValueError(f"{name}: expected {count} truth values, got {shown(values)}")
+    return np.array(values, dtype=bool)

@@ -13,8 +13,28 @@ from dyntorch.numerics import canonical_correlation, on_cpu, orthonormal_basis
 from indexing.action.bank import Windows, stack
 from indexing.clip import Clip
 from indexing.phase.frames import Learned, standardized, training_frames
-from indexing.phase.model import Course, PhaseModel, learn_course, wrong_scores
-from indexing.phase.options import PhaseOptions
+from indexing.phase.model import Course, PhaseModel, PhaseOptions, learn_course, wrong_scores
+
+MAX_MIRROR_FRAMES = 500  # by which the joints' mirror images are recognized
+COMPARED_RATE = 25.0  # samples per second at which clips are compared with themselves
+# 1 - correlation of changes of pose a period later, of half the clips: CMU walks .12-.6, punches .2-.3, jumps on one leg .63-.78
+MAX_PERIODIC_DEPTH = 0.65
+MAX_OWN_PERIOD_DEPTH = 0.8  # the same up to which pieces of such an action count their own period
+MAX_DEPTH_RATIO = 1.3  # to the best lag, up to which lags are periods too; the shortest counts
+CHANGE_REACH = 3  # samples to either side that a change of pose is measured over: slow turns of the person are none
+CYCLE_BINS = 24  # of a mean cycle
+PIECE_PERIODS = 2.0  # of the pieces that become mean cycles
+LOCAL_SECONDS = 5.0  # over which one period may hold
+MIN_RATE = 0.5  # of the mean, while a clip is followed through its cycle
+MAX_RATE = 1.6  # the same
+PATH_STEPS = 64  # phases of that path
+# of a flat card turned about the vertical, and seen from behind: AUC from one view per take .970 -> .982
+CARD_WIDTHS = (1.0, -1.0, 0.6, -0.6)
+COARSE_HARMONICS = (2, 3, 4)  # while phases are estimated: 58, 16, 20 and 11 degrees from the truth after none to three of them
+MAX_COARSE_FRAMES = 600  # for those
+MIRROR_HARMONICS = 3  # by which an action is compared with its own mirror image
+# of the way from the frames' own residual to that at any phase, log scale: CMU gait .17-.2, punching, bending .9-1.0
+MAX_MIRROR_SHARE = 0.35
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Where in its action every training frame is, found from the clips themselves: no view, joint or action is special.
@@ -25,14 +45,14 @@ from indexing.phase.options import PhaseOptions
 # from the start of its clip to the end.
 
 
-def period(x: Tensor, seconds: Tensor, options: PhaseOptions = PhaseOptions()) -> tuple[float, float]:
+def period(x: Tensor, seconds: Tensor, options: PhaseOptions) -> tuple[float, float]:
     """Seconds after which frames ``(F, n, 2)`` come back, and how far from it they remain (1 = they do not)."""
-    x = _sampled(standardized(x, x.new_ones(x.shape[:2])), seconds, options).flatten(1)
-    rate = options.period.rate
-    low, high = round(options.period.shortest * rate), min(round(options.period.longest * rate), 2 * len(x) // 3)
-    if high <= low + 2 or len(x) <= 4 * options.period.reach:
+    x = _sampled(standardized(x, x.new_ones(x.shape[:2])), seconds).flatten(1)
+    rate = COMPARED_RATE
+    low, high = round(options.min_period * rate), min(round(options.max_period * rate), 2 * len(x) // 3)
+    if high <= low + 2 or len(x) <= 4 * CHANGE_REACH:
         return 0.0, 1.0
-    x = x[2 * options.period.reach :] - x[: -2 * options.period.reach]
+    x = x[2 * CHANGE_REACH :] - x[: -2 * CHANGE_REACH]
     lags = range(min(high, len(x) - 2) + 1)
     energy = x.square().sum(1)
     apart = torch.stack(
@@ -47,16 +67,16 @@ def period(x: Tensor, seconds: Tensor, options: PhaseOptions = PhaseOptions()) -
         return 0.0, 1.0
     found = dip.nonzero()[:, 0] + 1
     depth = apart[found]
-    first = int((depth <= max(options.period.alike * float(depth.min()), 0.5 * options.period.deep)).nonzero()[0, 0])
+    first = int((depth <= max(MAX_DEPTH_RATIO * float(depth.min()), 0.5 * MAX_PERIODIC_DEPTH)).nonzero()[0, 0])
     at = int(found[first])
     before, here, after = (float(apart[at + k]) for k in (-1, 0, 1))
     shift = (before - after) / (2 * max(before + after - 2 * here, 1e-12))
     return (at + max(-0.5, min(0.5, shift))) / rate, float(depth[first])
 
 
-def _sampled(x: Tensor, seconds: Tensor, options: PhaseOptions) -> Tensor:
+def _sampled(x: Tensor, seconds: Tensor) -> Tensor:
     """Frames at the rate of the options, by linear interpolation."""
-    wanted = torch.arange(float(seconds[0]), float(seconds[-1]) + 1e-9, 1 / options.period.rate, dtype=seconds.dtype)
+    wanted = torch.arange(float(seconds[0]), float(seconds[-1]) + 1e-9, 1 / COMPARED_RATE, dtype=seconds.dtype)
     right = torch.searchsorted(seconds, wanted, right=True).clamp(1, len(seconds) - 1)
     share = ((wanted - seconds[right - 1]) / (seconds[right] - seconds[right - 1])).clamp(0, 1)[:, None, None].to(x)
     return x[right - 1] + share * (x[right] - x[right - 1])
@@ -64,28 +84,28 @@ def _sampled(x: Tensor, seconds: Tensor, options: PhaseOptions) -> Tensor:
 
 def _local(x: Tensor, seconds: Tensor, options: PhaseOptions) -> list[tuple[slice, float, float]]:
     """Pieces of a clip of a few seconds, with the period and its depth in each."""
-    count = max(1, round(float(seconds[-1] - seconds[0]) / options.period.local))
+    count = max(1, round(float(seconds[-1] - seconds[0]) / LOCAL_SECONDS))
     parts = _cut(seconds, slice(0, len(seconds)), count)
     return [(part, *period(x[part], seconds[part], options=options)) for part in parts]
 
 
 @on_cpu
-def in_step(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions = PhaseOptions()) -> list[Tensor] | None:
+def in_step(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions) -> list[Tensor] | None:
     """Phases in [0, 1) of the frames of clips of one action that repeats; ``None`` where it does not. clips ``(F, n, 2)``."""
     local = [_local(*clip, options=options) for clip in clips]
     depths = sorted(min(depth for _, _, depth in parts) for parts in local)
-    if depths[len(depths) // 2] > options.period.deep:
+    if depths[len(depths) // 2] > MAX_PERIODIC_DEPTH:
         return None
-    sure = sorted(seconds for parts in local for _, seconds, depth in parts if depth <= options.period.deep)
+    sure = sorted(seconds for parts in local for _, seconds, depth in parts if depth <= MAX_PERIODIC_DEPTH)
     usual = sure[len(sure) // 2]
     cycles, owner = [], []
     for k, ((x, t), parts) in enumerate(zip(clips, local, strict=True)):
         for part, seconds, depth in parts:
-            tempo = seconds if depth <= options.period.loose and 0.6 < seconds / usual < 1.6 else usual
-            for piece in _cut(t, part, max(1, round(float(t[part][-1] - t[part][0]) / (options.period.piece * tempo)))):
-                cycles.append(_mean_cycle(x[piece], t[piece], tempo, options))
+            tempo = seconds if depth <= MAX_OWN_PERIOD_DEPTH and 0.6 < seconds / usual < 1.6 else usual
+            for piece in _cut(t, part, max(1, round(float(t[part][-1] - t[part][0]) / (PIECE_PERIODS * tempo)))):
+                cycles.append(_mean_cycle(x[piece], t[piece], tempo))
                 owner.append((k, piece, tempo))
-    shifts = _shifts(torch.stack(cycles), options)
+    shifts = _shifts(torch.stack(cycles))
     phases = [torch.zeros_like(t) for _, t in clips]
     for (k, piece, tempo), shift in zip(owner, shifts, strict=True):
         phases[k][piece] = (clips[k][1][piece] / tempo + shift).remainder(1.0)
@@ -100,24 +120,24 @@ def _cut(seconds: Tensor, part: slice, count: int) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(cuts) if b > a + 1]
 
 
-def _mean_cycle(x: Tensor, seconds: Tensor, period_: float, options: PhaseOptions) -> Tensor:
+def _mean_cycle(x: Tensor, seconds: Tensor, period_: float) -> Tensor:
     """``(bins, n, 2)`` mean frame around every phase; the phase is time over period."""
     x = standardized(x, x.new_ones(x.shape[:2]))
     phase = seconds / period_
-    apart = (phase[:, None] - torch.arange(options.period.bins, dtype=phase.dtype) / options.period.bins + 0.5).remainder(1.0) - 0.5
+    apart = (phase[:, None] - torch.arange(CYCLE_BINS, dtype=phase.dtype) / CYCLE_BINS + 0.5).remainder(1.0) - 0.5
     # a phase that a short clip misses takes the nearest frames
-    weight = torch.exp(-0.5 * (apart * options.period.bins).square()) + 1e-12
+    weight = torch.exp(-0.5 * (apart * CYCLE_BINS).square()) + 1e-12
     return torch.einsum("fg,fnd->gnd", weight / weight.sum(0), x)
 
 
-def _shifts(cycles: Tensor, options: PhaseOptions) -> list[float]:
+def _shifts(cycles: Tensor) -> list[float]:
     """What to add to each cycle's own phase, so that all are in step with the one that fits the others best."""
     moving = cycles - cycles.mean(1, keepdim=True)
     count = len(moving)
-    turned = torch.stack([moving.roll(-k, dims=1) for k in range(options.period.bins)], 1)  # cycle at phase + k
+    turned = torch.stack([moving.roll(-k, dims=1) for k in range(CYCLE_BINS)], 1)  # cycle at phase + k
     basis = orthonormal_basis((turned - turned.mean(2, keepdim=True)).flatten(2, 3).flatten(0, 1))
-    apart = 1 - canonical_correlation(basis[:: options.period.bins], basis)
-    apart = (apart + 1e-3).log().unflatten(1, (count, options.period.bins))  # (cycle, other, shift of the other)
+    apart = 1 - canonical_correlation(basis[::CYCLE_BINS], basis)
+    apart = (apart + 1e-3).log().unflatten(1, (count, CYCLE_BINS))  # (cycle, other, shift of the other)
     rise = (apart.mean(2) - apart.amin(2)).fill_diagonal_(0)
     done, shifts = [int(rise.sum(1).argmax())], [0] * count
     while len(done) < count:
@@ -127,23 +147,21 @@ def _shifts(cycles: Tensor, options: PhaseOptions) -> list[float]:
         best = int((total.mean(1) - total.amin(1)).argmax())
         shifts[rest[best]] = int(total[best].argmin())
         done.append(rest[best])
-    return [-shift / options.period.bins for shift in shifts]
+    return [-shift / CYCLE_BINS for shift in shifts]
 
 
-def followed(
-    course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Tensor, options: PhaseOptions = PhaseOptions()
-) -> Tensor:
+def followed(course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Tensor) -> Tensor:
     """Phases of one clip's frames that go forward at about the clip's rate and leave least, by dynamic programming. phase
     ``(F,)``."""
     if len(x) < 3:
         return phase
     # one comparison of all frames at once, and then one step after the other, which only the CPU is quick at
-    curve = (course.curve(Windows(x[:, None], seen), options.period.steps) + 1e-3).log().cpu()
+    curve = (course.curve(Windows(x[:, None], seen), PATH_STEPS) + 1e-3).log().cpu()
     home, seconds, phase = phase.device, seconds.cpu(), phase.cpu()
     steps = (phase.diff() + 0.5).remainder(1.0) - 0.5
     rate = float(steps.median() / seconds.diff().median())
-    least = (options.period.slow * rate * seconds.diff() * options.period.steps).floor().long().clamp(min=0)
-    most = torch.maximum((options.period.fast * rate * seconds.diff() * options.period.steps).ceil().long(), least + 1)
+    least = (MIN_RATE * rate * seconds.diff() * PATH_STEPS).floor().long().clamp(min=0)
+    most = torch.maximum((MAX_RATE * rate * seconds.diff() * PATH_STEPS).ceil().long(), least + 1)
     cost, back = curve[0], []
     for f in range(1, len(curve)):
         moves = torch.arange(int(least[f - 1]), int(most[f - 1]) + 1)
@@ -153,8 +171,8 @@ def followed(
         cost = best.values + curve[f]
     at = [int(cost.argmin())]
     for move in reversed(back):
-        at.append((at[-1] - int(move[at[-1]])) % options.period.steps)
-    return (torch.tensor(at[::-1], dtype=phase.dtype) / options.period.steps).to(home)
+        at.append((at[-1] - int(move[at[-1]])) % PATH_STEPS)
+    return (torch.tensor(at[::-1], dtype=phase.dtype) / PATH_STEPS).to(home)
 
 
 Swap = Callable[[Tensor, Tensor], Tensor | None]
@@ -171,11 +189,11 @@ def learn_model(
     swap: Swap,
     device: torch.device | str = "cpu",
     camera: str = "affine",
-    options: PhaseOptions = PhaseOptions(),
+    options: PhaseOptions,
 ) -> tuple[PhaseModel, list[bool]]:
     """The model, on the CPU, and which classes are their own mirror image half a cycle later. clips ``(clips,)``."""
     learned = training_frames(clips)
-    some = learned.frames[: options.views.mirror_windows]
+    some = learned.frames[:MAX_MIRROR_FRAMES]
     twin = swap(some.values, some.seen) if mirror else None
     learned, phases = learned.to(device), [None if values is None else values.to(device) for values in phases]
     if mirror is True and twin is None:
@@ -193,11 +211,11 @@ def learn_model(
             mirrored.append(True)
         else:
             mirrored.append(False)
-        courses.append(_course(one, options.learning.frames, harmonics, repeats, options))
-        part = _spread(one, options.learning.kept * (1 + mirrored[-1]))
-        banks += [_card(part[0].frames, width) for width in options.learning.cards]
-        kept += [part[1]] * len(options.learning.cards)
-        labels.append(torch.full((len(options.learning.cards) * len(part[1]),), c, device=part[1].device))
+        courses.append(_course(one, options.max_training_frames, harmonics, repeats))
+        part = _spread(one, options.max_kept_frames * (1 + mirrored[-1]))
+        banks += [_card(part[0].frames, width) for width in CARD_WIDTHS]
+        kept += [part[1]] * len(CARD_WIDTHS)
+        labels.append(torch.full((len(CARD_WIDTHS) * len(part[1]),), c, device=part[1].device))
     model = PhaseModel(stack(banks), torch.cat(labels), torch.cat(kept), tuple(courses), torch.zeros(0), options, camera)
     return replace(model, wrong=wrong_scores(model, learned, label.to(learned.clip.device))).to("cpu"), mirrored
 
@@ -218,10 +236,10 @@ def _phases(
         if course == "periodic":
             raise ValueError("course='periodic': no period was found in the clips; give longer ones, or phases")
         return [_once(part.times) for part in parts], False
-    for harmonics in options.learning.rounds:
-        found = _course(_joined(parts, stepped), options.learning.first_frames, harmonics, True, options)
+    for harmonics in COARSE_HARMONICS:
+        found = _course(_joined(parts, stepped), MAX_COARSE_FRAMES, harmonics, True)
         stepped = [
-            followed(found, part.frames.values[:, 0], part.frames.seen, part.times, phase, options=options)
+            followed(found, part.frames.values[:, 0], part.frames.seen, part.times, phase)
             for part, phase in zip(parts, stepped, strict=True)
         ]
     return stepped, True
@@ -255,7 +273,7 @@ def _spread(one: Phased, most: int) -> Phased:
     return Learned(learned.frames[at], learned.clip[at], learned.times[at]), phase[at]
 
 
-def _course(one: Phased, most: int, harmonics: int, repeats: bool, options: PhaseOptions) -> Course:
+def _course(one: Phased, most: int, harmonics: int, repeats: bool) -> Course:
     learned, phase = _spread(one, most)
     return learn_course(
         learned.frames.values[:, 0],
@@ -264,7 +282,6 @@ def _course(one: Phased, most: int, harmonics: int, repeats: bool, options: Phas
         learned.clip,
         harmonics=harmonics,
         periodic=repeats,
-        options=options,
     )
 
 
@@ -286,14 +303,14 @@ def _with_mirror(one: Phased, swap: Tensor) -> Phased:
 
 def _own_mirror(one: Phased, swap: Tensor, options: PhaseOptions) -> bool:
     """Whether the mirrored frames fit the course half a cycle later."""
-    learned, phase = _spread(one, options.learning.first_frames)
-    found = _course((learned, phase), options.learning.first_frames, options.learning.mirror_harmonics, True, options)
+    learned, phase = _spread(one, MAX_COARSE_FRAMES)
+    found = _course((learned, phase), MAX_COARSE_FRAMES, MIRROR_HARMONICS, True)
 
     def left(frames: Windows, at: Tensor) -> tuple[Tensor, Tensor]:
-        curve = found.curve(frames, options.course.grid)
+        curve = found.curve(frames, options.num_phases)
         count = curve.shape[1]
         return curve.gather(1, (at * count).round().long().remainder(count)[:, None]).mean().log(), curve.mean().log()
 
     own, _ = left(learned.frames, phase)
     other, anywhere = left(_twins(learned.frames, swap), phase + 0.5)
-    return bool(other - own < options.learning.twin * (anywhere - own))
+    return bool(other - own < MAX_MIRROR_SHARE * (anywhere - own))

@@ -15,9 +15,45 @@ from indexing import scoring
 from indexing.action.bank import EPSILON, Windows, stack
 from indexing.modelfile import part, stored
 from indexing.phase.frames import LEAST as FRAMES_LEAST
-from indexing.phase.frames import Learned, image_distance, shape_distance, standardized
-from indexing.phase.options import PhaseOptions
-from indexing.phase.perspective import perspective_distance
+from indexing.phase.frames import Learned, image_distance, perspective_distance, shape_distance, standardized
+
+RIDGE = 1e-4  # of the mean diagonal; 1e-5 is as good, 1e-3 costs .5 and 1e-2 4 degrees
+NUM_ROUNDS = 30  # alternations from the mean shape
+NUM_STYLE_ROUNDS = 8  # alternations after every change of styles
+STYLES = (-0.7, 0.0, 0.7)  # of people; five from -1 to 1 give the same
+NUM_STYLE_CHANGES = 5
+INITIAL_SWING = 0.3  # share by which styles start as more and less motion
+MIN_STYLED_CLIPS = 4  # fewer do not tell styles apart
+NUM_RIVALS = 5  # frames of other actions that an action is held against: 1 costs .004 of the AUC
+PHASE_REACH = 4  # steps of the grid, .04 of the course: frames this near in phase stand for a phase; 8 cost .3 degrees
+SHAPE_WEIGHT = 0.5  # beside the nearest images: 0 / .5 / 1 give .867 / .957 / .946 AUC from one view per take
+LEAN_VARIANCE = 0.1  # of perspective cameras: what a frame of norm 1 leaves anyway, over the joints' relative depths
+MAX_ASKED_SECONDS = 120  # spread over all clips: bounds the time of calibration
+FRAMES_PER_SECOND = 8  # asked of each
+MIN_CALIBRATED_CLASSES = 3  # among two, leaving one out leaves nothing to be nearer to
+# at which a wrong action may reach an event's peak; .05 / .3: recall .58 / .78 at 0 / 15 % false finds of 13 actions
+FALSE_ALARM_RATE = 0.1
+EXTENT_RATE = 1.7  # times that rate for the level that an event's ends reach
+MIN_LEVELS = (0.3, 0.0)  # of an event's peak and ends; at 0 a frame is as near to other actions
+
+
+@dataclass(frozen=True)
+class PhaseOptions:
+    """What :class:`indexing.PhaseIndexer` learns from, and what it costs."""
+
+    min_period: float = 0.3
+    """Seconds that a cycle lasts at least."""
+    max_period: float = 4.0
+    """Seconds that a cycle lasts at most."""
+    num_phases: int = 96
+    """Phases that a frame is compared at: 3.75 degrees apart; 192 takes twice the time and changes the error by .1 degree."""
+    max_training_frames: int = 1500
+    """Frames that an action's course is learned from: 600 costs .9 degrees of phase."""
+    max_kept_frames: int = 1000
+    """Frames of an action that others are compared with: memory and time of every question."""
+    event_seconds: float = 1.0
+    """Seconds of a recording that scores are averaged over before events are cut from them."""
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How the shape of the joints goes through an action, learned from single frames: :math:`X(\phi) = \sum_b c_b(\phi) X_b`.
@@ -68,9 +104,7 @@ def _argument(phase: Tensor, periodic: bool) -> Tensor:
     return phase if periodic else 2 * phase - 1
 
 
-def learn_course(
-    x: Tensor, seen: Tensor, phase: Tensor, clip: Tensor, *, harmonics: int, periodic: bool, options: PhaseOptions = PhaseOptions()
-) -> Course:
+def learn_course(x: Tensor, seen: Tensor, phase: Tensor, clip: Tensor, *, harmonics: int, periodic: bool) -> Course:
     r"""Alternate between cameras and shapes, each a linear problem; then give every clip a style a and repeat. x ``(F, n, 2)``."""
     rows = basis_of(periodic, 2 * harmonics + 1).rows(_argument(phase, periodic))
     _, owner, counts = clip.unique(return_inverse=True, return_counts=True)
@@ -82,20 +116,20 @@ def learn_course(
     start[0] = torch.linalg.eigh(flat @ flat.mT)[1][:, -3:].flip(1)
     noise = torch.randn(start[1:].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
     start[1:] = 0.1 * noise.to(x.device) / rows.shape[1]
-    shapes = _alternated(x, weight, rows, start, options.course.rounds, options)
+    shapes = _alternated(x, weight, rows, start, NUM_ROUNDS)
     known = seen.any(0)
-    if len(counts) < options.course.styled:
+    if len(counts) < MIN_STYLED_CLIPS:
         return Course(shapes[None], periodic, known)
-    swing = options.course.swing * shapes
+    swing = INITIAL_SWING * shapes
     swing[0] = 0
     both = torch.cat([shapes, swing])
-    levels = x.new_tensor(options.course.styles)
-    for _ in range(options.course.changes):
+    levels = x.new_tensor(STYLES)
+    for _ in range(NUM_STYLE_CHANGES):
         left = torch.stack([_left(x, weight, rows, _styled(both, level)) for level in levels])
         style = levels[x.new_zeros(len(levels), len(counts)).index_add_(1, owner, left).argmin(0)]
         style = style - style.mean()
-        style = max(options.course.styles) * style / style.std(correction=0).clamp(min=1e-9)
-        both = _alternated(x, weight, torch.cat([rows, style[owner, None] * rows], 1), both, options.course.again, options)
+        style = max(STYLES) * style / style.std(correction=0).clamp(min=1e-9)
+        both = _alternated(x, weight, torch.cat([rows, style[owner, None] * rows], 1), both, NUM_STYLE_ROUNDS)
     return Course(torch.stack([_styled(both, level) for level in levels]), periodic, known)
 
 
@@ -121,7 +155,7 @@ def _left(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor) -> Tensor:
     return ((x - at @ cameras[:, :3] - cameras[:, 3:]).square() * weight[..., None]).sum((1, 2))
 
 
-def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds: int, options: PhaseOptions) -> Tensor:
+def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds: int) -> Tensor:
     frames, n = weight.shape
     eye = torch.eye(3 * rows.shape[1], dtype=x.dtype, device=x.device)
     for _ in range(rounds):
@@ -129,7 +163,7 @@ def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds:
         design = (rows[:, None, :, None] * cameras[:, :3].mT[:, :, None]).flatten(2)  # (F, 2, 3 B)
         gram = (weight.mT @ (design.mT @ design).flatten(1)).unflatten(1, eye.shape)
         right = ((x - cameras[:, 3:]) * weight[..., None]).permute(1, 0, 2).flatten(1) @ design.flatten(0, 1)
-        gram = gram + options.course.ridge * gram.diagonal(dim1=1, dim2=2).mean(-1).clamp(min=1e-12)[:, None, None] * eye
+        gram = gram + RIDGE * gram.diagonal(dim1=1, dim2=2).mean(-1).clamp(min=1e-12)[:, None, None] * eye
         shapes = torch.linalg.solve(gram, right).reshape(n, -1, 3).transpose(0, 1)
         # the affine frame is free: unit covariance keeps the ridge meaningful
         at = _at(rows, shapes)
@@ -157,7 +191,7 @@ class PhaseModel:
     phase: Tensor = field(metadata=stored("real", "frames", least=0, most=1))
     courses: tuple[Course, ...]
     wrong: Tensor = field(metadata=stored("real", None))
-    options: PhaseOptions = PhaseOptions()
+    options: PhaseOptions
     camera: str = "affine"
 
     def to(self, device: torch.device | str) -> PhaseModel:
@@ -187,19 +221,15 @@ class PhaseModel:
     def _evidence(self, query: Windows) -> tuple[Tensor, Tensor]:
         distance = image_distance(query, self.bank)
         scores, found = [], []
-        lean = self.options.evidence.lean if self.camera == "projective" else None
-        every = curves(query, self.courses, self.options.course.grid, lean)
+        lean = LEAN_VARIANCE if self.camera == "projective" else None
+        every = curves(query, self.courses, self.options.num_phases, lean)
         for c, (course, shapes) in enumerate(zip(self.courses, every, strict=True)):
             mine = self.label == c
-            images = _by_phase(distance[:, mine], self.phase[mine], course.periodic, self.options)
-            curve = self.options.evidence.mix * _log(shapes) + (1 - self.options.evidence.mix) * _log(images)
+            images = _by_phase(distance[:, mine], self.phase[mine], course.periodic, self.options.num_phases)
+            curve = SHAPE_WEIGHT * _log(shapes) + (1 - SHAPE_WEIGHT) * _log(images)
             best, phase = _lowest(curve, course.periodic)
             others = distance[:, ~mine]
-            rival = (
-                _log(others.topk(min(self.options.evidence.nearest, others.shape[1]), largest=False).values.mean(1))
-                if others.shape[1]
-                else 0.0
-            )
+            rival = _log(others.topk(min(NUM_RIVALS, others.shape[1]), largest=False).values.mean(1)) if others.shape[1] else 0.0
             scores.append(rival - best)
             found.append(phase)
         told = (query.seen.sum(1) >= FRAMES_LEAST)[:, None]
@@ -210,14 +240,14 @@ def _log(residual: Tensor) -> Tensor:
     return (residual + EPSILON).log()
 
 
-def _by_phase(distance: Tensor, phase: Tensor, periodic: bool, options: PhaseOptions) -> Tensor:
+def _by_phase(distance: Tensor, phase: Tensor, periodic: bool, grid: int) -> Tensor:
     """``(Q, grid)`` distance from the nearest frame within some steps of every phase, 1 where there is none."""
-    at = (phase * (options.course.grid if periodic else options.course.grid - 1)).round().long().remainder(options.course.grid)
-    nearest = distance.new_ones(len(distance), options.course.grid).scatter_reduce(1, at.expand(distance.shape), distance, "amin")
-    sides = nearest[:, -options.evidence.near :], nearest[:, : options.evidence.near]
+    at = (phase * (grid if periodic else grid - 1)).round().long().remainder(grid)
+    nearest = distance.new_ones(len(distance), grid).scatter_reduce(1, at.expand(distance.shape), distance, "amin")
+    sides = nearest[:, -PHASE_REACH:], nearest[:, :PHASE_REACH]
     if not periodic:
         sides = torch.ones_like(sides[0]), torch.ones_like(sides[1])
-    return torch.cat([sides[0], nearest, sides[1]], 1).unfold(1, 2 * options.evidence.near + 1, 1).amin(2)
+    return torch.cat([sides[0], nearest, sides[1]], 1).unfold(1, 2 * PHASE_REACH + 1, 1).amin(2)
 
 
 def _lowest(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
@@ -243,17 +273,17 @@ Array = NDArray[Any]
 
 def wrong_scores(model: PhaseModel, learned: Learned, label: Tensor) -> Tensor:
     """``(seconds,)`` the best mean score of training seconds in a model that their class was left out of."""
-    if len(model.courses) < model.options.events.classes:
+    if len(model.courses) < MIN_CALIBRATED_CLASSES:
         return torch.zeros(0, dtype=torch.float64)
-    whole = (learned.times / model.options.events.second).floor().long()
+    whole = (learned.times / model.options.event_seconds).floor().long()
     cuts = (learned.clip.diff() != 0) | (whole.diff() != 0)
     piece = torch.cat([cuts.new_zeros(1), cuts]).cumsum(0)
     found = []
     for c in range(len(model.courses)):
         mine = piece[label[learned.clip] == c].unique()
         asked = [
-            _spread((piece == one).nonzero()[:, 0], model.options.events.frames)
-            for one in _spread(mine, max(1, model.options.events.asked // len(model.courses)))
+            _spread((piece == one).nonzero()[:, 0], FRAMES_PER_SECOND)
+            for one in _spread(mine, max(1, MAX_ASKED_SECONDS // len(model.courses)))
         ]
         scores = model.without(c).evidence(learned.frames[torch.cat(asked)])[0]
         found += [part.mean(0).max() for part in scores.split([len(one) for one in asked])]
@@ -265,8 +295,6 @@ def _spread(values: Tensor, most: int) -> Tensor:
     return values[torch.linspace(0, len(values) - 1, min(most, len(values))).round().long()]
 
 
-def event_levels(wrong: Tensor, rate: float | None, options: PhaseOptions = PhaseOptions()) -> tuple[float, float]:
+def event_levels(wrong: Tensor, rate: float | None) -> tuple[float, float]:
     """Scores that an event needs somewhere and throughout, for a rate of wrong actions that may reach them."""
-    return scoring.event_levels(
-        wrong.cpu().numpy(), options.events.false_alarms if rate is None else rate, options.events.extent, options.events.least
-    )
+    return scoring.event_levels(wrong.cpu().numpy(), FALSE_ALARM_RATE if rate is None else rate, EXTENT_RATE, MIN_LEVELS)

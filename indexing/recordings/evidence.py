@@ -11,9 +11,21 @@ import torch
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows
-from indexing.action.model import ShapeModel, standardized
-from indexing.recordings.options import ExplanationOptions
+from indexing.action.model import NUM_NEIGHBOURS, ShapeModel, standardized
 from indexing.windows import Ragged, sample
+
+STEPS_PER_ACTION = 6.0  # that the shortest action (median of its exemplars) is divided into: segments begin and end at such steps
+MAX_STEP = 0.1  # seconds; .2 costs .03 of the frames of synthetic actors seen from the side
+DURATION_RATIO = 1.12  # between neighbouring durations; 1.25 takes a third less time and costs .01 to .03 of the frames
+MAX_DENSE_EXEMPLARS = 300  # up to which durations lie so close; of more, every other one is taken, for the time
+DURATION_REACH = 0.8  # times the shortest exemplar (and the longest, divided by it)
+MAX_DURATION_FACTOR = 3.0  # from what is usual for its class; beyond it a label holds more than the action (UTKinect)
+MAX_TEMPO_FACTOR = 2.0  # from an exemplar, up to which a window is compared with it
+LOG_DURATION_SIGMA = 0.35  # around each exemplar of a class
+MIN_DURATION_LIKELIHOOD = 1e-6
+# of an exemplar a cycle later, from which a class counts as cyclic, and fully so: jacks .7 to .9, single movements .3
+CYCLIC_CORRELATION = (0.35, 0.65)
+MIN_CYCLIC = 0.5  # 0..1, from which segments that touch are one
 
 Array = NDArray[Any]
 BLOCK = 2000  # windows compared at once: bounds memory whatever the length of the recording
@@ -28,18 +40,18 @@ class Durations:
     cyclic: Array
 
     @classmethod
-    def of(cls, model: ShapeModel, window: float, stride: float, options: ExplanationOptions) -> Durations:
+    def of(cls, model: ShapeModel, window: float, stride: float) -> Durations:
         """Of a model; where its file does not say, from how many short windows each exemplar was cut into."""
         labels = model.labels.cpu().numpy()
         kept = model.exemplars.seconds
         counts = np.bincount(model.exemplars.owner.cpu().numpy(), minlength=len(labels))
         seconds = (window + stride * (counts - 1.0)) if kept is None else kept.cpu().numpy().astype(float)
         seconds = np.maximum(seconds, 1e-3)
-        low, high = options.cyclic
+        low, high = CYCLIC_CORRELATION
         again = np.zeros(len(labels)) if model.exemplars.cyclic is None else model.exemplars.cyclic.cpu().numpy()
         each = [labels == c for c in range(model.classes)]
         usual = np.array([np.median(seconds[mine]) for mine in each])[labels]
-        seconds = np.where(np.abs(np.log(seconds / usual)) <= np.log(options.strange), seconds, np.nan)
+        seconds = np.where(np.abs(np.log(seconds / usual)) <= np.log(MAX_DURATION_FACTOR), seconds, np.nan)
         return cls(
             seconds,
             np.array([np.nanmedian(seconds[mine]) for mine in each]),
@@ -51,14 +63,14 @@ class Durations:
         """Seconds of an ordinary exemplar: what qualities are counted by."""
         return float(np.nanmedian(self.seconds))
 
-    def likelihoods(self, durations: Array, labels: Array, options: ExplanationOptions) -> Array:
+    def likelihoods(self, durations: Array, labels: Array) -> Array:
         """``(durations, classes)`` log likelihood of each duration, a kernel density around the exemplars of each class."""
         least = 1e-9  # seconds: windows of one length are equal up to the rounding of their edges
         durations, again = np.unique(np.maximum(np.round(durations / least), 1.0) * least, return_inverse=True)
         apart = np.log(durations)[:, None] - np.log(self.seconds)[None]
-        near = np.nan_to_num(np.exp(-0.5 * (apart / options.spread) ** 2))
+        near = np.nan_to_num(np.exp(-0.5 * (apart / LOG_DURATION_SIGMA) ** 2))
         each = [near[:, labels == c].mean(axis=1) for c in range(len(self.typical))]
-        return np.log(np.stack(each, axis=1) + options.unlikely).astype(np.float32)[again]
+        return np.log(np.stack(each, axis=1) + MIN_DURATION_LIKELIHOOD).astype(np.float32)[again]
 
 
 @dataclass(frozen=True)
@@ -69,13 +81,13 @@ class Lattice:
     windows: Array
 
     @classmethod
-    def over(cls, begin: float, end: float, durations: Durations, options: ExplanationOptions) -> Lattice:
+    def over(cls, begin: float, end: float, durations: Durations, num_durations: int) -> Lattice:
         """Of a stretch: windows of every duration that actions have, from every edge."""
-        step = min(options.coarsest, float(durations.typical.min()) / options.step)
+        step = min(MAX_STEP, float(durations.typical.min()) / STEPS_PER_ACTION)
         cells = max(1, round((end - begin) / step))
-        shortest, longest = options.reach * np.nanmin(durations.seconds), np.nanmax(durations.seconds) / options.reach
-        ratio = options.ratio if len(durations.seconds) <= options.many else options.ratio**2
-        count = min(options.durations, int(np.ceil(np.log(longest / shortest) / np.log(ratio))) + 1)
+        shortest, longest = DURATION_REACH * np.nanmin(durations.seconds), np.nanmax(durations.seconds) / DURATION_REACH
+        ratio = DURATION_RATIO if len(durations.seconds) <= MAX_DENSE_EXEMPLARS else DURATION_RATIO**2
+        count = min(num_durations, int(np.ceil(np.log(longest / shortest) / np.log(ratio))) + 1)
         lengths = np.geomspace(shortest, longest, max(2, count)) / max(end - begin, 1e-9) * cells
         lengths = np.unique(np.clip(np.round(lengths), 1, cells).astype(np.intp))
         # in order of their last edges, then of their first ones: of each last edge the longest that fit, the longest first
@@ -106,9 +118,7 @@ class Lattice:
         return Windows(values, torch.from_numpy(source.seen[owner]))
 
 
-def whole_scores(
-    model: ShapeModel, lattice: Lattice, cut: Callable[[Array], Windows], durations: Durations, options: ExplanationOptions
-) -> Array:
+def whole_scores(model: ShapeModel, lattice: Lattice, cut: Callable[[Array], Windows], durations: Durations) -> Array:
     """``(W, classes)`` minus the mean residual to the nearest whole exemplars of each class that last about as long; NaN: none."""
     labels = model.labels.cpu().numpy()
     out = np.full((len(lattice.windows), model.classes), np.nan, dtype=np.float32)
@@ -116,7 +126,7 @@ def whole_scores(
     for count in np.unique(cells).tolist():
         rows = np.flatnonzero(cells == count)
         lasts = float(np.median(lattice.seconds[rows]))
-        near = np.flatnonzero(np.abs(np.log(durations.seconds / max(lasts, 1e-9))) <= np.log(options.tempo))
+        near = np.flatnonzero(np.abs(np.log(durations.seconds / max(lasts, 1e-9))) <= np.log(MAX_TEMPO_FACTOR))
         if not len(near):
             continue
         chosen = torch.from_numpy(near).to(model.labels.device)
@@ -125,7 +135,7 @@ def whole_scores(
             residual = model.whole_residuals(cut(some).to(chosen.device), chosen).cpu().numpy()
             for c in np.unique(labels[near]).tolist():
                 mine = residual[:, labels[near] == c]
-                kept = min(options.neighbours, mine.shape[1])
+                kept = min(NUM_NEIGHBOURS, mine.shape[1])
                 out[some, c] = -np.partition(mine, kept - 1, axis=1)[:, :kept].mean(axis=1)
     return out
 

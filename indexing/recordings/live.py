@@ -1,6 +1,6 @@
 """A recording explained while it is being recorded: frames go in, events and scores of frames come out a fixed time later.
 
-The same evidence and the same dynamic programming as for recordings that are there as a whole (:mod:`indexing.recordings.explain`).
+The same evidence and the same dynamic programming as for complete recordings (:mod:`indexing.recordings.decoding`).
 Every window is looked at once, when its last frame is there.  What begins at a moment is decided when so much of what follows is
 known that every segment that may lie there is among what was compared; nothing that was decided changes later.  What is kept
 are the frames and the windows of that time, whatever the length of the stream.
@@ -19,19 +19,22 @@ from numpy.typing import NDArray
 from dyntorch.numerics import one_thread
 from indexing.action.background import event_level
 from indexing.action.exemplars import moment_window
-from indexing.action.model import ShapeModel
-from indexing.action.stream import Stream, moments, presence, wrong_contrast
+from indexing.action.model import NUM_NEIGHBOURS, ShapeModel
+from indexing.action.stream import INTERPOLATION_MARGIN, Stream, moments, presence, wrong_contrast
 from indexing.cameras import y_up
 from indexing.clip import Clip
 from indexing.estimator import is_number
 from indexing.joints import matched_all
-from indexing.recordings.evidence import Durations, Lattice
-from indexing.recordings.explain import Stretch, log_scores, segment_values, told_events
-from indexing.recordings.options import ExplanationOptions
+from indexing.recordings.decoding import EDGE_TOLERANCE, TEMPERATURE, Stretch, log_scores, segment_values, told_events
+from indexing.recordings.evidence import DURATION_REACH, MAX_TEMPO_FACTOR, MIN_CYCLIC, Durations, Lattice
 from indexing.recordings.tiling import TiledSegment, best_tiling, posterior
 from indexing.scoring import Event, event_levels
 from indexing.skeleton import Skeleton
-from indexing.windows import Ragged, RepairOptions, mended, ragged
+from indexing.windows import Ragged, mended, ragged
+
+# of the usual duration of the longest action, looked at after a moment before it is decided; of half of it long actions are missed
+HORIZON = 1.25
+NUM_RECENT_STEPS = 30  # between the latest frames, which may be too far apart for any window
 
 Array = NDArray[Any]
 
@@ -54,7 +57,7 @@ class LiveSource:
     look: Stream
     rate: float | None
     least: float
-    repair: RepairOptions | None
+    repair: bool
     joints: int
     skeleton: Skeleton | None
     fps: float
@@ -139,15 +142,15 @@ class ActionStream:
     def __init__(self, source: LiveSource, lag: float | None, up: str, skeleton: Skeleton | None) -> None:
         self.source, self.up, self.skeleton, self.classes = source, up, skeleton, source.classes
         self._asked = source.joints if skeleton is None else len(skeleton.joints)  # joints of a frame
-        model, options = source.model, source.model.options
-        self._look = replace(source.look, window=moment_window(source.look.window, model.exemplars.seconds, options.exemplars))
-        self._durations = Durations.of(model, self._look.window, 0.3 * self._look.window, options.recordings)
-        self._step, self._lengths = _grid(self._durations, options.recordings)
+        model, options = source.model, source.look.options
+        self._look = replace(source.look, window=moment_window(source.look.window, model.exemplars.seconds))
+        self._durations = Durations.of(model, self._look.window, 0.3 * self._look.window)
+        self._step, self._lengths = _grid(self._durations, options.num_durations)
         self._ahead = max(1.0, *self._look.tempi) * self._look.window / 2  # seconds that a moment looks ahead
         self._horizon, self.lag = self._horizon_of(lag)
         self._place = _places(source, up, skeleton)
         self._floor = _floor(model, source.rate)
-        cells = options.live.memory / self._step
+        cells = options.live_memory / self._step
         self._contrast = RunningLevel(cells * model.classes)
         self._wholes = RunningLevel(cells * model.classes * len(self._lengths))
         self._count, self._last, self._steps = 0, -np.inf, np.empty(0)
@@ -155,10 +158,10 @@ class ActionStream:
 
     def _horizon_of(self, lag: Any) -> tuple[int, float]:
         """How many cells that follow a moment decide about it, and the seconds after which an event is told then."""
-        live, typical = self.source.model.options.live, float(self._durations.typical.max())
-        known, edge = live.block + self._ahead + self._step, 1e-9  # seconds after a cell at which it is known at the latest
+        options, typical = self.source.look.options, float(self._durations.typical.max())
+        known, edge = options.live_block + self._ahead + self._step, 1e-9  # seconds after a cell at which it is known at the latest
         if lag is None:
-            cells = int(np.ceil(live.horizon * typical / self._step - edge))
+            cells = int(np.ceil(HORIZON * typical / self._step - edge))
         elif is_number(lag) and lag >= known + typical - edge:
             cells = int((float(lag) - known) / self._step + edge)
         else:
@@ -224,7 +227,7 @@ class ActionStream:
         if clip.times[0] <= self._last:
             raise ValueError(f"stream: times: {clip.times[0]:.6g} s comes after {self._last:.6g} s; times must increase")
         steps = np.diff(clip.times, prepend=self._last)
-        many = self.source.model.options.live.recent
+        many = NUM_RECENT_STEPS
         recent = np.append(self._steps, steps[np.isfinite(steps)])[-many:]
         if len(recent) == many and float(np.median(recent)) > self._look.window:
             raise ValueError(
@@ -240,7 +243,7 @@ class ActionStream:
         self._raw, self._good = np.concatenate([self._raw, frames]), np.concatenate([self._good, frames])
         self._at = np.concatenate([self._at, at])
         told: list[LiveAnswer] = []
-        block = self.source.model.options.live.block
+        block = self.source.look.options.live_block
         while self._at[-1] >= (self._blocks + 1) * block:
             self._blocks += 1
             known = self._blocks * block
@@ -266,16 +269,16 @@ class ActionStream:
         """Look at ``count`` more cells, of which the first ``frames`` frames show all."""
         model, first = self.source.model, self._first + len(self._cells)
         since = first * self._step - self._ahead
-        begin = int(np.searchsorted(self._at, since - model.options.events.margin))
+        begin = int(np.searchsorted(self._at, since - INTERPOLATION_MARGIN))
         near = Clip(self._raw[begin:frames], times=self._at[begin:frames])
-        if self.source.repair is not None:  # judged with the frames before and after them
+        if self.source.repair:  # judged with the frames before and after them
             fresh = int(np.searchsorted(self._at, since))
-            self._good[fresh:frames] = mended(near, self.source.repair).joints[fresh - begin :]
+            self._good[fresh:frames] = mended(near).joints[fresh - begin :]
             near = near.replace(joints=self._good[begin:frames])
         middle = (first + np.arange(count) + 0.5) * self._step
         own = np.zeros(count, dtype=np.intp)
         scores, motion = moments(model, ragged([near]), own, middle, self._look)
-        present = presence(near, np.array([[0, len(near)]]), middle, own, self._look, model.options)
+        present = presence(near, np.array([[0, len(near)]]), middle, own, self._look)
         contrast = np.where(present[:, None], scores - scores.mean(axis=1, keepdims=True), 0.0)
         cells = _Cells(contrast, motion, present, self._whole(frames, first, count))
         self._contrast.push(contrast[present])
@@ -284,7 +287,7 @@ class ActionStream:
 
     def _whole(self, frames: int, first: int, count: int) -> Array:
         """``(count, lengths, classes)`` ``whole_scores`` of the windows that end in each cell, from one comparison."""
-        model, options = self.source.model, self.source.model.options.recordings
+        model = self.source.model
         last = first + 1 + np.arange(count)
         begin = last[:, None] - self._lengths
         row, which = np.nonzero(begin >= self._first)
@@ -296,9 +299,9 @@ class ActionStream:
         every = torch.arange(len(model.labels), device=model.labels.device)
         residual, labels = model.whole_residuals(windows, every).cpu().numpy(), model.labels.cpu().numpy()
         tempo = np.abs(np.log(self._durations.seconds / (self._lengths[:, None] * self._step)))
-        near = (tempo <= np.log(options.tempo))[which]
+        near = (tempo <= np.log(MAX_TEMPO_FACTOR))[which]
         for c in range(model.classes):
-            mine = np.sort(np.where(near[:, labels == c], residual[:, labels == c], np.inf), axis=1)[:, : options.neighbours]
+            mine = np.sort(np.where(near[:, labels == c], residual[:, labels == c], np.inf), axis=1)[:, :NUM_NEIGHBOURS]
             there = np.isfinite(mine)
             mean = np.where(there, mine, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
             out[row, which, c] = np.where(there.any(axis=1), -mean, np.nan)
@@ -310,7 +313,7 @@ class ActionStream:
     # ---- what is decided ---------------------------------------------------------------------------------------------
     def _explained(self, frames: int) -> _Tiled:
         """The best explanation of all that is known and not decided."""
-        model, options, cells = self.source.model, self.source.model.options.recordings, self._cells
+        model, cells = self.source.model, self._cells
         count = len(cells)
         begin = np.arange(1, count + 1)[:, None] - self._lengths
         row, which = np.nonzero(begin >= 0)
@@ -321,9 +324,9 @@ class ActionStream:
         one = Stretch(self._source(frames), lattice, cells.raw, cells.raw / spread, cells.motion, cells.present, whole, (0, frames))
         if not len(row):
             return _Tiled(one, np.zeros((0, model.classes)), {}, np.zeros((count, model.classes)))
-        values, calm, _ = segment_values(model, one, self._durations, self._wholes.level(), self._look.length, options)
+        values, calm, _ = segment_values(model, one, self._durations, self._wholes.level(), self._look.length, self._look.options)
         segments, _ = best_tiling(lattice.windows, values, calm)
-        likely = posterior(lattice.windows, values, calm, options.temperature)
+        likely = posterior(lattice.windows, values, calm, TEMPERATURE)
         return _Tiled(one, values, {each.first: each for each in segments}, likely)
 
     def _rest(self) -> list[LiveAnswer]:
@@ -339,21 +342,21 @@ class ActionStream:
         self._told += len(told.times)
         self._first += edge
         self._cells = self._cells.after(edge)
-        reach = self._first * self._step - self._ahead - self.source.model.options.events.margin
+        reach = self._first * self._step - self._ahead - INTERPOLATION_MARGIN
         kept = max(0, min(self._told, int(np.searchsorted(self._at, reach))))
         self._raw, self._good, self._at, self._told = self._raw[kept:], self._good[kept:], self._at[kept:], self._told - kept
         return [told]
 
     def _tell(self, tiled: _Tiled, count: int | None) -> tuple[LiveAnswer, int, _Running | None]:
         """What begins in the first ``count`` cells, the edge that it reaches to, and the event that may go on there."""
-        options, known, edge, running = self.source.model.options.recordings, len(self.classes), 0, self._running
+        known, edge, running = len(self.classes), 0, self._running
         done: list[Event] = []
         while edge < (len(self._cells) if count is None else count):
             part = tiled.segments.get(edge)
             edge = edge + 1 if part is None else part.last
             mine = None if part is None or part.label >= known or not self._evident(tiled, part) else part
             goes_on = mine is not None and running is not None and running.label == mine.label
-            if running is not None and not (goes_on and self._durations.cyclic[running.label] > options.joined):
+            if running is not None and not (goes_on and self._durations.cyclic[running.label] > MIN_CYCLIC):
                 done.append(running.event)
                 running = None
             if mine is not None:
@@ -362,10 +365,10 @@ class ActionStream:
             done.append(running.event)
             running = None
         edges = tiled.one.lattice.edges
-        last = len(self._at) if count is None else int(np.searchsorted(self._at, edges[edge] - options.edge))
+        last = len(self._at) if count is None else int(np.searchsorted(self._at, edges[edge] - EDGE_TOLERANCE))
         rows = slice(self._told, max(last, self._told))
-        cell = np.searchsorted(edges, self._at[rows] + options.edge, side="right") - 1
-        scores = log_scores(tiled.likely, options)[np.clip(cell, 0, len(tiled.likely) - 1), :known]
+        cell = np.searchsorted(edges, self._at[rows] + EDGE_TOLERANCE, side="right") - 1
+        scores = log_scores(tiled.likely)[np.clip(cell, 0, len(tiled.likely) - 1), :known]
         return LiveAnswer(self._at[rows] + self._begin, scores, self._loud(done)), edge, running
 
     def _evident(self, tiled: _Tiled, part: TiledSegment) -> bool:
@@ -389,7 +392,7 @@ class ActionStream:
     def _silent(self, rows: slice) -> LiveAnswer:
         """Frames of which nothing can be said."""
         at = self._at[rows]
-        least = log_scores(np.zeros(1), self.source.model.options.recordings)[0]
+        least = log_scores(np.zeros(1))[0]
         return LiveAnswer(at + self._begin, np.full((len(at), len(self.classes)), least))
 
     def _joined(self, told: list[LiveAnswer]) -> LiveAnswer:
@@ -399,10 +402,10 @@ class ActionStream:
         return LiveAnswer(np.concatenate([one.times for one in told]), np.concatenate([one.scores for one in told]), events)
 
 
-def _grid(durations: Durations, options: ExplanationOptions) -> tuple[float, Array]:
+def _grid(durations: Durations, num_durations: int) -> tuple[float, Array]:
     """Seconds of a cell, and ``(lengths,)`` of windows in cells, as in recordings that are there as a whole."""
-    longest = 10 * float(np.nanmax(durations.seconds)) / options.reach  # a recording that is long enough for all windows
-    lattice = Lattice.over(0.0, longest, durations, options)
+    longest = 10 * float(np.nanmax(durations.seconds)) / DURATION_REACH  # a recording that is long enough for all windows
+    lattice = Lattice.over(0.0, longest, durations, num_durations)
     lengths = np.unique(lattice.windows[:, 1] - lattice.windows[:, 0])
     return float(lattice.edges[1]), lengths
 

@@ -24,25 +24,12 @@ IntArray = NDArray[np.intp]
 GhostReason = Literal["too short", "too few joints", "at one place"]
 
 
-@dataclass(frozen=True)
-class PresenceOptions:
-    """Which tracks are people, and when one is said to leave, to appear, and to change places with another."""
-
-    shortest: float = 0.5
-    """Seconds in view: tracks of less are a detector's ghosts.  Actions last from a third of a second, people in view longer."""
-    share: float = 0.5
-    """Of the recording: whoever is in view for so much of it is a person, however short the recording."""
-    joints: int = 3
-    """Seen in half the frames: of fewer nothing can be compared (:data:`indexing.action.bank.COMMON`)."""
-    absence: float = 1.0
-    """Seconds out of view, from which on a person has left: by position nobody can say who comes then.  Detectors lose a person
-    who is in view for less."""
-    near: float = 1.0
-    """Box diagonals between where one left and another appears: there it may be the same."""
-    jump: float = 0.5
-    """Box diagonals from one frame to the next that nobody goes: the reader's reach for one person."""
-    closer: float = 4.0
-    """Times that two identities must be nearer to each other's last places than to their own, to be said to have changed places."""
+MIN_SHARE = 0.5  # of the recording: whoever is in view for so much of it is a person, however short the recording
+MIN_JOINTS = 3  # seen in half the frames: of fewer nothing can be compared (indexing.action.bank.COMMON)
+MIN_ABSENCE = 1.0  # seconds out of view, from which on a person has left; detectors lose a person for less
+MAX_RETURN_DISTANCE = 1.0  # box diagonals between where one left and another appears: there it may be the same
+MAX_JUMP = 0.5  # box diagonals from one frame to the next: the reader's reach for one person
+MIN_EXCHANGE_RATIO = 4.0  # times nearer to each other's last places than to their own, for two identities to have changed places
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,17 +106,17 @@ def of_recording(clips: Sequence[Clip]) -> bool:
     return bool(clips) and all({"followed", "person"} <= clip.meta.keys() for clip in clips)
 
 
-def tracked_people(clips: Sequence[Clip], name: str = "", options: PresenceOptions = PresenceOptions()) -> Crowd:
-    """The people of one recording from its identities."""
+def tracked_people(clips: Sequence[Clip], name: str = "", min_seconds: float = 0.5) -> Crowd:
+    """The people of one recording from its identities; tracks of less than ``min_seconds`` in view are ghosts of the detector."""
     by_ids = clips[0].meta["followed"] == "ids"
     whole = by_ids or clips[0].meta["person"] is None
-    parts = list(clips) if whole else [part for clip in clips for part in _parted(clip, options)]
+    parts = list(clips) if whole else [part for clip in clips for part in _parted(clip)]
     step = _step(clips)
     length = max(clip.times[-1] for clip in clips) - min(clip.times[0] for clip in clips) + step
-    least = min(options.joints, max(int(clip.seen.sum(axis=1).max()) for clip in clips))
+    least = min(MIN_JOINTS, max(int(clip.seen.sum(axis=1).max()) for clip in clips))
     tracks, ghosts = [], Counter[GhostReason]()
     for part in parts:
-        reason = _ghost(part, step, length, least, options)
+        reason = _ghost(part, step, length, least, min_seconds)
         if reason is None:
             tracks.append(_track(part))
         else:
@@ -148,9 +135,9 @@ def tracked_people(clips: Sequence[Clip], name: str = "", options: PresenceOptio
         dict(ghosts),
         by_ids,
         int(clips[0].meta.get("untracked", 0)),
-        tuple(_appearances(names, tracks, options)),
-        tuple(Absence(who, *gap) for who, track in zip(names, tracks, strict=True) for gap in _absences(track, options)),
-        tuple(_exchanges(names, tracks, options)),
+        tuple(_appearances(names, tracks)),
+        tuple(Absence(who, *gap) for who, track in zip(names, tracks, strict=True) for gap in _absences(track)),
+        tuple(_exchanges(names, tracks)),
     )
 
 
@@ -166,10 +153,10 @@ def _step(clips: Sequence[Clip]) -> float:
     return float(np.median(np.concatenate(steps))) if steps else 0.0
 
 
-def _parted(clip: Clip, options: PresenceOptions) -> list[Clip]:
+def _parted(clip: Clip) -> list[Clip]:
     """An identity by position, cut where it is out of view for long; frames that do not show it at an end are left out."""
     rows = np.flatnonzero(clip.seen.any(axis=1))
-    cuts = np.flatnonzero(np.diff(clip.times[rows]) > options.absence) + 1
+    cuts = np.flatnonzero(np.diff(clip.times[rows]) > MIN_ABSENCE) + 1
     if not len(cuts) and len(rows) == len(clip):
         return [clip]
     return [_rows(clip, slice(int(some[0]), int(some[-1]) + 1)) for some in np.split(rows, cuts) if len(some)]
@@ -180,11 +167,11 @@ def _rows(clip: Clip, rows: slice) -> Clip:
     return clip.replace(joints=clip.joints[rows], times=clip.times[rows], confidence=confidence)
 
 
-def _ghost(clip: Clip, step: float, length: float, least: int, options: PresenceOptions) -> GhostReason | None:
+def _ghost(clip: Clip, step: float, length: float, least: int, min_seconds: float) -> GhostReason | None:
     """Why an identity is no person."""
     joints = clip.seen.sum(axis=1)
     shown = joints > 0
-    if shown.sum() * step < min(options.shortest, options.share * length) - step / 2 or len(clip) < 2:
+    if shown.sum() * step < min(min_seconds, MIN_SHARE * length) - step / 2 or len(clip) < 2:
         return "too short"
     if np.median(joints[shown]) < least:
         return "too few joints"
@@ -212,15 +199,15 @@ def _one(tracks: Sequence[_Track]) -> Clip:
     return clips[0].replace(joints=joints, times=times[order], confidence=None if sure is None else sure[order])
 
 
-def _absences(track: _Track, options: PresenceOptions) -> list[tuple[float, float]]:
+def _absences(track: _Track) -> list[tuple[float, float]]:
     """When a person is out of view; a pause of the recording itself is none, where the clip has all of its frames."""
-    away = np.diff(track.times) > options.absence
+    away = np.diff(track.times) > MIN_ABSENCE
     if track.clip.meta["person"] is None:
         away &= np.diff(track.rows) > 1
     return [(float(track.times[i]), float(track.times[i + 1])) for i in np.flatnonzero(away)]
 
 
-def _appearances(names: Sequence[str], tracks: Sequence[_Track], options: PresenceOptions) -> list[Appearance]:
+def _appearances(names: Sequence[str], tracks: Sequence[_Track]) -> list[Appearance]:
     """Whoever comes after somebody else has left; of those who may be the same, who left nearby, and of these the latest."""
     if not tracks:
         return []
@@ -234,9 +221,9 @@ def _appearances(names: Sequence[str], tracks: Sequence[_Track], options: Presen
             if left is track or before < 0:
                 continue  # itself, or not there yet
             gone = before + 1 == len(left.times)
-            if not gone and left.times[before + 1] - left.times[before] <= options.absence:
+            if not gone and left.times[before + 1] - left.times[before] <= MIN_ABSENCE:
                 continue  # in view all the time
-            near = _apart(left, before, track) <= options.near * max(left.size, track.size)
+            near = _apart(left, before, track) <= MAX_RETURN_DISTANCE * max(left.size, track.size)
             if near or gone:
                 candidates.append((near, float(left.times[before]), other))
         if candidates and at > begin:
@@ -251,21 +238,21 @@ def _apart(left: _Track, row: int, track: _Track) -> float:
     return float(np.linalg.norm(np.nanmean(a, axis=0) - np.nanmean(b, axis=0)))
 
 
-def _exchanges(names: Sequence[str], tracks: Sequence[_Track], options: PresenceOptions) -> list[Exchange]:
+def _exchanges(names: Sequence[str], tracks: Sequence[_Track]) -> list[Exchange]:
     """Where two identities are, from one frame to the next, at each other's places."""
-    leaps = [(who, track, _leaps(track, options)) for who, track in zip(names, tracks, strict=True)]
+    leaps = [(who, track, _leaps(track)) for who, track in zip(names, tracks, strict=True)]
     found = []
     for (first, a, mine), (second, b, other) in combinations([one for one in leaps if len(one[2])], 2):
         for at in np.intersect1d(mine, other).tolist():
             now, then = _pair(a, at), _pair(b, at)
             own = min(_mean(now[1] - now[0]), _mean(then[1] - then[0]))
             crossed = max(_mean(now[1] - then[0]), _mean(then[1] - now[0]))
-            if own > options.closer * crossed:
+            if own > MIN_EXCHANGE_RATIO * crossed:
                 found.append(Exchange(first, second, float(at)))
     return sorted(found, key=lambda one: one.at)
 
 
-def _leaps(track: _Track, options: PresenceOptions) -> FloatArray:
+def _leaps(track: _Track) -> FloatArray:
     """The times at which a person is farther from where it was a frame before than anybody goes."""
     if len(track.times) < 2:
         return np.empty(0)
@@ -273,7 +260,7 @@ def _leaps(track: _Track, options: PresenceOptions) -> FloatArray:
     apart = np.linalg.norm(np.diff(joints, axis=0), axis=2)
     known = np.isfinite(apart)
     mean = np.where(known, apart, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-    return np.asarray(track.times[1:][(mean > options.jump * track.size) & (np.diff(track.times) <= options.absence)])
+    return np.asarray(track.times[1:][(mean > MAX_JUMP * track.size) & (np.diff(track.times) <= MIN_ABSENCE)])
 
 
 def _pair(track: _Track, at: float) -> tuple[Any, Any]:

@@ -18,67 +18,40 @@ from numpy.typing import NDArray
 from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip
 from indexing.scoring import Event
-from indexing.windows import Ragged, RepairOptions, ragged, sample, whole
+from indexing.windows import Ragged, ragged, sample, whole
 
 Array = NDArray[Any]
 Unit = Literal["performance", "cycle"]
 
 
-@dataclass(frozen=True)
-class RepetitionOptions:
-    """What decides when repetitions are counted; chosen on synthetic actors, other people than those of any acceptance set."""
-
-    rate: float = 15.0
-    """Samples per second that movements are compared at."""
-    margin: float = 0.5
-    """Seconds looked at before the first and after the last event of a span."""
-    bridge: float = 4.0
-    """Seconds between events of one label, without another label between them, up to which they are one span."""
-    exemplars: int = 4
-    """Exemplars that are asked, spread over those given."""
-    deep: float = 0.55
-    """A movement repeats itself where its changes of pose come back to 1 - this correlation: actors' gait .1-.5 and jacks .02-.1,
-    single movements mostly above .6."""
-    throughout: float = 0.75
-    """An exemplar is made of cycles where that holds everywhere, to 1 - this correlation over half a cycle: of 80 walks .95 stay
-    below .56 (one reaches .92), runs and jacks below .71; 80 punches, which begin and end, are above .84, another was not."""
-    again: float = 1.6
-    """Times the longest exemplar that a movement goes on without rest where what it repeats inside is counted, not itself; a first
-    guess, as the next three."""
-    inside: float = 0.6
-    """Of the shortest exemplar: longest cycle that is counted then; of actors' key poses, punches in a row .4, swings of a wave
-    .25."""
-    calm: float = 0.35
-    """Of the usual speed of the joints (80 % of the time slower): slower than this is a rest between cycles."""
-    pause: float = 0.3
-    """Seconds that such a rest lasts at least."""
-    shortest: float = 0.4
-    """Seconds that a cycle lasts at least."""
-    longest: float = 4.0
-    """Seconds that a cycle lasts at most."""
-    lag: float = 0.15
-    """Seconds that velocities are multiplied by beside heights: down and up differ."""
-    scales: tuple[float, ...] = (0.75, 1.0, 1.33)
-    """Durations tried, times the exemplar's."""
-    tried: int = 3
-    """Best beginnings that are learned on."""
-    rounds: int = 4
-    """Times that the course is learned anew from what was found."""
-    first: float = 2.0
-    """Cost of a sample that nothing explains while the exemplar is another person's, in units of the movement's variance; at 1
-    one of three people's lunges towards the camera are all missed, at 2 none."""
-    unexplained: float = 1.0
-    """The same once it was learned anew."""
-    begin: float = 1.0
-    """Cost of beginning a performance."""
-    begin_cycle: float = 2.0
-    """Cost of beginning a run of cycles."""
-    tempo: float = 0.08
-    """Cost of a sample at half or twice the tempo."""
-    noise: float = 0.01
-    """Body heights: what a joint jitters."""
-    stretch: float = 1.6
-    """Times longer or shorter that a course may become while it is learned anew; without a bound one slow course explains all."""
+# chosen on synthetic actors, other people than those of any acceptance set
+SAMPLE_RATE = 15.0  # per second, that movements are compared at
+SPAN_MARGIN = 0.5  # seconds looked at before the first and after the last event of a span
+MAX_EVENT_GAP = 4.0  # seconds between events of one label, without another label between them, that are one span
+MAX_EXEMPLARS = 4  # that are asked, spread over those given
+# 1 - correlation of changes of pose a period later: actors' gait .1-.5, jacks .02-.1, single movements mostly above .6
+MAX_PERIODIC_DEPTH = 0.55
+# the same over any half cycle of an exemplar made of cycles: walks below .56, runs and jacks .71, punches above .84
+MAX_WORST_DEPTH = 0.75
+# times the longest exemplar without rest, from which what repeats inside is counted; a first guess, as the next three
+MIN_UNBROKEN_FACTOR = 1.6
+MAX_INNER_CYCLE = 0.6  # of the shortest exemplar; of key poses, punches in a row .4, swings of a wave .25
+REST_SPEED = 0.35  # of the usual speed of the joints (80 % of the time slower)
+MIN_REST_SECONDS = 0.3
+MIN_CYCLE_SECONDS = 0.4
+MAX_CYCLE_SECONDS = 4.0
+VELOCITY_SECONDS = 0.15  # that velocities are multiplied by beside heights: down and up differ
+DURATION_SCALES = (0.75, 1.0, 1.33)  # that are tried, times the exemplar's
+NUM_STARTS = 3  # best beginnings that are learned on
+NUM_ROUNDS = 4  # times that the course is learned anew
+# of a sample, in variances of the movement, while the exemplar is another person's; at 1 lunges to the camera are missed
+FIRST_UNEXPLAINED_COST = 2.0
+UNEXPLAINED_COST = 1.0  # the same once it was learned anew
+CYCLES_COST = 2.0  # of beginning a run of cycles
+PERFORMANCE_COST = 1.0  # of beginning a performance
+TEMPO_COST = 0.08  # of a sample at half or twice the tempo
+JOINT_NOISE = 0.01  # body heights
+MAX_STRETCH = 1.6  # of a course while it is learned anew; without a bound one slow course explains all
 
 
 @dataclass(frozen=True)
@@ -123,7 +96,6 @@ def count_repetitions(
     clip: Clip,
     events: Sequence[Event],
     exemplars: Mapping[Any, Sequence[Clip]] = {},
-    options: RepetitionOptions = RepetitionOptions(),
 ) -> list[RepetitionCount]:
     """Count what was found in a recording, one entry per label in order of the labels' first performance."""
     if not events:
@@ -139,23 +111,21 @@ def count_repetitions(
                     "use clips of one joint layout"
                 )
         pick: list[int] = (
-            np.unique(np.linspace(0, len(given) - 1, min(len(given), options.exemplars)).round().astype(int)).tolist()
-            if given
-            else []
+            np.unique(np.linspace(0, len(given) - 1, min(len(given), MAX_EXEMPLARS)).round().astype(int)).tolist() if given else []
         )
-        shown_clips = [given[i] for i in pick] or _own(clip, mine, options)
-        pattern = _pattern(shown_clips, options)
-        spans = _spans(mine, events, options)
-        tracks = [_track(repaired, start, end, options) for start, end, _ in spans]
-        pattern = _unbroken(tracks, pattern, options)
+        shown_clips = [given[i] for i in pick] or _own(clip, mine)
+        pattern = _pattern(shown_clips)
+        spans = _spans(mine, events)
+        tracks = [_track(repaired, start, end) for start, end, _ in spans]
+        pattern = _unbroken(tracks, pattern)
         performances: list[Repetition] = []
         for track, (_, _, inside) in zip(tracks, spans, strict=True):
-            performances += _counted(track, inside, pattern, options)
+            performances += _counted(track, inside, pattern)
         found.append(RepetitionCount(label, tuple(performances), "cycle" if pattern.period else "performance"))
     return sorted(found, key=lambda one: one.performances[0].start if one.performances else np.inf)
 
 
-def _own(clip: Clip, events: Sequence[Event], options: RepetitionOptions) -> list[Clip]:
+def _own(clip: Clip, events: Sequence[Event]) -> list[Clip]:
     """Events of usual length, as exemplars."""
     ordered = sorted(events, key=lambda event: event.end - event.start)
     middle = ordered[max(0, len(ordered) // 2 - 1) : len(ordered) // 2 + 1]
@@ -163,22 +133,22 @@ def _own(clip: Clip, events: Sequence[Event], options: RepetitionOptions) -> lis
     return [clip.between(*part) for part in parts]
 
 
-def _spans(mine: Sequence[Event], events: Sequence[Event], options: RepetitionOptions) -> list[tuple[float, float, list[Event]]]:
+def _spans(mine: Sequence[Event], events: Sequence[Event]) -> list[tuple[float, float, list[Event]]]:
     """Neighbouring events of one label as one span, kept apart from those of other labels."""
     others = [event for event in events if event.label != mine[0].label]
     groups: list[list[Event]] = []
     for event in mine:
         last = max((one.end for one in groups[-1]), default=-np.inf) if groups else -np.inf
         between = any(last <= (one.start + one.end) / 2 <= event.start for one in others)
-        if event.start - last <= options.bridge and not between:
+        if event.start - last <= MAX_EVENT_GAP and not between:
             groups[-1].append(event)
         else:
             groups.append([event])
     out = []
     for group in groups:
         first, last = group[0].start, max(one.end for one in group)
-        before = max([one.end for one in others if one.end <= first] + [first - options.margin])
-        after = min([one.start for one in others if one.start >= last] + [last + options.margin])
+        before = max([one.end for one in others if one.end <= first] + [first - SPAN_MARGIN])
+        after = min([one.start for one in others if one.start >= last] + [last + SPAN_MARGIN])
         out.append((before, after, group))
     return out
 
@@ -214,15 +184,15 @@ class _Repaired(NamedTuple):
 
     @classmethod
     def of(cls, clip: Clip) -> _Repaired:
-        source = ragged([clip], RepairOptions())
+        source = ragged([clip], repair=True)
         y = source.joints[:, source.seen[0], 1]
         return cls(source, max(float(np.median(y.max(axis=1) - y.min(axis=1))), 1e-9) if y.shape[1] else 1.0)
 
 
-def _track(repaired: _Repaired, start: float, end: float, options: RepetitionOptions) -> _RepeatedTrack:
+def _track(repaired: _Repaired, start: float, end: float) -> _RepeatedTrack:
     source, size = repaired
     start, end = max(start, float(source.times[0])), min(end, float(source.times[-1]))
-    count = max(1, round((end - start) * options.rate))
+    count = max(1, round((end - start) * SAMPLE_RATE))
     x = sample(source, np.zeros(1, int), np.array([start]), np.array([end]), count)[0].double().numpy() / size
     x = x - x.mean(axis=1, keepdims=True)
     if count > 2:
@@ -232,18 +202,18 @@ def _track(repaired: _Repaired, start: float, end: float, options: RepetitionOpt
     return _RepeatedTrack(times, x[..., 1], x.reshape(count, -1))
 
 
-def _moving(values: Array, options: RepetitionOptions) -> Array:
+def _moving(values: Array) -> Array:
     """Positions beside velocities."""
     if len(values) < 2:
         return np.concatenate([values, np.zeros_like(values)], axis=1)
-    return np.concatenate([values, options.lag * options.rate * np.gradient(values, axis=0)], axis=1)
+    return np.concatenate([values, VELOCITY_SECONDS * SAMPLE_RATE * np.gradient(values, axis=0)], axis=1)
 
 
-def _period(poses: Array, shortest: float, longest: float, options: RepetitionOptions) -> tuple[float, float, float]:
+def _period(poses: Array, shortest: float, longest: float) -> tuple[float, float, float]:
     """Seconds after which changes of pose come back, how far from it they remain (1 = they do not), and where it is worst."""
     count = len(poses)
     x = poses[4:] - poses[:-4] if count > 8 else poses[:0]
-    low, high = round(shortest * options.rate), min(round(longest * options.rate), 2 * count // 3, len(x) - 2)
+    low, high = round(shortest * SAMPLE_RATE), min(round(longest * SAMPLE_RATE), 2 * count // 3, len(x) - 2)
     if high <= low + 2:
         return 0.0, 1.0, 1.0
     energy = np.square(x).sum(axis=1)
@@ -256,22 +226,22 @@ def _period(poses: Array, shortest: float, longest: float, options: RepetitionOp
     dips = [k for k in range(max(low, 1), high) if apart[k] <= apart[k - 1] and apart[k] < apart[k + 1]]
     if not dips:
         return 0.0, 1.0, 1.0
-    level = max(1.3 * min(apart[k] for k in dips), options.deep / 2)
+    level = max(1.3 * min(apart[k] for k in dips), MAX_PERIODIC_DEPTH / 2)
     best = next(k for k in dips if apart[k] <= level)
     box, most = np.ones(min(max(1, best // 2), len(x) - best)), energy[best:] + energy[: len(x) - best]
     worst = np.convolve(np.square(x[best:] - x[: len(x) - best]).sum(axis=1), box, "valid") / np.maximum(
         np.convolve(most, box, "valid"), 1e-30
     )
-    return best / options.rate, float(apart[best]), float(worst.max())
+    return best / SAMPLE_RATE, float(apart[best]), float(worst.max())
 
 
-def _still(track: _RepeatedTrack, options: RepetitionOptions) -> Array:
+def _still(track: _RepeatedTrack) -> Array:
     """``(F,)`` where the joints rest."""
-    wide = max(1, round(options.pause * options.rate))
+    wide = max(1, round(MIN_REST_SECONDS * SAMPLE_RATE))
     if len(track.times) < 2 * wide:
         return np.zeros(len(track.times), bool)
     speed = np.sqrt(np.convolve(np.square(np.gradient(track.poses, axis=0)).sum(axis=1), np.ones(wide) / wide, "same"))
-    slow = speed < options.calm * np.quantile(speed, 0.8)
+    slow = speed < REST_SPEED * np.quantile(speed, 0.8)
     for first, end in _stretches(slow):
         slow[first:end] = end - first >= wide
     return slow
@@ -282,49 +252,51 @@ def _stretches(on: Array) -> Array:
     return np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int))).reshape(-1, 2)
 
 
-def _liveliest(track: _RepeatedTrack, options: RepetitionOptions) -> slice:
+def _liveliest(track: _RepeatedTrack) -> slice:
     """The longest part without a rest."""
-    parts = _stretches(~_still(track, options))
+    parts = _stretches(~_still(track))
     return slice(*parts[(parts[:, 1] - parts[:, 0]).argmax()]) if len(parts) else slice(0, len(track.times))
 
 
-def _unbroken(tracks: Sequence[_RepeatedTrack], pattern: _Pattern, options: RepetitionOptions) -> _Pattern:
+def _unbroken(tracks: Sequence[_RepeatedTrack], pattern: _Pattern) -> _Pattern:
     """A movement that goes on for longer than its exemplars, because it repeats a part of them, is counted by that part."""
     if pattern.period or not pattern.shown:
         return pattern
-    lasts = [len(one.heights) / options.rate for one in pattern.shown]
-    part = max((track.poses[_liveliest(track, options)] for track in tracks), key=len)
-    if len(part) < options.again * max(lasts) * options.rate:
+    lasts = [len(one.heights) / SAMPLE_RATE for one in pattern.shown]
+    part = max((track.poses[_liveliest(track)] for track in tracks), key=len)
+    if len(part) < MIN_UNBROKEN_FACTOR * max(lasts) * SAMPLE_RATE:
         return pattern
-    seconds, depth, _ = _period(part, options.shortest, options.inside * min(lasts), options)
-    return _Pattern((), seconds) if depth <= options.deep else pattern
+    seconds, depth, _ = _period(part, MIN_CYCLE_SECONDS, MAX_INNER_CYCLE * min(lasts))
+    return _Pattern((), seconds) if depth <= MAX_PERIODIC_DEPTH else pattern
 
 
-def _pattern(shown: Sequence[Clip], options: RepetitionOptions) -> _Pattern:
+def _pattern(shown: Sequence[Clip]) -> _Pattern:
     """What exemplars show, and whether they repeat it."""
     parts = []
     for clip in shown:
-        track = _track(_Repaired.of(clip), float(clip.times[0]), float(clip.times[-1]), options)
+        track = _track(_Repaired.of(clip), float(clip.times[0]), float(clip.times[-1]))
         source = ragged([clip])
         swap = mirror_permutation(clip.skeleton, whole(source, 12)) if clip.dims == 2 or clip.skeleton is not None else None
-        seconds, depth, worst = _period(track.poses, options.shortest, options.longest, options)
-        depth = depth if worst <= options.throughout else 1.0
+        seconds, depth, worst = _period(track.poses, MIN_CYCLE_SECONDS, MAX_CYCLE_SECONDS)
+        depth = depth if worst <= MAX_WORST_DEPTH else 1.0
         parts.append((track.heights, None if swap is None else swap.numpy(), seconds, depth))
-    sure = [seconds for _, _, seconds, depth in parts if depth <= options.deep]
+    sure = [seconds for _, _, seconds, depth in parts if depth <= MAX_PERIODIC_DEPTH]
     usual = float(np.median(sure)) if sure else 0.0
     # an exemplar of about one cycle cannot tell
     able = [
-        depth <= options.deep for h, _, _, depth in parts if sure and (depth <= options.deep or len(h) > 2.2 * usual * options.rate)
+        depth <= MAX_PERIODIC_DEPTH
+        for h, _, _, depth in parts
+        if sure and (depth <= MAX_PERIODIC_DEPTH or len(h) > 2.2 * usual * SAMPLE_RATE)
     ]
     if not able or np.mean(able) < 0.5:
         return _Pattern(tuple(_Cycle(h, swap) for h, swap, _, _ in parts if len(h) > 3), 0.0)
-    cycles = [_Cycle(_mean_cycle(h, seconds, options), swap) for h, swap, seconds, depth in parts if depth <= options.deep]
+    cycles = [_Cycle(_mean_cycle(h, seconds), swap) for h, swap, seconds, depth in parts if depth <= MAX_PERIODIC_DEPTH]
     return _Pattern(tuple(cycles), usual)
 
 
-def _mean_cycle(heights: Array, seconds: float, options: RepetitionOptions) -> Array:
-    m = max(4, round(seconds * options.rate))
-    phase = np.arange(len(heights)) / (options.rate * seconds)
+def _mean_cycle(heights: Array, seconds: float) -> Array:
+    m = max(4, round(seconds * SAMPLE_RATE))
+    phase = np.arange(len(heights)) / (SAMPLE_RATE * seconds)
     apart = (phase[:, None] - np.arange(m) / m + 0.5) % 1.0 - 0.5
     weight = np.exp(-0.5 * np.square(apart * m)) + 1e-9
     return np.asarray((weight / weight.sum(axis=0)).T @ heights)
@@ -337,12 +309,10 @@ def _resampled(course: Array, m: int, turns: bool) -> Array:
 
 
 # ---- following a course through a recording ----------------------------------------------------------------------------
-def _costs(
-    x: Array, course: Array, turns: bool, level: float, left: Array | None, still: Array, options: RepetitionOptions
-) -> tuple[Array, Array]:
+def _costs(x: Array, course: Array, turns: bool, level: float, left: Array | None, still: Array) -> tuple[Array, Array]:
     """``(F, m)`` cost of every sample at every place of the course, and ``(F,)`` at rest; joints count by what they tell."""
     spread = course.var(axis=0)
-    doubt = np.full(len(spread), options.noise**2) if left is None else np.maximum(left, options.noise**2)
+    doubt = np.full(len(spread), JOINT_NOISE**2) if left is None else np.maximum(left, JOINT_NOISE**2)
     weight = spread / (spread + doubt)
     scale = np.sqrt(weight / max((weight * spread).sum(), 1e-12))
     a, b = x * scale, course * scale
@@ -357,10 +327,10 @@ def _costs(
     return cost, rest
 
 
-def _followed(cost: Array, rest: Array, turns: bool, options: RepetitionOptions) -> tuple[float, Array]:
+def _followed(cost: Array, rest: Array, turns: bool) -> tuple[float, Array]:
     """The cheapest way, and ``(F,)`` the place of every sample; m = at rest."""
     count, m = cost.shape
-    begin = options.begin_cycle if turns else options.begin
+    begin = CYCLES_COST if turns else PERFORMANCE_COST
     place, back = np.arange(m), np.zeros((count, m + 1), int)
     before = np.stack([place, (place - 1) % m, (place - 2) % m, np.full(m, m)])
     total, after = np.append(cost[0] + begin if turns else np.full(m, np.inf), rest[0]), np.empty(m + 1)
@@ -368,18 +338,18 @@ def _followed(cost: Array, rest: Array, turns: bool, options: RepetitionOptions)
     ways = np.full((4, m), np.inf)  # what is not written below stays so; made once, as frames are many and places few
     for f in range(1, count):
         came, idle = total[:m], total[m]
-        np.add(came, options.tempo, out=ways[0])
+        np.add(came, TEMPO_COST, out=ways[0])
         ways[1, 1:] = came[:-1]
-        np.add(came[:-2], options.tempo, out=ways[2, 2:])
+        np.add(came[:-2], TEMPO_COST, out=ways[2, 2:])
         if turns:
-            ways[1, 0], ways[2, :2], ways[3] = came[-1], came[-2:] + options.tempo, idle + begin
+            ways[1, 0], ways[2, :2], ways[3] = came[-1], came[-2:] + TEMPO_COST, idle + begin
         else:
             ways[3, 0] = min(idle + begin, came[-1] + begin / 2)
         way = ways.argmin(axis=0)
         source = before[way, place]
         if not turns and way[0] == 3 and came[-1] + begin / 2 < idle + begin:
             source[0] = m - 1
-        last = int(came.argmin()) if turns else m - 1 if came[-1] <= came[-2] + options.tempo else m - 2
+        last = int(came.argmin()) if turns else m - 1 if came[-1] <= came[-2] + TEMPO_COST else m - 2
         back[f, :m], back[f, m] = source, m if idle <= came[last] else last
         np.add(ways.min(axis=0), cost[f], out=after[:m])
         after[m] = min(idle, came[last]) + rest[f]
@@ -414,7 +384,7 @@ def _learned(x: Array, path: Array, m: int) -> Array | None:
     return np.stack([np.interp(np.arange(m), known, column) for column in means.T], axis=1)
 
 
-def _even(course: Array, path: Array, turns: bool, first: int, options: RepetitionOptions) -> Array:
+def _even(course: Array, path: Array, turns: bool, first: int) -> Array:
     """The course with its places spread evenly over the time that samples spend at them."""
     m = len(course)
     covers = np.zeros(m)
@@ -422,7 +392,7 @@ def _even(course: Array, path: Array, turns: bool, first: int, options: Repetiti
         np.add.at(covers, np.arange(places[0], places[-1] + 1) % m, 1)
     spent = np.bincount(path[path < m], minlength=m) / np.maximum(covers, 1)
     used = spent > 0
-    size = int(np.clip(round(spent.sum()), max(4, first / options.stretch), max(4, first * options.stretch)))
+    size = int(np.clip(round(spent.sum()), max(4, first / MAX_STRETCH), max(4, first * MAX_STRETCH)))
     middle = (np.cumsum(spent) - spent / 2)[used]
     whole_time, values = spent.sum(), course[used]
     at = (np.arange(size) + 0.5) * whole_time / size
@@ -431,48 +401,48 @@ def _even(course: Array, path: Array, turns: bool, first: int, options: Repetiti
     return np.stack([np.interp(at, middle, column) for column in values.T], axis=1)
 
 
-def _beginnings(track: _RepeatedTrack, pattern: _Pattern, options: RepetitionOptions) -> list[tuple[float, Array, int]]:
+def _beginnings(track: _RepeatedTrack, pattern: _Pattern) -> list[tuple[float, Array, int]]:
     """Cost, path and length of the courses that fit best: exemplars, their mirror images, and the span's own cycle."""
-    x, turns, still = _moving(track.heights, options), pattern.period > 0, _still(track, options)
+    x, turns, still = _moving(track.heights), pattern.period > 0, _still(track)
     found: list[tuple[float, Array, int]] = []
     for shown in pattern.shown:
         for heights in [shown.heights] if shown.swap is None else [shown.heights, shown.heights[:, shown.swap]]:
             tried = []
-            for scale in options.scales:
+            for scale in DURATION_SCALES:
                 m = max(4, round(len(heights) * scale))
                 course = _resampled(heights, m, turns)
-                course = _moving(np.concatenate([course] * 3), options)[m : 2 * m] if turns else _moving(course, options)
-                tried.append((*_followed(*_costs(x, course, turns, options.first, None, still, options), turns, options), m))
+                course = _moving(np.concatenate([course] * 3))[m : 2 * m] if turns else _moving(course)
+                tried.append((*_followed(*_costs(x, course, turns, FIRST_UNEXPLAINED_COST, None, still), turns), m))
             found.append(min(tried, key=lambda one: one[0]))
-    found = sorted(found, key=lambda one: one[0])[: options.tried]
+    found = sorted(found, key=lambda one: one[0])[:NUM_STARTS]
     if turns:
-        part = _liveliest(track, options)
-        seconds, depth, _ = _period(track.poses[part], max(0.3, pattern.period / 2), 2 * pattern.period, options)
+        part = _liveliest(track)
+        seconds, depth, _ = _period(track.poses[part], max(0.3, pattern.period / 2), 2 * pattern.period)
         if depth < 0.8:
-            m = max(4, round(seconds * options.rate))
+            m = max(4, round(seconds * SAMPLE_RATE))
             path = np.full(len(x), m)
-            path[part] = (np.arange(part.stop - part.start) / (seconds * options.rate) * m).astype(int) % m
+            path[part] = (np.arange(part.stop - part.start) / (seconds * SAMPLE_RATE) * m).astype(int) % m
             found.append((0.0, path, m))
     return found
 
 
-def _counted(track: _RepeatedTrack, events: Sequence[Event], pattern: _Pattern, options: RepetitionOptions) -> list[Repetition]:
+def _counted(track: _RepeatedTrack, events: Sequence[Event], pattern: _Pattern) -> list[Repetition]:
     """The repetitions in one span; its longest event where the movement tells nothing."""
-    turns, still = pattern.period > 0, _still(track, options)
+    turns, still = pattern.period > 0, _still(track)
     best: tuple[float, Array, int] | None = None
     if len(track.times) > 3:
-        for _, begun, first in _beginnings(track, pattern, options):
+        for _, begun, first in _beginnings(track, pattern):
             for values in (track.poses, track.heights):
-                x, path, m, cost = _moving(values, options), begun, first, np.inf
-                for again in range(options.rounds):
+                x, path, m, cost = _moving(values), begun, first, np.inf
+                for again in range(NUM_ROUNDS):
                     course = _learned(x, path, m)
                     if course is None:
                         break
                     on = path < m
                     left = np.square(x[on] - course[path[on]]).mean(axis=0)
-                    course = _even(course, path, turns, first, options) if again else course
+                    course = _even(course, path, turns, first) if again else course
                     m = len(course)
-                    cost, path = _followed(*_costs(x, course, turns, options.unexplained, left, still, options), turns, options)
+                    cost, path = _followed(*_costs(x, course, turns, UNEXPLAINED_COST, left, still), turns)
                 if best is None or cost < best[0]:
                     best = (cost, path, m)
     parts: list[tuple[float, float]] = []

@@ -29,21 +29,41 @@ from numpy.typing import NDArray
 from dyntorch.numerics import one_thread
 from indexing.action.bank import Bank, Copy, Windows, fused_residuals, fusion, planes_of, stack
 from indexing.action.inputs import check_queries
-from indexing.action.options import ActionOptions
 from indexing.action.stream import motion_levels, motion_of
 from indexing.clip import Clip, stretches
 from indexing.recordings.evidence import Durations
-from indexing.recordings.options import SuggestOptions
 from indexing.scoring import probabilities
 from indexing.windows import mended, ragged, sample
 
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
-    from indexing.recordings.explanation import Explanation
+    from indexing.recordings.decoding import Explanation
 
 Array = NDArray[Any]
 Span = tuple[float, float]
 SuggestReason = Literal["unlike what is known", "either of two", "much else is like it"]
+
+
+MIN_PART_SECONDS = 1.0  # of what nothing explains: of less nobody can say what it is
+MAX_EVENT_LENGTH = 2.0  # ordinary examples, beyond which an event is cut: a wrong one may hold several actions
+MAX_LABELLED_SHARE = 0.3  # of a part, from which on it is not suggested again
+MIN_MOTION = 0.5  # times that of still moments of the examples
+MIN_SHOWN_SHARE = 0.5  # of a part's frames that must show the person
+# of that between examples of different actions: known actions of actors stand at .03 to .05, others at .45 to .6
+MIN_UNLIKE_RESIDUAL = 0.33
+MAX_DOUBT_MARGIN = 0.5  # difference of probabilities, below which a part may be either of two actions
+
+
+@dataclass(frozen=True)
+class SuggestOptions:
+    """Which parts of recordings are worth a person's time (experiments.labels.suggesting)."""
+
+    max_candidates: int = 600
+    """Parts that are compared with each other, spread evenly over the recordings: some 2 s for all pairs."""
+    coverage: bool = True
+    """Whether a part counts for all that is like it, or for itself alone (farthest first), which finds oddities."""
+    doubt_weight: float = 0.3
+    """How much more a part counts between two actions (margin 0) than where the action is sure (margin 1)."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +96,7 @@ def suggest(
     clips: Sequence[Clip],
     number: int = 10,
     labelled: Sequence[Sequence[Span]] | None = None,
-    options: SuggestOptions = SuggestOptions(),
+    options: SuggestOptions | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[Suggestion]:
     """The parts of recordings that are worth a label most, in the order in which they were chosen.
@@ -99,12 +119,13 @@ def suggest(
         >>> min(found[0].end, end) - max(found[0].start, start) > 0.5, found[0].reason
         (True, 'unlike what is known')
     """
+    options = options or SuggestOptions()
     if number < 1:
         raise ValueError(f"number={number}: suggests nothing; give 1 or more")
     found = []
     for index, clip in enumerate(clips):
         done = [] if labelled is None else labelled[index]
-        found.append(parts_of(indexer, clip, done, options))
+        found.append(parts_of(indexer, clip, done))
         if progress is not None:
             progress(0.9 * (index + 1) / len(clips))
     parts = _together(found, options)
@@ -119,9 +140,9 @@ def suggest(
     for at in chosen(near, apart, margin, number, parts.worth, options):
         names = [classes[which] if which < len(classes) else None for which in ranked[at, :2].tolist()]
         reason: SuggestReason = "much else is like it"
-        if near[at] >= options.far * usual:
+        if near[at] >= MIN_UNLIKE_RESIDUAL * usual:
             reason = "unlike what is known"
-        elif margin[at] < options.doubt and None not in names and len(names) > 1:
+        elif margin[at] < MAX_DOUBT_MARGIN and None not in names and len(names) > 1:
             reason = "either of two"
         start, end = parts.spans[at].tolist()
         other = names[1] if len(names) > 1 else None
@@ -129,18 +150,18 @@ def suggest(
     return out
 
 
-def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span], options: SuggestOptions) -> RecordingParts | None:
+def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span]) -> RecordingParts | None:
     """A recording cut into parts; None where there are none."""
-    model, settings = indexer.model_, indexer.options or ActionOptions()
+    model = indexer.model_
     (image,) = check_queries([clip], indexer.fps, indexer.n_joints_, indexer.skeleton_, recordings=True)
     begin = float(image.times[0])
     image = image.replace(times=image.times - begin)
-    unit = Durations.of(model, indexer.window, 0.3 * indexer.window, settings.recordings).unit
-    spans = np.array(_cut(indexer.explain(clip), clip, max(unit, options.shortest), options)).reshape(-1, 2)
-    spans = spans[[_share(span, labelled) < options.labelled for span in spans.tolist()]]
+    unit = Durations.of(model, indexer.window, 0.3 * indexer.window).unit
+    spans = np.array(_cut(indexer.explain(clip), clip, max(unit, MIN_PART_SECONDS))).reshape(-1, 2)
+    spans = spans[[_share(span, labelled) < MAX_LABELLED_SHARE for span in spans.tolist()]]
     if not len(spans):
         return None
-    source = ragged([mended(image, settings.repair) if indexer.repair else image])
+    source = ragged([mended(image) if indexer.repair else image])
     nobody = np.zeros(len(spans), dtype=np.intp)
     values = sample(source, nobody, spans[:, 0] - begin, spans[:, 1] - begin, indexer.length)
     windows = Windows(values, torch.from_numpy(source.seen[nobody]))
@@ -148,11 +169,11 @@ def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span], optio
     shown = np.concatenate([[0.0], np.cumsum(clip.seen.any(axis=1))])
     first, last = np.searchsorted(clip.times, spans[:, 0]), np.searchsorted(clip.times, spans[:, 1], side="right")
     seen = (shown[last] - shown[first]) / np.maximum(last - first, 1)
-    worth = (motion_of(windows) > options.still * still) & (seen >= options.shown) & (last - first > 1)
+    worth = (motion_of(windows) > MIN_MOTION * still) & (seen >= MIN_SHOWN_SHARE) & (last - first > 1)
     return RecordingParts(nobody, spans, windows, worth)
 
 
-def _cut(told: Explanation, clip: Clip, unit: float, options: SuggestOptions) -> list[Span]:
+def _cut(told: Explanation, clip: Clip, unit: float) -> list[Span]:
     """Spans of what was found, and of what lies between, in seconds of the recording's clock."""
     out: list[Span] = []
     found = sorted((event.start, event.end) for event in told.events)
@@ -163,7 +184,7 @@ def _cut(told: Explanation, clip: Clip, unit: float, options: SuggestOptions) ->
             if start - edge >= unit / 2:
                 out += _pieces(edge, start, unit)
             if stop > start:
-                out += _pieces(start, stop, unit) if stop - start > options.longest * unit else [(start, stop)]
+                out += _pieces(start, stop, unit) if stop - start > MAX_EVENT_LENGTH * unit else [(start, stop)]
             edge = max(edge, stop)
     return out
 
@@ -188,7 +209,7 @@ def _together(found: Sequence[RecordingParts | None], options: SuggestOptions) -
     owner = np.concatenate([np.full(int(parts.worth.sum()), number) for number, parts in several])
     spans = np.concatenate([parts.spans[parts.worth] for _, parts in several])
     windows = stack([parts.windows[torch.from_numpy(parts.worth)] for _, parts in several])
-    kept = np.unique(np.linspace(0, len(owner) - 1, options.candidates).round().astype(np.intp))
+    kept = np.unique(np.linspace(0, len(owner) - 1, options.max_candidates).round().astype(np.intp))
     return RecordingParts(owner[kept], spans[kept], windows[torch.from_numpy(kept)], np.ones(len(kept), dtype=bool))
 
 
@@ -216,10 +237,10 @@ def chosen(near: Array, apart: Array, margin: Array, number: int, worth: Array, 
     """Numbers of parts, one after the other: each leaves the least that is unlike what is known and what was chosen before.
     near ``(N,)``."""
     free, distance = worth.copy(), near.astype(np.float64)
-    weight = (1.0 + options.unsure * (1.0 - margin)) * worth
+    weight = (1.0 + options.doubt_weight * (1.0 - margin)) * worth
     out: list[int] = []
     while free.any() and len(out) < number:
-        gain = weight @ np.maximum(distance[:, None] - apart, 0.0) if options.alike else weight * distance
+        gain = weight @ np.maximum(distance[:, None] - apart, 0.0) if options.coverage else weight * distance
         best = int(np.where(free, gain, -np.inf).argmax())
         out.append(best)
         free[best] = False

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from indexing.clip import Clip
 
 if TYPE_CHECKING:
-    from indexing.recordings.explanation import Withheld
+    from indexing.recordings.decoding import Withheld
     from indexing.recordings.repetitions import RepetitionCount
 
 Truth = tuple[Hashable, float, float]

@@ -96,7 +96,7 @@ class Case:
 
 WRONG_KEYPOINTS = {
     "view": "front", "weights": "odd", "scorer": "best", "mirror": "maybe", "reject": "often", "fps": 0.0, "length": 3, "tempi": (),
-    "pool": -1.0, "window": -1.0, "virtual_views": -1, "random_state": "x", "device": "abacus",
+    "window": -1.0, "virtual_views": -1, "random_state": "x", "device": "abacus",
 }  # fmt: skip
 WRONG_FRAMES = {
     "harmonics": 0, "course": "often", "reject": "often", "fps": 0.0, "mirror": "maybe", "window": -1.0, "device": "abacus",

@@ -224,7 +224,7 @@ def test_score_needs_one_label_per_clip(labels, unchanged):
     [
         ("view", "front"), ("view", None), ("view", ["any"]), ("weights", "uniform"), ("scorer", "C"),
         ("mirror", "always"), ("mirror", None), ("fps", 0), ("fps", -30), ("fps", np.nan), ("fps", "30"), ("fps", None),
-        ("window", 0), ("window", np.inf), ("stride", 0.0), ("stride", -1), ("pool", -1), ("pool", np.nan), ("pool", "2"),
+        ("window", 0), ("window", np.inf), ("stride", 0.0), ("stride", -1),
         ("tempi", ()), ("tempi", (1.0, 0.0)), ("tempi", (np.nan,)), ("tempi", 1.0), ("tempi", None), ("tempi", "fast"),
         ("length", 3), ("length", 12.0), ("length", True), ("length", None), ("virtual_views", -1), ("virtual_views", 1.5),
         ("reject", np.nan), ("reject", "0.1"), ("reject", (0.1,)), ("device", "moon"), ("device", "cuda:99"),
@@ -250,11 +250,6 @@ def test_windows_cut_otherwise_cannot_be_added(change, unchanged, lesson):
     with pytest.raises(ValueError, match=next(iter(change))):
         unchanged.partial_fit(lesson[:2])
     unchanged.set_params(**old)
-
-
-def test_a_pool_of_any_real_type_is_taken(lesson):
-    for pool in (0, np.float32(1.0), np.int64(2)):
-        ActionIndexer(pool=pool, scorer="nearest").fit(lesson)
 
 
 # ---- comparisons that would mean nothing ---------------------------------------------------------------------------------

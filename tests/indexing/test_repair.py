@@ -5,9 +5,18 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from indexing import ActionIndexer, Clip
+from indexing import ActionIndexer, Clip, windows
 from indexing.actors import Person, dataset
-from indexing.windows import RepairOptions, ragged, wrong_joints
+from indexing.windows import (
+    MAX_SPREADS,
+    MAX_USUAL_FACTOR,
+    MIN_SIGHTINGS,
+    NOISE_FLOOR,
+    NUM_COMPARED,
+    USUAL_SHARE,
+    ragged,
+    wrong_joints,
+)
 
 
 def walk(frames=80, joints=6, seed=0):
@@ -19,26 +28,23 @@ def walk(frames=80, joints=6, seed=0):
     return places.astype(np.float32), times
 
 
-USUAL = RepairOptions()
-
-
-def wrong_in(joints, times, options=USUAL):
-    return wrong_joints(joints, times, np.array([0, len(joints)]), options)
+def wrong_in(joints, times, stride=1):
+    return wrong_joints(joints, times, np.array([0, len(joints)]), stride)
 
 
 def slow(joints, times):
     """One pass over one clip, sighting by sighting."""
     there = np.isfinite(joints).all(axis=2)
     extent = np.nanmax(joints, axis=1) - np.nanmin(joints, axis=1)
-    floor = USUAL.floor * np.median(extent, axis=0).max()
+    floor = NOISE_FLOOR * np.median(extent, axis=0).max()
     found = {}
     for j in range(joints.shape[1]):
         seen = np.flatnonzero(there[:, j])
-        if len(seen) < USUAL.least:
+        if len(seen) < MIN_SIGHTINGS:
             continue
         for k, f in enumerate(seen):
-            first = max(0, min(k - USUAL.width // 2, len(seen) - USUAL.width))
-            at = seen[first : first + USUAL.width]
+            first = max(0, min(k - NUM_COMPARED // 2, len(seen) - NUM_COMPARED))
+            at = seen[first : first + NUM_COMPARED]
             x, t = joints[at, j].astype(float), times[at] - times[f]
             slopes = [(x[b] - x[a]) / (t[b] - t[a]) for a, b in combinations(range(len(at)), 2) if b - a > 1]
             rest = x - np.quantile(slopes, 0.5, axis=0, method="lower") * t[:, None]
@@ -46,8 +52,8 @@ def slow(joints, times):
             spread = 1.4826 * np.quantile(np.abs(rest - middle), 0.5, axis=0, method="lower")
             found[f, j] = np.abs(joints[f, j] - middle), spread
     far = np.sort([one.max() for one, _ in found.values()])
-    usual = USUAL.usual * far[min(int(USUAL.share * len(far)), len(far) - 1)]
-    return {at for at, (one, spread) in found.items() if (one > USUAL.limit * spread + usual + floor).any()}
+    usual = MAX_USUAL_FACTOR * far[min(int(USUAL_SHARE * len(far)), len(far) - 1)]
+    return {at for at, (one, spread) in found.items() if (one > MAX_SPREADS * spread + usual + floor).any()}
 
 
 def places(mask):
@@ -55,13 +61,14 @@ def places(mask):
 
 
 @pytest.mark.parametrize("frames", [7, 30])
-def test_one_pass_against_the_definition(frames):
+def test_one_pass_against_the_definition(frames, monkeypatch):
+    monkeypatch.setattr(windows, "NUM_PASSES", 1)
     rng = np.random.default_rng(frames)
     joints, times = walk(frames)
     joints += rng.normal(scale=0.02, size=joints.shape).astype(np.float32)
     joints[rng.random(joints.shape[:2]) < 0.2] = np.nan
     joints[rng.random(joints.shape[:2]) < 0.1] += 1.0
-    assert places(wrong_in(joints, times, RepairOptions(passes=1))) == slow(joints, times) != set()
+    assert places(wrong_in(joints, times)) == slow(joints, times) != set()
 
 
 def test_planted_jumps_are_found_and_only_those():
@@ -109,7 +116,7 @@ def test_repair_interpolates_what_was_wrong():
     clean, times = walk()
     joints = clean.copy()
     joints[33, 2] = 50
-    source = ragged([Clip(joints, times=times), Clip(clean, times=times)], repair=RepairOptions())
+    source = ragged([Clip(joints, times=times), Clip(clean, times=times)], repair=True)
     np.testing.assert_allclose(source.joints[:80], clean, atol=0.02)
     assert np.abs(ragged([Clip(joints, times=times)]).joints - clean).max() > 40
 
@@ -121,7 +128,7 @@ def test_repair_helps_where_joints_jump():
     assert ActionIndexer(scorer="nearest", repair=True).fit(train).score(jumpy, test.labels) == 1.0
 
 
-def test_long_recordings_are_mended_in_parts():
+def test_long_recordings_are_mended_in_parts(monkeypatch):
     from indexing.clip import Clip
     from indexing.windows import mended
 
@@ -133,4 +140,5 @@ def test_long_recordings_are_mended_in_parts():
     broken = Clip(walk, fps=30.0)
     whole = mended(broken)
     assert np.argwhere(~whole.seen).tolist() == [[30, 0], [199, 1], [200, 2], [350, 3]]
-    assert np.array_equal(mended(broken, RepairOptions(part=100)).seen, whole.seen)
+    monkeypatch.setattr(windows, "MAX_FRAMES_JUDGED", 100)
+    assert np.array_equal(mended(broken).seen, whole.seen)

@@ -10,12 +10,10 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from indexing import ActionIndexer, Clip
+from indexing.action import background as of_background
 from indexing.action.background import OtherMovement, performed, played_otherwise, recorded
-from indexing.action.options import ActionOptions, BackgroundOptions
 from indexing.actors import Person, dataset, detect, stream
 from indexing.skeleton import COCO17, OPENPOSE18
-
-OPTIONS = BackgroundOptions(people=1, views=1)
 
 
 @pytest.fixture(scope="module")
@@ -127,25 +125,29 @@ def test_a_second_action_can_be_added(squat, others):
     assert indexer.predict(waves).tolist() == ["wave"] * len(waves) and indexer.predict([squat]).tolist() == ["squat"]
 
 
-def test_what_is_made():
+def test_what_is_made(monkeypatch):
+    monkeypatch.setattr(of_background, "NUM_PEOPLE", 1)
+    monkeypatch.setattr(of_background, "NUM_CAMERAS", 1)
     clip = Clip(np.random.default_rng(0).normal(size=(20, 17, 2)), skeleton=COCO17)
     rng = np.random.default_rng(0)
-    played = played_otherwise([clip], True, OPTIONS, rng)
+    played = played_otherwise([clip], True, rng)
     assert all(one.joints.shape == clip.joints.shape for one in played.clips) and not any(played.sure)
     for one, kind in zip(played.clips, played.kinds, strict=True):
         assert np.allclose(one.joints.mean(axis=0), clip.joints.mean(axis=0), atol=1e-5), kind  # other movement about the same pose
-    people = performed(OPENPOSE18, 2, OPTIONS, rng)
+    people = performed(OPENPOSE18, 2, rng)
     assert len(set(people.kinds)) == 13 and {one.joints.shape[1:] for one in people.clips} == {(18, 2)}
-    assert len(performed(None, 2, OPTIONS, rng)) == 0
+    assert len(performed(None, 2, rng)) == 0
     assert len(people + played) == len(people) + len(played) and len(OtherMovement()) == 0
 
 
-def test_recordings_are_cut_into_pieces_as_long_as_the_action():
+def test_recordings_are_cut_into_pieces_as_long_as_the_action(monkeypatch):
+    monkeypatch.setattr(of_background, "MAX_PIECES", 10)
+    monkeypatch.setattr(of_background, "MAX_KINDS", 3)
     clip = Clip(np.random.default_rng(0).normal(size=(600, 5, 2)), fps=30.0)
-    pieces = recorded([clip], 30.0, 5, None, 2.0, BackgroundOptions(pieces=10, parts=3))
+    pieces = recorded([clip], 30.0, 5, None, 2.0)
     assert len(pieces) == 10 and len(set(pieces.kinds)) == 3 and all(pieces.sure)
     assert {round(piece.duration, 1) for piece in pieces.clips} == {2.0}
-    short = recorded([clip.replace(joints=clip.joints[:20], times=clip.times[:20])], 30.0, 5, None, 2.0, BackgroundOptions())
+    short = recorded([clip.replace(joints=clip.joints[:20], times=clip.times[:20])], 30.0, 5, None, 2.0)
     assert len(short) == 1
 
 
@@ -165,9 +167,9 @@ def test_bad_backgrounds(squat, background, message):
         ActionIndexer().fit([squat], ["squat"], background=background)
 
 
-def test_an_action_that_is_the_same_however_it_is_played():
+def test_an_action_that_is_the_same_however_it_is_played(monkeypatch):
     turning = np.linspace(0, 12 * np.pi, 90)
     wheel = np.stack([np.stack([np.cos(turning + i), np.sin(turning + i)], axis=1) for i in range(6)], axis=1)
-    options = ActionOptions(background=BackgroundOptions(exchanges=0))
+    monkeypatch.setattr(of_background, "NUM_EXCHANGES", 0)
     with pytest.raises(ValueError, match=r"labels: only one class .*'wheel'.*background="):
-        ActionIndexer(scorer="nearest", virtual_views=0, options=options).fit([wheel], ["wheel"])
+        ActionIndexer(scorer="nearest", virtual_views=0).fit([wheel], ["wheel"])

@@ -27,8 +27,7 @@ from indexing.action.bank import (
     planes_of,
 )
 from indexing.action.joint_weights import JointWeights
-from indexing.action.model import MOMENT_TERMS, PairwiseMachine, mirror_some
-from indexing.action.options import MachineOptions
+from indexing.action.model import MOMENT_TERMS, PENALTY, TURNED_CARD_WEIGHT, PairwiseMachine, mirror_some
 from indexing.action.planes import entries, epipolar_correlation, factorize
 from indexing.action.symmetry import mirror, turn
 
@@ -283,7 +282,7 @@ def slow_residuals(model, query, crops, chosen):
     copies = [windows[chosen] for windows in copies]
     epipolar = model.parts.residual(query, copies, model.metric, model.labels[chosen])
     turned = fused_residual(query, copies, model.metric, terms=("turned",))
-    return epipolar + model.options.nearest.turned * turned - model.hub[chosen]
+    return epipolar + TURNED_CARD_WEIGHT * turned - model.hub[chosen]
 
 
 @pytest.mark.slow
@@ -312,11 +311,7 @@ def test_what_a_model_keeps_stays_with_it_alone(fitted):
     for other in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model), dataclasses.replace(model, hub=model.hub + 1)):
         assert other.kept is not model.kept
     torch.testing.assert_close(copy.deepcopy(model).scores(random_windows(3, 37)), answer, atol=1e-3, rtol=0)
-    calmer = dataclasses.replace(model.options, nearest=dataclasses.replace(model.options.nearest, turned=0.0))
-    assert model.with_options(calmer).kept is model.kept and model.with_options(calmer).options is calmer
-    assert not torch.equal(model.with_options(calmer).residuals(random_windows(3, 37)), model.residuals(random_windows(3, 37)))
     assert model.to("meta") is model.to("meta") and model.to("cpu") is model
-    assert model.with_options(calmer).to("meta").options == calmer and model.to("meta").options == model.options
     first = indexer.model_
     indexer = copy.copy(indexer).partial_fit(clips[:1], [2])
     assert indexer.model_.kept is not first.kept and len(indexer.decision_function(clips[:2])) == 2
@@ -330,7 +325,7 @@ def test_no_exemplars_is_refused():
 @pytest.mark.parametrize("one_side", [False, True])
 def test_kernels_are_symmetric_with_ones_on_the_diagonal(one_side):
     windows = random_windows(20, 17)
-    kernel = Kernels(metric_of(windows, 0.0), one_side).fit(windows, MachineOptions())
+    kernel = Kernels(metric_of(windows, 0.0), one_side).fit(windows)
     assert kernel.shape == (20, 20)
     torch.testing.assert_close(kernel, kernel.mT, atol=1e-5, rtol=0)
     torch.testing.assert_close(kernel.diagonal(), torch.ones(20), atol=2e-2 if one_side else 1e-4, rtol=0)
@@ -343,7 +338,7 @@ def test_kernels_are_symmetric_with_ones_on_the_diagonal(one_side):
 def test_kernel_by_definition(one_side):
     query, bank = random_windows(4, 18), random_windows(9, 19)
     kernels = Kernels(metric_of(bank, 0.0), one_side)
-    kernels.fit(bank, MachineOptions())
+    kernels.fit(bank)
 
     def distances(a, b):
         unit = torch.nn.functional.normalize
@@ -380,7 +375,7 @@ def test_pairwise_machine_is_the_support_vector_machine(classes):
     gram, cross = x @ x.T, q @ x.T
     machine = PairwiseMachine.fit(torch.from_numpy(gram).float(), labels)
     got = machine(torch.from_numpy(cross).float()[:, machine.support]).numpy()
-    reference = SVC(C=MachineOptions().penalty, kernel="precomputed", decision_function_shape="ovr").fit(gram, labels)
+    reference = SVC(C=PENALTY, kernel="precomputed", decision_function_shape="ovr").fit(gram, labels)
     expected = reference.decision_function(cross)
     assert got.shape == (40, classes)
     if classes == 2:

@@ -9,13 +9,10 @@ import torch
 from indexing import ActionIndexer
 from indexing.action.bank import JointMetric, Windows, fused_residual
 from indexing.action.joint_weights import JointWeights
-from indexing.action.learning import _fewest_mistakes, _sharpened, blended, leave_out
+from indexing.action.learning import BLENDS, _fewest_mistakes, _sharpened, blended, leave_out
 from indexing.action.model import Blend, evidence
-from indexing.action.options import ActionOptions
 from indexing.actors import Person, dataset
 from indexing.scoring import probabilities, reject_threshold
-
-USUAL = ActionOptions()
 
 ACTIONS = ("squat", "wave", "kick", "bow", "punch")
 
@@ -53,20 +50,20 @@ def test_the_scorer_that_is_right_is_chosen():
     truth = torch.arange(5).repeat(20)
     right = torch.nn.functional.one_hot(truth, 5).double() + 0.1 * torch.rand(100, 5, generator=draw, dtype=torch.float64)
     wrong = 1.2 * right.roll(1, dims=1)
-    only_a = _fewest_mistakes(torch.stack([2 * wrong, right]), truth, Blend(), USUAL)
-    only_b = _fewest_mistakes(torch.stack([right, wrong]), truth, Blend(), USUAL)
+    only_a = _fewest_mistakes(torch.stack([2 * wrong, right]), truth, Blend())
+    only_b = _fewest_mistakes(torch.stack([right, wrong]), truth, Blend())
     assert (only_a.kernel, only_a.nearest) == (1.0, 3.0)
     assert (only_b.kernel, only_b.nearest) == (1.0, 0.5)
-    same = _fewest_mistakes(torch.stack([right, right]), truth, Blend(), USUAL)
+    same = _fewest_mistakes(torch.stack([right, right]), truth, Blend())
     assert (same.kernel, same.nearest) == (1.0, Blend().nearest)  # nothing gained, nothing changed
-    assert (Blend().kernel, Blend().nearest) in USUAL.blend.blends
+    assert (Blend().kernel, Blend().nearest) in BLENDS
 
 
 def test_sharpness_is_the_likeliest():
     draw = torch.Generator().manual_seed(1)
     truth = torch.arange(4).repeat(50)
     scores = torch.nn.functional.one_hot(truth, 4).double() + torch.randn(200, 4, generator=draw, dtype=torch.float64)
-    found = _sharpened(Blend(), scores, truth, 10**6, USUAL).sharpness
+    found = _sharpened(Blend(), scores, truth, 10**6).sharpness
 
     def likelihood(sharpness):
         chance = probabilities(scores.numpy(), sharpness)
@@ -75,7 +72,7 @@ def test_sharpness_is_the_likeliest():
     assert likelihood(found) >= max(likelihood(found * 1.19), likelihood(found / 1.19))
     assert likelihood(found) > likelihood(8.0)
     certain = 5.0 * torch.nn.functional.one_hot(truth, 4).double()  # nobody was ever wrong: the fewer asked, the less it says
-    few, many = (_sharpened(Blend(), certain, truth, exemplars, USUAL).sharpness for exemplars in (8, 800))
+    few, many = (_sharpened(Blend(), certain, truth, exemplars).sharpness for exemplars in (8, 800))
     assert few < many < 16
 
 

@@ -5,20 +5,26 @@ import dataclasses
 import pytest
 import torch
 
+from indexing.action import joint_weights
 from indexing.action.bank import NEAREST, JointMetric, Windows, fused_residual
 from indexing.action.joint_weights import JointWeights, WeightedMetric, epipolar, gather, learn_joint_weights
-from indexing.action.options import ActionOptions, JointWeightOptions
 
 JOINTS, LENGTH = 6, 8
-ONE_ROUND = ActionOptions(joints=JointWeightOptions(rounds=1))
 TELLING = 4
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_round():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joint_weights, "NUM_ROUNDS", 1)
+        yield
+
+
 @pytest.fixture(scope="module")
-def plain():
+def plain(one_round):
     """Planted windows of five people, and what is learned from them."""
     bank, labels, groups = planted(5)
-    found = learn_joint_weights(bank, torch.arange(15), [bank], a_metric(bank), labels, groups=groups, options=ONE_ROUND)
+    found = learn_joint_weights(bank, torch.arange(15), [bank], a_metric(bank), labels, groups=groups)
     return bank, labels, groups, found
 
 
@@ -133,7 +139,7 @@ def test_each_action_gets_the_joint_that_tells_it():
     bank, labels, groups = own_joints(10, seed=0)
     query, truth, _ = own_joints(20, seed=5)
     metric = a_metric(bank)
-    found = learn_joint_weights(bank, torch.arange(len(labels)), [bank], metric, labels, groups=groups, options=ONE_ROUND)
+    found = learn_joint_weights(bank, torch.arange(len(labels)), [bank], metric, labels, groups=groups)
     assert found.by_class is not None
     assert found.by_class.argmax(dim=1).tolist() == [0, 1, 2]
     shared = dataclasses.replace(found, by_class=None)
@@ -144,18 +150,14 @@ def test_the_order_of_joints_changes_nothing_but_the_order(plain):
     bank, labels, groups, learned = plain
     order = torch.tensor([3, 5, 0, 4, 1, 2])
     turned = Windows(bank.values[:, :, order], bank.seen[:, order])
-    other = learn_joint_weights(
-        turned, torch.arange(len(labels)), [turned], a_metric(turned), labels, groups=groups, options=ONE_ROUND
-    )
+    other = learn_joint_weights(turned, torch.arange(len(labels)), [turned], a_metric(turned), labels, groups=groups)
     torch.testing.assert_close(other.joints, learned.joints[:, order], atol=0.03, rtol=0.03)
 
 
 def test_mirror_images_share_a_weight(plain):
     bank, labels, groups, _ = plain
     swap = torch.tensor([0, 1, 2, 3, 5, 4])
-    found = learn_joint_weights(
-        bank, torch.arange(len(labels)), [bank], a_metric(bank), labels, groups=groups, symmetry=swap, options=ONE_ROUND
-    )
+    found = learn_joint_weights(bank, torch.arange(len(labels)), [bank], a_metric(bank), labels, groups=groups, symmetry=swap)
     torch.testing.assert_close(found.joints[:, 4], found.joints[:, 5])
 
 

@@ -11,8 +11,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from sklearn.base import clone
 
-from indexing import ActionIndexer
-from indexing.action.options import ActionOptions, ExemplarOptions, NearestOptions
+from indexing import ActionIndexer, ActionOptions
 from indexing.actors import Person, dataset
 
 FEW = ("squat", "wave", "kick", "bow")
@@ -242,26 +241,21 @@ def test_options_are_kept_where_they_are_not_the_defaults(train, test, tmp_path)
     ActionIndexer(scorer="nearest").fit(train).save(plain)
     ActionIndexer(scorer="nearest", options=ActionOptions()).fit(train).save(usual)
     assert plain.read_bytes() == usual.read_bytes() and ActionIndexer.load(usual).options is None
-    options = ActionOptions(
-        exemplars=ExemplarOptions(crops=((0.0, 1.0), (0.1, 0.8))), nearest=NearestOptions(neighbours=1, floor=0.5, turned=0.0)
-    )
+    options = ActionOptions(num_durations=2, rest_weight=1.0)
     taught = clone(ActionIndexer(scorer="nearest", options=options)).fit(train)
     taught.save(other)
-    assert contents(other)[1]["parameters"]["options"] == {
-        "exemplars": {"crops": [[0.0, 1.0], [0.1, 0.8]]}, "nearest": {"neighbours": 1, "floor": 0.5, "turned": 0.0}
-    }  # fmt: skip
+    assert contents(other)[1]["parameters"]["options"] == {"num_durations": 2, "rest_weight": 1.0}
     again = ActionIndexer.load(other)
-    assert again.options == options and again.model_.options == options
-    np.testing.assert_array_equal(again.decision_function(test), taught.decision_function(test))
-    assert not np.array_equal(again.decision_function(test), ActionIndexer.load(plain).decision_function(test))
+    assert again.options == options
+    np.testing.assert_array_equal(again.score_frames(test[0]), taught.score_frames(test[0]))
+    assert not np.array_equal(again.score_frames(test[0]), ActionIndexer.load(plain).score_frames(test[0]))
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ([1], "options: expected fields"), ({"nearest": {"near": 1}}, "options.nearest: there is no 'near'"),
-        ({"nearest": {"neighbours": 1.5}}, "options.nearest.neighbours: expected a value like 2"),
-        ({"recordings": {"cyclic": [1.0]}}, "options.recordings.cyclic"), ({"events": {"step": "x"}}, "options.events.step"),
+        ([1], "options: expected fields"), ({"nearest": {"neighbours": 1}}, "options: there is no 'nearest'"),
+        ({"num_durations": 1.5}, "options.num_durations: expected a value like 24"), ({"window_step": "x"}, "options.window_step"),
     ],
 )  # fmt: skip
 def test_options_that_are_none_are_refused(options, said, saved, tmp_path):

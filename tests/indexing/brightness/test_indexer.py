@@ -12,7 +12,7 @@ from sklearn.base import clone
 from indexing.actors import Person, perform
 from indexing.actors.textured import film
 from indexing.brightness.indexer import BrightnessIndexer
-from indexing.brightness.options import BrightnessOptions, MatchingOptions, MotionMapOptions
+from indexing.brightness.sight import BrightnessOptions
 from indexing.video import Chunk
 from tests.battery.pretend_device import accelerators
 
@@ -221,11 +221,11 @@ def test_options_are_kept_where_they_are_not_the_defaults(learned, asked, tmp_pa
     BrightnessIndexer(fps=15.0).fit(learned, ACTIONS * 2).save(plain)
     BrightnessIndexer(fps=15.0, options=BrightnessOptions()).fit(learned, ACTIONS * 2).save(usual)
     assert plain.read_bytes() == usual.read_bytes() and BrightnessIndexer.load(usual).options is None
-    options = BrightnessOptions(maps=MotionMapOptions(sigma=2.0), matching=MatchingOptions(slack=0.1))
+    options = BrightnessOptions(blur_sigma=2.0, noise_level=0.008, motion_memory=2.0, num_directions=8)
     taught = clone(BrightnessIndexer(fps=15.0, options=options)).fit(learned, ACTIONS * 2)
     taught.save(other)
     again = BrightnessIndexer.load(other)
-    assert again.options == options
+    assert again.options == options and again.recognizer_.library.rows.shape[1] == 8
     np.testing.assert_array_equal(again.decision_function(asked), taught.decision_function(asked))
     assert not np.array_equal(again.decision_function(asked), BrightnessIndexer.load(plain).decision_function(asked))
     with pytest.raises(ValueError, match="options were changed since fit"):

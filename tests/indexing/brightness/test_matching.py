@@ -4,11 +4,8 @@ import numpy as np
 import torch
 
 from indexing.brightness.library import VideoExemplars, library
-from indexing.brightness.options import MatchingOptions
 from indexing.brightness.sight import LENGTH
-from indexing.brightness.stream import Pool, Warping
-
-SHARP, SLACK = MatchingOptions().sharp, MatchingOptions().slack
+from indexing.brightness.stream import MEAN_SHARPNESS, SLACK, Pool, Warping
 
 
 def exemplars(lengths=(5, 3, 7), labels=(1, 0, 1)):
@@ -53,6 +50,6 @@ def test_the_pool_is_a_weighted_mean_of_exponentials():
     found = Pool(2, 4.0).push(scores, energy)
     for t in range(1, 6):
         weight = 0.75 ** np.arange(t, -1, -1) * energy[: t + 1]
-        mean = (weight[:, None] * np.exp(SHARP * scores[: t + 1])).sum(0) / weight.sum()
-        np.testing.assert_allclose(found[t], np.log(mean) / SHARP, rtol=1e-9)
+        mean = (weight[:, None] * np.exp(MEAN_SHARPNESS * scores[: t + 1])).sum(0) / weight.sum()
+        np.testing.assert_allclose(found[t], np.log(mean) / MEAN_SHARPNESS, rtol=1e-9)
     assert found[0].tolist() == [0, 0]

@@ -5,11 +5,19 @@ import pytest
 import torch
 
 from indexing.brightness.features import FEW_BLOCK, blur, blurred, gradients, inner_gradients, slopes
-from indexing.brightness.options import BrightnessOptions
-from indexing.brightness.sight import MotionBox, MotionMaps, described, mirrored, pooled, profile
+from indexing.brightness.sight import (
+    MIN_CHANGE,
+    SOFT_NORM,
+    BrightnessOptions,
+    MotionBox,
+    MotionMaps,
+    described,
+    mirrored,
+    pooled,
+    profile,
+)
 
-USUAL = BrightnessOptions()
-QUIET, SIGMA, SOFT = USUAL.maps.quiet, USUAL.maps.sigma, USUAL.descriptor.soft
+QUIET, SIGMA = BrightnessOptions().noise_level, BrightnessOptions().blur_sigma
 
 
 def video(frames=9, height=18, width=24, seed=0):
@@ -18,7 +26,7 @@ def video(frames=9, height=18, width=24, seed=0):
 
 def test_maps_are_kornias_gradients_of_the_frame_before():
     frames = video()
-    maps, change = MotionMaps().push(frames)
+    maps, change = MotionMaps(SIGMA, QUIET).push(frames)
     gx, gy, gt = gradients(blur(frames, SIGMA))
     for t in (2, 5, 8):  # the change from t - 2 to t, about frame t - 1
         weight = -gt[t - 1].sign() * (gt[t - 1].abs() - QUIET).clamp(min=0) / ((gx[t - 1] ** 2 + gy[t - 1] ** 2).sqrt() + 0.02)
@@ -31,7 +39,9 @@ def test_maps_are_kornias_gradients_of_the_frame_before():
 
 def test_maps_do_not_know_the_sign_of_the_contrast():
     frames = video()
-    torch.testing.assert_close(MotionMaps().push(1 - frames)[0], MotionMaps().push(frames)[0], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(
+        MotionMaps(SIGMA, QUIET).push(1 - frames)[0], MotionMaps(SIGMA, QUIET).push(frames)[0], atol=1e-5, rtol=1e-4
+    )
 
 
 def test_tables_are_kornias():
@@ -47,7 +57,7 @@ def slow_box(change):
     """Frame by frame, quantiles by counting."""
     seen, out = np.zeros(change.shape[1:]), []
     for frame in change:
-        seen = np.maximum(seen * (1 - 1 / 150), np.maximum(frame - USUAL.box.lively, 0))
+        seen = np.maximum(seen * (1 - 1 / 150), np.maximum(frame - MIN_CHANGE, 0))
         ends = []
         for axis in (0, 1):
             share = np.cumsum(seen.sum(axis)) / seen.sum()
@@ -88,12 +98,12 @@ def test_descriptors_are_shorter_than_one_and_mirror_with_the_image():
     box = torch.tensor([12.0, 9, 20, 20]).expand(6, 4)
 
     def seen(images):
-        cells = pooled(MotionMaps().push(images)[0], box[:, None])[:, 0]
+        cells = pooled(MotionMaps(SIGMA, QUIET).push(images)[0], box[:, None])[:, 0]
         return torch.cat([described(cells), described(cells), described(profile(cells))], dim=1)
 
     rows = seen(frames)
     assert rows[2:, :256].norm(dim=1).max() < 1
     cells = rows[3, :256] / (1 - rows[3, :256].norm())
-    mean = pooled(MotionMaps().push(frames)[0], box[:, None])[3]
-    torch.testing.assert_close(cells.norm() * SOFT, mean.sum().sqrt(), rtol=1e-3, atol=0)
+    mean = pooled(MotionMaps(SIGMA, QUIET).push(frames)[0], box[:, None])[3]
+    torch.testing.assert_close(cells.norm() * SOFT_NORM, mean.sum().sqrt(), rtol=1e-3, atol=0)
     torch.testing.assert_close(mirrored(rows), seen(frames.flip(2)), atol=1e-5, rtol=1e-3)

@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing import ActionIndexer, Clip, ClipSet, synchronize
+from indexing import ActionIndexer, ActionOptions, Clip, ClipSet, synchronize
 from indexing.actors import Person, dataset
 from indexing.cli import main
 from indexing.cli.inputs import Reading
 from indexing.cli.remarks import remarks
-from indexing.recordings.explanation import Withheld
-from indexing.recordings.options import ExplanationOptions
+from indexing.recordings.decoding import Withheld
 from indexing.skeleton import BODY25, COCO17, Skeleton
 
 ORDER = np.random.default_rng(0).permutation(17)
@@ -256,7 +255,7 @@ def test_how_strictly_rest_is_judged(run, monkeypatch):
     original, asked = ActionIndexer.explain, []
 
     def explain(self, clip, progress=None):
-        asked.append(self.options.recordings.rest)
+        asked.append(self.options.rest_weight)
         told = original(self, clip, progress)
         held = [Withheld(event, "at rest") for event in told.events]
         return dataclasses.replace(told, events=[], withheld=held)
@@ -265,7 +264,7 @@ def test_how_strictly_rest_is_judged(run, monkeypatch):
     for rest in ("strict", "usual", "off"):
         out = run(f"index scan wave -m m.safetensors --fps 30 --rest {rest}")[1]
         assert re.search(r"held back, at rest: \d+ wave", out) and "no action found" in out
-    usual = ExplanationOptions().rest
+    usual = ActionOptions().rest_weight
     assert asked == [2 * usual, usual, 0.0]
     code, _, err = run("index scan wave -m m.safetensors --rest often")
     assert code == 2 and "--rest often: " in err and "off, strict, usual" in err

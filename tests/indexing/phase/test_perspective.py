@@ -8,7 +8,7 @@ from indexing import PhaseIndexer
 from indexing.actors import dataset
 from indexing.cameras import virtual
 from indexing.clip import Clip
-from indexing.phase.perspective import leaning
+from indexing.phase.frames import leaning
 
 
 def centred(*shape, seed):

@@ -9,8 +9,8 @@ from indexing import Clip
 from indexing.actors import Person, dataset, detect, perform
 from indexing.phase.frames import query_frames
 from indexing.phase.indexer import PhaseIndexer
-from indexing.phase.model import event_levels
-from indexing.phase.options import CourseOptions, PhaseEvidenceOptions, PhaseOptions
+from indexing.phase.learning import period
+from indexing.phase.model import PhaseOptions, event_levels
 
 ACTIONS = ("walk", "sit_down")
 TURNS = (0, 40, 80)
@@ -201,12 +201,27 @@ def test_options_are_kept_where_they_are_not_the_defaults(tmp_path):
     PhaseIndexer(harmonics=2).fit(clips, clips.labels).save(plain)
     PhaseIndexer(harmonics=2, options=PhaseOptions()).fit(clips, clips.labels).save(usual)
     assert plain.read_bytes() == usual.read_bytes() and PhaseIndexer.load(usual).options is None
-    options = PhaseOptions(evidence=PhaseEvidenceOptions(mix=1.0), course=CourseOptions(grid=48))
+    options = PhaseOptions(num_phases=48, max_training_frames=60, max_kept_frames=40)
     taught = PhaseIndexer(harmonics=2, options=options).fit(clips, clips.labels)
     taught.save(other)
     again = PhaseIndexer.load(other)
     assert again.options == again.model_.options == options
+    assert len(again.model_.bank) < len(PhaseIndexer.load(plain).model_.bank)
     np.testing.assert_array_equal(again.decision_function(clips), taught.decision_function(clips))
     assert not np.array_equal(again.decision_function(clips), PhaseIndexer.load(plain).decision_function(clips))
     with pytest.raises(ValueError, match="options must be None or indexing"):
-        PhaseIndexer(options=PhaseEvidenceOptions()).fit(clips, clips.labels)
+        PhaseIndexer(options={"num_phases": 48}).fit(clips, clips.labels)
+
+
+@pytest.mark.slow
+def test_seconds_over_which_scores_are_averaged_and_periods_that_are_looked_for():
+    clips = dataset(2, ["walk", "squat", "wave"], azimuth=0.0, rng=0)
+    coarse = PhaseIndexer(harmonics=2, options=PhaseOptions(event_seconds=3.0)).fit(clips, clips.labels)
+    fine = PhaseIndexer(harmonics=2).fit(clips, clips.labels)
+    assert len(coarse.model_.wrong) < len(fine.model_.wrong)
+    walk = clips.select(label="walk")[0]
+    x, times = torch.from_numpy(np.nan_to_num(walk.joints).astype(float)), torch.from_numpy(walk.times)
+    own = period(x, times, PhaseOptions())[0]
+    assert 0.3 <= own <= 4.0
+    assert period(x, times, PhaseOptions(min_period=1.2 * own))[0] != own
+    assert period(x, times, PhaseOptions(max_period=0.8 * own))[0] < 0.8 * own

@@ -10,9 +10,9 @@ import torch
 
 from indexing import ActionIndexer
 from indexing.actors import Person, dataset, detect, stream
+from indexing.recordings import live as of_live
 from indexing.recordings.evidence import whole_scores
 from indexing.recordings.live import ActionStream, RunningLevel
-from indexing.recordings.options import LiveOptions
 
 KNOWN = ("squat", "wave", "bow", "kick", "walk")
 
@@ -189,19 +189,16 @@ def test_what_a_level_refuses_is_not_told(indexer, seen):
     assert events + rest == [] and np.isfinite(scores).all()
 
 
-def test_windows_say_what_they_say_in_the_whole(indexer, seen):
+def test_windows_say_what_they_say_in_the_whole(indexer, seen, monkeypatch):
     """One comparison with all exemplars, instead of one for each duration."""
     clip, _ = seen
-    source = indexer.stream().source
-    patient = replace(source.model.options, live=LiveOptions(horizon=100.0))  # nothing is decided
-    source = replace(source, model=source.model.with_options(patient), repair=None)
+    monkeypatch.setattr(of_live, "HORIZON", 100.0)  # nothing is decided
+    source = replace(indexer.stream().source, repair=False)
     live = ActionStream(source, None, clip.up, None)
     live.push(clip.joints[:300], clip.times[:300])
     one = live._explained(live.buffered).one
     with torch.no_grad():
-        whole = whole_scores(
-            live.source.model, one.lattice, lambda rows: one.cut(rows, indexer.length), live._durations, patient.recordings
-        )
+        whole = whole_scores(live.source.model, one.lattice, lambda rows: one.cut(rows, indexer.length), live._durations)
     assert np.array_equal(np.isnan(whole), np.isnan(one.whole))
     assert np.nanmax(np.abs(whole - one.whole)) < 1e-3
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexing.clip import Clip
-from indexing.recordings.people import Appearance, Exchange, PresenceOptions, of_recording, tracked_people
+from indexing.recordings.people import Appearance, Exchange, of_recording, tracked_people
 
 BOX = np.array([[0.0, 0.0], [40.0, 0.0], [40.0, 90.0], [0.0, 90.0]])
 FPS = 30.0
@@ -175,4 +175,4 @@ def test_only_ghosts_is_nobody():
 
 def test_the_options_decide():
     clips = [track([(0, 6)], 0, by="ids"), track([(2, 2.3)], 1, place=900, by="ids")]
-    assert len(tracked_people(clips, options=PresenceOptions(shortest=0.2)).people) == 2
+    assert len(tracked_people(clips, min_seconds=0.2).people) == 2

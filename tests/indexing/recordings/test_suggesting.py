@@ -9,8 +9,7 @@ import pytest
 
 from indexing import ActionIndexer, Clip
 from indexing.actors import Person, dataset, detect, stream
-from indexing.recordings.options import SuggestOptions
-from indexing.recordings.suggesting import chosen, compared, parts_of, suggest
+from indexing.recordings.suggesting import SuggestOptions, chosen, compared, parts_of, suggest
 
 KNOWN = ("squat", "wave")
 DONE = ["squat", "kick", "wave", "kick", "bow", "squat", "kick", "wave"]
@@ -82,14 +81,14 @@ def test_parts_cover_the_recording_and_stay_within_gaps(learned, recording) -> N
     clip, _ = recording
     kept = (clip.times < 6) | (clip.times > 9)
     torn = clip.replace(joints=clip.joints[kept], times=clip.times[kept], confidence=None)
-    parts = parts_of(learned, torn, [], SuggestOptions())
+    parts = parts_of(learned, torn, [])
     assert not ((parts.spans[:, 0] < 8.9) & (parts.spans[:, 1] > 6.1)).any()
     assert parts.spans.min() >= clip.times[0] and parts.spans.max() <= clip.times[-1]
 
 
 def test_residuals_tell_what_is_known(learned, recording) -> None:
     clip, truth = recording
-    parts = parts_of(learned, clip, [], SuggestOptions())
+    parts = parts_of(learned, clip, [])
     likely, near, apart, usual = compared(learned, parts.windows)
     assert likely.shape == (len(parts.spans), 2) and apart.shape == (len(parts.spans),) * 2
     assert np.allclose(apart, apart.T, atol=0.1) and (np.diag(apart) < 0.01).all() and 0 < usual < 1
@@ -99,7 +98,7 @@ def test_residuals_tell_what_is_known(learned, recording) -> None:
 
 def test_too_many_parts_are_thinned_out(learned, recording) -> None:
     clip, _ = recording
-    found = suggest(learned, [clip], 99, options=SuggestOptions(candidates=4))
+    found = suggest(learned, [clip], 99, options=SuggestOptions(max_candidates=4))
     assert 1 <= len(found) <= 4
 
 
@@ -120,7 +119,7 @@ def left(points, centres, weight):
 def test_each_leaves_the_least_that_is_unlike_what_is_known(seed: int) -> None:
     points, known, apart, near, worth = scattered(seed)
     margin = np.random.default_rng(seed).random(40)
-    picked = chosen(near, apart, margin, 6, worth, SuggestOptions(unsure=2.0))
+    picked = chosen(near, apart, margin, 6, worth, SuggestOptions(doubt_weight=2.0))
     assert len(set(picked)) == 6 and worth[picked].all()
     weight = (1 + 2.0 * (1 - margin)) * worth
     for count, one in enumerate(picked):
@@ -131,7 +130,7 @@ def test_each_leaves_the_least_that_is_unlike_what_is_known(seed: int) -> None:
 
 def test_alone_it_is_farthest_first() -> None:
     points, known, apart, near, worth = scattered(0)
-    picked = chosen(near, apart, np.ones(40), 6, worth, SuggestOptions(alike=False))
+    picked = chosen(near, apart, np.ones(40), 6, worth, SuggestOptions(coverage=False))
     for count, one in enumerate(picked):  # each as far as any from all that are known by then
         centres = np.concatenate([known, points[picked[:count]]])
         distance = np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1)
@@ -141,7 +140,7 @@ def test_alone_it_is_farthest_first() -> None:
 def test_who_is_less_sure_comes_sooner() -> None:
     same = np.ones((2, 2)) - np.eye(2)
     assert chosen(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions()) == [1]
-    assert chosen(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions(unsure=0.0)) == [0]
+    assert chosen(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions(doubt_weight=0.0)) == [0]
 
 
 def test_bad_input_says_what_is_wrong(learned, recording) -> None:

@@ -9,7 +9,6 @@ import torch
 from indexing import ActionIndexer, Clip
 from indexing.action.bank import Windows
 from indexing.action.learning import halves, importance
-from indexing.action.options import ActionOptions
 from indexing.report.learned import BodyParts, body_parts, in_body, measure_body_parts, telling_joints
 from indexing.skeleton import COCO17
 
@@ -35,7 +34,7 @@ def test_a_linear_margin_is_found():
         return torch.where(asks[:, None] == labels[None], -evidence, torch.zeros(()))
 
     exemplars = SimpleNamespace(crop=lambda _: windows)
-    model = SimpleNamespace(exemplars=exemplars, labels=labels, classes=2, residuals=residuals, options=ActionOptions())
+    model = SimpleNamespace(exemplars=exemplars, labels=labels, classes=2, residuals=residuals)
     found = importance(model, groups)
     # halves of fixed size tell joints from each other, not how many are seen: compare about the mean
     centred = share.double() - share.double().mean(dim=1, keepdim=True)

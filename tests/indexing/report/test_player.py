@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from indexing.clip import Clip
-from indexing.recordings.explanation import Withheld
+from indexing.recordings.decoding import Withheld
 from indexing.report import RecognitionReport, RecordingResult, player, write_recognition
 from indexing.report.player import PlayerOptions, players
 from indexing.report.results import by_recording

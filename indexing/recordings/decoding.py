@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,15 +18,56 @@ import torch
 from indexing.action.bank import Windows
 from indexing.action.exemplars import moment_window
 from indexing.action.model import ShapeModel
-from indexing.action.stream import Progress, Stream, StreamScan, motion_levels, scan, wrong_contrast
+from indexing.action.stream import ActionOptions, Progress, Stream, StreamScan, motion_levels, scan, wrong_contrast
 from indexing.action.symmetry import mirror
 from indexing.clip import Clip
-from indexing.recordings.evidence import Array, Durations, Lattice, level, machine_scores, whole_scores
-from indexing.recordings.explanation import Explanation, Reason, Withheld
-from indexing.recordings.options import ExplanationOptions
+from indexing.recordings.evidence import MIN_CYCLIC, Array, Durations, Lattice, level, machine_scores, whole_scores
 from indexing.recordings.tiling import TiledSegment, best_tiling, posterior, through
 from indexing.scoring import Event, event_levels
 from indexing.windows import Ragged, ragged
+
+WHOLE_WEIGHT = 1.0  # of the nearest whole exemplars
+MACHINE_WEIGHT = 0.8  # of the kernel machine (UTKinect without it: .813 for .843)
+MOMENT_WEIGHT = 1.25  # of short windows of the exemplars
+DURATION_WEIGHT = 0.5  # of the log likelihood of a duration; 0 costs .02 on UTKinect
+SEGMENT_COST = 1.0  # of beginning a segment
+ABSENCE_COST = 8.0  # where nobody is seen
+TEMPERATURE = 0.15  # of the posterior of frames; the best segments alone (0) are as good on most sets
+MAX_VALUE_GAP = 3.0  # to the best explanation, for a window to be asked of the kernel machine
+CYCLIC_MOMENT_GAIN = 2.0  # more weight of short windows for cyclic actions, which have no begin and end to be aligned
+CYCLIC_WHOLE_LOSS = 0.75  # share of the weight of whole exemplars that they lose
+# pose between two segments, from the ends over from within the exemplar: bows, squats .3 to 1.2, punches in a row 3.7 to 3.9
+MIN_SEAM_RATIO = 2.0
+MIN_LIKELIHOOD = 1e-6  # whose logarithm is the least score of a frame
+MIN_RANKED_LIKELIHOOD = 1e-16  # down to which classes are still ranked: the rounding of sums
+RANKING_WEIGHT = 1e-3  # of the logarithm of such likelihoods
+EDGE_TOLERANCE = 1e-6  # seconds: a frame on an edge belongs to the cell behind it, however its time was rounded
+
+Reason = Literal["at rest", "nobody there", "below the level", "other movement"]
+
+
+@dataclass(frozen=True)
+class Withheld:
+    """Something that looked like an action and is not reported: what it would have been, and why it is not."""
+
+    event: Event
+    reason: Reason
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A recording of one person as segments."""
+
+    times: Array
+    classes: tuple[Any, ...]
+    scores: Array
+    events: Sequence[Event] = ()
+    withheld: Sequence[Withheld] = ()
+    background: Array | None = None
+
+    def seconds(self, label: Any) -> float:
+        """How long one action lasts in all."""
+        return sum(event.end - event.start for event in self.events if event.label == label)
 
 
 @dataclass(frozen=True)
@@ -51,31 +92,30 @@ def explain(
     model: ShapeModel, clip: Clip, stream: Stream, classes: Sequence[Any], rate: float | None, progress: Progress = None
 ) -> Explanation:
     """The segments of a recording, and what they say of its frames."""
-    options = model.options.recordings
-    stream = dataclasses.replace(stream, window=moment_window(stream.window, model.exemplars.seconds, model.options.exemplars))
-    durations = Durations.of(model, stream.window, 0.3 * stream.window, options)
-    events = dataclasses.replace(model.options.events, step=min(model.options.events.step, stream.window / 4))
-    finer = model.with_options(dataclasses.replace(model.options, events=events))
-    moments = scan(finer, clip, stream, None if progress is None else lambda share: progress(0.5 * share))
+    window = moment_window(stream.window, model.exemplars.seconds)
+    options = dataclasses.replace(stream.options, window_step=min(stream.options.window_step, window / 4))
+    stream = dataclasses.replace(stream, window=window, options=options)
+    durations = Durations.of(model, stream.window, 0.3 * stream.window)
+    moments = scan(model, clip, stream, None if progress is None else lambda share: progress(0.5 * share))
     stretches = _stretches(model, clip, moments, durations, stream, progress)
     wholes = level(np.concatenate([one.whole.ravel() for one in stretches]) if stretches else np.zeros(0))
-    scores = np.full((len(clip), model.classes), log_scores(np.zeros(1), options)[0])
+    scores = np.full((len(clip), model.classes), log_scores(np.zeros(1))[0])
     background = np.ones(len(clip))
     found: list[Event] = []
     held: list[Withheld] = []
     for one in stretches:
         values, calm, absent = segment_values(model, one, durations, wholes, stream.length, options)
         segments, _ = best_tiling(one.lattice.windows, values, calm)
-        inside = posterior(one.lattice.windows, values, calm, options.temperature)
+        inside = posterior(one.lattice.windows, values, calm, TEMPERATURE)
         first, end = one.frames
-        cell = np.searchsorted(one.lattice.edges, clip.times[first:end] + options.edge, side="right") - 1
+        cell = np.searchsorted(one.lattice.edges, clip.times[first:end] + EDGE_TOLERANCE, side="right") - 1
         cell = np.clip(cell, 0, len(inside) - 1)
-        scores[first:end] = log_scores(inside, options)[cell]
+        scores[first:end] = log_scores(inside)[cell]
         background[first:end] = 1.0 - inside.sum(axis=1).clip(0.0, 1.0)[cell]
         mine = _joined(model, one, segments, durations, stream.length)
         found += told_events(model, one, mine, values, classes, stream.length)
         # what would be there, did rest and absence count as movement, and is not
-        awake = np.minimum(calm, options.background * _unit(one, durations))
+        awake = np.minimum(calm, options.min_quality * _unit(one, durations))
         restless, _ = best_tiling(one.lattice.windows, values + absent, awake)
         silent = [part for part in _joined(model, one, restless, durations, stream.length) if not _meets(part, mine)]
         reasons: list[Reason] = ["nobody there" if not one.present[part.first : part.last].any() else "at rest" for part in silent]
@@ -88,9 +128,11 @@ def explain(
     return Explanation(clip.times, tuple(classes), scores, found, held, background)
 
 
-def log_scores(likely: Array, options: ExplanationOptions) -> Array:
+def log_scores(likely: Array) -> Array:
     """Logarithms of likelihoods; below the least ones a shade tells classes apart."""
-    return np.asarray(np.log(np.maximum(likely, options.least)) + options.shade * np.log(np.maximum(likely, options.faint)))
+    return np.asarray(
+        np.log(np.maximum(likely, MIN_LIKELIHOOD)) + RANKING_WEIGHT * np.log(np.maximum(likely, MIN_RANKED_LIKELIHOOD))
+    )
 
 
 def _unit(one: Stretch, durations: Durations) -> float:
@@ -107,7 +149,7 @@ def _stretches(
     out: list[Stretch] = []
     for number, (part, frames) in enumerate(moments.parts()):
         times = clip.times[frames]
-        lattice = Lattice.over(float(times[0]), float(times[-1]), durations, model.options.recordings)
+        lattice = Lattice.over(float(times[0]), float(times[-1]), durations, stream.options.num_durations)
         middle, at = (lattice.edges[1:] + lattice.edges[:-1]) / 2, moments.times[part]
         cells = np.stack([np.interp(middle, at, column) for column in contrast[part].T], axis=1)
         motion = np.interp(middle, at, moments.motion[part])
@@ -117,7 +159,7 @@ def _stretches(
         def cut(chosen: Array, lattice: Lattice = lattice, source: Ragged = source) -> Windows:
             return lattice.cut(source, 0, chosen, stream.length)
 
-        whole = whole_scores(model, lattice, cut, durations, model.options.recordings)
+        whole = whole_scores(model, lattice, cut, durations)
         out.append(Stretch(source, lattice, cells, cells / spread, motion, present, whole, (frames.start, frames.stop)))
         if progress is not None:
             progress(0.5 + 0.4 * (number + 1) / len(moments.stretches))
@@ -135,40 +177,38 @@ class _Worth:
     absent: Array
 
 
-def _worth(
-    model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], options: ExplanationOptions
-) -> _Worth:
+def _worth(model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], options: ActionOptions) -> _Worth:
     """A segment is worth its quality times its duration in ordinary exemplars, the likelihood of its duration, less what it costs
     to begin one."""
     lattice, cyclic = one.lattice, durations.cyclic[None].astype(np.float32)
     whole = np.nan_to_num((one.whole - wholes[0]) / wholes[1], nan=-2.0)
-    unseen = options.absent * ~one.present
+    unseen = ABSENCE_COST * ~one.present
     rest = _rest(model, one)
     lasts = (lattice.seconds / durations.unit).astype(np.float32)[:, None]
     absent = lasts * lattice.mean(unseen[:, None])
-    quality = options.moments * (1 + options.cyclic_moments * cyclic) * lattice.mean(one.contrast)
+    quality = MOMENT_WEIGHT * (1 + CYCLIC_MOMENT_GAIN * cyclic) * lattice.mean(one.contrast)
     # what moments say of cyclic actions counts more, so rest must, too
-    quality -= options.rest * options.cyclic_moments * cyclic * lattice.mean(rest.clip(min=0.0)[:, None])
-    weight = 1 - options.cyclic_whole * cyclic
-    quality += options.whole * weight * whole
-    prior = durations.likelihoods(lattice.seconds, model.labels.cpu().numpy(), options)
-    told = lasts * quality + options.duration * prior - options.entry - absent
-    share = options.machine * lasts * weight
+    quality -= options.rest_weight * CYCLIC_MOMENT_GAIN * cyclic * lattice.mean(rest.clip(min=0.0)[:, None])
+    weight = 1 - CYCLIC_WHOLE_LOSS * cyclic
+    quality += WHOLE_WEIGHT * weight * whole
+    prior = durations.likelihoods(lattice.seconds, model.labels.cpu().numpy())
+    told = lasts * quality + DURATION_WEIGHT * prior - SEGMENT_COST - absent
+    share = MACHINE_WEIGHT * lasts * weight
     proxy = whole - whole.mean(axis=1, keepdims=True)
     proxy /= np.maximum(proxy.std(axis=1, keepdims=True), 1e-9)
-    background = (options.background + options.rest * rest + unseen) * _unit(one, durations)
+    background = (options.min_quality + options.rest_weight * rest + unseen) * _unit(one, durations)
     return _Worth(told + share * proxy, told, share, background, absent)
 
 
 def segment_values(
-    model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], length: int, options: ExplanationOptions
+    model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[float, float], length: int, options: ActionOptions
 ) -> tuple[Array, Array, Array]:
     """``(W, classes)`` what windows are worth as segments of each class, ``(cells,)`` what background is worth, ``(W, 1)``
     what absence takes off."""
     worth = _worth(model, one, durations, wholes, options)
     if model.kernels is not None:
         total = through(one.lattice.windows, worth.values, worth.background)
-        survivors = np.flatnonzero(total >= total.max() - options.survive)
+        survivors = np.flatnonzero(total >= total.max() - MAX_VALUE_GAP)
         machine = machine_scores(model, lambda chosen: one.cut(chosen, length), survivors)
         worth.values[survivors] = worth.told[survivors] + worth.share[survivors] * machine
     return worth.values, worth.background, worth.absent
@@ -183,12 +223,11 @@ def _rest(model: ShapeModel, one: Stretch) -> Array:
 
 def _joined(model: ShapeModel, one: Stretch, segments: list[TiledSegment], durations: Durations, length: int) -> list[TiledSegment]:
     """Segments of one action that touch become one where it is a cycle, or where the performance has not ended there."""
-    options = model.options.recordings
     out: list[TiledSegment] = []
     for part in segments:
         before = out[-1] if out else None
         touch = before is not None and before.last == part.first and before.label == part.label
-        cycle = durations.cyclic[part.label] > options.joined
+        cycle = durations.cyclic[part.label] > MIN_CYCLIC
         if before is not None and touch and (cycle or _goes_on(model, one, before, part, length)):
             longer = part.window if part.last - part.first > before.last - before.first else before.window
             out[-1] = TiledSegment(before.first, part.last, part.label, before.value + part.value, longer)
@@ -208,7 +247,7 @@ def _goes_on(model: ShapeModel, one: Stretch, before: TiledSegment, after: Tiled
     exemplar = known[(seen[:, None] - known).square().mean(dim=(0, 2, 3)).argmin()]
     apart = ((seen[0, -1] + seen[1, 0]) / 2 - exemplar).square().mean(dim=1).sqrt()
     ends, within = (apart[0] + apart[-1]) / 2, apart[2:-2].min() if len(apart) > 4 else apart.max()
-    return bool(ends > model.options.recordings.seam * within)
+    return bool(ends > MIN_SEAM_RATIO * within)
 
 
 def _heights(windows: torch.Tensor) -> torch.Tensor:
