@@ -349,7 +349,7 @@ def _keypoints(source: ArchiveSource, reading: Mapping[str, Any]) -> Path:
     assert source.path is not None
     if source.poses is None or available() is None:
         return source.path  # whoever reads it says what is missing
-    how = reading.get("watching", WatchOptions())
+    how = reading.get("watching") or WatchOptions()
     made = keypoint_file(source.path, source.poses, how.people, model=how.model, every=how.every, fps=reading.get("fps"), own=True)
     return made.path
 

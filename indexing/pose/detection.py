@@ -27,8 +27,7 @@ from indexing.pose.models import ModelSet, load_models
 from indexing.pose.networks import LiteNetworks, NetworkMaker
 from indexing.pose.options import PoseOptions
 from indexing.pose.pieces import Piece, PieceLost, Stopped, Store, VideoPlan, plan, work
-from indexing.readers.files import LinkOptions
-from indexing.readers.recording import NobodySeen
+from indexing.readers.recording import MIN_CROWDED_SHARE, NobodySeen
 from indexing.skeleton import BLAZEPOSE33
 from indexing.video.reading import av, cv2
 
@@ -314,7 +313,7 @@ def made_by(models: ModelSet) -> NetworkMaker:
 # People as clips.
 
 
-def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0, linking: LinkOptions = LinkOptions()) -> Detected:
+def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0) -> Detected:
     """The people of a video as clips."""
     if not len(seen.at):
         raise NobodyInVideo(task.path, np.arange(len(seen.times)), seen.times, seen.notes)
@@ -323,7 +322,7 @@ def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0, linking: Li
     known = {"size": (task.info.width, task.info.height), "every": task.every, "content": task.content, "made_from": task.made_from}
     if task.people == 1:
         rows = largest(seen, people)
-        crowded = len(seen.crowd) > 0 and float((seen.crowd > 1).mean()) > linking.crowded
+        crowded = len(seen.crowd) > 0 and float((seen.crowd > 1).mean()) > MIN_CROWDED_SHARE
         others = {"people": int(seen.crowd.max())} if crowded else {}
         who = {"person": 0, "followed": "position", **others}
         clips = [_clip(task, seen, rows, np.arange(len(seen.times)), name, {**known, **who})]

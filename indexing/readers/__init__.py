@@ -8,7 +8,7 @@ from pathlib import Path
 from indexing.clip import Clip, ClipSet
 from indexing.opening import error, shown, uncollected
 from indexing.readers.detect import detect, registered_formats
-from indexing.readers.files import LinkOptions, Options, WatchOptions, open_source
+from indexing.readers.files import Options, WatchOptions, open_source
 from indexing.readers.video import read_video
 from indexing.registry import format_names
 
@@ -24,14 +24,13 @@ def read(
     min_confidence: float = 0.0,
     label: Hashable | None = None,
     size: tuple[float, float] | None = None,
-    linking: LinkOptions = LinkOptions(),
     layout: str | None = None,
-    watching: WatchOptions = WatchOptions(),
+    watching: WatchOptions | None = None,
 ) -> ClipSet:
     """Read a keypoint file or folder, or find the people in a video; a single recording is a set of one clip. size
     ``(width, height)``."""
     options = Options(
-        fps=fps, person=person, min_confidence=min_confidence, label=label, size=size, linking=linking, layout=layout,
+        fps=fps, person=person, min_confidence=min_confidence, label=label, size=size, layout=layout,
         watching=watching,
     )  # fmt: skip
     if format is not None and format not in FORMATS:
@@ -54,13 +53,12 @@ def read_clip(
     min_confidence: float = 0.0,
     label: Hashable | None = None,
     size: tuple[float, float] | None = None,
-    linking: LinkOptions = LinkOptions(),
     layout: str | None = None,
-    watching: WatchOptions = WatchOptions(),
+    watching: WatchOptions | None = None,
 ) -> Clip:
     """Read one recording; the arguments are those of :func:`read`."""
     clips = read(
-        path, format=format, fps=fps, person=person, min_confidence=min_confidence, label=label, size=size, linking=linking,
+        path, format=format, fps=fps, person=person, min_confidence=min_confidence, label=label, size=size,
         layout=layout, watching=watching,
     )  # fmt: skip
     if len(clips) != 1:

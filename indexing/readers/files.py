@@ -216,24 +216,6 @@ PEOPLE = ("largest", "confident", "tracked", "all", "everyone")
 
 
 @dataclass(frozen=True)
-class LinkOptions:
-    """Who is who where a file has no ids: people linked from frame to frame by position."""
-
-    point: float = 0.2
-    """Of the scene, that counts as the box of a person of whom there is only one point."""
-    reach: float = 0.5
-    """Box diagonals: a joint moves less from one detection of a person to the next, another person is farther away."""
-    waiting: int = 256
-    """Identities that are waited for at most, the latest seen: where nobody matches, the time for all detections is linear.  A
-    frame before 256 takes 0.1 ms (17 joints)."""
-    away: float = 2.0
-    """Seconds without a person, of which that person's own clip keeps no frames: an hour of 200 people who come and go would take
-    6 GB otherwise."""
-    crowded: float = 0.05
-    """Share of the frames with somebody that show several people, from where on a clip says how many."""
-
-
-@dataclass(frozen=True)
 class WatchOptions:
     """How people are found in a video, by :func:`indexing.pose.detect`."""
 
@@ -259,18 +241,15 @@ class Options:
     min_confidence: float = 0.0
     label: Hashable | None = None
     size: tuple[float, float] | None = None
-    linking: LinkOptions = LinkOptions()
     layout: str | None = None
-    watching: WatchOptions = WatchOptions()
+    watching: WatchOptions | None = None
 
     def __post_init__(self) -> None:
         if self.fps is not None:
             check_fps(self.fps)
         if self.person not in PEOPLE:
             raise ValueError(f"unknown person={self.person!r}; use one of {', '.join(PEOPLE)}")
-        if not isinstance(self.linking, LinkOptions):
-            raise ValueError(f"linking must be LinkOptions, got {self.linking!r}; use dataclasses.replace(LinkOptions(), ...)")
-        if not isinstance(self.watching, WatchOptions):
+        if not isinstance(self.watching, WatchOptions | None):
             raise ValueError(f"watching must be WatchOptions, got {self.watching!r}; use dataclasses.replace(WatchOptions(), ...)")
         if self.layout is not None:
             layout_named(self.layout)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,22 +32,13 @@ HEIGHT = {
 """Of joints of people who stand, in heights of the body; hands are anywhere."""
 
 
-@dataclass(frozen=True)
-class LayoutOptions:
-    """When a layout is recognized by what the body looks like."""
-
-    longest_bones: float = 0.65
-    """Mean length of bones over the mean distance of two joints; .26 to .45 with the right layout (shared recordings of BODY_25B
-    and of Kinect-20, actors of COCO-17 from three sides), .34 to 1.06 with a wrong one, .9 to 1 of random points."""
-    posture: float = 0.8
-    """Correlation of heights with those of people who stand; .98 to 1 with the right layout, up to .75 with a wrong one, of people
-    upside down."""
-    apart: float = 0.2
-    """Posture less bones, by which the best of several layouts that could be is ahead of the next."""
-    frames: int = 200
-    """Frames looked at, evenly over the recording: a millisecond each would be noticed in an hour's recording."""
-    joints: int = 8
-    """Joints seen in a frame, of those whose height says something, that its posture counts."""
+MAX_BONES = 0.65
+"""Mean length of bones over the mean distance of two joints; .26 to .45 with the right layout, .34 to 1.06 with a wrong one."""
+MIN_POSTURE = 0.8
+"""Correlation of heights with those of people who stand; .98 to 1 with the right layout, up to .75 with a wrong one."""
+MIN_LEAD = 0.2  # posture less bones, by which the best of several layouts that could be is ahead of the next
+MAX_FRAMES = 200  # looked at, evenly over the recording
+MIN_JOINTS = 8  # seen in a frame, of those whose height says something, that its posture counts
 
 
 class LayoutFit(NamedTuple):
@@ -64,29 +54,23 @@ class LayoutFit(NamedTuple):
         return self.posture - self.bones
 
 
-def fits(
-    joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()
-) -> list[LayoutFit]:
+def fits(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None) -> list[LayoutFit]:
     """Each layout's fit, best first. joints ``(frames, n, 2 | 3)``."""
-    some = np.asarray(joints[np.unique(np.linspace(0, len(joints) - 1, options.frames).round().astype(int))], dtype=np.float64)
+    some = np.asarray(joints[np.unique(np.linspace(0, len(joints) - 1, MAX_FRAMES).round().astype(int))], dtype=np.float64)
     some = np.where(np.abs(some) <= LARGEST, some, np.nan)
     ups = [axis for axis in UP_AXES if "xyz".index(axis[-1]) < joints.shape[2]] if up is None else [up]
     found = []
     for layout in layouts:
         bones = _bones(some, layout)
-        best = max(((_posture(some, layout, axis, options), axis) for axis in ups), default=(-1.0, "y"))
+        best = max(((_posture(some, layout, axis), axis) for axis in ups), default=(-1.0, "y"))
         found.append(LayoutFit(layout, bones, *best))
     return sorted(found, key=lambda fit: -fit.value)
 
 
-def recognized(
-    joints: FloatArray, layouts: Sequence[Skeleton], up: str | None, options: LayoutOptions = LayoutOptions()
-) -> LayoutFit | None:
+def recognized(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None) -> LayoutFit | None:
     """The layout that the joints are of, where that is clear."""
-    could = [
-        fit for fit in fits(joints, layouts, up, options) if fit.bones <= options.longest_bones and fit.posture >= options.posture
-    ]
-    return could[0] if len(could) == 1 or (could and could[0].value - could[1].value >= options.apart) else None
+    could = [fit for fit in fits(joints, layouts, up) if fit.bones <= MAX_BONES and fit.posture >= MIN_POSTURE]
+    return could[0] if len(could) == 1 or (could and could[0].value - could[1].value >= MIN_LEAD) else None
 
 
 def settled(
@@ -94,10 +78,9 @@ def settled(
     usual: Skeleton | None,
     layouts: Sequence[Skeleton],
     up: str | None,
-    options: LayoutOptions = LayoutOptions(),
 ) -> tuple[Skeleton | None, dict[str, str], str | None]:
     """The layout of joints whose number alone is known."""
-    found = recognized(joints, layouts, up, options) if len(joints) else None
+    found = recognized(joints, layouts, up) if len(joints) else None
     if found is not None:
         said = {} if found.layout is usual else {"layout": f"recognized: {found.layout.name}"}
         return found.layout, said, found.up
@@ -107,13 +90,13 @@ def settled(
     return usual, {"layout": f"guessed: {usual.name}, not {others}"}, None
 
 
-def upward(joints: FloatArray, names: Sequence[str], usual: str, options: LayoutOptions = LayoutOptions()) -> str:
+def upward(joints: FloatArray, names: Sequence[str], usual: str) -> str:
     """The direction that is up for a body whose joints have names; the usual one where the body does not show it."""
     words = [canonical(name) for name in names]
     plain = {word.replace("_", ""): word for word in HEIGHT}
     known = [plain.get(word, plain.get(re.sub("^(left|right)", "", word), f"joint {i}")) for i, word in enumerate(words)]
-    found = fits(joints, [Skeleton("", tuple(known))], None, options)[0]
-    return found.up if found.posture >= options.posture else usual
+    found = fits(joints, [Skeleton("", tuple(known))], None)[0]
+    return found.up if found.posture >= MIN_POSTURE else usual
 
 
 def told(path: Path, name: str, joints: int, own: Skeleton | None = None) -> Skeleton:
@@ -144,13 +127,13 @@ def _bones(joints: FloatArray, layout: Skeleton) -> float:
     return float(np.nanmedian(lengths, axis=0).mean() / np.nanmean(pairs))
 
 
-def _posture(joints: FloatArray, layout: Skeleton, up: str, options: LayoutOptions) -> float:
+def _posture(joints: FloatArray, layout: Skeleton, up: str) -> float:
     """Median over the frames of the correlation of heights; -1 where too little is seen."""
     names = [joint.removeprefix("left_").removeprefix("right_") for joint in layout.joints]
     usual = np.array([HEIGHT.get(name, np.nan) for name in names])
     high = (-1 if up.startswith("-") else 1) * joints[..., "xyz".index(up[-1])]
     seen = np.isfinite(usual) & np.isfinite(high)
-    kept = seen.sum(axis=1) >= options.joints
+    kept = seen.sum(axis=1) >= MIN_JOINTS
     if not kept.any():
         return -1.0
     seen, high = seen[kept], np.where(seen, high, 0.0)[kept]

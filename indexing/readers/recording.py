@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dyntorch.numerics import Message
 from indexing.clip import LARGEST, Clip, ClipSet, FloatArray
 from indexing.opening import error, shown
-from indexing.readers.files import LinkOptions, Options
+from indexing.readers.files import Options
 from indexing.readers.layouts import settled, told
 from indexing.skeleton import LAYOUTS, Skeleton
 
@@ -42,11 +42,18 @@ from indexing.skeleton import LAYOUTS, Skeleton
 
 
 IntArray = NDArray[np.int64]
+POINT_BOX_SHARE = 0.2  # of the scene, that counts as the box of a person of whom there is only one point
+MAX_STEP_DIAGONALS = 0.5
+"""Box diagonals: a joint moves less from one detection of a person to the next, another person is farther away."""
+MAX_WAITING = 256
+"""Identities that are waited for at most, the latest seen: where nobody matches, the time for all detections is linear."""
+MAX_ABSENCE_SECONDS = 2.0
+"""Without a person, of which that person's own clip keeps no frames: an hour of 200 people who come and go would take 6 GB."""
+MIN_CROWDED_SHARE = 0.05
+"""Of the frames with somebody that show several people, from where on a clip says how many."""
 
 
-def choose(
-    path: Path, recording: Recording, person: str, linking: LinkOptions = LinkOptions()
-) -> list[tuple[Hashable | None, IntArray]]:
+def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable | None, IntArray]]:
     """The detections that make each clip."""
     ids, names, repeated = _given(recording)
     if person == "all" and ids is None:
@@ -57,7 +64,7 @@ def choose(
     if person == "everyone" and alone:
         return [(None, np.arange(len(recording.at)))]
     if person in ("all", "everyone"):
-        ids = link(recording.at, recording.joints, linking) if ids is None else ids
+        ids = link(recording.at, recording.joints) if ids is None else ids
         return [(name, np.flatnonzero(ids == i)) for i, name in enumerate(names or range(int(ids.max()) + 1))]
     if person == "confident" and recording.confidence is None:
         what = Message("has no confidences, so {arg:person='confident'} cannot be applied")
@@ -68,7 +75,7 @@ def choose(
     weight = recording.confidence.mean(axis=1) if person == "confident" and recording.confidence is not None else area
     tracked = ids is not None
     if ids is None:
-        ids = link(recording.at, recording.joints, linking)
+        ids = link(recording.at, recording.joints)
     known = np.maximum(ids, 0)
     total = np.bincount(known, weight * (ids >= 0))
     if person == "tracked":
@@ -97,7 +104,7 @@ def _given(recording: Recording) -> tuple[IntArray | None, list[Hashable], int |
     return ids, list(index), None
 
 
-def link(at: IntArray, joints: FloatArray, options: LinkOptions = LinkOptions()) -> IntArray:
+def link(at: IntArray, joints: FloatArray) -> IntArray:
     """Identities by position: each detection continues the nearest identity, nearest pairs first. at ``(m,)``, joints
     ``(m, n, 2 | 3)`` -> ``(m,)``."""
     identity = np.full(len(at), -1, dtype=np.int64)
@@ -108,11 +115,11 @@ def link(at: IntArray, joints: FloatArray, options: LinkOptions = LinkOptions())
     if len(at) and not (diagonal > 0).any():
         if len(np.unique(at)) == len(at):
             return np.zeros(len(at), dtype=np.int64)
-        diagonal[:] = options.point * np.linalg.norm(_extents(joints.reshape(1, -1, joints.shape[2])))
+        diagonal[:] = POINT_BOX_SHARE * np.linalg.norm(_extents(joints.reshape(1, -1, joints.shape[2])))
     for rows in np.split(np.argsort(at, kind="stable"), np.flatnonzero(np.diff(np.sort(at))) + 1):
         before = last[waiting]
         cost = _distances(joints[before] + step[waiting, None], joints[rows], np.maximum.outer(diagonal[before], diagonal[rows]))
-        while cost.size and cost.min() <= options.reach:
+        while cost.size and cost.min() <= MAX_STEP_DIAGONALS:
             old, new = (int(i) for i in np.unravel_index(int(np.argmin(cost)), cost.shape))
             who, row = waiting[old], rows[new]
             step[who] = np.nanmean(joints[row] - joints[last[who]], axis=0)
@@ -122,7 +129,7 @@ def link(at: IntArray, joints: FloatArray, options: LinkOptions = LinkOptions())
         identity[fresh] = np.arange(count, count + len(fresh))
         last[identity[fresh]] = fresh
         count += len(fresh)
-        waiting = _latest(np.append(waiting, identity[fresh]), at, last, options.waiting)
+        waiting = _latest(np.append(waiting, identity[fresh]), at, last, MAX_WAITING)
     return identity
 
 
@@ -262,13 +269,13 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     ids = _given(recording)[0] if each else None
     own = {"followed": "position"} if ids is None else {"followed": "ids", "untracked": int((ids < 0).sum())}
     crowd = np.bincount(recording.at)
-    others = {"people": int(crowd.max())} if (crowd > 1).mean() > options.linking.crowded else {}
+    others = {"people": int(crowd.max())} if (crowd > 1).mean() > MIN_CROWDED_SHARE else {}
     known = dict(recording.meta)
     clips = []
-    for track, rows in choose(path, recording, options.person, options.linking):
+    for track, rows in choose(path, recording, options.person):
         # each person's clip spans what was seen of that person
         one = each and track is not None
-        frames = _around(times, recording.at[rows], options.linking.away) if one else np.arange(len(times))
+        frames = _around(times, recording.at[rows], MAX_ABSENCE_SECONDS) if one else np.arange(len(times))
         joints, confidence = _fill(recording, rows, frames)
         clips.append(
             Clip(

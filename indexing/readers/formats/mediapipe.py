@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -36,22 +35,14 @@ UNITS = {"ms": 1e-3, "msec": 1e-3, "us": 1e-6, "ns": 1e-9}
 PERSON = ("person", "person_id", "pose", "pose_id", "pose_index", "track", "track_id")
 LANDMARK = ("landmark", "landmark_id", "landmark_index", "landmark_idx", "landmark_name", "joint", "keypoint", "id", "name")
 ONE_NAME = "give a landmark the same name in every frame"
+CALM_SHARE = 0.3  # of the frames, those with the least movement, in which noise is looked at
+MAX_RAW_CORRELATION = -0.2
+"""Of one frame's step with the next in calm frames, below which nothing was smoothed: noise alone gives -.5; actors with noise of
+.5 to 1 % of their height -.22 to -.44; through MediaPipe's filter -.15 to .92, with any noise."""
+MIN_CALM_FRAMES = 30  # that show it: a second
 MOST = 1000  # MediaPipe's largest set, pose with face and hands, has 543 landmarks
 SUFFIX = re.compile(r"(.+?)[ _.\-:](" + "|".join(KINDS) + ")")
 PREFIX = re.compile("(" + "|".join(KINDS) + r")(?:[ _.\-:](.+)|(\d+))")
-
-
-@dataclass(frozen=True)
-class SmoothingOptions:
-    """What tells landmarks that were never smoothed."""
-
-    calm: float = 0.3
-    """Share of the frames, those with the least movement, in which noise is looked at."""
-    raw: float = -0.2
-    """Correlation of one frame's step with the next in calm frames, below which nothing was smoothed: noise alone gives -.5.
-    Actors with noise of .5 to 1 % of their height: -.22 to -.44; through MediaPipe's filter -.15 to .92, with any noise."""
-    frames: int = 30
-    """Frames that show it: a second."""
 
 
 class Columns(NamedTuple):
@@ -141,21 +132,21 @@ def read_table(source: Source, columns: Columns, axes: str, recorded: bool) -> T
     return Table(frames, at, times, table, people, names)
 
 
-def may_lag(clip: Clip, options: SmoothingOptions = SmoothingOptions()) -> bool:
+def may_lag(clip: Clip) -> bool:
     """Whether MediaPipe may have smoothed a body as it was recorded: unless its noise shows that it did not."""
     steps = np.diff(clip.joints, axis=0)
     joints = np.isfinite(steps).all(axis=(0, 2))
-    if len(steps) < options.frames or not joints.any():
+    if len(steps) < MIN_CALM_FRAMES or not joints.any():
         return True
     steps = steps[:, joints]
     speed = np.median(np.linalg.norm(steps, axis=2), axis=1)
     pair = np.maximum(speed[1:], speed[:-1])
-    calm = pair <= np.quantile(pair, options.calm)
+    calm = pair <= np.quantile(pair, CALM_SHARE)
     after, before = (part[calm] - part[calm].mean(axis=0) for part in (steps[1:], steps[:-1]))
     size = np.sqrt(np.square(after).sum(axis=(0, 2)) * np.square(before).sum(axis=(0, 2)))
     if not (size > 0).any():
         return True
-    return float(np.median((after * before).sum(axis=(0, 2))[size > 0] / size[size > 0])) >= options.raw
+    return float(np.median((after * before).sum(axis=(0, 2))[size > 0] / size[size > 0])) >= MAX_RAW_CORRELATION
 
 
 def _frames(source: Source, columns: Columns, keys: FloatArray) -> tuple[IntArray, IntArray, FloatArray | None]:

@@ -8,7 +8,6 @@ Cells are separated by tabs; empty ones, and a marker exactly at the origin, wer
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -23,17 +22,10 @@ HEAD = "PathFileType"
 UNITS = ("m", "cm", "mm", "px", "in", "meters", "metres", "millimeters", "inches", "pixels", "unknown")
 MISSING = ("", "nan", "na", "n/a", "none", "null")
 REMEDY = "export it again as TRC, with tabs between the cells"
-
-
-@dataclass(frozen=True)
-class ClockOptions:
-    """When a column of times is a steady rate, rounded."""
-
-    rounded: float = 0.05
-    """Of the step between frames, that no time of the recording is farther off: three digits at 60 to 100 frames per second are off
-    by up to .03 to .05."""
-    exact: float = 1e-6
-    """Of the step: times with all their digits are kept."""
+MAX_ROUNDING = 0.05
+"""Of the step between frames, by which times that were rounded are off a steady rate: three digits at 60 to 100 frames per second
+by .03 to .05."""
+MIN_ROUNDING = 1e-6  # of the step: times with all their digits are kept
 
 
 def read(source: Source, options: Options) -> ClipSet:
@@ -62,11 +54,11 @@ def read(source: Source, options: Options) -> ClipSet:
     return to_clips(path, of_markers(path, points, names, frames, times, about["units"], ""), options)
 
 
-def unrounded(times: FloatArray, frames: IntArray, rate: float, options: ClockOptions = ClockOptions()) -> FloatArray:
+def unrounded(times: FloatArray, frames: IntArray, rate: float) -> FloatArray:
     """Times that are those of frames at a steady rate but for the digits that were written, exactly so; others as they are."""
     even = times[0] + (frames - frames[0]) / rate
     apart = np.abs(times - even).max() * rate if np.isfinite(times).all() else np.inf
-    return even if options.exact < apart <= options.rounded else times
+    return even if MIN_ROUNDING < apart <= MAX_ROUNDING else times
 
 
 def _about(path: Path, lines: list[str]) -> dict[str, str]:

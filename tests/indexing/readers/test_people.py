@@ -8,15 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing.readers import read, read_clip
-from indexing.readers import recording as people
-from indexing.readers.files import LinkOptions
+from indexing.readers import read, read_clip, recording
 from indexing.readers.recording import link
-
-WAITING = LinkOptions().waiting
 
 Write = Callable[..., Path]
 FRAMES = 8
+WAITING = recording.MAX_WAITING
 
 
 def walk(x: float, size: float, step: float = 0.0, confidence: float = 0.8) -> np.ndarray:
@@ -154,13 +151,13 @@ def test_identities_do_not_depend_on_the_order_within_frames(seed: int) -> None:
 
 def test_strangers_in_every_frame_are_compared_with_the_latest_only(monkeypatch: pytest.MonkeyPatch) -> None:
     compared: list[int] = []
-    distances = people._distances
+    distances = recording._distances
 
     def counted(awaited: np.ndarray, found: np.ndarray, size: np.ndarray) -> np.ndarray:
         compared.append(len(awaited) * len(found))
         return distances(awaited, found, size)
 
-    monkeypatch.setattr(people, "_distances", counted)
+    monkeypatch.setattr(recording, "_distances", counted)
     box = np.array([[0.0, 0.0], [10.0, 20.0]])
     at = np.repeat(np.arange(4 * WAITING), 2)
     joints = box + 1000.0 * np.arange(len(at))[:, None, None]
@@ -185,11 +182,12 @@ def test_a_crowd_larger_than_what_is_waited_for_is_followed() -> None:
     assert (first == second).all() and (first == third[::-1]).all()
 
 
-def test_how_people_are_linked_is_an_option():
+def test_how_far_a_person_may_step(monkeypatch: pytest.MonkeyPatch) -> None:
     box = np.array([[0.0, 0.0], [10.0, 20.0]])
     at, joints = np.arange(3), np.stack([box, box + 5, box + 10])
     assert link(at, joints).tolist() == [0, 0, 0]
-    assert link(at, joints, LinkOptions(reach=0.1)).tolist() == [0, 1, 2]
+    monkeypatch.setattr(recording, "MAX_STEP_DIAGONALS", 0.1)
+    assert link(at, joints).tolist() == [0, 1, 2]
 
 
 def test_everyone_says_how_people_are_followed(openpose_folder: Write) -> None:
@@ -210,11 +208,12 @@ def test_everyone_of_one_person_is_the_whole_recording(openpose_folder: Write) -
     assert alone.name == largest.name and alone.meta == {"person": None, "followed": "position"}
 
 
-def test_a_person_s_clip_keeps_no_frames_of_long_absences(openpose_folder: Write) -> None:
+def test_a_person_s_clip_keeps_no_frames_of_long_absences(openpose_folder: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     frames = {i: [BIG[i % FRAMES]] + [SMALL[0]] * (i in (5, 7, 60)) for i in range(70)}
     folder = openpose_folder(frames, ids={i: [1, 2][: len(people)] for i, people in frames.items()})
     clips = read(folder, person="all", fps=10.0)
     assert [len(clip) for clip in clips] == [70, 4]
     assert clips[1].times.tolist() == [0.5, 0.6, 0.7, 6.0]
-    kept = read(folder, person="all", fps=10.0, linking=LinkOptions(away=10.0))
+    monkeypatch.setattr(recording, "MAX_ABSENCE_SECONDS", 10.0)
+    kept = read(folder, person="all", fps=10.0)
     assert len(kept[1]) == 56
