@@ -60,7 +60,7 @@ FORMATS = {
     "indexing/brightness/footage.py": {"LUMA"},
     "indexing/brightness/indexer.py": {"VERSION"},
     "indexing/calibrate/lenses.py": {"FOCAL_35"},
-    "indexing/cli/archive.py": {"PROBLEMS", "INTERRUPTED"},
+    "indexing/cli/commands/archive.py": {"PROBLEMS", "INTERRUPTED"},
     "indexing/cli/__init__.py": {"DONE", "BAD_INPUT", "REFUSED", "INTERRUPTED", "BROKEN_PIPE"},
     "indexing/cli/console.py": {"REFUSED"},
     "indexing/colmap/masks.py": {"BLACK", "WHITE"},
@@ -86,10 +86,10 @@ FORMATS = {
 SCENES = ("dyntorch/scenes/", "indexing/actors/", "indexing/cameras.py")
 """Places whose numbers say how large made-up scenes and people are: they are the truth, and decide nothing about it."""
 WORDING = {
-    "indexing/cli/archive.py": {"SHOWN"},
+    "indexing/cli/commands/archive.py": {"MAX_EVENTS_PRINTED"},
     "indexing/cli/console.py": {"PLAIN_WIDTH", "SHOWN"},
     "indexing/cli/protocol.py": {"LISTED"},
-    "indexing/cli/remarks.py": {"LISTED"},
+    "indexing/cli/notes.py": {"LISTED"},
     "indexing/joints.py": {"LISTED"},
     "indexing/opening.py": {"VALUE", "SAID", "LISTED"},
     "indexing/readers/matches.py": {"SHOWN"},
@@ -116,7 +116,7 @@ DRAWING = {
             "MARKS",
         ),
     },
-    "indexing/cli/bodies.py": {"UNTIMED"},
+    "indexing/cli/commands/segment_tracks.py": {"UNTIMED"},
     "indexing/report/bodies.py": {"ALIVE"},
     "indexing/report/bodies_picture.py": {
         *("PANELS", "WIDTH", "TALL", "EDGE", "GAP", "HEAD", "TICKS", "FOOT", "WIDE", "NARROW", "TAIL", "FRINGE", "DRAWN"),
@@ -306,9 +306,9 @@ def test_nobody_parses_what_the_library_says():
     assert wrong == []
     for file in (
         "indexing/sync/synchronize.py",
-        "indexing/cli/align.py",
-        "indexing/cli/segment.py",
-        "indexing/cli/sync.py",
+        "indexing/cli/commands/align.py",
+        "indexing/cli/commands/segment.py",
+        "indexing/cli/commands/sync.py",
         "indexing/report/sync.py",
     ):
         assert "\nimport re\n" not in (ROOT / file).read_text(encoding="utf-8"), file

@@ -1,10 +1,6 @@
 """The command line ``dyntorch demo | pose | index fit | index scan | archive add | ... | align | reconstruct | ...``.
 
-Each has a file of its own: a dataclass whose fields are its flags, with ``run() -> exit code``.  Only what parsing needs is
-imported here, so that ``--help`` answers at once; a command imports its tools when it runs.
-
-A new command is a new file, and a line in :data:`COMMANDS` (or :data:`INDEX` for a verb of
-``dyntorch index``, :data:`ARCHIVE` of ``dyntorch archive``).
+:mod:`indexing.cli.flags` says what may be typed, and is all that ``--help`` needs; :mod:`indexing.cli.commands` does the work.
 """
 
 from __future__ import annotations
@@ -15,56 +11,15 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Protocol, cast, get_args
+from typing import Any, get_args
 
 import tyro
 
-from indexing.cli.align import Align
-from indexing.cli.archive import Add, Find, Info, Remove, Search, Verify
-from indexing.cli.calibrate import Calibrate
 from indexing.cli.console import complain, reworded
-from indexing.cli.convert import Convert
-from indexing.cli.count import Count
-from indexing.cli.demo import Demo
-from indexing.cli.evaluate import Evaluate
-from indexing.cli.index import Fit, Scan
-from indexing.cli.pose import Pose
-from indexing.cli.reconstruct import Reconstruct
-from indexing.cli.segment import Segment
-from indexing.cli.suggest import Suggest
-from indexing.cli.sync import Sync
+from indexing.cli.flags import GROUPS, find_command, grammar
 
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
 
-Command = tyro.conf.subcommand
-INDEX: Any = (
-    Annotated[Fit, Command("fit")]
-    | Annotated[Scan, Command("scan")]
-    | Annotated[Evaluate, Command("evaluate")]
-    | Annotated[Suggest, Command("suggest")]
-)
-ARCHIVE: Any = (
-    Annotated[Add, Command("add")]
-    | Annotated[Search, Command("search")]
-    | Annotated[Find, Command("find")]
-    | Annotated[Info, Command("info")]
-    | Annotated[Verify, Command("verify")]
-    | Annotated[Remove, Command("remove")]
-)
-COMMANDS: Any = (
-    Annotated[Demo, Command("demo")]
-    | Annotated[INDEX, Command("index", description="Learn actions from one clip each and find them elsewhere.")]
-    | Annotated[ARCHIVE, Command("archive", description="Keep recordings as movement, and ask where else anybody did this.")]
-    | Annotated[Pose, Command("pose")]
-    | Annotated[Align, Command("align")]
-    | Annotated[Reconstruct, Command("reconstruct")]
-    | Annotated[Segment, Command("segment")]
-    | Annotated[Sync, Command("sync")]
-    | Annotated[Calibrate, Command("calibrate")]
-    | Annotated[Convert, Command("convert")]
-    | Annotated[Count, Command("count")]
-)
-GROUPS = ("index", "archive")  # words that need another one behind them
 DESCRIPTION = """Geometry of scenes in which everything moves: find people in videos (pose); learn actions from one clip each and
 find them in other clips, from other viewpoints (index); keep thousands of recordings and ask where else anybody did this
 (archive); put cameras that nobody synchronized on one clock (sync); find where they stand, and the movement in 3D, from the people
@@ -73,12 +28,6 @@ move, and what stood still (align); find cameras, points and velocities from tra
 matches of two images move together (segment); count how many matches such a problem takes (count).
 
 dyntorch COMMAND --help explains a command, dyntorch --version says the version."""
-
-
-class Runnable(Protocol):
-    """What parsing gives: a command with its flags."""
-
-    def run(self) -> int: ...
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -93,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(f"dyntorch {_version()}")
                 return DONE
             command = parse(words)
-            code = command if isinstance(command, int) else command.run()
+            code = command if isinstance(command, int) else find_command(command).run(command)
             sys.stdout.flush()
             return code
     except KeyboardInterrupt:
@@ -113,15 +62,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return BAD_INPUT
 
 
-def parse(words: list[str]) -> Runnable | int:
-    """The command that the words ask for, or the exit code where they ask for help or for what does not exist."""
+def parse(words: list[str]) -> Any:
+    """The flags of the command that the words ask for, or the exit code where they ask for help or for what does not exist."""
     if not words or (len(words) == 1 and words[0] in GROUPS):
         words = [*words, "--help"]
-    said = io.StringIO()
+    message = io.StringIO()
     try:
-        with contextlib.redirect_stderr(said):
-            parsed = tyro.cli(
-                COMMANDS,
+        with contextlib.redirect_stderr(message):
+            return tyro.cli(
+                grammar(),
                 prog="dyntorch",
                 description=DESCRIPTION,
                 args=words,
@@ -130,21 +79,20 @@ def parse(words: list[str]) -> Runnable | int:
     except SystemExit as stop:
         if stop.code in (None, 0):
             return DONE
-        complain(reworded(said.getvalue(), f"{_asked(words)} --help"))
+        complain(reworded(message.getvalue(), f"{_asked(words)} --help"))
         return BAD_INPUT
-    return cast("Runnable", parsed)
 
 
 def _asked(words: list[str]) -> str:
     """The command that the words begin with, as far as there is one: whose help says what is wrong with the others."""
-    found, level = ["dyntorch"], COMMANDS
+    asked, level = ["dyntorch"], grammar()
     for word in words:
-        known = {choice.__metadata__[0].name: choice.__origin__ for choice in get_args(level)}
-        if word not in known:
+        choices = {choice.__metadata__[0].name: choice.__origin__ for choice in get_args(level)}
+        if word not in choices:
             break
-        found.append(word)
-        level = known[word]
-    return " ".join(found)
+        asked.append(word)
+        level = choices[word]
+    return " ".join(asked)
 
 
 def _version() -> str:

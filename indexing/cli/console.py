@@ -54,7 +54,7 @@ def ended(page: object, refusal: str | None) -> int:
     return REFUSED
 
 
-def flags(*names: str, **own: str) -> Callable[[str, str | None], str]:
+def flag_words(*names: str, **own: str) -> Callable[[str, str | None], str]:
     """What the command line calls the arguments that a message of the library speaks of."""
 
     def words(name: str, value: str | None) -> str:

@@ -1,4 +1,4 @@
-"""What commands read: example clips as ``label=file``, recordings, known events, and the flags that say how to read them."""
+"""What commands read: example clips as ``label=file``, recordings and known events."""
 
 from __future__ import annotations
 
@@ -6,89 +6,60 @@ import math
 import re
 from collections import Counter
 from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Any
 
-import tyro
+import numpy as np
 
 from dyntorch.numerics import worded
 from indexing.cli.console import count, names
-from indexing.cli.films import Watched, Watching
-from indexing.cli.remarks import WORDS, few, on_examples, on_gaps, on_people, remarks
+from indexing.cli.flags.shared import Example, Reading, Watched
+from indexing.cli.notes import WORDS, few, on_examples, on_gaps, on_people, remarks
+from indexing.cli.protocol import choose
+from indexing.cli.videos import find_keypoints
+from indexing.clip import Clip, ClipSet, FloatArray
+from indexing.joints import layout_of, matched
 from indexing.opening import clipped, read_rows, shown
-from indexing.registry import format_names
+from indexing.readers import read
+from indexing.readers.recording import NobodySeen
+from indexing.recordings.people import of_recording, tracked_people
+from indexing.skeleton import Skeleton
+from indexing.windows import unusable
 
-if TYPE_CHECKING:
-    from indexing.clip import Clip, ClipSet, FloatArray
-    from indexing.skeleton import Skeleton
-
-if TYPE_CHECKING:
-    Format = str
-else:
-    Format = Literal[format_names("readers")]
-People = Literal["largest", "confident", "tracked", "all", "everyone"]
 TRIM = re.compile(r"(?P<path>.+)@(?P<start>\d+(\.\d*)?|\.\d+)?-(?P<end>\d+(\.\d*)?|\.\d+)?")
 CUT = 0.1  # seconds that an example may end before it was said to: nobody counts frames
 KnownEvent = tuple[Hashable, float, float]
 
 
-@dataclass(frozen=True)
-class Reading:
-    """How keypoint files are read."""
+def watch_videos(reading: Reading, paths: Iterable[Path], beside: Path | None) -> Reading:
+    """The same, with the keypoints of all videos among some inputs found, and kept beside the output."""
+    return replace(reading, watched=find_keypoints(reading.footage, paths, beside, reading.fps))
 
-    fps: Annotated[float | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
-    """frames per second, for files that do not say (30 is assumed then, and the output says so)"""
-    person: People = "largest"
-    """who is followed where a frame shows several people"""
-    min_confidence: Annotated[float, tyro.conf.arg(metavar="C")] = 0.0
-    """joints that the detector trusts less are taken as not seen"""
-    format: Annotated[Format | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """of the keypoint files; by default their content decides"""
-    size: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="W H", help_behavior_hint="")] = None
-    """width and height of the image in pixels, for files with coordinates from 0 to 1"""
-    layout: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
-    """which joint is which, such as BODY_25B; by default as the file says, or as the body looks"""
 
-    footage: Watching = field(default_factory=Watching)
-    watched: Annotated[Watched, tyro.conf.Suppress] = field(default_factory=lambda: Watched({}))
-
-    def watching(self, paths: Iterable[Path], beside: Path | None) -> Self:
-        """The same, with the keypoints of all videos among some inputs found, and kept beside the output."""
-        return replace(self, watched=self.footage.watch(paths, beside, self.fps))
-
-    def read(self, path: Path, label: str | None = None) -> ClipSet:
-        """All clips of a file or folder: here alone paths become clips."""
-        from indexing.readers import read
-
-        refuse_range(path)
-        found = self.watched.files.get(path, path)
-        if isinstance(found, ValueError):
-            raise found
-        if found != path:  # keypoints of a video go by the name of the video
-            return _renamed(replace(self, watched=Watched({}), size=None, fps=None).read(found, label), found, path)
-        try:
-            return read(
-                path, format=self.format, fps=self.fps, person=self.person, min_confidence=self.min_confidence, label=label,
-                size=self.size, layout=self.layout,
-            )  # fmt: skip
-        except ValueError as problem:
-            if type(problem) is not ValueError:
-                raise  # nobody is in view, which some commands say in their own way
-            raise ValueError(worded(problem, WORDS)) from None
+def read_clips(reading: Reading, path: Path, label: str | None = None) -> ClipSet:
+    """All clips of a file or folder: here alone paths become clips."""
+    refuse_range(path)
+    found = reading.watched.files.get(path, path)
+    if isinstance(found, ValueError):
+        raise found
+    if found != path:  # keypoints of a video go by the name of the video
+        own = replace(reading, watched=Watched({}), size=None, fps=None)
+        return _renamed(read_clips(own, found, label), found, path)
+    try:
+        return read(
+            path, format=reading.format, fps=reading.fps, person=reading.person, min_confidence=reading.min_confidence, label=label,
+            size=reading.size, layout=reading.layout,
+        )  # fmt: skip
+    except ValueError as problem:
+        if type(problem) is not ValueError:
+            raise  # nobody is in view, which some commands say in their own way
+        raise ValueError(worded(problem, WORDS)) from None
 
 
 def _renamed(clips: ClipSet, old: Path, new: Path) -> ClipSet:
     return type(clips)([clip.replace(name=new.name + clip.name.removeprefix(old.name)) for clip in clips], new.name)
-
-
-@dataclass(frozen=True)
-class Following(Reading):
-    """How recordings are read that may show several people."""
-
-    person: People = "everyone"
-    """who is scanned where several people are in view: everyone by itself, or the one who is followed"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,16 +70,6 @@ class Lane:
     person: str
     clip: Clip | None
     times: FloatArray
-
-
-@dataclass(frozen=True)
-class Example:
-    """One word of ``dyntorch index fit``: a file, its label unless it is a labelled clip set, and the seconds that count."""
-
-    path: Path
-    label: str | None = None
-    start: float | None = None
-    end: float | None = None
 
 
 def parse_example(text: str) -> Example:
@@ -148,14 +109,11 @@ def refuse_range(path: Path) -> None:
 
 def read_examples(examples: Sequence[Example], reading: Reading, select: Sequence[str]) -> tuple[list[Clip], list[str]]:
     """Labelled clips, and what a person should know about them."""
-    from indexing.cli.protocol import choose
-    from indexing.joints import layout_of
-
     clips: list[Clip] = []
     notes: list[str] = []
     guessed: list[Clip] = []
     for example in examples:
-        found = reading.read(example.path, example.label)
+        found = read_clips(reading, example.path, example.label)
         is_set = example.label is None
         if is_set and all(clip.label is None for clip in found):
             raise ValueError(
@@ -187,16 +145,12 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
 
 def of_layout(clips: Sequence[Clip], known: Skeleton | None, path: Path) -> tuple[list[Clip], list[str]]:
     """Clips with their joints in the order of those known, and a note where not all are used or nobody knows which is which."""
-    from indexing.joints import matched
-
     found = [matched(clip, known, str(path)) for clip in clips]
     return [clip for clip, _ in found], list(dict.fromkeys(note for _, note in found if note))
 
 
 def _cut(clips: ClipSet, example: Example) -> tuple[ClipSet, list[str]]:
     """The seconds that count, and a note where the recording does not have all of them."""
-    from indexing.clip import ClipSet
-
     start, end = example.start if example.start is not None else -math.inf, example.end if example.end is not None else math.inf
     found = ClipSet((clip.between(start, end) for clip in clips), clips.name)
     alone = [clip for clip in found if len(clip) == 1]
@@ -244,7 +198,6 @@ def _ranged(example: Example) -> str:
 
 
 def _checked(clips: Sequence[Clip], path: Path) -> list[Clip]:
-    from indexing.windows import unusable
 
     for clip in clips:
         reason = unusable(clip)
@@ -259,10 +212,6 @@ def _checked(clips: Sequence[Clip], path: Path) -> list[Clip]:
 
 def usable(clips: ClipSet, path: Path) -> tuple[ClipSet, list[str]]:
     """The clips with a label that can be compared, and a note on those left out."""
-    import numpy as np
-
-    from indexing.windows import unusable
-
     reasons = [unusable(clip) or ("its action is not known" if clip.label is None else None) for clip in clips]
     bad = [i for i, reason in enumerate(reasons) if reason]
     if not bad:
@@ -321,14 +270,9 @@ def _apart(paths: Sequence[Path], found: Sequence[Sequence[Lane]]) -> list[Lane]
 
 def lanes_of(path: Path, reading: Reading) -> tuple[list[Lane], list[str]]:
     """What one file holds, person by person, or recording by recording."""
-    import numpy as np
-
-    from indexing.readers.recording import NobodySeen
-    from indexing.recordings.people import of_recording, tracked_people
-
     name = path.name or path.resolve().name
     try:
-        clips = list(reading.read(path))
+        clips = list(read_clips(reading, path))
     except NobodySeen as nobody:
         rate = 30.0 if reading.fps is None else reading.fps
         times = nobody.frames / rate if nobody.times is None else nobody.times

@@ -5,70 +5,44 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import tyro
+from typing import Any
 
 from indexing.cli.console import check_file, count, names
+from indexing.cli.flags.shared import Example, Labelling, Reading
+from indexing.cli.inputs import KnownEvent, Lane, assumed, lanes_of, of_layout
+from indexing.cli.notes import on_examples, remarks
+from indexing.clip import Clip
+from indexing.files import prepare
+from indexing.joints import layout_of
+from indexing.labels import Label, LabelFile, choose_labels, open_labels, within, write_labels
+from indexing.labels.format import Request
+from indexing.labels.media import of_recording, same_recording
 from indexing.opening import error, listed
-
-if TYPE_CHECKING:
-    from indexing.cli.inputs import Example, KnownEvent, Lane, Reading
-    from indexing.clip import Clip
-    from indexing.labels import Label, LabelFile
-    from indexing.report import RecordingResult
+from indexing.report import RecordingResult
+from indexing.report.results import by_recording
+from indexing.windows import unusable
 
 UNCONFIRMED = "?"
 """What a label begins with that was suggested, and that nobody has corrected."""
-Named = Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")]
 
 
-@dataclass(frozen=True)
-class Labelling:
-    """What a person has marked in the recordings, and which of it counts."""
-
-    labels: Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")] = ()
-    """what a person marked in the recordings: a file of BORIS, ELAN, Label Studio, VIA or ActivityNet, or a table with the columns
-    label,start,end (repeat the option for further files)"""
-    observation: Named = None
-    """of the labels, only this observation (BORIS)"""
-    tier: Named = None
-    """of the labels, only this tier (ELAN) or row"""
-    subject: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
-    """of the labels, only those of this subject; NAME=PERSON says which person of the recording it is, e.g. Ann=2"""
-    media: Named = None
-    """what the recording is called in the file of labels, where it has another name there"""
-
-    def open(self, path: Path, recording: str | None, fps: float | None, **others: Any) -> LabelFile:
-        """A file of labels, of which only those count that were asked for."""
-        from indexing.labels import open_labels
-
-        return open_labels(
-            path.expanduser(),
-            recording=recording,
-            media=self.media,
-            observation=self.observation,
-            tier=self.tier,
-            fps=fps,
-            **others,
-        )
-
-    @property
-    def people(self) -> dict[str, str]:
-        """Subject -> which person of the recording it is; empty text where that was not said."""
-        said = [text.partition("=") for text in self.subject]
-        return {subject.strip(): person.strip() for subject, _, person in said}
+MIN_EXAMPLE_FRAMES = 4
+"""Of fewer, nothing is left of a movement once it is resampled to 12 steps."""
+MIN_BACKGROUND_SECONDS = 1.0
+"""Between labels: people mark begins and ends some tenths of a second off, and what touches an action looks like it."""
 
 
-@dataclass(frozen=True)
-class CuttingOptions:
-    """What of the labels can be learned from."""
-
-    frames: int = 4
-    """Frames that an example has, at least: of fewer, nothing is left of a movement once it is resampled to 12 steps."""
-    between: float = 1.0
-    """Seconds between labels, from which on they are learned as background, where that was asked for: people mark begins and ends
-    some tenths of a second off, and what touches an action looks like it."""
+def open_marked(labelling: Labelling, path: Path, recording: str | None, fps: float | None, **others: Any) -> LabelFile:
+    """A file of labels, of which only those count that were asked for."""
+    return open_labels(
+        path.expanduser(),
+        recording=recording,
+        media=labelling.media,
+        observation=labelling.observation,
+        tier=labelling.tier,
+        fps=fps,
+        **others,
+    )
 
 
 def _why_nothing(notes: Sequence[str]) -> str:
@@ -109,9 +83,7 @@ def _rate(lanes: Sequence[Any], reading: Reading) -> float | None:
 
 def _chosen(labelling: Labelling, path: Path, recording: str, fps: float | None) -> tuple[list[Label], list[str]]:
     """What a file says of a recording, less moments and subjects that were not asked for."""
-    from indexing.labels import choose_labels
-
-    file = choose_labels(labelling.open(path, recording, fps))
+    file = choose_labels(open_marked(labelling, path, recording, fps))
     labels, notes = list(file.labels), [f"{path}: {note}" for note in file.notices]
     if labels and all({one.observation, one.tier} & set(file.machine) for one in labels):
         notes.append(f"{path}: a program found what is marked there; it counts as you left it")
@@ -142,7 +114,7 @@ def _of_recordings(labelling: Labelling, recordings: Sequence[str], reading: Rea
         raise ValueError(f"--media {labelling.media}: {len(recordings)} recordings are given; give one, or leave it out")
     out: dict[str, list[Path]] = {name: [] for name in recordings}
     for path in labelling.labels:
-        media = labelling.open(path, None, reading.fps).media or (path.name,)
+        media = open_marked(labelling, path, None, reading.fps).media or (path.name,)
         mine = list(dict.fromkeys(name for medium in media for name in of_medium(medium, recordings)))
         if not mine:
             raise error(
@@ -161,16 +133,12 @@ def _of_recordings(labelling: Labelling, recordings: Sequence[str], reading: Rea
 
 def of_medium(medium: str, recordings: Sequence[str]) -> list[str]:
     """The recordings that one file is which labels are of: those called like it, else those in whose name its name is a word."""
-    from indexing.labels.media import same_recording
-
     return [name for name in recordings if same_recording(medium, name)] or [
         name for name in recordings if _is_word_of(medium, name)
     ]
 
 
 def _is_word_of(medium: str, recording: str) -> bool:
-    from indexing.labels.format import Request
-    from indexing.labels.media import of_recording
 
     try:
         return bool(of_recording([medium], Request(Path(medium), recording=recording)))
@@ -254,13 +222,12 @@ def labelled_examples(
     reading: Reading,
     throughout: bool,
     others: Sequence[Clip] = (),
-    options: CuttingOptions = CuttingOptions(),
 ) -> Examples:
     """What is marked in recordings, cut out."""
     lanes, notes = _lanes_of(paths, reading, others)
     several = any(lane.clip is not None and lane.clip.meta.get("people") for lane in lanes)
     if several and any(
-        one.subject for path in labelling.labels for one in labelling.open(path, None, _rate(lanes, reading)).labels
+        one.subject for path in labelling.labels for one in open_marked(labelling, path, None, _rate(lanes, reading)).labels
     ):
         lanes, notes = _lanes_of(paths, replace(reading, person="everyone"), others)  # the labels say whose they are
     marked, said = read_marked(labelling, lanes, reading)
@@ -270,18 +237,17 @@ def labelled_examples(
         number += len(labels or ())
         if labels is None or lane.clip is None:
             continue
-        clips, said, why = _cut_out(lane.clip, lane, labels, options)
+        clips, said, why = _cut_out(lane.clip, lane, labels)
         out.clips += clips
         out.notes += said
         reasons += why
         if throughout:
-            out.background += _between(lane.clip, _everything(labelling, lane, reading), options)
+            out.background += _between(lane.clip, _everything(labelling, lane, reading))
     if not out.clips:
         where = names([str(path) for path in labelling.labels])
         first = f"; the first: {reasons[0]}" if reasons else ""
         what = f"none of its {count(number, 'label')} can be learned from{first}" if number else _why_nothing(out.notes)
         raise error(where, what, f"mark actions that {names([path.name for path in paths])} shows, each from its begin to its end")
-    from indexing.cli.remarks import on_examples
 
     out.notes += on_examples(out.clips)
     if throughout:
@@ -292,10 +258,6 @@ def labelled_examples(
 
 def _lanes_of(paths: Sequence[Path], reading: Reading, others: Sequence[Clip]) -> tuple[list[Lane], list[str]]:
     """The recordings, with their joints as in other clips, and what to know of them."""
-    from indexing.cli.inputs import assumed, lanes_of, of_layout
-    from indexing.cli.remarks import remarks
-    from indexing.joints import layout_of
-
     found: list[Lane] = []
     notes: list[str] = []
     seen = list(others)
@@ -315,11 +277,8 @@ def _lanes_of(paths: Sequence[Path], reading: Reading, others: Sequence[Clip]) -
     return found, notes + assumed(clips) + remarks(clips, reading)
 
 
-def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label], options: CuttingOptions) -> tuple[list[Clip], list[str], list[str]]:
+def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label]) -> tuple[list[Clip], list[str], list[str]]:
     """The clips of some labels, what to know of them, and why others cannot be learned from."""
-    from indexing.labels import within
-    from indexing.windows import unusable
-
     name = f"{lane.name}, person {lane.person}" if lane.person else lane.name
     inside, notes = within(labels, float(clip.times[0]), float(clip.times[-1]), name)
     reasons = list(notes) if len(inside) < len(labels) else []
@@ -329,8 +288,8 @@ def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label], options: CuttingOp
     for one in inside:
         shown = (clip.times >= one.start) & (clip.times <= one.end)
         part = clip.between(one.start, one.end) if shown.any() else None
-        why = "it lasts no frame" if part is None else unusable(part, options.frames)
-        if part is None or why is not None or len(part) < options.frames:
+        why = "it lasts no frame" if part is None else unusable(part, MIN_EXAMPLE_FRAMES)
+        if part is None or why is not None or len(part) < MIN_EXAMPLE_FRAMES:
             short.append(f"{one.label} at {one.start:.6g} to {one.end:.6g} s: {why or f'{len(part or ())} frames'}")
             continue
         span = (float(part.times[0]), float(part.times[-1]))
@@ -352,20 +311,20 @@ def _everything(labelling: Labelling, lane: Lane, reading: Reading) -> list[Labe
     """All that is marked in a recording, of whatever tier and subject, and suggestions, too: none of it is background."""
     found: list[Label] = []
     for path in labelling.labels:
-        file = replace(labelling, tier=None).open(path, None, _rate([lane], reading))
+        file = open_marked(replace(labelling, tier=None), path, None, _rate([lane], reading))
         if not file.media or labelling.media is not None or any(of_medium(medium, [lane.name]) for medium in file.media):
-            found += replace(labelling, tier=None).open(path, lane.name, _rate([lane], reading)).labels
+            found += open_marked(replace(labelling, tier=None), path, lane.name, _rate([lane], reading)).labels
     return found
 
 
-def _between(clip: Clip, labels: Sequence[Label], options: CuttingOptions) -> list[Clip]:
+def _between(clip: Clip, labels: Sequence[Label]) -> list[Clip]:
     """What of a recording no label is near."""
     edge = float(clip.times[0])
     out = []
     for start, end in [*sorted((one.start, one.end) for one in labels), (float(clip.times[-1]),) * 2]:
-        if start - edge >= options.between:
+        if start - edge >= MIN_BACKGROUND_SECONDS:
             inside = (clip.times > edge) & (clip.times < start)
-            if inside.sum() >= options.frames:
+            if inside.sum() >= MIN_EXAMPLE_FRAMES:
                 out.append(clip.between(float(clip.times[inside][0]), float(clip.times[inside][-1])))
         edge = max(edge, end)
     return out
@@ -373,8 +332,6 @@ def _between(clip: Clip, labels: Sequence[Label], options: CuttingOptions) -> li
 
 def film_examples(examples: Sequence[Example], labelling: Labelling, reading: Reading) -> tuple[list[Example], list[str]]:
     """Videos with what is marked in them, as examples with their labels and seconds."""
-    from indexing.cli.inputs import Example
-
     given = [example for example in examples if example.label is not None]
     unnamed = [Example(example.path) for example in examples if example.label is None]
     lanes = [_Unread(example.path.name) for example in unnamed]
@@ -423,7 +380,6 @@ def check_write(
     path = check_file(path, inputs)
     if not path.exists():
         return path
-    from indexing.labels import Label, open_labels, write_labels
 
     if kind not in BESIDE:  # no row of it says whether somebody made or corrected it
         raise error(path, "is there already", "give another name, or a format that keeps what is there (.eaf, .boris)")
@@ -437,8 +393,6 @@ def check_write(
 
 def found_labels(results: Sequence[RecordingResult], recordings: Sequence[Path]) -> list[Label]:
     """What was reported, as labels: the subject is the person, the score is kept."""
-    from indexing.labels import Label
-
     alone = len(recordings) == 1
     return [
         Label(
@@ -456,8 +410,6 @@ def found_labels(results: Sequence[RecordingResult], recordings: Sequence[Path])
 
 def write_found(path: Path, results: Sequence[RecordingResult], recordings: Sequence[Path], labelling: Labelling) -> list[str]:
     """Write what was reported into a file of labels, beside what is there; what the format does not keep."""
-    from indexing.report.results import by_recording
-
     end = max(float(one.times[-1]) for one in results) if len(by_recording(results)) == 1 else None
     return write_to(path, found_labels(results, recordings), recordings, end, labelling)
 
@@ -471,9 +423,6 @@ def write_to(
     tier: str = "dyntorch",
 ) -> list[str]:
     """Write labels into a tier (or observation) of their own; what the format does not keep."""
-    from indexing.files import prepare
-    from indexing.labels import write_labels
-
     prepare(path.parent)
     alone = recordings[0].expanduser() if len(recordings) == 1 else None
     return write_labels(path, labels, recording=alone, duration=duration, tier=tier, media=labelling.media)

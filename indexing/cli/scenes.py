@@ -1,18 +1,29 @@
-"""Videos and pictures as inputs of align, reconstruct and segment: points followed through the frames asked for."""
+"""Videos and pictures as inputs of align, reconstruct and segment, and the cameras that ``--calibration`` gives."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from indexing.readers.matches import Matched
-    from indexing.readers.pairs import MatchedPair, Photograph
-    from indexing.readers.tracks import TrackSet
-    from indexing.video.scene import SceneTracks
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyntorch.geometry import undistort
+from indexing.readers.files import VIDEOS
+from indexing.readers.matches import Matched
+from indexing.readers.pairs import MatchedPair, Photograph
+from indexing.readers.tracks import TrackSet
+from indexing.report.page import table_csv
+from indexing.sync.calibration import read_calibration
+from indexing.video.options import SceneOptions
+from indexing.video.scene import SceneTracks, track_scene
+from indexing.video.sequence import PictureSequence, in_order, is_pattern, pictures_of
+from indexing.video.whole import track_whole
 
 PICTURE_FILES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LEFT_OUT = "it is for a video or a sequence of pictures"
@@ -34,8 +45,6 @@ def is_scene(paths: Sequence[Path]) -> bool:
 
 def is_video(path: Path) -> bool:
     """Whether a file's name says that it is a video."""
-    from indexing.readers.files import VIDEOS
-
     return path.suffix.lower() in VIDEOS
 
 
@@ -103,9 +112,6 @@ def follow(
     fps: float | None = None,
 ) -> SceneTracks:
     """Points of a video or of pictures, in the frames asked for."""
-    from indexing.video.options import SceneOptions
-    from indexing.video.scene import track_scene
-
     numbers, moments = asked.numbers(), asked.moments()
     for flag, given in (("frames", numbers), ("at", moments)):
         least, exactly = views or 2, views is not None and not more
@@ -121,8 +127,6 @@ def follow(
 
 def follow_whole(paths: Sequence[Path], asked: Asked) -> SceneTracks:
     """Points of a whole video or of all pictures, from where they appear to where they are lost."""
-    from indexing.video.whole import track_whole
-
     span = asked.span()
     numbers, moments = _spanned(*span) if span else asked.numbers(), asked.moments()
     for flag, given in (("frames", numbers), ("at", moments)):
@@ -135,23 +139,17 @@ def follow_whole(paths: Sequence[Path], asked: Asked) -> SceneTracks:
 
 def _spanned(first: int, last: int) -> list[int]:
     """Frames from the first to the last, of many every so many, as of a whole video."""
-    from indexing.video.options import SceneOptions
-
     return list(range(first, last + 1, -(-(last + 1 - first) // SceneOptions().most)))
 
 
 def source_of(paths: Sequence[Path]) -> Any:
     """A video, a folder or a pattern; or pictures in the order of their numbers."""
-    from indexing.video.sequence import in_order
-
     files = [path.expanduser() for path in paths]
     return files[0] if len(files) == 1 else in_order(files)
 
 
 def _check_moments(paths: Sequence[Path], source: Any, asked: Asked) -> None:
     """Raise where moments of pictures are asked for."""
-    from indexing.video.sequence import PictureSequence
-
     if asked.at is not None and _kind(paths[0].expanduser()) != "video":
         frames = len(PictureSequence(source))
         raise ValueError(f"--at {asked.at}: pictures have no times; give their numbers, --frames with some of 0 to {frames - 1}")
@@ -159,8 +157,6 @@ def _check_moments(paths: Sequence[Path], source: Any, asked: Asked) -> None:
 
 def inputs_of(paths: Sequence[Path]) -> list[Path]:
     """The files that are read, for the manifest."""
-    from indexing.video.sequence import is_pattern, pictures_of
-
     found = []
     for path in (path.expanduser() for path in paths):
         found += pictures_of(path) if path.is_dir() or is_pattern(path) else [path]
@@ -169,10 +165,6 @@ def inputs_of(paths: Sequence[Path]) -> list[Path]:
 
 def photographs(tracks: SceneTracks) -> list[Photograph]:
     """The frames taken, to draw on, or those of them that were kept."""
-    import numpy as np
-
-    from indexing.readers.pairs import Photograph
-
     size = (float(tracks.size[0]), float(tracks.size[1]))
     kept = tracks.frames if tracks.pictured is None else [tracks.frames[i] for i in tracks.pictured]
     gray = [np.divide(image, 255, dtype=np.float32) for image in tracks.pictures]
@@ -186,16 +178,12 @@ def named(tracks: SceneTracks) -> tuple[str, ...]:
 
 def as_matches(tracks: SceneTracks) -> Matched:
     """As files of points for each view would give them."""
-    from indexing.readers.matches import Matched
-
     views = tuple(view.numpy() for view in tracks.points)
     return Matched(views, named(tracks), tuple(f"frame {k}" for k in tracks.frames), notes=tracks.notes)
 
 
 def as_pair(tracks: SceneTracks, path: Path) -> MatchedPair:
     """As a file of matches would give them."""
-    from indexing.readers.pairs import MatchedPair
-
     x1, x2 = (view.numpy() for view in tracks.points)
     size = (float(tracks.size[0]), float(tracks.size[1]))
     return MatchedPair(str(path), path.name, x1, x2, named(tracks), size=size)
@@ -203,20 +191,59 @@ def as_pair(tracks: SceneTracks, path: Path) -> MatchedPair:
 
 def as_tracks(tracks: SceneTracks, path: Path, timed: bool) -> TrackSet:
     """As a table of tracks would give them."""
-    from indexing.readers.tracks import TrackSet
-
     times = tracks.times.numpy() if timed else None
     return TrackSet(str(path), tracks.points.numpy(), named(tracks), tuple(map(str, tracks.frames)), times, notes=tracks.notes)
 
 
 def tracks_csv(tracks: SceneTracks) -> str:
     """``frame, time, id, x, y`` of every point in every frame that shows it: what ``dyntorch reconstruct`` reads, too."""
-    import numpy as np
-
-    from indexing.report.page import table_csv
-
     rows: list[list[object]] = []
     for k, moment, view in zip(tracks.frames, tracks.times.tolist(), tracks.points.numpy(), strict=True):
         for i in np.flatnonzero(np.isfinite(view[:, 0])).tolist():
             rows.append([k, f"{moment:.6g}", i + 1, f"{view[i, 0]:.4f}", f"{view[i, 1]:.4f}"])
     return table_csv(["frame", "time", "id", "x", "y"], rows)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# ``--calibration FX,FY,CX,CY|FILE.toml``.
+
+
+def calibration_files(given: str | None) -> list[Path]:
+    """The file that ``--calibration`` names, if it does."""
+    return [] if given is None or _inner(given) is not None else [Path(given)]
+
+
+def _inner(given: str) -> list[float] | None:
+    """The four numbers of ``FX,FY,CX,CY``, or None for anything else."""
+    try:
+        found = [float(word) for word in given.split(",")]
+    except ValueError:
+        return None
+    if len(found) != 4 or not all(math.isfinite(x) for x in found) or min(found[:2]) <= 0:
+        raise ValueError(f"--calibration {given!r}: expected fx,fy,cx,cy in pixels, focal lengths positive, or a TOML file")
+    return found
+
+
+def calibrated(given: str | None, tracks: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Tracks ``(views, n, 2)`` without lens distortion, and K of all views or of each; None without a calibration."""
+    if given is None:
+        return tracks, None
+    if tracks.shape[-1] != 2:
+        raise ValueError(f"--calibration is of cameras, and the tracks are of sensors that measure {tracks.shape[-1]} coordinates")
+    numbers = _inner(given)
+    if numbers is not None:
+        fx, fy, cx, cy = numbers
+        return tracks, torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+    lenses = read_calibration(given)
+    if len(lenses) not in (1, len(tracks)):
+        raise ValueError(f"--calibration {given}: {len(lenses)} cameras for {len(tracks)} views; give one for all, or one for each")
+    if any(lens.fisheye for lens in lenses):
+        raise ValueError(f"--calibration {given}: a fisheye lens is not modelled; undistort the points first")
+    every = lenses * (len(tracks) // len(lenses))
+    K = torch.stack([lens.matrix for lens in every]).double()
+    straight = [
+        undistort(x, k, lens.distortions.double()) if len(lens.distortions) else x
+        for x, k, lens in zip(tracks.double(), K, every, strict=True)
+    ]
+    return torch.stack(straight), K

@@ -20,8 +20,8 @@ import pytest
 from indexing import Archive
 from indexing.actors import Person, dataset, detect, stream
 from indexing.archive import adding
-from indexing.cli import archive as verbs
 from indexing.cli import main
+from indexing.cli.commands import archive as verbs
 from indexing.clip import Clip, ClipSet
 
 ACTIONS = ("squat", "kick", "wave")
@@ -157,7 +157,7 @@ def test_few_sources_need_no_processes(data: Path, monkeypatch: pytest.MonkeyPat
 
     found = gather(data / "week")
     assert verbs._soon(found) and not verbs._soon(found * 500)
-    monkeypatch.setattr(verbs, "WORK", verbs.WorkforceOptions(size=1000))
+    monkeypatch.setattr(verbs, "MAX_BYTES_ALONE", 1000)
     assert not verbs._soon(found)
     with verbs.workforce(1, None, 5) as executor:
         assert executor is None
@@ -259,7 +259,7 @@ def test_find_prints_events_and_writes_the_report(run, data: Path, tmp_path: Pat
 
 @pytest.mark.slow
 def test_many_events_are_counted(run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verbs, "SHOWN", 2)
+    monkeypatch.setattr(verbs, "MAX_EVENTS_PRINTED", 2)
     code, out, _ = run("find", "lab.archive", "-m", "moves.safetensors")
     assert code == 0 and "times" in out and "margin" not in out and "events.csv of a report" in out
     code, out, _ = run("find", "lab.archive", "-m", "moves.safetensors", "--reject", "1000")
@@ -318,7 +318,7 @@ def test_without_dask_the_extra_is_named(refuse, monkeypatch: pytest.MonkeyPatch
 
 def test_a_cluster_that_is_not_there_is_one_line(refuse, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("dask.distributed")
-    monkeypatch.setattr(verbs, "WORK", verbs.WorkforceOptions(patience=1))
+    monkeypatch.setattr(verbs, "CLUSTER_TIMEOUT", 1)
     refuse("search", "lab.archive", "kick.json", "--dask", "tcp://127.0.0.1:9", says=("tcp://127.0.0.1:9", "scheduler that runs"))
     refuse("search", "lab.archive", "kick.json", "--dask", "foo://x", says=("foo", "scheduler that runs"))
 

@@ -16,8 +16,9 @@ import pytest
 from indexing.action.indexer import ActionIndexer
 from indexing.actors import Person, dataset, detect, perform, stream
 from indexing.cli import main
-from indexing.cli.index import exemplars, within_label
-from indexing.cli.inputs import Example, Format, People, parse_example, read_truth
+from indexing.cli.commands.scan import exemplars, within_label
+from indexing.cli.flags.shared import Example, Format, People
+from indexing.cli.inputs import parse_example, read_truth
 from indexing.cli.protocol import Cameras, choose, draw_shots, splits
 from indexing.clip import Clip, ClipSet
 from indexing.readers import FORMATS

@@ -14,8 +14,8 @@ import pytest
 from indexing import ActionIndexer, Clip, ClipSet
 from indexing.actors import Person, detect, stream
 from indexing.cli import main
-from indexing.cli.inputs import Example, Reading
-from indexing.cli.labels import Labelling, check_write, film_examples
+from indexing.cli.flags.shared import Example, Labelling, Reading
+from indexing.cli.labels import check_write, film_examples
 from indexing.labels import Label, open_labels, write_labels
 from tests.indexing.cli.test_commands import coco
 

@@ -19,7 +19,7 @@ from dyntorch import metrics, scenes
 from dyntorch.core import Notice, NoticeCode
 from dyntorch.tasks.reconstruct import motions
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from indexing.cli.reconstruct import MotionName
+from indexing.cli.flags.geometry import MotionName
 from indexing.report.reconstruction import FILES, PURPOSE
 
 # torch's own, when it first loads its transforms; hidden outside of tests

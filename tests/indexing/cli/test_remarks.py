@@ -13,8 +13,8 @@ import pytest
 from indexing import ActionIndexer, ActionOptions, Clip, ClipSet, synchronize
 from indexing.actors import Person, dataset
 from indexing.cli import main
-from indexing.cli.inputs import Reading
-from indexing.cli.remarks import remarks
+from indexing.cli.flags.shared import Reading
+from indexing.cli.notes import remarks
 from indexing.recordings.decoding import Withheld
 from indexing.skeleton import BODY25, COCO17, Skeleton
 
@@ -284,7 +284,8 @@ def test_nobody_in_view_is_an_answer(run, tmp_path):
 
 
 def test_many_examples_are_compared_within_their_files(monkeypatch, tmp_path):
-    from indexing.cli.inputs import Example, on_overlaps
+    from indexing.cli.flags.shared import Example
+    from indexing.cli.inputs import on_overlaps
 
     asked = []
     monkeypatch.setattr(Path, "resolve", lambda path, strict=False: asked.append(path) or path)

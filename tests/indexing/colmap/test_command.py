@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import indexing.colmap
 from indexing.cli import main
-from indexing.cli.colmap import ColmapJob, run_colmap
+from indexing.cli.commands.segment_colmap import ColmapJob, run_colmap
 from indexing.report.static import FILES
 from tests.indexing.colmap.test_database import changed, sha256
 
@@ -22,7 +21,9 @@ from tests.indexing.colmap.test_database import changed, sha256
 @pytest.fixture
 def quick(found, monkeypatch):
     """What was found once is found again at once."""
-    monkeypatch.setattr(indexing.colmap, "find_static", lambda database, *_, **__: replace(found, database=database))
+    monkeypatch.setattr(
+        "indexing.cli.commands.segment_colmap.find_static", lambda database, *_, **__: replace(found, database=database)
+    )
 
 
 @pytest.mark.slow
@@ -54,7 +55,7 @@ def test_everything_is_written(given, quick, tmp_path, capsys):
 
 def test_a_refusal_writes_a_report_and_no_database(given, found, tmp_path, monkeypatch, capsys):
     few = replace(found, refused=(0, 1, 2, 3), reason="fewer than 15 points stand still in 000.png, 4 of 6 images; add images")
-    monkeypatch.setattr(indexing.colmap, "find_static", lambda *_, **__: few)
+    monkeypatch.setattr("indexing.cli.commands.segment_colmap.find_static", lambda *_, **__: few)
     assert run_colmap(ColmapJob(given, tmp_path / "static.db"), {}) == 3
     assert "refused: fewer than 15 points stand still in 000.png" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["static-report"]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from indexing.cli.inputs import Format
+from indexing.cli.flags.shared import Format
 from indexing.clip import Clip, ClipSet
 from indexing.readers import FORMATS, read
 from indexing.readers.detect import detect

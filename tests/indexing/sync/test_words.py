@@ -7,7 +7,7 @@ import pytest
 from dyntorch.core import Notice
 from dyntorch.numerics import Message, named, worded
 from dyntorch.tasks.synchronize.result import ClocksNotice, ShiftNotice
-from indexing.cli.sync import WORDS
+from indexing.cli.commands.sync import WORDS
 from indexing.sync.notices import BrightnessNotice, SyncNotice
 
 NAMES = {"a": "left-1", "b": "right", "0": "left-1", "1": "mid", "2": "right"}

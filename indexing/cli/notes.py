@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from dyntorch.numerics import worded
-from indexing.cli.console import count, flags, names
-
-if TYPE_CHECKING:
-    from indexing.cli.inputs import Reading
-    from indexing.clip import Clip
-    from indexing.recordings.people import Appearance, Crowd
+from indexing.cli.console import count, flag_words, names
+from indexing.cli.flags.shared import Reading
+from indexing.clip import Clip, stretches
+from indexing.recordings.people import Appearance, Crowd
+from indexing.remarks import FOLLOWED, remarks_on
+from indexing.sync.people import jumps
 
 SLOW, FAST = 5.0, 480.0  # frames per second given by hand, beyond which they are mentioned
 STILL = 0.005  # of a body's size: joints that stay this close to their places do not move
 LISTED = 3  # moments, and names of joints
-WORDS = flags("fps", "person", "min_confidence", "format", "layout", size="--size W H")
+WORDS = flag_words("fps", "person", "min_confidence", "format", "layout", size="--size W H")
 
 
 def remarks(clips: Sequence[Clip], reading: Reading) -> list[str]:
     """On clips of any use: who is in them, in which units, and at which rate."""
-    from indexing.remarks import remarks_on
-
     found = [*_people(clips, reading), *(worded(one, WORDS) for one in remarks_on(clips, reading.size is not None))]
     if reading.fps is not None and not SLOW <= reading.fps <= FAST and clips:
         length = max(clip.duration for clip in clips)
@@ -59,8 +58,6 @@ def on_classes(labels: Sequence[str]) -> list[str]:
 
 def on_gaps(clips: Sequence[Clip]) -> list[str]:
     """On recordings that pause."""
-    from indexing.clip import stretches
-
     found = []
     for clip in clips:
         cuts = stretches(clip.times)
@@ -114,8 +111,6 @@ def few(sentences: Sequence[str]) -> list[str]:
 
 
 def _people(clips: Sequence[Clip], reading: Reading) -> list[str]:
-    from indexing.remarks import FOLLOWED
-    from indexing.sync.people import jumps
 
     found = []
     for clip in clips:
@@ -132,7 +127,6 @@ def _people(clips: Sequence[Clip], reading: Reading) -> list[str]:
 
 
 def _is_still(clip: Clip) -> bool:
-    import numpy as np
 
     seen = clip.joints[:, clip.seen.any(axis=0)]
     if len(seen) < 2:

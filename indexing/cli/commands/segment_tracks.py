@@ -5,21 +5,29 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import torch
+
+import dyntorch
 from dyntorch.numerics import worded
-from indexing.cli.console import check_report, count, ended, flags, progress, say, table, tell
+from indexing.cli.console import check_report, count, ended, flag_words, progress, say, table, tell
 from indexing.cli.scenes import Asked, as_tracks, follow_whole, inputs_of, is_video, photographs, source_of
+from indexing.files import manifest
+from indexing.readers.pairs import MatchedPair, Photograph
+from indexing.readers.tracks import TrackSet, read_tracks
+from indexing.report.bodies import FILM, WRITTEN, BodiesReport, rows_of, write_bodies
+from indexing.report.bodies_picture import PANELS
+from indexing.report.labelled import colour_of
+from indexing.video.overlay import Overlay, write_overlay
+from indexing.video.scene import SceneTracks
+from indexing.video.sequence import PictureSequence, chunks
+from indexing.video.whole import spread
 
-if TYPE_CHECKING:
-    from indexing.readers.pairs import MatchedPair, Photograph
-    from indexing.readers.tracks import TrackSet
-    from indexing.report.bodies import BodiesReport
-    from indexing.video.scene import SceneTracks
-
-WORDS = flags("bodies", "threshold", cameras="the cameras (in Python: cameras=)")
+WORDS = flag_words("bodies", "threshold", cameras="the cameras (in Python: cameras=)")
 LEAST = 8  # tracks, or matches
 SMALL = 50  # thresholds across the points, below which these are hardly pixels
 UNTIMED = 10.0  # frames per second of the video that is written where nobody says how fast pictures follow each other
@@ -34,7 +42,6 @@ class Given:
 
     def as_pair(self) -> MatchedPair:
         """Two frames, as a file of matches would give them."""
-        from indexing.readers.pairs import MatchedPair
 
         tracks, size = self.tracks, None
         if self.followed is not None:
@@ -68,7 +75,6 @@ def read_given(files: Sequence[Path], scene: bool, asked: Asked, key: str | None
     if scene:
         followed = follow_whole(files, asked)
         return Given(as_tracks(followed, files[0], is_video(files[0])), followed)
-    from indexing.readers.tracks import read_tracks
 
     span = asked.span()
     if span is not None:
@@ -95,9 +101,6 @@ def flat(tracks: TrackSet) -> Any:
 
 def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str, Any]) -> int:
     """Segment, draw, write, and say what was found."""
-    from indexing.files import manifest
-    from indexing.report.bodies import WRITTEN, BodiesReport, write_bodies
-
     folder = check_report(job.out, job.inputs, WRITTEN)
     tracks = given.tracks
     notes = [*tracks.notes, *checked(tracks, job)]
@@ -128,8 +131,6 @@ def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str
 
 def checked(tracks: TrackSet, job: BodiesJob) -> list[str]:
     """What to say about the input."""
-    import numpy as np
-
     values = flat(tracks)
     number = len(tracks.ids)
     short = int((_seen(tracks) < 2).sum())
@@ -160,8 +161,6 @@ def unit_notes(path: str, extent: float, threshold: float | None, auto: bool = T
 
 def _seen(tracks: TrackSet) -> Any:
     """``(n,)`` in how many frames each track is seen."""
-    import numpy as np
-
     return np.isfinite(tracks.values).all(axis=-1).sum(axis=0)
 
 
@@ -171,11 +170,6 @@ def solve(tracks: TrackSet, job: BodiesJob) -> Any:
     Raises:
         ValueError: naming the file.
     """
-    import numpy as np
-    import torch
-
-    import dyntorch
-
     values = tracks.values
     if tracks.weights is not None:
         values = np.where(tracks.weights[..., None] > 0, values, np.nan)
@@ -219,7 +213,6 @@ class Pictures:
             return Pictures(source_of(job.files), given.followed.frames)
         if not job.images or job.out is None:
             return None
-        from indexing.video.sequence import PictureSequence, chunks
 
         source, views = source_of(job.images), given.tracks.views
         stream: Any = chunks(source)
@@ -235,12 +228,6 @@ class Pictures:
 
     def shown(self, given: Given) -> dict[int, Photograph]:
         """Some of them, by their views."""
-        import numpy as np
-
-        from indexing.readers.pairs import Photograph
-        from indexing.report.bodies_picture import PANELS
-        from indexing.video.sequence import chunks
-        from indexing.video.whole import spread
 
         if given.followed is not None:
             places = given.followed.pictured or range(len(self.frames))
@@ -259,13 +246,8 @@ class Pictures:
 
     def filmed(self, report: BodiesReport) -> BodiesReport:
         """The report with the video in which the tracks are drawn."""
-        from dataclasses import replace
 
         from matplotlib.colors import to_rgb
-
-        from indexing.report.bodies import FILM
-        from indexing.report.labelled import colour_of
-        from indexing.video.overlay import Overlay, write_overlay
 
         tracks = report.tracks
         labels = range(1, report.bodies + 1)
@@ -296,8 +278,6 @@ def _rgb(colour: tuple[float, float, float]) -> tuple[int, int, int]:
 
 def show(report: BodiesReport) -> None:
     """Print the result."""
-    from indexing.report.bodies import rows_of
-
     number = max(1, int(report.present.sum()))
     rows: list[list[object]] = []
     for label, (tracks, _, lives, moved, noise, _, geometry) in enumerate(rows_of(report), start=1):

@@ -1,21 +1,204 @@
-"""``dyntorch index evaluate --labels``: how far a model, or somebody else, agrees with what a person has marked."""
+"""``dyntorch index evaluate``: measure recognition on a labelled clip set, or agreement with what a person marked."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from indexing.cli.console import check_report, count, names, progress, say, table
-from indexing.cli.labels import Labelling, lasting, of_medium
+import numpy as np
+from numpy.typing import NDArray
+
+from indexing.action.indexer import ActionIndexer
+from indexing.cli.commands.scan import search
+from indexing.cli.commands.suggest import TIER
+from indexing.cli.console import Progress, check_report, count, names, progress, say, table
+from indexing.cli.flags.index import Evaluate, Scan
+from indexing.cli.flags.shared import Labelling
+from indexing.cli.inputs import assumed, read_clips, usable
+from indexing.cli.labels import check_labelling, lasting, of_medium, open_marked
+from indexing.cli.protocol import Cameras, Fold, Viewing, check_classes, check_dims, draw_shots, splits, strangers
+from indexing.cli.videos import AsTheyAre, are_films, frame_rate, pixel_indexer, read_set, refuse_film_flags, refuse_keypoint_flags
+from indexing.clip import LabelledSet
+from indexing.comparing import NONE, Agreement, ComparedSpan, compare
+from indexing.files import manifest
+from indexing.labels import Label, choose_labels
 from indexing.opening import error, listed
+from indexing.report import EvaluationResult, RecognitionReport, write_recognition
+from indexing.report.agreement import FILES, AgreementReport, label_rows, overlap_rows, write_agreement
+from indexing.report.recognition import duration
+from indexing.report.results import confused_with, recognition
 
-if TYPE_CHECKING:
-    from indexing.cli.evaluate import Evaluate
-    from indexing.comparing import Agreement, ComparedSpan
-    from indexing.labels import Label
+REJECTED = "(rejected)"
+
+
+def run(flags: Evaluate) -> int:
+    """Read, split, learn and ask for every fold, or compare with labels; write the report and print the numbers."""
+    if flags.labelling.labels:
+        return against_labels(flags)
+    check_labelling(flags.labelling, [], False)
+    folder = check_report(flags.report, [path(flags)])
+    started = time.perf_counter()
+    with progress("loading", steps=False):
+        clips, cameras, notes = _films(flags) if are_films([path(flags)]) else _load(flags)
+        folds, warned = splits(clips, flags.train, flags.test, flags.leave_out)
+        labels = clips.labels.astype(str)
+        check_classes(folds, labels, clips.name)
+        folds, few = _shots(flags, folds, labels)
+    notes += warned + few + strangers(folds, labels)
+    timings = {"load": time.perf_counter() - started, "learn": 0.0, "recognize": 0.0}
+    with progress("learning and recognizing") as bar:
+        results = _measure(flags, clips, labels, folds, cameras, timings, bar)
+
+    measured = recognition([result for _, result in results])
+    groups = _by_group(results) if flags.leave_out is not None else {}
+    page = None if folder is None else _write(flags, folder, [result for _, result in results], groups, notes, timings)
+    _show(measured, groups)
+    for note in notes:
+        say(note if note.startswith("warning") else f"note: {note}")
+    low, high = measured["accuracy_interval"]
+    say(f"accuracy {measured['accuracy']:.3f} ({measured['clips']:,} clips; 95 % interval {low:.3f} to {high:.3f})")
+    say(f"learned in {timings['learn']:.1f} s, recognized in {timings['recognize']:.1f} s")
+    if page is not None:
+        say(f"report: {page}")
+    return 0
+
+
+def path(flags: Evaluate) -> Path:
+    """The clip set.
+
+    Raises:
+        ValueError: it is not one, or something is asked for that needs labels.
+    """
+    given = [name for name in ("model", "found_tier", "found_observation") if getattr(flags, name) is not None]
+    if given:
+        raise ValueError(f"--{given[0].replace('_', '-')}: to compare with labels; add --labels FILE, or leave it out")
+    if len(flags.clips) != 1:
+        what = names([str(path) for path in flags.clips]) if flags.clips else "no clip set"
+        raise ValueError(f"{what}: give one clip set, SET.npz; or recordings with --labels FILE and --model FILE")
+    return flags.clips[0]
+
+
+def _films(flags: Evaluate) -> tuple[LabelledSet[Any], Viewing, list[str]]:
+
+    refuse_keypoint_flags(flags, "camera", "azimuth", "exemplars", "view", "weights", "mirror")
+    return read_set(path(flags), flags.reading), AsTheyAre(), []
+
+
+def _load(flags: Evaluate) -> tuple[LabelledSet[Any], Viewing, list[str]]:
+
+    refuse_film_flags(flags.pixels)
+    clips = read_clips(flags.reading, path(flags))
+    if all(clip.label is None for clip in clips):
+        raise ValueError(f"{path(flags)}: says nothing of the actions; give a clip set with 'action' (and 'action_names')")
+    clips, notes = usable(clips, path(flags))
+    cameras = Cameras(flags.camera, _azimuths(flags), flags.exemplars == "3d", flags.seed)
+    return clips, cameras, notes + assumed(clips, path(flags)) + check_dims(clips, cameras)
+
+
+def _azimuths(flags: Evaluate) -> tuple[float, ...]:
+    if flags.azimuth is None:
+        return (0.0,)
+    if flags.camera != "virtual":
+        raise ValueError(f"--azimuth {flags.azimuth}: only virtual cameras turn; add --camera virtual")
+    try:
+        return tuple(float(word) for word in flags.azimuth.split(","))
+    except ValueError:
+        raise ValueError(f"--azimuth {flags.azimuth!r}: expected degrees, such as 0,45,90") from None
+
+
+def _shots(flags: Evaluate, folds: list[Fold], labels: NDArray[np.str_]) -> tuple[list[Fold], list[str]]:
+
+    if flags.shots is None:
+        return folds, []
+    drawn = [draw_shots(fold, labels, flags.shots, flags.seed) for fold in folds]
+    return [fold for fold, _ in drawn], [note for _, few in drawn for note in few]
+
+
+def _measure(
+    flags: Evaluate, clips: LabelledSet[Any], labels: NDArray[np.str_], folds: list[Fold], cameras: Viewing,
+    timings: dict[str, float], bar: Progress,
+) -> list[tuple[str, EvaluationResult]]:  # fmt: skip
+    """One result per fold and camera, each with the name of its fold."""
+    classes = sorted(set(labels))
+    out = []
+    for number, fold in enumerate(folds):
+        started = time.perf_counter()
+        examples = [cameras.exemplar(clips[i], int(i)) for i in fold.train]
+        indexer = _indexer(flags, examples).fit(examples, labels[fold.train])
+        timings["learn"] += time.perf_counter() - started
+        for view, setting in enumerate(cameras.settings):
+            queries = [cameras.query(clips[i], int(i), view) for i in fold.test]
+            started = time.perf_counter()
+            predicted = indexer.predict(queries)
+            timings["recognize"] += time.perf_counter() - started
+            out.append((fold.name, EvaluationResult(classes, labels[fold.test], predicted, setting or fold.name)))
+            bar((number + (view + 1) / len(cameras.settings)) / len(folds))
+    return out
+
+
+def _indexer(flags: Evaluate, examples: list[Any]) -> Any:
+    """A new indexer of what the examples are."""
+    if are_films([path(flags)]):
+        return pixel_indexer(flags.pixels, frame_rate(examples), reject=flags.reject, none_label=REJECTED)
+
+    return ActionIndexer(
+        view=flags.view, weights=flags.weights, reject=flags.reject, none_label=REJECTED,
+        mirror="auto" if flags.mirror else False, random_state=flags.seed,
+    )  # fmt: skip
+
+
+def _write(
+    flags: Evaluate,
+    folder: Path,
+    results: list[EvaluationResult],
+    groups: dict[str, float],
+    notes: list[str],
+    timings: dict[str, float],
+) -> Path:
+
+    report = RecognitionReport(
+        f"Recognition of {path(flags).name}",
+        evaluations=results,
+        metrics={"accuracy_by_group": groups} if groups else {},
+        notes=notes,
+        manifest=manifest(
+            {"command": "index evaluate", **dataclasses.asdict(flags)}, [path(flags).expanduser()], flags.seed, timings
+        ),
+    )
+    with progress("drawing the report", steps=False):
+        return write_recognition(folder, report)
+
+
+def _by_group(results: list[tuple[str, EvaluationResult]]) -> dict[str, float]:
+    """Accuracy of each group that was left out, over all cameras."""
+    right: dict[str, list[bool]] = {}
+    for name, result in results:
+        right.setdefault(name, []).extend(str(a) == str(b) for a, b in zip(result.truth, result.predicted, strict=True))
+    return {name: sum(values) / len(values) for name, values in right.items()}
+
+
+def _show(measured: Mapping[str, Any], groups: dict[str, float]) -> None:
+
+    rows = []
+    for name, row in measured["per_class"].items():
+        wrong = confused_with(measured["confusion"], name)
+        taken = f"{wrong[0]} ({wrong[1]})" if wrong else ""
+        if row["clips"]:
+            rows.append([name, row["clips"], f"{row['recall']:.3f}", f"{row['precision']:.3f}", taken])
+    table(["action", "clips ", "recall ", "precision ", "most often taken for"], rows)
+    settings = measured["accuracy_by_setting"]
+    shown = settings | {name: value for name, value in groups.items() if name not in settings}
+    if set(shown) != {""}:
+        table(["setting", "accuracy "], [[name, f"{value:.3f}"] for name, value in shown.items()])
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is found, or what somebody marked, against what a person marked.
+
 
 OF_SETS = ("train", "test", "leave_out", "camera", "azimuth", "exemplars", "shots", "view", "weights", "mirror")
 """Flags of an evaluation on a labelled clip set, in which there is something to learn."""
@@ -33,8 +216,6 @@ class _Compared:
 
 def against_labels(command: Evaluate) -> int:
     """Compare what a model finds in recordings, or what files of labels say, with what a person marked; print and report it."""
-    from indexing.report.agreement import FILES
-
     defaults = type(command).__dataclass_fields__
     given = [name for name in OF_SETS if getattr(command, name) != defaults[name].default]
     if given:
@@ -43,14 +224,13 @@ def against_labels(command: Evaluate) -> int:
     inputs = [*command.clips, *command.labelling.labels, *([command.model] if command.model is not None else [])]
     folder = check_report(command.report, inputs, FILES)
     compared = _of_files(command) if command.model is None else _of_model(command)
-    from indexing.comparing import compare
 
     both = compare(compared.spans)
-    page = None if folder is None else _write(command, folder, both, compared, inputs)
-    _show(both, compared.sides)
+    page = None if folder is None else _write_agreement(command, folder, both, compared, inputs)
+    _show_agreement(both, compared.sides)
     for note in compared.notes:
         say(f"note: {note}")
-    say(_summary(both, compared))
+    say(_agreement_summary(both, compared))
     if page is not None:
         say(f"report: {page}")
     return 0
@@ -58,14 +238,11 @@ def against_labels(command: Evaluate) -> int:
 
 def _of_model(command: Evaluate) -> _Compared:
     """What a model finds in recordings, and what is marked in them."""
-    from indexing.cli.index import Scan
-    from indexing.comparing import ComparedSpan
-
     if command.found_tier is not None or command.found_observation is not None:
         raise ValueError("--found-tier, --found-observation: of files of labels, but a model says what was found; leave them out")
     assert command.model is not None
-    scan = Scan(command.clips, command.model, reject=command.reject, labelling=command.labelling, reading=command.reading)
-    _, results, notes, timings = scan.search()
+    flags = Scan(command.clips, command.model, reject=command.reject, labelling=command.labelling, reading=command.reading)
+    _, results, notes, timings = search(flags)
     spans = []
     for result in results:
         if result.truth is not None:
@@ -111,10 +288,7 @@ def _called(known: Path, found: Path, command: Evaluate) -> tuple[str, str]:
 def _side(labelling: Labelling, path: Path, command: Evaluate, detections: bool) -> tuple[list[Label], list[str], list[str]]:
     """The labels of one hand, the media that they are of, and what to know; of detections those of a program, where one
     looked."""
-    from indexing.cli.suggest import TIER
-    from indexing.labels import choose_labels
-
-    file = labelling.open(path, None, command.reading.fps)
+    file = open_marked(labelling, path, None, command.reading.fps)
     programs = {name for name in file.machine if not name.startswith(TIER)}  # a suggestion says nothing of what was found
     ours = [one for one in file.labels if {one.observation, one.tier} & programs]
     asked = labelling.observation is not None or labelling.tier is not None
@@ -153,8 +327,6 @@ def _paired(
     known: Sequence[Label], found: Sequence[Label], media: Sequence[str], paths: tuple[Path, Path]
 ) -> tuple[list[ComparedSpan], list[str]]:
     """What is compared: each recording that both sides know, from 0 to where its last label ends, subject by subject."""
-    from indexing.comparing import ComparedSpan
-
     spans: list[ComparedSpan] = []
     notes: list[str] = []
     recordings, left = _recordings(known, found, media, paths)
@@ -219,9 +391,7 @@ def _subjects(
 # What is printed and written.
 
 
-def _show(both: Agreement, sides: tuple[str, str]) -> None:
-    from indexing.comparing import NONE
-    from indexing.report.agreement import label_rows, overlap_rows
+def _show_agreement(both: Agreement, sides: tuple[str, str]) -> None:
 
     say(f"confusion over time, in seconds: rows are {sides[0]}, columns {sides[1]}")
     named = [*both.labels, NONE]
@@ -235,8 +405,7 @@ def _show(both: Agreement, sides: tuple[str, str]) -> None:
     table(["overlap", "right ", "found ", "known ", "precision ", "recall ", "F1 "], overlap_rows(both))
 
 
-def _summary(both: Agreement, compared: _Compared) -> str:
-    from indexing.report.recognition import duration
+def _agreement_summary(both: Agreement, compared: _Compared) -> str:
 
     recordings = len({span.name for span in compared.spans})
     people = sum(bool(span.person) for span in compared.spans)
@@ -248,9 +417,7 @@ def _summary(both: Agreement, compared: _Compared) -> str:
     )
 
 
-def _write(command: Evaluate, folder: Path, both: Agreement, compared: _Compared, inputs: Sequence[Path]) -> Path:
-    from indexing.files import manifest
-    from indexing.report.agreement import AgreementReport, write_agreement
+def _write_agreement(command: Evaluate, folder: Path, both: Agreement, compared: _Compared, inputs: Sequence[Path]) -> Path:
 
     arguments: dict[str, Any] = {"command": "index evaluate", **dataclasses.asdict(command)}
     about = manifest(arguments, [path.expanduser() for path in inputs], timings=compared.timings)

@@ -9,14 +9,16 @@ from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from indexing.archive.workers import QuietProcesses
 from indexing.cli.console import check_folder, check_report, count, counted, ended, keep, names, progress, say, table
-
-if TYPE_CHECKING:
-    from indexing.colmap import MatchDatabase, StaticPoints
-    from indexing.readers.pairs import Photograph
-    from indexing.report.static import StaticReport
+from indexing.colmap import MatchDatabase, StaticOptions, StaticPoints, check_target, find_static, read_database
+from indexing.colmap.dividing import colmap
+from indexing.colmap.masks import write_masks
+from indexing.files import manifest
+from indexing.readers.pairs import Photograph, read_image
+from indexing.report.static import FILES, StaticReport, describe, image_rows, images_drawn, write_report
 
 
 @dataclass(frozen=True)
@@ -35,12 +37,6 @@ class ColmapJob:
 
 def run_colmap(job: ColmapJob, arguments: Mapping[str, Any]) -> int:
     """Read, divide, vote, write, and say what was found."""
-    from indexing.colmap import check_target, find_static, read_database
-    from indexing.colmap.dividing import colmap
-    from indexing.colmap.masks import write_masks
-    from indexing.files import manifest
-    from indexing.report.static import FILES, StaticReport, write_report
-
     if job.out is None:
         raise ValueError("--colmap: where to? name the database to write, --out static.db")
     database, out = job.database.expanduser(), job.out.expanduser()
@@ -83,9 +79,6 @@ def run_colmap(job: ColmapJob, arguments: Mapping[str, Any]) -> int:
 
 def _workforce(pairs: int) -> contextlib.AbstractContextManager[Executor | None]:
     """All cores, where that is worth it."""
-    from indexing.archive.workers import QuietProcesses
-    from indexing.colmap import StaticOptions
-
     cores = os.cpu_count() or 1
     return contextlib.nullcontext() if cores < 2 or pairs < StaticOptions().divide.shared_out else QuietProcesses(cores)
 
@@ -100,8 +93,6 @@ def _photographs(database: MatchDatabase, folder: Path | None) -> tuple[dict[int
     """Those of the images that the report draws, by their places, and what is to be said."""
     if folder is None:
         return {}, []
-    from indexing.readers.pairs import read_image
-    from indexing.report.static import images_drawn
 
     found, missing, other = {}, [], []
     for place in images_drawn(database):
@@ -122,8 +113,6 @@ def _photographs(database: MatchDatabase, folder: Path | None) -> tuple[dict[int
 
 def show(report: StaticReport, found: StaticPoints) -> None:
     """Print the result."""
-    from indexing.report.static import describe, image_rows
-
     say(describe(report) if found.ok else f"{report.matches:,} matches of {count(len(found.database.pairs), 'pair')} of images")
     rows = image_rows(report)
     few = sorted(rows, key=lambda row: row[2])[:10] if len(rows) > 20 else rows

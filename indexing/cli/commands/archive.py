@@ -1,0 +1,429 @@
+"""``dyntorch archive add | search | find | info | verify | remove``: where else anybody did this."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from indexing import Archive
+from indexing.action.indexer import ActionIndexer
+from indexing.archive.results import Addition, ArchivedEvent, ArchiveInfo, Hit
+from indexing.archive.sources import ArchiveSource, gather, stamp
+from indexing.archive.workers import QuietProcesses
+from indexing.cli.commands.scan import exemplars, within_label
+from indexing.cli.console import (
+    REPORT_FILES,
+    Progress,
+    check_report,
+    complain,
+    count,
+    counted,
+    names,
+    one_line,
+    progress,
+    say,
+    table,
+)
+from indexing.cli.flags.archive import Add, Find, Info, Remove, Search, Verify
+from indexing.cli.flags.shared import Example, Following, Reading
+from indexing.cli.inputs import CUT, assumed, parse_example, read_clips, watch_videos
+from indexing.cli.notes import remarks
+from indexing.cli.protocol import choose, known
+from indexing.cli.videos import watch_options
+from indexing.clip import Clip
+from indexing.files import manifest, plain
+from indexing.modelfile import model_kind
+from indexing.report.archive import FindReport, SearchReport, write_finds, write_search
+from indexing.report.page import even
+from indexing.report.recognition import duration
+
+PROBLEMS, INTERRUPTED = 2, 130  # exit codes
+MAX_EVENTS_PRINTED = 100  # events that are printed: all are in the report
+
+
+# up to these one process is done before others, which take some 8 s to start on two cores, could have helped
+MAX_SOURCES_ALONE = 1000  # recordings to add
+MAX_BYTES_ALONE = 2**28  # of recordings to add
+MAX_SECONDS_ALONE = 5400.0  # of recordings in which actions are searched
+CLUSTER_TIMEOUT = 5  # seconds for a cluster to answer
+SHUTDOWN_TIMEOUT = 1.0  # seconds for a process to end by itself after an interruption
+
+
+def add(flags: Add) -> int:
+    """Read what is new, and say what became of it."""
+    if not flags.sources:
+        raise ValueError("no sources; give keypoint files, clip sets, or folders that hold them")
+    check_workers(flags.workers, flags.dask)
+    with progress("looking for recordings", steps=False):
+        archive = Archive(_absolute(flags.archive) if flags.dask else flags.archive)
+        given = [_absolute(path) if flags.dask else path for path in flags.sources]
+        found = gather(given)
+        alone = flags.workers is None and _soon(found)
+    before, started = len(archive), time.perf_counter()
+    try:
+        with workforce(1 if alone else flags.workers, flags.dask, len(found)) as executor, rate("adding", len(found)) as bar:
+            done = archive.add(given, executor, bar, _options(flags.reading))
+    except KeyboardInterrupt:
+        complain(f"interrupted; {_kept(archive, before)}")
+        return INTERRUPTED
+    _added_show(done)
+    say(f"{archive.path}: {_size(archive.info())}; took {time.perf_counter() - started:.1f} s")
+    for failure in done.failed:
+        complain(f"failed: {failure.reason or failure.source}")
+    fine = bool(done.of("added") or done.of("replaced")) and not flags.strict
+    return PROBLEMS if done.failed and not fine else 0
+
+
+def search(flags: Search) -> int:
+    """Search, print the hits, write the report."""
+    check_workers(flags.workers, flags.dask)
+    example = _example(flags.example)
+    folder = check_report(flags.report, [example.path], (*REPORT_FILES, "hits.csv"))
+    with progress("loading", steps=False):
+        archive = Archive(_absolute(flags.archive) if flags.dask else flags.archive)
+        reading = watch_videos(flags.reading, [example.path], flags.report)
+        clip, notes = read_query(example, reading, flags.select)
+        notes = [*reading.watched.notes, *notes]
+    started = time.perf_counter()
+    with workforce(flags.workers, flags.dask, threads=True) as executor, progress("searching") as bar:
+        hits = archive.search(clip, flags.k, executor, bar, flags.mirror)
+    seconds = time.perf_counter() - started
+    info = archive.info()
+    page = None if folder is None else _write_hits(flags, folder, archive, clip, hits, info, notes, seconds)
+    _hits_show(hits, flags.mirror)
+    for note in notes:
+        say(f"note: {note}")
+    say(f"{count(len(hits), 'hit')} in {_size(info)}, searched in {seconds:.1f} s")
+    if page is not None:
+        say(f"report: {page}")
+    return 0
+
+
+def _write_hits(
+    flags: Search, folder: Path, archive: Archive, clip: Clip, hits: list[Hit], info: ArchiveInfo, notes: list[str], seconds: float
+) -> Path:
+
+    about = _manifest("search", flags, [_example(flags.example).path], archive, info, {"search": seconds})
+    with progress("drawing the report", steps=False):
+        return write_search(folder, SearchReport(clip, hits, archive, info, notes, about))
+
+
+def find(flags: Find) -> int:
+    """Search everything, count, write the report."""
+    check_workers(flags.workers, flags.dask)
+    folder = check_report(flags.report, [flags.model])
+    with progress("loading", steps=False):
+        archive = Archive(_absolute(flags.archive) if flags.dask else flags.archive)
+        info = archive.info()
+        if model_kind(flags.model) == "dyntorch.brightness-indexer":
+            raise ValueError(f"{flags.model}: was learned from videos, and archives hold keypoints; learn from keypoint files")
+        indexer = ActionIndexer.load(flags.model.expanduser())
+    if flags.reject is not None:
+        indexer.set_params(reject=flags.reject)
+    started = time.perf_counter()
+    workers = 1 if flags.workers is None and info.seconds <= MAX_SECONDS_ALONE else flags.workers
+    with workforce(workers, flags.dask, info.recordings) as executor, rate("searching", info.recordings) as bar:
+        events = archive.find(indexer, executor, bar)
+    seconds = time.perf_counter() - started
+    page = None if folder is None else _write_events(flags, folder, archive, indexer, events, info, seconds)
+    _events_show(events, [str(label) for label in indexer.classes_])
+    where = len({event.source for event in events})
+    said = f"{count(len(events), 'action')} found in {count(where, 'recording')} of" if events else "no action found in"
+    say(f"{said} {_size(info)}, searched in {seconds:.1f} s")
+    if page is not None:
+        say(f"report: {page}")
+    return 0
+
+
+def _write_events(
+    flags: Find, folder: Path, archive: Archive, indexer: Any, events: list[ArchivedEvent], info: ArchiveInfo, seconds: float
+) -> Path:
+
+    about = _manifest("find", flags, [flags.model], archive, info, {"find": seconds})
+    named = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
+    classes = [str(label) for label in indexer.classes_]
+    report = FindReport(classes, named, archive.recordings(), archive, exemplars(indexer), manifest=about)
+    with progress("drawing the report", steps=False):
+        return write_finds(folder, report)
+
+
+def info(flags: Info) -> int:
+    """Count, and list."""
+    with progress("counting", steps=False):
+        archive = Archive(flags.archive)
+        info = archive.info()
+    if flags.sources:
+        rows = [
+            [one.source, one.person, f"{one.start:.2f}", f"{one.end:.2f}", f"{one.seconds:.1f}", one.layout]
+            for one in archive.recordings()
+        ]
+        table(["source", "person", "start (s) ", "end (s) ", "stored (s) ", "joints"], rows)
+    else:
+        lines = [[name, joints, _long(seconds)] for name, joints, seconds in info.layouts]
+        table(["joint layout", "joints ", "time "], lines)
+    people = f" ({count(info.recordings, 'recording')} of one person each)" * (info.recordings != info.sources)
+    hours = info.seconds / 3600
+    each = f", {info.size / 1e6 / hours:.1f} MB an hour" * (hours >= 1)
+    say(f"{count(info.sources, 'source')}{people}, {_long(info.seconds)}, {count(info.windows, 'window')}")
+    say(f"{info.size / 1e6:,.1f} MB in {count(info.segments, 'segment')}{each}; version {info.version}")
+    if info.dead:
+        say(f"{count(info.dead, 'window')} of what was removed still take space; later additions take it back")
+    return 0
+
+
+def verify(flags: Verify) -> int:
+    """Check, and say what is wrong, with what to do about it."""
+    with progress("reading everything", steps=False):
+        found = Archive(flags.archive).verify()
+    for problem in found.problems:
+        complain(problem)
+    if found.orphans:
+        left = count(len(found.orphans), "file")
+        say(f"note: {left} of interrupted additions hold nothing that is missed; the next addition takes them away")
+    where = f"{count(found.windows, 'window')} in {count(found.segments, 'segment')}"
+    say(f"{where}: all there, whole, and once" if found.ok else f"{where}: {count(len(found.problems), 'problem')}")
+    return 0 if found.ok else PROBLEMS
+
+
+def remove(flags: Remove) -> int:
+    """Remove one after the other; what is not there is said, and the others are removed all the same."""
+    if not flags.sources:
+        raise ValueError("no sources; give the names or paths of those to remove")
+
+    archive, code = Archive(flags.archive), 0
+    archive.info()  # says what is wrong with the archive, before its sources are blamed
+    for source in flags.sources:
+        try:
+            say(f"{source}: {count(archive.remove(source), 'recording')} removed")
+        except ValueError as problem:
+            complain(str(problem))
+            code = PROBLEMS
+    return code
+
+
+# ---- who does the work ---------------------------------------------------------------------------------------------------
+def check_workers(workers: int | None, dask: str | None) -> None:
+    """Raise where the flags contradict each other or make no sense."""
+    if workers is not None and workers < 1:
+        raise ValueError(f"--workers {workers}: expected 1 or more; leave it out for as many as there are cores")
+    if workers is not None and dask is not None:
+        raise ValueError("--workers and --dask: a cluster has its own workers; leave one of them out")
+
+
+def workforce(
+    workers: int | None, dask: str | None, tasks: int | None = None, threads: bool = False
+) -> AbstractContextManager[Executor | None]:
+    """Who does the work: a cluster, threads or processes; ``None`` where this process is as quick by itself."""
+    if dask is not None:
+        return _cluster(dask)
+    if threads:
+        return contextlib.nullcontext() if workers is None else _threads(workers)
+    number = min(workers or os.cpu_count() or 1, tasks or 1)
+    return contextlib.nullcontext() if number == 1 else _processes(number)
+
+
+def _threads(workers: int) -> Executor:
+
+    return ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator[Executor]:
+    """A pool that ends with the work, or soon after an interruption."""
+    others = set(multiprocessing.active_children())
+    pool = QuietProcesses(workers)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(multiprocessing.active_children()) - others:
+            child.join(SHUTDOWN_TIMEOUT)  # a pool must have dropped what nobody began before its processes are ended, or it hangs
+            child.terminate()
+        raise
+    pool.shutdown()
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[Executor]:
+    """The workers of a Dask cluster."""
+    try:
+        from dask.distributed import Client
+    except ImportError:
+        raise ValueError(f'--dask {address}: needs Dask, which is not installed: pip install "dyntorch[cluster]"') from None
+    try:
+        client: Any = Client(address, timeout=CLUSTER_TIMEOUT)
+    except Exception as problem:  # whatever answers at an address where no scheduler runs: a web server's answer is taken for sizes
+        said = one_line(problem) or type(problem).__name__
+        raise ValueError(f"--dask {address}: {said}; give the address of a scheduler that runs, such as tcp://head:8786") from None
+    try:
+        if not client.scheduler_info()["workers"]:
+            raise ValueError(f"--dask {address}: the cluster has no workers; start some with dask worker {address}")
+        yield client.get_executor()
+    finally:
+        client.close(timeout=CLUSTER_TIMEOUT)
+
+
+@contextmanager
+def rate(what: str, number: int) -> Iterator[Progress]:
+    """A bar on the terminal, with how many there are in a second and how long it still takes; moved by the share done."""
+    if not number:
+        yield lambda share: None
+        return
+    with counted(what, "a second") as bar:
+        if bar is not None:
+            bar(0, number)
+        yield lambda share: None if bar is None else bar(round(share * number), number)
+
+
+# ---- what is read --------------------------------------------------------------------------------------------------------
+def _absolute(path: Path) -> Path:
+    """As whoever works elsewhere finds it."""
+    return path.expanduser().absolute()
+
+
+def _soon(sources: Sequence[ArchiveSource]) -> bool:
+    """Whether one process has read all before others could have helped."""
+    size = 0
+    for source in sources:
+        with contextlib.suppress(OSError, ValueError):  # said when it is read
+            size += stamp(source).size
+    return len(sources) <= MAX_SOURCES_ALONE and size <= MAX_BYTES_ALONE
+
+
+def _options(reading: Following) -> dict[str, Any]:
+    """The flags that were given, as arguments of :func:`indexing.readers.read`: whoever adds without them reads alike."""
+    usual = Following()
+    if reading.footage.by == "pixels" or reading.footage.poses is not None:
+        flag = "--by pixels" if reading.footage.by == "pixels" else f"--poses {reading.footage.poses}"
+        raise ValueError(f"{flag}: an archive holds keypoints, and keeps those of videos itself; leave it out")
+    names_of = [each.name for each in dataclasses.fields(reading) if each.name not in ("footage", "watched")]
+    found = {name: getattr(reading, name) for name in names_of if getattr(reading, name) != getattr(usual, name)}
+    return found if reading.footage == usual.footage else {**found, "watching": watch_options(reading.footage)}
+
+
+def _example(text: str) -> Example:
+    """``file`` or ``file@2.1-3.0``; a label, as ``dyntorch index fit`` wants one, is no hindrance."""
+    found = parse_example(text)
+    whole = Path(f"{found.label}={found.path}")
+    return dataclasses.replace(found, path=whole) if found.label is not None and whole.expanduser().exists() else found
+
+
+def read_query(example: Example, reading: Reading, select: Sequence[str]) -> tuple[Clip, list[str]]:
+    """The one clip that is asked for, named as it was given, and what a reader should know of it."""
+    clips = every = read_clips(reading, example.path)
+    named, fields = [word[5:] for word in select if word[:5] == "name="], [word for word in select if word[:5] != "name="]
+    if named:
+        clips = clips[[i for i, clip in enumerate(every) if clip.name in named]]
+        if not clips:
+            have = names([clip.name for clip in every])
+            raise ValueError(f"--select name={named[0]}: {example.path} has no such clip; it holds {have}")
+    if fields:
+        clips = clips[choose(clips, fields, "--select")]
+    if len(clips) != 1:
+        several = f"{example.path}: holds {count(len(clips), 'clip')}, and one is asked for"
+        raise ValueError(f"{several}; choose it with --select name=NAME, or by a field; {known(clips)}")
+    name = example.path.name if len(every) == 1 else f"{example.path.name}: {clips[0].name}"
+    clip = clips[0].replace(name=name)
+    notes = remarks([clip], reading) + assumed([clip])
+    start = clip.times[0] if example.start is None else example.start
+    end = clip.times[-1] if example.end is None else example.end
+    if example.start is not None or example.end is not None:
+        clip = clip.between(start, end)
+        first, last = clips[0].times[0], clips[0].times[-1]
+        if start < first - CUT or end > last + CUT:
+            notes.append(
+                f"{example.path}: the recording runs from {first:.6g} to {last:.6g} s; {clip.duration:.3g} s of it are asked for"
+            )
+        clip = clip.replace(name=f"{name}, {clip.times[0]:.6g} to {clip.times[-1]:.6g} s")
+    return clip, notes
+
+
+# ---- what is printed -----------------------------------------------------------------------------------------------------
+def _long(seconds: float) -> str:
+
+    return duration(seconds)
+
+
+def _size(info: ArchiveInfo) -> str:
+    return f"{count(info.sources, 'source')} ({_long(info.seconds)})"
+
+
+def _kept(archive: Archive, before: int) -> str:
+    """What an interrupted addition leaves."""
+    again = "the same command goes on from there"
+    try:
+        info = archive.info()
+    except ValueError:
+        return f"nothing was added yet; {again}"
+    new = max(0, info.windows - before)
+    return f"the archive is whole: {_size(info)}, {count(new, 'window')} of it new; {again}"
+
+
+def _added_show(done: Addition) -> None:
+    rows = []
+    for outcome in ("added", "replaced", "known", "left out", "failed"):
+        some = done.of(outcome)
+        if some:
+            fresh = outcome in ("added", "replaced")
+            windows, seconds = sum(one.windows for one in some), sum(one.seconds for one in some)
+            rows.append([outcome, f"{len(some):,}", f"{windows:,}" if fresh else "", _long(seconds) if fresh else ""])
+    table(["", "sources ", "windows ", "time "], rows)
+    reasons: dict[str, list[str]] = {}
+    for one in done.sources:
+        if one.reason and one.outcome in ("added", "replaced", "left out"):
+            reasons.setdefault(f"{one.reason}{', left out' * (one.outcome == 'left out')}", []).append(one.source)
+    for reason, sources in reasons.items():
+        say(f"note: {reason}: {names(sources)}")
+
+
+def _hits_show(hits: Sequence[Hit], mirror: bool) -> None:
+
+    people, scores = any(hit.person for hit in hits), even([hit.score for hit in hits])
+    rows = [
+        [
+            f"{number}", hit.source, *[hit.person] * people, f"{hit.start:.2f}", f"{hit.end:.2f}", score,
+            *["mirrored" * hit.mirrored] * mirror,
+        ]
+        for number, (hit, score) in enumerate(zip(hits, scores, strict=True), 1)
+    ]  # fmt: skip
+    if rows:
+        table(["rank ", "source", *["person"] * people, "start (s) ", "end (s) ", "score ", *[""] * mirror], rows)
+
+
+def _events_show(events: Sequence[ArchivedEvent], classes: Sequence[str]) -> None:
+    """Few events one by one; of many, how many there are of each action."""
+    if 0 < len(events) <= MAX_EVENTS_PRINTED:
+        people = any(event.person for event in events)
+        scores, margins = even([event.score for event in events]), even([event.margin for event in events])
+        rows: list[list[object]] = [
+            [event.source, *[event.person] * people, event.label, f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
+            for event, score, margin in zip(events, scores, margins, strict=True)
+        ]
+        table(["source", *["person"] * people, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)
+    elif events:
+        times: dict[str, list[str]] = {label: [] for label in classes}
+        for event in events:
+            times.setdefault(str(event.label), []).append(event.source)
+        rows = [[label, f"{len(where):,}", f"{len(set(where)):,}"] for label, where in times.items()]
+        table(["action", "times ", "sources "], rows)
+        say("note: each event, with its times, is in events.csv of a report (--report FOLDER)")
+
+
+def _manifest(
+    verb: str, command: Any, inputs: Sequence[Path], archive: Archive, info: ArchiveInfo, timings: dict[str, float]
+) -> dict[str, Any]:
+    """How a report came about; of the archive what it held, not the hash of gigabytes."""
+    made = manifest(
+        {"command": f"archive {verb}", **dataclasses.asdict(command)}, [path.expanduser() for path in inputs], timings=timings
+    )
+    return {**made, "archive": {"path": str(archive.path), **plain(info)}}

@@ -1,0 +1,256 @@
+"""``dyntorch index scan``: find learned actions in long recordings."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from indexing import ActionOptions
+from indexing.action.indexer import ActionIndexer
+from indexing.brightness.indexer import BrightnessIndexer
+from indexing.cli.console import Progress, check_report, count, names, progress, say, table
+from indexing.cli.flags.index import Scan
+from indexing.cli.inputs import KnownEvent, Lane, on_truth, read_recordings, read_truth, watch_videos
+from indexing.cli.labels import check_write, known_events, read_marked, write_found
+from indexing.cli.notes import on_classes
+from indexing.cli.videos import FilmRecording, are_films, read_films
+from indexing.clip import Clip
+from indexing.files import manifest
+from indexing.modelfile import model_kind
+from indexing.readers.formats.clipset import holds_frames
+from indexing.recordings.repetitions import count_repetitions
+from indexing.report import RecognitionReport, RecordingResult, write_recognition
+from indexing.report.page import even
+from indexing.report.results import by_recording, matched, missed
+from indexing.report.results import seconds as lasts
+from indexing.report.tallies import COUNTS, count_row, held_sentences
+from indexing.scoring import Event
+
+RESTED = {"strict": 2.0, "usual": 1.0, "off": 0.0}
+"""Times the usual weight that resting has against an action."""
+
+
+def run(flags: Scan) -> int:
+    """Read all, scan all, write the report, print the hits."""
+    if not flags.recordings:
+        raise ValueError("no recordings; give at least one keypoint file or folder to search")
+    if flags.truth is not None and flags.labelling.labels:
+        raise ValueError(f"--truth {flags.truth}: --labels says what is known, too; give one of them")
+    inputs = [*flags.recordings, flags.model, *([flags.truth] if flags.truth is not None else [])]
+    folder, target = check_report(flags.report, inputs), check_write(flags.write, inputs, flags.recordings, flags.labelling.media)
+    inputs += flags.labelling.labels
+    indexer, results, notes, timings = search(flags)
+    if target is not None:
+        with progress(f"writing {target.name}", steps=False):
+            notes += write_found(target, results, flags.recordings, flags.labelling)
+    page = None if folder is None else _write(flags, folder, indexer, results, notes, inputs, timings)
+    _scan_show(results)
+    _counts_show(results)
+    for note in notes:
+        say(f"note: {note}")
+    for sentence in held_sentences(results):
+        say(sentence)
+    say(_summary(results, timings["scan"]))
+    if any(result.truth is not None for result in results):
+        for sentence in [_against_truth(results), *_right(results)]:
+            say(sentence)
+    if target is not None:
+        say(f"written: {target}")
+    if page is not None:
+        say(f"report: {page}")
+    return 0
+
+
+def search(flags: Scan) -> tuple[Any, list[RecordingResult], list[str], dict[str, float]]:
+    """The model, what it finds in each recording, person by person, what to know of that, and the seconds it took."""
+    started = time.perf_counter()
+    with progress("loading", steps=False):
+        indexer, recordings, notes = _films(flags) if _of_films(flags) else _clips(flags)
+    if flags.reject is not None:
+        indexer.set_params(reject=flags.reject)
+    names, people = [one.name for one in recordings], [getattr(one, "person", "") for one in recordings]
+    truth, unread = _known(flags, recordings, names, people)
+    notes = notes + unread + _unknown(truth, indexer)
+    if truth is not None:
+        notes += on_truth(truth, recordings)
+    loaded = time.perf_counter()
+    results = [
+        _scan(flags, indexer, one, None if truth is None else truth[i], f" ({i + 1} of {len(names)})" if len(names) > 1 else "")
+        for i, one in enumerate(recordings)
+    ]
+    return indexer, results, notes, {"load": loaded - started, "scan": time.perf_counter() - loaded}
+
+
+def _known(
+    flags: Scan, recordings: Sequence[Any], names: list[str], people: list[str]
+) -> tuple[list[list[KnownEvent] | None] | None, list[str]]:
+    """What is known to have happened in each recording, person by person, where anything is."""
+    if flags.truth is not None:
+        return read_truth(flags.truth, names, people)
+    if flags.labelling.labels:
+        marked, notes = read_marked(flags.labelling, recordings, flags.reading)
+        return known_events(marked), notes
+    return None, []
+
+
+def _of_films(flags: Scan) -> bool:
+    """Whether the model was learned from pixels; the recordings must be of the same kind."""
+    of_films, by = model_kind(flags.model) == "dyntorch.brightness-indexer", flags.reading.footage.by
+    has = "the pixels of videos" if of_films else "keypoints"
+    if by == ("keypoints" if of_films else "pixels"):
+        raise ValueError(f"--by {by}: the model {flags.model} was learned from {has}; leave --by out")
+    if not (are_films(flags.recordings) if of_films else not any(map(holds_frames, flags.recordings))):
+        need = "videos" if of_films else "keypoint files, or videos as the camera wrote them"
+        raise ValueError(f"{flags.recordings[0]}: the model {flags.model} was learned from {has}; give {need} to search")
+    return of_films
+
+
+def _clips(flags: Scan) -> tuple[ActionIndexer, list[Lane], list[str]]:
+
+    indexer = ActionIndexer.load(flags.model.expanduser())
+    options = indexer.options or ActionOptions()
+    options = dataclasses.replace(options, rest_weight=RESTED[flags.rest] * options.rest_weight)
+    indexer.set_params(options=options)
+    reading = watch_videos(flags.reading, flags.recordings, flags.report or (None if flags.write is None else flags.write.parent))
+    lanes, notes = read_recordings(flags.recordings, reading, indexer.n_joints_, flags.model, indexer.skeleton_)
+    return indexer, lanes, [*reading.watched.notes, *notes, *on_classes([str(label) for label in indexer.classes_])]
+
+
+def _films(flags: Scan) -> tuple[BrightnessIndexer, list[FilmRecording], list[str]]:
+
+    if flags.rest != "usual":
+        raise ValueError(
+            f"--rest {flags.rest}: {flags.model} was learned from videos, in which nobody's rest is judged; leave it out"
+        )
+    return BrightnessIndexer.load(flags.model.expanduser()), *read_films(flags.recordings, flags.reading)
+
+
+def _scan(flags: Scan, indexer: Any, recording: Any, truth: list[KnownEvent] | None, which: str) -> RecordingResult:
+
+    classes = [str(label) for label in indexer.classes_]
+    if isinstance(recording, Lane) and recording.clip is None:  # nobody is in view
+        nothing = np.full((len(recording.times), len(classes)), np.nan)
+        return RecordingResult(recording.name, None, recording.times, classes, nothing, (), truth, repetitions=())
+    person = getattr(recording, "person", "")
+    with progress(f"scanning {recording.name}{f', person {person}' * bool(person)}{which}") as bar:
+        if isinstance(recording, Lane):
+            return _of_person(indexer, recording, truth, bar)
+        times, scores, events = indexer.scan(recording.source, bar)
+        return RecordingResult(recording.name, None, times, classes, scores, events, truth)
+
+
+def _write(flags: Scan, folder: Path, indexer: Any, results: list[RecordingResult], notes: list[str], inputs: list[Path],
+    timings: dict[str, float],
+) -> Path:  # fmt: skip
+
+    number = len(by_recording(results))
+    arguments = {"command": "index scan", **dataclasses.asdict(flags)}
+    report = RecognitionReport(
+        f"Actions in {results[0].name}" if number == 1 else f"Actions in {number} recordings",
+        recordings=results,
+        exemplars=exemplars(indexer) if hasattr(indexer, "exemplar") else {},
+        notes=notes,
+        manifest=manifest(arguments, [path.expanduser() for path in inputs], getattr(indexer, "random_state", None), timings),
+    )
+    with progress("drawing the report", steps=False):
+        return write_recognition(folder, report)
+
+
+def _of_person(indexer: ActionIndexer, lane: Lane, truth: list[KnownEvent] | None, bar: Progress) -> RecordingResult:
+    """One person of a recording: explained, and what was found counted."""
+    assert lane.clip is not None
+    told = indexer.explain(lane.clip, bar)
+    counts = count_repetitions(lane.clip, told.events, exemplars(indexer))
+
+    def named(event: Event) -> Event:
+        return dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar))
+
+    held = [dataclasses.replace(one, event=named(one.event)) for one in told.withheld]
+    return RecordingResult(
+        lane.name, lane.clip, lane.times, [str(label) for label in told.classes], told.scores, list(map(named, told.events)), truth,
+        person=lane.person, withheld=held, repetitions=counts,
+    )  # fmt: skip
+
+
+def within_label(indexer: ActionIndexer, exemplar: int | None) -> int | None:
+    """An exemplar's number among those of its label, from its number in the model."""
+    if exemplar is None:
+        return None
+    labels = indexer.model_.labels
+    return int((labels[:exemplar] == labels[exemplar]).sum())
+
+
+def exemplars(indexer: ActionIndexer) -> dict[Any, list[Clip]]:
+    """Label -> the clips it was learned from."""
+    found: dict[Any, list[Clip]] = {}
+    for index in range(len(indexer.model_.labels)):
+        clip = indexer.exemplar(index)
+        found.setdefault(clip.label, []).append(clip)
+    return found
+
+
+def _unknown(truth: Sequence[Sequence[KnownEvent] | None] | None, indexer: Any) -> list[str]:
+    known = {str(label) for label in indexer.classes_}
+    strange = sorted({str(label) for events in truth or [] for label, _, _ in events or []} - known)
+    return [f"the model does not know {names(strange)}, which the known events name"] if strange else []
+
+
+def _scan_show(results: list[RecordingResult]) -> None:
+    """The events as a table, with the recording and the person where there are several."""
+    found = [(result, event) for result in results for event in result.events]
+    scores, margins = even([event.score for _, event in found]), even([event.margin for _, event in found])
+    columns, whose = _whose(results)
+    rows = [
+        [*whose(result), str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
+        for (result, event), score, margin in zip(found, scores, margins, strict=True)
+    ]
+    if rows:
+        table([*columns, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)
+
+
+def _counts_show(results: list[RecordingResult]) -> None:
+    """How often each action was performed, and how."""
+    columns, whose = _whose(results)
+    rows = [[*whose(result), *count_row(one)] for result in results for one in result.repetitions or ()]
+    if rows:
+        table([*columns, *COUNTS], rows)
+
+
+def _whose(results: Sequence[RecordingResult]) -> tuple[list[str], Callable[[RecordingResult], list[str]]]:
+    """Headings that tell recordings and people apart, where there are several, and a result's cells below them."""
+    named = {"recording": len({result.name for result in results}) > 1, "person": any(result.person for result in results)}
+    columns = [name for name, wanted in named.items() if wanted]
+    return columns, lambda result: [result.name] * named["recording"] + [result.person] * named["person"]
+
+
+def _summary(results: list[RecordingResult], seconds: float) -> str:
+    """What was found, where, and how long it took; of a recording with several people, its length counts once."""
+    found, files = sum(len(result.events) for result in results), by_recording(results)
+    length = sum(map(lasts, files))
+    where = f"{count(len(files), 'recording')} ({length:.1f} s long)"
+    people = sum(bool(result.person) for result in results)
+    who = f" of {count(people, 'person', 'people')}" if people else ""
+    return f"{count(found, 'action') if found else 'no action'}{who} found in {where} in {seconds:.1f} s"
+
+
+def _against_truth(results: list[RecordingResult]) -> str:
+    """How many of the known actions an event of the same name overlaps, and which are missed."""
+    lost = [(result, event) for result in results for event in missed(result)]
+    known = sum(len(result.truth or ()) for result in results)
+    named = ", ".join(f"{label} at {start:.2f} to {end:.2f} s" for _, (label, start, end) in lost[:5])
+    more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+    return f"{known - len(lost)} of {count(known, 'known action')} found" + (f"; missed: {named}{more}" if lost else "")
+
+
+def _right(results: list[RecordingResult]) -> list[str]:
+    """Precision and recall of what was reported, where both times overlap by half or more."""
+    compared = [result for result in results if result.truth is not None]
+    right, said = sum(map(matched, compared)), sum(len(result.events) for result in compared)
+    known = sum(len(result.truth or ()) for result in compared)
+    shares = [f"{name} {right / number:.3f}" for name, number in (("precision", said), ("recall", known)) if number]
+    return [f"{right} of {said} reported share half of their time or more with a known one ({', '.join(shares)})"] * bool(shares)
