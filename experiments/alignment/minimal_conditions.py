@@ -8,10 +8,9 @@ each kind by themselves and together with the usual ones; ``dyntorch count NAME 
 
 from __future__ import annotations
 
-from indexing.cli.commands.count import purpose
-
 from dyntorch import counting
 from experiments.common.tables import aligned, command
+from indexing.cli.commands.count import purpose
 
 WORDS = {
     "static": "stand still, unknown",
