@@ -61,11 +61,11 @@ _HOME = {
     "align_points": "dyntorch.tasks.align.points",
     "align_lines": "dyntorch.tasks.align.lines",
     "segment": "dyntorch.tasks.segment.segment",
-    "segment_tracks": "dyntorch.tasks.segment_tracks.segment_tracks",
+    "segment_tracks": "dyntorch.tasks.segment.tracks",
     "translating_planes": "dyntorch.tasks.planes.planes",
     "TranslatingPlanes": "dyntorch.tasks.planes.planes",
     "Segmentation": "dyntorch.tasks.segment.result",
-    "TrackSegmentation": "dyntorch.tasks.segment_tracks.result",
+    "TrackSegmentation": "dyntorch.tasks.segment.result",
     "Reconstruction": "dyntorch.tasks.reconstruct.result",
     "reconstruct": "dyntorch.tasks.reconstruct.reconstruct",
     "synchronize": "dyntorch.tasks.synchronize.synchronize",
@@ -91,7 +91,7 @@ _HOME = {
     "ReconstructOptions": "dyntorch.tasks.reconstruct.options",
     "SegmentOptions": "dyntorch.tasks.segment.options",
     "SynchronizeOptions": "dyntorch.tasks.synchronize.options",
-    "TrackSegmentOptions": "dyntorch.tasks.segment_tracks.options",
+    "TrackSegmentOptions": "dyntorch.tasks.segment.options",
     "TrajectoryOptions": "dyntorch.tasks.trajectories.trajectories",
 }
 _MODULES = {

@@ -21,7 +21,7 @@ SLOW_EXAMPLES = (
     "dyntorch.tasks.calibrate.calibrate.calibrate",
     "dyntorch.tasks.pair.pair.reconstruct_pair",
     "dyntorch.tasks.pair.result.PairReconstruction.images",
-    "dyntorch.tasks.segment_tracks.segment_tracks.segment_tracks",
+    "dyntorch.tasks.segment.tracks.segment_tracks",
     "dyntorch.tasks.synchronize.breaks.breaks",
     "dyntorch.tasks.synchronize.breaks.camera_breaks",
     "dyntorch.tasks.trajectories.trajectories.trajectory_cameras",

@@ -84,12 +84,11 @@ def segmented(
     bodies: int | None = None,
     threshold: float = DEFAULT,
     seed: int = 0,
-    options: dyn.SegmentOptions = dyn.SegmentOptions(),
 ) -> Outcome:
     """Segment a pair and compare with the truth."""
     clock = time.perf_counter()
     generator = torch.Generator().manual_seed(seed)
-    found = dyn.segment(pair.x1, pair.x2, bodies=bodies, threshold=threshold, generator=generator, options=options)
+    found = dyn.segment(pair.x1, pair.x2, bodies=bodies, threshold=threshold, generator=generator)
     seconds = time.perf_counter() - clock
     return Outcome(100 * float(misclassification(found.labels, pair.labels)), int(found.bodies), seconds)
 

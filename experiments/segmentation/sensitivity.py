@@ -1,9 +1,9 @@
-"""How much the segmentation depends on its own options, and whether they were fitted to the pairs that they are judged by.
+"""How much the segmentation depends on its own constants, and whether they were fitted to the pairs that they are judged by.
 
     DYNTORCH_DATA=../shared/data python -m experiments.segmentation.sensitivity
     DYNTORCH_DATA=../shared/data python -m experiments.segmentation.sensitivity --quick
 
-One option at a time is changed, the others keep their values (25 minutes).  Errors are misclassifications as in
+One constant at a time is changed, the others keep their values (25 minutes).  Errors are misclassifications as in
 ``experiments.segmentation.segmentation``.  Those of :func:`dyntorch.segment` were chosen while looking at these recordings, as one
 set for both; the last rows say what that is worth: for every pair of AdelaideRMF the setting with the least mean error on the
 *other* pairs is taken, and for every sequence of Hopkins155 that with the least on the other sequences (a sequence and its pairs
@@ -12,49 +12,52 @@ of bodies are one).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
+from types import ModuleType
 from typing import Annotated
+from unittest.mock import patch
 
 import tyro
 
-import dyntorch as dyn
+from dyntorch.tasks.segment import coherence, energy, labels, search
+from dyntorch.tasks.segment import segment as two_views
 from experiments.benchmarks.interleaved import threads
 from experiments.common.tables import NoiseConfig, Row, aligned, command, measured
 from experiments.recognition.protocol import data_folder
 from experiments.segmentation.data import hopkins_pairs, motion_pairs
 from experiments.segmentation.segmentation import left_out, segmented
 
-VARIED: tuple[tuple[str, str, tuple[float, ...]], ...] = (
-    ("labels", "outlier", (0.7, 1.4)),
-    ("labels", "strange", (1.5, 4.0)),
-    ("labels", "conforming", (0.15, 0.35)),
-    ("labels", "found", (3.0, 9.0)),
-    ("energy", "noise", (0.5, 1.0)),
-    ("energy", "cap", (3.0, 6.0)),
-    ("energy", "cut", (3.0, 5.0)),
-    ("energy", "parallax", (0.1, 0.3)),
-    ("count", "penalty", (3.5, 5.5)),
-    ("pool", "cut", (2.0, 4.5)),
-    ("descent", "noise", (0.35, 0.7)),
-    ("coherence", "noise", (2.0, 4.5)),
-    ("coherence", "linked", (0.2, 0.4)),
-    ("coherence", "tolerance", (0.5, 0.9)),
-    ("coherence", "edge_tolerance", (0.35, 0.7)),
+VARIED: tuple[tuple[ModuleType, str, tuple[float, float]], ...] = (
+    (labels, "OUTLIER_COST", (0.7, 1.4)),
+    (labels, "NONCONFORMITY_COST", (1.5, 4.0)),
+    (labels, "FREE_CONFORMITY", (0.15, 0.35)),
+    (labels, "ASSIGNMENT_GAIN", (3.0, 9.0)),
+    (energy, "SAMPSON_NOISE_PIXELS", (0.5, 1.0)),
+    (energy, "ENERGY_MAX_SQUARED_DISTANCE", (3.0, 6.0)),
+    (energy, "CUT_COST", (3.0, 5.0)),
+    (energy, "PARALLAX_WEIGHT", (0.1, 0.3)),
+    (two_views, "BODY_PENALTY", (3.5, 5.5)),
+    (search, "POOL_CUT_COST", (2.0, 4.5)),
+    (search, "DESCENT_NOISE_PIXELS", (0.35, 0.7)),
+    (two_views, "MATCH_NOISE_PIXELS", (2.0, 4.5)),
+    (two_views, "MIN_LINK_WEIGHT", (0.2, 0.4)),
+    (coherence, "DEVIATION_TOLERANCE", (0.5, 0.9)),
+    (coherence, "EDGE_TOLERANCE", (0.35, 0.7)),
 )
-"""Stage and field of :class:`dyntorch.SegmentOptions`, and the values that it takes besides its own."""
+"""Module, constant, and the values that it takes besides its own."""
 DEFAULT = "as shipped"
 
 
 @dataclass(frozen=True)
 class Config(NoiseConfig):
-    """The options of the segmentation, one at a time, on the recordings in the folder DYNTORCH_DATA."""
+    """The constants of the segmentation, one at a time, on the recordings in the folder DYNTORCH_DATA."""
 
     scenes: int = 3
     """Seeds per pair of AdelaideRMF."""
     quick: bool = False
-    """Three options."""
+    """Three constants."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/segmentation_sensitivity.json")
     """Where the results and this configuration are written as JSON."""
 
@@ -63,39 +66,35 @@ Errors = dict[str, float]
 """Percent by the name of a pair."""
 
 
-def adelaide(seeds: int, options: dyn.SegmentOptions) -> Errors:
+def adelaide(seeds: int) -> Errors:
     """Mean errors of the pairs, number of bodies unknown."""
-    return {pair.name: fmean(segmented(pair, seed=seed, options=options).error for seed in range(seeds)) for pair in motion_pairs()}
+    return {pair.name: fmean(segmented(pair, seed=seed).error for seed in range(seeds)) for pair in motion_pairs()}
 
 
-def hopkins(options: dyn.SegmentOptions) -> tuple[Errors, float]:
+def hopkins() -> tuple[Errors, float]:
     """Mean errors of every other sequence, number of bodies known, by sequence; and how often the number is found."""
     pairs = hopkins_pairs()[::2]
     errors: dict[str, list[float]] = {}
     for pair in pairs:
-        errors.setdefault(pair.name.split("_g")[0], []).append(segmented(pair, pair.bodies, options=options).error)
-    right = fmean(segmented(pair, options=options).bodies == pair.bodies for pair in pairs)
+        errors.setdefault(pair.name.split("_g")[0], []).append(segmented(pair, pair.bodies).error)
+    right = fmean(segmented(pair).bodies == pair.bodies for pair in pairs)
     return {name: fmean(found) for name, found in errors.items()}, 100 * right
-
-
-def varied(stage: str, field: str, value: float) -> dyn.SegmentOptions:
-    """The options as shipped, but for one field."""
-    options = dyn.SegmentOptions()
-    return replace(options, **{stage: replace(getattr(options, stage), **{field: value})})
 
 
 def sensitivity(config: Config) -> list[Row]:
     """Every setting, and what choosing among them on other recordings gives."""
-    settings = {DEFAULT: dyn.SegmentOptions()}
-    for stage, field, values in VARIED[:: 5 if config.quick else 1]:
-        settings |= {f"{stage}.{field} {value:g}": varied(stage, field, value) for value in values}
+    module, name, _ = VARIED[0]
+    settings = [(DEFAULT, module, name, getattr(module, name))]
+    for module, name, values in VARIED[:: 5 if config.quick else 1]:
+        settings += [(f"{name} {value:g}", module, name, value) for value in values]
     first, second, shares = {}, {}, {}
-    for setting, options in settings.items():
-        first[setting] = adelaide(config.scenes, options)
-        second[setting], shares[setting] = hopkins(options)
+    for setting, module, name, value in settings:
+        with patch.object(module, name, value):
+            first[setting] = adelaide(config.scenes)
+            second[setting], shares[setting] = hopkins()
     mean = {setting: (fmean(first[setting].values()), fmean(second[setting].values()), shares[setting]) for setting in first}
     lines = [(setting, *(f"{figure:.2f}" for figure in figures)) for setting, figures in mean.items()]
-    print(aligned(("option", "AdelaideRMF, K unknown, %", "Hopkins155, K known, %", "Hopkins155, K right, %"), lines))
+    print(aligned(("constant", "AdelaideRMF, K unknown, %", "Hopkins155, K known, %", "Hopkins155, K right, %"), lines))
     rows = []
     for column, (task, goal) in enumerate((("AdelaideRMF, K unknown", 1.0), ("Hopkins155, K known", 2.0))):
         figures = [found[column] for found in mean.values()]
@@ -118,7 +117,7 @@ def run(config: Config) -> None:
     data_folder()
     target = config.target()
     with threads(1):
-        measured(["The options of the segmentation, one at a time"], lambda _: sensitivity(config), target, vars(config))
+        measured(["The constants of the segmentation, one at a time"], lambda _: sensitivity(config), target, vars(config))
 
 
 if __name__ == "__main__":

@@ -20,8 +20,17 @@ from dyntorch.geometry.plane_motion import CommonPlane, PlaneMotion, motion_over
 from dyntorch.numerics.chi_square import three_sigma
 from dyntorch.numerics.least_squares import LeastSquaresOptions, minimize
 from dyntorch.numerics.nullspace import eigenvalues
-from dyntorch.tasks.align.options import AlignMetricOptions
 from dyntorch.tasks.align.result import OUTLIER, AlignNotice
+
+MAX_NORMAL_STEPS = 30  # of each descent on the normal of the plane
+LENGTH_ROUNDING = 1e-9  # relative deviation from equal lengths: homographies of pixels lose 6 of 16 digits
+MAX_EQUIVALENT_CHI_SQUARE = 9.0  # beyond the least, up to which a plane explains as well: three standard deviations
+MAX_HIDDEN_SHARE = 0.02  # of points behind cameras, beyond the least, up to which a plane shows them as well
+MIN_NORMAL_ANGLE = 0.03  # radians from which two normals are two
+MIN_NORMAL_DEVIATIONS = 3.0  # and besides so many standard deviations
+MAX_NORMAL_DEVIATION = 0.3  # radians; a camera that only turns leaves 1 and more
+MAX_CALIBRATION_MISFIT = 5.0  # chi-square over its quantile of three standard deviations
+MIN_LENGTH_DEVIATION = 0.003  # relative, that a calibration to two or three digits leaves
 
 
 class CalibratedViews(NamedTuple):
@@ -71,9 +80,9 @@ class CalibratedViews(NamedTuple):
         """Every problem so many times in a row."""
         return CalibratedViews(*(part.repeat_interleave(count, 0) for part in self))
 
-    def plane(self, options: AlignMetricOptions) -> CommonPlane:
+    def plane(self) -> CommonPlane:
         """The least squares problem of the normal."""
-        return CommonPlane(inverse=self.inverse, covariance=self.covariance, floor=options.floor)
+        return CommonPlane(inverse=self.inverse, covariance=self.covariance, floor=LENGTH_ROUNDING)
 
     def oriented(self, normal: Tensor) -> Tensor:
         """The normals ``(b, 3)`` or their opposites, such that most of the plane that view 1 sees lies before it."""
@@ -86,9 +95,9 @@ class CalibratedViews(NamedTuple):
         wrong = ((mapped @ normal[:, None, :, None])[..., 0] <= 0) & self.counts[:, None]
         return (wrong.sum(-1) / self.counts.sum(-1).clamp(min=1)[:, None]).amax(-1)
 
-    def motion(self, normal: Tensor, options: AlignMetricOptions) -> PlaneMotion:
+    def motion(self, normal: Tensor) -> PlaneMotion:
         """Rotations and translations ``(b, v + 1, ...)`` of all views, the first included, above the plane of a normal."""
-        H = torch.linalg.inv_ex(self.plane(options).corrected(normal))[0]
+        H = torch.linalg.inv_ex(self.plane().corrected(normal))[0]
         rotation, translation = motion_over(torch.where(H.isfinite(), H, 0.0), normal[:, None].expand(*H.shape[:2], 3))
         eye = torch.eye(3, dtype=H.dtype, device=H.device).expand(len(H), 1, 3, 3)
         return PlaneMotion(
@@ -111,25 +120,25 @@ class PlaneChoice(NamedTuple):
     """``(b,)`` standard deviation of the normal in its worst direction, radians."""
 
 
-def chosen_plane(views: CalibratedViews, options: AlignMetricOptions) -> PlaneChoice:
+def chosen_plane(views: CalibratedViews) -> PlaneChoice:
     """The plane that explains the homographies best, and before the cameras, from either solution of every view."""
     inverse = views.inverse
     b = len(inverse)
     starts = plane_motions(torch.linalg.inv(inverse)).normal.flatten(1, 2)
     count = starts.shape[1]
     wide = views.repeated(count)
-    problem = wide.plane(options)
-    found = minimize(problem, problem.evaluate((starts.flatten(0, 1),)), LeastSquaresOptions(iterations=options.steps))
+    problem = wide.plane()
+    found = minimize(problem, problem.evaluate((starts.flatten(0, 1),)), LeastSquaresOptions(iterations=MAX_NORMAL_STEPS))
     flat = wide.oriented(found.theta[0])
     normal, cost, wrong = flat.view(b, count, 3), found.cost.view(b, count), wide.behind(flat).view(b, count)
-    fits = cost <= cost.amin(-1, keepdim=True) + options.as_good
-    fits = fits & (wrong <= torch.where(fits, wrong, torch.inf).amin(-1, keepdim=True) + options.as_visible)
+    fits = cost <= cost.amin(-1, keepdim=True) + MAX_EQUIVALENT_CHI_SQUARE
+    fits = fits & (wrong <= torch.where(fits, wrong, torch.inf).amin(-1, keepdim=True) + MAX_HIDDEN_SHARE)
     best = torch.where(fits, cost, torch.inf).argmin(-1)
     row = torch.arange(b, device=best.device)
     chosen = normal[row, best]
-    r, turns, weight, _ = views.plane(options).weighted(chosen)
+    r, turns, weight, _ = views.plane().weighted(chosen)
     deviation = eigenvalues(turns.mT @ weight @ turns)[:, 0].clamp(min=torch.finfo(r.dtype).tiny).rsqrt()
-    apart = fits & ((normal - chosen[:, None]).norm(dim=-1) > options.other + options.deviations * deviation[:, None])
+    apart = fits & ((normal - chosen[:, None]).norm(dim=-1) > MIN_NORMAL_ANGLE + MIN_NORMAL_DEVIATIONS * deviation[:, None])
     second = normal[row, torch.where(apart, cost, torch.inf).argmin(-1)]
     return PlaneChoice(
         chosen,
@@ -140,23 +149,21 @@ def chosen_plane(views: CalibratedViews, options: AlignMetricOptions) -> PlaneCh
     )
 
 
-def euclidean(
-    solution: Solution, data: Matches, labels: Tensor, K: Tensor, options: AlignMetricOptions
-) -> tuple[PlaneMotion, PlaneMotion, list[Notice]]:
+def euclidean(solution: Solution, data: Matches, labels: Tensor, K: Tensor) -> tuple[PlaneMotion, PlaneMotion, list[Notice]]:
     """Motion of calibrated cameras above a plane, another that explains the matches as well, and what limits both. labels
     ``(b, n)``, K ``(b, views, 3, 3)``."""
     views = CalibratedViews.of(solution, data, labels, K)
-    choice = chosen_plane(views, options)
-    free = views.fine & (choice.deviation > options.undetermined)
+    choice = chosen_plane(views)
+    free = views.fine & (choice.deviation > MAX_NORMAL_DEVIATION)
     several = views.fine & ~free & (choice.other != 0).any(-1)
     degrees = 2 * views.inverse.shape[1] - 2
-    odd = views.known & (choice.cost > options.misfit * three_sigma(degrees)) & (choice.misfit > options.small)
+    odd = views.known & (choice.cost > MAX_CALIBRATION_MISFIT * three_sigma(degrees)) & (choice.misfit > MIN_LENGTH_DEVIATION)
     notices, note = noting(data.batch)
     note(AlignNotice.PLANE_OPEN, choice.deviation.clamp(max=9.9), free)
     note(AlignNotice.TWO_PLANES, _angle(choice.normal, choice.other), several)
     note(AlignNotice.CALIBRATION, choice.misfit, odd & ~free)
-    first = views.motion(choice.normal, options)
-    second = views.motion(torch.where(several[:, None], choice.other, choice.normal), options)
+    first = views.motion(choice.normal)
+    second = views.motion(torch.where(several[:, None], choice.other, choice.normal))
     return _kept(first, views.fine, ~free, data), _kept(second, several, several, data), notices
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.residual import whitened
@@ -21,7 +22,7 @@ from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.numerics.blocks import select
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
-from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, THRESHOLD_SIGMAS, Evidence, Labelled, joined, static_consensus
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 from dyntorch.tasks.align.several import motion_of_all, moving_points
@@ -48,13 +49,21 @@ MORE_VIEWS = Message(
 )
 
 
+MIN_JOIN_MATCHES = 60  # from which on the join tensor itself gives a start
+NUM_JOIN_SAMPLES = 1000  # of five: 97 % to draw five static ones where they are 20 % of all
+MAX_JOIN_STEPS = 30  # of the final refinement
+MAX_JOIN_DEVIATION = 0.5  # of the worst direction of a motion of norm 1, above which it is not known at all
+MIN_SPARE_JOIN = 10  # conditions beyond the degrees of freedom that inliers must fulfil
+MAX_JOIN_TRAJECTORY_DISTANCE = 3.0  # standard deviations of the noise from a trajectory line
+
+
 def align_join(
     data: Matches, threshold: float | None, model: str, generator: torch.Generator | None, options: AlignOptions
 ) -> Alignment:
     """:func:`dyntorch.align_points` with a join tensor, for checked matches."""
-    evidence = Evidence.of(moving_points(3, len(data.views)), data, options)
+    evidence = Evidence.of(moving_points(3, len(data.views)), data)
     best = _search(evidence, threshold, model, generator, options)
-    solution, labels, worst = _solved(evidence, best, options)
+    solution, labels, worst = _solved(evidence, best)
     outcome = replace(solution, inliers=labels != OUTLIER).back(data)
     A, B, *others = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
@@ -76,18 +85,14 @@ def _search(
     evidence: Evidence, threshold: float | None, model: str, generator: torch.Generator | None, options: AlignOptions
 ) -> Labelled:
     """The best of the motions that static samples and the tensors lead to."""
-    given = (
-        None
-        if threshold is None
-        else torch.full_like(evidence.floor, threshold / options.labels.threshold_in_sigmas).maximum(evidence.floor)
-    )
+    given = None if threshold is None else torch.full_like(evidence.floor, threshold / THRESHOLD_SIGMAS).maximum(evidence.floor)
     starts = [_from_static(evidence, given, generator, options)]
     if evidence.data.count >= MINIMAL[model]:
-        starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator, options))
-    full, size = model == "join" and evidence.data.count >= options.join.full, len(evidence.floor)
+        starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator))
+    full, size = model == "join" and evidence.data.count >= MIN_JOIN_MATCHES, len(evidence.floor)
     if given is None:
         if full:
-            starts.append(_from_tensor(JoinTensor(), evidence, None, generator, options))
+            starts.append(_from_tensor(JoinTensor(), evidence, None, generator))
         # the least estimate is that of a motion most matches agree with; it may be low, for static matches show half the noise
         sigma = 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
         theta = _improved(evidence, [start for start, _ in starts], sigma, sampled=True)
@@ -96,7 +101,7 @@ def _search(
         # where the noise is known, so is whether the motion of the minimal tensor is the right one
         doubt = _doubt(evidence, theta[-size:], given) if full else torch.zeros_like(given)
         if bool(doubt.any()):
-            last, _ = _from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator, options)
+            last, _ = _from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator)
             theta = torch.cat([theta, _improved(evidence, [last], given, sampled=False)])
     count = len(theta) // size if size else 1
     best = evidence.repeated(count).cost(theta, sigma.repeat(count)).unflatten(0, (count, size)).argmin(0)
@@ -129,8 +134,8 @@ def _from_static(
         pool = torch.where((known.sum(-1) >= ENOUGH)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * three_sigma(evidence.still) * (options.labels.rough * scale * given).square()
-    motion, variance = static_consensus(evidence.views, pool, limit, options.join.samples, generator, options)
+    limit = None if given is None else 2 * three_sigma(evidence.still) * (ROUGH_LABEL_FACTOR * scale * given).square()
+    motion, variance = static_consensus(evidence.views, pool, limit, options.num_samples or NUM_JOIN_SAMPLES, generator)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     if given is not None:
         return theta, given
@@ -139,7 +144,7 @@ def _from_static(
 
 
 def _from_tensor(
-    invariant: Invariant, evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, options: AlignOptions
+    invariant: Invariant, evidence: Evidence, given: Tensor | None, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor]:
     """Motion of a tensor by robust estimation, and the noise that the median of all matches shows."""
     data = evidence.data
@@ -159,7 +164,7 @@ def _from_tensor(
     if given is not None:
         return theta, given
     if plain:
-        refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), options.join.steps)
+        refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_JOIN_STEPS)
         assert refined.sigma is not None
         theta, noise = joined(refined), refined.sigma
     else:
@@ -170,16 +175,14 @@ def _from_tensor(
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 
-def _solved(evidence: Evidence, best: Labelled, options: AlignOptions) -> tuple[Solution, Tensor, Tensor]:
+def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
     """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
-    refined = evidence.refined(best.theta, best.labels, options.join.steps)
+    refined = evidence.refined(best.theta, best.labels, MAX_JOIN_STEPS)
     theta = joined(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
-    status = _status(
-        evidence, replace(best, labels=labels), worst, values[:, 0] <= options.join.indeterminate * values[:, -1], options
-    )
+    status = _status(evidence, replace(best, labels=labels), worst, values[:, 0] <= MIN_INFORMATION * values[:, -1])
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     assert refined.sigma is not None and refined.covariance is not None
@@ -195,15 +198,15 @@ def _solved(evidence: Evidence, best: Labelled, options: AlignOptions) -> tuple[
     return solution, labels, worst
 
 
-def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Tensor, options: AlignOptions) -> Tensor:
+def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Tensor) -> Tensor:
     usable = evidence.data.weights > 0
     present = usable.sum(-1)
     known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
     still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
     conditions = evidence.still * still + evidence.invariant.codim * moving
-    accident = (still + moving < options.join.consensus * present) | (conditions < evidence.invariant.dof + options.join.spare)
+    accident = (still + moving < MIN_CONSENSUS * present) | (conditions < evidence.invariant.dof + MIN_SPARE_JOIN)
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    status = torch.where(worst > options.join.ambiguous, int(Status.AMBIGUOUS), torch.zeros_like(present))
+    status = torch.where(worst > MAX_JOIN_DEVIATION, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined, int(Status.DEGENERATE), status)
     return torch.where((present < MINIMAL["join"]) & (known < ENOUGH), int(Status.TOO_FEW), status)
@@ -217,13 +220,13 @@ def _notices(
     found, note = noting(batch)
     note(AlignNotice.FEW_MOVING, moving, solved & (moving < MOVERS) & (still < ENOUGH), least=f"{MOVERS} and more")
     note(AlignNotice.NEAR_STATIC, moving, solved & (moving < LINES) & (still >= ENOUGH), case="matches")
-    lines = trajectory_lines(evidence, best, options)
+    lines = trajectory_lines(evidence, best)
     note(AlignNotice.FEW_LINES, lines, solved & (moving > lines) & (lines < LINES), least=LINES)
-    note(AlignNotice.UNCERTAIN, worst, solved & (worst > options.join.uncertain), case="matches", what="motion")
+    note(AlignNotice.UNCERTAIN, worst, solved & (worst > options.max_deviation), case="matches", what="motion")
     return in_order(found)
 
 
-def trajectory_lines(evidence: Evidence, best: Labelled, options: AlignOptions) -> Tensor:
+def trajectory_lines(evidence: Evidence, best: Labelled) -> Tensor:
     """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES."""
     parts = evidence.problem(best.labels).parts(best.theta)
     others = [inhomogeneous(homogeneous(x) @ m.mT) for m, x in zip(parts, evidence.views[1:], strict=True)]
@@ -233,7 +236,7 @@ def trajectory_lines(evidence: Evidence, best: Labelled, options: AlignOptions) 
     along = ends.gather(0, widest[None, ..., None].expand(1, -1, -1, 3))[0] / length[..., None].clamp(min=1e-12)
     problem = torch.arange(len(length), device=length.device)
     left, count = best.labels == MOVING, torch.zeros(len(length), dtype=torch.long, device=length.device)
-    noise = options.join.room * (evidence.norm.scales[0] * best.sigma)[:, None]
+    noise = MAX_JOIN_TRAJECTORY_DISTANCE * (evidence.norm.scales[0] * best.sigma)[:, None]
     for _ in range(LINES):
         longest = torch.where(left, length, -1.0).argmax(-1)
         centre, direction, base = places[:, problem, longest].mean(0), along[problem, longest], length[problem, longest]

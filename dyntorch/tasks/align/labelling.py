@@ -17,8 +17,16 @@ from dyntorch.geometry.homogeneous import apply, homogeneous
 from dyntorch.numerics.blocks import each, map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.nullspace import spectrum
-from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
+
+NUM_LABEL_ROUNDS = 3  # of labelling and refining with the noise known
+NUM_LABEL_ROUNDS_UNKNOWN_NOISE = 6  # turns with the noise to be found as well
+NOISE_TOLERANCE = 0.02  # relative change of the noise that needs no further round
+THRESHOLD_SIGMAS = 3.0  # a threshold, in standard deviations of the noise of one coordinate
+ROUGH_LABEL_FACTOR = 3.0  # width of the first labels over that of the noise, where the motion comes from a minimal sample
+MAX_WIDENING = 4.0  # of a limit by the uncertainty of the motion: a moving match called static gives a wrong motion
+NUM_LABEL_STEPS = 6  # of Levenberg-Marquardt between two labellings
+NUM_SCORED_MATCHES = 256  # that judge a hypothesis: enough to tell 5 % of agreement from none
 
 
 @dataclass(frozen=True)
@@ -44,10 +52,9 @@ class Evidence:
     """Normalized."""
     floor: Tensor
     """``(b,)`` the least noise that the numbers allow, in the unit of the matches."""
-    options: AlignOptions
 
     @classmethod
-    def of(cls, invariant: Invariant, data: Matches, options: AlignOptions) -> Evidence:
+    def of(cls, invariant: Invariant, data: Matches) -> Evidence:
         """From checked matches; those with ``data.static`` are known not to move."""
         largest = data.weights.amax(-1, keepdim=True).clamp(min=torch.finfo(torch.float64).tiny)
         flat = replace(
@@ -55,7 +62,7 @@ class Evidence:
         )
         norm = normalization(invariant, flat.views, flat.weights)
         floor = 100 * torch.finfo(data.dtype).eps / torch.stack(norm.scales).amin(0)
-        return Evidence(invariant, flat, norm, norm.apply(invariant, flat.views), floor, options=options)
+        return Evidence(invariant, flat, norm, norm.apply(invariant, flat.views), floor)
 
     @property
     def still(self) -> int:
@@ -72,7 +79,7 @@ class Evidence:
         data = replace(self.data, views=views, weights=weights, static=static, batch=weights.shape[:1])
         transforms, actions = each(again, (self.norm.transforms, self.norm.actions))
         norm = Normalization(transforms, self.norm.primitives, actions)
-        return Evidence(self.invariant, data, norm, each(again, self.views), again(self.floor), options=self.options)
+        return Evidence(self.invariant, data, norm, each(again, self.views), again(self.floor))
 
     def weighted(self, weights: Tensor) -> Evidence:
         """With the matches of each problem weighted by ``(b,)``; 0 leaves a problem out."""
@@ -120,7 +127,7 @@ class Evidence:
             pieces = [self._widened(theta, spread, piece) for piece in self._pieces(theta)]
             for k, (plain, limit) in enumerate(zip((path, still), limits, strict=True)):
                 widened = torch.cat([piece[k] for piece in pieces], dim=-1)
-                agree[k] = agree[k] | ((widened <= limit) & (plain <= self.options.labels.widest**2 * limit))
+                agree[k] = agree[k] | ((widened <= limit) & (plain <= MAX_WIDENING**2 * limit))
         if self.data.static is not None:
             agree[0] = agree[0] & ~self.data.static
         labels = torch.where(agree[1], STATIC, torch.where(agree[0], MOVING, OUTLIER))
@@ -165,25 +172,25 @@ class Evidence:
 
     def improved(self, theta: Tensor, sigma: Tensor, rough: Tensor) -> Tensor:
         """One labelling and refinement; where ``rough (b,)``, the motion comes from a minimal sample of static matches."""
-        labels = self.labels(theta, torch.where(rough, self.options.labels.rough * sigma, sigma))
+        labels = self.labels(theta, torch.where(rough, ROUGH_LABEL_FACTOR * sigma, sigma))
         # what a rough motion says about moving matches is left to chance
         labels = torch.where(rough[:, None] & (labels == MOVING), OUTLIER, labels)
-        return joined(self.refined(theta, labels, self.options.labels.steps))
+        return joined(self.refined(theta, labels, NUM_LABEL_STEPS))
 
     def settled(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
         """Label and refine in turns, until the labels stay; ``estimate``: and the noise with them."""
         labels, steady = self.labels(theta, sigma), not estimate
-        for _ in range(self.options.labels.rounds_with_noise if estimate else self.options.labels.rounds):
+        for _ in range(NUM_LABEL_ROUNDS_UNKNOWN_NOISE if estimate else NUM_LABEL_ROUNDS):
             _, spread = self.information(theta, labels)
             new = self.labels(theta, sigma, spread)
             if bool((new == labels).all()) and steady:
                 break
             labels = new
-            found = self.refined(theta, labels, self.options.labels.steps)
+            found = self.refined(theta, labels, NUM_LABEL_STEPS)
             theta = joined(found)
             if estimate and found.sigma is not None:
                 old, sigma = sigma, torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
-                steady = bool(((sigma - old).abs() <= self.options.labels.steady * old).all())
+                steady = bool(((sigma - old).abs() <= NOISE_TOLERANCE * old).all())
         return Labelled(theta, labels, sigma)
 
 
@@ -206,7 +213,6 @@ def static_consensus(
     limit: Tensor | None,
     samples: int,
     generator: torch.Generator | None,
-    options: AlignOptions,
 ) -> tuple[tuple[Tensor, ...], Tensor]:
     r"""Collineations of view 2, 3, ... to view 1 on which the most matches agree, from samples of d + 2 matches. views
     ``(b, n, d)``, pool ``(b, n)``, limit ``(b,)`` -> ``(b, d + 1, d + 1)``."""
@@ -223,7 +229,7 @@ def static_consensus(
             place = place + (place >= other)
         taken.append(place)
     chosen = torch.stack(taken, -1).clamp(max=n - 1)
-    judges = shuffled[:, : options.labels.judges]
+    judges = shuffled[:, :NUM_SCORED_MATCHES]
     size = max(1, BLOCK // max(1, samples * judges.shape[-1] * (d + 1)))
     return map_blocks(_search, views, shuffled, chosen, judges, count, limit, size=size)
 

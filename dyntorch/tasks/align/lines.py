@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.core.fit import fit_matches
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.matrix import gram
 from dyntorch.core.normalize import Normalization, denormalize_motion
@@ -27,6 +28,7 @@ from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, by_match, derivatives, minimize
 from dyntorch.numerics.messages import Message
 from dyntorch.numerics.nullspace import spectrum
+from dyntorch.tasks.align.labelling import THRESHOLD_SIGMAS
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
@@ -37,6 +39,18 @@ from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, Alig
 FIVE = 5  # static lines that determine a collineation
 DESCENT = LeastSquaresOptions(iterations=12, stuck_damping=1e5, tolerance=1e-10)
 DOF = TranslatingLinesMatrix.dof
+
+
+NUM_LINE_ROUNDS = 4  # of labelling and least squares
+MIN_LINES_UNKNOWN_NOISE = 45  # three times the degrees of freedom: below, noise and outliers cannot be told apart
+MIN_LINE_SINGULAR_VALUE = 2.0  # over the noise, to count; missing ones reach 1.7, true ones of 45 lines begin at 2.4
+MAX_LINE_DEVIATION = 0.5  # of the worst direction of A of norm 1, above which it is not known at all
+MIN_AGREEING_SHARE = 0.65  # with the robust start, below which static lines are tried: wrong ones reach .54
+NUM_LINE_SAMPLES = 2000  # of five static lines: eight of them are clean where a third of the lines is static
+SAMPLE_THRESHOLD_FACTOR = 4.0  # times the threshold within which a line agrees with such a sample
+NUM_WEAK_DIRECTIONS = 4  # of the matrix from which another motion is looked for where its rank is short
+MAX_RIVAL_COST = 1.3  # squared error over the least, up to which another motion explains as well (.9 to 1.2)
+MIN_SPARE_LINES = 6  # conditions beyond the degrees of freedom that inliers must fulfil
 
 
 @dataclass(frozen=True)
@@ -153,13 +167,11 @@ def _two_points(line: Tensor, present: Tensor) -> Tensor:
     return torch.stack([nearest - size / 2 * along, nearest + size / 2 * along], dim=-2)
 
 
-def settle(
-    lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain: bool, options: AlignOptions
-) -> tuple[Tensor, Tensor, Tensor]:
+def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain: bool) -> tuple[Tensor, Tensor, Tensor]:
     """Label and refine in turns: A ``(b, 16)`` in normalized coordinates, labels ``(b, n)``, noise ``(b,)``."""
     present = lines.data.weights > 0
     labels = torch.where(present, MOVING, OUTLIER) if plain else _labels(lines, theta, sigma)
-    for _ in range(options.lines.rounds):
+    for _ in range(NUM_LINE_ROUNDS):
         theta = refined(lines, theta, labels)
         if estimate:
             left = lines.residual(theta, labels).square().sum(-1)
@@ -227,7 +239,7 @@ def align_lines(
     weights: Tensor | None = None,
     static: Tensor | None = None,
     generator: torch.Generator | None = None,
-    options: AlignOptions = AlignOptions(),
+    options: AlignOptions | None = None,
 ) -> Alignment:
     r"""Motion of a 3D sensor from two views of lines, with a label for every line: static, moving or outlier.
 
@@ -250,7 +262,7 @@ def align_lines(
             of every problem (at least half of the lines must be inliers; fewer than 45 lines are all taken as such).
         weights: ``(*batch, n)`` not negative; 0 leaves a line out.
         generator: source of the random samples.
-        options: every number that decides, by stage and model; ``dataclasses.replace`` changes some of them.
+        options: what the search takes and expects; None is :class:`dyntorch.AlignOptions` as it is.
 
     Returns:
         An :class:`~dyntorch.tasks.align.result.Alignment` with A only.
@@ -270,6 +282,7 @@ def align_lines(
         >>> bool((result.A - scene.motion[0]).norm() < 0.02)
         True
     """
+    options = AlignOptions() if options is None else options
     check_options(options, AlignOptions)
     check_threshold(threshold)
     data = matches(TranslatingLinesMatrix(), (l1, l2), weights, static)
@@ -310,15 +323,15 @@ def _align(
     flat = replace(data, views=as_points(data.views, data.weights), batch=data.weights.shape[:1], dtype=torch.float64)
     flat = replace(flat, weights=flat.weights / flat.weights.amax(-1, keepdim=True).clamp(min=1e-300), device=flat.weights.device)
     joined = _joined(flat, points)
-    given = None if threshold is None else torch.full_like(flat.weights[:, 0], threshold / options.labels.threshold_in_sigmas)
-    plain = (given is None and joined.count < options.lines.certain) or not len(flat.weights)
+    given = None if threshold is None else torch.full_like(flat.weights[:, 0], threshold / THRESHOLD_SIGMAS)
+    plain = (given is None and joined.count < MIN_LINES_UNKNOWN_NOISE) or not len(flat.weights)
     start = (
         fit_matches(TranslatingLinesMatrix(), joined)
         if plain
         else robust_fit(
             TranslatingLinesMatrix,
             *joined.views,
-            threshold=None if given is None else (options.labels.threshold_in_sigmas * given),
+            threshold=None if given is None else (THRESHOLD_SIGMAS * given),
             weights=joined.weights,
             generator=generator,
         )
@@ -330,7 +343,7 @@ def _align(
         bound = three_sigma(1) * (_noise(lines, theta, plain) if given is None else given.maximum(lines.floor)).square()
         theta = _better(lines, theta, usable, bound, generator, options)
     sigma = _noise(lines, theta, plain) if given is None else given.maximum(lines.floor)
-    theta, labels, sigma = settle(lines, theta, sigma, estimate=given is None, plain=plain, options=options)
+    theta, labels, sigma = settle(lines, theta, sigma, estimate=given is None, plain=plain)
     return _result(data, lines, start, theta, labels, sigma, usable, points, options)
 
 
@@ -341,7 +354,7 @@ def _from_static(lines: Lines, bound: Tensor, generator: torch.Generator | None,
     planes = planes / planes[..., :3].norm(dim=-1, keepdim=True).clamp(min=1e-12)
     rows = (planes[..., :, None, :, None] * homogeneous(second)[..., None, :, None, :]).flatten(-2).flatten(-3, -2)  # (b, n, 4, 16)
     rows = torch.where((lines.data.weights > 0)[..., None, None], rows, 0.0)
-    draw = torch.randint(rows.shape[1], (options.lines.samples, FIVE), generator=generator).to(rows.device)
+    draw = torch.randint(rows.shape[1], (options.num_samples or NUM_LINE_SAMPLES, FIVE), generator=generator).to(rows.device)
     sample = rows[:, draw].flatten(2, 3)  # (b, samples, 16, 16)
     found = spectrum(sample.mT @ sample)[1][..., 0]
     present = lines.data.weights > 0
@@ -352,9 +365,9 @@ def _from_static(lines: Lines, bound: Tensor, generator: torch.Generator | None,
         away = (moved @ planes[:, None].mT / moved[..., 3:]).square().amax((-2, -1)) / lines.norm.scales[0][:, None, None].square()
         return (away <= times**2 * bound[:, None, None]) & present[:, None]
 
-    support = agree(found, options.lines.loose).sum(-1)
+    support = agree(found, SAMPLE_THRESHOLD_FACTOR).sum(-1)
     best = found.gather(1, support.argmax(-1)[:, None, None].expand(-1, 1, 16))
-    for times in (options.lines.loose, options.lines.loose / 2, 1.0):  # more lines and less noise in each turn
+    for times in (SAMPLE_THRESHOLD_FACTOR, SAMPLE_THRESHOLD_FACTOR / 2, 1.0):  # more lines and less noise in each turn
         kept = rows * agree(best, times)[:, 0, :, None, None]
         best = spectrum(torch.einsum("bnij,bnik->bjk", kept, kept))[1][:, None, :, 0]
     return best[:, 0]
@@ -370,7 +383,7 @@ def _better(
         return torch.where(present, lines.moving(motion).square().nan_to_num(torch.inf).minimum(bound[:, None]), 0.0)
 
     here = squares(theta)
-    doubtful = usable & (((here < bound[:, None]) & present).sum(-1) < options.lines.agreed * present.sum(-1))
+    doubtful = usable & (((here < bound[:, None]) & present).sum(-1) < MIN_AGREEING_SHARE * present.sum(-1))
     if not bool(doubtful.any()):
         return theta
     other = _from_static(lines, bound, generator, options)
@@ -413,16 +426,16 @@ def _result(
     worst = sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
     present = (data.weights > 0).sum(-1)
     conditions = (labels != OUTLIER).sum(-1) + 3 * (labels == STATIC).sum(-1) + (0 if points is None else 3 * points[0].shape[1])
-    accident = ((labels != OUTLIER).sum(-1) < options.lines.consensus * present) | (
-        (conditions < TranslatingLinesMatrix.dof + options.lines.spare) & (present > MINIMAL)
+    accident = ((labels != OUTLIER).sum(-1) < MIN_CONSENSUS * present) | (
+        (conditions < TranslatingLinesMatrix.dof + MIN_SPARE_LINES) & (present > MINIMAL)
     )
-    status = torch.where(worst > options.lines.ambiguous, int(Status.AMBIGUOUS), torch.zeros_like(present))
+    status = torch.where(worst > MAX_LINE_DEVIATION, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
-    rank = _rank(lines, labels, sigma, usable, points, options)
+    rank = _rank(lines, labels, sigma, usable, points)
     status = torch.where((rank <= RANKS[-1][0]) & (status == Status.OK), int(Status.AMBIGUOUS), status)
     doubtful = (rank < MINIMAL) & (status == Status.OK)
     status = torch.where(_rivals(lines, theta, labels, points, doubtful, options), int(Status.AMBIGUOUS), status)
-    status = torch.where(extent[:, 0] <= options.lines.indeterminate * extent[:, 1], int(Status.DEGENERATE), status)
+    status = torch.where(extent[:, 0] <= MIN_INFORMATION * extent[:, 1], int(Status.DEGENERATE), status)
     status = torch.where(usable, status, start.status.to(status))
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
@@ -455,22 +468,18 @@ def _rivals(
     joined = _joined(lines.data.restricted(labels != OUTLIER), points)
     _, vectors = spectrum(gram(model.primitives, lines.norm.apply(model, joined.views), joined.weights))
     best, here = problem.normal_equations(theta)[0], unit(theta.unflatten(-1, (4, 4)))
-    weakest = vectors[..., : options.lines.starts].unbind(-1)
+    weakest = vectors[..., :NUM_WEAK_DIRECTIONS].unbind(-1)
     mixed = [one + sign * two for one, two in combinations(weakest, 2) for sign in (1, -1)]
     for flat in (*weakest, *mixed):
         start = model.decompose(flat.unflatten(-1, (6, 6))).flatten(1)
         other = refined(lines, torch.where(start.isfinite(), start, theta), labels)
         there = unit(other.unflatten(-1, (4, 4)))
-        far = (
-            torch.minimum((there - here).flatten(1).norm(dim=-1), (there + here).flatten(1).norm(dim=-1)) > options.lines.uncertain
-        )
-        found |= far & (problem.normal_equations(other)[0] <= options.lines.rival * best)
+        far = torch.minimum((there - here).flatten(1).norm(dim=-1), (there + here).flatten(1).norm(dim=-1)) > options.max_deviation
+        found |= far & (problem.normal_equations(other)[0] <= MAX_RIVAL_COST * best)
     return found & doubtful
 
 
-def _rank(
-    lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: tuple[Tensor, Tensor] | None, options: AlignOptions
-) -> Tensor:
+def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: tuple[Tensor, Tensor] | None) -> Tensor:
     """Singular values ``(b,)`` of the estimation matrix above the noise: of the inliers, of all lines where there is no motion."""
     kept = lines.data.restricted((labels != OUTLIER) | ~usable[:, None])
     joined = _joined(kept, points)
@@ -479,7 +488,7 @@ def _rank(
     values = fit_matches(TranslatingLinesMatrix(), joined).singular_values
     noise = torch.where(usable, sigma, lines.floor) * torch.stack(lines.norm.scales).mean(0)
     noise = noise * joined.weights.square().sum(-1).sqrt()
-    return (values > torch.maximum(options.lines.above * noise[:, None], 1e-9 * values[:, :1])).sum(-1)
+    return (values > torch.maximum(MIN_LINE_SINGULAR_VALUE * noise[:, None], 1e-9 * values[:, :1])).sum(-1)
 
 
 def _notices(
@@ -490,5 +499,5 @@ def _notices(
     for most, case in RANKS:
         note(AlignNotice.PURE_TRANSLATION, rank, enough & (rank > least) & (rank <= most), case=case, full=MINIMAL)
         least = most
-    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > options.lines.uncertain), case="lines", what="motion")
+    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > options.max_deviation), case="lines", what="motion")
     return in_order(found)

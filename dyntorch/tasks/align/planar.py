@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.robust import robust_fit
@@ -22,7 +23,7 @@ from dyntorch.numerics.blocks import one_thread, select
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align.euclidean import euclidean
-from dyntorch.tasks.align.labelling import Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, THRESHOLD_SIGMAS, Evidence, Labelled, joined, static_consensus
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 from dyntorch.tasks.align.several import motion_of_all, moving_points, still_but_one, three_of
@@ -37,8 +38,26 @@ NOTICES_MINIMAL = 4
 """Static matches that determine the motion."""
 
 
+PLANAR_RANK_TOLERANCE = 1e-9  # singular value over the largest that rounding alone leaves
+# of the weakest equation; .4 to .7 where all is static, 1.3 to 1.6 at 1 to 5 px of motion and .5 px noise
+MIN_TENSOR_STRENGTH = 2.0
+MIN_DETERMINED_STRENGTH = 1.2  # corrected for 26 equations: .7 to .9 where all make equal steps, .5 where all is static
+MIN_STATIC_SUPPORT = 10  # static matches that decide such a family; a wrong motion makes 0 to 6 of 80 matches static
+STATIC_SUPPORT_FACTOR = 3.0  # static matches for each that is expected by chance, besides
+CHANCE_LIMIT_FACTOR = 3.0  # times the limit of static matches within which those that are static by chance spread evenly
+MIN_LINE_WIDTH = 3.0  # standard deviations of the noise across a line of points, below which they may as well lie on it
+MAX_TRAJECTORY_DISTANCE = 3.0  # standard deviations of the noise from a trajectory line
+NUM_PLANAR_SAMPLES = 1000  # of four: 96 % to draw four static ones where they are 24 % of all
+MAX_PLANAR_STEPS = 30  # of the final refinement
+MAX_DEVIATION = 0.5  # of the worst direction of a motion of norm 1, above which it is not known at all
+MIN_SINGULAR_RATIO = 1e-3  # of a homography in normalized coordinates; usually above .1
+MAX_NOISE_RATIO = 1.3  # shown by the inliers over assumed; random matches fill the limits evenly (1.7)
+MIN_NOISY_INLIER_SHARE = 0.7  # where the inliers show more noise than that
+MIN_SPARE_PLANAR = 8  # conditions beyond the 16 degrees of freedom that inliers must fulfil
+
+
 def planar_notices(
-    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], status: Tensor, batch: tuple[int, ...], options: AlignOptions
+    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], status: Tensor, batch: tuple[int, ...]
 ) -> tuple[Notice, ...]:
     """All notices on a flat batch of problems with final labels, in the order of the problems; ``tensor`` from
     :func:`tensor_rank`."""
@@ -50,47 +69,47 @@ def planar_notices(
     found, note = noting(batch)
     full = HomographyTensor.width() - 1
     note(AlignNotice.DEGENERATE, rank, solved & (rank < full))
-    note(AlignNotice.NEAR_STATIC, strength, solved & (rank >= full) & (strength < options.planar.near_static), case="tensor")
-    family = (status == Status.AMBIGUOUS) & undecided(evidence, best, tensor, options)
+    note(AlignNotice.NEAR_STATIC, strength, solved & (rank >= full) & (strength < MIN_TENSOR_STRENGTH), case="tensor")
+    family = (status == Status.AMBIGUOUS) & undecided(evidence, best, tensor)
     note(AlignNotice.OTHER_SOLUTION, (best.labels == STATIC).sum(-1), family)
     note(AlignNotice.FEW_MOVING, count, solved & (count < FEWEST), least=f"{FEWEST}")
-    lines = trajectory_lines(evidence, best, moving, options)
+    lines = trajectory_lines(evidence, best, moving)
     note(AlignNotice.FEW_LINES, lines, solved & (lines > 0) & (lines < LINES), least=LINES)
     note(AlignNotice.ONE_LINE, lines, solved & (lines == 1))
     thin = thinness(evidence, best.sigma)
-    note(AlignNotice.COLLINEAR, thin, (data.weights > 0).any(-1) & (thin < options.planar.thin))
+    note(AlignNotice.COLLINEAR, thin, (data.weights > 0).any(-1) & (thin < MIN_LINE_WIDTH))
     doubtful = (best.labels == MOVING) & unverified(evidence, best)
     note(AlignNotice.UNVERIFIED, doubtful.sum(-1), solved & doubtful.any(-1))
     return in_order(found)
 
 
-def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor, options: AlignOptions) -> tuple[Tensor, Tensor]:
+def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor) -> tuple[Tensor, Tensor]:
     """Numeric rank ``(b,)`` of the estimation matrix, and how far its 26th singular value is above the noise."""
     # a row of unit length changes by about the noise of the normalized coordinates
     noise = sigma * torch.stack(evidence.norm.scales).square().mean(0).sqrt() * inliers.weights.square().sum(-1).sqrt()
     ranks, strengths = [], []
     for three in three_of(inliers):
         values = fit_matches(HomographyTensor(), three).singular_values
-        ranks.append((values > options.planar.rank * values[:, :1]).sum(-1))
+        ranks.append((values > PLANAR_RANK_TOLERANCE * values[:, :1]).sum(-1))
         strengths.append(values[:, -2] / noise.clamp(min=torch.finfo(values.dtype).tiny))
     return torch.stack(ranks).amax(0), torch.stack(strengths).amax(0)
 
 
-def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], options: AlignOptions) -> Tensor:
+def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor]) -> Tensor:
     """Where the moving matches leave a family of motions ``(b,)``, and no more are static than some motion of it makes by
     chance."""
     rank, strength = tensor
     used = (best.labels != OUTLIER).sum(-1)
     equations = HomographyTensor.width() - 1
     spare = ((used - equations).clamp(min=1) / used.clamp(min=1)).sqrt()
-    family = (rank >= equations) & (strength < options.planar.undecided * spare)
+    family = (rank >= equations) & (strength < MIN_DETERMINED_STRENGTH * spare)
     still = (best.labels == STATIC) & (evidence.data.weights > 0)
     if evidence.data.static is not None:
         family = family & ((still & evidence.data.static).sum(-1) < NOTICES_MINIMAL)
     square = evidence.residuals(best.theta)[1].square().sum(-1)
-    limit = options.planar.wider**2 * three_sigma(evidence.still) * best.sigma.square()[:, None]
+    limit = CHANCE_LIMIT_FACTOR**2 * three_sigma(evidence.still) * best.sigma.square()[:, None]
     beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
-    return family & (still.sum(-1) < options.planar.support + options.planar.chance * beside / (options.planar.wider**2 - 1))
+    return family & (still.sum(-1) < MIN_STATIC_SUPPORT + STATIC_SUPPORT_FACTOR * beside / (CHANCE_LIMIT_FACTOR**2 - 1))
 
 
 def unverified(evidence: Evidence, best: Labelled) -> Tensor:
@@ -112,7 +131,7 @@ def unverified(evidence: Evidence, best: Labelled) -> Tensor:
     return agree.any(0) & (evidence.data.weights > 0)
 
 
-def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor, options: AlignOptions) -> Tensor:
+def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor) -> Tensor:
     """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES."""
     parts = evidence.problem(best.labels).parts(best.theta)
     places = torch.stack(
@@ -124,7 +143,7 @@ def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor, options
     normal = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
     problem = torch.arange(len(length), device=length.device)
     left, count = moving, torch.zeros(len(length), dtype=torch.long, device=length.device)
-    noise = options.planar.room * (evidence.norm.scales[0] * best.sigma)[:, None]
+    noise = MAX_TRAJECTORY_DISTANCE * (evidence.norm.scales[0] * best.sigma)[:, None]
     for _ in range(LINES):
         longest = torch.where(left, length, -1.0).argmax(-1)
         centre, across, base = places[:, problem, longest].mean(0), normal[problem, longest], length[problem, longest]
@@ -180,7 +199,7 @@ def align_planar(
     static: Tensor | None = None,
     calibration: Tensor | None = None,
     generator: torch.Generator | None = None,
-    options: AlignOptions = AlignOptions(),
+    options: AlignOptions | None = None,
 ) -> Alignment:
     r"""Motion of a camera from three or more views of a plane, with a label for every match: static, moving or outlier.
 
@@ -217,7 +236,7 @@ def align_planar(
         calibration: K of all views ``(3, 3)``, or of each ``(views, 3, 3)``, or ``(*batch, views, 3, 3)``, in the unit of the
             points, which are without lens distortion.  A, B and labels are the same with and without.
         generator: source of the random samples.
-        options: every number that decides, by stage and model; ``dataclasses.replace`` changes some of them.
+        options: what the search takes and expects; None is :class:`dyntorch.AlignOptions` as it is.
 
     Returns:
         An :class:`~dyntorch.tasks.align.result.Alignment`; ``collineations`` holds A, B and those of further views.
@@ -244,6 +263,7 @@ def align_planar(
         >>> result.rotations.shape, result.translations.shape, result.normal.shape
         (torch.Size([3, 3, 3]), torch.Size([3, 3]), torch.Size([3]))
     """
+    options = AlignOptions() if options is None else options
     check_options(options, AlignOptions)
     check_threshold(threshold)
     data = matches(moving_points(2, 3 + len(more)), (x1, x2, x3, *more), weights, static)
@@ -260,15 +280,15 @@ def align_planar(
 def _align(
     data: Matches, threshold: float | None, K: Tensor | None, generator: torch.Generator | None, options: AlignOptions
 ) -> Alignment:
-    evidence = Evidence.of(moving_points(2, len(data.views)), data, options)
-    solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator, options), options)
+    evidence = Evidence.of(moving_points(2, len(data.views)), data)
+    solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator, options))
     outcome = solution.back(data)
     A, B, *others = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
-    notices = planar_notices(evidence, best, tensor, solution.status, data.batch, options)
+    notices = planar_notices(evidence, best, tensor, solution.status, data.batch)
     turned, other = None, None
     if K is not None:
-        turned, other, told = euclidean(solution, data, best.labels, K, options.metric)
+        turned, other, told = euclidean(solution, data, best.labels, K)
         notices = in_order([*notices, *told])
     return Alignment(
         A=A,
@@ -292,14 +312,10 @@ def _align(
 def _search(evidence: Evidence, threshold: float | None, generator: torch.Generator | None, options: AlignOptions) -> Labelled:
     """The better one of the motions that the two searches start from, with its labels."""
     size = len(evidence.floor)
-    given = (
-        None
-        if threshold is None
-        else torch.full_like(evidence.floor, threshold / options.labels.threshold_in_sigmas).maximum(evidence.floor)
-    )
+    given = None if threshold is None else torch.full_like(evidence.floor, threshold / THRESHOLD_SIGMAS).maximum(evidence.floor)
     starts = [_from_static(evidence, given, generator, options)]
     if MINIMAL <= evidence.data.count < FEW:
-        starts.append(_from_all(evidence, given, generator, options))
+        starts.append(_from_all(evidence, given, generator))
     if size and evidence.data.count >= (MINIMAL if given is not None else FEW):
         starts.append(_from_tensor(evidence, given, generator))
     count = len(starts)
@@ -308,16 +324,16 @@ def _search(evidence: Evidence, threshold: float | None, generator: torch.Genera
     several, noise = evidence.repeated(count), sigma.repeat(count)
     rough = torch.arange(count, device=sigma.device).repeat_interleave(size) == 0
     theta = several.improved(torch.cat([start for start, _ in starts]), noise, rough)
-    cost = torch.where(_singular(theta, options), torch.inf, several.cost(theta, noise))
+    cost = torch.where(_singular(theta), torch.inf, several.cost(theta, noise))
     best = cost.unflatten(0, (count, size)).argmin(0)
     chosen = theta[best * size + torch.arange(size, device=best.device)]
     return evidence.settled(chosen, sigma, estimate=given is None)
 
 
-def _singular(theta: Tensor, options: AlignOptions) -> Tensor:
+def _singular(theta: Tensor) -> Tensor:
     """Whether a motion ``(b, 9 maps)`` takes the plane to a line or a point, which fulfils every match and explains none."""
     values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (-1, 3, 3)))
-    return (values[..., 2] < options.planar.singular * values[..., 0]).any(-1)
+    return (values[..., 2] < MIN_SINGULAR_RATIO * values[..., 0]).any(-1)
 
 
 def _from_static(
@@ -331,8 +347,8 @@ def _from_static(
         pool = torch.where((known.sum(-1) >= 4)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * three_sigma(evidence.still) * (options.labels.rough * scale * given).square()
-    motion, variance = static_consensus(evidence.views, pool, limit, options.planar.samples, generator, options)
+    limit = None if given is None else 2 * three_sigma(evidence.still) * (ROUGH_LABEL_FACTOR * scale * given).square()
+    motion, variance = static_consensus(evidence.views, pool, limit, options.num_samples or NUM_PLANAR_SAMPLES, generator)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
     # static_consensus divides by the median of 4 conditions; more views have more
     variance = variance * (median(4) / median(evidence.still))
@@ -360,9 +376,7 @@ def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Gene
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 
-def _from_all(
-    evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, options: AlignOptions
-) -> tuple[Tensor, Tensor]:
+def _from_all(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
     """Motion as if all matches were moving inliers, and the noise that they then show."""
     data = evidence.data
 
@@ -370,7 +384,7 @@ def _from_all(
         return fit_matches(HomographyTensor(), replace(data, views=views, static=None))
 
     theta, usable = _usable(*motion_of_all(evidence, solve, given, generator))
-    refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), options.planar.steps)
+    refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_PLANAR_STEPS)
     assert refined.sigma is not None
     return joined(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
 
@@ -383,18 +397,18 @@ def _usable(motion: tuple[Tensor, ...], found: Solution) -> tuple[Tensor, Tensor
     return torch.where(usable[:, None], theta, identity), usable
 
 
-def _solved(evidence: Evidence, best: Labelled, options: AlignOptions) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
+def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
     """The solution with its status, the final labels, none where there is no motion, and what the tensor alone rests on."""
-    refined = evidence.refined(best.theta, best.labels, options.planar.steps)
+    refined = evidence.refined(best.theta, best.labels, MAX_PLANAR_STEPS)
     theta = joined(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     assert refined.sigma is not None and refined.covariance is not None
     best = Labelled(theta, labels, best.sigma)
-    tensor = tensor_rank(evidence.data.restricted(labels != OUTLIER), evidence, best.sigma, options)
-    free = (worst > options.planar.ambiguous) | undecided(evidence, best, tensor, options)
-    status = _status(evidence, best, refined.sigma, free, values[:, 0] <= options.planar.indeterminate * values[:, -1], options)
+    tensor = tensor_rank(evidence.data.restricted(labels != OUTLIER), evidence, best.sigma)
+    free = (worst > MAX_DEVIATION) | undecided(evidence, best, tensor)
+    status = _status(evidence, best, refined.sigma, free, values[:, 0] <= MIN_INFORMATION * values[:, -1])
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     zero = none[:, None, None]
@@ -411,7 +425,7 @@ def _solved(evidence: Evidence, best: Labelled, options: AlignOptions) -> tuple[
     return solution, replace(best, labels=labels), tensor
 
 
-def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor, options: AlignOptions) -> Tensor:
+def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor) -> Tensor:
     """``(b,)`` from the inliers, the noise they show, and whether a part of the motion is free by the noise, or exactly."""
     usable = evidence.data.weights > 0
     present = usable.sum(-1)
@@ -419,9 +433,9 @@ def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, und
     still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
     share = (still + moving) / present.clamp(min=1)
     accident = (
-        (share < options.planar.consensus)
-        | ((share < options.planar.doubtful) & (shown > options.planar.uniform * best.sigma))
-        | (evidence.still * still + evidence.invariant.codim * moving < evidence.invariant.dof + options.planar.spare)
+        (share < MIN_CONSENSUS)
+        | ((share < MIN_NOISY_INLIER_SHARE) & (shown > MAX_NOISE_RATIO * best.sigma))
+        | (evidence.still * still + evidence.invariant.codim * moving < evidence.invariant.dof + MIN_SPARE_PLANAR)
     )
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     status = torch.full_like(present, int(Status.OK))

@@ -41,7 +41,7 @@ def align_points(
     weights: Tensor | None = None,
     static: Tensor | None = None,
     generator: torch.Generator | None = None,
-    options: AlignOptions = AlignOptions(),
+    options: AlignOptions | None = None,
 ) -> Alignment:
     r"""Motion of a 3D sensor from three or more views of points, with a label for every match: static, moving or outlier.
 
@@ -81,7 +81,7 @@ def align_points(
         weights: ``(*batch, n)`` not negative; 0 leaves a match out.
         static: ``(*batch, n)`` bool, matches known not to move (they may still be outliers).
         generator: source of the random samples.
-        options: every number that decides, by stage and model; ``dataclasses.replace`` changes some of them.
+        options: what the search takes and expects; None is :class:`dyntorch.AlignOptions` as it is.
 
     Returns:
         An :class:`~dyntorch.tasks.align.result.Alignment`.  Rigid A and B have 1 as last entry, all others norm 1.  With constant
@@ -115,6 +115,7 @@ def align_points(
             "{arg:motion='{motion}'} belongs to {arg:model='rigid'}, got {arg:model='{model}'}; use {arg:model='constant_velocity'}"
         )
         raise ValueError(Message(text, motion=motion, model=model))
+    options = AlignOptions() if options is None else options
     check_options(options, AlignOptions)
     check_threshold(threshold)
     if len(views) > 3 and model not in ("join", "minimal_join"):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyntorch.core.limits import MIN_CONSENSUS
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
 from dyntorch.core.solution import NOISY
@@ -17,6 +18,7 @@ from dyntorch.numerics.blocks import each, map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.numerics.nullspace import spectrum
+from dyntorch.tasks.align.labelling import THRESHOLD_SIGMAS
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
@@ -35,6 +37,17 @@ from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, Alig
 MOTIONS = {"straight": 2, "constant_velocity": 3}
 """Conditions that a moving point fulfils."""
 DESCENT = LeastSquaresOptions(iterations=20, least_damping=1e-10, stuck_damping=1e5)
+
+
+NUM_STATIC_SAMPLES = 60  # of 3: 40 % static points without outliers are met by 98 % of 60 such samples
+NUM_MOVING_SAMPLES = 60  # of matches taken as moving
+NUM_REFINED_STARTS = 5  # of least cost
+NUM_RIGID_ROUNDS = 4  # of labelling and least squares
+RIGID_BLOCK = 16  # problems of a batch that are solved together
+NUM_RIGID_VELOCITY_CANDIDATES = 512  # tried as the common one
+RIGID_INFORMATION_RATIO = 1e-10  # worst over best direction, below which it is rounding error
+MAX_RIGID_DEVIATION = 0.3  # of the worst direction, radians or sizes of the scene, above which the motion is not known at all
+MIN_SPARE_RIGID = 4  # conditions beyond the degrees of freedom that inliers must fulfil: a minimal set fulfils those
 
 
 @dataclass(frozen=True)
@@ -213,7 +226,7 @@ def search(
         floor: least noise that is believed.
     """
     b, n = data.weights.shape
-    draws = uniform(b, options.rigid.static_starts + options.rigid.moving_starts, n, generator=generator, device=data.x1.device)
+    draws = uniform(b, NUM_STATIC_SAMPLES + NUM_MOVING_SAMPLES, n, generator=generator, device=data.x1.device)
     # matches of weight 0 come last, so that they are drawn only where there is nothing else
     order = (draws + 2.0 * (data.weights <= 0)[:, None]).argsort(-1)[..., : SAMPLE[data.motion]]
     flags = torch.zeros(b, n, dtype=torch.bool, device=data.x1.device) if still is None else still
@@ -221,18 +234,18 @@ def search(
     def run(data: RigidSightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor) -> Rigid:
         return _search(each(lambda x: x[:, None], data), sigma, held, order, given, floor, options)
 
-    return map_blocks(run, data, sigma, flags, order, starts, size=options.rigid.problems)
+    return map_blocks(run, data, sigma, flags, order, starts, size=RIGID_BLOCK)
 
 
 def _search(
     data: RigidSightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor, floor: float, options: AlignOptions
 ) -> Rigid:
     """One block: sightings ``(b, 1, n, 3)``."""
-    candidates = torch.cat([given, _all(data)[:, None], *_samples(data, order, options)], dim=1)
+    candidates = torch.cat([given, _all(data)[:, None], *_samples(data, order)], dim=1)
     moving, static = squares(candidates, data)
     noise = _scales(moving, data, floor) if sigma is None else sigma[:, None].expand(candidates.shape[:2]).clamp(min=floor)
     score = noise if sigma is None else _score(moving, static, held, data, noise)
-    best = score.topk(min(options.rigid.finalists, score.shape[1]), dim=1, largest=False).indices
+    best = score.topk(min(NUM_REFINED_STARTS, score.shape[1]), dim=1, largest=False).indices
     # the given starts run as well: they rest on all matches, which no small sample does
     chosen = torch.cat([torch.arange(given.shape[1] + 1, device=best.device).expand(len(best), -1), best], dim=1)
     motions = candidates.gather(1, chosen[..., None, None, None].expand(-1, -1, 2, 4, 4))
@@ -247,15 +260,15 @@ def _search(
     first = torch.arange(len(winner), device=winner.device)
     flat = RigidSightings(data.x1[:, 0], data.x2[:, 0], data.x3[:, 0], data.weights[:, 0], data.motion)
     grounded = held.any(-1) if data.motion == "constant_velocity" else torch.ones_like(held[:, 0])
-    found = _settle(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor, options)
+    found = _settle(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor)
     if data.motion == "straight":
         return found
     common, members, present = *common_velocity(found, flat, options), (flat.weights > 0).sum(-1)
-    standing = ~grounded & (members >= 3) & (members >= options.rigid.standing * present)
+    standing = ~grounded & (members >= 3) & (members >= options.min_static_share * present)
     found = replace(found, motions=drifted(found.motions, torch.where(grounded[:, None], 0.0, common)))
     if not bool(standing.any()):
         return found
-    return _settle(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor, options)
+    return _settle(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
 
 
 def _all(data: RigidSightings) -> Tensor:
@@ -264,10 +277,10 @@ def _all(data: RigidSightings) -> Tensor:
     return torch.stack([rigid_alignment(x1, data.x2[:, 0], w), rigid_alignment(x1, data.x3[:, 0], w)], dim=1)
 
 
-def _samples(data: RigidSightings, order: Tensor, options: AlignOptions) -> tuple[Tensor, Tensor]:
+def _samples(data: RigidSightings, order: Tensor) -> tuple[Tensor, Tensor]:
     """Motions from samples of 3 static matches, and of a few moving ones."""
     found = []
-    for index, still in ((order[:, : options.rigid.static_starts, :3], True), (order[:, options.rigid.static_starts :], False)):
+    for index, still in ((order[:, :NUM_STATIC_SAMPLES, :3], True), (order[:, NUM_STATIC_SAMPLES:], False)):
         sample = data.sample(index)
         start = torch.stack([rigid_alignment(sample.x1, x, sample.weights) for x in (sample.x2, sample.x3)], dim=2)
         found.append(start if still else descend(start, sample, iterations=12)[0])
@@ -304,11 +317,10 @@ def _settle(
     held: Tensor,
     grounded: Tensor,
     floor: float,
-    options: AlignOptions,
 ) -> Rigid:
     """Least squares over the matches that belong to the model, static ones as such, until they do not change."""
     present = data.weights > 0
-    for _ in range(options.rigid.rounds):
+    for _ in range(NUM_RIGID_ROUNDS):
         moving, static = squares(motions, data)
         square = sigma.square()[:, None]
         resting = static <= three_sigma(6) * square
@@ -343,7 +355,7 @@ def common_velocity(found: Rigid, data: RigidSightings, options: AlignOptions) -
     """The velocity ``(b, 3)`` that most matches share, in the frame of view 1 and per step, and how many do, ``(b,)``."""
     u, v, _, _ = combinations(found.motions, data)
     velocity = -u / 2**0.5
-    step = max(1, velocity.shape[-2] // options.rigid.seeds)
+    step = max(1, velocity.shape[-2] // NUM_RIGID_VELOCITY_CANDIDATES)
     # of a static point |u|^2 + |v|^2 is within the limit, with u counted from the common velocity
     room = (three_sigma(6) * found.sigma.square()[:, None] - v.square().sum(-1)).clamp(min=0.0) / 2
     near = (torch.cdist(velocity[:, ::step], velocity).square() <= 2 * room[:, None]) & found.inliers[:, None]
@@ -352,7 +364,7 @@ def common_velocity(found: Rigid, data: RigidSightings, options: AlignOptions) -
     mean = _mean(velocity, members)
     members = ((velocity - mean[:, None]).square().sum(-1) <= room) & found.inliers
     count = members.sum(-1)
-    enough = (count >= 3) & (count >= options.rigid.standing * found.inliers.sum(-1))
+    enough = (count >= 3) & (count >= options.min_static_share * found.inliers.sum(-1))
     return _mean(velocity, torch.where(enough[:, None], members, found.inliers)), count
 
 
@@ -383,7 +395,7 @@ def align_rigid(
     centres, scale = _frame(data.views, weights)
     x1, x2, x3 = ((x - c[:, None]) * scale[:, None, None] for x, c in zip(data.views, centres, strict=True))
     sightings = RigidSightings(x1, x2, x3, weights, motion)
-    sigma = None if threshold is None else threshold / options.labels.threshold_in_sigmas * scale
+    sigma = None if threshold is None else threshold / THRESHOLD_SIGMAS * scale
     none = x1.new_zeros(len(x1), 0, 2, 4, 4)
     starts = none if data.static is None else _from_static(sightings, data.static & (weights > 0))
     found = search(sightings, sigma, data.static, starts, generator, floor=100 * torch.finfo(data.dtype).eps, options=options)
@@ -414,9 +426,7 @@ def _result(
     worst = found.sigma * values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     top = found.information.diagonal(dim1=-2, dim2=-1).amax(-1)
     noisy = found.sigma.isfinite() & (found.sigma > NOISY)
-    status = _status(
-        labels, sightings.weights, worst, noisy, values <= options.rigid.indeterminate * top, dof, MOTIONS[motion], options
-    )
+    status = _status(labels, sightings.weights, worst, noisy, values <= RIGID_INFORMATION_RATIO * top, dof, MOTIONS[motion])
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     matrices, entries = _measured(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
@@ -466,15 +476,12 @@ def _status(
     undetermined: Tensor,
     dof: Tensor,
     conditions: int,
-    options: AlignOptions,
 ) -> Tensor:
     present = (weights > 0).sum(-1)
     still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
-    accident = (
-        (still + moving < options.rigid.consensus * present) | (6 * still + conditions * moving < dof + options.rigid.spare) | noisy
-    )
+    accident = (still + moving < MIN_CONSENSUS * present) | (6 * still + conditions * moving < dof + MIN_SPARE_RIGID) | noisy
     status = torch.full_like(present, int(Status.OK))
-    status = torch.where(worst > options.rigid.ambiguous, int(Status.AMBIGUOUS), status)
+    status = torch.where(worst > MAX_RIGID_DEVIATION, int(Status.AMBIGUOUS), status)
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
     return torch.where(present < 3, int(Status.TOO_FEW), status)
@@ -505,7 +512,7 @@ def _notices(
 ) -> tuple[Notice, ...]:
     moving, solved = (labels == MOVING).sum(-1), ~none
     found, note = noting(batch)
-    note(AlignNotice.UNCERTAIN, worst, solved & (worst > options.rigid.uncertain), case="rigid")
+    note(AlignNotice.UNCERTAIN, worst, solved & (worst > options.max_deviation), case="rigid")
     note(AlignNotice.COMMON_VELOCITY, worst, solved & ~grounded)
     few = solved & (moving < MINIMAL[motion]) & ((labels == STATIC).sum(-1) < 3)
     note(AlignNotice.FEW_MOVING, moving, few, least=f"{MINIMAL[motion]}")

@@ -21,8 +21,11 @@ from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.numerics.blocks import select, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.nullspace import null_space
-from dyntorch.tasks.align.labelling import Evidence
-from dyntorch.tasks.align.options import AlignOptions
+from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, Evidence
+
+NUM_RESECTION_SAMPLES = 256  # per view: 99.9 % to draw a clean one at 30 % wrong points
+RESECTION_SAMPLE_SIZE = 10  # 8 determine a collineation of the plane or of space
+NUM_RESECTION_ROUNDS = 4  # reweighted fits to all matches after that
 
 
 def moving_points(dim: int, views: int) -> Invariant:
@@ -50,7 +53,7 @@ def motion_of_all(
     planes, weights, noise = _flats_of(evidence, three, torch.stack([known[v] for v in three], dim=-3), given)
     for v in range(1, count):
         if v not in known:
-            known[v] = resected(planes, evidence.views[v], evidence.norm.scales[v] * noise, weights, generator, evidence.options)
+            known[v] = resected(planes, evidence.views[v], evidence.norm.scales[v] * noise, weights, generator)
     return tuple(known[v] for v in range(1, count)), found
 
 
@@ -75,22 +78,20 @@ def _flats_of(evidence: Evidence, three: tuple[int, ...], maps: Tensor, given: T
     return planes, evidence.data.weights * good, noise
 
 
-def resected(
-    planes: Tensor, x: Tensor, sigma: Tensor, weights: Tensor, generator: torch.Generator | None, options: AlignOptions
-) -> Tensor:
+def resected(planes: Tensor, x: Tensor, sigma: Tensor, weights: Tensor, generator: torch.Generator | None) -> Tensor:
     r"""The collineation A of a view whose points lie on known flats of view 1: :math:`L_i A (x_i, 1) = 0`, robustly. planes
     ``(b, n, d, d + 1)``, x ``(b, n, d)``, sigma ``(b,)``, weights ``(b, n)`` -> ``(b, d + 1, d + 1)``."""
     b, n, _, size = planes.shape
     p = homogeneous(x)
     rows = (planes[..., :, None] * p[..., None, None, :]).flatten(-2)  # (b, n, d, N N)
-    drawn = uniform(b, options.several.samples, n, generator=generator, device=x.device).masked_fill(weights[:, None] <= 0, 2.0)
-    chosen = drawn.argsort(-1)[..., : min(n, options.several.sample)]
+    drawn = uniform(b, NUM_RESECTION_SAMPLES, n, generator=generator, device=x.device).masked_fill(weights[:, None] <= 0, 2.0)
+    chosen = drawn.argsort(-1)[..., : min(n, RESECTION_SAMPLE_SIZE)]
     problem = torch.arange(b, device=x.device)[:, None, None]
     maps = null_space(rows[problem, chosen].flatten(2, 3))[..., 0, :].unflatten(-1, (size, size))
-    limit = (options.labels.rough * sigma).square()[:, None] * three_sigma(size - 1)
+    limit = (ROUGH_LABEL_FACTOR * sigma).square()[:, None] * three_sigma(size - 1)
     best = ((_squares(planes, maps, p) / limit[..., None]).clamp(max=1.0) * weights[:, None]).sum(-1).argmin(-1)
     found = maps[torch.arange(b, device=x.device), best]
-    for _ in range(options.several.rounds):
+    for _ in range(NUM_RESECTION_ROUNDS):
         square, length = _squares(planes, found[:, None], p)[:, 0], _lengths(planes, found[:, None])[:, 0]
         trust = weights * (limit / (limit + square)).square()
         scaled = rows * (trust.sqrt() / length)[..., None, None]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import denormalize_motion
 from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
@@ -19,7 +20,7 @@ from dyntorch.numerics.blocks import map_blocks, uniform
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import LeastSquaresOptions, derivatives, minimize
 from dyntorch.numerics.nullspace import spectrum
-from dyntorch.tasks.align.labelling import Evidence
+from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, THRESHOLD_SIGMAS, Evidence
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 
@@ -32,6 +33,17 @@ GAUGE = 3  # degrees of freedom of the common velocity
 DOF = {False: 30, True: 21}
 """Of three projective (affine) maps up to an affinity of the world and the common velocity."""
 ENTRIES = (12, 13, 14)  # of a 4 x 4 matrix: zero for an affine map
+
+
+NUM_VELOCITY_ROUNDS = 4  # of labelling and least squares
+NUM_VELOCITY_CANDIDATES = 64  # tried as the common one: of 10 % static matches six or seven are among them
+NUM_AFFINE_SAMPLES = 150  # 40 % outliers leave 1.7 % of samples of eight clean, 92 % to draw one
+AFFINE_SAMPLE_SIZE = 8  # one above the minimum
+MAX_DEGENERATE_EIGENVALUE = 1e-9  # over the largest: 3e-5 of the size of the data, far below any real noise
+MAX_VELOCITY_DEVIATION = 0.5  # of the worst direction of maps of norm 1, above which they are not known at all
+MIN_SPARE_VELOCITY = 6  # conditions beyond the degrees of freedom that inliers must fulfil
+VELOCITY_BLOCK = 8  # problems of a batch that are sampled together
+MIN_VELOCITY_SINGULAR_VALUE = 3.0  # over the noise, to count
 
 
 @dataclass(frozen=True)
@@ -59,9 +71,7 @@ def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estim
     grounded = torch.zeros_like(sigma, dtype=torch.bool) if known is None else (known & (evidence.data.weights > 0)).any(-1)
     if known is not None:
         theta = _fixed(evidence, theta, known & (evidence.data.weights > 0))
-    state = _rounds(
-        evidence, Velocities(theta, _labels(evidence, theta, sigma, grounded), sigma, grounded), affine, estimate, options
-    )
+    state = _rounds(evidence, Velocities(theta, _labels(evidence, theta, sigma, grounded), sigma, grounded), affine, estimate)
     theta, standing = _ground(evidence, state, options)
     standing = standing & ~grounded
     state = replace(state, theta=theta)
@@ -69,7 +79,7 @@ def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estim
         return state
     grounded = grounded | standing
     labels = _labels(evidence, theta, state.sigma, grounded)
-    return _rounds(evidence, Velocities(theta, labels, state.sigma, grounded), affine, estimate, options)
+    return _rounds(evidence, Velocities(theta, labels, state.sigma, grounded), affine, estimate)
 
 
 def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -102,9 +112,9 @@ def residuals(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor]:
     return moving, model.whitened_static(motion, evidence.views, scales).square().sum(-1)
 
 
-def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool, options: AlignOptions) -> Velocities:
+def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool) -> Velocities:
     theta, labels, sigma = state.theta, state.labels, state.sigma
-    for _ in range(options.velocity.rounds):
+    for _ in range(NUM_VELOCITY_ROUNDS):
         theta = refined(evidence, theta, labels, affine)
         if estimate:
             sigma = _noise(evidence, theta, labels, sigma, DOF[affine] + GAUGE * state.grounded.long())
@@ -138,7 +148,7 @@ def _ground(evidence: Evidence, state: Velocities, options: AlignOptions) -> tup
     inliers = state.labels != OUTLIER
     limit = three_sigma(6) * state.sigma.square()[:, None]
     n = inliers.shape[-1]
-    chosen = torch.arange(0, n, max(1, -(-n // options.velocity.seeds)), device=inliers.device)
+    chosen = torch.arange(0, n, max(1, -(-n // NUM_VELOCITY_CANDIDATES)), device=inliers.device)
     motion, views = _maps(evidence, state.theta), evidence.views
     several = tuple(m[:, None].expand(-1, len(chosen), -1, -1) for m in motion)
     one = tuple(x[:, chosen, None] for x in views)
@@ -146,13 +156,13 @@ def _ground(evidence: Evidence, state: Velocities, options: AlignOptions) -> tup
     scales = tuple(s[:, None] for s in evidence.norm.scales)
     resting = ConstantVelocityTensor().whitened_static(tried, tuple(x[:, None] for x in views), scales).square().sum(-1)
     # the noise of the one match that chose the velocity is in these residuals, too
-    near = (resting <= options.labels.rough**2 * limit[:, None]) & inliers[:, None]
+    near = (resting <= ROUGH_LABEL_FACTOR**2 * limit[:, None]) & inliers[:, None]
     best = (near.sum(-1) * inliers[:, chosen]).argmax(-1)
     members = near[torch.arange(len(best), device=best.device), best]
     theta = _fixed(evidence, state.theta, members)
     members = (residuals(evidence, theta)[1] <= limit) & inliers
     count = members.sum(-1)
-    enough = (count >= 3) & (count >= options.velocity.standing * inliers.sum(-1))
+    enough = (count >= 3) & (count >= options.min_static_share * inliers.sum(-1))
     free = torch.where(state.grounded[:, None], False, torch.where(enough[:, None], members, inliers))
     return _fixed(evidence, state.theta, free), enough
 
@@ -197,12 +207,8 @@ def align_velocity(
     data: Matches, threshold: float | None, affine: bool, generator: torch.Generator | None, options: AlignOptions
 ) -> Alignment:
     """:func:`dyntorch.align_points` with a model of constant velocity, for checked matches."""
-    evidence = Evidence.of(ConstantVelocityTensor(), data, options)
-    given = (
-        None
-        if threshold is None
-        else torch.full_like(evidence.floor, threshold / options.labels.threshold_in_sigmas).maximum(evidence.floor)
-    )
+    evidence = Evidence.of(ConstantVelocityTensor(), data)
+    given = None if threshold is None else torch.full_like(evidence.floor, threshold / THRESHOLD_SIGMAS).maximum(evidence.floor)
     start = (
         _affine_start(evidence, given, generator, options) if affine else _projective_start(evidence, given, threshold, generator)
     )
@@ -213,7 +219,7 @@ def align_velocity(
     # singular maps have no motion between them to be known
     covariance = torch.where(covariance.isfinite().flatten(1).all(-1)[:, None, None], covariance, torch.inf)
     worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
-    status = _status(evidence, state, worst, extent[:, 0] <= options.velocity.indeterminate * extent[:, 1], found, affine, options)
+    status = _status(evidence, state, worst, extent[:, 0] <= MIN_INFORMATION * extent[:, 1], found, affine)
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, state.labels)
     zero = none[:, None, None]
@@ -254,14 +260,14 @@ def _affine_start(
     nine = torch.cat([x / s[:, None, None] for x, s in zip(evidence.views, scale / scale.mean(0), strict=True)], dim=-1)
     size = scale.mean(0)
     present = data.weights > 0
-    draws = uniform(len(nine), options.velocity.samples, nine.shape[1], generator=generator, device=nine.device)
-    order = (draws + 2.0 * ~present[:, None]).argsort(-1)[..., : options.velocity.sample]
+    draws = uniform(len(nine), options.num_samples or NUM_AFFINE_SAMPLES, nine.shape[1], generator=generator, device=nine.device)
+    order = (draws + 2.0 * ~present[:, None]).argsort(-1)[..., :AFFINE_SAMPLE_SIZE]
     noise = None if given is None else given * size
 
     def run(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        return _affine_consensus(points, weights, index, sigma, options)
+        return _affine_consensus(points, weights, index, sigma)
 
-    null, mean, ok = map_blocks(run, nine, data.weights, order, noise, size=options.velocity.problems)
+    null, mean, ok = map_blocks(run, nine, data.weights, order, noise, size=VELOCITY_BLOCK)
     theta = _affine_maps(null, mean, ok)
     parts = theta.unflatten(-1, (3, 4, 4)).clone()
     parts[..., :3, :] *= (scale / size).mT[..., None, None]
@@ -270,15 +276,13 @@ def _affine_start(
     return theta, _starting_noise(evidence, theta, given), status
 
 
-def _affine_consensus(
-    points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor | None, options: AlignOptions
-) -> tuple[Tensor, Tensor, Tensor]:
+def _affine_consensus(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Conditions ``(b, 3, 9)`` on the centred coordinates, their centre ``(b, 9)``, and whether the matches decide."""
     present = weights > 0
     sample = points[:, None].expand(-1, index.shape[1], -1, -1).gather(2, index[..., None].expand(-1, -1, -1, 9))
-    null, mean, _ = _conditions(sample, torch.ones_like(sample[..., 0]), options)
+    null, mean, _ = _conditions(sample, torch.ones_like(sample[..., 0]))
     # the last start is of all matches, which is the best one where there are no outliers
-    own, centre, _ = _conditions(points, weights, options)
+    own, centre, _ = _conditions(points, weights)
     null, mean = torch.cat([null, own[:, None]], dim=1), torch.cat([mean, centre[:, None]], dim=1)
     square = ((points[:, None] - mean[:, :, None]) @ null.mT).square().sum(-1)
     if sigma is None:
@@ -297,15 +301,15 @@ def _affine_consensus(
     inside = (square[first, best] <= 4 * limit[:, None]) & present
     floor = torch.finfo(points.dtype).eps
     inside = inside | ((square[first, best] <= floor) & present)
-    return _conditions(points, weights * inside, options)
+    return _conditions(points, weights * inside)
 
 
-def _conditions(points: Tensor, weights: Tensor, options: AlignOptions) -> tuple[Tensor, Tensor, Tensor]:
+def _conditions(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     total = weights.sum(-1, keepdim=True).clamp(min=torch.finfo(weights.dtype).tiny)
     mean = (weights[..., None] * points).sum(-2) / total
     centred = (points - mean[..., None, :]) * weights.sqrt()[..., None]
     values, vectors = spectrum(centred.mT @ centred)
-    ok = (values[..., 3] > options.velocity.held * values[..., 8]) & ((weights > 0).sum(-1) >= MINIMAL[True])
+    ok = (values[..., 3] > MAX_DEGENERATE_EIGENVALUE * values[..., 8]) & ((weights > 0).sum(-1) >= MINIMAL[True])
     return vectors[..., :3].mT, mean, ok
 
 
@@ -332,18 +336,16 @@ def _identity(theta: Tensor) -> Tensor:
     return torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(3) / 2
 
 
-def _status(
-    evidence: Evidence, state: Velocities, worst: Tensor, undetermined: Tensor, found: Tensor, affine: bool, options: AlignOptions
-) -> Tensor:
+def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: Tensor, found: Tensor, affine: bool) -> Tensor:
     present = (evidence.data.weights > 0).sum(-1)
     still = (state.labels == STATIC).sum(-1)
     moving = (state.labels != OUTLIER).sum(-1) - still
     dof = DOF[affine] + GAUGE * state.grounded.long()
-    accident = (still + moving < options.velocity.consensus * present) | (
-        6 * still + 3 * moving < dof + options.velocity.spare * (present > MINIMAL[affine] + 1)
+    accident = (still + moving < MIN_CONSENSUS * present) | (
+        6 * still + 3 * moving < dof + MIN_SPARE_VELOCITY * (present > MINIMAL[affine] + 1)
     )
     accident = accident | (state.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    status = torch.where(worst > options.velocity.ambiguous, int(Status.AMBIGUOUS), torch.zeros_like(present))
+    status = torch.where(worst > MAX_VELOCITY_DEVIATION, int(Status.AMBIGUOUS), torch.zeros_like(present))
     status = torch.where(accident, int(Status.NO_CONSENSUS), status)
     status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
     status = torch.where(found != Status.OK, found.to(status), status)
@@ -356,20 +358,20 @@ def _notices(
     found, note = noting(batch)
     enough = (evidence.data.weights > 0).sum(-1) >= MINIMAL[affine]
     if evidence.data.count >= MINIMAL[False]:
-        rank = _rank(evidence, state, none, options)
+        rank = _rank(evidence, state, none)
         least = 0
         for most, code in RANKS:
             note(code, rank, enough & (rank > least) & (rank <= most), most=most)
             least = most
     note(AlignNotice.COMMON_VELOCITY, worst, ~none & ~state.grounded)
-    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > options.velocity.uncertain), case="matches", what="maps")
+    note(AlignNotice.UNCERTAIN, worst, ~none & (worst > options.max_deviation), case="matches", what="maps")
     return in_order(found)
 
 
-def _rank(evidence: Evidence, state: Velocities, none: Tensor, options: AlignOptions) -> Tensor:
+def _rank(evidence: Evidence, state: Velocities, none: Tensor) -> Tensor:
     """Singular values ``(b,)`` of the estimation matrix of the inliers (of all matches where there is no motion) above noise."""
     inliers = torch.where(none[:, None], torch.ones_like(state.labels, dtype=torch.bool), state.labels != OUTLIER)
     kept = evidence.data.restricted(inliers)
     values = fit_matches(ConstantVelocityTensor(), kept).singular_values
     noise = state.sigma * torch.stack(evidence.norm.scales).mean(0) * kept.weights.square().sum(-1).sqrt()
-    return (values > torch.maximum(options.velocity.above * noise[:, None], 1e-9 * values[:, :1])).sum(-1)
+    return (values > torch.maximum(MIN_VELOCITY_SINGULAR_VALUE * noise[:, None], 1e-9 * values[:, :1])).sum(-1)

@@ -13,13 +13,17 @@ from dyntorch.geometry.extensors import compound, extensor_of, subspace_of, wedg
 from dyntorch.geometry.homogeneous import cofactors, nonzero_sign, null_vectors, rank_one, skew, unit_size, unit_vectors
 from dyntorch.numerics.blocks import constant, map_blocks
 from dyntorch.numerics.nullspace import gram_null_space, null_space, real_eigenvalues
-from dyntorch.tasks.planes.options import PlanesOptions
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Pencils of matrices with a member of rank one: what a plane of a translating body makes with the homography at infinity.
 
 
 DETERMINANT_EPSILON = 1e-12  # |det| / |H|^3 below which a homography cannot be scaled to determinant 1
+
+
+BEAM_WIDTH = 243  # selections of scales while planes are added: all of up to six planes
+NUM_SCALE_CHOICES = 4  # selections of scales that are solved to the end
+NUM_REWEIGHTINGS = 1  # of the planes beside a known fundamental matrix; three do no better
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,7 @@ def finite_matrices(matrices: Tensor) -> tuple[Tensor, Tensor]:
 RIDGE_EPSILON = 1e-14  # of the trace: what keeps normal equations invertible
 
 
-def infinity_closed_form(homographies: Tensor, options: PlanesOptions = PlanesOptions()) -> tuple[Tensor, Tensor]:
+def infinity_closed_form(homographies: Tensor) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from three planes of translating bodies, or more, in closed form. homographies
     ``(*batch, n, 3, 3)`` -> ``(*batch, 3, 3)``."""
     check_homographies(homographies, 3)
@@ -145,7 +149,7 @@ def infinity_closed_form(homographies: Tensor, options: PlanesOptions = PlanesOp
     finite, order = finite.sort(dim=-1, descending=True, stable=True)
     planes = unit_determinant(given.take_along_dim(order[..., None, None], dim=1))
     present = finite.double()[:, None]
-    scaled = _choices(_scaled_candidates(planes), present, options)
+    scaled = _choices(_scaled_candidates(planes), present)
     # the last candidates: each of the planes, if it is static
     found = torch.cat([*(solve(scaled, present) for solve in SOLVERS), planes], dim=1)
     found = unit_determinant(found.nan_to_num(0.0, 0.0, 0.0))
@@ -165,7 +169,7 @@ def _scaled_candidates(planes: Tensor) -> Tensor:
     return ratios[..., None, None] * planes[:, :, None]
 
 
-def _choices(candidates: Tensor, present: Tensor, options: PlanesOptions) -> Tensor:
+def _choices(candidates: Tensor, present: Tensor) -> Tensor:
     """``(b, k, n, 3, 3)``: the choices of scales for which the differences are nearest to singular."""
     cost = _pair_costs(candidates) * (present.mT * present)[..., None, None]
     b, n = candidates.shape[:2]
@@ -175,11 +179,11 @@ def _choices(candidates: Tensor, present: Tensor, options: PlanesOptions) -> Ten
         # cost[i, j, choice_i, .] summed over the planes i before j
         rows = [cost[:, i, j].gather(1, chosen[:, :, i, None].expand(-1, -1, 3)) for i in range(j)]
         more = (total[..., None] + torch.stack(rows).sum(0)).flatten(1)
-        total, index = more.topk(min(options.starts.beam, more.shape[1]), dim=1, largest=False)
+        total, index = more.topk(min(BEAM_WIDTH, more.shape[1]), dim=1, largest=False)
         before = chosen.gather(1, (index // 3)[..., None].expand(-1, -1, j))
         chosen = torch.cat([before, (index % 3)[..., None]], dim=-1)
     chosen = chosen.gather(
-        1, total.topk(min(options.starts.choices, total.shape[1]), largest=False).indices[..., None].expand(-1, -1, n)
+        1, total.topk(min(NUM_SCALE_CHOICES, total.shape[1]), largest=False).indices[..., None].expand(-1, -1, n)
     )
     return candidates[:, None].take_along_dim(chosen[..., None, None, None], dim=3)[:, :, :, 0]
 
@@ -275,9 +279,7 @@ def infinity_from_fundamentals(fundamentals: Tensor, weights: Tensor | None = No
     return unit_determinant(found), torch.linalg.svdvals(rows.detach())
 
 
-def infinity_from_mixed(
-    fundamental: Tensor, homographies: Tensor, options: PlanesOptions = PlanesOptions()
-) -> tuple[Tensor, Tensor]:
+def infinity_from_mixed(fundamental: Tensor, homographies: Tensor) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from one fundamental matrix and two planes of other bodies, or more, in closed form.
     fundamental ``(*batch, 3, 3)``, homographies ``(*batch, n, 3, 3)`` -> ``(*batch, 3, 3)``."""
     check_homographies(homographies, 2)
@@ -296,7 +298,7 @@ def infinity_from_mixed(
     strength = normal.norm(dim=-1) * present
     normal = unit_vectors(normal)
     on_line = (epipole[..., None, None, :] @ planes)[..., 0, :] / scale
-    a = _nearest_to_lines(on_line, normal, strength, scale[..., 0], options.starts.reweightings)
+    a = _nearest_to_lines(on_line, normal, strength, scale[..., 0], NUM_REWEIGHTINGS)
     infinity = unit_determinant(visible + epipole[..., :, None] * a[..., None, :])
     squares = plane_parts(planes, infinity).residual.square() * present
     return infinity, (squares.sum(-1) / present.sum(-1).clamp(min=1.0)).sqrt()

@@ -12,7 +12,6 @@ from torch.nn.functional import pad
 
 from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.tasks.planes.closed_forms import finite_matrices
-from dyntorch.tasks.planes.options import PlanesOptions
 from dyntorch.tasks.planes.problem import LEAST, frames_of_calibration, frames_of_matches, frames_of_matrices
 
 Points = Tensor | Sequence[Tensor]
@@ -20,6 +19,9 @@ Pair = tuple[Tensor, Tensor]
 
 PLANE_MATCHES, BODY_MATCHES = 4, 7
 """Matches that determine a homography, and a fundamental matrix."""
+
+
+MIN_SINGULAR_RATIO = 1e-8  # of a homography in coordinates of order 1, below which it maps its plane to a line
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,6 @@ class GivenPlanes:
         planes: Pair | None,
         bodies: Pair | None,
         calibration: Tensor | None,
-        options: PlanesOptions = PlanesOptions(),
     ) -> GivenPlanes:
         """Checked matrices, with the matches where there are any."""
         # a device without float64 lends its data to the CPU and gets the result back
@@ -63,10 +64,10 @@ class GivenPlanes:
             views = [torch.cat([a.flatten(1, 2), b.flatten(1, 2)], dim=1) for a, b in zip(seen.views, more.views, strict=True)]
             frames = frames_of_matches((views[0], views[1]), torch.cat([seen.weights.flatten(1), more.weights.flatten(1)], dim=1))
         elif cameras is not None:
-            frames = frames_of_calibration((cameras[:, 0], cameras[:, 1]), options)
+            frames = frames_of_calibration((cameras[:, 0], cameras[:, 1]))
         else:
-            frames = frames_of_matrices(h, f, options)
-        hn, fn = normalized(h, frames, options), normalized_fundamentals(f, frames, options)
+            frames = frames_of_matrices(h, f)
+        hn, fn = normalized(h, frames), normalized_fundamentals(f, frames)
         return GivenPlanes(
             hn, fn, seen.moved(frames, hn), more.moved(frames, fn), matched, frames, h * _there(hn), cameras, batch, H
         )
@@ -236,16 +237,16 @@ def _finite(matrices: Tensor) -> Tensor:
     return unit(finite_matrices(matrices)[0])
 
 
-def normalized(homographies: Tensor, frames: Pair, options: PlanesOptions) -> Tensor:
+def normalized(homographies: Tensor, frames: Pair) -> Tensor:
     """Homographies ``(b, p, 3, 3)`` of norm 1 in new coordinates; zero where one is missing or singular."""
     moved = _finite(frames[1][:, None] @ homographies @ torch.linalg.inv_ex(frames[0])[0][:, None])
     values = torch.linalg.svdvals(moved)
-    return torch.where((values[..., 2] > options.frames.singular * values[..., 0])[..., None, None], moved, 0.0)
+    return torch.where((values[..., 2] > MIN_SINGULAR_RATIO * values[..., 0])[..., None, None], moved, 0.0)
 
 
-def normalized_fundamentals(fundamentals: Tensor, frames: Pair, options: PlanesOptions) -> Tensor:
+def normalized_fundamentals(fundamentals: Tensor, frames: Pair) -> Tensor:
     """Fundamental matrices ``(b, m, 3, 3)`` of norm 1 in new coordinates; zero where one is missing or has rank one."""
     inverse = [torch.linalg.inv_ex(frame)[0][:, None] for frame in frames]
     moved = _finite(inverse[1].mT @ fundamentals @ inverse[0])
     values = torch.linalg.svdvals(moved)
-    return torch.where((values[..., 1] > options.frames.singular * values[..., 0])[..., None, None], moved, 0.0)
+    return torch.where((values[..., 1] > MIN_SINGULAR_RATIO * values[..., 0])[..., None, None], moved, 0.0)

@@ -15,12 +15,28 @@ from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
 from dyntorch.tasks.planes.input import GivenPlanes
-from dyntorch.tasks.planes.options import PlaneDegeneracyOptions, PlanesOptions
 
 _ALIKE = "{value:a pair of planes or bodies moves|# pairs of planes or bodies move} alike, as of one body"
 _REST = "{value:a plane does not move, or is at infinity: it has|# planes do not move, or are at infinity: they have} no epipole"
 _THREE = "; three planes do not suffice then"
 _INFINITY = "one homography at infinity leaves {value:.0%} of what the homographies differ by"
+
+
+ROUNDING_ERROR = 1e-7  # sine or ratio
+MAX_NEAR_ZERO = 0.1  # sine or ratio below which noise is asked whether it is zero
+ZERO_CONFIDENCE = 0.99  # probability that noise leaves what is zero within the limit
+MAX_RELATIVE_NOISE = 0.4  # of residuals over what it would be without epipoles and normals; 1200 scenes: .37 at most
+MAX_CHANCE_NOISE = 0.43  # the same, from which random homographies would do as well, for very many planes
+CHANCE_NOISE_DECREASE = 0.62  # of that limit, times the root of the residuals to spare
+MAX_ENTRY_NOISE = 0.065  # of homographies of norm 1 in normalized coordinates; in those scenes .059 at most
+MAX_F_DEVIATE = 3.09  # normal deviate of the F ratio, exceeded once in a thousand
+MAX_CERTAIN_F_DEVIATE = 2.33  # the same, once in a hundred: from there the ratio is taken for an error of the model
+MAX_MATCH_NOISE = 0.25  # over the extent of planes and bodies: .03 at 1 px in 120 px, .4 to .5 where matches are random
+MIN_SPARE_RESIDUALS = 8  # of the separate matrices, for these to say what the noise is
+RESIDUAL_ROUNDING = 1e-5  # in normalized coordinates, in single precision
+MAX_ROTATION_DISTANCE = 0.01  # that a calibration to two or three digits leaves
+MAX_ROTATION_DISTANCE_DEVIATION = 0.01  # with four planes
+MIN_ROTATION_DEVIATIONS = 8.0  # standard deviations of that distance that noise is believed to reach
 
 
 class PlanesNotice(NoticeCode):
@@ -93,17 +109,16 @@ class Figures:
     normal_covariance: Tensor  # ``(b, p, 3, 3)`` of them
     moving: Tensor  # ``(b, c)`` those that move, and count
     used: Tensor  # ``(b, c)`` those that count
-    options: PlaneDegeneracyOptions  # what is near, and how likely
 
     @cached_property
     def line(self) -> tuple[Tensor, Tensor]:
         """How far the epipoles are from one line ``(b,)``, and whether noise explains it."""
-        return _flatness(self.epipoles, self.epipole_covariance, self.moving, self.options)
+        return _flatness(self.epipoles, self.epipole_covariance, self.moving)
 
     @cached_property
     def plane(self) -> tuple[Tensor, Tensor]:
         """The same for the normals and one plane."""
-        return _flatness(self.normals, self.normal_covariance, self.moving[:, : self.normals.shape[1]], self.options)
+        return _flatness(self.normals, self.normal_covariance, self.moving[:, : self.normals.shape[1]])
 
     def several(self) -> Tensor:
         """Where more than one homography at infinity fits the planes, by their position ``(b,)``."""
@@ -121,8 +136,8 @@ class Figures:
         square = (e[:, :, None] - sign[..., None] * e[:, None]).square().sum(-1)
         spread = self.epipole_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
         variance = (spread[:, :, None] + spread[:, None]) / 2
-        limit = quantile(self.options.confidence, 2) * (variance + self.options.exact**2)
-        near = (square < self.options.near**2) & (square <= limit)
+        limit = quantile(ZERO_CONFIDENCE, 2) * (variance + ROUNDING_ERROR**2)
+        near = (square < MAX_NEAR_ZERO**2) & (square <= limit)
         both = self.moving[:, :, None] & self.moving[:, None]
         return near & both & ~torch.eye(e.shape[1], dtype=torch.bool, device=e.device)
 
@@ -171,7 +186,7 @@ def planes_notices(
     return in_order(found)
 
 
-def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor, options: PlaneDegeneracyOptions) -> tuple[Tensor, Tensor]:
+def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     """Smallest over largest singular value ``(b,)`` of at least three vectors, and whether it is 0 within the noise."""
     kept = torch.where(count[..., None], vectors, 0.0)
     values, directions = spectrum(kept.mT @ kept)
@@ -179,9 +194,9 @@ def _flatness(vectors: Tensor, covariance: Tensor, count: Tensor, options: Plane
     across = directions[:, None, :, 0]
     distance = (kept * across).sum(-1)
     variance = (across[..., None, :] @ covariance @ across[..., :, None])[..., 0, 0]
-    square = (distance.square() / (variance + options.exact**2)).sum(-1)
+    square = (distance.square() / (variance + ROUNDING_ERROR**2)).sum(-1)
     spare = (count.sum(-1) - 2).clamp(min=1)
-    return ratio, (count.sum(-1) >= 3) & (ratio < options.near) & (square <= quantile(options.confidence, 2) * spare)
+    return ratio, (count.sum(-1) >= 3) & (ratio < MAX_NEAR_ZERO) & (square <= quantile(ZERO_CONFIDENCE, 2) * spare)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -200,7 +215,7 @@ class Misfit:
     vague: Tensor  # whether they agree with any homographies and fundamental matrices as badly
 
 
-def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor, options: PlanesOptions) -> Misfit:
+def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor) -> Misfit:
     r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it. cost ``(b,)``,
     separate ``(b,)``."""
     rows, spare = given.rows()
@@ -209,21 +224,21 @@ def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor, options: PlanesOp
     if given.matched:
         planes, bodies = used[:, :p].sum(-1), used[:, p:].sum(-1)
         free = rows - 8 * planes - 7 * bodies
-        variance = (separate / free.clamp(min=1)).clamp(min=(options.misfit.rounding / given.frames[1][:, 0, 0]) ** 2)
+        variance = (separate / free.clamp(min=1)).clamp(min=(RESIDUAL_ROUNDING / given.frames[1][:, 0, 0]) ** 2)
         more = (spare - free).clamp(min=1)
         ratio = (cost - separate) / more / variance
-        told, unusual = (free >= options.misfit.fewest_spare) & (spare > free), deviate(ratio, more, free.clamp(min=1))
-        excess = torch.where(told & (unusual > options.misfit.doubtful), ratio, 1.0)
-        apart = told & (unusual > options.misfit.unlikely)
+        told, unusual = (free >= MIN_SPARE_RESIDUALS) & (spare > free), deviate(ratio, more, free.clamp(min=1))
+        excess = torch.where(told & (unusual > MAX_CERTAIN_F_DEVIATE), ratio, 1.0)
+        apart = told & (unusual > MAX_F_DEVIATE)
         # the given matrices may fit badly where they are linear, and the common ones where none is common
         vagueness = sigma.minimum(variance.sqrt()) / _extent(given).clamp(min=torch.finfo(sigma.dtype).tiny)
-        return Misfit(ratio, excess, apart, torch.zeros_like(apart), vagueness, (vagueness > options.misfit.vague) & (spare > 0))
+        return Misfit(ratio, excess, apart, torch.zeros_like(apart), vagueness, (vagueness > MAX_MATCH_NOISE) & (spare > 0))
     entries = given.homographies.flatten(-2)
     different = used[:, :p].sum(-1) - eigenvalues(entries.mT @ entries)[:, -1]
     ratio = sigma / (different / (rows - 8).clamp(min=1)).clamp(min=torch.finfo(sigma.dtype).tiny).sqrt()
-    told = (spare > 1) & (used[:, p:].sum(-1) == 0) & (sigma > options.misfit.rounding)
-    chance = told & (ratio > options.misfit.chance - options.misfit.chance_of_few / spare.clamp(min=1).sqrt())
-    apart = told & ((ratio > options.misfit.spread) | (sigma > options.misfit.entries))
+    told = (spare > 1) & (used[:, p:].sum(-1) == 0) & (sigma > RESIDUAL_ROUNDING)
+    chance = told & (ratio > MAX_CHANCE_NOISE - CHANCE_NOISE_DECREASE / spare.clamp(min=1).sqrt())
+    apart = told & ((ratio > MAX_RELATIVE_NOISE) | (sigma > MAX_ENTRY_NOISE))
     return Misfit(ratio, torch.ones_like(ratio), apart, chance, torch.zeros_like(ratio), torch.zeros_like(told))
 
 
@@ -249,9 +264,7 @@ def _extent(given: GivenPlanes) -> Tensor:
     return torch.stack(found).amin(0)
 
 
-def turned(
-    given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Tensor, options: PlanesOptions
-) -> tuple[Tensor, Tensor]:
+def turned(given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
     r"""Distance ``(b,)`` of :math:`K_2^{-1} H_\infty K_1`, of determinant 1, from a rotation, and whether noise is no reason."""
     if given.calibration is None:
         return torch.zeros_like(infinity[:, 0]), torch.zeros_like(status, dtype=torch.bool)
@@ -274,5 +287,5 @@ def turned(
     known = (status == Status.OK) & (given.rows()[1] > 1)
     # the fit of four small planes may be another minimum, far from what its covariance says
     used, p = given.used(), given.homographies.shape[1]
-    known = known & ((used[:, :p].sum(-1) >= 5) | used[:, p:].any(-1) | (deviation < options.calibration.small))
-    return distance, known & (distance > options.calibration.turned) & (distance > options.calibration.deviations * deviation)
+    known = known & ((used[:, :p].sum(-1) >= 5) | used[:, p:].any(-1) | (deviation < MAX_ROTATION_DISTANCE_DEVIATION))
+    return distance, known & (distance > MAX_ROTATION_DISTANCE) & (distance > MIN_ROTATION_DEVIATIONS * deviation)

@@ -28,7 +28,7 @@ from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import map_blocks, one_thread
 from dyntorch.tasks.planes.input import GivenPlanes, Pair, Points, both, cameras, check_counts, enough, padded
-from dyntorch.tasks.planes.notices import Figures, PlanesNotice, misfit, planes_notices, turned
+from dyntorch.tasks.planes.notices import MAX_NEAR_ZERO, ROUNDING_ERROR, Figures, PlanesNotice, misfit, planes_notices, turned
 from dyntorch.tasks.planes.options import PlanesOptions
 from dyntorch.tasks.planes.problem import Layout, PlaneMatches, noise_variance, projected, solve
 
@@ -37,6 +37,9 @@ from dyntorch.tasks.planes.problem import Layout, PlaneMatches, noise_variance, 
 
 
 STEPS = 5  # of Gauss and Newton on the reprojection error of a point
+
+
+MAX_STATIC_DEVIATIONS = 3.0  # within which a plane does not move
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -199,9 +202,9 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     used = given.used()
     planes, bodies = used[:, : layout.planes].sum(-1), used[:, layout.planes :].sum(-1)
     rows, spare = given.rows()
-    covariance = noise_variance(cost, spare, options)[:, None, None] * covariance
-    figures = _figures(layout, theta, covariance, used, options)
-    against = misfit(given, cost, separate, options)
+    covariance = noise_variance(cost, spare, options.risk)[:, None, None] * covariance
+    figures = _figures(layout, theta, covariance, used)
+    against = misfit(given, cost, separate)
     # what one homography at infinity leaves beyond the noise is an error as well
     covariance = against.excess[:, None, None] * covariance
     uncertainty = projected(covariance[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
@@ -212,17 +215,17 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     vague = against.vague & told
     apart = (against.apart & told) | vague
     chance = against.chance & told & ~apart
-    status = torch.where((uncertainty > options.ambiguity.uncertain) | other | several | chance, Status.AMBIGUOUS, Status.OK)
+    status = torch.where((uncertainty > options.max_error) | other | several | chance, Status.AMBIGUOUS, Status.OK)
     status = torch.where(apart, Status.NO_CONSENSUS, status)
     status = torch.where(undetermined, Status.DEGENERATE, status)
     status = torch.where(right, status, Status.TOO_FEW)
-    distance, bent = turned(given, theta[:, :9], covariance[:, :9, :9], status, options)
+    distance, bent = turned(given, theta[:, :9], covariance[:, :9, :9], status)
     said = {
         PlanesNotice.NO_COMMON_INFINITY: (against.ratio, apart & ~vague),
         PlanesNotice.CHANCE: (against.ratio, chance),
         PlanesNotice.INCOHERENT: (against.vagueness, vague),
         PlanesNotice.CALIBRATION: (distance, bent),
-        PlanesNotice.UNCERTAIN: (uncertainty, (uncertainty > options.ambiguity.uncertain) & right & ~apart),
+        PlanesNotice.UNCERTAIN: (uncertainty, (uncertainty > options.max_error) & right & ~apart),
         PlanesNotice.OTHER_SOLUTION: (used.sum(-1), (other | several) & right & ~apart),
     }
     limits = planes_notices(figures, right, said, given)
@@ -256,7 +259,7 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     )
 
 
-def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor, options: PlanesOptions) -> Figures:
+def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor) -> Figures:
     """Directions of epipoles and normals with their covariances, and which planes move."""
     infinity, epipoles, planes = layout.unpack(theta)
     p = layout.planes
@@ -272,8 +275,8 @@ def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor, op
         + of_epipoles[:, :p].diagonal(dim1=-2, dim2=-1).sum(-1) * n.square().sum(-1)
     ).sqrt()
     length = e.norm(dim=-1) * n.norm(dim=-1)
-    near = (length <= options.degeneracy.near * size) & (length <= options.degeneracy.still * spread)
-    still = (length <= options.degeneracy.exact * size) | near
+    near = (length <= MAX_NEAR_ZERO * size) & (length <= MAX_STATIC_DEVIATIONS * spread)
+    still = (length <= ROUNDING_ERROR * size) | near
     moving = torch.cat([used[:, :p] & ~still, used[:, p:]], dim=1)
     return Figures(
         epipoles=unit_vectors(epipoles),
@@ -282,7 +285,6 @@ def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor, op
         normal_covariance=projected(of_normals, n),
         moving=moving,
         used=used,
-        options=options.degeneracy,
     )
 
 
@@ -341,7 +343,7 @@ def translating_planes(
     method: str = "auto",
     refine: bool = True,
     calibration: Tensor | tuple[Tensor, Tensor] | None = None,
-    options: PlanesOptions = PlanesOptions(),
+    options: PlanesOptions | None = None,
 ) -> TranslatingPlanes:
     r"""The homography at infinity from planes that translate independently, seen in two views.
 
@@ -370,7 +372,7 @@ def translating_planes(
         refine: False returns the start as it is.
         calibration: K ``(3, 3)`` or ``(*batch, 3, 3)``, or a pair of them for the two views, upgrades the affine frame to a
             similarity: :math:`H_\infty \sim K_2 R K_1^{-1}`.
-        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
+        options: what the fit takes and risks; None is :class:`dyntorch.PlanesOptions` as it is.
 
     Returns:
         A :class:`~dyntorch.tasks.planes.planes.TranslatingPlanes`.
@@ -391,6 +393,7 @@ def translating_planes(
         >>> print(repr(found).splitlines()[0])
         TranslatingPlanes(planes=4, bodies=0, batch=(): 1 OK)
     """
+    options = PlanesOptions() if options is None else options
     check_options(options, PlanesOptions)
     planes = _views(x1, x2)
     bodies = None if body_matches is None else padded("body_matches", body_matches)
@@ -404,7 +407,7 @@ def translating_planes(
         raise ValueError("matches are given of the planes or of the bodies only: give both x1, x2 and body_matches, or neither")
     camera = None if calibration is None else cameras(calibration, tuple(H.shape[:-3]), H)
     with torch.no_grad():
-        given = GivenPlanes.of(H, F, planes, bodies, camera, options)
+        given = GivenPlanes.of(H, F, planes, bodies, camera)
         result = outcome(given, _solved(given, method, refine, options), method, refine, options)
         shaped: dict[str, Any] = {name: given.back(value) for name, value in vars(result).items() if isinstance(value, Tensor)}
     return replace(result, **shaped)

@@ -28,7 +28,21 @@ from dyntorch.tasks.planes.closed_forms import (
     plane_parts,
     unit_determinant,
 )
-from dyntorch.tasks.planes.options import PlaneFrameOptions, PlanesOptions
+from dyntorch.tasks.planes.options import PlanesOptions
+
+FOCAL_PER_HALF_IMAGE = 2.0  # focal lengths per half image; at 1 the error of H alone is 1.3 times as large, at 3 the same
+# where the middle of the image may be, in focal lengths: the origin, or pixels counted from a corner
+IMAGE_CENTRES = ((0.0, 0.0), (0.5, 0.4))
+MIN_LOG10_FOCAL = -1.0  # least focal length that is tried, its decimal logarithm
+MAX_LOG10_FOCAL = 4.5  # largest focal length that is tried, its decimal logarithm
+NUM_FOCALS = 56  # focal lengths that are tried
+MAX_STATIC_TRIALS = 5  # planes up to which each is tried as static
+MAX_STEPS_ON_MATRICES = 40  # steps on the matrices, at most
+SAME_SOLUTION_TOLERANCE = 1e-6  # one minus the cosine of homographies at infinity that are one solution
+MIN_SOLUTION_SINE = 0.3  # of homographies at infinity that are two solutions: a camera that turns by 20 degrees moves them as far
+MAX_EQUIVALENT_COST = 4.0  # in noise variances beyond the least
+COST_ROUNDING = 1e-20  # over one and the least cost
+MAX_OPEN_VARIANCE_RATIO = 1e12  # of the homography at infinity; three planes 1e3 to 1e9, degenerate ones 1e14 and more
 
 
 class Normal(NamedTuple):
@@ -229,16 +243,14 @@ def frames_of_matches(views: tuple[Tensor, Tensor], weights: Tensor) -> tuple[Te
     return first, second
 
 
-def frames_of_calibration(calibration: tuple[Tensor, Tensor], options: PlanesOptions = PlanesOptions()) -> tuple[Tensor, Tensor]:
+def frames_of_calibration(calibration: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Similarities, but for skew, in which known cameras have images of size about 1."""
     first, second = (torch.linalg.inv_ex(k)[0] for k in calibration)
-    size = torch.tensor([options.frames.extent, options.frames.extent, 1.0], dtype=first.dtype, device=first.device)[:, None]
+    size = torch.tensor([FOCAL_PER_HALF_IMAGE, FOCAL_PER_HALF_IMAGE, 1.0], dtype=first.dtype, device=first.device)[:, None]
     return size * first, size * second
 
 
-def frames_of_matrices(
-    homographies: Tensor, fundamentals: Tensor, options: PlanesOptions = PlanesOptions()
-) -> tuple[Tensor, Tensor]:
+def frames_of_matrices(homographies: Tensor, fundamentals: Tensor) -> tuple[Tensor, Tensor]:
     r"""Similarities for images that nothing is known of, from what homographies between them look like. homographies
     ``(b, p, 3, 3)``, fundamentals ``(b, m, 3, 3)`` -> ``(b, 3, 3)``."""
     if not homographies.shape[1]:
@@ -247,27 +259,27 @@ def frames_of_matrices(
         scale = torch.where((near > 0) & (far > 0), near / far, 1.0).sqrt()
         frame = similarity(scale, torch.zeros_like(fundamentals[:, 0, 0, :2]))
         return frame, frame
-    frames, inverses = _frames(options.frames, homographies.device)
+    frames, inverses = _frames(homographies.device)
     scaled = unit_determinant(homographies)
     size = torch.stack([(frame @ scaled @ inverse).square().sum((-2, -1)) for frame, inverse in zip(frames, inverses, strict=True)])
     best = torch.where(size > 0, size, 1.0).log().sum(-1).argmin(0)
-    extent = options.frames.extent
-    frame = frames[best] * torch.tensor([extent, extent, 1.0], dtype=frames.dtype, device=frames.device)[:, None]
+    frame = (
+        frames[best]
+        * torch.tensor([FOCAL_PER_HALF_IMAGE, FOCAL_PER_HALF_IMAGE, 1.0], dtype=frames.dtype, device=frames.device)[:, None]
+    )
     return frame, frame
 
 
 @constant
-def _frames(options: PlaneFrameOptions, device: torch.device) -> tuple[Tensor, Tensor]:
+def _frames(device: torch.device) -> tuple[Tensor, Tensor]:
     """All similarities that are tried, and their inverses."""
-    focal = torch.logspace(options.shortest_focal, options.longest_focal, options.focals, dtype=torch.float64, device=device)
-    centres = torch.tensor(options.centres, dtype=torch.float64, device=device)
+    focal = torch.logspace(MIN_LOG10_FOCAL, MAX_LOG10_FOCAL, NUM_FOCALS, dtype=torch.float64, device=device)
+    centres = torch.tensor(IMAGE_CENTRES, dtype=torch.float64, device=device)
     frames = similarity((1 / focal)[:, None].expand(-1, len(centres)), focal[:, None, None] * centres).flatten(0, 1)
     return frames, torch.linalg.inv(frames)
 
 
-def starts(
-    method: str, homographies: Tensor, fundamentals: Tensor, several: bool = True, *, options: PlanesOptions = PlanesOptions()
-) -> list[Tensor]:
+def starts(method: str, homographies: Tensor, fundamentals: Tensor, several: bool = True) -> list[Tensor]:
     """Homographies at infinity ``(b, 3, 3)`` of norm about 1 by one method, or by all that the numbers of planes and bodies
     allow."""
     planes, bodies = homographies.shape[1], fundamentals.shape[1]
@@ -278,13 +290,13 @@ def starts(
         if planes < LEAST[name][0] or bodies < LEAST[name][1]:
             continue
         if name == "mixed":
-            found.append(infinity_from_mixed(known[:, 0], filled, options)[0])
+            found.append(infinity_from_mixed(known[:, 0], filled)[0])
         elif name == "fundamentals":
             found.append(infinity_from_fundamentals(known)[0])
         else:
             linear = {"linear": infinity_linear, "thesis": infinity_thesis}
-            found.append((linear[name](filled) if name in linear else infinity_closed_form(filled, options))[0])
-    if method == "auto" and several and bodies < 2 and planes <= options.starts.static_planes:
+            found.append((linear[name](filled) if name in linear else infinity_closed_form(filled))[0])
+    if method == "auto" and several and bodies < 2 and planes <= MAX_STATIC_TRIALS:
         found += unit_determinant(filled).unbind(1)
     eye = torch.eye(3, dtype=homographies.dtype, device=homographies.device)
     return [
@@ -339,7 +351,7 @@ def solve(
         spare: ``(b,)`` residuals beyond the degrees of freedom.
         method: see :func:`~dyntorch.tasks.planes.problem.starts`.
         refine: False leaves a start as it is.
-        options: every number that decides.
+        options: time and risk.
 
     Returns:
         theta ``(b, size)`` of :class:`Layout`, cost ``(b,)``, the covariance ``(b, size, size)`` of theta for residuals of
@@ -347,69 +359,69 @@ def solve(
         fits them as well ``(b,)``.
     """
     layout, b = Layout(homographies.shape[1], fundamentals.shape[1]), len(homographies)
-    weights = homographies.new_tensor([1.0] * layout.planes + [options.fit.body_weight] * layout.bodies)
+    weights = homographies.new_tensor([1.0] * layout.planes + [options.body_weight] * layout.bodies)
     matrices = PlanesProblem(layout, Matrices(torch.cat([homographies, fundamentals], dim=1), weights))
-    first = starts(method, homographies, fundamentals, several=refine, options=options)
+    first = starts(method, homographies, fundamentals, several=refine)
     theta = torch.cat([parameters(homographies, fundamentals, infinity) for infinity in first])
     rounds = matrices.repeated(len(first))
     if refine:
         start = rounds.evaluate((theta,))
-        theta = minimize(rounds, start, LeastSquaresOptions(iterations=options.fit.steps_on_matrices)).theta[0]
+        theta = minimize(rounds, start, LeastSquaresOptions(iterations=MAX_STEPS_ON_MATRICES)).theta[0]
     cost = rounds.normal_equations(theta)[0]
-    theta, cost = _distinct(theta.unflatten(0, (len(first), b)), cost.unflatten(0, (len(first), b)), options)
+    theta, cost = _distinct(theta.unflatten(0, (len(first), b)), cost.unflatten(0, (len(first), b)), options.num_refined)
     problem = matrices if matches is None else PlanesProblem(layout, matches)
     if matches is not None:
         chosen = cost.flatten().isfinite().nonzero()[:, 0]
         again = problem.repeated(len(cost)).subset(chosen)
         if refine:
             start = again.evaluate((theta.flatten(0, 1)[chosen],))
-            found = minimize(again, start, LeastSquaresOptions(iterations=options.fit.steps_on_matches))
+            found = minimize(again, start, LeastSquaresOptions(iterations=options.max_steps))
             theta, value = theta.flatten(0, 1).index_copy(0, chosen, found.theta[0]).unflatten(0, cost.shape), found.cost
         else:
             value = again.normal_equations(theta.flatten(0, 1)[chosen])[0]
         cost = cost.flatten().index_copy(0, chosen, value).unflatten(0, cost.shape)
     best = cost.argmin(0)
     everyone = torch.arange(b, device=best.device)
-    other = _others(theta[..., :9], cost, best, spare, options) if refine else torch.zeros_like(spare, dtype=torch.bool)
+    other = _others(theta[..., :9], cost, best, spare, options.risk) if refine else torch.zeros_like(spare, dtype=torch.bool)
     theta, cost = theta[best, everyone], cost[best, everyone]
-    covariance, undetermined = _covariance(problem, theta, options)
+    covariance, undetermined = _covariance(problem, theta)
     if matches is not None:
-        undetermined = _covariance(matrices, theta, options)[1]
+        undetermined = _covariance(matrices, theta)[1]
     return theta, cost, covariance, undetermined, other
 
 
-def _distinct(theta: Tensor, cost: Tensor, options: PlanesOptions) -> tuple[Tensor, Tensor]:
+def _distinct(theta: Tensor, cost: Tensor, num_refined: int) -> tuple[Tensor, Tensor]:
     """The best few of several results ``(rounds, b, *)``; the cost of one that was found before is infinite."""
     cost, order = cost.nan_to_num(torch.inf).sort(dim=0, stable=True)
     theta = theta.gather(0, order[..., None].expand_as(theta))
     directions = unit_vectors(theta[..., :9])
     cosine = torch.einsum("kbi,lbi->klb", directions, directions).abs()
-    again = cosine > 1 - options.fit.same
+    again = cosine > 1 - SAME_SOLUTION_TOLERANCE
     before = torch.ones(len(cost), len(cost), dtype=torch.bool, device=cost.device).tril(-1)[..., None]
     cost = torch.where((again & before).any(1), torch.inf, cost)
     cost, order = cost.sort(dim=0, stable=True)
-    return theta.gather(0, order[..., None].expand_as(theta))[: options.fit.kept], cost[: options.fit.kept]
+    return theta.gather(0, order[..., None].expand_as(theta))[:num_refined], cost[:num_refined]
 
 
-def _others(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor, options: PlanesOptions) -> Tensor:
+def _others(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor, risk: float) -> Tensor:
     """Where another homography at infinity ``(k, b, 9)`` has about the cost of the best."""
     directions = unit_vectors(infinity)
     everyone = torch.arange(len(best), device=best.device)
     least = cost[best, everyone]
     sine = (1 - (directions * directions[best, everyone]).sum(-1).square()).clamp(min=0).sqrt()
-    limit = least + options.ambiguity.likely * noise_variance(least, spare, options) + options.ambiguity.exact * (least + 1)
-    return ((cost <= limit) & (sine > options.ambiguity.apart)).any(0)
+    limit = least + MAX_EQUIVALENT_COST * noise_variance(least, spare, risk) + COST_ROUNDING * (least + 1)
+    return ((cost <= limit) & (sine > MIN_SOLUTION_SINE)).any(0)
 
 
-def noise_variance(cost: Tensor, spare: Tensor, options: PlanesOptions = PlanesOptions()) -> Tensor:
+def noise_variance(cost: Tensor, spare: Tensor, risk: float) -> Tensor:
     r"""Variance of the noise, :math:`c / q` with the lower quantile q of :math:`\chi^2`, which is near the number of residuals
     to spare where that is large; 0 where none is. cost ``(b,)``, spare ``(b,)``."""
-    share, degrees = options.ambiguity.underestimated, spare.clamp(min=1).flatten().tolist()
-    limits = spare.new_tensor([quantile(share, free) for free in degrees]).reshape(spare.shape)
+    degrees = spare.clamp(min=1).flatten().tolist()
+    limits = spare.new_tensor([quantile(risk, free) for free in degrees]).reshape(spare.shape)
     return torch.where(spare > 0, cost / limits, 0.0)
 
 
-def _covariance(problem: PlanesProblem, theta: Tensor, options: PlanesOptions) -> tuple[Tensor, Tensor]:
+def _covariance(problem: PlanesProblem, theta: Tensor) -> tuple[Tensor, Tensor]:
     """Inverse of the Gauss-Newton matrix with the gauges held, and whether the homography at infinity has an open direction."""
     matrix = problem.normal_equations(theta)[2]
     size = matrix.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -422,7 +434,7 @@ def _covariance(problem: PlanesProblem, theta: Tensor, options: PlanesOptions) -
     inverse = (vectors / values.clamp(min=EIGENVALUE_EPSILON)[:, None, :]) @ vectors.mT / (unit[:, :, None] * unit[:, None])
     spread = projected(inverse[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1)
     least = 1 / matrix[:, :9, :9].diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=torch.finfo(matrix.dtype).tiny)
-    return inverse, spread > options.ambiguity.open * least
+    return inverse, spread > MAX_OPEN_VARIANCE_RATIO * least
 
 
 def projected(covariance: Tensor, vector: Tensor) -> Tensor:

@@ -8,14 +8,29 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from dyntorch.tasks.segment.options import SegmentOptions
-
 TABLE = 1 << 22  # distances held at a time
 
 
 DENSE = 1000
 """Matches up to which links are a dense matrix: milliseconds per product with 320 columns at 340, 550, 1100 matches 1.0, 2.2, 11;
 of a sparse one 1.2, 1.6, 4.8, but with two copies."""
+
+
+NUM_NEIGHBOURS = 15  # nearest matches, in either image, by which the coherence of a match is judged
+NUM_EDGES = 8  # nearest matches, in either image, that a match is linked with
+DEVIATION_TOLERANCE = 0.7  # relative to the distance of the neighbour: coherence falls to 1/e
+EDGE_TOLERANCE = 0.5  # the same for the weight of a link
+RIDGE = 0.25  # weight of the common motion in the fit of a local one, over the moments of the neighbours
+MAX_NEIGHBOUR_DISTANCE = 2.5  # over the median one: farther deviations are no longer divided by the distance
+NUM_PASSES = 2  # each without the neighbours that the last one distrusts
+MIN_NEIGHBOUR_COHERENCE = 0.02  # below it a match is no neighbour in the next pass
+MAX_CONFORMITY_MEMBERS = 1500  # members of a body by which the conformity of a match is judged, about
+MAX_SIMILARITY_PAIRS = 400  # pairs of neighbours by which common similarities are looked for, about
+NUM_MEAN_SHIFT_STARTS = 16  # of these pairs
+MAX_IDENTITY_DISTANCE = 0.35  # of the complex factor of zoom and rotation from 1: local motions start from the identity
+MIN_FACTOR_SEPARATION = 0.7  # relative distance of a further factor from the first ones
+MIN_FURTHER_FACTOR_SHARE = 0.1  # of the pairs; by chance .05 to .08
+MIN_FIRST_FACTOR_SHARE = 0.05  # of the pairs; by chance .02 to .04
 
 
 @dataclass(frozen=True)
@@ -73,57 +88,50 @@ class Coherence:
     links: Links  # how well two neighbours move alike
 
 
-def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None, *, options: SegmentOptions) -> Coherence:
+def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None) -> Coherence:
     r"""Deviation of each match from the affine motion of its neighbours, in both directions. x1 ``(n, 2)``, among ``(n,)``."""
     among = torch.ones_like(x1[:, 0], dtype=torch.bool) if among is None else among
     fresh = _first_of_copies(x1, x2, among, scale / 6)
     values = torch.ones_like(x1[:, 0])
-    for _ in range(options.coherence.passes):
+    for _ in range(NUM_PASSES):
         # the first pass finds most wrong matches, which then no longer stand between the neighbours of the others
-        trusted = values > options.coherence.trusted
-        values, linked = _judged(x1, x2, fresh & trusted, scale, options)
+        trusted = values > MIN_NEIGHBOUR_COHERENCE
+        values, linked = _judged(x1, x2, fresh & trusted, scale)
     return Coherence(values, _links(*linked, among))
 
 
-def _judged(
-    x1: Tensor, x2: Tensor, eligible: Tensor, scale: float, options: SegmentOptions
-) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+def _judged(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Coherence of all matches with their nearest eligible ones ``(n,)``; rows, columns and weights of the links."""
     count = len(x1)
     values = torch.zeros_like(x1[:, 0])
     rows, columns, weights = [], [], []
     for a, b in ((x1, x2), (x2, x1)):
-        index, usable = _nearest(a, b, eligible.nonzero().flatten(), scale / 6, options)
+        index, usable = _nearest(a, b, eligible.nonzero().flatten(), scale / 6)
         da, db = a[index] - a[:, None], b[index] - b[:, None]
-        reach = _reach(da, usable, eligible, options)
-        each = torch.stack(
-            [_deviation(da, db, usable, common, reach, scale, options) for common in _common_motions(da, db, usable, options)]
-        )
+        reach = _reach(da, usable, eligible)
+        each = torch.stack([_deviation(da, db, usable, common, reach, scale) for common in _common_motions(da, db, usable)])
         # a match follows the one of the common motions by which it agrees most with its neighbours
-        agreed, best = (torch.exp(-((each / options.coherence.tolerance) ** 2)) * usable).sum(-1).max(0)
+        agreed, best = (torch.exp(-((each / DEVIATION_TOLERANCE) ** 2)) * usable).sum(-1).max(0)
         deviation = each[best, torch.arange(count, device=x1.device)]
         values = values + agreed / usable.sum(-1).clamp(min=1) / 2
-        linked = (
-            torch.exp(-((deviation[:, : options.coherence.edges] / options.coherence.edge_tolerance) ** 2))
-            * usable[:, : options.coherence.edges]
-        )
+        linked = torch.exp(-((deviation[:, :NUM_EDGES] / EDGE_TOLERANCE) ** 2)) * usable[:, :NUM_EDGES]
         rows.append(torch.arange(count, device=x1.device)[:, None].expand_as(linked).flatten())
-        columns.append(index[:, : options.coherence.edges].flatten())
+        columns.append(index[:, :NUM_EDGES].flatten())
         weights.append(linked.flatten())
     return values, (torch.cat(rows), torch.cat(columns), torch.cat(weights))
 
 
-def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float, options: SegmentOptions) -> Tensor:
+def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float) -> Tensor:
     """How well every match moves like its nearest members of each body. x1 ``(n, 2)``, members ``(K, n)`` -> ``(K, n)``."""
-    some = [_thinned(body, options) for body in members]
+    some = [_thinned(body) for body in members]
     fresh = _first_of_copies(x1, x2, torch.stack(some).any(0), scale / 6)
-    return torch.stack([_judged(x1, x2, fresh & body, scale, options)[0] for body in some])
+    return torch.stack([_judged(x1, x2, fresh & body, scale)[0] for body in some])
 
 
-def _thinned(body: Tensor, options: SegmentOptions) -> Tensor:
-    """About ``options.coherence.members`` of the members ``(n,)`` bool, evenly."""
+def _thinned(body: Tensor) -> Tensor:
+    """About ``MAX_CONFORMITY_MEMBERS`` of the members ``(n,)`` bool, evenly."""
     rank = body.cumsum(-1)
-    return body & (rank % max(1, int(rank[-1]) // options.coherence.members) == 0)
+    return body & (rank % max(1, int(rank[-1]) // MAX_CONFORMITY_MEMBERS) == 0)
 
 
 def _links(row: Tensor, column: Tensor, weight: Tensor, among: Tensor) -> Links:
@@ -166,10 +174,10 @@ def _first_of_copies(x1: Tensor, x2: Tensor, among: Tensor, least: float) -> Ten
     return fresh
 
 
-def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float, options: SegmentOptions) -> tuple[Tensor, Tensor]:
+def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float) -> tuple[Tensor, Tensor]:
     """Indices ``(n, k)`` of the matches nearest in a, nearest first, of some of them (indices), and which of these exist."""
     near, joint = a[among], torch.cat([a, b], dim=-1)
-    count = min(options.coherence.neighbours, len(among))
+    count = min(NUM_NEIGHBOURS, len(among))
     indices, exist = [], []
     for rows in _blocks(len(a), len(among)):
         distance = torch.cdist(a[rows], near).masked_fill_(torch.cdist(joint[rows], joint[among]) < least, torch.inf)
@@ -179,12 +187,12 @@ def _nearest(a: Tensor, b: Tensor, among: Tensor, least: float, options: Segment
     return torch.cat(indices), torch.cat(exist)
 
 
-def _common_motions(da: Tensor, db: Tensor, usable: Tensor, options: SegmentOptions) -> Tensor:
+def _common_motions(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
     """The similarities ``(m, 2, 2)`` that many neighbours share, those that differ much, the identity for all near it."""
     size = da.square().sum(-1)
     near = usable & (size > 0)
     pair = near.flatten().nonzero().flatten()
-    pair = pair[:: max(1, len(pair) // options.coherence.ratios)]
+    pair = pair[:: max(1, len(pair) // MAX_SIMILARITY_PAIRS)]
     da, db, size = da.flatten(0, 1)[pair], db.flatten(0, 1)[pair], size.flatten()[pair]
     # zoom and rotation as a complex number, db / da
     turned = da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]
@@ -192,7 +200,7 @@ def _common_motions(da: Tensor, db: Tensor, usable: Tensor, options: SegmentOpti
     if not len(factor):
         return torch.eye(2, dtype=da.dtype, device=da.device)[None]
     # the modes, by mean shift from some of them, with a window relative to their size
-    mode = factor[:: max(1, len(factor) // options.coherence.modes)]
+    mode = factor[:: max(1, len(factor) // NUM_MEAN_SHIFT_STARTS)]
     score = torch.zeros_like(mode[:, 0])
     for _ in range(5):
         window = 0.3 * mode.norm(dim=-1, keepdim=True) + torch.finfo(da.dtype).tiny
@@ -203,29 +211,27 @@ def _common_motions(da: Tensor, db: Tensor, usable: Tensor, options: SegmentOpti
     kept: list[complex] = []
     for (real, imaginary), share in zip(mode[order].tolist(), (score[order] / len(factor)).tolist(), strict=True):
         found = complex(real, imaginary)
-        found = 1.0 if abs(found - 1) <= options.coherence.distorted else found
-        if share >= (options.coherence.share_of_further if kept else options.coherence.share_of_first) and all(
-            abs(found - other) > options.coherence.apart * abs(other) for other in kept
+        found = 1.0 if abs(found - 1) <= MAX_IDENTITY_DISTANCE else found
+        if share >= (MIN_FURTHER_FACTOR_SHARE if kept else MIN_FIRST_FACTOR_SHARE) and all(
+            abs(found - other) > MIN_FACTOR_SEPARATION * abs(other) for other in kept
         ):
             kept.append(found)
     return torch.tensor([[[z.real, -z.imag], [z.imag, z.real]] for z in kept or [1.0]], dtype=da.dtype, device=da.device)
 
 
-def _reach(da: Tensor, usable: Tensor, eligible: Tensor, options: SegmentOptions) -> Tensor:
+def _reach(da: Tensor, usable: Tensor, eligible: Tensor) -> Tensor:
     """d ``()``, from the neighbours of those matches that are neighbours themselves."""
     distance = da.norm(dim=-1)[usable & eligible[:, None]]
-    return options.coherence.reach * distance.median() if len(distance) else da.new_tensor(torch.inf)
+    return MAX_NEIGHBOUR_DISTANCE * distance.median() if len(distance) else da.new_tensor(torch.inf)
 
 
-def _deviation(
-    da: Tensor, db: Tensor, usable: Tensor, common: Tensor, reach: Tensor, scale: float, options: SegmentOptions
-) -> Tensor:
+def _deviation(da: Tensor, db: Tensor, usable: Tensor, common: Tensor, reach: Tensor, scale: float) -> Tensor:
     """r ``(n, k)`` after one weighted fit of the local motions."""
     size = da.norm(dim=-1).minimum(reach) * torch.linalg.det(common).abs().sqrt() + scale
     error = db - da @ common.mT
-    weight = torch.exp(-((error.norm(dim=-1) / size / options.coherence.tolerance) ** 2)) * usable
+    weight = torch.exp(-((error.norm(dim=-1) / size / DEVIATION_TOLERANCE) ** 2)) * usable
     moment = (da * weight[..., None]).mT @ da
-    ridge = options.coherence.ridge * moment.diagonal(dim1=-2, dim2=-1).sum(-1) + 4 * scale * scale
+    ridge = RIDGE * moment.diagonal(dim1=-2, dim2=-1).sum(-1) + 4 * scale * scale
     moment = moment + ridge[:, None, None] * torch.eye(2, dtype=da.dtype, device=da.device)
     local = torch.linalg.inv_ex(moment)[0] @ (da * weight[..., None]).mT @ error
     return (error - da @ local).norm(dim=-1) / size

@@ -10,7 +10,16 @@ from torch import Tensor
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import homogeneous, null_vectors, skew
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.options import SegmentOptions
+
+THRESHOLD_PIXELS = 2.5  # threshold in pixels to which all figures in pixels refer
+SAMPSON_NOISE_PIXELS = 0.7  # standard deviation of a Sampson distance
+ENERGY_MAX_SQUARED_DISTANCE = 4.0  # over the variance of the noise
+CUT_COST = 4.0  # of a link of weight 1 between two bodies
+PARALLAX_WEIGHT = 0.2  # of motion along the epipolar lines beside that of the body's mean plane
+PARALLAX_FREEDOM = 2.0  # degrees of freedom of Student's distribution of the parallax
+MIN_PARALLAX_PIXELS = 2.0  # least scale of the parallax
+NUM_PLANE_FITS = 6  # reweighted fits of the mean plane of a body
+NUM_PARALLAX_SCALE_UPDATES = 2  # in each of them
 
 
 @dataclass(frozen=True)
@@ -19,7 +28,7 @@ class View:
 
     x1: Tensor  # ``(n, 2)``
     x2: Tensor
-    pixel: float  # the threshold / ``options.units.threshold_in_pixels``, in these coordinates: a pixel at the default threshold
+    pixel: float  # the threshold / ``THRESHOLD_PIXELS``, in these coordinates: a pixel at the default threshold
     links: Links  # between matches
 
     def subset(self, keep: Tensor) -> View:
@@ -27,23 +36,22 @@ class View:
         return View(self.x1[keep], self.x2[keep], self.pixel, self.links.subset(keep))
 
 
-def energy(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> Tensor:
+def energy(view: View, fundamentals: Tensor, member: Tensor) -> Tensor:
     r"""Cost of labellings with their fundamental matrices: fundamentals ``(B, K, 3, 3)``, member ``(B, K, n)`` -> ``(B,)``."""
-    square = sampson_squared(fundamentals, view.x1, view.x2) / (options.energy.noise * view.pixel) ** 2
-    distances = (square.clamp(max=options.energy.cap) * member).sum((-2, -1))
-    cost = relief(view, fundamentals, member, options)
-    return distances + options.energy.cut * view.links.cut(member) + options.energy.parallax * (cost * member).sum((-2, -1))
+    square = sampson_squared(fundamentals, view.x1, view.x2) / (SAMPSON_NOISE_PIXELS * view.pixel) ** 2
+    distances = (square.clamp(max=ENERGY_MAX_SQUARED_DISTANCE) * member).sum((-2, -1))
+    cost = relief(view, fundamentals, member)
+    return distances + CUT_COST * view.links.cut(member) + PARALLAX_WEIGHT * (cost * member).sum((-2, -1))
 
 
-def relief(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> Tensor:
+def relief(view: View, fundamentals: Tensor, member: Tensor, min_scale: float = MIN_PARALLAX_PIXELS) -> Tensor:
     r"""Cost ``(B, K, n)`` of the parallax of every match beside every body:
     :math:`(\nu + 1) \log(1 + p^2 / \nu t^2) + \log t^2`."""
-    value, scale = parallax(view, fundamentals, member, options)
-    freedom = options.energy.parallax_freedom
-    return (freedom + 1) * torch.log1p(value.square() / (freedom * scale[..., None])) + scale.log()[..., None]
+    value, scale = parallax(view, fundamentals, member, min_scale)
+    return (PARALLAX_FREEDOM + 1) * torch.log1p(value.square() / (PARALLAX_FREEDOM * scale[..., None])) + scale.log()[..., None]
 
 
-def parallax(view: View, fundamentals: Tensor, member: Tensor, options: SegmentOptions) -> tuple[Tensor, Tensor]:
+def parallax(view: View, fundamentals: Tensor, member: Tensor, min_scale: float = MIN_PARALLAX_PIXELS) -> tuple[Tensor, Tensor]:
     r"""Distances along the epipolar lines from the robust mean plane of each body, and their squared scale, in pixels.
     fundamentals ``(B, K, 3, 3)``, member ``(B, K, n)`` -> ``(B, K, n)``."""
     first, second = homogeneous(view.x1), homogeneous(view.x2)
@@ -60,7 +68,7 @@ def parallax(view: View, fundamentals: Tensor, member: Tensor, options: SegmentO
     total = member.sum(-1) + 1e-9
     eye = torch.eye(3, dtype=first.dtype, device=first.device)
     weight, scale, value = member, torch.zeros_like(total), depth
-    for turn in range(options.energy.plane_rounds):
+    for turn in range(NUM_PLANE_FITS):
         heavy = weight * lever.square()
         inner = (heavy @ moments).unflatten(-1, (3, 3))
         ridge = 1e-9 * inner.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] + 1e-20
@@ -69,15 +77,10 @@ def parallax(view: View, fundamentals: Tensor, member: Tensor, options: SegmentO
         square = value.square()
         if turn == 0:
             scale = ((member * value.abs()).sum(-1) / total).square()
-        for _ in range(options.energy.scale_rounds):
-            share = (options.energy.parallax_freedom + 1) / (
-                options.energy.parallax_freedom
-                + square / scale.clamp(min=options.energy.parallax_scale * options.energy.parallax_scale)[..., None]
-            )
-            scale = ((member * share * square).sum(-1) / total).clamp(
-                min=options.energy.parallax_scale * options.energy.parallax_scale
-            )
-        weight = member * (options.energy.parallax_freedom + 1) / (options.energy.parallax_freedom + square / scale[..., None])
+        for _ in range(NUM_PARALLAX_SCALE_UPDATES):
+            share = (PARALLAX_FREEDOM + 1) / (PARALLAX_FREEDOM + square / scale.clamp(min=min_scale * min_scale)[..., None])
+            scale = ((member * share * square).sum(-1) / total).clamp(min=min_scale * min_scale)
+        weight = member * (PARALLAX_FREEDOM + 1) / (PARALLAX_FREEDOM + square / scale[..., None])
     return value, scale
 
 

@@ -111,3 +111,127 @@ class Segmentation(Outcome):
         elif self.bodies.numel():
             lines.append(f"  bodies: {int(self.bodies.min())} to {int(self.bodies.max())}")
         return "\n".join(lines + self.warned())
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What segment_tracks() returns: which track moves with which body, how each body moved, and which one rests.
+
+
+class TrackNotice(NoticeCode):
+    """What limits a segmentation of tracks, and how it is said."""
+
+    SHORT = (
+        "short",
+        "no track is in two frames; give tracks that are followed from frame to frame",
+        Status.TOO_FEW,
+    )
+    """All tracks are shorter than two frames."""
+    FEW_COMMON = (
+        "few_common",
+        "no two frames have more than {value:g} tracks in common, and {least} are needed; give longer tracks, or more of them",
+        Status.TOO_FEW,
+    )
+    """No pair of frames with enough tracks."""
+    STILL = (
+        "still",
+        "nothing moves: no track goes farther than {value:.2g} px, and motion begins at {least:.2g}; take frames farther apart",
+        Status.DEGENERATE,
+    )
+    """No track moves more than the noise."""
+    CUT = (
+        "cut",
+        {
+            "": "the video has a cut at frame {frame}: {value:.0%} of the tracks go on; "
+            "give the frames before it, or those from it on",
+            "jump": "the tracks jump at frame {frame}, {value:.0f} times as far as between other frames, as at a cut; "
+            "give the frames before it, or those from it on",
+        },
+        Status.DEGENERATE,
+    )
+    """The frames show two scenes."""
+    INCOHERENT = (
+        "incoherent",
+        "the tracks move each by itself: a usual one has {value:.0%} of what it prefers in common with the most alike, as random "
+        "tracks have; clean the tracks, or follow more points",
+        Status.NO_CONSENSUS,
+    )
+    """Tracks have no motion in common."""
+    FEWER_BODIES = (
+        "fewer_bodies",
+        "{asked:# body was|# bodies were} asked for, the tracks carry {value:g}; ask for fewer, or give more tracks of the others",
+    )
+    """The tracks carry fewer bodies than were asked for."""
+    SPARE_BODY = (
+        "spare_body",
+        "two of the {asked} bodies move nearly alike: one may be a part of the other; ask for fewer",
+    )
+    """Two of the bodies that were asked for are hardly separate."""
+    ONE_BODY = (
+        "one_body",
+        "all tracks move as one body: nothing moves against the rest",
+    )
+    """There is one body."""
+    UNSURE_STATIC = (
+        "unsure_static",
+        "which body stands still is not clear: the largest has {value:.0%} of the tracks; give {arg:cameras}",
+    )
+    """No body is so large and wide that it must be what stands still."""
+    DISAGREEING = (
+        "disagreeing",
+        "no body moves as {arg:cameras} say: the nearest is {value:.2g} px off; check their order and their unit",
+    )
+    """The declared cameras agree with no body."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrackSegmentation(Outcome):
+    """Bodies in the tracks of a video.
+
+    Where problems of a batch have different numbers of bodies or pairs, K and P are the largest; what is behind is 0, in
+    ``pairs`` -1.
+
+    Attributes:
+        labels: ``(*batch, n)`` int64, 0 outlier or missing, 1..K the bodies: the larger first, of equally large ones that of
+            the earliest track.
+        bodies: ``(*batch,)`` int64, how many bodies.
+        static_body: ``(*batch,)`` int64, the body that stands still, 1..K; 0 where the data do not say which one it is.
+        pairs: ``(*batch, P, 2)`` int64 numbers of the frames that were compared, the earlier one first.
+        geometries: ``(*batch, P, K, 3, 3)`` fundamental matrices of norm 1, :math:`x_b^T F x_a = 0` for the frames (a, b) of a
+            pair; 0 where they have too few tracks of the body in common.  Where ``planar``, F is one of many that fit alike.
+        homographies: ``(*batch, P, K, 3, 3)`` of norm 1, frame a to frame b; 0 where the body is no plane there.
+        planar: ``(*batch, P, K)`` bool: the body shows a plane, or a rotation alone, between these frames.
+        probabilities: ``(*batch, n, K + 1)``: column 0 outlier, then the bodies; rows sum to 1 (0 for missing tracks).
+        residuals: ``(*batch, n)`` root mean square of the Sampson distances from the own body, for outliers from the nearest body,
+            over the pairs of frames that show the track, in the unit of the tracks.
+        threshold: ``(*batch,)`` as given.
+    """
+
+    labels: Tensor
+    bodies: Tensor
+    static_body: Tensor
+    pairs: Tensor
+    geometries: Tensor
+    homographies: Tensor
+    planar: Tensor
+    probabilities: Tensor
+    residuals: Tensor
+    threshold: Tensor
+
+    TASK = "segment_tracks"
+    REMEDIES: ClassVar[Mapping[Status, str]] = {
+        Status.TOO_FEW: "too few tracks are in two frames at once; give more, or longer ones",
+        Status.DEGENERATE: "the tracks show no motion, or more than one scene; take other frames",
+        Status.AMBIGUOUS: "other segmentations fit as well; add frames, or say how many {arg:bodies} there are",
+        Status.NO_CONSENSUS: "no body moves so that enough of the tracks agree; raise {arg:threshold}, or clean the tracks",
+    }
+
+    def __repr__(self) -> str:
+        lines = [self.head(tracks=self.labels.shape[-1])]
+        if not self.status.ndim:
+            for number in range(1, int(self.bodies) + 1):
+                rests = ", stands still" if number == int(self.static_body) else ""
+                lines.append(f"  body {number}: {int((self.labels == number).sum())} tracks{rests}")
+            lines.append(f"  outliers: {int((self.labels == 0).sum())}")
+        elif self.bodies.numel():
+            lines.append(f"  bodies: {int(self.bodies.min())} to {int(self.bodies.max())}")
+        return "\n".join(lines + self.warned())

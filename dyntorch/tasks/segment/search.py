@@ -9,53 +9,81 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit
+from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import descend, fit_fundamental, sample_fundamentals
 from dyntorch.invariants.segmentation_matrix import SegmentationMatrix
 from dyntorch.numerics.blocks import uniform
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import View, energy, mean_field
-from dyntorch.tasks.segment.options import SegmentOptions
+from dyntorch.tasks.segment.energy import ENERGY_MAX_SQUARED_DISTANCE, SAMPSON_NOISE_PIXELS, View, energy, mean_field
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts of a segmentation: several affine flows at a time, from random patches of the image that move alike.
 
 
-def affine_flows(
-    x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: float, generator: torch.Generator | None, options: SegmentOptions
-) -> Tensor:
+# matches of the patches that runs start from, in turns: small bodies need small ones, noisy flows large ones
+PATCH_SIZES = (12, 20, 30, 45)
+NUM_FLOW_ROUNDS = 8  # of expectation maximization
+NUM_FLOW_LABEL_UPDATES = 3  # of the mean field in each round
+NUM_FLOW_SCALE_UPDATES = 2  # of each flow in each round
+FLOW_CUT_COST = 2.0  # of a link of weight 1 between two flows
+FLOW_FREEDOM = 3.0  # degrees of freedom of Student's distribution of the deviations: bodies have depth
+MIN_FLOW_NOISE_PIXELS = 0.5  # least standard deviation of a flow
+MIN_FITTED_MATCHES = 10  # of a group whose geometry enters the pool
+MAX_GROUP_OVERLAP = 0.93  # intersection over union above which one of two groups is enough
+POOL_FIT_SCALES_PIXELS = (4.0, 2.0)  # one after the other
+POOL_NOISE_PIXELS = 1.0  # of a Sampson distance by which geometries are selected
+POOL_CUT_COST = 3.0  # of a link of weight 1 between two bodies in the search
+MAX_STARTS = 6  # of each kind
+MAX_SETS = 400  # followed from one geometry to the next
+MAX_LABEL_OVERLAP = 0.97  # share of the matches in the same groups above which two labellings are one
+MATRIX_MATCHES = 40  # that a segmentation matrix takes
+DESCENT_SCHEDULE = (2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0)  # noise in the rounds, over that at the end
+DESCENT_NOISE_PIXELS = 0.5  # at the end: finer than in the final energy, for small bodies to hold their own
+NUM_DESCENT_LABEL_UPDATES = 3  # of the mean field in each round
+DESCENT_FIT_SCALE_PIXELS = 2.0  # scale of the fits, pixels
+SAMPLES_AT_ONCE = 6000  # samples drawn at a time
+NUM_PURE_SAMPLES = 10.0  # wanted, all of whose matches are of the largest body
+SAMPLE_DISTANCE_PIXELS = 3.0  # up to which a match votes for a sample
+NUM_DESCENDED_SAMPLES = 240  # of a round
+SAMPLE_FIT_SCALES_PIXELS = (3.0, 2.0)  # one after the other
+NUM_PARTIAL_SETS = 4  # whose unexplained matches the next round samples
+NUM_FIRST_GEOMETRIES = 40  # that sets start from
+MAX_SUPPORT_OVERLAP = 0.97  # intersection over union above which one of two geometries is enough
+NUM_DESCENDED_SETS = 30  # for each number of bodies
+MIN_BODY_GAIN = 5.0  # in units of the root of the number of matches: by chance 2 to 5, small bodies 8
+NUM_MATRIX_ROUNDS = 3  # of the weights of the segmentation matrix
+
+
+def affine_flows(x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: float, generator: torch.Generator | None) -> Tensor:
     r"""Labellings by robust affine flows :math:`x_2 = A_k x_1 + b_k`, smooth over the links. x1, x2 ``(n, 2)``, bodies
     ``(runs,)`` -> ``(runs, n)``."""
     a = torch.cat([x1, torch.ones_like(x1[:, :1])], dim=-1).float()
     b = x2.float()
     width = int(bodies.max())
     absent = (torch.arange(width, device=x1.device) >= bodies[:, None])[..., None]
-    member = _patches(x1.float(), (x2 - x1).float(), bodies, width, generator, options).masked_fill(absent, 0.0)
+    member = _patches(x1.float(), (x2 - x1).float(), bodies, width, generator).masked_fill(absent, 0.0)
     moments, targets = (a[:, :, None] * a[:, None, :]).flatten(1), (a[:, :, None] * b[:, None, :]).flatten(1)
-    eye = torch.eye(3, device=a.device)
+    eye = torch.eye(3, dtype=a.dtype, device=a.device)
     weight, variance = member, None
-    for _ in range(options.flows.rounds):
+    for _ in range(NUM_FLOW_ROUNDS):
         inner = (weight @ moments).unflatten(-1, (3, 3))
         ridge = 1e-6 * inner.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] + 1e-12
         flow = torch.linalg.solve_ex(inner + ridge * eye, (weight @ targets).unflatten(-1, (3, 2)))[0]
         square = (a @ flow - b).square().sum(-1)
         total = 2 * member.sum(-1) + 1e-9
-        for _ in range(options.flows.scale_rounds):
-            heavy = (
-                1.0 if variance is None else (options.flows.freedom + 2) / (options.flows.freedom + square / variance[..., None])
-            )
+        for _ in range(NUM_FLOW_SCALE_UPDATES):
+            heavy = 1.0 if variance is None else (FLOW_FREEDOM + 2) / (FLOW_FREEDOM + square / variance[..., None])
             variance = ((member * heavy * square).sum(-1) / total).clamp(min=noise * noise)
         assert variance is not None
         ratio = square / variance[..., None]
-        cost = (options.flows.freedom + 2) * torch.log1p(ratio / options.flows.freedom) + 2 * variance.log()[..., None]
-        member = mean_field(cost.masked_fill(absent, torch.inf), links, options.flows.cut, options.flows.turns)
-        weight = member * (options.flows.freedom + 2) / (options.flows.freedom + ratio)
+        cost = (FLOW_FREEDOM + 2) * torch.log1p(ratio / FLOW_FREEDOM) + 2 * variance.log()[..., None]
+        member = mean_field(cost.masked_fill(absent, torch.inf), links, FLOW_CUT_COST, NUM_FLOW_LABEL_UPDATES)
+        weight = member * (FLOW_FREEDOM + 2) / (FLOW_FREEDOM + ratio)
     return member.argmax(1)
 
 
-def _patches(
-    x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: torch.Generator | None, options: SegmentOptions
-) -> Tensor:
+def _patches(x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: torch.Generator | None) -> Tensor:
     """Members ``(runs, width, n)`` of patches: nearest matches in place and motion of seeds that are far from each other."""
     apart = _scaled_distances(x) + _scaled_distances(motion)
     runs, count = len(bodies), len(x)
@@ -64,10 +92,10 @@ def _patches(
         far = apart[seeds].amin(1).double().cumsum(-1)
         pick = uniform(runs, 1, generator=generator, device=x.device) * far[:, -1:]
         seeds = torch.cat([seeds, torch.searchsorted(far, pick).clamp(max=count - 1)], dim=-1)
-    sizes = torch.tensor(options.flows.patches, device=x.device)[torch.arange(runs, device=x.device) % len(options.flows.patches)]
-    order = apart[seeds].topk(min(max(options.flows.patches), count), dim=-1, largest=False).indices
+    sizes = torch.tensor(PATCH_SIZES, device=x.device)[torch.arange(runs, device=x.device) % len(PATCH_SIZES)]
+    order = apart[seeds].topk(min(max(PATCH_SIZES), count), dim=-1, largest=False).indices
     chosen = (torch.arange(order.shape[-1], device=x.device) < sizes[:, None, None].clamp(max=max(4, count // 2))).expand_as(order)
-    return torch.zeros(runs, width, count, device=x.device).scatter_(-1, order, chosen.float())
+    return torch.zeros(runs, width, count, dtype=torch.float32, device=x.device).scatter_(-1, order, chosen.float())
 
 
 def _scaled_distances(x: Tensor) -> Tensor:
@@ -96,10 +124,10 @@ def one_hot(labels: Tensor, width: int) -> Tensor:
     return (labels[..., None, :] == torch.arange(width, device=labels.device)[:, None]).double()
 
 
-def rough_cost(view: View, fundamentals: Tensor, options: SegmentOptions) -> Tensor:
+def rough_cost(view: View, fundamentals: Tensor) -> Tensor:
     """Truncated squared distances ``(*batch, n)``."""
     square = sampson_squared(fundamentals, view.x1, view.x2)
-    return (square / (options.pool.noise * view.pixel) ** 2).clamp(max=options.pool.cap)
+    return (square / (POOL_NOISE_PIXELS * view.pixel) ** 2).clamp(max=MAX_SQUARED_DISTANCE)
 
 
 def smoothed(cost: Tensor, view: View) -> Tensor:
@@ -107,26 +135,26 @@ def smoothed(cost: Tensor, view: View) -> Tensor:
     return (cost + view.links.pull(cost)) / (1 + view.links.weight.sum(-1))
 
 
-def pool_of(view: View, groups: Tensor, options: SegmentOptions) -> Tensor:
+def pool_of(view: View, groups: Tensor) -> Tensor:
     """Fundamental matrices ``(P, 3, 3)`` of all different groups ``(g, n)``, 0 and 1."""
     size = groups.sum(-1)
     order = size.argsort(descending=True, stable=True)
-    groups = groups[order][size[order] >= min(options.pool.fitted, groups.shape[-1])]
+    groups = groups[order][size[order] >= min(MIN_FITTED_MATCHES, groups.shape[-1])]
     size, single = groups.sum(-1), groups.float()
     shared = (single @ single.mT).double()
     overlap = shared / (size[:, None] + size - shared)
-    groups = groups[~(overlap.triu(1) > options.pool.alike).any(0)]
-    return fit_fundamental(view.x1, view.x2, groups, [view.pixel * scale for scale in options.pool.fit_scales], steps=2)[0]
+    groups = groups[~(overlap.triu(1) > MAX_GROUP_OVERLAP).any(0)]
+    return fit_fundamental(view.x1, view.x2, groups, [view.pixel * scale for scale in POOL_FIT_SCALES_PIXELS], steps=2)[0]
 
 
-def fitted(view: View, labels: Tensor, count: int, options: SegmentOptions) -> Starts:
+def fitted(view: View, labels: Tensor, count: int) -> Starts:
     """Labellings ``(s, n)`` with the geometries of their bodies."""
     member = one_hot(labels, count)
-    found = fit_fundamental(view.x1, view.x2, member.flatten(0, 1), (options.pool.fit_scales[0] * view.pixel,), steps=2)[0]
+    found = fit_fundamental(view.x1, view.x2, member.flatten(0, 1), (POOL_FIT_SCALES_PIXELS[0] * view.pixel,), steps=2)[0]
     return Starts(labels, found.unflatten(0, member.shape[:2]))
 
 
-def best_sets(cost: Tensor, most: int, first: int | None = None, *, options: SegmentOptions) -> list[Tensor]:
+def best_sets(cost: Tensor, most: int, first: int | None = None) -> list[Tensor]:
     """Sets ``(s, K)`` of geometries of least total cost, :math:`\\sum_i \\min_{k \\in \\text{set}} c_{ki}`, the best first."""
     single = cost.float()
     size = len(single)
@@ -138,36 +166,36 @@ def best_sets(cost: Tensor, most: int, first: int | None = None, *, options: Seg
             continue
         least = single[sets].amin(1)
         grown = torch.stack([torch.minimum(row, single).sum(-1) for row in least])
-        place = grown.flatten().topk(min(5 * options.pool.sets, grown.numel()), largest=False).indices
+        place = grown.flatten().topk(min(5 * MAX_SETS, grown.numel()), largest=False).indices
         candidates = torch.cat([sets[place // size], (place % size)[:, None]], dim=-1).sort(-1).values
         candidates = candidates[(candidates.diff(dim=-1) > 0).all(-1)]
-        different = list(dict.fromkeys(map(tuple, candidates.tolist())))[: options.pool.sets]
+        different = list(dict.fromkeys(map(tuple, candidates.tolist())))[:MAX_SETS]
         sets = torch.tensor(different, dtype=torch.long, device=cost.device).view(-1, count)
         found.append(sets)
     return found
 
 
-def distinct(view: View, starts: Starts, options: SegmentOptions) -> Starts:
-    """Up to ``options.pool.kept`` starts that differ, the cheapest first, with enough matches in every body."""
+def distinct(view: View, starts: Starts) -> Starts:
+    """Up to ``MAX_STARTS`` starts that differ, the cheapest first, with enough matches in every body."""
     count = starts.fundamentals.shape[-3]
     member = one_hot(starts.labels, count)
-    cost = (rough_cost(view, starts.fundamentals, options) * member).sum((-2, -1)) + options.pool.cut * view.links.cut(member)
+    cost = (rough_cost(view, starts.fundamentals) * member).sum((-2, -1)) + POOL_CUT_COST * view.links.cut(member)
     cost = torch.where(member.sum(-1).amin(-1) >= LEAST, cost, torch.inf)
     order = cost.argsort(stable=True)
     order = order[cost[order].isfinite()]
     flat = member[order].float().flatten(0, 1)
     shared = (flat @ flat.mT).unflatten(0, (-1, count)).unflatten(-1, (-1, count))
-    alike = (shared.amax(1).sum(-1) > options.pool.distinct * flat.shape[-1]).tolist()
+    alike = (shared.amax(1).sum(-1) > MAX_LABEL_OVERLAP * flat.shape[-1]).tolist()
     kept: list[int] = []
     for index in range(len(order)):
-        if len(kept) < options.pool.kept and not any(alike[other][index] for other in kept):
+        if len(kept) < MAX_STARTS and not any(alike[other][index] for other in kept):
             kept.append(index)
     return Starts(starts.labels[order[kept]], starts.fundamentals[order[kept]])
 
 
-def set_starts(pool: Tensor, cost: Tensor, sets: Tensor, options: SegmentOptions) -> Starts:
+def set_starts(pool: Tensor, cost: Tensor, sets: Tensor) -> Starts:
     """The starts of the first sets ``(s, K)`` of geometries ``(P, 3, 3)``: each match to the one of least cost ``(P, n)``."""
-    chosen = sets[: 8 * options.pool.kept]
+    chosen = sets[: 8 * MAX_STARTS]
     return Starts(cost[chosen].argmin(1), pool[chosen])
 
 
@@ -175,9 +203,9 @@ def set_starts(pool: Tensor, cost: Tensor, sets: Tensor, options: SegmentOptions
 # Pairs of geometries by the segmentation matrix, among the starts of a segmentation.
 
 
-def matrix_pairs(view: View, groups: Tensor, rounds: int, options: SegmentOptions) -> Tensor:
+def matrix_pairs(view: View, groups: Tensor, rounds: int) -> Tensor:
     """Geometries ``(2 g, 3, 3)`` of the segmentation matrices of groups ``(b, n)``, 0 and 1; those too small are left out."""
-    groups = groups[groups.sum(-1) >= options.pool.matrix_matches]
+    groups = groups[groups.sum(-1) >= MATRIX_MATCHES]
     x1, x2 = (x.expand(len(groups), -1, -1) for x in (view.x1, view.x2))
     weights = groups
     for _ in range(rounds if len(groups) else 0):
@@ -202,7 +230,7 @@ class Candidate:
     fundamentals: Tensor  # ``(K, 3, 3)``
 
 
-def descended(view: View, starts: Sequence[Starts], options: SegmentOptions) -> dict[int, list[Candidate]]:
+def descended(view: View, starts: Sequence[Starts]) -> dict[int, list[Candidate]]:
     """The segmentations that the starts lead to, by their number of bodies, the cheapest first."""
     device = view.x1.device
     bodies = torch.cat([torch.full((len(s.labels),), s.fundamentals.shape[1], device=device) for s in starts])
@@ -214,23 +242,23 @@ def descended(view: View, starts: Sequence[Starts], options: SegmentOptions) -> 
 
     def distances(noise: float) -> Tensor:
         square = sampson_squared(geometry, view.x1, view.x2) / (noise * view.pixel) ** 2
-        full = torch.full((present.numel(), len(view.x1)), torch.inf, device=device)
-        full[rows] = square.clamp(max=options.pool.cap).float()
+        full = torch.full((present.numel(), len(view.x1)), torch.inf, dtype=torch.float32, device=device)
+        full[rows] = square.clamp(max=MAX_SQUARED_DISTANCE).float()
         return full.unflatten(0, present.shape)
 
     member = torch.cat([one_hot(s.labels, width) for s in starts]).float()
-    for noise in options.descent.schedule:
-        member = mean_field(distances(noise * options.descent.noise), view.links, options.pool.cut, options.descent.turns, member)
+    for noise in DESCENT_SCHEDULE:
+        member = mean_field(distances(noise * DESCENT_NOISE_PIXELS), view.links, POOL_CUT_COST, NUM_DESCENT_LABEL_UPDATES, member)
         geometry = descend(
-            geometry, view.x1, view.x2, member.flatten(0, 1)[rows].double(), options.descent.fit_scale * view.pixel, steps=2
+            geometry, view.x1, view.x2, member.flatten(0, 1)[rows].double(), DESCENT_FIT_SCALE_PIXELS * view.pixel, steps=2
         )
-    member = mean_field(distances(options.descent.noise), view.links, options.pool.cut, options.descent.turns, member)
+    member = mean_field(distances(DESCENT_NOISE_PIXELS), view.links, POOL_CUT_COST, NUM_DESCENT_LABEL_UPDATES, member)
     labels = member.masked_fill(~present[..., None], -1.0).argmax(1)
     hard = one_hot(labels, width)
     fundamentals = geometry.new_zeros(present.numel(), 3, 3)
     fundamentals[rows] = geometry
     fundamentals = fundamentals.unflatten(0, present.shape)
-    total = energy(view, fundamentals, hard, options)
+    total = energy(view, fundamentals, hard)
     whole = ~((hard.sum(-1) < LEAST) & present).any(-1)
     found: dict[int, list[Candidate]] = {}
     for count in sorted({s.fundamentals.shape[1] for s in starts}):
@@ -241,7 +269,7 @@ def descended(view: View, starts: Sequence[Starts], options: SegmentOptions) -> 
 
 
 def search(
-    view: View, counts: Sequence[int], generator: torch.Generator | None, extra: Sequence[Tensor] = (), *, options: SegmentOptions
+    view: View, counts: Sequence[int], generator: torch.Generator | None, extra: Sequence[Tensor] = (), *, num_starts: int
 ) -> dict[int, list[Candidate]]:
     """Segmentations into each number of bodies, the cheapest first.
 
@@ -255,21 +283,21 @@ def search(
         Candidates for each number; none where no start had so many bodies of enough matches.
     """
     flows = sorted({max(2, count + more) for count in counts for more in (0, 1)})
-    plan = torch.tensor(flows, device=view.x1.device).repeat(options.flows.runs if len(flows) > 2 else 2 * options.flows.runs)
-    labels = affine_flows(view.x1, view.x2, view.links, plan, options.flows.noise * view.pixel, generator, options)
+    plan = torch.tensor(flows, device=view.x1.device).repeat(num_starts if len(flows) > 2 else 2 * num_starts)
+    labels = affine_flows(view.x1, view.x2, view.links, plan, MIN_FLOW_NOISE_PIXELS * view.pixel, generator)
     widths = [(labels, int(plan.max())), *((x[None], int(x.max()) + 1) for x in extra), (torch.zeros_like(labels[:1]), 1)]
-    pool = pool_of(view, torch.cat([one_hot(x, width).flatten(0, 1) for x, width in widths]), options)
+    pool = pool_of(view, torch.cat([one_hot(x, width).flatten(0, 1) for x, width in widths]))
     if max(counts) > 1:
         # linear: the search improves it, and its weights would take longer than all flows
-        pool = torch.cat([pool, matrix_pairs(view, torch.ones_like(view.x1[None, :, 0]), rounds=0, options=options)])
-    cost = smoothed(rough_cost(view, pool, options), view)
-    sets = best_sets(cost, max(counts), options=options)
+        pool = torch.cat([pool, matrix_pairs(view, torch.ones_like(view.x1[None, :, 0]), rounds=0)])
+    cost = smoothed(rough_cost(view, pool), view)
+    sets = best_sets(cost, max(counts))
     starts = []
     for count in counts:
-        starts.append(set_starts(pool, cost, sets[count - 1], options))
+        starts.append(set_starts(pool, cost, sets[count - 1]))
         groups = [labels[plan == count], *(x[None] for x in extra if int(x.max()) + 1 == count)]
-        starts += [fitted(view, x, count, options) for x in groups if len(x)]
-    return descended(view, [distinct(view, start, options) for start in starts], options)
+        starts += [fitted(view, x, count) for x in groups if len(x)]
+    return descended(view, [distinct(view, start) for start in starts])
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -281,30 +309,30 @@ BLOCK = 1024
 
 
 def search_samples(
-    view: View, counts: Sequence[int], generator: torch.Generator | None, options: SegmentOptions
+    view: View, counts: Sequence[int], generator: torch.Generator | None, max_samples: int
 ) -> dict[int, list[Candidate]]:
     """Segmentations into each number of bodies, the cheapest first."""
-    pool = _pool(view, min(counts), max(counts), generator, options)
-    cost = rough_cost(view, pool, options)
-    sets = best_sets(cost, max(counts), options.samples.first, options=options)
+    pool = _pool(view, min(counts), max(counts), generator, max_samples)
+    cost = rough_cost(view, pool)
+    sets = best_sets(cost, max(counts), NUM_FIRST_GEOMETRIES)
     starts = []
     for count in counts:
         if count <= len(pool):
-            chosen = sets[count - 1][: options.samples.starts]
+            chosen = sets[count - 1][:NUM_DESCENDED_SETS]
             starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
-    found = descended(view, starts, options) if starts else {}
-    return {count: _ranked(view, found.get(count, []), options) for count in counts}
+    found = descended(view, starts) if starts else {}
+    return {count: _ranked(view, found.get(count, [])) for count in counts}
 
 
-def _ranked(view: View, candidates: list[Candidate], options: SegmentOptions) -> list[Candidate]:
+def _ranked(view: View, candidates: list[Candidate]) -> list[Candidate]:
     """The candidates with enough inliers in every body, by their cost if what is far from all bodies is in none."""
     if not candidates:
         return []
     fundamentals = torch.stack([candidate.fundamentals for candidate in candidates])
-    square = _distances(view, fundamentals, options)
-    member = one_hot(square.argmin(1), square.shape[1]) * (square < options.energy.cap)
+    square = _distances(view, fundamentals)
+    member = one_hot(square.argmin(1), square.shape[1]) * (square < ENERGY_MAX_SQUARED_DISTANCE)
     inliers = member.sum(-1)
-    total = energy(view, fundamentals, member, options) + options.energy.cap * (len(view.x1) - inliers.sum(-1))
+    total = energy(view, fundamentals, member) + ENERGY_MAX_SQUARED_DISTANCE * (len(view.x1) - inliers.sum(-1))
     order = total.argsort(stable=True)
     order = order[inliers[order].amin(-1) >= LEAST]
     if not len(order):
@@ -314,61 +342,59 @@ def _ranked(view: View, candidates: list[Candidate], options: SegmentOptions) ->
     return [Candidate(float(total[i]), candidates[i].labels, candidates[i].fundamentals) for i in order.tolist()]
 
 
-def _different(view: View, pool: Tensor, options: SegmentOptions) -> Tensor:
+def _different(view: View, pool: Tensor) -> Tensor:
     """Those of the geometries that not many of the same matches agree with, the cheapest first."""
-    cost = rough_cost(view, pool, options)
+    cost = rough_cost(view, pool)
     order = cost.sum(-1).argsort(stable=True)
-    near = (cost[order] < options.pool.cap).float()
+    near = (cost[order] < MAX_SQUARED_DISTANCE).float()
     shared, size = near @ near.mT, near.sum(-1)
-    alike = shared > options.samples.alike * (size[:, None] + size - shared)
+    alike = shared > MAX_SUPPORT_OVERLAP * (size[:, None] + size - shared)
     return pool[order[~alike.triu(1).any(0)]]
 
 
-def _pool(view: View, least: int, most: int, generator: torch.Generator | None, options: SegmentOptions) -> Tensor:
+def _pool(view: View, least: int, most: int, generator: torch.Generator | None, max_samples: int) -> Tensor:
     """Geometries ``(P, 3, 3)``: of samples from all matches, then from those that sets of one, two, ... leave unexplained."""
     left = torch.ones_like(view.x1[None, :, 0])
-    pool = matrix_pairs(view, left[: most - 1], options.samples.matrix_rounds, options)  # none for a single body
-    last = options.energy.cap * len(view.x1)
+    pool = matrix_pairs(view, left[: most - 1], NUM_MATRIX_ROUNDS)  # none for a single body
+    last = ENERGY_MAX_SQUARED_DISTANCE * len(view.x1)
     for count in range(1, most + 1):
-        pool = _different(
-            view, torch.cat([pool, *(_sampled(view, open_, len(left), generator, options) for open_ in left)]), options
-        )
+        pool = _different(view, torch.cat([pool, *(_sampled(view, open_, len(left), generator, max_samples) for open_ in left)]))
         if count == most or len(pool) < count:
             break
-        cost = rough_cost(view, pool, options)
-        sets = best_sets(cost, count, options.samples.first, options=options)[-1][: options.samples.partial]
-        total = float(_distances(view, pool[sets], options).amin(1).sum(-1).min())
-        if count > least and last - total < options.samples.worth * len(view.x1) ** 0.5:
+        cost = rough_cost(view, pool)
+        sets = best_sets(cost, count, NUM_FIRST_GEOMETRIES)[-1][:NUM_PARTIAL_SETS]
+        total = float(_distances(view, pool[sets]).amin(1).sum(-1).min())
+        if count > least and last - total < MIN_BODY_GAIN * len(view.x1) ** 0.5:
             break
         last = total
-        left = (cost[sets].amin(1) >= options.pool.cap).double()
+        left = (cost[sets].amin(1) >= MAX_SQUARED_DISTANCE).double()
         left = left[left.sum(-1) > LEAST]
     return pool
 
 
-def _distances(view: View, fundamentals: Tensor, options: SegmentOptions) -> Tensor:
+def _distances(view: View, fundamentals: Tensor) -> Tensor:
     """Truncated squared distances ``(*batch, n)`` as the energy counts them."""
-    return (sampson_squared(fundamentals, view.x1, view.x2) / (options.energy.noise * view.pixel) ** 2).clamp(
-        max=options.energy.cap
+    return (sampson_squared(fundamentals, view.x1, view.x2) / (SAMPSON_NOISE_PIXELS * view.pixel) ** 2).clamp(
+        max=ENERGY_MAX_SQUARED_DISTANCE
     )
 
 
-def _sampled(view: View, weight: Tensor, parts: int, generator: torch.Generator | None, options: SegmentOptions) -> Tensor:
+def _sampled(view: View, weight: Tensor, parts: int, generator: torch.Generator | None, max_samples: int) -> Tensor:
     """Geometries of the best samples of the matches with weights ``(n,)``, descended; this is one of several parts of the work."""
     x1, x2, single = view.x1.float(), view.x2.float(), weight.float()
     best, votes = view.x1.new_zeros(0, 3, 3), single.new_zeros(0)
     drawn, needed = 0, 1.0
-    while drawn < min(needed, options.samples.most / parts):
-        found, valid = sample_fundamentals(view.x1, view.x2, weight[None], options.samples.at_once // parts, generator)
-        drawn += options.samples.at_once // parts
+    while drawn < min(needed, max_samples / parts):
+        found, valid = sample_fundamentals(view.x1, view.x2, weight[None], SAMPLES_AT_ONCE // parts, generator)
+        drawn += SAMPLES_AT_ONCE // parts
         found = found[valid]
-        totals = [_votes(part, x1, x2, single, options.samples.distance * view.pixel) for part in found.float().split(BLOCK)]
+        totals = [_votes(part, x1, x2, single, SAMPLE_DISTANCE_PIXELS * view.pixel) for part in found.float().split(BLOCK)]
         best, votes = torch.cat([best, found]), torch.cat([votes, *totals])
-        votes, place = votes.topk(min(options.samples.best // parts, len(votes)))
+        votes, place = votes.topk(min(NUM_DESCENDED_SAMPLES // parts, len(votes)))
         best = best[place]
         share = float(votes[0] / single.sum()) if len(votes) else 0.0
-        needed = options.samples.pure / max(share, 0.1) ** 7
-    for scale in options.samples.fit_scales:
+        needed = NUM_PURE_SAMPLES / max(share, 0.1) ** 7
+    for scale in SAMPLE_FIT_SCALES_PIXELS:
         best = descend(best, view.x1, view.x2, weight.expand(len(best), -1), scale * view.pixel)
     return best
 

@@ -21,7 +21,7 @@ from dyntorch.numerics.blocks import one_thread, uniform
 from dyntorch.numerics.chi_square import median
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.segment.coherence import Links, coherence
-from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS, View
 from dyntorch.tasks.segment.labels import Labelling, Models, choose, label, significant
 from dyntorch.tasks.segment.options import SegmentOptions
 from dyntorch.tasks.segment.result import BodyModel, Segmentation, SegmentNotice
@@ -32,6 +32,26 @@ from dyntorch.tasks.segment.search import LEAST, Candidate, one_hot, search, sea
 
 
 Search = Callable[[Sequence[int]], dict[int, list[Candidate]]]
+
+
+THRESHOLD_SIGMAS = 5.0  # an estimated threshold, in standard deviations of a coordinate
+FIRST_THRESHOLD = 0.003  # over the diagonal of the image: where the estimation of the threshold starts
+MATCH_NOISE_PIXELS = 3.0  # noise of the differences of matches
+MIN_COHERENCE = 0.2  # from which a match belongs to a group
+MIN_LINK_WEIGHT = 0.3  # from which a link joins two matches to one group
+NUM_FIRST_COUNTS = 4  # numbers of bodies tried at first: one to so many
+NUM_FURTHER_COUNTS = 2  # tried further, each time that the largest one is the cheapest
+BODY_PENALTY = 4.5  # in units of the root of the number of matches
+BODY_PENALTY_GEOMETRY_ONLY = 6.2  # spurious bodies explain up to 4.9, true ones 7.6 and more
+SAME_SEGMENTATION_SHARE = 0.9  # share of equal labels from which two segmentations are one
+MIN_RUNNER_UP_COST = 1.0  # beyond the least cost, in units of the root of the number of matches
+MIN_UNEXPLAINED_MATCHES = 10  # linked matches without a body from which one body more is tried
+MIN_UNEXPLAINED_SHARE = 0.08  # their share of all linked ones
+FAR_DISTANCE = 20.0  # from the middle, over the median one: garbage where neighbours do not matter
+MAX_DISTANCE = 1e3  # from the middle of the matches, over the median one, to which farther ones are moved
+MAX_RELATIVE_THRESHOLD = 0.2  # over the spread of the points, from which the problem is refused
+MAX_REPEATED_SHARE = 0.1  # of the matches, without a notice
+MIN_LINKED_SHARE = 0.3  # of the matches, without a notice
 
 
 @dataclass(frozen=True)
@@ -46,7 +66,7 @@ class Best:
     """What the best other segmentation into as many costs more, in units of the root of the number of matches."""
 
 
-def best(search: Search, matches: int, bodies: int | None, penalty: float, options: SegmentOptions) -> Best | None:
+def best(search: Search, matches: int, bodies: int | None, penalty: float, max_bodies: int) -> Best | None:
     """The best segmentation of so many matches into ``bodies``, or, for None, into the number of least penalized cost."""
     room = max(1, matches // LEAST)
     known: dict[int, Candidate] = {}
@@ -57,7 +77,7 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float, optio
 
     def cheapest(counts: Sequence[int]) -> dict[int, Candidate]:
         found = {count: candidates for count, candidates in search(counts).items() if candidates}
-        rivals.update({count: _rival(candidates, options) / matches**0.5 for count, candidates in found.items()})
+        rivals.update({count: _rival(candidates) / matches**0.5 for count, candidates in found.items()})
         return {count: candidates[0] for count, candidates in found.items()}
 
     if bodies is not None:
@@ -69,8 +89,8 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float, optio
                 return Best(known[count], spare, rival=rivals[count])
         return None
     top = 0
-    while top < min(room, options.count.most):
-        last, top = top, min(top + (options.count.further if top else options.count.first), room, options.count.most)
+    while top < min(room, max_bodies):
+        last, top = top, min(top + (NUM_FURTHER_COUNTS if top else NUM_FIRST_COUNTS), room, max_bodies)
         known |= cheapest(range(last + 1, top + 1))
         chosen = min(known, key=penalized, default=0)
         if chosen < top:
@@ -81,13 +101,13 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float, optio
     return Best(known[count], further=known.get(count + 1), rival=rivals[count])
 
 
-def _rival(candidates: Sequence[Candidate], options: SegmentOptions) -> float:
+def _rival(candidates: Sequence[Candidate]) -> float:
     """What the best segmentation costs more that is another one than the best of all, not the same with a few other labels."""
     best = candidates[0]
     member = one_hot(best.labels, len(best.fundamentals))
     for other in candidates[1:]:
         shared = member @ one_hot(other.labels, len(other.fundamentals)).mT
-        if float(shared.amax(0).sum()) < options.count.same * len(best.labels):
+        if float(shared.amax(0).sum()) < SAME_SEGMENTATION_SHARE * len(best.labels):
             return other.energy - best.energy
     return inf
 
@@ -167,16 +187,14 @@ def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, 
     )
 
 
-def outcome(
-    given: GivenMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool, options: SegmentOptions
-) -> SegmentedProblem:
+def outcome(given: GivenMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool) -> SegmentedProblem:
     """The labels in order of size, with the model of every body."""
     labelled = _sorted(labelled)
     labels, fundamentals = labelled.labels, labelled.fundamentals
     count = len(fundamentals)
     if not count:
         return nothing(given.weights, threshold, Status.NO_CONSENSUS, given.repeated, given.linked)
-    models = choose(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present], options)
+    models = choose(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present])
     planar = unit(torch.linalg.inv(given.second) @ models.homographies @ given.first)
     return SegmentedProblem(
         labels=given.spread(labels),
@@ -210,19 +228,18 @@ def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models)
     return torch.where(labels > 0, own, square.amin(0)).sqrt()
 
 
-def segmentation_notices(
-    found: list[SegmentedProblem], bodies: int | None, batch: tuple[int, ...], options: SegmentOptions
-) -> tuple[Notice, ...]:
+def segmentation_notices(found: list[SegmentedProblem], bodies: int | None, batch: tuple[int, ...]) -> tuple[Notice, ...]:
     """What limits the results of a batch."""
     if not found:
         return ()
-    count = torch.tensor([float(outcome.count) for outcome in found])
-    repeated = torch.tensor([outcome.repeated for outcome in found])
-    linked = torch.tensor([outcome.linked for outcome in found])
+
+    def figures(name: str) -> Tensor:
+        return torch.tensor([float(getattr(problem, name)) for problem in found], dtype=torch.float32)
+
+    count, repeated, linked, coarse, rival = map(figures, ("count", "repeated", "linked", "coarse", "rival"))
     tried = torch.tensor([outcome.status != Status.TOO_FEW for outcome in found])
     spatial = linked < 1.0  # where neighbours do not matter, all matches count
     said, note = noting(batch)
-    coarse = torch.tensor([outcome.coarse for outcome in found])
     tried = tried & (coarse == 0)
     note(SegmentNotice.COARSE, coarse, coarse > 0)
     if bodies is not None:
@@ -230,10 +247,9 @@ def segmentation_notices(
         # where a body got lost, the notice above says so
         spare = torch.tensor([outcome.spare for outcome in found]) & (count == bodies)
         note(SegmentNotice.SPARE_BODY, count - 1, spare, asked=bodies)
-    rival = torch.tensor([outcome.rival for outcome in found])
-    note(SegmentNotice.UNDECIDED, rival, tried & (count > 1) & (rival < options.count.decided))
-    note(SegmentNotice.REPEATED, repeated, repeated > options.input.repeated)
-    note(SegmentNotice.INCOHERENT, linked, tried & spatial & (linked < options.input.sparse))
+    note(SegmentNotice.UNDECIDED, rival, tried & (count > 1) & (rival < MIN_RUNNER_UP_COST))
+    note(SegmentNotice.REPEATED, repeated, repeated > MAX_REPEATED_SHARE)
+    note(SegmentNotice.INCOHERENT, linked, tried & spatial & (linked < MIN_LINKED_SHARE))
     return tuple(said)
 
 
@@ -253,21 +269,22 @@ class Request:
     threshold: float | None
     spatial: bool
     generator: torch.Generator | None
+    options: SegmentOptions
 
 
-def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, options: SegmentOptions) -> SegmentedProblem:
+def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request) -> SegmentedProblem:
     """Segment one problem of matches ``(n, 2)`` with weights ``(n,)``, 0 = missing."""
     if request.threshold is not None:
-        return _solve(x1, x2, weights, request, request.threshold, options)
+        return _solve(x1, x2, weights, request, request.threshold)
     size = _diagonal(x1[weights > 0])
-    first = _solve(x1, x2, weights, request, options.units.first_threshold * size if size > 0 else 1.0, options)
+    first = _solve(x1, x2, weights, request, FIRST_THRESHOLD * size if size > 0 else 1.0)
     if not first.count:
         return first
     # the median distance in standard deviations: in one dimension from epipolar lines, in two from the points of a plane
     medians = first.labels.new_tensor([MEDIANS[model] for model in first.models], dtype=x1.dtype)
     inlier = first.labels > 0
     noise = float((first.residuals[inlier] / medians[first.labels[inlier] - 1]).median())
-    return _solve(x1, x2, weights, request, max(options.units.threshold_in_sigmas * noise, 1e-6 * size), options)
+    return _solve(x1, x2, weights, request, max(THRESHOLD_SIGMAS * noise, 1e-6 * size))
 
 
 def _diagonal(x: Tensor) -> float:
@@ -278,9 +295,8 @@ def _diagonal(x: Tensor) -> float:
     return float((high - low).norm()) / 0.9
 
 
-def _solve(
-    x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float, options: SegmentOptions
-) -> SegmentedProblem:
+def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float) -> SegmentedProblem:
+    options = request.options
     present = (weights > 0).nonzero().flatten()
     distinct, *places = (len(torch.unique(x[present], dim=0)) for x in (torch.cat([x1, x2], dim=-1), x1, x2))
     # points that are all in one place of a view fit any motion of that place
@@ -288,52 +304,51 @@ def _solve(
     repeated = 1 - distinct / len(present) if len(present) else 0.0
     if distinct < LEAST + 1:
         return nothing(weights, threshold, Status.TOO_FEW, repeated)
-    given = _given(x1[present], x2[present], weights, present, threshold, request, repeated, options)
-    if options.units.threshold_in_pixels * given.view.pixel > options.input.coarse:
+    given = _given(x1[present], x2[present], weights, present, threshold, request, repeated)
+    if THRESHOLD_PIXELS * given.view.pixel > MAX_RELATIVE_THRESHOLD:
         refused = nothing(weights, threshold, Status.AMBIGUOUS, repeated, given.linked)
-        return replace(refused, coarse=options.units.threshold_in_pixels * given.view.pixel)
+        return replace(refused, coarse=THRESHOLD_PIXELS * given.view.pixel)
     part = given.view.subset(given.keep[given.searched])
 
     def searched(counts: Sequence[int]) -> dict[int, list[Candidate]]:
         if not request.spatial:
-            return search_samples(part, counts, request.generator, options)
+            return search_samples(part, counts, request.generator, options.max_samples)
         groups = given.groups[given.searched]
-        extra = [groups] if int(groups.max()) < options.count.most else []
-        return search(part, counts, request.generator, extra, options=options)
+        extra = [groups] if int(groups.max()) < options.max_bodies else []
+        return search(part, counts, request.generator, extra, num_starts=options.num_starts)
 
-    penalty = options.count.penalty if request.spatial else options.count.penalty_without_neighbours
-    chosen = best(searched, len(part.x1), request.bodies, penalty, options) if len(part.x1) > LEAST else None
+    penalty = BODY_PENALTY if request.spatial else BODY_PENALTY_GEOMETRY_ONLY
+    chosen = best(searched, len(part.x1), request.bodies, penalty, options.max_bodies) if len(part.x1) > LEAST else None
     if chosen is None:
         return nothing(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
-    labelled = _labelled(given, chosen.candidate, request, options)
+    labelled = _labelled(given, chosen.candidate, request)
     left = _left(given, labelled)
-    if chosen.further is not None and left >= max(options.count.left, options.count.left_share * len(given.keep)):
+    if chosen.further is not None and left >= max(MIN_UNEXPLAINED_MATCHES, MIN_UNEXPLAINED_SHARE * len(given.keep)):
         # matches that move like their neighbours and fit no body: there is another one, which the truncated distances hid
-        other = _labelled(given, chosen.further, request, options)
+        other = _labelled(given, chosen.further, request)
         labelled = other if _left(given, other) < 0.5 * left else labelled
-    return replace(outcome(given, labelled, threshold, request.bodies, chosen.spare, options), rival=chosen.rival)
+    return replace(outcome(given, labelled, threshold, request.bodies, chosen.spare), rival=chosen.rival)
 
 
-def _labelled(given: GivenMatches, candidate: Candidate, request: Request, options: SegmentOptions) -> Labelling:
+def _labelled(given: GivenMatches, candidate: Candidate, request: Request) -> Labelling:
     """Labels of all matches by a segmentation of those that were searched."""
     found = torch.zeros_like(given.present)
     found[given.keep[given.searched]] = candidate.labels + 1
     pixel = given.view.pixel
-    near, share = (options.coherence.noise * pixel, 1 - given.linked) if request.spatial else (None, options.samples.outliers)
+    near, share = (MATCH_NOISE_PIXELS * pixel, 1 - given.linked) if request.spatial else (None, request.options.outlier_share)
     labelled = label(
         given.view,
         found,
         candidate.fundamentals,
         given.weights[given.present],
-        options.units.threshold_in_pixels * pixel,
+        THRESHOLD_PIXELS * pixel,
         near,
         share,
-        options,
     )
     if request.spatial:
         return labelled
     # nothing but the geometry speaks for these bodies: those that random matches would show as well are none
-    return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels, options))
+    return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels, request.options.false_alarms))
 
 
 def _left(given: GivenMatches, labelled: Labelling) -> int:
@@ -349,7 +364,6 @@ def _given(
     threshold: float,
     request: Request,
     repeated: float,
-    options: SegmentOptions,
 ) -> GivenMatches:
     """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
     centres = x1.median(0).values, x2.median(0).values
@@ -359,37 +373,34 @@ def _given(
     spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
     scale = 1 / spread.clamp(min=torch.finfo(spread.dtype).tiny)
     first, second = (similarity(scale, centre) for centre in centres)
-    a, b = (
-        ((x - centre) * scale).clamp(-options.input.farthest, options.input.farthest)
-        for x, centre in zip((x1, x2), centres, strict=True)
-    )
-    pixel = threshold / options.units.threshold_in_pixels * float(scale)
+    a, b = (((x - centre) * scale).clamp(-MAX_DISTANCE, MAX_DISTANCE) for x, centre in zip((x1, x2), centres, strict=True))
+    pixel = threshold / THRESHOLD_PIXELS * float(scale)
     values = torch.zeros_like(a[:, 0])
-    some = _some(len(a), request.generator, a.device, options)
+    some = _some(len(a), request.generator, a.device, request.options.max_searched)
     if request.spatial:
-        graph = coherence(a, b, options.coherence.noise * pixel, some, options=options)
+        graph = coherence(a, b, MATCH_NOISE_PIXELS * pixel, some)
         values, links = graph.values, graph.links
-        keep, groups = _groups(values, links, options)
+        keep, groups = _groups(values, links)
     else:
         links = Links(torch.zeros(len(a), 0, dtype=torch.long, device=a.device), a.new_zeros(len(a), 0))
         # without neighbours nothing but the place tells garbage, one of which can spoil the depth of a whole body
-        keep = (torch.cat([a, b], dim=-1).norm(dim=-1) < options.samples.far).nonzero().flatten()
+        keep = (torch.cat([a, b], dim=-1).norm(dim=-1) < FAR_DISTANCE).nonzero().flatten()
         groups = keep[:0]
     view = View(a, b, pixel, links)
     searched = some[keep].nonzero().flatten()
     return GivenMatches(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
 
 
-def _some(count: int, generator: torch.Generator | None, device: torch.device, options: SegmentOptions) -> Tensor:
+def _some(count: int, generator: torch.Generator | None, device: torch.device, max_searched: int) -> Tensor:
     """``(m,)`` bool: all matches, or a random part of very many: what is dense beside the noise shows no motion of its own."""
-    if count <= options.input.searched:
+    if count <= max_searched:
         return torch.ones(count, dtype=torch.bool, device=device)
-    return uniform(count, generator=generator, device=device).argsort().argsort() < options.input.searched
+    return uniform(count, generator=generator, device=device).argsort().argsort() < max_searched
 
 
-def _groups(values: Tensor, links: Links, options: SegmentOptions) -> tuple[Tensor, Tensor]:
+def _groups(values: Tensor, links: Links) -> tuple[Tensor, Tensor]:
     """The matches in linked groups large enough for a body, and these groups, from 0."""
-    component = links.components(options.coherence.linked, values > options.coherence.coherent)
+    component = links.components(MIN_LINK_WEIGHT, values > MIN_COHERENCE)
     _, group, size = component.unique(return_inverse=True, return_counts=True)
     keep = (size[group] >= LEAST).nonzero().flatten()
     return keep, torch.unique(group[keep], return_inverse=True)[1]
@@ -410,7 +421,7 @@ def segment(
     weights: Tensor | None = None,
     spatial: bool = True,
     generator: torch.Generator | None = None,
-    options: SegmentOptions = SegmentOptions(),
+    options: SegmentOptions | None = None,
 ) -> Segmentation:
     r"""Bodies that moved independently between two views, and the matches that belong to none.
 
@@ -435,7 +446,7 @@ def segment(
         spatial: whether bodies are regions of the images.  False for bodies that interleave, such as transparent motions or
             sparse points of a crowd: then only the geometry decides, which takes more matches and bears fewer outliers.
         generator: source of all randomness; None is torch's global one.
-        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
+        options: what the search takes and risks; None is :class:`dyntorch.SegmentOptions` as it is.
 
     Returns:
         A :class:`~dyntorch.tasks.segment.result.Segmentation`, without gradients.
@@ -456,6 +467,7 @@ def segment(
         (2, (2, 3, 3))
     """
     check_threshold(threshold)
+    options = SegmentOptions() if options is None else options
     check_options(options, SegmentOptions)
     data = matches(FundamentalMatrix(), (x1, x2), weights)
     if generator is not None and not isinstance(generator, torch.Generator):
@@ -467,7 +479,7 @@ def segment(
     _check_counts(bodies, data.count)
     with torch.no_grad():
         found = [
-            solve(first, second, weight, Request(bodies, threshold, spatial, generator), options)
+            solve(first, second, weight, Request(bodies, threshold, spatial, generator, options))
             for first, second, weight in zip(*data.views, data.weights, strict=True)
         ]
     width = max([outcome.count for outcome in found], default=0)
@@ -495,7 +507,7 @@ def segment(
         coherence=stacked("coherence", (n,)),
         status=numbers([int(outcome.status) for outcome in found]),
         threshold=stacked("threshold", ()),
-        notices=segmentation_notices(found, bodies, data.batch, options),
+        notices=segmentation_notices(found, bodies, data.batch),
     )
 
 

@@ -31,7 +31,6 @@ from dyntorch.shapes.basis import Polynomial
 from dyntorch.tasks.planes import closed_forms as infinity_extensors
 from dyntorch.tasks.planes import problem as planes_problem
 from dyntorch.tasks.planes import problem as planes_starts
-from dyntorch.tasks.planes.options import PlaneFrameOptions
 from dyntorch.tasks.synchronize import projective
 
 CPU = torch.device("cpu")
@@ -66,7 +65,7 @@ TABLES = [
     (monomials.collecting, (2, 2, CPU)),
     (monomials.multiplicity, (2, 2, CPU)),
     (planes_problem._own, (3, 1, CPU)),
-    (planes_starts._frames, (PlaneFrameOptions(), CPU)),
+    (planes_starts._frames, (CPU,)),
     (projective._products, (CPU,)),
     (shape_completion._choices, (8, CPU)),
     (shape_points._basis, ("plane", 4, CPU)),

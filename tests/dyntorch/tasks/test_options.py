@@ -11,6 +11,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
+from dyntorch.tasks.align.result import AlignNotice
 
 KINDS = [getattr(dyn, name) for name in dyn.__all__ if name.endswith("Options")]
 NAMES = [kind.__name__ for kind in KINDS]
@@ -91,14 +92,18 @@ def test_options_of_another_verb_are_refused(call):
 
 @pytest.mark.slow
 def test_options_of_the_alignment_decide():
-    scene = scenes.planar(60, sigma=0.3, static=0.5, generator=torch.Generator().manual_seed(0))
-    shipped = dyn.AlignOptions()
-    severe = replace(shipped, labels=replace(shipped.labels, threshold_in_sigmas=30.0))
-    found = [
-        dyn.align_planar(*scene.views, generator=torch.Generator().manual_seed(0), options=options) for options in (shipped, severe)
-    ]
-    static = [int((one.labels == 1).sum()) for one in found]
-    assert static[1] < static[0]
+    def aligned(scene, model, **given):
+        options = dyn.AlignOptions(**given)
+        return dyn.align_points(*scene.views, model=model, generator=torch.Generator().manual_seed(0), options=options)
+
+    scene = scenes.moving_points(60, sensors="projective", sigma=1e-4, static=0.5, generator=torch.Generator().manual_seed(5))
+    codes = [{str(notice.code) for notice in aligned(scene, "join", max_deviation=most).notices} for most in (0.05, 0.0)]
+    assert codes[1] - codes[0] == {str(AlignNotice.UNCERTAIN)}
+    drawn = [aligned(scene, "join", num_samples=number).labels for number in (None, 1000, 200)]
+    assert torch.equal(drawn[0], drawn[1]) and float((drawn[2] == drawn[0]).double().mean()) > 0.9
+    scene = scenes.constant_velocity(60, sensors="affine", sigma=1e-4, static=0.3, generator=torch.Generator().manual_seed(5))
+    static = [int((aligned(scene, "affine_constant_velocity", min_static_share=share).labels == 1).sum()) for share in (0.1, 0.9)]
+    assert static[0] > 10 and static[1] < static[0]
 
 
 def test_options_of_the_synchronization_decide():

@@ -17,7 +17,7 @@ import torch
 import dyntorch
 from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.numerics import Message
-from dyntorch.tasks.segment_tracks.result import TrackSegmentation
+from dyntorch.tasks.segment.result import TrackSegmentation
 from indexing.actors.sheets import render, sheet
 from indexing.report.bodies import FILES, FILM
 from indexing.video.overlay import encoded

@@ -13,7 +13,7 @@ from PIL import Image
 
 from dyntorch import Status
 from dyntorch.core.outcome import Notice, NoticeCode
-from dyntorch.tasks.segment_tracks.result import TrackSegmentation
+from dyntorch.tasks.segment.result import TrackSegmentation
 from indexing.readers.pairs import Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.bodies import BodiesReport, as_json, describe, labels_csv, rows_of, tracks_csv, write_bodies

@@ -298,10 +298,13 @@ def test_options_decide():
     scene, shipped = scenes.translating_planes(5, sigma=0.5, generator=torch.Generator().manual_seed(0)), dyn.PlanesOptions()
     matches = {"x1": scene.x1, "x2": scene.x2}
     assert int(translating_planes(**matches).status) == Status.OK
-    sure = replace(shipped, ambiguity=replace(shipped.ambiguity, uncertain=0.0))
+    sure = replace(shipped, max_error=0.0)
     assert int(translating_planes(**matches, options=sure).status) == Status.AMBIGUOUS
-    strict = replace(shipped, misfit=replace(shipped.misfit, unlikely=-100.0))
-    assert int(translating_planes(**matches, options=strict).status) == Status.NO_CONSENSUS
+    for other in (replace(shipped, max_steps=0), replace(shipped, num_refined=1), replace(shipped, body_weight=1.0)):
+        found = translating_planes(**matches, options=other)
+        assert bool(found.homography_at_infinity.isfinite().all())
+    careful = translating_planes(**matches, options=replace(shipped, risk=1e-6))
+    assert float(careful.uncertainty) > float(translating_planes(**matches).uncertainty)
 
 
 def test_options_are_of_the_verb():

@@ -10,8 +10,18 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from dyntorch.tasks.segment import coherence as module
-from dyntorch.tasks.segment.coherence import Links, coherence, conformity
-from dyntorch.tasks.segment.options import SegmentOptions
+from dyntorch.tasks.segment.coherence import (
+    DEVIATION_TOLERANCE,
+    EDGE_TOLERANCE,
+    MIN_NEIGHBOUR_COHERENCE,
+    NUM_EDGES,
+    NUM_NEIGHBOURS,
+    NUM_PASSES,
+    RIDGE,
+    Links,
+    coherence,
+    conformity,
+)
 
 F64 = torch.float64
 SCALE = 0.01
@@ -50,10 +60,10 @@ def deviations(a, b, i, neighbours):
     moment, target = torch.zeros(2, 2, dtype=F64), torch.zeros(2, 2, dtype=F64)
     errors = [(b[j] - b[i]) - (a[j] - a[i]) for j in neighbours]
     for j, s, error in zip(neighbours, size, errors, strict=True):
-        weight = math.exp(-((float(error.norm()) / s / SegmentOptions().coherence.tolerance) ** 2))
+        weight = math.exp(-((float(error.norm()) / s / DEVIATION_TOLERANCE) ** 2))
         moment += weight * torch.outer(a[j] - a[i], a[j] - a[i])
         target += weight * torch.outer(a[j] - a[i], error)
-    moment += (SegmentOptions().coherence.ridge * moment.trace() + 4 * SCALE**2) * torch.eye(2, dtype=F64)
+    moment += (RIDGE * moment.trace() + 4 * SCALE**2) * torch.eye(2, dtype=F64)
     local = torch.linalg.solve(moment, target)
     return [float((e - (a[j] - a[i]) @ local).norm()) / s for j, s, e in zip(neighbours, size, errors, strict=True)]
 
@@ -67,20 +77,20 @@ def brute_force(x1, x2):
     def apart(i: int, j: int) -> bool:
         return bool((joint[i] - joint[j]).norm() >= SCALE / 6)
 
-    for _ in range(SegmentOptions().coherence.passes):
+    for _ in range(NUM_PASSES):
         trusted, values, links = values, [0.0] * n, torch.zeros(n, n, dtype=F64)
         for a, b in ((x1, x2), (x2, x1)):
             for i in range(n):
                 others = [
                     j
                     for j in range(n)
-                    if apart(i, j) and trusted[j] > SegmentOptions().coherence.trusted and all(apart(j, k) for k in range(j))
+                    if apart(i, j) and trusted[j] > MIN_NEIGHBOUR_COHERENCE and all(apart(j, k) for k in range(j))
                 ]
-                others = sorted(others, key=lambda j: float((a[i] - a[j]).norm()))[: SegmentOptions().coherence.neighbours]
+                others = sorted(others, key=lambda j: float((a[i] - a[j]).norm()))[:NUM_NEIGHBOURS]
                 deviation = deviations(a, b, i, others)
-                values[i] += sum(math.exp(-((d / SegmentOptions().coherence.tolerance) ** 2)) for d in deviation) / len(others) / 2
-                for j, d in list(zip(others, deviation, strict=True))[: SegmentOptions().coherence.edges]:
-                    weight = math.exp(-((d / SegmentOptions().coherence.edge_tolerance) ** 2)) / 4
+                values[i] += sum(math.exp(-((d / DEVIATION_TOLERANCE) ** 2)) for d in deviation) / len(others) / 2
+                for j, d in list(zip(others, deviation, strict=True))[:NUM_EDGES]:
+                    weight = math.exp(-((d / EDGE_TOLERANCE) ** 2)) / 4
                     links[i, j] += weight
                     links[j, i] += weight
     return torch.tensor(values, dtype=F64), links
@@ -93,7 +103,7 @@ def dense(links: Links) -> torch.Tensor:
 @pytest.mark.slow
 def test_formula_one_match_at_a_time():
     x1, x2 = mixed(26)
-    found = coherence(x1, x2, SCALE, options=SegmentOptions())
+    found = coherence(x1, x2, SCALE)
     values, links = brute_force(x1, x2)
     torch.testing.assert_close(found.values, values)
     torch.testing.assert_close(dense(found.links), links)
@@ -101,7 +111,7 @@ def test_formula_one_match_at_a_time():
 
 
 def test_links_are_symmetric_and_gathered_alike(monkeypatch):
-    links = coherence(*mixed(), SCALE, options=SegmentOptions()).links
+    links = coherence(*mixed(), SCALE).links
     full = torch.zeros(40, 40, dtype=F64)
     for i in range(40):
         for j, weight in zip(links.index[i].tolist(), links.weight[i].tolist(), strict=True):
@@ -115,7 +125,7 @@ def test_links_are_symmetric_and_gathered_alike(monkeypatch):
 
 
 def test_cut_is_the_sum_over_pairs_in_different_bodies():
-    links = coherence(*mixed(), SCALE, options=SegmentOptions()).links
+    links = coherence(*mixed(), SCALE).links
     full = dense(links)
     labels = torch.randint(0, 3, (2, 40), generator=draw(2))
     members = (labels[:, None] == torch.arange(3)[:, None]).to(F64)
@@ -124,14 +134,14 @@ def test_cut_is_the_sum_over_pairs_in_different_bodies():
 
 
 def test_subset_keeps_the_links_among_its_matches():
-    links = coherence(*mixed(), SCALE, options=SegmentOptions()).links
+    links = coherence(*mixed(), SCALE).links
     keep = torch.randperm(40, generator=draw(3))[:23]
     torch.testing.assert_close(dense(links.subset(keep)), dense(links)[keep][:, keep])
 
 
 @pytest.mark.parametrize("least", [0.05, 0.3, 0.6])
 def test_components_are_those_of_the_graph(least):
-    links = coherence(*mixed(90), SCALE, options=SegmentOptions()).links
+    links = coherence(*mixed(90), SCALE).links
     among = torch.rand(90, generator=draw(4)) > 0.3
     full = dense(links)
     joined = (full > least) & among[:, None] & among
@@ -161,47 +171,45 @@ def test_components_of_a_chain_and_without_links():
 def test_placing_and_turning_the_images_changes_nothing(angle):
     x1, x2 = mixed()
     turn, shift = similarity(1.0, angle), torch.tensor([30.0, -7.0], dtype=F64)
-    found = coherence(x1, x2, SCALE, options=SegmentOptions())
-    moved = coherence(x1 @ turn.mT + shift, x2 @ turn.mT - shift, SCALE, options=SegmentOptions())
+    found = coherence(x1, x2, SCALE)
+    moved = coherence(x1 @ turn.mT + shift, x2 @ turn.mT - shift, SCALE)
     torch.testing.assert_close(moved.values, found.values, rtol=0, atol=1e-9)
-    scaled = coherence(250 * x1, 250 * x2, 250 * SCALE, options=SegmentOptions())
+    scaled = coherence(250 * x1, 250 * x2, 250 * SCALE)
     torch.testing.assert_close(scaled.values, found.values, rtol=0, atol=1e-9)
     torch.testing.assert_close(dense(scaled.links), dense(found.links), rtol=0, atol=1e-9)
 
 
 def test_views_and_order_of_matches_do_not_matter():
     x1, x2 = mixed()
-    found = coherence(x1, x2, SCALE, options=SegmentOptions())
-    swapped = coherence(x2, x1, SCALE, options=SegmentOptions())
+    found = coherence(x1, x2, SCALE)
+    swapped = coherence(x2, x1, SCALE)
     torch.testing.assert_close(swapped.values, found.values)
     torch.testing.assert_close(dense(swapped.links), dense(found.links))
     order = torch.randperm(40, generator=draw(6))
     # not the two repeated ones, of which one or the other may be a neighbour
-    torch.testing.assert_close(
-        coherence(x1[order], x2[order], SCALE, options=SegmentOptions()).values, found.values[order], rtol=0, atol=1e-9
-    )
+    torch.testing.assert_close(coherence(x1[order], x2[order], SCALE).values, found.values[order], rtol=0, atol=1e-9)
 
 
 def test_affine_fields_are_coherent_and_random_matches_are_not():
     x1 = points(150)
-    assert float(coherence(x1, affine(x1, 0.002), SCALE, options=SegmentOptions()).values.min()) > 0.7
-    found = coherence(x1, points(150, 1), SCALE, options=SegmentOptions())
+    assert float(coherence(x1, affine(x1, 0.002), SCALE).values.min()) > 0.7
+    found = coherence(x1, points(150, 1), SCALE)
     assert float(found.values.mean()) < 0.1
     assert int(found.links.components(0.3, found.values > 0.2).unique(return_counts=True)[1].max()) < 7
     # wrong matches among right ones
     x2 = affine(x1, 0.002)
     x2[:75] = points(75, 2)
-    values = coherence(x1, x2, SCALE, options=SegmentOptions()).values
+    values = coherence(x1, x2, SCALE).values
     assert float((values[75:] > 0.35).double().mean()) > 0.97 and float((values[:75] < 0.2).double().mean()) > 0.9
 
 
 def test_repeated_matches_confirm_nothing():
     # not the copies of random matches each other, nor those of a neighbour the local motion towards it
     for x1, x2 in ((points(60), points(60, 1)), mixed(60)):
-        alone = coherence(x1, x2, SCALE, options=SegmentOptions())
-        found = coherence(x1.repeat(6, 1), x2.repeat(6, 1), SCALE, options=SegmentOptions())
+        alone = coherence(x1, x2, SCALE)
+        found = coherence(x1.repeat(6, 1), x2.repeat(6, 1), SCALE)
         torch.testing.assert_close(found.values, alone.values.repeat(6), rtol=0, atol=1e-9)
-    same = coherence(x1[:1].expand(30, 2), x2[:1].expand(30, 2), SCALE, options=SegmentOptions())
+    same = coherence(x1[:1].expand(30, 2), x2[:1].expand(30, 2), SCALE)
     assert bool((same.values == 0).all()) and bool((same.links.weight == 0).all())
 
 
@@ -210,7 +218,7 @@ def test_common_zoom_and_rotation_are_recognized(zoom, angle):
     x1 = points(200)
     x2 = x1 @ similarity(zoom, angle).mT + 0.5 + 0.002 * torch.randn(200, 2, generator=draw(7), dtype=F64)
     x2[:60] = zoom * points(60, 8)
-    values = coherence(x1, x2, SCALE, options=SegmentOptions()).values
+    values = coherence(x1, x2, SCALE).values
     assert float((values[60:] > 0.35).double().mean()) > 0.97 and float((values[:60] < 0.2).double().mean()) > 0.9
 
 
@@ -220,7 +228,7 @@ def test_a_part_that_turns_far_is_as_coherent_as_the_rest(angle):
     right = x1[:, 0] > 0.7
     noise = 0.002 * torch.randn(200, 2, generator=draw(7), dtype=F64)
     x2 = torch.where(right[:, None], x1 @ similarity(1.0, angle).mT, x1 + 0.1) + noise
-    found = coherence(x1, x2, SCALE, options=SegmentOptions())
+    found = coherence(x1, x2, SCALE)
     assert float(found.values[right].median()) > 0.7 and float(found.values[~right].median()) > 0.7
     assert float(found.links.cut(torch.stack([right, ~right]).double())) < 0.1 * float(found.links.weight.sum()) / 2
 
@@ -229,18 +237,18 @@ def test_conformity_asks_the_members_of_each_body_alone():
     x1 = points(120)
     right = x1[:, 0] > 0.5
     x2 = torch.where(right[:, None], x1 @ similarity(1.0, 0.3).mT, x1 + torch.tensor([0.2, -0.1], dtype=F64))
-    found = conformity(x1, x2, torch.stack([~right, right]), SCALE, options=SegmentOptions())
+    found = conformity(x1, x2, torch.stack([~right, right]), SCALE)
     assert found.shape == (2, 120)
     assert float(found[0, ~right].min()) > 0.7 and float(found[1, right].min()) > 0.7
     assert float(found[0, right].mean()) < 0.4
     # all matches as one body: the coherence of one pass
-    whole = conformity(x1, x2, torch.ones(1, 120, dtype=torch.bool), SCALE, options=SegmentOptions())[0]
-    assert float((whole - coherence(x1, x2, SCALE, options=SegmentOptions()).values).abs().max()) < 0.1
-    assert bool((conformity(x1, x2, torch.zeros(1, 120, dtype=torch.bool), SCALE, options=SegmentOptions()) == 0).all())
+    whole = conformity(x1, x2, torch.ones(1, 120, dtype=torch.bool), SCALE)[0]
+    assert float((whole - coherence(x1, x2, SCALE).values).abs().max()) < 0.1
+    assert bool((conformity(x1, x2, torch.zeros(1, 120, dtype=torch.bool), SCALE) == 0).all())
 
 
 def test_few_matches():
     for n in (1, 2, 3, 9):
-        found = coherence(points(n), affine(points(n)), SCALE, options=SegmentOptions())
+        found = coherence(points(n), affine(points(n)), SCALE)
         assert found.values.shape == (n,) and bool(found.values.isfinite().all())
         assert found.links.index.shape[0] == n

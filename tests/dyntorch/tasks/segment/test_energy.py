@@ -10,8 +10,17 @@ import torch
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import apply, homogeneous, skew, unit
 from dyntorch.tasks.segment.coherence import coherence
-from dyntorch.tasks.segment.energy import View, energy, parallax
-from dyntorch.tasks.segment.options import SegmentOptions
+from dyntorch.tasks.segment.energy import (
+    CUT_COST,
+    ENERGY_MAX_SQUARED_DISTANCE,
+    MIN_PARALLAX_PIXELS,
+    PARALLAX_FREEDOM,
+    PARALLAX_WEIGHT,
+    SAMPSON_NOISE_PIXELS,
+    View,
+    energy,
+    parallax,
+)
 
 F64 = torch.float64
 PIXEL = 1 / 200
@@ -22,7 +31,7 @@ def draw(seed: int = 0) -> torch.Generator:
 
 
 def view_of(x1, x2) -> View:
-    return View(x1, x2, PIXEL, coherence(x1, x2, 3 * PIXEL, options=SegmentOptions()).links)
+    return View(x1, x2, PIXEL, coherence(x1, x2, 3 * PIXEL).links)
 
 
 def scene_view(seed: int = 0, **options) -> tuple[View, torch.Tensor, torch.Tensor]:
@@ -55,8 +64,8 @@ def test_energy_is_the_sum_over_matches_and_pairs():
     view, F, labels = scene_view(sigma=1.0)
     labels = torch.stack([labels, labels.roll(3)])
     member = torch.stack([one_hot(row) for row in labels])
-    found = energy(view, F.expand(2, 2, 3, 3), member, options=SegmentOptions())
-    relief, scale = parallax(view, F.expand(2, 2, 3, 3), member, options=SegmentOptions())
+    found = energy(view, F.expand(2, 2, 3, 3), member)
+    relief, scale = parallax(view, F.expand(2, 2, 3, 3), member)
     full = view.links.pull(torch.eye(60, dtype=F64))
     for b, row in enumerate(labels.tolist()):
         expected = 0.0
@@ -64,11 +73,11 @@ def test_energy_is_the_sum_over_matches_and_pairs():
             one, two = homogeneous(view.x1[i]), homogeneous(view.x2[i])
             line, other = F[k] @ one, F[k].mT @ two
             square = float((two @ line) ** 2 / (line[:2] @ line[:2] + other[:2] @ other[:2]))
-            expected += min(square / (SegmentOptions().energy.noise * PIXEL) ** 2, SegmentOptions().energy.cap)
-            expected += sum(SegmentOptions().energy.cut * float(full[i, j]) for j in range(i) if row[j] != k)
+            expected += min(square / (SAMPSON_NOISE_PIXELS * PIXEL) ** 2, ENERGY_MAX_SQUARED_DISTANCE)
+            expected += sum(CUT_COST * float(full[i, j]) for j in range(i) if row[j] != k)
             p, t = float(relief[b, k, i]), float(scale[b, k])
-            nu = SegmentOptions().energy.parallax_freedom
-            expected += SegmentOptions().energy.parallax * ((nu + 1) * math.log(1 + p * p / (nu * t)) + math.log(t))
+            nu = PARALLAX_FREEDOM
+            expected += PARALLAX_WEIGHT * ((nu + 1) * math.log(1 + p * p / (nu * t)) + math.log(t))
         assert float(found[b]) == pytest.approx(expected, rel=1e-9)
     assert found[0] < found[1]
 
@@ -76,12 +85,11 @@ def test_energy_is_the_sum_over_matches_and_pairs():
 def test_empty_bodies_cost_nothing():
     view, F, labels = scene_view(sigma=0.5)
     member = one_hot(labels)
-    found = energy(view, F[None], member[None], options=SegmentOptions())
+    found = energy(view, F[None], member[None])
     more = energy(
         view,
         torch.cat([F, torch.zeros(1, 3, 3, dtype=F64)])[None],
         torch.cat([member, torch.zeros(1, 60, dtype=F64)])[None],
-        options=SegmentOptions(),
     )
     torch.testing.assert_close(more, found)
 
@@ -89,9 +97,9 @@ def test_empty_bodies_cost_nothing():
 def test_points_of_a_plane_have_no_parallax():
     F, _, x1, second = plane_and_points()
     view = view_of(x1, second(torch.zeros(40)))
-    value, scale = parallax(view, F[None, None], torch.ones(1, 1, 40, dtype=F64), options=SegmentOptions())
+    value, scale = parallax(view, F[None, None], torch.ones(1, 1, 40, dtype=F64))
     assert float(value.abs().max()) < 1e-5
-    torch.testing.assert_close(scale, torch.full((1, 1), SegmentOptions().energy.parallax_scale ** 2, dtype=F64))
+    torch.testing.assert_close(scale, torch.full((1, 1), MIN_PARALLAX_PIXELS**2, dtype=F64))
 
 
 def test_parallax_is_the_way_along_the_epipolar_line_in_pixels():
@@ -99,13 +107,13 @@ def test_parallax_is_the_way_along_the_epipolar_line_in_pixels():
     step = torch.zeros(40, dtype=F64)
     step[:12] = 1e-4 * torch.linspace(-1, 1, 12, dtype=F64)
     member = (step == 0).to(F64)[None, None]  # the plane is that of the others
-    value, _ = parallax(view_of(x1, second(step)), F[None, None], member, options=SegmentOptions())
+    value, _ = parallax(view_of(x1, second(step)), F[None, None], member)
     way = (second(step) - apply(H, x1)).norm(dim=-1) / PIXEL
     torch.testing.assert_close(value[0, 0, :12].abs(), way[:12], rtol=1e-3, atol=1e-7)
     # to both sides of the plane
     assert bool((value[0, 0, :6] * value[0, 0, 6:12].flip(0) < 0).all())
     for factor in (-1.0, 7.0, 1e-3):
-        scaled, _ = parallax(view_of(x1, second(step)), factor * F[None, None], member, options=SegmentOptions())
+        scaled, _ = parallax(view_of(x1, second(step)), factor * F[None, None], member)
         torch.testing.assert_close(scaled.abs(), value.abs(), rtol=1e-6, atol=1e-6)
 
 
@@ -113,9 +121,9 @@ def test_a_few_points_off_the_plane_do_not_bend_it():
     F, _, x1, second = plane_and_points()
     step = torch.zeros(40, dtype=F64)
     step[:6] = 0.3
-    value, scale = parallax(view_of(x1, second(step)), F[None, None], torch.ones(1, 1, 40, dtype=F64), options=SegmentOptions())
+    value, scale = parallax(view_of(x1, second(step)), F[None, None], torch.ones(1, 1, 40, dtype=F64))
     assert float(value[0, 0, 6:].abs().max()) < 1.0 and float(value[0, 0, :6].abs().min()) > 20
-    assert float(scale) < 8 * SegmentOptions().energy.parallax_scale ** 2
+    assert float(scale) < 8 * MIN_PARALLAX_PIXELS**2
 
 
 def test_scale_is_that_of_students_distribution():
@@ -123,9 +131,7 @@ def test_scale_is_that_of_students_distribution():
     normal = torch.randn(3, 400, generator=draw(5), dtype=F64)
     student = normal[0] / ((normal[1] ** 2 + normal[2] ** 2) / 2).sqrt()
     slope = (second(torch.full((400,), 1e-5)) - second(torch.zeros(400))).norm(dim=-1) / 1e-5
-    _, scale = parallax(
-        view_of(x1, second(student * 6 * PIXEL / slope)), F[None, None], torch.ones(1, 1, 400, dtype=F64), options=SegmentOptions()
-    )
+    _, scale = parallax(view_of(x1, second(student * 6 * PIXEL / slope)), F[None, None], torch.ones(1, 1, 400, dtype=F64))
     assert 5 < math.sqrt(float(scale)) < 7.2
 
 
@@ -133,13 +139,13 @@ def test_batches_are_loops_and_subsets_are_views_of_their_own():
     view, F, labels = scene_view(1, sigma=0.5)
     turned = torch.stack([F, F.flip(0), F])
     member = torch.stack([one_hot(labels), one_hot(labels), one_hot(labels.roll(7))])
-    value, scale = parallax(view, turned, member, options=SegmentOptions())
-    total = energy(view, turned, member, options=SegmentOptions())
+    value, scale = parallax(view, turned, member)
+    total = energy(view, turned, member)
     for b in range(3):
-        one, two = parallax(view, turned[b : b + 1], member[b : b + 1], options=SegmentOptions())
+        one, two = parallax(view, turned[b : b + 1], member[b : b + 1])
         torch.testing.assert_close(value[b], one[0])
         torch.testing.assert_close(scale[b], two[0])
-        torch.testing.assert_close(total[b], energy(view, turned[b : b + 1], member[b : b + 1], options=SegmentOptions())[0])
+        torch.testing.assert_close(total[b], energy(view, turned[b : b + 1], member[b : b + 1])[0])
     keep = torch.randperm(60, generator=draw())[:30]
     part = view.subset(keep)
     assert part.pixel == PIXEL and torch.equal(part.x1, view.x1[keep]) and torch.equal(part.x2, view.x2[keep])
@@ -150,13 +156,11 @@ def test_absent_bodies_and_matches_at_the_epipole_stay_finite():
     view, F, labels = scene_view(2)
     nothing = torch.zeros(1, 2, 60, dtype=F64)
     for matrices in (F[None], torch.zeros(1, 2, 3, 3, dtype=F64)):
-        value, scale = parallax(view, matrices, nothing, options=SegmentOptions())
+        value, scale = parallax(view, matrices, nothing)
         assert bool(value.isfinite().all()) and bool(scale.isfinite().all())
-        assert bool(energy(view, matrices, one_hot(labels)[None], options=SegmentOptions()).isfinite().all())
+        assert bool(energy(view, matrices, one_hot(labels)[None]).isfinite().all())
     # zoom: the epipole is a point of the image
     F, zoom = skew(torch.tensor([0.0, 0.0, 1.0], dtype=F64)), view.x1.clone()
     zoom[0] = 0.0
-    value, _ = parallax(
-        View(zoom, 1.2 * zoom, PIXEL, view.links), F[None, None], torch.ones(1, 1, 60, dtype=F64), options=SegmentOptions()
-    )
+    value, _ = parallax(View(zoom, 1.2 * zoom, PIXEL, view.links), F[None, None], torch.ones(1, 1, 60, dtype=F64))
     assert bool(value.isfinite().all())

@@ -7,7 +7,6 @@ import torch
 
 from dyntorch.tasks.segment.coherence import coherence
 from dyntorch.tasks.segment.energy import mean_field
-from dyntorch.tasks.segment.options import SegmentOptions
 from dyntorch.tasks.segment.search import affine_flows
 
 F64 = torch.float64
@@ -25,7 +24,7 @@ def two_flows(interleaved: bool = False):
     first = x1 @ torch.tensor([[0.98, -0.2], [0.2, 0.98]], dtype=F64).mT + torch.tensor([0.1, 0.0], dtype=F64)
     second = 0.9 * x1 + torch.tensor([-0.3, 0.35], dtype=F64)
     x2 = torch.where(labels[:, None] == 0, first, second) + NOISE * torch.randn(120, 2, generator=draw(1), dtype=F64)
-    return x1, x2, coherence(x1, x2, 3 * NOISE, options=SegmentOptions()).links, labels
+    return x1, x2, coherence(x1, x2, 3 * NOISE).links, labels
 
 
 def agreement(found, labels):
@@ -36,7 +35,7 @@ def agreement(found, labels):
 @pytest.mark.parametrize(("interleaved", "share"), [(False, 0.9), (True, 0.5)])
 def test_two_flows_are_recovered(interleaved, share):
     x1, x2, links, labels = two_flows(interleaved)
-    found = affine_flows(x1, x2, links, torch.full((16,), 2), NOISE, draw(2), options=SegmentOptions())
+    found = affine_flows(x1, x2, links, torch.full((16,), 2), NOISE, draw(2))
     assert found.shape == (16, 120) and found.dtype == torch.long
     right = agreement(found, labels)
     assert float(right.max()) == 1.0 and float((right > 0.97).double().mean()) >= share
@@ -45,14 +44,14 @@ def test_two_flows_are_recovered(interleaved, share):
 def test_runs_have_their_own_number_of_flows():
     x1, x2, links, _ = two_flows()
     bodies = torch.tensor([1, 2, 3, 4, 2, 1])
-    found = affine_flows(x1, x2, links, bodies, NOISE, draw(), options=SegmentOptions())
+    found = affine_flows(x1, x2, links, bodies, NOISE, draw())
     assert bool((found >= 0).all()) and bool((found.amax(-1) < bodies).all())
 
 
 def test_randomness_comes_from_the_generator():
     x1, x2, links, _ = two_flows()
     bodies = torch.full((12,), 3)
-    runs = [affine_flows(x1, x2, links, bodies, NOISE, draw(seed), options=SegmentOptions()) for seed in (5, 5, 6)]
+    runs = [affine_flows(x1, x2, links, bodies, NOISE, draw(seed)) for seed in (5, 5, 6)]
     assert torch.equal(runs[0], runs[1]) and not torch.equal(runs[0], runs[2])
     # the runs themselves differ too
     assert len(runs[0].unique(dim=0)) > 1
@@ -65,11 +64,10 @@ def test_few_and_equal_matches():
             found = affine_flows(
                 x1,
                 x2,
-                coherence(x1, x2, NOISE, options=SegmentOptions()).links,
+                coherence(x1, x2, NOISE).links,
                 torch.tensor([1, 2, 3]),
                 NOISE,
                 draw(),
-                options=SegmentOptions(),
             )
             assert found.shape == (3, n) and bool((found.amax(-1) < torch.tensor([1, 2, 3])).all())
 

@@ -11,8 +11,7 @@ from dyntorch.geometry.homogeneous import unit
 from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment.coherence import Links, coherence
 from dyntorch.tasks.segment.energy import View
-from dyntorch.tasks.segment.labels import field, label
-from dyntorch.tasks.segment.options import SegmentOptions
+from dyntorch.tasks.segment.labels import LABEL_SHARPNESS, NUM_LABEL_UPDATES, field, label
 
 F64 = torch.float64
 SCALE = 1 / 200
@@ -30,13 +29,13 @@ def labelled(seed: int = 0, spatial: bool = True, found=None, weights=None, shar
     inverse = torch.linalg.inv(torch.tensor([[SCALE, 0, -1.6], [0, SCALE, -1.2], [0, 0, 1]], dtype=F64))
     F = unit(inverse.mT @ torch.stack(scene.motion) @ inverse)
     none = Links(torch.zeros(150, 0, dtype=torch.long), torch.zeros(150, 0, dtype=F64))
-    view = View(x1, x2, SCALE, coherence(x1, x2, 3 * SCALE, options=SegmentOptions()).links if spatial else none)
+    view = View(x1, x2, SCALE, coherence(x1, x2, 3 * SCALE).links if spatial else none)
     found = scene.labels if found is None else found
     weights = torch.ones(150, dtype=F64) if weights is None else weights
     return (
         view,
         scene.labels,
-        label(view, found, F, weights, THRESHOLD, 3 * SCALE if spatial else None, share=share, options=SegmentOptions()),
+        label(view, found, F, weights, THRESHOLD, 3 * SCALE if spatial else None, share=share),
     )
 
 
@@ -92,14 +91,14 @@ def test_field_one_match_at_a_time():
     view, _, _ = labelled(0)
     cost = 3 * torch.rand(2, 150, generator=draw(1), dtype=F64)
     links = view.links
-    found = field(cost, 1.3, links, options=SegmentOptions())
-    full = SegmentOptions().labels.sharpness * torch.cat([torch.full((1, 150), 1.3, dtype=F64), cost])
+    found = field(cost, 1.3, links)
+    full = LABEL_SHARPNESS * torch.cat([torch.full((1, 150), 1.3, dtype=F64), cost])
     member = torch.softmax(-full, 0)
-    for _ in range(SegmentOptions().labels.turns):
+    for _ in range(NUM_LABEL_UPDATES):
         fresh = torch.zeros_like(member)
         for i in range(150):
             pull = (member[:, links.index[i]] * links.weight[i]).sum(-1)
-            fresh[:, i] = torch.softmax(SegmentOptions().labels.sharpness * pull - full[:, i], 0)
+            fresh[:, i] = torch.softmax(LABEL_SHARPNESS * pull - full[:, i], 0)
         member = (member + fresh) / 2
     torch.testing.assert_close(found, member)
 
@@ -107,5 +106,5 @@ def test_field_one_match_at_a_time():
 def test_no_links_leave_the_softmax_of_the_costs():
     none = Links(torch.zeros(6, 0, dtype=torch.long), torch.zeros(6, 0, dtype=F64))
     cost = 3 * torch.rand(2, 6, generator=draw(2), dtype=F64)
-    expected = torch.softmax(-SegmentOptions().labels.sharpness * torch.cat([torch.ones(1, 6, dtype=F64), cost]), 0)
-    torch.testing.assert_close(field(cost, 1.0, none, options=SegmentOptions()), expected)
+    expected = torch.softmax(-LABEL_SHARPNESS * torch.cat([torch.ones(1, 6, dtype=F64), cost]), 0)
+    torch.testing.assert_close(field(cost, 1.0, none), expected)

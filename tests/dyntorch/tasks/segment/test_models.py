@@ -14,8 +14,7 @@ from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous, ske
 from dyntorch.tasks.segment import labels as module
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.energy import View
-from dyntorch.tasks.segment.labels import choose
-from dyntorch.tasks.segment.options import SegmentOptions
+from dyntorch.tasks.segment.labels import MAX_SQUARED_DEVIATION, NUM_LABEL_ROUNDS, TRUNCATED_VARIANCE, choose
 
 F64 = torch.float64
 SCALE = 1 / 200
@@ -33,7 +32,7 @@ def chosen(kind: str, n: int, sigma: float, seed: int, weight: float = 1.0):
     view = View(x1, x2, SCALE, Links(torch.zeros(n, 0, dtype=torch.long), torch.zeros(n, 0, dtype=F64)))
     member = torch.full((1, n), weight, dtype=F64)
     F = fit_fundamental(x1, x2, member, [6 * SCALE, 3 * SCALE, 2 * SCALE])[0]
-    return choose(view, F, member, options=SegmentOptions()), view
+    return choose(view, F, member), view
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 1.0])
@@ -75,9 +74,9 @@ def test_matches_without_weight_do_not_matter():
         member = torch.ones(1, 60, dtype=F64)
         member[:, :15] = 0.0
         F = fit_fundamental(view.x1, x2, member, [6 * SCALE, 3 * SCALE, 2 * SCALE])[0]
-        found = choose(View(view.x1, x2, SCALE, view.links), F, member, options=SegmentOptions())
+        found = choose(View(view.x1, x2, SCALE, view.links), F, member)
         part = view.subset(torch.arange(15, 60))
-        alone = choose(part, F, member[:, 15:], options=SegmentOptions())
+        alone = choose(part, F, member[:, 15:])
         assert torch.equal(found.planar, alone.planar)
         torch.testing.assert_close(found.homographies, alone.homographies, rtol=0, atol=1e-6)
 
@@ -109,8 +108,8 @@ def test_choice_is_the_smaller_criterion_with_the_noise_of_a_loop():
             J = torch.cat([H[:2, :2] - two[:2, None] * H[2, :2], -(H @ one)[2] * torch.eye(2, dtype=F64)], dim=-1)
             planar.append(float(c @ torch.linalg.solve(J @ J.mT, c)))
         noise = statistics.median_low(epipolar) / statistics.NormalDist().inv_cdf(0.75) ** 2
-        for _ in range(SegmentOptions().labels.rounds):
-            noise = sum(min(s, SegmentOptions().models.truncated * noise) for s in epipolar) / (SegmentOptions().models.kept * 50)
+        for _ in range(NUM_LABEL_ROUNDS):
+            noise = sum(min(s, MAX_SQUARED_DEVIATION * noise) for s in epipolar) / (TRUNCATED_VARIANCE * 50)
         noise *= 50 / (50 - 7 - math.sqrt(100))
         assert math.sqrt(noise) / SCALE == pytest.approx(0.7, rel=0.3)
         first = sum(min(s / noise, 2) for s in epipolar) + 3 * 50 * math.log(4) + 7 * math.log(200)
@@ -121,18 +120,18 @@ def test_choice_is_the_smaller_criterion_with_the_noise_of_a_loop():
 def test_noise_is_that_of_all_bodies():
     square = torch.randn(3, 400, generator=draw(8), dtype=F64).square() * 0.3**2
     square[:, :8] = 100.0  # a few that belong to no body
-    variance = float(module._noise(square, torch.ones(3, 400, dtype=F64), options=SegmentOptions()))
+    variance = float(module._noise(square, torch.ones(3, 400, dtype=F64)))
     assert 0.29 < math.sqrt(variance) < 0.36
     # a body without matches adds nothing
     member = torch.ones(3, 400, dtype=F64)
     member[2] = 0.0
-    assert math.sqrt(float(module._noise(square, member, options=SegmentOptions()))) == pytest.approx(math.sqrt(variance), rel=0.1)
+    assert math.sqrt(float(module._noise(square, member))) == pytest.approx(math.sqrt(variance), rel=0.1)
 
 
 def test_no_and_few_matches():
     models, view = chosen("general", 8, 0.5, 9)
     assert models.planar.shape == (1,) and bool(models.homographies.isfinite().all())
-    nothing = choose(view, torch.zeros(1, 3, 3, dtype=F64), torch.zeros(1, 8, dtype=F64), options=SegmentOptions())
+    nothing = choose(view, torch.zeros(1, 3, 3, dtype=F64), torch.zeros(1, 8, dtype=F64))
     assert bool(nothing.homographies.isfinite().all())
 
 
@@ -149,7 +148,5 @@ def test_a_plane_with_more_than_a_few_matches_off_it_is_a_body_with_depth(off, p
     pixel = 0.002
     x2 = x2 + 0.3 * pixel * torch.randn(100, 2, generator=draw, dtype=torch.float64)
     none = Links(torch.zeros(100, 0, dtype=torch.long), torch.zeros(100, 0, dtype=torch.float64))
-    found = choose(
-        View(x1, x2, pixel, none), (skew(e) @ H)[None], torch.ones(1, 100, dtype=torch.float64), options=SegmentOptions()
-    )
+    found = choose(View(x1, x2, pixel, none), (skew(e) @ H)[None], torch.ones(1, 100, dtype=torch.float64))
     assert found.planar.tolist() == [planar]

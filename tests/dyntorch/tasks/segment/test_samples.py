@@ -8,8 +8,7 @@ from dyntorch import scenes
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import View
-from dyntorch.tasks.segment.options import SegmentOptions
+from dyntorch.tasks.segment.energy import ENERGY_MAX_SQUARED_DISTANCE, SAMPSON_NOISE_PIXELS, View
 from dyntorch.tasks.segment.search import LEAST, matrix_pairs, search_samples
 
 
@@ -62,19 +61,17 @@ def test_the_same_numbers_give_the_same_bodies():
 def test_candidates_are_ordered_and_cost_their_distances():
     scene = scenes.bodies((40, 40), sigma=0.3, outliers=0.2, interleaved=True, generator=generator(4))
     view = view_of(scene)
-    found = search_samples(view, [1, 2, 3], generator(), options=SegmentOptions())
+    found = search_samples(view, [1, 2, 3], generator(), max_samples=24000)
     assert sorted(found) == [1, 2, 3]
     for count, candidates in found.items():
         energies = [candidate.energy for candidate in candidates]
         assert energies == sorted(energies)
         square = torch.stack([sampson_squared(x.fundamentals, view.x1, view.x2).amin(0) for x in candidates])
-        cost = (square / (SegmentOptions().energy.noise * view.pixel) ** 2).clamp(max=SegmentOptions().energy.cap).sum(-1).min()
+        cost = (square / (SAMPSON_NOISE_PIXELS * view.pixel) ** 2).clamp(max=ENERGY_MAX_SQUARED_DISTANCE).sum(-1).min()
         assert energies[0] == pytest.approx(float(cost))
         for candidate in candidates:
             square = sampson_squared(candidate.fundamentals, view.x1, view.x2)
-            near = square.argmin(0)[
-                square.amin(0) < SegmentOptions().energy.cap * (SegmentOptions().energy.noise * view.pixel) ** 2
-            ]
+            near = square.argmin(0)[square.amin(0) < ENERGY_MAX_SQUARED_DISTANCE * (SAMPSON_NOISE_PIXELS * view.pixel) ** 2]
             assert int(torch.bincount(near, minlength=count).min()) >= LEAST
 
 
@@ -83,10 +80,10 @@ def test_the_pair_of_the_segmentation_matrix_is_exact_without_noise():
     view = view_of(scene)
     groups = torch.stack([torch.ones(80, dtype=torch.float64), (torch.arange(80) < 20).double()])
     for rounds in (0, 2):
-        pair = matrix_pairs(view, groups, rounds, options=SegmentOptions())
+        pair = matrix_pairs(view, groups, rounds)
         assert pair.shape == (2, 3, 3)  # the second group is too small
         assert float(sampson_squared(pair, view.x1, view.x2).amin(0).max()) < 1e-12
-        assert matrix_pairs(view, groups[1:], rounds, options=SegmentOptions()).shape == (0, 3, 3)
+        assert matrix_pairs(view, groups[1:], rounds).shape == (0, 3, 3)
 
 
 @pytest.mark.parametrize("count", [8, 12, 20])

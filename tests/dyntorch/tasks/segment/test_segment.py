@@ -276,10 +276,37 @@ def test_very_many_matches_are_labelled_by_what_some_of_them_show():
 def test_options_decide():
     scene, shipped = two_bodies(), dyn.SegmentOptions()
     assert int(segmented(scene).bodies) == 2
-    costly = replace(shipped, count=replace(shipped.count, penalty=100.0))
-    assert int(segmented(scene, options=costly).bodies) == 1
-    strict = replace(shipped, input=replace(shipped.input, coarse=1e-6))
-    assert int(segmented(scene, options=strict).status) == Status.AMBIGUOUS
+    assert int(segmented(scene, options=replace(shipped, max_bodies=1)).bodies) == 1
+    few = segmented(scene, options=replace(shipped, max_searched=60, num_starts=4))
+    assert int(few.bodies) == 2 and few.labels.shape == segmented(scene).labels.shape
+
+
+@pytest.mark.slow
+def test_options_of_the_search_by_geometry_decide():
+    scene, shipped = scenes.bodies((80, 60), sigma=0.3, interleaved=True, generator=draw(3)), dyn.SegmentOptions()
+    assert int(segmented(scene, spatial=False).bodies) == 2
+    assert int(segmented(scene, spatial=False, options=replace(shipped, false_alarms=1e-200)).bodies) == 0
+    assert int(segmented(scene, spatial=False, options=replace(shipped, max_samples=6000)).bodies) == 2
+    outliers = [
+        int((segmented(scene, spatial=False, options=replace(shipped, outlier_share=p)).labels == 0).sum()) for p in (0.005, 0.2)
+    ]
+    assert outliers[0] <= outliers[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spatial", [True, False])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_default_dtype_decides_nothing(dtype, spatial):
+    views = [x.to(dtype) for x in two_bodies().views]
+    known = dyn.segment(*views, spatial=spatial, generator=draw(0))
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        found = dyn.segment(*views, spatial=spatial, generator=draw(0))
+    finally:
+        torch.set_default_dtype(before)
+    for name in ("labels", "fundamentals", "probabilities", "residuals"):
+        torch.testing.assert_close(getattr(found, name), getattr(known, name), rtol=0, atol=0)
 
 
 def test_options_are_of_the_verb():

@@ -11,9 +11,8 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS, View
 from dyntorch.tasks.segment.labels import _alarms, _chance, significant
-from dyntorch.tasks.segment.options import SegmentOptions
 
 
 def draw(seed: int = 0) -> torch.Generator:
@@ -36,13 +35,9 @@ def test_chance_is_the_share_of_random_points_near_a_line_at_most():
     lines = torch.randn(200, 2, generator=draw(1), dtype=torch.float64)
     lines = lines / lines.norm(dim=-1, keepdim=True)
     middle = torch.tensor([320.0, 240.0], dtype=torch.float64)
-    near = ((x - middle) @ lines.mT).abs() < SegmentOptions().units.threshold_in_pixels
+    near = ((x - middle) @ lines.mT).abs() < THRESHOLD_PIXELS
     # the bound is the longest line, along the diagonal
-    assert (
-        float(near.double().mean())
-        < _chance(x, SegmentOptions().units.threshold_in_pixels)
-        < 2 * float(near.double().mean(0).max())
-    )
+    assert float(near.double().mean()) < _chance(x, THRESHOLD_PIXELS) < 2 * float(near.double().mean(0).max())
 
 
 def test_bodies_are_believed_and_accidents_are_not():
@@ -50,9 +45,9 @@ def test_bodies_are_believed_and_accidents_are_not():
     none = Links(torch.zeros(60, 0, dtype=torch.long), torch.zeros(60, 0, dtype=torch.float64))
     view = View(*scene.views, 1.0, none)
     fundamentals = torch.stack(scene.motion)
-    assert significant(view, fundamentals, scene.labels, options=SegmentOptions()).all()
+    assert significant(view, fundamentals, scene.labels, false_alarms=1e-2).all()
     random = torch.randn(2, 3, 3, generator=draw(3), dtype=torch.float64)
-    assert not significant(view, random, scene.labels, options=SegmentOptions()).any()
+    assert not significant(view, random, scene.labels, false_alarms=1e-2).any()
 
 
 @pytest.mark.slow

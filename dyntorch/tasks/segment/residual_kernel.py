@@ -16,28 +16,33 @@ from torch import Tensor
 from dyntorch.geometry.homogeneous import cofactors, homogeneous
 from dyntorch.numerics.blocks import uniform
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment_tracks.frames import Film, FramePair, pairs_near
-from dyntorch.tasks.segment_tracks.options import FrameOptions, PreferenceOptions
+from dyntorch.tasks.segment.frame_pairs import Film, FramePair, pairs_near
 
 TINY = 1e-12
 
 
-def preference_kernel(
-    film: Film, searched: Tensor, generator: torch.Generator | None, frames: FrameOptions, options: PreferenceOptions
-) -> Tensor:
+KERNEL_GAPS = (1, 2, 4, 8)  # frames between those of a pair
+KERNEL_PAIRS_PER_GAP = 20  # in a video as long as its tracks; longer ones have more
+MIN_KERNEL_TRACKS = 16  # that both frames of such a pair must show
+PREFERRED_SHARE = 0.1  # of the hypotheses, that fit a track best
+MIN_SAMPLE_RADIUS = 0.05  # about its first track in which a hypothesis finds the others, over the extent of all
+MAX_SAMPLE_RADIUS = 0.7  # the largest one
+
+
+def preference_kernel(film: Film, searched: Tensor, generator: torch.Generator | None, num_hypotheses: int) -> Tensor:
     r"""How alike tracks move: the mean share of preferred hypotheses that they have in common, searched ``(m,)`` -> ``(n, m)``."""
     count = film.x.shape[1]
     place = torch.full((count,), -1, device=searched.device)
     place[searched] = torch.arange(len(searched), device=searched.device)
-    kernel = torch.zeros(count, len(searched), device=searched.device)
+    kernel = torch.zeros(count, len(searched), dtype=torch.float32, device=searched.device)
     met = torch.zeros_like(kernel)
-    for pair in pairs_near(film, options.gaps, options.starts, options.common):
-        both = film.pair(pair, frames)
+    for pair in pairs_near(film, KERNEL_GAPS, KERNEL_PAIRS_PER_GAP, MIN_KERNEL_TRACKS):
+        both = film.pair(pair)
         column = place[both.index]
         own = (column >= 0).nonzero().flatten()
-        if len(own) < options.common:
+        if len(own) < MIN_KERNEL_TRACKS:
             continue
-        liked = _preferred(both, own, generator, options)
+        liked = _preferred(both, own, generator, num_hypotheses)
         shared = liked @ liked[own].mT
         rows, columns = both.index[:, None], column[own][None]
         kernel[rows, columns] += shared
@@ -47,31 +52,35 @@ def preference_kernel(
     return kernel
 
 
-def _preferred(both: FramePair, own: Tensor, generator: torch.Generator | None, options: PreferenceOptions) -> Tensor:
+def _preferred(both: FramePair, own: Tensor, generator: torch.Generator | None, number: int) -> Tensor:
     """``(m, 3 h)`` 1 for what a track prefers, else 0, over the root of the number of preferences."""
     x1, x2 = both.view.x1, both.view.x2
     # three of eight tracks give an affine map, four a homography, all of them a fundamental matrix
-    sample = own[_samples(x1[own], generator, options)]
+    sample = own[_samples(x1[own], generator, number)]
     a, b = x1[sample], x2[sample]
     squares = [
         _transfer(affine_map(a[:, :3], b[:, :3]), x1, x2),
         _transfer(homography_of_four(a[:, :4], b[:, :4]), x1, x2),
         _epipolar(fundamental_of_eight(a, b), x1, x2),
     ]
-    few = max(1, round(options.preferred * len(sample)))
+    few = max(1, round(PREFERRED_SHARE * len(sample)))
     # exactly so many, also where several fit alike
     best = [square.topk(few, dim=0, largest=False).indices for square in squares]
     liked = [torch.zeros_like(square).scatter_(0, index, 1.0) for square, index in zip(squares, best, strict=True)]
     return torch.cat(liked).mT / (3 * few) ** 0.5
 
 
-def _samples(x: Tensor, generator: torch.Generator | None, options: PreferenceOptions) -> Tensor:
+def _samples(x: Tensor, generator: torch.Generator | None, number: int) -> Tensor:
     """``(h, 8)`` different points ``(m, 2)``: one at random, the others by a normal distribution about it, of some width."""
-    count, number = len(x), options.hypotheses
+    count = len(x)
     low, high = x.quantile(x.new_tensor([0.02, 0.98]), dim=0)
     extent = (high - low).norm() / 2**0.5
     seed = (uniform(number, generator=generator, device=x.device) * count).long().clamp(max=count - 1)
-    radius = options.near * (options.far / options.near) ** uniform(number, 1, generator=generator, device=x.device) * extent
+    radius = (
+        MIN_SAMPLE_RADIUS
+        * (MAX_SAMPLE_RADIUS / MIN_SAMPLE_RADIUS) ** uniform(number, 1, generator=generator, device=x.device)
+        * extent
+    )
     # Gumbel's trick: the largest of log p + noise are a sample without replacement
     noise = -(-uniform(number, count, generator=generator, device=x.device).clamp(min=1e-300).log()).log()
     chance = noise - torch.cdist(x[seed], x).square() / (2 * radius.square()).clamp(min=TINY)

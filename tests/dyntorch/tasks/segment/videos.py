@@ -10,11 +10,9 @@ from torch import Tensor
 
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, skew, unit
 from dyntorch.geometry.rigid import rotation_exponential
-from dyntorch.tasks.segment_tracks.frames import Film
-from dyntorch.tasks.segment_tracks.options import TrackSegmentOptions
+from dyntorch.tasks.segment.frame_pairs import Film
 
 F64 = torch.float64
-OPTIONS = TrackSegmentOptions()
 K = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], dtype=F64)
 PLACES = ((150.0, 130.0), (490.0, 340.0), (480.0, 110.0), (160.0, 360.0))
 """Where bodies 2, 3, ... are in frame 0, pixels."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
 from dyntorch.geometry.homogeneous import apply
-from dyntorch.tasks.segment_tracks.frames import Film, chosen_pairs, cut_of, pairs_near, spread_evenly
-from tests.dyntorch.tasks.segment_tracks.films import F64, OPTIONS, draw, shot
+from dyntorch.tasks.segment.frame_pairs import Film, chosen_pairs, cut_of, pairs_near, spread_evenly
+from tests.dyntorch.tasks.segment.videos import F64, draw, shot
 
 
 def long_film(frames: int, length: int = 10, each: int = 6, shortest: int = 2) -> Film:
@@ -60,11 +58,11 @@ def test_equal_points_do_not_divide_by_zero():
 
 def test_a_pair_holds_the_tracks_of_both_frames_and_trusts_those_that_move_little():
     film = long_film(30)
-    pair = film.pair((10, 13), OPTIONS.frames)
+    pair = film.pair((10, 13))
     assert pair.index.tolist() == (film.seen[10] & film.seen[13]).nonzero().flatten().tolist()
     torch.testing.assert_close(pair.view.x1, film.x[10][pair.index])
     torch.testing.assert_close(pair.view.x2, film.x[13][pair.index])
-    still = film.pair((10, 10), OPTIONS.frames)
+    still = film.pair((10, 10))
     assert bool((still.precision == 1).all()) and bool((pair.precision < 1).all()) and bool((pair.precision > 0).all())
     groups = torch.ones(1, film.x.shape[1], dtype=torch.bool)
     torch.testing.assert_close(pair.weighed(groups)[0] * pair.precision.mean(), pair.precision)
@@ -91,10 +89,10 @@ def test_near_pairs_have_enough_in_common_and_grow_with_the_video():
 
 def test_chosen_pairs_show_all_tracks_and_are_the_same_every_time():
     film = long_film(40, each=12, shortest=4)
-    pairs = chosen_pairs(film, OPTIONS.frames)
-    assert pairs == sorted(set(pairs)) == chosen_pairs(film, OPTIONS.frames)
+    pairs = chosen_pairs(film, 64)
+    assert pairs == sorted(set(pairs)) == chosen_pairs(film, 64)
     assert all(0 <= a < b < 40 for a, b in pairs)
-    assert all(int((film.seen[a] & film.seen[b]).sum()) >= min(OPTIONS.frames.common, 20) for a, b in pairs)
+    assert all(int((film.seen[a] & film.seen[b]).sum()) >= 20 for a, b in pairs)
     assert float((kept(pairs, film)[film.seen.sum(0) >= 3] > 0).double().mean()) > 0.95
     assert max(b - a for a, b in pairs) > 2 * min(b - a for a, b in pairs)  # near and far
 
@@ -102,16 +100,15 @@ def test_chosen_pairs_show_all_tracks_and_are_the_same_every_time():
 @pytest.mark.parametrize("frames", [2, 3, 8])
 def test_chosen_pairs_of_few_frames(frames):
     film = shot((30, 20), frames=frames).film()
-    pairs = chosen_pairs(film, OPTIONS.frames)
+    pairs = chosen_pairs(film, 64)
     assert 1 <= len(pairs) <= frames * (frames - 1) // 2 and (0, frames - 1) in pairs
     assert bool((kept(pairs, film) == len(pairs)).all())
 
 
 def test_chosen_pairs_grow_with_the_length_of_the_video_at_most():
-    unlimited = replace(OPTIONS.frames, most=10_000)
-    counts = [len(chosen_pairs(long_film(frames), unlimited)) for frames in (40, 80, 160)]
+    counts = [len(chosen_pairs(long_film(frames), 10_000)) for frames in (40, 80, 160)]
     assert counts[0] < counts[1] < counts[2] < 5 * counts[0]
-    assert len(chosen_pairs(long_film(160), OPTIONS.frames)) <= OPTIONS.frames.most
+    assert len(chosen_pairs(long_film(160), 64)) <= 64
 
 
 def test_no_pair_where_no_frames_have_enough_in_common():
@@ -119,13 +116,13 @@ def test_no_pair_where_no_frames_have_enough_in_common():
     tracks = torch.full_like(scene.tracks, torch.nan)
     for track in range(30):
         tracks[track % 6, track] = scene.tracks[track % 6, track]
-    assert chosen_pairs(Film.of(tracks), OPTIONS.frames) == []
+    assert chosen_pairs(Film.of(tracks), 64) == []
 
 
 def test_plain_videos_have_no_cut():
     for scene in (shot((60, 40)), shot((60,), frames=3), shot((60, 30), moves=4.0)):
-        assert cut_of(scene.film(), OPTIONS.frames) is None
-    assert cut_of(long_film(60), OPTIONS.frames) is None
+        assert cut_of(scene.film()) is None
+    assert cut_of(long_film(60)) is None
 
 
 @pytest.mark.parametrize("frame", [3, 6])
@@ -134,7 +131,7 @@ def test_a_cut_is_where_the_tracks_end_and_others_begin(frame):
     before, after = tracks.clone(), tracks.clone()
     before[frame:], after[:frame] = torch.nan, torch.nan
     before[:, :4] = tracks[:, :4]  # a few are taken for the same
-    cut = cut_of(Film.of(torch.cat([before, after], 1)), OPTIONS.frames)
+    cut = cut_of(Film.of(torch.cat([before, after], 1)))
     assert cut is not None and cut.frame == frame
     assert cut.share == pytest.approx(4 / 60, abs=0.02) and cut.jump == 0
 
@@ -145,11 +142,11 @@ def test_a_cut_is_where_all_tracks_jump(frame):
     tracks = scene.tracks.clone()
     shuffled = torch.randperm(80, generator=draw(1))
     tracks[frame:] = tracks[frame:][:, shuffled]
-    cut = cut_of(Film.of(tracks), OPTIONS.frames)
+    cut = cut_of(Film.of(tracks))
     assert cut is not None and cut.frame == frame and cut.jump > 5
 
 
 def test_some_tracks_that_jump_are_no_cut():
     tracks = shot((60, 20)).tracks.clone()
     tracks[5:, :20] += 300.0
-    assert cut_of(Film.of(tracks), OPTIONS.frames) is None
+    assert cut_of(Film.of(tracks)) is None

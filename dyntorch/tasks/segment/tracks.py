@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from math import log
+from functools import cached_property
+from math import log, log1p
 from typing import Any
 
 import torch
@@ -15,16 +16,146 @@ from dyntorch.core.problems import of_problem, one_by_one
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
+from dyntorch.tasks.segment.agglomeration import NEGLIGIBLE_LINKS, Judge, NearPairs, merged, pieces, weakest_separation
+from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS
+from dyntorch.tasks.segment.frame_pairs import Film, FramePair, chosen_pairs, cut_of, pairs_near
+from dyntorch.tasks.segment.labels import agreeing, distances, motions, outliers, resting
+from dyntorch.tasks.segment.options import TrackSegmentOptions
+from dyntorch.tasks.segment.residual_kernel import MIN_KERNEL_TRACKS, common_share, links_of, preference_kernel, strongest
+from dyntorch.tasks.segment.result import TrackNotice, TrackSegmentation
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.segment import MINIMAL
-from dyntorch.tasks.segment_tracks.choosing import Chosen, Start, bodies_of
-from dyntorch.tasks.segment_tracks.descent import Candidates, TrackEvidence, costs, unlinked
-from dyntorch.tasks.segment_tracks.frames import Film, FramePair, chosen_pairs, cut_of, pairs_near
-from dyntorch.tasks.segment_tracks.labels import agreeing, distances, motions, outliers, resting
-from dyntorch.tasks.segment_tracks.merging import Judge, NearPairs, pieces
-from dyntorch.tasks.segment_tracks.options import TrackSegmentOptions
-from dyntorch.tasks.segment_tracks.preferences import common_share, links_of, preference_kernel, strongest
-from dyntorch.tasks.segment_tracks.result import TrackNotice, TrackSegmentation
+from dyntorch.tasks.segment.track_energy import (
+    MIN_BODY_TRACKS,
+    Candidates,
+    Exchanges,
+    TrackEvidence,
+    costs,
+    descended,
+    energy,
+    unlinked,
+)
+
+# ----------------------------------------------------------------------------------------------------------------------
+# How many bodies there are, and which of the segmentations into them is the best.
+
+MIN_EXCHANGE_PAIRS = 4  # pairs of frames: two views alone allow wrong exchanges
+EXCHANGE_CUT_WEIGHTS = (1.0, 3.0)  # over that in the descent, one search each: either finds what the other misses
+COMPARISON_CUT_WEIGHT = 3.0  # at 1, bodies that share an epipolar geometry swallow parts of each other
+SEPARATION_WEIGHT = 0.5  # of the least separate bodies, beside the cost per track
+COMPARISON_RELIEF_WEIGHT = 0.04  # on streets relief prefers halves of what rests to bodies
+SEPARATION_LINK_WEIGHT = 0.1  # of the links cut between the least separate bodies
+ENERGY_WEIGHT = 0.5  # of the cost of a segmentation, for each of its tracks
+ANOTHER_BODY_LOGIT = -5.7  # logistic regression on 104 sequences of KT3DMoSeg, MTPV62 and Hopkins155: constant,
+ANOTHER_BODY_RATIO = 0.4  # what one motion of both costs beside two,
+ANOTHER_BODY_UNLINKED = 1.6  # logarithm of the links between them, for each track of the smaller one,
+ANOTHER_BODY_SAVED = 2.2  # logarithm of the cost saved, in units of the root of the number of tracks
+
+
+@dataclass(frozen=True)
+class Start:
+    """What the search for bodies starts from."""
+
+    evidence: TrackEvidence  # links and pairs of frames
+    judge: Judge  # of groups of tracks
+    cuts: Sequence[Tensor]  # labels ``(n,)`` of the pieces, once for each number of pieces
+
+    @cached_property
+    def trees(self) -> list[dict[int, Tensor]]:
+        """Labels ``(n,)`` with any number of bodies, for each of the cuts."""
+        most = max(int(cut.max()) + 1 for cut in self.cuts)
+        return [merged(self.judge, cut, range(1, most + 1)) for cut in self.cuts]
+
+    def best(self, bodies: int, thorough: bool = False) -> Candidates | None:
+        """The best segmentation into so many bodies: separate, and of little cost; None where there is none."""
+        starts = [tree[bodies] for tree in self.trees if bodies in tree]
+        if not starts:
+            return None
+        if thorough and bodies > 1:
+            for cut, tree in zip(self.cuts, self.trees, strict=True):
+                if bodies in tree:
+                    exchanges = Exchanges(self.evidence, cut)
+                    starts += [exchanges.improved(tree[bodies], weight) for weight in EXCHANGE_CUT_WEIGHTS]
+        distinct = [x for place, x in enumerate(starts) if not any(torch.equal(x, other) for other in starts[:place])]
+        found = descended(self.evidence, torch.stack(distinct), bodies)
+        values = [self._value(found.of(which), thorough) for which in range(len(distinct))]
+        best = max(range(len(values)), key=values.__getitem__)
+        return found.of(best) if values[best] > float("-inf") else None
+
+    def _value(self, one: Candidates, thorough: bool) -> float:
+        """How good a segmentation is beside others into as many bodies."""
+        if not bool(one.energy.isfinite()):
+            return float("-inf")
+        apart = weakest_separation(self.judge, one, SEPARATION_LINK_WEIGHT) if one.bodies > 1 else 0.0
+        count = len(self.evidence.count)
+        if not thorough:
+            return apart - ENERGY_WEIGHT * float(one.energy) / count
+        cost = energy(self.evidence, one.geometry, one.labels, one.scale, COMPARISON_RELIEF_WEIGHT)
+        cut = self.evidence.links.cut(one_hot(one.labels, one.bodies).double())
+        return SEPARATION_WEIGHT * apart - float(cost + (COMPARISON_CUT_WEIGHT - 1) * cut) / count
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The segmentation that was chosen, and whether one body less would do."""
+
+    candidate: Candidates
+    spare: bool = False
+
+
+def bodies_of(start: Start, bodies: int | None, max_bodies: int) -> Chosen | None:
+    """The best segmentation into ``bodies``, or fewer where there are no so many; for None into as many as there are."""
+    if bodies is not None:
+        for number in range(bodies, 0, -1):
+            found = start.best(number, thorough=len(start.evidence.pairs) >= MIN_EXCHANGE_PAIRS)
+            if found is not None:
+                fewer = start.best(number - 1) if number > 1 else None
+                return Chosen(found, fewer is not None and evidence_of_another(start, fewer, found) < 0)
+        return None
+    chosen = start.best(1)
+    if chosen is None:
+        return None
+    for number in range(2, max_bodies + 1):
+        more = start.best(number)
+        if more is None or evidence_of_another(start, chosen, more) < 0:
+            break
+        chosen = more
+    return Chosen(chosen)
+
+
+def evidence_of_another(start: Start, fewer: Candidates, more: Candidates) -> float:
+    r"""Logarithm of the odds that there is one body more,"""
+    member = one_hot(more.labels[0], more.bodies) > 0
+    before = one_hot(fewer.labels[0], fewer.bodies) > 0
+    apart = start.judge.separation(member)
+    # the two bodies whose union is most like a body of the other segmentation
+    union = (member[apart.first] | member[apart.second]).double()
+    shared = union @ before.double().mT
+    likeness = shared / (union.sum(-1, keepdim=True) + before.double().sum(-1) - shared)
+    split = int(likeness.amax(-1).argmax())
+    ratio, links = apart.ratio()[split], apart.links[split] + NEGLIGIBLE_LINKS
+    saved = float(fewer.energy - more.energy) / len(start.evidence.count) ** 0.5
+    return float(
+        ANOTHER_BODY_LOGIT
+        + ANOTHER_BODY_RATIO * ratio
+        - ANOTHER_BODY_UNLINKED * links.log()
+        + ANOTHER_BODY_SAVED * log1p(max(saved, 0.0))
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The verb.
+
+
+NUM_TRACK_NEIGHBOURS = 10  # those with the most common preferences
+MIN_COMMON_PREFERENCES = 0.04  # share in common with the five most alike, for one track, and ...
+MIN_COMMON_PREFERENCES_GROWTH = 0.0435  # ... per unit of the logarithm of their number
+TRACK_CUT_COST = 18.0  # of cutting all links of a track
+PIECE_COUNTS = (10, 14)  # one start of the search for each; fewer where a piece would have too few tracks
+MIN_PIECE_TRACKS = 6  # on average
+MERGE_GAPS = (1, 2, 5)  # frames between those of the pairs by which pieces merge: near ones, where linear fits do
+MERGE_PAIRS_PER_GAP = 10  # in a video as long as its tracks; longer ones have more
+MAX_CAMERA_DISTANCE = 0.4  # median, in thresholds, of a body that agrees with declared cameras
 
 
 @dataclass(frozen=True)
@@ -39,7 +170,7 @@ class TrackRequest:
     @property
     def pixel(self) -> float:
         """A pixel of the options in the unit of the tracks: all of them follow the threshold."""
-        return self.threshold / self.options.views.units.threshold_in_pixels
+        return self.threshold / THRESHOLD_PIXELS
 
 
 @one_thread
@@ -51,7 +182,7 @@ def segment_tracks(
     *,
     cameras: Tensor | None = None,
     generator: torch.Generator | None = None,
-    options: TrackSegmentOptions = TrackSegmentOptions(),
+    options: TrackSegmentOptions | None = None,
 ) -> TrackSegmentation:
     r"""Bodies that move independently through a video, from tracks that live in any part of it.
 
@@ -77,10 +208,10 @@ def segment_tracks(
         cameras: ``(*batch, frames, 3, 4)`` projections that the camera is known to have had, up to scale; the body that agrees
             with them stands still.
         generator: source of all randomness; None is torch's global one.
-        options: every number that decides, by stage; ``dataclasses.replace`` changes some of them.
+        options: what the search takes and expects; None is :class:`dyntorch.TrackSegmentOptions` as it is.
 
     Returns:
-        A :class:`~dyntorch.tasks.segment_tracks.result.TrackSegmentation`, without gradients.
+        A :class:`~dyntorch.tasks.segment.result.TrackSegmentation`, without gradients.
 
     Raises:
         ValueError: fewer than eight tracks or two frames, shapes or dtypes that do not fit, a threshold or a number of bodies that
@@ -98,6 +229,7 @@ def segment_tracks(
         ((150,), 2)
     """
     check_threshold(threshold, estimated=False)
+    options = TrackSegmentOptions() if options is None else options
     check_options(options, TrackSegmentOptions)
     _check(tracks, bodies, cameras, generator)
     batch = tracks.shape[:-3]
@@ -149,38 +281,37 @@ def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> Tra
         return _nothing(count, request, [Notice(TrackNotice.SHORT)])
     film = Film.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.pixel)
     refused = _refusal(film, request)
-    frames = [] if refused else chosen_pairs(film, options.frames)
+    frames = [] if refused else chosen_pairs(film, options.max_frame_pairs)
     if refused or not frames:
         common = int((film.seen[:-1] & film.seen[1:]).sum(-1).max())
         few = Notice(TrackNotice.FEW_COMMON, float(common), {"least": MINIMAL})
         return _nothing(count, request, [refused or few])
     # 2. which tracks move alike, and the bodies of those that are searched
     searched = _searched(film, request)
-    kernel = preference_kernel(film, searched, request.generator, options.frames, options.preferences)
+    kernel = preference_kernel(film, searched, request.generator, options.num_hypotheses)
     alike = common_share(kernel[searched])
-    how = options.preferences
-    if alike < how.coherent + how.coherent_grows * log(len(searched)):
+    if alike < MIN_COMMON_PREFERENCES + MIN_COMMON_PREFERENCES_GROWTH * log(len(searched)):
         return _nothing(count, request, [Notice(TrackNotice.INCOHERENT, alike)])
     start = _start(film, frames, kernel, searched, request)
-    chosen = bodies_of(start, request.bodies, options)
+    chosen = bodies_of(start, request.bodies, options.max_bodies)
     if chosen is None:
         return _nothing(count, request, [], Status.NO_CONSENSUS)
     # 3. all tracks follow, and what belongs to no body is told
-    pairs = [film.pair(pair, options.frames) for pair in frames]
-    member = _followed(film, pairs, kernel, searched, chosen.candidate, options)
+    pairs = [film.pair(pair) for pair in frames]
+    member = _followed(film, pairs, kernel, searched, chosen.candidate)
     return _outcome(tracks, cameras, film, pairs, kernel, searched, member, chosen, request)
 
 
 def _refusal(film: Film, request: TrackRequest) -> Notice | None:
     """Why there is nothing to segment."""
-    cut = cut_of(film, request.options.frames)
+    cut = cut_of(film)
     if cut is not None:
         values = {"frame": cut.frame, "case": "jump" if cut.jump else ""}
         return Notice(TrackNotice.CUT, cut.jump or cut.share, values)
     low = torch.where(film.seen[..., None], film.x, torch.inf).amin(0)
     high = torch.where(film.seen[..., None], film.x, -torch.inf).amax(0)
     way = (high - low).norm(dim=-1)[film.seen.any(0)] / film.pixel
-    farthest, least = float(way.quantile(0.95)), request.options.outliers.still
+    farthest, least = float(way.quantile(0.95)), request.options.min_motion
     if farthest < least:
         return Notice(TrackNotice.STILL, farthest * request.pixel, {"least": least * request.pixel})
     return None
@@ -189,7 +320,7 @@ def _refusal(film: Film, request: TrackRequest) -> Notice | None:
 def _searched(film: Film, request: TrackRequest) -> Tensor:
     """Indices of the tracks that the search looks at: all, or a random part of very many."""
     alive = film.seen.any(0).nonzero().flatten()
-    most = request.options.preferences.searched
+    most = request.options.max_searched
     if len(alive) <= most:
         return alive
     order = uniform(len(alive), generator=request.generator, device=alive.device).argsort()
@@ -198,24 +329,21 @@ def _searched(film: Film, request: TrackRequest) -> Tensor:
 
 def _start(film: Film, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
     """What the search for bodies starts from: links, pairs of frames and pieces of the searched tracks."""
-    options = request.options
     part = Film(film.x[:, searched], film.seen[:, searched], film.pixel, film.change)
     inner = kernel[searched]
     inner = (inner + inner.mT) / 2
-    sparse = strongest(inner, options.preferences.neighbours)
-    pairs = [part.pair(pair, options.frames) for pair in frames]
-    evidence = TrackEvidence.of(pairs, links_of(sparse, options.preferences.cut))
-    beside = pairs_near(part, options.merge.gaps, options.merge.starts, options.preferences.common)
-    near = NearPairs(part, beside or frames, options.frames, options.merge)
-    least, most = request.bodies or 1, max(1, len(searched) // options.merge.members)
-    cuts = [pieces(sparse, max(min(number, most), min(least, most))) for number in options.merge.pieces]
-    judge = Judge.of(near, inner, one_hot(cuts[0], int(cuts[0].max()) + 1) > 0, options.merge)
+    sparse = strongest(inner, NUM_TRACK_NEIGHBOURS)
+    pairs = [part.pair(pair) for pair in frames]
+    evidence = TrackEvidence.of(pairs, links_of(sparse, TRACK_CUT_COST))
+    beside = pairs_near(part, MERGE_GAPS, MERGE_PAIRS_PER_GAP, MIN_KERNEL_TRACKS)
+    near = NearPairs(part, beside or frames)
+    least, most = request.bodies or 1, max(1, len(searched) // MIN_PIECE_TRACKS)
+    cuts = [pieces(sparse, max(min(number, most), min(least, most))) for number in PIECE_COUNTS]
+    judge = Judge.of(near, inner, one_hot(cuts[0], int(cuts[0].max()) + 1) > 0)
     return Start(evidence, judge, cuts)
 
 
-def _followed(
-    film: Film, pairs: list[FramePair], kernel: Tensor, searched: Tensor, found: Candidates, options: TrackSegmentOptions
-) -> Tensor:
+def _followed(film: Film, pairs: list[FramePair], kernel: Tensor, searched: Tensor, found: Candidates) -> Tensor:
     """Probabilities ``(K, n)`` of all tracks: those searched have theirs, the others those of what they move like."""
     count = film.x.shape[1]
     member = torch.zeros(found.bodies, count, dtype=torch.float64, device=film.x.device)
@@ -224,11 +352,11 @@ def _followed(
     rest[searched] = False
     rest = rest.nonzero().flatten()
     if len(rest):
-        near = kernel[rest].topk(min(options.preferences.neighbours, len(searched)), dim=-1)
+        near = kernel[rest].topk(min(NUM_TRACK_NEIGHBOURS, len(searched)), dim=-1)
         weight = near.values.double() / near.values.double().sum(-1, keepdim=True).clamp(min=1e-9)
-        pulled = (member[:, searched][:, near.indices] * weight).sum(-1) * options.preferences.cut
+        pulled = (member[:, searched][:, near.indices] * weight).sum(-1) * TRACK_CUT_COST
         evidence = TrackEvidence.of(pairs, unlinked(count, film.x.device))
-        cost = costs(evidence, found.geometry, found.scale, member[None], options)[0][:, rest]
+        cost = costs(evidence, found.geometry, found.scale, member[None])[0][:, rest]
         member[:, rest] = torch.softmax(pulled - cost, dim=0)
     return member
 
@@ -245,22 +373,22 @@ def _outcome(
     request: TrackRequest,
 ) -> TrackSegmentation:
     """Labels by size, with motions, the body that stands still, and what limits all that."""
-    options, count = request.options, tracks.shape[1]
+    count = tracks.shape[1]
     alive = film.seen.any(0)
     labels = member.argmax(0)
     geometry = chosen.candidate.geometry
     far = distances(pairs, geometry, count)
-    wrong = outliers(far, labels, _support(kernel, labels[searched], labels, options), options.outliers) | ~alive
+    wrong = outliers(far, labels, _support(kernel, labels[searched], labels)) | ~alive
     hard = one_hot(labels, len(member)) * ~wrong
     order = order_of_bodies(hard > 0)
-    order = order[(hard.sum(-1) >= options.descent.members)[order]]
+    order = order[(hard.sum(-1) >= MIN_BODY_TRACKS)[order]]
     member, hard, far = member[order], hard[order], far[:, order]
     if not len(order):
         return _nothing(count, request, [], Status.NO_CONSENSUS)
     named = torch.where(hard.any(0), hard.argmax(0) + 1, 0)
     own = far.gather(1, (named - 1).clamp(min=0).expand(len(far), 1, -1))[:, 0]
     nearest = torch.where(named > 0, own.square().nanmean(0), far.square().nanmean(0).nan_to_num(nan=torch.inf).amin(0))
-    moved = motions(pairs, [F[:, order] for F in geometry], hard, film, options)
+    moved = motions(pairs, [F[:, order] for F in geometry], hard, film)
     static, notices = _static(tracks, cameras, film, hard, pairs, request)
     notices = [*_about(len(order), chosen, request), *notices]
     bodies = member / member.sum(0).clamp(min=1e-12) * (named > 0)
@@ -281,9 +409,9 @@ def _outcome(
     )
 
 
-def _support(kernel: Tensor, searched: Tensor, labels: Tensor, options: TrackSegmentOptions) -> Tensor:
+def _support(kernel: Tensor, searched: Tensor, labels: Tensor) -> Tensor:
     """``(n,)`` share of what a track is linked with that has its label: ``(n,)`` of all, ``(m,)`` of the searched ones."""
-    top = kernel.topk(min(options.preferences.neighbours, kernel.shape[1]), dim=-1)
+    top = kernel.topk(min(NUM_TRACK_NEIGHBOURS, kernel.shape[1]), dim=-1)
     same = (searched[top.indices] == labels[:, None]) * top.values
     return (same.sum(-1) / top.values.sum(-1).clamp(min=1e-9)).double()
 
@@ -303,14 +431,13 @@ def _static(
     tracks: Tensor, cameras: Tensor | None, film: Film, hard: Tensor, pairs: list[FramePair], request: TrackRequest
 ) -> tuple[int, list[Notice]]:
     """The number of the body that stands still, 0 where it is not known, and why."""
-    options = request.options.static
     if cameras is not None:
         off = agreeing(tracks, hard, cameras.double(), pairs)
         best = int(off.argmin())
-        if float(off[best]) <= options.agrees * request.threshold:
+        if float(off[best]) <= MAX_CAMERA_DISTANCE * request.threshold:
             return best + 1, []
         return 0, [Notice(TrackNotice.DISAGREEING, float(off[best]))]
-    rests = resting(film, hard, options)
+    rests = resting(film, hard)
     if rests is not None:
         return rests + 1, []
     return 0, [Notice(TrackNotice.UNSURE_STATIC, float(hard.sum(-1).max() / hard.sum()))]

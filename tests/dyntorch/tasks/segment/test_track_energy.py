@@ -9,10 +9,20 @@ import pytest
 import torch
 
 from dyntorch.geometry.epipolar import sampson_squared
+from dyntorch.tasks.segment import track_energy
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.energy import relief
+from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, chosen_pairs
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment_tracks.descent import (
+from dyntorch.tasks.segment.track_energy import (
+    EFFECTIVE_PAIRS,
+    MAX_TRACK_DISTANCE,
+    MAX_TRACK_NOISE_PIXELS,
+    MIN_BODY_TRACKS,
+    MIN_TRACK_NOISE_PIXELS,
+    MIN_TRACK_PARALLAX_PIXELS,
+    RELIEF_WEIGHT,
+    TRACK_FREEDOM,
     TrackEvidence,
     costs,
     descended,
@@ -23,16 +33,14 @@ from dyntorch.tasks.segment_tracks.descent import (
     squares,
     unlinked,
 )
-from dyntorch.tasks.segment_tracks.frames import chosen_pairs
-from tests.dyntorch.tasks.segment_tracks.films import F64, OPTIONS, Shot, draw, shot
+from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
 
-HOW = OPTIONS.descent
 HERE = torch.device("cpu")
 
 
 def pairs_of(scene: Shot, threshold: float = 2.5):
     film = scene.film(threshold)
-    return [film.pair(pair, OPTIONS.frames) for pair in chosen_pairs(film, OPTIONS.frames)]
+    return [film.pair(pair) for pair in chosen_pairs(film, 64)]
 
 
 def evidence_of(scene: Shot, links: Links | None = None) -> TrackEvidence:
@@ -53,14 +61,13 @@ def fits(scene: Shot, evidence: TrackEvidence):
     return [F[None] for F in found], member
 
 
-def test_improbable_is_students_cost_up_to_a_cutoff():
+def test_improbable_is_students_cost_up_to_a_cutoff(monkeypatch):
     square = torch.tensor([0.0, 0.5, 3.0, 15.9, 16.0, 1e6], dtype=F64)
-    how = replace(HOW, freedom=2.0, cutoff=4.0)
     known = [3 * log(1 + min(z, 16.0) / 2) for z in square.tolist()]
-    assert improbable(square, how).tolist() == pytest.approx(known)
-    assert improbable(square, replace(HOW, freedom=5.0, cutoff=1.0)).tolist() == pytest.approx(
-        [6 * log(1 + min(z, 1.0) / 5) for z in square.tolist()]
-    )
+    assert improbable(square).tolist() == pytest.approx(known)
+    monkeypatch.setattr(track_energy, "TRACK_FREEDOM", 5.0)
+    monkeypatch.setattr(track_energy, "MAX_TRACK_DISTANCE", 1.0)
+    assert improbable(square).tolist() == pytest.approx([6 * log(1 + min(z, 1.0) / 5) for z in square.tolist()])
 
 
 def test_squares_are_sampson_distances_in_pixels_as_of_tracks_at_rest():
@@ -68,7 +75,7 @@ def test_squares_are_sampson_distances_in_pixels_as_of_tracks_at_rest():
     pair = pairs_of(scene)[0]
     F = torch.randn(2, 3, 3, generator=draw(), dtype=F64)
     moved = (pair.view.x2 - pair.view.x1).norm(dim=-1) / pair.view.pixel
-    known = sampson_squared(F, pair.view.x1, pair.view.x2) / pair.view.pixel**2 / (1 + moved / OPTIONS.frames.grows)
+    known = sampson_squared(F, pair.view.x1, pair.view.x2) / pair.view.pixel**2 / (1 + moved / DOUBLED_VARIANCE_MOTION)
     torch.testing.assert_close(squares(pair, F), known)
 
 
@@ -80,8 +87,8 @@ def test_evidence_counts_the_pairs_of_a_track():
     known = [sum(track in pair.index.tolist() for pair in evidence.pairs) for track in range(5)]
     assert evidence.count[:5].tolist() == known
     assert known[0] == len(evidence.pairs) > known[3] and known[4] == 0
-    share = evidence.share(HOW)
-    assert float(share[0] * known[0]) == pytest.approx(HOW.evidence) and bool(share.isfinite().all())
+    share = evidence.share()
+    assert float(share[0] * known[0]) == pytest.approx(EFFECTIVE_PAIRS) and bool(share.isfinite().all())
 
 
 @pytest.mark.parametrize("sigma", [0.08, 0.2, 0.4])
@@ -96,11 +103,11 @@ def test_the_noise_is_that_of_the_scene(sigma):
     for pair in pairs:
         normal = torch.randn(2, len(pair.index), 2, generator=chance, dtype=F64) * sigma * pair.view.pixel
         heavy = (
-            HOW.freedom / torch.randn(round(HOW.freedom), len(pair.index), 1, generator=chance, dtype=F64).square().sum(0)
+            TRACK_FREEDOM / torch.randn(round(TRACK_FREEDOM), len(pair.index), 1, generator=chance, dtype=F64).square().sum(0)
         ).sqrt()
         view = replace(pair.view, x1=pair.view.x1 + normal[0] * heavy, x2=pair.view.x2 + normal[1] * heavy)
         found.append(replace(pair, view=view))
-    assert float(noise(found, geometry, member, HOW)) == pytest.approx(sigma, rel=0.2)
+    assert float(noise(found, geometry, member)) == pytest.approx(sigma, rel=0.2)
 
 
 def _true(scene, pairs):
@@ -114,9 +121,9 @@ def test_the_noise_stays_between_its_limits():
     pairs = pairs_of(shot((40, 40), sigma=0.0))
     scene = shot((40, 40), sigma=0.0)
     member = one_hot(scene.labels[None] - 1, 2).double()
-    assert float(noise(pairs, _true(scene, pairs), member, HOW)) == pytest.approx(HOW.least_scale)
+    assert float(noise(pairs, _true(scene, pairs), member)) == pytest.approx(MIN_TRACK_NOISE_PIXELS)
     wild = [torch.randn(1, 2, 3, 3, generator=draw(), dtype=F64) for _ in pairs]
-    assert float(noise(pairs, wild, member, HOW)) == pytest.approx(HOW.most_scale)
+    assert float(noise(pairs, wild, member)) == pytest.approx(MAX_TRACK_NOISE_PIXELS)
 
 
 def test_the_energy_is_the_sum_that_is_said():
@@ -129,7 +136,8 @@ def test_the_energy_is_the_sum_that_is_said():
     labels = scene.labels - 1
     total = 0.0
     reliefs = [
-        relief(pair.view, F, member[..., pair.index], OPTIONS.views)[0] for pair, F in zip(evidence.pairs, geometry, strict=True)
+        relief(pair.view, F, member[..., pair.index], MIN_TRACK_PARALLAX_PIXELS)[0]
+        for pair, F in zip(evidence.pairs, geometry, strict=True)
     ]
     for track in range(28):
         own = int(labels[track])
@@ -139,13 +147,13 @@ def test_the_energy_is_the_sum_that_is_said():
                 continue
             place = pair.index.tolist().index(track)
             z = float(squares(pair, F[0])[own, place]) / 0.17**2
-            said += (HOW.freedom + 1) * log(1 + min(z, HOW.cutoff**2) / HOW.freedom) + log(0.17**2)
-            said += HOW.relief * float(hills[own, place])
-        total += HOW.evidence * said / int(evidence.count[track])
+            said += (TRACK_FREEDOM + 1) * log(1 + min(z, MAX_TRACK_DISTANCE**2) / TRACK_FREEDOM) + log(0.17**2)
+            said += RELIEF_WEIGHT * float(hills[own, place])
+        total += EFFECTIVE_PAIRS * said / int(evidence.count[track])
     for track in range(28):
         for place, weight in zip(links.index[track].tolist(), links.weight[track].tolist(), strict=True):
             total += weight / 2 * (int(labels[track]) != int(labels[place]))
-    found = energy(evidence, geometry, labels[None], scale, OPTIONS)
+    found = energy(evidence, geometry, labels[None], scale)
     assert float(found) == pytest.approx(total, rel=1e-8)
 
 
@@ -154,8 +162,8 @@ def test_a_body_of_few_tracks_costs_infinity():
     evidence = evidence_of(scene)
     geometry, _ = fits(scene, evidence)
     labels = torch.zeros(50, dtype=torch.long)
-    labels[: HOW.members - 1] = 1
-    assert float(energy(evidence, geometry, labels[None], torch.tensor([0.1], dtype=F64), OPTIONS)) == torch.inf
+    labels[: MIN_BODY_TRACKS - 1] = 1
+    assert float(energy(evidence, geometry, labels[None], torch.tensor([0.1], dtype=F64))) == torch.inf
 
 
 def test_costs_are_least_in_the_own_body():
@@ -163,17 +171,16 @@ def test_costs_are_least_in_the_own_body():
     evidence = evidence_of(scene)
     geometry, _ = fits(scene, evidence)
     scale = torch.tensor([0.1], dtype=F64)
-    cost = costs(evidence, geometry, scale, None, OPTIONS)[0]
+    cost = costs(evidence, geometry, scale, None)[0]
     assert cost.shape == (3, 90)
     assert float((cost.argmin(0) == scene.labels - 1).double().mean()) > 0.97
-    without = replace(OPTIONS, descent=replace(HOW, relief=0.0))
     member = one_hot(scene.labels[None] - 1, 3).double()
-    torch.testing.assert_close(costs(evidence, geometry, scale, member, without)[0], cost)
+    torch.testing.assert_close(costs(evidence, geometry, scale, member, 0.0)[0], cost)
 
 
 def test_a_descent_stays_at_the_truth():
     scene = shot((40, 30, 20))
-    found = descended(evidence_of(scene, chain(scene)), scene.labels[None] - 1, 3, OPTIONS)
+    found = descended(evidence_of(scene, chain(scene)), scene.labels[None] - 1, 3)
     assert found.bodies == 3 and found.labels.shape == (1, 90) and found.member.shape == (1, 3, 90)
     assert float((found.labels[0] == scene.labels - 1).double().mean()) > 0.98
     torch.testing.assert_close(found.member.sum(1), torch.ones(1, 90), rtol=0, atol=1e-5)
@@ -187,7 +194,7 @@ def test_a_descent_improves_wrong_labels_and_prefers_the_truth():
     wrong = truth.clone()
     wrong[::5] = 1 - wrong[::5]
     random = torch.randint(0, 2, (70,), generator=draw(4))
-    found = descended(evidence, torch.stack([truth, wrong, random]), 2, OPTIONS)
+    found = descended(evidence, torch.stack([truth, wrong, random]), 2)
     assert float((found.labels[1] == truth).double().mean()) > 0.95
     assert int(found.energy.argmin()) != 2 or float((found.labels[2] == truth).double().mean()) > 0.95
     one = found.of(1)
@@ -201,7 +208,7 @@ def test_starts_side_by_side_are_those_one_by_one():
     truth = scene.labels - 1
     wrong = truth.clone()
     wrong[::6] = 1 - wrong[::6]
-    both = descended(evidence, torch.stack([wrong, wrong]), 2, OPTIONS)
-    alone = descended(evidence, wrong[None], 2, OPTIONS)
+    both = descended(evidence, torch.stack([wrong, wrong]), 2)
+    alone = descended(evidence, wrong[None], 2)
     assert both.labels[1].tolist() == alone.labels[0].tolist()
     torch.testing.assert_close(both.energy[:1], alone.energy, rtol=1e-4, atol=1e-3)

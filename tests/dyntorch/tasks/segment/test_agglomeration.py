@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
+from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import sampson_squared
+from dyntorch.tasks.segment import residual_kernel
+from dyntorch.tasks.segment.agglomeration import (
+    CHANCE_PREFERENCE_SHARE,
+    COST_SCALE_FACTOR,
+    MIN_PIECE_NOISE_PIXELS,
+    PIECE_LINK_WEIGHT,
+    Judge,
+    NearPairs,
+    merged,
+    pieces,
+)
+from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, pairs_near
+from dyntorch.tasks.segment.residual_kernel import preference_kernel, strongest
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment_tracks.frames import pairs_near
-from dyntorch.tasks.segment_tracks.merging import Judge, NearPairs, merged, pieces
-from dyntorch.tasks.segment_tracks.preferences import preference_kernel, strongest
-from tests.dyntorch.tasks.segment_tracks.films import F64, OPTIONS, Shot, draw, shot
-
-MERGE = OPTIONS.merge
-FEW = replace(OPTIONS.preferences, hypotheses=100, starts=5)
+from dyntorch.tasks.segment.tracks import MERGE_GAPS, MERGE_PAIRS_PER_GAP
+from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
 
 
-def near_of(scene: Shot, cap: float = MERGE.cap) -> NearPairs:
+@pytest.fixture(autouse=True)
+def few_pairs(monkeypatch):
+    """A kernel of few pairs of frames is enough here."""
+    monkeypatch.setattr(residual_kernel, "KERNEL_PAIRS_PER_GAP", 5)
+
+
+def near_of(scene: Shot) -> NearPairs:
     film = scene.film()
-    return NearPairs(film, pairs_near(film, MERGE.gaps, MERGE.starts, 16), OPTIONS.frames, replace(MERGE, cap=cap))
+    return NearPairs(film, pairs_near(film, MERGE_GAPS, MERGE_PAIRS_PER_GAP, 16))
 
 
 def groups_of(labels: torch.Tensor) -> torch.Tensor:
@@ -28,7 +41,7 @@ def groups_of(labels: torch.Tensor) -> torch.Tensor:
 
 
 def kernel_of(scene: Shot) -> torch.Tensor:
-    return preference_kernel(scene.film(), torch.arange(len(scene.labels)), draw(), OPTIONS.frames, FEW)
+    return preference_kernel(scene.film(), torch.arange(len(scene.labels)), draw(), 100)
 
 
 def halves(scene: Shot) -> torch.Tensor:
@@ -37,7 +50,7 @@ def halves(scene: Shot) -> torch.Tensor:
 
 
 def judge_of(scene: Shot, labels: torch.Tensor) -> Judge:
-    return Judge.of(near_of(scene), kernel_of(scene), groups_of(labels), MERGE)
+    return Judge.of(near_of(scene), kernel_of(scene), groups_of(labels))
 
 
 def rms(near: NearPairs, group: torch.Tensor) -> float:
@@ -59,11 +72,11 @@ def test_distances_are_those_of_the_motion_that_most_tracks_have():
     scene.tracks[:, 0] += torch.linspace(0, 9, 10, dtype=F64)[:, None]  # one goes astray
     film = scene.film()
     pairs = pairs_near(film, (5,), 3, 16)
-    near = NearPairs(film, pairs, OPTIONS.frames, MERGE)
+    near = NearPairs(film, pairs)
     own = scene.labels == 1
     for row, (a, b) in zip(near.squares(own, 0.15, rounds=8)[0], pairs, strict=True):
         exact = sampson_squared(scene.fundamental(0, a, b), scene.tracks[a][own], scene.tracks[b][own])
-        known = exact / (1 + (scene.tracks[b] - scene.tracks[a])[own].norm(dim=-1) / OPTIONS.frames.grows)
+        known = exact / (1 + (scene.tracks[b] - scene.tracks[a])[own].norm(dim=-1) / DOUBLED_VARIANCE_MOTION)
         assert float(row[1:].max()) < 0.05 < 0.3 * float(known[0])
         torch.testing.assert_close(row[0], known[0], rtol=0.3, atol=0)
 
@@ -75,9 +88,9 @@ def test_costs_count_sightings_up_to_a_cap():
     cost = judge.cost(groups)
     for found, group in zip(cost.tolist(), groups, strict=True):
         square, seen = judge.near.squares(group, judge.scale)
-        known = (square / judge.scale**2).clamp(max=MERGE.cap)[seen].sum()
+        known = (square / judge.scale**2).clamp(max=MAX_SQUARED_DISTANCE)[seen].sum()
         assert found == pytest.approx(float(known), rel=1e-9)
-        assert found <= MERGE.cap * float(judge.near.count[group].sum())
+        assert found <= MAX_SQUARED_DISTANCE * float(judge.near.count[group].sum())
     assert float(cost[2]) > 2 * float(cost[0] + cost[1])
 
 
@@ -117,13 +130,13 @@ def test_true_bodies_are_farther_apart_than_halves_of_one():
     scene = shot((40, 40, 40), sigma=0.1)
     judge = judge_of(scene, halves(scene))
     apart = judge.separation(groups_of(halves(scene)))
-    value = apart.value(MERGE.links, MERGE)
+    value = apart.value(PIECE_LINK_WEIGHT)
     same = apart.first // 2 == apart.second // 2
     assert len(value) == 15 and int(same.sum()) == 3
     assert float(value[same].max()) < float(value[~same].min())
     assert float(apart.excess[same].max()) < float(apart.excess[~same].min())
     assert float(apart.links[same].min()) > float(apart.links[~same].max())
-    assert float(apart.ratio(MERGE)[same].max()) < float(apart.ratio(MERGE)[~same].min())
+    assert float(apart.ratio()[same].max()) < float(apart.ratio()[~same].min())
 
 
 def test_separation_says_what_it_says():
@@ -137,7 +150,7 @@ def test_separation_says_what_it_says():
     seen = [float(judge.near.count[some].sum()) for some in (one, other)]
     assert float(apart.excess[place]) == pytest.approx((cost[2] - cost[0] - cost[1]) / min(seen), rel=1e-6)
     assert float(apart.own[place]) == pytest.approx((cost[0] + cost[1]) / sum(seen), rel=1e-6)
-    links = float((kernel_of(scene) - MERGE.chance).clamp(min=0)[one][:, other].sum())
+    links = float((kernel_of(scene) - CHANCE_PREFERENCE_SHARE).clamp(min=0)[one][:, other].sum())
     assert float(apart.links[place]) == pytest.approx(links / min(int(one.sum()), int(other.sum())), rel=1e-4)
 
 
@@ -156,7 +169,7 @@ def test_the_judge_knows_the_noise_and_remembers_costs():
     scene = shot((40, 30), sigma=0.5)
     judge = judge_of(scene, scene.labels - 1)
     quiet = judge_of(shot((40, 30), sigma=0.0), scene.labels - 1)
-    assert quiet.scale == pytest.approx(MERGE.widened * MERGE.least_scale)
+    assert quiet.scale == pytest.approx(COST_SCALE_FACTOR * MIN_PIECE_NOISE_PIXELS)
     assert judge.scale > 1.5 * quiet.scale
     groups = groups_of(scene.labels - 1)
     first = judge.cost(groups)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-import dyntorch as dyn
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.segment_tracks.descent import TrackEvidence, unlinked
-from dyntorch.tasks.segment_tracks.exchange import Exchanges
-from dyntorch.tasks.segment_tracks.frames import Film, chosen_pairs
-from tests.dyntorch.tasks.segment_tracks.films import shot
+from dyntorch.tasks.segment import track_energy
+from dyntorch.tasks.segment.frame_pairs import Film, chosen_pairs
+from dyntorch.tasks.segment.track_energy import Exchanges, TrackEvidence, unlinked
+from dyntorch.tasks.segment.tracks import EXCHANGE_CUT_WEIGHTS
+from tests.dyntorch.tasks.segment.videos import shot
 
-OPTIONS = dyn.TrackSegmentOptions()
 COUNTS = (48, 40)
 
 
@@ -22,14 +19,14 @@ def exchanges() -> tuple[Exchanges, torch.Tensor, torch.Tensor]:
     """Of six pieces, three of each of two bodies, without links: the labels of the pieces and of the bodies, from 0."""
     scene = shot(COUNTS, frames=6, sigma=0.1)
     film = Film.of(scene.tracks)
-    pairs = [film.pair(pair, OPTIONS.frames) for pair in chosen_pairs(film, OPTIONS.frames)]
+    pairs = [film.pair(pair) for pair in chosen_pairs(film, 64)]
     evidence = TrackEvidence.of(pairs, unlinked(sum(COUNTS), film.x.device))
     truth = scene.labels - 1
     place = torch.cat([torch.arange(count) * 3 // count for count in COUNTS])
-    return Exchanges(evidence, 3 * truth + place, OPTIONS), 3 * truth + place, truth
+    return Exchanges(evidence, 3 * truth + place), 3 * truth + place, truth
 
 
-@pytest.mark.parametrize("weight", OPTIONS.exchange.weights)
+@pytest.mark.parametrize("weight", EXCHANGE_CUT_WEIGHTS)
 @pytest.mark.parametrize("wrong", [(), (1,), (0, 4)])
 def test_pieces_in_the_wrong_body_are_put_right(wrong, weight):
     search, pieces, truth = exchanges()
@@ -40,10 +37,11 @@ def test_pieces_in_the_wrong_body_are_put_right(wrong, weight):
     assert float(misclassification(found + 1, truth + 1)) == 0.0
 
 
-def test_bodies_stay_as_many_as_they_are():
+def test_bodies_stay_as_many_as_they_are(monkeypatch):
     search, _, truth = exchanges()
-    few = Exchanges(search.evidence, search.cut, replace(OPTIONS, exchange=replace(OPTIONS.exchange, most=1)))
-    for one in (search, few):
+    for most in (track_energy.MAX_EXCHANGES, 1):
+        monkeypatch.setattr(track_energy, "MAX_EXCHANGES", most)
+        one = Exchanges(search.evidence, search.cut)
         assert len(one.improved(1 - truth, 1.0).unique()) == 2
 
 

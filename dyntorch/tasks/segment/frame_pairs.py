@@ -11,9 +11,19 @@ from torch import Tensor
 from dyntorch.geometry.homogeneous import similarity
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.energy import View
-from dyntorch.tasks.segment_tracks.options import FrameOptions
 
 Pair = tuple[int, int]
+
+
+LENGTH_QUANTILE = 0.75  # of the tracks, that the widest pairs of frames have
+NUM_GAP_HALVINGS = 4  # near pairs show short tracks, far ones more motion
+MIN_FRAME_PAIRS = 12  # compared, where there are so many
+MEAN_PAIRS_PER_TRACK = 5.0  # at least, where the most pairs allow it
+MIN_COMMON_TRACKS = 20  # that both frames of a pair must show
+DOUBLED_VARIANCE_MOTION = 2.0  # pixels between two frames at which the variance of a track has doubled
+MAX_CUT_SURVIVAL = 0.2  # share of the tracks of a frame that live on in the next one, at a cut
+MIN_JUMPING_SHARE = 0.5  # of the tracks, at a cut
+MIN_JUMP = 12.0  # over the median motion of tracks between all other frames
 
 
 @dataclass(frozen=True)
@@ -63,14 +73,14 @@ class Film:
         first, last = self.ends
         return (last - first + 1).clamp(min=0)
 
-    def pair(self, frames: Pair, options: FrameOptions) -> FramePair:
+    def pair(self, frames: Pair) -> FramePair:
         """Two frames."""
         first, second = frames
         index = (self.seen[first] & self.seen[second]).nonzero().flatten()
         x1, x2 = self.x[first][index], self.x[second][index]
         moved = (x2 - x1).norm(dim=-1) / self.pixel
         none = Links(index[:, None][:, :0], x1[:, :0])
-        return FramePair(frames, index, View(x1, x2, self.pixel, none), 1 / (1 + moved / options.grows))
+        return FramePair(frames, index, View(x1, x2, self.pixel, none), 1 / (1 + moved / DOUBLED_VARIANCE_MOTION))
 
 
 def spread_evenly(count: int, gap: int, most: int) -> list[Pair]:
@@ -90,13 +100,13 @@ def pairs_near(film: Film, gaps: tuple[int, ...], starts: int, common: int) -> l
     return [pair for pair in found if _common(film, pair) >= common]
 
 
-def chosen_pairs(film: Film, options: FrameOptions) -> list[Pair]:
+def chosen_pairs(film: Film, max_pairs: int) -> list[Pair]:
     """The pairs of frames that bodies are judged by: wide ones, narrower ones for short tracks, all tracks in some of them."""
     count = len(film.seen)
-    common = min(options.common, max(8, film.x.shape[1] // 2))
-    gap = int(min(count - 1, max(1.0, float(film.lengths.double().quantile(options.long)) - 1)))
+    common = min(MIN_COMMON_TRACKS, max(8, film.x.shape[1] // 2))
+    gap = int(min(count - 1, max(1.0, float(film.lengths.double().quantile(LENGTH_QUANTILE)) - 1)))
     offered: dict[Pair, Tensor] = {}
-    for _ in range(options.halvings):
+    for _ in range(NUM_GAP_HALVINGS):
         step = max(1, gap // 2)
         for a in {*range(0, count - gap, step), count - 1 - gap}:
             both = film.seen[a] & film.seen[a + gap]
@@ -110,8 +120,8 @@ def chosen_pairs(film: Film, options: FrameOptions) -> list[Pair]:
     wide = torch.tensor([float(b - a) for a, b in pairs], dtype=both.dtype, device=both.device).sqrt()
     have, kept = torch.zeros_like(both[0]), torch.zeros(len(pairs), dtype=torch.bool, device=both.device)
     alive = int((both.sum(0) > 0).sum())
-    while not bool(kept.all()) and int(kept.sum()) < options.most:
-        if int(kept.sum()) >= options.least and float(have.sum()) >= options.each * alive:
+    while not bool(kept.all()) and int(kept.sum()) < max_pairs:
+        if int(kept.sum()) >= MIN_FRAME_PAIRS and float(have.sum()) >= MEAN_PAIRS_PER_TRACK * alive:
             break
         gain = (both @ (1 / (1 + have)) * wide).masked_fill(kept, -1.0)
         best = int(gain.argmax())
@@ -130,7 +140,7 @@ class SceneCut:
     jump: float = 0.0
 
 
-def cut_of(film: Film, options: FrameOptions) -> SceneCut | None:
+def cut_of(film: Film) -> SceneCut | None:
     """The first cut of a video, if there is one."""
     first, last = film.ends
     steps = []
@@ -138,15 +148,15 @@ def cut_of(film: Film, options: FrameOptions) -> SceneCut | None:
         before, after = (first < frame) & (last >= frame - 1), (first <= frame) & (last >= frame)
         across = before & after
         least = float(torch.minimum(before.sum(), after.sum()))
-        if least >= options.common and float(across.sum()) < options.cut * least:
+        if least >= MIN_COMMON_TRACKS and float(across.sum()) < MAX_CUT_SURVIVAL * least:
             return SceneCut(frame, float(across.sum()) / least)
         both = film.seen[frame - 1] & film.seen[frame]
         steps.append((film.x[frame] - film.x[frame - 1])[both].norm(dim=-1) / film.pixel)
     usual = [float(step.median()) for step in steps if len(step)]
     if len(usual) > 2:
-        typical = max(float(torch.tensor(usual).median()), 1.0)
+        typical = max(float(torch.tensor(usual, dtype=torch.float32).median()), 1.0)
         for frame, step in enumerate(steps, start=1):
-            if len(step) and float((step > options.jumped * typical).double().mean()) > options.jump:
+            if len(step) and float((step > MIN_JUMP * typical).double().mean()) > MIN_JUMPING_SHARE:
                 return SceneCut(frame, 1.0, float(step.median()) / typical)
     return None
 

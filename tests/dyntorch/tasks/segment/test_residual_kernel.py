@@ -10,8 +10,9 @@ import torch
 
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.metrics import relative_error
-from dyntorch.tasks.segment_tracks.frames import pairs_near
-from dyntorch.tasks.segment_tracks.preferences import (
+from dyntorch.tasks.segment import residual_kernel
+from dyntorch.tasks.segment.frame_pairs import pairs_near
+from dyntorch.tasks.segment.residual_kernel import (
     affine_map,
     fundamental_of_eight,
     homography_of_four,
@@ -19,19 +20,25 @@ from dyntorch.tasks.segment_tracks.preferences import (
     preference_kernel,
     strongest,
 )
-from tests.dyntorch.tasks.segment_tracks.films import F64, OPTIONS, draw, shot
+from tests.dyntorch.tasks.segment.videos import F64, draw, shot
 
 SOLVERS = ((affine_map, 3), (homography_of_four, 4), (fundamental_of_eight, 8))
-FEW = replace(OPTIONS.preferences, hypotheses=60, starts=3)
+HYPOTHESES = 60
+
+
+@pytest.fixture(autouse=True)
+def few_pairs(monkeypatch):
+    """Few pairs of frames are enough here."""
+    monkeypatch.setattr(residual_kernel, "KERNEL_PAIRS_PER_GAP", 3)
 
 
 def points(*size: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(*size, 2, generator=draw(seed), dtype=F64) - 0.5
 
 
-def kernel_of(scene, searched=None, options=FEW, seed: int = 0):
+def kernel_of(scene, searched=None, seed: int = 0):
     everything = torch.arange(len(scene.labels)) if searched is None else searched
-    return preference_kernel(scene.film(), everything, draw(seed), OPTIONS.frames, options)
+    return preference_kernel(scene.film(), everything, draw(seed), HYPOTHESES)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -128,11 +135,12 @@ def twins(frames: int):
     return replace(scene, tracks=torch.cat([scene.tracks, copy], 1), labels=torch.cat([scene.labels, scene.labels[:1]]))
 
 
-def test_a_track_has_most_in_common_with_one_beside_it():
-    kernel = kernel_of(twins(frames=2), options=replace(FEW, gaps=(1,)))
+def test_a_track_has_most_in_common_with_one_beside_it(monkeypatch):
+    monkeypatch.setattr(residual_kernel, "KERNEL_GAPS", (1,))
+    kernel = kernel_of(twins(frames=2))
     assert float(kernel[0, 32]) > 0.5 and int(kernel[0].argmax()) == 32
     # one pair of frames: the share of preferences is a multiple of 1 / (3 h)
-    few = 3 * round(FEW.preferred * FEW.hypotheses)
+    few = 3 * round(residual_kernel.PREFERRED_SHARE * HYPOTHESES)
     torch.testing.assert_close(kernel * few, (kernel * few).round(), rtol=0, atol=1e-3)
 
 
@@ -148,7 +156,7 @@ def test_tracks_that_never_meet_have_nothing_in_common():
     tracks[4:, :25] = torch.nan
     tracks[:4, 25:] = torch.nan
     apart = replace(scene, tracks=tracks)
-    assert pairs_near(apart.film(), FEW.gaps, FEW.starts, FEW.common)
+    assert pairs_near(apart.film(), residual_kernel.KERNEL_GAPS, 3, residual_kernel.MIN_KERNEL_TRACKS)
     kernel = kernel_of(apart)
     assert bool((kernel[:25, 25:] == 0).all()) and bool((kernel[25:, :25] == 0).all())
     assert bool(kernel.isfinite().all()) and float(kernel[:25, :25].sum()) > 0 and float(kernel[25:, 25:].sum()) > 0

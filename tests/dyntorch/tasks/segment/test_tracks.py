@@ -12,17 +12,22 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.segment_tracks.result import TrackNotice
+from dyntorch.tasks.segment import frame_pairs, residual_kernel
+from dyntorch.tasks.segment import tracks as module
+from dyntorch.tasks.segment.result import TrackNotice
 from tests.battery.pretend_device import pretend_device
-from tests.dyntorch.tasks.segment_tracks.films import F64, OPTIONS, Shot, draw, shot
+from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
 
-QUICK = replace(
-    OPTIONS,
-    frames=replace(OPTIONS.frames, least=6, most=8),
-    preferences=replace(OPTIONS.preferences, hypotheses=100, starts=5),
-    merge=replace(OPTIONS.merge, pieces=(8,), starts=4),
-)
-"""Fewer pairs of frames, fewer hypotheses, and one start: enough for a hundred tracks."""
+QUICK = dyn.TrackSegmentOptions(max_frame_pairs=8, num_hypotheses=100)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Fewer pairs of frames, fewer hypotheses, and one start: enough for a hundred tracks."""
+    monkeypatch.setattr(frame_pairs, "MIN_FRAME_PAIRS", 6)
+    monkeypatch.setattr(residual_kernel, "KERNEL_PAIRS_PER_GAP", 5)
+    monkeypatch.setattr(module, "PIECE_COUNTS", (8,))
+    monkeypatch.setattr(module, "MERGE_PAIRS_PER_GAP", 4)
 
 
 def segmented(tracks, bodies=None, seed: int = 9, **given):
@@ -117,7 +122,7 @@ def test_tracks_that_follow_nothing_are_outliers():
 @pytest.mark.slow
 def test_tracks_that_are_not_searched_follow():
     scene = shot((70, 50), seed=4)
-    few = replace(QUICK, preferences=replace(QUICK.preferences, searched=60))
+    few = replace(QUICK, max_searched=60)
     found = segmented(scene.tracks, 2, options=few)
     assert wrong(found, scene.labels) <= 0.05
     assert bool((found.labels > 0).all())
@@ -392,3 +397,25 @@ def test_random_tracks_are_no_bodies(count, frames):
     found = dyn.segment_tracks(tracks, generator=draw())
     assert int(found.status) == Status.NO_CONSENSUS and not found.labels.any()
     assert "by itself" in found.reason
+
+
+@pytest.mark.slow
+def test_options_decide():
+    scene = shot((45, 25, 20), seed=2)
+    assert int(segmented(scene.tracks, options=replace(QUICK, max_bodies=2)).bodies) == 2
+    assert TrackNotice.STILL in codes(segmented(scene.tracks, options=replace(QUICK, min_motion=1e3)))
+    assert len(segmented(scene.tracks, 3, options=replace(QUICK, max_frame_pairs=6)).pairs) == 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_the_default_dtype_decides_nothing(dtype):
+    tracks = shot((45, 25)).tracks.to(dtype)
+    known = segmented(tracks, 2)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(F64)
+    try:
+        found = segmented(tracks, 2)
+    finally:
+        torch.set_default_dtype(before)
+    same(found, known, rtol=0, atol=0)

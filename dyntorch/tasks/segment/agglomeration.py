@@ -10,13 +10,23 @@ import torch
 from sklearn.cluster import spectral_clustering
 from torch import Tensor
 
+from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import null_vector
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.chi_square import median
+from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, Film, Pair
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment_tracks.descent import Candidates
-from dyntorch.tasks.segment_tracks.frames import Film, Pair
-from dyntorch.tasks.segment_tracks.options import FrameOptions, MergeOptions
+from dyntorch.tasks.segment.track_energy import Candidates
+
+FIRST_PIECE_NOISE_PIXELS = 0.15  # of a coordinate at rest
+MIN_PIECE_NOISE_PIXELS = 0.05  # least one that is believed, pixels
+COST_SCALE_FACTOR = 1.5  # scale of the costs over the noise of the pieces
+OWN_COST_FLOOR = 0.4  # added to the cost of a sighting in its own body
+CHANCE_PREFERENCE_SHARE = 0.1  # preferences in common by chance: PREFERRED_SHARE
+PIECE_LINK_WEIGHT = 0.5  # beside what a common motion costs
+NEGLIGIBLE_LINKS = 0.01  # per track of the smaller of two pieces
+MIN_COMMON_MEMBERS = 3  # tracks of a group that a pair of frames must show
+NEVER_COMMON_SEPARATION = 1e3  # of groups that no pair of frames shows together: they merge last
 
 
 def pieces(sparse: Tensor, count: int) -> Tensor:
@@ -42,28 +52,27 @@ class Separation:
     links: Tensor
     met: Tensor
 
-    def value(self, weight: float, options: MergeOptions) -> Tensor:
+    def value(self, weight: float) -> Tensor:
         r"""``(q,)``, large for groups that are surely two bodies: :math:`\log(1 + x / (o + f)) - w \log(l + l_0)`."""
-        value = self.ratio(options) - weight * torch.log(self.links + options.unlinked)
+        value = self.ratio() - weight * torch.log(self.links + NEGLIGIBLE_LINKS)
         # groups that never meet are one body only if others join them
-        return torch.where(self.met, value, options.never)
+        return torch.where(self.met, value, NEVER_COMMON_SEPARATION)
 
-    def ratio(self, options: MergeOptions) -> Tensor:
+    def ratio(self) -> Tensor:
         r"""``(q,)`` what joining costs beside what the groups cost: :math:`\log(1 + x / (o + f))`."""
-        return torch.log1p(self.excess.clamp(min=0) / (self.own.clamp(min=0) + options.floor))
+        return torch.log1p(self.excess.clamp(min=0) / (self.own.clamp(min=0) + OWN_COST_FLOOR))
 
 
 class NearPairs:
     """Linear fits of many groups of tracks between many pairs of near frames at a time."""
 
-    def __init__(self, film: Film, pairs: Sequence[Pair], frames: FrameOptions, options: MergeOptions) -> None:
+    def __init__(self, film: Film, pairs: Sequence[Pair]) -> None:
         """Of pairs of frames ``(p, 2)``."""
-        self.options = options
         first, second = torch.tensor(list(pairs), device=film.x.device).reshape(-1, 2).unbind(-1)
         x1, x2 = film.x[first], film.x[second]
         self.seen = film.seen[first] & film.seen[second]
         moved = (x2 - x1).norm(dim=-1) / film.pixel
-        self.precision = self.seen / (1 + moved / frames.grows) / film.pixel**2
+        self.precision = self.seen / (1 + moved / DOUBLED_VARIANCE_MOTION) / film.pixel**2
         self.first, self.second = homogeneous(x1), homogeneous(x2)
         rows = (self.second[..., :, None] * self.first[..., None, :]).flatten(-2)
         self.rows = rows  # (p, n, 9)
@@ -73,7 +82,7 @@ class NearPairs:
     def squares(self, group: Tensor, scale: float, rounds: int = 2) -> tuple[Tensor, Tensor]:
         """Squared distances in pixels at rest of the tracks of a group ``(n,)`` bool from its motion."""
         index = group.nonzero().flatten()
-        live = (self.seen[:, index].sum(-1) >= self.options.together).nonzero().flatten()
+        live = (self.seen[:, index].sum(-1) >= MIN_COMMON_MEMBERS).nonzero().flatten()
         member = self.seen[live][:, index].double()
         rows = self.rows[live][:, index]
         products = rows[..., self.upper[0]] * rows[..., self.upper[1]]
@@ -102,14 +111,14 @@ class NearPairs:
     def meetings(self, groups: Tensor) -> tuple[Tensor, Tensor]:
         """Tracks of each group ``(g, n)`` that are seen beside others of each group, and their sightings there, ``(g, g)`` both."""
         member, seen = groups.double(), self.seen.double()
-        there = ((seen @ member.mT) >= self.options.together).double()  # (p, g)
+        there = ((seen @ member.mT) >= MIN_COMMON_MEMBERS).double()  # (p, g)
         beside = ((seen.mT @ there) > 0).double()  # (n, g)
         return member @ beside, member @ seen.mT @ there
 
     def cost(self, group: Tensor, scale: float) -> float:
         """Cost of a group ``(n,)`` bool: the squared distances of all sightings over the noise, each at most the cap."""
         square, seen = self.squares(group, scale)
-        return float(((square / scale**2).clamp(max=self.options.cap) * seen).sum())
+        return float(((square / scale**2).clamp(max=MAX_SQUARED_DISTANCE) * seen).sum())
 
 
 @dataclass
@@ -119,17 +128,16 @@ class Judge:
     near: NearPairs  # pairs of frames
     alike: Tensor  # ``(n, n)`` how alike tracks move, beyond chance
     scale: float  # of the costs, pixels at rest
-    options: MergeOptions  # of all stages
     known: dict[bytes, float] = field(default_factory=dict)
 
     @staticmethod
-    def of(near: NearPairs, kernel: Tensor, groups: Tensor, options: MergeOptions) -> Judge:
+    def of(near: NearPairs, kernel: Tensor, groups: Tensor) -> Judge:
         """With the noise of groups ``(g, n)`` bool that are surely pure."""
-        found = [near.squares(group, options.first_scale) for group in groups]
+        found = [near.squares(group, FIRST_PIECE_NOISE_PIXELS) for group in groups]
         own = torch.cat([square[seen] for square, seen in found])
-        noise = (float(own.median()) / median(1)) ** 0.5 if len(own) else options.first_scale
-        alike = (kernel - options.chance).clamp(min=0)
-        return Judge(near, alike, options.widened * max(noise, options.least_scale), options)
+        noise = (float(own.median()) / median(1)) ** 0.5 if len(own) else FIRST_PIECE_NOISE_PIXELS
+        alike = (kernel - CHANCE_PREFERENCE_SHARE).clamp(min=0)
+        return Judge(near, alike, COST_SCALE_FACTOR * max(noise, MIN_PIECE_NOISE_PIXELS))
 
     def cost(self, groups: Tensor) -> Tensor:
         """``(g,)`` of groups ``(g, n)`` bool."""
@@ -167,7 +175,7 @@ def merged(judge: Judge, labels: Tensor, counts: Sequence[int]) -> dict[int, Ten
         if len(groups) <= max(1, min(counts)):
             return found
         pairs = judge.separation(groups)
-        weakest = int(pairs.value(judge.options.links, judge.options).argmin())
+        weakest = int(pairs.value(PIECE_LINK_WEIGHT).argmin())
         one, other = int(pairs.first[weakest]), int(pairs.second[weakest])
         rest = torch.ones(len(groups), dtype=torch.bool, device=groups.device)
         rest[[one, other]] = False
@@ -179,4 +187,4 @@ def weakest_separation(judge: Judge, candidate: Candidates, weight: float) -> fl
     member = one_hot(candidate.labels[0], candidate.bodies) > 0
     if len(member) < 2:
         return float("inf")
-    return float(judge.separation(member).value(weight, judge.options).min())
+    return float(judge.separation(member).value(weight).min())

@@ -10,18 +10,18 @@ import torch
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.metrics import relative_error
+from dyntorch.tasks.segment import labels as module
+from dyntorch.tasks.segment.frame_pairs import Film
+from dyntorch.tasks.segment.labels import agreeing, distances, motions, outliers, resting, widths
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment_tracks.frames import Film
-from dyntorch.tasks.segment_tracks.labels import agreeing, distances, motions, outliers, resting, widths
-from tests.dyntorch.tasks.segment_tracks.films import F64, OPTIONS, Shot, shot
+from tests.dyntorch.tasks.segment.videos import F64, Shot, shot
 
-STATIC, STRAY = OPTIONS.static, OPTIONS.outliers
 PAIRS = ((0, 4), (2, 7), (0, 9))
 
 
 def pairs_of(scene: Shot):
     film = scene.film()
-    return [film.pair(pair, OPTIONS.frames) for pair in PAIRS]
+    return [film.pair(pair) for pair in PAIRS]
 
 
 def members(scene: Shot) -> torch.Tensor:
@@ -36,7 +36,7 @@ def true_geometry(scene: Shot) -> list[torch.Tensor]:
 
 
 def moved(scene: Shot):
-    return motions(pairs_of(scene), true_geometry(scene), members(scene), scene.film(), OPTIONS)
+    return motions(pairs_of(scene), true_geometry(scene), members(scene), scene.film())
 
 
 def test_distances_are_in_pixels_and_missing_where_a_track_is():
@@ -52,7 +52,7 @@ def test_distances_are_in_pixels_and_missing_where_a_track_is():
     torch.testing.assert_close(found[1, 1], known, rtol=1e-6, atol=1e-8)
 
 
-def test_outliers_are_usually_far_from_their_body():
+def test_outliers_are_usually_far_from_their_body(monkeypatch):
     distance = torch.full((3, 2, 6), 0.1, dtype=F64)
     labels = torch.tensor([0, 0, 0, 1, 1, 1])
     distance[:, 0, 0] = torch.tensor([9.0, 9.0, 0.1])  # twice of three
@@ -61,11 +61,11 @@ def test_outliers_are_usually_far_from_their_body():
     distance[:, 1, 3] = torch.tensor([5.0, 5.0, torch.nan])  # where it is known
     distance[:, 1, 4] = torch.nan  # nowhere
     none = torch.zeros(6, dtype=F64)
-    assert outliers(distance, labels, none, STRAY).tolist() == [True, False, False, True, False, False]
+    assert outliers(distance, labels, none).tolist() == [True, False, False, True, False, False]
     full = torch.ones(6, dtype=F64)
-    assert outliers(distance, labels, full, STRAY).tolist() == [True, False, False, False, False, False]
-    severe = replace(STRAY, farthest=0.05)
-    assert outliers(distance, labels, none, severe).tolist() == [True, True, True, True, False, True]
+    assert outliers(distance, labels, full).tolist() == [True, False, False, False, False, False]
+    monkeypatch.setattr(module, "MAX_BODY_DISTANCE_PIXELS", 0.05)
+    assert outliers(distance, labels, none).tolist() == [True, True, True, True, False, True]
 
 
 def test_motions_are_those_of_the_pixels():
@@ -104,14 +104,14 @@ def test_motions_are_zero_where_a_body_has_too_few_tracks():
 
 def test_widths_are_shares_of_the_picture():
     scene = shot((60, 40))
-    found = widths(scene.film(), members(scene), STATIC)
+    found = widths(scene.film(), members(scene))
     assert found.shape == (2,) and bool((found > 0).all()) and bool((found <= 1).all())
     assert float(found[0]) > 2 * float(found[1])
     everything = torch.ones(1, 100, dtype=F64)
-    assert float(widths(scene.film(), everything, STATIC)) == pytest.approx(1.0)
+    assert float(widths(scene.film(), everything)) == pytest.approx(1.0)
     # frames that show nothing do not count
     empty = torch.cat([scene.tracks, torch.full_like(scene.tracks[:3], torch.nan)])
-    torch.testing.assert_close(widths(Film.of(empty, 2.5), members(scene), STATIC), found)
+    torch.testing.assert_close(widths(Film.of(empty, 2.5), members(scene)), found)
 
 
 @pytest.mark.parametrize(
@@ -121,13 +121,14 @@ def test_widths_are_shares_of_the_picture():
 )
 def test_what_rests_is_the_largest_and_widest(counts, rests):
     scene = shot(counts)
-    assert resting(scene.film(), members(scene), STATIC) == rests
+    assert resting(scene.film(), members(scene)) == rests
 
 
-def test_what_rests_has_a_share_of_all():
+def test_what_rests_has_a_share_of_all(monkeypatch):
     scene = shot((40, 20, 20, 20))
-    assert resting(scene.film(), members(scene), replace(STATIC, share=0.5)) is None
-    assert resting(scene.film(), members(scene), replace(STATIC, share=0.3)) == 0
+    for share, known in ((0.5, None), (0.3, 0)):
+        monkeypatch.setattr(module, "MIN_STATIC_SHARE", share)
+        assert resting(scene.film(), members(scene)) == known
 
 
 def test_declared_cameras_agree_with_what_rests():
