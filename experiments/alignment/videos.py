@@ -27,13 +27,13 @@ from dyntorch import metrics
 from experiments.common.tables import Row, command, measured_on_one_thread, note
 from experiments.recognition.protocol import data_folder
 from indexing.actors.sheets import RenderedVideo, render, sheet
-from indexing.video import Chunk, SceneOptions, SceneTracks, track_scene
+from indexing.video import Chunk, SceneTracks, track_scene
+from indexing.video.scene import SCENE_FOLLOWING, THRESHOLD
 
 Floats = NDArray[np.float64]
 SIZE = (480, 360)
 CAMERA = np.array([[450.0, 0, 239.5], [0, 450.0, 179.5], [0, 0, 1]])
 FPS = 25.0
-THRESHOLD = SceneOptions().threshold
 RECORDED = ("pose2sim/cam01.mp4", "pose2sim/cam02.mp4")
 
 
@@ -222,7 +222,7 @@ def recordings(config: Config) -> list[Row]:
     rows = []
     for name in RECORDED:
         tracks = track_scene(data_folder() / name, views=3)
-        shrunk = max(1.0, max(tracks.size) / SceneOptions().follow.working)
+        shrunk = max(1.0, max(tracks.size) / SCENE_FOLLOWING.working_side)
         found = dyn.align_planar(*tracks.points, threshold=shrunk * THRESHOLD, generator=torch.Generator().manual_seed(0))
         still = torch.eye(3, dtype=torch.float64)
         size = (float(tracks.size[0]), float(tracks.size[1]))

@@ -20,10 +20,8 @@ from indexing.readers.pairs import MatchedPair, Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.page import table_csv
 from indexing.sync.calibration import read_calibration
-from indexing.video.options import SceneOptions
-from indexing.video.scene import SceneTracks, track_scene
+from indexing.video.scene import RECONSTRUCTION_FRAMES, SceneTrackOptions, SceneTracks, track_scene, track_whole
 from indexing.video.sequence import PictureSequence, in_order, is_pattern, pictures_of
-from indexing.video.whole import track_whole
 
 PICTURE_FILES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 LEFT_OUT = "it is for a video or a sequence of pictures"
@@ -121,7 +119,7 @@ def follow(
     source = source_of(paths)
     if fps is None:
         _check_moments(paths, source, asked)
-    few = None if numbers or moments or asked.every else views or SceneOptions().several
+    few = None if numbers or moments or asked.every else views or RECONSTRUCTION_FRAMES
     return track_scene(source, frames=numbers, at=moments, every=asked.every, views=few, missing=missing, fps=fps)
 
 
@@ -139,7 +137,7 @@ def follow_whole(paths: Sequence[Path], asked: Asked) -> SceneTracks:
 
 def _spanned(first: int, last: int) -> list[int]:
     """Frames from the first to the last, of many every so many, as of a whole video."""
-    return list(range(first, last + 1, -(-(last + 1 - first) // SceneOptions().most)))
+    return list(range(first, last + 1, -(-(last + 1 - first) // SceneTrackOptions().max_frames)))
 
 
 def source_of(paths: Sequence[Path]) -> Any:

@@ -9,12 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.colmap.database import DatabaseImage, DatabasePair, MatchDatabase, PairGeometry
-from indexing.colmap.options import DivideOptions, KeepOptions
 from indexing.opening import clipped, error
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 INSTALL = "install it with pip install 'dyntorch[colmap]'"
+
+NUM_NEIGHBOURS = 5  # divided matches nearest in both images whose majority another match joins
+MIN_VERIFIED_MATCHES = 15  # of a pair: COLMAP's mapper leaves out pairs of fewer
+VERIFICATION_DISTANCE = 4.0  # pixels, of COLMAP's verification: COLMAP's default
+
+
+@dataclass(frozen=True)
+class StaticOptions:
+    """Options of :func:`indexing.colmap.find_static`: how long a pair may take, and what is too little."""
+
+    min_matches: int = 16
+    """Matches of a pair below which it is not divided: two bodies of eight.  Votes of other pairs decide about it."""
+    max_matches: int = 1500
+    """Matches of a pair that are divided, drawn at random; the others join the bodies of those beside them.  Bounds the time of a
+    pair to about a second."""
+    pairs_per_image: int = 30
+    """Pairs of an image, those with most matches, that are divided; the votes decide about its others."""
+    min_static_points: int = 15
+    """Static keypoints below which an image is refused by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +94,16 @@ def _seen(database: MatchDatabase, image: DatabaseImage) -> SeenImage:
     return SeenImage(camera, straight)
 
 
-def chosen(database: MatchDatabase, options: DivideOptions) -> list[int]:
+def chosen(database: MatchDatabase, options: StaticOptions) -> list[int]:
     """The pairs to divide: of each image those with most matches; places in the list of pairs."""
     order = sorted(range(len(database.pairs)), key=lambda place: -len(database.pairs[place].matches))
     taken, used = [], [0] * len(database.images)
     for place in order:
         pair = database.pairs[place]
-        if len(pair.matches) < options.least:
+        if len(pair.matches) < options.min_matches:
             break
         # a pair is left out only where both of its images have their share
-        if min(used[pair.first], used[pair.second]) < options.per_image:
+        if min(used[pair.first], used[pair.second]) < options.pairs_per_image:
             taken.append(place)
             used[pair.first] += 1
             used[pair.second] += 1
@@ -112,13 +130,13 @@ class PairTask:
 
 
 def task(
-    pair: DatabasePair, images: list[SeenImage], threshold: float | None, spatial: bool, seed: int, options: DivideOptions
+    pair: DatabasePair, images: list[SeenImage], threshold: float | None, spatial: bool, seed: int, options: StaticOptions
 ) -> PairTask:
     """What is to be done about a pair; its random numbers are its own, so that no pair depends on which others there are."""
     x1, x2 = images[pair.first].points[pair.matches[:, 0]], images[pair.second].points[pair.matches[:, 1]]
     draw = np.random.default_rng([seed, pair.first, pair.second])
-    rows = np.sort(draw.permutation(len(x1))[: options.most])
-    return PairTask(x1, x2, rows, threshold, spatial, int(draw.integers(2**31)), options.beside)
+    rows = np.sort(draw.permutation(len(x1))[: options.max_matches])
+    return PairTask(x1, x2, rows, threshold, spatial, int(draw.integers(2**31)), NUM_NEIGHBOURS)
 
 
 def divide(task: PairTask) -> PairBodies:
@@ -158,24 +176,22 @@ def _joined(task: PairTask, labels: IntArray, distances: FloatArray, threshold: 
     return labels
 
 
-def verified(
-    database: MatchDatabase, pair: DatabasePair, matches: IntArray, images: list[SeenImage], seed: int, options: KeepOptions
-) -> PairGeometry:
+def verified(database: MatchDatabase, pair: DatabasePair, matches: IntArray, images: list[SeenImage], seed: int) -> PairGeometry:
     """What COLMAP's own estimation makes of some matches of a pair, as its matchers would have written it."""
     module = colmap()
     settings = module.TwoViewGeometryOptions()
-    settings.min_num_inliers = options.least
-    settings.ransac.max_error = options.distance
+    settings.min_num_inliers = MIN_VERIFIED_MATCHES
+    settings.ransac.max_error = VERIFICATION_DISTANCE
     settings.ransac.random_seed = seed
     none = PairGeometry(int(module.TwoViewGeometryConfiguration.DEGENERATE), np.zeros((0, 2), dtype=np.int64))
-    if len(matches) < options.least:
+    if len(matches) < MIN_VERIFIED_MATCHES:
         return none
     first, second = database.images[pair.first], database.images[pair.second]
     found = module.estimate_two_view_geometry(
         images[pair.first].camera, first.points, images[pair.second].camera, second.points, matches.astype(np.uint32), settings
     )
     inliers = np.asarray(found.inlier_matches, dtype=np.int64).reshape(-1, 2)
-    if len(inliers) < options.least:
+    if len(inliers) < MIN_VERIFIED_MATCHES:
         return none
     return PairGeometry(int(found.config), inliers, *(_matrix(getattr(found, name, None)) for name in "FEH"))
 

@@ -12,13 +12,26 @@ from numpy.typing import NDArray
 
 from indexing.archive.workers import InOrder
 from indexing.colmap.database import MatchDatabase, PairGeometry, write_database
-from indexing.colmap.dividing import PairBodies, SeenImage, chosen, divide, left_open, seen, task, verified
-from indexing.colmap.options import SpreadOptions, StaticOptions
-from indexing.colmap.voting import DividedPair, Votes, vote
+from indexing.colmap.dividing import (
+    VERIFICATION_DISTANCE,
+    PairBodies,
+    SeenImage,
+    StaticOptions,
+    chosen,
+    divide,
+    left_open,
+    seen,
+    task,
+    verified,
+)
+from indexing.colmap.voting import GRID_CELLS, DividedPair, Votes, vote
 from indexing.opening import count, listed
 
 IntArray = NDArray[np.int64]
 Told = Callable[[int, int], None]
+
+MIN_PARALLEL_PAIRS = 40  # pairs from which on the command line takes all cores: a process takes as long to start as ten
+MIN_ANSWERED_SHARE = 0.5  # of the images with matches, or else all are refused
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +97,7 @@ def find_static(
     threshold: float | None = 2.5,
     spatial: bool = True,
     seed: int = 0,
-    options: StaticOptions = StaticOptions(),
+    options: StaticOptions | None = None,
     progress: Told | None = None,
     executor: Executor | None = None,
 ) -> StaticPoints:
@@ -99,7 +112,7 @@ def find_static(
         threshold: of :func:`dyntorch.segment`, pixels; None estimates it for each pair.
         spatial: whether bodies are regions of the images.
         seed: of the random samples.
-        options: every number that decides, by stage.
+        options: how much of each pair, and what is too little.
         progress: called with how many pairs are divided, and of how many.
         executor: whoever divides pairs, anything with the interface of ``concurrent.futures``; None does it here.
 
@@ -107,41 +120,38 @@ def find_static(
         ValueError: pycolmap is not installed (``pip install 'dyntorch[colmap]'``), or it does not know a camera.
     """
     images = seen(database)
-    places = chosen(database, options.divide)
+    options = options or StaticOptions()
+    places = chosen(database, options)
     bodies = [left_open(pair) for pair in database.pairs]
-    tasks = (task(database.pairs[place], images, threshold, spatial, seed, options.divide) for place in places)
+    tasks = (task(database.pairs[place], images, threshold, spatial, seed, options) for place in places)
     for done, (place, (_, divided)) in enumerate(zip(places, InOrder(divide, executor)(tasks), strict=True)):
         if isinstance(divided, PairBodies):  # a pair that its workers did not survive is left to the votes
             bodies[place] = divided
         if progress is not None:
             progress(done + 1, len(places))
     starts = np.cumsum([0, *(len(image.points) for image in database.images)])
-    votes = _voted(database, bodies, starts, options)
-    reach = threshold if threshold is not None else options.keep.distance
+    votes = _voted(database, bodies, starts)
+    reach = threshold if threshold is not None else VERIFICATION_DISTANCE
     kept = [_kept(database, place, bodies[place], votes, starts, reach) for place in range(len(database.pairs))]
-    geometries = [
-        verified(database, pair, rows, images, seed, options.keep) for pair, rows in zip(database.pairs, kept, strict=True)
-    ]
+    geometries = [verified(database, pair, rows, images, seed) for pair, rows in zip(database.pairs, kept, strict=True)]
     return _found(database, bodies, votes, kept, geometries, starts, images, options)
 
 
-def _voted(database: MatchDatabase, bodies: list[PairBodies], starts: IntArray, options: StaticOptions) -> Votes:
+def _voted(database: MatchDatabase, bodies: list[PairBodies], starts: IntArray) -> Votes:
     """The votes over the graph of pairs."""
     pairs = [
         DividedPair(starts[pair.first] + pair.matches[:, 0], starts[pair.second] + pair.matches[:, 1], found.labels)
         for pair, found in zip(database.pairs, bodies, strict=True)
     ]
-    cells = np.concatenate(
-        [_cells(image.points, image.camera.width, image.camera.height, options.spread) for image in database.images]
-    )
+    cells = np.concatenate([_cells(image.points, image.camera.width, image.camera.height) for image in database.images])
     image = np.repeat(np.arange(len(database.images)), np.diff(starts))
-    return vote(pairs, cells, image, options.vote, options.spread)
+    return vote(pairs, cells, image)
 
 
-def _cells(points: NDArray[np.float64], width: int, height: int, options: SpreadOptions) -> IntArray:
+def _cells(points: NDArray[np.float64], width: int, height: int) -> IntArray:
     """The cell of the grid that each keypoint is in; those outside of the image are in the nearest."""
-    at = np.floor(points / [width, height] * options.cells).astype(np.int64).clip(0, options.cells - 1)
-    return np.asarray(at[:, 1] * options.cells + at[:, 0])
+    at = np.floor(points / [width, height] * GRID_CELLS).astype(np.int64).clip(0, GRID_CELLS - 1)
+    return np.asarray(at[:, 1] * GRID_CELLS + at[:, 0])
 
 
 def _kept(database: MatchDatabase, place: int, bodies: PairBodies, votes: Votes, starts: IntArray, reach: float) -> IntArray:
@@ -174,11 +184,11 @@ def _found(
         matched |= {pair.first, pair.second}
         held[pair.first].update(found.inliers[:, 0].tolist())
         held[pair.second].update(found.inliers[:, 1].tolist())
-    refused = tuple(sorted(place for place in matched if len(held[place]) < options.keep.points))
+    refused = tuple(sorted(place for place in matched if len(held[place]) < options.min_static_points))
     names = [image.name for image in database.images]
-    few = f"fewer than {options.keep.points} points stand still in {listed(names[place] for place in refused)}"
+    few = f"fewer than {options.min_static_points} points stand still in {listed(names[place] for place in refused)}"
     reason, notes = "", []
-    if len(matched) - len(refused) < max(2, options.keep.images * len(matched)):
+    if len(matched) - len(refused) < max(2, MIN_ANSWERED_SHARE * len(matched)):
         reason = f"{few}, {len(refused)} of {count(len(matched), 'image')}; add images, or matches of what stands still"
         if len(set(refused) & set(votes.open)) > len(refused) / 2:
             where = listed(names[place] for place in votes.open)

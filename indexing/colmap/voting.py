@@ -15,10 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.colmap.options import SpreadOptions, VoteOptions
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+MIN_SHARED_KEYPOINTS = 6  # of a body on which other pairs have voted, from which these decide about the body
+MIN_AGREEMENT = 0.7  # in [-1, 1], of the votes on a body's keypoints from which it is static; below minus this it moves
+SINGLE_BODY_WEIGHT = 0.3  # of the votes of a pair of one body
+NEIGHBOUR_WEIGHT = 0.5  # of the votes of a matched keypoint, of its own ones
+NUM_PASSES = 2  # times that votes are carried along matches: as many pairs away
+MAX_ITERATIONS = 30  # of the exchange between bodies and keypoints
+NUM_SEED_PAIRS = 5  # with most matches whose bodies are tried as the static one: 15 bodies or so
+GRID_CELLS = 8  # columns and rows of the grid on an image in which keypoints are counted
+BORDER_WEIGHT = 0.5  # of the outermost cells, where what is static surrounds what moves
+MIN_SPREAD_RATIO = 1.15  # over the next body, of the static one; ten scenes of which 60 % moves: 3.3 to 9
+DUPLICATE_OVERLAP = 0.5  # share of common static keypoints from which two answers are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,21 +56,21 @@ class Votes:
     open: tuple[int, ...] = ()  # the images of parts in which another body spreads as widely, so that nothing has a sign there
 
 
-def vote(pairs: Sequence[DividedPair], cells: IntArray, image: IntArray, vote: VoteOptions, spread: SpreadOptions) -> Votes:
+def vote(pairs: Sequence[DividedPair], cells: IntArray, image: IntArray) -> Votes:
     """Decide what stands still. cells ``(q,)``, image ``(q,)``."""
-    graph = _Graph(pairs, cells, image, vote, spread)
+    graph = _Graph(pairs, cells, image)
     signs = np.zeros(graph.nodes, dtype=np.int64)
     lead, undecided = np.inf, list[int]()
     tried = np.zeros(len(pairs), dtype=bool)
     while True:
-        seeds = graph.seeds(signs, tried, vote.seeds)
+        seeds = graph.seeds(signs, tried, NUM_SEED_PAIRS)
         if not len(seeds):
             break
         best, ahead = _answer(graph, seeds, signs)
         told = best != signs
         tried[graph.pair[seeds]] = True
         lead = min(lead, ahead)
-        if ahead >= spread.lead:
+        if ahead >= MIN_SPREAD_RATIO:
             signs = best
         else:
             tried[graph.pair[told]] = True
@@ -92,15 +102,13 @@ def _common(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
 class _Graph:
     """Bodies of pairs (nodes) and the keypoints that they hold."""
 
-    def __init__(
-        self, pairs: Sequence[DividedPair], cells: IntArray, image: IntArray, vote: VoteOptions, spread: SpreadOptions
-    ) -> None:
+    def __init__(self, pairs: Sequence[DividedPair], cells: IntArray, image: IntArray) -> None:
         from scipy.sparse import coo_array
 
         bodies = [pair.bodies for pair in pairs]
-        self.nodes, self.options, self.alike = sum(bodies), vote, spread.alike
+        self.nodes, self.alike = sum(bodies), DUPLICATE_OVERLAP
         self.pair = np.repeat(np.arange(len(pairs)), bodies)
-        self.weights = np.repeat([vote.alone if count == 1 else 1.0 for count in bodies], bodies)
+        self.weights = np.repeat([SINGLE_BODY_WEIGHT if count == 1 else 1.0 for count in bodies], bodies)
         ends, nodes, links = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((2, 0), np.int64)]
         for pair, start in zip(pairs, np.cumsum([0, *bodies]).tolist(), strict=False):
             held = pair.labels > 0
@@ -116,20 +124,20 @@ class _Graph:
         self.links = coo_array((np.ones(both.shape[1]), (both[0], both[1])), shape=(len(image), len(image))).tocsr()
         self.image, self.images = image, int(image.max(initial=-1)) + 1
         self.part = self._parts(len(pairs))
-        self._grid(cells, spread)
+        self._grid(cells)
 
-    def _grid(self, cells: IntArray, spread: SpreadOptions) -> None:
+    def _grid(self, cells: IntArray) -> None:
         """Cells of all images, by their weight: those that hold a keypoint of any body; of each image they sum to 1."""
-        many = spread.cells**2
+        many = GRID_CELLS**2
         self.cell = self.image * many + cells
-        row, column = np.divmod(np.arange(many), spread.cells)
-        edge = (np.minimum(row, column) == 0) | (np.maximum(row, column) == spread.cells - 1)
+        row, column = np.divmod(np.arange(many), GRID_CELLS)
+        edge = (np.minimum(row, column) == 0) | (np.maximum(row, column) == GRID_CELLS - 1)
         held = np.zeros(self.images * many)
         held[self.cell[np.unique(self.keypoint)]] = 1
         whole = held.reshape(self.images, many)
         outer = whole * edge
         inner, border = (part / np.maximum(part.sum(axis=1, keepdims=True), 1) for part in (whole, outer))
-        share = np.where(outer.any(axis=1, keepdims=True), spread.border, 0.0)
+        share = np.where(outer.any(axis=1, keepdims=True), BORDER_WEIGHT, 0.0)
         self.worth = (1 - share) * inner + share * border
 
     def spread(self, static: NDArray[np.bool_]) -> FloatArray:
@@ -176,10 +184,10 @@ class _Graph:
 
     def settled(self, signs: IntArray) -> IntArray:
         """Signs of all bodies that keypoints lead to, from those of some."""
-        for _ in range(self.options.turns):
+        for _ in range(MAX_ITERATIONS):
             agreement, known = self.agreement(signs)
-            told = known >= self.options.shared
-            new = np.where(told, np.where(np.abs(agreement) >= self.options.agreed, np.sign(agreement), 0), signs).astype(np.int64)
+            told = known >= MIN_SHARED_KEYPOINTS
+            new = np.where(told, np.where(np.abs(agreement) >= MIN_AGREEMENT, np.sign(agreement), 0), signs).astype(np.int64)
             # beside a static body, one that other pairs know nothing of moves
             beside = np.zeros(int(self.pair.max(initial=-1)) + 1, dtype=bool)
             beside[self.pair[new > 0]] = True
@@ -203,7 +211,7 @@ class _Graph:
     def joined(self, signs: IntArray) -> IntArray:
         """The signs, with the parts of the scene that some pairs take for bodies of their own static again."""
         agreement, known = self.agreement(signs)
-        again = (signs < 0) & (known >= self.options.shared) & (agreement >= self.options.agreed)
+        again = (signs < 0) & (known >= MIN_SHARED_KEYPOINTS) & (agreement >= MIN_AGREEMENT)
         return np.where(again, 1, signs)
 
     def agreement(self, signs: IntArray) -> tuple[FloatArray, IntArray]:
@@ -236,8 +244,8 @@ class _Graph:
         """The same with the votes on the keypoints that a keypoint is matched with."""
         own, total = self._sums(signs)
         mean = own / np.maximum(total, 1e-9)
-        for _ in range(self.options.passes):
+        for _ in range(NUM_PASSES):
             known = (np.abs(mean) > 0).astype(np.float64)
-            votes = own + self.options.neighbours * (self.links @ mean)
-            mean = votes / np.maximum(total + self.options.neighbours * (self.links @ known), 1e-9)
+            votes = own + NEIGHBOUR_WEIGHT * (self.links @ mean)
+            mean = votes / np.maximum(total + NEIGHBOUR_WEIGHT * (self.links @ known), 1e-9)
         return np.asarray(mean)

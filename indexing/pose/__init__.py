@@ -4,7 +4,7 @@ The files are, in the order of the work: :mod:`~indexing.pose.models` (the model
 :mod:`~indexing.pose.networks` (their runtime), :mod:`~indexing.pose.blazepose` (what their numbers mean),
 :mod:`~indexing.pose.regions` (what is cut out of a picture), :mod:`~indexing.pose.tracking` (people from frame to frame),
 :mod:`~indexing.pose.pieces` (long videos), :mod:`~indexing.pose.identities` (who is who), :mod:`~indexing.pose.detection` (the
-verb) and :mod:`~indexing.pose.writing` (keypoint files); :mod:`~indexing.pose.options` has every number that decides.
+verb) and :mod:`~indexing.pose.writing` (keypoint files).
 """
 
 from __future__ import annotations
@@ -14,6 +14,6 @@ from indexing.pose.detection import NobodyInVideo as NobodyInVideo
 from indexing.pose.detection import detect as detect
 from indexing.pose.models import available as available
 from indexing.pose.models import get_models as get_models
-from indexing.pose.options import PoseOptions as PoseOptions
+from indexing.pose.tracking import PoseOptions as PoseOptions
 from indexing.pose.writing import KeypointFile as KeypointFile
 from indexing.pose.writing import keypoint_file as keypoint_file

@@ -17,8 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.pose.options import DetectorOptions, LandmarkOptions
-
 Floats = NDArray[np.floating[Any]]
 
 # ---- the formats of the networks ----
@@ -29,6 +27,10 @@ POINTS = 4  # of a detection: hips, circle about the body, shoulders, circle abo
 LANDMARKS = 39  # 33 joints, two that say where the body is, four of the hands
 JOINTS, HIPS, CIRCLE = 33, 33, 34
 CLIPPED = 100.0  # of logits, before the exponential
+
+DUPLICATE_OVERLAP = 0.3  # of two boxes (intersection over union); MediaPipe's value
+HEATMAP_KERNEL = 7  # cells about a joint whose mean refines its place; MediaPipe's value
+MIN_HEATMAP_PEAK = 0.5  # from which on it does; MediaPipe's value
 
 
 @cache
@@ -59,15 +61,15 @@ class PersonCandidates:
         return len(self.scores)
 
 
-def candidates(raw: Floats, logits: Floats, options: DetectorOptions = DetectorOptions()) -> PersonCandidates:
+def candidates(raw: Floats, logits: Floats, min_score: float = 0.5) -> PersonCandidates:
     """People from the detector's outputs. raw ``(2254, 12)``, logits ``(2254,)``."""
     scores = sigmoid(logits).reshape(-1)
-    chosen = np.flatnonzero(scores >= options.score)
+    chosen = np.flatnonzero(scores >= min_score)
     values = np.asarray(raw, dtype=np.float64)[chosen].reshape(-1, 2 + POINTS, 2) / PICTURE
     centre, size, points = values[:, 0] + anchors()[chosen], values[:, 1], values[:, 2:] + anchors()[chosen][:, None]
     boxes = np.concatenate([centre - size / 2, centre + size / 2], axis=1)
     fine = np.isfinite(values).all(axis=(1, 2)) & (size > 0).all(axis=1)
-    return merged(PersonCandidates(scores[chosen][fine], boxes[fine], points[fine]), options.overlap)
+    return merged(PersonCandidates(scores[chosen][fine], boxes[fine], points[fine]), DUPLICATE_OVERLAP)
 
 
 def merged(found: PersonCandidates, overlap: float) -> PersonCandidates:
@@ -104,25 +106,25 @@ class Landmarks:
     confidence: Floats
 
 
-def landmarks(values: Floats, present: float, heatmap: Floats, options: LandmarkOptions = LandmarkOptions()) -> Landmarks:
+def landmarks(values: Floats, present: float, heatmap: Floats) -> Landmarks:
     """A person from the outputs of the network of landmarks. values ``(39, 5)``, heatmap ``(h, w, 39)``."""
     table = np.asarray(values, dtype=np.float64).reshape(LANDMARKS, -1)
-    places = refined(table[:, :2] / REGION, heatmap, options)
+    places = refined(table[:, :2] / REGION, heatmap)
     return Landmarks(float(present), places, sigmoid(table[:, 3:5]).min(axis=1))
 
 
-def refined(places: Floats, heatmap: Floats, options: LandmarkOptions = LandmarkOptions()) -> Floats:
+def refined(places: Floats, heatmap: Floats) -> Floats:
     """Places moved to the mean of the heatmap's cells about them, where one of these is sure."""
     rows, columns, count = heatmap.shape
     column, row = np.nan_to_num(np.floor(places * [columns, rows]), nan=-1).clip(-1, max(rows, columns)).astype(np.intp).T
-    reach = np.arange(options.kernel) - (options.kernel - 1) // 2
+    reach = np.arange(HEATMAP_KERNEL) - (HEATMAP_KERNEL - 1) // 2
     y, x = (row[:, None] + reach)[:, :, None], (column[:, None] + reach)[:, None, :]
     inside = (y >= 0) & (y < rows) & (x >= 0) & (x < columns)
     cells = heatmap[y.clip(0, rows - 1), x.clip(0, columns - 1), np.arange(count)[:, None, None]]
     sure = np.where(inside, sigmoid(cells), 0.0)
     total = sure.sum(axis=(1, 2))
     use = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    use &= (sure.max(axis=(1, 2)) >= options.sure) & (total > 0)
+    use &= (sure.max(axis=(1, 2)) >= MIN_HEATMAP_PEAK) & (total > 0)
     weight = np.where(use, total, 1.0)
     moved = np.stack([(sure * x).sum(axis=(1, 2)) / weight / columns, (sure * y).sum(axis=(1, 2)) / weight / rows], axis=1)
     return np.asarray(np.where(use[:, None], moved, places))

@@ -25,8 +25,8 @@ from indexing.pose.blazepose import JOINTS, Floats
 from indexing.pose.identities import Indices, Sightings, identities, joined, largest
 from indexing.pose.models import ModelSet, load_models
 from indexing.pose.networks import LiteNetworks, NetworkMaker
-from indexing.pose.options import PoseOptions
 from indexing.pose.pieces import Piece, PieceLost, Stopped, Store, VideoPlan, plan, work
+from indexing.pose.tracking import PoseOptions
 from indexing.readers.recording import MIN_CROWDED_SHARE, NobodySeen
 from indexing.skeleton import BLAZEPOSE33
 from indexing.video.reading import av, cv2
@@ -35,7 +35,6 @@ ModelName = Literal["heavy", "full", "lite"]
 Progress = Callable[[float], None]
 FrameProgress = Callable[[int, int], None]
 """Called with the frames that are done, and how many there are in all."""
-DEFAULT = PoseOptions()
 
 
 class NobodyInVideo(NobodySeen):
@@ -78,7 +77,7 @@ def detect(
     fps: float | None = None,
     workers: int = 1,
     progress: Progress | None = None,
-    options: PoseOptions = PoseOptions(),
+    options: PoseOptions | None = None,
 ) -> ClipSet:
     """Find people in a video and follow their joints, offline; nothing is smoothed and nothing is filled in.
 
@@ -95,7 +94,7 @@ def detect(
         fps: frames per second of a file without timestamps; default 30.
         workers: threads that work on pieces of the video; the result does not depend on their number.
         progress: called with the share done.
-        options: every number that decides; ``dataclasses.replace`` changes some of them.
+        options: chunks, scores and absences.
 
     Returns:
         one :class:`~indexing.Clip` per person, the largest first: ``joints (frames, 33, 2)`` in pixels of the upright picture, from
@@ -117,7 +116,7 @@ def detect(
     """
     check(people, every, workers, fps)
     chosen = load_models(model, models)
-    task = VideoTask(Path(path).expanduser(), people, every, fps, chosen.name, options)
+    task = VideoTask(Path(path).expanduser(), people, every, fps, chosen.name, options or PoseOptions())
     ((_, found),) = run([task], made_by(chosen), workers, as_frames(progress))
     if isinstance(found, ValueError):
         raise found
@@ -146,7 +145,7 @@ class VideoTask:
     every: int
     fps: float | None
     model: str
-    options: PoseOptions = DEFAULT
+    options: PoseOptions = field(default_factory=PoseOptions)
     parts: Path | None = None
 
 
@@ -317,7 +316,7 @@ def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0) -> Detected
     """The people of a video as clips."""
     if not len(seen.at):
         raise NobodyInVideo(task.path, np.arange(len(seen.times)), seen.times, seen.notes)
-    people = identities(seen, task.options.identity)
+    people = identities(seen, task.options.max_absence)
     name = task.path.name
     known = {"size": (task.info.width, task.info.height), "every": task.every, "content": task.content, "made_from": task.made_from}
     if task.people == 1:

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.pose.blazepose import Floats
-from indexing.pose.options import IdentityOptions
 
 Indices = NDArray[np.int64]
+
+MAX_RETURN_RADII = 0.6  # between the joints then and now, in the mean, after no time
+RETURN_SPEED = 1.0  # radii per second by which that grows: a step aside, not a run
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +63,7 @@ class _Stretch:
         return max(_size(self.first), _size(self.last))
 
 
-def identities(seen: Sightings, options: IdentityOptions = IdentityOptions()) -> list[Indices]:
+def identities(seen: Sightings, max_absence: float = 2.0) -> list[Indices]:
     """The sightings of each person, the largest person first."""
     order = np.argsort(seen.tracks, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(seen.tracks[order])) + 1) if len(order) else []
@@ -70,8 +72,8 @@ def identities(seen: Sightings, options: IdentityOptions = IdentityOptions()) ->
     recent: list[list[_Stretch]] = []  # those of them who may return; an hour has thousands of tracks
     for moment, begun in groupby(tracks, key=lambda one: one.begin):
         fresh = list(begun)
-        recent = [owner for owner in recent if moment - owner[-1].end <= options.away]
-        cost = np.array([[_apart(owner[-1], one, options) for one in fresh] for owner in recent]).reshape(-1, len(fresh))
+        recent = [owner for owner in recent if moment - owner[-1].end <= max_absence]
+        cost = np.array([[_apart(owner[-1], one, max_absence) for one in fresh] for owner in recent]).reshape(-1, len(fresh))
         taken = set()
         while cost.size and cost.min() <= 1:
             i, j = (int(k) for k in np.unravel_index(int(np.argmin(cost)), cost.shape))
@@ -101,13 +103,13 @@ def _stretch(seen: Sightings, rows: Indices) -> _Stretch:
     return _Stretch(rows, float(times[0]), float(times[-1]), seen.joints[rows[0]], seen.joints[rows[-1]])
 
 
-def _apart(old: _Stretch, new: _Stretch, options: IdentityOptions) -> float:
+def _apart(old: _Stretch, new: _Stretch, max_absence: float) -> float:
     """How far somebody is from where somebody was, in what is allowed; infinite where they cannot be the same."""
     gap = new.begin - old.end
-    if not 0 < gap <= options.away:
+    if not 0 < gap <= max_absence:
         return np.inf
     size = max(_size(old.last), _size(new.first)) / 2
-    allowed = size * (options.reach + options.speed * gap)
+    allowed = size * (MAX_RETURN_RADII + RETURN_SPEED * gap)
     far = float(np.linalg.norm(old.last - new.first, axis=1).mean())
     return far / allowed if allowed > 0 else np.inf
 

@@ -25,9 +25,8 @@ from indexing.opening import error, opened, size_of
 from indexing.pose.blazepose import JOINTS, Floats
 from indexing.pose.identities import Sightings
 from indexing.pose.networks import Networks
-from indexing.pose.options import PieceOptions, PoseOptions
 from indexing.pose.regions import VideoPicture
-from indexing.pose.tracking import Sighting, Tracker
+from indexing.pose.tracking import PoseOptions, Sighting, Tracker
 from indexing.readers.npz import NumpyArchive
 from indexing.video.reading import Video, VideoInfo, frame_times
 
@@ -76,7 +75,7 @@ def plan(path: Path, people: int, every: int, fps: float | None, model: str, opt
     numbers = np.flatnonzero(times >= 0)
     wanted = numbers[::every] if len(numbers) else np.arange(len(times))[::every]
     # where the file has no times there is no way to go to one
-    cuts = cut(times[wanted], options.pieces) if info.timed else [(0, 0, len(wanted))]
+    cuts = cut(times[wanted], options) if info.timed else [(0, 0, len(wanted))]
     pieces = tuple(Piece(number, wanted[a:b], wanted[lead:a]) for number, (lead, a, b) in enumerate(cuts))
     content = content_of(path)
     about = (VERSION, content, model, people, every, fps, options)
@@ -84,13 +83,13 @@ def plan(path: Path, people: int, every: int, fps: float | None, model: str, opt
     return VideoPlan(path, info, fps, times, people, every, model, pieces, options, content, made_from)
 
 
-def cut(times: Floats, options: PieceOptions = PieceOptions()) -> list[tuple[int, int, int]]:
+def cut(times: Floats, options: PoseOptions) -> list[tuple[int, int, int]]:
     """Where each piece's lead begins, where it begins, and where it ends."""
     if not len(times):
         return []
-    number = np.floor((times - times[0]) / options.seconds + 1e-9).astype(np.int64)
+    number = np.floor((times - times[0]) / options.chunk_seconds + 1e-9).astype(np.int64)
     starts = np.flatnonzero(np.diff(number, prepend=-1))
-    leads = np.searchsorted(times, times[starts] - options.lead - 1e-9)
+    leads = np.searchsorted(times, times[starts] - options.lead_seconds - 1e-9)
     ends = np.append(starts[1:], len(times))
     return [(int(a), int(b), int(c)) for a, b, c in zip(leads, starts, ends, strict=True)]
 

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.pose.blazepose import CIRCLE, HIPS, Floats, Landmarks, PersonCandidates
-from indexing.pose.options import FollowOptions
 from indexing.video.reading import Orientation, cv2, orientation
 
 Image = NDArray[np.uint8]
+
+MIN_REGION_SIDE = 12.0  # pixels in which nothing can be seen any more
+MAX_REGION_SIDE = 4.0  # longest sides of the picture
 
 
 @dataclass(frozen=True)
@@ -38,13 +40,13 @@ class Region:
         """The region elsewhere."""
         return Region(self.x + dx, self.y + dy, self.side, self.turn)
 
-    def usable(self, width: int, height: int, options: FollowOptions = FollowOptions()) -> bool:
+    def usable(self, width: int, height: int) -> bool:
         """Whether anything can be seen in it: neither tiny nor huge, and its centre not far outside of the picture."""
         if not all(map(math.isfinite, (self.x, self.y, self.side, self.turn))):
             return False
         reach = self.side / 2
         near = -reach < self.x < width + reach and -reach < self.y < height + reach
-        return near and options.smallest <= self.side <= options.largest * max(width, height)
+        return near and MIN_REGION_SIDE <= self.side <= MAX_REGION_SIDE * max(width, height)
 
 
 def about(centre: Floats, circle: Floats, expand: float) -> Region:

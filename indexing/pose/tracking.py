@@ -11,14 +11,49 @@ Nothing is smoothed, and nothing is filled in: a frame shows what the network sa
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from indexing.pose.blazepose import JOINTS, PICTURE, REGION, Floats, Landmarks, candidates, landmarks
 from indexing.pose.networks import Networks
-from indexing.pose.options import PoseOptions
 from indexing.pose.regions import Region, VideoPicture, of_candidates, of_landmarks
+
+MAX_CANDIDATES = 12  # people of one picture that are looked at, the largest first
+MIN_PRESENCE = 0.5  # probability that the region shows somebody who is followed; MediaPipe's value
+MIN_NEW_PRESENCE = 0.9  # the same for somebody new, at every look: of 30 regions without a person three had more
+REGION_SCALE = 1.25  # side in diameters of the circle about the hips that holds the body; MediaPipe's value
+NUM_LOOKS = 2  # at a new person, each from the region of the look before: the detector's regions are rough
+CLOSER_SEARCH_SECONDS = 2.0  # between searches in enlarged parts, which take some 20 looks
+MIN_SIZE_RATIO = 1.5  # of somebody new to the smallest of those followed, to take that place
+SAME_PLACE_RADII = 0.5  # between hips: a detection of somebody who is followed already
+DUPLICATE_RADII = 0.3  # between joints, in the mean: two tracks on one person
+STATIC_RADII = 0.1  # per frame, up to which a region stays: motion that small is noise
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """Options of :func:`indexing.pose.detect`."""
+
+    chunk_seconds: float = 30.0
+    """Seconds of a chunk of a long video: what an interruption costs at most, and a worker's share.  Short ones cost decoding, as
+    each begins at a key frame before it: with key frames 8 s apart, one of 30 s costs 13 % more."""
+    lead_seconds: float = 0.25
+    """Seconds before a chunk that are looked at, too, and not kept, so that its first regions come from landmarks."""
+    min_score: float = 0.5
+    """Of the detector for a person in the picture; MediaPipe's value."""
+    min_closer_score: float = 0.65
+    """The same in enlarged parts: there parts of people and of furniture get up to .74, people whom it sees whole .7 and more."""
+    zooms: tuple[int, ...] = (1, 2, 3)
+    """The detector looks at the picture, and where that is not enough, at overlapping squares of one part in so many of its longer
+    side."""
+    farther_zooms: tuple[int, ...] = (5,)
+    """The same where nobody is found by these.  People of 140 pixels in a picture of 1920: in .69 of the frames without it, in .95
+    with it; of 100 pixels, in none and in .83."""
+    search_seconds: float = 0.5
+    """Seconds after which the detector looks for further people, or for a larger one."""
+    max_absence: float = 2.0
+    """Seconds within which somebody who is lost and found is the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +113,7 @@ class Tracker:
         step = time - one.time
         dx, dy = one.speed[0] * step, one.speed[1] * step
         reach = self._radius(one.region)
-        return one.region.moved(dx, dy) if self.options.follow.still * reach < math.hypot(dx, dy) < reach else one.region
+        return one.region.moved(dx, dy) if STATIC_RADII * reach < math.hypot(dx, dy) < reach else one.region
 
     def _update(self, one: _Followed, picture: VideoPicture, region: Region, time: float) -> bool:
         """Look for somebody in a region; whether anybody is there."""
@@ -99,14 +134,13 @@ class Tracker:
 
     def _look(self, picture: VideoPicture, region: Region) -> tuple[Landmarks, Region] | None:
         """What a region shows and the next region; None where nobody is in it."""
-        if not region.usable(picture.width, picture.height, self.options.follow):
+        if not region.usable(picture.width, picture.height):
             return None
-        options = self.options.landmarks
-        seen = landmarks(*self.networks.landmarks(picture.cut(region, REGION)), options)
-        if not (seen.present >= options.present and np.isfinite(seen.places).all()):
+        seen = landmarks(*self.networks.landmarks(picture.cut(region, REGION)))
+        if not (seen.present >= MIN_PRESENCE and np.isfinite(seen.places).all()):
             return None
-        following = of_landmarks(seen, region, options.expand)
-        return (seen, following) if following.usable(picture.width, picture.height, self.options.follow) else None
+        following = of_landmarks(seen, region, REGION_SCALE)
+        return (seen, following) if following.usable(picture.width, picture.height) else None
 
     def _apart(self, people: list[_Followed]) -> list[_Followed]:
         """Without those who sit on somebody else: the one that leapt farther goes, of equals the later one."""
@@ -114,29 +148,29 @@ class Tracker:
         for i, one in enumerate(people):
             for other in people[i + 1 :]:
                 if one.number not in gone and other.number not in gone and self._alike(one, other):
-                    gone.add(one.number if one.leap > other.leap + self.options.follow.alike else other.number)
+                    gone.add(one.number if one.leap > other.leap + DUPLICATE_RADII else other.number)
         return [one for one in people if one.number not in gone]
 
     def _alike(self, one: _Followed, other: _Followed) -> bool:
         apart = float(np.linalg.norm(one.joints - other.joints, axis=1).mean())
-        return apart < self.options.follow.alike * max(self._radius(one.region), self._radius(other.region))
+        return apart < DUPLICATE_RADII * max(self._radius(one.region), self._radius(other.region))
 
     def _radius(self, region: Region) -> float:
-        return region.side / (2 * self.options.landmarks.expand)
+        return region.side / (2 * REGION_SCALE)
 
     # ---- who is new ----
     def _due(self, before: int, time: float) -> bool:
         """Whether the detector should look: somebody was just lost, nobody is there, or it has not looked for long."""
         if not self._followed or len(self._followed) < before:
             return True
-        return time - self._searched >= self.options.follow.search
+        return time - self._searched >= self.options.search_seconds
 
     def _search(self, picture: VideoPicture, time: float) -> None:
         """Look at the whole picture, and closer where nobody is found there, or from time to time where some are still wanted."""
-        wait = self.options.follow.search_closer if self._followed and self.people > 1 else self.options.follow.search
+        wait = CLOSER_SEARCH_SECONDS if self._followed and self.people > 1 else self.options.search_seconds
         closer = time - self._looked_closer >= wait
         self._searched = time
-        shrinks, farther = self.options.detector.shrinks, self.options.detector.farther
+        shrinks, farther = self.options.zooms, self.options.farther_zooms
         for shrink in (*shrinks, *farther):
             if shrink > 1:
                 if self._followed and shrink in farther:
@@ -156,18 +190,17 @@ class Tracker:
         smallest = min(self._followed, key=lambda one: one.region.side, default=None)
         if not full:
             self._begin(picture, region, time, None)
-        elif smallest is not None and region.side >= self.options.follow.larger * smallest.region.side:
+        elif smallest is not None and region.side >= MIN_SIZE_RATIO * smallest.region.side:
             self._begin(picture, region, time, smallest)
 
     def _detect(self, picture: VideoPicture, shrink: int) -> list[Region]:
         """Regions about the people whom the detector sees, the largest first."""
-        options = self.options.detector
-        least = options.score if shrink == 1 else options.closer_score
+        least = self.options.min_score if shrink == 1 else self.options.min_closer_score
         found: list[Region] = []
         for window in windows(picture.width, picture.height, max(picture.width, picture.height) / shrink):
-            seen = candidates(*self.networks.detector(picture.cut(window, PICTURE, fill=True)), replace(options, score=least))
-            found += of_candidates(seen, window, self.options.landmarks.expand)
-        return self._distinct(found)[: options.most]
+            seen = candidates(*self.networks.detector(picture.cut(window, PICTURE, fill=True)), least)
+            found += of_candidates(seen, window, REGION_SCALE)
+        return self._distinct(found)[:MAX_CANDIDATES]
 
     def _distinct(self, regions: list[Region]) -> list[Region]:
         """The largest first, and each person once, though windows overlap."""
@@ -181,15 +214,15 @@ class Tracker:
         return any(self._same_place(region, one.region) for one in self._followed)
 
     def _same_place(self, a: Region, b: Region) -> bool:
-        return math.hypot(a.x - b.x, a.y - b.y) < self.options.follow.place * max(self._radius(a), self._radius(b))
+        return math.hypot(a.x - b.x, a.y - b.y) < SAME_PLACE_RADII * max(self._radius(a), self._radius(b))
 
     def _begin(self, picture: VideoPicture, region: Region, time: float, instead: _Followed | None) -> None:
         """Follow somebody new, if the region shows a person who is not followed already."""
         seen: Landmarks | None = None
         used = following = region
-        for _ in range(self.options.landmarks.looks):
+        for _ in range(NUM_LOOKS):
             found = self._look(picture, following)
-            if found is None or found[0].present < self.options.landmarks.new:
+            if found is None or found[0].present < MIN_NEW_PRESENCE:
                 return
             used, (seen, following) = following, found
         if seen is None:

@@ -33,8 +33,8 @@ from indexing.pose.detection import (
 from indexing.pose.identities import Indices
 from indexing.pose.models import load_models
 from indexing.pose.networks import NetworkMaker
-from indexing.pose.options import PoseOptions
 from indexing.pose.pieces import clear, content_of, nearest, plan
+from indexing.pose.tracking import PoseOptions
 from indexing.readers.formats.clipset import read_clip_set
 from indexing.readers.npz import NumpyArchive
 
@@ -76,7 +76,7 @@ def keypoint_file(
     progress: Progress | None = None,
     json: bool = False,
     own: bool = False,
-    options: PoseOptions = PoseOptions(),
+    options: PoseOptions | None = None,
 ) -> KeypointFile:
     """The keypoints of a video from a folder, made where they are not there yet.
 
@@ -96,7 +96,7 @@ def keypoint_file(
     """
     check(people, every, workers, fps)
     chosen = load_models(model, models)
-    task = VideoTask(Path(video).expanduser(), people, every, fps, chosen.name, options)
+    task = VideoTask(Path(video).expanduser(), people, every, fps, chosen.name, options or PoseOptions())
     ((_, made),) = keypoint_files([task], Path(folder).expanduser(), made_by(chosen), workers, as_frames(progress), json, own)
     if isinstance(made, ValueError):
         raise made

@@ -11,7 +11,7 @@ from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, pn
 from indexing.report.labelled import colour_of
 from indexing.report.reconstruction_picture import finish, foot, limits
 from indexing.report.segmentation import STRAYS, mark_of
-from indexing.video.whole import spread
+from indexing.video.scene import spread
 
 if TYPE_CHECKING:
     from indexing.report.bodies import BodiesReport

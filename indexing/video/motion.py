@@ -10,8 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dyntorch.numerics import check_options
-from indexing.video.options import CameraMotionOptions
 from indexing.video.reading import Chunk, Source, cv2
 from indexing.video.sequence import chunks
 
@@ -25,12 +23,26 @@ from indexing.video.sequence import chunks
 
 Floats = NDArray[np.float64]
 
+MOTION_WORKING_SIDE = 640  # longest side, pixels, at which a camera's motion is measured
+MOTION_CELLS = (8, 6)  # of the image, the same number of points in each: a textured person does not outvote the background
+POINTS_PER_CELL = 8
+MIN_BACKGROUND_POINTS = 12  # below which nothing is said about the camera
+MOTION_TOLERANCE = 1.5  # pixels of a point from where the camera's motion puts it; KLT's own error is about 0.1
+MODEL_TOLERANCE = 0.5  # pixels, to compare two models
+STATIC_POINT_MOTION = 0.5  # pixels that points stay within where the camera is static
+MIN_STATIC_EXTENT = 0.035  # share x standard deviation / longest side of static points: 20 clips of signing have .09-.21
+MIN_MOTION_SUPPORT = 0.25  # share of points; below, the picture has changed or the background is hidden
+MIN_KEY_SUPPORT = 0.6  # share of a key frame's best support at which a new one is taken
+MAX_KEY_SHIFT = 0.2  # of the width: a key frame this far away overlaps too little
+STATIC_CAMERA_MOTION = 0.002  # of the diagonal: a tripod stays well below, a hand goes beyond within half a second
+MOTION_WINDOW_SECONDS = 0.5  # within which the corners of the picture must move by that
+MAX_UNSEEN_SHARE = 0.1  # of frames without enough background, above which the answer is called unsure
+
 
 class Background:
     """Follows the background through grey frames of one size; :meth:`step` per frame, in order."""
 
-    def __init__(self, options: CameraMotionOptions = CameraMotionOptions()) -> None:
-        self.options = options
+    def __init__(self) -> None:
         self.support, self.cut = 1.0, False
         self._key: NDArray[np.uint8] | None = None  # key frame
         self._points = np.zeros((0, 2))
@@ -49,16 +61,13 @@ class Background:
             if self.support == 0:  # the key frame may have grown old: try the frame before
                 self._renew(previous, self.to_first)
                 motion, self.support = self._match(image)
-            self.cut = self.support == 0 and len(self._points) >= self.options.fewest
+            self.cut = self.support == 0 and len(self._points) >= MIN_BACKGROUND_POINTS
             if self.support == 0:  # nothing known: as if the camera had stood still since
                 self._renew(image, self.to_first)
             else:
                 self._last = motion
                 self._peak = max(self._peak, self.support)
-                if (
-                    self.support < self.options.renew * self._peak
-                    or _shift(motion, image.shape) > self.options.far * image.shape[1]
-                ):
+                if self.support < MIN_KEY_SUPPORT * self._peak or _shift(motion, image.shape) > MAX_KEY_SHIFT * image.shape[1]:
                     self._renew(image, self.to_first)
         self._previous = image
         return self.to_first
@@ -72,12 +81,12 @@ class Background:
     def _renew(self, image: NDArray[np.uint8], to_first: Floats) -> None:
         """Make this frame the key frame."""
         self._key_to_first, self._last, self._peak = to_first, np.eye(3), 0.0
-        self._points = spread(image, options=self.options)
+        self._points = spread(image)
         self._key = image
 
     def _match(self, image: NDArray[np.uint8]) -> tuple[Floats, float]:
         """Motion of the key frame to this frame, and the share of points that agree."""
-        if len(self._points) < self.options.fewest:
+        if len(self._points) < MIN_BACKGROUND_POINTS:
             return self._last, 0.0
         source = self._points.astype(np.float32)
         guess = transform(self._last, self._points).astype(np.float32)
@@ -85,44 +94,40 @@ class Background:
             self._key, image, source, guess, winSize=(21, 21), maxLevel=3, flags=cv2().OPTFLOW_USE_INITIAL_FLOW
         )
         found = found.ravel().astype(bool)
-        if found.sum() < self.options.fewest:
+        if found.sum() < MIN_BACKGROUND_POINTS:
             return self._last, 0.0
-        motion, agree = robust_motion(
-            self._points[found], target[found].astype(np.float64), self._last, max(image.shape), options=self.options
-        )
+        motion, agree = robust_motion(self._points[found], target[found].astype(np.float64), self._last, max(image.shape))
         return motion, agree.sum() / len(source)
 
 
-def robust_motion(
-    source: Floats, target: Floats, guess: Floats, side: float, options: CameraMotionOptions = CameraMotionOptions()
-) -> tuple[Floats, NDArray[np.bool_]]:
+def robust_motion(source: Floats, target: Floats, guess: Floats, side: float) -> tuple[Floats, NDArray[np.bool_]]:
     """That of the points that rest, where these are enough; else the similarity, or the homography, that maps most points.
     source ``(n, 2)``, target ``(n, 2)``, guess ``(3, 3)`` -> ``(3, 3)``."""
-    rests = np.linalg.norm(target - source, axis=1) < options.rest
-    if rests.sum() >= options.fewest and rests.mean() * source[rests].std(0).max() > options.stands * side:
+    rests = np.linalg.norm(target - source, axis=1) < STATIC_POINT_MOTION
+    if rests.sum() >= MIN_BACKGROUND_POINTS and rests.mean() * source[rests].std(0).max() > MIN_STATIC_EXTENT * side:
         return similarity(source[rests], target[rests]), rests
     motion = guess
-    agree = _agree(motion, source, target, options.tolerance)
+    agree = _agree(motion, source, target, MOTION_TOLERANCE)
     if agree.mean() < 0.5:
         found = cv2().estimateAffinePartial2D(
-            source, target, method=cv2().RANSAC, ransacReprojThreshold=options.tolerance, confidence=0.999
+            source, target, method=cv2().RANSAC, ransacReprojThreshold=MOTION_TOLERANCE, confidence=0.999
         )[0]
         if found is not None:
             motion = np.vstack([found, [0.0, 0, 1]])
-            agree = _agree(motion, source, target, options.tolerance)
+            agree = _agree(motion, source, target, MOTION_TOLERANCE)
     for _ in range(3):
-        if agree.sum() < options.fewest:
+        if agree.sum() < MIN_BACKGROUND_POINTS:
             return motion, np.zeros_like(agree)
         motion = similarity(source[agree], target[agree])
-        agree = _agree(motion, source, target, options.tolerance)
+        agree = _agree(motion, source, target, MOTION_TOLERANCE)
     # A pan by an angle is a homography; a similarity is enough for a few pixels, and stays off by less than the tolerance for more.
-    if np.linalg.norm((target - source)[agree].mean(0)) > 2 * options.tolerance and len(source) >= 3 * options.fewest:
-        found = cv2().findHomography(source, target, cv2().RANSAC, options.tolerance)[0]
+    if np.linalg.norm((target - source)[agree].mean(0)) > 2 * MOTION_TOLERANCE and len(source) >= 3 * MIN_BACKGROUND_POINTS:
+        found = cv2().findHomography(source, target, cv2().RANSAC, MOTION_TOLERANCE)[0]
         if found is not None:
-            gain = _agree(found, source, target, options.close).sum() - _agree(motion, source, target, options.close).sum()
+            gain = _agree(found, source, target, MODEL_TOLERANCE).sum() - _agree(motion, source, target, MODEL_TOLERANCE).sum()
             if gain > max(5, 0.05 * len(source)):
-                motion, agree = found, _agree(found, source, target, options.tolerance)
-    return motion, agree & (agree.mean() > options.trusted)
+                motion, agree = found, _agree(found, source, target, MOTION_TOLERANCE)
+    return motion, agree & (agree.mean() > MIN_MOTION_SUPPORT)
 
 
 def similarity(source: Floats, target: Floats) -> Floats:
@@ -146,20 +151,20 @@ def shrinking(scale: tuple[float, float]) -> Floats:
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
 
 
-def spread(image: NDArray[np.uint8], options: CameraMotionOptions = CameraMotionOptions()) -> Floats:
+def spread(image: NDArray[np.uint8]) -> Floats:
     """Corners of an image ``(n, 2)``, the strongest of each cell."""
     height, width = image.shape
     corners = cv2().goodFeaturesToTrack(image, 1500, 0.003, max(3, width / 100), blockSize=5)
     if corners is None:
         return np.zeros((0, 2))
     corners = corners.reshape(-1, 2).astype(np.float64)
-    cells = (corners // [width / options.cells[0], height / options.cells[1]]) @ [1, options.cells[0]]
+    cells = (corners // [width / MOTION_CELLS[0], height / MOTION_CELLS[1]]) @ [1, MOTION_CELLS[0]]
     # corners come strongest first: their rank within the cell
     rank = np.zeros(len(corners), int)
     for cell in np.unique(cells):
         inside = cells == cell
         rank[inside] = np.arange(inside.sum())
-    return np.asarray(corners[rank < options.per_cell])
+    return np.asarray(corners[rank < POINTS_PER_CELL])
 
 
 def _agree(motion: Floats, source: Floats, target: Floats, within: float) -> NDArray[np.bool_]:
@@ -236,9 +241,7 @@ class CameraMotion:
         return transform(self.path if times is None else self.at(times), np.asarray(points, np.float64))
 
 
-def camera_motion(
-    source: str | Path | Source, *, threshold: float | None = None, options: CameraMotionOptions = CameraMotionOptions()
-) -> CameraMotion:
+def camera_motion(source: str | Path | Source, *, threshold: float | None = None) -> CameraMotion:
     """Whether, when and by how much the camera moves, from the background of a video.
 
     Corners spread over the picture are followed from a key frame (KLT) and a similarity, or a homography where that explains
@@ -249,7 +252,6 @@ def camera_motion(
     Args:
         source: a path, or chunks of grey frames.
         threshold: pixels; default: 0.2 % of the diagonal.
-        options: every number that decides.
 
     Returns:
         the motion in pixels of the video as shown (for chunks: of their frames).
@@ -267,9 +269,8 @@ def camera_motion(
         >>> print(camera_motion([Chunk(np.stack(seen), np.arange(30) / 10)]))
         camera moves between 1.5 and 2.9 s by 56 px (pan)
     """
-    check_options(options, CameraMotionOptions)
-    background, builder = Background(options), PathBuilder(options)
-    for chunk in (stream := chunks(source, size=options.working)):
+    background, builder = Background(), PathBuilder()
+    for chunk in (stream := chunks(source, size=MOTION_WORKING_SIDE)):
         for image in chunk.frames:
             builder.add(background, image)
         builder.times.extend(chunk.times.tolist())
@@ -280,8 +281,7 @@ def camera_motion(
 class PathBuilder:
     """Collects the motion of a :class:`Background` frame by frame."""
 
-    def __init__(self, options: CameraMotionOptions = CameraMotionOptions()) -> None:
-        self.options = options
+    def __init__(self) -> None:
         self.times: list[float] = []
         self.path: list[Floats] = []
         self.support: list[float] = []
@@ -307,17 +307,17 @@ class PathBuilder:
         shrink = shrinking(scale)
         path = np.linalg.inv(shrink) @ np.array(self.path) @ shrink
         size = (round(self.shape[1] / scale[0]), round(self.shape[0] / scale[1]))
-        limit = self.options.still * float(np.hypot(*size)) if threshold is None else threshold
+        limit = STATIC_CAMERA_MOTION * float(np.hypot(*size)) if threshold is None else threshold
         corners = _steady(transform(path, _corners(size)).reshape(len(times), -1))
-        moments = _moments(times, corners, limit, self.options)
-        kind = _kind(times, corners, moments, limit, self.options)
+        moments = _moments(times, corners, limit)
+        kind = _kind(times, corners, moments, limit)
         if not moments and _extent(corners) > 3 * limit:
             moments, kind = [Move(times[0], times[-1], _extent(corners))], "drift"
         if not moments:  # what is left is the error of measurement
             path = np.tile(np.eye(3), (len(times), 1, 1))
         span = max(times[-1] - times[0], 1e-9)
         said = list(notes)
-        if (support == 0).mean() > self.options.unseen:
+        if (support == 0).mean() > MAX_UNSEEN_SHARE:
             said.append(f"too little background to tell in {(support == 0).mean():.0%} of the frames: is there texture behind?")
         cuts = tuple(float(times[i]) for i in self.cuts)
         if cuts:
@@ -378,11 +378,11 @@ def _extent(corners: Floats) -> float:
     return float(np.hypot(*np.ptp(corners, axis=0).reshape(4, 2).T).max())
 
 
-def _moments(times: Floats, corners: Floats, limit: float, options: CameraMotionOptions) -> list[Move]:
+def _moments(times: Floats, corners: Floats, limit: float) -> list[Move]:
     """Spans in which the corners move by more than the limit within a window."""
     if len(times) < 3:
         return []
-    reach = max(1, round(options.window / 2 / float(np.median(np.diff(times)))))
+    reach = max(1, round(MOTION_WINDOW_SECONDS / 2 / float(np.median(np.diff(times)))))
     windows = [slice(max(0, i - reach), i + reach + 1) for i in range(len(times))]
     moving = np.array([_extent(corners[window]) > limit for window in windows])
     edges = np.flatnonzero(np.diff(np.r_[0, moving.astype(int), 0]))
@@ -393,18 +393,18 @@ def _moments(times: Floats, corners: Floats, limit: float, options: CameraMotion
             (first if first == 0 else min(first + reach - 1, end - 1)),
             (end - 1 if end == len(times) else max(end - reach, first)),
         )
-        if spans and times[first] - times[spans[-1][1]] < options.window:
+        if spans and times[first] - times[spans[-1][1]] < MOTION_WINDOW_SECONDS:
             first = spans.pop()[0]
         spans.append((first, max(first, last)))
     return [Move(float(times[a]), float(times[b]), _extent(corners[max(0, a - 1) : b + 2])) for a, b in spans]
 
 
-def _kind(times: Floats, corners: Floats, moments: list[Move], limit: float, options: CameraMotionOptions) -> str:
+def _kind(times: Floats, corners: Floats, moments: list[Move], limit: float) -> str:
     """One word for the moments."""
     if not moments:
         return "still"
     if max(m.stop - m.start for m in moments) < 1.0 and len(moments) < 4:
         return "knock"
-    step = max(1, round(options.window / float(np.median(np.diff(times)))))
+    step = max(1, round(MOTION_WINDOW_SECONDS / float(np.median(np.diff(times)))))
     travelled = float(np.linalg.norm(np.diff(corners[::step], axis=0).reshape(-1, 4, 2), axis=2).max(axis=1).sum())
     return "pan" if _extent(corners) > 0.6 * travelled and _extent(corners) > 3 * limit else "handheld"

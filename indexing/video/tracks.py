@@ -11,20 +11,42 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dyntorch.numerics import check_options
 from indexing.video.motion import Background, CameraMotion, Floats, PathBuilder, shrinking, transform, warp
-from indexing.video.options import TrackOptions
 from indexing.video.reading import Chunk, Source, cv2
 from indexing.video.sequence import chunks
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Following single points, and where in the picture there is something to follow.
 
+STATIC_POINT_SHARE = 0.25  # of points on ground where nothing moves now: people who rest and move later
+MIN_TRACK_EXTENT = 3.0  # pixels from which a track may be worth keeping
+MIN_GRAY_CHANGE = 16  # levels over a chunk, after shrinking by four: beyond noise, where something moved
+CHECK_FRAMES = 5  # after which a point must still look like itself
+MIN_CORRELATION = 0.6  # of its surroundings then: a passer-by drags background points along, and there and back agree
+MIN_MOTION = 0.01  # of the diagonal: extent of a track that counts as moving
+MIN_MIDDLE_EXTENT = 0.15  # of that: background dragged along by a passer-by rests for the rest of its life
+
+
+@dataclass(frozen=True)
+class FollowSettings:
+    """How points are followed from frame to frame; pixels are those of the working image."""
+
+    working_side: int = 960  # longest side, pixels: KLT is exact to a tenth of these
+    max_return_error: float = 0.7  # pixels between a point and where following it there and back ends
+    patch: tuple[int, int] = (17, 17)  # surroundings of a point that are followed
+    min_corner: float = 0.01  # of the best corner's strength
+    renewal_frames: int = 10  # after which new points replace lost ones
+    min_separation: int = 90  # one part in so many of the width
+    min_frames: int = 10  # of a track that is worth keeping
+
+
+POINT_FOLLOWING = FollowSettings()
+
 
 class MovingArea:
     """Where something moves within a chunk, for each of its frames: a mask of the frame's size."""
 
-    def __init__(self, chunk: Chunk, path: list[Floats], change: float = TrackOptions.change):
+    def __init__(self, chunk: Chunk, path: list[Floats], change: float = MIN_GRAY_CHANGE):
         height, width = chunk.frames.shape[1:]
         self.shape = (height, width)
         self.shrink = shrinking((0.25, 0.25))
@@ -48,23 +70,25 @@ class MovingArea:
 
 
 def follow(
-    before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32], options: TrackOptions = TrackOptions()
+    before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32], settings: FollowSettings = POINT_FOLLOWING
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where points of one frame are in the next, and which of them can be trusted: following back ends where they came from."""
-    how = {"winSize": options.patch, "maxLevel": 3, "criteria": (3, 20, 0.01)}
+    how = {"winSize": settings.patch, "maxLevel": 3, "criteria": (3, 20, 0.01)}
     ahead, found, _ = cv2().calcOpticalFlowPyrLK(before, after, points, None, **how)
     back, found_back, _ = cv2().calcOpticalFlowPyrLK(after, before, ahead, None, **how)
-    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (np.linalg.norm(back - points, axis=1) < options.back)
+    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (np.linalg.norm(back - points, axis=1) < settings.max_return_error)
     inside = ((ahead >= 2) & (ahead < np.array(after.shape[::-1]) - 2)).all(axis=1)
     return np.asarray(ahead, np.float32), np.asarray(good & inside)
 
 
-def patches(image: NDArray[np.uint8], points: NDArray[np.float32], options: TrackOptions = TrackOptions()) -> NDArray[np.float32]:
+def patches(
+    image: NDArray[np.uint8], points: NDArray[np.float32], settings: FollowSettings = POINT_FOLLOWING
+) -> NDArray[np.float32]:
     """Surroundings of points ``(n, pixels)``, free of mean and of norm 1: their products are correlations."""
     if not len(points):
-        return np.zeros((0, options.patch[0] * options.patch[1]), np.float32)
+        return np.zeros((0, settings.patch[0] * settings.patch[1]), np.float32)
     found = np.stack(
-        [cv2().getRectSubPix(image, options.patch, point, patchType=cv2().CV_32F).ravel() for point in points.tolist()]
+        [cv2().getRectSubPix(image, settings.patch, point, patchType=cv2().CV_32F).ravel() for point in points.tolist()]
     )
     found -= found.mean(1, keepdims=True)
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6), np.float32)
@@ -115,7 +139,6 @@ def track_points(
     keep: int = 40,
     complete: float = 0.7,
     motion: float | None = None,
-    options: TrackOptions = TrackOptions(),
 ) -> Tracks:
     """Follow points that move against the background through a video.
 
@@ -129,7 +152,6 @@ def track_points(
         keep: tracks returned at most.
         complete: least share of the frames in which a track must be there, in [0, 1].
         motion: least extent of a track in pixels (of the middle nine tenths of its positions); default: 1 % of the diagonal.
-        options: every number that decides besides these.
 
     Returns:
         the tracks; none of them (``n = 0``), and a note, where nothing that moves could be followed long enough.
@@ -150,17 +172,16 @@ def track_points(
         >>> (tracks.points[-1] - tracks.points[0]).median(0).values.round().tolist()
         [57.0, 0.0]
     """
-    check_options(options, TrackOptions)
     if count < 1 or keep < 1:
         raise ValueError(f"track_points: count and keep must be at least 1, got count={count!r}, keep={keep!r}")
     if not 0 <= complete <= 1:
         raise ValueError(f"track_points: complete is a share of the frames in [0, 1], got {complete!r}")
-    background, path, book = Background(options.camera), PathBuilder(options.camera), _MovingBook(count, options)
+    background, path, book = Background(), PathBuilder(), _MovingBook(count)
     previous: NDArray[np.uint8] | None = None
-    for chunk in (stream := chunks(source, size=options.working)):
+    for chunk in (stream := chunks(source, size=POINT_FOLLOWING.working_side)):
         moved = [path.add(background, image) for image in chunk.frames]
         path.times.extend(chunk.times.tolist())
-        where = MovingArea(chunk, moved, options.change)
+        where = MovingArea(chunk, moved, MIN_GRAY_CHANGE)
         for image, matrix in zip(chunk.frames, moved, strict=True):
             book.look(previous, image, where(matrix), matrix)
             previous = image
@@ -169,8 +190,8 @@ def track_points(
         raise ValueError(f"track_points: the video has {len(path.times)} frame(s); tracks need at least 2")
     scale = getattr(stream, "scale", (1.0, 1.0)) if isinstance(source, (str, Path)) else (1.0, 1.0)
     camera = path.finish(scale, None, getattr(stream, "notes", ()))
-    limit = options.moving * float(np.hypot(*camera.size)) if motion is None else motion
-    points, notes = _select(book, camera, scale, limit, complete, keep, options)
+    limit = MIN_MOTION * float(np.hypot(*camera.size)) if motion is None else motion
+    points, notes = _select(book, camera, scale, limit, complete, keep)
     notes += [*camera.notes, *([f"{camera}; it is taken out"] if camera.moves else [])]
     return Tracks(torch.from_numpy(points), torch.from_numpy(camera.times), camera.size, camera, tuple(notes))
 
@@ -178,30 +199,30 @@ def track_points(
 class Book:
     """Points being followed, and the histories of those that are worth it."""
 
-    def __init__(self, count: int, options: TrackOptions):
-        self.options = options
+    def __init__(self, count: int, settings: FollowSettings):
+        self.settings = settings
         self.count, self.frame = count, -1
         self.alive = np.zeros((0, 2), np.float32)
         self.ids = np.zeros(0, int)
         self.histories: dict[int, tuple[int, list[NDArray[np.float32]]]] = {}  # id -> first frame, positions
         self.done: list[tuple[int, NDArray[np.float32]]] = []
         self.next = 0
-        self.looks = np.zeros((0, self.options.patch[0] * self.options.patch[1]), np.float32)
+        self.looks = np.zeros((0, self.settings.patch[0] * self.settings.patch[1]), np.float32)
 
     def step(self, previous: NDArray[np.uint8] | None, image: NDArray[np.uint8]) -> None:
         """Follow all points into the next frame, and find new ones."""
         self.frame += 1
         if previous is not None and len(self.ids):
-            ahead, good = follow(previous, image, self.alive, options=self.options)
+            ahead, good = follow(previous, image, self.alive, settings=self.settings)
             self.alive = ahead
             self._keep(good)
-            if self.frame % self.options.check == 0:
-                looks = patches(image, self.alive, options=self.options)
-                same = (looks * self.looks).sum(1) > self.options.same
+            if self.frame % CHECK_FRAMES == 0:
+                looks = patches(image, self.alive, settings=self.settings)
+                same = (looks * self.looks).sum(1) > MIN_CORRELATION
                 self.looks = looks
                 self._keep(same)
         self._write()
-        if self.frame % self.options.renew == 0:
+        if self.frame % self.settings.renewal_frames == 0:
             self._replace(image)
 
     def _write(self) -> None:
@@ -216,11 +237,11 @@ class Book:
     def _detect(self, image: NDArray[np.uint8], mask: NDArray[Any], room: int) -> None:
         if room <= 0 or not mask.any():
             return
-        apart = max(4, image.shape[1] // self.options.apart)
+        apart = max(4, image.shape[1] // self.settings.min_separation)
         free = (mask > 0).astype(np.uint8)
         for x, y in self.alive.tolist():
             cv2().circle(free, (round(x), round(y)), apart, 0, -1)
-        found = cv2().goodFeaturesToTrack(image, room, self.options.corner, apart, mask=free, blockSize=7)
+        found = cv2().goodFeaturesToTrack(image, room, self.settings.min_corner, apart, mask=free, blockSize=7)
         if found is None:
             return
         found = found.reshape(-1, 2)
@@ -228,7 +249,7 @@ class Book:
         self.next += len(found)
         self._begin(ids, found)
         self.alive, self.ids = np.r_[self.alive, found], np.r_[self.ids, ids]
-        self.looks = np.r_[self.looks, patches(image, found, options=self.options)]
+        self.looks = np.r_[self.looks, patches(image, found, settings=self.settings)]
 
     def _begin(self, ids: NDArray[np.int_], found: NDArray[np.float32]) -> None:
         """The histories of new points."""
@@ -241,7 +262,7 @@ class Book:
 
     def _worth(self, key: int) -> bool:
         """Whether a track that has ended is kept."""
-        return len(self.histories[key][1]) >= self.options.shortest
+        return len(self.histories[key][1]) >= self.settings.min_frames
 
     def _finish(self, keys: NDArray[np.int_]) -> None:
         """Put tracks away, or forget those that are worth nothing."""
@@ -259,8 +280,8 @@ class Book:
 class _MovingBook(Book):
     """Points that move: they are looked for where something does."""
 
-    def __init__(self, count: int, options: TrackOptions):
-        super().__init__(count, options)
+    def __init__(self, count: int):
+        super().__init__(count, POINT_FOLLOWING)
         self.moved: list[Floats] = []
         self.where = np.zeros((0, 0), np.uint8)
 
@@ -274,12 +295,12 @@ class _MovingBook(Book):
         """New points where something moves, and a few where nothing does; points that rest elsewhere make room."""
         x, y = np.rint(self.alive).astype(int).T.clip(0, [[image.shape[1] - 1], [image.shape[0] - 1]])
         elsewhere = self.where[y, x] == 0
-        spare = elsewhere.sum() - int(self.options.rest * self.count)
+        spare = elsewhere.sum() - int(STATIC_POINT_SHARE * self.count)
         if spare > 0:
             old = [key for key in self.ids[elsewhere].tolist() if not self._moves(key)][:spare]
             self._keep(~np.isin(self.ids, old))
         self._detect(image, self.where, self.count - len(self.ids))
-        resting = int(self.options.rest * self.count) - max(0, int(elsewhere.sum()))
+        resting = int(STATIC_POINT_SHARE * self.count) - max(0, int(elsewhere.sum()))
         self._detect(image, 1 - (self.where > 0), min(resting, self.count - len(self.ids)))
 
     def _moves(self, key: int) -> bool:
@@ -287,7 +308,7 @@ class _MovingBook(Book):
         image = transform(np.array(self.moved[first : first + len(positions)]), np.array(positions).astype(np.float64)[:, None])[
             :, 0
         ]
-        return extent(image) > self.options.wandering
+        return extent(image) > MIN_TRACK_EXTENT
 
     def _worth(self, key: int) -> bool:
         return super()._worth(key) and self._moves(key)
@@ -299,7 +320,7 @@ class _MovingBook(Book):
 
 
 def _select(
-    book: Book, camera: CameraMotion, scale: tuple[float, float], limit: float, complete: float, keep: int, options: TrackOptions
+    book: Book, camera: CameraMotion, scale: tuple[float, float], limit: float, complete: float, keep: int
 ) -> tuple[Floats, list[str]]:
     """The tracks that live long enough and move, ``(frames, n, 2)``, and what to say about them."""
     frames = len(camera.times)
@@ -311,7 +332,7 @@ def _select(
         if camera.moves:
             track = transform(camera.path[first : first + len(track)], track[:, None])[:, 0]
         moves = extent(track)
-        if moves < limit or extent(track, 0.5) < options.dragged * limit:
+        if moves < limit or extent(track, 0.5) < MIN_MIDDLE_EXTENT * limit:
             continue
         if len(track) < complete * frames:
             shorter += 1

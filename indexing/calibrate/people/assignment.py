@@ -16,8 +16,8 @@ from indexing.calibrate.people.pair_geometry import (
     MAX_DETECTION_DISTANCE,
     NUM_REWEIGHTINGS,
     STRANGER_DISTANCE,
+    CameraPair,
     CommonFrames,
-    PairGeometry,
     PieceView,
     arrange,
     common_frames,
@@ -44,16 +44,16 @@ MAX_ITERATIONS = 6  # clustering tracklets and refitting pairwise geometry
 MIN_PERSON_SECONDS = 0.3  # that a person is seen by two cameras
 
 
-def estimate_spanning_tree(views: Sequence[PieceView], known: Floats | None) -> tuple[Floats, dict[Pair, PairGeometry], list[int]]:
+def estimate_spanning_tree(views: Sequence[PieceView], known: Floats | None) -> tuple[Floats, dict[Pair, CameraPair], list[int]]:
     """Clocks ``(cameras, 2)`` against the first camera, relations of the pairs that they come from, and the cameras without any."""
     order = sorted(range(len(views)), key=lambda camera: (-int(views[camera].lengths.sum()), camera))
     placed, waiting = [order[0]], order[1:]
     clocks = np.tile([0.0, 1.0], (len(views), 1)) if known is None else known
-    relations: dict[Pair, PairGeometry] = {}
+    relations: dict[Pair, CameraPair] = {}
     lost: list[int] = []
     while waiting:
         camera = waiting.pop(0)
-        best: tuple[float, int, PairGeometry] | None = None
+        best: tuple[float, int, CameraPair] | None = None
         for other in placed:
             clock = None if known is None else relative_clock(clocks, other, camera)
             hypothesis = estimate_pair(views[other], views[camera], clock)
@@ -87,7 +87,7 @@ class Assignment:
     """Pieces of all cameras sorted into groups."""
 
     views: Sequence[PieceView]
-    relations: dict[Pair, PairGeometry]
+    relations: dict[Pair, CameraPair]
     labels: Integers
     scores: Floats = None  # type: ignore[assignment]  # of all pieces
     conflicts: Booleans = None  # type: ignore[assignment]
@@ -102,7 +102,7 @@ class Assignment:
         return self.labels[self.starts[camera] : self.starts[camera + 1]]
 
 
-def calibrated_pairs(views: Sequence[PieceView], clocks: Floats, calibration: Calibration) -> dict[Pair, PairGeometry]:
+def calibrated_pairs(views: Sequence[PieceView], clocks: Floats, calibration: Calibration) -> dict[Pair, CameraPair]:
     """The relations of all pairs of known cameras: :math:`F = K_j^{-T} [t]_\\times R K_i^{-1}` with the motion R, t from i to j."""
     K, R, t = (getattr(calibration, name).detach().numpy().astype(np.float64) for name in ("K", "R", "t"))
     inverse = np.linalg.inv(K)
@@ -115,11 +115,11 @@ def calibrated_pairs(views: Sequence[PieceView], clocks: Floats, calibration: Ca
         norm = np.linalg.norm(fundamental)
         if norm > 0:  # two cameras at one place have no epipolar geometry
             sigma = INITIAL_SIGMA * np.sqrt(views[i].pieces.size * views[j].pieces.size)
-            out[i, j] = PairGeometry(*relative_clock(clocks, i, j), fundamental / norm, float(sigma), held=True)
+            out[i, j] = CameraPair(*relative_clock(clocks, i, j), fundamental / norm, float(sigma), held=True)
     return out
 
 
-def _oriented(relations: dict[Pair, PairGeometry], i: int, j: int, clock: tuple[float, float]) -> PairGeometry | None:
+def _oriented(relations: dict[Pair, CameraPair], i: int, j: int, clock: tuple[float, float]) -> CameraPair | None:
     """The relation of i < j from one that may be of (j, i), with another clock."""
     if (i, j) in relations:
         return replace(relations[i, j], offset=clock[0], rate=clock[1])
@@ -129,7 +129,7 @@ def _oriented(relations: dict[Pair, PairGeometry], i: int, j: int, clock: tuple[
     return None
 
 
-def assign(views: Sequence[PieceView], clocks: Floats, relations: dict[Pair, PairGeometry]) -> Assignment:
+def assign(views: Sequence[PieceView], clocks: Floats, relations: dict[Pair, CameraPair]) -> Assignment:
     """Sort the pieces by the relations that there are, fit those of all pairs to who is the same, until nothing changes."""
     pairs = list(combinations(range(len(views)), 2))
     both = {(i, j): common_frames(views[i], views[j], *relative_clock(clocks, i, j)) for i, j in pairs}
@@ -170,16 +170,16 @@ def _within_cameras(sorting: Assignment) -> tuple[Floats, Booleans]:
     return links, conflicts
 
 
-def _refit_pairs(sorting: Assignment, both: dict[Pair, CommonFrames], clocks: Floats) -> dict[Pair, PairGeometry]:
+def _refit_pairs(sorting: Assignment, both: dict[Pair, CommonFrames], clocks: Floats) -> dict[Pair, CameraPair]:
     """The relations of all pairs by who is the same now; one that nobody fits any more stays."""
-    out: dict[Pair, PairGeometry] = {}
+    out: dict[Pair, CameraPair] = {}
     for (i, j), moments in both.items():
         old = sorting.relations.get((i, j))
         matched = sorting.of(i)[:, None] == sorting.of(j)[None]
         if old is not None:
             a, b = sorting.starts[i], sorting.starts[j]
             matched &= sorting.scores[a : a + matched.shape[0], b : b + matched.shape[1]] > 0
-        start = old or PairGeometry(*relative_clock(clocks, i, j), np.full((3, 3), np.nan), moments.spread)
+        start = old or CameraPair(*relative_clock(clocks, i, j), np.full((3, 3), np.nan), moments.spread)
         rounds = NUM_REWEIGHTINGS + (2 if old is None else 0)
         fitted = fit_pair(start, moments, matched, rounds) if len(moments.a) else None
         if fitted is not None and (old is not None or fitted.sigma <= MAX_SIGMA * moments.spread / STRANGER_DISTANCE):
@@ -296,14 +296,14 @@ def split_inconsistent(sorting: Assignment) -> tuple[list[PieceView], bool]:
     return views, changed
 
 
-def _reversed_pair(relation: PairGeometry) -> PairGeometry:
+def _reversed_pair(relation: CameraPair) -> CameraPair:
     """The same, of a against b."""
     return replace(
         relation, fundamental=relation.fundamental.T, offset=-relation.offset / relation.rate, rate=1 / relation.rate, shift=None
     )
 
 
-def _shared_times(a: PieceView, b: PieceView, relation: PairGeometry) -> Floats:
+def _shared_times(a: PieceView, b: PieceView, relation: CameraPair) -> Floats:
     """The times of a's frames that :func:`common_frames` takes."""
     moments = relation.rate * a.times + relation.offset
     margin = MAX_DETECTION_DISTANCE / b.seen.fps

@@ -100,7 +100,7 @@ def interpolate(one: PieceView, times: Floats) -> tuple[Floats, Floats, Integers
 
 
 @dataclass(frozen=True, eq=False)
-class PairGeometry:
+class CameraPair:
     """How camera b relates to camera a. fundamental ``(3, 3)``."""
 
     offset: float
@@ -147,7 +147,7 @@ def distances(fundamental: Floats, a: Floats, b: Floats) -> Floats:
     return np.asarray(value / np.sqrt(np.maximum(square_a[:, :, None] + square_b[:, None], 1e-300)))
 
 
-def evidence(relation: PairGeometry, both: CommonFrames) -> Floats:
+def evidence(relation: CameraPair, both: CommonFrames) -> Floats:
     """Nats for being the same person, ``(T, slots_a, slots_b)``; 0 where nothing can be compared."""
     return _evidence_of(distances(relation.fundamental, both.a, both.b), relation.sigma, both)
 
@@ -173,12 +173,12 @@ def sum_over_time(found: Floats, both: CommonFrames, shape: tuple[int, int]) -> 
 
 
 def fit_pair(
-    relation: PairGeometry,
+    relation: CameraPair,
     both: CommonFrames,
     matched: Booleans,
     rounds: int,
     most: int | None = None,
-) -> PairGeometry | None:
+) -> CameraPair | None:
     """The relation with the fundamental matrix and sigma of those who are the same, by reweighted least squares. matched
     ``(pieces_a, pieces_b)``."""
     import torch
@@ -235,7 +235,7 @@ def _sampson(fundamental: Floats, x1: Floats, x2: Floats) -> tuple[Floats, Float
 class Hypothesis:
     """A relation with who is who by it."""
 
-    relation: PairGeometry
+    relation: CameraPair
     score: float
     explained: float
     size: float
@@ -246,7 +246,7 @@ class Hypothesis:
         return decided and self.explained >= MIN_EXPLAINED and self.relation.sigma <= MAX_CONFIDENT_SIGMA * self.size
 
 
-def match_and_refit(a: PieceView, b: PieceView, relation: PairGeometry) -> Hypothesis | None:
+def match_and_refit(a: PieceView, b: PieceView, relation: CameraPair) -> Hypothesis | None:
     """Match everybody by a relation that may come from two people only, and fit it to all who were matched."""
     both = common_frames(a, b, relation.offset, relation.rate, MAX_SEARCH_FRAMES)
     if not len(both.a):
@@ -305,12 +305,12 @@ def seed_pairs(a: PieceView, b: PieceView) -> list[tuple[int, int]]:
     return sorted(every, key=lambda both: -min(a.lengths[both[0]], b.lengths[both[1]]))
 
 
-def propose_unsynchronized(a: PieceView, b: PieceView) -> Iterator[PairGeometry]:
+def propose_unsynchronized(a: PieceView, b: PieceView) -> Iterator[CameraPair]:
     """Relations by comparing pieces of people whose clocks nobody knows."""
     for i, j in seed_pairs(a, b):
         shift = synchronize_tracklets(_tracklet_points(a, i), _tracklet_points(b, j), quick=True)
         if shift is not None and shift.fundamental is not None and math.isfinite(shift.offset):
-            yield PairGeometry(shift.offset, shift.rate, shift.fundamental.numpy().astype(np.float64), math.nan, shift)
+            yield CameraPair(shift.offset, shift.rate, shift.fundamental.numpy().astype(np.float64), math.nan, shift)
 
 
 def _tracklet_points(one: PieceView, piece: int) -> tuple[Floats, Floats, Floats]:
@@ -336,13 +336,13 @@ def synchronize_tracklets(a: tuple[Floats, Floats, Floats], b: tuple[Floats, Flo
     return shift
 
 
-def propose_synchronized(a: PieceView, b: PieceView, offset: float, rate: float) -> Iterator[PairGeometry]:
+def propose_synchronized(a: PieceView, b: PieceView, offset: float, rate: float) -> Iterator[CameraPair]:
     """Relations of people who may be the same, where the clocks are known."""
     both = common_frames(a, b, offset, rate, MAX_SEARCH_FRAMES)
     for i, j in seed_pairs(a, b):
         matched = np.zeros((len(a.pieces), len(b.pieces)), dtype=bool)
         matched[i, j] = True
-        start = PairGeometry(offset, rate, np.full((3, 3), np.nan), both.spread)
+        start = CameraPair(offset, rate, np.full((3, 3), np.nan), both.spread)
         fitted = fit_pair(start, both, matched, NUM_REWEIGHTINGS + 2) if len(both.a) else None
         if fitted is not None:
             yield fitted

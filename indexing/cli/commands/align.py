@@ -26,8 +26,7 @@ from indexing.cli.scenes import (
 from indexing.files import manifest
 from indexing.readers.matches import Matched, read_matches
 from indexing.report.alignment import PURPOSE, WRITTEN, AlignmentReport, write_alignment
-from indexing.video.options import SceneOptions
-from indexing.video.scene import SceneTracks
+from indexing.video.scene import SCENE_FOLLOWING, THRESHOLD, SceneTracks
 
 SEVERAL = ("planar", "join", "minimal_join")
 """Models that take more than three views."""
@@ -128,8 +127,7 @@ def _model(flags: Align, matched: Matched) -> tuple[str, list[str]]:
 def _limit(flags: Align, tracks: SceneTracks | None) -> float | None:
     """The threshold as the library takes it; None = estimated."""
     if flags.threshold is None and tracks is not None:
-        options = SceneOptions()
-        return options.threshold * max(1.0, max(tracks.size) / options.follow.working)
+        return THRESHOLD * max(1.0, max(tracks.size) / SCENE_FOLLOWING.working_side)
     return None if flags.threshold in ("auto", None) else float(flags.threshold)
 
 

@@ -13,9 +13,10 @@ from typing import Any
 
 from indexing.archive.workers import QuietProcesses
 from indexing.cli.console import check_folder, check_report, count, counted, ended, keep, names, progress, say, table
-from indexing.colmap import MatchDatabase, StaticOptions, StaticPoints, check_target, find_static, read_database
+from indexing.colmap import MatchDatabase, StaticPoints, check_target, find_static, read_database
 from indexing.colmap.dividing import colmap
 from indexing.colmap.masks import write_masks
+from indexing.colmap.static import MIN_PARALLEL_PAIRS
 from indexing.files import manifest
 from indexing.readers.pairs import Photograph, read_image
 from indexing.report.static import FILES, StaticReport, describe, image_rows, images_drawn, write_report
@@ -80,7 +81,7 @@ def run_colmap(job: ColmapJob, arguments: Mapping[str, Any]) -> int:
 def _workforce(pairs: int) -> contextlib.AbstractContextManager[Executor | None]:
     """All cores, where that is worth it."""
     cores = os.cpu_count() or 1
-    return contextlib.nullcontext() if cores < 2 or pairs < StaticOptions().divide.shared_out else QuietProcesses(cores)
+    return contextlib.nullcontext() if cores < 2 or pairs < MIN_PARALLEL_PAIRS else QuietProcesses(cores)
 
 
 def _check_images(folder: Path | None) -> None:

@@ -23,9 +23,8 @@ from indexing.report.bodies import FILM, WRITTEN, BodiesReport, rows_of, write_b
 from indexing.report.bodies_picture import PANELS
 from indexing.report.labelled import colour_of
 from indexing.video.overlay import Overlay, write_overlay
-from indexing.video.scene import SceneTracks
+from indexing.video.scene import SceneTracks, spread
 from indexing.video.sequence import PictureSequence, chunks
-from indexing.video.whole import spread
 
 WORDS = flag_words("bodies", "threshold", cameras="the cameras (in Python: cameras=)")
 LEAST = 8  # tracks, or matches

@@ -117,6 +117,7 @@ def test_keypoint_files_on_one_clock_with_people_in_one_order(tmp_path):
     assert len(back) == 2 and back[0].times[0] == pytest.approx(25 / FPS)
 
 
+@pytest.mark.slow
 def test_files_of_the_input_keep_their_names(tmp_path):
     write_cameras(tmp_path)
     found = rig()

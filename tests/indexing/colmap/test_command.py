@@ -53,6 +53,7 @@ def test_everything_is_written(given, quick, tmp_path, capsys):
     assert all(int(row["static"]) > 50 and int(row["moving"]) > 50 for row in rows)
 
 
+@pytest.mark.slow
 def test_a_refusal_writes_a_report_and_no_database(given, found, tmp_path, monkeypatch, capsys):
     few = replace(found, refused=(0, 1, 2, 3), reason="fewer than 15 points stand still in 000.png, 4 of 6 images; add images")
     monkeypatch.setattr("indexing.cli.commands.segment_colmap.find_static", lambda *_, **__: few)

@@ -13,7 +13,6 @@ from experiments.segmentation.colmap import mapped, worst, write_scene
 from experiments.segmentation.photographs import photographs
 from indexing.colmap import StaticOptions, find_static, read_database
 from indexing.colmap.dividing import chosen, divide, seen, task
-from indexing.colmap.options import DivideOptions, KeepOptions
 from tests.indexing.colmap.test_database import changed, sha256
 
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -81,7 +80,7 @@ def test_a_scene_in_which_nothing_moves_stays_whole(tmp_path):
 
 
 def test_too_little_that_stands_still_is_refused_by_name(found, tmp_path):
-    strict = StaticOptions(keep=KeepOptions(points=10_000))
+    strict = StaticOptions(min_static_points=10_000)
     refused = find_static_again(found, strict)
     assert not refused.ok and refused.refused == tuple(range(6))
     assert (
@@ -98,7 +97,7 @@ def test_some_images_without_static_points_are_a_note(found):
         for side, place in enumerate((pair.first, pair.second)):
             held[place].update(geometry.inliers[:, side].tolist())
     least = min(map(len, held))
-    some = find_static_again(found, StaticOptions(keep=KeepOptions(points=least + 1)))
+    some = find_static_again(found, StaticOptions(min_static_points=least + 1))
     assert some.ok and len(some.refused) >= 1
     assert some.notes[0].endswith("COLMAP will leave it out") and some.database.images[some.refused[0]].name in some.notes[0]
 
@@ -114,17 +113,17 @@ def find_static_again(found, options):
 
 
 def test_of_each_image_the_pairs_with_most_matches_are_divided(found):
-    few = chosen(found.database, DivideOptions(per_image=1))
+    few = chosen(found.database, StaticOptions(pairs_per_image=1))
     images = {place for pair in few for place in (found.database.pairs[pair].first, found.database.pairs[pair].second)}
     assert images == set(range(6)) and len(few) < len(found.database.pairs)
-    assert chosen(found.database, DivideOptions(least=10_000)) == []
+    assert chosen(found.database, StaticOptions(min_matches=10_000)) == []
 
 
 def test_matches_beyond_the_most_join_those_beside_them(scene, found):
     """Half of the matches are divided, and nearly as many are labelled as if all were."""
     images = seen(found.database)
     pair, whole = found.database.pairs[0], found.bodies[0]
-    half = divide(task(pair, images, 2.5, True, 0, DivideOptions(most=len(pair.matches) // 2)))
+    half = divide(task(pair, images, 2.5, True, 0, StaticOptions(max_matches=len(pair.matches) // 2)))
     still = scene.still(pair.first, pair.second, pair.matches)
     moving = scene.right(pair.first, pair.second, pair.matches) & ~still
     assert (half.labels > 0).sum() > 0.85 * (whole.labels > 0).sum()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from indexing.colmap.options import SpreadOptions, VoteOptions
 from indexing.colmap.voting import DividedPair, vote
 
 IMAGES = 5
@@ -32,7 +31,7 @@ class World:
         return DividedPair(i * self.count + ids, j * self.count + ids, labels)
 
     def voted(self, pairs):
-        return vote(pairs, self.cells, self.image, VoteOptions(), SpreadOptions())
+        return vote(pairs, self.cells, self.image)
 
     def things(self, found):
         """Mean vote on the keypoints of each thing, over the images that have any."""

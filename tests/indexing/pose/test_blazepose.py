@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from indexing.pose import blazepose
 from indexing.pose.blazepose import (
     HEATMAP,
     LANDMARKS,
@@ -19,7 +20,6 @@ from indexing.pose.blazepose import (
     refined,
     sigmoid,
 )  # fmt: skip
-from indexing.pose.options import DetectorOptions, LandmarkOptions
 
 
 def test_anchors_are_the_cells_of_the_grids_row_by_row():
@@ -116,16 +116,16 @@ def brute_refine(places, heatmap, kernel=7, sure=0.5):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_refinement_is_the_mean_of_the_cells_about_a_joint(seed):
+def test_refinement_is_the_mean_of_the_cells_about_a_joint(seed, monkeypatch):
     rng = np.random.default_rng(seed)
     places, heatmap = rng.uniform(-0.1, 1.1, (39, 2)), rng.normal(-3, 2, (64, 64, 39))
     heatmap[..., ::3] -= 20  # nowhere sure
     got = refined(places, heatmap)
     np.testing.assert_allclose(got, brute_refine(places, heatmap), atol=1e-12)
     assert (got[1::3] != places[1::3]).any() and (got[::3] == places[::3]).all()
-    np.testing.assert_allclose(
-        refined(places, heatmap, LandmarkOptions(kernel=3, sure=0.2)), brute_refine(places, heatmap, 3, 0.2), atol=1e-12
-    )
+    monkeypatch.setattr(blazepose, "HEATMAP_KERNEL", 3)
+    monkeypatch.setattr(blazepose, "MIN_HEATMAP_PEAK", 0.2)
+    np.testing.assert_allclose(refined(places, heatmap), brute_refine(places, heatmap, 3, 0.2), atol=1e-12)
 
 
 def test_places_that_are_none_stay_so():
@@ -147,4 +147,3 @@ def test_landmarks_come_in_parts_of_the_region_with_the_lower_probability():
 
 def test_huge_logits_are_no_overflow():
     assert sigmoid([-1e9, 0, 1e9]).tolist() == pytest.approx([0, 0.5, 1])
-    assert DetectorOptions().score == 0.5

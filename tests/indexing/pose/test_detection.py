@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from indexing.pose import NobodyInVideo, PoseOptions, detect, detection, keypoint_file
-from indexing.pose.options import DetectorOptions, PieceOptions
 from indexing.pose.pieces import plan
 from indexing.recordings.people import of_recording, tracked_people
 from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
 
 WIDTH, HEIGHT = 320, 240
-SHORT = PoseOptions(pieces=PieceOptions(seconds=0.5, lead=0.1))
+SHORT = PoseOptions(chunk_seconds=0.5, lead_seconds=0.1)
 
 
 def person(x, y, height, lean=0.0):
@@ -212,7 +209,7 @@ def test_small_people_are_found_by_looking_closer(tmp_path, seeing, monkeypatch)
     (clip,) = detect(path)
     assert error_of(clip, truth) < 2.5
     with pytest.raises(NobodyInVideo):
-        detect(path, options=PoseOptions(DetectorOptions(shrinks=(1,), farther=())))
+        detect(path, options=PoseOptions(zooms=(1,), farther_zooms=()))
 
 
 def test_nobody_in_a_video_is_one_line(tmp_path, seeing):
@@ -284,6 +281,6 @@ def test_an_interruption_ends_the_work(tmp_path, seeing):
 
 def test_options_are_what_decides(tmp_path, seeing):
     path = film(tmp_path, [[walk(i)] for i in range(10)])
-    blind = dataclasses.replace(PoseOptions(), detector=DetectorOptions(score=0.99, closer_score=0.99))
+    blind = PoseOptions(min_score=0.99, min_closer_score=0.99)
     with pytest.raises(NobodyInVideo):
         detect(path, options=blind)

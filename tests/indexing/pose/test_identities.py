@@ -10,7 +10,6 @@ import pytest
 
 from indexing.pose import identities as room
 from indexing.pose.identities import Sightings, identities, joined, largest
-from indexing.pose.options import IdentityOptions
 from indexing.pose.tracking import windows
 
 BODY = np.array([[0.0, 0.0], [20.0, 30.0], [10.0, 80.0]])
@@ -26,15 +25,15 @@ def tracks(*some, frames=60, fps=10.0):
     return Sightings(np.arange(frames) / fps, at, track, joints, np.ones(joints.shape[:2]))
 
 
-def groups(seen, **options):
-    return [sorted({int(seen.tracks[row]) for row in rows}) for rows in identities(seen, IdentityOptions(**options))]
+def groups(seen, **how):
+    return [sorted({int(seen.tracks[row]) for row in rows}) for rows in identities(seen, **how)]
 
 
 def test_a_track_goes_on_where_another_ended_soon_and_nearby():
     assert groups(tracks((0, 20, 0, 0, 1), (25, 59, 8, 0, 1))) == [[0, 1]]
     assert groups(tracks((0, 20, 0, 0, 1), (50, 59, 8, 0, 1))) == [[0], [1]]  # three seconds later
     assert groups(tracks((0, 20, 0, 0, 1), (22, 59, 90, 0, 1))) == [[1], [0]]  # two bodies away
-    assert groups(tracks((0, 20, 0, 0, 1), (50, 59, 8, 0, 1)), away=5.0) == [[0, 1]]
+    assert groups(tracks((0, 20, 0, 0, 1), (50, 59, 8, 0, 1)), max_absence=5.0) == [[0, 1]]
 
 
 def test_two_who_are_there_at_once_are_two():
@@ -71,7 +70,7 @@ def test_nobody_is_nobody():
     assert joined([nobody, nobody]).times.tolist() == [0, 1, 2, 0, 1, 2]
 
 
-def every_pair(seen: Sightings, options: IdentityOptions) -> list[list[int]]:
+def every_pair(seen: Sightings, max_absence: float) -> list[list[int]]:
     """The same as identities(), with a look at everybody who ever was."""
     rows = [np.flatnonzero(seen.tracks == track) for track in np.unique(seen.tracks)]
     left = sorted((room._stretch(seen, one) for one in rows), key=lambda one: (one.begin, -one.size))
@@ -79,7 +78,7 @@ def every_pair(seen: Sightings, options: IdentityOptions) -> list[list[int]]:
     for moment in sorted({one.begin for one in left}):
         fresh = [one for one in left if one.begin == moment]
         pairs = sorted(
-            (room._apart(owner[-1], one, options), i, j) for i, owner in enumerate(owners) for j, one in enumerate(fresh)
+            (room._apart(owner[-1], one, max_absence), i, j) for i, owner in enumerate(owners) for j, one in enumerate(fresh)
         )
         taken: dict[int, int] = {}
         for far, i, j in pairs:
@@ -102,8 +101,8 @@ def test_who_may_return_is_found_as_among_everybody(seed):
     some = [
         (int(a), int(min(59, a + rng.integers(0, 12))), float(rng.integers(0, 6)) * 20, 0, float(rng.integers(1, 3))) for a in first
     ]
-    seen, options = tracks(*some), IdentityOptions(away=float(rng.choice([0.1, 0.5, 2.0])))
-    assert [rows.tolist() for rows in identities(seen, options)] == every_pair(seen, options)
+    seen, max_absence = tracks(*some), float(rng.choice([0.1, 0.5, 2.0]))
+    assert [rows.tolist() for rows in identities(seen, max_absence)] == every_pair(seen, max_absence)
 
 
 @pytest.mark.slow

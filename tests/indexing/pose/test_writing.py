@@ -11,7 +11,6 @@ import pytest
 from indexing import ClipSet
 from indexing.pose import PoseOptions, detect, keypoint_file
 from indexing.pose.detection import VideoTask
-from indexing.pose.options import PieceOptions
 from indexing.pose.pieces import Store
 from indexing.pose.writing import keypoint_files, write_json_folder
 from indexing.readers import read
@@ -20,7 +19,7 @@ from indexing.video.reading import Video
 from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
 from tests.indexing.pose.test_detection import HEIGHT, WIDTH, film, person, walk
 
-SHORT = PoseOptions(pieces=PieceOptions(seconds=0.5, lead=0.1))
+SHORT = PoseOptions(chunk_seconds=0.5, lead_seconds=0.1)
 
 
 def same(one: ClipSet, other: ClipSet) -> bool:

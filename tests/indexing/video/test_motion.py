@@ -112,6 +112,7 @@ def test_stabilized_frames_stand_still(scene):
     assert all((a.frames == b.frames).all() for a, b in zip(still, stabilize(still, still_camera), strict=True))
 
 
+@pytest.mark.slow
 def test_tracks_lose_the_cameras_motion(motion_of):
     camera = motion_of(pan, 75)
     wall = np.array([[200.0, 50], [250, 200]])

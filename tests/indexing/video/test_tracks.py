@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.video import Chunk, track_points
-from indexing.video.options import CameraMotionOptions, TrackOptions
+from indexing.video import Chunk, motion, track_points
 from indexing.video.tracks import extent, follow, patches
 
 
@@ -117,11 +116,10 @@ def test_one_frame_is_no_video():
         track_points([Chunk(np.zeros((1, 48, 64), np.uint8), np.zeros(1))])
 
 
-def test_options_reach_tracks_and_camera(rng):
+def test_too_few_points_say_nothing_of_the_camera(rng, monkeypatch):
     frames = rng.integers(0, 255, (12, 64, 64)).astype(np.uint8)
     chunks = [Chunk(np.repeat(frames[:1], 12, axis=0), np.arange(12.0))]
     assert track_points(chunks).camera.support.min() == 1.0
-    unsure = track_points(chunks, options=TrackOptions(camera=CameraMotionOptions(fewest=10_000)))
+    monkeypatch.setattr(motion, "MIN_BACKGROUND_POINTS", 10_000)
+    unsure = track_points(chunks)
     assert not unsure.camera.support[1:].any() and "too little background" in unsure.notes[-1]
-    with pytest.raises(ValueError, match="options must be TrackOptions"):
-        track_points(chunks, options=CameraMotionOptions())
