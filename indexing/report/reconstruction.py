@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.numerics import worded
+from dyntorch.tasks.reconstruct.motion_models import MOTION_MODELS
 from indexing.readers.pairs import Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.canvas import DARK
@@ -24,19 +25,7 @@ WRITTEN = (*FILES, "tracks.csv")  # the last one of videos
 ROUNDING = 1e-12
 LABELS = (("outlier", "static", "moving"), ("outlier", "body 1", "body 2"))
 ARRAYS = ("cameras", "points", "residuals", "inliers", "structure", "projections")
-PURPOSE = {
-    "static_2d": "The points of a plane stand still.",
-    "static_3d": "The points stand still.",
-    "constant_direction_2d": "The points move in a plane along one common direction, each at its own speed.",
-    "constant_velocity_2d": "The points move in a plane, each at its own constant velocity.",
-    "constant_acceleration_2d": "The points move in a plane, each with its own constant acceleration.",
-    "constant_direction_3d": "The points move in space along one common direction, each at its own speed.",
-    "constant_velocity_planes_3d": "The points move in space, parallel to a plane, each at its own constant velocity.",
-    "constant_velocity_3d": "The points move in space, each at its own constant velocity.",
-    "constant_velocity_3d_sensors": "The points move in space, each at its own constant velocity, before a 3D sensor.",
-    "two_bodies_2d": "The points of a plane belong to two bodies, one of which is shifted against the other.",
-    "two_bodies_3d": "The points belong to two bodies, one of which is shifted against the other.",
-}
+PURPOSE = {model.name: model.purpose for model in MOTION_MODELS}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

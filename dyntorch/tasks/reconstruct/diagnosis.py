@@ -14,7 +14,7 @@ from dyntorch.geometry.pairs import hyperplane_pair
 from dyntorch.geometry.triangulation import unit_projections
 from dyntorch.numerics.blocks import map_blocks
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
-from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion, polynomial
+from dyntorch.tasks.reconstruct.motions import Motion, smaller_motion
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks, camera_unknowns, projections_of_tracks
 from dyntorch.tasks.reconstruct.result import ReconstructNotice
@@ -106,54 +106,6 @@ def _derivatives(cameras: Tensor, structure: Tensor, weights: Tensor, lifts: Ten
     return (slope[..., None] * world[..., None, None, :]).flatten(-2), slope @ (cameras @ lifts)[:, :, None]
 
 
-class Smaller(NamedTuple):
-    """A model of fewer unknowns, and the notice that it explains the tracks."""
-
-    motion: Motion
-    code: ReconstructNotice
-    case: str = ""
-
-
-_TURNING = Motion(lambda t: torch.cat([torch.eye(3, dtype=torch.float64), t * torch.eye(3, dtype=torch.float64)], 1), "turning")
-_RESTING_SENSORS = Motion(polynomial(3, 0), "static_3d_sensors", sensor=3, static=True)
-
-
-def _smaller(name: str, code: ReconstructNotice) -> Smaller:
-    return Smaller(MOTIONS[name], code)
-
-
-_STATIC = {d: _smaller(f"static_{d}d", ReconstructNotice.STATIC_SCENE) for d in (2, 3)}
-_ONE = {d: _smaller(f"static_{d}d", ReconstructNotice.ONE_BODY) for d in (2, 3)}
-SMALLER: dict[str, tuple[Smaller, ...]] = {
-    "static_3d": (_smaller("static_2d", ReconstructNotice.TURNING_CAMERA),),
-    "constant_direction_2d": (_STATIC[2],),
-    "constant_velocity_2d": (_STATIC[2], _smaller("constant_direction_2d", ReconstructNotice.LINEAR_VELOCITIES)),
-    "constant_acceleration_2d": (_STATIC[2], _smaller("constant_velocity_2d", ReconstructNotice.DEGENERATE)),
-    "constant_direction_3d": (
-        _smaller("constant_direction_2d", ReconstructNotice.TURNING_CAMERA),
-        _STATIC[3],
-        _smaller("constant_velocity_2d", ReconstructNotice.UNIFORM_CAMERA),
-    ),
-    "constant_velocity_planes_3d": (
-        _smaller("constant_velocity_2d", ReconstructNotice.TURNING_CAMERA),
-        _STATIC[3],
-        _smaller("constant_direction_3d", ReconstructNotice.LINEAR_VELOCITIES),
-        Smaller(_TURNING, ReconstructNotice.UNIFORM_CAMERA),
-    ),
-    "constant_velocity_3d": (
-        _STATIC[3],
-        _smaller("constant_direction_3d", ReconstructNotice.LINEAR_VELOCITIES),
-        Smaller(_TURNING, ReconstructNotice.UNIFORM_CAMERA),
-        _smaller("constant_velocity_planes_3d", ReconstructNotice.PLANAR_VELOCITIES),
-    ),
-    "constant_velocity_3d_sensors": (Smaller(_RESTING_SENSORS, ReconstructNotice.STATIC_SCENE, "sensors"),),
-    "two_bodies_2d": (_ONE[2],),
-    "two_bodies_3d": (_ONE[3],),
-}
-"""Models that leave the larger one undetermined where they explain the tracks.  Seen by a camera that does not accelerate, a moving
-point is one of the plane, :math:`x \\sim p + t q` with p and q of three coordinates."""
-
-
 NOTED_UNCERTAINTY = 0.1  # expected error of the points over the size of the scene from which smaller models are tried
 SMALLER_NOISE_RATIO = 1.25  # noise of a smaller model over that of the model, up to which it explains the tracks
 NOISE_ROUNDING = 1e-7  # noise over the extent of the images that counts as none
@@ -184,11 +136,12 @@ def diagnose(
     cheap = motion.k <= 4 or motion.bodies > 1
     suspect = (status == Status.DEGENERATE) | (solved & (doubt > NOTED_UNCERTAINTY)) | ((status == Status.AMBIGUOUS) & cheap)
     explained = torch.zeros_like(solved)
-    for smaller in SMALLER.get(motion.name, ()):
-        asked = (suspect | (smaller.motion.static & (status == Status.AMBIGUOUS))) & ~explained
-        left = _noise_of(tracks, smaller.motion, asked)
+    for entry in motion.smaller:
+        smaller = smaller_motion(entry)
+        asked = (suspect | (smaller.static & (status == Status.AMBIGUOUS))) & ~explained
+        left = _noise_of(tracks, smaller, asked)
         same = asked & (left <= SMALLER_NOISE_RATIO * torch.where(solved, noise, 0.0) + NOISE_ROUNDING)
-        note(smaller.code, left / tracks.scale(), same, case=smaller.case, smaller=smaller.motion.name)
+        note(ReconstructNotice[entry.notice.upper()], left / tracks.scale(), same, case=entry.case, smaller=smaller.name)
         explained = explained | same
     judged = torch.where((explained | (doubt > options.max_uncertainty)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
     astray = torch.zeros_like(solved) if lifting is None else wild(tracks, scene, lifting)

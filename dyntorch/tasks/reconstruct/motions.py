@@ -1,9 +1,9 @@
-"""Motion models as declarations: how a moving point of the scene is a static point of a higher projective space."""
+"""How a moving point of the scene is a static point of a higher projective space: motions, and what follows from their lifts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 from math import comb
@@ -15,10 +15,10 @@ from dyntorch import counting
 from dyntorch.counting.exact import IntArray, Views
 from dyntorch.geometry.lift import gauge_algebra, least_views
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
+from dyntorch.tasks.reconstruct.motion_models import AUXILIARY_MODELS, MOTION_MODELS, MotionModel, SmallerModel
 
 Lift = Callable[[Tensor], Tensor]
 
-AFFINE = "an affinity of the world and a velocity common to all points"
 STENCIL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 """Central differences of fourth order, exact for motions that are polynomials of the time."""
 STEP = 1e-2
@@ -51,6 +51,8 @@ class Motion:
         shift: takes c and returns :math:`R(c)`, ``(K, K)`` float64, with :math:`B(t + c) = B(t)\,R(c)` for all t, where there is
             one (for polynomials: :func:`polynomial_shift`): then times far from 0 lose no digits.
         metric_open: the ambiguity that remains with calibrated cameras, in words.
+        purpose: what the points do, one sentence.
+        smaller: models of fewer unknowns that make this one degenerate where they explain the tracks.
 
     Raises:
         ValueError: a lift that does not return, at time 0, a finite real matrix of full rank with no fewer columns than rows, or
@@ -78,6 +80,8 @@ class Motion:
     static: bool = False
     shift: Callable[[float], Tensor] | None = None
     metric_open: str = ""
+    purpose: str = ""
+    smaller: tuple[SmallerModel, ...] = ()
 
     def __post_init__(self) -> None:
         if self.lift is None and self.k < 2:
@@ -175,6 +179,11 @@ class Motion:
         lifts = self.centred(times)[0][: len(tensor.profile)]
         return views, _counted(tensor.profile, self.sensor, tuple(tuple(map(tuple, lift)) for lift in lifts.tolist()))
 
+    def least(self, times: Tensor | Sequence[float]) -> tuple[int, int]:
+        """Fewest views and tracks of a reconstruction: :meth:`minimal`, and what tells two bodies apart."""
+        views, matches = self.minimal(times)
+        return views, max(matches, (self.k + 1) * (self.k + 2) // 2 - 1 if self.bodies > 1 else 0)
+
     def ambiguity(self, times: Tensor | Sequence[float]) -> int:
         """Dimension of the ambiguity from views at these times; without a lift that of the projections, all collineations."""
         return (self.k + 1) ** 2 - 1 if self.lift is None else len(gauge_algebra(self.centred(times)[0])) - 1
@@ -246,56 +255,43 @@ def polynomial_shift(dim: int, directions: int, degree: int = 1) -> Callable[[fl
     return shift
 
 
-def _polynomial(
-    name: str, leaves_open: str, metric_open: str, dim: int, directions: int, degree: int = 1, sensor: int = 2
-) -> Motion:
-    shift = polynomial_shift(dim, directions, degree)
-    static = directions == 0
-    lift = polynomial(dim, directions, degree)
-    return Motion(lift, name, sensor, leaves_open, static=static, shift=shift, metric_open=metric_open)
-
-
-_PARTLY = "a collineation of the world that keeps the direction{} of motion, and a velocity, linear in the position, added to all"
-_BODIES = "an affinity of each body, with a linear part common to both"
-_SAME = "a similarity of the {}"
-_ALONG = "a similarity of the {}, and a velocity along the direction of motion, common to all points"
-_COMMON = "a similarity of the {}, and a velocity common to all points"
-_BESIDE = "a similarity of the world, and a velocity parallel to the planes of motion, common to all points"
-_RIGID = "a rigid motion of the world, and a velocity common to all points"
-_TWO = "a similarity of each body, with a rotation common to both"
-MOTIONS: dict[str, Motion] = {
-    motion.name: motion
-    for motion in (
-        _polynomial("static_2d", "a collineation of the plane", _SAME.format("plane"), 2, 0),
-        _polynomial("static_3d", "a collineation of space", _SAME.format("world"), 3, 0),
-        _polynomial("constant_direction_2d", _PARTLY.format(""), _ALONG.format("plane"), 2, 1),
-        _polynomial("constant_velocity_2d", AFFINE, _COMMON.format("plane"), 2, 2),
-        _polynomial(
-            "constant_acceleration_2d",
-            f"{AFFINE}, and likewise a common acceleration",
-            f"{_COMMON.format('plane')}, and likewise a common acceleration",
-            2,
-            2,
-            2,
-        ),
-        _polynomial("constant_direction_3d", _PARTLY.format(""), _ALONG.format("world"), 3, 1),
-        _polynomial("constant_velocity_planes_3d", _PARTLY.format("s"), _BESIDE, 3, 2),
-        _polynomial("constant_velocity_3d", AFFINE, _COMMON.format("world"), 3, 3),
-        _polynomial("constant_velocity_3d_sensors", AFFINE, _RIGID, 3, 3, sensor=3),
-        # in a plane the centres of the cameras, where both bodies would meet, show how large one is against the other
-        Motion(None, "two_bodies_2d", bodies=2, k=3, leaves_open=_BODIES, metric_open=f"{_TWO}, which are of one scale"),
-        Motion(
-            None,
-            "two_bodies_3d",
-            bodies=2,
-            k=4,
-            leaves_open=f"{_BODIES}, and the size of one body against the other",
-            metric_open=f"{_TWO}, and the size of one body against the other",
-        ),
+def _declared(model: MotionModel) -> Motion:
+    """The motion of an entry of :mod:`~dyntorch.tasks.reconstruct.motion_models`."""
+    shape = model.dim, model.directions, model.degree
+    if model.bodies > 1:
+        motion = Motion(None, model.name, model.sensor, bodies=model.bodies, k=model.dim + 1)
+    elif (rows := model.lift) is not None:
+        motion = Motion(lambda time: torch.tensor(rows(float(time)), dtype=torch.float64), model.name, model.sensor)
+    else:
+        static = model.directions == 0
+        motion = Motion(polynomial(*shape), model.name, model.sensor, static=static, shift=polynomial_shift(*shape))
+    return replace(
+        motion, leaves_open=model.leaves_open, metric_open=model.metric_open, purpose=model.purpose, smaller=model.smaller
     )
-}
-"""The declared models.  ``constant_direction``: all points move along one common, unknown direction; ``planes``: within parallel
-planes."""
+
+
+MOTIONS: dict[str, Motion] = {model.name: _declared(model) for model in MOTION_MODELS}
+"""The declared models, see :mod:`~dyntorch.tasks.reconstruct.motion_models`.  ``constant_direction``: all points move along one
+common, unknown direction; ``planes``: within parallel planes."""
+_ALL = MOTIONS | {model.name: _declared(model) for model in AUXILIARY_MODELS}
+
+
+def smaller_motion(smaller: SmallerModel) -> Motion:
+    """The motion that a larger one is compared with."""
+    return _ALL[smaller.name]
+
+
+def motion_table() -> str:
+    """The declared models with the views and tracks that they take at least, and what the points do.
+
+    Example:
+        >>> print(motion_table().splitlines()[3])
+        constant_velocity_2d            3 views   13 tracks   The points move in a plane, each at its own constant velocity.
+    """
+    needs = {motion.name: motion.least(range(12)) for motion in MOTIONS.values()}
+    return "\n".join(
+        f"{name:<30}{needs[name][0]:>3} views{needs[name][1]:>5} tracks   {motion.purpose}" for name, motion in MOTIONS.items()
+    )
 
 
 def as_motion(motion: str | Motion) -> Motion:

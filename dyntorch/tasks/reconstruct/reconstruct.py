@@ -20,7 +20,7 @@ from dyntorch.tasks.reconstruct.motions import Motion, as_motion
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
-from dyntorch.tasks.reconstruct.solver import choose, least, solve
+from dyntorch.tasks.reconstruct.solver import choose, solve
 
 
 @one_thread
@@ -51,21 +51,9 @@ def reconstruct(
         tracks: ``(*batch, views, n, 2)`` pixels (3D sensors: ``(*batch, views, n, 3)``), NaN or infinite = missing.
         motion: a name in ``dyntorch.motions.MOTIONS``, a :class:`dyntorch.Motion` (any lift B(t)), or ``"auto"``: the declared
             models are tried and the one of least penalized cost is taken, one for the whole batch.
-
-            ============================== ======== ===== =======================================================
-            model                          views    n     the points
-            ============================== ======== ===== =======================================================
-            static_2d, static_3d           2        4, 8  stand still, in a plane or in space
-            constant_direction_2d, \_3d    3        7, 13 move along one common direction, each at its own speed
-            constant_velocity_2d           3        13    move in a plane, each at its own velocity
-            constant_acceleration_2d       4        40    and acceleration
-            constant_velocity_planes_3d    4        20    move in space within parallel planes
-            constant_velocity_3d           4        40    move in space, each at its own velocity
-            constant_velocity_3d_sensors   3        21    the same, before sensors that measure 3D points
-            two_bodies_2d, two_bodies_3d   2, 3     9, 14 belong to two bodies in relative translation, in any steps
-            ============================== ======== ===== =======================================================
-
-            The tensor of two bodies needs 8 and 13 tracks, the pair of hyperplanes that tells them apart 9 and 14.
+            ``print(dyntorch.motions.motion_table())`` lists them: static points, points that move at constant velocity in a plane
+            (3 views of 13 tracks), in parallel planes (4, 20) or in space (4, 40; before 3D sensors 3, 21), along one direction,
+            with constant acceleration, and two bodies in relative translation.
         times: of the views, any unit and spacing; default 0, 1, 2, ...  Far from 0 the points at time 0 lose digits: count from the
             first view.
         static: ``(*batch, n)`` bool, points known to stand still: they fix the motion common to all points, which no view can
@@ -279,7 +267,7 @@ def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
             f"got {different} in {views} views" if different < views else f"{views} views at {times.tolist()} do not determine it"
         )
         raise ValueError(f"{model.name!r} needs views at {usual} different times or more, {hint}; add views at other times")
-    need = least(model, times)
+    need = model.least(times)
     if n < need[1]:
         raise ValueError(f"{model.name!r} needs at least {need[1]} tracks through {need[0]} views, got {n}; add tracks")
 

@@ -250,7 +250,7 @@ def choose(
     untried = tuple(Ranked(name, math.inf, math.nan, reason) for name, reason in reasons.items() if reason)
     if not models:
         first = MOTIONS[next(iter(reasons))]
-        need = least(first, tracks.times)
+        need = first.least(tracks.times)
         raise ValueError(
             f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
         )
@@ -295,19 +295,12 @@ class LiftedFit(NamedTuple):
         return cls(motion, apart, failed(status), sigma)
 
 
-def least(motion: Motion, times: Tensor) -> tuple[int, int]:
-    """Fewest views and tracks that a model can be fitted to."""
-    views, matches = motion.minimal(times)
-    bodies = (motion.k + 1) * (motion.k + 2) // 2 - 1 if motion.bodies > 1 else 0
-    return views, max(matches, bodies)
-
-
 def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
     """What is missing of views, tracks, and observations to spare; empty where nothing is."""
     usual = motion.views(range(12))
     if views < usual:
         return f"needs {usual} views"
-    need = least(motion, times)
+    need = motion.least(times)
     if need[0] > views or (motion.lift is not None and motion.ambiguity(times) > motion.ambiguity(range(12))):
         return f"needs views at {usual} different times"
     if need[1] > n:

@@ -8,14 +8,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from dyntorch.tasks.reconstruct.motion_models import MotionName
 from indexing.cli.flags import command
 
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
-MotionName = Literal[
-    "auto", "static_2d", "static_3d", "constant_direction_2d", "constant_velocity_2d", "constant_acceleration_2d",
-    "constant_direction_3d", "constant_velocity_planes_3d", "constant_velocity_3d", "constant_velocity_3d_sensors",
-    "two_bodies_2d", "two_bodies_3d",
-]  # fmt: skip
 Number = Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")]
 Numbers = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...", help_behavior_hint="")]
 

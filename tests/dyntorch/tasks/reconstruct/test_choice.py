@@ -17,7 +17,7 @@ from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.reconstruct import normalized
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from dyntorch.tasks.reconstruct.solver import LABEL_COST, OUTLIER_COST, LiftedFit, _lacks, least, penalized
+from dyntorch.tasks.reconstruct.solver import LABEL_COST, OUTLIER_COST, LiftedFit, _lacks, penalized
 
 
 @pytest.mark.slow
@@ -64,7 +64,7 @@ def test_models_that_were_not_tried_say_why() -> None:
 
 
 def test_fewest_tracks_of_two_bodies() -> None:
-    assert least(MOTIONS["two_bodies_3d"], torch.arange(5.0)) == (3, 14)
+    assert MOTIONS["two_bodies_3d"].least(torch.arange(5.0)) == (3, 14)
 
 
 @pytest.mark.slow

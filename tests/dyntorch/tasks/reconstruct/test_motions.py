@@ -1,13 +1,17 @@
 """Motion models: what follows from a lift, against the table of the theory, the scenes, and derivatives by hand."""
 
 import math
+from typing import get_args
 
 import pytest
 import torch
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion, as_motion, polynomial
+from dyntorch.tasks.reconstruct.motion_models import MotionName
+from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion, as_motion, motion_table, polynomial, smaller_motion
+from dyntorch.tasks.reconstruct.result import ReconstructNotice
+from indexing.report.reconstruction import PURPOSE
 
 # k, profile of the fewest views that determine the scene, those views and matches, dimension of the ambiguity
 TABLE = {
@@ -28,7 +32,38 @@ TIMES = (0.0, 1.0, 2.5, 4.0, 7.0)
 
 def test_every_model_is_in_the_table():
     assert set(TABLE) == set(MOTIONS)
-    assert all(name == motion.name and motion.leaves_open for name, motion in MOTIONS.items())
+
+
+def test_a_declaration_is_all_that_others_read():
+    """Names, words, smaller models and their sentences, the command line and the report are made from the declarations."""
+    wrong = []
+    lines = motion_table().splitlines()
+    for (name, motion), line in zip(MOTIONS.items(), lines, strict=True):
+        views, tracks = motion.least(range(12))
+        smaller = [smaller_motion(entry) for entry in motion.smaller]
+        facts = {
+            "name": name == motion.name,
+            "words": motion.leaves_open and motion.metric_open and motion.purpose.endswith("."),
+            "table": line.split()[:4] == [name, str(views), "views", str(tracks)] and line.endswith(motion.purpose),
+            "scene": name in scenes.lifts.KINDS,
+            "command line": name in get_args(MotionName),
+            "report": PURPOSE[name] == motion.purpose,
+            "smaller have fewer unknowns": all(one.k < motion.k or one.dim < motion.dim for one in smaller),
+            "smaller of the same sensor": all(one.sensor == motion.sensor for one in smaller),
+            "sentences": all(entry.case in ReconstructNotice[entry.notice.upper()].templates for entry in motion.smaller),
+        }
+        wrong += [(name, fact) for fact, holds in facts.items() if not holds]
+    assert wrong == []
+
+
+@pytest.mark.slow
+def test_declared_models_take_the_matches_that_exact_ranks_of_their_lifts_take():
+    wrong = {}
+    for name, motion in MOTIONS.items():
+        if motion.lift is not None and motion.tensor(motion.views(range(6))).width() <= 128:
+            counted = Motion(motion.lift, "counted", motion.sensor, static=motion.static).minimal(range(6))
+            wrong |= {} if counted == motion.minimal(range(6)) else {name: counted}
+    assert wrong == {}
 
 
 @pytest.mark.parametrize("name", TABLE)
