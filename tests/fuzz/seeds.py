@@ -14,6 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from indexing.labels.detect import registered_formats as label_formats
+from indexing.readers import FORMATS
+from indexing.readers.detect import detect
+from indexing.readers.files import open_source
+from tests.indexing.readers import tools
+
 FRAMES, JOINTS = 8, 17
 
 
@@ -41,7 +47,22 @@ def make(folder: Path) -> list[Seed]:
     found = [*_json(folder, people), *_tables(folder, people), *_models(folder), *_sets(folder), *_points(folder), *_pairs(folder)]
     found += [*_arrays(folder, people), *_hdf5(folder, people), *_tracks(folder), *_settings(folder), *_pictures(folder)]
     found += _labels(folder)
-    return found
+    return [*found, *_registered(folder, found)]
+
+
+def _registered(folder: Path, known: list[Seed]) -> list[Seed]:
+    """A file of every format of keypoints that has none above, as the test of its reader makes it."""
+    lacking = set(FORMATS) - {detect(open_source(seed.path)) for seed in known if seed.read is keypoints}
+    seeds = []
+    for number, make_sample in enumerate(tools.samples().values() if lacking else ()):
+        place = folder / f"sample{number}"
+        place.mkdir()
+        path = make_sample(place).path
+        name = detect(open_source(path))
+        if name in lacking:
+            seeds.append(Seed(f"{name}:{path.name}", path, keypoints, _scan(folder)))
+    assert lacking <= {seed.name.partition(":")[0] for seed in seeds}, f"formats without a sample in their test: {lacking}"
+    return seeds
 
 
 def person(seed: int, frames: int = FRAMES) -> np.ndarray:
@@ -176,11 +197,7 @@ def _arrays(folder: Path, people: np.ndarray) -> list[Seed]:
 
 
 def _hdf5(folder: Path, people: np.ndarray) -> list[Seed]:
-    """DeepLabCut, SLEAP and movement, where h5py is there."""
-    try:
-        from tests.indexing.readers import tools
-    except ImportError:
-        return []
+    """DeepLabCut, SLEAP and movement."""
     names = [f"p{i}" for i in range(JOINTS)]
     both = {"a": people, "b": people + 1}
     made = [
@@ -427,8 +444,8 @@ def _labels(folder: Path) -> list[Seed]:
 
     found = [Label(1, 3, "squat", "Ann", comment="c", score=1.5), Label(2, 4, "squat", "Ann"), Label(5, 5, "clap", tier="t")]
     seeds = []
-    for name, suffix in {"boris": ".boris", "elan": ".eaf", "tsv": ".tsv", "label_studio": ".json", "via": ".json"}.items():
-        path = folder / f"labels_{name}{suffix}"
+    for name, suffix in (item for known in label_formats().values() for item in known.written.items()):
+        path = folder / f"labels_{name}{suffix or '.json'}"
         write_labels(path, found, recording="session.mp4", duration=60, fps=25, format=name)
         seeds.append(Seed(path.name, path, labels))
     return seeds

@@ -110,11 +110,11 @@ def test_unknown_options_are_refused(tmp_path: Path, options: dict[str, object],
     assert all(word in str(caught.value) for word in words)
 
 
-@pytest.mark.parametrize("name", sorted(set(readers.FORMATS) - {"clipset"}))
-def test_naming_the_wrong_format_says_what_the_file_is(tmp_path: Path, name: str) -> None:
+def test_naming_the_wrong_format_says_what_the_file_is(tmp_path: Path) -> None:
     path = tmp_path / "set.npz"
     np.savez(path, joints=np.ones((3, 2, 2)))
-    refused(path, "is a npz", name, "leave format= out", format=name)
+    for name in set(readers.FORMATS) - {"clipset"}:
+        refused(path, "is a npz", name, "leave format= out", format=name)
 
 
 def test_reading_leaves_the_collector_of_cycles_as_it_was(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import json
 import pickle
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,28 @@ import numpy as np
 import pytest
 
 from indexing.readers import read
+from indexing.skeleton import COCO17, Skeleton
 
 SCORER = "DLC_resnet50_walkJan1shuffle1_100000"
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A file as a tool writes it, and what reading it must give; confidences are .75 where there are some."""
+
+    path: Path
+    fps: float | None = None  # where it has times
+    people: tuple[str | int, ...] = ()  # who is tracked
+    layout: Skeleton | None = COCO17  # whose names the joints have; None: others
+    dims: int = 2
+    clips: int = 1
+
+
+def samples() -> dict[str, Callable[[Path], Sample]]:
+    """What writes a file into a folder, by the tool that writes such files: ``SAMPLES`` of the tests in this folder."""
+    tests = sorted(path for path in Path(__file__).parent.glob("test_*.py") if "\nSAMPLES" in path.read_text(encoding="utf-8"))
+    modules = [import_module(f"tests.indexing.readers.{path.stem}") for path in tests]
+    return {tool: make for module in modules for tool, make in module.SAMPLES.items()}
 
 
 def refused(path: Path, *words: str, action: Callable[..., Any] = read, **options: Any) -> None:
