@@ -14,7 +14,7 @@ from dyntorch.core.outcome import Status
 from dyntorch.geometry.lens import undistorted
 from dyntorch.numerics.arguments import FARTHEST
 from dyntorch.tasks.synchronize.result import Clocks
-from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, read_tracks
+from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks, reject_outliers
 
 SAID_BLOCK = 1_000_000
 """Positions that say where points lie: torch takes quantiles of 16 million numbers at most."""
@@ -91,7 +91,7 @@ def read_rig(
             if lens is not None:
                 own = read.times if own is None else own
                 read = read_tracks(f"tracks[{i}]", straight[-1], None, own, given)
-            found.append(cleaned(read))
+            found.append(reject_outliers(read))
         except ValueError as error:
             raise ValueError(f"camera {i}: {error}") from error
     centers = torch.stack([size[i] / 2 if lens is None else lens[0][:2, 2] for i, lens in enumerate(lenses)])

@@ -18,9 +18,9 @@ from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.piecewise_offset import Course, Jump, JumpEvidence, mended
+from dyntorch.tasks.synchronize.piecewise_offset import Jump, JumpEvidence, PiecewiseOffset, repair_clocks
 from dyntorch.tasks.synchronize.result import BreakNotice, Breaks, ClockBreak, Clocks, Shift
-from dyntorch.tasks.synchronize.synchronize import prepared, synchronize
+from dyntorch.tasks.synchronize.synchronize import prepare_tracks, synchronize
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -93,31 +93,33 @@ def breaks(
         shift = synchronize(a, b, max_shift=max_shift, options=options, **given)
     if shift.status.ndim:
         raise ValueError("breaks are of one pair of films; give those of a batch one by one")
-    first, second, origin = prepared(a, b, options=options, **given)
+    first, second, origin = prepare_tracks(a, b, options=options, **given)
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"breaks are told by corresponding points; a has {a.shape[1]} and b {b.shape[1]}: give the same ones")
     clocks = first.times + origin, second.times + origin
     told = None
-    if not (first.still or second.still):
+    if not (first.static or second.static):
         start = shift.since(-origin)
         rates = (1.0, shift.rate) if shift.rate != 1 else (1.0,)
         evidence = JumpEvidence(first, second, rates, start.offset if start.sigma < math.inf else None, max_shift, options)
-        told = evidence.told()
+        told = evidence.select_significant()
     if told is None or not told[0].jumps:
-        return _unbroken(shift, clocks)
+        return _without_breaks(shift, clocks)
     course, nats, residuals = told
-    found = _found(course, nats, residuals, *evidence.sizes(course), (first, second), origin)
-    a_times, b_times = mended(first, second, course.rate, course.offset, _snapped(course, found, (first.step, second.step)))
+    found = _clock_breaks(course, nats, residuals, *evidence.sizes(course), (first, second), origin)
+    a_times, b_times = repair_clocks(
+        first, second, course.rate, course.offset, _snap_to_frames(course, found, (first.step, second.step))
+    )
     new = a_times.times + origin, b_times.times + origin
     again = synchronize(a, b, times=new, max_shift=max_shift, calibration=calibration, weights=weights, options=options)
-    if not again.ok or evidence.contradicted(course):
+    if not again.ok or evidence.is_contradicted(course):
         refused = (Notice(BreakNotice.UNDECIDED, 0.0, {"said": again.reason or "pieces of the take contradict each other"}),)
         return Breaks((), clocks, shift, status=status_from(refused), notices=refused)
     limits = tuple(_notice(one) for one in found)
     return Breaks(found, new, again, status=status_from(limits), notices=limits)
 
 
-def _unbroken(shift: Shift, clocks: tuple[Tensor, Tensor]) -> Breaks:
+def _without_breaks(shift: Shift, clocks: tuple[Tensor, Tensor]) -> Breaks:
     """Nothing jumps; where no single offset is sure either, that is said."""
     limits = () if shift.ok else (Notice(BreakNotice.UNDECIDED, 0.0, {"said": shift.reason}),)
     return Breaks((), clocks, shift, status=status_from(limits), notices=limits)
@@ -126,8 +128,8 @@ def _unbroken(shift: Shift, clocks: tuple[Tensor, Tensor]) -> Breaks:
 WHOLE_FRAME_TOLERANCE = 0.3  # Frames by which a jump may differ from a whole number of frames.
 
 
-def _found(
-    course: Course, nats: list[float], residuals: list[float], sizes: list[float], sigmas: list[float],
+def _clock_breaks(
+    course: PiecewiseOffset, nats: list[float], residuals: list[float], sizes: list[float], sigmas: list[float],
     tracks: tuple[Tracks, Tracks], origin: float,
 ) -> tuple[ClockBreak, ...]:  # fmt: skip
     """The jumps as breaks of one or the other camera."""
@@ -155,7 +157,7 @@ def _found(
     return tuple(found)
 
 
-def _snapped(course: Course, found: Sequence[ClockBreak], steps: tuple[float, float]) -> tuple[Jump, ...]:
+def _snap_to_frames(course: PiecewiseOffset, found: Sequence[ClockBreak], steps: tuple[float, float]) -> tuple[Jump, ...]:
     """The jumps by whole frames where those fit, else by as much as was measured."""
     exact = []
     for jump, one in zip(course.jumps, found, strict=True):
@@ -272,12 +274,12 @@ def camera_breaks(
         for pair, told in sure.items()
         for one in told.breaks
     ]
-    broken = tuple(one for group in _together(blames) for one in _blamed(group, sorted(sure), count, own))
+    broken = tuple(one for group in _group_by_moment(blames) for one in _attribute_to_cameras(group, sorted(sure), count, own))
     limits: tuple[Notice, ...] = tuple(_notice(one) for one in broken)
     if not sure:
         said = next((one.reason for one in found.values()), "no pair was compared")
         limits = (Notice(BreakNotice.UNDECIDED, 0.0, {"said": said}),)
-    new = tuple(mended_times(clock, camera, broken) for camera, clock in enumerate(own))
+    new = tuple(repair_times(clock, camera, broken) for camera, clock in enumerate(own))
     return Breaks(broken, new, clocks, status=status_from(limits), notices=limits)
 
 
@@ -298,7 +300,7 @@ def _reference(clocks: Clocks, camera: int, moment: float) -> float:
 MAX_BREAK_DISTANCE_SECONDS = 1.0  # Within this the breaks of several pairs are one.
 
 
-def _together(blames: list[Blame]) -> list[list[Blame]]:
+def _group_by_moment(blames: list[Blame]) -> list[list[Blame]]:
     """Groups of breaks that may be one, by their moments."""
     groups: list[list[Blame]] = []
     for one in sorted(blames, key=lambda blame: blame.time):
@@ -309,13 +311,15 @@ def _together(blames: list[Blame]) -> list[list[Blame]]:
     return groups
 
 
-def _blamed(group: list[Blame], pairs: Sequence[tuple[int, int]], count: int, times: Sequence[Tensor]) -> list[ClockBreak]:
+def _attribute_to_cameras(
+    group: list[Blame], pairs: Sequence[tuple[int, int]], count: int, times: Sequence[Tensor]
+) -> list[ClockBreak]:
     """Cameras that broke at about one moment: as long as there is something to explain, the one that explains most of it."""
     left, found = list(group), []
     while left:
         ranked = []
         for camera in range(count):
-            mine = _agreeing([one for one in left if camera in one.pair], camera, times)
+            mine = _largest_agreeing_set([one for one in left if camera in one.pair], camera, times)
             # a pair of this camera that saw nothing, and a break of two others, speak against it
             silent = sum(camera in pair for pair in pairs) - len({one.pair for one in mine})
             ranked.append((len(mine) - silent, len(mine), camera, mine))
@@ -331,7 +335,7 @@ def _blamed(group: list[Blame], pairs: Sequence[tuple[int, int]], count: int, ti
     return found
 
 
-def _agreeing(mine: list[Blame], camera: int, times: Sequence[Tensor]) -> list[Blame]:
+def _largest_agreeing_set(mine: list[Blame], camera: int, times: Sequence[Tensor]) -> list[Blame]:
     """The largest set of a camera's pairs that say the same jump, to half a frame."""
     frame = float(times[camera].diff().median()) if len(times[camera]) > 1 else 0.0
     sets = [
@@ -361,7 +365,7 @@ def _of_camera(camera: int, mine: list[Blame], times: Sequence[Tensor]) -> Clock
     )
 
 
-def mended_times(times: Tensor, camera: int, broken: Sequence[ClockBreak]) -> Tensor:
+def repair_times(times: Tensor, camera: int, broken: Sequence[ClockBreak]) -> Tensor:
     """Times ``(frames,)`` of a camera's frames, as a clock that does not break would have told them."""
     new = times.clone()
     step = float(times.diff().median()) if len(times) > 1 else 0.0

@@ -42,7 +42,7 @@ class Network:
     weight: Tensor  # ``(E,)`` of the squared residual: the probability that the best peak is right
 
     @property
-    def searched(self) -> bool:
+    def has_rates(self) -> bool:
         """Whether some pair searched its rate."""
         return bool((self.rate_sigma > FIXED_RATE_SIGMA).any())
 
@@ -152,17 +152,17 @@ def readings(net: Network, reference: int) -> list[Reading]:
     logs, starts = _search(net, reference)
     found: dict[tuple[int, ...], Reading] = {}
     for one_log, one_start in zip(logs, starts, strict=True):
-        reading = refined(net, reference, one_log, one_start)
+        reading = refine_reading(net, reference, one_log, one_start)
         if reading.labels not in found or reading.cost < found[reading.labels].cost:
             found[reading.labels] = reading
     different: list[Reading] = []
     for reading in sorted(found.values(), key=lambda one: one.cost):
-        if all(differing(net, reading, other) for other in different):
+        if all(differing_cameras(net, reading, other) for other in different):
             different.append(reading)
     return different
 
 
-def differing(net: Network, one: Reading, other: Reading) -> list[int]:
+def differing_cameras(net: Network, one: Reading, other: Reading) -> list[int]:
     """Cameras whose clocks differ by more than a frame and four standard deviations, or have none in one of the two."""
     variance = torch.minimum(one.covariance.diagonal(), other.covariance.diagonal())[net.cameras :]
     allowed = torch.maximum(4 * variance.sqrt(), net.slack.max() / PEAK_ERROR_FRAMES)
@@ -186,7 +186,7 @@ def _search(net: Network, reference: int) -> tuple[Tensor, Tensor]:
     for camera in placed[1:] * 2:
         joined += [camera] if camera not in joined else []
         ties = torch.tensor([camera in ends and set(ends) <= set(joined) for ends in net.ends.tolist()])
-        logs, starts = _joined(net, logs, starts, camera, ties)
+        logs, starts = _add_camera(net, logs, starts, camera, ties)
         within = torch.tensor([set(ends) <= set(joined) for ends in net.ends.tolist()])
         saved = (starts[:, joined].isnan() * net.saving[joined]).sum(-1)
         cost = _costs(net, logs, starts, within)[0].sum(-1) - saved
@@ -211,7 +211,7 @@ def _next(net: Network, placed: list[int]) -> int | None:
     return camera if camera is not None and best[camera] > 0 else None
 
 
-def _joined(net: Network, logs: Tensor, starts: Tensor, camera: int, ties: Tensor) -> tuple[Tensor, Tensor]:
+def _add_camera(net: Network, logs: Tensor, starts: Tensor, camera: int, ties: Tensor) -> tuple[Tensor, Tensor]:
     """Every state as it is, then with the camera where each candidate of each tie puts it: ``(S (1 + ties K), cameras)``."""
     new_logs, new_starts = [logs], [starts]
     for edge in ties.nonzero().flatten().tolist():
@@ -238,7 +238,7 @@ def _costs(net: Network, logs: Tensor, starts: Tensor, pairs: Tensor) -> tuple[T
     spread = torch.hypot(net.sigma, net.slack)[pairs, None]
     fit, label = torch.nan_to_num(0.5 * (away / spread).square() + net.cost[pairs], nan=torch.inf).min(-1)
     # rates are compared more loosely than they were measured, like shifts
-    loose = torch.hypot(net.rate_sigma, torch.tensor(UNSEARCHED_RATE_SIGMA if net.searched else FIXED_RATE_SIGMA))[pairs]
+    loose = torch.hypot(net.rate_sigma, torch.tensor(UNSEARCHED_RATE_SIGMA if net.has_rates else FIXED_RATE_SIGMA))[pairs]
     drift = (net.rate[pairs] - logs[:, j] + logs[:, i]) / loose
     fit = fit + (0.5 * drift.square()).clamp(max=MAX_RATE_COST)
     return torch.minimum(fit, net.none[pairs]), torch.where(fit <= net.none[pairs], label, -1)
@@ -266,7 +266,7 @@ def _distinct(starts: Tensor, cost: Tensor, allowed: float) -> Tensor:
 MAX_REWEIGHTINGS = 5  # Reweighted least squares of a state.
 
 
-def refined(net: Network, reference: int, logs: Tensor, starts: Tensor) -> Reading:
+def refine_reading(net: Network, reference: int, logs: Tensor, starts: Tensor) -> Reading:
     """The weighted least squares of the candidates that a state agrees with, and these chosen again, until they stay."""
     every = torch.ones(len(net.ends), dtype=torch.bool)
     labels: tuple[int, ...] = ()
@@ -468,7 +468,7 @@ def combine_shifts(shifts: Mapping[tuple[int, int], Shift], cameras: int, refere
         offsets=offsets,
         rates=rates,
         sigmas=_sigmas(best, rates, center),
-        rate_sigmas=best.covariance.diagonal()[:cameras].sqrt() * rates * float(net.searched),
+        rate_sigmas=best.covariance.diagonal()[:cameras].sqrt() * rates * float(net.has_rates),
         confidence=confidence,
         pairs=table,
         cycle_error=(sum(error**2 for _, error in cycles) / len(cycles)) ** 0.5 if cycles else nan,
@@ -548,12 +548,12 @@ def _refusal(
     if lost:
         return Notice(ClocksNotice.LOST, float(len(lost)), {"lost": tuple(lost)})
     ends, sure = list(shifts), _surely_tied(shifts, best, reference)
-    margins = [MIN_LOG_ODDS if sure.issuperset(differing(net, best, one)) else MIN_LOG_ODDS_OF_REFUSED for one in rivals]
+    margins = [MIN_LOG_ODDS if sure.issuperset(differing_cameras(net, best, one)) else MIN_LOG_ODDS_OF_REFUSED for one in rivals]
     close = [one for one, margin in zip(rivals, margins, strict=True) if one.cost - best.cost < margin]
     if not close:
         return None
     rival = min(close, key=lambda one: one.cost)
-    undecided = tuple(differing(net, best, rival))
+    undecided = tuple(differing_cameras(net, best, rival))
     lost = rival.starts.isnan().nonzero().flatten().tolist()
     refused = [pair for pair, shift in shifts.items() if not shift.ok and (not lost or set(lost) & set(pair))]
     if refused:

@@ -10,20 +10,20 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Notice, Status, status_from
-from dyntorch.tasks.synchronize.motion_capture import combined_fit
+from dyntorch.tasks.synchronize.motion_capture import fit_combination
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
 from dyntorch.tasks.synchronize.row_spaces import (
     KINDS,
     MEASURES,
-    Films,
     Hypothesis,
     Kind,
     KindMoments,
     Place,
+    TrackPair,
     hypotheses,
     kind_moments,
-    refined,
+    refine_lag,
 )
 from dyntorch.tasks.synchronize.subspace import (
     MAX_SIGMA_FRAMES,
@@ -36,7 +36,7 @@ from dyntorch.tasks.synchronize.subspace import (
     subspace_curve,
     subspace_shift,
 )
-from dyntorch.tasks.synchronize.tracks import MAX_FRAME_RATE_ERROR, RATE_SIGNIFICANCE_SIGMAS, Tracks, smoothed
+from dyntorch.tasks.synchronize.tracks import MAX_FRAME_RATE_ERROR, RATE_SIGNIFICANCE_SIGMAS, Tracks, smooth_at
 
 MIN_STEP_SECONDS = 1 / 30  # Step of the search at least: faster videos say no more.
 MIN_SECONDS_FOR_RATE = 20.0  # Overlap from which clock rates are searched.
@@ -51,7 +51,7 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
         if value not in known:
             raise ValueError(f"options.{name} must be one of {', '.join(known)}, got {value!r}")
     step = max(a.step, b.step, MIN_STEP_SECONDS)
-    a, b = _upright(a, b, step, rate or 1.0, max_shift)
+    a, b = _orient_axes(a, b, step, rate or 1.0, max_shift)
     found = _Samples(a, b, step, rate or 1.0)
     curve = found.curve(max_shift)
     best = found.shift(curve)
@@ -59,17 +59,17 @@ def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: flo
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
     if rate is None and span > MIN_SECONDS_FOR_RATE and math.isfinite(best.sigma):
         # a shift that is sure of itself is near enough everywhere; one that is not may be smeared by a wrong rate
-        settled = _drift(curve, best, step) if best.ok else _rate(a, b, step, span, found.lag(best.position))
+        settled = _rate_by_windows(curve, best, step) if best.ok else _rate_by_search(a, b, step, span, found.lag(best.position))
         ratio, rate_sigma = settled
         if ratio != 1:
             found = _Samples(a, b, step, ratio)
             curve = found.curve(max_shift)
             best = found.shift(curve)
-    body = _result(a, b, found, curve, _to_a_frame(best, step, max(a.step, b.step)), rate_sigma)
+    body = _result(a, b, found, curve, _refuse_coarse(best, step, max(a.step, b.step)), rate_sigma)
     spaces = row_space_shift(a, b, step=step, rate=body.rate, max_shift=max_shift, around=body.offset, options=options)
     if options.measure == options.camera_model == "auto":
-        return _forwards(_between_frames(a, b, _combined(body, spaces)), curve)
-    return _of_spaces(body, spaces, 1 / min(body.fps))
+        return _test_time_reversal(_refine_by_combinations(a, b, _decide(body, spaces)), curve)
+    return _with_row_space_lag(body, spaces, 1 / min(body.fps))
 
 
 # From here on the lag is that of one kind of camera; below, sigma includes the difference of both methods.
@@ -80,7 +80,7 @@ MIN_CONFIRMING_STRENGTH = 0.6  # The same above which a row-space peak that agre
 MIN_SUPPORTING_STRENGTH = 0.15  # The same below which even an agreeing lag is refused.
 
 
-def _combined(body: Shift, spaces: RowSpaceShift | None) -> Shift:
+def _decide(body: Shift, spaces: RowSpaceShift | None) -> Shift:
     """What the body's shape and motion say, and what its row spaces say: both may decide, neither may contradict the other."""
     if spaces is None or body.status in (Status.TOO_FEW, Status.DEGENERATE):
         return body
@@ -90,26 +90,26 @@ def _combined(body: Shift, spaces: RowSpaceShift | None) -> Shift:
         # cameras that are nearly of some kind bend a lag by a frame or two, each way of looking by as much as it is wrong
         spaces = dataclasses.replace(spaces, sigma=math.hypot(spaces.sigma, away))
     if spaces.ok:
-        return _refused(body, spaces) if apart and body.ok else _of_spaces(body, spaces, frame)
+        return _refuse_contradiction(body, spaces) if apart and body.ok else _with_row_space_lag(body, spaces, frame)
     if not body.ok:  # the likelier candidate of two that do not decide
-        return _of_spaces(body, spaces, frame) if spaces.strength > MIN_CONFIRMING_STRENGTH else body
+        return _with_row_space_lag(body, spaces, frame) if spaces.strength > MIN_CONFIRMING_STRENGTH else body
     if apart:
-        return _refused(body, spaces) if spaces.strength > MIN_CONTRADICTING_STRENGTH else body
+        return _refuse_contradiction(body, spaces) if spaces.strength > MIN_CONTRADICTING_STRENGTH else body
     if spaces.strength > MIN_CONFIRMING_STRENGTH:
-        return _of_spaces(body, spaces, frame, confirmed=True)
+        return _with_row_space_lag(body, spaces, frame, confirmed=True)
     if spaces.strength < MIN_SUPPORTING_STRENGTH:
-        return _refused(body, spaces)
-    return body if away <= frame else _blunt(body, math.hypot(body.sigma, away / 2), frame)
+        return _refuse_contradiction(body, spaces)
+    return body if away <= frame else _refuse_imprecise(body, math.hypot(body.sigma, away / 2), frame)
 
 
-def _between_frames(a: Tracks, b: Tracks, shift: Shift) -> Shift:
+def _refine_by_combinations(a: Tracks, b: Tracks, shift: Shift) -> Shift:
     """Of a camera and points in space, which are seen as combinations of these, the place between frames that a camera tells."""
     blunt = any(notice.code == ShiftNotice.BLUNT for notice in shift.notices)
     if a.x.shape[-1] == b.x.shape[-1] or not (shift.ok or blunt):
         return shift
     turned = a.x.shape[-1] == 3  # the fit goes from the camera to the space
     offset, rate = (-shift.offset / shift.rate, 1 / shift.rate) if turned else (shift.offset, shift.rate)
-    found = combined_fit(b, a, offset, rate) if turned else combined_fit(a, b, offset, rate)
+    found = fit_combination(b, a, offset, rate) if turned else fit_combination(a, b, offset, rate)
     if found is None:
         return shift
     place, sigma = (-found.offset * shift.rate, found.sigma * shift.rate) if turned else (found.offset, found.sigma)
@@ -126,13 +126,13 @@ MIN_FORWARD_MARGIN = 5.0
 CLEAR_MARGIN = 20.0  # Margin (nats) above which the time-reversal test is skipped.
 
 
-def _forwards(shift: Shift, curve: SubspaceCurve) -> Shift:
+def _test_time_reversal(shift: Shift, curve: SubspaceCurve) -> Shift:
     """Refused where b played backwards tells about as much at its best lag: chance does that, and a film that somebody reversed."""
     if not shift.ok or curve.bodies is None:
         return shift
     first, second = curve.bodies
     lags = int(curve.lags[0]), int(curve.lags[-1])
-    other = bodies_curve(first, second.reversed, lags, first.step)
+    other = bodies_curve(first, second.time_reversed, lags, first.step)
     best, backwards = (float(one.scores.nan_to_num(-math.inf).max()) for one in (curve, other))
     more = (best - backwards if backwards > -math.inf else math.inf) - MIN_FORWARD_MARGIN
     confidence = shift.confidence / (1 + math.exp(-max(min(more, 700.0), -700.0)))
@@ -144,7 +144,7 @@ def _forwards(shift: Shift, curve: SubspaceCurve) -> Shift:
     return dataclasses.replace(shift, status=status_from((notice,)), notices=(notice, *shift.notices), confidence=confidence)
 
 
-def _blunt(shift: Shift, sigma: float, frame: float) -> Shift:
+def _refuse_imprecise(shift: Shift, sigma: float, frame: float) -> Shift:
     """Refused: known to no better than a frame."""
     notice = Notice(ShiftNotice.BLUNT, sigma, {"case": "frame", "frame": frame})
     return dataclasses.replace(
@@ -152,14 +152,14 @@ def _blunt(shift: Shift, sigma: float, frame: float) -> Shift:
     )
 
 
-def _refused(body: Shift, spaces: RowSpaceShift) -> Shift:
+def _refuse_contradiction(body: Shift, spaces: RowSpaceShift) -> Shift:
     """Two answers, both sure."""
     rivals = ", ".join(f"{second + (body.rate - 1) * body.center:+.2f}" for second in (body.offset, spaces.lag))
     notice = Notice(ShiftNotice.REPEATED, spaces.margin, {"case": "others", "rivals": rivals})
     return dataclasses.replace(body, status=status_from((notice,)), notices=(notice,), confidence=min(body.confidence, 0.5))
 
 
-def _of_spaces(body: Shift, spaces: RowSpaceShift | None, frame: float, *, confirmed: bool = False) -> Shift:
+def _with_row_space_lag(body: Shift, spaces: RowSpaceShift | None, frame: float, *, confirmed: bool = False) -> Shift:
     """The answer of the row spaces, with the body's clock rate; ``confirmed`` by the evidence of shape and motion."""
     if spaces is None:
         notice = Notice(ShiftNotice.SHORT_OVERLAP)
@@ -171,7 +171,7 @@ def _of_spaces(body: Shift, spaces: RowSpaceShift | None, frame: float, *, confi
     if not (spaces.ok or confirmed):
         rivals = ", ".join(f"{second:+.2f}" for second in peaks[1:4, 0].tolist())
         notices.append(Notice(ShiftNotice.REPEATED, spaces.margin, {"case": "unclear", "rivals": rivals}))
-    for which, mask in zip("ab", spaces.foreign, strict=True):
+    for which, mask in zip("ab", spaces.rejected, strict=True):
         if bool(mask.any()):
             tracks = ", ".join(str(k) for k in mask.nonzero()[:, 0].tolist())
             notices.append(Notice(ShiftNotice.FOREIGN, float(mask.sum()), {"which": which, "tracks": tracks, "points": len(mask)}))
@@ -187,17 +187,17 @@ def _of_spaces(body: Shift, spaces: RowSpaceShift | None, frame: float, *, confi
         notices=tuple(notices),
     )
     decided = spaces.ok or confirmed
-    return _blunt(found, found.sigma, frame) if decided and found.sigma > MAX_SIGMA_FRAMES * frame else found
+    return _refuse_imprecise(found, found.sigma, frame) if decided and found.sigma > MAX_SIGMA_FRAMES * frame else found
 
 
-def _to_a_frame(best: SubspaceShift, step: float, frame: float) -> SubspaceShift:
+def _refuse_coarse(best: SubspaceShift, step: float, frame: float) -> SubspaceShift:
     """Refused where the shift is not known to a frame of the slower camera, though it may be to a step of the search."""
     if not best.ok or best.sigma * step <= MAX_SIGMA_FRAMES * frame:
         return best
     return dataclasses.replace(best, refusal=Notice(ShiftNotice.BLUNT, best.sigma * step, {"case": "frame", "frame": frame}))
 
 
-def _upright(a: Tracks, b: Tracks, step: float, rate: float, max_shift: float | None) -> tuple[Tracks, Tracks]:
+def _orient_axes(a: Tracks, b: Tracks, step: float, rate: float, max_shift: float | None) -> tuple[Tracks, Tracks]:
     """Both, points in space with that axis second which shares most with the y of the camera: files have y or z up."""
     if a.x.shape[-1] == b.x.shape[-1]:
         return a, b
@@ -213,8 +213,8 @@ class _Samples:
     """Both cameras at equal steps of a's clock."""
 
     def __init__(self, a: Tracks, b: Tracks, step: float, rate: float) -> None:
-        self.first, self.wa = _sampled(a, step)
-        self.second, self.wb = _sampled(b, step * rate)
+        self.first, self.wa = _resample(a, step)
+        self.second, self.wb = _resample(b, step * rate)
         self.start = float(b.times[0]) / rate - float(a.times[0])
         self.step, self.rate = step, rate
 
@@ -234,10 +234,10 @@ class _Samples:
         return (self.start + position * self.step) * self.rate
 
 
-def _sampled(tracks: Tracks, step: float) -> tuple[Tensor, Tensor]:
+def _resample(tracks: Tracks, step: float) -> tuple[Tensor, Tensor]:
     if abs(tracks.step / step - 1) < 1e-6 and float((tracks.times.diff() / step - 1).abs().max()) < 1e-3:
         return tracks.x, tracks.weights  # its own frames: nothing to interpolate
-    x, _, weights = smoothed(tracks, tracks.every(step), max(0.5 * step, 0.5 * tracks.step))
+    x, _, weights = smooth_at(tracks, tracks.every(step), max(0.5 * step, 0.5 * tracks.step))
     return x, weights
 
 
@@ -247,7 +247,7 @@ MIN_WINDOW_PROBABILITY = 0.5  # Probability from which the shift of a window cou
 MIN_WINDOW_SIGMA_FRAMES = 0.3  # Error of the shift of a window at least, frames.
 
 
-def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[float, float]:
+def _rate_by_windows(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[float, float]:
     """The clock rate by a line through the shifts of windows, and its sigma; 1 unless it differs significantly."""
     assert curve.bodies is not None
     first, second = curve.bodies
@@ -256,7 +256,7 @@ def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[floa
     size = min(round(RATE_WINDOW_SECONDS / step), (end - begin) // 4)
     found = []
     for start in range(begin, end - size + 1, size):
-        parts = _cut(first, start, start + size), _cut(second, start + lag - reach, start + lag + size + reach)
+        parts = _slice_body(first, start, start + size), _slice_body(second, start + lag - reach, start + lag + size + reach)
         local = subspace_shift(bodies_curve(*parts, (0, 2 * reach), step), step=1.0)
         if math.isfinite(local.sigma) and local.probability > MIN_WINDOW_PROBABILITY and 1 < local.position < 2 * reach - 1:
             found.append((start + size / 2, local.position, max(local.sigma, MIN_WINDOW_SIGMA_FRAMES)))
@@ -277,7 +277,7 @@ def _drift(curve: SubspaceCurve, best: SubspaceShift, step: float) -> tuple[floa
     return (1 + drift, sigma) if abs(drift) > RATE_SIGNIFICANCE_SIGMAS * sigma else (1.0, sigma)
 
 
-def _cut(body: Body, start: int, end: int) -> Body:
+def _slice_body(body: Body, start: int, end: int) -> Body:
     part = slice(start, min(end, len(body.rows)))
     return dataclasses.replace(body, rows=body.rows[part], motion=body.motion[part], weights=body.weights[part])
 
@@ -285,7 +285,7 @@ def _cut(body: Body, start: int, end: int) -> Body:
 MIN_RATE_GAIN = 8.0  # Nats by which another clock rate has to be better.
 
 
-def _rate(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float) -> tuple[float, float]:
+def _rate_by_search(a: Tracks, b: Tracks, step: float, span: float, lag: Tensor | float) -> tuple[float, float]:
     """The clock rate whose best score near a shift is highest, by the parabola over rates, and its sigma; 1 unless convincing."""
     change = 4 * step / span  # moves the ends of the overlap by two steps
     count = math.ceil(MAX_FRAME_RATE_ERROR / change)
@@ -353,12 +353,12 @@ class RowSpaceShift:
     margin: float  # nats over any other lag
     curve: Hypothesis  # of that kind and level
     seconds: Tensor  # ``(L,)`` of its lags
-    foreign: tuple[Tensor, Tensor]  # tracks of a and of b ``(n,)``, ``(m,)`` bool that were left out
+    rejected: tuple[Tensor, Tensor]  # tracks of a and of b ``(n,)``, ``(m,)`` bool that were left out
 
     @property
     def ok(self) -> bool:
         """Whether the lag is beyond doubt."""
-        return _decided(self.clearness, self.votes)
+        return _accepts(self.clearness, self.votes)
 
     @property
     def strength(self) -> float:
@@ -383,10 +383,10 @@ class RowSpaceShift:
         """Probability that the lag is right, from how clear it is."""
         return _sigmoid((_strength(self.clearness, self.votes) - 1) * CLEARNESS_ODDS + math.log(19))
 
-    def turned(self, rate: float) -> RowSpaceShift:
+    def exchange(self, rate: float) -> RowSpaceShift:
         """The same with a and b exchanged; ``rate`` of the new b's clock."""
         lag, sigma, seconds = -self.lag * rate, self.sigma * rate, -self.seconds * rate
-        return replace(self, lag=lag, sigma=sigma, seconds=seconds, foreign=(self.foreign[1], self.foreign[0]))
+        return replace(self, lag=lag, sigma=sigma, seconds=seconds, rejected=(self.rejected[1], self.rejected[0]))
 
 
 MIN_CLEARNESS = 4.2  # Margin over the spread of other lags that decides where all hypotheses agree.
@@ -398,7 +398,7 @@ def _strength(clearness: float, votes: float) -> float:
     return clearness / (MIN_CLEARNESS + (1 - votes) * LONE_CLEARNESS)
 
 
-def _decided(clearness: float, votes: float) -> bool:
+def _accepts(clearness: float, votes: float) -> bool:
     return _strength(clearness, votes) >= 1
 
 
@@ -414,35 +414,35 @@ def row_space_shift(
     a: Tracks, b: Tracks, *, step: float, rate: float, max_shift: float | None, around: float = 0.0, options: SynchronizeOptions
 ) -> RowSpaceShift | None:
     """The clearest lag between two cameras' row spaces; None where none can be judged."""
-    if a.still or b.still:
+    if a.static or b.static:
         return None
     if b.x.shape[-1] == 3:  # what is looked at between frames is the second, and a camera is the shorter take of fewer points
         back = {"step": step * rate, "rate": 1 / rate, "around": -around / rate}
         other = row_space_shift(b, a, max_shift=max_shift, options=options, **back)
-        return None if other is None else other.turned(rate)
-    films = Films(a, b, step, rate, options)
-    films = films.completed if films.spatial else films
+        return None if other is None else other.exchange(rate)
+    films = TrackPair(a, b, step, rate, options)
+    films = films.without_gaps if films.spatial else films
     ta, tb = films.times
     if min(len(ta), len(tb)) < 3:
         return None
     start = float(tb[0]) / rate - float(ta[0])
-    lags = _span(films, start, max_shift, around / rate)
+    lags = _lag_range(films, start, max_shift, around / rate)
     if lags is None:
         return None
     kinds = kind_moments(films, lags)
     found = hypotheses(kinds)
     if not found:
         return None
-    best, votes = _chosen(found)
+    best, votes = _select_clearest(found)
     kept = tuple(torch.ones(x.x.shape[1], dtype=torch.bool, device=x.x.device) for x in (a, b))
     if MIN_STRENGTH_FOR_REJECTION < _strength(best.clearness, votes) < 1:
-        without = _left_out(kinds, best)
+        without = _reject_tracks(kinds, best)
         if without is not None:
             fewer = hypotheses([one.only(*without) for one in kinds])
-            chosen, agree = _chosen(fewer)
+            chosen, agree = _select_clearest(fewer)
             if _strength(chosen.clearness, agree) > MIN_CLEARNESS_GAIN * _strength(best.clearness, votes):
                 best, votes, kept, found = chosen, agree, without, fewer
-    kind, place = _plainest(films.only(*kept), found, best)
+    kind, place = _locate_between_frames(films.only(*kept), found, best)
     seconds = (start + best.lags * step) * rate
     lag, sigma, foreign = (start + place.lag * step) * rate, place.sigma * step * rate, (~kept[0], ~kept[1])
     return RowSpaceShift(lag, sigma, kind, best.clearness, votes, best.margin, best, seconds, foreign)
@@ -451,7 +451,7 @@ def row_space_shift(
 MAX_LAGS = 1_200  # Lags; of longer searches those near the best one of shape and motion.
 
 
-def _span(films: Films, start: float, max_shift: float | None, around: float) -> tuple[int, int] | None:
+def _lag_range(films: TrackPair, start: float, max_shift: float | None, around: float) -> tuple[int, int] | None:
     """First and last lag, frames."""
     ta, tb = films.times
     lo, hi = 1 - len(ta), len(tb) - 1
@@ -464,7 +464,7 @@ def _span(films: Films, start: float, max_shift: float | None, around: float) ->
     return (lo, hi) if hi - lo >= 2 else None
 
 
-def _chosen(found: list[Hypothesis]) -> tuple[Hypothesis, float]:
+def _select_clearest(found: list[Hypothesis]) -> tuple[Hypothesis, float]:
     """The clearest, and the share of all that say the same lag."""
     best = max(found, key=lambda one: one.clearness)
     place = float(best.lags[best.best])
@@ -474,7 +474,7 @@ def _chosen(found: list[Hypothesis]) -> tuple[Hypothesis, float]:
 EQUIVALENT_NATS_SHARE = 0.75  # Share of the nats of the best kind of camera from which another one is equivalent.
 
 
-def _plainest(films: Films, found: list[Hypothesis], best: Hypothesis) -> tuple[Kind, Place]:
+def _locate_between_frames(films: TrackPair, found: list[Hypothesis], best: Hypothesis) -> tuple[Kind, Place]:
     """Of the kinds that say the same lag, the one with most nats at its place: cameras as they are leave but noise
     unexplained."""
     lag = float(best.lags[best.best])
@@ -483,7 +483,7 @@ def _plainest(films: Films, found: list[Hypothesis], best: Hypothesis) -> tuple[
     chosen = [
         max(part, key=lambda one: float(one.totals[one.best])) for part in (fixed, [x for x in same if x not in fixed]) if part
     ]
-    places = [(one.kind, refined(films, one)) for one in chosen]
+    places = [(one.kind, refine_lag(films, one)) for one in chosen]
     kind, first = max(places, key=lambda pair: pair[1].nats)
     rivals = [place for _, place in places if place.nats > EQUIVALENT_NATS_SHARE * first.nats]
     apart = max((abs(place.lag - first.lag) for place in rivals), default=0.0) / 2
@@ -494,7 +494,7 @@ MAX_REJECTED_SHARE = 0.34  # Share of a camera's tracks that may be rejected.
 MIN_TRACKS = 3  # Tracks that stay at least.
 
 
-def _left_out(kinds: list[KindMoments], best: Hypothesis) -> tuple[Tensor, Tensor] | None:
+def _reject_tracks(kinds: list[KindMoments], best: Hypothesis) -> tuple[Tensor, Tensor] | None:
     """Tracks of a and of b ``(n,)``, ``(m,)`` bool that are left when those go, one by one, without which a lag stands out more."""
     counts = [kinds[0].films.a.x.shape[1], kinds[0].films.b.x.shape[1]]
     kept = [torch.ones(count, dtype=torch.bool) for count in counts]

@@ -16,7 +16,7 @@ from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, rank
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.lags import epipolar_moments
 from dyntorch.numerics.least_squares import damped_step
-from dyntorch.tasks.synchronize.tracks import Tracks, noise_ratio, smoothed
+from dyntorch.tasks.synchronize.tracks import Tracks, noise_ratio, smooth_at
 
 MIN_PEAK_SEPARATION_FRAMES = 2.5  # Within this peaks are one, and halves of a take agree.
 MIN_HALF_OVERLAP_SHARE = 0.5  # Share of the largest overlap below which a half of the take does not score a lag.
@@ -42,8 +42,8 @@ class Samples:
     @classmethod
     def of(cls, a: Tracks, b: Tracks, step: float, rate: float = 1.0) -> Self:
         """b's clock goes ``rate`` seconds in one of a's.  The kernel is as wide as a step."""
-        first, w1 = _sampled(a, step, step)
-        second, w2 = _sampled(b, step * rate, step * rate)
+        first, w1 = _sample(a, step, step)
+        second, w2 = _sample(b, step * rate, step * rate)
         noise = float(a.change[0, 0]), float(b.change[0, 0]) * noise_ratio(a, b)
         start = float(b.times[0]) / rate - float(a.times[0])
         return cls(first, second, w1, w2, step, start, rate, noise)
@@ -65,7 +65,7 @@ class Samples:
         """Moments ``([n,] L, ...)`` of the residual at lags, and counts ``([n,] L)`` of pairs of positions."""
         return epipolar_moments(self.x1, self.x2, lags, (self.w1, self.w2), per_point)
 
-    def solved(self, moments: Tensor) -> tuple[Tensor, Tensor]:
+    def solve(self, moments: Tensor) -> tuple[Tensor, Tensor]:
         """Variances ``(L,)`` of the residual, px^2 of a, and the geometry ``(L, ...)`` that has it."""
         return epipolar_variance(moments, self.noise)
 
@@ -127,7 +127,7 @@ def epipolar_curve(samples: Samples, max_shift: float | None = None, overlap: fl
     r"""Scores at all lags."""
     overlap = MIN_OVERLAP_SHARE if overlap is None else overlap
     lo, hi = samples.lags(max_shift)
-    found = [_piece(samples, first, min(first + PIECE - 1, hi)) for first in range(lo, hi + 1, PIECE)]
+    found = [_score_chunk(samples, first, min(first + PIECE - 1, hi)) for first in range(lo, hi + 1, PIECE)]
     if not found:
         empty = samples.x1.new_zeros(0)
         return Curve(empty, empty, empty, empty, samples.rate, 1.0)
@@ -140,13 +140,13 @@ def epipolar_curve(samples: Samples, max_shift: float | None = None, overlap: fl
     return Curve(lags, torch.where(judged, scores, torch.nan), variance, counts, samples.rate, float(level))
 
 
-def _piece(samples: Samples, lo: int, hi: int) -> tuple[Tensor, Tensor]:
+def _score_chunk(samples: Samples, lo: int, hi: int) -> tuple[Tensor, Tensor]:
     moments, counts = samples.moments((lo, hi))
-    return samples.solved(moments)[0], counts
+    return samples.solve(moments)[0], counts
 
 
-def _sampled(tracks: Tracks, step: float, width: float) -> tuple[Tensor, Tensor]:
-    x, _, weights = smoothed(tracks, tracks.every(step), width)
+def _sample(tracks: Tracks, step: float, width: float) -> tuple[Tensor, Tensor]:
+    x, _, weights = smooth_at(tracks, tracks.every(step), width)
     linear, moved = tracks.change[:-1, :-1], tracks.change[:-1, -1]
     return torch.where((weights > 0)[..., None], x @ linear.mT + moved, 0.0), weights
 
@@ -169,7 +169,7 @@ class Grid:
     step: float
     x: Tensor  # (m, n, d)
     v: Tensor
-    calm: Tensor  # velocities to differentiate by
+    smooth_velocities: Tensor  # velocities to differentiate by
     weights: Tensor  # (m, n)
 
     @staticmethod
@@ -178,13 +178,13 @@ class Grid:
         step, start = width / 2, float(tracks.times[0])
         count = max(2, math.ceil((float(tracks.times[-1]) - start) / step) + 1)
         at = start + step * torch.arange(count, dtype=torch.float64, device=tracks.x.device)
-        x, v, weights = smoothed(tracks, at, width)
+        x, v, weights = smooth_at(tracks, at, width)
         speed = float(torch.where(weights > 0, v.square().sum(-1), torch.nan).nanmedian()) ** 0.5
         wider = min(
             max(1 + VELOCITY_WIDTH_SLOPE * tracks.noise / max(speed * width, 1e-300), MIN_VELOCITY_WIDTH),
             MAX_VELOCITY_WIDTH,
         )
-        _, calm, _ = smoothed(tracks, at, wider * width)
+        _, calm, _ = smooth_at(tracks, at, wider * width)
         return Grid(start, step, x, v, calm, weights)
 
     def at(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -197,7 +197,7 @@ class Grid:
         v0, v1 = self.step * self.v[left], self.step * self.v[left + 1]
         d, s = x1 - x0, v0 + v1
         x = x0 + u * (v0 + u * (3 * d - s - v0 + u * (s - 2 * d)))
-        v = self.calm[left] + u * (self.calm[left + 1] - self.calm[left])
+        v = self.smooth_velocities[left] + u * (self.smooth_velocities[left + 1] - self.smooth_velocities[left])
         w0, w1 = self.weights[left], self.weights[left + 1]
         return x, v, torch.where((w0 > 0) & (w1 > 0) & inside[:, None], w0 + u[..., 0] * (w1 - w0), 0.0)
 
@@ -249,7 +249,7 @@ class ShiftDescent:
         step = max(a.step, b.step) * stride
         span = float(a.times[-1] - a.times[0])
         self.times = a.times[0] + step * torch.arange(int(span / step) + 1, dtype=torch.float64, device=a.x.device)
-        self.x, _, self.weights = smoothed(a, self.times, width)
+        self.x, _, self.weights = smooth_at(a, self.times, width)
         self.grid = Grid.of(b, width)
         self.frame = max(a.step, b.step)
         self.width = width
@@ -276,10 +276,10 @@ class ShiftDescent:
 
     def variance(self, offset: float, rate: float = 1.0) -> float:
         """Of the residual at a state, as on the curve, by the F that is best there; infinite where too little is seen."""
-        matched = self._matched(offset, rate)
+        matched = self._match(offset, rate)
         return math.inf if matched is None else float(self._moment_fit(matched)[0])
 
-    def _matched(self, offset: float, rate: float, every: int = 1) -> Matched | None:
+    def _match(self, offset: float, rate: float, every: int = 1) -> Matched | None:
         """Normalized positions of both cameras at the same moments, or at some of them; None where too few."""
         x2, v2, w2 = self.grid.at(self.times[::every] * rate + offset)
         sure = self.weights[::every] * w2
@@ -307,7 +307,7 @@ class ShiftDescent:
 
     def _rows(self, state: _State, every: int = 1) -> Residuals | None:
         """Residuals and their derivatives at a state; a first F where there is none."""
-        matched = self._matched(state.offset, state.rate, every)
+        matched = self._match(state.offset, state.rate, every)
         if matched is None:
             return None
         times = self.times[::every, None].expand_as(matched.both)[matched.both]
@@ -365,12 +365,12 @@ class ShiftDescent:
         frames = torch.zeros(len(self.times), influence.shape[1], dtype=J.dtype, device=J.device)
         frames.index_add_(0, rows.frames, influence)
         step = float(self.times[1] - self.times[0]) if len(self.times) > 1 else self.frame
-        sigmas = long_run(
+        sigmas = long_run_sigma(
             frames,
             round(min(MAX_CORRELATION_SECONDS, float(rows.times[-1] - rows.times[0]) / MIN_CORRELATION_BLOCKS) / step),
         )
         scale_of = rows.scale()
-        F = self._given(state.F)
+        F = self._denormalize(state.F)
         distances = torch.full(rows.both.shape, torch.nan, dtype=J.dtype, device=J.device)
         distances[rows.both] = rows.distances / max(scale_of, 1e-300)
         correlated = 2 * math.sqrt(math.pi) * self.width / step  # frames that the kernel makes into one
@@ -406,10 +406,10 @@ class ShiftDescent:
         frames = torch.zeros(len(self.times), len(later), dtype=J.dtype, device=J.device)
         frames.index_add_(0, rows.frames, influence)
         memory = min(MAX_CORRELATION_SECONDS, float(rows.times[-1] - rows.times[0]) / MIN_CORRELATION_BLOCKS)
-        sigmas = SIGMA_INFLATION * long_run(frames, round(memory / self.frame))
+        sigmas = SIGMA_INFLATION * long_run_sigma(frames, round(memory / self.frame))
         return -influence.sum(0), sigmas.hypot(torch.as_tensor(MIN_SIGMA_FRAMES * self.frame))
 
-    def _given(self, F: Tensor) -> Tensor:
+    def _denormalize(self, F: Tensor) -> Tensor:
         """The same F, of the coordinates given."""
         first, second = self.changes
         return second.mT @ F @ first
@@ -506,7 +506,7 @@ EPIPOLAR = PairModel("epipolar", Samples, ShiftDescent)
 """Two cameras that see the same points."""
 
 
-def long_run(influence: Tensor, memory: int) -> Tensor:
+def long_run_sigma(influence: Tensor, memory: int) -> Tensor:
     """Standard deviations of sums ``(frames, k)`` of what neighbouring frames have in common (Newey and West)."""
     variance = influence.square().sum(0)
     for lag in range(1, min(memory, len(influence) - 1) + 1):

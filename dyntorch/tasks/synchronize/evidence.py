@@ -71,7 +71,7 @@ class Attempt:
     points: Tensor  # ``(n,)`` bool, who takes part
     method: str  # ``"epipolar"`` or ``"affine"``
     min_margin: float  # nats for a decision, of perspective cameras
-    pruned: bool = False  # whether positions that did not fit were left out
+    positions_removed: bool = False  # whether positions that did not fit were left out
     model: PairModel = EPIPOLAR  # what is compared
 
     @property
@@ -85,10 +85,10 @@ class Attempt:
         if self.fit is None:
             return []
         found = [(self._shift(lag), score) for lag, score in self.curve.peaks(4 * NUM_PEAKS)]
-        here = [score for shift, score in found if self._near(shift)]
+        here = [score for shift, score in found if self._is_own_peak(shift)]
         own = here[0] if here else self._score(self.fit.shift)
         # a higher maximum of the curve that a descent found no better is none
-        others = [(shift, min(score, own)) for shift, score in found if not self._near(shift)]
+        others = [(shift, min(score, own)) for shift, score in found if not self._is_own_peak(shift)]
         return [(self.fit.shift, own), *others[: NUM_PEAKS - 1]]
 
     @cached_property
@@ -116,7 +116,7 @@ class Attempt:
         return rough
 
     @cached_property
-    def forward(self) -> float:
+    def time_reversal_margin(self) -> float:
         r"""Nats by which the residual is smaller than with b played backwards, at whatever shift."""
         if self.fit is None:
             return 0.0
@@ -130,14 +130,14 @@ class Attempt:
         return own + 0.5 * math.log(max(float(curve.variance[judged].min()), tiny))
 
     @property
-    def needed_forward(self) -> float:
+    def required_time_reversal_margin(self) -> float:
         """The same for a decision: more where something may have been made to fit."""
-        return MIN_FORWARD_MARGIN + DOUBTFUL_FORWARD_MARGIN * self.doubtful
+        return MIN_FORWARD_MARGIN + DOUBTFUL_FORWARD_MARGIN * self.doubt
 
     @cached_property
     def halves(self) -> tuple[float, float]:
         """Shifts in which the first and the second half of the overlap are best, from the fit's, in frames; NaN where none."""
-        return tuple(self._away(curve) for curve in self.half_curves)  # type: ignore[return-value]
+        return tuple(self._distance_to_best(curve) for curve in self.half_curves)  # type: ignore[return-value]
 
     @property
     def sigma(self) -> float:
@@ -146,7 +146,7 @@ class Attempt:
         if self.fit is None:
             return math.inf
         first, second = self.halves
-        differing = abs(first - second) / 2 * self.frame if self.agree and self.step <= self.frame else 0.0
+        differing = abs(first - second) / 2 * self.frame if self.halves_agree and self.step <= self.frame else 0.0
         # as much is expected; short halves may differ by more than the whole is uncertain
         beyond = math.sqrt(max(differing**2 - self.fit.sigma**2, 0.0))
         return math.hypot(self.fit.sigma, min(beyond, 3 * self.fit.sigma))
@@ -167,12 +167,12 @@ class Attempt:
         ]
 
     @cached_property
-    def agree(self) -> bool:
+    def halves_agree(self) -> bool:
         """Whether both halves of the overlap say the same shift as the whole."""
-        return self.fit is not None and self.apart == 0
+        return self.fit is not None and self.half_disagreement == 0
 
     @cached_property
-    def apart(self) -> float:
+    def half_disagreement(self) -> float:
         """Frames by which halves of the overlap may differ from the whole, where one does by more, or both do to the same side; 0
         where they agree."""
         first, second = self.halves
@@ -182,7 +182,7 @@ class Attempt:
         return MAX_COMMON_HALF_SHIFT_FRAMES if leaning else 0.0
 
     @cached_property
-    def wander(self) -> float:
+    def camera_motion_ratio(self) -> float:
         """Residual of the whole over that of its halves by themselves: 1 where neither camera moves."""
         if self.fit is None:
             return 1.0
@@ -193,58 +193,64 @@ class Attempt:
         return math.sqrt(whole / mean) if 0 < mean < math.inf else 1.0
 
     @cached_property
-    def decided(self) -> bool:
+    def accepted_shift(self) -> bool:
         """Whether the shift is beyond doubt."""
-        sure = self.fit is not None and self.sharp and not self.edge and self.margin >= self.needed and self.agree
-        return sure and self.forward >= self.needed_forward
+        sure = (
+            self.fit is not None
+            and self.precise
+            and not self.at_search_end
+            and self.margin >= self.required_margin
+            and self.halves_agree
+        )
+        return sure and self.time_reversal_margin >= self.required_time_reversal_margin
 
     @property
-    def sharp(self) -> bool:
+    def precise(self) -> bool:
         """Whether the shift is known well enough to trust its sigma."""
         return self.fit is not None and self.fit.sigma <= MAX_SIGMA_FRAMES * max(self.frame, MIN_FRAME_SECONDS)
 
     @property
-    def needed(self) -> float:
+    def required_margin(self) -> float:
         """Nats above the next peak, for a decision."""
         affine = self.method == "affine"
         least = AFFINE_MARGIN_FACTOR * self.min_margin if affine else self.min_margin
-        if affine or self.doubtful == 0:
+        if affine or self.doubt == 0:
             # with a residual far above the noise something may have been made to fit, the more so by leaving out what does not
-            usual = USUAL_ROUGHNESS_WITHOUT_OUTLIERS if self.chosen else USUAL_ROUGHNESS_CLEAR
-            rough = math.log(max(self.roughness, 1e-300) / usual)
-            return least + ROUGH_MARGIN * min(max(rough, 0.0), 1.0) + SHORT_OVERLAP_MARGIN * self.short
-        return least + ROUGH_MARGIN * self.doubtful + SHORT_OVERLAP_MARGIN * self.short
+            usual = USUAL_ROUGHNESS_WITHOUT_OUTLIERS if self.outliers_removed else USUAL_ROUGHNESS_CLEAR
+            rough = math.log(max(self.normalized_residual, 1e-300) / usual)
+            return least + ROUGH_MARGIN * min(max(rough, 0.0), 1.0) + SHORT_OVERLAP_MARGIN * self.overlap_shortage
+        return least + ROUGH_MARGIN * self.doubt + SHORT_OVERLAP_MARGIN * self.overlap_shortage
 
     @property
-    def short(self) -> float:
+    def overlap_shortage(self) -> float:
         """0 to 1: how much shorter than the longest overlap it is, where points were left out: so little fits easily."""
         assert self.fit is not None
         counts = self.curve.counts
-        if not self.chosen or not len(counts):
+        if not self.outliers_removed or not len(counts):
             return 0.0
         place = int((self.curve.lags - self._lag(self.fit.shift)).abs().argmin())
         share = float(counts[place] / counts.max().clamp(min=1e-300))
         return min(max((SHORT_OVERLAP_SHARE - share) / (0.5 * SHORT_OVERLAP_SHARE), 0.0), 1.0)
 
     @property
-    def chosen(self) -> bool:
+    def outliers_removed(self) -> bool:
         """Whether points or positions that did not fit were left out."""
-        return self.pruned or not bool(self.points.all())
+        return self.positions_removed or not bool(self.points.all())
 
     @property
-    def doubtful(self) -> float:
+    def doubt(self) -> float:
         """0 where all points fit as well as their noise lets them; 1 where something may have been made to fit."""
-        rough = math.log(max(self.roughness, 1e-300) / USUAL_ROUGHNESS)
-        if not self.chosen and rough <= 0:
+        rough = math.log(max(self.normalized_residual, 1e-300) / USUAL_ROUGHNESS)
+        if not self.outliers_removed and rough <= 0:
             return 0.0
         own, *others = (score for _, score in self.peaks)
         alone = own - max(others, default=-math.inf) >= CLEAR_SCORE_MARGIN
-        if self.short == 0 and (alone or self.forward >= CLEAR_FORWARD_MARGIN):
+        if self.overlap_shortage == 0 and (alone or self.time_reversal_margin >= CLEAR_FORWARD_MARGIN):
             return 0.0
-        return 1.0 if self.chosen else min(rough / ROUGHNESS_LOG_RANGE, 1.0)
+        return 1.0 if self.outliers_removed else min(rough / ROUGHNESS_LOG_RANGE, 1.0)
 
     @property
-    def roughness(self) -> float:
+    def normalized_residual(self) -> float:
         """Residual over what white noise and the smoothing kernel leave of it."""
         assert self.fit is not None
         left = math.sqrt(0.5 / math.sqrt(math.pi))  # by a Gaussian kernel of one frame
@@ -252,7 +258,7 @@ class Attempt:
         return self.fit.residual / (left * max(image.noise, 1e-6 * image.scale))
 
     @property
-    def edge(self) -> bool:
+    def at_search_end(self) -> bool:
         """Whether the best lies at the end of what was searched."""
         return self.fit is not None and self.max_shift is not None and abs(self.fit.shift) > self.max_shift - 0.5 * self.frame
 
@@ -263,22 +269,24 @@ class Attempt:
             return 0.0
         own = math.erf(self.frame / max(math.sqrt(2) * self.sigma, 1e-12))
         rival = (
-            1 / (1 + math.exp(-(self.margin - EVEN_MARGIN * self.needed) / MARGIN_SCALE)) if self.margin > HOPELESS_MARGIN else 0.0
+            1 / (1 + math.exp(-(self.margin - EVEN_MARGIN * self.required_margin) / MARGIN_SCALE))
+            if self.margin > HOPELESS_MARGIN
+            else 0.0
         )
         return (
             own
             * rival
-            * self._forward_share
-            * (CONFIDENCE_AGREEING_HALVES if self.agree else CONFIDENCE_DISAGREEING_HALVES)
-            * (1.0 if self.sharp and not self.edge else IMPRECISE_CONFIDENCE_FACTOR)
+            * self._time_reversal_factor
+            * (CONFIDENCE_AGREEING_HALVES if self.halves_agree else CONFIDENCE_DISAGREEING_HALVES)
+            * (1.0 if self.precise and not self.at_search_end else IMPRECISE_CONFIDENCE_FACTOR)
         )
 
     @property
-    def _forward_share(self) -> float:
+    def _time_reversal_factor(self) -> float:
         """Odds of a film that runs forwards, as a factor of the confidence; where the rest is hopeless that is not looked at."""
-        if self.margin < EVEN_MARGIN * self.needed:
+        if self.margin < EVEN_MARGIN * self.required_margin:
             return 1.0
-        return 1 / (1 + math.exp(-min((self.forward - self.needed_forward) / FORWARD_SCALE, 700.0)))
+        return 1 / (1 + math.exp(-min((self.time_reversal_margin - self.required_time_reversal_margin) / FORWARD_SCALE, 700.0)))
 
     def _shift(self, lag: float) -> float:
         """Of b's clock against a's at the center, of a lag of the curve."""
@@ -290,7 +298,7 @@ class Attempt:
         assert self.fit is not None
         return (shift + self.fit.center) / self.curve.rate - self.fit.center
 
-    def _near(self, shift: float) -> bool:
+    def _is_own_peak(self, shift: float) -> bool:
         assert self.fit is not None
         return abs(shift - self.fit.shift) <= max(MIN_PEAK_SEPARATION_FRAMES * self.frame, 1.5 * self.step)
 
@@ -298,7 +306,7 @@ class Attempt:
         assert self.fit is not None
         return float(self.curve.scores[int((self.curve.lags - self._lag(shift)).abs().argmin())].nan_to_num(-math.inf))
 
-    def _away(self, curve: Curve) -> float:
+    def _distance_to_best(self, curve: Curve) -> float:
         """Frames from the fit's shift to this curve's best."""
         assert self.fit is not None
         best = curve.peaks(1)
@@ -336,7 +344,7 @@ def consistent_points(a: Tracks, b: Tracks, found: Attempt, generator: Generator
     best: tuple[float, Tensor] | None = None
     for _ in range(NUM_SUBSETS):
         chosen = torch.randperm(n, generator=generator)[:SUBSET_SIZE].to(moments.device)
-        variance, geometry = samples.solved(moments[chosen].sum(0))
+        variance, geometry = samples.solve(moments[chosen].sum(0))
         lag = int((variance / counts[chosen].sum(0).clamp(min=1).sqrt()).argmin())
         each = samples.variances_by(geometry[lag], moments[:, lag])
         cost = float(each.nanquantile(MIN_INLIER_SHARE))

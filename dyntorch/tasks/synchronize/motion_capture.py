@@ -37,10 +37,10 @@ from dyntorch.tasks.synchronize.epipolar import (
     Residuals,
     Samples,
     ShiftDescent,
-    long_run,
+    long_run_sigma,
 )
-from dyntorch.tasks.synchronize.subspace import completed, filled
-from dyntorch.tasks.synchronize.tracks import Tracks, image_of, smoothed
+from dyntorch.tasks.synchronize.subspace import fill_gaps, regress_missing
+from dyntorch.tasks.synchronize.tracks import Tracks, image_of, smooth_at
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The camera of least residual from moments, at all shifts at once.
@@ -89,7 +89,7 @@ class SpaceSamples(Samples):
         moments, counts = resection_moments(self.x2, self.x1, (-lags[1], -lags[0]), (self.w2, self.w1), per_point)
         return moments.flip(-4), counts.flip(-1)
 
-    def solved(self, moments: Tensor) -> tuple[Tensor, Tensor]:
+    def solve(self, moments: Tensor) -> tuple[Tensor, Tensor]:
         """Variances ``(L,)``, px^2, and cameras ``(L, 3, 4)``."""
         return camera_variance(moments, self.noise[0])
 
@@ -119,11 +119,11 @@ class SpaceDescent(ShiftDescent):
         unit = float(image_of(a, b).change[0, 0])
         self.noise = (unit, unit)
         # velocities of the space are as good as exact, those of a camera are not
-        self.speed = None if image_of(a, b) is a else smoothed(a, self.times, width)[1]
+        self.speed = None if image_of(a, b) is a else smooth_at(a, self.times, width)[1]
 
-    def _matched(self, offset: float, rate: float, every: int = 1) -> Matched | None:
+    def _match(self, offset: float, rate: float, every: int = 1) -> Matched | None:
         """As of two cameras, the image as p and the space as q; the speed is that of the space by the offset."""
-        found = super()._matched(offset, rate, every)
+        found = super()._match(offset, rate, every)
         if found is None or self.speed is None:
             return found
         # b shows later what it would show without the offset: as if a were earlier
@@ -165,7 +165,7 @@ class SpaceDescent(ShiftDescent):
             matched.sure,
         )  # fmt: skip
 
-    def _given(self, F: Tensor) -> Tensor:
+    def _denormalize(self, F: Tensor) -> Tensor:
         image, space = self.changes if self.speed is None else self.changes[::-1]
         return torch.linalg.solve(image, F @ space)
 
@@ -210,13 +210,13 @@ MAX_ITERATIONS = 30  # Steps of each.
 COST_TOLERANCE = 1e-7  # Relative decrease of the cost that ends them.
 
 
-def combined_fit(film: Tracks, space: Tracks, offset: float, rate: float) -> CombinedFit | None:
+def fit_combination(film: Tracks, space: Tracks, offset: float, rate: float) -> CombinedFit | None:
     """The shift near an offset at which combinations of the points in space are what the camera sees; None where none is
     found."""
-    problem = _Problem.of(film, space, offset, rate)
+    problem = _CombinationProblem.of(film, space, offset, rate)
     if problem is None:
         return None
-    theta = problem.started()
+    theta = problem.start()
     if theta is None:
         return None
     for _ in range(NUM_REWEIGHTINGS):
@@ -224,7 +224,7 @@ def combined_fit(film: Tracks, space: Tracks, offset: float, rate: float) -> Com
         if not bool(start.cost.isfinite()):
             return None
         theta = minimize(problem, start, LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=COST_TOLERANCE)).theta
-        problem = problem.weighed(theta)
+        problem = problem.reweight(theta)
     return problem.fit(theta)
 
 
@@ -240,7 +240,7 @@ MIN_COMBINED_SIGMA_FRAMES = 0.05  # Error at least, frames.
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem(LeastSquares):
+class _CombinationProblem(LeastSquares):
     """One problem: parameters are the camera ``(1, 3, 4)``, weights ``(1, n, k)`` and the shift from the start in frames."""
 
     x: Tensor  # (T, n, 2) normalized
@@ -255,11 +255,11 @@ class _Problem(LeastSquares):
     ridge: float
 
     @staticmethod
-    def of(film: Tracks, space: Tracks, offset: float, rate: float) -> _Problem | None:
+    def of(film: Tracks, space: Tracks, offset: float, rate: float) -> _CombinationProblem | None:
         frame = max(film.step, space.step)
         stride = max(1, math.ceil(len(film.times) * film.x.shape[1] / MAX_COMBINED_ROWS))
         times = film.every(frame * stride)
-        x, _, sure = smoothed(film, times, frame)
+        x, _, sure = smooth_at(film, times, frame)
         change = film.change
         x = torch.where((sure > 0)[..., None], x @ change[:2, :2].mT + change[:2, 2], 0.0)
         grid = Grid.of(_combinations(space, film.noise / max(film.scale, 1e-300)), frame)
@@ -270,9 +270,9 @@ class _Problem(LeastSquares):
         if int((sure > 0).sum()) < MIN_FRAMES * film.x.shape[1]:
             return None
         unit = float(change[0, 0])
-        return _Problem(x, sure, torch.ones_like(sure), there, grid, frame, offset, frame, unit, unit**2)
+        return _CombinationProblem(x, sure, torch.ones_like(sure), there, grid, frame, offset, frame, unit, unit**2)
 
-    def started(self) -> Tensors | None:
+    def start(self) -> Tensors | None:
         """An affine camera and weights: regressions of all coordinates on those in space have the form :math:`w_i \\otimes A`."""
         places, _, _ = self.grid.at(self.times)
         kept = min(places.shape[1] - 1, NUM_START_COMBINATIONS)
@@ -362,11 +362,11 @@ class _Problem(LeastSquares):
         weights = solved[..., -1] - solved[..., :-1] @ move
         return move[:12].unflatten(0, (1, 3, 4)), weights[None], move[12:][None]
 
-    def subset(self, keep: Tensor) -> _Problem:
+    def subset(self, keep: Tensor) -> _CombinationProblem:
         """There is one."""
         return self
 
-    def weighed(self, theta: Tensors) -> _Problem:
+    def reweight(self, theta: Tensors) -> _CombinationProblem:
         """With robust weights at these parameters, and the ridge that the residual asks for."""
         distance = (self._images(theta)[0] - self.x).norm(dim=-1)
         scale = float(distance[self.sure > 0].median()) / 1.1774
@@ -386,7 +386,7 @@ class _Problem(LeastSquares):
         step = float(self.times[1] - self.times[0])
         span = float(self.times[-1] - self.times[0])
         memory = round(min(MAX_CORRELATION_SECONDS, span / MIN_CORRELATION_BLOCKS) / step)
-        sigma = self.frame * COMBINED_SIGMA_INFLATION * float(long_run(frames, memory)[0])
+        sigma = self.frame * COMBINED_SIGMA_INFLATION * float(long_run_sigma(frames, memory)[0])
         if not math.isfinite(sigma):
             return None
         distance = (self._images(theta)[0] - self.x).norm(dim=-1)[self.sure > 0]
@@ -407,7 +407,7 @@ MIN_MOTION_RATIO = 1.0  # Motion of a combination over the noise from which it c
 def _combinations(space: Tracks, noise: float) -> Tracks:
     """The middle of all points, then orthonormal combinations about it that move by more than the noise, in units of the size."""
     seen = space.weights > 0
-    x = completed(filled(space.x, seen), seen)
+    x = regress_missing(fill_gaps(space.x, seen), seen)
     middle = x.mean(1, keepdim=True)
     about = (x - middle) / max(float((x - middle).square().sum((1, 2)).mean().sqrt()), 1e-300)
     by_point = about.movedim(1, 0).flatten(1)

@@ -28,7 +28,7 @@ from dyntorch.tasks.synchronize.epipolar import (
     epipolar_curve,
 )
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
+from dyntorch.tasks.synchronize.tracks import Tracks, smooth_at
 
 # ----------------------------------------------------------------------------------------------------------------------
 # One fundamental matrix, and at every moment the lag that it explains best: the cheapest course of lags that seldom jumps.
@@ -44,7 +44,7 @@ class Jump:
 
 
 @dataclass(frozen=True)
-class Course:
+class PiecewiseOffset:
     """An offset with jumps."""
 
     rate: float  # of b's clock that was taken out
@@ -69,7 +69,7 @@ JUMP_PENALTY = 12.0  # Nats that a jump costs in the search.
 MAX_ALTERNATIONS = 6  # Alternations of search and fit.
 
 
-class CourseSearch:
+class PiecewiseOffsetSearch:
     """Both cameras at equal steps of a's clock, for one rate of b's."""
 
     def __init__(self, a: Tracks, b: Tracks, rate: float, max_shift: float | None, options: SynchronizeOptions) -> None:
@@ -78,7 +78,7 @@ class CourseSearch:
         self.samples = Samples.of(a, b, self.step, rate)
         self.max_shift = max_shift
         self.times = a.every(self.step)
-        self.x, _, self.weights = smoothed(a, self.times, self.step)
+        self.x, _, self.weights = smooth_at(a, self.times, self.step)
         self.grid = Grid.of(b, self.step)
 
     def starts(self) -> list[tuple[float, float, Tensor]]:
@@ -108,7 +108,7 @@ class CourseSearch:
         """Signed Sampson distances ``(T, n)`` in px of a at one offset; NaN where not both are seen."""
         x2, _, w2 = self.grid.at(self.times * self.rate + offset)
         ratio = self._ratio
-        Fp, Fq = _mapped(self.x, F), _mapped(x2, F.mT)
+        Fp, Fq = _epipolar_lines(self.x, F), _epipolar_lines(x2, F.mT)
         gradient = Fq[..., :2].square().sum(-1) + ratio**2 * Fp[..., :2].square().sum(-1)
         distance = ((x2 * Fp[..., :2]).sum(-1) + Fp[..., 2]) / gradient.clamp(min=1e-300).sqrt()
         return torch.where((self.weights > 0) & (w2 > 0), distance, torch.nan)
@@ -126,14 +126,14 @@ class CourseSearch:
 
     def scale(self, F: Tensor, offset: float) -> Tensor:
         """``(n,)`` robust standard deviation of each point's residuals at an offset, px."""
-        return torch.maximum(_spread(self.residuals(F, offset)), self.finest(F, offset))
+        return torch.maximum(_robust_scale(self.residuals(F, offset)), self.finest(F, offset))
 
     def finest(self, F: Tensor, offset: float) -> Tensor:
         """``(n,)`` px that a part of a frame makes: what lags that are frames apart cannot tell."""
         moved = self.residuals(F, offset + self.step) - self.residuals(F, offset)
-        return LAG_RESOLUTION_FRAMES * _spread(moved).clamp(min=1e-9 * self.a.scale)
+        return LAG_RESOLUTION_FRAMES * _robust_scale(moved).clamp(min=1e-9 * self.a.scale)
 
-    def course(self, offset: float, F: Tensor) -> Course | None:
+    def estimate(self, offset: float, F: Tensor) -> PiecewiseOffset | None:
         """From a start: the cheapest lags, what was lost put back, and one fit of all that, until the jumps stay."""
         scale, known, fit = self.scale(F, offset), None, None
         for _ in range(MAX_ALTERNATIONS):
@@ -141,21 +141,21 @@ class CourseSearch:
             if not len(offsets):
                 return None  # gone astray
             costs = self.costs(F, offsets, scale)
-            path = cheapest(costs, JUMP_PENALTY)
+            path = cheapest_path(costs, JUMP_PENALTY)
             jumps = self._jumps(path, offsets, costs)
             first = float(offsets[path[0]])
-            mended_a, mended_b = mended(self.a, self.b, self.rate, first, jumps)
+            mended_a, mended_b = repair_clocks(self.a, self.b, self.rate, first, jumps)
             fit = ShiftDescent(mended_a, mended_b, self.step).run(first, self.rate)
             if fit is None:
                 return None
-            same, known = _same(jumps, known, self.step), jumps
+            same, known = _same_jumps(jumps, known, self.step), jumps
             offset, F = fit.offset, fit.fundamental
-            scale = torch.maximum(_spread(fit.distances * fit.residual), self.finest(F, offset))
+            scale = torch.maximum(_robust_scale(fit.distances * fit.residual), self.finest(F, offset))
             if same:
                 break
         assert known is not None
         assert fit is not None
-        return Course(self.rate, fit.offset, known, fit, scale)
+        return PiecewiseOffset(self.rate, fit.offset, known, fit, scale)
 
     def _offsets(self, middle: float) -> Tensor:
         """What is compared ``(L,)``: half frames near the middle, as one fit of two pieces lies between both, else whole ones."""
@@ -184,7 +184,7 @@ class CourseSearch:
         return tuple(found)
 
 
-def _mapped(x: Tensor, F: Tensor) -> Tensor:
+def _epipolar_lines(x: Tensor, F: Tensor) -> Tensor:
     """Homogeneous lines ``(..., 3)`` of points ``(..., 2)``."""
     return x @ F[:, :2].mT + F[:, 2]
 
@@ -201,20 +201,20 @@ def _cost(far: Tensor, scale: Tensor, unseen: float = 0.0) -> NDArray[np.float64
     return (0.5 * square / (1 + square / cut)).nan_to_num(unseen).sum(-1).div(alike * CORRELATED_RESIDUALS).numpy()
 
 
-def _spread(far: Tensor) -> Tensor:
+def _robust_scale(far: Tensor) -> Tensor:
     """``(n,)`` robust standard deviation of each point's residuals ``(T, n)``."""
     pooled = max(1.4826 * float(far.abs().nanmedian().nan_to_num(0.0)), 1e-300)
     own = (1.4826 * far.abs().nanmedian(0).values / pooled).nan_to_num(1.0)
     return pooled * own.clamp(*SCALE_RANGE)
 
 
-def _same(jumps: tuple[Jump, ...], known: tuple[Jump, ...] | None, step: float) -> bool:
+def _same_jumps(jumps: tuple[Jump, ...], known: tuple[Jump, ...] | None, step: float) -> bool:
     if known is None or len(jumps) != len(known):
         return False
     return all(abs(x.size - y.size) < 0.6 * step and abs(x.moment - y.moment) < 2 * step for x, y in zip(jumps, known, strict=True))
 
 
-def cheapest(costs: NDArray[np.float64], penalty: float) -> NDArray[np.int64]:
+def cheapest_path(costs: NDArray[np.float64], penalty: float) -> NDArray[np.int64]:
     r"""The course of states ``(T,)`` that costs least where every change costs the same."""
     count, states = costs.shape
     total, here = costs[0].copy(), np.arange(states)
@@ -263,7 +263,7 @@ def _moment(left: NDArray[np.float64], right: NDArray[np.float64], lost: int) ->
 # What was lost put back: the frames' times, as a camera that keeps time would have told them.
 
 
-def mended(a: Tracks, b: Tracks, rate: float, offset: float, jumps: Sequence[Jump]) -> tuple[Tracks, Tracks]:
+def repair_clocks(a: Tracks, b: Tracks, rate: float, offset: float, jumps: Sequence[Jump]) -> tuple[Tracks, Tracks]:
     """Tracks with times that leave room for what was lost: by b where the offset falls, by a where it grows."""
     ta, tb = a.times.clone(), b.times.clone()
     for jump in jumps:
@@ -292,21 +292,21 @@ class JumpEvidence:
                  options: SynchronizeOptions) -> None:  # fmt: skip
         self.a, self.b, self.options, self.max_shift = a, b, options, max_shift
         self.frame = max(a.step, b.step)
-        found: list[Course] = []
+        found: list[PiecewiseOffset] = []
         for rate in dict.fromkeys(rates):
-            search = CourseSearch(a, b, rate, max_shift, options)
+            search = PiecewiseOffsetSearch(a, b, rate, max_shift, options)
             plain = None if start is None else self._fit((), start, rate)
             starts = [] if plain is None else [(plain.center, plain.offset, plain.fundamental)]
-            courses: list[Course] = []
+            courses: list[PiecewiseOffset] = []
             for moment, offset, F in starts + search.starts():
                 # a window that a course explains already leads to the same one
                 if all(abs(one.at(moment) - offset) > 1.5 * self.frame for one in courses):
-                    course = search.course(offset, F)
+                    course = search.estimate(offset, F)
                     courses += [] if course is None else [course]
             found += courses
-        self.course = self._best(found, rates[0])
+        self.course = self._select_cheapest(found, rates[0])
 
-    def _best(self, courses: list[Course], given: float) -> Course | None:
+    def _select_cheapest(self, courses: list[PiecewiseOffset], given: float) -> PiecewiseOffset | None:
         """The one whose residuals and jumps cost least, on the scale of the one with the least residuals."""
         if not courses:
             return None
@@ -324,10 +324,10 @@ class JumpEvidence:
         return float(cost.sum()) / max(seen, 1.0) * float((self.a.weights > 0).sum())
 
     def _fit(self, jumps: Sequence[Jump], offset: float, rate: float) -> EpipolarFit | None:
-        a, b = mended(self.a, self.b, rate, offset, jumps)
+        a, b = repair_clocks(self.a, self.b, rate, offset, jumps)
         return ShiftDescent(a, b, self.frame).run(offset, rate)
 
-    def told(self) -> tuple[Course, list[float], list[float]] | None:
+    def select_significant(self) -> tuple[PiecewiseOffset, list[float], list[float]] | None:
         """The course with the jumps that are beyond doubt, nats for each of them, and the residual without it, px."""
         course = self.course
         while course is not None:
@@ -344,28 +344,28 @@ class JumpEvidence:
             weak = [k for k, one in enumerate(nats) if one < MIN_JUMP_EVIDENCE or sizes[k] < least]
             if not weak:
                 return course, nats, residuals
-            course = self._dropped(course, min(weak, key=nats.__getitem__))
+            course = self._drop_jump(course, min(weak, key=nats.__getitem__))
         return None
 
-    def _without(self, course: Course, k: int) -> list[EpipolarFit]:
+    def _without(self, course: PiecewiseOffset, k: int) -> list[EpipolarFit]:
         """Fits of one offset on both sides of a jump, from that of either side."""
         rest = (*course.jumps[:k], *course.jumps[k + 1 :])
         size = course.jumps[k].size
         found = [self._fit(rest, course.offset + share * size, course.rate) for share in (0.0, 0.5, 1.0)]
         return [fit for fit in found if fit is not None]
 
-    def _dropped(self, course: Course, k: int) -> Course | None:
+    def _drop_jump(self, course: PiecewiseOffset, k: int) -> PiecewiseOffset | None:
         """The course without a jump; of neighbouring pieces the longer keeps its place."""
         rest = list(course.jumps[:k]) + list(course.jumps[k + 1 :])
         fits = self._without(course, k)
         if not fits:
             return None
         fit = min(fits, key=lambda one: one.residual)
-        return Course(course.rate, fit.offset, tuple(rest), fit, course.scale)
+        return PiecewiseOffset(course.rate, fit.offset, tuple(rest), fit, course.scale)
 
-    def sizes(self, course: Course) -> tuple[list[float], list[float]]:
+    def sizes(self, course: PiecewiseOffset) -> tuple[list[float], list[float]]:
         """Seconds by which the offset changes at each jump, and their standard deviations, by least squares of all at once."""
-        a, b = mended(self.a, self.b, course.rate, course.offset, course.jumps)
+        a, b = repair_clocks(self.a, self.b, course.rate, course.offset, course.jumps)
         gained, moments = 0.0, []
         for jump in course.jumps:
             moments.append(jump.moment + gained)
@@ -374,9 +374,9 @@ class JumpEvidence:
         moved, sigmas = descent.jumps(course.fit, moments)
         return [jump.size + more for jump, more in zip(course.jumps, moved.tolist(), strict=True)], sigmas.tolist()
 
-    def contradicted(self, course: Course) -> bool:
+    def is_contradicted(self, course: PiecewiseOffset) -> bool:
         """Whether a piece that is long enough to say so is elsewhere by itself, with a fundamental matrix of its own."""
-        a, b = mended(self.a, self.b, course.rate, course.offset, course.jumps)
+        a, b = repair_clocks(self.a, self.b, course.rate, course.offset, course.jumps)
         samples = Samples.of(a, b, self.frame, course.rate)
         times = float(a.times[0]) + self.frame * torch.arange(len(samples.x1), dtype=torch.float64)
         edges = [-math.inf, *(jump.moment for jump in course.jumps), math.inf]

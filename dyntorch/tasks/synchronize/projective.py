@@ -224,7 +224,7 @@ def _log(rotation: Tensor) -> Tensor:
     return odd / 2 * torch.where(sine > 1e-12, angle / sine.clamp(min=1e-300), 1.0)[..., None]
 
 
-def started_at(problem: SharedMotion, x: Tensor, y: Tensor) -> Tensors:
+def linear_start(problem: SharedMotion, x: Tensor, y: Tensor) -> Tensors:
     """The parameters of least squares for given turns ``(b, 3, 3)``: scale and places are linear, all frames alike."""
     clock, times = problem.start, problem.a.times
     turn, place = problem.b.at(clock[:, :1] + clock[:, 1:] * times)
@@ -248,7 +248,7 @@ def common_motion(first: Poses, second: Poses) -> tuple[tuple[Tensor, Tensor, Te
     free = x.new_ones(15)
     free[:2] = 0.0
     problem = SharedMotion(first, second, start, 0.0, free)
-    theta = started_at(problem, rotations_of(x), rotations_of(y))
+    theta = linear_start(problem, rotations_of(x), rotations_of(y))
     found = minimize(problem, problem.evaluate(theta), LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9))
     return (found.theta[1][0], found.theta[2][0], found.theta[3][0]), float((found.cost[0] / 6).sqrt())
 
@@ -268,14 +268,14 @@ def rank_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, in
         rows.append(x / x.square().sum(0).clamp(min=1e-300).sqrt())
     aa, bb, ab, counts = lag_covariances(rows[0], rows[1], lags, (wa, wb))
     # each camera by its own spread in the overlap: what is large in one frame of coordinates is no evidence
-    aa, ab = _scaled(aa, ab)
-    bb, ba = _scaled(bb, ab.mT)
+    aa, ab = _normalize_rows(aa, ab)
+    bb, ba = _normalize_rows(bb, ab.mT)
     both = torch.cat([torch.cat([aa, ba.mT], -1), torch.cat([ba, bb], -1)], -2)
     values = torch.linalg.eigvalsh(both).clamp(min=0)
     return values[:, : values.shape[1] - 12].sum(-1) / values.sum(-1).clamp(min=1e-300), counts
 
 
-def _scaled(own: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
+def _normalize_rows(own: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
     size = own.diagonal(dim1=-2, dim2=-1).clamp(min=1e-300).rsqrt()
     return size[..., None] * own * size[..., None, :], size[..., None] * cross
 
@@ -294,7 +294,7 @@ def projective_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: fl
     motions = [body_motion(name, tracks, options) for name, tracks in (("a", a), ("b", b))]
     wrong = tuple(motion for motion in motions if isinstance(motion, Notice))
     if wrong:
-        return _nothing(a, b, wrong)
+        return _refuse(a, b, wrong)
     poses = [
         Poses.of(motion, tracks.times) for motion, tracks in zip(motions, (a, b), strict=True) if isinstance(motion, BodyMotion)
     ]
@@ -308,18 +308,18 @@ def match_motions(
     curve = _curve(first, second, a, b, rate or 1.0, max_shift, options)
     top = curve.maxima()
     if not top:
-        return _nothing(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
+        return _refuse(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
     problem, theta = _starts(first, second, curve, top)
     found = minimize(problem, problem.evaluate(theta), LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9))
     misfits = (found.cost / 6).sqrt()
     if not bool(misfits.isfinite().any()):
-        return _nothing(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
+        return _refuse(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
     best = misfits.argmin()
     alone = replace(problem.subset(best[None]), start=found.theta[0][best][None])
     theta = tuple(part[best][None] for part in found.theta)
     if rate is None and a.times[-1] - a.times[0] > MIN_SECONDS_FOR_RATE:
         theta, alone = _with_rate(alone, theta)
-    return _judged(alone, theta, problem.start, found.theta[0], misfits, curve, a, b)
+    return _summarize(alone, theta, problem.start, found.theta[0], misfits, curve, a, b)
 
 
 NUM_PEAKS = 5  # Lags from which a descent starts.
@@ -389,7 +389,7 @@ def _starts(first: Poses, second: Poses, curve: _Curve, top: list[int]) -> tuple
     free = torch.ones(15, dtype=offsets.dtype, device=offsets.device)
     free[1] = 0.0
     problem = SharedMotion(first, second, start, 2 * curve.step, free)
-    return problem, started_at(problem, *(rotations_of(turn[top]) for turn in curve.turns))
+    return problem, linear_start(problem, *(rotations_of(turn[top]) for turn in curve.turns))
 
 
 def _with_rate(problem: SharedMotion, theta: Tensors) -> tuple[Tensors, SharedMotion]:
@@ -416,7 +416,7 @@ MARGIN_SCALE = 0.03  # The same per unit of the log odds.
 MIN_SIGMA_SECONDS = 1e-6  # Error of a shift at least: poses between frames are interpolated.
 
 
-def _judged(
+def _summarize(
     problem: SharedMotion,
     theta: Tensors,
     starts: Tensor,
@@ -477,7 +477,7 @@ def _refusal(best: float, margin: float, sigma: float, shifts: Tensor, curve: _C
     return None
 
 
-def _nothing(a: Tracks, b: Tracks, limits: tuple[Notice, ...]) -> Shift:
+def _refuse(a: Tracks, b: Tracks, limits: tuple[Notice, ...]) -> Shift:
     none = torch.zeros(0, dtype=torch.float64, device=a.x.device)
     fps = 1 / a.step, 1 / b.step
     return Shift(

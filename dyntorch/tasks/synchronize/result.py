@@ -158,7 +158,7 @@ class ClockOutcome(Outcome):
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know besides the reason."""
-        return told(self.notices)
+        return note_texts(self.notices)
 
     def check(self) -> Self:
         """Raise where the data do not decide."""
@@ -170,7 +170,7 @@ class ClockOutcome(Outcome):
 
     def _telling(self, status: Status) -> Sequence[Notice]:
         """The notices that refuse."""
-        return refusing(self.notices)
+        return refusals(self.notices)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -273,12 +273,12 @@ class Shift(ClockOutcome):
         return "\n".join(lines)
 
 
-def told(found: Sequence[Notice]) -> tuple[str, ...]:
+def note_texts(found: Sequence[Notice]) -> tuple[str, ...]:
     """The sentences of the notices that refuse nothing."""
     return tuple(notice.text for notice in found if notice.code.refuses is None)
 
 
-def refusing(found: Sequence[Notice]) -> tuple[Notice, ...]:
+def refusals(found: Sequence[Notice]) -> tuple[Notice, ...]:
     """The notices that refuse."""
     return tuple(notice for notice in found if notice.code.refuses is not None)
 

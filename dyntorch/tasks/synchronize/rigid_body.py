@@ -36,7 +36,7 @@ class BodyMotion:
     scale: float  # pixels
 
     @property
-    def turned(self) -> float:
+    def turn_angle(self) -> float:
         """Radians: rms angle of the body about its mean attitude."""
         rotations = self.body.motions[0, self.seen, :, :3]
         mean = nearest_rotation(rotations.mean(0))
@@ -68,22 +68,22 @@ def body_motion(name: str, tracks: Tracks, options: SynchronizeOptions | None = 
         return Notice(ShiftNotice.FEW_ON_BODY, float(often.sum()), values)
     centre = tracks.x[seen].mean(0)
     scale = float((tracks.x[seen] - centre).square().mean().sqrt().clamp(min=1e-300))
-    take = _Take(
+    take = _BodyTracks(
         torch.where(seen[..., None], (tracks.x - centre) / scale, 0.0), seen, tracks.noise / scale, options or SynchronizeOptions()
     )
-    found = take.fitted(often)
+    found = take.fit(often)
     if found is None or not found.agrees(often):
-        found = take.without_strangers(often) or found
+        found = take.fit_subsets(often) or found
     if found is None:
         return Notice(ShiftNotice.NO_BODY, math.inf, {"which": name, "noise": tracks.noise})
-    motion = _measured(take, found, centre, scale)
+    motion = _summarize(take, found, centre, scale)
     if not found.agrees(found.points):
         return Notice(ShiftNotice.NO_BODY, motion.residual, {"which": name, "noise": tracks.noise})
     noise = max(motion.residual, MIN_RELATIVE_NOISE * scale)
     if motion.thickness < MIN_THICKNESS_RATIO * noise:
         return Notice(ShiftNotice.FLAT_BODY, motion.thickness, {"which": name, "noise": noise})
-    if motion.turned < MIN_TURN_RATIO * noise / _extent(motion):
-        return Notice(ShiftNotice.NO_TURN, motion.turned, {"which": name})
+    if motion.turn_angle < MIN_TURN_RATIO * noise / _extent(motion):
+        return Notice(ShiftNotice.NO_TURN, motion.turn_angle, {"which": name})
     return motion
 
 
@@ -94,7 +94,7 @@ def _extent(motion: BodyMotion) -> float:
     return float((images - images.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()) * motion.scale
 
 
-def _measured(take: _Take, found: _Fit, centre: Tensor, scale: float) -> BodyMotion:
+def _summarize(take: _BodyTracks, found: _Fit, centre: Tensor, scale: float) -> BodyMotion:
     information = take.problem(found.points, found.frames).information(found.body)[0] * scale**2
     return BodyMotion(
         body=found.body,
@@ -135,7 +135,7 @@ MAX_FITTED_SUBSETS = 8  # Of them those that are fitted.
 
 
 @dataclass(frozen=True, eq=False)
-class _Take:
+class _BodyTracks:
     """Normalized tracks ``(frames, n, 2)``, which are seen ``(frames, n)``, and their noise."""
 
     x: Tensor
@@ -148,16 +148,16 @@ class _Take:
         weights = (self.seen[:, points] & frames[:, None]).to(self.x)
         return BodyProblem(self.x[None, :, points], weights[None], _camera(int(points.sum()), self.x))
 
-    def fitted(self, points: Tensor) -> _Fit | None:
+    def fit(self, points: Tensor) -> _Fit | None:
         """The body that these points ``(n,)`` bool are on, if there is one."""
         chosen, frames = self._start(points)
         if len(frames) < MIN_FRAMES:
             return None
-        body = started(self.x[frames][:, chosen], self.options)
+        body = start_body(self.x[frames][:, chosen], self.options)
         if body is None:
             return None
-        placed = self._posed(body, chosen, frames)
-        return None if placed is None else self._adjusted(*placed, points, chosen)
+        placed = self._resect_frames(body, chosen, frames)
+        return None if placed is None else self._adjust(*placed, points, chosen)
 
     def _start(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Points and frames that see all of them, some, spread evenly: the points seen least are left out where they have to be."""
@@ -171,7 +171,7 @@ class _Take:
         views = min(len(whole), self.options.num_views)
         return chosen, whole[torch.linspace(0, max(len(whole) - 1, 0), views).round().long()]
 
-    def _posed(self, body: FilmedBody, chosen: Tensor, frames: Tensor) -> tuple[FilmedBody, Tensor] | None:
+    def _resect_frames(self, body: FilmedBody, chosen: Tensor, frames: Tensor) -> tuple[FilmedBody, Tensor] | None:
         """The body in all frames, by resection or as in the nearest frame of the start, whichever fits; and where it is known."""
         x, seen = self.x[:, chosen], self.seen[:, chosen]
         projections = torch.linalg.inv(body.calibrations[0, 0]) @ resect(homogeneous(body.points[0]), x, seen.to(x))
@@ -193,19 +193,19 @@ class _Take:
         best = torch.where((square[0] <= square[1])[:, None, None], both[0], both[1])
         return body._replace(motions=best[None]), usable
 
-    def _adjusted(self, body: FilmedBody, usable: Tensor, points: Tensor, chosen: Tensor) -> _Fit | None:
+    def _adjust(self, body: FilmedBody, usable: Tensor, points: Tensor, chosen: Tensor) -> _Fit | None:
         """All frames, then all points together; the others are placed on the body that they are compared with."""
         options = LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9)
         body, cost = fit_body(self.problem(chosen, usable), body, options)
         if not bool(cost.isfinite().all()):
             return None
         if not bool((chosen == points).all()):
-            everyone = self._placed(body, usable)
+            everyone = self._triangulate_points(body, usable)
             body = body._replace(points=everyone[None, points])
             body, cost = fit_body(self.problem(points, usable), body, options)
             if not bool(cost.isfinite().all()):
                 return None
-        everyone = self._placed(body, usable)
+        everyone = self._triangulate_points(body, usable)
         everyone[points] = body.points[0]
         images, depth = body._replace(points=everyone[None]).images(_camera(len(points), self.x))
         counted = self.seen & usable[:, None] & (depth[0] > 0)
@@ -218,13 +218,13 @@ class _Take:
         limit = max(MAX_MISFIT_RATIO * self.noise, MIN_RELATIVE_NOISE)
         return _Fit(body, points, usable, residuals.nan_to_num(nan=math.inf), rms, limit)
 
-    def _placed(self, body: FilmedBody, usable: Tensor) -> Tensor:
+    def _triangulate_points(self, body: FilmedBody, usable: Tensor) -> Tensor:
         """All points ``(n, 3)`` on a body whose motion is known."""
         projections = body.calibrations[0] @ body.motions[0]
         found = triangulate(projections, self.x, (self.seen & usable[:, None]).to(self.x), steps=NUM_TRIANGULATION_STEPS)
         return found[:, :3] / torch.where(found[:, 3:].abs() > 1e-12, found[:, 3:], 1e-12)
 
-    def without_strangers(self, often: Tensor) -> _Fit | None:
+    def fit_subsets(self, often: Tensor) -> _Fit | None:
         """The body of the most points: subsets of six that move most like affine views of one body are tried first."""
         index = often.nonzero()[:, 0].tolist()
         whole = self.seen[:, often].all(-1)
@@ -237,10 +237,10 @@ class _Take:
         )
         best: _Fit | None = None
         for i in (left[2] * energy).argsort(stable=True)[:MAX_FITTED_SUBSETS].tolist():
-            found = self.fitted(torch.zeros_like(often).index_fill(0, sets[i], True))
+            found = self.fit(torch.zeros_like(often).index_fill(0, sets[i], True))
             if found is None or not found.agrees(found.points):
                 continue
-            joined = self.fitted(often & (found.residuals <= found.limit))
+            joined = self.fit(often & (found.residuals <= found.limit))
             found = joined if joined is not None and joined.agrees(joined.points) else found
             if best is None or int(found.points.sum()) > int(best.points.sum()):
                 best = found
@@ -276,7 +276,7 @@ NUM_CONTINUED_STARTS = 3  # Starts that are continued.
 NUM_START_ITERATIONS = 50  # Further steps of these.
 
 
-def started(x: Tensor, options: SynchronizeOptions) -> FilmedBody | None:
+def start_body(x: Tensor, options: SynchronizeOptions) -> FilmedBody | None:
     """The best body ``(1, ...)`` of tracks ``(views, n, 2)`` of order 1, without outliers; None where nothing descends."""
     focal = torch.tensor(options.focal_lengths, dtype=x.dtype, device=x.device)
     starts = [*_projective(x, focal), *_affine(x, focal)]
@@ -310,7 +310,7 @@ def _projective(x: Tensor, focal: Tensor) -> list[FilmedBody]:
     roots = values[:, None, 1:].clamp(min=1e-6 * values[:, -1:, None].clamp(min=1e-30)).sqrt()
     change = torch.cat([vectors[..., 1:] * roots, vectors[..., :1]], -1)
     points = torch.linalg.solve(change, found.structure.mT.expand(len(focal), -1, -1)).mT
-    return [_decoded(seen @ change[:, None], points, focal)]
+    return [_bodies_of_projections(seen @ change[:, None], points, focal)]
 
 
 def _quadric_rows(p: Tensor, q: Tensor) -> Tensor:
@@ -321,7 +321,7 @@ def _quadric_rows(p: Tensor, q: Tensor) -> Tensor:
     return torch.where(i == j, outer[..., i, j] / 2, outer[..., i, j])
 
 
-def _decoded(seen: Tensor, points: Tensor, focal: Tensor) -> FilmedBody:
+def _bodies_of_projections(seen: Tensor, points: Tensor, focal: Tensor) -> FilmedBody:
     """Bodies of projections ``(k, views, 3, 4)`` that are nearly :math:`s\\,[R \\mid T]`, and homogeneous points ``(k, n, 4)``."""
     size = torch.linalg.det(seen[..., :3])
     size = torch.where(size < 0, -1.0, 1.0) * size.abs().clamp(min=1e-30) ** (1 / 3)

@@ -35,11 +35,11 @@ from dyntorch.tasks.synchronize.subspace import (
     MIN_OVERLAP_SHARE,
     NOISE_FACTOR,
     SIZE_KERNEL_SECONDS,
-    completed,
-    filled,
+    fill_gaps,
+    regress_missing,
     smooth,
 )
-from dyntorch.tasks.synchronize.tracks import Tracks, smoothed
+from dyntorch.tasks.synchronize.tracks import Tracks, smooth_at
 
 Kind = Literal["affine", "affine_moving", "perspective"]
 
@@ -67,12 +67,12 @@ class LagCovariances:
         """Of rows ``(Ta, p)`` and ``(Tb, q)`` at the lags from the first to the last."""
         return LagCovariances(*lag_covariances(a, b, lags, None))
 
-    def scaled(self, variances: tuple[float, float]) -> LagCovariances:
+    def scale(self, variances: tuple[float, float]) -> LagCovariances:
         """In units of these variances of a's and of b's noise."""
         va, vb = variances
         return LagCovariances(self.aa / va, self.bb / vb, self.ab / math.sqrt(va * vb), self.counts)
 
-    def combined(self, a: Tensor, b: Tensor) -> LagCovariances:
+    def combine(self, a: Tensor, b: Tensor) -> LagCovariances:
         """Of combinations ``(p', p)`` of a's rows and ``(q', q)`` of b's."""
         return LagCovariances(a @ self.aa @ a.mT, b @ self.bb @ b.mT, a @ self.ab @ b.mT, self.counts)
 
@@ -85,7 +85,7 @@ class LagCovariances:
 MIN_SIGNAL_VARIANCE = 4.0  # Variance over the noise from which a direction belongs to a row space.
 
 
-def shared(moments: LagCovariances, judged: Tensor, measure: Measure) -> Tensor:
+def shared_information(moments: LagCovariances, judged: Tensor, measure: Measure) -> Tensor:
     r"""How much the rows share at every lag ``(L,)``, more is better; in units of noise of variance 1."""
     if measure == "rank":
         return _beyond_rank(moments, judged)
@@ -129,7 +129,7 @@ MIN_RELATIVE_NOISE = 1e-6  # Floor of the noise over the RMS distance of the poi
 
 
 @dataclass(frozen=True, eq=False)
-class Films:
+class TrackPair:
     """Two cameras' tracks on a common clock, smoothed alike, b at several moments between frames."""
 
     a: Tracks  # the tracks
@@ -165,9 +165,9 @@ class Films:
         return self._points(self.b, self.times[1] + fraction * self.step * self.rate, self.width * self.rate)
 
     def _points(self, tracks: Tracks, times: Tensor, width: float) -> Tensor:
-        x, _, weights = smoothed(tracks, times, width)
+        x, _, weights = smooth_at(tracks, times, width)
         seen = weights > 0
-        return completed(filled(x, seen), seen)
+        return regress_missing(fill_gaps(x, seen), seen)
 
     def variance(self, tracks: Tracks, width: float) -> float:
         """Of a coordinate's noise after the kernel."""
@@ -188,16 +188,16 @@ class Films:
         return min(1.0, self.step / (2 * math.sqrt(math.pi) * self.width))
 
     @property
-    def completed(self) -> Films:
+    def without_gaps(self) -> TrackPair:
         """With what is missing filled in once, in the frames as they are, rather than at every moment that is asked for."""
         whole = []
         for tracks in (self.a, self.b):
             seen = tracks.weights > 0
-            x = completed(filled(tracks.x, seen), seen)
+            x = regress_missing(fill_gaps(tracks.x, seen), seen)
             whole.append(replace(tracks, x=x, weights=torch.ones_like(tracks.weights)))
         return replace(self, a=whole[0], b=whole[1])
 
-    def only(self, a: Tensor, b: Tensor) -> Films:
+    def only(self, a: Tensor, b: Tensor) -> TrackPair:
         """Of these points ``(n,)`` and ``(m,)`` bool alone."""
         return replace(self, a=self.a.only(a), b=self.b.only(b))
 
@@ -266,17 +266,17 @@ MIN_PEAK_SEPARATION_SECONDS = 0.2  # Within this peaks are one.
 class KindMoments:
     """Covariances of both cameras' rows as one kind of camera needs them, at all lags and with b played backwards."""
 
-    films: Films
+    films: TrackPair
     kind: Kind  # of the cameras
     moments: LagCovariances  # of the films, and with b backwards
     chance: LagCovariances
     judged: Tensor  # ``(L,)`` bool, lags of either that overlap enough
-    ruled: Tensor
+    chance_scored: Tensor
     lags: Tensor  # ``(L,)`` frames
     energies: tuple[float, float]  # mean squares of a's and of b's rows
 
     @staticmethod
-    def of(films: Films, kind: Kind, second: list[Tensor], lags: tuple[int, int]) -> KindMoments:
+    def of(films: TrackPair, kind: Kind, second: list[Tensor], lags: tuple[int, int]) -> KindMoments:
         """Of b's points at fractions of frames."""
         slow = SIZE_KERNEL_SECONDS / films.step
         a, bs = rows_of(films.first, kind, slow), [rows_of(part, kind, slow) for part in second]
@@ -297,11 +297,11 @@ class KindMoments:
 
     def only(self, a: Tensor, b: Tensor) -> KindMoments:
         """Of these points ``(n,)`` and ``(m,)`` bool alone: their rows are combinations of all points' rows."""
-        one, two = torch.eye(self.moments.aa.shape[-1], dtype=self.moments.aa.dtype, device=a.device), self._combined(b)
-        one = one if self.films.spatial else self._combined(a)
-        return replace(self, moments=self.moments.combined(one, two), chance=self.chance.combined(one, two))
+        one, two = torch.eye(self.moments.aa.shape[-1], dtype=self.moments.aa.dtype, device=a.device), self._combination(b)
+        one = one if self.films.spatial else self._combination(a)
+        return replace(self, moments=self.moments.combine(one, two), chance=self.chance.combine(one, two))
 
-    def _combined(self, kept: Tensor) -> Tensor:
+    def _combination(self, kept: Tensor) -> Tensor:
         rows = torch.eye(len(kept), dtype=self.moments.aa.dtype, device=kept.device)[kept]
         if self.kind != "affine":  # about the middle of those that are left
             rows = rows - rows.mean(0)
@@ -316,10 +316,10 @@ class KindMoments:
         )
         if not (0 < first < math.inf and 0 < second < math.inf and min(self.energies) > 0):
             return None
-        scores = shared(self.moments.scaled((first, second)), self.judged, measure)
-        if bool(self.ruled.any()):
-            chance = shared(self.chance.scaled((first, second)), self.ruled, measure).nan_to_num(0.0)
-            scores = scores - _line(chance, self.chance.counts, self.moments.counts, self.ruled)
+        scores = shared_information(self.moments.scale((first, second)), self.judged, measure)
+        if bool(self.chance_scored.any()):
+            chance = shared_information(self.chance.scale((first, second)), self.chance_scored, measure).nan_to_num(0.0)
+            scores = scores - _line(chance, self.chance.counts, self.moments.counts, self.chance_scored)
         scores = torch.where(self.judged, scores, torch.nan)
         apart = MIN_PEAK_SEPARATION_SECONDS / self.films.step
         return Hypothesis(self.kind, level, self.lags, scores, self.moments.counts, self.films.samples, apart)
@@ -328,7 +328,7 @@ class KindMoments:
 NUM_FRACTIONS = 2  # Places within a frame at which lags are scored.
 
 
-def kind_moments(films: Films, lags: tuple[int, int]) -> list[KindMoments]:
+def kind_moments(films: TrackPair, lags: tuple[int, int]) -> list[KindMoments]:
     """Of every kind of camera that the options allow."""
     fractions = NUM_FRACTIONS
     asked = films.options.camera_model
@@ -373,17 +373,17 @@ NUM_ZOOM_TERMS = 8  # Chebyshev polynomials in time of the log ratio of both cam
 NUM_ZOOM_ALTERNATIONS = 3  # Alternations of zoom and lag.
 
 
-def refined(films: Films, found: Hypothesis) -> Place:
+def refine_lag(films: TrackPair, found: Hypothesis) -> Place:
     """Lag of most information near a hypothesis's best; of cameras that may zoom, with the ratio of their zooms."""
     start = float(found.lags[found.best])
-    plain = _climbed(_Between(films, found.kind, found.level, around=start), start)
+    plain = _climb(_LagScore(films, found.kind, found.level, around=start), start)
     if found.kind == "affine" or films.options.measure not in ("auto", "log_determinant"):
         return plain
     place = plain
     rounds = NUM_ZOOM_ALTERNATIONS
     for level in [max(MODEL_ERRORS)] + [found.level] * (rounds - 1):  # a wide optimum first
-        between = _Between(films, "affine_moving", level, place.zoom, around=start)
-        place = _climbed(replace(between, zoom=between.freed(place.lag)), place.lag)
+        between = _LagScore(films, "affine_moving", level, place.zoom, around=start)
+        place = _climb(replace(between, zoom=between.estimate_zoom(place.lag)), place.lag)
     # a function of time is fitted with so many numbers, each worth half the logarithm of the samples
     price = 0.5 * NUM_ZOOM_TERMS * math.log(max(len(films.first) * films.samples, 2.0))
     return replace(place, nats=place.nats - price) if place.nats > plain.nats + price else plain
@@ -393,7 +393,7 @@ MIN_SEARCH_STEP_FRAMES = 1 / 2048  # Step that ends the search between frames.
 CURVATURE_STEP_FRAMES = 0.125  # Step of the second difference of the score.
 
 
-def _climbed(score: _Between, place: float) -> Place:
+def _climb(score: _LagScore, place: float) -> Place:
     """The highest place near this one."""
     top, reach = score(place), 1.0 / NUM_FRACTIONS
     while reach > MIN_SEARCH_STEP_FRAMES:
@@ -413,10 +413,10 @@ MIN_UNSHARED_VARIANCE = 1e-6  # Floor of the share of a direction that is not co
 
 
 @dataclass(frozen=True)
-class _Between:
+class _LagScore:
     """Nats at any lag near one, by one kind of camera and level of noise; ``zoom`` as of :class:`Place`."""
 
-    films: Films
+    films: TrackPair
     kind: Kind
     level: float
     zoom: Tensor | None = None
@@ -432,7 +432,7 @@ class _Between:
         c, p = (both.mT @ both / len(both))[None], a.shape[1]
         count = both.new_full((1,), len(both))
         moments = LagCovariances(c[:, :p, :p], c[:, p:, p:], c[:, :p, p:], count)
-        value = shared(moments, count > 0, self.films.options.measure)
+        value = shared_information(moments, count > 0, self.films.options.measure)
         return float(value[0] * count[0]) * self.films.samples
 
     def rows(self, lag: float) -> tuple[Tensor, Tensor]:
@@ -458,7 +458,7 @@ class _Between:
         low, high = min(whole, math.floor(self.around) - 1), max(whole, math.ceil(self.around) + 1)
         return max(0, -low), max(min(first, second - high), 0)
 
-    def freed(self, lag: float) -> Tensor:
+    def estimate_zoom(self, lag: float) -> Tensor:
         r"""The ratio of the zooms that makes the row spaces meet best, by steps of least squares."""
         frames = len(self.films.first)
         zoom = self.films.first.new_zeros(frames) if self.zoom is None else self.zoom

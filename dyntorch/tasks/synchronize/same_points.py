@@ -29,9 +29,9 @@ from dyntorch.tasks.synchronize.tracks import (
     MIN_SECONDS_FOR_RATE,
     RATE_SIGNIFICANCE_SIGMAS,
     Tracks,
-    frame_scaled,
-    smoothed,
-    without,
+    remove_positions,
+    scale_frames,
+    smooth_at,
 )
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ class ShiftSearch:
     generator: Generator | None = None  # of the subsets of points
 
 
-def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None) -> Attempt:
+def search_shift(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = None) -> Attempt:
     """Search all shifts at the given rates of b's clock, descend from the best, and settle the rate. points ``(n,)``."""
     points = torch.ones(a.x.shape[1], dtype=torch.bool, device=a.x.device) if points is None else points
     a, b = (a, b) if bool(points.all()) else (a.only(points), b.only(points))
@@ -61,7 +61,7 @@ def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = N
         (samples, epipolar_curve(samples, search.max_shift))
         for samples in (search.model.samples.of(a, b, step, r) for r in search.rates)
     ]
-    fit = _best(a, b, [curve for _, curve in searched], step, search)
+    fit = _descend_from_peaks(a, b, [curve for _, curve in searched], step, search)
     samples, curve = min(searched, key=lambda found: abs(found[0].rate - (fit.rate if fit else 1.0)))
     if fit is not None and abs(fit.rate - samples.rate) * (float(a.times[-1]) - float(a.times[0])) > 0.25 * step:
         samples = search.model.samples.of(a, b, step, fit.rate)
@@ -74,7 +74,7 @@ def attempt(a: Tracks, b: Tracks, search: ShiftSearch, points: Tensor | None = N
 CLEAR_PEAK_MARGIN = 0.6  # Nats above the next peak from which that one needs no descent of its own.
 
 
-def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, search: ShiftSearch) -> EpipolarFit | None:
+def _descend_from_peaks(a: Tracks, b: Tracks, curves: list[Curve], step: float, search: ShiftSearch) -> EpipolarFit | None:
     """The likeliest minimum near the peaks of the curves."""
     free_rate = search.free_rate
     frame = max(a.step, b.step)
@@ -104,13 +104,13 @@ def _best(a: Tracks, b: Tracks, curves: list[Curve], step: float, search: ShiftS
         descent = search.model.descent(a, b, width)
         best = descent.run(best.offset, best.rate, free_rate=free_rate) or best
     long = float(best.times[-1] - best.times[0]) > MIN_SECONDS_FOR_RATE
-    return _settled(descent, best) if free_rate and long else best
+    return _select_rate(descent, best) if free_rate and long else best
 
 
 MIN_RATE_EFFECT_FRAMES = 0.1  # Frames over the take that a rate must amount to.
 
 
-def _settled(descent: ShiftDescent, fit: EpipolarFit) -> EpipolarFit:
+def _select_rate(descent: ShiftDescent, fit: EpipolarFit) -> EpipolarFit:
     """With its own rate where that differs from 1 beyond doubt, else with rate 1."""
     free = descent.run(fit.offset, fit.rate, free_rate=True)
     span = float(fit.times[-1] - fit.times[0])
@@ -127,7 +127,7 @@ def _settled(descent: ShiftDescent, fit: EpipolarFit) -> EpipolarFit:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Result:
+class SamePointsResult:
     """The best attempt and what it took."""
 
     found: Attempt
@@ -150,7 +150,7 @@ def search_same_points(
     generator: Generator | None,
     options: SynchronizeOptions,
     model: PairModel = EPIPOLAR,
-) -> Result:
+) -> SamePointsResult:
     """The shift of cameras that see the same points, or of a camera and the same points in space."""
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
     search = ShiftSearch(
@@ -159,37 +159,37 @@ def search_same_points(
         options=options, generator=generator,
     )  # fmt: skip
     seen = (a.weights > 0).any(0) & (b.weights > 0).any(0)
-    if a.still or b.still:
-        return Result(dataclasses.replace(attempt(a, b, search), fit=None), (), seen)
+    if a.static or b.static:
+        return SamePointsResult(dataclasses.replace(search_shift(a, b, search), fit=None), (), seen)
     if camera == "affine":
-        return Result(_affine(a, b, search), (), seen)
-    found = _sorted_out(a, b, search)
-    if not found.decided and rate is None:
-        found = _better(found, _over_rates(a, b, search, span))
+        return SamePointsResult(_search_affine(a, b, search), (), seen)
+    found = _search_without_outliers(a, b, search)
+    if not found.accepted_shift and rate is None:
+        found = _select_attempt(found, _search_rates(a, b, search, span))
     known: tuple[Notice, ...] = ()
-    if lenses and found.fit is not None and found.roughness > MIN_ROUGHNESS_FOR_LENSES:
-        found, known = _straightened(found, a, b, search)
-    if camera == "auto" and model is EPIPOLAR and not found.decided:
-        scaled = _affine(a, b, search)
+    if lenses and found.fit is not None and found.normalized_residual > MIN_ROUGHNESS_FOR_LENSES:
+        found, known = _search_undistorted(found, a, b, search)
+    if camera == "auto" and model is EPIPOLAR and not found.accepted_shift:
+        scaled = _search_affine(a, b, search)
         # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
-        if scaled.decided and _agree(scaled, found):
-            return Result(scaled, (Notice(ShiftNotice.AFFINE),), seen)
-    return Result(found, known if found.decided else (), seen)
+        if scaled.accepted_shift and _same_shift(scaled, found):
+            return SamePointsResult(scaled, (Notice(ShiftNotice.AFFINE),), seen)
+    return SamePointsResult(found, known if found.accepted_shift else (), seen)
 
 
-def _sorted_out(a: Tracks, b: Tracks, search: ShiftSearch) -> Attempt:
+def _search_without_outliers(a: Tracks, b: Tracks, search: ShiftSearch) -> Attempt:
     """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
-    found = attempt(a, b, search)
-    pruned = _pruned(found)
+    found = search_shift(a, b, search)
+    pruned = _reject_positions(found)
     if pruned is not None:
         a, b = pruned
-        found = _better(found, dataclasses.replace(attempt(a, b, search), pruned=True))
-    if found.decided and not bool(_suspects(found).any()):
+        found = _select_attempt(found, dataclasses.replace(search_shift(a, b, search), positions_removed=True))
+    if found.accepted_shift and not bool(_suspected_points(found).any()):
         return found
     points = consistent_points(a, b, found, search.generator) if search.options.reject_points else None
     if points is None or bool(points.all()):
         return found
-    return _better(found, dataclasses.replace(attempt(a, b, search, points), pruned=pruned is not None))
+    return _select_attempt(found, dataclasses.replace(search_shift(a, b, search, points), positions_removed=pruned is not None))
 
 
 OUTLIER_SIGMAS = 6.0  # Robust sigmas from the fit at which a position is an outlier.
@@ -198,7 +198,7 @@ NUM_STRETCHES = 8  # Stretches of the take that are tested for it.
 NEGLIGIBLE_OUTLIER_SHARE = 0.01  # Share of outliers that makes no difference to an accepted fit.
 
 
-def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
+def _reject_positions(found: Attempt) -> tuple[Tracks, Tracks] | None:
     """Tracks without the positions far from the fit, in both cameras: whose is wrong is not known; None where all is well."""
     fit = found.fit
     if fit is None or len(fit.times) != len(found.a.times):
@@ -210,7 +210,7 @@ def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
     parts = [
         (float(one.sum()), float(all_.sum())) for one, all_ in zip(far.chunk(NUM_STRETCHES), seen.chunk(NUM_STRETCHES), strict=True)
     ]
-    if found.decided and float(far.double().mean()) < NEGLIGIBLE_OUTLIER_SHARE:
+    if found.accepted_shift and float(far.double().mean()) < NEGLIGIBLE_OUTLIER_SHARE:
         return None  # the weights of the fit are enough
     # a stretch that does not fit is no outlier: it contradicts
     if not bool(far.any()) or any(lost > MAX_OUTLIER_SHARE * whole for lost, whole in parts):
@@ -220,13 +220,13 @@ def _pruned(found: Attempt) -> tuple[Tracks, Tracks] | None:
     nearest = (there[:, None] - found.b.times).abs().argmin(1)
     other = torch.zeros_like(found.b.weights, dtype=torch.bool)
     other[nearest, joints] = True
-    return without(found.a, far), without(found.b, other)
+    return remove_positions(found.a, far), remove_positions(found.b, other)
 
 
 MAX_RATE_STEPS = 2_000  # Steps of a take for a search over rates, of a tenth of a second at least.
 
 
-def _over_rates(a: Tracks, b: Tracks, search: ShiftSearch, span: float) -> Attempt | None:
+def _search_rates(a: Tracks, b: Tracks, search: ShiftSearch, span: float) -> Attempt | None:
     """A search over clock rates too, where a wrong one would have smeared the motion."""
     step = max(span / MAX_RATE_STEPS, 0.1)
     change = 2 * step / span  # moves the ends of the overlap by a step
@@ -234,26 +234,26 @@ def _over_rates(a: Tracks, b: Tracks, search: ShiftSearch, span: float) -> Attem
     if span < MIN_SECONDS_FOR_RATE:
         return None
     rates = tuple(1 + k * change for k in range(-count, count + 1))
-    coarse = attempt(a, b, dataclasses.replace(search, step=step, rates=rates))
+    coarse = search_shift(a, b, dataclasses.replace(search, step=step, rates=rates))
     if coarse.fit is None:
         return None
-    return _sorted_out(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)))
+    return _search_without_outliers(a, b, dataclasses.replace(search, rates=(coarse.fit.rate,)))
 
 
-def _affine(a: Tracks, b: Tracks, search: ShiftSearch) -> Attempt:
-    return _sorted_out(frame_scaled(a), frame_scaled(b), dataclasses.replace(search, method="affine"))
+def _search_affine(a: Tracks, b: Tracks, search: ShiftSearch) -> Attempt:
+    return _search_without_outliers(scale_frames(a), scale_frames(b), dataclasses.replace(search, method="affine"))
 
 
-def _better(one: Attempt, other: Attempt | None) -> Attempt:
+def _select_attempt(one: Attempt, other: Attempt | None) -> Attempt:
     """The decided one; where both are, the other, which had the more careful input; where none is, the one more likely right."""
     if other is None or other.fit is None:
         return one
-    if one.fit is None or other.decided:
+    if one.fit is None or other.accepted_shift:
         return other
-    return one if one.decided or one.confidence >= other.confidence else other
+    return one if one.accepted_shift or one.confidence >= other.confidence else other
 
 
-def _agree(one: Attempt, other: Attempt) -> bool:
+def _same_shift(one: Attempt, other: Attempt) -> bool:
     """Whether the best shifts are the same."""
     return (
         one.fit is not None
@@ -265,19 +265,19 @@ def _agree(one: Attempt, other: Attempt) -> bool:
 SUSPECT_RESIDUAL_RATIO = 3.0  # Residual over the usual one beyond which a point is suspected.
 
 
-def _suspects(found: Attempt) -> Tensor:
+def _suspected_points(found: Attempt) -> Tensor:
     """``(n,)`` of the points that took part: whether their residual is out of all proportion."""
     assert found.fit is not None
     own = found.fit.distances.abs().nanmedian(0).values * 1.4826
     return own.nan_to_num(0.0) > SUSPECT_RESIDUAL_RATIO
 
 
-def _straightened(found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch) -> tuple[Attempt, tuple[Notice, ...]]:
+def _search_undistorted(found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch) -> tuple[Attempt, tuple[Notice, ...]]:
     """Once more with lenses fitted at the shift found, where they are significant."""
     assert found.fit is not None
     fit = found.fit
-    x1, _, w1 = smoothed(found.a, fit.times, found.frame)
-    x2, _, w2 = smoothed(found.b, fit.times * fit.rate + fit.offset, found.frame)
+    x1, _, w1 = smooth_at(found.a, fit.times, found.frame)
+    x2, _, w2 = smooth_at(found.b, fit.times * fit.rate + fit.offset, found.frame)
     lens = fit_distortion(x1.flatten(0, 1), x2.flatten(0, 1), (w1 * w2).flatten())
     if not lens.significant:
         return found, ()
@@ -286,8 +286,8 @@ def _straightened(found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch) -> 
         x = one.undistort(tracks.x)
         seen = x.isfinite().all(-1)
         straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
-    again = attempt(straight[0], straight[1], search, found.points)
-    better = again.fit is not None and again.fit.residual < fit.residual and _better(found, again) is again
+    again = search_shift(straight[0], straight[1], search, found.points)
+    better = again.fit is not None and again.fit.residual < fit.residual and _select_attempt(found, again) is again
     values = {"a": lens.lambda_a, "b": lens.lambda_b}
     return (again, (Notice(ShiftNotice.LENS, 0.0, values),)) if better else (found, ())
 
@@ -295,7 +295,7 @@ def _straightened(found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch) -> 
 MAX_CAMERA_MOTION_RATIO = 1.35  # Residual over that of each half by itself beyond which a camera may have moved.
 
 
-def shift_of(result: Result) -> Shift:
+def shift_of(result: SamePointsResult) -> Shift:
     """The result of an attempt."""
     found, limits = result.found, result.notices
     fps = 1 / found.a.step, 1 / found.b.step
@@ -303,19 +303,19 @@ def shift_of(result: Result) -> Shift:
     points = found.points & result.seen
     if fit is None:
         none = torch.zeros(0, dtype=torch.float64)
-        limits = (_nothing(found),)
+        limits = (_refuse_without_peak(found),)
         return Shift(
             0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), found.method, fps, 0.0, none, none, result.seen,
             status=status_from(limits), notices=limits,
         )  # fmt: skip
-    if not found.decided:
+    if not found.accepted_shift:
         limits = (_refusal(found), *limits)
     wrong = (result.seen & ~found.points).nonzero()[:, 0].tolist()
     if wrong:
         which = ", ".join(str(point) for point in wrong)
         limits = (*limits, Notice(ShiftNotice.LEFT_OUT, float(len(wrong)), {"points": len(points), "which": which}))
-    if found.decided and found.wander > MAX_CAMERA_MOTION_RATIO:
-        limits = (*limits, Notice(ShiftNotice.MOVED, found.wander))
+    if found.accepted_shift and found.camera_motion_ratio > MAX_CAMERA_MOTION_RATIO:
+        limits = (*limits, Notice(ShiftNotice.MOVED, found.camera_motion_ratio))
     lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
     return Shift(
         offset=fit.offset,
@@ -337,12 +337,12 @@ def shift_of(result: Result) -> Shift:
     )
 
 
-def _nothing(found: Attempt) -> Notice:
+def _refuse_without_peak(found: Attempt) -> Notice:
     """Why no shift stands out."""
     for name, tracks in (("a", found.a), ("b", found.b)):
         if not bool((tracks.weights > 0).any()):
             return Notice(ShiftNotice.NO_POINT, 0.0, {"which": name})
-        if tracks.still:
+        if tracks.static:
             return Notice(ShiftNotice.STILL, 0.0, {"which": name})
     return Notice(ShiftNotice.NOTHING)
 
@@ -355,19 +355,23 @@ def _refusal(found: Attempt) -> Notice:
     fit = found.fit
     assert fit is not None
     if fit.sigma > MAX_SIGMA_OF_PEAK_FRAMES * found.frame:
-        return _nothing(found)
-    if found.agree and found.margin >= found.needed and found.forward < found.needed_forward:
-        return Notice(ShiftNotice.BACKWARDS, found.forward)
-    if found.edge:
+        return _refuse_without_peak(found)
+    if (
+        found.halves_agree
+        and found.margin >= found.required_margin
+        and found.time_reversal_margin < found.required_time_reversal_margin
+    ):
+        return Notice(ShiftNotice.BACKWARDS, found.time_reversal_margin)
+    if found.at_search_end:
         return Notice(ShiftNotice.EDGE, fit.shift, {"best": fit.shift})
-    if not found.sharp:
+    if not found.precise:
         return Notice(ShiftNotice.BLUNT, fit.sigma, {"case": "small", "best": fit.shift})
-    if found.margin < found.needed and len(found.peaks) > 1:
-        least = found.misfits[0] - found.needed
+    if found.margin < found.required_margin and len(found.peaks) > 1:
+        least = found.misfits[0] - found.required_margin
         near = [shift for (shift, _), misfit in zip(found.peaks, found.misfits, strict=True) if misfit > least]
         rivals = ", ".join(f"{shift:+.3g} s" for shift in near[1:4])
         return Notice(ShiftNotice.REPEATED, found.margin, {"case": "rivals", "best": found.peaks[0][0], "rivals": rivals})
     first, second = found.halves
     shifts = (f"{fit.shift + away * found.frame:+.3g} s" for away in (first, second))
     said = " and ".join("nothing" if "nan" in shift else shift for shift in shifts)
-    return Notice(ShiftNotice.HALVES, 0.0, {"halves": said, "apart": found.apart, "best": fit.shift})
+    return Notice(ShiftNotice.HALVES, 0.0, {"halves": said, "apart": found.half_disagreement, "best": fit.shift})

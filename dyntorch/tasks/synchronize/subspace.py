@@ -63,12 +63,12 @@ class Body:
         return float((w * x.square()).sum() / (x.shape[-1] * spare.sum()).clamp(min=1)) / noise
 
     @property
-    def reversed(self) -> Body:
+    def time_reversed(self) -> Body:
         """The same played backwards: as smooth, and in step with nothing."""
         return replace(self, rows=self.rows.flip(0), motion=self.motion.flip(0), weights=self.weights.flip(0))
 
     @property
-    def blurred(self) -> Body:
+    def with_lag_noise(self) -> Body:
         """Rows with as much more noise as a time that is known to a frame only makes."""
         if len(self.rows) < 2:
             return self
@@ -95,10 +95,10 @@ def body_of(x: Tensor, weights: Tensor, step: float = STEP, *, least: float = TI
         rest = max(len(x) - 2 * edge, 1)
         rows, motion = x.new_zeros(rest, x[0].numel()), x.new_zeros(rest, x.shape[-1])
         return Body(rows, motion, x.new_zeros(rest), x, seen, step)
-    return _body(completed(filled(x, seen), seen), seen, whole, step, least)
+    return _body(regress_missing(fill_gaps(x, seen), seen), seen, whole, step, least)
 
 
-def halves(body: Body) -> tuple[Body, Body]:
+def split_points(body: Body) -> tuple[Body, Body]:
     """Bodies of either half of the points: their noise is independent."""
     n = body.points.shape[1]
     order = torch.randperm(n, generator=torch.Generator().manual_seed(0)).to(body.points.device)
@@ -127,11 +127,11 @@ def _body(held: Tensor, seen: Tensor, whole: Tensor, step: float, least: float) 
     inside = slice(edge, -edge)
     places = smooth(shape, width)[inside]
     places = (places - places.mean(0)) / math.sqrt(variance)
-    rows = (places if held.shape[-1] == 2 else _fewer(places)).flatten(1)
+    rows = (places if held.shape[-1] == 2 else _principal_combinations(places)).flatten(1)
     return Body(rows, _motion(held, width)[inside], whole.double()[inside], held, seen, step, noise=noise)
 
 
-def _fewer(places: Tensor) -> Tensor:
+def _principal_combinations(places: Tensor) -> Tensor:
     """As many combinations ``(T, k, d)`` of points ``(T, n, d)`` as move by more than noise of variance 1: what all tell,
     sooner."""
     by_point = places.movedim(1, 0).flatten(1)
@@ -157,20 +157,20 @@ def _edge(step: float) -> int:
 
 def smooth(x: Tensor, width: float) -> Tensor:
     """Gaussian means along the first dimension, of what there is at the ends."""
-    return _convolved(x, width) / _convolved(x.new_ones(len(x), *[1] * (x.ndim - 1)), width)
+    return _convolve(x, width) / _convolve(x.new_ones(len(x), *[1] * (x.ndim - 1)), width)
 
 
 GAP_KERNELS_FRAMES = (1.0, 2.5, 6.0, 15.0, 40.0)  # Ever wider kernels that fill gaps, frames.
 
 
-def filled(x: Tensor, seen: Tensor) -> Tensor:
+def fill_gaps(x: Tensor, seen: Tensor) -> Tensor:
     """Missing positions ``(T, n)`` from the same track's nearest times, by the narrowest Gaussian that sees some."""
     result, open_ = x, ~seen
     for width in GAP_KERNELS_FRAMES:
         if not bool(open_.any()):
             return result
-        share = _convolved(seen.double(), width)
-        found = _convolved(torch.where(seen[..., None], x, 0.0), width) / share.clamp(min=1e-12)[..., None]
+        share = _convolve(seen.double(), width)
+        found = _convolve(torch.where(seen[..., None], x, 0.0), width) / share.clamp(min=1e-12)[..., None]
         take = open_ & (share > 0.1)
         result, open_ = torch.where(take[..., None], found, result), open_ & ~take
     count = seen.sum(0).clamp(min=1)[:, None]
@@ -201,7 +201,7 @@ def _noise(x: Tensor, seen: Tensor) -> float:
 NUM_FILL_PASSES = 12  # Regressions of missing positions on the other points.
 
 
-def completed(x: Tensor, seen: Tensor) -> Tensor:
+def regress_missing(x: Tensor, seen: Tensor) -> Tensor:
     r"""Positions ``(T, n, d)``, those missing by regression on the other points of their frame, over and over."""
     if bool(seen.all()):
         return x
@@ -213,7 +213,7 @@ def completed(x: Tensor, seen: Tensor) -> Tensor:
         inverse = torch.linalg.inv(rows.mT @ rows / len(rows) + noise * unit)
         own = inverse.unflatten(0, (n, dims)).unflatten(2, (n, dims)).diagonal(dim1=0, dim2=2).movedim(-1, 0)  # (n, d, d)
         change = torch.linalg.solve(own, (rows @ inverse).unflatten(1, (n, dims)).movedim(0, 2)).movedim(2, 0)
-        nearby = filled(torch.where(seen[..., None], change, 0.0), seen)
+        nearby = fill_gaps(torch.where(seen[..., None], change, 0.0), seen)
         rows = rows - torch.where(seen[..., None], 0.0, change - nearby).flatten(1)
     return rows.unflatten(1, (n, dims)) + mean
 
@@ -224,7 +224,7 @@ def _motion(x: Tensor, width: float) -> Tensor:
     return 0.5 * (velocity.median(1).values - (-velocity).median(1).values)  # of both middle ones
 
 
-def _convolved(x: Tensor, width: float) -> Tensor:
+def _convolve(x: Tensor, width: float) -> Tensor:
     """Sums under a Gaussian of sum 1 along the first dimension."""
     reach = min(math.ceil(4 * width), max(len(x) - 1, 1))
     u = torch.arange(-reach, reach + 1, dtype=x.dtype, device=x.device) / width
@@ -291,7 +291,7 @@ def bodies_curve(first: Body, second: Body, lags: tuple[int, int], step: float =
         MIN_OVERLAP_SECONDS / step - 1e-9,
     )
     if bool(judged.any()):
-        chance = _chance(first, second.reversed, counts, judged, lags)
+        chance = _chance_bias(first, second.time_reversed, counts, judged, lags)
         shape, height = shape - chance[:, 0], height - chance[:, 1]
     scores = counts * step * (SHAPE_SAMPLE_RATE * shape + HEIGHT_SAMPLE_RATE * height + MOTION_SAMPLE_RATE * motion)
     span = torch.arange(lags[0], lags[1] + 1, dtype=torch.float64, device=counts.device)
@@ -309,14 +309,14 @@ def _curves(a: Body, b: Body, lags: tuple[int, int]) -> list[Tensor]:
         aa, bb, ab, counts = lag_covariances(a.rows, b.rows, span, weights)
         *motion, _ = lag_covariances(a.motion, b.motion, span, weights)
         upright = _vertical((aa, bb, ab), (a.dims, b.dims))
-        found.append((_shared(aa, bb, ab), _shared(*upright), _correlated(*motion), counts))
+        found.append((_mutual_information(aa, bb, ab), _mutual_information(*upright), _motion_information(*motion), counts))
     return [torch.cat(parts) for parts in zip(*found, strict=True)]
 
 
 NUM_CHANCE_LAGS = 40  # Lags at which the bias by chance is measured.
 
 
-def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, int]) -> Tensor:
+def _chance_bias(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, int]) -> Tensor:
     """What shapes and heights ``(L, 2)`` of different events tell about each other: a line in 1 / count, through some lags."""
     at = judged.nonzero()[:, 0]
     at = at[torch.linspace(0, len(at) - 1, min(NUM_CHANCE_LAGS, len(at))).round().long().to(at.device)]
@@ -329,7 +329,7 @@ def _chance(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[int, i
         share = 1 / max(len(both), 1)
         c = (share * both.mT @ both)[None]
         parts = c[:, :n, :n], c[:, n:, n:], c[:, :n, n:]
-        told.append(torch.cat([_shared(*parts), _shared(*_vertical(parts, (a.dims, b.dims)))]))
+        told.append(torch.cat([_mutual_information(*parts), _mutual_information(*_vertical(parts, (a.dims, b.dims)))]))
         inverse.append([1.0, share])
     design = torch.tensor(inverse, dtype=torch.float64, device=counts.device)
     # the default driver reads an order of pivots that nobody wrote: last digits that differ from run to run (pytorch issue 187411)
@@ -341,8 +341,8 @@ def information(shape: Tensor, motion: Tensor, bodies: tuple[Body, Body]) -> Ten
     """Evidence per second ``(L,)`` of joint covariances of the bodies' shapes and motions; chance is in it."""
     dims, n = (bodies[0].dims, bodies[1].dims), bodies[0].rows.shape[1]
     parts = _parts(shape, n)
-    told = SHAPE_SAMPLE_RATE * _shared(*parts) + HEIGHT_SAMPLE_RATE * _shared(*_vertical(parts, dims))
-    return told + MOTION_SAMPLE_RATE * _correlated(*_parts(motion, dims[0]))
+    told = SHAPE_SAMPLE_RATE * _mutual_information(*parts) + HEIGHT_SAMPLE_RATE * _mutual_information(*_vertical(parts, dims))
+    return told + MOTION_SAMPLE_RATE * _motion_information(*_parts(motion, dims[0]))
 
 
 _Parts = tuple[Tensor, Tensor, Tensor]
@@ -359,7 +359,7 @@ def _vertical(parts: _Parts, dims: tuple[int, int]) -> _Parts:
     return aa[..., 1::da, 1::da], bb[..., 1::db, 1::db], ab[..., 1::da, 1::db]
 
 
-def _shared(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
+def _mutual_information(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
     """Mutual information ``(L,)`` of rows with noise of variance 1."""
     aa, bb = (c + torch.eye(c.shape[-1], dtype=c.dtype, device=c.device) for c in (aa, bb))
     low_a, low_b = _factor(aa), _factor(bb)
@@ -372,11 +372,11 @@ def _shared(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
 VELOCITY_NOISE_SHARE = 0.02  # Noise of a velocity as a share of its variance: medians of different points differ.
 
 
-def _correlated(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
+def _motion_information(aa: Tensor, bb: Tensor, ab: Tensor) -> Tensor:
     """Mutual information ``(L,)`` where each coordinate has noise in proportion to itself."""
     one, two = (VELOCITY_NOISE_SHARE * c.diagonal(dim1=-2, dim2=-1) for c in (aa, bb))
     one, two = (v.clamp(min=1e-12 * float(v.max()) + 1e-300).rsqrt()[..., None] for v in (one, two))
-    return _shared(one * aa * one.mT, two * bb * two.mT, one * ab * two.mT)
+    return _mutual_information(one * aa * one.mT, two * bb * two.mT, one * ab * two.mT)
 
 
 def _factor(c: Tensor) -> Tensor:
@@ -388,7 +388,7 @@ def _factor(c: Tensor) -> Tensor:
 # What speaks against a lag between different points: motion that repeats itself, and a peak that depends on single moments.
 
 
-def resemblance(curve: SubspaceCurve, best: int, apart: float) -> float:
+def self_similarity(curve: SubspaceCurve, best: int, apart: float) -> float:
     r"""How much the motion resembles itself at another time that fits as well: 0 not at all, 1 as much as at the same time."""
     if curve.bodies is None:
         return 0.0
@@ -398,7 +398,7 @@ def resemblance(curve: SubspaceCurve, best: int, apart: float) -> float:
     reach = min(int(rivals.abs().max()), frames - math.ceil(MIN_OVERLAP_SECONDS / step))
     if reach <= apart:
         return 0.0
-    both = sum((_alike(body, reach) for body in curve.bodies), curve.scores.new_zeros(2 * reach + 1))
+    both = sum((_self_information(body, reach) for body in curve.bodies), curve.scores.new_zeros(2 * reach + 1))
     both = both + both.flip(0)
     padded = torch.nn.functional.pad(both, (1, 1), value=math.inf)
     peak = (both >= padded[:-2]) & (both >= padded[2:])
@@ -410,16 +410,16 @@ def resemblance(curve: SubspaceCurve, best: int, apart: float) -> float:
     return other / own if own > 0 else math.inf
 
 
-def _alike(body: Body, reach: int) -> Tensor:
+def _self_information(body: Body, reach: int) -> Tensor:
     """Evidence per frame ``(2 reach + 1,)`` between halves of the points."""
-    first, second = halves(body)
-    return bodies_curve(first.blurred, second.blurred, (-reach, reach), body.step).rates.nan_to_num(-math.inf)
+    first, second = split_points(body)
+    return bodies_curve(first.with_lag_noise, second.with_lag_noise, (-reach, reach), body.step).rates.nan_to_num(-math.inf)
 
 
 NUM_JACKKNIFE_BLOCKS = 8  # Parts of the overlap that the jackknife leaves out in turn.
 
 
-def wobble(curve: SubspaceCurve, lag: int) -> float:
+def jackknife_sigma(curve: SubspaceCurve, lag: int) -> float:
     r"""Standard deviation of the best lag in frames, by the jackknife over parts of the overlap."""
     if curve.bodies is None:
         return 0.0
@@ -436,13 +436,13 @@ def wobble(curve: SubspaceCurve, lag: int) -> float:
         for kept, x, y in ((shapes, a.rows, b.rows), (motions, a.motion, b.motion)):
             both = torch.cat([x[start:end], y[start + at : end + at], torch.ones_like(w)[:, None]], dim=1) * w[:, None]
             kept.append(torch.stack([part.mT @ part for part in both.split(sizes)]))
-    shape, motion = (_without(torch.stack(kept)) for kept in (shapes, motions))
+    shape, motion = (_leave_one_out(torch.stack(kept)) for kept in (shapes, motions))
     before, here, after = information(shape, motion, (a, b)).unflatten(0, (3, NUM_JACKKNIFE_BLOCKS))
     bend = float((before - 2 * here + after).mean())
     return math.sqrt((NUM_JACKKNIFE_BLOCKS - 1) * float(((after - before) / 2).var(correction=0))) / -bend if bend < 0 else math.inf
 
 
-def _without(moments: Tensor) -> Tensor:
+def _leave_one_out(moments: Tensor) -> Tensor:
     """Covariances ``(L B, d, d)`` of all parts but one, of moments ``(L, B, d + 1, d + 1)``."""
     rest = (moments.sum(1, keepdim=True) - moments).flatten(0, 1)
     count = rest[:, -1:, -1:].clamp(min=1.0)
@@ -499,13 +499,13 @@ def subspace_shift(curve: SubspaceCurve, *, start: float = 0.0, step: float = ST
     probability, margin = _probability(scores, best), _margin(curve, best, MIN_PEAK_SEPARATION_SECONDS / step)
     probability = min(probability, 1 / (1 + math.exp(-max(min(margin, 700.0), -700.0))))
     position = float(peaks[0, 0])
-    sigma = math.hypot(MODEL_SIGMA_SECONDS / step, max(positions[0][1], wobble(curve, round(position))))
+    sigma = math.hypot(MODEL_SIGMA_SECONDS / step, max(positions[0][1], jackknife_sigma(curve, round(position))))
     times = start + step * peaks[1:4, 0]
     refusal = _refusal(curve, best, probability, margin, times, step)
     if (
         refusal is None
         and margin < UNIQUE_PEAK_SHARE * float(scores[best])
-        and resemblance(curve, best, MIN_PEAK_SEPARATION_SECONDS / step) > MAX_SELF_SIMILARITY
+        and self_similarity(curve, best, MIN_PEAK_SEPARATION_SECONDS / step) > MAX_SELF_SIMILARITY
     ):
         refusal = Notice(ShiftNotice.REPEATED, margin, {"case": "itself"})
     if refusal is None and sigma > MAX_SIGMA_STEPS:

@@ -24,7 +24,7 @@ from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.projective import projective_points
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
 from dyntorch.tasks.synchronize.same_points import search_same_points, shift_of
-from dyntorch.tasks.synchronize.tracks import Tracks, cleaned, read_tracks
+from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks, reject_outliers
 
 CAMERAS = ("auto", "perspective", "affine", "projective")
 
@@ -116,7 +116,7 @@ def synchronize(
     options = SynchronizeOptions() if options is None else options
     check_options(options, SynchronizeOptions)
     _check(correspondence, fps, times, weights, max_shift, rate, camera)
-    first, second, origin = prepared(a, b, fps=fps, times=times, weights=weights, calibration=calibration, options=options)
+    first, second, origin = prepare_tracks(a, b, fps=fps, times=times, weights=weights, calibration=calibration, options=options)
     spatial = _spatial((first, second), camera)
     if camera == "projective":
         return projective_points(first, second, max_shift=max_shift, rate=rate, options=options).since(origin)
@@ -142,7 +142,7 @@ def synchronize(
     return shift_of(result).since(origin)
 
 
-def prepared(
+def prepare_tracks(
     a: Tensor,
     b: Tensor,
     *,
@@ -166,10 +166,10 @@ def prepared(
             text = "{camera:{which}} has {frames} frames, {needed} are needed at least"
             raise ValueError(Message(text, which=name, frames=len(one.times), needed=options.min_frames))
     if calibration is not None:
-        tracks = [_straight(name, one, lens) for name, one, lens in zip("ab", tracks, _pairwise(calibration), strict=True)]
+        tracks = [_undistort(name, one, lens) for name, one, lens in zip("ab", tracks, _pairwise(calibration), strict=True)]
     # both clocks count from a's first frame: timestamps may be of any era, and products of rates with them lose digits
     origin = float(tracks[0].times[0])
-    first, second = (cleaned(dataclasses.replace(one, times=one.times - origin)) for one in tracks)
+    first, second = (reject_outliers(dataclasses.replace(one, times=one.times - origin)) for one in tracks)
     return first, second, origin
 
 
@@ -218,7 +218,7 @@ def _spatial(tracks: Sequence[Tracks], camera: str) -> bool:
     return count == 1
 
 
-def _straight(name: str, tracks: Tracks, lens: Any) -> Tracks:
+def _undistort(name: str, tracks: Tracks, lens: Any) -> Tracks:
     if tracks.x.shape[-1] == 3:
         if lens is None:
             return tracks
@@ -246,8 +246,8 @@ def synchronize_batch(
 
     def solve(place: int) -> Shift:
         takes = [without_filling(of_problem(x, place, batch, 3)) for x in (a, b)]
-        clocks = None if times is None else _own(times, takes, place, batch, 1)
-        trust = None if weights is None else _own(weights, takes, place, batch, 2)
+        clocks = None if times is None else _of_problem(times, takes, place, batch, 1)
+        trust = None if weights is None else _of_problem(weights, takes, place, batch, 2)
         return verb(*takes, times=clocks, weights=trust, **more)
 
     def spare(said: str) -> Shift:
@@ -261,7 +261,7 @@ def synchronize_batch(
     return one_by_one(batch, solve, spare)
 
 
-def _own(values: tuple[Any, Any], takes: list[Tensor], place: int, batch: Any, own: int) -> tuple[Any, Any]:
+def _of_problem(values: tuple[Any, Any], takes: list[Tensor], place: int, batch: Any, own: int) -> tuple[Any, Any]:
     """What belongs to a problem, of the frames that its takes have."""
     parts = [of_problem(value, place, batch, own) for value in values]
     return tuple(None if x is None else x[: len(take)] for x, take in zip(parts, takes, strict=True))  # type: ignore[return-value]

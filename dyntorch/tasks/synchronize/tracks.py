@@ -57,7 +57,7 @@ class Tracks:
         return float(self.centred.square().sum(-1).mul(self.weights).sum().div(self.weights.sum().clamp(min=1e-300)).sqrt())
 
     @cached_property
-    def still(self) -> bool:
+    def static(self) -> bool:
         """Whether no point moves by more than a millionth of how far points lie apart."""
         share = self.weights / self.weights.sum(0).clamp(min=1e-300)
         away = (self.x - (self.x * share[..., None]).sum(0)).square().sum(-1)
@@ -170,7 +170,7 @@ def _check_dense(name: str, times: Tensor) -> None:
     )
 
 
-def without(tracks: Tracks, bad: Tensor) -> Tracks:
+def remove_positions(tracks: Tracks, bad: Tensor) -> Tracks:
     """Tracks without some positions ``(frames, n)`` bool."""
     kept = torch.where(bad, 0.0, tracks.weights)
     return dataclasses.replace(tracks, x=torch.where((kept > 0)[..., None], tracks.x, 0.0), weights=kept)
@@ -191,19 +191,21 @@ def image_of(a: Tracks, b: Tracks) -> Tracks:
 KERNEL_SIGMAS = 4.0  # Half width of the smoothing kernel, standard deviations.
 
 
-def smoothed(tracks: Tracks, at: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
+def smooth_at(tracks: Tracks, at: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
     r"""Positions and velocities at any moments, by a line fitted to the frames around each, with Gaussian weights. at ``(m,)``
     -> ``(m, n, 2)``."""
     taps = 2 * (math.ceil(KERNEL_SIGMAS * width / tracks.step) + 1) + 1
     rows = max(1, PIECE // max(1, taps * tracks.x[0].numel()))
-    pieces = [_smoothed(tracks, piece, width, taps // 2) for piece in at.split(rows)] or [_smoothed(tracks, at, width, taps // 2)]
+    pieces = [_smooth_chunk(tracks, piece, width, taps // 2) for piece in at.split(rows)] or [
+        _smooth_chunk(tracks, at, width, taps // 2)
+    ]
     return tuple(torch.cat(parts) for parts in zip(*pieces, strict=True))  # type: ignore[return-value]
 
 
 MIN_KERNEL_WEIGHT = 0.4  # Share of the kernel's weight that must be visible; less is a gap.
 
 
-def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tensor, Tensor, Tensor]:
+def _smooth_chunk(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tensor, Tensor, Tensor]:
     frames = len(tracks.weights)
     near = torch.searchsorted(tracks.times, at.contiguous())[:, None] + torch.arange(-taps, taps + 1, device=at.device)
     index = near.clamp(0, frames - 1)
@@ -234,12 +236,12 @@ def _smoothed(tracks: Tracks, at: Tensor, width: float, taps: int) -> tuple[Tens
 HAMPEL_HALF_WIDTH = 3  # Frames on either side of that median.
 
 
-def cleaned(tracks: Tracks) -> Tracks:
+def reject_outliers(tracks: Tracks) -> Tracks:
     r"""Without positions far from the median of their neighbours, then, one by one, without those far from a line through the
     others."""
     if len(tracks.x) < 2 * HAMPEL_HALF_WIDTH + 1:
         return tracks
-    return _peeled(without(tracks, _far_from_median(tracks)))
+    return _reject_from_line(remove_positions(tracks, _far_from_median(tracks)))
 
 
 HAMPEL_SIGMAS = 4.0  # Robust sigmas from the running median beyond which a position is an outlier (3 rejects turning points).
@@ -254,7 +256,7 @@ def _far_from_median(tracks: Tracks) -> Tensor:
     middle = window.nanmedian(-1).values
     far = (x - middle).abs()
     spread = 1.4826 * (window - middle[..., None]).abs().nanmedian(-1).values
-    usual = 1.4826 * _usual(torch.where(seen[..., None], far, torch.nan))
+    usual = 1.4826 * _usual_deviation(torch.where(seen[..., None], far, torch.nan))
     usual = torch.maximum(usual, usual.nanmedian(0).values).clamp(min=MIN_RELATIVE_DEVIATION * tracks.scale)
     return (far > HAMPEL_SIGMAS * torch.maximum(spread, usual)).any(-1)
 
@@ -264,12 +266,12 @@ MIN_RESIDUAL_RATIO = 2.0  # and its residual over those of the neighbouring fram
 MAX_LINE_PASSES = 8  # Repetitions of the second pass.
 
 
-def _peeled(tracks: Tracks) -> Tracks:
+def _reject_from_line(tracks: Tracks) -> Tracks:
     """The worst position of its neighbourhood goes first, then the line through what is left is fitted again."""
     kept = tracks.weights > 0
     for _ in range(MAX_LINE_PASSES):
         away = _from_line(tracks.x, kept)
-        scale = 1.4826 * _usual(away)
+        scale = 1.4826 * _usual_deviation(away)
         scale = scale.clamp(min=max(MIN_RELATIVE_DEVIATION * tracks.scale, float(scale.nanmedian().nan_to_num(0.0))))
         away = away.nan_to_num(0.0)
         rows = pad(away, (0, 0, 2, 2))
@@ -282,10 +284,10 @@ def _peeled(tracks: Tracks) -> Tracks:
         if not bool(bad.any()):
             break
         kept = kept & ~bad
-    return without(tracks, ~kept)
+    return remove_positions(tracks, ~kept)
 
 
-def _usual(far: Tensor) -> Tensor:
+def _usual_deviation(far: Tensor) -> Tensor:
     """Medians over the frames; of what differs from 0 where most do not: points at rest, or rounded to whole pixels."""
     usual, rounding = far.nanmedian(0).values, 1e-9 * far.nan_to_num(0.0).amax()
     other = torch.where(far > rounding, far, torch.nan).nanmedian(0).values.nan_to_num(0.0)
@@ -303,16 +305,16 @@ def _from_line(x: Tensor, kept: Tensor) -> Tensor:
     kernel = torch.exp(-0.5 * u.square())
     kernel[reach] = 0.0
     w = kept.to(x.dtype)
-    s0, s1, s2 = (_correlated(w, kernel * u**power) for power in range(3))
+    s0, s1, s2 = (_correlate(w, kernel * u**power) for power in range(3))
     weighted = torch.where(kept[..., None], x, 0.0)
-    t0, t1 = (_correlated(weighted.flatten(1), kernel * u**power).unflatten(1, x.shape[1:]) for power in range(2))
+    t0, t1 = (_correlate(weighted.flatten(1), kernel * u**power).unflatten(1, x.shape[1:]) for power in range(2))
     determinant = s0 * s2 - s1.square()
     known = kept & (determinant > 0.1 * s0.square()) & (s0 > 0.3)
     line = (s2[..., None] * t0 - s1[..., None] * t1) / torch.where(known, determinant, 1.0)[..., None]
     return torch.where(known, (x - line).norm(dim=-1), torch.nan)
 
 
-def _correlated(rows: Tensor, kernel: Tensor) -> Tensor:
+def _correlate(rows: Tensor, kernel: Tensor) -> Tensor:
     """``(frames, channels)`` with a kernel in time."""
     return conv1d(rows.mT[:, None], kernel[None, None], padding=len(kernel) // 2)[:, 0].mT
 
@@ -321,14 +323,14 @@ def _correlated(rows: Tensor, kernel: Tensor) -> Tensor:
 # Tracks about the middle of each frame, in units of how large they are there: what affine cameras would have seen.
 
 
-def frame_scaled(tracks: Tracks) -> Tracks:
+def scale_frames(tracks: Tracks) -> Tracks:
     r"""Tracks with the strongest effects of perspective taken out."""
     seen = tracks.weights > 0
     shown = torch.where(seen[..., None], tracks.x, torch.nan)
     middle = shown.nanmedian(1).values  # (frames, 2)
     away = shown - middle[:, None]
     size = away.norm(dim=-1).nanmedian(1).values
-    slow = _slow(size, tracks.times)
+    slow = _smooth_size(size, tracks.times)
     level = slow[slow > 0].median() if bool((slow > 0).any()) else slow.new_ones(())
     scaled = away / torch.where(slow > 0, slow / level, 1.0)[:, None, None]
     return dataclasses.replace(tracks, x=torch.where(seen[..., None], scaled, 0.0))
@@ -337,7 +339,7 @@ def frame_scaled(tracks: Tracks) -> Tracks:
 SIZE_KERNEL_SECONDS = 0.5  # Standard deviation of the kernel for the size of a person in the image.
 
 
-def _slow(size: Tensor, times: Tensor) -> Tensor:
+def _smooth_size(size: Tensor, times: Tensor) -> Tensor:
     """Gaussian means over time of what is known."""
     known = size.isfinite()
     reach = max(1, int(3 * SIZE_KERNEL_SECONDS / float(times.diff().median())) if len(times) > 1 else 1)

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.tasks.synchronize.breaks import breaks, camera_breaks, mended_times
+from dyntorch.tasks.synchronize.breaks import breaks, camera_breaks, repair_times
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.piecewise_offset import MIN_JUMP_EVIDENCE, Jump, cheapest, mended
+from dyntorch.tasks.synchronize.piecewise_offset import MIN_JUMP_EVIDENCE, Jump, cheapest_path, repair_clocks
 from dyntorch.tasks.synchronize.result import ClockBreak
 from dyntorch.tasks.synchronize.tracks import read_tracks
 
@@ -161,12 +161,12 @@ def test_cheapest_is_the_cheapest_of_all():
             return sum(costs[k, state] for k, state in enumerate(path)) + penalty * changes
 
         best = min(itertools.product(range(3), repeat=6), key=price)
-        assert price(cheapest(costs, penalty).tolist()) == pytest.approx(price(best))
+        assert price(cheapest_path(costs, penalty).tolist()) == pytest.approx(price(best))
 
 
 def test_mended_leaves_room_on_the_side_that_lost():
     tracks = [read_tracks("a", torch.ones(20, 1, 2).double(), 10.0, None, None) for _ in range(2)]
-    a, b = mended(*tracks, 1.0, 0.5, (Jump(0.45, 0.1, -0.3), Jump(1.05, 0.1, 0.2)))
+    a, b = repair_clocks(*tracks, 1.0, 0.5, (Jump(0.45, 0.1, -0.3), Jump(1.05, 0.1, 0.2)))
     assert a.times[:11].tolist() == pytest.approx((torch.arange(11) / 10).tolist())
     assert a.times[11].item() == pytest.approx(1.3)
     assert b.times[9].item() == pytest.approx(0.9)
@@ -175,9 +175,9 @@ def test_mended_leaves_room_on_the_side_that_lost():
 
 def test_doubled_frames_stand_close_together():
     one = ClockBreak((1,), (0.35,), 0.1, 0.2, 0.0, 2, 99.0, (2.0, 1.0))
-    times = mended_times(torch.arange(9, dtype=torch.float64) / 10, 1, [one])
+    times = repair_times(torch.arange(9, dtype=torch.float64) / 10, 1, [one])
     assert times.tolist() == pytest.approx([0, 0.1, 0.2, 0.3, 0.3 + 0.1 / 3, 0.3 + 0.2 / 3, 0.4, 0.5, 0.6])
-    assert mended_times(torch.arange(3.0), 0, [one]).tolist() == [0, 1, 2]
+    assert repair_times(torch.arange(3.0), 0, [one]).tolist() == [0, 1, 2]
 
 
 def test_misuse(pair):

@@ -9,7 +9,7 @@ from dyntorch.geometry.epipolar import epipolar_variance
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import filmed
 from dyntorch.tasks.synchronize.epipolar import Samples, epipolar_curve
-from dyntorch.tasks.synchronize.tracks import read_tracks, smoothed
+from dyntorch.tasks.synchronize.tracks import read_tracks, smooth_at
 
 
 def scene_of(seed=0, **more):
@@ -128,7 +128,7 @@ def test_samples_are_the_smoothed_tracks_normalized():
     a, b = tracks_of(scene)
     samples = Samples.of(a, b, 0.04)
     at = torch.arange(10, dtype=torch.float64) * 0.04
-    x, _, w = smoothed(b, at, 0.04)
+    x, _, w = smooth_at(b, at, 0.04)
     seen = w > 0
     expected = (homogeneous(x) @ b.change.mT)[..., :2]
     assert torch.allclose(samples.x2[:10][seen], expected[seen]) and not samples.x2[:10][~seen].any()

@@ -9,7 +9,7 @@ import torch
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import filmed
 from dyntorch.tasks.synchronize.epipolar import Grid, ShiftDescent
-from dyntorch.tasks.synchronize.tracks import read_tracks, smoothed
+from dyntorch.tasks.synchronize.tracks import read_tracks, smooth_at
 
 FRAME = 1 / 30
 
@@ -36,7 +36,7 @@ def test_positions_between_the_steps_of_a_grid_are_those_of_smoothing():
         tracks = tracks_of(scene, noise)[1]
         grid = Grid.of(tracks, FRAME)
         at = 0.2 + 2.5 * torch.rand(200, generator=seeded(2), dtype=torch.float64)
-        expected, _, sure = smoothed(tracks, at, FRAME)
+        expected, _, sure = smooth_at(tracks, at, FRAME)
         x, v, weights = grid.at(at)
         assert bool((sure > 0).all()) and torch.allclose(weights, sure, atol=0.01)
         assert float((x - expected).abs().max()) < 0.01 + 0.02 * noise
@@ -69,13 +69,13 @@ def test_grids_have_no_weight_in_gaps_and_beyond_the_take():
 def test_the_minimum_is_that_of_a_general_solver(seed):
     a, b = tracks_of(filmed(9, seconds=1.5, offset=0.113, generator=seeded(seed)), 1.0, seed)
     fit = ShiftDescent(a, b, FRAME).run(0.113)
-    x1, _, w1 = smoothed(a, a.times, FRAME)
+    x1, _, w1 = smooth_at(a, a.times, FRAME)
     centre, size = torch.tensor([640.0, 480.0], dtype=torch.float64), 300.0
     own = (w1 > 0.5) & (a.times > 0.25)[:, None] & (a.times < 1.25)[:, None]  # seen in both whatever the shift
     p = homogeneous(((x1 - centre) / size)[own])
 
     def residuals(theta):
-        x2, _, _ = smoothed(b, a.times + float(theta[0]), FRAME)
+        x2, _, _ = smooth_at(b, a.times + float(theta[0]), FRAME)
         A, B = torch.from_numpy(theta[1:]).reshape(2, 3, 2)  # of rank 2
         return (size * sampson(A @ B.mT, p, homogeneous(((x2 - centre) / size)[own]))).numpy()
 
@@ -161,8 +161,8 @@ def test_distances_are_those_of_each_frame_and_point():
     scene = filmed(8, seconds=2.0, offset=0.2, missing=0.2, generator=seeded(10))
     a, b = tracks_of(scene, 1.0)
     fit = ShiftDescent(a, b, FRAME).run(0.2)
-    x1, _, w1 = smoothed(a, fit.times, FRAME)
-    x2, _, w2 = smoothed(b, fit.times + fit.offset, FRAME)
+    x1, _, w1 = smooth_at(a, fit.times, FRAME)
+    x2, _, w2 = smooth_at(b, fit.times + fit.offset, FRAME)
     seen = fit.distances.isfinite()
     assert int(seen.sum()) > 200
     assert float((((w1 * w2) > 0) == seen).double().mean()) > 0.95

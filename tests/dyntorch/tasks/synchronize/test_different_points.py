@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.tasks.synchronize.different_points import _to_a_frame
+from dyntorch.tasks.synchronize.different_points import _refuse_coarse
 from dyntorch.tasks.synchronize.subspace import SubspaceShift
 from dyntorch.tasks.synchronize.synchronize import synchronize
 
@@ -196,8 +196,8 @@ def test_numbers_of_points_may_differ_but_not_of_coordinates():
 
 def test_a_shift_that_is_not_known_to_a_frame_of_fast_cameras_is_refused():
     found = SubspaceShift(3.0, 0.5, torch.zeros(0, 2), 0.99, 9.0)
-    assert _to_a_frame(found, 1 / 30, 1 / 30) is found
-    fast = _to_a_frame(found, 1 / 30, 1 / 60)
+    assert _refuse_coarse(found, 1 / 30, 1 / 30) is found
+    fast = _refuse_coarse(found, 1 / 30, 1 / 60)
     assert not fast.ok and "uncertain by 0.017 s" in fast.reason and fast.position == found.position
 
 

@@ -8,7 +8,13 @@ from scipy.linalg import eigh
 
 from dyntorch import synchronize, synchronize_cameras
 from dyntorch.numerics.lags import resection_moments
-from dyntorch.tasks.synchronize.motion_capture import SpaceDescent, SpaceSamples, _Problem, camera_variance, combined_fit
+from dyntorch.tasks.synchronize.motion_capture import (
+    SpaceDescent,
+    SpaceSamples,
+    _CombinationProblem,
+    camera_variance,
+    fit_combination,
+)
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import read_tracks
 
@@ -239,7 +245,7 @@ def test_both_orders_have_the_same_moments():
     one, two = (SpaceSamples.of(*both, 1 / FPS) for both in ((a, b), (b, a)))
     (first, counts), (second, back) = one.moments((-20, 30)), two.moments((-30, 20))
     assert torch.allclose(first, second.flip(0)) and torch.equal(counts, back.flip(0))
-    variance, cameras = one.solved(first)
+    variance, cameras = one.solve(first)
     each, _ = one.moments((-20, 30), per_point=True)
     shares = one.variances_by(cameras[5], each[:, 5])
     weights = each[:, 5, 0] @ cameras[5, 2] @ cameras[5, 2]  # squared depths: what each point's variance counts for
@@ -252,7 +258,7 @@ def test_the_derivatives_are_those_of_the_residuals(swapped):
     a, b = (read_tracks(n, x, f, None, None) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
     offset = -OFFSET if swapped else OFFSET
     descent = SpaceDescent(*((b, a) if swapped else (a, b)), 1 / FPS)
-    at, ahead = (descent._matched(offset + d, 1.0) for d in (0.0, 1e-4))
+    at, ahead = (descent._match(offset + d, 1.0) for d in (0.0, 1e-4))
     times = torch.zeros(len(at.p), dtype=torch.float64)
     _, camera = descent._moment_fit(at)
     rows = descent._residuals(camera, at, times)
@@ -274,8 +280,8 @@ def test_the_steps_of_the_combined_fit_are_those_of_the_whole_problem():
     """The weights of every point are eliminated; camera, weights and shift at once have the same step."""
     film, space = taken(19, points=6, noise=1.0)
     a, b = (read_tracks(n, x, f, None, None) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
-    problem = _Problem.of(a, b, OFFSET, 1.0)
-    at = problem.evaluate(problem.started())
+    problem = _CombinationProblem.of(a, b, OFFSET, 1.0)
+    at = problem.evaluate(problem.start())
     damping = torch.full((1,), 0.1, dtype=torch.float64)
     camera, weights, shift = problem.step(at, damping)
     residual, own, common = problem._derivatives(at.theta)
@@ -301,8 +307,8 @@ def test_combinations_of_what_was_recorded_tell_the_place_between_frames(start):
     between = torch.stack([seen[:, [k, k + 1, k + 2]].mean(1) for k in range(6)], dim=1)
     film = seen_by(between, noise=2.0, generator=seeded(3))
     a, b = (read_tracks(n, x, f, None, None) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
-    found = combined_fit(a, b, OFFSET + start / FPS, 1.0)
+    found = fit_combination(a, b, OFFSET + start / FPS, 1.0)
     assert abs(found.offset - OFFSET) < 0.2 / FPS and abs(found.offset - OFFSET) < 4 * found.sigma
     assert found.residual < 4 and found.weights.shape[0] == 6
     nothing = read_tracks("a", torch.full((40, 3, 2), torch.nan), FPS, None, None)
-    assert combined_fit(nothing, b, 0.0, 1.0) is None
+    assert fit_combination(nothing, b, 0.0, 1.0) is None

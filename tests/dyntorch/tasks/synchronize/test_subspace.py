@@ -12,17 +12,17 @@ from dyntorch.tasks.synchronize.subspace import (
     NUM_JACKKNIFE_BLOCKS,
     SHAPE_SAMPLE_RATE,
     SubspaceCurve,
-    _correlated,
-    _shared,
+    _motion_information,
+    _mutual_information,
     _vertical,
     body_of,
-    completed,
-    halves,
-    resemblance,
+    jackknife_sigma,
+    regress_missing,
+    self_similarity,
     smooth,
+    split_points,
     subspace_curve,
     subspace_shift,
-    wobble,
 )
 
 
@@ -65,7 +65,7 @@ def curve_of(a, b, lags=(-40, 40), step=1 / 30):
 def test_the_information_is_that_of_the_determinants():
     x = normal(0, 40, 7)
     c = torch.cov(x.T)
-    found = _shared(c[None, :3, :3], c[None, 3:, 3:], c[None, :3, 3:])
+    found = _mutual_information(c[None, :3, :3], c[None, 3:, 3:], c[None, :3, 3:])
     unit = torch.eye(7, dtype=torch.float64)
     parts = torch.logdet(c[:3, :3] + unit[:3, :3]) + torch.logdet(c[3:, 3:] + unit[:4, :4]) - torch.logdet(c + unit)
     assert abs(float(found[0] - 0.5 * parts)) < 1e-12
@@ -161,7 +161,7 @@ def test_completed_positions_are_near_the_true_ones():
     for j in range(10):
         seen[14 * j : 14 * j + 12, j] = False
     start = torch.where(seen[..., None], a, a.mean(0))
-    error = (completed(start, seen) - a)[~seen].norm(dim=-1)
+    error = (regress_missing(start, seen) - a)[~seen].norm(dim=-1)
     assert float(error.median()) < 0.05 * float((start - a)[~seen].norm(dim=-1).median())
 
 
@@ -200,13 +200,13 @@ def test_repeated_motion_whose_periods_happen_to_differ_is_refused(seed):
 
 def test_repeated_motion_resembles_itself_and_other_motion_does_not():
     moving, turning = curve_of(*scene(120, 5)), curve_of(repeated(30, 120, 8, 3), repeated(30, 120, 8, 4, start=-7))
-    assert resemblance(moving, 45, 3) < 0.6
-    assert resemblance(turning, 47, 3) > 0.8
+    assert self_similarity(moving, 45, 3) < 0.6
+    assert self_similarity(turning, 47, 3) > 0.8
 
 
 def test_halves_share_the_point_in_the_middle_only():
     body = body_of(uniform(0, 40, 7, 2), full(uniform(0, 40, 7, 2)))
-    first, second = halves(body)
+    first, second = split_points(body)
     assert first.points.shape[1] + second.points.shape[1] == 8
     assert len({tuple(p.tolist()) for half in (first, second) for p in half.points[0]}) == 7
 
@@ -224,13 +224,18 @@ def test_the_jackknife_is_that_of_blocks_left_out():
             parts = [torch.cat([x[kept], y[kept + lag]], dim=1) for x, y in ((one.rows, two.rows), (one.motion, two.motion))]
             shape, motion = (torch.cov(part.T, correction=0)[None] for part in parts)
             blocks = shape[:, :14, :14], shape[:, 14:, 14:], shape[:, :14, 14:]
-            told.append(SHAPE_SAMPLE_RATE * _shared(*blocks) + HEIGHT_SAMPLE_RATE * _shared(*_vertical(blocks, (2, 2))))
-            told[-1] = float(told[-1] + MOTION_SAMPLE_RATE * _correlated(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:]))
+            told.append(
+                SHAPE_SAMPLE_RATE * _mutual_information(*blocks)
+                + HEIGHT_SAMPLE_RATE * _mutual_information(*_vertical(blocks, (2, 2)))
+            )
+            told[-1] = float(
+                told[-1] + MOTION_SAMPLE_RATE * _motion_information(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:])
+            )
         slopes.append((told[2] - told[0]) / 2)
         bends.append(told[0] - 2 * told[1] + told[2])
     places = torch.tensor(slopes).double() / (-sum(bends) / NUM_JACKKNIFE_BLOCKS)
     spread = math.sqrt((NUM_JACKKNIFE_BLOCKS - 1) / NUM_JACKKNIFE_BLOCKS * float((places - places.mean()).square().sum()))
-    assert wobble(curve, 5) == pytest.approx(spread, rel=1e-6)
+    assert jackknife_sigma(curve, 5) == pytest.approx(spread, rel=1e-6)
 
 
 def test_noise_that_keeps_for_some_frames_is_told_by_sigma():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dyntorch.scenes import filmed
-from dyntorch.tasks.synchronize.tracks import noise_ratio, read_tracks, smoothed, without
+from dyntorch.tasks.synchronize.tracks import noise_ratio, read_tracks, remove_positions, smooth_at
 
 
 def seeded(seed=0):
@@ -39,7 +39,7 @@ def test_smoothing_is_weighted_least_squares_with_gaps_and_irregular_times(width
     weights = torch.rand(len(times), 5, generator=seeded(3), dtype=torch.float64)
     tracks = tracks_of(scene.a, times=times, weights=weights)
     at = times[0] + (times[-1] - times[0]) * torch.rand(25, generator=seeded(4), dtype=torch.float64)
-    x, v, sure = smoothed(tracks, at, width)
+    x, v, sure = smooth_at(tracks, at, width)
     known = (sure > 0).nonzero().tolist()
     assert len(known) > 50
     for i, j in known:
@@ -55,7 +55,7 @@ def test_straight_motion_is_kept_exactly_everywhere():
     x = torch.stack([100 + 30 * t, 50 - 80 * t], dim=-1)[:, None].clone()
     x[10:13] = torch.nan
     at = torch.linspace(0, 1.5, 33, dtype=torch.float64)
-    found, v, sure = smoothed(tracks_of(x, 25.0), at, 0.06)
+    found, v, sure = smooth_at(tracks_of(x, 25.0), at, 0.06)
     seen = sure[:, 0] > 0
     assert int(seen.sum()) > 25
     assert torch.allclose(found[seen, 0], torch.stack([100 + 30 * at, 50 - 80 * at], dim=-1)[seen], atol=1e-9)
@@ -66,7 +66,7 @@ def test_gaps_and_places_beyond_the_take_have_no_weight():
     x = torch.zeros(60, 2, 2)
     x[20:40, 1] = torch.nan
     at = torch.tensor([-0.5, 0.5, 1.0, 1.5, 2.5], dtype=torch.float64)
-    _, _, sure = smoothed(tracks_of(x), at, 1 / 30)
+    _, _, sure = smooth_at(tracks_of(x), at, 1 / 30)
     assert (sure > 0).tolist() == [[False, False], [True, True], [True, False], [True, True], [False, False]]
     assert torch.allclose(sure[1], torch.ones(2, dtype=torch.float64), atol=0.01)
 
@@ -74,7 +74,7 @@ def test_gaps_and_places_beyond_the_take_have_no_weight():
 def test_weights_are_those_of_the_frames_near_by():
     weights = torch.full((40, 1), 0.25)
     weights[20:] = 0.75
-    _, _, sure = smoothed(
+    _, _, sure = smooth_at(
         tracks_of(torch.zeros(40, 1, 2), weights=weights),
         torch.tensor([0.3, 1.0], dtype=torch.float64),
         1 / 30,
@@ -87,7 +87,7 @@ def test_noise_that_is_left_does_not_depend_on_the_place_between_frames():
     x = torch.randn(frames, 3, 2, generator=seeded(), dtype=torch.float64)
     phases = torch.linspace(0, 1, 9, dtype=torch.float64)
     tracks, middle = tracks_of(x, 30.0), torch.arange(10, frames - 10, dtype=torch.float64)
-    left = torch.stack([smoothed(tracks, (middle + phase) / 30, 1 / 30)[0].square().mean() for phase in phases])
+    left = torch.stack([smooth_at(tracks, (middle + phase) / 30, 1 / 30)[0].square().mean() for phase in phases])
     expected = 0.5 / math.sqrt(math.pi)  # of a Gaussian kernel of one frame
     assert left.tolist() == pytest.approx([expected] * 9, rel=0.03)
     assert float(left.max() / left.min()) < 1.01
@@ -135,7 +135,7 @@ def test_missing_positions_and_weights_of_zero_are_the_same():
     one, two = tracks_of(gone), tracks_of(x, weights=weights)
     assert torch.equal(one.x, two.x) and torch.equal(one.weights, two.weights)
     assert one.x.dtype == torch.float64
-    cut = without(tracks_of(x), weights == 0)
+    cut = remove_positions(tracks_of(x), weights == 0)
     assert torch.equal(cut.x, one.x) and torch.equal(cut.weights, one.weights)
     assert torch.equal(one.only(torch.tensor([True, False, True])).x, one.x[:, [0, 2]])
 
