@@ -10,6 +10,8 @@ _HOME = {
     "breaks": "dyntorch.tasks.synchronize.breaks",
     "camera_breaks": "dyntorch.tasks.synchronize.breaks",
     "affine_segmentation": "dyntorch.tasks.segment.affine",
+    "MOTION_MODELS": "dyntorch.tasks.reconstruct.motion_models",
+    "MotionName": "dyntorch.tasks.reconstruct.motion_models",
     "projective_factorization": "dyntorch.tasks.reconstruct.factorization",
     "velocity_factorization": "dyntorch.tasks.reconstruct.factorization",
     "LineStatus": "dyntorch.tasks.trajectories.trajectories",

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.numerics import worded
-from dyntorch.tasks.reconstruct.motion_models import MOTION_MODELS
+from dyntorch.tasks import MOTION_MODELS
 from indexing.readers.pairs import Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.canvas import DARK

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from dyntorch.tasks.reconstruct.motion_models import MotionName
+from dyntorch.tasks import MotionName
 from indexing.cli.flags import command
 
 Model = Literal["planar", "join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid", "lines"]
