@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from indexing.labels.label import NUM_NAMED, Label, LabelFile, in_order, spots
+from indexing.labels.label import NUM_NAMED, Label, LabelFile, in_order, list_spots
 from indexing.opening import clipped, count, error, shown
 
 TIME_REMEDY = "give seconds"
@@ -120,14 +120,14 @@ class Gathering:
     def finish(self) -> LabelFile:
         """The file as read: labels sorted, what comes twice kept once."""
         if self._nameless:
-            where = spots(self._nameless)
+            where = list_spots(self._nameless)
             self.note(f"{count(len(self._nameless), 'label')} without a name left out ({where})")
         kept = self.labels
         if len(set(kept)) < len(kept):
             twice = [label for label, times in Counter(kept).items() if times > 1]
             kept = list(dict.fromkeys(kept))
             again = len(self.labels) - len(kept)
-            self.note(f"{count(again, 'label')} left out: there twice ({spots(twice)})")
+            self.note(f"{count(again, 'label')} left out: there twice ({list_spots(twice)})")
         return LabelFile(
             path=self.asked.path,
             format=self.format,
@@ -157,7 +157,7 @@ def parse_seconds(text: str) -> float:
     return sign * total
 
 
-def whole(value: Any) -> int | None:
+def parse_whole(value: Any) -> int | None:
     """A whole number of a file, None where it is none."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return None
@@ -172,7 +172,7 @@ def text_of(value: Any) -> str:
     return shown(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else ""
 
 
-def few(names: Iterable[object]) -> str:
+def list_few(names: Iterable[object]) -> str:
     """The first names of a list, each short."""
     listed = [clipped(name, 40) or "(unnamed)" for name in names]
     return ", ".join(listed[:NUM_NAMED]) + f" and {len(listed) - NUM_NAMED} more" * (len(listed) > NUM_NAMED)
@@ -192,7 +192,7 @@ def seal(*parts: object) -> str:
     return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:8]
 
 
-def changed(target: Target, what: str) -> ValueError:
+def correction_error(target: Target, what: str) -> ValueError:
     """What was found is corrected where it stands: nobody loses that without a word."""
     said = f"{what} is not as dyntorch wrote it: somebody has corrected it"
     return error(target.into or target.path, said, "rename it to take it over, delete it, or write to another file")

@@ -145,19 +145,19 @@ def within(
     runs = f"runs from {begin:.6g} to {end:.6g} s"
     notices = []
     if outside:
-        notices.append(f"{count(len(outside), 'label')} left out: outside {name}, which {runs} ({spots(outside)})")
+        notices.append(f"{count(len(outside), 'label')} left out: outside {name}, which {runs} ({list_spots(outside)})")
     if cut:
-        notices.append(f"{count(len(cut), 'label')} cut: {name} {runs} ({spots(cut)})")
+        notices.append(f"{count(len(cut), 'label')} cut: {name} {runs} ({list_spots(cut)})")
     return kept, notices
 
 
-def spots(labels: Iterable[Label]) -> str:
+def list_spots(labels: Iterable[Label]) -> str:
     """The first of some labels, for a notice."""
-    found = [spot(label) for label in islice(labels, NUM_NAMED + 1)]
+    found = [describe_spot(label) for label in islice(labels, NUM_NAMED + 1)]
     return ", ".join(found[:NUM_NAMED]) + ", ..." * (len(found) > NUM_NAMED)
 
 
-def spot(label: Label) -> str:
+def describe_spot(label: Label) -> str:
     """A label for a notice, short."""
     when = f"{label.start:.6g}" if label.point else f"{label.start:.6g}-{label.end:.6g}"
     return f"{clipped(label.label, 24) or '(no name)'} at {when} s"

@@ -93,11 +93,11 @@ class _Parser:
 
     def last(self, first: int, at: int) -> int:
         """Where an element ends that begins here: of ``<A/>`` expat says so itself, of ``<A></A>`` where the closing tag begins."""
-        if self.data[at - 2 : at] == b"/>" and (at == self.data.find(b">", first) + 1 or at == self.closed(first)):
+        if self.data[at - 2 : at] == b"/>" and (at == self.data.find(b">", first) + 1 or at == self.find_tag_end(first)):
             return at
         return self.data.index(b">", at) + 1
 
-    def closed(self, first: int) -> int:
+    def find_tag_end(self, first: int) -> int:
         """The end of a tag that begins here; ``>`` may stand in its attributes."""
         quote = 0
         for at in range(first, len(self.data)):

@@ -25,7 +25,7 @@ class Span:
     end: float = math.inf
 
 
-def cut_up(start: float, end: float, spans: Sequence[Span]) -> list[tuple[str, float, float]]:
+def split_by_media(start: float, end: float, spans: Sequence[Span]) -> list[tuple[str, float, float]]:
     """A stretch of a clock, by the files that are played then: each file with start and end on its own clock."""
     found = []
     for number, span in enumerate(spans):

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from indexing.labels.detect import detect, registered_formats
-from indexing.labels.format import Request, few
+from indexing.labels.format import Request, list_few
 from indexing.labels.label import Label, LabelFile
 from indexing.labels.media import of_recording
 from indexing.opening import count, error, listed, shown, uncollected
@@ -170,5 +170,5 @@ def _asked_for(found: LabelFile, asked: Request) -> LabelFile:
         labels = [label for label in labels if not label.media or label.media in mine]
         if others:
             total = sum(others.values())
-            notices.append(f"{count(total, 'label')} left out: of other recordings ({few(others)})")
+            notices.append(f"{count(total, 'label')} left out: of other recordings ({list_few(others)})")
     return replace(found, labels=tuple(labels), watched=tuple(watched), notices=tuple(notices))

@@ -77,8 +77,10 @@ def write_labels(
     source = _source(target, into, known)
     own = str(recording) if recording is not None else ""
     if own:  # labels may name the video, and the recording be its keypoints
-        own = next((label.media for label in labels if label.media and same_recording(label.media, own)), _film(own, target, name))
-    sound, notices = _sound(labels, own)
+        own = next(
+            (label.media for label in labels if label.media and same_recording(label.media, own)), _find_video(own, target, name)
+        )
+    sound, notices = _clean_labels(labels, own)
     if own and known.program and source is None and Path(own).suffix.lower() not in FILMS:
         notices.append(f"{base_name(own)} is no video: {known.program} asks for one when you open {target.name}")
     recordings = dict.fromkeys(([own] if own else []) + [label.media for label in sound])
@@ -120,7 +122,7 @@ def _source(path: Path, into: str | Path | None, known: LabelFormat) -> Path | N
     return path if known.program and is_regular(path) else None
 
 
-def _film(recording: str, target: Path, name: str) -> str:
+def _find_video(recording: str, target: Path, name: str) -> str:
     """The video of a recording, where it lies beside it, as the format names it: BORIS looks for it from where its project is."""
     path = Path(os.path.expanduser(recording))
     if not path.name:
@@ -135,7 +137,7 @@ def _film(recording: str, target: Path, name: str) -> str:
     return film.relative_to(folder).as_posix() if film.is_relative_to(folder) else str(film)
 
 
-def _sound(labels: Sequence[Label], recording: str) -> tuple[list[Label], list[str]]:
+def _clean_labels(labels: Sequence[Label], recording: str) -> tuple[list[Label], list[str]]:
     """Labels in characters that every format can write, each with its recording."""
     found, changed = [], 0
     named = [label for label in labels if label.label.strip()]

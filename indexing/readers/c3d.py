@@ -78,7 +78,7 @@ def read(path: Path) -> PointSequence:
     body = data[(start - 1) * BLOCK :]
     frames = last - first + 1
     if last == WORD or last < first:  # longer than the header can say
-        frames = max(frames, *(_whole(parameters.values.get(f"POINT:{name}")) for name in ("FRAMES", "LONG_FRAMES")))
+        frames = max(frames, *(_parse_count(parameters.values.get(f"POINT:{name}")) for name in ("FRAMES", "LONG_FRAMES")))
     frames = min(frames, len(body) // width) if last == WORD else frames
     if frames < 1 or len(body) < frames * width:
         raise error(path, f"has {len(body) // width} of {frames} frames", "the file may be truncated: export it again")
@@ -134,7 +134,7 @@ def _texts(value: Any) -> list[str]:
     return [text for text in value if isinstance(text, str)] if isinstance(value, list) else []
 
 
-def _whole(value: Any) -> int:
+def _parse_count(value: Any) -> int:
     """A parameter that is one number; 0 where it is none."""
     number = value.ravel()[0] if isinstance(value, np.ndarray) and value.size else 0
     return int(number) if 0 <= number < MOST else 0

@@ -57,7 +57,7 @@ class Hdf5:
             kinds = {name: type(found.get(name, getlink=True)).__name__ for name in found}
             return [name for name, kind in kinds.items() if kind in ("HardLink", "SoftLink")]
 
-        return self._sure(inside, group)
+        return self._guard(inside, group)
 
     def array(self, name: str, ndim: int | None = None, kinds: str = "biuf") -> Array:
         """The values of a dataset."""
@@ -65,7 +65,7 @@ class Hdf5:
         if data.dtype.kind not in kinds or (ndim is not None and data.ndim != ndim):
             what = f"{data.ndim} axes of {data.dtype}" if data.dtype.kind != "O" else "text"
             raise error(self.path, f"{shown(name)} has {what}, which it cannot have", AGAIN)
-        return np.asarray(self._sure(lambda: data[()], name))
+        return np.asarray(self._guard(lambda: data[()], name))
 
     def records(self, name: str, fields: tuple[str, ...]) -> dict[str, Array]:
         """Fields of a table of records, a column each; a field may be a row of numbers itself."""
@@ -80,7 +80,7 @@ class Hdf5:
             raise error(self.path, f"{shown(name)}: {shown(odd[0])} has values that are no numbers", AGAIN)
         if data.dtype.hasobject:  # a piece of a heap may be the field of every record, and is copied for each
             raise error(self.path, f"{shown(name)} has fields that are neither numbers nor text of one length", AGAIN)
-        whole = self._sure(lambda: data[()], name)
+        whole = self._guard(lambda: data[()], name)
         return {field: np.asarray(whole[field]) for field in fields}
 
     def fields(self, name: str) -> tuple[str, ...]:
@@ -96,21 +96,21 @@ class Hdf5:
         data = self._dataset(name)
         if data.ndim > 1 or data.size > MOST_TEXTS_BLOCK or data.dtype.kind not in "OS":
             raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
-        if data.dtype.kind == "O" and self._sure(lambda: data.id.get_type().get_class(), name) != TEXT:
+        if data.dtype.kind == "O" and self._guard(lambda: data.id.get_type().get_class(), name) != TEXT:
             raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
         if data.dtype.kind == "O":
             self._check_lengths(data, name)
-        return [_text(value) for value in np.atleast_1d(self._sure(lambda: data[()], name))]
+        return [_text(value) for value in np.atleast_1d(self._guard(lambda: data[()], name))]
 
     def _check_lengths(self, data: Any, name: str) -> None:
         """Refuse texts that say they are longer than the file, alone or together: the library would make room for each of
         them."""
         total = 0
         with opened(self.path) as file:
-            for offset, size, packed in self._sure(lambda: _places(data), name):
+            for offset, size, packed in self._guard(lambda: _places(data), name):
                 file.seek(min(offset, self._size))
                 raw = file.read(min(size, ENTRY * MOST_TEXTS_BLOCK))
-                lengths = self._sure(partial(_lengths, raw, packed), name)
+                lengths = self._guard(partial(_lengths, raw, packed), name)
                 total += int(lengths.sum(dtype=np.uint64))
                 if total > self._size:
                     what = "a text longer" if (lengths > self._size).any() else "texts that are together longer"
@@ -128,22 +128,22 @@ class Hdf5:
                 return None
             return owner.attrs[key] if about.get_storage_size() <= min(self._size, LARGEST) else None
 
-        return self._sure(value, f"{name}@{key}")
+        return self._guard(value, f"{name}@{key}")
 
     def _dataset(self, name: str) -> Any:
         """A dataset that is what it says."""
-        found = self._sure(lambda: self._handle[name] if self._hard(name) else None, name)
+        found = self._guard(lambda: self._handle[name] if self._hard(name) else None, name)
         if found is None or not hasattr(found, "shape"):
             raise error(self.path, f"has no dataset {shown(name)} (it has {listed(self.names())})", AGAIN)
 
         def elsewhere() -> bool:
             return bool(found.external) or bool(found.is_virtual)
 
-        if self._sure(elsewhere, name):
+        if self._guard(elsewhere, name):
             raise error(self.path, f"{shown(name)} is kept in another file", "copy its values into one file")
-        if self._sure(lambda: found.shape is None, name):
+        if self._guard(lambda: found.shape is None, name):
             raise error(self.path, f"{shown(name)} is empty", AGAIN)
-        size, stored = self._sure(lambda: (math.prod(found.shape) * found.dtype.itemsize, found.id.get_storage_size()), name)
+        size, stored = self._guard(lambda: (math.prod(found.shape) * found.dtype.itemsize, found.id.get_storage_size()), name)
         large, times = PLENTY_BLOCK
         if size > LARGEST or stored > self._size or size > max(large, times * stored):
             raise error(self.path, f"{shown(name)} would take {size / 2**30:.1f} GB of {stored / 2**20:.1f} MB", AGAIN)
@@ -159,7 +159,7 @@ class Hdf5:
                 return False
         return True
 
-    def _sure(self, read: Callable[[], T], name: str) -> T:
+    def _guard(self, read: Callable[[], T], name: str) -> T:
         try:
             return read()
         except DAMAGED as problem:

@@ -54,7 +54,7 @@ class LayoutFit(NamedTuple):
         return self.posture - self.bones
 
 
-def fits(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None) -> list[LayoutFit]:
+def rank_layouts(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None) -> list[LayoutFit]:
     """Each layout's fit, best first. joints ``(frames, n, 2 | 3)``."""
     some = np.asarray(joints[np.unique(np.linspace(0, len(joints) - 1, MAX_FRAMES).round().astype(int))], dtype=np.float64)
     some = np.where(np.abs(some) <= LARGEST, some, np.nan)
@@ -67,20 +67,20 @@ def fits(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None) -> lis
     return sorted(found, key=lambda fit: -fit.value)
 
 
-def recognized(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None) -> LayoutFit | None:
+def recognize_layout(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None) -> LayoutFit | None:
     """The layout that the joints are of, where that is clear."""
-    could = [fit for fit in fits(joints, layouts, up) if fit.bones <= MAX_BONES and fit.posture >= MIN_POSTURE]
+    could = [fit for fit in rank_layouts(joints, layouts, up) if fit.bones <= MAX_BONES and fit.posture >= MIN_POSTURE]
     return could[0] if len(could) == 1 or (could and could[0].value - could[1].value >= MIN_LEAD) else None
 
 
-def settled(
+def choose_layout(
     joints: FloatArray,
     usual: Skeleton | None,
     layouts: Sequence[Skeleton],
     up: str | None,
 ) -> tuple[Skeleton | None, dict[str, str], str | None]:
     """The layout of joints whose number alone is known."""
-    found = recognized(joints, layouts, up) if len(joints) else None
+    found = recognize_layout(joints, layouts, up) if len(joints) else None
     if found is not None:
         said = {} if found.layout is usual else {"layout": f"recognized: {found.layout.name}"}
         return found.layout, said, found.up
@@ -90,16 +90,16 @@ def settled(
     return usual, {"layout": f"guessed: {usual.name}, not {others}"}, None
 
 
-def upward(joints: FloatArray, names: Sequence[str], usual: str) -> str:
+def estimate_up(joints: FloatArray, names: Sequence[str], usual: str) -> str:
     """The direction that is up for a body whose joints have names; the usual one where the body does not show it."""
     words = [canonical(name) for name in names]
     plain = {word.replace("_", ""): word for word in HEIGHT}
     known = [plain.get(word, plain.get(re.sub("^(left|right)", "", word), f"joint {i}")) for i, word in enumerate(words)]
-    found = fits(joints, [Skeleton("", tuple(known))], None)[0]
+    found = rank_layouts(joints, [Skeleton("", tuple(known))], None)[0]
     return found.up if found.posture >= MIN_POSTURE else usual
 
 
-def told(path: Path, name: str, joints: int, own: Skeleton | None = None) -> Skeleton:
+def check_named_layout(path: Path, name: str, joints: int, own: Skeleton | None = None) -> Skeleton:
     """The layout that a person names."""
     layout = layout_named(name)
     if len(layout.joints) != joints:

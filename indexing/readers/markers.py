@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from indexing.clip import FloatArray
-from indexing.readers.layouts import upward
+from indexing.readers.layouts import estimate_up
 from indexing.readers.recording import IntArray, Recording
 from indexing.skeleton import Skeleton
 
@@ -22,11 +22,11 @@ UNITS = {
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 
 
-def of_markers(
+def build_marker_recording(
     path: Path, points: FloatArray, names: list[str], frames: IntArray, times: FloatArray | None, units: str, up: str
 ) -> Recording:
     """A recording of named markers. points ``(frames, markers, 3)``."""
-    people, joints = people_of(names)
+    people, joints = split_people(names)
     unit = next((unit for unit, words in UNITS.items() if units.lower() in words), "")
     values = METRES.get(unit, 1.0) * points.reshape(len(points) * len(people), len(joints), 3)
     depth = values[..., 2]
@@ -41,12 +41,12 @@ def of_markers(
         tracks=people * len(frames) if len(people) > 1 else None,
         times=times,
         skeleton=Skeleton(path.stem, tuple(joints)),
-        up=up or upward(values, joints, usual),
+        up=up or estimate_up(values, joints, usual),
         meta={"units": "m" if unit in METRES else unit} if unit else {},
     )
 
 
-def people_of(names: Sequence[str]) -> tuple[list[str], list[str]]:
+def split_people(names: Sequence[str]) -> tuple[list[str], list[str]]:
     """Who is in a file of markers, and the markers of each."""
     parts = [name.partition(":") for name in names]
     if not all(before and colon and after for before, colon, after in parts):

@@ -73,7 +73,7 @@ class NumpyArchive(Mapping[str, Array]):
         self._members = {info.filename.removesuffix(".npy"): info for info in self._zip.infolist()}
 
     def __getitem__(self, name: str) -> Array:
-        where, take = f"array {shown(name)}", self._opened(name)
+        where, take = f"array {shown(name)}", self._open_member(name)
         header, info = _header(self.path, where, take, self._members[name].file_size), self._members[name]
         large, times = PLENTY
         if header.size > max(large, times * info.compress_size):
@@ -92,9 +92,9 @@ class NumpyArchive(Mapping[str, Array]):
 
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of an array, which is not read."""
-        return _header(self.path, f"array {shown(name)}", self._opened(name), self._members[name].file_size).shape
+        return _header(self.path, f"array {shown(name)}", self._open_member(name), self._members[name].file_size).shape
 
-    def _opened(self, name: str) -> Take:
+    def _open_member(self, name: str) -> Take:
         """A member to read from; whatever goes wrong with its packing is said in one line."""
         info, where = self._members[name], f"array {shown(name)}"
         if info.flag_bits & ENCRYPTED:

@@ -88,7 +88,7 @@ def _points(values: Any, where: str | Path) -> FloatArray:
 # ---- npz -----------------------------------------------------------------------------------------------------------------
 def _archive(path: Path, pair: str | None) -> MatchedPair:
     archive = NumpyArchive(path)
-    before = _chosen(path, list(archive), pair)
+    before = _select_prefix(path, list(archive), pair)
     x1, x2 = (_points(archive[before + name], f"{path} {before}{name}") for name in ("x1", "x2"))
     if len(x1) != len(x2):
         raise error(path, f"{before}x1 has {len(x1)} rows, {before}x2 {len(x2)}", "give a row per match in both")
@@ -108,7 +108,7 @@ def _archive(path: Path, pair: str | None) -> MatchedPair:
     return _pair(path, pair or before.rstrip("/") or path.name, x1, x2, ids, **_marks(path, extra))
 
 
-def _chosen(path: Path, names: list[str], pair: str | None) -> str:
+def _select_prefix(path: Path, names: list[str], pair: str | None) -> str:
     """What the names of the arrays of the pair begin with."""
     several = [name.removesuffix("x1") for name in names if name.endswith("/x1")]
     pairs = listed(name.rstrip("/") for name in several)
@@ -160,7 +160,7 @@ def _table(path: Path) -> MatchedPair:
     if not rows:
         raise error(path, "the file is empty", "export it again")
     if points.is_data(rows[0][1]):
-        names = _unnamed(path, rows[0][1])
+        names = _default_columns(path, rows[0][1])
     else:
         names, rows = [cell.strip().lower() for cell in rows[0][1]], rows[1:]
     absent = [name for name in COLUMNS if name not in names]
@@ -192,7 +192,7 @@ def _cells(cells: list[str]) -> list[str]:
     return cells
 
 
-def _unnamed(path: Path, cells: list[str]) -> list[str]:
+def _default_columns(path: Path, cells: list[str]) -> list[str]:
     """Names of the columns of a table without a header: the four coordinates, and perhaps a name before them."""
     named = points.number(cells[0]) is None
     if len(cells) != len(COLUMNS) + named:

@@ -271,14 +271,14 @@ _OTHER = {_CODES[name]: OTHERS.get(name, f"the step {name}") for name in _CODES 
 
 def read_pickle(path: Path) -> Any:
     """What a pickle holds: numpy arrays, numbers, text, lists, tuples and dictionaries."""
-    return unpickled(path, read_bytes(path), "")
+    return unpickle_bytes(path, read_bytes(path), "")
 
 
-def unpickled(path: Path, data: bytes, where: str) -> Any:
+def unpickle_bytes(path: Path, data: bytes, where: str) -> Any:
     """The same of bytes in a file."""
     who = f"{where}: the pickle" if where else "the pickle"
     try:
-        return _finished(_Reader(data).load(), {})
+        return _replace_parts(_Reader(data).load(), {})
     except Refused as refused:
         raise error(path, f"{who} holds {refused}, which is not read from a file", REMEDY) from None
     except Exception as problem:  # a program that does not run fails in as many ways as there are steps
@@ -286,7 +286,7 @@ def unpickled(path: Path, data: bytes, where: str) -> Any:
         raise error(path, f"{who} cannot be read ({said}; the file may be truncated)", REMEDY) from None
 
 
-def _finished(value: Any, seen: dict[int, Any]) -> Any:
+def _replace_parts(value: Any, seen: dict[int, Any]) -> Any:
     """The value with arrays in place of what they were made of; containers are changed in place, each once."""
     stack = [value]
     while stack:
@@ -301,15 +301,15 @@ def _finished(value: Any, seen: dict[int, Any]) -> Any:
             if isinstance(part, _Array):
                 if isinstance(one, tuple):
                     raise Refused("an array in a tuple")
-                one[key] = _whole(part)
+                one[key] = _require_values(part)
             else:
                 stack.append(part)
     if isinstance(value, (_Kind, _Name)):
         raise Refused("a part of an array outside of one")
-    return _whole(value) if isinstance(value, _Array) else value
+    return _require_values(value) if isinstance(value, _Array) else value
 
 
-def _whole(part: _Array) -> NDArray[Any]:
+def _require_values(part: _Array) -> NDArray[Any]:
     if part.values is None:
         raise Refused("an array without its parts")
     return part.values

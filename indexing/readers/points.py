@@ -106,7 +106,7 @@ def read(path: Path) -> PointSet:
         raise error(path, "the file is empty", "export it again")
     header = None if is_data(rows[0][1]) else [cell.strip().lower() for cell in rows[0][1]]
     if header is None:
-        names = _unnamed(path, rows[0][1])
+        names = _default_columns(path, rows[0][1])
     else:
         names, rows = header, rows[1:]
         if not rows:
@@ -142,7 +142,7 @@ def is_data(cells: Sequence[str]) -> bool:
     return any(number(cell) is not None and cell.strip().lower() not in MISSING for cell in cells)
 
 
-def _unnamed(path: Path, cells: Sequence[str]) -> list[str]:
+def _default_columns(path: Path, cells: Sequence[str]) -> list[str]:
     """Names of the columns of a file without a header."""
     named = number(cells[0]) is None  # words before numbers name the rows
     size = len(cells) - named

@@ -1,7 +1,7 @@
-"""Detections of any format -> clips: the one place where people, missing joints and times are settled.
+"""Detections of any format -> clips: the one place that decides about people, missing joints and times.
 
-A format module turns its file into a :class:`Recording` (directly, or through :func:`gather` where the file lists people
-frame by frame); :func:`to_clips` does the rest, the same for all formats.
+A format turns its file into a :class:`Recording` (directly, or through :func:`collect_detections` where the file lists people frame
+by frame); :func:`to_clips` does the rest, the same for all formats.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from dyntorch.numerics import Message
 from indexing.clip import LARGEST, Clip, ClipSet, FloatArray
 from indexing.opening import error, shown
 from indexing.readers.files import Options
-from indexing.readers.layouts import settled, told
+from indexing.readers.layouts import check_named_layout, choose_layout
 from indexing.skeleton import LAYOUTS, Skeleton
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Who is who where a frame shows several people: the one place where that is decided.
 #
 # An *identity* is a set of detections, at most one per frame, taken to be one person: the tracker's ids where the file has
-# them, otherwise people linked from frame to frame by position (:func:`link`).  On identities the rules are:
+# them, otherwise people linked from frame to frame by position (:func:`link_by_position`).  On identities the rules are:
 #
 # - ``"largest"``: in each frame, the identity with the largest bounding boxes, summed over the whole recording, of those
 #   present.  It does not hop between two people who are both there, and it continues with the next largest where that
@@ -53,9 +53,9 @@ MIN_CROWDED_SHARE = 0.05
 """Of the frames with somebody that show several people, from where on a clip says how many."""
 
 
-def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable | None, IntArray]]:
+def select_people(path: Path, recording: Recording, person: str) -> list[tuple[Hashable | None, IntArray]]:
     """The detections that make each clip."""
-    ids, names, repeated = _given(recording)
+    ids, names, repeated = _read_ids(recording)
     if person == "all" and ids is None:
         why = f"its person ids repeat in frame {repeated}" if repeated is not None else "it has no person ids"
         what = Message("{arg:person='all'} needs tracked people, but {why}", why=why)
@@ -64,7 +64,7 @@ def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable
     if person == "everyone" and alone:
         return [(None, np.arange(len(recording.at)))]
     if person in ("all", "everyone"):
-        ids = link(recording.at, recording.joints) if ids is None else ids
+        ids = link_by_position(recording.at, recording.joints) if ids is None else ids
         return [(name, np.flatnonzero(ids == i)) for i, name in enumerate(names or range(int(ids.max()) + 1))]
     if person == "confident" and recording.confidence is None:
         what = Message("has no confidences, so {arg:person='confident'} cannot be applied")
@@ -75,7 +75,7 @@ def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable
     weight = recording.confidence.mean(axis=1) if person == "confident" and recording.confidence is not None else area
     tracked = ids is not None
     if ids is None:
-        ids = link(recording.at, recording.joints)
+        ids = link_by_position(recording.at, recording.joints)
     known = np.maximum(ids, 0)
     total = np.bincount(known, weight * (ids >= 0))
     if person == "tracked":
@@ -88,7 +88,7 @@ def choose(path: Path, recording: Recording, person: str) -> list[tuple[Hashable
     return [(None, order[last])]
 
 
-def _given(recording: Recording) -> tuple[IntArray | None, list[Hashable], int | None]:
+def _read_ids(recording: Recording) -> tuple[IntArray | None, list[Hashable], int | None]:
     """Ids 0, 1, ... of the detections (-1: none) and their names; None, and the frame where they repeat, if unusable."""
     if recording.tracks is None or all(track is None for track in recording.tracks):
         return None, [], None
@@ -104,7 +104,7 @@ def _given(recording: Recording) -> tuple[IntArray | None, list[Hashable], int |
     return ids, list(index), None
 
 
-def link(at: IntArray, joints: FloatArray) -> IntArray:
+def link_by_position(at: IntArray, joints: FloatArray) -> IntArray:
     """Identities by position: each detection continues the nearest identity, nearest pairs first. at ``(m,)``, joints
     ``(m, n, 2 | 3)`` -> ``(m,)``."""
     identity = np.full(len(at), -1, dtype=np.int64)
@@ -192,7 +192,7 @@ class Recording:
     meta: Mapping[str, Any] = field(default_factory=dict)
 
 
-def numbers(path: Path, where: str, value: Any) -> FloatArray:
+def parse_numbers(path: Path, where: str, value: Any) -> FloatArray:
     """An array of float64 from parsed JSON (``null`` = NaN)."""
     try:
         return np.array(value, dtype=np.float64)
@@ -217,9 +217,9 @@ def track_id(value: Any) -> Hashable | None:
     return value if isinstance(value, str) and value else None
 
 
-def flat(path: Path, where: str, value: Any, width: int = 3) -> tuple[FloatArray, FloatArray]:
+def parse_flat_joints(path: Path, where: str, value: Any, width: int = 3) -> tuple[FloatArray, FloatArray]:
     """``(n, width - 1)`` joints and ``(n,)`` confidences from a flat list ``x, y, c, x, y, c, ...``."""
-    array = numbers(path, where, value)
+    array = parse_numbers(path, where, value)
     if array.ndim == 2 and array.shape[1] == width:  # some exporters keep one row per joint
         array = array.ravel()
     if array.ndim != 1 or array.size == 0 or array.size % width:
@@ -232,7 +232,7 @@ def flat(path: Path, where: str, value: Any, width: int = 3) -> tuple[FloatArray
     return table[:, :-1], table[:, -1]
 
 
-def gather(path: Path, frames: Sequence[tuple[int, Sequence[Detection]]]) -> Recording:
+def collect_detections(path: Path, frames: Sequence[tuple[int, Sequence[Detection]]]) -> Recording:
     """A recording from the people of each frame."""
     frames = sorted(frames, key=lambda frame: frame[0])
     if frames and max(abs(frames[0][0]), abs(frames[-1][0])) >= LAST_FRAME:
@@ -262,20 +262,20 @@ def gather(path: Path, frames: Sequence[tuple[int, Sequence[Detection]]]) -> Rec
 
 def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     """Choose people by ``options.person`` and make their clips."""
-    recording = _named(path, _mask(path, _scale(path, recording, options), options.min_confidence), options)
+    recording = _assign_layout(path, _mask(path, _scale(path, recording, options), options.min_confidence), options)
     times, fps = _times(path, recording, options.fps)
     name = path.name or path.resolve().name
     each = options.person in ("all", "everyone")
-    ids = _given(recording)[0] if each else None
+    ids = _read_ids(recording)[0] if each else None
     own = {"followed": "position"} if ids is None else {"followed": "ids", "untracked": int((ids < 0).sum())}
     crowd = np.bincount(recording.at)
     others = {"people": int(crowd.max())} if (crowd > 1).mean() > MIN_CROWDED_SHARE else {}
     known = dict(recording.meta)
     clips = []
-    for track, rows in choose(path, recording, options.person):
+    for track, rows in select_people(path, recording, options.person):
         # each person's clip spans what was seen of that person
         one = each and track is not None
-        frames = _around(times, recording.at[rows], MAX_ABSENCE_SECONDS) if one else np.arange(len(times))
+        frames = _select_frames(times, recording.at[rows], MAX_ABSENCE_SECONDS) if one else np.arange(len(times))
         joints, confidence = _fill(recording, rows, frames)
         clips.append(
             Clip(
@@ -294,7 +294,7 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     return ClipSet(clips, name)
 
 
-def of_people(clips: Sequence[Clip]) -> Recording | None:
+def merge_people(clips: Sequence[Clip]) -> Recording | None:
     """The recording that clips are the people of, as :func:`to_clips` gives them for ``person="everyone"``; of others None."""
     if not clips or not all("followed" in clip.meta and "person" in clip.meta for clip in clips):
         return None
@@ -328,19 +328,19 @@ class NobodySeen(ValueError):
         self.frames, self.times = frames, times
 
 
-def _named(path: Path, recording: Recording, options: Options) -> Recording:
+def _assign_layout(path: Path, recording: Recording, options: Options) -> Recording:
     """Which joint is which: as the caller says, or where only their number is known, as the body looks."""
     if options.layout is not None:
         own = None if any(recording.skeleton is one for one in LAYOUTS.values()) else recording.skeleton  # by its number alone
         meta = {key: value for key, value in recording.meta.items() if key != "layout"}
-        return replace(recording, skeleton=told(path, options.layout, recording.joints.shape[1], own), meta=meta)
+        return replace(recording, skeleton=check_named_layout(path, options.layout, recording.joints.shape[1], own), meta=meta)
     if not recording.layouts:
         return recording
-    layout, said, _ = settled(recording.joints, recording.skeleton, recording.layouts, recording.up)
+    layout, said, _ = choose_layout(recording.joints, recording.skeleton, recording.layouts, recording.up)
     return replace(recording, skeleton=layout, meta={**recording.meta, **said})
 
 
-def _around(times: FloatArray, at: IntArray, away: float) -> IntArray:
+def _select_frames(times: FloatArray, at: IntArray, away: float) -> IntArray:
     """The frames from the first to the last of a person, without those where nothing was seen of it for longer than ``away``."""
     seen = np.sort(at)
     frames = np.arange(int(seen[0]), int(seen[-1]) + 1)

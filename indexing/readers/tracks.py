@@ -106,7 +106,7 @@ def exact(value: float) -> str:
     return repr(float(value)).removesuffix(".0")
 
 
-def numbered(count: int) -> tuple[str, ...]:
+def default_names(count: int) -> tuple[str, ...]:
     """Names of tracks that have none."""
     return tuple(str(i + 1) for i in range(count))
 
@@ -253,7 +253,7 @@ KNOWN = ("label", "labels", "s")  # the last one as in the files of Hopkins 155
 def read_arrays(path: Path, key: str | None) -> TrackSet:
     """Tracks of an ``.npz``."""
     archive = NumpyArchive(path)
-    before, name = _chosen(path, list(archive), key)
+    before, name = _select_prefix(path, list(archive), key)
     values, extra = archive[name], {kind: archive[before + kind] for kind in EXTRA if before + kind in archive}
     if values.ndim != 3 or values.shape[-1] not in (2, 3):
         raise error(path, f"{name} has shape {values.shape}", KEYS)
@@ -262,12 +262,12 @@ def read_arrays(path: Path, key: str | None) -> TrackSet:
     for kind, shape in (("times", (views,)), ("ids", (n,)), ("static", (n,)), ("weights", (views, n))):
         if kind in extra and extra[kind].shape != shape:
             raise error(path, f"{kind} has shape {extra[kind].shape}, {name} has {values.shape}", f"expected {shape}")
-    ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else numbered(n)
+    ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else default_names(n)
     return TrackSet(
         str(path), _hidden(archive, before, flat.reshape(values.shape)), ids, tuple(map(str, range(views))),
         _reals(path, extra, "times"),
         _reals(path, extra, "weights", 0.0), None if "static" not in extra else extra["static"].astype(bool),
-        known=_known(archive, before, n),
+        known=_read_labels(archive, before, n),
     )  # fmt: skip
 
 
@@ -279,7 +279,7 @@ def _hidden(archive: NumpyArchive, before: str, values: FloatArray) -> FloatArra
     return values
 
 
-def _known(archive: NumpyArchive, before: str, count: int) -> NDArray[np.int64] | None:
+def _read_labels(archive: NumpyArchive, before: str, count: int) -> NDArray[np.int64] | None:
     """Labels of the tracks, where the file has some that can be meant."""
     for name in (before + kind for kind in KNOWN):
         labels = archive[name] if name in archive else np.zeros(0)
@@ -288,7 +288,7 @@ def _known(archive: NumpyArchive, before: str, count: int) -> NDArray[np.int64] 
     return None
 
 
-def _chosen(path: Path, names: list[str], key: str | None) -> tuple[str, str]:
+def _select_prefix(path: Path, names: list[str], key: str | None) -> tuple[str, str]:
     """What the names of the arrays begin with, and the name of the tracks."""
     several = [name[:-2] for name in names if name.endswith("/y")]
     if key is not None and key in names:
@@ -350,7 +350,7 @@ def _read(files: Sequence[Path], key: str | None) -> TrackSet:
     first = opened[0]
     if isinstance(first, PointSequence) and len(opened) == 1:
         names = tuple(str(first.first + i) for i in range(len(first.values)))
-        return TrackSet(first.path, first.values, first.ids or numbered(first.values.shape[1]), names)
+        return TrackSet(first.path, first.values, first.ids or default_names(first.values.shape[1]), names)
     views = []
     for view in opened:
         if isinstance(view, PointSequence):
@@ -360,7 +360,7 @@ def _read(files: Sequence[Path], key: str | None) -> TrackSet:
         views.append(view)
     if len(views) == 1:
         raise error(views[0].path, "holds the points of one view", FORMATS)
-    return _joined(views)
+    return _match_views(views)
 
 
 def holds_tracks(path: Path) -> bool:
@@ -388,7 +388,7 @@ def _is_text(path: Path) -> bool:
     return bool(start) and b"\0" not in start and not start.startswith(b"ply")
 
 
-def _joined(views: Sequence[PointSet]) -> TrackSet:
+def _match_views(views: Sequence[PointSet]) -> TrackSet:
     """One file per view: by name where all have names, and then a name may be absent from some; otherwise by row."""
     first = views[0]
     odd = next((view for view in views if view.values.shape[1] != first.values.shape[1]), None)
@@ -404,7 +404,7 @@ def _joined(views: Sequence[PointSet]) -> TrackSet:
         if longer is not None:
             said = f"has {len(longer.values)} rows, {first.path} {len(first.values)}"
             raise error(longer.path, said, "give a row per track in every file, or a column id to match the rows by")
-        rows, ids = [np.arange(len(first.values))] * len(views), numbered(len(first.values))
+        rows, ids = [np.arange(len(first.values))] * len(views), default_names(len(first.values))
     values = np.full((len(views), len(ids), first.values.shape[1]), np.nan)
     weights = np.ones(values.shape[:2])
     still = np.ones(len(ids), dtype=bool)

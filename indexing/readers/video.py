@@ -7,7 +7,7 @@ import numpy as np
 from indexing.clip import ClipSet
 from indexing.opening import error
 from indexing.readers.files import Options, Source, WatchOptions
-from indexing.readers.recording import NobodySeen, of_people, to_clips
+from indexing.readers.recording import NobodySeen, merge_people, to_clips
 
 
 def read_video(source: Source, options: Options) -> ClipSet:
@@ -20,7 +20,7 @@ def read_video(source: Source, options: Options) -> ClipSet:
     if available() is None:
         raise error(source.path, "is a video, and there is no pose model to find the people in it", f"{FETCH}, or give keypoints")
     how = options.watching or WatchOptions()
-    found = of_people(detect(source.path, how.people, model=how.model, every=how.every, fps=options.fps).clips)
+    found = merge_people(detect(source.path, how.people, model=how.model, every=how.every, fps=options.fps).clips)
     if found is None:
         raise NobodySeen(source.path, np.zeros(0, dtype=np.int64))
     return to_clips(source.path, found, options)

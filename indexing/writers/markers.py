@@ -66,7 +66,7 @@ def markers_of(clips: Sequence[Clip], path: Path, units: str | None = None) -> M
     twice = repeated(names)
     if twice is not None:
         raise error(path, f"there are two points {twice!r}", "give every joint a name of its own (Clip.skeleton)")
-    times, places = together(clips)
+    times, places = align_clips(clips)
     notes = []
     if first.dims == 2:
         places = np.concatenate([places, np.where(np.isnan(places[..., :1]), np.nan, 0.0).astype(places.dtype)], axis=2)
@@ -119,7 +119,7 @@ def joint_names(clip: Clip) -> list[str]:
     return [joint or f"joint{i}" for i, joint in enumerate(plain)]
 
 
-def together(clips: Sequence[Clip]) -> tuple[FloatArray, FloatArray]:
+def align_clips(clips: Sequence[Clip]) -> tuple[FloatArray, FloatArray]:
     """All frames of the clips, and ``(frames, joints of all, d)``; NaN where a person has no such frame."""
     times = np.unique(np.concatenate([clip.times for clip in clips]))
     dtype = np.result_type(*(clip.joints.dtype for clip in clips))

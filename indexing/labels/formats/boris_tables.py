@@ -12,10 +12,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from indexing.labels.format import NUM_HEADER_ROWS, Gathering, LabelFormat, Request, few, parse_seconds
-from indexing.labels.formats.boris.project import MACHINE, Entry, Interval, joined, scored
+from indexing.labels.format import NUM_HEADER_ROWS, Gathering, LabelFormat, Request, list_few, parse_seconds
+from indexing.labels.formats.boris.project import MACHINE, Entry, Interval, join_comments, split_score
 from indexing.labels.label import LabelFile
-from indexing.labels.media import Span, base_name, cut_up, of_recording
+from indexing.labels.media import Span, base_name, of_recording, split_by_media
 from indexing.opening import Row, count, error, listed, shown
 
 COLUMNS = {
@@ -129,7 +129,7 @@ def _row(out: Gathering, sitting: Sitting, row: dict[str, str], modifiers: list[
     comment = "" if row.get("comment", "") in NOTHING else row.get("comment", "")
     if stops:
         stop = "" if row.get("comment_stop", "") in NOTHING else row["comment_stop"]
-        sitting.stretches.append((Interval(start, stops[0], key, joined(comment, stop)), media))
+        sitting.stretches.append((Interval(start, stops[0], key, join_comments(comment, stop)), media))
         return
     _event(out, sitting, Entry(start, key, comment), row["kind"].upper(), media, where)
 
@@ -146,7 +146,9 @@ def _event(out: Gathering, sitting: Sitting, event: Entry, kind: str, media: str
     elif kind == "STOP":
         if event.key in sitting.begun:
             begin, first = sitting.begun.pop(event.key)
-            sitting.stretches.append((Interval(begin.time, event.time, event.key, joined(begin.comment, event.comment)), first))
+            sitting.stretches.append(
+                (Interval(begin.time, event.time, event.key, join_comments(begin.comment, event.comment)), first)
+            )
         else:
             sitting.stray.append(of)
     else:
@@ -158,7 +160,7 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
     where = f"observation {sitting.name!r}" if sitting.name else "the observation"
     stray = sitting.stray + [f"{event.key[1]} at {event.time:.6g} s" for event, _ in sitting.begun.values()]
     if stray:
-        lone = f"START without STOP, or the other way round ({few(stray)})"
+        lone = f"START without STOP, or the other way round ({list_few(stray)})"
         out.note(f"{where}: {count(len(stray), 'event')} left out: {lone}")
     if sitting.timeless:
         out.note(f"{where}: {count(sitting.timeless, 'event')} left out: of pictures without a time")
@@ -169,14 +171,14 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
     lost: Counter[str] = Counter()
     for number, (stretch, media) in enumerate(sorted(sitting.stretches, key=lambda pair: pair[0].start), start=1):
         start, end = stretch.start - sitting.offset, stretch.end - sitting.offset
-        pieces = cut_up(start, end, spans) if spans else [(media, start, end)]
+        pieces = split_by_media(start, end, spans) if spans else [(media, start, end)]
         if not spans and len(sitting.files) > 1 and media != next(iter(sitting.files)):
             lost[media] += 1
             continue
         for name, first, last in pieces:
             if mine is None or not name or name in mine:
                 subject, code, modifiers = stretch.key
-                comment, score = scored(stretch.comment) if sitting.machine else (stretch.comment, None)
+                comment, score = split_score(stretch.comment) if sitting.machine else (stretch.comment, None)
                 out.add(
                     code,
                     round(first, 6),
@@ -190,7 +192,7 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
                     modifiers=tuple(modifiers.split("|")) if modifiers else (),
                 )
     if lost:
-        said = f"of {few(lost)}, which is not played first, and the table does not say how long the first is"
+        said = f"of {list_few(lost)}, which is not played first, and the table does not say how long the first is"
         if mine is not None and mine & lost.keys():
             raise error(out.asked.path, f"{where} has labels {said}", "give the project (.boris)")
         out.note(f"{where}: {count(sum(lost.values()), 'label')} left out: {said}; the project (.boris) does")

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from indexing.files import write_json
-from indexing.labels.format import Gathering, LabelFormat, Request, Target, text_of, whole
+from indexing.labels.format import Gathering, LabelFormat, Request, Target, parse_whole, text_of
 from indexing.labels.label import Label, LabelFile, in_order
 from indexing.labels.media import base_name
 from indexing.opening import clipped, count, error, shown
@@ -58,7 +58,7 @@ def _media(task: Mapping[str, Any]) -> str:
 def _regions(out: Gathering, task: Mapping[str, Any], where: str) -> Iterator[tuple[str, bool, dict[str, Any]]]:
     """Who marked it, whether that was a program, and the region."""
     if "annotations" not in task and "predictions" not in task and "completions" not in task:
-        yield from _least(task)
+        yield from _compact_regions(task)
         return
     for part in ("annotations", "completions", "predictions"):
         for one in _list(out, task.get(part), f"{where}, {part}"):
@@ -74,7 +74,7 @@ def _regions(out: Gathering, task: Mapping[str, Any], where: str) -> Iterator[tu
                     yield who, machine, region
 
 
-def _least(task: Mapping[str, Any]) -> Iterator[tuple[str, bool, dict[str, Any]]]:
+def _compact_regions(task: Mapping[str, Any]) -> Iterator[tuple[str, bool, dict[str, Any]]]:
     """The regions of JSON-MIN: lists of what is the value of a region elsewhere."""
     for key, held in task.items():
         if isinstance(held, list):
@@ -128,7 +128,7 @@ def _region(out: Gathering, region: Mapping[str, Any], media: str, who: str, whe
 
 def _frames(out: Gathering, one: Any, where: str) -> tuple[float, float]:
     """The times of the first and the last frame of a range."""
-    ends = [whole(one.get(key)) if isinstance(one, dict) else None for key in ("start", "end")]
+    ends = [parse_whole(one.get(key)) if isinstance(one, dict) else None for key in ("start", "end")]
     if ends[0] is None or ends[1] is None:
         raise error(out.asked.path, f"{where}: {shown(one)} is no range of frames", REMEDY)
     if out.asked.fps is None:

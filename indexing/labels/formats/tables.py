@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from indexing.files import write_text
-from indexing.labels.format import Gathering, LabelFormat, Request, Target, parse_seconds, whole
+from indexing.labels.format import Gathering, LabelFormat, Request, Target, parse_seconds, parse_whole
 from indexing.labels.label import Label, LabelFile, in_order
 from indexing.opening import Row, clipped, error, listed, shown
 
@@ -97,7 +97,7 @@ def _seconds(out: Gathering, row: dict[str, str], where: str) -> tuple[float, fl
 def _frames(out: Gathering, row: dict[str, str], where: str) -> tuple[float, float]:
     times = []
     for column in ("start_frame", "end_frame"):
-        number = whole(row[column])
+        number = parse_whole(row[column])
         if number is None:
             said = f"{where}: column {column!r}: {shown(row[column])} is no frame number"
             raise error(out.asked.path, said, "count frames from 0")

@@ -30,9 +30,9 @@ from indexing.clip import UP_AXES, Clip, ClipSet, FloatArray, LabelledSet
 from indexing.files import replacing
 from indexing.opening import error, listed, shown
 from indexing.readers.files import Format, Options, Source
-from indexing.readers.layouts import settled, told
+from indexing.readers.layouts import check_named_layout, choose_layout
 from indexing.readers.npz import NumpyArchive
-from indexing.readers.recording import of_people, to_clips
+from indexing.readers.recording import merge_people, to_clips
 from indexing.skeleton import Skeleton, candidates
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ LAST = 2**53  # whole numbers are exact below it
 FORMS = {"joints": "joints (F, n, 2 or 3)", "frames": "frames (F, height, width)"}
 
 
-def need(path: Path, data: Mapping[str, Array], key: str, ndim: int) -> Array:
+def require_array(path: Path, data: Mapping[str, Array], key: str, ndim: int) -> Array:
     """One array with so many axes, or an error that names what the file holds."""
     if key not in data:
         raise error(
@@ -167,7 +167,7 @@ def clip_offsets(path: Path, data: Mapping[str, Array], key: str) -> NDArray[np.
                 path, f"has {actions.size} actions but no offsets", "save offsets (N + 1): where each clip starts, and the end"
             )
         return np.array([0, frames])
-    offsets = need(path, data, "offsets", 1)
+    offsets = require_array(path, data, "offsets", 1)
     if offsets.dtype.kind not in "iu" or len(offsets) < 2:
         raise error(
             path,
@@ -211,7 +211,7 @@ def clip_labels(path: Path, data: Mapping[str, Array], count: int) -> list[Hasha
     """``(N,)`` labels; ``None`` where unknown."""
     if "action" not in data:
         return [None] * count
-    action = need(path, data, "action", 1)
+    action = require_array(path, data, "action", 1)
     if len(action) != count:
         raise error(path, f"action has {len(action)} values for {count} clips", "save one action per clip")
     if action.dtype.kind == "U":
@@ -223,7 +223,7 @@ def clip_labels(path: Path, data: Mapping[str, Array], count: int) -> list[Hasha
     index = np.nan_to_num(action, nan=-1).astype(np.int64).tolist()
     if "action_names" not in data:
         return [i if i >= 0 else None for i in index]
-    names = need(path, data, "action_names", 1)
+    names = require_array(path, data, "action_names", 1)
     if max(index) >= len(names):
         raise error(
             path, f"action[{int(np.argmax(index))}] = {max(index)}, but there are {len(names)} action_names", "add the name"
@@ -277,7 +277,7 @@ def clip_meta(data: NumpyArchive, count: int, rows: str) -> dict[str, Array]:
     return meta
 
 
-def plain(value: Any) -> Any:
+def to_python(value: Any) -> Any:
     """A Python number or text; rows of 2-D arrays stay arrays."""
     return value.item() if isinstance(value, np.generic) else value
 
@@ -289,7 +289,7 @@ def read(source: Source, options: Options) -> ClipSet:
     clips = read_clip_set(
         source.path, fps=options.fps, label=options.label, min_confidence=options.min_confidence, layout=options.layout
     )
-    people = of_people(clips)
+    people = merge_people(clips)
     return clips if people is None else to_clips(source.path, people, replace(options, label=clips[0].label))
 
 
@@ -304,7 +304,7 @@ def read_clip_set(
     """Read a clip-set ``.npz`` (its keys are listed above), without pickle."""
     path = Path(path)
     data = NumpyArchive(path)
-    joints = need(path, data, "joints", 3)
+    joints = require_array(path, data, "joints", 3)
     if joints.shape[2] not in (2, 3) or joints.dtype.kind not in "fiu":
         raise error(
             path, f"joints must be numbers (F, n, 2 or 3), got {joints.dtype} {joints.shape}", "save x, y or x, y, z per joint"
@@ -316,7 +316,7 @@ def read_clip_set(
     count = len(offsets) - 1
     labels = [label] * count if label is not None else clip_labels(path, data, count)
     names = clip_names(path, data, count)
-    joints, confidence = _trusted(path, data, joints, min_confidence)
+    joints, confidence = _mask_unsure(path, data, joints, min_confidence)
     rate = per_clip(path, data, "fps", count, 30.0 if fps is None else fps)
     assumed = per_clip(path, data, "fps_assumed", count, "fps" not in data and "times" not in data and fps is None)
     times = frame_times(path, data, offsets, rate, names)
@@ -340,7 +340,7 @@ def read_clip_set(
                     name=names[i],
                     skeleton=skeleton,
                     up=str(up[i]),
-                    meta={**{key: plain(values[i]) for key, values in meta.items()}, **said},
+                    meta={**{key: to_python(values[i]) for key, values in meta.items()}, **said},
                     fps_assumed=bool(assumed[i]),
                 )
             )
@@ -350,7 +350,7 @@ def read_clip_set(
     return ClipSet(clips, path.name)
 
 
-def _trusted(path: Path, data: Mapping[str, Array], joints: Array, min_confidence: float) -> tuple[Array, Array | None]:
+def _mask_unsure(path: Path, data: Mapping[str, Array], joints: Array, min_confidence: float) -> tuple[Array, Array | None]:
     """Joints, NaN where their confidence is below the limit, and the confidences."""
     if "confidence" not in data:
         if min_confidence > 0:
@@ -371,10 +371,10 @@ def _layout(
     """Which joint is which: as the caller or the file says, or as the body shows; and what to say about it."""
     own = _skeleton(path, data, joints.shape[1])
     if name is not None:
-        return told(path, name, joints.shape[1], own), {}
+        return check_named_layout(path, name, joints.shape[1], own), {}
     if "joint_names" in data or len(ups) != 1:
         return own, {}
-    layout, said, _ = settled(joints, None, candidates(joints.shape[1]), ups[0])
+    layout, said, _ = choose_layout(joints, None, candidates(joints.shape[1]), ups[0])
     return layout or own, said
 
 
@@ -386,15 +386,17 @@ def _skeleton(path: Path, data: Mapping[str, Array], joints: int) -> Skeleton | 
         raise error(path, f"joint_names has {len(names)} names for {joints} joints", "save one name per joint")
     try:
         if "bones" in data:
-            bones = [(a, b) for a, b in _whole(data["bones"], 2).tolist()]
+            bones = [(a, b) for a, b in _parse_integers(data["bones"], 2).tolist()]
         else:
-            bones = [(parent, i) for i, parent in enumerate(_whole(data.get("parents", np.zeros(0)), 1).tolist()) if parent >= 0]
+            bones = [
+                (parent, i) for i, parent in enumerate(_parse_integers(data.get("parents", np.zeros(0)), 1).tolist()) if parent >= 0
+            ]
         return Skeleton(str(data.get("skeleton_name", path.stem)), names, tuple(bones))
     except (TypeError, ValueError, OverflowError) as problem:
         raise error(path, f"bones or parents do not fit the joints ({problem})", "save bones (m, 2) or parents (n)") from None
 
 
-def _whole(values: Array, ndim: int) -> NDArray[np.int64]:
+def _parse_integers(values: Array, ndim: int) -> NDArray[np.int64]:
     if values.ndim != ndim or values.dtype.kind not in "fiu" or not (np.abs(values) < 2**31).all():
         raise ValueError(f"{values.dtype} of shape {values.shape}")
     return values.astype(np.int64)
@@ -446,7 +448,7 @@ def read_film_set(path: str | Path, *, fps: float | None = None) -> FilmSet:
     """Read a film set, without pickle."""
     path = Path(path).expanduser()
     data = NumpyArchive(path)
-    frames = need(path, data, "frames", 3)
+    frames = require_array(path, data, "frames", 3)
     if frames.dtype != np.uint8:
         raise error(path, f"frames must be uint8 grey, got {frames.dtype}", "save grey values from 0 to 255")
     offsets = clip_offsets(path, data, "frames")
@@ -458,7 +460,9 @@ def read_film_set(path: str | Path, *, fps: float | None = None) -> FilmSet:
     films = []
     for i, (start, end) in enumerate(pairwise(offsets.tolist())):
         clock = np.arange(end - start) / float(rate[i]) if times is None else times[start:end] - times[start]
-        films.append(Film(frames[start:end], clock, labels[i], names[i], {key: plain(values[i]) for key, values in meta.items()}))
+        films.append(
+            Film(frames[start:end], clock, labels[i], names[i], {key: to_python(values[i]) for key, values in meta.items()})
+        )
     return FilmSet(films, path.name)
 
 

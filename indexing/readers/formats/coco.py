@@ -14,7 +14,7 @@ from typing import Any
 from indexing.clip import ClipSet
 from indexing.opening import error, shown
 from indexing.readers.files import Format, Options, Source, frame_number
-from indexing.readers.recording import Detection, flat, gather, to_clips, track_id
+from indexing.readers.recording import Detection, collect_detections, parse_flat_joints, to_clips, track_id
 from indexing.skeleton import Skeleton, known
 
 REMEDY = "export COCO keypoint results: a list of {image_id, category_id, keypoints, score}"
@@ -35,11 +35,11 @@ def read(source: Source, options: Options) -> ClipSet:
         where = f"{where} (image_id {shown(image)}), keypoints"
         detections = frames.setdefault(image, [])
         if person["keypoints"]:
-            detections.append(Detection(*flat(source.path, where, person["keypoints"]), _track(person)))
+            detections.append(Detection(*parse_flat_joints(source.path, where, person["keypoints"]), _track(person)))
     if not frames:
         raise error(source.path, "no person was detected in any frame", "check the video or the pose estimator's threshold")
     numbers = _numbers(source, {image: images.get(image, image) for image in frames})
-    recording = gather(source.path, [(numbers[image], detections) for image, detections in frames.items()])
+    recording = collect_detections(source.path, [(numbers[image], detections) for image, detections in frames.items()])
     joints = recording.joints.shape[1]
     layout = Skeleton(source.path.stem, names, bones) if len(names) == joints else known(joints)
     return to_clips(source.path, replace(recording, skeleton=layout), options)

@@ -21,7 +21,7 @@ from indexing.clip import ClipSet, FloatArray
 from indexing.opening import error, listed, shown
 from indexing.readers.files import Format, Options, Source, frame_number, read_columns
 from indexing.readers.hdf import AGAIN, Hdf5, opened_hdf5
-from indexing.readers.pickles import unpickled
+from indexing.readers.pickles import unpickle_bytes
 from indexing.readers.recording import IntArray, Recording, to_clips
 from indexing.skeleton import Skeleton
 
@@ -152,27 +152,27 @@ def read_frame(file: Hdf5) -> HdfFrame:
     key = KEY if KEY in keys else keys[0] if len(keys) == 1 else None
     if key is None:
         raise error(file.path, f"holds {len(keys)} tables of pandas ({listed(keys)}), none of them {KEY}", "save one per file")
-    kind = _word(file.attribute(key, "pandas_type"))
+    kind = _to_text(file.attribute(key, "pandas_type"))
     if kind == "frame_table":
-        return _table(file, key)
+        return _read_table(file, key)
     if kind != "frame":
         raise error(file.path, f"{shown(key)} is a {shown(kind)} of pandas, not a data frame", AGAIN)
-    return _fixed(file, key)
+    return _read_fixed(file, key)
 
 
 def _keys(file: Hdf5) -> list[str]:
     return [name for name in file.names() if file.attribute(name, "pandas_type") is not None]
 
 
-def _fixed(file: Hdf5, key: str) -> HdfFrame:
+def _read_fixed(file: Hdf5, key: str) -> HdfFrame:
     count = _count(file, key, "nblocks")
     columns: list[list[list[str]]] = []
     blocks: list[FloatArray] = []
-    rows = _axis(file, f"{key}/axis1", _word(file.attribute(key, "axis1_variety")), _levels(file, key, "axis1"))
+    rows = _read_axis(file, f"{key}/axis1", _to_text(file.attribute(key, "axis1_variety")), _levels(file, key, "axis1"))
     for i in range(count):
         name = f"{key}/block{i}_items"
         levels = _levels(file, key, f"block{i}_items")
-        parts = _rows(file, name, levels)
+        parts = _read_name_rows(file, name, levels)
         values = file.array(f"{key}/block{i}_values", 2).astype(np.float64)
         if file.attribute(f"{key}/block{i}_values", "transposed") in (0, None) and values.shape != (len(rows), len(parts[0])):
             values = values.T
@@ -183,12 +183,12 @@ def _fixed(file: Hdf5, key: str) -> HdfFrame:
             raise error(file.path, f"{key}: blocks with {len(columns[0])} and {len(parts)} rows of column names", AGAIN)
         columns.append(parts)
         blocks.append(values)
-    names = [_word(file.attribute(f"{key}/axis0_level{k}", "name")) for k in range(len(columns[0]))]
+    names = [_to_text(file.attribute(f"{key}/axis0_level{k}", "name")) for k in range(len(columns[0]))]
     header = [[word for part in columns for word in part[k]] for k in range(len(names))]
-    return _frame(file, header, names, blocks, rows)
+    return _build_frame(file, header, names, blocks, rows)
 
 
-def _table(file: Hdf5, key: str) -> HdfFrame:
+def _read_table(file: Hdf5, key: str) -> HdfFrame:
     table = f"{key}/table"
     fields = file.fields(table)
     blocks = [name for name in fields if name.startswith("values_block_")]
@@ -197,8 +197,8 @@ def _table(file: Hdf5, key: str) -> HdfFrame:
     parts: list[tuple[str, ...]] = []
     for block in blocks:
         kind = file.attribute(table, f"{block}_kind")
-        found = unpickled(file.path, _raw(kind), f"{table}@{block}_kind")
-        if not isinstance(found, list) or not all(_named(one) for one in found):
+        found = unpickle_bytes(file.path, _to_bytes(kind), f"{table}@{block}_kind")
+        if not isinstance(found, list) or not all(_is_column_name(one) for one in found):
             raise error(file.path, f"{block} has no columns named by {' and '.join(LEVELS[3])}", AGAIN)
         parts += [tuple(map(str, one)) for one in found]
     records = file.records(table, ("index", *blocks))
@@ -207,21 +207,21 @@ def _table(file: Hdf5, key: str) -> HdfFrame:
     if len(levels) != 1 or sum(block.shape[1] for block in values) != len(parts):
         raise error(file.path, f"{shown(table)} has {len(parts)} names for {sum(b.shape[1] for b in values)} columns", AGAIN)
     header = [[one[k] for one in parts] for k in range(levels.pop())]
-    return _frame(file, header, _level_names(file, key), values, [_word(name) for name in records["index"].tolist()])
+    return _build_frame(file, header, _level_names(file, key), values, [_to_text(name) for name in records["index"].tolist()])
 
 
 def _level_names(file: Hdf5, key: str) -> list[str]:
     """What the rows of column names of a table are called; empty where it does not say."""
     raw = file.attribute(key, "info")
     try:
-        info = unpickled(file.path, _raw(raw), f"{key}@info")
+        info = unpickle_bytes(file.path, _to_bytes(raw), f"{key}@info")
         names = tuple(info[1]["names"])
-        return list(map(str, names)) if _named(names) else []
+        return list(map(str, names)) if _is_column_name(names) else []
     except (ValueError, KeyError, TypeError, IndexError):
         return []
 
 
-def _named(one: Any) -> bool:
+def _is_column_name(one: Any) -> bool:
     """Whether the words of a column's name are text and numbers: text of a tuple of tuples can be without end."""
 
     def is_word(word: Any) -> bool:
@@ -231,7 +231,7 @@ def _named(one: Any) -> bool:
     return isinstance(one, tuple) and 0 < len(one) <= MOST_BLOCK and all(map(is_word, one))
 
 
-def _frame(file: Hdf5, header: list[list[str]], names: list[str], blocks: Sequence[FloatArray], rows: list[str]) -> HdfFrame:
+def _build_frame(file: Hdf5, header: list[list[str]], names: list[str], blocks: Sequence[FloatArray], rows: list[str]) -> HdfFrame:
     usual = LEVELS.get(len(header), ())
     told = len(set(names)) == len(header) and {"bodyparts", "coords"} <= set(names)
     named = names if told else list(usual)
@@ -242,13 +242,13 @@ def _frame(file: Hdf5, header: list[list[str]], names: list[str], blocks: Sequen
     return HdfFrame(dict(zip(named, header, strict=True)), np.concatenate(blocks, axis=1), rows)
 
 
-def _rows(file: Hdf5, name: str, levels: int) -> list[list[str]]:
+def _read_name_rows(file: Hdf5, name: str, levels: int) -> list[list[str]]:
     """Each row of column names: words, and which of them each column has."""
     found = []
     for k in range(levels):
         if levels * math.prod(file.shape(f"{name}_label{k}")) > NAMES_BLOCK:
             raise error(file.path, f"{shown(name)} has more names than any table of points", AGAIN)
-        words = _words(file, f"{name}_level{k}")
+        words = _read_texts(file, f"{name}_level{k}")
         which = file.array(f"{name}_label{k}", 1, "iu").astype(np.int64)
         if which.size and not (which.min() >= -1 and which.max() < len(words)):
             raise error(file.path, f"{shown(name)} names columns by words that are not there", AGAIN)
@@ -258,18 +258,18 @@ def _rows(file: Hdf5, name: str, levels: int) -> list[list[str]]:
     return found
 
 
-def _axis(file: Hdf5, name: str, variety: str, levels: int) -> list[str]:
+def _read_axis(file: Hdf5, name: str, variety: str, levels: int) -> list[str]:
     """A name or number per row; of labelled images, the parts of their path."""
     if variety == "multi":
-        return ["/".join(parts) for parts in zip(*_rows(file, name, levels), strict=True)]
-    return _words(file, name)
+        return ["/".join(parts) for parts in zip(*_read_name_rows(file, name, levels), strict=True)]
+    return _read_texts(file, name)
 
 
-def _words(file: Hdf5, name: str) -> list[str]:
+def _read_texts(file: Hdf5, name: str) -> list[str]:
     if math.prod(file.shape(name)) > NAMES_BLOCK:
         raise error(file.path, f"{shown(name)} has more names than any table of points", AGAIN)
     data = file.array(name, 1, "iufS")
-    return [_word(value) for value in data.tolist()]
+    return [_to_text(value) for value in data.tolist()]
 
 
 def _levels(file: Hdf5, key: str, axis: str) -> int:
@@ -284,14 +284,14 @@ def _count(file: Hdf5, key: str, name: str) -> int:
     return number
 
 
-def _word(value: Any) -> str:
+def _to_text(value: Any) -> str:
     """A number or text as text."""
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace").rstrip("\0")
     return f"{value:g}" if isinstance(value, float) and value == value and abs(value) < 1e15 else str(value)
 
 
-def _raw(value: Any) -> bytes:
+def _to_bytes(value: Any) -> bytes:
     """The bytes of an attribute that holds a pickle."""
     return value if isinstance(value, bytes) else str(value or "").encode("latin-1", "replace")
 

@@ -15,7 +15,7 @@ import numpy as np
 from indexing.clip import ClipSet
 from indexing.opening import error
 from indexing.readers.files import Format, Options, Source
-from indexing.readers.recording import Detection, gather, numbers, to_clips, track_id
+from indexing.readers.recording import Detection, collect_detections, parse_numbers, to_clips, track_id
 from indexing.skeleton import Skeleton, candidates, known
 
 REMEDY = "export with MMPoseInferencer(..., pred_out_dir=...) or a demo script's --save-predictions"
@@ -27,7 +27,7 @@ def read(source: Source, options: Options) -> ClipSet:
         (number, [_detection(source, number, i, instance) for i, instance in enumerate(instances)])
         for number, instances in _frames(source)
     ]
-    recording = gather(source.path, people)
+    recording = collect_detections(source.path, people)
     joints, dims = recording.joints.shape[1:]
     layout, up = _layout(source, joints), "-y" if dims == 2 else "z"
     rivals = candidates(joints) if layout is None and dims == 3 else ()  # a lifter's, which are Human3.6M's as a rule
@@ -69,14 +69,14 @@ def _detection(source: Source, number: int, index: int, instance: Any) -> Detect
     where = f"frame {number}, instance {index}"
     if not isinstance(instance, dict) or "keypoints" not in instance:
         raise error(source.path, f"{where}: no keypoints", REMEDY)
-    joints = numbers(source.path, f"{where}, keypoints", instance["keypoints"])
+    joints = parse_numbers(source.path, f"{where}, keypoints", instance["keypoints"])
     joints = joints[0] if joints.ndim == 3 and len(joints) == 1 else joints
     if joints.ndim != 2 or joints.shape[1] not in (2, 3):
         raise error(source.path, f"{where}: keypoints must be (joints, 2 or 3), got shape {joints.shape}", REMEDY)
     scores = instance.get("keypoint_scores")
     confidence = None
     if scores is not None:
-        confidence = np.atleast_1d(numbers(source.path, f"{where}, keypoint_scores", scores).squeeze())
+        confidence = np.atleast_1d(parse_numbers(source.path, f"{where}, keypoint_scores", scores).squeeze())
         if confidence.shape != joints.shape[:1]:
             raise error(source.path, f"{where}: {len(joints)} keypoints, but keypoint_scores of shape {confidence.shape}", REMEDY)
     return Detection(joints, confidence, track_id(instance.get("track_id")))

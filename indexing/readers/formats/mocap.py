@@ -29,7 +29,7 @@ from indexing.opening import error, listed
 from indexing.readers.c3d import read as read_c3d
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.formats.mediapipe import PREFIX, SUFFIX, Columns, find_columns, layout_of, read_table
-from indexing.readers.markers import of_markers, people_of
+from indexing.readers.markers import build_marker_recording, split_people
 from indexing.readers.recording import to_clips
 from indexing.skeleton import HAND21, MEDIAPIPE33
 
@@ -50,7 +50,7 @@ def read(source: Source, options: Options) -> ClipSet:
     frames = np.arange(len(found.values)) + max(found.first - 1, 0)
     rate = options.fps or found.rate
     times = frames / rate if rate > 0 else None
-    recording = of_markers(source.path, found.values, list(found.ids or ()), frames, times, found.units, found.up)
+    recording = build_marker_recording(source.path, found.values, list(found.ids or ()), frames, times, found.units, found.up)
     return to_clips(source.path, recording, options)
 
 
@@ -85,11 +85,11 @@ def read_spatial(source: Source, options: Options) -> ClipSet:
     table = read_table(source, columns, "xyz", rated)
     points = table.values[..., :3]
     points = np.where(np.isfinite(points).all(axis=2, keepdims=True), points, np.nan)
-    names = table.names if columns.landmark is not None else [_spelled(source, columns, joint) for joint in table.names]
-    people = people_of(names)[0]
+    names = table.names if columns.landmark is not None else [_original_spelling(source, columns, joint) for joint in table.names]
+    people = split_people(names)[0]
     if table.people is not None and len(people) > 1:
         raise error(source.path, f"names people in a column and before the points ({listed(people)})", "keep one of the two")
-    recording = of_markers(source.path, points, names, table.frames, table.times, "", "")
+    recording = build_marker_recording(source.path, points, names, table.frames, table.times, "", "")
     if rated:
         recording = replace(recording, confidence=table.values[..., 3].reshape(recording.joints.shape[:2]))
     if table.people is not None:
@@ -106,7 +106,7 @@ def _visibility(source: Source, column: int) -> bool:
     return (found[1] if found else name) in VISIBILITY
 
 
-def _spelled(source: Source, columns: Columns, joint: str) -> str:
+def _original_spelling(source: Source, columns: Columns, joint: str) -> str:
     """A point's name with the capitals of the file."""
     cell = source.data[0][columns.joints[joint]["x"]].strip()
     found = cell[: len(joint)] if SUFFIX.fullmatch(cell.lower()) else cell[-len(joint) :]

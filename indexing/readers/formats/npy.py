@@ -13,7 +13,7 @@ import numpy as np
 from indexing.clip import DEPTH, ClipSet, FloatArray
 from indexing.opening import error
 from indexing.readers.files import Format, Options, Source
-from indexing.readers.layouts import settled
+from indexing.readers.layouts import choose_layout
 from indexing.readers.npz import read_npy
 from indexing.readers.recording import Recording, to_clips
 from indexing.skeleton import candidates, known
@@ -26,7 +26,7 @@ def read(source: Source, options: Options) -> ClipSet:
     values = read_npy(source.path)
     if values.dtype.kind not in "fiu" or values.ndim != 3 or values.shape[2] not in (2, 3) or not values.size:
         raise error(source.path, f"is an array {values.shape} of {values.dtype}, not joints over time", REMEDY)
-    joints, confidence = trusted(source.path, values.astype(np.float64))
+    joints, confidence = split_confidence(source.path, values.astype(np.float64))
     return to_clips(source.path, recording_of(joints, confidence), options)
 
 
@@ -34,14 +34,14 @@ def recording_of(joints: FloatArray, confidence: FloatArray | None = None) -> Re
     """A recording of one body of unknown layout, and the direction that is up in it where the body shows that."""
     usual, flat = known(joints.shape[1]), joints.shape[2] == 2
     could = candidates(joints.shape[1])
-    layout, said, up = settled(joints, usual, could, "-y" if flat else None)
+    layout, said, up = choose_layout(joints, usual, could, "-y" if flat else None)
     if layout is not None and not said:  # the file says nothing of it
         said = {"layout": f"recognized: {layout.name}"}
     frames = np.arange(len(joints))
     return Recording(frames, frames, joints, confidence, skeleton=layout, up=up or ("-y" if flat else "y"), meta=said)
 
 
-def trusted(path: Path, values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+def split_confidence(path: Path, values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
     """Joints, and their confidence where that is what the third number is."""
     if values.shape[2] == 2:
         return values, None

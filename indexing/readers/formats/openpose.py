@@ -13,7 +13,7 @@ from indexing import skeleton
 from indexing.clip import ClipSet
 from indexing.opening import error
 from indexing.readers.files import Format, Options, Source, frame_number
-from indexing.readers.recording import Detection, flat, gather, to_clips, track_id
+from indexing.readers.recording import Detection, collect_detections, parse_flat_joints, to_clips, track_id
 
 # layouts by number of joints; AlphaPose and RTMPose write their own in OpenPose's form
 LAYOUTS = {
@@ -26,7 +26,7 @@ RIVALS = {25: (skeleton.BODY25, skeleton.BODY25B)}
 
 def read(source: Source, options: Options) -> ClipSet:
     """Read OpenPose JSON; the frame number is the one in the file's name."""
-    recording = gather(source.path, [(number, _people(source, number, frame)) for number, frame in _frames(source)])
+    recording = collect_detections(source.path, [(number, _people(source, number, frame)) for number, frame in _frames(source)])
     joints = recording.joints.shape[1]
     recording = replace(recording, skeleton=LAYOUTS.get(joints), layouts=RIVALS.get(joints, ()))
     return to_clips(source.path, recording, options)
@@ -56,9 +56,11 @@ def _people(source: Source, number: int, frame: Any) -> list[Detection]:
         track = track_id(person.get("person_id", person.get("idx")))  # [-1] unless a tracker ran
         flat_2d = next((person[key] for key in ("pose_keypoints_2d", "pose_keypoints", "joints") if person.get(key)), None)
         if flat_2d:
-            found.append(Detection(*flat(source.path, f"{where}, pose_keypoints_2d", flat_2d), track))
+            found.append(Detection(*parse_flat_joints(source.path, f"{where}, pose_keypoints_2d", flat_2d), track))
         elif person.get("pose_keypoints_3d"):
-            found.append(Detection(*flat(source.path, f"{where}, pose_keypoints_3d", person["pose_keypoints_3d"], 4), track))
+            found.append(
+                Detection(*parse_flat_joints(source.path, f"{where}, pose_keypoints_3d", person["pose_keypoints_3d"], 4), track)
+            )
     return found
 
 

@@ -98,7 +98,7 @@ def _analysis(file: Hdf5) -> Recording:
         at=np.repeat(np.arange(frames), animals),
         joints=joints,
         confidence=confidence,
-        tracks=_unlike(names or [""] * animals) * frames if animals > 1 or any(names) else None,
+        tracks=_number_duplicates(names or [""] * animals) * frames if animals > 1 or any(names) else None,
         skeleton=_skeleton(file.path.stem, nodes, _bones(file, len(nodes))),
     )
 
@@ -117,7 +117,7 @@ def _axes(file: Hdf5, name: str, wanted: Sequence[str], usual: Sequence[str]) ->
     return file.array(name, len(wanted), "f").transpose([order.index(axis) for axis in wanted])
 
 
-def _unlike(names: Sequence[str]) -> list[Hashable | None]:
+def _number_duplicates(names: Sequence[str]) -> list[Hashable | None]:
     """Names of tracks, told apart by their number where two are the same."""
     counts = Counter(names)
     return [name if counts[name] == 1 and name else f"{name or 'track'}#{i}" for i, name in enumerate(names)]
@@ -294,7 +294,7 @@ def _tracks(file: Hdf5) -> list[Hashable | None]:
     for i, text in enumerate(file.texts("tracks_json") if "tracks_json" in file else []):
         one = parse_json(file.path, text, EXPORT, f"tracks_json[{i}]")
         names.append(str(one[1]) if isinstance(one, list) and len(one) > 1 else "")
-    return _unlike(names)
+    return _number_duplicates(names)
 
 
 def _number(value: Any) -> float | None:

@@ -15,7 +15,7 @@ import numpy as np
 from indexing.clip import COARSEST, FINEST, ClipSet, FloatArray
 from indexing.opening import WIDEST, error, listed, read_text, repeated, shown
 from indexing.readers.files import Format, Options, Source
-from indexing.readers.markers import of_markers
+from indexing.readers.markers import build_marker_recording
 from indexing.readers.recording import IntArray, frame_numbers, to_clips
 
 HEAD = "PathFileType"
@@ -50,11 +50,11 @@ def read(source: Source, options: Options) -> ClipSet:
         fps = options.fps or rate
         times = None if fps is None else (frames - frames[0]) / fps
     elif rate is not None:
-        times = unrounded(stamps, frames, rate)
-    return to_clips(path, of_markers(path, points, names, frames, times, about["units"], ""), options)
+        times = restore_steady_times(stamps, frames, rate)
+    return to_clips(path, build_marker_recording(path, points, names, frames, times, about["units"], ""), options)
 
 
-def unrounded(times: FloatArray, frames: IntArray, rate: float) -> FloatArray:
+def restore_steady_times(times: FloatArray, frames: IntArray, rate: float) -> FloatArray:
     """Times that are those of frames at a steady rate but for the digits that were written, exactly so; others as they are."""
     even = times[0] + (frames - frames[0]) / rate
     apart = np.abs(times - even).max() * rate if np.isfinite(times).all() else np.inf

@@ -16,7 +16,7 @@ import numpy as np
 from indexing.clip import LARGEST, ClipSet, FloatArray
 from indexing.opening import VALUE, clipped, error, parse_json, read_text, shown
 from indexing.readers.files import Format, FrameFile, Options, Source
-from indexing.readers.recording import Detection, gather, numbers, to_clips, track_id
+from indexing.readers.recording import Detection, collect_detections, parse_numbers, to_clips, track_id
 from indexing.skeleton import known
 
 REMEDY = "export every frame's result.to_json() of a pose model (yolo ...-pose)"
@@ -33,7 +33,7 @@ def read(source: Source, options: Options) -> ClipSet:
             (i, [found for k, person in enumerate(people) if (found := _person(source, i, k, person))])
             for i, people in _json_frames(source)
         ]
-    recording = gather(source.path, frames)
+    recording = collect_detections(source.path, frames)
     return to_clips(source.path, replace(recording, skeleton=known(recording.joints.shape[1])), options)
 
 
@@ -60,9 +60,9 @@ def _person(source: Source, number: int, index: int, person: Any) -> Detection |
     points = person.get("keypoints") if isinstance(person, dict) else None
     if not isinstance(points, dict) or not {"x", "y"} <= points.keys():
         raise error(source.path, f"{where}: no keypoints {{x, y, visible}}", REMEDY)
-    x, y = (numbers(source.path, f"{where}, keypoints.{axis}", points[axis]) for axis in "xy")
+    x, y = (parse_numbers(source.path, f"{where}, keypoints.{axis}", points[axis]) for axis in "xy")
     visible = points.get("visible")
-    confidence = None if visible is None else numbers(source.path, f"{where}, keypoints.visible", visible)
+    confidence = None if visible is None else parse_numbers(source.path, f"{where}, keypoints.visible", visible)
     if x.ndim != 1 or x.shape != y.shape or (confidence is not None and confidence.shape != x.shape):
         raise error(source.path, f"{where}: keypoints x, y and visible have different lengths", REMEDY)
     return Detection(np.stack([x, y], axis=1), confidence, track_id(person.get("track_id"))) if x.size else None
@@ -70,7 +70,7 @@ def _person(source: Source, number: int, index: int, person: Any) -> Detection |
 
 def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
     files: list[FrameFile] = source.data
-    lines = [(file, n, words) for file in files for n, words in enumerate(_words(file), start=1)]
+    lines = [(file, n, words) for file in files for n, words in enumerate(_split_lines(file), start=1)]
     if not lines:
         raise error(
             source.path, f"no person was detected in any of {len(files)} frames", "check the video or the model's threshold"
@@ -104,7 +104,7 @@ def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
     return list(frames.items())
 
 
-def _words(file: FrameFile) -> list[list[str]]:
+def _split_lines(file: FrameFile) -> list[list[str]]:
     return [line.split() for line in read_text(file.path, TEXT_REMEDY).splitlines() if line.strip()]
 
 

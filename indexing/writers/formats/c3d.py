@@ -97,9 +97,9 @@ def _parameters(found: Markers, first: int, path: Path) -> bytes:
     last = first + frames - 1
     right, upwards = SCREEN[found.up]
     names = [_name(name, path) for name in found.names]
-    points = [_words("USED", [count]), _reals("SCALE", [-1.0]), _reals("RATE", [found.rate])]
+    points = [_integers("USED", [count]), _reals("SCALE", [-1.0]), _reals("RATE", [found.rate])]
     # as many as a word says; of longer recordings programs look at LONG_FRAMES, or at the fields of TRIAL
-    points += [_words("FRAMES", [min(frames, WORD)]), _reals("LONG_FRAMES", [float(frames)])]
+    points += [_integers("FRAMES", [min(frames, WORD)]), _reals("LONG_FRAMES", [float(frames)])]
     points += [_texts("UNITS", [found.units]), _texts("X_SCREEN", [right]), _texts("Y_SCREEN", [upwards])]
     for begin in range(0, count, LABELS):
         more = "" if not begin else str(begin // LABELS + 1)
@@ -108,12 +108,13 @@ def _parameters(found: Markers, first: int, path: Path) -> bytes:
             _texts(f"DESCRIPTIONS{more}", [""] * len(names[begin : begin + LABELS])),
         ]
     trial = [
-        _words(name, [number & WORD, number >> 16]) for name, number in (("ACTUAL_START_FIELD", first), ("ACTUAL_END_FIELD", last))
+        _integers(name, [number & WORD, number >> 16])
+        for name, number in (("ACTUAL_START_FIELD", first), ("ACTUAL_END_FIELD", last))
     ]
-    analog = [_words("USED", [0]), _reals("RATE", [0.0]), _reals("GEN_SCALE", [1.0])]
+    analog = [_integers("USED", [0]), _reals("RATE", [0.0]), _reals("GEN_SCALE", [1.0])]
 
     def groups(data_start: int) -> bytes:
-        filled = {"POINT": [*points, _words("DATA_START", [data_start])], "TRIAL": trial, "ANALOG": analog}
+        filled = {"POINT": [*points, _integers("DATA_START", [data_start])], "TRIAL": trial, "ANALOG": analog}
         filled["MANUFACTURER"] = [_texts("COMPANY", ["dyntorch"])]
         records = []
         for number, (group, values) in enumerate(filled.items(), start=1):
@@ -140,7 +141,7 @@ def _record(name: str, number: int, value: bytes) -> bytes:
     return struct.pack("<bb", len(name), number) + name.encode("ascii") + struct.pack("<h", 2 + len(value)) + value
 
 
-def _words(name: str, values: Sequence[int]) -> Parameter:
+def _integers(name: str, values: Sequence[int]) -> Parameter:
     return name, struct.pack(f"<b{_shape(values)}{len(values)}H", 2, *_sides(values), *values)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from indexing.opening import clipped, error, read_bytes
-from indexing.writers.markers import Writer, people_of, together
+from indexing.writers.markers import Writer, align_clips, people_of
 
 if TYPE_CHECKING:
     from indexing.clip import Clip
@@ -49,7 +49,7 @@ def dataset_of(clips: Sequence[Clip], path: Path = Path("dataset")) -> Any:
     first = clips[0]
     if len({(clip.joints.shape[1], clip.skeleton) for clip in clips}) > 1:
         raise error(path, "the clips have different joints", "write a file of each")
-    times, flat = together(clips)
+    times, flat = align_clips(clips)
     shape = (len(times), len(clips), first.joints.shape[1], first.dims)
     position = flat.reshape(shape).transpose(0, 3, 2, 1)
     sure = np.full((len(times), shape[2], shape[1]), np.nan, np.float32)

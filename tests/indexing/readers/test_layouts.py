@@ -11,7 +11,7 @@ import pytest
 
 from indexing.clip import Clip, ClipSet
 from indexing.readers import read, read_clip
-from indexing.readers.layouts import fits, recognized
+from indexing.readers.layouts import rank_layouts, recognize_layout
 from indexing.skeleton import (
     BLAZEPOSE33,
     BODY25,
@@ -87,9 +87,9 @@ def test_joints_are_where_the_tool_puts_them(layout: Skeleton, places: dict[str,
 @pytest.mark.parametrize("layout", [layout for layout in BODIES if len(layout.joints) <= 33], ids=lambda layout: layout.name)
 def test_a_body_is_recognized_among_its_rivals(layout: Skeleton, dims: int) -> None:
     body = tools.standing(layout, dims=dims)
-    found = recognized(body, candidates(len(layout.joints)), "-y" if dims == 2 else "y")
+    found = recognize_layout(body, candidates(len(layout.joints)), "-y" if dims == 2 else "y")
     assert found is not None and found.layout is layout
-    found = recognized(body, candidates(len(layout.joints)), None)
+    found = recognize_layout(body, candidates(len(layout.joints)), None)
     assert found is not None and (found.layout is layout, found.up) == (True, "-y" if dims == 2 else "y")
 
 
@@ -97,27 +97,27 @@ def test_what_is_up_is_found_in_three_dimensions() -> None:
     body = tools.standing(NTU25, dims=3)
     turned = body[..., [0, 2, 1]]
     for points, up in ((body, "y"), (turned, "z"), (-turned, "-z"), (-body, "-y")):
-        found = recognized(points, candidates(25), None)
+        found = recognize_layout(points, candidates(25), None)
         assert found is not None and (found.layout, found.up) == (NTU25, up)
 
 
 def test_points_of_no_body_are_not_recognized() -> None:
     rng = np.random.default_rng(0)
     for joints in (17, 20, 25):
-        assert recognized(rng.normal(size=(50, joints, 2)), candidates(joints), "-y") is None
-        assert recognized(np.full((5, joints, 2), np.nan), candidates(joints), "-y") is None
-        assert recognized(np.zeros((5, joints, 2)), candidates(joints), None) is None
-    assert recognized(rng.normal(size=(50, 9, 2)), candidates(9), "-y") is None
+        assert recognize_layout(rng.normal(size=(50, joints, 2)), candidates(joints), "-y") is None
+        assert recognize_layout(np.full((5, joints, 2), np.nan), candidates(joints), "-y") is None
+        assert recognize_layout(np.zeros((5, joints, 2)), candidates(joints), None) is None
+    assert recognize_layout(rng.normal(size=(50, 9, 2)), candidates(9), "-y") is None
     lying = tools.standing(BODY25)[..., ::-1]
-    assert recognized(lying, candidates(25), "-y") is None
+    assert recognize_layout(lying, candidates(25), "-y") is None
 
 
 def test_half_a_body_and_missing_joints_do_not_matter_much() -> None:
     body = tools.standing(BODY25B, frames=60)
     body[np.random.default_rng(0).random(body.shape[:2]) < 0.4] = np.nan
-    found = recognized(body, candidates(25), "-y")
+    found = recognize_layout(body, candidates(25), "-y")
     assert found is not None and found.layout is BODY25B
-    best, second, _ = fits(body, candidates(25), "-y")
+    best, second, _ = rank_layouts(body, candidates(25), "-y")
     assert best.layout is BODY25B and best.bones < 0.5 < second.bones
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from indexing.readers import read, read_clip, recording
-from indexing.readers.recording import link
+from indexing.readers.recording import link_by_position
 
 Write = Callable[..., Path]
 FRAMES = 8
@@ -123,7 +123,7 @@ def test_link_waits_for_people_and_does_not_reach_too_far() -> None:
     box = np.array([[0.0, 0.0], [10.0, 20.0]])
     at = np.array([0, 0, 1, 4, 4])
     joints = np.stack([box, box + 100, box + 1, box + 101, box + 300])
-    assert link(at, joints).tolist() == [0, 1, 0, 1, 2]
+    assert link_by_position(at, joints).tolist() == [0, 1, 0, 1, 2]
 
 
 def test_link_compares_only_joints_that_both_show() -> None:
@@ -131,10 +131,10 @@ def test_link_compares_only_joints_that_both_show() -> None:
     half = full.copy()
     half[2] = np.nan
     other = half + np.array([11.0, 0.0])
-    assert link(np.array([0, 1, 1]), np.stack([full, other, half])).tolist() == [0, 1, 0]
+    assert link_by_position(np.array([0, 1, 1]), np.stack([full, other, half])).tolist() == [0, 1, 0]
     hidden = np.full_like(full, np.nan)
     hidden[2] = full[2]
-    assert link(np.array([0, 1]), np.stack([half, hidden])).tolist() == [0, 1]
+    assert link_by_position(np.array([0, 1]), np.stack([half, hidden])).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -144,7 +144,7 @@ def test_identities_do_not_depend_on_the_order_within_frames(seed: int) -> None:
     at = np.repeat(np.arange(20), 5)
     joints = people.transpose(1, 0, 2, 3).reshape(100, 6, 2)
     order = np.concatenate([5 * i + rng.permutation(5) for i in range(20)])
-    ids = link(at, joints[order])
+    ids = link_by_position(at, joints[order])
     truth = np.tile(np.arange(5), 20)[order]
     assert len(set(zip(ids.tolist(), truth.tolist(), strict=True))) == len(set(ids.tolist())) == 5
 
@@ -161,7 +161,7 @@ def test_strangers_in_every_frame_are_compared_with_the_latest_only(monkeypatch:
     box = np.array([[0.0, 0.0], [10.0, 20.0]])
     at = np.repeat(np.arange(4 * WAITING), 2)
     joints = box + 1000.0 * np.arange(len(at))[:, None, None]
-    assert link(at, joints).tolist() == list(range(len(at)))
+    assert link_by_position(at, joints).tolist() == list(range(len(at)))
     assert max(compared) == 2 * WAITING and sum(compared) <= len(at) * WAITING
 
 
@@ -170,14 +170,14 @@ def test_who_was_seen_lately_is_waited_for_however_many_come_and_go() -> None:
     frames = 3 * WAITING
     strangers = box + 1000.0 * np.arange(1, frames + 1)[:, None, None]
     at = np.concatenate([np.arange(frames), np.arange(0, frames, WAITING // 2)])
-    ids = link(at, np.concatenate([strangers, np.repeat(box[None], 6, axis=0)]))
+    ids = link_by_position(at, np.concatenate([strangers, np.repeat(box[None], 6, axis=0)]))
     assert len(set(ids[frames:].tolist())) == 1 and len(set(ids.tolist())) == frames + 1
 
 
 def test_a_crowd_larger_than_what_is_waited_for_is_followed() -> None:
     box = np.array([[0.0, 0.0], [10.0, 20.0]])
     crowd = box + 100.0 * np.arange(WAITING + 40)[:, None, None]
-    ids = link(np.repeat(np.arange(3), len(crowd)), np.concatenate([crowd, crowd + 1, crowd[::-1] + 2]))
+    ids = link_by_position(np.repeat(np.arange(3), len(crowd)), np.concatenate([crowd, crowd + 1, crowd[::-1] + 2]))
     first, second, third = ids.reshape(3, -1)
     assert (first == second).all() and (first == third[::-1]).all()
 
@@ -185,9 +185,9 @@ def test_a_crowd_larger_than_what_is_waited_for_is_followed() -> None:
 def test_how_far_a_person_may_step(monkeypatch: pytest.MonkeyPatch) -> None:
     box = np.array([[0.0, 0.0], [10.0, 20.0]])
     at, joints = np.arange(3), np.stack([box, box + 5, box + 10])
-    assert link(at, joints).tolist() == [0, 0, 0]
+    assert link_by_position(at, joints).tolist() == [0, 0, 0]
     monkeypatch.setattr(recording, "MAX_STEP_DIAGONALS", 0.1)
-    assert link(at, joints).tolist() == [0, 1, 2]
+    assert link_by_position(at, joints).tolist() == [0, 1, 2]
 
 
 def test_everyone_says_how_people_are_followed(openpose_folder: Write) -> None:

@@ -20,7 +20,7 @@ import pytest
 
 from indexing.readers import read
 from indexing.readers.formats import pyskl as reader
-from indexing.readers.pickles import _Reader, read_pickle, unpickled
+from indexing.readers.pickles import _Reader, read_pickle, unpickle_bytes
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17, NTU25
 from tests.indexing.readers import tools
@@ -338,7 +338,7 @@ def test_values_of_the_same_bytes_again_and_again_are_refused(tmp_path: Path) ->
 def test_numbers_of_the_memo_are_the_files_but_not_their_hashes() -> None:
     numbers = [i * (2**61 - 1) + 5 for i in range(20_000)]  # all of one hash
     program = b"N" + b"".join(b"p%d\n" % number for number in numbers) + b"0](" + b"g%d\ng%d\n" % (numbers[0], numbers[-1]) + b"e."
-    assert unpickled(Path("a.pkl"), program + bytes(2**16), "") == [None, None]
+    assert unpickle_bytes(Path("a.pkl"), program + bytes(2**16), "") == [None, None]
     reader_ = _Reader(program)
     assert reader_.load() == [None, None]
     assert len({hash(key) for key in reader_.memo}) > 19_000
@@ -347,7 +347,7 @@ def test_numbers_of_the_memo_are_the_files_but_not_their_hashes() -> None:
 def test_keys_that_files_have_are_read() -> None:
     value = {"a": 1, b"b": 2, 3: 3, -(2**53): 4, 2.5: 5, None: 6, False: 7, **{f"class {i}": i for i in range(9000)}}
     for protocol in range(6):
-        assert unpickled(Path("a.pkl"), pickle.dumps(value, protocol), "") == value
+        assert unpickle_bytes(Path("a.pkl"), pickle.dumps(value, protocol), "") == value
 
 
 def test_lists_a_million_deep_are_refused_without_recursion(tmp_path: Path) -> None:
@@ -378,7 +378,7 @@ def test_nothing_is_imported_or_changed(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(builtins, "__import__", never)
     assert isinstance(pickle._Unpickler.dispatch, dict)
     with pytest.raises(ValueError, match="system"):
-        unpickled(tmp_path, program, "")
+        unpickle_bytes(tmp_path, program, "")
 
 
 def test_what_numpy_writes_is_read_as_numpy_reads_it() -> None:
@@ -388,7 +388,7 @@ def test_what_numpy_writes_is_read_as_numpy_reads_it() -> None:
         "i": np.array([b"x"]), "j": b"", "k": (1, "two", None, -3.5), "l": [True, 2**70], "m": np.float16([1, 2]),
     }  # fmt: skip
     for protocol in range(6):
-        found = unpickled(Path("a.pkl"), pickle.dumps(value, protocol), "")
+        found = unpickle_bytes(Path("a.pkl"), pickle.dumps(value, protocol), "")
         assert list(found) == list(value)
         for key, one in value.items():
             np.testing.assert_array_equal(found[key], one)

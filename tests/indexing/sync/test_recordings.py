@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexing.clip import Clip
-from indexing.readers.recording import link
+from indexing.readers.recording import link_by_position
 from indexing.sync.files import plan
 from indexing.sync.recordings import find_cameras, take_of
 from tests.indexing.sync.scene import cut, write_openpose
@@ -77,4 +77,4 @@ def test_points_that_are_told_apart_stay_two():
     t = np.arange(40)
     one, two = np.stack([4.0 * t, 0.0 * t], 1), np.stack([160 - 4.0 * t, 0.0 * t + 90], 1)
     joints = np.stack([one, two], 1).reshape(80, 1, 2)
-    assert link(np.repeat(t, 2), joints).tolist() == [0, 1] * 40
+    assert link_by_position(np.repeat(t, 2), joints).tolist() == [0, 1] * 40

@@ -16,9 +16,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from indexing.labels.format import Gathering, Request, few, parse_seconds, text_of
+from indexing.labels.format import Gathering, Request, list_few, parse_seconds, text_of
 from indexing.labels.label import LabelFile
-from indexing.labels.media import Span, cut_up, of_recording
+from indexing.labels.media import Span, of_recording, split_by_media
 from indexing.opening import count, error, listed, shown
 
 REMEDY = "save the project again in BORIS"
@@ -75,7 +75,7 @@ def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
             left[name] += len(_list(asked, observation.get("events"), f"observation {name!r}, events"))
     left += Counter()  # drops those without events
     if left:
-        of = f"of other recordings than {asked.media or asked.recording} ({few(left)})"
+        of = f"of other recordings than {asked.media or asked.recording} ({list_few(left)})"
         out.note(f"{count(len(left), 'observation')} left out: {of}")
     return out.finish()
 
@@ -111,7 +111,7 @@ def _observation(
     name, called = names
     where = f"observation {name!r}"
     events = _events(out, observation, where)
-    stretches = list(paired(out, events, types, where))
+    stretches = list(pair_events(out, events, types, where))
     if not stretches:
         return
     offset = _offset(out, observation, where)
@@ -120,9 +120,9 @@ def _observation(
     for number, stretch in enumerate(stretches):
         subject, code, modifiers = stretch.key
         start, end = stretch.start - offset, stretch.end - offset
-        pieces = cut_up(start, end, spans) if spans else [("", start, end)]
+        pieces = split_by_media(start, end, spans) if spans else [("", start, end)]
         cut += len(pieces) > 1
-        comment, score = (stretch.comment, None) if called not in out.machine else scored(stretch.comment)
+        comment, score = (stretch.comment, None) if called not in out.machine else split_score(stretch.comment)
         for media, first, last in pieces:
             if mine is None or media in mine or not spans:
                 out.add(
@@ -167,7 +167,7 @@ def _events(out: Gathering, observation: Mapping[str, Any], where: str) -> list[
     return found
 
 
-def paired(out: Gathering, events: Sequence[Entry], types: Mapping[str, bool], where: str) -> Iterator[Interval]:
+def pair_events(out: Gathering, events: Sequence[Entry], types: Mapping[str, bool], where: str) -> Iterator[Interval]:
     """Point events as they are, and each START with its STOP."""
     begun: dict[tuple[str, str, str], Entry] = {}
     unknown: Counter[str] = Counter()
@@ -180,7 +180,7 @@ def paired(out: Gathering, events: Sequence[Entry], types: Mapping[str, bool], w
             found.append(Interval(event.time, event.time, event.key, event.comment))
         elif event.key in begun:
             start = begun.pop(event.key)
-            found.append(Interval(start.time, event.time, event.key, joined(start.comment, event.comment)))
+            found.append(Interval(start.time, event.time, event.key, join_comments(start.comment, event.comment)))
         else:
             begun[event.key] = event
     found += _asked_at_stop(out, begun, where)
@@ -208,18 +208,18 @@ def _asked_at_stop(out: Gathering, begun: dict[tuple[str, str, str], Entry], whe
             if later:
                 stop = min(later, key=lambda other: other.time)
                 del begun[event.key], begun[stop.key]
-                found.append(Interval(event.time, stop.time, stop.key, joined(event.comment, stop.comment)))
+                found.append(Interval(event.time, stop.time, stop.key, join_comments(event.comment, stop.comment)))
     if found:
         out.note(f"{where}: {count(len(found), 'state')} without modifiers at START paired with the STOP that has them")
     return found
 
 
-def joined(start: str, stop: str) -> str:
+def join_comments(start: str, stop: str) -> str:
     """The comments at START and STOP, as one."""
     return " / ".join(comment for comment in (start, stop) if comment)
 
 
-def scored(comment: str) -> tuple[str, float | None]:
+def split_score(comment: str) -> tuple[str, float | None]:
     """A comment of ours without the score that it begins with, and the score."""
     found = SCORE.fullmatch(comment)
     number = parse_seconds(found["score"]) if found else math.nan

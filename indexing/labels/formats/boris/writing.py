@@ -18,7 +18,7 @@ from string import ascii_lowercase, digits
 from typing import Any
 
 from indexing.files import write_text
-from indexing.labels.format import Request, Target, changed, seal, text_of
+from indexing.labels.format import Request, Target, correction_error, seal, text_of
 from indexing.labels.formats.boris.project import MACHINE, ethogram, files_of
 from indexing.labels.label import Label, in_order
 from indexing.labels.media import base_name, of_recording
@@ -46,7 +46,7 @@ class Draft:
 def write(labels: Sequence[Label], target: Target) -> list[str]:
     """Write a project, or observations into one."""
     text = "" if target.into is None else read_text(target.into, REMEDY)
-    project = _empty() if target.into is None else _checked(target.into, parse_json(target.into, text, REMEDY))
+    project = _empty() if target.into is None else _check_project(target.into, parse_json(target.into, text, REMEDY))
     draft = Draft(target, project)
     _behaviours(draft, labels)
     _subjects(draft, labels)
@@ -79,7 +79,7 @@ def _empty() -> dict[str, Any]:
     }
 
 
-def _checked(path: Path, data: Any) -> dict[str, Any]:
+def _check_project(path: Path, data: Any) -> dict[str, Any]:
     """A project whose parts are what they should be."""
     if not isinstance(data, dict) or not isinstance(data.get("observations"), dict):
         raise error(path, "is no BORIS project: it has no observations", REMEDY)
@@ -172,7 +172,7 @@ def _observations(draft: Draft, labels: Sequence[Label]) -> None:
     groups |= {("", media): [] for media in target.media if media in empty}
     there = {media: _there(target, known, media) for _, media in groups}
     replaced = [[there[media]] for observation, media in groups if not observation]
-    kept = _kept(target, before, replaced)
+    kept = _select_others(target, before, replaced)
     written: dict[str, Any] = {}
     for (observation, media), own in groups.items():
         base = base_name(there[media])
@@ -193,7 +193,7 @@ def _observations(draft: Draft, labels: Sequence[Label]) -> None:
     draft.project["observations"] = kept | written
 
 
-def _kept(target: Target, before: Mapping[str, Any], replaced: Sequence[list[str]]) -> dict[str, Any]:
+def _select_others(target: Target, before: Mapping[str, Any], replaced: Sequence[list[str]]) -> dict[str, Any]:
     """The observations that stay: all but those that dyntorch wrote of these files."""
     old = {
         name: one
@@ -204,7 +204,7 @@ def _kept(target: Target, before: Mapping[str, Any], replaced: Sequence[list[str
         number = sum(files_of(other) == files_of(one) for other in old.values())
         found = SEAL.search(text_of(one.get("description")))
         if found is None or found[1] != _seal(name, one, number):
-            raise changed(target, f"observation {clipped(name)!r}")
+            raise correction_error(target, f"observation {clipped(name)!r}")
     return {name: one for name, one in before.items() if name not in old}
 
 
@@ -245,7 +245,7 @@ def _layers(labels: Sequence[Label]) -> list[list[Label]]:
     layers: list[list[Label]] = [[]]
     ends: list[dict[tuple[str, str, str], int]] = [{}]
     for label in sorted(labels, key=in_order):
-        key = (label.subject, label.label, _joined(label))
+        key = (label.subject, label.label, _format_comment(label))
         start = _milli(label.start)
         at = next((i for i, last in enumerate(ends) if last.get(key, -math.inf) <= start), len(layers))
         if at == len(layers):
@@ -294,11 +294,11 @@ def _events(draft: Draft, labels: Sequence[Label]) -> list[list[Any]]:
         for number in range(1 + lasts):
             time = label.end if number else label.start
             frame = round(time * draft.target.fps) if draft.target.fps else "NA"
-            rows.append([_milli(time) / 1000, label.subject, code, _joined(label), "" if number else comment, frame])
+            rows.append([_milli(time) / 1000, label.subject, code, _format_comment(label), "" if number else comment, frame])
     return sorted(rows, key=lambda row: row[0])
 
 
-def _joined(label: Label) -> str:
+def _format_comment(label: Label) -> str:
     return "|".join(map(_modifier, label.modifiers))
 
 

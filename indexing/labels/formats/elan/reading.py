@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
 
-from indexing.labels.format import Gathering, Request, whole
+from indexing.labels.format import Gathering, Request, parse_whole
 from indexing.labels.formats.elan.times import MACHINE, REMEDY, Annotation, Tier, place, take_over
 from indexing.labels.label import LabelFile
 from indexing.labels.markup import Placed, parse_xml
@@ -25,7 +25,7 @@ def read(_: Any, asked: Request) -> LabelFile:
     """Read an ELAN file."""
     out = Gathering(asked, "elan")
     parts = TierParts(asked)
-    root, _ = parse_xml(asked.path, read_bytes(asked.path), parts.take)
+    root, _ = parse_xml(asked.path, read_bytes(asked.path), parts.collect_part)
     if root.tag != "ANNOTATION_DOCUMENT":
         raise error(asked.path, f"is XML, but no ELAN file (its root is {clipped(root.tag, 40)})", "export an .eaf from ELAN")
     units = next((head.get("TIME_UNITS", "milliseconds") for head in root.iterfind("HEADER")), "milliseconds")
@@ -36,10 +36,10 @@ def read(_: Any, asked: Request) -> LabelFile:
     take_over(asked, tiers, constraints(root))
     media, origin = _medium(out, root)
     for tier in tiers:
-        out.tiers.setdefault(tier.shown)
-        out.watched.setdefault((tier.shown, media))
+        out.tiers.setdefault(tier.plain_name)
+        out.watched.setdefault((tier.plain_name, media))
         if tier.machine:
-            out.machine.setdefault(tier.shown)
+            out.machine.setdefault(tier.plain_name)
         if tier.participant:
             out.subjects.setdefault(tier.participant)
         for one in tier.annotations:
@@ -50,7 +50,7 @@ def read(_: Any, asked: Request) -> LabelFile:
                 end = begin
             where = f"tier {tier.name!r}, annotation {one.name}"
             start, stop = (round((time + origin) / 1000, 6) for time in (begin, end))
-            out.add(one.value, start, stop, where, subject=tier.participant, tier=tier.shown, media=media)
+            out.add(one.value, start, stop, where, subject=tier.participant, tier=tier.plain_name, media=media)
     return out.finish()
 
 
@@ -63,7 +63,7 @@ class TierParts:
         self.slots: dict[str, float | None] = {}
         self.annotations: dict[Element, list[Annotation]] = {}
 
-    def take(self, placed: Placed, parent: Element) -> bool:
+    def collect_part(self, placed: Placed, parent: Element) -> bool:
         """See :data:`indexing.labels.markup.Taken`."""
         if parent.tag == "TIME_ORDER":
             self._slot(placed.element)
@@ -78,7 +78,7 @@ class TierParts:
         name, value = slot.get("TIME_SLOT_ID", ""), slot.get("TIME_VALUE")
         if name in self.slots:
             raise error(self.asked.path, f"time slot {shown(name)} is there twice", REMEDY)
-        number = None if value is None else whole(value)
+        number = None if value is None else parse_whole(value)
         if value is not None and number is None:
             said = f"time slot {shown(name)}: TIME_VALUE {shown(value)} is no whole number of milliseconds"
             raise error(self.asked.path, said, REMEDY)
@@ -164,7 +164,7 @@ def media_of(root: Element) -> list[tuple[str, str, float]]:
     found = []
     for one in root.iterfind("HEADER/MEDIA_DESCRIPTOR"):
         address = one.get("MEDIA_URL") or one.get("RELATIVE_MEDIA_URL") or ""
-        found.append((base_name(address), address, float(whole(one.get("TIME_ORIGIN", "0")) or 0)))
+        found.append((base_name(address), address, float(parse_whole(one.get("TIME_ORIGIN", "0")) or 0)))
     if not found:
         old = next((head.get("MEDIA_FILE", "") for head in root.iterfind("HEADER")), "")
         found = [(base_name(old), old, 0.0)] if old else []

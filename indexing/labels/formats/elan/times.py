@@ -46,7 +46,7 @@ class Tier:
         return self.kind == MACHINE and self.annotator.split(" ")[0] == MACHINE
 
     @property
-    def shown(self) -> str:
+    def plain_name(self) -> str:
         """Its name without what ``writing`` puts behind it to tell people and overlapping rows apart."""
         if self.kind != MACHINE:
             return self.name

@@ -16,10 +16,10 @@ from xml.etree.ElementTree import Element
 from xml.sax.saxutils import escape, quoteattr
 
 from indexing.files import write_bytes
-from indexing.labels.format import Request, Target, changed, seal
+from indexing.labels.format import Request, Target, correction_error, seal
 from indexing.labels.formats.elan.reading import media_of, tier_of
 from indexing.labels.formats.elan.times import MACHINE, REMEDY
-from indexing.labels.label import Label, in_order, spots
+from indexing.labels.label import Label, in_order, list_spots
 from indexing.labels.markup import Placed, parse_xml
 from indexing.labels.media import base_name, of_recording
 from indexing.opening import count, error, listed, read_bytes, shown
@@ -88,12 +88,12 @@ class Document:
         self.times: dict[str, int] = {}
         self.ours: dict[Element, list[tuple[str, str, str]]] = {}
         self.properties: list[Placed] = []
-        self.root, self.placed = parse_xml(path, data, self._take)
+        self.root, self.placed = parse_xml(path, data, self._collect_part)
         if self.root.tag != "ANNOTATION_DOCUMENT":
             raise error(path, "is XML, but no ELAN file", "write to another file")
         self.order = next((one for one in self.parts("TIME_ORDER")), None)
 
-    def _take(self, placed: Placed, parent: Element) -> bool:
+    def _collect_part(self, placed: Placed, parent: Element) -> bool:
         """Where time slots stand, and which of them each tier uses (:data:`indexing.labels.markup.Taken`)."""
         element = placed.element
         if parent.tag == "TIME_ORDER":
@@ -118,7 +118,7 @@ class Document:
         """Children of the root, of a kind."""
         return (one for one in self.placed if one.element.tag == tag)
 
-    def gone(self, first: int, last: int) -> Edit:
+    def remove_element(self, first: int, last: int) -> Edit:
         """Without an element, and the line that it stood on."""
         while self.data[first - 1 : first].isspace():
             first -= 1
@@ -188,7 +188,7 @@ def _rows(labels: Sequence[Label], target: Target, origin: float) -> tuple[list[
         row.annotations.append((begin, end, label.label))
     if not labels:  # nothing was found: that is what the tier says
         rows[target.tier, ""] = [TierRow(target.tier, target.tier, "", [])]
-    said = f"{count(len(early), 'label')} left out: before the time at which the ELAN file begins ({spots(early)})"
+    said = f"{count(len(early), 'label')} left out: before the time at which the ELAN file begins ({list_spots(early)})"
     return [row for group in rows.values() for row in group], [said] * bool(early)
 
 
@@ -198,13 +198,15 @@ def _edits(document: Document, target: Target, rows: Sequence[TierRow], bases: s
     if document.order is None:
         raise error(document.path, "is no sound ELAN file: it has no TIME_ORDER", REMEDY)
     tiers_there = list(document.parts("TIER"))
-    old = [part for part in tiers_there if tier_of(part.element).machine and tier_of(part.element).shown in bases]
+    old = [part for part in tiers_there if tier_of(part.element).machine and tier_of(part.element).plain_name in bases]
     _check_unchanged(document, target, old)
     _check_free(document, old, rows)
     gone = {part.element for part in old}
     used = {slot for part in tiers_there if part.element not in gone for slot in document.uses.get(part.element, ())}
     freed = {slot for element in gone for slot in document.uses.get(element, ()) if slot in document.slots} - used
-    edits = [document.gone(part.first, part.last) for part in old] + [document.gone(*document.slots[slot]) for slot in freed]
+    edits = [document.remove_element(part.first, part.last) for part in old] + [
+        document.remove_element(*document.slots[slot]) for slot in freed
+    ]
     slot = max((_number("ts", name) for name in document.slots if name not in freed), default=0)
     number = max((number for element, number in document.numbers.items() if element not in gone), default=0)
     order, tiers = [], []
@@ -245,11 +247,11 @@ def _check_unchanged(document: Document, target: Target, old: Sequence[Placed]) 
     """What dyntorch wrote is as it was."""
     tiers = [tier_of(part.element) for part in old]
     for part, tier in zip(old, tiers, strict=True):
-        layers = sum((other.shown, other.participant) == (tier.shown, tier.participant) for other in tiers)
+        layers = sum((other.plain_name, other.participant) == (tier.plain_name, tier.participant) for other in tiers)
         ours = document.ours.get(part.element, ())
         there = [(document.times.get(begin, 0), document.times.get(end, 0), value) for begin, end, value in ours]
         if tier.annotator != f"{MACHINE} {_seal(tier.name, tier.participant, layers, there)}":
-            raise changed(target, f"tier {shown(tier.name)}")
+            raise correction_error(target, f"tier {shown(tier.name)}")
 
 
 def _check_free(document: Document, old: Sequence[Placed], rows: Sequence[TierRow]) -> None:
