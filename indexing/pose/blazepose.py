@@ -69,10 +69,10 @@ def candidates(raw: Floats, logits: Floats, min_score: float = 0.5) -> PersonCan
     centre, size, points = values[:, 0] + anchors()[chosen], values[:, 1], values[:, 2:] + anchors()[chosen][:, None]
     boxes = np.concatenate([centre - size / 2, centre + size / 2], axis=1)
     fine = np.isfinite(values).all(axis=(1, 2)) & (size > 0).all(axis=1)
-    return merged(PersonCandidates(scores[chosen][fine], boxes[fine], points[fine]), DUPLICATE_OVERLAP)
+    return merge_overlapping(PersonCandidates(scores[chosen][fine], boxes[fine], points[fine]), DUPLICATE_OVERLAP)
 
 
-def merged(found: PersonCandidates, overlap: float) -> PersonCandidates:
+def merge_overlapping(found: PersonCandidates, overlap: float) -> PersonCandidates:
     """One candidate of each group whose boxes overlap: the mean of their coordinates, weighted by their scores."""
     left = np.argsort(-found.scores, kind="stable")
     scores, boxes, points = [], [], []
@@ -109,11 +109,11 @@ class Landmarks:
 def landmarks(values: Floats, present: float, heatmap: Floats) -> Landmarks:
     """A person from the outputs of the network of landmarks. values ``(39, 5)``, heatmap ``(h, w, 39)``."""
     table = np.asarray(values, dtype=np.float64).reshape(LANDMARKS, -1)
-    places = refined(table[:, :2] / REGION, heatmap)
+    places = refine_by_heatmap(table[:, :2] / REGION, heatmap)
     return Landmarks(float(present), places, sigmoid(table[:, 3:5]).min(axis=1))
 
 
-def refined(places: Floats, heatmap: Floats) -> Floats:
+def refine_by_heatmap(places: Floats, heatmap: Floats) -> Floats:
     """Places moved to the mean of the heatmap's cells about them, where one of these is sure."""
     rows, columns, count = heatmap.shape
     column, row = np.nan_to_num(np.floor(places * [columns, rows]), nan=-1).clip(-1, max(rows, columns)).astype(np.intp).T

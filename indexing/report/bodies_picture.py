@@ -11,7 +11,7 @@ from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, pn
 from indexing.report.labelled import colour_of
 from indexing.report.reconstruction_picture import finish, foot, limits
 from indexing.report.segmentation import STRAYS, mark_of
-from indexing.video.scene import spread
+from indexing.video.scene import evenly_spaced
 
 if TYPE_CHECKING:
     from indexing.report.bodies import BodiesReport
@@ -29,7 +29,7 @@ DRAWN = 1500  # tracks of a body in a panel; more are a blot
 
 def picture_of(report: BodiesReport, theme: Theme = LIGHT) -> bytes:
     """PNG: four frames from the first to the last, or those that there are photographs of."""
-    shown = sorted(report.photographs) or spread(len(report.tracks.views), PANELS)
+    shown = sorted(report.photographs) or evenly_spaced(len(report.tracks.views), PANELS)
     box = _box(report)
     with style(theme):
         figure, panels = _grid(len(shown), box, bool(report.photographs))

@@ -162,9 +162,9 @@ def hear(path: str | Path) -> Sound | None:
 
 @lru_cache(maxsize=16)
 def _heard(path: Path, changed: tuple[int, int]) -> Sound | None:
-    from indexing.video.reading import opened
+    from indexing.video.reading import open_video
 
-    with opened(path) as (container, pictures):
+    with open_video(path) as (container, pictures):
         streams = [stream for stream in container.streams.audio if stream.codec_context is not None]
         if not streams:
             return None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from indexing.clip import Clip
 from indexing.files import write_bytes
 from indexing.skeleton import known
-from indexing.video.overlay import encoded
+from indexing.video.overlay import encode
 from indexing.video.reading import cv2, read_video
 
 Image = NDArray[np.uint8]
@@ -82,7 +82,7 @@ def write_check_video(
     moments = start + np.arange(1 + math.floor((stop - start) * rate + 1e-6)) / rate
     pictures = zip(left.shown(moments), right.shown(np.asarray(shift.at(moments), np.float64)), strict=True)
     frames = (_compose(*pair, names) for pair in pictures)
-    return write_bytes(path, encoded(frames, rate))
+    return write_bytes(path, encode(frames, rate))
 
 
 class _Film:

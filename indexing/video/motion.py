@@ -145,7 +145,7 @@ def transform(matrix: Floats, points: Floats) -> Floats:
     return np.asarray(mapped[..., :2] / mapped[..., 2:])
 
 
-def shrinking(scale: tuple[float, float]) -> Floats:
+def shrink_matrix(scale: tuple[float, float]) -> Floats:
     """``(3, 3)``: pixels of a picture -> pixels of the picture resized by ``scale`` (x, y); pixel centres are whole numbers."""
     x, y = scale
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
@@ -304,11 +304,11 @@ class PathBuilder:
         if not self.times:
             raise ValueError("camera_motion: the video has no frames; give at least one chunk")
         times, support = np.array(self.times), np.array(self.support)
-        shrink = shrinking(scale)
+        shrink = shrink_matrix(scale)
         path = np.linalg.inv(shrink) @ np.array(self.path) @ shrink
         size = (round(self.shape[1] / scale[0]), round(self.shape[0] / scale[1]))
         limit = STATIC_CAMERA_MOTION * float(np.hypot(*size)) if threshold is None else threshold
-        corners = _steady(transform(path, _corners(size)).reshape(len(times), -1))
+        corners = _smooth_corners(transform(path, _corners(size)).reshape(len(times), -1))
         moments = _moments(times, corners, limit)
         kind = _kind(times, corners, moments, limit)
         if not moments and _extent(corners) > 3 * limit:
@@ -348,7 +348,7 @@ def stabilize(source: str | Path | Source, camera: CameraMotion) -> Iterator[Chu
     """
     for chunk in chunks(source):
         height, width = chunk.frames.shape[1:3]
-        grow = shrinking((width / camera.size[0], height / camera.size[1]))
+        grow = shrink_matrix((width / camera.size[0], height / camera.size[1]))
         path = grow @ camera.at(chunk.times) @ np.linalg.inv(grow)
         frames = [warp(image, matrix) for image, matrix in zip(chunk.frames, path, strict=True)]
         yield Chunk(np.stack(frames), chunk.times)
@@ -367,7 +367,7 @@ def _corners(size: tuple[int, int]) -> Floats:
     return np.array([[0.0, 0], [width, 0], [0, height], [width, height]])
 
 
-def _steady(corners: Floats) -> Floats:
+def _smooth_corners(corners: Floats) -> Floats:
     """Without jumps of one or two frames: no camera does that, but where somebody fills the picture the fit may."""
     padded = np.pad(corners, ((2, 2), (0, 0)), mode="edge")
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1))

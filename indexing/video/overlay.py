@@ -46,18 +46,18 @@ class Overlay:
 
 def write_overlay(source: Source | Sequence[str | Path], overlay: Overlay, fps: float = 25.0) -> bytes:
     """The frames in calm grey with the tracks over them, dots with short tails, as an MP4 of at most 960 pixels."""
-    return encoded(_drawn(source, overlay), float(np.clip(fps, SLOWEST, FASTEST)))
+    return encode(_draw_frames(source, overlay), float(np.clip(fps, SLOWEST, FASTEST)))
 
 
-def _drawn(source: Source | Sequence[str | Path], overlay: Overlay) -> Iterator[Image]:
+def _draw_frames(source: Source | Sequence[str | Path], overlay: Overlay) -> Iterator[Image]:
     """One picture for each of the frames."""
     order = [
         (0, STRAY),
-        *enumerate(map(_lit, overlay.colours), start=1),
+        *enumerate(map(_brighten, overlay.colours), start=1),
     ]  # the small ones on top: dense bodies would hide them otherwise
     view = 0
-    for image in _taken(source, overlay.frames):
-        image = _sized(image)
+    for image in _read_frames(source, overlay.frames):
+        image = _fit_size(image)
         height, width = image.shape
         scale = np.array([width / overlay.size[0], height / overlay.size[1]])
         calm = (CALM[0] * image.astype(np.float32) + CALM[1]).astype(np.uint8)
@@ -72,7 +72,7 @@ def _drawn(source: Source | Sequence[str | Path], overlay: Overlay) -> Iterator[
         raise ValueError(f"the video has no frame {missing}, in which points are to be drawn; give the one they were found in")
 
 
-def _taken(source: Source | Sequence[str | Path], frames: Sequence[int]) -> Iterator[Image]:
+def _read_frames(source: Source | Sequence[str | Path], frames: Sequence[int]) -> Iterator[Image]:
     left, index = set(frames), 0
     for chunk in chunks(source, size=WIDEST):
         for image in chunk.frames:
@@ -83,7 +83,7 @@ def _taken(source: Source | Sequence[str | Path], frames: Sequence[int]) -> Iter
             return
 
 
-def _sized(image: Image) -> Image:
+def _fit_size(image: Image) -> Image:
     """A large picture made smaller, a small one larger, up to twice: dots of a few pixels are no dots."""
     by = min(LARGER, WIDEST / max(image.shape))
     if by == 1:
@@ -98,22 +98,22 @@ def _draw(canvas: Image, paths: Floats, colour: Colour, tails: bool, size: float
     paths = paths[:, now]
     if tails and len(paths) > 1:
         ways = [path[np.isfinite(path[:, 0])] for path in paths.transpose(1, 0, 2)]
-        lines = [_fixed(way) for way in ways if len(way) > 1]
+        lines = [_to_fixed_point(way) for way in ways if len(way) > 1]
         cv2().polylines(canvas, lines, False, colour, max(1, round(0.8 * size)), cv2().LINE_AA, SUBPIXEL)
     radius = round((1.5 if tails else 0.8) * size * (1 << SUBPIXEL))
-    for x, y in _fixed(paths[-1]).tolist():
+    for x, y in _to_fixed_point(paths[-1]).tolist():
         if tails:
             cv2().circle(canvas, (x, y), radius + (1 << SUBPIXEL) * 2 // 3, PAPER, -1, cv2().LINE_AA, SUBPIXEL)
         cv2().circle(canvas, (x, y), radius, colour, -1, cv2().LINE_AA, SUBPIXEL)
 
 
-def _lit(colour: Colour) -> Colour:
+def _brighten(colour: Colour) -> Colour:
     """A colour of a page on a dark ground."""
     red, green, blue = (round(part + LIGHTER * (255 - part)) for part in colour)
     return red, green, blue
 
 
-def _fixed(points: Floats) -> NDArray[np.int32]:
+def _to_fixed_point(points: Floats) -> NDArray[np.int32]:
     """Pixels in OpenCV's fixed point; far outside of the picture nothing is to be seen."""
     return np.rint(np.clip(points, -4096, 4096) * (1 << SUBPIXEL)).astype(np.int32)
 
@@ -127,7 +127,7 @@ def _legend(width: int, overlay: Overlay, caption: str) -> Image:
     x, end = 10, width - wide - 10
     cv2().putText(strip, caption, (max(2, end), STRIP - 10), font, scale, MUTED, 1, cv2().LINE_AA)
     strays = [("no body", STRAY)] if (overlay.groups == 0).any() else []
-    for name, colour in [*zip(overlay.names, map(_lit, overlay.colours), strict=True), *strays]:
+    for name, colour in [*zip(overlay.names, map(_brighten, overlay.colours), strict=True), *strays]:
         text = name.encode("ascii", "replace").decode()
         room = cv2().getTextSize(text, font, scale, 1)[0][0]
         if x + room + 30 > end:
@@ -138,7 +138,7 @@ def _legend(width: int, overlay: Overlay, caption: str) -> Image:
     return strip
 
 
-def encoded(frames: Iterable[Image], fps: float) -> bytes:
+def encode(frames: Iterable[Image], fps: float) -> bytes:
     """An MP4 file of RGB frames of even size: H.264 where FFmpeg has it, else MPEG-4, in yuv420p, which plays everywhere."""
     codec, options = (
         ("libx264", {"crf": "23", "preset": "veryfast"}) if "libx264" in av().codecs_available else ("mpeg4", {"qscale": "4"})

@@ -132,7 +132,7 @@ def orientation(frame: Any) -> Orientation:
 
 
 @contextmanager
-def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
+def open_video(path: str | Path) -> Iterator[tuple[Any, Any]]:
     """PyAV's container and its video stream."""
     name = repr(str(path))
     try:
@@ -143,7 +143,7 @@ def opened(path: str | Path) -> Iterator[tuple[Any, Any]]:
         # tags may hold other bytes than text, and a playlist may name other files, or what is on the net
         container = av().open(f"file:{path}", metadata_errors="replace", options={"protocol_whitelist": "file"})
     except (av().FFmpegError, OSError, ValueError) as error:
-        cause = "is empty" if size == 0 else f"cannot be read as video ({_said(error)}): cut off, damaged, or no video"
+        cause = "is empty" if size == 0 else f"cannot be read as video ({_error_text(error)}): cut off, damaged, or no video"
         raise ValueError(f"video {name}: the file {cause}; {REMEDY}") from error
     with container:
         # cover pictures of audio files are video streams, too; and FFmpeg draws text files as pictures of themselves
@@ -168,7 +168,7 @@ def packets(container: Any, stream: Any, failed: list[str]) -> Iterator[Any]:
         except StopIteration:
             return
         except av().FFmpegError as error:
-            failed.append(_said(error))
+            failed.append(_error_text(error))
             return
 
 
@@ -196,7 +196,7 @@ def frame_times(path: str | Path, *, fps: float | None = None) -> tuple[VideoInf
     failed: list[str] = []
     stamps: list[int | None] = []
     first = None
-    with opened(path) as (container, stream):
+    with open_video(path) as (container, stream):
         for packet in packets(container, stream, failed):
             if packet.size and not packet.is_discard:
                 stamps.append(packet.pts)
@@ -209,13 +209,13 @@ def frame_times(path: str | Path, *, fps: float | None = None) -> tuple[VideoInf
         width, height = upright.size(first.width, first.height)
         base, zero = float(stream.time_base), stream.start_time
         nominal = float(stream.average_rate or stream.guessed_rate or 0)
-        claimed = _claimed(container, stream)
+        claimed = _declared_duration(container, stream)
         codec = stream.codec_context.name
     timed = np.sort(np.array([s for s in stamps if s is not None], np.float64)) * base
     notes = [f"reading stopped early: {text}" for text in failed]
     has_times = len(timed) >= 0.5 * len(stamps)
     if not has_times:
-        notes.append(untimed(fps))
+        notes.append(assumed_rate_note(fps))
         timed, zero, nominal = np.arange(len(stamps)) / (fps or UNTIMED_FPS), 0, 0.0
     start = timed[0] if zero is None else zero * base
     times = np.unique(timed)
@@ -245,7 +245,7 @@ def evenness(times: NDArray[np.float64], tick: float = 0.0) -> tuple[float, int]
     return float(off), int(missing.clip(0).sum())
 
 
-def untimed(fps: float | None) -> str:
+def assumed_rate_note(fps: float | None) -> str:
     """The note for files without times."""
     return (
         f"the file has no timestamps: {fps:g} fps as given" if fps else f"the file has no timestamps: {UNTIMED_FPS:g} fps assumed"
@@ -258,7 +258,7 @@ def nothing_decoded(path: str | Path, received: int) -> ValueError:
     return ValueError(f"video {str(path)!r}: {cause}; {REMEDY}")
 
 
-def _claimed(container: Any, stream: Any) -> float | None:
+def _declared_duration(container: Any, stream: Any) -> float | None:
     """Seconds that a file says its pictures last; of Matroska a text says so, or the length of all, where there is no sound."""
     if stream.duration:
         return float(stream.duration * stream.time_base)
@@ -294,7 +294,7 @@ def _is_cover(stream: Any) -> bool:
     return "attached_pic" in str(stream.disposition).lower()
 
 
-def _said(error: BaseException) -> str:
+def _error_text(error: BaseException) -> str:
     return str(getattr(error, "strerror", None) or error)
 
 
@@ -367,7 +367,7 @@ class Video:
         """PyAV's own frames of the span, as they are stored (not turned, in the file's colours), one by one, with their times."""
         self.notes = ()
         start, stop = self.span
-        with opened(self.path) as (container, stream):
+        with open_video(self.path) as (container, stream):
             clock = _Clock(stream, self.fps)
             if start > 0 and stream.start_time is not None:
                 _seek(container, stream, start)
@@ -383,7 +383,7 @@ class Video:
                 yield frame, time
                 last, seen = time, seen + 1
             self.notes = decoder.notes + clock.notes
-            claimed = _claimed(container, stream)
+            claimed = _declared_duration(container, stream)
         if not ended and last > -math.inf:
             self.notes += tuple(cut_off(claimed, last))
         if not decoder.received:
@@ -440,7 +440,7 @@ def read_video(
         raise ValueError(f"read_video: fps must be a positive number of frames per second, got {fps!r}")
     if size is not None and min(size if isinstance(size, tuple) else (size,)) < 8:
         raise ValueError(f"read_video: size must be at least 8 pixels, got {size!r}")
-    with opened(path):
+    with open_video(path):
         return Video(path, gray, size, span, chunk, fps)
 
 
@@ -466,7 +466,7 @@ class _Clock:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was made up."""
-        notes = (untimed(self.fps),) if self.made_up > self.count / 2 else ()
+        notes = (assumed_rate_note(self.fps),) if self.made_up > self.count / 2 else ()
         return notes + ((f"{self.repeated} frames not later than the one before are left out",) if self.repeated else ())
 
 

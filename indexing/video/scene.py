@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dyntorch.numerics import check_options
-from indexing.video.motion import Floats, shrinking, transform
+from indexing.video.motion import Floats, shrink_matrix, transform
 from indexing.video.reading import Chunk, Source, Video, cv2
 from indexing.video.sequence import PictureSequence, chunks
 from indexing.video.tracks import Book, FollowSettings
@@ -137,11 +137,11 @@ def track_scene(
     pictures = _pictures(stream, taken)
     scale = getattr(stream, "scale", (1.0, 1.0))
     least = max(2, round(MIN_PRESENCE * len(taken))) if missing else len(taken)
-    positions = _seen(_anchored(_at(book, [k - first for k in taken]), pictures), least)
+    positions = _drop_rarely_seen(_refine_to_first(_at(book, [k - first for k in taken]), pictures), least)
     shape = pictures[0].shape
     shown = (round(shape[1] / scale[0]), round(shape[0] / scale[1]))
     check(positions, taken, name_of(source))
-    points = transform(np.asarray(np.linalg.inv(shrinking(scale)), np.float64), positions)
+    points = transform(np.asarray(np.linalg.inv(shrink_matrix(scale)), np.float64), positions)
     moments = np.array([times[k] for k in taken])
     known = isinstance(stream, PictureSequence) and stream.fps is None
     notes = [frames_said(taken, moments, len(times), known) + why, *getattr(stream, "notes", ())]
@@ -268,12 +268,12 @@ def _at(book: Book, places: list[int]) -> Floats:
     return np.stack(kept, axis=1) if kept else np.zeros((len(places), 0, 2))
 
 
-def _seen(positions: Floats, least: int) -> Floats:
+def _drop_rarely_seen(positions: Floats, least: int) -> Floats:
     """Those that are in so many pictures."""
     return positions[:, np.isfinite(positions[..., 0]).sum(axis=0) >= least]
 
 
-def _anchored(positions: Floats, pictures: Images) -> Floats:
+def _refine_to_first(positions: Floats, pictures: Images) -> Floats:
     """Each point compared with the first picture that shows it, there and back from where it was followed to; NaN where it
     fails."""
     views = len(positions)
@@ -286,11 +286,11 @@ def _anchored(positions: Floats, pictures: Images) -> Floats:
         for k in range(j + 1, views):
             rows = np.flatnonzero((first == j) & seen[k])
             if len(rows):
-                out[k, rows] = matched(pictures[j], pictures[k], positions[j, rows], positions[k, rows])
+                out[k, rows] = refine_match(pictures[j], pictures[k], positions[j, rows], positions[k, rows])
     return out
 
 
-def matched(before: Picture, after: Picture, here: Floats, there: Floats) -> Floats:
+def refine_match(before: Picture, after: Picture, here: Floats, there: Floats) -> Floats:
     """Where points ``here (n, 2)`` of one picture are in another, near ``there``; NaN where that is not so, there and back."""
     how = {"winSize": SCENE_FOLLOWING.patch, "maxLevel": 1, "criteria": (3, 30, 0.003), "flags": cv2().OPTFLOW_USE_INITIAL_FLOW}
     origin, goal = (np.ascontiguousarray(points, np.float32) for points in (here, there))
@@ -390,16 +390,16 @@ def track_whole(
     if iter(stream) is stream:
         raise ValueError("track_whole: chunks that can be read only once, and two passes are needed; give a list of them")
     step = 1 if frames or at or every else -(-_length(stream) // options.max_frames)
-    book, times = _followed(stream, wanted, step, options)
+    book, times = _follow_all(stream, wanted, step, options)
     named = name_of(source)
     taken = wanted.taken(times, 0, named) if frames or at or every else list(range(0, wanted.enough(times, named), step))
     least = max(2, min(MIN_TRACK_FRAMES, len(taken) // 2))
-    positions = chosen(book.table(len(taken)), least, 2 * options.max_tracks)
-    kept = spread(len(taken), NUM_PICTURES)
+    positions = select_longest(book.table(len(taken)), least, 2 * options.max_tracks)
+    kept = evenly_spaced(len(taken), NUM_PICTURES)
     pictures: Images = []
-    positions = anchored(positions, _watched(_read(stream, taken), kept, pictures))
+    positions = refine_along_spans(positions, _collect_pictures(_read(stream, taken), kept, pictures))
     count = int((np.isfinite(positions[..., 0]).sum(axis=0) >= least).sum())
-    positions = chosen(positions, least, options.max_tracks)
+    positions = select_longest(positions, least, options.max_tracks)
     scale = getattr(stream, "scale", (1.0, 1.0))
     shape = pictures[0].shape
     shown = (round(shape[1] / scale[0]), round(shape[0] / scale[1]))
@@ -409,7 +409,7 @@ def track_whole(
     notes = [frames_said(taken, moments, len(times), untimed) + f"; at most {options.max_frames} are taken" * (step > 1)]
     if count > options.max_tracks:
         notes.append(f"{options.max_tracks:,} of {count:,} points are used: those seen longest, and some of the others")
-    points = transform(np.asarray(np.linalg.inv(shrinking(scale)), np.float64), positions)
+    points = transform(np.asarray(np.linalg.inv(shrink_matrix(scale)), np.float64), positions)
     return SceneTracks(
         torch.from_numpy(points), torch.from_numpy(moments), tuple(taken), len(times), shown, tuple(pictures),
         (*notes, *getattr(stream, "notes", ())), tuple(kept),
@@ -458,13 +458,13 @@ class _Course(Book):
     def _finish(self, keys: NDArray[np.int_]) -> None:
         super()._finish(keys)
         if len(self.done) > 4 * self.most:
-            rows = keeping(np.array([len(positions) for _, positions in self.done]), 2 * self.most)
+            rows = select_indices(np.array([len(positions) for _, positions in self.done]), 2 * self.most)
             self.done = [self.done[i] for i in rows.tolist()]
 
 
-def _followed(stream: Iterable[Chunk], wanted: Wanted, step: int, options: SceneTrackOptions) -> tuple[_Course, list[float]]:
+def _follow_all(stream: Iterable[Chunk], wanted: Wanted, step: int, options: SceneTrackOptions) -> tuple[_Course, list[float]]:
     """All points through all frames of interest, and the times of all frames up to the last of these."""
-    book, taking = _Course(options), _taking(wanted, step)
+    book, taking = _Course(options), _frame_selector(wanted, step)
     times: list[float] = []
     previous: Picture | None = None
     for image, time in ((image, float(time)) for chunk in stream for image, time in zip(*chunk, strict=True)):
@@ -480,7 +480,7 @@ def _followed(stream: Iterable[Chunk], wanted: Wanted, step: int, options: Scene
     return book, times
 
 
-def _taking(wanted: Wanted, step: int) -> Callable[[int, float], bool]:
+def _frame_selector(wanted: Wanted, step: int) -> Callable[[int, float], bool]:
     """Whether a frame of this number and time is taken, asked in order."""
     if wanted.frames is not None:
         numbers = set(wanted.frames)
@@ -505,7 +505,7 @@ def _length(stream: Iterable[Chunk]) -> int:
     return len(stream) if isinstance(stream, PictureSequence) else sum(len(chunk.frames) for chunk in stream)
 
 
-def keeping(lengths: NDArray[np.int_], most: int) -> NDArray[np.int_]:
+def select_indices(lengths: NDArray[np.int_], most: int) -> NDArray[np.int_]:
     """Places of the tracks that are kept, in order: the longest, and as many of the others, evenly."""
     if len(lengths) <= most:
         return np.arange(len(lengths))
@@ -514,17 +514,17 @@ def keeping(lengths: NDArray[np.int_], most: int) -> NDArray[np.int_]:
     return np.sort(np.concatenate([long, rest[np.linspace(0, len(rest) - 1, most // 2).round().astype(int)]]))
 
 
-def spread(views: int, most: int) -> list[int]:
+def evenly_spaced(views: int, most: int) -> list[int]:
     """Places of some of the views, evenly to the last one; the first a little after the beginning, when points have gone
     somewhere."""
     return np.unique(np.linspace(0.1 * (views - 1), views - 1, min(most, views)).round().astype(int)).tolist()
 
 
-def chosen(positions: Floats, least: int, most: int) -> Floats:
+def select_longest(positions: Floats, least: int, most: int) -> Floats:
     """The tracks that are seen in so many of the pictures, at most so many of them."""
     lengths = np.isfinite(positions[..., 0]).sum(axis=0)
     rows = np.flatnonzero(lengths >= least)
-    return positions[:, rows[keeping(lengths[rows], most)]]
+    return positions[:, rows[select_indices(lengths[rows], most)]]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -543,7 +543,7 @@ def _read(stream: Iterable[Chunk], taken: list[int]) -> Iterator[Picture]:
             return
 
 
-def _watched(pictures: Iterator[Picture], kept: list[int], out: Images) -> Iterator[Picture]:
+def _collect_pictures(pictures: Iterator[Picture], kept: list[int], out: Images) -> Iterator[Picture]:
     """The same; those that are kept are copied on the way."""
     for i, image in enumerate(pictures):
         if i in kept:
@@ -551,7 +551,7 @@ def _watched(pictures: Iterator[Picture], kept: list[int], out: Images) -> Itera
         yield image
 
 
-def anchored(positions: Floats, pictures: Iterator[Picture]) -> Floats:
+def refine_along_spans(positions: Floats, pictures: Iterator[Picture]) -> Floats:
     """Each point compared with the first picture of every span that shows it, there and back from where it was followed to.
     positions ``(views, n, 2)`` -> ``(views, m, 2)``."""
     out = positions.copy()
@@ -564,7 +564,7 @@ def anchored(positions: Floats, pictures: Iterator[Picture]) -> Floats:
         if len(held) <= ANCHOR_SPAN and start + len(held) < views:
             continue
         stop = start + len(held)
-        ended = _compared(out, start, held)
+        ended = _refine_to_anchor(out, start, held)
         later = np.isfinite(out[stop:, ended, 0]).any(axis=0)
         if later.any():
             rows = ended[later]
@@ -579,7 +579,7 @@ def anchored(positions: Floats, pictures: Iterator[Picture]) -> Floats:
     return out
 
 
-def _compared(out: Floats, start: int, pictures: Images) -> NDArray[np.int_]:
+def _refine_to_anchor(out: Floats, start: int, pictures: Images) -> NDArray[np.int_]:
     """Compare the points of one span in place, and carry what they are corrected by; the tracks that end in it."""
     part = out[start : start + len(pictures)]
     before = part.copy()
@@ -590,7 +590,7 @@ def _compared(out: Floats, start: int, pictures: Images) -> NDArray[np.int_]:
         for k in range(j + 1, len(pictures)):
             rows = np.flatnonzero((first == j) & seen[k])
             if len(rows):
-                part[k, rows] = matched(pictures[j], pictures[k], part[j, rows], before[k, rows])
+                part[k, rows] = refine_match(pictures[j], pictures[k], part[j, rows], before[k, rows])
     last = len(seen) - 1 - seen[::-1].argmax(axis=0)
     there = np.isfinite(part[..., 0])
     columns = np.arange(out.shape[1])

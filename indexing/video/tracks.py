@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from indexing.video.motion import Background, CameraMotion, Floats, PathBuilder, shrinking, transform, warp
+from indexing.video.motion import Background, CameraMotion, Floats, PathBuilder, shrink_matrix, transform, warp
 from indexing.video.reading import Chunk, Source, cv2
 from indexing.video.sequence import chunks
 
@@ -49,7 +49,7 @@ class MovingArea:
     def __init__(self, chunk: Chunk, path: list[Floats], change: float = MIN_GRAY_CHANGE):
         height, width = chunk.frames.shape[1:]
         self.shape = (height, width)
-        self.shrink = shrinking((0.25, 0.25))
+        self.shrink = shrink_matrix((0.25, 0.25))
         self.reference = np.linalg.inv(path[0])  # first frame -> first frame of the chunk
         low = high = None
         for image, matrix in zip(chunk.frames, path, strict=True):
@@ -324,7 +324,7 @@ def _select(
 ) -> tuple[Floats, list[str]]:
     """The tracks that live long enough and move, ``(frames, n, 2)``, and what to say about them."""
     frames = len(camera.times)
-    grow = np.asarray(np.linalg.inv(shrinking(scale)), np.float64)
+    grow = np.asarray(np.linalg.inv(shrink_matrix(scale)), np.float64)
     chosen: list[tuple[int, float, int, Floats]] = []
     shorter = 0
     for first, positions in book.done:

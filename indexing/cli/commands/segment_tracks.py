@@ -23,7 +23,7 @@ from indexing.report.bodies import FILM, WRITTEN, BodiesReport, rows_of, write_b
 from indexing.report.bodies_picture import PANELS
 from indexing.report.labelled import colour_of
 from indexing.video.overlay import Overlay, write_overlay
-from indexing.video.scene import SceneTracks, spread
+from indexing.video.scene import SceneTracks, evenly_spaced
 from indexing.video.sequence import PictureSequence, chunks
 
 WORDS = flag_words("bodies", "threshold", cameras="the cameras (in Python: cameras=)")
@@ -231,7 +231,7 @@ class Pictures:
         if given.followed is not None:
             places = given.followed.pictured or range(len(self.frames))
             return dict(zip(places, photographs(given.followed), strict=True))
-        wanted = {self.frames[i]: i for i in spread(len(self.frames), PANELS)}
+        wanted = {self.frames[i]: i for i in evenly_spaced(len(self.frames), PANELS)}
         found, index = {}, 0
         stream: Any = chunks(self.source, size=1280)
         for chunk in stream:

@@ -20,7 +20,7 @@ from dyntorch.numerics import Message
 from dyntorch.tasks.segment.result import TrackSegmentation
 from indexing.actors.sheets import render, sheet
 from indexing.report.bodies import FILES, FILM
-from indexing.video.overlay import encoded
+from indexing.video.overlay import encode
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 
@@ -77,7 +77,7 @@ def data(tmp_path_factory):
     (folder / "room").mkdir()
     for i, frame in enumerate(video.frames):
         cv2.imwrite(str(folder / "room" / f"f{i}.png"), frame)
-    (folder / "room.mp4").write_bytes(encoded((np.repeat(frame[..., None], 3, axis=2) for frame in video.frames), 25))
+    (folder / "room.mp4").write_bytes(encode((np.repeat(frame[..., None], 3, axis=2) for frame in video.frames), 25))
     return folder
 
 

@@ -13,7 +13,7 @@ import torch
 
 from indexing.actors.sheets import render, sheet
 from indexing.cli import main
-from indexing.video.overlay import encoded
+from indexing.video.overlay import encode
 
 SIZE, FRAMES = (240, 180), 10
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
@@ -37,7 +37,7 @@ def data(tmp_path_factory):
         cv2.imwrite(str(folder / "wall" / f"f{i}.png"), frame)
     for name, frames in (("wall", video.frames), ("still", video.frames[[0] * 4]), ("one", video.frames[:1])):
         colour = (np.repeat(frame[..., None], 3, axis=2) for frame in frames)
-        (folder / f"{name}.mp4").write_bytes(encoded(colour, 25))
+        (folder / f"{name}.mp4").write_bytes(encode(colour, 25))
     (folder / "text.mp4").write_text("no video")
     (folder / "none").mkdir()
     np.savez(folder / "m.npz", x1=np.zeros((9, 2)), x2=np.zeros((9, 2)))

@@ -15,9 +15,9 @@ from indexing.pose.blazepose import (
     anchors,
     candidates,
     landmarks,
-    merged,
+    merge_overlapping,
     overlaps,
-    refined,
+    refine_by_heatmap,
     sigmoid,
 )  # fmt: skip
 
@@ -84,7 +84,7 @@ def test_people_are_merged_as_box_after_box_says(seed):
     rng = np.random.default_rng(seed)
     corner, size = rng.uniform(0, 1, (40, 2)), rng.uniform(0.1, 0.4, (40, 2))
     boxes, points, scores = np.hstack([corner, corner + size]), rng.normal(size=(40, 4, 2)), rng.uniform(0.5, 1, 40)
-    found = merged(PersonCandidates(scores, boxes, points), 0.3)
+    found = merge_overlapping(PersonCandidates(scores, boxes, points), 0.3)
     expected = brute_merge(scores, boxes, points, 0.3)
     assert len(found) == len(expected) < 40
     for i, (score, box, point) in enumerate(expected):
@@ -120,18 +120,18 @@ def test_refinement_is_the_mean_of_the_cells_about_a_joint(seed, monkeypatch):
     rng = np.random.default_rng(seed)
     places, heatmap = rng.uniform(-0.1, 1.1, (39, 2)), rng.normal(-3, 2, (64, 64, 39))
     heatmap[..., ::3] -= 20  # nowhere sure
-    got = refined(places, heatmap)
+    got = refine_by_heatmap(places, heatmap)
     np.testing.assert_allclose(got, brute_refine(places, heatmap), atol=1e-12)
     assert (got[1::3] != places[1::3]).any() and (got[::3] == places[::3]).all()
     monkeypatch.setattr(blazepose, "HEATMAP_KERNEL", 3)
     monkeypatch.setattr(blazepose, "MIN_HEATMAP_PEAK", 0.2)
-    np.testing.assert_allclose(refined(places, heatmap), brute_refine(places, heatmap, 3, 0.2), atol=1e-12)
+    np.testing.assert_allclose(refine_by_heatmap(places, heatmap), brute_refine(places, heatmap, 3, 0.2), atol=1e-12)
 
 
 def test_places_that_are_none_stay_so():
     places = np.full((39, 2), np.nan)
     places[1] = np.inf
-    got = refined(places, np.zeros((HEATMAP, HEATMAP, LANDMARKS)))
+    got = refine_by_heatmap(places, np.zeros((HEATMAP, HEATMAP, LANDMARKS)))
     assert np.isnan(got[0]).all() and np.isinf(got[1]).all()
 
 

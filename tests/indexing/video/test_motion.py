@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from indexing.video import Chunk, camera_motion, stabilize
-from indexing.video.motion import robust_motion, shrinking, similarity, transform
+from indexing.video.motion import robust_motion, shrink_matrix, similarity, transform
 
 
 def shift(x, y):
@@ -179,5 +179,5 @@ def test_resizing_keeps_pixel_centres():
     cv2 = pytest.importorskip("cv2")
     ramp = np.arange(40, dtype=np.float32)[None].repeat(40, 0)  # value = x
     small = cv2.resize(ramp, (20, 10), interpolation=cv2.INTER_AREA)
-    x = transform(np.linalg.inv(shrinking((0.5, 0.25))), np.array([[3.0, 5.0]]))[0]
+    x = transform(np.linalg.inv(shrink_matrix((0.5, 0.25))), np.array([[3.0, 5.0]]))[0]
     assert x[0] == pytest.approx(float(small[5, 3])) and x[1] == pytest.approx(21.5)

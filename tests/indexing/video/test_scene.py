@@ -10,7 +10,15 @@ import torch
 import dyntorch as dyn
 from indexing.actors.sheets import render, sheet
 from indexing.video import Chunk, SceneTrackOptions, track_scene, track_whole
-from indexing.video.scene import ANCHOR_SPAN, MIN_TRACK_FRAMES, NUM_PICTURES, anchored, chosen, keeping, spread
+from indexing.video.scene import (
+    ANCHOR_SPAN,
+    MIN_TRACK_FRAMES,
+    NUM_PICTURES,
+    evenly_spaced,
+    refine_along_spans,
+    select_indices,
+    select_longest,
+)
 from indexing.video.sequence import PictureSequence
 
 SIZE, FRAMES = (200, 150), 14
@@ -186,7 +194,7 @@ def test_no_point_has_to_last(walk):
 
 def test_pictures_of_some_frames_are_kept(walk):
     tracks = track_whole(chunked(walk.frames), options=SMALL)
-    assert tracks.pictured == tuple(spread(LONG_FRAMES, NUM_PICTURES)) and len(tracks.pictures) == NUM_PICTURES
+    assert tracks.pictured == tuple(evenly_spaced(LONG_FRAMES, NUM_PICTURES)) and len(tracks.pictures) == NUM_PICTURES
     for place, picture in zip(tracks.pictured, tracks.pictures, strict=True):
         np.testing.assert_array_equal(picture, walk.frames[place])
 
@@ -226,7 +234,7 @@ def test_a_point_that_is_dragged_along_begins_again(walk):
     still = np.repeat(walk.frames[:1], views, axis=0)
     positions = np.tile(np.array([[80.0, 90.0], [150.0, 60.0]]), (views, 1, 1))
     positions[10:, 1] += np.linspace(3, 9, views - 10)[:, None]  # nothing moves, and it is somewhere else
-    out = anchored(positions, iter(still))
+    out = refine_along_spans(positions, iter(still))
     assert np.isfinite(out[:, 0]).all() and np.abs(out[:, 0] - positions[:, 0]).max() < 0.2
     assert np.isnan(out[10:, 1]).all() and np.isfinite(out[:10, 1]).all()
     assert out.shape[1] == 3 and np.isnan(out[: ANCHOR_SPAN + 1, 2]).all() and np.isfinite(out[ANCHOR_SPAN + 1, 2]).all()
@@ -234,11 +242,11 @@ def test_a_point_that_is_dragged_along_begins_again(walk):
 
 def test_what_is_kept_of_too_many():
     lengths = np.array([5, 1, 9, 2, 2, 8, 1, 3])
-    assert keeping(lengths, 8).tolist() == list(range(8))
-    rows = keeping(lengths, 4)
+    assert select_indices(lengths, 8).tolist() == list(range(8))
+    rows = select_indices(lengths, 4)
     assert len(set(rows.tolist())) == 4 and {2, 5} <= set(rows.tolist())
     positions = np.where(np.arange(9)[:, None, None] < lengths[:, None], 1.0, np.nan) * np.ones(2)
-    assert chosen(positions, 3, 10).shape[1] == 4
+    assert select_longest(positions, 3, 10).shape[1] == 4
 
 
 def test_chunks_that_can_be_read_once_are_refused(walk):
