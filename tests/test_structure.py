@@ -70,7 +70,7 @@ FORMATS = {
         *("PICTURE", "REGION", "HEATMAP", "GRIDS", "POINTS", "LANDMARKS", "JOINTS", "HIPS", "CIRCLE", "CLIPPED"),
     },
     "indexing/pose/networks.py": {"OUTPUTS_FIELD", "OPERATORS_FIELD"},
-    "indexing/pose/pieces.py": {"VERSION"},
+    "indexing/pose/chunks.py": {"VERSION"},
     "indexing/readers/c3d.py": {"INTEL", "DEC", "MIPS", "MOST", "WORD"},
     "indexing/readers/formats/clipset.py": {"LAST"},
     "indexing/readers/hdf.py": {"ENTRY", "GZIP", "TEXT"},

@@ -67,7 +67,7 @@ def colmap() -> Any:
     Raises:
         ValueError: it is not installed.
     """
-    from indexing.colmap.dividing import colmap
+    from indexing.colmap.pair_segmentation import colmap
 
     module = colmap()
     module.logging.minloglevel = 2

@@ -102,12 +102,12 @@ class Person:
         )  # fmt: skip
 
 
-def limited(angles: FloatArray) -> FloatArray:
+def clip_angles(angles: FloatArray) -> FloatArray:
     """The same channels with every joint inside its range of motion (elbows and knees never bend backwards)."""
     return np.clip(angles, _LOW, _HIGH)
 
 
-def mirrored(angles: FloatArray) -> FloatArray:
+def mirror_angles(angles: FloatArray) -> FloatArray:
     """The same movement done with the other side of the body."""
     n, m = len(CENTRAL), len(LIMBS)
     out = np.concatenate([angles[:, :n], angles[:, n + m :], angles[:, n : n + m]], axis=1)

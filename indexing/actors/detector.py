@@ -63,13 +63,18 @@ def detect(
     rng = np.random.default_rng(rng)
     metre = FOCAL * image[0] / distance  # pixels per metre in the plane of the person
     turned, pixels = _project(clip, azimuth, elevation, distance, image)
-    hidden = _hidden(turned)
+    hidden = _self_occlusion(turned)
     scale = (metre * noise * (1 + hidden) * _SPREAD)[..., None]
     pixels = pixels + scale * _jitter(pixels.shape, _rate(clip), rng)
     trust = 0.93 - 0.5 * hidden + 0.06 * _jitter(hidden.shape, _rate(clip), rng)
-    pixels, wrong = _mistaken(pixels, outliers, metre, rng)
+    pixels, wrong = _outliers(pixels, outliers, metre, rng)
     trust = np.where(wrong, trust - rng.uniform(0.0, 0.6, trust.shape), trust)
-    lost = _lost(hidden, dropout, rng) | np.isnan(pixels).any(axis=2) | (pixels < 0).any(axis=2) | (pixels >= image).any(axis=2)
+    lost = (
+        _missing_joints(hidden, dropout, rng)
+        | np.isnan(pixels).any(axis=2)
+        | (pixels < 0).any(axis=2)
+        | (pixels >= image).any(axis=2)
+    )
     confidence = np.where(lost, 0.0, np.clip(trust, 0.02, 1.0))
     return clip.replace(joints=np.where(lost[..., None], np.nan, pixels), confidence=confidence, up="-y")
 
@@ -105,7 +110,7 @@ def _rate(clip: Clip) -> float:
     return float(1.0 / np.median(np.diff(clip.times))) if len(clip) > 1 else 30.0
 
 
-def _hidden(turned: FloatArray) -> FloatArray:
+def _self_occlusion(turned: FloatArray) -> FloatArray:
     """``(frames, 17)`` in [0, 1]: how far a joint is covered by the body, from joints in camera axes (z away)."""
     hidden = np.zeros(turned.shape[:2])
     for left, right in PAIRS[2:]:  # a limb right behind its twin
@@ -158,13 +163,13 @@ def _bursts(shape: tuple[int, int], chance: FloatArray | float, length: float, r
     return np.asarray(np.cumsum(change, axis=0)[lead:-1] > 0)
 
 
-def _lost(hidden: FloatArray, dropout: float, rng: np.random.Generator) -> BoolArray:
+def _missing_joints(hidden: FloatArray, dropout: float, rng: np.random.Generator) -> BoolArray:
     weight = 0.4 + 2.0 * hidden
     chance = np.minimum(dropout * weight / weight.mean(), 0.5 + 0.5 * dropout)
     return _bursts((hidden.shape[0], hidden.shape[1]), chance, BURST, rng)
 
 
-def _mistaken(pixels: FloatArray, share: float, metre: float, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
+def _outliers(pixels: FloatArray, share: float, metre: float, rng: np.random.Generator) -> tuple[FloatArray, BoolArray]:
     """Pixels with outliers, and which joints they are; ``metre`` in pixels."""
     frames = len(pixels)
     swapped = np.zeros(pixels.shape[:2], dtype=bool)

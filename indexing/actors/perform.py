@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from indexing.actors.body import CENTRAL, INDEX, LIMBS, STYLES, Person, joints, limited, mirrored
+from indexing.actors.body import CENTRAL, INDEX, LIMBS, STYLES, Person, clip_angles, joints, mirror_angles
 from indexing.actors.detector import detect
 from indexing.clip import Clip, ClipSet, FloatArray
 from indexing.skeleton import COCO17
@@ -271,7 +271,7 @@ def stream(
     for action, move in moves:
         before, after = ENDS.get(action, (STAND, STAND))
         gap = _rest(posture, before, rng.uniform(*rest), person, fps)
-        body = _faded(_angles(move, action, person, fps, repeats, rng), before, after, person, fps)
+        body = _blend(_angles(move, action, person, fps, repeats, rng), before, after, person, fps)
         truth.append((action, (at + len(gap)) / fps, (at + len(gap) + len(body) - 1) / fps))
         parts += [gap, body]
         at, posture = at + len(gap) + len(body), after
@@ -349,15 +349,15 @@ def _angles(
         shift = 0.0 if rng is None else float(rng.uniform(0.0, move.period))
         start, end = move.period + shift, move.period * (1 + count) + shift
     else:
-        times = _retimed(times, habit[1] + 0.5 * chance[1], habit[2] + 0.5 * chance[2])
+        times = _warp_times(times, habit[1] + 0.5 * chance[1], habit[2] + 0.5 * chance[2])
         end = times[-1]
     frames = max(2, round((end - start) / tempo * fps) + 1)
     moments = np.linspace(start, end, frames)
     angles = interpolate(times, poses, moments)
     arms = [INDEX[name] for name in _GROUPS["left"] + _GROUPS["right"]]
     angles[:, arms] = interpolate(times, poses[:, arms], moments - (person.lag + 0.015 * chance[3]))
-    angles = _own(angles, person)
-    return limited(mirrored(angles) if person.handed < 0 else angles)
+    angles = _personal_angles(angles, person)
+    return clip_angles(mirror_angles(angles) if person.handed < 0 else angles)
 
 
 def _gain(move: ActorMove, person: Person, habit: FloatArray, chance: FloatArray) -> FloatArray:
@@ -384,7 +384,7 @@ def _habits(action: str, person: Person) -> FloatArray:
     return habits
 
 
-def _own(angles: FloatArray, person: Person) -> FloatArray:
+def _personal_angles(angles: FloatArray, person: Person) -> FloatArray:
     """The same movement with the person's carriage: posture, stance, how the arms hang."""
     out = angles.copy()
     carriage = {"lean": person.posture, "nod": -0.5 * person.posture, "turn": 4.0 * person.style[0]}
@@ -394,7 +394,7 @@ def _own(angles: FloatArray, person: Person) -> FloatArray:
     return out
 
 
-def _retimed(times: FloatArray, bias: float, ripple: float) -> FloatArray:
+def _warp_times(times: FloatArray, bias: float, ripple: float) -> FloatArray:
     """Key times with the intervals stretched: early ones against late ones, and every other one."""
     steps = np.diff(times)
     place = np.arange(len(steps))
@@ -426,9 +426,9 @@ def _ease(u: FloatArray) -> FloatArray:
     return eased
 
 
-def _posed(posture: FloatArray, person: Person) -> FloatArray:
-    shape = _own(posture[None], person)
-    angles = limited(mirrored(shape) if person.handed < 0 else shape)
+def _static_pose(posture: FloatArray, person: Person) -> FloatArray:
+    shape = _personal_angles(posture[None], person)
+    angles = clip_angles(mirror_angles(shape) if person.handed < 0 else shape)
     return angles.reshape(-1)
 
 
@@ -437,15 +437,15 @@ def _rest(first: FloatArray, last: FloatArray, seconds: float, person: Person, f
     change = first is not last
     frames = max(1, round(max(seconds, 1.4 if change else 0.0) * fps))
     u = np.linspace(0.0, 1.0, frames)[:, None]
-    a, b = _posed(first, person), _posed(last, person)
+    a, b = _static_pose(first, person), _static_pose(last, person)
     return a + (b - a) * _ease((u - 0.1) / 0.8)
 
 
-def _faded(angles: FloatArray, before: FloatArray, after: FloatArray, person: Person, fps: float) -> FloatArray:
+def _blend(angles: FloatArray, before: FloatArray, after: FloatArray, person: Person, fps: float) -> FloatArray:
     """The action, left and entered from a resting posture; never by more than a third of it."""
     frames = np.arange(len(angles))[:, None]
     span = max(1.0, min(FADE * fps, len(angles) / 3))
-    a, b = _posed(before, person), _posed(after, person)
+    a, b = _static_pose(before, person), _static_pose(after, person)
     angles = a + (angles - a) * _ease(frames / span)
     return b + (angles - b) * _ease((len(angles) - 1 - frames) / span)
 
@@ -460,4 +460,4 @@ def _clip(angles: FloatArray, person: Person, fps: float, rng: np.random.Generat
     sway = np.sin(2 * np.pi * waves * seconds[:, None] + phases).sum(axis=0) * np.sqrt(2 / 3)  # standard deviation 1
     swayed = angles.copy()
     swayed[:, [INDEX[name] for name in size]] += person.sway * sway * np.array(list(size.values()))
-    return Clip(joints(limited(swayed), person), fps=fps, skeleton=COCO17, up="y", **known)
+    return Clip(joints(clip_angles(swayed), person), fps=fps, skeleton=COCO17, up="y", **known)

@@ -117,7 +117,7 @@ def read_database(path: str | Path) -> MatchDatabase:
             places = {image.key: place for place, image in enumerate(images)}
             found = _pairs(path, database, "two_view_geometries") | _pairs(path, database, "matches")
     except sqlite3.Error as problem:
-        raise _unreadable(path, problem) from None
+        raise _read_error(path, problem) from None
     pairs = tuple(_pair(path, key, rows, images, places) for key, rows in sorted(found.items()))
     if not pairs:
         raise error(path, f"holds {len(images)} images and no matches", "run a matcher first, such as colmap exhaustive_matcher")
@@ -141,7 +141,7 @@ def _connect(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(f"{path.resolve().as_uri()}?{'mode=ro' if busy else 'mode=ro&immutable=1'}", uri=True)
 
 
-def _unreadable(path: Path, problem: sqlite3.Error) -> ValueError:
+def _read_error(path: Path, problem: sqlite3.Error) -> ValueError:
     return error(path, f"cannot be read ({problem})", "close the programs that write it, or make it again with COLMAP")
 
 
@@ -243,7 +243,7 @@ def write_database(
     ``(m, 2)``."""
     path = check_target(path, source.path)
     with (
-        _appearing(path) as temporary,
+        _atomic_file(path) as temporary,
         contextlib.closing(_connect(source.path)) as old,
         contextlib.closing(sqlite3.connect(temporary)) as new,
     ):
@@ -255,7 +255,7 @@ def write_database(
 
 
 @contextlib.contextmanager
-def _appearing(path: Path) -> Iterator[Path]:
+def _atomic_file(path: Path) -> Iterator[Path]:
     """A temporary name beside a file, which becomes its name at the end."""
     temporary = path.parent / f".dyntorch-{secrets.token_hex(8)}.tmp"
     try:

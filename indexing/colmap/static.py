@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from indexing.archive.workers import InOrder
 from indexing.colmap.database import MatchDatabase, PairGeometry, write_database
-from indexing.colmap.dividing import (
+from indexing.colmap.pair_segmentation import (
     VERIFICATION_DISTANCE,
     PairBodies,
     SeenImage,
     StaticOptions,
-    chosen,
     divide,
     left_open,
-    seen,
+    prepare_images,
+    select_pairs,
     task,
-    verified,
+    verify,
 )
 from indexing.colmap.voting import GRID_CELLS, DividedPair, Votes, vote
 from indexing.opening import count, listed
@@ -119,9 +119,9 @@ def find_static(
     Raises:
         ValueError: pycolmap is not installed (``pip install 'dyntorch[colmap]'``), or it does not know a camera.
     """
-    images = seen(database)
+    images = prepare_images(database)
     options = options or StaticOptions()
-    places = chosen(database, options)
+    places = select_pairs(database, options)
     bodies = [left_open(pair) for pair in database.pairs]
     tasks = (task(database.pairs[place], images, threshold, spatial, seed, options) for place in places)
     for done, (place, (_, divided)) in enumerate(zip(places, InOrder(divide, executor)(tasks), strict=True)):
@@ -130,14 +130,14 @@ def find_static(
         if progress is not None:
             progress(done + 1, len(places))
     starts = np.cumsum([0, *(len(image.points) for image in database.images)])
-    votes = _voted(database, bodies, starts)
+    votes = _vote(database, bodies, starts)
     reach = threshold if threshold is not None else VERIFICATION_DISTANCE
-    kept = [_kept(database, place, bodies[place], votes, starts, reach) for place in range(len(database.pairs))]
-    geometries = [verified(database, pair, rows, images, seed) for pair, rows in zip(database.pairs, kept, strict=True)]
-    return _found(database, bodies, votes, kept, geometries, starts, images, options)
+    kept = [_static_matches(database, place, bodies[place], votes, starts, reach) for place in range(len(database.pairs))]
+    geometries = [verify(database, pair, rows, images, seed) for pair, rows in zip(database.pairs, kept, strict=True)]
+    return _result(database, bodies, votes, kept, geometries, starts, images, options)
 
 
-def _voted(database: MatchDatabase, bodies: list[PairBodies], starts: IntArray) -> Votes:
+def _vote(database: MatchDatabase, bodies: list[PairBodies], starts: IntArray) -> Votes:
     """The votes over the graph of pairs."""
     pairs = [
         DividedPair(starts[pair.first] + pair.matches[:, 0], starts[pair.second] + pair.matches[:, 1], found.labels)
@@ -154,7 +154,9 @@ def _cells(points: NDArray[np.float64], width: int, height: int) -> IntArray:
     return np.asarray(at[:, 1] * GRID_CELLS + at[:, 0])
 
 
-def _kept(database: MatchDatabase, place: int, bodies: PairBodies, votes: Votes, starts: IntArray, reach: float) -> IntArray:
+def _static_matches(
+    database: MatchDatabase, place: int, bodies: PairBodies, votes: Votes, starts: IntArray, reach: float
+) -> IntArray:
     """The static matches of a pair."""
     pair, signs = database.pairs[place], votes.signs[place]
     first, second = (votes.keypoints[starts[image] + pair.matches[:, k]] for k, image in enumerate((pair.first, pair.second)))
@@ -167,7 +169,7 @@ def _kept(database: MatchDatabase, place: int, bodies: PairBodies, votes: Votes,
     return pair.matches[(mine & ~moves) | (~mine & stands & near)]
 
 
-def _found(
+def _result(
     database: MatchDatabase,
     bodies: list[PairBodies],
     votes: Votes,

@@ -3,8 +3,8 @@
 The files are, in the order of the work: :mod:`~indexing.pose.models` (the model files, and how they are fetched),
 :mod:`~indexing.pose.networks` (their runtime), :mod:`~indexing.pose.blazepose` (what their numbers mean),
 :mod:`~indexing.pose.regions` (what is cut out of a picture), :mod:`~indexing.pose.tracking` (people from frame to frame),
-:mod:`~indexing.pose.pieces` (long videos), :mod:`~indexing.pose.identities` (who is who), :mod:`~indexing.pose.detection` (the
-verb) and :mod:`~indexing.pose.writing` (keypoint files).
+:mod:`~indexing.pose.chunks` (long videos), :mod:`~indexing.pose.reidentification` (who is who),
+:mod:`~indexing.pose.detection` (the verb) and :mod:`~indexing.pose.writing` (keypoint files).
 """
 
 from __future__ import annotations

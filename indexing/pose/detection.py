@@ -1,8 +1,8 @@
 """Videos to keypoints: :func:`detect`, and the work behind it, for one video or many.
 
-1. The file is looked at and cut into pieces (:mod:`indexing.pose.pieces`).
+1. The file is looked at and cut into pieces (:mod:`indexing.pose.chunks`).
 2. Each piece is worked: people are found and followed from frame to frame (:mod:`indexing.pose.tracking`).
-3. Tracks of all pieces become people (:mod:`indexing.pose.identities`), and people clips.
+3. Tracks of all pieces become people (:mod:`indexing.pose.reidentification`), and people clips.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ import numpy as np
 from indexing.clip import Clip, ClipSet, check_fps
 from indexing.opening import count, error
 from indexing.pose.blazepose import JOINTS, Floats
-from indexing.pose.identities import Indices, Sightings, identities, joined, largest
+from indexing.pose.chunks import Piece, PieceLost, Stopped, Store, VideoPlan, plan, work
 from indexing.pose.models import ModelSet, load_models
 from indexing.pose.networks import LiteNetworks, NetworkMaker
-from indexing.pose.pieces import Piece, PieceLost, Stopped, Store, VideoPlan, plan, work
+from indexing.pose.reidentification import Indices, Sightings, concatenate, identities, largest
 from indexing.pose.tracking import PoseOptions
 from indexing.readers.recording import MIN_CROWDED_SHARE, NobodySeen
 from indexing.skeleton import BLAZEPOSE33
@@ -166,7 +166,7 @@ def run(
 ) -> Iterator[tuple[VideoTask, Detected | ValueError]]:
     """Work on videos; each comes out as soon as it is done, in order, or with what is wrong with it."""
     av(), cv2()
-    jobs = [_planned(task) for task in tasks]
+    jobs = [_plan_job(task) for task in tasks]
     meter = _Meter(sum(job.plan.frames for job in jobs if job.plan is not None), progress)
     own, halted = threading.local(), threading.Event()
 
@@ -207,7 +207,7 @@ def run(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _planned(task: VideoTask) -> _Job:
+def _plan_job(task: VideoTask) -> _Job:
     job = _Job(task)
     try:
         job.plan = plan(task.path, task.people, task.every, task.fps, task.model, task.options)
@@ -240,7 +240,7 @@ def _outcome(job: _Job) -> Detected | ValueError:
         return first or error(job.task.path, "has no frame to look at", "leave --every out")
     lost = [] if first is None else [f"{count(len(job.pieces) - len(parts), 'part')} of it cannot be decoded ({first})"]
     try:
-        found = detected(job.plan, joined(parts), job.seconds)
+        found = make_clips(job.plan, concatenate(parts), job.seconds)
     except NobodyInVideo as problem:
         return problem
     return replace(found, notes=(*found.notes, *lost))
@@ -312,7 +312,7 @@ def made_by(models: ModelSet) -> NetworkMaker:
 # People as clips.
 
 
-def detected(task: VideoPlan, seen: Sightings, seconds: float = 0.0) -> Detected:
+def make_clips(task: VideoPlan, seen: Sightings, seconds: float = 0.0) -> Detected:
     """The people of a video as clips."""
     if not len(seen.at):
         raise NobodyInVideo(task.path, np.arange(len(seen.times)), seen.times, seen.notes)

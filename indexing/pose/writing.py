@@ -18,6 +18,7 @@ from indexing.clip import Clip, ClipSet
 from indexing.files import prepare, recover_folder, replace_folder
 from indexing.opening import entries, error, is_regular, parse_json, read_text
 from indexing.pose.blazepose import Floats
+from indexing.pose.chunks import clear, content_of, nearest, plan
 from indexing.pose.detection import (
     Detected,
     FrameProgress,
@@ -30,10 +31,9 @@ from indexing.pose.detection import (
     made_by,
     run,
 )
-from indexing.pose.identities import Indices
 from indexing.pose.models import load_models
 from indexing.pose.networks import NetworkMaker
-from indexing.pose.pieces import clear, content_of, nearest, plan
+from indexing.pose.reidentification import Indices
 from indexing.pose.tracking import PoseOptions
 from indexing.readers.formats.clipset import read_clip_set
 from indexing.readers.npz import NumpyArchive
@@ -129,7 +129,7 @@ def keypoint_files(
     there: dict[int, KeypointFile | ValueError] = {}
     for number, (task, target) in enumerate(zip(tasks, targets, strict=True)):
         try:
-            kept = _there(task, target, json, own)
+            kept = _reusable(task, target, json, own)
         except ValueError as problem:
             there[number] = problem
             continue
@@ -148,7 +148,7 @@ def keypoint_files(
         same, found = next(working)
         if isinstance(found, NobodyInVideo):
             clear(_parts(target))
-        made = found if isinstance(found, ValueError) else _written(same, found, target, json)
+        made = found if isinstance(found, ValueError) else _write(same, found, target, json)
         with suppress(OSError):  # pieces that are kept for the next run stay
             _parts(target).rmdir()
         yield task, made
@@ -175,7 +175,7 @@ def _json(target: Path) -> Path:
     return target.with_name(f"{target.stem}_json")
 
 
-def _there(task: VideoTask, target: Path, json: bool, own: bool) -> KeypointFile | None:
+def _reusable(task: VideoTask, target: Path, json: bool, own: bool) -> KeypointFile | None:
     """The file that was written before, if it is what would be written now."""
     folder = _json(target)
     recover_folder(folder)
@@ -202,7 +202,7 @@ def _there(task: VideoTask, target: Path, json: bool, own: bool) -> KeypointFile
     return KeypointFile(target, folder if with_json else None, clips, True)
 
 
-def _written(task: VideoTask, found: Detected, target: Path, json: bool) -> KeypointFile | ValueError:
+def _write(task: VideoTask, found: Detected, target: Path, json: bool) -> KeypointFile | ValueError:
     """Write what was found; the clip set last, so that it says that all is there."""
     folder = _json(target)
     with_json = json or _of_video(_of_folder(folder), str(found.clips[0].meta[CONTENT]))
@@ -224,7 +224,7 @@ def _written(task: VideoTask, found: Detected, target: Path, json: bool) -> Keyp
 
 @dataclass(frozen=True)
 class _Origin:
-    """What a file or folder of ours was made from; see :class:`indexing.pose.pieces.VideoPlan`."""
+    """What a file or folder of ours was made from; see :class:`indexing.pose.chunks.VideoPlan`."""
 
     made_from: str
     content: str

@@ -11,7 +11,7 @@ import pytest
 
 from indexing import synchronize
 from indexing.pose import available, detect, keypoint_file, networks
-from indexing.pose.models import VARIABLE, kept, load_models
+from indexing.pose.models import VARIABLE, cache_folder, load_models
 from indexing.pose.networks import LiteNetworks
 from indexing.readers import read
 
@@ -19,10 +19,10 @@ from indexing.readers import read
 def fetched() -> Path:
     """Where the model files are, whatever the tests of everything else are told."""
     if available() is not None:
-        return kept()
+        return cache_folder()
     with mock.patch.dict(os.environ):
         os.environ.pop(VARIABLE, None)
-        return kept()
+        return cache_folder()
 
 
 MODELS = fetched()
@@ -74,9 +74,9 @@ def test_a_pruned_network_computes_the_same(name: str, monkeypatch: pytest.Monke
     models = load_models(name, MODELS)
     image = np.random.default_rng(0).integers(0, 255, (256, 256, 3)).astype(np.uint8)
     short = LiteNetworks(models).landmarks(image)
-    monkeypatch.setattr("indexing.pose.networks.pruned", lambda model, wanted: model)
+    monkeypatch.setattr("indexing.pose.networks.prune", lambda model, wanted: model)
     whole = LiteNetworks(models).landmarks(image)
-    assert len(networks.pruned(models.landmarks, {1})) == len(models.landmarks)
+    assert len(networks.prune(models.landmarks, {1})) == len(models.landmarks)
     for a, b in zip(short, whole, strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -14,7 +14,7 @@ from indexing.clip import check_fps
 from indexing.pose import models as files
 from indexing.pose import writing
 from indexing.pose.detection import VideoTask, made_by, workers_here
-from indexing.pose.models import kept
+from indexing.pose.models import cache_folder
 from indexing.pose.writing import KeypointFile
 
 
@@ -45,7 +45,8 @@ def _fetch(flags: Pose) -> int:
     for one in done:
         if one.state == "missing":
             say(f"note: {one.file} is not there: {one.why}")
-    say(f"{kept() if flags.models is None else flags.models}: {count(sum(one.state != 'missing' for one in done), 'model file')}")
+    where = cache_folder() if flags.models is None else flags.models
+    say(f"{where}: {count(sum(one.state != 'missing' for one in done), 'model file')}")
     return 0
 
 

@@ -14,8 +14,8 @@ from typing import Any
 from indexing.archive.workers import QuietProcesses
 from indexing.cli.console import check_folder, check_report, count, counted, ended, keep, names, progress, say, table
 from indexing.colmap import MatchDatabase, StaticPoints, check_target, find_static, read_database
-from indexing.colmap.dividing import colmap
 from indexing.colmap.masks import write_masks
+from indexing.colmap.pair_segmentation import colmap
 from indexing.colmap.static import MIN_PARALLEL_PAIRS
 from indexing.files import manifest
 from indexing.readers.pairs import Photograph, read_image

@@ -12,7 +12,7 @@ import pytest
 from experiments.segmentation.colmap import mapped, worst, write_scene
 from experiments.segmentation.photographs import photographs
 from indexing.colmap import StaticOptions, find_static, read_database
-from indexing.colmap.dividing import chosen, divide, seen, task
+from indexing.colmap.pair_segmentation import divide, prepare_images, select_pairs, task
 from tests.indexing.colmap.test_database import changed, sha256
 
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -113,15 +113,15 @@ def find_static_again(found, options):
 
 
 def test_of_each_image_the_pairs_with_most_matches_are_divided(found):
-    few = chosen(found.database, StaticOptions(pairs_per_image=1))
+    few = select_pairs(found.database, StaticOptions(pairs_per_image=1))
     images = {place for pair in few for place in (found.database.pairs[pair].first, found.database.pairs[pair].second)}
     assert images == set(range(6)) and len(few) < len(found.database.pairs)
-    assert chosen(found.database, StaticOptions(min_matches=10_000)) == []
+    assert select_pairs(found.database, StaticOptions(min_matches=10_000)) == []
 
 
 def test_matches_beyond_the_most_join_those_beside_them(scene, found):
     """Half of the matches are divided, and nearly as many are labelled as if all were."""
-    images = seen(found.database)
+    images = prepare_images(found.database)
     pair, whole = found.database.pairs[0], found.bodies[0]
     half = divide(task(pair, images, 2.5, True, 0, StaticOptions(max_matches=len(pair.matches) // 2)))
     still = scene.still(pair.first, pair.second, pair.matches)
@@ -136,7 +136,7 @@ def test_lens_distortion_is_undone(given, tmp_path):
     """A camera of COLMAP's model SIMPLE_RADIAL: number 2, with parameters f, cx, cy, k."""
     params = np.array([700.0, 480, 360, -0.1]).tobytes().hex()
     path = changed(given, tmp_path / "bent.db", f"UPDATE cameras SET model = 2, params = x'{params}'")
-    (image, *_), database = seen(read_database(path)), read_database(path)
+    (image, *_), database = prepare_images(read_database(path)), read_database(path)
     rays = (image.points - [480, 360]) / 700
     bent = rays * (1 - 0.1 * (rays**2).sum(axis=1, keepdims=True)) * 700 + [480, 360]
     assert np.abs(bent - database.images[0].points).max() < 1e-3

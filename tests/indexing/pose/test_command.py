@@ -11,6 +11,7 @@ from indexing.cli import console, main
 from tests.indexing.pose.test_detection import film, person, walk
 
 
+@pytest.mark.slow
 def test_videos_become_files(tmp_path, seeing, capsys):
     one = film(tmp_path, [[walk(i)] for i in range(20)], "one.mp4")
     two = film(tmp_path, [[walk(i), person(280, 200, 30)] for i in range(20)], "two.mp4")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexing.pose import NobodyInVideo, PoseOptions, detect, detection, keypoint_file
-from indexing.pose.pieces import plan
+from indexing.pose.chunks import plan
 from indexing.recordings.people import of_recording, tracked_people
 from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
 

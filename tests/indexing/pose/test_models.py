@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from indexing.pose import available, get_models, models
-from indexing.pose.models import PACKAGE, VARIABLE, WHEEL, kept, load_models
+from indexing.pose.models import PACKAGE, VARIABLE, WHEEL, cache_folder, load_models
 
 COMMAND = "dyntorch pose --get-models"
 ANOTHER = "the download is another file than the one that is known (by its SHA-256); try again later"
@@ -184,13 +184,13 @@ def test_a_missing_extra_says_what_to_install(tmp_path, content, monkeypatch):
 def test_the_folder_is_the_users_cache_or_the_one_that_is_named(monkeypatch, tmp_path):
     for name in (VARIABLE, "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(name, raising=False)
-    assert kept().parts[-3:] == (".cache", "dyntorch", "pose")
+    assert cache_folder().parts[-3:] == (".cache", "dyntorch", "pose")
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "local"))
-    assert kept() == tmp_path / "local" / "dyntorch" / "pose"
+    assert cache_folder() == tmp_path / "local" / "dyntorch" / "pose"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert kept() == tmp_path / "xdg" / "dyntorch" / "pose"
+    assert cache_folder() == tmp_path / "xdg" / "dyntorch" / "pose"
     monkeypatch.setenv(VARIABLE, str(tmp_path / "own"))
-    assert kept() == tmp_path / "own"
+    assert cache_folder() == tmp_path / "own"
 
 
 def test_the_real_files_are_known_by_size_and_hash():

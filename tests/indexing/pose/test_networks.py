@@ -9,7 +9,7 @@ import pytest
 
 from indexing.pose import networks
 from indexing.pose.models import ModelSet
-from indexing.pose.networks import LiteNetworks, pruned
+from indexing.pose.networks import LiteNetworks, prune
 
 SHAPES = {b"detector": [(1, 2254, 12), (1, 2254, 1)], b"landmarks": [(1, 195), (1, 1), (1, 256, 256, 1), (1, 64, 64, 39), (1, 117)]}
 MODELS = ModelSet("full", b"detector", b"landmarks", (Path("d.tflite"), Path("l.tflite")))
@@ -103,7 +103,7 @@ def test_what_leads_to_no_wanted_output_is_left_out():
     model.subgraphs = [graph]
     builder = flatbuffers.Builder(0)
     builder.Finish(model.Pack(builder))
-    left = schema.Model.GetRootAs(pruned(bytes(builder.Output()), {7}), 0).Subgraphs(0)
+    left = schema.Model.GetRootAs(prune(bytes(builder.Output()), {7}), 0).Subgraphs(0)
     assert left.OutputsAsNumpy().tolist() == [2] and left.OperatorsLength() == 2
     flow = [(left.Operators(i).Inputs(0), left.Operators(i).Outputs(0)) for i in range(2)]
     assert flow == [(0, 1), (1, 2)]
@@ -111,4 +111,4 @@ def test_what_leads_to_no_wanted_output_is_left_out():
 
 @pytest.mark.parametrize("content", [b"", b"l", b"landmarks", bytes(100), b"\xff" * 300])
 def test_what_cannot_be_read_as_a_network_stays_as_it_is(content):
-    assert pruned(content, {1}) == content
+    assert prune(content, {1}) == content

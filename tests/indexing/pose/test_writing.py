@@ -10,8 +10,8 @@ import pytest
 
 from indexing import ClipSet
 from indexing.pose import PoseOptions, detect, keypoint_file
+from indexing.pose.chunks import Store
 from indexing.pose.detection import VideoTask
-from indexing.pose.pieces import Store
 from indexing.pose.writing import keypoint_files, write_json_folder
 from indexing.readers import read
 from indexing.readers.formats.clipset import read_clip_set

@@ -98,6 +98,7 @@ def test_a_slow_slide_is_a_drift(scene):
     assert slow.kind == "drift" and slow.moments[0].pixels == pytest.approx(3.1, abs=0.5)
 
 
+@pytest.mark.slow
 def test_stabilized_frames_stand_still(scene):
     still, _ = scene(20, noise=0.0, blobs=0)
     moving, _ = scene(30, camera=handheld, noise=0.0, blobs=0)

@@ -23,9 +23,9 @@ from indexing.clip import check_fps
 from indexing.files import prepare, replacing
 from indexing.opening import error, opened, size_of
 from indexing.pose.blazepose import JOINTS, Floats
-from indexing.pose.identities import Sightings
 from indexing.pose.networks import Networks
 from indexing.pose.regions import VideoPicture
+from indexing.pose.reidentification import Sightings
 from indexing.pose.tracking import PoseOptions, Sighting, Tracker
 from indexing.readers.npz import NumpyArchive
 from indexing.video.reading import Video, VideoInfo, frame_times
@@ -75,7 +75,7 @@ def plan(path: Path, people: int, every: int, fps: float | None, model: str, opt
     numbers = np.flatnonzero(times >= 0)
     wanted = numbers[::every] if len(numbers) else np.arange(len(times))[::every]
     # where the file has no times there is no way to go to one
-    cuts = cut(times[wanted], options) if info.timed else [(0, 0, len(wanted))]
+    cuts = split_times(times[wanted], options) if info.timed else [(0, 0, len(wanted))]
     pieces = tuple(Piece(number, wanted[a:b], wanted[lead:a]) for number, (lead, a, b) in enumerate(cuts))
     content = content_of(path)
     about = (VERSION, content, model, people, every, fps, options)
@@ -83,7 +83,7 @@ def plan(path: Path, people: int, every: int, fps: float | None, model: str, opt
     return VideoPlan(path, info, fps, times, people, every, model, pieces, options, content, made_from)
 
 
-def cut(times: Floats, options: PoseOptions) -> list[tuple[int, int, int]]:
+def split_times(times: Floats, options: PoseOptions) -> list[tuple[int, int, int]]:
     """Where each piece's lead begins, where it begins, and where it ends."""
     if not len(times):
         return []
@@ -123,7 +123,7 @@ def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], 
     counted, looked = set(piece.frames.tolist()), set(both.tolist())
     size: tuple[int, int] | None = None
     changed, reformat = 0, import_module("av.video.reformatter").VideoReformatter().reformat
-    for frame, time in _decoded(task, video):
+    for frame, time in _decode(task, video):
         if stop():
             raise Stopped
         size = size or (frame.width, frame.height)
@@ -137,21 +137,21 @@ def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], 
             kept.add(time, seen)
             moved()
     if looked:  # frames that the file had when it was looked at first
-        _unchanged(task)
+        _check_unchanged(task)
     notes = [*video.notes, *([f"{changed} frames of another size than the first were brought to its size"] if changed else [])]
     return kept.sightings(tracker.crowd, notes)
 
 
-def _decoded(task: VideoPlan, video: Video) -> Iterator[tuple[Any, float]]:
+def _decode(task: VideoPlan, video: Video) -> Iterator[tuple[Any, float]]:
     """The frames of a video as they are stored, and their times."""
     try:
         yield from video.stored()
     except ValueError as problem:
-        _unchanged(task)
+        _check_unchanged(task)
         raise PieceLost(*problem.args) from problem
 
 
-def _unchanged(task: VideoPlan) -> None:
+def _check_unchanged(task: VideoPlan) -> None:
     """Raise where the file is gone, cannot be read any more, or is another one than it was."""
     if content_of(task.path) != task.content:
         raise error(task.path, "has changed while it was worked", "start again when it is complete")

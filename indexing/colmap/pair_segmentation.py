@@ -62,12 +62,12 @@ class SeenImage:
     points: FloatArray
 
 
-def seen(database: MatchDatabase) -> list[SeenImage]:
+def prepare_images(database: MatchDatabase) -> list[SeenImage]:
     """The images of a database."""
-    return [_seen(database, image) for image in database.images]
+    return [_prepare_image(database, image) for image in database.images]
 
 
-def _seen(database: MatchDatabase, image: DatabaseImage) -> SeenImage:
+def _prepare_image(database: MatchDatabase, image: DatabaseImage) -> SeenImage:
     known, module = image.camera, colmap()
     who = f"the camera of image {clipped(image.name)}"
     try:
@@ -94,7 +94,7 @@ def _seen(database: MatchDatabase, image: DatabaseImage) -> SeenImage:
     return SeenImage(camera, straight)
 
 
-def chosen(database: MatchDatabase, options: StaticOptions) -> list[int]:
+def select_pairs(database: MatchDatabase, options: StaticOptions) -> list[int]:
     """The pairs to divide: of each image those with most matches; places in the list of pairs."""
     order = sorted(range(len(database.pairs)), key=lambda place: -len(database.pairs[place].matches))
     taken, used = [], [0] * len(database.images)
@@ -153,10 +153,10 @@ def divide(task: PairTask) -> PairBodies:
         return PairBodies(np.zeros(len(x1), dtype=np.int64), np.zeros((0, len(x1))), state)
     distances = dyn.sampson(dyn.FundamentalMatrix, found.fundamentals, *(x.expand(bodies, -1, -1) for x in (x1, x2)))
     labels = torch.zeros(len(x1), dtype=torch.long).index_copy(0, rows, found.labels).numpy()
-    return PairBodies(_joined(task, labels, distances.numpy(), float(found.threshold)), distances.numpy(), state)
+    return PairBodies(_assign_others(task, labels, distances.numpy(), float(found.threshold)), distances.numpy(), state)
 
 
-def _joined(task: PairTask, labels: IntArray, distances: FloatArray, threshold: float) -> IntArray:
+def _assign_others(task: PairTask, labels: IntArray, distances: FloatArray, threshold: float) -> IntArray:
     """The labels with those of the matches that were not divided: of the body of most matches beside them, if its motion agrees."""
     from scipy.spatial import cKDTree
 
@@ -176,7 +176,7 @@ def _joined(task: PairTask, labels: IntArray, distances: FloatArray, threshold: 
     return labels
 
 
-def verified(database: MatchDatabase, pair: DatabasePair, matches: IntArray, images: list[SeenImage], seed: int) -> PairGeometry:
+def verify(database: MatchDatabase, pair: DatabasePair, matches: IntArray, images: list[SeenImage], seed: int) -> PairGeometry:
     """What COLMAP's own estimation makes of some matches of a pair, as its matchers would have written it."""
     module = colmap()
     settings = module.TwoViewGeometryOptions()

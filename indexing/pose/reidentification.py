@@ -33,7 +33,7 @@ class Sightings:
     notes: tuple[str, ...] = ()  # what a user should know
 
 
-def joined(parts: Sequence[Sightings]) -> Sightings:
+def concatenate(parts: Sequence[Sightings]) -> Sightings:
     """Consecutive parts of a video as one; each has tracks of its own."""
     frames = np.cumsum([0, *(len(part.times) for part in parts)])
     tracks = np.cumsum([0, *(int(part.tracks.max(initial=-1)) + 1 for part in parts)])
@@ -73,7 +73,9 @@ def identities(seen: Sightings, max_absence: float = 2.0) -> list[Indices]:
     for moment, begun in groupby(tracks, key=lambda one: one.begin):
         fresh = list(begun)
         recent = [owner for owner in recent if moment - owner[-1].end <= max_absence]
-        cost = np.array([[_apart(owner[-1], one, max_absence) for one in fresh] for owner in recent]).reshape(-1, len(fresh))
+        cost = np.array([[_association_cost(owner[-1], one, max_absence) for one in fresh] for owner in recent]).reshape(
+            -1, len(fresh)
+        )
         taken = set()
         while cost.size and cost.min() <= 1:
             i, j = (int(k) for k in np.unravel_index(int(np.argmin(cost)), cost.shape))
@@ -103,7 +105,7 @@ def _stretch(seen: Sightings, rows: Indices) -> _Stretch:
     return _Stretch(rows, float(times[0]), float(times[-1]), seen.joints[rows[0]], seen.joints[rows[-1]])
 
 
-def _apart(old: _Stretch, new: _Stretch, max_absence: float) -> float:
+def _association_cost(old: _Stretch, new: _Stretch, max_absence: float) -> float:
     """How far somebody is from where somebody was, in what is allowed; infinite where they cannot be the same."""
     gap = new.begin - old.end
     if not 0 < gap <= max_absence:

@@ -8,8 +8,8 @@ from itertools import count
 import numpy as np
 import pytest
 
-from indexing.pose import identities as room
-from indexing.pose.identities import Sightings, identities, joined, largest
+from indexing.pose import reidentification as room
+from indexing.pose.reidentification import Sightings, concatenate, identities, largest
 from indexing.pose.tracking import windows
 
 BODY = np.array([[0.0, 0.0], [20.0, 30.0], [10.0, 80.0]])
@@ -59,7 +59,7 @@ def test_one_sighting_a_frame_is_of_the_largest_who_is_there():
 
 def test_parts_joined_keep_their_tracks_apart():
     one, other = tracks((0, 3, 0, 0, 1), frames=4), tracks((1, 2, 0, 0, 1), (2, 3, 90, 0, 1), frames=4)
-    both = joined([one, other])
+    both = concatenate([one, other])
     assert both.at.tolist() == [0, 1, 2, 3, 5, 6, 6, 7] and len(both.times) == 8
     assert both.tracks.tolist() == [0, 0, 0, 0, 1, *other.tracks[1:] + 1]
 
@@ -67,7 +67,7 @@ def test_parts_joined_keep_their_tracks_apart():
 def test_nobody_is_nobody():
     nobody = Sightings(np.arange(3.0), *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 3, 2)), np.zeros((0, 3)))
     assert identities(nobody) == [] and largest(nobody, []).tolist() == []
-    assert joined([nobody, nobody]).times.tolist() == [0, 1, 2, 0, 1, 2]
+    assert concatenate([nobody, nobody]).times.tolist() == [0, 1, 2, 0, 1, 2]
 
 
 def every_pair(seen: Sightings, max_absence: float) -> list[list[int]]:
@@ -78,7 +78,9 @@ def every_pair(seen: Sightings, max_absence: float) -> list[list[int]]:
     for moment in sorted({one.begin for one in left}):
         fresh = [one for one in left if one.begin == moment]
         pairs = sorted(
-            (room._apart(owner[-1], one, max_absence), i, j) for i, owner in enumerate(owners) for j, one in enumerate(fresh)
+            (room._association_cost(owner[-1], one, max_absence), i, j)
+            for i, owner in enumerate(owners)
+            for j, one in enumerate(fresh)
         )
         taken: dict[int, int] = {}
         for far, i, j in pairs:
@@ -109,7 +111,7 @@ def test_who_may_return_is_found_as_among_everybody(seed):
 def test_thousands_of_tracks_are_not_compared_with_each_other(monkeypatch):
     """Looks at two tracks and looks at two moments are counted."""
     number, looks = 20_000, count(1)
-    apart, stretch = room._apart, room._stretch
+    apart, stretch = room._association_cost, room._stretch
 
     def counted(value):
         assert next(looks) < 40 * number
@@ -121,7 +123,7 @@ def test_thousands_of_tracks_are_not_compared_with_each_other(monkeypatch):
 
         __hash__ = float.__hash__
 
-    monkeypatch.setattr(room, "_apart", lambda *what: counted(apart(*what)))
+    monkeypatch.setattr(room, "_association_cost", lambda *what: counted(apart(*what)))
     monkeypatch.setattr(room, "_stretch", lambda seen, rows: replace(one := stretch(seen, rows), begin=Moment(one.begin)))
     at = np.arange(number)
     seen = Sightings(3.0 * at, at, at, np.tile(BODY, (number, 1, 1)), np.ones((number, len(BODY))))
