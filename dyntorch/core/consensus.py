@@ -16,8 +16,8 @@ from dyntorch.core.matrix import unpack
 from dyntorch.core.normalize import Normalization, normalization, relative
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, triangle
 from dyntorch.core.residual import SINGULAR, whiten
-from dyntorch.core.solution import copied
-from dyntorch.numerics.blocks import Draws, Record, each, map_blocks, put, workers
+from dyntorch.core.solution import with_copies
+from dyntorch.numerics.blocks import Draws, Record, each, map_blocks, replace_problems, workers
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.eigenspaces import orthonormal
 from dyntorch.numerics.nullspace import gram_null_space
@@ -27,7 +27,7 @@ from dyntorch.numerics.nullspace import gram_null_space
 
 
 SHIFT_EPSILON = 1e-14  # of the trace: keeps the factor of an exactly singular Gram finite
-FAR = 1e30  # squared distance in place of one that is no number
+HUGE_SQUARE = 1e30  # squared distance in place of one that is no number
 MAX_SEARCHED = 1000
 """Matches among which is searched, at least 10 for every column; of more, a random part (all are used for the final fit)."""
 GROSS_OUTLIER = 5.0
@@ -97,7 +97,7 @@ class Bundle:
             norms = norms * u[..., 0, :].square().sum(-2) if primitive.rows == 1 else norms
         return norms.clamp(min=1e-300)
 
-    def constrained(self, basis: Tensor) -> Tensor:
+    def constrain_to_motions(self, basis: Tensor) -> Tensor:
         """The tensors of the motions that tensors ``(b, c, K, a, D)`` decompose into; where no motion guides, the tensors."""
         if self.invariant.starts is not None:
             return basis
@@ -127,7 +127,7 @@ class Bundle:
         r"""Squared Sampson distances ``(b, K, n)`` in the unit of the measurements, and row weights ``(b, c, K, n)``."""
         slot = transfer_slot(self.primitives)
         square, rows = self._form(basis) if slot is None else self._transfer(basis, slot)
-        return square.nan_to_num(nan=FAR, posinf=FAR).clamp(max=FAR), rows.nan_to_num(nan=0.0, posinf=0.0)
+        return square.nan_to_num(nan=HUGE_SQUARE, posinf=HUGE_SQUARE).clamp(max=HUGE_SQUARE), rows.nan_to_num(nan=0.0, posinf=0.0)
 
     def _form(self, basis: Tensor) -> tuple[Tensor, Tensor]:
         """Values of the multilinear form on all rows of a match over the length of their gradients."""
@@ -222,7 +222,7 @@ def anneal(data: Bundle, basis: Tensor, end: Tensor | None, iterations: int, *, 
     start: Tensor | None = None
     shrinking = SHRINKING_SHARE * iterations
     for i in range(iterations):
-        square, rows = data.distances(data.constrained(basis) if guided and i < shrinking else basis)
+        square, rows = data.distances(data.constrain_to_motions(basis) if guided and i < shrinking else basis)
         if guided and 2 * i < iterations:
             # the gradients of a wrong tensor mislead: half their say doubles the successes of lines (175, 30 % outliers)
             rows = (rows / data.lengths()[:, :, None]).sqrt()
@@ -255,7 +255,7 @@ def median(square: Tensor, weights: Tensor) -> Tensor:
     """Median ``(b, K)`` over the matches with weight."""
     order = square.masked_fill(weights[:, None] <= 0, torch.inf).sort(-1).values
     middle = ((weights > 0).sum(-1) // 2).clamp(max=order.shape[-1] - 1)
-    return order.gather(-1, middle[:, None, None].expand(*order.shape[:2], 1))[..., 0].clamp(max=FAR)
+    return order.gather(-1, middle[:, None, None].expand(*order.shape[:2], 1))[..., 0].clamp(max=HUGE_SQUARE)
 
 
 def _products(vectors: list[Tensor]) -> Tensor:
@@ -274,7 +274,7 @@ STARTS_BLOCK = 1 << 20
 """Numbers in one block of the batch (8 MB)."""
 
 
-class Found(NamedTuple):
+class SearchResult(NamedTuple):
     """The best tensor of each problem."""
 
     basis: Tensor
@@ -290,13 +290,13 @@ class Found(NamedTuple):
     agreeing: Tensor
     """``(b,)`` share of the starts that ended there, of so many that it says something, else 0."""
 
-    def better(self, new: Found, at: Tensor) -> Found:
+    def better(self, new: SearchResult, at: Tensor) -> SearchResult:
         """With the new ones of some problems, where they lose less."""
         wins = new.score < self.score[at]
-        return put(self, at[wins], each(lambda x: x[wins], new))
+        return replace_problems(self, at[wins], each(lambda x: x[wins], new))
 
 
-class Searched(NamedTuple):
+class SearchMatches(NamedTuple):
     """Matches among which is searched."""
 
     weights: Tensor
@@ -319,18 +319,18 @@ class Search:
         self.invariant, self.data = invariant, data
         self.draws = Draws(len(data.weights), generator, data.weights.device)
         self.everyone = torch.arange(len(data.weights), device=data.weights.device)
-        near = data.weights * _near(invariant, data)
-        views, weights, _ = copied(invariant, data.views, near, None)
+        near = data.weights * _without_gross_outliers(invariant, data)
+        views, weights, _ = with_copies(invariant, data.views, near, None)
         self.norm: Normalization = normalization(invariant, views, weights)
         # the search measures in this unit, so that no limit of it depends on that of the matches
         self.unit = relative([t.flatten(1)[:, 0] for t in self.norm.transforms])[1]
         self.some = some = self._some()
-        moved = self.norm.apply(invariant, copied(invariant, some.views, some.weights, None)[0])
+        moved = self.norm.apply(invariant, with_copies(invariant, some.views, some.weights, None)[0])
         self.weights = some.weights / some.weights.amax(-1, keepdim=True).clamp(min=1e-300)
         views = moved if invariant.copies else tuple(x[:, None] for x in moved)
-        self.searched = Searched(self.weights, views, self.norm.transforms)
+        self.searched = SearchMatches(self.weights, views, self.norm.transforms)
 
-    def run(self, cut: Tensor, starts: Sequence[int]) -> Found:
+    def run(self, cut: Tensor, starts: Sequence[int]) -> SearchResult:
         """Best tensors: more and more starts for the problems that need them.
 
         Args:
@@ -348,7 +348,7 @@ class Search:
             new = self._solve(left, cut, count)
             found = found.better(new, left)
             # more starts would find it again
-            settled[left] = (new.agreeing >= MIN_AGREEING_STARTS) & (new.score <= self._same(found.score[left]))
+            settled[left] = (new.agreeing >= MIN_AGREEING_STARTS) & (new.score <= self._equal_score(found.score[left]))
         return found
 
     def scale(self) -> Tensor:
@@ -356,9 +356,9 @@ class Search:
         inv, everyone, count = self.invariant, self.everyone, NUM_SCALE_STARTS
         chosen = torch.cat([self.weights[:, None], self._samples(everyone, count)], dim=1)
 
-        def block(searched: Searched, chosen: Tensor) -> Tensor:
+        def block(searched: SearchMatches, chosen: Tensor) -> Tensor:
             work = self._bundle(searched)
-            basis = _best(work, work.first(chosen), lambda square: median(square, work.weights), count + 1)
+            basis = _select_starts(work, work.first(chosen), lambda square: median(square, work.weights), count + 1)
             basis = concentrate(work, anneal(work, basis, None, SCALE_REWEIGHTINGS, guided=True), None, NUM_CONCENTRATIONS)
             return median(work.distances(basis)[0], work.weights).amin(1)
 
@@ -368,30 +368,30 @@ class Search:
         return threshold_of(inv, middle.sqrt() * few / quantile(0.5, inv.codim) ** 0.5) / self.unit
 
     def evidence(self, tensor: Tensor, cut: Tensor) -> Tensor:
-        """Evidence ``(b,)``, see :class:`Found`, of normalized tensors as a solution holds them, with another threshold."""
+        """Evidence ``(b,)``, see :class:`SearchResult`, of normalized tensors as a solution holds them, with another threshold."""
         inv = self.invariant
         tensors = inv.basis_of(tensor)
 
-        def block(searched: Searched, basis: Tensor, cut: Tensor) -> Tensor:
+        def block(searched: SearchMatches, basis: Tensor, cut: Tensor) -> Tensor:
             work = self._bundle(searched)
             square = work.distances(basis[:, :, None])[0][:, 0]
-            return judge(work, basis[:, :, None], square, cut.square())[0]
+            return evidence_and_doubt(work, basis[:, :, None], square, cut.square())[0]
 
         return self._map(block, self.everyone, tensors if inv.copies else tensors[:, None], cut * self.unit)
 
-    def _solve(self, where: Tensor, cut: Tensor, count: int) -> Found:
+    def _solve(self, where: Tensor, cut: Tensor, count: int) -> SearchResult:
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
         kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
         steps = REWEIGHTINGS[kind]
         keep = max(1, count // STARTS_PER_ANNEALED_SAMPLE) if kind == "minimal" else count
 
-        def block(searched: Searched, chosen: Tensor, cut: Tensor) -> Found:
+        def block(searched: SearchMatches, chosen: Tensor, cut: Tensor) -> SearchResult:
             work, limit = self._bundle(searched), cut.square()
 
             def score(square: Tensor) -> Tensor:
                 return msac(square, work.weights, limit)
 
-            basis = _best(work, work.first(chosen), score, keep)
+            basis = _select_starts(work, work.first(chosen), score, keep)
             unguided = -(-keep // STARTS_PER_UNGUIDED)
             free, led = basis[:, :, :unguided], basis[:, :, unguided:]
             if kind == "many":
@@ -400,16 +400,16 @@ class Search:
             else:
                 basis = anneal(work, basis, limit, steps)
             lost = score(work.distances(basis)[0])
-            agreeing = (lost <= self._same(lost.amin(-1, keepdim=True))).double().mean(-1)
+            agreeing = (lost <= self._equal_score(lost.amin(-1, keepdim=True))).double().mean(-1)
             agreeing = agreeing * (lost.shape[-1] >= MIN_STARTS_TO_COMPARE)
-            basis = concentrate(work, _chosen(basis, lost.argmin(-1, keepdim=True)), limit, NUM_CONCENTRATIONS)
+            basis = concentrate(work, _gather_starts(basis, lost.argmin(-1, keepdim=True)), limit, NUM_CONCENTRATIONS)
             square = work.distances(basis)[0]
-            evidence, doubt = judge(work, basis, square[:, 0], limit)
-            return Found(basis[:, :, 0], score(square)[:, 0], evidence, doubt, square[:, 0] <= limit[:, None], agreeing)
+            evidence, doubt = evidence_and_doubt(work, basis, square[:, 0], limit)
+            return SearchResult(basis[:, :, 0], score(square)[:, 0], evidence, doubt, square[:, 0] <= limit[:, None], agreeing)
 
         return self._map(block, where, chosen, cut[where])
 
-    def _same(self, score: Tensor) -> Tensor:
+    def _equal_score(self, score: Tensor) -> Tensor:
         """The score up to which two finds are the same one: the weight of a hundredth of a match is no difference."""
         return score * (1 + SAME_SCORE) + SAME_SCORE
 
@@ -439,7 +439,7 @@ class Search:
         size = min(STARTS_BLOCK // per_problem, -(-len(where) // workers()))
         return map_blocks(function, each(lambda x: x[where], self.searched), starts, *more, size=max(1, size))
 
-    def _bundle(self, searched: Searched) -> Bundle:
+    def _bundle(self, searched: SearchMatches) -> Bundle:
         transforms = searched.transforms
         primitives = tuple(p.normalized(t) for p, t in zip(self.invariant.primitives, transforms, strict=True))
         base = self.invariant.normalized(tuple(t[:, None] for t in transforms))
@@ -447,13 +447,13 @@ class Search:
         return bundle(base, primitives, searched.views, scales, searched.weights)
 
 
-def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+def evidence_and_doubt(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
     r"""Evidence and doubt ``(b,)`` of one tensor per problem."""
     present = work.weights > 0
     n, k = present.sum(-1).to(square), ((square <= limit[:, None]) & present).sum(-1).to(square)
     m = torch.full_like(n, float(work.invariant.minimal()))
     hits, trials = torch.zeros_like(n), torch.zeros_like(n)
-    for mixed in _mixed(work):
+    for mixed in _shuffle_views(work):
         real = mixed.weights > 0
         hits = hits + ((mixed.distances(basis)[0][:, 0] <= limit[:, None]) & real).sum(-1)
         trials = trials + real.sum(-1)
@@ -463,7 +463,7 @@ def judge(work: Bundle, basis: Tensor, square: Tensor, limit: Tensor) -> tuple[T
     return torch.where(k > m, evidence, torch.inf), (k <= m) | (evidence >= 0) | (near > MAX_NEAR_MISSES * k)
 
 
-def _mixed(work: Bundle) -> list[Bundle]:
+def _shuffle_views(work: Bundle) -> list[Bundle]:
     """Random matches: view v shifted against the first one by v steps of several sizes."""
     n, count = work.weights.shape[-1], len(work.views)
     steps = sorted({max(1, (2 * j + 1) * n // (2 * NUM_SHUFFLES * count)) for j in range(NUM_SHUFFLES)})
@@ -483,19 +483,19 @@ def _choose(n: Tensor, k: Tensor) -> Tensor:
     return torch.lgamma(n + 1) - torch.lgamma(k + 1) - torch.lgamma(n - k + 1)
 
 
-def _best(work: Bundle, basis: Tensor, score: Callable[[Tensor], Tensor], count: int) -> Tensor:
+def _select_starts(work: Bundle, basis: Tensor, score: Callable[[Tensor], Tensor], count: int) -> Tensor:
     """The ``count`` starts with the least score."""
     if basis.shape[2] <= count:
         return basis
-    return _chosen(basis, score(work.distances(basis)[0]).topk(count, largest=False).indices)
+    return _gather_starts(basis, score(work.distances(basis)[0]).topk(count, largest=False).indices)
 
 
-def _chosen(basis: Tensor, order: Tensor) -> Tensor:
+def _gather_starts(basis: Tensor, order: Tensor) -> Tensor:
     """The starts ``(b, count)`` of ``(b, c, K, a, D)``."""
     return basis.gather(2, order[:, None, :, None, None].expand(*basis.shape[:2], order.shape[-1], *basis.shape[3:]))
 
 
-def _near(invariant: Invariant, data: Matches) -> Tensor:
+def _without_gross_outliers(invariant: Invariant, data: Matches) -> Tensor:
     """Matches ``(b, n)`` without gross outliers, which would make the others small."""
     keep = data.weights > 0
     for primitive, x in zip(invariant.primitives, data.views, strict=True):

@@ -17,35 +17,35 @@ from dyntorch.core.matrix import estimation_matrix, gram, labelled_rows, triangu
 from dyntorch.core.normalize import Normalization, denormalize, normalization
 from dyntorch.core.outcome import Status, failed
 from dyntorch.core.primitives import Primitive
-from dyntorch.core.solution import Solution, copied
+from dyntorch.core.solution import Solution, with_copies
 from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
 from dyntorch.numerics.eigenspaces import on_host, orthonormal
 from dyntorch.numerics.function_transforms import over_problems
 from dyntorch.numerics.nullspace import GramNullSpace, gram_null_space, null_space
 
-AMBIGUOUS = 0.5
+MAX_RELATIVE_NOISE = 0.5
 """Residual energy of the solution times the harmonic sum of that of all other directions: above it another tensor fits as well.
 Measured: 0.02 for the homography tensor at 2 px and 0.1 at 5 px (100 matches), 0.01 to 0.1 for the tensors of space at usual noise;
 1 to 5 for scenes of lower rank with noise (velocities in a plane, lines that only translate), 3 % of them below 0.5."""
-NARROW, JUDGED, CHANCE, QUANTILE = 9, 5, 1.3, -2.576
+MAX_NARROW_WIDTH, MIN_SPARE_ROWS, CHANCE_FACTOR, CHANCE_QUANTILE = 9, 5, 1.3, -2.576
 """A tensor of up to 9 entries has few other directions, and from few matches one is small by chance: random matches passed
 AMBIGUOUS in 5 % of 1500 problems for 12 in one dimension (16 % for 8) and in 1.4 % for a fundamental matrix of 16.  There the limit
 is the 0.5 % quantile of chi-square over the rows to spare, times what random matches showed it to be off (1.1 to 2); true
 collineations of a line keep it at noise of 3 % of the scene (8 matches) to 10 % (12).  Fewer than 5 rows to spare judge nothing."""
-ILL_CONDITIONED = 1e-10
+MAX_GRAM_ROUNDING = 1e-10
 """Rounding error of a null vector from a float64 Gram, eps * (s_1 / s_{D-1})^2, above which the matrix itself is decomposed, unless
 the noise outweighs it a thousandfold anyway."""
-WORN = 1e-6
+MAX_GRADIENT_ROUNDING = 1e-6
 """The same rounding error, as that of derivatives, which come from a Gram in any case, above which the rows are levelled first
 (unless the noise, which the derivatives of levelled rows leave out, outweighs it)."""
 ROUNDING = 32.0
 """Singular value, in units of eps times the largest, up to which exact matches make it by their rounding: those that the Gram calls
 degenerate are so in their rows as well.  Measured on 70 kinds of degenerate matches: 3 at most where the centre of the views is
 within their extent; a centre so many extents away loses so many times the digits.  Of general matches the smallest was 1e5."""
-WEAK = 5e5
+MIN_CONDITION_OF_NOISE = 5e5
 """Trace of the Gram times the harmonic sum of its other eigenvalues above which noise may reach the last of them.  General motion
 has 1e4 (lines) to 3e5 (constant velocity, 60 matches), data of lower rank 1e6 at noise of 1 % of the scene and 1e9 at 0.03 %."""
-BLOCK, LEAST = 5 << 19, 1 << 20
+BLOCK, MIN_BLOCK = 5 << 19, 1 << 20
 """Numbers in the largest temporary of one block of the batch, summed in pieces by the Gram, and fewest in a block that is cut for
 the sake of another core.  Measured best: 364 problems of 200 points of the plane (47 us each; 128: 59), 131 of space.  100 problems
 of 100 points take 3.9 ms on one core; cut for two they take 5.5."""
@@ -110,7 +110,7 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
     if data.views[0].shape[0] and few:
         raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
     check_plain(invariant)
-    solve = partial(_solved, invariant, normalize, torch.finfo(data.dtype).eps)
+    solve = partial(_fit_blocks, invariant, normalize, torch.finfo(data.dtype).eps)
     (whole, present), found = over_problems(solve, data.views, data.weights, data.static)
     data = replace(data, views=whole, weights=present)
     pairs = zip(invariant.primitives, found.transforms, strict=True)
@@ -119,7 +119,7 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
     return Solution(invariant, tensor, uncertainty, data, norm, found.normalized, status=status)
 
 
-class Solved(NamedTuple):
+class LinearFits(NamedTuple):
     """Linear fits of a block of problems, in their own coordinates and in normalized ones."""
 
     tensor: Tensor
@@ -131,17 +131,17 @@ class Solved(NamedTuple):
     """As in :class:`~dyntorch.core.normalize.Normalization`."""
 
 
-def _solved(
+def _fit_blocks(
     invariant: Invariant, normalize: bool, precision: float, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
-) -> tuple[tuple[tuple[Tensor, ...], Tensor], Solved]:
+) -> tuple[tuple[tuple[Tensor, ...], Tensor], LinearFits]:
     """Views and weights ``(b, n, ...)`` with what they lack filled in, and the linear fits of all problems."""
     views, weights = invariant.completed(views, weights)
     count = weights.shape[-1]
     per_problem = count * max(1, invariant.copies or 1) * _largest(invariant)
-    most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, LEAST))
+    most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, MIN_BLOCK))
     size = min(most, max(least, -(-len(weights) // workers())))
-    copies = copied(invariant, views, weights, static)
-    return (views, weights), map_blocks(partial(_solve, invariant, normalize, precision), *copies, size=size)
+    copies = with_copies(invariant, views, weights, static)
+    return (views, weights), map_blocks(partial(_fit_block, invariant, normalize, precision), *copies, size=size)
 
 
 def _largest(invariant: Invariant) -> int:
@@ -154,9 +154,9 @@ def _largest(invariant: Invariant) -> int:
     return size
 
 
-def _solve(
+def _fit_block(
     invariant: Invariant, normalize: bool, precision: float, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
-) -> Solved:
+) -> LinearFits:
     """One block."""
     # components first in memory: every later pass then runs along the matches
     views = tuple(x.mT.contiguous().mT for x in views)
@@ -170,7 +170,7 @@ def _solve(
         # as many digits as the measurements have, less those that their distance from the origin takes
         away = torch.stack([t[..., :-1, -1].norm(dim=-1) for t in norm.transforms]).amax(0).detach()
         rows = EstimationRows(norm.primitives, moved, weights, static, ROUNDING * precision * (1 + away))
-        basis, status, uncertainty = _null(invariant, rows)
+        basis, status, uncertainty = _solve_null_space(invariant, rows)
         tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
     else:
         tensor, uncertainty = own.tensor, own.uncertainty
@@ -184,7 +184,7 @@ def _solve(
     held = flat.isfinite().all(-1) & (flat != 0).any(-1)
     status = torch.where(held | failed(status), status, int(Status.DEGENERATE))
     sound = ~failed(status)
-    return Solved(select(sound, back, 0.0), select(sound, tensor, 0.0), status, uncertainty, norm.transforms, norm.actions)
+    return LinearFits(select(sound, back, 0.0), select(sound, tensor, 0.0), status, uncertainty, norm.transforms, norm.actions)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class EstimationRows:
         return self.primitives, self.views, self.weights, self.static
 
 
-def _null(invariant: Invariant, rows: EstimationRows) -> tuple[Tensor, Tensor, Tensor]:
+def _solve_null_space(invariant: Invariant, rows: EstimationRows) -> tuple[Tensor, Tensor, Tensor]:
     """Null space ``(*batch, nullity, D)``, status and uncertainty ``(*batch,)`` of normalized matches."""
     nullity, width, weights = invariant.nullity, invariant.width(), rows.weights
     present = (weights > 0).sum(-1) * invariant.rows()
@@ -232,7 +232,7 @@ def _null(invariant: Invariant, rows: EstimationRows) -> tuple[Tensor, Tensor, T
     few = present < width - nullity
     if rows.static is None:
         few = few | ((weights > 0).sum(-1) < invariant.minimal())
-    found, again = _decided(g, nullity, factor, torch.where(few, torch.inf, rows.rounding))
+    found, again = _null_space_by_rows(g, nullity, factor, torch.where(few, torch.inf, rows.rounding))
     basis = found.basis
     spare = (present - (width - nullity)).clamp(min=0)
     # the noise that the solution leaves, per row, against what every other direction has
@@ -240,21 +240,21 @@ def _null(invariant: Invariant, rows: EstimationRows) -> tuple[Tensor, Tensor, T
     square = torch.where(spare > 0, noise * found.competing, torch.zeros_like(noise)).detach()
     trace = g.diagonal(dim1=-2, dim2=-1).sum(-1)
     rounding = torch.finfo(g.dtype).eps * (trace * found.competing).detach()
-    exact = (rounding > ILL_CONDITIONED) & (rounding > 1e-3 * square)
+    exact = (rounding > MAX_GRAM_ROUNDING) & (rounding > 1e-3 * square)
     exact = (exact.index_fill(0, again, True) if len(again) else exact) & ~found.degenerate
     # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
-    limit = 0.0 if invariant.intrinsic else WEAK
+    limit = 0.0 if invariant.intrinsic else MIN_CONDITION_OF_NOISE
     weak = (spare > 0) & ~found.degenerate & (trace * found.competing > limit)
     if invariant.copies is not None:
         weak = torch.zeros_like(weak)
-    worn = exact & (rounding > WORN) & (rounding > square) & _followed(g)
+    worn = exact & (rounding > MAX_GRADIENT_ROUNDING) & (rounding > square) & _needs_gradient(g)
     # an accelerator waits once per block for all answers: what a tensor and its status are must not depend on where it lives
     asked = int((exact & ~worn).any().long() + 2 * weak.any() + 4 * worn.any())
     if asked & 1:
         basis = _with_matrix(basis, exact & ~worn, null_space, rows, invariant, host=bool(len(again)))
     if asked & 4:
-        basis = _with_matrix(basis, worn, _levelled, rows, invariant, host=bool(len(again)))
-    ambiguous = square * present.clamp(min=1) > _limit(spare, width)
+        basis = _with_matrix(basis, worn, _preconditioned_null_space, rows, invariant, host=bool(len(again)))
+    ambiguous = square * present.clamp(min=1) > _ambiguity_limit(spare, width)
     if asked & 2:
         place = weak.nonzero(as_tuple=True)  # an accelerator waits here, and for every mask that is an index
         with torch.no_grad():
@@ -262,13 +262,17 @@ def _null(invariant: Invariant, rows: EstimationRows) -> tuple[Tensor, Tensor, T
     return basis, _status(few, found.degenerate, ambiguous), square.sqrt()
 
 
-def _limit(spare: Tensor, width: int) -> Tensor:
-    """Of :data:`AMBIGUOUS` for so many rows to spare ``(*batch,)``, such that matches by chance stay above it."""
-    if width > NARROW:
-        return torch.full_like(spare, AMBIGUOUS, dtype=torch.float64)
+def _ambiguity_limit(spare: Tensor, width: int) -> Tensor:
+    """Of :data:`MAX_RELATIVE_NOISE` for so many rows to spare ``(*batch,)``, such that matches by chance stay above it."""
+    if width > MAX_NARROW_WIDTH:
+        return torch.full_like(spare, MAX_RELATIVE_NOISE, dtype=torch.float64)
     # the quantile of chi-square over its mean (Wilson and Hilferty)
-    part = 2 / (9 * spare.clamp(min=JUDGED).double())
-    return torch.where(spare >= JUDGED, (CHANCE * (1 - part + QUANTILE * part.sqrt()) ** 3).clamp(max=AMBIGUOUS), AMBIGUOUS)
+    part = 2 / (9 * spare.clamp(min=MIN_SPARE_ROWS).double())
+    return torch.where(
+        spare >= MIN_SPARE_ROWS,
+        (CHANCE_FACTOR * (1 - part + CHANCE_QUANTILE * part.sqrt()) ** 3).clamp(max=MAX_RELATIVE_NOISE),
+        MAX_RELATIVE_NOISE,
+    )
 
 
 def _status(few: Tensor, degenerate: Tensor, ambiguous: Tensor) -> Tensor:
@@ -278,7 +282,9 @@ def _status(few: Tensor, degenerate: Tensor, ambiguous: Tensor) -> Tensor:
     return torch.where(few, int(Status.TOO_FEW), status)
 
 
-def _decided(gram: Tensor, dim: int, factor: Callable[[Tensor], Tensor], tolerance: Tensor) -> tuple[GramNullSpace, Tensor]:
+def _null_space_by_rows(
+    gram: Tensor, dim: int, factor: Callable[[Tensor], Tensor], tolerance: Tensor
+) -> tuple[GramNullSpace, Tensor]:
     r"""``gram_null_space`` whose ``degenerate`` does not depend on the device, and is what the rows say, not their squares.
     gram ``(b, ..., D, D)``, factor ``(k,)``, tolerance ``(b, ...)`` -> ``(k,)``."""
     found = gram_null_space(gram, dim)
@@ -287,7 +293,7 @@ def _decided(gram: Tensor, dim: int, factor: Callable[[Tensor], Tensor], toleran
     if not len(doubted):
         return found, doubted
     if not on_host(gram):
-        found = _replaced(found, doubted, **vars(gram_null_space(gram[doubted].cpu(), dim)))
+        found = _replace_problems(found, doubted, **vars(gram_null_space(gram[doubted].cpu(), dim)))
         doubted = _some(found.degenerate & asked)
         if not len(doubted):
             return found, doubted
@@ -296,7 +302,7 @@ def _decided(gram: Tensor, dim: int, factor: Callable[[Tensor], Tensor], toleran
     lost = others[..., -1] <= tolerance[doubted].cpu() * values[..., 0]
     # of a null space that is larger there is nothing to say
     competing = torch.where(lost[..., None], 1.0, others).square().reciprocal().sum(-1)
-    return _replaced(found, doubted, residual=null.square(), competing=competing, degenerate=lost), doubted
+    return _replace_problems(found, doubted, residual=null.square(), competing=competing, degenerate=lost), doubted
 
 
 def _some(flagged: Tensor) -> Tensor:
@@ -304,7 +310,7 @@ def _some(flagged: Tensor) -> Tensor:
     return flagged.flatten(1).any(-1).nonzero()[:, 0] if flagged.ndim > 1 else flagged.nonzero()[:, 0]
 
 
-def _replaced(found: GramNullSpace, place: Tensor, **parts: Tensor) -> GramNullSpace:
+def _replace_problems(found: GramNullSpace, place: Tensor, **parts: Tensor) -> GramNullSpace:
     """The null spaces with these parts of some problems."""
     put = {name: (whole := getattr(found, name)).index_put((place,), part.to(whole.device)) for name, part in parts.items()}
     return replace(found, **put)
@@ -328,12 +334,12 @@ def _with_matrix(
     return basis.index_put(place, found.to(basis.device))
 
 
-def _followed(x: Tensor) -> bool:
+def _needs_gradient(x: Tensor) -> bool:
     """Whether somebody wants a derivative of it."""
     return (torch.is_grad_enabled() and x.requires_grad) or forward_ad.unpack_dual(x).tangent is not None
 
 
-def _levelled(matrix: Tensor, dim: int) -> Tensor:
+def _preconditioned_null_space(matrix: Tensor, dim: int) -> Tensor:
     r"""``null_space`` of rows that hardly tell some vectors from null ones."""
     with torch.no_grad():
         finite = torch.isfinite(matrix).flatten(1).all(-1)[:, None, None]

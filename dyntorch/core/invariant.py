@@ -20,12 +20,12 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
 from torch import Tensor
 
 from dyntorch.core.primitives import Primitive
-from dyntorch.numerics.least_squares import flattened, jacobian, parts_of
+from dyntorch.numerics.least_squares import flatten_parts, jacobian, parts_of
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-ARGUMENTS = ("weights", "static", "dimensions", "normalize", "threshold", "generator", "starts", "polish", "iterations", "options")
+ARGUMENTS = ("weights", "static", "dimensions", "normalize", "threshold", "generator", "starts", "polish", "iterations")
 """What ``fit``, ``robust_fit``, ``refine`` and ``sampson`` take by name for every invariant."""
 
 
@@ -165,7 +165,7 @@ class Invariant:
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """The tensor, flat ``(b, D)``, and its derivative ``(b, p, D)`` by all entries of the motion ``(b, ...)``."""
         shapes = [part.shape[1:] for part in motion]
-        return jacobian(lambda t: self.compose(*parts_of(t, shapes)).flatten(t.ndim - 1), flattened(motion))
+        return jacobian(lambda t: self.compose(*parts_of(t, shapes)).flatten(t.ndim - 1), flatten_parts(motion))
 
     def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """The same for matches that do not move: all their views agree under the motion.  ``(*batch, n, c)``."""

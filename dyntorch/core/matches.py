@@ -12,7 +12,7 @@ from torch import Tensor
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.primitives import Point, Primitive
 from dyntorch.numerics.arguments import FARTHEST, check_tensor, refuse_vmap
-from dyntorch.numerics.function_transforms import over_problems, transformed
+from dyntorch.numerics.function_transforms import is_transformed, over_problems
 
 WIDEST = 4096
 """Unknowns of a tensor; the Gram of one problem then takes 134 MB."""
@@ -43,7 +43,7 @@ class Matches:
         result = result.reshape((*self.batch, *result.shape[1:]))
         return result.to(device=self.device, dtype=self.dtype if result.is_floating_point() else result.dtype)
 
-    def restricted(self, keep: Tensor) -> Matches:
+    def restrict(self, keep: Tensor) -> Matches:
         """The same matches with weight 0 where ``keep (b, n)`` is False."""
         return Matches(self.views, self.weights * keep, self.static, self.batch, self.dtype, self.device)
 
@@ -78,10 +78,10 @@ def matches(
     weight = _weights(option("weights", weights, batch, n, first), flat[0])
     label = option("static", static, batch, n, first)
     if dimensions is not None:
-        label = _freed(invariant, option("dimensions", dimensions, batch, n, first), static is not None)
+        label = _free_slots(invariant, option("dimensions", dimensions, batch, n, first), static is not None)
     elif label is not None:
         label = label.bool() if invariant.within == 2 else label.bool() * (invariant.within - 1)
-    looked_at = home.type == "cpu" and not transformed(tuple(flat), weight)
+    looked_at = home.type == "cpu" and not is_transformed(tuple(flat), weight)
     if looked_at and bool(weight.detach().sum().isfinite()) and all(bool(_near(x.detach())) for x in flat):
         # nothing is missing: one norm per view says so, and nothing is copied
         return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
@@ -103,7 +103,7 @@ def check_plain(invariant: Invariant) -> None:
     """Raise a ``ValueError`` for an invariant whose own numbers are inside of a transformation of ``torch.func``."""
     held = [part for part in vars(invariant).values() if isinstance(part, Tensor)]
     held += [part for primitive in invariant.primitives for part in vars(primitive).values() if isinstance(part, Tensor)]
-    if transformed(*held):
+    if is_transformed(*held):
         raise ValueError(
             f"{invariant!r} holds numbers that torch.func transforms (cameras, an interval of times): make it from what is not "
             "transformed, or give all problems at once, in leading dimensions"
@@ -143,7 +143,7 @@ def _labels(label: Tensor | None, home: torch.device) -> Tensor | None:
     return None if label is None else label.to(home)
 
 
-def _freed(invariant: Invariant, dimensions: Tensor | None, static: bool) -> Tensor:
+def _free_slots(invariant: Invariant, dimensions: Tensor | None, static: bool) -> Tensor:
     """Slots ``(b, n)`` that hold anything, for matches within subspaces of known dimensions."""
     assert dimensions is not None
     if not invariant.labels_static:

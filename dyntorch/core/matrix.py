@@ -29,7 +29,7 @@ def estimation_matrix(
     blocks = [_kronecker(vectors, weights * (static == 0))]
     # a projector is its own Gram, so its rows serve as the vectors
     free = [p.free(x) for p, x in zip(primitives, views, strict=True)]
-    for slots in _freed(len(views), static):
+    for slots in _free_slots(len(views), static):
         chosen = [free[v] if v in slots else u for v, u in enumerate(vectors)]
         blocks.append(_kronecker(chosen, weights * (static == len(slots))))
     lead = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
@@ -103,13 +103,13 @@ def _moments(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: 
         return moment(packed, weights)
     moments = moment(packed, weights * (static == 0))
     free = [_pack(p.free(x)) for p, x in zip(primitives, views, strict=True)]
-    for slots in _freed(len(views), static):
+    for slots in _free_slots(len(views), static):
         chosen = [free[v] if v in slots else m for v, m in enumerate(packed)]
         moments = moments + moment(chosen, weights * (static == len(slots)))
     return moments
 
 
-def _freed(views: int, static: Tensor) -> list[tuple[int, ...]]:
+def _free_slots(views: int, static: Tensor) -> list[tuple[int, ...]]:
     """Which slots are free at once in some match."""
     most = 1 if static.dtype == torch.bool else int(static.max()) if static.numel() else 0
     return [slots for count in range(1, most + 1) for slots in combinations(range(views), count)]

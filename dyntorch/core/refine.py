@@ -13,12 +13,20 @@ from dyntorch.core.matches import Matches, check_plain, largest_weights, matches
 from dyntorch.core.matrix import gram
 from dyntorch.core.normalize import Normalization, denormalize, denormalize_motion, relative
 from dyntorch.core.outcome import failed, in_order
-from dyntorch.core.refine_gradient import followed, unfinished, wanted
+from dyntorch.core.refine_gradient import differentiable_minimum, needs_gradient, unfinished_notices
 from dyntorch.core.residual import multilinear_derivative, residual_derivative
 from dyntorch.core.solution import Solution
 from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
-from dyntorch.numerics.function_transforms import over_problems, transformed
-from dyntorch.numerics.least_squares import LeastSquaresOptions, Minimum, NormalEquations, flattened, jacobian, minimize, parts_of
+from dyntorch.numerics.function_transforms import is_transformed, over_problems
+from dyntorch.numerics.least_squares import (
+    LeastSquaresOptions,
+    Minimum,
+    NormalEquations,
+    flatten_parts,
+    jacobian,
+    minimize,
+    parts_of,
+)
 from dyntorch.numerics.nullspace import spectrum
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -289,7 +297,7 @@ def refine(
         data = replace(data, weights=data.weights * (keep > 0 if solution.inliers is not None else keep))
     if data.static is None and old.static is not None:
         data = replace(data, static=old.static)
-    if not transformed(data.views, data.weights, data.static, solution.normalized, solution.normalization.transforms):
+    if not is_transformed(data.views, data.weights, data.static, solution.normalized, solution.normalization.transforms):
         return refine_matches(solution, data, iterations)
     return _of_transformed(solution, data, iterations)
 
@@ -333,10 +341,10 @@ def _of_transformed(solution: Solution, data: Matches, iterations: int) -> Solut
 
 def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIONS) -> Solution:
     """:func:`refine` for checked matches."""
-    invariant, motion, recorded = solution.invariant, solution.normalized_motion(), wanted(solution, data)
-    starts = [flattened(motion).detach()]
+    invariant, motion, recorded = solution.invariant, solution.normalized_motion(), needs_gradient(solution, data)
+    starts = [flatten_parts(motion).detach()]
     if invariant.starts is not None and solution.refined is None:
-        starts.append(flattened(algebraic_motion(solution, data)))
+        starts.append(flatten_parts(algebraic_motion(solution, data)))
     base, shapes = solution.base(), tuple(part.shape[1:] for part in motion)
     frames = tuple(t.detach() for t in solution.frames())
     views = tuple(p.move(x, t).detach() for p, x, t in zip(invariant.primitives, data.views, frames, strict=True))
@@ -361,14 +369,14 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
         gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in found.terms)
         found = Minimum(found.theta, found.cost / unit.square(), (gradient, matrix), found.steps)
         if not recorded:
-            return _refined(solution, data, motion, found)
-        open_ = unfinished(found, invariant.dof, data.batch)
-    theta, cost = followed(solution, data, shapes, found)
-    refined = _refined(solution, data, motion, Minimum((theta,), cost, found.terms, found.steps))
+            return _apply_minimum(solution, data, motion, found)
+        open_ = unfinished_notices(found, invariant.dof, data.batch)
+    theta, cost = differentiable_minimum(solution, data, shapes, found)
+    refined = _apply_minimum(solution, data, motion, Minimum((theta,), cost, found.terms, found.steps))
     return replace(refined, notices=in_order((*solution.notices, *open_)))
 
 
-def _refined(solution: Solution, data: Matches, old: tuple[Tensor, ...], found: Minimum) -> Solution:
+def _apply_minimum(solution: Solution, data: Matches, old: tuple[Tensor, ...], found: Minimum) -> Solution:
     """The solution with the refined motion, where refinement was possible; elsewhere with the old one."""
     invariant, shapes = solution.invariant, tuple(part.shape[1:] for part in old)
     good = found.cost.isfinite() & ~failed(solution.status.reshape(-1).to(found.cost.device))

@@ -11,7 +11,7 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import relative
 from dyntorch.core.outcome import Notice, NoticeCode, notices
-from dyntorch.core.residual import whitened
+from dyntorch.core.residual import whitened_residual
 from dyntorch.core.solution import Solution
 from dyntorch.numerics.blocks import map_blocks
 from dyntorch.numerics.implicit import flat_directions, follow_minimum
@@ -40,13 +40,15 @@ class RefineNotice(NoticeCode):
     """Refinement took all its steps, and gradients were wanted."""
 
 
-def wanted(solution: Solution, data: Matches) -> bool:
+def needs_gradient(solution: Solution, data: Matches) -> bool:
     """Whether gradients are recorded of what refinement depends on."""
     given = *data.views, data.weights, *solution.normalization.transforms
     return torch.is_grad_enabled() and any(x.requires_grad for x in given)
 
 
-def followed(solution: Solution, data: Matches, shapes: tuple[torch.Size, ...], found: Minimum) -> tuple[Tensor, Tensor]:
+def differentiable_minimum(
+    solution: Solution, data: Matches, shapes: tuple[torch.Size, ...], found: Minimum
+) -> tuple[Tensor, Tensor]:
     """Parameters ``(b, p)`` of the minimum and its cost ``(b,)``, in the unit of the matches, with their derivatives."""
     invariant, theta = solution.invariant, found.theta[0]
     count, labelled = len(data.views), data.static is not None
@@ -73,17 +75,21 @@ def _cost(invariant: Invariant, shapes: tuple[torch.Size, ...], count: int, labe
         moved = tuple(p.move(x, t) for p, x, t in zip(invariant.primitives, views, frames, strict=True))
         scales, unit = relative([t[:, 0, 0] for t in frames])
         base, motion = invariant.normalized(transforms), parts_of(theta, shapes)
-        total = whitened(base, motion, moved, scales).square().sum(-1) * torch.where(label == 0, weights, 0.0)
+        total = whitened_residual(base, motion, moved, scales).square().sum(-1) * torch.where(label == 0, weights, 0.0)
         for free in range(1, (2 if label.dtype == torch.bool else invariant.within) if labelled else 1):
             smaller = base.confined(free)
-            rest = base.whitened_static(motion, moved, scales) if smaller is None else whitened(smaller, motion, moved, scales)
+            rest = (
+                base.whitened_static(motion, moved, scales)
+                if smaller is None
+                else whitened_residual(smaller, motion, moved, scales)
+            )
             total = total + rest.square().sum(-1) * torch.where(label == free, weights, 0.0)
         return total.sum(-1) / unit.square()
 
     return cost
 
 
-def unfinished(found: Minimum, dof: int, batch: tuple[int, ...]) -> list[Notice]:
+def unfinished_notices(found: Minimum, dof: int, batch: tuple[int, ...]) -> list[Notice]:
     """A notice for every problem whose next step would still be long and lower its cost."""
     gradient, matrix = found.terms
     values, vectors = spectrum(matrix)

@@ -12,8 +12,8 @@ from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import check_plain, check_views
 from dyntorch.numerics.arguments import FARTHEST
 from dyntorch.numerics.blocks import select
-from dyntorch.numerics.function_transforms import over_problems, transformed
-from dyntorch.numerics.least_squares import by_match, flattened, parts_of
+from dyntorch.numerics.function_transforms import is_transformed, over_problems
+from dyntorch.numerics.least_squares import by_match, flatten_parts, parts_of
 
 SINGULAR = 1e-14  # squared gradient, in normalized units, added where value and gradient vanish together (static points)
 LETTERS = "abcdefghijkl"
@@ -45,7 +45,7 @@ def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Te
     _check(invariant, tensor, views)
     if invariant.nullity > 1 or invariant.copies is not None:
         raise ValueError(f"the tensors of {invariant!r} do not stand alone: a match has no single algebraic residual; use sampson")
-    views, missing = _whole(invariant, views)
+    views, missing = _mask_missing(invariant, views)
     return _infinite(_form(invariant, tensor, views)[0], missing)
 
 
@@ -83,11 +83,11 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
     """
     invariant, views = as_invariant(invariant).prepared(views, **given)
     _check(invariant, tensor, views)
-    views, missing = _whole(invariant, views)
+    views, missing = _mask_missing(invariant, views)
     ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
     if invariant.single():
         return _infinite(multilinear(invariant, tensor, views, ones).abs(), missing)
-    if not transformed(tensor, views):
+    if not is_transformed(tensor, views):
         return _infinite(distance(invariant, invariant.motion_of(tensor), views, ones), missing)
     check_plain(invariant)
     return _infinite(_of_transformed(invariant, tensor, views, missing.shape[:-1]), missing)
@@ -112,7 +112,7 @@ def _flat(x: Tensor, batch: torch.Size, leading: int) -> Tensor:
     return x.expand(*batch, *x.shape[leading:]).reshape(math.prod(batch), *x.shape[leading:])
 
 
-def _whole(invariant: Invariant, views: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], Tensor]:
+def _mask_missing(invariant: Invariant, views: Sequence[Tensor]) -> tuple[tuple[Tensor, ...], Tensor]:
     """The views with 0 for matches that are missing in any of them, and which these are, ``(*batch, n)``."""
     present = [(x.abs() <= FARTHEST).flatten(p.match_axis(x) + 1).all(-1) for p, x in zip(invariant.primitives, views, strict=True)]
     missing = ~torch.stack(present).all(0)
@@ -138,10 +138,12 @@ def _check(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor]) -> Non
 
 def distance(invariant: Invariant, motion: tuple[Tensor, ...], views: Sequence[Tensor], scales: tuple[Tensor, ...]) -> Tensor:
     """Sampson distance ``(*batch, n)`` from the motion, in standard deviations of noise ``scales``; see :func:`sampson`."""
-    return whitened(invariant, motion, views, scales).norm(dim=-1)
+    return whitened_residual(invariant, motion, views, scales).norm(dim=-1)
 
 
-def whitened(invariant: Invariant, motion: tuple[Tensor, ...], views: Sequence[Tensor], scales: tuple[Tensor, ...]) -> Tensor:
+def whitened_residual(
+    invariant: Invariant, motion: tuple[Tensor, ...], views: Sequence[Tensor], scales: tuple[Tensor, ...]
+) -> Tensor:
     """Whitened residual ``(*batch, n, c)`` of matches that may move: the invariant's own, or that of its multilinear form."""
     own = invariant.whitened(motion, tuple(views), scales)
     return own if own is not None else multilinear(invariant, invariant.compose(*motion), views, scales)[..., None]
@@ -159,7 +161,7 @@ def residual_derivative(
     def of_copies(theta: Tensor, scales: tuple[Tensor, ...], single: tuple[Tensor, ...]) -> Tensor:
         return residual(parts_of(theta, shapes), single, scales)
 
-    return by_match(of_copies, flattened(motion), scales, views)
+    return by_match(of_copies, flatten_parts(motion), scales, views)
 
 
 def multilinear(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor], scales: tuple[Tensor, ...]) -> Tensor:

@@ -8,14 +8,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from dyntorch.core.consensus import Found, Search, threshold_of
+from dyntorch.core.consensus import Search, SearchResult, threshold_of
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.normalize import denormalize, relative
 from dyntorch.core.outcome import Status, failed
 from dyntorch.core.refine import refine_matches
-from dyntorch.core.residual import multilinear, whitened
+from dyntorch.core.residual import multilinear, whitened_residual
 from dyntorch.core.solution import NOISY, Solution
 from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
 from dyntorch.numerics.chi_square import quantile
@@ -134,7 +134,7 @@ def _threshold(threshold: float | Tensor, data: Matches) -> Tensor:
     return value
 
 
-def _finish(search: Search, found: Found, cut: Tensor, rounds: Sequence[int], *, estimate: bool) -> Solution:
+def _finish(search: Search, found: SearchResult, cut: Tensor, rounds: Sequence[int], *, estimate: bool) -> Solution:
     """Refine on the inliers, choose them again, and say how it ended."""
     invariant, data = search.invariant, search.data
     solution = _solution(search, found)
@@ -142,7 +142,7 @@ def _finish(search: Search, found: Found, cut: Tensor, rounds: Sequence[int], *,
     for i, steps in enumerate(rounds):
         if estimate:
             cut = _update_threshold(invariant, data, distance, cut) * (WIDE_THRESHOLD if i + 1 < len(rounds) else 1.0)
-        refined = refine_matches(solution, data.restricted(_within(data, distance, cut)), iterations=steps)
+        refined = refine_matches(solution, data.restrict(_within(data, distance, cut)), iterations=steps)
         new = distances(refined)
         # the tensor found has more freedom than the motion, so the first motion may well cost more
         better = (_score(data, new, cut) < _score(data, distance, cut)) | (i == 0)
@@ -150,14 +150,14 @@ def _finish(search: Search, found: Found, cut: Tensor, rounds: Sequence[int], *,
     cut = _update_threshold(invariant, data, distance, cut) if estimate else cut
     evidence = search.evidence(solution.normalized, cut)
     # a tensor that the matches leave open has no motion, and so no inliers by it
-    exact = fit_matches(invariant, search.some.restricted(found.inliers)).status.reshape(-1).to(cut.device)
+    exact = fit_matches(invariant, search.some.restrict(found.inliers)).status.reshape(-1).to(cut.device)
     degenerate = (exact == int(Status.DEGENERATE)) & (found.evidence < 0)
     sigma = _sigma(invariant, data, distance, cut)
     if estimate:
         # with the noise unknown, a tensor whose inliers fill the scene has found nothing
         extent = torch.stack([t.reshape(len(cut), -1, *t.shape[-2:])[:, 0, 0, 0] for t in search.norm.transforms]).amax(0)
         evidence = torch.where(sigma * extent > NOISY, 1.0, evidence)
-    return _judged(solution, evidence, degenerate, _within(data, distance, cut), sigma)
+    return _with_status(solution, evidence, degenerate, _within(data, distance, cut), sigma)
 
 
 def _update_threshold(invariant: Invariant, data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
@@ -171,7 +171,7 @@ def _within(data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
     return (distance <= cut[:, None]) & (data.weights > 0)
 
 
-def _solution(search: Search, found: Found) -> Solution:
+def _solution(search: Search, found: SearchResult) -> Solution:
     """The tensors found, as a solution in the coordinates of the search."""
     invariant, norm, data = search.invariant, search.norm, search.data
     tensor = invariant.tensor_of(found.basis if invariant.copies else found.basis[:, 0])
@@ -195,7 +195,7 @@ def distances(solution: Solution) -> Tensor:
         scales, unit = relative([t[:, 0, 0] for t in frames])
         if alone:
             return multilinear(invariant, motion[0], views, scales).abs() / unit[:, None]
-        return whitened(invariant, motion, views, scales).norm(dim=-1) / unit[:, None]
+        return whitened_residual(invariant, motion, views, scales).norm(dim=-1) / unit[:, None]
 
     size = max(1, min(BLOCK // max(1, data.count), -(-len(data.weights) // workers())))
     return map_blocks(block, solution.frames(), data.views, parts, size=size).nan_to_num(nan=torch.inf)
@@ -229,10 +229,10 @@ def _pick(better: Tensor, new: Solution, old: Solution) -> Solution:
     )
 
 
-def _judged(solution: Solution, evidence: Tensor, degenerate: Tensor, inliers: Tensor, sigma: Tensor) -> Solution:
+def _with_status(solution: Solution, evidence: Tensor, degenerate: Tensor, inliers: Tensor, sigma: Tensor) -> Solution:
     """The solution with its status, inliers and noise."""
     invariant, data = solution.invariant, solution.matches
-    linear = fit_matches(invariant, data.restricted(inliers))
+    linear = fit_matches(invariant, data.restrict(inliers))
     status = torch.where(evidence < 0, linear.status.reshape(-1).to(evidence.device), int(Status.NO_CONSENSUS))
     status = torch.where(degenerate, int(Status.DEGENERATE), status)
     few = (data.weights > 0).sum(-1) < invariant.minimal()

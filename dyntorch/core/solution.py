@@ -78,7 +78,7 @@ class Solution(Outcome):
         m = self.matches
         if self.invariant.motion_alone:
             raise ValueError(f"{self.invariant!r} has no estimation matrix: it holds the motion of all views, and no tensor")
-        views, weights, static = copied(self.invariant, m.views, m.weights, m.static)
+        views, weights, static = with_copies(self.invariant, m.views, m.weights, m.static)
         moved = self.normalization.apply(self.invariant, views)
         values = torch.linalg.svdvals(triangular_factor(self.normalization.primitives, moved, weights, static))
         width = self.invariant.width()
@@ -180,7 +180,7 @@ class Solution(Outcome):
     def __repr__(self) -> str:
         if mapped_over(self.status):
             return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={tuple(self.status.shape)}: mapped over)"
-        noise = "" if self.sigma is None else _shown(self.sigma[self.status == Status.OK])
+        noise = "" if self.sigma is None else _noise_text(self.sigma[self.status == Status.OK])
         shape = tuple(self.status.shape)
         return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {self.counted()}{noise})"
 
@@ -189,12 +189,12 @@ def _frames(transforms: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     return tuple(t.reshape(t.shape[0], *t.shape[-2:]) for t in transforms)
 
 
-def _shown(sigma: Tensor) -> str:
+def _noise_text(sigma: Tensor) -> str:
     """The noise for a repr: of a batch the median."""
     return f", sigma {'about ' if sigma.numel() > 1 else ''}{float(sigma.detach().median()):.2g}" if sigma.numel() else ""
 
 
-def copied(
+def with_copies(
     invariant: Invariant, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
 ) -> tuple[tuple[Tensor, ...], Tensor, Tensor | None]:
     """Views, weights and labels with the dimension of copies behind the batch, for an invariant that has it."""

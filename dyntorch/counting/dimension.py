@@ -43,7 +43,7 @@ def dim_v(n: int, m: int, k: int) -> int:
         raise ValueError(f"the dimension of V({n}, {m}, {k}) may have more than {DIGITS:,} bits; take a smaller n or m")
     if k >= m:
         return int(n**m)
-    if _many(m, min(k, n)):
+    if _has_many_hooks(m, min(k, n)):
         raise ValueError(
             f"{m} has too many partitions into up to {min(k, n)} parts, more than {HOOKS // m:,}; take a smaller m, or n or k"
         )
@@ -104,7 +104,7 @@ def partitions(m: int, parts: int | None = None, largest: int | None = None) -> 
                 yield (first, *rest)
 
 
-def _many(m: int, parts: int) -> bool:
+def _has_many_hooks(m: int, parts: int) -> bool:
     """Whether the partitions of m into so many parts have more than HOOKS hooks."""
     ways = [1] + [0] * m  # by parts of sizes up to the current one, as many as of up to so many parts
     for size in range(1, min(parts, m) + 1):

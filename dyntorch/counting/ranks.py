@@ -237,7 +237,7 @@ def _configuration(what: str | int | Sampler, options: dict[str, Any]) -> tuple[
             raise ValueError(f"unknown configuration {what!r}; known are {', '.join(CONFIGURATIONS)}; or pass numbers or a sampler")
         return what, CONFIGURATIONS[what], next(iter(options_of(what)))
     if callable(what):
-        return getattr(what, "__name__", "sampler"), _sampled, "matches"
+        return getattr(what, "__name__", "sampler"), _sample, "matches"
     if isinstance(what, bool) or not isinstance(what, int) or what < 0:
         raise ValueError(f"expected the name of a configuration, the dimension of a space or a sampler, got {what!r}")
     if not {"views", "profile"} & options.keys():
@@ -281,7 +281,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(0 <= value <= MOST)
 
 
-def _sampled(field: Field, *, sampler: Sampler, matches: int | None = None) -> list[Step]:
+def _sample(field: Field, *, sampler: Sampler, matches: int | None = None) -> list[Step]:
     rows = iter(sampler(field))
 
     def draw() -> IntArray:
@@ -296,7 +296,7 @@ def _count(name: str, configure: Configuration, field: Field, options: dict[str,
         tally.take(step)
     rank, usual = tally.rank, steps[-1]
     more: int | None = 0
-    if configure is _sampled:
+    if configure is _sample:
         more = None
     elif usual.matches is not None:
         more = len(set(tally.ranks(dataclasses.replace(usual, matches=None))) - {rank})

@@ -34,14 +34,14 @@ class FilmedBody(NamedTuple):
         """``(b, c, 3, 4)`` of the cameras."""
         return self.calibrations @ self.sights
 
-    def placed(self) -> Tensor:
+    def points_in_camera(self) -> Tensor:
         """``(b, frames, n, 3)`` points before the first camera."""
         return self.points[:, None] @ self.motions[..., :3].mT + self.motions[..., None, :, 3]
 
     def images(self, camera: Tensor) -> tuple[Tensor, Tensor]:
         """Images ``(b, frames, n, 2)`` and depths ``(b, frames, n)`` of points that the cameras ``(n,)`` see."""
         own = self.projections[:, camera]  # (b, n, 3, 4)
-        seen = torch.einsum("bnij,btnj->btni", own[..., :3], self.placed()) + own[:, None, :, :, 3]
+        seen = torch.einsum("bnij,btnj->btni", own[..., :3], self.points_in_camera()) + own[:, None, :, :, 3]
         return seen[..., :2] / seen[..., 2:], seen[..., 2]
 
 
@@ -94,8 +94,8 @@ class BodyProblem(LeastSquares):
         calibrations = at.calibrations.clone()
         calibrations[..., rows, columns] -= inner.unflatten(-1, (cameras, INTRINSICS))
         sights = at.sights.clone()
-        sights[:, 1:] = _turned(at.sights[:, 1:], -turns.unflatten(-1, (cameras - 1, 6)))
-        return calibrations, sights, _turned(at.motions, -own), at.points - points.unflatten(-1, (n, 3))
+        sights[:, 1:] = _move_cameras(at.sights[:, 1:], -turns.unflatten(-1, (cameras - 1, 6)))
+        return calibrations, sights, _move_cameras(at.motions, -own), at.points - points.unflatten(-1, (n, 3))
 
     def information(self, at: FilmedBody) -> Tensor:
         """``(b, frames, 6, 6)`` of the motions, all else known: turns in radians about the origin, then moves."""
@@ -135,7 +135,7 @@ class BodyProblem(LeastSquares):
         return error.flatten(2), torch.cat(blocks, -1).flatten(2, 3), own
 
 
-def _turned(motion: Tensor, tangent: Tensor) -> Tensor:
+def _move_cameras(motion: Tensor, tangent: Tensor) -> Tensor:
     r"""[R T] with :math:`e^{[\omega]} R` and :math:`T + \tau`."""
     rotation = rotation_exponential(tangent[..., :3]) @ motion[..., :3]
     return torch.cat([rotation, (motion[..., 3] + tangent[..., 3:])[..., None]], -1)

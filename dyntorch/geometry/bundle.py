@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.geometry.calibrated_cameras import CalibratedCameras
-from dyntorch.geometry.triangulation import observed
+from dyntorch.geometry.triangulation import mask_missing
 from dyntorch.numerics.arguments import check_tensor, check_together
 from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
@@ -99,7 +99,7 @@ class BundleProblem(LeastSquares):
         cameras, points = at.theta
         linear = self._linear(cameras, points)
         images, slope, error = linear.images, linear.slope, linear.error
-        panel, pivots = _eliminated(_damped(_gram(linear.by_point), points, damping, self.outside), linear.by_point)
+        panel, pivots = _eliminate_points(_damp_blocks(_gram(linear.by_point), points, damping, self.outside), linear.by_point)
         reduced = panel[:, points.shape[1] :]
         whitened = (reduced * error.flatten(1, 2)[:, :, None]).sum(1)
         rest = error - (reduced * whitened[:, None]).sum(2).view_as(error)
@@ -122,8 +122,8 @@ class BundleProblem(LeastSquares):
         points = normalize(at.theta[1] - step[1], dim=1)
         linear = self._linear(cameras, points)
         gradient = (linear.by_point * linear.error.flatten(1, 2)[:, :, None]).sum(1, keepdim=True)
-        blocks = _damped(_gram(linear.by_point), points, torch.full_like(points[:, 0, 0], 1e-9), self.outside)
-        panel, pivots = _eliminated(blocks, gradient)
+        blocks = _damp_blocks(_gram(linear.by_point), points, torch.full_like(points[:, 0, 0], 1e-9), self.outside)
+        panel, pivots = _eliminate_points(blocks, gradient)
         settled = normalize(points - _back_substituted(panel, pivots, panel[:, -1]), dim=1)
         costs = self.costs(cameras, settled)
         better = costs < linear.costs
@@ -195,7 +195,7 @@ def _gram(rows: Tensor) -> Tensor:
     return total
 
 
-def _damped(gram: Tensor, points: Tensor, damping: Tensor, outside: Tensor | None) -> Tensor:
+def _damp_blocks(gram: Tensor, points: Tensor, damping: Tensor, outside: Tensor | None) -> Tensor:
     """The point blocks with damping, the free scale and the forbidden directions of every point held, and regular where nothing is
     known."""
     diagonal = gram.diagonal(dim1=1, dim2=2)
@@ -207,7 +207,7 @@ def _damped(gram: Tensor, points: Tensor, damping: Tensor, outside: Tensor | Non
     return gram
 
 
-def _eliminated(gram: Tensor, rows: Tensor) -> tuple[Tensor, list[Tensor]]:
+def _eliminate_points(gram: Tensor, rows: Tensor) -> tuple[Tensor, list[Tensor]]:
     r"""The panel :math:`(L; J L^{-T})` of :math:`V = L L^T`, ``(b, K + r, K, n)``, and the reciprocal diagonal of L."""
     panel, pivots = torch.cat([gram, rows], dim=1), []
     size = gram.shape[1]
@@ -339,9 +339,9 @@ def bundle_adjust(
     def flat(tensor: Tensor, *shape: int) -> Tensor:
         return tensor.detach().double().expand(*batch, *shape).reshape(count, *shape)
 
-    images, w = observed(x, weights)
+    images, w = mask_missing(x, weights)
     cameras_, points = flat(cameras, *cameras.shape[-3:]), flat(structure, *structure.shape[-2:])
-    w, moves, seen = _counted(flat(w, views, n), points, size)
+    w, moves, seen = _count_observations(flat(w, views, n), points, size)
     lift = None if lifts is None else flat(lifts, *lifts.shape[-3:])
     limit = None if scale is None else _scales(scale, batch, x.device)
     outside: Tensor | None = None
@@ -374,7 +374,7 @@ def bundle_adjust(
     )
 
 
-def _counted(weights: Tensor, structure: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+def _count_observations(weights: Tensor, structure: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
     """Weights of what counts, the points ``(b, n)`` that are seen often enough, and the views ``(b, v)`` that see any of them."""
     moves = ((weights > 0).sum(1) * size >= structure.shape[-1] - 1) & (structure != 0).any(-1)
     weights = weights * moves[:, None]
@@ -447,7 +447,7 @@ def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None
     def flat(tensor: Tensor, *shape: int) -> Tensor:
         return tensor.double().expand(*batch, *shape).reshape(count, *shape)
 
-    w = flat(observed(x, weights)[1], views, n)
+    w = flat(mask_missing(x, weights)[1], views, n)
     points = normalize(flat(structure, *structure.shape[-2:]), dim=-1).mT
     w = w * (points != 0).any(1)[:, None]
     lift = None if lifts is None else flat(lifts, *lifts.shape[-3:])

@@ -246,7 +246,7 @@ def check_matches(x1: Tensor, x2: Tensor, weights: Tensor | None = None) -> None
         )
 
 
-def described(result: object, labels: Tensor, degenerate: Tensor, bodies: int) -> str:
+def describe_labels(result: object, labels: Tensor, degenerate: Tensor, bodies: int) -> str:
     """Shape, how many matches each label has, and how many problems are degenerate, in two lines. labels ``(*batch, n)``,
     degenerate ``(*batch,)``."""
     counts = labels.flatten().bincount(minlength=bodies + 1).tolist()

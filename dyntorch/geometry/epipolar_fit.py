@@ -120,7 +120,7 @@ def _descend_block(tables: Products, F: Tensor, weights: Tensor, scales: Sequenc
     options, frames, found = replace(DESCENT, iterations=steps), Frames.of(F), None
     for scale in scales:
         problem = EpipolarProblem(tables, weights, 1 / max(scale, LEAST) ** 2)
-        start = problem.evaluate((frames.turns, frames.core)) if found is None else problem.again(found)
+        start = problem.evaluate((frames.turns, frames.core)) if found is None else problem.evaluate_at_scale(found)
         found = minimize(problem, start, options)
     assert found is not None
     return found.terms[0].unflatten(-1, (3, 3)), found.cost
@@ -141,7 +141,7 @@ class EpipolarProblem(LeastSquares):
         value, square = self.tables.data.flat_terms(f)
         return Iterate(theta, _msac(value, square, self.weights, self.inverse), (f, value, square))
 
-    def again(self, at: Minimum) -> Iterate:
+    def evaluate_at_scale(self, at: Minimum) -> Iterate:
         """The same place at another scale."""
         _, value, square = at.terms
         return Iterate(at.theta, _msac(value, square, self.weights, self.inverse), at.terms)

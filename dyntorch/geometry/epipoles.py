@@ -40,7 +40,7 @@ def epipoles(projections: Sequence[Tensor]) -> Tensor:
     centres = meet(*maps.unbind(-2))
     images = torch.einsum("...imk,...jk->...ijm", maps, centres)
     own = torch.eye(len(projections), dtype=torch.bool, device=views.device)[..., None]
-    return _oriented(images.masked_fill(own, 0.0)).to(views.dtype)
+    return _orient(images.masked_fill(own, 0.0)).to(views.dtype)
 
 
 @one_thread
@@ -152,9 +152,9 @@ def _meeting(lines: Tensor, coordinates: Tensor, dtype: torch.dtype) -> JointEpi
     sine = torch.linalg.vector_norm(crossing, dim=-1)
     points = torch.where((sine > FLAT)[..., None], (coordinates @ crossing[..., None])[..., 0], 0.0)
     seen = lines @ cofactors(coordinates).mT
-    return JointEpipoles(_oriented(points).to(dtype), _oriented(seen).to(dtype), sine.amin(-1).to(dtype))
+    return JointEpipoles(_orient(points).to(dtype), _orient(seen).to(dtype), sine.amin(-1).to(dtype))
 
 
-def _oriented(vectors: Tensor) -> Tensor:
+def _orient(vectors: Tensor) -> Tensor:
     """Unit vectors whose largest entry is positive."""
     return unit(vectors[..., None])[..., 0]

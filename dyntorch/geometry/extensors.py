@@ -188,10 +188,10 @@ def adjugate(matrix: Tensor) -> Tensor:
 def project(matrix: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     r"""Images :math:`y = \pi(A (x, 1))` of points, and the Jacobian :math:`\partial y / \partial x` of each. matrix
     ``(*batch, e + 1, d + 1)``, points ``(*batch, n, d)`` -> ``(*batch, n, e)``."""
-    return dehomogenized(points @ matrix[..., :-1].mT + matrix[..., None, :, -1], matrix[..., None, :, :-1])
+    return dehomogenize(points @ matrix[..., :-1].mT + matrix[..., None, :, -1], matrix[..., None, :, :-1])
 
 
-def dehomogenized(p: Tensor, derivative: Tensor) -> tuple[Tensor, Tensor]:
+def dehomogenize(p: Tensor, derivative: Tensor) -> tuple[Tensor, Tensor]:
     r"""Points :math:`\pi(p)` and the derivative of their coordinates. p ``(*batch, n, e + 1)``, derivative
     ``(*batch, n, e + 1, d)`` -> ``(*batch, n, e)``."""
     depth = finite_depth(p)

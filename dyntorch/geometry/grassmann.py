@@ -48,14 +48,14 @@ def grassmann_tensor(projections: Sequence[Tensor], profile: Sequence[int]) -> T
     # two halves of about the same step, whose last product is one matrix product
     cut = 1 + next(i for i in range(len(profile)) if 2 * sum(profile[: i + 1]) >= size)
     cut = min(cut, len(profile) - 1)
-    left, step = _joined(parts[:cut], profile[:cut], size)
-    right, _ = _joined(parts[cut:], profile[cut:], size)
+    left, step = _join_rows(parts[:cut], profile[:cut], size)
+    right, _ = _join_rows(parts[cut:], profile[cut:], size)
     sign = -1 if step * (size - step) % 2 else 1  # of (I, I^c) against (I^c, I)
     tensor = left @ (sign * dual(right, size, size - step)).mT
     return tensor.flatten(-2).unflatten(-1, [int(p.shape[-2]) for p in parts])
 
 
-def _joined(parts: Sequence[Tensor], steps: Sequence[int], size: int) -> tuple[Tensor, int]:
+def _join_rows(parts: Sequence[Tensor], steps: Sequence[int], size: int) -> tuple[Tensor, int]:
     """The joins of one row of each part, ``(*batch, rows, binomial(size, total step))``, and the step."""
     total, step = parts[0], steps[0]
     for part, more in zip(parts[1:], steps[1:], strict=True):
@@ -72,7 +72,7 @@ def grassmann_derivative(projections: Sequence[Tensor], profile: Sequence[int]) 
     derivatives, lengths = [], [int(p.shape[-2]) for p in parts]
     value: Tensor | None = None
     for i, (matrix, order) in enumerate(zip(projections, profile, strict=True)):
-        others, step = _joined([*parts[:i], *parts[i + 1 :]], [*profile[:i], *profile[i + 1 :]], size)
+        others, step = _join_rows([*parts[:i], *parts[i + 1 :]], [*profile[:i], *profile[i + 1 :]], size)
         # the rows of this view stand before those of the later ones
         sign = -1 if order * sum(profile[i + 1 :]) % 2 else 1
         weight = sign * dual(others, size, step)
@@ -144,7 +144,7 @@ def candidates(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int], tri
     with torch.no_grad():
         scaled, sound = unit(tensor.reshape(prod(batch), *tensor.shape[len(batch) :]))
         found = _recover(scaled, tables(tuple(profile), tuple(sizes), tries, tensor.device))
-        parts = balanced([torch.where(sound[:, None, None], part, torch.zeros_like(part)) for part in found])
+        parts = balance_projections([torch.where(sound[:, None, None], part, torch.zeros_like(part)) for part in found])
     return tuple(part.reshape(tries, *batch, *part.shape[-2:]).to(tensor.dtype) for part in parts)
 
 
@@ -169,15 +169,15 @@ def unit(tensor: Tensor) -> tuple[Tensor, Tensor]:
     return (flat / flat.norm(dim=-1, keepdim=True)).view(tensor.shape), sound[:, 0]
 
 
-def balanced(parts: Sequence[Tensor]) -> list[Tensor]:
+def balance_projections(parts: Sequence[Tensor]) -> list[Tensor]:
     """The same projections up to a collineation: all of norm 1, the columns of the stack orthogonal but for that.  Zeros stay."""
-    parts = _normalized(parts)
+    parts = _normalize(parts)
     stack = torch.cat(parts, dim=-2)
     stack = torch.linalg.qr(stack).Q * (stack != 0).any(-1, keepdim=True)
-    return _normalized(stack.split([int(part.shape[-2]) for part in parts], dim=-2))
+    return _normalize(stack.split([int(part.shape[-2]) for part in parts], dim=-2))
 
 
-def rotated(tensor: Tensor, compounds: Sequence[Tensor]) -> Tensor:
+def rotate_tensors(tensor: Tensor, compounds: Sequence[Tensor]) -> Tensor:
     """Tensors ``(b, N_1, ..., N_n)`` in images moved by rotations with ``compounds`` ``(tries, N_i, N_i)``: ``(tries, b, ...)``."""
     tries, count = compounds[0].shape[0], len(compounds)
     result = tensor.expand(tries, *tensor.shape)
@@ -235,7 +235,7 @@ def _replacements(size: int, alpha: int) -> tuple[Tensor, Tensor, Tensor]:
 
 def _recover(tensor: Tensor, table: Tables) -> list[Tensor]:
     """All candidates ``(tries, b, m_i, K)`` for tensors ``(b, ...)`` of norm 1."""
-    values = rotated(tensor, table.compounds)
+    values = rotate_tensors(tensor, table.compounds)
     tries, count = values.shape[:2]
     flat = values.flatten(0, 1).flatten(1)
     # the rows of the largest minor become the unit vectors; the minors count relative to it
@@ -328,7 +328,7 @@ def _axes(block: Tensor, row: int, column: int) -> Tensor:
     return (block if row <= column else block.mT).reshape(len(block), *shape)
 
 
-def _normalized(parts: Sequence[Tensor]) -> list[Tensor]:
+def _normalize(parts: Sequence[Tensor]) -> list[Tensor]:
     """Matrices of Frobenius norm 1; zero stays, and so does what is not finite."""
     return [unit_vectors(part.nan_to_num(0.0, 0.0, 0.0).flatten(-2)).view(part.shape) for part in parts]
 

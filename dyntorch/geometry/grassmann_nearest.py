@@ -10,7 +10,16 @@ from math import comb, prod
 import torch
 from torch import Tensor
 
-from dyntorch.geometry.grassmann import balanced, candidates, check, grassmann_derivative, grassmann_tensor, rotated, tables, unit
+from dyntorch.geometry.grassmann import (
+    balance_projections,
+    candidates,
+    check,
+    grassmann_derivative,
+    grassmann_tensor,
+    rotate_tensors,
+    tables,
+    unit,
+)
 from dyntorch.geometry.homogeneous import unit_vectors
 from dyntorch.numerics.blocks import constant, map_blocks
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, minimize
@@ -38,12 +47,12 @@ def projections_of(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int])
     scaled, sound = unit(tensor.reshape(prod(batch), *tensor.shape[len(batch) :]))
     # in turned images no minor vanishes for all projections of a kind, as many do for [I | 0]
     table = tables(tuple(profile), tuple(sizes), 1, tensor.device)
-    target = rotated(scaled, table.compounds)[0]
+    target = rotate_tensors(scaled, table.compounds)[0]
     problem = _Nearest(tuple(profile), tuple(sizes))
     with torch.no_grad():
-        theta = map_blocks(problem.solved, target.flatten(1), size=problem.block)
+        theta = map_blocks(problem.lowest_minimum, target.flatten(1), size=problem.block)
     if target.requires_grad:
-        theta = map_blocks(problem.followed, theta, target.flatten(1), size=problem.block)
+        theta = map_blocks(problem.follow_target, theta, target.flatten(1), size=problem.block)
     parts = [rotation.mT @ part for part, rotation in zip(problem.parts(theta), table.rotations, strict=True)]
     parts = _standard(parts, profile)
     parts = [torch.where(sound[:, None, None], part, 0.0).to(tensor.dtype) for part in parts]
@@ -62,11 +71,11 @@ class _Nearest:
         """Projections ``(b, m_i, K)`` of parameters ``(b, p)``."""
         return list(theta.unflatten(-1, (-1, self.width)).split(self.sizes, dim=-2))
 
-    def joined(self, parts: Sequence[Tensor]) -> Tensor:
+    def stack_projections(self, parts: Sequence[Tensor]) -> Tensor:
         """Parameters ``(b, p)``: the stack of all projections."""
         return torch.cat(list(parts), dim=-2).flatten(-2)
 
-    def solved(self, target: Tensor) -> Tensor:
+    def lowest_minimum(self, target: Tensor) -> Tensor:
         """The lowest minimum found, balanced."""
         first, *others = self.starts(target)
         theta, cost = self.nearest(first, target)
@@ -77,11 +86,11 @@ class _Nearest:
                 better = lower < (1 - EQUAL) * cost[far]
                 theta[far] = torch.where(better[:, None], again, theta[far])
                 cost[far] = torch.where(better, lower, cost[far])
-        return self.joined(balanced(self.parts(theta)))
+        return self.stack_projections(balance_projections(self.parts(theta)))
 
-    def followed(self, theta: Tensor, target: Tensor) -> Tensor:
+    def follow_target(self, theta: Tensor, target: Tensor) -> Tensor:
         """The minimum as a function of the target: the value that it has, with its first derivative and its second."""
-        sided = self.sided(theta, target)
+        sided = self.orient(theta, target)
         step = self.newton_step(theta, sided)[0]
         first = theta - (step - step.detach())
         with torch.no_grad():
@@ -89,7 +98,7 @@ class _Nearest:
             hessian = self.hessian(theta, sided, u, matrix) + self.free(theta)
         with torch.enable_grad():
             (slope,) = torch.autograd.grad(self.cost(first, sided).sum(), first, create_graph=True)
-        again = _solved(hessian, slope)[0]
+        again = _solve_positive_definite(hessian, slope)[0]
         return first - (again - again.detach())
 
     def starts(self, target: Tensor) -> list[Tensor]:
@@ -98,9 +107,9 @@ class _Nearest:
         cosine = (unit_vectors(grassmann_tensor(found, self.profile).flatten(2)) * target).sum(-1)
         order = (1 - cosine.square()).clamp(min=EQUAL).argsort(stable=True, dim=0)[:STARTS]
         every = torch.arange(len(target), device=target.device)
-        return [self.joined([part[best, every] for part in found]) for best in order]
+        return [self.stack_projections([part[best, every] for part in found]) for best in order]
 
-    def sided(self, theta: Tensor, target: Tensor) -> Tensor:
+    def orient(self, theta: Tensor, target: Tensor) -> Tensor:
         """The target with the sign of the tensor."""
         product = (grassmann_tensor(self.parts(theta), self.profile).flatten(1) * target.detach()).sum(-1, keepdim=True)
         return torch.where(product < 0, -target, target)
@@ -130,7 +139,7 @@ class _Nearest:
 
     def nearest(self, theta: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """The minimum next to ``theta``, of the target or its negative, and f there ``(b,)``."""
-        target = self.sided(theta, target)
+        target = self.orient(theta, target)
         active = torch.arange(len(theta), device=theta.device)
         for near in NEAR:
             found, done = self.newton(self.descend(theta[active], target[active], near), target[active])
@@ -166,12 +175,12 @@ class _Nearest:
         with torch.no_grad():
             u, slope, matrix = self.linearized(theta)
             hessian = self.hessian(theta, target.detach(), u, matrix)
-        return _solved(hessian + self.free(theta), -(slope @ _across(target, u)[..., None])[..., 0])
+        return _solve_positive_definite(hessian + self.free(theta), -(slope @ _across(target, u)[..., None])[..., 0])
 
     def hessian(self, theta: Tensor, target: Tensor, u: Tensor, matrix: Tensor) -> Tensor:
         r"""Second derivative of f where its gradient vanishes ``(b, p, p)``."""
         weight = _across(target, u) * u
-        rows, stack = _chosen(self.profile, self.sizes, theta.device), theta.unflatten(-1, (-1, self.width))
+        rows, stack = _determinant_rows(self.profile, self.sizes, theta.device), theta.unflatten(-1, (-1, self.width))
         inverse = torch.linalg.inv_ex(stack[:, rows]).inverse.nan_to_num(0.0, 0.0, 0.0)
         spread = inverse.new_zeros(*inverse.shape[:2], stack.shape[1], self.width)
         spread.scatter_(2, rows[..., None].expand(*inverse.shape[:2], -1, self.width), inverse.mT)
@@ -208,7 +217,7 @@ class NearestProblem(LeastSquares):
         gradient = -(slope @ _across(self.target, u)[..., None])[..., 0]
         diagonal = matrix.diagonal(dim1=-2, dim2=-1)
         floor = damping[:, None] * (diagonal + 1e-3 * diagonal.mean(-1, keepdim=True))
-        return (_solved(matrix + self.family.free(at.theta[0]) + torch.diag_embed(floor), gradient)[0],)
+        return (_solve_positive_definite(matrix + self.family.free(at.theta[0]) + torch.diag_embed(floor), gradient)[0],)
 
     def finished(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor:
         """Where the rest is left to Newton."""
@@ -226,7 +235,7 @@ def _standard(parts: Sequence[Tensor], profile: Sequence[int]) -> list[Tensor]:
     return [part * (scale[:, None] * flip)[:, None] for part in parts]
 
 
-def _solved(matrix: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
+def _solve_positive_definite(matrix: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
     """Solutions for positive definite matrices ``(b, p)``, zero for others, and which were ``(b,)``."""
     factor, failed = torch.linalg.cholesky_ex(matrix.nan_to_num(0.0, 0.0, 0.0))
     step = torch.cholesky_solve(vector[..., None], factor)[..., 0]
@@ -241,7 +250,7 @@ def _views(sizes: Sequence[int], width: int) -> list[slice]:
 
 
 @constant
-def _chosen(profile: tuple[int, ...], sizes: tuple[int, ...], device: torch.device) -> Tensor:
+def _determinant_rows(profile: tuple[int, ...], sizes: tuple[int, ...], device: torch.device) -> Tensor:
     """The rows of the stack of which each entry of the tensor is the determinant, ``(D, K)``."""
     starts = [0, *accumulate(sizes)]
     sets = [combinations(range(start, start + size), alpha) for start, size, alpha in zip(starts, sizes, profile, strict=False)]

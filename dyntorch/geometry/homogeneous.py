@@ -131,20 +131,20 @@ def cofactors(matrix: Tensor) -> Tensor:
 def null_vectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
     r"""Left and right null vector of a 3 x 3 matrix of rank two: :math:`y^T M = 0,\ M z = 0`. matrix ``(*batch, 3, 3)`` ->
     ``(*batch, 3)``."""
-    adjoint = cofactors(_scaled(matrix))
-    power = adjoint @ _scaled(adjoint).mT
+    adjoint = cofactors(_rescale(matrix))
+    power = adjoint @ _rescale(adjoint).mT
     for _ in range(SQUARINGS):
-        power = _scaled(power)
+        power = _rescale(power)
         power = power @ power
     # every column is a multiple of the vector; the longest one of them is never zero
     pick = power.detach().diagonal(dim1=-2, dim2=-1).argmax(dim=-1, keepdim=True)[..., None].expand(*power.shape[:-1], 1)
-    left = _scaled(power.gather(-1, pick))[..., 0]
+    left = _rescale(power.gather(-1, pick))[..., 0]
     left = left / _nonzero(torch.linalg.vector_norm(left, dim=-1, keepdim=True))
-    right = (_scaled(adjoint).mT @ left[..., None])[..., 0]
+    right = (_rescale(adjoint).mT @ left[..., None])[..., 0]
     return left, right / _nonzero(torch.linalg.vector_norm(right, dim=-1, keepdim=True))
 
 
-def _scaled(matrix: Tensor) -> Tensor:
+def _rescale(matrix: Tensor) -> Tensor:
     """Largest entry 1.  The scale is no variable: the null vectors do not depend on it."""
     return matrix / _nonzero(matrix.detach().abs().amax(dim=(-2, -1), keepdim=True))
 

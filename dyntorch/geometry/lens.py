@@ -53,7 +53,7 @@ def distort(x: Tensor, K: Tensor, dist: Tensor) -> Tensor:
         [[695.0, 240.0]]
     """
     _check(x, K, dist)
-    return _to_pixels(_bent(_from_pixels(x, K), _padded(dist))[0], K)
+    return _to_pixels(_distort_ideal(_from_pixels(x, K), _pad_coefficients(dist))[0], K)
 
 
 def undistort(x: Tensor, K: Tensor, dist: Tensor) -> Tensor:
@@ -84,19 +84,19 @@ def undistort(x: Tensor, K: Tensor, dist: Tensor) -> Tensor:
     """
     _check(x, K, dist)
     dtype, x, K, dist = x.dtype, x.double(), K.double(), dist.double()
-    target, k = _from_pixels(x, K), _padded(dist)
+    target, k = _from_pixels(x, K), _pad_coefficients(dist)
     with torch.no_grad():
         u, solved = _invert(target, k)
     # what has no solution stays out of the derivatives: the principal point, a solution of every lens, stands in for it
     solved = solved[..., None]
     u, target = torch.where(solved, u, 0.0), _from_pixels(torch.where(solved, x, K[..., None, :2, 2]), K)
     # one more step from the solution: it moves nothing, and its derivative is that of the implicit function
-    value, jacobian = _bent(u, k)
+    value, jacobian = _distort_ideal(u, k)
     u = u + _solve(jacobian.detach(), target - value)
     return torch.where(solved, _to_pixels(u, K), torch.nan).to(dtype)
 
 
-def undistorted(x: Tensor, calibration: Any) -> Tensor:
+def undistort_points(x: Tensor, calibration: Any) -> Tensor:
     """A camera's points without the distortion of its lens: :func:`undistort` for what a user hands over. x
     ``(*batch, n, 2)``, calibration ``(K, dist)``."""
     if calibration is None:
@@ -161,7 +161,7 @@ def _check(x: Tensor, K: Tensor, dist: Tensor) -> None:
         )
 
 
-def _padded(dist: Tensor) -> Tensor:
+def _pad_coefficients(dist: Tensor) -> Tensor:
     """``(*batch, 1, 8)``."""
     return torch.nn.functional.pad(dist, (0, 8 - dist.shape[-1]))[..., None, :]
 
@@ -174,7 +174,7 @@ def _to_pixels(u: Tensor, K: Tensor) -> Tensor:
     return (homogeneous(u) @ K.mT)[..., :2]
 
 
-def _bent(u: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
+def _distort_ideal(u: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
     """Where the lens images ``u (*batch, n, 2)``, in focal lengths, and the symmetric derivative ``(*batch, n, 2, 2)``."""
     k1, k2, p1, p2, k3, k4, k5, k6 = k.unbind(-1)
     x, y = u.unbind(-1)
@@ -201,12 +201,12 @@ def _invert(target: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
     """The points imaged at ``target``, and which of them are solutions on the near side of the fold."""
     u = torch.zeros_like(target)
     for step in range(1, CONTINUATION + NEWTON):
-        value, jacobian = _bent(u, k)
+        value, jacobian = _distort_ideal(u, k)
         u = u + _solve(jacobian, min(1.0, step / CONTINUATION) * target - value)
-    value, _ = _bent(u, k)
+    value, _ = _distort_ideal(u, k)
     solved = (value - target).abs().amax(-1) <= SOLVED * (1 + target.abs().amax(-1))
     way = torch.linspace(1 / SAMPLES, 1, SAMPLES, dtype=u.dtype, device=u.device)[:, *([None] * u.ndim)]
-    jacobian = _bent(way * u, k)[1]
+    jacobian = _distort_ideal(way * u, k)[1]
     # positive definite: neither folded once (determinant) nor twice (trace)
     first, mixed, _, second = jacobian.flatten(-2).unbind(-1)
     upright = (first * second > mixed.square()) & (first + second > 0)
@@ -365,9 +365,9 @@ def fit_distortion(
     if len(chosen) < MIN_MATCHES:
         return LensFit(ideal, (torch.inf, torch.inf), 0.0, False)
     data = LensMatches.of(a[chosen].double(), b[chosen].double(), weights[chosen].double(), ideal).subset(MAX_MATCHES)
-    plain, full = _fitted(data)
+    plain, full = _fit_lenses(data)
     scale = _scale(data, full)
-    plain, full = plain.descended(data, scale, lens=False), full.descended(data, scale, lens=True)
+    plain, full = plain.descend(data, scale, lens=False), full.descend(data, scale, lens=True)
     before, after = (float(fit.cost(data, scale)) for fit in (plain, full))
     free = float((data.weights / data.weights.max()).sum()) - 9
     strength = full.lens[0]
@@ -404,7 +404,7 @@ class LensMatches:
         chosen = torch.arange(min(count, n), device=self.a.device) * n // min(count, n)
         return LensMatches(self.a[chosen], self.b[chosen], self.weights[chosen], self.radii)
 
-    def weighing(self, weights: Tensor) -> LensMatches:
+    def with_weights(self, weights: Tensor) -> LensMatches:
         """The same matches with other weights."""
         return LensMatches(self.a, self.b, weights, self.radii)
 
@@ -444,12 +444,12 @@ class LensDescent:
         """Truncated squared distances ``(B,)`` in units of ``scale``."""
         return ((self.distances(data) / scale).square().clamp(max=MAX_SQUARED_DISTANCE) * data.weights).sum(-1)
 
-    def best(self, data: LensMatches, scale: Tensor) -> LensDescent:
+    def lowest_cost(self, data: LensMatches, scale: Tensor) -> LensDescent:
         """The one with the least cost."""
         k = int(self.cost(data, scale).argmin())
         return LensDescent(Frames(self.frames.turns[k : k + 1], self.frames.core[k : k + 1]), self.lens[k : k + 1])
 
-    def descended(self, data: LensMatches, scale: Tensor, *, lens: bool) -> LensDescent:
+    def descend(self, data: LensMatches, scale: Tensor, *, lens: bool) -> LensDescent:
         """At the minimum next to it, with the lenses or without."""
         free = torch.ones_like(self.lens[0]).repeat_interleave(5)[:9]
         free[7:] = float(lens)
@@ -510,17 +510,17 @@ class LensProblem(LeastSquares):
         return fresh.frames.turns, fresh.frames.core, fresh.lens
 
 
-def _fitted(data: LensMatches) -> tuple[LensDescent, LensDescent]:
+def _fit_lenses(data: LensMatches) -> tuple[LensDescent, LensDescent]:
     """The best fits without and with lenses."""
     few = data.subset(NUM_START_MATCHES)
     lens = torch.tensor(STARTS, dtype=data.a.dtype, device=data.a.device)
     F = torch.cat([_start(few, one) for one in lens])
     every = LensDescent(Frames.of(F), lens)
     scale = _scale(few, every).min()
-    plain = LensDescent(Frames.of(F[:1]), lens[:1]).descended(few, scale, lens=False)
+    plain = LensDescent(Frames.of(F[:1]), lens[:1]).descend(few, scale, lens=False)
     # what explains the points without lenses is a start, too
     every = LensDescent(Frames.of(torch.cat([F, plain.frames.matrix().unflatten(-1, (3, 3))])), torch.cat([lens, lens[:1]]))
-    return plain, every.descended(few, scale, lens=True).best(few, scale)
+    return plain, every.descend(few, scale, lens=True).lowest_cost(few, scale)
 
 
 def _start(data: LensMatches, lens: Tensor) -> Tensor:
@@ -546,6 +546,6 @@ def _scale(data: LensMatches, fit: LensDescent) -> Tensor:
 def _holds(data: LensMatches, plain: LensDescent, full: LensDescent, scale: Tensor, fold: int) -> bool:
     """Whether lenses fitted without one part of the matches explain that part better than no lenses do."""
     place = torch.arange(len(data.weights), device=data.weights.device) * NUM_FOLDS // len(data.weights)
-    rest, part = (data.weighing(data.weights * own) for own in (place != fold, place == fold))
-    costs = [fit.descended(rest, scale, lens=lens).cost(part, scale) for fit, lens in ((plain, False), (full, True))]
+    rest, part = (data.with_weights(data.weights * own) for own in (place != fold, place == fold))
+    costs = [fit.descend(rest, scale, lens=lens).cost(part, scale) for fit, lens in ((plain, False), (full, True))]
     return bool(costs[1] < costs[0])

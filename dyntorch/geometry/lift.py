@@ -30,7 +30,7 @@ def gauge_algebra(lifts: Tensor) -> Tensor:
     :math:`\{S : B_i S \ker(B_i) = 0 \text{ for all } i\}`. lifts ``(views, a + 1, K)`` -> ``(dim, K, K)``."""
     if lifts.ndim != 3 or lifts.shape[-2] > lifts.shape[-1]:
         raise ValueError(f"lifts must be (views, a + 1, K) with a + 1 <= K, got {tuple(lifts.shape)}")
-    even, root = balanced(lifts)
+    even, root = balance_lifts(lifts)
     found = torch.linalg.solve(root, balanced_algebra(even) @ root)
     return torch.linalg.qr(found.flatten(1).mT).Q.mT.unflatten(-1, found.shape[1:]).to(lifts.dtype)
 
@@ -45,7 +45,7 @@ def balanced_algebra(lifts: Tensor) -> Tensor:
     return vh[values <= ZERO * values[0].clamp(min=ZERO)].unflatten(-1, (size, size))
 
 
-def balanced(lifts: Tensor) -> tuple[Tensor, Tensor]:
+def balance_lifts(lifts: Tensor) -> tuple[Tensor, Tensor]:
     """Lifts ``(views, a + 1, K)`` whose stack has orthonormal columns, and the root R with ``lifts = balanced @ R``."""
     stack = lifts.double().flatten(0, 1)
     _, values, vh = torch.linalg.svd(stack, full_matrices=False)
@@ -80,7 +80,7 @@ def upgrade(projections: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
 
 def least_views(lifts: Tensor, rows: int) -> int:
     """Fewest of these views from which cameras with so many rows, otherwise arbitrary, are upgraded without doubt."""
-    lifts = balanced(lifts)[0]
+    lifts = balance_lifts(lifts)[0]
     draw = torch.Generator().manual_seed(0)
     total, width = lifts.shape[0], lifts.shape[-1]
     whole = len(gauge_algebra(lifts))
@@ -100,8 +100,8 @@ def least_views(lifts: Tensor, rows: int) -> int:
 # ----------------------------------------------------------------------------------------------------------------------
 # Frames of a lifted scene: which of the worlds that no view can tell apart is shown.
 #
-# Each function returns a collineation G of :math:`P^k` from the ambiguity of the lifts; :func:`moved` applies it, and the images
-# stay what they are.
+# Each function returns a collineation G of :math:`P^k` from the ambiguity of the lifts; :func:`change_frame` applies it, and the
+# images stay what they are.
 
 
 TOLERANCE = 1e-8
@@ -110,7 +110,7 @@ FRAMES_DRAWS = 16
 """Members of the ambiguity with the same plane at infinity among which the one that leaves the points roundest is taken."""
 
 
-def moved(G: Tensor, cameras: Tensor, structure: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
+def change_frame(G: Tensor, cameras: Tensor, structure: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
     r"""Cameras :math:`P_i B_i G^{-1} B_i^+` and points :math:`G Y` after a change of frame, for any scale of both. G
     ``(*batch, K, K)``, cameras ``(*batch, views, m, a + 1)``, structure ``(*batch, n, K)``, lifts ``(views, a + 1, K)``."""
     inverse = torch.linalg.inv_ex(G)[0]
@@ -194,7 +194,7 @@ def behind(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) -
     return (torch.where(depth.sign().sum(-1, keepdim=True) < 0, -depth, depth) < 0).any(1)
 
 
-def steady(structure: Tensor, lifts: Tensor, start: Tensor, algebra: Tensor, weights: Tensor) -> Tensor:
+def steadiest_frame(structure: Tensor, lifts: Tensor, start: Tensor, algebra: Tensor, weights: Tensor) -> Tensor:
     r"""The frame in which the chosen points move least: a motion common to all, which no view can tell, is taken off. structure
     ``(*batch, n, K)``, lifts ``(views, a + 1, K)``, start ``(a + 1, K)``, algebra ``(dim, K, K)``, weights ``(*batch, n)``."""
     size = lifts.shape[-1]
@@ -218,7 +218,7 @@ def steady(structure: Tensor, lifts: Tensor, start: Tensor, algebra: Tensor, wei
     return G - torch.einsum("...c,cij->...ij", step[..., 0], free)
 
 
-def centred(structure: Tensor, lifts: Tensor, weights: Tensor) -> Tensor:
+def center_frame(structure: Tensor, lifts: Tensor, weights: Tensor) -> Tensor:
     r"""A frame in which the positions over all views have mean 0 and rms distance from it :math:`\sqrt d`, if possible round.
     structure ``(*batch, n, K)``, lifts ``(views, a + 1, K)``, weights ``(*batch, n)``."""
     homogeneous = structure[..., None, :, :] @ lifts.mT
@@ -239,8 +239,8 @@ def centred(structure: Tensor, lifts: Tensor, weights: Tensor) -> Tensor:
     G = same = torch.eye(lifts.shape[-1], dtype=x.dtype, device=x.device).expand(*structure.shape[:-2], -1, -1)
     # a matrix of one kind that the lifts allow tells that they allow the kind, whatever the points
     for scale, example in ((factor, eye + torch.ones_like(eye).triu()), (plain, 2 * eye)):
-        if _induced(_world(example, torch.ones_like(eye[:1])), lifts)[1] < TOLERANCE:
-            G = _induced(_world(torch.linalg.inv_ex(scale)[0], mean), lifts)[0]
+        if _induced_map(_world(example, torch.ones_like(eye[:1])), lifts)[1] < TOLERANCE:
+            G = _induced_map(_world(torch.linalg.inv_ex(scale)[0], mean), lifts)[0]
             break
     return torch.where(counted & G.isfinite().flatten(-2).all(-1)[..., None, None], G, same)
 
@@ -251,7 +251,7 @@ def _world(linear: Tensor, mean: Tensor) -> Tensor:
     return torch.cat([top, torch.nn.functional.pad(torch.zeros_like(top[..., :1, :-1]), (0, 1), value=1.0)], dim=-2)
 
 
-def _induced(world: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
+def _induced_map(world: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
     """The G with :math:`B_i G = H B_i` for all views, and what is left of that equation ``(*batch,)``."""
     target = (world[..., None, :, :] @ lifts).flatten(-3, -2)
     stack = lifts.flatten(0, 1)

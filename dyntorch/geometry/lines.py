@@ -54,7 +54,7 @@ def klein_frame(projections: Tensor) -> Tensor:
             f"projections must be (*batch, views, 3, 6) with {VIEWS} or more views, got {tuple(projections.shape)}; "
             "fewer leave a family of quadrics, give more views"
         )
-    stack, upper, good = _balanced(projections.double())
+    stack, upper, good = _balance(projections.double())
     symmetric = _quadric(stack)
     values, vectors = eigh(symmetric)
     form = plucker_form(device=projections.device)
@@ -67,7 +67,7 @@ def klein_frame(projections: Tensor) -> Tensor:
     return torch.where(good, found, 0.0).to(projections.dtype)
 
 
-def _balanced(projections: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _balance(projections: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Projections in a frame of P^5 where their stack is orthonormal, the triangular change of frame, and where there is one."""
     size = torch.linalg.matrix_norm(projections, keepdim=True)
     scaled = projections / torch.where(size > 0, size, 1.0)

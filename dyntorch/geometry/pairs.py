@@ -84,9 +84,9 @@ def hyperplane_pair(structure: Tensor, weights: Tensor | None = None, *, informa
         >>> pair.labels.tolist(), bool(pair.distances.amin(-2).max() < 1e-20)
         ([1, 1, 1, 1, 1, 1, 1, 2, 2, 2, 2, 2], True)
     """
-    weights, finite = _checked(structure, weights, information)
+    weights, finite = _check_weights(structure, weights, information)
     points = torch.where(finite[..., None], structure.double(), 0.0)
-    unit, frame, scale = _whitened(points, weights)
+    unit, frame, scale = _whiten(points, weights)
     covariance = None
     if information is not None:
         covariance = _covariance(torch.where(finite[..., None, None], information.double(), 0.0), unit, frame, scale)
@@ -103,7 +103,7 @@ def hyperplane_pair(structure: Tensor, weights: Tensor | None = None, *, informa
     return HyperplanePair(hyperplanes.to(dtype), labels, distances.to(dtype), lost.any(-1) | same | several)
 
 
-def _checked(structure: Tensor, weights: Tensor | None, information: Tensor | None) -> tuple[Tensor, Tensor]:
+def _check_weights(structure: Tensor, weights: Tensor | None, information: Tensor | None) -> tuple[Tensor, Tensor]:
     """Weights in float64, 0 for what is not finite, and which points are finite."""
     if structure.ndim < 2 or not structure.is_floating_point() or structure.shape[-1] < 2:
         raise ValueError(
@@ -126,7 +126,7 @@ def _checked(structure: Tensor, weights: Tensor | None, information: Tensor | No
     return given * finite, finite
 
 
-def _whitened(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _whiten(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Unit vectors z_n = scale_n frame Y_n, whose second moment is about the same in all directions; frame; scale."""
     unit = unit_vectors(points)
     moment = (unit * weights[..., None]).mT @ unit
@@ -281,16 +281,16 @@ def factor_product(matrix: Tensor) -> tuple[Tensor, Tensor]:
     stand_in = product_matrix(*torch.diag_embed(matrix.new_tensor([[1.0, -1.0, 0.0], [1.0, 0.0, 2.0]])).unbind(0))
     flat = torch.where(sound, matrix / torch.where(sound, size, 1.0), stand_in).reshape(-1, 6, 6)
     scale = multiplicity(2, 2, flat.device).to(flat.dtype).sqrt()
-    flat, second, first = _balanced(flat / scale[:, None] / scale)
-    found = _nearest(flat, _paired(flat, _epipoles(null_space(flat.mT, 2)), _epipoles(null_space(flat, 2))))
+    flat, second, first = _balance(flat / scale[:, None] / scale)
+    found = _nearest(flat, _pair_epipoles(flat, _epipoles(null_space(flat.mT, 2)), _epipoles(null_space(flat, 2))))
     found = second[:, None, :, None] * found * first[:, None, None, :]
     found = unit_vectors(found.flatten(-2))
-    found = _ordered(found).unflatten(-1, (3, 3)).reshape(*matrix.shape[:-2], 2, 3, 3)
+    found = _order_factors(found).unflatten(-1, (3, 3)).reshape(*matrix.shape[:-2], 2, 3, 3)
     found = torch.where(sound[..., None], found, 0.0)
     return found[..., 0, :, :], found[..., 1, :, :]
 
 
-def _balanced(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _balance(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The isometric matrix in units in which the points of both views are of order 1, and the scales ``(b, 3)`` of the forms'
     axes."""
     scales = []
@@ -330,7 +330,7 @@ def _epipoles(kernel: Tensor) -> Tensor:
     return unit_vectors(unit_vectors(column) @ across)
 
 
-def _paired(matrix: Tensor, second: Tensor, first: Tensor) -> Tensor:
+def _pair_epipoles(matrix: Tensor, second: Tensor, first: Tensor) -> Tensor:
     """The forms ``(b, 2, 2, 3, 3)`` for epipoles ``(b, 2, 3)`` of view 2 and view 1, paired in both ways."""
     bases = [null_space(e.flatten(0, 1)[:, None], 2).reshape(-1, 2, 2, 3) for e in (second, first)]
     return torch.stack([_forms(matrix, bases[0], chosen) for chosen in (bases[1], bases[1].flip(1))], dim=1)
@@ -356,8 +356,8 @@ def _forms(matrix: Tensor, second: Tensor, first: Tensor) -> Tensor:
 
 def _nearest(matrix: Tensor, tries: Tensor) -> Tensor:
     """The forms ``(b, 2, 3, 3)`` of rank two whose product is nearest, by damped Gauss-Newton steps from ``(b, 2, 2, 3, 3)``."""
-    rest = _rest(matrix.repeat_interleave(2, 0), tries.flatten(0, 1))[0].unflatten(0, (-1, 2))
-    forms = _best(tries, rest)
+    rest = _product_distance(matrix.repeat_interleave(2, 0), tries.flatten(0, 1))[0].unflatten(0, (-1, 2))
+    forms = _lower_cost(tries, rest)
     chosen = (rest.detach().amin(-1) > EXACT).nonzero()[:, 0]
     if len(chosen):
         forms = forms.index_copy(0, chosen, _descent(matrix[chosen], tries[chosen]))
@@ -373,15 +373,15 @@ def _descent(matrix: Tensor, tries: Tensor) -> Tensor:
     """:func:`_nearest` of matrices that are no product."""
     problem = ProductProblem(matrix.repeat_interleave(2, 0))
     found = minimize(problem, problem.evaluate((tries.flatten(0, 1),)), DESCENT)
-    return _best(found.theta[0].unflatten(0, (-1, 2)), found.cost.unflatten(0, (-1, 2)))
+    return _lower_cost(found.theta[0].unflatten(0, (-1, 2)), found.cost.unflatten(0, (-1, 2)))
 
 
-def _best(tries: Tensor, rest: Tensor) -> Tensor:
+def _lower_cost(tries: Tensor, rest: Tensor) -> Tensor:
     """Those of two tries that leave less."""
     return tries.gather(1, rest.detach().argmin(-1)[:, None, None, None, None].expand(-1, 1, 2, 3, 3))[:, 0]
 
 
-def _rest(matrix: Tensor, forms: Tensor) -> tuple[Tensor, Tensor]:
+def _product_distance(matrix: Tensor, forms: Tensor) -> tuple[Tensor, Tensor]:
     """Distance ``(b,)`` of the matrix to the multiples of the product, and the best factor."""
     product = (_with(forms[:, 1]) @ forms[:, 0].flatten(1)[..., None])[..., 0]
     flat = matrix.flatten(1)
@@ -397,7 +397,7 @@ class ProductProblem(LeastSquares):
 
     def evaluate(self, theta: Tensors) -> Iterate:
         """The distance, which falls with its square, and the best factor of the product."""
-        rest, scale = _rest(self.matrix, theta[0])
+        rest, scale = _product_distance(self.matrix, theta[0])
         return Iterate(theta, rest, (scale,))
 
     def step(self, at: Iterate, damping: Tensor) -> Tensors:
@@ -439,7 +439,7 @@ def _product_table(device: torch.device) -> Tensor:
     return torch.einsum("iac,jbd->cdijab", collect, collect).reshape(9, 36 * 9).to(device)
 
 
-def _ordered(forms: Tensor) -> Tensor:
+def _order_factors(forms: Tensor) -> Tensor:
     """Both vectors ``(b, 2, 9)``, whose product does not know their order, in the one that a fixed measure gives them."""
     measure = forms.detach().square() @ torch.linspace(1, 2, 9, dtype=forms.dtype, device=forms.device)
     return torch.where((measure[:, 0] < measure[:, 1])[:, None, None], forms.flip(1), forms)
@@ -518,7 +518,7 @@ def two_bodies(projections: Tensor, structure: Tensor, hyperplanes: Tensor, labe
     views, points, pair = (torch.nan_to_num(t.double()) for t in (projections, structure, hyperplanes))
     bodies = torch.stack([labels == 1, labels == 2], dim=-2)
     views, points = _positive_depths(views, points, labels > 0)
-    pair, apart = _oriented(pair, points, bodies)
+    pair, apart = _orient_hyperplanes(pair, points, bodies)
     if views.shape[-2] == views.shape[-1] - 1:
         pair = pair * _ratio(views, pair)[..., None]
     size = points.shape[-1]
@@ -566,7 +566,7 @@ def _positive_depths(views: Tensor, points: Tensor, known: Tensor) -> tuple[Tens
     return views * of_view[..., None, None], points * of_point[..., None]
 
 
-def _oriented(pair: Tensor, points: Tensor, bodies: Tensor) -> tuple[Tensor, Tensor]:
+def _orient_hyperplanes(pair: Tensor, points: Tensor, bodies: Tensor) -> tuple[Tensor, Tensor]:
     """Unit hyperplanes, each positive on the points of the other body, and whether they are two."""
     pair = unit_vectors(pair)
     sign = nonzero_sign(((pair @ points.mT).detach() * bodies.flip(-2)).sum(-1))

@@ -154,7 +154,7 @@ class CommonPlane(NormalEquations):
         along = (matrix.diagonal(dim1=-2, dim2=-1).sum(-1) + TINY)[:, None, None] * theta[:, :, None] * theta[:, None, :]
         return (r[:, None] @ inverse @ r[..., None])[:, 0, 0], (weighed @ r[..., None])[..., 0], matrix + along
 
-    def corrected(self, normal: Tensor) -> Tensor:
+    def correct_homographies(self, normal: Tensor) -> Tensor:
         """The homographies N next to the measured ones, in standard deviations, that fulfil the conditions."""
         r, _, inverse, spread = self.weighted(normal)
         return self.inverse - (spread @ inverse @ r[..., None])[..., 0].view_as(self.inverse)

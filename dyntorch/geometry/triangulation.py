@@ -33,11 +33,11 @@ def reproject(projections: Tensor, structure: Tensor) -> Tensor:
     """
     _check_width("projections", projections, structure)
     check_together(projections=(projections, 3), structure=(structure, 2))
-    image = inhomogeneous(_scaled(structure, 1)[..., None, :, :] @ _scaled(projections, 2).mT)
+    image = inhomogeneous(_rescale(structure, 1)[..., None, :, :] @ _rescale(projections, 2).mT)
     return torch.where(image.isfinite(), image, 0.0)
 
 
-def _scaled(values: Tensor, last: int) -> Tensor:
+def _rescale(values: Tensor, last: int) -> Tensor:
     """Homogeneous quantities in the last dimensions with their largest entry 1 where it is extreme; 0 where one is not finite."""
     axes = tuple(range(-last, 0))
     if not values.shape[-last:].numel():
@@ -83,7 +83,7 @@ def triangulate(projections: Tensor, x: Tensor, weights: Tensor | None = None, *
         >>> (found / found[2]).round(decimals=6).tolist()
         [1.0, 2.0, 1.0, 0.5, -1.0]
     """
-    x, weights, dtype = *observed(x, weights), x.dtype
+    x, weights, dtype = *mask_missing(x, weights), x.dtype
     rows, width = _check_views(projections, x)
     check_together(projections=(projections.to(x.dtype), 3), x=(x, 3))
     sound = projections.isfinite().flatten(-2).all(-1)[..., None]
@@ -129,7 +129,7 @@ def resect(structure: Tensor, x: Tensor, weights: Tensor | None = None, *, lifts
         >>> bool(torch.allclose(found * M.norm() * torch.sign(found[0, 0, 0]), M))
         True
     """
-    x, weights, dtype = *observed(x, weights), x.dtype
+    x, weights, dtype = *mask_missing(x, weights), x.dtype
     _check_points(structure, x)
     batch = check_together(structure=(structure.to(x.dtype), 2), x=(x, 3))
     x, weights = x.expand(*batch, *x.shape[-3:]), weights.expand(*batch, *weights.shape[-2:])
@@ -153,7 +153,7 @@ def resect(structure: Tensor, x: Tensor, weights: Tensor | None = None, *, lifts
     return torch.where(known[..., None, None], found.basis[..., 0, :].unflatten(-1, (size + 1, width)), 0.0).to(dtype)
 
 
-def observed(x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+def mask_missing(x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
     """Images and weights in float64, with 0 for both where an image is missing. x ``(*batch, views, n, l)``, weights
     ``(*batch, views, n)``."""
     check_tensor("x", x, "views", "n", "l")

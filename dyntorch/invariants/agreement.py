@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.residual import whiten, whiten_entries
-from dyntorch.geometry.extensors import dehomogenized, levi_civita
+from dyntorch.geometry.extensors import dehomogenize, levi_civita
 from dyntorch.geometry.homogeneous import cofactors, homogeneous, null_vectors, unit
 from dyntorch.numerics.nullspace import gram_null_space, null_space
 
@@ -63,7 +63,7 @@ def point_error(image: Tensor, derivative: Tensor, x: Tensor) -> tuple[Tensor, T
     Returns:
         ``(*batch, n, d)`` and ``(*batch, n, d, d)``.
     """
-    y, jacobian = dehomogenized(image, derivative[..., :-1])
+    y, jacobian = dehomogenize(image, derivative[..., :-1])
     return y - x, jacobian
 
 

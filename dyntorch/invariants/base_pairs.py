@@ -78,7 +78,7 @@ class RelationPair(Invariant):
         return torch.where(finite, 1 + distances.argmin(0), 0)
 
     @staticmethod
-    def reweighted(tensor: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
+    def reweight(tensor: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
         r"""Weights :math:`1 / \|\nabla h_n\|^2` of the matches for the next fit: the algebraic error becomes that in the
         images. tensor ``(*batch, 6, 6)``, x1, x2 ``(*batch, n, 2)`` -> ``(*batch, n)``."""
         value, distance = algebraic(RelationPair, tensor, x1, x2), sampson(RelationPair, tensor, x1, x2)

@@ -93,7 +93,7 @@ def unit_tensor(tensor: Tensor) -> Tensor:
     return _unit(exact)
 
 
-def balanced(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+def balance_views(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
     r"""Bring each view to a unit in which its points are of order 1: :math:`T_{ijk} = \hat T_{ijk}\, d_i e_j f_k`."""
     scales = []
     for axis, like in ((-3, 13**-0.5), (-2, 1.0), (-1, 5**0.5)):

@@ -15,7 +15,7 @@ from dyntorch.core.residual import residual_derivative, whiten
 from dyntorch.geometry.extensors import adjugate, back_project, compound, dual, join, project
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.invariants.constant_velocity_algebra import (
-    balanced,
+    balance_views,
     constant_velocity_maps,
     constant_velocity_tensor,
     structure,
@@ -168,7 +168,7 @@ class ConstantVelocityTensor(Invariant):
         Args:
             tensor: ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` of a camera.
         """
-        exact = balanced(unit_tensor(tensor))[0]
+        exact = balance_views(unit_tensor(tensor))[0]
         alpha, beta, q, k = structure(exact)
         fitted = torch.einsum("...i,...kj->...ijk", alpha, q) + torch.einsum("...ki,...j->...ijk", k, beta)
         left = (exact - fitted).flatten(-3).norm(dim=-1)
@@ -354,7 +354,7 @@ def _drift(matrix: Tensor, shift: Tensor) -> Tensor:
 
 def _solve(tensor: Tensor) -> Motion:
     """The maps, decomposed in float64 and in coordinates of order 1."""
-    even, (first, second, third) = balanced(unit_tensor(tensor))
+    even, (first, second, third) = balance_views(unit_tensor(tensor))
     maps = constant_velocity_maps(even)
     scaled = (maps[0] / first[..., None], maps[1] / second[..., None], maps[2] * third[..., None])
     first, second, third = (unit(m).to(tensor.dtype) for m in scaled)

@@ -62,7 +62,7 @@ class ConvergentMotionMatrix(RelationPair):
         >>> scene = convergent_motions(200, sigma=0.3, generator=torch.Generator().manual_seed(0))
         >>> fitted = dyn.fit(ConvergentMotionMatrix, *scene.views)
         >>> for _ in range(5):
-        ...     weights = ConvergentMotionMatrix.reweighted(fitted.tensor, *scene.views)
+        ...     weights = ConvergentMotionMatrix.reweight(fitted.tensor, *scene.views)
         ...     fitted = dyn.fit(ConvergentMotionMatrix, *scene.views, weights=weights)
         >>> S = dyn.refine(fitted, *scene.views, weights=torch.ones(200)).tensor
         >>> labels = ConvergentMotionMatrix.labels(*ConvergentMotionMatrix.fundamentals(S), *scene.views)

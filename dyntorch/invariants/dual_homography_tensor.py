@@ -268,13 +268,13 @@ def _line_error(image: Tensor, derivative: Tensor, source: Tensor, line: Tensor)
     nearby = torch.where((across == 0) & (along == 0), torch.ones_like(along), along.abs())
     error = torch.stack([torch.atan2(sign * across, nearby), sign * unit_line[..., 2] - reference[..., 2]], dim=-1)
     columns = []
-    for tangent in (_turned(start), start.new_tensor([0.0, 0.0, 1.0]).expand_as(start)):
+    for tangent in (_rotate_normal(start), start.new_tensor([0.0, 0.0, 1.0]).expand_as(start)):
         change = (derivative @ tangent[..., None])[..., 0]
         change = (change - unit_line * (unit_line[..., :2] * change[..., :2]).sum(-1, keepdim=True)) / length
-        columns.append(torch.stack([(_turned(unit_line) * change).sum(-1), sign * change[..., 2]], dim=-1))
+        columns.append(torch.stack([(_rotate_normal(unit_line) * change).sum(-1), sign * change[..., 2]], dim=-1))
     return error, torch.stack(columns, dim=-1)
 
 
-def _turned(line: Tensor) -> Tensor:
+def _rotate_normal(line: Tensor) -> Tensor:
     """The normal turned by a right angle, with offset 0: the derivative of the line by its angle."""
     return torch.stack([-line[..., 1], line[..., 0], torch.zeros_like(line[..., 0])], dim=-1)

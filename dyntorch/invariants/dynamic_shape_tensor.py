@@ -21,17 +21,17 @@ from dyntorch.shapes.basis import Polynomial, Trajectory, extremes, times_of_vie
 from dyntorch.shapes.moving import (
     MAX_UNCERTAINTY,
     ProjectedShapes,
+    canonical_frame,
     centred_views,
     fit_shapes,
     followed_shapes,
-    framed,
     project,
     shapes_at,
     shapes_through,
     slopes,
 )
 from dyntorch.shapes.projective import recover_perspective_times
-from dyntorch.shapes.static import centred
+from dyntorch.shapes.static import centring_basis
 from dyntorch.shapes.times import Recovery, recover_times
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -42,7 +42,7 @@ Base = tuple[int, int, int, int]
 
 
 @constant
-def arranged(n: int, base: Base, device: torch.device) -> Tensor:
+def basis_points_first(n: int, base: Base, device: torch.device) -> Tensor:
     """Indices of the four basis points, then of all others in order."""
     return torch.tensor([*base, *(i for i in range(n) if i not in base)], device=device)
 
@@ -51,7 +51,7 @@ def graph_rows(measured: Tensor, trajectory: Trajectory, base: Base) -> Tensor:
     r"""Rows of :math:`D(t) x_j = \sum_{i=1}^4 N_{ij}(t) x_i` with :math:`\sum_i N_{ij} = D` eliminated. measured
     ``(*batch, views, n, 4)`` -> ``(*batch, views, 2 (n - 4), K (1 + 3 (n - 4)))``."""
     n = measured.shape[-2]
-    order = arranged(n, base, measured.device)
+    order = basis_points_first(n, base, measured.device)
     seen = measured[..., order, 2] > 0
     points = centred_views(measured[..., :2], measured[..., 2]).x[..., order, :]
     use = (seen[..., 4:] & seen[..., :4].all(-1, keepdim=True)).to(points.dtype)[..., None]
@@ -68,7 +68,7 @@ def span_rows(measured: Tensor) -> Tensor:
     """The two centred coordinates of each view, ``(*batch, views, 2, n - 1)``; 0 where a point is missing."""
     n = measured.shape[-2]
     whole = (measured[..., 2] > 0).all(-1)[..., None, None]
-    return torch.where(whole, centred_views(measured[..., :2]).x.mT @ centred(n, measured.device).mT, 0.0)
+    return torch.where(whole, centred_views(measured[..., :2]).x.mT @ centring_basis(n, measured.device).mT, 0.0)
 
 
 def span_residual(measured: Tensor, basis: Tensor) -> Tensor:
@@ -89,14 +89,14 @@ def annihilator(unknowns: Tensor, n: int, base: Base) -> Tensor:
     above = slopes.movedim(-1, -3).mT  # (.., K, 3, m)
     fourth = scale[..., None, None] - above.sum(-2, keepdim=True)
     matrix = torch.cat([above, fourth, -scale[..., None, None] * eye], dim=-2)
-    order = arranged(n, base, unknowns.device).argsort()
+    order = basis_points_first(n, base, unknowns.device).argsort()
     return matrix[..., order, :].reshape(*unknowns.shape[:-1], size, n, m)
 
 
 def unknowns_of(matrix: Tensor, base: Base) -> Tensor:
     """The inverse of :func:`annihilator`."""
     n = matrix.shape[-2]
-    ordered = matrix[..., arranged(n, base, matrix.device), :]
+    ordered = matrix[..., basis_points_first(n, base, matrix.device), :]
     scale = -ordered[..., 4:, :].diagonal(dim1=-2, dim2=-1).mean(-1)
     return torch.cat([scale, ordered[..., :3, :].mT.movedim(-3, -1).flatten(-3)], dim=-1)
 
@@ -111,7 +111,7 @@ def graph_of(shapes: Tensor, trajectory: Trajectory, base: Base) -> Tensor:
     """The unknowns ``(*batch, K (1 + 3 m))`` of :func:`graph_rows`, of any scale, of shapes ``(*batch, B, n, 3)``: brackets."""
     n = shapes.shape[-2]
     rows, inverse = _samples(trajectory, shapes.device)
-    every = torch.einsum("gb,...bnk->...gnk", rows, shapes)[..., arranged(n, base, shapes.device), :]
+    every = torch.einsum("gb,...bnk->...gnk", rows, shapes)[..., basis_points_first(n, base, shapes.device), :]
     y, z = every[..., :3, :] - every[..., 3:4, :], every[..., 4:, :] - every[..., 3:4, :]
     sides = torch.linalg.cross(y[..., [1, 2, 0], :], y[..., [2, 0, 1], :])
     scale = (y[..., 0, :] * sides[..., 0, :]).sum(-1)  # (.., g)
@@ -129,26 +129,26 @@ def shapes_of_graph(unknowns: Tensor, n: int, trajectory: Trajectory, base: Base
     eye = torch.eye(4, 3, dtype=unknowns.dtype, device=unknowns.device)
     above = (scale @ powers.mT)[..., None, None] * eye
     below = torch.einsum("gk,xmik->xgmi", powers, slopes)
-    points = torch.cat([above, below], dim=-2)[..., arranged(n, base, unknowns.device).argsort(), :]
-    helmert = centred(n, unknowns.device)
+    points = torch.cat([above, below], dim=-2)[..., basis_points_first(n, base, unknowns.device).argsort(), :]
+    helmert = centring_basis(n, unknowns.device)
     problems = len(points)
     found = shapes_through(helmert @ points, rows.expand(problems, *rows.shape), points.new_ones(problems, len(rows)))
     return (helmert.mT @ found).reshape(*unknowns.shape[:-1], trajectory.size, n, 3)
 
 
-def beside(shapes: Tensor) -> Tensor:
+def concatenate_shapes(shapes: Tensor) -> Tensor:
     """``(*batch, B, n, 3)`` to ``(*batch, n, 3 B)``."""
     return shapes.transpose(-3, -2).flatten(-2)
 
 
-def apart(shapes: Tensor) -> Tensor:
+def split_shapes(shapes: Tensor) -> Tensor:
     """``(*batch, n, 3 B)`` to ``(*batch, B, n, 3)``."""
     return shapes.unflatten(-1, (shapes.shape[-1] // 3, 3)).transpose(-3, -2)
 
 
 def framed_beside(shapes: Tensor) -> Tensor:
     """Shapes ``(*batch, B, n, 3)`` in their canonical frame, side by side."""
-    return beside(framed(shapes.reshape(-1, *shapes.shape[-3:])).reshape(shapes.shape))
+    return concatenate_shapes(canonical_frame(shapes.reshape(-1, *shapes.shape[-3:])).reshape(shapes.shape))
 
 
 @constant
@@ -332,7 +332,7 @@ class DynamicShapeTensor(Invariant):
     def tensor_of(self, basis: Tensor) -> Tensor:
         """The tensor of a null space of the rows."""
         if self.form == "span":
-            rows = basis @ centred(self.points, basis.device)
+            rows = basis @ centring_basis(self.points, basis.device)
             return rows[..., 0, :] if self.nullity == 1 else rows
         if self.form == "basis":
             return annihilator(basis[..., 0, :], self.points, self.base)
@@ -341,9 +341,9 @@ class DynamicShapeTensor(Invariant):
     def basis_of(self, tensor: Tensor) -> Tensor:
         """The inverse of :meth:`tensor_of`."""
         if self.form == "span":
-            return (tensor if self.nullity > 1 else tensor[..., None, :]) @ centred(self.points, tensor.device).mT
+            return (tensor if self.nullity > 1 else tensor[..., None, :]) @ centring_basis(self.points, tensor.device).mT
         if self.form == "joint":
-            unknowns = graph_of(apart(tensor), self.trajectory, self.base)
+            unknowns = graph_of(split_shapes(tensor), self.trajectory, self.base)
             return (unknowns / unknowns.norm(dim=-1, keepdim=True).clamp(min=1e-300))[..., None, :]
         return unknowns_of(tensor, self.base)[..., None, :]
 
@@ -361,7 +361,7 @@ class DynamicShapeTensor(Invariant):
         shapes = found.shapes
         if torch.is_grad_enabled() and (measured.requires_grad or weights.requires_grad):
             shapes = select(found.status == Status.OK, followed_shapes(shapes, measured, rows, weights), shapes)
-        return Estimate(beside(shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
+        return Estimate(concatenate_shapes(shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
 
     @on_class
     def compose(self, shapes: Tensor) -> Tensor:
@@ -376,11 +376,11 @@ class DynamicShapeTensor(Invariant):
     def _composed(self, shapes: Tensor) -> Tensor:
         n = self.points
         if self.form == "span":
-            rows = (shapes - shapes.mean(-2, keepdim=True)).mT @ centred(n, shapes.device).mT
+            rows = (shapes - shapes.mean(-2, keepdim=True)).mT @ centring_basis(n, shapes.device).mT
             return self.tensor_of(null_space(rows, n - 1 - shapes.shape[-1]))
         if self.form == "joint":
-            return framed_beside(apart(shapes)) * 3**-0.5  # of three orthonormal columns
-        tensor = annihilator(graph_of(apart(shapes), self.trajectory, self.base), n, self.base)
+            return framed_beside(split_shapes(shapes)) * 3**-0.5  # of three orthonormal columns
+        tensor = annihilator(graph_of(split_shapes(shapes), self.trajectory, self.base), n, self.base)
         size = tensor.flatten(-3).norm(dim=-1)[..., None, None, None]
         return tensor / torch.where(size > 0, size, 1.0)
 
@@ -401,13 +401,13 @@ class DynamicShapeTensor(Invariant):
         if self.form == "span":
             raise ValueError("form='span' knows the positions of all times together, no shape of any; use 'joint' or 'basis'")
         if self.form == "joint":
-            return apart(tensor)
+            return split_shapes(tensor)
         return shapes_of_graph(unknowns_of(tensor, self.base), tensor.shape[-2], self.trajectory, self.base)
 
     def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The distance of each view from the images of its shape, point by point: ``(*batch, views, 2 n)``."""
         if self.projective:
-            wide = (apart(motion[0].double()), views[0].double(), scales[0].double())
+            wide = (split_shapes(motion[0].double()), views[0].double(), scales[0].double())
             return perspective_shapes.whitened(*wide, self.trajectory).to(views[0].dtype)
         residual = self._projected(motion[0].double(), views[0].double())[0].residual.flatten(-2)
         return (residual / scales[0][..., None, None]).to(views[0].dtype)
@@ -417,7 +417,7 @@ class DynamicShapeTensor(Invariant):
     ) -> tuple[Tensor, Tensor] | None:
         """:meth:`whitened` and its derivative by the shapes."""
         if self.projective:
-            return perspective_shapes.linearized(apart(motion[0]), views[0], scales[0], self.trajectory)
+            return perspective_shapes.linearized(split_shapes(motion[0]), views[0], scales[0], self.trajectory)
         if self.form == "span":
             return None
         found, rows = self._projected(motion[0], views[0])
@@ -430,7 +430,7 @@ class DynamicShapeTensor(Invariant):
         x, seen = measured[..., :2], measured[..., 2].detach()
         centre = (x * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)
         rows = self.trajectory.rows(measured[..., 0, 3])
-        shape = shapes[..., None, :, :] if self.form == "span" else shapes_at(apart(shapes), rows)
+        shape = shapes[..., None, :, :] if self.form == "span" else shapes_at(split_shapes(shapes), rows)
         return project((x - centre) * seen[..., None], seen, shape), rows
 
     @on_class

@@ -225,7 +225,7 @@ class DynamicTensor(Invariant):
         """
         if source == target or not {source, target} <= set(range(1, self.views + 1)):
             raise ValueError(f"source and target must be two different views of 1 to {self.views}, got {source} and {target}")
-        maps = self._stacked(self.decompose(tensor.double()))
+        maps = self._stack_maps(self.decompose(tensor.double()))
         both = torch.linalg.solve_ex(maps[..., target - 1, :, :], maps[..., source - 1, :, :])[0]
         return inhomogeneous(homogeneous(x.double()) @ both.mT).to(x.dtype)
 
@@ -256,7 +256,7 @@ class DynamicTensor(Invariant):
             raise ValueError(f"expected {self.views} views and one of their numbers, got {len(views)} views and view={view}")
         batch, count = views[0].shape[:-2], views[0].shape[-2]
         points = torch.stack([x.double() for x in views], dim=-2).reshape(-1, count, self.views, self.n)
-        maps = self._stacked(self.decompose(tensor.double()))
+        maps = self._stack_maps(self.decompose(tensor.double()))
         maps = maps.expand(*batch, -1, -1, -1).reshape(-1, self.views, self.size, self.size)
         found = nearest_flats(maps, points, torch.ones(len(maps), self.views, dtype=torch.float64, device=maps.device), self.k)
         planes = torch.linalg.qr((found.hyperplanes @ maps[:, None, view - 1]).mT)[0].mT
@@ -267,7 +267,7 @@ class DynamicTensor(Invariant):
         if self.single():
             return None
         batch = torch.broadcast_shapes(*(part.shape[:-2] for part in motion), *(x.shape[:-2] for x in views))
-        maps = self._stacked(motion).expand(*batch, -1, -1, -1).reshape(-1, self.views, self.size, self.size)
+        maps = self._stack_maps(motion).expand(*batch, -1, -1, -1).reshape(-1, self.views, self.size, self.size)
         flat = [x.expand(*batch, -1, -1).reshape(-1, *x.shape[-2:]).double() for x in views]
         found = flat_residual(maps.double(), flat, [s.double().expand(batch).reshape(-1) for s in scales], self.k)
         return found.reshape(*batch, *found.shape[1:]).to(views[0].dtype)
@@ -275,7 +275,7 @@ class DynamicTensor(Invariant):
     def linearized(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
-        return None if self.single() else flat_residual_derivative(self._stacked(motion), views, scales, self.k)
+        return None if self.single() else flat_residual_derivative(self._stack_maps(motion), views, scales, self.k)
 
     def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Disagreement of the views of a static point, ``(*batch, n, n (m - 1))``."""
@@ -300,7 +300,7 @@ class DynamicTensor(Invariant):
         moved = forms.movedim(axis, -1)
         return (moved @ matrix.reshape(*matrix.shape[:-2], *[1] * (self.views - 1), self.size, self.size)).movedim(-1, axis)
 
-    def _stacked(self, maps: tuple[Tensor, ...]) -> Tensor:
+    def _stack_maps(self, maps: tuple[Tensor, ...]) -> Tensor:
         """``(*batch, m, N, N)`` with the identity for view 1."""
         return torch.stack([torch.eye(self.size, dtype=maps[0].dtype, device=maps[0].device).expand_as(maps[0]), *maps], dim=-3)
 

@@ -168,12 +168,12 @@ def flat_residual(maps: Tensor, views: Sequence[Tensor], scales: Sequence[Tensor
     with torch.no_grad():
         hyperplanes = nearest_flats(maps, points, noise, step).hyperplanes
     if torch.is_grad_enabled() and any(x.requires_grad for x in (maps, points, noise)):
-        hyperplanes = _followed(hyperplanes, maps, points, noise, step)
+        hyperplanes = _differentiable_flats(hyperplanes, maps, points, noise, step)
     s = noise[:, None, :, None, None]
     return whitened_incidence(hyperplanes, maps, homogeneous(points), s)[0].flatten(-2)
 
 
-def _followed(hyperplanes: Tensor, maps: Tensor, points: Tensor, noise: Tensor, step: int) -> Tensor:
+def _differentiable_flats(hyperplanes: Tensor, maps: Tensor, points: Tensor, noise: Tensor, step: int) -> Tensor:
     """The nearest flats ``(b, n, c, N)`` as functions of what they are nearest to, every match by itself."""
     problems, count, c, size = hyperplanes.shape
     across = eigh(hyperplanes.mT @ hyperplanes)[1][..., : size - c].mT[..., :step, :]

@@ -110,7 +110,7 @@ class HomographyTensor(Invariant):
             >>> [round(x, 6) for x in (3 * HomographyTensor.decompose(H)[1].diagonal()).tolist()]
             [1.0, 2.0, 2.0]
         """
-        balanced, (first, second, third) = _balanced(tensor.double())
+        balanced, (first, second, third) = _balance_slices(tensor.double())
         a = _solution(balanced) * second[..., None, :] / first[..., :, None]
         b = _solution(balanced.mT) * third[..., None, :] / first[..., :, None]
         return unit(a).to(tensor.dtype), unit(b).to(tensor.dtype)
@@ -138,7 +138,7 @@ class HomographyTensor(Invariant):
             (True, True)
         """
         a, b = HomographyTensor.decompose(tensor.double())
-        h, (_, second, third) = _balanced(tensor.double())
+        h, (_, second, third) = _balance_slices(tensor.double())
         conditions = []
         for slices in (h, h.mT):
             # singular values of one problem that is not finite would stop the whole batch
@@ -277,7 +277,7 @@ class HomographyTensor(Invariant):
         return static_residual(motion, views, scales)
 
 
-def _balanced(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+def _balance_slices(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
     r"""Scale the homogeneous coordinates of each view so that all slices of the tensor are of similar size."""
     if tensor.shape[-3:] != (3, 3, 3):
         raise ValueError(f"tensor must be (*batch, 3, 3, 3), got {tuple(tensor.shape)}")

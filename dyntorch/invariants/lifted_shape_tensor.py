@@ -155,7 +155,7 @@ class LiftedShapeTensor(Invariant):
         n, size = self.n, self.l + 1
         if self.frame == GENERAL:
             width = len(lifted.free(self.k, self.l, self.profile, torch.device("cpu")))
-            rows, make = lifted.counted(self.k, self.l, self.profile)[0], partial(lifted.view_rows, profile=self.profile)
+            rows, make = lifted.count_rows(self.k, self.l, self.profile)[0], partial(lifted.view_rows, profile=self.profile)
         elif self.frame == PLANE:
             m = n - size - 1
             width, rows, make = size * (m - 1), self.l * m - size, lifted.plane_rows  # type: ignore[assignment]
@@ -166,7 +166,7 @@ class LiftedShapeTensor(Invariant):
     def minimal(self) -> int:
         """Fewest views that determine the tensor: in the frame ``general`` by the rank of views of a random shape."""
         if self.frame == GENERAL:
-            return lifted.counted(self.k, self.l, self.profile)[1]
+            return lifted.count_rows(self.k, self.l, self.profile)[1]
         return -(-(self.width() - self.nullity) // self.rows())
 
     @property
@@ -199,21 +199,21 @@ class LiftedShapeTensor(Invariant):
     def _free(self, device: torch.device) -> Tensor:
         """Orthonormal basis of what the estimation matrix says of a flat tensor."""
         if self.frame == AFFINE:
-            return static.centred(self.n, device)
+            return static.centring_basis(self.n, device)
         return lifted.free(self.k, self.l, self.profile, device)
 
     def tensor_of(self, basis: Tensor) -> Tensor:
         """The tensor of a null space of the estimation matrix, whose columns are the coordinates that constraints leave free."""
         if self.frame == PLANE:
             v = basis.unflatten(-1, (-1, self.l + 1))
-            tensor = (v.mT @ static.centred(v.shape[-2] + 1, basis.device)).mT
+            tensor = (v.mT @ static.centring_basis(v.shape[-2] + 1, basis.device)).mT
             return tensor[..., 0, :, :]
         tensor = basis @ self._free(basis.device)
         return tensor[..., 0, :] if self.nullity == 1 else tensor
 
     def basis_of(self, tensor: Tensor) -> Tensor:
         if self.frame == PLANE:
-            return (tensor.mT @ static.centred(tensor.shape[-2], tensor.device).mT).mT.flatten(-2)[..., None, :]
+            return (tensor.mT @ static.centring_basis(tensor.shape[-2], tensor.device).mT).mT.flatten(-2)[..., None, :]
         basis = tensor @ self._free(tensor.device).mT
         return basis[..., None, :] if self.nullity == 1 else basis
 
@@ -261,7 +261,7 @@ class LiftedShapeTensor(Invariant):
             # the scale of each point is that of the tensor
             others = points[..., self.k + 1 :, :]
             size = others.abs().amax(-1, keepdim=True)
-            return lifted.composed(others / torch.where(size > 0, size, 1.0), self.profile)
+            return lifted.compose_entries(others / torch.where(size > 0, size, 1.0), self.profile)
         others = points[..., self.k + 1 :, :]
         v = others[..., :-1] / others[..., -1:]
         return v - v.mean(-2, keepdim=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.core.normalize import hartley
 from dyntorch.core.primitives import Monomials
 from dyntorch.core.residual import sampson
-from dyntorch.geometry.epipolar import check_matches, described
+from dyntorch.geometry.epipolar import check_matches, describe_labels
 from dyntorch.geometry.homogeneous import homogeneous, monomial_derivatives, monomials, unit, unit_vectors
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
@@ -41,7 +41,7 @@ class Multibody:
     with fewer than 8.  Labels and matrices then mean nothing."""
 
     def __repr__(self) -> str:
-        return described(self, self.labels, self.degenerate, self.fundamentals.shape[-3])
+        return describe_labels(self, self.labels, self.degenerate, self.fundamentals.shape[-3])
 
 
 @one_thread
@@ -90,11 +90,11 @@ def multibody_matrix(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None
         >>> multibody_matrix(x1, x2, 2).labels.tolist() == [1] * 24 + [2] * 16
         True
     """
-    weights = _checked(x1, x2, bodies, weights)
+    weights = _check(x1, x2, bodies, weights)
     raw = [torch.where((weights > 0)[..., None], x, 0.0).double() for x in (x1, x2)]
     frames = [hartley(x[..., None, :], weights) for x in raw]
     first, second = (homogeneous(x) @ frame.mT for x, frame in zip(raw, frames, strict=True))
-    matrix, single = _fitted(first, second, bodies, weights)
+    matrix, single = _fit(first, second, bodies, weights)
     with torch.no_grad():
         labels, fundamentals, enough = _bodies(matrix, first, second, bodies, weights)
     lifts = [Monomials(bodies).action(frame) for frame in frames]
@@ -112,7 +112,7 @@ def multibody_lines(matrix: Tensor, p1: Tensor, p2: Tensor, bodies: int) -> tupl
     return l1, l2
 
 
-def _checked(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None) -> Tensor:
+def _check(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None) -> Tensor:
     """Weights in float64, 0 for what is not finite."""
     check_matches(x1, x2, weights)
     if not isinstance(bodies, int) or isinstance(bodies, bool) or bodies < 1:
@@ -127,7 +127,7 @@ def _checked(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None) -> Ten
     return torch.where(finite & given.isfinite(), given, 0.0)
 
 
-def _fitted(first: Tensor, second: Tensor, bodies: int, weights: Tensor) -> tuple[Tensor, Tensor]:
+def _fit(first: Tensor, second: Tensor, bodies: int, weights: Tensor) -> tuple[Tensor, Tensor]:
     """The multibody matrix of normalized matches, and whether it is the only one."""
     rows = monomials(second.mT, bodies).mT[..., :, None] * monomials(first.mT, bodies).mT[..., None, :]
     size = rows.shape[-1]
@@ -145,7 +145,7 @@ def _bodies(matrix: Tensor, first: Tensor, second: Tensor, bodies: int, weights:
     trust = torch.stack([line.norm(dim=-1) for line in lines]).prod(0) * (weights > 0)
     trust = trust / trust.amax(-1, keepdim=True).clamp(min=torch.finfo(trust.dtype).tiny)
     e1, e2 = (_epipoles(line, trust, bodies) for line in lines)
-    label = _grouped((e2[..., :, None] * e1[..., None, :]).flatten(-2), trust, bodies)
+    label = _group_directions((e2[..., :, None] * e1[..., None, :]).flatten(-2), trust, bodies)
     row = unit_vectors((second[..., :, None] * first[..., None, :]).flatten(-2))
     share = trust  # at first, matches where bodies cross count little
     for _ in range(ROUNDS):
@@ -173,7 +173,7 @@ def _epipoles(lines: Tensor, trust: Tensor, bodies: int) -> Tensor:
     return unit_vectors(_gradient(form[..., None, :], lines, bodies))
 
 
-def _grouped(vectors: Tensor, trust: Tensor, groups: int) -> Tensor:
+def _group_directions(vectors: Tensor, trust: Tensor, groups: int) -> Tensor:
     """Unit vectors ``(*batch, n, d)`` up to sign in groups ``(*batch, n)``: seeds far from each other, then the nearest seed."""
     far, seeds = trust, []
     for _ in range(groups):

@@ -34,14 +34,14 @@ class CameraKind:
 def reprojection_residual(structure: Tensor, x: Tensor, scale: Tensor, cameras: CameraKind) -> Tensor:
     r"""Reprojection error that no camera takes away, in standard deviations of noise, to first order. structure
     ``(*batch, n, k + 1)``, x ``(*batch, views, n, l + 1)``, scale ``(*batch,)`` -> ``(*batch, views, l n)``."""
-    at, known, _ = _linearized(structure, x, scale, cameras)
+    at, known, _ = _linearize(structure, x, scale, cameras)
     error = at.error - (at.slope @ (at.inverse @ (at.slope.mT @ at.error[..., None])))[..., 0]
     return torch.where(known[..., None], error[..., 0, :], torch.nan)
 
 
 def reprojection_derivative(structure: Tensor, x: Tensor, scale: Tensor, cameras: CameraKind) -> tuple[Tensor, Tensor]:
     """The residual and its derivative ``(*batch, views, l n, n, k + 1)`` by the points; both 0 where a view says nothing."""
-    at, known, length = _linearized(structure, x, scale, cameras)
+    at, known, length = _linearize(structure, x, scale, cameras)
     known = known[..., None, None]
     project = torch.eye(at.error.shape[-1], dtype=x.dtype, device=x.device) - (at.slope @ at.inverse @ at.slope.mT)[..., 0, :, :]
     error = (project @ at.error.mT)[..., 0]
@@ -63,7 +63,7 @@ def looked_at(x: Tensor) -> Tensor:
     return x[..., -1] > 0
 
 
-def _linearized(structure: Tensor, x: Tensor, scale: Tensor, cameras: CameraKind) -> tuple[Linearization, Tensor, Tensor]:
+def _linearize(structure: Tensor, x: Tensor, scale: Tensor, cameras: CameraKind) -> tuple[Linearization, Tensor, Tensor]:
     """Cameras and images of all views; which views say something; the lengths ``(*batch, views | 1, n)`` of the points."""
     if structure.ndim < x.ndim:
         structure = structure[..., None, :, :]

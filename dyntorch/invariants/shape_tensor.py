@@ -143,7 +143,7 @@ class ShapeTensor(Invariant):
         if self.frame != AFFINE or not len(x) or bool(((x[..., 2] > 0) | (weights <= 0)[..., None]).all()):
             return views, weights
         near, factor = static.local(x)
-        filled, whole = static.completed(near[..., :2], x[..., 2] > 0, weights)
+        filled, whole = static.complete_points(near[..., :2], x[..., 2] > 0, weights)
         back = (filled - near[..., :2]) / factor[..., None, None]
         centre = (x[..., :2] * x[..., 2:]).sum(-2, keepdim=True) / x[..., 2:].sum(-2, keepdim=True).clamp(min=1.0)
         missing = torch.where(x[..., 2:] > 0, x[..., :2], centre + back)
@@ -186,11 +186,11 @@ class ShapeTensor(Invariant):
         """The tensor of a null space of the estimation matrix, whose columns are the coordinates that constraints leave free."""
         device = basis.device
         if self.frame == AFFINE:
-            tensor = basis @ static.centred(self.n, device)
+            tensor = basis @ static.centring_basis(self.n, device)
         elif self.frame == GENERAL:
             tensor = basis @ static.free(self.n, device)
         else:
-            v = (basis.unflatten(-1, (-1, 3)).mT @ static.centred(self.n - 4, device)).mT.flatten(-2)
+            v = (basis.unflatten(-1, (-1, 3)).mT @ static.centring_basis(self.n - 4, device)).mT.flatten(-2)
             tensor = v @ static.plane_map(self.n, device).mT if self.multilinear else v
         tensor = tensor.unflatten(-1, self.shape())
         return tensor.squeeze(-1 - len(self.shape())) if self.nullity == 1 else tensor
@@ -199,11 +199,11 @@ class ShapeTensor(Invariant):
         device = tensor.device
         flat = tensor.flatten(-len(self.shape()))
         if self.frame == AFFINE:
-            basis = flat @ static.centred(self.n, device).mT
+            basis = flat @ static.centring_basis(self.n, device).mT
         elif self.frame == GENERAL:
             basis = flat @ static.free(self.n, device).mT
         else:
-            basis = (self._beside(flat).mT @ static.centred(self.n - 4, device).mT).mT.flatten(-2)
+            basis = (self._plane_points(flat).mT @ static.centring_basis(self.n - 4, device).mT).mT.flatten(-2)
         return basis.unsqueeze(-2) if self.nullity == 1 else basis
 
     @on_class
@@ -264,10 +264,10 @@ class ShapeTensor(Invariant):
         elif self.frame == GENERAL:
             points = static.general_points(flat, self.n - 4)
         else:
-            points = static.plane_points(self._beside(flat.flatten(-len(self.shape()))))
+            points = static.plane_points(self._plane_points(flat.flatten(-len(self.shape()))))
         return points.to(tensor.dtype)
 
-    def _beside(self, flat: Tensor) -> Tensor:
+    def _plane_points(self, flat: Tensor) -> Tensor:
         """The points v ``(*batch, n - 4, 3)``, of sum 0, of flat tensors of a reference plane."""
         v = flat @ static.plane_inverse(self.n, flat.device).mT if self.multilinear else flat
         return v.unflatten(-1, (self.n - 4, 3))

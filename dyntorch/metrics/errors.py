@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous, unit
-from dyntorch.geometry.lift import balanced, balanced_algebra
+from dyntorch.geometry.lift import balance_lifts, balanced_algebra
 from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.numerics.least_squares import damped_step
 from dyntorch.numerics.nullspace import null_space
@@ -392,14 +392,14 @@ def lifted_error(structure: Tensor, true: Tensor, lifts: Tensor, mask: Tensor | 
     z = torch.where(counts[..., None], z, 0.0)
     placed = inhomogeneous(z[:, None] @ lifts.double().mT)
     # both sides in coordinates in which they fill the space: whatever the gauges, the least squares are well conditioned
-    even, back = balanced(lifts)
-    right, y = _balanced(torch.where(weights[..., None] > 0, y, 0.0) @ back.mT)
-    left, z = _balanced(torch.where(weights[..., None] > 0, z, 0.0) @ back.mT)
+    even, back = balance_lifts(lifts)
+    right, y = _balance(torch.where(weights[..., None] > 0, y, 0.0) @ back.mT)
+    left, z = _balance(torch.where(weights[..., None] > 0, z, 0.0) @ back.mT)
     basis = torch.linalg.solve(left[:, None], balanced_algebra(even) @ right[:, None])
     basis = torch.linalg.qr(basis.flatten(2).mT).Q.mT.unflatten(-1, (size, size))
     image = (basis @ y.mT[:, None]).permute(0, 3, 2, 1)
     seen = (even @ left[:, None])[:, :, None] @ image[:, None]
-    c = _refined(_algebraic(image, z, weights), seen, placed, weights)
+    c = _refine(_algebraic(image, z, weights), seen, placed, weights)
     return _errors(inhomogeneous((seen @ c[:, None, None, :, None])[..., 0]), placed, counts, valid, batch)
 
 
@@ -425,7 +425,7 @@ def _median(x: Tensor, counts: Tensor) -> Tensor:
     return ordered.gather(-1, middle)[..., 0]
 
 
-def _balanced(y: Tensor) -> tuple[Tensor, Tensor]:
+def _balance(y: Tensor) -> tuple[Tensor, Tensor]:
     r"""A map A and unit points w with :math:`y \sim A w` for which :math:`\sum w w^T \sim I` (Tyler), for points ``(b, n, K)``."""
     size = y.shape[-1]
     spread = torch.eye(size, dtype=y.dtype, device=y.device).expand(len(y), -1, -1)
@@ -461,7 +461,7 @@ def _algebraic(image: Tensor, z: Tensor, weights: Tensor) -> Tensor:
     return c
 
 
-def _refined(c: Tensor, seen: Tensor, placed: Tensor, weights: Tensor) -> Tensor:
+def _refine(c: Tensor, seen: Tensor, placed: Tensor, weights: Tensor) -> Tensor:
     """Levenberg-Marquardt on the positions ``(b, views, n, d)``, seen as ``seen (b, views, n, d + 1, dim) @ c``."""
 
     def residual(c: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -120,14 +120,14 @@ def on_cpu(verb: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
             return verb(*args, **kwargs)
         if len(homes) > 1:
             raise ValueError(f"{verb.__name__} got tensors of {', '.join(sorted(map(str, homes)))}; use .to(device)")
-        args, kwargs = moved((args, kwargs), CPU)
-        result: Result = moved(verb(*args, **kwargs), *homes)
+        args, kwargs = move_to_device((args, kwargs), CPU)
+        result: Result = move_to_device(verb(*args, **kwargs), *homes)
         return result
 
     return lent
 
 
-def moved(value: Any, device: torch.device) -> Any:
+def move_to_device(value: Any, device: torch.device) -> Any:
     """The same value with its tensors on another device, whatever holds them."""
     if isinstance(value, Tensor):
         # a device without float64 gets float32
@@ -135,14 +135,14 @@ def moved(value: Any, device: torch.device) -> Any:
     if isinstance(value, torch.Generator):
         return value if device != CPU or value.device == CPU else torch.Generator().manual_seed(_seed(value))
     if isinstance(value, Mapping):
-        return {key: moved(part, device) for key, part in value.items()}
+        return {key: move_to_device(part, device) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        parts = [moved(part, device) for part in value]
+        parts = [move_to_device(part, device) for part in value]
         return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
     if _holds_fields(value):
         held = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
         return dataclasses.replace(
-            value, **{name: moved(part, device) for name, part in held.items() if any(True for _ in _tensors(part))}
+            value, **{name: move_to_device(part, device) for name, part in held.items() if any(True for _ in _tensors(part))}
         )
     return value
 

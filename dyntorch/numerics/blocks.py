@@ -166,7 +166,7 @@ def each(function: Callable[[Tensor], Tensor], record: Record) -> Record:
     return rebuilt(record, map(function, tensors_of(record)))
 
 
-def put(record: Record, at: Tensor, new: Record) -> Record:
+def replace_problems(record: Record, at: Tensor, new: Record) -> Record:
     """The record with the problems ``at (k,)`` replaced by those of another record of k problems, in memory of its own."""
     pairs = zip(tensors_of(record), tensors_of(new), strict=True)
     return rebuilt(record, (old.index_put((at,), part) for old, part in pairs))

@@ -125,7 +125,7 @@ def _generic(size: int, count: int, device: torch.device) -> Tensor:
 def by_inverse_iteration(gram: Tensor, dim: int) -> Eigenspace:
     r"""Subspace iteration with :math:`(G + \mu I)^{-1}`, then Newton corrections with a certificate. gram ``(b, D, D)``."""
     size, host = gram.shape[-1], on_host(gram)
-    factor, indefinite = torch.linalg.cholesky_ex(shifted(gram.clone(), size * EPS))
+    factor, indefinite = torch.linalg.cholesky_ex(add_to_diagonal(gram.clone(), size * EPS))
     # half an iteration: any start is as good as any other
     block = orthonormal(torch.linalg.solve_triangular(factor.mT, _generic(size, dim + 1, gram.device), upper=True))
     for _ in range(2 if host else 6):
@@ -133,7 +133,7 @@ def by_inverse_iteration(gram: Tensor, dim: int) -> Eigenspace:
     block, values = ritz(gram, block)
     vectors = block[..., :dim]
     sigma, competing = values[:, dim - 1].clamp(0.0, 1.0), values[:, dim]
-    deflated, missed = torch.linalg.cholesky_ex(shifted(raised(gram, vectors), -sigma[:, None]))
+    deflated, missed = torch.linalg.cholesky_ex(add_to_diagonal(raise_eigenspace(gram, vectors), -sigma[:, None]))
     sound = (indefinite == 0) & (missed == 0)
     vectors, values, bound = newton(gram, deflated, vectors, sigma, competing)
     if host:
@@ -155,7 +155,7 @@ def by_squaring(gram: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     r"""The smallest eigenvalue by k squarings of the inverse: every column is multiplied by :math:`G^{-2^k}`. gram
     ``(b, D, D)`` -> ``(b, D, 1)``."""
     size = gram.shape[-1]
-    factor, indefinite = torch.linalg.cholesky_ex(shifted(gram.clone(), size * EPS))
+    factor, indefinite = torch.linalg.cholesky_ex(add_to_diagonal(gram.clone(), size * EPS))
     inverse = torch.cholesky_inverse(factor)
     power, enough = inverse, 2 * ANGLE / size**0.5
     for squarings in range(1, SQUARINGS + 1):
@@ -226,14 +226,14 @@ def competing_sum(factor: Tensor, vectors: Tensor) -> Tensor:
     return total
 
 
-def raised(gram: Tensor, vectors: Tensor) -> Tensor:
+def raise_eigenspace(gram: Tensor, vectors: Tensor) -> Tensor:
     """G + V V^T: the eigenspace moves to the other end of the spectrum."""
     if vectors.shape[-1] == 1:
         return torch.addcmul(gram, vectors, vectors.mT)  # twice as fast as the product
     return torch.baddbmm(gram, vectors, vectors.mT)
 
 
-def shifted(matrix: Tensor, shift: Tensor | float) -> Tensor:
+def add_to_diagonal(matrix: Tensor, shift: Tensor | float) -> Tensor:
     """The matrix itself, with ``shift`` added to its diagonal."""
     matrix.diagonal(dim1=-2, dim2=-1).add_(shift)
     return matrix

@@ -20,7 +20,7 @@ Record = TypeVar("Record")
 Tensors = tuple[Tensor, ...]
 
 
-def transformed(*data: Any) -> bool:
+def is_transformed(*data: Any) -> bool:
     """Whether a tensor of some records is inside of a transformation of ``torch.func``, so that its values are not at hand."""
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
     return any(wrapped(tensor) for tensor in tensors_of(data))
@@ -39,7 +39,7 @@ def mapped_over(value: Tensor) -> bool:
 def over_problems(function: Callable[..., Record], *data: Any) -> Record:
     """``function(*data)`` of batches of independent problems; within ``torch.func`` too, in whatever order it is transformed.
     function ``(b, ...)``."""
-    if not transformed(*data):
+    if not is_transformed(*data):
         return function(*data)
     made: list[Record] = []
 
@@ -84,7 +84,7 @@ class _OverProblems(torch.autograd.Function):
     def vmap(
         info: Any, in_dims: tuple[int | None, ...], function: Callable[..., Tensors], *inputs: Tensor
     ) -> tuple[Tensors, tuple[int, ...]]:
-        whole = (merged(info, axis, x) for axis, x in zip(in_dims[1:], inputs, strict=True))
+        whole = (merge_mapped_dimension(info, axis, x) for axis, x in zip(in_dims[1:], inputs, strict=True))
         parts = tuple(split_again(info, part) for part in _OverProblems.apply(function, *whole))  # type: ignore[no-untyped-call]
         return parts, (0,) * len(parts)
 
@@ -133,12 +133,12 @@ def _leaves(inputs: Tensors) -> tuple[Tensors, Tensors]:
     return every, tuple(x for x in every if x.is_floating_point())
 
 
-def merged(info: Any, axis: int | None, tensor: Tensor) -> Tensor:
+def merge_mapped_dimension(info: Any, axis: int | None, tensor: Tensor) -> Tensor:
     """The dimension that vmap maps over as part of the batch."""
     whole = tensor.expand(info.batch_size, *tensor.shape) if axis is None else tensor.movedim(axis, 0)
     return whole.flatten(0, 1)
 
 
 def split_again(info: Any, part: Tensor) -> Tensor:
-    """The inverse of :func:`merged` for what comes out."""
+    """The inverse of :func:`merge_mapped_dimension` for what comes out."""
     return part.reshape(info.batch_size, len(part) // max(1, info.batch_size), *part.shape[1:])

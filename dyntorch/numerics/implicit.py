@@ -60,7 +60,7 @@ class _Minimum(torch.autograd.Function):
             given = [x.view_as(x) if again else x.detach() for x in data]
             hessian = _hessian(ctx.cost, theta, given, again)
             sound = hessian.detach().flatten(1).isfinite().all(-1)
-            right = _solved(hessian, free, cotangent, sound)
+            right = _solve_sound(hessian, free, cotangent, sound)
             variables = [x if again else x.requires_grad_() for x, want in zip(given, wanted, strict=True) if want]
             (slope,) = grad(ctx.cost(theta, *given).sum(), theta, create_graph=True)
             found = grad(slope, variables, -right, create_graph=again, allow_unused=True)
@@ -83,7 +83,7 @@ def _hessian(cost: Cost, theta: Tensor, data: list[Tensor], again: bool) -> Tens
     return torch.cat(rows).movedim(0, 1)
 
 
-def _solved(hessian: Tensor, free: Tensor, right: Tensor, sound: Tensor) -> Tensor:
+def _solve_sound(hessian: Tensor, free: Tensor, right: Tensor, sound: Tensor) -> Tensor:
     """The solution ``(b, p)`` that does not move along ``free``; 0 where there is none, or the Hessian is not ``sound (b,)``."""
     eye = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
     matrix = torch.where(sound[:, None, None], 0.5 * (hessian + hessian.mT), eye)

@@ -68,7 +68,7 @@ class Iterate(NamedTuple):
         """Some of the problems."""
         return Iterate(tuple(x[keep] for x in self.theta), self.cost[keep], tuple(x[keep] for x in self.terms))
 
-    def updated(self, index: Tensor, part: Iterate) -> Iterate:
+    def replace_problems(self, index: Tensor, part: Iterate) -> Iterate:
         """With other values for the problems ``index``."""
         theta, terms = (
             tuple(old.index_copy(0, index, new) for old, new in zip(*pair, strict=True))
@@ -145,13 +145,13 @@ class NormalEquations(LeastSquares):
         return step[0].abs().amax(-1) < SHORT
 
 
-def flattened(parts: Sequence[Tensor]) -> Tensor:
+def flatten_parts(parts: Sequence[Tensor]) -> Tensor:
     """All entries of motions ``(b, ...)``, part after part, ``(b, p)``."""
     return torch.cat([part.flatten(1) for part in parts], dim=-1)
 
 
 def parts_of(theta: Tensor, shapes: Sequence[torch.Size]) -> tuple[Tensor, ...]:
-    """The inverse of :func:`flattened`, for any leading dimensions."""
+    """The inverse of :func:`flatten_parts`, for any leading dimensions."""
     sizes = [shape.numel() for shape in shapes]
     return tuple(part.unflatten(-1, shape) for part, shape in zip(theta.split(sizes, -1), shapes, strict=True))
 
@@ -181,11 +181,11 @@ def minimize(problem: LeastSquares, start: Iterate, options: LeastSquaresOptions
     steps = torch.full_like(start.cost, options.iterations, dtype=torch.long)
     if options.tolerance is None:
         for _ in range(options.iterations):
-            at, damping, _ = _stepped(problem, at, damping, options)
+            at, damping, _ = _take_step(problem, at, damping, options)
     else:
         at = _until_done(problem, at, damping, options, steps)
     for _ in range(options.settling_steps):
-        at = _settled(problem, at, options)
+        at = _take_final_step(problem, at, options)
     return Minimum(at.theta, at.cost, at.terms, steps)
 
 
@@ -198,16 +198,16 @@ def _until_done(problem: LeastSquares, whole: Iterate, damping: Tensor, options:
         # launches hundreds of kernels
         keep = (~done).nonzero()[:, 0]
         if keep.shape != left.shape:
-            whole = whole.updated(left, at)
+            whole = whole.replace_problems(left, at)
             steps[left[done]] = count
             left, damping, at, problem = left[keep], damping[keep], at.subset(keep), problem.subset(keep)
         if not keep.shape[0]:
             return whole
-        at, damping, done = _stepped(problem, at, damping, options)
-    return at if left.shape == steps.shape else whole.updated(left, at)
+        at, damping, done = _take_step(problem, at, damping, options)
+    return at if left.shape == steps.shape else whole.replace_problems(left, at)
 
 
-def _stepped(problem: LeastSquares, at: Iterate, damping: Tensor, options: LeastSquaresOptions) -> tuple[Iterate, Tensor, Tensor]:
+def _take_step(problem: LeastSquares, at: Iterate, damping: Tensor, options: LeastSquaresOptions) -> tuple[Iterate, Tensor, Tensor]:
     """Where a step of every problem leads, the next damping, and which problems are done (where there is a tolerance)."""
     step = problem.step(at, damping)
     fresh = problem.moved(at, step)
@@ -221,7 +221,7 @@ def _stepped(problem: LeastSquares, at: Iterate, damping: Tensor, options: Least
     return fresh.where(better, at), damping, done
 
 
-def _settled(problem: LeastSquares, at: Iterate, options: LeastSquaresOptions) -> Iterate:
+def _take_final_step(problem: LeastSquares, at: Iterate, options: LeastSquaresOptions) -> Iterate:
     """One step of every problem that is near its minimum, whatever rounding makes of the cost."""
     step = problem.step(at, torch.full_like(at.cost, options.least_damping))
     fresh = problem.moved(at, step)

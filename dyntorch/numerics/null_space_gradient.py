@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics.blocks import map_blocks
-from dyntorch.numerics.eigenspaces import EPS, block_size, gram_of, on_host, raised, shifted, solve, unit_trace
-from dyntorch.numerics.function_transforms import merged, split_again
+from dyntorch.numerics.eigenspaces import EPS, add_to_diagonal, block_size, gram_of, on_host, raise_eigenspace, solve, unit_trace
+from dyntorch.numerics.function_transforms import merge_mapped_dimension, split_again
 
 OfGrams = Callable[[Tensor, int], tuple[Tensor, Tensor, Tensor, Tensor]]
 """Basis ``(b, dim, D)``, residual, competing and degenerate of Grams ``(b, D, D)``, as
@@ -24,16 +24,16 @@ def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
     ``(b, D, D)``, vectors ``(b, D, k)``, gradient ``(b, D, k)``."""
     values = (vectors * (gram @ vectors)).sum(-2)
     gradient = gradient - vectors @ (vectors.mT @ gradient)
-    deflated = raised(gram, vectors)
+    deflated = raise_eigenspace(gram, vectors)
     columns = []
     for j in range(vectors.shape[-1]):
-        factor = _regularized_factor(shifted(deflated.clone(), gram.shape[-1] * EPS - values[:, j, None]))
+        factor = _regularized_factor(add_to_diagonal(deflated.clone(), gram.shape[-1] * EPS - values[:, j, None]))
         columns.append(solve(gradient[..., j : j + 1], factor))
     found = torch.cat(columns, dim=-1)
     return found - vectors @ (vectors.mT @ found)
 
 
-def turned(gram: Tensor, vectors: Tensor, image: Tensor) -> Tensor:
+def eigenspace_derivative(gram: Tensor, vectors: Tensor, image: Tensor) -> Tensor:
     r"""How an eigenspace turns, :math:`dV = -W` where G changes by dG: the solution of a Sylvester equation. gram
     ``(b, D, D)``, vectors ``(b, D, k)``, image ``(b, D, k)``."""
     size, dim = vectors.shape[-2:]
@@ -55,7 +55,7 @@ def turned(gram: Tensor, vectors: Tensor, image: Tensor) -> Tensor:
 
 def gram_gradient(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
     """Gradient ``(b, D, D)`` by a Gram of a function of its eigenvectors with this gradient ``(b, D, k)``; differentiable."""
-    product = turned(gram, vectors, gradient) @ vectors.mT
+    product = eigenspace_derivative(gram, vectors, gradient) @ vectors.mT
     return 0.5 * (product + product.mT)
 
 
@@ -66,7 +66,7 @@ def _regularized_factor(matrix: Tensor) -> Tensor:
     failed = info > 0
     if on_host(matrix) and not bool(failed.any()):
         return factor
-    factor, _ = torch.linalg.cholesky_ex(shifted(matrix.clone(), torch.where(failed, 1e-10, 0.0)[:, None]))
+    factor, _ = torch.linalg.cholesky_ex(add_to_diagonal(matrix.clone(), torch.where(failed, 1e-10, 0.0)[:, None]))
     return factor
 
 
@@ -100,14 +100,14 @@ class NullSpaceOfGrams(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, *_: None) -> tuple[Tensor, None, None, None]:
         gram, basis = ctx.saved_tensors
-        moved = turned(gram.double(), basis.double().mT, tangent.double() @ basis.double().mT)
+        moved = eigenspace_derivative(gram.double(), basis.double().mT, tangent.double() @ basis.double().mT)
         return moved.mT.to(gram.dtype), None, None, None
 
     @staticmethod
     def vmap(
         info: Any, in_dims: tuple[int | None, None, None], gram: Tensor, dim: int, solver: OfGrams
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        parts = NullSpaceOfGrams.apply(merged(info, in_dims[0], gram), dim, solver)  # type: ignore[no-untyped-call]
+        parts = NullSpaceOfGrams.apply(merge_mapped_dimension(info, in_dims[0], gram), dim, solver)  # type: ignore[no-untyped-call]
         return tuple(split_again(info, part) for part in parts), (0, 0, 0, 0)
 
 
@@ -156,13 +156,13 @@ class NullSpaceOfRows(torch.autograd.Function):
         matrix, basis = ctx.saved_tensors
         a, vectors = _or_zero(matrix.double()), basis.double().mT
         change = a.mT @ (tangent.double() @ vectors) + tangent.double().mT @ (a @ vectors)
-        return turned(a.mT @ a, vectors, change).mT.to(matrix.dtype), None
+        return eigenspace_derivative(a.mT @ a, vectors, change).mT.to(matrix.dtype), None
 
     @staticmethod
     def vmap(
         info: Any, in_dims: tuple[int | None, None, None, None], matrix: Tensor, dim: int, keep: bool, solver: OfRows
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        basis, gram = NullSpaceOfRows.apply(merged(info, in_dims[0], matrix), dim, keep, solver)  # type: ignore[no-untyped-call]
+        basis, gram = NullSpaceOfRows.apply(merge_mapped_dimension(info, in_dims[0], matrix), dim, keep, solver)  # type: ignore[no-untyped-call]
         return (split_again(info, basis), split_again(info, gram)), (0, 0)
 
 

@@ -25,7 +25,7 @@ from dyntorch.numerics.eigenspaces import (
     solve,
     unit_trace,
 )
-from dyntorch.numerics.function_transforms import transformed
+from dyntorch.numerics.function_transforms import is_transformed
 from dyntorch.numerics.null_space_gradient import NullSpaceOfGrams, NullSpaceOfRows
 
 UNDERFLOW = 1e-250  # of the order of the entries: squares and products of what is smaller are no normal numbers
@@ -39,7 +39,7 @@ def eigh(matrix: Tensor) -> tuple[Tensor, Tensor]:
 
 def _without(matrix: Tensor, limit: float) -> Tensor:
     """The matrix with 0 for entries below a limit, which keep their derivatives."""
-    nothing = matrix - matrix.detach() if matrix.requires_grad or transformed(matrix) else 0.0
+    nothing = matrix - matrix.detach() if matrix.requires_grad or is_transformed(matrix) else 0.0
     return torch.where(matrix.abs() < limit, nothing, matrix)
 
 
@@ -230,17 +230,17 @@ def _solve_rows(matrix: Tensor, gram: Tensor, dim: int) -> Tensor:
     found = by_inverse_iteration(scaled, dim)
     vectors = found.vectors
     if not on_host(matrix):
-        return torch.where(finite[:, None, None], _corrected(matrix, scale, vectors, found.deflated), 0.0)
+        return torch.where(finite[:, None, None], _correct_by_newton(matrix, scale, vectors, found.deflated), 0.0)
     slow = (finite & ~found.certified & (found.competing > ACCURATE)).nonzero()[:, 0]
     if len(slow):
         vectors[slow] = by_eigh(scaled[slow], dim)[0]
     inexact = (finite & found.certified & (found.competing <= ACCURATE) & (found.competing > RESOLVED)).nonzero()[:, 0]
     if len(inexact):
-        vectors[inexact] = _corrected(matrix[inexact], scale[inexact], vectors[inexact], found.deflated[inexact])
+        vectors[inexact] = _correct_by_newton(matrix[inexact], scale[inexact], vectors[inexact], found.deflated[inexact])
     return _with_svd(matrix, vectors, ~(finite & (found.competing > torch.where(found.certified, RESOLVED, ACCURATE))))
 
 
-def _corrected(matrix: Tensor, scale: Tensor, vectors: Tensor, deflated: Tensor) -> Tensor:
+def _correct_by_newton(matrix: Tensor, scale: Tensor, vectors: Tensor, deflated: Tensor) -> Tensor:
     """Newton corrections whose residual comes from the rows: the error is that of the SVD, eps kappa, not eps kappa^2."""
     for _ in range(2):
         image = matrix @ vectors

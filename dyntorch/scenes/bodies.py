@@ -71,7 +71,7 @@ def bodies(
         True
     """
     counts = _counts(n, bodies)
-    flat, still = (_chosen(name, k, len(counts)) for name, k in (("planar", planar), ("rotating", rotating)))
+    flat, still = (_select_bodies(name, k, len(counts)) for name, k in (("planar", planar), ("rotating", rotating)))
     draw = Draw(sum(counts), batch, sigma, 0.0, outliers, generator, dtype)
     body = _of_match(draw, counts)
     flat, still = flat.to(body.device), still.to(body.device)
@@ -117,7 +117,7 @@ def _counts(n: int | Sequence[int], bodies: int | None) -> list[int]:
     return counts
 
 
-def _chosen(name: str, chosen: Collection[int], count: int) -> Tensor:
+def _select_bodies(name: str, chosen: Collection[int], count: int) -> Tensor:
     """``(K,)`` which bodies were named."""
     if not all(1 <= k <= count for k in chosen):
         raise ValueError(f"{name} must name bodies from 1 to {count}, got {tuple(chosen)}")

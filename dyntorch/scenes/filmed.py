@@ -105,7 +105,7 @@ def filmed(
     mistaken = torch.zeros(n, dtype=torch.bool).index_fill(0, torch.randperm(n, generator=generator)[:wrong], True)
     own = torch.arange(n)
     seen = exact[0], exact[1][:, torch.where(mistaken, (own + 1) % n, own)]
-    shown = [_detected(x, noise, missing, outliers, lens, generator) for x in seen]
+    shown = [_detect(x, noise, missing, outliers, lens, generator) for x in seen]
     return FilmedScene(
         a=shown[0][0],
         b=shown[1][0],
@@ -174,7 +174,7 @@ def _fundamental(cameras: Tensor) -> Tensor:
     return F / F.norm()
 
 
-def _detected(
+def _detect(
     x: Tensor, noise: float, missing: float, outliers: float, lens: float, generator: torch.Generator | None
 ) -> tuple[Tensor, Tensor]:
     """What a detector makes of ideal pixels, and which positions are elsewhere."""

@@ -156,9 +156,9 @@ def lifted(
     t = _times(views, times, kind.views, draw)
     cameras = draw.sensors(len(t), "projective") if kind.sensors else _cameras(draw, t, jitter, drift, plane=kind.dim == 2)
     middle = _ball(draw, kind.dim)
-    truth = _bodies(draw, t, cameras, middle) if kind.bodies > 1 else _moving(draw, t, cameras, middle, kind)
+    truth = _bodies(draw, t, cameras, middle) if kind.bodies > 1 else _polynomial_truth(draw, t, cameras, middle, kind)
     exact = inhomogeneous(truth.structure[..., None, :, :] @ truth.projections.mT)
-    truth = replace(truth, exact=exact, tracks=_observed(draw, exact, missing, truth.structure.shape[-1] - 1))
+    truth = replace(truth, exact=exact, tracks=_observe(draw, exact, missing, truth.structure.shape[-1] - 1))
     return truth.to(dtype)
 
 
@@ -202,7 +202,7 @@ def _cameras(draw: Draw, t: Tensor, jitter: float, drift: float, plane: bool) ->
     return cameras[..., [0, 1, 3]] if plane else cameras
 
 
-def _moving(draw: Draw, t: Tensor, cameras: Tensor, middle: Tensor, kind: LiftedKind) -> LiftedScene:
+def _polynomial_truth(draw: Draw, t: Tensor, cameras: Tensor, middle: Tensor, kind: LiftedKind) -> LiftedScene:
     """The truth of points that move as polynomials in time."""
     dim, axes = kind.dim, kind.axes
     eye = torch.eye(dim + 1, dtype=t.dtype, device=t.device)
@@ -227,7 +227,7 @@ def _bodies(draw: Draw, t: Tensor, cameras: Tensor, points: Tensor) -> LiftedSce
     return LiftedScene(points, points, None, cameras, structure, draw.labels, t, draw.sigma, points, None, path)
 
 
-def _observed(draw: Draw, exact: Tensor, missing: float, k: int) -> Tensor:
+def _observe(draw: Draw, exact: Tensor, missing: float, k: int) -> Tensor:
     """Noise, outliers in one observed view of a point, and gaps that leave every point ``k / l`` views."""
     views, n, size = exact.shape[-3:]
     order = draw.uniform(views, n).argsort(dim=-2)

@@ -141,7 +141,7 @@ def streets(
         >>> bool(((seen - street.exact).norm(dim=-1).nan_to_num() < 1e-6).all())
         True
     """
-    _checked(bodies, frames, tracks, sigma, outliers, options)
+    _check(bodies, frames, tracks, sigma, outliers, options)
     chance = Chance(generator)
     for _ in range(ATTEMPTS):
         scene = _Scene.draw(bodies, frames, options, chance)
@@ -157,7 +157,7 @@ def streets(
     )
 
 
-def _checked(bodies: int, frames: int, tracks: int, sigma: float, outliers: float, options: StreetOptions) -> None:
+def _check(bodies: int, frames: int, tracks: int, sigma: float, outliers: float, options: StreetOptions) -> None:
     if bodies < 1 or frames < options.shortest:
         raise ValueError(f"a street needs bodies >= 1 and frames >= {options.shortest}, got bodies={bodies}, frames={frames}")
     if tracks < 2 * options.members * bodies:
@@ -301,13 +301,13 @@ class _Scene:
         rough = (patch - patch.floor() < options.texture) | (body > 0)
         kept = (owner == body) & ((box != NOTHING) | far) & rough
         kept &= (box != GROUND) | (chance.uniform(len(start)) < options.road)
-        return self._followed(start[kept], box[kept], local[kept], point[kept], chance) if bool(kept.any()) else None
+        return self._follow_tracks(start[kept], box[kept], local[kept], point[kept], chance) if bool(kept.any()) else None
 
     def _rays(self, frame: Tensor, pixel: Tensor) -> Tensor:
         """``(m, 3)`` directions of pixels, of depth 1."""
         return torch.linalg.solve(self.cameras[frame, :, :3], homogeneous(pixel)[..., None])[..., 0]
 
-    def _followed(self, start: Tensor, box: Tensor, local: Tensor, point: Tensor, chance: Chance) -> _Part:
+    def _follow_tracks(self, start: Tensor, box: Tensor, local: Tensor, point: Tensor, chance: Chance) -> _Part:
         """Tracks from their first frame until they leave, are hidden, move too far, or are lost."""
         frames = torch.arange(len(self.cameras))
         moved = torch.stack([self.boxes.world(t, box.clamp(min=0), local) for t in frames.tolist()])

@@ -179,7 +179,7 @@ def deformable_shapes(
         >>> print(found.head(frames=15))
         DeformableShapes(frames=15, batch=(): 1 OK)
     """
-    batch, pairs = _checked(x1, x2, basis, lengths, weights)
+    batch, pairs = _check(x1, x2, basis, lengths, weights)
     T, n = x1.shape[-3:-1]
     x = torch.stack([x1.detach().expand(*batch, T, n, 2), x2.detach().expand(*batch, T, n, 2)], dim=-4).double()
     seen = x.isfinite().all(-1)
@@ -187,13 +187,11 @@ def deformable_shapes(
     count = prod(batch)
     x, w = torch.where(w[..., None] > 0, x, 0.0).reshape(count, 2, T, n, 2), w.reshape(count, 2, T, n)
     with torch.no_grad():
-        found = _solved(x, w, basis, pairs, orthographic, replace(STOP, max_iterations=iterations))
-    return _shaped(found, batch, x1)
+        found = _fit_stages(x, w, basis, pairs, orthographic, replace(STOP, max_iterations=iterations))
+    return _result(found, batch, x1)
 
 
-def _checked(
-    x1: Tensor, x2: Tensor, basis: int, lengths: Tensor | None, weights: Tensor | None
-) -> tuple[torch.Size, Tensor | None]:
+def _check(x1: Tensor, x2: Tensor, basis: int, lengths: Tensor | None, weights: Tensor | None) -> tuple[torch.Size, Tensor | None]:
     """The batch, and the pairs."""
     check_tensor("x1", x1, "frames", "n", 2)
     check_tensor("x2", x2, "frames", "n", 2)
@@ -214,7 +212,7 @@ def _checked(
     return batch, pairs.long()
 
 
-class _Found(NamedTuple):
+class _Fit(NamedTuple):
     """What a flat batch ends as."""
 
     model: _Model
@@ -225,7 +223,7 @@ class _Found(NamedTuple):
     scale: Tensor
 
 
-def _solved(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic: bool, stop: Stop) -> _Found:
+def _fit_stages(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic: bool, stop: Stop) -> _Fit:
     """The stages in their order: size, cameras and points, metric, shapes, least squares, frame."""
     scale = _size(x, w)
     x = x / scale[:, None, None, None, None]
@@ -235,13 +233,13 @@ def _solved(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic
     turns = torch.eye(3, dtype=x.dtype, device=x.device).expand(b, T, 3, 3).clone()
     if pairs is not None:
         noise = values[:, 0].clamp(min=0) / (both.sum((1, 2)) - both.any(-1).sum(-1)).clamp(min=1)
-        change, metric = _by_lengths(points, both, cameras, noise, pairs.to(x.device), orthographic)
+        change, metric = _metric_by_lengths(points, both, cameras, noise, pairs.to(x.device), orthographic)
         cameras, points = cameras @ torch.linalg.inv(change)[:, None], points @ change.mT
-        turned = _turned(points, both)
+        turned = _rotate_to_mean_shape(points, both)
         turns = torch.where(metric[:, None, None, None], turned, turns)
     coefficients, shapes = _low_rank(points @ turns, both, basis)
     model = _Model(cameras, turns, coefficients, shapes, torch.zeros_like(x[:, :, :, 0]))
-    model, cost = _in_turn(x, w, model, metric, stop)
+    model, cost = _alternate(x, w, model, metric, stop)
     images = (w > 0).sum((1, 2, 3))
     turning = 3 * T * metric
     free = 12 + basis * (T + 3 * n) + 4 * T + turning - basis * (basis + 3) - torch.where(metric, 7, 9)
@@ -256,7 +254,7 @@ def _solved(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic
     status = torch.where((spare < 0) | ((both.sum(-1) > 3).sum(-1) < 1) | (both.sum((1, 2)) < 4), int(Status.TOO_FEW), status)
     finite = torch.stack([part.isfinite().flatten(1).all(-1) for part in model]).all(0)
     status = torch.where(~finite & ~failed(status), int(Status.DEGENERATE), status)
-    return _Found(_framed(model), metric, rms * scale, sigma * scale, status, scale)
+    return _Fit(_canonical_model(model), metric, rms * scale, sigma * scale, status, scale)
 
 
 def _size(x: Tensor, w: Tensor) -> Tensor:
@@ -280,7 +278,7 @@ def _stereo(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return frame.unflatten(1, (2, 2)), joint @ frame[:, None], both, values
 
 
-class _Ways(NamedTuple):
+class _Differences(NamedTuple):
     """Differences of the pairs of constant length."""
 
     way: Tensor  # (b, T, k, 3)
@@ -302,15 +300,15 @@ class _Ways(NamedTuple):
         return ((square - mean).square() * weight).sum((2, 3))
 
 
-def _by_lengths(
+def _metric_by_lengths(
     points: Tensor, both: Tensor, cameras: Tensor, noise: Tensor, pairs: Tensor, orthographic: bool
 ) -> tuple[Tensor, Tensor]:
     """The change of the world ``(b, 3, 3)`` that makes lengths constant, and whether they decide one ``(b,)``."""
     way = points[:, :, pairs[:, 0]] - points[:, :, pairs[:, 1]]
     seen = (both[:, :, pairs[:, 0]] & both[:, :, pairs[:, 1]]).to(points.dtype)
     size = way.square().sum(-1, keepdim=True).mean((1, 2))
-    ways = _Ways(way, seen, 2 * noise + EXACT * size[:, 0])
-    matrix, decided = _along_family(ways, cameras) if orthographic else _of_any_cameras(ways)
+    ways = _Differences(way, seen, 2 * noise + EXACT * size[:, 0])
+    matrix, decided = _metric_of_orthographic_cameras(ways, cameras) if orthographic else _metric_of_any_cameras(ways)
     inner, axes = eigh(matrix)
     sound = decided & (inner[:, 0] > MIN_METRIC * inner[:, 2])
     root = (inner.clamp(min=0).sqrt()[:, None] * axes) @ axes.mT
@@ -319,7 +317,7 @@ def _by_lengths(
     return torch.where(sound[:, None, None], root, eye.expand_as(root)), sound
 
 
-def _of_any_cameras(ways: _Ways) -> tuple[Tensor, Tensor]:
+def _metric_of_any_cameras(ways: _Differences) -> tuple[Tensor, Tensor]:
     r"""The metric Q ``(b, 3, 3)`` by lengths alone: with the monomials :math:`m(d)`, :math:`d^T Q\, d = q \cdot m(d)`,"""
     way, seen = ways.way, ways.seen
     i, j = torch.triu_indices(3, 3, device=way.device)
@@ -355,7 +353,7 @@ def _of_any_cameras(ways: _Ways) -> tuple[Tensor, Tensor]:
     return best, decided
 
 
-def _along_family(ways: _Ways, cameras: Tensor) -> tuple[Tensor, Tensor]:
+def _metric_of_orthographic_cameras(ways: _Differences, cameras: Tensor) -> tuple[Tensor, Tensor]:
     r"""The metric Q ``(b, 3, 3)`` of scaled orthographic cameras: :math:`M_v Q^{-1} M_v^T \sim I` leaves a family of one parameter
     (Koenderink and van Doorn), of which the lengths choose one; and whether there is any, ``(b,)``."""
     i, j = torch.triu_indices(3, 3, device=cameras.device)
@@ -394,7 +392,7 @@ def _along_family(ways: _Ways, cameras: Tensor) -> tuple[Tensor, Tensor]:
     return best, decided
 
 
-def _turned(points: Tensor, both: Tensor) -> Tensor:
+def _rotate_to_mean_shape(points: Tensor, both: Tensor) -> Tensor:
     """Rotations ``(b, T, 3, 3)`` from a common frame to the frames, by turns with the mean shape."""
     weight = both.to(points.dtype)[..., None]
     shape = points.gather(1, both.sum(-1).argmax(-1)[:, None, None, None].expand(-1, 1, *points.shape[2:]))
@@ -426,17 +424,17 @@ def _low_rank(points: Tensor, both: Tensor, basis: int) -> tuple[Tensor, Tensor]
 # Least squares in turn: every one of coefficients with offsets, rotations, shapes and cameras is linear given the others.
 
 
-def _in_turn(x: Tensor, w: Tensor, model: _Model, metric: Tensor, stop: Stop) -> tuple[_Model, Tensor]:
+def _alternate(x: Tensor, w: Tensor, model: _Model, metric: Tensor, stop: Stop) -> tuple[_Model, Tensor]:
     """The model after least squares in turn, and its cost ``(b,)``, which never rises."""
-    model = _deformed(x, w, model)
+    model = _update_coefficients(x, w, model)
     cost = _cost(x, w, model)
     left = torch.arange(len(x), device=x.device)
     floor = EXACT * w.sum((1, 2, 3))
     for _ in range(stop.max_iterations):
         some, images, weight, turning = _Model(*(part[left] for part in model)), x[left], w[left], metric[left]
-        fresh = _shaped_anew(images, weight, some)
-        fresh = _seen_anew(images, weight, fresh, turning)
-        fresh = _deformed(images, weight, fresh)
+        fresh = _update_shapes(images, weight, some)
+        fresh = _update_cameras(images, weight, fresh, turning)
+        fresh = _update_coefficients(images, weight, fresh)
         now = _cost(images, weight, fresh)
         better = now < cost[left]
         at = left[better]
@@ -459,7 +457,7 @@ def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     return torch.linalg.solve_ex(matrix + RIDGE * size * eye, right[..., None])[0][..., 0]
 
 
-def _deformed(x: Tensor, w: Tensor, model: _Model) -> _Model:
+def _update_coefficients(x: Tensor, w: Tensor, model: _Model) -> _Model:
     """The best coefficients and offsets of every frame."""
     b, _, T, n, _ = x.shape
     basis = model.coefficients.shape[-1]
@@ -475,7 +473,7 @@ def _deformed(x: Tensor, w: Tensor, model: _Model) -> _Model:
     return model._replace(coefficients=found[..., :basis], offsets=offsets)
 
 
-def _shaped_anew(x: Tensor, w: Tensor, model: _Model) -> _Model:
+def _update_shapes(x: Tensor, w: Tensor, model: _Model) -> _Model:
     """The best place of every point in every basis shape."""
     basis = model.shapes.shape[1]
     views = model.cameras[:, :, None] @ model.turns[:, None]
@@ -490,7 +488,7 @@ def _shaped_anew(x: Tensor, w: Tensor, model: _Model) -> _Model:
     return model._replace(shapes=found.unflatten(-1, (basis, 3)).transpose(1, 2))
 
 
-def _seen_anew(x: Tensor, w: Tensor, model: _Model, turning: Tensor) -> _Model:
+def _update_cameras(x: Tensor, w: Tensor, model: _Model, turning: Tensor) -> _Model:
     """The best cameras; before a metric thing the best small turns of every frame, within cameras as they are."""
     points = model.points
     away = x - model.offsets[..., None, :]
@@ -511,7 +509,7 @@ def _seen_anew(x: Tensor, w: Tensor, model: _Model, turning: Tensor) -> _Model:
     return model._replace(turns=torch.where(turning[:, None, None, None], turns, model.turns))
 
 
-def _framed(model: _Model) -> _Model:
+def _canonical_model(model: _Model) -> _Model:
     """Shapes about their centroids, orthogonal coefficients of mean square 1, the most important shape first."""
     cameras, turns, coefficients, shapes, offsets = model
     middle = shapes.mean(2)
@@ -534,7 +532,7 @@ def _framed(model: _Model) -> _Model:
     return _Model(cameras, turns, left, right.unflatten(-1, shapes.shape[2:]), offsets)
 
 
-def _shaped(found: _Found, batch: torch.Size, like: Tensor) -> DeformableShapes:
+def _result(found: _Fit, batch: torch.Size, like: Tensor) -> DeformableShapes:
     """In the caller's batch, unit and dtype; zero where nothing was found."""
     model, bad = found.model, failed(found.status)
 

@@ -31,7 +31,7 @@ from dyntorch.geometry.grassmann_nearest import projections_of
 from dyntorch.geometry.homogeneous import unit_vectors
 from dyntorch.numerics.blocks import constant
 from dyntorch.numerics.nullspace import null_space
-from dyntorch.shapes.static import GENERAL, THIN, centred, lines_through, local, with_basis
+from dyntorch.shapes.static import GENERAL, THIN, centring_basis, lines_through, local, with_basis
 
 Profile = tuple[int, ...]
 ROUNDS = 10
@@ -46,12 +46,12 @@ def profile_of(k: int, others: int) -> Profile:
     return (least + 1,) * more + (least,) * (others - more)
 
 
-def _ordered(left: tuple[int, ...], profile: Profile) -> list[tuple[tuple[int, ...], ...]]:
+def _ordered_partitions(left: tuple[int, ...], profile: Profile) -> list[tuple[tuple[int, ...], ...]]:
     """All ordered partitions of ``left`` into sets of these sizes."""
     if not profile:
         return [()]
     first = combinations(left, profile[0])
-    return [(s, *rest) for s in first for rest in _ordered(tuple(i for i in left if i not in s), profile[1:])]
+    return [(s, *rest) for s in first for rest in _ordered_partitions(tuple(i for i in left if i not in s), profile[1:])]
 
 
 @constant
@@ -62,7 +62,7 @@ def partitions(k: int, profile: Profile, device: torch.device) -> tuple[Tensor, 
         ``(m, N)`` which minor of the compound matrix of each point, ``(N,)`` signs, and ``(N, m, k + 1)`` which coordinates of
         which point the entry of the tensor is the product of.
     """
-    found = _ordered(tuple(range(k + 1)), profile)
+    found = _ordered_partitions(tuple(range(k + 1)), profile)
     place = [{s: i for i, s in enumerate(combinations(range(k + 1), a))} for a in profile]
     index = torch.tensor([[place[j][s] for s in row] for j, row in enumerate(zip(*found, strict=True))])
     flat = [[i for s in row for i in s] for row in found]
@@ -127,7 +127,7 @@ def _rows_of_a_view(l: int, profile: Profile) -> int:  # noqa: E741
 
 
 @constant
-def counted(k: int, l: int, profile: Profile) -> tuple[int, int]:  # noqa: E741
+def count_rows(k: int, l: int, profile: Profile) -> tuple[int, int]:  # noqa: E741
     """Independent rows of one view, and fewest views that determine the tensor: ranks of views of a random shape."""
     draw = torch.Generator().manual_seed(1)
     basis = free(k, l, profile, torch.device("cpu"))
@@ -147,7 +147,7 @@ def counted(k: int, l: int, profile: Profile) -> tuple[int, int]:  # noqa: E741
             return rows, views
 
 
-def composed(points: Tensor, profile: Profile) -> Tensor:
+def compose_entries(points: Tensor, profile: Profile) -> Tensor:
     """Entries ``(*batch, N)`` of the tensor of points ``(*batch, n, k + 1)`` in the frame of the basis, all partitions."""
     others = points[..., -len(profile) :, :]
     member = partitions(points.shape[-1] - 1, profile, points.device)[2]
@@ -229,7 +229,7 @@ def plane_rows(x: Tensor) -> Tensor:
     shared = inverse(square + 1e-14 * (1 + square.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]) * eye)
     for _ in range(2):
         points = points - camera @ (shared @ (camera.mT @ points))
-    return (points.unflatten(-1, (count, size)).mT @ centred(count, x.device).mT).mT.flatten(-2)
+    return (points.unflatten(-1, (count, size)).mT @ centring_basis(count, x.device).mT).mT.flatten(-2)
 
 
 def camera_score(structure: Tensor, x: Tensor, freedom: int, affine: bool) -> Tensor:

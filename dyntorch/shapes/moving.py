@@ -15,7 +15,7 @@ from dyntorch.numerics.blocks import one_thread, select
 from dyntorch.numerics.implicit import flat_directions, follow_minimum
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
-from dyntorch.shapes.static import centred
+from dyntorch.shapes.static import centring_basis
 
 # ----------------------------------------------------------------------------------------------------------------------
 # All joints of a moving shape at once: the least squares shapes :math:`X_b` behind single affine views of it.
@@ -135,7 +135,7 @@ def canonical(shapes: Tensor) -> Tensor:
     return torch.linalg.qr(flat)[0].unflatten(1, shapes.shape[1:3])
 
 
-def framed(shapes: Tensor) -> Tensor:
+def canonical_frame(shapes: Tensor) -> Tensor:
     """:func:`canonical` with the columns of :math:`X_0` orthogonal, the longest first: one representative of each family."""
     moved = canonical(shapes)
     first = moved[:, 0]
@@ -249,13 +249,13 @@ def complete(views: AffineViews) -> Tensor:
     for _ in range(FILL_ITERATIONS):
         mean = leading(x, views.share)[:, None]
         part = torch.where(seen, mean, 0.0)
-        filled = mean @ _regressed(part, torch.where(seen, x, 0.0))
+        filled = mean @ _regress(part, torch.where(seen, x, 0.0))
         x = torch.where(seen, x, filled)
         x = x - x.mean(-2, keepdim=True)
     return x
 
 
-def _regressed(basis: Tensor, x: Tensor) -> Tensor:
+def _regress(basis: Tensor, x: Tensor) -> Tensor:
     gram = basis.mT @ basis
     eye = torch.eye(basis.shape[-1], dtype=x.dtype, device=x.device)
     return torch.linalg.solve_ex(gram + FILL_RIDGE * eye, basis.mT @ x)[0]
@@ -292,7 +292,7 @@ def shapes_through(bases: Tensor, rows: Tensor, share: Tensor) -> Tensor:
 def graph_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor | None:
     """Shapes ``(b, B, n, 3)`` by the graph over the mean shape of centred views ``(b, views, n, 2)``; None with too few views."""
     powers = products(rows)
-    helmert = centred(x.shape[-2], x.device)
+    helmert = centring_basis(x.shape[-2], x.device)
     flat = helmert @ x
     if 2 * x.shape[1] < 3 * powers.shape[-1] + 1:
         return None
@@ -304,7 +304,7 @@ def graph_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor | None:
 
 def window_start(x: Tensor, rows: Tensor, share: Tensor) -> Tensor:
     """Shapes ``(b, B, n, 3)`` by the static shapes of windows of views at about one time."""
-    helmert = centred(x.shape[-2], x.device)
+    helmert = centring_basis(x.shape[-2], x.device)
     flat = helmert @ x
     count = x.shape[1]
     anchors = torch.linspace(0, count - 1, min(count, MAX_WINDOWS), device=x.device).round().long()
@@ -413,13 +413,13 @@ def fit_shapes(
         (True, False)
     """
     batch, views, times = checked_views(x, rows, weights, share)
-    few = _few(views, times)
-    shapes, cost = _best(views, times, iterations)
+    few = _is_underdetermined(views, times)
+    shapes, cost = _fit_from_starts(views, times, iterations)
     uncertainty, noise, free = _uncertainty(views, times, shapes, cost)
     found = project(views.x, views.weights, shapes_at(shapes, times))
     residual = found.residual.square().sum((-2, -1)).clamp(0, 1)
     none = few[:, None, None, None]
-    back = [torch.where(none, 0.0, framed(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty)]
+    back = [torch.where(none, 0.0, canonical_frame(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty)]
     done = [part.reshape((*batch, *part.shape[1:])).to(x.dtype) for part in back]
     return MovingShapes(*done, status=status_of(free, few).reshape(batch))
 
@@ -437,10 +437,10 @@ def followed_shapes(shapes: Tensor, measured: Tensor, rows: Tensor, share: Tenso
     found = follow_minimum(cost, theta, free, measured, rows, share).unflatten(1, shapes.shape[1:])
     # what no view can tell is nailed down as it is in the fit
     none = (theta == 0).all(-1)
-    return select(~none, framed(select(~none, found, _standing(shapes))), 0.0)
+    return select(~none, canonical_frame(select(~none, found, _placeholder_shape(shapes))), 0.0)
 
 
-def _standing(shapes: Tensor) -> Tensor:
+def _placeholder_shape(shapes: Tensor) -> Tensor:
     """A shape whose frame has derivatives, in place of one that is zero."""
     n = torch.arange(1.0, shapes.shape[-2] * 3 + 1, dtype=shapes.dtype, device=shapes.device).reshape(-1, 3)
     return (n.sin() * torch.tensor([1.0, 2.0, 3.0]).to(n)).expand_as(shapes)
@@ -474,7 +474,7 @@ def checked_views(
     return batch, views, wide / torch.where(largest > 0, largest, 1.0)
 
 
-def _few(views: AffineViews, rows: Tensor) -> Tensor:
+def _is_underdetermined(views: AffineViews, rows: Tensor) -> Tensor:
     """Whether the views hold fewer conditions than the shapes have parameters."""
     return _spare(views, rows) < 0
 
@@ -485,11 +485,11 @@ def _spare(views: AffineViews, rows: Tensor) -> Tensor:
     return 2 * seen.sum(-1) - (3 * rows.shape[-1] * (views.x.shape[-2] - 1) - GAUGE)
 
 
-def _best(views: AffineViews, rows: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
+def _fit_from_starts(views: AffineViews, rows: Tensor, iterations: int) -> tuple[Tensor, Tensor]:
     """Shapes and cost of the best of all starts."""
     filled = complete(views)
     made = [make(filled, rows, views.share) for make in (graph_start, window_start)]
-    made += [pooled_start(filled, rows, views.share), _grown(views, filled, rows)]
+    made += [pooled_start(filled, rows, views.share), _incremental_start(views, filled, rows)]
     starts = [torch.where(start.isfinite(), start, 0.0) for start in made if start is not None]
     shapes, cost = descend(views.repeated(len(starts)), rows.repeat(len(starts), 1, 1), torch.cat(starts), START_STEPS)
     cost = torch.where(cost.isfinite(), cost, torch.inf).unflatten(0, (len(starts), -1))
@@ -498,7 +498,7 @@ def _best(views: AffineViews, rows: Tensor, iterations: int) -> tuple[Tensor, Te
     return descend(views, rows, chosen, max(0, iterations - START_STEPS))
 
 
-def _grown(views: AffineViews, filled: Tensor, rows: Tensor) -> Tensor:
+def _incremental_start(views: AffineViews, filled: Tensor, rows: Tensor) -> Tensor:
     """Shapes ``(b, B, n, 3)`` that start at rest and are given one function of the time after the other."""
     shapes = leading(filled, views.share)[:, None]
     for size in range(2, rows.shape[-1] + 1):

@@ -29,10 +29,10 @@ from dyntorch.shapes.moving import (
     AffineViews,
     MovingShapes,
     canonical,
+    canonical_frame,
     centred_views,
     checked_views,
     fit_shapes,
-    framed,
     shapes_at,
 )
 from dyntorch.shapes.times import TIME_STEPS, Recovery, lowest_minima, tried_times
@@ -223,7 +223,7 @@ def fit_perspective_shapes(
     uncertainty, free = _uncertainty(descent, shapes, noise)
     none = few[:, None, None, None]
     residual = descent.at(shapes.flatten(1)).cost.clamp(0, 1)
-    back = [torch.where(none, 0.0, framed(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty)]
+    back = [torch.where(none, 0.0, canonical_frame(shapes)), noise, residual, torch.where(few, torch.inf, uncertainty)]
     done = [part.reshape((*batch, *part.shape[1:])).to(x.dtype) for part in back]
     return MovingShapes(*done, status=status_of(free, few).reshape(batch))
 

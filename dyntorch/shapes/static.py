@@ -89,7 +89,7 @@ def general_rows(x: Tensor) -> Tensor:
 
 
 def plane_rows(x: Tensor) -> Tensor:
-    r"""Rows of points beside a reference plane, in the coordinates of :func:`centred`: ``(..., 2 (n - 4), 3 (n - 5))``."""
+    r"""Rows of points beside a reference plane, in the coordinates of :func:`centring_basis`: ``(..., 2 (n - 4), 3 (n - 5))``."""
     q, noise = canonical(x)
     count = q.shape[-2]
     camera = (lines_through(q) / noise[..., None, None]).flatten(-3, -2)  # (.., 2 m, 3)
@@ -103,20 +103,20 @@ def plane_rows(x: Tensor) -> Tensor:
     for _ in range(2):
         # the second pass takes what the ridge and rounding leave: up to 1e-8 where all points look alike, then 1e-13
         rows = rows - camera @ (shared @ (camera.mT @ rows))
-    basis = centred(count, x.device)
+    basis = centring_basis(count, x.device)
     return (rows.unflatten(-1, (count, 3)).mT @ basis.mT).mT.flatten(-2)
 
 
 def affine_rows(x: Tensor) -> Tensor:
-    """The centred coordinates of all points of each view, in the coordinates of :func:`centred`: ``(..., 2, n - 1)``."""
+    """The centred coordinates of all points of each view, in the coordinates of :func:`centring_basis`: ``(..., 2, n - 1)``."""
     xy = x[..., :-1] - x[..., :-1].mean(-2, keepdim=True)
     square = xy.square().mean((-2, -1), keepdim=True)
     xy = xy * torch.where(square > 0, square, 1.0).rsqrt()
-    return xy.mT @ centred(x.shape[-2], x.device).mT
+    return xy.mT @ centring_basis(x.shape[-2], x.device).mT
 
 
 @constant
-def centred(count: int, device: torch.device) -> Tensor:
+def centring_basis(count: int, device: torch.device) -> Tensor:
     """Orthonormal basis ``(count - 1, count)`` of the vectors of sum 0."""
     return null_space(torch.ones(1, count, dtype=torch.float64), count - 1).to(device)
 
@@ -272,7 +272,7 @@ COMPLETION_FLAT = 1e-8
 """Of the energy of all points: four basis points with less in their third direction lie in a plane."""
 
 
-def completed(x: Tensor, seen: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def complete_points(x: Tensor, seen: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     r"""Fill in the missing points of affine views of one shape. x ``(b, views, n, 2)``, seen ``(b, views, n)``, weights
     ``(b, views)`` -> ``(b, views, n, 2)``."""
     with torch.no_grad():

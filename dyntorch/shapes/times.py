@@ -110,7 +110,7 @@ def recover_times(
     views = centred_views(seen, weight)
     step = max(1, CHUNK // (grid * 16 * max(1, flat)))
     pieces = [slice(i, i + step) for i in range(0, max(1, views.x.shape[1]), step)]
-    parts = [_recovered(wide, basis, times, views.x[:, p], views.weights[:, p]) for p in pieces]
+    parts = [_recover(wide, basis, times, views.x[:, p], views.weights[:, p]) for p in pieces]
     found = [torch.cat(part, dim=1) for part in zip(*parts, strict=True)]
     known, middle = views.share > 0, times[len(times) // 2]
     none = (middle.new_tensor(1.0), middle, middle.new_tensor(torch.inf), middle, middle.new_tensor(0.0))
@@ -137,13 +137,13 @@ def tried_times(shapes: Tensor, basis: Trajectory, x: Tensor, count: int, interv
     return torch.arange(count, dtype=torch.float64, device=x.device) * (basis.period / count)
 
 
-def _recovered(shapes: Tensor, basis: Trajectory, times: Tensor, x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+def _recover(shapes: Tensor, basis: Trajectory, times: Tensor, x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
     """Residual, time, sigma, second and rise of one piece of the views, ``(b, views)`` each."""
     curve = residuals_at(shapes, basis.rows(times), x, weights)
     start, lone = lowest_minima(curve, basis.period is not None)
     step = times[1] - times[0]
     within = times if basis.period is None else None
-    t, f, h = _refined(shapes, basis, times[start], step, x, weights, within)
+    t, f, h = _refine(shapes, basis, times[start], step, x, weights, within)
     f = torch.where(lone, torch.inf, f)
     order = f.argsort(-1)
     t, f, h = (part.gather(-1, order) for part in (t, f, h))
@@ -186,7 +186,7 @@ def lowest_minima(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
     return place, ~depth.isfinite()
 
 
-def _refined(
+def _refine(
     shapes: Tensor,
     basis: Trajectory,
     start: Tensor,

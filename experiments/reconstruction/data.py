@@ -13,7 +13,7 @@ import dyntorch as dyn
 from dyntorch import metrics
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
-from dyntorch.geometry.lift import balanced
+from dyntorch.geometry.lift import balance_lifts
 from dyntorch.geometry.triangulation import reproject, resect
 from dyntorch.scenes.scene import calibration, looking_at
 from dyntorch.tasks.reconstruct.motions import as_motion
@@ -182,7 +182,7 @@ def predicted(found: Reconstruction, time: float, image: Tensor, known: Tensor) 
 
 def minimum(tracks: Tensor, world: World, cameras: Tensor, motion: str) -> tuple[float, metrics.LiftedError]:
     """Rms reprojection distance and errors of the minimum that bundle adjustment finds from the truth."""
-    lifts, root = balanced(as_motion(motion).lifts(world.times))
+    lifts, root = balance_lifts(as_motion(motion).lifts(world.times))
     data = normalized(tracks[None], torch.ones_like(tracks[None, ..., 0]), world.times)
     done = bundle_adjust(
         data.x, data.weights, data.transforms @ cameras, (world.structure(motion) @ root.mT)[None], lifts, iterations=100

@@ -72,7 +72,7 @@ def scene_errors(n: int, sigma: float, draw: torch.Generator) -> list[float]:
     linear = dyn.fit(KIND, *scene.views)
     fitted = linear
     for _ in range(TURNS):
-        fitted = dyn.fit(KIND, *scene.views, weights=KIND.reweighted(fitted.tensor, *scene.views))
+        fitted = dyn.fit(KIND, *scene.views, weights=KIND.reweight(fitted.tensor, *scene.views))
     refined = dyn.refine(fitted, *scene.views, weights=torch.ones(n))
     pair = dyn.fit(dyn.SegmentationMatrix, *scene.views)
     pair = dyn.refine(pair, *scene.views)

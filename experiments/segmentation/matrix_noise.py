@@ -87,7 +87,7 @@ def methods(scene: Scene) -> dict[str, Callable[[], Pair]]:
     linear = dyn.fit(matrix, x1, x2)
     reweighted = linear
     for _ in range(REWEIGHTINGS):
-        reweighted = dyn.fit(matrix, x1, x2, weights=matrix.reweighted(reweighted.tensor, x1, x2))
+        reweighted = dyn.fit(matrix, x1, x2, weights=matrix.reweight(reweighted.tensor, x1, x2))
     derivatives = matrix.decompose_by_derivatives(linear.tensor, x1, x2)
     return {
         "linear, kernels": lambda: fundamentals(linear),

@@ -146,7 +146,7 @@ def counted() -> Iterator[Traffic]:
 
 def moved(value: Any, device: torch.device | str) -> Any:
     """The tensors of a value on another device, whatever holds them."""
-    return devices.moved(value, torch.device(device))
+    return devices.move_to_device(value, torch.device(device))
 
 
 # ---- one operation -----------------------------------------------------------------------------------------------------

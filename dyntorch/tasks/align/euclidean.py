@@ -97,7 +97,7 @@ class CalibratedViews(NamedTuple):
 
     def motion(self, normal: Tensor) -> PlaneMotion:
         """Rotations and translations ``(b, v + 1, ...)`` of all views, the first included, above the plane of a normal."""
-        H = torch.linalg.inv_ex(self.plane().corrected(normal))[0]
+        H = torch.linalg.inv_ex(self.plane().correct_homographies(normal))[0]
         rotation, translation = motion_over(torch.where(H.isfinite(), H, 0.0), normal[:, None].expand(*H.shape[:2], 3))
         eye = torch.eye(3, dtype=H.dtype, device=H.device).expand(len(H), 1, 3, 3)
         return PlaneMotion(

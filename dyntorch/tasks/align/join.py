@@ -13,7 +13,7 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
-from dyntorch.core.residual import whitened
+from dyntorch.core.residual import whitened_residual
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY, Solution
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
@@ -169,7 +169,7 @@ def _from_tensor(
         theta, noise = joined(refined), refined.sigma
     else:
         parts = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
-        moving = whitened(evidence.invariant, parts, evidence.views, evidence.norm.scales).square().sum(-1)
+        moving = whitened_residual(evidence.invariant, parts, evidence.views, evidence.norm.scales).square().sum(-1)
         middle = torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values
         noise = (middle / median(evidence.invariant.codim)).sqrt()
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)

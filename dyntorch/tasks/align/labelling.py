@@ -11,7 +11,7 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import Normalization, normalization, normalize_motion
 from dyntorch.core.refine import Problem, refine_matches
-from dyntorch.core.residual import whiten, whitened
+from dyntorch.core.residual import whiten, whitened_residual
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import apply, homogeneous
 from dyntorch.numerics.blocks import each, map_blocks, uniform
@@ -102,7 +102,7 @@ class Evidence:
     def residuals(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Whitened residual ``(b, n, c)`` of every match if it moves, and if it stands still."""
         motion = self.problem(torch.zeros_like(self.data.weights)).parts(theta)
-        moving = whitened(self.invariant, motion, self.views, self.norm.scales)
+        moving = whitened_residual(self.invariant, motion, self.views, self.norm.scales)
         return moving, self.invariant.whitened_static(motion, self.views, self.norm.scales)
 
     def cost(self, theta: Tensor, sigma: Tensor) -> Tensor:

@@ -465,7 +465,7 @@ def _rivals(
     if not bool(doubtful.any()):
         return found
     model, problem = TranslatingLinesMatrix(), lines.problem(labels)
-    joined = _joined(lines.data.restricted(labels != OUTLIER), points)
+    joined = _joined(lines.data.restrict(labels != OUTLIER), points)
     _, vectors = spectrum(gram(model.primitives, lines.norm.apply(model, joined.views), joined.weights))
     best, here = problem.normal_equations(theta)[0], unit(theta.unflatten(-1, (4, 4)))
     weakest = vectors[..., :NUM_WEAK_DIRECTIONS].unbind(-1)
@@ -481,7 +481,7 @@ def _rivals(
 
 def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: tuple[Tensor, Tensor] | None) -> Tensor:
     """Singular values ``(b,)`` of the estimation matrix above the noise: of the inliers, of all lines where there is no motion."""
-    kept = lines.data.restricted((labels != OUTLIER) | ~usable[:, None])
+    kept = lines.data.restrict((labels != OUTLIER) | ~usable[:, None])
     joined = _joined(kept, points)
     if joined.count < MINIMAL:
         return torch.full_like(labels[:, 0], MINIMAL)

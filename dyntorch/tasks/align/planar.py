@@ -406,7 +406,7 @@ def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tup
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     assert refined.sigma is not None and refined.covariance is not None
     best = Labelled(theta, labels, best.sigma)
-    tensor = tensor_rank(evidence.data.restricted(labels != OUTLIER), evidence, best.sigma)
+    tensor = tensor_rank(evidence.data.restrict(labels != OUTLIER), evidence, best.sigma)
     free = (worst > MAX_DEVIATION) | undecided(evidence, best, tensor)
     status = _status(evidence, best, refined.sigma, free, values[:, 0] <= MIN_INFORMATION * values[:, -1])
     none = failed(status)

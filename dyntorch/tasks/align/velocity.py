@@ -371,7 +371,7 @@ def _notices(
 def _rank(evidence: Evidence, state: Velocities, none: Tensor) -> Tensor:
     """Singular values ``(b,)`` of the estimation matrix of the inliers (of all matches where there is no motion) above noise."""
     inliers = torch.where(none[:, None], torch.ones_like(state.labels, dtype=torch.bool), state.labels != OUTLIER)
-    kept = evidence.data.restricted(inliers)
+    kept = evidence.data.restrict(inliers)
     values = fit_matches(ConstantVelocityTensor(), kept).singular_values
     noise = state.sigma * torch.stack(evidence.norm.scales).mean(0) * kept.weights.square().sum(-1).sqrt()
     return (values > torch.maximum(MIN_VELOCITY_SINGULAR_VALUE * noise[:, None], 1e-9 * values[:, :1])).sum(-1)

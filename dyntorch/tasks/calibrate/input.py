@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Status
-from dyntorch.geometry.lens import undistorted
+from dyntorch.geometry.lens import undistort_points
 from dyntorch.numerics.arguments import FARTHEST
 from dyntorch.tasks.synchronize.result import Clocks
 from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks, reject_outliers
@@ -87,7 +87,7 @@ def read_rig(
             given = None if weights is None else weights[i]
             read = read_tracks(f"tracks[{i}]", x, None if own is not None else rates[i], own, given)
             _check_inside(x, size[i])
-            straight.append(x if lens is None else _ideal(undistorted(x, lens), lens[0]))
+            straight.append(x if lens is None else _ideal(undistort_points(x, lens), lens[0]))
             if lens is not None:
                 own = read.times if own is None else own
                 read = read_tracks(f"tracks[{i}]", straight[-1], None, own, given)
@@ -166,7 +166,7 @@ def _lenses(calibration: Sequence[Any] | None, cameras: int) -> list[tuple[Tenso
             found.append(None)
             continue
         try:
-            undistorted(torch.zeros(1, 2, dtype=torch.float64), lens)
+            undistort_points(torch.zeros(1, 2, dtype=torch.float64), lens)
         except ValueError as error:
             raise ValueError(f"camera {i}: {error}") from error
         dist = torch.zeros(5) if lens[1] is None else torch.as_tensor(lens[1])

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import Notice, Status, failed
-from dyntorch.core.problems import of_problem, one_by_one, without_filling
+from dyntorch.core.problems import select_problem, solve_one_by_one, trim_padding
 from dyntorch.core.residual import sampson
 from dyntorch.core.robust import robust_fit
 from dyntorch.geometry.triangulation import triangulate
@@ -234,13 +234,13 @@ def _batch(
     batch = check_together(a=(a, 3), b=(b, 3))
 
     def solve(place: int) -> PairReconstruction:
-        first, second = (without_filling(of_problem(x, place, batch, 3)) for x in (a, b))
-        own = of_problem(shift, place, batch, 0)
+        first, second = (trim_padding(select_problem(x, place, batch, 3)) for x in (a, b))
+        own = select_problem(shift, place, batch, 0)
         if isinstance(shift, Shift) and shift.status.ndim:
             own = shift.problem(*(int(i) for i in np.unravel_index(place, tuple(batch))))
         clocks = None
         if times is not None:
-            clocks = [of_problem(x, place, batch, 1)[: len(take)] for x, take in zip(times, (first, second), strict=True)]
+            clocks = [select_problem(x, place, batch, 1)[: len(take)] for x, take in zip(times, (first, second), strict=True)]
         own = float(own) if isinstance(own, Tensor) else own
         return reconstruct_pair(first, second, own, correspondence, times=clocks, camera=camera, **more)
 
@@ -251,7 +251,7 @@ def _batch(
         notice = Notice(PairNotice.UNUSABLE, 0.0, {"said": said})
         return _in(failure((n, m), none, Status.TOO_FEW, notice, width, n if correspondence else n + m), a.dtype)
 
-    return one_by_one(batch, solve, spare)
+    return solve_one_by_one(batch, solve, spare)
 
 
 CAMERAS = ("auto", "affine", "projective")

@@ -96,7 +96,7 @@ def _assembled(
     back = torch.stack([similarity(torch.as_tensor(one.scale).to(one.centre), -one.centre / one.scale) for one in (first, second)])
     inner = back @ body.calibrations[0]
     cameras = inner @ body.sights[0]
-    placed = normalize(homogeneous(body.placed()[0]), dim=-1)
+    placed = normalize(homogeneous(body.points_in_camera()[0]), dim=-1)
     known = first.seen | second.seen
     points = placed.new_full((frames, n + m, 4), math.nan)
     points[:, kept] = torch.where(known[:, None, None], placed, math.nan)

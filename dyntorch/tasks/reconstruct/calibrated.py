@@ -11,7 +11,7 @@ from dyntorch.core.outcome import Note, Status, failed, in_order, noting
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.calibrated_cameras import CalibratedCameras
 from dyntorch.geometry.homogeneous import nonzero_sign
-from dyntorch.geometry.lift import moved, steady
+from dyntorch.geometry.lift import change_frame, steadiest_frame
 from dyntorch.geometry.triangulation import unit_projections
 from dyntorch.tasks.reconstruct.diagnosis import NOISE_ROUNDING, unknowns
 from dyntorch.tasks.reconstruct.metric import WorldChanges, metric_frames
@@ -204,7 +204,7 @@ def metric_scene(tracks: ViewTracks, scene: LiftedState, stage: Stage, labels: T
     known = CalibratedCameras(K, d)
     inverse = torch.linalg.inv_ex(frames.change)[0]
     inverse = _lengths(bare, inverse, frames.change, stage) if stage.motion.sensor == 3 else inverse
-    cameras, structure = moved(inverse, cameras, structure, stage.lifts)
+    cameras, structure = change_frame(inverse, cameras, structure, stage.lifts)
     cameras, structure = _adjusted(some, cameras, structure, stage, labels[left], known)
     cameras, structure = _framed(some, cameras, structure, stage, labels[left], known)
     cameras, turn, rest = _posed(some, cameras, structure, stage, known)
@@ -278,8 +278,8 @@ def _framed(
     if stage.middle is not None:
         static = tracks.static
         still = there if static is None else torch.where((there & static).any(-1, keepdim=True), there & static, there)
-        G = steady(structure, lifts, stage.middle, stage.changes.metric, still.to(structure.dtype))
-        cameras, structure = moved(G, cameras, structure, lifts)
+        G = steadiest_frame(structure, lifts, stage.middle, stage.changes.metric, still.to(structure.dtype))
+        cameras, structure = change_frame(G, cameras, structure, lifts)
     size = lifts.shape[1]
     for body in range(stage.motion.bodies):
         mine = there if stage.motion.bodies == 1 else there & (labels == body + 1)
@@ -294,7 +294,7 @@ def _framed(
         if stage.motion.sensor == 2 and body == 0:
             # the size of the second body is that of the first, or in space anything: the same
             change[:, :d] = change[:, :d] / spread[:, None, None]
-        cameras, structure = moved(_of_world(change, lifts), cameras, structure, lifts)
+        cameras, structure = change_frame(_of_world(change, lifts), cameras, structure, lifts)
     return cameras, structure
 
 
@@ -316,7 +316,7 @@ def _upright(
             change[:, :d] = change[:, :d] * (side[:, None, None] if d == 3 else 1.0)
         else:
             change[:, d + body, d + body] = side
-    cameras, structure = moved(_of_world(change, lifts), cameras, structure, lifts)
+    cameras, structure = change_frame(_of_world(change, lifts), cameras, structure, lifts)
     below = (structure @ stage.world.mT).sum(-1)
     return cameras, structure / torch.where(below.abs() > 1e-12, below, 1.0)[..., None]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import failed, in_order, noting
 from dyntorch.geometry.calibrated_cameras import calibrations
-from dyntorch.geometry.triangulation import observed
+from dyntorch.geometry.triangulation import mask_missing
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.messages import Message
@@ -132,7 +132,7 @@ def _checked(
         raise ValueError(f"weights must be a tensor (*batch, views, n) = {(*batch, views, n)}, got {given}")
     if not bool((w >= 0).all()):
         raise ValueError(f"weights must not be negative or NaN, got {float(w.min()):g}; use 0 to leave an observation out")
-    x, w = observed(tracks.detach(), w.detach().expand(*batch, views, n))
+    x, w = mask_missing(tracks.detach(), w.detach().expand(*batch, views, n))
     count = math.prod(batch)
     return moment, x.reshape(count, views, n, dim), w.reshape(count, views, n), batch
 

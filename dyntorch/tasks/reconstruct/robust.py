@@ -16,7 +16,7 @@ from dyntorch.core.solution import NOISY
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
-from dyntorch.numerics.blocks import each, put, uniform
+from dyntorch.numerics.blocks import each, replace_problems, uniform
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices
@@ -153,7 +153,7 @@ class Consensus:
     def better(self, new: Consensus, at: Tensor) -> Consensus:
         """With the new ones of some problems, where they are better."""
         wins = new.lost < self.lost[at]
-        return put(self, at[wins], each(lambda x: x[wins], new))
+        return replace_problems(self, at[wins], each(lambda x: x[wins], new))
 
 
 # parts of the points that the starts keep: the smaller the fewer outliers, the larger the better the fit

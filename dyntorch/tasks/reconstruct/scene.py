@@ -9,7 +9,17 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Status, failed
 from dyntorch.geometry.bundle import bundle_adjust, point_information
-from dyntorch.geometry.lift import balanced, balanced_algebra, behind, centred, finite, gauge_algebra, moved, steady, upgrade
+from dyntorch.geometry.lift import (
+    balance_lifts,
+    balanced_algebra,
+    behind,
+    center_frame,
+    change_frame,
+    finite,
+    gauge_algebra,
+    steadiest_frame,
+    upgrade,
+)
 from dyntorch.geometry.pairs import hyperplane_pair, two_bodies
 from dyntorch.geometry.triangulation import reproject, resect, triangulate, unit_projections
 from dyntorch.tasks.reconstruct.motions import Motion
@@ -54,8 +64,8 @@ def resting(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
     lifts = eye.expand(views, -1, -1)
     known = (found.structure != 0).any(-1).to(tracks.x.dtype)
     G, cameras, structure = finite(found.projections, found.structure, lifts, gauge_algebra(lifts), tracks.weights)
-    cameras, structure = moved(G, cameras, structure, lifts)
-    cameras, _ = moved(centred(structure, lifts, known), cameras, structure, lifts)
+    cameras, structure = change_frame(G, cameras, structure, lifts)
+    cameras, _ = change_frame(center_frame(structure, lifts, known), cameras, structure, lifts)
     return cameras
 
 
@@ -105,7 +115,7 @@ class Lifting:
         """The motion at these times, on the device of ``like``."""
         span = float(times.max() - times.min()) / max(1, len(times) - 1)
         even, shift, origin = motion.centred(times)
-        lifts, root = balanced(even)
+        lifts, root = balance_lifts(even)
         inverse = torch.linalg.inv(root)
         start, slope = motion.lifts([-origin])[0] @ inverse, motion.slope(-origin, span or 1.0) @ inverse
         middle = motion.lifts([float(times.mean()) - origin])[0] @ inverse
@@ -261,10 +271,10 @@ def framed(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedSt
     scene = _finite(tracks, scene, lifting)
     cameras, structure = scene.cameras, scene.structure
     weights = known if static is None else torch.where((known & static).any(-1, keepdim=True), known & static, known)
-    G = steady(structure, lifts, lifting.middle, lifting.algebra, weights.to(structure.dtype))
-    cameras, structure = moved(G, cameras, structure, lifts)
-    G = centred(structure, lifts, known.to(structure.dtype))
-    cameras, structure = moved(G, cameras, structure, lifts)
+    G = steadiest_frame(structure, lifts, lifting.middle, lifting.algebra, weights.to(structure.dtype))
+    cameras, structure = change_frame(G, cameras, structure, lifts)
+    G = center_frame(structure, lifts, known.to(structure.dtype))
+    cameras, structure = change_frame(G, cameras, structure, lifts)
     depth = structure @ lifts[0, -1]
     structure = structure / torch.where(depth.abs() > 1e-12, depth, 1.0)[..., None]
     return LiftedState(unit_projections(cameras), structure, scene.cost)
@@ -273,7 +283,7 @@ def framed(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedSt
 def _finite(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedState:
     """The scene in a frame in which all points are finite, if there is one."""
     G, cameras, structure = finite(scene.cameras, scene.structure, lifting.lifts, lifting.algebra, tracks.weights)
-    return LiftedState(*moved(G, cameras, structure, lifting.lifts), scene.cost)
+    return LiftedState(*change_frame(G, cameras, structure, lifting.lifts), scene.cost)
 
 
 def positions(structure: Tensor, lift: Tensor) -> Tensor:

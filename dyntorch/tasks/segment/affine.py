@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Outcome, Status, status_of
-from dyntorch.geometry.epipolar import check_matches, described
+from dyntorch.geometry.epipolar import check_matches, describe_labels
 from dyntorch.geometry.homogeneous import homogeneous, unit
 from dyntorch.geometry.pairs import hyperplane_pair, order_of_bodies
 from dyntorch.numerics.arguments import FARTHEST
@@ -42,7 +42,7 @@ class AffineSegmentation(Outcome):
         return self.status != Status.OK
 
     def __repr__(self) -> str:
-        return described(self, self.labels, self.degenerate, 2)
+        return describe_labels(self, self.labels, self.degenerate, 2)
 
 
 @one_thread

@@ -210,7 +210,7 @@ def matrix_pairs(view: View, groups: Tensor, rounds: int) -> Tensor:
     weights = groups
     for _ in range(rounds if len(groups) else 0):
         tensor = fit(SegmentationMatrix, x1, x2, weights=weights).tensor
-        weights = groups * SegmentationMatrix.reweighted(tensor, x1, x2)
+        weights = groups * SegmentationMatrix.reweight(tensor, x1, x2)
     if not len(groups):
         return view.x1.new_zeros(0, 3, 3)
     found = torch.cat(SegmentationMatrix.fundamentals(fit(SegmentationMatrix, x1, x2, weights=weights).tensor))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Notice, Status, status_from
-from dyntorch.core.problems import of_problem, one_by_one
+from dyntorch.core.problems import select_problem, solve_one_by_one
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
@@ -236,12 +236,12 @@ def segment_tracks(
     request = TrackRequest(bodies, threshold, generator, options)
 
     def solve(place: int) -> TrackSegmentation:
-        own = None if cameras is None else of_problem(cameras, place, batch, 3)
-        return _solve(of_problem(tracks, place, batch, 3).double(), own, request)
+        own = None if cameras is None else select_problem(cameras, place, batch, 3)
+        return _solve(select_problem(tracks, place, batch, 3).double(), own, request)
 
     with torch.no_grad():
         if batch:
-            found = one_by_one(batch, solve, lambda said: _nothing(tracks.shape[-2], request, [], Status.TOO_FEW))
+            found = solve_one_by_one(batch, solve, lambda said: _nothing(tracks.shape[-2], request, [], Status.TOO_FEW))
         else:
             found = solve(0)
     return _as(found, tracks.dtype)

@@ -12,8 +12,8 @@ import torch
 from torch import Generator, Tensor
 
 from dyntorch.core.outcome import Notice, status_from
-from dyntorch.core.problems import of_problem, one_by_one, without_filling
-from dyntorch.geometry.lens import undistorted
+from dyntorch.core.problems import select_problem, solve_one_by_one, trim_padding
+from dyntorch.geometry.lens import undistort_points
 from dyntorch.numerics.arguments import check_options, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.messages import Message
@@ -224,7 +224,7 @@ def _undistort(name: str, tracks: Tracks, lens: Any) -> Tracks:
             return tracks
         raise ValueError(Message("calibration of {camera:{which}}: it holds points in space; give None for it", which=name))
     try:
-        x = undistorted(tracks.x, lens)
+        x = undistort_points(tracks.x, lens)
     except ValueError as problem:
         raise ValueError(Message("calibration of {camera:{which}}: {said}", which=name, said=str(problem))) from problem
     seen = (tracks.weights > 0) & x.isfinite().all(-1)
@@ -245,7 +245,7 @@ def synchronize_batch(
     batch = check_together(a=(a, 3), b=(b, 3))
 
     def solve(place: int) -> Shift:
-        takes = [without_filling(of_problem(x, place, batch, 3)) for x in (a, b)]
+        takes = [trim_padding(select_problem(x, place, batch, 3)) for x in (a, b)]
         clocks = None if times is None else _of_problem(times, takes, place, batch, 1)
         trust = None if weights is None else _of_problem(weights, takes, place, batch, 2)
         return verb(*takes, times=clocks, weights=trust, **more)
@@ -258,10 +258,10 @@ def synchronize_batch(
             status=status_from(limits), notices=limits,
         )  # fmt: skip
 
-    return one_by_one(batch, solve, spare)
+    return solve_one_by_one(batch, solve, spare)
 
 
 def _of_problem(values: tuple[Any, Any], takes: list[Tensor], place: int, batch: Any, own: int) -> tuple[Any, Any]:
     """What belongs to a problem, of the frames that its takes have."""
-    parts = [of_problem(value, place, batch, own) for value in values]
+    parts = [select_problem(value, place, batch, own) for value in values]
     return tuple(None if x is None else x[: len(take)] for x, take in zip(parts, takes, strict=True))  # type: ignore[return-value]

@@ -73,7 +73,7 @@ def test_options_broadcast_over_the_batch():
 def test_restricted_keeps_labels_and_weights():
     data = matches(H, views(2), torch.full((2, 4), 3.0).double(), torch.ones(4, dtype=torch.bool))
     keep = torch.tensor([[True, False, True, True], [False, True, True, True]])
-    less = data.restricted(keep)
+    less = data.restrict(keep)
     assert isinstance(less, Matches)
     assert torch.equal(less.weights, 3.0 * keep.double()) and less.static is data.static and less.batch == (2,)
 

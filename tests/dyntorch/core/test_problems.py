@@ -7,7 +7,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.core.outcome import Status
-from dyntorch.core.problems import stacked
+from dyntorch.core.problems import stack_results
 from dyntorch.geometry.lens import Division, fit_distortion
 from dyntorch.numerics import canonical_correlation, orthonormal_basis
 from dyntorch.scenes.filmed import filmed, nonrigid_pair
@@ -37,12 +37,12 @@ def same(whole, one, place):
 
 
 def test_stacked_fills_up_and_keeps_what_is_the_same():
-    found = stacked(
+    found = stack_results(
         [(torch.ones(2), 1.5, "a", None), (torch.zeros(1, dtype=torch.float32).double(), 2.0, "a", torch.ones(1))], (2,)
     )
     assert found[0].isnan().tolist() == [[False, False], [False, True]] and found[1].tolist() == [1.5, 2.0]
     assert found[2] == "a" and found[3].isnan().tolist() == [[True], [False]]
-    assert stacked([("x",), ("y",)], (2,)) == (("x", "y"),)
+    assert stack_results([("x",), ("y",)], (2,)) == (("x", "y"),)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch import Status, scenes
 from dyntorch.core import consensus
-from dyntorch.core.consensus import Search, anneal, judge, msac
+from dyntorch.core.consensus import Search, anneal, evidence_and_doubt, msac
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import matches
 from dyntorch.core.matrix import estimation_matrix
@@ -168,7 +168,7 @@ def test_constrained_tensors_of_motions_are_themselves() -> None:
         search = Search(case.invariant, matches(case.invariant, made.views), seeded())
         work = search._bundle(search.searched)
         basis = work.first(search.weights[:, None].expand(-1, 3, -1))
-        again = work.constrained(basis)
+        again = work.constrain_to_motions(basis)
         # spans: sign and basis are free
         inside = basis @ again.mT @ (again @ again.mT).inverse() @ again
         assert torch.allclose(inside, basis, atol=1e-6), case
@@ -191,7 +191,7 @@ def test_evidence_is_the_expected_number_of_chance_finds() -> None:
     limit = (1.5 * search.unit).square()
     basis = anneal(work, work.first(search.weights[:, None]), limit, 30)
     square = work.distances(basis)[0][:, 0]
-    evidence, _ = judge(work, basis, square, limit)
+    evidence, _ = evidence_and_doubt(work, basis, square, limit)
     n, m, k = 60, 26, int((square <= limit).sum())
     hits, trials = 0, 0
     for j in range(4):

@@ -56,7 +56,7 @@ def test_nothing_is_nearer(profile, sizes):
         value = grassmann_tensor(problem.parts(theta), profile).flatten(1)
         return ((value / value.norm(dim=-1, keepdim=True)) * unit).sum(-1, keepdim=True)
 
-    assert jacobian(each(cosine), problem.joined(found))[1].abs().max() < 1e-12
+    assert jacobian(each(cosine), problem.stack_projections(found))[1].abs().max() < 1e-12
 
 
 @pytest.mark.slow
@@ -64,8 +64,8 @@ def test_the_hessian_is_the_second_derivative_at_a_minimum():
     profile, sizes = (2, 2, 1), (3, 3, 3)
     tensor = noisy(profile, sizes, 2, sigma=0.1).flatten(1)
     problem, tensor = _Nearest(profile, sizes), tensor / tensor.norm(dim=-1, keepdim=True)
-    theta = problem.solved(tensor)
-    aim = problem.sided(theta, tensor)
+    theta = problem.lowest_minimum(tensor)
+    aim = problem.orient(theta, tensor)
     u, _, matrix = problem.linearized(theta)
     hessian = problem.hessian(theta, aim, u, matrix)
     for k in range(theta.shape[1]):
@@ -96,10 +96,10 @@ def test_candidates_start_as_well_as_the_truth(profile, sizes):
     tensor = noisy(profile, sizes, 20, sigma=3e-2).flatten(1)
     tensor = tensor / tensor.norm(dim=-1, keepdim=True)
     problem = _Nearest(profile, sizes)
-    theta = problem.joined(scene(profile, sizes, 20))
+    theta = problem.stack_projections(scene(profile, sizes, 20))
     truth = problem.nearest(theta, tensor)[1]
-    found = problem.solved(tensor)
-    assert (problem.cost(found, problem.sided(found, tensor)) <= 1.0001 * truth).all()
+    found = problem.lowest_minimum(tensor)
+    assert (problem.cost(found, problem.orient(found, tensor)) <= 1.0001 * truth).all()
 
 
 def test_gauge_sign_scale_and_batch():
@@ -140,7 +140,7 @@ def test_the_gradient_at_an_exact_tensor_is_the_projector_on_the_tangents():
     derivative = torch.autograd.functional.jacobian(lambda t: composed(t, profile, sizes), tensor).reshape(27, 27)
     problem = _Nearest(profile, sizes)
     tensors = each(lambda t: grassmann_tensor(problem.parts(t), profile).flatten(1))
-    slope = jacobian(tensors, problem.joined(scene(profile, sizes, 1)))[1][0]
+    slope = jacobian(tensors, problem.stack_projections(scene(profile, sizes, 1)))[1][0]
     u = tensor.flatten()
     basis = torch.linalg.svd(slope - (slope @ u)[:, None] * u).Vh[:18]
     torch.testing.assert_close(derivative * derivative.trace().sign(), basis.T @ basis, rtol=0, atol=1e-9)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dyntorch.geometry.extensors import compound
-from dyntorch.geometry.grassmann import balanced, candidates, grassmann_tensor, rotated, tables
+from dyntorch.geometry.grassmann import balance_projections, candidates, grassmann_tensor, rotate_tensors, tables
 
 CASES = [
     ((2, 1), (3, 3)),
@@ -139,11 +139,11 @@ def test_noise_that_no_projection_explains_stays_finite():
 
 def test_balanced_is_a_collineation_away():
     views = scene((2, 2, 1), (3, 3, 3), 4)
-    parts = balanced([1e6 * views[0], views[1], 1e-3 * views[2]])
+    parts = balance_projections([1e6 * views[0], views[1], 1e-3 * views[2]])
     assert relative(parts, views).max() < 1e-12
     for part in parts:
         torch.testing.assert_close(part.flatten(1).norm(dim=-1), torch.ones(4).double())
-    zero = balanced([torch.zeros(1, 3, 5, dtype=torch.float64)] * 3)
+    zero = balance_projections([torch.zeros(1, 3, 5, dtype=torch.float64)] * 3)
     assert all((part == 0).all() for part in zero)
 
 
@@ -151,7 +151,7 @@ def test_rotated_is_the_tensor_of_rotated_images():
     profile, sizes = (3, 2, 1), (4, 3, 3)
     views, table = scene(profile, sizes, 5), tables(profile, sizes, 2, torch.device("cpu"))
     turned = grassmann_tensor([r[:, None] @ m for r, m in zip(table.rotations, views, strict=True)], profile)
-    torch.testing.assert_close(rotated(grassmann_tensor(views, profile), table.compounds), turned)
+    torch.testing.assert_close(rotate_tensors(grassmann_tensor(views, profile), table.compounds), turned)
     torch.testing.assert_close(table.compounds[0], compound(table.rotations[0], 3))
     assert tables(profile, sizes, 2, torch.device("cpu")) is table
 

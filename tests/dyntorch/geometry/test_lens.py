@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.geometry.lens import Division, distort, undistort, undistorted
+from dyntorch.geometry.lens import Division, distort, undistort, undistort_points
 
 K = torch.tensor([[1100.0, 0.0, 950.0], [0.0, 1080.0, 530.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 LENSES = {
@@ -117,10 +117,10 @@ def test_division_without_a_size_uses_the_box_of_the_points():
 
 def test_calibrations_as_users_write_them():
     x = pixels(6).reshape(2, 3, 2)
-    assert undistorted(x, None) is x
-    assert torch.equal(undistorted(x, (K.tolist(), None)), x)
+    assert undistort_points(x, None) is x
+    assert torch.equal(undistort_points(x, (K.tolist(), None)), x)
     expected = undistort(x, K, lens("five"))
-    assert torch.equal(undistorted(x, (K.numpy(), [LENSES["five"]])), expected)
+    assert torch.equal(undistort_points(x, (K.numpy(), [LENSES["five"]])), expected)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_calibrations_as_users_write_them():
 )
 def test_calibrations_that_are_none(calibration, words):
     with pytest.raises(ValueError, match=words):
-        undistorted(pixels(3), calibration)
+        undistort_points(pixels(3), calibration)
 
 
 def test_points_of_a_wrong_shape():

@@ -125,7 +125,7 @@ def test_the_descent_never_rises_and_keeps_fixed_lenses():
     start = LensDescent(Frames.of(F), torch.tensor([[-0.1, 0.0]] * 3, dtype=torch.float64))
     scale = torch.full((3, 1), 5.0, dtype=torch.float64)
     for lens in (False, True):
-        found = start.descended(data, scale, lens=lens)
+        found = start.descend(data, scale, lens=lens)
         assert (found.cost(data, scale) <= start.cost(data, scale)).all()
         assert torch.equal(found.lens, start.lens) != lens
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.geometry.lift import balanced, gauge_algebra, kernel, least_views, upgrade
+from dyntorch.geometry.lift import balance_lifts, gauge_algebra, kernel, least_views, upgrade
 
 
 def random(*shape, seed=0):
@@ -40,7 +40,7 @@ TIMES = [(0.0, 1.0, 2.0, 3.0, 4.0, 5.0), (-3.0, 0.5, 1.0, 4.0, 9.0, 9.5), (100.0
 def test_ambiguities_of_the_theory(name, times):
     dim, axes, degree, rows, ambiguity, views = TABLE[name]
     B = lifts(dim, axes, times, degree)
-    algebra = gauge_algebra(balanced(B)[0])
+    algebra = gauge_algebra(balance_lifts(B)[0])
     assert len(algebra) == ambiguity
     flat = algebra.flatten(1)
     torch.testing.assert_close(flat @ flat.T, torch.eye(ambiguity).double())
@@ -48,7 +48,7 @@ def test_ambiguities_of_the_theory(name, times):
     products = (algebra[:, None] @ algebra[None]).flatten(2).flatten(0, 1)
     assert (products - (products @ flat.T) @ flat).abs().max() < 1e-10
     # from unbalanced lifts, moved back
-    whole = balanced(B)
+    whole = balance_lifts(B)
     torch.testing.assert_close(whole[0] @ whole[1], B, rtol=1e-9, atol=1e-9)
     assert least_views(whole[0], rows) == views
 
@@ -64,7 +64,7 @@ def test_kernels():
 
 def test_balanced_lifts_are_orthonormal():
     B = lifts(2, 2, (1000.0, 1001.0, 1005.0))
-    Q, R = balanced(B)
+    Q, R = balance_lifts(B)
     stack = Q.flatten(0, 1)
     torch.testing.assert_close(stack.T @ stack / 3, torch.eye(5).double())
     torch.testing.assert_close(Q @ R, B)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.geometry.triangulation import observed, reproject, resect, triangulate
+from dyntorch.geometry.triangulation import mask_missing, reproject, resect, triangulate
 
 CASES = [(3, 2, 3), (4, 2, 3), (5, 2, 4), (6, 2, 5), (6, 3, 3), (2, 1, 4), (3, 1, 5)]  # k, dim, views
 
@@ -147,10 +147,10 @@ def test_gradients(steps):
 
 def test_what_is_observed():
     x = torch.tensor([[[1.0, 2.0], [float("nan"), 0.0], [3.0, 4.0]]])
-    images, weights = observed(x, torch.tensor([[2.0, 1.0, float("nan")]]))
+    images, weights = mask_missing(x, torch.tensor([[2.0, 1.0, float("nan")]]))
     assert images.tolist() == [[[1.0, 2.0], [0.0, 0.0], [0.0, 0.0]]] and weights.tolist() == [[2.0, 0.0, 0.0]]
     with pytest.raises(ValueError, match="weights must not be negative, got -3; use 0 to leave an image out"):
-        observed(x, torch.tensor([[2.0, -1.0, -3.0]]))
+        mask_missing(x, torch.tensor([[2.0, -1.0, -3.0]]))
 
 
 def test_shapes_that_do_not_fit():

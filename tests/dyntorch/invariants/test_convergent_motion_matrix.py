@@ -144,7 +144,7 @@ def test_true_parameters_are_better_than_the_linear_ones_under_noise():
     scene = convergent_motions(200, batch=8, sigma=0.3, generator=generator(1))
     solution = dyn.fit(ConvergentMotionMatrix, *scene.views)
     for _ in range(4):
-        weights = SegmentationMatrix.reweighted(solution.tensor, *scene.views)
+        weights = SegmentationMatrix.reweight(solution.tensor, *scene.views)
         solution = dyn.fit(ConvergentMotionMatrix, *scene.views, weights=weights)
     refined = dyn.refine(solution, *scene.views, weights=torch.ones(8, 200).double())
     before, after = (relative_error(s.motion[0], scene.extras["homography"]).median() for s in (solution, refined))

@@ -137,7 +137,7 @@ def test_rows_are_determinants_of_the_stacked_incidences():
     invariant = dyn.LiftedShapeTensor(4, points=9)
     frame = truth[:5]
     others = truth[5:] @ torch.linalg.inv(frame)
-    tensor = lifted.composed(torch.cat([torch.eye(5).double(), others]), invariant.profile)
+    tensor = lifted.compose_entries(torch.cat([torch.eye(5).double(), others]), invariant.profile)
     p = torch.nn.functional.pad(x[0] + torch.linspace(0, 1, 9).double()[:, None], (0, 1), value=1.0)  # a view of another shape
     through = torch.stack([torch.linalg.svd(q[None], full_matrices=True).Vh[1:] for q in p[5:]])
     rows = lifted.products(p[:5], through, invariant.profile)

@@ -92,7 +92,7 @@ def test_missing_matches_have_no_label_and_take_no_part():
     labels = SM.labels(*SM.fundamentals(S), x1, found.views[1])
     assert (labels == 0).nonzero().flatten().tolist() == [3, 9]
     assert pair_error(SM.decompose_by_derivatives(S, x1, found.views[1]), found.motion) < 1e-6
-    weights = SM.reweighted(S, x1, found.views[1])
+    weights = SM.reweight(S, x1, found.views[1])
     assert weights[[3, 9]].tolist() == [0, 0] and (weights >= 0).all()
 
 
@@ -127,7 +127,7 @@ def test_reweighted_is_the_inverse_square_of_the_gradient():
 
     square = torch.func.vmap(torch.func.grad(form))(x).square().sum(-1)
     expected = 1 / (square / square.median()).clamp(min=1e-3)
-    torch.testing.assert_close(SM.reweighted(S, *found.views), expected, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(SM.reweight(S, *found.views), expected, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ def test_reweighted_fit_and_refinement_label_better():
     refined = dyn.refine(linear, *found.views)
     weighted = linear
     for _ in range(4):
-        weighted = dyn.fit(SM, *found.views, weights=SM.reweighted(weighted.tensor, *found.views))
+        weighted = dyn.fit(SM, *found.views, weights=SM.reweight(weighted.tensor, *found.views))
 
     def share(S):
         return wrong(SM.labels(*SM.fundamentals(S), *found.views), found.labels).mean()

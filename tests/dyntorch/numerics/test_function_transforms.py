@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
-from dyntorch.numerics.function_transforms import over_problems, transformed
+from dyntorch.numerics.function_transforms import is_transformed, over_problems
 
 
 class Parts(NamedTuple):
@@ -80,13 +80,13 @@ def test_records_counts_and_inputs_that_go_out():
     x, y = data(3, 4)
 
     def parts(x: Tensor, y: Tensor) -> Parts:
-        assert transformed(x, (None, (y,)))
+        assert is_transformed(x, (None, (y,)))
         found = over_problems(decided, x[None], y[None])
         return Parts(*(part[0] for part in found))
 
     found, plain = vmap(parts)(x, y), decided(x, y)
     torch.testing.assert_close(found, plain)
-    assert not transformed(x, y) and found.positive.dtype == torch.int64
+    assert not is_transformed(x, y) and found.positive.dtype == torch.int64
     slope = vmap(grad(lambda y, x: parts(x, y).given.square().sum()))(y, x)
     torch.testing.assert_close(slope, 2 * y)
     tangent = jvp(lambda x: over_problems(decided, x[None], y[:1])[0], (x[0],), (y[0],))[1]

@@ -11,11 +11,11 @@ from dyntorch.shapes.basis import Fourier, Polynomial
 from dyntorch.shapes.moving import (
     ShapeDescent,
     canonical,
+    canonical_frame,
     centred_views,
     complete,
     cost_of,
     fit_shapes,
-    framed,
     graph_start,
     pooled_start,
     window_start,
@@ -145,7 +145,7 @@ def test_noise_is_the_noise_and_no_other_shapes_fit_better():
     assert (cost_of(views, wide, found.shapes) < cost_of(views, wide, shapes)).all()
     views_of_one = centred_views(x[:1])
     g = torch.Generator().manual_seed(8)
-    near = framed(found.shapes[:1] + 1e-3 * draw(50, *found.shapes.shape[1:], g=g))
+    near = canonical_frame(found.shapes[:1] + 1e-3 * draw(50, *found.shapes.shape[1:], g=g))
     many = views_of_one.repeated(50)
     assert (cost_of(many, rows.expand(50, -1, -1), near) >= cost_of(views_of_one, wide[:1], found.shapes[:1])).all()
     # uncertainty: the error of the subspaces is of its size

@@ -8,7 +8,7 @@ import torch
 from dyntorch import scenes
 from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import Status
-from dyntorch.geometry.triangulation import observed, triangulate
+from dyntorch.geometry.triangulation import mask_missing, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks, projections_of_tracks
@@ -21,7 +21,7 @@ def generator(seed=0):
 
 
 def tracks_of(images, times):
-    x, weights = observed(images, None)
+    x, weights = mask_missing(images, None)
     transforms = hartley(x.unsqueeze(-2), (weights > 0).to(x.dtype))
     scales = transforms[..., 0, 0]
     moved = torch.where((weights > 0)[..., None], x * scales[..., None, None] + transforms[..., None, :-1, -1], 0.0)
