@@ -79,7 +79,7 @@ def test_many(run):
 BAD = {
     "convert -o a.trc": "no recordings; give at least one",
     "convert none.json -o a.trc": "none.json: no such file or folder",
-    "convert one.json -o a.abc": "-o a.abc: no format ends so; end it in .npz, .trc, .c3d, .nc, or say it with --to for a folder",
+    "convert one.json -o a.abc": "-o a.abc: no format ends so; end it in .npz, .c3d, .nc, .trc, or say it with --to for a folder",
     "convert one.json --to trc -o a.c3d": "--to trc and -o a.c3d say different formats",
     "convert one.json two.json -o a.trc": "a.trc: one recording is a file, but 2 are given; give a folder: --to trc -o a",
     "convert set.npz -o a.c3d": "a.c3d: 2 clips (set[0], ...) are not the people of one recording",

@@ -40,6 +40,17 @@ def samples() -> dict[str, Callable[[Path], Sample]]:
     return {tool: make for module in modules for tool, make in module.SAMPLES.items()}
 
 
+def list_failures(cases: Mapping[str, Callable[[], None]]) -> dict[str, str]:
+    """Which of many checks of one property fail, and how."""
+    wrong = {}
+    for name, check in cases.items():
+        try:
+            check()
+        except (Exception, pytest.fail.Exception) as problem:
+            wrong[name] = f"{type(problem).__name__}: {problem}"[:300]
+    return wrong
+
+
 def refused(path: Path, *words: str, action: Callable[..., Any] = read, **options: Any) -> None:
     """Reading fails with one line of bearable length that names the file, has a remedy, and all the words."""
     with pytest.raises(ValueError, match=re.escape(path.name)) as caught:
