@@ -94,7 +94,7 @@ WORDING = {
     "indexing/opening.py": {"VALUE", "SAID", "LISTED"},
     "indexing/readers/matches.py": {"SHOWN"},
     "indexing/remarks.py": {"NAMED"},
-    "indexing/report/tallies.py": {"TIMES"},
+    "indexing/report/results.py": {"TIMES"},
     "indexing/sync/synchronize.py": {"LISTED"},
 }
 """How much a message lists."""
@@ -122,11 +122,11 @@ DRAWING = {
         *("PANELS", "WIDTH", "TALL", "EDGE", "GAP", "HEAD", "TICKS", "FOOT", "WIDE", "NARROW", "TAIL", "FRINGE", "DRAWN"),
     },
     "indexing/report/canvas.py": {"DPI", "FADE", "FRAMES", "AROUND", "WIDTH", "HEIGHT"},
-    "indexing/report/learned.py": {"COLUMNS", "PANEL", "PIECES", "THIN", "THICK", "DOT", "HEAD", "TRAIL", "NAMED"},
+    "indexing/report/training.py": {"COLUMNS", "PANEL", "PIECES", "THIN", "THICK", "DOT", "HEAD", "TRAIL", "NAMED"},
     "indexing/report/page.py": {"PIXEL_RATIO", "LISTED", "LINES"},
     "indexing/report/pictures.py": {"COLUMNS", "STEPS", "WIDTH", "ABOVE", "BESIDE"},
     "indexing/report/recognition.py": {"TIMELINES", "STRIPS", "TIPS", "ROWS", "LOST", "PERFORMANCES"},
-    "indexing/report/reconstruction_picture.py": {
+    "indexing/report/reconstruction.py": {
         *("WIDTH", "FOOT", "TITLE", "TICKS", "SHOWN", "TANGLE", "LONG", "ROOM", "TALL", "STRAYS", "GAP", "LEFT"),
         *("TRACKS_TALL", "TRACKS_STRAYS"),
     },

@@ -20,7 +20,7 @@ from dyntorch.numerics import as_python
 from indexing.opening import count as count  # by this name for all commands
 
 if TYPE_CHECKING:
-    from indexing.report.page import ResultReport
+    from indexing.report.summary import Summary
 
 PLAIN_WIDTH = 132  # columns where the output is no terminal
 REFUSED = 3  # exit code: the data cannot decide
@@ -75,16 +75,6 @@ def names(values: Sequence[object]) -> str:
     return ", ".join(map(str, values[:SHOWN])) + more
 
 
-def tell(report: ResultReport) -> None:
-    """What a reader should note, a line each."""
-    from indexing.report.page import heading
-
-    for note in report.notes:
-        say(f"note: {note}")
-    for code, _, message in report.warnings:
-        say(f"warning: {heading(code)}: {message}")
-
-
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]], title: str = "") -> None:
     """Print a table; columns of numbers (their headings end in a space) are aligned right."""
     from rich import box
@@ -105,6 +95,18 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]], title: str =
         drawn.add_row(*(Text(one_line(cell)) for cell in row))
     terminal = sys.stdout.isatty()
     Quiet(file=sys.stdout, width=None if terminal else PLAIN_WIDTH, highlight=False).print(drawn)
+
+
+def show(summary: Summary) -> None:
+    """Print a result: its tables with what is said below them, notes and warnings, and what is to be said last."""
+    for line in summary.opening:
+        say(line)
+    for one in summary.tables:
+        table(one.columns, one.rows)
+        for sentence in one.below:
+            say(sentence)
+    for line in (*summary.notes, *summary.closing):
+        say(line)
 
 
 @contextmanager

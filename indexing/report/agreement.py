@@ -16,7 +16,7 @@ from indexing.opening import count
 from indexing.report import pictures
 from indexing.report.page import Picture, bar, render, table_csv, write_files
 from indexing.report.recognition import TIMELINES, TIPS, duration, percent, timeline_name
-from indexing.report.tallies import cell
+from indexing.report.results import cell
 
 FILES = ("report.html", "metrics.json", "manifest.json", "confusion.png", "confusion.csv", "timeline.png")
 OURS = r"confusion\.(png|csv)|timeline(-\d+)?\.png|events\.csv|repetitions\.csv"

@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from string import ascii_uppercase
 from typing import Any
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 from dyntorch.numerics import worded
 from indexing.readers.matches import Matched
 from indexing.readers.pairs import Photograph
-from indexing.report.canvas import DARK, LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
-from indexing.report.page import Picture, ResultReport, markup, render, safe_cell, sentence, table_csv, write_files
+from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
+from indexing.report.page import ResultReport, markup, safe_cell, sentence, table_csv
+from indexing.report.summary import Summary, Table, notes_of, write_summary
 
 FloatArray = NDArray[np.float64]
 FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png")
@@ -148,18 +150,36 @@ def describe(report: AlignmentReport) -> str:
     return f"Of {number:,} {what} in {len(report.views)} views, {'; '.join(parts)}. {PURPOSE[report.model]}"
 
 
+def summarize(report: AlignmentReport) -> Summary:
+    """Everything that is said of an alignment."""
+    known, poses = report.solved, report.poses
+    row: list[object] = [len(report.ids), *(n if known or name == "missing" else "" for name, n in report.counts.items())]
+    row += [f"{report.sigma:.3g}" if known else "", report.state]
+    tables = [Table(["matches ", "static ", "moving ", "outliers ", "missing ", "noise ", "status"], [row])]
+    for name, view, rows, scaled in report.shown:
+        heading = f"{name}: view {view} to view 1" + ("" if scaled else ", norm 1")
+        cells = [[f"row {i}", *(" ± ".join(filter(None, cell)) for cell in row[1:])] for i, row in enumerate(rows, start=1)]
+        tables.append(Table([heading, *(f"column {j} " for j in range(1, len(cells[0])))], cells))
+    if poses:
+        cells = [[f"view {v}", f"{turn:.4g}°", *(f"{x:.4g}" for x in shift)] for v, turn, shift in poses]
+        normal = ", ".join(f"{x:.4g}" for x in report.found.normal)
+        plane = f"plane: normal ({normal}) before view 1; shifts in units of its distance"
+        tables.append(Table(["camera against view 1", "turn ", "x ", "y ", "z "], cells, [plane]))
+    return Summary(
+        headline=describe(report), tables=tables, notes=notes_of(report),
+        closing=[f"open: {report.ambiguity}"] if known and report.ambiguity else [],
+        pictures={"alignment.png": partial(picture_of, report)}, dark=bool(report.photographs),
+        files={"labels.csv": partial(labels_csv, report), "alignment.json": partial(as_json, report), "tracks.csv": None},
+    )  # fmt: skip
+
+
 def write_alignment(folder: str | Path, report: AlignmentReport) -> Path:
     """Write a report into a folder: ``report.html``, ``alignment.json``, ``labels.csv`` and ``alignment.png``."""
-    drawn = picture_of(report)
-    picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
     turns = []
     if report.model == "rigid":
         turns = [(angle, shift, float(np.linalg.norm(shift))) for angle, shift in map(turn_and_shift, report.motion)]
     motions = [(name, view, [[row[0], *map(_cell, row[1:])] for row in rows], one) for name, view, rows, one in report.shown]
-    html = render("alignment", report, summary=describe(report), picture=picture, motions=motions, turns=turns)
-    contents = {"alignment.png": drawn, "labels.csv": labels_csv(report), "alignment.json": as_json(report), "tracks.csv": None}
-    contents |= {**report.besides, "report.html": html}
-    return write_files(folder, contents)
+    return write_summary(folder, "alignment", report, summarize(report), motions=motions, turns=turns)
 
 
 def _cell(number: tuple[str, str]) -> Any:

@@ -25,8 +25,7 @@ from indexing.report.page import LISTED, Script, even, markup, render, table_csv
 from indexing.report.pictures import colours
 from indexing.report.player import Player, players
 from indexing.report.recognition import duration, none
-from indexing.report.results import RecognitionReport, RecordingResult, by_recording
-from indexing.report.tallies import cell
+from indexing.report.results import RecognitionReport, RecordingResult, by_recording, cell
 
 if TYPE_CHECKING:
     from indexing.archive.results import ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit

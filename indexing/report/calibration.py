@@ -19,6 +19,7 @@ from indexing.calibrate.rig import ASSOCIATED, CALIBRATION, drop_associated, rot
 from indexing.opening import parse_json, read_bytes, read_text
 from indexing.report.page import Picture, Script, even, markup, render, sentence, write_files
 from indexing.report.rig import array_of, heat_picture, plan_picture, scene
+from indexing.report.summary import Summary, Table
 
 if TYPE_CHECKING:
     from indexing.calibrate.left_right import SideExchange
@@ -244,7 +245,7 @@ def page(report: CalibrationReport, plan: bytes | None, heat: bytes | None, name
         "unknown": rig.unknown, "files": file_rows(names),
         "residual_heads": ["Joint", *((name, "number") for name in rig.names)], "joint_rows": joint_rows(report),
     }  # fmt: skip
-    return render("calibration", report, summary=describe(report), **values)
+    return render("calibration", report, summary=summarize(report).headline, **values)
 
 
 def describe(report: CalibrationReport) -> str:
@@ -262,6 +263,25 @@ def describe(report: CalibrationReport) -> str:
         f"Where {len(rig.names)} cameras stood, their focal lengths and their clocks, from {people} in view; the movement "
         f"in space, {scale}. Joints as detected and as predicted are {typical:.1f} pixels apart."
     )
+
+
+def summarize(report: CalibrationReport, folder: Path | None = None) -> Summary:
+    """Everything that is said of a calibration that was written into a folder."""
+    rig = report.rig
+    pixels = [f"{value:.1f}" if math.isfinite(value) else "none" for value in report.residual]
+    rows = [
+        [name, focal_text(report, i), place_text(report, i), offset_text(report, i), pixels[i], agrees_text(report, i)]
+        for i, name in enumerate(rig.names)
+    ]
+    unit = "m" if rig.calibration.metric else "no unit"
+    closing = [f"open: {text}" for text in rig.unknown] if rig.ok else []
+    if folder is not None:
+        kept = sorted(name for name in earlier(folder) if not name.endswith((".png", ".html", ".json")))
+        closing.append(f"written to {folder}/: {', '.join(kept) or 'the report alone, and no calibration'}")
+    return Summary(
+        headline=describe(report), notes=[f"note: {note}" for note in report.notes], closing=closing,
+        tables=[Table(["camera", "focal length px ", f"position {unit} ", "clock s ", "residual px ", "agrees "], rows)],
+    )  # fmt: skip
 
 
 def cards(report: CalibrationReport) -> list[tuple[str, str, str]]:

@@ -246,3 +246,76 @@ def draw_photograph(panel: Any, photograph: Photograph, theme: Theme) -> None:
     fade = FADE[int(paper.mean() < 0.5)]
     shown = (1 - fade) * photograph.gray[..., None] + fade * paper
     panel.imshow(shown, extent=(-0.5, wide - 0.5, tall - 0.5, -0.5), interpolation="bilinear", zorder=0)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Panels of points and paths: side by side, with equal axes, limits that leave strays out, and a legend below.
+
+
+FloatArray = NDArray[np.float64]
+PAGE_WIDTH, PANEL_FOOT, PANEL_TITLE, PANEL_TICKS = 10.2, 0.4, 0.3, 0.25  # inches
+MAX_PATHS = 1500  # drawn; more are a blot
+MAX_LONG_PATHS, LONG_PATH = 60, 0.06  # paths drawn where half of them are longer than this share of the picture
+PANEL_MARGIN = 0.06  # around the points, of their extent
+
+
+def layout(boxes: list[tuple[FloatArray, FloatArray]], tall: float, edge: float, gap: float) -> tuple[Any, list[Any]]:
+    """A figure of panels side by side, as wide as they need to be, and the panels."""
+    wide = (PAGE_WIDTH - edge - gap * (len(boxes) - 1)) / len(boxes)
+    ratios = [float(np.clip((high - low)[1] / (high - low)[0], 0.05, 20)) for low, high in boxes]
+    sizes = [(min(wide, tall / ratio), min(tall, wide * ratio)) for ratio in ratios]
+    width = edge + sum(size for size, _ in sizes) + gap * (len(boxes) - 1)
+    highest = max(size for _, size in sizes)
+    height = PANEL_TITLE + highest + PANEL_TICKS + PANEL_FOOT
+    figure, left, panels = new_figure(width, height), edge, []
+    for across, down in sizes:
+        panels.append(figure.add_axes((left / width, 1 - (PANEL_TITLE + down) / height, across / width, down / height)))
+        left += across + gap
+    return figure, panels
+
+
+def limits(points: FloatArray, share: float = 1.0) -> tuple[FloatArray, FloatArray]:
+    """Low and high ``(d,)`` around the points ``(..., d)``, but for a share of strays, with room around."""
+    flat = points.reshape(-1, points.shape[-1])
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    if not len(flat):
+        return np.zeros(points.shape[-1]), np.ones(points.shape[-1])
+    low, high = np.percentile(flat, 100 * (1 - share), axis=0), np.percentile(flat, 100 * share, axis=0)
+    room = max(PANEL_MARGIN * float((high - low).max()), 1e-3 * float(np.abs(flat).max()), 1e-6)
+    return low - room, high + room
+
+
+def around(paths: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
+    """Low and high ``(d,)`` around whole paths ``(views, n, d)``, from dot to arrow head, but for those that stray far away."""
+    low, high = limits(paths, share)
+    with np.errstate(invalid="ignore"):
+        near = ((paths > low - (high - low)) & (paths < high + (high - low))).all(axis=(0, 2))
+    return limits(paths[:, near]) if near.any() else (low, high)
+
+
+def sample(paths: FloatArray, box: tuple[FloatArray, FloatArray]) -> NDArray[np.intp]:
+    """Of paths ``(views, n, d)`` those to be drawn: all, or where long ones would tangle, every so many."""
+    count = paths.shape[1]
+    if count <= MAX_LONG_PATHS:
+        return np.arange(count)
+    ways = np.linalg.norm(paths[-1] - paths[0], axis=-1)
+    long = float(np.nanmedian(ways)) > LONG_PATH * float((box[1] - box[0]).max()) if np.isfinite(ways).any() else False
+    return np.linspace(0, count - 1, MAX_LONG_PATHS).round().astype(np.intp) if long else np.arange(min(count, MAX_PATHS))
+
+
+def foot(figure: Any, handles: list[Any], columns: int = 4, ink: str = LIGHT.ink) -> None:
+    """The legend at the foot of the figure."""
+    anchor = (0.5, 0.28 / figure.get_figheight())
+    figure.legend(handles=handles, loc="upper center", bbox_to_anchor=anchor, ncols=columns, frameon=False, labelcolor=ink)
+
+
+def finish(panel: Any, low: FloatArray, high: FloatArray, down: bool, title: str) -> None:
+    """Limits, equal axes and a title."""
+    panel.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]) if down else (low[1], high[1]))
+    panel.set_aspect("equal", adjustable="box", anchor="N")
+    panel.tick_params(length=2.5, labelsize=7.5)
+    panel.locator_params(nbins=6)
+    panel.ticklabel_format(useOffset=False)
+    panel.set_title(title, fontsize=9, loc="left", parse_math=False)
+    for side in panel.spines.values():
+        side.set_linewidth(0.8)

@@ -16,17 +16,22 @@ from indexing.report.page import Picture, Script, bar, even, markup, render, tab
 from indexing.report.pictures import timeline_tips
 from indexing.report.player import Player, players
 from indexing.report.results import (
+    MEANING,
     RecognitionReport,
     RecordingResult,
     ReportedEvent,
     by_recording,
+    cell,
     confused_with,
+    count_row,
+    held_rows,
     measure,
     missed,
     overlapping,
+    repetition_rows,
+    repetitions_csv,
     seconds,
 )
-from indexing.report.tallies import MEANING, cell, count_row, held_rows, repetition_rows, repetitions_csv
 
 TIMELINES = 12  # recordings, or people in them, whose timeline is drawn, and recordings that have a player
 STRIPS = 60  # events that are shown as stick figures, over all recordings

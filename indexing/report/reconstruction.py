@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,25 @@ from dyntorch.numerics import worded
 from dyntorch.tasks import MOTION_MODELS
 from indexing.readers.pairs import Photograph
 from indexing.readers.tracks import TrackSet
-from indexing.report.canvas import DARK
-from indexing.report.page import Picture, ResultReport, markup, matrix, npz, render, safe_cell, sentence, table_csv, write_files
-from indexing.report.reconstruction_picture import scene_picture, tracks_picture
+from indexing.report.canvas import (
+    LIGHT,
+    MAX_PATHS,
+    PAGE_WIDTH,
+    Theme,
+    around,
+    draw_photograph,
+    finish,
+    foot,
+    layout,
+    limits,
+    new_figure,
+    png,
+    sample,
+    shorten,
+    style,
+)
+from indexing.report.page import ResultReport, markup, matrix, npz, safe_cell, sentence, table_csv
+from indexing.report.summary import Summary, Table, notes_of, write_summary
 
 FloatArray = NDArray[np.float64]
 FILES = ("report.html", "reconstruction.npz", "reconstruction.json", "points.csv", "tracks.png", "scene.png")
@@ -158,20 +175,38 @@ def describe(report: ReconstructionReport) -> str:
     return f"Of {number:,} points tracked through {views} views, {', '.join(parts)}. {PURPOSE.get(report.motion, '')}"
 
 
+def summarize(report: ReconstructionReport) -> Summary:
+    """Everything that is said of a reconstruction."""
+    counts, known, failed = report.counts, report.solved, left_out(report)
+    row: list[object] = [report.motion, len(report.tracks.views), len(report.tracks.ids)]
+    row += [number if known or name == "missing" else "" for name, number in counts.items()]
+    row += [f"{report.residual:.3g}" if known else "", report.state]
+    tables = [Table(["motion", "views ", "tracks ", *(f"{name} " for name in counts), "rms residual ", "status"], [row])]
+    if report.result.candidates:
+        fitted = [one for one in report.result.candidates if math.isfinite(one.score)]
+        rows = [[one.motion, f"{one.score:.6g}", f"{one.residual:.3g}"] for one in fitted]
+        tables.append(Table(["model", "penalized cost ", "rms residual "], rows, [f"note: {failed}"] if failed else []))
+    return Summary(
+        headline=describe(report), tables=tables, notes=notes_of(report),
+        closing=[f"open: {report.ambiguity}"] if known and report.ambiguity else [],
+        pictures={
+            "tracks.png": partial(tracks_picture, report),
+            "scene.png": (lambda theme: scene_picture(report)) if report.drawable else None,
+        },
+        dark=report.photograph is not None,
+        files={
+            "points.csv": partial(points_csv, report), "reconstruction.npz": partial(as_npz, report),
+            "reconstruction.json": partial(as_json, report), "tracks.csv": None,
+        },
+    )  # fmt: skip
+
+
 def write_reconstruction(folder: str | Path, report: ReconstructionReport) -> Path:
     """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
-    tracks = tracks_picture(report)
-    scene = scene_picture(report) if report.drawable else None
-    picture = Picture(tracks, dark=tracks_picture(report, DARK) if report.photograph is not None else None)
-    values = {"summary": describe(report), "scene": scene and Picture(scene), "picture": picture, **tables(report)}
-    contents: dict[str, Any] = {"tracks.png": tracks, "scene.png": scene, "points.csv": points_csv(report)}
-    contents |= {"reconstruction.npz": as_npz(report), "reconstruction.json": as_json(report), "tracks.csv": None}
-    contents |= report.besides
-    contents["report.html"] = render("reconstruction", report, **values)
-    return write_files(folder, contents)
+    return write_summary(folder, "reconstruction", report, summarize(report), **page_tables(report))
 
 
-def tables(report: ReconstructionReport) -> dict[str, Any]:
+def page_tables(report: ReconstructionReport) -> dict[str, Any]:
     """Rows of the page's tables: models, views and their cameras; and what to say about the models left out."""
     taken = markup('{name} <small class="none">taken</small>', name=report.motion)
     fitted = [one for one in report.result.candidates if math.isfinite(one.score)]
@@ -253,3 +288,255 @@ def points_csv(report: ReconstructionReport) -> str:
         place = [f"{value:.9g}" if np.isfinite(value) else "" for value in (*points[i], *velocities[i])]
         rows.append([safe_cell(name), int(report.labels[i]), kind, *place, int(seen[i]), f"{rms[i]:.6g}" if seen[i] else ""])
     return table_csv(["id", "label", "name", *axes, *(f"v{axis}" for axis in axes), "views", "rms"], rows)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The pictures: the scene, a plan of a plane or space from two sides; and the tracks.
+
+
+# apart for colour-blind eyes, too, on both papers; outliers are crosses besides
+COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "body 1": "#2f7fb8", "body 2": "#e8741e", "outlier": "#8b949c"}
+
+
+def kinds_of(report: ReconstructionReport) -> NDArray[Any]:
+    """What every track is drawn as: its kind, or ``unlabelled`` where no scene was decided on."""
+    return np.array(report.kinds) if report.drawable else np.full(len(report.tracks.ids), "unlabelled")
+
+
+def colour_of(kind: str) -> str:
+    """The colour of a kind."""
+    return COLOURS.get(kind, LIGHT.muted)
+
+
+def size_of(count: int) -> float:
+    """Area of a mark, smaller where there are many."""
+    return float(np.clip(2500 / max(1, count), 4, 22))
+
+
+def legend(figure: Any, kinds: NDArray[Any], ink: str = LIGHT.ink) -> None:
+    """How many tracks of every kind, at the foot of the figure."""
+    from matplotlib.lines import Line2D
+
+    handles = []
+    for kind in (*COLOURS, "unlabelled"):
+        number = int((kinds == kind).sum())
+        if number:
+            name = f"{number:,} {kind}{'s' * (kind == 'outlier' and number > 1)}" if " " not in kind else f"{kind}: {number:,}"
+            mark = "x" if kind == "outlier" else "o"
+            handles.append(Line2D([], [], color=colour_of(kind), marker=mark, linestyle="", markersize=5, label=name))
+    foot(figure, handles, ink=ink)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The picture of the scene: a plan of a plane, or space from two sides, with the way of every point from first to last view.
+
+
+Box = tuple[FloatArray, FloatArray]
+TALL = 6.2  # inches, the greatest height of a plan
+STRAYS = 0.99  # of the positions, those that a panel shows
+SIDES = ((90.0, -90.0, 1.6, "as the first camera looks"), (24.0, -62.0, 1.2, "from the side"))  # elevation, azimuth, zoom, name
+
+
+def scene_picture(report: ReconstructionReport) -> bytes:
+    """PNG of the scene in the frame nearest to the first view: the tracks fix it only up to an affinity or less."""
+    kinds = kinds_of(report)
+    positions = nearest_frame(report)
+    with style():
+        draw = _plan if positions.shape[-1] == 2 else _space
+        figure = draw(report, positions, kinds)
+        legend(figure, kinds)
+        return png(figure, tight=True)
+
+
+def nearest_frame(report: ReconstructionReport) -> FloatArray:
+    """Positions ``(views, n, d)`` carried by the affinity that brings the first ones nearest to their images in the first
+    view."""
+    image = report.tracks.values[0, :, :2]
+    fits = np.isfinite(image).all(axis=1) & report.placed & (report.labels > 0)
+    dim = report.found.points.shape[1]
+    if fits.sum() < dim + 1:
+        return report.positions
+    start = report.positions[0, fits]
+    middle, aim = start.mean(axis=0), image[fits].mean(axis=0)
+    across = np.linalg.lstsq(start - middle, image[fits] - aim, rcond=None)[0]  # (d, 2)
+    if dim == 2:
+        return np.asarray((report.positions - middle) @ across + aim)
+    # the coordinate of the points that is uncorrelated with those two
+    spread = np.cov((start - middle).T)
+    depth = np.linalg.svd((spread @ across).T)[2][-1]
+    shown = (report.positions - middle) @ np.column_stack([across, depth])
+    size = shown[0, fits].std(axis=0)
+    shown[..., 2] *= size[:2].mean() / max(size[2], 1e-12)
+    if _depth_order(report, fits, shown[0, fits, 2]) < 0:
+        shown[..., 2] *= -1
+    out: FloatArray = shown * np.array([1.0, -1.0, -1.0])  # y of images points down, and depth away
+    return out
+
+
+def _depth_order(report: ReconstructionReport, fits: NDArray[np.bool_], depth: FloatArray) -> float:
+    """Whether a coordinate grows with the depth in the first view; no telling up to a collineation, but nearly always right."""
+    camera = report.found.cameras[0]
+    w = report.found.points[fits] @ camera[-1, :-1] + camera[-1, -1]
+    return float(np.nan_to_num(np.sign(w.mean()) * np.cov(w, depth)[0, 1]))
+
+
+def _plan(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[Any]) -> Any:
+    """The plane, with an arrow from the first to the last view for every moving point."""
+    halves = ["body 1", "body 2"] if report.bodies > 1 else [""]
+    shown = [positions[:, kinds == half] if half else positions[:, np.isin(kinds, ("static", "moving"))] for half in halves]
+    boxes = [around(points, STRAYS) for points in shown]
+    figure, panels = layout(boxes, TALL, 0.1, 0.5)
+    for panel, half, box in zip(panels, halves, boxes, strict=True):
+        reach = float(np.max(box[1] - box[0]))
+        for kind in ("outlier", "static", "moving", "body 1", "body 2"):
+            mine = positions[:, (kinds == kind) & np.isin(kind, [half or kind])][:, :MAX_PATHS]
+            _arrows(panel, mine, kind, reach, size_of(positions.shape[1]), box)
+        finish(panel, *box, True, half or "the plane, in a frame of its own" + _sampled(positions, kinds, box))
+        panel.set(xticks=[], yticks=[])
+    return figure
+
+
+def _sampled(positions: FloatArray, kinds: NDArray[Any], box: Box) -> str:
+    """That only some ways are drawn, where that is so."""
+    moving = positions[:, kinds == "moving"]
+    drawn = len(sample(moving, box))
+    return f"; the ways of {drawn} of {moving.shape[1]:,}" if drawn < moving.shape[1] else ""
+
+
+def _arrows(panel: Any, points: FloatArray, kind: str, reach: float, size: float, box: Box) -> None:
+    """Where points ``(views, n, 2)`` begin, their ways, and the heads of those long enough to have one."""
+    from matplotlib.collections import LineCollection
+
+    if not points.shape[1] or kind == "outlier":
+        return
+    colour = colour_of(kind)
+    panel.scatter(*points[0].T, s=size, c=colour, linewidth=0, zorder=3)
+    if kind != "moving":
+        return
+    points = points[:, sample(points, box)]
+    ends = points[[0, -1]]
+    step = ends[1] - ends[0]
+    length = np.linalg.norm(step, axis=-1)
+    panel.add_collection(LineCollection(list(points.transpose(1, 0, 2)), colors=colour, linewidths=1.2, alpha=0.75, zorder=2))
+    head = np.minimum(0.35 * length, 0.016 * reach)
+    long = length > 0.006 * reach
+    last = points[-1] - points[-2]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = last / np.linalg.norm(last, axis=-1, keepdims=True)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    back = ends[1] - head[:, None] * along
+    wings = np.stack([back + 0.45 * head[:, None] * across, ends[1], back - 0.45 * head[:, None] * across], axis=1)
+    panel.add_collection(LineCollection(list(wings[long]), colors=colour, linewidths=1.2, zorder=2))
+
+
+def _space(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[Any]) -> Any:
+    """Space, as the first camera looks and from the side; of two bodies, each for itself."""
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    halves = ["body 1", "body 2"] if report.bodies > 1 else ["", ""]
+    wide = PAGE_WIDTH / 2
+    figure = new_figure(PAGE_WIDTH, 4.9)
+    for i, (half, side) in enumerate(zip(halves, SIDES, strict=True)):
+        elevation, azimuth, zoom, name = SIDES[1] if half else side
+        panel = figure.add_axes((i * wide / PAGE_WIDTH, 0.07, wide / PAGE_WIDTH, 0.86), projection="3d", proj_type="ortho")
+        shown = positions[:, kinds == half] if half else positions[:, np.isin(kinds, ("static", "moving"))]
+        low, high = box = around(shown, STRAYS)
+        for kind in ("static", "moving", "body 1", "body 2"):
+            mine = positions[:, (kinds == kind) & np.isin(kind, [half or kind])][:, :MAX_PATHS]
+            if not mine.shape[1]:
+                continue
+            colour = colour_of(kind)
+            panel.scatter(*mine[0].T, s=size_of(positions.shape[1]), c=colour, linewidth=0, depthshade=not half)
+            if kind == "moving":
+                mine = mine[:, sample(mine, box)]
+                panel.add_collection3d(Line3DCollection(list(mine.transpose(1, 0, 2)), colors=colour, linewidths=1.0, alpha=0.75))
+        middle, reach = (low + high) / 2, float((high - low).max()) / 2
+        panel.set(**{f"{axis}lim": (middle[j] - reach, middle[j] + reach) for j, axis in enumerate("xyz")})
+        panel.set(xticklabels=[], yticklabels=[], zticklabels=[])
+        panel.set_box_aspect((1, 1, 1), zoom=zoom)
+        for axis in (panel.xaxis, panel.yaxis, panel.zaxis):
+            axis.set_pane_color(LIGHT.paper)
+            axis._axinfo["grid"].update(color=LIGHT.line, linewidth=0.5)
+        panel.view_init(elev=elevation, azim=azimuth)
+        panel.set_title(half or name + _sampled(positions, kinds, box), fontsize=9, loc="left", y=1.0)
+    return figure
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The picture of the tracks: as they were measured, and as the first camera would have seen them had it stood still.
+
+
+GAP, LEFT, TRACKS_TALL = 0.55, 0.45, 5.2  # inches; the last is the greatest height of a panel
+TRACKS_STRAYS = 0.995  # of the positions, those that a panel shows
+
+
+def tracks_picture(report: ReconstructionReport, theme: Theme = LIGHT) -> bytes:
+    """PNG: the tracks through all views in the first one; beside them the same without the motion of the camera."""
+    kinds = kinds_of(report)
+    measured = report.tracks.values[..., shown_axes(report.tracks.values)]
+    still = as_first_camera(report)
+    panels: list[tuple[FloatArray, str]] = [
+        (measured, f"as tracked, from {_named(report.tracks.views[0], report.tracks.by_time)} on")
+    ]
+    if still is not None:
+        panels.append((still[..., shown_axes(report.tracks.values)], "as the first camera would see it, standing still"))
+    kept = [points[:, kinds != "missing"] for points, _ in panels]
+    boxes = [limits(points, TRACKS_STRAYS) for points in kept]
+    if report.photograph is not None:
+        boxes[0] = np.array([-0.5, -0.5]), np.array(report.photograph.size) - 0.5
+    down = report.tracks.values.shape[-1] == 2
+    with style(theme):
+        figure, places = layout(boxes, TRACKS_TALL, LEFT, GAP)
+        for panel, (points, title), box in zip(places, panels, boxes, strict=True):
+            if report.photograph is not None and panel is places[0]:
+                draw_photograph(panel, report.photograph, theme)
+            _draw(panel, points, kinds)
+            finish(panel, *box, down, title)
+        legend(figure, kinds, theme.ink)
+        return png(figure, tight=True)
+
+
+def _named(view: str, by_time: bool) -> str:
+    return f"{'time' if by_time else 'frame'} {view}" if view.lstrip("-").replace(".", "", 1).isdigit() else shorten(view, 40)
+
+
+def shown_axes(values: FloatArray) -> list[int]:
+    """The two coordinates in which the first view extends most."""
+    if values.shape[-1] == 2:
+        return [0, 1]
+    first = values[0]
+    seen = first[np.isfinite(first).all(axis=1)]
+    spread = np.ptp(seen, axis=0) if len(seen) else np.ones(3)
+    return sorted(np.argsort(-spread, kind="stable")[:2].tolist())
+
+
+def as_first_camera(report: ReconstructionReport) -> FloatArray | None:
+    """Where the first camera would have seen the points at the times of all views, ``(views, n, l)``; None for two bodies, or
+    where no scene was decided on."""
+    if not report.drawable or report.velocities is None:
+        return None
+    camera = report.found.cameras[0]
+    rays = report.positions @ camera[:, :-1].T + camera[:, -1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        seen: FloatArray = rays[..., :-1] / rays[..., -1:]
+    # past infinity: behind the camera
+    return np.where(rays[..., -1:] * rays[:1, :, -1:] > 0, seen, np.nan)
+
+
+def _draw(panel: Any, points: FloatArray, kinds: NDArray[Any]) -> None:
+    """Paths ``(views, n, 2)`` with a dot where they begin."""
+    from matplotlib.collections import LineCollection
+
+    size = size_of(points.shape[1])
+    for kind in ("unlabelled", "outlier", "static", "moving", "body 1", "body 2"):  # what matters most on top
+        mine = points[:, kinds == kind][:, :MAX_PATHS]
+        if not mine.shape[1]:
+            continue
+        colour = colour_of(kind)
+        paths = [path[np.isfinite(path).all(axis=1)] for path in mine.transpose(1, 0, 2)]
+        paths = [path for path in paths if len(path)]
+        quiet = 0.35 if kind == "outlier" else 0.7
+        panel.add_collection(LineCollection([path for path in paths if len(path) > 1], colors=colour, linewidths=1.0, alpha=quiet))
+        starts = np.array([path[0] for path in paths]).reshape(-1, 2)
+        mark = {"marker": "x", "linewidth": 1.1} if kind == "outlier" else {"marker": "o", "linewidth": 0}
+        panel.scatter(*starts.T, s=size, c=colour, zorder=3, **mark)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,31 @@ from numpy.typing import NDArray
 
 from indexing.opening import count
 from indexing.readers.pairs import MatchedPair, Photograph
-from indexing.report.canvas import DARK, LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
-from indexing.report.labelled import COLOURS, LabelledReport, colour_of, share
+from indexing.report.body_labels import COLOURS, LabelledReport, colour_of, share
+from indexing.report.canvas import (
+    LIGHT,
+    Theme,
+    draw_photograph,
+    finish,
+    foot,
+    layout,
+    limits,
+    new_figure,
+    png,
+    sample,
+    shorten,
+    style,
+)
 from indexing.report.page import (
-    Picture,
+    even,
     markup,
     matrix,
     npz,
-    render,
     safe_cell,
     sentence,
     table_csv,
-    write_files,
 )
-from indexing.report.reconstruction_picture import finish, foot, layout, limits, sample
+from indexing.report.summary import Summary, Table, notes_of, write_summary
 
 FloatArray = NDArray[np.float64]
 FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png")
@@ -82,26 +94,32 @@ def describe(report: SegmentationReport) -> str:
     return f"Of {number:,} matches of two images, {moved}{rest}.{lost}"
 
 
+def summarize(report: SegmentationReport) -> Summary:
+    """Everything that is said of a segmentation."""
+    number, counts = report.seen, report.counts
+    noise = even([report.rms(label) for label in range(1, len(report.models) + 1)])
+    rows: list[list[object]] = []
+    for label, model in enumerate(report.models, start=1):
+        mine = counts[f"body {label}"]
+        rows.append([f"body {label}", f"{mine:,}", f"{100 * mine / number:.1f} %", model, noise[label - 1] if mine else ""])
+    rest = "outliers" if report.models else "unlabelled"
+    rows.append([rest, f"{counts['outlier']:,}", f"{100 * counts['outlier'] / number:.1f} %", "", ""])
+    return Summary(
+        headline=describe(report), notes=notes_of(report),
+        tables=[Table(["body", "matches ", "share ", "model", "noise rms px "], rows, report.errors)],
+        pictures={"segmentation.png": partial(picture_of, report)}, dark=bool(report.photographs),
+        files={
+            "labels.csv": partial(labels_csv, report), "segmentation.npz": partial(as_npz, report),
+            "segmentation.json": partial(as_json, report), "tracks.csv": None, "segmentation.mp4": None,
+        },
+    )  # fmt: skip
+
+
 def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
     """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
-    drawn = picture_of(report)
-    picture = Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None)
     doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
-    values = {"summary": describe(report), "picture": picture, "doubtful": doubtful, "share": share, "rms": report.rms_text()}
-    html = render("segmentation", report, **values, **tables(report))
-    return write_files(
-        folder,
-        {
-            "segmentation.png": drawn,
-            "labels.csv": labels_csv(report),
-            "segmentation.npz": as_npz(report),
-            "segmentation.json": as_json(report),
-            "tracks.csv": None,
-            "segmentation.mp4": None,
-            **report.besides,
-            "report.html": html,
-        },
-    )
+    values = {"doubtful": doubtful, "share": share, "rms": report.rms_text(), **tables(report)}
+    return write_summary(folder, "segmentation", report, summarize(report), **values)
 
 
 def tables(report: SegmentationReport) -> dict[str, list[list[Any]]]:

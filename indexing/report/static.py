@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 from indexing.colmap import MatchDatabase, StaticPoints
 from indexing.opening import count
 from indexing.readers.pairs import Photograph
-from indexing.report.canvas import DARK, LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
-from indexing.report.page import Picture, bar, render, safe_cell, sentence, table_csv, write_files
-from indexing.report.reconstruction_picture import finish, foot
+from indexing.report.canvas import LIGHT, Theme, draw_photograph, finish, foot, new_figure, png, shorten, style
+from indexing.report.page import bar, safe_cell, sentence, table_csv
+from indexing.report.summary import Summary, Table, write_summary
 
 FILES = ("report.html", "static.json", "images.csv", "pairs.csv", "static.png")
 PANELS, COLUMNS, WIDE, EDGE, HEAD, FOOT = 6, 3, 10.2, 0.15, 0.32, 0.5  # of the picture: images, and inches
@@ -118,32 +119,47 @@ def as_json(report: StaticReport) -> dict[str, Any]:
     }
 
 
+def summarize(report: StaticReport) -> Summary:
+    """Everything that is said of what stands still in a database."""
+    found, rows = report.found, image_rows(report)
+    given = f"{report.matches:,} matches of {count(len(found.database.pairs), 'pair')} of images"
+    few = sorted(rows, key=lambda row: row[2])[:10] if len(rows) > 20 else rows
+    cells = [[row[0], f"{row[1]:,}", f"{row[2]:,}", f"{row[3]:,}", f"{100 * row[4]:.0f} %"] for row in few]
+    more = [f"{len(rows) - len(few)} images with more static points: see the report"] if len(few) < len(rows) else []
+    return Summary(
+        headline=describe(report), opening=[describe(report) if found.ok else given],
+        tables=[Table(["image", "matched ", "static ", "moving ", "spread "], cells, more)],
+        notes=[f"note: {note}" for note in report.remarks],
+        closing=[f"database: {report.written}", f"masks: {report.masks}"] if found.ok else [],
+        pictures={"static.png": partial(picture_of, report)}, dark=bool(report.photographs),
+        files={
+            "images.csv": partial(images_csv, report), "pairs.csv": partial(pairs_csv, report),
+            "static.json": partial(as_json, report),
+        },
+    )  # fmt: skip
+
+
 def write_report(folder: str | Path, report: StaticReport) -> Path:
     """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
-    drawn = picture_of(report)
     images, pairs = image_rows(report), pair_rows(report)
     values = {
-        "summary": describe(report),
-        "picture": Picture(drawn, dark=picture_of(report, DARK) if report.photographs else None),
         "images": [[name, *(f"{n:,}" for n in row[:3]), bar(row[3]), "refused" if row[4] else ""] for name, *row in images],
         "pairs": [[f"{a} and {b}", *(f"{n:,}" for n in row[:5]), row[5]] for a, b, *row in pairs],
         "rows": ROWS,
     }
-    html = render("static", report, **values)
-    image_head = ["image", "matched", "static", "moving", "spread", "refused"]
-    pair_head = ["first", "second", "matches", "bodies", "static_bodies", "kept", "verified", "division"]
-    csv_images = [[safe_cell(name), *row[:3], f"{row[3]:.3f}", int(row[4])] for name, *row in images]
-    csv_pairs = [[safe_cell(a), safe_cell(b), *row] for a, b, *row in pairs]
-    return write_files(
-        folder,
-        {
-            "static.png": drawn,
-            "images.csv": table_csv(image_head, csv_images),
-            "pairs.csv": table_csv(pair_head, csv_pairs),
-            "static.json": as_json(report),
-            "report.html": html,
-        },
-    )
+    return write_summary(folder, "static", report, summarize(report), **values)
+
+
+def images_csv(report: StaticReport) -> str:
+    """``image,matched,static,moving,spread,refused`` of every image."""
+    rows = [[safe_cell(name), *row[:3], f"{row[3]:.3f}", int(row[4])] for name, *row in image_rows(report)]
+    return table_csv(["image", "matched", "static", "moving", "spread", "refused"], rows)
+
+
+def pairs_csv(report: StaticReport) -> str:
+    """``first,second,matches,bodies,static_bodies,kept,verified,division`` of every pair."""
+    head = ["first", "second", "matches", "bodies", "static_bodies", "kept", "verified", "division"]
+    return table_csv(head, [[safe_cell(a), safe_cell(b), *row] for a, b, *row in pair_rows(report)])
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from dyntorch.numerics import as_python, worded
 from indexing.clip import Clip
+from indexing.opening import count
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 from indexing.report.page import Picture, markup, render, sentence, write_files
+from indexing.report.summary import Summary, Table
 from indexing.sync.breaks import Mended
 from indexing.sync.notices import besides
 from indexing.sync.people import Pairing, joint_names, who
@@ -38,6 +40,7 @@ METHODS = {
     "sound": "sound",
 }
 PPM = 1e6
+REFUSALS = 3  # pairs whose refusals the terminal prints
 UNKNOWN = 1e3  # seconds of standard deviation that say nothing
 
 
@@ -243,6 +246,98 @@ def describe(report: SyncReport) -> str:
     )
 
 
+def summarize(report: SyncReport, folder: Path | None = None) -> Summary:
+    """Everything that is said of a synchronization that was written into a folder."""
+    tables, closing = [_pairs_table(report)], []
+    if len(report.clocks) > 2:
+        tables.append(_clocks_table(report))
+    elif report.ok:
+        closing.append(_clock_sentence(report))
+    for pair in report.pairs:
+        if pair.wrong and pair.shift.ok:
+            closing.append(f"inconsistent joints of {pair.a.name} and {pair.b.name}: {', '.join(pair.wrong)}")
+    refused = [pair for pair in report.pairs if not pair.shift.ok] if len(report.pairs) > 1 else []
+    closing += [f"{pair.a.name} and {pair.b.name} refused: {pair.reason}" for pair in refused[:REFUSALS]]
+    closing += [f"and {len(refused) - REFUSALS} more pairs refused"] if len(refused) > REFUSALS else []
+    closing += [*(f"note: {note}" for note in report.notes), *_written(report, folder)]
+    return Summary(headline=describe(report), tables=tables, closing=closing)
+
+
+def _clock_sentence(report: SyncReport) -> str:
+    """When the second of two cameras began, and how its clock runs."""
+    first, other = report.clocks
+    began = float(other.inverse(other.start)) - first.start
+    factor = "" if other.rate == 1 else f" * {other.rate:.6f}"
+    when = f"{abs(began):.4f} s {'after' if began >= 0 else 'before'}"
+    sign = "-" if other.offset < 0 else "+"
+    clock = f"time of {other.name} = time of {first.name}{factor} {sign} {abs(other.offset):.4f} s"
+    return f"{other.name} began {when} {first.name}: {clock}"
+
+
+def _pairs_table(report: SyncReport) -> Table:
+    """The pairs as the terminal prints them."""
+
+    rows: list[list[object]] = []
+    for pair in report.pairs:
+        shift, rival = pair.shift, pair.runner_up
+        numbers = [
+            f"{pair.apart:+.4f}" if len(shift.peaks) else "none",
+            f"{shift.sigma:.4f}" if shift.sigma < UNKNOWN else "unknown",
+            f"{pair.apart * shift.fps[1]:+.2f}" if len(shift.peaks) else "none",
+            ppm(shift.rate, shift.rate_sigma),
+            f"{shift.confidence:.3f}",
+        ]
+        rows.append(
+            [f"{pair.a.name} → {pair.b.name}", *numbers, f"{rival[0]:+.3f}" if rival else "none", "ok" if shift.ok else "refused"]
+        )
+    where = "offset s (mid) " if any(pair.shift.rate != 1 for pair in report.pairs) else "offset s "
+    return Table(["pair", where, "± s ", "frames ", "rate ppm ", "confidence ", "next peak s ", "status"], rows)
+
+
+def _clocks_table(report: SyncReport) -> Table:
+    """The clocks of all cameras as the terminal prints them."""
+
+    rows = [
+        [
+            clock.name,
+            f"{clock.offset:+.4f}",
+            f"{clock.sigma:.4f}" if clock.sigma < UNKNOWN else "unknown",
+            f"{clock.offset * clock.take.fps:+.2f}",
+            ppm(clock.rate),
+        ]
+        for clock in report.clocks
+    ]
+    below = []
+    if report.cycle is not None and math.isfinite(report.cycle):
+        out = f"; {report.outlier[0]} - {report.outlier[1]} contradicts the others" if report.outlier else ""
+        below.append(f"cycle error: {1000 * report.cycle:.2f} ms{out}")
+    return Table([f"clock against {report.reference.name}", "offset s ", "± s ", "frames ", "rate ppm "], rows, below)
+
+
+def _written(report: SyncReport, folder: Path | None) -> list[str]:
+    """What was written besides the report, a sentence each."""
+    out = []
+    for clock in (clock for clock in report.clocks if clock.take.spatial and clock.shifted is not None):
+        assert clock.shifted is not None
+        where = Path(clock.shifted["folder"]) if folder is None else folder / clock.shifted["folder"]
+        out.append(
+            f"motion capture: {where}, on the clock of {report.reference.name}, within {1000 * clock.shifted['rest']:.1f} ms"
+        )
+    moved = [clock for clock in report.clocks if clock.shifted is not None and not clock.take.spatial]
+    if moved:
+        rest = 1000 * max(clock.shifted["rest"] for clock in moved if clock.shifted is not None)
+        written = ", ".join(clock.name for clock in moved)
+        where = Path("pose-sync") if folder is None else folder / "pose-sync"
+        out.append(f"shifted files: {where}/ ({written}), within {rest:.1f} ms of {report.reference.name}")
+    if report.videos:
+        rest = 1000 * max(one["rest"] for one in report.videos["cameras"].values())
+        where = Path(report.videos["folder"]) if folder is None else folder / report.videos["folder"]
+        said = f"{count(len(report.videos['cameras']), 'video')} of {count(report.videos['frames'], 'frame')}"
+        most = f"{rest:.1f} ms of {report.reference.name}{'' if report.mended is None else ' where frames were lost'}"
+        out.append(f"videos: {where}/, {said}, {report.videos['fps']:.6g} per second, within {most}")
+    return out
+
+
 def drift_of(rate: float) -> str:
     """Seconds that a clock of this rate gains on the reference in an hour."""
     return f"{3600 * (rate - 1):+.3g}"
@@ -339,7 +434,7 @@ def page(report: SyncReport, drawn: bytes, videos: Sequence[str] = ()) -> str:
     values: dict[str, Any] = {"noted": noted(report), "clock_rows": clock_rows(report), "pair_rows": pair_rows(report)}
     values["video_rows"] = video_rows(report)
     values |= {"picture": Picture(drawn), "videos": videos, "drawn": DRAWN, "drift_of": drift_of, "ppm": ppm, "sigma": sigma_text}
-    return render("sync", report, summary=describe(report), **values)
+    return render("sync", report, summary=summarize(report).headline, **values)
 
 
 def as_json(report: SyncReport) -> dict[str, Any]:

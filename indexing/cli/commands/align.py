@@ -10,7 +10,7 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import worded
-from indexing.cli.console import check_report, count, ended, flag_words, names, progress, say, table, tell
+from indexing.cli.console import check_report, count, ended, flag_words, names, progress, show
 from indexing.cli.flags.geometry import Align
 from indexing.cli.scenes import (
     Asked,
@@ -25,7 +25,7 @@ from indexing.cli.scenes import (
 )
 from indexing.files import manifest
 from indexing.readers.matches import Matched, read_matches
-from indexing.report.alignment import PURPOSE, WRITTEN, AlignmentReport, write_alignment
+from indexing.report.alignment import PURPOSE, WRITTEN, AlignmentReport, summarize, write_alignment
 from indexing.video.scene import SCENE_FOLLOWING, THRESHOLD, SceneTracks
 
 SEVERAL = ("planar", "join", "minimal_join")
@@ -71,7 +71,7 @@ def run(flags: Align) -> int:
     if folder is not None:
         with progress("drawing the report", steps=False):
             page = write_alignment(folder, report)
-    show(report)
+    show(summarize(report))
     return ended(page, None if report.status == "OK" else report.reason)
 
 
@@ -161,24 +161,3 @@ def frame_numbers(text: str | None) -> tuple[int, ...] | None:
         return tuple(int(word) for word in text.split(","))
     except ValueError:
         raise ValueError(f"--frames {text!r}: expected whole numbers with commas between them, such as --frames 10,20,30") from None
-
-
-def show(report: AlignmentReport) -> None:
-    """Print the result."""
-    counts = report.counts
-    known = report.solved
-    row = [len(report.ids), *(counts[name] if known or name == "missing" else "" for name in counts)]
-    row += [f"{report.sigma:.3g}" if known else "", report.state]
-    table(["matches ", "static ", "moving ", "outliers ", "missing ", "noise ", "status"], [row])
-    for name, view, rows, scaled in report.shown:
-        heading = f"{name}: view {view} to view 1" + ("" if scaled else ", norm 1")
-        cells = [[f"row {i}", *(" ± ".join(filter(None, cell)) for cell in row[1:])] for i, row in enumerate(rows, start=1)]
-        table([heading, *(f"column {j} " for j in range(1, len(cells[0])))], cells)
-    if report.poses:
-        cells = [[f"view {v}", f"{turn:.4g}°", *(f"{x:.4g}" for x in shift)] for v, turn, shift in report.poses]
-        table(["camera against view 1", "turn ", "x ", "y ", "z "], cells)
-        normal = ", ".join(f"{x:.4g}" for x in report.found.normal)
-        say(f"plane: normal ({normal}) before view 1; shifts in units of its distance")
-    tell(report)
-    if known and report.ambiguity:
-        say(f"open: {report.ambiguity}")

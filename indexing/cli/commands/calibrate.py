@@ -12,22 +12,13 @@ from typing import Any
 from dyntorch.numerics import worded
 from indexing.calibrate import CameraRig, RigPriors, calibrate_recordings
 from indexing.calibrate.body_height import check_height
-from indexing.cli.console import check_folder, count, ended, flag_words, progress, say, table
+from indexing.cli.console import check_folder, count, ended, flag_words, progress, show
 from indexing.cli.flags.cameras import Calibrate
 from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import refuse_range
 from indexing.cli.videos import find_keypoints
 from indexing.files import manifest
-from indexing.report.calibration import (
-    CalibrationReport,
-    agrees_text,
-    check_folder_of,
-    earlier,
-    focal_text,
-    offset_text,
-    place_text,
-    write_calibration,
-)
+from indexing.report.calibration import CalibrationReport, check_folder_of, summarize, write_calibration
 from indexing.sync.recordings import Take, find_cameras, take_of
 
 WORDS = flag_words(
@@ -64,7 +55,7 @@ def run(flags: Calibrate) -> int:
             made = manifest({"command": "calibrate", **dataclasses.asdict(flags)}, inputs, None, timings)
             report = dataclasses.replace(report, manifest=made)
             page, report = write_calibration(folder, report)
-    show(report, folder)
+    show(summarize(report, folder))
     return ended(page, None if rig.ok else rig.reason)
 
 
@@ -158,25 +149,3 @@ def _solve(flags: Calibrate, takes: list[Take], clocks: str | None, watched: Wat
     except ValueError as problem:
         raise ValueError(worded(problem, WORDS)) from problem
     return dataclasses.replace(rig, remarks=(*watched.notes, *rig.remarks))
-
-
-def show(report: CalibrationReport, folder: Path | None = None) -> None:
-    """Print the result."""
-    rig = report.rig
-    unit = "m" if rig.calibration.metric else "no unit"
-    pixels = [f"{value:.1f}" if math.isfinite(value) else "none" for value in report.residual]
-    rows = [
-        [
-            name, focal_text(report, i), place_text(report, i), offset_text(report, i), pixels[i],
-            agrees_text(report, i),
-        ]
-        for i, name in enumerate(rig.names)
-    ]  # fmt: skip
-    table(["camera", "focal length px ", f"position {unit} ", "clock s ", "residual px ", "agrees "], rows)
-    for note in report.notes:
-        say(f"note: {note}")
-    for text in rig.unknown if rig.ok else []:
-        say(f"open: {text}")
-    if folder is not None:
-        kept = sorted(name for name in earlier(folder) if not name.endswith((".png", ".html", ".json")))
-        say(f"written to {folder}/: {', '.join(kept)}" if kept else f"written to {folder}/: the report alone, and no calibration")

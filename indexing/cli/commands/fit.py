@@ -26,7 +26,7 @@ from indexing.cli.videos import (
 )
 from indexing.clip import Clip
 from indexing.files import manifest, prepare
-from indexing.report.learned import write_learned
+from indexing.report.training import write_training
 
 
 def run(flags: Fit) -> int:
@@ -84,7 +84,7 @@ def _write(flags: Fit, folder: Path, indexer: ActionIndexer, clips: list[Clip], 
 
     about = manifest({"command": "index fit", **dataclasses.asdict(flags)}, [path.expanduser() for path in paths], flags.seed)
     with progress("drawing the report", steps=False):
-        return write_learned(folder, indexer, clips, notes, about)
+        return write_training(folder, indexer, clips, notes, about)
 
 
 def _from_pixels(flags: Fit, examples: list[Example], output: Path) -> int:

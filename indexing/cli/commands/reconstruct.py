@@ -13,7 +13,7 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import worded
-from indexing.cli.console import check_report, count, ended, flag_words, say, table, tell
+from indexing.cli.console import check_report, count, ended, flag_words, show
 from indexing.cli.console import progress as progress_of
 from indexing.cli.flags.geometry import Reconstruct
 from indexing.cli.scenes import (
@@ -30,7 +30,7 @@ from indexing.cli.scenes import (
 )
 from indexing.files import manifest
 from indexing.readers.tracks import TrackSet, exact, read_tracks
-from indexing.report.reconstruction import WRITTEN, ReconstructionReport, left_out, write_reconstruction
+from indexing.report.reconstruction import WRITTEN, ReconstructionReport, summarize, write_reconstruction
 
 WORDS = flag_words("times", "static", "threshold", "motion", "calibration")
 UNFIXED = (
@@ -74,7 +74,7 @@ def run(flags: Reconstruct) -> int:
     if folder is not None:
         with progress_of("drawing the report", steps=False):
             page = write_reconstruction(folder, report)
-    show(report)
+    show(summarize(report))
     return ended(page, None if report.status == "OK" else report.reason)
 
 
@@ -175,21 +175,3 @@ def numbers(text: str, expected: int) -> Any:
     if len(found) != expected or not np.isfinite(found).all():
         raise ValueError(f"--times {text!r}: {len(found)} times for {expected} views; give one finite number per view")
     return found
-
-
-def show(report: ReconstructionReport) -> None:
-    """Print the result."""
-    counts, candidates = report.counts, report.result.candidates
-    known = report.solved
-    cells = [number if known or name == "missing" else "" for name, number in counts.items()]
-    row = [report.motion, len(report.tracks.views), len(report.tracks.ids), *cells]
-    row += [f"{report.residual:.3g}" if known else "", report.state]
-    table(["motion", "views ", "tracks ", *(f"{name} " for name in counts), "rms residual ", "status"], [row])
-    if candidates:
-        fitted = [[one.motion, f"{one.score:.6g}", f"{one.residual:.3g}"] for one in candidates if math.isfinite(one.score)]
-        table(["model", "penalized cost ", "rms residual "], fitted)
-        if failed := left_out(report):
-            say(f"note: {failed}")
-    tell(report)
-    if known and report.ambiguity:
-        say(f"open: {report.ambiguity}")

@@ -26,9 +26,8 @@ from indexing.readers.formats.clipset import holds_frames
 from indexing.recordings.repetitions import count_repetitions
 from indexing.report import RecognitionReport, RecordingResult, write_recognition
 from indexing.report.page import even
-from indexing.report.results import by_recording, matched, missed
+from indexing.report.results import COUNTS, by_recording, count_row, held_sentences, matched, missed
 from indexing.report.results import seconds as lasts
-from indexing.report.tallies import COUNTS, count_row, held_sentences
 from indexing.scoring import Event
 
 RESTED = {"strict": 2.0, "usual": 1.0, "off": 0.0}

@@ -14,14 +14,13 @@ import dyntorch
 from dyntorch.numerics import worded
 from indexing.cli.commands.segment_colmap import ColmapJob, run_colmap
 from indexing.cli.commands.segment_tracks import LEAST, BodiesJob, Given, read_given, run_bodies, unit_notes
-from indexing.cli.console import check_report, count, ended, flag_words, progress, say, table, tell
+from indexing.cli.console import check_report, count, ended, flag_words, progress, show
 from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import LEFT_OUT, PICTURE_FILES, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
 from indexing.files import manifest
 from indexing.readers.pairs import MatchedPair, Photograph, read_image, read_pair
 from indexing.readers.tracks import holds_tracks
-from indexing.report.page import even
-from indexing.report.segmentation import WRITTEN, SegmentationReport, write_segmentation
+from indexing.report.segmentation import WRITTEN, SegmentationReport, summarize, write_segmentation
 from indexing.video.scene import SceneTracks
 
 WORDS = flag_words("bodies", "threshold", "spatial")
@@ -122,7 +121,7 @@ def _two_views(flags: Segment, files: list[Path], scene: bool, asked: Asked, giv
     if folder is not None:
         with progress("drawing the report", steps=False):
             page = write_segmentation(folder, report)
-    show(report)
+    show(summarize(report))
     return ended(page, None if report.status == "OK" else report.reason)
 
 
@@ -235,19 +234,3 @@ def _solve(flags: Segment, pair: MatchedPair) -> Any:
         )
     except ValueError as problem:
         raise ValueError(f"{pair.path}: {worded(problem, WORDS)}") from problem
-
-
-def show(report: SegmentationReport) -> None:
-    """Print the result."""
-    number, counts = report.seen, report.counts
-    noise = even([report.rms(label) for label in range(1, len(report.models) + 1)])
-    rows: list[list[object]] = []
-    for label, model in enumerate(report.models, start=1):
-        mine = counts[f"body {label}"]
-        rows.append([f"body {label}", f"{mine:,}", f"{100 * mine / number:.1f} %", model, noise[label - 1] if mine else ""])
-    rest = "outliers" if report.models else "unlabelled"
-    rows.append([rest, f"{counts['outlier']:,}", f"{100 * counts['outlier'] / number:.1f} %", "", ""])
-    table(["body", "matches ", "share ", "model", "noise rms px "], rows)
-    if report.misclassified is not None:
-        say(f"misclassified: {100 * report.misclassified:.2f} % against the labels of the file")
-    tell(report)

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from indexing.archive.workers import QuietProcesses
-from indexing.cli.console import check_folder, check_report, count, counted, ended, keep, names, progress, say, table
-from indexing.colmap import MatchDatabase, StaticPoints, check_target, find_static, read_database
+from indexing.cli.console import check_folder, check_report, count, counted, ended, keep, names, progress, show
+from indexing.colmap import MatchDatabase, check_target, find_static, read_database
 from indexing.colmap.masks import write_masks
 from indexing.colmap.pair_segmentation import colmap
 from indexing.colmap.static import MIN_PARALLEL_PAIRS
 from indexing.files import manifest
 from indexing.readers.pairs import Photograph, read_image
-from indexing.report.static import FILES, StaticReport, describe, image_rows, images_drawn, write_report
+from indexing.report.static import FILES, StaticReport, images_drawn, summarize, write_report
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def run_colmap(job: ColmapJob, arguments: Mapping[str, Any]) -> int:
     )
     with progress("drawing the report", steps=False):
         page = write_report(folder, report)
-    show(report, found)
+    show(summarize(report))
     return ended(page, None if found.ok else found.reason)
 
 
@@ -110,19 +110,3 @@ def _photographs(database: MatchDatabase, folder: Path | None) -> tuple[dict[int
     notes = [f"--images {folder} has no {names(missing)}; the report shows points alone"] if missing else []
     notes += [f"{names(other)} in --images {folder} has another size than the database says, and is not drawn"] if other else []
     return found, notes
-
-
-def show(report: StaticReport, found: StaticPoints) -> None:
-    """Print the result."""
-    say(describe(report) if found.ok else f"{report.matches:,} matches of {count(len(found.database.pairs), 'pair')} of images")
-    rows = image_rows(report)
-    few = sorted(rows, key=lambda row: row[2])[:10] if len(rows) > 20 else rows
-    cells = [[row[0], f"{row[1]:,}", f"{row[2]:,}", f"{row[3]:,}", f"{100 * row[4]:.0f} %"] for row in few]
-    table(["image", "matched ", "static ", "moving ", "spread "], cells)
-    if len(few) < len(rows):
-        say(f"{len(rows) - len(few)} images with more static points: see the report")
-    for note in report.remarks:
-        say(f"note: {note}")
-    if found.ok:
-        say(f"database: {report.written}")
-        say(f"masks: {report.masks}")

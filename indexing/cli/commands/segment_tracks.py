@@ -14,14 +14,13 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import worded
-from indexing.cli.console import check_report, count, ended, flag_words, progress, say, table, tell
+from indexing.cli.console import check_report, count, ended, flag_words, progress, show
 from indexing.cli.scenes import Asked, as_tracks, follow_whole, inputs_of, is_video, photographs, source_of
 from indexing.files import manifest
 from indexing.readers.pairs import MatchedPair, Photograph
 from indexing.readers.tracks import TrackSet, read_tracks
-from indexing.report.bodies import FILM, WRITTEN, BodiesReport, rows_of, write_bodies
-from indexing.report.bodies_picture import PANELS
-from indexing.report.labelled import colour_of
+from indexing.report.bodies import FILM, PANELS, WRITTEN, BodiesReport, summarize, write_bodies
+from indexing.report.body_labels import colour_of
 from indexing.video.overlay import Overlay, write_overlay
 from indexing.video.scene import SceneTracks, evenly_spaced
 from indexing.video.sequence import PictureSequence, chunks
@@ -124,7 +123,7 @@ def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str
             if pictures is not None and report.bodies:
                 report = pictures.filmed(report)
             page = write_bodies(folder, report)
-    show(report)
+    show(summarize(report))
     return ended(page, None if report.status == "OK" else report.reason)
 
 
@@ -273,19 +272,3 @@ def _captions(tracks: TrackSet) -> list[str]:
 def _rgb(colour: tuple[float, float, float]) -> tuple[int, int, int]:
     red, green, blue = (round(255 * part) for part in colour)
     return red, green, blue
-
-
-def show(report: BodiesReport) -> None:
-    """Print the result."""
-    number = max(1, int(report.present.sum()))
-    rows: list[list[object]] = []
-    for label, (tracks, _, lives, moved, noise, _, geometry) in enumerate(rows_of(report), start=1):
-        still = " (static)" * (label == report.static)
-        part = f"{100 * report.counts[f'body {label}'] / number:.1f} %"
-        rows.append([f"body {label}{still}", tracks, part, lives, moved, noise, geometry])
-    rest = "outliers" if report.bodies else "unlabelled"
-    rows.append([rest, f"{report.counts['outlier']:,}", f"{100 * report.counts['outlier'] / number:.1f} %", "", "", "", ""])
-    table(["body", "tracks ", "share ", "frames", "px per frame ", "noise rms px ", "geometry"], rows)
-    if report.misclassified is not None:
-        say(f"misclassified: {100 * report.misclassified:.2f} % against the labels of the file")
-    tell(report)

@@ -11,13 +11,13 @@ from typing import Any
 
 import dyntorch
 from dyntorch.numerics import Message, worded
-from indexing.cli.console import SHOWN, check_report, count, ended, flag_words, names, progress, say, table
+from indexing.cli.console import check_report, count, ended, flag_words, names, progress, say, show
 from indexing.cli.flags.cameras import Sync
 from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import refuse_range
 from indexing.cli.videos import find_keypoints, wants_keypoints
 from indexing.files import manifest, prepare
-from indexing.report.sync import FILES, UNKNOWN, SyncReport, drop_checks, names_of, ppm, write_checks, write_sync
+from indexing.report.sync import FILES, SyncReport, drop_checks, names_of, summarize, write_checks, write_sync
 from indexing.sync.breaks import find_breaks
 from indexing.sync.calibration import named_lenses
 from indexing.sync.files import (
@@ -98,7 +98,7 @@ def _one(flags: Sync, found: dict[str, Path], trial: Trial | None) -> int:
     if folder is not None:
         made = manifest({"command": "sync", **dataclasses.asdict(flags)}, inputs, None, timings)
         report, page = _write(flags, folder, dataclasses.replace(report, manifest=made), films, trial is not None)
-    show(report, folder)
+    show(summarize(report, folder))
     return ended(page, None if report.ok else report.reason)
 
 
@@ -327,85 +327,3 @@ def _shifted(one: Plan) -> dict[str, Any]:
         "folder": f"pose-sync/{folder_of(one.take)}", "files": len(one.numbers), "shift": one.shift, "rest": one.rest,
         "repeated": one.repeated, "left_out": one.before,
     }  # fmt: skip
-
-
-def show(report: SyncReport, folder: Path | None = None) -> None:
-    """Print the result."""
-    _show_pairs(report)
-    if len(report.clocks) > 2:
-        _show_clocks(report)
-    elif report.ok:
-        first, other = report.clocks
-        began = float(other.inverse(other.start)) - first.start
-        factor = "" if other.rate == 1 else f" * {other.rate:.6f}"
-        when = f"{abs(began):.4f} s {'after' if began >= 0 else 'before'}"
-        sign = "-" if other.offset < 0 else "+"
-        clock = f"time of {other.name} = time of {first.name}{factor} {sign} {abs(other.offset):.4f} s"
-        say(f"{other.name} began {when} {first.name}: {clock}")
-    for pair in report.pairs:
-        if pair.wrong and pair.shift.ok:
-            say(f"inconsistent joints of {pair.a.name} and {pair.b.name}: {', '.join(pair.wrong)}")
-    open_pairs = [pair for pair in report.pairs if not pair.shift.ok] if len(report.pairs) > 1 else []
-    for pair in open_pairs[:SHOWN]:
-        say(f"{pair.a.name} and {pair.b.name} refused: {pair.reason}")
-    if len(open_pairs) > SHOWN:
-        say(f"and {len(open_pairs) - SHOWN} more pairs refused")
-    for note in report.notes:
-        say(f"note: {note}")
-    _show_written(report, folder)
-
-
-def _show_written(report: SyncReport, folder: Path | None) -> None:
-    for clock in (clock for clock in report.clocks if clock.take.spatial and clock.shifted is not None):
-        assert clock.shifted is not None
-        where = Path(clock.shifted["folder"]) if folder is None else folder / clock.shifted["folder"]
-        say(f"motion capture: {where}, on the clock of {report.reference.name}, within {1000 * clock.shifted['rest']:.1f} ms")
-    moved = [clock for clock in report.clocks if clock.shifted is not None and not clock.take.spatial]
-    if moved:
-        rest = 1000 * max(clock.shifted["rest"] for clock in moved if clock.shifted is not None)
-        written = ", ".join(clock.name for clock in moved)
-        where = Path("pose-sync") if folder is None else folder / "pose-sync"
-        say(f"shifted files: {where}/ ({written}), within {rest:.1f} ms of {report.reference.name}")
-    if report.videos:
-        rest = 1000 * max(one["rest"] for one in report.videos["cameras"].values())
-        where = Path(report.videos["folder"]) if folder is None else folder / report.videos["folder"]
-        said = f"{count(len(report.videos['cameras']), 'video')} of {count(report.videos['frames'], 'frame')}"
-        most = f"{rest:.1f} ms of {report.reference.name}{'' if report.mended is None else ' where frames were lost'}"
-        say(f"videos: {where}/, {said}, {report.videos['fps']:.6g} per second, within {most}")
-
-
-def _show_pairs(report: SyncReport) -> None:
-
-    rows: list[list[object]] = []
-    for pair in report.pairs:
-        shift, rival = pair.shift, pair.runner_up
-        numbers = [
-            f"{pair.apart:+.4f}" if len(shift.peaks) else "none",
-            f"{shift.sigma:.4f}" if shift.sigma < UNKNOWN else "unknown",
-            f"{pair.apart * shift.fps[1]:+.2f}" if len(shift.peaks) else "none",
-            ppm(shift.rate, shift.rate_sigma),
-            f"{shift.confidence:.3f}",
-        ]
-        rows.append(
-            [f"{pair.a.name} → {pair.b.name}", *numbers, f"{rival[0]:+.3f}" if rival else "none", "ok" if shift.ok else "refused"]
-        )
-    where = "offset s (mid) " if any(pair.shift.rate != 1 for pair in report.pairs) else "offset s "
-    table(["pair", where, "± s ", "frames ", "rate ppm ", "confidence ", "next peak s ", "status"], rows)
-
-
-def _show_clocks(report: SyncReport) -> None:
-
-    rows = [
-        [
-            clock.name,
-            f"{clock.offset:+.4f}",
-            f"{clock.sigma:.4f}" if clock.sigma < UNKNOWN else "unknown",
-            f"{clock.offset * clock.take.fps:+.2f}",
-            ppm(clock.rate),
-        ]
-        for clock in report.clocks
-    ]
-    table([f"clock against {report.reference.name}", "offset s ", "± s ", "frames ", "rate ppm "], rows)
-    if report.cycle is not None and math.isfinite(report.cycle):
-        out = f"; {report.outlier[0]} - {report.outlier[1]} contradicts the others" if report.outlier else ""
-        say(f"cycle error: {1000 * report.cycle:.2f} ms{out}")

@@ -16,8 +16,7 @@ from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.tasks.segment.result import TrackSegmentation
 from indexing.readers.pairs import Photograph
 from indexing.readers.tracks import TrackSet
-from indexing.report.bodies import BodiesReport, as_json, describe, labels_csv, rows_of, tracks_csv, write_bodies
-from indexing.report.bodies_picture import picture_of
+from indexing.report.bodies import BodiesReport, as_json, describe, labels_csv, picture_of, rows_of, tracks_csv, write_bodies
 
 SCRIPT = "<script>alert(1)</script>"
 FRAMES = 6

@@ -9,7 +9,7 @@ import torch
 from indexing import ActionIndexer, Clip
 from indexing.action.bank import Windows
 from indexing.action.learning import halves, importance
-from indexing.report.learned import BodyParts, body_parts, in_body, measure_body_parts, telling_joints
+from indexing.report.training import BodyParts, body_parts, in_body, measure_body_parts, telling_joints
 from indexing.skeleton import COCO17
 
 JOINTS, TELLING = 6, 2

@@ -194,10 +194,10 @@ def test_page_parts_escape_and_nest():
     report = {"title": "<t>", "notes": notes, "manifest": {"a": {"b": [1, 2]}, "time": "<f>"}}
     values = {"cards": [("<n>", "1", "<i>\x00")], "joints": [["<j>", "A & B"]]}
     drawn = {"picture": page.Picture(PNG, tips=[page.Tip(0, 0, 1, 1, "<u>")]), "weighing": [], "examples": []}
-    text = page.render("learned", report, summary="<s>", **values, **drawn)
+    text = page.render("training", report, summary="<s>", **values, **drawn)
     assert Page(text).bad == [] and "A &amp; B" in text and "<code>a.b</code>" in text and "<code>1 2</code>" in text
     assert not re.search(r"<(n|i|s|k|m|q|j|u|f|t)>", text) and "\x00" not in text
-    long = page.render("learned", {**report, "manifest": {str(i): i for i in range(205)}}, summary="", **values, **drawn)
+    long = page.render("training", {**report, "manifest": {str(i): i for i in range(205)}}, summary="", **values, **drawn)
     assert "5 more lines" in long and "<code>199</code>" in long and "<code>200</code>" not in long
     assert 'width="100.0"' in page.bar(1.7) and 'width="0.0"' in page.bar(-1)
 

@@ -15,8 +15,15 @@ from dyntorch import Status
 from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction
 from indexing.readers.tracks import TrackSet
-from indexing.report.reconstruction import ReconstructionReport, as_json, points_csv, write_reconstruction
-from indexing.report.reconstruction_picture import around, as_first_camera, nearest_frame, sample
+from indexing.report.canvas import around, sample
+from indexing.report.reconstruction import (
+    ReconstructionReport,
+    as_first_camera,
+    as_json,
+    nearest_frame,
+    points_csv,
+    write_reconstruction,
+)
 
 SCRIPT = "<script>alert(1)</script>"
 

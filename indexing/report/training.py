@@ -217,7 +217,7 @@ PICTURE = "body_parts.png"
 NOBODY = "Nobody could be left out (the clips have no field 'subject', or it is one person): the usual weights stand."
 
 
-def write_learned(
+def write_training(
     folder: str | Path, indexer: ActionIndexer, clips: Sequence[Clip], notes: Sequence[str], manifest: Mapping[str, Any]
 ) -> Path:
     """Write a report into a folder: ``report.html``, ``body_parts.png``, ``metrics.json`` and ``manifest.json``."""
@@ -228,7 +228,7 @@ def write_learned(
     report = {"title": f"{len(indexer.classes_)} actions learned", "notes": said, "manifest": manifest}
     values = {"joints": telling_joints(parts), "weighing": _weighing(indexer), "examples": _examples(clips)}
     summary = _summary(indexer, clips)
-    html = render("learned", report, summary=summary, cards=_headline(indexer, clips), picture=Picture(drawn), **values)
+    html = render("training", report, summary=summary, cards=_headline(indexer, clips), picture=Picture(drawn), **values)
     contents = {PICTURE: drawn, "metrics.json": _metrics(indexer, parts), files.MANIFEST: {**manifest, "files": names}}
     return write_files(folder, {**contents, "report.html": html})
 

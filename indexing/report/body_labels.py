@@ -100,6 +100,12 @@ class LabelledReport(ResultReport):
         return float(metrics.misclassification(self.result.labels[present], known[present]))
 
     @property
+    def errors(self) -> list[str]:
+        """How many labels are wrong, in a sentence, where the file has labels."""
+        wrong = self.misclassified
+        return [] if wrong is None else [f"misclassified: {100 * wrong:.2f} % against the labels of the file"]
+
+    @property
     def compared(self) -> list[list[str]]:
         """A row for every body that the file knows: its name, and how many of its points were found to be of which body."""
         if self.known is None or not self.bodies:
