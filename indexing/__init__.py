@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer as ActionIndexer
     from indexing.action.stream import ActionOptions as ActionOptions
     from indexing.archive.archive import Archive as Archive
-    from indexing.archive.options import ArchiveOptions as ArchiveOptions
     from indexing.archive.results import Hit as Hit
+    from indexing.archive.writer import ArchiveOptions as ArchiveOptions
     from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
     from indexing.brightness.sight import BrightnessOptions as BrightnessOptions
     from indexing.clip import Clip as Clip
@@ -45,7 +45,7 @@ _HOME = {
     "synchronize": "indexing.sync.synchronize",
     # the numbers that decide in a verb
     "ActionOptions": "indexing.action.stream",
-    "ArchiveOptions": "indexing.archive.options",
+    "ArchiveOptions": "indexing.archive.writer",
     "BrightnessOptions": "indexing.brightness.sight",
     "PhaseOptions": "indexing.phase.model",
     "SyncOptions": "indexing.sync.options",

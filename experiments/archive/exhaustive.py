@@ -19,7 +19,8 @@ from experiments.recognition.baselines import WarpedNearest
 from experiments.recognition.protocol import Array
 from indexing import Archive, Clip
 from indexing.action.bank import Bank, Copy, JointMetric, Windows, between, channel, fused_residuals, fusion, planes_of
-from indexing.archive.options import SearchOptions
+from indexing.archive import search
+from indexing.archive.layout import WINDOW_LENGTH
 from indexing.archive.results import Hit
 from indexing.windows import ragged, sample
 
@@ -39,17 +40,17 @@ class Measure:
 def metric_of(archive: Archive) -> JointMetric:
     """How much joints count in the exact comparison of an archive of one joint layout."""
     (layout,) = archive._opened().contents.layouts.values()
-    return layout.joint_metric(archive.options.search)
+    return layout.joint_metric()
 
 
-def exact(metric: JointMetric, options: SearchOptions) -> Measure:
+def exact(metric: JointMetric) -> Measure:
     """Minus the fused epipolar residual of clip, frame and motion."""
     planes = planes_of(metric)
 
     def compare(queries: Windows, windows: Windows) -> Tensor:
         return -fused_residuals(queries, [Bank([Copy(windows)], planes)], [fusion(("epi",))])[0]
 
-    return Measure(options.length, compare)
+    return Measure(WINDOW_LENGTH, compare)
 
 
 def cosine(heights: bool, length: int = 12) -> Measure:
@@ -133,14 +134,12 @@ def rankings(
     clips: Sequence[Clip],
     duration: float,
     measures: Mapping[str, Measure],
-    options: SearchOptions,
     tempos: Sequence[float] | None = None,
     step: float = STEP,
 ) -> dict[str, list[Ranking]]:
     """For every measure the best KEPT windows of every query, all of one duration.
 
     Args:
-        options: how near to a better window none is kept.
         tempos: durations of the windows, in those of the query; by default those that the archive tries.
         step: seconds between their starts.
     """
@@ -150,11 +149,11 @@ def rankings(
     found = {name: [nothing] * len(queries) for name in measures}
     for at in range(0, len(clips), PART):
         part = clips[at : at + PART]
-        for tempo in options.tempos if tempos is None else tempos:
+        for tempo in search.TEMPOS if tempos is None else tempos:
             owner, start = cut(part, tempo * duration, step)
             if not len(owner):
                 continue
-            apart = round(options.apart * tempo * duration / step)
+            apart = round(search.MIN_SEPARATION * tempo * duration / step)
             windows = {length: windows_at(part, owner, start, tempo * duration, length) for length in lengths}
             for name, one in measures.items():
                 scores = peaks(one.compare(queried[one.length], windows[one.length]), owner, apart).numpy()
@@ -201,6 +200,8 @@ def merged(ranking: Ranking, count: int, share: float) -> Iterator[tuple[int, fl
         left[best] = False
 
 
-def hits(ranking: Ranking, clips: Sequence[Clip], count: int, share: float) -> list[Hit]:
+def hits(ranking: Ranking, clips: Sequence[Clip], count: int) -> list[Hit]:
     """The same as an archive answers."""
-    return [Hit(clips[owner].name, "", start, end, score) for owner, start, end, score in merged(ranking, count, share)]
+    return [
+        Hit(clips[owner].name, "", start, end, score) for owner, start, end, score in merged(ranking, count, search.MAX_OVERLAP)
+    ]

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
+from unittest import mock
 
 import numpy as np
 import tyro
@@ -31,7 +32,8 @@ from experiments.recognition import protocol
 from experiments.recognition.detection import SETS, Recording, Task, actor_tasks, exercise_tasks, joined_tasks
 from experiments.recognition.detection_metrics import f1
 from indexing import ActionIndexer, Archive
-from indexing.archive.finding import marked_rows, probes_of
+from indexing.archive import actions
+from indexing.archive.actions import marked_rows, probes_of
 from indexing.scoring import Event
 
 COLUMNS = ("F1 recordings", "F1 all looked at", "F1 archive", "skipped", "kept")
@@ -119,8 +121,9 @@ def ask(indexer: ActionIndexer, recordings: Sequence[Recording], tally: Tally) -
         archive = Archive(Path(folder) / "archive")
         clips = [one.clip.replace(name=f"recording {i}") for i, one in enumerate(recordings)]
         archive.add(clips)
-        everything = dataclasses.replace(archive.options, find=dataclasses.replace(archive.options.find, least=-1.0, quiet=0.0))
-        whole, sketched = Archive(archive.path, everything).find(indexer), archive.find(indexer)
+        with mock.patch.multiple(actions, MIN_CORRELATION=-1.0, MIN_MOTION_SHARE=0.0):
+            whole = archive.find(indexer)
+        sketched = archive.find(indexer)
         tally.rows.append(looked_at(archive, indexer))
     for one, clip in zip(recordings, clips, strict=True):
         tally.truth.append([event for event in one.truth if event.label in known])
@@ -131,12 +134,12 @@ def ask(indexer: ActionIndexer, recordings: Sequence[Recording], tally: Tally) -
 
 def looked_at(archive: Archive, indexer: ActionIndexer) -> tuple[int, int]:
     """Poses that the sketches leave, and all."""
-    snapshot, options = archive._opened(), archive.options.find
-    probes = probes_of(snapshot, indexer, options)
+    snapshot = archive._opened()
+    probes = probes_of(snapshot, indexer)
     looked = total = 0
     for row, segment in zip(snapshot.contents.segments, snapshot.segments, strict=True):
         for track in range(len(segment)):
-            mask = marked_rows(segment.only(track), probes[row.layout], options)
+            mask = marked_rows(segment.only(track), probes[row.layout])
             looked, total = looked + int(mask.sum()), total + len(mask)
     return looked, total
 

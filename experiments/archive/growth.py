@@ -171,7 +171,7 @@ def recorded(path: Path, hours: float, seed: int) -> Archive:
 
 def grow(original: Original, done: int, wanted: int, seed: int) -> int:
     """Copies until there are so many parts in all; how many there are then."""
-    each = max(1, ArchiveOptions().growth.windows // original.segment.windows)
+    each = max(1, ArchiveOptions().max_segment_windows // original.segment.windows)
     while done < wanted:
         numbers = range(done, min(done + each, wanted))
         original.write(numbers, np.random.default_rng([seed, 1, done]))
@@ -275,9 +275,9 @@ def asked(folder: Path, asking: Sequence[Sequence[Question]], cold: int, threads
 
 def unmap() -> None:
     """Let go of the files that this process has mapped."""
-    from indexing.archive import searching
+    from indexing.archive import search
 
-    searching._opened.cache_clear()
+    search._opened.cache_clear()
     gc.collect()
 
 

@@ -38,11 +38,10 @@ from experiments.common.book import Book
 from experiments.common.tables import Row, command, note
 from indexing import Archive, ArchiveOptions, Clip, ClipSet
 from indexing.archive.catalogue import Catalogue
-from indexing.archive.options import GrowthOptions
 from indexing.archive.results import Hit
 from indexing.archive.workers import QuietProcesses
 
-OPTIONS = ArchiveOptions(growth=GrowthOptions(seconds=0.0, small=3))  # commits after every source, and puts four segments together
+OPTIONS = ArchiveOptions(commit_seconds=0.0, max_small_segments=3)  # commits after every source, and puts four segments together
 PATIENCE = 120.0  # seconds for a process that is not killed
 TRIES = 4  # for each adder to be signalled before it has ended
 PAGE = 4096  # bytes of a disk that are written at once

@@ -24,6 +24,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+from unittest import mock
 
 import numpy as np
 import tyro
@@ -46,9 +47,9 @@ from experiments.common.tables import Row, command, note
 from experiments.recognition.corruptions import missing_bursts
 from experiments.recognition.protocol import data_folder
 from indexing import Archive, Clip, ClipSet
-from indexing.archive.queries import checked, queries_of
+from indexing.archive import search
 from indexing.archive.results import Hit
-from indexing.archive.searching import candidates, distinct, merged
+from indexing.archive.search import candidates, check_example, merge_candidates, queries_of, suppress_overlaps
 
 AT = (1, 10)
 STEP = 0.1  # seconds between the windows that are counted, and compared exhaustively
@@ -104,35 +105,34 @@ def searched(archive: Archive, asked: Sequence[Question], mirror: bool = False) 
 
 def sketched(archive: Archive, asked: Sequence[Question]) -> list[float]:
     """Places by the archive's sketches: the stages of a search before the exact comparison, neighbours merged."""
-    snapshot, options = archive._opened(), archive.options.search
+    snapshot = archive._opened()
     places = []
     for one in asked:
-        queries = queries_of(checked(one.clip, snapshot.contents.options.shortest, options), snapshot.contents, options)
-        found = candidates(snapshot.tasks(queries, options.settled), None, None)
-        pool = distinct(snapshot, merged(snapshot, queries, found, options), options)
+        queries = queries_of(check_example(one.clip, snapshot.contents.storage.min_duration), snapshot.contents)
+        found = candidates(snapshot.tasks(queries, search.MAX_SCANNED_WINDOWS), None, None)
+        pool = suppress_overlaps(snapshot, merge_candidates(snapshot, queries, found, archive.options.num_candidates))
         places.append(place(archive._hits(snapshot, pool), one))
     return places
 
 
 def compared(archive: Archive, clips: Sequence[Clip], asked: Sequence[Question], ways: Sequence[str]) -> dict[str, list[float]]:
     """Places where everything is compared with everything; all queries are of one duration."""
-    options, duration = archive.options.search, asked[0].clip.duration
-    residual = exact(metric_of(archive), options)
+    duration = asked[0].clip.duration
+    residual = exact(metric_of(archive))
     measures = {EXHAUSTIVE: residual, PLAIN: cosine(heights=False), HEIGHTS: cosine(heights=True)}
     queries = [one.clip for one in asked]
-    found = rankings(queries, clips, duration, {name: measures[name] for name in ways if name in measures}, options, (1.0,), STEP)
+    found = rankings(queries, clips, duration, {name: measures[name] for name in ways if name in measures}, (1.0,), STEP)
     if WIDE in ways:
-        found |= rankings(queries, clips, duration, {WIDE: residual}, options, step=STEP)
+        found |= rankings(queries, clips, duration, {WIDE: residual}, step=STEP)
     return {
-        name: [place(hits(one, clips, max(AT), options.merged), question) for one, question in zip(each, asked, strict=True)]
+        name: [place(hits(one, clips, max(AT)), question) for one, question in zip(each, asked, strict=True)]
         for name, each in found.items()
     }
 
 
-def again(archive: Archive, **changes: Any) -> Archive:
-    """The same archive, searched with other options."""
-    search = dataclasses.replace(archive.options.search, **changes)
-    return Archive(archive.path, options=dataclasses.replace(archive.options, search=search))
+def bounded(archive: Archive, count: int) -> Archive:
+    """The same archive, of which so many candidates are compared exactly."""
+    return Archive(archive.path, dataclasses.replace(archive.options, num_candidates=count))
 
 
 # ---- tables ------------------------------------------------------------------------------------------------------------
@@ -180,14 +180,17 @@ def by_difficulty(archive: Archive, clips: Sequence[Clip], people: Takes, config
         lines[title] = [share for places in found for share in recall(places)]
     columns = [f"{name} @{k}" for name in (ARCHIVE, SKETCHES, EXHAUSTIVE, HEIGHTS) for k in AT]
     book.grid(f"moments of {config.asked:g} s, asked in other ways", columns, lines)
-    changed = {f"{count} candidates": again(archive, candidates=count) for count in config.candidates}
-    changed |= {"nothing refined": again(archive, shifts=(0.0,), stretches=(1.0,))}
-    changed |= {"the query's tempo only": again(archive, tempos=(1.0,))}
+    changed: dict[str, tuple[Archive, dict[str, Any]]] = {
+        f"{count} candidates": (bounded(archive, count), {}) for count in config.candidates
+    }
+    changed |= {"nothing refined": (archive, {"SHIFTS": (0.0,), "STRETCHES": (1.0,)})}
+    changed |= {"the query's tempo only": (archive, {"TEMPOS": (1.0,)})}
     options = {}
-    for title, other in changed.items():
+    for title, (other, constants) in changed.items():
         note(f"... {title}")
         clock = time.perf_counter()
-        places = searched(other, usual)
+        with mock.patch.multiple(search, **constants):
+            places = searched(other, usual)
         options[title] = [*recall(places), (time.perf_counter() - clock) / len(usual)]
     places = searched(archive, usual, mirror=True)
     options["mirror images, too"] = [*recall(places), np.nan]

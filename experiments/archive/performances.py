@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
+from unittest import mock
 
 import numpy as np
 import tyro
@@ -33,8 +34,8 @@ from experiments.common.tables import Row, command, note
 from experiments.recognition import protocol
 from experiments.recognition.baselines import WarpedNearest
 from experiments.recognition.protocol import Array
-from indexing import Archive, Clip, ClipSet
-from indexing.archive.options import ArchiveOptions
+from indexing import Archive, ArchiveOptions, Clip, ClipSet
+from indexing.archive import search
 from indexing.archive.results import Hit
 
 SETS = Literal["utkinect", "florence3d", "exercises"]
@@ -47,15 +48,15 @@ WITHIN = 0.01  # of exhaustive
 ARCHIVE, EXHAUSTIVE, WARPED, CLIPS = "archive", "exhaustive", "DTW, windows", "DTW, clips"
 # what a search is with one thing changed
 CHANGED: dict[str, dict[str, Any]] = {
-    "archive, the query's tempo only": {"tempos": (1.0,)},
-    "archive, five tempi": {"tempos": (0.64, 0.8, 1.0, 1.25, 1.56)},
-    "archive, scanned in 16 steps": {"samples": 16},
-    "archive, settled in 4 steps": {"fine": 4},
-    "archive, candidates farther apart": {"apart": 0.35},
-    "archive, nothing refined": {"shifts": (0.0,), "stretches": (1.0,)},
-    "archive, 30 candidates": {"candidates": 30},
-    "archive, 100 candidates": {"candidates": 100},
-    "archive, 300 candidates": {"candidates": 300},
+    "archive, the query's tempo only": {"TEMPOS": (1.0,)},
+    "archive, five tempi": {"TEMPOS": (0.64, 0.8, 1.0, 1.25, 1.56)},
+    "archive, scanned in 16 steps": {"NUM_SAMPLES": 16},
+    "archive, refined in 4 steps": {"NUM_FINE_SAMPLES": 4},
+    "archive, candidates farther apart": {"MIN_SEPARATION": 0.35},
+    "archive, nothing refined": {"SHIFTS": (0.0,), "STRETCHES": (1.0,)},
+    "archive, 30 candidates": {"num_candidates": 30},
+    "archive, 100 candidates": {"num_candidates": 100},
+    "archive, 300 candidates": {"num_candidates": 300},
 }
 
 
@@ -121,7 +122,7 @@ class Config:
 # ---- who asks whom -----------------------------------------------------------------------------------------------------
 def clip_tasks(name: str, longest: float, seed: int) -> Iterator[Task]:
     """One per person: the clips of the others, asked by this person's."""
-    clips, shortest = protocol.load_set(name), ArchiveOptions().storage.shortest
+    clips, shortest = protocol.load_set(name), ArchiveOptions().min_duration
     seen = protocol.render(clips, seed, TURNS)
     known = [
         Known(clip, (Stretch(label, -np.inf, np.inf),)) for clip, label in zip(seen.exemplars, seen.labels.tolist(), strict=True)
@@ -206,13 +207,14 @@ def average_precision(right: Sequence[bool], total: int) -> float:
 
 # ---- ways to ask -------------------------------------------------------------------------------------------------------
 def searching(changes: dict[str, Any], mirror: bool = False) -> Way:
-    """By the archive, with other options."""
+    """By the archive, with other options and constants of its search."""
 
     def ask(task: Task, archive: Archive, turn: int) -> list[Answer]:
-        search = dataclasses.replace(archive.options.search, **changes)
-        other = Archive(archive.path, options=dataclasses.replace(archive.options, search=search))
         views = [query.views[turn] for query in task.queries]
-        return [(other.search(view, FEW, mirror=mirror), other.search(view, MANY, mirror=mirror)) for view in views]
+        options = {name: value for name, value in changes.items() if name.islower()}
+        other = Archive(archive.path, dataclasses.replace(archive.options, **options))
+        with mock.patch.multiple(search, **{name: value for name, value in changes.items() if name not in options}):
+            return [(other.search(view, FEW, mirror=mirror), other.search(view, MANY, mirror=mirror)) for view in views]
 
     return ask
 
@@ -221,12 +223,12 @@ def comparing(make: Callable[[Archive], Measure], step: float) -> Way:
     """With all windows, of the durations that the archive tries."""
 
     def ask(task: Task, archive: Archive, turn: int) -> list[Answer]:
-        options, measure, answers = archive.options.search, {"": make(archive)}, []
+        measure, answers = {"": make(archive)}, []
         clips = [one.clip for one in task.archived]
         for query in task.queries:
             asked = query.views[turn]
-            (found,) = rankings([asked], clips, asked.duration, measure, options, step=step)[""]
-            best = hits(found, clips, MANY, options.merged)
+            (found,) = rankings([asked], clips, asked.duration, measure, step=step)[""]
+            best = hits(found, clips, MANY)
             answers.append((best[:FEW], best))
         return answers
 
@@ -235,7 +237,7 @@ def comparing(make: Callable[[Archive], Measure], step: float) -> Way:
 
 def by_exact(archive: Archive) -> Measure:
     """The residual of the archive's last stage."""
-    return exact(metric_of(archive), archive.options.search)
+    return exact(metric_of(archive))
 
 
 def whole_clips(task: Task, archive: Archive, turn: int) -> list[Answer]:

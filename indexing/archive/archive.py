@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from indexing.archive import adding
+from indexing.archive import writer
 from indexing.archive.catalogue import Catalogue, drop_recordings, storable
-from indexing.archive.options import ArchiveOptions
-from indexing.archive.queries import checked, queries_of
 from indexing.archive.results import Addition, ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit, Verification
-from indexing.archive.searching import Shortlist, Snapshot, search
+from indexing.archive.search import Shortlist, Snapshot, check_example, queries_of, search
 from indexing.archive.segments import ArchiveSegment
 from indexing.archive.sources import Taken, gather, keeping, poses_of
-from indexing.archive.verifying import verify
+from indexing.archive.writer import MAX_ATTEMPTS, ArchiveOptions, verify
 from indexing.clip import Clip
 
 if TYPE_CHECKING:
@@ -36,7 +34,7 @@ class Archive:
 
     Args:
         path: a folder; made by the first :meth:`add`.
-        options: every number that decides; how movement is stored holds for a new archive, an old one says it itself.
+        options: how it stores, grows and searches; None: the defaults.
 
     Raises:
         ValueError: the folder is there and no archive, or one of a newer version.
@@ -58,8 +56,8 @@ class Archive:
         True
     """
 
-    def __init__(self, path: str | os.PathLike[str], options: ArchiveOptions = ArchiveOptions()) -> None:
-        self.path, self.options = Path(path).expanduser(), options
+    def __init__(self, path: str | os.PathLike[str], options: ArchiveOptions | None = None) -> None:
+        self.path, self.options = Path(path).expanduser(), options or ArchiveOptions()
         self._snapshot: Snapshot | None = None
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path}: is a file; an archive is a folder")
@@ -100,9 +98,9 @@ class Archive:
         Raises:
             ValueError: another process adds, or the archive cannot be written.
         """
-        found = keeping(gather(sources), self.path)
+        listed = keeping(gather(sources), self.path)
         catalogue = Catalogue.make(self.path, self.options.storage)
-        return adding.add(catalogue, found, self.options, executor, dict(reading or {}), progress)
+        return writer.add(catalogue, listed, self.options, executor, dict(reading or {}), progress)
 
     def remove(self, source: str | os.PathLike[str]) -> int:
         """Take a source out: a file by its path or name, a clip by its name.  How many recordings it had.
@@ -121,7 +119,7 @@ class Archive:
                 for row in mine:
                     count += drop_recordings(connection, row.id)
                     connection.execute("DELETE FROM sources WHERE id = ?", (row.id,))
-            adding.tidy(catalogue, self.options)
+            writer.tidy(catalogue, self.options)
             for row in mine:
                 shutil.rmtree(poses_of(self.path, row.key), ignore_errors=True)
         return count
@@ -213,9 +211,9 @@ class Archive:
         snapshot = self._opened()
         if not snapshot.contents.windows:
             raise ValueError(f"{self.path}: holds no movement yet; add recordings first")
-        asked = checked(clip, snapshot.contents.options.shortest, self.options.search)
-        queries = queries_of(asked, snapshot.contents, self.options.search, mirror)
-        return self._hits(snapshot, search(snapshot, queries, k, self.options.search, executor, progress))
+        example = check_example(clip, snapshot.contents.storage.min_duration)
+        queries = queries_of(example, snapshot.contents, mirror)
+        return self._hits(snapshot, search(snapshot, queries, k, self.options.num_candidates, executor, progress))
 
     def _hits(self, snapshot: Snapshot, found: Shortlist) -> list[Hit]:
         where = [
@@ -243,9 +241,9 @@ class Archive:
         Raises:
             ValueError: the model has too few joints in common with what is in the archive.
         """
-        from indexing.archive.finding import find
+        from indexing.archive.actions import find
 
-        return self._again(lambda: find(self._opened(), self._catalogue(), model, self.options.find, executor, progress))
+        return self._again(lambda: find(self._opened(), self._catalogue(), model, executor, progress))
 
     def verify(self) -> Verification:
         """Whether every window of the catalogue is there, whole, and once; reads everything."""
@@ -262,7 +260,7 @@ class Archive:
 
     def _again(self, question: Callable[[], T]) -> T:
         """The answer to a question; asked again where segments were put together meanwhile."""
-        for _ in range(self.options.search.attempts - 1):
+        for _ in range(MAX_ATTEMPTS - 1):
             with contextlib.suppress(FileNotFoundError):
                 return question()
             self._snapshot = None

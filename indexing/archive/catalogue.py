@@ -7,7 +7,6 @@ missed.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import random
 import sqlite3
@@ -18,10 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from indexing.archive.layout import Layout, layout_key
-from indexing.archive.options import GrowthOptions, StorageOptions
+from indexing.archive.tracks import StorageFormat
 from indexing.skeleton import Skeleton
 
 VERSION = 1
+LOCK_SECONDS = 30.0  # that a reader waits for a commit
+STORED = {"rate": "rate", "dimensions": "dimensions", "shortest": "min_duration", "views": "views"}  # key in the file -> field
 CATALOGUE, LOCK, SEGMENTS = "catalogue.sqlite", "writer.lock", "segments"
 SCHEMA = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -89,7 +90,7 @@ class Contents:
     """What an archive held at one moment: everything that a search needs of the catalogue."""
 
     generation: int
-    options: StorageOptions
+    storage: StorageFormat
     layouts: dict[int, Layout]
     segments: tuple[SegmentRow, ...]
     windows: int
@@ -119,7 +120,7 @@ class Catalogue:
         return self.folder / SEGMENTS
 
     @classmethod
-    def make(cls, folder: Path, options: StorageOptions) -> Catalogue:
+    def make(cls, folder: Path, storage: StorageFormat) -> Catalogue:
         """The catalogue of a folder, a new one where there is none."""
         path = folder / CATALOGUE
         try:
@@ -144,7 +145,7 @@ class Catalogue:
                         raise ValueError(
                             f"{path}: is empty, but segments are there; restore it from a copy, or give another folder"
                         )
-                    _create(connection, options)
+                    _create(connection, storage)
                 connection.execute("COMMIT")
         return cls(folder)
 
@@ -171,7 +172,7 @@ class Catalogue:
         if made is None:
             connection.close()
             connection = sqlite3.connect(":memory:", isolation_level=None)
-            _create(connection, StorageOptions())
+            _create(connection, StorageFormat())
         return connection
 
     @contextlib.contextmanager
@@ -218,9 +219,8 @@ class Catalogue:
             segments = tuple(SegmentRow(*row) for row in connection.execute("SELECT * FROM segments ORDER BY id"))
             windows = sum(row.windows - row.dead for row in segments)
             stored = json.loads(facts["storage"])
-            stored.pop("repair", None)  # of older archives
-            options = StorageOptions(**{**stored, "views": tuple(stored["views"])})
-            return Contents(int(facts["generation"]), options, layouts, segments, windows)
+            storage = StorageFormat(**{name: stored[key] for key, name in STORED.items()} | {"views": tuple(stored["views"])})
+            return Contents(int(facts["generation"]), storage, layouts, segments, windows)
         except (ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as problem:
             raise _senseless(self.folder, problem) from problem
 
@@ -312,12 +312,12 @@ def storable(text: str) -> str:
 
 def _connect(path: Path) -> sqlite3.Connection:
     """To a catalogue that is there: one that was deleted is not made anew."""
-    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=GrowthOptions.patience, isolation_level=None)
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=LOCK_SECONDS, isolation_level=None)
 
 
 def _write_ahead(connection: sqlite3.Connection) -> None:
     """Let others read while somebody writes.  SQLite does not wait for others to do the same to the same file."""
-    until = time.monotonic() + GrowthOptions.patience
+    until = time.monotonic() + LOCK_SECONDS
     while True:
         try:
             connection.execute("PRAGMA journal_mode=WAL")
@@ -328,11 +328,15 @@ def _write_ahead(connection: sqlite3.Connection) -> None:
             time.sleep(random.uniform(0.001, 0.02))
 
 
-def _create(connection: sqlite3.Connection, options: StorageOptions) -> None:
+def _create(connection: sqlite3.Connection, storage: StorageFormat) -> None:
     """The tables of a new catalogue."""
     for statement in SCHEMA.split(";"):
         connection.execute(statement)
-    facts = {"version": str(VERSION), "generation": "0", "storage": json.dumps(dataclasses.asdict(options))}
+    facts = {
+        "version": str(VERSION),
+        "generation": "0",
+        "storage": json.dumps({key: getattr(storage, name) for key, name in STORED.items()}),
+    }
     connection.executemany("INSERT INTO meta VALUES (?, ?)", list(facts.items()))
 
 

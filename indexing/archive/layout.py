@@ -19,12 +19,23 @@ from torch import Tensor
 
 from indexing.action.bank import JointMetric
 from indexing.action.symmetry import mirror_permutation
-from indexing.archive.options import SearchOptions, StorageOptions
-from indexing.archive.tracks import Track
+from indexing.archive.tracks import StorageFormat, Track
 from indexing.clip import Clip, FloatArray
 from indexing.joints import FEWEST, named, places
 from indexing.skeleton import Skeleton
 from indexing.windows import bridged, sample
+
+# evens out directions of codes: .25 gives .88 / .98 / .99 of right moments among 10 / 100 / 300, at 2 s .82 for .88
+CODE_WHITENING_POWER = 0.5
+CODE_FLOOR = 0.03  # added to the covariance of mean diagonal 1
+MIDDLE_VARIANCE = 10.0  # of where the middle of all joints is, in those of a joint, where some were not seen
+SIGHTING_VARIANCE = 1e-3  # in the same: nearly none, a code is to be that of the joints that were seen
+MAX_LEARNED_POSES = 20_000  # from which the directions of a layout are learned, and after which they stay: 22 minutes
+MAX_SAMPLED_WINDOWS = 3000  # from which the joint metric of a layout is learned
+# of the joint metric; right moment first, of 280,000 of 1 s and 2 s: .25 gives .81 / .93, .4 .83 / .95, .5 .79 / .95
+METRIC_POWER = 0.4
+METRIC_FLOOR = 0.05
+WINDOW_LENGTH = 12  # steps that windows are resampled to for the exact comparison
 
 EIGHT = 127  # largest whole number of 8 bits
 
@@ -47,12 +58,10 @@ class Layout:
         return self.skeleton.name if self.skeleton is not None else f"{self.joints} joints"
 
     @classmethod
-    def learn(
-        cls, tracks: Sequence[Track], skeleton: Skeleton | None, storage: StorageOptions, search: SearchOptions = SearchOptions()
-    ) -> Layout:
+    def learn(cls, tracks: Sequence[Track], skeleton: Skeleton | None, storage: StorageFormat) -> Layout:
         """From the tracks that came first."""
         joints = tracks[0].joints.shape[1]
-        step = max(1, sum(map(len, tracks)) // storage.learned)
+        step = max(1, sum(map(len, tracks)) // MAX_LEARNED_POSES)
         poses = np.concatenate([track.positions()[::step] for track in tracks])
         centred = _unit(poses)
         covariance = _grounded(np.einsum("tjd,tkd->jk", centred, centred, dtype=np.float64))
@@ -60,8 +69,8 @@ class Layout:
         values, vectors = values[::-1][: storage.dimensions].clip(min=0), vectors[:, ::-1][:, : storage.dimensions]
         # the sign of a direction is nobody's choice: the largest entry is positive, on every machine
         vectors = vectors * np.sign(vectors[np.abs(vectors).argmax(axis=0), np.arange(vectors.shape[1])])
-        basis = (vectors * (values + storage.floor) ** -storage.whitening).astype(np.float32)
-        windows, seen = _windows(tracks, storage, search)
+        basis = (vectors * (values + CODE_FLOOR) ** -CODE_WHITENING_POWER).astype(np.float32)
+        windows, seen = _windows(tracks, storage)
         mirrored = mirror_permutation(skeleton, windows, seen)
         swap = None if mirrored is None else mirrored.numpy()
         return cls(joints, skeleton, covariance, basis, _metric(windows, seen), sum(map(len, tracks)), swap)
@@ -86,8 +95,8 @@ class Layout:
         """``(seen, dimensions)``: from the joints seen to codes."""
         if seen.all():
             return self.basis
-        wide = self.covariance + StorageOptions.free
-        given = wide[np.ix_(seen, seen)] + StorageOptions.sure * np.eye(int(seen.sum()))
+        wide = self.covariance + MIDDLE_VARIANCE
+        given = wide[np.ix_(seen, seen)] + SIGHTING_VARIANCE * np.eye(int(seen.sum()))
         likely = np.linalg.solve(given, wide[seen])  # (seen, joints)
         likely = likely - likely.mean(axis=1, keepdims=True)
         return np.asarray((likely @ self.basis).astype(np.float32))
@@ -113,9 +122,9 @@ class Layout:
         joints[:, place < 0] = np.nan
         return clip.replace(joints=joints, confidence=None, skeleton=self.skeleton) if (joints == joints).any() else None
 
-    def joint_metric(self, options: SearchOptions) -> JointMetric:
+    def joint_metric(self) -> JointMetric:
         """For the exact comparison."""
-        return JointMetric(torch.from_numpy(self.metric), options.power, floor=options.floor)
+        return JointMetric(torch.from_numpy(self.metric), METRIC_POWER, floor=METRIC_FLOOR)
 
     # ---- as bytes ----------------------------------------------------------------------------------------------------
     def dump(self) -> bytes:
@@ -170,10 +179,10 @@ def _metric(windows: Tensor, seen: Tensor) -> NDArray[np.float64]:
     return np.stack([_grounded(one) for one in JointMetric.learn(windows, seen, 1.0).covariance.numpy()])
 
 
-def _windows(tracks: Sequence[Track], storage: StorageOptions, search: SearchOptions) -> tuple[Tensor, Tensor]:
+def _windows(tracks: Sequence[Track], storage: StorageFormat) -> tuple[Tensor, Tensor]:
     """``(N, length, joints, 2)`` windows of a second, evenly spread, and ``(N, joints)`` which joints were seen in each."""
     spans = [max(len(track) - round(storage.rate), 1) for track in tracks]
-    step = max(1.0, sum(spans) / search.sampled)
+    step = max(1.0, sum(spans) / MAX_SAMPLED_WINDOWS)
     windows: list[Tensor] = []
     seen: list[NDArray[np.bool_]] = []
     offset = 0.0
@@ -185,6 +194,6 @@ def _windows(tracks: Sequence[Track], storage: StorageOptions, search: SearchOpt
         times = np.arange(len(track)) / storage.rate
         begin = times[first.astype(np.intp)]
         source = bridged(track.positions(), times, np.array([0, len(track)]))
-        windows.append(sample(source, np.zeros(len(first), dtype=np.intp), begin, begin + 1.0, search.length))
+        windows.append(sample(source, np.zeros(len(first), dtype=np.intp), begin, begin + 1.0, WINDOW_LENGTH))
         seen.append(np.repeat(source.seen, len(first), axis=0))
     return torch.cat(windows), torch.from_numpy(np.concatenate(seen))

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import save
 
 from indexing.archive.layout import Layout
-from indexing.archive.options import StorageOptions
-from indexing.archive.tracks import Track, positions
+from indexing.archive.tracks import StorageFormat, Track, positions
 from indexing.files import replacing, sha256_of
 
 FORMAT, VERSION = "dyntorch.archive-segment", 1
@@ -46,7 +45,7 @@ class WrittenSegment:
     sha256: str
 
 
-def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, options: StorageOptions) -> WrittenSegment:
+def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, storage: StorageFormat) -> WrittenSegment:
     """Write tracks of one layout as a new file, on disk before this returns."""
     rows = np.cumsum([0, *map(len, tracks)])
     each = [layout.codes(track.positions()) for track in tracks]
@@ -65,7 +64,7 @@ def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, options
     about = {
         "format": FORMAT,
         "version": str(VERSION),
-        "rate": str(options.rate),
+        "rate": str(storage.rate),
         "skeleton": json.dumps(None if skeleton is None else [skeleton.name, skeleton.joints, skeleton.bones]),
     }
     name = f"{secrets.token_hex(8)}.safetensors"
@@ -74,7 +73,7 @@ def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, options
         stream.write(data)
         stream.flush()
         os.fsync(stream.fileno())
-    _settle(folder)
+    _sync_folder(folder)
     return WrittenSegment(name, len(data), hashlib.sha256(data).hexdigest())
 
 
@@ -86,7 +85,7 @@ def intact(path: Path, sha256: str) -> bool:
         return False
 
 
-def _settle(folder: Path) -> None:
+def _sync_folder(folder: Path) -> None:
     """The new name on disk, too, where the system can be asked for that."""
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)

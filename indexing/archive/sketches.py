@@ -142,7 +142,7 @@ def scan(
     return found.candidates(segment)
 
 
-def settled(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Probe], found: Candidates) -> Candidates:
+def refine_candidates(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Probe], found: Candidates) -> Candidates:
     """Candidates of a scan, at every tempo moved by less than a step of it to where they resemble the example best."""
     parts: list[Candidates] = []
     for number in np.unique(found.probe).tolist():

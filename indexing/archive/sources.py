@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from indexing.archive.catalogue import CATALOGUE, storable
-from indexing.archive.options import GrowthOptions, StorageOptions
-from indexing.archive.tracks import Track, total_windows, tracks_of
+from indexing.archive.tracks import StorageFormat, Track, total_windows, tracks_of
 from indexing.clip import Clip, LabelledSet
 from indexing.files import sha256_of
 from indexing.movement import clips_of, is_dataset
@@ -30,6 +29,7 @@ from indexing.readers.files import VIDEOS, WatchOptions, frame_number
 from indexing.remarks import remarks_on
 from indexing.skeleton import Skeleton
 
+MAX_FRAME_BYTES = 2**22  # of a JSON file that may be one frame of many
 POSES = "poses"  # the folder of an archive in which the keypoints of videos are kept
 KEYPOINT_FILES = (".json", ".npz", ".csv")  # suffixes that are looked into where a folder is given
 READING = {"person": "everyone"}  # how files are read where nothing else is said
@@ -210,7 +210,7 @@ def is_recording(folder: Path) -> bool:
 def _is_frame(path: Path) -> bool:
     """Whether a JSON file is one frame as OpenPose writes it."""
     try:
-        if path.stat().st_size > GrowthOptions.peeked:
+        if path.stat().st_size > MAX_FRAME_BYTES:
             return False
         data = parse_json(path, read_text(path), "")
     except (ValueError, OSError):
@@ -288,7 +288,7 @@ def _hash_of(clip: Clip) -> str:
 # ---- reading one, in a worker --------------------------------------------------------------------------------------------
 
 
-def read_source(source: ArchiveSource, reading: Mapping[str, Any], options: StorageOptions) -> ReadSource:
+def read_source(source: ArchiveSource, reading: Mapping[str, Any], storage: StorageFormat) -> ReadSource:
     """Movement of one source as it is stored; whatever is wrong with it becomes a reason, never an exception."""
     try:
         before = stamp(source)
@@ -296,10 +296,10 @@ def read_source(source: ArchiveSource, reading: Mapping[str, Any], options: Stor
         held = before.sha256 or content(source)
         if source.clip is None and stamp(source) != before:  # what was read may be half of it, under the hash of another half
             raise ValueError(f"{source.name}: was written to while it was read; add it again when it is finished")
-        found = [_recording(clip, name, person, options) for name, person, clip in people]
+        found = [_recording(clip, name, person, storage) for name, person, clip in people]
         kept = tuple(one for one in found if one.windows)
         if not kept:
-            note = f"nobody is in view for {options.shortest:g} s" if people else note
+            note = f"nobody is in view for {storage.min_duration:g} s" if people else note
         return ReadSource(Stamp(before.size, before.modified, held), kept, note)
     except Exception as problem:  # one file among thousands must not end an addition, whatever a reader does with it
         remedy = "; check the path and its permissions" * isinstance(problem, OSError)
@@ -354,12 +354,12 @@ def _keypoints(source: ArchiveSource, reading: Mapping[str, Any]) -> Path:
     return made.path
 
 
-def _recording(clip: Clip, name: str, person: str, options: StorageOptions) -> ReadRecording:
-    tracks = tuple(tracks_of(clip, options))
+def _recording(clip: Clip, name: str, person: str, storage: StorageFormat) -> ReadRecording:
+    tracks = tuple(tracks_of(clip, storage))
     first = [track for track in tracks if track.view == 0] or list(tracks)
-    seconds = sum((len(track) - 1) / options.rate for track in first)
+    seconds = sum((len(track) - 1) / storage.rate for track in first)
     begins = min((track.start for track in tracks), default=0.0)
-    ends = max((track.start + (len(track) - 1) / options.rate for track in tracks), default=0.0)
+    ends = max((track.start + (len(track) - 1) / storage.rate for track in tracks), default=0.0)
     return ReadRecording(
         storable(name),
         storable(person),
@@ -369,5 +369,5 @@ def _recording(clip: Clip, name: str, person: str, options: StorageOptions) -> R
         begins,
         ends,
         seconds,
-        total_windows(tracks, options),
+        total_windows(tracks, storage),
     )

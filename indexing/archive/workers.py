@@ -17,7 +17,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from indexing.archive.options import GrowthOptions
+MIN_TASKS_AHEAD = 32  # nobody says how many workers a cluster has
+
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -78,7 +79,7 @@ class InOrder(Generic[Task, Result]):
 
     def __init__(self, function: Callable[[Task], Result], executor: Executor | None, ahead: int = 4, tries: int = 3) -> None:
         self._function, self._executor, self._tries = function, executor, tries
-        self._ahead = max(GrowthOptions.under_way, ahead * int(getattr(executor, "_max_workers", 0) or 0))
+        self._ahead = max(MIN_TASKS_AHEAD, ahead * int(getattr(executor, "_max_workers", 0) or 0))
         self._own: Executor | None = None  # in the place of one that broke
 
     def __call__(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, Result | WorkerLost]]:

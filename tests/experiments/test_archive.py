@@ -16,7 +16,7 @@ from experiments.benchmarks import archive as benchmark
 from indexing import Clip, ClipSet
 from indexing.action.bank import JointMetric, Windows, fused_residual
 from indexing.actors import Person, perform
-from indexing.archive.options import SearchOptions
+from indexing.archive import search
 from indexing.archive.results import Hit
 
 PARENTS = [-1, 0, 0, 0, 1, 4, 5, 6, 2, 8, 9, 10, 3, 12, 13, 13, 13, 14, 17, 15, 19, 20, 21, 21, 22, 16, 25, 26, 27, 27, 28]
@@ -105,7 +105,7 @@ def test_a_question_shows_the_moment_that_it_names(people: scenes.Takes) -> None
     (question,) = scenes.questions(people, 1.0, 1, rng, exact)
     assert question.clip.duration == pytest.approx(1.0) and question.end - question.start == pytest.approx(1.0)
     metric = JointMetric.learn(torch.rand(5, 12, 20, 2), torch.ones(5, 20, dtype=torch.bool), 0.25)
-    measure, source = exhaustive.exact(metric, SearchOptions()), [archived[question.source]]
+    measure, source = exhaustive.exact(metric), [archived[question.source]]
     asked, none = exhaustive.asked([question.clip], 12), np.zeros(1, np.intp)
     found = {
         shift: float(measure.compare(asked, exhaustive.windows_at(source, none, np.array([question.start + shift]), 1.0, 12)))
@@ -121,15 +121,15 @@ def test_questions_longer_than_every_take_are_refused(people: scenes.Takes) -> N
 
 # ---- everything with everything ----------------------------------------------------------------------------------------
 @pytest.mark.slow
-def test_rankings_are_those_of_every_window(people: scenes.Takes) -> None:
+def test_rankings_are_those_of_every_window(people: scenes.Takes, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(6)
     clips = scenes.every_take(people, rng)[:3]
     asked = scenes.questions(people, 1.0, 2, rng)
-    options = SearchOptions(apart=0.0)  # every window may be a hit
+    monkeypatch.setattr(search, "MIN_SEPARATION", 0.0)  # every window may be a hit
     seen = torch.ones(40, 20, dtype=torch.bool)
     metric = JointMetric.learn(torch.rand(40, 12, 20, 2), seen, 0.25)
-    measures = {"exact": exhaustive.exact(metric, options)}
-    found = exhaustive.rankings([one.clip for one in asked], clips, 1.0, measures, options, (1.0,))
+    measures = {"exact": exhaustive.exact(metric)}
+    found = exhaustive.rankings([one.clip for one in asked], clips, 1.0, measures, (1.0,))
     for question, ranking in zip(asked, found["exact"], strict=True):
         scores = {}
         for i, clip in enumerate(clips):

@@ -22,13 +22,12 @@ import torch
 from safetensors.numpy import save
 
 from indexing import Archive, ArchiveOptions, Clip
-from indexing.archive import adding
+from indexing.archive import writer
 from indexing.archive.catalogue import CATALOGUE, LOCK, Catalogue, drop_recordings
-from indexing.archive.options import GrowthOptions, StorageOptions
 from indexing.archive.segments import ArchiveSegment
-from indexing.archive.tracks import windows_of
+from indexing.archive.tracks import StorageFormat, windows_of
 
-EAGER = ArchiveOptions(growth=GrowthOptions(small=3, relearned=np.inf))  # puts four small segments together
+EAGER = ArchiveOptions(max_small_segments=3, relearn_factor=np.inf)  # puts four small segments together
 NOBODY = 65534
 
 
@@ -61,7 +60,7 @@ def names(archive: Archive) -> list[str]:
 def test_all_counts_agree(three: Archive, moves) -> None:
     info, found, rows = three.info(), three.verify(), three.recordings()
     opened = [ArchiveSegment.open(path) for path in segments(three)]
-    counted = sum(windows_of(int(rows), StorageOptions()) for one in opened for rows in one.tracks[:, 3])
+    counted = sum(windows_of(int(rows), StorageFormat()) for one in opened for rows in one.tracks[:, 3])
     assert len(three) == info.windows == found.windows == counted > 0
     assert info.sources == info.recordings == len(rows) == 3 and info.segments == found.segments == len(opened) == 2
     assert info.seconds == pytest.approx(sum(row.seconds for row in rows)) == pytest.approx(sum(one[2] for one in info.layouts))
@@ -170,7 +169,7 @@ def test_a_full_disk_while_tidying_is_no_failure_of_what_was_asked(tmp_path: Pat
     archive = Archive(tmp_path / "a", EAGER)
     for number in range(3):
         archive.add(moves(number, name=f"{number}"))
-    write, written = adding.write_segment, []
+    write, written = writer.write_segment, []
 
     def once(*given):
         written.append(given)
@@ -178,7 +177,7 @@ def test_a_full_disk_while_tidying_is_no_failure_of_what_was_asked(tmp_path: Pat
             raise ValueError("cannot write (No space left on device); free the disk")
         return write(*given)
 
-    monkeypatch.setattr(adding, "write_segment", once)
+    monkeypatch.setattr(writer, "write_segment", once)
     assert archive.add(moves(3, name="3")).of("added")
     assert len(written) == 2 and archive.info().segments == 4 and archive.verify().ok
     monkeypatch.undo()
@@ -199,7 +198,7 @@ def test_tidying_does_not_hide_damage(tmp_path: Path, moves) -> None:
 
 
 def test_learning_again_does_not_hide_damage(tmp_path: Path, moves) -> None:
-    archive = Archive(tmp_path / "a", ArchiveOptions(growth=GrowthOptions(relearned=2.0)))
+    archive = Archive(tmp_path / "a", ArchiveOptions(relearn_factor=2.0))
     archive.add(moves(0, name="0"))
     flip(segments(archive)[0], -500)
     archive.add(moves(1, seconds=9.0, name="1"))
@@ -363,7 +362,7 @@ def test_folders_and_files_of_others_are_refused(tmp_path: Path, moves, saved) -
     with pytest.raises(ValueError, match="is no archive; make one with"):
         Archive(other)
     with pytest.raises(ValueError, match=r"is a folder with other files \(a.npz\)"):
-        Catalogue.make(other, StorageOptions())
+        Catalogue.make(other, StorageFormat())
     assert sorted(path.name for path in other.iterdir()) == ["a.npz"]
     foreign = tmp_path / "foreign"
     foreign.mkdir()
@@ -376,7 +375,7 @@ def test_folders_and_files_of_others_are_refused(tmp_path: Path, moves, saved) -
 def test_an_archive_whose_making_was_interrupted_is_an_empty_one(tmp_path: Path, moves) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / CATALOGUE).touch()
-    options = ArchiveOptions(storage=StorageOptions(rate=10.0))
+    options = ArchiveOptions(rate=10.0)
     begun = Archive(tmp_path / "a", options)
     assert len(begun) == 0 and begun.recordings() == [] and begun.verify().ok and begun.info().sources == 0
     assert (tmp_path / "a" / CATALOGUE).stat().st_size == 0  # reading writes nothing
@@ -452,7 +451,7 @@ def test_many_who_make_it_at_once_make_one(tmp_path: Path) -> None:
     def make() -> None:
         gate.wait()
         try:
-            Catalogue.make(folder, StorageOptions()).contents()
+            Catalogue.make(folder, StorageFormat()).contents()
         except BaseException as problem:
             problems.append(problem)
 
@@ -465,9 +464,8 @@ def test_many_who_make_it_at_once_make_one(tmp_path: Path) -> None:
 
 
 def test_a_verification_is_of_one_moment(three: Archive, moves, monkeypatch) -> None:
-    from indexing.archive import verifying
 
-    look, looks = verifying._segment_problems, []
+    look, looks = writer._segment_problems, []
 
     def meanwhile(*given):
         if not looks:  # while the first segment is looked at, somebody removes what is in it
@@ -476,7 +474,7 @@ def test_a_verification_is_of_one_moment(three: Archive, moves, monkeypatch) -> 
             three.remove("b")
         return look(*given)
 
-    monkeypatch.setattr(verifying, "_segment_problems", meanwhile)
+    monkeypatch.setattr(writer, "_segment_problems", meanwhile)
     assert three.verify().ok and names(three) == ["c"]
 
 

@@ -64,15 +64,15 @@ def test_interrupted_adders_leave_an_archive(stage: Stage) -> None:
 
 @pytest.mark.slow
 def test_an_adder_killed_between_segment_and_catalogue_leaves_a_file(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    from indexing.archive import adding
+    from indexing.archive import writer
 
     def dies(*given: object) -> None:
         raise SystemExit  # as far as one process can die and still be asked
 
     folder = stage.copy()
     with monkeypatch.context() as patch:
-        patch.setattr(adding.Adder, "_enter", dies)
-        patch.setattr(adding, "clear", lambda catalogue: None)
+        patch.setattr(writer.Adder, "_enter", dies)
+        patch.setattr(writer, "clear", lambda catalogue: None)
         with pytest.raises(SystemExit):
             Archive(folder).add(stage.new)
     assert len(Archive(folder).verify().orphans) == 1 and len(contents(folder)) == len(stage.earlier)
@@ -81,17 +81,17 @@ def test_an_adder_killed_between_segment_and_catalogue_leaves_a_file(stage: Stag
 
 @pytest.mark.slow
 def test_an_adder_killed_while_tidying_leaves_both(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    from indexing.archive import adding
+    from indexing.archive import writer
 
     def dies(*given: object) -> None:
         raise SystemExit
 
     def until(*given: Any) -> None:
-        monkeypatch.setattr(adding, "_unlink", dies)
+        monkeypatch.setattr(writer, "_unlink", dies)
         tidy(*given)
 
-    folder, tidy = stage.copy(), adding.tidy
-    monkeypatch.setattr(adding, "tidy", until)
+    folder, tidy = stage.copy(), writer.tidy
+    monkeypatch.setattr(writer, "tidy", until)
     with pytest.raises(SystemExit):
         Archive(folder, killed.OPTIONS).add(stage.new)
     monkeypatch.undo()

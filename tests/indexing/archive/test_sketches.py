@@ -6,15 +6,14 @@ import torch
 
 from indexing.archive import sketches
 from indexing.archive.layout import Layout
-from indexing.archive.options import SearchOptions, StorageOptions
-from indexing.archive.queries import probe_of
+from indexing.archive.search import probe_of
 from indexing.archive.segments import ArchiveSegment, write_segment
-from indexing.archive.sketches import Candidates, Probe, correlation, orthonormal, resembling, scan, settled
-from indexing.archive.tracks import tracks_of
+from indexing.archive.sketches import Candidates, Probe, correlation, orthonormal, refine_candidates, resembling, scan
+from indexing.archive.tracks import StorageFormat, tracks_of
 from indexing.clip import Clip
 from indexing.windows import ragged
 
-STORAGE = StorageOptions()
+STORAGE = StorageFormat()
 
 
 def movement(rng, seconds, joints=9):
@@ -64,7 +63,7 @@ def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=Fa
     rows = slice(round(begin * segment.rate), round((begin + seconds) * segment.rate) + 1)
     joints = segment.positions(track)[rows]
     source = ragged([Clip(joints, times=np.arange(len(joints)) / segment.rate)])
-    return probe_of(source, 0, layout, segment.rate, tempo, SearchOptions(samples=samples), moving=moving)
+    return probe_of(source, 0, layout, segment.rate, tempo, samples, moving=moving)
 
 
 def test_correlation_is_that_of_the_planes():
@@ -104,7 +103,7 @@ def test_another_camera_sees_the_same(segment):
     rng = np.random.default_rng(2)
     points = movement(rng, 30.0)
     tracks = [one for camera in range(2) for one in tracks_of(Clip(image(points, rng), fps=30.0), STORAGE, camera)]
-    layout = Layout.learn(tracks, None, StorageOptions(dimensions=9))
+    layout = Layout.learn(tracks, None, StorageFormat(dimensions=9))
     codes = [layout.project(track.positions()) for track in tracks]
     rows = 100 + np.arange(6) * 3
     window, example = (one[rows].transpose(1, 0, 2) for one in codes)
@@ -158,7 +157,7 @@ def test_candidates_settle_where_they_fit_best(segment):
     exact = probe(stored, layout, 2.5, samples=16)
     start = np.array([60, 58, 150])
     found = Candidates(np.zeros(3, np.float32), np.zeros(3, np.int64), start, np.zeros(3, np.int64))
-    moved = settled(stored, [asked], [exact], found)
+    moved = refine_candidates(stored, [asked], [exact], found)
     half, offset = asked.stride // 2, (asked.span - exact.span) // 2
     for begin, row, score in zip(start.tolist(), moved.row.tolist(), moved.score.tolist(), strict=True):
         values = {}
@@ -174,7 +173,7 @@ def test_candidates_settle_at_every_tempo(segment):
     asked = probe(stored, layout, 2.0)
     tempos = [probe(stored, layout, 2.0, tempo=tempo, samples=16) for tempo in (0.8, 1.0, 1.25)]
     found = Candidates(np.zeros(1, np.float32), np.zeros(1, np.int64), np.array([60]), np.zeros(1, np.int64))
-    moved = settled(stored, [asked], tempos, found)
+    moved = refine_candidates(stored, [asked], tempos, found)
     assert moved.probe.tolist() == [0, 1, 2] and moved.score.argmax() == 1
     middles = moved.row + np.array([one.span / 2 for one in tempos])
     assert np.abs(middles - (60 + asked.span / 2)).max() <= asked.stride / 2 + 1
@@ -211,7 +210,7 @@ def test_a_track_as_long_as_the_window_is_found_wherever_it_lies(tmp_path):
         layout = Layout.learn(tracks, None, STORAGE)
         stored = ArchiveSegment.open(tmp_path / write_segment(tmp_path, tracks, layout, STORAGE).file)
         source = ragged([Clip(stored.positions(1), times=np.arange(len(tracks[1])) / stored.rate)])
-        found = scan(stored, [probe_of(source, 0, layout, stored.rate, 1.0, SearchOptions())], 10)
+        found = scan(stored, [probe_of(source, 0, layout, stored.rate, 1.0)], 10)
         assert found.track[0] == 1 and found.score[0] > 0.999
 
 

@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from indexing import Archive
-from indexing.archive.layout import Layout, layout_key
-from indexing.archive.options import StorageOptions
-from indexing.archive.tracks import MISSING, images, positions, seen_around, tracks_of, windows_of
+from indexing.archive.layout import CODE_FLOOR, CODE_WHITENING_POWER, MIDDLE_VARIANCE, SIGHTING_VARIANCE, Layout, layout_key
+from indexing.archive.tracks import MISSING, StorageFormat, images, positions, seen_around, tracks_of, windows_of
 from indexing.cameras import rotation
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton
 from indexing.windows import bridged
 
-STORAGE = StorageOptions()
+STORAGE = StorageFormat()
 
 
 def swinging(t, joints=6, seed=0):
@@ -124,13 +123,13 @@ def learned(seed=0, joints=8, dimensions=5, **options):
     t = np.arange(900) / 30
     hidden = swinging(t, joints, seed)
     clip = Clip(np.einsum("ij,tjd->tid", mixing, hidden), times=t)
-    storage = StorageOptions(dimensions=dimensions, **options)
+    storage = StorageFormat(dimensions=dimensions, **options)
     tracks = tracks_of(clip, storage)
     return Layout.learn(tracks, None, storage), tracks, storage
 
 
 def test_basis_is_that_of_the_covariance():
-    layout, tracks, storage = learned()
+    layout, tracks, _ = learned()
     x = tracks[0].positions().astype(float)
     x = x - x.mean(axis=1, keepdims=True)
     x = x / np.linalg.norm(x, axis=(1, 2))[:, None, None]
@@ -138,7 +137,7 @@ def test_basis_is_that_of_the_covariance():
     sigma *= len(sigma) / np.trace(sigma)
     values, vectors = np.linalg.eigh(sigma)
     for number in range(3):
-        expected = vectors[:, -1 - number] * (values[-1 - number] + storage.floor) ** -storage.whitening
+        expected = vectors[:, -1 - number] * (values[-1 - number] + CODE_FLOOR) ** -CODE_WHITENING_POWER
         assert abs(expected @ layout.basis[:, number]) == pytest.approx(expected @ expected, rel=1e-3)
 
 
@@ -159,13 +158,13 @@ def test_codes_know_no_place():
 
 def test_a_joint_that_is_missing_is_what_the_others_make_likely():
     """Against the conditional expectation of a Gaussian, written out."""
-    layout, tracks, storage = learned()
+    layout, tracks, _ = learned()
     poses = tracks[0].positions()[:20].copy()
     poses[:, 3] = np.nan
     seen = np.arange(8) != 3
-    sigma = layout.covariance + storage.free
+    sigma = layout.covariance + MIDDLE_VARIANCE
     known = poses[:, seen] - poses[:, seen].mean(axis=1, keepdims=True)
-    gain = sigma[:, seen] @ np.linalg.inv(sigma[np.ix_(seen, seen)] + storage.sure * np.eye(7))
+    gain = sigma[:, seen] @ np.linalg.inv(sigma[np.ix_(seen, seen)] + SIGHTING_VARIANCE * np.eye(7))
     full = np.einsum("js,tsd->tjd", gain, known)
     full = full - full.mean(axis=1, keepdims=True)
     expected = np.einsum("tjd,jk->tdk", full, layout.basis)

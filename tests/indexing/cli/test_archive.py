@@ -19,7 +19,7 @@ import pytest
 
 from indexing import Archive
 from indexing.actors import Person, dataset, detect, stream
-from indexing.archive import adding
+from indexing.archive import writer
 from indexing.cli import main
 from indexing.cli.commands import archive as verbs
 from indexing.clip import Clip, ClipSet
@@ -114,7 +114,7 @@ def test_processes_add_the_same(run, tmp_path: Path) -> None:
 
 
 def test_an_interruption_keeps_what_was_read(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads, read = [], adding.read_source
+    reads, read = [], writer.read_source
 
     def stop(source, *more, **options):
         reads.append(source)
@@ -122,7 +122,7 @@ def test_an_interruption_keeps_what_was_read(run, tmp_path: Path, monkeypatch: p
             raise KeyboardInterrupt
         return read(source, *more, **options)
 
-    monkeypatch.setattr(adding, "read_source", stop)
+    monkeypatch.setattr(writer, "read_source", stop)
     code, out, err = run("add", "@/a", "week")
     assert code == 130 and out == "" and err.count("\n") == 1
     assert "the archive is whole: 2 sources" in err and "the same command goes on from there" in err

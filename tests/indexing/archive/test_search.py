@@ -1,18 +1,14 @@
 """Searching: the same movement from other cameras, against looking at every window exactly; and what cannot be searched."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from indexing import Archive, ArchiveOptions, Clip
 from indexing.actors import ACTIONS, Person, detect, perform, stream
-from indexing.archive.comparing import Places, residuals
-from indexing.archive.options import SearchOptions
-from indexing.archive.queries import checked, queries_of
+from indexing.archive.layout import WINDOW_LENGTH
+from indexing.archive.search import MAX_OVERLAP, Places, check_example, queries_of, residuals
 from indexing.skeleton import Skeleton
 
-SEARCH = SearchOptions()
 FINGERS = tuple(f"finger {i}a" for i in range(17))
 
 
@@ -84,16 +80,16 @@ def test_hits_are_those_of_looking_at_everything(archive, streams):
     _, start, end = intervals[2]
     clip = filmed(points, 130.0, 9).between(start, end)
     snapshot = archive._opened()
-    asked = checked(clip, 0.5, SEARCH)
-    query = queries_of(asked, snapshot.contents, SEARCH)[1]
-    metric = snapshot.contents.layouts[1].joint_metric(SEARCH)
+    asked = check_example(clip, 0.5)
+    query = queries_of(asked, snapshot.contents)[1]
+    metric = snapshot.contents.layouts[1].joint_metric()
     best, where = -np.inf, (0, 0.0)
     for number, segment in enumerate(snapshot.segments):
         for track, rows in enumerate(segment.tracks[:, 3].tolist()):
             begin = np.arange(0, (rows - 1) / 15 - asked.duration, 1 / 15)
             places = Places(np.full(len(begin), number), np.full(len(begin), track), begin, begin + asked.duration)
             if len(begin):
-                every = residuals(query.windows, np.zeros(len(begin), int), places, snapshot.segments, metric, SEARCH.length)
+                every = residuals(query.windows, np.zeros(len(begin), int), places, snapshot.segments, metric, WINDOW_LENGTH)
                 if -every.min() > best:
                     best, where = -every.min(), (int(segment.tracks[track, 0]), segment.starts[track] + begin[every.argmin()])
     hit = archive.search(clip, k=1)[0]
@@ -111,7 +107,7 @@ def test_hits_are_distinct_and_in_order(archive, streams):
         for other in hits[:i]:
             shared = min(one.end, other.end) - max(one.start, other.start)
             if one.source == other.source:
-                assert shared < SEARCH.merged * min(one.end - one.start, other.end - other.start) + 1e-6
+                assert shared < MAX_OVERLAP * min(one.end - one.start, other.end - other.start) + 1e-6
 
 
 def test_other_tempos_are_found(tmp_path):
@@ -165,7 +161,7 @@ def test_layouts_are_searched_by_common_joints(streams, tmp_path):
 def test_candidates_bound_what_is_looked_at(archive, streams):
     points, intervals = streams[0]
     clip = filmed(points, 0.0, 5).between(*intervals[0][1:])
-    few = Archive(archive.path, ArchiveOptions(search=dataclasses.replace(SEARCH, candidates=3)))
+    few = Archive(archive.path, ArchiveOptions(num_candidates=3))
     assert len(few.search(clip, k=40)) <= 3
 
 

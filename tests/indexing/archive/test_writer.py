@@ -12,9 +12,8 @@ import pytest
 
 from indexing import Archive, ArchiveOptions, Clip, ClipSet
 from indexing.archive import sources
-from indexing.archive.options import GrowthOptions, StorageOptions
 from indexing.archive.sources import gather, is_recording, read_source, reading_key
-from indexing.archive.tracks import tracks_of
+from indexing.archive.tracks import StorageFormat, tracks_of
 from indexing.opening import size_of
 from indexing.skeleton import Skeleton
 
@@ -330,7 +329,7 @@ def test_movement_in_3d_is_kept_from_two_sides(archive: Archive, moves) -> None:
     solid = moves(0, dims=3, joints=12, name="solid", up="z")
     archive.add([solid, moves(1, dims=3, joints=12, name="other", up="z")])
     assert len(archive.recordings()) == 2
-    assert len(archive) == 2 * sum(max(0, len(track) - 8) for track in tracks_of(solid, StorageOptions()))
+    assert len(archive) == 2 * sum(max(0, len(track) - 8) for track in tracks_of(solid, StorageFormat()))
     flat = {"front": [0, 2], "side": [1, 2]}
     for axes in flat.values():
         assert archive.search(Clip(solid.joints[..., axes], fps=30.0), k=1)[0].source == "solid"
@@ -370,21 +369,21 @@ def test_batches_are_committed_as_they_fill(tmp_path: Path, moves) -> None:
     once = Archive(tmp_path / "once")
     once.add(clips)
     windows = len(once) // 6
-    small = Archive(tmp_path / "small", ArchiveOptions(growth=GrowthOptions(windows=2 * windows, relearned=np.inf)))
+    small = Archive(tmp_path / "small", ArchiveOptions(max_segment_windows=2 * windows, relearn_factor=np.inf))
     small.add(clips)
     assert once.info().segments == 1 and small.info().segments == 3
     assert names(small) == names(once) and len(small) == len(once)
     shares: list[float] = []
-    eager = ArchiveOptions(growth=GrowthOptions(seconds=0.0, relearned=np.inf))
+    eager = ArchiveOptions(commit_seconds=0.0, relearn_factor=np.inf)
     Archive(tmp_path / "timed", eager).add(clips, progress=shares.append)
     assert Archive(tmp_path / "timed").info().segments == 6
     assert shares == [pytest.approx((i + 1) / 6) for i in range(6)]
 
 
 def test_a_failing_batch_leaves_what_was_committed(tmp_path: Path, moves, monkeypatch) -> None:
-    from indexing.archive import adding
+    from indexing.archive import writer
 
-    archive, write = Archive(tmp_path / "a", ArchiveOptions(growth=GrowthOptions(seconds=0.0))), adding.write_segment
+    archive, write = Archive(tmp_path / "a", ArchiveOptions(commit_seconds=0.0)), writer.write_segment
     count = iter(range(10))
 
     def full(folder: Path, *given):
@@ -393,7 +392,7 @@ def test_a_failing_batch_leaves_what_was_committed(tmp_path: Path, moves, monkey
             raise ValueError("cannot write 'x' (No space left on device); free the name or the disk")
         return write(folder, *given)
 
-    monkeypatch.setattr(adding, "write_segment", full)
+    monkeypatch.setattr(writer, "write_segment", full)
     with pytest.raises(ValueError, match="No space left"):
         archive.add([moves(i, name=f"{i}") for i in range(5)])
     assert names(archive) == ["0", "1"] and archive.verify().ok and not archive.verify().orphans
@@ -417,11 +416,11 @@ def test_an_interruption_keeps_what_was_read(archive: Archive, moves) -> None:
 
 def test_a_source_read_by_itself_says_what_it_holds(saved, moves) -> None:
     (source,) = gather(saved("a.npz"))
-    found = read_source(source, {}, StorageOptions())
+    found = read_source(source, {}, StorageFormat())
     assert found.failure == "" and found.windows == found.recordings[0].windows > 0 and found.seconds > 2.8
     assert found.stamp.size == size_of(source.path) and len(found.stamp.sha256) == 64
     (clip,) = gather(moves(0))
-    again = read_source(clip, {}, StorageOptions())
+    again = read_source(clip, {}, StorageFormat())
     assert again.recordings[0].windows == found.windows and again.stamp.modified == 0
 
 

@@ -1,4 +1,4 @@
-"""Adding: sources are read by workers, put together in their order, and committed as segments; the coordinator alone writes.
+"""Writing an archive, and verifying it: sources are read by workers, and committed in their order; the coordinator alone writes.
 
 Stages: what is known already is left alone (:func:`_news`); the others are read (:mod:`indexing.archive.sources`); batches of them
 are written as segments and committed in one step each (:meth:`Adder.commit`); small segments are put together (:func:`tidy`).
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -16,17 +17,52 @@ from pathlib import Path
 from typing import Any
 
 from dyntorch.numerics import one_thread
-from indexing.archive.catalogue import Catalogue, SegmentRow, SourceRow, add_layout, drop_recordings
-from indexing.archive.layout import Layout, layout_key
-from indexing.archive.options import ArchiveOptions, StorageOptions
-from indexing.archive.results import Addition, Outcome, SourceOutcome
+from indexing.archive.catalogue import Catalogue, Contents, RecordingRow, SegmentRow, SourceRow, add_layout, drop_recordings
+from indexing.archive.layout import MAX_LEARNED_POSES, Layout, layout_key
+from indexing.archive.results import Addition, Outcome, SourceOutcome, Verification
 from indexing.archive.segments import ArchiveSegment, WrittenSegment, damaged, intact, write_segment
 from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, read_source, reading_key, stamp, told
-from indexing.archive.tracks import Track, total_windows
+from indexing.archive.tracks import StorageFormat, Track, total_windows, windows_of
 from indexing.archive.workers import InOrder, WorkerLost
+from indexing.opening import count, listed
 from indexing.skeleton import Skeleton
 
 Progress = Callable[[float], None] | None
+
+MAX_DEAD_SHARE = 0.5  # of removed windows, from which a segment is written anew
+MAX_TRIES = 3  # of a source where its worker dies, the last time by itself
+TASKS_AHEAD = 4  # sources per worker that are read ahead of what is written: bounds memory
+MAX_ATTEMPTS = 3  # of a question where segments are merged meanwhile
+
+
+@dataclass(frozen=True)
+class ArchiveOptions:
+    """How an archive stores movement (the first four, fixed when it is made), grows and is searched."""
+
+    rate: float = 15.0
+    """Stored poses per second, each with a sketch: 4.8 MB per hour of 17 joints.  Windows may begin and end at any of them."""
+    dimensions: int = 8
+    """Directions of joint space that a sketch keeps, of x and of y.  Right moment among the best 10 / 100 / 300 of 280,000 windows
+    of 1 s (CMU): 6 give .72 / .89 / .96, 8 .88 / .98 / .99, 12 .92 / 1.00 / 1.00, all .98 / .99 / .99 (without re-ranking)."""
+    min_duration: float = 0.5
+    """Seconds of the shortest window; what is in view for less is left out."""
+    views: tuple[float, ...] = (0.0, 90.0)
+    """Degrees about the vertical from which movement in 3D is kept: what goes towards one camera, the other sees."""
+    max_segment_windows: int = 1_000_000
+    """Windows of one file, unless one source has more: 18 hours, 88 MB of 17 joints."""
+    commit_seconds: float = 120.0
+    """Seconds after which what was read is committed: as much is lost at most where an addition is killed."""
+    max_small_segments: int = 16
+    """Files of less than half that size that may lie about before they are merged."""
+    relearn_factor: float = 4.0
+    """Times as much movement as a layout was learned from, from which on it is learned anew, until it was learned from enough."""
+    num_candidates: int = 1000
+    """Moments that a search compares exactly: what it costs, and what it may miss."""
+
+    @property
+    def storage(self) -> StorageFormat:
+        """How a new archive stores movement."""
+        return StorageFormat(self.rate, self.dimensions, self.min_duration, self.views)
 
 
 @dataclass(eq=False)
@@ -57,9 +93,7 @@ def add(
         adder = Adder(catalogue, options, reading)
         outcomes: dict[str, SourceOutcome] = {}
         news = list(_news(adder.known, sources, adder.reading, outcomes))
-        work = InOrder(
-            partial(read_source, reading=dict(reading), options=adder.storage), executor, options.growth.ahead, options.growth.tries
-        )
+        work = InOrder(partial(read_source, reading=dict(reading), storage=adder.storage), executor, TASKS_AHEAD, MAX_TRIES)
         try:
             for done, (source, read) in enumerate(work(news), 1):
                 outcomes[source.key] = adder.take(source, read)
@@ -116,7 +150,7 @@ class Adder:
     def __init__(self, catalogue: Catalogue, options: ArchiveOptions, reading: Mapping[str, Any]) -> None:
         self.catalogue, self.options, self.reading = catalogue, options, reading_key(reading)
         contents = catalogue.contents()
-        self.storage = contents.options
+        self.storage = contents.storage
         self.known = catalogue.sources()
         self.layouts = {layout_key(one.joints, one.skeleton): (number, one) for number, one in contents.layouts.items()}
         self.staged = Staged(since=time.monotonic())
@@ -132,8 +166,10 @@ class Adder:
             self._touch(row, read.stamp)
             return SourceOutcome(source.name, "known", row.note)
         self.staged.sources.append((source, read))
-        grown = self.options.growth
-        if self.staged.windows >= grown.windows or time.monotonic() - self.staged.since >= grown.seconds:
+        if (
+            self.staged.windows >= self.options.max_segment_windows
+            or time.monotonic() - self.staged.since >= self.options.commit_seconds
+        ):
             self.commit()
         outcome: Outcome = "left out" if not read.windows else "added" if row is None else "replaced"
         return SourceOutcome(source.name, outcome, read.note, read.windows, read.seconds)
@@ -174,19 +210,19 @@ class Adder:
         self, key: str, tracks: Sequence[Track], skeleton: Skeleton | None
     ) -> tuple[Layout, tuple[SegmentRow, ...], list[Track]]:
         """What a layout's codes are, and which segments are written anew for that, with what is in them."""
-        storage, search = self.storage, self.options.search
+        storage = self.storage
         if key not in self.layouts:
-            return Layout.learn(tracks, skeleton, storage, search), (), []
+            return Layout.learn(tracks, skeleton, storage), (), []
         number, layout = self.layouts[key]
         rows = tuple(row for row in self.catalogue.contents().segments if row.layout == number)
         total = sum(row.windows - row.dead for row in rows) + sum(map(len, tracks))
-        if layout.poses >= storage.learned or total < self.options.growth.relearned * layout.poses:
+        if layout.poses >= MAX_LEARNED_POSES or total < self.options.relearn_factor * layout.poses:
             return layout, (), []
         try:
             older = [track for row in rows for track in live_tracks(self.catalogue, row)]
         except (OSError, ValueError):
             return layout, (), []  # damaged: verifying says so
-        return Layout.learn([*older, *tracks], skeleton, storage, search), rows, older
+        return Layout.learn([*older, *tracks], skeleton, storage), rows, older
 
     def _first_number(self) -> int:
         """Of the recordings to come; nobody else writes."""
@@ -259,12 +295,12 @@ def clear(catalogue: Catalogue) -> None:
 
 def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
     """Put small segments together, and write those anew of which much was removed."""
-    contents, grown = catalogue.contents(), options.growth
+    contents = catalogue.contents()
     for number, layout in contents.layouts.items():
         mine = [row for row in contents.segments if row.layout == number]
-        small = [row for row in mine if row.windows - row.dead < grown.windows / 2]
-        due = [row for row in mine if row.dead > grown.dead * row.windows]
-        if len(small) > grown.small:
+        small = [row for row in mine if row.windows - row.dead < options.max_segment_windows / 2]
+        due = [row for row in mine if row.dead > MAX_DEAD_SHARE * row.windows]
+        if len(small) > options.max_small_segments:
             due = [row for row in mine if row in small or row in due]
         batch: list[SegmentRow] = []
         with contextlib.suppress(ValueError):  # what it would have freed or put together is no part of what was asked for
@@ -272,14 +308,14 @@ def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
                 if row.dead < row.windows and not intact(catalogue.segments_folder / row.file, row.sha256):
                     continue
                 batch.append(row)
-                if sum(one.windows - one.dead for one in batch) >= grown.windows:
-                    _join(catalogue, batch, layout, contents.options)
+                if sum(one.windows - one.dead for one in batch) >= options.max_segment_windows:
+                    _merge_segments(catalogue, batch, layout, contents.storage)
                     batch = []
             if batch:
-                _join(catalogue, batch, layout, contents.options)
+                _merge_segments(catalogue, batch, layout, contents.storage)
 
 
-def _join(catalogue: Catalogue, rows: Sequence[SegmentRow], layout: Layout, storage: StorageOptions) -> None:
+def _merge_segments(catalogue: Catalogue, rows: Sequence[SegmentRow], layout: Layout, storage: StorageFormat) -> None:
     """One segment in the place of some, without what was removed."""
     tracks = [track for row in rows for track in live_tracks(catalogue, row)]
     made = write_segment(catalogue.segments_folder, tracks, layout, storage) if tracks else None
@@ -320,3 +356,93 @@ def _unlink(catalogue: Catalogue, rows: Sequence[SegmentRow]) -> None:
     for row in rows:
         with contextlib.suppress(OSError):
             (catalogue.segments_folder / row.file).unlink()
+
+
+# ---- verification: whether every window of the catalogue is there, whole, and once ---------------------------------------
+
+
+def verify(catalogue: Catalogue) -> Verification:
+    """Every segment read and compared with the catalogue; again where somebody changed the archive meanwhile."""
+    for attempt in range(MAX_ATTEMPTS):
+        contents, recordings, sources = catalogue.moment(checked=True)
+        problems = _problems(catalogue.segments_folder, contents, recordings, sources)
+        if not problems or attempt == MAX_ATTEMPTS - 1 or catalogue.generation() == contents.generation:
+            break
+    left = tuple(path.name for path in orphans(catalogue))
+    # whoever adds right now has files that are no leftovers
+    return Verification(contents.windows, len(contents.segments), tuple(problems), () if catalogue.held() else left)
+
+
+def _problems(folder: Path, contents: Contents, recordings: Sequence[RecordingRow], sources: Sequence[SourceRow]) -> list[str]:
+    problems: list[str] = []
+    by_segment: dict[int, list[RecordingRow]] = {row.id: [] for row in contents.segments}
+    for one in recordings:
+        if one.segment in by_segment:
+            by_segment[one.segment].append(one)
+        else:
+            problems.append(f"{one.name}: its segment is not in the catalogue; remove its source and add it again")
+    names = {row.id: row.name for row in sources}
+    for row in contents.segments:
+        if row.layout not in contents.layouts:
+            problems.append(f"{folder / row.file}: its joint layout is not in the catalogue; {_lost(by_segment[row.id], names)}")
+            continue
+        problems += _segment_problems(folder, row, by_segment[row.id], contents, names)
+    twice = [key for key, count in Counter((one.source, one.name, one.person) for one in recordings).items() if count > 1]
+    problems += [f"{name}{f', {who}' * bool(who)}: is there twice; remove its source and add it again" for _, name, who in twice]
+    problems += [
+        f"{one.name}: belongs to no source; restore the catalogue from a copy, or add the recordings to a new archive"
+        for one in recordings
+        if one.source not in names
+    ]
+    return problems
+
+
+def _segment_problems(
+    folder: Path, row: SegmentRow, recordings: Sequence[RecordingRow], contents: Contents, names: Mapping[int, str]
+) -> list[str]:
+    path, lost = folder / row.file, _lost(recordings, names)
+    try:
+        if path.stat().st_size != row.size or not intact(path, row.sha256):
+            return [f"{path}: is not what was written; {lost}"]
+        segment = ArchiveSegment.open(path)
+    except OSError as problem:
+        return [f"{path}: {problem.strerror or problem}; {lost}"]
+    except ValueError as problem:
+        return [f"{problem}; {lost}"]
+    if segment.joints.shape[1] != contents.layouts[row.layout].joints or segment.rate != contents.storage.rate:
+        return [f"{path}: has other joints or another rate than the catalogue says; {lost}"]
+    live = {one.id: one for one in recordings}
+    windows: Counter[int] = Counter()
+    held: dict[int, list[tuple[float, float]]] = {number: [] for number in live}  # first and last second of each track
+    for (recording, view, _, rows), start in zip(segment.tracks.tolist(), segment.starts.tolist(), strict=True):
+        windows[recording] += windows_of(rows, contents.storage)
+        if recording in live and view == 0:
+            held[recording].append((start, start + (rows - 1) / segment.rate))
+    found = [
+        f"{path}: does not hold what the catalogue says of {one.name}; remove {names.get(one.source, one.name)} and add it again"
+        for one in recordings
+        if windows[one.id] != one.windows or not _same_times(held[one.id], one)
+    ]
+    total = sum(windows.values())
+    dead = total - sum(windows[number] for number in live)
+    if (row.windows, row.dead) != (total, dead):
+        found.append(
+            f"{path}: has {total} windows, {dead} of them removed; the catalogue says {row.windows} and {row.dead}; {lost}"
+        )
+    return found
+
+
+def _same_times(spans: Sequence[tuple[float, float]], row: RecordingRow) -> bool:
+    """Whether a recording begins, ends and lasts as the catalogue says, to a thousandth of a second."""
+    if not spans:
+        return row.seconds == 0  # movement in 3D that only the second image shows
+    told = min(begin for begin, _ in spans), max(end for _, end in spans), sum(end - begin for begin, end in spans)
+    return all(abs(a - b) <= 1e-3 for a, b in zip(told, (row.begins, row.ends, row.seconds), strict=True))
+
+
+def _lost(recordings: Sequence[RecordingRow], names: Mapping[int, str]) -> str:
+    """What a segment takes with it, and what to do."""
+    if not recordings:
+        return "nothing of it is used"
+    sources = sorted({names.get(one.source, one.name) for one in recordings})
+    return f"{count(len(recordings), 'recording')} lost: remove and add again {listed(sources)}"

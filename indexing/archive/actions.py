@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Catalogue
 from indexing.archive.layout import Layout
-from indexing.archive.options import FindOptions, SearchOptions
-from indexing.archive.queries import probe_of
 from indexing.archive.results import ArchivedEvent
-from indexing.archive.searching import Snapshot
+from indexing.archive.search import Snapshot, probe_of
 from indexing.archive.segments import ArchiveSegment
 from indexing.archive.sketches import Probe, resembling
 from indexing.archive.workers import InOrder, WorkerLost
@@ -38,6 +36,13 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
 
 Progress = Callable[[float], None] | None
+# squared, of movement between sketches and the nearest exemplar: all of 182 actions by others reach .33; .36 costs .07 of F1
+MIN_CORRELATION = 0.3
+# of an exemplar's movement, by energy beside that of the pose, below which somebody rests: skips a quarter of a recording
+MIN_MOTION_SHARE = 0.25
+TEMPOS = (0.7, 1.0, 1.4)  # durations of exemplars by which that is measured, in their own
+MARGIN_SECONDS = 0.5  # around what may be an action, that are read with it
+POSES_PER_TASK = 54_000  # that one worker reads before it answers: an hour
 MODEL = "model.safetensors"
 
 
@@ -49,7 +54,6 @@ class FindTask:
     recordings: tuple[tuple[int, tuple[int, ...]], ...]
     layout: Layout
     probes: tuple[Probe, ...]
-    options: FindOptions
     model: bytes
 
 
@@ -58,7 +62,6 @@ def find(
     snapshot: Snapshot,
     catalogue: Catalogue,
     model: ActionIndexer | str | os.PathLike[str],
-    options: FindOptions,
     executor: Executor | None,
     progress: Progress,
 ) -> list[ArchivedEvent]:
@@ -67,14 +70,14 @@ def find(
 
     indexer = ActionIndexer.load(Path(model).expanduser()) if isinstance(model, (str, os.PathLike)) else model
     data = _dumped(indexer)
-    probes = probes_of(snapshot, indexer, options)
+    probes = probes_of(snapshot, indexer)
     if not probes:
         known = ", ".join(one.name for one in snapshot.contents.layouts.values()) or "nothing"
         raise ValueError(
             f"{catalogue.folder}: joints: the model has too few in common with what is in the archive ({known}); use the same pose "
             "estimator for both"
         )
-    tasks = _tasks(snapshot, probes, data, options)
+    tasks = _tasks(snapshot, probes, data)
     names = catalogue.named([number for task in tasks for number, _ in task.recordings])
     found: list[ArchivedEvent] = []
     for done, (task, events) in enumerate(InOrder(find_in, executor, tries=2)(tasks), 1):
@@ -91,9 +94,9 @@ def find(
     return sorted(found, key=lambda event: (event.source, event.person, event.start, event.end))
 
 
-def probes_of(snapshot: Snapshot, indexer: ActionIndexer, options: FindOptions) -> dict[int, tuple[Probe, ...]]:
+def probes_of(snapshot: Snapshot, indexer: ActionIndexer) -> dict[int, tuple[Probe, ...]]:
     """How the exemplars move, for each layout that the model can be asked about."""
-    rate, asked = snapshot.contents.options.rate, SearchOptions()
+    rate = snapshot.contents.storage.rate
     model = indexer.model_
     exemplars = [indexer.exemplar(i) for i in range(len(model.labels))]
     if model.symmetry is not None:  # those that count mirrored: an image and its mirror image are of one shape, but for the joints
@@ -106,14 +109,12 @@ def probes_of(snapshot: Snapshot, indexer: ActionIndexer, options: FindOptions) 
             continue
         clips = [clip.replace(joints=y_up(clip), up="y") for clip in facing if clip is not None]
         source = ragged(clips)
-        all_of = [
-            probe_of(source, i, layout, rate, tempo, asked, moving=True) for i in range(len(clips)) for tempo in options.tempos
-        ]
+        all_of = [probe_of(source, i, layout, rate, tempo, moving=True) for i in range(len(clips)) for tempo in TEMPOS]
         found[number] = tuple(probe for probe in all_of if probe is not None)
     return found
 
 
-def _tasks(snapshot: Snapshot, probes: dict[int, tuple[Probe, ...]], model: bytes, options: FindOptions) -> list[FindTask]:
+def _tasks(snapshot: Snapshot, probes: dict[int, tuple[Probe, ...]], model: bytes) -> list[FindTask]:
     contents, tasks = snapshot.contents, []
     for i, row in enumerate(contents.segments):
         if row.layout not in probes:
@@ -126,8 +127,8 @@ def _tasks(snapshot: Snapshot, probes: dict[int, tuple[Probe, ...]], model: byte
                 by_recording.setdefault(number, []).append(track)
         layout = contents.layouts[row.layout]
         tasks += [
-            FindTask(segment.path, part, layout, probes[row.layout], options, model)
-            for part in _parts(by_recording, segment, options.rows)
+            FindTask(segment.path, part, layout, probes[row.layout], model)
+            for part in _parts(by_recording, segment, POSES_PER_TASK)
         ]
     return tasks
 
@@ -162,7 +163,7 @@ def _events(task: FindTask, segment: ArchiveSegment, tracks: Sequence[int]) -> l
     clips: list[tuple[NDArray[np.float64], NDArray[np.float32]]] = []
     for track in sorted(tracks, key=lambda number: float(segment.starts[number])):
         part = segment.only(track)
-        rows = np.flatnonzero(marked_rows(part, task.probes, task.options))
+        rows = np.flatnonzero(marked_rows(part, task.probes))
         if len(rows) > 1:
             clips.append((float(part.starts[0]) + rows / part.rate, part.poses(np.zeros(len(rows), np.int64), rows)))
     if not clips:
@@ -176,9 +177,9 @@ def _events(task: FindTask, segment: ArchiveSegment, tracks: Sequence[int]) -> l
         return list(_loaded(task.model).find(clip))
 
 
-def marked_rows(track: ArchiveSegment, probes: Sequence[Probe], options: FindOptions) -> NDArray[np.bool_]:
+def marked_rows(track: ArchiveSegment, probes: Sequence[Probe]) -> NDArray[np.bool_]:
     """``(rows,)`` the poses of a track that are looked at: of what moves as an exemplar does, and a margin around it."""
-    mask, margin = resembling(track, probes, options.least, options.quiet), round(options.margin * track.rate)
+    mask, margin = resembling(track, probes, MIN_CORRELATION, MIN_MOTION_SHARE), round(MARGIN_SECONDS * track.rate)
     total = np.concatenate([[0], np.cumsum(mask)])
     index = np.arange(len(mask))
     return np.asarray(total[np.minimum(index + margin + 1, len(mask))] > total[np.maximum(index - margin, 0)])
