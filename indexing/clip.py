@@ -12,6 +12,7 @@ import sys
 import warnings
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol, Self, TypeVar, cast, overload
 
@@ -105,11 +106,11 @@ class LabelledSet(Sequence[T]):
             if column.ndim != 1:
                 raise ValueError(f"clip set {self.name!r}: field {name!r} has several columns; select one of them, e.g. {name}0")
             values = [wanted] if isinstance(wanted, str) or not isinstance(wanted, Iterable) else list(wanted)
-            keep &= np.array([any(_same(entry, value) for value in values) for entry in column.tolist()], dtype=bool)
+            keep &= np.array([any(_equals(entry, value) for value in values) for entry in column.tolist()], dtype=bool)
         return self[keep]
 
 
-def _same(entry: Any, value: Any) -> bool:
+def _equals(entry: Any, value: Any) -> bool:
     """Whether a field equals a value that may come as text (command line): 60 == 60.0 == "60"."""
     if entry == value or str(entry) == str(value):
         return True
@@ -128,24 +129,12 @@ EXACT = 0.01  # of the step between frames, that neighbouring numbers may be apa
 UP_AXES = ("y", "-y", "z", "-z")
 
 
-@dataclass(frozen=True)
-class DepthOptions:
-    """When the third of three coordinates, from 0 to 1, is the confidence of pixels and no depth."""
-
-    pixels: float = 50.0
-    """Units that a body goes over in x and y where they are surely no metres: no body is so flat."""
-    few_pixels: float = 10.0
-    """Units that it goes over where they are probably none."""
-    ones: float = 0.05
-    """Share of values of exactly 1, and of places outside of the image, of which coordinates have hardly any."""
-    high: float = 0.9
-    """Median; of 3D data brought to 0 to 1 axis by axis it stays below .87 (345 clips of three sets)."""
-    unsteady: float = 2.5
-    """Times as far from frame to frame as x and y, for how far it goes at all: confidences 2.9 to 5.9 (pose2sim), depth at most 1.9
-    (the same 345 clips)."""
-
-
-DEPTH = DepthOptions()
+# when the third of three coordinates, from 0 to 1, is the confidence of pixels and no depth
+SURE_PIXELS = 50.0  # units that a body goes over in x and y where they are surely no metres: no body is so flat
+LIKELY_PIXELS = 10.0  # units that it goes over where they are probably none
+MAX_ONES = 0.05  # share of values of exactly 1, and of places outside of the image, of which coordinates have hardly any
+MIN_CONFIDENCE_MEDIAN = 0.9  # 3D data brought to 0 to 1 axis by axis stay below .87 (345 clips of three sets)
+MIN_UNSTEADINESS = 2.5  # from frame to frame, over that of x and y: confidences 2.9 to 5.9 (pose2sim), depth at most 1.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,16 +280,12 @@ class Clip:
         Raises:
             ValueError: xarray is not installed.
         """
-        from indexing.writers.formats.nc import dataset_of
-
-        return dataset_of([self])
+        return _files("writers.formats.nc").dataset_of([self])
 
     @classmethod
     def load(cls, path: str | Path, **options: Any) -> Clip:
         """Read one clip from a keypoint file or folder; see :func:`indexing.readers.read_clip`."""
-        from indexing.readers import read_clip
-
-        return read_clip(path, **options)
+        return cast("Clip", _files("readers").read_clip(path, **options))
 
 
 class ClipSet(LabelledSet[Clip]):
@@ -327,20 +312,21 @@ class ClipSet(LabelledSet[Clip]):
         Raises:
             ValueError: what the format cannot hold; nothing is written then.
         """
-        from indexing.readers.formats.clipset import write_clip_set
-        from indexing.writers import FORMATS, write
-
-        if Path(path).suffix.lower() in FORMATS:
-            return write(self.clips, path, units)
-        write_clip_set(self, path)
+        writers = _files("writers")
+        if Path(path).suffix.lower() in writers.FORMATS:
+            return cast("list[str]", writers.write(self.clips, path, units))
+        _files("readers.formats.clipset").write_clip_set(self, path)
         return []
 
     @classmethod
     def load(cls, path: str | Path, **options: Any) -> ClipSet:
         """Read a clip-set ``.npz``, or any keypoint file as a set of one; see :func:`indexing.readers.read`."""
-        from indexing.readers import read
+        return cast("ClipSet", _files("readers").read(path, **options))
 
-        return read(path, **options)
+
+def _files(module: str) -> Any:
+    """A module of readers or writers by its name: they make clips of files, so that clips cannot import them."""
+    return import_module(f"indexing.{module}")
 
 
 def as_clip(value: Clip | ArrayLike, fps: float = 30.0, name: str = "") -> Clip:
@@ -401,13 +387,13 @@ def _check_depth(joints: FloatArray, who: str) -> None:
     width = float(np.median((high - low)[seen].max(axis=1)) if joints.shape[1] > 1 else np.ptp(high[seen], axis=0).max())
     typical = _is_confidence(joints, known)
     remedy = "give joints[..., :2] and confidence=joints[..., 2]"
-    if width > (DEPTH.few_pixels if typical else DEPTH.pixels) and (typical or joints.shape[1] > 1):
+    if width > (LIKELY_PIXELS if typical else SURE_PIXELS) and (typical or joints.shape[1] > 1):
         raise ValueError(
             f"{who}: joints: x and y go over {width:.3g}, and z from {third.min():.2g} to {third.max():.2g}, which is "
             f"the confidence of pixels, not depth; {remedy}"
         )
     inside = float(((joints[known][:, :2] >= 0) & (joints[known][:, :2] <= 1)).all(axis=1).mean())
-    if width > DEPTH.few_pixels or (typical and inside > 1 - DEPTH.ones):
+    if width > LIKELY_PIXELS or (typical and inside > 1 - MAX_ONES):
         # without the clip's name: of a set, it is said once
         warnings.warn(
             f"joints: z goes from 0 to 1 as a confidence does, and is taken for depth; if it is none, {remedy}", stacklevel=4
@@ -422,9 +408,9 @@ def _is_confidence(joints: FloatArray, known: NDArray[np.bool_]) -> bool:
     if joints.shape[1] == 1:
         return False
     across, along = _unsteady(joints[..., :2]), _unsteady(joints[..., 2:])
-    if float((third == 1).mean()) > DEPTH.ones or float(np.median(third)) > DEPTH.high:
+    if float((third == 1).mean()) > MAX_ONES or float(np.median(third)) > MIN_CONFIDENCE_MEDIAN:
         return True
-    return float(along[0]) > DEPTH.unsteady * float(across.max())
+    return float(along[0]) > MIN_UNSTEADINESS * float(across.max())
 
 
 def _unsteady(values: FloatArray) -> FloatArray:

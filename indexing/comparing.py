@@ -173,7 +173,7 @@ def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = Comparing
         for lengths, here, there, used in _moments(span, (known, found), number, options.block):
             table[np.ix_([*used, -1], [*used, -1])] += time_table(lengths, here, there)
             lasting[used] += np.stack([lengths @ side for side in (here, there, here & there)], axis=1)
-    segments = {overlap: _counted(inside, names, overlap) for overlap in options.overlaps}
+    segments = {overlap: _count_segments(inside, names, overlap) for overlap in options.overlaps}
     total = float(table.sum())
     by_label = {}
     for i, name in enumerate(names):
@@ -263,7 +263,7 @@ def _one_against_all(lasting: FloatArray, total: float) -> float:
     return kappa(np.array([[both, known - both], [found - both, total - known - found + both]]))
 
 
-def _counted(
+def _count_segments(
     inside: Sequence[tuple[Sequence[Interval], Sequence[Interval]]], names: Sequence[str], overlap: float
 ) -> list[SegmentCounts]:
     """Of each label, the segments of all spans."""

@@ -48,7 +48,7 @@ def named(skeleton: Skeleton | None) -> bool:
     """
     if skeleton is None:
         return False
-    names = [_plain(joint) for joint in skeleton.joints]
+    names = [_letters(joint) for joint in skeleton.joints]
     return len(set(names)) == len(names) and not all(name.isdigit() or not name for name in names)
 
 
@@ -62,7 +62,7 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
     """The clip with its joints in the order of those known, and what to say about it."""
     own, who = clip.skeleton, who or f"clip {clip.name!r}"
     if known is None or own is None or not (named(known) and named(own)):
-        return clip, _unnamed(clip, known, who)
+        return clip, _note_unnamed(clip, known, who)
     if own.joints == known.joints:
         return clip, ""
     place = places(own, known)
@@ -71,8 +71,8 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
     counted = _of_body(known)
     if sum(place[i] >= 0 for i in counted) < max(FEWEST, len(counted) / 2):
         raise ValueError(
-            f"{who}: joints: {shared} of its {len(own.joints)} ({_few(own.joints)}) have names of the {len(known.joints)} joints "
-            f"learned ({_few(known.joints)}); use clips of one joint layout"
+            f"{who}: joints: {shared} of its {len(own.joints)} ({_list_some(own.joints)}) have names of the "
+            f"{len(known.joints)} joints learned ({_list_some(known.joints)}); use clips of one joint layout"
         )
     joints = clip.joints[:, place].copy()
     confidence = None if clip.confidence is None else clip.confidence[:, place].copy()
@@ -82,7 +82,7 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
         confidence[:, gone] = 0.0
     said = ""
     if missing:
-        said = f"{who}: {shared} of the {len(known.joints)} joints learned are in it; not {_few(missing)}"
+        said = f"{who}: {shared} of the {len(known.joints)} joints learned are in it; not {_list_some(missing)}"
     elif shared < len(own.joints):
         said = f"{who}: of its {len(own.joints)} joints ({own.name}) the {shared} learned ({known.name}) are used"
     if said and (own.name in MEASURED) != (known.name in MEASURED):
@@ -92,18 +92,18 @@ def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, st
 
 def places(own: Skeleton, known: Skeleton) -> list[int]:
     """Where each joint known is among one's own, by name; -1 where it is not."""
-    index = {_plain(joint): i for i, joint in enumerate(own.joints)}
+    index = {_letters(joint): i for i, joint in enumerate(own.joints)}
     words = [canonical(joint) for joint in own.joints]
     wanted = [canonical(joint) for joint in known.joints]
     alike = {word: i for i, word in enumerate(words) if words.count(word) == 1 and wanted.count(word) == 1}
-    found = [index.get(_plain(joint), -1) for joint in known.joints]
+    found = [index.get(_letters(joint), -1) for joint in known.joints]
     taken = set(found)
     return [alike.get(word, -1) if i < 0 and alike.get(word, -1) not in taken else i for i, word in zip(found, wanted, strict=True)]
 
 
 def canonical(joint: str) -> str:
     """What a joint is, whatever it is called."""
-    plain = _plain(joint)
+    plain = _letters(joint)
     if plain in SAME:
         return SAME[plain]
     if plain == "rear" and not re.match(r"[rR](E|[\W_])", joint):  # the back of an animal
@@ -127,7 +127,7 @@ def matched_all(clips: Sequence[Clip], known: Skeleton | None) -> list[Clip]:
     return [clip for clip, _ in found]
 
 
-def _unnamed(clip: Clip, known: Skeleton | None, who: str) -> str:
+def _note_unnamed(clip: Clip, known: Skeleton | None, who: str) -> str:
     own = clip.skeleton
     if known is None and own is None:
         return ""
@@ -143,9 +143,9 @@ def _unnamed(clip: Clip, known: Skeleton | None, who: str) -> str:
     return f"{who}: its joints have no names in common with those learned; joint 0 is taken for joint 0, and so on"
 
 
-def _plain(joint: str) -> str:
+def _letters(joint: str) -> str:
     return re.sub(r"[\W_]+", "", joint.lower())
 
 
-def _few(joints: Sequence[str]) -> str:
+def _list_some(joints: Sequence[str]) -> str:
     return ", ".join(joints[:LISTED]) + (", ..." if len(joints) > LISTED else "")

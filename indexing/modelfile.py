@@ -41,7 +41,7 @@ def write_model(
     """Write a fitted estimator, atomically."""
     from safetensors.torch import save as to_bytes
 
-    kept = {name: _plain(value) for name, value in parameters.items() if name != "device"}
+    kept = {name: _to_plain(value) for name, value in parameters.items() if name != "device"}
     try:
         header = json.dumps({"format": kind, "version": version, "parameters": kept, **about})
     except TypeError as error:
@@ -55,7 +55,7 @@ def write_model(
 
 def read_model(path: str | Path, kind: str, version: int) -> tuple[dict[str, Any], Parts]:
     """What :func:`write_model` wrote: the header, and the tensors."""
-    header, tensors = _opened(Path(path), with_tensors=True)
+    header, tensors = _open(Path(path), with_tensors=True)
     if header.get("format") != kind:
         found = header.get("format", "nothing that dyntorch wrote")
         said = f"is {found if isinstance(found, str) and len(found) < VALUE else shown(found)}, but {kind} is expected"
@@ -67,7 +67,7 @@ def read_model(path: str | Path, kind: str, version: int) -> tuple[dict[str, Any
 
 def model_kind(path: str | Path) -> str:
     """What kind of model a file holds, empty where it does not say."""
-    return str(_opened(Path(path), with_tensors=False)[0].get("format", ""))
+    return str(_open(Path(path), with_tensors=False)[0].get("format", ""))
 
 
 def labels_to_json(classes: NDArray[Any]) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def part(name: str | None = None, **sizes: int | str) -> dict[str, Stored]:
 def tensors_of(model: Any, before: str = "") -> dict[str, Tensor]:
     """All stored fields of a model, by their names in the file."""
     out: dict[str, Tensor] = {}
-    for name, each, _, how in _stored(model, before):
+    for name, each, _, how in _stored_fields(model, before):
         value = getattr(model, each)
         if value is not None:
             out |= tensors_of(value, name) if how.kind == "part" else {name: torch.as_tensor(value)}
@@ -207,7 +207,7 @@ def tensors_of(model: Any, before: str = "") -> dict[str, Tensor]:
 def read_fields(kind: type, parts: Parts, sizes: dict[str, int], before: str = "") -> dict[str, Any]:
     """The stored fields of a model, as its file has them; those that may be None are where the file lacks them."""
     out: dict[str, Any] = {}
-    for name, each, hint, how in _stored(kind, before):
+    for name, each, hint, how in _stored_fields(kind, before):
         kinds = get_args(hint) or (hint,)
         if type(None) in kinds and not any(other == name or other.startswith(name) for other in parts.tensors):
             out[each] = None
@@ -227,7 +227,7 @@ def read_fields(kind: type, parts: Parts, sizes: dict[str, int], before: str = "
     return out
 
 
-def _stored(model: Any, before: str) -> Iterator[tuple[str, str, Any, Stored]]:
+def _stored_fields(model: Any, before: str) -> Iterator[tuple[str, str, Any, Stored]]:
     """Name in the file, name, type and storage of every stored field."""
     hints = get_type_hints(model if isinstance(model, type) else type(model))
     for each in fields(model):
@@ -237,7 +237,7 @@ def _stored(model: Any, before: str) -> Iterator[tuple[str, str, Any, Stored]]:
             yield f"{before}{name}{'.' if how.kind == 'part' and name else ''}", each.name, hints[each.name], how
 
 
-def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Tensor]]:
     from safetensors import SafetensorError, safe_open
 
     path = path.expanduser()
@@ -256,7 +256,7 @@ def _opened(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, T
     return header, tensors
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """numpy scalars become Python's, arrays and tuples lists."""
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()

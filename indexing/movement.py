@@ -47,7 +47,7 @@ def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, n
     if lacking:
         boxes = "bounding boxes have none; " if lacking == ["keypoints"] else ""
         raise ValueError(f"{name}: position has the axes {listed(axes)}, but no {lacking[0]}; {boxes}{NEEDED}")
-    position = _ordered(values, axes, ("time", "individuals", "keypoints", "space"))[..., _spatial(dataset, axes, values, name)]
+    position = _reorder(values, axes, ("time", "individuals", "keypoints", "space"))[..., _spatial(dataset, axes, values, name)]
     confidence = _confidence(dataset, position, name)
     times, rate, assumed = _times(dataset, attrs, len(position), fps, name)
     joints, people = _names(dataset, "keypoints", position.shape[2]), _names(dataset, "individuals", position.shape[1])
@@ -111,7 +111,7 @@ def _values(dataset: Any, name: str, who: str) -> tuple[FloatArray, tuple[str, .
     return values.astype(values.dtype if values.dtype in (np.float32, np.float64) else np.float64), axes
 
 
-def _ordered(values: FloatArray, axes: tuple[str, ...], wanted: tuple[str, ...]) -> FloatArray:
+def _reorder(values: FloatArray, axes: tuple[str, ...], wanted: tuple[str, ...]) -> FloatArray:
     """The axes in an order, those that are not there with one entry."""
     there = [axis for axis in wanted if axis in axes]
     values = values.transpose([axes.index(axis) for axis in there])
@@ -150,7 +150,7 @@ def _confidence(dataset: Any, position: FloatArray, who: str) -> FloatArray | No
     if not hasattr(getattr(dataset, "confidence", None), "dims"):
         return None
     values, axes = _values(dataset, "confidence", who)
-    found = _ordered(values, axes, ("time", "individuals", "keypoints", "space"))
+    found = _reorder(values, axes, ("time", "individuals", "keypoints", "space"))
     if found.shape != (*position.shape[:3], 1):
         raise ValueError(
             f"{who}: confidence has the axes {listed(axes)} and the shape {values.shape}, which do not fit position; {NEEDED}"

@@ -7,7 +7,6 @@ them words their arguments (``size=`` or ``--size``).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,24 +16,16 @@ from indexing.clip import Clip, FloatArray
 NAMED = 4  # clips that a sentence names; of more it says how many
 
 
-@dataclass(frozen=True)
-class RemarkOptions:
-    """When something is said of a recording."""
-
-    normalized: float = 1.5
-    """Coordinates from 0 to 1 stay below it, those of joints guessed outside of the image too."""
-
-
-REMARK = RemarkOptions()
+MAX_NORMALIZED = 1.5  # coordinates from 0 to 1 stay below it, those of joints guessed outside of the image too
 FOLLOWED = {"largest": "the largest", "confident": "the one that the detector trusts most", "tracked": "one who is tracked"}
 """Who of several people is followed, in words, by the rules of :mod:`indexing.readers.recording`."""
 
 
 def remarks_on(clips: Sequence[Clip], sized: bool = False) -> list[Message]:
     """What to know of clips besides who is in them: shape of the image, layout of the joints, clock."""
-    found = [] if sized else _grouped(clips, lambda clip: _STRETCHED if is_normalized(clip) else "")
-    found += _grouped(clips, _layout)
-    found += _grouped(clips, _lag)
+    found = [] if sized else _group(clips, lambda clip: _STRETCHED if is_normalized(clip) else "")
+    found += _group(clips, _layout)
+    found += _group(clips, _lag)
     return found
 
 
@@ -43,9 +34,7 @@ _STRETCHED = "coordinates from 0 to 1, so the shape of the image is not known an
 
 def is_normalized(clip: Clip) -> bool:
     """Whether a clip has coordinates of an image from 0 to 1: of images that are not square, people come out too wide or narrow."""
-    return (
-        clip.dims == 2 and clip.up == "-y" and bool(clip.seen.any()) and float(np.nanmax(np.abs(clip.joints))) <= REMARK.normalized
-    )
+    return clip.dims == 2 and clip.up == "-y" and bool(clip.seen.any()) and float(np.nanmax(np.abs(clip.joints))) <= MAX_NORMALIZED
 
 
 def _layout(clip: Clip) -> str:
@@ -67,7 +56,7 @@ def _lag(clip: Clip) -> str:
     return "may be smoothed by MediaPipe, whose tracking lags by up to 2.4 frames where movement is quick; 'dyntorch pose' does not"
 
 
-def _grouped(clips: Sequence[Clip], told: Callable[[Clip], str]) -> list[Message]:
+def _group(clips: Sequence[Clip], told: Callable[[Clip], str]) -> list[Message]:
     """One message for all clips of which the same is to be said."""
     who: dict[str, dict[str, None]] = {}
     for clip in clips:

@@ -84,10 +84,10 @@ def events(
     state = np.where(open_, scores.argmax(axis=1), -1)
     middle = (times[1:] + times[:-1]) / 2
     edges = np.concatenate([times[:1], middle, times[-1:]])
-    runs = _bridged(_runs(state), state, edges, MAX_GAP_SECONDS)
+    runs = _bridge_gaps(_runs(state), state, edges, MAX_GAP_SECONDS)
     # once flicker is gone, what it parted is one again
     long = [(a, b) for a, b in runs if edges[b + 1] - edges[a] >= MIN_EVENT_SECONDS]
-    runs = _bridged(long, state, edges, MAX_GAP_SECONDS)
+    runs = _bridge_gaps(long, state, edges, MAX_GAP_SECONDS)
     found = []
     for first, last in runs:
         label, inside = int(state[first]), np.arange(first, last + 1)
@@ -100,7 +100,7 @@ def events(
     return found
 
 
-def _bridged(runs: list[tuple[int, int]], state: Array, edges: Array, gap: float) -> list[tuple[int, int]]:
+def _bridge_gaps(runs: list[tuple[int, int]], state: Array, edges: Array, gap: float) -> list[tuple[int, int]]:
     """Runs of one class that only a short gap parts become one."""
     out: list[tuple[int, int]] = []
     for first, last in runs:

@@ -277,7 +277,7 @@ def unmap() -> None:
     """Let go of the files that this process has mapped."""
     from indexing.archive import search
 
-    search._opened.cache_clear()
+    search._open_segment.cache_clear()
     gc.collect()
 
 

@@ -23,7 +23,7 @@ from experiments.recognition.protocol import Array
 from indexing.brightness.features import blur, gradients
 from indexing.brightness.footage import Shrinker
 from indexing.brightness.library import VideoExemplars, library
-from indexing.brightness.sight import SMALLEST, described
+from indexing.brightness.sight import SMALLEST, describe_cells
 from indexing.brightness.stream import Warping
 from indexing.sync.brightness_features import CROP_SIDE, boxes, crop, inverse_root, motion, window_kernels
 from indexing.video import Chunk, track_points
@@ -56,7 +56,7 @@ def energy_grid(frames: Frames, fps: float) -> Tensor:
     """``(F, 64)`` brightness change above the noise in cells that overlap by half."""
     _, _, gt = gradients(blur(cropped(frames, fps), SIGMA))
     change = (gt.abs() - QUIET).clamp(min=0)
-    return described(_cells(change[:, None]))
+    return describe_cells(_cells(change[:, None]))
 
 
 def oriented_gradients(frames: Frames, fps: float) -> Tensor:
@@ -66,7 +66,7 @@ def oriented_gradients(frames: Frames, fps: float) -> Tensor:
     strength = (gx * gx + gy * gy).sqrt()
     sector = (torch.atan2(gy, gx) / torch.pi * DIRECTIONS).floor().long() % DIRECTIONS
     maps = torch.zeros(len(crops), DIRECTIONS, *crops.shape[1:]).scatter_(1, sector[:, None], strength[:, None])
-    return described(_cells((maps - QUIET).clamp(min=0)))
+    return describe_cells(_cells((maps - QUIET).clamp(min=0)))
 
 
 def tracks(frames: Frames, fps: float) -> Tensor:
@@ -83,7 +83,7 @@ def tracks(frames: Frames, fps: float) -> Tensor:
     near = (1 - (place[..., None] - 0.5 - torch.arange(CELLS)).abs()).clamp(min=0)  # (F, n, 2, cells): bilinear shares
     ways = torch.cat([speed, -speed], dim=2).clamp(min=0)
     cells = torch.einsum("fni,fnj,fnk->fkij", near[:, :, 1], near[:, :, 0], ways).flatten(1)
-    return described(cells.float(), 0.02)
+    return describe_cells(cells.float(), 0.02)
 
 
 def _cells(maps: Tensor) -> Tensor:

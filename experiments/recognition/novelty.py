@@ -14,7 +14,7 @@ from torch import Tensor
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip
 from indexing.action.bank import Windows
-from indexing.action.model import ClassProfiles, ShapeModel, class_scores, evidence, standardized
+from indexing.action.model import ClassProfiles, ShapeModel, class_scores, evidence, standardize
 from indexing.actors import dataset
 from indexing.joints import matched
 from indexing.joints import named as has_names
@@ -100,7 +100,7 @@ def _agreement(model: ShapeModel, query: Windows) -> Tensor:
     if model.kernels is not None:
         each += [model.kernel_scores(query), model.machine_scores(query)]
     votes = torch.stack([torch.nn.functional.one_hot(scores.argmax(dim=1), model.classes) for scores in each]).sum(dim=0)
-    margins = torch.stack([standardized(scores).topk(2, dim=1).values for scores in each]).mean(dim=0)
+    margins = torch.stack([standardize(scores).topk(2, dim=1).values for scores in each]).mean(dim=0)
     return votes.amax(dim=1) + 0.1 * (margins[:, 0] - margins[:, 1])
 
 

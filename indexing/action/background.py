@@ -66,7 +66,7 @@ class OtherMovement:
         return np.asarray(np.unique(np.array(self.kinds, dtype=str), return_inverse=True)[1])
 
 
-def _made(found: Sequence[tuple[str, Clip]], sure: bool) -> OtherMovement:
+def _collect(found: Sequence[tuple[str, Clip]], sure: bool) -> OtherMovement:
     return OtherMovement(tuple(clip for _, clip in found), tuple(kind for kind, _ in found), (sure,) * len(found))
 
 
@@ -90,10 +90,10 @@ def played_otherwise(clips: Sequence[Clip], ordered: bool, random_state: np.rand
             order[seen] = random_state.permutation(order[seen])
             joints = middle + (clip.joints - middle)[:, order]
             found.append((f"other joints {number}", clip.replace(joints=joints, confidence=None)))
-    return _made(found, False)
+    return _collect(found, False)
 
 
-def performed(skeleton: Skeleton | None, dims: int, random_state: np.random.Generator) -> OtherMovement:
+def perform_other_actions(skeleton: Skeleton | None, dims: int, random_state: np.random.Generator) -> OtherMovement:
     """Synthetic people who do everyday actions, each seen from somewhere; nothing where the joints cannot be told by name."""
     if not named(skeleton):
         return OtherMovement()
@@ -104,10 +104,10 @@ def performed(skeleton: Skeleton | None, dims: int, random_state: np.random.Gene
             found.append((str(clip.label), matched(clip, skeleton)[0]))
         except ValueError:  # too few joints have these names
             return OtherMovement()
-    return _made(found, False)
+    return _collect(found, False)
 
 
-def recorded(background: Iterable[Any], fps: float, joints: int, skeleton: Skeleton | None, seconds: float) -> OtherMovement:
+def cut_background(background: Iterable[Any], fps: float, joints: int, skeleton: Skeleton | None, seconds: float) -> OtherMovement:
     """Recordings of other movement, cut into pieces as long as an action."""
     try:
         clips = [part for item in as_clips(background, fps) for part in (item if isinstance(item, tuple) else (item,))]
@@ -121,7 +121,7 @@ def recorded(background: Iterable[Any], fps: float, joints: int, skeleton: Skele
             f"background: no {seconds:.3g} s without a gap in {len(clips)} clips show anybody; give a recording of other movement"
         )
     kept = np.unique(np.linspace(0, len(found) - 1, MAX_PIECES).round().astype(int))
-    return _made([found[i] for i in kept], True)
+    return _collect([found[i] for i in kept], True)
 
 
 def _pieces(clip: Clip, number: int, seconds: float) -> list[tuple[str, Clip]]:
@@ -146,7 +146,7 @@ def _pieces(clip: Clip, number: int, seconds: float) -> list[tuple[str, Clip]]:
 # What of it is too much like the action, and what a recording tells once background is taken out.
 
 
-def alike(exemplars: Exemplars, numbers: Array, kinds: Sequence[str]) -> Array:
+def find_similar_kinds(exemplars: Exemplars, numbers: Array, kinds: Sequence[str]) -> Array:
     """``(kinds,)`` bool, which of the made exemplars are of a kind that may be the action itself."""
     labels = torch.from_numpy(np.asarray(numbers))
     classes = int(labels.max()) + 1

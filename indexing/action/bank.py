@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics import map_blocks
-from indexing.action.planes import Fusion, entries, epipolar_correlation, factorize, fused
+from indexing.action.planes import Fusion, entries, epipolar_correlation, factorize, fuse_terms
 from indexing.action.symmetry import mirror
 from indexing.modelfile import stored
 
@@ -156,7 +156,7 @@ def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Te
     out = query.values.new_empty(len(query), len(bank))
     for rows, seen in patterns(query.seen):
         for columns, known in groups:
-            joints = _common(seen, known)
+            joints = _shared_joints(seen, known)
             if joints is None:
                 out[rows[:, None], columns] = worst
             else:
@@ -166,7 +166,7 @@ def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Te
     return out
 
 
-def _common(seen: Tensor, known: Tensor) -> Tensor | slice | None:
+def _shared_joints(seen: Tensor, known: Tensor) -> Tensor | slice | None:
     """The joints that both sides saw; ``None`` where they are too few."""
     both = seen & known
     if int(both.sum()) < min(COMMON, len(both)):
@@ -277,7 +277,7 @@ class Bank:
 
     def _described(self, copy: Copy, seen: Tensor) -> Iterator[Facing]:
         for numbers, known in copy.groups():
-            joints, count = _common(seen, known), len(copy.windows) if numbers is None else len(numbers)
+            joints, count = _shared_joints(seen, known), len(copy.windows) if numbers is None else len(numbers)
             if joints is None or not count:
                 yield Facing(numbers)
                 continue
@@ -292,7 +292,7 @@ def _among(joints: Tensor | slice, describe: Describe, values: Tensor) -> Descri
     return describe(values[:, :, joints])
 
 
-def least(
+def least_over_copies(
     query: Windows, banks: Sequence[Bank], compare: Compare, worst: Sequence[float], chosen: Tensor | None = None
 ) -> list[Tensor]:
     """``(queries, exemplars)`` tables, each the least over the exemplars' copies of what ``compare`` says."""
@@ -370,7 +370,9 @@ def fused_residual(
 def fused_residuals(query: Windows, banks: Sequence[Bank], fusions: Sequence[Fusion], chosen: Tensor | None = None) -> list[Tensor]:
     """The same of banks of planes (:func:`planes_of`): a ``(queries, chosen)`` table for each fusion."""
     worst = [(1.0 + EPSILON) ** (len(one.terms) * sum(one.powers)) for one in fusions]
-    tables = least(query, banks, lambda left, right: fused(left.parts, right.parts, fusions, EPSILON), worst, chosen)
+    tables = least_over_copies(
+        query, banks, lambda left, right: fuse_terms(left.parts, right.parts, fusions, EPSILON), worst, chosen
+    )
     return [table.log_() for table in tables]
 
 
@@ -422,7 +424,9 @@ class Kernels:
     def fit(self, windows: Windows) -> Tensor:
         """Set the scales from training windows and return their ``(N, N)`` kernel matrix."""
         chosen = windows[torch.arange(0, len(windows), max(1, len(windows) // MAX_SCALE_WINDOWS))]
-        tables = least(chosen, [self.bank(chosen)], lambda left, right: list(self._distances(left, right)), [1.0] * self.count)
+        tables = least_over_copies(
+            chosen, [self.bank(chosen)], lambda left, right: list(self._distances(left, right)), [1.0] * self.count
+        )
         self.scales = torch.stack([kernel_scale(table, KERNEL_WIDTH) for table in tables])
         return self(windows, windows)
 
@@ -443,7 +447,7 @@ class Kernels:
                 out.add_(kernel)
             return [out.div_(len(slopes))]
 
-        return least(query, [bank if isinstance(bank, Bank) else self.bank(bank)], total, [0.0])[0]
+        return least_over_copies(query, [bank if isinstance(bank, Bank) else self.bank(bank)], total, [0.0])[0]
 
     def _describer(self, joints: Tensor | slice) -> Describe:
         weights = [self.metric.weights(name, joints) for name in CHANNELS]

@@ -106,7 +106,7 @@ class Exemplars:
         )
 
 
-def cut(clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Generator) -> Exemplars:
+def cut_exemplars(clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Generator) -> Exemplars:
     """Cut everything that is kept of the clips; 3D clips are rendered, first as seen along z, then from around."""
     images = [_render(clip, 0.0, VIEW_ELEVATION, random_state) for clip in clips]
     source = ragged(images, plan.repair)
@@ -114,14 +114,14 @@ def cut(clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Gener
     crops = CROPS if plan.search else CROPS[:1]
     cropped = stack([Windows(whole(source, plan.length, crop), seen) for crop in crops])
     views = [_view(clips, source, plan, random_state) for _ in range(plan.views)]
-    seconds = torch.tensor([lasts(clip) for clip in images], dtype=torch.float32)
+    seconds = torch.tensor([clip_seconds(clip) for clip in images], dtype=torch.float32)
     window = moment_window(plan.window, seconds)
     moments, owner = slide(source, plan.length, window, plan.stride * window / plan.window)
     solid = torch.tensor([clip.dims == 3 for clip in clips])
     return Exemplars(cropped, stack(views) if views else cropped[:0], moments, owner, solid, seconds, recurrence(source))
 
 
-def lasts(clip: Clip) -> float:
+def clip_seconds(clip: Clip) -> float:
     """Seconds from the first frame of a clip to the end of its last one."""
     steps = np.diff(clip.times)
     return float(clip.duration + (np.median(steps) if len(steps) else 0.0))

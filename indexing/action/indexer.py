@@ -15,16 +15,16 @@ from dyntorch.numerics import one_thread
 from indexing.action.background import (
     FALSE_ALARM_RATE,
     OtherMovement,
-    alike,
+    cut_background,
     event_level,
-    performed,
+    find_similar_kinds,
+    perform_other_actions,
     played_otherwise,
-    recorded,
     segment_evidence,
     without_background,
 )
 from indexing.action.bank import Windows
-from indexing.action.exemplars import CROPS, NUM_VIEWS, NUM_VIEWS_SOLID, ExemplarPlan, Exemplars, cut, lasts
+from indexing.action.exemplars import CROPS, NUM_VIEWS, NUM_VIEWS_SOLID, ExemplarPlan, Exemplars, clip_seconds, cut_exemplars
 from indexing.action.inputs import check_common, check_plan, check_queries, gather, gather_groups, gather_labels
 from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel, read_shape_model
@@ -35,7 +35,7 @@ from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, Rule, SavedClassi
 from indexing.joints import layout_of
 from indexing.modelfile import Parts, labels_from_json, labels_to_json, skeleton_from_json, skeleton_to_json, tensors_of
 from indexing.modelfile import whole as whole_number
-from indexing.recordings.decoding import Explanation, Withheld, explain
+from indexing.recordings.decoding import Explanation, Withheld, decode
 from indexing.recordings.live import ActionStream, LiveSource
 from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
@@ -227,7 +227,7 @@ class ActionIndexer(SavedClassifier):
         rng = np.random.default_rng(self.random_state)
         other = self._other_movement(found, len(classes) == 1, background)
         plan = self._plan(_default_views(found))
-        exemplars = cut([*found, *other.clips], plan, rng)
+        exemplars = cut_exemplars([*found, *other.clips], plan, rng)
         numbers = np.concatenate([numbers, len(classes) + other.numbers])
         if people is not None:
             people = np.concatenate([people, [f"background: {kind}" for kind in other.kinds]])
@@ -247,12 +247,12 @@ class ActionIndexer(SavedClassifier):
         skeleton = layout_of(found)
         other = OtherMovement()
         if background is not None:
-            lengths = [lasts(clip) for clip in found]
-            other += recorded(background, self.fps, found[0].joints.shape[1], skeleton, float(np.median(lengths)))
+            lengths = [clip_seconds(clip) for clip in found]
+            other += cut_background(background, self.fps, found[0].joints.shape[1], skeleton, float(np.median(lengths)))
         if alone:
             # a generator of its own: what is made does not hang on how the exemplars are seen
             rng = np.random.default_rng(0)
-            people = performed(skeleton, 3 if all(clip.dims == 3 for clip in found) else 2, rng)
+            people = perform_other_actions(skeleton, 3 if all(clip.dims == 3 for clip in found) else 2, rng)
             other += people + played_otherwise(found, not len(people), rng)
         return other
 
@@ -263,7 +263,7 @@ class ActionIndexer(SavedClassifier):
         own = np.where(hidden, numbers - known + 1, 0)[new | hidden]
         kinds = other.kinds if other is not None else ("",) * int(hidden.sum())
         kept = np.ones(len(numbers), dtype=bool)
-        kept[hidden] = ~alike(exemplars.only(asked), own, kinds)
+        kept[hidden] = ~find_similar_kinds(exemplars.only(asked), own, kinds)
         if other is not None:
             kept[hidden] |= np.array(other.sure)
         return kept
@@ -296,7 +296,7 @@ class ActionIndexer(SavedClassifier):
         plan = self._plan(len(self.model_.exemplars.views) // len(before))
         seed = 0 if self.random_state is None else self.random_state
         rng = np.random.default_rng([seed, len(before)])
-        extended = self.model_.exemplars.extended(cut(found, plan, rng))
+        extended = self.model_.exemplars.extended(cut_exemplars(found, plan, rng))
         if self.model_.hidden:
             kept = self._unlike(extended, numbers, len(known), np.arange(len(numbers)) >= len(before))
             if len(known) > 1 or kept[numbers >= len(known)].any():
@@ -430,7 +430,7 @@ class ActionIndexer(SavedClassifier):
         found = mended(found) if self.repair else found
         model = self._model()
         rate = None if model.hidden else self.reject
-        told = explain(
+        told = decode(
             model,
             found,
             self._stream(),

@@ -86,8 +86,8 @@ class Evidence:
 def epipolar(cross: Entries, left: Entries, right: Entries) -> Tensor:
     r"""Residual :math:`1 - s_1` of two images from their products: differentiable, closed form."""
     c00, c01, c10, c11 = cross
-    l00, l01, l11, left_det = _ridged(left)
-    r00, r01, r11, right_det = _ridged(right)
+    l00, l01, l11, left_det = _add_ridge(left)
+    r00, r01, r11, right_det = _add_ridge(right)
     # D = adj(L) C, then tr(D adj(R) C^T), whose entries are products of these
     d00, d01 = l11 * c00 - l01 * c10, l11 * c01 - l01 * c11
     d10, d11 = l00 * c10 - l01 * c00, l00 * c11 - l01 * c01
@@ -101,7 +101,7 @@ def epipolar(cross: Entries, left: Entries, right: Entries) -> Tensor:
     return 1 - ((trace + root) / 2).clamp(min=1e-10, max=1.0).sqrt()
 
 
-def _ridged(gram: Entries) -> Entries:
+def _add_ridge(gram: Entries) -> Entries:
     """Entries 00, 01, 11 and the determinant of symmetric 2x2 matrices, with a ridge."""
     scale = (gram[0] + gram[3]).clamp(min=1e-30)
     a, b, d = gram[0] + GRAM_EPSILON * scale, gram[1], gram[3] + GRAM_EPSILON * scale
@@ -146,7 +146,7 @@ def gather(
 def _products(query: Windows, nearest: Windows, metric: JointMetric, name: str, shape: torch.Size) -> Tensor:
     """``(3, *shape, 2, 2, joints)`` tables of one channel; a joint that either side has not seen counts for nothing."""
     count = query.values.shape[2]
-    x, y = (metric.apply(_filled(part), name).unflatten(1, (-1, count)) for part in (query, nearest))
+    x, y = (metric.apply(_fill_unseen(part), name).unflatten(1, (-1, count)) for part in (query, nearest))
     y = y.unflatten(0, shape)
     own = torch.einsum("qtja,qtjb->qabj", x, x)[None, :, None].expand(*shape, 2, 2, count)
     pairs = torch.einsum("qtja,cqktjb->cqkabj", x, y), own, torch.einsum("cqktja,cqktjb->cqkabj", y, y)
@@ -154,7 +154,7 @@ def _products(query: Windows, nearest: Windows, metric: JointMetric, name: str, 
     return torch.stack(pairs) * both[..., None, None, :]
 
 
-def _filled(windows: Windows) -> Tensor:
+def _fill_unseen(windows: Windows) -> Tensor:
     """Joints never seen moved to the middle of the others, where they change no mean."""
     known = windows.seen[:, None, :, None].to(windows.values)
     middle = (windows.values * known).sum(dim=2, keepdim=True) / known.sum(dim=2, keepdim=True).clamp(min=1.0)

@@ -22,7 +22,7 @@ from indexing.action.model import (
     class_scores,
     evidence,
     mirror_some,
-    standardized,
+    standardize,
 )
 from indexing.action.symmetry import turn
 from indexing.scoring import SHARPNESS
@@ -83,14 +83,14 @@ def learn_blend(model: ShapeModel, groups: Tensor, trained: Trained | None) -> B
             found.append(_machine_out(model, trained, windows, folds))
         if model.scorer != "kernel":
             found.append(_out(model.residuals(windows), model, folds))
-        views.append(torch.stack([standardized(scores) for scores in found]))
+        views.append(torch.stack([standardize(scores) for scores in found]))
     evidence = torch.cat([view[:, usable] for view in views], dim=1).double()
     truth = labels[usable].repeat(len(asked))
     if model.scorer != "both":
-        return _sharpened(model.blend, evidence[0], truth, int(usable.sum()))
+        return _fit_sharpness(model.blend, evidence[0], truth, int(usable.sum()))
     few = int(torch.bincount(labels).median()) < MIN_EXAMPLES_TO_BLEND
     blend = model.blend if few else _fewest_mistakes(evidence, truth, model.blend)
-    return _sharpened(blend, blended(evidence, blend), truth, int(usable.sum()))
+    return _fit_sharpness(blend, blend_scores(evidence, blend), truth, int(usable.sum()))
 
 
 def _out(residuals: Tensor, model: ShapeModel, folds: Tensor) -> Tensor:
@@ -138,7 +138,7 @@ def _machine_out(model: ShapeModel, trained: Trained, asked: Windows, folds: Ten
     return out
 
 
-def blended(evidence: Tensor, blend: Blend) -> Tensor:
+def blend_scores(evidence: Tensor, blend: Blend) -> Tensor:
     """``(N, classes)`` sum of the standardized scores ``(2, N, classes)`` of B and A."""
     return blend.kernel * evidence[0] + blend.nearest * evidence[1]
 
@@ -148,16 +148,16 @@ def _fewest_mistakes(evidence: Tensor, truth: Tensor, prior: Blend) -> Blend:
     best, chosen = (float("inf"), 0.0), prior
     for kernel, nearest in BLENDS:
         blend = dataclasses.replace(prior, kernel=kernel, nearest=nearest)
-        wrong = float((blended(evidence, blend).argmax(dim=1) != truth).sum())
+        wrong = float((blend_scores(evidence, blend).argmax(dim=1) != truth).sum())
         far = abs(nearest / (kernel + nearest) - prior.nearest / (prior.kernel + prior.nearest))
         if (wrong, far) < best:
             best, chosen = (wrong, far), blend
     return chosen
 
 
-def _sharpened(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int) -> Blend:
+def _fit_sharpness(blend: Blend, scores: Tensor, truth: Tensor, exemplars: int) -> Blend:
     """The blend with the sharpness that makes the answers most likely, were one more of the exemplars asked a mistake."""
-    even, count = standardized(scores), scores.shape[1]
+    even, count = standardize(scores), scores.shape[1]
     doubt = 1 / (exemplars + 2)
     losses = []
     for sharp in SHARPNESSES:
@@ -339,7 +339,7 @@ def importance(model: ShapeModel, groups: Tensor | None = None, seed: int = 0) -
     originals, labels = model.exemplars.crop(0), model.labels
     groups = torch.arange(len(labels), device=labels.device) if groups is None else groups.to(labels.device)
     generator = torch.Generator().manual_seed(seed)
-    asked = _asked(labels, generator)
+    asked = _sample_queries(labels, generator)
     query, truth = originals[asked], labels[asked]
     hidden = groups[asked][:, None] == groups[None]
     member = torch.nn.functional.one_hot(labels, model.classes).double()
@@ -374,7 +374,7 @@ def halves(joints: int, generator: torch.Generator) -> Tensor:
     return torch.stack(out)
 
 
-def _asked(labels: Tensor, generator: torch.Generator) -> Tensor:
+def _sample_queries(labels: Tensor, generator: torch.Generator) -> Tensor:
     """At most ``MAX_IMPORTANCE_QUERIES`` exemplars, as many of every class as there are or as fit."""
     each = max(1, MAX_IMPORTANCE_QUERIES // int(labels.max() + 1))
     order = torch.randperm(len(labels), generator=generator).to(labels.device)

@@ -209,7 +209,7 @@ class ShapeModel:
         return there
 
     def _there(self, device: str | torch.device) -> ShapeModel:
-        moved: dict[str, Any] = {f.name: _moved(getattr(self, f.name), device) for f in dataclasses.fields(self) if f.init}
+        moved: dict[str, Any] = {f.name: _to_device(getattr(self, f.name), device) for f in dataclasses.fields(self) if f.init}
         return dataclasses.replace(self, **moved)
 
     def shown(self) -> NDArray[np.bool_]:
@@ -295,7 +295,7 @@ class ShapeModel:
         nearest = self.nearest_scores(query) if nearest is None else nearest
         if self.scorer == "nearest":
             return nearest
-        return self.blend.kernel * standardized(self.machine_scores(query)) + self.blend.nearest * standardized(nearest)
+        return self.blend.kernel * standardize(self.machine_scores(query)) + self.blend.nearest * standardize(nearest)
 
     def evidence(self, query: Windows, nearest: Tensor | None = None) -> Tensor:
         """``(Q,)`` how well a query shows one of the known actions rather than another one."""
@@ -347,7 +347,7 @@ def class_scores(residuals: Tensor, labels: Tensor, classes: int) -> Tensor:
     return out
 
 
-def standardized(scores: Tensor) -> Tensor:
+def standardize(scores: Tensor) -> Tensor:
     """Zero mean and unit deviation over the classes of each query; two classes keep their margin (else it were +-1)."""
     centred = scores - scores.mean(dim=1, keepdim=True)
     if scores.shape[1] == 2:
@@ -362,12 +362,12 @@ def mirror_some(windows: Windows, symmetry: Tensor, chosen: Tensor) -> Windows:
     return Windows(values, torch.where(chosen[:, None], windows.seen[:, symmetry], windows.seen))
 
 
-def _moved(value: object, device: str | torch.device) -> object:
+def _to_device(value: object, device: str | torch.device) -> object:
     """Tensors, and dataclasses of tensors, on another device."""
     if isinstance(value, Tensor):
         return value.to(device)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return dataclasses.replace(value, **{f.name: _moved(getattr(value, f.name), device) for f in dataclasses.fields(value)})
+        return dataclasses.replace(value, **{f.name: _to_device(getattr(value, f.name), device) for f in dataclasses.fields(value)})
     return value
 
 

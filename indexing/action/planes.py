@@ -67,12 +67,12 @@ def _products(c: Entries, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     return torch.mul(c00, l00, out=rest).mul_(m00), heights
 
 
-def _same(c: Entries, left: Tensor, right: Tensor) -> Tensor:
+def _image_correlation(c: Entries, left: Tensor, right: Tensor) -> Tensor:
     across, heights = _products(c, left, right)
     return across.add_(heights)
 
 
-def _turned(c: Entries, left: Tensor, right: Tensor) -> Tensor:
+def _card_correlation(c: Entries, left: Tensor, right: Tensor) -> Tensor:
     """A turn of a flat card scales its x by -1 to 1: the best one takes the product of the x without its sign."""
     across, heights = _products(c, left, right)
     return across.abs_().add_(heights)
@@ -81,8 +81,8 @@ def _turned(c: Entries, left: Tensor, right: Tensor) -> Tensor:
 # Evidence of a pair of windows in one channel: a correlation, 1 where they are the same.
 TERMS: dict[str, Callable[[Entries, Tensor, Tensor], Tensor]] = {
     "epi": lambda c, left, right: epipolar_correlation(c),
-    "nn": _same,
-    "turned": _turned,
+    "nn": _image_correlation,
+    "turned": _card_correlation,
 }
 
 
@@ -94,7 +94,7 @@ class Fusion:
     powers: tuple[float, ...]
 
 
-def fused(left: Sequence[Tensor], right: Sequence[Tensor], fusions: Sequence[Fusion], epsilon: float) -> list[Tensor]:
+def fuse_terms(left: Sequence[Tensor], right: Sequence[Tensor], fusions: Sequence[Fusion], epsilon: float) -> list[Tensor]:
     r"""``(Q, E)`` products :math:`\prod_c \prod_{\text{terms}} (r_c + \epsilon)^{w_c}` of residuals, of each fusion."""
     found: list[Tensor | None] = [None] * len(fusions)
     for i in range(len(left) // 2):

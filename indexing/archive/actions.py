@@ -69,7 +69,7 @@ def find(
     from indexing.action.indexer import ActionIndexer
 
     indexer = ActionIndexer.load(Path(model).expanduser()) if isinstance(model, (str, os.PathLike)) else model
-    data = _dumped(indexer)
+    data = _model_bytes(indexer)
     probes = probes_of(snapshot, indexer)
     if not probes:
         known = ", ".join(one.name for one in snapshot.contents.layouts.values()) or "nothing"
@@ -174,7 +174,7 @@ def _events(task: FindTask, segment: ArchiveSegment, tracks: Sequence[int]) -> l
         return []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that the model has other joints, too, is so of every recording
-        return list(_loaded(task.model).find(clip))
+        return list(_load_model(task.model).find(clip))
 
 
 def marked_rows(track: ArchiveSegment, probes: Sequence[Probe]) -> NDArray[np.bool_]:
@@ -185,7 +185,7 @@ def marked_rows(track: ArchiveSegment, probes: Sequence[Probe]) -> NDArray[np.bo
     return np.asarray(total[np.minimum(index + margin + 1, len(mask))] > total[np.maximum(index - margin, 0)])
 
 
-def _dumped(indexer: ActionIndexer) -> bytes:
+def _model_bytes(indexer: ActionIndexer) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / MODEL
         indexer.save(path)
@@ -193,7 +193,7 @@ def _dumped(indexer: ActionIndexer) -> bytes:
 
 
 @lru_cache(maxsize=4)
-def _loaded(data: bytes) -> ActionIndexer:
+def _load_model(data: bytes) -> ActionIndexer:
     """A worker loads a model once, however many tasks bring it along."""
     from indexing.action.indexer import ActionIndexer
 

@@ -136,7 +136,7 @@ class Catalogue:
         except OSError as problem:
             said = problem.strerror or problem
             raise ValueError(f"{folder}: cannot be written ({said}); choose a folder that you may write to") from problem
-        with _told(folder), contextlib.closing(_connect(path)) as connection:
+        with _database_errors(folder), contextlib.closing(_connect(path)) as connection:
             if connection.execute("SELECT name FROM sqlite_master").fetchone() is None:
                 _write_ahead(connection)
                 connection.execute("BEGIN IMMEDIATE")
@@ -152,7 +152,7 @@ class Catalogue:
     @contextlib.contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
         """A connection whose answers are all of one moment."""
-        with _told(self.folder), contextlib.closing(self._reader()) as connection:
+        with _database_errors(self.folder), contextlib.closing(self._reader()) as connection:
             connection.execute("BEGIN")
             yield connection
             connection.execute("COMMIT")
@@ -178,7 +178,7 @@ class Catalogue:
     @contextlib.contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
         """A connection whose changes are made all or none, when the block ends."""
-        with _told(self.folder), contextlib.closing(_connect(self.path)) as connection:
+        with _database_errors(self.folder), contextlib.closing(_connect(self.path)) as connection:
             connection.execute("PRAGMA synchronous=FULL")
             connection.execute("BEGIN IMMEDIATE")
             try:
@@ -367,7 +367,7 @@ def _skeleton(text: str | None) -> Skeleton | None:
 
 
 @contextlib.contextmanager
-def _told(folder: Path) -> Iterator[None]:
+def _database_errors(folder: Path) -> Iterator[None]:
     """What SQLite says, as one line with a remedy."""
     try:
         yield

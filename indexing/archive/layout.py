@@ -64,7 +64,7 @@ class Layout:
         step = max(1, sum(map(len, tracks)) // MAX_LEARNED_POSES)
         poses = np.concatenate([track.positions()[::step] for track in tracks])
         centred = _unit(poses)
-        covariance = _grounded(np.einsum("tjd,tkd->jk", centred, centred, dtype=np.float64))
+        covariance = _normalize_gram(np.einsum("tjd,tkd->jk", centred, centred, dtype=np.float64))
         values, vectors = np.linalg.eigh(covariance)
         values, vectors = values[::-1][: storage.dimensions].clip(min=0), vectors[:, ::-1][:, : storage.dimensions]
         # the sign of a direction is nobody's choice: the largest entry is positive, on every machine
@@ -165,7 +165,7 @@ def _unit(poses: FloatArray) -> NDArray[np.float64]:
     return np.asarray(x / np.where(norm > 0, norm, 1.0))
 
 
-def _grounded(gram: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normalize_gram(gram: NDArray[np.float64]) -> NDArray[np.float64]:
     """With mean diagonal 1; a joint of which nothing is known is like the others."""
     unknown = np.diag(gram) <= 0
     total = np.trace(gram)
@@ -176,7 +176,7 @@ def _grounded(gram: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _metric(windows: Tensor, seen: Tensor) -> NDArray[np.float64]:
     """``(channels, joints, joints)`` covariances over windows."""
-    return np.stack([_grounded(one) for one in JointMetric.learn(windows, seen, 1.0).covariance.numpy()])
+    return np.stack([_normalize_gram(one) for one in JointMetric.learn(windows, seen, 1.0).covariance.numpy()])
 
 
 def _windows(tracks: Sequence[Track], storage: StorageFormat) -> tuple[Tensor, Tensor]:

@@ -256,11 +256,11 @@ def _select(
 @one_thread
 def scan_task(task: ScanTask) -> Candidates:
     """What a worker does: it needs nothing but the file."""
-    return scan(_opened(str(task.path)), task.probes, task.keep, task.dead, task.begin, task.end)
+    return scan(_open_segment(str(task.path)), task.probes, task.keep, task.dead, task.begin, task.end)
 
 
 @lru_cache(maxsize=256)
-def _opened(path: str) -> ArchiveSegment:
+def _open_segment(path: str) -> ArchiveSegment:
     return ArchiveSegment.open(Path(path))
 
 

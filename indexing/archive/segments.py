@@ -118,18 +118,18 @@ class ArchiveSegment:
                 os.posix_fadvise(stream.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
             length = int.from_bytes(stream.read(8), "little")
             if not 2 <= length <= min(HEADER, size - 8):
-                raise damaged(path, "its header is cut off")
+                raise damage_error(path, "its header is cut off")
             header = _header(path, stream.read(length))
             try:
                 places = {name: _place(header[name], 8 + length) for name in SHAPES}
                 rate = float(header["__metadata__"]["rate"])
             except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as problem:
-                raise damaged(path, "its header makes no sense") from problem
+                raise damage_error(path, "its header makes no sense") from problem
             arrays = {name: _array(path, stream, name, *places[name], size) for name in SHAPES}
         segment = cls(path, **arrays, rate=rate)
         wrong = segment.check()
         if wrong is not None:
-            raise damaged(path, wrong)
+            raise damage_error(path, wrong)
         return segment
 
     def __len__(self) -> int:
@@ -177,7 +177,7 @@ class ArchiveSegment:
         return None if whole and (self.firsts == np.cumsum(rows) - rows).all() else "its tracks do not lie end to end"
 
 
-def damaged(path: Path, what: str) -> ValueError:
+def damage_error(path: Path, what: str) -> ValueError:
     """The one message of a file that is not what it should be."""
     return ValueError(f"{path}: {what}; dyntorch archive verify says what is lost: remove those sources and add them again")
 
@@ -189,9 +189,9 @@ def _header(path: Path, data: bytes) -> dict[str, Any]:
         about = header.get("__metadata__", {})
         form, version = about.get("format"), int(about.get("version", 0))
     except (TypeError, ValueError, AttributeError, OverflowError) as problem:
-        raise damaged(path, "its header makes no sense") from problem
+        raise damage_error(path, "its header makes no sense") from problem
     if form != FORMAT:
-        raise damaged(path, "it is no segment of an archive")
+        raise damage_error(path, "it is no segment of an archive")
     if version > VERSION:
         raise ValueError(f"{path}: written by a newer dyntorch (segment version {version}); update dyntorch")
     return header
@@ -209,7 +209,7 @@ def _array(
     """One array of the file, which must lie in it: mapped where there is a row of it for each pose, read otherwise."""
     expected = math.prod(shape) * np.dtype(kind).itemsize
     if len(shape) != SHAPES[name] or min(shape) < 0 or end - begin != expected or end > size or begin < 0:
-        raise damaged(path, "it is cut off")
+        raise damage_error(path, "it is cut off")
     if expected == 0:
         return np.zeros(shape, kind)
     if name not in MAPPED:

@@ -204,9 +204,9 @@ def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float, q
         for low in range(0, total - samples + 1, BLOCK):
             x = _poses(segment, low, min(total, low + BLOCK + samples - 1), stride)
             gram = _gram(x)
-            resting = _gram(_summed(x, samples)) / samples
+            resting = _gram(_window_sums(x, samples)) / samples
             scores = _scores(x, gram, mine, resting)
-            energy = _summed(gram[0] + gram[2], samples)
+            energy = _window_sums(gram[0] + gram[2], samples)
             moved = 1.0 - (resting[0] + resting[2]) / torch.where(energy > 0, energy, 1.0)
             scores[moved < quiet * torch.tensor([[probe.moved] for probe in mine])] = -1.0
             best = scores.amax(dim=0)
@@ -239,11 +239,11 @@ def _scores(x: Tensor, gram: Tensor, probes: Sequence[Probe], resting: Tensor | 
     c = products[:, :, :, 0, :count].clone()
     for step in range(1, samples):
         c += products[:, :, :, step, step : step + count]
-    total = _summed(gram, samples)
+    total = _window_sums(gram, samples)
     return correlation(c, total if resting is None else total - resting)
 
 
-def _summed(values: Tensor, samples: int) -> Tensor:
+def _window_sums(values: Tensor, samples: int) -> Tensor:
     """``(..., windows)`` the sums over each window of ``(..., poses)``."""
     count = values.shape[-1] - samples + 1
     total = values[..., :count].clone()

@@ -123,17 +123,17 @@ def _of_clip(clip: Clip) -> ArchiveSource:
 
 def _of_path(path: Path) -> list[ArchiveSource]:
     path = path.expanduser()
-    return _walked(path, set()) if os.path.isdir(path) and not is_recording(path) else [_of_file(path)]
+    return _walk(path, set()) if os.path.isdir(path) and not is_recording(path) else [_of_file(path)]
 
 
 def _of_file(path: Path) -> ArchiveSource:
     """A file, or a folder that is one recording; whatever is wrong with it is found when it is read."""
-    return ArchiveSource(storable(f"file:{_resolved(path)}"), storable(str(path)), path)
+    return ArchiveSource(storable(f"file:{_resolve(path)}"), storable(str(path)), path)
 
 
-def _walked(folder: Path, walked: set[Path]) -> list[ArchiveSource]:
+def _walk(folder: Path, walked: set[Path]) -> list[ArchiveSource]:
     """All that is in a folder, by name; links that lead to where the walk has been are not followed."""
-    real = Path(_resolved(folder))
+    real = Path(_resolve(folder))
     if real in walked:
         return []
     walked.add(real)
@@ -150,7 +150,7 @@ def _walked(folder: Path, walked: set[Path]) -> list[ArchiveSource]:
             if is_recording(one):
                 found.append(_of_file(one))
             elif not os.path.exists(one / CATALOGUE):
-                found += _walked(one, walked)
+                found += _walk(one, walked)
         elif one.suffix.lower() in KEYPOINT_FILES:
             found.append(_of_file(one))
         elif one.suffix.lower() in VIDEOS:
@@ -181,7 +181,7 @@ def _is_video(path: Path | None) -> bool:
     return path is not None and path.suffix.lower() in VIDEOS and not os.path.isdir(path)
 
 
-def _resolved(path: Path) -> str:
+def _resolve(path: Path) -> str:
     try:
         return os.path.realpath(path)
     except (OSError, ValueError):  # no file can have this name
@@ -303,10 +303,10 @@ def read_source(source: ArchiveSource, reading: Mapping[str, Any], storage: Stor
         return ReadSource(Stamp(before.size, before.modified, held), kept, note)
     except Exception as problem:  # one file among thousands must not end an addition, whatever a reader does with it
         remedy = "; check the path and its permissions" * isinstance(problem, OSError)
-        return ReadSource(Stamp(0, 0), failure=told(source, problem) + remedy)
+        return ReadSource(Stamp(0, 0), failure=failure_text(source, problem) + remedy)
 
 
-def told(source: ArchiveSource, problem: Exception) -> str:
+def failure_text(source: ArchiveSource, problem: Exception) -> str:
     """What is wrong with a source, as one line that names it; a reader's own words name it already."""
     if isinstance(problem, ValueError):
         return " ".join(str(problem).split())

@@ -32,7 +32,7 @@ class QuietProcesses(ProcessPoolExecutor):
     """Processes of one thread each, started afresh, that leave an interruption to the process that asked, which ends them."""
 
     def __init__(self, workers: int | None = None) -> None:
-        super().__init__(workers or os.cpu_count() or 1, multiprocessing.get_context("spawn"), initializer=_alone)
+        super().__init__(workers or os.cpu_count() or 1, multiprocessing.get_context("spawn"), initializer=_use_one_thread)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """As of any pool; a process starts here, where none is idle, and takes after this one."""
@@ -40,7 +40,7 @@ class QuietProcesses(ProcessPoolExecutor):
             return super().submit(fn, *args, **kwargs)
 
 
-def _alone() -> None:
+def _use_one_thread() -> None:
     """One thread: the others are the other workers'.  Whoever interrupts means the process that asked."""
     import torch
 

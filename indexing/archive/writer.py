@@ -20,8 +20,8 @@ from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Catalogue, Contents, RecordingRow, SegmentRow, SourceRow, add_layout, drop_recordings
 from indexing.archive.layout import MAX_LEARNED_POSES, Layout, layout_key
 from indexing.archive.results import Addition, Outcome, SourceOutcome, Verification
-from indexing.archive.segments import ArchiveSegment, WrittenSegment, damaged, intact, write_segment
-from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, read_source, reading_key, stamp, told
+from indexing.archive.segments import ArchiveSegment, WrittenSegment, damage_error, intact, write_segment
+from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, failure_text, read_source, reading_key, stamp
 from indexing.archive.tracks import StorageFormat, Track, total_windows, windows_of
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.opening import count, listed
@@ -89,7 +89,7 @@ def add(
 ) -> Addition:
     """Add what is new or has changed; see :meth:`indexing.Archive.add`."""
     with catalogue.alone():
-        clear(catalogue)
+        remove_orphans(catalogue)
         adder = Adder(catalogue, options, reading)
         outcomes: dict[str, SourceOutcome] = {}
         news = list(_news(adder.known, sources, adder.reading, outcomes))
@@ -112,14 +112,14 @@ def _news(
     """The sources that must be read; of the others, what became of them."""
     for source in sources:
         row = known.get(source.key)
-        if row is None or row.reading != _asked(source, reading):
+        if row is None or row.reading != _reading_of(source, reading):
             yield source
             continue
         try:
             now = stamp(source)
         except (OSError, ValueError) as problem:
             outcomes[source.key] = SourceOutcome(
-                source.name, "failed", f"{told(source, problem)}; what is in the archive of it stays"
+                source.name, "failed", f"{failure_text(source, problem)}; what is in the archive of it stays"
             )
             continue
         same = now.sha256 == row.sha256 if source.clip is not None else (now.size, now.modified) == (row.size, row.modified)
@@ -129,7 +129,7 @@ def _news(
             yield source
 
 
-def _asked(source: ArchiveSource, reading: str) -> str:
+def _reading_of(source: ArchiveSource, reading: str) -> str:
     """How a source is read: clips from memory are as they are."""
     return reading if source.clip is None else ""
 
@@ -162,7 +162,7 @@ class Adder:
         if read.failure:
             return SourceOutcome(source.name, "failed", read.failure)
         row = self.known.get(source.key)
-        if row is not None and row.reading == _asked(source, self.reading) and row.sha256 == read.stamp.sha256:
+        if row is not None and row.reading == _reading_of(source, self.reading) and row.sha256 == read.stamp.sha256:
             self._touch(row, read.stamp)
             return SourceOutcome(source.name, "known", row.note)
         self.staged.sources.append((source, read))
@@ -203,7 +203,7 @@ class Adder:
             _unlink(self.catalogue, [row for one in written.values() for row in one.joined])
         except BaseException:
             with contextlib.suppress(OSError, ValueError):
-                clear(self.catalogue)  # what is not in the catalogue: an interruption may have come after the commit
+                remove_orphans(self.catalogue)  # what is not in the catalogue: an interruption may have come after the commit
             raise
 
     def _layout(
@@ -262,7 +262,7 @@ def _enter_source(connection: Any, source: ArchiveSource, read: ReadSource, read
     """The row of a source, in the place of an earlier one."""
     path = source.key.removeprefix("file:") if source.clip is None else ""
     stamped = read.stamp
-    values = (source.name, path, stamped.size, stamped.modified, stamped.sha256, _asked(source, reading), read.note)
+    values = (source.name, path, stamped.size, stamped.modified, stamped.sha256, _reading_of(source, reading), read.note)
     row = connection.execute("SELECT id FROM sources WHERE key = ?", (source.key,)).fetchone()
     if row is not None:
         drop_recordings(connection, int(row[0]))
@@ -286,7 +286,7 @@ def orphans(catalogue: Catalogue) -> list[Path]:
     return [one for one in there if one.name not in known]
 
 
-def clear(catalogue: Catalogue) -> None:
+def remove_orphans(catalogue: Catalogue) -> None:
     """Take the files of interrupted additions away."""
     for one in orphans(catalogue):
         with contextlib.suppress(OSError):
@@ -331,7 +331,7 @@ def live_tracks(catalogue: Catalogue, row: SegmentRow) -> list[Track]:
         return []
     path = catalogue.segments_folder / row.file
     if not intact(path, row.sha256):
-        raise damaged(path, "it is not what was written")
+        raise damage_error(path, "it is not what was written")
     segment = ArchiveSegment.open(path)
     return [segment.track(i) for i in range(len(segment)) if int(segment.tracks[i, 0]) in live]
 
@@ -384,7 +384,9 @@ def _problems(folder: Path, contents: Contents, recordings: Sequence[RecordingRo
     names = {row.id: row.name for row in sources}
     for row in contents.segments:
         if row.layout not in contents.layouts:
-            problems.append(f"{folder / row.file}: its joint layout is not in the catalogue; {_lost(by_segment[row.id], names)}")
+            problems.append(
+                f"{folder / row.file}: its joint layout is not in the catalogue; {_loss_text(by_segment[row.id], names)}"
+            )
             continue
         problems += _segment_problems(folder, row, by_segment[row.id], contents, names)
     twice = [key for key, count in Counter((one.source, one.name, one.person) for one in recordings).items() if count > 1]
@@ -400,7 +402,7 @@ def _problems(folder: Path, contents: Contents, recordings: Sequence[RecordingRo
 def _segment_problems(
     folder: Path, row: SegmentRow, recordings: Sequence[RecordingRow], contents: Contents, names: Mapping[int, str]
 ) -> list[str]:
-    path, lost = folder / row.file, _lost(recordings, names)
+    path, lost = folder / row.file, _loss_text(recordings, names)
     try:
         if path.stat().st_size != row.size or not intact(path, row.sha256):
             return [f"{path}: is not what was written; {lost}"]
@@ -440,7 +442,7 @@ def _same_times(spans: Sequence[tuple[float, float]], row: RecordingRow) -> bool
     return all(abs(a - b) <= 1e-3 for a, b in zip(told, (row.begins, row.ends, row.seconds), strict=True))
 
 
-def _lost(recordings: Sequence[RecordingRow], names: Mapping[int, str]) -> str:
+def _loss_text(recordings: Sequence[RecordingRow], names: Mapping[int, str]) -> str:
     """What a segment takes with it, and what to do."""
     if not recordings:
         return "nothing of it is used"

@@ -179,7 +179,7 @@ class Shrinker:
                 f"{self.name}: frame {self.count} has {size[1]} x {size[0]} px, those before {self.given[1]} x {self.given[0]}"
             )
         self.count += len(grey)
-        return grey.float() if self.size == size else adaptive_avg_pool2d(binned(grey, int(1 / self.scale)), self.size)
+        return grey.float() if self.size == size else adaptive_avg_pool2d(bin_pixels(grey, int(1 / self.scale)), self.size)
 
     def _begin(self, size: tuple[int, int]) -> None:
         self.given, self.scale = size, min(1.0, self.largest / max(size))
@@ -217,7 +217,7 @@ class Shrinker:
         return (frames * (255 / self.white)).round()
 
 
-def binned(frames: Tensor, cell: int) -> Tensor:
+def bin_pixels(frames: Tensor, cell: int) -> Tensor:
     """``(n, h // cell, w // cell)`` means over cells of ``cell`` pixels; what fills no cell is left out."""
     height, width = (n // cell for n in frames.shape[1:])
     rows = frames[:, : height * cell, : width * cell].unflatten(1, (height, cell))

@@ -20,7 +20,7 @@ from indexing.brightness.stream import (
     BrightnessStream,
     Recognizer,
     found_events,
-    learned,
+    learn_descriptors,
     mirrors_matter,
     recognize,
     wrong_evidence,
@@ -208,7 +208,7 @@ class BrightnessIndexer(SavedClassifier):
         return self._learn(self.exemplars_.extended(more, labels), known)
 
     def _exemplars(self, videos: list[Footage], numbers: Array) -> VideoExemplars:
-        views = learned(videos, self._optics())
+        views = learn_descriptors(videos, self._optics())
         labels = np.repeat(numbers, [len(each) for each in views])
         return VideoExemplars.of([one for each in views for one in each], torch.from_numpy(labels))
 

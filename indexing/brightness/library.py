@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from indexing.brightness.sight import mirrored
+from indexing.brightness.sight import mirror_rows
 from indexing.modelfile import stored
 
 FRAMES = 2**31  # of a video, at most
@@ -56,7 +56,7 @@ def library(exemplars: VideoExemplars, classes: int, flip: bool, num_directions:
     videos, labels = exemplars.videos(), exemplars.labels.tolist()
     rows, gaps, bounds, at = [], [], [0] * (classes + 1), 0
     for i in sorted(range(len(videos)), key=labels.__getitem__):
-        for track in [videos[i], mirrored(videos[i])] if flip else [videos[i]]:
+        for track in [videos[i], mirror_rows(videos[i])] if flip else [videos[i]]:
             rows += [track.new_zeros(GAP, track.shape[1]), track]
             gaps += [at, at + 1]
             at += GAP + len(track)

@@ -40,10 +40,10 @@ class MotionMaps:
         gx, gy, gt = inner_gradients(known)
         change = gt.abs()
         u, v = weighted_differences(gx, gy, gt.sign() * (change - self.noise).clamp(min=0))
-        return rectified(u, v), change
+        return rectify(u, v), change
 
 
-def rectified(u: Tensor, v: Tensor) -> Tensor:
+def rectify(u: Tensor, v: Tensor) -> Tensor:
     """``(n, 4, h, w)`` what moves right, left, down and up: pooled apart, so that opposite motions do not cancel."""
     return torch.stack([u, -u, v, -v], dim=1).clamp_(min=0)
 
@@ -87,7 +87,7 @@ def boxes_about(seen: Tensor) -> Tensor:
     return torch.cat([(low + high) / 2, size, size], dim=1)
 
 
-def together(seen: list[Tensor]) -> list[Tensor]:
+def merge_motion(seen: list[Tensor]) -> list[Tensor]:
     """Of each video, what moved in it and in all videos of its size that were taken at its place. seen ``(h, w)``."""
     out = list(seen)
     for shape in {one.shape for one in seen}:
@@ -126,7 +126,7 @@ def _positions(cells: int, pixels: int, dtype: torch.dtype, device: torch.device
     return (torch.arange(cells, dtype=dtype, device=device) + 0.5 - cells / 2)[:, None], edges[:-1], edges[1:]
 
 
-def pooled(maps: Tensor, boxes: Tensor, cells: int = CELLS) -> Tensor:
+def pool_cells(maps: Tensor, boxes: Tensor, cells: int = CELLS) -> Tensor:
     """``(n, b, c * cells * cells)`` mean of maps ``(n, c, h, w)`` in the cells of boxes ``(n, b, 4)``; 0 outside the image."""
     (n, b, _), (height, width) = boxes.shape, maps.shape[2:]
     across, along = overlaps(boxes[..., :2], boxes[..., 2:], max(height, width), cells).unbind(2)
@@ -135,7 +135,7 @@ def pooled(maps: Tensor, boxes: Tensor, cells: int = CELLS) -> Tensor:
     return (along[:, :, None, :, :height] @ bands).flatten(2)
 
 
-def described(cells: Tensor, soft: float = SOFT_NORM) -> Tensor:
+def describe_cells(cells: Tensor, soft: float = SOFT_NORM) -> Tensor:
     r"""Descriptor :math:`f = s / (\|s\| + .005)` with :math:`s = \sqrt{cells}`: shorter than 1, and near 0 where nothing moves."""
     root = cells.sqrt()
     return root / (root.norm(dim=-1, keepdim=True) + soft)
@@ -147,7 +147,7 @@ def profile(cells: Tensor, count: int = CELLS) -> Tensor:
     return torch.cat([right + left, down, up], dim=-1)
 
 
-def mirrored(rows: Tensor, count: int = CELLS) -> Tensor:
+def mirror_rows(rows: Tensor, count: int = CELLS) -> Tensor:
     """Descriptors of the same video seen in a mirror: right and left change places; a row profile at the end stays."""
     size = 4 * count**2
     grids, rest = rows.split([rows.shape[1] // size * size, rows.shape[1] % size], dim=1)
@@ -216,8 +216,8 @@ class Sight:
             boxes[:, ::2] = self.box.push(change)[:, None]
             boxes[:, 0, 2:].clamp_(min=MIN_BOX * height)
             boxes[:, 2, 2:].clamp_(min=height)
-        cells = pooled(maps, boxes)
-        grids, rows = (described(part, SOFT_NORM) for part in (cells[:, :2], profile(cells.flip(1)[:, :2])))
+        cells = pool_cells(maps, boxes)
+        grids, rows = (describe_cells(part, SOFT_NORM) for part in (cells[:, :2], profile(cells.flip(1)[:, :2])))
         weights = _weights(SHARES, maps.dtype, maps.device)
         return torch.cat([grids.flatten(1), rows.flatten(1)], dim=1).mul_(weights)
 

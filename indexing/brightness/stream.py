@@ -14,7 +14,7 @@ from torch import Tensor
 from dyntorch.numerics import one_thread
 from indexing.brightness.footage import Footage, Resampler
 from indexing.brightness.library import Library, VideoExemplars
-from indexing.brightness.sight import Optics, Sight, mirrored, together
+from indexing.brightness.sight import Optics, Sight, merge_motion, mirror_rows
 from indexing.scoring import Event, event_levels, events
 
 SLACK = 0.02  # price of a step other than 1
@@ -173,13 +173,13 @@ def recognize(stream: BrightnessStream, video: Footage) -> Array:
     return stream.whole.mean()
 
 
-def learned(videos: list[Footage], optics: Optics) -> list[list[Tensor]]:
+def learn_descriptors(videos: list[Footage], optics: Optics) -> list[list[Tensor]]:
     """Descriptors of videos to learn from: what a stream of each would give, and what a stream would give that began earlier."""
     first = [_looked_at(video, optics, None) for video in videos]
     moved = [seen for _, seen in first if seen is not None]
     if not moved:
         return [[one] for one, _ in first]
-    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, together(moved), strict=True)]
+    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, merge_motion(moved), strict=True)]
     return [[one, other] for (one, _), other in zip(first, again, strict=True)]
 
 
@@ -201,7 +201,7 @@ def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Ten
 def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch.Tensor, Array]:
     """What exemplars find in other actions: the evidence of each ``(videos,)``, the contrast of moving frames ``(frames,)``."""
     best, contrasts = [], []
-    for i in _asked(exemplars, MAX_ASKED):
+    for i in _sample_exemplars(exemplars, MAX_ASKED):
         stream, seen = _fresh(source), exemplars.videos()[i]
         label = int(exemplars.labels[i])
         scores, energy = stream.compare(seen.to(source.optics.device))
@@ -213,9 +213,9 @@ def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch
 
 def mirrors_matter(source: Recognizer, exemplars: VideoExemplars) -> bool:
     """Whether some exemplar's mirror image looks clearly more like another action than like its own."""
-    for i in _asked(exemplars, MAX_ASKED):
+    for i in _sample_exemplars(exemplars, MAX_ASKED):
         stream, seen = _fresh(source), exemplars.videos()[i]
-        stream.compare(mirrored(seen).to(source.optics.device))
+        stream.compare(mirror_rows(seen).to(source.optics.device))
         scores = stream.whole.mean()
         label = int(exemplars.labels[i])
         if float(scores.max() - scores[label]) > MIRROR_MARGIN:
@@ -230,7 +230,7 @@ def found_events(scores: Array, times: Array, energy: Array, classes: Array, wro
     return events(contrast, times, classes.tolist(), peak, floor, energy < QUIET_ENERGY)
 
 
-def _asked(exemplars: VideoExemplars, most: int) -> list[int]:
+def _sample_exemplars(exemplars: VideoExemplars, most: int) -> list[int]:
     """Exemplars to ask, spread over all of them."""
     count = len(exemplars.labels)
     return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})

@@ -55,7 +55,7 @@ def images(clip: Clip) -> list[Clip]:
     return [virtual(clip, 360 / NUM_TURNS * i, ELEVATIONS[i % len(ELEVATIONS)]) for i in range(NUM_TURNS)]
 
 
-def standardized(x: Tensor, seen: Tensor) -> Tensor:
+def normalize_frames(x: Tensor, seen: Tensor) -> Tensor:
     """Frames ``(F, n, 2)`` about the middle of the joints seen ``(F, n)``, Frobenius norm 1; zero where nothing is seen."""
     weight = seen[..., None].to(x)
     x = (x - (x * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp(min=1.0)) * weight
@@ -66,7 +66,7 @@ def image_distance(query: Windows, bank: Windows) -> Tensor:
     """``(Q, E)`` 1 - cosine between frames, each about its middle: place and size in the image are free, the viewpoint is not."""
 
     def compare(a: Tensor, b: Tensor, _: Tensor | slice) -> Tensor:
-        return cosine_distance(centred(a).flatten(1), centred(b).flatten(1))
+        return cosine_distance(centre(a).flatten(1), centre(b).flatten(1))
 
     return between(query, bank, compare, worst=1.0)
 
@@ -77,8 +77,8 @@ def shape_distance(query: Windows, shapes: Windows) -> Tensor:
     def compare(a: Tensor, b: Tensor, joints: Tensor | slice) -> Tensor:
         if a.shape[2] < LEAST:
             return a.new_ones(len(a), len(b))
-        basis = orthonormal_basis(centred(b)[:, 0])
-        x = centred(a)[:, 0]
+        basis = orthonormal_basis(centre(b)[:, 0])
+        x = centre(a)[:, 0]
         x = x / x.flatten(1).norm(dim=1).clamp(min=1e-300)[:, None, None]
         inner = x.mT.flatten(0, 1) @ basis.permute(1, 0, 2).flatten(1)
         return (1 - inner.square().reshape(len(a), 2, len(b), 3).sum((1, 3))).clamp(0, 1)
@@ -86,7 +86,7 @@ def shape_distance(query: Windows, shapes: Windows) -> Tensor:
     return between(query, shapes, compare, worst=1.0)
 
 
-def centred(x: Tensor) -> Tensor:
+def centre(x: Tensor) -> Tensor:
     return x - x.mean(-2, keepdim=True)
 
 
@@ -142,8 +142,8 @@ def perspective_distance(query: Windows, shapes: Windows, kappa: float) -> Tenso
     def compare(a: Tensor, b: Tensor, joints: Tensor | slice) -> Tensor:
         if a.shape[2] < LEAST + 1:
             return a.new_ones(len(a), len(b))
-        basis = orthonormal_basis(centred(b)[:, 0])
-        x = centred(a)[:, 0]
+        basis = orthonormal_basis(centre(b)[:, 0])
+        x = centre(a)[:, 0]
         x = x / x.flatten(1).norm(dim=1).clamp(min=1e-300)[:, None, None]
         step = max(1, PAIR_BLOCK // max(1, len(b)))
         return torch.cat([leaning(part, basis, kappa) for part in x.split(step)]).clamp(0, 1)

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyntorch.numerics import canonical_correlation, on_cpu, orthonormal_basis
 from indexing.action.bank import Windows, stack
 from indexing.clip import Clip
-from indexing.phase.frames import Learned, standardized, training_frames
+from indexing.phase.frames import Learned, normalize_frames, training_frames
 from indexing.phase.model import Course, PhaseModel, PhaseOptions, learn_course, wrong_scores
 
 MAX_MIRROR_FRAMES = 500  # by which the joints' mirror images are recognized
@@ -47,7 +47,7 @@ MAX_MIRROR_SHARE = 0.35
 
 def period(x: Tensor, seconds: Tensor, options: PhaseOptions) -> tuple[float, float]:
     """Seconds after which frames ``(F, n, 2)`` come back, and how far from it they remain (1 = they do not)."""
-    x = _sampled(standardized(x, x.new_ones(x.shape[:2])), seconds).flatten(1)
+    x = _resample(normalize_frames(x, x.new_ones(x.shape[:2])), seconds).flatten(1)
     rate = COMPARED_RATE
     low, high = round(options.min_period * rate), min(round(options.max_period * rate), 2 * len(x) // 3)
     if high <= low + 2 or len(x) <= 4 * CHANGE_REACH:
@@ -74,7 +74,7 @@ def period(x: Tensor, seconds: Tensor, options: PhaseOptions) -> tuple[float, fl
     return (at + max(-0.5, min(0.5, shift))) / rate, float(depth[first])
 
 
-def _sampled(x: Tensor, seconds: Tensor) -> Tensor:
+def _resample(x: Tensor, seconds: Tensor) -> Tensor:
     """Frames at the rate of the options, by linear interpolation."""
     wanted = torch.arange(float(seconds[0]), float(seconds[-1]) + 1e-9, 1 / COMPARED_RATE, dtype=seconds.dtype)
     right = torch.searchsorted(seconds, wanted, right=True).clamp(1, len(seconds) - 1)
@@ -85,7 +85,7 @@ def _sampled(x: Tensor, seconds: Tensor) -> Tensor:
 def _local(x: Tensor, seconds: Tensor, options: PhaseOptions) -> list[tuple[slice, float, float]]:
     """Pieces of a clip of a few seconds, with the period and its depth in each."""
     count = max(1, round(float(seconds[-1] - seconds[0]) / LOCAL_SECONDS))
-    parts = _cut(seconds, slice(0, len(seconds)), count)
+    parts = _split_times(seconds, slice(0, len(seconds)), count)
     return [(part, *period(x[part], seconds[part], options=options)) for part in parts]
 
 
@@ -102,7 +102,7 @@ def in_step(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions) -> list[T
     for k, ((x, t), parts) in enumerate(zip(clips, local, strict=True)):
         for part, seconds, depth in parts:
             tempo = seconds if depth <= MAX_OWN_PERIOD_DEPTH and 0.6 < seconds / usual < 1.6 else usual
-            for piece in _cut(t, part, max(1, round(float(t[part][-1] - t[part][0]) / (PIECE_PERIODS * tempo)))):
+            for piece in _split_times(t, part, max(1, round(float(t[part][-1] - t[part][0]) / (PIECE_PERIODS * tempo)))):
                 cycles.append(_mean_cycle(x[piece], t[piece], tempo))
                 owner.append((k, piece, tempo))
     shifts = _shifts(torch.stack(cycles))
@@ -112,7 +112,7 @@ def in_step(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions) -> list[T
     return phases
 
 
-def _cut(seconds: Tensor, part: slice, count: int) -> list[slice]:
+def _split_times(seconds: Tensor, part: slice, count: int) -> list[slice]:
     """A part of a clip in so many parts of the same duration."""
     inside = seconds[part]
     edges = torch.linspace(float(inside[0]), float(inside[-1]), count + 1, dtype=seconds.dtype)
@@ -122,7 +122,7 @@ def _cut(seconds: Tensor, part: slice, count: int) -> list[slice]:
 
 def _mean_cycle(x: Tensor, seconds: Tensor, period_: float) -> Tensor:
     """``(bins, n, 2)`` mean frame around every phase; the phase is time over period."""
-    x = standardized(x, x.new_ones(x.shape[:2]))
+    x = normalize_frames(x, x.new_ones(x.shape[:2]))
     phase = seconds / period_
     apart = (phase[:, None] - torch.arange(CYCLE_BINS, dtype=phase.dtype) / CYCLE_BINS + 0.5).remainder(1.0) - 0.5
     # a phase that a short clip misses takes the nearest frames
@@ -150,7 +150,7 @@ def _shifts(cycles: Tensor) -> list[float]:
     return [-shift / CYCLE_BINS for shift in shifts]
 
 
-def followed(course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Tensor) -> Tensor:
+def track_phases(course: Course, x: Tensor, seen: Tensor, seconds: Tensor, phase: Tensor) -> Tensor:
     """Phases of one clip's frames that go forward at about the clip's rate and leave least, by dynamic programming. phase
     ``(F,)``."""
     if len(x) < 3:
@@ -205,13 +205,13 @@ def learn_model(
         parts = [Learned(learned.frames[at], learned.clip[at], learned.times[at]) for at in of]
         given = [phases[k] for k in mine]
         found, repeats = _phases(parts, given, course, options)
-        one = _joined(parts, found)
+        one = _concatenate(parts, found)
         if repeats and twin is not None and (mirror is True or _own_mirror(one, twin, options)):
             one = _with_mirror(one, twin)
             mirrored.append(True)
         else:
             mirrored.append(False)
-        courses.append(_course(one, options.max_training_frames, harmonics, repeats))
+        courses.append(_fit_course(one, options.max_training_frames, harmonics, repeats))
         part = _spread(one, options.max_kept_frames * (1 + mirrored[-1]))
         banks += [_card(part[0].frames, width) for width in CARD_WIDTHS]
         kept += [part[1]] * len(CARD_WIDTHS)
@@ -237,9 +237,9 @@ def _phases(
             raise ValueError("course='periodic': no period was found in the clips; give longer ones, or phases")
         return [_once(part.times) for part in parts], False
     for harmonics in COARSE_HARMONICS:
-        found = _course(_joined(parts, stepped), MAX_COARSE_FRAMES, harmonics, True)
+        found = _fit_course(_concatenate(parts, stepped), MAX_COARSE_FRAMES, harmonics, True)
         stepped = [
-            followed(found, part.frames.values[:, 0], part.frames.seen, part.times, phase)
+            track_phases(found, part.frames.values[:, 0], part.frames.seen, part.times, phase)
             for part, phase in zip(parts, stepped, strict=True)
         ]
     return stepped, True
@@ -256,7 +256,7 @@ def _once(seconds: Tensor) -> Tensor:
     return (seconds - seconds[0]) / (seconds[-1] - seconds[0])
 
 
-def _joined(parts: Sequence[Learned], phases: Sequence[Tensor]) -> Phased:
+def _concatenate(parts: Sequence[Learned], phases: Sequence[Tensor]) -> Phased:
     """All frames of an action whose phase is known."""
     phase = torch.cat(list(phases))
     known = phase.isfinite()
@@ -273,7 +273,7 @@ def _spread(one: Phased, most: int) -> Phased:
     return Learned(learned.frames[at], learned.clip[at], learned.times[at]), phase[at]
 
 
-def _course(one: Phased, most: int, harmonics: int, repeats: bool) -> Course:
+def _fit_course(one: Phased, most: int, harmonics: int, repeats: bool) -> Course:
     learned, phase = _spread(one, most)
     return learn_course(
         learned.frames.values[:, 0],
@@ -304,7 +304,7 @@ def _with_mirror(one: Phased, swap: Tensor) -> Phased:
 def _own_mirror(one: Phased, swap: Tensor, options: PhaseOptions) -> bool:
     """Whether the mirrored frames fit the course half a cycle later."""
     learned, phase = _spread(one, MAX_COARSE_FRAMES)
-    found = _course((learned, phase), MAX_COARSE_FRAMES, MIRROR_HARMONICS, True)
+    found = _fit_course((learned, phase), MAX_COARSE_FRAMES, MIRROR_HARMONICS, True)
 
     def left(frames: Windows, at: Tensor) -> tuple[Tensor, Tensor]:
         curve = found.curve(frames, options.num_phases)

@@ -15,7 +15,7 @@ from indexing import scoring
 from indexing.action.bank import EPSILON, Windows, stack
 from indexing.modelfile import part, stored
 from indexing.phase.frames import LEAST as FRAMES_LEAST
-from indexing.phase.frames import Learned, image_distance, perspective_distance, shape_distance, standardized
+from indexing.phase.frames import Learned, image_distance, normalize_frames, perspective_distance, shape_distance
 
 RIDGE = 1e-4  # of the mean diagonal; 1e-5 is as good, 1e-3 costs .5 and 1e-2 4 degrees
 NUM_ROUNDS = 30  # alternations from the mean shape
@@ -109,14 +109,14 @@ def learn_course(x: Tensor, seen: Tensor, phase: Tensor, clip: Tensor, *, harmon
     rows = basis_of(periodic, 2 * harmonics + 1).rows(_argument(phase, periodic))
     _, owner, counts = clip.unique(return_inverse=True, return_counts=True)
     weight = seen.to(x) * (len(x) / (len(counts) * counts[owner].to(x)))[:, None]
-    x = standardized(x, seen)
+    x = normalize_frames(x, seen)
     # the first guess stands still
     flat = x.permute(1, 0, 2).flatten(1)
     start = x.new_zeros(rows.shape[1], x.shape[1], 3)
     start[0] = torch.linalg.eigh(flat @ flat.mT)[1][:, -3:].flip(1)
     noise = torch.randn(start[1:].shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
     start[1:] = 0.1 * noise.to(x.device) / rows.shape[1]
-    shapes = _alternated(x, weight, rows, start, NUM_ROUNDS)
+    shapes = _alternate(x, weight, rows, start, NUM_ROUNDS)
     known = seen.any(0)
     if len(counts) < MIN_STYLED_CLIPS:
         return Course(shapes[None], periodic, known)
@@ -125,15 +125,15 @@ def learn_course(x: Tensor, seen: Tensor, phase: Tensor, clip: Tensor, *, harmon
     both = torch.cat([shapes, swing])
     levels = x.new_tensor(STYLES)
     for _ in range(NUM_STYLE_CHANGES):
-        left = torch.stack([_left(x, weight, rows, _styled(both, level)) for level in levels])
+        left = torch.stack([_residuals(x, weight, rows, _apply_style(both, level)) for level in levels])
         style = levels[x.new_zeros(len(levels), len(counts)).index_add_(1, owner, left).argmin(0)]
         style = style - style.mean()
         style = max(STYLES) * style / style.std(correction=0).clamp(min=1e-9)
-        both = _alternated(x, weight, torch.cat([rows, style[owner, None] * rows], 1), both, NUM_STYLE_ROUNDS)
-    return Course(torch.stack([_styled(both, level) for level in levels]), periodic, known)
+        both = _alternate(x, weight, torch.cat([rows, style[owner, None] * rows], 1), both, NUM_STYLE_ROUNDS)
+    return Course(torch.stack([_apply_style(both, level) for level in levels]), periodic, known)
 
 
-def _styled(both: Tensor, level: Tensor) -> Tensor:
+def _apply_style(both: Tensor, level: Tensor) -> Tensor:
     plain, change = both.chunk(2)
     return plain + level * change
 
@@ -148,14 +148,14 @@ def _cameras(x: Tensor, weight: Tensor, at: Tensor) -> Tensor:
     return torch.linalg.solve(gram + ridge, heavy @ x)
 
 
-def _left(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor) -> Tensor:
+def _residuals(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor) -> Tensor:
     """``(F,)`` weighted squared residual of every frame."""
     at = _at(rows, shapes)
     cameras = _cameras(x, weight, at)
     return ((x - at @ cameras[:, :3] - cameras[:, 3:]).square() * weight[..., None]).sum((1, 2))
 
 
-def _alternated(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds: int) -> Tensor:
+def _alternate(x: Tensor, weight: Tensor, rows: Tensor, shapes: Tensor, rounds: int) -> Tensor:
     frames, n = weight.shape
     eye = torch.eye(3 * rows.shape[1], dtype=x.dtype, device=x.device)
     for _ in range(rounds):

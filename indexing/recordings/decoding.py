@@ -88,7 +88,7 @@ class Stretch:
         return self.lattice.cut(self.source, 0, chosen, length)
 
 
-def explain(
+def decode(
     model: ShapeModel, clip: Clip, stream: Stream, classes: Sequence[Any], rate: float | None, progress: Progress = None
 ) -> Explanation:
     """The segments of a recording, and what they say of its frames."""
@@ -112,16 +112,16 @@ def explain(
         cell = np.clip(cell, 0, len(inside) - 1)
         scores[first:end] = log_scores(inside)[cell]
         background[first:end] = 1.0 - inside.sum(axis=1).clip(0.0, 1.0)[cell]
-        mine = _joined(model, one, segments, durations, stream.length)
-        found += told_events(model, one, mine, values, classes, stream.length)
+        mine = _merge_segments(model, one, segments, durations, stream.length)
+        found += events_of(model, one, mine, values, classes, stream.length)
         # what would be there, did rest and absence count as movement, and is not
         awake = np.minimum(calm, options.min_quality * _unit(one, durations))
         restless, _ = best_tiling(one.lattice.windows, values + absent, awake)
-        silent = [part for part in _joined(model, one, restless, durations, stream.length) if not _meets(part, mine)]
+        silent = [part for part in _merge_segments(model, one, restless, durations, stream.length) if not _meets(part, mine)]
         reasons: list[Reason] = ["nobody there" if not one.present[part.first : part.last].any() else "at rest" for part in silent]
-        told = told_events(model, one, silent, values, classes, stream.length)
+        told = events_of(model, one, silent, values, classes, stream.length)
         held += [Withheld(event, reason) for event, reason in zip(told, reasons, strict=True)]
-    found, low = _levelled(model, found, rate)
+    found, low = _apply_level(model, found, rate)
     if progress is not None:
         progress(1.0)
     held = sorted([*held, *low], key=lambda each: each.event.start)
@@ -183,7 +183,7 @@ def _worth(model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[
     lattice, cyclic = one.lattice, durations.cyclic[None].astype(np.float32)
     whole = np.nan_to_num((one.whole - wholes[0]) / wholes[1], nan=-2.0)
     unseen = ABSENCE_COST * ~one.present
-    rest = _rest(model, one)
+    rest = _rest_evidence(model, one)
     lasts = (lattice.seconds / durations.unit).astype(np.float32)[:, None]
     absent = lasts * lattice.mean(unseen[:, None])
     quality = MOMENT_WEIGHT * (1 + CYCLIC_MOMENT_GAIN * cyclic) * lattice.mean(one.contrast)
@@ -214,14 +214,16 @@ def segment_values(
     return worth.values, worth.background, worth.absent
 
 
-def _rest(model: ShapeModel, one: Stretch) -> Array:
+def _rest_evidence(model: ShapeModel, one: Stretch) -> Array:
     """``(cells,)`` -1 where a person moves e times more than calm moments of what it looks like, 1 where e times less."""
     still, calm = motion_levels(model)
     own = np.minimum(still, calm[one.contrast.argmax(axis=1)])
     return np.asarray(np.log(np.maximum(own, 1e-30) / np.maximum(one.motion, 1e-30)).clip(-1.0, 1.0))
 
 
-def _joined(model: ShapeModel, one: Stretch, segments: list[TiledSegment], durations: Durations, length: int) -> list[TiledSegment]:
+def _merge_segments(
+    model: ShapeModel, one: Stretch, segments: list[TiledSegment], durations: Durations, length: int
+) -> list[TiledSegment]:
     """Segments of one action that touch become one where it is a cycle, or where the performance has not ended there."""
     out: list[TiledSegment] = []
     for part in segments:
@@ -256,7 +258,7 @@ def _heights(windows: torch.Tensor) -> torch.Tensor:
     return up / up.square().mean(dim=(1, 2), keepdim=True).sqrt().clamp(min=1e-9)
 
 
-def told_events(
+def events_of(
     model: ShapeModel, one: Stretch, parts: Sequence[TiledSegment], values: Array, classes: Sequence[Any], length: int
 ) -> list[Event]:
     """Segments as they are told: score: mean contrast of their moments; margin: what they are worth above the next class."""
@@ -281,7 +283,7 @@ def _meets(part: TiledSegment, others: Sequence[TiledSegment]) -> bool:
     return any(min(part.last, other.last) > max(part.first, other.first) for other in others)
 
 
-def _levelled(model: ShapeModel, found: list[Event], rate: float | None) -> tuple[list[Event], list[Withheld]]:
+def _apply_level(model: ShapeModel, found: list[Event], rate: float | None) -> tuple[list[Event], list[Withheld]]:
     """Those events that reach the level that was asked for, and those that do not."""
     if rate is None:
         return found, []

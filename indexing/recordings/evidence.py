@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from indexing.action.bank import Windows
-from indexing.action.model import NUM_NEIGHBOURS, ShapeModel, standardized
+from indexing.action.model import NUM_NEIGHBOURS, ShapeModel, standardize
 from indexing.windows import Ragged, sample
 
 STEPS_PER_ACTION = 6.0  # that the shortest action (median of its exemplars) is divided into: segments begin and end at such steps
@@ -143,7 +143,7 @@ def whole_scores(model: ShapeModel, lattice: Lattice, cut: Callable[[Array], Win
 def machine_scores(model: ShapeModel, cut: Callable[[Array], Windows], chosen: Array) -> Array:
     """``(chosen, classes)`` of the kernel machine, standardized over the classes of each window."""
     parts = [
-        standardized(model.machine_scores(cut(chosen[at : at + BLOCK]).to(model.labels.device))).cpu().numpy()
+        standardize(model.machine_scores(cut(chosen[at : at + BLOCK]).to(model.labels.device))).cpu().numpy()
         for at in range(0, len(chosen), BLOCK)
     ]
     return np.concatenate(parts) if parts else np.zeros((0, model.classes))

@@ -25,7 +25,7 @@ from indexing.cameras import y_up
 from indexing.clip import Clip
 from indexing.estimator import is_number
 from indexing.joints import matched_all
-from indexing.recordings.decoding import EDGE_TOLERANCE, TEMPERATURE, Stretch, log_scores, segment_values, told_events
+from indexing.recordings.decoding import EDGE_TOLERANCE, TEMPERATURE, Stretch, events_of, log_scores, segment_values
 from indexing.recordings.evidence import DURATION_REACH, MAX_TEMPO_FACTOR, MIN_CYCLIC, Durations, Lattice
 from indexing.recordings.tiling import TiledSegment, best_tiling, posterior
 from indexing.scoring import Event, event_levels
@@ -381,7 +381,7 @@ class ActionStream:
 
     def _event(self, tiled: _Tiled, part: TiledSegment) -> Event:
         """As it is told, on the clock of the stream."""
-        (event,) = told_events(self.source.model, tiled.one, [part], tiled.values, self.classes, self._look.length)
+        (event,) = events_of(self.source.model, tiled.one, [part], tiled.values, self.classes, self._look.length)
         last = float(self._at[-1])
         return replace(event, start=min(event.start, last) + self._begin, end=min(event.end, last) + self._begin)
 

@@ -110,7 +110,7 @@ def tracked_people(clips: Sequence[Clip], name: str = "", min_seconds: float = 0
     """The people of one recording from its identities; tracks of less than ``min_seconds`` in view are ghosts of the detector."""
     by_ids = clips[0].meta["followed"] == "ids"
     whole = by_ids or clips[0].meta["person"] is None
-    parts = list(clips) if whole else [part for clip in clips for part in _parted(clip)]
+    parts = list(clips) if whole else [part for clip in clips for part in _split_absences(clip)]
     step = _step(clips)
     length = max(clip.times[-1] for clip in clips) - min(clip.times[0] for clip in clips) + step
     least = min(MIN_JOINTS, max(int(clip.seen.sum(axis=1).max()) for clip in clips))
@@ -121,8 +121,8 @@ def tracked_people(clips: Sequence[Clip], name: str = "", min_seconds: float = 0
             tracks.append(_track(part))
         else:
             ghosts[reason] += 1
-    if not by_ids and tracks and not _together(tracks):
-        tracks = [_track(_one(tracks))]
+    if not by_ids and tracks and not _overlap(tracks):
+        tracks = [_track(_merge_identities(tracks))]
     tracks.sort(key=lambda track: (-track.area, track.times[0]))
     alone = not by_ids and len(tracks) == 1
     names = [""] if alone else [str(track.clip.meta["person"]) if by_ids else str(i) for i, track in enumerate(tracks, 1)]
@@ -153,7 +153,7 @@ def _step(clips: Sequence[Clip]) -> float:
     return float(np.median(np.concatenate(steps))) if steps else 0.0
 
 
-def _parted(clip: Clip) -> list[Clip]:
+def _split_absences(clip: Clip) -> list[Clip]:
     """An identity by position, cut where it is out of view for long; frames that do not show it at an end are left out."""
     rows = np.flatnonzero(clip.seen.any(axis=1))
     cuts = np.flatnonzero(np.diff(clip.times[rows]) > MIN_ABSENCE) + 1
@@ -178,13 +178,13 @@ def _ghost(clip: Clip, step: float, length: float, least: int, min_seconds: floa
     return "at one place" if unusable(clip, point=True) else None
 
 
-def _together(tracks: Sequence[_Track]) -> bool:
+def _overlap(tracks: Sequence[_Track]) -> bool:
     """Whether any two are ever in view in the same frame."""
     moments = np.concatenate([track.times for track in tracks])
     return len(np.unique(moments)) < len(moments)
 
 
-def _one(tracks: Sequence[_Track]) -> Clip:
+def _merge_identities(tracks: Sequence[_Track]) -> Clip:
     """Identities that are never in view together as one clip, without the frames between them that another's clip has empty."""
     if len(tracks) == 1:
         return tracks[0].clip
@@ -223,7 +223,7 @@ def _appearances(names: Sequence[str], tracks: Sequence[_Track]) -> list[Appeara
             gone = before + 1 == len(left.times)
             if not gone and left.times[before + 1] - left.times[before] <= MIN_ABSENCE:
                 continue  # in view all the time
-            near = _apart(left, before, track) <= MAX_RETURN_DISTANCE * max(left.size, track.size)
+            near = _distance(left, before, track) <= MAX_RETURN_DISTANCE * max(left.size, track.size)
             if near or gone:
                 candidates.append((near, float(left.times[before]), other))
         if candidates and at > begin:
@@ -232,7 +232,7 @@ def _appearances(names: Sequence[str], tracks: Sequence[_Track]) -> list[Appeara
     return sorted(found, key=lambda one: one.at)
 
 
-def _apart(left: _Track, row: int, track: _Track) -> float:
+def _distance(left: _Track, row: int, track: _Track) -> float:
     """From the middle of one person's joints in a frame to that of another's first."""
     a, b = left.clip.joints[left.rows[row]], track.clip.joints[track.rows[0]]
     return float(np.linalg.norm(np.nanmean(a, axis=0) - np.nanmean(b, axis=0)))

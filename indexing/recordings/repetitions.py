@@ -113,19 +113,19 @@ def count_repetitions(
         pick: list[int] = (
             np.unique(np.linspace(0, len(given) - 1, min(len(given), MAX_EXEMPLARS)).round().astype(int)).tolist() if given else []
         )
-        shown_clips = [given[i] for i in pick] or _own(clip, mine)
+        shown_clips = [given[i] for i in pick] or _event_exemplars(clip, mine)
         pattern = _pattern(shown_clips)
         spans = _spans(mine, events)
         tracks = [_track(repaired, start, end) for start, end, _ in spans]
         pattern = _unbroken(tracks, pattern)
         performances: list[Repetition] = []
         for track, (_, _, inside) in zip(tracks, spans, strict=True):
-            performances += _counted(track, inside, pattern)
+            performances += _count_span(track, inside, pattern)
         found.append(RepetitionCount(label, tuple(performances), "cycle" if pattern.period else "performance"))
     return sorted(found, key=lambda one: one.performances[0].start if one.performances else np.inf)
 
 
-def _own(clip: Clip, events: Sequence[Event]) -> list[Clip]:
+def _event_exemplars(clip: Clip, events: Sequence[Event]) -> list[Clip]:
     """Events of usual length, as exemplars."""
     ordered = sorted(events, key=lambda event: event.end - event.start)
     middle = ordered[max(0, len(ordered) // 2 - 1) : len(ordered) // 2 + 1]
@@ -202,7 +202,7 @@ def _track(repaired: _Repaired, start: float, end: float) -> _RepeatedTrack:
     return _RepeatedTrack(times, x[..., 1], x.reshape(count, -1))
 
 
-def _moving(values: Array) -> Array:
+def _with_velocities(values: Array) -> Array:
     """Positions beside velocities."""
     if len(values) < 2:
         return np.concatenate([values, np.zeros_like(values)], axis=1)
@@ -235,7 +235,7 @@ def _period(poses: Array, shortest: float, longest: float) -> tuple[float, float
     return best / SAMPLE_RATE, float(apart[best]), float(worst.max())
 
 
-def _still(track: _RepeatedTrack) -> Array:
+def _detect_rest(track: _RepeatedTrack) -> Array:
     """``(F,)`` where the joints rest."""
     wide = max(1, round(MIN_REST_SECONDS * SAMPLE_RATE))
     if len(track.times) < 2 * wide:
@@ -254,7 +254,7 @@ def _stretches(on: Array) -> Array:
 
 def _liveliest(track: _RepeatedTrack) -> slice:
     """The longest part without a rest."""
-    parts = _stretches(~_still(track))
+    parts = _stretches(~_detect_rest(track))
     return slice(*parts[(parts[:, 1] - parts[:, 0]).argmax()]) if len(parts) else slice(0, len(track.times))
 
 
@@ -302,7 +302,7 @@ def _mean_cycle(heights: Array, seconds: float) -> Array:
     return np.asarray((weight / weight.sum(axis=0)).T @ heights)
 
 
-def _resampled(course: Array, m: int, turns: bool) -> Array:
+def _resample(course: Array, m: int, turns: bool) -> Array:
     at = np.arange(m) * len(course) / m if turns else np.linspace(0, len(course) - 1, m)
     longer = np.concatenate([course, course[:1]]) if turns else course
     return np.stack([np.interp(at, np.arange(len(longer)), column) for column in longer.T], axis=1)
@@ -327,7 +327,7 @@ def _costs(x: Array, course: Array, turns: bool, level: float, left: Array | Non
     return cost, rest
 
 
-def _followed(cost: Array, rest: Array, turns: bool) -> tuple[float, Array]:
+def _follow_course(cost: Array, rest: Array, turns: bool) -> tuple[float, Array]:
     """The cheapest way, and ``(F,)`` the place of every sample; m = at rest."""
     count, m = cost.shape
     begin = CYCLES_COST if turns else PERFORMANCE_COST
@@ -375,7 +375,7 @@ def _runs(path: Array, m: int, turns: bool) -> list[tuple[int, Array]]:
     return out
 
 
-def _learned(x: Array, path: Array, m: int) -> Array | None:
+def _learn_course(x: Array, path: Array, m: int) -> Array | None:
     """``(m, d)`` mean sample at every place; None where too few are known."""
     known = np.unique(path[path < m])
     if len(known) < 3:
@@ -403,16 +403,16 @@ def _even(course: Array, path: Array, turns: bool, first: int) -> Array:
 
 def _beginnings(track: _RepeatedTrack, pattern: _Pattern) -> list[tuple[float, Array, int]]:
     """Cost, path and length of the courses that fit best: exemplars, their mirror images, and the span's own cycle."""
-    x, turns, still = _moving(track.heights), pattern.period > 0, _still(track)
+    x, turns, still = _with_velocities(track.heights), pattern.period > 0, _detect_rest(track)
     found: list[tuple[float, Array, int]] = []
     for shown in pattern.shown:
         for heights in [shown.heights] if shown.swap is None else [shown.heights, shown.heights[:, shown.swap]]:
             tried = []
             for scale in DURATION_SCALES:
                 m = max(4, round(len(heights) * scale))
-                course = _resampled(heights, m, turns)
-                course = _moving(np.concatenate([course] * 3))[m : 2 * m] if turns else _moving(course)
-                tried.append((*_followed(*_costs(x, course, turns, FIRST_UNEXPLAINED_COST, None, still), turns), m))
+                course = _resample(heights, m, turns)
+                course = _with_velocities(np.concatenate([course] * 3))[m : 2 * m] if turns else _with_velocities(course)
+                tried.append((*_follow_course(*_costs(x, course, turns, FIRST_UNEXPLAINED_COST, None, still), turns), m))
             found.append(min(tried, key=lambda one: one[0]))
     found = sorted(found, key=lambda one: one[0])[:NUM_STARTS]
     if turns:
@@ -426,23 +426,23 @@ def _beginnings(track: _RepeatedTrack, pattern: _Pattern) -> list[tuple[float, A
     return found
 
 
-def _counted(track: _RepeatedTrack, events: Sequence[Event], pattern: _Pattern) -> list[Repetition]:
+def _count_span(track: _RepeatedTrack, events: Sequence[Event], pattern: _Pattern) -> list[Repetition]:
     """The repetitions in one span; its longest event where the movement tells nothing."""
-    turns, still = pattern.period > 0, _still(track)
+    turns, still = pattern.period > 0, _detect_rest(track)
     best: tuple[float, Array, int] | None = None
     if len(track.times) > 3:
         for _, begun, first in _beginnings(track, pattern):
             for values in (track.poses, track.heights):
-                x, path, m, cost = _moving(values), begun, first, np.inf
+                x, path, m, cost = _with_velocities(values), begun, first, np.inf
                 for again in range(NUM_ROUNDS):
-                    course = _learned(x, path, m)
+                    course = _learn_course(x, path, m)
                     if course is None:
                         break
                     on = path < m
                     left = np.square(x[on] - course[path[on]]).mean(axis=0)
                     course = _even(course, path, turns, first) if again else course
                     m = len(course)
-                    cost, path = _followed(*_costs(x, course, turns, UNEXPLAINED_COST, left, still), turns)
+                    cost, path = _follow_course(*_costs(x, course, turns, UNEXPLAINED_COST, left, still), turns)
                 if best is None or cost < best[0]:
                     best = (cost, path, m)
     parts: list[tuple[float, float]] = []

@@ -1,11 +1,11 @@
 r"""Which parts of recordings to label next: those that are unlike what is known, and of which nobody can be sure.
 
-The stages: recordings are cut into parts, one per performance that was found and of what lies between them
-(:func:`parts_of`); each part is compared with all that is known and with all others, by the residual of the indexer, which does
-not see from where a camera looks (:func:`compared`); parts are chosen one after the other, each the one that would leave the least
-that is unlike everything known, what nobody can be sure of counting more (:func:`chosen`).  With :math:`r_{ij}` the residual
-between two parts, :math:`k_j` that of part :math:`j` to the nearest example, :math:`m_j` the margin between the probabilities of
-its two best actions, :math:`C` what was chosen before, and :math:`D_j = \min(k_j, \min_{i \in C} r_{ij})`, the next one is
+The stages: recordings are cut into parts, one per performance that was found and of what lies between them (:func:`parts_of`);
+each part is compared with all that is known and with all others, by the residual of the indexer, which does not see from where a
+camera looks (:func:`compare_parts`); parts are chosen one after the other, each the one that would leave the least that is unlike
+everything known, what nobody can be sure of counting more (:func:`select_parts`). With :math:`r_{ij}` the residual between two
+parts, :math:`k_j` that of part :math:`j` to the nearest example, :math:`m_j` the margin between the probabilities of its two best
+actions, :math:`C` what was chosen before, and :math:`D_j = \min(k_j, \min_{i \in C} r_{ij})`, the next one is
 
 .. math:: \arg\max_i \sum_j (1 + w (1 - m_j)) \max(D_j - r_{ij}, 0) .
 
@@ -128,16 +128,16 @@ def suggest(
         found.append(parts_of(indexer, clip, done))
         if progress is not None:
             progress(0.9 * (index + 1) / len(clips))
-    parts = _together(found, options)
+    parts = _pool_parts(found, options)
     if parts is None:
         return []
     classes = indexer.classes_.tolist()
-    likely, near, apart, usual = compared(indexer, parts.windows)
+    likely, near, apart, usual = compare_parts(indexer, parts.windows)
     ranked = np.argsort(-likely, axis=1, kind="stable")
     best = np.take_along_axis(likely, ranked, axis=1)
     margin = best[:, 0] - best[:, 1] if best.shape[1] > 1 else np.ones(len(best))
     out = []
-    for at in chosen(near, apart, margin, number, parts.worth, options):
+    for at in select_parts(near, apart, margin, number, parts.worth, options):
         names = [classes[which] if which < len(classes) else None for which in ranked[at, :2].tolist()]
         reason: SuggestReason = "much else is like it"
         if near[at] >= MIN_UNLIKE_RESIDUAL * usual:
@@ -157,7 +157,7 @@ def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span]) -> Re
     begin = float(image.times[0])
     image = image.replace(times=image.times - begin)
     unit = Durations.of(model, indexer.window, 0.3 * indexer.window).unit
-    spans = np.array(_cut(indexer.explain(clip), clip, max(unit, MIN_PART_SECONDS))).reshape(-1, 2)
+    spans = np.array(_cut_parts(indexer.explain(clip), clip, max(unit, MIN_PART_SECONDS))).reshape(-1, 2)
     spans = spans[[_share(span, labelled) < MAX_LABELLED_SHARE for span in spans.tolist()]]
     if not len(spans):
         return None
@@ -173,7 +173,7 @@ def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span]) -> Re
     return RecordingParts(nobody, spans, windows, worth)
 
 
-def _cut(told: Explanation, clip: Clip, unit: float) -> list[Span]:
+def _cut_parts(told: Explanation, clip: Clip, unit: float) -> list[Span]:
     """Spans of what was found, and of what lies between, in seconds of the recording's clock."""
     out: list[Span] = []
     found = sorted((event.start, event.end) for event in told.events)
@@ -201,7 +201,7 @@ def _share(span: Sequence[float], others: Sequence[Span]) -> float:
     return sum(max(0.0, min(end, b) - max(start, a)) for a, b in others) / max(end - start, 1e-9)
 
 
-def _together(found: Sequence[RecordingParts | None], options: SuggestOptions) -> RecordingParts | None:
+def _pool_parts(found: Sequence[RecordingParts | None], options: SuggestOptions) -> RecordingParts | None:
     """The parts of all recordings that are worth anything, thinned out evenly where they are too many to be compared."""
     several = [(number, parts) for number, parts in enumerate(found) if parts is not None and parts.worth.any()]
     if not several:
@@ -213,7 +213,7 @@ def _together(found: Sequence[RecordingParts | None], options: SuggestOptions) -
     return RecordingParts(owner[kept], spans[kept], windows[torch.from_numpy(kept)], np.ones(len(kept), dtype=bool))
 
 
-def compared(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Array, float]:
+def compare_parts(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Array, float]:
     """``(N, classes)`` probabilities, ``(N,)`` residual to the nearest example, ``(N, N)`` residuals between parts, and how
     far examples of different actions are apart, which is far."""
     model = indexer.model_
@@ -233,7 +233,7 @@ def compared(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Ar
     return likely, residual[count:, :count].min(axis=1), residual[count:, count:], float(np.median(finite)) if len(finite) else 1.0
 
 
-def chosen(near: Array, apart: Array, margin: Array, number: int, worth: Array, options: SuggestOptions) -> list[int]:
+def select_parts(near: Array, apart: Array, margin: Array, number: int, worth: Array, options: SuggestOptions) -> list[int]:
     """Numbers of parts, one after the other: each leaves the least that is unlike what is known and what was chosen before.
     near ``(N,)``."""
     free, distance = worth.copy(), near.astype(np.float64)

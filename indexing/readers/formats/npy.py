@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from indexing.clip import DEPTH, ClipSet, FloatArray
+from indexing.clip import SURE_PIXELS, ClipSet, FloatArray
 from indexing.opening import error
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.layouts import choose_layout
@@ -49,7 +49,7 @@ def split_confidence(path: Path, values: FloatArray) -> tuple[FloatArray, FloatA
     finite, flat = third[np.isfinite(third)], rest[np.isfinite(rest)]
     if not (finite.size and flat.size) or finite.min() < 0 or finite.max() > 1:
         return values, None
-    if float(flat.max()) - float(flat.min()) > DEPTH.pixels:
+    if float(flat.max()) - float(flat.min()) > SURE_PIXELS:
         return rest, np.where(np.isfinite(third), third, 0.0)
     if flat.min() >= 0 and flat.max() <= 1:
         said = "x, y and the third number are all from 0 to 1: it may be depth or confidence"

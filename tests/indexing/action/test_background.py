@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from indexing import ActionIndexer, Clip
 from indexing.action import background as of_background
-from indexing.action.background import OtherMovement, performed, played_otherwise, recorded
+from indexing.action.background import OtherMovement, cut_background, perform_other_actions, played_otherwise
 from indexing.actors import Person, dataset, detect, stream
 from indexing.skeleton import COCO17, OPENPOSE18
 
@@ -134,9 +134,9 @@ def test_what_is_made(monkeypatch):
     assert all(one.joints.shape == clip.joints.shape for one in played.clips) and not any(played.sure)
     for one, kind in zip(played.clips, played.kinds, strict=True):
         assert np.allclose(one.joints.mean(axis=0), clip.joints.mean(axis=0), atol=1e-5), kind  # other movement about the same pose
-    people = performed(OPENPOSE18, 2, rng)
+    people = perform_other_actions(OPENPOSE18, 2, rng)
     assert len(set(people.kinds)) == 13 and {one.joints.shape[1:] for one in people.clips} == {(18, 2)}
-    assert len(performed(None, 2, rng)) == 0
+    assert len(perform_other_actions(None, 2, rng)) == 0
     assert len(people + played) == len(people) + len(played) and len(OtherMovement()) == 0
 
 
@@ -144,10 +144,10 @@ def test_recordings_are_cut_into_pieces_as_long_as_the_action(monkeypatch):
     monkeypatch.setattr(of_background, "MAX_PIECES", 10)
     monkeypatch.setattr(of_background, "MAX_KINDS", 3)
     clip = Clip(np.random.default_rng(0).normal(size=(600, 5, 2)), fps=30.0)
-    pieces = recorded([clip], 30.0, 5, None, 2.0)
+    pieces = cut_background([clip], 30.0, 5, None, 2.0)
     assert len(pieces) == 10 and len(set(pieces.kinds)) == 3 and all(pieces.sure)
     assert {round(piece.duration, 1) for piece in pieces.clips} == {2.0}
-    short = recorded([clip.replace(joints=clip.joints[:20], times=clip.times[:20])], 30.0, 5, None, 2.0)
+    short = cut_background([clip.replace(joints=clip.joints[:20], times=clip.times[:20])], 30.0, 5, None, 2.0)
     assert len(short) == 1
 
 

@@ -9,7 +9,7 @@ import torch
 from indexing import ActionIndexer
 from indexing.action.bank import JointMetric, Windows, fused_residual
 from indexing.action.joint_weights import JointWeights
-from indexing.action.learning import BLENDS, _fewest_mistakes, _sharpened, blended, leave_out
+from indexing.action.learning import BLENDS, _fewest_mistakes, _fit_sharpness, blend_scores, leave_out
 from indexing.action.model import Blend, evidence
 from indexing.actors import Person, dataset
 from indexing.scoring import probabilities, reject_threshold
@@ -63,7 +63,7 @@ def test_sharpness_is_the_likeliest():
     draw = torch.Generator().manual_seed(1)
     truth = torch.arange(4).repeat(50)
     scores = torch.nn.functional.one_hot(truth, 4).double() + torch.randn(200, 4, generator=draw, dtype=torch.float64)
-    found = _sharpened(Blend(), scores, truth, 10**6).sharpness
+    found = _fit_sharpness(Blend(), scores, truth, 10**6).sharpness
 
     def likelihood(sharpness):
         chance = probabilities(scores.numpy(), sharpness)
@@ -72,13 +72,13 @@ def test_sharpness_is_the_likeliest():
     assert likelihood(found) >= max(likelihood(found * 1.19), likelihood(found / 1.19))
     assert likelihood(found) > likelihood(8.0)
     certain = 5.0 * torch.nn.functional.one_hot(truth, 4).double()  # nobody was ever wrong: the fewer asked, the less it says
-    few, many = (_sharpened(Blend(), certain, truth, exemplars).sharpness for exemplars in (8, 800))
+    few, many = (_fit_sharpness(Blend(), certain, truth, exemplars).sharpness for exemplars in (8, 800))
     assert few < many < 16
 
 
 def test_blended_is_the_weighted_sum():
     evidence = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(2))
-    assert torch.allclose(blended(evidence, Blend(2.0, 0.5)), 2 * evidence[0] + 0.5 * evidence[1])
+    assert torch.allclose(blend_scores(evidence, Blend(2.0, 0.5)), 2 * evidence[0] + 0.5 * evidence[1])
 
 
 @pytest.mark.slow

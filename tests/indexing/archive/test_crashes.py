@@ -72,7 +72,7 @@ def test_an_adder_killed_between_segment_and_catalogue_leaves_a_file(stage: Stag
     folder = stage.copy()
     with monkeypatch.context() as patch:
         patch.setattr(writer.Adder, "_enter", dies)
-        patch.setattr(writer, "clear", lambda catalogue: None)
+        patch.setattr(writer, "remove_orphans", lambda catalogue: None)
         with pytest.raises(SystemExit):
             Archive(folder).add(stage.new)
     assert len(Archive(folder).verify().orphans) == 1 and len(contents(folder)) == len(stage.earlier)

@@ -11,9 +11,9 @@ from indexing.brightness.sight import (
     BrightnessOptions,
     MotionBox,
     MotionMaps,
-    described,
-    mirrored,
-    pooled,
+    describe_cells,
+    mirror_rows,
+    pool_cells,
     profile,
 )
 
@@ -84,7 +84,7 @@ def test_cells_are_area_means():
     boxes = torch.tensor([[6.2, 4.0, 6.0, 5.0], [1.0, 7.0, 8.0, 8.0]], dtype=torch.float64)
     fine = 200  # sub-pixels: the integral by brute force
     for i, (x, y, w, h) in enumerate(boxes.tolist()):
-        found = pooled(maps, torch.stack([boxes, boxes.flip(0)], 1), count)[i, 0].view(count, count)
+        found = pool_cells(maps, torch.stack([boxes, boxes.flip(0)], 1), count)[i, 0].view(count, count)
         for row, column in ((0, 0), (1, 3), (3, 2)):
             xs = x - w / 2 + w / count * (column + 0.5 + np.linspace(-1, 1, fine, endpoint=False) + 1 / fine)
             ys = y - h / 2 + h / count * (row + 0.5 + np.linspace(-1, 1, fine, endpoint=False) + 1 / fine)
@@ -98,12 +98,12 @@ def test_descriptors_are_shorter_than_one_and_mirror_with_the_image():
     box = torch.tensor([12.0, 9, 20, 20]).expand(6, 4)
 
     def seen(images):
-        cells = pooled(MotionMaps(SIGMA, QUIET).push(images)[0], box[:, None])[:, 0]
-        return torch.cat([described(cells), described(cells), described(profile(cells))], dim=1)
+        cells = pool_cells(MotionMaps(SIGMA, QUIET).push(images)[0], box[:, None])[:, 0]
+        return torch.cat([describe_cells(cells), describe_cells(cells), describe_cells(profile(cells))], dim=1)
 
     rows = seen(frames)
     assert rows[2:, :256].norm(dim=1).max() < 1
     cells = rows[3, :256] / (1 - rows[3, :256].norm())
-    mean = pooled(MotionMaps(SIGMA, QUIET).push(frames)[0], box[:, None])[3]
+    mean = pool_cells(MotionMaps(SIGMA, QUIET).push(frames)[0], box[:, None])[3]
     torch.testing.assert_close(cells.norm() * SOFT_NORM, mean.sum().sqrt(), rtol=1e-3, atol=0)
-    torch.testing.assert_close(mirrored(rows), seen(frames.flip(2)), atol=1e-5, rtol=1e-3)
+    torch.testing.assert_close(mirror_rows(rows), seen(frames.flip(2)), atol=1e-5, rtol=1e-3)

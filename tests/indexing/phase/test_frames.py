@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from indexing.action.bank import Windows
-from indexing.phase.frames import image_distance, shape_distance, standardized
+from indexing.phase.frames import image_distance, normalize_frames, shape_distance
 
 
 def frames(count, joints, dims, seed):
@@ -38,5 +38,5 @@ def test_images_are_compared_up_to_place_and_size():
     seen = torch.ones(2, 6, dtype=torch.bool)
     found = image_distance(Windows(3 * x + torch.tensor([5.0, -2.0], dtype=x.dtype), seen), Windows(x, seen))
     assert found.diagonal().abs().max() < 1e-12
-    a, b = (standardized(x[:, 0], seen)[k].flatten() for k in (0, 1))
+    a, b = (normalize_frames(x[:, 0], seen)[k].flatten() for k in (0, 1))
     assert abs(float(found[0, 1] - (1 - a @ b))) < 1e-12

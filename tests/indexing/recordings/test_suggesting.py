@@ -9,7 +9,7 @@ import pytest
 
 from indexing import ActionIndexer, Clip
 from indexing.actors import Person, dataset, detect, stream
-from indexing.recordings.suggesting import SuggestOptions, chosen, compared, parts_of, suggest
+from indexing.recordings.suggesting import SuggestOptions, compare_parts, parts_of, select_parts, suggest
 
 KNOWN = ("squat", "wave")
 DONE = ["squat", "kick", "wave", "kick", "bow", "squat", "kick", "wave"]
@@ -89,7 +89,7 @@ def test_parts_cover_the_recording_and_stay_within_gaps(learned, recording) -> N
 def test_residuals_tell_what_is_known(learned, recording) -> None:
     clip, truth = recording
     parts = parts_of(learned, clip, [])
-    likely, near, apart, usual = compared(learned, parts.windows)
+    likely, near, apart, usual = compare_parts(learned, parts.windows)
     assert likely.shape == (len(parts.spans), 2) and apart.shape == (len(parts.spans),) * 2
     assert np.allclose(apart, apart.T, atol=0.1) and (np.diag(apart) < 0.01).all() and 0 < usual < 1
     inside = [any(a <= (s + e) / 2 <= b and label in KNOWN for label, a, b in truth) for s, e in parts.spans]
@@ -119,7 +119,7 @@ def left(points, centres, weight):
 def test_each_leaves_the_least_that_is_unlike_what_is_known(seed: int) -> None:
     points, known, apart, near, worth = scattered(seed)
     margin = np.random.default_rng(seed).random(40)
-    picked = chosen(near, apart, margin, 6, worth, SuggestOptions(doubt_weight=2.0))
+    picked = select_parts(near, apart, margin, 6, worth, SuggestOptions(doubt_weight=2.0))
     assert len(set(picked)) == 6 and worth[picked].all()
     weight = (1 + 2.0 * (1 - margin)) * worth
     for count, one in enumerate(picked):
@@ -130,7 +130,7 @@ def test_each_leaves_the_least_that_is_unlike_what_is_known(seed: int) -> None:
 
 def test_alone_it_is_farthest_first() -> None:
     points, known, apart, near, worth = scattered(0)
-    picked = chosen(near, apart, np.ones(40), 6, worth, SuggestOptions(coverage=False))
+    picked = select_parts(near, apart, np.ones(40), 6, worth, SuggestOptions(coverage=False))
     for count, one in enumerate(picked):  # each as far as any from all that are known by then
         centres = np.concatenate([known, points[picked[:count]]])
         distance = np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1)
@@ -139,8 +139,8 @@ def test_alone_it_is_farthest_first() -> None:
 
 def test_who_is_less_sure_comes_sooner() -> None:
     same = np.ones((2, 2)) - np.eye(2)
-    assert chosen(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions()) == [1]
-    assert chosen(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions(doubt_weight=0.0)) == [0]
+    assert select_parts(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions()) == [1]
+    assert select_parts(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions(doubt_weight=0.0)) == [0]
 
 
 def test_bad_input_says_what_is_wrong(learned, recording) -> None:
