@@ -212,7 +212,7 @@ def _check(x1: Tensor, x2: Tensor, basis: int, lengths: Tensor | None, weights: 
     return batch, pairs.long()
 
 
-class _Fit(NamedTuple):
+class _DeformableFit(NamedTuple):
     """What a flat batch ends as."""
 
     model: _Model
@@ -223,7 +223,7 @@ class _Fit(NamedTuple):
     scale: Tensor
 
 
-def _fit_stages(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic: bool, stop: Stop) -> _Fit:
+def _fit_stages(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthographic: bool, stop: Stop) -> _DeformableFit:
     """The stages in their order: size, cameras and points, metric, shapes, least squares, frame."""
     scale = _size(x, w)
     x = x / scale[:, None, None, None, None]
@@ -254,7 +254,7 @@ def _fit_stages(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthogra
     status = torch.where((spare < 0) | ((both.sum(-1) > 3).sum(-1) < 1) | (both.sum((1, 2)) < 4), int(Status.TOO_FEW), status)
     finite = torch.stack([part.isfinite().flatten(1).all(-1) for part in model]).all(0)
     status = torch.where(~finite & ~failed(status), int(Status.DEGENERATE), status)
-    return _Fit(_canonical_model(model), metric, rms * scale, sigma * scale, status, scale)
+    return _DeformableFit(_canonical_model(model), metric, rms * scale, sigma * scale, status, scale)
 
 
 def _size(x: Tensor, w: Tensor) -> Tensor:
@@ -532,7 +532,7 @@ def _canonical_model(model: _Model) -> _Model:
     return _Model(cameras, turns, left, right.unflatten(-1, shapes.shape[2:]), offsets)
 
 
-def _result(found: _Fit, batch: torch.Size, like: Tensor) -> DeformableShapes:
+def _result(found: _DeformableFit, batch: torch.Size, like: Tensor) -> DeformableShapes:
     """In the caller's batch, unit and dtype; zero where nothing was found."""
     model, bad = found.model, failed(found.status)
 

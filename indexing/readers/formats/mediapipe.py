@@ -55,7 +55,7 @@ class Columns(NamedTuple):
     person: int | None
 
 
-class Table(NamedTuple):
+class LandmarkTable(NamedTuple):
     """A table of points: ``m`` rows of somebody in a frame, in ``f`` frames."""
 
     frames: IntArray  # (f,) numbers
@@ -110,7 +110,7 @@ def read(source: Source, options: Options) -> ClipSet:
     return ClipSet([clip.replace(meta={**clip.meta, "may_lag": True}) if may_lag(clip) else clip for clip in clips], clips.name)
 
 
-def read_table(source: Source, columns: Columns, axes: str, recorded: bool) -> Table:
+def read_table(source: Source, columns: Columns, axes: str, recorded: bool) -> LandmarkTable:
     """The rows of a table, of which values are the axes (``"xy"`` or ``"xyz"``) and, where it is recorded, the confidence."""
     kinds = (*axes, "v") if recorded else tuple(axes)
     numeric = [place for place in (columns.frame, columns.time) if place is not None]
@@ -129,7 +129,7 @@ def read_table(source: Source, columns: Columns, axes: str, recorded: bool) -> T
     elif people is None and len(frames) < len(at):
         back = np.flatnonzero(np.diff(at) <= 0)[0]
         raise error(source.path, f"frame {frames[at[back + 1]]} comes twice", "drop repeated rows, or add a column 'person'")
-    return Table(frames, at, times, table, people, names)
+    return LandmarkTable(frames, at, times, table, people, names)
 
 
 def may_lag(clip: Clip) -> bool:
