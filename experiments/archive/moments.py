@@ -17,6 +17,7 @@ are rolled, that look from the ceiling, or do not see every joint; with fewer or
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import tempfile
 import time
@@ -189,7 +190,9 @@ def by_difficulty(archive: Archive, clips: Sequence[Clip], people: Takes, config
     for title, (other, constants) in changed.items():
         note(f"... {title}")
         clock = time.perf_counter()
-        with mock.patch.multiple(search, **constants):
+        with contextlib.ExitStack() as stack:
+            for constant, value in constants.items():
+                stack.enter_context(mock.patch.object(search, constant, value))
             places = searched(other, usual)
         options[title] = [*recall(places), (time.perf_counter() - clock) / len(usual)]
     places = searched(archive, usual, mirror=True)

@@ -16,6 +16,7 @@ warping (aeon) of normalized poses, every .2 s; *DTW, clips*: whole clips with w
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -213,7 +214,10 @@ def searching(changes: dict[str, Any], mirror: bool = False) -> Way:
         views = [query.views[turn] for query in task.queries]
         options = {name: value for name, value in changes.items() if name.islower()}
         other = Archive(archive.path, dataclasses.replace(archive.options, **options))
-        with mock.patch.multiple(search, **{name: value for name, value in changes.items() if name not in options}):
+        with contextlib.ExitStack() as stack:
+            for constant, value in changes.items():
+                if constant not in options:
+                    stack.enter_context(mock.patch.object(search, constant, value))
             return [(other.search(view, FEW, mirror=mirror), other.search(view, MANY, mirror=mirror)) for view in views]
 
     return ask
