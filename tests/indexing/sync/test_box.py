@@ -32,7 +32,7 @@ def test_box_of_a_take_encloses_what_moves():
     where, moving = boxes(found, 30.0)
     assert not moving and torch.equal(where[0], where[-1])
     assert (where[0, :2] - torch.tensor([44.0, 34.0])).abs().max() < 3 and 18 < where[0, 2] < 40
-    assert found.lively.double().mean() > 0.9 and not found.drift.moves and not found.drift.hopeless
+    assert found.lively.double().mean() > 0.9 and not found.drift.moves and not found.drift.too_fast
 
 
 def test_box_follows_what_crosses_the_image():
@@ -74,7 +74,7 @@ def test_camera_motion_is_measured():
 
 def test_flicker_is_hopeless():
     frames = scene(np.full((40, 2), 20)) * (torch.arange(40) % 3)[:, None, None] / 2
-    assert motion(frames).drift.hopeless
+    assert motion(frames).drift.too_fast
 
 
 def test_crop_is_a_cut_where_pixels_coincide(rng):

@@ -9,7 +9,7 @@ import pytest
 
 from indexing.clip import Clip
 from indexing.readers import read
-from indexing.sync.files import openpose_frames, plan, renumbered, write_poses
+from indexing.sync.files import openpose_frames, plan, renumber, write_poses
 from indexing.sync.recordings import take_of
 from tests.indexing.sync.scene import FPS, cut, moved, write_openpose
 
@@ -34,8 +34,8 @@ def test_equal_numbers_are_equal_moments():
 
 
 def test_names_keep_their_form():
-    assert renumbered("a1_000000000012_keypoints.json", 7) == "a1_000000000007_keypoints.json"
-    assert renumbered("cam01.99.json", 1234) == "cam01.1234.json" and renumbered("000.json", 5) == "005.json"
+    assert renumber("a1_000000000012_keypoints.json", 7) == "a1_000000000007_keypoints.json"
+    assert renumber("cam01.99.json", 1234) == "cam01.1234.json" and renumber("000.json", 5) == "005.json"
 
 
 def test_shifted_folders(tmp_path, cameras):

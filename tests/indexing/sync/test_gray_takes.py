@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.sync.brightness_features import MAX_IMAGE_SIDE, take
+from indexing.sync.brightness_features import MAX_IMAGE_SIDE, read_gray_video
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (50, 24, 32), dtype=np.uint8)
 
@@ -17,23 +17,23 @@ def chunks(frames, size=7, times=None):
 
 def test_arrays_and_streams_are_the_same_take():
     times = np.arange(50) / 25 + 3
-    whole = take(FRAMES, "a", fps=25.0)
+    whole = read_gray_video(FRAMES, "a", fps=25.0)
     assert torch.equal(whole.frames, torch.from_numpy(FRAMES)) and whole.fps == pytest.approx(25)
     for source in (chunks(FRAMES), list(chunks(FRAMES)), iter(torch.from_numpy(FRAMES))):
-        assert torch.equal(take(source, "a", fps=25.0).frames, whole.frames)
-    stamped = take(chunks(FRAMES, times=times), "a")
+        assert torch.equal(read_gray_video(source, "a", fps=25.0).frames, whole.frames)
+    stamped = read_gray_video(chunks(FRAMES, times=times), "a")
     assert torch.equal(stamped.frames, whole.frames) and stamped.times.tolist() == times.tolist()
 
 
 def test_floats_and_colours_become_grey_levels():
     for source in (FRAMES / 255, FRAMES.astype(np.float32), np.repeat(FRAMES[..., None], 3, axis=3)):
-        found = take(source, "a", fps=30.0).frames.int() - torch.from_numpy(FRAMES).int()
+        found = read_gray_video(source, "a", fps=30.0).frames.int() - torch.from_numpy(FRAMES).int()
         assert found.abs().max() <= 1  # rounding
 
 
 def test_large_frames_become_small():
     frames = np.repeat(np.repeat(FRAMES[:20], 40, axis=1), 40, axis=2)  # 1280 px wide
-    small = take(chunks(frames), "a", fps=30.0)
+    small = read_gray_video(chunks(frames), "a", fps=30.0)
     assert small.frames.shape[2] == MAX_IMAGE_SIDE and small.scale == MAX_IMAGE_SIDE / 1280
     assert torch.equal(small.frames[:, 5::10, 5::10], torch.from_numpy(FRAMES[:20]))
 
@@ -68,4 +68,4 @@ BAD = {
 def test_bad_videos_are_named(words):
     source, options = BAD[words]
     with pytest.raises(ValueError, match=words):
-        take(source, "a", **({"fps": 30.0} | options))
+        read_gray_video(source, "a", **({"fps": 30.0} | options))

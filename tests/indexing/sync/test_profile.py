@@ -11,7 +11,7 @@ from indexing.sync.brightness_features import (
     inverse_root,
     reversed_profile,
     row_profile,
-    whitened,
+    whiten,
 )
 
 
@@ -37,7 +37,7 @@ def test_whitening_equalizes_what_both_share(rng):
     mixing = rng.normal(size=(6, 6))
     first, second = (torch.from_numpy(rng.normal(size=(n, 6)) @ mixing) for n in (400, 300))
     first[5] = torch.nan
-    one, two = whitened(first, second, ridge=1e-9, reach=0)
+    one, two = whiten(first, second, ridge=1e-9, reach=0)
     assert (one[5] == 0).all() and torch.allclose(two.norm(dim=1), torch.ones(300, dtype=torch.float64))
     share = (one.T @ one / 399 + two.T @ two / 300) / 2
     assert (share - torch.eye(6) / 6).abs().max() < 0.03
@@ -46,7 +46,7 @@ def test_whitening_equalizes_what_both_share(rng):
 def test_neighbours_in_time_are_whitened_together(rng):
     first, second = (torch.from_numpy(rng.normal(size=(n, 3))) for n in (40, 30))
     stacked = [torch.cat([z[[0, *range(len(z) - 1)]], z, z[[*range(1, len(z)), -1]]], dim=1) for z in (first, second)]
-    for found, want in zip(whitened(first, second, reach=1), whitened(*stacked, reach=0), strict=True):
+    for found, want in zip(whiten(first, second, reach=1), whiten(*stacked, reach=0), strict=True):
         assert torch.allclose(found, want)
 
 

@@ -13,7 +13,7 @@ from indexing.skeleton import COCO17, HALPE26, Skeleton
 from indexing.sync.options import SyncOptions
 from indexing.sync.people import common_joints
 from indexing.sync.recordings import take_of
-from indexing.sync.synchronize import remarks, synchronize
+from indexing.sync.synchronize import recording_notices, synchronize
 from tests.indexing.sync.scene import FPS, SKIPPED, cut, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -136,7 +136,7 @@ def test_arrays_of_other_kinds_are_refused(cameras, library, value, says):
 
 def test_remarks_are_about_recordings():
     takes = [take_of(np.full((5, 3, 2), float(i)), name=f"c{i}", fps=None if i else 25.0) for i in range(3)]
-    assert [note.text for note in remarks(takes)] == ["30 frames per second assumed for c1, c2; fps= says otherwise"]
+    assert [note.text for note in recording_notices(takes)] == ["30 frames per second assumed for c1, c2; fps= says otherwise"]
 
 
 # ---- the library itself --------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.sync.synchronize import agreed, synchronize
+from indexing.sync.synchronize import combine_methods, synchronize
 from tests.indexing.sync.scene import FPS, shift, told
 
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -20,13 +20,20 @@ def test_two_methods_that_agree_decide_and_two_that_do_not_refuse():
     tracks, bright = shift(0.5, method="subspace", confidence=0.9), shift(0.52, method="brightness", confidence=0.8)
     unsure = dataclasses.replace(bright, **told({"ok": False, "reason": "halves differ"}))
     away = shift(2.5, method="brightness", confidence=0.99)
-    assert agreed(tracks, bright).ok and agreed(tracks, bright).method == "subspace" and agreed(tracks, bright).offset == 0.5
-    assert agreed(tracks, unsure).ok and agreed(dataclasses.replace(tracks, **told({"ok": False})), bright).method == "brightness"
-    refused = agreed(tracks, away)
+    assert (
+        combine_methods(tracks, bright).ok
+        and combine_methods(tracks, bright).method == "subspace"
+        and combine_methods(tracks, bright).offset == 0.5
+    )
+    assert (
+        combine_methods(tracks, unsure).ok
+        and combine_methods(dataclasses.replace(tracks, **told({"ok": False})), bright).method == "brightness"
+    )
+    refused = combine_methods(tracks, away)
     assert not refused.ok and "tracks say +0.500 s (sure), brightness says +2.500 s (sure)" in refused.reason
     assert refused.peaks[:, 0].tolist() == pytest.approx([0.5, 1.6, 2.5, 3.6])
-    assert not agreed(tracks, dataclasses.replace(away, **told({"ok": False}))).ok
-    both = agreed(dataclasses.replace(tracks, **told({"ok": False, "reason": "too still"})), unsure)
+    assert not combine_methods(tracks, dataclasses.replace(away, **told({"ok": False}))).ok
+    both = combine_methods(dataclasses.replace(tracks, **told({"ok": False, "reason": "too still"})), unsure)
     assert not both.ok and both.reason == "neither tracks nor brightness decide: too still; halves differ"
 
 
