@@ -14,12 +14,12 @@ from indexing.sync.recordings import Take, take_of
 from indexing.sync.trimming import (
     FOLDER,
     CameraVideo,
-    trim_as_json,
     check_videos,
     drop_videos,
     find_video,
     frame_clock,
     trim,
+    trim_as_json,
     video_of,
     write_videos,
 )
