@@ -23,7 +23,7 @@ from indexing.calibrate.priors import KnownLenses
 from indexing.clip import Clip, ClipSet
 from indexing.files import recover_folder, replace_folder, write_text
 from indexing.opening import count
-from indexing.sync.files import Plan, openpose_files, plan, renumbered
+from indexing.sync.files import Plan, openpose_files, plan, renumber
 
 if TYPE_CHECKING:
     from dyntorch import Calibration
@@ -315,7 +315,7 @@ def _write_camera(folder: Path, view: View, one: Plan) -> None:
         by_number = {int(np.rint(time * one.take.fps)): row for row, time in enumerate(one.take.times)}
         by_row = {by_number[number]: path.name for number, path in sources.items() if number in by_number}
     for number, row in zip(one.numbers.tolist(), one.rows.tolist(), strict=True):
-        name = renumbered(by_row[row], number) if row in by_row else f"{view.name}_{number:06d}.json"
+        name = renumber(by_row[row], number) if row in by_row else f"{view.name}_{number:06d}.json"
         (folder / name).write_text(texts[row], encoding="utf-8")
 
 

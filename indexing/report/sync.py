@@ -21,9 +21,9 @@ from indexing.opening import count
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 from indexing.report.page import Picture, markup, render, sentence, write_files
 from indexing.report.summary import Summary, Table
-from indexing.sync.breaks import Mended
-from indexing.sync.notices import besides
-from indexing.sync.people import Pairing, joint_names, who
+from indexing.sync.breaks import RepairedClocks
+from indexing.sync.notices import accepted_notices
+from indexing.sync.people import Pairing, joint_names, person_label
 from indexing.sync.recordings import Take
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Compared:
         several = len(self.a.people) > 1 or len(self.b.people) > 1
         if not several or not self.a.people or not self.b.people:
             return "", ""
-        return who(self.a, self.pairing.people[0]), who(self.b, self.pairing.people[1])
+        return person_label(self.a, self.pairing.people[0]), person_label(self.b, self.pairing.people[1])
 
     @property
     def apart(self) -> float:
@@ -135,7 +135,7 @@ class SyncReport:
     afterwards: Sequence[str] = ()
     shifted: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     videos: Mapping[str, Any] = field(default_factory=dict)
-    mended: Mended | None = None
+    mended: RepairedClocks | None = None
     heading: str = ""
     words: Callable[[str, str | None], str] = as_python
     manifest: Mapping[str, Any] = field(default_factory=dict)
@@ -213,14 +213,14 @@ class SyncReport:
         """What a user should know besides, a sentence each."""
         own = []
         for one in self.pairs:
-            for notice in besides(one.shift):
+            for notice in accepted_notices(one.shift):
                 if notice.code == "left_out" and one.wrong:  # these points are named beside their pair
                     continue
                 alone = len(self.pairs) == 1 or notice.values.get("camera")  # or it names the camera that it is about
                 said = notice.worded(self.words).text
                 own.append(str(said) if alone else f"{one.a.name} and {one.b.name}: {said}")
         if self.together is not None:  # what the pairs say is told with them
-            more = [notice for notice in besides(self.spoken) if notice.code != "of_pair"]
+            more = [notice for notice in accepted_notices(self.spoken) if notice.code != "of_pair"]
             own = [str(notice.worded(self.words).text) for notice in more] + own
         broke = [] if self.mended is None else [str(notice.worded(self.words).text) for notice in self.mended.found.notices]
         broke += ["offsets, rates and written files are as if no frame had been lost or doubled"] * bool(broke)
@@ -455,7 +455,7 @@ def as_json(report: SyncReport) -> dict[str, Any]:
         ],
         "pairs": [_pair_json(pair) for pair in report.pairs],
         "videos": report.videos or None,
-        "breaks": [] if report.mended is None else report.mended.told(),
+        "breaks": [] if report.mended is None else report.mended.as_json(),
         "cycle_error": report.cycle,
         "outlier_pair": list(report.outlier) if report.outlier else None,
         "notes": report.notes,

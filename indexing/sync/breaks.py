@@ -28,18 +28,18 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Mended:
+class RepairedClocks:
     """Recordings whose clocks broke, with times as if they had not."""
 
     found: Any
     takes: tuple[Take, ...]
 
     @property
-    def sure(self) -> bool:
+    def is_attributed(self) -> bool:
         """Whether it is known whose clock broke, as far as it can be: of three cameras the other pairs of both must say so, too."""
         return len(self.takes) == 2 or all(one.camera is not None for one in self.found.breaks)
 
-    def told(self) -> list[dict[str, Any]]:
+    def as_json(self) -> list[dict[str, Any]]:
         """Every break in plain types."""
         return [
             {
@@ -60,7 +60,7 @@ def find_breaks(
     calibration: Any = None,
     max_shift: float | None = None,
     options: SyncOptions | None = None,
-) -> Mended | None:
+) -> RepairedClocks | None:
     """Where the clocks of cameras broke; None where they did not, or where nothing tells: other joints in each, or no
     keypoints. compared ``(i, j)``."""
     import dyntorch
@@ -87,9 +87,9 @@ def find_breaks(
     names = {str(i): take.name for i, take in enumerate(takes)}
     named = dataclasses.replace(found, notices=tuple(notice.named(names) for notice in found.notices))
     changes: list[Floats] = [times.numpy() - clip.times for times, clip in zip(found.times, people, strict=True)]
-    return Mended(
+    return RepairedClocks(
         named,
-        tuple(retimed(take, np.asarray(clip.times, np.float64), by) for take, clip, by in zip(takes, people, changes, strict=True)),
+        tuple(retime(take, np.asarray(clip.times, np.float64), by) for take, clip, by in zip(takes, people, changes, strict=True)),
     )
 
 
@@ -115,7 +115,7 @@ def _trust(clip: Clip) -> Floats:
     return np.asarray(np.nan_to_num(np.clip(clip.confidence, 0.0, None)), dtype=np.float64)
 
 
-def retimed(take: Take, times: Floats, by: Floats) -> Take:
+def retime(take: Take, times: Floats, by: Floats) -> Take:
     """A recording whose clock is changed. times ``(k,)``, by ``(k,)``."""
 
     def new(old: Floats) -> Floats:

@@ -16,16 +16,16 @@ from dyntorch.numerics import Message, on_cpu, one_thread
 from indexing.sync.brightness_features import (
     KERNEL_HALF_FRAMES,
     MIN_FRAMES,
-    GrayTake,
+    GrayVideo,
     Region,
     Sampled,
     boxes,
     common_rate,
     kernel_descriptors,
     motion,
-    sampled,
-    take,
-    whitened,
+    read_gray_video,
+    sample,
+    whiten,
 )
 from indexing.sync.notices import BrightnessNotice
 from indexing.sync.options import MEASURES, Measure
@@ -196,7 +196,7 @@ class Verdict:
         return self.nats + LEAD_NATS * (1 - min(self.backwards, 2.0))
 
     @property
-    def agreed(self) -> bool:
+    def agrees(self) -> bool:
         """Whether halves and kernel agree with the best lag."""
         tolerance = AGREEMENT_FRAMES
         halves = all(abs(half - self.best) <= tolerance for half in self.halves)
@@ -205,7 +205,7 @@ class Verdict:
     @property
     def confidence(self) -> float:
         """Probability that the best lag is right to within a frame."""
-        table = AGREED_LOGISTIC if self.agreed and self.second <= MAX_SECOND_SCORE else OPEN_LOGISTIC
+        table = AGREED_LOGISTIC if self.agrees and self.second <= MAX_SECOND_SCORE else OPEN_LOGISTIC
         centre, scale = table[self.measure]
         return 1 / (1 + math.exp(-max(-30.0, min(30.0, (self.weight - centre) / scale))))
 
@@ -231,7 +231,7 @@ class Verdict:
 MIN_PEAK_SEPARATION_FRAMES = 8  # From the best peak, for another answer.
 
 
-def judge(
+def evaluate(
     a: Sampled,
     b: Sampled,
     lags: tuple[int, int],
@@ -239,7 +239,7 @@ def judge(
     measure: Measure = "profile",
 ) -> Verdict:
     """The best lag of two takes between ``lags``, with at least ``least`` rows of overlap, and what else speaks for it."""
-    compare = whitened if measure == "profile" else kernel_descriptors
+    compare = whiten if measure == "profile" else kernel_descriptors
     one, two = compare(*_rows(a, b, measure))
     curve = score_curve(one, two, least).within(*lags)
     if not bool(curve.scores.isfinite().any()):  # nothing moves in one of them
@@ -312,11 +312,11 @@ def brightness_shift(
     r"""How camera b's clock runs against camera a's, from brightness alone, or why that cannot be told. a ``(frames, h, w)``."""
     if measure not in MEASURES:
         raise ValueError(f"measure must be one of {', '.join(MEASURES)}, got {measure!r}")
-    first, second = _takes(a, b, fps, times)
+    first, second = _read_videos(a, b, fps, times)
     if max_shift is not None and not (math.isfinite(max_shift) and max_shift >= 0):
         raise ValueError(f"max_shift must be seconds, 0 or more, got {max_shift!r}")
     rate = common_rate(first, second)
-    (one, of_a), (two, of_b) = (_prepared(each, region, rate) for each in (first, second))
+    (one, of_a), (two, of_b) = (_sample_video(each, region, rate) for each in (first, second))
     base = two.start - one.start
     lengths = [len(rows) for rows in _rows(one, two, measure)]
     if measure == "window" and min(lengths) < KERNEL_HALF_FRAMES:
@@ -339,31 +339,31 @@ def brightness_shift(
             "allow larger shifts or give longer videos"
         )
         raise ValueError(Message(text, given=max_shift, least=least, rate=rate))
-    verdict = judge(one, two, span, least, measure)
+    verdict = evaluate(one, two, span, least, measure)
     return _shift((first, second), (one, two), verdict, (*of_a, *of_b))
 
 
-def _takes(a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, Any] | None) -> tuple[GrayTake, GrayTake]:
+def _read_videos(a: Any, b: Any, fps: tuple[float, float] | None, times: tuple[Any, Any] | None) -> tuple[GrayVideo, GrayVideo]:
     for name, pair in (("fps", fps), ("times", times)):
         if pair is not None and not (isinstance(pair, (tuple, list)) and len(pair) == 2):
             raise ValueError(f"{name} must be a pair, one for each video, got {pair!r}")
     rates, stamps = fps or (None, None), times or (None, None)
-    return take(a, "a", rates[0], stamps[0]), take(b, "b", rates[1], stamps[1])
+    return read_gray_video(a, "a", rates[0], stamps[0]), read_gray_video(b, "b", rates[1], stamps[1])
 
 
 MIN_MOVING_FRAMES = 10  # Frames in which something moves.
 
 
-def _prepared(source: GrayTake, region: str | Region | None, rate: float) -> tuple[Sampled, tuple[Notice, ...]]:
+def _sample_video(source: GrayVideo, region: str | Region | None, rate: float) -> tuple[Sampled, tuple[Notice, ...]]:
     """A take on the grid, and why it decides nothing, or what else to know of it."""
     height, width = source.frames.shape[1:]
-    found = motion(source.frames, None if region is None else _inside(region, source))
+    found = motion(source.frames, None if region is None else _region_in_pixels(region, source))
     box, moving = boxes(found, source.fps)
     if region is None:
         whole = torch.tensor([[width / 2, height / 2, max(width, height)]], dtype=torch.float64)
         box, moving = whole.expand(len(source.frames), 3), False
-    on_grid, values = sampled(source, box, rate), {"which": source.name, "camera": source.name}
-    if found.drift.hopeless:
+    on_grid, values = sample(source, box, rate), {"which": source.name, "camera": source.name}
+    if found.drift.too_fast:
         return on_grid, (Notice(BrightnessNotice.FLICKER, 0.0, values),)
     if int(found.lively.sum()) < MIN_MOVING_FRAMES:
         return on_grid, (Notice(BrightnessNotice.STILL, float(found.lively.sum()), values),)
@@ -373,7 +373,7 @@ def _prepared(source: GrayTake, region: str | Region | None, rate: float) -> tup
     return on_grid, (Notice(BrightnessNotice.CROSSES, 0.0, values),) if moving else ()
 
 
-def _inside(region: str | Region, source: GrayTake) -> Region | None:
+def _region_in_pixels(region: str | Region, source: GrayVideo) -> Region | None:
     if isinstance(region, str):
         if region != "motion":
             raise ValueError(f"region must be 'motion', None or (x0, y0, x1, y1) in pixels, got {region!r}")
@@ -393,7 +393,7 @@ MIN_SIGMA_FRAMES = 0.35  # Error of an accepted offset: .24 to .32 RMS on shifts
 
 
 def _shift(
-    takes: tuple[GrayTake, GrayTake],
+    takes: tuple[GrayVideo, GrayVideo],
     grids: tuple[Sampled, Sampled],
     verdict: Verdict,
     known: tuple[Notice, ...],

@@ -38,7 +38,7 @@ def row_profile(crops: Tensor) -> Tensor:
         gx, gy, gt = gradients(blur(crops[first:end], PROFILE_BLUR))
         gt = gt.sign() * (gt.abs() - PROFILE_NOISE_RATIO * gt.abs().median()).clamp(min=0)
         u, v = weighted_differences(gx, gy, gt)
-        parts.append(_pooled(u, v, NUM_BANDS)[begin - first : begin - first + PROFILE_BLOCK])
+        parts.append(_pool_rows(u, v, NUM_BANDS)[begin - first : begin - first + PROFILE_BLOCK])
     return torch.cat(parts)
 
 
@@ -48,7 +48,7 @@ def reversed_profile(profile: Tensor) -> Tensor:
     return torch.cat([down, up, across], dim=1)
 
 
-def _pooled(u: Tensor, v: Tensor, bands: int) -> Tensor:
+def _pool_rows(u: Tensor, v: Tensor, bands: int) -> Tensor:
     rows = torch.stack([(-v).clamp(min=0).mean(-1), v.clamp(min=0).mean(-1), u.abs().mean(-1)], dim=1)  # (T, 3, s)
     step = rows.shape[-1] // (bands + 1)
     pooled = avg_pool1d(rows, 2 * step, step)[..., :bands]
@@ -59,9 +59,7 @@ WHITENING_HALF_WIDTH = 3  # Frames on either side that are whitened together (2 
 PROFILE_RIDGE = 0.05  # Ridge of the whitening over the largest eigenvalue (.03 / .2: .91 / .87).
 
 
-def whitened(
-    first: Tensor, second: Tensor, reach: int = WHITENING_HALF_WIDTH, ridge: float = PROFILE_RIDGE
-) -> tuple[Tensor, Tensor]:
+def whiten(first: Tensor, second: Tensor, reach: int = WHITENING_HALF_WIDTH, ridge: float = PROFILE_RIDGE) -> tuple[Tensor, Tensor]:
     r"""Both cameras' profiles in space and time: centred, whitened by the covariance that they share, of norm 1 per frame.
     first, second ``(T, D)`` -> ``(T, (2 reach + 1) D)``."""
     around = torch.arange(-reach, reach + 1)
@@ -86,7 +84,7 @@ def inverse_root(matrix: Tensor, ridge: float) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class GrayTake:
+class GrayVideo:
     """What is kept of a video."""
 
     frames: Tensor  # ``(T, h, w)`` uint8, the longer side at most ``largest``; of a stream, in a file that goes with the object
@@ -104,7 +102,7 @@ MAX_IMAGE_SIDE = 320  # Longer side, pixels: a person a quarter as tall as a 108
 MIN_IMAGE_SIDE = 16  # Shorter side, pixels.
 
 
-def take(source: Any, name: str, fps: float | None = None, times: Any = None) -> GrayTake:
+def read_gray_video(source: Any, name: str, fps: float | None = None, times: Any = None) -> GrayVideo:
     """Read a video once. source ``(frames, h, w)``, times ``(frames,)``."""
     spool = _Spool(name, MAX_IMAGE_SIDE, MIN_IMAGE_SIDE)
     if not isinstance(source, (np.ndarray, Tensor)):
@@ -121,7 +119,7 @@ def take(source: Any, name: str, fps: float | None = None, times: Any = None) ->
         small = [spool.bytes(source[begin : begin + FOOTAGE_BLOCK]) for begin in range(0, max(len(source), 1), FOOTAGE_BLOCK)]
         spool.check()
         frames = torch.cat(small)
-    return GrayTake(frames, _times(times, fps, len(frames), name), spool.scale, name)
+    return GrayVideo(frames, _times(times, fps, len(frames), name), spool.scale, name)
 
 
 def _parts(source: Any, name: str) -> Iterator[Any]:
@@ -198,7 +196,7 @@ class Drift:
         return bool((self.step.norm(dim=1) > 0).double().mean() > self.often)
 
     @property
-    def hopeless(self) -> bool:
+    def too_fast(self) -> bool:
         """Whether it moves faster than can be followed, or the light changes."""
         return bool(self.lost.double().mean() > self.often)
 
@@ -460,13 +458,13 @@ class Sampled:
 MAX_FPS = 45.0  # Faster videos are compared at a half, a third ... of their rate; windows were chosen at 30.
 
 
-def common_rate(first: GrayTake, second: GrayTake) -> float:
+def common_rate(first: GrayVideo, second: GrayVideo) -> float:
     """The rate of the slower video, or a whole fraction of it."""
     rate = min(first.fps, second.fps)
     return rate / -(-rate // MAX_FPS)
 
 
-def sampled(source: GrayTake, where: Tensor, rate: float) -> Sampled:
+def sample(source: GrayVideo, where: Tensor, rate: float) -> Sampled:
     """Profile and kernels of a take in boxes ``(T, 3)`` of its frames, block by block."""
     start = float(source.times[0])
     count = int((float(source.times[-1]) - start) * rate + 1e-6) + 1
@@ -475,10 +473,10 @@ def sampled(source: GrayTake, where: Tensor, rate: float) -> Sampled:
         first, end = max(begin - KERNEL_HALF_FRAMES, 0), min(begin + BLOCK + KERNEL_HALF_FRAMES, count)
         crops, known = _crops(source, where, start + torch.arange(first, end, dtype=torch.float64) / rate)
         part = row_profile(crops)
-        part[~_around(known, 1)] = torch.nan
+        part[~_all_known_within(known, 1)] = torch.nan
         profiles.append(part[begin - first :][: min(BLOCK, count - begin)])
         found = window_kernels(crops).float()
-        found[~_around(known, KERNEL_HALF_FRAMES)[KERNEL_HALF_FRAMES : KERNEL_HALF_FRAMES + len(found)]] = torch.nan
+        found[~_all_known_within(known, KERNEL_HALF_FRAMES)[KERNEL_HALF_FRAMES : KERNEL_HALF_FRAMES + len(found)]] = torch.nan
         kernels.append(found)
     return Sampled(torch.cat(profiles), torch.cat(kernels), start, rate)
 
@@ -487,7 +485,7 @@ MAX_GAP_FRAMES = 2.5  # Over longer gaps nothing is interpolated.
 CROP_SIDE = 96  # Pixels.
 
 
-def _crops(source: GrayTake, where: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+def _crops(source: GrayVideo, where: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
     """Crops at any times, blended from the frames before and after, and whether these are near enough."""
     stamps = source.times
     after = torch.searchsorted(stamps, times - 1e-9).clamp(1, len(stamps) - 1)
@@ -508,7 +506,7 @@ def _crops(source: GrayTake, where: Tensor, times: Tensor) -> tuple[Tensor, Tens
     return out, known
 
 
-def _around(known: Tensor, reach: int) -> Tensor:
+def _all_known_within(known: Tensor, reach: int) -> Tensor:
     """``(T,)`` bool: whether all frames within ``reach`` are known."""
     lost = torch.nn.functional.max_pool1d((~known).float()[None], 2 * reach + 1, 1, reach)[0]
     return lost == 0

@@ -87,8 +87,8 @@ def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tu
     """The lens of each name: the section of this name, else the only one whose name contains it, else by order."""
     chosen: list[Lens | None] = []
     for name in names:
-        sections = [(lens, _plain(lens.name)) for lens in cameras]
-        plain = _plain(name)
+        sections = [(lens, _normalize_name(lens.name)) for lens in cameras]
+        plain = _normalize_name(name)
         equal = [lens for lens in cameras if lens.name == name] or [lens for lens, said in sections if said == plain]
         equal = equal or [lens for lens, said in sections if plain and plain in said]
         equal = equal or [lens for lens, said in sections if said and said in plain]
@@ -102,7 +102,7 @@ def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tu
     raise error(path, f"its cameras are {known_names}, and {listed(names)} are asked for", "name sections as the cameras")
 
 
-def _plain(name: str) -> str:
+def _normalize_name(name: str) -> str:
     """A name without what people write in two ways."""
     words = re.findall(r"[^\W\d_]+|\d+", name.lower())
     return " ".join(word.lstrip("0") or "0" if word.isdigit() else word for word in words)

@@ -151,15 +151,15 @@ def _write_camera(folder: Path, one: Plan, count: int | None = None) -> None:
         like = next(iter(sources.values())).name
         for number, row in chosen.items():
             if row in paths:
-                shutil.copyfile(paths[row], folder / renumbered(paths[row].name, number))
+                shutil.copyfile(paths[row], folder / renumber(paths[row].name, number))
                 written.add(number)
     else:
         texts = openpose_frames(one.take)
         for number, row in chosen.items():
-            (folder / renumbered(like, number)).write_text(texts[row], encoding="utf-8")
+            (folder / renumber(like, number)).write_text(texts[row], encoding="utf-8")
             written.add(number)
     for number in set(range(count or 0)) - written:
-        (folder / renumbered(like, number)).write_text(EMPTY, encoding="utf-8")
+        (folder / renumber(like, number)).write_text(EMPTY, encoding="utf-8")
 
 
 def openpose_files(path: Path | None) -> dict[int, Path]:
@@ -172,7 +172,7 @@ def openpose_files(path: Path | None) -> dict[int, Path]:
     return {number: file for file in found if (number := frame_number(file.name)) is not None}
 
 
-def renumbered(name: str, number: int) -> str:
+def renumber(name: str, number: int) -> str:
     """A file name with another frame number, at least as many digits."""
     stem, dot, suffix = name.rpartition(".")
     found = re.search(r"(\d{1,18})(?=_keypoints)", stem) or re.search(r"(\d{1,18})(?=\D*$)", stem)

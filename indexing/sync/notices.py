@@ -151,11 +151,11 @@ class BrightnessNotice(NoticeCode):
     """Too little evidence."""
 
 
-def noted(texts: Iterable[str], camera: str = "") -> list[Notice]:
+def reader_notices(texts: Iterable[str], camera: str = "") -> list[Notice]:
     """Notes of a reader as notices, of one recording or of all."""
     return [Notice(SyncNotice.NOTE, 0.0, {"text": text, "camera": camera}) for text in texts]
 
 
-def besides(shift: Outcome) -> list[Notice]:
+def accepted_notices(shift: Outcome) -> list[Notice]:
     """The notices that refuse nothing."""
     return [notice for notice in shift.notices if notice.code.refuses is None]

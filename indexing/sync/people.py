@@ -13,7 +13,7 @@ from dyntorch.core import Notice, status_from
 from indexing.clip import Clip
 from indexing.joints import named, places
 from indexing.skeleton import Skeleton, known
-from indexing.sync.notices import SyncNotice, besides
+from indexing.sync.notices import SyncNotice, accepted_notices
 from indexing.sync.recordings import FloatArray, Take
 
 if TYPE_CHECKING:
@@ -57,12 +57,12 @@ def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> 
     else:
         best, rivals = decide(found, frame)
     shift = best.shift
-    chosen = [f"{who(take, i)} of {take.name}" for take, i in zip((a, b), best.people, strict=True)]
+    chosen = [f"{person_label(take, i)} of {take.name}" for take, i in zip((a, b), best.people, strict=True)]
     note = Notice(SyncNotice.PEOPLE, float(len(found)), {"first": chosen[0], "second": chosen[1]})
     shift = dataclasses.replace(shift, notices=(*shift.notices, note))
     if rivals:
         listed = " and ".join(f"{rival:+.3f} s" for rival in rivals[:2])
-        limits = (Notice(SyncNotice.PAIRINGS, shift.offset, {"rivals": listed}), *besides(shift))
+        limits = (Notice(SyncNotice.PAIRINGS, shift.offset, {"rivals": listed}), *accepted_notices(shift))
         shift = dataclasses.replace(shift, status=status_from(limits), notices=limits)
     return Pairing(shift, best.people, rivals)
 
@@ -70,14 +70,14 @@ def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> 
 def backing(one: Pairing, found: Sequence[Pairing], frame: float) -> int:
     """How many pairings of other people, and this one, are sure of its offset."""
     others = [other for other in found if not set(enumerate(one.people)) & set(enumerate(other.people))]
-    return one.shift.ok + sum(one.shift.ok and other.shift.ok and not apart(one, other, frame) for other in others)
+    return one.shift.ok + sum(one.shift.ok and other.shift.ok and not contradict(one, other, frame) for other in others)
 
 
 OFFSET_TOLERANCE_FRAMES = 2.0  # Within this two answers are the same,
 OFFSET_TOLERANCE_SIGMAS = 3  # beside the sum of their standard deviations times this.
 
 
-def apart(one: Pairing, other: Pairing, frame: float) -> bool:
+def contradict(one: Pairing, other: Pairing, frame: float) -> bool:
     """Whether two answers differ by more than what both leave open."""
     return abs(_middle(one) - _middle(other)) > OFFSET_TOLERANCE_FRAMES * frame + OFFSET_TOLERANCE_SIGMAS * (
         one.shift.sigma + other.shift.sigma
@@ -88,7 +88,7 @@ def _middle(pairing: Pairing) -> float:
     return float(pairing.shift.at(pairing.shift.center)) - pairing.shift.center
 
 
-def who(take: Take, index: int) -> str:
+def person_label(take: Take, index: int) -> str:
     """A person of a camera in words."""
     person = take.people[index].meta.get("person")
     return "the largest person of each frame" if person is None else f"person {person}"
@@ -107,7 +107,7 @@ def decide(found: Sequence[Pairing], frame: float) -> tuple[Pairing, tuple[float
         for pairing in ranked[1:]
         if behind[id(pairing)] >= max(1, behind[id(best)])
         and pairing.shift.confidence >= MIN_CONFIDENCE_RATIO * best.shift.confidence
-        and apart(best, pairing, frame)
+        and contradict(best, pairing, frame)
     ]
     return best, tuple(rivals)
 
@@ -146,7 +146,7 @@ def disagreements(a: Clip, b: Clip, shift: Shift) -> list[tuple[float, float, fl
     """Stretches in which both do not show the same person: start and end on a's clock, and how many times the usual distance."""
     if shift.fundamental is None:
         return []
-    distance = _running(_distances(a, b, shift), round(MIN_STRETCH_SECONDS / 2 * float(a.fps or 30.0)))
+    distance = _running_median(_distances(a, b, shift), round(MIN_STRETCH_SECONDS / 2 * float(a.fps or 30.0)))
     usual = float(np.nanmedian(distance)) if np.isfinite(distance).any() else 0.0
     if not usual > 0:
         return []
@@ -178,7 +178,7 @@ def jumps(clip: Clip) -> list[float]:
     return [float(time) for time in times[alone[1:] & alone[:-1]]]
 
 
-def _running(values: FloatArray, half: int) -> FloatArray:
+def _running_median(values: FloatArray, half: int) -> FloatArray:
     """Running median over ``2 half + 1`` values; NaN where fewer than half of them are known."""
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, constant_values=np.nan), 2 * half + 1)
     enough = np.isfinite(windows).sum(axis=1) > half

@@ -47,7 +47,7 @@ class Trial:
         films = [self.films.get(name) for name in self.cameras]
         return [self.fps or (None if film is None else probe(film).fps) for film in films]
 
-    def filmed(self, takes: Sequence[Take]) -> list[Take]:
+    def with_videos(self, takes: Sequence[Take]) -> list[Take]:
         """Takes with the videos that their keypoints were found in."""
         return [dataclasses.replace(take, film=self.films.get(take.name)) for take in takes]
 
@@ -71,7 +71,7 @@ def trial_of(folder: Path) -> Trial | None:
     cameras = _cameras(folder / POSE)
     if not configs or len(cameras) < 2:
         return None
-    films = {name: film for name in cameras if (film := _film(folder / FILMS, name)) is not None}
+    films = {name: film for name in cameras if (film := _video_of(folder / FILMS, name)) is not None}
     homes = [folder] if (folder / CONFIG) == configs[0] else [folder.resolve().parent, folder]
     return Trial(folder, cameras, films, _frame_rate(configs), _calibration(homes))
 
@@ -83,16 +83,16 @@ def trials_in(folder: Path) -> list[Path]:
     project = _project(folder / CONFIG)
     excluded = project.get("exclude_from_batch", [])
     leave = {Path(str(name)).name for name in excluded} if isinstance(excluded, list) else set()
-    below = _below(folder, 3)  # participants, and their trials, and one more
+    below = _folders_below(folder, 3)  # participants, and their trials, and one more
     return [inner for inner in below if inner.name not in leave and trial_of(inner) is not None]
 
 
-def _below(folder: Path, depth: int) -> Iterator[Path]:
+def _folders_below(folder: Path, depth: int) -> Iterator[Path]:
     inner = sorted(entry for entry in folder.iterdir() if entry.is_dir() and not entry.name.startswith("."))
     for entry in inner if depth else []:
         yield entry
         if not (entry / POSE).is_dir():
-            yield from _below(entry, depth - 1)
+            yield from _folders_below(entry, depth - 1)
 
 
 def _cameras(pose: Path) -> dict[str, Path]:
@@ -108,7 +108,7 @@ def _last_number(name: str) -> tuple[bool, int]:
     return (False, int(digits[-1])) if digits else (True, 0)
 
 
-def _film(folder: Path, name: str) -> Path | None:
+def _video_of(folder: Path, name: str) -> Path | None:
     files = sorted(folder.iterdir()) if folder.is_dir() else []
     return next((file for file in files if file.suffix.lower() in VIDEOS and file.stem == name and file.is_file()), None)
 

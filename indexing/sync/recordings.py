@@ -89,13 +89,13 @@ def take_of(
     if fps is not None:
         check_fps(fps)
     how = {"min_confidence": min_confidence, "format": format, "size": size, "layout": layout}
-    take = _taken(value, name, fps, person, how, options)
+    take = _read(value, name, fps, person, how, options)
     if take.kind == "video" and by != "pixels":
-        take = _watched(take, by, keypoints, person, how, options)
-    return _without_pauses(take)
+        take = _read_people(take, by, keypoints, person, how, options)
+    return _cut_pauses(take)
 
 
-def _taken(value: Any, name: str, fps: float | None, person: str, how: dict[str, Any], options: SyncOptions) -> Take:
+def _read(value: Any, name: str, fps: float | None, person: str, how: dict[str, Any], options: SyncOptions) -> Take:
     if person not in CHOICES:
         raise ValueError(f"person must be one of {', '.join(CHOICES)}, got {person!r}")
     if isinstance(value, Clip):
@@ -118,7 +118,7 @@ MAX_SPAN_FRAMES = 20_000  # Frames that it may run over in any case.
 CUT_PAUSES_SECONDS = (60.0, 10.0, 1.0)  # Pauses at which a recording that is nearly all gap is cut: as few as will do.
 
 
-def _without_pauses(take: Take) -> Take:
+def _cut_pauses(take: Take) -> Take:
     """The take with its people cut to the longest stretch of frames, where it is nearly all gap."""
     if take.kind != "keypoints" or take.count < 2:
         return take
@@ -171,21 +171,21 @@ def _of_file(name: str, path: Path, fps: float | None, person: str, how: dict[st
 
     if person != "auto":
         clips = read(path, fps=fps, person=person, **how)
-        return _noted(_of_clips(name, path, [_single(path, list(clips))]), FOLLOWED[person])
+        return _with_notes(_of_clips(name, path, [_single(path, list(clips))]), FOLLOWED[person])
     everyone = list(read(path, fps=fps, person="everyone", **how))
     if any(clip.label is not None for clip in everyone) or "person" not in everyone[0].meta:  # a set of clips, not a recording
-        return _noted(_of_clips(name, path, [_single(path, everyone)]), "")
+        return _with_notes(_of_clips(name, path, [_single(path, everyone)]), "")
     largest = read(path, fps=fps, person="largest", **how)[0]  # this one has the frames without people, too
     tried = candidates(largest, everyone, options=options) if len(everyone) > 1 else []
     found = dataclasses.replace(_of_clips(name, path, [largest, *tried]), everyone=tuple(everyone))
-    return _noted(found, "" if tried else FOLLOWED["largest"])
+    return _with_notes(found, "" if tried else FOLLOWED["largest"])
 
 
 MAX_GRID_ERROR_FRAMES = 0.1  # Distance of times from an even grid, frames, up to which missing frames are counted.
 MAX_EMPTY_SHARE = 0.1  # Share of frames without a person above which it is said.
 
 
-def _noted(take: Take, followed: str) -> Take:
+def _with_notes(take: Take, followed: str) -> Take:
     """The recording with notes on frames that are missing, on those that show nobody, and on others in view than who is
     followed."""
     notes: list[str] = []
@@ -245,7 +245,7 @@ def _of_video(name: str, path: Path, fps: float | None) -> Take:
 MAX_PEOPLE_IN_VIDEO = 4  # People that a pose model looks for in a video: pairings of more are not tried.
 
 
-def _watched(
+def _read_people(
     video: Take, by: By, keypoints: Path | ValueError | None, person: str, how: dict[str, Any], options: SyncOptions
 ) -> Take:
     """The people in a video, as a pose model sees them; the video itself where there is no model, or nobody is seen."""

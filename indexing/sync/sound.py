@@ -125,10 +125,10 @@ class Sound:
         if not energy.shape[1]:
             return energy
         quiet = np.quantile(energy, 0.5, axis=1, keepdims=True) + 1e-9 * energy.max() + np.finfo(np.float32).tiny
-        return flattened(np.log(energy + quiet), 1 / step, SPECTRUM_SMOOTHING_HERTZ, MIN_MODULATION_HERTZ)
+        return phase_transform(np.log(energy + quiet), 1 / step, SPECTRUM_SMOOTHING_HERTZ, MIN_MODULATION_HERTZ)
 
 
-def flattened(curves: Signal, rate: float, smooth: float, slowest: float) -> Signal:
+def phase_transform(curves: Signal, rate: float, smooth: float, slowest: float) -> Signal:
     """The phase transform of curves: each frequency divided by its magnitude, smoothed over its neighbours. curves ``(k, n)``
     -> ``(k, n)``."""
     from scipy import fft, ndimage
@@ -148,7 +148,7 @@ def flattened(curves: Signal, rate: float, smooth: float, slowest: float) -> Sig
 # Listening to a file.
 
 
-def hear(path: str | Path) -> Sound | None:
+def read_sound(path: str | Path) -> Sound | None:
     """The sound of a video, on the clock of its pictures; None where it has none."""
     from indexing.opening import size_of
 
@@ -157,11 +157,11 @@ def hear(path: str | Path) -> Sound | None:
         changed = path.stat().st_mtime_ns, size_of(path)
     except (OSError, ValueError):
         changed = (0, 0)  # opening it says what is wrong
-    return _heard(path, changed)
+    return _read_sound(path, changed)
 
 
 @lru_cache(maxsize=16)
-def _heard(path: Path, changed: tuple[int, int]) -> Sound | None:
+def _read_sound(path: Path, changed: tuple[int, int]) -> Sound | None:
     from indexing.video.reading import open_video
 
     with open_video(path) as (container, pictures):
@@ -240,17 +240,17 @@ def sound_shift(
     """How the clock of one camera runs against that of another, by what their microphones heard."""
     missing = [which for which, one in zip("ab", (a, b), strict=True) if one is None]
     if a is None or b is None:
-        return _refused(fps, *(Notice(SoundNotice.NONE, 0.0, {"which": which}) for which in missing))
+        return _refuse(fps, *(Notice(SoundNotice.NONE, 0.0, {"which": which}) for which in missing))
     dead = [Notice(SoundNotice.SILENT, 0.0, {"which": which}) for which, one in zip("ab", (a, b), strict=True) if one.silent]
     if dead:
-        return _refused(fps, *dead)
+        return _refuse(fps, *dead)
     search = SoundSearch(a, b, max_shift, 0.0 if rate is None else rate - 1, rate is None)
     if not search.lags.size:
-        return _refused(fps, Notice(SoundNotice.SHORT, MIN_OVERLAP_SECONDS))
+        return _refuse(fps, Notice(SoundNotice.SHORT, MIN_OVERLAP_SECONDS))
     return search.shift(fps)
 
 
-def _refused(fps: tuple[float, float], *limits: Notice) -> Shift:
+def _refuse(fps: tuple[float, float], *limits: Notice) -> Shift:
     from dyntorch import Shift
 
     none = torch.zeros(0, dtype=torch.float64)
@@ -308,7 +308,7 @@ class SoundSearch:
         return np.arange(-many, many + 1) * 2 / length
 
     @cached_property
-    def scored(self) -> tuple[Floats, Floats]:
+    def lag_scores(self) -> tuple[Floats, Floats]:
         """``(L,)`` score of every lag at its best drift, and those drifts."""
         from scipy import fft
 
@@ -332,7 +332,7 @@ class SoundSearch:
 
     def peaks(self) -> list[SoundPeak]:
         """The best shifts that are not the slope of a better one, best first."""
-        scores, drifts = self.scored
+        scores, drifts = self.lag_scores
         left = scores.copy()
         found: list[SoundPeak] = []
         away = MIN_PEAK_SEPARATION_SECONDS / self.step
@@ -344,7 +344,7 @@ class SoundSearch:
             left[np.abs(self.lags - self.lags[at]) <= away] = -np.inf
         return found
 
-    def said(self, peak: SoundPeak) -> Floats:
+    def stretch_scores(self, peak: SoundPeak) -> Floats:
         """What each short stretch of a says for a shift; 0 where b recorded nothing."""
         one, two = self.a.coarse, self.b.coarse
         rows = np.arange(one.shape[1])
@@ -362,20 +362,20 @@ class SoundSearch:
 
         peaks = self.peaks()
         if not peaks:
-            return _refused(fps, Notice(SoundNotice.NOTHING, 0.0))
-        said = [self.said(one) for one in peaks]
-        order = sorted(range(len(peaks)), key=lambda i: -ratio(said[i]))  # a score is of chance where the overlap is short
+            return _refuse(fps, Notice(SoundNotice.NOTHING, 0.0))
+        said = [self.stretch_scores(one) for one in peaks]
+        order = sorted(range(len(peaks)), key=lambda i: -evidence_ratio(said[i]))  # a score is of chance where the overlap is short
         peaks, said = [peaks[i] for i in order], [said[i] for i in order]
-        best, strength = peaks[0], ratio(said[0])
-        apart = [ratio(said[0] - other) for other in said[1:]]
+        best, strength = peaks[0], evidence_ratio(said[0])
+        apart = [evidence_ratio(said[0] - other) for other in said[1:]]
         chance = len(self.lags) * len(self._drifts()) * math.exp(-(max(strength, 0.0) ** 2) / 2)
         rivals = sum(math.exp(-(max(value, 0.0) ** 2) / 2) for value in apart)
         fit = SoundFit(self, best)
         close = [one for one, value in zip(peaks[1:], apart, strict=True) if value < MIN_EVIDENCE_OVER_PEAK]
         limits = self._limits(best, chance, close)
-        scores, _ = self.scored
+        scores, _ = self.lag_scores
         lags = self.lags * self.step + self.between
-        kept = _thinned(lags, scores, MAX_CURVE_POINTS)
+        kept = _thin(lags, scores, MAX_CURVE_POINTS)
         return Shift(
             offset=fit.offset,
             sigma=math.sqrt(fit.sigma**2 + (DISTANCE_SIGMA_METRES / SPEED_OF_SOUND) ** 2 + LATENCY_SIGMA_SECONDS**2),
@@ -407,13 +407,13 @@ class SoundSearch:
         return (peak.lag + peak.drift * away) * self.step + self.between
 
 
-def ratio(values: Floats) -> float:
+def evidence_ratio(values: Floats) -> float:
     """The sum of values over the root of the sum of their squares; of values as likely positive as negative rarely above 4."""
     size = float(np.sqrt((values**2).sum()))
     return round(float(values.sum()) / size, 3) if size else 0.0
 
 
-def _thinned(lags: Floats, scores: Floats, most: int) -> tuple[Floats, Floats]:
+def _thin(lags: Floats, scores: Floats, most: int) -> tuple[Floats, Floats]:
     """The highest of every few values of a curve of many."""
     every = -(-len(lags) // most)
     if every == 1:
@@ -447,9 +447,9 @@ class SoundFit:
         self._at = lags
         drift = peak.drift
         long = search.free and high - low >= MIN_SECONDS_FOR_RATE
-        place, slope, covariance = self._best(drift, free=long)
+        place, slope, covariance = self._maximize(drift, free=long)
         if long and abs(slope - 0.0) <= SIGNIFICANCE_SIGMAS * math.sqrt(covariance[1, 1]):  # nothing speaks for a drift
-            long, (place, slope, covariance) = False, self._best(0.0, free=False)
+            long, (place, slope, covariance) = False, self._maximize(0.0, free=False)
         self.rate = 1 + slope
         self.rate_sigma = math.sqrt(covariance[1, 1]) if long else 0.0
         self.sigma = math.sqrt(covariance[0, 0])
@@ -480,7 +480,7 @@ class SoundFit:
             curves.append(ndimage.gaussian_filter1d(found[: 2 * reach + 1], SCORE_SMOOTHING_SECONDS / self.hop))
         return np.array(times), np.array(curves, dtype=np.float64)
 
-    def _along(self, place: float, slope: float) -> tuple[Floats, Floats, Floats]:
+    def _scores_along(self, place: float, slope: float) -> tuple[Floats, Floats, Floats]:
         """Score, slope and curvature of every piece's curve where offset and drift put it."""
         from scipy import ndimage
 
@@ -490,19 +490,19 @@ class SoundFit:
         before, here, after = values
         return here, (after - before) / (2 * self.hop), (after - 2 * here + before) / self.hop**2
 
-    def _best(self, drift: float, free: bool) -> tuple[float, float, Floats]:
+    def _maximize(self, drift: float, free: bool) -> tuple[float, float, Floats]:
         """Seconds from the peak, drift, and the covariance of both: a grid, then Newton's steps while they go up."""
         reach = MIN_PEAK_SEPARATION_SECONDS / 2
         places = np.arange(-reach, reach + self.hop / 2, self.hop)
         half = max(float(np.abs(self.times).max()), self.hop)
         near = min(MAX_RATE_DEVIATION, 2 * STEP_SECONDS / half)  # what the search before could not tell apart
         steps = drift + np.arange(-near, near + 1e-12, self.hop / half) if free else np.array([drift])
-        totals = [[float(self._along(place, slope)[0].sum()) for place in places.tolist()] for slope in steps.tolist()]
+        totals = [[float(self._scores_along(place, slope)[0].sum()) for place in places.tolist()] for slope in steps.tolist()]
         row, column = np.unravel_index(int(np.argmax(totals)), np.shape(totals))
         found = np.array([places[column], steps[row]])
         both = 2 if free else 1
         for _ in range(MAX_NEWTON_STEPS):
-            here, first, second = self._along(float(found[0]), float(found[1]))
+            here, first, second = self._scores_along(float(found[0]), float(found[1]))
             design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
             hessian = -(design * second[:, None]).T @ design
             if np.linalg.eigvalsh(hessian).min() <= 0:
@@ -510,14 +510,14 @@ class SoundFit:
             move = np.zeros(2)
             move[:both] = np.linalg.solve(hessian, design.T @ first)
             next_place, next_slope = (found + move).tolist()
-            if self._along(next_place, next_slope)[0].sum() < here.sum():
+            if self._scores_along(next_place, next_slope)[0].sum() < here.sum():
                 break
             found = found + move
         return float(found[0]), float(found[1]), self._covariance(found, both)
 
     def _covariance(self, found: Floats, both: int) -> Floats:
         """``(2, 2)`` of seconds and drift."""
-        _, first, second = self._along(float(found[0]), float(found[1]))
+        _, first, second = self._scores_along(float(found[0]), float(found[1]))
         design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
         hessian = -(design * second[:, None]).T @ design
         covariance = np.zeros((2, 2))
@@ -534,12 +534,12 @@ class SoundFit:
 # A witness to what keypoints or pixels say.
 
 
-def apart(one: Shift, other: Shift) -> float:
+def offset_difference(one: Shift, other: Shift) -> float:
     """Seconds that another result is later, in the middle of the first's overlap."""
     return float(other.at(one.center)) - float(one.at(one.center))
 
 
-def witnessed(found: Shift, heard: Shift) -> Shift:
+def check_by_sound(found: Shift, heard: Shift) -> Shift:
     """What keypoints or pixels say, with what the sound says to it: it agrees, contradicts (a refusal), or does not decide."""
     if not heard.ok:
         if all(notice.code is SoundNotice.NONE for notice in heard.notices):
@@ -549,7 +549,7 @@ def witnessed(found: Shift, heard: Shift) -> Shift:
     said = {"offset": f"{heard.at(heard.center) - heard.center:+.3f}", "sigma": f"{heard.sigma:.3f}"}
     if not found.ok:
         return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.ALONE, 0.0, said)))
-    off = apart(found, heard)
+    off = offset_difference(found, heard)
     if abs(off) <= SIGNIFICANCE_SIGMAS * math.hypot(found.sigma, heard.sigma):
         return dataclasses.replace(found, notices=(*found.notices, Notice(SoundNotice.AGREES, off)))
     said["found"] = f"{found.at(found.center) - found.center:+.3f}"

@@ -18,7 +18,7 @@ from dyntorch.core import Notice, status_from
 from dyntorch.numerics import Message, check_options, named
 from indexing.clip import Clip
 from indexing.remarks import is_normalized
-from indexing.sync.notices import SoundNotice, SyncNotice, besides, noted
+from indexing.sync.notices import SoundNotice, SyncNotice, accepted_notices, reader_notices
 from indexing.sync.options import MEASURES, Measure, SyncOptions
 from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
 from indexing.sync.recordings import By, Take, take_of
@@ -127,7 +127,7 @@ def synchronize(
         options=options,
         **more,
     ).shift
-    return dataclasses.replace(shift, notices=(*remarks(takes), *shift.notices))
+    return dataclasses.replace(shift, notices=(*recording_notices(takes), *shift.notices))
 
 
 def pair(
@@ -155,15 +155,15 @@ def pair(
     more = {**more, "calibration": _of_both(a, b, lens.values) if lens else None}
     try:
         if method == "sound":
-            heard = listened(a, b, **more)
+            heard = compare_sound(a, b, **more)
             limits: list[Notice] = []
             found = Pairing(heard, (0, 0), sound=heard)
         else:
-            found, limits = _compared(a, b, method, measure, more, options)
-            found = _witnessed(found, a, b, more) if sound else found
+            found, limits = _compare(a, b, method, measure, more, options)
+            found = _with_sound(found, a, b, more) if sound else found
     except ValueError as problem:
         raise ValueError(named(problem, names)) from problem
-    said = [notice.named(names) for notice in [*noted(lens.notes if lens else ()), *limits, *found.shift.notices]]
+    said = [notice.named(names) for notice in [*reader_notices(lens.notes if lens else ()), *limits, *found.shift.notices]]
     unique = {(notice.code, str(notice.text)): notice for notice in said}
     return dataclasses.replace(found, shift=dataclasses.replace(found.shift, notices=tuple(unique.values())))
 
@@ -175,7 +175,7 @@ def _of_both(a: Take, b: Take, values: Any) -> Any:
     return (None, *values) if a.spatial else (*values, None)
 
 
-def _compared(
+def _compare(
     a: Take, b: Take, method: Method, measure: Measure, more: dict[str, Any], options: SyncOptions
 ) -> tuple[Pairing, list[Notice]]:
     """What the data say, and what is to be said about the people in them."""
@@ -186,44 +186,44 @@ def _compared(
             partial(_keypoints, options=options, **more),
             partial(_keypoints, quick=True, options=options, **more),
         )
-        limits = _swapped(a, b, found)
+        limits = _identity_notices(a, b, found)
         if found.shift.ok or method != "auto" or a.video is None or b.video is None:
             return found, limits
-        return _second(found, synchronize_videos(a.video, b.video, method, **more, options=options)), limits
+        return _add_pixels(found, synchronize_videos(a.video, b.video, method, **more, options=options)), limits
 
     return Pairing(synchronize_videos(a, b, method, measure, **more, options=options), (0, 0)), []
 
 
-def listened(a: Take, b: Take, **more: Any) -> Shift:
+def compare_sound(a: Take, b: Take, **more: Any) -> Shift:
     """What the sound of two cameras says."""
-    from indexing.sync.sound import hear, sound_shift
+    from indexing.sync.sound import read_sound, sound_shift
 
     known = {name: value for name, value in more.items() if name in ("max_shift", "rate")}
-    sounds = [None if take.footage is None else hear(take.footage) for take in (a, b)]
+    sounds = [None if take.footage is None else read_sound(take.footage) for take in (a, b)]
     return sound_shift(sounds[0], sounds[1], fps=(a.fps, b.fps), **known)
 
 
-def _witnessed(found: Pairing, a: Take, b: Take, more: dict[str, Any]) -> Pairing:
+def _with_sound(found: Pairing, a: Take, b: Take, more: dict[str, Any]) -> Pairing:
     """What was found, and what the sound of both cameras says to it, where they have any."""
-    from indexing.sync.sound import witnessed
+    from indexing.sync.sound import check_by_sound
 
     if a.footage is None or b.footage is None:
         return found
     try:
-        heard = listened(a, b, **more)
+        heard = compare_sound(a, b, **more)
     except ValueError as problem:  # the pictures could be read, and need no witness
         said = Notice(SoundNotice.OPEN, 0.0, {"why": problem.args[0] if problem.args else str(problem)})
         return dataclasses.replace(found, shift=dataclasses.replace(found.shift, notices=(*found.shift.notices, said)))
-    return dataclasses.replace(found, shift=witnessed(found.shift, heard), sound=heard)
+    return dataclasses.replace(found, shift=check_by_sound(found.shift, heard), sound=heard)
 
 
-def _second(found: Pairing, seen: Shift) -> Pairing:
+def _add_pixels(found: Pairing, seen: Shift) -> Pairing:
     """What the pixels of two videos say where the people in them do not decide: taken where it is sure, and said in any case."""
     first = found.shift
     if seen.ok:
-        known = Notice(SyncNotice.BY_PIXELS, 0.0, {"keypoints": _why(first)})
+        known = Notice(SyncNotice.BY_PIXELS, 0.0, {"keypoints": _reason(first)})
         return dataclasses.replace(found, shift=dataclasses.replace(seen, notices=(known, *seen.notices)))
-    known = Notice(SyncNotice.NEITHER, 0.0, {"pixels": _why(seen)})
+    known = Notice(SyncNotice.NEITHER, 0.0, {"pixels": _reason(seen)})
     return dataclasses.replace(found, shift=dataclasses.replace(first, notices=(*first.notices, known)))
 
 
@@ -285,20 +285,20 @@ def _keypoints(
         options=options.of_points,
         **more,
     )
-    return dataclasses.replace(shift, notices=(*noted([note] if note else []), *shift.notices))
+    return dataclasses.replace(shift, notices=(*reader_notices([note] if note else []), *shift.notices))
 
 
-def remarks(takes: Sequence[Take]) -> list[Notice]:
+def recording_notices(takes: Sequence[Take]) -> list[Notice]:
     """What to say about the recordings themselves."""
-    found = [notice for take in takes for notice in noted(take.notes, take.name)]
+    found = [notice for take in takes for notice in reader_notices(take.notes, take.name)]
     names = [take.name for take in takes if take.fps_assumed]
     if names:
         found.append(Notice(SyncNotice.ASSUMED, 30.0, {"names": ", ".join(names)}))
-    same = [f"{a.name} and {b.name}" for a, b in combinations(takes, 2) if _same(a, b)]
+    same = [f"{a.name} and {b.name}" for a, b in combinations(takes, 2) if _is_same_recording(a, b)]
     return [*found, *(Notice(SyncNotice.SAME, 0.0, {"names": both}) for both in same)]
 
 
-def _same(a: Take, b: Take) -> bool:
+def _is_same_recording(a: Take, b: Take) -> bool:
     """Whether both are one recording: the best shift is then 0, and says nothing."""
     if a.path is not None and b.path is not None and a.path.resolve() == b.path.resolve():
         return True
@@ -308,7 +308,7 @@ def _same(a: Take, b: Take) -> bool:
     return bool(np.array_equal(first, second, equal_nan=first.dtype.kind == "f"))
 
 
-def _swapped(a: Take, b: Take, found: Pairing) -> list[Notice]:
+def _identity_notices(a: Take, b: Take, found: Pairing) -> list[Notice]:
     """Notes on moments at which somebody else is followed, and on stretches in which the two do not show the same person."""
     people = [take.people[i] for take, i in zip((a, b), found.people, strict=True)]
     found_notes = []
@@ -316,14 +316,16 @@ def _swapped(a: Take, b: Take, found: Pairing) -> list[Notice]:
         moments = jumps(clip)
         if moments:
             listed = ", ".join(f"{moment:.2f}" for moment in moments[:LISTED]) + " and more" * (len(moments) > LISTED)
-            found_notes += noted([f"{take.name}: whoever is followed jumps at {listed} s: people swapped, or a cut"], take.name)
+            found_notes += reader_notices(
+                [f"{take.name}: whoever is followed jumps at {listed} s: people swapped, or a cut"], take.name
+            )
     first, second, same, _ = common_joints(people[0], people[1])
     bad = disagreements(first, second, found.shift) if same and found.shift.ok else []
     if bad:
         listed = ", ".join(f"{start:.2f} to {end:.2f} s" for start, end, _ in bad[:LISTED]) + " and more" * (len(bad) > LISTED)
         worst = max(times for *_, times in bad)
         said = f"from {listed} on the clock of {a.name} the cameras fit each other {worst:.1f} times worse than otherwise"
-        found_notes += noted([f"{said}: people swapped, tracking lost, or a camera moved"])
+        found_notes += reader_notices([f"{said}: people swapped, tracking lost, or a camera moved"])
     return found_notes
 
 
@@ -350,39 +352,43 @@ def synchronize_videos(
         bright = _brightness(a, b, **brightness)
     except ValueError as problem:  # too short for it; the files can be read, as the tracks show
         said = problem.args[0] if problem.args else str(problem)
-        bright = refused(a, b, Notice(SyncNotice.UNUSABLE, 0.0, {"text": said}), method="brightness")
-    return agreed(tracked, bright)
+        bright = refuse(a, b, Notice(SyncNotice.UNUSABLE, 0.0, {"text": said}), method="brightness")
+    return combine_methods(tracked, bright)
 
 
 AGREEMENT_FRAMES = 2.0  # Within this tracks and brightness say the same.
 
 
-def agreed(tracked: Shift, bright: Shift) -> Shift:
+def combine_methods(tracked: Shift, bright: Shift) -> Shift:
     """One answer from two methods: the tracks' where both are sure of the same, a refusal with both where they are not."""
     both = (tracked, bright)
     sure = [shift for shift in both if shift.ok]
-    values = {"tracks": _told(tracked), "brightness": _told(bright)}
+    values = {"tracks": _summary(tracked), "brightness": _summary(bright)}
     best = sure[0] if sure else max(both, key=lambda shift: shift.confidence)
     other = bright if best is tracked else tracked
-    known = [Notice(SyncNotice.METHODS, 0.0, values), *besides(best), *(one for one in besides(other) if one not in besides(best))]
+    known = [
+        Notice(SyncNotice.METHODS, 0.0, values),
+        *accepted_notices(best),
+        *(one for one in accepted_notices(other) if one not in accepted_notices(best)),
+    ]
     apart = min((abs(offset - _middle(best)) for offset in _candidates(other)), default=float("inf"))
     if sure and apart <= AGREEMENT_FRAMES / min(best.fps):
         return dataclasses.replace(best, notices=tuple(known))
     peaks = torch.cat([best.peaks, other.peaks])  # scores of two methods: each list is in order, and the best one's comes first
     refusal = Notice(SyncNotice.DISAGREE, 0.0, values)
     if not sure:
-        refusal = Notice(SyncNotice.UNDECIDED, 0.0, {"tracks": _why(tracked), "brightness": _why(bright)})
+        refusal = Notice(SyncNotice.UNDECIDED, 0.0, {"tracks": _reason(tracked), "brightness": _reason(bright)})
     limits = (refusal, *known)
     return dataclasses.replace(best, status=status_from(limits), notices=limits, peaks=peaks)
 
 
-def _why(shift: Shift) -> str:
+def _reason(shift: Shift) -> str:
     """Why a method does not decide: a message, where there is one."""
     told = [notice.text for notice in shift.notices if notice.code.refuses is not None]
     return told[0] if told else shift.reason
 
 
-def _told(shift: Shift) -> str:
+def _summary(shift: Shift) -> str:
     if not len(shift.peaks):
         return "nothing"
     return f"{_middle(shift):+.3f} s ({'sure' if shift.ok else 'not sure'})"
@@ -409,7 +415,7 @@ def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, 
     few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < MIN_TRACKS]
     if few:
         values = {"needed": MIN_TRACKS, "names": " and ".join(few)}
-        return refused(a, b, Notice(SyncNotice.FEW_TRACKS, 0.0, values), *known)
+        return refuse(a, b, Notice(SyncNotice.FEW_TRACKS, 0.0, values), *known)
     shift: Shift = dyntorch.synchronize(
         found[0][0],
         found[1][0],
@@ -430,7 +436,7 @@ def points_of(take: Take) -> tuple[Tensor, Tensor, list[Notice]]:
     from indexing.video import track_points
 
     tracks = track_points(source_of(take))
-    return tracks.points, tracks.times, noted([f"{take.name}: {note}" for note in tracks.notes], take.name)
+    return tracks.points, tracks.times, reader_notices([f"{take.name}: {note}" for note in tracks.notes], take.name)
 
 
 def source_of(take: Take) -> Any:
@@ -463,7 +469,7 @@ def _brightness(a: Take, b: Take, **more: Any) -> Shift:
     return shift
 
 
-def refused(a: Take, b: Take, *limits: Notice, method: str = "subspace") -> Shift:
+def refuse(a: Take, b: Take, *limits: Notice, method: str = "subspace") -> Shift:
     """What is said where there is nothing to compare."""
     from dyntorch import Shift
 

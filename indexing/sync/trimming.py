@@ -39,7 +39,7 @@ class CameraClock(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class CameraFilm:
+class CameraVideo:
     """A camera's video, and when its frames were taken. stamps ``(frames,)``, times ``(frames,)``."""
 
     name: str
@@ -57,7 +57,7 @@ class CameraFilm:
 class Cut:
     """Which frames of a video are written. rows ``(k,)``."""
 
-    film: CameraFilm
+    film: CameraVideo
     rows: NDArray[np.int64]
     rest: float
 
@@ -76,7 +76,7 @@ class Cut:
         """How many frames between the first and the last are not written."""
         return int(self.rows[-1] - self.rows[0] + 1 - len(np.unique(self.rows)))
 
-    def told(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """The same in plain types."""
         first, last = int(self.rows[0]), int(self.rows[-1])
         return {
@@ -99,12 +99,12 @@ class Trim:
         return len(self.cuts[0].rows)
 
 
-def film_of(take: Take, times: Floats | None = None) -> CameraFilm:
+def video_of(take: Take, times: Floats | None = None) -> CameraVideo:
     """The video of a camera: what it is itself, what its keypoints were found in, or the one that lies beside them. times
     ``(frames,)``."""
     from indexing.video.reading import frame_times
 
-    path = take.footage or beside(take)
+    path = take.footage or find_video(take)
     if path is None:
         where = take.path or take.name
         raise ValueError(
@@ -112,10 +112,10 @@ def film_of(take: Take, times: Floats | None = None) -> CameraFilm:
             f"{take.name}.mp4 (or in a folder videos/ there)"
         )
     stamps = frame_times(path)[1]
-    return CameraFilm(take.name, path, stamps, clock_of(take, path, stamps, times))
+    return CameraVideo(take.name, path, stamps, frame_clock(take, path, stamps, times))
 
 
-def beside(take: Take) -> Path | None:
+def find_video(take: Take) -> Path | None:
     """The video that lies beside a camera's keypoints and has its name, or in a folder ``videos`` there or one above."""
     if take.path is None or take.kind != "keypoints":
         return None
@@ -132,7 +132,7 @@ TIME_TOLERANCE_FRAMES = 0.25  # Within this the times of keypoints are those of 
 MAX_OVERRUN_FRAMES = 2.0  # Frames by which keypoints may run over the end of their video.
 
 
-def clock_of(take: Take, path: Path, stamps: Floats, mended: Floats | None = None) -> Floats:
+def frame_clock(take: Take, path: Path, stamps: Floats, mended: Floats | None = None) -> Floats:
     """When the frames of a video were taken, on the clock of a camera's keypoints. mended ``(frames,)``."""
     if take.kind != "keypoints":
         return stamps
@@ -152,7 +152,7 @@ def clock_of(take: Take, path: Path, stamps: Floats, mended: Floats | None = Non
 MAX_FPS_DENOMINATOR = 1001  # Of the frame rate as a fraction: 30000/1001.
 
 
-def trim(films: Sequence[CameraFilm], clocks: Sequence[CameraClock], fps: float | None = None) -> Trim:
+def trim(films: Sequence[CameraVideo], clocks: Sequence[CameraClock], fps: float | None = None) -> Trim:
     """Choose the frames of what all cameras recorded: at each moment the nearest one of each."""
     first = films[0]
     own = (len(first.times) - 1) / (first.times[-1] - first.times[0]) if len(first.times) > 1 else 0.0
@@ -173,11 +173,11 @@ def trim(films: Sequence[CameraFilm], clocks: Sequence[CameraClock], fps: float 
             "them out"
         )
     moments = zero + (number + np.arange(count)) * step
-    cuts = tuple(_cut(film, np.asarray(clock.at(moments), np.float64)) for film, clock in zip(films, clocks, strict=True))
+    cuts = tuple(_select_frames(film, np.asarray(clock.at(moments), np.float64)) for film, clock in zip(films, clocks, strict=True))
     return Trim(exact, float(moments[0]), cuts)
 
 
-def _cut(film: CameraFilm, wanted: Floats) -> Cut:
+def _select_frames(film: CameraVideo, wanted: Floats) -> Cut:
     """The frame nearest to each time of the camera's clock."""
     after = np.clip(np.searchsorted(film.times, wanted), 0, len(film.times) - 1)
     before = np.maximum(after - 1, 0)
@@ -239,7 +239,7 @@ def write_videos(folder: Path, chosen: Trim, done: Callable[[float], None] | Non
         building.mkdir(parents=True)
         for i, cut in enumerate(chosen.cuts):
             written = 0
-            for written in _encoded(building / cut.file, cut, chosen.fps):
+            for written in _encode(building / cut.file, cut, chosen.fps):
                 if done is not None and written % PROGRESS_FRAMES == 0:
                     done((i * chosen.frames + written) / total)
             if written < chosen.frames:
@@ -260,7 +260,7 @@ H264_PRESET = "veryfast"  # Speed for size.
 MPEG4_QSCALE = "2"  # Quality of MPEG-4, where there is no H.264.
 
 
-def _encoded(path: Path, cut: Cut, fps: Fraction) -> Iterator[int]:
+def _encode(path: Path, cut: Cut, fps: Fraction) -> Iterator[int]:
     """Write a file frame by frame; how many are written."""
     from indexing.video.reading import av
 
@@ -317,9 +317,9 @@ def _upright(frame: Any, shape: tuple[int, int] | None) -> Any:
     return made.reformat(width, height, "yuv420p")
 
 
-def told(chosen: Trim) -> dict[str, Any]:
+def trim_as_json(chosen: Trim) -> dict[str, Any]:
     """What was written, in plain types, as sync.json has it."""
     return {
         "folder": FOLDER, "frames": chosen.frames, "fps": float(chosen.fps), "start": chosen.start,
-        "cameras": {cut.film.name: cut.told() for cut in chosen.cuts},
+        "cameras": {cut.film.name: cut.as_json() for cut in chosen.cuts},
     }  # fmt: skip

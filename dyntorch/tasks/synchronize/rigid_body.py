@@ -94,7 +94,7 @@ def _extent(motion: BodyMotion) -> float:
     return float((images - images.mean(1, keepdim=True)).square().sum(-1).mean().sqrt()) * motion.scale
 
 
-def _summarize(take: _BodyTracks, found: _Fit, centre: Tensor, scale: float) -> BodyMotion:
+def _summarize(take: _BodyTracks, found: _BodyFit, centre: Tensor, scale: float) -> BodyMotion:
     information = take.problem(found.points, found.frames).information(found.body)[0] * scale**2
     return BodyMotion(
         body=found.body,
@@ -109,7 +109,7 @@ def _summarize(take: _BodyTracks, found: _Fit, centre: Tensor, scale: float) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _BodyFit:
     """A body ``(1, ...)`` of the points ``(n,)`` in the frames ``(frames,)``, rms ``(n,)`` of every point about it."""
 
     body: FilmedBody
@@ -148,7 +148,7 @@ class _BodyTracks:
         weights = (self.seen[:, points] & frames[:, None]).to(self.x)
         return BodyProblem(self.x[None, :, points], weights[None], _camera(int(points.sum()), self.x))
 
-    def fit(self, points: Tensor) -> _Fit | None:
+    def fit(self, points: Tensor) -> _BodyFit | None:
         """The body that these points ``(n,)`` bool are on, if there is one."""
         chosen, frames = self._start(points)
         if len(frames) < MIN_FRAMES:
@@ -193,7 +193,7 @@ class _BodyTracks:
         best = torch.where((square[0] <= square[1])[:, None, None], both[0], both[1])
         return body._replace(motions=best[None]), usable
 
-    def _adjust(self, body: FilmedBody, usable: Tensor, points: Tensor, chosen: Tensor) -> _Fit | None:
+    def _adjust(self, body: FilmedBody, usable: Tensor, points: Tensor, chosen: Tensor) -> _BodyFit | None:
         """All frames, then all points together; the others are placed on the body that they are compared with."""
         options = LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9)
         body, cost = fit_body(self.problem(chosen, usable), body, options)
@@ -216,7 +216,7 @@ class _BodyTracks:
         spare = rows - 6 * int(usable.sum()) - 3 * int(points.sum()) + 2
         rms = (square[:, points].sum() / max(spare, 1)).sqrt()
         limit = max(MAX_MISFIT_RATIO * self.noise, MIN_RELATIVE_NOISE)
-        return _Fit(body, points, usable, residuals.nan_to_num(nan=math.inf), rms, limit)
+        return _BodyFit(body, points, usable, residuals.nan_to_num(nan=math.inf), rms, limit)
 
     def _triangulate_points(self, body: FilmedBody, usable: Tensor) -> Tensor:
         """All points ``(n, 3)`` on a body whose motion is known."""
@@ -224,7 +224,7 @@ class _BodyTracks:
         found = triangulate(projections, self.x, (self.seen & usable[:, None]).to(self.x), steps=NUM_TRIANGULATION_STEPS)
         return found[:, :3] / torch.where(found[:, 3:].abs() > 1e-12, found[:, 3:], 1e-12)
 
-    def fit_subsets(self, often: Tensor) -> _Fit | None:
+    def fit_subsets(self, often: Tensor) -> _BodyFit | None:
         """The body of the most points: subsets of six that move most like affine views of one body are tried first."""
         index = often.nonzero()[:, 0].tolist()
         whole = self.seen[:, often].all(-1)
@@ -235,7 +235,7 @@ class _BodyTracks:
         energy = torch.stack(
             [(self.x[whole][:, part] - self.x[whole][:, part].mean(1, keepdim=True)).square().sum() for part in sets]
         )
-        best: _Fit | None = None
+        best: _BodyFit | None = None
         for i in (left[2] * energy).argsort(stable=True)[:MAX_FITTED_SUBSETS].tolist():
             found = self.fit(torch.zeros_like(often).index_fill(0, sets[i], True))
             if found is None or not found.agrees(found.points):

@@ -36,9 +36,9 @@ from indexing.sync.files import (
 from indexing.sync.people import Pairing
 from indexing.sync.pose2sim import Trial, numbers, shortest, trial_of, trials_in
 from indexing.sync.recordings import By, Take, find_cameras, take_of
-from indexing.sync.synchronize import BY, Method, remarks
+from indexing.sync.synchronize import BY, Method, recording_notices
 from indexing.sync.synchronize import pair as compare_pair
-from indexing.sync.trimming import CameraFilm, check_videos, clock_of, drop_videos, film_of, told, trim, write_videos
+from indexing.sync.trimming import CameraVideo, check_videos, drop_videos, frame_clock, trim, trim_as_json, video_of, write_videos
 from indexing.video.reading import av, cv2
 
 WORDS = flag_words(
@@ -149,9 +149,9 @@ def _method(flags: Sync) -> Method:
     return "sound" if flags.footage.by == "sound" else flags.method
 
 
-def _films(flags: Sync, takes: list[Take]) -> list[CameraFilm] | None:
+def _films(flags: Sync, takes: list[Take]) -> list[CameraVideo] | None:
     """The videos to cut, looked for before the work."""
-    return [film_of(take) for take in takes if not take.spatial] if flags.videos else None
+    return [video_of(take) for take in takes if not take.spatial] if flags.videos else None
 
 
 def _read(flags: Sync, found: dict[str, Path], by: By, watched: Watched, trial: Trial | None = None) -> list[Take]:
@@ -167,7 +167,7 @@ def _read(flags: Sync, found: dict[str, Path], by: By, watched: Watched, trial: 
             how = {**options, "format": None, "size": None, "layout": None} if own else options
             rate = None if own and "," not in (flags.fps or "") else rate
             takes.append(take_of(path, name=name, fps=rate, keypoints=watched.files.get(path), **how))
-        return takes if trial is None else trial.filmed(takes)
+        return takes if trial is None else trial.with_videos(takes)
     except ValueError as problem:
         raise ValueError(worded(problem, WORDS)) from problem
 
@@ -180,11 +180,11 @@ def _mended(flags: Sync, report: SyncReport, done: Any, trial: Trial | None = No
     found = find_breaks(report.takes, report.compared, report.together, calibration=lenses, max_shift=flags.max_shift)
     if found is None:
         return report
-    if found.sure:
+    if found.is_attributed:
         again = _solve(flags, list(found.takes), done, trial)
         if again.ok >= report.ok and again.decided >= report.decided:
             return dataclasses.replace(again, takes=report.takes, remarks=report.remarks, mended=found)
-    why = "fewer pairs decide when it is mended" if found.sure else "other pairs of these cameras see nothing of it"
+    why = "fewer pairs decide when it is mended" if found.is_attributed else "other pairs of these cameras see nothing of it"
     doubts = [f"doubtful, and not mended, as {why}: {notice.text}" for notice in found.found.notices]
     return dataclasses.replace(report, remarks=[*report.remarks, *doubts])
 
@@ -225,12 +225,12 @@ def _solve(flags: Sync, takes: list[Take], done: Any, trial: Trial | None = None
         # that of a pair says which cameras it is about by name, and so not by number
         of_pair = problem.__cause__ if len(takes) > 2 and problem.__cause__ is not None else problem
         raise ValueError(worded(of_pair, WORDS)) from problem
-    known: dict[str, Any] = {"remarks": [*(one.text for one in remarks(takes)), *told], "heading": flags.title or ""}
+    known: dict[str, Any] = {"remarks": [*(one.text for one in recording_notices(takes)), *told], "heading": flags.title or ""}
     return SyncReport(takes=takes, compared=compared, together=clocks, words=WORDS, **known)
 
 
 def _write(
-    flags: Sync, folder: Path, report: SyncReport, films: list[CameraFilm] | None = None, trial: bool = False
+    flags: Sync, folder: Path, report: SyncReport, films: list[CameraVideo] | None = None, trial: bool = False
 ) -> tuple[SyncReport, Path]:
     """The shifted files and the cut videos where the data decide, the check video where asked for, and the report."""
     prepare(folder)
@@ -250,7 +250,7 @@ def _write(
         return report, write_sync(folder, report, videos)
 
 
-def _write_videos(flags: Sync, folder: Path, report: SyncReport, films: list[CameraFilm] | None) -> tuple[SyncReport, list[str]]:
+def _write_videos(flags: Sync, folder: Path, report: SyncReport, films: list[CameraVideo] | None) -> tuple[SyncReport, list[str]]:
     """``synchronized_videos/``, if they are asked for and the data decide."""
     if films is None or not report.ok:
         removed = drop_videos(folder)
@@ -260,13 +260,13 @@ def _write_videos(flags: Sync, folder: Path, report: SyncReport, films: list[Cam
     if report.mended is not None:
         new = {take.name: take.times for take in report.mended.takes}
         films = [
-            dataclasses.replace(film, times=clock_of(clock.take, film.path, film.stamps, new[film.name]))
+            dataclasses.replace(film, times=frame_clock(clock.take, film.path, film.stamps, new[film.name]))
             for film, clock in zip(films, clocks, strict=True)
         ]
     chosen = trim(films, [clock.against(clocks[0]) for clock in clocks], flags.videos_fps)
     with progress(f"writing {count(len(films), 'video')} of {count(chosen.frames, 'frame')}") as done:
         write_videos(folder, chosen, done)
-    return dataclasses.replace(report, videos=told(chosen)), []
+    return dataclasses.replace(report, videos=trim_as_json(chosen)), []
 
 
 def _check_spatial(takes: list[Take], folder: Path | None, inputs: list[Path]) -> None:

@@ -15,7 +15,7 @@ import dyntorch
 from dyntorch import Status
 from dyntorch.core import Notice, NoticeCode
 from indexing.cli import main
-from indexing.sync.breaks import find_breaks, retimed
+from indexing.sync.breaks import find_breaks, retime
 from indexing.sync.people import Pairing
 from indexing.sync.recordings import take_of
 from indexing.sync.trimming import FOLDER
@@ -80,7 +80,7 @@ def test_takes_get_the_times_of_their_frames(library, clips):
     left, right = found.takes
     assert left is takes[0] and np.allclose(np.diff(right.times)[AT - 1], (1 + LOST) / FPS)
     assert np.array_equal(right.people[0].times, right.times) and str(found.found.notices[0].text) == "right lost 6 frames"
-    [said] = found.told()
+    [said] = found.as_json()
     assert said["candidates"] == ["right", "left"] and said["camera"] is None and said["frames"] == LOST
     json.dumps(said)
 
@@ -101,7 +101,7 @@ def test_people_who_are_seen_in_some_frames_only(clips):
     take = take_of(clips[0], name="left")
     late = clips[0].replace(joints=clips[0].joints[30:], times=clips[0].times[30:], confidence=clips[0].confidence[30:])
     both = dataclasses.replace(take, people=(late,), everyone=(late, clips[0]))
-    moved = retimed(both, late.times, np.where(np.arange(90) >= 30, 0.5, 0.0))
+    moved = retime(both, late.times, np.where(np.arange(90) >= 30, 0.5, 0.0))
     assert moved.people[0] is moved.everyone[0] and np.allclose(moved.times[[29, 59, 60]], [29 / FPS, 59 / FPS, 2.5])
     assert np.allclose(moved.everyone[1].times, moved.times)
 

@@ -1,10 +1,25 @@
 """Two videos, no tracks: right shifts are found and believed, everything else is refused with its reason."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from indexing.sync.brightness import brightness_shift
+from indexing.sync.brightness import (
+    OUTLIER_SHARE,
+    OVERLAP_POWER,
+    SOFTMAX_SHARPNESS,
+    WINDOW_FRAMES,
+    WINDOW_LAG_RANGE,
+    Curve,
+    brightness_shift,
+    evidence,
+    lag_sums,
+    part_curve,
+    score_curve,
+    windows,
+)
 from tests.battery.pretend_device import counted, moved, pretend_device
 
 FPS = (30.0, 30.0)
@@ -105,3 +120,95 @@ BAD = {
 def test_bad_input_is_named(films, words):
     with pytest.raises(ValueError, match=words):
         brightness_shift(*(video[:30] for video in films), **({"fps": FPS} | BAD[words]))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Sums and scores at all lags against loops.
+
+
+def unit(rows, seed):
+    values = torch.randn(rows, 40, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.nn.functional.normalize(values, dim=1)
+
+
+def test_lag_sums_are_sums_over_diagonals():
+    a, b = unit(9, 0), unit(13, 1)
+    products = a @ b.T
+    want = [products.diagonal(lag).sum().item() for lag in range(-8, 13)]
+    assert lag_sums(a, b).tolist() == pytest.approx(want, abs=1e-12)
+
+
+def test_scores_leave_out_missing_frames_and_short_overlaps():
+    a, b = unit(30, 0), unit(25, 1)
+    a[4:9] = 0
+    curve = score_curve(a, b, 10)
+    products = a @ b.T
+    for lag in range(-29, 25):
+        pairs = [(i, i + lag) for i in range(30) if 0 <= i + lag < 25 and not 4 <= i < 9]
+        if len(pairs) < 10:
+            assert curve.at(lag) == -torch.inf
+        else:
+            mean = sum(products[i, j].item() for i, j in pairs) / len(pairs)
+            assert curve.at(lag) == pytest.approx(mean * (len(pairs) / float(curve.counts.max())) ** OVERLAP_POWER, abs=1e-12)
+
+
+def test_part_of_the_first_keeps_the_lags():
+    a = unit(60, 3)
+    b = torch.cat([unit(11, 5), a])
+    assert score_curve(a, b, 20).best == 11
+    assert part_curve(a, b, slice(35, 50)).best == 11
+    assert part_curve(a, b, slice(35, 50)).within(-5, 5).best != 11
+
+
+def test_peaks_and_parabola():
+    lags = torch.arange(-20, 21)
+    x = lags.double()
+    scores = torch.exp(-((x - 3.3) ** 2) / 20) + 0.5 * torch.exp(-((x + 12) ** 2) / 20)
+    curve = Curve(lags, scores, torch.ones(41))
+    assert curve.lags[curve.peaks(4)].tolist() == [3, -12]
+    assert curve.best + curve.offset(curve.best) == pytest.approx(3.3, abs=0.01)
+    assert curve.offset(-20) == 0.0
+    assert curve.within(-20, 3).offset(3) == 0.0
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Evidence of short windows: all agree, none agrees, nothing known.
+
+
+REACH, WINDOW = WINDOW_LAG_RANGE, WINDOW_FRAMES
+
+
+def walk(rows, seed):
+    """Unit vectors that change within a few frames."""
+    steps = torch.randn(rows + 8, 18, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.nn.functional.normalize(steps.unfold(0, 8, 1).mean(-1)[:rows], dim=1)
+
+
+def test_windows_are_means_about_the_lag():
+    a, b = walk(60, 0), walk(70, 1)
+    found = windows(a, b, 5)
+    means = (a @ b.T).diagonal(5 + 2)[24 : 24 + WINDOW].mean()
+    assert torch.allclose(found[3, REACH + 2], means)
+    assert found[0, 0].isnan() and found[0, REACH].isfinite()  # the first rows have no partner 12 frames earlier
+
+
+def test_agreement_adds_up_and_disagreement_too():
+    a = walk(120, 0)
+    b = torch.cat([walk(7, 2), a])
+    right, beside, unrelated = evidence(a, b, 7), evidence(a, b, 13), evidence(a, walk(120, 3), 7)
+    assert right > 20 and beside < -20 and -30 < unrelated < 5
+    assert right > evidence(a[:60], b, 7) > 5
+
+
+def test_one_window_by_hand():
+    a, b = walk(WINDOW + 2 * REACH, 0)[REACH:-REACH], walk(WINDOW + 2 * REACH, 1)
+    means = torch.stack([(a * b[REACH + d : REACH + d + WINDOW]).sum(1).mean() for d in range(-REACH, REACH + 1)])
+    share = torch.softmax(SOFTMAX_SHARPNESS * means, dim=0)[REACH - 1 : REACH + 2].sum().item()
+    assert math.isclose(evidence(a, b, REACH), math.log((1 - OUTLIER_SHARE) * share * 25 / 3 + OUTLIER_SHARE), rel_tol=1e-9)
+
+
+def test_missing_frames_say_nothing():
+    a = walk(80, 0)
+    gone = torch.zeros_like(a)
+    assert evidence(a, gone, 0) == 0.0
+    assert evidence(a, a, 200) == 0.0

@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from indexing.sync.sound import Sound, apart, flattened, hear, sound_shift, witnessed
+from indexing.sync.sound import Sound, check_by_sound, offset_difference, phase_transform, read_sound, sound_shift
 from indexing.sync.synchronize import synchronize
 from tests.indexing.sync.footage import RATE, clicks, microphone, noises, write_film
 from tests.indexing.sync.scene import shift, told
@@ -129,11 +129,11 @@ def test_silence_and_no_sound(scene):
 
 def test_the_phase_transform_makes_every_rate_of_change_count_alike():
     curves = np.random.default_rng(0).normal(size=(2, 3000)).cumsum(axis=1).astype(np.float32)
-    made = flattened(curves, 100.0, 1.0, 0.5)
+    made = phase_transform(curves, 100.0, 1.0, 0.5)
     power = np.abs(np.fft.rfft(made, axis=1)) ** 2
     slow, fast = power[:, 30:300].mean(), power[:, 900:1400].mean()  # 1 to 10 Hz, 30 to 47 Hz
     assert slow == pytest.approx(fast, rel=0.6) and power[:, :10].mean() < 0.15 * slow
-    assert not flattened(np.ones((1, 500), np.float32), 100.0, 1.0, 0.5).any()
+    assert not phase_transform(np.ones((1, 500), np.float32), 100.0, 1.0, 0.5).any()
 
 
 # ---- from files ----------------------------------------------------------------------------------------------------------
@@ -151,12 +151,12 @@ def films(tmp_path_factory: pytest.TempPathFactory, scene):
 
 @pytest.mark.slow
 def test_sound_is_placed_on_the_clock_of_the_pictures(films):
-    a, b, late = (hear(films / f"{name}.mp4") for name in ("a", "b", "late"))
+    a, b, late = (read_sound(films / f"{name}.mp4") for name in ("a", "b", "late"))
     assert a is not None and b is not None and late is not None
     assert a.seconds == pytest.approx(20.0, abs=0.1) and a.rate == RATE and late.start == pytest.approx(0.5, abs=0.07)
     assert sound_shift(a, b).offset == pytest.approx(LATER, abs=2e-3)
     assert sound_shift(a, late).offset == pytest.approx(LATER, abs=2e-3)
-    assert hear(films / "mute.mp4") is None and hear(films / "a.mp4") is a  # heard once
+    assert read_sound(films / "mute.mp4") is None and read_sound(films / "a.mp4") is a  # heard once
 
 
 def write_sound(path, samples, rate, codec, layout="stereo", gap=0.0):
@@ -196,13 +196,13 @@ def test_other_containers_and_codecs(films, scene, tmp_path, name, codec, rate, 
         pytest.skip(f"FFmpeg has no {codec}")
     samples = microphone(scene, STARTS[1], 15.0, 1)
     wide = np.interp(np.arange(int(15 * rate)) * RATE / rate, np.arange(len(samples)), samples).astype(np.int16)
-    heard_b = hear(write_sound(tmp_path / name, wide, rate, codec))
-    assert sound_shift(hear(films / "a.mp4"), heard_b).offset == pytest.approx(LATER, abs=off)
+    heard_b = read_sound(write_sound(tmp_path / name, wide, rate, codec))
+    assert sound_shift(read_sound(films / "a.mp4"), heard_b).offset == pytest.approx(LATER, abs=off)
 
 
 def test_a_gap_in_the_sound_keeps_its_length(tmp_path):
     samples = np.random.default_rng(0).normal(size=10 * RATE) * 3000
-    found = hear(write_sound(tmp_path / "gap.mkv", samples.astype(np.int16), RATE, "pcm_s16le", gap=2.0))
+    found = read_sound(write_sound(tmp_path / "gap.mkv", samples.astype(np.int16), RATE, "pcm_s16le", gap=2.0))
     assert found is not None and found.seconds == pytest.approx(12.0, abs=0.1)
     quiet = np.abs(found.samples[int(5.2 * RATE) : int(6.8 * RATE)].astype(int)).max()
     assert quiet == 0 and np.abs(found.samples[int(7.2 * RATE) :].astype(int)).max() > 3000
@@ -221,16 +221,16 @@ def test_videos_by_sound_alone(films):
 def test_a_witness_agrees_contradicts_or_says_nothing():
     sure = shift(-0.4, sigma=0.002)
     sound = dataclasses.replace(shift(-0.39, method="sound"), sigma=0.017)
-    found = witnessed(sure, sound)
+    found = check_by_sound(sure, sound)
     assert found.ok and found.offset == -0.4 and found.notes == ("sound agrees: +0.010 s",)
-    assert apart(sure, sound) == pytest.approx(0.01)
+    assert offset_difference(sure, sound) == pytest.approx(0.01)
     away = dataclasses.replace(sound, offset=0.7)
-    found = witnessed(sure, away)
+    found = check_by_sound(sure, away)
     assert not found.ok and "the sound says +0.700 ± 0.017 s, and the pictures say -0.400 ± 0.002 s" in found.reason
     assert "method='sound'" in found.reason and "sound=False" in found.reason and found.offset == -0.4
     open_ = dataclasses.replace(sure, **told({"ok": False, "reason": "periodic"}))
-    found = witnessed(open_, sound)
+    found = check_by_sound(open_, sound)
     assert not found.ok and found.reason == "periodic" and "the sound says -0.390 ± 0.017 s" in found.notes[-1]
     unsure = dataclasses.replace(sound, **told({"ok": False, "reason": "too quiet"}))
-    assert witnessed(sure, unsure).ok and witnessed(sure, unsure).notes == ("the sound does not decide: too quiet",)
-    assert witnessed(sure, sound_shift(None, None)) is sure
+    assert check_by_sound(sure, unsure).ok and check_by_sound(sure, unsure).notes == ("the sound does not decide: too quiet",)
+    assert check_by_sound(sure, sound_shift(None, None)) is sure

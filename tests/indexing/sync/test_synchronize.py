@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 import dyntorch
 import indexing
-from indexing.clip import Clip
+from indexing.clip import Clip, ClipSet
 from indexing.skeleton import COCO17, HALPE26, Skeleton
 from indexing.sync.options import SyncOptions
 from indexing.sync.people import common_joints
 from indexing.sync.recordings import take_of
-from indexing.sync.synchronize import remarks, synchronize
-from tests.indexing.sync.scene import FPS, SKIPPED, cut, write_openpose
+from indexing.sync.synchronize import combine_methods, recording_notices, synchronize
+from tests.indexing.sync.scene import FPS, SKIPPED, cut, moved, shift, told, write_openpose
 
 # torch's own, when it first loads its transforms; hidden outside of tests
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
@@ -136,7 +139,7 @@ def test_arrays_of_other_kinds_are_refused(cameras, library, value, says):
 
 def test_remarks_are_about_recordings():
     takes = [take_of(np.full((5, 3, 2), float(i)), name=f"c{i}", fps=None if i else 25.0) for i in range(3)]
-    assert [note.text for note in remarks(takes)] == ["30 frames per second assumed for c1, c2; fps= says otherwise"]
+    assert [note.text for note in recording_notices(takes)] == ["30 frames per second assumed for c1, c2; fps= says otherwise"]
 
 
 # ---- the library itself --------------------------------------------------------------------------------------------------
@@ -156,3 +159,171 @@ def test_options_reach_the_stages(rng):
         synchronize(still, still, fps=30.0, options=SyncOptions(min_frames=40))
     with pytest.raises(ValueError, match="options must be SyncOptions"):
         synchronize(still, still, fps=30.0, options=dyntorch.SynchronizeOptions())
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What synchronize() says of recordings that are read without an error and still are not what they seem.
+
+
+STRETCHED = "coordinates from 0 to 1, so the shape of the image is not known and people may be stretched; give size="
+
+
+@pytest.mark.slow
+def test_somebody_else_in_view_is_said_where_one_is_followed(cameras, tmp_path):
+    small = cut(cameras[0], 0, 25)
+    small = small.replace(joints=small.joints / 4 + 900.0)  # too short in view to be tried, and too long to be a ghost
+    folder = write_openpose(tmp_path / "cam1_json", [cameras[0], small])
+    said = "cam1: 2 people in view; compared is the largest; person= says otherwise"
+    assert said in take_of(folder, fps=FPS).notes and said in take_of(folder, fps=FPS, person="largest").notes
+    sure = take_of(folder, fps=FPS, person="confident").notes
+    assert any("compared is the one that the detector trusts most" in note for note in sure)
+    alone = write_openpose(tmp_path / "cam2_json", [cameras[0]])
+    assert take_of(alone, fps=FPS).notes == take_of(alone, fps=FPS, person="largest").notes == ()
+    both = take_of(write_openpose(tmp_path / "cam3_json", [cameras[0], moved(cameras[0], 900.0)]), fps=FPS)
+    assert len(both.people) > 1 and not any("people in view" in note for note in both.notes)  # the pairing that is taken is said
+
+
+def test_the_shape_of_the_image_is_not_known(cameras, tmp_path):
+    a, b = ((clip.replace(joints=clip.joints / [1920, 1080], up="-y")) for clip in cameras[:2])
+    found = synchronize(a, b)
+    assert [one.text for one in found.notices if STRETCHED in one.text] == [f"{a.name}: {STRETCHED}", f"{b.name}: {STRETCHED}"]
+    lens = (np.eye(3), np.zeros(5))
+    with pytest.raises(ValueError, match=r"cam1: its coordinates go from 0 to 1, and calibration= is of pixels; give size="):
+        synchronize(a, b, calibration=(lens, lens))
+    ClipSet([a]).save(tmp_path / "a.npz")
+    assert any(STRETCHED in note for note in take_of(tmp_path / "a.npz").notes)
+
+
+def test_layouts_are_matched_by_what_joints_are_called_whatever_the_spelling(cameras):
+    names = [f"{side}{part}" for part in ("Shoulder", "Elbow", "Wrist", "Hip", "Knee", "Ankle") for side in "LR"]
+    other = [name for part in ("shoulder", "elbow", "wrist", "hip", "knee") for name in (f"right_{part}", f"left_{part}")]
+    a = Clip(cameras[0].joints[:, :12], skeleton=Skeleton("short", tuple(names)))
+    b = Clip(cameras[1].joints[:, :10], skeleton=Skeleton("long", tuple(other)))
+    first, second, same, said = common_joints(a, b)
+    assert same and said == "short and long share 10 joints; these are compared"
+    assert first.skeleton == second.skeleton and first.skeleton.joints == tuple(names[:10])
+    assert np.array_equal(first.joints, a.joints[:, :10], equal_nan=True)
+    assert np.array_equal(second.joints, b.joints[:, [1, 0, 3, 2, 5, 4, 7, 6, 9, 8]], equal_nan=True)
+    numbers = Skeleton("numbers", tuple(map(str, range(12))))
+    assert common_joints(a, Clip(a.joints, skeleton=numbers))[2] is False
+
+
+@pytest.mark.parametrize(("head", "row"), [("frame,x,y", "{i},"), ("time,x,y", "{t},"), ("frame,x,y,score", "{i},")])
+def test_one_tracked_point_is_a_track(tmp_path, head, row):
+    rng = np.random.default_rng(3)
+    way = np.cumsum(np.cumsum(rng.normal(size=(420, 3)), axis=0) * 0.03, axis=0)
+    way = 5 * (way - way.mean(axis=0)) / way.std() + [0, 0, 40]
+    for name, turn, skip in (("a", 0.0, 0), ("b", 0.6, 24)):
+        place = way @ np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]) + [
+            0,
+            0,
+            40 * (turn > 0),
+        ]
+        seen = 1000 * place[:, :2] / place[:, 2:] + 500 + rng.normal(size=(420, 2)) * 0.3
+        last = ",0.9" if "score" in head else ""
+        lines = [f"{row.format(i=i, t=i / 30)}{x:.3f},{y:.3f}{last}" for i, (x, y) in enumerate(seen[skip : skip + 390])]
+        (tmp_path / f"{name}.csv").write_text("\n".join([head, *lines]))
+    takes = [take_of(tmp_path / f"{name}.csv", fps=30.0) for name in "ab"]
+    assert [take.count for take in takes] == [390, 390] and [len(take.people) for take in takes] == [1, 1]
+    found = synchronize(*takes, rate=1.0)
+    assert found.frames == pytest.approx(-24, abs=0.5)
+
+
+def test_frame_numbers_of_a_file_are_its_times(cameras, tmp_path):
+    a, b = cameras[:2]
+    kept = np.setdiff1d(np.arange(len(b)), np.arange(30, 50))
+    np.savez(tmp_path / "b.npz", joints=b.joints[kept], frame=kept + 100, fps=FPS)
+    take = take_of(tmp_path / "b.npz")
+    assert np.allclose(take.times, (kept + 100) / FPS) and take.fps == pytest.approx(FPS)
+    assert "b: 20 of" in take.notes[-1] and "frames are missing; the others keep their times" in take.notes[-1]
+    found = synchronize(a, tmp_path / "b.npz")
+    assert found.ok and found.offset == pytest.approx((100 - 12) / FPS, abs=0.5 / FPS)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tracks and brightness, each a check of the other.
+
+
+def test_two_methods_that_agree_decide_and_two_that_do_not_refuse():
+    tracks, bright = shift(0.5, method="subspace", confidence=0.9), shift(0.52, method="brightness", confidence=0.8)
+    unsure = dataclasses.replace(bright, **told({"ok": False, "reason": "halves differ"}))
+    away = shift(2.5, method="brightness", confidence=0.99)
+    assert (
+        combine_methods(tracks, bright).ok
+        and combine_methods(tracks, bright).method == "subspace"
+        and combine_methods(tracks, bright).offset == 0.5
+    )
+    assert (
+        combine_methods(tracks, unsure).ok
+        and combine_methods(dataclasses.replace(tracks, **told({"ok": False})), bright).method == "brightness"
+    )
+    refused = combine_methods(tracks, away)
+    assert not refused.ok and "tracks say +0.500 s (sure), brightness says +2.500 s (sure)" in refused.reason
+    assert refused.peaks[:, 0].tolist() == pytest.approx([0.5, 1.6, 2.5, 3.6])
+    assert not combine_methods(tracks, dataclasses.replace(away, **told({"ok": False}))).ok
+    both = combine_methods(dataclasses.replace(tracks, **told({"ok": False, "reason": "too still"})), unsure)
+    assert not both.ok and both.reason == "neither tracks nor brightness decide: too still; halves differ"
+
+
+@pytest.fixture
+def methods(monkeypatch, library):
+    """Tracks and brightness, known: tracks of the values' first ``n`` points, brightness at +0.5 s."""
+    import indexing.sync.brightness
+    import indexing.video
+
+    asked: dict = {"tracks": [], "brightness": [], "count": 12}
+
+    def tracks(source, **_):
+        asked["tracks"].append(source)
+        points = torch.zeros(60, asked["count"], 2, dtype=torch.float64)
+        return SimpleNamespace(points=points, times=torch.arange(60) / FPS, notes=("camera stands still",))
+
+    def bright(a, b, **options):
+        asked["brightness"].append((a, b, options))
+        if asked.get("short"):
+            raise ValueError("a: 5 frames are too few")
+        return shift(-0.41, method="brightness", notes=("b: dark",), ok=not asked.get("dark"), reason="halves differ")
+
+    monkeypatch.setattr(indexing.video, "track_points", tracks, raising=False)
+    monkeypatch.setattr(indexing.sync.brightness, "brightness_shift", bright, raising=False)
+    return asked
+
+
+GRAY = np.random.default_rng(0).uniform(size=(60, 24, 32))
+
+
+def test_gray_frames_by_every_method(methods, library):
+    found = synchronize(GRAY, GRAY[5:] * 255, "tracks", fps=FPS, max_shift=1.0)
+    assert found.notes == ("a: camera stands still", "b: camera stands still") and not library[0]["correspondence"]
+    assert library[0]["a"].shape == (60, 12, 2) and library[0]["max_shift"] == 1.0 and not methods["brightness"]
+    [chunk] = methods["tracks"][0]
+    assert chunk.frames.dtype == np.uint8 and np.array_equal(chunk.times, np.arange(60) / FPS)
+    assert np.array_equal(chunk.frames[5:], methods["tracks"][1][0].frames)  # 0 to 1 and 0 to 255 are the same picture
+    found = synchronize(GRAY, GRAY[5:], "brightness", fps=FPS, max_shift=1.0)
+    assert found.method == "brightness" and found.notes == ("b: dark",) and methods["brightness"][0][2]["max_shift"] == 1.0
+    assert len(next(methods["brightness"][0][0]).frames) == 60
+    found = synchronize(GRAY, GRAY[5:], fps=FPS)
+    assert found.ok and found.offset == -0.4 and "brightness says -0.410 s (sure)" in found.notes[0]
+
+
+def test_brightness_that_is_too_short_leaves_the_tracks_unconfirmed(methods, library):
+    methods["short"] = True
+    found = synchronize(GRAY, GRAY[5:], fps=FPS)
+    assert not found.ok and "brightness says" in found.reason
+    with pytest.raises(ValueError, match=r"too few"):
+        synchronize(GRAY, GRAY[5:], "brightness", fps=FPS)
+
+
+def test_keypoints_and_a_video_are_different_points(methods, library, cameras):
+    found = synchronize(cameras[0], GRAY, fps=FPS)
+    assert not library[0]["correspondence"] and library[0]["a"].shape[1] == 17 and library[0]["b"].shape[1] == 12
+    assert found.ok and not methods["brightness"] and len(methods["tracks"]) == 1
+    with pytest.raises(ValueError, match=r"b: is a video, and method='keypoints' needs keypoints"):
+        synchronize(cameras[0], GRAY, "keypoints", fps=FPS)
+
+
+def test_too_few_tracks_are_a_refusal(methods, library):
+    methods["count"] = 3
+    found = synchronize(GRAY, GRAY[5:], "tracks", fps=FPS)
+    assert not found.ok and "fewer than 4 moving points could be followed in a and b" in found.reason and not library
+    assert len(found.peaks) == len(found.scores) == 0 and found.confidence == 0

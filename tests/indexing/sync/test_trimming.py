@@ -13,14 +13,14 @@ from indexing.report.sync import Clock
 from indexing.sync.recordings import Take, take_of
 from indexing.sync.trimming import (
     FOLDER,
-    CameraFilm,
-    beside,
+    CameraVideo,
     check_videos,
-    clock_of,
     drop_videos,
-    film_of,
-    told,
+    find_video,
+    frame_clock,
     trim,
+    trim_as_json,
+    video_of,
     write_videos,
 )
 from tests.indexing.sync.footage import numbers_of, write_film
@@ -56,7 +56,7 @@ def clocks(takes: list[Take]) -> list[Clock]:
 
 
 def test_equal_frames_at_equal_moments(takes, tmp_path):
-    chosen = trim([film_of(take) for take in takes], clocks(takes))
+    chosen = trim([video_of(take) for take in takes], clocks(takes))
     done: list[float] = []
     target = write_videos(tmp_path, chosen, done.append)
     shown = {name: np.array(numbers_of(target / f"{name}.mp4")) for name in CAMERAS}
@@ -66,13 +66,13 @@ def test_equal_frames_at_equal_moments(takes, tmp_path):
         assert np.abs(shown[name] - shown["a"]).max() <= 0.5 * SCENE / fps + 1.5
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.mp4", "b.mp4", "c.mp4", FOLDER]
     assert done == sorted(done) and 0 < done[-1] <= 1
-    said = told(chosen)
+    said = trim_as_json(chosen)
     assert said["fps"] == 30 and said["frames"] == 49 and said["cameras"]["a"]["repeated"] == said["cameras"]["a"]["left_out"] == 0
     assert said["cameras"]["c"]["repeated"] > 0 and said["cameras"]["c"]["rest"] <= 0.5 / 25 + 1e-6
 
 
 def test_another_frame_rate(takes, tmp_path):
-    chosen = trim([film_of(take) for take in takes], clocks(takes), fps=15)
+    chosen = trim([video_of(take) for take in takes], clocks(takes), fps=15)
     assert chosen.fps == 15 and chosen.frames in (24, 25)
     write_videos(tmp_path, chosen)
     shown = [np.array(numbers_of(tmp_path / FOLDER / f"{name}.mp4")) for name in CAMERAS]
@@ -81,17 +81,17 @@ def test_another_frame_rate(takes, tmp_path):
 
 def test_a_rate_that_drifts_leaves_a_frame_out_now_and_then():
     times = np.arange(3000) / 30
-    films = [CameraFilm(name, Path(name), times, times) for name in "ab"]
+    films = [CameraVideo(name, Path(name), times, times) for name in "ab"]
     chosen = trim(films, [Clock(Take("a", "video"), 0.0, 0.0), Clock(Take("b", "video"), 0.0, 0.0, 1.001)])
     assert chosen.cuts[0].left_out == 0 and chosen.cuts[1].left_out == 3 and chosen.cuts[1].repeated == 0
     slower = trim(films, [Clock(Take("a", "video"), 0.0, 0.0), Clock(Take("b", "video"), 0.0, 0.0, 0.999)])
     assert slower.cuts[1].repeated == 3 and max(cut.rest for cut in slower.cuts) <= 0.5 / 30 + 1e-9
-    exact = trim([CameraFilm("a", Path("a"), times * 1.001, times * 1.001)], [Clock(Take("a", "video"), 0.0, 0.0)])
+    exact = trim([CameraVideo("a", Path("a"), times * 1.001, times * 1.001)], [Clock(Take("a", "video"), 0.0, 0.0)])
     assert (exact.fps.numerator, exact.fps.denominator) == (30000, 1001) and np.array_equal(exact.cuts[0].rows, np.arange(3000))
 
 
 def test_no_moment_in_common_is_said(takes):
-    films, away = [film_of(take) for take in takes], clocks(takes)
+    films, away = [video_of(take) for take in takes], clocks(takes)
     away[1] = dataclasses.replace(away[1], offset=-50.0)
     with pytest.raises(ValueError, match=r"^[ac] ended 4\d\.\d\d s before b began, so no moment is in the videos of all cameras"):
         trim(films, away)
@@ -109,7 +109,7 @@ def test_a_turned_video_of_odd_size_is_written_upright(tmp_path):
             file.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         file.mux(stream.encode())
     take = take_of(path, by="pixels")
-    write_videos(tmp_path, trim([film_of(take)], [Clock(take, 0.0, 0.0)]))
+    write_videos(tmp_path, trim([video_of(take)], [Clock(take, 0.0, 0.0)]))
     with av.open(str(tmp_path / FOLDER / "odd.mp4")) as file:
         shades = [int(frame.to_ndarray(format="gray").mean()) for frame in file.decode(video=0)]
         assert (file.streams.video[0].width, file.streams.video[0].height) == (32, 16)
@@ -123,35 +123,35 @@ def keypoints(films: Path, name: str = "a", fps: float = 30.0, frames: int = 80)
 
 
 def test_the_video_beside_keypoints_is_found(films, tmp_path):
-    assert beside(keypoints(films)) == films.resolve() / "a.mp4" and film_of(keypoints(films)).path.name == "a.mp4"
+    assert find_video(keypoints(films)) == films.resolve() / "a.mp4" and video_of(keypoints(films)).path.name == "a.mp4"
     pose = tmp_path / "pose"
     write_film(tmp_path / "videos" / "a.mp4", np.arange(3), 30)
-    assert beside(keypoints(pose)) == (tmp_path / "videos" / "a.mp4").resolve()
+    assert find_video(keypoints(pose)) == (tmp_path / "videos" / "a.mp4").resolve()
     with pytest.raises(ValueError, match=r"nowhere_json: no video of this camera is known: give the video itself"):
-        film_of(keypoints(films, "nowhere"))
+        video_of(keypoints(films, "nowhere"))
 
 
 def test_the_clock_of_keypoints_counts(films):
     take = keypoints(films, fps=30.0)
-    assert np.allclose(film_of(take).times, np.arange(90) / 30)
+    assert np.allclose(video_of(take).times, np.arange(90) / 30)
     slow = keypoints(films, fps=60.0)  # somebody said so: numbers are the clock
-    film = film_of(slow)
+    film = video_of(slow)
     assert np.allclose(film.times, np.arange(90) / 60) and np.allclose(film.stamps, np.arange(90) / 30)
     with pytest.raises(ValueError, match=r"a\.mp4: has 90 frames, but there are keypoints of a up to frame 119; give the video"):
-        film_of(keypoints(films, frames=120))
+        video_of(keypoints(films, frames=120))
     lost = take.times + np.where(np.arange(80) >= 40, 0.2, 0.0)
-    mended = clock_of(take, films / "a.mp4", film_of(take).stamps, lost)
+    mended = frame_clock(take, films / "a.mp4", video_of(take).stamps, lost)
     assert np.allclose(mended - np.arange(90) / 30, np.where(np.arange(90) >= 40, 0.2, 0.0))
 
 
 # ---- what is there ---------------------------------------------------------------------------------------------------------
 def test_files_of_others_are_never_replaced(takes, tmp_path):
     check_videos(tmp_path, [])
-    chosen = trim([film_of(take) for take in takes], clocks(takes))
+    chosen = trim([video_of(take) for take in takes], clocks(takes))
     write_videos(tmp_path, chosen)
     with pytest.raises(ValueError, match=r"synchronized_videos/a\.mp4: is there, and not from this command"):
         check_videos(tmp_path, [])
-    said = {"manifest": {"arguments": {"command": "sync"}}, "videos": told(chosen)}
+    said = {"manifest": {"arguments": {"command": "sync"}}, "videos": trim_as_json(chosen)}
     (tmp_path / "sync.json").write_text(json.dumps(said))
     check_videos(tmp_path, [])
     with pytest.raises(ValueError, match=r"is an input, and .*synchronized_videos would be replaced"):
@@ -165,7 +165,7 @@ def test_files_of_others_are_never_replaced(takes, tmp_path):
 
 
 def test_nothing_is_left_of_what_fails(takes, tmp_path, monkeypatch):
-    chosen = trim([film_of(take) for take in takes], clocks(takes))
+    chosen = trim([video_of(take) for take in takes], clocks(takes))
     monkeypatch.setattr("indexing.sync.trimming._frames", lambda cut: iter(()))
     with pytest.raises(ValueError, match=r"reading stopped at frame 0 of 49; copy it again"):
         write_videos(tmp_path, chosen)

@@ -270,3 +270,197 @@ def test_the_input_stays_as_it_was():
     a, b = scene.a.clone(), scene.b.clone()
     synced(scene)
     assert torch.equal(a.nan_to_num(-1), scene.a.nan_to_num(-1)) and torch.equal(b.nan_to_num(-1), scene.b.nan_to_num(-1))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Misuse of synchronize: every error names the field, what it got and the remedy.
+
+
+A, TIMES = torch.rand(20, 4, 2, generator=torch.Generator().manual_seed(0)), torch.arange(20.0)
+
+
+K = [[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({}, r"give either fps or times, got neither"),
+        ({"fps": 30.0, "times": (TIMES, TIMES)}, r"give either fps or times, got both"),
+        ({"fps": (30.0, 30.0, 25.0)}, r"fps must be a pair, one of a and one of b, got 3 values"),
+        ({"times": (TIMES,)}, r"times must be a pair, one of a and one of b, got 1 values"),
+        ({"fps": (30.0, -1.0)}, r"fps of b must be a positive number of frames per second, got -1.0"),
+        ({"times": (TIMES, TIMES[:19])}, r"times of b must be 20 finite seconds, one per frame, got \(19,\)"),
+        ({"times": (TIMES.flip(0), TIMES)}, r"times of a must increase, but frame 1 is not after the one before; sort or drop"),
+        ({"fps": 30.0, "max_shift": 0.0}, r"max_shift must be a positive number of seconds or None, got 0.0"),
+        ({"fps": 30.0, "max_shift": math.inf}, r"max_shift must be .* got inf"),
+        ({"fps": 30.0, "rate": 30.0}, r"rate must be about 1 .*, got 30.0; give fps for frame rates"),
+        ({"fps": 30.0, "camera": "pinhole"}, r"camera must be one of auto, perspective, affine, projective, got 'pinhole'"),
+        ({"fps": 30.0, "camera": "affine", "correspondence": False}, r"camera='affine' is for corresponding points; leave it out"),
+        ({"fps": 30.0, "weights": (torch.ones(20, 4),)}, r"weights must be a pair, one of a and one of b"),
+        ({"fps": 30.0, "weights": torch.ones(20, 4)}, r"weights must be a pair, one of a and one of b"),
+        ({"fps": 30.0, "weights": (None, torch.ones(20, 3))}, r"weights of b must be \(20, 4\)"),
+        ({"fps": 30.0, "calibration": (K, None)}, r"calibration of a: calibration of a camera must be None or \(K, dist\)"),
+        ({"fps": 30.0, "calibration": ((K, None),)}, r"calibration must be a pair, of a and of b: each None or \(K, dist\)"),
+        ({"fps": 30.0, "calibration": (None, ([[1.0]], None))}, r"calibration of b: calibration: K must be"),
+    ],
+)
+def test_misuse_names_the_field_and_the_remedy(more, words):
+    with pytest.raises(ValueError, match=words):
+        synchronize(A, A, **more)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "words"),
+    [
+        (A.numpy(), A, r"a must be a tensor \(frames, points, 2\), got ndarray"),
+        (A, A[..., :1], r"b must be a tensor \(frames, points, 2\), got \(20, 4, 1\)"),
+        (A, A.long(), r"b must hold floating point numbers, got torch.int64"),
+        (A[:11], A, r"a has 11 frames, 12 are needed at least"),
+        (A, A[:, :3], r"a has 4 points and b 3: corresponding points are as many; give the same ones .* correspondence=False"),
+    ],
+)
+def test_wrong_tracks_are_named(a, b, words):
+    with pytest.raises(ValueError, match=words):
+        synchronize(a, b, fps=30.0)
+
+
+@pytest.mark.parametrize("gap", [864000.0, 1e12])
+def test_takes_that_are_nearly_all_gap_are_refused(gap):
+    points, clock = A.double().repeat(2, 1, 1), torch.arange(40, dtype=torch.float64) / 30
+    torn = clock + gap * (torch.arange(40) > 29)
+    with pytest.raises(
+        ValueError, match=r"times of b run over .* it has 40 frames 0.0333 s apart, and none for .* one side of that gap"
+    ):
+        synchronize(points, points, times=(clock, torn))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What two cameras cannot decide is refused, with a reason, and the best guess stays.
+
+
+STRAIGHT = (None, None)
+
+
+"""Calibration of cameras without distortion, so that none is looked for."""
+
+
+def film_of_refusal(seed=0, **more):
+    return filmed(**{"n": 10, "seconds": 2.5, "noise": 1.0, "generator": seeded(seed)} | more)
+
+
+def normal(seed, *shape):
+    return torch.randn(*shape, generator=seeded(seed), dtype=torch.float64)
+
+
+def assert_refused(shift, *words):
+    """Refused in words, with numbers that are numbers."""
+    assert not shift.ok
+    assert any(word in shift.reason for word in words), shift.reason
+    assert "\n" not in shift.reason
+    assert math.isfinite(shift.offset) and math.isfinite(shift.center) and math.isfinite(shift.rate)
+    assert 0 <= shift.confidence <= 1 and not math.isnan(shift.sigma)
+    assert shift.peaks.ndim == 2 and shift.peaks.shape[1] == 2 and bool(shift.peaks.isfinite().all())
+    assert "refused" in repr(shift)
+    with pytest.raises(ValueError, match="synchronize: "):
+        shift.check()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("noise", "seed", "calibration"), [(0.0, 0, STRAIGHT), (1.0, 1, None)])
+def test_exactly_periodic_motion(noise, seed, calibration):
+    scene = film_of_refusal(seed, noise=noise, period=0.6, walk=0.0, offset=0.13)
+    shift = synchronize(scene.a, scene.b, fps=30.0, max_shift=0.8, calibration=calibration)
+    assert_refused(shift, "repeats itself")
+    assert shift.confidence < 0.5
+    offsets = shift.peaks[:, 0]
+    others = shift.peaks[1:, 1].tolist()
+    assert float(offsets[0]) == pytest.approx(shift.offset, abs=1e-9) and others == sorted(others, reverse=True)
+    # the true one is among the peaks, and so are the others
+    for period in (-0.6, 0.0, 0.6):
+        assert float((offsets - 0.13 - period).abs().min()) < 0.5 * FRAME
+    assert f"{float(offsets[0]):+.3g} s fits hardly better than" in shift.reason
+
+
+def test_periodic_motion_within_a_period_is_decided():
+    scene = film_of_refusal(0, period=0.8, walk=0.0, offset=0.23)
+    shift = synchronize(scene.a, scene.b, fps=30.0, max_shift=0.35)
+    assert shift.ok, shift.reason
+    assert shift.offset == pytest.approx(0.23, abs=0.05 * FRAME)
+
+
+def test_a_gait_that_crosses_the_room_is_refused_or_right():
+    scene = film_of_refusal(1, period=0.8, walk=1.5, offset=0.23, n=15)
+    shift = synchronize(scene.a, scene.b, fps=30.0, max_shift=1.2)
+    assert float((shift.peaks[:, 0] - 0.23).abs().min()) < 0.5 * FRAME
+    assert not shift.ok or shift.offset == pytest.approx(0.23, abs=0.1 * FRAME)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_nothing_moves(noise):
+    still = film_of_refusal(2).exact
+    a, b = (x[:1] + noise * normal(k, 50, 10, 2) for k, x in enumerate(still))
+    shift = synchronize(a, b, fps=30.0, max_shift=0.3, calibration=STRAIGHT)
+    assert_refused(shift, "motion is too small", "nothing moves", "repeats itself or is too small", "halves of the take")
+
+
+@pytest.mark.slow
+def test_unrelated_motion():
+    a, b = film_of_refusal(0).a, film_of_refusal(50).b
+    shift = synchronize(a, b, fps=30.0, max_shift=0.4)
+    assert_refused(shift, "motion is too small", "repeats itself or is too small", "halves of the take", "end of the search")
+    assert shift.confidence < 0.7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "offset", "backwards"), [(0, 1.5, False), (8, 0.0, True)])
+def test_wrong_shifts_are_not_made_to_fit_by_leaving_points_out(seed, offset, backwards):
+    scene = film_of_refusal(seed, n=12, seconds=4.0, offset=offset)
+    b = scene.b.flip(0) if backwards else scene.b
+    shift = synchronize(scene.a, b, fps=30.0, max_shift=None if backwards else 1.0, calibration=STRAIGHT, camera="perspective")
+    assert_refused(shift, "motion is too small", "repeats itself", "halves of the take", "fit", "end of the search")
+
+
+def test_the_best_shift_is_at_the_end_of_the_search():
+    scene = film_of_refusal(5, offset=0.5)
+    shift = synchronize(scene.a, scene.b, fps=30.0, max_shift=0.5)
+    assert_refused(shift, "lies at the end of the search or beyond; raise max_shift")
+    assert shift.offset == pytest.approx(0.5, abs=0.1 * FRAME)
+
+
+def test_clocks_too_far_apart_for_the_search():
+    scene = film_of_refusal(6)
+    shift = synchronize(scene.a, scene.b, times=(scene.times[0], scene.times[1] + 100), max_shift=1.0)
+    assert_refused(shift, "raise max_shift")
+    assert shift.sigma == math.inf and shift.confidence == 0 and len(shift.peaks) == 0
+    found = synchronize(scene.a, scene.b, times=(scene.times[0], scene.times[1] + 100))
+    assert found.ok and found.offset == pytest.approx(100, abs=0.1 * FRAME)
+
+
+def test_points_are_never_seen_in_both():
+    scene = film_of_refusal(7)
+    a, b = scene.a.clone(), scene.b.clone()
+    a[:50], b[40:] = torch.nan, torch.nan
+    assert_refused(synchronize(a, b, fps=30.0, max_shift=0.2), "enough points")
+
+
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_nothing_is_seen(name):
+    scene = film_of_refusal(8)
+    views = {"a": scene.a, "b": scene.b}
+    views[name] = torch.full_like(views[name], torch.nan)
+    shift = synchronize(views["a"], views["b"], fps=30.0)
+    assert_refused(shift, f"no point is seen in {name}; check the detections")
+    assert shift.fundamental is None and len(shift.lags) == 0
+    weights = tuple(torch.zeros(scene.a.shape[:2]) if name == one else None for one in "ab")
+    assert synchronize(scene.a, scene.b, fps=30.0, weights=weights).reason == shift.reason
+
+
+@pytest.mark.slow
+def test_the_halves_of_a_take_disagree():
+    one, other = (film_of_refusal(9, seconds=3.0, offset=offset) for offset in (0.1, 0.5))
+    b = torch.cat([one.b[:48], other.b[48:]])
+    shift = synchronize(one.a, b, fps=30.0, max_shift=0.7, calibration=STRAIGHT)
+    assert_refused(shift, "the halves of the take say", "repeats itself or is too small")
+    assert min(abs(shift.offset - value) for value in (0.1, 0.5)) < 3 * FRAME

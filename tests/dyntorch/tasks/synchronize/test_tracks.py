@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dyntorch.scenes import filmed
-from dyntorch.tasks.synchronize.tracks import noise_ratio, read_tracks, remove_positions, smooth_at
+from dyntorch.tasks.synchronize.tracks import noise_ratio, read_tracks, reject_outliers, remove_positions, scale_frames, smooth_at
 
 
 def seeded(seed=0):
@@ -147,6 +147,8 @@ def test_times_are_the_frames_or_those_given():
 
 
 GOOD = torch.zeros(5, 2, 2)
+
+
 RISING = torch.arange(5.0)
 
 
@@ -172,3 +174,157 @@ RISING = torch.arange(5.0)
 def test_misuse_names_the_field_and_the_remedy(arguments, words):
     with pytest.raises(ValueError, match=words):
         read_tracks("a", *arguments)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Positions that are elsewhere: planted ones go, good ones stay.
+
+
+def tracks_of_of_cleaning(x):
+    return read_tracks("a", x, 30.0, None, None)
+
+
+def removed(before, after):
+    return (before.weights > 0) & (after.weights == 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("noise", [0.0, 1.0, 4.0])
+def test_good_positions_stay(seed, noise):
+    tracks = tracks_of_of_cleaning(filmed(15, seconds=4.0, noise=noise, missing=0.1, generator=seeded(seed)).a)
+    after = reject_outliers(tracks)
+    assert float(removed(tracks, after).sum() / (tracks.weights > 0).sum()) < 0.03
+    kept = after.weights > 0
+    assert torch.equal(after.x[kept], tracks.x[kept]) and not after.x[~kept].any()
+
+
+@pytest.mark.parametrize("share", [0.03, 0.15])
+def test_planted_outliers_go(share):
+    for seed in range(3):
+        scene = filmed(15, seconds=4.0, noise=1.0, outliers=share, generator=seeded(seed))
+        tracks = tracks_of_of_cleaning(scene.a)
+        far = (tracks.x - scene.exact[0]).norm(dim=-1) > 15  # beyond doubt: 15 standard deviations
+        gone = removed(tracks, reject_outliers(tracks))
+        assert float((far & gone).sum() / far.sum()) > 0.93
+        assert float((gone & ~far).sum() / (~far).sum()) < 0.03
+
+
+def test_one_wrong_position_goes_and_nothing_else():
+    x = filmed(6, seconds=2.0, noise=0.5, generator=seeded(1)).a
+    before = reject_outliers(tracks_of_of_cleaning(x))
+    x[30, 2] += 40
+    after = reject_outliers(tracks_of_of_cleaning(x))
+    assert after.weights[30, 2] == 0
+    assert int((before.weights != after.weights).sum()) <= 2
+
+
+def test_a_point_at_rest_keeps_its_positions():
+    x = 100 + 0.5 * torch.randn(100, 3, 2, generator=seeded(), dtype=torch.float64)
+    x[:, 1] = 100.0  # a detector that says exactly the same
+    tracks = tracks_of_of_cleaning(x)
+    assert float(removed(tracks, reject_outliers(tracks)).float().mean()) < 0.02
+    assert not removed(tracks, reject_outliers(tracks))[:, 1].any()
+
+
+def test_positions_in_whole_pixels_stay():
+    x = (100 + 0.3 * torch.randn(100, 4, 2, generator=seeded(), dtype=torch.float64)).round()
+    tracks = tracks_of_of_cleaning(x)
+    assert float(removed(tracks, reject_outliers(tracks)).float().mean()) < 0.02
+
+
+def test_movement_after_rest_stays():
+    t = torch.arange(120, dtype=torch.float64) / 30
+    x = (100 + 50 * torch.where(t > 2, (2 * torch.pi * t).sin(), 0.0))[:, None, None].expand(120, 1, 2)
+    tracks = tracks_of_of_cleaning(x)
+    assert int(removed(tracks, reject_outliers(tracks)).sum()) <= 2
+
+
+def test_a_sudden_movement_stays():
+    x = 0.5 * torch.randn(80, 1, 2, generator=seeded(2), dtype=torch.float64)
+    x[40:] += 200.0  # and stays there
+    tracks = tracks_of_of_cleaning(x)
+    assert int(removed(tracks, reject_outliers(tracks)).sum()) <= 4  # at the step itself
+
+
+def test_what_scale_the_picture_has_does_not_matter():
+    x = filmed(8, seconds=2.0, noise=1.0, outliers=0.1, generator=seeded(3)).a
+    one, two = reject_outliers(tracks_of_of_cleaning(x)), reject_outliers(tracks_of_of_cleaning(4 * x + 1000))
+    assert torch.equal(one.weights, two.weights)
+
+
+def test_a_take_of_a_few_frames_is_left_alone():
+    x = torch.randn(5, 2, 2, generator=seeded())
+    assert torch.equal(reject_outliers(tracks_of_of_cleaning(x)).weights, tracks_of_of_cleaning(x).weights)
+
+
+def test_weights_that_were_given_are_kept():
+    x = filmed(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
+    weights = torch.rand(60, 5, generator=seeded(5), dtype=torch.float64)
+    after = reject_outliers(read_tracks("a", x, 30.0, None, weights))
+    kept = after.weights > 0
+    assert torch.equal(after.weights[kept], weights[kept])
+
+
+def test_a_point_never_seen_does_no_harm():
+    x = filmed(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
+    x[:, 2] = torch.nan
+    after = reject_outliers(tracks_of_of_cleaning(x))
+    assert not after.weights[:, 2].any() and after.x.isfinite().all()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tracks about their middle: place and distance of the person go, everything else stays.
+
+
+def tracks_of_of_scaled(x, fps=30.0):
+    return read_tracks("a", x, fps, None, None)
+
+
+def scene(**more):
+    return filmed(11, seconds=4.0, generator=torch.Generator().manual_seed(0), **more)
+
+
+def test_medians_of_every_frame_are_nought():
+    found = scale_frames(tracks_of_of_scaled(scene(noise=1.0).a))
+    assert torch.allclose(found.x.median(1).values, torch.zeros(120, 2, dtype=torch.float64), atol=1e-9)
+
+
+def test_place_and_distance_are_taken_out():
+    x = scene(walk=0.0).a
+    t = torch.arange(120, dtype=torch.float64)[:, None, None] / 30
+    path = torch.cat([300 * (0.7 * t).sin(), 20 * t], dim=-1)
+    # constant factors change the unit alone
+    one, moved = (
+        scale_frames(tracks_of_of_scaled(x)),
+        scale_frames(tracks_of_of_scaled(3 * x + path)),
+    )
+    assert torch.allclose(moved.x, 3 * one.x, atol=1e-6)
+    slow = 1 + 0.2 * t / 4  # somebody who comes nearer
+    near = scale_frames(tracks_of_of_scaled(slow * x))
+    ratio = (near.x.norm(dim=-1) / one.x.norm(dim=-1).clamp(min=1e-9))[15:-15].median(1).values
+    assert float(ratio.max() / ratio.min()) < 1.03  # of 1.15
+
+
+def test_one_wrong_point_moves_nothing_else():
+    tracks = tracks_of_of_scaled(scene(noise=1.0).a)
+    x = tracks.x.clone()
+    x[:, 4] += 500.0
+    good, bad = scale_frames(tracks), scale_frames(tracks_of_of_scaled(x))
+    rest = torch.arange(11) != 4
+    away = (good.x - bad.x)[:, rest].norm(dim=-1)
+    assert float(away.median()) < 0.2 * float(good.x[:, rest].norm(dim=-1).median())
+
+
+def test_missing_positions_stay_missing():
+    x = scene(noise=1.0, missing=0.3).a
+    x[50] = torch.nan
+    found = scale_frames(tracks_of_of_scaled(x))
+    assert bool(found.x.isfinite().all()) and not found.x[found.weights == 0].any()
+    assert torch.equal(found.weights > 0, x.isfinite().all(-1))
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_takes_of_a_frame_or_two(frames):
+    found = scale_frames(tracks_of_of_scaled(torch.rand(frames, 5, 2, generator=torch.Generator().manual_seed(1))))
+    assert bool(found.x.isfinite().all())
+    assert bool(scale_frames(tracks_of_of_scaled(torch.full((frames, 5, 2), torch.nan))).x.isfinite().all())
