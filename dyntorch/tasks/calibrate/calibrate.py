@@ -14,15 +14,14 @@ from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.calibrate import diagnosis
-from dyntorch.tasks.calibrate.adjusting import Freedom, RigSolution, adjusted, compared_starts, pose_of
-from dyntorch.tasks.calibrate.adjustment import LENS, PARAMETERS
 from dyntorch.tasks.calibrate.averaging import pair_graph
+from dyntorch.tasks.calibrate.bundle import Freedom, RigSolution, adjusted, compared_starts, pose_of, structure
+from dyntorch.tasks.calibrate.bundle_problem import LENS, PARAMETERS
 from dyntorch.tasks.calibrate.input import Rig, Scale, given_clocks, read_clocks, read_rig
 from dyntorch.tasks.calibrate.observations import RigViews, common_views
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.calibrate.result import Calibration, CalibrationNotice
-from dyntorch.tasks.calibrate.structure import structure
-from dyntorch.tasks.calibrate.world import World, world_of
+from dyntorch.tasks.calibrate.world_frame import World, world_of
 from dyntorch.tasks.synchronize.cameras import synchronize_cameras
 from dyntorch.tasks.synchronize.result import Clocks
 
@@ -55,7 +54,7 @@ def calibrate(
     1. clocks of all pairs from the same tracks (:func:`dyntorch.synchronize_cameras`);
     2. F of every pair at common moments; for focal lengths that are tried, rotations and centres by averaging over the pairs;
     3. the best of these starts adjusted: cameras, focal lengths, one term of distortion, clocks and points at once (see
-       ``adjustment.py`` for what is minimized);
+       ``bundle_problem.py`` for what is minimized);
     4. up from upright bodies, the scale from a height or lengths;
     5. what the data leave open: standard deviations, rival rigs, halves of the take.
 

@@ -10,13 +10,13 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice
 from dyntorch.geometry.homography import homography, homography_sampson_squared
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.tasks.calibrate.adjusting import RAYLEIGH, Pose, RigSolution
 from dyntorch.tasks.calibrate.averaging import LAST_CUTOFFS, Graph, PairGeometry
-from dyntorch.tasks.calibrate.bones import bodies
+from dyntorch.tasks.calibrate.bundle import RAYLEIGH, Pose, RigSolution
 from dyntorch.tasks.calibrate.input import Rig
 from dyntorch.tasks.calibrate.observations import MIN_NOISE
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.calibrate.result import CalibrationNotice
+from dyntorch.tasks.calibrate.world_frame import bodies
 
 
 def differences(one: Pose, other: Pose) -> tuple[Tensor, Tensor]:

@@ -20,7 +20,8 @@ from dyntorch.geometry.triangulation import triangulate
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.pair.affine import MIN_POINTS, Transfer, filled, solve
+from dyntorch.tasks.pair.affine import MIN_POINTS, Transfer, solve
+from dyntorch.tasks.pair.motion_prior import filled
 from dyntorch.tasks.pair.projective import body_pair
 from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
 from dyntorch.tasks.pair.tracks import MAX_RESIDUAL_SIGMAS, Overlap, match_tracks, overlap

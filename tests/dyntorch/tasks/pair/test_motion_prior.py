@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from dyntorch.tasks.pair.affine import Prior, cosines, filled, frames_of, motion_spectrum
+from dyntorch.tasks.pair.motion_prior import Prior, cosines, filled, frames_of, motion_spectrum
 
 
 def normal(*shape, seed=0):
