@@ -91,7 +91,7 @@ GROUND_QUANTILE = 0.01  # of the points' heights
 MAX_BODY_SPREAD = 0.15  # of a distance over itself up to which two points belong to one body
 
 
-def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale) -> World:
+def estimate_world(R: Tensor, centers: Tensor, points: Tensor, scale: Scale) -> World:
     r"""Up from the long axes of upright bodies, the ground below them, the scale from a height or lengths. R ``(c, 3, 3)``,
     centers ``(c, 3)``, points ``(T, n, 3)``."""
     points = points[:: max(1, len(points) // MAX_WORLD_MOMENTS)]
@@ -100,7 +100,7 @@ def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale) -> World:
     ends, _, _ = rigid_pairs(points.nan_to_num(0.0), points.isfinite().all(-1), MAX_BODY_SPREAD)
     groups = bodies(ends, n) or [list(range(n))]
     from_cameras = normalize(-R[:, 1].sum(0), dim=0)
-    up, share = upward(points, groups, from_cameras)
+    up, share = estimate_up(points, groups, from_cameras)
     by_people = share >= MIN_UPRIGHT_SHARE
     up = up if by_people else from_cameras
     ahead = R[0, 2] - (R[0, 2] @ up) * up
@@ -122,7 +122,7 @@ MIN_ELONGATION = 1.5  # ratio of the first two principal spreads
 MAX_CAMERA_TILT = 40.0  # degrees of the long axes from the cameras' own upward direction: nobody stands on a wall
 
 
-def upward(points: Tensor, groups: list[list[int]], guess: Tensor) -> tuple[Tensor, float]:
+def estimate_up(points: Tensor, groups: list[list[int]], guess: Tensor) -> tuple[Tensor, float]:
     """The direction ``(3,)`` that most long axes of bodies have, and the share of the axes that have it."""
     axes = []
     for group in groups:

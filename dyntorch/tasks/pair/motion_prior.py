@@ -21,7 +21,7 @@ def cosines(x: Tensor) -> Tensor:
     return (spectrum * turn[(..., *([None] * (x.ndim - 1)))]).real / (2 * frames) ** 0.5
 
 
-def frames_of(z: Tensor) -> Tensor:
+def inverse_cosines(z: Tensor) -> Tensor:
     """The inverse of :func:`cosines`: ``(T - 1, ...)`` to ``(T, ...)`` of mean 0."""
     frames = len(z) + 1
     turn = torch.exp(0.5j * torch.pi / frames * torch.arange(1, frames, dtype=z.dtype, device=z.device))
@@ -85,12 +85,12 @@ class Prior:
 FILL_ITERATIONS = 30  # each leaves about the share of the missing positions of the error
 
 
-def filled(x: Tensor, variance: float) -> Tensor:
+def fill_gaps(x: Tensor, variance: float) -> Tensor:
     r"""Tracks ``(T, n, 2)`` whose gaps (NaN) hold what the other points expect, and what these miss around the gap."""
     seen = x.isfinite().all(-1)
     if bool(seen.all()):
         return x
-    found = torch.where(seen[..., None], x, _lines(x, seen))
+    found = torch.where(seen[..., None], x, _interpolate_linearly(x, seen))
     weights = seen.to(x)
     mean = found.mean(0)
     spread = (found - mean).mT.flatten(0, 1)
@@ -109,10 +109,10 @@ def filled(x: Tensor, variance: float) -> Tensor:
         B, mean = (left.mT @ left + 2 * unsure.sum(0)) / len(left), found.mean(0)
     # what the others would have missed, had they to say where the point is
     beside = (precision @ offset) / torch.where(seen, precision.diagonal(dim1=-2, dim2=-1), 1.0)[..., None]
-    return torch.where(seen[..., None], x, found + _lines(torch.where(seen[..., None], beside, torch.nan), seen))
+    return torch.where(seen[..., None], x, found + _interpolate_linearly(torch.where(seen[..., None], beside, torch.nan), seen))
 
 
-def _lines(x: Tensor, seen: Tensor) -> Tensor:
+def _interpolate_linearly(x: Tensor, seen: Tensor) -> Tensor:
     """Gaps bridged by straight lines, the ends by the nearest position; 0 for points never seen."""
     frames = len(x)
     place = torch.arange(frames, device=x.device)[:, None].expand_as(seen)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dyntorch.tasks.calibrate.input import Scale
-from dyntorch.tasks.calibrate.world_frame import bodies, rigid_pairs, world_of
+from dyntorch.tasks.calibrate.world_frame import bodies, estimate_world, rigid_pairs
 from tests.dyntorch.tasks.calibrate.rigs import exponential
 
 F64 = torch.float64
@@ -46,7 +46,7 @@ def test_metres_up_and_ground(people, scale):
     R, centers, x, true_centers, truth = scene(people)
     x = x.clone()
     x[5:9, 1] = torch.nan
-    world = world_of(R, centers, x, scale)
+    world = estimate_world(R, centers, x, scale)
     assert world.metric and world.by_people and world.upright > 0.9
     found = world.points(x)
     assert torch.allclose(found[:, :, 2].nan_to_num(), torch.where(x[..., 0].isnan(), 0.0, truth[:, :, 2]), atol=0.03)
@@ -60,7 +60,7 @@ def test_metres_up_and_ground(people, scale):
 
 def test_without_a_length_the_cameras_are_one_away():
     R, centers, x, *_ = scene()
-    world = world_of(R, centers, x, Scale())
+    world = estimate_world(R, centers, x, Scale())
     assert not world.metric
     middle = x.flatten(0, 1).median(0).values
     assert float((world.scale * (centers - middle)).norm(dim=-1).median()) == pytest.approx(1.0)
@@ -68,7 +68,7 @@ def test_without_a_length_the_cameras_are_one_away():
 
 def test_lying_bodies_leave_up_to_the_cameras():
     R, centers, x, *_ = scene(lying=True)
-    world = world_of(R, centers, x, Scale())
+    world = estimate_world(R, centers, x, Scale())
     assert not world.by_people
     turned, _ = world.cameras(R, R.new_zeros(4, 3))
     assert torch.allclose(turned[:, 1], torch.tensor([0.0, 0.0, -1.0], dtype=F64).expand(4, 3), atol=1e-9)
