@@ -74,7 +74,7 @@ def normalize_sightings(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[Li
 
 
 @dataclass(frozen=True)
-class FittedLines:
+class LineFit:
     """Unit vectors ``(*batch, n, k)``, their cost ``(*batch, n)`` in px^2, and the trace of the inverse Gauss-Newton matrix along
     the surface, ``(*batch, n)``: the squared uncertainty at a noise of 1 px."""
 
@@ -113,13 +113,13 @@ def to_points(data: LineSightings, points: Tensor) -> tuple[Tensor, Tensor]:
     return error.transpose(-3, -2).flatten(-2), slope.transpose(-4, -3).flatten(-3, -2)
 
 
-def fit_lines(data: LineSightings, starts: Tensor) -> FittedLines:
+def fit_lines(data: LineSightings, starts: Tensor) -> LineFit:
     """Lines ``(*batch, n, 6)`` of least distance, from starts on the Klein quadric; leading dimensions of the starts broadcast."""
     form = plucker_form(device=starts.device)
     return _descend(Surface(lambda v: to_lines(data, v), lambda v: torch.stack([v, v @ form], dim=-2), nearest_line), starts)
 
 
-def fit_points(data: LineSightings, starts: Tensor) -> FittedLines:
+def fit_points(data: LineSightings, starts: Tensor) -> LineFit:
     """Points ``(*batch, n, 4)`` of least reprojection error."""
     return _descend(Surface(lambda p: to_points(data, p), lambda p: p[..., None, :], lambda p: normalize(p, dim=-1)), starts)
 
@@ -154,7 +154,7 @@ class Surface(LeastSquares):
         return (self.nearest(theta[0] - step[0]),)
 
 
-def _descend(surface: Surface, starts: Tensor) -> FittedLines:
+def _descend(surface: Surface, starts: Tensor) -> LineFit:
     """The vectors of least cost; with their derivatives, where gradients are recorded."""
     with torch.no_grad():
         at = Iterate(*minimize(surface, surface.evaluate((starts.detach(),)), SURFACE)[:3])
@@ -166,7 +166,7 @@ def _descend(surface: Surface, starts: Tensor) -> FittedLines:
             near = step.detach().norm(dim=-1, keepdim=True) < MAX_DERIVATIVE_STEP
             at = surface.moved(at, (torch.where(near, step, 0.0),))
     (vectors,), (_, matrix, size) = at.theta, at.terms
-    return FittedLines(vectors, at.cost, _spread(matrix.detach(), size.detach(), surface.normals(vectors).shape[-2]))
+    return LineFit(vectors, at.cost, _spread(matrix.detach(), size.detach(), surface.normals(vectors).shape[-2]))
 
 
 def _spread(matrix: Tensor, size: Tensor, constraints: int) -> Tensor:

@@ -19,7 +19,7 @@ from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.nullspace import gram_null_space
-from dyntorch.tasks.trajectories.descent import FittedLines, LineSightings, adjust, fit_lines, fit_points, normalize_sightings
+from dyntorch.tasks.trajectories.descent import LineFit, LineSightings, adjust, fit_lines, fit_points, normalize_sightings
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def line_vectors(data: LineSightings) -> Tensor:
 MIN_LINE_ANGLE = 1e-12  # squared sine between the unit vectors of both lines of four views
 
 
-def _lines(data: LineSightings) -> tuple[FittedLines, Tensor]:
+def _lines(data: LineSightings) -> tuple[LineFit, Tensor]:
     """The best lines, and the second ones of four views (0 elsewhere)."""
     rays = data.rays()
     null = gram_null_space(rays.mT @ rays, 2).basis
@@ -238,11 +238,11 @@ def _lines(data: LineSightings) -> tuple[FittedLines, Tensor]:
     two = ((data.weights > 0).sum(-2) == VIEWS) & real & apart & cost[1:].isfinite().all(0)
     best = torch.where(two, 1, cost.argmin(0))[None]
     vectors, least, spread = found.vectors.take_along_dim(best[..., None], 0), found.cost, found.spread
-    line = FittedLines(vectors[0], least.take_along_dim(best, 0)[0], spread.take_along_dim(best, 0)[0])
+    line = LineFit(vectors[0], least.take_along_dim(best, 0)[0], spread.take_along_dim(best, 0)[0])
     return line, torch.where(two[..., None], found.vectors[2], 0.0)
 
 
-def _points(data: LineSightings) -> FittedLines:
+def _points(data: LineSightings) -> LineFit:
     """Every point as if it did not move."""
     sides = data.sides()
     return fit_points(data, gram_null_space(sides.mT @ sides).basis[..., 0, :])
