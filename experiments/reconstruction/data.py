@@ -17,7 +17,7 @@ from dyntorch.geometry.lift import balance_lifts
 from dyntorch.geometry.triangulation import reproject, resect
 from dyntorch.scenes.scene import calibration, looking_at
 from dyntorch.tasks.reconstruct.motions import as_motion
-from dyntorch.tasks.reconstruct.reconstruct import normalized
+from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.result import Reconstruction
 from experiments.common.real_data import Take, Traffic, rotation
 from experiments.recognition.protocol import data_folder
@@ -183,7 +183,7 @@ def predicted(found: Reconstruction, time: float, image: Tensor, known: Tensor) 
 def minimum(tracks: Tensor, world: World, cameras: Tensor, motion: str) -> tuple[float, metrics.LiftedError]:
     """Rms reprojection distance and errors of the minimum that bundle adjustment finds from the truth."""
     lifts, root = balance_lifts(as_motion(motion).lifts(world.times))
-    data = normalized(tracks[None], torch.ones_like(tracks[None, ..., 0]), world.times)
+    data = normalize_tracks(tracks[None], torch.ones_like(tracks[None, ..., 0]), world.times)
     done = bundle_adjust(
         data.x, data.weights, data.transforms @ cameras, (world.structure(motion) @ root.mT)[None], lifts, iterations=100
     )

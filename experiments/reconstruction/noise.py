@@ -28,8 +28,8 @@ from dyntorch.geometry.lift import upgrade
 from dyntorch.geometry.triangulation import resect, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.projections import ViewTracks
-from dyntorch.tasks.reconstruct.reconstruct import normalized
-from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances
+from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
+from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjust_scene, distances
 from experiments.common.tables import command, note
 
 SCENES, QUICK = 40, 8
@@ -69,7 +69,7 @@ BODIES = (("two_bodies_2d", 2, 40, 1.0, 1.7), ("two_bodies_3d", 3, 40, 1.0, 1.5)
 
 def flat(tracks: Tensor, times: Tensor) -> ViewTracks:
     """Tracks ``(b, views, n, l)`` as the steps of a reconstruction take them."""
-    return normalized(tracks, torch.ones_like(tracks[..., 0]), times)
+    return normalize_tracks(tracks, torch.ones_like(tracks[..., 0]), times)
 
 
 def stages(tracks: ViewTracks, motion: Motion) -> dict[str, tuple[Tensor, Tensor]]:
@@ -105,7 +105,7 @@ def cell(setting: Setting, count: int, seed: int) -> str:
     scene = scenes.lifted(setting.motion, setting.points, setting.views, sigma=setting.sigma, batch=(count,), generator=draw)
     tracks = flat(scene.tracks, scene.times)
     lifting = Lifting.of(motion, tracks.times, tracks.x)
-    truth = adjusted(
+    truth = adjust_scene(
         tracks,
         LiftedState(tracks.transforms @ scene.cameras, scene.structure @ lifting.root.mT, tracks.x[:, 0, 0, 0]),
         lifting,

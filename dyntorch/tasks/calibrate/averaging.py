@@ -61,7 +61,7 @@ def pair_graph(views: RigViews, clocks: Tensor, fewest: int) -> dict[tuple[int, 
         if len(both) >= fewest:
             some = both[:: max(1, len(both) // MAX_PAIR_MATCHES)]
             x1, x2 = (x[i, some] - views.centers[i]) / unit, (x[j, some] - views.centers[j]) / unit
-            found[i, j] = _fitted(x1, x2, unit, len(both))
+            found[i, j] = _fit_pair(x1, x2, unit, len(both))
     return found
 
 
@@ -69,7 +69,7 @@ FIRST_CUTOFFS = (40.0, 20.0, 10.0)  # of the fit of F, thousandths of the longer
 LAST_CUTOFFS = (2.5, 1.5)  # of the fit of F, robust standard deviations of the residual
 
 
-def _fitted(x1: Tensor, x2: Tensor, unit: float, matches: int) -> PairGeometry:
+def _fit_pair(x1: Tensor, x2: Tensor, unit: float, matches: int) -> PairGeometry:
     weights = torch.ones(1, len(x1), dtype=torch.float64)
     F, _ = fit_fundamental(x1, x2, weights, [1e-3 * scale for scale in FIRST_CUTOFFS])
     sigma = _spread(F[0], x1, x2)
@@ -106,7 +106,7 @@ AVERAGING_ITERATIONS = 6  # in which the weights of the pairs' rotations are lea
 HALF_WEIGHT_DISTANCE = 0.1  # Frobenius norm between two rotations (4 degrees) at which a pair's weight is a half
 
 
-def averaged_rotations(turns: Mapping[tuple[int, int], Tensor], weights: Mapping[tuple[int, int], float], cameras: int) -> Tensor:
+def average_rotations(turns: Mapping[tuple[int, int], Tensor], weights: Mapping[tuple[int, int], float], cameras: int) -> Tensor:
     """Rotations ``(c, 3, 3)`` whose ratios :math:`R_j R_i^T` are nearest to given ones; the first is the identity."""
     soft = dict.fromkeys(turns, 1.0)
     R = torch.eye(3, dtype=torch.float64).repeat(cameras, 1, 1)
@@ -134,14 +134,14 @@ def _across(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     return d, weights[..., None, None] * (eye - d[..., :, None] * d[..., None, :])
 
 
-def meeting_points(R: Tensor, centers: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
+def nearest_points(R: Tensor, centers: Tensor, rays: Tensor, weights: Tensor) -> Tensor:
     """Points ``(m, 3)`` nearest to the rays of all cameras."""
     _, across = _across(R, rays, weights)
     inverse = torch.linalg.pinv(across.sum(0), hermitian=True)
     return (inverse @ torch.einsum("amij,aj->mi", across, centers)[..., None])[..., 0]
 
 
-def positioned(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def position_cameras(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Centres ``(c, 3)`` and points ``(m, 3)`` from rotations and rays, as the equation of this file says."""
     c = len(R)
     weights = weights * ((weights > 0).sum(0) >= 2)
@@ -165,9 +165,9 @@ def first_cameras(views: RigViews, graph: Graph, clocks: Tensor, focals: Tensor)
         both, share = relative_rotations(pair, float(focals[i]), float(focals[j]))
         best = int(share.argmax())
         turns[i, j], weights[i, j] = both[best], float(pair.weights.sum() * share[best])
-    R = averaged_rotations(turns, weights, len(focals))
+    R = average_rotations(turns, weights, len(focals))
     rays, known = viewing_rays(views, clocks, focals)
-    centers, points = positioned(R, rays, known)
+    centers, points = position_cameras(R, rays, known)
     return R, centers, points.view(len(views.times), -1, 3)
 
 

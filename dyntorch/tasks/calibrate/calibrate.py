@@ -14,15 +14,14 @@ from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.calibrate import diagnosis
-from dyntorch.tasks.calibrate.adjusting import Freedom, RigSolution, adjusted, compared_starts, pose_of
-from dyntorch.tasks.calibrate.adjustment import LENS, PARAMETERS
 from dyntorch.tasks.calibrate.averaging import pair_graph
-from dyntorch.tasks.calibrate.input import Rig, Scale, given_clocks, read_clocks, read_rig
+from dyntorch.tasks.calibrate.bundle import Freedom, RigSolution, adjust_bundle, compare_starts, pose_of, triangulate_frames
+from dyntorch.tasks.calibrate.bundle_problem import LENS, PARAMETERS
+from dyntorch.tasks.calibrate.input import Rig, Scale, clocks_as_given, read_clocks, read_rig
 from dyntorch.tasks.calibrate.observations import RigViews, common_views
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.calibrate.result import Calibration, CalibrationNotice
-from dyntorch.tasks.calibrate.structure import structure
-from dyntorch.tasks.calibrate.world import World, world_of
+from dyntorch.tasks.calibrate.world_frame import World, estimate_world
 from dyntorch.tasks.synchronize.cameras import synchronize_cameras
 from dyntorch.tasks.synchronize.result import Clocks
 
@@ -55,7 +54,7 @@ def calibrate(
     1. clocks of all pairs from the same tracks (:func:`dyntorch.synchronize_cameras`);
     2. F of every pair at common moments; for focal lengths that are tried, rotations and centres by averaging over the pairs;
     3. the best of these starts adjusted: cameras, focal lengths, one term of distortion, clocks and points at once (see
-       ``adjustment.py`` for what is minimized);
+       ``bundle_problem.py`` for what is minimized);
     4. up from upright bodies, the scale from a height or lengths;
     5. what the data leave open: standard deviations, rival rigs, halves of the take.
 
@@ -112,9 +111,9 @@ def calibrate(
     rig = read_rig(tracks, fps, times, sizes, focal, calibration, weights, one_lens, Scale(height, lengths))
     # 1. clocks
     found_clocks = _clocks(rig, clocks, max_shift, rate)
-    told = _told(found_clocks)
+    told = _clock_notices(found_clocks)
     if bool(found_clocks.offsets.isnan().any()):
-        return _nothing(rig, found_clocks, told)
+        return _failure(rig, found_clocks, told)
     # 2. first cameras
     values = torch.stack([found_clocks.offsets, found_clocks.rates], dim=-1)
     views = common_views(rig.tracks, rig.centers, values)
@@ -122,22 +121,22 @@ def calibrate(
     n = rig.tracks[0].x.shape[1]
     used = views.some(max(1, math.ceil(options.max_positions / n)))
     graph = pair_graph(used, own, options.min_matches)
-    hopeless = diagnosis.unmatched(graph, rig, options) or diagnosis.still(rig)
+    hopeless = diagnosis.check_matches(graph, rig, options) or diagnosis.check_motion(rig)
     if hopeless is not None:
-        return _nothing(rig, found_clocks, (*told, hopeless))
+        return _failure(rig, found_clocks, (*told, hopeless))
     freedom = Freedom.of(rig, own, clocks is not None, rate is not None, found_clocks.rate_sigmas)
     few = used.some(NUM_START_MOMENTS)
-    starts, worse = compared_starts(rig, few, graph, own, freedom)
+    starts, worse = compare_starts(rig, few, graph, own, freedom)
     # 3. space and time at once
-    best = adjusted(used, starts.of(torch.tensor([0])), freedom)
-    halves = _halves(used, best, freedom)
+    best = adjust_bundle(used, starts.of(torch.tensor([0])), freedom)
+    halves = _adjust_halves(used, best, freedom)
     # 4. the world, and the points of every frame
     others = [(pose_of(starts, k), float(worse[k])) for k in range(1, len(worse))]
     limits = [
-        diagnosis.planar(graph),
-        diagnosis.unsure(best, rig, options),
-        diagnosis.rival(pose_of(starts), others),
-        diagnosis.moved(halves),
+        diagnosis.check_plane(graph),
+        diagnosis.check_sigmas(best, rig, options),
+        diagnosis.check_rivals(pose_of(starts), others),
+        diagnosis.check_halves(halves),
     ]
     return _result(rig, views, best, found_clocks, [*told, *(limit for limit in limits if limit is not None)])
 
@@ -146,7 +145,7 @@ def _clocks(rig: Rig, clocks: Any, max_shift: float | None, rate: float | None) 
     """As given, or as the tracks say."""
     c = len(rig.tracks)
     if clocks is not None:
-        return given_clocks(clocks, read_clocks(clocks, c), float(rig.tracks[0].times.mean()))
+        return clocks_as_given(clocks, read_clocks(clocks, c), float(rig.tracks[0].times.mean()))
     return synchronize_cameras(
         rig.x,
         times=[track.times for track in rig.tracks],
@@ -156,7 +155,7 @@ def _clocks(rig: Rig, clocks: Any, max_shift: float | None, rate: float | None) 
     )
 
 
-def _told(clocks: Clocks) -> tuple[Notice, ...]:
+def _clock_notices(clocks: Clocks) -> tuple[Notice, ...]:
     """What synchronization says that concerns the rig."""
     if not clocks.ok:
         # the sentence itself, so that whoever prints it names its cameras and arguments
@@ -169,9 +168,9 @@ MIN_HALF_POSITIONS = 1_000  # that a half must have to be judged by itself
 MIN_HALF_SECONDS = 2.5  # a detector's error goes on for a second and looks like a camera that moved
 
 
-def _halves(views: RigViews, best: RigSolution, freedom: Freedom) -> tuple[RigSolution, RigSolution] | None:
+def _adjust_halves(views: RigViews, best: RigSolution, freedom: Freedom) -> tuple[RigSolution, RigSolution] | None:
     """Both halves of the take by themselves, from the whole; None where a half has too little."""
-    held = replace(freedom, whole=_only_poses(freedom.whole), shape=_only_poses(freedom.shape))
+    held = replace(freedom, whole=_pose_columns(freedom.whole), shape=_pose_columns(freedom.shape))
     found = []
     for part in (views.between(-math.inf, 0.0), views.between(0.0, math.inf)):
         if not len(part.times) or float(part.times.abs().max()) < MIN_HALF_SECONDS:
@@ -179,11 +178,11 @@ def _halves(views: RigViews, best: RigSolution, freedom: Freedom) -> tuple[RigSo
         if int((part.steady(best.state.clocks) > 0).sum()) < MIN_HALF_POSITIONS:
             return None
         few = part.some(NUM_START_MOMENTS)
-        found.append(adjusted(few, best.state, held))
+        found.append(adjust_bundle(few, best.state, held))
     return found[0], found[1]
 
 
-def _only_poses(basis: Tensor) -> Tensor:
+def _pose_columns(basis: Tensor) -> Tensor:
     """The columns that change nothing but poses."""
     other = basis.view(-1, PARAMETERS, basis.shape[1])[:, LENS.start :].abs().sum((0, 1))
     return basis[:, other == 0]
@@ -192,10 +191,10 @@ def _only_poses(basis: Tensor) -> Tensor:
 def _result(rig: Rig, views: RigViews, best: RigSolution, clocks: Clocks, limits: list[Notice]) -> Calibration:
     """The solution in its world, with the points of all frames."""
     state, c = best.state, len(rig.tracks)
-    found = structure(views, best)
-    foreign = diagnosis.foreign(found.inliers)
+    found = triangulate_frames(views, best)
+    foreign = diagnosis.check_inliers(found.inliers)
     limits += [foreign] if foreign is not None else []
-    world = world_of(state.R[0], state.centers[0], found.points, rig.scale)
+    world = estimate_world(state.R[0], state.centers[0], found.points, rig.scale)
     R, t = world.cameras(state.R[0], state.t[0])
     K = torch.eye(3, dtype=torch.float64).repeat(c, 1, 1)
     K[:, 0, 0] = K[:, 1, 1] = state.lens[0, :, 0].exp()
@@ -206,7 +205,7 @@ def _result(rig: Rig, views: RigViews, best: RigSolution, clocks: Clocks, limits
         if lens is not None:
             K[i], distortion[i, : len(lens[1])] = lens
     if not any(limit.code.refuses for limit in limits):
-        limits += _besides(rig, world, state.centers[0])
+        limits += _more_notices(rig, world, state.centers[0])
     return Calibration(
         K=K, R=R, t=t, distortion=distortion, sizes=rig.sizes,
         clocks=_adjusted_clocks(clocks, best, views.middle),
@@ -214,18 +213,18 @@ def _result(rig: Rig, views: RigViews, best: RigSolution, clocks: Clocks, limits
         points=world.points(found.points),
         sigmas=world.scale * found.sigmas,
         metric=world.metric, upright=world.by_people,
-        covariance=_in_world(best.covariance, world),
+        covariance=_covariance_in_world(best.covariance, world),
         residuals=found.residuals, inliers=found.inliers, fps=rig.fps,
         status=status_from(limits), notices=tuple(limits),
     )  # fmt: skip
 
 
-def _besides(rig: Rig, world: World, centers: Tensor) -> list[Notice]:
+def _more_notices(rig: Rig, world: World, centers: Tensor) -> list[Notice]:
     """What to know beside a good result."""
     found = []
     if len(rig.tracks) == 2:
         found.append(Notice(CalibrationNotice.TWO))
-    if diagnosis.collinear(centers):
+    if diagnosis.are_collinear(centers):
         found.append(Notice(CalibrationNotice.LINE))
     if not world.metric:
         found.append(Notice(CalibrationNotice.UNKNOWN_SCALE))
@@ -246,13 +245,13 @@ def _adjusted_clocks(clocks: Clocks, best: RigSolution, middle: float) -> Clocks
     )  # fmt: skip
 
 
-def _in_world(covariance: Tensor, world: World) -> Tensor:
+def _covariance_in_world(covariance: Tensor, world: World) -> Tensor:
     """Centres of the world's coordinates; what else a covariance is about does not change with them."""
     change = torch.eye(covariance.shape[-1], dtype=torch.float64)
     change[3:6, 3:6] = world.scale * world.turn
     return change @ covariance @ change.mT
 
 
-def _nothing(rig: Rig, clocks: Clocks, limits: tuple[Notice, ...]) -> Calibration:
+def _failure(rig: Rig, clocks: Clocks, limits: tuple[Notice, ...]) -> Calibration:
     """A result without cameras."""
     return Calibration.unknown(rig.sizes, rig.tracks[0].x.shape[1], clocks, rig.fps, limits)

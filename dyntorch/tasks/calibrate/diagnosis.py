@@ -10,16 +10,16 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice
 from dyntorch.geometry.homography import homography, homography_sampson_squared
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.tasks.calibrate.adjusting import RAYLEIGH, Pose, RigSolution
 from dyntorch.tasks.calibrate.averaging import LAST_CUTOFFS, Graph, PairGeometry
-from dyntorch.tasks.calibrate.bones import bodies
+from dyntorch.tasks.calibrate.bundle import RAYLEIGH, Pose, RigSolution
 from dyntorch.tasks.calibrate.input import Rig
 from dyntorch.tasks.calibrate.observations import MIN_NOISE
 from dyntorch.tasks.calibrate.options import CalibrateOptions
 from dyntorch.tasks.calibrate.result import CalibrationNotice
+from dyntorch.tasks.calibrate.world_frame import bodies
 
 
-def differences(one: Pose, other: Pose) -> tuple[Tensor, Tensor]:
+def pose_differences(one: Pose, other: Pose) -> tuple[Tensor, Tensor]:
     """By how much the cameras of two solutions differ, after the similarity that fits most: degrees, hundredths of the
     distance."""
     turns = one.R.mT @ other.R
@@ -39,7 +39,7 @@ def differences(one: Pose, other: Pose) -> tuple[Tensor, Tensor]:
     return angle, 100 * away / (a - one.middle).norm(dim=-1).clamp(min=1e-12)
 
 
-def unmatched(graph: Graph, rig: Rig, options: CalibrateOptions) -> Notice | None:
+def check_matches(graph: Graph, rig: Rig, options: CalibrateOptions) -> Notice | None:
     """Cameras that share too little with others to have a place in the rig."""
     together = bodies(torch.tensor(list(graph)).reshape(-1, 2), len(rig.tracks))
     lost = tuple(sorted(set(range(len(rig.tracks))) - set(together[0] if together else [0])))
@@ -51,7 +51,7 @@ def unmatched(graph: Graph, rig: Rig, options: CalibrateOptions) -> Notice | Non
 MIN_MOTION_SIGMAS = 2.0  # motion of the points over their noise
 
 
-def still(rig: Rig) -> Notice | None:
+def check_motion(rig: Rig) -> Notice | None:
     """Whether no camera sees anything move."""
     ratios = []
     for track in rig.tracks:
@@ -65,7 +65,7 @@ def still(rig: Rig) -> Notice | None:
 MIN_PLANE_RATIO = 2.0  # residual of the best homography over that of F
 
 
-def planar(graph: Graph) -> Notice | None:
+def check_plane(graph: Graph) -> Notice | None:
     """Whether every pair of cameras sees one plane, as two cameras see people who walk along one line seen from the side."""
     ratios = {pair: _plane_residual(geometry) / geometry.sigma for pair, geometry in graph.items()}
     if not ratios or max(ratios.values()) > MIN_PLANE_RATIO:
@@ -85,10 +85,10 @@ MIN_RIVAL_MARGIN = 10.0  # twice the logarithm of the likelihood ratio to anothe
 MIN_RIVAL_DEGREES = 2.0  # from which on two rigs are different
 
 
-def rival(best: Pose, others: Sequence[tuple[Pose, float]]) -> Notice | None:
+def check_rivals(best: Pose, others: Sequence[tuple[Pose, float]]) -> Notice | None:
     """Another solution that differs and is hardly worse."""
     for pose, worse in others:
-        angle = float(differences(best, pose)[0].max())
+        angle = float(pose_differences(best, pose)[0].max())
         if worse < MIN_RIVAL_MARGIN and angle > MIN_RIVAL_DEGREES:
             return Notice(CalibrationNotice.RIVAL, angle)
     return None
@@ -97,7 +97,7 @@ def rival(best: Pose, others: Sequence[tuple[Pose, float]]) -> Notice | None:
 MAX_LINE_SPREAD = 0.06  # of the cameras across a line over that along it
 
 
-def collinear(centers: Tensor) -> bool:
+def are_collinear(centers: Tensor) -> bool:
     """Whether three cameras or more stand nearly in a line."""
     if len(centers) < 3:
         return False
@@ -105,7 +105,7 @@ def collinear(centers: Tensor) -> bool:
     return bool(spread[1] < MAX_LINE_SPREAD * spread[0])
 
 
-def unsure(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | None:
+def check_sigmas(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | None:
     """Whether standard deviations are too large, the focal lengths first: they are what most often stays open."""
     variance = found.covariance.diagonal(dim1=-2, dim2=-1)
     if len(rig.tracks) == 2 and not bool(rig.focals.isfinite().any()) and not rig.one_lens:
@@ -113,7 +113,7 @@ def unsure(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | 
     focal = variance[:, 6].sqrt()
     pose = found.pose
     if float(focal.max()) > options.max_focal_sigma:
-        case = "line" if collinear(pose.centers) else ""
+        case = "line" if are_collinear(pose.centers) else ""
         which = tuple((focal > options.max_focal_sigma).nonzero().flatten().tolist())
         return Notice(CalibrationNotice.FOCAL, 100 * float(focal.max()), {"case": case, "cameras": which})
     turn = torch.rad2deg(variance[:, :3].sum(-1).sqrt())
@@ -130,7 +130,7 @@ def unsure(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | 
 MIN_INLIER_SHARE = 0.6  # of the positions of a camera
 
 
-def foreign(inliers: Tensor) -> Notice | None:
+def check_inliers(inliers: Tensor) -> Notice | None:
     """Cameras most of whose positions do not agree with the others."""
     which = tuple((inliers < MIN_INLIER_SHARE).nonzero().flatten().tolist())
     return Notice(CalibrationNotice.DISAGREES, 100 * float(inliers.min()), {"cameras": which}) if which else None
@@ -141,12 +141,12 @@ MAX_MOVED_PERCENT = 4.5  # the same of its place, hundredths of its distance fro
 MAX_MOVED_SIGMAS = 5.0  # the same in standard deviations
 
 
-def moved(halves: tuple[RigSolution, RigSolution] | None) -> Notice | None:
+def check_halves(halves: tuple[RigSolution, RigSolution] | None) -> Notice | None:
     """Cameras whose poses in both halves of the take differ by more than they may."""
     if halves is None:
         return None
     one, other = halves
-    angle, away = differences(one.pose, other.pose)
+    angle, away = pose_differences(one.pose, other.pose)
     variance = one.covariance.diagonal(dim1=-2, dim2=-1) + other.covariance.diagonal(dim1=-2, dim2=-1)
     sigma = torch.rad2deg(variance[:, :3].sum(-1).sqrt())
     far = (one.pose.centers - one.pose.middle).norm(dim=-1)

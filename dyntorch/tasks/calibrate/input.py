@@ -16,7 +16,7 @@ from dyntorch.numerics.arguments import FARTHEST
 from dyntorch.tasks.synchronize.result import Clocks
 from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks, reject_outliers
 
-SAID_BLOCK = 1_000_000
+MAX_QUANTILE_POSITIONS = 1_000_000
 """Positions that say where points lie: torch takes quantiles of 16 million numbers at most."""
 
 
@@ -117,7 +117,7 @@ def read_clocks(clocks: Any, cameras: int) -> Tensor:
     return values
 
 
-def given_clocks(clocks: Any, values: Tensor, center: float) -> Clocks:
+def clocks_as_given(clocks: Any, values: Tensor, center: float) -> Clocks:
     """Clocks that are taken as given."""
     if isinstance(clocks, Clocks):
         return clocks
@@ -196,7 +196,7 @@ def _check_inside(x: Tensor, size: Tensor) -> None:
         raise ValueError("no point is seen; check the detections")
     far = ((seen < -MAX_OUTSIDE * size) | (seen > (1 + MAX_OUTSIDE) * size)).any(-1).double().mean()
     if float(far) > MAX_OUTSIDE_SHARE:
-        some = seen[:: max(1, len(seen) // SAID_BLOCK)]
+        some = seen[:: max(1, len(seen) // MAX_QUANTILE_POSITIONS)]
         low, high = (some.quantile(q, dim=0).round().int().tolist() for q in (0.02, 0.98))
         width, height = size.int().tolist()
         raise ValueError(

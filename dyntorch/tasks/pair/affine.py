@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from dyntorch.tasks.pair.motion_prior import Prior, cosines, inverse_cosines, motion_spectrum
+
 # ----------------------------------------------------------------------------------------------------------------------
 # The epipolar coordinates of one camera's points as combinations of the other's, by ridge regression of most evidence.
 #
@@ -94,7 +96,7 @@ def regress(rows: Rows, *, means: bool) -> Ridge:
     return Ridge(level[pick], ridge[pick], variance[pick], gauge[pick], scaled)
 
 
-def combinations(rows: Rows, ridge: Tensor, gauge: Tensor) -> Tensor:
+def combination_weights(rows: Rows, ridge: Tensor, gauge: Tensor) -> Tensor:
     """Q ``(g, n, m)`` for a known ridge ``(g,)``, o and c ``(g, 2)``."""
     u, s, vt = torch.linalg.svd(rows.x, full_matrices=False)
     target = rows.y - rows.free @ gauge[..., None]
@@ -105,7 +107,7 @@ def combinations(rows: Rows, ridge: Tensor, gauge: Tensor) -> Tensor:
 NUM_FOLDS = 5  # stretches of time that are predicted from the others
 
 
-def predicted_apart(x: Tensor, y: Tensor, ridge: Tensor) -> Tensor:
+def leave_out_residuals(x: Tensor, y: Tensor, ridge: Tensor) -> Tensor:
     r"""Residuals of y where every stretch of time is predicted from all others, :math:`(I - H_{BB})^{-1} (y - H y)_B`. x
     ``(T, n)`` -> ``(T, m)``."""
     u, s, _ = torch.linalg.svd(x, full_matrices=False)
@@ -124,7 +126,7 @@ def predicted_apart(x: Tensor, y: Tensor, ridge: Tensor) -> Tensor:
     return torch.cat(pieces)
 
 
-def ridges_apart(x: Tensor, y: Tensor) -> Tensor:
+def column_ridges(x: Tensor, y: Tensor) -> Tensor:
     """The ridge of most evidence of every column of ``y (T, m)`` by itself, given ``x (T, n)``: ``(m,)``."""
     u, s, _ = torch.linalg.svd(x, full_matrices=False)
     inside = u.mT @ y
@@ -189,7 +191,7 @@ def direction(angle: Tensor) -> Tensor:
     return torch.stack([angle.cos(), angle.sin()], dim=-1)
 
 
-def along(x: Tensor, angle: Tensor) -> Tensor:
+def project_along(x: Tensor, angle: Tensor) -> Tensor:
     """Coordinates ``(g, ...)`` of ``(..., 2)`` along angles ``(g,)``."""
     return torch.movedim(x @ direction(angle).mT, -1, 0)
 
@@ -200,7 +202,7 @@ NOISE_FLOOR = 0.1  # share of the noise's variance added to covariances; CMU joi
 def information(motions: Motions, angles: Tensor) -> Tensor:
     r"""What the coordinates along two directions say of each other, ``(g,)``."""
     floor = max(NOISE_FLOOR * motions.variance, 1e-14 * float(motions.x.square().sum(0).mean()) / motions.frequencies)
-    x, y = (along(part, angle) for part, angle in zip((motions.x, motions.y), angles.unbind(-1), strict=True))
+    x, y = (project_along(part, angle) for part, angle in zip((motions.x, motions.y), angles.unbind(-1), strict=True))
     n, m = x.shape[-1], y.shape[-1]
     both = torch.cat([x, y], dim=-1)
     moment = both.mT @ both / motions.frequencies + floor * torch.eye(n + m, dtype=x.dtype, device=x.device)
@@ -228,8 +230,8 @@ def peaks(motions: Motions) -> Tensor:
 
 def likelihood(motions: Motions, angles: Tensor, affine: bool = False) -> Tensor:
     """Log likelihood ``(g,)`` of each camera's coordinates given the other's, above their own; ``affine``: with the mean places."""
-    both = [along(part, angle) for part, angle in zip((motions.x, motions.y), angles.unbind(-1), strict=True)]
-    places = [along(part, angle) for part, angle in zip(motions.means, angles.unbind(-1), strict=True)]
+    both = [project_along(part, angle) for part, angle in zip((motions.x, motions.y), angles.unbind(-1), strict=True)]
+    places = [project_along(part, angle) for part, angle in zip(motions.means, angles.unbind(-1), strict=True)]
     there = Rows.of(both[0], both[1], (places[0], places[1]) if affine else None, motions.dropped)
     back = Rows.of(both[1], both[0], (places[1], places[0]) if affine else None, motions.dropped)
     level = regress(there, means=affine).evidence + regress(back, means=affine).evidence
@@ -246,7 +248,7 @@ STEP_SHRINKAGE = 0.4  # where no neighbour is better
 MIN_GAIN = 1e-3  # of log likelihood, below which noise decides
 
 
-def refined(
+def refine_directions(
     motions: Motions, start: Tensor, finest: float | None = None, step: float | None = None, *, affine: bool = False
 ) -> tuple[Tensor, float]:
     """The directions ``(2,)`` of most likelihood near the start, and its value, by a grid that shrinks from step to finest, if not
@@ -267,130 +269,6 @@ def refined(
         elif gain < MIN_GAIN:
             break
     return angles, level
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# What tracks of one camera say of themselves: how much of every frequency and every combination of points is motion, not noise.
-#
-# The coordinates of n points over T frames, about their means, are taken as Gaussian with the covariance :math:`S_f\,B +
-# \sigma^2 I`
-# at each frequency f of the discrete cosine transform: one spectrum S for all points, one covariance B of the points for all
-# frequencies.  Nothing is assumed on the frequencies but what the tracks show.
-
-
-def cosines(x: Tensor) -> Tensor:
-    """Orthonormal discrete cosine transform (type II) over the first dimension, without its constant."""
-    frames = len(x)
-    spectrum = torch.fft.rfft(torch.cat([x, x.flip(0)]), dim=0)[1:frames]
-    turn = torch.exp(-0.5j * torch.pi / frames * torch.arange(1, frames, dtype=x.dtype, device=x.device))
-    return (spectrum * turn[(..., *([None] * (x.ndim - 1)))]).real / (2 * frames) ** 0.5
-
-
-def frames_of(z: Tensor) -> Tensor:
-    """The inverse of :func:`cosines`: ``(T - 1, ...)`` to ``(T, ...)`` of mean 0."""
-    frames = len(z) + 1
-    turn = torch.exp(0.5j * torch.pi / frames * torch.arange(1, frames, dtype=z.dtype, device=z.device))
-    half = z * turn[(..., *([None] * (z.ndim - 1)))] * (2 * frames) ** 0.5
-    zero = torch.zeros_like(half[:1])
-    return torch.fft.irfft(torch.cat([zero, half, zero]), n=2 * frames, dim=0)[:frames]
-
-
-MIN_POWER_RATIO = 1e-6  # of the motion of any frequency over the noise, and of the noise in gaps over the motion
-
-
-def motion_spectrum(z: Tensor, variance: float) -> Tensor:
-    """Power of the motion at each frequency, mean over points and coordinates, smoothed over an eighth of an octave,
-    ``(T - 1,)``."""
-    power = z.square().mean((1, 2))
-    total = torch.cat([power.new_zeros(1), power.cumsum(0)])
-    place = torch.arange(len(power), device=z.device)
-    low, high = (place - 1 - place // 8).clamp(min=0), (place + 2 + place // 8).clamp(max=len(power))
-    smooth = (total[high] - total[low]) / (high - low)
-    return (smooth - variance).clamp(min=MIN_POWER_RATIO * variance + 1e-300)
-
-
-EM_ITERATIONS = 20  # for the covariance of the points
-
-
-@dataclass(frozen=True)
-class Prior:
-    """The motion of the points of one camera."""
-
-    spectrum: Tensor  # ``(T - 1,)`` S
-    energies: Tensor  # ``(n,)`` eigenvalues of B
-    modes: Tensor  # ``(n, n)`` its eigenvectors, as columns
-    variance: float  # of the noise
-
-    @staticmethod
-    def of(z: Tensor, variance: float) -> Prior:
-        """Of ``(T - 1, n, 2)`` of :func:`cosines`, by expectation-maximization."""
-        spectrum = motion_spectrum(z, variance)
-        n = z.shape[1]
-        found = Prior(spectrum, z.new_ones(n), torch.eye(n, dtype=z.dtype, device=z.device), variance)
-        root = spectrum.sqrt()[:, None, None]
-        for _ in range(EM_ITERATIONS):
-            hidden = (found.denoised(z) / root).mT.flatten(0, 1)
-            left = (found.energies * (1 - found.shares())).sum(0) * 2
-            moment = (hidden.mT @ hidden + found.modes @ torch.diag(left) @ found.modes.mT) / (2 * len(z))
-            energies, modes = torch.linalg.eigh(moment)
-            found = Prior(spectrum, energies.clamp(min=1e-12), modes, variance)
-        return found
-
-    def shares(self) -> Tensor:
-        """``(T - 1, n)``: how much of each frequency of each mode is motion."""
-        power = self.spectrum[:, None] * self.energies
-        return power / (power + self.variance)
-
-    def denoised(self, z: Tensor) -> Tensor:
-        """The expected motion given ``(T - 1, n, 2)`` (Wiener)."""
-        shares = self.shares()[..., None]
-        return self.modes @ ((self.modes.mT @ z) * shares)
-
-
-FILL_ITERATIONS = 30  # each leaves about the share of the missing positions of the error
-
-
-def filled(x: Tensor, variance: float) -> Tensor:
-    r"""Tracks ``(T, n, 2)`` whose gaps (NaN) hold what the other points expect, and what these miss around the gap."""
-    seen = x.isfinite().all(-1)
-    if bool(seen.all()):
-        return x
-    found = torch.where(seen[..., None], x, _lines(x, seen))
-    weights = seen.to(x)
-    mean = found.mean(0)
-    spread = (found - mean).mT.flatten(0, 1)
-    B = spread.mT @ spread / len(spread)
-    level = max(variance, MIN_POWER_RATIO * float(B.diagonal().mean()))
-    for _ in range(FILL_ITERATIONS):
-        shared = weights[:, :, None] * B * weights[:, None]
-        # points that are missing have an equation of their own
-        precision = torch.linalg.inv_ex(shared + torch.diag_embed(torch.where(seen, level, 1.0)))[0] * weights[:, None]
-        offset = weights[..., None] * (found - mean)
-        gain = B @ (weights[:, :, None] * precision)
-        expected = gain @ offset
-        found = torch.where(seen[..., None], x, expected + mean)
-        left = torch.where(seen[..., None], offset, expected).mT.flatten(0, 1)
-        unsure = (B - gain @ (weights[:, :, None] * B)) * (1 - weights)[:, :, None] * (1 - weights)[:, None]
-        B, mean = (left.mT @ left + 2 * unsure.sum(0)) / len(left), found.mean(0)
-    # what the others would have missed, had they to say where the point is
-    beside = (precision @ offset) / torch.where(seen, precision.diagonal(dim1=-2, dim2=-1), 1.0)[..., None]
-    return torch.where(seen[..., None], x, found + _lines(torch.where(seen[..., None], beside, torch.nan), seen))
-
-
-def _lines(x: Tensor, seen: Tensor) -> Tensor:
-    """Gaps bridged by straight lines, the ends by the nearest position; 0 for points never seen."""
-    frames = len(x)
-    place = torch.arange(frames, device=x.device)[:, None].expand_as(seen)
-    before = torch.where(seen, place, -1).cummax(0).values
-    after = torch.where(seen, place, frames).flip(0).cummin(0).values.flip(0)
-    low, high = torch.where(before < 0, after, before), torch.where(after >= frames, before, after)
-    known = x.nan_to_num()
-
-    def at(index: Tensor) -> Tensor:
-        return known.gather(0, index.clamp(0, frames - 1)[..., None].expand_as(x))
-
-    share = ((place - low) / (high - low).clamp(min=1)).clamp(0, 1)[..., None]
-    return at(low) * (1 - share) + at(high) * share
 
 
 @dataclass(frozen=True)
@@ -432,7 +310,7 @@ def solve(x: Tensor, y: Tensor, noise: tuple[float, float], explained: float, nu
     good = torch.ones(n + y.shape[1], dtype=torch.bool, device=x.device)
     for _ in range(MAX_REJECTIONS):
         angles = _directions(x[:, good[:n]], y[:, good[n:]], noise)
-        r2, strange = judged(x, y, angles, noise, good, explained)
+        r2, strange = judge_points(x, y, angles, noise, good, explained)
         worst = (strange * good).argsort(descending=True)[: max(1, int((strange * good > 0).sum()) // 2)]
         left = good.scatter(0, worst, False)
         # points explained wrongly by one another have to go one after the other
@@ -443,11 +321,11 @@ def solve(x: Tensor, y: Tensor, noise: tuple[float, float], explained: float, nu
     if min(int(good[:n].sum()), int(good[n:].sum())) < MIN_POINTS:
         return good
     beyond = _beyond_chance(_motions(x[:, good[:n]], y[:, good[n:]], noise), angles, num_draws)
-    found = _transferred(x, y, noise, angles, r2, good)
+    found = _transfer(x, y, noise, angles, r2, good)
     if found.affine:
         # the mean places tell the directions better than the motions alone
         angles = _directions(x[:, good[:n]], y[:, good[n:]], noise, angles)
-        found = _transferred(x, y, noise, angles, r2, good)
+        found = _transfer(x, y, noise, angles, r2, good)
     return replace(found, beyond=beyond)
 
 
@@ -458,9 +336,9 @@ def _directions(x: Tensor, y: Tensor, noise: tuple[float, float], start: Tensor 
     """Angles ``(2,)`` of the epipolar normals; from a start, those that the mean places agree with as well."""
     motions, coarse = _motions(x, y, noise).compressed(), COARSE_STEP
     if start is not None:
-        return refined(motions, start, step=2 * coarse, affine=True)[0]
-    found = [refined(motions, start, coarse) for start in peaks(motions)]
-    return refined(motions, max(found, key=lambda one: one[1])[0], step=2 * coarse)[0]
+        return refine_directions(motions, start, step=2 * coarse, affine=True)[0]
+    found = [refine_directions(motions, start, coarse) for start in peaks(motions)]
+    return refine_directions(motions, max(found, key=lambda one: one[1])[0], step=2 * coarse)[0]
 
 
 def _motions(x: Tensor, y: Tensor, noise: tuple[float, float]) -> Motions:
@@ -484,19 +362,19 @@ def _beyond_chance(motions: Motions, angles: Tensor, num_draws: int) -> float:
     for _ in range(num_draws):
         signs = torch.randint(0, 2, (len(motions.y),), generator=generator).to(motions.y) * 2 - 1
         other = replace(motions, y=motions.y * signs[:, None, None]).compressed()
-        levels.append(refined(other, peaks(other)[0], COARSE_STEP)[1])
+        levels.append(refine_directions(other, peaks(other)[0], COARSE_STEP)[1])
     level = float(likelihood(motions.compressed(), angles[None])[0])
     return (level - max(levels)) / max(max(levels) - min(levels), 1e-9 * abs(level), 1e-300)
 
 
-def judged(
+def judge_points(
     x: Tensor, y: Tensor, angles: Tensor, noise: tuple[float, float], good: Tensor, explained: float
 ) -> tuple[Tensor, Tensor]:
     """How the other camera's good points predict every point's epipolar coordinate."""
     n = x.shape[1]
-    u, v = (along(part - part.mean(0), angle[None])[0] for part, angle in zip((x, y), angles, strict=True))
-    first = _judged(v[:, good[n:]], u, noise[0], good[:n], explained)
-    second = _judged(u[:, good[:n]], v, noise[1], good[n:], explained)
+    u, v = (project_along(part - part.mean(0), angle[None])[0] for part, angle in zip((x, y), angles, strict=True))
+    first = _judge_camera(v[:, good[n:]], u, noise[0], good[:n], explained)
+    second = _judge_camera(u[:, good[:n]], v, noise[1], good[n:], explained)
     return torch.cat([first[0], second[0]]), torch.cat([first[1], second[1]])
 
 
@@ -505,8 +383,8 @@ UNUSUAL_RATIO = 4.0  # over the usual distance
 MAX_MISSED_SIGMAS = 3.0  # up to which a prediction speaks against no point: it hardly moves across the epipolar lines
 
 
-def _judged(x: Tensor, y: Tensor, noise: float, good: Tensor, explained: float) -> tuple[Tensor, Tensor]:
-    missed = predicted_apart(x, y, ridges_apart(x, y)).square().mean(0)
+def _judge_camera(x: Tensor, y: Tensor, noise: float, good: Tensor, explained: float) -> tuple[Tensor, Tensor]:
+    missed = leave_out_residuals(x, y, column_ridges(x, y)).square().mean(0)
     small = missed <= (MAX_MISSED_SIGMAS * noise) ** 2
     # noise is nobody's to predict
     power = y.square().mean(0) - noise**2
@@ -521,7 +399,7 @@ MAX_MEAN_COST = 3.0  # factor of the residual variance that the mean places may 
 VARIANCE_ROUNDING = 1e-11  # residual over the power of the motion
 
 
-def _transferred(x: Tensor, y: Tensor, noise: tuple[float, float], angles: Tensor, r2: Tensor, good: Tensor) -> Transfer:
+def _transfer(x: Tensor, y: Tensor, noise: tuple[float, float], angles: Tensor, r2: Tensor, good: Tensor) -> Transfer:
     n = x.shape[1]
     left, right = good[:n], good[n:]
     means = (x.mean(0), y.mean(0))
@@ -530,14 +408,19 @@ def _transferred(x: Tensor, y: Tensor, noise: tuple[float, float], angles: Tenso
     if float(regress(rows[0], means=True).gauge[0, 1]) < 0:
         angles = angles + angles.new_tensor([0.0, torch.pi])
         rows = _rows(moving, moving, means, angles, (left, right))
-    free = [regress(_bare(one), means=False) for one in rows]
+    free = [regress(_without_means(one), means=False) for one in rows]
     # third differences bound the noise from above, and so do the residuals
-    sigma = _bounded(
-        noise, free, [combinations(_bare(one), fit.ridge, one.x.new_zeros(1, 2))[0] for one, fit in zip(rows, free, strict=True)]
+    sigma = _bound_noise(
+        noise,
+        free,
+        [
+            combination_weights(_without_means(one), fit.ridge, one.x.new_zeros(1, 2))[0]
+            for one, fit in zip(rows, free, strict=True)
+        ],
     )
-    clean = [_denoised(part, one, kept) for part, one, kept in zip(moving, sigma, (left, right), strict=True)]
+    clean = [_denoise(part, one, kept) for part, one, kept in zip(moving, sigma, (left, right), strict=True)]
     rows = _rows(clean, moving, means, angles, (left, right))
-    free = [regress(_bare(one), means=False) for one in rows]
+    free = [regress(_without_means(one), means=False) for one in rows]
     tied = [regress(one, means=True) for one in rows]
     better = min(range(2), key=lambda i: float(free[i].variance) / float(rows[i].y.square().mean()))
     exact = VARIANCE_ROUNDING * float(rows[better].y.square().mean())
@@ -545,11 +428,11 @@ def _transferred(x: Tensor, y: Tensor, noise: tuple[float, float], angles: Tenso
     if affine:
         scale, offset = _gauge(tied)
         gauges = angles.new_tensor([[offset, scale], [-offset / scale, 1 / scale]])
-        both = [combinations(one, fit.ridge, g[None])[0] for one, fit, g in zip(rows, tied, gauges, strict=True)]
+        both = [combination_weights(one, fit.ridge, g[None])[0] for one, fit, g in zip(rows, tied, gauges, strict=True)]
     else:
-        rows = [_bare(one) for one in rows]
-        both = [combinations(one, fit.ridge, one.free.new_zeros(1, 2))[0] for one, fit in zip(rows, free, strict=True)]
-        scale, offset = _loose(both, means, angles, (left, right))
+        rows = [_without_means(one) for one in rows]
+        both = [combination_weights(one, fit.ridge, one.free.new_zeros(1, 2))[0] for one, fit in zip(rows, free, strict=True)]
+        scale, offset = _gauge_of_free_means(both, means, angles, (left, right))
     missed = [(one.y[0] - one.x[0] @ q)[: len(x)] for one, q in zip(rows, both, strict=True)]
     residual = float(torch.cat([part.flatten() for part in missed]).square().mean().sqrt())
     forward, backward = (x.new_zeros(k, other) for k, other in ((n, y.shape[1]), (y.shape[1], n)))
@@ -560,7 +443,7 @@ def _transferred(x: Tensor, y: Tensor, noise: tuple[float, float], angles: Tenso
     )
 
 
-def _bounded(noise: tuple[float, float], free: list[Ridge], weights: list[Tensor]) -> list[float]:
+def _bound_noise(noise: tuple[float, float], free: list[Ridge], weights: list[Tensor]) -> list[float]:
     r"""Noise of a and of b: a residual has the variance :math:`\sigma_b^2 + |q|^2 \sigma_a^2`, and no less."""
     left = [float(fit.variance) ** 0.5 for fit in free]
     size = [float(q.norm(dim=0).median()) for q in weights]
@@ -571,24 +454,24 @@ def _rows(
     regressors: list[Tensor], explained: list[Tensor], means: tuple[Tensor, Tensor], angles: Tensor, good: tuple[Tensor, Tensor]
 ) -> list[Rows]:
     """b's epipolar coordinates by a's, and a's by b's."""
-    u, v = (along(part[:, kept], angle[None]) for part, kept, angle in zip(regressors, good, angles, strict=True))
-    s, t = (along(part[:, kept], angle[None]) for part, kept, angle in zip(explained, good, angles, strict=True))
-    first, second = (along(part[kept], angle[None]) for part, kept, angle in zip(means, good, angles, strict=True))
+    u, v = (project_along(part[:, kept], angle[None]) for part, kept, angle in zip(regressors, good, angles, strict=True))
+    s, t = (project_along(part[:, kept], angle[None]) for part, kept, angle in zip(explained, good, angles, strict=True))
+    first, second = (project_along(part[kept], angle[None]) for part, kept, angle in zip(means, good, angles, strict=True))
     return [Rows.of(u, t, (first, second)), Rows.of(v, s, (second, first))]
 
 
-def _bare(rows: Rows) -> Rows:
+def _without_means(rows: Rows) -> Rows:
     """Without the rows of the means."""
     return Rows(rows.x[:, :-2], rows.y[:, :-2], torch.zeros_like(rows.free[:, :-2]))
 
 
-def _denoised(x: Tensor, noise: float, good: Tensor) -> Tensor:
+def _denoise(x: Tensor, noise: float, good: Tensor) -> Tensor:
     """Motions of good points rid of noise; others as they are."""
     if not noise > 0:
         return x
     z = cosines(x[:, good])
     found = x.clone()
-    found[:, good] = frames_of(Prior.of(z, noise**2).denoised(z))
+    found[:, good] = inverse_cosines(Prior.of(z, noise**2).denoised(z))
     return found
 
 
@@ -604,9 +487,11 @@ def _gauge(tied: list[Ridge]) -> tuple[float, float]:
     return scale, (weights[0] * o1 - weights[1] * o2 * scale) / max(sum(weights), 1e-300)
 
 
-def _loose(both: list[Tensor], means: tuple[Tensor, Tensor], angles: Tensor, good: tuple[Tensor, Tensor]) -> tuple[float, float]:
+def _gauge_of_free_means(
+    both: list[Tensor], means: tuple[Tensor, Tensor], angles: Tensor, good: tuple[Tensor, Tensor]
+) -> tuple[float, float]:
     """Scale and offset where mean places are free: combinations sum to 1 in the median."""
     c1, c2 = (float(q.sum(0).median()) for q in both)
     scale = (c1 / c2) ** 0.5 if c1 > 0 and c2 > 0 else 1.0
-    first, second = (along(part[kept], angle[None])[0] for part, kept, angle in zip(means, good, angles, strict=True))
+    first, second = (project_along(part[kept], angle[None])[0] for part, kept, angle in zip(means, good, angles, strict=True))
     return scale, float((second - first @ both[0]).median())

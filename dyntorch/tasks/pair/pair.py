@@ -20,7 +20,8 @@ from dyntorch.geometry.triangulation import triangulate
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.pair.affine import MIN_POINTS, Transfer, filled, solve
+from dyntorch.tasks.pair.affine import MIN_POINTS, Transfer, solve
+from dyntorch.tasks.pair.motion_prior import fill_gaps
 from dyntorch.tasks.pair.projective import body_pair
 from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
 from dyntorch.tasks.pair.tracks import MAX_RESIDUAL_SIGMAS, Overlap, match_tracks, overlap
@@ -214,10 +215,10 @@ def reconstruct_pair(
             found = body_pair(seen, threshold, explained)
         else:
             found = _affine(seen, explained, options)
-    return _in(found, a.dtype)
+    return _to_dtype(found, a.dtype)
 
 
-def _in(found: PairReconstruction, dtype: torch.dtype) -> PairReconstruction:
+def _to_dtype(found: PairReconstruction, dtype: torch.dtype) -> PairReconstruction:
     """In the precision of the tracks; times keep theirs."""
     changed = {
         f.name: getattr(found, f.name).to(dtype=dtype)
@@ -249,7 +250,7 @@ def _batch(
         n, m = a.shape[-2], b.shape[-2]
         none = torch.zeros(0, dtype=torch.float64, device=a.device)
         notice = Notice(PairNotice.UNUSABLE, 0.0, {"said": said})
-        return _in(failure((n, m), none, Status.TOO_FEW, notice, width, n if correspondence else n + m), a.dtype)
+        return _to_dtype(failure((n, m), none, Status.TOO_FEW, notice, width, n if correspondence else n + m), a.dtype)
 
     return solve_one_by_one(batch, solve, spare)
 
@@ -294,7 +295,7 @@ def _affine(seen: Overlap, explained: float, options: PairOptions) -> PairRecons
         if int(kept.sum()) < MIN_POINTS:
             values = {"case": "shown", "which": name, "needed": MIN_POINTS}
             return failure((n, m), seen.times, Status.TOO_FEW, Notice(PairNotice.FEW_POINTS, float(kept.sum()), values), 3)
-    tracks = [filled(x[:, kept], s * s) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
+    tracks = [fill_gaps(x[:, kept], s * s) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
     most = max(x.shape[1] for x in tracks)
     wrong = _short(seen, most + MIN_SPARE_FRAMES) or _unusable(tracks, seen.noise)
     if wrong is not None:
@@ -308,7 +309,7 @@ def _affine(seen: Overlap, explained: float, options: PairOptions) -> PairRecons
         return failure((n, m), seen.times, Status.NO_CONSENSUS, notice, 3)
     if found.beyond < options.min_chance_margin:
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.CHANCE, found.beyond), 3)
-    return _assembled(seen, found, tracks, centres, torch.cat(often))
+    return _assemble(seen, found, tracks, centres, torch.cat(often))
 
 
 MIN_ACROSS_SIGMAS = 3.0  # motion across a line, over the noise
@@ -329,12 +330,12 @@ def _unusable(tracks: list[Tensor], noise: tuple[float, float]) -> Notice | None
     return None
 
 
-def _assembled(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: list[Tensor], often: Tensor) -> PairReconstruction:
+def _assemble(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: list[Tensor], often: Tensor) -> PairReconstruction:
     """Cameras, trajectories, matches in the frame (u, w_a, w_b): along the common normal, and along the epipolar lines of each."""
     n, split = seen.a.shape[1], tracks[0].shape[1]
     kept = often.clone()
     kept[often] = found.good
-    u, v = (_turned(normal) for normal in found.normals)
+    u, v = (_axes(normal) for normal in found.normals)
     first = (found.x + tracks[0].mean(0) - centres[0]) @ u.mT
     second = ((found.y + tracks[1].mean(0) - centres[1]) @ v.mT - found.normals.new_tensor([found.offset, 0.0])) / found.scale
     whole = torch.cat(
@@ -372,11 +373,11 @@ def _assembled(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: li
         residuals=residuals,
         residual=found.residual,
         status=torch.tensor(int(Status.OK), device=points.device),
-        notices=() if found.affine else (_free(found, split),),
+        notices=() if found.affine else (_free_places(found, split),),
     )
 
 
-def _turned(normal: Tensor) -> Tensor:
+def _axes(normal: Tensor) -> Tensor:
     """Rows: the normal, and the direction of the epipolar lines."""
     return torch.stack([normal, torch.stack([-normal[1], normal[0]])])
 
@@ -391,5 +392,5 @@ def _fundamental(cameras: Tensor) -> Tensor:
     return F / torch.linalg.matrix_norm(F)
 
 
-def _free(found: Transfer, split: int) -> Notice:
+def _free_places(found: Transfer, split: int) -> Notice:
     return Notice(PairNotice.FREE_PLACES, found.residual, {"a": split, "b": len(found.good) - split})

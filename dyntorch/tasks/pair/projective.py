@@ -35,11 +35,11 @@ def body_pair(seen: Overlap, threshold: float | None, explained: float) -> PairR
     shared, misfit = common_motion(poses[0], poses[1])
     if not misfit <= MAX_MISFIT:
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, misfit), 4, n + m)
-    body, problem = _joint(first, second, shared, tracks)
+    body, problem = _joint_problem(first, second, shared, tracks)
     body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-10))
     if not bool(cost.isfinite().all()):
         return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, math.inf), 4, n + m)
-    return _assembled(seen, body, first, second, threshold, explained)
+    return _assemble(seen, body, first, second, threshold, explained)
 
 
 def _tracks(x: Tensor, seen: Overlap) -> Tracks:
@@ -48,7 +48,7 @@ def _tracks(x: Tensor, seen: Overlap) -> Tracks:
     return Tracks(torch.where(known[..., None], x, 0.0), known.double(), seen.times, step)
 
 
-def _joint(
+def _joint_problem(
     first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, ...], tracks: list[Tracks]
 ) -> tuple[FilmedBody, BodyProblem]:
     """The start in the frame of a, and the problem of both cameras' tracks, each in its own unit."""
@@ -59,7 +59,7 @@ def _joint(
     body = FilmedBody(
         calibrations=torch.cat([first.body.calibrations, second.body.calibrations], 1),
         sights=torch.cat([first.body.sights, sight[None, None]], 1),
-        motions=_filled(first, second, shared),
+        motions=_merge_motions(first, second, shared),
         points=torch.cat([first.body.points, moved[None]], 1),
     )
     x, weights, camera = [], [], []
@@ -74,7 +74,7 @@ def _joint(
     return body, BodyProblem(torch.cat(x, 1)[None], (w / w.max())[None], torch.cat(camera))
 
 
-def _filled(first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, ...]) -> Tensor:
+def _merge_motions(first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, ...]) -> Tensor:
     """a's motions ``(1, frames, 3, 4)``; where only b knows one, b's in a's frame."""
     turn, seat, rest = shared
     own, other = first.body.motions[0], second.body.motions[0]
@@ -83,7 +83,7 @@ def _filled(first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, ...]) -
     return torch.where(first.seen[:, None, None], own, torch.cat([rotation, place[..., None]], -1))[None]
 
 
-def _assembled(
+def _assemble(
     seen: Overlap,
     body: FilmedBody,
     first: BodyMotion,
@@ -113,7 +113,7 @@ def _assembled(
     counted = apart.isfinite()
     share = (counted & (apart <= max(limit, MIN_RELATIVE_NOISE * first.scale))).sum(0) / counted.sum(0).clamp(min=1)
     good = kept & (share >= explained)
-    matches, distances = _matched(both, good, n, float(apart[:, good].square().nanmean().sqrt()))
+    matches, distances = _match(both, good, n, float(apart[:, good].square().nanmean().sqrt()))
     rotation, place = body.sights[0, 1].split([3, 1], -1)
     F = torch.linalg.inv(inner[1]).mT @ skew(place[:, 0]) @ rotation @ torch.linalg.inv(inner[0])
     return PairReconstruction(
@@ -133,7 +133,7 @@ def _assembled(
     )
 
 
-def _matched(both: Tensor, good: Tensor, n: int, residual: float) -> tuple[Tensor, Tensor]:
+def _match(both: Tensor, good: Tensor, n: int, residual: float) -> tuple[Tensor, Tensor]:
     """The track of a that a track of b is ``(m,)``, -1 = none, and rms distances ``(n, m)`` of all pairs in a's pixels."""
     apart = torch.stack([(x[:, :n, None] - x[:, None, n:]).square().sum(-1).nanmean(0).sqrt() for x in both])
     pairs = good[:n, None] & good[None, n:]

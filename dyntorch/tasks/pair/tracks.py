@@ -44,7 +44,7 @@ def overlap(
     first, second = tracks
     wanted = shift.at(first.times) if isinstance(shift, Shift) else first.times + shift
     if not len(second.times):
-        return Overlap(_unfilled(first)[:0], _unfilled(second), first.times[:0], (first.noise, second.noise))
+        return Overlap(_with_gaps(first)[:0], _with_gaps(second), first.times[:0], (first.noise, second.noise))
     start, end = second.times[0], second.times[-1]
     # rounding moves no frame out of the overlap
     inside = (
@@ -52,8 +52,8 @@ def overlap(
     )
     wanted = wanted.clamp(start, end)
     return Overlap(
-        _unfilled(first)[inside],
-        interpolated(_unfilled(second), second.times, wanted[inside]),
+        _with_gaps(first)[inside],
+        interpolate(_with_gaps(second), second.times, wanted[inside]),
         first.times[inside],
         (first.noise, second.noise),
     )
@@ -80,7 +80,7 @@ def _clocks(
     return (float(pair[0]), float(pair[1])), (None, None)
 
 
-def _unfilled(tracks: Tracks) -> Tensor:
+def _with_gaps(tracks: Tracks) -> Tensor:
     return torch.where((tracks.weights > 0)[..., None], tracks.x, torch.nan)
 
 
@@ -89,7 +89,7 @@ INTERPOLATION_FRAMES = (6, 4, 2)
 MAX_GAP_FRAMES = 2.5  # between two frames that are interpolated
 
 
-def interpolated(x: Tensor, times: Tensor, at: Tensor) -> Tensor:
+def interpolate(x: Tensor, times: Tensor, at: Tensor) -> Tensor:
     r"""Positions at any moments by Lagrange's polynomial through the frames around each: six where all are seen, else four or
     two. x ``(frames, n, 2)``, times ``(frames,)``, at ``(m,)`` -> ``(m, n, 2)``."""
     frames = len(times)

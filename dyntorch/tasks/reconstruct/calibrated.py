@@ -69,7 +69,7 @@ class Stage:
 MAX_MISFIT = 5.0  # the same from which on the scene stays without calibration
 
 
-def calibrated(
+def metric_reconstruction(
     plain: Reconstruction, tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None, labels: Tensor, calibration: Tensor
 ) -> Reconstruction:
     """A reconstruction in the metric frame of its cameras, where there is one; elsewhere as it is, with the reason. labels
@@ -121,7 +121,7 @@ def calibrated(
         status=status.reshape(batch),
         structure=_where(found.found, structure, plain.structure),
         projections=_where(found.found, unit_projections(projections), plain.projections),
-        ambiguity=_open(plain, found.found, tracks.static is not None),
+        ambiguity=_ambiguity_text(plain, found.found, tracks.static is not None),
         notices=in_order((*plain.notices, *more)),
         bodies=bodies,
         metric=found.found.reshape(batch),
@@ -139,7 +139,7 @@ def _where(found: Tensor, new: Tensor, old: Tensor) -> Tensor:
     return torch.where(wide, new, old.reshape(new.shape)).reshape(old.shape)
 
 
-def _open(plain: Reconstruction, found: Tensor, static: bool) -> str:
+def _ambiguity_text(plain: Reconstruction, found: Tensor, static: bool) -> str:
     """What remains unknown with the calibration."""
     if not bool(found.any()):
         return plain.ambiguity
@@ -205,9 +205,9 @@ def metric_scene(tracks: ViewTracks, scene: LiftedState, stage: Stage, labels: T
     inverse = torch.linalg.inv_ex(frames.change)[0]
     inverse = _lengths(bare, inverse, frames.change, stage) if stage.motion.sensor == 3 else inverse
     cameras, structure = change_frame(inverse, cameras, structure, stage.lifts)
-    cameras, structure = _adjusted(some, cameras, structure, stage, labels[left], known)
-    cameras, structure = _framed(some, cameras, structure, stage, labels[left], known)
-    cameras, turn, rest = _posed(some, cameras, structure, stage, known)
+    cameras, structure = _adjust(some, cameras, structure, stage, labels[left], known)
+    cameras, structure = _fix_frame(some, cameras, structure, stage, labels[left], known)
+    cameras, turn, rest = _poses(some, cameras, structure, stage, known)
     good = cameras.isfinite().flatten(1).all(-1) & structure.isfinite().flatten(1).all(-1) & (frames.weakness > MIN_WEAKNESS)
     doubt = frames.misfit / frames.weakness.clamp(min=MIN_WEAKNESS)
     at = left[good]
@@ -236,7 +236,7 @@ def _of_world(world: Tensor, lifts: Tensor) -> Tensor:
 METRIC_ITERATIONS = 60  # of bundle adjustment with calibrated cameras
 
 
-def _adjusted(
+def _adjust(
     tracks: ViewTracks, cameras: Tensor, structure: Tensor, stage: Stage, labels: Tensor, known: CalibratedCameras
 ) -> tuple[Tensor, Tensor]:
     """Bundle adjustment with calibrated cameras, from the nearest ones."""
@@ -264,7 +264,7 @@ def _adjusted(
     return done.cameras, done.structure
 
 
-def _framed(
+def _fix_frame(
     tracks: ViewTracks, cameras: Tensor, structure: Tensor, stage: Stage, labels: Tensor, known: CalibratedCameras
 ) -> tuple[Tensor, Tensor]:
     """The metric scene with no mirrored cameras, no motion common to all points, centred and (before cameras) of unit size."""
@@ -274,7 +274,7 @@ def _framed(
     below = inside.sum(-1)
     structure = structure / torch.where(below.abs() > 1e-12, below, 1.0)[..., None]
     if stage.motion.sensor == 2:
-        cameras, structure = _upright(tracks, cameras, structure, stage, labels, known)
+        cameras, structure = _remove_mirrors(tracks, cameras, structure, stage, labels, known)
     if stage.middle is not None:
         static = tracks.static
         still = there if static is None else torch.where((there & static).any(-1, keepdim=True), there & static, there)
@@ -298,7 +298,7 @@ def _framed(
     return cameras, structure
 
 
-def _upright(
+def _remove_mirrors(
     tracks: ViewTracks, cameras: Tensor, structure: Tensor, stage: Stage, labels: Tensor, known: CalibratedCameras
 ) -> tuple[Tensor, Tensor]:
     """The scene in front of its cameras, with rotations of determinant 1: a world may be seen in a mirror, a body from behind."""
@@ -338,7 +338,7 @@ def as_bodies(cameras: Tensor) -> Tensor:
     return torch.stack([torch.cat([cameras[..., :-2], cameras[..., -2 + body, None]], dim=-1) for body in range(2)], dim=1)
 
 
-def _posed(
+def _poses(
     tracks: ViewTracks, cameras: Tensor, structure: Tensor, stage: Stage, known: CalibratedCameras
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cameras :math:`K [R_{:d} | t]` of either norm 1 or zero, rotations ``(b, v, 3, 3)`` and translations ``(b, v, 3, s)``."""

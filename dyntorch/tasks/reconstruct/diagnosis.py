@@ -18,7 +18,7 @@ from dyntorch.tasks.reconstruct.motions import Motion, smaller_motion
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks, camera_unknowns, projections_of_tracks
 from dyntorch.tasks.reconstruct.result import ReconstructNotice
-from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, bodies_of, distances, scene_of, wild
+from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, bodies_of, distances, has_points_behind, scene_of
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How well noise leaves the points of a lifted scene determined, cameras and all.
@@ -39,15 +39,15 @@ def point_uncertainty(
     unit = torch.where(known[..., None], structure / torch.where(known[..., None], value, 1.0), 0.0)
     functional = depth.expand(b, n, -1)
 
-    def run(given: _Given) -> Tensor:
+    def run(given: _UncertaintyInput) -> Tensor:
         return _uncertainty(given, gauge, step)
 
-    given = _Given(cameras, unit, functional, weights * known[:, None], lifts, metric)
+    given = _UncertaintyInput(cameras, unit, functional, weights * known[:, None], lifts, metric)
     found = map_blocks(run, given, size=max(1, BLOCK // (n * wide + 1)))
     return torch.where(known[:, ::step] & found.isfinite(), found, torch.inf)
 
 
-class _Given(NamedTuple):
+class _UncertaintyInput(NamedTuple):
     """What :func:`point_uncertainty` is asked about, points of depth 1."""
 
     cameras: Tensor
@@ -62,7 +62,7 @@ class _Given(NamedTuple):
 EIGENVALUE_ROUNDING = 1e-10  # over the largest: sound scenes of 60 points have 3e-6 to .1, the gauge up to 1e-11
 
 
-def _uncertainty(given: _Given, gauge: int, step: int) -> Tensor:
+def _uncertainty(given: _UncertaintyInput, gauge: int, step: int) -> Tensor:
     cameras, structure, depth, weights, lifts, metric = given
     by_camera, by_point = _derivatives(cameras, structure, weights, lifts)
     information = torch.einsum("bvnlk,bvnlj->bnkj", by_point, by_point)
@@ -127,7 +127,7 @@ def diagnose(
     found, note = noting(batch)
     lost = (scene.cameras == 0).flatten(1).all(-1) | ~scene.cameras.isfinite().flatten(1).all(-1)
     status = torch.where(lost & ~failed(status), int(Status.DEGENERATE), status)
-    enough, size = _through(tracks, motion)
+    enough, size = _num_through(tracks, motion)
     status = torch.where(failed(status) & (enough < motion.tensor(size).minimal()), int(Status.TOO_FEW), status)
     solved = ~failed(status)
     noise = sigma * tracks.scale()
@@ -139,12 +139,12 @@ def diagnose(
     for entry in motion.smaller:
         smaller = smaller_motion(entry)
         asked = (suspect | (smaller.static & (status == Status.AMBIGUOUS))) & ~explained
-        left = _noise_of(tracks, smaller, asked)
+        left = _noise_left_by(tracks, smaller, asked)
         same = asked & (left <= SMALLER_NOISE_RATIO * torch.where(solved, noise, 0.0) + NOISE_ROUNDING)
         note(ReconstructNotice[entry.notice.upper()], left / tracks.scale(), same, case=entry.case, smaller=smaller.name)
         explained = explained | same
     judged = torch.where((explained | (doubt > options.max_uncertainty)) & solved, int(Status.AMBIGUOUS), int(Status.OK))
-    astray = torch.zeros_like(solved) if lifting is None else wild(tracks, scene, lifting)
+    astray = torch.zeros_like(solved) if lifting is None else has_points_behind(tracks, scene, lifting)
     judged = torch.where(solved & ~explained & ((noise > NOISY) | astray), int(Status.NO_CONSENSUS), judged)
     status = torch.where((status == Status.OK) | (status == Status.AMBIGUOUS), judged, status)
     note(ReconstructNotice.UNCERTAIN, doubt, solved & (doubt > NOTED_UNCERTAINTY) & doubt.isfinite())
@@ -229,7 +229,7 @@ def unknowns(tracks: ViewTracks, motion: Motion) -> Tensor:
     return free if tracks.static is None or motion.lift is None else torch.where(tracks.static, motion.dim, free)
 
 
-def _noise_of(tracks: ViewTracks, motion: Motion, asked: Tensor) -> Tensor:
+def _noise_left_by(tracks: ViewTracks, motion: Motion, asked: Tensor) -> Tensor:
     """Noise ``(b,)`` in normalized images that another model leaves; infinite where it was not asked for, or has no result."""
     left = torch.full_like(tracks.x[:, 0, 0, 0], torch.inf)
     chosen = asked.nonzero()[:, 0]
@@ -253,13 +253,13 @@ def _observations(tracks: ViewTracks, motion: Motion, status: Tensor, note: Note
     count = seen.sum(1)
     few = ((count > 0) & (count < need)).sum(-1)
     note(ReconstructNotice.FEW_OBSERVED, few, (few > 0) & ~failed(status), case="points", needed=need)
-    enough, size = _through(tracks, motion)
+    enough, size = _num_through(tracks, motion)
     least = motion.tensor(size).minimal()
     where = {"case": "tracks", "views": size, "motion": motion.name, "needed": least}
     note(ReconstructNotice.FEW_OBSERVED, enough, status == Status.TOO_FEW, **where)
 
 
-def _through(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, int]:
+def _num_through(tracks: ViewTracks, motion: Motion) -> tuple[Tensor, int]:
     """How many tracks ``(b,)`` are seen in as many views as the tensor takes, and these."""
     size = min(motion.views(tracks.times), motion.k + 1)
     return ((tracks.weights > 0).sum(1) >= size).sum(-1), size

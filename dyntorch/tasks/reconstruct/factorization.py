@@ -164,7 +164,7 @@ def _rays(x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
 
 def _solve(rays: Tensor, columns: Tensor, rank: int, iterations: int, tolerance: float) -> tuple[Tensor, Tensor]:
     """Depths ``(b, views, n)`` of the smallest residual that was met, and whether they no longer change ``(b,)``."""
-    best = _balanced((columns > 0).to(rays.dtype).expand(rays.shape[:-1]), columns, sweeps=10)
+    best = _balance((columns > 0).to(rays.dtype).expand(rays.shape[:-1]), columns, sweeps=10)
     smallest = torch.full_like(rays[:, 0, 0, 0], torch.inf)
     converged = torch.zeros_like(smallest, dtype=torch.bool)
     left = torch.arange(len(rays), device=rays.device)  # problems that still change
@@ -185,7 +185,7 @@ def _solve(rays: Tensor, columns: Tensor, rank: int, iterations: int, tolerance:
         depths = images[..., -1]
         if i >= PLAIN:
             given_up = (residual > WORSE * smallest[left])[:, None, None]
-            depths = torch.where(given_up, depths, _balanced(_mixed(images, steps), columns[left], sweeps=1))
+            depths = torch.where(given_up, depths, _balance(_mix(images, steps), columns[left], sweeps=1))
     return best, converged
 
 
@@ -196,7 +196,7 @@ def _next(depths: Tensor, rays: Tensor, columns: Tensor, rank: int) -> tuple[Ten
     seen = seen.squeeze(-2)
     new = spectrum(seen @ seen.mT)[1][..., -1].mT
     new = new * torch.where((new * depths).sum(1, keepdim=True) < 0, -1.0, 1.0)
-    return _balanced(new, columns), residual
+    return _balance(new, columns), residual
 
 
 def _subspace(depths: Tensor, rays: Tensor, rank: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -208,7 +208,7 @@ def _subspace(depths: Tensor, rays: Tensor, rank: int) -> tuple[Tensor, Tensor, 
     return scaled, basis, rest / torch.linalg.matrix_norm(scaled).clamp(min=1e-300)
 
 
-def _balanced(depths: Tensor, columns: Tensor, sweeps: int = 3) -> Tensor:
+def _balance(depths: Tensor, columns: Tensor, sweeps: int = 3) -> Tensor:
     """Sinkhorn sweeps: the same norm for all views, the same for all points, 1 for everything."""
     row = depths.shape[1] ** -0.5
     depths = torch.where(columns > 0, depths, 0.0)
@@ -218,7 +218,7 @@ def _balanced(depths: Tensor, columns: Tensor, sweeps: int = 3) -> Tensor:
     return depths
 
 
-def _mixed(images: Tensor, steps: Tensor) -> Tensor:
+def _mix(images: Tensor, steps: Tensor) -> Tensor:
     """Anderson mixing: the combination of the last images whose steps cancel best."""
     shape = images.shape[:-1]
     images, steps = images.flatten(1, 2), steps.flatten(1, 2)
@@ -374,7 +374,7 @@ def _factorize_moving(x: Tensor, t: Tensor, complete: Tensor, dim: int, iteratio
     unit = (t - start[:, None]).square().mean(-1).sqrt()
     tau = (t - start[:, None]) / unit[:, None]
     images = (x / scale).mT  # (b, views, 2, n)
-    cameras, degenerate = _upgraded(images, tau, dim)
+    cameras, degenerate = _upgrade(images, tau, dim)
     cameras, points, velocities, error = _alternate(images, tau, cameras, iterations, tolerance)
     # the gauge: orthogonal cameras of the size of a scaled orthography with scale 1
     gram = (cameras.mT @ cameras).mean(1) * (dim / 2)
@@ -391,7 +391,7 @@ def _factorize_moving(x: Tensor, t: Tensor, complete: Tensor, dim: int, iteratio
     return *(torch.where(torch.isfinite(part), part, 0.0) for part in found), degenerate
 
 
-def _upgraded(images: Tensor, tau: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+def _upgrade(images: Tensor, tau: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """Cameras ``(b, views, 2, d)`` whose space-time extension [A, tau A] has the columns of the measurements, and doubt."""
     stacked = images.flatten(1, 2)
     vectors, values = torch.linalg.svd(stacked, full_matrices=False)[:2]

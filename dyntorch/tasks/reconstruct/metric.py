@@ -21,7 +21,7 @@ from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
 from dyntorch.numerics.nullspace import eigenvalues
 
-SAME = 1e-9
+CONDITION_ROUNDING = 1e-9
 """Relative singular value below which a condition on changes of the world, made of lifts alone, is none."""
 
 
@@ -49,11 +49,11 @@ class WorldChanges(NamedTuple):
         length = inner.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
         against = torch.cat([(even - 2 * length * eye).flatten(2), below.flatten(2)], dim=-1).permute(0, 2, 1).flatten(0, 1)
         _, values, vh = torch.linalg.svd(against, full_matrices=True)
-        rank = int((values > SAME * values[:1].clamp(min=1.0)).sum())
+        rank = int((values > CONDITION_ROUNDING * values[:1].clamp(min=1.0)).sum())
         stack = lifts.flatten(0, 1)
         every = torch.eye(lifts.shape[1], dtype=lifts.dtype, device=lifts.device).repeat(len(lifts), 1)
         right = torch.linalg.pinv(stack) @ every
-        shared = bool((stack @ right - every).abs().max() < SAME)
+        shared = bool((stack @ right - every).abs().max() < CONDITION_ROUNDING)
         return cls(algebra, worlds, vh[rank:], algebra @ right[:, :dim] if shared else None, dim)
 
     @property
@@ -165,7 +165,7 @@ def metric_frames(
     fits = fits & (wrong <= fewest + MAX_EXTRA_BEHIND)
     best = torch.where(fits, cost, torch.inf).argmin(-1)
     row = torch.arange(b, device=cameras.device)
-    several = _different(theta, changes, d, fits, best)
+    several = _num_different(theta, changes, d, fits, best)
     # what is open by itself, and the derivative of the conditions across it
     value, slope = whole.linear(theta[row, best])
     slope = slope.permute(0, 2, 1, 3).flatten(2)
@@ -187,7 +187,7 @@ def metric_frames(
 MIN_METRIC_DISTANCE = 0.03  # relative, points of unit variance, from which on two metrics are different
 
 
-def _different(theta: Tensor, changes: WorldChanges, d: int, fits: Tensor, best: Tensor) -> Tensor:
+def _num_different(theta: Tensor, changes: WorldChanges, d: int, fits: Tensor, best: Tensor) -> Tensor:
     """How many of the starts that fit lead to different metrics, ``(b,)``."""
     turned = torch.einsum("bsp,vpad->bsvad", theta, changes.worlds[..., :d])
     metric = (turned @ turned.mT).flatten(2)
@@ -282,7 +282,7 @@ START_RIDGE = 1e-3  # weight with which a start stays where the frame is
 
 def _calibrated_first(first: Tensor, changes: WorldChanges, targets: Tensor) -> Tensor:
     """The changes ``(b, s, dim)`` next to the identity that make a camera ``(b, dim, 3, d)`` that of each target, up to a turn."""
-    same = _still(changes)
+    same = _identity_coordinates(changes)
     now = torch.einsum("bpmd,p->bmd", first, same)
     length = (now.square().sum((-2, -1)) / now.shape[-1]).sqrt()[:, None, None, None]
     rows = first.flatten(2).mT
@@ -313,7 +313,7 @@ def _by_quadric(projections: Tensor, share: Tensor, changes: WorldChanges) -> Te
     products = torch.einsum("pkd,qjd->pqkj", columns, columns)
     both = (products + products.mT).flatten(2).flatten(0, 1)
     _, values, vh = torch.linalg.svd(both, full_matrices=False)
-    basis = vh[values > SAME * values[0]].unflatten(-1, (size, size))
+    basis = vh[values > CONDITION_ROUNDING * values[0]].unflatten(-1, (size, size))
     images = torch.einsum("bvmk,rkj,bvnj->bvmnr", projections, basis, projections) * share[..., None, None, None]
     i, j = torch.tensor([0, 0, 1]), torch.tensor([1, 2, 2])
     even = images.diagonal(dim1=2, dim2=3).mT  # (b, v, 3, r)
@@ -338,12 +338,12 @@ def _by_quadric(projections: Tensor, share: Tensor, changes: WorldChanges) -> Te
         nearest = torch.einsum("rp,bsp->bsr", flat, theta).unflatten(-1, columns.shape[1:])
         turned = factor @ _polar(factor.mT @ nearest)
     # what the quadric does not see, such as translations, stays what it is in the frame that is given
-    still = _still(changes)
+    still = _identity_coordinates(changes)
     inside = back @ (flat @ still)
     return theta + torch.einsum("p,bs->bsp", (still - inside) / inside.norm(), theta.norm(dim=-1))
 
 
-def _still(changes: WorldChanges) -> Tensor:
+def _identity_coordinates(changes: WorldChanges) -> Tensor:
     """Coordinates ``(dim,)`` of the identity."""
     eye = torch.eye(changes.algebra.shape[-1], dtype=changes.algebra.dtype, device=changes.algebra.device)
     return torch.linalg.pinv(changes.algebra.flatten(1).mT) @ eye.flatten()

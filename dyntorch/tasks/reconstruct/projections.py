@@ -89,7 +89,7 @@ NUM_VIEW_SUBSETS = 6  # choices of views that a tensor is fitted to; the one of 
 NUM_SCORED_SUBSETS = 60  # choices of views that are scored by what they see and how far they spread
 
 
-def choices(tracks: ViewTracks, size: int) -> Tensor:
+def view_subsets(tracks: ViewTracks, size: int) -> Tensor:
     """Indices ``(b, s, size)`` of views for the tensor: seen by many points in common, spread over the time."""
     views = tracks.weights.shape[1]
     device = tracks.x.device
@@ -112,7 +112,7 @@ def choices(tracks: ViewTracks, size: int) -> Tensor:
 def projections_of_tracks(tracks: ViewTracks, invariant: GrassmannTensor, subsets: Tensor | None = None) -> Projections:
     """Linear, constrained, resected, adjusted: the best of several choices of views. subsets ``(b, s, size)``."""
     size = len(invariant.profile)
-    subsets = choices(tracks, size) if subsets is None else subsets
+    subsets = view_subsets(tracks, size) if subsets is None else subsets
     b, count, _ = subsets.shape
     many = tracks.repeated(count)
     found = _from_subset(many, invariant, subsets.flatten(0, 1))
@@ -153,8 +153,8 @@ def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor)
     if views > len(invariant.profile):
         whole = resect(structure, tracks.x, tracks.weights)
         whole = whole.scatter(1, chosen[..., None, None].expand(-1, -1, *some.shape[2:]), some)
-        whole, structure = _grown(tracks, whole)
-        lost = _unknown(tracks, whole).any(-1)
+        whole, structure = _grow(tracks, whole)
+        lost = _missing_views(tracks, whole).any(-1)
         status = torch.where(lost & (status == Status.OK), int(Status.DEGENERATE), status)
     else:
         order = chosen.argsort(1)
@@ -164,30 +164,30 @@ def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor)
     return Projections(torch.where(bad[..., None], 0.0, adjusted.cameras), torch.where(bad, 0.0, adjusted.structure), status)
 
 
-def _grown(tracks: ViewTracks, whole: Tensor) -> tuple[Tensor, Tensor]:
+def _grow(tracks: ViewTracks, whole: Tensor) -> tuple[Tensor, Tensor]:
     """All views and points from some of them, in turns: tracks shorter than the recording lead from views to their neighbours.
     whole ``(b, views, l + 1, K)``."""
-    structure = triangulate(whole, tracks.x, _seen(tracks, whole))
-    missing = _unknown(tracks, whole)
+    structure = triangulate(whole, tracks.x, _known_weights(tracks, whole))
+    missing = _missing_views(tracks, whole)
     left = (missing.any(-1) & (structure != 0).flatten(1).any(-1)).nonzero()[:, 0]
     while len(left):
         some, before = tracks.subset(left), missing[left]
         # drift is adjusted away before it is built upon
-        seen = _seen(some, whole[left])
+        seen = _known_weights(some, whole[left])
         done = bundle_adjust(some.x, seen, whole[left], structure[left], iterations=FREE_ITERATIONS, tolerance=FREE_TOLERANCE)
         more = torch.where(before[..., None, None], resect(done.structure, some.x, some.weights), done.cameras)
         whole = whole.index_copy(0, left, more)
-        structure = structure.index_copy(0, left, triangulate(more, some.x, _seen(some, more)))
-        missing = _unknown(tracks, whole)
+        structure = structure.index_copy(0, left, triangulate(more, some.x, _known_weights(some, more)))
+        missing = _missing_views(tracks, whole)
         left = left[missing[left].any(-1) & (missing[left].sum(-1) < before.sum(-1))]
     return whole, structure
 
 
-def _unknown(tracks: ViewTracks, whole: Tensor) -> Tensor:
+def _missing_views(tracks: ViewTracks, whole: Tensor) -> Tensor:
     """Views ``(b, views)`` that see something but are not known."""
     return (whole == 0).flatten(2).all(-1) & (tracks.weights > 0).any(-1)
 
 
-def _seen(tracks: ViewTracks, whole: Tensor) -> Tensor:
+def _known_weights(tracks: ViewTracks, whole: Tensor) -> Tensor:
     """The weights of the views that are known."""
     return tracks.weights * (whole != 0).flatten(2).any(-1)[..., None]

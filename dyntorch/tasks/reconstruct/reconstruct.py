@@ -98,24 +98,24 @@ def reconstruct(
     check_options(options, ReconstructOptions)
     if generator is not None and not isinstance(generator, torch.Generator):
         raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(...)")
-    moment, x, w, batch = _checked(tracks, times, weights)
+    moment, x, w, batch = _check(tracks, times, weights)
     if model is None or _moves(model):
-        _resolved(moment, times, tracks.dtype)
+        _check_resolution(moment, times, tracks.dtype)
     label = _static(static, batch, x)
     K = None if calibration is None else calibrations(calibration, batch, x.shape[1], x, x.shape[-1])
     limit = _limit(threshold)
     with torch.no_grad():
         if model is None:
-            found = choose(normalized(x, w, moment), label, limit, generator, batch, options, K)
+            found = choose(normalize_tracks(x, w, moment), label, limit, generator, batch, options, K)
         else:
-            _enough(model, moment, x)
+            _check_enough(model, moment, x)
             used = (w > 0).sum(-1) >= _resection(model)
-            data = normalized(x, w * used[..., None], moment)
-            found = _noted(solve(data, model, label, limit, generator, batch, options, K), label, used)
-    return _returned(found, tracks)
+            data = normalize_tracks(x, w * used[..., None], moment)
+            found = _with_notices(solve(data, model, label, limit, generator, batch, options, K), label, used)
+    return _to_caller(found, tracks)
 
 
-def _checked(
+def _check(
     tracks: Tensor, times: Tensor | Sequence[float] | None, weights: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, tuple[int, ...]]:
     """Times, flat tracks and weights, and the batch."""
@@ -156,7 +156,7 @@ MAX_FRAME_ROUNDING = 1 / 16  # rounding below which whole numbers are exact fram
 MAX_TIME_DISTANCE = (1e4, 1e9)  # over the span of the times, for float32 and float64: beyond, the points at time 0 are noise
 
 
-def _resolved(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: torch.dtype) -> None:
+def _check_resolution(moment: Tensor, times: Tensor | Sequence[float] | None, dtype: torch.dtype) -> None:
     """Refuse times that were rounded before they came here, and those so far from 0 that the points at time 0 would be noise."""
     if not len(moment):
         return
@@ -213,7 +213,7 @@ def _static(static: Tensor | Sequence[bool] | None, batch: tuple[int, ...], x: T
     return known.expand(*batch, n).reshape(len(x), n) if bool(known.any()) else None
 
 
-def normalized(x: Tensor, weights: Tensor, times: Tensor) -> ViewTracks:
+def normalize_tracks(x: Tensor, weights: Tensor, times: Tensor) -> ViewTracks:
     """Every view of mean 0 and rms sqrt(l), the weights such that the error stays that of the measured units."""
     transforms = hartley(x.unsqueeze(-2), (weights > 0).to(x.dtype))
     # a view without images has the scale of the others: no weight of theirs depends on it
@@ -242,7 +242,7 @@ def _moves(model: Motion) -> bool:
     return model.lift is not None and not model.static and model.k > model.dim
 
 
-def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
+def _check_enough(model: Motion, times: Tensor, x: Tensor) -> None:
     """Refuse what no problem of this shape can be solved from."""
     views, n, dim = x.shape[1:]
     if dim != model.sensor:
@@ -272,7 +272,7 @@ def _enough(model: Motion, times: Tensor, x: Tensor) -> None:
         raise ValueError(f"{model.name!r} needs at least {need[1]} tracks through {need[0]} views, got {n}; add tracks")
 
 
-def _noted(found: Reconstruction, static: Tensor | None, used: Tensor) -> Reconstruction:
+def _with_notices(found: Reconstruction, static: Tensor | None, used: Tensor) -> Reconstruction:
     """Without cameras for views that show too little, and with the notices on what was given."""
     batch = found.status.shape
     good = ~failed(found.status).reshape(-1)
@@ -287,7 +287,7 @@ def _noted(found: Reconstruction, static: Tensor | None, used: Tensor) -> Recons
     return replace(found, cameras=found.cameras * seen[..., None, None], bodies=bodies, notices=in_order((*found.notices, *more)))
 
 
-def _returned(found: Reconstruction, tracks: Tensor) -> Reconstruction:
+def _to_caller(found: Reconstruction, tracks: Tensor) -> Reconstruction:
     """Floating point results in the dtype and on the device of the tracks; times keep their own precision."""
     changed = {
         f.name: getattr(found, f.name).to(device=tracks.device, dtype=tracks.dtype)

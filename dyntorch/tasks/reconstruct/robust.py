@@ -19,8 +19,8 @@ from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.blocks import each, replace_problems, uniform
 from dyntorch.numerics.chi_square import quantile
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
-from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices
-from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances, scene_of
+from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, view_subsets
+from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjust_scene, distances, scene_of
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Which observations agree with given projections: per point all of its views, or all but the fewest that spoil it.
@@ -77,7 +77,7 @@ MAX_VARIANCE_CORRECTION = 2.0  # for the degrees of freedom of the projections
 MIN_NOISE = 1e-8  # over the extent of the image
 
 
-def settled_noise(tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5) -> Tensor:
+def estimate_noise(tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tensor, used: int, part: float = 0.5) -> Tensor:
     """Noise ``(b,)`` of one coordinate from a quantile of the chosen points, then the median of those within its threshold."""
     least = MIN_NOISE / tracks.scales.amin(1)
     level = torch.maximum(noise(square, free, chosen, part), least)
@@ -92,7 +92,7 @@ def settled_noise(tracks: ViewTracks, square: Tensor, free: Tensor, chosen: Tens
 MIN_SPARE_EQUATIONS = 2  # that must remain to confirm a point that has lost a view
 
 
-def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor) -> Tensor:
+def select_inliers(tracks: ViewTracks, projections: Tensor, sigma: Tensor) -> Tensor:
     r"""Weights ``(b, views, n)``, 0 for all observations that do not agree with the projections."""
     k, size = projections.shape[-1] - 1, tracks.x.shape[-1]
     free = freedom(tracks, k)
@@ -101,11 +101,11 @@ def agreeing(tracks: ViewTracks, projections: Tensor, sigma: Tensor) -> Tensor:
     rest = (~agrees & (free - size >= MIN_SPARE_EQUATIONS)).nonzero()
     for some in rest.split(PAIRS):
         problem, point = some.unbind(-1)
-        kept[problem, :, point] = _without(tracks, projections, sigma, problem, point)
+        kept[problem, :, point] = _reject_views(tracks, projections, sigma, problem, point)
     return kept
 
 
-def _without(tracks: ViewTracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor) -> Tensor:
+def _reject_views(tracks: ViewTracks, projections: Tensor, sigma: Tensor, problem: Tensor, point: Tensor) -> Tensor:
     """Weights ``(p, views)`` of single points, without the views that spoil them; all 0 where no views agree."""
     alone = ViewTracks(
         tracks.x[problem, :, point][:, :, None],
@@ -172,7 +172,7 @@ def consensus(
     options: ReconstructOptions,
 ) -> tuple[Consensus, Tensor, Tensor]:
     r"""Projections of the tensor's views on whose points the most agree. sigma ``(b,)`` -> ``(b,)``."""
-    subsets = choices(tracks, len(invariant.profile))
+    subsets = view_subsets(tracks, len(invariant.profile))
     search = _Search(invariant, sigma, generator, options=options)
     everyone = torch.arange(len(tracks.x), device=tracks.x.device)
     first = torch.ones_like(tracks.weights[:, :1])
@@ -223,7 +223,7 @@ class _Search:
         for _ in range(CONCENTRATION_STEPS):
             new = self._fitted(work, chosen, kept, level)
             best = new if best is None else best.better(new, torch.arange(len(kept), device=kept.device))
-            near = _nearest(new.square, _wanted(work, share, self.invariant.minimal(), MIN_KEPT_RATIO))
+            near = _nearest(new.square, _num_points(work, share, self.invariant.minimal(), MIN_KEPT_RATIO))
             cut = self._level(work, new.square, level).square() * bound(freedom(work, self.invariant.k), INLIER_QUANTILE).amax(-1)
             kept = (near | (new.square <= cut[:, None])).to(kept.dtype)
         assert best is not None
@@ -236,8 +236,8 @@ class _Search:
         count, minimal = len(START_SHARES), self.invariant.minimal()
         work = _of_views(tracks, views).repeated(count)
         share = torch.tensor(START_SHARES, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
-        wanted = _wanted(work, share, minimal, MIN_KEPT_RATIO)
-        drawn = _wanted(work, DRAWN_SHARE * share, minimal, MIN_DRAWN_RATIO)
+        wanted = _num_points(work, share, minimal, MIN_KEPT_RATIO)
+        drawn = _num_points(work, DRAWN_SHARE * share, minimal, MIN_DRAWN_RATIO)
         order = torch.stack([square, ranks], dim=1).repeat(1, -(-count // 2), 1)[:, :count].flatten(0, 1)
         seen = (work.weights > 0).all(1)
         pool = _nearest(order.masked_fill(~seen, torch.inf), torch.maximum(wanted, (MIN_KEPT_RATIO * drawn).long()))
@@ -249,7 +249,7 @@ class _Search:
         """Noise and doubt ``(b,)``."""
         work = _of_views(tracks, found.chosen)
         level = self._level(work, found.square, self.sigma)
-        return level, doubtful(work, found.square, level, self.invariant, self.options)
+        return level, is_doubtful(work, found.square, level, self.invariant, self.options)
 
     def weak(self, tracks: ViewTracks, found: Consensus) -> Tensor:
         """Where only the search for better ones tells whether projections ``(b,)`` are right."""
@@ -282,14 +282,16 @@ class _Search:
             return sigma
         free = freedom(tracks, self.invariant.k)
         chosen = (tracks.weights > 0).all(1)
-        return settled_noise(tracks, square, free, chosen, self.invariant.dof, _part(chosen, self.invariant))
+        return estimate_noise(tracks, square, free, chosen, self.invariant.dof, _part(chosen, self.invariant))
 
 
 MAX_NEAR_SHARE = 0.15  # points one to three thresholds away, per inlier: a wrong model has many
 MIN_REDUNDANCY = 1.25  # conditions of the inliers over the degrees of freedom of the projections
 
 
-def doubtful(tracks: ViewTracks, square: Tensor, sigma: Tensor, invariant: GrassmannTensor, options: ReconstructOptions) -> Tensor:
+def is_doubtful(
+    tracks: ViewTracks, square: Tensor, sigma: Tensor, invariant: GrassmannTensor, options: ReconstructOptions
+) -> Tensor:
     """Whether projections ``(b,)`` may be wrong: few inliers, many points just outside, or noise as large as the scene."""
     free = freedom(tracks, invariant.k)
     cut = sigma.square()[:, None] * bound(free, INLIER_QUANTILE)
@@ -313,7 +315,7 @@ def _of_views(tracks: ViewTracks, chosen: Tensor) -> ViewTracks:
     return ViewTracks(x, weights, scales, transforms, tracks.times)
 
 
-def _wanted(tracks: ViewTracks, share: Tensor, minimal: int, least: float) -> Tensor:
+def _num_points(tracks: ViewTracks, share: Tensor, minimal: int, least: float) -> Tensor:
     """How many points ``(b,)``: a share of those seen, but more than the minimal number."""
     seen = (tracks.weights > 0).all(1).sum(-1)
     return torch.minimum((share * seen).long().clamp(min=int(least * minimal) + 1), seen)
@@ -330,7 +332,7 @@ AMPLE_CONDITIONS = 6.0  # per unknown of the projections: from there on one outl
 LOUD_NOISE = 0.01  # over the extent of the images: least squares spreads wrong tracks over all
 
 
-def suspicious(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> Tensor:
+def have_outliers(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> Tensor:
     """Which problems ``(b,)`` show outliers after least squares."""
     square, free, sigma = _misfit(tracks, apart, unknowns, limit)
     if not len(apart):
@@ -346,7 +348,7 @@ def suspicious(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit:
 STATIC_CUTOFF = 2.0  # over the threshold of the others, above which points given as static move
 
 
-def unfounded(tracks: ViewTracks, apart: Tensor, unknowns: Tensor) -> Tensor:
+def moving_static_points(tracks: ViewTracks, apart: Tensor, unknowns: Tensor) -> Tensor:
     """The points ``(b, n)`` said to stand still that fit by far the worst: they move."""
     assert tracks.static is not None
     square, free, sigma = _misfit(tracks, apart, unknowns, None)
@@ -362,7 +364,7 @@ NUM_TRIMS = 2  # times that observations are taken from the least squares scene
 MIN_TRIMMED_SHARE = 0.9  # of the observations that has to stay then
 
 
-def trimmed(
+def trim_outliers(
     tracks: ViewTracks, scene: LiftedState, lifting: Lifting, unknowns: Tensor, limit: float | None
 ) -> tuple[LiftedState, ViewTracks, Tensor]:
     """The least squares scene after the few observations that disagree with it are taken away, the tracks without them, and
@@ -371,11 +373,11 @@ def trimmed(
     for _ in range(NUM_TRIMS):
         projections = scene.cameras @ lifting.lifts
         _, _, sigma = _misfit(fewer, distances(fewer, projections, scene.structure), unknowns, limit)
-        fewer = tracks.only(agreeing(tracks, projections, sigma))
+        fewer = tracks.only(select_inliers(tracks, projections, sigma))
         structure = triangulate(projections, fewer.x, fewer.weights, steps=2)
-        scene = adjusted(fewer, LiftedState(scene.cameras, structure, scene.cost), lifting)
+        scene = adjust_scene(fewer, LiftedState(scene.cameras, structure, scene.cost), lifting)
     apart = distances(fewer, scene.cameras @ lifting.lifts, scene.structure)
-    return scene, fewer, ~suspicious(fewer, apart, unknowns, limit) & (_kept(fewer, tracks) >= MIN_TRIMMED_SHARE)
+    return scene, fewer, ~have_outliers(fewer, apart, unknowns, limit) & (_inlier_share(fewer, tracks) >= MIN_TRIMMED_SHARE)
 
 
 def _misfit(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: float | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -387,7 +389,7 @@ def _misfit(tracks: ViewTracks, apart: Tensor, unknowns: Tensor | int, limit: fl
     return square, free, torch.maximum(sigma, least)
 
 
-def _kept(fewer: ViewTracks, tracks: ViewTracks) -> Tensor:
+def _inlier_share(fewer: ViewTracks, tracks: ViewTracks) -> Tensor:
     """Share ``(b,)`` of the observations that are left."""
     return (fewer.weights > 0).flatten(1).sum(-1) / (tracks.weights > 0).flatten(1).sum(-1).clamp(min=1)
 
@@ -408,16 +410,16 @@ def robust_projections(
     """Projections from the tracks that agree, and the tracks with weight 0 for all other observations."""
     given = None if limit is None else torch.full_like(tracks.scales[:, 0], limit / 3)
     best, sigma, _ = consensus(tracks, invariant, given, generator, options)
-    cameras = _extended(tracks, best, sigma)
-    cameras = _settled(tracks, cameras, None, sigma, SELECTION_CUTOFFS)
+    cameras = _extend_to_all_views(tracks, best, sigma)
+    cameras = _adjust_to_inliers(tracks, cameras, None, sigma, SELECTION_CUTOFFS)
     sigma = _level(tracks, cameras, sigma, given)
     if lifting is not None:
-        cameras = _structured(tracks, cameras, lifting, sigma, given)
+        cameras = _adjust_structured(tracks, cameras, lifting, sigma, given)
         sigma = _level(tracks, cameras, sigma, given)
-    fewer = tracks.only(agreeing(tracks, cameras, sigma))
+    fewer = tracks.only(select_inliers(tracks, cameras, sigma))
     ample = tracks.x.shape[1] * tracks.x.shape[-1] >= cameras.shape[-1] + AMPLE_COORDINATES
-    doubt = doubtful(tracks, distance(tracks, cameras), sigma, invariant, options) & ~(
-        (_kept(fewer, tracks) >= SUFFICIENT_INLIER_SHARE) & ample
+    doubt = is_doubtful(tracks, distance(tracks, cameras), sigma, invariant, options) & ~(
+        (_inlier_share(fewer, tracks) >= SUFFICIENT_INLIER_SHARE) & ample
     )
     status = torch.where(doubt, int(Status.NO_CONSENSUS), int(Status.OK))
     return Projections(cameras, triangulate(cameras, fewer.x, fewer.weights, steps=2), status), fewer
@@ -427,15 +429,15 @@ def _level(tracks: ViewTracks, cameras: Tensor, sigma: Tensor, given: Tensor | N
     """The noise ``(b,)``: as given, or that of the points that agree."""
     if given is not None:
         return given
-    fewer = tracks.only(agreeing(tracks, cameras, sigma))
+    fewer = tracks.only(select_inliers(tracks, cameras, sigma))
     free = freedom(fewer, cameras.shape[-1] - 1)
-    return settled_noise(tracks, distance(fewer, cameras), free, free >= 1, camera_unknowns(*cameras.shape[1:]))
+    return estimate_noise(tracks, distance(fewer, cameras), free, free >= 1, camera_unknowns(*cameras.shape[1:]))
 
 
 RESECTION_ITERATIONS = 10  # reweightings of the views that the tensor does not use
 
 
-def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor) -> Tensor:
+def _extend_to_all_views(tracks: ViewTracks, found: Consensus, sigma: Tensor) -> Tensor:
     """Projections of all views: the others by resection from the points that agree, reweighted."""
     b, size = found.chosen.shape
     if size == tracks.x.shape[1]:
@@ -461,22 +463,24 @@ def _extended(tracks: ViewTracks, found: Consensus, sigma: Tensor) -> Tensor:
 SELECTION_ITERATIONS = 10  # of bundle adjustment after each selection
 
 
-def _settled(tracks: ViewTracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...]) -> Tensor:
+def _adjust_to_inliers(
+    tracks: ViewTracks, cameras: Tensor, lifts: Tensor | None, sigma: Tensor, widths: tuple[float, ...]
+) -> Tensor:
     """Projections adjusted to the observations that agree, which are chosen again after each time."""
     for width in widths:
         projections = cameras if lifts is None else cameras @ lifts
-        weights = agreeing(tracks, projections, width * sigma)
+        weights = select_inliers(tracks, projections, width * sigma)
         structure = triangulate(projections, tracks.x, weights, steps=2)
         cameras = bundle_adjust(tracks.x, weights, cameras, structure, lifts, iterations=SELECTION_ITERATIONS).cameras
     return cameras if lifts is None else cameras @ lifts
 
 
-def _structured(tracks: ViewTracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None) -> Tensor:
+def _adjust_structured(tracks: ViewTracks, cameras: Tensor, lifting: Lifting, sigma: Tensor, given: Tensor | None) -> Tensor:
     """Projections that the lifts allow, where as many observations agree with them."""
-    weights = agreeing(tracks, cameras, sigma)
+    weights = select_inliers(tracks, cameras, sigma)
     fewer = tracks.only(weights)
     found = Projections(cameras, triangulate(cameras, fewer.x, weights, steps=2), torch.zeros_like(sigma).long())
     scene = scene_of(fewer, found, lifting)
-    better = _settled(tracks, scene.cameras, lifting.lifts, sigma, (1.0, 1.0))
-    more = (agreeing(tracks, better, sigma) > 0).sum((1, 2)) >= 0.98 * (weights > 0).sum((1, 2))
+    better = _adjust_to_inliers(tracks, scene.cameras, lifting.lifts, sigma, (1.0, 1.0))
+    more = (select_inliers(tracks, better, sigma) > 0).sum((1, 2)) >= 0.98 * (weights > 0).sum((1, 2))
     return torch.where(more[:, None, None, None], better, cameras)

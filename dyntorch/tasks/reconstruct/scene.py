@@ -23,7 +23,7 @@ from dyntorch.geometry.lift import (
 from dyntorch.geometry.pairs import hyperplane_pair, two_bodies
 from dyntorch.geometry.triangulation import reproject, resect, triangulate, unit_projections
 from dyntorch.tasks.reconstruct.motions import Motion
-from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, choices, projections_of_tracks
+from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, projections_of_tracks, view_subsets
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts of structured bundle adjustment that need no tensor: the scene as if it stood still, in several frames.
@@ -32,7 +32,7 @@ from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, came
 WINDOW_VIEWS = (6, 5)  # views taken at once, in turn, where there are more
 
 
-def middle(times: Tensor, number: int = 0) -> Tensor:
+def middle_views(times: Tensor, number: int = 0) -> Tensor:
     """Indices of the views in the middle of the time, during which nothing moves far; all, where they are few."""
     count = len(times) if len(times) <= WINDOW_VIEWS[0] else WINDOW_VIEWS[number % len(WINDOW_VIEWS)]
     first = (len(times) - count) // 2
@@ -42,7 +42,7 @@ def middle(times: Tensor, number: int = 0) -> Tensor:
 STATIC_TOLERANCE = 1e-8  # share of the lifts below which constants of a point do not change its position
 
 
-def resting_constants(lifts: Tensor) -> Tensor:
+def static_constants(lifts: Tensor) -> Tensor:
     """Orthonormal ``(K, a + 1)`` constants of the points that do not move; of no columns where not all positions are theirs."""
     change = (lifts - lifts.mean(0)).flatten(0, 1)
     _, values, vh = torch.linalg.svd(change, full_matrices=True)
@@ -53,14 +53,14 @@ def resting_constants(lifts: Tensor) -> Tensor:
 STATIC_TENSOR_VIEWS = 4  # views of the tensor of the static scene in space
 
 
-def resting(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
+def static_cameras(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
     """The cameras ``(b, views, l + 1, dim + 1)`` that explain tracks best if no point moves, points finite and of unit
     variance."""
     eye = torch.eye(dim + 1, dtype=tracks.x.dtype, device=tracks.x.device)
     views = tracks.x.shape[1]
     still = Motion(lambda time: torch.eye(dim + 1, dtype=torch.float64), sensor=sensor, static=True)
     invariant = still.tensor(min(views, STATIC_TENSOR_VIEWS if dim + 1 > sensor + 1 else 2))
-    found = projections_of_tracks(tracks, invariant, choices(tracks, len(invariant.profile))[:, :1])
+    found = projections_of_tracks(tracks, invariant, view_subsets(tracks, len(invariant.profile))[:, :1])
     lifts = eye.expand(views, -1, -1)
     known = (found.structure != 0).any(-1).to(tracks.x.dtype)
     G, cameras, structure = finite(found.projections, found.structure, lifts, gauge_algebra(lifts), tracks.weights)
@@ -72,7 +72,7 @@ def resting(tracks: ViewTracks, sensor: int, dim: int) -> Tensor:
 INFINITY_TILT = 0.25  # standard deviation of the hyperplane at infinity of further starts, points of unit variance
 
 
-def tilted(cameras: Tensor, number: int) -> Tensor:
+def tilt_infinity(cameras: Tensor, number: int) -> Tensor:
     """Cameras of the resting scene in one of many frames: the first as nearly affine as it can be, the others with the infinite
     tilted."""
     size = cameras.shape[-1]
@@ -82,7 +82,7 @@ def tilted(cameras: Tensor, number: int) -> Tensor:
     return cameras @ frame.to(cameras)
 
 
-AIDED = {2: 6, 3: 12}
+MIN_STATIC_POINTS = {2: 6, 3: 12}
 """Points known to stand still and seen by all views, half as many more as determine the cameras, from which on they do: in a plane
 and in space."""
 
@@ -121,7 +121,7 @@ class Lifting:
         middle = motion.lifts([float(times.mean()) - origin])[0] @ inverse
         # a shift is inverted exactly by the opposite one, however far
         back = (torch.eye(len(root), dtype=root.dtype) if motion.shift is None else motion.shift(-origin)) @ inverse
-        parts = (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts), resting_constants(lifts))
+        parts = (lifts, root @ shift, back, start, slope, middle, balanced_algebra(lifts), static_constants(lifts))
         return cls(motion, *(part.to(like) for part in parts))
 
 
@@ -145,25 +145,25 @@ def scene_of(tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Te
     """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
     scale ``(b,)``."""
     lost = failed(found.status)
-    aided = _aided(tracks, lifting)
+    aided = _static_points_suffice(tracks, lifting)
     coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
     size = lifting.lifts.shape[-1]
     known = torch.where(lost[:, None], coordinates >= size - 1, (found.structure != 0).any(-1))
-    scene = _scene(tracks, _upgraded(found, lost, lifting), known & ~lost[:, None], lifting, scale)
+    scene = _scene(tracks, _upgrade(found, lost, lifting), known & ~lost[:, None], lifting, scale)
     scene = LiftedState(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
     spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
     shaky = ~lost & (size >= MULTISTART_SIZE) & (spare <= MULTISTART_SPARE * known.sum(-1))
-    shaky = shaky | (~lost & wild(tracks, _finite(tracks, scene, lifting), lifting))
+    shaky = shaky | (~lost & has_points_behind(tracks, _finite(tracks, scene, lifting), lifting))
     unknown = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, lifting.lifts.shape[1], len(lifting.algebra) - 1)
     unaided = (found.status == Status.TOO_FEW) & (spare > unknown)
     left = (shaky | unaided | aided).nonzero()[:, 0] if lifting.still.shape[-1] else lost.new_zeros(0, dtype=torch.long)
-    return _confirmed(tracks, scene, left, known, lifting, scale) if len(left) else scene
+    return _multistart(tracks, scene, left, known, lifting, scale) if len(left) else scene
 
 
 MAX_BEHIND_SHARE = 0.05  # of the points: wrong minima have a tenth to a half of them behind cameras
 
 
-def wild(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> Tensor:
+def has_points_behind(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> Tensor:
     """Problems ``(b,)`` with so many points behind cameras that the scene, in a finite frame, is that of a wrong minimum."""
     if tracks.x.shape[-1] != 2:
         return torch.zeros_like(scene.cost, dtype=torch.bool)
@@ -172,15 +172,15 @@ def wild(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> Tensor:
     return count > (MAX_BEHIND_SHARE * known.sum(-1)).clamp(min=2)
 
 
-def _aided(tracks: ViewTracks, lifting: Lifting) -> Tensor:
+def _static_points_suffice(tracks: ViewTracks, lifting: Lifting) -> Tensor:
     """Problems ``(b,)`` whose cameras follow from the points known to stand still."""
     if tracks.static is None or lifting.motion.static or not lifting.still.shape[-1]:
         return torch.zeros_like(tracks.x[:, 0, 0, 0], dtype=torch.bool)
     resting = (tracks.weights > 0) & tracks.static[:, None]
-    return resting.all(1).sum(-1) >= AIDED[min(lifting.motion.dim, 3)]
+    return resting.all(1).sum(-1) >= MIN_STATIC_POINTS[min(lifting.motion.dim, 3)]
 
 
-def _upgraded(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
+def _upgrade(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
     """Cameras; of lost problems anything finite."""
     return upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
 
@@ -189,7 +189,7 @@ def _scene(tracks: ViewTracks, cameras: Tensor, known: Tensor, lifting: Lifting,
     """The scene that adjustment finds from some cameras, with the known points ``(b, n)``."""
     structure = triangulate(cameras @ lifting.lifts, tracks.x, tracks.weights)
     start = LiftedState(cameras, torch.where(known[..., None], structure, 0.0), torch.zeros_like(tracks.x[:, 0, 0, 0]))
-    done = adjusted(tracks, start, lifting, scale)
+    done = adjust_scene(tracks, start, lifting, scale)
     # a point that was lost costs the extent of the image
     gone = known & (done.structure == 0).all(-1)
     return LiftedState(done.cameras, done.structure, done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
@@ -201,7 +201,7 @@ SAME_COST = 1e-2  # relative difference of the costs of one minimum
 COST_ROUNDING = 1e-22  # cost per observation that is rounding
 
 
-def _confirmed(
+def _multistart(
     tracks: ViewTracks, scene: LiftedState, left: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None
 ) -> LiftedState:
     """The scenes of least cost among those of several starts: further ones until two of them end in the same minimum."""
@@ -211,7 +211,7 @@ def _confirmed(
     floor = COST_ROUNDING * (tracks.weights > 0).flatten(1).sum(-1)
     for number in range(NUM_STATIC_STARTS_ALONE):
         some = None if scale is None else scale[left]
-        fresh = _scene(tracks.subset(left), _started(tracks.subset(left), number, lifting, some), known[left], lifting, some)
+        fresh = _scene(tracks.subset(left), _start_cameras(tracks.subset(left), number, lifting, some), known[left], lifting, some)
         least = cost[left]
         near = fresh.cost <= least * (1 + SAME_COST) + floor[left]
         seen = torch.where(fresh.cost * (1 + SAME_COST) + floor[left] < least, 1, seen + near)
@@ -223,17 +223,17 @@ def _confirmed(
         if not len(left):
             break
     # without a tensor and without points known to stand still only what was found twice counts
-    cost[left[torch.isin(left, alone) & ~_aided(tracks, lifting)[left]]] = torch.inf
+    cost[left[torch.isin(left, alone) & ~_static_points_suffice(tracks, lifting)[left]]] = torch.inf
     return LiftedState(cameras, structure, cost)
 
 
-def _started(tracks: ViewTracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
+def _start_cameras(tracks: ViewTracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
     """Cameras of all views from those of the scene at rest; of a part of many views: adjusted, the others by resection."""
-    aided = bool(_aided(tracks, lifting).all())
-    window = middle(tracks.times, number)
+    aided = bool(_static_points_suffice(tracks, lifting).all())
+    window = middle_views(tracks.times, number)
     near = tracks.at(window)
     near = near.resting() if aided else near
-    cameras = tilted(resting(near, lifting.motion.sensor, lifting.motion.dim), number)
+    cameras = tilt_infinity(static_cameras(near, lifting.motion.sensor, lifting.motion.dim), number)
     if len(window) == tracks.x.shape[1]:
         return cameras
     some = replace(lifting, lifts=lifting.lifts[window])
@@ -246,7 +246,7 @@ MAX_ITERATIONS = 60  # of structured bundle adjustment
 COST_TOLERANCE = 1e-7  # relative gain of a step that ends it
 
 
-def adjusted(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
+def adjust_scene(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
     """Structured bundle adjustment."""
     confined = tracks.static if lifting.still.shape[-1] else None
     done = bundle_adjust(
@@ -264,7 +264,7 @@ def adjusted(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Te
     return LiftedState(done.cameras, done.structure, done.cost)
 
 
-def framed(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedState:
+def fix_frame(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedState:
     """The scene in its frame: finite, with no motion common to all points (to the static ones), centred, of unit size."""
     lifts, static = lifting.lifts, tracks.static
     known = (scene.structure != 0).any(-1)

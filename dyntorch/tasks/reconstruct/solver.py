@@ -13,20 +13,20 @@ from dyntorch.core.outcome import Status, agreed, failed, notices
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import triangulate, unit_projections
 from dyntorch.numerics.chi_square import quantile
-from dyntorch.tasks.reconstruct.calibrated import calibrated, of_bodies
+from dyntorch.tasks.reconstruct.calibrated import metric_reconstruction, of_bodies
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, projections_of_tracks
 from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction, ReconstructNotice
-from dyntorch.tasks.reconstruct.robust import robust_projections, suspicious, trimmed, unfounded
+from dyntorch.tasks.reconstruct.robust import have_outliers, moving_static_points, robust_projections, trim_outliers
 from dyntorch.tasks.reconstruct.scene import (
     LiftedState,
     Lifting,
-    adjusted,
+    adjust_scene,
     bodies_of,
     distances,
-    framed,
+    fix_frame,
     positions,
     scene_of,
     velocities,
@@ -64,41 +64,41 @@ def solve(
     found = projections_of_tracks(tracks, invariant)
     found, scene = _scene(tracks, found, lifting)
     if lifting is not None and static is not None and not motion.static:
-        tracks, scene = _corrected(tracks, scene, lifting)
+        tracks, scene = _correct_static(tracks, scene, lifting)
     free = unknowns(tracks, motion)
-    doubt = suspicious(tracks, _distances(tracks, scene, lifting), free, limit) | failed(found.status)
+    doubt = have_outliers(tracks, _distances(tracks, scene, lifting), free, limit) | failed(found.status)
     chosen = doubt.nonzero()[:, 0] if limit != float("inf") else doubt.nonzero()[:0, 0]
     if lifting is not None and len(chosen):
-        again, fewer, fine = trimmed(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit)
+        again, fewer, fine = trim_outliers(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit)
         fine = fine & ~failed(found.status[chosen])
         tracks = tracks.only(tracks.weights.index_copy(0, chosen[fine], fewer.weights[fine]))
-        scene = _merged(scene, _part(again, fine), chosen[fine])
+        scene = _merge(scene, _part(again, fine), chosen[fine])
         chosen = chosen[~fine]
     if len(chosen):
         some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator, options)
         some, again = _scene(fewer, some, lifting)
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
-        found = _merged(found, some, chosen)
-        scene = _merged(scene, again, chosen)
+        found = _merge(found, some, chosen)
+        scene = _merge(scene, again, chosen)
     return _result(tracks, motion, lifting, found, scene, static, batch, options, calibration)
 
 
 MAX_STATIC_CORRECTIONS = 4  # times that points given as static are checked
 
 
-def _corrected(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> tuple[ViewTracks, LiftedState]:
+def _correct_static(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> tuple[ViewTracks, LiftedState]:
     """The scene without points said to stand still that move, a few at a time, and the tracks with the others."""
     for _ in range(MAX_STATIC_CORRECTIONS):
         assert tracks.static is not None
-        wrong = unfounded(tracks, _distances(tracks, scene, lifting), unknowns(tracks, lifting.motion))
+        wrong = moving_static_points(tracks, _distances(tracks, scene, lifting), unknowns(tracks, lifting.motion))
         left = (wrong.any(-1) & scene.cost.isfinite()).nonzero()[:, 0]
         if not len(left):
             break
         tracks = replace(tracks, static=tracks.static & ~wrong)
         some = tracks.subset(left)
         structure = triangulate(scene.cameras[left] @ lifting.lifts, some.x, some.weights)
-        again = adjusted(some, LiftedState(scene.cameras[left], structure, scene.cost[left]), lifting)
-        scene = _merged(scene, again, left)
+        again = adjust_scene(some, LiftedState(scene.cameras[left], structure, scene.cost[left]), lifting)
+        scene = _merge(scene, again, left)
     return tracks, scene
 
 
@@ -113,7 +113,7 @@ def _scene(tracks: ViewTracks, found: Projections, lifting: Lifting | None) -> t
     return found, LiftedState(done.cameras, done.structure, done.cost)
 
 
-def _merged(old: Part, new: Part, chosen: Tensor) -> Part:
+def _merge(old: Part, new: Part, chosen: Tensor) -> Part:
     """Results of some problems in their places."""
     return type(old)(*(a.index_copy(0, chosen, b) for a, b in zip(vars(old).values(), vars(new).values(), strict=True)))
 
@@ -145,12 +145,12 @@ def _result(
         cameras, speed, projections = bodies[:, 0], None, scene.cameras
         structure, status = scene.structure, found.status
     else:
-        scene = framed(tracks, scene, lifting)
+        scene = fix_frame(tracks, scene, lifting)
         projections = scene.cameras @ lifting.lifts
         known = (scene.structure != 0).any(-1)
         labels = torch.where(known, 2, 0)
         if tracks.static is not None:
-            rests = tracks.static.any(-1, keepdim=True) & _rests(tracks, scene, lifting, projections)
+            rests = tracks.static.any(-1, keepdim=True) & _is_static(tracks, scene, lifting, projections)
             labels = torch.where(known & (tracks.static | rests), 1, labels)
         status = found.status
         cameras, structure = scene.cameras, scene.structure @ lifting.back.mT
@@ -187,20 +187,20 @@ def _result(
         projections=shaped(unit_projections(back @ (projections if lifting is None else projections @ lifting.root))),
         inliers=shaped(counted),
         times=tracks.times,
-        ambiguity=_open(motion, tracks.times, tracks.static),
+        ambiguity=_ambiguity_text(motion, tracks.times, tracks.static),
         notices=limits,
         bodies=None if bodies is None else shaped(unit_projections(back[:, None] @ bodies)),
     )
     if calibration is None:
         return plain
     start = scene if bodies is None else of_bodies(bodies, points, labels)
-    return calibrated(plain, tracks, start, lifting, labels, calibration)
+    return metric_reconstruction(plain, tracks, start, lifting, labels, calibration)
 
 
 EXACT_VARIANCE = 1e-18  # of the noise of exact data, over the squared extent of the image
 
 
-def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections: Tensor) -> Tensor:
+def _is_static(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections: Tensor) -> Tensor:
     """Which points ``(b, n)`` are explained as well, within the noise, by one position for all times."""
     still = lifting.still
     apart = distances(tracks, projections, scene.structure)
@@ -215,7 +215,7 @@ def _rests(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, projections
     return resting - moving <= quantile(0.99, extra) * sigma
 
 
-def _open(motion: Motion, times: Tensor, static: Tensor | None) -> str:
+def _ambiguity_text(motion: Motion, times: Tensor, static: Tensor | None) -> str:
     """What the tracks cannot tell."""
     text = motion.open_text(times)
     if motion.lift is None or motion.static or motion.k == motion.dim:
@@ -245,7 +245,7 @@ def choose(
     r"""Reconstruct with the declared model of least penalized cost; the others are listed in ``candidates``. static ``(b, n)``,
     calibration ``(b, views, l + 1, l + 1)``."""
     views, n = tracks.weights.shape[1:]
-    reasons = {m.name: _lacks(m, tracks.times, views, n) for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1]}
+    reasons = {m.name: _missing_input(m, tracks.times, views, n) for m in MOTIONS.values() if m.sensor == tracks.x.shape[-1]}
     models = [MOTIONS[name] for name, reason in reasons.items() if not reason]
     untried = tuple(Ranked(name, math.inf, math.nan, reason) for name, reason in reasons.items() if reason)
     if not models:
@@ -255,7 +255,7 @@ def choose(
             f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
         )
     plain = [LiftedFit.of(tracks, model, *least_squares(tracks, model)) for model in models]
-    listed = ranked(tracks, plain, limit)
+    listed = rank_models(tracks, plain, limit)
     best = solve(tracks, MOTIONS[listed[0].motion], static, limit, generator, batch, options, calibration)
     fit = next(fit for fit in plain if fit.motion is best.motion)
     whole = (best.inliers.reshape(fit.apart.shape) >= fit.apart.isfinite()).flatten(1).all(1)
@@ -272,7 +272,7 @@ def choose(
         LiftedFit.of(tracks, one.motion, one.residuals.reshape(tracks.weights.shape), one.status.reshape(-1))
         for one in robust.values()
     ]
-    listed = ranked(tracks, fits, limit)
+    listed = rank_models(tracks, fits, limit)
     return replace(robust[listed[0].motion], candidates=listed + untried)
 
 
@@ -295,7 +295,7 @@ class LiftedFit(NamedTuple):
         return cls(motion, apart, failed(status), sigma)
 
 
-def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
+def _missing_input(motion: Motion, times: Tensor, views: int, n: int) -> str:
     """What is missing of views, tracks, and observations to spare; empty where nothing is."""
     usual = motion.views(range(12))
     if views < usual:
@@ -310,12 +310,12 @@ def _lacks(motion: Motion, times: Tensor, views: int, n: int) -> str:
     return ""
 
 
-def ranked(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None) -> tuple[Ranked, ...]:
+def rank_models(tracks: ViewTracks, fits: list[LiftedFit], limit: float | None) -> tuple[Ranked, ...]:
     """The models by their penalized costs over the whole batch, the least first."""
     sigma = _noise(tracks, fits, limit)
     found = []
     for fit in fits:
-        score = float("inf") if bool(fit.lost.all()) else float(penalized(tracks, fit, sigma).sum())
+        score = float("inf") if bool(fit.lost.all()) else float(penalized_cost(tracks, fit, sigma).sum())
         rest = fit.apart[~fit.lost]
         found.append(Ranked(fit.motion.name, score, float(rest.square().nanmean().sqrt())))
     return tuple(sorted(found, key=lambda one: one.score))
@@ -342,7 +342,7 @@ OUTLIER_COST = 2.0  # of a coordinate that does not fit, in variances of the noi
 LABEL_COST = 0.2  # of a point of two bodies: 0 takes one plane for two bodies in 1 of 5 scenes, log 2 a static scene for two planes
 
 
-def penalized(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor) -> Tensor:
+def penalized_cost(tracks: ViewTracks, fit: LiftedFit, sigma: Tensor) -> Tensor:
     """The penalized cost ``(b,)`` of one model; where it failed, that of outliers only."""
     motion, seen = fit.motion, tracks.weights > 0
     r = seen.sum(1).to(sigma.dtype) * motion.sensor

@@ -14,7 +14,7 @@ from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.numerics.blocks import constant
 from dyntorch.numerics.lags import lag_covariances, lag_products
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
-from dyntorch.tasks.pair.tracks import interpolated
+from dyntorch.tasks.pair.tracks import interpolate
 from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
 from dyntorch.tasks.synchronize.rigid_body import MAX_ITERATIONS, MIN_FRAMES, MIN_RELATIVE_NOISE, BodyMotion, body_motion
@@ -101,7 +101,7 @@ class Poses:
     def at(self, moments: Tensor) -> tuple[Tensor, Tensor]:
         """Rotations ``(..., 3, 3)`` and places ``(..., 3)`` at any moments ``(...)``, NaN where not known."""
         padded = torch.nn.functional.pad(self.values, (0, 1)).unflatten(-1, (4, 2))
-        found = interpolated(padded, self.times, moments.flatten()).flatten(1).unflatten(0, moments.shape)
+        found = interpolate(padded, self.times, moments.flatten()).flatten(1).unflatten(0, moments.shape)
         return rotations_of(found[..., :4]), found[..., 4:7]
 
     def spread(self, moments: Tensor) -> Tensor:

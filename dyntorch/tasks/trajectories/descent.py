@@ -17,10 +17,10 @@ from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresO
 from dyntorch.numerics.nullspace import eigenvalues
 
 SURFACE = LeastSquaresOptions(iterations=15, damping=1e-4, increase=10.0, least_damping=1e-15, tolerance=None)
-FOLLOWED, NEAR = 5, 1e-4
+DERIVATIVE_STEPS, MAX_DERIVATIVE_STEP = 5, 1e-4
 """Steps that carry derivatives, where they are as small as at a minimum."""
-FREE = 1e-13  # eigenvalue of a Gauss-Newton matrix of trace 1 that is rounding
-FLAT = 1e-12  # relative size of an image line, or a depth, below which an image is no measurement
+EIGENVALUE_ROUNDING = 1e-13  # eigenvalue of a Gauss-Newton matrix of trace 1 that is rounding
+MIN_IMAGE_LINE = 1e-12  # relative size of an image line, or a depth, below which an image is no measurement
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class LineSightings:
         return (rows * self.weights.sqrt()[..., None, None]).transpose(-4, -3).flatten(-3, -2)
 
 
-def normalized(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[LineSightings, Tensor, Tensor]:
+def normalize_sightings(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[LineSightings, Tensor, Tensor]:
     """Images about 0 and of size 1, in a world in which the stacked cameras are orthonormal."""
     known = (weights > 0)[..., None]
     x = torch.where(known, x, 0.0)
@@ -74,7 +74,7 @@ def normalized(cameras: Tensor, x: Tensor, weights: Tensor) -> tuple[LineSightin
 
 
 @dataclass(frozen=True)
-class FoundLines:
+class LineFit:
     """Unit vectors ``(*batch, n, k)``, their cost ``(*batch, n)`` in px^2, and the trace of the inverse Gauss-Newton matrix along
     the surface, ``(*batch, n)``: the squared uncertainty at a noise of 1 px."""
 
@@ -88,7 +88,7 @@ def image_distances(data: LineSightings, lines: Tensor) -> tuple[Tensor, Tensor]
     ``(*batch, n, 6)`` -> ``(*batch, views, n)``."""
     image = torch.einsum("...vik,...nk->...vni", line_camera(data.cameras), lines)
     # a line through the centre of a camera has no image there
-    size = image[..., :2].norm(dim=-1).clamp(min=FLAT)
+    size = image[..., :2].norm(dim=-1).clamp(min=MIN_IMAGE_LINE)
     distance = (homogeneous(data.x) * image).sum(-1) / size
     normal = homogeneous(data.x - (distance / size)[..., None] * image[..., :2])
     factor = data.weights.sqrt() / data.unit
@@ -113,13 +113,13 @@ def to_points(data: LineSightings, points: Tensor) -> tuple[Tensor, Tensor]:
     return error.transpose(-3, -2).flatten(-2), slope.transpose(-4, -3).flatten(-3, -2)
 
 
-def best_lines(data: LineSightings, starts: Tensor) -> FoundLines:
+def fit_lines(data: LineSightings, starts: Tensor) -> LineFit:
     """Lines ``(*batch, n, 6)`` of least distance, from starts on the Klein quadric; leading dimensions of the starts broadcast."""
     form = plucker_form(device=starts.device)
     return _descend(Surface(lambda v: to_lines(data, v), lambda v: torch.stack([v, v @ form], dim=-2), nearest_line), starts)
 
 
-def best_points(data: LineSightings, starts: Tensor) -> FoundLines:
+def fit_points(data: LineSightings, starts: Tensor) -> LineFit:
     """Points ``(*batch, n, 4)`` of least reprojection error."""
     return _descend(Surface(lambda p: to_points(data, p), lambda p: p[..., None, :], lambda p: normalize(p, dim=-1)), starts)
 
@@ -154,19 +154,19 @@ class Surface(LeastSquares):
         return (self.nearest(theta[0] - step[0]),)
 
 
-def _descend(surface: Surface, starts: Tensor) -> FoundLines:
+def _descend(surface: Surface, starts: Tensor) -> LineFit:
     """The vectors of least cost; with their derivatives, where gradients are recorded."""
     with torch.no_grad():
         at = Iterate(*minimize(surface, surface.evaluate((starts.detach(),)), SURFACE)[:3])
     if torch.is_grad_enabled():
         at = surface.evaluate(at.theta)
         # at the minimum the derivatives are those of the last steps: each brings them nearer by what Gauss-Newton leaves out
-        for _ in range(FOLLOWED):
+        for _ in range(DERIVATIVE_STEPS):
             (step,) = surface.step(at, torch.zeros_like(at.cost))
-            near = step.detach().norm(dim=-1, keepdim=True) < NEAR
+            near = step.detach().norm(dim=-1, keepdim=True) < MAX_DERIVATIVE_STEP
             at = surface.moved(at, (torch.where(near, step, 0.0),))
     (vectors,), (_, matrix, size) = at.theta, at.terms
-    return FoundLines(vectors, at.cost, _spread(matrix.detach(), size.detach(), surface.normals(vectors).shape[-2]))
+    return LineFit(vectors, at.cost, _spread(matrix.detach(), size.detach(), surface.normals(vectors).shape[-2]))
 
 
 def _spread(matrix: Tensor, size: Tensor, constraints: int) -> Tensor:
@@ -174,8 +174,10 @@ def _spread(matrix: Tensor, size: Tensor, constraints: int) -> Tensor:
     sound = matrix.isfinite().flatten(-2).all(-1) & size.isfinite()
     eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     values = eigenvalues(torch.where(sound[..., None, None], matrix / size[..., None, None], eye))
-    free = ~sound | (values[..., 0] < FREE)
-    return torch.where(free, torch.inf, (values.clamp(min=FREE).reciprocal().sum(-1) - constraints).clamp(min=0) / size)
+    free = ~sound | (values[..., 0] < EIGENVALUE_ROUNDING)
+    return torch.where(
+        free, torch.inf, (values.clamp(min=EIGENVALUE_ROUNDING).reciprocal().sum(-1) - constraints).clamp(min=0) / size
+    )
 
 
 # ----------------------------------------------------------------------------------------------------------------------

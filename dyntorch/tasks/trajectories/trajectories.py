@@ -19,7 +19,7 @@ from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.nullspace import gram_null_space
-from dyntorch.tasks.trajectories.descent import FoundLines, LineSightings, adjust, best_lines, best_points, normalized
+from dyntorch.tasks.trajectories.descent import LineFit, LineSightings, adjust, fit_lines, fit_points, normalize_sightings
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class LineStatus(IntEnum):
     """Four views: two lines fulfil them exactly, ``lines`` and ``second``; nothing tells which of them is true."""
 
 
-ENDED = torch.tensor([Status.OK, Status.TOO_FEW, Status.DEGENERATE, Status.AMBIGUOUS, Status.AMBIGUOUS])
+STATUS_OF_LINES = torch.tensor([Status.OK, Status.TOO_FEW, Status.DEGENERATE, Status.AMBIGUOUS, Status.AMBIGUOUS])
 """The status of a :class:`LineStatus`: every line would do for a point that stands still."""
 
 
@@ -133,8 +133,8 @@ def triangulate_trajectories(
     """
     options = TrajectoryOptions() if options is None else options
     check_options(options, TrajectoryOptions)
-    weights = _checked(cameras, x, weights, sigma)
-    data, _, back = normalized(cameras.double(), x.double(), weights)
+    weights = _check(cameras, x, weights, sigma)
+    data, _, back = normalize_sightings(cameras.double(), x.double(), weights)
     seen = (data.weights > 0).sum(-2)
     line, second = _lines(data)
     still = _points(data)
@@ -152,13 +152,13 @@ def triangulate_trajectories(
     residual = torch.where(static, still.cost, line.cost).div(torch.where(total > 0, total, 1.0)).sqrt()
     lift = compound(back, 2).mT
     lines, second = (torch.where(none, 0.0, unit((v @ lift)[..., None])[..., 0]) for v in (line.vectors, second))
-    moving = _feet(data, line.vectors)
+    moving = _nearest_on_lines(data, line.vectors)
     place = torch.where(static[..., None, :, None], still.vectors[..., None, :, :], moving) @ back.mT[..., None, :, :]
     points = torch.where(((data.weights > 0) & ~few[..., None, :])[..., None], inhomogeneous(place), 0.0)
     uncertainty = torch.where(few | static, 1.0, uncertainty)
     found = (lines, second, points, torch.where(few, 0.0, residual), uncertainty, noise)
     lines, second, points, residual, uncertainty, noise = (part.to(x.dtype) for part in found)
-    return Trajectories(lines, second, points, residual, uncertainty, noise, kinds, status=ENDED.to(kinds.device)[kinds])
+    return Trajectories(lines, second, points, residual, uncertainty, noise, kinds, status=STATUS_OF_LINES.to(kinds.device)[kinds])
 
 
 def points_on_lines(cameras: Tensor, x: Tensor, lines: Tensor) -> Tensor:
@@ -184,10 +184,10 @@ def points_on_lines(cameras: Tensor, x: Tensor, lines: Tensor) -> Tensor:
         [[[2.0, 0.0, 4.0]]]
     """
     data = LineSightings(cameras, x, torch.ones_like(x[..., 0]), torch.ones_like(x[..., 0]))
-    return inhomogeneous(_feet(data, lines))
+    return inhomogeneous(_nearest_on_lines(data, lines))
 
 
-def _feet(data: LineSightings, lines: Tensor) -> Tensor:
+def _nearest_on_lines(data: LineSightings, lines: Tensor) -> Tensor:
     """Homogeneous points ``(*batch, views, n, 4)`` of lines ``(*batch, n, 6)``, nearest in the images."""
     image = torch.einsum("...vik,...nk->...vni", line_camera(data.cameras), lines)
     a, b = image[..., 0], image[..., 1]
@@ -197,7 +197,7 @@ def _feet(data: LineSightings, lines: Tensor) -> Tensor:
     return torch.einsum("...nkl,...vnl->...vnk", skew_line(lines), planes)
 
 
-def _checked(cameras: Tensor, x: Tensor, weights: Tensor | None, sigma: float | None) -> Tensor:
+def _check(cameras: Tensor, x: Tensor, weights: Tensor | None, sigma: float | None) -> Tensor:
     """Weights ``(*batch, views, n)`` float64, 0 where anything is missing."""
     if cameras.ndim < 3 or cameras.shape[-2:] != (3, 4):
         raise ValueError(f"cameras must be (*batch, views, 3, 4), got {tuple(cameras.shape)}")
@@ -219,7 +219,7 @@ def _checked(cameras: Tensor, x: Tensor, weights: Tensor | None, sigma: float | 
     return torch.where(known, weights, 0.0).double()
 
 
-def fitted_lines(data: LineSightings) -> Tensor:
+def line_vectors(data: LineSightings) -> Tensor:
     """The best lines ``(*batch, n, 6)`` of normalized sightings."""
     return _lines(data)[0].vectors
 
@@ -227,25 +227,25 @@ def fitted_lines(data: LineSightings) -> Tensor:
 MIN_LINE_ANGLE = 1e-12  # squared sine between the unit vectors of both lines of four views
 
 
-def _lines(data: LineSightings) -> tuple[FoundLines, Tensor]:
+def _lines(data: LineSightings) -> tuple[LineFit, Tensor]:
     """The best lines, and the second ones of four views (0 elsewhere)."""
     rays = data.rays()
     null = gram_null_space(rays.mT @ rays, 2).basis
     pencil, real = lines_of_pencil(null[..., 0, :], null[..., 1, :])
-    found = best_lines(data, torch.stack([nearest_line(null[..., 0, :]), pencil[..., 0, :], pencil[..., 1, :]]))
+    found = fit_lines(data, torch.stack([nearest_line(null[..., 0, :]), pencil[..., 0, :], pencil[..., 1, :]]))
     cost = torch.where(_visible(data, found.vectors), found.cost, torch.inf)
     apart = 1 - (found.vectors[1] * found.vectors[2]).sum(-1).square() > MIN_LINE_ANGLE
     two = ((data.weights > 0).sum(-2) == VIEWS) & real & apart & cost[1:].isfinite().all(0)
     best = torch.where(two, 1, cost.argmin(0))[None]
     vectors, least, spread = found.vectors.take_along_dim(best[..., None], 0), found.cost, found.spread
-    line = FoundLines(vectors[0], least.take_along_dim(best, 0)[0], spread.take_along_dim(best, 0)[0])
+    line = LineFit(vectors[0], least.take_along_dim(best, 0)[0], spread.take_along_dim(best, 0)[0])
     return line, torch.where(two[..., None], found.vectors[2], 0.0)
 
 
-def _points(data: LineSightings) -> FoundLines:
+def _points(data: LineSightings) -> LineFit:
     """Every point as if it did not move."""
     sides = data.sides()
-    return best_points(data, gram_null_space(sides.mT @ sides).basis[..., 0, :])
+    return fit_points(data, gram_null_space(sides.mT @ sides).basis[..., 0, :])
 
 
 MIN_IMAGE_LENGTH = 1e-7  # of a line, line and camera of norm 1: below, it goes through the centre of the camera
@@ -358,7 +358,7 @@ def trajectory_cameras(
     best = (found.residual.square() * mass).sum(-1).nan_to_num(nan=torch.inf).argmin(0)
     cameras = cameras[best, torch.arange(len(flat), device=x.device)]
     if bundle:
-        cameras = _adjusted(cameras, flat, each)
+        cameras = _adjust_cameras(cameras, flat, each)
     trajectories = triangulate_trajectories(cameras, flat, each, sigma=sigma, options=options)
     cameras = torch.where(good[..., None, None, None], cameras, 0.0)
     lead = x.shape[:-3]
@@ -372,11 +372,11 @@ def trajectory_cameras(
 NUM_ADJUSTMENTS = 3  # of the cameras, each from lines that are fitted anew
 
 
-def _adjusted(cameras: Tensor, x: Tensor, weights: Tensor) -> Tensor:
+def _adjust_cameras(cameras: Tensor, x: Tensor, weights: Tensor) -> Tensor:
     """Cameras ``(b, 6, 3, 4)`` of least distances of the points from the images of their lines."""
-    data, transform, _ = normalized(cameras, x, torch.where(x.isfinite().all(-1), weights, 0.0))
+    data, transform, _ = normalize_sightings(cameras, x, torch.where(x.isfinite().all(-1), weights, 0.0))
     for _ in range(NUM_ADJUSTMENTS):
         # a line whose start from the first cameras was bad stays in a minimum of its own: all get a new start
-        data = adjust(data, fitted_lines(data))
+        data = adjust(data, line_vectors(data))
     moved = torch.linalg.solve(transform, data.cameras)
     return unit(moved)

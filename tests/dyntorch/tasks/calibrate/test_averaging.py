@@ -9,9 +9,9 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.tasks.calibrate import averaging
 from dyntorch.tasks.calibrate.averaging import (
     PairGeometry,
-    averaged_rotations,
-    meeting_points,
-    positioned,
+    average_rotations,
+    nearest_points,
+    position_cameras,
     relative_rotations,
 )
 from tests.dyntorch.tasks.calibrate.rigs import exponential, shape_error
@@ -65,11 +65,11 @@ def test_relative_rotations_have_the_true_one(sign):
 def test_averaged_rotations_are_exact(seed):
     R = turns(5, seed)
     ratios = {(i, j): R[j] @ R[i].mT for i, j in combinations(range(5), 2)}
-    found = averaged_rotations(ratios, dict.fromkeys(ratios, 7.0), 5)
+    found = average_rotations(ratios, dict.fromkeys(ratios, 7.0), 5)
     assert torch.allclose(found, R @ R[0].mT, atol=1e-9)
     # a chain is enough
     chain = {pair: turn for pair, turn in ratios.items() if pair[1] == pair[0] + 1}
-    assert torch.allclose(averaged_rotations(chain, dict.fromkeys(chain, 2.0), 5), R @ R[0].mT, atol=1e-9)
+    assert torch.allclose(average_rotations(chain, dict.fromkeys(chain, 2.0), 5), R @ R[0].mT, atol=1e-9)
 
 
 def test_a_wrong_pair_drops_out(monkeypatch):
@@ -80,7 +80,7 @@ def test_a_wrong_pair_drops_out(monkeypatch):
     errors = []
     for iterations in (20, 1):
         monkeypatch.setattr(averaging, "AVERAGING_ITERATIONS", iterations)
-        found = averaged_rotations(ratios, dict.fromkeys(ratios, 1.0), 5)
+        found = average_rotations(ratios, dict.fromkeys(ratios, 1.0), 5)
         errors.append(float((found - truth).norm(dim=(1, 2)).max()))
     assert errors[0] < 0.01 and errors[0] < 0.05 * errors[1]
 
@@ -90,7 +90,7 @@ def test_positions_from_rays_are_exact(line):
     R, centers, points, rays = rig(line=line, seed=2)
     weights = (torch.rand(4, 60, generator=torch.Generator().manual_seed(3), dtype=F64) > 0.2).double()
     weights[:, :10] = 1.0
-    found, met = positioned(R, rays, weights)
+    found, met = position_cameras(R, rays, weights)
     both = weights.sum(0) >= 2
     # rotations are known: only shift and scale are free, and the scale is positive
     scale = (centers - centers.mean(0)).norm() / (found - found.mean(0)).norm()
@@ -103,4 +103,4 @@ def test_points_meet_where_rays_do():
     R, centers, points, rays = rig(seed=4)
     weights = torch.ones(4, 60, dtype=F64)
     weights[2:, ::2] = 0.0
-    assert torch.allclose(meeting_points(R, centers, rays, weights), points, atol=1e-9)
+    assert torch.allclose(nearest_points(R, centers, rays, weights), points, atol=1e-9)

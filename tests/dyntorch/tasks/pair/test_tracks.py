@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dyntorch.tasks.pair.tracks import interpolated, overlap
+from dyntorch.tasks.pair.tracks import interpolate, overlap
 
 NAN = math.nan
 
@@ -18,23 +18,23 @@ def test_between_frames_of_any_spacing():
     times = torch.arange(50, dtype=torch.float64) / 30
     times = times + 0.004 * torch.rand(50, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     at = torch.linspace(float(times[0]), float(times[-1]), 333, dtype=torch.float64)
-    assert float((interpolated(wave(times), times, at) - wave(at)).abs().max()) < 1e-4
+    assert float((interpolate(wave(times), times, at) - wave(at)).abs().max()) < 1e-4
 
 
 def test_frames_that_are_met_need_no_neighbours():
     times = torch.arange(9, dtype=torch.float64)
     x = wave(times)
     x[[3, 5]] = NAN
-    found = interpolated(x, times, times)
+    found = interpolate(x, times, times)
     assert torch.equal(found.isnan(), x.isnan())
     torch.testing.assert_close(found, x, equal_nan=True, atol=1e-12, rtol=0)
-    assert interpolated(x, times, times + 0.5).isnan().all(-1).flatten().nonzero().flatten().tolist() == [2, 3, 4, 5, 8]
+    assert interpolate(x, times, times + 0.5).isnan().all(-1).flatten().nonzero().flatten().tolist() == [2, 3, 4, 5, 8]
 
 
 def test_gaps_in_time_and_ends_are_missing():
     times = torch.tensor([0.0, 1, 2, 6, 7, 8], dtype=torch.float64)
     at = torch.tensor([-0.1, 1.5, 3.0, 7.5, 8.1], dtype=torch.float64)
-    assert interpolated(wave(times), times, at).isnan().all(-1).flatten().tolist() == [True, False, True, False, True]
+    assert interpolate(wave(times), times, at).isnan().all(-1).flatten().tolist() == [True, False, True, False, True]
 
 
 @pytest.mark.parametrize(("shift", "first", "last"), [(0.0, 0, 29), (5 / 30, 0, 24), (-5 / 30, 5, 29), (0.1 / 30, 0, 28)])

@@ -25,6 +25,7 @@ def codes(found: Reconstruction, problem: int) -> set[ReconstructNotice]:
     return {w.code for w in found.warnings if w.problem == (problem,)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in KINDS if "sensors" not in name])
 def test_sound_scenes_raise_no_doubt(name: str) -> None:
     found = solved(name)

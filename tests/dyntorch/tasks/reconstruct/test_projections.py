@@ -7,15 +7,15 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.tasks.reconstruct.motions import MOTIONS
-from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, choices, mean_error, projections_of_tracks
-from dyntorch.tasks.reconstruct.reconstruct import normalized
+from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, mean_error, projections_of_tracks, view_subsets
+from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 
 
 def tracks_of(name, n=60, seed=0, **options):
     options = {"batch": (1,), **options}
     scene = scenes.lifted(name, n, generator=torch.Generator().manual_seed(seed), **options)
     seen = scene.tracks.isfinite().all(-1).double()
-    return scene, normalized(scene.tracks.nan_to_num(), seen, scene.times)
+    return scene, normalize_tracks(scene.tracks.nan_to_num(), seen, scene.times)
 
 
 def tensor_of(name, times):
@@ -54,14 +54,14 @@ def test_batch_equals_loop_and_a_failed_problem_stays_alone():
 
 def test_choices_are_all_views_or_those_seen_most_and_spread():
     _, tracks = tracks_of("constant_velocity_2d", views=3)
-    assert choices(tracks, 3).tolist() == [[[0, 1, 2]]]
+    assert view_subsets(tracks, 3).tolist() == [[[0, 1, 2]]]
     _, tracks = tracks_of("constant_velocity_2d", views=5)
-    assert choices(tracks, 3)[0, 0].tolist() == [0, 2, 4]
+    assert view_subsets(tracks, 3)[0, 0].tolist() == [0, 2, 4]
     weights = tracks.weights.clone()
     weights[:, 2, 10:] = 0
-    assert not (choices(tracks.only(weights), 3)[0, :3] == 2).any()
+    assert not (view_subsets(tracks.only(weights), 3)[0, :3] == 2).any()
     _, tracks = tracks_of("constant_velocity_3d", views=12)
-    few = choices(tracks, 4)
+    few = view_subsets(tracks, 4)
     assert few.shape == (1, 6, 4)
     assert bool((few.diff(dim=-1) > 0).all())
 

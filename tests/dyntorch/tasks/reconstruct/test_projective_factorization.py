@@ -87,6 +87,7 @@ def optimum(tracks, projections, structure):
     return (residuals(theta).square().sum() / tracks[..., 0].numel()).sqrt()
 
 
+@pytest.mark.slow
 def test_noise_leaves_little_more_than_the_best_reprojection():
     exact, projections, structure = scene(2, views=5, n=60)
     tracks = exact + torch.randn(exact.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

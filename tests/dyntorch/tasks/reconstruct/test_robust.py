@@ -12,7 +12,7 @@ from dyntorch.geometry.triangulation import mask_missing, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import ViewTracks, projections_of_tracks
-from dyntorch.tasks.reconstruct.robust import agreeing, bound, distance, freedom, noise, robust_projections, suspicious
+from dyntorch.tasks.reconstruct.robust import bound, distance, freedom, have_outliers, noise, robust_projections, select_inliers
 from dyntorch.tasks.reconstruct.scene import Lifting, distances
 
 
@@ -120,8 +120,8 @@ def test_clean_tracks_are_not_suspected(sigma):
     _, tracks, invariant, _ = problem("constant_velocity_2d", 60, batch=24, sigma=sigma)
     found = projections_of_tracks(tracks, invariant)
     apart = distances(tracks, found.projections, found.structure)
-    assert float(suspicious(tracks, apart, 4, None).double().mean()) <= 0.2
-    assert float(suspicious(tracks, apart, 4, 1.5).double().mean()) <= 0.1
+    assert float(have_outliers(tracks, apart, 4, None).double().mean()) <= 0.2
+    assert float(have_outliers(tracks, apart, 4, 1.5).double().mean()) <= 0.1
 
 
 @pytest.mark.parametrize("outliers", [0.02, 0.1, 0.3])
@@ -129,8 +129,8 @@ def test_outliers_are_suspected(outliers):
     _, tracks, invariant, _ = problem("constant_velocity_2d", 100, batch=8, outliers=outliers)
     found = projections_of_tracks(tracks, invariant)
     apart = distances(tracks, found.projections, found.structure)
-    assert bool(suspicious(tracks, apart, 4, None).all())
-    assert bool(suspicious(tracks, apart, 4, 1.5).all())
+    assert bool(have_outliers(tracks, apart, 4, None).all())
+    assert bool(have_outliers(tracks, apart, 4, 1.5).all())
 
 
 def test_distance_is_the_reprojection_error_of_the_triangulated_points():
@@ -157,7 +157,7 @@ def test_agreeing_leaves_out_two_views_of_a_point():
     images[0, 1, 3] += 40
     images[0, 5, 3] -= 30
     spoiled = tracks_of(images, scene.times)
-    weights = agreeing(spoiled, spoiled.transforms @ scene.projections, torch.tensor([0.6]).double())
+    weights = select_inliers(spoiled, spoiled.transforms @ scene.projections, torch.tensor([0.6]).double())
     assert (weights[0, :, 3] > 0).tolist() == [True, False, True, True, True, False, True]
     assert bool((weights[0, :, :3] > 0).all())
 
@@ -168,7 +168,7 @@ def test_agreeing_drops_points_that_nothing_confirms():
     images[0, 1, 3] += 60
     images[0, 2, 5] = torch.nan
     spoiled = tracks_of(images, scene.times)
-    weights = agreeing(spoiled, spoiled.transforms @ scene.projections, torch.tensor([0.6]).double())
+    weights = select_inliers(spoiled, spoiled.transforms @ scene.projections, torch.tensor([0.6]).double())
     gone = (weights[0] == 0).all(0)
     assert bool(gone[3])
     assert bool(gone[5])  # two views of it say nothing but where it is

@@ -10,8 +10,17 @@ from dyntorch.core.outcome import Status
 from dyntorch.tasks.reconstruct import scene as module
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.projections import projections_of_tracks
-from dyntorch.tasks.reconstruct.reconstruct import normalized
-from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjusted, distances, framed, positions, scene_of, velocities
+from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
+from dyntorch.tasks.reconstruct.scene import (
+    LiftedState,
+    Lifting,
+    adjust_scene,
+    distances,
+    fix_frame,
+    positions,
+    scene_of,
+    velocities,
+)
 
 MOVING = [name for name, motion in MOTIONS.items() if motion.lift is not None and not motion.static]
 
@@ -21,7 +30,7 @@ def solved(name, n, seed=0, **options):
     options = {"batch": (1,), **options}
     truth = scenes.lifted(name, n, generator=torch.Generator().manual_seed(seed), **options)
     seen = truth.tracks.isfinite().all(-1).double()
-    tracks = normalized(truth.tracks.nan_to_num(), seen, truth.times)
+    tracks = normalize_tracks(truth.tracks.nan_to_num(), seen, truth.times)
     motion = MOTIONS[name]
     lifting = Lifting.of(motion, truth.times, tracks.x)
     found = projections_of_tracks(tracks, motion.tensor(min(motion.views(truth.times), motion.k + 1)))
@@ -33,7 +42,7 @@ def error(truth, lifting, scene):
 
 
 def from_truth(truth, tracks, lifting):
-    return adjusted(
+    return adjust_scene(
         tracks,
         LiftedState(tracks.transforms @ truth.cameras, truth.structure @ lifting.root.mT, None),
         lifting,
@@ -108,7 +117,7 @@ def test_batch_equals_loop():
 @pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_velocity_3d", "constant_direction_3d"])
 def test_the_frame_is_finite_round_and_brings_static_points_to_rest(name):
     truth, tracks, lifting, _, scene = solved(name, 60, views=6, static=0.3, batch=(2,))
-    shown = framed(replace(tracks, static=truth.labels == 1), scene, lifting)
+    shown = fix_frame(replace(tracks, static=truth.labels == 1), scene, lifting)
     assert float(distances(tracks, shown.cameras @ lifting.lifts, shown.structure).max()) < 1e-6
     speed = velocities(shown.structure, lifting.start, lifting.slope)
     assert float(speed[truth.labels == 1].abs().max()) < 1e-6

@@ -32,7 +32,7 @@ from dyntorch.tasks.calibrate.observations import RigViews, Seen
 TURN, MOVE, LENS, CLOCK = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
 """Places of a camera's parameters: rotation vector and translation; logarithm of the focal length, k1, k2; offset, log rate."""
 PARAMETERS = 11
-TINY = 1e-3
+MIN_DEPTH = 1e-3
 """Depth that stands in for smaller ones and for points behind a camera, whose images are then far away."""
 
 
@@ -70,12 +70,12 @@ class Priors:
 
     def costs(self, state: RigState) -> Tensor:
         """Twice the negative logarithm ``(b,)``."""
-        square = ((_varying(state) - self.mean) / self.scale).square()
+        square = ((_prior_parameters(state) - self.mean) / self.scale).square()
         return torch.where(self._heavy, 2 * square.log1p(), square).sum((1, 2))
 
     def equations(self, state: RigState) -> tuple[Tensor, Tensor]:
         """Curvature of the quadratic model and gradient, ``(b, c, 5)``."""
-        away = _varying(state) - self.mean
+        away = _prior_parameters(state) - self.mean
         weight = self.scale.square().reciprocal()
         weight = torch.where(self._heavy, 2 * weight / (1 + away.square() * weight), weight)
         return weight, weight * away
@@ -210,22 +210,22 @@ def images(state: RigState, centers: Tensor) -> Tensor:
     """Images ``(b, c, T, n, 2)`` px of the points in all cameras, with principal points ``(c, 2)``."""
     u = _rays(state.R[:, :, None, None], state.t[:, :, None, None], state.points[:, None])[1]
     lens = state.lens[:, :, None, None]
-    return lens[..., :1].exp() * _bend(u, lens)[1] * u + centers[:, None, None]
+    return lens[..., :1].exp() * _distortion(u, lens)[1] * u + centers[:, None, None]
 
 
 def _rays(R: Tensor, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
     """Points in the frame of a camera, and divided by their depths."""
     seen = (points[..., None, :] * R).sum(-1) + t
-    return seen, seen[..., :2] / seen[..., 2:].clamp(min=TINY)
+    return seen, seen[..., :2] / seen[..., 2:].clamp(min=MIN_DEPTH)
 
 
-def _bend(u: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
+def _distortion(u: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
     """Squared distance from the axis, and what the lens multiplies it by."""
     square = u.square().sum(-1, keepdim=True)
     return square, 1 + square * (lens[..., 1:2] + lens[..., 2:] * square)
 
 
-def _varying(state: RigState) -> Tensor:
+def _prior_parameters(state: RigState) -> Tensor:
     """``(b, c, 5)``: what priors are about."""
     return torch.cat([state.lens, state.clocks], dim=-1)
 
@@ -234,11 +234,11 @@ def _derivatives(state: RigState, i: int, v: Tensor, times: Tensor) -> tuple[Ten
     """Derivatives of the errors of a camera by the points ``(b, T, n, 2, 3)`` and by its parameters ``(b, T, n, 2, 11)``."""
     R, lens = state.R[:, i, None, None], state.lens[:, i, None, None]
     seen, u = _rays(R, state.t[:, i, None, None], state.points)
-    square, bend = _bend(u, lens)
+    square, bend = _distortion(u, lens)
     focal, k1, k2 = lens[..., :1].exp(), lens[..., 1:2], lens[..., 2:]
     eye = torch.eye(2, dtype=u.dtype)
     by_u = focal[..., None] * (bend[..., None] * eye + 2 * (k1 + 2 * k2 * square)[..., None] * u[..., None] * u[..., None, :])
-    by_seen = torch.cat([by_u, -by_u @ u[..., None]], dim=-1) / seen[..., 2:].clamp(min=TINY)[..., None]
+    by_seen = torch.cat([by_u, -by_u @ u[..., None]], dim=-1) / seen[..., 2:].clamp(min=MIN_DEPTH)[..., None]
     delta = times[:, None, None] * state.clocks[:, i, 1, None, None, None].exp()
     own = torch.stack([focal * bend * u, focal * square * u, focal * square.square() * u, -v, -v * delta], dim=-1)
     return by_seen @ R, torch.cat([-by_seen @ skew(seen), by_seen, own], dim=-1)

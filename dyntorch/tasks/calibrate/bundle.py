@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics.least_squares import LeastSquaresOptions, minimize
-from dyntorch.tasks.calibrate.adjustment import (
+from dyntorch.tasks.calibrate.averaging import Graph, first_cameras, nearest_points, viewing_rays
+from dyntorch.tasks.calibrate.bundle_problem import (
     CLOCK,
     LENS,
     PARAMETERS,
@@ -20,7 +21,6 @@ from dyntorch.tasks.calibrate.adjustment import (
     gauge,
     images,
 )  # fmt: skip
-from dyntorch.tasks.calibrate.averaging import Graph, first_cameras, meeting_points, viewing_rays
 from dyntorch.tasks.calibrate.input import Rig
 from dyntorch.tasks.calibrate.observations import MIN_NOISE, RigViews
 
@@ -119,7 +119,7 @@ NUM_KEPT_STARTS = 3  # that are adjusted to the end
 START_ITERATIONS = (8, 15, 15)  # of the rounds in which starts are compared; the noise is estimated between rounds
 
 
-def compared_starts(rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, freedom: Freedom) -> tuple[RigState, Tensor]:
+def compare_starts(rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, freedom: Freedom) -> tuple[RigState, Tensor]:
     """The best starts, adjusted on some of the moments, best first, and by how much each is worse than the first."""
     side = rig.sizes.amax(1)
     unknown = rig.focals.isnan()
@@ -134,7 +134,7 @@ def compared_starts(rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, fre
     state = RigState(R, t, lens, clocks.expand(len(starts), -1, -1).clone(), points)
     for k, steps in enumerate(START_ITERATIONS):
         problem = _problem(views, state, freedom.poses, freedom.priors)
-        state = _descended(problem, state, steps)
+        state = _descend(problem, state, steps)
         if k == 0 and len(state.R) > NUM_KEPT_STARTS:
             sigma = _noise(state, problem).log().sum(1)
             state = state.of(sigma.argsort(stable=True)[:NUM_KEPT_STARTS])
@@ -146,31 +146,33 @@ def compared_starts(rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, fre
     )
     cost = problem.evaluate(tuple(state)).cost
     order = cost.argsort(stable=True)
-    repeats = _repeats(problem.subset(order[:1]), state.of(order[:1]))
+    repeats = _autocorrelation_factor(problem.subset(order[:1]), state.of(order[:1]))
     return state.of(order), (cost[order] - cost[order[0]]) / repeats
 
 
 BUNDLE_ITERATIONS = (12, 12, 10)  # of the rounds of the last adjustment; the noise and who is seen are estimated between rounds
 
 
-def adjusted(views: RigViews, start: RigState, freedom: Freedom) -> RigSolution:
+def adjust_bundle(views: RigViews, start: RigState, freedom: Freedom) -> RigSolution:
     """The solution next to a start, at all the moments of views."""
-    state = start._replace(points=met_points(views, start)[None])
+    state = start._replace(points=intersect_rays(views, start)[None])
     problem = _problem(views, state, freedom.whole, freedom.priors)
     for k, steps in enumerate(BUNDLE_ITERATIONS):
         if k:
             problem = _problem(views, state, freedom.whole, freedom.priors)
-        state = _descended(problem, state, steps)
+        state = _descend(problem, state, steps)
     normal = problem.linear(state)
     _, reduced, _ = normal.eliminated(torch.zeros(1, dtype=torch.float64))
-    covariance = _repeats(problem, state) * camera_covariance(reduced[0], freedom.shape, gauge(state.R[0], state.t[0]))
-    return RigSolution(state, problem, _of_centers(covariance, state.R[0]))
+    covariance = _autocorrelation_factor(problem, state) * camera_covariance(
+        reduced[0], freedom.shape, gauge(state.R[0], state.t[0])
+    )
+    return RigSolution(state, problem, _covariance_of_centers(covariance, state.R[0]))
 
 
-def met_points(views: RigViews, state: RigState) -> Tensor:
+def intersect_rays(views: RigViews, state: RigState) -> Tensor:
     """Points ``(T, n, 3)`` nearest to the rays of one adjustment, lenses left out."""
     rays, known = viewing_rays(views, state.clocks[0], state.lens[0, :, 0].exp())
-    return meeting_points(state.R[0], state.centers[0], rays, known).view(len(views.times), -1, 3)
+    return nearest_points(state.R[0], state.centers[0], rays, known).view(len(views.times), -1, 3)
 
 
 NOISE_FREEDOM = 4.0  # degrees of freedom of Student's t, the noise of a detector
@@ -199,7 +201,7 @@ def _noise(state: RigState, problem: RigAdjustment) -> Tensor:
 COST_TOLERANCE = 1e-5  # relative gain of a step that ends a round
 
 
-def _descended(problem: RigAdjustment, state: RigState, steps: int) -> RigState:
+def _descend(problem: RigAdjustment, state: RigState, steps: int) -> RigState:
     settings = LeastSquaresOptions(iterations=steps, tolerance=COST_TOLERANCE)
     return RigState(*minimize(problem, problem.evaluate(tuple(state)), settings).theta)
 
@@ -207,7 +209,7 @@ def _descended(problem: RigAdjustment, state: RigState, steps: int) -> RigState:
 MIN_AUTOCORRELATION = 0.02  # of residuals some moments apart, down to which it is summed
 
 
-def _repeats(problem: RigAdjustment, state: RigState) -> float:
+def _autocorrelation_factor(problem: RigAdjustment, state: RigState) -> float:
     r"""By how much fewer residuals there are than it seems: :math:`1 + 2 \sum_k \rho_k` of how they repeat themselves in time."""
     error, weight = problem.agreement(state, problem.views.at(state.clocks))
     rows = (error * weight.sqrt()[..., None])[0].movedim(1, 0).flatten(1)  # (T, *)
@@ -221,7 +223,7 @@ def _repeats(problem: RigAdjustment, state: RigState) -> float:
     return total
 
 
-def _of_centers(covariance: Tensor, R: Tensor) -> Tensor:
+def _covariance_of_centers(covariance: Tensor, R: Tensor) -> Tensor:
     """``(c, 11, 11)`` of each camera with its centre in place of its translation: :math:`dC = -R^T dt` about the centre."""
     c = len(R)
     own = covariance.view(c, PARAMETERS, c, PARAMETERS)
@@ -229,3 +231,66 @@ def _of_centers(covariance: Tensor, R: Tensor) -> Tensor:
     change = torch.eye(PARAMETERS, dtype=torch.float64).repeat(c, 1, 1)
     change[:, 3:6, 3:6] = -R.mT
     return change @ own @ change.mT
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Points and how well they agree with the pictures."""
+
+    points: Tensor  # ``(T, n, 3)``, NaN where two cameras do not tell
+    sigmas: Tensor  # ``(T, n)`` root mean square of the standard deviations along the axes
+    residuals: Tensor  # ``(c, n)`` px, root mean square of the positions that agree
+    inliers: Tensor  # ``(c,)`` share of the positions that agree
+
+
+BLOCK_POINTS = 20_000  # points times moments that are solved at a time
+
+
+def triangulate_frames(views: RigViews, found: RigSolution) -> Structure:
+    """Points of all moments of views, each the least squares of the positions that see it, with the noise of Student's t."""
+    n = views.grids[0].x.shape[1]
+    step = max(1, BLOCK_POINTS // n)
+    parts = [_triangulate_block(replace(views, times=times), found) for times in views.times.split(step)]
+    points, sigmas = (torch.cat([part[k] for part in parts]) for k in (0, 1))
+    square, agree, seen = (torch.stack([part[k] for part in parts]).sum(0) for k in (2, 3, 4))
+    residuals = torch.where(agree > 0, (square / agree.clamp(min=1)).sqrt(), torch.nan)
+    inliers = agree.sum(1) / seen.sum(1).clamp(min=1)
+    return Structure(points, sigmas, residuals, inliers)
+
+
+POINT_ITERATIONS = 8  # of their least squares
+MAX_POINT_SIGMA = 0.08  # over the distance of the cameras
+OUTLIER_SIGMAS = 4.0  # of the noise beyond which a position does not agree
+
+
+def _triangulate_block(views: RigViews, found: RigSolution) -> tuple[Tensor, ...]:
+    """Points, their standard deviations, and per camera and point: sum of squares and number of what agrees, number of all."""
+    state = found.state
+    weights = views.at(state.clocks).weights
+    weights = weights * ((weights > 0).sum(1, keepdim=True) >= 2)
+    held = found.problem.basis[:, :0]
+    problem = RigAdjustment(views, weights, found.problem.sigma, found.problem.freedom, found.problem.priors, held)
+    state = state._replace(points=intersect_rays(views, state)[None])
+    settings = LeastSquaresOptions(iterations=POINT_ITERATIONS, tolerance=COST_TOLERANCE)
+    state = RigState(*minimize(problem, problem.evaluate(tuple(state)), settings).theta)
+    sigmas = _sigmas(problem, state)
+    far = (state.centers[0, :, None, None] - state.points[0]).norm(dim=-1).median(0).values
+    known = (weights[0] > 0).any(0) & (sigmas <= MAX_POINT_SIGMA * far)
+    error = (images(state, views.centers) - views.at(state.clocks).x)[0].norm(dim=-1)
+    seen = (weights[0] > 0) & known
+    agree = seen & (error <= OUTLIER_SIGMAS * RAYLEIGH * problem.sigma[0, :, None, None])
+    return (
+        torch.where(known[..., None], state.points[0], torch.nan),
+        torch.where(known, sigmas, torch.nan),
+        torch.where(agree, error.square() / 2, 0.0).sum(1),
+        agree.double().sum(1),
+        seen.double().sum(1),
+    )
+
+
+def _sigmas(problem: RigAdjustment, state: RigState) -> Tensor:
+    """Root mean square ``(T, n)`` of the standard deviations of points along the axes; infinite where they have none."""
+    blocks = problem.linear(state).matrix[0]
+    values = torch.linalg.eigvalsh(blocks).clamp(min=0)
+    variance = torch.where(values > 0, 1 / values, torch.inf).mean(-1)
+    return variance.sqrt().view(state.points.shape[1:3])

@@ -1,16 +1,67 @@
-"""The world that cameras and points are told in: up, the ground, and the scale."""
+r"""The coordinates of the world: up, the ground, and the scale, from bodies that keep their lengths.
+
+A distance between two points has a spread :math:`s_{ab} = q_{.9}\bigl| |X_a - X_b| - \mathrm{med} \bigr| / 1.645`.  Of all pairs
+whose :math:`s_{ab}` is a small share of the distance, those of a spanning forest with the least shares tie a body together; people
+stand side by side in one set of points and fall apart into trees of their own.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyntorch.tasks.calibrate.bones import bodies, rigid_pairs
 from dyntorch.tasks.calibrate.input import Scale
+
+
+def rigid_pairs(points: Tensor, known: Tensor, spread: float) -> tuple[Tensor, Tensor, Tensor]:
+    """The pairs of a spanning forest whose distances vary least. points ``(T, n, 3)``, known ``(T, n)`` -> ``(B, 2)``."""
+    n = points.shape[1]
+    if n < 2:
+        return torch.zeros(0, 2, dtype=torch.long), points.new_zeros(0), points.new_zeros(0)
+    one, other = torch.tensor(list(combinations(range(n), 2))).unbind(-1)
+    both = known[:, one] & known[:, other]
+    far = torch.where(both, (points[:, one] - points[:, other]).norm(dim=-1), torch.nan)
+    length = far.nanmedian(0).values
+    # two people may keep their distance for half of the time: nine tenths of it count
+    away = (far - length).abs().nanquantile(0.9, dim=0) / 1.645
+    share = (away / length).nan_to_num(torch.inf)
+    root = list(range(n))
+
+    def find(place: int) -> int:
+        while root[place] != place:
+            place = root[place]
+        return place
+
+    chosen = []
+    for k in share.argsort(stable=True).tolist():
+        a, b = find(int(one[k])), find(int(other[k]))
+        if share[k] > spread:
+            break
+        if a != b:
+            root[a] = b
+            chosen.append(k)
+    kept = torch.tensor(sorted(chosen), dtype=torch.long)
+    return torch.stack([one[kept], other[kept]], dim=-1), length[kept], share[kept]
+
+
+def bodies(ends: Tensor, points: int) -> list[list[int]]:
+    """Points that bones ``(B, 2)`` tie together, largest body first; those without bones in none.
+
+    Example:
+        >>> import torch
+        >>> bodies(torch.tensor([[0, 1], [3, 4], [1, 2]]), 6)
+        [[0, 1, 2], [3, 4]]
+    """
+    label = list(range(points))
+    for a, b in ends.tolist():
+        label = [label[a] if one == label[b] else one for one in label]
+    groups = [[k for k in range(points) if label[k] == one] for one in dict.fromkeys(label)]
+    return sorted((group for group in groups if len(group) > 1), key=lambda group: -len(group))
 
 
 @dataclass(frozen=True)
@@ -40,7 +91,7 @@ GROUND_QUANTILE = 0.01  # of the points' heights
 MAX_BODY_SPREAD = 0.15  # of a distance over itself up to which two points belong to one body
 
 
-def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale) -> World:
+def estimate_world(R: Tensor, centers: Tensor, points: Tensor, scale: Scale) -> World:
     r"""Up from the long axes of upright bodies, the ground below them, the scale from a height or lengths. R ``(c, 3, 3)``,
     centers ``(c, 3)``, points ``(T, n, 3)``."""
     points = points[:: max(1, len(points) // MAX_WORLD_MOMENTS)]
@@ -49,7 +100,7 @@ def world_of(R: Tensor, centers: Tensor, points: Tensor, scale: Scale) -> World:
     ends, _, _ = rigid_pairs(points.nan_to_num(0.0), points.isfinite().all(-1), MAX_BODY_SPREAD)
     groups = bodies(ends, n) or [list(range(n))]
     from_cameras = normalize(-R[:, 1].sum(0), dim=0)
-    up, share = upward(points, groups, from_cameras)
+    up, share = estimate_up(points, groups, from_cameras)
     by_people = share >= MIN_UPRIGHT_SHARE
     up = up if by_people else from_cameras
     ahead = R[0, 2] - (R[0, 2] @ up) * up
@@ -71,7 +122,7 @@ MIN_ELONGATION = 1.5  # ratio of the first two principal spreads
 MAX_CAMERA_TILT = 40.0  # degrees of the long axes from the cameras' own upward direction: nobody stands on a wall
 
 
-def upward(points: Tensor, groups: list[list[int]], guess: Tensor) -> tuple[Tensor, float]:
+def estimate_up(points: Tensor, groups: list[list[int]], guess: Tensor) -> tuple[Tensor, float]:
     """The direction ``(3,)`` that most long axes of bodies have, and the share of the axes that have it."""
     axes = []
     for group in groups:

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from dyntorch.tasks.pair.affine import Prior, cosines, filled, frames_of, motion_spectrum
+from dyntorch.tasks.pair.motion_prior import Prior, cosines, fill_gaps, inverse_cosines, motion_spectrum
 
 
 def normal(*shape, seed=0):
@@ -28,7 +28,7 @@ def test_cosines_are_the_orthonormal_transform():
         t, k = torch.arange(frames, dtype=torch.float64), torch.arange(1, frames, dtype=torch.float64)
         basis = (2 / frames) ** 0.5 * torch.cos(math.pi / frames * k[:, None] * (t + 0.5))
         torch.testing.assert_close(cosines(x), torch.einsum("kt,tnd->knd", basis, x))
-        torch.testing.assert_close(frames_of(cosines(x)), x - x.mean(0))
+        torch.testing.assert_close(inverse_cosines(cosines(x)), x - x.mean(0))
 
 
 def test_spectrum_is_that_of_the_motion_not_of_the_noise():
@@ -43,9 +43,9 @@ def test_noise_goes_and_motion_stays():
     for sigma in (0.5, 3.0):
         noisy = x + sigma * normal(90, 8, 2, seed=5)
         z = cosines(noisy - noisy.mean(0))
-        assert rms(frames_of(Prior.of(z, sigma**2).denoised(z)) - x) < 0.55 * sigma
+        assert rms(inverse_cosines(Prior.of(z, sigma**2).denoised(z)) - x) < 0.55 * sigma
     z = cosines(x)
-    torch.testing.assert_close(frames_of(Prior.of(z, 1e-20).denoised(z)), x, atol=1e-6, rtol=0)
+    torch.testing.assert_close(inverse_cosines(Prior.of(z, 1e-20).denoised(z)), x, atol=1e-6, rtol=0)
 
 
 def test_gaps_are_filled_from_the_other_points():
@@ -53,10 +53,10 @@ def test_gaps_are_filled_from_the_other_points():
     gaps = x.clone()
     for point in range(8):
         gaps[9 * point : 9 * point + 15, point] = torch.nan
-    found = filled(gaps, 0.0)
+    found = fill_gaps(gaps, 0.0)
     seen = gaps.isfinite()
     assert torch.equal(found[seen], x[seen]) and rms((found - x)[~seen]) < 1e-2 * rms(x)
-    assert filled(x, 0.0) is x
+    assert fill_gaps(x, 0.0) is x
 
 
 def test_gaps_of_points_that_no_other_tells_of_are_bridged():
@@ -64,4 +64,4 @@ def test_gaps_of_points_that_no_other_tells_of_are_bridged():
     x = torch.stack([0.5 * times.expand(60, 2), torch.sin(times / 4) * torch.ones(2, dtype=torch.float64)], dim=1)
     gaps = x.clone()
     gaps[20:24, 1] = torch.nan
-    assert rms((filled(gaps, 1e-6) - x)[20:24, 1]) < 0.15
+    assert rms((fill_gaps(gaps, 1e-6) - x)[20:24, 1]) < 0.15

@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 
 from dyntorch.tasks.pair.affine import (
@@ -9,14 +10,14 @@ from dyntorch.tasks.pair.affine import (
     NUM_FOLDS,
     Motions,
     Rows,
-    combinations,
+    column_ridges,
+    combination_weights,
     information,
+    leave_out_residuals,
     likelihood,
     peaks,
-    predicted_apart,
-    refined,
+    refine_directions,
     regress,
-    ridges_apart,
 )
 from dyntorch.tasks.pair.tracks import match_tracks
 
@@ -41,12 +42,13 @@ def test_evidence_is_the_marginal_likelihood():
     assert abs(float(found.evidence[0]) - log_likelihood(x, y, ridge)) < 1e-8
     assert all(log_likelihood(x, y, ridge * factor) <= float(found.evidence[0]) for factor in (0.3, 3.0))
     assert 0.1 < float(found.variance[0]) < 0.25 and 0.5 < ridge < 6
-    apart = ridges_apart(x, y)
+    apart = column_ridges(x, y)
     for k in range(4):
         own = log_likelihood(x, y[:, k : k + 1], float(apart[k]))
         assert all(log_likelihood(x, y[:, k : k + 1], float(apart[k]) * factor) <= own + 1e-9 for factor in (0.1, 10.0))
 
 
+@pytest.mark.slow
 def test_scale_and_offset_of_affine_combinations():
     weights = normal(6, 5)
     weights = weights + (1 - weights.sum(0)) / 6
@@ -55,13 +57,13 @@ def test_scale_and_offset_of_affine_combinations():
     rows = Rows.of(x[None], y[None], (places[None], other[None]))
     found = regress(rows, means=True)
     torch.testing.assert_close(found.gauge, torch.tensor([[2.5, 1.7]], dtype=torch.float64))
-    torch.testing.assert_close(combinations(rows, found.ridge, found.gauge)[0], 1.7 * weights)
+    torch.testing.assert_close(combination_weights(rows, found.ridge, found.gauge)[0], 1.7 * weights)
 
 
 def test_predictions_of_left_out_stretches():
     x, y = normal(23, 4), normal(23, 3, seed=1)
     ridge = torch.tensor([0.5, 2.0, 7.0], dtype=torch.float64)
-    found = predicted_apart(x, y, ridge)
+    found = leave_out_residuals(x, y, ridge)
     for rows in torch.arange(23).chunk(NUM_FOLDS):
         rest = torch.tensor([t for t in range(23) if t not in rows.tolist()])
         for k in range(3):
@@ -95,7 +97,7 @@ def test_common_directions_are_found():
     for sigma, allowed in ((0.0, 1e-8), (0.05, 0.05)):
         motions = pair(sigma)
         best = peaks(motions)[0]
-        found, level = refined(motions, best)
+        found, level = refine_directions(motions, best)
         error = torch.sin(found - torch.tensor([0.7, 2.0], dtype=torch.float64)).abs().max()
         assert float(error) < allowed
         assert level >= float(likelihood(motions, best[None])[0])

@@ -15,9 +15,9 @@ from dyntorch.core.outcome import Status
 from dyntorch.tasks.reconstruct import solver as lifted_choice
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.projections import ViewTracks
-from dyntorch.tasks.reconstruct.reconstruct import normalized
+from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from dyntorch.tasks.reconstruct.solver import LABEL_COST, OUTLIER_COST, LiftedFit, _lacks, penalized
+from dyntorch.tasks.reconstruct.solver import LABEL_COST, OUTLIER_COST, LiftedFit, _missing_input, penalized_cost
 
 
 @pytest.mark.slow
@@ -34,11 +34,11 @@ def test_the_model_of_the_scene(name: str) -> None:
 def test_formula() -> None:
     scene = scenes.lifted("constant_velocity_2d", 10, views=3, generator=torch.Generator().manual_seed(0))
     weights = torch.ones(1, 3, 10, dtype=torch.float64)
-    tracks = normalized(scene.tracks[None], weights, scene.times)
+    tracks = normalize_tracks(scene.tracks[None], weights, scene.times)
     apart = torch.full((1, 3, 10), 0.5, dtype=torch.float64)
     apart[0, :, 0] = 100.0
     motion = MOTIONS["constant_velocity_2d"]
-    found = penalized(
+    found = penalized_cost(
         tracks,
         LiftedFit(motion, apart, torch.tensor([False]), torch.ones(1)),
         torch.full((1,), 0.5, dtype=torch.float64),
@@ -58,9 +58,9 @@ def test_models_that_were_not_tried_say_why() -> None:
     assert "not tried: constant_velocity_3d (needs 40 tracks)" in repr(found)
     assert all(one.score == math.inf for one in found.candidates if one.reason)
     times = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)
-    assert _lacks(MOTIONS["constant_velocity_2d"], times, 4, 30) == "needs views at 3 different times"
-    assert _lacks(MOTIONS["constant_velocity_3d"], times[:2], 2, 30) == "needs 4 views"
-    assert _lacks(MOTIONS["static_3d"], times, 4, 30) == ""
+    assert _missing_input(MOTIONS["constant_velocity_2d"], times, 4, 30) == "needs views at 3 different times"
+    assert _missing_input(MOTIONS["constant_velocity_3d"], times[:2], 2, 30) == "needs 4 views"
+    assert _missing_input(MOTIONS["static_3d"], times, 4, 30) == ""
 
 
 def test_fewest_tracks_of_two_bodies() -> None:
