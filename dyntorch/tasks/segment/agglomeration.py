@@ -14,7 +14,7 @@ from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import null_vector
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.chi_square import median
-from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, Pair, TrackTable
+from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, Pair, TrackSet
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.track_energy import Candidates
 
@@ -66,7 +66,7 @@ class Separation:
 class NearPairs:
     """Linear fits of many groups of tracks between many pairs of near frames at a time."""
 
-    def __init__(self, film: TrackTable, pairs: Sequence[Pair]) -> None:
+    def __init__(self, film: TrackSet, pairs: Sequence[Pair]) -> None:
         """Of pairs of frames ``(p, 2)``."""
         first, second = torch.tensor(list(pairs), device=film.x.device).reshape(-1, 2).unbind(-1)
         x1, x2 = film.x[first], film.x[second]

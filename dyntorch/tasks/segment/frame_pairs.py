@@ -41,7 +41,7 @@ class FramePair:
 
 
 @dataclass(frozen=True)
-class TrackTable:
+class TrackSet:
     """The tracks of one problem, centred and of about unit size, all frames alike."""
 
     x: Tensor  # ``(frames, n, 2)``, 0 where a track is missing
@@ -50,7 +50,7 @@ class TrackTable:
     change: Tensor  # ``(3, 3)`` similarity from pixels to them
 
     @staticmethod
-    def of(tracks: Tensor, pixel: float = 1.0) -> TrackTable:
+    def of(tracks: Tensor, pixel: float = 1.0) -> TrackSet:
         """Of tracks ``(frames, n, 2)``, NaN = missing, in whose unit a pixel of the options is so long."""
         seen = tracks.isfinite().all(-1)
         there = tracks[seen]
@@ -59,7 +59,7 @@ class TrackTable:
         spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
         scale = 1 / spread
         x = torch.where(seen[..., None], (tracks - centre) * scale, 0.0)
-        return TrackTable(x, seen, pixel * float(scale), similarity(scale, centre))
+        return TrackSet(x, seen, pixel * float(scale), similarity(scale, centre))
 
     @cached_property
     def ends(self) -> tuple[Tensor, Tensor]:
@@ -91,7 +91,7 @@ def space_pairs(count: int, gap: int, most: int) -> list[Pair]:
     return [(a, a + gap) for a in places]
 
 
-def select_near_pairs(film: TrackTable, gaps: tuple[int, ...], starts: int, common: int) -> list[Pair]:
+def select_near_pairs(film: TrackSet, gaps: tuple[int, ...], starts: int, common: int) -> list[Pair]:
     """Pairs of frames with the given gaps, evenly spread; in a video longer than its tracks there are more of them."""
     count = len(film.seen)
     length = float(film.lengths.double().median())
@@ -100,7 +100,7 @@ def select_near_pairs(film: TrackTable, gaps: tuple[int, ...], starts: int, comm
     return [pair for pair in found if _num_common_tracks(film, pair) >= common]
 
 
-def select_frame_pairs(film: TrackTable, max_pairs: int) -> list[Pair]:
+def select_frame_pairs(film: TrackSet, max_pairs: int) -> list[Pair]:
     """The pairs of frames that bodies are judged by: wide ones, narrower ones for short tracks, all tracks in some of them."""
     count = len(film.seen)
     common = min(MIN_COMMON_TRACKS, max(8, film.x.shape[1] // 2))
@@ -140,7 +140,7 @@ class SceneCut:
     jump: float = 0.0
 
 
-def find_scene_cut(film: TrackTable) -> SceneCut | None:
+def find_scene_cut(film: TrackSet) -> SceneCut | None:
     """The first cut of a video, if there is one."""
     first, last = film.ends
     steps = []
@@ -161,5 +161,5 @@ def find_scene_cut(film: TrackTable) -> SceneCut | None:
     return None
 
 
-def _num_common_tracks(film: TrackTable, pair: Pair) -> int:
+def _num_common_tracks(film: TrackSet, pair: Pair) -> int:
     return int((film.seen[pair[0]] & film.seen[pair[1]]).sum())

@@ -17,7 +17,7 @@ from dyntorch.geometry.homography import homography, homography_sampson_squared
 from dyntorch.numerics.chi_square import median
 from dyntorch.tasks.segment.coherence import Links, conformity
 from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS, View, mean_field
-from dyntorch.tasks.segment.frame_pairs import FramePair, TrackTable
+from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet
 from dyntorch.tasks.segment.track_energy import MIN_BODY_TRACKS, Geometry
 
 OUTLIER_COST = 1.0  # where many are
@@ -239,7 +239,7 @@ class BodyMotions:
     planar: Tensor
 
 
-def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film: TrackTable) -> BodyMotions:
+def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film: TrackSet) -> BodyMotions:
     """With members ``(K, n)``, 0 or 1; 0 where two frames have too few of them in common."""
     back = torch.linalg.inv(film.change)
     fundamentals, homographies, planar = [], [], []
@@ -254,7 +254,7 @@ def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film
     return BodyMotions(torch.stack(fundamentals), torch.stack(homographies), torch.stack(planar))
 
 
-def widths(film: TrackTable, member: Tensor) -> Tensor:
+def widths(film: TrackSet, member: Tensor) -> Tensor:
     """How wide bodies of members ``(K, n)`` are: the share ``(K,)`` of the cells of a grid over the picture that they are seen in,
     of those that anything is seen in, in the mean over the frames."""
     there = film.x[film.seen]
@@ -271,7 +271,7 @@ def widths(film: TrackTable, member: Tensor) -> Tensor:
     return torch.stack(shares).mean(0)
 
 
-def find_static_body(film: TrackTable, member: Tensor) -> int | None:
+def find_static_body(film: TrackSet, member: Tensor) -> int | None:
     """Which body of members ``(K, n)`` must be what stands still: the largest, if it is the widest, too, and large enough."""
     size = member.sum(-1)
     largest = int(size.argmax())

@@ -16,7 +16,7 @@ from torch import Tensor
 from dyntorch.geometry.homogeneous import cofactors, homogeneous
 from dyntorch.numerics.blocks import uniform
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.frame_pairs import FramePair, TrackTable, select_near_pairs
+from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet, select_near_pairs
 
 TINY = 1e-12
 
@@ -29,7 +29,7 @@ MIN_SAMPLE_RADIUS = 0.05  # about its first track in which a hypothesis finds th
 MAX_SAMPLE_RADIUS = 0.7  # the largest one
 
 
-def preference_kernel(film: TrackTable, searched: Tensor, generator: torch.Generator | None, num_hypotheses: int) -> Tensor:
+def preference_kernel(film: TrackSet, searched: Tensor, generator: torch.Generator | None, num_hypotheses: int) -> Tensor:
     r"""How alike tracks move: the mean share of preferred hypotheses that they have in common, searched ``(m,)`` -> ``(n, m)``."""
     count = film.x.shape[1]
     place = torch.full((count,), -1, device=searched.device)

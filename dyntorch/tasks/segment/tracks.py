@@ -18,7 +18,7 @@ from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
 from dyntorch.tasks.segment.agglomeration import NEGLIGIBLE_LINKS, GroupCosts, NearPairs, merge_pieces, pieces, weakest_separation
 from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS
-from dyntorch.tasks.segment.frame_pairs import FramePair, TrackTable, find_scene_cut, select_frame_pairs, select_near_pairs
+from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs
 from dyntorch.tasks.segment.labels import distances, distances_from_cameras, find_static_body, motions, outliers
 from dyntorch.tasks.segment.options import TrackSegmentOptions
 from dyntorch.tasks.segment.residual_kernel import MIN_KERNEL_TRACKS, common_share, links_of, preference_kernel, strongest
@@ -279,7 +279,7 @@ def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> Tra
     # 1. what is there: tracks in two frames at least, frames with tracks in common, motion, one scene
     if not bool((seen.sum(0) > 1).any()):
         return _no_bodies(count, request, [Notice(TrackNotice.SHORT)])
-    film = TrackTable.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.pixel)
+    film = TrackSet.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.pixel)
     refused = _refusal(film, request)
     frames = [] if refused else select_frame_pairs(film, options.max_frame_pairs)
     if refused or not frames:
@@ -302,7 +302,7 @@ def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> Tra
     return _outcome(tracks, cameras, film, pairs, kernel, searched, member, chosen, request)
 
 
-def _refusal(film: TrackTable, request: TrackRequest) -> Notice | None:
+def _refusal(film: TrackSet, request: TrackRequest) -> Notice | None:
     """Why there is nothing to segment."""
     cut = find_scene_cut(film)
     if cut is not None:
@@ -317,7 +317,7 @@ def _refusal(film: TrackTable, request: TrackRequest) -> Notice | None:
     return None
 
 
-def _draw_tracks(film: TrackTable, request: TrackRequest) -> Tensor:
+def _draw_tracks(film: TrackSet, request: TrackRequest) -> Tensor:
     """Indices of the tracks that the search looks at: all, or a random part of very many."""
     alive = film.seen.any(0).nonzero().flatten()
     most = request.options.max_searched
@@ -327,9 +327,9 @@ def _draw_tracks(film: TrackTable, request: TrackRequest) -> Tensor:
     return alive[order[:most]].sort().values
 
 
-def _start(film: TrackTable, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
+def _start(film: TrackSet, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
     """What the search for bodies starts from: links, pairs of frames and pieces of the searched tracks."""
-    part = TrackTable(film.x[:, searched], film.seen[:, searched], film.pixel, film.change)
+    part = TrackSet(film.x[:, searched], film.seen[:, searched], film.pixel, film.change)
     inner = kernel[searched]
     inner = (inner + inner.mT) / 2
     sparse = strongest(inner, NUM_TRACK_NEIGHBOURS)
@@ -343,7 +343,7 @@ def _start(film: TrackTable, frames: Sequence[tuple[int, int]], kernel: Tensor, 
     return Start(evidence, judge, cuts)
 
 
-def _label_all(film: TrackTable, pairs: list[FramePair], kernel: Tensor, searched: Tensor, found: Candidates) -> Tensor:
+def _label_all(film: TrackSet, pairs: list[FramePair], kernel: Tensor, searched: Tensor, found: Candidates) -> Tensor:
     """Probabilities ``(K, n)`` of all tracks: those searched have theirs, the others those of what they move like."""
     count = film.x.shape[1]
     member = torch.zeros(found.bodies, count, dtype=torch.float64, device=film.x.device)
@@ -364,7 +364,7 @@ def _label_all(film: TrackTable, pairs: list[FramePair], kernel: Tensor, searche
 def _outcome(
     tracks: Tensor,
     cameras: Tensor | None,
-    film: TrackTable,
+    film: TrackSet,
     pairs: list[FramePair],
     kernel: Tensor,
     searched: Tensor,
@@ -428,7 +428,7 @@ def _count_notices(found: int, chosen: Chosen, request: TrackRequest) -> list[No
 
 
 def _static(
-    tracks: Tensor, cameras: Tensor | None, film: TrackTable, hard: Tensor, pairs: list[FramePair], request: TrackRequest
+    tracks: Tensor, cameras: Tensor | None, film: TrackSet, hard: Tensor, pairs: list[FramePair], request: TrackRequest
 ) -> tuple[int, list[Notice]]:
     """The number of the body that stands still, 0 where it is not known, and why."""
     if cameras is not None:

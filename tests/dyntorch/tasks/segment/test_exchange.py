@@ -7,7 +7,7 @@ import torch
 
 from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment import track_energy
-from dyntorch.tasks.segment.frame_pairs import TrackTable, select_frame_pairs
+from dyntorch.tasks.segment.frame_pairs import TrackSet, select_frame_pairs
 from dyntorch.tasks.segment.track_energy import Exchanges, TrackEvidence, no_links
 from dyntorch.tasks.segment.tracks import EXCHANGE_CUT_WEIGHTS
 from tests.dyntorch.tasks.segment.videos import shot
@@ -18,7 +18,7 @@ COUNTS = (48, 40)
 def exchanges() -> tuple[Exchanges, torch.Tensor, torch.Tensor]:
     """Of six pieces, three of each of two bodies, without links: the labels of the pieces and of the bodies, from 0."""
     scene = shot(COUNTS, frames=6, sigma=0.1)
-    film = TrackTable.of(scene.tracks)
+    film = TrackSet.of(scene.tracks)
     pairs = [film.pair(pair) for pair in select_frame_pairs(film, 64)]
     evidence = TrackEvidence.of(pairs, no_links(sum(COUNTS), film.x.device))
     truth = scene.labels - 1

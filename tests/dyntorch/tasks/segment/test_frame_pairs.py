@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from dyntorch.geometry.homogeneous import apply
-from dyntorch.tasks.segment.frame_pairs import TrackTable, find_scene_cut, select_frame_pairs, select_near_pairs, space_pairs
+from dyntorch.tasks.segment.frame_pairs import TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs, space_pairs
 from tests.dyntorch.tasks.segment.videos import F64, draw, shot
 
 
-def long_film(frames: int, length: int = 10, each: int = 6, shortest: int = 2) -> TrackTable:
+def long_film(frames: int, length: int = 10, each: int = 6, shortest: int = 2) -> TrackSet:
     """Many tracks of up to ``length`` frames, ``each`` of which begin in every frame."""
     generator = draw()
     count = frames * each
@@ -19,7 +19,7 @@ def long_film(frames: int, length: int = 10, each: int = 6, shortest: int = 2) -
     number = torch.arange(frames)[:, None]
     there = (number >= start) & (number < start + lives)
     x = 500 * torch.rand(count, 2, generator=generator, dtype=F64) + 4.0 * number[..., None]
-    return TrackTable.of(torch.where(there[..., None], x, torch.nan))
+    return TrackSet.of(torch.where(there[..., None], x, torch.nan))
 
 
 def kept(pairs, film):
@@ -31,7 +31,7 @@ def test_coordinates_are_centred_and_no_shift_or_scale_changes_them():
     scene = shot((40, 20))
     film = scene.film()
     assert float(film.x.reshape(-1, 2).norm(dim=-1).median()) == pytest.approx(1.0, abs=0.1)
-    moved = TrackTable.of(3.5 * scene.tracks + torch.tensor([1000.0, -70.0], dtype=F64), 3.5)
+    moved = TrackSet.of(3.5 * scene.tracks + torch.tensor([1000.0, -70.0], dtype=F64), 3.5)
     torch.testing.assert_close(moved.x, film.x, rtol=0, atol=1e-9)
     assert moved.pixel == pytest.approx(film.pixel)
     torch.testing.assert_close(apply(film.change, scene.tracks[3]), film.x[3], rtol=0, atol=1e-9)
@@ -45,14 +45,14 @@ def test_what_is_missing_is_zero_and_not_seen():
     tracks = scene.tracks.clone()
     tracks[2:5, 7] = torch.nan
     tracks[0, 3, 0] = torch.inf  # half a point is none
-    film = TrackTable.of(tracks)
+    film = TrackSet.of(tracks)
     assert not bool(film.seen[2:5, 7].any()) and not bool(film.seen[0, 3]) and int((~film.seen).sum()) == 4
     assert bool((film.x[~film.seen] == 0).all()) and bool(film.x.isfinite().all())
     assert film.lengths.tolist() == [10] * 3 + [9] + [10] * 36  # from the first to the last frame, holes included
 
 
 def test_equal_points_do_not_divide_by_zero():
-    film = TrackTable.of(torch.full((3, 10, 2), 5.0, dtype=F64))
+    film = TrackSet.of(torch.full((3, 10, 2), 5.0, dtype=F64))
     assert bool(film.x.isfinite().all()) and film.pixel > 0
 
 
@@ -116,7 +116,7 @@ def test_no_pair_where_no_frames_have_enough_in_common():
     tracks = torch.full_like(scene.tracks, torch.nan)
     for track in range(30):
         tracks[track % 6, track] = scene.tracks[track % 6, track]
-    assert select_frame_pairs(TrackTable.of(tracks), 64) == []
+    assert select_frame_pairs(TrackSet.of(tracks), 64) == []
 
 
 def test_plain_videos_have_no_cut():
@@ -131,7 +131,7 @@ def test_a_cut_is_where_the_tracks_end_and_others_begin(frame):
     before, after = tracks.clone(), tracks.clone()
     before[frame:], after[:frame] = torch.nan, torch.nan
     before[:, :4] = tracks[:, :4]  # a few are taken for the same
-    cut = find_scene_cut(TrackTable.of(torch.cat([before, after], 1)))
+    cut = find_scene_cut(TrackSet.of(torch.cat([before, after], 1)))
     assert cut is not None and cut.frame == frame
     assert cut.share == pytest.approx(4 / 60, abs=0.02) and cut.jump == 0
 
@@ -142,11 +142,11 @@ def test_a_cut_is_where_all_tracks_jump(frame):
     tracks = scene.tracks.clone()
     shuffled = torch.randperm(80, generator=draw(1))
     tracks[frame:] = tracks[frame:][:, shuffled]
-    cut = find_scene_cut(TrackTable.of(tracks))
+    cut = find_scene_cut(TrackSet.of(tracks))
     assert cut is not None and cut.frame == frame and cut.jump > 5
 
 
 def test_some_tracks_that_jump_are_no_cut():
     tracks = shot((60, 20)).tracks.clone()
     tracks[5:, :20] += 300.0
-    assert find_scene_cut(TrackTable.of(tracks)) is None
+    assert find_scene_cut(TrackSet.of(tracks)) is None

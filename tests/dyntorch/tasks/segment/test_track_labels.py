@@ -11,7 +11,7 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.metrics import relative_error
 from dyntorch.tasks.segment import labels as module
-from dyntorch.tasks.segment.frame_pairs import TrackTable
+from dyntorch.tasks.segment.frame_pairs import TrackSet
 from dyntorch.tasks.segment.labels import distances, distances_from_cameras, find_static_body, motions, outliers, widths
 from dyntorch.tasks.segment.search import one_hot
 from tests.dyntorch.tasks.segment.videos import F64, Shot, shot
@@ -111,7 +111,7 @@ def test_widths_are_shares_of_the_picture():
     assert float(widths(scene.film(), everything)) == pytest.approx(1.0)
     # frames that show nothing do not count
     empty = torch.cat([scene.tracks, torch.full_like(scene.tracks[:3], torch.nan)])
-    torch.testing.assert_close(widths(TrackTable.of(empty, 2.5), members(scene)), found)
+    torch.testing.assert_close(widths(TrackSet.of(empty, 2.5), members(scene)), found)
 
 
 @pytest.mark.parametrize(
