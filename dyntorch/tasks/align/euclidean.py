@@ -164,7 +164,7 @@ def euclidean(solution: Solution, data: Matches, labels: Tensor, K: Tensor) -> t
     note(AlignNotice.CALIBRATION, choice.misfit, odd & ~free)
     first = views.motion(choice.normal)
     second = views.motion(torch.where(several[:, None], choice.other, choice.normal))
-    return _kept(first, views.fine, ~free, data), _kept(second, several, several, data), notices
+    return _to_batch(first, views.fine, ~free, data), _to_batch(second, several, several, data), notices
 
 
 def _angle(first: Tensor, second: Tensor) -> Tensor:
@@ -172,7 +172,7 @@ def _angle(first: Tensor, second: Tensor) -> Tensor:
     return torch.rad2deg(torch.atan2(torch.linalg.cross(first, second).norm(dim=-1), (first * second).sum(-1)))
 
 
-def _kept(motion: PlaneMotion, turned: Tensor, determined: Tensor, data: Matches) -> PlaneMotion:
+def _to_batch(motion: PlaneMotion, turned: Tensor, determined: Tensor, data: Matches) -> PlaneMotion:
     """Zero where there is no rotation, and where the plane, in units of whose distance translations are, is not determined."""
     both = turned & determined
     return PlaneMotion(

@@ -63,7 +63,7 @@ def align_join(
     """:func:`dyntorch.align_points` with a join tensor, for checked matches."""
     evidence = Evidence.of(moving_points(3, len(data.views)), data)
     best = _search(evidence, threshold, model, generator, options)
-    solution, labels, worst = _solved(evidence, best)
+    solution, labels, worst = _solve(evidence, best)
     outcome = replace(solution, inliers=labels != OUTLIER).back(data)
     A, B, *others = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
@@ -95,21 +95,21 @@ def _search(
             starts.append(_from_tensor(JoinTensor(), evidence, None, generator))
         # the least estimate is that of a motion most matches agree with; it may be low, for static matches show half the noise
         sigma = 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
-        theta = _improved(evidence, [start for start, _ in starts], sigma, sampled=True)
+        theta = _improve_starts(evidence, [start for start, _ in starts], sigma, sampled=True)
     else:
-        sigma, theta = given, _improved(evidence, [start for start, _ in starts], given, sampled=True)
+        sigma, theta = given, _improve_starts(evidence, [start for start, _ in starts], given, sampled=True)
         # where the noise is known, so is whether the motion of the minimal tensor is the right one
         doubt = _doubt(evidence, theta[-size:], given) if full else torch.zeros_like(given)
         if bool(doubt.any()):
             last, _ = _from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator)
-            theta = torch.cat([theta, _improved(evidence, [last], given, sampled=False)])
+            theta = torch.cat([theta, _improve_starts(evidence, [last], given, sampled=False)])
     count = len(theta) // size if size else 1
     best = evidence.repeated(count).cost(theta, sigma.repeat(count)).unflatten(0, (count, size)).argmin(0)
     chosen = theta[best * size + torch.arange(size, device=best.device)]
     return evidence.settled(chosen, sigma, estimate=given is None)
 
 
-def _improved(evidence: Evidence, starts: list[Tensor], sigma: Tensor, *, sampled: bool) -> Tensor:
+def _improve_starts(evidence: Evidence, starts: list[Tensor], sigma: Tensor, *, sampled: bool) -> Tensor:
     """All starts after :meth:`Evidence.improved`, ``(starts b, p)``; ``sampled``: the first is from a minimal sample."""
     count, size = len(starts), len(sigma)
     rough = (torch.arange(count, device=sigma.device).repeat_interleave(size) == 0) & sampled
@@ -175,7 +175,7 @@ def _from_tensor(
     return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
 
 
-def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
+def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
     """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
     refined = evidence.refined(best.theta, best.labels, MAX_JOIN_STEPS)
     theta = joined(refined)

@@ -79,7 +79,7 @@ class Lines:
 
     def still(self, theta: Tensor) -> Tensor:
         """Distances ``(b, n, 6)`` of both points of a line in view 2, carried into view 1, from the line there; 4 conditions."""
-        return _still(theta, self.norm.scales, self.views)
+        return _static_residuals(theta, self.norm.scales, self.views)
 
     def at_points(self, theta: Tensor) -> Tensor:
         """Disagreement ``(b, k, 3)`` of static points."""
@@ -121,7 +121,7 @@ class LinesProblem(NormalEquations):
         model = TranslatingLinesMatrix()
         tensor, slope = model.compose_derivative((theta.unflatten(-1, (4, 4)),))
         path, by_tensor = multilinear_derivative(model, tensor.unflatten(1, model.shape()), self.views, self.scales)
-        parts = [(path, slope @ by_tensor.mT), by_match(_still, theta, self.scales, self.views)]
+        parts = [(path, slope @ by_tensor.mT), by_match(_static_residuals, theta, self.scales, self.views)]
         parts = [(value * root, slope * root[:, None]) for (value, slope), root in zip(parts, self.roots, strict=True)]
         parts.append(by_match(_at_points, theta, self.scales, self.points))
         value, slope = (torch.cat(part, dim=-1) for part in zip(*parts, strict=True))
@@ -129,7 +129,7 @@ class LinesProblem(NormalEquations):
         return torch.where(cost.isfinite(), cost, torch.inf), (slope @ value[..., None])[..., 0], slope @ slope.mT
 
 
-def _still(theta: Tensor, scales: tuple[Tensor, ...], views: tuple[Tensor, ...]) -> Tensor:
+def _static_residuals(theta: Tensor, scales: tuple[Tensor, ...], views: tuple[Tensor, ...]) -> Tensor:
     first, second = views[0].unbind(-2)
     along = second - first
     square = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(theta.dtype).tiny)
@@ -322,7 +322,7 @@ def _align(
 ) -> Alignment:
     flat = replace(data, views=as_points(data.views, data.weights), batch=data.weights.shape[:1], dtype=torch.float64)
     flat = replace(flat, weights=flat.weights / flat.weights.amax(-1, keepdim=True).clamp(min=1e-300), device=flat.weights.device)
-    joined = _joined(flat, points)
+    joined = _join_matches(flat, points)
     given = None if threshold is None else torch.full_like(flat.weights[:, 0], threshold / THRESHOLD_SIGMAS)
     plain = (given is None and joined.count < MIN_LINES_UNKNOWN_NOISE) or not len(flat.weights)
     start = (
@@ -341,7 +341,7 @@ def _align(
     theta = torch.where(usable[:, None], start.normalized_motion()[0].flatten(1), torch.eye(4).to(flat.weights).flatten() / 2)
     if not plain:
         bound = three_sigma(1) * (_noise(lines, theta, plain) if given is None else given.maximum(lines.floor)).square()
-        theta = _better(lines, theta, usable, bound, generator, options)
+        theta = _select_start(lines, theta, usable, bound, generator, options)
     sigma = _noise(lines, theta, plain) if given is None else given.maximum(lines.floor)
     theta, labels, sigma = settle(lines, theta, sigma, estimate=given is None, plain=plain)
     return _result(data, lines, start, theta, labels, sigma, usable, points, options)
@@ -373,7 +373,7 @@ def _from_static(lines: Lines, bound: Tensor, generator: torch.Generator | None,
     return best[:, 0]
 
 
-def _better(
+def _select_start(
     lines: Lines, theta: Tensor, usable: Tensor, bound: Tensor, generator: torch.Generator | None, options: AlignOptions
 ) -> Tensor:
     """The start, or where few lines agree with it that of :func:`_from_static`, if its truncated squared error is less."""
@@ -390,7 +390,7 @@ def _better(
     return torch.where((doubtful & (squares(other).sum(-1) < here.sum(-1)))[:, None], other, theta)
 
 
-def _joined(data: Matches, points: tuple[Tensor, Tensor] | None) -> Matches:
+def _join_matches(data: Matches, points: tuple[Tensor, Tensor] | None) -> Matches:
     """Lines and static points as matches of lines."""
     if points is None:
         return replace(data, static=None)
@@ -434,7 +434,7 @@ def _result(
     rank = _rank(lines, labels, sigma, usable, points)
     status = torch.where((rank <= RANKS[-1][0]) & (status == Status.OK), int(Status.AMBIGUOUS), status)
     doubtful = (rank < MINIMAL) & (status == Status.OK)
-    status = torch.where(_rivals(lines, theta, labels, points, doubtful, options), int(Status.AMBIGUOUS), status)
+    status = torch.where(_has_alternatives(lines, theta, labels, points, doubtful, options), int(Status.AMBIGUOUS), status)
     status = torch.where(extent[:, 0] <= MIN_INFORMATION * extent[:, 1], int(Status.DEGENERATE), status)
     status = torch.where(usable, status, start.status.to(status))
     none = failed(status)
@@ -452,7 +452,7 @@ def _result(
     )
 
 
-def _rivals(
+def _has_alternatives(
     lines: Lines,
     theta: Tensor,
     labels: Tensor,
@@ -465,7 +465,7 @@ def _rivals(
     if not bool(doubtful.any()):
         return found
     model, problem = TranslatingLinesMatrix(), lines.problem(labels)
-    joined = _joined(lines.data.restrict(labels != OUTLIER), points)
+    joined = _join_matches(lines.data.restrict(labels != OUTLIER), points)
     _, vectors = spectrum(gram(model.primitives, lines.norm.apply(model, joined.views), joined.weights))
     best, here = problem.normal_equations(theta)[0], unit(theta.unflatten(-1, (4, 4)))
     weakest = vectors[..., :NUM_WEAK_DIRECTIONS].unbind(-1)
@@ -482,7 +482,7 @@ def _rivals(
 def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: tuple[Tensor, Tensor] | None) -> Tensor:
     """Singular values ``(b,)`` of the estimation matrix above the noise: of the inliers, of all lines where there is no motion."""
     kept = lines.data.restrict((labels != OUTLIER) | ~usable[:, None])
-    joined = _joined(kept, points)
+    joined = _join_matches(kept, points)
     if joined.count < MINIMAL:
         return torch.full_like(labels[:, 0], MINIMAL)
     values = fit_matches(TranslatingLinesMatrix(), joined).singular_values

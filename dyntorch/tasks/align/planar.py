@@ -281,7 +281,7 @@ def _align(
     data: Matches, threshold: float | None, K: Tensor | None, generator: torch.Generator | None, options: AlignOptions
 ) -> Alignment:
     evidence = Evidence.of(moving_points(2, len(data.views)), data)
-    solution, best, tensor = _solved(evidence, _search(evidence, threshold, generator, options))
+    solution, best, tensor = _solve(evidence, _search(evidence, threshold, generator, options))
     outcome = solution.back(data)
     A, B, *others = outcome.motion
     assert outcome.sigma is not None and outcome.covariance is not None
@@ -397,7 +397,7 @@ def _usable(motion: tuple[Tensor, ...], found: Solution) -> tuple[Tensor, Tensor
     return torch.where(usable[:, None], theta, identity), usable
 
 
-def _solved(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
+def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
     """The solution with its status, the final labels, none where there is no motion, and what the tensor alone rests on."""
     refined = evidence.refined(best.theta, best.labels, MAX_PLANAR_STEPS)
     theta = joined(refined)

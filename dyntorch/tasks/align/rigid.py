@@ -260,7 +260,7 @@ def _search(
     first = torch.arange(len(winner), device=winner.device)
     flat = RigidSightings(data.x1[:, 0], data.x2[:, 0], data.x3[:, 0], data.weights[:, 0], data.motion)
     grounded = held.any(-1) if data.motion == "constant_velocity" else torch.ones_like(held[:, 0])
-    found = _settle(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor)
+    found = _iterate_labels(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor)
     if data.motion == "straight":
         return found
     common, members, present = *common_velocity(found, flat, options), (flat.weights > 0).sum(-1)
@@ -268,7 +268,7 @@ def _search(
     found = replace(found, motions=drifted(found.motions, torch.where(grounded[:, None], 0.0, common)))
     if not bool(standing.any()):
         return found
-    return _settle(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
+    return _iterate_labels(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
 
 
 def _all(data: RigidSightings) -> Tensor:
@@ -309,7 +309,7 @@ def _score(moving: Tensor, static: Tensor, held: Tensor, data: RigidSightings, s
     return (cost * (data.weights > 0)).sum(-1)
 
 
-def _settle(
+def _iterate_labels(
     motions: Tensor,
     data: RigidSightings,
     sigma: Tensor,
@@ -429,7 +429,7 @@ def _result(
     status = _status(labels, sightings.weights, worst, noisy, values <= RIGID_INFORMATION_RATIO * top, dof, MOTIONS[motion])
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
-    matrices, entries = _measured(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
+    matrices, entries = _to_point_units(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
     # a noise beyond the range of the numbers is not known, and nor is the covariance
     known = found.sigma.isfinite() & entries.isfinite().flatten(1).all(-1)
     entries = torch.where(known[:, None, None], entries, torch.inf)
@@ -487,7 +487,7 @@ def _status(
     return torch.where(present < 3, int(Status.TOO_FEW), status)
 
 
-def _measured(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale: Tensor) -> tuple[Tensor, Tensor]:
+def _to_point_units(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale: Tensor) -> tuple[Tensor, Tensor]:
     """Motions ``(b, 2, 4, 4)`` in the unit of the points, and the covariance ``(b, 32, 32)`` of their entries."""
     first, *others = centres
     result = motions.clone()

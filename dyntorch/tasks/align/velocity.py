@@ -70,16 +70,18 @@ def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estim
     known = evidence.data.static
     grounded = torch.zeros_like(sigma, dtype=torch.bool) if known is None else (known & (evidence.data.weights > 0)).any(-1)
     if known is not None:
-        theta = _fixed(evidence, theta, known & (evidence.data.weights > 0))
-    state = _rounds(evidence, Velocities(theta, _labels(evidence, theta, sigma, grounded), sigma, grounded), affine, estimate)
-    theta, standing = _ground(evidence, state, options)
+        theta = _fix_gauge(evidence, theta, known & (evidence.data.weights > 0))
+    state = _label_and_fit(
+        evidence, Velocities(theta, _labels(evidence, theta, sigma, grounded), sigma, grounded), affine, estimate
+    )
+    theta, standing = _find_background(evidence, state, options)
     standing = standing & ~grounded
     state = replace(state, theta=theta)
     if not bool(standing.any()):
         return state
     grounded = grounded | standing
     labels = _labels(evidence, theta, state.sigma, grounded)
-    return _rounds(evidence, Velocities(theta, labels, state.sigma, grounded), affine, estimate)
+    return _label_and_fit(evidence, Velocities(theta, labels, state.sigma, grounded), affine, estimate)
 
 
 def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -112,7 +114,7 @@ def residuals(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor]:
     return moving, model.whitened_static(motion, evidence.views, scales).square().sum(-1)
 
 
-def _rounds(evidence: Evidence, state: Velocities, affine: bool, estimate: bool) -> Velocities:
+def _label_and_fit(evidence: Evidence, state: Velocities, affine: bool, estimate: bool) -> Velocities:
     theta, labels, sigma = state.theta, state.labels, state.sigma
     for _ in range(NUM_VELOCITY_ROUNDS):
         theta = refined(evidence, theta, labels, affine)
@@ -143,7 +145,7 @@ def _noise(evidence: Evidence, theta: Tensor, labels: Tensor, before: Tensor, do
     return torch.where(spare >= 6, shown, before).maximum(evidence.floor)
 
 
-def _ground(evidence: Evidence, state: Velocities, options: AlignOptions) -> tuple[Tensor, Tensor]:
+def _find_background(evidence: Evidence, state: Velocities, options: AlignOptions) -> tuple[Tensor, Tensor]:
     """Maps in the gauge in which the most matches stand still, and where these are enough; else the mean velocity is 0."""
     inliers = state.labels != OUTLIER
     limit = three_sigma(6) * state.sigma.square()[:, None]
@@ -159,15 +161,15 @@ def _ground(evidence: Evidence, state: Velocities, options: AlignOptions) -> tup
     near = (resting <= ROUGH_LABEL_FACTOR**2 * limit[:, None]) & inliers[:, None]
     best = (near.sum(-1) * inliers[:, chosen]).argmax(-1)
     members = near[torch.arange(len(best), device=best.device), best]
-    theta = _fixed(evidence, state.theta, members)
+    theta = _fix_gauge(evidence, state.theta, members)
     members = (residuals(evidence, theta)[1] <= limit) & inliers
     count = members.sum(-1)
     enough = (count >= 3) & (count >= options.min_static_share * inliers.sum(-1))
     free = torch.where(state.grounded[:, None], False, torch.where(enough[:, None], members, inliers))
-    return _fixed(evidence, state.theta, free), enough
+    return _fix_gauge(evidence, state.theta, free), enough
 
 
-def _fixed(evidence: Evidence, theta: Tensor, members: Tensor) -> Tensor:
+def _fix_gauge(evidence: Evidence, theta: Tensor, members: Tensor) -> Tensor:
     x1, x2, x3 = evidence.views
     motion = ConstantVelocityTensor.fix_gauge(_maps(evidence, theta), x1, x2, x3, weights=members.to(theta))
     return torch.cat([part.flatten(1) for part in motion], dim=-1)

@@ -125,7 +125,7 @@ def padded(name: str, views: tuple[Points, Points]) -> Pair:
     if len(views) != 2 or any(not isinstance(x, Tensor | Sequence) or isinstance(x, str) for x in views):
         kinds = ", ".join(type(x).__name__ for x in views)
         raise ValueError(f"{name} must be two views, each a tensor or a list of tensors, got {len(views)}: {kinds}")
-    first, second = (x if isinstance(x, Tensor) else _stacked(name, x) for x in views)
+    first, second = (x if isinstance(x, Tensor) else _stack(name, x) for x in views)
     if first.shape != second.shape or first.ndim < 3 or first.shape[-1] != 2 or not first.is_floating_point():
         raise ValueError(
             f"{name} must be two views (*batch, planes, n, 2), or lists of (*batch, n, 2), of one floating point type, "
@@ -138,7 +138,7 @@ def padded(name: str, views: tuple[Points, Points]) -> Pair:
     return first, second
 
 
-def _stacked(name: str, points: Sequence[Tensor]) -> Tensor:
+def _stack(name: str, points: Sequence[Tensor]) -> Tensor:
     shapes = [tuple(torch.as_tensor(x).shape) for x in points]
     if not shapes or any(len(s) < 2 or s[-1] != 2 or s[:-2] != shapes[0][:-2] for s in shapes):
         raise ValueError(f"{name} must be lists of tensors (*batch, n, 2), one for each plane, got {shapes}")
@@ -186,14 +186,14 @@ def check_counts(planes: int, bodies: int, method: str) -> None:
         raise ValueError(f"method must be 'auto' or one of {', '.join(LEAST)}, got {method!r}")
     if not bool(enough(torch.tensor(planes), torch.tensor(bodies), method)):
         least = {"auto": "3 planes, 2 planes and 1 fundamental matrix, or 2 fundamental matrices"}
-        least |= {name: _counted(p, m) for name, (p, m) in LEAST.items()}
+        least |= {name: _count_words(p, m) for name, (p, m) in LEAST.items()}
         raise ValueError(
-            f"H and fundamentals hold {_counted(planes, bodies)}; method {method!r} needs at least {least[method]}: "
+            f"H and fundamentals hold {_count_words(planes, bodies)}; method {method!r} needs at least {least[method]}: "
             f"add some, each with a translation of its own"
         )
 
 
-def _counted(planes: int, bodies: int) -> str:
+def _count_words(planes: int, bodies: int) -> str:
     """As many planes and fundamental matrices as there are, such as ``"2 planes and 1 fundamental matrix"``."""
     said = [f"{planes} plane{'s' * (planes != 1)}"] * bool(planes)
     return " and ".join(said + [f"{bodies} fundamental matri{'x' if bodies == 1 else 'ces'}"] * bool(bodies)) or "none"

@@ -230,7 +230,7 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     }
     limits = planes_notices(figures, right, said, given)
     there = (~failed(status)).to(theta.dtype)
-    infinity, epipoles, normals = _measured(given, layout, theta)
+    infinity, epipoles, normals = _to_pixels(given, layout, theta)
     infinity = infinity * there[:, None, None]
     mask = (used & there.bool()[:, None]).to(theta.dtype)[..., None]
     epipoles, normals = epipoles * mask, normals * mask[:, : layout.planes]
@@ -249,8 +249,8 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
         scales=scales * mask[:, : layout.planes, 0],
         used=used,
         residual=(cost / rows.clamp(min=1)).sqrt() * there,
-        covariance=_known(_carried(covariance[:, :9, :9], theta[:, :9], given.frames), there),
-        uncertainty=_known(uncertainty, there),
+        covariance=_mask_missing(_transform_covariance(covariance[:, :9, :9], theta[:, :9], given.frames), there),
+        uncertainty=_mask_missing(uncertainty, there),
         status=status,
         rotation=rotation,
         calibration=given.calibration,
@@ -288,7 +288,7 @@ def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor) ->
     )
 
 
-def _measured(given: GivenPlanes, layout: Layout, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _to_pixels(given: GivenPlanes, layout: Layout, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Homography at infinity of norm 1, unit epipoles and normals in measured coordinates."""
     infinity, epipoles, planes = layout.unpack(theta)
     first, back = given.frames[0], torch.linalg.inv_ex(given.frames[1])[0]
@@ -312,14 +312,14 @@ def _measured(given: GivenPlanes, layout: Layout, theta: Tensor) -> tuple[Tensor
     return found, torch.cat([e[:, : layout.planes] * sign, bodies], dim=1), normals * sign
 
 
-def _known(value: Tensor, there: Tensor) -> Tensor:
+def _mask_missing(value: Tensor, there: Tensor) -> Tensor:
     """Zero where there is no result, infinite where a number of it is beyond the range."""
     wide = (..., *[None] * (value.ndim - 1))
     finite = value.isfinite().flatten(1).all(-1) if value.ndim > 1 else value.isfinite()
     return torch.where(there.bool()[wide], torch.where(finite[wide], value, torch.inf), 0.0)
 
 
-def _carried(covariance: Tensor, entries: Tensor, frames: tuple[Tensor, Tensor]) -> Tensor:
+def _transform_covariance(covariance: Tensor, entries: Tensor, frames: tuple[Tensor, Tensor]) -> Tensor:
     """Covariance ``(b, 9, 9)`` of the entries of the homography at infinity in measured coordinates, at norm 1."""
     back = torch.linalg.inv_ex(frames[1])[0]
     lift = two_sided(back, frames[0])
@@ -408,7 +408,7 @@ def translating_planes(
     camera = None if calibration is None else cameras(calibration, tuple(H.shape[:-3]), H)
     with torch.no_grad():
         given = GivenPlanes.of(H, F, planes, bodies, camera)
-        result = outcome(given, _solved(given, method, refine, options), method, refine, options)
+        result = outcome(given, _solve_blocks(given, method, refine, options), method, refine, options)
         shaped: dict[str, Any] = {name: given.back(value) for name, value in vars(result).items() if isinstance(value, Tensor)}
     return replace(result, **shaped)
 
@@ -421,7 +421,7 @@ def _views(x1: Points | None, x2: Points | None) -> Pair | None:
     return padded("x1 and x2", (x1, x2))
 
 
-def _solved(given: GivenPlanes, method: str, refine: bool, options: PlanesOptions) -> tuple[Tensor, ...]:
+def _solve_blocks(given: GivenPlanes, method: str, refine: bool, options: PlanesOptions) -> tuple[Tensor, ...]:
     """What :func:`~dyntorch.tasks.planes.problem.solve` says, block by block, and the cost under the given matrices."""
     seen, body = given.planes, given.bodies
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])

@@ -90,7 +90,7 @@ class Layout:
 
     def models(self, theta: Tensor) -> Tensor:
         """``(*, p + m, 3, 3)`` homographies of the planes, then fundamental matrices of the bodies."""
-        return self.models_of(pad(theta, (0, 1))[..., _own(self.planes, self.bodies, theta.device)])
+        return self.models_of(pad(theta, (0, 1))[..., _parameter_places(self.planes, self.bodies, theta.device)])
 
     def models_of(self, entries: Tensor) -> Tensor:
         """The same from the parameters ``(*, p + m, 16)`` of each: homography at infinity, epipole, plane (0 for a body)."""
@@ -201,7 +201,7 @@ class PlanesProblem(NormalEquations):
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost ``(b,)``, gradient ``(b, size)`` and Gauss-Newton matrix ``(b, size, size)``."""
-        own, size = _own(self.layout.planes, self.layout.bodies, theta.device), self.layout.size
+        own, size = _parameter_places(self.layout.planes, self.layout.bodies, theta.device), self.layout.size
         # a plane or body depends on 16 parameters: its share has that size, whatever their number
         entries = pad(theta, (0, 1))[:, own]
         flat, slopes = jacobian(lambda each: self.layout.models_of(each).flatten(-2), entries)
@@ -218,7 +218,7 @@ class PlanesProblem(NormalEquations):
 
 
 @constant
-def _own(planes: int, bodies: int, device: torch.device) -> Tensor:
+def _parameter_places(planes: int, bodies: int, device: torch.device) -> Tensor:
     """Where the 16 parameters of every plane and body are, ``(p + m, 16)``; a body has no plane, and points behind the end."""
     count = planes + bodies
     shared = torch.arange(9, device=device).expand(count, 9)
@@ -283,7 +283,7 @@ def starts(method: str, homographies: Tensor, fundamentals: Tensor, several: boo
     """Homographies at infinity ``(b, 3, 3)`` of norm about 1 by one method, or by all that the numbers of planes and bodies
     allow."""
     planes, bodies = homographies.shape[1], fundamentals.shape[1]
-    filled, known = _filled(homographies), _filled(fundamentals)
+    filled, known = _fill_missing(homographies), _fill_missing(fundamentals)
     chosen = AUTOMATIC if method == "auto" else (method,)
     found = []
     for name in chosen:
@@ -304,7 +304,7 @@ def starts(method: str, homographies: Tensor, fundamentals: Tensor, several: boo
     ]
 
 
-def _filled(matrices: Tensor) -> Tensor:
+def _fill_missing(matrices: Tensor) -> Tensor:
     """The first matrix that is there in the place of each missing one: the same plane again says nothing new."""
     if not matrices.shape[1]:
         return matrices
@@ -368,7 +368,7 @@ def solve(
         start = rounds.evaluate((theta,))
         theta = minimize(rounds, start, LeastSquaresOptions(iterations=MAX_STEPS_ON_MATRICES)).theta[0]
     cost = rounds.normal_equations(theta)[0]
-    theta, cost = _distinct(theta.unflatten(0, (len(first), b)), cost.unflatten(0, (len(first), b)), options.num_refined)
+    theta, cost = _select_distinct(theta.unflatten(0, (len(first), b)), cost.unflatten(0, (len(first), b)), options.num_refined)
     problem = matrices if matches is None else PlanesProblem(layout, matches)
     if matches is not None:
         chosen = cost.flatten().isfinite().nonzero()[:, 0]
@@ -382,7 +382,9 @@ def solve(
         cost = cost.flatten().index_copy(0, chosen, value).unflatten(0, cost.shape)
     best = cost.argmin(0)
     everyone = torch.arange(b, device=best.device)
-    other = _others(theta[..., :9], cost, best, spare, options.risk) if refine else torch.zeros_like(spare, dtype=torch.bool)
+    other = (
+        _has_alternatives(theta[..., :9], cost, best, spare, options.risk) if refine else torch.zeros_like(spare, dtype=torch.bool)
+    )
     theta, cost = theta[best, everyone], cost[best, everyone]
     covariance, undetermined = _covariance(problem, theta)
     if matches is not None:
@@ -390,7 +392,7 @@ def solve(
     return theta, cost, covariance, undetermined, other
 
 
-def _distinct(theta: Tensor, cost: Tensor, num_refined: int) -> tuple[Tensor, Tensor]:
+def _select_distinct(theta: Tensor, cost: Tensor, num_refined: int) -> tuple[Tensor, Tensor]:
     """The best few of several results ``(rounds, b, *)``; the cost of one that was found before is infinite."""
     cost, order = cost.nan_to_num(torch.inf).sort(dim=0, stable=True)
     theta = theta.gather(0, order[..., None].expand_as(theta))
@@ -403,7 +405,7 @@ def _distinct(theta: Tensor, cost: Tensor, num_refined: int) -> tuple[Tensor, Te
     return theta.gather(0, order[..., None].expand_as(theta))[:num_refined], cost[:num_refined]
 
 
-def _others(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor, risk: float) -> Tensor:
+def _has_alternatives(infinity: Tensor, cost: Tensor, best: Tensor, spare: Tensor, risk: float) -> Tensor:
     """Where another homography at infinity ``(k, b, 9)`` has about the cost of the best."""
     directions = unit_vectors(infinity)
     everyone = torch.arange(len(best), device=best.device)

@@ -14,7 +14,7 @@ from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import null_vector
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.chi_square import median
-from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, Film, Pair
+from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, Pair, TrackSet
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.track_energy import Candidates
 
@@ -66,7 +66,7 @@ class Separation:
 class NearPairs:
     """Linear fits of many groups of tracks between many pairs of near frames at a time."""
 
-    def __init__(self, film: Film, pairs: Sequence[Pair]) -> None:
+    def __init__(self, film: TrackSet, pairs: Sequence[Pair]) -> None:
         """Of pairs of frames ``(p, 2)``."""
         first, second = torch.tensor(list(pairs), device=film.x.device).reshape(-1, 2).unbind(-1)
         x1, x2 = film.x[first], film.x[second]
@@ -90,7 +90,7 @@ class NearPairs:
         precision = self.precision[live][:, index]
         weight = square = member
         for remaining in range(rounds, -1, -1):
-            F = self._least(weight, products)
+            F = self._solve_least_squares(weight, products)
             matrix = F.unflatten(-1, (3, 3))
             there, here = first @ matrix[:, :2].mT, second @ matrix[:, :, :2]
             gradient = (there.square().sum(-1) + here.square().sum(-1)).clamp(min=1e-12)
@@ -100,7 +100,7 @@ class NearPairs:
                 weight = weight / weight.amax(-1, keepdim=True).clamp(min=1e-200)
         return square, member > 0
 
-    def _least(self, weight: Tensor, products: Tensor) -> Tensor:
+    def _solve_least_squares(self, weight: Tensor, products: Tensor) -> Tensor:
         """Unit vectors ``(q, 9)`` of least squares."""
         sums = (weight[:, None] @ products)[:, 0]
         gram = sums.new_zeros(*sums.shape[:-1], 9, 9)
@@ -122,7 +122,7 @@ class NearPairs:
 
 
 @dataclass
-class Judge:
+class GroupCosts:
     """Costs of groups of tracks under one motion each, every group fitted once."""
 
     near: NearPairs  # pairs of frames
@@ -131,13 +131,13 @@ class Judge:
     known: dict[bytes, float] = field(default_factory=dict)
 
     @staticmethod
-    def of(near: NearPairs, kernel: Tensor, groups: Tensor) -> Judge:
+    def of(near: NearPairs, kernel: Tensor, groups: Tensor) -> GroupCosts:
         """With the noise of groups ``(g, n)`` bool that are surely pure."""
         found = [near.squares(group, FIRST_PIECE_NOISE_PIXELS) for group in groups]
         own = torch.cat([square[seen] for square, seen in found])
         noise = (float(own.median()) / median(1)) ** 0.5 if len(own) else FIRST_PIECE_NOISE_PIXELS
         alike = (kernel - CHANCE_PREFERENCE_SHARE).clamp(min=0)
-        return Judge(near, alike, COST_SCALE_FACTOR * max(noise, MIN_PIECE_NOISE_PIXELS))
+        return GroupCosts(near, alike, COST_SCALE_FACTOR * max(noise, MIN_PIECE_NOISE_PIXELS))
 
     def cost(self, groups: Tensor) -> Tensor:
         """``(g,)`` of groups ``(g, n)`` bool."""
@@ -164,7 +164,7 @@ class Judge:
         )
 
 
-def merged(judge: Judge, labels: Tensor, counts: Sequence[int]) -> dict[int, Tensor]:
+def merge_pieces(judge: GroupCosts, labels: Tensor, counts: Sequence[int]) -> dict[int, Tensor]:
     """Labels ``(n,)`` from 0 with each number of bodies, from pieces ``(n,)`` that are joined one pair after the other."""
     groups = one_hot(labels, int(labels.max()) + 1) > 0
     groups = groups[groups.any(-1)]
@@ -182,7 +182,7 @@ def merged(judge: Judge, labels: Tensor, counts: Sequence[int]) -> dict[int, Ten
         groups = torch.cat([groups[rest], (groups[one] | groups[other])[None]])
 
 
-def weakest_separation(judge: Judge, candidate: Candidates, weight: float) -> float:
+def weakest_separation(judge: GroupCosts, candidate: Candidates, weight: float) -> float:
     """Of the least separate bodies of one candidate; infinite for a single body."""
     member = one_hot(candidate.labels[0], candidate.bodies) > 0
     if len(member) < 2:

@@ -96,11 +96,11 @@ def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None)
     for _ in range(NUM_PASSES):
         # the first pass finds most wrong matches, which then no longer stand between the neighbours of the others
         trusted = values > MIN_NEIGHBOUR_COHERENCE
-        values, linked = _judged(x1, x2, fresh & trusted, scale)
+        values, linked = _measure_coherence(x1, x2, fresh & trusted, scale)
     return Coherence(values, _links(*linked, among))
 
 
-def _judged(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+def _measure_coherence(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Coherence of all matches with their nearest eligible ones ``(n,)``; rows, columns and weights of the links."""
     count = len(x1)
     values = torch.zeros_like(x1[:, 0])
@@ -123,12 +123,12 @@ def _judged(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Ten
 
 def conformity(x1: Tensor, x2: Tensor, members: Tensor, scale: float) -> Tensor:
     """How well every match moves like its nearest members of each body. x1 ``(n, 2)``, members ``(K, n)`` -> ``(K, n)``."""
-    some = [_thinned(body) for body in members]
+    some = [_thin(body) for body in members]
     fresh = _first_of_copies(x1, x2, torch.stack(some).any(0), scale / 6)
-    return torch.stack([_judged(x1, x2, fresh & body, scale)[0] for body in some])
+    return torch.stack([_measure_coherence(x1, x2, fresh & body, scale)[0] for body in some])
 
 
-def _thinned(body: Tensor) -> Tensor:
+def _thin(body: Tensor) -> Tensor:
     """About ``MAX_CONFORMITY_MEMBERS`` of the members ``(n,)`` bool, evenly."""
     rank = body.cumsum(-1)
     return body & (rank % max(1, int(rank[-1]) // MAX_CONFORMITY_MEMBERS) == 0)

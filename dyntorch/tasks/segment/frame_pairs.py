@@ -35,13 +35,13 @@ class FramePair:
     view: View  # their places, without links
     precision: Tensor  # ``(m,)`` in [0, 1]: the inverse variance of a track beside that of one that does not move
 
-    def weighed(self, groups: Tensor) -> Tensor:
+    def weigh_groups(self, groups: Tensor) -> Tensor:
         """Weights ``(B, m)`` of these tracks in fits of groups ``(B, n)``: by their precision, of mean 1."""
         return groups[:, self.index].double() * (self.precision / self.precision.mean())
 
 
 @dataclass(frozen=True)
-class Film:
+class TrackSet:
     """The tracks of one problem, centred and of about unit size, all frames alike."""
 
     x: Tensor  # ``(frames, n, 2)``, 0 where a track is missing
@@ -50,7 +50,7 @@ class Film:
     change: Tensor  # ``(3, 3)`` similarity from pixels to them
 
     @staticmethod
-    def of(tracks: Tensor, pixel: float = 1.0) -> Film:
+    def of(tracks: Tensor, pixel: float = 1.0) -> TrackSet:
         """Of tracks ``(frames, n, 2)``, NaN = missing, in whose unit a pixel of the options is so long."""
         seen = tracks.isfinite().all(-1)
         there = tracks[seen]
@@ -59,7 +59,7 @@ class Film:
         spread = distance[distance > 0].median() if bool(distance.any()) else torch.ones_like(distance[0])
         scale = 1 / spread
         x = torch.where(seen[..., None], (tracks - centre) * scale, 0.0)
-        return Film(x, seen, pixel * float(scale), similarity(scale, centre))
+        return TrackSet(x, seen, pixel * float(scale), similarity(scale, centre))
 
     @cached_property
     def ends(self) -> tuple[Tensor, Tensor]:
@@ -83,7 +83,7 @@ class Film:
         return FramePair(frames, index, View(x1, x2, self.pixel, none), 1 / (1 + moved / DOUBLED_VARIANCE_MOTION))
 
 
-def spread_evenly(count: int, gap: int, most: int) -> list[Pair]:
+def space_pairs(count: int, gap: int, most: int) -> list[Pair]:
     """Up to ``most`` pairs of ``count`` frames with a gap, from the first to the last."""
     last = count - 1 - gap
     number = min(most, last + 1)
@@ -91,16 +91,16 @@ def spread_evenly(count: int, gap: int, most: int) -> list[Pair]:
     return [(a, a + gap) for a in places]
 
 
-def pairs_near(film: Film, gaps: tuple[int, ...], starts: int, common: int) -> list[Pair]:
+def select_near_pairs(film: TrackSet, gaps: tuple[int, ...], starts: int, common: int) -> list[Pair]:
     """Pairs of frames with the given gaps, evenly spread; in a video longer than its tracks there are more of them."""
     count = len(film.seen)
     length = float(film.lengths.double().median())
     most = round(starts * max(1.0, count / max(length, 4.0) / 1.5))
-    found = dict.fromkeys(pair for gap in gaps for pair in spread_evenly(count, min(gap, count - 1), most))
-    return [pair for pair in found if _common(film, pair) >= common]
+    found = dict.fromkeys(pair for gap in gaps for pair in space_pairs(count, min(gap, count - 1), most))
+    return [pair for pair in found if _num_common_tracks(film, pair) >= common]
 
 
-def chosen_pairs(film: Film, max_pairs: int) -> list[Pair]:
+def select_frame_pairs(film: TrackSet, max_pairs: int) -> list[Pair]:
     """The pairs of frames that bodies are judged by: wide ones, narrower ones for short tracks, all tracks in some of them."""
     count = len(film.seen)
     common = min(MIN_COMMON_TRACKS, max(8, film.x.shape[1] // 2))
@@ -140,7 +140,7 @@ class SceneCut:
     jump: float = 0.0
 
 
-def cut_of(film: Film) -> SceneCut | None:
+def find_scene_cut(film: TrackSet) -> SceneCut | None:
     """The first cut of a video, if there is one."""
     first, last = film.ends
     steps = []
@@ -161,5 +161,5 @@ def cut_of(film: Film) -> SceneCut | None:
     return None
 
 
-def _common(film: Film, pair: Pair) -> int:
+def _num_common_tracks(film: TrackSet, pair: Pair) -> int:
     return int((film.seen[pair[0]] & film.seen[pair[1]]).sum())

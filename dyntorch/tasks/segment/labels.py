@@ -17,7 +17,7 @@ from dyntorch.geometry.homography import homography, homography_sampson_squared
 from dyntorch.numerics.chi_square import median
 from dyntorch.tasks.segment.coherence import Links, conformity
 from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS, View, mean_field
-from dyntorch.tasks.segment.frame_pairs import Film, FramePair
+from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet
 from dyntorch.tasks.segment.track_energy import MIN_BODY_TRACKS, Geometry
 
 OUTLIER_COST = 1.0  # where many are
@@ -57,7 +57,7 @@ class Labelling:
         return Labelling(torch.cat([1 - kept.sum(0, keepdim=True), kept]).clamp(min=0), self.fundamentals[bodies])
 
 
-def label(
+def label_matches(
     view: View,
     found: Tensor,
     fundamentals: Tensor,
@@ -70,14 +70,14 @@ def label(
     numbers = torch.arange(1, len(fundamentals) + 1, device=found.device)[:, None]
     members = found == numbers
     gain = ASSIGNMENT_GAIN * members.to(weights.dtype) if scale is not None else 0.0
-    strange = _strange(view, members, scale)
-    links = _normalized(view.links)
+    strange = _nonconformity_cost(view, members, scale)
+    links = _normalize_links(view.links)
     odds = [(1 - p) / p for p in (min(max(share, MIN_OUTLIER_SHARE), MAX_OUTLIER_SHARE), MAX_OUTLIER_SHARE)]
     outlier = OUTLIER_COST + log(odds[0] / odds[1]) / LABEL_SHARPNESS
 
     def probabilities(bodies: Tensor) -> Tensor:
         square = sampson_squared(bodies, view.x1, view.x2) / threshold**2
-        return field(square.clamp(max=MAX_SQUARED_DISTANCE) + strange - gain, outlier, links)
+        return label_field(square.clamp(max=MAX_SQUARED_DISTANCE) + strange - gain, outlier, links)
 
     bodies = fundamentals
     member = probabilities(bodies)
@@ -85,18 +85,18 @@ def label(
         members = member.argmax(0) == numbers
         # a descent never raises its own truncated cost, so geometries cannot drift away from their members
         bodies = descend(bodies, view.x1, view.x2, members * weights, LABEL_FIT_SCALE * threshold)
-        strange = _strange(view, members, scale) if turn == 0 else strange
+        strange = _nonconformity_cost(view, members, scale) if turn == 0 else strange
         member = probabilities(bodies)
     return Labelling(member, bodies)
 
 
-def field(cost: Tensor, outlier: float, links: Links) -> Tensor:
+def label_field(cost: Tensor, outlier: float, links: Links) -> Tensor:
     """Mean field ``(K + 1, n)`` of the costs ``(K, n)`` of bodies, the first of an outlier."""
     every = torch.cat([torch.full_like(cost[:1], outlier), cost])
     return mean_field(LABEL_SHARPNESS * every, links, LABEL_SHARPNESS, NUM_LABEL_UPDATES)
 
 
-def _strange(view: View, members: Tensor, scale: float | None) -> Tensor:
+def _nonconformity_cost(view: View, members: Tensor, scale: float | None) -> Tensor:
     """Cost ``(K, n)`` of moving unlike the neighbours."""
     if scale is None:
         return torch.zeros_like(members, dtype=view.x1.dtype)
@@ -106,7 +106,7 @@ def _strange(view: View, members: Tensor, scale: float | None) -> Tensor:
     return NONCONFORMITY_COST * (1 - value / (FREE_CONFORMITY * usual).clamp(min=MIN_FREE_CONFORMITY)).clamp(min=0)
 
 
-def _normalized(links: Links) -> Links:
+def _normalize_links(links: Links) -> Links:
     """Links whose sum is 1 for every match."""
     return Links(links.index, links.weight / links.weight.sum(-1, keepdim=True).clamp(min=1e-9))
 
@@ -126,7 +126,7 @@ class Models:
     planar: Tensor  # ``(K,)`` bool, the homography explains the body
 
 
-def choose(view: View, fundamentals: Tensor, members: Tensor) -> Models:
+def select_models(view: View, fundamentals: Tensor, members: Tensor) -> Models:
     r"""The model with the smaller robust information criterion,"""
     # weights are relative: they count as so many equal ones
     members = members * (members.sum(-1) / members.square().sum(-1).clamp(min=TINY))[:, None]
@@ -239,14 +239,14 @@ class BodyMotions:
     planar: Tensor
 
 
-def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film: Film) -> BodyMotions:
+def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film: TrackSet) -> BodyMotions:
     """With members ``(K, n)``, 0 or 1; 0 where two frames have too few of them in common."""
     back = torch.linalg.inv(film.change)
     fundamentals, homographies, planar = [], [], []
     for pair, F in zip(pairs, geometry, strict=True):
         some = member[:, pair.index]
         there = some.sum(-1) >= MIN_BODY_TRACKS
-        models = choose(pair.view, F[0], some)
+        models = select_models(pair.view, F[0], some)
         flat = there & models.planar
         fundamentals.append(torch.where(there[:, None, None], unit(film.change.mT @ F[0] @ film.change), 0.0))
         homographies.append(torch.where(flat[:, None, None], unit(back @ models.homographies @ film.change), 0.0))
@@ -254,7 +254,7 @@ def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film
     return BodyMotions(torch.stack(fundamentals), torch.stack(homographies), torch.stack(planar))
 
 
-def widths(film: Film, member: Tensor) -> Tensor:
+def widths(film: TrackSet, member: Tensor) -> Tensor:
     """How wide bodies of members ``(K, n)`` are: the share ``(K,)`` of the cells of a grid over the picture that they are seen in,
     of those that anything is seen in, in the mean over the frames."""
     there = film.x[film.seen]
@@ -271,7 +271,7 @@ def widths(film: Film, member: Tensor) -> Tensor:
     return torch.stack(shares).mean(0)
 
 
-def resting(film: Film, member: Tensor) -> int | None:
+def find_static_body(film: TrackSet, member: Tensor) -> int | None:
     """Which body of members ``(K, n)`` must be what stands still: the largest, if it is the widest, too, and large enough."""
     size = member.sum(-1)
     largest = int(size.argmax())
@@ -281,7 +281,7 @@ def resting(film: Film, member: Tensor) -> int | None:
     return largest if clear and float(size[largest]) >= MIN_STATIC_SHARE * float(size.sum()) else None
 
 
-def agreeing(tracks: Tensor, member: Tensor, cameras: Tensor, pairs: Sequence[FramePair]) -> Tensor:
+def distances_from_cameras(tracks: Tensor, member: Tensor, cameras: Tensor, pairs: Sequence[FramePair]) -> Tensor:
     """Median Sampson distances ``(K,)`` of bodies of members ``(K, n)`` from the motion of cameras ``(frames, 3, 4)``."""
     found: list[list[Tensor]] = [[] for _ in member]
     for pair in pairs:

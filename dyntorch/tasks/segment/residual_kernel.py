@@ -16,7 +16,7 @@ from torch import Tensor
 from dyntorch.geometry.homogeneous import cofactors, homogeneous
 from dyntorch.numerics.blocks import uniform
 from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.frame_pairs import Film, FramePair, pairs_near
+from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet, select_near_pairs
 
 TINY = 1e-12
 
@@ -29,20 +29,20 @@ MIN_SAMPLE_RADIUS = 0.05  # about its first track in which a hypothesis finds th
 MAX_SAMPLE_RADIUS = 0.7  # the largest one
 
 
-def preference_kernel(film: Film, searched: Tensor, generator: torch.Generator | None, num_hypotheses: int) -> Tensor:
+def preference_kernel(film: TrackSet, searched: Tensor, generator: torch.Generator | None, num_hypotheses: int) -> Tensor:
     r"""How alike tracks move: the mean share of preferred hypotheses that they have in common, searched ``(m,)`` -> ``(n, m)``."""
     count = film.x.shape[1]
     place = torch.full((count,), -1, device=searched.device)
     place[searched] = torch.arange(len(searched), device=searched.device)
     kernel = torch.zeros(count, len(searched), dtype=torch.float32, device=searched.device)
     met = torch.zeros_like(kernel)
-    for pair in pairs_near(film, KERNEL_GAPS, KERNEL_PAIRS_PER_GAP, MIN_KERNEL_TRACKS):
+    for pair in select_near_pairs(film, KERNEL_GAPS, KERNEL_PAIRS_PER_GAP, MIN_KERNEL_TRACKS):
         both = film.pair(pair)
         column = place[both.index]
         own = (column >= 0).nonzero().flatten()
         if len(own) < MIN_KERNEL_TRACKS:
             continue
-        liked = _preferred(both, own, generator, num_hypotheses)
+        liked = _rank_hypotheses(both, own, generator, num_hypotheses)
         shared = liked @ liked[own].mT
         rows, columns = both.index[:, None], column[own][None]
         kernel[rows, columns] += shared
@@ -52,7 +52,7 @@ def preference_kernel(film: Film, searched: Tensor, generator: torch.Generator |
     return kernel
 
 
-def _preferred(both: FramePair, own: Tensor, generator: torch.Generator | None, number: int) -> Tensor:
+def _rank_hypotheses(both: FramePair, own: Tensor, generator: torch.Generator | None, number: int) -> Tensor:
     """``(m, 3 h)`` 1 for what a track prefers, else 0, over the root of the number of preferences."""
     x1, x2 = both.view.x1, both.view.x2
     # three of eight tracks give an affine map, four a homography, all of them a fundamental matrix

@@ -107,7 +107,7 @@ def _scaled_distances(x: Tensor) -> Tensor:
 # A pool of epipolar geometries, and sets of them that explain all matches.
 
 
-LEAST = 7
+MIN_BODY_MATCHES = 7
 """Fewest matches of a body."""
 
 
@@ -130,12 +130,12 @@ def rough_cost(view: View, fundamentals: Tensor) -> Tensor:
     return (square / (POOL_NOISE_PIXELS * view.pixel) ** 2).clamp(max=MAX_SQUARED_DISTANCE)
 
 
-def smoothed(cost: Tensor, view: View) -> Tensor:
+def smooth_costs(cost: Tensor, view: View) -> Tensor:
     """Costs ``(P, n)``, each match's own and those of its neighbours, by their links."""
     return (cost + view.links.pull(cost)) / (1 + view.links.weight.sum(-1))
 
 
-def pool_of(view: View, groups: Tensor) -> Tensor:
+def fit_pool(view: View, groups: Tensor) -> Tensor:
     """Fundamental matrices ``(P, 3, 3)`` of all different groups ``(g, n)``, 0 and 1."""
     size = groups.sum(-1)
     order = size.argsort(descending=True, stable=True)
@@ -147,7 +147,7 @@ def pool_of(view: View, groups: Tensor) -> Tensor:
     return fit_fundamental(view.x1, view.x2, groups, [view.pixel * scale for scale in POOL_FIT_SCALES_PIXELS], steps=2)[0]
 
 
-def fitted(view: View, labels: Tensor, count: int) -> Starts:
+def fit_labellings(view: View, labels: Tensor, count: int) -> Starts:
     """Labellings ``(s, n)`` with the geometries of their bodies."""
     member = one_hot(labels, count)
     found = fit_fundamental(view.x1, view.x2, member.flatten(0, 1), (POOL_FIT_SCALES_PIXELS[0] * view.pixel,), steps=2)[0]
@@ -175,12 +175,12 @@ def best_sets(cost: Tensor, most: int, first: int | None = None) -> list[Tensor]
     return found
 
 
-def distinct(view: View, starts: Starts) -> Starts:
+def select_distinct(view: View, starts: Starts) -> Starts:
     """Up to ``MAX_STARTS`` starts that differ, the cheapest first, with enough matches in every body."""
     count = starts.fundamentals.shape[-3]
     member = one_hot(starts.labels, count)
     cost = (rough_cost(view, starts.fundamentals) * member).sum((-2, -1)) + POOL_CUT_COST * view.links.cut(member)
-    cost = torch.where(member.sum(-1).amin(-1) >= LEAST, cost, torch.inf)
+    cost = torch.where(member.sum(-1).amin(-1) >= MIN_BODY_MATCHES, cost, torch.inf)
     order = cost.argsort(stable=True)
     order = order[cost[order].isfinite()]
     flat = member[order].float().flatten(0, 1)
@@ -230,7 +230,7 @@ class Candidate:
     fundamentals: Tensor  # ``(K, 3, 3)``
 
 
-def descended(view: View, starts: Sequence[Starts]) -> dict[int, list[Candidate]]:
+def descend_starts(view: View, starts: Sequence[Starts]) -> dict[int, list[Candidate]]:
     """The segmentations that the starts lead to, by their number of bodies, the cheapest first."""
     device = view.x1.device
     bodies = torch.cat([torch.full((len(s.labels),), s.fundamentals.shape[1], device=device) for s in starts])
@@ -259,7 +259,7 @@ def descended(view: View, starts: Sequence[Starts]) -> dict[int, list[Candidate]
     fundamentals[rows] = geometry
     fundamentals = fundamentals.unflatten(0, present.shape)
     total = energy(view, fundamentals, hard)
-    whole = ~((hard.sum(-1) < LEAST) & present).any(-1)
+    whole = ~((hard.sum(-1) < MIN_BODY_MATCHES) & present).any(-1)
     found: dict[int, list[Candidate]] = {}
     for count in sorted({s.fundamentals.shape[1] for s in starts}):
         these = ((bodies == count) & whole).nonzero().flatten()
@@ -286,18 +286,18 @@ def search(
     plan = torch.tensor(flows, device=view.x1.device).repeat(num_starts if len(flows) > 2 else 2 * num_starts)
     labels = affine_flows(view.x1, view.x2, view.links, plan, MIN_FLOW_NOISE_PIXELS * view.pixel, generator)
     widths = [(labels, int(plan.max())), *((x[None], int(x.max()) + 1) for x in extra), (torch.zeros_like(labels[:1]), 1)]
-    pool = pool_of(view, torch.cat([one_hot(x, width).flatten(0, 1) for x, width in widths]))
+    pool = fit_pool(view, torch.cat([one_hot(x, width).flatten(0, 1) for x, width in widths]))
     if max(counts) > 1:
         # linear: the search improves it, and its weights would take longer than all flows
         pool = torch.cat([pool, matrix_pairs(view, torch.ones_like(view.x1[None, :, 0]), rounds=0)])
-    cost = smoothed(rough_cost(view, pool), view)
+    cost = smooth_costs(rough_cost(view, pool), view)
     sets = best_sets(cost, max(counts))
     starts = []
     for count in counts:
         starts.append(set_starts(pool, cost, sets[count - 1]))
         groups = [labels[plan == count], *(x[None] for x in extra if int(x.max()) + 1 == count)]
-        starts += [fitted(view, x, count) for x in groups if len(x)]
-    return descended(view, [distinct(view, start) for start in starts])
+        starts += [fit_labellings(view, x, count) for x in groups if len(x)]
+    return descend_starts(view, [select_distinct(view, start) for start in starts])
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -320,11 +320,11 @@ def search_samples(
         if count <= len(pool):
             chosen = sets[count - 1][:NUM_DESCENDED_SETS]
             starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
-    found = descended(view, starts) if starts else {}
-    return {count: _ranked(view, found.get(count, [])) for count in counts}
+    found = descend_starts(view, starts) if starts else {}
+    return {count: _rank_candidates(view, found.get(count, [])) for count in counts}
 
 
-def _ranked(view: View, candidates: list[Candidate]) -> list[Candidate]:
+def _rank_candidates(view: View, candidates: list[Candidate]) -> list[Candidate]:
     """The candidates with enough inliers in every body, by their cost if what is far from all bodies is in none."""
     if not candidates:
         return []
@@ -334,7 +334,7 @@ def _ranked(view: View, candidates: list[Candidate]) -> list[Candidate]:
     inliers = member.sum(-1)
     total = energy(view, fundamentals, member) + ENERGY_MAX_SQUARED_DISTANCE * (len(view.x1) - inliers.sum(-1))
     order = total.argsort(stable=True)
-    order = order[inliers[order].amin(-1) >= LEAST]
+    order = order[inliers[order].amin(-1) >= MIN_BODY_MATCHES]
     if not len(order):
         return []
     # between numbers of bodies only distances count: parallax tells true bodies from spurious ones less well
@@ -342,7 +342,7 @@ def _ranked(view: View, candidates: list[Candidate]) -> list[Candidate]:
     return [Candidate(float(total[i]), candidates[i].labels, candidates[i].fundamentals) for i in order.tolist()]
 
 
-def _different(view: View, pool: Tensor) -> Tensor:
+def _remove_duplicates(view: View, pool: Tensor) -> Tensor:
     """Those of the geometries that not many of the same matches agree with, the cheapest first."""
     cost = rough_cost(view, pool)
     order = cost.sum(-1).argsort(stable=True)
@@ -358,7 +358,9 @@ def _pool(view: View, least: int, most: int, generator: torch.Generator | None, 
     pool = matrix_pairs(view, left[: most - 1], NUM_MATRIX_ROUNDS)  # none for a single body
     last = ENERGY_MAX_SQUARED_DISTANCE * len(view.x1)
     for count in range(1, most + 1):
-        pool = _different(view, torch.cat([pool, *(_sampled(view, open_, len(left), generator, max_samples) for open_ in left)]))
+        pool = _remove_duplicates(
+            view, torch.cat([pool, *(_sample_geometries(view, open_, len(left), generator, max_samples) for open_ in left)])
+        )
         if count == most or len(pool) < count:
             break
         cost = rough_cost(view, pool)
@@ -368,7 +370,7 @@ def _pool(view: View, least: int, most: int, generator: torch.Generator | None, 
             break
         last = total
         left = (cost[sets].amin(1) >= MAX_SQUARED_DISTANCE).double()
-        left = left[left.sum(-1) > LEAST]
+        left = left[left.sum(-1) > MIN_BODY_MATCHES]
     return pool
 
 
@@ -379,7 +381,7 @@ def _distances(view: View, fundamentals: Tensor) -> Tensor:
     )
 
 
-def _sampled(view: View, weight: Tensor, parts: int, generator: torch.Generator | None, max_samples: int) -> Tensor:
+def _sample_geometries(view: View, weight: Tensor, parts: int, generator: torch.Generator | None, max_samples: int) -> Tensor:
     """Geometries of the best samples of the matches with weights ``(n,)``, descended; this is one of several parts of the work."""
     x1, x2, single = view.x1.float(), view.x2.float(), weight.float()
     best, votes = view.x1.new_zeros(0, 3, 3), single.new_zeros(0)

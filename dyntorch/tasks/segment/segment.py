@@ -22,10 +22,10 @@ from dyntorch.numerics.chi_square import median
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.segment.coherence import Links, coherence
 from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS, View
-from dyntorch.tasks.segment.labels import Labelling, Models, choose, label, significant
+from dyntorch.tasks.segment.labels import Labelling, Models, label_matches, select_models, significant
 from dyntorch.tasks.segment.options import SegmentOptions
 from dyntorch.tasks.segment.result import BodyModel, Segmentation, SegmentNotice
-from dyntorch.tasks.segment.search import LEAST, Candidate, one_hot, search, search_samples
+from dyntorch.tasks.segment.search import MIN_BODY_MATCHES, Candidate, one_hot, search, search_samples
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How many bodies: the segmentation of least cost with a penalty for each body, or with the number that was asked for.
@@ -55,7 +55,7 @@ MIN_LINKED_SHARE = 0.3  # of the matches, without a notice
 
 
 @dataclass(frozen=True)
-class Best:
+class CountSelection:
     """The segmentation that was chosen."""
 
     candidate: Candidate  # itself
@@ -66,9 +66,9 @@ class Best:
     """What the best other segmentation into as many costs more, in units of the root of the number of matches."""
 
 
-def best(search: Search, matches: int, bodies: int | None, penalty: float, max_bodies: int) -> Best | None:
+def select_count(search: Search, matches: int, bodies: int | None, penalty: float, max_bodies: int) -> CountSelection | None:
     """The best segmentation of so many matches into ``bodies``, or, for None, into the number of least penalized cost."""
-    room = max(1, matches // LEAST)
+    room = max(1, matches // MIN_BODY_MATCHES)
     known: dict[int, Candidate] = {}
     rivals: dict[int, float] = {}
 
@@ -77,7 +77,7 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float, max_b
 
     def cheapest(counts: Sequence[int]) -> dict[int, Candidate]:
         found = {count: candidates for count, candidates in search(counts).items() if candidates}
-        rivals.update({count: _rival(candidates) / matches**0.5 for count, candidates in found.items()})
+        rivals.update({count: _runner_up_cost(candidates) / matches**0.5 for count, candidates in found.items()})
         return {count: candidates[0] for count, candidates in found.items()}
 
     if bodies is not None:
@@ -86,7 +86,7 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float, max_b
             known |= cheapest(range(max(1, count - 1), count + 1))
             if count in known:
                 spare = count > 1 and count - 1 in known and penalized(count - 1) < penalized(count)
-                return Best(known[count], spare, rival=rivals[count])
+                return CountSelection(known[count], spare, rival=rivals[count])
         return None
     top = 0
     while top < min(room, max_bodies):
@@ -98,10 +98,10 @@ def best(search: Search, matches: int, bodies: int | None, penalty: float, max_b
     if not known:
         return None
     count = min(known, key=penalized)
-    return Best(known[count], further=known.get(count + 1), rival=rivals[count])
+    return CountSelection(known[count], further=known.get(count + 1), rival=rivals[count])
 
 
-def _rival(candidates: Sequence[Candidate]) -> float:
+def _runner_up_cost(candidates: Sequence[Candidate]) -> float:
     """What the best segmentation costs more that is another one than the best of all, not the same with a few other labels."""
     best = candidates[0]
     member = one_hot(best.labels, len(best.fundamentals))
@@ -117,7 +117,7 @@ def _rival(candidates: Sequence[Candidate]) -> float:
 
 
 @dataclass(frozen=True)
-class GivenMatches:
+class PreparedMatches:
     """The matches of one problem, ready for the search."""
 
     weights: Tensor  # ``(n,)`` of all matches, 0 = missing
@@ -169,7 +169,7 @@ class SegmentedProblem:
         return len(self.models)
 
 
-def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, linked: float = 0.0) -> SegmentedProblem:
+def no_bodies(weights: Tensor, threshold: float, status: Status, repeated: float, linked: float = 0.0) -> SegmentedProblem:
     """No bodies: all matches ``(n,)`` are outliers, those with weight surely."""
     none = torch.zeros(0, 3, 3, dtype=torch.float64, device=weights.device)
     return SegmentedProblem(
@@ -187,14 +187,16 @@ def nothing(weights: Tensor, threshold: float, status: Status, repeated: float, 
     )
 
 
-def outcome(given: GivenMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool) -> SegmentedProblem:
+def describe_bodies(
+    given: PreparedMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool
+) -> SegmentedProblem:
     """The labels in order of size, with the model of every body."""
-    labelled = _sorted(labelled)
+    labelled = _sort_bodies(labelled)
     labels, fundamentals = labelled.labels, labelled.fundamentals
     count = len(fundamentals)
     if not count:
-        return nothing(given.weights, threshold, Status.NO_CONSENSUS, given.repeated, given.linked)
-    models = choose(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present])
+        return no_bodies(given.weights, threshold, Status.NO_CONSENSUS, given.repeated, given.linked)
+    models = select_models(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present])
     planar = unit(torch.linalg.inv(given.second) @ models.homographies @ given.first)
     return SegmentedProblem(
         labels=given.spread(labels),
@@ -212,11 +214,11 @@ def outcome(given: GivenMatches, labelled: Labelling, threshold: float, bodies: 
     )
 
 
-def _sorted(labelled: Labelling) -> Labelling:
+def _sort_bodies(labelled: Labelling) -> Labelling:
     """The bodies that kept enough matches, numbered by the rule."""
     members = one_hot(labelled.labels - 1, len(labelled.fundamentals)) > 0
     order = order_of_bodies(members)
-    return labelled.of(order[members.sum(-1)[order] >= LEAST])
+    return labelled.of(order[members.sum(-1)[order] >= MIN_BODY_MATCHES])
 
 
 def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models) -> Tensor:
@@ -300,13 +302,13 @@ def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold:
     present = (weights > 0).nonzero().flatten()
     distinct, *places = (len(torch.unique(x[present], dim=0)) for x in (torch.cat([x1, x2], dim=-1), x1, x2))
     # points that are all in one place of a view fit any motion of that place
-    distinct = min(places) if min(places) < LEAST + 1 else distinct
+    distinct = min(places) if min(places) < MIN_BODY_MATCHES + 1 else distinct
     repeated = 1 - distinct / len(present) if len(present) else 0.0
-    if distinct < LEAST + 1:
-        return nothing(weights, threshold, Status.TOO_FEW, repeated)
-    given = _given(x1[present], x2[present], weights, present, threshold, request, repeated)
+    if distinct < MIN_BODY_MATCHES + 1:
+        return no_bodies(weights, threshold, Status.TOO_FEW, repeated)
+    given = _prepare_matches(x1[present], x2[present], weights, present, threshold, request, repeated)
     if THRESHOLD_PIXELS * given.view.pixel > MAX_RELATIVE_THRESHOLD:
-        refused = nothing(weights, threshold, Status.AMBIGUOUS, repeated, given.linked)
+        refused = no_bodies(weights, threshold, Status.AMBIGUOUS, repeated, given.linked)
         return replace(refused, coarse=THRESHOLD_PIXELS * given.view.pixel)
     part = given.view.subset(given.keep[given.searched])
 
@@ -318,25 +320,29 @@ def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold:
         return search(part, counts, request.generator, extra, num_starts=options.num_starts)
 
     penalty = BODY_PENALTY if request.spatial else BODY_PENALTY_GEOMETRY_ONLY
-    chosen = best(searched, len(part.x1), request.bodies, penalty, options.max_bodies) if len(part.x1) > LEAST else None
+    chosen = (
+        select_count(searched, len(part.x1), request.bodies, penalty, options.max_bodies)
+        if len(part.x1) > MIN_BODY_MATCHES
+        else None
+    )
     if chosen is None:
-        return nothing(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
-    labelled = _labelled(given, chosen.candidate, request)
-    left = _left(given, labelled)
+        return no_bodies(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
+    labelled = _label_all(given, chosen.candidate, request)
+    left = _num_unexplained(given, labelled)
     if chosen.further is not None and left >= max(MIN_UNEXPLAINED_MATCHES, MIN_UNEXPLAINED_SHARE * len(given.keep)):
         # matches that move like their neighbours and fit no body: there is another one, which the truncated distances hid
-        other = _labelled(given, chosen.further, request)
-        labelled = other if _left(given, other) < 0.5 * left else labelled
-    return replace(outcome(given, labelled, threshold, request.bodies, chosen.spare), rival=chosen.rival)
+        other = _label_all(given, chosen.further, request)
+        labelled = other if _num_unexplained(given, other) < 0.5 * left else labelled
+    return replace(describe_bodies(given, labelled, threshold, request.bodies, chosen.spare), rival=chosen.rival)
 
 
-def _labelled(given: GivenMatches, candidate: Candidate, request: Request) -> Labelling:
+def _label_all(given: PreparedMatches, candidate: Candidate, request: Request) -> Labelling:
     """Labels of all matches by a segmentation of those that were searched."""
     found = torch.zeros_like(given.present)
     found[given.keep[given.searched]] = candidate.labels + 1
     pixel = given.view.pixel
     near, share = (MATCH_NOISE_PIXELS * pixel, 1 - given.linked) if request.spatial else (None, request.options.outlier_share)
-    labelled = label(
+    labelled = label_matches(
         given.view,
         found,
         candidate.fundamentals,
@@ -351,12 +357,12 @@ def _labelled(given: GivenMatches, candidate: Candidate, request: Request) -> La
     return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels, request.options.false_alarms))
 
 
-def _left(given: GivenMatches, labelled: Labelling) -> int:
+def _num_unexplained(given: PreparedMatches, labelled: Labelling) -> int:
     """How many of the kept matches became outliers."""
     return int((labelled.labels[given.keep] == 0).sum()) if len(given.groups) else 0
 
 
-def _given(
+def _prepare_matches(
     x1: Tensor,
     x2: Tensor,
     weights: Tensor,
@@ -364,7 +370,7 @@ def _given(
     threshold: float,
     request: Request,
     repeated: float,
-) -> GivenMatches:
+) -> PreparedMatches:
     """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
     centres = x1.median(0).values, x2.median(0).values
     # squares of tiny coordinates would underflow: a view without extent would not count
@@ -376,7 +382,7 @@ def _given(
     a, b = (((x - centre) * scale).clamp(-MAX_DISTANCE, MAX_DISTANCE) for x, centre in zip((x1, x2), centres, strict=True))
     pixel = threshold / THRESHOLD_PIXELS * float(scale)
     values = torch.zeros_like(a[:, 0])
-    some = _some(len(a), request.generator, a.device, request.options.max_searched)
+    some = _draw_subset(len(a), request.generator, a.device, request.options.max_searched)
     if request.spatial:
         graph = coherence(a, b, MATCH_NOISE_PIXELS * pixel, some)
         values, links = graph.values, graph.links
@@ -388,10 +394,10 @@ def _given(
         groups = keep[:0]
     view = View(a, b, pixel, links)
     searched = some[keep].nonzero().flatten()
-    return GivenMatches(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
+    return PreparedMatches(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
 
 
-def _some(count: int, generator: torch.Generator | None, device: torch.device, max_searched: int) -> Tensor:
+def _draw_subset(count: int, generator: torch.Generator | None, device: torch.device, max_searched: int) -> Tensor:
     """``(m,)`` bool: all matches, or a random part of very many: what is dense beside the noise shows no motion of its own."""
     if count <= max_searched:
         return torch.ones(count, dtype=torch.bool, device=device)
@@ -402,11 +408,11 @@ def _groups(values: Tensor, links: Links) -> tuple[Tensor, Tensor]:
     """The matches in linked groups large enough for a body, and these groups, from 0."""
     component = links.components(MIN_LINK_WEIGHT, values > MIN_COHERENCE)
     _, group, size = component.unique(return_inverse=True, return_counts=True)
-    keep = (size[group] >= LEAST).nonzero().flatten()
+    keep = (size[group] >= MIN_BODY_MATCHES).nonzero().flatten()
     return keep, torch.unique(group[keep], return_inverse=True)[1]
 
 
-MINIMAL = 8
+MIN_MATCHES = 8
 """Fewest matches: seven determine a fundamental matrix, and one has to agree with it."""
 
 
@@ -472,7 +478,7 @@ def segment(
     data = matches(FundamentalMatrix(), (x1, x2), weights)
     if generator is not None and not isinstance(generator, torch.Generator):
         raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
-    if data.count == 1 and len(x1) >= MINIMAL:
+    if data.count == 1 and len(x1) >= MIN_MATCHES:
         raise ValueError(
             f"x1 is {tuple(x1.shape)}: problems of one match each; for points as OpenCV gives them, use x1[:, 0], x2[:, 0]"
         )
@@ -501,7 +507,7 @@ def segment(
         bodies=numbers([outcome.count for outcome in found]),
         fundamentals=stacked("fundamentals", (width, 3, 3)),
         homographies=stacked("homographies", (width, 3, 3)),
-        models=_nested([outcome.models for outcome in found], data.batch),
+        models=_nest_models([outcome.models for outcome in found], data.batch),
         probabilities=stacked("probabilities", (n, width + 1)),
         residuals=stacked("residuals", (n,)),
         coherence=stacked("coherence", (n,)),
@@ -514,21 +520,28 @@ def segment(
 def _check_counts(bodies: int | None, count: int) -> None:
     if bodies is not None and (isinstance(bodies, bool) or not isinstance(bodies, int) or bodies < 1):
         raise ValueError(f"bodies must be a positive whole number, or None to find out, got {bodies!r}")
-    if count < MINIMAL:
-        raise ValueError(f"segment needs at least {MINIMAL} matches, got {count}: add {MINIMAL - count}")
-    if bodies is not None and bodies * LEAST > count:
+    if count < MIN_MATCHES:
+        raise ValueError(f"segment needs at least {MIN_MATCHES} matches, got {count}: add {MIN_MATCHES - count}")
+    if bodies is not None and bodies * MIN_BODY_MATCHES > count:
         text = (
             "{arg:bodies={bodies}} take at least {least} matches each, {all} in all, got {count}: "
             "add {more}, or ask for at most {most}"
         )
-        whole = bodies * LEAST
-        values = {"bodies": bodies, "least": LEAST, "all": whole, "count": count, "more": whole - count, "most": count // LEAST}
+        whole = bodies * MIN_BODY_MATCHES
+        values = {
+            "bodies": bodies,
+            "least": MIN_BODY_MATCHES,
+            "all": whole,
+            "count": count,
+            "more": whole - count,
+            "most": count // MIN_BODY_MATCHES,
+        }
         raise ValueError(Message(text, **values))
 
 
-def _nested(models: list[tuple[BodyModel, ...]], batch: tuple[int, ...]) -> tuple[object, ...]:
+def _nest_models(models: list[tuple[BodyModel, ...]], batch: tuple[int, ...]) -> tuple[object, ...]:
     """Models of a flat batch in its shape."""
     if not batch:
         return models[0]
     step = prod(batch[1:])
-    return tuple(_nested(models[i * step : (i + 1) * step], batch[1:]) for i in range(batch[0]))
+    return tuple(_nest_models(models[i * step : (i + 1) * step], batch[1:]) for i in range(batch[0]))

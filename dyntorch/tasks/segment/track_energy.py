@@ -79,16 +79,16 @@ class Candidates:
         return Candidates(self.labels[part], self.member[part], geometry, self.scale[part], self.energy[part])
 
 
-def unlinked(count: int, device: torch.device) -> Links:
+def no_links(count: int, device: torch.device) -> Links:
     """No links between so many tracks."""
     return Links(torch.zeros(count, 0, dtype=torch.long, device=device), torch.zeros(count, 0, dtype=torch.float64, device=device))
 
 
-def fitted(pairs: Sequence[FramePair], groups: Tensor, scales: Sequence[float], steps: int = 2) -> Geometry:
+def fit_groups(pairs: Sequence[FramePair], groups: Tensor, scales: Sequence[float], steps: int = 2) -> Geometry:
     """Fundamental matrices ``(B, 3, 3)`` of groups of tracks ``(B, n)``, weights, for every pair of frames."""
     return [
         fit_fundamental(
-            pair.view.x1, pair.view.x2, pair.weighed(groups), [scale * pair.view.pixel for scale in scales], steps=steps
+            pair.view.x1, pair.view.x2, pair.weigh_groups(groups), [scale * pair.view.pixel for scale in scales], steps=steps
         )[0]
         for pair in pairs
     ]
@@ -99,7 +99,7 @@ def squares(pair: FramePair, fundamentals: Tensor) -> Tensor:
     return sampson_squared(fundamentals, pair.view.x1, pair.view.x2) * (pair.precision / pair.view.pixel**2)
 
 
-def improbable(square: Tensor) -> Tensor:
+def student_cost(square: Tensor) -> Tensor:
     r"""Cost of squared distances over the variance, :math:`(\nu + 1) \log(1 + \min(z, c^2) / \nu)`."""
     worst = (TRACK_FREEDOM + 1) * log1p(MAX_TRACK_DISTANCE**2 / TRACK_FREEDOM)
     return ((TRACK_FREEDOM + 1) * torch.log1p(square / TRACK_FREEDOM)).clamp(max=worst)
@@ -130,18 +130,18 @@ def costs(
     B, K = geometry[0].shape[:2]
     total = torch.zeros(B, K, len(evidence.count), dtype=torch.float64, device=scale.device)
     for pair, F in zip(evidence.pairs, geometry, strict=True):
-        cost = improbable(squares(pair, F) / scale.square()[:, None, None])
+        cost = student_cost(squares(pair, F) / scale.square()[:, None, None])
         if member is not None and relief_weight > 0:
             cost = cost + relief_weight * relief(pair.view, F, member[..., pair.index].double(), MIN_TRACK_PARALLAX_PIXELS)
         total[..., pair.index] += cost
     return total * evidence.share()
 
 
-def descended(evidence: TrackEvidence, labels: Tensor, bodies: int) -> Candidates:
+def descend_labels(evidence: TrackEvidence, labels: Tensor, bodies: int) -> Candidates:
     """Labels and epipolar geometries in turns, from several labellings ``(B, n)`` from 0."""
     count = len(labels)
     member = one_hot(labels, bodies).float()
-    found = fitted(evidence.pairs, member.flatten(0, 1), FIRST_FIT_SCALES_PIXELS)
+    found = fit_groups(evidence.pairs, member.flatten(0, 1), FIRST_FIT_SCALES_PIXELS)
     geometry = [F.unflatten(0, (count, bodies)) for F in found]
 
     def turn(member: Tensor, geometry: Geometry) -> tuple[Tensor, Tensor]:
@@ -153,16 +153,16 @@ def descended(evidence: TrackEvidence, labels: Tensor, bodies: int) -> Candidate
     for _ in range(NUM_TRACK_ROUNDS):
         member, scale = turn(member, geometry)
         size = float(TRACK_FIT_SCALE * scale.median())
-        geometry = [_refitted(pair, F, member, size) for pair, F in zip(evidence.pairs, geometry, strict=True)]
+        geometry = [_refit(pair, F, member, size) for pair, F in zip(evidence.pairs, geometry, strict=True)]
     member, scale = turn(member, geometry)
     found_labels = member.argmax(1)
     return Candidates(found_labels, member, geometry, scale, energy(evidence, geometry, found_labels, scale))
 
 
-def _refitted(pair: FramePair, F: Tensor, member: Tensor, scale: float) -> Tensor:
+def _refit(pair: FramePair, F: Tensor, member: Tensor, scale: float) -> Tensor:
     # the noise grows with the motion, and with it the scale
     size = max(scale * float(pair.precision.median()) ** -0.5, MIN_TRACK_FIT_SCALE_PIXELS) * pair.view.pixel
-    weight = pair.weighed(member.flatten(0, 1))
+    weight = pair.weigh_groups(member.flatten(0, 1))
     return descend(F.flatten(0, 1), pair.view.x1, pair.view.x2, weight, size, steps=2).unflatten(0, F.shape[:2])
 
 
@@ -200,19 +200,21 @@ class Exchanges:
         self.count = int(cut.max()) + 1
         self.members = one_hot(cut, self.count).double()
         self.sizes = [int(size) for size in self.members.sum(-1)]
-        geometry = [F[None] for F in fitted(evidence.pairs, self.members, FIRST_FIT_SCALES_PIXELS, steps=1)]
+        geometry = [F[None] for F in fit_groups(evidence.pairs, self.members, FIRST_FIT_SCALES_PIXELS, steps=1)]
         self.scale = noise(evidence.pairs, geometry, self.members[None])
         self.between = self.members @ evidence.links.pull(self.members).mT
         self.known: dict[Body, tuple[float, float]] = {}
 
-    def improved(self, labels: Tensor, weight: float) -> Tensor:
+    def improve(self, labels: Tensor, weight: float) -> Tensor:
         """Labels ``(n,)`` from 0 after the best exchanges from bodies ``(n,)`` made of the pieces, at a weight of the links."""
         bodies = [
             frozenset(piece for piece in range(self.count) if int(labels[self.cut == piece].median()) == body)
             for body in range(int(labels.max()) + 1)
         ]
         for _ in range(MAX_EXCHANGES):
-            offered = [one for one in self._offered(bodies) if min(self._size(one[2]), self._size(one[3])) >= MIN_BODY_TRACKS]
+            offered = [
+                one for one in self._possible_exchanges(bodies) if min(self._size(one[2]), self._size(one[3])) >= MIN_BODY_TRACKS
+            ]
             self._fit([*bodies, *(body for one in offered for body in one[2:])])
             gain = [self._cost([bodies[one[0]], bodies[one[1]]], weight) - self._cost(one[2:], weight) for one in offered]
             if not gain or max(gain) <= MIN_EXCHANGE_GAIN:
@@ -225,7 +227,7 @@ class Exchanges:
     def _size(self, body: Body) -> int:
         return sum(self.sizes[piece] for piece in body)
 
-    def _offered(self, bodies: Sequence[Body]) -> Iterator[Exchange]:
+    def _possible_exchanges(self, bodies: Sequence[Body]) -> Iterator[Exchange]:
         """A piece to the other body, or both bodies joined and a piece made a body of its own."""
         for first, second in combinations(range(len(bodies)), 2):
             a, b = bodies[first], bodies[second]
@@ -244,7 +246,7 @@ class Exchanges:
             return
         chosen = self.members.new_tensor([[float(piece in body) for piece in range(self.count)] for body in new])
         groups = chosen @ self.members
-        geometry = [F[None] for F in fitted(self.evidence.pairs, groups, FIRST_FIT_SCALES_PIXELS, steps=1)]
+        geometry = [F[None] for F in fit_groups(self.evidence.pairs, groups, FIRST_FIT_SCALES_PIXELS, steps=1)]
         own = (costs(self.evidence, geometry, self.scale, None)[0] * groups).sum(-1)
         cut = ((chosen @ self.between) * (1 - chosen)).sum(-1) / 2
         self.known.update(zip(new, zip(own.tolist(), cut.tolist(), strict=True), strict=True))

@@ -16,24 +16,24 @@ from dyntorch.core.problems import select_problem, solve_one_by_one
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
-from dyntorch.tasks.segment.agglomeration import NEGLIGIBLE_LINKS, Judge, NearPairs, merged, pieces, weakest_separation
+from dyntorch.tasks.segment.agglomeration import NEGLIGIBLE_LINKS, GroupCosts, NearPairs, merge_pieces, pieces, weakest_separation
 from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS
-from dyntorch.tasks.segment.frame_pairs import Film, FramePair, chosen_pairs, cut_of, pairs_near
-from dyntorch.tasks.segment.labels import agreeing, distances, motions, outliers, resting
+from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs
+from dyntorch.tasks.segment.labels import distances, distances_from_cameras, find_static_body, motions, outliers
 from dyntorch.tasks.segment.options import TrackSegmentOptions
 from dyntorch.tasks.segment.residual_kernel import MIN_KERNEL_TRACKS, common_share, links_of, preference_kernel, strongest
 from dyntorch.tasks.segment.result import TrackNotice, TrackSegmentation
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment.segment import MINIMAL
+from dyntorch.tasks.segment.segment import MIN_MATCHES
 from dyntorch.tasks.segment.track_energy import (
     MIN_BODY_TRACKS,
     Candidates,
     Exchanges,
     TrackEvidence,
     costs,
-    descended,
+    descend_labels,
     energy,
-    unlinked,
+    no_links,
 )
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -57,14 +57,14 @@ class Start:
     """What the search for bodies starts from."""
 
     evidence: TrackEvidence  # links and pairs of frames
-    judge: Judge  # of groups of tracks
+    judge: GroupCosts  # of groups of tracks
     cuts: Sequence[Tensor]  # labels ``(n,)`` of the pieces, once for each number of pieces
 
     @cached_property
     def trees(self) -> list[dict[int, Tensor]]:
         """Labels ``(n,)`` with any number of bodies, for each of the cuts."""
         most = max(int(cut.max()) + 1 for cut in self.cuts)
-        return [merged(self.judge, cut, range(1, most + 1)) for cut in self.cuts]
+        return [merge_pieces(self.judge, cut, range(1, most + 1)) for cut in self.cuts]
 
     def best(self, bodies: int, thorough: bool = False) -> Candidates | None:
         """The best segmentation into so many bodies: separate, and of little cost; None where there is none."""
@@ -75,9 +75,9 @@ class Start:
             for cut, tree in zip(self.cuts, self.trees, strict=True):
                 if bodies in tree:
                     exchanges = Exchanges(self.evidence, cut)
-                    starts += [exchanges.improved(tree[bodies], weight) for weight in EXCHANGE_CUT_WEIGHTS]
+                    starts += [exchanges.improve(tree[bodies], weight) for weight in EXCHANGE_CUT_WEIGHTS]
         distinct = [x for place, x in enumerate(starts) if not any(torch.equal(x, other) for other in starts[:place])]
-        found = descended(self.evidence, torch.stack(distinct), bodies)
+        found = descend_labels(self.evidence, torch.stack(distinct), bodies)
         values = [self._value(found.of(which), thorough) for which in range(len(distinct))]
         best = max(range(len(values)), key=values.__getitem__)
         return found.of(best) if values[best] > float("-inf") else None
@@ -241,10 +241,10 @@ def segment_tracks(
 
     with torch.no_grad():
         if batch:
-            found = solve_one_by_one(batch, solve, lambda said: _nothing(tracks.shape[-2], request, [], Status.TOO_FEW))
+            found = solve_one_by_one(batch, solve, lambda said: _no_bodies(tracks.shape[-2], request, [], Status.TOO_FEW))
         else:
             found = solve(0)
-    return _as(found, tracks.dtype)
+    return _to_dtype(found, tracks.dtype)
 
 
 def _check(tracks: Tensor, bodies: int | None, cameras: Tensor | None, generator: torch.Generator | None) -> None:
@@ -253,9 +253,9 @@ def _check(tracks: Tensor, bodies: int | None, cameras: Tensor | None, generator
         raise ValueError(f"tracks must be a floating-point tensor (*batch, frames, n, 2), NaN = missing, got {kind}")
     if tracks.shape[-3] < 2:
         raise ValueError(f"tracks hold {tracks.shape[-3]} frame, and motion needs two; give (frames, n, 2)")
-    if tracks.shape[-2] < MINIMAL:
+    if tracks.shape[-2] < MIN_MATCHES:
         raise ValueError(
-            f"segment_tracks needs at least {MINIMAL} tracks, got {tracks.shape[-2]}: add {MINIMAL - tracks.shape[-2]}"
+            f"segment_tracks needs at least {MIN_MATCHES} tracks, got {tracks.shape[-2]}: add {MIN_MATCHES - tracks.shape[-2]}"
         )
     if bodies is not None and (isinstance(bodies, bool) or not isinstance(bodies, int) or bodies < 1):
         raise ValueError(f"bodies must be a positive whole number, or None to find out, got {bodies!r}")
@@ -278,33 +278,33 @@ def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> Tra
     seen = tracks.isfinite().all(-1)
     # 1. what is there: tracks in two frames at least, frames with tracks in common, motion, one scene
     if not bool((seen.sum(0) > 1).any()):
-        return _nothing(count, request, [Notice(TrackNotice.SHORT)])
-    film = Film.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.pixel)
+        return _no_bodies(count, request, [Notice(TrackNotice.SHORT)])
+    film = TrackSet.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.pixel)
     refused = _refusal(film, request)
-    frames = [] if refused else chosen_pairs(film, options.max_frame_pairs)
+    frames = [] if refused else select_frame_pairs(film, options.max_frame_pairs)
     if refused or not frames:
         common = int((film.seen[:-1] & film.seen[1:]).sum(-1).max())
-        few = Notice(TrackNotice.FEW_COMMON, float(common), {"least": MINIMAL})
-        return _nothing(count, request, [refused or few])
+        few = Notice(TrackNotice.FEW_COMMON, float(common), {"least": MIN_MATCHES})
+        return _no_bodies(count, request, [refused or few])
     # 2. which tracks move alike, and the bodies of those that are searched
-    searched = _searched(film, request)
+    searched = _draw_tracks(film, request)
     kernel = preference_kernel(film, searched, request.generator, options.num_hypotheses)
     alike = common_share(kernel[searched])
     if alike < MIN_COMMON_PREFERENCES + MIN_COMMON_PREFERENCES_GROWTH * log(len(searched)):
-        return _nothing(count, request, [Notice(TrackNotice.INCOHERENT, alike)])
+        return _no_bodies(count, request, [Notice(TrackNotice.INCOHERENT, alike)])
     start = _start(film, frames, kernel, searched, request)
     chosen = bodies_of(start, request.bodies, options.max_bodies)
     if chosen is None:
-        return _nothing(count, request, [], Status.NO_CONSENSUS)
+        return _no_bodies(count, request, [], Status.NO_CONSENSUS)
     # 3. all tracks follow, and what belongs to no body is told
     pairs = [film.pair(pair) for pair in frames]
-    member = _followed(film, pairs, kernel, searched, chosen.candidate)
+    member = _label_all(film, pairs, kernel, searched, chosen.candidate)
     return _outcome(tracks, cameras, film, pairs, kernel, searched, member, chosen, request)
 
 
-def _refusal(film: Film, request: TrackRequest) -> Notice | None:
+def _refusal(film: TrackSet, request: TrackRequest) -> Notice | None:
     """Why there is nothing to segment."""
-    cut = cut_of(film)
+    cut = find_scene_cut(film)
     if cut is not None:
         values = {"frame": cut.frame, "case": "jump" if cut.jump else ""}
         return Notice(TrackNotice.CUT, cut.jump or cut.share, values)
@@ -317,7 +317,7 @@ def _refusal(film: Film, request: TrackRequest) -> Notice | None:
     return None
 
 
-def _searched(film: Film, request: TrackRequest) -> Tensor:
+def _draw_tracks(film: TrackSet, request: TrackRequest) -> Tensor:
     """Indices of the tracks that the search looks at: all, or a random part of very many."""
     alive = film.seen.any(0).nonzero().flatten()
     most = request.options.max_searched
@@ -327,23 +327,23 @@ def _searched(film: Film, request: TrackRequest) -> Tensor:
     return alive[order[:most]].sort().values
 
 
-def _start(film: Film, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
+def _start(film: TrackSet, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
     """What the search for bodies starts from: links, pairs of frames and pieces of the searched tracks."""
-    part = Film(film.x[:, searched], film.seen[:, searched], film.pixel, film.change)
+    part = TrackSet(film.x[:, searched], film.seen[:, searched], film.pixel, film.change)
     inner = kernel[searched]
     inner = (inner + inner.mT) / 2
     sparse = strongest(inner, NUM_TRACK_NEIGHBOURS)
     pairs = [part.pair(pair) for pair in frames]
     evidence = TrackEvidence.of(pairs, links_of(sparse, TRACK_CUT_COST))
-    beside = pairs_near(part, MERGE_GAPS, MERGE_PAIRS_PER_GAP, MIN_KERNEL_TRACKS)
+    beside = select_near_pairs(part, MERGE_GAPS, MERGE_PAIRS_PER_GAP, MIN_KERNEL_TRACKS)
     near = NearPairs(part, beside or frames)
     least, most = request.bodies or 1, max(1, len(searched) // MIN_PIECE_TRACKS)
     cuts = [pieces(sparse, max(min(number, most), min(least, most))) for number in PIECE_COUNTS]
-    judge = Judge.of(near, inner, one_hot(cuts[0], int(cuts[0].max()) + 1) > 0)
+    judge = GroupCosts.of(near, inner, one_hot(cuts[0], int(cuts[0].max()) + 1) > 0)
     return Start(evidence, judge, cuts)
 
 
-def _followed(film: Film, pairs: list[FramePair], kernel: Tensor, searched: Tensor, found: Candidates) -> Tensor:
+def _label_all(film: TrackSet, pairs: list[FramePair], kernel: Tensor, searched: Tensor, found: Candidates) -> Tensor:
     """Probabilities ``(K, n)`` of all tracks: those searched have theirs, the others those of what they move like."""
     count = film.x.shape[1]
     member = torch.zeros(found.bodies, count, dtype=torch.float64, device=film.x.device)
@@ -355,7 +355,7 @@ def _followed(film: Film, pairs: list[FramePair], kernel: Tensor, searched: Tens
         near = kernel[rest].topk(min(NUM_TRACK_NEIGHBOURS, len(searched)), dim=-1)
         weight = near.values.double() / near.values.double().sum(-1, keepdim=True).clamp(min=1e-9)
         pulled = (member[:, searched][:, near.indices] * weight).sum(-1) * TRACK_CUT_COST
-        evidence = TrackEvidence.of(pairs, unlinked(count, film.x.device))
+        evidence = TrackEvidence.of(pairs, no_links(count, film.x.device))
         cost = costs(evidence, found.geometry, found.scale, member[None])[0][:, rest]
         member[:, rest] = torch.softmax(pulled - cost, dim=0)
     return member
@@ -364,7 +364,7 @@ def _followed(film: Film, pairs: list[FramePair], kernel: Tensor, searched: Tens
 def _outcome(
     tracks: Tensor,
     cameras: Tensor | None,
-    film: Film,
+    film: TrackSet,
     pairs: list[FramePair],
     kernel: Tensor,
     searched: Tensor,
@@ -384,13 +384,13 @@ def _outcome(
     order = order[(hard.sum(-1) >= MIN_BODY_TRACKS)[order]]
     member, hard, far = member[order], hard[order], far[:, order]
     if not len(order):
-        return _nothing(count, request, [], Status.NO_CONSENSUS)
+        return _no_bodies(count, request, [], Status.NO_CONSENSUS)
     named = torch.where(hard.any(0), hard.argmax(0) + 1, 0)
     own = far.gather(1, (named - 1).clamp(min=0).expand(len(far), 1, -1))[:, 0]
     nearest = torch.where(named > 0, own.square().nanmean(0), far.square().nanmean(0).nan_to_num(nan=torch.inf).amin(0))
     moved = motions(pairs, [F[:, order] for F in geometry], hard, film)
     static, notices = _static(tracks, cameras, film, hard, pairs, request)
-    notices = [*_about(len(order), chosen, request), *notices]
+    notices = [*_count_notices(len(order), chosen, request), *notices]
     bodies = member / member.sum(0).clamp(min=1e-12) * (named > 0)
     missing = (named == 0) & alive
     return TrackSegmentation(
@@ -416,7 +416,7 @@ def _support(kernel: Tensor, searched: Tensor, labels: Tensor) -> Tensor:
     return (same.sum(-1) / top.values.sum(-1).clamp(min=1e-9)).double()
 
 
-def _about(found: int, chosen: Chosen, request: TrackRequest) -> list[Notice]:
+def _count_notices(found: int, chosen: Chosen, request: TrackRequest) -> list[Notice]:
     said = []
     if request.bodies is not None and found < request.bodies:
         said.append(Notice(TrackNotice.FEWER_BODIES, float(found), {"asked": request.bodies}))
@@ -428,22 +428,22 @@ def _about(found: int, chosen: Chosen, request: TrackRequest) -> list[Notice]:
 
 
 def _static(
-    tracks: Tensor, cameras: Tensor | None, film: Film, hard: Tensor, pairs: list[FramePair], request: TrackRequest
+    tracks: Tensor, cameras: Tensor | None, film: TrackSet, hard: Tensor, pairs: list[FramePair], request: TrackRequest
 ) -> tuple[int, list[Notice]]:
     """The number of the body that stands still, 0 where it is not known, and why."""
     if cameras is not None:
-        off = agreeing(tracks, hard, cameras.double(), pairs)
+        off = distances_from_cameras(tracks, hard, cameras.double(), pairs)
         best = int(off.argmin())
         if float(off[best]) <= MAX_CAMERA_DISTANCE * request.threshold:
             return best + 1, []
         return 0, [Notice(TrackNotice.DISAGREEING, float(off[best]))]
-    rests = resting(film, hard)
+    rests = find_static_body(film, hard)
     if rests is not None:
         return rests + 1, []
     return 0, [Notice(TrackNotice.UNSURE_STATIC, float(hard.sum(-1).max() / hard.sum()))]
 
 
-def _nothing(count: int, request: TrackRequest, notices: list[Notice], status: Status | None = None) -> TrackSegmentation:
+def _no_bodies(count: int, request: TrackRequest, notices: list[Notice], status: Status | None = None) -> TrackSegmentation:
     """No bodies: all tracks are outliers."""
     none = torch.zeros(0, 0, 3, 3, dtype=torch.float64)
     return TrackSegmentation(
@@ -462,7 +462,7 @@ def _nothing(count: int, request: TrackRequest, notices: list[Notice], status: S
     )
 
 
-def _as(found: TrackSegmentation, dtype: torch.dtype) -> TrackSegmentation:
+def _to_dtype(found: TrackSegmentation, dtype: torch.dtype) -> TrackSegmentation:
     """With floating-point parts of the type of the tracks, and 0 where a batch is filled up."""
     parts: dict[str, Any] = {}
     for one in fields(found):

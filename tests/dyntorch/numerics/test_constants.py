@@ -64,7 +64,7 @@ TABLES = [
     (monomials.factors, (2, 2, CPU)),
     (monomials.collecting, (2, 2, CPU)),
     (monomials.multiplicity, (2, 2, CPU)),
-    (planes_problem._own, (3, 1, CPU)),
+    (planes_problem._parameter_places, (3, 1, CPU)),
     (planes_starts._frames, (CPU,)),
     (projective._products, (CPU,)),
     (shape_completion._choices, (8, CPU)),

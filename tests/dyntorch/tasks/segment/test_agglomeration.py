@@ -13,12 +13,12 @@ from dyntorch.tasks.segment.agglomeration import (
     COST_SCALE_FACTOR,
     MIN_PIECE_NOISE_PIXELS,
     PIECE_LINK_WEIGHT,
-    Judge,
+    GroupCosts,
     NearPairs,
-    merged,
+    merge_pieces,
     pieces,
 )
-from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, pairs_near
+from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, select_near_pairs
 from dyntorch.tasks.segment.residual_kernel import preference_kernel, strongest
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.tracks import MERGE_GAPS, MERGE_PAIRS_PER_GAP
@@ -33,7 +33,7 @@ def few_pairs(monkeypatch):
 
 def near_of(scene: Shot) -> NearPairs:
     film = scene.film()
-    return NearPairs(film, pairs_near(film, MERGE_GAPS, MERGE_PAIRS_PER_GAP, 16))
+    return NearPairs(film, select_near_pairs(film, MERGE_GAPS, MERGE_PAIRS_PER_GAP, 16))
 
 
 def groups_of(labels: torch.Tensor) -> torch.Tensor:
@@ -49,8 +49,8 @@ def halves(scene: Shot) -> torch.Tensor:
     return 2 * (scene.labels - 1) + torch.arange(len(scene.labels)) % 2
 
 
-def judge_of(scene: Shot, labels: torch.Tensor) -> Judge:
-    return Judge.of(near_of(scene), kernel_of(scene), groups_of(labels))
+def judge_of(scene: Shot, labels: torch.Tensor) -> GroupCosts:
+    return GroupCosts.of(near_of(scene), kernel_of(scene), groups_of(labels))
 
 
 def rms(near: NearPairs, group: torch.Tensor) -> float:
@@ -71,7 +71,7 @@ def test_distances_are_those_of_the_motion_that_most_tracks_have():
     scene = shot((60, 30), sigma=0.0)
     scene.tracks[:, 0] += torch.linspace(0, 9, 10, dtype=F64)[:, None]  # one goes astray
     film = scene.film()
-    pairs = pairs_near(film, (5,), 3, 16)
+    pairs = select_near_pairs(film, (5,), 3, 16)
     near = NearPairs(film, pairs)
     own = scene.labels == 1
     for row, (a, b) in zip(near.squares(own, 0.15, rounds=8)[0], pairs, strict=True):
@@ -159,7 +159,7 @@ def test_groups_that_never_meet_are_joined_last():
     scene.tracks[6:, 40:80] = torch.nan
     scene.tracks[:6, 80:] = torch.nan  # body 3 comes when body 2 has gone
     judge = judge_of(scene, halves(scene))
-    found = merged(judge, halves(scene), [2, 3])
+    found = merge_pieces(judge, halves(scene), [2, 3])
     truth = scene.labels[:, None] == scene.labels
     assert bool(((found[3][:, None] == found[3]) == truth).all())
     assert bool((found[2][:40] == found[2][0]).all())
@@ -180,7 +180,7 @@ def test_the_judge_knows_the_noise_and_remembers_costs():
 def test_merged_labels_are_nested_and_end_at_the_bodies():
     scene = shot((40, 40, 40), sigma=0.1)
     judge = judge_of(scene, halves(scene))
-    found = merged(judge, halves(scene), range(1, 7))
+    found = merge_pieces(judge, halves(scene), range(1, 7))
     assert sorted(found) == [1, 2, 3, 4, 5, 6]
     assert all(sorted(labels.unique().tolist()) == list(range(count)) for count, labels in found.items())
     for count in range(1, 6):
@@ -188,4 +188,4 @@ def test_merged_labels_are_nested_and_end_at_the_bodies():
         assert all(len(coarse[fine == piece].unique()) == 1 for piece in range(count + 1))
     truth = scene.labels[:, None] == scene.labels
     assert bool(((found[3][:, None] == found[3]) == truth).all())
-    assert sorted(merged(judge, halves(scene), [2, 4])) == [2, 4]
+    assert sorted(merge_pieces(judge, halves(scene), [2, 4])) == [2, 4]

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from dyntorch.geometry.homogeneous import apply
-from dyntorch.tasks.segment.frame_pairs import Film, chosen_pairs, cut_of, pairs_near, spread_evenly
+from dyntorch.tasks.segment.frame_pairs import TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs, space_pairs
 from tests.dyntorch.tasks.segment.videos import F64, draw, shot
 
 
-def long_film(frames: int, length: int = 10, each: int = 6, shortest: int = 2) -> Film:
+def long_film(frames: int, length: int = 10, each: int = 6, shortest: int = 2) -> TrackSet:
     """Many tracks of up to ``length`` frames, ``each`` of which begin in every frame."""
     generator = draw()
     count = frames * each
@@ -19,7 +19,7 @@ def long_film(frames: int, length: int = 10, each: int = 6, shortest: int = 2) -
     number = torch.arange(frames)[:, None]
     there = (number >= start) & (number < start + lives)
     x = 500 * torch.rand(count, 2, generator=generator, dtype=F64) + 4.0 * number[..., None]
-    return Film.of(torch.where(there[..., None], x, torch.nan))
+    return TrackSet.of(torch.where(there[..., None], x, torch.nan))
 
 
 def kept(pairs, film):
@@ -31,7 +31,7 @@ def test_coordinates_are_centred_and_no_shift_or_scale_changes_them():
     scene = shot((40, 20))
     film = scene.film()
     assert float(film.x.reshape(-1, 2).norm(dim=-1).median()) == pytest.approx(1.0, abs=0.1)
-    moved = Film.of(3.5 * scene.tracks + torch.tensor([1000.0, -70.0], dtype=F64), 3.5)
+    moved = TrackSet.of(3.5 * scene.tracks + torch.tensor([1000.0, -70.0], dtype=F64), 3.5)
     torch.testing.assert_close(moved.x, film.x, rtol=0, atol=1e-9)
     assert moved.pixel == pytest.approx(film.pixel)
     torch.testing.assert_close(apply(film.change, scene.tracks[3]), film.x[3], rtol=0, atol=1e-9)
@@ -45,14 +45,14 @@ def test_what_is_missing_is_zero_and_not_seen():
     tracks = scene.tracks.clone()
     tracks[2:5, 7] = torch.nan
     tracks[0, 3, 0] = torch.inf  # half a point is none
-    film = Film.of(tracks)
+    film = TrackSet.of(tracks)
     assert not bool(film.seen[2:5, 7].any()) and not bool(film.seen[0, 3]) and int((~film.seen).sum()) == 4
     assert bool((film.x[~film.seen] == 0).all()) and bool(film.x.isfinite().all())
     assert film.lengths.tolist() == [10] * 3 + [9] + [10] * 36  # from the first to the last frame, holes included
 
 
 def test_equal_points_do_not_divide_by_zero():
-    film = Film.of(torch.full((3, 10, 2), 5.0, dtype=F64))
+    film = TrackSet.of(torch.full((3, 10, 2), 5.0, dtype=F64))
     assert bool(film.x.isfinite().all()) and film.pixel > 0
 
 
@@ -65,32 +65,32 @@ def test_a_pair_holds_the_tracks_of_both_frames_and_trusts_those_that_move_littl
     still = film.pair((10, 10))
     assert bool((still.precision == 1).all()) and bool((pair.precision < 1).all()) and bool((pair.precision > 0).all())
     groups = torch.ones(1, film.x.shape[1], dtype=torch.bool)
-    torch.testing.assert_close(pair.weighed(groups)[0] * pair.precision.mean(), pair.precision)
+    torch.testing.assert_close(pair.weigh_groups(groups)[0] * pair.precision.mean(), pair.precision)
 
 
 def test_pairs_are_spread_evenly():
-    assert spread_evenly(10, 2, 100) == [(a, a + 2) for a in range(8)]
-    few = spread_evenly(101, 1, 5)
+    assert space_pairs(10, 2, 100) == [(a, a + 2) for a in range(8)]
+    few = space_pairs(101, 1, 5)
     assert few == [(0, 1), (25, 26), (50, 51), (74, 75), (99, 100)] or (few[0], few[-1], len(few)) == ((0, 1), (99, 100), 5)
-    assert len(spread_evenly(50, 4, 1)) == 1 and spread_evenly(2, 1, 3) == [(0, 1)]
+    assert len(space_pairs(50, 4, 1)) == 1 and space_pairs(2, 1, 3) == [(0, 1)]
 
 
 def test_near_pairs_have_enough_in_common_and_grow_with_the_video():
     short, long = long_film(30), long_film(120)
     gaps, starts, common = (1, 2, 4), 10, 16
-    found = pairs_near(short, gaps, starts, common)
+    found = select_near_pairs(short, gaps, starts, common)
     assert found and all(b - a in gaps and int((short.seen[a] & short.seen[b]).sum()) >= common for a, b in found)
     assert len(set(found)) == len(found)
-    more = pairs_near(long, gaps, starts, common)
+    more = select_near_pairs(long, gaps, starts, common)
     assert 2 * len(found) < len(more) < 8 * len(found)
-    assert pairs_near(short, (50,), 3, 1) in ([], [(0, 29)])  # no gap is wider than the video
-    assert pairs_near(short, gaps, starts, 10_000) == []
+    assert select_near_pairs(short, (50,), 3, 1) in ([], [(0, 29)])  # no gap is wider than the video
+    assert select_near_pairs(short, gaps, starts, 10_000) == []
 
 
 def test_chosen_pairs_show_all_tracks_and_are_the_same_every_time():
     film = long_film(40, each=12, shortest=4)
-    pairs = chosen_pairs(film, 64)
-    assert pairs == sorted(set(pairs)) == chosen_pairs(film, 64)
+    pairs = select_frame_pairs(film, 64)
+    assert pairs == sorted(set(pairs)) == select_frame_pairs(film, 64)
     assert all(0 <= a < b < 40 for a, b in pairs)
     assert all(int((film.seen[a] & film.seen[b]).sum()) >= 20 for a, b in pairs)
     assert float((kept(pairs, film)[film.seen.sum(0) >= 3] > 0).double().mean()) > 0.95
@@ -100,15 +100,15 @@ def test_chosen_pairs_show_all_tracks_and_are_the_same_every_time():
 @pytest.mark.parametrize("frames", [2, 3, 8])
 def test_chosen_pairs_of_few_frames(frames):
     film = shot((30, 20), frames=frames).film()
-    pairs = chosen_pairs(film, 64)
+    pairs = select_frame_pairs(film, 64)
     assert 1 <= len(pairs) <= frames * (frames - 1) // 2 and (0, frames - 1) in pairs
     assert bool((kept(pairs, film) == len(pairs)).all())
 
 
 def test_chosen_pairs_grow_with_the_length_of_the_video_at_most():
-    counts = [len(chosen_pairs(long_film(frames), 10_000)) for frames in (40, 80, 160)]
+    counts = [len(select_frame_pairs(long_film(frames), 10_000)) for frames in (40, 80, 160)]
     assert counts[0] < counts[1] < counts[2] < 5 * counts[0]
-    assert len(chosen_pairs(long_film(160), 64)) <= 64
+    assert len(select_frame_pairs(long_film(160), 64)) <= 64
 
 
 def test_no_pair_where_no_frames_have_enough_in_common():
@@ -116,13 +116,13 @@ def test_no_pair_where_no_frames_have_enough_in_common():
     tracks = torch.full_like(scene.tracks, torch.nan)
     for track in range(30):
         tracks[track % 6, track] = scene.tracks[track % 6, track]
-    assert chosen_pairs(Film.of(tracks), 64) == []
+    assert select_frame_pairs(TrackSet.of(tracks), 64) == []
 
 
 def test_plain_videos_have_no_cut():
     for scene in (shot((60, 40)), shot((60,), frames=3), shot((60, 30), moves=4.0)):
-        assert cut_of(scene.film()) is None
-    assert cut_of(long_film(60)) is None
+        assert find_scene_cut(scene.film()) is None
+    assert find_scene_cut(long_film(60)) is None
 
 
 @pytest.mark.parametrize("frame", [3, 6])
@@ -131,7 +131,7 @@ def test_a_cut_is_where_the_tracks_end_and_others_begin(frame):
     before, after = tracks.clone(), tracks.clone()
     before[frame:], after[:frame] = torch.nan, torch.nan
     before[:, :4] = tracks[:, :4]  # a few are taken for the same
-    cut = cut_of(Film.of(torch.cat([before, after], 1)))
+    cut = find_scene_cut(TrackSet.of(torch.cat([before, after], 1)))
     assert cut is not None and cut.frame == frame
     assert cut.share == pytest.approx(4 / 60, abs=0.02) and cut.jump == 0
 
@@ -142,11 +142,11 @@ def test_a_cut_is_where_all_tracks_jump(frame):
     tracks = scene.tracks.clone()
     shuffled = torch.randperm(80, generator=draw(1))
     tracks[frame:] = tracks[frame:][:, shuffled]
-    cut = cut_of(Film.of(tracks))
+    cut = find_scene_cut(TrackSet.of(tracks))
     assert cut is not None and cut.frame == frame and cut.jump > 5
 
 
 def test_some_tracks_that_jump_are_no_cut():
     tracks = shot((60, 20)).tracks.clone()
     tracks[5:, :20] += 300.0
-    assert cut_of(Film.of(tracks)) is None
+    assert find_scene_cut(TrackSet.of(tracks)) is None

@@ -11,7 +11,7 @@ from dyntorch.geometry.homogeneous import unit
 from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment.coherence import Links, coherence
 from dyntorch.tasks.segment.energy import View
-from dyntorch.tasks.segment.labels import LABEL_SHARPNESS, NUM_LABEL_UPDATES, field, label
+from dyntorch.tasks.segment.labels import LABEL_SHARPNESS, NUM_LABEL_UPDATES, label_field, label_matches
 
 F64 = torch.float64
 SCALE = 1 / 200
@@ -35,7 +35,7 @@ def labelled(seed: int = 0, spatial: bool = True, found=None, weights=None, shar
     return (
         view,
         scene.labels,
-        label(view, found, F, weights, THRESHOLD, 3 * SCALE if spatial else None, share=share),
+        label_matches(view, found, F, weights, THRESHOLD, 3 * SCALE if spatial else None, share=share),
     )
 
 
@@ -91,7 +91,7 @@ def test_field_one_match_at_a_time():
     view, _, _ = labelled(0)
     cost = 3 * torch.rand(2, 150, generator=draw(1), dtype=F64)
     links = view.links
-    found = field(cost, 1.3, links)
+    found = label_field(cost, 1.3, links)
     full = LABEL_SHARPNESS * torch.cat([torch.full((1, 150), 1.3, dtype=F64), cost])
     member = torch.softmax(-full, 0)
     for _ in range(NUM_LABEL_UPDATES):
@@ -107,4 +107,4 @@ def test_no_links_leave_the_softmax_of_the_costs():
     none = Links(torch.zeros(6, 0, dtype=torch.long), torch.zeros(6, 0, dtype=F64))
     cost = 3 * torch.rand(2, 6, generator=draw(2), dtype=F64)
     expected = torch.softmax(-LABEL_SHARPNESS * torch.cat([torch.ones(1, 6, dtype=F64), cost]), 0)
-    torch.testing.assert_close(field(cost, 1.0, none), expected)
+    torch.testing.assert_close(label_field(cost, 1.0, none), expected)

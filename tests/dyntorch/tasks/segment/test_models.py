@@ -14,7 +14,7 @@ from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous, ske
 from dyntorch.tasks.segment import labels as module
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.energy import View
-from dyntorch.tasks.segment.labels import MAX_SQUARED_DEVIATION, NUM_LABEL_ROUNDS, TRUNCATED_VARIANCE, choose
+from dyntorch.tasks.segment.labels import MAX_SQUARED_DEVIATION, NUM_LABEL_ROUNDS, TRUNCATED_VARIANCE, select_models
 
 F64 = torch.float64
 SCALE = 1 / 200
@@ -32,7 +32,7 @@ def chosen(kind: str, n: int, sigma: float, seed: int, weight: float = 1.0):
     view = View(x1, x2, SCALE, Links(torch.zeros(n, 0, dtype=torch.long), torch.zeros(n, 0, dtype=F64)))
     member = torch.full((1, n), weight, dtype=F64)
     F = fit_fundamental(x1, x2, member, [6 * SCALE, 3 * SCALE, 2 * SCALE])[0]
-    return choose(view, F, member), view
+    return select_models(view, F, member), view
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 1.0])
@@ -74,9 +74,9 @@ def test_matches_without_weight_do_not_matter():
         member = torch.ones(1, 60, dtype=F64)
         member[:, :15] = 0.0
         F = fit_fundamental(view.x1, x2, member, [6 * SCALE, 3 * SCALE, 2 * SCALE])[0]
-        found = choose(View(view.x1, x2, SCALE, view.links), F, member)
+        found = select_models(View(view.x1, x2, SCALE, view.links), F, member)
         part = view.subset(torch.arange(15, 60))
-        alone = choose(part, F, member[:, 15:])
+        alone = select_models(part, F, member[:, 15:])
         assert torch.equal(found.planar, alone.planar)
         torch.testing.assert_close(found.homographies, alone.homographies, rtol=0, atol=1e-6)
 
@@ -131,7 +131,7 @@ def test_noise_is_that_of_all_bodies():
 def test_no_and_few_matches():
     models, view = chosen("general", 8, 0.5, 9)
     assert models.planar.shape == (1,) and bool(models.homographies.isfinite().all())
-    nothing = choose(view, torch.zeros(1, 3, 3, dtype=F64), torch.zeros(1, 8, dtype=F64))
+    nothing = select_models(view, torch.zeros(1, 3, 3, dtype=F64), torch.zeros(1, 8, dtype=F64))
     assert bool(nothing.homographies.isfinite().all())
 
 
@@ -148,5 +148,5 @@ def test_a_plane_with_more_than_a_few_matches_off_it_is_a_body_with_depth(off, p
     pixel = 0.002
     x2 = x2 + 0.3 * pixel * torch.randn(100, 2, generator=draw, dtype=torch.float64)
     none = Links(torch.zeros(100, 0, dtype=torch.long), torch.zeros(100, 0, dtype=torch.float64))
-    found = choose(View(x1, x2, pixel, none), (skew(e) @ H)[None], torch.ones(1, 100, dtype=torch.float64))
+    found = select_models(View(x1, x2, pixel, none), (skew(e) @ H)[None], torch.ones(1, 100, dtype=torch.float64))
     assert found.planar.tolist() == [planar]

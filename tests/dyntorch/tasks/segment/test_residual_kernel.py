@@ -11,7 +11,7 @@ import torch
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.metrics import relative_error
 from dyntorch.tasks.segment import residual_kernel
-from dyntorch.tasks.segment.frame_pairs import pairs_near
+from dyntorch.tasks.segment.frame_pairs import select_near_pairs
 from dyntorch.tasks.segment.residual_kernel import (
     affine_map,
     fundamental_of_eight,
@@ -156,7 +156,7 @@ def test_tracks_that_never_meet_have_nothing_in_common():
     tracks[4:, :25] = torch.nan
     tracks[:4, 25:] = torch.nan
     apart = replace(scene, tracks=tracks)
-    assert pairs_near(apart.film(), residual_kernel.KERNEL_GAPS, 3, residual_kernel.MIN_KERNEL_TRACKS)
+    assert select_near_pairs(apart.film(), residual_kernel.KERNEL_GAPS, 3, residual_kernel.MIN_KERNEL_TRACKS)
     kernel = kernel_of(apart)
     assert bool((kernel[:25, 25:] == 0).all()) and bool((kernel[25:, :25] == 0).all())
     assert bool(kernel.isfinite().all()) and float(kernel[:25, :25].sum()) > 0 and float(kernel[25:, 25:].sum()) > 0

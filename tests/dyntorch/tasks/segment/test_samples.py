@@ -9,7 +9,7 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.energy import ENERGY_MAX_SQUARED_DISTANCE, SAMPSON_NOISE_PIXELS, View
-from dyntorch.tasks.segment.search import LEAST, matrix_pairs, search_samples
+from dyntorch.tasks.segment.search import MIN_BODY_MATCHES, matrix_pairs, search_samples
 
 
 def generator(seed=0):
@@ -72,7 +72,7 @@ def test_candidates_are_ordered_and_cost_their_distances():
         for candidate in candidates:
             square = sampson_squared(candidate.fundamentals, view.x1, view.x2)
             near = square.argmin(0)[square.amin(0) < ENERGY_MAX_SQUARED_DISTANCE * (SAMPSON_NOISE_PIXELS * view.pixel) ** 2]
-            assert int(torch.bincount(near, minlength=count).min()) >= LEAST
+            assert int(torch.bincount(near, minlength=count).min()) >= MIN_BODY_MATCHES
 
 
 def test_the_pair_of_the_segmentation_matrix_is_exact_without_noise():

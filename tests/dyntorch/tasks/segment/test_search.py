@@ -16,7 +16,7 @@ from dyntorch.tasks.segment.coherence import coherence
 from dyntorch.tasks.segment.energy import View, energy
 from dyntorch.tasks.segment.result import BodyModel
 from dyntorch.tasks.segment.search import Candidate, search
-from dyntorch.tasks.segment.segment import best, nothing, segmentation_notices
+from dyntorch.tasks.segment.segment import no_bodies, segmentation_notices, select_count
 
 F64 = torch.float64
 SCALE = 1 / 200
@@ -101,13 +101,13 @@ def test_another_segmentation_of_little_more_cost_is_a_rival(moved, costs, rival
     def search(counts):
         return {count: [Candidate(100.0, labels, pair), Candidate(100.0 + costs, other, pair)] for count in counts if count == 2}
 
-    chosen = best(search, 100, 2, penalty=4.5, max_bodies=12)
+    chosen = select_count(search, 100, 2, penalty=4.5, max_bodies=12)
     assert chosen is not None and chosen.rival == pytest.approx(rival)
 
 
 @pytest.mark.parametrize(("rival", "said"), [(0.5, True), (3.0, False), (inf, False)])
 def test_two_views_that_hardly_decide_say_so(rival, said):
-    problem = nothing(torch.ones(30, dtype=F64), 2.5, Status.OK, 0.0, 1.0)
+    problem = no_bodies(torch.ones(30, dtype=F64), 2.5, Status.OK, 0.0, 1.0)
     problem = replace(problem, models=(BodyModel.FUNDAMENTAL,) * 2, rival=rival)
     told = [str(notice) for notice in segmentation_notices([problem], None, ())]
     assert any("through more frames" in text for text in told) is said

@@ -12,7 +12,7 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.tasks.segment import track_energy
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.energy import relief
-from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, chosen_pairs
+from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, select_frame_pairs
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.track_energy import (
     EFFECTIVE_PAIRS,
@@ -25,13 +25,13 @@ from dyntorch.tasks.segment.track_energy import (
     TRACK_FREEDOM,
     TrackEvidence,
     costs,
-    descended,
+    descend_labels,
     energy,
-    fitted,
-    improbable,
+    fit_groups,
+    no_links,
     noise,
     squares,
-    unlinked,
+    student_cost,
 )
 from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
 
@@ -40,11 +40,11 @@ HERE = torch.device("cpu")
 
 def pairs_of(scene: Shot, threshold: float = 2.5):
     film = scene.film(threshold)
-    return [film.pair(pair) for pair in chosen_pairs(film, 64)]
+    return [film.pair(pair) for pair in select_frame_pairs(film, 64)]
 
 
 def evidence_of(scene: Shot, links: Links | None = None) -> TrackEvidence:
-    return TrackEvidence.of(pairs_of(scene), unlinked(len(scene.labels), HERE) if links is None else links)
+    return TrackEvidence.of(pairs_of(scene), no_links(len(scene.labels), HERE) if links is None else links)
 
 
 def chain(scene: Shot, weight: float = 3.0) -> Links:
@@ -57,17 +57,17 @@ def chain(scene: Shot, weight: float = 3.0) -> Links:
 def fits(scene: Shot, evidence: TrackEvidence):
     """Geometries ``(1, K, 3, 3)`` of the true bodies, and the members."""
     member = one_hot(scene.labels[None] - 1, int(scene.labels.max())).double()
-    found = fitted(evidence.pairs, member[0], (4.0, 1.0, 0.3))
+    found = fit_groups(evidence.pairs, member[0], (4.0, 1.0, 0.3))
     return [F[None] for F in found], member
 
 
 def test_improbable_is_students_cost_up_to_a_cutoff(monkeypatch):
     square = torch.tensor([0.0, 0.5, 3.0, 15.9, 16.0, 1e6], dtype=F64)
     known = [3 * log(1 + min(z, 16.0) / 2) for z in square.tolist()]
-    assert improbable(square).tolist() == pytest.approx(known)
+    assert student_cost(square).tolist() == pytest.approx(known)
     monkeypatch.setattr(track_energy, "TRACK_FREEDOM", 5.0)
     monkeypatch.setattr(track_energy, "MAX_TRACK_DISTANCE", 1.0)
-    assert improbable(square).tolist() == pytest.approx([6 * log(1 + min(z, 1.0) / 5) for z in square.tolist()])
+    assert student_cost(square).tolist() == pytest.approx([6 * log(1 + min(z, 1.0) / 5) for z in square.tolist()])
 
 
 def test_squares_are_sampson_distances_in_pixels_as_of_tracks_at_rest():
@@ -180,7 +180,7 @@ def test_costs_are_least_in_the_own_body():
 
 def test_a_descent_stays_at_the_truth():
     scene = shot((40, 30, 20))
-    found = descended(evidence_of(scene, chain(scene)), scene.labels[None] - 1, 3)
+    found = descend_labels(evidence_of(scene, chain(scene)), scene.labels[None] - 1, 3)
     assert found.bodies == 3 and found.labels.shape == (1, 90) and found.member.shape == (1, 3, 90)
     assert float((found.labels[0] == scene.labels - 1).double().mean()) > 0.98
     torch.testing.assert_close(found.member.sum(1), torch.ones(1, 90), rtol=0, atol=1e-5)
@@ -194,7 +194,7 @@ def test_a_descent_improves_wrong_labels_and_prefers_the_truth():
     wrong = truth.clone()
     wrong[::5] = 1 - wrong[::5]
     random = torch.randint(0, 2, (70,), generator=draw(4))
-    found = descended(evidence, torch.stack([truth, wrong, random]), 2)
+    found = descend_labels(evidence, torch.stack([truth, wrong, random]), 2)
     assert float((found.labels[1] == truth).double().mean()) > 0.95
     assert int(found.energy.argmin()) != 2 or float((found.labels[2] == truth).double().mean()) > 0.95
     one = found.of(1)
@@ -208,7 +208,7 @@ def test_starts_side_by_side_are_those_one_by_one():
     truth = scene.labels - 1
     wrong = truth.clone()
     wrong[::6] = 1 - wrong[::6]
-    both = descended(evidence, torch.stack([wrong, wrong]), 2)
-    alone = descended(evidence, wrong[None], 2)
+    both = descend_labels(evidence, torch.stack([wrong, wrong]), 2)
+    alone = descend_labels(evidence, wrong[None], 2)
     assert both.labels[1].tolist() == alone.labels[0].tolist()
     torch.testing.assert_close(both.energy[:1], alone.energy, rtol=1e-4, atol=1e-3)

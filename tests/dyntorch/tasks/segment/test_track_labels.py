@@ -11,8 +11,8 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.metrics import relative_error
 from dyntorch.tasks.segment import labels as module
-from dyntorch.tasks.segment.frame_pairs import Film
-from dyntorch.tasks.segment.labels import agreeing, distances, motions, outliers, resting, widths
+from dyntorch.tasks.segment.frame_pairs import TrackSet
+from dyntorch.tasks.segment.labels import distances, distances_from_cameras, find_static_body, motions, outliers, widths
 from dyntorch.tasks.segment.search import one_hot
 from tests.dyntorch.tasks.segment.videos import F64, Shot, shot
 
@@ -111,7 +111,7 @@ def test_widths_are_shares_of_the_picture():
     assert float(widths(scene.film(), everything)) == pytest.approx(1.0)
     # frames that show nothing do not count
     empty = torch.cat([scene.tracks, torch.full_like(scene.tracks[:3], torch.nan)])
-    torch.testing.assert_close(widths(Film.of(empty, 2.5), members(scene)), found)
+    torch.testing.assert_close(widths(TrackSet.of(empty, 2.5), members(scene)), found)
 
 
 @pytest.mark.parametrize(
@@ -121,28 +121,30 @@ def test_widths_are_shares_of_the_picture():
 )
 def test_what_rests_is_the_largest_and_widest(counts, rests):
     scene = shot(counts)
-    assert resting(scene.film(), members(scene)) == rests
+    assert find_static_body(scene.film(), members(scene)) == rests
 
 
 def test_what_rests_has_a_share_of_all(monkeypatch):
     scene = shot((40, 20, 20, 20))
     for share, known in ((0.5, None), (0.3, 0)):
         monkeypatch.setattr(module, "MIN_STATIC_SHARE", share)
-        assert resting(scene.film(), members(scene)) == known
+        assert find_static_body(scene.film(), members(scene)) == known
 
 
 def test_declared_cameras_agree_with_what_rests():
     scene = shot((40, 30, 20), sigma=0.1)
-    off = agreeing(scene.tracks, members(scene), scene.cameras, pairs_of(scene))
+    off = distances_from_cameras(scene.tracks, members(scene), scene.cameras, pairs_of(scene))
     assert int(off.argmin()) == 0 and float(off[0]) < 0.3 and float(off[1:].min()) > 5 * float(off[0])
     scaled = scene.cameras * torch.linspace(-2, 3, 10, dtype=F64)[:, None, None]
-    torch.testing.assert_close(agreeing(scene.tracks, members(scene), scaled, pairs_of(scene)), off, rtol=1e-5, atol=1e-8)
+    torch.testing.assert_close(
+        distances_from_cameras(scene.tracks, members(scene), scaled, pairs_of(scene)), off, rtol=1e-5, atol=1e-8
+    )
     world = torch.linalg.qr(torch.randn(4, 4, generator=torch.Generator().manual_seed(0), dtype=F64))[0]
     torch.testing.assert_close(
-        agreeing(scene.tracks, members(scene), scene.cameras @ world, pairs_of(scene)), off, rtol=1e-4, atol=1e-6
+        distances_from_cameras(scene.tracks, members(scene), scene.cameras @ world, pairs_of(scene)), off, rtol=1e-4, atol=1e-6
     )
     # the cameras of a body that moves agree with that one
-    other = agreeing(scene.tracks, members(scene), scene.projections[:, 1], pairs_of(scene))
+    other = distances_from_cameras(scene.tracks, members(scene), scene.projections[:, 1], pairs_of(scene))
     assert int(other.argmin()) == 1
 
 
@@ -151,5 +153,5 @@ def test_a_body_in_no_pair_agrees_with_nothing():
     tracks = scene.tracks.clone()
     tracks[1:, 40:] = torch.nan
     gone = replace(scene, tracks=tracks)
-    off = agreeing(tracks, members(gone), scene.cameras, pairs_of(gone))
+    off = distances_from_cameras(tracks, members(gone), scene.cameras, pairs_of(gone))
     assert float(off[1]) == torch.inf and float(off[0]) < 0.5

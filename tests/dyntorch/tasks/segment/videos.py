@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, skew, unit
 from dyntorch.geometry.rigid import rotation_exponential
-from dyntorch.tasks.segment.frame_pairs import Film
+from dyntorch.tasks.segment.frame_pairs import TrackSet
 
 F64 = torch.float64
 K = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], dtype=F64)
@@ -38,9 +38,9 @@ class Shot:
         centre = torch.linalg.svd(a)[2][-1]
         return unit(skew(b @ centre) @ b @ torch.linalg.pinv(a))
 
-    def film(self, pixel: float = 1.0) -> Film:
+    def film(self, pixel: float = 1.0) -> TrackSet:
         """As the stages see it."""
-        return Film.of(self.tracks, pixel)
+        return TrackSet.of(self.tracks, pixel)
 
 
 def draw(seed: int = 0) -> torch.Generator:
