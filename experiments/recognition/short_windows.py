@@ -24,6 +24,8 @@ from indexing.action.stream import BLOCK, Stream, StreamScan, around, motion_lev
 from indexing.scoring import Event, event_levels, events, smooth
 from indexing.windows import mended
 
+BLOCK_STEP = 0.2  # seconds between the windows of which BLOCK are described at once
+
 
 @dataclass(frozen=True)
 class ShortWindowOptions:
@@ -114,7 +116,7 @@ def find_events(
         motion = smooth(windows.motion[part, None], at, stream.window)[:, 0]
         resting = at_rest(contrast, motion, still, calm, (floor, convincing), options=options) | ~windows.present[part]
         ends = np.minimum(at, clip.times[frames][-1])
-        found += events(contrast, ends, list(classes), peak, floor, resting, model.options.decisions)
+        found += events(contrast, ends, list(classes), peak, floor, resting)
     return _with_exemplars(model, clip, stream, windows.stretches, classes, found)
 
 
@@ -158,8 +160,8 @@ def _with_exemplars(
     middles = np.array([(event.start + event.end) / 2 for event in found])
     owner = np.searchsorted(clip.times[cuts[:, 0]], middles, side="right") - 1
     queries = []
-    for some in np.split(np.arange(len(found)), np.flatnonzero(np.diff(middles // (BLOCK * model.options.events.step))) + 1):
-        source, own = around(clip, cuts, middles[some], owner[some], stream, model.options)
+    for some in np.split(np.arange(len(found)), np.flatnonzero(np.diff(middles // (BLOCK * BLOCK_STEP))) + 1):
+        source, own = around(clip, cuts, middles[some], owner[some], stream)
         queries.append(windows_at(source, own, middles[some], stream.window, stream.length))
     residual = model.moment_residuals(stack(queries).to(stream.device))
     owners = model.labels[model.exemplars.owner]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """Options of :func:`dyntorch.calibrate`."""
+    """What a user can set in :func:`dyntorch.calibrate`: how much it takes, and what it may answer."""
 
     min_matches: int = 60
     """Positions that two cameras must see at the same moments: ten times the seven unknowns of F is little."""

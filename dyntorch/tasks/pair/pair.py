@@ -30,7 +30,7 @@ from dyntorch.tasks.synchronize.result import Shift
 
 @dataclass(frozen=True)
 class PairOptions:
-    """Options of :func:`dyntorch.reconstruct_pair`."""
+    """What a user can set in :func:`dyntorch.reconstruct_pair`."""
 
     min_frames: int = 12
     """Frames in common: fewer are explained by any tracks."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """Options of :func:`dyntorch.reconstruct`."""
+    """What a user can set in :func:`dyntorch.reconstruct`."""
 
     min_inlier_share: float = 0.4
     """Share of the points that must agree where tracks are wrong: .5 and more found 60 to 70 % outliers right in 3 of 28 scenes,

@@ -17,7 +17,8 @@ from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import refuse_range
 from indexing.cli.videos import find_keypoints, wants_keypoints
 from indexing.files import manifest, prepare
-from indexing.report.sync import FILES, SyncReport, drop_checks, names_of, summarize, write_checks, write_sync
+from indexing.report.check_videos import drop_checks, names_of, write_checks
+from indexing.report.sync import FILES, SyncReport, summarize, write_sync
 from indexing.sync.breaks import find_breaks
 from indexing.sync.calibration import named_lenses
 from indexing.sync.files import (
