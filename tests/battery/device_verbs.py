@@ -566,7 +566,10 @@ NOT_VERBS = {
     ),
     "check_options": "looks at no tensor",
     "map_blocks": "computes nothing by itself",
-    **dict.fromkeys(("BodyModel", "LineStatus", "Status", "Motion", "Polynomial", "Fourier", "Invariant"), "names and numbers"),
+    **dict.fromkeys(
+        ("BodyModel", "LineStatus", "Status", "Motion", "MotionName", "MOTION_MODELS", "Polynomial", "Fourier", "Invariant"),
+        "names and numbers",
+    ),
     **dict.fromkeys(
         (
             "Alignment",
