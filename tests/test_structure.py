@@ -20,13 +20,15 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("dyntorch", "indexing")
 MAX_FIELDS = 12
 """Fields of the options of one verb."""
+NESTED = {"Options.watching"}
+"""What every reader is called with holds what only videos need."""
 BOUNDS = {
-    "files": 418,
+    "files": 417,
     "lines": 97_000,
     "code lines": 60_000,
     "docstring lines": 14_800,
-    "option fields": 150,
-    "option fields that nobody sets": 40,
+    "option fields": 140,
+    "option fields that nobody sets": 31,
     "functions called by an everyday word": 375,
     "imports of our own inside functions": 70,
     "circles of imports": 0,
@@ -218,7 +220,7 @@ def test_options_of_a_verb_are_few_and_flat():
         for part in node.body
         if isinstance(part, ast.AnnAssign) and names & set(re.findall(r"\w+", ast.unparse(part.annotation)))
     ]
-    assert many == {} and nested == []
+    assert many == {} and set(nested) == NESTED
 
 
 DAMPED = {"dyntorch/numerics/least_squares.py", "dyntorch/metrics/errors.py"}

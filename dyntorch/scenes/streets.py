@@ -25,6 +25,14 @@ ALONG = 8
 
 Light = Literal["day", "night"]
 
+CAR_TRACK_SHARE = (0.035, 0.25)  # share of the tracks that one car has, from and to
+MAX_DENSITY = 25.0  # tracks that a car has at most per 1000 square pixels where it is largest, of 500 in all
+FIRST_FRAME_SHARE = 0.65  # share of the tracks that begin in frame 0, in 20 frames; less in more
+MIN_TRACK_FRAMES = 5  # frames of a track
+MAX_STEP = 70.0  # pixels per frame that the tracker follows
+TRACK_DRIFT = 0.15  # of a track, per frame, in units of sigma
+BLUR_DRIFT = 0.01  # further drift per frame and pixel of motion, in units of sigma
+
 
 @dataclass(frozen=True)
 class StreetOptions:
@@ -40,16 +48,9 @@ class StreetOptions:
         buses: share of cars that are 11 m long and 3 m high.
         texture: share of the surface that has something to track, in patches of 1.5 m.
         road: of what is tracked elsewhere, the share that is tracked on the road.
-        moving: share of the tracks that one car has, from and to.
-        density: most tracks that a car has per 1000 square pixels where it is largest, of 500 tracks in all.
         members: least tracks of a car.
         visible: pixels per frame by which the corners of a car move otherwise (median) than on every other body, at its best.
-        first: share of the tracks that begin in frame 0, in 20 frames; less in more.
         loss: share of the tracks that the tracker loses per frame, besides those that leave or are hidden.
-        shortest: frames of a track.
-        step: pixels per frame that the tracker follows.
-        drift: of a track, per frame, in units of sigma.
-        blur: further drift per frame and pixel of motion, in units of sigma.
     """
 
     speed: tuple[float, float] = (0.5, 1.2)
@@ -61,16 +62,9 @@ class StreetOptions:
     buses: float = 0.0
     texture: float = 0.6
     road: float = 0.3
-    moving: tuple[float, float] = (0.035, 0.25)
-    density: float = 25.0
     members: int = 15
     visible: float = 1.0
-    first: float = 0.65
     loss: float = 0.04
-    shortest: int = 5
-    step: float = 70.0
-    drift: float = 0.15
-    blur: float = 0.01
 
 
 DAY = StreetOptions()
@@ -158,8 +152,8 @@ def streets(
 
 
 def _check(bodies: int, frames: int, tracks: int, sigma: float, outliers: float, options: StreetOptions) -> None:
-    if bodies < 1 or frames < options.shortest:
-        raise ValueError(f"a street needs bodies >= 1 and frames >= {options.shortest}, got bodies={bodies}, frames={frames}")
+    if bodies < 1 or frames < MIN_TRACK_FRAMES:
+        raise ValueError(f"a street needs bodies >= 1 and frames >= {MIN_TRACK_FRAMES}, got bodies={bodies}, frames={frames}")
     if tracks < 2 * options.members * bodies:
         raise ValueError(f"{bodies} bodies need at least {2 * options.members * bodies} tracks, got tracks={tracks}")
     if not sigma >= 0:
@@ -243,11 +237,11 @@ class _Scene:
 
     def quota(self, tracks: int, chance: Chance) -> list[int] | None:
         """Tracks of every body, the street first; nothing where a car is too small or the street has too little."""
-        low, high = self.options.moving
+        low, high = CAR_TRACK_SHARE
         counts = []
         for car in self.cars:
             share = math.exp(chance.between(math.log(low), math.log(high)))
-            most = self.options.density / 1000 * float(self.frame_of(car)[2].max()) * max(1.0, tracks / 500)
+            most = MAX_DENSITY / 1000 * float(self.frame_of(car)[2].max()) * max(1.0, tracks / 500)
             counts.append(int(min(max(self.options.members, share * tracks), most)))
         if any(count < self.options.members for count in counts):
             return None
@@ -278,9 +272,9 @@ class _Scene:
         if body > 0:
             low, high, area = self.frame_of(self.cars[body - 1])
             seen = area > 60.0
-        latest = frames - options.shortest
+        latest = frames - MIN_TRACK_FRAMES
         begin = torch.where(
-            chance.uniform(count) < options.first * min(1.0, 20 / frames), 0.0, chance.uniform(count) * (latest + 1)
+            chance.uniform(count) < FIRST_FRAME_SHARE * min(1.0, 20 / frames), 0.0, chance.uniform(count) * (latest + 1)
         )
         start = begin.long().clamp(max=latest)
         start = start[seen[start]]
@@ -316,14 +310,14 @@ class _Scene:
         step = torch.nn.functional.pad(image.diff(dim=0).norm(dim=-1), (0, 0, 1, 0))
         after = frames[:, None] >= start
         life = (chance.uniform(len(start)).log() / math.log(1 - self.options.loss)).ceil() if self.options.loss > 0 else torch.inf
-        lost = ~self.inside(points, self.cameras) | ((step > self.options.step) & (frames[:, None] > start))
-        alive = after & ((after & lost).cumsum(0) == 0) & (frames[:, None] - start < self.options.shortest + life)
+        lost = ~self.inside(points, self.cameras) | ((step > MAX_STEP) & (frames[:, None] > start))
+        alive = after & ((after & lost).cumsum(0) == 0) & (frames[:, None] - start < MIN_TRACK_FRAMES + life)
         hidden = torch.zeros_like(alive)
         for t in frames.tolist():
             here = alive[t].nonzero()[:, 0]
             hidden[t, here] = ~self._free(t, points[t, here], box[here])
         alive &= hidden.cumsum(0) == 0
-        long = alive.sum(0) >= self.options.shortest
+        long = alive.sum(0) >= MIN_TRACK_FRAMES
         return _Part(alive[:, long], points[:, long], image[:, long])
 
     def _free(self, frame: int, points: Tensor, own: Tensor) -> Tensor:
@@ -342,8 +336,8 @@ class _Scene:
         order = chance.uniform(len(labels)).argsort()
         alive, points, image, labels = alive[:, order], points[:, order], image[:, order], labels[order]
         exact = torch.where(alive[..., None], image, torch.nan)
-        step = torch.nn.functional.pad(image.diff(dim=0).norm(dim=-1).clamp(max=self.options.step), (0, 0, 1, 0))
-        drift = (chance.normal(*image.shape) * (self.options.drift + self.options.blur * step)[..., None]).cumsum(0)
+        step = torch.nn.functional.pad(image.diff(dim=0).norm(dim=-1).clamp(max=MAX_STEP), (0, 0, 1, 0))
+        drift = (chance.normal(*image.shape) * (TRACK_DRIFT + BLUR_DRIFT * step)[..., None]).cumsum(0)
         first = alive.double().argmax(0)
         drift = drift - drift[first, torch.arange(len(labels))]
         tracks = image + sigma * (chance.normal(*image.shape) + drift)

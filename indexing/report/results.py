@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from indexing.clip import Clip
 from indexing.opening import count
-from indexing.recordings.repetitions import RepetitionCount
 from indexing.report.page import table_csv
 
 if TYPE_CHECKING:

@@ -129,10 +129,18 @@ def read_file(path: Path) -> Any:
             return {name: arrays[name] for name in arrays.files}
     if path.suffix == ".safetensors":
         with safe_open(path, "numpy") as file:
-            about = {key: json.loads(text) for key, text in (file.metadata() or {}).items()}
+            about = {key: decoded(text) for key, text in (file.metadata() or {}).items()}
             return {"tensors": {key: file.get_tensor(key) for key in sorted(file.keys())}, "about": about}
     data = path.read_bytes()
     return data.decode() if path.suffix == ".txt" else hashlib.sha256(data).hexdigest()
+
+
+def decoded(text: str) -> Any:
+    """What JSON says, and any other text as it is."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 def numbers(column: tuple[str, ...]) -> Any:
