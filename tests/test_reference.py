@@ -28,6 +28,7 @@ def reference():
     return module
 
 
+@pytest.mark.slow
 def test_every_public_name_has_its_text():
     wrong = []
     for package, name in PUBLIC:
@@ -41,6 +42,7 @@ def test_every_public_name_has_its_text():
     assert wrong == []
 
 
+@pytest.mark.slow
 def test_every_public_name_is_in_the_reference(reference):
     pages = reference.pages()
     written = "\n".join(reference.text(page) for page in pages)

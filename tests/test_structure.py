@@ -211,6 +211,7 @@ def test_the_house_does_not_grow():
     assert wrong == {}, "python -m tests.test_structure lists what there is"
 
 
+@pytest.mark.slow
 def test_options_of_a_verb_are_few_and_flat():
     many = {node.name: len(fields) for _, node, fields in options() if len(fields) > MAX_FIELDS}
     names = {node.name for _, node, _ in options()}
@@ -283,6 +284,7 @@ def test_every_result_is_an_outcome():
     assert {name: fields(found[name]) & own for name in RESULTS if fields(found[name]) & own} == {}
 
 
+@pytest.mark.slow
 def test_what_verbs_return_is_an_outcome():
     """By what the public verbs say that they return, so that a new one cannot bring a result of its own kind."""
     import dyntorch

@@ -21,8 +21,10 @@ ON_ALL = {
     "motion_of_composed_tensor_is_the_motion", "change_of_coordinates_commutes_with_exact_fit",
 }  # fmt: skip
 """What catches a wrong row, factor, sign or order of views: fast, and run on every case."""
-STATISTICS = {"covariance_is_calibrated", "neighbours_do_not_matter", "an_accelerator_agrees"}
-"""Draws, or the whole of an invariant done twice: slow on every case."""
+STATISTICS = {
+    "covariance_is_calibrated", "neighbours_do_not_matter", "an_accelerator_agrees", "dof_and_codim_are_ranks_of_derivatives",
+}  # fmt: skip
+"""Draws, the whole of an invariant done twice, derivatives by autograd: slow on every case."""
 SEARCHES = {
     "robust_fit_survives_outliers", "hostile_scales_stay_finite", "refinement_never_raises_the_distances",
     "refinement_finds_a_stationary_point",

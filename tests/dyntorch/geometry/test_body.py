@@ -1,5 +1,6 @@
 """The least squares problem of a body before fixed cameras: derivatives and descent, against finite differences and the truth."""
 
+import pytest
 import torch
 
 from dyntorch.geometry.body import BodyProblem, FilmedBody, fit_body
@@ -28,6 +29,7 @@ def problem(at, noise=0.0):
     return BodyProblem(at.images(CAMERA)[0] + noise * normal(4, 1, FRAMES, N, 2), 0.5 + normal(5, 1, FRAMES, N).abs(), CAMERA)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences():
     at = body()
     given = problem(at, 0.1)
