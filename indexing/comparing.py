@@ -40,13 +40,13 @@ Interval = tuple[Hashable, float, float]
 NONE = "(none)"
 SHARE_EPSILON = 1e-9  # an overlap of exactly one half is one half, however its ends were rounded
 
+OVERLAPS = (0.1, 0.25, 0.5)  # intersection over union from which two segments are one
+
 
 @dataclass(frozen=True)
 class ComparingOptions:
     """What is counted as the same segment, and how many kinds of label can be told apart in a table."""
 
-    overlaps: tuple[float, ...] = (0.1, 0.25, 0.5)
-    """Temporal intersection over union, of the F1s: those of the tables of temporal segmentation."""
     labels: int = 500
     """Different labels at most: free text is no label, and a table of more is neither read nor drawn."""
     block: int = 128
@@ -157,8 +157,9 @@ def _at_overlap(segments: Mapping[float, SegmentCounts]) -> dict[str, Any]:
     }
 
 
-def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = ComparingOptions()) -> Agreement:
+def compare(spans: Sequence[ComparedSpan], options: ComparingOptions | None = None) -> Agreement:
     """How far what was found agrees with what is known, over all spans together."""
+    options = options or ComparingOptions()
     inside = [(_inside(one.known, one), _inside(one.found, one)) for one in spans]
     names = sorted({str(label) for sides in inside for side in sides for label, _, _ in side})
     if len(names) > options.labels:
@@ -173,7 +174,7 @@ def compare(spans: Sequence[ComparedSpan], options: ComparingOptions = Comparing
         for lengths, here, there, used in _moments(span, (known, found), number, options.block):
             table[np.ix_([*used, -1], [*used, -1])] += time_table(lengths, here, there)
             lasting[used] += np.stack([lengths @ side for side in (here, there, here & there)], axis=1)
-    segments = {overlap: _count_segments(inside, names, overlap) for overlap in options.overlaps}
+    segments = {overlap: _count_segments(inside, names, overlap) for overlap in OVERLAPS}
     total = float(table.sum())
     by_label = {}
     for i, name in enumerate(names):

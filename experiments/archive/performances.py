@@ -123,7 +123,7 @@ class Config:
 # ---- who asks whom -----------------------------------------------------------------------------------------------------
 def clip_tasks(name: str, longest: float, seed: int) -> Iterator[Task]:
     """One per person: the clips of the others, asked by this person's."""
-    clips, shortest = protocol.load_set(name), ArchiveOptions().min_duration
+    clips, shortest = protocol.load_set(name), ArchiveOptions().storage.min_duration
     seen = protocol.render(clips, seed, TURNS)
     known = [
         Known(clip, (Stretch(label, -np.inf, np.inf),)) for clip, label in zip(seen.exemplars, seen.labels.tolist(), strict=True)

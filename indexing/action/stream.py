@@ -43,10 +43,6 @@ class ActionOptions:
     rest_weight: float = 4.0
     """Quality taken off where a person moves e times less than calm moments of the action do: 0 where people do not rest between
     actions.  F1 of actors who rest 2 to 7 s, camera turned by 60 degrees: 3: .79, 4: .85, 6: .90, but then Florence3D loses .02."""
-    live_block: float = 0.5
-    """Seconds of frames that a stream looks at together: a part of its lag, and the fewer the more it costs."""
-    live_memory: float = 300.0
-    """Seconds of the past by which a stream scales its scores: less where cameras and people change."""
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,6 @@ class ArchiveOptions:
     dimensions: int = 8
     """Directions of joint space that a sketch keeps, of x and of y.  Right moment among the best 10 / 100 / 300 of 280,000 windows
     of 1 s (CMU): 6 give .72 / .89 / .96, 8 .88 / .98 / .99, 12 .92 / 1.00 / 1.00, all .98 / .99 / .99 (without re-ranking)."""
-    min_duration: float = 0.5
-    """Seconds of the shortest window; what is in view for less is left out."""
     views: tuple[float, ...] = (0.0, 90.0)
     """Degrees about the vertical from which movement in 3D is kept: what goes towards one camera, the other sees."""
     max_segment_windows: int = 1_000_000
@@ -62,7 +60,7 @@ class ArchiveOptions:
     @property
     def storage(self) -> StorageFormat:
         """How a new archive stores movement."""
-        return StorageFormat(self.rate, self.dimensions, self.min_duration, self.views)
+        return StorageFormat(self.rate, self.dimensions, views=self.views)
 
 
 @dataclass(eq=False)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d
 
+MAX_PAUSE_SECONDS = 10.0  # without a frame, up to which frames are interpolated: what a video costs is told by its frames
 SAME_RATE = 0.01  # relative difference of frame rates that is none (29.97 and 30)
 
 
@@ -120,8 +121,8 @@ def _is_read(video: Any) -> bool:
 class Resampler:
     """Frames at the times of an even grid, interpolated between the frame before and the one after."""
 
-    def __init__(self, rate: float, fps: float | None, max_pause: float = 10.0) -> None:
-        self.step, self.made, self.max_pause = 1 / rate, 0, max_pause
+    def __init__(self, rate: float, fps: float | None) -> None:
+        self.step, self.made = 1 / rate, 0
         self.off = fps is not None and not abs(fps / rate - 1) <= SAME_RATE
         self.last: tuple[Tensor, float] | None = None
         self.begin = 0.0
@@ -136,7 +137,7 @@ class Resampler:
             self.begin = float(times[0])
         for frame, time in zip(frames, (times - self.begin).tolist(), strict=True):
             before, start = self.last or (frame, time - self.step)
-            if time - start > self.max_pause:  # nothing is made up for it, whatever its length
+            if time - start > MAX_PAUSE_SECONDS:  # nothing is made up for it, whatever its length
                 before, start, self.made = frame, time - self.step, math.ceil(time / self.step - 1e-9)
             while self.made * self.step <= time + 1e-9:
                 share = (self.made * self.step - start) / (time - start)

@@ -171,8 +171,6 @@ class BrightnessOptions:
     """Grey 0..1 per frame below which brightness change is noise (theory: .004; .008 at sensor noise 3/255)."""
     motion_memory: float = 20.0
     """Seconds over which the box forgets where somebody moved: less where people wander."""
-    max_pause: float = 10.0
-    """Seconds without a frame up to which frames are interpolated: what a video costs is told by its frames."""
     num_directions: int = 96
     """Principal directions in which frames are compared: all of 560 cost 4.3 ms per frame and 20,000 rows, these .2 ms; 32 name
     .7 of a percent fewer frames."""

@@ -124,7 +124,7 @@ class BrightnessStream:
     def __init__(self, source: Recognizer, classes: int, name: str, fps: float | None) -> None:
         self.source, self.fps = source, fps
         self.sight = Sight(source.optics, name)
-        self.resample = Resampler(source.optics.fps, fps, source.optics.options.max_pause)
+        self.resample = Resampler(source.optics.fps, fps)
         self.warping = Warping(source.library, source.window)
         self.pool = Pool(classes, source.pool, MEAN_SHARPNESS)
         self.whole = Pool(classes, float("inf"), MEAN_SHARPNESS)
@@ -185,7 +185,7 @@ def learn_descriptors(videos: list[Footage], optics: Optics) -> list[list[Tensor
 
 def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Descriptors of a whole video, and where something has moved in the end."""
-    sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate, optics.options.max_pause)
+    sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate)
     found = torch.cat([sight.push(resample.push(sight.small(frames), times)[0]) for frames, times in video]).cpu()
     if len(found) < MIN_FRAMES:
         raise ValueError(f"{video.name}: {len(found)} frames; motion needs at least {MIN_FRAMES}")

@@ -24,6 +24,7 @@ MIN_PRESENCE = 0.5  # probability that the region shows somebody who is followed
 MIN_NEW_PRESENCE = 0.9  # the same for somebody new, at every look: of 30 regions without a person three had more
 REGION_SCALE = 1.25  # side in diameters of the circle about the hips that holds the body; MediaPipe's value
 NUM_LOOKS = 2  # at a new person, each from the region of the look before: the detector's regions are rough
+SEARCH_SECONDS = 0.5  # between two searches of the whole picture
 CLOSER_SEARCH_SECONDS = 2.0  # between searches in enlarged parts, which take some 20 looks
 MIN_SIZE_RATIO = 1.5  # of somebody new to the smallest of those followed, to take that place
 SAME_PLACE_RADII = 0.5  # between hips: a detection of somebody who is followed already
@@ -50,8 +51,6 @@ class PoseOptions:
     farther_zooms: tuple[int, ...] = (5,)
     """The same where nobody is found by these.  People of 140 pixels in a picture of 1920: in .69 of the frames without it, in .95
     with it; of 100 pixels, in none and in .83."""
-    search_seconds: float = 0.5
-    """Seconds after which the detector looks for further people, or for a larger one."""
     max_absence: float = 2.0
     """Seconds within which somebody who is lost and found is the same."""
 
@@ -163,11 +162,11 @@ class Tracker:
         """Whether the detector should look: somebody was just lost, nobody is there, or it has not looked for long."""
         if not self._followed or len(self._followed) < before:
             return True
-        return time - self._searched >= self.options.search_seconds
+        return time - self._searched >= SEARCH_SECONDS
 
     def _search(self, picture: VideoPicture, time: float) -> None:
         """Look at the whole picture, and closer where nobody is found there, or from time to time where some are still wanted."""
-        wait = CLOSER_SEARCH_SECONDS if self._followed and self.people > 1 else self.options.search_seconds
+        wait = CLOSER_SEARCH_SECONDS if self._followed and self.people > 1 else SEARCH_SECONDS
         closer = time - self._looked_closer >= wait
         self._searched = time
         shrinks, farther = self.options.zooms, self.options.farther_zooms

@@ -33,6 +33,8 @@ from indexing.skeleton import Skeleton
 from indexing.windows import Ragged, mended, ragged
 
 # of the usual duration of the longest action, looked at after a moment before it is decided; of half of it long actions are missed
+BLOCK_SECONDS = 0.5  # of frames that a stream looks at together: a part of its lag, and the fewer the more it costs
+MEMORY_SECONDS = 300.0  # of the past by which a stream scales its scores: less where cameras and people change
 HORIZON = 1.25
 NUM_RECENT_STEPS = 30  # between the latest frames, which may be too far apart for any window
 
@@ -150,7 +152,7 @@ class ActionStream:
         self._horizon, self.lag = self._horizon_of(lag)
         self._place = _places(source, up, skeleton)
         self._floor = _floor(model, source.rate)
-        cells = options.live_memory / self._step
+        cells = MEMORY_SECONDS / self._step
         self._contrast = RunningLevel(cells * model.classes)
         self._wholes = RunningLevel(cells * model.classes * len(self._lengths))
         self._count, self._last, self._steps = 0, -np.inf, np.empty(0)
@@ -158,8 +160,8 @@ class ActionStream:
 
     def _horizon_of(self, lag: Any) -> tuple[int, float]:
         """How many cells that follow a moment decide about it, and the seconds after which an event is told then."""
-        options, typical = self.source.look.options, float(self._durations.typical.max())
-        known, edge = options.live_block + self._ahead + self._step, 1e-9  # seconds after a cell at which it is known at the latest
+        typical = float(self._durations.typical.max())
+        known, edge = BLOCK_SECONDS + self._ahead + self._step, 1e-9  # seconds after a cell at which it is known at the latest
         if lag is None:
             cells = int(np.ceil(HORIZON * typical / self._step - edge))
         elif is_number(lag) and lag >= known + typical - edge:
@@ -243,7 +245,7 @@ class ActionStream:
         self._raw, self._good = np.concatenate([self._raw, frames]), np.concatenate([self._good, frames])
         self._at = np.concatenate([self._at, at])
         told: list[LiveAnswer] = []
-        block = self.source.look.options.live_block
+        block = BLOCK_SECONDS
         while self._at[-1] >= (self._blocks + 1) * block:
             self._blocks += 1
             known = self._blocks * block

@@ -28,6 +28,15 @@ Array = NDArray[Any]
 PIECE = 6000  # frames that are searched at once for joints in wrong places: bounds memory
 FOUND, KNOWN, HELD = range(3)  # kinds of bars of the strip
 
+TYPICAL_SECONDS = 600.0  # of one person, or of all together, that the coordinates of a page are for
+MAX_VALUES = 1_000_000  # coordinates of a page, whatever the length
+EVENT_MARGIN_SECONDS = 0.5  # before and after an event that count as at it
+MAX_GAP_SECONDS = 0.5  # without a pose, more than lie between two on purpose, in which nobody is drawn
+GRID_STEPS = 240.0  # in a person's height: a joint is shown within a fifth of a percent of it
+MAX_EXAMPLES = 120  # of a page
+MAX_BARS = 3000  # of the strip of a recording
+WIDE_SCENE = 4.0  # times a person's height, and twice what people need at one time: where it is wider, the picture follows them
+
 
 @dataclass(frozen=True)
 class PlayerOptions:
@@ -35,31 +44,14 @@ class PlayerOptions:
 
     values: int = 300_000
     """Coordinates of all players of a page together at most: about a byte each, 0.4 MB of text."""
-    usual: float = 600.0
-    """Seconds of one person, or of all together, that they are for."""
     further: float = 100.0
     """Coordinates for each second beyond; as many as fit three poses a second of 17 joints."""
-    most: int = 1_000_000
-    """Coordinates whatever the length."""
     rates: tuple[tuple[float, float], ...] = (
         *((15.0, 15.0), (12.5, 12.5), (10.0, 10.0), (10.0, 5.0), (8.0, 3.0), (8.0, 1.0), (6.0, 0.5), (4.0, 0.2), (3.0, 0.1)),
     )
     """Poses per second at events and between them: the first that fit are used, and of the last as many as do."""
-    margin: float = 0.5
-    """Seconds before and after an event that count as at it."""
-    absent: float = 0.5
-    """Seconds without a pose, more than lie between two on purpose, in which nobody is drawn."""
-    grid: float = 240.0
-    """Steps of the grid in a person's height: a joint is shown within a fifth of a percent of it."""
-    examples: int = 120
-    """Examples that a page holds at most."""
     poses: int = 40
     """Poses of an example at most."""
-    bars: int = 3000
-    """Bars of the strip of a recording at most."""
-    wide: float = 4.0
-    """Times a person's height: where the scene is wider, and twice as wide as people need at one time, the picture follows
-    them."""
 
 
 @dataclass(frozen=True)
@@ -112,9 +104,10 @@ class _Part:
 
 
 def players(
-    groups: Sequence[Sequence[RecordingResult]], report: RecognitionReport, options: PlayerOptions = PlayerOptions()
+    groups: Sequence[Sequence[RecordingResult]], report: RecognitionReport, options: PlayerOptions | None = None
 ) -> list[Player | None]:
     """A player for each recording, person by person; ``None`` where there are no joints to show."""
+    options = options or PlayerOptions()
     parts = [_parts(people, options) for people in groups]
     rates, share = _rates([part for several in parts for part in several], options)
     examples = _Examples(report, options)
@@ -125,13 +118,13 @@ def _parts(people: Sequence[RecordingResult], options: PlayerOptions) -> list[_P
     spans = [(event.start, event.end) for one in people for event in one.events]
     spans += [(start, end) for one in people for _, start, end in one.truth or ()]
     shown = [(one, one.clip) for one in people if one.clip is not None and one.clip.seen.any()]
-    return [_Part.of(one, clip, spans, options.margin) for one, clip in shown]
+    return [_Part.of(one, clip, spans, EVENT_MARGIN_SECONDS) for one, clip in shown]
 
 
 def _rates(parts: Sequence[_Part], options: PlayerOptions) -> tuple[tuple[float, float], float]:
     """Poses per second that fit into a page, and the share of them that does where even the fewest are too many."""
     lasts = sum(float(np.minimum(np.diff(part.clip.times), 1.0).sum()) for part in parts)
-    room = min(options.most, options.values + options.further * max(0.0, lasts - options.usual))
+    room = min(MAX_VALUES, options.values + options.further * max(0.0, lasts - TYPICAL_SECONDS))
     for rates in options.rates:
         needed = sum(2 * part.clip.joints.shape[1] * len(part.kept(rates)) for part in parts)
         if needed <= room:
@@ -147,7 +140,7 @@ def _player(
         kept = [frames[np.unique(np.linspace(0, len(frames) - 1, max(2, int(share * len(frames)))).astype(int))] for frames in kept]
     rates = (rates[0] * share, rates[1] * share)
     joints = [part.joints[frames] for part, frames in zip(parts, kept, strict=True)]
-    unit = max(float(np.nanmedian([_height(one) for one in joints])), 1e-9) / options.grid
+    unit = max(float(np.nanmedian([_height(one) for one in joints])), 1e-9) / GRID_STEPS
     view, middle = _view(joints, [part.clip.times[one] for part, one in zip(parts, kept, strict=True)], unit, options)
     people = []
     for part, frames, places in zip(parts, kept, joints, strict=True):
@@ -171,10 +164,10 @@ def _player(
     usual = float(np.median([float(np.median(np.diff(part.clip.times))) for part in parts if len(part.clip) > 1] or [0.0]))
     data = {
         "people": people, "view": view, "actions": [[str(clean(name)), colour] for name, colour in paint.items()],
-        "bars": bars[: options.bars], "absent": 1000 * (options.absent + max(1.5 / rates[1], 3 * usual)),
+        "bars": bars[: MAX_BARS], "absent": 1000 * (MAX_GAP_SECONDS + max(1.5 / rates[1], 3 * usual)),
         "examples": {number: examples.drawn[number] for number in {bar[5] for bar in bars} if number >= 0},
     }  # fmt: skip
-    unlisted = sum(bar[1] == FOUND for bar in bars[options.bars :])
+    unlisted = sum(bar[1] == FOUND for bar in bars[MAX_BARS:])
     return Player(json.dumps(data, ensure_ascii=False, separators=(",", ":")), rates, unlisted)
 
 
@@ -213,7 +206,7 @@ class _Examples:
         clip = None if kind == KNOWN else self.report.exemplar(event)
         if clip is None or not clip.seen.any():
             return -1
-        if id(clip) not in self.numbers and len(self.drawn) < self.options.examples:
+        if id(clip) not in self.numbers and len(self.drawn) < MAX_EXAMPLES:
             self.numbers[id(clip)] = len(self.drawn)
             self.drawn.append(self._packed(clip))
         return self.numbers.get(id(clip), -1)
@@ -222,7 +215,7 @@ class _Examples:
         frames = np.unique(np.linspace(0, len(clip) - 1, min(len(clip), self.options.poses)).round().astype(int))
         part = _Part(RecordingResult("", clip, clip.times, (), np.zeros((len(clip), 0))), clip, np.zeros(len(clip), bool))
         joints = part.joints[frames]
-        unit = max(_height(joints), 1e-9) / self.options.grid
+        unit = max(_height(joints), 1e-9) / GRID_STEPS
         view, middle = _view([joints], [clip.times[frames]], unit, self.options)
         lasts = 1000 * clip.duration * len(clip) / max(1, len(clip) - 1)
         return {
@@ -292,12 +285,12 @@ def _view(joints: Sequence[Array], times: Sequence[Array], unit: float, options:
     every = np.concatenate([one.reshape(-1, 2) for one in joints])
     every = every[np.isfinite(every).all(axis=1)]
     inner = np.percentile(every, [1, 99], axis=0)
-    room = 0.5 * unit * options.grid  # beyond which a joint is a mistake of the detector
+    room = 0.5 * unit * GRID_STEPS  # beyond which a joint is a mistake of the detector
     low, high = np.maximum(every.min(axis=0), inner[0] - room), np.minimum(every.max(axis=0), inner[1] + room)
     size, middle = (high - low) / unit, (low + high) / 2
     at_once = _at_once(np.concatenate(joints), np.concatenate(times)) / unit
-    follows = bool(size[0] > options.wide * options.grid and size[0] > 2 * at_once[0])
-    shown = np.maximum(np.where([follows, False], np.minimum(at_once, size), size), 0.3 * options.grid)
+    follows = bool(size[0] > WIDE_SCENE * GRID_STEPS and size[0] > 2 * at_once[0])
+    shown = np.maximum(np.where([follows, False], np.minimum(at_once, size), size), 0.3 * GRID_STEPS)
     return [*(round(float(x), 1) for x in shown), int(follows)], middle
 
 

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 MISSING = -32768  # rig.js knows it, too
 
+MAX_GAP_SECONDS = 0.25  # without a frame, beyond which nothing is filled in
+GRID_STEPS = 30_000  # of the grid to either side: coordinates are 16-bit numbers
+
 
 @dataclass(frozen=True)
 class StageOptions:
@@ -30,10 +33,6 @@ class StageOptions:
     """Coordinates at most: two bytes each, .64 MB of text."""
     rate: float = 30.0
     """Frames per second at most."""
-    gap: float = 0.25
-    """Seconds without a frame, beyond which nothing is filled in."""
-    grid: int = 30_000
-    """Steps of the grid to either side: coordinates are 16-bit numbers."""
 
 
 def array_of(value: Any) -> FloatArray:
@@ -45,8 +44,9 @@ def array_of(value: Any) -> FloatArray:
 # The scene in space, packed into the page; rig.js draws it.
 
 
-def scene(rig: CameraRig, options: StageOptions = StageOptions()) -> tuple[str, str]:
+def scene(rig: CameraRig, options: StageOptions | None = None) -> tuple[str, str]:
     """JSON for the script, and what to say about it; empty where there is nothing to draw."""
+    options = options or StageOptions()
     found, world, times = rig.calibration, rig.points, rig.moments
     centers = array_of(found.centers)
     if not len(times) or not np.isfinite(centers).all():
@@ -62,8 +62,8 @@ def scene(rig: CameraRig, options: StageOptions = StageOptions()) -> tuple[str, 
     middle = inner.mean(axis=0)
     low, high = np.minimum(inner[0], centers.min(axis=0)), np.maximum(inner[1], centers.max(axis=0))
     reach = max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
-    unit = 4 * reach / options.grid
-    codes = np.clip(np.round((points - middle) / unit), -options.grid, options.grid)
+    unit = 4 * reach / GRID_STEPS
+    codes = np.clip(np.round((points - middle) / unit), -GRID_STEPS, GRID_STEPS)
     packed = np.where(np.isfinite(points).all(axis=2, keepdims=True), codes, MISSING).astype("<i2")
     bones = rig.joints.skeleton.bones if rig.joints.skeleton is not None else ()
     first = centers[0] - middle
@@ -72,7 +72,7 @@ def scene(rig: CameraRig, options: StageOptions = StageOptions()) -> tuple[str, 
         "people": rig.persons, "joints": rig.joints.count, "bones": [[a, b, _side(rig, a, b)] for a, b in bones],
         "times": kept.tolist(), "points": base64.b64encode(packed.tobytes()).decode("ascii"),
         "unit": unit, "middle": middle.tolist(),
-        "gap": 1000 * max(options.gap, 1.5 * step * every), "ground": _ground(low, high, reach),
+        "gap": 1000 * max(MAX_GAP_SECONDS, 1.5 * step * every), "ground": _ground(low, high, reach),
         "target": ((low + high) / 2).tolist(), "reach": reach, "turn": round(math.atan2(first[1], first[0]) + 0.5, 4),
     }  # fmt: skip
     grid = f" The lines on the ground are {data['ground']['step']:g} m apart." if found.metric else ""
