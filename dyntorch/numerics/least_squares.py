@@ -19,6 +19,9 @@ SHORT = 1e-13  # change of parameters of norm 1 that is rounding
 
 Tensors = tuple[Tensor, ...]
 
+DAMPING_DECREASE = 0.1  # factor of the damping after a step that lowers the cost
+SETTLING_LENGTH = 1e-3  # of a step, of parameters of norm 1, that ends near the minimum
+
 
 @dataclass(frozen=True)
 class LeastSquaresOptions:
@@ -28,8 +31,6 @@ class LeastSquaresOptions:
     """Steps at most, the refused ones included."""
     damping: float = 1e-3
     """Of the first step, as a multiple of the diagonal of the Gauss-Newton matrix."""
-    decrease: float = 0.1
-    """Factor of the damping after a step that lowers the cost."""
     increase: float = 8.0
     """Factor of the damping after one that does not and is refused."""
     least_damping: float = 1e-12
@@ -41,8 +42,6 @@ class LeastSquaresOptions:
     settling_steps: int = 0
     """Gauss-Newton steps of all problems at the end.  The last digits of a step depend on how many problems take it, and a flat
     minimum makes more of them than digits; these steps take them back."""
-    settling_length: float = 1e-3
-    """Length of a step, of parameters of norm 1, that ends near the minimum."""
 
 
 class Iterate(NamedTuple):
@@ -217,7 +216,7 @@ def _take_step(problem: LeastSquares, at: Iterate, damping: Tensor, options: Lea
         done = torch.where(better, fall <= options.tolerance * at.cost, damping > options.stuck_damping)
         finished = problem.finished(at, fresh, step, options.tolerance)
         done = done if finished is None else done | finished
-    damping = torch.where(better, (damping * options.decrease).clamp(min=options.least_damping), damping * options.increase)
+    damping = torch.where(better, (damping * DAMPING_DECREASE).clamp(min=options.least_damping), damping * options.increase)
     return fresh.where(better, at), damping, done
 
 
@@ -225,7 +224,7 @@ def _take_final_step(problem: LeastSquares, at: Iterate, options: LeastSquaresOp
     """One step of every problem that is near its minimum, whatever rounding makes of the cost."""
     step = problem.step(at, torch.full_like(at.cost, options.least_damping))
     fresh = problem.moved(at, step)
-    near = step[0].abs().amax(-1) < options.settling_length
+    near = step[0].abs().amax(-1) < SETTLING_LENGTH
     return fresh.where(near & (fresh.cost <= at.cost * (1 + (options.tolerance or 0.0))), at)
 
 

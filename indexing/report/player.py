@@ -34,6 +34,9 @@ EVENT_MARGIN_SECONDS = 0.5  # before and after an event that count as at it
 MAX_GAP_SECONDS = 0.5  # without a pose, more than lie between two on purpose, in which nobody is drawn
 GRID_STEPS = 240.0  # in a person's height: a joint is shown within a fifth of a percent of it
 MAX_EXAMPLES = 120  # of a page
+MAX_EXAMPLE_POSES = 40
+POSE_RATES = ((15.0, 15.0), (12.5, 12.5), (10.0, 10.0), (10.0, 5.0), (8.0, 3.0), (8.0, 1.0), (6.0, 0.5), (4.0, 0.2), (3.0, 0.1))
+"""Poses per second at events and between them: the first that fit are used, and of the last as many as do."""
 MAX_BARS = 3000  # of the strip of a recording
 WIDE_SCENE = 4.0  # times a person's height, and twice what people need at one time: where it is wider, the picture follows them
 
@@ -46,12 +49,6 @@ class PlayerOptions:
     """Coordinates of all players of a page together at most: about a byte each, 0.4 MB of text."""
     further: float = 100.0
     """Coordinates for each second beyond; as many as fit three poses a second of 17 joints."""
-    rates: tuple[tuple[float, float], ...] = (
-        *((15.0, 15.0), (12.5, 12.5), (10.0, 10.0), (10.0, 5.0), (8.0, 3.0), (8.0, 1.0), (6.0, 0.5), (4.0, 0.2), (3.0, 0.1)),
-    )
-    """Poses per second at events and between them: the first that fit are used, and of the last as many as do."""
-    poses: int = 40
-    """Poses of an example at most."""
 
 
 @dataclass(frozen=True)
@@ -125,11 +122,11 @@ def _rates(parts: Sequence[_Part], options: PlayerOptions) -> tuple[tuple[float,
     """Poses per second that fit into a page, and the share of them that does where even the fewest are too many."""
     lasts = sum(float(np.minimum(np.diff(part.clip.times), 1.0).sum()) for part in parts)
     room = min(MAX_VALUES, options.values + options.further * max(0.0, lasts - TYPICAL_SECONDS))
-    for rates in options.rates:
+    for rates in POSE_RATES:
         needed = sum(2 * part.clip.joints.shape[1] * len(part.kept(rates)) for part in parts)
         if needed <= room:
             return rates, 1.0
-    return options.rates[-1], room / needed
+    return POSE_RATES[-1], room / needed
 
 
 def _player(
@@ -212,7 +209,7 @@ class _Examples:
         return self.numbers.get(id(clip), -1)
 
     def _packed(self, clip: Clip) -> dict[str, Any]:
-        frames = np.unique(np.linspace(0, len(clip) - 1, min(len(clip), self.options.poses)).round().astype(int))
+        frames = np.unique(np.linspace(0, len(clip) - 1, min(len(clip), MAX_EXAMPLE_POSES)).round().astype(int))
         part = _Part(RecordingResult("", clip, clip.times, (), np.zeros((len(clip), 0))), clip, np.zeros(len(clip), bool))
         joints = part.joints[frames]
         unit = max(_height(joints), 1e-9) / GRID_STEPS

@@ -6,7 +6,6 @@ import base64
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,17 +21,9 @@ FloatArray = NDArray[np.float64]
 MISSING = -32768  # rig.js knows it, too
 
 MAX_GAP_SECONDS = 0.25  # without a frame, beyond which nothing is filled in
+MAX_VALUES = 240_000  # coordinates of a page: two bytes each, .64 MB of text
+MAX_RATE = 30.0  # frames per second of a page
 GRID_STEPS = 30_000  # of the grid to either side: coordinates are 16-bit numbers
-
-
-@dataclass(frozen=True)
-class StageOptions:
-    """How much of the movement the page holds, and how finely."""
-
-    values: int = 240_000
-    """Coordinates at most: two bytes each, .64 MB of text."""
-    rate: float = 30.0
-    """Frames per second at most."""
 
 
 def array_of(value: Any) -> FloatArray:
@@ -44,15 +35,14 @@ def array_of(value: Any) -> FloatArray:
 # The scene in space, packed into the page; rig.js draws it.
 
 
-def scene(rig: CameraRig, options: StageOptions | None = None) -> tuple[str, str]:
+def scene(rig: CameraRig) -> tuple[str, str]:
     """JSON for the script, and what to say about it; empty where there is nothing to draw."""
-    options = options or StageOptions()
     found, world, times = rig.calibration, rig.points, rig.moments
     centers = array_of(found.centers)
     if not len(times) or not np.isfinite(centers).all():
         return "", ""
-    step = float(np.median(np.diff(times))) if len(times) > 1 else 1 / options.rate
-    every = _every(len(times), step, world.shape[1], options)
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 1 / MAX_RATE
+    every = _every(len(times), step, world.shape[1])
     frames = np.arange(0, len(times), every)
     points, kept = world[frames], np.round(1000 * times[frames]).astype(int)
     known = points[np.isfinite(points).all(axis=2)]
@@ -80,10 +70,10 @@ def scene(rig: CameraRig, options: StageOptions | None = None) -> tuple[str, str
     return json.dumps(data, ensure_ascii=False, separators=(",", ":")), said
 
 
-def _every(frames: int, step: float, joints: int, options: StageOptions) -> int:
+def _every(frames: int, step: float, joints: int) -> int:
     """One frame of so many is in the page: as many a second as were recorded, or as fit."""
-    most = max(2, options.values // (3 * joints))
-    return max(1, math.ceil(1 / step / options.rate - 0.01), math.ceil(frames / most))
+    most = max(2, MAX_VALUES // (3 * joints))
+    return max(1, math.ceil(1 / step / MAX_RATE - 0.01), math.ceil(frames / most))
 
 
 def _side(rig: CameraRig, a: int, b: int) -> str:

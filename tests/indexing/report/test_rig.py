@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.report.rig import StageOptions, heat_picture, plan_picture, scene
+from indexing.report.rig import MAX_VALUES, heat_picture, plan_picture, scene
 from tests.indexing.calibrate.scene import FPS, SIZE, rig, truth
 
 NODE = shutil.which("node")
@@ -45,7 +45,7 @@ def test_a_long_recording_fits_into_the_page():
     points = torch.from_numpy(truth().points).repeat(many // 110 + 1, 1, 1)[:many]
     long = rig(times=torch.arange(many, dtype=torch.float64) / 60, points=points)
     data, said = scene(long)
-    assert len(data) < 900_000 and len(json.loads(data)["times"]) <= StageOptions().values // 51 and "of 60 frames a second" in said
+    assert len(data) < 900_000 and len(json.loads(data)["times"]) <= MAX_VALUES // 51 and "of 60 frames a second" in said
     nothing = rig(points=torch.full_like(found.calibration.points, torch.nan))
     assert scene(nothing) == ("", "") and plan_picture(nothing)[:4] == b"\x89PNG"
     assert heat_picture(rig(residuals=torch.full((3, 17), torch.nan, dtype=torch.float64))) is None
