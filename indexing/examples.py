@@ -59,7 +59,7 @@ def write_examples(folder: str | Path) -> list[str]:
     _people(where)
     _week(where)
     with_videos = find_spec("av") is not None
-    _films(where, with_videos)
+    _write_videos(where, with_videos)
     commands = COMMANDS + (VIDEO_COMMANDS if with_videos else NO_VIDEOS)
     files.write_text(where / "commands.txt", commands)
     return commands.splitlines()
@@ -128,7 +128,7 @@ def _week(where: Path) -> None:
     _table(where / "week.csv", ("file", "label", "start", "end"), done)
 
 
-def _films(where: Path, with_videos: bool) -> None:
+def _write_videos(where: Path, with_videos: bool) -> None:
     """Grey films: a set of two people, and as videos the actions of one and a recording of the other."""
     solid = [[perform(action, Person.random(person), fps=FILM_FPS, rng=person) for action in FILMED] for person in (1, 2)]
     parts = [[film(clip, azimuth=0, rng=i + 10 * k) for i, clip in enumerate(clips)] for k, clips in enumerate(solid)]

@@ -39,7 +39,7 @@ _DETAIL = re.compile(
 )
 
 
-def named(skeleton: Skeleton | None) -> bool:
+def has_names(skeleton: Skeleton | None) -> bool:
     """Whether the joints have names of their own; numbers are none.
 
     Example:
@@ -55,13 +55,13 @@ def named(skeleton: Skeleton | None) -> bool:
 def layout_of(clips: Sequence[Clip]) -> Skeleton | None:
     """Whose names the joints of many clips go by: the first with names, else the first with bones."""
     known = [clip.skeleton for clip in clips if clip.skeleton is not None]
-    return next((skeleton for skeleton in known if named(skeleton)), known[0] if known else None)
+    return next((skeleton for skeleton in known if has_names(skeleton)), known[0] if known else None)
 
 
-def matched(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, str]:
+def match_joints(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, str]:
     """The clip with its joints in the order of those known, and what to say about it."""
     own, who = clip.skeleton, who or f"clip {clip.name!r}"
-    if known is None or own is None or not (named(known) and named(own)):
+    if known is None or own is None or not (has_names(known) and has_names(own)):
         return clip, _note_unnamed(clip, known, who)
     if own.joints == known.joints:
         return clip, ""
@@ -119,8 +119,8 @@ def _of_body(known: Skeleton) -> list[int]:
 
 
 def matched_all(clips: Sequence[Clip], known: Skeleton | None) -> list[Clip]:
-    """:func:`matched` clips, with a warning where not all joints are used."""
-    found = [matched(clip, known, f"clip {i}" + (f" ({clip.name!r})" if clip.name else "")) for i, clip in enumerate(clips)]
+    """:func:`match_joints` clips, with a warning where not all joints are used."""
+    found = [match_joints(clip, known, f"clip {i}" + (f" ({clip.name!r})" if clip.name else "")) for i, clip in enumerate(clips)]
     partly = [note for (clip, note), given in zip(found, clips, strict=True) if note and clip is not given]
     if partly:
         warnings.warn(partly[0] + (f" (and {len(partly) - 1} more clips)" if len(partly) > 1 else ""), stacklevel=4)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from indexing.files import write_bytes
-from indexing.opening import VALUE, clipped, error, parse_json, shown, size_of
+from indexing.opening import VALUE, clip_text, error, parse_json, shown, size_of
 from indexing.skeleton import Skeleton
 
 HEADER = "dyntorch"  # the metadata entry that holds the JSON
@@ -112,7 +112,7 @@ def number(value: Any, name: str, least: float = -LARGE, most: float = LARGE) ->
     return float(value)
 
 
-def whole(value: Any, name: str, least: int, most: int) -> int:
+def read_integer(value: Any, name: str, least: int, most: int) -> int:
     """A whole number of the header."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
         raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {shown(value)}")
@@ -125,7 +125,7 @@ def usable(path: str | Path) -> Iterator[None]:
     try:
         yield
     except MISFITS as problem:
-        said = f"not a model that can be used ({type(problem).__name__}: {clipped(problem, 3 * VALUE)})"
+        said = f"not a model that can be used ({type(problem).__name__}: {clip_text(problem, 3 * VALUE)})"
         raise error(path, said, AGAIN) from None
 
 
@@ -175,7 +175,7 @@ class Parts:
 
 @dataclass(frozen=True)
 class Stored:
-    """How a field of a model is kept in its file, and what is believed when it is read: see :func:`stored` and :func:`part`."""
+    """How a field of a model is kept in its file, and what is believed when it is read: see :func:`store` and :func:`part`."""
 
     kind: str
     shape: tuple[int | str | None, ...] = ()
@@ -183,7 +183,7 @@ class Stored:
     name: str | None = None
 
 
-def stored(kind: str, *shape: int | str | None, name: str | None = None, **limits: float | str) -> dict[str, Stored]:
+def store(kind: str, *shape: int | str | None, name: str | None = None, **limits: float | str) -> dict[str, Stored]:
     """The metadata of a dataclass's field that is a tensor of the model's file."""
     return {"stored": Stored(kind, shape, limits, name)}
 
@@ -248,7 +248,7 @@ def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Ten
             # cloned, since tensors of the file lie at odd addresses, where products may be rounded otherwise in the last bit
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()} if with_tensors else {}  # noqa: SIM118
     except (SafetensorError, OSError, *MISFITS) as problem:
-        said = f"not a model file (safetensors says: {clipped(problem, 2 * VALUE)})"
+        said = f"not a model file (safetensors says: {clip_text(problem, 2 * VALUE)})"
         raise error(path, said, "give the file that 'index fit' wrote") from None
     header = parse_json(path, text or "{}", AGAIN, "its header is damaged")
     if not isinstance(header, dict):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip, ClipSet, FloatArray, check_fps
-from indexing.opening import clipped, listed, shown
+from indexing.opening import clip_text, listing, shown
 from indexing.skeleton import Skeleton
 
 AXES = {
@@ -46,7 +46,7 @@ def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, n
     lacking = [axis for axis in ("time", "space", "keypoints") if axis not in axes]
     if lacking:
         boxes = "bounding boxes have none; " if lacking == ["keypoints"] else ""
-        raise ValueError(f"{name}: position has the axes {listed(axes)}, but no {lacking[0]}; {boxes}{NEEDED}")
+        raise ValueError(f"{name}: position has the axes {listing(axes)}, but no {lacking[0]}; {boxes}{NEEDED}")
     position = _reorder(values, axes, ("time", "individuals", "keypoints", "space"))[..., _spatial(dataset, axes, values, name)]
     confidence = _confidence(dataset, position, name)
     times, rate, assumed = _times(dataset, attrs, len(position), fps, name)
@@ -84,7 +84,7 @@ def clip_of(dataset: Any, *, fps: float | None = None, name: str = "") -> Clip:
     """The only individual of a dataset of poses."""
     clips = clips_of(dataset, fps=fps, name=name)
     if len(clips) > 1:
-        people = listed(clip.meta["person"] for clip in clips)
+        people = listing(clip.meta["person"] for clip in clips)
         raise ValueError(
             f"{clips.name}: holds {len(clips)} individuals ({people}) where one is expected; choose one: "
             "indexing.movement.clips_of(dataset)[0]"
@@ -100,13 +100,13 @@ def _values(dataset: Any, name: str, who: str) -> tuple[FloatArray, tuple[str, .
         if values.dtype.kind not in "fiub":
             raise TypeError(f"dtype {values.dtype}")
     except (TypeError, ValueError) as problem:
-        raise ValueError(f"{who}: {name} holds no numbers ({clipped(problem)}); {NEEDED}") from None
+        raise ValueError(f"{who}: {name} holds no numbers ({clip_text(problem)}); {NEEDED}") from None
     called = {word: axis for axis, words in AXES.items() for word in words}
     axes = tuple(called.get(str(axis), str(axis)) for axis in variable.dims)
     strange = [axis for axis in axes if axis not in AXES]
     if strange or len(axes) != values.ndim or len(set(axes)) < len(axes):
         raise ValueError(
-            f"{who}: {name} has the axes {listed(axes)} and the shape {values.shape}; select one of what is no axis of poses"
+            f"{who}: {name} has the axes {listing(axes)} and the shape {values.shape}; select one of what is no axis of poses"
         )
     return values.astype(values.dtype if values.dtype in (np.float32, np.float64) else np.float64), axes
 
@@ -141,7 +141,7 @@ def _spatial(dataset: Any, axes: tuple[str, ...], values: FloatArray, who: str) 
     count = values.shape[axes.index("space")]
     names = [name.lower() for name in _names(dataset, "space", count)] or list(CARTESIAN[:count])
     if sorted(names) != sorted(CARTESIAN[:count]) or count < 2:
-        raise ValueError(f"{who}: space holds {listed(names)}; positions must be x, y or x, y, z (movement.utils.vector.pol2cart)")
+        raise ValueError(f"{who}: space holds {listing(names)}; positions must be x, y or x, y, z (movement.utils.vector.pol2cart)")
     return [names.index(axis) for axis in CARTESIAN[:count]]
 
 
@@ -153,7 +153,7 @@ def _confidence(dataset: Any, position: FloatArray, who: str) -> FloatArray | No
     found = _reorder(values, axes, ("time", "individuals", "keypoints", "space"))
     if found.shape != (*position.shape[:3], 1):
         raise ValueError(
-            f"{who}: confidence has the axes {listed(axes)} and the shape {values.shape}, which do not fit position; {NEEDED}"
+            f"{who}: confidence has the axes {listing(axes)} and the shape {values.shape}, which do not fit position; {NEEDED}"
         )
     return np.asarray(found[..., 0])
 

@@ -45,11 +45,11 @@ KINDS: tuple[tuple[Callable[[int], bool], str, str], ...] = (
 # ---- messages ------------------------------------------------------------------------------------------------------------
 def error(path: str | Path, what: object, remedy: str) -> ValueError:
     """The one shape of every message, a line that is never long: file, what is wrong, what to do."""
-    said, help_ = (part if isinstance(part, Message) else clipped(part) for part in (what, remedy))
+    said, help_ = (part if isinstance(part, Message) else clip_text(part) for part in (what, remedy))
     return ValueError(Message("{path}: {what}; {remedy}", path=str(path), what=said, remedy=help_))
 
 
-def clipped(text: object, most: int = SAID) -> str:
+def clip_text(text: object, most: int = SAID) -> str:
     """Text on one line, without control characters, and without its middle where it is long."""
     plain = " ".join(str(text).split())
     if not plain.isprintable():
@@ -71,7 +71,7 @@ def shown(value: Any) -> str:
         return repr(value)
     if isinstance(value, int) and value.bit_length() > 1000:  # Python refuses to print some thousand digits
         return f"a whole number of about {int(value.bit_length() * 0.30103)} digits"
-    return clipped(SHORT.repr(value), VALUE)
+    return clip_text(SHORT.repr(value), VALUE)
 
 
 def count(number: int, one: str, many: str = "") -> str:
@@ -84,13 +84,13 @@ def count(number: int, one: str, many: str = "") -> str:
     return f"{number:,} {one if number == 1 else many or f'{one}s'}"
 
 
-def listed(names: Iterable[object], most: int = LISTED) -> str:
+def listing(names: Iterable[object], most: int = LISTED) -> str:
     """The first names, each clipped."""
-    found = [clipped(name, VALUE // 3) or "(unnamed)" for name, _ in zip(names, range(most + 1), strict=False)]
+    found = [clip_text(name, VALUE // 3) or "(unnamed)" for name, _ in zip(names, range(most + 1), strict=False)]
     return ", ".join(found[:most]) + ", ..." * (len(found) > most) or "none"
 
 
-def repeated(names: Iterable[Any]) -> Any:
+def first_duplicate(names: Iterable[Any]) -> Any:
     """The first that comes again later, None where none does."""
     names = list(names)
     counts = Counter(names)
@@ -180,7 +180,7 @@ def read_text(path: str | Path, remedy: str = TEXT_REMEDY, missing: str = "check
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
+def without_garbage_collection() -> Iterator[None]:
     """Without Python's search for reference cycles: read objects make none, and among a million it takes a third of the time."""
     before = gc.isenabled()
     gc.disable()
@@ -216,7 +216,7 @@ def parse_toml(path: str | Path, text: str, remedy: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as problem:
-        raise error(path, f"is not a TOML file ({clipped(problem, 2 * VALUE)})", remedy) from None
+        raise error(path, f"is not a TOML file ({clip_text(problem, 2 * VALUE)})", remedy) from None
     except RecursionError:
         raise error(path, "the TOML is nested too deeply", remedy) from None
     except ValueError:

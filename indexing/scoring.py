@@ -127,7 +127,7 @@ def same_label(a: Any, b: Any) -> bool:
     return type(a) is type(b) and bool(a == b)
 
 
-def joined(first: Array, second: Array) -> Array:
+def join_labels(first: Array, second: Array) -> Array:
     """Labels of both, refusing to mix kinds that numpy would silently turn into strings."""
     if first.dtype.kind != second.dtype.kind and {first.dtype.kind, second.dtype.kind} & {"U", "S", "O"}:
         raise ValueError(

@@ -28,7 +28,7 @@ def from_names(name: str, joints: Sequence[str], bones: Sequence[tuple[str, str]
     return Skeleton(name, tuple(joints), tuple((index[a], index[b]) for a, b in bones))
 
 
-def known(joints: int) -> Skeleton | None:
+def usual_layout(joints: int) -> Skeleton | None:
     """The usual layout with this number of joints: what pose estimators write where they say no more than the number."""
     return {17: COCO17, 25: BODY25, 26: HALPE26, 33: MEDIAPIPE33, 133: WHOLEBODY133, 136: HALPE136}.get(joints)
 

@@ -75,7 +75,7 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
     return wrong
 
 
-def mended(clip: Clip, stride: int = 1) -> Clip:
+def repair_clip(clip: Clip, stride: int = 1) -> Clip:
     """A clip of any length without its wrong joints; judged in parts, which bounds memory, between gaps."""
     part, cuts = MAX_FRAMES_JUDGED, stretches(clip.times).tolist()
     pieces = [np.arange(begin, max(end - part // 2, begin + 1), part) for begin, end in cuts]
@@ -193,10 +193,10 @@ def ragged(clips: Sequence[Clip], repair: bool = False) -> Ragged:
     starts = np.concatenate([[0], np.cumsum(lengths)])
     if repair:
         joints[wrong_joints(joints, times, starts)] = np.nan
-    return bridged(joints, times, starts)
+    return interpolate_gaps(joints, times, starts)
 
 
-def bridged(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]) -> Ragged:
+def interpolate_gaps(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]) -> Ragged:
     """Stretches that lie end to end, y up, with what is missing interpolated; arguments as in :class:`Ragged`, NaN = not seen."""
     there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
     seen = np.logical_or.reduceat(there, starts[:-1], axis=0)

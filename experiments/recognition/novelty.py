@@ -16,8 +16,8 @@ from indexing import ActionIndexer, Clip
 from indexing.action.bank import Windows
 from indexing.action.model import ClassProfiles, ShapeModel, class_scores, evidence, standardize
 from indexing.actors import dataset
-from indexing.joints import matched
-from indexing.joints import named as has_names
+from indexing.joints import has_names as has_names
+from indexing.joints import match_joints
 from indexing.skeleton import Skeleton
 
 _LIMBS = [f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "wrist")]
@@ -107,7 +107,7 @@ def _agreement(model: ShapeModel, query: Windows) -> Tensor:
 def _against_people(clips: Sequence[Clip], labels: Array, name: str) -> Callable[[Sequence[Clip]], Tensor]:
     """How much nearer clips are to the best class than to synthetic people who do thirteen things, seen from anywhere."""
     taught = [named(clip, name) for clip in clips]
-    people = [matched(clip, taught[0].skeleton)[0] for clip in dataset(2, azimuth=[40.0, 160.0, 280.0], rng=0)]
+    people = [match_joints(clip, taught[0].skeleton)[0] for clip in dataset(2, azimuth=[40.0, 160.0, 280.0], rng=0)]
     indexer = ActionIndexer(scorer="nearest", virtual_views=0, mirror=False).fit(taught, labels, background=people)
     known = indexer.model_.known
 

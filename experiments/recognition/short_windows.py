@@ -22,7 +22,7 @@ from indexing.action.bank import stack
 from indexing.action.model import ShapeModel
 from indexing.action.stream import BLOCK, Stream, StreamScan, around, motion_levels, scan, windows_at, wrong_contrast
 from indexing.scoring import Event, event_levels, events, smooth
-from indexing.windows import mended
+from indexing.windows import repair_clip
 
 BLOCK_STEP = 0.2  # seconds between the windows of which BLOCK are described at once
 
@@ -66,7 +66,7 @@ class ShortWindows:
 
     def scan(self, clip: Clip) -> tuple[Array, list[Event]]:
         """Scores of frames, and events."""
-        clip = mended(clip)
+        clip = repair_clip(clip)
         model, options = self.indexer.model_, ActionOptions(window_step=self.options.step)
         stream = Stream(self.indexer.length, self.indexer.window, tuple(self.indexer.tempi), "cpu", options)
         found = scan(model, clip, stream)

@@ -24,7 +24,7 @@ from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel, class_scores
 from indexing.actors import ACTIONS, dataset
 from indexing.clip import Clip, stretches
-from indexing.joints import FEWEST, matched, matched_all, named
+from indexing.joints import FEWEST, has_names, match_joints, matched_all
 from indexing.recordings.decoding import Explanation, Withheld
 from indexing.recordings.evidence import MIN_CYCLIC
 from indexing.scoring import Event
@@ -95,13 +95,13 @@ def played_otherwise(clips: Sequence[Clip], ordered: bool, random_state: np.rand
 
 def perform_other_actions(skeleton: Skeleton | None, dims: int, random_state: np.random.Generator) -> OtherMovement:
     """Synthetic people who do everyday actions, each seen from somewhere; nothing where the joints cannot be told by name."""
-    if not named(skeleton):
+    if not has_names(skeleton):
         return OtherMovement()
     azimuth = None if dims == 3 else [float(a) for a in random_state.uniform(0.0, 360.0, NUM_CAMERAS)]
     found = []
     for clip in dataset(NUM_PEOPLE, ACTIONS, azimuth=azimuth, rng=random_state):
         try:
-            found.append((str(clip.label), matched(clip, skeleton)[0]))
+            found.append((str(clip.label), match_joints(clip, skeleton)[0]))
         except ValueError:  # too few joints have these names
             return OtherMovement()
     return _collect(found, False)

@@ -18,7 +18,7 @@ from torch import Tensor
 from dyntorch.numerics import map_blocks
 from indexing.action.planes import Fusion, entries, epipolar_correlation, factorize, fuse_terms
 from indexing.action.symmetry import mirror
-from indexing.modelfile import stored
+from indexing.modelfile import store
 
 WHITENING_POWER = 0.25  # of the joint metric: UTKinect .909 -> .919, few shots +3 %; .5 whitens too much
 COVARIANCE_FLOOR = 0.1  # beside a mean diagonal of 1; .03 amplifies noise (-2 %), 1 whitens too little (-1 %; UTKinect, Florence3D)
@@ -65,8 +65,8 @@ def order_free(windows: Tensor, whole_image: bool = False) -> Tensor:
 class JointMetric:
     r"""How much each direction of joint space counts, per channel: :math:`W = (\Sigma + \lambda I)^{-\alpha}`."""
 
-    covariance: Tensor = field(metadata=stored("real", "channels", "joints", "joints", name="metric"))  # float64
-    power: float = field(metadata=stored("real", name="metric_power", least=0, most=10))  # alpha
+    covariance: Tensor = field(metadata=store("real", "channels", "joints", "joints", name="metric"))  # float64
+    power: float = field(metadata=store("real", name="metric_power", least=0, most=10))  # alpha
     floor: float = field(default=COVARIANCE_FLOOR, kw_only=True)  # lambda
 
     @classmethod
@@ -118,8 +118,8 @@ KEPT_BLOCK = 2**25  # bytes of the descriptions that a bank keeps: 32 MB; those 
 class Windows:
     """Batched windows and the joints that were seen in each."""
 
-    values: Tensor = field(metadata=stored("real", "rows", "length", "joints", 2))
-    seen: Tensor = field(metadata=stored("truth", "rows", "joints"))
+    values: Tensor = field(metadata=store("real", "rows", "length", "joints", 2))
+    seen: Tensor = field(metadata=store("truth", "rows", "joints"))
 
     def __len__(self) -> int:
         return len(self.values)

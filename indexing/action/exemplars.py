@@ -14,7 +14,7 @@ from indexing.action.bank import Windows, stack
 from indexing.action.symmetry import turn
 from indexing.cameras import virtual
 from indexing.clip import Clip, stretches
-from indexing.modelfile import part, stored
+from indexing.modelfile import part, store
 from indexing.windows import Ragged, ragged, sample, whole
 
 # begin and end, in parts of the duration: extent and tempo search; the first is all of it
@@ -52,10 +52,10 @@ class Exemplars:
     crops: Windows = field(metadata=part(rows="crops"))
     views: Windows = field(metadata=part(rows="views"))
     moments: Windows = field(metadata=part(rows="moments"))
-    owner: torch.Tensor = field(metadata=stored("every", "moments", below="exemplars"))
-    solid: torch.Tensor = field(metadata=stored("truth", "exemplars"))
-    seconds: torch.Tensor | None = field(default=None, metadata=stored("real", "exemplars"))
-    cyclic: torch.Tensor | None = field(default=None, metadata=stored("real", "exemplars"))
+    owner: torch.Tensor = field(metadata=store("every", "moments", below="exemplars"))
+    solid: torch.Tensor = field(metadata=store("truth", "exemplars"))
+    seconds: torch.Tensor | None = field(default=None, metadata=store("real", "exemplars"))
+    cyclic: torch.Tensor | None = field(default=None, metadata=store("real", "exemplars"))
 
     def __len__(self) -> int:
         return len(self.solid)

@@ -34,12 +34,12 @@ from indexing.clip import Clip, check_fps
 from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, Rule, SavedClassifier, is_positive, is_whole, one_of
 from indexing.joints import layout_of
 from indexing.modelfile import Parts, labels_from_json, labels_to_json, skeleton_from_json, skeleton_to_json, tensors_of
-from indexing.modelfile import whole as whole_number
+from indexing.modelfile import read_integer as whole_number
 from indexing.recordings.decoding import Explanation, Withheld, decode
 from indexing.recordings.live import ActionStream, LiveSource
-from indexing.scoring import Event, joined, probabilities, refuse, reject_threshold, same_label
+from indexing.scoring import Event, join_labels, probabilities, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
-from indexing.windows import mended, ragged, whole
+from indexing.windows import ragged, repair_clip, whole
 
 Array = NDArray[Any]
 
@@ -289,7 +289,7 @@ class ActionIndexer(SavedClassifier):
         values = gather_labels(found, owners, labels)
         before = self.model_.labels.numpy()
         named = before < self.model_.known  # the others are background
-        known, fresh = np.unique(joined(self.classes_[before[named]], values), return_inverse=True)
+        known, fresh = np.unique(join_labels(self.classes_[before[named]], values), return_inverse=True)
         numbers = np.concatenate([before - self.model_.known + len(known), fresh[named.sum() :]])
         numbers[: len(before)][named] = fresh[: named.sum()]
         check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
@@ -427,7 +427,7 @@ class ActionIndexer(SavedClassifier):
         begin = float(found.times[0])
         times = found.times
         found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
-        found = mended(found) if self.repair else found
+        found = repair_clip(found) if self.repair else found
         model = self._model()
         rate = None if model.hidden else self.reject
         told = decode(

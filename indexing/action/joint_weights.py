@@ -29,7 +29,7 @@ from indexing.action.bank import (
     planes_of,
 )
 from indexing.action.planes import GRAM_EPSILON, Entries, Fusion
-from indexing.modelfile import stored
+from indexing.modelfile import store
 
 NUM_CANDIDATES = 2  # nearest exemplars per class that a query is compared with: as many as the scorer averages
 PULLS = (1.0, 0.3, 0.1, 0.03)  # towards equal weights, that are tried, strongest first
@@ -178,9 +178,9 @@ class WeightedMetric(JointMetric):
 class JointWeights:
     """What was learned; everything is 1 where learning did not pay."""
 
-    joints: Tensor = field(metadata=stored("real", "nearest", "joints", least=0, most=MOST_WEIGHT))
-    channels: Tensor = field(metadata=stored("real", "nearest", least=0, most=MOST_WEIGHT))
-    by_class: Tensor | None = field(default=None, metadata=stored("real", "classes", "joints", least=0, most=MOST_WEIGHT))
+    joints: Tensor = field(metadata=store("real", "nearest", "joints", least=0, most=MOST_WEIGHT))
+    channels: Tensor = field(metadata=store("real", "nearest", least=0, most=MOST_WEIGHT))
+    by_class: Tensor | None = field(default=None, metadata=store("real", "classes", "joints", least=0, most=MOST_WEIGHT))
     gain: float = 0.0
     sigma: float = 0.0
 

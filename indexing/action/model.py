@@ -38,7 +38,7 @@ from indexing.action.bank import (
 from indexing.action.exemplars import Exemplars
 from indexing.action.joint_weights import MOST_WEIGHT, JointWeights
 from indexing.action.symmetry import mirror
-from indexing.modelfile import Parts, number, part, read_fields, stored
+from indexing.modelfile import Parts, number, part, read_fields, store
 from indexing.opening import shown
 from indexing.scoring import SHARPNESS
 
@@ -58,10 +58,10 @@ NEAREST_WEIGHT = 1.5  # of scorer A against B, standardized over classes; 1 .. 2
 class PairwiseMachine:
     """One support vector machine per pair of classes, over a precomputed kernel."""
 
-    support: Tensor = field(metadata=stored("whole", "rows"))
-    dual: Tensor = field(metadata=stored("real", "others", "rows"))
-    intercept: Tensor = field(metadata=stored("real", "pairs"))
-    counts: Tensor = field(metadata=stored("whole", "classes", below=2**31))
+    support: Tensor = field(metadata=store("whole", "rows"))
+    dual: Tensor = field(metadata=store("real", "others", "rows"))
+    intercept: Tensor = field(metadata=store("real", "pairs"))
+    counts: Tensor = field(metadata=store("whole", "classes", below=2**31))
 
     @classmethod
     def fit(cls, kernel: Tensor, classes: np.ndarray, penalty: float = PENALTY) -> PairwiseMachine:
@@ -120,8 +120,8 @@ def evidence(
 class ClassProfiles:
     r"""The profiles of the exemplars of each class: their mean, and how they scatter about it."""
 
-    centres: Tensor = field(metadata=stored("real", "known", "columns"))
-    precision: Tensor = field(metadata=stored("real", "columns", "columns"))
+    centres: Tensor = field(metadata=store("real", "known", "columns"))
+    precision: Tensor = field(metadata=store("real", "columns", "columns"))
 
     @classmethod
     def learn(cls, profiles: Tensor, labels: Tensor, known: int) -> Self | None:
@@ -181,21 +181,21 @@ class ShapeModel:
     """Learned state; ``classes`` are numbers 0..C-1 and ``labels`` holds one per exemplar."""
 
     exemplars: Exemplars = field(metadata=part(""))
-    labels: Tensor = field(metadata=stored("every", "exemplars", below="classes"))
+    labels: Tensor = field(metadata=store("every", "exemplars", below="classes"))
     classes: int
     view: str
     scorer: str  # "nearest" (A), "kernel" (B) or "both"
     metric: JointMetric = field(metadata=part(""))
-    symmetry: Tensor | None = field(metadata=stored("every", "joints", below="joints"))  # of the mirror image's joints
-    mirrored: Tensor = field(metadata=stored("truth", "exemplars"))  # which exemplars also count mirrored
+    symmetry: Tensor | None = field(metadata=store("every", "joints", below="joints"))  # of the mirror image's joints
+    mirrored: Tensor = field(metadata=store("truth", "exemplars"))  # which exemplars also count mirrored
     parts: JointWeights = field(metadata=part())  # how much each joint and each channel of A counts
-    hub: Tensor = field(metadata=stored("real", "exemplars"))  # how close an exemplar is to other classes
-    moment_hub: Tensor = field(metadata=stored("real", "moments"))  # the same of its short windows
+    hub: Tensor = field(metadata=store("real", "exemplars"))  # how close an exemplar is to other classes
+    moment_hub: Tensor = field(metadata=store("real", "moments"))  # the same of its short windows
     kernels: Kernels | None
     support: Windows | None = field(metadata=part(rows="rows"))  # windows behind the machine's support rows
     machine: PairwiseMachine | None = field(metadata=part())
     # (N,) evidence of exemplars whose class was left out
-    evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0), metadata=stored("real", None))
+    evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0), metadata=store("real", None))
     blend: Blend = field(default_factory=lambda: Blend())
     profiles: ClassProfiles | None = field(default=None, metadata=part())  # of the exemplars' class scores; older files have none
     hidden: int = 0

@@ -270,12 +270,12 @@ def stream(
     parts, truth, at, posture = [], [], 0, STAND
     for action, move in moves:
         before, after = ENDS.get(action, (STAND, STAND))
-        gap = _rest(posture, before, rng.uniform(*rest), person, fps)
+        gap = _perform_rest(posture, before, rng.uniform(*rest), person, fps)
         body = _blend(_angles(move, action, person, fps, repeats, rng), before, after, person, fps)
         truth.append((action, (at + len(gap)) / fps, (at + len(gap) + len(body) - 1) / fps))
         parts += [gap, body]
         at, posture = at + len(gap) + len(body), after
-    parts.append(_rest(posture, posture, rng.uniform(*rest), person, fps))
+    parts.append(_perform_rest(posture, posture, rng.uniform(*rest), person, fps))
     return _clip(np.concatenate(parts), person, fps, rng, label=None, name="stream"), truth
 
 
@@ -432,7 +432,7 @@ def _static_pose(posture: FloatArray, person: Person) -> FloatArray:
     return angles.reshape(-1)
 
 
-def _rest(first: FloatArray, last: FloatArray, seconds: float, person: Person, fps: float) -> FloatArray:
+def _perform_rest(first: FloatArray, last: FloatArray, seconds: float, person: Person, fps: float) -> FloatArray:
     """Standing or sitting still; where the posture changes, at least 1.4 s long."""
     change = first is not last
     frames = max(1, round(max(seconds, 1.4 if change else 0.0) * fps))

@@ -21,9 +21,9 @@ from indexing.action.bank import JointMetric
 from indexing.action.symmetry import mirror_permutation
 from indexing.archive.tracks import StorageFormat, Track
 from indexing.clip import Clip, FloatArray
-from indexing.joints import FEWEST, named, places
+from indexing.joints import FEWEST, has_names, places
 from indexing.skeleton import Skeleton
-from indexing.windows import bridged, sample
+from indexing.windows import interpolate_gaps, sample
 
 # evens out directions of codes: .25 gives .88 / .98 / .99 of right moments among 10 / 100 / 300, at 2 s .82 for .88
 CODE_WHITENING_POWER = 0.5
@@ -112,7 +112,7 @@ class Layout:
     def facing(self, clip: Clip) -> Clip | None:
         """A clip with its joints in the order of these; ``None`` where too few are the same."""
         own = clip.skeleton
-        if own is None or self.skeleton is None or not (named(own) and named(self.skeleton)):
+        if own is None or self.skeleton is None or not (has_names(own) and has_names(self.skeleton)):
             return clip if clip.joints.shape[1] == self.joints else None
         place = np.array(places(own, self.skeleton))
         shared = int((place >= 0).sum())
@@ -150,7 +150,7 @@ class Layout:
 
 def layout_key(joints: int, skeleton: Skeleton | None) -> str:
     """What tells layouts apart: names in their order, or how many joints, with their bones where these are known."""
-    if skeleton is not None and named(skeleton):
+    if skeleton is not None and has_names(skeleton):
         return ",".join(joint.replace(",", " ") for joint in skeleton.joints)
     bones = "" if skeleton is None else " ".join(f"{min(bone)}-{max(bone)}" for bone in sorted(skeleton.bones))
     return f"{joints}:{bones}" if bones else str(joints)
@@ -193,7 +193,7 @@ def _windows(tracks: Sequence[Track], storage: StorageFormat) -> tuple[Tensor, T
             continue
         times = np.arange(len(track)) / storage.rate
         begin = times[first.astype(np.intp)]
-        source = bridged(track.positions(), times, np.array([0, len(track)]))
+        source = interpolate_gaps(track.positions(), times, np.array([0, len(track)]))
         windows.append(sample(source, np.zeros(len(first), dtype=np.intp), begin, begin + 1.0, WINDOW_LENGTH))
         seen.append(np.repeat(source.seen, len(first), axis=0))
     return torch.cat(windows), torch.from_numpy(np.concatenate(seen))

@@ -28,7 +28,7 @@ from indexing.archive.tracks import images
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.cameras import y_up
 from indexing.clip import Clip, FloatArray
-from indexing.windows import Ragged, bridged, mended, ragged, sample, unusable, whole
+from indexing.windows import Ragged, interpolate_gaps, ragged, repair_clip, sample, unusable, whole
 
 Progress = Callable[[float], None] | None
 
@@ -69,7 +69,7 @@ def check_example(clip: Clip, min_duration: float) -> Clip:
     reason = unusable(clip)
     if reason:
         raise ValueError(f"{who}: {reason}; give a clip that shows the movement")
-    clip = mended(clip.replace(joints=clip.joints[there], times=clip.times[there], confidence=None))
+    clip = repair_clip(clip.replace(joints=clip.joints[there], times=clip.times[there], confidence=None))
     if clip.duration < min_duration * (1 - 1e-9):
         raise ValueError(
             f"{who}: shows {clip.duration:.3g} s, but the shortest window lasts {min_duration:g} s; give more of the movement"
@@ -358,7 +358,7 @@ def cut_windows(places: Places, segments: Sequence[ArchiveSegment], length: int)
         counts = last - first
         starts = np.concatenate([[0], np.cumsum(counts)])
         step = np.arange(starts[-1]) - np.repeat(starts[:-1], counts) + np.repeat(first, counts)
-        source = bridged(segment.poses(np.repeat(track, counts), step), step / segment.rate, starts)
+        source = interpolate_gaps(segment.poses(np.repeat(track, counts), step), step / segment.rate, starts)
         values[mine] = sample(source, np.arange(len(mine)), begin, end, length)
         seen[mine] = torch.from_numpy(source.seen)
     return Windows(values, seen)
@@ -366,7 +366,7 @@ def cut_windows(places: Places, segments: Sequence[ArchiveSegment], length: int)
 
 def rank(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortlist, k: int) -> Shortlist:
     """Candidates by their exact residual, best first; the best ones moved and stretched to where it is least."""
-    shortlist = _sorted(shortlist.at(shortlist.places, _scores(snapshot, queries, shortlist)))
+    shortlist = _sort_shortlist(shortlist.at(shortlist.places, _scores(snapshot, queries, shortlist)))
     best = shortlist[: max(MAX_REFINED, 4 * k)]
     middle, half = (best.places.begin + best.places.end) / 2, (best.places.end - best.places.begin) / 2
     parts = [
@@ -379,7 +379,7 @@ def rank(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortlist,
     tried = np.stack([_scores(snapshot, queries, best.at(part, best.score)) for part in parts])
     which, index = np.argmax(tried, axis=0), np.arange(len(best))
     begin, end = (np.stack([getattr(part, name) for part in parts])[which, index] for name in ("begin", "end"))
-    return _sorted(best.at(replace(best.places, begin=begin, end=end), tried[which, index]))
+    return _sort_shortlist(best.at(replace(best.places, begin=begin, end=end), tried[which, index]))
 
 
 def _scores(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortlist) -> FloatArray:
@@ -396,7 +396,7 @@ def _scores(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortli
     return out
 
 
-def _sorted(shortlist: Shortlist) -> Shortlist:
+def _sort_shortlist(shortlist: Shortlist) -> Shortlist:
     """Best first, of equal ones in the order in which they lie; without those that could not be compared."""
     places = shortlist.places
     order = np.lexsort((shortlist.probe, places.begin, places.track, places.segment, -shortlist.score))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dyntorch.numerics import one_thread
 from indexing.cameras import rotation, y_up
 from indexing.clip import Clip, FloatArray
-from indexing.windows import mended, ragged, sample
+from indexing.windows import ragged, repair_clip, sample
 
 MISSING = -(2**15)  # stored coordinate of a joint that was not seen
 LARGEST = 2**15 - 2  # of the others
@@ -65,7 +65,7 @@ def positions(stored: NDArray[np.int16], origin: FloatArray, scale: float | Floa
 def tracks_of(clip: Clip, storage: StorageFormat, recording: int = 0) -> list[Track]:
     """One person's recording as tracks; none where nobody is in view for long enough."""
     found: list[Track] = []
-    clip = mended(clip, REPAIR_STRIDE)
+    clip = repair_clip(clip, REPAIR_STRIDE)
     for view, image in enumerate(images(clip, storage.views)):
         there = image.seen.sum(axis=1) >= min(MIN_JOINTS, image.joints.shape[1])
         if not there.any():

@@ -24,7 +24,7 @@ from indexing.archive.segments import ArchiveSegment, WrittenSegment, damage_err
 from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, failure_text, read_source, reading_key, stamp
 from indexing.archive.tracks import StorageFormat, Track, total_windows, windows_of
 from indexing.archive.workers import InOrder, WorkerLost
-from indexing.opening import count, listed
+from indexing.opening import count, listing
 from indexing.skeleton import Skeleton
 
 Progress = Callable[[float], None] | None
@@ -445,4 +445,4 @@ def _loss_text(recordings: Sequence[RecordingRow], names: Mapping[int, str]) -> 
     if not recordings:
         return "nothing of it is used"
     sources = sorted({names.get(one.source, one.name) for one in recordings})
-    return f"{count(len(recordings), 'recording')} lost: remove and add again {listed(sources)}"
+    return f"{count(len(recordings), 'recording')} lost: remove and add again {listing(sources)}"

@@ -37,7 +37,7 @@ from indexing.estimator import (
 )
 from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_fields, tensors_of
 from indexing.opening import shown
-from indexing.scoring import SHARPNESS, Event, joined, probabilities, refuse, reject_threshold
+from indexing.scoring import SHARPNESS, Event, join_labels, probabilities, refuse, reject_threshold
 
 MIN_WINDOW_FRAMES = 5.0  # of exercises at 15 per second, 0 / 60 degrees, 3 name .816 / .690 of the frames, 5 .821 / .751
 
@@ -200,7 +200,7 @@ class BrightnessIndexer(SavedClassifier):
         if self._optics() != self._learned_optics:
             raise ValueError("fps, region, size or options were changed since fit; set them back, or fit all videos again")
         found = gather(videos, float(self.fps))
-        values = joined(self.classes_[self.exemplars_.labels.numpy()], check_labels(labels, len(found)))
+        values = join_labels(self.classes_[self.exemplars_.labels.numpy()], check_labels(labels, len(found)))
         known, numbers = np.unique(values, return_inverse=True)
         old = len(self.exemplars_.labels)
         more = self._exemplars(found, numbers[old:])

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from indexing.brightness.sight import mirror_rows
-from indexing.modelfile import stored
+from indexing.modelfile import store
 
 FRAMES = 2**31  # of a video, at most
 LONGEST = 1.001  # of the entries of a unit vector, with rounding
@@ -19,9 +19,9 @@ GAP = 2  # empty rows before each track: no step leads from one track into the n
 class VideoExemplars:
     """Learned videos, one after the other."""
 
-    motion: Tensor = field(metadata=stored("real", "frames", "descriptor", least=-LONGEST, most=LONGEST))
-    lengths: Tensor = field(metadata=stored("whole", "videos", below=FRAMES))  # ``(videos,)`` frames
-    labels: Tensor = field(metadata=stored("every", "videos", below="classes"))  # ``(videos,)`` numbers of classes
+    motion: Tensor = field(metadata=store("real", "frames", "descriptor", least=-LONGEST, most=LONGEST))
+    lengths: Tensor = field(metadata=store("whole", "videos", below=FRAMES))  # ``(videos,)`` frames
+    labels: Tensor = field(metadata=store("every", "videos", below="classes"))  # ``(videos,)`` numbers of classes
 
     @classmethod
     def of(cls, videos: list[Tensor], labels: Tensor) -> VideoExemplars:

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from indexing.brightness.features import blurred, inner_gradients, weighted_differences
+from indexing.brightness.features import blur_small, inner_gradients, weighted_differences
 from indexing.brightness.footage import Shrinker
 
 MIN_CHANGE = 0.006  # grey 0..1 per frame: less does not widen the box
@@ -34,7 +34,7 @@ class MotionMaps:
 
     def push(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Maps ``(n, 4, h, w)`` (right, left, down, up) and brightness change ``(n, h, w)`` of frames ``(n, h, w)`` in 0..1."""
-        smooth = blurred(frames, self.sigma)
+        smooth = blur_small(frames, self.sigma)
         known = torch.cat([smooth[:1].expand(2, -1, -1) if self.last is None else self.last, smooth])
         self.last = known[-2:]
         gx, gy, gt = inner_gradients(known)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dyntorch.numerics import Message
 from indexing.joints import canonical
-from indexing.opening import listed
+from indexing.opening import listing
 
 if TYPE_CHECKING:
     from dyntorch import Calibration
@@ -117,7 +117,7 @@ def standing_extent(names: Sequence[str], height: float) -> Stature:
             "{arg:height}: the joints ({names}) do not reach from the head or the shoulders to the feet, so the height says "
             "nothing of them; give {arg:length} between two of them instead"
         )
-        raise ValueError(Message(text, names=listed(names)))
+        raise ValueError(Message(text, names=listing(names)))
     low, high = levels[0][0], levels[-1][0]
     tops, bottoms = (tuple(name for share, name in levels if share.height == edge.height) for edge in (high, low))
     return Stature((high.height - low.height) * height, height * math.hypot(low.spread, high.spread), tops, bottoms, height)

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from dyntorch.numerics import Message
 from indexing.clip import Clip
-from indexing.joints import canonical, named
-from indexing.opening import listed
+from indexing.joints import canonical, has_names
+from indexing.opening import listing
 from indexing.remarks import is_normalized, remarks_on, same_clips
-from indexing.skeleton import Skeleton, known
+from indexing.skeleton import Skeleton, usual_layout
 from indexing.sync.recordings import Take
 
 FloatArray = NDArray[np.float64]
@@ -98,13 +98,13 @@ class Joints:
 
 def select_common_joints(clips: Sequence[Clip], names: Sequence[str]) -> Joints:
     """The joints of many layouts by their names: those that two cameras or more have."""
-    layouts = [clip.skeleton or known(clip.joints.shape[1]) for clip in clips]
+    layouts = [clip.skeleton or usual_layout(clip.joints.shape[1]) for clip in clips]
     sizes = [clip.joints.shape[1] for clip in clips]
     alike = all(layout is None or layouts[0] is None or layout.joints == layouts[0].joints for layout in layouts)
     if len(set(sizes)) == 1 and alike:
         shown = next((layout for layout in layouts if layout is not None), None)
         return Joints(shown, sizes[0], tuple(tuple(range(sizes[0])) for _ in clips))
-    unnamed = [i for i, layout in enumerate(layouts) if not named(layout)]
+    unnamed = [i for i, layout in enumerate(layouts) if not has_names(layout)]
     if unnamed:
         i = unnamed[0]
         other = next(j for j in range(len(clips)) if sizes[j] != sizes[i] or layouts[j] != layouts[i])
@@ -130,7 +130,7 @@ def _match_joint_names(layouts: Sequence[Skeleton], names: Sequence[str]) -> Joi
                 "{name}: its joints ({own}) share {most} names with those of any other camera, and {needed} are needed; "
                 "use files of one kind of pose estimator"
             )
-            raise ValueError(Message(text, name=name, own=listed(layout.joints), most=most, needed=MIN_SHARED_JOINTS))
+            raise ValueError(Message(text, name=name, own=listing(layout.joints), most=most, needed=MIN_SHARED_JOINTS))
     index = {word: i for i, word in enumerate(kept)}
     bones: dict[tuple[int, int], None] = {}
     for layout in layouts:
@@ -141,7 +141,7 @@ def _match_joint_names(layouts: Sequence[Skeleton], names: Sequence[str]) -> Joi
     skeleton = Skeleton("joints of several layouts", tuple(called[word] for word in kept), tuple(bones))
     kinds = list(dict.fromkeys(layout.name for layout in layouts))
     places = tuple(tuple(own.get(word, -1) for word in kept) for own in words)
-    return Joints(skeleton, len(kept), places, f"the cameras have {listed(kinds)}: {len(kept)} joints are used, by their names")
+    return Joints(skeleton, len(kept), places, f"the cameras have {listing(kinds)}: {len(kept)} joints are used, by their names")
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from indexing.calibrate.priors import KnownLenses, given_clocks, known_lenses
 from indexing.calibrate.rig import CameraRig
 from indexing.clip import Clip
 from indexing.joints import canonical
-from indexing.opening import listed
+from indexing.opening import listing
 from indexing.sync.recordings import Take, find_cameras, take_of
 
 Progress = Callable[[str], None]
@@ -222,7 +222,7 @@ def calibrate_recordings(
 def _recording_notes(takes: Sequence[Take]) -> list[str]:
     """What to know of the recordings."""
     rated = [take.name for take in takes if take.fps_assumed]
-    return [*([Message(ASSUMED_RATE, names=listed(rated))] if rated else []), *(note for take in takes for note in take.notes)]
+    return [*([Message(ASSUMED_RATE, names=listing(rated))] if rated else []), *(note for take in takes for note in take.notes)]
 
 
 def sizes_of(sizes: Any, cameras: int) -> list[Size | None]:
@@ -320,7 +320,7 @@ def _side_notes(views: Sequence[View], exchanges: Sequence[SideExchange]) -> lis
         own = [one for one in exchanges if one.camera == i]
         if own:
             lasts = sum(one.end - one.start + 1 / view.take.fps for one in own)
-            limbs = listed(dict.fromkeys(one.limb for one in own))
+            limbs = listing(dict.fromkeys(one.limb for one in own))
             notes.append(
                 f"{view.name}: left and right exchanged {len(own)} times ({limbs}; {lasts:.2f} s in all), mended by the others"
             )

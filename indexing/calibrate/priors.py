@@ -15,7 +15,7 @@ from torch import Tensor
 from dyntorch import Clocks
 from dyntorch.numerics import Message
 from indexing.calibrate.camera_views import Size
-from indexing.opening import error, listed, parse_json, read_text
+from indexing.opening import error, listing, parse_json, read_text
 from indexing.sync.calibration import Lens, named_lenses
 from indexing.sync.recordings import Take
 
@@ -139,7 +139,7 @@ def _from_exif(takes: Sequence[Take], sizes: Sequence[Size]) -> KnownLenses:
             "{names}: no 35 mm equivalent is written in its video, nor in a photo beside its keypoints; "
             "leave {arg:exif} out, or give {arg:focal}"
         )
-        raise ValueError(Message(text, names=listed(lacking)))
+        raise ValueError(Message(text, names=listing(lacking)))
     known = [one for one in focals_35 if one is not None]
     focals = tuple(mm * math.hypot(*size) / DIAGONAL for (mm, _), size in zip(known, sizes, strict=True))
     listing = "; ".join(
@@ -226,7 +226,7 @@ def _clocks_from_sync(path: Path, names: Sequence[str]) -> Tensor:
     known = {one["name"]: one for one in cameras}
     lacking = [name for name in names if name not in known]
     if lacking:
-        raise error(path, f"has no clock of {listed(lacking)} (it has {listed(known)})", "synchronize the same recordings")
+        raise error(path, f"has no clock of {listing(lacking)} (it has {listing(known)})", "synchronize the same recordings")
     rows = []
     for name in names:
         offset, rate = known[name].get("offset"), known[name].get("rate")

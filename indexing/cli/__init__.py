@@ -15,7 +15,7 @@ from typing import Any, get_args
 
 import tyro
 
-from indexing.cli.console import complain, reworded
+from indexing.cli.console import complain, reword_parser_message
 from indexing.cli.flags import GROUPS, find_command, grammar
 
 DONE, BAD_INPUT, REFUSED, INTERRUPTED, BROKEN_PIPE = 0, 2, 3, 130, 141
@@ -79,11 +79,11 @@ def parse(words: list[str]) -> Any:
     except SystemExit as stop:
         if stop.code in (None, 0):
             return DONE
-        complain(reworded(message.getvalue(), f"{_asked(words)} --help"))
+        complain(reword_parser_message(message.getvalue(), f"{_command_of(words)} --help"))
         return BAD_INPUT
 
 
-def _asked(words: list[str]) -> str:
+def _command_of(words: list[str]) -> str:
     """The command that the words begin with, as far as there is one: whose help says what is wrong with the others."""
     asked, level = ["dyntorch"], grammar()
     for word in words:

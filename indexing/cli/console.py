@@ -44,7 +44,7 @@ def say(text: str = "") -> None:
     print(one_line(text))
 
 
-def ended(page: object, refusal: str | None) -> int:
+def finish(page: object, refusal: str | None) -> int:
     """Say where the report is, and why the data cannot decide, if so: the exit code."""
     if page is not None:
         say(f"report: {page}")
@@ -127,7 +127,7 @@ def progress(what: str, steps: bool = True) -> Iterator[Progress]:
 
 
 @contextmanager
-def counted(what: str, unit: str) -> Iterator[Callable[[int, int], None] | None]:
+def counting_bar(what: str, unit: str) -> Iterator[Callable[[int, int], None] | None]:
     """A bar on the terminal with how many are done in a second and the time that is left; None where stderr is no terminal."""
     if not sys.stderr.isatty():
         yield None
@@ -209,7 +209,7 @@ def keep(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:
 # What the parser of the command line says, in our words: one line that names the flag, what was given and what is expected.
 
 
-def reworded(text: str, command: str) -> str:
+def reword_parser_message(text: str, command: str) -> str:
     """The parser's message, which it draws in a box with rules between the parts, as one line in our words.
 
     Args:

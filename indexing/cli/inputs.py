@@ -16,12 +16,12 @@ import numpy as np
 from dyntorch.numerics import worded
 from indexing.cli.console import count, names
 from indexing.cli.flags.shared import Example, Reading, Watched
-from indexing.cli.notes import WORDS, few, on_examples, on_gaps, on_people, remarks
+from indexing.cli.notes import WORDS, clip_notes, first_sentences, on_examples, on_gaps, on_people
 from indexing.cli.protocol import choose
 from indexing.cli.videos import find_keypoints
 from indexing.clip import Clip, ClipSet, FloatArray
-from indexing.joints import layout_of, matched
-from indexing.opening import clipped, read_rows, shown
+from indexing.joints import layout_of, match_joints
+from indexing.opening import clip_text, read_rows, shown
 from indexing.readers import read
 from indexing.readers.recording import NobodySeen
 from indexing.recordings.people import of_recording, tracked_people
@@ -46,7 +46,7 @@ def read_clips(reading: Reading, path: Path, label: str | None = None) -> ClipSe
         raise found
     if found != path:  # keypoints of a video go by the name of the video
         own = replace(reading, watched=Watched({}), size=None, fps=None)
-        return _renamed(read_clips(own, found, label), found, path)
+        return _rename_clips(read_clips(own, found, label), found, path)
     try:
         return read(
             path, format=reading.format, fps=reading.fps, person=reading.person, min_confidence=reading.min_confidence, label=label,
@@ -58,7 +58,7 @@ def read_clips(reading: Reading, path: Path, label: str | None = None) -> ClipSe
         raise ValueError(worded(problem, WORDS)) from None
 
 
-def _renamed(clips: ClipSet, old: Path, new: Path) -> ClipSet:
+def _rename_clips(clips: ClipSet, old: Path, new: Path) -> ClipSet:
     return type(clips)([clip.replace(name=new.name + clip.name.removeprefix(old.name)) for clip in clips], new.name)
 
 
@@ -75,17 +75,17 @@ class Lane:
 def parse_example(text: str) -> Example:
     """``label=file``, ``label=file@1.5-4`` (seconds; an end may be left open) or ``set.npz``."""
     label, equals, rest = text.partition("=")
-    if not equals or (Path(text).expanduser().exists() and not _trimmed(rest).path.expanduser().exists()):
-        return _trimmed(text)
+    if not equals or (Path(text).expanduser().exists() and not _trim_text(rest).path.expanduser().exists()):
+        return _trim_text(text)
     if not label.strip() or not rest:
         raise ValueError(f"example {text!r}: expected label=file, such as squat=a.json; give both the label and the file")
-    found = _trimmed(rest)
+    found = _trim_text(rest)
     if "=" in rest and not found.path.expanduser().exists() and Path(file := rest.rpartition("=")[2]).expanduser().exists():
         raise ValueError(f"example {text!r}: two labels for {file}; give one, as in {label.strip()}={file}")
     return Example(found.path, label.strip(), found.start, found.end)
 
 
-def _trimmed(text: str) -> Example:
+def _trim_text(text: str) -> Example:
     match = TRIM.fullmatch(text)
     if Path(text).expanduser().exists():
         return Example(Path(text))
@@ -123,16 +123,16 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
         if is_set and select:
             found = found[choose(found, select, "--select")]
         if example.start is not None or example.end is not None:
-            found, cut = _cut(found, example)
+            found, cut = _crop_example(found, example)
             notes += cut
         if is_set or len(found) > 1:
             found, left_out = usable(found, example.path)
             notes += left_out
         if is_set:
-            notes += assumed(found, example.path)
+            notes += assumed_rate_notes(found, example.path)
         else:
             guessed += found
-        own, said = of_layout(_checked(found, example.path), layout_of([*clips, *found]), example.path)
+        own, said = of_layout(_check_clips(found, example.path), layout_of([*clips, *found]), example.path)
         notes += said
         clips += own
         first, last = clips[0].joints.shape[1], clips[-1].joints.shape[1]
@@ -140,22 +140,24 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
             raise ValueError(
                 f"{example.path}: has {last} joints, but {examples[0].path} has {first}; use one pose estimator and joint layout"
             )
-    return clips, notes + assumed(guessed) + remarks(clips, reading) + on_examples(clips) + on_overlaps(examples)
+    return clips, notes + assumed_rate_notes(guessed) + clip_notes(clips, reading) + on_examples(clips) + on_overlaps(examples)
 
 
 def of_layout(clips: Sequence[Clip], known: Skeleton | None, path: Path) -> tuple[list[Clip], list[str]]:
     """Clips with their joints in the order of those known, and a note where not all are used or nobody knows which is which."""
-    found = [matched(clip, known, str(path)) for clip in clips]
+    found = [match_joints(clip, known, str(path)) for clip in clips]
     return [clip for clip, _ in found], list(dict.fromkeys(note for _, note in found if note))
 
 
-def _cut(clips: ClipSet, example: Example) -> tuple[ClipSet, list[str]]:
+def _crop_example(clips: ClipSet, example: Example) -> tuple[ClipSet, list[str]]:
     """The seconds that count, and a note where the recording does not have all of them."""
     start, end = example.start if example.start is not None else -math.inf, example.end if example.end is not None else math.inf
     found = ClipSet((clip.between(start, end) for clip in clips), clips.name)
     alone = [clip for clip in found if len(clip) == 1]
     if alone and len(alone) == len(found):
-        raise ValueError(f"{_ranged(example)}: one frame only lies in these seconds ({alone[0].times[0]:.6g} s); give more of them")
+        raise ValueError(
+            f"{_range_text(example)}: one frame only lies in these seconds ({alone[0].times[0]:.6g} s); give more of them"
+        )
     short = [clip for clip in clips if on_range(example, clip.times[0], clip.times[-1])]
     if not short:
         return found, []
@@ -167,7 +169,7 @@ def on_range(example: Example, first: float, last: float) -> list[str]:
     """On an example whose seconds lie beyond its recording, keypoints or video, which runs from ``first`` to ``last``."""
     early = example.start is not None and example.start < first - CUT
     late = example.end is not None and last + CUT < example.end
-    return [f"{_ranged(example)}: the recording runs from {first:.6g} to {last:.6g} s"] if early or late else []
+    return [f"{_range_text(example)}: the recording runs from {first:.6g} to {last:.6g} s"] if early or late else []
 
 
 def on_overlaps(examples: Sequence[Example]) -> list[str]:
@@ -189,15 +191,15 @@ def on_overlaps(examples: Sequence[Example]) -> list[str]:
             found.append(
                 f"{one.path}: {when} count both as {one.label} and as {other.label}; correct the ranges if they do not overlap"
             )
-    return few(found)
+    return first_sentences(found)
 
 
-def _ranged(example: Example) -> str:
+def _range_text(example: Example) -> str:
     start, end = ("" if value is None else f"{value:g}" for value in (example.start, example.end))
     return f"{example.path}@{start}-{end}"
 
 
-def _checked(clips: Sequence[Clip], path: Path) -> list[Clip]:
+def _check_clips(clips: Sequence[Clip], path: Path) -> list[Clip]:
 
     for clip in clips:
         reason = unusable(clip)
@@ -222,7 +224,7 @@ def usable(clips: ClipSet, path: Path) -> tuple[ClipSet, list[str]]:
     return clips[np.setdiff1d(np.arange(len(clips)), bad)], [f"{count(len(bad), 'clip')} of {path} left out; the first, {first}"]
 
 
-def assumed(clips: Sequence[Clip], path: Path | None = None) -> list[str]:
+def assumed_rate_notes(clips: Sequence[Clip], path: Path | None = None) -> list[str]:
     """A note on clips whose frame rate nobody said: the names of recordings, or the number of clips of a set."""
     found = [clip.name for clip in clips if clip.fps_assumed]
     who = names(list(dict.fromkeys(found))) if path is None else f"{count(len(found), 'clip')} of {path}"
@@ -247,15 +249,15 @@ def read_recordings(
                     f"{path}: has {clip.joints.shape[1]} joints, but the model {model} was learned from clips with {joints}; "
                     "actions are compared joint by joint: use the same pose estimator and joint layout for both"
                 )
-        same = iter(_checked(clips, path))
+        same = iter(_check_clips(clips, path))
         found.append([replace(lane, clip=None if lane.clip is None else next(same)) for lane in lanes])
-    lanes = _apart(paths, found)
+    lanes = _distinguish_names(paths, found)
     clips = [lane.clip for lane in lanes if lane.clip is not None]
     alone = [clip for clip in clips if "followed" not in clip.meta or clip.meta.get("person") is None]
-    return lanes, notes + remarks(clips, reading) + on_gaps(alone) + assumed(clips)
+    return lanes, notes + clip_notes(clips, reading) + on_gaps(alone) + assumed_rate_notes(clips)
 
 
-def _apart(paths: Sequence[Path], found: Sequence[Sequence[Lane]]) -> list[Lane]:
+def _distinguish_names(paths: Sequence[Path], found: Sequence[Sequence[Lane]]) -> list[Lane]:
     """All lanes, under names that tell recordings apart: those that are equal get their path."""
     owners = {(lane.name, i, 0 if lane.person else j) for i, lanes in enumerate(found) for j, lane in enumerate(lanes)}
     times = Counter(name for name, *_ in owners)
@@ -335,14 +337,14 @@ def read_truth(
     if rows and len(elsewhere) == len(rows):
         column = "'person' names" if by_person and not any(row.get("file") for _, row in rows) else "'file' names"
         raise ValueError(
-            f"{path}: column {column} {clipped(names(sorted(set(elsewhere))))}, none of the recordings; correct the names"
+            f"{path}: column {column} {clip_text(names(sorted(set(elsewhere))))}, none of the recordings; correct the names"
         )
     notes = [
         f"{path}: does not say whose the events of {name} are; compared with person {people[first[name]]}, the largest; a column "
         "'person' says otherwise"
         for name in sorted(blamed)
     ]
-    left = f"{count(len(elsewhere), 'row')} of {path} left out: of other recordings ({clipped(names(sorted(set(elsewhere))))})"
+    left = f"{count(len(elsewhere), 'row')} of {path} left out: of other recordings ({clip_text(names(sorted(set(elsewhere))))})"
     return known, notes + ([left] if elsewhere else [])
 
 

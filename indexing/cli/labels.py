@@ -9,15 +9,15 @@ from typing import Any
 
 from indexing.cli.console import check_file, count, names
 from indexing.cli.flags.shared import Example, Labelling, Reading
-from indexing.cli.inputs import KnownEvent, Lane, assumed, lanes_of, of_layout
-from indexing.cli.notes import on_examples, remarks
+from indexing.cli.inputs import KnownEvent, Lane, assumed_rate_notes, lanes_of, of_layout
+from indexing.cli.notes import clip_notes, on_examples
 from indexing.clip import Clip
 from indexing.files import prepare
 from indexing.joints import layout_of
 from indexing.labels import Label, LabelFile, choose_labels, open_labels, within, write_labels
 from indexing.labels.format import Request
 from indexing.labels.media import of_recording, same_recording
-from indexing.opening import error, listed
+from indexing.opening import error, listing
 from indexing.report import RecordingResult
 from indexing.report.results import by_recording
 from indexing.windows import unusable
@@ -65,7 +65,7 @@ def read_marked(labelling: Labelling, lanes: Sequence[Any], reading: Reading) ->
     for name in recordings:
         mine = [i for i, lane in enumerate(lanes) if lane.name == name]
         for path in files[name]:
-            labels, said = _chosen(labelling, path, name, _rate([lanes[i] for i in mine], reading))
+            labels, said = _select_labels(labelling, path, name, _rate([lanes[i] for i in mine], reading))
             notes += said
             given, said = _to_people(labelling, path, name, labels, [getattr(lanes[i], "person", "") for i in mine])
             notes += said
@@ -81,7 +81,7 @@ def _rate(lanes: Sequence[Any], reading: Reading) -> float | None:
     return clips[0].fps if reading.fps is None and clips and not clips[0].fps_assumed else reading.fps
 
 
-def _chosen(labelling: Labelling, path: Path, recording: str, fps: float | None) -> tuple[list[Label], list[str]]:
+def _select_labels(labelling: Labelling, path: Path, recording: str, fps: float | None) -> tuple[list[Label], list[str]]:
     """What a file says of a recording, less moments and subjects that were not asked for."""
     file = choose_labels(open_marked(labelling, path, recording, fps))
     labels, notes = list(file.labels), [f"{path}: {note}" for note in file.notices]
@@ -91,7 +91,7 @@ def _chosen(labelling: Labelling, path: Path, recording: str, fps: float | None)
         there = list(dict.fromkeys(one.subject for one in labels))
         strange = next((subject for subject in labelling.people if subject not in there), None)
         if strange is not None:
-            raise error(path, f"has no label of the subject {strange!r}, only of {listed(there)}", "give one of these (--subject)")
+            raise error(path, f"has no label of the subject {strange!r}, only of {listing(there)}", "give one of these (--subject)")
         labels = [one for one in labels if one.subject in labelling.people]
     kept, said = lasting(path, labels)
     return kept, notes + said
@@ -118,7 +118,7 @@ def _of_recordings(labelling: Labelling, recordings: Sequence[str], reading: Rea
         mine = list(dict.fromkeys(name for medium in media for name in of_medium(medium, recordings)))
         if not mine:
             raise error(
-                path, f"is of {listed(media)}, none of the recordings ({listed(recordings)})",
+                path, f"is of {listing(media)}, none of the recordings ({listing(recordings)})",
                 "give the recording that it is of, or name the file of labels like it",
             )  # fmt: skip
         for name in mine:
@@ -126,7 +126,7 @@ def _of_recordings(labelling: Labelling, recordings: Sequence[str], reading: Rea
     lost = [name for name in recordings if not out[name]]
     if lost:
         raise error(
-            lost[0], f"none of the files of labels is of it ({listed(labelling.labels)})", "leave it out, or add its labels"
+            lost[0], f"none of the files of labels is of it ({listing(labelling.labels)})", "leave it out, or add its labels"
         )
     return out
 
@@ -154,7 +154,7 @@ def _to_people(
     if len(people) == 1:
         if len([subject for subject in subjects if subject]) > 1:
             raise error(
-                path, f"is of {listed(subjects)}, but {recording} shows one person", "choose with --subject whose labels count"
+                path, f"is of {listing(subjects)}, but {recording} shows one person", "choose with --subject whose labels count"
             )  # fmt: skip
         return [list(labels)], []
     owner: dict[str, int] = {}
@@ -167,7 +167,7 @@ def _to_people(
             owner[subject] = folded.index(person.casefold())
         else:
             raise error(
-                path, f"subject {person!r} is none of the people of {recording} ({listed(people)})",
+                path, f"subject {person!r} is none of the people of {recording} ({listing(people)})",
                 f"say who it is, as in --subject {subject}={people[0]}",
             )  # fmt: skip
     by_person = any(subjects) or not subjects
@@ -242,7 +242,7 @@ def labelled_examples(
         out.notes += said
         reasons += why
         if throughout:
-            out.background += _between(lane.clip, _everything(labelling, lane, reading))
+            out.background += _between(lane.clip, _all_labels(labelling, lane, reading))
     if not out.clips:
         where = names([str(path) for path in labelling.labels])
         first = f"; the first: {reasons[0]}" if reasons else ""
@@ -274,7 +274,7 @@ def _lanes_of(paths: Sequence[Path], reading: Reading, others: Sequence[Clip]) -
         same = iter(clips)
         found += [replace(lane, clip=None if lane.clip is None else next(same)) for lane in lanes]
     clips = seen[len(others) :]
-    return found, notes + assumed(clips) + remarks(clips, reading)
+    return found, notes + assumed_rate_notes(clips) + clip_notes(clips, reading)
 
 
 def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label]) -> tuple[list[Clip], list[str], list[str]]:
@@ -295,7 +295,7 @@ def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label]) -> tuple[list[Clip
         span = (float(part.times[0]), float(part.times[-1]))
         other = taken.setdefault(span, one)
         if other.label != one.label:
-            tiers = listed(sorted({one.tier, other.tier} - {""}))
+            tiers = listing(sorted({one.tier, other.tier} - {""}))
             raise ValueError(
                 f"{lane.name}: {span[0]:g} to {span[1]:g} s is marked {other.label!r} and {one.label!r}; correct one of them, or "
                 f"choose a tier (--tier, of {tiers})"
@@ -307,7 +307,7 @@ def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label]) -> tuple[list[Clip
     return clips, notes, reasons + short
 
 
-def _everything(labelling: Labelling, lane: Lane, reading: Reading) -> list[Label]:
+def _all_labels(labelling: Labelling, lane: Lane, reading: Reading) -> list[Label]:
     """All that is marked in a recording, of whatever tier and subject, and suggestions, too: none of it is background."""
     found: list[Label] = []
     for path in labelling.labels:

@@ -20,7 +20,7 @@ LISTED = 3  # moments, and names of joints
 WORDS = flag_words("fps", "person", "min_confidence", "format", "layout", size="--size W H")
 
 
-def remarks(clips: Sequence[Clip], reading: Reading) -> list[str]:
+def clip_notes(clips: Sequence[Clip], reading: Reading) -> list[str]:
     """On clips of any use: who is in them, in which units, and at which rate."""
     found = [*_people(clips, reading), *(worded(one, WORDS) for one in remarks_on(clips, reading.size is not None))]
     if reading.fps is not None and not SLOW <= reading.fps <= FAST and clips:
@@ -83,10 +83,10 @@ def on_people(name: str, crowd: Crowd) -> list[str]:
         found.append(f"{count(sum(crowd.ghosts.values()), 'track')} left out, as of no person ({reasons})")
     if crowd.untracked:
         found.append(f"{count(crowd.untracked, 'detection')} without an id left out; --person largest uses them")
-    found += few([_appears(one) for one in crowd.appearances])
-    found += few([_is_away(who, crowd) for who in dict.fromkeys(one.person for one in crowd.absences)])
+    found += first_sentences([_appears(one) for one in crowd.appearances])
+    found += first_sentences([_is_away(who, crowd) for who in dict.fromkeys(one.person for one in crowd.absences)])
     swapped = "change places at {:.2f} s; their ids may be swapped there"
-    found += few([f"persons {one.first} and {one.second} {swapped.format(one.at)}" for one in crowd.exchanges])
+    found += first_sentences([f"persons {one.first} and {one.second} {swapped.format(one.at)}" for one in crowd.exchanges])
     return [f"{name}: {sentence}" for sentence in found]
 
 
@@ -104,7 +104,7 @@ def _is_away(who: str, crowd: Crowd) -> str:
     return f"nobody is in view from {listed}; whoever comes then may be somebody else"
 
 
-def few(sentences: Sequence[str]) -> list[str]:
+def first_sentences(sentences: Sequence[str]) -> list[str]:
     """The first of many, and how many more there are."""
     more = len(sentences) - LISTED
     return [*sentences[:LISTED], *([f"and so {count(more, 'time')} more"] if more > 0 else [])]

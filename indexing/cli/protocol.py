@@ -30,7 +30,7 @@ def choose(clips: LabelledSet[Any], criteria: Sequence[str], flag: str) -> IntAr
     for text in criteria:
         field, equals, wanted = text.partition("=")
         if not equals or not field.strip() or not wanted.strip():
-            raise ValueError(f"{flag} {text!r}: expected field=value, such as view=1,2; {known(clips)}")
+            raise ValueError(f"{flag} {text!r}: expected field=value, such as view=1,2; {field_values(clips)}")
         values = column(clips, field.strip(), flag)
         found = _matching(values, wanted)
         if found is None:
@@ -38,21 +38,21 @@ def choose(clips: LabelledSet[Any], criteria: Sequence[str], flag: str) -> IntAr
             raise ValueError(f"{flag} {text!r}: no clip of {clips.name} has such a value; {field.strip()!r} is one of {listed}")
         keep &= found
     if not keep.any():
-        raise ValueError(f"{flag} {' '.join(criteria)}: no clip of {clips.name} meets all of it; {known(clips)}")
+        raise ValueError(f"{flag} {' '.join(criteria)}: no clip of {clips.name} meets all of it; {field_values(clips)}")
     return np.flatnonzero(keep)
 
 
 def column(clips: LabelledSet[Any], field: str, flag: str) -> NDArray[Any]:
     """One value per clip."""
     if field not in (*clips.fields, "action", "label"):
-        raise ValueError(f"{flag}: {clips.name} has no field {field!r}; {known(clips)}")
+        raise ValueError(f"{flag}: {clips.name} has no field {field!r}; {field_values(clips)}")
     values = clips.column(field)
     if values.ndim != 1:
         raise ValueError(f"{flag}: field {field!r} of {clips.name} has {values.shape[1]} columns; name one of them, e.g. {field}0")
     return values
 
 
-def known(clips: LabelledSet[Any]) -> str:
+def field_values(clips: LabelledSet[Any]) -> str:
     """What may be asked for: the fields and their values."""
     parts = []
     for name in (*clips.fields, "action"):
@@ -175,14 +175,14 @@ def splits(
         return _leave_out(clips, leave_out), []
     if not train and not test:
         raise ValueError(
-            f"say what to learn from and what to ask: --train view=1 --test view=2, or --leave-out field; {known(clips)}"
+            f"say what to learn from and what to ask: --train view=1 --test view=2, or --leave-out field; {field_values(clips)}"
         )
     everything = np.arange(len(clips))
     asked = choose(clips, test, "--test") if test else np.setdiff1d(everything, choose(clips, train, "--train"))
     learned = choose(clips, train, "--train") if train else np.setdiff1d(everything, asked)
     for name, chosen, other in (("--test", asked, "--train"), ("--train", learned, "--test")):
         if not len(chosen):
-            raise ValueError(f"{name}: {other} takes all {count(len(clips), 'clip')} of {clips.name}; {known(clips)}")
+            raise ValueError(f"{name}: {other} takes all {count(len(clips), 'clip')} of {clips.name}; {field_values(clips)}")
     both = np.intersect1d(asked, learned)
     notes = [f"warning: {count(len(both), 'clip')} in both --train and --test, so the accuracy is too good"] if len(both) else []
     return [Fold("", learned, asked)], notes
@@ -192,7 +192,7 @@ def _leave_out(clips: LabelledSet[Any], field: str) -> list[Fold]:
     values = column(clips, field, "--leave-out")
     groups = np.unique(values)
     if len(groups) < 2:
-        raise ValueError(f"--leave-out {field}: all clips of {clips.name} have the value {groups[0]}; {known(clips)}")
+        raise ValueError(f"--leave-out {field}: all clips of {clips.name} have the value {groups[0]}; {field_values(clips)}")
     return [Fold(f"{field} {value}", np.flatnonzero(values != value), np.flatnonzero(values == value)) for value in groups]
 
 

@@ -126,7 +126,7 @@ def follow(
 def follow_whole(paths: Sequence[Path], asked: Asked) -> SceneTracks:
     """Points of a whole video or of all pictures, from where they appear to where they are lost."""
     span = asked.span()
-    numbers, moments = _spanned(*span) if span else asked.numbers(), asked.moments()
+    numbers, moments = _frame_range(*span) if span else asked.numbers(), asked.moments()
     for flag, given in (("frames", numbers), ("at", moments)):
         if given is not None and len(given) < 2:
             raise ValueError(f"--{flag} {getattr(asked, flag)}: {len(given)} given, at least 2 are needed")
@@ -135,7 +135,7 @@ def follow_whole(paths: Sequence[Path], asked: Asked) -> SceneTracks:
     return track_whole(source, frames=numbers, at=moments, every=asked.every)
 
 
-def _spanned(first: int, last: int) -> list[int]:
+def _frame_range(first: int, last: int) -> list[int]:
     """Frames from the first to the last, of many every so many, as of a whole video."""
     return list(range(first, last + 1, -(-(last + 1 - first) // SceneTrackOptions().max_frames)))
 
@@ -169,7 +169,7 @@ def photographs(tracks: SceneTracks) -> list[Photograph]:
     return [Photograph(f"frame {k}", image, size) for k, image in zip(kept, gray, strict=True)]
 
 
-def named(tracks: SceneTracks) -> tuple[str, ...]:
+def names_of(tracks: SceneTracks) -> tuple[str, ...]:
     """Names of the points: their numbers, from 1."""
     return tuple(str(i + 1) for i in range(tracks.points.shape[1]))
 
@@ -177,20 +177,20 @@ def named(tracks: SceneTracks) -> tuple[str, ...]:
 def as_matches(tracks: SceneTracks) -> Matched:
     """As files of points for each view would give them."""
     views = tuple(view.numpy() for view in tracks.points)
-    return Matched(views, named(tracks), tuple(f"frame {k}" for k in tracks.frames), notes=tracks.notes)
+    return Matched(views, names_of(tracks), tuple(f"frame {k}" for k in tracks.frames), notes=tracks.notes)
 
 
 def as_pair(tracks: SceneTracks, path: Path) -> MatchedPair:
     """As a file of matches would give them."""
     x1, x2 = (view.numpy() for view in tracks.points)
     size = (float(tracks.size[0]), float(tracks.size[1]))
-    return MatchedPair(str(path), path.name, x1, x2, named(tracks), size=size)
+    return MatchedPair(str(path), path.name, x1, x2, names_of(tracks), size=size)
 
 
 def as_tracks(tracks: SceneTracks, path: Path, timed: bool) -> TrackSet:
     """As a table of tracks would give them."""
     times = tracks.times.numpy() if timed else None
-    return TrackSet(str(path), tracks.points.numpy(), named(tracks), tuple(map(str, tracks.frames)), times, notes=tracks.notes)
+    return TrackSet(str(path), tracks.points.numpy(), names_of(tracks), tuple(map(str, tracks.frames)), times, notes=tracks.notes)
 
 
 def tracks_csv(tracks: SceneTracks) -> str:
@@ -222,7 +222,7 @@ def _inner(given: str) -> list[float] | None:
     return found
 
 
-def calibrated(given: str | None, tracks: Tensor) -> tuple[Tensor, Tensor | None]:
+def undistort_views(given: str | None, tracks: Tensor) -> tuple[Tensor, Tensor | None]:
     """Tracks ``(views, n, 2)`` without lens distortion, and K of all views or of each; None without a calibration."""
     if given is None:
         return tracks, None

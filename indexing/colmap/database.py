@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import clipped, error, listed, size_of
+from indexing.opening import clip_text, error, listing, size_of
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -153,7 +153,7 @@ def _check_tables(path: Path, database: sqlite3.Connection) -> None:
     tables = [str(row[0]) for row in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
     for table, names in NEEDED.items():
         if table not in tables:
-            raise error(path, f"is no database of COLMAP: it has no table {table} (its tables are {listed(tables)})", MAKE)
+            raise error(path, f"is no database of COLMAP: it has no table {table} (its tables are {listing(tables)})", MAKE)
         there = _columns(database, table)
         lacking = [name for name in names if name not in there]
         if lacking:
@@ -175,7 +175,7 @@ def _images(path: Path, database: sqlite3.Connection) -> tuple[DatabaseImage, ..
     images = []
     for key, name, camera in database.execute("SELECT image_id, name, camera_id FROM images ORDER BY image_id"):
         if camera not in cameras:
-            raise error(path, f"image {clipped(name)} has camera {camera}, which is not there", "extract the features again")
+            raise error(path, f"image {clip_text(name)} has camera {camera}, which is not there", "extract the features again")
         images.append(DatabaseImage(key, str(name), cameras[camera], points.get(key, np.zeros((0, 2)))))
     return tuple(images)
 
@@ -212,7 +212,7 @@ def _pair(path: Path, key: int, rows: IntArray, images: Sequence[DatabaseImage],
     for place, column in ((pair.first, rows[:, 0]), (pair.second, rows[:, 1])):
         image = images[place]
         if column.max() >= len(image.points):
-            said = f"a match of image {clipped(image.name)} is keypoint {column.max()}, and it has {len(image.points)}"
+            said = f"a match of image {clip_text(image.name)} is keypoint {column.max()}, and it has {len(image.points)}"
             raise error(path, said, "match the images again")
     return pair
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from indexing.colmap.static import StaticPoints
 from indexing.files import prepare, write_bytes
-from indexing.opening import clipped, error
+from indexing.opening import clip_text, error
 
 Mask = NDArray[np.uint8]
 BLACK, WHITE = 0, 255
@@ -26,7 +26,7 @@ def mask_name(path: Path, name: str) -> PurePosixPath:
     """Where the mask of an image stands, within the folder of masks."""
     parts = PurePosixPath(name.replace("\\", "/"))
     if parts.is_absolute() or PureWindowsPath(name).drive or ".." in parts.parts or not parts.name or "\0" in name:
-        said = f"the name of image {clipped(repr(name))} leads out of the folder of images"
+        said = f"the name of image {clip_text(repr(name))} leads out of the folder of images"
         raise error(path, said, "extract the features again with --image_path at their folder")
     return parts.with_name(f"{parts.name}.png")
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.colmap.database import DatabaseImage, DatabasePair, MatchDatabase, PairGeometry
-from indexing.opening import clipped, error
+from indexing.opening import clip_text, error
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -69,7 +69,7 @@ def prepare_images(database: MatchDatabase) -> list[SeenImage]:
 
 def _prepare_image(database: MatchDatabase, image: DatabaseImage) -> SeenImage:
     known, module = image.camera, colmap()
-    who = f"the camera of image {clipped(image.name)}"
+    who = f"the camera of image {clip_text(image.name)}"
     try:
         camera = module.Camera(
             model=module.CameraModelId(known.model), width=known.width, height=known.height, params=list(known.params)
@@ -77,7 +77,7 @@ def _prepare_image(database: MatchDatabase, image: DatabaseImage) -> SeenImage:
         camera.has_prior_focal_length = known.prior
         good = camera.verify_params()
     except (RuntimeError, TypeError, ValueError) as problem:
-        said = f"{who} is of a model that pycolmap {module.__version__} does not know (number {known.model}: {clipped(problem)})"
+        said = f"{who} is of a model that pycolmap {module.__version__} does not know (number {known.model}: {clip_text(problem)})"
         raise error(database.path, said, "install the newest pycolmap") from None
     if not good:
         said = f"{who} has {len(known.params)} parameters, which are not those of its model"

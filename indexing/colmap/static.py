@@ -25,7 +25,7 @@ from indexing.colmap.pair_segmentation import (
     verify,
 )
 from indexing.colmap.voting import GRID_CELLS, DividedPair, Votes, vote
-from indexing.opening import count, listed
+from indexing.opening import count, listing
 
 IntArray = NDArray[np.int64]
 Told = Callable[[int, int], None]
@@ -188,12 +188,12 @@ def _result(
         held[pair.second].update(found.inliers[:, 1].tolist())
     refused = tuple(sorted(place for place in matched if len(held[place]) < options.min_static_points))
     names = [image.name for image in database.images]
-    few = f"fewer than {options.min_static_points} points stand still in {listed(names[place] for place in refused)}"
+    few = f"fewer than {options.min_static_points} points stand still in {listing(names[place] for place in refused)}"
     reason, notes = "", []
     if len(matched) - len(refused) < max(2, MIN_ANSWERED_SHARE * len(matched)):
         reason = f"{few}, {len(refused)} of {count(len(matched), 'image')}; add images, or matches of what stands still"
         if len(set(refused) & set(votes.open)) > len(refused) / 2:
-            where = listed(names[place] for place in votes.open)
+            where = listing(names[place] for place in votes.open)
             reason = (
                 f"what stands still is open: two bodies spread alike over {where}; add images in which more of the scene is seen"
             )

@@ -89,12 +89,12 @@ def _answer(graph: _Graph, seeds: IntArray, signs: IntArray) -> tuple[IntArray, 
         found.append((float(graph.spread(static).sum()), mine, static))
     found.sort(key=lambda answer: -answer[0])
     spread, best, static = found[0]
-    others = [other for other, _, also in found[1:] if _common(static, also) < graph.alike]
+    others = [other for other, _, also in found[1:] if _overlap_share(static, also) < graph.alike]
     before = float(graph.spread(graph.voted(signs) > 0).sum())  # of parts of the graph that were decided earlier
     return best, (spread - before) / max(max(others, default=0.0) - before, 1e-9) if others else np.inf
 
 
-def _common(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
+def _overlap_share(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
     either = int((first | second).sum())
     return int((first & second).sum()) / either if either else 1.0
 

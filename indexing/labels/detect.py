@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from indexing.labels.format import LabelFormat
-from indexing.opening import error, head_of, listed, parse_json, read_rows, read_text
+from indexing.opening import error, head_of, listing, parse_json, read_rows, read_text
 from indexing.registry import load_formats
 
 FOREIGN = (
@@ -59,5 +59,5 @@ def _parse(path: Path) -> tuple[str, Any]:
 
 def _describe(data: Any) -> str:
     if isinstance(data, dict):
-        return f"an object with {listed(data, 5)}" if data else "an empty object"
+        return f"an object with {listing(data, 5)}" if data else "an empty object"
     return "a list of no tasks" if isinstance(data, list) else f"a {type(data).__name__}"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from indexing.labels.label import NUM_NAMED, Label, LabelFile, in_order, list_spots
-from indexing.opening import clipped, count, error, shown
+from indexing.opening import clip_text, count, error, shown
 
 TIME_REMEDY = "give seconds"
 NUM_HEADER_ROWS = 80  # in which a table says what it is about, before it begins
@@ -174,7 +174,7 @@ def text_of(value: Any) -> str:
 
 def list_few(names: Iterable[object]) -> str:
     """The first names of a list, each short."""
-    listed = [clipped(name, 40) or "(unnamed)" for name in names]
+    listed = [clip_text(name, 40) or "(unnamed)" for name in names]
     return ", ".join(listed[:NUM_NAMED]) + f" and {len(listed) - NUM_NAMED} more" * (len(listed) > NUM_NAMED)
 
 

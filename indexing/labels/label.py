@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from indexing.opening import clipped, count
+from indexing.opening import clip_text, count
 
 MAX_OVERHANG_SECONDS = 0.1
 """That a label may reach beyond its recording without a word: players stop some frames before or after the last one."""
@@ -52,10 +52,10 @@ class Label:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.start) and math.isfinite(self.end)):
-            raise ValueError(f"label {clipped(self.label)!r}: start={self.start}, end={self.end}; give finite seconds")
+            raise ValueError(f"label {clip_text(self.label)!r}: start={self.start}, end={self.end}; give finite seconds")
         if self.end < self.start:
             said = f"ends at {self.end:g} s, but starts at {self.start:g} s"
-            raise ValueError(f"label {clipped(self.label)!r}: {said}; give start first")
+            raise ValueError(f"label {clip_text(self.label)!r}: {said}; give start first")
 
     @property
     def point(self) -> bool:
@@ -160,4 +160,4 @@ def list_spots(labels: Iterable[Label]) -> str:
 def describe_spot(label: Label) -> str:
     """A label for a notice, short."""
     when = f"{label.start:.6g}" if label.point else f"{label.start:.6g}-{label.end:.6g}"
-    return f"{clipped(label.label, 24) or '(no name)'} at {when} s"
+    return f"{clip_text(label.label, 24) or '(no name)'} at {when} s"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from urllib.parse import unquote
 
 from indexing.labels.format import Request
-from indexing.opening import error, listed
+from indexing.opening import error, listing
 
 SUFFIX = re.compile(r"\.\w{1,8}$")
 REMEDY = "name the recording as its video is named, or say which it is (--media NAME)"
@@ -49,7 +49,7 @@ def of_recording(names: Iterable[str], asked: Request) -> set[str] | None:
     if asked.media is not None:
         same = {name for name in known if name == asked.media} or {name for name in known if base_name(name) == asked.media}
         if not same:
-            said = f"has no labels of {asked.media}, only of {listed(known)}"
+            said = f"has no labels of {asked.media}, only of {listing(known)}"
             raise error(asked.path, said, "give one of these names (--media)")
         return same
     if asked.recording is None or not known:
@@ -58,10 +58,10 @@ def of_recording(names: Iterable[str], asked: Request) -> set[str] | None:
     best = max(ranks.values())
     if not best:
         own = base_name(str(asked.recording))
-        raise error(asked.path, f"its labels are of {listed(known)}, not of {own}", REMEDY)
+        raise error(asked.path, f"its labels are of {listing(known)}, not of {own}", REMEDY)
     found = [name for name in known if ranks[name] == best]
     if len(found) > 1:
-        raise error(asked.path, f"{base_name(str(asked.recording))} may be any of {listed(found)}", REMEDY)
+        raise error(asked.path, f"{base_name(str(asked.recording))} may be any of {listing(found)}", REMEDY)
     return set(found)
 
 

@@ -13,7 +13,7 @@ from indexing.labels.detect import detect, registered_formats
 from indexing.labels.format import Request, list_few
 from indexing.labels.label import Label, LabelFile
 from indexing.labels.media import of_recording
-from indexing.opening import count, error, listed, shown, uncollected
+from indexing.opening import count, error, listing, shown, without_garbage_collection
 
 
 def open_labels(
@@ -64,7 +64,7 @@ def open_labels(
     if fps is not None and not 0 < fps < math.inf:
         raise error(path, f"fps={shown(fps)} is no frame rate", "give frames per second, such as 29.97")
     asked = Request(Path(path), recording, media, observation, subject, tier, fps)
-    with uncollected():
+    with without_garbage_collection():
         detected, data = detect(asked.path)
         if format is not None and format != detected:
             said = f"is of the format {detected!r}, not {format!r}"
@@ -93,16 +93,16 @@ def choose_labels(found: LabelFile) -> LabelFile:
         names = [name for name in found.machine if any(name in (label.observation, label.tier) for label in labels)]
         verb = "--tier" if any(label.tier in names for label in labels) else "--observation"
         notices.append(
-            f"{count(len(labels) - len(people), 'label')} left out: a program found them ({listed(names)}); {verb} NAME reads them"
+            f"{count(len(labels) - len(people), 'label')} left out: a program found them ({listing(names)}); {verb} NAME reads them"
         )
         labels = people
     observations = list(dict.fromkeys(label.observation for label in labels))
     if len(observations) > 1:
-        said = f"has labels of {len(observations)} observations ({listed(observations)})"
+        said = f"has labels of {len(observations)} observations ({listing(observations)})"
         raise error(found.path, said, "choose one (--observation NAME)")
     tiers = list(dict.fromkeys(label.tier for label in labels))
     if len(tiers) > 1:
-        notices.append(f"labels of {len(tiers)} tiers are taken together ({listed(tiers)}); --tier NAME takes one")
+        notices.append(f"labels of {len(tiers)} tiers are taken together ({listing(tiers)}); --tier NAME takes one")
     return replace(found, labels=tuple(labels), notices=tuple(notices))
 
 
@@ -160,7 +160,7 @@ def _asked_for(found: LabelFile, asked: Request) -> LabelFile:
     ):
         if wanted is not None:
             if wanted not in known:
-                raise error(asked.path, f"has no {what} {shown(wanted)}, only {listed(known)}", f"give one of these (--{what})")
+                raise error(asked.path, f"has no {what} {shown(wanted)}, only {listing(known)}", f"give one of these (--{what})")
             labels = [label for label in labels if getattr(label, what) == wanted]
     mine = of_recording(found.media, asked)
     names = [name for name in (asked.observation, asked.tier) if name is not None]

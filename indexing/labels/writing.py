@@ -14,7 +14,7 @@ from indexing.labels.detect import registered_formats
 from indexing.labels.format import LabelFormat, Target
 from indexing.labels.label import Label
 from indexing.labels.media import base_name, same_recording
-from indexing.opening import count, error, is_regular, listed, shown
+from indexing.opening import count, error, is_regular, listing, shown
 
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".wav")
 """What annotation programs play."""
@@ -116,7 +116,7 @@ def _source(path: Path, into: str | Path | None, known: LabelFormat) -> Path | N
     """The file whose content is taken over, if any."""
     if into is not None and not known.program:
         kept = [suffix for each in registered_formats().values() if each.program for suffix in each.written.values()]
-        raise error(path, f"labels cannot be written beside those of {into}", f"write {listed(kept)}")
+        raise error(path, f"labels cannot be written beside those of {into}", f"write {listing(kept)}")
     if into is not None:
         return Path(into)
     return path if known.program and is_regular(path) else None

@@ -28,7 +28,7 @@ from indexing.modelfile import (
     skeleton_to_json,
     tensors_of,
 )
-from indexing.modelfile import whole as whole_number
+from indexing.modelfile import read_integer as whole_number
 from indexing.opening import shown
 from indexing.phase.frames import LEAST, images, query_frames
 from indexing.phase.learning import learn_model

@@ -13,7 +13,7 @@ from torch import Tensor
 from dyntorch import Fourier, Polynomial
 from indexing import scoring
 from indexing.action.bank import EPSILON, Windows, stack
-from indexing.modelfile import part, stored
+from indexing.modelfile import part, store
 from indexing.phase.frames import LEAST as FRAMES_LEAST
 from indexing.phase.frames import Learned, image_distance, normalize_frames, perspective_distance, shape_distance
 
@@ -67,9 +67,9 @@ class PhaseOptions:
 class Course:
     """The shapes of an action."""
 
-    shapes: Tensor = field(metadata=stored("real", None, "basis", "joints", 3))
+    shapes: Tensor = field(metadata=store("real", None, "basis", "joints", 3))
     periodic: bool
-    seen: Tensor = field(metadata=stored("truth", "joints"))
+    seen: Tensor = field(metadata=store("truth", "joints"))
 
     def bank(self, grid: int) -> Windows:
         """The shapes of all styles at all phases of the grid, style by style."""
@@ -187,10 +187,10 @@ class PhaseModel:
     """Training frames of all classes and the courses of their shapes."""
 
     bank: Windows = field(metadata=part(rows="frames", length=1))
-    label: Tensor = field(metadata=stored("every", "frames", below="classes"))
-    phase: Tensor = field(metadata=stored("real", "frames", least=0, most=1))
+    label: Tensor = field(metadata=store("every", "frames", below="classes"))
+    phase: Tensor = field(metadata=store("real", "frames", least=0, most=1))
     courses: tuple[Course, ...]
-    wrong: Tensor = field(metadata=stored("real", None))
+    wrong: Tensor = field(metadata=store("real", None))
     options: PhaseOptions
     camera: str = "affine"
 

@@ -226,6 +226,6 @@ class Store:
             )  # fmt: skip
 
 
-def clear(folder: Path) -> None:
+def remove_chunks(folder: Path) -> None:
     """Take a folder of finished pieces away."""
     shutil.rmtree(folder, ignore_errors=True)

@@ -18,7 +18,7 @@ from indexing.clip import Clip, ClipSet
 from indexing.files import prepare, recover_folder, replace_folder
 from indexing.opening import entries, error, is_regular, parse_json, read_text
 from indexing.pose.blazepose import Floats
-from indexing.pose.chunks import clear, content_of, nearest, plan
+from indexing.pose.chunks import content_of, nearest, plan, remove_chunks
 from indexing.pose.detection import (
     Detected,
     FrameProgress,
@@ -147,7 +147,7 @@ def keypoint_files(
             continue
         same, found = next(working)
         if isinstance(found, NobodyInVideo):
-            clear(_parts(target))
+            remove_chunks(_parts(target))
         made = found if isinstance(found, ValueError) else _write(same, found, target, json)
         with suppress(OSError):  # pieces that are kept for the next run stay
             _parts(target).rmdir()
@@ -214,7 +214,7 @@ def _write(task: VideoTask, found: Detected, target: Path, json: bool) -> Keypoi
     except ValueError as problem:
         return problem
     if task.parts is not None:
-        clear(task.parts)
+        remove_chunks(task.parts)
     return KeypointFile(target, folder if with_json else None, found.clips, False, found)
 
 

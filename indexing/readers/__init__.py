@@ -6,7 +6,7 @@ from collections.abc import Hashable
 from pathlib import Path
 
 from indexing.clip import Clip, ClipSet
-from indexing.opening import error, shown, uncollected
+from indexing.opening import error, shown, without_garbage_collection
 from indexing.readers.detect import detect, registered_formats
 from indexing.readers.files import Options, WatchOptions, open_source
 from indexing.readers.video import read_video
@@ -35,7 +35,7 @@ def read(
     )  # fmt: skip
     if format is not None and format not in FORMATS:
         raise ValueError(f"{path}: unknown format={shown(format)}; use one of {', '.join(FORMATS)}, or leave it out to detect it")
-    with uncollected():
+    with without_garbage_collection():
         source = open_source(path)
         name = format or detect(source)
         if name == "video":

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from indexing.opening import error, listed
+from indexing.opening import error, listing
 from indexing.readers.files import Format, Source
 from indexing.readers.hdf import opened_hdf5
 from indexing.registry import list_programs, load_formats
@@ -95,12 +95,12 @@ def _only_empty_lists(data: Any) -> bool:
 def _describe(kind: str, data: Any) -> str:
     """What was found, of a kind of file that several readers know."""
     if kind == "csv":
-        return f"text without keypoint columns that a reader knows (first row: {listed(data[0], 6)})"
+        return f"text without keypoint columns that a reader knows (first row: {listing(data[0], 6)})"
     if kind == "hdf5":
-        return f"HDF5 without keypoints that a reader knows (it has {listed(data.names(), 6)})"
+        return f"HDF5 without keypoints that a reader knows (it has {listing(data.names(), 6)})"
     shape = f"a {type(data).__name__}"
     if isinstance(data, dict):
-        shape = f"an object with {listed(data, 5)}"
+        shape = f"an object with {listing(data, 5)}"
     elif isinstance(data, list) and data and isinstance(data[0], dict):
-        shape = f"a list of objects with {listed(data[0], 5)}"
+        shape = f"a list of objects with {listing(data[0], 5)}"
     return f"JSON without keypoints that a reader knows ({shape})"

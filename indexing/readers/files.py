@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from indexing.clip import ClipSet, FloatArray, check_fps
-from indexing.opening import VALUE, clipped, entries, error, head_of, listed, parse_json, read_rows, read_text, shown, size_of
+from indexing.opening import VALUE, clip_text, entries, error, head_of, listing, parse_json, read_rows, read_text, shown, size_of
 from indexing.skeleton import layout_named
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
@@ -139,7 +139,7 @@ def _open_folder(folder: Path) -> Source:
             if number in numbered:
                 raise error(
                     folder,
-                    f"{clipped(numbered[number].name, VALUE)} and {clipped(file.name, VALUE)} are both frame {number}",
+                    f"{clip_text(numbered[number].name, VALUE)} and {clip_text(file.name, VALUE)} are both frame {number}",
                     "a folder holds one recording: put each recording in a folder of its own",
                 )
             numbered[number] = file
@@ -150,7 +150,7 @@ def _open_folder(folder: Path) -> Source:
     arrays = _arrays(folder, visible)
     if arrays:
         return Source(folder, "npy folder", arrays)
-    inside = listed((entry.name for entry in visible), 5) if visible else "nothing"
+    inside = listing((entry.name for entry in visible), 5) if visible else "nothing"
     raise error(folder, f"the folder has no .json or .txt keypoint files (it has {inside})", "give the folder of one recording")
 
 

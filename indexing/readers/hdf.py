@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import LARGEST, VALUE, clipped, error, listed, opened, shown, size_of
+from indexing.opening import LARGEST, VALUE, clip_text, error, listing, opened, shown, size_of
 
 HEAP = b"GCOL\x01\0\0\0"
 AGAIN = "export or copy it again"
@@ -73,7 +73,7 @@ class Hdf5:
         there = data.dtype.names or ()
         missing = [field for field in fields if field not in there]
         if missing or data.ndim != 1:
-            raise error(self.path, f"{shown(name)} has no field {shown((missing or fields)[0])} (it has {listed(there)})", AGAIN)
+            raise error(self.path, f"{shown(name)} has no field {shown((missing or fields)[0])} (it has {listing(there)})", AGAIN)
         kinds = {field: data.dtype[field].base.kind for field in fields}
         odd = [field for field, kind in kinds.items() if kind not in "biufS"]
         if odd:
@@ -134,7 +134,7 @@ class Hdf5:
         """A dataset that is what it says."""
         found = self._guard(lambda: self._handle[name] if self._hard(name) else None, name)
         if found is None or not hasattr(found, "shape"):
-            raise error(self.path, f"has no dataset {shown(name)} (it has {listed(self.names())})", AGAIN)
+            raise error(self.path, f"has no dataset {shown(name)} (it has {listing(self.names())})", AGAIN)
 
         def elsewhere() -> bool:
             return bool(found.external) or bool(found.is_virtual)
@@ -165,7 +165,7 @@ class Hdf5:
         except DAMAGED as problem:
             if type(problem) is ValueError and str(self.path) in str(problem):
                 raise
-            said = f"{shown(name)} cannot be read ({clipped(problem, VALUE)}; the file may be truncated)"
+            said = f"{shown(name)} cannot be read ({clip_text(problem, VALUE)}; the file may be truncated)"
             raise error(self.path, said, AGAIN) from None
 
 
@@ -181,7 +181,7 @@ def opened_hdf5(path: Path) -> Iterator[Hdf5]:
     try:
         handle = h5py.File(path, "r", locking=False)
     except DAMAGED as problem:
-        said = f"cannot be read as HDF5 ({clipped(problem, VALUE)}; the file may be truncated)"
+        said = f"cannot be read as HDF5 ({clip_text(problem, VALUE)}; the file may be truncated)"
         raise error(path, said, AGAIN) from None
     try:
         yield Hdf5(path, handle, size)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from indexing.opening import VALUE, clipped, error, head_of, shown
+from indexing.opening import VALUE, clip_text, error, head_of, shown
 from indexing.readers import c3d, ply, points
 from indexing.readers.points import BoolArray, FloatArray, PointSequence, PointSet
 
@@ -145,7 +145,7 @@ def _by_name(views: Several[PointSet], names: tuple[str, ...]) -> Matched:
     if lost:
         more = f" and {len(lost) - SHOWN} more" if len(lost) > SHOWN else ""
         left = "name is not in every view and was" if len(lost) == 1 else "names are not in every view and were"
-        notes.append(f"{len(lost)} {left} left out: {', '.join(clipped(name, VALUE) for name in lost[:SHOWN])}{more}")
+        notes.append(f"{len(lost)} {left} left out: {', '.join(clip_text(name, VALUE) for name in lost[:SHOWN])}{more}")
     order = [np.array([place[name] for name in shared]) for place in places]
     sorted_views = [
         PointSet(

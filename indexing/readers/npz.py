@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import VALUE, clipped, error, opened, shown, size_of
+from indexing.opening import VALUE, clip_text, error, opened, shown, size_of
 
 Array = NDArray[Any]
 Take = Callable[[int], bytes]
@@ -68,7 +68,7 @@ class NumpyArchive(Mapping[str, Array]):
         try:
             self._zip = zipfile.ZipFile(path)
         except DAMAGED as problem:
-            said = f"cannot be read as numpy data: it is not an .npz file ({clipped(problem, VALUE)}; the file may be truncated)"
+            said = f"cannot be read as numpy data: it is not an .npz file ({clip_text(problem, VALUE)}; the file may be truncated)"
             raise error(path, said, "write or copy it again") from None
         self._members = {info.filename.removesuffix(".npy"): info for info in self._zip.infolist()}
 
@@ -110,7 +110,7 @@ class NumpyArchive(Mapping[str, Array]):
             try:
                 return read()
             except DAMAGED as problem:
-                said = f"{where} cannot be read ({clipped(problem, VALUE)}; the file may be truncated)"
+                said = f"{where} cannot be read ({clip_text(problem, VALUE)}; the file may be truncated)"
                 raise error(self.path, said, "write or copy it again") from None
 
         stream = guarded(lambda: self._zip.open(info))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import VALUE, clipped, error, listed, repeated, shown, size_of
+from indexing.opening import VALUE, clip_text, error, first_duplicate, listing, shown, size_of
 from indexing.readers import points
 from indexing.readers.matches import opening
 from indexing.readers.npz import NumpyArchive, read_npy
@@ -100,7 +100,7 @@ def _archive(path: Path, pair: str | None) -> MatchedPair:
             if kind != "wh" and extra[kind].shape != (len(x1),):
                 raise error(path, f"{name} has shape {extra[kind].shape}, {before}x1 has {len(x1)} rows", "give one per match")
     ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
-    twice = repeated(ids or ())
+    twice = first_duplicate(ids or ())
     if twice is not None:
         raise error(
             path, f"{before}ids: {shown(twice)} names several matches", "give each match a name of its own, or leave ids out"
@@ -111,19 +111,19 @@ def _archive(path: Path, pair: str | None) -> MatchedPair:
 def _select_prefix(path: Path, names: list[str], pair: str | None) -> str:
     """What the names of the arrays of the pair begin with."""
     several = [name.removesuffix("x1") for name in names if name.endswith("/x1")]
-    pairs = listed(name.rstrip("/") for name in several)
+    pairs = listing(name.rstrip("/") for name in several)
     if pair is not None and f"{pair}/x1" not in names and (several or "x1" in names):
         raise error(
             path, f"has no pair {shown(pair)}", f"its pairs are {pairs}" if several else "it holds one pair: leave --pair out"
         )
     if pair is None and "x1" not in names and len(several) > 1:
-        raise error(path, f"holds {len(several)} pairs ({pairs})", f"say which: --pair {clipped(several[0].rstrip('/'), VALUE)}")
+        raise error(path, f"holds {len(several)} pairs ({pairs})", f"say which: --pair {clip_text(several[0].rstrip('/'), VALUE)}")
     before = f"{pair}/" if pair is not None else "" if "x1" in names or not several else several[0]
     missing = next((before + name for name in ("x1", "x2") if before + name not in names), None)
     if missing is not None:
         tracks = not several and any(name.rpartition("/")[2] in TRACKS for name in names)
         remedy = FRAMES if tracks else KEYS
-        raise error(path, f"has no {missing} (its arrays are {listed(names)})", remedy)
+        raise error(path, f"has no {missing} (its arrays are {listing(names)})", remedy)
     return before
 
 
@@ -165,12 +165,12 @@ def _table(path: Path) -> MatchedPair:
         names, rows = [cell.strip().lower() for cell in rows[0][1]], rows[1:]
     absent = [name for name in COLUMNS if name not in names]
     if absent:
-        said = f"has no column {shown(absent[0])} (its columns are {listed(names)})"
+        said = f"has no column {shown(absent[0])} (its columns are {listing(names)})"
         raise error(path, said, "name the columns x1,y1,x2,y2 (and perhaps id, weight, label)")
     if not rows:
         raise error(path, "the file has a header but no rows", "export it again")
     points.check_widths(path, rows, names)
-    twice = repeated(name for name in names if name in (*COLUMNS, *IDS, *points.WEIGHTS, *KNOWN))
+    twice = first_duplicate(name for name in names if name in (*COLUMNS, *IDS, *points.WEIGHTS, *KNOWN))
     if twice is not None:
         raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
     values = points.column_values(path, rows, names, COLUMNS)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import LARGEST, VALUE, clipped, error, read_bytes, shown
+from indexing.opening import LARGEST, VALUE, clip_text, error, read_bytes, shown
 
 REMEDY = "save it again with nothing in it but numpy arrays of numbers, text, lists and dictionaries"
 # steps of pickles by their names: containers, numbers, text, bytes, the memo, and calls of the names below
@@ -170,7 +170,7 @@ class _Reader(pickle._Unpickler):
         """A stand-in, whatever the file names."""
         found = self._known.get((module.replace("__builtin__", "builtins"), name))
         if found is None:
-            raise Refused(f"the name {clipped(f'{module}.{name}', VALUE)}")
+            raise Refused(f"the name {clip_text(f'{module}.{name}', VALUE)}")
         return found
 
     def persistent_load(self, pid: Any) -> Any:
@@ -233,7 +233,7 @@ def _fill(into: Any, items: list[Any]) -> None:
         raise Refused("keys and values without a dictionary")
     for key, value in zip(items[::2], items[1::2], strict=True):
         if type(key) not in KEYS:
-            raise Refused(f"a key of the type {clipped(type(key).__name__, VALUE)}")
+            raise Refused(f"a key of the type {clip_text(type(key).__name__, VALUE)}")
         if type(key) is int and abs(key) > WHOLE:
             raise Refused(f"the key {shown(key)}")
         if type(key) in (int, float) and len(into) >= NUMBERED_BLOCK:
@@ -282,7 +282,7 @@ def unpickle_bytes(path: Path, data: bytes, where: str) -> Any:
     except Refused as refused:
         raise error(path, f"{who} holds {refused}, which is not read from a file", REMEDY) from None
     except Exception as problem:  # a program that does not run fails in as many ways as there are steps
-        said = clipped(f"{type(problem).__name__}: {problem}", VALUE)
+        said = clip_text(f"{type(problem).__name__}: {problem}", VALUE)
         raise error(path, f"{who} cannot be read ({said}; the file may be truncated)", REMEDY) from None
 
 

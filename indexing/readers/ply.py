@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from indexing.opening import error, listed, read_bytes, repeated, shown
+from indexing.opening import error, first_duplicate, listing, read_bytes, shown
 from indexing.readers.points import FloatArray, PointSet, as_view
 
 TYPES = {
@@ -44,7 +44,7 @@ def read(path: Path) -> PointSet:
     names = [name for name, _ in kinds]
     missing = [name for name in "xyz" if name not in names]
     if missing:
-        raise error(path, f"its vertices have no property {shown(missing[0])} (they have {listed(names)})", "export x, y, z")
+        raise error(path, f"its vertices have no property {shown(missing[0])} (they have {listing(names)})", "export x, y, z")
     if not element.rows:
         raise error(path, "has no vertices", "export a point cloud")
     read_rows = _text if order == "" else _binary
@@ -52,7 +52,7 @@ def read(path: Path) -> PointSet:
     ids = None
     if "id" in columns:
         ids = tuple(f"{value:g}" for value in columns["id"])
-        twice = repeated(ids)
+        twice = first_duplicate(ids)
         if twice is not None:
             raise error(path, f"property 'id': {twice} names several vertices", "give each vertex an id of its own")
     return PointSet(str(path), as_view(np.stack([columns[name] for name in "xyz"], axis=-1), path), ids)

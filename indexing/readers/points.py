@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import Row, error, listed, repeated, shown
+from indexing.opening import Row, error, first_duplicate, listing, shown
 from indexing.opening import read_rows as rows_of
 from indexing.readers.npz import NumpyArchive
 from indexing.readers.npz import read_npy as read_npy_file
@@ -114,8 +114,8 @@ def read(path: Path) -> PointSet:
     check_widths(path, rows, names)
     columns = next((shape for shape in SHAPES if set(shape) <= set(names)), None)
     if columns is None:
-        raise error(path, f"its columns are {listed(names)}", EXPECTED)
-    twice = repeated(name for name in names if name in (*columns, *IDS))
+        raise error(path, f"its columns are {listing(names)}", EXPECTED)
+    twice = first_duplicate(name for name in names if name in (*columns, *IDS))
     if twice is not None:
         raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
     values = column_values(path, rows, names, columns)
@@ -231,7 +231,7 @@ def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
     names = list(archive)
     prefix = next((prefix for prefix in ("x", "P", "l") if f"{prefix}1" in names), None)
     if prefix is None:
-        raise error(path, f"its arrays are {listed(names)}", KEYS)
+        raise error(path, f"its arrays are {listing(names)}", KEYS)
     unknown = [name for name in names if name not in EXTRA and not (name[:1] == prefix and name[1:] in ("1", "2", "3"))]
     if unknown:
         raise error(path, f"has an array {shown(unknown[0])}, which is not known", KEYS)

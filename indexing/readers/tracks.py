@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import VALUE, Row, check_dense, clipped, error, head_of, is_regular, listed, shown, size_of
+from indexing.opening import VALUE, Row, check_dense, clip_text, error, head_of, is_regular, listing, shown, size_of
 from indexing.readers.matches import open_points
 from indexing.readers.npz import NumpyArchive, read_npy
 from indexing.readers.points import (
@@ -138,7 +138,7 @@ def check_headings(path: Path) -> None:
     if not names and read_rows(path):
         raise error(path, "row 1 holds numbers, and no row names the columns", EXPECTED)
     if names and not ({"x", "y"} <= set(names) or {"x1", "y1"} <= set(names)):
-        raise error(path, f"its columns are {listed(names)}", EXPECTED)
+        raise error(path, f"its columns are {listing(names)}", EXPECTED)
 
 
 def read_long(path: Path) -> TrackSet:
@@ -149,7 +149,7 @@ def read_long(path: Path) -> TrackSet:
     check_widths(path, rows, names)
     point = next((names.index(name) for name in IDS if name in names), None)
     if point is None:
-        raise error(path, f"no column names the points (its columns are {listed(names)})", EXPECTED)
+        raise error(path, f"no column names the points (its columns are {listing(names)})", EXPECTED)
     timed = next((name for name in TIMES if name in names), None)
     viewed = next((name for name in VIEWS if name in names), timed)
     assert viewed is not None  # is_long
@@ -158,7 +158,7 @@ def read_long(path: Path) -> TrackSet:
     place = _present(path, rows, names, viewed)
     moments, views = np.unique(place, return_inverse=True)
     ids: dict[str, int] = {}
-    columns = np.array([ids.setdefault(_named(path, line, cells[point], names[point]), len(ids)) for line, cells in rows])
+    columns = np.array([ids.setdefault(_point_name(path, line, cells[point], names[point]), len(ids)) for line, cells in rows])
     _once(path, rows, names[point], views, columns, moments)
     shape = (len(moments), len(ids))
     same = "give a point the same name, and a frame the same number, in all of its rows"
@@ -182,7 +182,7 @@ def _present(path: Path, rows: Sequence[Row], names: Sequence[str], column: str)
     return found
 
 
-def _named(path: Path, line: int, cell: str, column: str) -> str:
+def _point_name(path: Path, line: int, cell: str, column: str) -> str:
     if not cell.strip():
         raise error(path, f"row {line}, column {shown(column)}: is empty", "name the point")
     return cell.strip()
@@ -196,7 +196,7 @@ def _once(path: Path, rows: Sequence[Row], point: str, views: IntArray, columns:
             said = f"row {line}: point {column + 1} of the file {again}"
             raise error(
                 path,
-                f"{said} (row: {clipped(', '.join(cells), VALUE)})",
+                f"{said} (row: {clip_text(', '.join(cells), VALUE)})",
                 f"give each point one row per frame; column {shown(point)} names it",
             )
         before[view, column] = line
@@ -294,18 +294,18 @@ def _select_prefix(path: Path, names: list[str], key: str | None) -> tuple[str, 
     if key is not None and key in names:
         return "", key
     if key is not None and key not in several:
-        known = f"its sequences are {listed(several)}" if several else f"its arrays are {listed(names)}"
+        known = f"its sequences are {listing(several)}" if several else f"its arrays are {listing(names)}"
         raise error(path, f"has no {'sequence' if several else 'array'} {shown(key)}", known)
     if key is None and several:
         raise error(
-            path, f"holds {len(several)} sequences ({listed(several, 4)})", f"say which: --key {clipped(several[0], VALUE)}"
+            path, f"holds {len(several)} sequences ({listing(several, 4)})", f"say which: --key {clip_text(several[0], VALUE)}"
         )
     before = "" if key is None else f"{key}/"
     name = next((f"{before}{kind}" for kind in ("tracks", "y") if f"{before}{kind}" in names), None)
     if name is None:
         others = [other for other in names if other not in EXTRA]
-        choice = f"; or say which array has the tracks: --key {clipped(others[0], VALUE)}" if others else ""
-        raise error(path, f"its arrays are {listed(names)}", KEYS + choice)
+        choice = f"; or say which array has the tracks: --key {clip_text(others[0], VALUE)}" if others else ""
+        raise error(path, f"its arrays are {listing(names)}", KEYS + choice)
     return before, name
 
 
@@ -334,7 +334,7 @@ def read_tracks(
         found = found.select(frames)
     if len(found.views) < 2:
         raise error(found.path, f"holds {len(found.views)} view", FORMATS)
-    return found if static is None else replace(found, static=_marked(static.expanduser(), found.ids))
+    return found if static is None else replace(found, static=_static_points(static.expanduser(), found.ids))
 
 
 def _read(files: Sequence[Path], key: str | None) -> TrackSet:
@@ -423,7 +423,7 @@ def _match_views(views: Sequence[PointSet]) -> TrackSet:
     )  # fmt: skip
 
 
-def _marked(path: Path, ids: Sequence[str]) -> BoolArray:
+def _static_points(path: Path, ids: Sequence[str]) -> BoolArray:
     """Points that a file names: those of the column ``id``, or of its only column."""
     size_of(path, "check the path; --static is a CSV with a column id")
     rows = read_rows(path)
@@ -439,5 +439,5 @@ def _marked(path: Path, ids: Sequence[str]) -> BoolArray:
     named = {cells[column].strip(): line for i, (line, cells) in enumerate(rows) if marks is None or marks[i]}
     stranger = next((name for name in named if name not in set(ids)), None)
     if stranger is not None:
-        raise error(path, f"row {named[stranger]}: no track is named {shown(stranger)}", f"the tracks are {listed(ids, 4)}")
+        raise error(path, f"row {named[stranger]}: no track is named {shown(stranger)}", f"the tracks are {listing(ids, 4)}")
     return np.array([name in named for name in ids])

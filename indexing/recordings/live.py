@@ -30,7 +30,7 @@ from indexing.recordings.evidence import DURATION_REACH, MAX_TEMPO_FACTOR, MIN_C
 from indexing.recordings.tiling import TiledSegment, best_tiling, posterior
 from indexing.scoring import Event, event_levels
 from indexing.skeleton import Skeleton
-from indexing.windows import Ragged, mended, ragged
+from indexing.windows import Ragged, ragged, repair_clip
 
 # of the usual duration of the longest action, looked at after a moment before it is decided; of half of it long actions are missed
 BLOCK_SECONDS = 0.5  # of frames that a stream looks at together: a part of its lag, and the fewer the more it costs
@@ -275,7 +275,7 @@ class ActionStream:
         near = Clip(self._raw[begin:frames], times=self._at[begin:frames])
         if self.source.repair:  # judged with the frames before and after them
             fresh = int(np.searchsorted(self._at, since))
-            self._good[fresh:frames] = mended(near).joints[fresh - begin :]
+            self._good[fresh:frames] = repair_clip(near).joints[fresh - begin :]
             near = near.replace(joints=self._good[begin:frames])
         middle = (first + np.arange(count) + 0.5) * self._step
         own = np.zeros(count, dtype=np.intp)

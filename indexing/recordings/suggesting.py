@@ -33,7 +33,7 @@ from indexing.action.stream import motion_levels, motion_of
 from indexing.clip import Clip, stretches
 from indexing.recordings.evidence import Durations
 from indexing.scoring import probabilities
-from indexing.windows import mended, ragged, sample
+from indexing.windows import ragged, repair_clip, sample
 
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
@@ -161,7 +161,7 @@ def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span]) -> Re
     spans = spans[[_share(span, labelled) < MAX_LABELLED_SHARE for span in spans.tolist()]]
     if not len(spans):
         return None
-    source = ragged([mended(image) if indexer.repair else image])
+    source = ragged([repair_clip(image) if indexer.repair else image])
     nobody = np.zeros(len(spans), dtype=np.intp)
     values = sample(source, nobody, spans[:, 0] - begin, spans[:, 1] - begin, indexer.length)
     windows = Windows(values, torch.from_numpy(source.seen[nobody]))

@@ -57,15 +57,16 @@ def write_agreement(folder: str | Path, report: AgreementReport) -> Path:
     sides = f"seconds known ({report.sides[0]})", f"seconds found ({report.sides[1]})"
     drawn_confusion = pictures.confusion(both.seconds.round(1), names, sides)
     values: dict[str, Any] = {
-        "summary": described(report),
+        "summary": describe_agreement(report),
         "cards": _cards(both),
         "notes": [("", "", note) for note in report.notes],
         "timelines": [
-            (called(span), Picture(png, tips=_tips(span)[:TIPS])) for span, png in zip(report.spans, drawn.values(), strict=False)
+            (span_name(span), Picture(png, tips=_tips(span)[:TIPS]))
+            for span, png in zip(report.spans, drawn.values(), strict=False)
         ],
         "hidden": len(report.spans) - len(drawn),
         "spans": [
-            [called(span), duration(one.compared), _share(one.agreement), _number(one.kappa), _number(_last(one).f1)]
+            [span_name(span), duration(one.compared), _share(one.agreement), _number(one.kappa), _number(_last(one).f1)]
             for span, one in each
         ],
         "heads": [(f"F1 at {overlap:g}", "number") for overlap in both.segments],
@@ -90,7 +91,7 @@ def write_agreement(folder: str | Path, report: AgreementReport) -> Path:
     return write_files(folder, contents)
 
 
-def described(report: AgreementReport) -> str:
+def describe_agreement(report: AgreementReport) -> str:
     """The result in plain words."""
     both = report.agreement
     known, found = report.sides
@@ -134,7 +135,7 @@ def confusion_csv(both: Agreement) -> str:
     return table_csv(["known \\ found", *map(cell, names)], rows)
 
 
-def called(span: ComparedSpan) -> str:
+def span_name(span: ComparedSpan) -> str:
     """A recording, and the person where there are several."""
     return f"{span.name}, person {span.person}" if span.person else span.name
 

@@ -308,7 +308,7 @@ def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
     if report.photographs:
         boxes = [(-0.5, wide - 0.5, -0.5, tall - 0.5) for wide, tall in (one.size for one in report.photographs)]
     elif report.solved:
-        boxes[0] = _widened(boxes[0], report, kinds, axes_shown)
+        boxes[0] = _widen_box(boxes[0], report, kinds, axes_shown)
     with style(theme):
         height, places = _layout([(box[3] - box[2]) / (box[1] - box[0]) for box in boxes])
         figure = new_figure(WIDTH, height)
@@ -377,10 +377,10 @@ def _box(points: FloatArray, kinds: NDArray[Any]) -> Box:
     return float(low[0] - room), float(high[0] + room), float(low[1] - room), float(high[1] + room)
 
 
-def _widened(box: Box, report: AlignmentReport, kinds: NDArray[Any], shown: list[int]) -> Box:
+def _widen_box(box: Box, report: AlignmentReport, kinds: NDArray[Any], shown: list[int]) -> Box:
     """The box of view 1 with the paths of what moves in it, as far as they do not lead far away."""
     found = [
-        carried(matrix, view[kinds == "moving"])[..., shown].reshape(-1, 2)
+        transform_points(matrix, view[kinds == "moving"])[..., shown].reshape(-1, 2)
         for view, matrix in zip(report.views[1:], report.motion, strict=True)
         if view.shape[-1] + 1 == matrix.shape[-1]
     ]
@@ -408,7 +408,7 @@ def as_segments(lines: FloatArray) -> FloatArray:
     return out
 
 
-def carried(matrix: FloatArray, points: FloatArray) -> FloatArray:
+def transform_points(matrix: FloatArray, points: FloatArray) -> FloatArray:
     """Points ``(..., d)`` moved by a collineation."""
     moved = points @ matrix[:-1, :-1].T + matrix[:-1, -1]
     last = points @ matrix[-1, :-1] + matrix[-1, -1]
@@ -425,7 +425,7 @@ def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown:
     if not all(fits):
         return
     moving = np.flatnonzero(kinds == "moving")[:PATHS]
-    others = [carried(matrix, view[moving]) for view, matrix in zip(report.views[1:], report.motion, strict=True)]
+    others = [transform_points(matrix, view[moving]) for view, matrix in zip(report.views[1:], report.motion, strict=True)]
     if report.segments:  # lines: where view 2 saw them, dashed
         panel.add_collection(
             LineCollection(list(others[0][..., shown]), colors=colour, linewidths=0.9, alpha=0.55, linestyles=(0, (3, 2)))

@@ -96,7 +96,7 @@ def write_search(folder: str | Path, report: SearchReport) -> Path:
         for number, (hit, score) in enumerate(zip(report.hits[:ROWS], scores, strict=True), 1)
     ][len(rows) :]
     html = render(
-        "hits", report, summary=_search_words(report, measured), cards=_search_cards(report, measured), notes=_noted(report),
+        "hits", report, summary=_search_words(report, measured), cards=_search_cards(report, measured), notes=_notes_of(report),
         query=strip(report.query, frames=8, alt="Key frames of the query") or none("no joint seen"),
         rows=rows, rest=rest, unlisted=max(0, len(report.hits) - ROWS), sides=_sides(rows),
     )  # fmt: skip
@@ -107,11 +107,11 @@ def write_finds(folder: str | Path, report: FindReport) -> Path:
     """Write where actions were found: ``report.html``, ``events.csv``, ``metrics.json`` and ``manifest.json``."""
     measured = measure_finds(report)
     paint = colours([*report.classes, *(event.label for event in report.events)])
-    played = _played(report)
+    played = _event_players(report)
     actions = _actions(report)
     html = render(
-        "finds", report, summary=_find_words(report, measured), cards=_find_cards(measured), notes=_noted(report), actions=actions,
-        counts=_count_rows(report), found=_recording_rows(report, paint), FIRST=FIRST, paint=paint, played=played,
+        "finds", report, summary=_find_words(report, measured), cards=_find_cards(measured), notes=_notes_of(report),
+        actions=actions, counts=_count_rows(report), found=_recording_rows(report, paint), FIRST=FIRST, paint=paint, played=played,
         script=Script("player.js") if played else None, unlisted=max(0, measured["recordings_with_events"] - LISTED),
         sides=any(_sides(rows) for one in actions for _, rows in one["groups"]),
     )  # fmt: skip
@@ -184,7 +184,7 @@ def _write(folder: str | Path, manifest: Mapping[str, Any], contents: dict[str, 
     return write_files(where, {**contents, files.MANIFEST: {**manifest, "files": names}, "report.html": page})
 
 
-def _noted(report: SearchReport | FindReport) -> list[tuple[str, str, str]]:
+def _notes_of(report: SearchReport | FindReport) -> list[tuple[str, str, str]]:
     return [("", "", note) for note in report.notes]
 
 
@@ -222,7 +222,7 @@ def frames_of(seconds: float) -> int:
     return min(max(round(seconds * rate), least), most)
 
 
-def film(drawing: str, seconds: float, mirrored: bool = False) -> Any:
+def hover_strip(drawing: str, seconds: float, mirrored: bool = False) -> Any:
     """A strip as a film that plays when its row is pointed at: the strip slides by behind a window of one frame."""
     found = re.search(r'viewBox="0 0 ([\d.]+) ', drawing)
     if found is None:
@@ -258,7 +258,7 @@ class _Drawing:
         moving = strip(clip, found.start, found.end, frames=frames_of(seconds))
         pair = markup(
             '<span class="pair" tabindex="0" role="img" aria-label="{what}, played beside what it resembles">{one}{other}</span>',
-            what=what, one=film(model, seconds, getattr(found, "mirrored", False)), other=film(moving, seconds),
+            what=what, one=hover_strip(model, seconds, getattr(found, "mirrored", False)), other=hover_strip(moving, seconds),
         )  # fmt: skip
         self.weight += len(drawn) + len(pair)
         return [drawn, pair]
@@ -356,7 +356,7 @@ def _actions(report: FindReport) -> list[dict[str, Any]]:
     out = []
     for label, events in found.items():
         groups = []
-        for title, some in _chosen(events, room):
+        for title, some in _select_events(events, room):
             rows = list(_event_rows(report, drawing, some))
             if rows:
                 groups.append((title, rows))
@@ -365,7 +365,7 @@ def _actions(report: FindReport) -> list[dict[str, Any]]:
     return out
 
 
-def _chosen(events: Sequence[ArchivedEvent], room: int) -> list[tuple[str, list[ArchivedEvent]]]:
+def _select_events(events: Sequence[ArchivedEvent], room: int) -> list[tuple[str, list[ArchivedEvent]]]:
     """All events, surest first, where they fit; else the surest, and those of the least margin."""
     ordered = sorted(events, key=lambda event: -event.score)
     if len(ordered) <= room:
@@ -433,7 +433,7 @@ def marks(events: Sequence[ArchivedEvent], start: float, end: float, paint: Mapp
     )
 
 
-def _played(report: FindReport) -> list[dict[str, Any]]:
+def _event_players(report: FindReport) -> list[dict[str, Any]]:
     """Players of the recordings with finds, where they are few and short enough for a page."""
     found = {event.source for event in report.events}
     some = [one for one in report.recordings if one.source in found]

@@ -132,7 +132,7 @@ class BodiesReport(LabelledReport):
         return np.maximum(1.0, np.abs(np.diff([float(name) for name in numbers])))
 
 
-def standing(report: BodiesReport) -> str:
+def static_text(report: BodiesReport) -> str:
     """Which body stands still, in a sentence."""
     if report.static:
         return f"body {report.static} stands still"
@@ -149,7 +149,7 @@ def describe(report: BodiesReport) -> str:
     moved = f"{number - counts['outlier']:,} move "
     moved += f"with one of {report.bodies} bodies ({', '.join(most)} and {last})" if most else "as one body"
     rest = f"; {count(counts['outlier'], 'fits', 'fit')} none" * (counts["outlier"] > 0)
-    still = f" {sentence(standing(report))}" if most else ""
+    still = f" {sentence(static_text(report))}" if most else ""
     return f"Of {number:,} tracks through {frames:,} frames, {moved}{rest}.{still}"
 
 
@@ -192,7 +192,13 @@ def summarize(report: BodiesReport) -> Summary:
 def write_bodies(folder: str | Path, report: BodiesReport) -> Path:
     """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
     doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
-    values = {"doubtful": doubtful, "share": share, "standing": standing(report), "rms": report.rms_text(), "film": FILM}
+    values = {
+        "doubtful": doubtful,
+        "share": share,
+        "standing": static_text(report),
+        "rms": report.rms_text(),
+        "film": FILM,
+    }
     return write_summary(folder, "bodies", report, summarize(report), **values, **_tables(report))
 
 
@@ -318,14 +324,14 @@ def picture_of(report: BodiesReport, theme: Theme = LIGHT) -> bytes:
             if photograph is not None:
                 draw_photograph(panel, photograph, theme)
             _draw(panel, report, view, theme)
-            finish(panel, *box, True, shorten(_named(report, view), 60))
+            finish(panel, *box, True, shorten(_view_name(report, view), 60))
             if photograph is not None:
                 panel.set(xticks=[], yticks=[])
         foot(figure, _handles(report, theme), columns=6, ink=theme.ink)
         return png(figure, tight=True)
 
 
-def _named(report: BodiesReport, view: int) -> str:
+def _view_name(report: BodiesReport, view: int) -> str:
     name, times = report.tracks.views[view], report.tracks.times
     if report.tracks.by_time:
         return f"{name} s"

@@ -237,7 +237,7 @@ def page(report: CalibrationReport, plan: bytes | None, heat: bytes | None, name
     rig = report.rig
     data, drawn = scene(rig)
     values: dict[str, Any] = {
-        "rig": rig, "cards": cards(report), "noted": noted(report), "data": data, "drawn": drawn,
+        "rig": rig, "cards": cards(report), "noted": calibration_notes(report), "data": data, "drawn": drawn,
         "script": Script("rig.js") if data else None,
         "plan": Picture(plan) if plan else None, "heat": Picture(heat) if heat else None,
         "camera_rows": camera_rows(report), "clock_rows": clock_rows(report), "residual_rows": residual_rows(report),
@@ -317,7 +317,7 @@ def _scale(rig: CameraRig) -> str:
     return "by known lengths"
 
 
-def noted(report: CalibrationReport) -> list[tuple[str, str, str]]:
+def calibration_notes(report: CalibrationReport) -> list[tuple[str, str, str]]:
     """What a reader should note, as of :func:`indexing.report.page.remarks`; names of cameras keep their letters."""
     names = tuple(report.rig.names)
     said = [note[:1] * note.startswith(names) + sentence(note)[note.startswith(names) :] for note in report.notes]

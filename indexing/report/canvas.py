@@ -18,7 +18,7 @@ from indexing.cameras import y_up
 from indexing.clip import Clip
 from indexing.readers.pairs import Photograph
 from indexing.report.page import markup
-from indexing.skeleton import known
+from indexing.skeleton import usual_layout
 
 DPI = 150
 FADE = (0.62, 0.78)  # how much of white and of dark paper is laid over a photograph
@@ -162,7 +162,7 @@ def strip(clip: Clip, start: float | None = None, end: float | None = None, *, f
         return ""
     points, seen = points[drawn], seen[drawn]
     points[..., 0] -= np.array([np.median(frame[ok, 0]) for frame, ok in zip(points, seen, strict=True)])[:, None]
-    seen &= ~(_stray(points[..., 0]) | _stray(points[..., 1]))  # they would shrink the person to a dot
+    seen &= ~(_is_outlier(points[..., 0]) | _is_outlier(points[..., 1]))  # they would shrink the person to a dot
     bounds = [(points[..., axis][seen].min(), points[..., axis][seen].max()) for axis in (0, 1)]
     extent = max((bounds[0][1] - bounds[0][0]) / (WIDTH - 6), (bounds[1][1] - bounds[1][0]) / (HEIGHT - 8))
     scale = 1.0 / extent if extent > 0 else 1.0
@@ -189,7 +189,7 @@ def _right(clip: Clip, at: NDArray[np.intp]) -> NDArray[Any]:
 
 def _paths(clip: Clip, places: NDArray[np.float64], seen: NDArray[np.bool_]) -> dict[str, str]:
     """SVG path data by CSS class: left limbs, right limbs, the middle, and dots for joints without bones."""
-    skeleton = clip.skeleton or known(clip.joints.shape[1])
+    skeleton = clip.skeleton or usual_layout(clip.joints.shape[1])
     bones = skeleton.bones if skeleton is not None else ()
     sides = [side_of(name) for name in skeleton.joints] if skeleton is not None else []
     face = [words_of(name) & FACE != set() for name in skeleton.joints] if skeleton is not None else []
@@ -230,7 +230,7 @@ def side_of(name: str) -> str:
     return "l" if found & {"left", "l"} else "r" if found & {"right", "r"} else "m"
 
 
-def _stray(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_outlier(values: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which coordinates lie so far from all others that they are a detector's mistake: two spreads beyond the bulk."""
     low, high = np.percentile(values[~np.isnan(values)], [10, 90])
     spread = high - low

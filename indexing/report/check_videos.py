@@ -23,7 +23,7 @@ def write_checks(folder: Path, report: SyncReport) -> tuple[list[str], list[str]
     written, notes, takes, found = [], [], report.takes, report.compared
     for i, name in enumerate(names_of([take.name for take in takes]), start=1):
         people = found[0, i].people if (0, i) in found else (0, 0)
-        first, other = (_shown(take, person) for take, person in zip((takes[0], takes[i]), people, strict=True))
+        first, other = (_shown_recording(take, person) for take, person in zip((takes[0], takes[i]), people, strict=True))
         try:
             write_check_video(folder / name, first, other, report.clocks[i], names=(takes[0].name, takes[i].name))
             written.append(name)
@@ -47,7 +47,7 @@ def drop_checks(folder: Path, written: Sequence[str]) -> None:
                 (folder / name).unlink()
 
 
-def _shown(take: Take, person: int) -> Path | Clip:
+def _shown_recording(take: Take, person: int) -> Path | Clip:
     if take.kind == "keypoints" and take.video is None:
         return take.people[person]
     assert take.path is not None  # the command line has no frames without a file

@@ -164,7 +164,7 @@ def heading(code: str) -> str:
     return HEADINGS.get(code, code.replace("_", " "))
 
 
-def remarks(reason: str, warnings: Iterable[tuple[str, float, str]] = (), notes: Iterable[str] = ()) -> list[tuple[str, str, str]]:
+def notes_of(reason: str, warnings: Iterable[tuple[str, float, str]] = (), notes: Iterable[str] = ()) -> list[tuple[str, str, str]]:
     """What a reader should note: CSS class and words of the heading (or none), and the sentence; refusals first."""
     warnings = list(warnings)
     told = [text for _, _, text in warnings if text in reason]
@@ -189,7 +189,14 @@ def _environment() -> Environment:
         lstrip_blocks=True, finalize=clean,
     )  # fmt: skip
     made.filters |= {"form": lambda value, form: f"{value:{form}}", "sentence": sentence, "settings": settings}
-    made.globals |= {"count": count, "remarks": remarks, "listed": listed, "ceil": math.ceil, "LISTED": LISTED, "LINES": LINES}
+    made.globals |= {
+        "count": count,
+        "remarks": notes_of,
+        "listed": kinds_of,
+        "ceil": math.ceil,
+        "LISTED": LISTED,
+        "LINES": LINES,
+    }
     return made
 
 
@@ -220,7 +227,7 @@ def bar(fraction: float, mark: float | None = None) -> Markup:
     )
 
 
-def listed(
+def kinds_of(
     ids: Sequence[str], kinds: Sequence[str], order: Sequence[str], several: Mapping[str, str] | None = None
 ) -> list[tuple[str, list[str]]]:
     """How many there are of each kind, and their names."""

@@ -22,7 +22,7 @@ from indexing.report.canvas import FACE, side_of, words_of
 from indexing.report.page import clean
 from indexing.report.pictures import colours
 from indexing.report.results import RecognitionReport, RecordingResult, ReportedEvent
-from indexing.skeleton import known
+from indexing.skeleton import usual_layout
 
 Array = NDArray[Any]
 PIECE = 6000  # frames that are searched at once for joints in wrong places: bounds memory
@@ -145,7 +145,7 @@ def _player(
         people.append({
             "name": str(clean(part.recording.person)),
             "first": int(times[0]), "times": _text(_varints(np.diff(times))),
-            "joints": _text(packed(places, unit, middle)), "skeleton": _skeleton(part.clip),
+            "joints": _text(pack_joints(places, unit, middle)), "skeleton": _skeleton(part.clip),
         })  # fmt: skip
     names = [name for part in parts for name in [*part.recording.classes, *(event.label for event, _ in _bars(part.recording))]]
     paint = colours(names)
@@ -216,13 +216,13 @@ class _Examples:
         view, middle = _view([joints], [clip.times[frames]], unit, self.options)
         lasts = 1000 * clip.duration * len(clip) / max(1, len(clip) - 1)
         return {
-            "joints": _text(packed(joints, unit, middle)), "skeleton": _skeleton(clip), "view": view,
+            "joints": _text(pack_joints(joints, unit, middle)), "skeleton": _skeleton(clip), "view": view,
             "lasts": 0 if clip.fps_assumed else round(lasts),
         }  # fmt: skip
 
 
 # ---- packing -------------------------------------------------------------------------------------------------------------
-def packed(joints: Array, unit: float, middle: Array) -> bytes:
+def pack_joints(joints: Array, unit: float, middle: Array) -> bytes:
     """Places on a grid as bytes, frame by frame. joints ``(frames, joints, 2)``."""
     with np.errstate(invalid="ignore"):
         places = np.clip(np.round((joints - middle) / unit), -32000, 32000).reshape(len(joints), -1)
@@ -254,7 +254,7 @@ def _text(content: bytes) -> str:
 
 def _skeleton(clip: Clip) -> dict[str, Any]:
     """Bones as ``[joint, joint, side]``, and the joints of the face, which are drawn as a circle; without bones, dots."""
-    skeleton = clip.skeleton or known(clip.joints.shape[1])
+    skeleton = clip.skeleton or usual_layout(clip.joints.shape[1])
     if skeleton is None or not skeleton.bones:
         return {"joints": clip.joints.shape[1], "bones": [], "face": []}
     sides = [side_of(name) for name in skeleton.joints]

@@ -26,7 +26,7 @@ from indexing.report.results import (
     count_row,
     held_rows,
     measure,
-    missed,
+    missed_actions,
     overlapping,
     repetition_rows,
     repetitions_csv,
@@ -142,7 +142,7 @@ def headline(report: RecognitionReport, measured: Mapping[str, Any]) -> list[tup
         items += _of_search(measured)
     for name, value in report.metrics.items():
         if isinstance(value, (int, float, str, np.number, np.bool_)) and measured.get(name) is value:
-            items.append((str(name).replace("_", " ").capitalize(), value if isinstance(value, str) else _plain(value), ""))
+            items.append((str(name).replace("_", " ").capitalize(), value if isinstance(value, str) else _plain_text(value), ""))
     return items
 
 
@@ -226,8 +226,8 @@ def of_recording(report: RecognitionReport, recording: RecordingResult, before: 
         if recording.truth is not None:
             rows[-1].append(_verdict(event, overlapping(event, recording.truth)))
         if number < draw:
-            rows[-1] += _drawn(report, recording, event)
-    lost = missed(recording)
+            rows[-1] += _draw_event(report, recording, event)
+    lost = missed_actions(recording)
     more = f"; and {len(lost) - LOST} more" if len(lost) > LOST else ""
     return {
         "recording": recording, "events": len(events), "drawn": rows[:draw], "rest": rows[draw:],
@@ -237,7 +237,7 @@ def of_recording(report: RecognitionReport, recording: RecordingResult, before: 
     }  # fmt: skip
 
 
-def _drawn(report: RecognitionReport, recording: RecordingResult, event: ReportedEvent) -> list[Any]:
+def _draw_event(report: RecognitionReport, recording: RecordingResult, event: ReportedEvent) -> list[Any]:
     """An event's cells with key frames: its own, and those of its example."""
     assert recording.clip is not None  # else nothing is drawn
     alt = f"Key frames of {event.label} found at {event.start:.1f} to {event.end:.1f} s"
@@ -305,7 +305,7 @@ def percent(value: float) -> str:
     return f"{100 * value:.1f}%"
 
 
-def _plain(value: Any) -> str:
+def _plain_text(value: Any) -> str:
     if isinstance(value, (bool, np.bool_)):
         return "yes" if value else "no"
     if value is None or not np.isfinite(value):

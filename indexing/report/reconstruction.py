@@ -74,7 +74,7 @@ class ReconstructionReport(ResultReport):
     @functools.cached_property
     def velocities(self) -> FloatArray | None:
         """``(n, d)`` per unit of the times; None = the model has none."""
-        return rested(self.found.velocities, self.found.points, float(np.ptp(self.found.times)))
+        return suppress_rounding(self.found.velocities, self.found.points, float(np.ptp(self.found.times)))
 
     @functools.cached_property
     def positions(self) -> FloatArray:
@@ -267,7 +267,7 @@ def as_json(report: ReconstructionReport) -> dict[str, Any]:
     }
 
 
-def rested(velocities: FloatArray | None, points: FloatArray, span: float) -> FloatArray | None:
+def suppress_rounding(velocities: FloatArray | None, points: FloatArray, span: float) -> FloatArray | None:
     """Velocities without what is nothing but rounding: ways, from first to last view, that are no part of the scene's size."""
     if velocities is None:
         return None
@@ -391,12 +391,12 @@ def _plan(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[An
         for kind in ("outlier", "static", "moving", "body 1", "body 2"):
             mine = positions[:, (kinds == kind) & np.isin(kind, [half or kind])][:, :MAX_PATHS]
             _arrows(panel, mine, kind, reach, size_of(positions.shape[1]), box)
-        finish(panel, *box, True, half or "the plane, in a frame of its own" + _sampled(positions, kinds, box))
+        finish(panel, *box, True, half or "the plane, in a frame of its own" + _sampling_note(positions, kinds, box))
         panel.set(xticks=[], yticks=[])
     return figure
 
 
-def _sampled(positions: FloatArray, kinds: NDArray[Any], box: Box) -> str:
+def _sampling_note(positions: FloatArray, kinds: NDArray[Any], box: Box) -> str:
     """That only some ways are drawn, where that is so."""
     moving = positions[:, kinds == "moving"]
     drawn = len(sample(moving, box))
@@ -458,7 +458,7 @@ def _space(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[A
             axis.set_pane_color(LIGHT.paper)
             axis._axinfo["grid"].update(color=LIGHT.line, linewidth=0.5)
         panel.view_init(elev=elevation, azim=azimuth)
-        panel.set_title(half or name + _sampled(positions, kinds, box), fontsize=9, loc="left", y=1.0)
+        panel.set_title(half or name + _sampling_note(positions, kinds, box), fontsize=9, loc="left", y=1.0)
     return figure
 
 
@@ -476,7 +476,7 @@ def tracks_picture(report: ReconstructionReport, theme: Theme = LIGHT) -> bytes:
     measured = report.tracks.values[..., shown_axes(report.tracks.values)]
     still = as_first_camera(report)
     panels: list[tuple[FloatArray, str]] = [
-        (measured, f"as tracked, from {_named(report.tracks.views[0], report.tracks.by_time)} on")
+        (measured, f"as tracked, from {_view_heading(report.tracks.views[0], report.tracks.by_time)} on")
     ]
     if still is not None:
         panels.append((still[..., shown_axes(report.tracks.values)], "as the first camera would see it, standing still"))
@@ -496,7 +496,7 @@ def tracks_picture(report: ReconstructionReport, theme: Theme = LIGHT) -> bytes:
         return png(figure, tight=True)
 
 
-def _named(view: str, by_time: bool) -> str:
+def _view_heading(view: str, by_time: bool) -> str:
     return f"{'time' if by_time else 'frame'} {view}" if view.lstrip("-").replace(".", "", 1).isdigit() else shorten(view, 40)
 
 

@@ -244,7 +244,7 @@ def overlapping(event: ReportedEvent, truth: Sequence[Truth]) -> str | None:
     return best[2] if best is not None and best[0] > 0 else None
 
 
-def missed(recording: RecordingResult) -> list[Truth]:
+def missed_actions(recording: RecordingResult) -> list[Truth]:
     """Known actions that no event of the same label overlaps."""
     by_label: dict[str, list[ReportedEvent]] = {}
     for event in recording.events:
@@ -288,7 +288,7 @@ def confused_with(confusion: Mapping[str, Any], label: str) -> tuple[str, int] |
     return row.most_common(1)[0] if row else None
 
 
-def matched(recording: RecordingResult, overlap: float = 0.5) -> int:
+def count_matches(recording: RecordingResult, overlap: float = 0.5) -> int:
     r"""How many events are right: each of a known action of its own, of the same name, with which it shares enough of the time,"""
     pairs = []
     for i, event in enumerate(recording.events):
@@ -343,7 +343,7 @@ def _search(recordings: Sequence[RecordingResult]) -> dict[str, Any]:
 def _against_known(known: Sequence[RecordingResult]) -> dict[str, Any]:
     """How what was reported compares with what is known, over the recordings of which something is."""
     reported, happened = sum(len(recording.events) for recording in known), sum(len(recording.truth or ()) for recording in known)
-    right = sum(map(matched, known))
+    right = sum(map(count_matches, known))
     inside = np.array([(_known_frames(recording) != "").sum() for recording in known], dtype=float)
     shares = np.array([frame_accuracy(recording) for recording in known])
     frames = [len(recording.times) for recording in known]
@@ -353,7 +353,7 @@ def _against_known(known: Sequence[RecordingResult]) -> dict[str, Any]:
         "false_events": sum(
             overlapping(event, recording.truth or ()) != str(event.label) for recording in known for event in recording.events
         ),
-        "missed_events": sum(len(missed(recording)) for recording in known),
+        "missed_events": sum(len(missed_actions(recording)) for recording in known),
         "right_events": right,
         "precision": right / reported if reported else math.nan,
         "recall": right / happened if happened else math.nan,

@@ -256,7 +256,7 @@ def summarize(report: SyncReport, folder: Path | None = None) -> Summary:
     refused = [pair for pair in report.pairs if not pair.shift.ok] if len(report.pairs) > 1 else []
     closing += [f"{pair.a.name} and {pair.b.name} refused: {pair.reason}" for pair in refused[:REFUSALS]]
     closing += [f"and {len(refused) - REFUSALS} more pairs refused"] if len(refused) > REFUSALS else []
-    closing += [*(f"note: {note}" for note in report.notes), *_written(report, folder)]
+    closing += [*(f"note: {note}" for note in report.notes), *_written_sentences(report, folder)]
     return Summary(headline=describe(report), tables=tables, closing=closing)
 
 
@@ -311,7 +311,7 @@ def _clocks_table(report: SyncReport) -> Table:
     return Table([f"clock against {report.reference.name}", "offset s ", "± s ", "frames ", "rate ppm "], rows, below)
 
 
-def _written(report: SyncReport, folder: Path | None) -> list[str]:
+def _written_sentences(report: SyncReport, folder: Path | None) -> list[str]:
     """What was written besides the report, a sentence each."""
     out = []
     for clock in (clock for clock in report.clocks if clock.take.spatial and clock.shifted is not None):
@@ -351,7 +351,7 @@ def ppm(rate: float, sigma: float | None = None) -> str:
     return "0" if rate == 1 or not (much or sigma) else f"{much:+d}" + ("" if sigma is None else f" ± {PPM * sigma:.0f}")
 
 
-def noted(report: SyncReport) -> list[tuple[str, str, str]]:
+def sync_notes(report: SyncReport) -> list[tuple[str, str, str]]:
     """What a reader should note, as of :func:`indexing.report.page.remarks`; names of cameras keep their letters."""
     names = tuple(report.names)
     said = [note[:1] * note.startswith(names) + sentence(note)[note.startswith(names) :] for note in report.notes]
@@ -428,7 +428,7 @@ def write_sync(folder: str | Path, report: SyncReport, videos: Sequence[str] = (
 
 def page(report: SyncReport, drawn: bytes, videos: Sequence[str] = ()) -> str:
     """The page, with a picture of the curves."""
-    values: dict[str, Any] = {"noted": noted(report), "clock_rows": clock_rows(report), "pair_rows": pair_rows(report)}
+    values: dict[str, Any] = {"noted": sync_notes(report), "clock_rows": clock_rows(report), "pair_rows": pair_rows(report)}
     values["video_rows"] = video_rows(report)
     values |= {"picture": Picture(drawn), "videos": videos, "drawn": DRAWN, "drift_of": drift_of, "ppm": ppm, "sigma": sigma_text}
     return render("sync", report, summary=summarize(report).headline, **values)

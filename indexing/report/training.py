@@ -17,7 +17,7 @@ from indexing.cameras import y_up
 from indexing.clip import Clip
 from indexing.report.canvas import FACE, LIGHT, new_figure, png, shorten_all, style
 from indexing.report.page import Picture, markup, render, write_files
-from indexing.skeleton import Skeleton, known
+from indexing.skeleton import Skeleton, usual_layout
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Which body parts tell the actions apart: a skeleton per action, its joints and bones coloured by how much they matter.
@@ -56,7 +56,7 @@ class BodyParts:
             )
         own = self.examples[0].skeleton if self.skeleton is None else self.skeleton
         object.__setattr__(self, "importance", values)
-        object.__setattr__(self, "skeleton", known(values.shape[1]) if own is None else own)
+        object.__setattr__(self, "skeleton", usual_layout(values.shape[1]) if own is None else own)
 
     @property
     def shares(self) -> Array:
@@ -105,7 +105,7 @@ def telling_joints(parts: BodyParts) -> list[list[Any]]:
     names = parts.skeleton.joints if parts.skeleton is not None else tuple(f"joint {i}" for i in range(parts.shares.shape[1]))
     rows: list[list[Any]] = []
     for label, share in zip(parts.classes, parts.shares, strict=True):
-        first = [f"{_plain(names[j])} ({share[j]:.0%})" for j in np.argsort(-share)[:NAMED] if share[j] > 0]
+        first = [f"{_plain_name(names[j])} ({share[j]:.0%})" for j in np.argsort(-share)[:NAMED] if share[j] > 0]
         rows.append([label, ", ".join(first) or markup('<span class="none">none stands out</span>')])
     return rows
 
@@ -203,7 +203,7 @@ def _bones(skeleton: Skeleton | None) -> list[tuple[int, int]]:
     return [(a, b) for a, b in skeleton.bones if not (face[a] or face[b])]
 
 
-def _plain(name: str) -> str:
+def _plain_name(name: str) -> str:
     return name.replace("_", " ")
 
 
@@ -226,7 +226,7 @@ def write_training(
     names = [PICTURE, "metrics.json", files.MANIFEST, "report.html"]
     said = [("", "", note) for note in notes]
     report = {"title": f"{len(indexer.classes_)} actions learned", "notes": said, "manifest": manifest}
-    values = {"joints": telling_joints(parts), "weighing": _weighing(indexer), "examples": _examples(clips)}
+    values = {"joints": telling_joints(parts), "weighing": _weight_rows(indexer), "examples": _examples(clips)}
     summary = _summary(indexer, clips)
     html = render("training", report, summary=summary, cards=_headline(indexer, clips), picture=Picture(drawn), **values)
     contents = {PICTURE: drawn, "metrics.json": _metrics(indexer, parts), files.MANIFEST: {**manifest, "files": names}}
@@ -263,7 +263,7 @@ def _headline(indexer: ActionIndexer, clips: Sequence[Clip]) -> list[tuple[str, 
     return [*items, ("People", f"{len(people)}", "")] if people else items
 
 
-def _weighing(indexer: ActionIndexer) -> list[list[str]]:
+def _weight_rows(indexer: ActionIndexer) -> list[list[str]]:
     """What each kind of evidence weighs."""
     model, blend = indexer.model_, indexer.model_.blend
     total = blend.kernel + blend.nearest

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from indexing.opening import VALUE, clipped, error, listed, parse_toml, read_text, shown
+from indexing.opening import VALUE, clip_text, error, listing, parse_toml, read_text, shown
 
 LARGEST = 1e7  # pixels: focal lengths and centres have some thousand
 REMEDY = "give a .toml with matrix (3, 3) and distortions for every camera, as Pose2Sim writes it"
@@ -59,7 +59,7 @@ def read_calibration(path: str | Path) -> list[Lens]:
     content = parse_toml(path, read_text(path, REMEDY), REMEDY)
     found = []
     for key, values in content.items():
-        section = clipped(key, VALUE)
+        section = clip_text(key, VALUE)
         if isinstance(values, dict) and "matrix" in values:
             matrix = _numbers(path, section, "matrix", values["matrix"])
             if not _is_inner(matrix):
@@ -96,10 +96,10 @@ def match(cameras: Sequence[Lens], names: Sequence[str], path: str | Path) -> tu
     known = [lens for lens in chosen if lens is not None]
     if len(known) == len(names) and len({id(lens) for lens in known}) == len(names):
         return known, ()
-    known_names = listed(lens.name for lens in cameras)
+    known_names = listing(lens.name for lens in cameras)
     if len(cameras) == len(names):
         return list(cameras), (f"calibration taken in the order of its file ({known_names}), because names differ",)
-    raise error(path, f"its cameras are {known_names}, and {listed(names)} are asked for", "name sections as the cameras")
+    raise error(path, f"its cameras are {known_names}, and {listing(names)} are asked for", "name sections as the cameras")
 
 
 def _normalize_name(name: str) -> str:

@@ -11,8 +11,8 @@ import numpy as np
 
 from dyntorch.core import Notice, status_from
 from indexing.clip import Clip
-from indexing.joints import named, places
-from indexing.skeleton import Skeleton, known
+from indexing.joints import has_names, places
+from indexing.skeleton import Skeleton, usual_layout
 from indexing.sync.notices import SyncNotice, accepted_notices
 from indexing.sync.recordings import FloatArray, Take
 
@@ -123,7 +123,7 @@ def common_joints(a: Clip, b: Clip) -> tuple[Clip, Clip, bool, str]:
         if count[0] == count[1]:
             return a, b, True, ""
     else:
-        there = [(i, j) for i, j in enumerate(places(second, first)) if j >= 0] if named(first) and named(second) else []
+        there = [(i, j) for i, j in enumerate(places(second, first)) if j >= 0] if has_names(first) and has_names(second) else []
         if len(there) >= MIN_COMMON_JOINTS:
             both = tuple(first.joints[i] for i, _ in there)
             said = f"{first.name} and {second.name} share {len(there)} joints; these are compared"
@@ -217,5 +217,5 @@ def joint_names(a: Take, b: Take, people: tuple[int, int]) -> tuple[str, ...]:
     if not (a.people and b.people):
         return ()
     first, _, same, _ = common_joints(a.people[people[0]], b.people[people[1]])
-    layout = first.skeleton or known(first.joints.shape[1])
+    layout = first.skeleton or usual_layout(first.joints.shape[1])
     return layout.joints if same and layout is not None else ()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from indexing.clip import Clip
 from indexing.files import write_bytes
-from indexing.skeleton import known
+from indexing.skeleton import usual_layout
 from indexing.video.overlay import encode
 from indexing.video.reading import cv2, read_video
 
@@ -123,7 +123,7 @@ class _Figure:
         self.points = (points - (low + high) / 2) * scale + np.array(self.size) / 2
         self.times, self.fps = clip.times, float(clip.fps or SMOOTHEST)
         self.first, self.last = float(clip.times[0]), float(clip.times[-1])
-        skeleton = clip.skeleton or known(clip.joints.shape[1])
+        skeleton = clip.skeleton or usual_layout(clip.joints.shape[1])
         self.bones = skeleton.bones if skeleton else ()
 
     def shown(self, moments: NDArray[np.float64]) -> Iterator[tuple[Image, float]]:

@@ -107,26 +107,26 @@ def robust_motion(source: Floats, target: Floats, guess: Floats, side: float) ->
     if rests.sum() >= MIN_BACKGROUND_POINTS and rests.mean() * source[rests].std(0).max() > MIN_STATIC_EXTENT * side:
         return similarity(source[rests], target[rests]), rests
     motion = guess
-    agree = _agree(motion, source, target, MOTION_TOLERANCE)
+    agree = _fits(motion, source, target, MOTION_TOLERANCE)
     if agree.mean() < 0.5:
         found = cv2().estimateAffinePartial2D(
             source, target, method=cv2().RANSAC, ransacReprojThreshold=MOTION_TOLERANCE, confidence=0.999
         )[0]
         if found is not None:
             motion = np.vstack([found, [0.0, 0, 1]])
-            agree = _agree(motion, source, target, MOTION_TOLERANCE)
+            agree = _fits(motion, source, target, MOTION_TOLERANCE)
     for _ in range(3):
         if agree.sum() < MIN_BACKGROUND_POINTS:
             return motion, np.zeros_like(agree)
         motion = similarity(source[agree], target[agree])
-        agree = _agree(motion, source, target, MOTION_TOLERANCE)
+        agree = _fits(motion, source, target, MOTION_TOLERANCE)
     # A pan by an angle is a homography; a similarity is enough for a few pixels, and stays off by less than the tolerance for more.
     if np.linalg.norm((target - source)[agree].mean(0)) > 2 * MOTION_TOLERANCE and len(source) >= 3 * MIN_BACKGROUND_POINTS:
         found = cv2().findHomography(source, target, cv2().RANSAC, MOTION_TOLERANCE)[0]
         if found is not None:
-            gain = _agree(found, source, target, MODEL_TOLERANCE).sum() - _agree(motion, source, target, MODEL_TOLERANCE).sum()
+            gain = _fits(found, source, target, MODEL_TOLERANCE).sum() - _fits(motion, source, target, MODEL_TOLERANCE).sum()
             if gain > max(5, 0.05 * len(source)):
-                motion, agree = found, _agree(found, source, target, MOTION_TOLERANCE)
+                motion, agree = found, _fits(found, source, target, MOTION_TOLERANCE)
     return motion, agree & (agree.mean() > MIN_MOTION_SUPPORT)
 
 
@@ -167,7 +167,7 @@ def spread(image: NDArray[np.uint8]) -> Floats:
     return np.asarray(corners[rank < POINTS_PER_CELL])
 
 
-def _agree(motion: Floats, source: Floats, target: Floats, within: float) -> NDArray[np.bool_]:
+def _fits(motion: Floats, source: Floats, target: Floats, within: float) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(transform(motion, source) - target, axis=1) < within)
 
 

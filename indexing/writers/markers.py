@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.numerics import Message
-from indexing.opening import clipped, error, repeated
+from indexing.opening import clip_text, error, first_duplicate
 
 if TYPE_CHECKING:
     from indexing.clip import Clip
@@ -63,7 +63,7 @@ def markers_of(clips: Sequence[Clip], path: Path, units: str | None = None) -> M
     names: list[str] = []
     for clip, who in zip(clips, people, strict=True):
         names += [f"{who}:{joint}" if who else joint for joint in joint_names(clip)]
-    twice = repeated(names)
+    twice = first_duplicate(names)
     if twice is not None:
         raise error(path, f"there are two points {twice!r}", "give every joint a name of its own (Clip.skeleton)")
     times, places = align_clips(clips)
@@ -100,10 +100,10 @@ def people_of(clips: Sequence[Clip], path: Path) -> list[str]:
         return [""]
     lacking = [clip for clip in clips if clip.meta.get("person") is None]
     if lacking:
-        what = f"{len(clips)} clips ({clipped(lacking[0].name, 40)}, ...) are not the people of one recording (meta 'person')"
+        what = f"{len(clips)} clips ({clip_text(lacking[0].name, 40)}, ...) are not the people of one recording (meta 'person')"
         raise error(path, what, ONE)
     people = [str(clip.meta["person"]) for clip in clips]
-    twice = repeated(people)
+    twice = first_duplicate(people)
     if twice is not None:
         raise error(path, f"two clips are of person {twice}, so they are of several recordings", ONE)
     if len({(clip.dims, clip.up) for clip in clips}) > 1:

@@ -5,7 +5,7 @@ import pytest
 
 from indexing import ActionIndexer, Clip, PhaseIndexer
 from indexing.actors import Person, dataset, detect, stream
-from indexing.joints import canonical, layout_of, matched, places
+from indexing.joints import canonical, layout_of, match_joints, places
 from indexing.skeleton import (
     BODY25,
     BODY25B,
@@ -73,7 +73,7 @@ def test_joints_that_a_clip_does_not_have_are_not_seen(lesson, recording):
     part = recording.replace(
         joints=recording.joints[:, few], confidence=None, skeleton=Skeleton("no ears", tuple(COCO17.joints[i] for i in few))
     )
-    clip, said = matched(part, COCO17, "a.json")
+    clip, said = match_joints(part, COCO17, "a.json")
     assert clip.joints.shape[1] == 17 and not clip.seen[:, [3, 4]].any() and clip.skeleton is COCO17
     assert said == "a.json: 15 of the 17 joints learned are in it; not left_ear, right_ear"
     np.testing.assert_array_equal(clip.joints[:, few], part.joints)
@@ -91,15 +91,15 @@ def test_layouts_without_names_that_contradict_each_other_are_refused():
     chain, star = Skeleton("chain", numbers, ((0, 1), (1, 2), (2, 3))), Skeleton("star", numbers, ((0, 1), (0, 2), (0, 3)))
     clip = Clip(np.random.default_rng(0).normal(size=(5, 4, 2)), skeleton=star, name="b")
     with pytest.raises(ValueError, match=r"clip 'b': joints: their bones \(star\) are not those learned \(chain\)"):
-        matched(clip, chain)
-    assert matched(clip, star) == (clip, "") and matched(clip.replace(skeleton=None), None)[1] == ""
-    assert "joint 0 is taken for joint 0" in matched(clip.replace(skeleton=None), chain)[1]
+        match_joints(clip, chain)
+    assert match_joints(clip, star) == (clip, "") and match_joints(clip.replace(skeleton=None), None)[1] == ""
+    assert "joint 0 is taken for joint 0" in match_joints(clip.replace(skeleton=None), chain)[1]
     assert layout_of([clip, clip.replace(skeleton=Skeleton("named", ("a", "b", "c", "d")))]).name == "named"
 
 
 @pytest.mark.parametrize("learned", [layout for layout in LAYOUTS.values() if layout is not HAND21], ids=lambda x: x.name)
 def test_a_model_of_any_layout_of_a_body_takes_coco(recording, learned):
-    clip, said = matched(recording, learned, "a.json")
+    clip, said = match_joints(recording, learned, "a.json")
     shared = [name for name in COCO17.joints if name in learned.joints]
     assert clip.skeleton is learned or learned is COCO17
     for name in shared:
@@ -110,10 +110,10 @@ def test_a_model_of_any_layout_of_a_body_takes_coco(recording, learned):
 
 def test_faces_and_fingers_do_not_make_another_layout(recording):
     for learned, count in ((WHOLEBODY133, 133), (HALPE136, 136)):
-        said = matched(recording, learned, "a.json")[1]
+        said = match_joints(recording, learned, "a.json")[1]
         assert said.startswith(f"a.json: 17 of the {count} joints learned are in it; not ")
     with pytest.raises(ValueError, match=r"0 of its 17 \(nose, left_eye, right_eye, left_ear, ...\) have names of the 21 joints"):
-        matched(recording, HAND21)
+        match_joints(recording, HAND21)
 
 
 def test_a_model_of_openpose_scans_coco(recording):

@@ -23,11 +23,11 @@ from indexing.modelfile import (
     number,
     part,
     read_fields,
+    read_integer,
     skeleton_from_json,
-    stored,
+    store,
     tensors_of,
     usable,
-    whole,
 )
 
 
@@ -202,15 +202,15 @@ def test_truth_values_of_other_bytes_than_0_and_1_are_true() -> None:
 
 @dataclass(frozen=True)
 class Inner:
-    values: torch.Tensor = field(metadata=stored("real", "rows", "wide"))
-    rows: torch.Tensor | None = field(metadata=stored("every", "rows", below="rows"))
+    values: torch.Tensor = field(metadata=store("real", "rows", "wide"))
+    rows: torch.Tensor | None = field(metadata=store("every", "rows", below="rows"))
 
 
 @dataclass(frozen=True)
 class Outer:
     shown: Inner = field(metadata=part(rows="windows"))
     other: Inner | None = field(metadata=part("", rows=3))
-    weight: float = field(metadata=stored("real", name="w", most=1))
+    weight: float = field(metadata=store("real", name="w", most=1))
     about: str = ""
 
 
@@ -243,7 +243,7 @@ def test_parts_and_values_say_what_they_expect() -> None:
     with pytest.raises(ValueError, match="x: expected a number from 0 to 1, got True"):
         number(True, "x", 0, 1)
     with pytest.raises(ValueError, match=r"x: expected a whole number from 0 to 1, got 1\.0"):
-        whole(1.0, "x", 0, 1)
+        read_integer(1.0, "x", 0, 1)
     with pytest.raises(ValueError, match="skeleton: 1 names for 2 joints"):
         skeleton_from_json(["s", ["a"], []], 2)
     with pytest.raises(ValueError, match="are no labels"):

@@ -130,15 +130,15 @@ def test_repair_helps_where_joints_jump():
 
 def test_long_recordings_are_mended_in_parts(monkeypatch):
     from indexing.clip import Clip
-    from indexing.windows import mended
+    from indexing.windows import repair_clip
 
     rng = np.random.default_rng(5)
     walk = np.linspace(0, 3, 400)[:, None, None] + np.arange(4.0)[:, None] + 0.005 * rng.normal(size=(400, 4, 2))
     clean = Clip(walk, fps=30.0)
-    assert mended(clean) is clean
+    assert repair_clip(clean) is clean
     walk[[30, 199, 200, 350], [0, 1, 2, 3]] += 2.0
     broken = Clip(walk, fps=30.0)
-    whole = mended(broken)
+    whole = repair_clip(broken)
     assert np.argwhere(~whole.seen).tolist() == [[30, 0], [199, 1], [200, 2], [350, 3]]
     monkeypatch.setattr(windows, "MAX_FRAMES_JUDGED", 100)
-    assert np.array_equal(mended(broken).seen, whole.seen)
+    assert np.array_equal(repair_clip(broken).seen, whole.seen)

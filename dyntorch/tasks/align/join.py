@@ -22,7 +22,14 @@ from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.numerics.blocks import select
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
-from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, THRESHOLD_SIGMAS, Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.labelling import (
+    ROUGH_LABEL_FACTOR,
+    THRESHOLD_SIGMAS,
+    Evidence,
+    Labelled,
+    normalized_motion,
+    static_consensus,
+)
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 from dyntorch.tasks.align.several import motion_of_all, moving_points
@@ -166,7 +173,7 @@ def _from_tensor(
     if plain:
         refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_JOIN_STEPS)
         assert refined.sigma is not None
-        theta, noise = joined(refined), refined.sigma
+        theta, noise = normalized_motion(refined), refined.sigma
     else:
         parts = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
         moving = whitened_residual(evidence.invariant, parts, evidence.views, evidence.norm.scales).square().sum(-1)
@@ -178,7 +185,7 @@ def _from_tensor(
 def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
     """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
     refined = evidence.refined(best.theta, best.labels, MAX_JOIN_STEPS)
-    theta = joined(refined)
+    theta = normalized_motion(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)

@@ -175,7 +175,7 @@ class Evidence:
         labels = self.labels(theta, torch.where(rough, ROUGH_LABEL_FACTOR * sigma, sigma))
         # what a rough motion says about moving matches is left to chance
         labels = torch.where(rough[:, None] & (labels == MOVING), OUTLIER, labels)
-        return joined(self.refined(theta, labels, NUM_LABEL_STEPS))
+        return normalized_motion(self.refined(theta, labels, NUM_LABEL_STEPS))
 
     def settled(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
         """Label and refine in turns, until the labels stay; ``estimate``: and the noise with them."""
@@ -187,14 +187,14 @@ class Evidence:
                 break
             labels = new
             found = self.refined(theta, labels, NUM_LABEL_STEPS)
-            theta = joined(found)
+            theta = normalized_motion(found)
             if estimate and found.sigma is not None:
                 old, sigma = sigma, torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
                 steady = bool(((sigma - old).abs() <= NOISE_TOLERANCE * old).all())
         return Labelled(theta, labels, sigma)
 
 
-def joined(solution: Solution) -> Tensor:
+def normalized_motion(solution: Solution) -> Tensor:
     """``(b, p)`` normalized motion of a solution."""
     return torch.cat([part.flatten(1) for part in solution.normalized_motion()], dim=-1)
 

@@ -172,7 +172,7 @@ def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain:
     present = lines.data.weights > 0
     labels = torch.where(present, MOVING, OUTLIER) if plain else _labels(lines, theta, sigma)
     for _ in range(NUM_LINE_ROUNDS):
-        theta = refined(lines, theta, labels)
+        theta = refine_map(lines, theta, labels)
         if estimate:
             left = lines.residual(theta, labels).square().sum(-1)
             spare = (labels == MOVING).sum(-1) + 4 * (labels == STATIC).sum(-1) + 3 * lines.points[0].shape[1] - DOF
@@ -184,7 +184,7 @@ def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain:
     return theta, labels, sigma
 
 
-def refined(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
+def refine_map(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
     """A that minimizes the residuals of all labelled matches, by Levenberg-Marquardt."""
     problem = lines.problem(labels)
     return minimize(problem, problem.evaluate((theta,)), DESCENT).theta[0]
@@ -472,7 +472,7 @@ def _has_alternatives(
     mixed = [one + sign * two for one, two in combinations(weakest, 2) for sign in (1, -1)]
     for flat in (*weakest, *mixed):
         start = model.decompose(flat.unflatten(-1, (6, 6))).flatten(1)
-        other = refined(lines, torch.where(start.isfinite(), start, theta), labels)
+        other = refine_map(lines, torch.where(start.isfinite(), start, theta), labels)
         there = unit(other.unflatten(-1, (4, 4)))
         far = torch.minimum((there - here).flatten(1).norm(dim=-1), (there + here).flatten(1).norm(dim=-1)) > options.max_deviation
         found |= far & (problem.normal_equations(other)[0] <= MAX_RIVAL_COST * best)

@@ -23,7 +23,14 @@ from dyntorch.numerics.blocks import one_thread, select
 from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align.euclidean import euclidean
-from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, THRESHOLD_SIGMAS, Evidence, Labelled, joined, static_consensus
+from dyntorch.tasks.align.labelling import (
+    ROUGH_LABEL_FACTOR,
+    THRESHOLD_SIGMAS,
+    Evidence,
+    Labelled,
+    normalized_motion,
+    static_consensus,
+)
 from dyntorch.tasks.align.options import AlignOptions
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
 from dyntorch.tasks.align.several import motion_of_all, moving_points, still_but_one, three_of
@@ -70,7 +77,7 @@ def planar_notices(
     full = HomographyTensor.width() - 1
     note(AlignNotice.DEGENERATE, rank, solved & (rank < full))
     note(AlignNotice.NEAR_STATIC, strength, solved & (rank >= full) & (strength < MIN_TENSOR_STRENGTH), case="tensor")
-    family = (status == Status.AMBIGUOUS) & undecided(evidence, best, tensor)
+    family = (status == Status.AMBIGUOUS) & is_undecided(evidence, best, tensor)
     note(AlignNotice.OTHER_SOLUTION, (best.labels == STATIC).sum(-1), family)
     note(AlignNotice.FEW_MOVING, count, solved & (count < FEWEST), least=f"{FEWEST}")
     lines = trajectory_lines(evidence, best, moving)
@@ -78,7 +85,7 @@ def planar_notices(
     note(AlignNotice.ONE_LINE, lines, solved & (lines == 1))
     thin = thinness(evidence, best.sigma)
     note(AlignNotice.COLLINEAR, thin, (data.weights > 0).any(-1) & (thin < MIN_LINE_WIDTH))
-    doubtful = (best.labels == MOVING) & unverified(evidence, best)
+    doubtful = (best.labels == MOVING) & unverified_matches(evidence, best)
     note(AlignNotice.UNVERIFIED, doubtful.sum(-1), solved & doubtful.any(-1))
     return in_order(found)
 
@@ -95,7 +102,7 @@ def tensor_rank(inliers: Matches, evidence: Evidence, sigma: Tensor) -> tuple[Te
     return torch.stack(ranks).amax(0), torch.stack(strengths).amax(0)
 
 
-def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor]) -> Tensor:
+def is_undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor]) -> Tensor:
     """Where the moving matches leave a family of motions ``(b,)``, and no more are static than some motion of it makes by
     chance."""
     rank, strength = tensor
@@ -112,7 +119,7 @@ def undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor])
     return family & (still.sum(-1) < MIN_STATIC_SUPPORT + STATIC_SUPPORT_FACTOR * beside / (CHANCE_LIMIT_FACTOR**2 - 1))
 
 
-def unverified(evidence: Evidence, best: Labelled) -> Tensor:
+def unverified_matches(evidence: Evidence, best: Labelled) -> Tensor:
     """Matches ``(b, n)`` that all views but one agree on as static, whatever that one says."""
     parts = evidence.problem(best.labels).parts(best.theta)
     if len(evidence.views) > 3:
@@ -299,7 +306,7 @@ def _align(
         covariance=outcome.covariance,
         ambiguity=MORE_VIEWS if others else AMBIGUITY,
         notices=notices,
-        unverified=data.back(unverified(evidence, best) & (best.labels == MOVING)),
+        unverified=data.back(unverified_matches(evidence, best) & (best.labels == MOVING)),
         solution=outcome,
         others=tuple(others),
         rotations=None if turned is None else turned.rotations,
@@ -386,7 +393,7 @@ def _from_all(evidence: Evidence, given: Tensor | None, generator: torch.Generat
     theta, usable = _usable(*motion_of_all(evidence, solve, given, generator))
     refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_PLANAR_STEPS)
     assert refined.sigma is not None
-    return joined(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
+    return normalized_motion(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
 
 
 def _usable(motion: tuple[Tensor, ...], found: Solution) -> tuple[Tensor, Tensor]:
@@ -400,14 +407,14 @@ def _usable(motion: tuple[Tensor, ...], found: Solution) -> tuple[Tensor, Tensor
 def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
     """The solution with its status, the final labels, none where there is no motion, and what the tensor alone rests on."""
     refined = evidence.refined(best.theta, best.labels, MAX_PLANAR_STEPS)
-    theta = joined(refined)
+    theta = normalized_motion(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     assert refined.sigma is not None and refined.covariance is not None
     best = Labelled(theta, labels, best.sigma)
     tensor = tensor_rank(evidence.data.restrict(labels != OUTLIER), evidence, best.sigma)
-    free = (worst > MAX_DEVIATION) | undecided(evidence, best, tensor)
+    free = (worst > MAX_DEVIATION) | is_undecided(evidence, best, tensor)
     status = _status(evidence, best, refined.sigma, free, values[:, 0] <= MIN_INFORMATION * values[:, -1])
     none = failed(status)
     labels = torch.where(none[:, None], OUTLIER, labels)

@@ -265,7 +265,7 @@ def _search(
         return found
     common, members, present = *common_velocity(found, flat, options), (flat.weights > 0).sum(-1)
     standing = ~grounded & (members >= 3) & (members >= options.min_static_share * present)
-    found = replace(found, motions=drifted(found.motions, torch.where(grounded[:, None], 0.0, common)))
+    found = replace(found, motions=shift_gauge(found.motions, torch.where(grounded[:, None], 0.0, common)))
     if not bool(standing.any()):
         return found
     return _iterate_labels(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
@@ -343,7 +343,7 @@ def _noise(motions: Tensor, data: RigidSightings, inliers: Tensor, still: Tensor
     return torch.where(spare >= 4, (total / spare.clamp(min=1)).sqrt(), before)
 
 
-def drifted(motions: Tensor, velocity: Tensor) -> Tensor:
+def shift_gauge(motions: Tensor, velocity: Tensor) -> Tensor:
     """Motions ``(b, 2, 4, 4)`` in the gauge in which points of this velocity ``(b, 3)`` stand still."""
     steps = torch.tensor([1.0, 2.0], dtype=motions.dtype, device=motions.device)
     shift = torch.zeros_like(motions)

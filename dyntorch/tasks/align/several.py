@@ -53,7 +53,7 @@ def motion_of_all(
     planes, weights, noise = _flats_of(evidence, three, torch.stack([known[v] for v in three], dim=-3), given)
     for v in range(1, count):
         if v not in known:
-            known[v] = resected(planes, evidence.views[v], evidence.norm.scales[v] * noise, weights, generator)
+            known[v] = resect_view(planes, evidence.views[v], evidence.norm.scales[v] * noise, weights, generator)
     return tuple(known[v] for v in range(1, count)), found
 
 
@@ -78,7 +78,7 @@ def _flats_of(evidence: Evidence, three: tuple[int, ...], maps: Tensor, given: T
     return planes, evidence.data.weights * good, noise
 
 
-def resected(planes: Tensor, x: Tensor, sigma: Tensor, weights: Tensor, generator: torch.Generator | None) -> Tensor:
+def resect_view(planes: Tensor, x: Tensor, sigma: Tensor, weights: Tensor, generator: torch.Generator | None) -> Tensor:
     r"""The collineation A of a view whose points lie on known flats of view 1: :math:`L_i A (x_i, 1) = 0`, robustly. planes
     ``(b, n, d, d + 1)``, x ``(b, n, d)``, sigma ``(b,)``, weights ``(b, n)`` -> ``(b, d + 1, d + 1)``."""
     b, n, _, size = planes.shape

@@ -56,7 +56,7 @@ class Velocities:
     grounded: Tensor  # ``(b,)`` bool, whether static matches fix the common velocity
 
 
-def refined(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> Tensor:
+def refine_maps(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> Tensor:
     """The maps ``(b, 48)`` that minimize the residuals of the labelled matches, by Levenberg-Marquardt; affine maps stay affine."""
     problem = replace(evidence.problem(labels), free=_free(theta, affine))
     if not bool((labels == STATIC).any()):
@@ -117,7 +117,7 @@ def residuals(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor]:
 def _label_and_fit(evidence: Evidence, state: Velocities, affine: bool, estimate: bool) -> Velocities:
     theta, labels, sigma = state.theta, state.labels, state.sigma
     for _ in range(NUM_VELOCITY_ROUNDS):
-        theta = refined(evidence, theta, labels, affine)
+        theta = refine_maps(evidence, theta, labels, affine)
         if estimate:
             sigma = _noise(evidence, theta, labels, sigma, DOF[affine] + GAUGE * state.grounded.long())
         new = _labels(evidence, theta, sigma, state.grounded)

@@ -67,7 +67,7 @@ class GivenPlanes:
             frames = frames_of_calibration((cameras[:, 0], cameras[:, 1]))
         else:
             frames = frames_of_matrices(h, f)
-        hn, fn = normalized(h, frames), normalized_fundamentals(f, frames)
+        hn, fn = normalize_homographies(h, frames), normalized_fundamentals(f, frames)
         return GivenPlanes(
             hn, fn, seen.moved(frames, hn), more.moved(frames, fn), matched, frames, h * _there(hn), cameras, batch, H
         )
@@ -120,7 +120,7 @@ def _matrices(name: str, value: Tensor) -> Tensor:
     return value
 
 
-def padded(name: str, views: tuple[Points, Points]) -> Pair:
+def pad_matches(name: str, views: tuple[Points, Points]) -> Pair:
     """Two views of the matches of k planes as ``(*batch, k, n, 2)``, filled up with NaN where a plane has fewer."""
     if len(views) != 2 or any(not isinstance(x, Tensor | Sequence) or isinstance(x, str) for x in views):
         kinds = ", ".join(type(x).__name__ for x in views)
@@ -237,7 +237,7 @@ def _finite(matrices: Tensor) -> Tensor:
     return unit(finite_matrices(matrices)[0])
 
 
-def normalized(homographies: Tensor, frames: Pair) -> Tensor:
+def normalize_homographies(homographies: Tensor, frames: Pair) -> Tensor:
     """Homographies ``(b, p, 3, 3)`` of norm 1 in new coordinates; zero where one is missing or singular."""
     moved = _finite(frames[1][:, None] @ homographies @ torch.linalg.inv_ex(frames[0])[0][:, None])
     values = torch.linalg.svdvals(moved)

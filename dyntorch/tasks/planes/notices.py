@@ -264,7 +264,7 @@ def _extent(given: GivenPlanes) -> Tensor:
     return torch.stack(found).amin(0)
 
 
-def turned(given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
+def rotation_distance(given: GivenPlanes, infinity: Tensor, covariance: Tensor, status: Tensor) -> tuple[Tensor, Tensor]:
     r"""Distance ``(b,)`` of :math:`K_2^{-1} H_\infty K_1`, of determinant 1, from a rotation, and whether noise is no reason."""
     if given.calibration is None:
         return torch.zeros_like(infinity[:, 0]), torch.zeros_like(status, dtype=torch.bool)

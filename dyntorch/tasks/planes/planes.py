@@ -27,10 +27,18 @@ from dyntorch.invariants.collineation import Collineation
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options
 from dyntorch.numerics.blocks import map_blocks, one_thread
-from dyntorch.tasks.planes.input import GivenPlanes, Pair, Points, both, cameras, check_counts, enough, padded
-from dyntorch.tasks.planes.notices import MAX_NEAR_ZERO, ROUNDING_ERROR, Figures, PlanesNotice, misfit, planes_notices, turned
+from dyntorch.tasks.planes.input import GivenPlanes, Pair, Points, both, cameras, check_counts, enough, pad_matches
+from dyntorch.tasks.planes.notices import (
+    MAX_NEAR_ZERO,
+    ROUNDING_ERROR,
+    Figures,
+    PlanesNotice,
+    misfit,
+    planes_notices,
+    rotation_distance,
+)
 from dyntorch.tasks.planes.options import PlanesOptions
-from dyntorch.tasks.planes.problem import Layout, PlaneMatches, noise_variance, projected, solve
+from dyntorch.tasks.planes.problem import Layout, PlaneMatches, noise_variance, project_covariance, solve
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What translating_planes() returns: the homography at infinity, how every body moved, and its reconstruction.
@@ -207,7 +215,7 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     against = misfit(given, cost, separate)
     # what one homography at infinity leaves beyond the noise is an error as well
     covariance = against.excess[:, None, None] * covariance
-    uncertainty = projected(covariance[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
+    uncertainty = project_covariance(covariance[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1).sqrt()
     right = enough(planes, bodies, method)
     several = figures.several()
     # what moves alike, or not at all, differs by noise alone
@@ -219,7 +227,7 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     status = torch.where(apart, Status.NO_CONSENSUS, status)
     status = torch.where(undetermined, Status.DEGENERATE, status)
     status = torch.where(right, status, Status.TOO_FEW)
-    distance, bent = turned(given, theta[:, :9], covariance[:, :9, :9], status)
+    distance, bent = rotation_distance(given, theta[:, :9], covariance[:, :9, :9], status)
     said = {
         PlanesNotice.NO_COMMON_INFINITY: (against.ratio, apart & ~vague),
         PlanesNotice.CHANCE: (against.ratio, chance),
@@ -280,9 +288,9 @@ def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor) ->
     moving = torch.cat([used[:, :p] & ~still, used[:, p:]], dim=1)
     return Figures(
         epipoles=unit_vectors(epipoles),
-        epipole_covariance=projected(of_epipoles, epipoles),
+        epipole_covariance=project_covariance(of_epipoles, epipoles),
         normals=unit_vectors(n),
-        normal_covariance=projected(of_normals, n),
+        normal_covariance=project_covariance(of_normals, n),
         moving=moving,
         used=used,
     )
@@ -323,7 +331,7 @@ def _transform_covariance(covariance: Tensor, entries: Tensor, frames: tuple[Ten
     """Covariance ``(b, 9, 9)`` of the entries of the homography at infinity in measured coordinates, at norm 1."""
     back = torch.linalg.inv_ex(frames[1])[0]
     lift = two_sided(back, frames[0])
-    return projected(lift @ covariance @ lift.mT, (lift @ entries[..., None])[..., 0])
+    return project_covariance(lift @ covariance @ lift.mT, (lift @ entries[..., None])[..., 0])
 
 
 BLOCK = 1 << 21
@@ -396,7 +404,7 @@ def translating_planes(
     options = PlanesOptions() if options is None else options
     check_options(options, PlanesOptions)
     planes = _views(x1, x2)
-    bodies = None if body_matches is None else padded("body_matches", body_matches)
+    bodies = None if body_matches is None else pad_matches("body_matches", body_matches)
     if H is None and planes is not None:
         H = fit(Collineation(2), planes[1], planes[0]).tensor
     if fundamentals is None and bodies is not None:
@@ -418,7 +426,7 @@ def _views(x1: Points | None, x2: Points | None) -> Pair | None:
         return None
     if x1 is None or x2 is None:
         raise ValueError(f"x1 and x2 belong together, got only {'x2' if x1 is None else 'x1'}: give both views, or neither")
-    return padded("x1 and x2", (x1, x2))
+    return pad_matches("x1 and x2", (x1, x2))
 
 
 def _solve_blocks(given: GivenPlanes, method: str, refine: bool, options: PlanesOptions) -> tuple[Tensor, ...]:

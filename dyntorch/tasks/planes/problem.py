@@ -434,12 +434,12 @@ def _covariance(problem: PlanesProblem, theta: Tensor) -> tuple[Tensor, Tensor]:
     scaled = matrix / (unit[:, :, None] * unit[:, None]) + gauges @ gauges.mT + torch.diag_embed(none.to(matrix.dtype))
     values, vectors = spectrum(scaled)
     inverse = (vectors / values.clamp(min=EIGENVALUE_EPSILON)[:, None, :]) @ vectors.mT / (unit[:, :, None] * unit[:, None])
-    spread = projected(inverse[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1)
+    spread = project_covariance(inverse[:, :9, :9], theta[:, :9]).diagonal(dim1=-2, dim2=-1).sum(-1)
     least = 1 / matrix[:, :9, :9].diagonal(dim1=-2, dim2=-1).mean(-1).clamp(min=torch.finfo(matrix.dtype).tiny)
     return inverse, spread > MAX_OPEN_VARIANCE_RATIO * least
 
 
-def projected(covariance: Tensor, vector: Tensor) -> Tensor:
+def project_covariance(covariance: Tensor, vector: Tensor) -> Tensor:
     """Covariance ``(*, k, k)`` of the direction of a vector ``(*, k)`` of any length."""
     length = vector.norm(dim=-1)[..., None, None].clamp(min=torch.finfo(vector.dtype).tiny)
     unit = unit_vectors(vector)

@@ -177,7 +177,7 @@ class Motion:
         if self.lift is None or MOTIONS.get(self.name) is self or tensor.width() > COUNTED:
             return views, tensor.minimal()
         lifts = self.centred(times)[0][: len(tensor.profile)]
-        return views, _counted(tensor.profile, self.sensor, tuple(tuple(map(tuple, lift)) for lift in lifts.tolist()))
+        return views, _count_matches(tensor.profile, self.sensor, tuple(tuple(map(tuple, lift)) for lift in lifts.tolist()))
 
     def least(self, times: Tensor | Sequence[float]) -> tuple[int, int]:
         """Fewest views and tracks of a reconstruction: :meth:`minimal`, and what tells two bodies apart."""
@@ -208,7 +208,7 @@ class Motion:
 
 
 @lru_cache(maxsize=64)
-def _counted(profile: tuple[int, ...], sensor: int, lifts: tuple[tuple[tuple[float, ...], ...], ...]) -> int:
+def _count_matches(profile: tuple[int, ...], sensor: int, lifts: tuple[tuple[tuple[float, ...], ...], ...]) -> int:
     """Matches that determine the tensor of views at random places with these lifts; what general ones take where none do."""
     k = len(lifts[0][0]) - 1
     tensor = GrassmannTensor(k, profile, sensor)
@@ -255,7 +255,7 @@ def polynomial_shift(dim: int, directions: int, degree: int = 1) -> Callable[[fl
     return shift
 
 
-def _declared(model: MotionModel) -> Motion:
+def _make_motion(model: MotionModel) -> Motion:
     """The motion of an entry of :mod:`~dyntorch.tasks.reconstruct.motion_models`."""
     shape = model.dim, model.directions, model.degree
     if model.bodies > 1:
@@ -270,10 +270,10 @@ def _declared(model: MotionModel) -> Motion:
     )
 
 
-MOTIONS: dict[str, Motion] = {model.name: _declared(model) for model in MOTION_MODELS}
+MOTIONS: dict[str, Motion] = {model.name: _make_motion(model) for model in MOTION_MODELS}
 """The declared models, see :mod:`~dyntorch.tasks.reconstruct.motion_models`.  ``constant_direction``: all points move along one
 common, unknown direction; ``planes``: within parallel planes."""
-_ALL = MOTIONS | {model.name: _declared(model) for model in AUXILIARY_MODELS}
+_ALL = MOTIONS | {model.name: _make_motion(model) for model in AUXILIARY_MODELS}
 
 
 def smaller_motion(smaller: SmallerModel) -> Motion:

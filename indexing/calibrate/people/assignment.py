@@ -119,7 +119,7 @@ def calibrated_pairs(views: Sequence[PieceView], clocks: Floats, calibration: Ca
     return out
 
 
-def _oriented(relations: dict[Pair, CameraPair], i: int, j: int, clock: tuple[float, float]) -> CameraPair | None:
+def _orient_pair(relations: dict[Pair, CameraPair], i: int, j: int, clock: tuple[float, float]) -> CameraPair | None:
     """The relation of i < j from one that may be of (j, i), with another clock."""
     if (i, j) in relations:
         return replace(relations[i, j], offset=clock[0], rate=clock[1])
@@ -134,7 +134,7 @@ def assign(views: Sequence[PieceView], clocks: Floats, relations: dict[Pair, Cam
     pairs = list(combinations(range(len(views)), 2))
     both = {(i, j): common_frames(views[i], views[j], *relative_clock(clocks, i, j)) for i, j in pairs}
     current = {
-        (i, j): relation for i, j in pairs if (relation := _oriented(relations, i, j, relative_clock(clocks, i, j))) is not None
+        (i, j): relation for i, j in pairs if (relation := _orient_pair(relations, i, j, relative_clock(clocks, i, j))) is not None
     }
     sorting = Assignment(views, current, np.zeros(0, dtype=np.int64))
     links, conflicts = _within_cameras(sorting)

@@ -26,7 +26,7 @@ from indexing.calibrate.people.pair_geometry import MIN_SEED_SECONDS, PieceView,
 from indexing.calibrate.people.result import Association, PeopleNotice, TrackExchange
 from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Floats, Integers, sightings, split_tracks
 from indexing.clip import Clip
-from indexing.joints import named, places
+from indexing.joints import has_names, places
 from indexing.sync.recordings import Take
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def _common_joints(everyone: Sequence[Sequence[Clip]], names: Sequence[str]) -> 
     widths = {one.joints.shape[1] for one in first}
     if len(widths) == 1 and len({skeleton.joints if skeleton is not None else None for skeleton in skeletons}) == 1:
         return [list(range(first[0].joints.shape[1]))] * len(first)
-    nameless = next((name for name, skeleton in zip(names, skeletons, strict=True) if not named(skeleton)), None)
+    nameless = next((name for name, skeleton in zip(names, skeletons, strict=True) if not has_names(skeleton)), None)
     if nameless is not None:
         if len(widths) == 1:
             return [list(range(first[0].joints.shape[1]))] * len(first)

@@ -307,7 +307,7 @@ def _best_move(scores: Floats, conflicts: Booleans, labels: Integers, piece: int
     reach = np.bincount(labels, weights=scores[piece], minlength=groups + 1)
     best, most = None, MIN_GAIN
     for other in range(groups + 1):
-        if other == own or (other < groups and reach[other] <= 0 and not _blocked(conflicts, labels, piece, other)):
+        if other == own or (other < groups and reach[other] <= 0 and not _is_blocked(conflicts, labels, piece, other)):
             continue
         changed, gain = exchange(scores, conflicts, labels, piece, other)
         if gain > most:
@@ -315,7 +315,7 @@ def _best_move(scores: Floats, conflicts: Booleans, labels: Integers, piece: int
     return None if best is None else _compact(best)
 
 
-def _blocked(conflicts: Booleans, labels: Integers, piece: int, other: int) -> bool:
+def _is_blocked(conflicts: Booleans, labels: Integers, piece: int, other: int) -> bool:
     return bool((conflicts[piece] & (labels == other)).any())
 
 

@@ -10,18 +10,18 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import worded
-from indexing.cli.console import check_report, count, ended, flag_words, names, progress, show
+from indexing.cli.console import check_report, count, finish, flag_words, names, progress, show
 from indexing.cli.flags.geometry import Align
 from indexing.cli.scenes import (
     Asked,
     as_matches,
-    calibrated,
     calibration_files,
     follow,
     inputs_of,
     is_scene,
     photographs,
     tracks_csv,
+    undistort_views,
 )
 from indexing.files import manifest
 from indexing.readers.matches import Matched, read_matches
@@ -72,7 +72,7 @@ def run(flags: Align) -> int:
         with progress("drawing the report", steps=False):
             page = write_alignment(folder, report)
     show(summarize(report))
-    return ended(page, None if report.status == "OK" else report.reason)
+    return finish(page, None if report.status == "OK" else report.reason)
 
 
 def _check(flags: Align) -> None:
@@ -143,7 +143,7 @@ def _solve(flags: Align, matched: Matched, model: str, threshold: float | None) 
         options["static"] = torch.from_numpy(matched.static)
     try:
         if model == "planar":
-            straight, matrices = calibrated(flags.calibration, torch.stack(views))
+            straight, matrices = undistort_views(flags.calibration, torch.stack(views))
             return dyntorch.align_planar(*straight, calibration=matrices, **options)
         if model == "lines":
             points = tuple(torch.from_numpy(part) for part in matched.static_points)

@@ -27,7 +27,7 @@ from indexing.cli.console import (
     check_report,
     complain,
     count,
-    counted,
+    counting_bar,
     names,
     one_line,
     progress,
@@ -36,9 +36,9 @@ from indexing.cli.console import (
 )
 from indexing.cli.flags.archive import Add, Find, Info, Remove, Search, Verify
 from indexing.cli.flags.shared import Example, Following, Reading
-from indexing.cli.inputs import CUT, assumed, parse_example, read_clips, watch_videos
-from indexing.cli.notes import remarks
-from indexing.cli.protocol import choose, known
+from indexing.cli.inputs import CUT, assumed_rate_notes, parse_example, read_clips, watch_videos
+from indexing.cli.notes import clip_notes
+from indexing.cli.protocol import choose, field_values
 from indexing.cli.videos import watch_options
 from indexing.clip import Clip
 from indexing.files import manifest, plain
@@ -74,7 +74,7 @@ def add(flags: Add) -> int:
         with workforce(1 if alone else flags.workers, flags.dask, len(found)) as executor, rate("adding", len(found)) as bar:
             done = archive.add(given, executor, bar, _options(flags.reading))
     except KeyboardInterrupt:
-        complain(f"interrupted; {_kept(archive, before)}")
+        complain(f"interrupted; {_kept_text(archive, before)}")
         return INTERRUPTED
     _added_show(done)
     say(f"{archive.path}: {_size(archive.info())}; took {time.perf_counter() - started:.1f} s")
@@ -279,7 +279,7 @@ def rate(what: str, number: int) -> Iterator[Progress]:
     if not number:
         yield lambda share: None
         return
-    with counted(what, "a second") as bar:
+    with counting_bar(what, "a second") as bar:
         if bar is not None:
             bar(0, number)
         yield lambda share: None if bar is None else bar(round(share * number), number)
@@ -331,10 +331,10 @@ def read_query(example: Example, reading: Reading, select: Sequence[str]) -> tup
         clips = clips[choose(clips, fields, "--select")]
     if len(clips) != 1:
         several = f"{example.path}: holds {count(len(clips), 'clip')}, and one is asked for"
-        raise ValueError(f"{several}; choose it with --select name=NAME, or by a field; {known(clips)}")
+        raise ValueError(f"{several}; choose it with --select name=NAME, or by a field; {field_values(clips)}")
     name = example.path.name if len(every) == 1 else f"{example.path.name}: {clips[0].name}"
     clip = clips[0].replace(name=name)
-    notes = remarks([clip], reading) + assumed([clip])
+    notes = clip_notes([clip], reading) + assumed_rate_notes([clip])
     start = clip.times[0] if example.start is None else example.start
     end = clip.times[-1] if example.end is None else example.end
     if example.start is not None or example.end is not None:
@@ -358,7 +358,7 @@ def _size(info: ArchiveInfo) -> str:
     return f"{count(info.sources, 'source')} ({_long(info.seconds)})"
 
 
-def _kept(archive: Archive, before: int) -> str:
+def _kept_text(archive: Archive, before: int) -> str:
     """What an interrupted addition leaves."""
     again = "the same command goes on from there"
     try:

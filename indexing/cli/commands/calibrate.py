@@ -12,7 +12,7 @@ from typing import Any
 from dyntorch.numerics import worded
 from indexing.calibrate import CameraRig, RigPriors, calibrate_recordings
 from indexing.calibrate.body_height import check_height
-from indexing.cli.console import check_folder, count, ended, flag_words, progress, show
+from indexing.cli.console import check_folder, count, finish, flag_words, progress, show
 from indexing.cli.flags.cameras import Calibrate
 from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import refuse_range
@@ -56,7 +56,7 @@ def run(flags: Calibrate) -> int:
             report = dataclasses.replace(report, manifest=made)
             page, report = write_calibration(folder, report)
     show(summarize(report, folder))
-    return ended(page, None if rig.ok else rig.reason)
+    return finish(page, None if rig.ok else rig.reason)
 
 
 def _check(flags: Calibrate) -> str | None:
@@ -123,7 +123,7 @@ def _read(flags: Calibrate, found: dict[str, Path], watched: Watched) -> list[Ta
         raise ValueError(worded(problem, WORDS)) from problem
 
 
-def _known(flags: Calibrate, cameras: int, clocks: str | None) -> RigPriors:
+def _rig_priors(flags: Calibrate, cameras: int, clocks: str | None) -> RigPriors:
 
     focal = _numbers(flags, "focal", cameras)
     return RigPriors(
@@ -144,7 +144,7 @@ def _solve(flags: Calibrate, takes: list[Take], clocks: str | None, watched: Wat
     people = flags.footage.people if flags.person == "everyone" else 1
     try:
         rig = calibrate_recordings(
-            takes, _known(flags, len(takes), clocks), sizes=_sizes(flags, len(takes)), people=people, words=WORDS
+            takes, _rig_priors(flags, len(takes), clocks), sizes=_sizes(flags, len(takes)), people=people, words=WORDS
         )
     except ValueError as problem:
         raise ValueError(worded(problem, WORDS)) from problem

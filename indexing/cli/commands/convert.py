@@ -10,11 +10,11 @@ from pathlib import Path
 from dyntorch.numerics import worded
 from indexing.cli.console import check_file, check_folder, count, flag_words, keep, names, progress, say
 from indexing.cli.flags.cameras import Convert
-from indexing.cli.inputs import assumed, read_clips
-from indexing.cli.notes import remarks
+from indexing.cli.inputs import assumed_rate_notes, read_clips
+from indexing.cli.notes import clip_notes
 from indexing.clip import Clip, ClipSet
 from indexing.files import prepare, write_bytes
-from indexing.opening import repeated
+from indexing.opening import first_duplicate
 from indexing.recordings.people import of_recording, tracked_people
 from indexing.registry import format_names
 from indexing.writers import encode, suffixes_with_units
@@ -74,7 +74,7 @@ def _single(flags: Convert) -> bool:
 def _read(flags: Convert, path: Path) -> tuple[list[Clip], list[str]]:
     """The clips of a file, and what a reader should know: of a recording, those of its people."""
     clips = list(read_clips(flags.reading, path))
-    notes = remarks(clips, flags.reading) + assumed(clips)
+    notes = clip_notes(clips, flags.reading) + assumed_rate_notes(clips)
     if not of_recording(clips):
         return clips, notes
     crowd = tracked_people(clips, path.stem or path.resolve().name)
@@ -114,7 +114,7 @@ def _parts(flags: Convert, found: Sequence[tuple[Path, list[Clip]]], folder: Pat
         parts += [(stem, clips)] if together else [(f"{stem}-{i + 1:04d}", [clip]) for i, clip in enumerate(clips)]
     times = Counter(stem for stem, _ in parts)
     stems = [stem if times[stem] == 1 else f"{stem}-{i + 1}" for i, (stem, _) in enumerate(parts)]
-    twice = repeated(stems)
+    twice = first_duplicate(stems)
     if twice is not None:
         raise ValueError(f"{folder}: two recordings would be {twice}.{flags.to}; rename one, or convert them one by one")
     return [(folder / f"{stem}.{flags.to}", clips) for stem, (_, clips) in zip(stems, parts, strict=True)]

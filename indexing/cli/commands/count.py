@@ -40,7 +40,7 @@ def run(flags: Count) -> int:
         if name not in counting.CONFIGURATIONS:
             raise ValueError(f"unknown configuration {flags.configuration!r}; known are {', '.join(counting.CONFIGURATIONS)}")
         result = counting.count(name, seed=flags.seed, **given)
-        _print(flags, result, purpose(name), unique="profile" in counting.options_of(name), most=_most(flags, name, given))
+        _print(flags, result, purpose(name), unique="profile" in counting.options_of(name), most=_max_counts(flags, name, given))
     elif general:
         _print_general(flags, given)
     else:
@@ -55,7 +55,7 @@ def _print_dimension(flags: Count, n: int, m: int, k: int) -> None:
     say(json.dumps({"n": n, "m": m, "k": k, "dim_v": dimension}) if flags.json else f"dim V({n}, {m}, {k}) = {dimension}")
 
 
-def _most(flags: Count, name: str, given: dict[str, Any]) -> dict[str, int]:
+def _max_counts(flags: Count, name: str, given: dict[str, Any]) -> dict[str, int]:
     """How many matches of each kind that was given count at most."""
     asked = [option for option in counting.options_of(name) if option in given and option in (*CONFINED, *CONFINED_MORE)]
     if not asked:

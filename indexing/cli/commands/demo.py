@@ -12,7 +12,7 @@ from indexing.demo import Demonstration, demonstrate, report
 from indexing.examples import write_examples
 from indexing.files import manifest
 from indexing.report import write_recognition
-from indexing.report.results import frame_accuracy, missed
+from indexing.report.results import frame_accuracy, missed_actions
 
 
 def run(flags: Demo) -> int:
@@ -56,7 +56,7 @@ def _show(shown: Demonstration) -> None:
     known = stream.truth or ()
     say(
         f"Searched {stream.duration:.0f} s of another person, camera turned by {shown.stream_azimuth:g} degrees: "
-        f"{len(known) - len(missed(stream))} of {count(len(known), 'known action')} found, {len(stream.events)} reported; "
+        f"{len(known) - len(missed_actions(stream))} of {count(len(known), 'known action')} found, {len(stream.events)} reported; "
         f"{frame_accuracy(stream):.0%} of the frames in known actions are right."
     )
     times = shown.timings

@@ -18,7 +18,7 @@ from indexing.cli.commands.suggest import TIER
 from indexing.cli.console import Progress, check_report, count, names, progress, say, table
 from indexing.cli.flags.index import Evaluate, Scan
 from indexing.cli.flags.shared import Labelling
-from indexing.cli.inputs import assumed, read_clips, usable
+from indexing.cli.inputs import assumed_rate_notes, read_clips, usable
 from indexing.cli.labels import check_labelling, lasting, of_medium, open_marked
 from indexing.cli.protocol import Cameras, Fold, Viewing, check_classes, check_dims, draw_shots, splits, strangers
 from indexing.cli.videos import AsTheyAre, are_films, frame_rate, pixel_indexer, read_set, refuse_film_flags, refuse_keypoint_flags
@@ -26,7 +26,7 @@ from indexing.clip import LabelledSet
 from indexing.comparing import NONE, Agreement, ComparedSpan, compare
 from indexing.files import manifest
 from indexing.labels import Label, choose_labels
-from indexing.opening import error, listed
+from indexing.opening import error, listing
 from indexing.report import EvaluationResult, RecognitionReport, write_recognition
 from indexing.report.agreement import FILES, AgreementReport, label_rows, overlap_rows, write_agreement
 from indexing.report.recognition import duration
@@ -43,7 +43,7 @@ def run(flags: Evaluate) -> int:
     folder = check_report(flags.report, [path(flags)])
     started = time.perf_counter()
     with progress("loading", steps=False):
-        clips, cameras, notes = _films(flags) if are_films([path(flags)]) else _load(flags)
+        clips, cameras, notes = _read_videos(flags) if are_films([path(flags)]) else _load(flags)
         folds, warned = splits(clips, flags.train, flags.test, flags.leave_out)
         labels = clips.labels.astype(str)
         check_classes(folds, labels, clips.name)
@@ -82,7 +82,7 @@ def path(flags: Evaluate) -> Path:
     return flags.clips[0]
 
 
-def _films(flags: Evaluate) -> tuple[LabelledSet[Any], Viewing, list[str]]:
+def _read_videos(flags: Evaluate) -> tuple[LabelledSet[Any], Viewing, list[str]]:
 
     refuse_keypoint_flags(flags, "camera", "azimuth", "exemplars", "view", "weights", "mirror")
     return read_set(path(flags), flags.reading), AsTheyAre(), []
@@ -96,7 +96,7 @@ def _load(flags: Evaluate) -> tuple[LabelledSet[Any], Viewing, list[str]]:
         raise ValueError(f"{path(flags)}: says nothing of the actions; give a clip set with 'action' (and 'action_names')")
     clips, notes = usable(clips, path(flags))
     cameras = Cameras(flags.camera, _azimuths(flags), flags.exemplars == "3d", flags.seed)
-    return clips, cameras, notes + assumed(clips, path(flags)) + check_dims(clips, cameras)
+    return clips, cameras, notes + assumed_rate_notes(clips, path(flags)) + check_dims(clips, cameras)
 
 
 def _azimuths(flags: Evaluate) -> tuple[float, ...]:
@@ -271,12 +271,12 @@ def _of_files(command: Evaluate) -> _Compared:
         known, _, notes = _side(command.labelling, other, command, False)
         found, media, said = _side(theirs, path, command, True)
     notes += said
-    known = _renamed(known, command.labelling, other)
-    spans, said = _paired(known, found, media, (other, path))
-    return _Compared(spans, _called(other, path, command), notes + said, {})
+    known = _rename_labels(known, command.labelling, other)
+    spans, said = _pair_spans(known, found, media, (other, path))
+    return _Compared(spans, _side_names(other, path, command), notes + said, {})
 
 
-def _called(known: Path, found: Path, command: Evaluate) -> tuple[str, str]:
+def _side_names(known: Path, found: Path, command: Evaluate) -> tuple[str, str]:
     """Names of the two sides that differ."""
     if known.name != found.name:
         return known.name, found.name
@@ -295,7 +295,7 @@ def _side(labelling: Labelling, path: Path, command: Evaluate, detections: bool)
     looked = [one for one in file.watched if one[0] in programs]
     said = []
     if detections and not asked and (ours or looked):
-        which = f"what a program found ({listed(sorted(programs))}); --found-tier, --found-observation choose others"
+        which = f"what a program found ({listing(sorted(programs))}); --found-tier, --found-observation choose others"
         said = [f"{path}: compared is {which}"] * (len(ours) < len(file.labels))
         file = replace(file, labels=tuple(ours), watched=tuple(looked))
     media = list(dict.fromkeys([*(one.media for one in file.labels), *(medium for _, medium in file.watched)])) or [""]
@@ -311,19 +311,19 @@ def _side(labelling: Labelling, path: Path, command: Evaluate, detections: bool)
     return labels, media, [f"{path}: {note}" for note in file.notices] + said
 
 
-def _renamed(labels: Sequence[Label], labelling: Labelling, path: Path) -> list[Label]:
+def _rename_labels(labels: Sequence[Label], labelling: Labelling, path: Path) -> list[Label]:
     """Labels of the subjects that were asked for, under the names that they have on the other side."""
     if not labelling.subject:
         return list(labels)
     there = list(dict.fromkeys(one.subject for one in labels))
     strange = next((subject for subject in labelling.people if subject not in there), None)
     if strange is not None:
-        raise error(path, f"has no label of the subject {strange!r}, only of {listed(there)}", "give one of these (--subject)")
+        raise error(path, f"has no label of the subject {strange!r}, only of {listing(there)}", "give one of these (--subject)")
     people = labelling.people
     return [replace(one, subject=people[one.subject] or one.subject) for one in labels if one.subject in people]
 
 
-def _paired(
+def _pair_spans(
     known: Sequence[Label], found: Sequence[Label], media: Sequence[str], paths: tuple[Path, Path]
 ) -> tuple[list[ComparedSpan], list[str]]:
     """What is compared: each recording that both sides know, from 0 to where its last label ends, subject by subject."""
@@ -357,12 +357,12 @@ def _recordings(
         if not same and searched != [medium] and not any(one.media == medium for one in found):
             continue  # nothing is known of it, and nothing was found
         if not same:
-            said = f"is of {medium or 'a recording without a name'}, and {paths[0]} of {listed(media[0])}"
+            said = f"is of {medium or 'a recording without a name'}, and {paths[0]} of {listing(media[0])}"
             raise error(paths[1], said, "compare labels of the same recordings, under the same names")
         mine = out.setdefault(same[0], ([one for one in known if one.media == same[0]], []))
         mine[1].extend(one for one in found if one.media == medium)
     if not out:
-        said = f"is of {listed(searched)}, and {paths[0]} of {listed(media[0])}"
+        said = f"is of {listing(searched)}, and {paths[0]} of {listing(media[0])}"
         raise error(paths[1], said, "compare labels of the same recordings, under the same names")
     return out, [name for name in media[0] if name not in out]
 
@@ -375,7 +375,7 @@ def _subjects(
     if any(set(side) <= {""} for side in sides):
         return {"": (list(known), list(found))}
     if not set(sides[0]) & set(sides[1]):
-        both = [listed([name or "(nobody)" for name in side.values()]) for side in sides]
+        both = [listing([name or "(nobody)" for name in side.values()]) for side in sides]
         raise error(
             paths[1], f"is of {both[1]}, and {paths[0]} of {both[0]}: no subject in common",
             "say who is who, as in --subject Ann=1",

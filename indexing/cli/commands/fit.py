@@ -61,7 +61,7 @@ def run(flags: Fit) -> int:
     notes += _other_movement(indexer)
     for note in notes:
         say(f"note: {note}")
-    code = _written(output, seconds)
+    code = _report_written(output, seconds)
     if page is not None:
         say(f"report: {page}")
     return code
@@ -113,7 +113,7 @@ def _from_pixels(flags: Fit, examples: list[Example], output: Path) -> int:
     table(["action", "examples ", "seconds "], lines)
     for note in [*notes, f"learned from pixels, at {indexer.fps:.3g} frames per second"]:
         say(f"note: {note}")
-    return _written(output, time.perf_counter() - started)
+    return _report_written(output, time.perf_counter() - started)
 
 
 def _check_two(labels: Sequence[str], examples: Sequence[Example]) -> None:
@@ -131,7 +131,7 @@ def _other_movement(indexer: ActionIndexer) -> list[str]:
     return [f"told from a background of {count(clips, 'clip')} in {count(model.hidden, 'kind')}, which are never reported"]
 
 
-def _written(output: Path, seconds: float) -> int:
+def _report_written(output: Path, seconds: float) -> int:
     say(f"learned in {seconds:.1f} s; model written to {output} ({max(1, round(output.stat().st_size / 1000)):,} kB)")
     return 0
 

@@ -13,13 +13,12 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import worded
-from indexing.cli.console import check_report, count, ended, flag_words, show
+from indexing.cli.console import check_report, count, finish, flag_words, show
 from indexing.cli.console import progress as progress_of
 from indexing.cli.flags.geometry import Reconstruct
 from indexing.cli.scenes import (
     Asked,
     as_tracks,
-    calibrated,
     calibration_files,
     follow,
     inputs_of,
@@ -27,6 +26,7 @@ from indexing.cli.scenes import (
     is_video,
     photographs,
     tracks_csv,
+    undistort_views,
 )
 from indexing.files import manifest
 from indexing.readers.tracks import TrackSet, exact, read_tracks
@@ -53,8 +53,8 @@ def run(flags: Reconstruct) -> int:
     with progress_of("reading", steps=False):
         frames = None if flags.frames is None else [word.strip() for word in flags.frames.split(",")]
         followed = follow(flags.files, asked, missing=True, fps=flags.fps) if scene else None
-        filmed = as_tracks(followed, flags.files[0], _filmed(flags)) if followed else None
-        tracks = _timed(flags, filmed or read_tracks(flags.files, frames=frames, key=flags.key, static=flags.static))
+        filmed = as_tracks(followed, flags.files[0], _has_frame_times(flags)) if followed else None
+        tracks = _with_times(flags, filmed or read_tracks(flags.files, frames=frames, key=flags.key, static=flags.static))
     read = time.perf_counter()
     with progress_of(f"reconstructing {count(len(tracks.ids), 'track')}", steps=False):
         result = _solve(flags, tracks)
@@ -64,7 +64,7 @@ def run(flags: Reconstruct) -> int:
         result=result,
         tracks=tracks,
         threshold=None if limit == math.inf else limit,
-        notes=[*tracks.notes, *unfixed(tracks, result)],
+        notes=[*tracks.notes, *open_motion_notes(tracks, result)],
         words=WORDS,
         manifest=manifest({"command": "reconstruct", **dataclasses.asdict(flags)}, inputs, flags.seed, timings),
         photograph=photographs(followed)[0] if followed else None,
@@ -75,7 +75,7 @@ def run(flags: Reconstruct) -> int:
         with progress_of("drawing the report", steps=False):
             page = write_reconstruction(folder, report)
     show(summarize(report))
-    return ended(page, None if report.status == "OK" else report.reason)
+    return finish(page, None if report.status == "OK" else report.reason)
 
 
 def _check(flags: Reconstruct) -> None:
@@ -97,11 +97,11 @@ def _check_scene(flags: Reconstruct, scene: bool, asked: Asked) -> None:
     for flag in ("key", "static"):
         if scene and getattr(flags, flag) is not None:
             raise ValueError(f"--{flag} is of files of tracks, and a video or pictures are given; leave it out")
-    if scene and flags.fps is not None and _filmed(flags):
+    if scene and flags.fps is not None and _has_frame_times(flags):
         raise ValueError(f"--fps {flags.fps:g}: a video has the times of its frames; leave it out")
 
 
-def _filmed(flags: Reconstruct) -> bool:
+def _has_frame_times(flags: Reconstruct) -> bool:
     """Whether the frames have times of their own, or a rate that was given."""
     return is_video(flags.files[0])
 
@@ -120,7 +120,7 @@ def _limit(flags: Reconstruct) -> float | None:
     return limit
 
 
-def _timed(flags: Reconstruct, tracks: TrackSet) -> TrackSet:
+def _with_times(flags: Reconstruct, tracks: TrackSet) -> TrackSet:
     """The tracks with times that begin at 0, and what to say about them."""
     notes = []
     if flags.times is not None:
@@ -143,7 +143,7 @@ def _timed(flags: Reconstruct, tracks: TrackSet) -> TrackSet:
 
 def _solve(flags: Reconstruct, tracks: TrackSet) -> Any:
     """The reconstruction, by the library."""
-    values, matrices = calibrated(flags.calibration, torch.from_numpy(tracks.values))
+    values, matrices = undistort_views(flags.calibration, torch.from_numpy(tracks.values))
     try:
         return dyntorch.reconstruct(
             values,
@@ -159,7 +159,7 @@ def _solve(flags: Reconstruct, tracks: TrackSet) -> Any:
         raise ValueError(f"{tracks.path}: {worded(problem, WORDS)}") from problem
 
 
-def unfixed(tracks: TrackSet, result: Any) -> list[str]:
+def open_motion_notes(tracks: TrackSet, result: Any) -> list[str]:
     """That a motion common to all points is open, where it is."""
     known = tracks.static is not None and bool(tracks.static.any())
     decided = int(result.status) == 0 and result.velocities is not None and not result.motion.static

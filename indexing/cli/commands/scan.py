@@ -26,7 +26,7 @@ from indexing.readers.formats.clipset import holds_frames
 from indexing.recordings.repetitions import count_repetitions
 from indexing.report import RecognitionReport, RecordingResult, write_recognition
 from indexing.report.page import even
-from indexing.report.results import COUNTS, by_recording, count_row, held_sentences, matched, missed
+from indexing.report.results import COUNTS, by_recording, count_matches, count_row, held_sentences, missed_actions
 from indexing.report.results import seconds as lasts
 from indexing.scoring import Event
 
@@ -69,11 +69,11 @@ def search(flags: Scan) -> tuple[Any, list[RecordingResult], list[str], dict[str
     """The model, what it finds in each recording, person by person, what to know of that, and the seconds it took."""
     started = time.perf_counter()
     with progress("loading", steps=False):
-        indexer, recordings, notes = _films(flags) if _of_films(flags) else _clips(flags)
+        indexer, recordings, notes = _read_videos(flags) if _of_films(flags) else _clips(flags)
     if flags.reject is not None:
         indexer.set_params(reject=flags.reject)
     names, people = [one.name for one in recordings], [getattr(one, "person", "") for one in recordings]
-    truth, unread = _known(flags, recordings, names, people)
+    truth, unread = _known_labels(flags, recordings, names, people)
     notes = notes + unread + _unknown(truth, indexer)
     if truth is not None:
         notes += on_truth(truth, recordings)
@@ -85,7 +85,7 @@ def search(flags: Scan) -> tuple[Any, list[RecordingResult], list[str], dict[str
     return indexer, results, notes, {"load": loaded - started, "scan": time.perf_counter() - loaded}
 
 
-def _known(
+def _known_labels(
     flags: Scan, recordings: Sequence[Any], names: list[str], people: list[str]
 ) -> tuple[list[list[KnownEvent] | None] | None, list[str]]:
     """What is known to have happened in each recording, person by person, where anything is."""
@@ -120,7 +120,7 @@ def _clips(flags: Scan) -> tuple[ActionIndexer, list[Lane], list[str]]:
     return indexer, lanes, [*reading.watched.notes, *notes, *on_classes([str(label) for label in indexer.classes_])]
 
 
-def _films(flags: Scan) -> tuple[BrightnessIndexer, list[FilmRecording], list[str]]:
+def _read_videos(flags: Scan) -> tuple[BrightnessIndexer, list[FilmRecording], list[str]]:
 
     if flags.rest != "usual":
         raise ValueError(
@@ -203,7 +203,7 @@ def _scan_show(results: list[RecordingResult]) -> None:
     """The events as a table, with the recording and the person where there are several."""
     found = [(result, event) for result in results for event in result.events]
     scores, margins = even([event.score for _, event in found]), even([event.margin for _, event in found])
-    columns, whose = _whose(results)
+    columns, whose = _person_headings(results)
     rows = [
         [*whose(result), str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
         for (result, event), score, margin in zip(found, scores, margins, strict=True)
@@ -214,13 +214,13 @@ def _scan_show(results: list[RecordingResult]) -> None:
 
 def _counts_show(results: list[RecordingResult]) -> None:
     """How often each action was performed, and how."""
-    columns, whose = _whose(results)
+    columns, whose = _person_headings(results)
     rows = [[*whose(result), *count_row(one)] for result in results for one in result.repetitions or ()]
     if rows:
         table([*columns, *COUNTS], rows)
 
 
-def _whose(results: Sequence[RecordingResult]) -> tuple[list[str], Callable[[RecordingResult], list[str]]]:
+def _person_headings(results: Sequence[RecordingResult]) -> tuple[list[str], Callable[[RecordingResult], list[str]]]:
     """Headings that tell recordings and people apart, where there are several, and a result's cells below them."""
     named = {"recording": len({result.name for result in results}) > 1, "person": any(result.person for result in results)}
     columns = [name for name, wanted in named.items() if wanted]
@@ -239,7 +239,7 @@ def _summary(results: list[RecordingResult], seconds: float) -> str:
 
 def _against_truth(results: list[RecordingResult]) -> str:
     """How many of the known actions an event of the same name overlaps, and which are missed."""
-    lost = [(result, event) for result in results for event in missed(result)]
+    lost = [(result, event) for result in results for event in missed_actions(result)]
     known = sum(len(result.truth or ()) for result in results)
     named = ", ".join(f"{label} at {start:.2f} to {end:.2f} s" for _, (label, start, end) in lost[:5])
     more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
@@ -249,7 +249,7 @@ def _against_truth(results: list[RecordingResult]) -> str:
 def _right(results: list[RecordingResult]) -> list[str]:
     """Precision and recall of what was reported, where both times overlap by half or more."""
     compared = [result for result in results if result.truth is not None]
-    right, said = sum(map(matched, compared)), sum(len(result.events) for result in compared)
+    right, said = sum(map(count_matches, compared)), sum(len(result.events) for result in compared)
     known = sum(len(result.truth or ()) for result in compared)
     shares = [f"{name} {right / number:.3f}" for name, number in (("precision", said), ("recall", known)) if number]
     return [f"{right} of {said} reported share half of their time or more with a known one ({', '.join(shares)})"] * bool(shares)

@@ -14,7 +14,7 @@ import dyntorch
 from dyntorch.numerics import worded
 from indexing.cli.commands.segment_colmap import ColmapJob, run_colmap
 from indexing.cli.commands.segment_tracks import LEAST, BodiesJob, Given, read_given, run_bodies, unit_notes
-from indexing.cli.console import check_report, count, ended, flag_words, progress, show
+from indexing.cli.console import check_report, count, finish, flag_words, progress, show
 from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import LEFT_OUT, PICTURE_FILES, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
 from indexing.files import manifest
@@ -122,7 +122,7 @@ def _two_views(flags: Segment, files: list[Path], scene: bool, asked: Asked, giv
         with progress("drawing the report", steps=False):
             page = write_segmentation(folder, report)
     show(summarize(report))
-    return ended(page, None if report.status == "OK" else report.reason)
+    return finish(page, None if report.status == "OK" else report.reason)
 
 
 def _pair(

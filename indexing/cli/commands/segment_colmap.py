@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from indexing.archive.workers import QuietProcesses
-from indexing.cli.console import check_folder, check_report, count, counted, ended, keep, names, progress, show
+from indexing.cli.console import check_folder, check_report, count, counting_bar, finish, keep, names, progress, show
 from indexing.colmap import MatchDatabase, check_target, find_static, read_database
 from indexing.colmap.masks import write_masks
 from indexing.colmap.pair_segmentation import colmap
@@ -56,7 +56,7 @@ def run_colmap(job: ColmapJob, arguments: Mapping[str, Any]) -> int:
         colmap()
         shown, notes = _photographs(held, job.images)
     read = time.perf_counter()
-    with counted(f"segmenting {count(len(held.pairs), 'pair')}", "pairs/s") as told, _workforce(len(held.pairs)) as executor:
+    with counting_bar(f"segmenting {count(len(held.pairs), 'pair')}", "pairs/s") as told, _workforce(len(held.pairs)) as executor:
         found = find_static(held, job.threshold, job.spatial, job.seed, progress=told, executor=executor)
     timings = {"read": read - started, "segment": time.perf_counter() - read}
     if found.ok:
@@ -75,7 +75,7 @@ def run_colmap(job: ColmapJob, arguments: Mapping[str, Any]) -> int:
     with progress("drawing the report", steps=False):
         page = write_report(folder, report)
     show(summarize(report))
-    return ended(page, None if found.ok else found.reason)
+    return finish(page, None if found.ok else found.reason)
 
 
 def _workforce(pairs: int) -> contextlib.AbstractContextManager[Executor | None]:

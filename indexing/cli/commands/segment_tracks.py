@@ -14,7 +14,7 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import worded
-from indexing.cli.console import check_report, count, ended, flag_words, progress, show
+from indexing.cli.console import check_report, count, finish, flag_words, progress, show
 from indexing.cli.scenes import Asked, as_tracks, follow_whole, inputs_of, is_video, photographs, source_of
 from indexing.files import manifest
 from indexing.readers.pairs import MatchedPair, Photograph
@@ -101,10 +101,10 @@ def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str
     """Segment, draw, write, and say what was found."""
     folder = check_report(job.out, job.inputs, WRITTEN)
     tracks = given.tracks
-    notes = [*tracks.notes, *checked(tracks, job)]
+    notes = [*tracks.notes, *check_tracks(tracks, job)]
     pictures = Pictures.of(job, given)
     started = time.perf_counter()
-    seen = int((_seen(tracks) > 1).sum())
+    seen = int((_frame_counts(tracks) > 1).sum())
     with progress(f"segmenting {count(seen, 'track')}", steps=False):
         result = solve(tracks, job)
     timings = {"read": read, "segment": time.perf_counter() - started}
@@ -124,14 +124,14 @@ def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str
                 report = pictures.filmed(report)
             page = write_bodies(folder, report)
     show(summarize(report))
-    return ended(page, None if report.status == "OK" else report.reason)
+    return finish(page, None if report.status == "OK" else report.reason)
 
 
-def checked(tracks: TrackSet, job: BodiesJob) -> list[str]:
+def check_tracks(tracks: TrackSet, job: BodiesJob) -> list[str]:
     """What to say about the input."""
     values = flat(tracks)
     number = len(tracks.ids)
-    short = int((_seen(tracks) < 2).sum())
+    short = int((_frame_counts(tracks) < 2).sum())
     if short == number:
         said = f"{tracks.path}: none of its {number} tracks is seen in two frames"
         raise ValueError(f"{said}; a point keeps its id from frame to frame, check the column id")
@@ -157,7 +157,7 @@ def unit_notes(path: str, extent: float, threshold: float | None, auto: bool = T
     return [f"{said}; if they are not in pixels, give --threshold in their unit{', or auto' * auto}"]
 
 
-def _seen(tracks: TrackSet) -> Any:
+def _frame_counts(tracks: TrackSet) -> Any:
     """``(n,)`` in how many frames each track is seen."""
     return np.isfinite(tracks.values).all(axis=-1).sum(axis=0)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import dyntorch
 from dyntorch.numerics import Message, worded
-from indexing.cli.console import check_report, count, ended, flag_words, names, progress, say, show
+from indexing.cli.console import check_report, count, finish, flag_words, names, progress, say, show
 from indexing.cli.flags.cameras import Sync
 from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import refuse_range
@@ -59,7 +59,7 @@ def run(flags: Sync) -> int:
     trial = None if home is None else trial_of(home)
     if trial is None and home is not None and (inner := trials_in(home)):
         return _session(flags, home, inner)
-    return _one(flags, find_cameras(paths) if trial is None else trial.cameras, trial)
+    return _sync_scene(flags, find_cameras(paths) if trial is None else trial.cameras, trial)
 
 
 def _session(flags: Sync, home: Path, trials: list[Path]) -> int:
@@ -72,7 +72,7 @@ def _session(flags: Sync, home: Path, trials: list[Path]) -> int:
     return max(codes)
 
 
-def _one(flags: Sync, found: dict[str, Path], trial: Trial | None) -> int:
+def _sync_scene(flags: Sync, found: dict[str, Path], trial: Trial | None) -> int:
     """The cameras of one scene."""
     inputs = [*found.values(), *([flags.calibration.expanduser()] if flags.calibration else [])]
     out = trial.folder if trial is not None and flags.out is None else flags.out
@@ -89,18 +89,18 @@ def _one(flags: Sync, found: dict[str, Path], trial: Trial | None) -> int:
     with progress("reading", steps=False):
         takes = _read(flags, found, by, watched, trial)
         _check_spatial(takes, folder, inputs)
-        films = _films(flags, takes)
+        films = _camera_videos(flags, takes)
     read = time.perf_counter()
     pairs = len(takes) * (len(takes) - 1) // 2
     with progress(f"comparing {count(pairs, 'pair')} of cameras") as done:
-        report = _mended(flags, _solve(flags, takes, done, trial), done, trial)
+        report = _repair_clocks(flags, _solve(flags, takes, done, trial), done, trial)
     timings = {"read": read - started, "synchronize": time.perf_counter() - read}
     page = None
     if folder is not None:
         made = manifest({"command": "sync", **dataclasses.asdict(flags)}, inputs, None, timings)
         report, page = _write(flags, folder, dataclasses.replace(report, manifest=made), films, trial is not None)
     show(summarize(report, folder))
-    return ended(page, None if report.ok else report.reason)
+    return finish(page, None if report.ok else report.reason)
 
 
 def _check(flags: Sync) -> None:
@@ -150,7 +150,7 @@ def _method(flags: Sync) -> Method:
     return "sound" if flags.footage.by == "sound" else flags.method
 
 
-def _films(flags: Sync, takes: list[Take]) -> list[CameraVideo] | None:
+def _camera_videos(flags: Sync, takes: list[Take]) -> list[CameraVideo] | None:
     """The videos to cut, looked for before the work."""
     return [video_of(take) for take in takes if not take.spatial] if flags.videos else None
 
@@ -173,7 +173,7 @@ def _read(flags: Sync, found: dict[str, Path], by: By, watched: Watched, trial: 
         raise ValueError(worded(problem, WORDS)) from problem
 
 
-def _mended(flags: Sync, report: SyncReport, done: Any, trial: Trial | None = None) -> SyncReport:
+def _repair_clocks(flags: Sync, report: SyncReport, done: Any, trial: Trial | None = None) -> SyncReport:
     """The report, where clocks broke with what is found when they are mended."""
     if not flags.breaks or _method(flags) not in ("auto", "keypoints"):
         return report
@@ -314,7 +314,7 @@ def _write_poses(folder: Path, report: SyncReport, trial: bool) -> tuple[SyncRep
     notes = early(list(plans.values()), first.name)
     if trial and first is not report.reference:
         notes.append(f"frame numbers in pose-sync are those of {first.name}, the shortest recording, as in Pose2Sim")
-    return dataclasses.replace(report, shifted={i: _shifted(one) for i, one in plans.items()}), notes
+    return dataclasses.replace(report, shifted={i: _frame_shift(one) for i, one in plans.items()}), notes
 
 
 def early(plans: list[Plan], reference: str) -> list[str]:
@@ -323,7 +323,7 @@ def early(plans: list[Plan], reference: str) -> list[str]:
     return [f"{names(said)} left out of pose-sync: taken before number 0 of {reference}"] if said else []
 
 
-def _shifted(one: Plan) -> dict[str, Any]:
+def _frame_shift(one: Plan) -> dict[str, Any]:
     return {
         "folder": f"pose-sync/{folder_of(one.take)}", "files": len(one.numbers), "shift": one.shift, "rest": one.rest,
         "repeated": one.repeated, "left_out": one.before,

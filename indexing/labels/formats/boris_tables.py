@@ -16,7 +16,7 @@ from indexing.labels.format import NUM_HEADER_ROWS, Gathering, LabelFormat, Requ
 from indexing.labels.formats.boris.project import MACHINE, Entry, Interval, join_comments, split_score
 from indexing.labels.label import LabelFile
 from indexing.labels.media import Span, base_name, of_recording, split_by_media
-from indexing.opening import Row, count, error, listed, shown
+from indexing.opening import Row, count, error, listing, shown
 
 COLUMNS = {
     "observation": ("observation id",),
@@ -165,7 +165,7 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
     if sitting.timeless:
         out.note(f"{where}: {count(sitting.timeless, 'event')} left out: of pictures without a time")
     if mine is not None and mine & set(sitting.beside) and not mine & set(sitting.files):
-        said = f"{where} plays {listed(mine)} beside {listed(sitting.files)}, and the table does not say how they are shifted"
+        said = f"{where} plays {listing(mine)} beside {listing(sitting.files)}, and the table does not say how they are shifted"
         raise error(out.asked.path, said, "give the project (.boris)")
     spans = _spans(sitting)
     lost: Counter[str] = Counter()

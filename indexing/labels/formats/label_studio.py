@@ -17,7 +17,7 @@ from indexing.files import write_json
 from indexing.labels.format import Gathering, LabelFormat, Request, Target, parse_whole, text_of
 from indexing.labels.label import Label, LabelFile, in_order
 from indexing.labels.media import base_name
-from indexing.opening import clipped, count, error, shown
+from indexing.opening import clip_text, count, error, shown
 
 REMEDY = "export it again from Label Studio as JSON"
 SOUND = ("labels", "timeserieslabels")
@@ -38,9 +38,9 @@ def read(data: Any, asked: Request) -> LabelFile:
         for who, machine, region in _regions(out, task, f"task {number}"):
             if machine:
                 out.machine.setdefault(who)
-            _region(out, region, media, who, f"task {number}, region {clipped(text_of(region.get('id')), 20) or '?'}", other)
+            _region(out, region, media, who, f"task {number}, region {clip_text(text_of(region.get('id')), 20) or '?'}", other)
     if other:
-        kinds = ", ".join(f"{clipped(kind, 20) or 'without a type'}: {times}" for kind, times in other.most_common(3))
+        kinds = ", ".join(f"{clip_text(kind, 20) or 'without a type'}: {times}" for kind, times in other.most_common(3))
         out.note(f"{count(sum(other.values()), 'region')} left out: they mark no time ({kinds})")
     return out.finish()
 

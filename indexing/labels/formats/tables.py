@@ -17,7 +17,7 @@ from typing import Any
 from indexing.files import write_text
 from indexing.labels.format import Gathering, LabelFormat, Request, Target, parse_seconds, parse_whole
 from indexing.labels.label import Label, LabelFile, in_order
-from indexing.opening import Row, clipped, error, listed, shown
+from indexing.opening import Row, clip_text, error, listing, shown
 
 COLUMNS = {
     "label": ("label", "action", "behavior", "behaviour", "class", "event", "code", "annotation", "value"),
@@ -81,7 +81,7 @@ def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
         else:
             lacking += [name for name in ("start", "end") if name not in found]
     if lacking:
-        raise error(path, f"has no column {lacking[0]!r} (the first line has {listed(header, 5)})", FORM)
+        raise error(path, f"has no column {lacking[0]!r} (the first line has {listing(header, 5)})", FORM)
     return found
 
 
@@ -123,7 +123,7 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
     notices: dict[str, None] = {}
     for label in sorted(labels, key=in_order):
         if any("|" in modifier for modifier in label.modifiers):
-            notices[f"modifiers with | become several ({clipped(label.modifiers, 40)})"] = None
+            notices[f"modifiers with | become several ({clip_text(label.modifiers, 40)})"] = None
         table.writerow([_cell(getattr(label, name)) for name in filled])
     write_text(target.path, stream.getvalue())
     return list(notices)

@@ -17,7 +17,7 @@ from indexing.files import write_json
 from indexing.labels.format import NUM_HEADER_ROWS, Gathering, LabelFormat, Request, Target, text_of
 from indexing.labels.label import Label, LabelFile, in_order
 from indexing.labels.media import base_name, of_recording
-from indexing.opening import Row, clipped, count, error, parse_json, read_text, shown
+from indexing.opening import Row, clip_text, count, error, parse_json, read_text, shown
 
 REMEDY = "save or export it again from VIA 3"
 MACHINE = "dyntorch"  # the description of attributes that a program wrote
@@ -60,7 +60,7 @@ def _read_project(out: Gathering, data: Mapping[str, Any]) -> None:
     mine = of_recording(out.media, out.asked)
     left: Counter[str] = Counter()
     for name, one in data["metadata"].items():
-        where = f"metadata {clipped(name, 24)!r}"
+        where = f"metadata {clip_text(name, 24)!r}"
         if not isinstance(one, dict):
             raise error(out.asked.path, f"{where} is {shown(one)}", REMEDY)
         seen = shown_in.get(text_of(one.get("vid")), [files.get(text_of(one.get("vid")), "")])

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from indexing.clip import UP_AXES, Clip, ClipSet, FloatArray, LabelledSet
 from indexing.files import replacing
-from indexing.opening import error, listed, shown
+from indexing.opening import error, listing, shown
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.layouts import check_named_layout, choose_layout
 from indexing.readers.npz import NumpyArchive
@@ -145,7 +145,7 @@ def require_array(path: Path, data: Mapping[str, Array], key: str, ndim: int) ->
     if key not in data:
         raise error(
             path,
-            f"is not a clip set: it has no {shown(key)} (it has {listed(data)})",
+            f"is not a clip set: it has no {shown(key)} (it has {listing(data)})",
             f"save {FORMS.get(key, key)}, offsets (N + 1), action (N)",
         )
     if data[key].ndim != ndim:

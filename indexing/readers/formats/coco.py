@@ -15,7 +15,7 @@ from indexing.clip import ClipSet
 from indexing.opening import error, shown
 from indexing.readers.files import Format, Options, Source, frame_number
 from indexing.readers.recording import Detection, collect_detections, parse_flat_joints, to_clips, track_id
-from indexing.skeleton import Skeleton, known
+from indexing.skeleton import Skeleton, usual_layout
 
 REMEDY = "export COCO keypoint results: a list of {image_id, category_id, keypoints, score}"
 IDENTITIES = ("track_id", "tracking_id", "person_id", "idx")
@@ -41,7 +41,7 @@ def read(source: Source, options: Options) -> ClipSet:
     numbers = _numbers(source, {image: images.get(image, image) for image in frames})
     recording = collect_detections(source.path, [(numbers[image], detections) for image, detections in frames.items()])
     joints = recording.joints.shape[1]
-    layout = Skeleton(source.path.stem, names, bones) if len(names) == joints else known(joints)
+    layout = Skeleton(source.path.stem, names, bones) if len(names) == joints else usual_layout(joints)
     return to_clips(source.path, replace(recording, skeleton=layout), options)
 
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import ClipSet, FloatArray
-from indexing.opening import error, listed, shown
+from indexing.opening import error, listing, shown
 from indexing.readers.files import Format, Options, Source, frame_number, read_columns
 from indexing.readers.hdf import AGAIN, Hdf5, opened_hdf5
 from indexing.readers.pickles import unpickle_bytes
@@ -151,7 +151,7 @@ def read_frame(file: Hdf5) -> HdfFrame:
     keys = _keys(file)
     key = KEY if KEY in keys else keys[0] if len(keys) == 1 else None
     if key is None:
-        raise error(file.path, f"holds {len(keys)} tables of pandas ({listed(keys)}), none of them {KEY}", "save one per file")
+        raise error(file.path, f"holds {len(keys)} tables of pandas ({listing(keys)}), none of them {KEY}", "save one per file")
     kind = _to_text(file.attribute(key, "pandas_type"))
     if kind == "frame_table":
         return _read_table(file, key)
@@ -193,7 +193,7 @@ def _read_table(file: Hdf5, key: str) -> HdfFrame:
     fields = file.fields(table)
     blocks = [name for name in fields if name.startswith("values_block_")]
     if not blocks or "index" not in fields or len(blocks) > MOST_BLOCK:
-        raise error(file.path, f"{shown(table)} has the fields {listed(fields)}, no index and values", AGAIN)
+        raise error(file.path, f"{shown(table)} has the fields {listing(fields)}, no index and values", AGAIN)
     parts: list[tuple[str, ...]] = []
     for block in blocks:
         kind = file.attribute(table, f"{block}_kind")

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import ClipSet
-from indexing.opening import error, listed
+from indexing.opening import error, listing
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.formats.mediapipe import may_lag
 from indexing.readers.npz import read_npy
@@ -49,7 +49,7 @@ def read(source: Source, options: Options) -> ClipSet:
     files: list[Path] = [source.path] if source.kind == "npy" else list(source.data)
     ranked = sorted((place, str(file), file) for file in files if (place := rank(file.name)) is not None)
     if not ranked:
-        raise error(source.path, f"has no array of a body (it has {listed(file.name for file in files)})", REMEDY)
+        raise error(source.path, f"has no array of a body (it has {listing(file.name for file in files)})", REMEDY)
     _, _, path = ranked[0]
     values = read_npy(path)
     flat = values.ndim == 4

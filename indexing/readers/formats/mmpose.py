@@ -16,7 +16,7 @@ from indexing.clip import ClipSet
 from indexing.opening import error
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.recording import Detection, collect_detections, parse_numbers, to_clips, track_id
-from indexing.skeleton import Skeleton, candidates, known
+from indexing.skeleton import Skeleton, candidates, usual_layout
 
 REMEDY = "export with MMPoseInferencer(..., pred_out_dir=...) or a demo script's --save-predictions"
 
@@ -32,7 +32,7 @@ def read(source: Source, options: Options) -> ClipSet:
     layout, up = _layout(source, joints), "-y" if dims == 2 else "z"
     rivals = candidates(joints) if layout is None and dims == 3 else ()  # a lifter's, which are Human3.6M's as a rule
     if layout is None and dims == 2:
-        layout = known(joints)
+        layout = usual_layout(joints)
     return to_clips(source.path, replace(recording, skeleton=layout, up=up, layouts=rivals), options)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from dyntorch.numerics import Message
 from indexing.clip import ClipSet
-from indexing.opening import error, listed
+from indexing.opening import error, listing
 from indexing.readers.c3d import read as read_c3d
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.formats.mediapipe import PREFIX, SUFFIX, Columns, find_columns, layout_of, read_table
@@ -61,7 +61,7 @@ def is_spatial(source: Source, columns: Columns) -> bool:
     if len(flat) == len(joints) or any("v" in kinds and _visibility(source, kinds["v"]) for kinds in joints.values()):
         return False
     if flat:
-        raise error(source.path, f"has z of some points, but not of {listed(flat)}", REMEDY)
+        raise error(source.path, f"has z of some points, but not of {listing(flat)}", REMEDY)
     rated = any("v" in kinds for kinds in joints.values())
     table = read_table(source, columns, "xy", False)
     values = table.values[np.isfinite(table.values)]
@@ -79,7 +79,7 @@ def read_spatial(source: Source, options: Options) -> ClipSet:
     columns = find_columns(source.data[0])
     flat = None if columns is None else [joint or "the points" for joint, kinds in columns.joints.items() if "z" not in kinds]
     if columns is None or flat:
-        what = "has no columns like hip_x, hip_y, hip_z" if flat is None else f"has no z of {listed(flat)}"
+        what = "has no columns like hip_x, hip_y, hip_z" if flat is None else f"has no z of {listing(flat)}"
         raise error(source.path, what, "export x, y and z of every point, with a header row")
     rated = all("v" in kinds for kinds in columns.joints.values())
     table = read_table(source, columns, "xyz", rated)
@@ -88,7 +88,7 @@ def read_spatial(source: Source, options: Options) -> ClipSet:
     names = table.names if columns.landmark is not None else [_original_spelling(source, columns, joint) for joint in table.names]
     people = split_people(names)[0]
     if table.people is not None and len(people) > 1:
-        raise error(source.path, f"names people in a column and before the points ({listed(people)})", "keep one of the two")
+        raise error(source.path, f"names people in a column and before the points ({listing(people)})", "keep one of the two")
     recording = build_marker_recording(source.path, points, names, table.frames, table.times, "", "")
     if rated:
         recording = replace(recording, confidence=table.values[..., 3].reshape(recording.joints.shape[:2]))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import COARSEST, FINEST, UP_AXES, ClipSet
-from indexing.opening import error, listed, shown
+from indexing.opening import error, listing, shown
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.hdf import Array, Hdf5, opened_hdf5
 from indexing.readers.recording import Recording, to_clips
@@ -37,7 +37,7 @@ def _recording(file: Hdf5, options: Options) -> Recording:
     frames = len(position)
     fits = position.size and position.shape[1:] == (len(animals), len(joints), len(space))
     if not fits or space not in (["x", "y"], ["x", "y", "z"]):
-        said = f"{len(animals)} individuals, {len(joints)} keypoints and the axes {listed(space)}"
+        said = f"{len(animals)} individuals, {len(joints)} keypoints and the axes {listing(space)}"
         raise error(file.path, f"position is {position.shape} for {said}", REMEDY)
     confidence = None
     if "confidence" in file:
@@ -66,7 +66,7 @@ def _axes(file: Hdf5, name: str, wanted: tuple[str, ...]) -> tuple[Array, list[s
     values, there = file.array(name, None, "fiu"), _names(file, name)
     unknown = [axis for axis in there if axis not in wanted]
     if unknown or len(set(there)) < len(there) or len(there) != values.ndim or not {"time", "keypoints"} <= set(there):
-        raise error(file.path, f"{name} has the axes {listed(there)}, not {', '.join(wanted)}", REMEDY)
+        raise error(file.path, f"{name} has the axes {listing(there)}, not {', '.join(wanted)}", REMEDY)
     values = values.transpose([there.index(axis) for axis in wanted if axis in there])
     for i, axis in enumerate(wanted):
         if axis not in there:

@@ -16,7 +16,7 @@ from indexing.readers.files import Format, Options, Source
 from indexing.readers.layouts import choose_layout
 from indexing.readers.npz import read_npy
 from indexing.readers.recording import Recording, to_clips
-from indexing.skeleton import candidates, known
+from indexing.skeleton import candidates, usual_layout
 
 REMEDY = "save (frames, joints, 2 or 3), or a clip set: np.savez(file, joints=array, fps=...)"
 
@@ -32,7 +32,7 @@ def read(source: Source, options: Options) -> ClipSet:
 
 def recording_of(joints: FloatArray, confidence: FloatArray | None = None) -> Recording:
     """A recording of one body of unknown layout, and the direction that is up in it where the body shows that."""
-    usual, flat = known(joints.shape[1]), joints.shape[2] == 2
+    usual, flat = usual_layout(joints.shape[1]), joints.shape[2] == 2
     could = candidates(joints.shape[1])
     layout, said, up = choose_layout(joints, usual, could, "-y" if flat else None)
     if layout is not None and not said:  # the file says nothing of it

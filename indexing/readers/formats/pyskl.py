@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import Clip, ClipSet
-from indexing.opening import LARGEST, clipped, error, listed, shown, size_of
+from indexing.opening import LARGEST, clip_text, error, listing, shown, size_of
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.pickles import read_pickle
 from indexing.readers.recording import IntArray, NobodySeen, Recording, to_clips
-from indexing.skeleton import COCO17, NTU25, candidates, known
+from indexing.skeleton import COCO17, NTU25, candidates, usual_layout
 
 REMEDY = "save {'split': ..., 'annotations': [{'frame_dir', 'label', 'keypoint', ...}]}, as pyskl does"
 GROWTH_BLOCK = 2**24, 64  # bytes, and times the bytes of the file, that its clips may take: half floats become four times as large
@@ -30,7 +30,7 @@ def read(source: Source, options: Options) -> ClipSet:
     data = read_pickle(source.path)
     annotations = data.get("annotations") if isinstance(data, dict) else data
     if not isinstance(annotations, list) or not annotations:
-        what = f"a dictionary with {listed(data)}" if isinstance(data, dict) else f"a {type(data).__name__}"
+        what = f"a dictionary with {listing(data)}" if isinstance(data, dict) else f"a {type(data).__name__}"
         raise error(source.path, f"is a pickle of {what}, not of skeletons", REMEDY)
     parts = _splits(source, data)
     if len(annotations) > 1 and options.person == "everyone":  # clips are no people of one recording
@@ -70,9 +70,9 @@ def _is_empty(one: Any) -> bool:
 def _annotation(source: Source, index: int, one: Any) -> tuple[Recording, str]:
     """What an annotation shows, and what it is called."""
     if not isinstance(one, dict) or not isinstance(one.get("keypoint"), np.ndarray):
-        has = f"has {listed(one)}" if isinstance(one, dict) else f"is a {type(one).__name__}"
+        has = f"has {listing(one)}" if isinstance(one, dict) else f"is a {type(one).__name__}"
         raise error(source.path, f"annotation {index}: no array 'keypoint' (it {has})", REMEDY)
-    name = clipped(one["frame_dir"]) if isinstance(one.get("frame_dir"), str) else f"{source.path.stem}[{index}]"
+    name = clip_text(one["frame_dir"]) if isinstance(one.get("frame_dir"), str) else f"{source.path.stem}[{index}]"
     where, keypoint = f"annotation {index} ({shown(name)})", one["keypoint"]
     if keypoint.ndim == 3:
         keypoint = keypoint[None]
@@ -91,7 +91,7 @@ def _annotation(source: Source, index: int, one: Any) -> tuple[Recording, str]:
     table = np.moveaxis(keypoint, 0, 1).reshape(frames * people, joints, dims).astype(np.float64)
     if dims == 3:  # a person who is not there
         table[(table == 0).all(axis=(1, 2))] = np.nan
-    usual, up = (known(joints), "-y") if dims == 2 else (NTU25 if joints == len(NTU25.joints) else None, "y")
+    usual, up = (usual_layout(joints), "-y") if dims == 2 else (NTU25 if joints == len(NTU25.joints) else None, "y")
     tracks: list[Hashable | None] | None = [str(i) for i in range(people)] * frames if people > 1 else None
     could = () if usual is COCO17 else candidates(joints)
     return Recording(np.arange(frames), at, table, score, tracks, None, usual, up, could), name

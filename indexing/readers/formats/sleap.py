@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import COARSEST, FINEST, ClipSet
-from indexing.opening import error, listed, parse_json, shown
+from indexing.opening import error, listing, parse_json, shown
 from indexing.readers.files import Format, Options, Source, read_columns
 from indexing.readers.hdf import Array, Hdf5, opened_hdf5
 from indexing.readers.recording import Recording, frame_numbers, to_clips
@@ -79,7 +79,7 @@ def _analysis(file: Hdf5) -> Recording:
     nodes = file.texts("node_names")
     names = file.texts("track_names") if "track_names" in file else []
     if not nodes or len(set(nodes)) < len(nodes):
-        raise error(file.path, f"node_names are {listed(nodes)}: none, or one twice", EXPORT)
+        raise error(file.path, f"node_names are {listing(nodes)}: none, or one twice", EXPORT)
     tracks = _axes(file, "tracks", ("frame", "track", "node", "xy"), ("track", "xy", "node", "frame"))
     frames, animals, points, axes = tracks.shape
     if axes not in (2, 3) or points != len(nodes) or (names and len(names) != animals) or not tracks.size:
@@ -187,7 +187,7 @@ def _one_video(file: Hdf5, video: Array) -> float | None:
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         about, names = [], []
     if len(used) > 1:
-        told = listed(str(names[i]).replace("\\", "/").rpartition("/")[2] if i < len(names) else i for i in used)
+        told = listing(str(names[i]).replace("\\", "/").rpartition("/")[2] if i < len(names) else i for i in used)
         raise error(
             file.path, f"has labels in {len(used)} videos ({told})", "export each video by itself: File > Export Analysis HDF5"
         )
@@ -265,7 +265,7 @@ def _nodes(file: Hdf5, about: dict[str, Any], which: int) -> tuple[list[str], li
     except (KeyError, IndexError, TypeError, ValueError):
         raise error(file.path, f"metadata@json: the nodes of skeleton {which} are not there", EXPORT) from None
     if not names or len(set(names)) < len(names):
-        raise error(file.path, f"metadata@json: the skeleton has the nodes {listed(names)}: none, or one twice", EXPORT)
+        raise error(file.path, f"metadata@json: the skeleton has the nodes {listing(names)}: none, or one twice", EXPORT)
     return names, _edges(skeleton.get("links"), place)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from indexing.clip import COARSEST, FINEST, ClipSet, FloatArray
-from indexing.opening import WIDEST, error, listed, read_text, repeated, shown
+from indexing.opening import WIDEST, error, first_duplicate, listing, read_text, shown
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.markers import build_marker_recording
 from indexing.readers.recording import IntArray, frame_numbers, to_clips
@@ -81,13 +81,13 @@ def _names(path: Path, lines: list[str]) -> tuple[list[str], int]:
     if len(cells) > WIDEST:
         raise error(path, f"line {at + 1} has {len(cells)} cells", REMEDY)
     names = [cell.strip() for cell in cells[2:] if cell.strip()]
-    twice = repeated(names)
+    twice = first_duplicate(names)
     if not names or twice is not None:
         said = "names no markers" if not names else f"names the marker {shown(twice)} twice"
         raise error(path, f"line {at + 1} {said}", "name every marker once")
     said = _about(path, lines).get("nummarkers", "")
     if said.isdecimal() and said != str(len(names)):
-        raise error(path, f"NumMarkers is {said[:9]}, but line {at + 1} names {len(names)} ({listed(names)})", REMEDY)
+        raise error(path, f"NumMarkers is {said[:9]}, but line {at + 1} names {len(names)} ({listing(names)})", REMEDY)
     return names, at + 1
 
 

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import LARGEST, ClipSet, FloatArray
-from indexing.opening import VALUE, clipped, error, parse_json, read_text, shown
+from indexing.opening import VALUE, clip_text, error, parse_json, read_text, shown
 from indexing.readers.files import Format, FrameFile, Options, Source
 from indexing.readers.recording import Detection, collect_detections, parse_numbers, to_clips, track_id
-from indexing.skeleton import known
+from indexing.skeleton import usual_layout
 
 REMEDY = "export every frame's result.to_json() of a pose model (yolo ...-pose)"
 TEXT_REMEDY = "export with a pose model and save_txt=True"
@@ -34,7 +34,7 @@ def read(source: Source, options: Options) -> ClipSet:
             for i, people in _json_frames(source)
         ]
     recording = collect_detections(source.path, frames)
-    return to_clips(source.path, replace(recording, skeleton=known(recording.joints.shape[1])), options)
+    return to_clips(source.path, replace(recording, skeleton=usual_layout(recording.joints.shape[1])), options)
 
 
 def _json_frames(source: Source) -> list[tuple[int, list[Any]]]:
@@ -81,7 +81,7 @@ def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
         try:
             rows.append([float(word) for word in words])
         except ValueError:
-            raise error(file.path, f"line {n} is not a list of numbers: {clipped(' '.join(words), VALUE)}", TEXT_REMEDY) from None
+            raise error(file.path, f"line {n} is not a list of numbers: {clip_text(' '.join(words), VALUE)}", TEXT_REMEDY) from None
         if len(words) != width:
             raise error(
                 file.path,
@@ -125,7 +125,7 @@ def _layout(source: Source, table: FloatArray) -> tuple[int, int]:
             seen = (points[..., :2] != 0).any(axis=2)
             away = np.abs(points[..., :2] - table[:, None, 1:3]) / np.maximum(table[:, None, 3:5], 1e-6) - 0.5
             outside = float(np.maximum(away, 0.0)[seen].mean()) if seen.any() else 0.0
-            readings.append((outside - NEARLY * (known(points.shape[1]) is not None), dims, extras))
+            readings.append((outside - NEARLY * (usual_layout(points.shape[1]) is not None), dims, extras))
     if not readings:
         raise error(source.path, f"{columns} numbers after the box are not x y [v] per joint", TEXT_REMEDY)
     least = min(readings)[0]

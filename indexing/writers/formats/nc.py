@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from indexing.opening import clipped, error, read_bytes
+from indexing.opening import clip_text, error, read_bytes
 from indexing.writers.markers import Writer, align_clips, people_of
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple
                 dataset.to_netcdf(made, engine=engine)
                 break
             except (ValueError, ImportError) as problem:
-                problems.append(clipped(problem, 80))
+                problems.append(clip_text(problem, 80))
         else:
             raise error(path, f"xarray cannot write netCDF here ({problems[0]})", INSTALL)
         return read_bytes(made), []

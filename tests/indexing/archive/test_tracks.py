@@ -9,7 +9,7 @@ from indexing.archive.tracks import MISSING, StorageFormat, images, positions, s
 from indexing.cameras import rotation
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton
-from indexing.windows import bridged
+from indexing.windows import interpolate_gaps
 
 STORAGE = StorageFormat()
 
@@ -205,7 +205,7 @@ def test_gaps_are_bridged_in_time():
     poses[:, 0] = np.arange(5)[:, None]
     poses[1:4, 0] = np.nan
     poses[:, 1] = np.nan
-    found = bridged(poses, np.arange(5.0), np.array([0, 5]))
+    found = interpolate_gaps(poses, np.arange(5.0), np.array([0, 5]))
     out, seen = found.joints, found.seen
     assert out[:, 0, 0].tolist() == [0, 1, 2, 3, 4] and seen.tolist() == [[True, False]] and not out[:, 1].any()
 

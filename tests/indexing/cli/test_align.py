@@ -22,10 +22,10 @@ from indexing.report.alignment import (
     AlignmentReport,
     as_json,
     as_segments,
-    carried,
     display_scale,
     figures,
     labels_csv,
+    transform_points,
     turn_and_shift,
     write_alignment,
 )
@@ -397,6 +397,6 @@ def test_small_numbers_of_the_page():
     motion[:3, 3] = 1, 2, 3
     turn, shift = turn_and_shift(2 * motion)
     assert abs(turn - 170) < 1e-9 and shift.tolist() == [1, 2, 3]
-    np.testing.assert_allclose(carried(motion, np.array([[1.0, 0, 0]])), [[1 + np.cos(angle), 2 + np.sin(angle), 3]])
+    np.testing.assert_allclose(transform_points(motion, np.array([[1.0, 0, 0]])), [[1 + np.cos(angle), 2 + np.sin(angle), 3]])
     assert figures(1.0, float("inf")) == ("1", "") and figures(0.0, 1e-9)[1] == "1.0e-09"
     assert figures(123456.0, 2345.0) == ("123456", "2345")

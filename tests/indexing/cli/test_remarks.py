@@ -14,7 +14,7 @@ from indexing import ActionIndexer, ActionOptions, Clip, ClipSet, synchronize
 from indexing.actors import Person, dataset
 from indexing.cli import main
 from indexing.cli.flags.shared import Reading
-from indexing.cli.notes import remarks
+from indexing.cli.notes import clip_notes
 from indexing.recordings.decoding import Withheld
 from indexing.skeleton import BODY25, COCO17, Skeleton
 
@@ -121,14 +121,14 @@ def test_one_tracked_point_is_no_person(run):
 def test_notes_of_readers(clips):
     wave = clips["wave"].replace(up="-y", meta={"layout": "guessed: BODY_25, not BODY_25B", "may_lag": True}, name="a")
     other = wave.replace(meta={"layout": "recognized: BODY_25B"}, name="b")
-    said = remarks([wave, wave.replace(name="c"), other], Reading())
+    said = clip_notes([wave, wave.replace(name="c"), other], Reading())
     assert said == [
         "a, c: its joints are taken for BODY_25 by their number, though as many joints may be BODY_25B; --layout says otherwise",
         "b: its joints are taken for BODY_25B, which is how the body looks; --layout says otherwise",
         "a, c: may be smoothed by MediaPipe, whose tracking lags by up to 2.4 frames where movement is quick; 'dyntorch pose' does "
         "not",
     ]
-    assert remarks([clips["wave"]], Reading()) == []
+    assert clip_notes([clips["wave"]], Reading()) == []
     notices = [one.text for one in synchronize(wave, clips["wave"]).notices]
     assert any("taken for BODY_25 by their number" in text and "layout= says" in text for text in notices)
     assert any("may be smoothed by MediaPipe" in text for text in notices)

@@ -11,7 +11,7 @@ import pytest
 
 from indexing.labels import Label, open_labels, write_labels
 from indexing.labels.label import in_order
-from indexing.opening import repeated
+from indexing.opening import first_duplicate
 
 SUFFIX = {"boris": ".boris", "elan": ".eaf", "csv": ".csv", "tsv": ".tsv"}
 FORMATS = (*SUFFIX, "activitynet", "label_studio", "via")
@@ -102,8 +102,8 @@ def test_what_is_written_is_read_again(name: str, seed: int, tmp_path: Path) -> 
         wanted = [replace(label, observation="") for label in wanted]
     path = tmp_path / f"labels{SUFFIX.get(name, '.json')}"
     kept = [rounded(label, name) for label in wanted]
-    while repeated(kept) is not None:
-        at = kept.index(repeated(kept))
+    while first_duplicate(kept) is not None:
+        at = kept.index(first_duplicate(kept))
         del kept[at], wanted[at]
     write_labels(path, wanted, recording="session.mp4", duration=200.0, fps=FPS, format=name)
     found = open_labels(path, fps=FPS)

@@ -117,10 +117,10 @@ class Terminal(io.StringIO):
 
 
 def test_the_bar_shows_frames(monkeypatch):
-    with console.counted("x", "frames/s") as bar:
+    with console.counting_bar("x", "frames/s") as bar:
         assert bar is None  # no terminal
     monkeypatch.setattr(sys, "stderr", Terminal())
-    with console.counted("looking", "frames/s") as bar:
+    with console.counting_bar("looking", "frames/s") as bar:
         for done in range(0, 101, 10):
             bar(done, 100)
         shown = sys.stderr

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from indexing.cli.inputs import read_truth
-from indexing.opening import clipped, parse_json, read_text, shown
+from indexing.opening import clip_text, parse_json, read_text, shown
 from indexing.readers import npz as npz_gate
 from indexing.readers import read
 from indexing.readers.formats.clipset import read_film_set
@@ -273,7 +273,7 @@ def test_parameters_of_c3d_are_held_against_the_file(tmp_path: Path) -> None:
 
 # ---- messages ------------------------------------------------------------------------------------------------------------
 def test_messages_are_short_and_of_one_line() -> None:
-    assert clipped("a\x1b[31m\nb") == "a?[31m b"
+    assert clip_text("a\x1b[31m\nb") == "a?[31m b"
     assert len(shown(10**4000)) < 60
     assert len(shown([[["x" * 10**6]]] * 10**5)) <= 60
     deep: Any = []

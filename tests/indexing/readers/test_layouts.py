@@ -28,8 +28,8 @@ from indexing.skeleton import (
     WHOLEBODY133,
     Skeleton,
     candidates,
-    known,
     layout_named,
+    usual_layout,
 )
 from tests.indexing.readers import tools
 
@@ -60,7 +60,7 @@ def test_numbers_of_joints() -> None:
         "OpenPose-COCO-18": 18,
         "OpenPose-MPI-15": 15,
     }  # fmt: skip
-    assert [known(n) for n in (17, 25, 26, 33, 133, 136, 20)] == [
+    assert [usual_layout(n) for n in (17, 25, 26, 33, 133, 136, 20)] == [
         COCO17, BODY25, HALPE26, MEDIAPIPE33, WHOLEBODY133, HALPE136, None,
     ]  # fmt: skip
     assert candidates(17) == (COCO17, H36M17) and candidates(25) == (BODY25, BODY25B, NTU25) and candidates(9) == ()
@@ -162,7 +162,7 @@ def test_clip_sets_without_names(layout: Skeleton, tmp_path: Path) -> None:
     again = ClipSet.load(tmp_path / "copy.npz")
     assert [clip.skeleton for clip in again] == [layout] * 2 and again.column("layout").tolist() == clips.column("layout").tolist()
     other = read(tmp_path / "set.npz", layout={17: "COCO-17", 20: "Kinect-20", 25: "BODY_25"}[len(layout.joints)])
-    assert other[0].skeleton is known(len(layout.joints)) or layout is KINECT20
+    assert other[0].skeleton is usual_layout(len(layout.joints)) or layout is KINECT20
     assert "layout" not in other.fields
     assert "layout" not in read(tmp_path / "copy.npz", layout=layout.name).fields
 

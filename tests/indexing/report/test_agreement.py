@@ -10,7 +10,7 @@ import pytest
 
 from indexing.comparing import ComparedSpan, compare
 from indexing.report import pictures
-from indexing.report.agreement import AgreementReport, described, label_rows, overlap_rows, write_agreement
+from indexing.report.agreement import AgreementReport, describe_agreement, label_rows, overlap_rows, write_agreement
 
 KNOWN = [("squat", 1.0, 4.0), ("kick", 5.0, 6.0), ("=wave", 12.0, 14.0)]
 FOUND = [("squat", 1.5, 4.0), ("<b>jump</b>", 5.0, 6.0)]
@@ -54,10 +54,10 @@ def test_rows_and_words() -> None:
     assert rows["squat"][1:4] == ["3.0", "5.0", "2.5"] and rows["squat"][5:7] == ["1", "2"]
     assert rows["squat"][-1] == "0.667" and rows["kick"][-1] == "0.000"
     assert overlap_rows(both)[-1] == ["0.5", "1", "4", "3", "0.250", "0.333", "0.286"]
-    assert "1 of 4 segments found share half of their time or more with one of 3 known." in described(report())
+    assert "1 of 4 segments found share half of their time or more with one of 3 known." in describe_agreement(report())
     nothing = [ComparedSpan("a", 0.0, 5.0, [], [])]
     assert overlap_rows(compare(nothing))[0] == ["0.1", "0", "0", "0", "n/a", "n/a", "n/a"]
-    assert "100.0%" in described(AgreementReport("none", compare(nothing), nothing))
+    assert "100.0%" in describe_agreement(AgreementReport("none", compare(nothing), nothing))
 
 
 def test_nothing_at_all_is_still_a_page(tmp_path: Path) -> None:

@@ -217,9 +217,9 @@ def test_a_film_has_as_many_steps_as_its_strip_has_frames(lab):
 
     clip = lab[2]["squat"][0]
     drawing = strip(clip, frames=11)
-    assert 'style="--steps:11;--lasts:1.50s"' in pages.film(drawing, 1.5)
-    assert 'class="film turned"' in pages.film(drawing, 1.5, mirrored=True)
-    assert pages.film("", 1.0) == ""
+    assert 'style="--steps:11;--lasts:1.50s"' in pages.hover_strip(drawing, 1.5)
+    assert 'class="film turned"' in pages.hover_strip(drawing, 1.5, mirrored=True)
+    assert pages.hover_strip("", 1.0) == ""
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs a browser: chromium or chrome")

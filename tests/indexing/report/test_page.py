@@ -190,7 +190,7 @@ def test_a_file_in_the_way_is_refused_before_anything_is_written(tmp_path):
 
 
 def test_page_parts_escape_and_nest():
-    notes = page.remarks("", [("<k>", 1.0, "<m>")], ["<q>"])
+    notes = page.notes_of("", [("<k>", 1.0, "<m>")], ["<q>"])
     report = {"title": "<t>", "notes": notes, "manifest": {"a": {"b": [1, 2]}, "time": "<f>"}}
     values = {"cards": [("<n>", "1", "<i>\x00")], "joints": [["<j>", "A & B"]]}
     drawn = {"picture": page.Picture(PNG, tips=[page.Tip(0, 0, 1, 1, "<u>")]), "weighing": [], "examples": []}

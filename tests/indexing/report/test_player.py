@@ -67,7 +67,7 @@ def test_what_is_packed_is_what_was_seen():
     joints[rng.random((50, 5)) < 0.2] = np.nan
     joints[:, 4] = np.nan
     joints[7, 0] = 1e9  # a detector's mistake stays on the grid
-    back = places(base64.b64encode(player.packed(joints, 2.0, np.array([5.0, -3.0]))), 5)
+    back = places(base64.b64encode(player.pack_joints(joints, 2.0, np.array([5.0, -3.0]))), 5)
     expected = np.clip(np.round((joints - [5.0, -3.0]) / 2.0), -32000, 32000)
     assert np.array_equal(back, expected, equal_nan=True)
     large = np.array([0, 1, 127, 128, 300, 2**31, 10**12])

@@ -19,7 +19,7 @@ from typing import Any
 from indexing.labels.format import Gathering, Request, list_few, parse_seconds, text_of
 from indexing.labels.label import LabelFile
 from indexing.labels.media import Span, of_recording, split_by_media
-from indexing.opening import count, error, listed, shown
+from indexing.opening import count, error, listing, shown
 
 REMEDY = "save the project again in BORIS"
 MACHINE = "dyntorch:"  # how the description of an observation begins that a program wrote
@@ -256,7 +256,7 @@ def clock(out: Gathering, observation: Mapping[str, Any], where: str, mine: set[
         spans.append(Span(media, begin + shift, begin + shift + length))
         begin += length
     if len(players) > 1 and mine is None:
-        out.note(f"{where} plays {listed(files[0] for files in players.values())} beside each other; times are those of the first")
+        out.note(f"{where} plays {listing(files[0] for files in players.values())} beside each other; times are those of the first")
     return spans
 
 

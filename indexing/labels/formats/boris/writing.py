@@ -22,7 +22,7 @@ from indexing.labels.format import Request, Target, correction_error, seal, text
 from indexing.labels.formats.boris.project import MACHINE, ethogram, files_of
 from indexing.labels.label import Label, in_order
 from indexing.labels.media import base_name, of_recording
-from indexing.opening import clipped, error, parse_json, read_text
+from indexing.opening import clip_text, error, parse_json, read_text
 
 SEAL = re.compile(r"\[([0-9a-f]{8})\]")
 LATEST = 1e9  # seconds, thirty years: no time is later
@@ -88,7 +88,7 @@ def _check_project(path: Path, data: Any) -> dict[str, Any]:
             raise error(path, f"is no sound BORIS project: {part} is no object", REMEDY)
     for name, one in data["observations"].items():
         if not isinstance(one, dict):
-            raise error(path, f"is no sound BORIS project: observation {clipped(name)!r} is no object", REMEDY)
+            raise error(path, f"is no sound BORIS project: observation {clip_text(name)!r} is no object", REMEDY)
     return data
 
 
@@ -106,8 +106,8 @@ def _behaviours(draft: Draft, labels: Sequence[Label]) -> None:
         while known.get(code) is False and lasts:  # there as a point event: BORIS cannot tell how long it lasts
             code += " (state)"
         if code != name:
-            said = f"{clipped(name, 40)!r} is a point event in the project; its labels, some of which last, are written as"
-            draft.notices.append(f"{said} {clipped(code, 50)!r}")
+            said = f"{clip_text(name, 40)!r} is a point event in the project; its labels, some of which last, are written as"
+            draft.notices.append(f"{said} {clip_text(code, 50)!r}")
         if code not in known:
             known[code] = lasts
             key = next((letter for letter in (code[:1].lower(), *ascii_lowercase, *digits) if letter not in keys), "")
@@ -204,7 +204,7 @@ def _select_others(target: Target, before: Mapping[str, Any], replaced: Sequence
         number = sum(files_of(other) == files_of(one) for other in old.values())
         found = SEAL.search(text_of(one.get("description")))
         if found is None or found[1] != _seal(name, one, number):
-            raise correction_error(target, f"observation {clipped(name)!r}")
+            raise correction_error(target, f"observation {clip_text(name)!r}")
     return {name: one for name, one in before.items() if name not in old}
 
 

@@ -18,7 +18,7 @@ from indexing.labels.formats.elan.times import MACHINE, REMEDY, Annotation, Tier
 from indexing.labels.label import LabelFile
 from indexing.labels.markup import Placed, parse_xml
 from indexing.labels.media import base_name, of_recording
-from indexing.opening import clipped, error, listed, read_bytes, repeated, shown
+from indexing.opening import clip_text, error, first_duplicate, listing, read_bytes, shown
 
 
 def read(_: Any, asked: Request) -> LabelFile:
@@ -27,7 +27,7 @@ def read(_: Any, asked: Request) -> LabelFile:
     parts = TierParts(asked)
     root, _ = parse_xml(asked.path, read_bytes(asked.path), parts.collect_part)
     if root.tag != "ANNOTATION_DOCUMENT":
-        raise error(asked.path, f"is XML, but no ELAN file (its root is {clipped(root.tag, 40)})", "export an .eaf from ELAN")
+        raise error(asked.path, f"is XML, but no ELAN file (its root is {clip_text(root.tag, 40)})", "export an .eaf from ELAN")
     units = next((head.get("TIME_UNITS", "milliseconds") for head in root.iterfind("HEADER")), "milliseconds")
     if units != "milliseconds":
         raise error(asked.path, f"TIME_UNITS is {shown(units)}, not milliseconds", "save it again in a newer ELAN")
@@ -111,7 +111,7 @@ def _tiers(asked: Request, root: Element, parts: TierParts) -> list[Tier]:
             if not one.value.strip():
                 one.value = values.get(one.entry, "")
         found.append(tier)
-    twice = repeated(tier.name for tier in found)
+    twice = first_duplicate(tier.name for tier in found)
     if twice is not None:
         raise error(asked.path, f"two tiers are called {shown(twice)}", "rename one (ELAN: Tier > Change Tier Attributes)")
     _check_parents(asked, found)
@@ -120,7 +120,7 @@ def _tiers(asked: Request, root: Element, parts: TierParts) -> list[Tier]:
     if lost is not None:
         said = f"tier {shown(lost.name)}: its linguistic type {shown(lost.kind)} is not there"
         raise error(asked.path, said, "give it another one (ELAN: Tier > Change Tier Attributes)")
-    same = repeated(one.name for tier in found for one in tier.annotations)
+    same = first_duplicate(one.name for tier in found for one in tier.annotations)
     if same is not None:
         raise error(asked.path, f"two annotations have the id {shown(same)}", REMEDY)
     return found
@@ -142,7 +142,7 @@ def _check_parents(asked: Request, tiers: Sequence[Tier]) -> None:
             if name not in above:
                 raise error(asked.path, f"tier {shown(next(reversed(seen)))}: its parent tier {shown(name)} is not there", REMEDY)
             if name in seen:
-                raise error(asked.path, f"tier {shown(name)} is its own parent, by way of {listed(seen, 4)}", REMEDY)
+                raise error(asked.path, f"tier {shown(name)} is its own parent, by way of {listing(seen, 4)}", REMEDY)
             seen[name] = None
             name = above[name]
         fine.update(seen)
@@ -156,7 +156,7 @@ def _annotation(asked: Request, tier: str, element: Element) -> Annotation:
         return Annotation(name, text, (element.get("TIME_SLOT_REF1", ""), element.get("TIME_SLOT_REF2", "")), entry=entry)
     if element.tag == "REF_ANNOTATION":
         return Annotation(name, text, None, element.get("ANNOTATION_REF", ""), element.get("PREVIOUS_ANNOTATION", ""), entry)
-    raise error(asked.path, f"tier {shown(tier)}: holds {clipped(element.tag, 40)}, which is no annotation", REMEDY)
+    raise error(asked.path, f"tier {shown(tier)}: holds {clip_text(element.tag, 40)}, which is no annotation", REMEDY)
 
 
 def media_of(root: Element) -> list[tuple[str, str, float]]:
@@ -179,7 +179,7 @@ def _medium(out: Gathering, root: Element) -> tuple[str, float]:
     mine = of_recording(out.media, out.asked)
     name, _, origin = next((one for one in known if mine is None or one[0] in mine), ("", "", 0.0))
     if mine is None and len({origin for *_, origin in known}) > 1:
-        out.note(f"has media that begin at other times ({listed(out.media)}); times are those of {name}")
+        out.note(f"has media that begin at other times ({listing(out.media)}); times are those of {name}")
     if not known and out.asked.recording is not None:
         out.note(f"names no media file; its clock is taken for that of {out.asked.recording}")
     return name, origin

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from indexing.labels.format import Gathering, Request
 from indexing.labels.label import NUM_NAMED
-from indexing.opening import count, error, listed, shown
+from indexing.opening import count, error, listing, shown
 
 REMEDY = "open it in ELAN, mend it and save it again"
 MACHINE = (
@@ -76,7 +76,7 @@ def place(out: Gathering, tiers: Sequence[Tier], slots: Mapping[str, float | Non
     if between:
         out.note(f"{count(between, 'time')} that nobody set taken from the neighbours, as ELAN does")
     if nowhere:
-        out.note(f"{count(len(nowhere), 'annotation')} left out: without a time ({listed(nowhere, NUM_NAMED)})")
+        out.note(f"{count(len(nowhere), 'annotation')} left out: without a time ({listing(nowhere, NUM_NAMED)})")
 
 
 def _fill(tiers: Sequence[Tier], known: dict[str, float], slots: Mapping[str, float | None]) -> int:
@@ -144,7 +144,7 @@ def _upwards(
     while one.name not in settled:
         where = f"tier {shown(home[one.name].name)}, annotation {one.name}"
         if one.name in seen:
-            raise error(asked.path, f"{where}: it is its own parent, by way of {listed(seen, 4)}", REMEDY)
+            raise error(asked.path, f"{where}: it is its own parent, by way of {listing(seen, 4)}", REMEDY)
         seen.add(one.name)
         yield one
         if one.parent not in by_name:

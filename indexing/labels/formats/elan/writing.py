@@ -22,7 +22,7 @@ from indexing.labels.formats.elan.times import MACHINE, REMEDY
 from indexing.labels.label import Label, in_order, list_spots
 from indexing.labels.markup import Placed, parse_xml
 from indexing.labels.media import base_name, of_recording
-from indexing.opening import count, error, listed, read_bytes, shown
+from indexing.opening import count, error, listing, read_bytes, shown
 
 ENCODING = re.compile(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([^\"']*)")
 NUMBERED = re.compile(r" \(\d+\)$")
@@ -128,7 +128,7 @@ class Document:
 def write(labels: Sequence[Label], target: Target) -> list[str]:
     """Write an ELAN file, or tiers into one."""
     if len(target.media) > 1:
-        said = f"an ELAN file is of one recording, and these labels are of {len(target.media)} ({listed(target.media)})"
+        said = f"an ELAN file is of one recording, and these labels are of {len(target.media)} ({listing(target.media)})"
         raise error(target.path, said, "write a file for each")
     media = target.media[0] if target.media else ""
     document = Document(target.into or target.path, _empty(target, media) if target.into is None else read_bytes(target.into))

@@ -18,7 +18,7 @@ from dyntorch.tasks.planes.problem import (
     frames_of_calibration,
     frames_of_matrices,
     parameters,
-    projected,
+    project_covariance,
     starts,
 )
 
@@ -106,7 +106,7 @@ def test_projected_is_the_covariance_of_unit_vectors():
     root = 1e-4 * torch.randn(5, 5, generator=draw(3), dtype=F64)
     samples = vector + torch.randn(200_000, 5, generator=draw(4), dtype=F64) @ root.mT
     measured = torch.cov(torch.nn.functional.normalize(samples, dim=-1).mT)
-    assert torch.allclose(projected(root @ root.mT, vector), measured, atol=0.02 * float(measured.abs().max()))
+    assert torch.allclose(project_covariance(root @ root.mT, vector), measured, atol=0.02 * float(measured.abs().max()))
 
 
 @pytest.mark.parametrize("focal", [300.0, 1000.0, 4000.0])
