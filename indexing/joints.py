@@ -43,7 +43,7 @@ def has_names(skeleton: Skeleton | None) -> bool:
     """Whether the joints have names of their own; numbers are none.
 
     Example:
-        >>> named(Skeleton("hand", ("wrist", "tip"))), named(Skeleton("any", ("0", "1"))), named(None)
+        >>> has_names(Skeleton("hand", ("wrist", "tip"))), has_names(Skeleton("any", ("0", "1"))), has_names(None)
         (True, False, False)
     """
     if skeleton is None:

@@ -142,10 +142,10 @@ def _from_exif(takes: Sequence[Take], sizes: Sequence[Size]) -> KnownLenses:
         raise ValueError(Message(text, names=listing(lacking)))
     known = [one for one in focals_35 if one is not None]
     focals = tuple(mm * math.hypot(*size) / DIAGONAL for (mm, _), size in zip(known, sizes, strict=True))
-    listing = "; ".join(
+    written = "; ".join(
         f"{take.name} {mm:g} mm ({where}): {f:.0f} px" for take, (mm, where), f in zip(takes, known, focals, strict=True)
     )
-    note = f"35 mm equivalents as written, and held: {listing}; stabilized videos show up to a tenth less than photos"
+    note = f"35 mm equivalents as written, and held: {written}; stabilized videos show up to a tenth less than photos"
     return KnownLenses(focals, source="35 mm equivalent, and held", notes=(note,))
 
 
