@@ -144,7 +144,7 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def save(self, path: str | Path) -> None:
         """Write a ``.safetensors`` file with JSON metadata; atomically, and without pickle."""
         check_is_fitted(self, self.FITTED)
-        about, tensors = self._stored()
+        about, tensors = self._export_state()
         write_model(Path(path), self.FORMAT, self.VERSION, self.saved_parameters(), about, tensors)
 
     @classmethod
@@ -164,7 +164,7 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """The parameters of a model file, without those of older versions."""
         return dict(header["parameters"])
 
-    def _stored(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    def _export_state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """What the header of the file says of a fitted indexer besides its parameters, and its tensors."""
         raise NotImplementedError
 

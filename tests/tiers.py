@@ -14,7 +14,8 @@ import pytest
 SLOW_FROM = 0.3
 """Seconds of the processor from which on a test is to be marked."""
 TOO_SLOW = 2.0
-"""Seconds from which on an unmarked test fails: it would be slow on any machine."""
+"""Seconds from which on an unmarked test fails: it would be slow on any machine.  Not with the arithmetic of another processor,
+which takes several times as long."""
 SLOW_EXAMPLES = (
     "dyntorch.counting.ranks.count",
     "dyntorch.tasks.align.planar.align_planar",
@@ -50,7 +51,7 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     seconds = processor_seconds() - begun
     if item.get_closest_marker("slow") is None:
         item.user_properties.append(("processor_seconds", seconds))
-        if seconds > TOO_SLOW:
+        if seconds > TOO_SLOW and "ATEN_CPU_CAPABILITY" not in os.environ:
             pytest.fail(f"{seconds:.1f} s of the processor: mark it @pytest.mark.slow, or make it faster", pytrace=False)
     return result
 

@@ -199,7 +199,7 @@ def bundle(
         rows, columns = triangle(primitive.width, x.device)
         if primitive.rows > 1:
             vectors.append(primitive.vectors(x).permute(0, 1, 4, 3, 2).contiguous())
-            packed.append(primitive.packed(x).mT)
+            packed.append(primitive.pack(x).mT)
         else:
             # not the components of the estimation matrix, which may be scaled: distances need the length that is measured
             vectors.append(primitive.raw(x).mT.contiguous()[..., None, :])
@@ -441,8 +441,8 @@ class Search:
 
     def _bundle(self, searched: SearchMatches) -> Bundle:
         transforms = searched.transforms
-        primitives = tuple(p.normalized(t) for p, t in zip(self.invariant.primitives, transforms, strict=True))
-        base = self.invariant.normalized(tuple(t[:, None] for t in transforms))
+        primitives = tuple(p.normalize(t) for p, t in zip(self.invariant.primitives, transforms, strict=True))
+        base = self.invariant.normalize(tuple(t[:, None] for t in transforms))
         scales = relative([t.flatten(1)[:, 0] for t in transforms])[0]
         return bundle(base, primitives, searched.views, scales, searched.weights)
 

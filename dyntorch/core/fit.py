@@ -15,7 +15,7 @@ from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import Matches, check_plain, matches, relative_weights
 from dyntorch.core.matrix import estimation_matrix, gram, labelled_rows, triangular_factor, within_noise
 from dyntorch.core.normalize import Normalization, denormalize, normalization
-from dyntorch.core.outcome import Status, failed
+from dyntorch.core.outcome import Status, is_failure
 from dyntorch.core.primitives import Primitive
 from dyntorch.core.solution import Solution, with_copies
 from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
@@ -97,7 +97,7 @@ def fit(
         >>> (solution.tensor / solution.tensor[2, 2]).mul(1000).round().div(1000).tolist()
         [[1.0, 0.1, 2.0], [-0.1, 1.0, 3.0], [0.1, 0.2, 1.0]]
     """
-    invariant, views = as_invariant(invariant).prepared(views, weights, **given)
+    invariant, views = as_invariant(invariant).bind_arguments(views, weights, **given)
     return fit_matches(invariant, matches(invariant, views, weights, static, dimensions, mapped=True), normalize=normalize)
 
 
@@ -114,7 +114,7 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
     (whole, present), found = over_problems(solve, data.views, data.weights, data.static)
     data = replace(data, views=whole, weights=present)
     pairs = zip(invariant.primitives, found.transforms, strict=True)
-    norm = Normalization(found.transforms, tuple(p.normalized(t) for p, t in pairs), found.actions)
+    norm = Normalization(found.transforms, tuple(p.normalize(t) for p, t in pairs), found.actions)
     tensor, status, uncertainty = (data.back(part) for part in (found.tensor, found.status, found.uncertainty))
     return Solution(invariant, tensor, uncertainty, data, norm, found.normalized, status=status)
 
@@ -135,7 +135,7 @@ def _fit_blocks(
     invariant: Invariant, normalize: bool, precision: float, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
 ) -> tuple[tuple[tuple[Tensor, ...], Tensor], LinearFits]:
     """Views and weights ``(b, n, ...)`` with what they lack filled in, and the linear fits of all problems."""
-    views, weights = invariant.completed(views, weights)
+    views, weights = invariant.fill_missing(views, weights)
     count = weights.shape[-1]
     per_problem = count * max(1, invariant.copies or 1) * _largest(invariant)
     most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, MIN_BLOCK))
@@ -165,25 +165,25 @@ def _fit_block(
     fixed = invariant.intrinsic or not normalize
     norm = _identity(invariant, views) if fixed else normalization(invariant, views, weights)
     moved = norm.apply(invariant, views)
-    own = invariant.estimated(moved, weights)
+    own = invariant.estimate_tensor(moved, weights)
     if own is None:
         # as many digits as the measurements have, less those that their distance from the origin takes
         away = torch.stack([t[..., :-1, -1].norm(dim=-1) for t in norm.transforms]).amax(0).detach()
         rows = EstimationRows(norm.primitives, moved, weights, static, ROUNDING * precision * (1 + away))
         basis, status, uncertainty = _solve_null_space(invariant, rows)
-        tensor = invariant.normalized(norm.transforms).constrain(invariant.tensor_of(basis))
+        tensor = invariant.normalize(norm.transforms).constrain(invariant.tensor_of(basis))
     else:
         tensor, uncertainty = own.tensor, own.uncertainty
         status = _status(own.few, own.degenerate, own.ambiguous)
     if invariant.copies is not None:
         status, uncertainty = status.amax(-1), uncertainty.amax(-1)
-    tensor = select(~failed(status), tensor, 0.0)
+    tensor = select(~is_failure(status), tensor, 0.0)
     # coordinates may be so large or small that float64 holds no tensor of theirs
     back = denormalize(invariant, tensor, norm.actions)
     flat = back.detach().flatten(status.ndim)
     held = flat.isfinite().all(-1) & (flat != 0).any(-1)
-    status = torch.where(held | failed(status), status, int(Status.DEGENERATE))
-    sound = ~failed(status)
+    status = torch.where(held | is_failure(status), status, int(Status.DEGENERATE))
+    sound = ~is_failure(status)
     return LinearFits(select(sound, back, 0.0), select(sound, tensor, 0.0), status, uncertainty, norm.transforms, norm.actions)
 
 

@@ -112,7 +112,7 @@ class Invariant:
     """Motions ``(tries, *batch, ...)`` from which to look for that of a noisy tensor, where what it decomposes into may be far off:
     refinement then minimizes the algebraic error first, and no motion guides robust estimation.  None: decomposing is enough."""
 
-    def prepared(
+    def bind_arguments(
         self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
     ) -> tuple[Invariant, tuple[Tensor, ...]]:
         """The invariant that the arguments of a call belong to, and what they measure in the slot of every primitive.
@@ -129,11 +129,11 @@ class Invariant:
             raise unknown_argument(self, name)
         return self, tuple(views)
 
-    def completed(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    def fill_missing(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
         """Measurements ``(b, n, ...)`` and weights ``(b, n)`` of a fit with what they lack filled in; by default as they are."""
         return views, weights
 
-    def estimated(self, views: tuple[Tensor, ...], weights: Tensor) -> Estimate | None:
+    def estimate_tensor(self, views: tuple[Tensor, ...], weights: Tensor) -> Estimate | None:
         """Tensors of ``views (b, n, ...)``, ``weights (b, n)`` in a way of its own; by default None: the null space of the rows."""
         return None
 
@@ -142,7 +142,7 @@ class Invariant:
         the tensor itself."""
         return tensor
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         r"""Whitened geometric residual :math:`Q^{-1/2} e` of each match, :math:`Q = \sum_v s_v^2 J_v J_v^T`.
 
         Args:
@@ -155,11 +155,11 @@ class Invariant:
         """
         return None
 
-    def linearized(
+    def linearize(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
-        """:meth:`whitened`, flat ``(b, n c)``, and its derivative by all entries of the motion ``(b, p, n c)``, where there is a
-        shorter way than automatic differentiation match by match; by default None, there is not."""
+        """:meth:`whitened_residual`, flat ``(b, n c)``, and its derivative by the entries of the motion ``(b, p, n c)``, where
+        there is a shorter way than automatic differentiation match by match; by default None, there is not."""
         return None
 
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
@@ -167,16 +167,16 @@ class Invariant:
         shapes = [part.shape[1:] for part in motion]
         return jacobian(lambda t: self.compose(*parts_of(t, shapes)).flatten(t.ndim - 1), flatten_parts(motion))
 
-    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """The same for matches that do not move: all their views agree under the motion.  ``(*batch, n, c)``."""
         raise ValueError(f"{self!r} has no separate residual for static matches; leave out static=")
 
-    def confined(self, free: int) -> Invariant | None:
+    def confine(self, free: int) -> Invariant | None:
         """The invariant of matches that stay in a subspace of ``free`` dimensions less; None where that is a static point, whose
-        residual is :meth:`whitened_static`."""
+        residual is :meth:`whitened_static_residual`."""
         return None
 
-    def normalized(self, transforms: tuple[Tensor, ...]) -> Invariant:
+    def normalize(self, transforms: tuple[Tensor, ...]) -> Invariant:
         """The invariant that the tensor of normalized matches belongs to: the same one, unless it depends on coordinates."""
         return self
 

@@ -28,6 +28,6 @@ class Stop:
     max_iterations: int = 30
     tolerance: float = 1e-9
 
-    def reached(self, before: Tensor, after: Tensor) -> Tensor:
+    def has_converged(self, before: Tensor, after: Tensor) -> Tensor:
         """Where the costs ``(b,)`` before and after an iteration end it, bool."""
         return ~(before - after > self.tolerance * after)

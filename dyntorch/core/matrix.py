@@ -98,7 +98,7 @@ def gram(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tens
 
 def _moments(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None) -> Tensor:
     """Packed Gram of one piece of the matches."""
-    packed = [p.packed(x) for p, x in zip(primitives, views, strict=True)]
+    packed = [p.pack(x) for p, x in zip(primitives, views, strict=True)]
     if static is None:
         return moment(packed, weights)
     moments = moment(packed, weights * (static == 0))
@@ -192,7 +192,7 @@ def within_noise(
     # numbers stay
     draw = torch.Generator().manual_seed(0)
     shifts = [STEP * torch.randn(x.shape[1:], generator=draw, dtype=x.dtype).to(x.device).expand_as(x) for x in views]
-    moved = [p.disturbed(x, change) for p, x, change in zip(primitives, views, shifts, strict=True)]
+    moved = [p.add_noise(x, change) for p, x, change in zip(primitives, views, shifts, strict=True)]
     rows = estimation_matrix(primitives, views, weights, static)
     change = estimation_matrix(primitives, moved, weights, static) - rows
     first = basis.mT

@@ -29,7 +29,7 @@ class Normalization:
     def of(cls, invariant: Invariant, transforms: Sequence[Tensor]) -> Normalization:
         """What similarities of the views do to what the invariant measures in them."""
         pairs = tuple(zip(invariant.primitives, transforms, strict=True))
-        return cls(tuple(transforms), tuple(p.normalized(t) for p, t in pairs), tuple(p.action(t) for p, t in pairs))
+        return cls(tuple(transforms), tuple(p.normalize(t) for p, t in pairs), tuple(p.action(t) for p, t in pairs))
 
     @property
     def scales(self) -> tuple[Tensor, ...]:

@@ -39,12 +39,12 @@ REMEDY: Mapping[Status, str] = {
 """What to do, as templates of messages; a task that knows better has its own (:attr:`Outcome.REMEDIES`)."""
 
 
-def failed(status: Tensor) -> Tensor:
+def is_failure(status: Tensor) -> Tensor:
     """Where a status leaves no tensor, bool of the same shape."""
     return (status == Status.TOO_FEW) | (status == Status.DEGENERATE)
 
 
-def agreed(status: Tensor) -> Tensor:
+def has_inliers(status: Tensor) -> Tensor:
     """Where matches agree with what was found, bool of the same shape; elsewhere no match is an inlier of anything."""
     return (status == Status.OK) | (status == Status.AMBIGUOUS)
 
@@ -104,13 +104,13 @@ class Notice:
         template = self.code.templates[self.values.get("case", "")]
         return Message(template, self.words, self.names, **{"value": self.value, **self.values})
 
-    def worded(self, words: Words) -> Notice:
+    def with_words(self, words: Words) -> Notice:
         """The same, with what a surface calls the arguments."""
         return replace(self, words=words)
 
-    def named(self, names: Mapping[str, str]) -> Notice:
+    def with_names(self, names: Mapping[str, str]) -> Notice:
         """The same, with the names of cameras; names that were given before stay."""
-        values = {key: value.named(names) if isinstance(value, Message) else value for key, value in self.values.items()}
+        values = {key: value.with_names(names) if isinstance(value, Message) else value for key, value in self.values.items()}
         return replace(self, names={**names, **self.names}, values=values)
 
     def __str__(self) -> str:
@@ -190,7 +190,7 @@ class Outcome:
         status = self._single() if status is None else status
         if status == Status.OK:
             return ""
-        told = [notice.text if words is None else notice.worded(words).text for notice in self._telling(status)]
+        told = [notice.text if words is None else notice.with_words(words).text for notice in self._telling(status)]
         return "; ".join(told[:2]) or Message(self.REMEDIES[status], words or as_python)
 
     def check(self) -> Self:
@@ -202,7 +202,7 @@ class Outcome:
         check_status(self.task, self.status, self.notices, self.REMEDIES)
         return self
 
-    def counted(self) -> str:
+    def count_statuses(self) -> str:
         """How many problems ended how: ``2 OK, 1 TOO_FEW``."""
         states = Counter(self.status.reshape(-1).tolist())
         return ", ".join(f"{count} {Status(state).name}" for state, count in sorted(states.items())) or "empty"
@@ -210,9 +210,9 @@ class Outcome:
     def head(self, **what: object) -> str:
         """First line of a representation: the class, what it is of, the batch and its states."""
         of = ", ".join(f"{name}={value}" for name, value in what.items())
-        return f"{type(self).__name__}({of}{', ' if of else ''}batch={tuple(self.status.shape)}: {self.counted()})"
+        return f"{type(self).__name__}({of}{', ' if of else ''}batch={tuple(self.status.shape)}: {self.count_statuses()})"
 
-    def warned(self) -> list[str]:
+    def warning_lines(self) -> list[str]:
         """Lines of a representation: the notices of one problem, or how many problems of a batch have which."""
         if not self.status.ndim:
             return [f"  warning {notice}" for notice in self.notices]

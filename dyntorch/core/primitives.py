@@ -84,7 +84,7 @@ class Primitive(ABC):
     def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
         r"""The other way: the change :math:`J c` of the raw vector, ``(*batch, n, width)``, for a change of the coordinates."""
 
-    def packed(self, x: Tensor) -> Tensor:
+    def pack(self, x: Tensor) -> Tensor:
         r"""Upper triangle of :math:`\sum_r v_r v_r^T` of each measurement, component first: ``(*batch, w (w + 1) / 2, n)``."""
         rows, columns = triangle(self.width, x.device)
         if self.rows > 1:
@@ -111,7 +111,7 @@ class Primitive(ABC):
         """The measurement after a similarity of its view (a scale and a shift), ``(*batch, d+1, d+1)``, in the same shape."""
         return torch.addcmul(transform[..., None, :-1, -1], x, transform[..., :1, :1])
 
-    def disturbed(self, x: Tensor, noise: Tensor) -> Tensor:
+    def add_noise(self, x: Tensor, noise: Tensor) -> Tensor:
         """The measurement with noise of the same shape, in units of normalized coordinates."""
         return x + noise
 
@@ -120,7 +120,7 @@ class Primitive(ABC):
         """Vectors of one measurement that belong to problems of their own; None: it has one."""
         return None
 
-    def normalized(self, transform: Tensor) -> Primitive:
+    def normalize(self, transform: Tensor) -> Primitive:
         """The primitive that measures in normalized coordinates: the same one, unless it depends on the coordinates."""
         return self
 
@@ -171,7 +171,7 @@ class Equations(Primitive):
     def vectors(self, x: Tensor) -> Tensor:
         return self.make(x)
 
-    def disturbed(self, x: Tensor, noise: Tensor) -> Tensor:
+    def add_noise(self, x: Tensor, noise: Tensor) -> Tensor:
         # matches are not normalized: the size of each is its own unit
         xy = x[..., :2]
         size = (xy - xy.mean(-2, keepdim=True)).square().mean((-2, -1), keepdim=True).sqrt()
@@ -233,7 +233,7 @@ class Monomials(Primitive):
         product = monomials(torch.cat([x.mT, torch.ones_like(x.mT[..., :1, :])], dim=-2), self.degree)
         return product * self.scale(x.device).to(x.dtype)[:, None] if self.isometric else product
 
-    def normalized(self, transform: Tensor) -> Primitive:
+    def normalize(self, transform: Tensor) -> Primitive:
         """The isometric ones: what is least squares must not depend on how the axes lie."""
         return Monomials(self.degree, self.dim, isometric=True)
 
@@ -290,7 +290,7 @@ class Point(Primitive):
     def components(self, x: Tensor) -> Tensor:
         return torch.cat([x.mT, torch.ones_like(x.mT[..., :1, :])], dim=-2)
 
-    def packed(self, x: Tensor) -> Tensor:
+    def pack(self, x: Tensor) -> Tensor:
         moved = x.mT
         # the products with the last coordinate, 1, are there already
         rows = [part for i in range(self.dim) for part in (moved[..., i:, :] * moved[..., i : i + 1, :], moved[..., i : i + 1, :])]
@@ -343,9 +343,9 @@ class HyperplanesThrough(Primitive):
         hyperplanes = torch.cat([eye.expand(*x.shape, self.dim), -x[..., None]], dim=-1)
         return compound(hyperplanes, self.order)
 
-    def packed(self, x: Tensor) -> Tensor:
+    def pack(self, x: Tensor) -> Tensor:
         if self.order > 1:
-            return super().packed(x)
+            return super().pack(x)
         moved = x.mT
         one, zero = torch.ones_like(moved[..., :1, :]), torch.zeros_like(moved)
         rows = [torch.cat([one, zero[..., i + 1 :, :], -moved[..., i : i + 1, :]], dim=-2) for i in range(self.dim)]
@@ -547,7 +547,7 @@ class Projected(Primitive):
     def raw(self, x: Tensor) -> Tensor:
         return homogeneous(x) @ self.cameras.to(x).mT
 
-    def normalized(self, transform: Tensor) -> Primitive:
+    def normalize(self, transform: Tensor) -> Primitive:
         return Projected(self._split(transform)[1])
 
     def action(self, transform: Tensor) -> Tensor:

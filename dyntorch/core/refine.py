@@ -12,7 +12,7 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches, check_plain, largest_weights, matches, relative_weights
 from dyntorch.core.matrix import gram
 from dyntorch.core.normalize import Normalization, denormalize, denormalize_motion, relative
-from dyntorch.core.outcome import failed, in_order
+from dyntorch.core.outcome import in_order, is_failure
 from dyntorch.core.refine_gradient import differentiable_minimum, needs_gradient, unfinished_notices
 from dyntorch.core.residual import multilinear_derivative, residual_derivative
 from dyntorch.core.solution import Solution
@@ -80,12 +80,12 @@ class Problem(NormalEquations):
     def moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that may move, and their derivative."""
         invariant, motion = self.invariant, self.parts(theta)
-        known = invariant.linearized(motion, views, self.scales)
+        known = invariant.linearize(motion, views, self.scales)
         if known is not None:
             return known
         nothing = each(lambda x: x[:0], (motion, views, self.scales))
-        if invariant.whitened(*nothing) is not None:
-            return residual_derivative(invariant.whitened, motion, views, self.scales)  # type: ignore[arg-type]
+        if invariant.whitened_residual(*nothing) is not None:
+            return residual_derivative(invariant.whitened_residual, motion, views, self.scales)  # type: ignore[arg-type]
         # one row per match: by hand through the tensor, several times cheaper than forward mode through the matches
         tensor, slope = invariant.compose_derivative(motion)
         value, derivative = multilinear_derivative(invariant, tensor.unflatten(1, invariant.shape()), views, self.scales)
@@ -93,10 +93,10 @@ class Problem(NormalEquations):
 
     def resting(self, theta: Tensor, views: tuple[Tensor, ...], free: int = 1) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that do not move, or move in so many dimensions less, and their derivative."""
-        smaller = self.invariant.confined(free)
+        smaller = self.invariant.confine(free)
         if smaller is not None:
             return replace(self, invariant=smaller).moving(theta, views)
-        return residual_derivative(self.invariant.whitened_static, self.parts(theta), views, self.scales)
+        return residual_derivative(self.invariant.whitened_static_residual, self.parts(theta), views, self.scales)
 
     def pieces(self, width: int) -> list[slice]:
         """The matches in slices whose Jacobians fit into memory, whatever their number."""
@@ -199,7 +199,7 @@ def constrain_matches(solution: Solution, data: Matches, iterations: int = CONST
         motion = algebraic_motion(solution, data, iterations)
         normalized = solution.base().compose(*motion)
         tensor = data.back(denormalize(invariant, normalized, solution.normalization.actions))
-        good = ~failed(solution.status.reshape(-1)).to(normalized.device)
+        good = ~is_failure(solution.status.reshape(-1)).to(normalized.device)
         return replace(
             solution,
             tensor=select(data.back(good), tensor, solution.tensor),
@@ -284,7 +284,7 @@ def refine(
         >>> bool((refined.sigma - 0.5).abs() < 0.15)
         True
     """
-    invariant, views = solution.invariant.prepared(views, **given)
+    invariant, views = solution.invariant.bind_arguments(views, **given)
     data = matches(invariant, views, weights, static, dimensions, mapped=True)
     old = solution.matches
     if data.batch != old.batch or data.count != old.count:
@@ -379,7 +379,7 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
 def _apply_minimum(solution: Solution, data: Matches, old: tuple[Tensor, ...], found: Minimum) -> Solution:
     """The solution with the refined motion, where refinement was possible; elsewhere with the old one."""
     invariant, shapes = solution.invariant, tuple(part.shape[1:] for part in old)
-    good = found.cost.isfinite() & ~failed(solution.status.reshape(-1).to(found.cost.device))
+    good = found.cost.isfinite() & ~is_failure(solution.status.reshape(-1).to(found.cost.device))
     motion = tuple(select(good, new, part) for new, part in zip(parts_of(found.theta[0], shapes), old, strict=True))
     # tensors of copies have the axis of the copies behind the batch, like the transforms of the solution
     normalized = solution.base().compose(*(select(good, part, _any(part)) for part in motion))
@@ -408,7 +408,7 @@ def _noise(invariant: Invariant, data: Matches, cost: Tensor) -> Tensor:
     conditions = torch.full_like(data.weights, float(invariant.codim))
     if data.static is not None:
         for free in range(1, invariant.within):
-            smaller = invariant.confined(free)
+            smaller = invariant.confine(free)
             still = sum(p.freedom() for p in invariant.primitives[1:]) if smaller is None else smaller.codim
             conditions = torch.where(data.static == free, float(still), conditions)
     spare = ((data.weights > 0) * conditions).sum(-1) - invariant.dof

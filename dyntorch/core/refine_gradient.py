@@ -74,12 +74,12 @@ def _cost(invariant: Invariant, shapes: tuple[torch.Size, ...], count: int, labe
         frames = tuple(t.reshape(t.shape[0], *t.shape[-2:]) for t in transforms)
         moved = tuple(p.move(x, t) for p, x, t in zip(invariant.primitives, views, frames, strict=True))
         scales, unit = relative([t[:, 0, 0] for t in frames])
-        base, motion = invariant.normalized(transforms), parts_of(theta, shapes)
+        base, motion = invariant.normalize(transforms), parts_of(theta, shapes)
         total = whitened_residual(base, motion, moved, scales).square().sum(-1) * torch.where(label == 0, weights, 0.0)
         for free in range(1, (2 if label.dtype == torch.bool else invariant.within) if labelled else 1):
-            smaller = base.confined(free)
+            smaller = base.confine(free)
             rest = (
-                base.whitened_static(motion, moved, scales)
+                base.whitened_static_residual(motion, moved, scales)
                 if smaller is None
                 else whitened_residual(smaller, motion, moved, scales)
             )

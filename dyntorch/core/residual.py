@@ -41,7 +41,7 @@ def algebraic(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Te
         >>> algebraic(dyn.FundamentalMatrix, F, torch.tensor([[0.0, 1.0]]), torch.tensor([[5.0, 3.0]])).tolist()
         [-2.0]
     """
-    invariant, views = as_invariant(invariant).prepared(views, **given)
+    invariant, views = as_invariant(invariant).bind_arguments(views, **given)
     _check(invariant, tensor, views)
     if invariant.nullity > 1 or invariant.copies is not None:
         raise ValueError(f"the tensors of {invariant!r} do not stand alone: a match has no single algebraic residual; use sampson")
@@ -81,7 +81,7 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
         >>> round(float(sampson(dyn.FundamentalMatrix, F, torch.tensor([[0.0, 1.0]]), torch.tensor([[5.0, 3.0]]))), 4)
         1.4142
     """
-    invariant, views = as_invariant(invariant).prepared(views, **given)
+    invariant, views = as_invariant(invariant).bind_arguments(views, **given)
     _check(invariant, tensor, views)
     views, missing = _mask_missing(invariant, views)
     ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
@@ -145,7 +145,7 @@ def whitened_residual(
     invariant: Invariant, motion: tuple[Tensor, ...], views: Sequence[Tensor], scales: tuple[Tensor, ...]
 ) -> Tensor:
     """Whitened residual ``(*batch, n, c)`` of matches that may move: the invariant's own, or that of its multilinear form."""
-    own = invariant.whitened(motion, tuple(views), scales)
+    own = invariant.whitened_residual(motion, tuple(views), scales)
     return own if own is not None else multilinear(invariant, invariant.compose(*motion), views, scales)[..., None]
 
 

@@ -13,7 +13,7 @@ from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.normalize import denormalize, relative
-from dyntorch.core.outcome import Status, failed
+from dyntorch.core.outcome import Status, is_failure
 from dyntorch.core.refine import refine_matches
 from dyntorch.core.residual import multilinear, whitened_residual
 from dyntorch.core.solution import NOISY, Solution
@@ -92,7 +92,7 @@ def robust_fit(
         >>> bool(solution.inliers[right].double().mean() > 0.95), bool(solution.inliers[~right].double().mean() < 0.2)
         (True, True)
     """
-    invariant, views = as_invariant(invariant).prepared(views, **given)
+    invariant, views = as_invariant(invariant).bind_arguments(views, **given)
     with torch.no_grad():
         data = matches(invariant, views, weights)
         _check(invariant, data, starts)
@@ -175,7 +175,7 @@ def _solution(search: Search, found: SearchResult) -> Solution:
     """The tensors found, as a solution in the coordinates of the search."""
     invariant, norm, data = search.invariant, search.norm, search.data
     tensor = invariant.tensor_of(found.basis if invariant.copies else found.basis[:, 0])
-    nearest = invariant.normalized(norm.transforms).constrain(tensor)
+    nearest = invariant.normalize(norm.transforms).constrain(tensor)
     # 0 where there is none, which all matches would fulfil
     tensor = select((nearest != 0).flatten(1).any(-1), nearest, tensor)
     status = torch.full(tensor.shape[:1], int(Status.OK), device=tensor.device)
@@ -237,7 +237,7 @@ def _with_status(solution: Solution, evidence: Tensor, degenerate: Tensor, inlie
     status = torch.where(degenerate, int(Status.DEGENERATE), status)
     few = (data.weights > 0).sum(-1) < invariant.minimal()
     status = torch.where(few, int(Status.TOO_FEW), status)
-    good, covariance = ~failed(status), solution.covariance
+    good, covariance = ~is_failure(status), solution.covariance
     return replace(
         solution,
         tensor=select(data.back(good), solution.tensor, torch.zeros_like(solution.tensor)),

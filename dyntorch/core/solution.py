@@ -15,7 +15,7 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
 from dyntorch.core.matrix import triangular_factor
 from dyntorch.core.normalize import Normalization, denormalize_motion
-from dyntorch.core.outcome import Outcome, Status, check_status, failed
+from dyntorch.core.outcome import Outcome, Status, check_status, is_failure
 from dyntorch.numerics.arguments import check_precision
 from dyntorch.numerics.blocks import select
 from dyntorch.numerics.function_transforms import mapped_over, over_problems
@@ -65,9 +65,9 @@ class Solution(Outcome):
         self, normalized: Tensor, status: Tensor, transforms: tuple[Tensor, ...], refined: tuple[Tensor, ...] | None
     ) -> tuple[Tensor, ...]:
         """:attr:`motion`, flat batch, float64."""
-        parts = self.invariant.normalized(transforms).motion_of(normalized) if refined is None else refined
+        parts = self.invariant.normalize(transforms).motion_of(normalized) if refined is None else refined
         moved = denormalize_motion(self.invariant, parts, _frames(transforms))
-        return tuple(select(~failed(status.to(part.device)), part, 0.0) for part in moved)
+        return tuple(select(~is_failure(status.to(part.device)), part, 0.0) for part in moved)
 
     @cached_property
     def singular_values(self) -> Tensor:
@@ -92,7 +92,7 @@ class Solution(Outcome):
 
     def base(self) -> Invariant:
         """The invariant of the normalized matches."""
-        return self.invariant.normalized(self.normalization.transforms)
+        return self.invariant.normalize(self.normalization.transforms)
 
     def frames(self) -> tuple[Tensor, ...]:
         """What normalized the views, ``(b, d + 1, d + 1)`` each, without an axis of copies."""
@@ -159,7 +159,7 @@ class Solution(Outcome):
             outer(self.tensor),
             outer(self.uncertainty),
             data,
-            Normalization(transforms, tuple(p.normalized(t) for p, t in pairs), tuple(map(inner, self.normalization.actions))),
+            Normalization(transforms, tuple(p.normalize(t) for p, t in pairs), tuple(map(inner, self.normalization.actions))),
             inner(self.normalized),
             status=outer(self.status),
             inliers=None if self.inliers is None else outer(self.inliers),
@@ -182,7 +182,7 @@ class Solution(Outcome):
             return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={tuple(self.status.shape)}: mapped over)"
         noise = "" if self.sigma is None else _noise_text(self.sigma[self.status == Status.OK])
         shape = tuple(self.status.shape)
-        return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {self.counted()}{noise})"
+        return f"Solution({self.invariant!r}, matches={self.matches.count}, batch={shape}: {self.count_statuses()}{noise})"
 
 
 def _frames(transforms: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

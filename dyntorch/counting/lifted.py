@@ -167,9 +167,9 @@ class _Lifted:
     def static(self, static: int | None, on_plane: int = 0, on_line: int = 0) -> list[Step]:
         """Points that do not move, some of them on one plane or line."""
         still = self.step("static", static, lambda w: np.zeros(self.rates, dtype=np.int64))
-        return [self.confined("on line", on_line, 1), *([self.confined("on plane", on_plane, 2)] if self.dim > 2 else []), still]
+        return [self.confine("on line", on_line, 1), *([self.confine("on plane", on_plane, 2)] if self.dim > 2 else []), still]
 
-    def confined(self, kind: str, matches: int, size: int) -> Step:
+    def confine(self, kind: str, matches: int, size: int) -> Step:
         """Matches of points that stay on one line (size 1) or plane (2), which has as many directions of motion as can be."""
         field, free = self.field, self.directions[0] if self.directions else 0
         ways = field.random(min(size, free), free)

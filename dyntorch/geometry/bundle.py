@@ -116,7 +116,7 @@ class BundleProblem(LeastSquares):
         moved = moved + (linear.by_point * point_step[:, None]).sum(2).view_as(moved)
         return camera_step, point_step, (moved * (2 * error - moved)).sum((1, 2, 3))
 
-    def moved(self, at: Iterate, step: Tensors) -> Iterate:
+    def advance(self, at: Iterate, step: Tensors) -> Iterate:
         """After a step of cameras and points, and one more of each point, where that lowers its cost."""
         cameras = self._cameras(at.theta[0] - step[0])
         points = normalize(at.theta[1] - step[1], dim=1)
@@ -130,7 +130,7 @@ class BundleProblem(LeastSquares):
         points, costs = torch.where(better[:, None], settled, points), torch.where(better, costs, linear.costs)
         return Iterate((cameras, points), costs.sum(-1), ())
 
-    def finished(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor:
+    def has_converged(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor:
         """Where nothing is left but rounding, or no gain was to be expected of a step that brought none."""
         return torch.where(fresh.cost < at.cost, fresh.cost <= self.rounding, step[2] <= tolerance * at.cost)
 

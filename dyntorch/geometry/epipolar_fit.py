@@ -47,13 +47,13 @@ class Frames:
         return (u @ self.core.unflatten(-1, (2, 2)) @ v.mT).flatten(1)
 
     def tangents(self) -> Tensor:
-        """Derivative ``(b, 7, 9)`` of F by the parameters of :meth:`moved`, at 0."""
+        """Derivative ``(b, 7, 9)`` of F by the parameters of :meth:`retract`, at 0."""
         local = (self.core @ _tables(self.core.dtype, self.core.device)[0]).unflatten(-1, (7, 9))
         u, v = self.turns.unbind(1)
         turn = (u.mT[:, :, None, :, None] * v.mT[:, None, :, None, :]).reshape(-1, 9, 9)
         return local @ turn
 
-    def moved(self, step: Tensor) -> Frames:
+    def retract(self, step: Tensor) -> Frames:
         """After a step ``(b, 7)``: U turned about its first two axes, V about its own, B along its tangents."""
         _, quaternions, rotation, multiplied, still = _tables(step.dtype, step.device)
         q = torch.addmm(still, step, quaternions).unflatten(-1, (3, 4))
@@ -154,7 +154,7 @@ class EpipolarProblem(LeastSquares):
 
     def retract(self, theta: Tensors, step: Tensors) -> Tensors:
         """The frames turned."""
-        fresh = Frames(*theta).moved(-step[0])
+        fresh = Frames(*theta).retract(-step[0])
         return fresh.turns, fresh.core
 
 

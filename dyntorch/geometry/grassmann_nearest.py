@@ -94,7 +94,7 @@ class _Nearest:
         step = self.newton_step(theta, sided)[0]
         first = theta - (step - step.detach())
         with torch.no_grad():
-            u, _, matrix = self.linearized(theta)
+            u, _, matrix = self.linearize(theta)
             hessian = self.hessian(theta, sided, u, matrix) + self.free(theta)
         with torch.enable_grad():
             (slope,) = torch.autograd.grad(self.cost(first, sided).sum(), first, create_graph=True)
@@ -114,7 +114,7 @@ class _Nearest:
         product = (grassmann_tensor(self.parts(theta), self.profile).flatten(1) * target.detach()).sum(-1, keepdim=True)
         return torch.where(product < 0, -target, target)
 
-    def linearized(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def linearize(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         r"""The unit tensor u ``(b, D)``, :math:`\nabla A / |A|` ``(b, p, D)`` and the Gauss-Newton matrix :math:`J_u J_u^T`."""
         value, slope = grassmann_derivative(self.parts(theta), self.profile)
         size = value.norm(dim=-1, keepdim=True).clamp(min=1e-300)
@@ -173,7 +173,7 @@ class _Nearest:
     def newton_step(self, theta: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         r""":math:`H^+ \nabla f`, to be subtracted, and whether it exists; its derivative by the target is that of the minimum."""
         with torch.no_grad():
-            u, slope, matrix = self.linearized(theta)
+            u, slope, matrix = self.linearize(theta)
             hessian = self.hessian(theta, target.detach(), u, matrix)
         return _solve_positive_definite(hessian + self.free(theta), -(slope @ _across(target, u)[..., None])[..., 0])
 
@@ -213,13 +213,13 @@ class NearestProblem(LeastSquares):
 
     def step(self, at: Iterate, damping: Tensor) -> Tensors:
         """Across the directions that leave the tensor alone."""
-        u, slope, matrix = self.family.linearized(at.theta[0])
+        u, slope, matrix = self.family.linearize(at.theta[0])
         gradient = -(slope @ _across(self.target, u)[..., None])[..., 0]
         diagonal = matrix.diagonal(dim1=-2, dim2=-1)
         floor = damping[:, None] * (diagonal + 1e-3 * diagonal.mean(-1, keepdim=True))
         return (_solve_positive_definite(matrix + self.family.free(at.theta[0]) + torch.diag_embed(floor), gradient)[0],)
 
-    def finished(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor:
+    def has_converged(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor:
         """Where the rest is left to Newton."""
         return step[0].norm(dim=-1) <= self.near * at.theta[0].norm(dim=-1)
 

@@ -432,9 +432,9 @@ class LensDescent:
     lens: Tensor
     """``(B, 2)``."""
 
-    def moved(self, step: Tensor) -> LensDescent:
+    def retract(self, step: Tensor) -> LensDescent:
         """After a step ``(B, 9)``: seven parameters of F, two lambda."""
-        return LensDescent(self.frames.moved(step[:, :7]), self.lens + step[:, 7:])
+        return LensDescent(self.frames.retract(step[:, :7]), self.lens + step[:, 7:])
 
     def distances(self, data: LensMatches) -> Tensor:
         """``(B, N)`` px."""
@@ -462,7 +462,7 @@ class LensDescent:
         # central differences: exact to 1e-10, and four times faster than jacfwd
         near = NEAR * torch.eye(9, dtype=away.dtype, device=away.device)
         turns, core, lens = (part.repeat_interleave(18, dim=0) for part in (self.frames.turns, self.frames.core, self.lens))
-        moved = LensDescent(Frames(turns, core), lens).moved(torch.cat([near, -near]).repeat(len(away), 1))
+        moved = LensDescent(Frames(turns, core), lens).retract(torch.cat([near, -near]).repeat(len(away), 1))
         ahead, behind = moved.distances(data).unflatten(0, (-1, 2, 9)).unbind(1)
         jacobian = ((ahead - behind) / (2 * NEAR)).mT / scale[..., None]
         weighted = (data.weights * (away.square() < MAX_SQUARED_DISTANCE))[..., None] * jacobian
@@ -506,7 +506,7 @@ class LensProblem(LeastSquares):
 
     def retract(self, theta: Tensors, step: Tensors) -> Tensors:
         """The frames turned, the lenses changed."""
-        fresh = LensDescent(Frames(*theta[:2]), theta[2]).moved(-step[0])
+        fresh = LensDescent(Frames(*theta[:2]), theta[2]).retract(-step[0])
         return fresh.frames.turns, fresh.frames.core, fresh.lens
 
 

@@ -364,7 +364,7 @@ def _nearest(matrix: Tensor, tries: Tensor) -> Tensor:
     # a full step at the end gives exact products the gradient of the nearest one, too
     problem = ProductProblem(matrix)
     at = problem.evaluate((forms,))
-    trial = problem.moved(at, problem.step(at, torch.full_like(at.cost, FULL)))
+    trial = problem.advance(at, problem.step(at, torch.full_like(at.cost, FULL)))
     better = trial.cost <= at.cost.clamp(min=EXACT)
     return torch.where(better[:, None, None, None], trial.theta[0], forms)
 

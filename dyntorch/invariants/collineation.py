@@ -120,6 +120,6 @@ class Collineation(Invariant):
         """
         return apply(tensor, x2)
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""Whitened :math:`e = \pi(A p_2) - x_1`, with :math:`Q = s_1^2 I + s_2^2 J J^T`; ``(*batch, matches, n)``."""
         return static_residual(motion, views, scales)

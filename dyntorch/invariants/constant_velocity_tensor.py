@@ -308,7 +308,7 @@ class ConstantVelocityTensor(Invariant):
         one = torch.ones((), dtype=x1.dtype, device=x1.device)
         return resting_residual(inverses(motion), (x1, x2, x3), (one, one, one)).norm(dim=-1)
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""The residual :math:`e = y_0 - 2 y_1 + y_2`, whitened; in an image :math:`e = \pi(A_2 (2 y_1 - y_0, 1)) - x_3`.
 
         Returns:
@@ -316,9 +316,7 @@ class ConstantVelocityTensor(Invariant):
         """
         return moving_residual(inverses(motion), views, scales)
 
-    def linearized(
-        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
-    ) -> tuple[Tensor, Tensor]:
+    def linearize(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """By way of the inverses, which the residuals of all matches share: computed once per motion."""
         maps, slope = self._inverses(motion)
         value, derivative = residual_derivative(moving_residual, maps, views, scales)
@@ -338,7 +336,7 @@ class ConstantVelocityTensor(Invariant):
         rows = [pad(block, (sum(sizes[:i]), sum(sizes[i + 1 :]))) for i, block in enumerate(blocks)]
         return (*value.unflatten(-1, (4, 4)).unflatten(0, (count, b)), *motion[count:]), torch.cat(rows, dim=-2)
 
-    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""Residual of matches that stand still, :math:`(y_1 - y_0, y_2 - y_1)`, whitened; it holds the common velocity at 0.
 
         Returns:

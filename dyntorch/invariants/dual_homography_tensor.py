@@ -221,11 +221,11 @@ class DualHomographyTensor(Invariant):
         one = torch.ones((), dtype=torch.float64, device=lines1.device)
         return whitened_agreement(parts, (one,) * 3).norm(dim=-1).to(lines1.dtype)
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """Static points: their disagreement in view 1, ``(*batch, n, 4)``.  Lines: that of the form itself."""
         return static_residual(motion, views, scales) if self.measure == "points" else None
 
-    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""Disagreement of a static line with its images :math:`A^{-T} l_2` and :math:`B^{-T} l_3` in angle and offset,
         whitened; ``(*batch, n, 4)``."""
         if self.measure == "points":

@@ -244,7 +244,7 @@ class DynamicShapeTensor(Invariant):
         if len(set(self.base)) != 4 or len(self.base) != 4 or min(self.base) < 0:
             raise ValueError(f"base must be four different points, counted from 0, got {self.base!r}")
 
-    def prepared(
+    def bind_arguments(
         self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
     ) -> tuple[Invariant, tuple[Tensor, ...]]:
         """The invariant of so many points and of this interval, and ``(*batch, views, n, 4)``: x, y, 1 (0 where missing), time."""
@@ -347,7 +347,7 @@ class DynamicShapeTensor(Invariant):
             return (unknowns / unknowns.norm(dim=-1, keepdim=True).clamp(min=1e-300))[..., None, :]
         return unknowns_of(tensor, self.base)[..., None, :]
 
-    def estimated(self, views: tuple[Tensor, ...], weights: Tensor) -> Estimate | None:
+    def estimate_tensor(self, views: tuple[Tensor, ...], weights: Tensor) -> Estimate | None:
         """The form ``joint`` by least squares over all points; the others are the null space of the rows."""
         if self.form != "joint":
             return None
@@ -371,9 +371,9 @@ class DynamicShapeTensor(Invariant):
             shapes: ``(*batch, n, 3 B)`` the shapes :math:`[P_0, P_1, \dots]` of the functions of the trajectory, at times in
                 [-1, 1] for polynomials.
         """
-        return replace(self, points=shapes.shape[-2])._composed(shapes.double()).to(shapes.dtype)
+        return replace(self, points=shapes.shape[-2])._compose(shapes.double()).to(shapes.dtype)
 
-    def _composed(self, shapes: Tensor) -> Tensor:
+    def _compose(self, shapes: Tensor) -> Tensor:
         n = self.points
         if self.form == "span":
             rows = (shapes - shapes.mean(-2, keepdim=True)).mT @ centring_basis(n, shapes.device).mT
@@ -404,20 +404,20 @@ class DynamicShapeTensor(Invariant):
             return split_shapes(tensor)
         return shapes_of_graph(unknowns_of(tensor, self.base), tensor.shape[-2], self.trajectory, self.base)
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The distance of each view from the images of its shape, point by point: ``(*batch, views, 2 n)``."""
         if self.projective:
             wide = (split_shapes(motion[0].double()), views[0].double(), scales[0].double())
-            return perspective_shapes.whitened(*wide, self.trajectory).to(views[0].dtype)
+            return perspective_shapes.whitened_residual(*wide, self.trajectory).to(views[0].dtype)
         residual = self._projected(motion[0].double(), views[0].double())[0].residual.flatten(-2)
         return (residual / scales[0][..., None, None]).to(views[0].dtype)
 
-    def linearized(
+    def linearize(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
-        """:meth:`whitened` and its derivative by the shapes."""
+        """:meth:`whitened_residual` and its derivative by the shapes."""
         if self.projective:
-            return perspective_shapes.linearized(split_shapes(motion[0]), views[0], scales[0], self.trajectory)
+            return perspective_shapes.linearize(split_shapes(motion[0]), views[0], scales[0], self.trajectory)
         if self.form == "span":
             return None
         found, rows = self._projected(motion[0], views[0])

@@ -262,7 +262,7 @@ class DynamicTensor(Invariant):
         planes = torch.linalg.qr((found.hyperplanes @ maps[:, None, view - 1]).mT)[0].mT
         return planes.reshape(*batch, *planes.shape[1:]).to(views[0].dtype)
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """Distances of all views from the nearest flat, ``(*batch, n, m (n + 1 - k))``; None where one equation says it all."""
         if self.single():
             return None
@@ -272,16 +272,16 @@ class DynamicTensor(Invariant):
         found = flat_residual(maps.double(), flat, [s.double().expand(batch).reshape(-1) for s in scales], self.k)
         return found.reshape(*batch, *found.shape[1:]).to(views[0].dtype)
 
-    def linearized(
+    def linearize(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
         return None if self.single() else flat_residual_derivative(self._stack_maps(motion), views, scales, self.k)
 
-    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Disagreement of the views of a static point, ``(*batch, n, n (m - 1))``."""
         return static_residual(motion, views, scales)
 
-    def confined(self, free: int) -> Invariant | None:
+    def confine(self, free: int) -> Invariant | None:
         return None if self.k - free <= 1 else DynamicTensor(self.n, self.views, self.k - free)
 
     def _moved(self, maps: tuple[Tensor, ...], but: int = -1) -> Tensor:
@@ -341,12 +341,12 @@ class DynamicMotion(DynamicTensor):
     def decompose(self, tensor: Tensor) -> tuple[Tensor, ...]:
         return tensor.unbind(-3)
 
-    def confined(self, free: int) -> Invariant | None:
+    def confine(self, free: int) -> Invariant | None:
         return DynamicMotion(self.n, self.views, self.k - free)
 
-    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Distances of all views from the nearest static point, ``(*batch, n, m n)``, of n (m - 1) degrees of freedom."""
-        found = DynamicMotion(self.n, self.views, 1).whitened(motion, views, scales)
+        found = DynamicMotion(self.n, self.views, 1).whitened_residual(motion, views, scales)
         assert found is not None
         return found
 

@@ -159,11 +159,11 @@ class GrassmannTensor(Invariant):
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         return normalized_derivative(*grassmann_derivative(motion, self.profile))
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The reprojection error that is left when the point is eliminated; None where one condition is all there is."""
         return None if self.single() else agreement.residual(motion, views, scales)
 
-    def linearized(
+    def linearize(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
         return None if self.single() else agreement.residual_derivative(motion, views, scales)

@@ -272,7 +272,7 @@ class HomographyTensor(Invariant):
         one = torch.ones((), dtype=torch.float64, device=x1.device)
         return whitened_agreement(parts, (one,) * 3).norm(dim=-1).to(x1.dtype)
 
-    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         r"""Whitened :math:`e = (\pi(A p_2) - x_1,\ \pi(B p_3) - x_1)`, ``(*batch, n, 4)``."""
         return static_residual(motion, views, scales)
 

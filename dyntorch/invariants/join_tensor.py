@@ -27,11 +27,11 @@ class CollinearPoints(Invariant):
         """Forms ``(*batch, c, 4, 4, 4)`` on the points of the three views."""
         raise NotImplementedError
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Distance from one straight line, ``(*batch, n, 3)``, two degrees of freedom; see :func:`collinearity`."""
         return collinearity(motion, views, scales)
 
-    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Disagreement of the three views of a static point, ``(*batch, n, 6)``, six degrees of freedom."""
         return static_residual(motion, views, scales)
 
@@ -72,7 +72,7 @@ class CollinearPoints(Invariant):
         ``(*batch, n, 3)``, x2 ``(*batch, n, 3)``, x3 ``(*batch, n, 3)`` -> ``(*batch, n)``."""
         motion = motion_of_forms(self._several(tensor))
         one = torch.ones((), dtype=x1.dtype, device=x1.device)
-        return self.whitened_static(motion, (x1, x2, x3), (one, one, one)).norm(dim=-1)
+        return self.whitened_static_residual(motion, (x1, x2, x3), (one, one, one)).norm(dim=-1)
 
     def _several(self, tensor: Tensor) -> Tensor:
         """The forms, unless there is only one."""

@@ -137,16 +137,16 @@ class LiftedShapeTensor(Invariant):
         """The projections that are eliminated."""
         return CameraKind(self.k, self.l, self.frame == AFFINE)
 
-    def prepared(
+    def bind_arguments(
         self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
     ) -> tuple[Invariant, tuple[Tensor, ...]]:
-        super().prepared(views, weights, **given)
+        super().bind_arguments(views, weights, **given)
         if self.points not in (None, len(views)):
             raise ValueError(f"{self!r} takes {self.points} points, each (*batch, views, {self.l}), got {len(views)} arguments")
         self._check_points(len(views))
         return replace(self, points=len(views)), (constellations(self, views, self.l),)
 
-    def completed(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    def fill_missing(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
         """Views that miss a point have no part in a fit, while the points that they show can still be measured."""
         return views, weights * looked_at(views[0]).all(-1)
 
@@ -243,7 +243,7 @@ class LiftedShapeTensor(Invariant):
         whole = torch.where(
             sound, whole, 1.0 if own.frame == PLANE else torch.eye(*whole.shape[-2:], device=whole.device).to(whole)
         )
-        tensor = own._composed(whole)
+        tensor = own._compose(whole)
         if own.frame == GENERAL:
             # what no view tells is left out: tensors of one shape are then equal
             tensor = own.tensor_of(own.basis_of(tensor))
@@ -252,7 +252,7 @@ class LiftedShapeTensor(Invariant):
         flat = torch.where(sound if own.nullity > 1 else sound[..., 0], flat / torch.where(norm > 0, norm, 1.0), 0.0)
         return flat.unflatten(-1, own.shape()).to(points.dtype)
 
-    def _composed(self, points: Tensor) -> Tensor:
+    def _compose(self, points: Tensor) -> Tensor:
         """The tensor, of any scale, of points ``(*batch, n, k + 1)`` in the standard frame."""
         if self.frame == AFFINE:
             annihilator = null_space(points.mT, self.n - self.k - 1)
@@ -306,14 +306,12 @@ class LiftedShapeTensor(Invariant):
             )
         return lifted.multilinear(tensor.double(), basis.double(), self.profile).to(tensor.dtype)
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Reprojection error ``(*batch, views, l n)`` of the points of each view, whose camera is found first."""
         structure = static.standard(motion[0].double(), self.frame)
         return reprojection_residual(structure, views[0].double(), scales[0].double(), self.cameras).to(views[0].dtype)
 
-    def linearized(
-        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
-    ) -> tuple[Tensor, Tensor]:
+    def linearize(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         shape = motion[0].shape[-2:]
         value, slope = jacobian(lambda t: static.standard(t.unflatten(-1, shape), self.frame).flatten(-2), motion[0].flatten(-2))
         error, derivative = reprojection_derivative(value.unflatten(-1, shape), views[0], scales[0], self.cameras)
@@ -332,7 +330,7 @@ class LiftedShapeTensor(Invariant):
         Returns:
             ``(*batch, views)`` in [0, 1], 0 for a view of the shape; NaN where the view says nothing.
         """
-        invariant, (x,) = self.prepared(points)
+        invariant, (x,) = self.bind_arguments(points)
         assert isinstance(invariant, LiftedShapeTensor)
         structure = static.standard(invariant.decompose(tensor.double()), self.frame)
         return lifted.camera_score(structure, x.double(), self.cameras.freedom, self.frame == AFFINE).to(x.dtype)

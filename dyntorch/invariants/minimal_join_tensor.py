@@ -56,13 +56,13 @@ class MinimalJoinTensor(CollinearPoints):
             _check_cameras(cameras)
         object.__setattr__(self, "primitives", (Point(3), Point(3), Projected(cameras)))
 
-    def normalized(self, transforms: tuple[Tensor, ...]) -> Invariant:
+    def normalize(self, transforms: tuple[Tensor, ...]) -> Invariant:
         """The invariant of normalized matches, whose cameras have orthonormal rows.
 
         Args:
             transforms: ``(*batch, 1, 4, 4)`` similarity of each view, with a dimension for the cameras.
         """
-        third = self.primitives[2].normalized(transforms[2])
+        third = self.primitives[2].normalize(transforms[2])
         assert isinstance(third, Projected)
         return MinimalJoinTensor(third.cameras)
 

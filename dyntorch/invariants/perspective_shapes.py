@@ -55,13 +55,13 @@ def _structure(shapes: Tensor, measured: Tensor, trajectory: Trajectory) -> tupl
     return torch.nn.functional.pad(shapes_at(shapes, rows), (0, 1), value=1.0), rows
 
 
-def whitened(shapes: Tensor, measured: Tensor, scale: Tensor, trajectory: Trajectory) -> Tensor:
+def whitened_residual(shapes: Tensor, measured: Tensor, scale: Tensor, trajectory: Trajectory) -> Tensor:
     """Reprojection error ``(*batch, views, 2 n)`` of the points of each view at its time, whose camera is found first."""
     structure, _ = _structure(shapes, measured, trajectory)
     return reprojection_residual(structure, measured[..., :3], scale, CAMERA)
 
 
-def linearized(shapes: Tensor, measured: Tensor, scale: Tensor, trajectory: Trajectory) -> tuple[Tensor, Tensor]:
+def linearize(shapes: Tensor, measured: Tensor, scale: Tensor, trajectory: Trajectory) -> tuple[Tensor, Tensor]:
     """:func:`whitened`, flat, and its derivative ``(b, n 3 B, views 2 n)`` by the shapes side by side."""
     structure, rows = _structure(shapes, measured, trajectory)
     error, slope = reprojection_derivative(structure, measured[..., :3], scale, CAMERA)

@@ -122,10 +122,10 @@ class ShapeTensor(Invariant):
         """Whether the tensor is a multilinear form of the points of a view."""
         return self.frame != AFFINE and self.n <= LARGEST
 
-    def prepared(
+    def bind_arguments(
         self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
     ) -> tuple[Invariant, tuple[Tensor, ...]]:
-        super().prepared(views, weights, **given)
+        super().bind_arguments(views, weights, **given)
         if self.points not in (None, len(views)):
             raise ValueError(f"{self!r} takes {self.points} points, each (*batch, views, 2), got {len(views)} arguments")
         self._check_points(len(views))
@@ -137,7 +137,7 @@ class ShapeTensor(Invariant):
             x = torch.cat([torch.where(gone, torch.nan, x[..., :2]), x[..., 2:]], dim=-1)
         return replace(self, points=len(views)), (x,)
 
-    def completed(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    def fill_missing(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
         """Affine views with their missing points filled in, which must show at least five; other frames leave out rows."""
         x = views[0]
         if self.frame != AFFINE or not len(x) or bool(((x[..., 2] > 0) | (weights <= 0)[..., None]).all()):
@@ -228,13 +228,13 @@ class ShapeTensor(Invariant):
         whole = static.standard(whole.double(), own.frame)
         sound = whole.isfinite().flatten(-2).all(-1)[..., None, None]
         whole = torch.where(sound, whole, static.with_basis(torch.ones_like(whole[..., 4:, :]), own.frame))
-        tensor = own._composed(whole)
+        tensor = own._compose(whole)
         flat = tensor.flatten(-len(own.shape()))
         norm = flat.norm(dim=-1, keepdim=True)
         flat = torch.where(sound if own.nullity > 1 else sound[..., 0], flat / torch.where(norm > 0, norm, 1.0), 0.0)
         return flat.unflatten(-1, own.shape()).to(points.dtype)
 
-    def _composed(self, points: Tensor) -> Tensor:
+    def _compose(self, points: Tensor) -> Tensor:
         """The tensor, of any scale, of points ``(*batch, n, 4)`` in the standard frame."""
         others = points[..., 4:, :]
         if self.frame == AFFINE:
@@ -272,14 +272,12 @@ class ShapeTensor(Invariant):
         v = flat @ static.plane_inverse(self.n, flat.device).mT if self.multilinear else flat
         return v.unflatten(-1, (self.n - 4, 3))
 
-    def whitened(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Reprojection error ``(*batch, views, 2 n)`` of the points of each view, whose camera is found first."""
         structure = static.standard(motion[0].double(), self.frame)
         return reprojection_residual(structure, views[0].double(), scales[0].double(), CAMERA[self.frame]).to(views[0].dtype)
 
-    def linearized(
-        self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
-    ) -> tuple[Tensor, Tensor]:
+    def linearize(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         value, slope = jacobian(
             lambda t: static.standard(t.unflatten(-1, (self.n, 4)), self.frame).flatten(-2), motion[0].flatten(-2)
         )
@@ -310,7 +308,7 @@ class ShapeTensor(Invariant):
             >>> bool(family.score(family.compose(P), *view) < 1e-12), bool(family.score(family.compose(P), *view.flip(0)) > 0.1)
             (True, True)
         """
-        invariant, (x,) = self.prepared(points)
+        invariant, (x,) = self.bind_arguments(points)
         assert isinstance(invariant, ShapeTensor)
         structure = static.standard(invariant.decompose(tensor.double()), self.frame)
         return view_score(structure, x.double(), self.frame).to(x.dtype)

@@ -209,7 +209,7 @@ class TranslatingLinesMatrix(Invariant):
         basis = torch.linalg.qr(family.flatten(-2).mT)[0].mT
         return basis.unflatten(-1, (6, 6))
 
-    def whitened_static(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+    def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Residual of lines that do not move: both points of view 2, mapped to view 1, lie on the line there, whitened.
 
         Returns:

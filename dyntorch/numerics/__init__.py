@@ -28,8 +28,8 @@ _HOME = {
     "metric_upgrade": "dyntorch.numerics.subspaces",
     "Message": "dyntorch.numerics.messages",
     "as_python": "dyntorch.numerics.messages",
-    "worded": "dyntorch.numerics.messages",
-    "named": "dyntorch.numerics.messages",
+    "with_words": "dyntorch.numerics.messages",
+    "with_names": "dyntorch.numerics.messages",
 }
 __all__ = sorted(_HOME)
 

@@ -100,11 +100,11 @@ class LeastSquares(ABC):
         """The parameters after a step."""
         return tuple([part - move for part, move in zip(theta, step, strict=True)])
 
-    def moved(self, at: Iterate, step: Tensors) -> Iterate:
+    def advance(self, at: Iterate, step: Tensors) -> Iterate:
         """The place after a step."""
         return self.evaluate(self.retract(at.theta, step))
 
-    def finished(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor | None:
+    def has_converged(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor | None:
         """Problems ``(b,)`` that the step from one place to another shows to be done, whatever the cost says."""
         return None
 
@@ -139,7 +139,7 @@ class NormalEquations(LeastSquares):
         gradient, matrix = at.terms
         return (damped_step(gradient, matrix, damping, self.free),)
 
-    def finished(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor | None:
+    def has_converged(self, at: Iterate, fresh: Iterate, step: Tensors, tolerance: float) -> Tensor | None:
         """Where nothing moves."""
         return step[0].abs().amax(-1) < SHORT
 
@@ -209,12 +209,12 @@ def _until_done(problem: LeastSquares, whole: Iterate, damping: Tensor, options:
 def _take_step(problem: LeastSquares, at: Iterate, damping: Tensor, options: LeastSquaresOptions) -> tuple[Iterate, Tensor, Tensor]:
     """Where a step of every problem leads, the next damping, and which problems are done (where there is a tolerance)."""
     step = problem.step(at, damping)
-    fresh = problem.moved(at, step)
+    fresh = problem.advance(at, step)
     fall = at.cost - fresh.cost
     done = better = fall > 0
     if options.tolerance is not None:
         done = torch.where(better, fall <= options.tolerance * at.cost, damping > options.stuck_damping)
-        finished = problem.finished(at, fresh, step, options.tolerance)
+        finished = problem.has_converged(at, fresh, step, options.tolerance)
         done = done if finished is None else done | finished
     damping = torch.where(better, (damping * DAMPING_DECREASE).clamp(min=options.least_damping), damping * options.increase)
     return fresh.where(better, at), damping, done
@@ -223,7 +223,7 @@ def _take_step(problem: LeastSquares, at: Iterate, damping: Tensor, options: Lea
 def _take_final_step(problem: LeastSquares, at: Iterate, options: LeastSquaresOptions) -> Iterate:
     """One step of every problem that is near its minimum, whatever rounding makes of the cost."""
     step = problem.step(at, torch.full_like(at.cost, options.least_damping))
-    fresh = problem.moved(at, step)
+    fresh = problem.advance(at, step)
     near = step[0].abs().amax(-1) < SETTLING_LENGTH
     return fresh.where(near & (fresh.cost <= at.cost * (1 + (options.tolerance or 0.0))), at)
 

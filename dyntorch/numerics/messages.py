@@ -30,7 +30,7 @@ class Message(str):
     - ``{value:# point is|# points are}``: one or many, by the value, which stands for ``#``;
     - ``{ends:pairs}``, ``{which:cameras}``: pairs of cameras and lists of them, by number.
 
-    A value that is a message itself is worded as the message around it.
+    A value that is a message itself gets the words of the message around it.
 
     Args:
         template: the sentence.
@@ -42,7 +42,7 @@ class Message(str):
         >>> said = Message("nothing moves in {camera:a}; {arg:max_shift} is {value:g}", value=2)
         >>> said
         'nothing moves in a; max_shift is 2'
-        >>> said.named({"a": "left"}).worded(lambda name, value: "--" + name.replace("_", "-"))
+        >>> said.with_names({"a": "left"}).with_words(lambda name, value: "--" + name.replace("_", "-"))
         'nothing moves in left; --max-shift is 2'
         >>> [Message("{n:# point is|# points are} off", n=n) for n in (1, 11)]
         ['1 point is off', '11 points are off']
@@ -61,31 +61,32 @@ class Message(str):
     def __getnewargs_ex__(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
         return (self.template, self.words, self.names), dict(self.values)
 
-    def worded(self, words: Words) -> Message:
+    def with_words(self, words: Words) -> Message:
         """The same, with what a surface calls the arguments."""
         return Message(self.template, words, self.names, **self.values)
 
-    def named(self, names: Mapping[str, str]) -> Message:
+    def with_names(self, names: Mapping[str, str]) -> Message:
         """The same, with the names of the cameras; names that were given before stay."""
-        values = {key: value.named(names) if isinstance(value, Message) else value for key, value in self.values.items()}
+        values = {key: value.with_names(names) if isinstance(value, Message) else value for key, value in self.values.items()}
         return Message(self.template, self.words, {**names, **self.names}, **values)
 
 
-def worded(text: object, words: Words) -> str:
+def with_words(text: object, words: Words) -> str:
     """What is said by a message or an error with one, in these words; anything else as it is.
 
     Example:
-        >>> worded(ValueError(Message("give {arg:times=}")), lambda name, value: f"--{name}"), worded("a plain one", as_python)
+        >>> error = ValueError(Message("give {arg:times=}"))
+        >>> with_words(error, lambda name, value: f"--{name}"), with_words("a plain one", as_python)
         ('give --times', 'a plain one')
     """
     said = text.args[0] if isinstance(text, Exception) and len(text.args) == 1 else text
-    return said.worded(words) if isinstance(said, Message) else str(text)
+    return said.with_words(words) if isinstance(said, Message) else str(text)
 
 
-def named(text: object, names: Mapping[str, str]) -> str:
+def with_names(text: object, names: Mapping[str, str]) -> str:
     """The same with the names of cameras."""
     said = text.args[0] if isinstance(text, Exception) and len(text.args) == 1 else text
-    return said.named(names) if isinstance(said, Message) else str(text)
+    return said.with_names(names) if isinstance(said, Message) else str(text)
 
 
 class _Form(Formatter):
@@ -104,7 +105,7 @@ class _Form(Formatter):
         if value is _OWN["camera"]:
             return self._name(format_spec)
         if isinstance(value, Message):
-            return value if self.words is as_python else value.worded(self.words)
+            return value if self.words is as_python else value.with_words(self.words)
         if format_spec == "cameras":
             return f"camera{'s' if len(value) > 1 else ''} {', '.join(map(self._name, value))}"
         if format_spec == "pairs":

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.limits import MAX_SQUARED_DISTANCE, Stop
-from dyntorch.core.outcome import Outcome, Status, failed
+from dyntorch.core.outcome import Outcome, Status, is_failure
 from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.numerics.arguments import check_tensor, check_together
 from dyntorch.numerics.blocks import one_thread
@@ -91,9 +91,9 @@ class DeformableShapes(Outcome):
     def __repr__(self) -> str:
         basis, n = self.shapes.shape[-3:-1]
         first = self.head(frames=self.points.shape[-3], points=n, basis=basis)
-        if bool(failed(self.status).all()):
+        if bool(is_failure(self.status).all()):
             return first
-        known = self.residual[~failed(self.status)]
+        known = self.residual[~is_failure(self.status)]
         kind = "metric" if bool(self.metric.all()) else "affine" if not bool(self.metric.any()) else "metric or affine"
         return f"{first}\n  {kind}; residual {float(known.median()):.3g} rms"
 
@@ -253,7 +253,7 @@ def _fit_stages(x: Tensor, w: Tensor, basis: int, pairs: Tensor | None, orthogra
     status = torch.where(third < MIN_THIRD_VALUE, int(Status.DEGENERATE), status)
     status = torch.where((spare < 0) | ((both.sum(-1) > 3).sum(-1) < 1) | (both.sum((1, 2)) < 4), int(Status.TOO_FEW), status)
     finite = torch.stack([part.isfinite().flatten(1).all(-1) for part in model]).all(0)
-    status = torch.where(~finite & ~failed(status), int(Status.DEGENERATE), status)
+    status = torch.where(~finite & ~is_failure(status), int(Status.DEGENERATE), status)
     return _DeformableFit(_canonical_model(model), metric, rms * scale, sigma * scale, status, scale)
 
 
@@ -439,7 +439,7 @@ def _alternate(x: Tensor, w: Tensor, model: _Model, metric: Tensor, stop: Stop) 
         better = now < cost[left]
         at = left[better]
         model = _Model(*(old.index_copy(0, at, new[better]) for old, new in zip(model, fresh, strict=True)))
-        done = stop.reached(cost[left], now)
+        done = stop.has_converged(cost[left], now)
         cost = cost.index_copy(0, at, now[better])
         left = left[better & ~done & (now > floor[left])]
         if not len(left):
@@ -534,7 +534,7 @@ def _canonical_model(model: _Model) -> _Model:
 
 def _result(found: _DeformableFit, batch: torch.Size, like: Tensor) -> DeformableShapes:
     """In the caller's batch, unit and dtype; zero where nothing was found."""
-    model, bad = found.model, failed(found.status)
+    model, bad = found.model, is_failure(found.status)
 
     def shaped(value: Tensor) -> Tensor:
         wide = bad[(..., *[None] * (value.ndim - 1))]

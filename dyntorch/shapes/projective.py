@@ -201,7 +201,7 @@ def fit_perspective_shapes(
         >>> points = torch.randn(9, 3, generator=g).double() + t[:, None, None] * 0.5 * torch.randn(9, 3, generator=g).double()
         >>> seen = points @ torch.linalg.qr(torch.randn(14, 3, 3, generator=g).double())[0]
         >>> found = fit_perspective_shapes(seen[..., :2] / (8 + seen[..., 2:]), Polynomial(1).rows(t))
-        >>> bool(found.residual.max() < 1e-12), found.counted()
+        >>> bool(found.residual.max() < 1e-12), found.count_statuses()
         (True, '1 OK')
     """
     if x.ndim > 2 and x.shape[-2] < 6:

@@ -48,7 +48,7 @@ class Recovery(Outcome):
     TASK = "recover_times"
 
     def __repr__(self) -> str:
-        return f"Recovery(views={self.times.shape[-1]}, batch={tuple(self.times.shape[:-1])}: {self.counted()})"
+        return f"Recovery(views={self.times.shape[-1]}, batch={tuple(self.times.shape[:-1])}: {self.count_statuses()})"
 
     def ambiguous(self, noise: Tensor | float, odds: float = 20.0) -> Tensor:
         """Whether noise of this standard deviation could exchange the two times, ``(*batch, views)`` bool.

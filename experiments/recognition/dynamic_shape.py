@@ -164,7 +164,7 @@ def counts(config: Config) -> list[Row]:
         size = (n - 2) // 3 if form == "span" else 2
         one = views(NoiseConfig(scenes=1, seed=config.seed), Polynomial(size - 1), n, noise=0.0)
         kind = DynamicShapeTensor(Polynomial(size - 1), form=form)
-        invariant, measured = kind.prepared(one.seen, times=one.times[:, : one.frames])
+        invariant, measured = kind.bind_arguments(one.seen, times=one.times[:, : one.frames])
         found = least(invariant.primitives[0].vectors(measured[0])[0], invariant.width() - invariant.nullity)
         rows.append(Row(f"{form}, B = {size}", f"{n} points", found, goal, at_most=True))
     g = torch.Generator().manual_seed(config.seed)

@@ -166,7 +166,7 @@ class ActionIndexer(SavedClassifier):
         parameters = {name: value for name, value in header["parameters"].items() if name not in ("depth", "pool")}  # older files
         return {**parameters, "tempi": tuple(parameters["tempi"])}
 
-    def _stored(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    def _export_state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
         model, tensors = self.model_, tensors_of(self.model_)
         if model.kernels is not None and model.kernels.scales is not None:
             tensors["scales"] = model.kernels.scales

@@ -160,7 +160,7 @@ class BrightnessIndexer(SavedClassifier):
             raise ValueError(f"temporal_weight={shown(weight)}: window kernels are no longer mixed into scores")
         return parameters
 
-    def _stored(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    def _export_state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
         return {"classes": labels_to_json(self.classes_)}, tensors_of(self.exemplars_)
 
     def _restore(self, header: Mapping[str, Any], parts: Parts) -> None:

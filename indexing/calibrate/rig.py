@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dyntorch.numerics import as_python, worded
+from dyntorch.numerics import as_python, with_words
 from indexing.calibrate.body_height import Stature
 from indexing.calibrate.camera_views import Joints, View
 from indexing.calibrate.priors import KnownLenses
@@ -97,7 +97,7 @@ class CameraRig:
     def with_camera_names(self) -> Calibration:
         """The calibration, whose notices call the cameras by name."""
         names = {str(number): name for number, name in enumerate(self.names)}
-        said = tuple(notice.named(names) for notice in self.calibration.notices)
+        said = tuple(notice.with_names(names) for notice in self.calibration.notices)
         return dataclasses.replace(self.calibration, notices=said)
 
     @functools.cached_property
@@ -131,14 +131,14 @@ class CameraRig:
     @functools.cached_property
     def notes(self) -> list[str]:
         """What a reader should know besides, a sentence each."""
-        own = [str(notice.worded(self.words).text) for notice in self.with_camera_names.notices if _is_note(notice)]
+        own = [str(notice.with_words(self.words).text) for notice in self.with_camera_names.notices if _is_note(notice)]
         known = [*self.remarks, *self.lenses.notes, *([self.stature.note] if self.stature is not None else [])]
-        return list(dict.fromkeys([*(worded(note, self.words) for note in known), *own]))
+        return list(dict.fromkeys([*(with_words(note, self.words) for note in known), *own]))
 
     @functools.cached_property
     def unknown(self) -> list[str]:
         """What cannot be known from these recordings, a sentence each."""
-        open_ = [str(notice.worded(self.words).text) for notice in self.with_camera_names.notices if notice.code.value in OPEN]
+        open_ = [str(notice.with_words(self.words).text) for notice in self.with_camera_names.notices if notice.code.value in OPEN]
         return [
             *open_,
             f"where in the world the rig stands: the origin is on the ground below the people, y is ahead of {self.names[0]}",

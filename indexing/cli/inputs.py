@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.cli.console import count, names
 from indexing.cli.flags.shared import Example, Reading, Watched
 from indexing.cli.notes import WORDS, clip_notes, first_sentences, on_examples, on_gaps, on_people
@@ -55,7 +55,7 @@ def read_clips(reading: Reading, path: Path, label: str | None = None) -> ClipSe
     except ValueError as problem:
         if type(problem) is not ValueError:
             raise  # nobody is in view, which some commands say in their own way
-        raise ValueError(worded(problem, WORDS)) from None
+        raise ValueError(with_words(problem, WORDS)) from None
 
 
 def _rename_clips(clips: ClipSet, old: Path, new: Path) -> ClipSet:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.cli.console import count, flag_words, names
 from indexing.cli.flags.shared import Reading
 from indexing.clip import Clip, stretches
@@ -22,7 +22,7 @@ WORDS = flag_words("fps", "person", "min_confidence", "format", "layout", size="
 
 def clip_notes(clips: Sequence[Clip], reading: Reading) -> list[str]:
     """On clips of any use: who is in them, in which units, and at which rate."""
-    found = [*_people(clips, reading), *(worded(one, WORDS) for one in remarks_on(clips, reading.size is not None))]
+    found = [*_people(clips, reading), *(with_words(one, WORDS) for one in remarks_on(clips, reading.size is not None))]
     if reading.fps is not None and not SLOW <= reading.fps <= FAST and clips:
         length = max(clip.duration for clip in clips)
         found.append(f"--fps {reading.fps:g}: the longest clip lasts {length:.3g} s then; is that so?")

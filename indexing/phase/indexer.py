@@ -244,7 +244,7 @@ class PhaseIndexer(SavedClassifier):
         return self
 
     # ---- files -------------------------------------------------------------------------------------------------------
-    def _stored(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    def _export_state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         about = {
             "classes": labels_to_json(self.classes_),
             "joints": self.n_joints_,

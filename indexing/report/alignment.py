@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.readers.matches import Matched
 from indexing.readers.pairs import Photograph
 from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
@@ -81,7 +81,7 @@ class AlignmentReport(ResultReport):
     @property
     def ambiguity(self) -> str:
         """What the data cannot tell, even without noise."""
-        return worded(self.result.ambiguity, self.words)
+        return with_words(self.result.ambiguity, self.words)
 
     @property
     def solved(self) -> bool:

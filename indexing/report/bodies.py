@@ -72,7 +72,7 @@ class BodiesReport(LabelledReport):
         found = []
         for notice in self.result.notices:
             values = {key: self._frame(value) if key in ("frame", "frames") else value for key, value in notice.values.items()}
-            found.append(dataclasses.replace(notice, values=values).worded(self.words))
+            found.append(dataclasses.replace(notice, values=values).with_words(self.words))
         return found
 
     def _frame(self, value: Any) -> Any:

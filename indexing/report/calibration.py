@@ -184,7 +184,7 @@ def as_json(report: CalibrationReport, names: Sequence[str] = ()) -> dict[str, A
         "exchanges": [_exchange_json(report, one) for one in rig.exchanges],
         "unknown": rig.unknown,
         "notices": [
-            {"code": notice.code.value, "value": notice.value, "message": notice.worded(rig.words).text,
+            {"code": notice.code.value, "value": notice.value, "message": notice.with_words(rig.words).text,
              "refuses": notice.code.refuses is not None}
             for notice in rig.with_camera_names.notices
         ],

@@ -127,7 +127,7 @@ class ResultReport:
     @functools.cached_property
     def warnings(self) -> list[tuple[str, float, str]]:
         """Code, figure and sentence of every notice."""
-        return [(notice.code.value, notice.value, notice.worded(self.words).text) for notice in self.result.notices]
+        return [(notice.code.value, notice.value, notice.with_words(self.words).text) for notice in self.result.notices]
 
     @property
     def reason(self) -> str:

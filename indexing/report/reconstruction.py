@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from dyntorch.tasks import MOTION_MODELS
 from indexing.readers.pairs import Photograph
 from indexing.readers.tracks import TrackSet
@@ -107,7 +107,7 @@ class ReconstructionReport(ResultReport):
     @property
     def ambiguity(self) -> str:
         """What the tracks cannot tell, even without noise."""
-        return worded(self.result.ambiguity, self.words)
+        return with_words(self.result.ambiguity, self.words)
 
     @property
     def single(self) -> int:

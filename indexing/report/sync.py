@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dyntorch.numerics import as_python, worded
+from dyntorch.numerics import as_python, with_words
 from indexing.opening import count
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 from indexing.report.page import Picture, markup, render, sentence, write_files
@@ -186,7 +186,7 @@ class SyncReport:
     def spoken(self) -> Any:
         """The clocks of all cameras, whose notices call them by name."""
         names = {str(number): name for number, name in enumerate(self.names)}
-        return dataclasses.replace(self.together, notices=tuple(notice.named(names) for notice in self.together.notices))
+        return dataclasses.replace(self.together, notices=tuple(notice.with_names(names) for notice in self.together.notices))
 
     @property
     def cycle(self) -> float | None:
@@ -214,14 +214,14 @@ class SyncReport:
                 if notice.code == "left_out" and one.wrong:  # these points are named beside their pair
                     continue
                 alone = len(self.pairs) == 1 or notice.values.get("camera")  # or it names the camera that it is about
-                said = notice.worded(self.words).text
+                said = notice.with_words(self.words).text
                 own.append(str(said) if alone else f"{one.a.name} and {one.b.name}: {said}")
         if self.together is not None:  # what the pairs say is told with them
             more = [notice for notice in accepted_notices(self.spoken) if notice.code != "of_pair"]
-            own = [str(notice.worded(self.words).text) for notice in more] + own
-        broke = [] if self.mended is None else [str(notice.worded(self.words).text) for notice in self.mended.found.notices]
+            own = [str(notice.with_words(self.words).text) for notice in more] + own
+        broke = [] if self.mended is None else [str(notice.with_words(self.words).text) for notice in self.mended.found.notices]
         broke += ["offsets, rates and written files are as if no frame had been lost or doubled"] * bool(broke)
-        return [*dict.fromkeys([*(worded(note, self.words) for note in self.remarks), *broke, *own]), *self.afterwards]
+        return [*dict.fromkeys([*(with_words(note, self.words) for note in self.remarks), *broke, *own]), *self.afterwards]
 
 
 def describe(report: SyncReport) -> str:

@@ -85,7 +85,7 @@ def find_breaks(
     if not (found.ok and found.breaks):
         return None
     names = {str(i): take.name for i, take in enumerate(takes)}
-    named = dataclasses.replace(found, notices=tuple(notice.named(names) for notice in found.notices))
+    named = dataclasses.replace(found, notices=tuple(notice.with_names(names) for notice in found.notices))
     changes: list[Floats] = [times.numpy() - clip.times for times, clip in zip(found.times, people, strict=True)]
     return RepairedClocks(
         named,

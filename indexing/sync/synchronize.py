@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from dyntorch.core import Notice, status_from
-from dyntorch.numerics import Message, check_options, named
+from dyntorch.numerics import Message, check_options, with_names
 from indexing.clip import Clip
 from indexing.remarks import is_normalized
 from indexing.sync.notices import SoundNotice, SyncNotice, accepted_notices, reader_notices
@@ -162,8 +162,8 @@ def pair(
             found, limits = _compare(a, b, method, measure, more, options)
             found = _with_sound(found, a, b, more) if sound else found
     except ValueError as problem:
-        raise ValueError(named(problem, names)) from problem
-    said = [notice.named(names) for notice in [*reader_notices(lens.notes if lens else ()), *limits, *found.shift.notices]]
+        raise ValueError(with_names(problem, names)) from problem
+    said = [notice.with_names(names) for notice in [*reader_notices(lens.notes if lens else ()), *limits, *found.shift.notices]]
     unique = {(notice.code, str(notice.text)): notice for notice in said}
     return dataclasses.replace(found, shift=dataclasses.replace(found.shift, notices=tuple(unique.values())))
 

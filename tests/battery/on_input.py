@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.core.outcome import failed
+from dyntorch.core.outcome import is_failure
 from dyntorch.core.primitives import Hyperplane
 from dyntorch.core.refine import constrain
 from tests.battery.cases import Case
@@ -55,7 +55,7 @@ def labelled_static_matches_have_the_ranks_of_the_theory(case: Case) -> None:
         # one that weighs nothing stands in for the missing one, which could be refused at once
         weights = (torch.arange(still + moving) != gone).double()
         fewer = dyn.fit(case.invariant, *scene.exact, static=static, weights=weights)
-        assert bool(failed(fewer.status)) and fewer.tensor.abs().max() == 0
+        assert bool(is_failure(fewer.status)) and fewer.tensor.abs().max() == 0
 
 
 @prop(lambda case: not case.invariant.labels_static)
@@ -113,7 +113,7 @@ def degenerate_problems_have_a_status_and_no_tensor(case: Case) -> None:
     for s in (solution, refined):
         finite(s)
         for i, kind in enumerate(names):
-            assert bool(failed(s.status[i])) == (kind != "good"), f"{kind}: {s!r}"
+            assert bool(is_failure(s.status[i])) == (kind != "good"), f"{kind}: {s!r}"
             assert (s.tensor[i].abs().max() == 0) == (kind != "good")
         ends = [0, len(names) - 1]
         assert worst(case.error(tuple(m[ends] for m in s.motion), tuple(m[None] for m in good.motion))) < 1e-6
@@ -171,8 +171,8 @@ def hostile_scales_stay_finite(case: Case) -> None:
     measured = not any(isinstance(p, Hyperplane) for p in case.invariant.primitives)
     for solution in (found, dyn.refine(found, *stacked, iterations=2)):
         finite(solution)
-        assert not measured or [int(s) for s in failed(solution.status).logical_not().nonzero()] == sound
-        assert torch.equal(solution.tensor.flatten(1).abs().amax(-1) > 0, ~failed(solution.status))
+        assert not measured or [int(s) for s in is_failure(solution.status).logical_not().nonzero()] == sound
+        assert torch.equal(solution.tensor.flatten(1).abs().amax(-1) > 0, ~is_failure(solution.status))
     assert not measured or found.status[sound].eq(found.status[0]).all()
     assert not measured or worst((found.singular_values[[3, 4]] / found.singular_values[0] - 1)[..., 0].abs()) < 1e-9
     few = tuple(x[[0, 1, 3]] for x in stacked)

@@ -68,7 +68,7 @@ class ShapeCase:
     def rows(self, views: tuple[Tensor, ...]) -> Tensor:
         """Of the estimation matrix, view by view."""
         points, given = self.arguments(views)
-        invariant, measured = self.invariant.prepared(points, **given)
+        invariant, measured = self.invariant.bind_arguments(points, **given)
         return invariant.primitives[0].vectors(measured[0])
 
     def scene(

@@ -5,7 +5,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch import counting
-from dyntorch.core.outcome import failed
+from dyntorch.core.outcome import is_failure
 
 EXACT = [(1, 2, 1), (1, 4, 1), (2, 2, 1), (2, 3, 1), (2, 3, 2), (2, 4, 2), (3, 2, 1), (3, 3, 2), (3, 4, 2), (3, 4, 3), (4, 4, 3)]
 """(n, m, k): points of P^n, m views, subspaces of k dimensions."""
@@ -147,7 +147,7 @@ def test_what_says_nothing_is_refused_with_its_reason():
     assert counting.dim_v(3, 3, 3) == 3**3 and counting.dim_v(4, 2, 2) == 4**2
     # static points alone are a smaller space: other tensors fit as well
     views, _ = observed(2, 4, 2, [1] * 100)
-    assert bool(failed(dyn.fit(dyn.DynamicTensor(2, 4, 2), *views).status))
+    assert bool(is_failure(dyn.fit(dyn.DynamicTensor(2, 4, 2), *views).status))
 
 
 def test_statuses_and_batches_are_those_of_every_invariant():

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import denormalize_motion
-from dyntorch.core.outcome import Notice, agreed, noting
+from dyntorch.core.outcome import Notice, has_inliers, noting
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import homogeneous, nonzero_sign
 from dyntorch.geometry.plane_motion import CommonPlane, PlaneMotion, motion_over, plane_motions
@@ -54,7 +54,7 @@ class CalibratedViews(NamedTuple):
         """Of a solution and its labels ``(b, n)``, with K ``(b, v + 1, 3, 3)``."""
         back = torch.linalg.inv(K)
         motion = denormalize_motion(solution.invariant, solution.normalized_motion(), solution.normalization.transforms)
-        solved = agreed(solution.status.reshape(-1))
+        solved = has_inliers(solution.status.reshape(-1))
         A = torch.stack(list(motion), dim=1)
         N = back[:, :1] @ A @ K[:, 1:]
         fine = solved & N.isfinite().flatten(1).all(-1) & (torch.linalg.det(N) != 0).all(-1)

@@ -12,7 +12,7 @@ from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches
-from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
+from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.residual import whitened_residual
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY, Solution
@@ -165,7 +165,7 @@ def _from_tensor(
 
     motion, found = motion_of_all(evidence, solve, given, generator)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
-    usable = theta.isfinite().all(-1) & ~failed(found.status.reshape(-1))
+    usable = theta.isfinite().all(-1) & ~is_failure(found.status.reshape(-1))
     identity = torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(len(motion)) / 2
     theta = torch.where(usable[:, None], theta, identity)
     if given is not None:
@@ -190,7 +190,7 @@ def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
     status = _status(evidence, replace(best, labels=labels), worst, values[:, 0] <= MIN_INFORMATION * values[:, -1])
-    none = failed(status)
+    none = is_failure(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     assert refined.sigma is not None and refined.covariance is not None
     solution = replace(
@@ -222,7 +222,7 @@ def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Ten
 def _notices(
     evidence: Evidence, best: Labelled, worst: Tensor, status: Tensor, batch: tuple[int, ...], options: AlignOptions
 ) -> tuple[Notice, ...]:
-    solved = ~failed(status)
+    solved = ~is_failure(status)
     moving, still = (best.labels == MOVING).sum(-1), (best.labels == STATIC).sum(-1)
     found, note = noting(batch)
     note(AlignNotice.FEW_MOVING, moving, solved & (moving < MOVERS) & (still < ENOUGH), least=f"{MOVERS} and more")

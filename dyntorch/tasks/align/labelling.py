@@ -103,7 +103,7 @@ class Evidence:
         """Whitened residual ``(b, n, c)`` of every match if it moves, and if it stands still."""
         motion = self.problem(torch.zeros_like(self.data.weights)).parts(theta)
         moving = whitened_residual(self.invariant, motion, self.views, self.norm.scales)
-        return moving, self.invariant.whitened_static(motion, self.views, self.norm.scales)
+        return moving, self.invariant.whitened_static_residual(motion, self.views, self.norm.scales)
 
     def cost(self, theta: Tensor, sigma: Tensor) -> Tensor:
         """How badly the motion explains the matches, ``(b,)``."""

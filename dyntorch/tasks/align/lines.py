@@ -14,7 +14,7 @@ from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.matrix import gram
 from dyntorch.core.normalize import Normalization, denormalize_motion
-from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
+from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.primitives import Line, direction
 from dyntorch.core.residual import multilinear, multilinear_derivative
 from dyntorch.core.robust import robust_fit
@@ -336,7 +336,7 @@ def _align(
             generator=generator,
         )
     )
-    usable = ~failed(start.status)
+    usable = ~is_failure(start.status)
     lines = Lines.of(flat, points, start.normalization)
     theta = torch.where(usable[:, None], start.normalized_motion()[0].flatten(1), torch.eye(4).to(flat.weights).flatten() / 2)
     if not plain:
@@ -437,7 +437,7 @@ def _result(
     status = torch.where(_has_alternatives(lines, theta, labels, points, doubtful, options), int(Status.AMBIGUOUS), status)
     status = torch.where(extent[:, 0] <= MIN_INFORMATION * extent[:, 1], int(Status.DEGENERATE), status)
     status = torch.where(usable, status, start.status.to(status))
-    none = failed(status)
+    none = is_failure(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     zero = none[:, None, None]
     return Alignment(

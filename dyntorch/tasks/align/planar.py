@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches, matches
-from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
+from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY, Solution
 from dyntorch.geometry.calibrated_cameras import calibrations
@@ -70,7 +70,7 @@ def planar_notices(
     :func:`tensor_rank`."""
     data = evidence.data
     rank, strength = tensor
-    solved = ~failed(status)
+    solved = ~is_failure(status)
     moving = best.labels == MOVING
     count = moving.sum(-1)
     found, note = noting(batch)
@@ -399,7 +399,7 @@ def _from_all(evidence: Evidence, given: Tensor | None, generator: torch.Generat
 def _usable(motion: tuple[Tensor, ...], found: Solution) -> tuple[Tensor, Tensor]:
     """The normalized motion, the identity where it failed, and where it did not."""
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
-    usable = theta.isfinite().all(-1) & ~failed(found.status)
+    usable = theta.isfinite().all(-1) & ~is_failure(found.status)
     identity = torch.eye(3, dtype=theta.dtype, device=theta.device).flatten().repeat(len(motion))
     return torch.where(usable[:, None], theta, identity), usable
 
@@ -416,7 +416,7 @@ def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tupl
     tensor = tensor_rank(evidence.data.restrict(labels != OUTLIER), evidence, best.sigma)
     free = (worst > MAX_DEVIATION) | is_undecided(evidence, best, tensor)
     status = _status(evidence, best, refined.sigma, free, values[:, 0] <= MIN_INFORMATION * values[:, -1])
-    none = failed(status)
+    none = is_failure(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     zero = none[:, None, None]
     solution = replace(

@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, agreed
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, has_inliers
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.plane_motion import PlaneMotion
 
@@ -164,7 +164,7 @@ class Alignment(Outcome):
 
     def __post_init__(self) -> None:
         """Where the matches do not agree, no label, velocity or noise says otherwise."""
-        good = agreed(self.status)
+        good = has_inliers(self.status)
         for name in ("labels", "sigma", "velocities", "unverified"):
             value = getattr(self, name)
             if value is not None:
@@ -219,7 +219,7 @@ class Alignment(Outcome):
         lines = [self.head(matches=self.labels.shape[-1]), f"  labels: {counts}"]
         if self.sigma.numel():
             lines.append(f"  noise: {_median(self.sigma):.3g} per coordinate" + (" (median)" if self.status.ndim else ""))
-        return "\n".join(lines + self.warned())
+        return "\n".join(lines + self.warning_lines())
 
 
 def _median(values: Tensor) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyntorch.core.limits import MIN_CONSENSUS
 from dyntorch.core.matches import Matches
-from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
+from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import similarity, skew
 from dyntorch.geometry.rigid import moved_by, rigid_alignment
@@ -427,7 +427,7 @@ def _result(
     top = found.information.diagonal(dim1=-2, dim2=-1).amax(-1)
     noisy = found.sigma.isfinite() & (found.sigma > NOISY)
     status = _status(labels, sightings.weights, worst, noisy, values <= RIGID_INFORMATION_RATIO * top, dof, MOTIONS[motion])
-    none = failed(status)
+    none = is_failure(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     matrices, entries = _to_point_units(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
     # a noise beyond the range of the numbers is not known, and nor is the covariance

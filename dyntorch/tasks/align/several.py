@@ -11,7 +11,7 @@ from torch import Tensor
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import normalize_motion
-from dyntorch.core.outcome import failed
+from dyntorch.core.outcome import is_failure
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import homogeneous, unit
 from dyntorch.invariants.dynamic_tensor import DynamicMotion
@@ -47,7 +47,7 @@ def motion_of_all(
     parts = normalize_motion(moving_points(parts[0].shape[-1] - 1, 3), parts, [evidence.norm.transforms[v] for v in three])
     if count == 3:
         return parts, found
-    sound = ~failed(found.status.reshape(-1))
+    sound = ~is_failure(found.status.reshape(-1))
     eye = torch.eye(parts[0].shape[-1], dtype=parts[0].dtype, device=parts[0].device).expand_as(parts[0])
     known = dict(zip(three, (eye, *(select(sound & p.isfinite().flatten(1).all(-1), p, eye) for p in parts)), strict=True))
     planes, weights, noise = _flats_of(evidence, three, torch.stack([known[v] for v in three], dim=-3), given)

@@ -11,7 +11,7 @@ from dyntorch.core.fit import fit_matches
 from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import denormalize_motion
-from dyntorch.core.outcome import Notice, Status, failed, in_order, noting
+from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import apply, unit
@@ -110,8 +110,8 @@ def world_velocities(evidence: Evidence, theta: Tensor) -> Tensor:
 def residuals(evidence: Evidence, theta: Tensor) -> tuple[Tensor, Tensor]:
     """Squared residuals ``(b, n)`` of each match as a moving point and as a static one, in the unit of the matches."""
     model, motion, scales = ConstantVelocityTensor(), _maps(evidence, theta), evidence.norm.scales
-    moving = model.whitened(motion, evidence.views, scales).square().sum(-1)
-    return moving, model.whitened_static(motion, evidence.views, scales).square().sum(-1)
+    moving = model.whitened_residual(motion, evidence.views, scales).square().sum(-1)
+    return moving, model.whitened_static_residual(motion, evidence.views, scales).square().sum(-1)
 
 
 def _label_and_fit(evidence: Evidence, state: Velocities, affine: bool, estimate: bool) -> Velocities:
@@ -156,7 +156,7 @@ def _find_background(evidence: Evidence, state: Velocities, options: AlignOption
     one = tuple(x[:, chosen, None] for x in views)
     tried = ConstantVelocityTensor.fix_gauge((several[0], several[1], several[2]), *one)
     scales = tuple(s[:, None] for s in evidence.norm.scales)
-    resting = ConstantVelocityTensor().whitened_static(tried, tuple(x[:, None] for x in views), scales).square().sum(-1)
+    resting = ConstantVelocityTensor().whitened_static_residual(tried, tuple(x[:, None] for x in views), scales).square().sum(-1)
     # the noise of the one match that chose the velocity is in these residuals, too
     near = (resting <= ROUGH_LABEL_FACTOR**2 * limit[:, None]) & inliers[:, None]
     best = (near.sum(-1) * inliers[:, chosen]).argmax(-1)
@@ -222,7 +222,7 @@ def align_velocity(
     covariance = torch.where(covariance.isfinite().flatten(1).all(-1)[:, None, None], covariance, torch.inf)
     worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
     status = _status(evidence, state, worst, extent[:, 0] <= MIN_INFORMATION * extent[:, 1], found, affine)
-    none = failed(status)
+    none = is_failure(status)
     labels = torch.where(none[:, None], OUTLIER, state.labels)
     zero = none[:, None, None]
     velocities = world_velocities(evidence, state.theta)
@@ -247,7 +247,7 @@ def _projective_start(
     data = evidence.data
     found = robust_fit(ConstantVelocityTensor(), *data.views, threshold=threshold, weights=data.weights, generator=generator)
     theta = evidence.parameters(tuple(part.reshape(-1, 4, 4) for part in found.motion))
-    usable = theta.isfinite().all(-1) & ~failed(found.status)
+    usable = theta.isfinite().all(-1) & ~is_failure(found.status)
     theta = torch.where(usable[:, None], theta, _identity(theta))
     return theta, _starting_noise(evidence, theta, given), torch.where(usable, int(Status.OK), found.status)
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.normalize import hartley
-from dyntorch.core.outcome import Notice, Status, failed
+from dyntorch.core.outcome import Notice, Status, is_failure
 from dyntorch.core.problems import select_problem, solve_one_by_one, trim_padding
 from dyntorch.core.residual import sampson
 from dyntorch.core.robust import robust_fit
@@ -69,7 +69,7 @@ def projective(
     part = chosen[::stride]
     fitted = robust_fit(FundamentalMatrix, x1.flatten(0, 1)[part], x2.flatten(0, 1)[part], threshold=threshold, generator=generator)
     status = Status(int(fitted.status))
-    if bool(failed(fitted.status)):
+    if bool(is_failure(fitted.status)):
         return failure((n, n), seen.times, status, Notice(PairNotice.DEGENERATE, float(len(part))), 4)
     F = fitted.tensor
     distance = sampson(FundamentalMatrix, F, x1.flatten(0, 1), x2.flatten(0, 1)).unflatten(0, (frames, n))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, agreed
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, has_inliers
 from dyntorch.geometry.triangulation import reproject
 
 
@@ -143,18 +143,18 @@ class PairReconstruction(Outcome):
 
     def __repr__(self) -> str:
         if self.status.ndim:
-            return "\n".join([self.head(), *self.warned()])
+            return "\n".join([self.head(), *self.warning_lines()])
         kind = "projective" if self.points.shape[-1] == 4 else "affine"
         frames, count = self.points.shape[:2]
         found, matched = int((self.labels > 0).sum()), int((self.matches >= 0).sum())
         lines = [f"PairReconstruction({kind}, frames={frames}, points={count}: {Status(int(self.status)).name})"]
-        if bool(agreed(self.status)):
+        if bool(has_inliers(self.status)):
             first, second = (int(((self.labels > 0) & (self.source == k)).sum()) for k in (0, 1))
             of = f" ({first} of a, {second} of b)" if bool((self.source > 0).any()) else ""
             lines.append(
                 f"  {found} found{of}, {count - found} outliers, {matched} seen by both; residual {self.residual:.3g} px rms"
             )
-        return "\n".join(lines + self.warned())
+        return "\n".join(lines + self.warning_lines())
 
 
 def failure(

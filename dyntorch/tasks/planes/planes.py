@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit
 from dyntorch.core.normalize import hartley
-from dyntorch.core.outcome import Outcome, Status, failed
+from dyntorch.core.outcome import Outcome, Status, is_failure
 from dyntorch.geometry.homogeneous import (
     finite_depth,
     homogeneous,
@@ -186,12 +186,12 @@ class TranslatingPlanes(Outcome):
     def __repr__(self) -> str:
         planes, bodies = self.normals.shape[-2], self.epipoles.shape[-2] - self.normals.shape[-2]
         lines = [self.head(planes=planes, bodies=bodies)]
-        good = ~failed(self.status)
+        good = ~is_failure(self.status)
         if bool(good.any()):
             middle = " (median)" if self.status.ndim else ""
             error, residual = (float(v[good].double().median()) for v in (self.uncertainty, self.residual))
             lines.append(f"  homography at infinity: relative error about {error:.2g}{middle}; residual {residual:.3g} {self.unit}")
-        return "\n".join(lines + self.warned())
+        return "\n".join(lines + self.warning_lines())
 
 
 def _centre(frames: Tensor) -> Tensor:
@@ -237,7 +237,7 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
         PlanesNotice.OTHER_SOLUTION: (used.sum(-1), (other | several) & right & ~apart),
     }
     limits = planes_notices(figures, right, said, given)
-    there = (~failed(status)).to(theta.dtype)
+    there = (~is_failure(status)).to(theta.dtype)
     infinity, epipoles, normals = _to_pixels(given, layout, theta)
     infinity = infinity * there[:, None, None]
     mask = (used & there.bool()[:, None]).to(theta.dtype)[..., None]

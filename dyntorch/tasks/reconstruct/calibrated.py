@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Note, Status, failed, in_order, noting
+from dyntorch.core.outcome import Note, Status, in_order, is_failure, noting
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.calibrated_cameras import CalibratedCameras
 from dyntorch.geometry.homogeneous import nonzero_sign
@@ -77,7 +77,7 @@ def metric_reconstruction(
     motion, batch = plain.motion, tuple(plain.status.shape)
     stage = Stage.of_bodies(motion, tracks.x, tracks.x.shape[1]) if lifting is None else Stage.of_lift(lifting)
     status = plain.status.reshape(-1)
-    solved = ~failed(status)
+    solved = ~is_failure(status)
     found = metric_scene(tracks, scene, stage, labels, tracks.transforms @ calibration, solved)
     projections = found.cameras @ stage.lifts
     apart = distances(tracks, projections, found.structure)

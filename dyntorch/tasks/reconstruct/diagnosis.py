@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Note, Notice, Status, failed, in_order, noting
+from dyntorch.core.outcome import Note, Notice, Status, in_order, is_failure, noting
 from dyntorch.core.solution import NOISY
 from dyntorch.geometry.lift import behind
 from dyntorch.geometry.pairs import hyperplane_pair
@@ -126,10 +126,10 @@ def diagnose(
     """The status ``(b,)`` of every problem, judged by the scene, and the notices on all of them."""
     found, note = noting(batch)
     lost = (scene.cameras == 0).flatten(1).all(-1) | ~scene.cameras.isfinite().flatten(1).all(-1)
-    status = torch.where(lost & ~failed(status), int(Status.DEGENERATE), status)
+    status = torch.where(lost & ~is_failure(status), int(Status.DEGENERATE), status)
     enough, size = _num_through(tracks, motion)
-    status = torch.where(failed(status) & (enough < motion.tensor(size).minimal()), int(Status.TOO_FEW), status)
-    solved = ~failed(status)
+    status = torch.where(is_failure(status) & (enough < motion.tensor(size).minimal()), int(Status.TOO_FEW), status)
+    solved = ~is_failure(status)
     noise = sigma * tracks.scale()
     stack, doubt = conditions(tracks, scene, lifting, noise)
     stack, doubt = torch.where(solved, stack, 0.0), torch.where(solved, doubt, torch.inf)
@@ -243,7 +243,7 @@ def _noise_left_by(tracks: ViewTracks, motion: Motion, asked: Tensor) -> Tensor:
     mean = (apart.square().nansum((1, 2)) / spare(some, counted, motion).clamp(min=1)).sqrt() * some.scale()
     # a model that loses points explains nothing
     whole = counted.flatten(1).sum(-1) >= 0.9 * (some.weights > 0).flatten(1).sum(-1)
-    return left.index_copy(0, chosen, torch.where(failed(status) | ~whole, torch.inf, mean))
+    return left.index_copy(0, chosen, torch.where(is_failure(status) | ~whole, torch.inf, mean))
 
 
 def _observations(tracks: ViewTracks, motion: Motion, status: Tensor, note: Note) -> None:
@@ -252,7 +252,7 @@ def _observations(tracks: ViewTracks, motion: Motion, status: Tensor, note: Note
     need = -(-motion.k // motion.sensor)
     count = seen.sum(1)
     few = ((count > 0) & (count < need)).sum(-1)
-    note(ReconstructNotice.FEW_OBSERVED, few, (few > 0) & ~failed(status), case="points", needed=need)
+    note(ReconstructNotice.FEW_OBSERVED, few, (few > 0) & ~is_failure(status), case="points", needed=need)
     enough, size = _num_through(tracks, motion)
     least = motion.tensor(size).minimal()
     where = {"case": "tracks", "views": size, "motion": motion.name, "needed": least}

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.matches import Matches
-from dyntorch.core.outcome import Status, failed
+from dyntorch.core.outcome import Status, is_failure
 from dyntorch.core.refine import constrain_matches
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
@@ -119,7 +119,7 @@ def projections_of_tracks(tracks: ViewTracks, invariant: GrassmannTensor, subset
     if count == 1:
         return found
     error = mean_error(many, found).nan_to_num(nan=torch.inf)
-    error = torch.where(failed(found.status), torch.inf, error).unflatten(0, (b, count))
+    error = torch.where(is_failure(found.status), torch.inf, error).unflatten(0, (b, count))
     # where all fail the status of the first choice stands
     best = error.argmin(1) + count * torch.arange(b, device=error.device)
     return Projections(found.projections[best], found.structure[best], found.status[best])
@@ -160,7 +160,7 @@ def _from_subset(tracks: ViewTracks, invariant: GrassmannTensor, chosen: Tensor)
         order = chosen.argsort(1)
         whole = some.gather(1, order[..., None, None].expand_as(some))
     adjusted = bundle_adjust(tracks.x, tracks.weights, whole, structure, iterations=FREE_ITERATIONS, tolerance=FREE_TOLERANCE)
-    bad = failed(status)[:, None, None]
+    bad = is_failure(status)[:, None, None]
     return Projections(torch.where(bad[..., None], 0.0, adjusted.cameras), torch.where(bad, 0.0, adjusted.structure), status)
 
 

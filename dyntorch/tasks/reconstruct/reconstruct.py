@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.normalize import hartley
-from dyntorch.core.outcome import failed, in_order, noting
+from dyntorch.core.outcome import in_order, is_failure, noting
 from dyntorch.geometry.calibrated_cameras import calibrations
 from dyntorch.geometry.triangulation import mask_missing
 from dyntorch.numerics.arguments import check_options, on_cpu
@@ -275,7 +275,7 @@ def _check_enough(model: Motion, times: Tensor, x: Tensor) -> None:
 def _with_notices(found: Reconstruction, static: Tensor | None, used: Tensor) -> Reconstruction:
     """Without cameras for views that show too little, and with the notices on what was given."""
     batch = found.status.shape
-    good = ~failed(found.status).reshape(-1)
+    good = ~is_failure(found.status).reshape(-1)
     unused = (~used).sum(-1)
     more, note = noting(tuple(batch))
     note(ReconstructNotice.UNUSED_VIEW, unused, unused > 0, needed=_resection(found.motion))

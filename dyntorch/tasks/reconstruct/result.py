@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, failed
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, is_failure
 from dyntorch.geometry.homogeneous import inhomogeneous
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.tasks.reconstruct.motions import Motion
@@ -252,9 +252,10 @@ class Reconstruction(Outcome):
     def __repr__(self) -> str:
         views, n = self.residuals.shape[-2:]
         lines = [
-            f"Reconstruction({self.motion.name}, views={views}, points={n}, batch={tuple(self.status.shape)}: {self.counted()})"
+            f"Reconstruction({self.motion.name}, views={views}, points={n}, batch={tuple(self.status.shape)}: "
+            f"{self.count_statuses()})"
         ]
-        good = ~failed(self.status)
+        good = ~is_failure(self.status)
         if bool(good.any()):
             kinds = ("outlier", "body 1", "body 2") if self.motion.bodies > 1 else ("outlier", "static", "moving")
             kinds = ("outlier", "static", "static") if self.motion.static else kinds
@@ -273,4 +274,4 @@ class Reconstruction(Outcome):
             lines.append(f"  metric{whole}" if bool(self.metric.any()) else "  not metric")
         if self.ambiguity:
             lines.append(f"  {self.ambiguity}")
-        return "\n".join(lines + self.warned())
+        return "\n".join(lines + self.warning_lines())

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Status, failed
+from dyntorch.core.outcome import Status, is_failure
 from dyntorch.geometry.bundle import bundle_adjust, point_information
 from dyntorch.geometry.lift import (
     balance_lifts,
@@ -144,7 +144,7 @@ MULTISTART_SPARE = 6  # spare coordinates per point beyond which it is enough th
 def scene_of(tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
     """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
     scale ``(b,)``."""
-    lost = failed(found.status)
+    lost = is_failure(found.status)
     aided = _static_points_suffice(tracks, lifting)
     coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
     size = lifting.lifts.shape[-1]

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Status, agreed, failed, notices
+from dyntorch.core.outcome import Status, has_inliers, is_failure, notices
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import triangulate, unit_projections
 from dyntorch.numerics.chi_square import quantile
@@ -66,11 +66,11 @@ def solve(
     if lifting is not None and static is not None and not motion.static:
         tracks, scene = _correct_static(tracks, scene, lifting)
     free = unknowns(tracks, motion)
-    doubt = have_outliers(tracks, _distances(tracks, scene, lifting), free, limit) | failed(found.status)
+    doubt = have_outliers(tracks, _distances(tracks, scene, lifting), free, limit) | is_failure(found.status)
     chosen = doubt.nonzero()[:, 0] if limit != float("inf") else doubt.nonzero()[:0, 0]
     if lifting is not None and len(chosen):
         again, fewer, fine = trim_outliers(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit)
-        fine = fine & ~failed(found.status[chosen])
+        fine = fine & ~is_failure(found.status[chosen])
         tracks = tracks.only(tracks.weights.index_copy(0, chosen[fine], fewer.weights[fine]))
         scene = _merge(scene, _part(again, fine), chosen[fine])
         chosen = chosen[~fine]
@@ -107,7 +107,7 @@ def _scene(tracks: ViewTracks, found: Projections, lifting: Lifting | None) -> t
     if lifting is not None:
         scene = scene_of(tracks, found, lifting)
         # no tensor: too few points in common, or too like each other; but a scene was found without it
-        status = torch.where(failed(found.status) & scene.cost.isfinite(), int(Status.OK), found.status)
+        status = torch.where(is_failure(found.status) & scene.cost.isfinite(), int(Status.OK), found.status)
         return Projections(found.projections, found.structure, status), scene
     done = bundle_adjust(tracks.x, tracks.weights, found.projections, found.structure)
     return found, LiftedState(done.cameras, done.structure, done.cost)
@@ -166,7 +166,7 @@ def _result(
     if given is not None and tracks.static is not None:
         wrong = (given & ~tracks.static).sum(-1)
         limits += tuple(notices(ReconstructNotice.STATIC_MOVES, wrong, wrong > 0, batch))
-    bad = failed(status)
+    bad = is_failure(status)
 
     def shaped(value: Tensor, none: float = 0.0) -> Tensor:
         wide = bad[(..., *[None] * (value.ndim - 1))]
@@ -178,7 +178,7 @@ def _result(
         cameras=shaped(unit_projections(back @ cameras)),
         points=shaped(points, nan),
         velocities=None if speed is None else shaped(speed, nan),
-        labels=shaped(torch.where(agreed(status)[:, None], labels, 0)),
+        labels=shaped(torch.where(has_inliers(status)[:, None], labels, 0)),
         residual=shaped((total / number.clamp(min=1)).sqrt()),
         residuals=shaped(apart, nan),
         sigma=shaped(sigma),
@@ -292,7 +292,7 @@ class LiftedFit(NamedTuple):
         """With the noise from the distances."""
         counted = apart.isfinite()
         sigma = (apart.square().nansum((1, 2)) / spare(tracks, counted, motion).clamp(min=1)).sqrt()
-        return cls(motion, apart, failed(status), sigma)
+        return cls(motion, apart, is_failure(status), sigma)
 
 
 def _missing_input(motion: Motion, times: Tensor, views: int, n: int) -> str:

@@ -110,7 +110,7 @@ class Segmentation(Outcome):
             lines.append(f"  outliers: {int((self.labels == OUTLIER).sum())}")
         elif self.bodies.numel():
             lines.append(f"  bodies: {int(self.bodies.min())} to {int(self.bodies.max())}")
-        return "\n".join(lines + self.warned())
+        return "\n".join(lines + self.warning_lines())
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -234,4 +234,4 @@ class TrackSegmentation(Outcome):
             lines.append(f"  outliers: {int((self.labels == 0).sum())}")
         elif self.bodies.numel():
             lines.append(f"  bodies: {int(self.bodies.min())} to {int(self.bodies.max())}")
-        return "\n".join(lines + self.warned())
+        return "\n".join(lines + self.warning_lines())

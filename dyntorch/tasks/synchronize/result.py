@@ -264,7 +264,7 @@ class Shift(ClockOutcome):
 
     def __repr__(self) -> str:
         if self.status.ndim:
-            return "\n".join([self.head(), *self.warned()])
+            return "\n".join([self.head(), *self.warning_lines()])
         drift = f", rate {1e6 * (self.rate - 1):+.0f} ± {1e6 * self.rate_sigma:.0f} ppm" if self.rate != 1 else ""
         state = "ok" if self.ok else f"refused: {self.reason}"
         lines = [f"Shift({self.offset:+.4f} ± {self.sigma:.4f} s = {self.frames:+.2f} frames{drift}, {self.method}, {state})"]

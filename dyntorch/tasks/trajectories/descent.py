@@ -164,7 +164,7 @@ def _descend(surface: Surface, starts: Tensor) -> LineFit:
         for _ in range(DERIVATIVE_STEPS):
             (step,) = surface.step(at, torch.zeros_like(at.cost))
             near = step.detach().norm(dim=-1, keepdim=True) < MAX_DERIVATIVE_STEP
-            at = surface.moved(at, (torch.where(near, step, 0.0),))
+            at = surface.advance(at, (torch.where(near, step, 0.0),))
     (vectors,), (_, matrix, size) = at.theta, at.terms
     return LineFit(vectors, at.cost, _spread(matrix.detach(), size.detach(), surface.normals(vectors).shape[-2]))
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit
-from dyntorch.core.outcome import Outcome, Status, failed
+from dyntorch.core.outcome import Outcome, Status, is_failure
 from dyntorch.geometry.extensors import compound, skew_line
 from dyntorch.geometry.homogeneous import inhomogeneous, unit
 from dyntorch.geometry.lines import cameras_of_lines, line_camera, lines_of_pencil, nearest_line
@@ -346,7 +346,7 @@ def trajectory_cameras(
     flat = x.reshape(-1, *x.shape[-3:]).double()
     mass = torch.ones_like(flat[:, 0, :, 0]) if weights is None else weights.reshape(flat.shape[0], -1).double()
     solution = fit(SIX, *flat.unbind(1), weights=mass)
-    good = ~failed(solution.status)
+    good = ~is_failure(solution.status)
     parts = torch.stack(SIX.starts(solution.normalized), dim=-3)  # (tries, b, 6, 3, 6)
     transforms = torch.stack(solution.normalization.transforms, dim=-3)
     # lines are covariant: l' = T^-T l

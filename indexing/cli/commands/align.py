@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 import dyntorch
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.cli.console import check_report, count, finish, flag_words, names, progress, show
 from indexing.cli.flags.geometry import Align
 from indexing.cli.scenes import (
@@ -150,7 +150,7 @@ def _solve(flags: Align, matched: Matched, model: str, threshold: float | None) 
             return dyntorch.align_lines(*views, static_points=points or None, **options)
         return dyntorch.align_points(*views, model=model, motion=flags.motion, **options)
     except ValueError as problem:
-        raise ValueError(f"{names(matched.names)}: {worded(problem, WORDS)}") from problem
+        raise ValueError(f"{names(matched.names)}: {with_words(problem, WORDS)}") from problem
 
 
 def frame_numbers(text: str | None) -> tuple[int, ...] | None:

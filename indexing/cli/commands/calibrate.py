@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.calibrate import CameraRig, RigPriors, calibrate_recordings
 from indexing.calibrate.body_height import check_height
 from indexing.cli.console import check_folder, count, finish, flag_words, progress, show
@@ -72,7 +72,7 @@ def _check(flags: Calibrate) -> str | None:
         try:
             check_height(flags.height)
         except ValueError as problem:
-            raise ValueError(worded(problem, WORDS)) from None
+            raise ValueError(with_words(problem, WORDS)) from None
     if flags.footage.by == "pixels":
         raise ValueError("--by pixels: cameras are calibrated from the joints of people; leave it out")
     _numbers(flags, "fps", None), _numbers(flags, "focal", None), _sizes(flags, None)
@@ -120,7 +120,7 @@ def _read(flags: Calibrate, found: dict[str, Path], watched: Watched) -> list[Ta
             for (name, path), rate in zip(found.items(), rates, strict=True)
         ]
     except ValueError as problem:
-        raise ValueError(worded(problem, WORDS)) from problem
+        raise ValueError(with_words(problem, WORDS)) from problem
 
 
 def _rig_priors(flags: Calibrate, cameras: int, clocks: str | None) -> RigPriors:
@@ -147,5 +147,5 @@ def _solve(flags: Calibrate, takes: list[Take], clocks: str | None, watched: Wat
             takes, _rig_priors(flags, len(takes), clocks), sizes=_sizes(flags, len(takes)), people=people, words=WORDS
         )
     except ValueError as problem:
-        raise ValueError(worded(problem, WORDS)) from problem
+        raise ValueError(with_words(problem, WORDS)) from problem
     return dataclasses.replace(rig, remarks=(*watched.notes, *rig.remarks))

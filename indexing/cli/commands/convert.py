@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.cli.console import check_file, check_folder, count, flag_words, keep, names, progress, say
 from indexing.cli.flags.cameras import Convert
 from indexing.cli.inputs import assumed_rate_notes, read_clips
@@ -101,8 +101,8 @@ def _write(flags: Convert, clips: Sequence[Clip], path: Path) -> tuple[Callable[
     try:
         data, notes = encode(clips, path, flags.units)
     except ValueError as problem:
-        raise ValueError(worded(problem, WORDS)) from None
-    return partial(write_bytes, path, data), [worded(note, WORDS) for note in notes]
+        raise ValueError(with_words(problem, WORDS)) from None
+    return partial(write_bytes, path, data), [with_words(note, WORDS) for note in notes]
 
 
 def _parts(flags: Convert, found: Sequence[tuple[Path, list[Clip]]], folder: Path) -> list[tuple[Path, list[Clip]]]:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 import dyntorch
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.cli.console import check_report, count, finish, flag_words, show
 from indexing.cli.console import progress as progress_of
 from indexing.cli.flags.geometry import Reconstruct
@@ -156,7 +156,7 @@ def _solve(flags: Reconstruct, tracks: TrackSet) -> Any:
             generator=torch.Generator().manual_seed(flags.seed),
         )
     except ValueError as problem:
-        raise ValueError(f"{tracks.path}: {worded(problem, WORDS)}") from problem
+        raise ValueError(f"{tracks.path}: {with_words(problem, WORDS)}") from problem
 
 
 def open_motion_notes(tracks: TrackSet, result: Any) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 import dyntorch
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.cli.commands.segment_colmap import ColmapJob, run_colmap
 from indexing.cli.commands.segment_tracks import LEAST, BodiesJob, Given, read_given, run_bodies, unit_notes
 from indexing.cli.console import check_report, count, finish, flag_words, progress, show
@@ -233,4 +233,4 @@ def _solve(flags: Segment, pair: MatchedPair) -> Any:
             generator=torch.Generator().manual_seed(flags.seed),
         )
     except ValueError as problem:
-        raise ValueError(f"{pair.path}: {worded(problem, WORDS)}") from problem
+        raise ValueError(f"{pair.path}: {with_words(problem, WORDS)}") from problem

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 import dyntorch
-from dyntorch.numerics import worded
+from dyntorch.numerics import with_words
 from indexing.cli.console import check_report, count, finish, flag_words, progress, show
 from indexing.cli.scenes import Asked, as_tracks, follow_whole, inputs_of, is_video, photographs, source_of
 from indexing.files import manifest
@@ -179,7 +179,7 @@ def solve(tracks: TrackSet, job: BodiesJob) -> Any:
             generator=torch.Generator().manual_seed(job.seed),
         )
     except ValueError as problem:
-        raise ValueError(f"{tracks.path}: {worded(problem, WORDS)}") from problem
+        raise ValueError(f"{tracks.path}: {with_words(problem, WORDS)}") from problem
 
 
 def stretches(tracks: TrackSet, result: Any) -> list[str]:

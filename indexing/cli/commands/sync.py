@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import dyntorch
-from dyntorch.numerics import Message, worded
+from dyntorch.numerics import Message, with_words
 from indexing.cli.console import check_report, count, finish, flag_words, names, progress, say, show
 from indexing.cli.flags.cameras import Sync
 from indexing.cli.flags.shared import Watched
@@ -170,7 +170,7 @@ def _read(flags: Sync, found: dict[str, Path], by: By, watched: Watched, trial: 
             takes.append(take_of(path, name=name, fps=rate, keypoints=watched.files.get(path), **how))
         return takes if trial is None else trial.with_videos(takes)
     except ValueError as problem:
-        raise ValueError(worded(problem, WORDS)) from problem
+        raise ValueError(with_words(problem, WORDS)) from problem
 
 
 def _repair_clocks(flags: Sync, report: SyncReport, done: Any, trial: Trial | None = None) -> SyncReport:
@@ -225,7 +225,7 @@ def _solve(flags: Sync, takes: list[Take], done: Any, trial: Trial | None = None
     except ValueError as problem:
         # that of a pair says which cameras it is about by name, and so not by number
         of_pair = problem.__cause__ if len(takes) > 2 and problem.__cause__ is not None else problem
-        raise ValueError(worded(of_pair, WORDS)) from problem
+        raise ValueError(with_words(of_pair, WORDS)) from problem
     known: dict[str, Any] = {"remarks": [*(one.text for one in recording_notices(takes)), *told], "heading": flags.title or ""}
     return SyncReport(takes=takes, compared=compared, together=clocks, words=WORDS, **known)
 

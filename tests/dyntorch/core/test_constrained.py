@@ -8,7 +8,7 @@ import torch
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.core.matches import matches
-from dyntorch.core.outcome import failed
+from dyntorch.core.outcome import is_failure
 from dyntorch.core.refine import constrain_matches
 from tests.battery.projections import tensor_error, unit
 
@@ -53,7 +53,7 @@ def test_least_error_of_all_motions(invariant, views):
     assert 1 - (invariant.compose(*found.motion) * found.tensor).flatten(1).sum(-1).abs().min() < 1e-9
     least = energy(linear, found.normalized)
     # more than the linear tensor, less than what that decomposes into, and nothing nearby is better
-    parts = invariant.normalized(linear.normalization.transforms).decompose(linear.normalized)
+    parts = invariant.normalize(linear.normalization.transforms).decompose(linear.normalized)
     if type(invariant).constrain is dyn.Invariant.constrain:  # else the fit has left the null vector already
         assert (energy(linear, linear.normalized) <= least).all()
     assert (least <= energy(linear, invariant.compose(*parts)) * (1 + 1e-9)).all()
@@ -74,7 +74,8 @@ def test_p6_needs_it():
     found, refined = dyn.constrain(linear), dyn.refine(linear, *views)
     ones = (torch.ones((), dtype=torch.float64),) * 4
     off = [
-        P6.whitened(motion, views, ones).square().mean((-2, -1)).sqrt() for motion in (linear.motion, found.motion, refined.motion)
+        P6.whitened_residual(motion, views, ones).square().mean((-2, -1)).sqrt()
+        for motion in (linear.motion, found.motion, refined.motion)
     ]
     assert off[1].median() < 0.6 * off[0].median() and (off[2] < off[1]).all()
     # refinement begins with it: the error is that of a start from the truth
@@ -101,7 +102,7 @@ def test_batch_is_loop_and_failed_problems_stay():
     weights[1, 0, :20] = 3.0
     linear = dyn.fit(P4, *views, weights=weights)
     whole = dyn.constrain(linear)
-    assert failed(whole.status).tolist() == [[False, True], [False, False]]
+    assert is_failure(whole.status).tolist() == [[False, True], [False, False]]
     assert whole.tensor[0, 1].abs().max() == 0 and all(m.isfinite().all() for m in (whole.tensor, *whole.motion))
     for i, j in ((0, 0), (1, 0), (1, 1)):
         alone = dyn.constrain(dyn.fit(P4, *(x[i, j] for x in views), weights=weights[i, j]))

@@ -33,7 +33,7 @@ def test_singular_values_are_those_of_the_normalized_rows(case):
     moved = moved_views(case.invariant, views, frames)
     invariant = copy(case.invariant)
     # what is least squares is said by the primitives of normalized coordinates
-    vars(invariant)["primitives"] = tuple(p.normalized(t) for p, t in zip(invariant.primitives, frames, strict=True))
+    vars(invariant)["primitives"] = tuple(p.normalize(t) for p, t in zip(invariant.primitives, frames, strict=True))
     matrix = matrices(replace(case, invariant=invariant), moved)[0]
     values = torch.linalg.svdvals(matrix)
     values = torch.nn.functional.pad(values, (0, case.invariant.width() - len(values)))

@@ -46,10 +46,10 @@ def test_counts_of_the_thesis():
 def test_defaults_leave_everything_as_it_is():
     invariant, tensor = Invariant(), torch.rand(2, 3)
     assert invariant.constrain(tensor) is tensor
-    assert invariant.normalized((tensor,)) is invariant
-    assert invariant.whitened((), (), ()) is None
+    assert invariant.normalize((tensor,)) is invariant
+    assert invariant.whitened_residual((), (), ()) is None
     with pytest.raises(ValueError, match="Invariant has no separate residual for static matches; leave out static="):
-        invariant.whitened_static((), (), ())
+        invariant.whitened_static_residual((), (), ())
 
 
 def test_on_class_stands_for_the_default_instance():

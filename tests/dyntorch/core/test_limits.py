@@ -15,4 +15,4 @@ def test_rounding_follows_dtype_scale_and_condition():
 def test_an_iteration_ends_where_it_gains_little_or_nothing():
     before = torch.tensor([1.0, 1.0, 1.0, float("nan")])
     after = torch.tensor([0.5, 1 - 1e-4, 2.0, 1.0])
-    assert Stop(tolerance=1e-3).reached(before, after).tolist() == [False, True, True, True]
+    assert Stop(tolerance=1e-3).has_converged(before, after).tolist() == [False, True, True, True]

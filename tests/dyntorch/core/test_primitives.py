@@ -53,7 +53,7 @@ def test_shapes(primitive, x):
     assert torch.linalg.matrix_rank(vectors).eq(primitive.rows).all()
     rows, columns = torch.triu_indices(primitive.width, primitive.width)
     form = torch.einsum("...ri,...rj->...ij", vectors, vectors)[..., rows, columns]
-    torch.testing.assert_close(primitive.packed(x), form.mT)
+    torch.testing.assert_close(primitive.pack(x), form.mT)
     assert repr(primitive).startswith(type(primitive).__name__)
     with pytest.raises(ValueError, match=r"expected \(\*batch, n, \d.*\), got \(2, 5, 17\)"):
         primitive.match_axis(torch.zeros(2, 5, 17))
@@ -128,7 +128,7 @@ def test_action_is_that_of_the_moved_measurement(primitive, x):
     frame = similar(primitive.dim)
     moved = primitive.move(x, frame)
     assert moved.shape == x.shape
-    new = primitive.normalized(frame)
+    new = primitive.normalize(frame)
     action = primitive.action(frame)
     before, after = primitive.vectors(x), new.vectors(moved)
     # all vectors of a measurement together: their span
@@ -191,7 +191,7 @@ def test_cameras_of_normalized_points_are_well_conditioned():
     frame = similar(3)
     x = random(1, 6, 3)
     camera = Projected(CAMERAS)
-    new = camera.normalized(frame)
+    new = camera.normalize(frame)
     torch.testing.assert_close(new.cameras @ new.cameras.mT, torch.eye(3).double().expand(2, 3, 3))
     assert parallel(camera.raw(x) @ camera.action(frame).mT, new.raw(camera.move(x, frame)))
 

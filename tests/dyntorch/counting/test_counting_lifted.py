@@ -150,6 +150,7 @@ def test_models_and_profiles_are_those_of_the_library():
 # ------------------------------------------------------------------------------------- Grassmann tensors by numbers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("k", "profile", "l"),
     [

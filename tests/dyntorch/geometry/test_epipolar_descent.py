@@ -19,7 +19,7 @@ def test_frames_hold_the_nearest_matrix_of_rank_two():
 
 
 def test_moved_frames_are_frames():
-    frames = Frames.of(random(5, 3, 3)).moved(random(5, 7, seed=1))
+    frames = Frames.of(random(5, 3, 3)).retract(random(5, 7, seed=1))
     torch.testing.assert_close(frames.turns @ frames.turns.mT, torch.eye(3).double().expand(5, 2, 3, 3))
     torch.testing.assert_close(frames.matrix().norm(dim=-1), torch.ones(5).double())
     assert torch.linalg.det(frames.matrix().unflatten(-1, (3, 3))).abs().max() < 1e-15
@@ -29,7 +29,7 @@ def test_a_small_step_turns_by_the_exponential():
     frames = Frames.of(random(3, 3, 3))
     step = 1e-3 * random(3, 7, seed=2)
     axes = torch.nn.functional.pad(step[:, :4].unflatten(-1, (2, 2)), (0, 1))
-    torch.testing.assert_close(frames.moved(step).turns, frames.turns @ torch.linalg.matrix_exp(skew(axes)), atol=1e-8, rtol=0)
+    torch.testing.assert_close(frames.retract(step).turns, frames.turns @ torch.linalg.matrix_exp(skew(axes)), atol=1e-8, rtol=0)
 
 
 @pytest.mark.parametrize("start", [torch.diag(torch.tensor([1.0, 1.0, 0.0])), torch.diag(torch.tensor([1.0, 0.0, 0.0])), None])
@@ -39,7 +39,7 @@ def test_derivative_by_finite_differences(start):
     weights = torch.rand(4, 11, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
     def residual(step):
-        value, square = data.flat_terms(frames.moved(step).matrix())
+        value, square = data.flat_terms(frames.retract(step).matrix())
         return value / square.sqrt()
 
     steps = 1e-6 * torch.eye(7, dtype=torch.float64)[:, None].expand(7, 4, 7)
@@ -58,7 +58,7 @@ def test_descent_ends_in_a_minimum():
     x1, x2, _ = scene(60, 1.0)
     F = descend(eight_point(x1, x2, ONES), x1, x2, ONES, scale=100.0, steps=20)
     least = sampson_squared(F, x1, x2).sum()
-    around = Frames.of(F.expand(200, 3, 3)).moved(1e-4 * random(200, 7)).matrix().unflatten(-1, (3, 3))
+    around = Frames.of(F.expand(200, 3, 3)).retract(1e-4 * random(200, 7)).matrix().unflatten(-1, (3, 3))
     assert (sampson_squared(around, x1, x2).sum(-1) > least).all()
     # the start does not matter
     far = descend(affine_fundamental(x1, x2, ONES), x1, x2, ONES, scale=100.0, steps=40)

@@ -66,7 +66,7 @@ def test_the_hessian_is_the_second_derivative_at_a_minimum():
     problem, tensor = _Nearest(profile, sizes), tensor / tensor.norm(dim=-1, keepdim=True)
     theta = problem.lowest_minimum(tensor)
     aim = problem.orient(theta, tensor)
-    u, _, matrix = problem.linearized(theta)
+    u, _, matrix = problem.linearize(theta)
     hessian = problem.hessian(theta, aim, u, matrix)
     for k in range(theta.shape[1]):
         step = 1e-5 * torch.eye(theta.shape[1], dtype=theta.dtype)[k]

@@ -31,7 +31,7 @@ def test_values_and_shapes(primitive):
     torch.testing.assert_close(primitive.vectors(x), expected[..., None, :])
     assert primitive.width == expected.shape[-1] and primitive.match_axis(x) == 1
     rows, columns = torch.triu_indices(primitive.width, primitive.width)
-    torch.testing.assert_close(primitive.packed(x), (expected[..., rows] * expected[..., columns]).mT)
+    torch.testing.assert_close(primitive.pack(x), (expected[..., rows] * expected[..., columns]).mT)
     with pytest.raises(ValueError, match=r"expected \(\*batch, n, \d.*\), got \(2, 5, 17\)"):
         primitive.match_axis(torch.zeros(2, 5, 17))
 
@@ -86,7 +86,7 @@ def test_vectors_that_do_not_end_in_one(degree):
 
 def test_isometric_ones_turn_with_the_point():
     for degree in (1, 2, 3):
-        primitive = Monomials(degree).normalized(torch.eye(3))
+        primitive = Monomials(degree).normalize(torch.eye(3))
         assert primitive.isometric
         turn = torch.linalg.qr(random(3, 3)).Q
         action = primitive.action(turn)

@@ -70,9 +70,9 @@ def test_residual_is_chi_square_and_vanishes_on_exact_matches(n):
     sigma = 1e-3
     found = scene(n, 8000, sigma=sigma)
     scales = (torch.tensor(sigma).double(),) * 2
-    w = Collineation(n).whitened(found.motion, found.views, scales)
+    w = Collineation(n).whitened_residual(found.motion, found.views, scales)
     assert abs(float(w.square().sum(-1).mean()) / n - 1) < 0.06
-    assert Collineation(n).whitened(found.motion, found.exact, scales).abs().max() < 1e-8
+    assert Collineation(n).whitened_residual(found.motion, found.exact, scales).abs().max() < 1e-8
 
 
 def test_residual_agrees_with_finite_differences():
@@ -86,7 +86,7 @@ def test_residual_agrees_with_finite_differences():
         covariance = covariance + column[:, :, None] * column[:, None, :]
     e = apply(A, x2) - x1
     square = (e[:, None] @ torch.linalg.inv(covariance) @ e[..., None]).flatten()
-    w = Collineation(2).whitened((A,), (x1, x2), (torch.tensor(s1).double(), torch.tensor(s2).double()))
+    w = Collineation(2).whitened_residual((A,), (x1, x2), (torch.tensor(s1).double(), torch.tensor(s2).double()))
     torch.testing.assert_close(w.square().sum(-1), square, rtol=1e-6, atol=1e-10)
 
 
@@ -94,7 +94,7 @@ def test_zero_is_never_nan():
     zero = torch.zeros(2, 3, 3).double().requires_grad_()
     x = random(2, 4, 2)
     one = (torch.ones(2).double(),) * 2
-    out = Collineation(2).whitened((Collineation.compose(Collineation.decompose(zero)),), (x, x), one)
+    out = Collineation(2).whitened_residual((Collineation.compose(Collineation.decompose(zero)),), (x, x), one)
     out.sum().backward()
     assert out.isfinite().all()
     assert zero.grad.isfinite().all()

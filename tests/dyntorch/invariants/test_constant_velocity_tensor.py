@@ -203,7 +203,7 @@ def test_gauge_changes_nothing(camera):
     assert distance(CV.compose(*moved), CV.compose(*scene.motion)) < 1e-13
     noisy = tuple(x + 0.01 * random(*x.shape, seed=15 + i) for i, x in enumerate(scene.views))
     invariant = CV("image" if camera else "space")
-    before, after = (invariant.whitened(m, noisy, ONES).norm(dim=-1) for m in (scene.motion, tuple(moved)))
+    before, after = (invariant.whitened_residual(m, noisy, ONES).norm(dim=-1) for m in (scene.motion, tuple(moved)))
     assert torch.allclose(before, after, rtol=1e-9)
 
 
@@ -311,7 +311,7 @@ def test_whitened_residuals_against_automatic_derivatives(camera):
 
     invariant = CV("image" if camera else "space")
     tensors = tuple(torch.tensor(s, dtype=torch.float64) for s in scales)
-    for method, residual in ((invariant.whitened, moving), (invariant.whitened_static, static)):
+    for method, residual in ((invariant.whitened_residual, moving), (invariant.whitened_static_residual, static)):
         found = method(scene.motion, scene.views, tensors).square().sum(-1)
         expected = torch.stack([reference_square(residual, tuple(x[n] for x in scene.views), scales) for n in range(6)])
         assert torch.allclose(found, expected, rtol=1e-9)
@@ -325,8 +325,8 @@ def test_residuals_follow_chi_squared(camera):
     moving = constant_velocity(4000, camera=camera, sigma=sigma, generator=generator(22))
     still = constant_velocity(4000, camera=camera, static=1.0, sigma=sigma, generator=generator(23))
     for scene, method, freedom in (
-        (moving, invariant.whitened, 2 if camera else 3),
-        (still, invariant.whitened_static, 5 if camera else 6),
+        (moving, invariant.whitened_residual, 2 if camera else 3),
+        (still, invariant.whitened_static_residual, 5 if camera else 6),
     ):
         square = method(scene.motion, scene.views, scales).square().sum(-1)
         # 4 standard errors of the mean and variance of 4000 draws
@@ -338,7 +338,7 @@ def test_residuals_follow_chi_squared(camera):
 def test_forward_mode_derivatives(camera):
     scene = constant_velocity(5, camera=camera, sigma=0.01, generator=generator(24))
     invariant = CV("image" if camera else "space")
-    for method in (invariant.whitened, invariant.whitened_static):
+    for method in (invariant.whitened_residual, invariant.whitened_static_residual):
         tangents = torch.stack([random(4, 4, seed=s) for s in (25, 26)])
 
         def value(first, method=method):
@@ -390,8 +390,8 @@ def test_repeated_matches_give_finite_residuals():
     views = tuple(torch.zeros(5, 3, dtype=torch.float64) for _ in range(3))
     maps = tuple(torch.zeros(4, 4, dtype=torch.float64) for _ in range(3))
     for motion in (maps, CV.decompose(torch.zeros(4, 4, 4, dtype=torch.float64))):
-        assert CV().whitened(motion, views, ONES).isfinite().all()
-        assert CV().whitened_static(motion, views, ONES).isfinite().all()
+        assert CV().whitened_residual(motion, views, ONES).isfinite().all()
+        assert CV().whitened_static_residual(motion, views, ONES).isfinite().all()
         assert CV.positions(motion, *views).isfinite().all()
 
 
@@ -408,6 +408,7 @@ def test_diagnosis_tells_other_tensors_apart():
     assert (CV.diagnose(CV.compose(random(4, 4), random(4, 4, seed=1), random(3, 4, seed=2))).infinity == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "sigma", "bound"), [(24, 5e-4, 0.0085), (50, 2e-3, 0.010), (200, 2e-3, 0.0044)])
 def test_linear_solution_under_noise(n, sigma, bound):
     """Error of the predicted third view; the bounds are the medians of an independent prototype on like scenes, with a margin."""

@@ -157,9 +157,9 @@ def test_residual_of_static_lines_agrees_with_finite_differences():
             column = (ends[0] - ends[1]) / (2 * step) * scales[v]
             covariance = covariance + column[:, :, None] * column[:, None, :]
     truth = whiten(angle_and_offset(motion, views), covariance)
-    torch.testing.assert_close(LINES.whitened_static(tuple(motion), tuple(views), scales), truth, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(LINES.whitened_static_residual(tuple(motion), tuple(views), scales), truth, rtol=1e-5, atol=1e-7)
     flipped = (views[0], -views[1], 3 * views[2])
-    torch.testing.assert_close(LINES.whitened_static(tuple(motion), flipped, scales), truth, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(LINES.whitened_static_residual(tuple(motion), flipped, scales), truth, rtol=1e-5, atol=1e-7)
 
 
 def test_static_distance_needs_no_motion_and_is_chi_square():
@@ -168,7 +168,7 @@ def test_static_distance_needs_no_motion_and_is_chi_square():
     views = [disturbed(line, *(sigma * random(2, 5000, seed=5 + v))) for v, line in enumerate(exact)]
     tensor = DualHomographyTensor.compose(*motion)
     distance = DualHomographyTensor.static_distance(-tensor, *views)
-    truth = LINES.whitened_static(tuple(motion), tuple(views), ONES).norm(dim=-1)
+    truth = LINES.whitened_static_residual(tuple(motion), tuple(views), ONES).norm(dim=-1)
     torch.testing.assert_close(distance, truth, rtol=1e-6, atol=1e-9)
     assert abs(float((distance / sigma).square().mean()) - 4) < 0.2
     moving, _ = concurrent(motion, 50)
@@ -179,10 +179,10 @@ def test_residual_of_points_is_their_disagreement():
     motion, sigma = near_identity(), 1e-3
     points = [x + sigma * random(4000, 2, seed=7 + v) for v, x in enumerate(concurrent(motion, 4000)[1])]
     scales = (torch.tensor(sigma).double(),) * 3
-    w = POINTS.whitened(tuple(motion), tuple(points), scales)
+    w = POINTS.whitened_residual(tuple(motion), tuple(points), scales)
     assert w.shape == (4000, 4)
     assert abs(float(w.square().sum(-1).median()) - 3.357) < 0.2  # median of chi-square with 4 degrees of freedom
-    assert LINES.whitened(tuple(motion), tuple(points), scales) is None
+    assert LINES.whitened_residual(tuple(motion), tuple(points), scales) is None
 
 
 def test_degenerate_input_is_never_nan():
@@ -230,7 +230,7 @@ def test_gradients_and_forward_mode():
     theta = torch.stack([m[0].detach() for m in motion]).flatten()
     for function in (
         lambda t: DualHomographyTensor.compose(*t.unflatten(0, (2, 3, 3))),
-        lambda t: LINES.whitened_static(tuple(t.unflatten(0, (2, 3, 3))), views, ONES),
+        lambda t: LINES.whitened_static_residual(tuple(t.unflatten(0, (2, 3, 3))), views, ONES),
     ):
         forward = torch.func.vmap(lambda v, f=function: torch.func.jvp(f, (theta,), (v,))[1])(torch.eye(18).double())
         torch.testing.assert_close(forward.movedim(0, -1), torch.func.jacrev(function)(theta))

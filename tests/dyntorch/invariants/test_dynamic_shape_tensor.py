@@ -158,9 +158,11 @@ def test_derivatives_of_distances_are_those_of_automatic_differentiation(form):
     views[0, 2, 1, :3] = 0.0
     invariant, motion = DynamicShapeTensor(form=form, points=6), shapes.transpose(1, 2).flatten(2)
     scales = 1 + torch.rand(2, generator=g, dtype=torch.float64)
-    value, derivative = invariant.linearized((motion,), (views,), (scales,))
-    torch.testing.assert_close(value, invariant.whitened((motion,), (views,), (scales,)).flatten(1))
-    jacobian = torch.autograd.functional.jacobian(lambda m: invariant.whitened((m,), (views,), (scales,)).flatten(1), motion)
+    value, derivative = invariant.linearize((motion,), (views,), (scales,))
+    torch.testing.assert_close(value, invariant.whitened_residual((motion,), (views,), (scales,)).flatten(1))
+    jacobian = torch.autograd.functional.jacobian(
+        lambda m: invariant.whitened_residual((m,), (views,), (scales,)).flatten(1), motion
+    )
     expected = torch.stack([jacobian[b, :, b].flatten(1).mT for b in range(2)])
     torch.testing.assert_close(derivative, expected, rtol=1e-6, atol=1e-9)
 

@@ -115,7 +115,7 @@ def test_distances_carry_gradients():
     invariant = dyn.DynamicTensor(2, 4, 2)
 
     def total(*views):
-        return invariant.whitened(scene.motion, views, (torch.ones(()).double(),) * 4).square().sum(-1)
+        return invariant.whitened_residual(scene.motion, views, (torch.ones(()).double(),) * 4).square().sum(-1)
 
     views = [x.clone().requires_grad_() for x in scene.views]
     assert torch.autograd.gradcheck(total, views, eps=1e-7, atol=1e-5, rtol=1e-4)
@@ -128,7 +128,7 @@ def test_points_that_stand_still_have_a_distance_as_well():
     line = dyn.sampson(on_lines, on_lines.compose(*scene.motion), *scene.views).square() / 1e-6
     point = dyn.sampson(at_points, at_points.compose(*scene.motion), *scene.views).square() / 1e-6
     assert (line <= point * (1 + 1e-9)).all() and 0.8 < float(point.mean()) / 9 < 1.2
-    still = on_lines.whitened_static(scene.motion, scene.views, (torch.ones(()).double(),) * 4).square().sum(-1) / 1e-6
+    still = on_lines.whitened_static_residual(scene.motion, scene.views, (torch.ones(()).double(),) * 4).square().sum(-1) / 1e-6
     torch.testing.assert_close(still, point, rtol=0.05, atol=0.05)
 
 

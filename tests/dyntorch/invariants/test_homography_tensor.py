@@ -160,7 +160,7 @@ def test_static_distance_is_the_whitened_disagreement_under_the_motion():
     found = scene(200, batch=3, static=0.5, sigma=0.5)
     H = HomographyTensor.compose(*found.motion)
     distance = HomographyTensor.static_distance(-2 * H, *found.views)
-    residual = HomographyTensor().whitened_static(found.motion, found.views, ONES)
+    residual = HomographyTensor().whitened_static_residual(found.motion, found.views, ONES)
     torch.testing.assert_close(distance, residual.norm(dim=-1), rtol=1e-6, atol=1e-7)
     still = found.labels == 1
     assert abs(float((distance[still] / 0.5).square().mean()) - 4) < 0.5
@@ -183,7 +183,7 @@ def test_sampson_is_the_true_geometric_distance_of_moving_points():
         moved = start - gradient * (value / gradient.square().sum(-1))[:, None]
     truth = (moved - start).norm(dim=-1)
     found_distance = multilinear(HomographyTensor(), H, found.views, ONES).abs()
-    assert HomographyTensor().whitened(found.motion, found.views, ONES) is None
+    assert HomographyTensor().whitened_residual(found.motion, found.views, ONES) is None
     assert ((found_distance - truth).abs() / truth.mean()).max() < 0.01
     assert abs(float((found_distance / 0.5).square().mean()) - 1) < 0.35
 

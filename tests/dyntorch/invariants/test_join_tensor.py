@@ -198,10 +198,10 @@ def test_static_distance_tells_static_from_moving():
 
 def test_static_residual_has_six_degrees_of_freedom():
     scene = moving_points(5000, batch=2, static=1.0, sigma=0.003, generator=generator(24))
-    residual = as_invariant(JoinTensor).whitened_static(scene.motion, scene.views, (0.003 * ONE,) * 3)
+    residual = as_invariant(JoinTensor).whitened_static_residual(scene.motion, scene.views, (0.003 * ONE,) * 3)
     assert residual.shape == (2, 5000, 6)
     assert abs(residual.square().sum(-1).mean() / 6 - 1) < 0.02
-    moving = as_invariant(JoinTensor).whitened(scene.motion, scene.views, (0.003 * ONE,) * 3)
+    moving = as_invariant(JoinTensor).whitened_residual(scene.motion, scene.views, (0.003 * ONE,) * 3)
     assert abs(moving.square().sum(-1).mean() / 2 - 0.5) < 0.04
 
 

@@ -50,7 +50,7 @@ def normalized(views):
 def fitted(invariant, views):
     """Motion by plain singular vectors, one per camera, in normalized coordinates."""
     points, frames = normalized(views)
-    inner = invariant.normalized(tuple(t[..., None, :, :] for t in frames))
+    inner = invariant.normalize(tuple(t[..., None, :, :] for t in frames))
     image = homogeneous(points[2])[..., None, :, :] @ inner.primitives[2].cameras.mT
     first, second = (homogeneous(x)[..., None, :, :].expand(*image.shape[:-1], 4) for x in points[:2])
     matrix = rows(first, second, image)
@@ -171,14 +171,14 @@ def test_scale_of_the_cameras_does_not_matter():
 def test_batch_equals_loop_with_cameras_of_each_problem():
     """After normalization every problem has cameras of its own."""
     frames = tuple(similarity(random(6, seed=s).abs() + 0.3, random(6, 3, seed=s + 1))[:, None] for s in (27, 29, 31))
-    invariant = MinimalJoinTensor().normalized(frames)
+    invariant = MinimalJoinTensor().normalize(frames)
     a, b = random(6, 4, 4, seed=33), random(6, 4, 4, seed=34)
     tensor = invariant.compose(a, b)
     assert tensor.shape == (6, 4, 4, 4, 3)
     x = random(6, 5, 3, seed=35)
     transferred, parts = invariant.transfer(tensor, x, 3, 1), invariant.decompose(tensor)
     for i in range(6):
-        alone = MinimalJoinTensor().normalized(tuple(t[i] for t in frames))
+        alone = MinimalJoinTensor().normalize(tuple(t[i] for t in frames))
         torch.testing.assert_close(alone.compose(a[i], b[i]), tensor[i], atol=1e-12, rtol=0)
         torch.testing.assert_close(alone.transfer(tensor[i], x[i], 3, 1), transferred[i], atol=1e-9, rtol=1e-9)
         for got, part in zip(alone.decompose(tensor[i]), parts, strict=True):
@@ -190,7 +190,7 @@ def test_change_of_coordinates_commutes_with_compose():
     frames = tuple(similarity(random(2, seed=s).abs() + 0.3, random(2, 3, seed=s + 1)) for s in (36, 38, 40))
     with_cameras = tuple(t[:, None] for t in frames)
     outer = MinimalJoinTensor(random(3, 3, 4, seed=42))
-    inner = outer.normalized(with_cameras)
+    inner = outer.normalize(with_cameras)
     q = inner.primitives[2].cameras
     torch.testing.assert_close(q @ q.mT, torch.eye(3, dtype=torch.float64).expand(2, 3, 3, 3), atol=1e-12, rtol=0)
     a, b = random(2, 4, 4, seed=43), random(2, 4, 4, seed=44)
@@ -223,7 +223,7 @@ def test_residuals_are_those_of_the_join_tensor():
     scene = moving_points(30, batch=2, sigma=0.01, static=0.5, generator=generator(48))
     scales = tuple(torch.full((2,), s, dtype=torch.float64) for s in (0.01, 0.02, 0.03))
     one, other = as_invariant(MinimalJoinTensor), as_invariant(JoinTensor)
-    for name in ("whitened", "whitened_static"):
+    for name in ("whitened_residual", "whitened_static_residual"):
         assert torch.equal(*(getattr(i, name)(scene.motion, scene.views, scales) for i in (one, other)))
     distance = one.static_distance(one.compose(*scene.motion), *scene.views)
     torch.testing.assert_close(distance, other.static_distance(other.compose(*scene.motion), *scene.views))

@@ -62,7 +62,7 @@ def test_counts(exact):
     assert count("dynamic_shape", synthetic=True).minimal == 49 and count("dynamic_shape", coplanar_base=True).minimal == 8
     # the freedom that views know: rank of the derivative of all distances by the shapes
     motion, views = (solution.motion[0][None],), (solution.matches.views[0],)
-    slope = inv.linearized(motion, views, (torch.ones(1).double(),))[1][0]
+    slope = inv.linearize(motion, views, (torch.ones(1).double(),))[1][0]
     values = torch.linalg.svdvals(slope)
     assert int((values > 1e-7 * values[0]).sum()) == inv.dof
 
@@ -91,12 +91,12 @@ def test_refinement_lowers_the_distances_and_its_derivative_is_right():
     inv = solution.invariant
     scales, views = (torch.ones(1).double(),), (solution.matches.views[0],)
     motion = solution.motion[0][None]
-    value, slope = inv.linearized((motion,), views, scales)
+    value, slope = inv.linearize((motion,), views, scales)
     step = 1e-6 * torch.randn(motion.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    costs = [inv.linearized((motion + s * step,), views, scales)[0].square().sum() for s in (1, -1)]
+    costs = [inv.linearize((motion + s * step,), views, scales)[0].square().sum() for s in (1, -1)]
     # Kaufman's form leaves out a part of the derivative that is across to the residual: the gradient of the cost is whole
     torch.testing.assert_close(costs[0] - costs[1], 4 * (slope @ value[..., None]).flatten() @ step.flatten(), rtol=1e-2, atol=0)
-    torch.testing.assert_close(inv.whitened((motion,), views, scales).flatten(), value.flatten())
+    torch.testing.assert_close(inv.whitened_residual((motion,), views, scales).flatten(), value.flatten())
 
 
 @pytest.mark.parametrize("prior", [0.0, 0.02])

@@ -50,7 +50,7 @@ def test_square_sums_follow_chi_square(invariant):
     motion, structure = scene(invariant, 4000)
     scales = scales_of(motion, (1.0, 3.0, 0.5, 2.0))
     views = noisy(images(motion, structure), scales, 1e-5)
-    square = (invariant.whitened(motion, views, scales) / 1e-5).square().sum(-1)
+    square = (invariant.whitened_residual(motion, views, scales) / 1e-5).square().sum(-1)
     freedom = invariant.codim
     assert abs(float(square.mean()) - freedom) < 5 * (2 * freedom / 4000) ** 0.5
     assert abs(float(square.var()) / (2 * freedom) - 1) < 0.2
@@ -101,9 +101,9 @@ def test_derivative_by_finite_differences(invariant):
         return torch.stack([(function(theta + c) - function(theta - c)) / (2 * step) for c in columns], dim=1)
 
     exact = images(motion, structure)
-    value, derivative = invariant.linearized(motion, exact, scales)
+    value, derivative = invariant.linearize(motion, exact, scales)
     assert value.abs().max() < 1e-10
-    expected = slopes(lambda t: invariant.whitened(parts(t), exact, scales).flatten(1))
+    expected = slopes(lambda t: invariant.whitened_residual(parts(t), exact, scales).flatten(1))
     assert (derivative - expected).norm() < 1e-7 * expected.norm()
     # with residuals that are not zero, the gradient of their square sum
     views = noisy(exact, scales, 1e-2)
@@ -158,4 +158,4 @@ def test_one_condition_is_left_to_the_form_itself():
         dyn.GrassmannTensor(3, (1,) * 4, dual=True),
     ):
         empty = tuple(torch.zeros(1, m, invariant.k + 1, dtype=torch.float64) for m in invariant.sizes)
-        assert invariant.whitened(empty, (), ()) is None and invariant.linearized(empty, (), ()) is None
+        assert invariant.whitened_residual(empty, (), ()) is None and invariant.linearize(empty, (), ()) is None

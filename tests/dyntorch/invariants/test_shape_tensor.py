@@ -195,7 +195,7 @@ def test_refinement_lowers_the_distances(case):
     assert ((refined.sigma > 0.25) & (refined.sigma < 1)).all()
     fresh, _ = case.scene(MANY, batch=(6,), seed=10)
     assert dyn.sampson(case.invariant, refined.tensor, *fresh).median() < 1.5
-    residual, slope = case.invariant.linearized(
+    residual, slope = case.invariant.linearize(
         (refined.motion[0],),
         (torch.stack([torch.nn.functional.pad(p, (0, 1), value=1.0) for p in points], -2),),
         (torch.ones(6).double(),),

@@ -240,7 +240,7 @@ def test_moving_residual_against_automatic_derivatives():
     scene = translating_lines(8, sigma=0.02, generator=generator(19))
     (matrix,) = scene.motion
     scales = tuple(torch.tensor(s, dtype=torch.float64) for s in (1.0, 0.5))
-    assert TL().whitened(scene.motion, scene.views, scales) is None
+    assert TL().whitened_residual(scene.motion, scene.views, scales) is None
     found = multilinear(TL(), TL.compose(matrix), scene.views, scales).square()
 
     def residual(l1, l2):
@@ -254,7 +254,7 @@ def test_static_residual_against_automatic_derivatives():
     scene = translating_lines(8, static=0.5, sigma=0.02, generator=generator(20))
     (matrix,) = scene.motion
     scales = tuple(torch.tensor(s, dtype=torch.float64) for s in (1.0, 0.5))
-    found = TL().whitened_static(scene.motion, scene.views, scales).square().sum(-1)
+    found = TL().whitened_static_residual(scene.motion, scene.views, scales).square().sum(-1)
     expected = []
     for n in range(8):
         l1, l2 = (x[n] for x in scene.views)
@@ -276,8 +276,8 @@ def test_static_residual_against_automatic_derivatives():
     assert torch.allclose(found[still], exact[still], rtol=0.1)
     assert (found[~still] > 50 * found[still].median()).all()
     clean = translating_lines(10, static=1.0, generator=generator(21))
-    assert TL().whitened_static(clean.motion, clean.views, ONES).abs().max() < 1e-10
-    assert TL().whitened_static(clean.motion, tuple(map(plucker, clean.views)), ONES).abs().max() < 1e-9
+    assert TL().whitened_static_residual(clean.motion, clean.views, ONES).abs().max() < 1e-10
+    assert TL().whitened_static_residual(clean.motion, tuple(map(plucker, clean.views)), ONES).abs().max() < 1e-9
 
 
 def test_residuals_follow_chi_squared():
@@ -286,7 +286,7 @@ def test_residuals_follow_chi_squared():
     still = translating_lines(4000, static=1.0, sigma=float(sigma), generator=generator(23))
     square = multilinear(TL(), TL.compose(*moving.motion), moving.views, (sigma, sigma)).square()
     assert square.mean().item() == pytest.approx(1, abs=4 * (2 / 4000) ** 0.5)
-    square = TL().whitened_static(still.motion, still.views, (sigma, sigma)).square().sum(-1)
+    square = TL().whitened_static_residual(still.motion, still.views, (sigma, sigma)).square().sum(-1)
     assert square.mean().item() == pytest.approx(4, abs=4 * (8 / 4000) ** 0.5)
     assert square.var().item() == pytest.approx(8, rel=0.25)
 
@@ -298,7 +298,7 @@ def test_forward_mode_derivatives():
     step = 1e-6
     for value in (
         lambda m: multilinear(TL(), TL.compose(m), scene.views, ONES),
-        lambda m: TL().whitened_static((m,), scene.views, ONES),
+        lambda m: TL().whitened_static_residual((m,), scene.views, ONES),
     ):
         forward = torch.func.vmap(lambda d, value=value: torch.func.jvp(value, (matrix,), (d,))[1])(tangents)
         for d, found in zip(tangents, forward, strict=True):
@@ -332,7 +332,7 @@ def test_nothing_spoils_a_batch():
     same = torch.zeros(6, 2, 3, dtype=torch.float64)
     assert TL.compose(zero).isfinite().all()
     for m in (zero, matrix[0]):
-        assert TL().whitened_static((m,), (same, same), ONES).isfinite().all()
+        assert TL().whitened_static_residual((m,), (same, same), ONES).isfinite().all()
         assert multilinear(TL(), TL.compose(m), (same, same), ONES).isfinite().all()
         assert TL.swept_plane(TL.compose(m), same, same).isfinite().all()
     assert TL.decompose(bad.float()).dtype == torch.float32

@@ -276,7 +276,7 @@ ELEMENTWISE = {
     "check_options",
     "named",
     "status_from",
-    "worded",
+    "with_words",
 }
 """Without a search or a factorization: torch starts threads for them only above 32,768 numbers, where they pay."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dyntorch.core import Notice
-from dyntorch.numerics import Message, named, worded
+from dyntorch.numerics import Message, with_names, with_words
 from dyntorch.tasks.synchronize.result import ClocksNotice, ShiftNotice
 from indexing.cli.commands.sync import WORDS
 from indexing.sync.notices import BrightnessNotice, SyncNotice
@@ -29,22 +29,28 @@ NAMES = {"a": "left-1", "b": "right", "0": "left-1", "1": "mid", "2": "right"}
     ],
 )
 def test_cameras_have_names(notice, said):
-    assert notice.named(NAMES).text == said
-    assert notice.text == notice.named({}).text
+    assert notice.with_names(NAMES).text == said
+    assert notice.text == notice.with_names({}).text
 
 
 def test_names_that_were_given_first_stay():
-    inner = Message("{camera:a} has 8 frames").named({"a": "left"})
-    assert Message("{pair:pairs}: {note}", pair=((0, 1),), note=inner).named({"a": "other", "0": "x"}) == "x-1: left has 8 frames"
+    inner = Message("{camera:a} has 8 frames").with_names({"a": "left"})
+    assert (
+        Message("{pair:pairs}: {note}", pair=((0, 1),), note=inner).with_names({"a": "other", "0": "x"}) == "x-1: left has 8 frames"
+    )
 
 
 def test_arguments_are_flags():
-    lens = Notice(ShiftNotice.LENS, 0.0, {"a": -0.1, "b": 0.2}).worded(WORDS).text
+    lens = Notice(ShiftNotice.LENS, 0.0, {"a": -0.1, "b": 0.2}).with_words(WORDS).text
     assert lens.endswith("an approximation; give --calibration FILE.toml")
-    assert Notice(ShiftNotice.NOTHING).worded(WORDS).text.endswith("film longer, or raise --max-shift")
-    assert Notice(SyncNotice.ASSUMED, 30.0, {"names": "cam1"}).worded(WORDS).text.endswith("assumed for cam1; --fps says otherwise")
+    assert Notice(ShiftNotice.NOTHING).with_words(WORDS).text.endswith("film longer, or raise --max-shift")
+    assert (
+        Notice(SyncNotice.ASSUMED, 30.0, {"names": "cam1"})
+        .with_words(WORDS)
+        .text.endswith("assumed for cam1; --fps says otherwise")
+    )
     inner = Notice(ShiftNotice.NOTHING).text
-    both = Notice(SyncNotice.UNDECIDED, 0.0, {"tracks": inner, "brightness": "no"}).worded(WORDS).text
+    both = Notice(SyncNotice.UNDECIDED, 0.0, {"tracks": inner, "brightness": "no"}).with_words(WORDS).text
     assert "raise --max-shift; no" in both and "max_shift" not in both
-    assert worded(ValueError(Message("{arg:person='all'} needs more")), WORDS) == "--person all needs more"
-    assert named(ValueError("a plain one"), NAMES) == "a plain one"
+    assert with_words(ValueError(Message("{arg:person='all'} needs more")), WORDS) == "--person all needs more"
+    assert with_names(ValueError("a plain one"), NAMES) == "a plain one"
