@@ -85,13 +85,13 @@ _HOME = {
     "Fourier": "dyntorch.shapes.basis",
     # the numbers that decide in a task
     "AlignOptions": "dyntorch.tasks.align.options",
-    "CalibrateOptions": "dyntorch.tasks.calibrate.options",
+    "CalibrateOptions": "dyntorch.tasks.calibrate.calibrate",
     "PairOptions": "dyntorch.tasks.pair.pair",
     "PlanesOptions": "dyntorch.tasks.planes.options",
     "ReconstructOptions": "dyntorch.tasks.reconstruct.options",
-    "SegmentOptions": "dyntorch.tasks.segment.options",
-    "SynchronizeOptions": "dyntorch.tasks.synchronize.options",
-    "TrackSegmentOptions": "dyntorch.tasks.segment.options",
+    "SegmentOptions": "dyntorch.tasks.segment.segment",
+    "SynchronizeOptions": "dyntorch.tasks.synchronize.result",
+    "TrackSegmentOptions": "dyntorch.tasks.segment.tracks",
     "TrajectoryOptions": "dyntorch.tasks.trajectories.trajectories",
 }
 _MODULES = {

@@ -21,7 +21,7 @@ from unittest.mock import patch
 
 import tyro
 
-from dyntorch.tasks.segment import coherence, energy, labels, search
+from dyntorch.tasks.segment import coherence, labels, search
 from dyntorch.tasks.segment import segment as two_views
 from experiments.benchmarks.interleaved import threads
 from experiments.common.tables import NoiseConfig, Row, aligned, command, measured
@@ -34,10 +34,10 @@ VARIED: tuple[tuple[ModuleType, str, tuple[float, float]], ...] = (
     (labels, "NONCONFORMITY_COST", (1.5, 4.0)),
     (labels, "FREE_CONFORMITY", (0.15, 0.35)),
     (labels, "ASSIGNMENT_GAIN", (3.0, 9.0)),
-    (energy, "SAMPSON_NOISE_PIXELS", (0.5, 1.0)),
-    (energy, "ENERGY_MAX_SQUARED_DISTANCE", (3.0, 6.0)),
-    (energy, "CUT_COST", (3.0, 5.0)),
-    (energy, "PARALLAX_WEIGHT", (0.1, 0.3)),
+    (coherence, "SAMPSON_NOISE_PIXELS", (0.5, 1.0)),
+    (coherence, "ENERGY_MAX_SQUARED_DISTANCE", (3.0, 6.0)),
+    (coherence, "CUT_COST", (3.0, 5.0)),
+    (coherence, "PARALLAX_WEIGHT", (0.1, 0.3)),
     (two_views, "BODY_PENALTY", (3.5, 5.5)),
     (search, "POOL_CUT_COST", (2.0, 4.5)),
     (search, "DESCENT_NOISE_PIXELS", (0.35, 0.7)),

@@ -20,7 +20,7 @@ from typing import Annotated
 import tyro
 
 import dyntorch as dyn
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.result import SynchronizeOptions
 from dyntorch.tasks.synchronize.row_spaces import MEASURES
 from experiments.common.tables import Row, command, measured_on_one_thread
 from experiments.synchronization.data import Pair

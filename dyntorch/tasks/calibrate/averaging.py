@@ -28,7 +28,7 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import fit_fundamental
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.tasks.calibrate.observations import RigViews
+from dyntorch.tasks.calibrate.input import RigViews
 
 
 @dataclass(frozen=True)

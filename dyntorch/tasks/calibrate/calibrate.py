@@ -4,26 +4,204 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Notice, status_from
+from dyntorch.geometry.homography import homography, homography_sampson_squared
+from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.calibrate import diagnosis
-from dyntorch.tasks.calibrate.averaging import pair_graph
-from dyntorch.tasks.calibrate.bundle import Freedom, RigSolution, adjust_bundle, compare_starts, pose_of, triangulate_frames
-from dyntorch.tasks.calibrate.bundle_problem import LENS, PARAMETERS
-from dyntorch.tasks.calibrate.input import Rig, Scale, clocks_as_given, read_clocks, read_rig
-from dyntorch.tasks.calibrate.observations import RigViews, common_views
-from dyntorch.tasks.calibrate.options import CalibrateOptions
+from dyntorch.tasks.calibrate.averaging import LAST_CUTOFFS, Graph, PairGeometry, pair_graph
+from dyntorch.tasks.calibrate.bundle import (
+    LENS,
+    PARAMETERS,
+    RAYLEIGH,
+    Freedom,
+    Pose,
+    RigSolution,
+    adjust_bundle,
+    compare_starts,
+    pose_of,
+    triangulate_frames,
+)
+from dyntorch.tasks.calibrate.input import MIN_NOISE, Rig, RigViews, Scale, clocks_as_given, common_views, read_clocks, read_rig
 from dyntorch.tasks.calibrate.result import Calibration, CalibrationNotice
-from dyntorch.tasks.calibrate.world_frame import World, estimate_world
+from dyntorch.tasks.calibrate.world_frame import World, bodies, estimate_world
 from dyntorch.tasks.synchronize.cameras import synchronize_cameras
 from dyntorch.tasks.synchronize.result import Clocks
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """What a user can set in :func:`dyntorch.calibrate`: how much it takes, and what it may answer."""
+
+    min_matches: int = 60
+    """Positions that two cameras must see at the same moments: ten times the seven unknowns of F is little."""
+    max_positions: int = 7_000
+    """Points times moments that are adjusted, the moments evenly spread: half as many are 1.2 times as far off, in .6 of the time
+    (20 rigs of 300 frames and 17 points)."""
+    max_rotation_sigma: float = 0.8
+    """Degrees: standard deviation of the rotation of a camera beyond which a rig is refused."""
+    max_focal_sigma: float = 0.08
+    """The same of the focal length, as a share: Pose2Sim's recording of 1.5 s leaves 5 to 6 %, is 4 to 6 % off, and its rotations
+    are within 1.6 degrees."""
+    max_center_sigma: float = 0.04
+    """The same of a centre, as a share of the distance from the people."""
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What the data leave open: motion that does not decide, rigs that fit as well, cameras that moved or do not belong.
+
+
+def pose_differences(one: Pose, other: Pose) -> tuple[Tensor, Tensor]:
+    """By how much the cameras of two solutions differ, after the similarity that fits most: degrees, hundredths of the
+    distance."""
+    turns = one.R.mT @ other.R
+    turn = nearest_rotation(turns.sum(0))
+    for _ in range(10):  # the rotation with the least sum of angles: a camera that moved has no say
+        away = (turns - turn).flatten(1).norm(dim=-1).clamp(min=1e-6)
+        turn = nearest_rotation((turns / away[:, None, None]).sum(0))
+    relative = (one.R @ turn @ other.R.mT).diagonal(dim1=-2, dim2=-1).sum(-1)
+    angle = torch.rad2deg(((relative - 1) / 2).clamp(-1, 1).arccos())
+    a, b = one.centers, other.centers @ turn.mT
+    away = torch.ones(len(a), dtype=torch.float64)
+    for _ in range(10):
+        share = (1 / away.clamp(min=1e-6) / (1 / away.clamp(min=1e-6)).sum())[:, None]
+        p, q = a - (share * a).sum(0), b - (share * b).sum(0)
+        scale = (share * p * q).sum() / (share * q.square()).sum().clamp(min=1e-300)
+        away = (p - scale * q).norm(dim=-1)
+    return angle, 100 * away / (a - one.middle).norm(dim=-1).clamp(min=1e-12)
+
+
+def check_matches(graph: Graph, rig: Rig, options: CalibrateOptions) -> Notice | None:
+    """Cameras that share too little with others to have a place in the rig."""
+    together = bodies(torch.tensor(list(graph)).reshape(-1, 2), len(rig.tracks))
+    lost = tuple(sorted(set(range(len(rig.tracks))) - set(together[0] if together else [0])))
+    if not lost:
+        return None
+    return Notice(CalibrationNotice.APART, 0.0, {"cameras": lost, "needed": options.min_matches})
+
+
+MIN_MOTION_SIGMAS = 2.0  # motion of the points over their noise
+
+
+def check_motion(rig: Rig) -> Notice | None:
+    """Whether no camera sees anything move."""
+    ratios = []
+    for track in rig.tracks:
+        x = torch.where((track.weights > 0)[..., None], track.x, torch.nan)
+        away = (x - x.nanmedian(0).values).norm(dim=-1)
+        ratios.append(float(away.nanmedian()) / max(track.noise, MIN_NOISE))
+    ratio = max(ratios)
+    return Notice(CalibrationNotice.STILL, ratio) if ratio < MIN_MOTION_SIGMAS else None
+
+
+MIN_PLANE_RATIO = 2.0  # residual of the best homography over that of F
+
+
+def check_plane(graph: Graph) -> Notice | None:
+    """Whether every pair of cameras sees one plane, as two cameras see people who walk along one line seen from the side."""
+    ratios = {pair: _plane_residual(geometry) / geometry.sigma for pair, geometry in graph.items()}
+    if not ratios or max(ratios.values()) > MIN_PLANE_RATIO:
+        return None
+    return Notice(CalibrationNotice.PLANE, max(ratios.values()), {"pairs": tuple(ratios)})
+
+
+def _plane_residual(pair: PairGeometry) -> float:
+    """Robust standard deviation, px, of what the best homography leaves, in both pictures: of a plane it is what F leaves."""
+    scale = LAST_CUTOFFS[0] * pair.sigma / pair.unit
+    H, _ = homography(pair.x1, pair.x2, pair.weights[None], scale)
+    away = homography_sampson_squared(H[0], pair.x1, pair.x2).sqrt()
+    return pair.unit * float(away[pair.weights > 0].median()) / RAYLEIGH
+
+
+MIN_RIVAL_MARGIN = 10.0  # twice the logarithm of the likelihood ratio to another rig
+MIN_RIVAL_DEGREES = 2.0  # from which on two rigs are different
+
+
+def check_rivals(best: Pose, others: Sequence[tuple[Pose, float]]) -> Notice | None:
+    """Another solution that differs and is hardly worse."""
+    for pose, worse in others:
+        angle = float(pose_differences(best, pose)[0].max())
+        if worse < MIN_RIVAL_MARGIN and angle > MIN_RIVAL_DEGREES:
+            return Notice(CalibrationNotice.RIVAL, angle)
+    return None
+
+
+MAX_LINE_SPREAD = 0.06  # of the cameras across a line over that along it
+
+
+def are_collinear(centers: Tensor) -> bool:
+    """Whether three cameras or more stand nearly in a line."""
+    if len(centers) < 3:
+        return False
+    spread = torch.linalg.svdvals(centers - centers.mean(0))
+    return bool(spread[1] < MAX_LINE_SPREAD * spread[0])
+
+
+def check_sigmas(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Notice | None:
+    """Whether standard deviations are too large, the focal lengths first: they are what most often stays open."""
+    variance = found.covariance.diagonal(dim1=-2, dim2=-1)
+    if len(rig.tracks) == 2 and not bool(rig.focals.isfinite().any()) and not rig.one_lens:
+        return Notice(CalibrationNotice.TWO_FOCALS)
+    focal = variance[:, 6].sqrt()
+    pose = found.pose
+    if float(focal.max()) > options.max_focal_sigma:
+        case = "line" if are_collinear(pose.centers) else ""
+        which = tuple((focal > options.max_focal_sigma).nonzero().flatten().tolist())
+        return Notice(CalibrationNotice.FOCAL, 100 * float(focal.max()), {"case": case, "cameras": which})
+    turn = torch.rad2deg(variance[:, :3].sum(-1).sqrt())
+    if float(turn.max()) > options.max_rotation_sigma:
+        which = tuple((turn > options.max_rotation_sigma).nonzero().flatten().tolist())
+        return Notice(CalibrationNotice.ROTATION, float(turn.max()), {"cameras": which})
+    away = variance[:, 3:6].sum(-1).sqrt() / (pose.centers - pose.middle).norm(dim=-1)
+    if float(away.max()) > options.max_center_sigma:
+        which = tuple((away > options.max_center_sigma).nonzero().flatten().tolist())
+        return Notice(CalibrationNotice.CENTER, 100 * float(away.max()), {"cameras": which})
+    return None
+
+
+MIN_INLIER_SHARE = 0.6  # of the positions of a camera
+
+
+def check_inliers(inliers: Tensor) -> Notice | None:
+    """Cameras most of whose positions do not agree with the others."""
+    which = tuple((inliers < MIN_INLIER_SHARE).nonzero().flatten().tolist())
+    return Notice(CalibrationNotice.DISAGREES, 100 * float(inliers.min()), {"cameras": which}) if which else None
+
+
+MAX_MOVED_DEGREES = 1.5  # between the poses of a camera in both halves of the recording
+MAX_MOVED_PERCENT = 4.5  # the same of its place, hundredths of its distance from the people
+MAX_MOVED_SIGMAS = 5.0  # the same in standard deviations
+
+
+def check_halves(halves: tuple[RigSolution, RigSolution] | None) -> Notice | None:
+    """Cameras whose poses in both halves of the take differ by more than they may."""
+    if halves is None:
+        return None
+    one, other = halves
+    angle, away = pose_differences(one.pose, other.pose)
+    variance = one.covariance.diagonal(dim1=-2, dim2=-1) + other.covariance.diagonal(dim1=-2, dim2=-1)
+    sigma = torch.rad2deg(variance[:, :3].sum(-1).sqrt())
+    far = (one.pose.centers - one.pose.middle).norm(dim=-1)
+    spread = 100 * variance[:, 3:6].sum(-1).sqrt() / far
+    turned = (angle > MAX_MOVED_DEGREES) & (angle > MAX_MOVED_SIGMAS * sigma)
+    went = (away > MAX_MOVED_PERCENT) & (away > MAX_MOVED_SIGMAS * spread)
+    which = turned | went
+    if not bool(which.any()):
+        return None
+    # the one that moved pulls at the others: it is the farthest
+    worst = int(torch.where(which, angle + away, -1.0).argmax())
+    return Notice(CalibrationNotice.MOVED, float(angle[worst]), {"cameras": (worst,)})
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The verb.
+
 
 NUM_START_MOMENTS = 60  # evenly spread, at which starts and halves are adjusted
 
@@ -49,12 +227,12 @@ def calibrate(
 ) -> Calibration:
     r"""Cameras, lenses and clocks from what moves before them: no board, no known lens, no common clock.
 
-    The stages, each in a file of this room:
+    The stages:
 
     1. clocks of all pairs from the same tracks (:func:`dyntorch.synchronize_cameras`);
     2. F of every pair at common moments; for focal lengths that are tried, rotations and centres by averaging over the pairs;
     3. the best of these starts adjusted: cameras, focal lengths, one term of distortion, clocks and points at once (see
-       ``bundle_problem.py`` for what is minimized);
+       ``bundle.py`` for what is minimized);
     4. up from upright bodies, the scale from a height or lengths;
     5. what the data leave open: standard deviations, rival rigs, halves of the take.
 
@@ -76,7 +254,7 @@ def calibrate(
         one_lens: whether focal length and distortion are the same in all cameras.
         max_shift: seconds that clocks differ by at most.
         rate: of all clocks against the first one's, which is held, such as 1 where one clock drives all cameras; by default found.
-        options: :class:`~dyntorch.tasks.calibrate.options.CalibrateOptions`; None = the defaults.
+        options: :class:`~dyntorch.tasks.calibrate.calibrate.CalibrateOptions`; None = the defaults.
 
     Returns:
         See :class:`dyntorch.Calibration`; ``ok`` is False, and ``reason`` says why, where the data do not decide.
@@ -121,7 +299,7 @@ def calibrate(
     n = rig.tracks[0].x.shape[1]
     used = views.some(max(1, math.ceil(options.max_positions / n)))
     graph = pair_graph(used, own, options.min_matches)
-    hopeless = diagnosis.check_matches(graph, rig, options) or diagnosis.check_motion(rig)
+    hopeless = check_matches(graph, rig, options) or check_motion(rig)
     if hopeless is not None:
         return _failure(rig, found_clocks, (*told, hopeless))
     freedom = Freedom.of(rig, own, clocks is not None, rate is not None, found_clocks.rate_sigmas)
@@ -133,10 +311,10 @@ def calibrate(
     # 4. the world, and the points of every frame
     others = [(pose_of(starts, k), float(worse[k])) for k in range(1, len(worse))]
     limits = [
-        diagnosis.check_plane(graph),
-        diagnosis.check_sigmas(best, rig, options),
-        diagnosis.check_rivals(pose_of(starts), others),
-        diagnosis.check_halves(halves),
+        check_plane(graph),
+        check_sigmas(best, rig, options),
+        check_rivals(pose_of(starts), others),
+        check_halves(halves),
     ]
     return _result(rig, views, best, found_clocks, [*told, *(limit for limit in limits if limit is not None)])
 
@@ -192,7 +370,7 @@ def _result(rig: Rig, views: RigViews, best: RigSolution, clocks: Clocks, limits
     """The solution in its world, with the points of all frames."""
     state, c = best.state, len(rig.tracks)
     found = triangulate_frames(views, best)
-    foreign = diagnosis.check_inliers(found.inliers)
+    foreign = check_inliers(found.inliers)
     limits += [foreign] if foreign is not None else []
     world = estimate_world(state.R[0], state.centers[0], found.points, rig.scale)
     R, t = world.cameras(state.R[0], state.t[0])
@@ -224,7 +402,7 @@ def _more_notices(rig: Rig, world: World, centers: Tensor) -> list[Notice]:
     found = []
     if len(rig.tracks) == 2:
         found.append(Notice(CalibrationNotice.TWO))
-    if diagnosis.are_collinear(centers):
+    if are_collinear(centers):
         found.append(Notice(CalibrationNotice.LINE))
     if not world.metric:
         found.append(Notice(CalibrationNotice.UNKNOWN_SCALE))

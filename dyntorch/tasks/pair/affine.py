@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.tasks.pair.motion_prior import Prior, cosines, inverse_cosines, motion_spectrum
+from dyntorch.tasks.pair.tracks import Prior, cosines, inverse_cosines, motion_spectrum
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The epipolar coordinates of one camera's points as combinations of the other's, by ridge regression of most evidence.

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.geometry.homogeneous import similarity
-from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment.coherence import Links, View
 
 Pair = tuple[int, int]
 

@@ -14,8 +14,7 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import descend, fit_fundamental, sample_fundamentals
 from dyntorch.invariants.segmentation_matrix import SegmentationMatrix
 from dyntorch.numerics.blocks import uniform
-from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import ENERGY_MAX_SQUARED_DISTANCE, SAMPSON_NOISE_PIXELS, View, energy, mean_field
+from dyntorch.tasks.segment.coherence import ENERGY_MAX_SQUARED_DISTANCE, SAMPSON_NOISE_PIXELS, Links, View, energy, mean_field
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts of a segmentation: several affine flows at a time, from random patches of the image that move alike.

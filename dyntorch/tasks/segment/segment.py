@@ -20,12 +20,29 @@ from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
 from dyntorch.numerics.chi_square import median
 from dyntorch.numerics.messages import Message
-from dyntorch.tasks.segment.coherence import Links, coherence
-from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS, View
+from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS, Links, View, coherence
 from dyntorch.tasks.segment.labels import Labelling, Models, label_matches, select_models, significant
-from dyntorch.tasks.segment.options import SegmentOptions
 from dyntorch.tasks.segment.result import BodyModel, Segmentation, SegmentNotice
 from dyntorch.tasks.segment.search import MIN_BODY_MATCHES, Candidate, one_hot, search, search_samples
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """What :func:`dyntorch.segment` takes and risks."""
+
+    max_bodies: int = 12
+    """Largest number of bodies tried where ``bodies`` is None."""
+    outlier_share: float = 0.3
+    """Share of wrong matches that is expected where ``spatial=False``: neighbours do not tell it then."""
+    false_alarms: float = 1e-2
+    """Bodies expected in random matches below which a body is believed where ``spatial=False``."""
+    max_searched: int = 1500
+    """Matches that the search looks at (time, memory); the others are labelled by what it finds."""
+    num_starts: int = 16
+    """Random starts for each number of bodies (time); twice as many where at most two numbers are tried."""
+    max_samples: int = 24000
+    """Samples of seven matches drawn at most where ``spatial=False`` (time)."""
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How many bodies: the segmentation of least cost with a penalty for each body, or with the number that was asked for.

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import descend, fit_fundamental
-from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import mean_field, relief
+from dyntorch.tasks.segment.coherence import Links, mean_field, relief
 from dyntorch.tasks.segment.frame_pairs import FramePair
 from dyntorch.tasks.segment.search import one_hot
 

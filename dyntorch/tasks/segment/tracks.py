@@ -16,12 +16,22 @@ from dyntorch.core.problems import select_problem, solve_one_by_one
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
-from dyntorch.tasks.segment.agglomeration import NEGLIGIBLE_LINKS, GroupCosts, NearPairs, merge_pieces, pieces, weakest_separation
-from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS
+from dyntorch.tasks.segment.agglomeration import (
+    MIN_KERNEL_TRACKS,
+    NEGLIGIBLE_LINKS,
+    GroupCosts,
+    NearPairs,
+    common_share,
+    links_of,
+    merge_pieces,
+    pieces,
+    preference_kernel,
+    strongest,
+    weakest_separation,
+)
+from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS
 from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs
 from dyntorch.tasks.segment.labels import distances, distances_from_cameras, find_static_body, motions, outliers
-from dyntorch.tasks.segment.options import TrackSegmentOptions
-from dyntorch.tasks.segment.residual_kernel import MIN_KERNEL_TRACKS, common_share, links_of, preference_kernel, strongest
 from dyntorch.tasks.segment.result import TrackNotice, TrackSegmentation
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.segment import MIN_MATCHES
@@ -35,6 +45,23 @@ from dyntorch.tasks.segment.track_energy import (
     energy,
     no_links,
 )
+
+
+@dataclass(frozen=True)
+class TrackSegmentOptions:
+    """What :func:`dyntorch.segment_tracks` takes and expects."""
+
+    max_bodies: int = 8
+    """Largest number of bodies tried where ``bodies`` is None."""
+    min_motion: float = 1.0
+    """Extent of the tracks, in 19 of 20 cases, below which nothing moves; pixels at a threshold of 2.5, and follows it."""
+    max_frame_pairs: int = 64
+    """Pairs of frames compared at most (time, memory)."""
+    num_hypotheses: int = 200
+    """Motions drawn of each kind (affine, homography, fundamental matrix) for a pair of frames (time)."""
+    max_searched: int = 1200
+    """Tracks that the search looks at (time, memory); the others are labelled by what it finds."""
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How many bodies there are, and which of the segmentations into them is the best.

@@ -17,9 +17,8 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.piecewise_offset import Jump, JumpEvidence, PiecewiseOffset, repair_clocks
-from dyntorch.tasks.synchronize.result import BreakNotice, Breaks, ClockBreak, Clocks, Shift
+from dyntorch.tasks.synchronize.result import BreakNotice, Breaks, ClockBreak, Clocks, Shift, SynchronizeOptions
 from dyntorch.tasks.synchronize.synchronize import prepare_tracks, synchronize
 from dyntorch.tasks.synchronize.tracks import Tracks
 

@@ -16,8 +16,7 @@ from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.synchronize.breaks import camera_breaks
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Clocks, ClocksNotice, Pair, Shift
+from dyntorch.tasks.synchronize.result import Clocks, ClocksNotice, Pair, Shift, SynchronizeOptions
 from dyntorch.tasks.synchronize.synchronize import synchronize
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from dyntorch.core.outcome import Notice, Status, status_from
 from dyntorch.tasks.synchronize.motion_capture import fit_combination
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
+from dyntorch.tasks.synchronize.result import Shift, ShiftNotice, SynchronizeOptions
 from dyntorch.tasks.synchronize.row_spaces import (
     KINDS,
     MEASURES,

@@ -27,7 +27,7 @@ from dyntorch.tasks.synchronize.epipolar import (
     ShiftDescent,
     epipolar_curve,
 )
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.result import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import Tracks, smooth_at
 
 # ----------------------------------------------------------------------------------------------------------------------

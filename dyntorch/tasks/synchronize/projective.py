@@ -15,8 +15,7 @@ from dyntorch.numerics.blocks import constant
 from dyntorch.numerics.lags import lag_covariances, lag_products
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.tasks.pair.tracks import interpolate
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
+from dyntorch.tasks.synchronize.result import Shift, ShiftNotice, SynchronizeOptions
 from dyntorch.tasks.synchronize.rigid_body import MAX_ITERATIONS, MIN_FRAMES, MIN_RELATIVE_NOISE, BodyMotion, body_motion
 from dyntorch.tasks.synchronize.subspace import (
     MAX_SIGMA_FRAMES,

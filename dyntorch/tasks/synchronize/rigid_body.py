@@ -17,8 +17,7 @@ from dyntorch.geometry.triangulation import resect, triangulate
 from dyntorch.numerics.least_squares import LeastSquaresOptions
 from dyntorch.numerics.subspaces import affine_factorization, metric_upgrade
 from dyntorch.tasks.reconstruct.factorization import projective_factorization
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import ShiftNotice
+from dyntorch.tasks.synchronize.result import ShiftNotice, SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import Tracks
 
 

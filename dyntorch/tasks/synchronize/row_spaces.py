@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics.lags import compress, lag_covariances
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.result import SynchronizeOptions
 from dyntorch.tasks.synchronize.subspace import (
     MIN_OVERLAP_SECONDS,
     MIN_OVERLAP_SHARE,

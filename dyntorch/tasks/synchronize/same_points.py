@@ -21,8 +21,7 @@ from dyntorch.tasks.synchronize.epipolar import (
     epipolar_curve,
 )
 from dyntorch.tasks.synchronize.evidence import NUM_PEAKS, Attempt, consistent_points
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
-from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
+from dyntorch.tasks.synchronize.result import Shift, ShiftNotice, SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import (
     MAX_FRAME_RATE_ERROR,
     MAX_RATE_DEVIATION,

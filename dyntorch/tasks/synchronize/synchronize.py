@@ -20,9 +20,8 @@ from dyntorch.numerics.messages import Message
 from dyntorch.tasks.synchronize.different_points import different_points
 from dyntorch.tasks.synchronize.epipolar import EPIPOLAR
 from dyntorch.tasks.synchronize.motion_capture import CAMERA
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.projective import projective_points
-from dyntorch.tasks.synchronize.result import Shift, ShiftNotice
+from dyntorch.tasks.synchronize.result import Shift, ShiftNotice, SynchronizeOptions
 from dyntorch.tasks.synchronize.same_points import search_same_points, shift_of
 from dyntorch.tasks.synchronize.tracks import Tracks, read_tracks, reject_outliers
 

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from dyntorch.tasks.pair.motion_prior import Prior, cosines, fill_gaps, inverse_cosines, motion_spectrum
+from dyntorch.tasks.pair.tracks import Prior, cosines, fill_gaps, inverse_cosines, motion_spectrum
 
 
 def normal(*shape, seed=0):

@@ -7,7 +7,7 @@ import torch
 
 from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import sampson_squared
-from dyntorch.tasks.segment import residual_kernel
+from dyntorch.tasks.segment import agglomeration
 from dyntorch.tasks.segment.agglomeration import (
     CHANCE_PREFERENCE_SHARE,
     COST_SCALE_FACTOR,
@@ -17,9 +17,10 @@ from dyntorch.tasks.segment.agglomeration import (
     NearPairs,
     merge_pieces,
     pieces,
+    preference_kernel,
+    strongest,
 )
 from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, select_near_pairs
-from dyntorch.tasks.segment.residual_kernel import preference_kernel, strongest
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.tracks import MERGE_GAPS, MERGE_PAIRS_PER_GAP
 from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
@@ -28,7 +29,7 @@ from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
 @pytest.fixture(autouse=True)
 def few_pairs(monkeypatch):
     """A kernel of few pairs of frames is enough here."""
-    monkeypatch.setattr(residual_kernel, "KERNEL_PAIRS_PER_GAP", 5)
+    monkeypatch.setattr(agglomeration, "KERNEL_PAIRS_PER_GAP", 5)
 
 
 def near_of(scene: Shot) -> NearPairs:

@@ -9,8 +9,7 @@ import torch
 
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import apply, homogeneous, skew, unit
-from dyntorch.tasks.segment.coherence import coherence
-from dyntorch.tasks.segment.energy import (
+from dyntorch.tasks.segment.coherence import (
     CUT_COST,
     ENERGY_MAX_SQUARED_DISTANCE,
     MIN_PARALLAX_PIXELS,
@@ -18,6 +17,7 @@ from dyntorch.tasks.segment.energy import (
     PARALLAX_WEIGHT,
     SAMPSON_NOISE_PIXELS,
     View,
+    coherence,
     energy,
     parallax,
 )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dyntorch.tasks.segment.coherence import coherence
-from dyntorch.tasks.segment.energy import mean_field
+from dyntorch.tasks.segment.coherence import coherence, mean_field
 from dyntorch.tasks.segment.search import affine_flows
 
 F64 = torch.float64

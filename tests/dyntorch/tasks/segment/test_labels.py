@@ -9,8 +9,7 @@ from dyntorch import scenes
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import unit
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.segment.coherence import Links, coherence
-from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment.coherence import Links, View, coherence
 from dyntorch.tasks.segment.labels import LABEL_SHARPNESS, NUM_LABEL_UPDATES, label_field, label_matches
 
 F64 = torch.float64

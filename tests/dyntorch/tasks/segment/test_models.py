@@ -12,8 +12,7 @@ from dyntorch import scenes
 from dyntorch.geometry.epipolar_fit import fit_fundamental
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous, skew
 from dyntorch.tasks.segment import labels as module
-from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import View
+from dyntorch.tasks.segment.coherence import Links, View
 from dyntorch.tasks.segment.labels import MAX_SQUARED_DEVIATION, NUM_LABEL_ROUNDS, TRUNCATED_VARIANCE, select_models
 
 F64 = torch.float64

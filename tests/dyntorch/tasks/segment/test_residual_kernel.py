@@ -10,9 +10,8 @@ import torch
 
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.metrics import relative_error
-from dyntorch.tasks.segment import residual_kernel
-from dyntorch.tasks.segment.frame_pairs import select_near_pairs
-from dyntorch.tasks.segment.residual_kernel import (
+from dyntorch.tasks.segment import agglomeration
+from dyntorch.tasks.segment.agglomeration import (
     affine_map,
     fundamental_of_eight,
     homography_of_four,
@@ -20,6 +19,7 @@ from dyntorch.tasks.segment.residual_kernel import (
     preference_kernel,
     strongest,
 )
+from dyntorch.tasks.segment.frame_pairs import select_near_pairs
 from tests.dyntorch.tasks.segment.videos import F64, draw, shot
 
 SOLVERS = ((affine_map, 3), (homography_of_four, 4), (fundamental_of_eight, 8))
@@ -29,7 +29,7 @@ HYPOTHESES = 60
 @pytest.fixture(autouse=True)
 def few_pairs(monkeypatch):
     """Few pairs of frames are enough here."""
-    monkeypatch.setattr(residual_kernel, "KERNEL_PAIRS_PER_GAP", 3)
+    monkeypatch.setattr(agglomeration, "KERNEL_PAIRS_PER_GAP", 3)
 
 
 def points(*size: int, seed: int = 0) -> torch.Tensor:
@@ -136,11 +136,11 @@ def twins(frames: int):
 
 
 def test_a_track_has_most_in_common_with_one_beside_it(monkeypatch):
-    monkeypatch.setattr(residual_kernel, "KERNEL_GAPS", (1,))
+    monkeypatch.setattr(agglomeration, "KERNEL_GAPS", (1,))
     kernel = kernel_of(twins(frames=2))
     assert float(kernel[0, 32]) > 0.5 and int(kernel[0].argmax()) == 32
     # one pair of frames: the share of preferences is a multiple of 1 / (3 h)
-    few = 3 * round(residual_kernel.PREFERRED_SHARE * HYPOTHESES)
+    few = 3 * round(agglomeration.PREFERRED_SHARE * HYPOTHESES)
     torch.testing.assert_close(kernel * few, (kernel * few).round(), rtol=0, atol=1e-3)
 
 
@@ -156,7 +156,7 @@ def test_tracks_that_never_meet_have_nothing_in_common():
     tracks[4:, :25] = torch.nan
     tracks[:4, 25:] = torch.nan
     apart = replace(scene, tracks=tracks)
-    assert select_near_pairs(apart.film(), residual_kernel.KERNEL_GAPS, 3, residual_kernel.MIN_KERNEL_TRACKS)
+    assert select_near_pairs(apart.film(), agglomeration.KERNEL_GAPS, 3, agglomeration.MIN_KERNEL_TRACKS)
     kernel = kernel_of(apart)
     assert bool((kernel[:25, 25:] == 0).all()) and bool((kernel[25:, :25] == 0).all())
     assert bool(kernel.isfinite().all()) and float(kernel[:25, :25].sum()) > 0 and float(kernel[25:, 25:].sum()) > 0

@@ -7,8 +7,7 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import ENERGY_MAX_SQUARED_DISTANCE, SAMPSON_NOISE_PIXELS, View
+from dyntorch.tasks.segment.coherence import ENERGY_MAX_SQUARED_DISTANCE, SAMPSON_NOISE_PIXELS, Links, View
 from dyntorch.tasks.segment.search import MIN_BODY_MATCHES, matrix_pairs, search_samples
 
 

@@ -12,8 +12,7 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.segment.coherence import coherence
-from dyntorch.tasks.segment.energy import View, energy
+from dyntorch.tasks.segment.coherence import View, coherence, energy
 from dyntorch.tasks.segment.result import BodyModel
 from dyntorch.tasks.segment.search import Candidate, search
 from dyntorch.tasks.segment.segment import no_bodies, segmentation_notices, select_count

@@ -10,8 +10,7 @@ import torch
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.core.outcome import Status
-from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import THRESHOLD_PIXELS, View
+from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS, Links, View
 from dyntorch.tasks.segment.labels import _alarms, _chance, significant
 
 

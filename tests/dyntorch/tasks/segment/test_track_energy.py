@@ -10,8 +10,7 @@ import torch
 
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.tasks.segment import track_energy
-from dyntorch.tasks.segment.coherence import Links
-from dyntorch.tasks.segment.energy import relief
+from dyntorch.tasks.segment.coherence import Links, relief
 from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, select_frame_pairs
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.track_energy import (

@@ -12,7 +12,7 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.segment import frame_pairs, residual_kernel
+from dyntorch.tasks.segment import agglomeration, frame_pairs
 from dyntorch.tasks.segment import tracks as module
 from dyntorch.tasks.segment.result import TrackNotice
 from tests.battery.pretend_device import pretend_device
@@ -25,7 +25,7 @@ QUICK = dyn.TrackSegmentOptions(max_frame_pairs=8, num_hypotheses=100)
 def quick(monkeypatch):
     """Fewer pairs of frames, fewer hypotheses, and one start: enough for a hundred tracks."""
     monkeypatch.setattr(frame_pairs, "MIN_FRAME_PAIRS", 6)
-    monkeypatch.setattr(residual_kernel, "KERNEL_PAIRS_PER_GAP", 5)
+    monkeypatch.setattr(agglomeration, "KERNEL_PAIRS_PER_GAP", 5)
     monkeypatch.setattr(module, "PIECE_COUNTS", (8,))
     monkeypatch.setattr(module, "MERGE_PAIRS_PER_GAP", 4)
 

@@ -9,9 +9,8 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.tasks.synchronize.breaks import breaks, camera_breaks, repair_times
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.piecewise_offset import MIN_JUMP_EVIDENCE, Jump, cheapest_path, repair_clocks
-from dyntorch.tasks.synchronize.result import ClockBreak
+from dyntorch.tasks.synchronize.result import ClockBreak, SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import read_tracks
 
 FPS, FRAMES, OFFSET = 30.0, 200, 0.31

@@ -15,7 +15,7 @@ from dyntorch.tasks.synchronize.motion_capture import (
     camera_variance,
     fit_combination,
 )
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
+from dyntorch.tasks.synchronize.result import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import read_tracks
 
 FPS, RECORDED = 30.0, 120.0

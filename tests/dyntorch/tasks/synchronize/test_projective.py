@@ -8,8 +8,8 @@ import torch
 
 from dyntorch.core.outcome import Notice, Status
 from dyntorch.geometry.rigid import rotation_exponential
-from dyntorch.tasks.synchronize.options import SynchronizeOptions
 from dyntorch.tasks.synchronize.projective import Poses, SharedMotion, attitude_curve, quaternions, rank_curve, rotations_of
+from dyntorch.tasks.synchronize.result import SynchronizeOptions
 from dyntorch.tasks.synchronize.rigid_body import body_motion
 from dyntorch.tasks.synchronize.synchronize import synchronize
 from dyntorch.tasks.synchronize.tracks import read_tracks

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dyntorch.numerics.least_squares import Iterate
-from dyntorch.tasks.calibrate.bundle_problem import PARAMETERS, Priors, RigAdjustment, RigState, camera_covariance, gauge, images
-from dyntorch.tasks.calibrate.observations import Seen
+from dyntorch.tasks.calibrate.bundle import PARAMETERS, Priors, RigAdjustment, RigState, camera_covariance, gauge, images
+from dyntorch.tasks.calibrate.input import Seen
 from tests.dyntorch.tasks.calibrate.rigs import exponential, pictures
 
 F64 = torch.float64
