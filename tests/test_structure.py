@@ -227,7 +227,7 @@ def test_options_of_a_verb_are_few_and_flat():
     assert many == {} and set(nested) == NESTED
 
 
-DAMPED = {"dyntorch/numerics/least_squares.py", "dyntorch/metrics/errors.py"}
+DAMPED = {"dyntorch/numerics/least_squares.py", "dyntorch/metrics.py"}
 """Files with a loop that damps its steps: the one Levenberg-Marquardt, and the one whose weights change with every step."""
 
 

@@ -3,7 +3,8 @@
 In the order in which data passes: ``primitives`` (what a view measures), ``invariant`` (the contract), ``matches`` and
 ``normalize`` (what was given, checked, at unit size), ``matrix`` (the estimation matrix and its Gram), ``residual``, ``fit``,
 ``refine``, ``consensus`` (the search behind) ``robust``; what all of them return is in ``solution``, and what every result of
-the library derives from, with its status and its notices, in ``outcome``.  Nothing here knows an invariant by name.
+the library derives from, with its status and its notices, in ``outcome``; ``limits`` are numbers that several tasks share.
+Nothing here knows an invariant by name.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant
+from dyntorch.core.limits import quantile
 from dyntorch.core.matches import Matches
 from dyntorch.core.matrix import unpack
 from dyntorch.core.normalize import Normalization, normalization, relative
@@ -18,7 +19,6 @@ from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, trian
 from dyntorch.core.residual import SINGULAR, whiten
 from dyntorch.core.solution import with_copies
 from dyntorch.numerics.blocks import Draws, Record, each, map_blocks, replace_problems, workers
-from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.eigenspaces import orthonormal
 from dyntorch.numerics.nullspace import gram_null_space
 

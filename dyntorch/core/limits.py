@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
-import torch
+from scipy.special import chdtri
 from torch import Tensor
 
 MIN_CONSENSUS = 0.4
@@ -13,12 +15,6 @@ MAX_SQUARED_DISTANCE = 9.0
 """Squared distance, over the squared noise, at which the cost of a match is cut off: three standard deviations."""
 MIN_INFORMATION = 1e-13
 """Information on the worst direction of a motion, over that on the best, up to which it is rounding: the motion is open."""
-
-
-def rounding_error(dtype: torch.dtype = torch.float64, scale: float = 1.0, condition: float = 1.0) -> float:
-    """What rounding leaves of a zero: the last safe decimal of ``dtype`` (1e-15, 1e-6) of numbers of size ``scale``, times what the
-    computation loses (``condition``)."""
-    return torch.finfo(dtype).resolution * scale * condition
 
 
 @dataclass(frozen=True)
@@ -31,3 +27,23 @@ class Stop:
     def has_converged(self, before: Tensor, after: Tensor) -> Tensor:
         """Where the costs ``(b,)`` before and after an iteration end it, bool."""
         return ~(before - after > self.tolerance * after)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Quantiles of chi-square: what the square sum of so many standard normal numbers keeps below with a given chance.
+
+
+@cache
+def quantile(probability: float, degrees: float) -> float:
+    """The value that chi-square with so many degrees of freedom stays below with this probability."""
+    return float(chdtri(degrees, 1 - probability))
+
+
+def median(degrees: float) -> float:
+    """The median of chi-square."""
+    return quantile(0.5, degrees)
+
+
+def three_sigma(degrees: float) -> float:
+    """The quantile at 99.73 %: what the square of three standard deviations is for one condition, for several."""
+    return quantile(math.erf(3 / math.sqrt(2)), degrees)

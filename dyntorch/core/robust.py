@@ -11,6 +11,7 @@ from torch import Tensor
 from dyntorch.core.consensus import Search, SearchResult, threshold_of
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant, as_invariant
+from dyntorch.core.limits import quantile
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.normalize import denormalize, relative
 from dyntorch.core.outcome import Status, is_failure
@@ -18,7 +19,6 @@ from dyntorch.core.refine import refine_matches
 from dyntorch.core.residual import multilinear, whitened_residual
 from dyntorch.core.solution import NOISY, Solution
 from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
-from dyntorch.numerics.chi_square import quantile
 
 BLOCK = 1 << 16  # matches per block of the distances
 REFINEMENT_STEPS = (3, 8)

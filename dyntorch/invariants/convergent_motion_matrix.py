@@ -8,8 +8,8 @@ from torch import Tensor
 from dyntorch.core.invariant import Frame
 from dyntorch.geometry.extensors import adjugate
 from dyntorch.geometry.homogeneous import skew, unit, unit_vectors
-from dyntorch.invariants.base_pairs import RelationPair
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
+from dyntorch.invariants.segmentation_matrix import RelationPair
 
 
 class ConvergentMotionMatrix(RelationPair):

@@ -14,7 +14,7 @@ from dyntorch.core.invariant import Estimate, Frame, Invariant, on_class, unknow
 from dyntorch.core.matches import constellations, option
 from dyntorch.core.outcome import Status
 from dyntorch.core.primitives import Equations
-from dyntorch.invariants import perspective_shapes
+from dyntorch.invariants.reprojection import CameraKind, reprojection_derivative, reprojection_residual
 from dyntorch.numerics.blocks import constant, select
 from dyntorch.numerics.nullspace import null_space
 from dyntorch.shapes.basis import Polynomial, Trajectory, extremes, times_of_views
@@ -30,8 +30,8 @@ from dyntorch.shapes.moving import (
     shapes_through,
     slopes,
 )
-from dyntorch.shapes.projective import recover_perspective_times
-from dyntorch.shapes.static import centring_basis
+from dyntorch.shapes.projective import fit_perspective_shapes, gauge, recover_perspective_times
+from dyntorch.shapes.static import centring_basis, general_rows
 from dyntorch.shapes.times import Recovery, recover_times
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -163,6 +163,15 @@ def _samples(trajectory: Trajectory, device: torch.device) -> tuple[Tensor, Tens
     return trajectory.rows(nodes), torch.linalg.pinv(trajectory.power(3).rows(nodes))
 
 
+def perspective_rows(measured: Tensor, trajectory: Trajectory, places: tuple[int, ...]) -> Tensor:
+    r"""Rows of :math:`p_5^T F(t)\, p_6 = 0` of six of the points, ``(*batch, views, 1, 5 K)``; zero where one is missing."""
+    row = general_rows(measured[..., list(places), :3])
+    return (trajectory.power(9).rows(measured[..., 0, 3])[..., None, :, None] * row[..., None, :]).flatten(-2)
+
+
+PERSPECTIVE = CameraKind()
+MIN_PERSPECTIVE_POINTS = 6
+"""Any five points go anywhere by a camera of the plane."""
 Form = Literal["joint", "basis", "span"]
 Camera = Literal["affine", "projective"]
 
@@ -269,7 +278,7 @@ class DynamicShapeTensor(Invariant):
         return replace(self, points=n, interval=interval), (measured,)
 
     def _enough(self, n: int) -> None:
-        least = 3 * self.trajectory.size + 2 if self.form == "span" else (perspective_shapes.LEAST if self.projective else 5)
+        least = 3 * self.trajectory.size + 2 if self.form == "span" else (MIN_PERSPECTIVE_POINTS if self.projective else 5)
         if n < least:
             raise ValueError(f"{self!r} needs at least {least} points, got {n}; add points, or use fewer functions of the time")
         if max(self.base) >= n:
@@ -292,7 +301,10 @@ class DynamicShapeTensor(Invariant):
         """One slot: a whole view and its time."""
         n, trajectory, base = self.points, self.trajectory, self.base
         if self.projective:
-            return (perspective_shapes.equations(n, trajectory, base),)
+            # the linear form of the four basis points and the next two
+            places = (*base, *(i for i in range(n) if i not in base))[:6]
+            rows = partial(perspective_rows, trajectory=trajectory, places=places)
+            return (Equations((n, 4), 5 * trajectory.power(9).size, rows),)
         if self.form == "span":
             return (Equations((n, 4), n - 1, span_rows, rows=2),)
         width = trajectory.power(3).size * (1 + 3 * (n - 4))
@@ -306,16 +318,17 @@ class DynamicShapeTensor(Invariant):
     @property
     def dof(self) -> int:  # type: ignore[override]
         """Numbers behind the tensor: positions of all functions up to translation, less what the gauge takes."""
-        if self.projective:
-            return perspective_shapes.freedom(self.points, self.trajectory)
         size = 3 * self.trajectory.size
+        if self.projective:
+            # positions of all functions up to translation, less the affine frame of the world
+            return size * (self.points - 1) - gauge(self.trajectory.size)
         return size * (self.points - 1 - size) if self.form == "span" else size * (self.points - 1) - 9
 
     @property
     def codim(self) -> int:  # type: ignore[override]
         """Conditions on one view."""
         if self.projective:
-            return 2 * self.points - perspective_shapes.CAMERA.freedom
+            return 2 * self.points - PERSPECTIVE.freedom
         return 2 * (self.nullity if self.form == "span" else self.points - 4)
 
     @on_class
@@ -351,17 +364,17 @@ class DynamicShapeTensor(Invariant):
         """The form ``joint`` by least squares over all points; the others are the null space of the rows."""
         if self.form != "joint":
             return None
-        if self.projective:
-            return perspective_shapes.estimate(views[0], weights, self.trajectory)
         measured = views[0]
         rows = self.trajectory.rows(measured[..., 0, 3])
         with torch.no_grad():
-            found = fit_shapes(measured[..., :2], rows, measured[..., 2], share=weights)
-        ambiguous = found.uncertainty > MAX_UNCERTAINTY
-        shapes = found.shapes
-        if torch.is_grad_enabled() and (measured.requires_grad or weights.requires_grad):
-            shapes = select(found.status == Status.OK, followed_shapes(shapes, measured, rows, weights), shapes)
-        return Estimate(concatenate_shapes(shapes), found.few, found.degenerate, ambiguous, found.uncertainty)
+            estimate = (fit_perspective_shapes if self.projective else fit_shapes)(
+                measured[..., :2], rows, measured[..., 2], share=weights
+            )
+        ambiguous = estimate.uncertainty > MAX_UNCERTAINTY
+        shapes = estimate.shapes
+        if not self.projective and torch.is_grad_enabled() and (measured.requires_grad or weights.requires_grad):
+            shapes = select(estimate.status == Status.OK, followed_shapes(shapes, measured, rows, weights), shapes)
+        return Estimate(concatenate_shapes(shapes), estimate.few, estimate.degenerate, ambiguous, estimate.uncertainty)
 
     @on_class
     def compose(self, shapes: Tensor) -> Tensor:
@@ -407,9 +420,10 @@ class DynamicShapeTensor(Invariant):
     def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The distance of each view from the images of its shape, point by point: ``(*batch, views, 2 n)``."""
         if self.projective:
-            wide = (split_shapes(motion[0].double()), views[0].double(), scales[0].double())
-            return perspective_shapes.whitened_residual(*wide, self.trajectory).to(views[0].dtype)
-        residual = self._projected(motion[0].double(), views[0].double())[0].residual.flatten(-2)
+            structure, _ = self._structure(motion[0].double(), views[0].double())
+            error = reprojection_residual(structure, views[0][..., :3].double(), scales[0].double(), PERSPECTIVE)
+            return error.to(views[0].dtype)
+        residual = self._project(motion[0].double(), views[0].double())[0].residual.flatten(-2)
         return (residual / scales[0][..., None, None]).to(views[0].dtype)
 
     def linearize(
@@ -417,15 +431,23 @@ class DynamicShapeTensor(Invariant):
     ) -> tuple[Tensor, Tensor] | None:
         """:meth:`whitened_residual` and its derivative by the shapes."""
         if self.projective:
-            return perspective_shapes.linearize(split_shapes(motion[0]), views[0], scales[0], self.trajectory)
+            structure, rows = self._structure(motion[0], views[0])
+            error, slope = reprojection_derivative(structure, views[0][..., :3], scales[0], PERSPECTIVE)
+            derivative = torch.einsum("bvcnk,bvf->bnfkvc", slope[..., :3], rows)
+            return error.flatten(-2), derivative.flatten(1, 3).flatten(2)
         if self.form == "span":
             return None
-        found, rows = self._projected(motion[0], views[0])
-        derivative = slopes(found, views[0][..., 2], rows).flatten(-2).flatten(-4, -2)  # (b, v, n 3 B, 2 n)
+        projected, rows = self._project(motion[0], views[0])
+        derivative = slopes(projected, views[0][..., 2], rows).flatten(-2).flatten(-4, -2)  # (b, v, n 3 B, 2 n)
         scale = scales[0][:, None]
-        return found.residual.flatten(1) / scale, derivative.transpose(1, 2).flatten(2) / scale[..., None]
+        return projected.residual.flatten(1) / scale, derivative.transpose(1, 2).flatten(2) / scale[..., None]
 
-    def _projected(self, shapes: Tensor, measured: Tensor) -> tuple[ProjectedShapes, Tensor]:
+    def _structure(self, shapes: Tensor, measured: Tensor) -> tuple[Tensor, Tensor]:
+        """Homogeneous points ``(*batch, views, n, 4)`` at the times of the views, and the functions of the time."""
+        rows = self.trajectory.rows(measured[..., 0, 3])
+        return torch.nn.functional.pad(shapes_at(split_shapes(shapes), rows), (0, 1), value=1.0), rows
+
+    def _project(self, shapes: Tensor, measured: Tensor) -> tuple[ProjectedShapes, Tensor]:
         """Views ``(*batch, views, n, 4)`` beside their shapes, and the functions of the time."""
         x, seen = measured[..., :2], measured[..., 2].detach()
         centre = (x * seen[..., None]).sum(-2, keepdim=True) / seen.sum(-1)[..., None, None].clamp(min=1.0)

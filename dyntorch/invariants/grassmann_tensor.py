@@ -11,7 +11,7 @@ from dyntorch.core.invariant import Frame, Invariant
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
 from dyntorch.geometry.grassmann import candidates, grassmann_derivative, grassmann_tensor
 from dyntorch.geometry.grassmann_nearest import projections_of
-from dyntorch.invariants import agreement
+from dyntorch.invariants import reprojection
 from dyntorch.numerics.least_squares import normalized_derivative
 
 
@@ -161,12 +161,12 @@ class GrassmannTensor(Invariant):
 
     def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
         """The reprojection error that is left when the point is eliminated; None where one condition is all there is."""
-        return None if self.single() else agreement.residual(motion, views, scales)
+        return None if self.single() else reprojection.residual(motion, views, scales)
 
     def linearize(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
     ) -> tuple[Tensor, Tensor] | None:
-        return None if self.single() else agreement.residual_derivative(motion, views, scales)
+        return None if self.single() else reprojection.residual_derivative(motion, views, scales)
 
     def __repr__(self) -> str:
         dims = "" if set(self.dims) == {2} else f", l={self.l}"

@@ -12,7 +12,7 @@ from torch import Tensor
 from dyntorch.core.invariant import Frame, Invariant
 from dyntorch.core.matches import constellations
 from dyntorch.core.primitives import Equations
-from dyntorch.invariants.reprojected_shapes import CameraKind, looked_at, reprojection_derivative, reprojection_residual
+from dyntorch.invariants.reprojection import CameraKind, looked_at, reprojection_derivative, reprojection_residual
 from dyntorch.numerics.least_squares import jacobian
 from dyntorch.numerics.nullspace import null_space
 from dyntorch.shapes import lifted, static

@@ -1,7 +1,7 @@
-"""Knows matrices and numbers only, no camera and no point: null spaces, least squares, subspaces, time lags, quantiles.
+"""Knows matrices and numbers only, no camera and no point: null spaces, least squares, subspaces, time lags.
 
 Everything here is batched over leading dimensions and computes in float64.  ``nullspace`` is the only place where null spaces
-are solved (``eigenspaces`` the means, ``null_space_gradient`` the derivatives), ``function_transforms`` is what makes solvers that
+are solved (``eigenspaces`` the means), ``function_transforms`` is what makes solvers that
 look at values work within ``torch.func``, ``least_squares`` holds the one Levenberg-Marquardt, ``blocks`` cuts batches into pieces
 that fit the cache and gives each to a thread, ``arguments`` checks what a function was given and where it computes, ``messages``
 are sentences that keep their data.

@@ -12,8 +12,7 @@ from dyntorch.core.outcome import Outcome, Status, status_of
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.numerics.arguments import check_weights
 from dyntorch.numerics.blocks import one_thread, select
-from dyntorch.numerics.implicit import flat_directions, follow_minimum
-from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, minimize
+from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, flat_directions, follow_minimum, minimize
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
 from dyntorch.shapes.static import centring_basis
 

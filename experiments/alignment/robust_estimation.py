@@ -22,7 +22,7 @@ import tyro
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.core.invariant import Invariant
-from dyntorch.numerics.chi_square import quantile
+from dyntorch.core.limits import quantile
 from dyntorch.scenes.scene import OUTLIER, Scene
 from experiments.common.tables import Row, command, measured
 from indexing.files import prepare

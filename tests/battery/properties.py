@@ -14,7 +14,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.core.solution import Solution
-from dyntorch.invariants.base_pairs import RelationPair
+from dyntorch.invariants.segmentation_matrix import RelationPair
 from tests.battery.cases import Case, carried, moved_views
 from tests.battery.references import apart, matrices, noisy, pulled_back, rank, spans
 

@@ -323,7 +323,6 @@ def errors() -> Any:
     return {
         "relative": metrics.relative_error(a, b), "grid": metrics.grid_transfer_error(a, b, 640, 480),
         "rotation": metrics.rotation_error(*rigid), "translation": metrics.translation_error(*rigid),
-        "angle": metrics.subspace_angle(a[..., :2], b[..., :2]),
         "labels": metrics.label_scores(labels, truth), "wrong": metrics.misclassification(labels, truth),
         "gauge": tried(lambda: metrics.affine_gauge(normal(3, 4, 4), normal(3, 4, 4, number=1))),
     }  # fmt: skip

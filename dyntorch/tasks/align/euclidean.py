@@ -11,13 +11,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from dyntorch.core.limits import three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import denormalize_motion
 from dyntorch.core.outcome import Notice, has_inliers, noting
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import homogeneous, nonzero_sign
 from dyntorch.geometry.plane_motion import CommonPlane, PlaneMotion, motion_over, plane_motions
-from dyntorch.numerics.chi_square import three_sigma
 from dyntorch.numerics.least_squares import LeastSquaresOptions, minimize
 from dyntorch.numerics.nullspace import eigenvalues
 from dyntorch.tasks.align.result import OUTLIER, AlignNotice

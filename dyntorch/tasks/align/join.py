@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant
-from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.residual import whitened_residual
@@ -20,7 +20,6 @@ from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.numerics.blocks import select
-from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align.labelling import (
     ROUGH_LABEL_FACTOR,

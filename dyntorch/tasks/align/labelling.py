@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant
+from dyntorch.core.limits import median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import Normalization, normalization, normalize_motion
 from dyntorch.core.refine import Problem, refine_matches
@@ -15,7 +16,6 @@ from dyntorch.core.residual import whiten, whitened_residual
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import apply, homogeneous
 from dyntorch.numerics.blocks import each, map_blocks, uniform
-from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
 

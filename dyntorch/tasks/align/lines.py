@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.core.fit import fit_matches
-from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median, three_sigma
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.matrix import gram
 from dyntorch.core.normalize import Normalization, denormalize_motion
@@ -24,7 +24,6 @@ from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, by_match, derivatives, minimize
 from dyntorch.numerics.messages import Message
 from dyntorch.numerics.nullspace import spectrum

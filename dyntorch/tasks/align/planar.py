@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
-from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median, three_sigma
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.robust import robust_fit
@@ -20,7 +20,6 @@ from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread, select
-from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.align.euclidean import euclidean
 from dyntorch.tasks.align.labelling import (

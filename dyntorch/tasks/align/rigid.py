@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.core.limits import MIN_CONSENSUS
+from dyntorch.core.limits import MIN_CONSENSUS, median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import similarity, skew
 from dyntorch.geometry.rigid import moved_by, rigid_alignment
 from dyntorch.numerics.blocks import each, map_blocks, uniform
-from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import THRESHOLD_SIGMAS

@@ -9,17 +9,16 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant
+from dyntorch.core.limits import median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import normalize_motion
 from dyntorch.core.outcome import is_failure
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import homogeneous, unit
-from dyntorch.invariants.dynamic_tensor import DynamicMotion
-from dyntorch.invariants.flats import flat_residual, nearest_flats
+from dyntorch.invariants.dynamic_tensor import DynamicMotion, flat_residual, nearest_flats
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.numerics.blocks import select, uniform
-from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.nullspace import null_space
 from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, Evidence
 

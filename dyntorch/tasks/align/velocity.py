@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
-from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import denormalize_motion
 from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
@@ -17,7 +17,6 @@ from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.numerics.blocks import map_blocks, uniform
-from dyntorch.numerics.chi_square import median, three_sigma
 from dyntorch.numerics.least_squares import LeastSquaresOptions, derivatives, minimize
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, THRESHOLD_SIGMAS, Evidence

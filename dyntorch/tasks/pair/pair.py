@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.core.normalize import hartley
-from dyntorch.core.outcome import Notice, Status, is_failure
-from dyntorch.core.problems import select_problem, solve_one_by_one, trim_padding
+from dyntorch.core.outcome import Notice, Status, is_failure, select_problem, solve_one_by_one, trim_padding
 from dyntorch.core.residual import sampson
 from dyntorch.core.robust import robust_fit
 from dyntorch.geometry.body import BodyProblem, FilmedBody, fit_body

@@ -9,10 +9,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from dyntorch.core.limits import quantile
 from dyntorch.core.outcome import Notice, NoticeCode, Status, in_order, noting
 from dyntorch.geometry.homogeneous import two_sided
 from dyntorch.geometry.rigid import nearest_rotation
-from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
 from dyntorch.tasks.planes.input import GivenPlanes
 

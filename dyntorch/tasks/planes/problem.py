@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from dyntorch.core.limits import quantile
 from dyntorch.core.normalize import hartley
 from dyntorch.core.residual import multilinear_derivative
 from dyntorch.geometry.homogeneous import null_vectors, similarity, skew, unit_vectors
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.blocks import constant
-from dyntorch.numerics.chi_square import quantile
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, by_match, jacobian, minimize
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.planes.closed_forms import (

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
+from dyntorch.core.limits import quantile
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Status
 from dyntorch.core.refine import constrain_matches
@@ -17,7 +18,6 @@ from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.blocks import each, replace_problems, uniform
-from dyntorch.numerics.chi_square import quantile
 from dyntorch.tasks.reconstruct.options import ReconstructOptions
 from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, view_subsets
 from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjust_scene, distances, scene_of

@@ -9,10 +9,10 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from dyntorch.core.limits import quantile
 from dyntorch.core.outcome import Status, has_inliers, is_failure, notices
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import triangulate, unit_projections
-from dyntorch.numerics.chi_square import quantile
 from dyntorch.tasks.reconstruct.calibrated import metric_reconstruction, of_bodies
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion

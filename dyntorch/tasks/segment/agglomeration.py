@@ -21,11 +21,10 @@ import torch
 from sklearn.cluster import spectral_clustering
 from torch import Tensor
 
-from dyntorch.core.limits import MAX_SQUARED_DISTANCE
+from dyntorch.core.limits import MAX_SQUARED_DISTANCE, median
 from dyntorch.geometry.epipolar import null_vector
 from dyntorch.geometry.homogeneous import cofactors, homogeneous
 from dyntorch.numerics.blocks import uniform
-from dyntorch.numerics.chi_square import median
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, FramePair, Pair, TrackSet, select_near_pairs
 from dyntorch.tasks.segment.search import one_hot

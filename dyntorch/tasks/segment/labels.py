@@ -9,12 +9,11 @@ from math import lgamma, log
 import torch
 from torch import Tensor
 
-from dyntorch.core.limits import MAX_SQUARED_DISTANCE
+from dyntorch.core.limits import MAX_SQUARED_DISTANCE, median
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import descend
 from dyntorch.geometry.homogeneous import skew, unit
 from dyntorch.geometry.homography import homography, homography_sampson_squared
-from dyntorch.numerics.chi_square import median
 from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS, Links, View, conformity, mean_field
 from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet
 from dyntorch.tasks.segment.track_energy import MIN_BODY_TRACKS, Geometry

@@ -9,6 +9,7 @@ from math import inf, prod
 import torch
 from torch import Tensor
 
+from dyntorch.core.limits import median
 from dyntorch.core.matches import matches
 from dyntorch.core.outcome import Notice, Status, noting
 from dyntorch.geometry.epipolar import sampson_squared
@@ -18,7 +19,6 @@ from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform
-from dyntorch.numerics.chi_square import median
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS, Links, View, coherence
 from dyntorch.tasks.segment.labels import Labelling, Models, label_matches, select_models, significant

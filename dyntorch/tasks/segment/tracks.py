@@ -11,8 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Notice, Status, status_from
-from dyntorch.core.problems import select_problem, solve_one_by_one
+from dyntorch.core.outcome import Notice, Status, select_problem, solve_one_by_one, status_from
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
 from dyntorch.numerics.blocks import one_thread, uniform

@@ -11,8 +11,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from dyntorch.core.outcome import Notice, status_from
-from dyntorch.core.problems import select_problem, solve_one_by_one, trim_padding
+from dyntorch.core.outcome import Notice, select_problem, solve_one_by_one, status_from, trim_padding
 from dyntorch.geometry.lens import undistort_points
 from dyntorch.numerics.arguments import check_options, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread

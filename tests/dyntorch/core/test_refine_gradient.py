@@ -10,7 +10,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.refine_gradient import RefineNotice
+from dyntorch.core.refine import RefineNotice
 
 H = dyn.HomographyTensor
 

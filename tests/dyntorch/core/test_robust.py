@@ -15,10 +15,10 @@ from dyntorch import Status, scenes
 from dyntorch.core import consensus
 from dyntorch.core.consensus import Search, anneal, evidence_and_doubt, msac
 from dyntorch.core.invariant import Invariant
+from dyntorch.core.limits import quantile
 from dyntorch.core.matches import matches
 from dyntorch.core.matrix import estimation_matrix
 from dyntorch.core.normalize import denormalize
-from dyntorch.numerics.chi_square import quantile
 from dyntorch.scenes.scene import OUTLIER
 from tests.battery.cases import CASES as KNOWN
 from tests.battery.cases import Case

@@ -77,16 +77,6 @@ def test_square_follows_chi_square():
     torch.testing.assert_close(w.T @ w / len(w), torch.eye(4).double(), rtol=0, atol=0.04)
 
 
-def test_batch_is_loop_and_scale_is_free():
-    motion = collineations(2, 3, 5)
-    views = static_views(motion, 7, 3, 0.1)
-    scales = [torch.rand(5, generator=torch.Generator().manual_seed(v)).double() + 0.5 for v in range(3)]
-    whole = static_residual(motion, views, scales)
-    for i in range(5):
-        one = static_residual([-4 * m[i] for m in motion], [x[i] for x in views], [s[i] for s in scales])
-        torch.testing.assert_close(whole[i], one)
-
-
 def test_points_at_infinity_stay_finite_in_value_and_gradient():
     matrix = torch.eye(3).double()
     matrix[2] = torch.tensor([1.0, 0.0, 0.0])
@@ -97,17 +87,3 @@ def test_points_at_infinity_stay_finite_in_value_and_gradient():
     w.sum().backward()
     assert w.isfinite().all()
     assert x2.grad.isfinite().all()
-
-
-def test_forward_mode_under_vmap_agrees_with_backward_mode():
-    motion = collineations(2, 2)
-    views = static_views(motion, 3, 2, 0.1)
-    ones = [torch.ones(()).double()] * 3
-    theta = torch.stack(motion).flatten()
-
-    def residual(t):
-        return static_residual(list(t.unflatten(0, (2, 3, 3))), views, ones).flatten()
-
-    forward = torch.func.vmap(lambda v: torch.func.jvp(residual, (theta,), (v,))[1])(torch.eye(18).double()).T
-    torch.testing.assert_close(forward, torch.func.jacrev(residual)(theta))
-    assert torch.autograd.gradcheck(residual, theta.requires_grad_())

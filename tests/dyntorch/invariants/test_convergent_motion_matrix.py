@@ -92,23 +92,6 @@ def test_two_matrices_with_both_ties_share_a_homography():
     assert torch.linalg.det(H).abs().min() > 1e-6
 
 
-def freedom(compose, *parts):
-    """Rank of the derivative of the matrix by all entries of the parts: the dimension of what it can be."""
-    sizes, shapes = [p.numel() for p in parts], [p.shape for p in parts]
-
-    def tensor(theta):
-        return compose(*(p.reshape(shape) for p, shape in zip(theta.split(sizes), shapes, strict=True))).flatten()
-
-    values = torch.linalg.svdvals(torch.func.jacfwd(tensor)(torch.cat([p.flatten() for p in parts])))
-    return int((values > 1e-10 * values[0]).sum())
-
-
-def test_degrees_of_freedom():
-    H, e2, v2 = motion()
-    assert freedom(ConvergentMotionMatrix.compose, H, e2, v2) == ConvergentMotionMatrix.dof == 12
-    assert freedom(SegmentationMatrix.compose, H, e2, random(3, 3, seed=9), v2) == 14
-
-
 def test_decompose_returns_the_motion_in_either_order():
     H, e2, v2 = motion(50)
     found = ConvergentMotionMatrix.decompose(ConvergentMotionMatrix.compose(H, e2, v2))

@@ -26,22 +26,6 @@ def scene(n, **options):
     return scenes.two_view(n, generator=torch.Generator().manual_seed(0), **options)
 
 
-def test_eight_matches_determine_it():
-    assert FundamentalMatrix.minimal() == 8
-    (F,), views = scene(12).motion, scene(12).views
-    centred = [(x - x.mean(0)) / x.std() for x in views]
-    p1, p2 = (homogeneous(x) for x in centred)
-    rows = torch.einsum("na,nb->nab", p2, p1).flatten(1)
-    assert torch.linalg.matrix_rank(rows) == 8
-    assert torch.linalg.matrix_rank(rows[:8]) == 8
-    assert torch.linalg.matrix_rank(rows[:7]) == 7
-    # axes of the tensor: view 2, then view 1
-    assert FundamentalMatrix.axes() == (1, 0)
-    assert FundamentalMatrix.shape() == (3, 3)
-    residual = torch.einsum("na,ab,nb->n", homogeneous(views[1]), F, homogeneous(views[0]))
-    assert residual.abs().max() < 1e-10
-
-
 def test_of_cameras_it_is_that_of_kornia():
     P1 = torch.cat([torch.eye(3), torch.zeros(3, 1)], -1).double()
     for seed in range(20):
@@ -132,24 +116,3 @@ def test_degenerate_matrices_are_never_nan():
         FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 0, 1])), torch.zeros(1, 2)
     )
     assert torch.equal(at_epipole, torch.zeros(1, 3))
-
-
-@pytest.mark.slow
-def test_gradients_and_forward_mode():
-    A, e2 = random(2, 3, 3).requires_grad_(), random(2, 3, seed=1).requires_grad_()
-
-    def gauge_free(A, e2):
-        F = FundamentalMatrix.compose(*FundamentalMatrix.decompose(FundamentalMatrix.compose(A, e2)))
-        return F[..., :, :, None, None] * F[..., None, None, :, :]
-
-    assert torch.autograd.gradcheck(gauge_free, (A, e2))
-    assert torch.autograd.gradcheck(FundamentalMatrix().constrain, random(3, 3, seed=4).requires_grad_())
-    x = random(2, 4, 2, seed=2).requires_grad_()
-    assert torch.autograd.gradcheck(FundamentalMatrix.epipolar_lines, (random(2, 3, 3, seed=3).requires_grad_(), x))
-
-    def composed(t):
-        return FundamentalMatrix.compose(t[:9].unflatten(0, (3, 3)), t[9:])
-
-    theta = torch.cat([A[0].flatten(), e2[0]]).detach()
-    forward = torch.func.vmap(lambda v: torch.func.jvp(composed, (theta,), (v,))[1])(torch.eye(12).double())
-    torch.testing.assert_close(forward.movedim(0, -1), torch.func.jacrev(composed)(theta))

@@ -5,7 +5,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
-from dyntorch.invariants.agreement import linearize, residual, residual_derivative
+from dyntorch.invariants.reprojection import linearize, residual, residual_derivative
 
 PROFILES = [
     dyn.GrassmannTensor(3, (2, 1, 1)),

@@ -119,31 +119,6 @@ def test_static_points_alone():
         TL.static_point_lines(x1, x2[:, :4])
 
 
-def meeting(line, count, seed):
-    """Random lines that meet a line given by two points."""
-    on = line[0] + random(count, 1, seed=seed) * (line[1] - line[0])
-    return torch.stack([on, random(count, 3, seed=seed + 1)], dim=-2)
-
-
-def test_labelled_static_lines_against_brute_force():
-    """A static line may be replaced in either view by any line that meets it: 9 rows, and six such lines determine the matrix."""
-    scene = translating_lines(7, static=1.0, generator=generator(7))
-    l1, l2 = scene.views
-    direct, brute = [], []
-    for k in range(7):
-        first, second = lines(l1[k : k + 1]), lines(l2[k : k + 1])
-        free1, free2 = Line().free(l1[k : k + 1])[0], Line().free(l2[k : k + 1])[0]
-        direct += [torch.kron(free2, first), torch.kron(second, free1)]
-        for seed in (100 * k, 100 * k + 50):
-            brute += [rows(l1[k : k + 1].expand(20, 2, 3), meeting(l2[k], 20, seed + 10))]
-            brute += [rows(meeting(l1[k], 20, seed + 20), l2[k : k + 1].expand(20, 2, 3))]
-    found = [rank(torch.cat(direct[: 2 * k])) for k in range(1, 8)]
-    assert found == [rank(torch.cat(brute[: 4 * k])) for k in range(1, 8)]
-    assert found == [rank(torch.cat(direct[: 2 * k] + brute[: 4 * k])) for k in range(1, 8)]
-    assert found == [9, 18, 26, 31, 34, 35, 35]
-    assert (torch.cat(direct) @ TL.compose(*scene.motion).flatten()).abs().max() < 1e-12
-
-
 def test_pure_translation_family():
     scene = translating_lines(120, motion="translation", sensors="projective", generator=generator(8))
     (matrix,) = scene.motion
@@ -178,20 +153,6 @@ def infinity_of(scene):
     return torch.linalg.svd(torch.stack(points)).Vh[-1]
 
 
-@pytest.mark.parametrize("scale", [1.0, -1.0, 2.5, -1e-3])
-def test_round_trip(scale):
-    matrix = unit(random(50, 4, 4, seed=10))
-    matrix[:25] = unit(torch.eye(4, dtype=torch.float64) + 0.2 * random(25, 4, 4, seed=11))
-    found = TL.decompose(scale * TL.compose(matrix))
-    assert (found - matrix).abs().max() < 1e-9
-    assert (torch.linalg.det(matrix) < 0).any() and (torch.linalg.det(matrix) > 0).any()
-
-
-def test_dof_is_the_rank_of_compose():
-    jacobian = torch.autograd.functional.jacobian(TL.compose, random(4, 4, seed=12))
-    assert rank(jacobian.flatten(2).flatten(0, 1)) == TL.dof
-
-
 def test_transfer_of_lines_and_points():
     (matrix,) = translating_lines(1, batch=3, generator=generator(13)).motion
     form = TL.compose(matrix)
@@ -218,36 +179,12 @@ def test_swept_plane_contains_both_lines():
         assert torch.einsum("bnki,bni->bnk", homogeneous(ends), plane).abs().max() < 1e-10
 
 
-def test_linear_fit_recovers_the_motion():
-    scene = translating_lines(35, generator=generator(17))
-    null = torch.linalg.svd(rows(*scene.views)).Vh[-1].reshape(6, 6)
-    assert (TL.decompose(null) - scene.motion[0]).abs().max() < 1e-8
-    two = translating_lines(80, motion="objects", objects=2, static_points=2, generator=generator(18))
-    static = TL.static_point_lines(two.extras["points1"], two.extras["points2"])
-    matrix = torch.cat([rows(*two.views), rows(*static)])
-    assert (TL.decompose(torch.linalg.svd(matrix).Vh[-1].reshape(6, 6)) - two.motion[0]).abs().max() < 1e-8
-
-
 def reference_square(residual, views, scales):
     """e^T (sum s^2 J J^T)^-1 e of one match, with automatic derivatives."""
     e = residual(*views)
     jacobians = [j.flatten(1) for j in torch.autograd.functional.jacobian(residual, views)]
     q = sum(s**2 * j @ j.mT for s, j in zip(scales, jacobians, strict=True))
     return e @ torch.linalg.solve(q, e)
-
-
-def test_moving_residual_against_automatic_derivatives():
-    scene = translating_lines(8, sigma=0.02, generator=generator(19))
-    (matrix,) = scene.motion
-    scales = tuple(torch.tensor(s, dtype=torch.float64) for s in (1.0, 0.5))
-    assert TL().whitened_residual(scene.motion, scene.views, scales) is None
-    found = multilinear(TL(), TL.compose(matrix), scene.views, scales).square()
-
-    def residual(l1, l2):
-        return torch.linalg.det(torch.cat([homogeneous(l1), homogeneous(l2) @ matrix.mT]))[None]
-
-    expected = torch.stack([reference_square(residual, tuple(x[n] for x in scene.views), scales) for n in range(8)])
-    assert torch.allclose(found, expected, rtol=1e-9)
 
 
 def test_static_residual_against_automatic_derivatives():
@@ -289,32 +226,6 @@ def test_residuals_follow_chi_squared():
     square = TL().whitened_static_residual(still.motion, still.views, (sigma, sigma)).square().sum(-1)
     assert square.mean().item() == pytest.approx(4, abs=4 * (8 / 4000) ** 0.5)
     assert square.var().item() == pytest.approx(8, rel=0.25)
-
-
-def test_forward_mode_derivatives():
-    scene = translating_lines(5, sigma=0.01, generator=generator(24))
-    (matrix,) = scene.motion
-    tangents = random(2, 4, 4, seed=25)
-    step = 1e-6
-    for value in (
-        lambda m: multilinear(TL(), TL.compose(m), scene.views, ONES),
-        lambda m: TL().whitened_static_residual((m,), scene.views, ONES),
-    ):
-        forward = torch.func.vmap(lambda d, value=value: torch.func.jvp(value, (matrix,), (d,))[1])(tangents)
-        for d, found in zip(tangents, forward, strict=True):
-            numeric = (value(matrix + step * d) - value(matrix - step * d)) / (2 * step)
-            assert torch.allclose(found, numeric, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_gradient_of_the_nearest_matrix(noise):
-    form = (TL.compose(random(4, 4, seed=26)) + noise * random(6, 6, seed=27) / 6).requires_grad_()
-
-    def projector(x):
-        f = TL.compose(TL.decompose(x)).flatten()
-        return (f[:, None] * f)[::5, ::3]
-
-    assert torch.autograd.gradcheck(projector, form, eps=1e-7, atol=1e-5)
 
 
 def test_nothing_spoils_a_batch():

@@ -17,8 +17,8 @@ from dyntorch.geometry import grassmann as grassmann_recovery
 from dyntorch.geometry import homogeneous as monomials
 from dyntorch.geometry import pairs as epipole_pairs
 from dyntorch.invariants import dynamic_shape_tensor as dynamic_shape_rows
-from dyntorch.invariants import flats
-from dyntorch.invariants import reprojected_shapes as shape_residual
+from dyntorch.invariants import dynamic_tensor
+from dyntorch.invariants import reprojection as shape_residual
 from dyntorch.numerics import eigenspaces, lags
 from dyntorch.numerics import lags as covariances
 from dyntorch.numerics.blocks import constant
@@ -43,7 +43,7 @@ TABLES = [
     (extensors._laplace, (4, 2, CPU)),
     (extensors._dual_signs, (4, 2, CPU)),
     (exterior._splits, (4, 2, 1, CPU)),
-    (flats.vanishing_forms, (2, 3, 2, CPU)),
+    (dynamic_tensor.vanishing_forms, (2, 3, 2, CPU)),
     (grassmann._removals, (4, 2, CPU)),
     (grassmann._insertions, (4, 2, CPU)),
     (grassmann_nearest._determinant_rows, ((2, 1, 1), (3, 3, 3), CPU)),

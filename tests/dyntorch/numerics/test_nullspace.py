@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from dyntorch.numerics import eigenspaces, null_space_gradient, nullspace
+from dyntorch.numerics import eigenspaces, nullspace
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
 from tests.grid import grid
 
@@ -50,7 +50,7 @@ def gradient_holds(function, *inputs):
 @pytest.fixture
 def accelerator(monkeypatch):
     """The code takes the branches of an accelerator, and reading a value on the host raises."""
-    for module in (eigenspaces, null_space_gradient, nullspace):
+    for module in (eigenspaces, nullspace):
         monkeypatch.setattr(module, "on_host", lambda tensor: False)
     forbidden = {aten._local_scalar_dense.default, aten.nonzero.default, aten.is_nonzero.default, aten.equal.default}
     forbidden |= {aten._linalg_eigh.default, aten._linalg_svd.default, aten._linalg_check_errors.default}

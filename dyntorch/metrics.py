@@ -1,4 +1,7 @@
-"""Errors of matrices, tensors, subspaces and labels, blind to scale, sign and the affine gauge of constant velocity."""
+"""Errors that do not depend on what an estimate leaves open: scale and sign, the affinity of the world, a common velocity.
+
+A failed estimate (NaN, or no solution at all) has the worst error, not NaN, so that medians over a batch count it.
+"""
 
 from __future__ import annotations
 
@@ -208,38 +211,6 @@ def affine_gauge(estimated: Tensor, true: Tensor) -> tuple[Tensor, Tensor]:
     usable = aligned.isfinite().flatten(-3).all(dim=-1)[..., None, None, None]
     aligned = unit(torch.where(usable, aligned, 0.0))
     return aligned, relative_error(aligned, true).amax(dim=-1)
-
-
-def subspace_angle(first: Tensor, second: Tensor) -> Tensor:
-    r"""Largest principal angle between two column spaces, of the smaller one to the larger one, degrees.
-
-    Args:
-        first: ``(*batch, rows, k)`` of full column rank.
-        second: ``(*batch, rows, m)`` of full column rank.
-
-    Returns:
-        ``(*batch,)``, 0 to 90; 0 iff one space contains the other, 90 for NaN.
-
-    Raises:
-        ValueError: vectors of different lengths.
-
-    Example:
-        >>> import torch
-        >>> round(float(subspace_angle(torch.eye(3)[:, :2], torch.tensor([[1.0], [0.0], [1.0]]))), 3)
-        45.0
-    """
-    if first.ndim < 2 or second.ndim < 2 or first.shape[-2] != second.shape[-2]:
-        raise ValueError(f"expected (*batch, rows, k) and (*batch, rows, m), got {tuple(first.shape)} and {tuple(second.shape)}")
-    valid = first.isfinite().flatten(-2).all(dim=-1) & second.isfinite().flatten(-2).all(dim=-1)
-    # the decompositions refuse NaN for the whole batch
-    u, v = (torch.linalg.qr(torch.where(valid[..., None, None], x, 0.0)).Q for x in (first, second))
-    if v.shape[-1] > u.shape[-1]:
-        u, v = v, u
-    inside = u.mT @ v
-    sine = torch.linalg.matrix_norm(v - u @ inside, ord=2)
-    cosine = torch.linalg.svdvals(inside)[..., -1]
-    # sine and cosine together are accurate for small angles and for large ones
-    return torch.where(valid, torch.rad2deg(torch.atan2(sine, cosine)), 90.0)
 
 
 class LabelScores(NamedTuple):
@@ -485,17 +456,16 @@ def _refine(c: Tensor, seen: Tensor, placed: Tensor, weights: Tensor) -> Tensor:
     return c
 
 
-def body_error(points: Tensor, true: Tensor, labels: Tensor, bodies: int = 2) -> Tensor:
+def body_error(points: Tensor, true: Tensor, labels: Tensor) -> Tensor:
     r"""Error of each body after its own best affine alignment, :math:`x_{true} \approx A x + a`, gross errors weighing little.
 
     Args:
         points: ``(*batch, n, d)`` estimated.
         true: ``(*batch, n, d)``.
-        labels: ``(*batch, n)`` true bodies, 1 to ``bodies``; points of other labels do not count.
-        bodies: their number.
+        labels: ``(*batch, n)`` true bodies, 1 and 2; points of other labels do not count.
 
     Returns:
-        ``(*batch, bodies)`` median distance relative to the rms radius of the body; infinite for a body without points, and
+        ``(*batch, 2)`` median distance relative to the rms radius of the body; infinite for a body without points, and
         for more than half of its points NaN.
 
     Raises:
@@ -516,8 +486,8 @@ def body_error(points: Tensor, true: Tensor, labels: Tensor, bodies: int = 2) ->
         )
     n, d = true.shape[-2:]
     batch = torch.Size(np.broadcast_shapes(points.shape[:-2], true.shape[:-2], labels.shape[:-1]))
-    x, z = (p.double().expand(*batch, n, d)[..., None, :, :].expand(*batch, bodies, n, d).reshape(-1, n, d) for p in (points, true))
-    kinds = torch.arange(1, bodies + 1, device=labels.device)[:, None]
+    x, z = (p.double().expand(*batch, n, d)[..., None, :, :].expand(*batch, 2, n, d).reshape(-1, n, d) for p in (points, true))
+    kinds = torch.arange(1, 3, device=labels.device)[:, None]
     counts = (labels.expand(*batch, n)[..., None, :] == kinds).reshape(-1, n)
     valid = x.isfinite().all(-1)
     weights = (counts & valid).to(x.dtype)
@@ -535,4 +505,4 @@ def body_error(points: Tensor, true: Tensor, labels: Tensor, bodies: int = 2) ->
     z = torch.where(counts[..., None], z, 0.0)
     spread = torch.where(counts[..., None], z - (z.sum(-2) / many[:, None])[:, None], 0.0).square().sum((-2, -1)) / many
     error = _median(torch.where(valid, off, torch.inf), counts) / spread.sqrt()
-    return torch.where(error.isnan(), torch.inf, error).reshape(*batch, bodies)
+    return torch.where(error.isnan(), torch.inf, error).reshape(*batch, 2)

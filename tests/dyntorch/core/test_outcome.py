@@ -6,8 +6,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.core.outcome import Status
-from dyntorch.core.problems import stack_results
+from dyntorch.core.outcome import Status, stack_results
 from dyntorch.geometry.lens import Division, fit_distortion
 from dyntorch.numerics import canonical_correlation, orthonormal_basis
 from dyntorch.scenes.filmed import filmed, nonrigid_pair
