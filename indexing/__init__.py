@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer as ActionIndexer
     from indexing.action.stream import ActionOptions as ActionOptions
     from indexing.archive.archive import Archive as Archive
-    from indexing.archive.results import Hit as Hit
+    from indexing.archive.search import Hit as Hit
     from indexing.archive.writer import ArchiveOptions as ArchiveOptions
+    from indexing.brightness.descriptors import BrightnessOptions as BrightnessOptions
     from indexing.brightness.indexer import BrightnessIndexer as BrightnessIndexer
-    from indexing.brightness.sight import BrightnessOptions as BrightnessOptions
     from indexing.clip import Clip as Clip
     from indexing.clip import ClipSet as ClipSet
     from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
@@ -38,7 +38,7 @@ _HOME = {
     "ClipSet": "indexing.clip",
     "ActionIndexer": "indexing.action.indexer",
     "Archive": "indexing.archive.archive",
-    "Hit": "indexing.archive.results",
+    "Hit": "indexing.archive.search",
     "BrightnessIndexer": "indexing.brightness.indexer",
     "PhaseIndexer": "indexing.phase.indexer",
     "Event": "indexing.scoring",
@@ -46,7 +46,7 @@ _HOME = {
     # the numbers that decide in a verb
     "ActionOptions": "indexing.action.stream",
     "ArchiveOptions": "indexing.archive.writer",
-    "BrightnessOptions": "indexing.brightness.sight",
+    "BrightnessOptions": "indexing.brightness.descriptors",
     "PhaseOptions": "indexing.phase.model",
     "SyncOptions": "indexing.sync.options",
 }

@@ -20,8 +20,8 @@ from experiments.recognition.protocol import Array
 from indexing import Archive, Clip
 from indexing.action.bank import Bank, Copy, JointMetric, Windows, between, channel, fused_residuals, fusion, planes_of
 from indexing.archive import search
-from indexing.archive.layout import WINDOW_LENGTH
-from indexing.archive.results import Hit
+from indexing.archive.search import Hit
+from indexing.archive.tracks import WINDOW_LENGTH
 from indexing.windows import ragged, sample
 
 STEP = 0.1  # seconds between windows

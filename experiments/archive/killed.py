@@ -38,7 +38,7 @@ from experiments.common.book import Book
 from experiments.common.tables import Row, command, note
 from indexing import Archive, ArchiveOptions, Clip, ClipSet
 from indexing.archive.catalogue import Catalogue
-from indexing.archive.results import Hit
+from indexing.archive.search import Hit
 from indexing.archive.workers import QuietProcesses
 
 OPTIONS = ArchiveOptions(commit_seconds=0.0, max_small_segments=3)  # commits after every source, and puts four segments together

@@ -49,8 +49,7 @@ from experiments.recognition.corruptions import missing_bursts
 from experiments.recognition.protocol import data_folder
 from indexing import Archive, Clip, ClipSet
 from indexing.archive import search
-from indexing.archive.results import Hit
-from indexing.archive.search import candidates, check_example, merge_candidates, queries_of, suppress_overlaps
+from indexing.archive.search import Hit, candidates, check_example, merge_candidates, queries_of, suppress_overlaps
 
 AT = (1, 10)
 STEP = 0.1  # seconds between the windows that are counted, and compared exhaustively

@@ -37,7 +37,7 @@ from experiments.recognition.baselines import WarpedNearest
 from experiments.recognition.protocol import Array
 from indexing import Archive, ArchiveOptions, Clip, ClipSet
 from indexing.archive import search
-from indexing.archive.results import Hit
+from indexing.archive.search import Hit
 
 SETS = Literal["utkinect", "florence3d", "exercises"]
 TURNS = (0, 90)

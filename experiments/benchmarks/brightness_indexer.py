@@ -23,9 +23,9 @@ import tyro
 from numpy.typing import NDArray
 
 from experiments.common.tables import Row, command, measured_on_one_thread, note
+from indexing.brightness.descriptors import LENGTH
 from indexing.brightness.indexer import BrightnessIndexer
-from indexing.brightness.library import VideoExemplars
-from indexing.brightness.sight import LENGTH
+from indexing.brightness.stream import VideoExemplars
 
 IMAGES = ((160, 120), (640, 480))
 GOAL = 600.0  # frames per second

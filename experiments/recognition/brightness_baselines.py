@@ -20,11 +20,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, normalize
 
 from experiments.recognition.protocol import Array
-from indexing.brightness.features import blur, gradients
+from indexing.brightness.descriptors import SMALLEST, blur, describe_cells, gradients
 from indexing.brightness.footage import Shrinker
-from indexing.brightness.library import VideoExemplars, library
-from indexing.brightness.sight import SMALLEST, describe_cells
-from indexing.brightness.stream import Warping
+from indexing.brightness.stream import VideoExemplars, Warping, library
 from indexing.sync.brightness_features import CROP_SIDE, boxes, crop, inverse_root, motion, window_kernels
 from indexing.video import Chunk, track_points
 

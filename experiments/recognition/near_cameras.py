@@ -32,7 +32,7 @@ from experiments.recognition.protocol import ELEVATION, SPREAD, leave_one_subjec
 from indexing import ActionIndexer, Clip
 from indexing.action.bank import channel
 from indexing.cameras import virtual, y_up
-from indexing.phase.frames import leaning
+from indexing.phase.model import leaning
 
 Array = NDArray[Any]
 TRAINED = 4.5

@@ -1,7 +1,10 @@
-"""All pairs of windows compared at once: residuals between views, fused, and the similarity kernels for learning.
+r"""All pairs of windows compared at once: planes of space-time, residuals between views, fused, and the kernels for learning.
 
-``nearest`` is what scorer A stands on (the epipolar residual, free of the viewpoint), ``Kernels`` what scorer B stands on
-(heights, which a turn about the vertical leaves alone, and the whole image, which is bound to the view).
+The image of a window in one channel is a tall matrix X with two columns, x and y of all joints over all frames.  With the
+factorization :math:`X / \|X\| = U L^T`, U orthonormal and L lower triangular, the 2x2 product :math:`C = U_q^T U_e` of two windows
+gives every evidence there is of the pair: the four entries for all pairs are two GEMMs, and the rest is elementwise.
+The nearest exemplar of scorer A stands on the epipolar residual, free of the viewpoint; :class:`Kernels` of scorer B on heights,
+which a turn about the vertical leaves alone, and on the whole image, which is bound to the view.
 """
 
 from __future__ import annotations
@@ -16,13 +19,107 @@ import torch
 from torch import Tensor
 
 from dyntorch.numerics import map_blocks
-from indexing.action.planes import Fusion, entries, epipolar_correlation, factorize, fuse_terms
-from indexing.action.symmetry import mirror
 from indexing.modelfile import store
+
+GRAM_EPSILON = 1e-6  # of a 2x2 Gram, relative to its trace: as in dyntorch.numerics.orthonormal_basis
+FEW_BLOCK = 8  # queries up to which one product that reads all windows once is faster: one query 6.2 ms for 10.2
+
+Entries = tuple[Tensor, Tensor, Tensor, Tensor]  # 00, 01, 10, 11 of 2x2 matrices
+
+
+def factorize(images: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Orthonormal rows and triangular factor of each image: :math:`X / \|X\| = U L^T`. images ``(N, 2, rows)`` ->
+    ``(N, 2, rows)``."""
+    # the unit is that of the largest entry: no square of it leaves the range
+    largest = images.abs().amax((1, 2), keepdim=True)
+    usable = largest.isfinite()
+    if not bool(usable.all()):
+        images, largest = torch.where(usable, images, 0.0), torch.where(usable, largest, 0.0)
+    x = images / torch.where(largest > 0, largest, 1.0)
+    g00, g01, _, g11 = (x @ x.mT).flatten(1).unbind(1)
+    scale = (g00 + g11).clamp(min=torch.finfo(x.dtype).tiny).rsqrt()
+    l00 = (g00 * scale**2 + GRAM_EPSILON).sqrt()
+    l10 = g01 * scale**2 / l00
+    l11 = (g11 * scale**2 + GRAM_EPSILON - l10**2).clamp(min=GRAM_EPSILON / 2).sqrt()
+    inverse = torch.stack([1 / l00, torch.zeros_like(l00), -l10 / (l00 * l11), 1 / l11], dim=1).unflatten(1, (2, 2))
+    return (inverse * scale[:, None, None]) @ x, torch.stack([l00, l10, l11], dim=1)
+
+
+def entries(left: Tensor, right: Tensor) -> Entries:
+    """``(Q, E)`` the four entries of C of all pairs, from U ``(Q, 2, rows)`` and ``(E, 2, rows)``."""
+    count = len(left)
+    both = left.transpose(0, 1).flatten(0, 1)
+    if count <= FEW_BLOCK:
+        c = (right.flatten(0, 1) @ both.mT).view(len(right), 2, 2, count).permute(2, 1, 3, 0).contiguous()
+        return c[0, 0], c[0, 1], c[1, 0], c[1, 1]
+    first, second = both @ right[:, 0].mT, both @ right[:, 1].mT
+    return first[:count], second[:count], first[count:], second[count:]
+
+
+def epipolar_correlation(c: Entries) -> Tensor:
+    r"""``(Q, E)`` the largest singular value of C, the correlation of two images of one shape: 1 whatever the viewpoints."""
+    c00, c01, c10, c11 = c
+    one, other = c00 + c11, c01 - c10
+    total = one.square_().addcmul_(other, other).sqrt_()
+    one, other = c00 - c11, c01 + c10
+    return total.add_(one.square_().addcmul_(other, other).sqrt_()).mul_(0.5)
+
+
+def _products(c: Entries, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
+    """Of x with x and of y with y of unit images, from L of both: ``X_q^T X_e = L_q C L_e^T``."""
+    c00, c01, c10, c11 = c
+    (l00, l10, l11), (m00, m10, m11) = left.T[..., None], right.T
+    heights = (c00 * l10).addcmul_(c10, l11).mul_(m10)
+    rest = (c01 * l10).addcmul_(c11, l11)
+    heights.addcmul_(rest, m11)
+    return torch.mul(c00, l00, out=rest).mul_(m00), heights
+
+
+def _image_correlation(c: Entries, left: Tensor, right: Tensor) -> Tensor:
+    across, heights = _products(c, left, right)
+    return across.add_(heights)
+
+
+def _card_correlation(c: Entries, left: Tensor, right: Tensor) -> Tensor:
+    """A turn of a flat card scales its x by -1 to 1: the best one takes the product of the x without its sign."""
+    across, heights = _products(c, left, right)
+    return across.abs_().add_(heights)
+
+
+# Evidence of a pair of windows in one channel: a correlation, 1 where they are the same.
+TERMS: dict[str, Callable[[Entries, Tensor, Tensor], Tensor]] = {
+    "epi": lambda c, left, right: epipolar_correlation(c),
+    "nn": _image_correlation,
+    "turned": _card_correlation,
+}
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """What a residual is made of: terms that all channels have, and the power of each channel."""
+
+    terms: tuple[str, ...]
+    powers: tuple[float, ...]
+
+
+def fuse_terms(left: Sequence[Tensor], right: Sequence[Tensor], fusions: Sequence[Fusion], epsilon: float) -> list[Tensor]:
+    r"""``(Q, E)`` products :math:`\prod_c \prod_{\text{terms}} (r_c + \epsilon)^{w_c}` of residuals, of each fusion."""
+    found: list[Tensor | None] = [None] * len(fusions)
+    for i in range(len(left) // 2):
+        (u, own), (v, other) = left[2 * i : 2 * i + 2], right[2 * i : 2 * i + 2]
+        c = entries(u, v)
+        for number, fusion in enumerate(fusions):
+            for term in fusion.terms:
+                residual = TERMS[term](c, own, other).neg_().add_(1.0 + epsilon).clamp_(min=epsilon)
+                if fusion.powers[i] != 1:
+                    residual.pow_(fusion.powers[i])
+                before = found[number]
+                found[number] = residual if before is None else before.mul_(residual)
+    return [table for table in found if table is not None]
+
 
 WHITENING_POWER = 0.25  # of the joint metric: UTKinect .909 -> .919, few shots +3 %; .5 whitens too much
 COVARIANCE_FLOOR = 0.1  # beside a mean diagonal of 1; .03 amplifies noise (-2 %), 1 whitens too little (-1 %; UTKinect, Florence3D)
-MACHINE_WHITENING_POWER = 0.0  # .15 gives UTKinect +1 %, takes 1 % from Florence3D
 KERNEL_WIDTH = 0.5  # over the median distance; 1 costs 1-2 %
 MAX_SCALE_WINDOWS = 600  # that set the kernel scales: their median is stable to 1 % from 300 on
 
@@ -130,6 +227,13 @@ class Windows:
     def to(self, device: torch.device | str) -> Windows:
         """The same windows on another device."""
         return Windows(self.values.to(device), self.seen.to(device))
+
+
+def mirror(windows: Tensor, permutation: Tensor) -> Tensor:
+    """The same action done by the other side of the body: image mirrored, left and right joints exchanged."""
+    flipped = windows[:, :, permutation].clone()
+    flipped[..., 0].neg_()
+    return flipped
 
 
 def patterns(seen: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
@@ -411,15 +515,13 @@ def _flat(x: Tensor) -> Tensor:
 class Kernels:
     r"""Mean of Gaussian-like kernels :math:`K = \tfrac1k \sum_k \exp(-d_k / s_k)` on cosine distances :math:`d_k`."""
 
-    metric: JointMetric
     one_side: bool = False
     scales: Tensor | None = None
 
     @property
     def count(self) -> int:
         """How many distances there are."""
-        one_side, moments = self.one_side, 3
-        return len(CHANNELS) * (4 if one_side else 2) + moments * (2 if one_side else 1)
+        return (4 * len(CHANNELS) + 6) if self.one_side else (2 * len(CHANNELS) + 3)
 
     def fit(self, windows: Windows) -> Tensor:
         """Set the scales from training windows and return their ``(N, N)`` kernel matrix."""
@@ -432,7 +534,7 @@ class Kernels:
 
     def bank(self, windows: Windows) -> Bank:
         """Windows that queries are compared with again and again."""
-        return Bank([Copy(windows)], self._describer)
+        return Bank([Copy(windows)], lambda _: self._describe)
 
     def __call__(self, query: Windows, bank: Windows | Bank) -> Tensor:
         """``(Q, E)`` kernel matrix."""
@@ -449,22 +551,17 @@ class Kernels:
 
         return least_over_copies(query, [bank if isinstance(bank, Bank) else self.bank(bank)], total, [0.0])[0]
 
-    def _describer(self, joints: Tensor | slice) -> Describe:
-        weights = [self.metric.weights(name, joints) for name in CHANNELS]
-
-        def describe(values: Tensor) -> Described:
-            """Unit images and how much larger they are than their heights, where bases are compared these; then moments."""
-            parts = []
-            for name, some in zip(CHANNELS, weights, strict=True):
-                image = laid_out(values, name, some)
-                unit = _flat(image).view_as(image)
-                parts += [unit, 1 / unit[:, 1].norm(dim=1, keepdim=True).clamp(min=TINY)]
-                parts += [factorize(image)[0]] if self.one_side else []
-            for whole_image in (False, True)[: 1 + self.one_side]:
-                parts += [_flat(moment) for moment in order_free(values, whole_image)]
-            return Described(tuple(parts))
-
-        return describe
+    def _describe(self, values: Tensor) -> Described:
+        """Unit images and how much larger they are than their heights, where bases are compared these; then moments."""
+        parts = []
+        for name in CHANNELS:
+            image = laid_out(values, name, None)
+            unit = _flat(image).view_as(image)
+            parts += [unit, 1 / unit[:, 1].norm(dim=1, keepdim=True).clamp(min=TINY)]
+            parts += [factorize(image)[0]] if self.one_side else []
+        for whole_image in (False, True)[: 1 + self.one_side]:
+            parts += [_flat(moment) for moment in order_free(values, whole_image)]
+        return Described(tuple(parts))
 
     def _distances(self, left: Described, right: Described) -> Iterator[Tensor]:
         """``(Q, E)`` distances, one kernel after the other."""

@@ -24,12 +24,21 @@ from indexing.action.background import (
     without_background,
 )
 from indexing.action.bank import Windows
-from indexing.action.exemplars import CROPS, NUM_VIEWS, NUM_VIEWS_SOLID, ExemplarPlan, Exemplars, clip_seconds, cut_exemplars
+from indexing.action.exemplars import (
+    CROPS,
+    MAX_WINDOWS,
+    NUM_VIEWS,
+    NUM_VIEWS_SOLID,
+    ExemplarPlan,
+    Exemplars,
+    clip_seconds,
+    cut_exemplars,
+    mirror_permutation,
+)
 from indexing.action.inputs import check_common, check_plan, check_queries, gather, gather_groups, gather_labels
 from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel, read_shape_model
 from indexing.action.stream import ActionOptions, Stream
-from indexing.action.symmetry import MAX_WINDOWS, mirror_permutation
 from indexing.clip import Clip, check_fps
 from indexing.estimator import POSITIVE, RANDOM_STATE, REJECT, Rule, SavedClassifier, is_positive, is_whole, one_of
 from indexing.joints import layout_of

@@ -18,9 +18,12 @@ from torch import Tensor
 from indexing.action.bank import (
     CHANNELS,
     EPSILON,
+    GRAM_EPSILON,
     NEAREST,
     Bank,
     Copy,
+    Entries,
+    Fusion,
     JointMetric,
     Windows,
     fused_residual,
@@ -28,7 +31,6 @@ from indexing.action.bank import (
     fusion,
     planes_of,
 )
-from indexing.action.planes import GRAM_EPSILON, Entries, Fusion
 from indexing.modelfile import store
 
 NUM_CANDIDATES = 2  # nearest exemplars per class that a query is compared with: as many as the scorer averages

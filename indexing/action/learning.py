@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from indexing.action.bank import COVARIANCE_FLOOR, MACHINE_WHITENING_POWER, WHITENING_POWER, JointMetric, Kernels, Windows, stack
-from indexing.action.exemplars import CARD_PITCH_SIGMA, MAX_SAMPLED_MOMENTS, Exemplars
+from indexing.action.bank import COVARIANCE_FLOOR, WHITENING_POWER, JointMetric, Kernels, Windows, stack
+from indexing.action.exemplars import CARD_PITCH_SIGMA, MAX_SAMPLED_MOMENTS, Exemplars, turn
 from indexing.action.joint_weights import JointWeights, learn_joint_weights
 from indexing.action.model import (
     NEAREST_WEIGHT,
@@ -24,7 +24,6 @@ from indexing.action.model import (
     mirror_some,
     standardize,
 )
-from indexing.action.symmetry import turn
 from indexing.scoring import SHARPNESS
 
 MIN_MUTUAL_SHARE = 0.5  # of the mirror images of two classes that are nearest to the other one: neither is mirrored then
@@ -319,7 +318,7 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
         chosen = model.mirrored[owner]
         rows = stack([rows, mirror_some(rows[chosen], model.symmetry, chosen[chosen])])
         owner = torch.cat([owner, owner[chosen]])
-    kernels = Kernels(JointMetric(model.metric.covariance, MACHINE_WHITENING_POWER, floor=model.metric.floor), one_side=one_side)
+    kernels = Kernels(one_side)
     gram = kernels.fit(rows)
     machine = PairwiseMachine.fit(gram, model.labels[owner].cpu().numpy().astype(np.int64), PENALTY)
     trained = Trained(rows, owner, gram)

@@ -23,7 +23,6 @@ from torch import Tensor
 from indexing.action.bank import (
     CHANNELS,
     EPSILON,
-    MACHINE_WHITENING_POWER,
     NEAREST,
     Bank,
     Copy,
@@ -33,11 +32,11 @@ from indexing.action.bank import (
     Windows,
     fused_residuals,
     fusion,
+    mirror,
     planes_of,
 )
 from indexing.action.exemplars import Exemplars
 from indexing.action.joint_weights import MOST_WEIGHT, JointWeights
-from indexing.action.symmetry import mirror
 from indexing.modelfile import Parts, number, part, read_fields, store
 from indexing.opening import shown
 from indexing.scoring import SHARPNESS
@@ -392,9 +391,9 @@ def read_shape_model(
         raise ValueError(f"views: {sizes['views']} windows of {sizes['exemplars']} exemplars")
     if not trained:
         stored_fields |= {"support": None, "machine": None}
-    metric, kernels = stored_fields.pop("metric"), None
+    kernels = None
     if trained:
-        kernels = Kernels(JointMetric(metric.covariance, MACHINE_WHITENING_POWER), view == "same")
+        kernels = Kernels(view == "same")
         kernels.scales = parts.real("scales", kernels.count, least=MIN_SCALE)
         counts = stored_fields["machine"].counts
         if int(counts.sum()) != sizes["rows"]:
@@ -402,7 +401,7 @@ def read_shape_model(
     blend = {name: number(value, name, 0, MOST_WEIGHT) for name, value in header["blend"].items()}
     weights = _read_joint_weights(stored_fields.pop("parts"), header["parts"])
     about = {"classes": sizes["classes"], "view": view, "scorer": scorer, "kernels": kernels, "blend": Blend(**blend)}
-    return ShapeModel(**stored_fields, **about, metric=metric, parts=weights, hidden=hidden)
+    return ShapeModel(**stored_fields, **about, parts=weights, hidden=hidden)
 
 
 def _sizes(parts: Parts, classes: int, joints: int, length: int, crops: int) -> dict[str, int]:

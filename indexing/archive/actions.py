@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 
 from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Catalogue
-from indexing.archive.layout import Layout
-from indexing.archive.results import ArchivedEvent
 from indexing.archive.search import Snapshot, probe_of
 from indexing.archive.segments import ArchiveSegment
 from indexing.archive.sketches import Probe, resembling
+from indexing.archive.tracks import Layout
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.cameras import y_up
 from indexing.clip import Clip
@@ -44,6 +43,14 @@ TEMPOS = (0.7, 1.0, 1.4)  # durations of exemplars by which that is measured, in
 MARGIN_SECONDS = 0.5  # around what may be an action, that are read with it
 POSES_PER_TASK = 54_000  # that one worker reads before it answers: an hour
 MODEL = "model.safetensors"
+
+
+@dataclass(frozen=True)
+class ArchivedEvent(Event):
+    """An event of a learned action, and where it is: the recording's name, and the person, empty where only one is in view."""
+
+    source: str = ""
+    person: str = ""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,18 +16,46 @@ import numpy as np
 
 from indexing.archive import writer
 from indexing.archive.catalogue import Catalogue, drop_recordings, storable
-from indexing.archive.results import Addition, ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit, Verification
-from indexing.archive.search import Shortlist, Snapshot, check_example, queries_of, search
+from indexing.archive.search import Hit, Shortlist, Snapshot, check_example, queries_of, search
 from indexing.archive.segments import ArchiveSegment
 from indexing.archive.sources import Taken, gather, keeping, poses_of
-from indexing.archive.writer import MAX_ATTEMPTS, ArchiveOptions, verify
+from indexing.archive.writer import MAX_ATTEMPTS, Addition, ArchiveOptions, Verification, verify
 from indexing.clip import Clip
 
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
+    from indexing.archive.actions import ArchivedEvent
 
 Progress = Callable[[float], None] | None
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ArchivedRecording:
+    """One person of a recording in an archive."""
+
+    source: str
+    path: str
+    person: str
+    start: float
+    end: float
+    seconds: float
+    layout: str
+
+
+@dataclass(frozen=True)
+class ArchiveInfo:
+    """What is in an archive."""
+
+    sources: int
+    recordings: int
+    windows: int
+    seconds: float
+    segments: int
+    dead: int
+    size: int
+    layouts: tuple[tuple[str, int, float], ...]
+    version: int
 
 
 class Archive:

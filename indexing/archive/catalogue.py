@@ -16,8 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from indexing.archive.layout import Layout, layout_key
-from indexing.archive.tracks import StorageFormat
+from indexing.archive.tracks import Layout, StorageFormat, layout_key
 from indexing.skeleton import Skeleton
 
 VERSION = 1

@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from dyntorch.numerics import one_thread
 from indexing.action.bank import NEAREST, Bank, Copy, JointMetric, Windows, fused_residuals, fusion, planes_of
 from indexing.archive.catalogue import Contents
-from indexing.archive.layout import WINDOW_LENGTH, Layout
 from indexing.archive.segments import ArchiveSegment
 from indexing.archive.sketches import TASK_BLOCK, Candidates, Probe, orthonormal, refine_candidates, scan
-from indexing.archive.tracks import images
+from indexing.archive.tracks import WINDOW_LENGTH, Layout, images
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.cameras import y_up
 from indexing.clip import Clip, FloatArray
@@ -49,6 +48,23 @@ READ_AROUND = 2  # poses beyond both ends of a window: what the first and last o
 
 
 # ---- the example ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Hit:
+    """A stretch of a recording that resembles a query.
+
+    source: the recording's name (its file, or what the clip was called); person: who, empty where only one is in view; start, end:
+    seconds on the recording's own clock; score: minus the logarithm of the fused residual, higher is better; mirrored: whether it
+    is the query's mirror image that resembles it.
+    """
+
+    source: str
+    person: str
+    start: float
+    end: float
+    score: float
+    mirrored: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from indexing.archive.layout import Layout
-from indexing.archive.tracks import StorageFormat, Track, positions
+from indexing.archive.tracks import Layout, StorageFormat, Track, positions
 from indexing.files import replacing, sha256_of
 
 FORMAT, VERSION = "dyntorch.archive-segment", 1

@@ -14,15 +14,13 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Catalogue, Contents, RecordingRow, SegmentRow, SourceRow, add_layout, drop_recordings
-from indexing.archive.layout import MAX_LEARNED_POSES, Layout, layout_key
-from indexing.archive.results import Addition, Outcome, SourceOutcome, Verification
 from indexing.archive.segments import ArchiveSegment, WrittenSegment, damage_error, intact, write_segment
 from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, failure_text, read_source, reading_key, stamp
-from indexing.archive.tracks import StorageFormat, Track, total_windows, windows_of
+from indexing.archive.tracks import MAX_LEARNED_POSES, Layout, StorageFormat, Track, layout_key, total_windows, windows_of
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.opening import count, listing
 from indexing.skeleton import Skeleton
@@ -61,6 +59,61 @@ class ArchiveOptions:
     def storage(self) -> StorageFormat:
         """How a new archive stores movement."""
         return StorageFormat(self.rate, self.dimensions, views=self.views)
+
+
+Outcome = Literal["added", "replaced", "known", "failed", "left out"]
+
+
+@dataclass(frozen=True)
+class SourceOutcome:
+    """What became of one source that was to be added."""
+
+    source: str
+    outcome: Outcome
+    reason: str = ""
+    windows: int = 0
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Addition:
+    """What :meth:`indexing.Archive.add` did, source by source, in the order given."""
+
+    sources: tuple[SourceOutcome, ...]
+
+    def of(self, outcome: Outcome) -> tuple[SourceOutcome, ...]:
+        """The sources that met this outcome."""
+        return tuple(one for one in self.sources if one.outcome == outcome)
+
+    @property
+    def failed(self) -> tuple[SourceOutcome, ...]:
+        """Sources that could not be read, with their reasons."""
+        return self.of("failed")
+
+    @property
+    def windows(self) -> int:
+        """Windows that are new."""
+        return sum(one.windows for one in self.sources if one.outcome in ("added", "replaced"))
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of recordings that are new, every person counted."""
+        return sum(one.seconds for one in self.sources if one.outcome in ("added", "replaced"))
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What :meth:`indexing.Archive.verify` found: one line for each problem, none where all is well."""
+
+    windows: int
+    segments: int
+    problems: tuple[str, ...] = ()
+    orphans: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether every window of the catalogue is there, whole, and once."""
+        return not self.problems
 
 
 @dataclass(eq=False)

@@ -13,14 +13,15 @@ from sklearn.utils.validation import check_is_fitted
 
 from dyntorch.numerics import one_thread
 from indexing.action.inputs import check_labels
+from indexing.brightness.descriptors import LENGTH, SMALLEST, BrightnessOptions, Optics
 from indexing.brightness.footage import Footage, footage, gather
-from indexing.brightness.library import VideoExemplars, library
-from indexing.brightness.sight import LENGTH, SMALLEST, BrightnessOptions, Optics
 from indexing.brightness.stream import (
     BrightnessStream,
     Recognizer,
+    VideoExemplars,
     found_events,
     learn_descriptors,
+    library,
     mirrors_matter,
     recognize,
     wrong_evidence,
@@ -85,8 +86,7 @@ class BrightnessIndexer(SavedClassifier):
         pool: seconds over which :meth:`score_frames` averages, backwards from each frame.
         size: px of the longer side of the image that is worked on.
         device: where to compute, e.g. ``"cuda"``.
-        options: what is known of the videos, and what it costs (:class:`~indexing.brightness.sight.BrightnessOptions`); None: the
-            defaults.
+        options: what is known of the videos, and what it costs (:class:`indexing.BrightnessOptions`); None: the defaults.
 
     Attributes:
         classes_: ``(classes,)`` labels as given.  exemplars_: what is kept of the videos.  flip_: whether mirrored exemplars

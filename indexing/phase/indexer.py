@@ -14,8 +14,8 @@ from torch import Tensor
 
 from dyntorch.numerics import one_thread
 from indexing.action.bank import Windows, stack
+from indexing.action.exemplars import mirror_permutation
 from indexing.action.inputs import check_queries, gather, gather_labels
-from indexing.action.symmetry import mirror_permutation
 from indexing.clip import Clip, stretches
 from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, SavedClassifier, is_whole, one_of
 from indexing.joints import layout_of
@@ -30,9 +30,17 @@ from indexing.modelfile import (
 )
 from indexing.modelfile import read_integer as whole_number
 from indexing.opening import shown
-from indexing.phase.frames import LEAST, images, query_frames
 from indexing.phase.learning import learn_model
-from indexing.phase.model import MIN_CALIBRATED_CLASSES, Course, PhaseModel, PhaseOptions, event_levels
+from indexing.phase.model import (
+    MIN_CALIBRATED_CLASSES,
+    MIN_FRAME_JOINTS,
+    Course,
+    PhaseModel,
+    PhaseOptions,
+    event_levels,
+    images,
+    query_frames,
+)
 from indexing.scoring import SHARPNESS, Event, events, probabilities, refuse, reject_threshold, same_label, smooth
 
 MAX_JOINTS = 10_000  # of a model file; the largest layouts have some hundred
@@ -208,9 +216,10 @@ class PhaseIndexer(SavedClassifier):
         items = list(clips) if isinstance(clips, Iterable) and not isinstance(clips, (Clip, str, bytes)) else clips
         found, owners = gather(items, self.fps)
         values = gather_labels(found, owners, labels)
-        if found[0].joints.shape[1] < LEAST:
+        if found[0].joints.shape[1] < MIN_FRAME_JOINTS:
             raise ValueError(
-                f"clips: {found[0].joints.shape[1]} joints, but a frame needs {LEAST} to tell its phase; give more joints"
+                f"clips: {found[0].joints.shape[1]} joints, but a frame needs {MIN_FRAME_JOINTS} to tell its phase; "
+                "give more joints"
             )
         given = check_phases(phases, found, owners)
         classes, numbers = np.unique(values, return_inverse=True)
@@ -258,7 +267,10 @@ class PhaseIndexer(SavedClassifier):
         return about, tensors
 
     def _restore(self, header: Mapping[str, Any], parts: Parts) -> None:
-        classes, joints = labels_from_json(header["classes"]), whole_number(header["joints"], "joints", LEAST, MAX_JOINTS)
+        classes, joints = (
+            labels_from_json(header["classes"]),
+            whole_number(header["joints"], "joints", MIN_FRAME_JOINTS, MAX_JOINTS),
+        )
         periodic, mirrored = (_flags(header[name], name, len(classes)) for name in ("periodic", "mirrored"))
         sizes = {"classes": len(classes), "joints": joints, "basis": 2 * self.harmonics + 1}
         courses = tuple(

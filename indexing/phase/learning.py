@@ -12,8 +12,16 @@ from torch import Tensor
 from dyntorch.numerics import canonical_correlation, on_cpu, orthonormal_basis
 from indexing.action.bank import Windows, stack
 from indexing.clip import Clip
-from indexing.phase.frames import Learned, normalize_frames, training_frames
-from indexing.phase.model import Course, PhaseModel, PhaseOptions, learn_course, wrong_scores
+from indexing.phase.model import (
+    Course,
+    Learned,
+    PhaseModel,
+    PhaseOptions,
+    learn_course,
+    normalize_frames,
+    training_frames,
+    wrong_scores,
+)
 
 MAX_MIRROR_FRAMES = 500  # by which the joints' mirror images are recognized
 COMPARED_RATE = 25.0  # samples per second at which clips are compared with themselves

@@ -15,11 +15,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from indexing.action.bank import Windows
+from indexing.action.bank import Windows, mirror
 from indexing.action.exemplars import moment_window
 from indexing.action.model import ShapeModel
 from indexing.action.stream import ActionOptions, Progress, Stream, StreamScan, motion_levels, scan, wrong_contrast
-from indexing.action.symmetry import mirror
 from indexing.clip import Clip
 from indexing.recordings.evidence import MIN_CYCLIC, Array, Durations, Lattice, level, machine_scores, whole_scores
 from indexing.recordings.tiling import TiledSegment, best_tiling, posterior, through

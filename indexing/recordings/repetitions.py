@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.action.symmetry import mirror_permutation
+from indexing.action.exemplars import mirror_permutation
 from indexing.clip import Clip
 from indexing.scoring import Event
 from indexing.windows import Ragged, ragged, sample, whole

@@ -28,7 +28,9 @@ from indexing.report.recognition import duration, none
 from indexing.report.results import RecognitionReport, RecordingResult, by_recording, cell
 
 if TYPE_CHECKING:
-    from indexing.archive.results import ArchivedEvent, ArchivedRecording, ArchiveInfo, Hit
+    from indexing.archive.actions import ArchivedEvent
+    from indexing.archive.archive import ArchivedRecording, ArchiveInfo
+    from indexing.archive.search import Hit
 
 PICTURED = 60  # hits, or events of all actions, that are drawn
 WEIGHT = 2_000_000  # characters of drawings in a page, beyond which no more are drawn: layouts of 133 joints are heavy

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d, conv1d, grid_sample, normalize
 
 from dyntorch.numerics import Message
-from indexing.brightness.features import as_grey, blur, gradients, slopes, weighted_differences
+from indexing.brightness.descriptors import as_grey, blur, gradients, weighted_differences
 from indexing.brightness.footage import SHRINKING_BLOCK as FOOTAGE_BLOCK
 from indexing.brightness.footage import Shrinker
 
@@ -388,7 +388,7 @@ GRADIENT_DAMPING = 0.05  # Share of the largest gradient energy of a frame that 
 def window_kernels(crops: Tensor, half: int = KERNEL_HALF_FRAMES, patch: int = PATCH_SIDE, rows: int = NUM_KERNEL_ROWS) -> Tensor:
     """``(T - 2 half, L, L)`` float64 of crops ``(T, s, s)``, trace 1 (0 if nothing moves); the first is frame ``half``."""
     frames = blur(crops, KERNEL_BLUR)
-    gx, gy = slopes(frames)
+    gx, gy, _ = gradients(frames)
     gx[:, :, [0, -1]], gy[:, [0, -1]] = 0.0, 0.0  # with a neighbour on one side only, a difference is not central
     cells, slope = _patches(frames, patch), torch.stack([_patches(gx, patch), _patches(gy, patch)], dim=2)
     length = 2 * half + 1

@@ -17,7 +17,7 @@ from indexing import Clip, ClipSet
 from indexing.action.bank import JointMetric, Windows, fused_residual
 from indexing.actors import Person, perform
 from indexing.archive import search
-from indexing.archive.results import Hit
+from indexing.archive.search import Hit
 
 PARENTS = [-1, 0, 0, 0, 1, 4, 5, 6, 2, 8, 9, 10, 3, 12, 13, 13, 13, 14, 17, 15, 19, 20, 21, 21, 22, 16, 25, 26, 27, 27, 28]
 NAMES = [

@@ -17,9 +17,12 @@ import torch
 
 from indexing import Archive
 from indexing.action.indexer import ActionIndexer
-from indexing.archive.results import Addition, ArchivedEvent, ArchiveInfo, Hit
+from indexing.archive.actions import ArchivedEvent
+from indexing.archive.archive import ArchiveInfo
+from indexing.archive.search import Hit
 from indexing.archive.sources import ArchiveSource, gather, stamp
 from indexing.archive.workers import QuietProcesses
+from indexing.archive.writer import Addition
 from indexing.cli.commands.scan import exemplars, within_label
 from indexing.cli.console import (
     REPORT_FILES,

@@ -20,16 +20,19 @@ from indexing.action.bank import (
     Kernels,
     Windows,
     channel,
+    entries,
+    epipolar_correlation,
+    factorize,
     fused_residual,
     fused_residuals,
     fusion,
+    mirror,
     order_free,
     planes_of,
 )
+from indexing.action.exemplars import turn
 from indexing.action.joint_weights import JointWeights
 from indexing.action.model import MOMENT_TERMS, PENALTY, TURNED_CARD_WEIGHT, PairwiseMachine, mirror_some
-from indexing.action.planes import entries, epipolar_correlation, factorize
-from indexing.action.symmetry import mirror, turn
 
 LENGTH, JOINTS = 8, 6
 
@@ -325,7 +328,7 @@ def test_no_exemplars_is_refused():
 @pytest.mark.parametrize("one_side", [False, True])
 def test_kernels_are_symmetric_with_ones_on_the_diagonal(one_side):
     windows = random_windows(20, 17)
-    kernel = Kernels(metric_of(windows, 0.0), one_side).fit(windows)
+    kernel = Kernels(one_side).fit(windows)
     assert kernel.shape == (20, 20)
     torch.testing.assert_close(kernel, kernel.mT, atol=1e-5, rtol=0)
     torch.testing.assert_close(kernel.diagonal(), torch.ones(20), atol=2e-2 if one_side else 1e-4, rtol=0)
@@ -337,7 +340,7 @@ def test_kernels_are_symmetric_with_ones_on_the_diagonal(one_side):
 @pytest.mark.parametrize("one_side", [False, True])
 def test_kernel_by_definition(one_side):
     query, bank = random_windows(4, 18), random_windows(9, 19)
-    kernels = Kernels(metric_of(bank, 0.0), one_side)
+    kernels = Kernels(one_side)
     kernels.fit(bank)
 
     def distances(a, b):
@@ -363,7 +366,7 @@ def test_kernel_by_definition(one_side):
 
 def test_kernels_need_scales():
     with pytest.raises(ValueError, match="fit them first"):
-        Kernels(metric_of(random_windows(3)))(random_windows(2), random_windows(3))
+        Kernels()(random_windows(2), random_windows(3))
 
 
 @pytest.mark.parametrize("classes", [2, 3, 6])

@@ -5,8 +5,8 @@ import pytest
 
 from indexing import Archive, ArchiveOptions, Clip
 from indexing.actors import ACTIONS, Person, detect, perform, stream
-from indexing.archive.layout import WINDOW_LENGTH
 from indexing.archive.search import MAX_OVERLAP, Places, check_example, queries_of, residuals
+from indexing.archive.tracks import WINDOW_LENGTH
 from indexing.skeleton import Skeleton
 
 FINGERS = tuple(f"finger {i}a" for i in range(17))

@@ -5,11 +5,10 @@ import pytest
 import torch
 
 from indexing.archive import sketches
-from indexing.archive.layout import Layout
 from indexing.archive.search import probe_of
 from indexing.archive.segments import ArchiveSegment, write_segment
 from indexing.archive.sketches import Candidates, Probe, correlation, orthonormal, refine_candidates, resembling, scan
-from indexing.archive.tracks import StorageFormat, tracks_of
+from indexing.archive.tracks import Layout, StorageFormat, tracks_of
 from indexing.clip import Clip
 from indexing.windows import ragged
 

@@ -4,8 +4,21 @@ import numpy as np
 import pytest
 
 from indexing import Archive
-from indexing.archive.layout import CODE_FLOOR, CODE_WHITENING_POWER, MIDDLE_VARIANCE, SIGHTING_VARIANCE, Layout, layout_key
-from indexing.archive.tracks import MISSING, StorageFormat, images, positions, seen_around, tracks_of, windows_of
+from indexing.archive.tracks import (
+    CODE_FLOOR,
+    CODE_WHITENING_POWER,
+    MIDDLE_VARIANCE,
+    MISSING,
+    SIGHTING_VARIANCE,
+    Layout,
+    StorageFormat,
+    images,
+    layout_key,
+    positions,
+    seen_around,
+    tracks_of,
+    windows_of,
+)
 from indexing.cameras import rotation
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton

@@ -11,8 +11,8 @@ from sklearn.base import clone
 
 from indexing.actors import Person, perform
 from indexing.actors.textured import film
+from indexing.brightness.descriptors import BrightnessOptions
 from indexing.brightness.indexer import BrightnessIndexer
-from indexing.brightness.sight import BrightnessOptions
 from indexing.video import Chunk
 from tests.battery.pretend_device import accelerators
 

@@ -3,9 +3,8 @@
 import numpy as np
 import torch
 
-from indexing.brightness.library import VideoExemplars, library
-from indexing.brightness.sight import LENGTH
-from indexing.brightness.stream import MEAN_SHARPNESS, SLACK, Pool, Warping
+from indexing.brightness.descriptors import LENGTH
+from indexing.brightness.stream import MEAN_SHARPNESS, SLACK, Pool, VideoExemplars, Warping, library
 
 
 def exemplars(lengths=(5, 3, 7), labels=(1, 0, 1)):

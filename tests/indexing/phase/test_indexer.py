@@ -7,10 +7,9 @@ from sklearn.base import clone
 
 from indexing import Clip
 from indexing.actors import Person, dataset, detect, perform
-from indexing.phase.frames import query_frames
 from indexing.phase.indexer import PhaseIndexer
 from indexing.phase.learning import period
-from indexing.phase.model import PhaseOptions, event_levels
+from indexing.phase.model import PhaseOptions, event_levels, query_frames
 
 ACTIONS = ("walk", "sit_down")
 TURNS = (0, 40, 80)

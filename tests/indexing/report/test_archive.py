@@ -14,7 +14,8 @@ import pytest
 
 from indexing import Archive
 from indexing.actors import Person, dataset, detect, stream
-from indexing.archive.results import ArchivedEvent, Hit
+from indexing.archive.actions import ArchivedEvent
+from indexing.archive.search import Hit
 from indexing.clip import Clip
 from indexing.report import archive as pages
 from indexing.report.archive import FindReport, SearchReport, write_finds, write_search

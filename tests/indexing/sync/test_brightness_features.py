@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from indexing.brightness.features import blur, gradients, weighted_differences
+from indexing.brightness.descriptors import blur, gradients, weighted_differences
 from indexing.brightness.footage import Resampler
 from indexing.sync.brightness_features import (
     CROP_SIDE,

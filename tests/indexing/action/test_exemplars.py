@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from indexing import ActionIndexer, Clip
-from indexing.action.symmetry import from_data, from_names, mirror, mirror_permutation
+from indexing.action.bank import mirror
+from indexing.action.exemplars import from_data, from_names, mirror_permutation
 from indexing.actors import Person, dataset
 from indexing.skeleton import BODY25, COCO17, HALPE26, MEDIAPIPE33, OPENPOSE18, Skeleton
 

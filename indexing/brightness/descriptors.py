@@ -1,4 +1,4 @@
-"""What the indexer sees of a video: one descriptor per frame, as the frames come in."""
+"""What the brightness indexer sees of a video: one descriptor per frame, as the frames come in."""
 
 from __future__ import annotations
 
@@ -7,10 +7,37 @@ from functools import lru_cache
 from typing import Any
 
 import torch
+from kornia.filters import gaussian_blur2d, spatial_gradient3d
 from torch import Tensor
 
-from indexing.brightness.features import blur_small, inner_gradients, weighted_differences
 from indexing.brightness.footage import Shrinker
+
+GRADIENT_EPSILON = 0.02  # grey 0..1: gradients below this are not divided by (theory: within noise from .01 to .05)
+
+
+def as_grey(frames: Tensor) -> Tensor:
+    """Float32 in 0..1 of uint8 or float frames."""
+    return frames.float() / 255 if frames.dtype == torch.uint8 else frames.float()
+
+
+def blur(frames: Tensor, sigma: float) -> Tensor:
+    """Frames ``(T, h, w)`` smoothed by a Gaussian of ``sigma`` pixels."""
+    size = 2 * int(3 * sigma + 0.5) + 1
+    size = min(size, 2 * ((min(frames.shape[-2:]) - 1) // 2) + 1)
+    return gaussian_blur2d(frames[:, None], (size, size), (sigma, sigma))[:, 0]
+
+
+def gradients(frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Central differences ``(gx, gy, gt)``, each ``(T, h, w)``, of frames ``(T, h, w)``; repeated at the borders: kornia's."""
+    gx, gy, gt = spatial_gradient3d(frames[None, None], mode="diff", order=1)[0, 0]
+    return gx, gy, gt
+
+
+def weighted_differences(gx: Tensor, gy: Tensor, gt: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Horizontal and vertical brightness change per gradient. gx, gy, gt ``(..., h, w)``."""
+    weight = -gt / ((gx * gx + gy * gy).sqrt() + GRADIENT_EPSILON)
+    return weight * gx, weight * gy
+
 
 MIN_CHANGE = 0.006  # grey 0..1 per frame: less does not widen the box
 BOX_QUANTILES = (0.02, 0.98)  # of the motion that a box encloses
@@ -34,10 +61,10 @@ class MotionMaps:
 
     def push(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Maps ``(n, 4, h, w)`` (right, left, down, up) and brightness change ``(n, h, w)`` of frames ``(n, h, w)`` in 0..1."""
-        smooth = blur_small(frames, self.sigma)
+        smooth = blur(frames, self.sigma)
         known = torch.cat([smooth[:1].expand(2, -1, -1) if self.last is None else self.last, smooth])
         self.last = known[-2:]
-        gx, gy, gt = inner_gradients(known)
+        gx, gy, gt = (part[1:-1] for part in gradients(known))
         change = gt.abs()
         u, v = weighted_differences(gx, gy, gt.sign() * (change - self.noise).clamp(min=0))
         return rectify(u, v), change
@@ -199,13 +226,13 @@ class Sight:
 
     def push(self, frames: Tensor) -> Tensor:
         """Descriptors ``(n, 560)`` of more small frames ``(n, h, w)``, grey 0..1, at the rate of the optics."""
-        return self._described(*self.maps.push(frames)) if len(frames) else frames.new_zeros(0, LENGTH)
+        return self._describe(*self.maps.push(frames)) if len(frames) else frames.new_zeros(0, LENGTH)
 
     def small(self, frames: Any) -> Tensor:
         """Small grey frames ``(n, h, w)`` in 0..1 of frames as given."""
         return self.shrink(frames).to(self.optics.device) / 255
 
-    def _described(self, maps: Tensor, change: Tensor) -> Tensor:
+    def _describe(self, maps: Tensor, change: Tensor) -> Tensor:
         n, height, width = change.shape
         region = self.optics.region
         x0, y0, x1, y1 = (v * self.shrink.scale for v in region) if isinstance(region, tuple) else (0.0, 0.0, width, height)

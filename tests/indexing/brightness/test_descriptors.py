@@ -4,17 +4,21 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.brightness.features import FEW_BLOCK, blur, blur_small, gradients, inner_gradients, slopes
-from indexing.brightness.sight import (
+from indexing.brightness.descriptors import (
+    GRADIENT_EPSILON,
     MIN_CHANGE,
     SOFT_NORM,
     BrightnessOptions,
     MotionBox,
     MotionMaps,
+    as_grey,
+    blur,
     describe_cells,
+    gradients,
     mirror_rows,
     pool_cells,
     profile,
+    weighted_differences,
 )
 
 QUIET, SIGMA = BrightnessOptions().noise_level, BrightnessOptions().blur_sigma
@@ -22,6 +26,32 @@ QUIET, SIGMA = BrightnessOptions().noise_level, BrightnessOptions().blur_sigma
 
 def video(frames=9, height=18, width=24, seed=0):
     return torch.rand(frames, height, width, generator=torch.Generator().manual_seed(seed))
+
+
+def test_gradients_are_central_differences(rng):
+    frames = rng.random((5, 6, 7))
+    gx, gy, gt = gradients(torch.from_numpy(frames))
+    for axis, found in ((2, gx), (1, gy), (0, gt)):
+        inner = (slice(1, -1),) * 3
+        assert np.allclose(found.numpy()[inner], np.gradient(frames, axis=axis)[inner])
+
+
+def test_weighted_differences_are_the_motion_times_the_contrast():
+    x, t = torch.meshgrid(torch.arange(40.0), torch.arange(5.0), indexing="ij")
+    for slope in (0.05, -0.05):
+        ramp = (slope * (x - 0.3 * t)).T[:, None].expand(-1, 10, -1)  # moves right by 0.3 px per frame
+        u, v = weighted_differences(*gradients(ramp))
+        assert torch.allclose(u[2, 5, 20], torch.tensor(0.3 * 0.05**2 / (0.05 + GRADIENT_EPSILON)))
+        assert v.abs().max() < 1e-7
+
+
+def test_blur_keeps_the_mean_and_fits_small_frames(rng):
+    assert torch.allclose(blur(torch.full((2, 20, 20), 0.4), 2.0), torch.tensor(0.4))
+    assert blur(torch.from_numpy(rng.random((2, 5, 9))), 3.0).shape == (2, 5, 9)
+
+
+def test_grey_is_from_0_to_1():
+    assert as_grey(torch.tensor([255], dtype=torch.uint8)).tolist() == [1.0]
 
 
 def test_maps_are_kornias_gradients_of_the_frame_before():
@@ -42,15 +72,6 @@ def test_maps_do_not_know_the_sign_of_the_contrast():
     torch.testing.assert_close(
         MotionMaps(SIGMA, QUIET).push(1 - frames)[0], MotionMaps(SIGMA, QUIET).push(frames)[0], atol=1e-5, rtol=1e-4
     )
-
-
-def test_tables_are_kornias():
-    for count in (3, FEW_BLOCK + 2, FEW_BLOCK + 3):
-        frames = video(count)
-        torch.testing.assert_close(blur_small(frames, SIGMA), blur(frames, SIGMA))
-        found, expected = inner_gradients(frames), gradients(frames)
-        for one, other in zip((*found, *slopes(frames)), (*(part[1:-1] for part in expected), *expected[:2]), strict=True):
-            torch.testing.assert_close(one, other)
 
 
 def slow_box(change):
