@@ -15,8 +15,7 @@ from indexing.clip import Clip
 from indexing.files import prepare
 from indexing.joints import layout_of
 from indexing.labels import Label, LabelFile, choose_labels, open_labels, within, write_labels
-from indexing.labels.format import Request
-from indexing.labels.media import of_recording, same_recording
+from indexing.labels.format import Request, of_recording, same_recording
 from indexing.opening import error, listing
 from indexing.report import RecordingResult
 from indexing.report.results import by_recording

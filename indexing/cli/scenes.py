@@ -15,8 +15,7 @@ from torch import Tensor
 
 from dyntorch.geometry import undistort
 from indexing.readers.files import VIDEOS
-from indexing.readers.matches import Matched
-from indexing.readers.pairs import MatchedPair, Photograph
+from indexing.readers.matches import Matched, MatchedPair, Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.page import table_csv
 from indexing.sync.calibration import read_calibration

@@ -5,14 +5,19 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from indexing.labels.label import NUM_NAMED, Label, LabelFile, in_order, list_spots
-from indexing.opening import clip_text, count, error, shown
+from indexing.opening import clip_text, count, error, head_of, listing, parse_json, read_rows, read_text, shown
+from indexing.registry import load_formats
 
 TIME_REMEDY = "give seconds"
 NUM_HEADER_ROWS = 80  # in which a table says what it is about, before it begins
@@ -196,3 +201,145 @@ def correction_error(target: Target, what: str) -> ValueError:
     """What was found is corrected where it stands: nobody loses that without a word."""
     said = f"{what} is not as dyntorch wrote it: somebody has corrected it"
     return error(target.into or target.path, said, "rename it to take it over, delete it, or write to another file")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Which format a file of labels has: decided by what it holds, not by its name
+
+
+FOREIGN = (
+    (b"\x1f\x8b", "is compressed (gzip)", "unpack it, as gunzip does, or save it uncompressed in BORIS"),
+    (b"PK\x03\x04", "is a zip archive or a spreadsheet", "export it as TSV or CSV in UTF-8"),
+    (b"\xd0\xcf\x11\xe0", "is a spreadsheet of Excel", "export it as TSV or CSV in UTF-8"),
+    (b"\xff\xfe", "is text in UTF-16", "save it in UTF-8"),
+    (b"\xfe\xff", "is text in UTF-16", "save it in UTF-8"),
+)
+
+
+@cache
+def registered_formats() -> dict[str, LabelFormat]:
+    """The formats by name, in the order in which they are asked."""
+    return load_formats("labels")
+
+
+def detect(path: Path) -> tuple[str, Any]:
+    """The format, and what was parsed to tell: the JSON, the rows of a table, nothing for XML.
+
+    Raises:
+        ValueError: it cannot be read, or no reader knows it; the message says what was found.
+    """
+    kind, data = _parse(path)
+    for name, known in registered_formats().items():
+        if kind in known.kinds and known.matches(data):
+            return name, data
+    titles = [known.title for _, known in sorted(registered_formats().items())]
+    remedy = f"give {', '.join(titles[:-1])} or {titles[-1]}"
+    raise error(path, f"JSON without labels that a reader knows ({_describe(data)})", remedy)
+
+
+def _parse(path: Path) -> tuple[str, Any]:
+    """The kind of a file, and what it holds."""
+    head = head_of(path)
+    for magic, said, remedy in FOREIGN:
+        if head.startswith(magic):
+            raise error(path, said, remedy)
+    begin = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if begin.startswith(b"<"):
+        return "xml", None
+    if begin.startswith((b"{", b"[")):
+        return "json", parse_json(path, read_text(path, "export it again in UTF-8"), "export it again as JSON")
+    rows = list(read_rows(path, "export it again as CSV in UTF-8", numbers=False))
+    if not rows:
+        raise error(path, "the file is empty", "export it again")
+    return "table", rows
+
+
+def _describe(data: Any) -> str:
+    if isinstance(data, dict):
+        return f"an object with {listing(data, 5)}" if data else "an empty object"
+    return "a list of no tasks" if isinstance(data, list) else f"a {type(data).__name__}"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Which file that labels are of is the recording at hand, and whose clock runs when several are played after each other
+
+
+SUFFIX = re.compile(r"\.\w{1,8}$")
+REMEDY = "name the recording as its video is named, or say which it is (--media NAME)"
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of a clock on which one file is played."""
+
+    media: str
+    begin: float = 0.0
+    end: float = math.inf
+
+
+def split_by_media(start: float, end: float, spans: Sequence[Span]) -> list[tuple[str, float, float]]:
+    """A stretch of a clock, by the files that are played then: each file with start and end on its own clock."""
+    found = []
+    for number, span in enumerate(spans):
+        first = -math.inf if number == 0 else span.begin
+        last = math.inf if number == len(spans) - 1 else span.end
+        inside = first <= start < last if start == end else start < last and end > first
+        if inside:
+            found.append((span.media, max(start, first) - span.begin, min(end, last) - span.begin))
+    return found
+
+
+def base_name(name: str) -> str:
+    """The name of a file without folders, whatever system or address it was written on."""
+    plain = unquote(name) if "://" in name or name.startswith("file:") else name
+    return re.split(r"[\\/]", plain.rstrip("\\/"))[-1]
+
+
+def of_recording(names: Iterable[str], asked: Request) -> set[str] | None:
+    """Those of the files in a label file that are the recording at hand; None where none is at hand."""
+    known = list(dict.fromkeys(name for name in names if name))
+    if asked.media is not None:
+        same = {name for name in known if name == asked.media} or {name for name in known if base_name(name) == asked.media}
+        if not same:
+            said = f"has no labels of {asked.media}, only of {listing(known)}"
+            raise error(asked.path, said, "give one of these names (--media)")
+        return same
+    if asked.recording is None or not known:
+        return None
+    ranks = {name: _likeness(name, str(asked.recording)) for name in known}
+    best = max(ranks.values())
+    if not best:
+        own = base_name(str(asked.recording))
+        raise error(asked.path, f"its labels are of {listing(known)}, not of {own}", REMEDY)
+    found = [name for name in known if ranks[name] == best]
+    if len(found) > 1:
+        raise error(asked.path, f"{base_name(str(asked.recording))} may be any of {listing(found)}", REMEDY)
+    return set(found)
+
+
+def same_recording(name: str, other: str) -> bool:
+    """Whether two files are called alike, but for their folders and suffixes: a video and its keypoints."""
+    return SUFFIX.sub("", base_name(name)).casefold() == SUFFIX.sub("", base_name(other)).casefold()
+
+
+def _likeness(name: str, recording: str) -> tuple[int, int] | tuple[()]:
+    """How much a file of the labels is like the recording: empty where it is another one."""
+    folders = [re.split(r"[\\/]", text)[:-1] for text in (name, os.path.abspath(os.path.expanduser(recording)))]
+    shared = 0
+    for a, b in zip(reversed(folders[0]), reversed(folders[1]), strict=False):
+        if a != b:
+            break
+        shared += 1
+    theirs, ours = base_name(name), base_name(recording)
+    if theirs == ours:
+        return 3, shared
+    stems = [SUFFIX.sub("", text).casefold() for text in (theirs, ours)]
+    if stems[0] == stems[1]:
+        return 2, shared
+    if all(stems) and (_holds(stems[1], stems[0]) or _holds(stems[0], stems[1])):
+        return 1, len(min(stems, key=len))
+    return ()
+
+
+def _holds(text: str, word: str) -> bool:
+    return re.search(rf"(?<![^\W_]){re.escape(word)}(?![^\W_])|^{re.escape(word)}dlc", text) is not None

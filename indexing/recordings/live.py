@@ -25,9 +25,18 @@ from indexing.cameras import y_up
 from indexing.clip import Clip
 from indexing.estimator import is_number
 from indexing.joints import matched_all
-from indexing.recordings.decoding import EDGE_TOLERANCE, TEMPERATURE, Stretch, events_of, log_scores, segment_values
+from indexing.recordings.decoding import (
+    EDGE_TOLERANCE,
+    TEMPERATURE,
+    Stretch,
+    TiledSegment,
+    best_tiling,
+    events_of,
+    log_scores,
+    posterior,
+    segment_values,
+)
 from indexing.recordings.evidence import DURATION_REACH, MAX_TEMPO_FACTOR, MIN_CYCLIC, Durations, Lattice
-from indexing.recordings.tiling import TiledSegment, best_tiling, posterior
 from indexing.scoring import Event, event_levels
 from indexing.skeleton import Skeleton
 from indexing.windows import Ragged, ragged, repair_clip

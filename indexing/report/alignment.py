@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.numerics import with_words
-from indexing.readers.matches import Matched
-from indexing.readers.pairs import Photograph
+from indexing.readers.matches import Matched, Photograph
 from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
 from indexing.report.page import ResultReport, markup, safe_cell, sentence, table_csv
 from indexing.report.summary import Summary, Table, notes_of, write_summary

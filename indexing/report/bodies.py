@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dyntorch.core import Notice
 from indexing.opening import count
-from indexing.readers.pairs import Photograph
+from indexing.readers.matches import Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.body_labels import LabelledReport, colour_of, share
 from indexing.report.canvas import LIGHT, Theme, draw_photograph, finish, foot, limits, new_figure, png, shorten, style

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from indexing.cameras import y_up
 from indexing.clip import Clip
-from indexing.readers.pairs import Photograph
+from indexing.readers.matches import Photograph
 from indexing.report.page import markup
 from indexing.skeleton import usual_layout
 

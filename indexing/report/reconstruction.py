@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dyntorch.numerics import with_words
 from dyntorch.tasks import MOTION_MODELS
-from indexing.readers.pairs import Photograph
+from indexing.readers.matches import Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.canvas import (
     LIGHT,

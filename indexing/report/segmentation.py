@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.opening import count
-from indexing.readers.pairs import MatchedPair, Photograph
+from indexing.readers.matches import MatchedPair, Photograph
 from indexing.report.body_labels import COLOURS, LabelledReport, colour_of, share
 from indexing.report.canvas import (
     LIGHT,

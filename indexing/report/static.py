@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from indexing.colmap import MatchDatabase, StaticPoints
 from indexing.opening import count
-from indexing.readers.pairs import Photograph
+from indexing.readers.matches import Photograph
 from indexing.report.canvas import LIGHT, Theme, draw_photograph, finish, foot, new_figure, png, shorten, style
 from indexing.report.page import bar, safe_cell, sentence, table_csv
 from indexing.report.summary import Summary, Table, write_summary

@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from indexing.clip import Clip
 from indexing.files import prepare, recover_folder, replace_folder, write_bytes
 from indexing.opening import error, parse_json, read_text
-from indexing.readers.detect import detect_json
-from indexing.readers.files import frame_number, load_json
-from indexing.readers.markers import METRES
+from indexing.readers.files import detect_json, frame_number, load_json
+from indexing.readers.recording import METRES
 from indexing.sync.recordings import Take
 
 POSE_FOLDER = "pose-sync"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.opening import entries, error
-from indexing.readers.pairs import read_image
+from indexing.readers.matches import read_image
 from indexing.video.reading import UNTIMED_FPS, Chunk, Source, cv2, read_video
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")

@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from indexing.labels.detect import registered_formats as label_formats
+from indexing.labels.format import registered_formats as label_formats
 from indexing.readers import FORMATS
-from indexing.readers.detect import detect
-from indexing.readers.files import open_source
+from indexing.readers.files import detect, open_source
 from tests.indexing.readers import tools
 
 FRAMES, JOINTS = 8, 17
@@ -373,7 +372,7 @@ def _points(folder: Path) -> list[Seed]:
 
 
 def _pairs(folder: Path) -> list[Seed]:
-    from indexing.readers.pairs import read_pair
+    from indexing.readers.matches import read_pair
 
     rng = np.random.default_rng(2)
     x1 = rng.uniform(0, 600, (20, 2)).round(2)
@@ -462,7 +461,7 @@ def labels(path: Path) -> Any:
 def _pictures(folder: Path) -> list[Seed]:
     from PIL import Image
 
-    from indexing.readers.pairs import read_image
+    from indexing.readers.matches import read_image
 
     image = np.random.default_rng(0).integers(0, 255, (24, 32), dtype=np.uint8)
     Image.fromarray(image).save(folder / "image.png")

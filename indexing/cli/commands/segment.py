@@ -18,7 +18,7 @@ from indexing.cli.console import check_report, count, finish, flag_words, progre
 from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import LEFT_OUT, PICTURE_FILES, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
 from indexing.files import manifest
-from indexing.readers.pairs import MatchedPair, Photograph, read_image, read_pair
+from indexing.readers.matches import MatchedPair, Photograph, read_image, read_pair
 from indexing.readers.tracks import holds_tracks
 from indexing.report.segmentation import WRITTEN, SegmentationReport, summarize, write_segmentation
 from indexing.video.scene import SceneTracks

@@ -18,7 +18,7 @@ from indexing.colmap.masks import write_masks
 from indexing.colmap.pair_segmentation import colmap
 from indexing.colmap.static import MIN_PARALLEL_PAIRS
 from indexing.files import manifest
-from indexing.readers.pairs import Photograph, read_image
+from indexing.readers.matches import Photograph, read_image
 from indexing.report.static import FILES, StaticReport, images_drawn, summarize, write_report
 
 

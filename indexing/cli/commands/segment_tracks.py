@@ -17,7 +17,7 @@ from dyntorch.numerics import with_words
 from indexing.cli.console import check_report, count, finish, flag_words, progress, show
 from indexing.cli.scenes import Asked, as_tracks, follow_whole, inputs_of, is_video, photographs, source_of
 from indexing.files import manifest
-from indexing.readers.pairs import MatchedPair, Photograph
+from indexing.readers.matches import MatchedPair, Photograph
 from indexing.readers.tracks import TrackSet, read_tracks
 from indexing.report.bodies import FILM, PANELS, WRITTEN, BodiesReport, summarize, write_bodies
 from indexing.report.body_labels import colour_of

@@ -12,10 +12,20 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from indexing.labels.format import NUM_HEADER_ROWS, Gathering, LabelFormat, Request, list_few, parse_seconds
-from indexing.labels.formats.boris.project import MACHINE, Entry, Interval, join_comments, split_score
+from indexing.labels.format import (
+    NUM_HEADER_ROWS,
+    Gathering,
+    LabelFormat,
+    Request,
+    Span,
+    base_name,
+    list_few,
+    of_recording,
+    parse_seconds,
+    split_by_media,
+)
+from indexing.labels.formats.boris import MACHINE, Entry, Interval, join_comments, split_score
 from indexing.labels.label import LabelFile
-from indexing.labels.media import Span, base_name, of_recording, split_by_media
 from indexing.opening import Row, count, error, listing, shown
 
 COLUMNS = {

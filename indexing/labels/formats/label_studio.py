@@ -14,9 +14,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from indexing.files import write_json
-from indexing.labels.format import Gathering, LabelFormat, Request, Target, parse_whole, text_of
+from indexing.labels.format import Gathering, LabelFormat, Request, Target, base_name, parse_whole, text_of
 from indexing.labels.label import Label, LabelFile, in_order
-from indexing.labels.media import base_name
 from indexing.opening import clip_text, count, error, shown
 
 REMEDY = "export it again from Label Studio as JSON"

@@ -14,9 +14,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from indexing.files import write_json
-from indexing.labels.format import NUM_HEADER_ROWS, Gathering, LabelFormat, Request, Target, text_of
+from indexing.labels.format import NUM_HEADER_ROWS, Gathering, LabelFormat, Request, Target, base_name, of_recording, text_of
 from indexing.labels.label import Label, LabelFile, in_order
-from indexing.labels.media import base_name, of_recording
 from indexing.opening import Row, clip_text, count, error, parse_json, read_text, shown
 
 REMEDY = "save or export it again from VIA 3"

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from indexing.clip import UP_AXES, Clip, ClipSet, FloatArray, LabelledSet
 from indexing.files import replacing
+from indexing.joints import check_named_layout, choose_layout
 from indexing.opening import error, listing, shown
 from indexing.readers.files import Format, Options, Source
-from indexing.readers.layouts import check_named_layout, choose_layout
 from indexing.readers.npz import NumpyArchive
 from indexing.readers.recording import merge_people, to_clips
 from indexing.skeleton import Skeleton, candidates

@@ -29,8 +29,7 @@ from indexing.opening import error, listing
 from indexing.readers.c3d import read as read_c3d
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.formats.mediapipe import PREFIX, SUFFIX, Columns, find_columns, layout_of, read_table
-from indexing.readers.markers import build_marker_recording, split_people
-from indexing.readers.recording import to_clips
+from indexing.readers.recording import build_marker_recording, split_people, to_clips
 from indexing.skeleton import HAND21, MEDIAPIPE33
 
 MIN_SHARE_INSIDE = 0.8

@@ -1,6 +1,6 @@
 """Bare arrays (``.npy``) of one recording: ``(frames, joints, 2 | 3)``, NaN = not seen.
 
-Which joint is which, and in 3D which way is up, the body shows where it does (:mod:`indexing.readers.layouts`); ``layout=`` names
+Which joint is which, and in 3D which way is up, the body shows where it does (:mod:`indexing.joints`); ``layout=`` names
 the joints otherwise.  A third number from 0 to 1 beside pixels is the confidence.  The file has neither times nor names.
 """
 
@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from indexing.clip import SURE_PIXELS, ClipSet, FloatArray
+from indexing.joints import choose_layout
 from indexing.opening import error
 from indexing.readers.files import Format, Options, Source
-from indexing.readers.layouts import choose_layout
 from indexing.readers.npz import read_npy
 from indexing.readers.recording import Recording, to_clips
 from indexing.skeleton import candidates, usual_layout

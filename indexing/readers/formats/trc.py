@@ -15,8 +15,7 @@ import numpy as np
 from indexing.clip import COARSEST, FINEST, ClipSet, FloatArray
 from indexing.opening import WIDEST, error, first_duplicate, listing, read_text, shown
 from indexing.readers.files import Format, Options, Source
-from indexing.readers.markers import build_marker_recording
-from indexing.readers.recording import IntArray, frame_numbers, to_clips
+from indexing.readers.recording import IntArray, build_marker_recording, frame_numbers, to_clips
 
 HEAD = "PathFileType"
 UNITS = ("m", "cm", "mm", "px", "in", "meters", "metres", "millimeters", "inches", "pixels", "unknown")

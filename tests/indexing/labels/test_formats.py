@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from indexing.labels import Label, choose_labels, open_labels, read_labels, within, write_labels
-from indexing.labels.format import Request
-from indexing.labels.media import base_name, of_recording
+from indexing.labels.format import Request, base_name, of_recording
 
 
 def saved(path: Path, value: Any) -> Path:

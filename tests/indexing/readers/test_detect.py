@@ -12,8 +12,7 @@ import pytest
 
 from indexing.clip import Clip, ClipSet
 from indexing.readers import FORMATS, read
-from indexing.readers.detect import detect, detect_json, registered_formats
-from indexing.readers.files import open_source
+from indexing.readers.files import detect, detect_json, open_source, registered_formats
 from indexing.skeleton import COCO17, H36M17, HALPE26, MEDIAPIPE33, Skeleton
 from tests.fuzz.seeds import c3d
 from tests.indexing.readers import tools

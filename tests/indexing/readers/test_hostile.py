@@ -19,8 +19,7 @@ from indexing.opening import clip_text, parse_json, read_text, shown
 from indexing.readers import npz as npz_gate
 from indexing.readers import read
 from indexing.readers.formats.clipset import read_film_set
-from indexing.readers.matches import open_points, read_matches
-from indexing.readers.pairs import read_image, read_pair
+from indexing.readers.matches import open_points, read_image, read_matches, read_pair
 from indexing.readers.tracks import read_tracks
 from indexing.sync.calibration import read_calibration
 from tests.indexing.readers import tools

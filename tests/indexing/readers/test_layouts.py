@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from indexing.clip import Clip, ClipSet
+from indexing.joints import rank_layouts, recognize_layout
 from indexing.readers import read, read_clip
-from indexing.readers.layouts import rank_layouts, recognize_layout
 from indexing.skeleton import (
     BLAZEPOSE33,
     BODY25,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from indexing.readers.pairs import SIDE, read_image, read_pair
+from indexing.readers.matches import MAX_SIDE, read_image, read_pair
 
 X1, X2 = np.arange(20.0).reshape(10, 2), np.arange(20.0, 40.0).reshape(10, 2)
 
@@ -124,9 +124,9 @@ def test_photographs_keep_the_size_of_the_file(tmp_path):
     np.testing.assert_allclose(found.gray, gray / 255, atol=1e-6)
     Image.fromarray(gray.astype(np.uint16) * 100).save(tmp_path / "deep.png")
     np.testing.assert_allclose(read_image(tmp_path / "deep.png").gray, gray / 255, atol=0.01)
-    Image.new("RGBA", (2 * SIDE, 10), "red").save(tmp_path / "large.png")
+    Image.new("RGBA", (2 * MAX_SIDE, 10), "red").save(tmp_path / "large.png")
     large = read_image(tmp_path / "large.png")
-    assert large.size == (2 * SIDE, 10) and large.gray.shape == (5, SIDE)
+    assert large.size == (2 * MAX_SIDE, 10) and large.gray.shape == (5, MAX_SIDE)
 
 
 def test_photographs_are_turned_as_their_file_says(tmp_path):

@@ -329,7 +329,7 @@ def pyskl(
 
 def standing(layout: Any, frames: int = 12, dims: int = 2, seed: int = 0) -> np.ndarray:
     """``(frames, joints, dims)`` somebody who stands and moves a little, in pixels (y down) or metres (y up)."""
-    from indexing.readers.layouts import HEIGHT
+    from indexing.joints import HEIGHT
 
     rng = np.random.default_rng(seed)
     arms = {"elbow": 0.63, "wrist": 0.49, "hand": 0.46, "hand_tip": 0.43, "thumb": 0.45, "pinky": 0.45, "index": 0.44}

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from indexing.recordings.tiling import best_tiling, posterior, through
+from indexing.recordings.decoding import best_tiling, posterior, through
 
 
 def explanations(windows, cells):

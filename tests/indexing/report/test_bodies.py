@@ -14,7 +14,7 @@ from PIL import Image
 from dyntorch import Status
 from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.tasks.segment.result import TrackSegmentation
-from indexing.readers.pairs import Photograph
+from indexing.readers.matches import Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.bodies import BodiesReport, as_json, describe, labels_csv, picture_of, rows_of, tracks_csv, write_bodies
 

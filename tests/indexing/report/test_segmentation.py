@@ -11,7 +11,7 @@ import torch
 
 from dyntorch import Segmentation, Status
 from dyntorch.core.outcome import Notice, NoticeCode
-from indexing.readers.pairs import MatchedPair, Photograph
+from indexing.readers.matches import MatchedPair, Photograph
 from indexing.report.canvas import DARK, LIGHT
 from indexing.report.segmentation import (
     SegmentationReport,
