@@ -345,10 +345,14 @@ def stretches(times: FloatArray, gap: float = GAP) -> NDArray[np.intp]:
     return np.stack([np.concatenate([[0], cuts]), np.concatenate([cuts, [len(times)]])], axis=1).astype(np.intp)
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number, and not a truth value."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
 def check_fps(fps: Any, who: str = "") -> float:
     """A frame rate that a recording can have."""
-    number = isinstance(fps, (int, float, np.integer, np.floating)) and not isinstance(fps, bool) and np.isfinite(fps)
-    if not (number and fps > 0):
+    if not (is_number(fps) and fps > 0):
         raise ValueError(f"{who}fps must be a positive number of frames per second, got {fps!r}")
     if not COARSEST <= fps <= FINEST:
         raise ValueError(f"{who}fps must be frames per second, from {COARSEST:g} to {FINEST:,.0f}, got {fps:g}")

@@ -41,17 +41,10 @@ NONE = "(none)"
 SHARE_EPSILON = 1e-9  # an overlap of exactly one half is one half, however its ends were rounded
 
 OVERLAPS = (0.1, 0.25, 0.5)  # intersection over union from which two segments are one
-
-
-@dataclass(frozen=True)
-class ComparingOptions:
-    """What is counted as the same segment, and how many kinds of label can be told apart in a table."""
-
-    labels: int = 500
-    """Different labels at most: free text is no label, and a table of more is neither read nor drawn."""
-    block: int = 128
-    """Moments between boundaries that are counted at a time, and only the labels that hold in them: 50,000 labels of 500 names take
-    0.8 s and 12 MB so, 6.6 s and 0.94 GB all at once.  It changes no result."""
+MAX_LABELS = 500  # different ones: free text is no label, and a table of more is neither read nor drawn
+BLOCK = 128
+"""Moments between boundaries that are counted at a time, and only the labels that hold in them: 50,000 labels of 500 names take
+0.8 s and 12 MB so, 6.6 s and 0.94 GB all at once.  It changes no result."""
 
 
 @dataclass(frozen=True)
@@ -157,21 +150,20 @@ def _at_overlap(segments: Mapping[float, SegmentCounts]) -> dict[str, Any]:
     }
 
 
-def compare(spans: Sequence[ComparedSpan], options: ComparingOptions | None = None) -> Agreement:
+def compare(spans: Sequence[ComparedSpan]) -> Agreement:
     """How far what was found agrees with what is known, over all spans together."""
-    options = options or ComparingOptions()
     inside = [(_inside(one.known, one), _inside(one.found, one)) for one in spans]
     names = sorted({str(label) for sides in inside for side in sides for label, _, _ in side})
-    if len(names) > options.labels:
+    if len(names) > MAX_LABELS:
         raise ValueError(
-            f"{len(names):,} different labels, of which {options.labels} can be compared; are they free text? choose a tier that "
+            f"{len(names):,} different labels, of which {MAX_LABELS} can be compared; are they free text? choose a tier that "
             "holds names of actions"
         )
     number = {name: index for index, name in enumerate(names)}
     table = np.zeros((len(names) + 1, len(names) + 1))
     lasting = np.zeros((len(names), 3))
     for span, (known, found) in zip(spans, inside, strict=True):
-        for lengths, here, there, used in _moments(span, (known, found), number, options.block):
+        for lengths, here, there, used in _moments(span, (known, found), number):
             table[np.ix_([*used, -1], [*used, -1])] += time_table(lengths, here, there)
             lasting[used] += np.stack([lengths @ side for side in (here, there, here & there)], axis=1)
     segments = {overlap: _count_segments(inside, names, overlap) for overlap in OVERLAPS}
@@ -200,7 +192,7 @@ def _inside(intervals: Sequence[Interval], span: ComparedSpan) -> list[Interval]
 
 
 def _moments(
-    span: ComparedSpan, sides: tuple[Sequence[Interval], Sequence[Interval]], number: Mapping[str, int], block: int
+    span: ComparedSpan, sides: tuple[Sequence[Interval], Sequence[Interval]], number: Mapping[str, int]
 ) -> Iterator[tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_], NDArray[np.int64]]]:
     """Block by block, durations ``(M,)`` between neighbouring boundaries, the labels ``(M, n)`` that are known and found there, and
     which ``(n,)`` labels these are."""
@@ -209,8 +201,8 @@ def _moments(
     lengths = np.diff(edges)
     changes = [_changes(edges, side, number) for side in sides]
     holding: NDArray[np.int32] = np.zeros((2, len(number)), dtype=np.int32)  # how often each label holds before a block
-    for first in range(0, len(lengths), block):
-        rows = min(block, len(lengths) - first)
+    for first in range(0, len(lengths), BLOCK):
+        rows = min(BLOCK, len(lengths) - first)
         parts = [each[:, slice(*np.searchsorted(each[0], [first, first + rows]))] for each in changes]
         used = np.unique(np.concatenate([parts[0][1], parts[1][1], np.flatnonzero(holding.any(axis=0))]))
         held = []

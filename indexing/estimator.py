@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from indexing.action.inputs import check_labels
+from indexing.clip import is_number
 from indexing.modelfile import Parts, read_model, usable, write_model
 from indexing.opening import shown
 
@@ -28,11 +29,6 @@ class Rule:
     accepts: Callable[[Any], bool]
     wanted: str
     """Follows "must be" in the message."""
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value is a finite number, and not a truth value."""
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 def is_positive(value: Any) -> bool:

@@ -42,13 +42,13 @@ def write_model(
     from safetensors.torch import save as to_bytes
 
     kept = {name: _to_plain(value) for name, value in parameters.items() if name != "device"}
-    try:
-        header = json.dumps({"format": kind, "version": version, "parameters": kept, **about})
-    except TypeError as error:
-        bad = [name for name, value in kept.items() if not _is_json(value)]
-        raise ValueError(
-            f"{', '.join(bad)}: a model file holds text, numbers and lists only ({error}); set it to one of these"
-        ) from None
+    for name, value in kept.items():
+        try:
+            json.dumps(value)
+        except TypeError as problem:
+            what = f"a model file holds text, numbers and lists only ({problem})"
+            raise ValueError(f"{name}: {what}; set it to one of these") from None
+    header = json.dumps({"format": kind, "version": version, "parameters": kept, **about})
     alone = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     write_bytes(Path(path), to_bytes(alone, metadata={HEADER: header}))
 
@@ -261,11 +261,3 @@ def _to_plain(value: Any) -> Any:
     if isinstance(value, (np.generic, np.ndarray)):
         return value.tolist()
     return list(value) if isinstance(value, tuple) else value
-
-
-def _is_json(value: Any) -> bool:
-    try:
-        json.dumps(value)
-    except TypeError:
-        return False
-    return True

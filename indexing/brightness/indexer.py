@@ -26,13 +26,13 @@ from indexing.brightness.stream import (
     recognize,
     wrong_evidence,
 )
+from indexing.clip import is_number
 from indexing.estimator import (
     POSITIVE,
     REJECT,
     SECONDS,
     Rule,
     SavedClassifier,
-    is_number,
     is_whole,
     one_of,
 )

@@ -128,17 +128,7 @@ def choose_labels(found: LabelFile) -> LabelFile:
     return replace(found, labels=tuple(labels), notices=tuple(notices))
 
 
-def read_labels(
-    path: str | Path,
-    *,
-    recording: str | Path | None = None,
-    media: str | None = None,
-    observation: str | None = None,
-    subject: str | None = None,
-    tier: str | None = None,
-    fps: float | None = None,
-    format: str | None = None,  # noqa: A002
-) -> list[Label]:
+def read_labels(path: str | Path, **selection: Any) -> list[Label]:
     """The labels of one hand, sorted by start: what is to be learned from, or compared with.
 
     The arguments are those of :func:`open_labels`.  What was left out or assumed is said as Python warnings; to have it as text,
@@ -154,18 +144,7 @@ def read_labels(
         >>> read_labels(path)
         [Label(0.5, 0.5, 'clap'), Label(1.5, 4.0, 'squat')]
     """
-    found = choose_labels(
-        open_labels(
-            path,
-            recording=recording,
-            media=media,
-            observation=observation,
-            subject=subject,
-            tier=tier,
-            fps=fps,
-            format=format,
-        )
-    )
+    found = choose_labels(open_labels(path, **selection))
     for notice in found.notices:
         warnings.warn(f"{path}: {notice}", UserWarning, stacklevel=2)
     return list(found.labels)

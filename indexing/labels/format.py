@@ -20,6 +20,8 @@ from indexing.opening import clip_text, count, error, head_of, listing, parse_js
 from indexing.registry import load_formats
 
 TIME_REMEDY = "give seconds"
+NAMES = {"observations": "observation", "tiers": "tier", "subjects": "subject", "media": "media"}
+"""Of a file of labels, lists of names, and the field of a label that each is of."""
 NUM_HEADER_ROWS = 80  # in which a table says what it is about, before it begins
 
 
@@ -98,14 +100,9 @@ class Gathering:
             self.labels.append(found)
         else:
             self._nameless.append(found)
-        for name, known in (
-            (found.observation, self.observations),
-            (found.tier, self.tiers),
-            (found.subject, self.subjects),
-            (found.media, self.media),
-        ):
-            if name:
-                known.setdefault(name)
+        for names, field_ in NAMES.items():
+            if name := getattr(found, field_):
+                getattr(self, names).setdefault(name)
 
     def seconds(self, value: Any, where: str, what: str) -> float:
         """A time of the file as seconds: a number, digits, or ``hh:mm:ss.sss``."""
@@ -116,6 +113,12 @@ class Gathering:
         if not math.isfinite(number):
             raise error(self.asked.path, f"{where}: {what} {shown(value)} is no time", TIME_REMEDY)
         return number
+
+    def list_of(self, value: Any, where: str, remedy: str) -> list[Any]:
+        """A list of the file; an empty one where nothing is there."""
+        if value is not None and not isinstance(value, list):
+            raise error(self.asked.path, f"{where} is {shown(value)}, not a list", remedy)
+        return value or []
 
     def note(self, notice: str) -> None:
         """Something that a person should know, once."""
@@ -137,13 +140,7 @@ class Gathering:
             path=self.asked.path,
             format=self.format,
             labels=tuple(sorted(kept, key=in_order)),
-            observations=tuple(self.observations),
-            tiers=tuple(self.tiers),
-            subjects=tuple(self.subjects),
-            media=tuple(self.media),
-            machine=tuple(self.machine),
-            watched=tuple(self.watched),
-            notices=tuple(self.notices),
+            **{name: tuple(getattr(self, name)) for name in (*NAMES, "machine", "watched", "notices")},
         )
 
 

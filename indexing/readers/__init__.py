@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -45,23 +46,9 @@ def read(
         return registered_formats()[name].read(source, options)
 
 
-def read_clip(
-    path: str | Path,
-    *,
-    format: str | None = None,  # noqa: A002
-    fps: float | None = None,
-    person: str = "largest",
-    min_confidence: float = 0.0,
-    label: Hashable | None = None,
-    size: tuple[float, float] | None = None,
-    layout: str | None = None,
-    watching: WatchOptions | None = None,
-) -> Clip:
+def read_clip(path: str | Path, **options: Any) -> Clip:
     """Read one recording; the arguments are those of :func:`read`."""
-    clips = read(
-        path, format=format, fps=fps, person=person, min_confidence=min_confidence, label=label, size=size,
-        layout=layout, watching=watching,
-    )  # fmt: skip
+    clips = read(path, **options)
     if len(clips) != 1:
         raise error(path, f"holds {len(clips)} clips where one is expected", "use ClipSet.load, or dyntorch index evaluate")
     return clips[0]

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from indexing.clip import ClipSet, FloatArray, check_fps
+from indexing.clip import ClipSet, FloatArray, check_fps, is_number
 from indexing.opening import VALUE, clip_text, entries, error, head_of, listing, parse_json, read_rows, read_text, shown, size_of
 from indexing.readers.hdf import opened_hdf5
 from indexing.registry import list_programs, load_formats
@@ -256,16 +256,12 @@ class Options:
             raise ValueError(f"watching must be WatchOptions, got {self.watching!r}; use dataclasses.replace(WatchOptions(), ...)")
         if self.layout is not None:
             layout_named(self.layout)
-        if not _is_number(self.min_confidence):
+        if not is_number(self.min_confidence):
             raise ValueError(f"min_confidence must be a number (0 keeps every joint), got {self.min_confidence!r}")
         if self.size is not None:
             size = np.asarray(self.size, dtype=float)
             if size.shape != (2,) or not (np.isfinite(size).all() and (size > 0).all()):
                 raise ValueError(f"size must be (width, height) of the image in pixels, got {self.size!r}")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -130,16 +130,18 @@ class Hdf5:
 
         return self._guard(value, f"{name}@{key}")
 
+    def text(self, name: str, key: str) -> str:
+        """An attribute that is text; empty where there is none."""
+        value = self.attribute(name, key)
+        return "" if value is None else _text(value)
+
     def _dataset(self, name: str) -> Any:
         """A dataset that is what it says."""
         found = self._guard(lambda: self._handle[name] if self._hard(name) else None, name)
         if found is None or not hasattr(found, "shape"):
             raise error(self.path, f"has no dataset {shown(name)} (it has {listing(self.names())})", AGAIN)
 
-        def elsewhere() -> bool:
-            return bool(found.external) or bool(found.is_virtual)
-
-        if self._guard(elsewhere, name):
+        if self._guard(lambda: bool(found.external) or bool(found.is_virtual), name):
             raise error(self.path, f"{shown(name)} is kept in another file", "copy its values into one file")
         if self._guard(lambda: found.shape is None, name):
             raise error(self.path, f"{shown(name)} is empty", AGAIN)

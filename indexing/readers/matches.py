@@ -183,6 +183,7 @@ def _weights_and_static(views: Sequence[PointSet]) -> tuple[FloatArray | None, B
 PAIR_COLUMNS = ("x1", "y1", "x2", "y2")
 PAIR_IDS = ("id", "name", "match", "track")
 PAIR_LABELS = ("label", "labels")
+PAIR_COLUMNS_REMEDY = "name the columns x1,y1,x2,y2 (and perhaps id, weight, label)"
 PAIR_FORMATS = "give npz with x1, x2 (n, 2), or CSV with columns x1,y1,x2,y2 (and perhaps id, weight, label)"
 PAIR_KEYS = "give x1 and x2 (n, 2), and perhaps label, weights, ids, wh; of several pairs NAME/x1 and NAME/x2"
 PAIR_EXTRA = {"label": PAIR_LABELS, "weights": points.WEIGHTS, "ids": ("ids", "id"), "wh": ("wh", "size")}
@@ -319,29 +320,11 @@ def _pair_marks(path: Path, extra: Mapping[str, Any]) -> dict[str, Any]:
 
 # ---- tables --------------------------------------------------------------------------------------------------------------
 def _read_table(path: Path) -> MatchedPair:
-    rows = [(line, _split_cells(cells)) for line, cells in points.read_rows(path)]
-    rows = [(line, cells) for line, cells in rows if cells]
-    if not rows:
-        raise error(path, "the file is empty", "export it again")
-    if points.is_data(rows[0][1]):
-        names = _default_pair_columns(path, rows[0][1])
-    else:
-        names, rows = [cell.strip().lower() for cell in rows[0][1]], rows[1:]
-    absent = [name for name in PAIR_COLUMNS if name not in names]
-    if absent:
-        said = f"has no column {shown(absent[0])} (its columns are {listing(names)})"
-        raise error(path, said, "name the columns x1,y1,x2,y2 (and perhaps id, weight, label)")
-    if not rows:
-        raise error(path, "the file has a header but no rows", "export it again")
-    points.check_widths(path, rows, names)
-    twice = first_duplicate(name for name in names if name in (*PAIR_COLUMNS, *PAIR_IDS, *points.WEIGHTS, *PAIR_LABELS))
-    if twice is not None:
-        raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
+    rows = [(line, cells) for line, row in points.read_rows(path) if (cells := _split_cells(row))]
+    single = (*PAIR_IDS, *points.WEIGHTS, *PAIR_LABELS)
+    rows, names, _ = points.split_header(path, rows, (PAIR_COLUMNS,), PAIR_COLUMNS_REMEDY, single)
     values = points.column_values(path, rows, names, PAIR_COLUMNS)
-    extra = {
-        "weights": points.optional_column(path, rows, names, points.WEIGHTS),
-        "label": points.optional_column(path, rows, names, PAIR_LABELS),
-    }
+    extra = {kind: points.optional_column(path, rows, names, PAIR_EXTRA[kind]) for kind in ("weights", "label")}
     marks = _pair_marks(path, {kind: column for kind, column in extra.items() if column is not None})
     return _build_pair(path, path.name, values[:, :2], values[:, 2:], points.row_names(path, rows, names, PAIR_IDS), **marks)
 
@@ -354,15 +337,6 @@ def _split_cells(cells: list[str]) -> list[str]:
         cells = [cells[0][1:].strip(), *cells[1:]]
         cells = cells if cells[0] else cells[1:]
     return cells
-
-
-def _default_pair_columns(path: Path, cells: list[str]) -> list[str]:
-    """Names of the columns of a table without a header: the four coordinates, and perhaps a name before them."""
-    named = points.number(cells[0]) is None
-    if len(cells) != len(PAIR_COLUMNS) + named:
-        said = f"row 1 has {len(cells)} columns, and no row names them"
-        raise error(path, said, "matches without a header are x1,y1,x2,y2; name further columns (id, weight, label) in a header")
-    return [*(["id"] if named else []), *PAIR_COLUMNS]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

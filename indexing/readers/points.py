@@ -101,28 +101,42 @@ EXPECTED = "name the columns x,y or x,y,z, of lines x1,y1,z1,x2,y2,z2, and a col
 
 def read_csv(path: Path) -> PointSet:
     """The points of a CSV file; ``;`` and tabs separate, too."""
-    rows = read_rows(path)
-    if not rows:
-        raise error(path, "the file is empty", "export it again")
-    header = None if is_data(rows[0][1]) else [cell.strip().lower() for cell in rows[0][1]]
-    if header is None:
-        names = _default_columns(path, rows[0][1])
-    else:
-        names, rows = header, rows[1:]
-        if not rows:
-            raise error(path, "the file has a header but no rows", "export it again")
-    check_widths(path, rows, names)
-    columns = next((shape for shape in SHAPES if set(shape) <= set(names)), None)
-    if columns is None:
-        raise error(path, f"its columns are {listing(names)}", EXPECTED)
-    twice = first_duplicate(name for name in names if name in (*columns, *IDS))
-    if twice is not None:
-        raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
+    rows, names, columns = split_header(path, read_rows(path), SHAPES, EXPECTED, IDS)
     values = column_values(path, rows, names, columns)
     values = values.reshape(-1, 2, 3) if columns == LINE else values
     return PointSet(
         str(path), values, row_names(path, rows, names), optional_column(path, rows, names, WEIGHTS), flags(path, rows, names)
     )
+
+
+def split_header(
+    path: Path, rows: list[Row], shapes: Sequence[tuple[str, ...]], remedy: str, single: Sequence[str]
+) -> tuple[list[Row], list[str], tuple[str, ...]]:
+    """Rows of data, the names of their columns, and those of the coordinates: the first of some shapes that the table has.
+
+    Without a header the columns are those of a shape, perhaps with a name before them; columns of ``single`` must not come twice.
+    """
+    if not rows:
+        raise error(path, "the file is empty", "export it again")
+    cells = rows[0][1]
+    if is_data(cells):
+        named = ["id"] * (number(cells[0]) is None)  # words before numbers name the rows
+        shape = next((shape for shape in shapes if len(shape) == len(cells) - len(named)), None)
+        if shape is None:
+            raise error(path, f"row 1 has {len(cells)} columns, and no row names them", remedy)
+        names = [*named, *shape]
+    else:
+        names, rows = [cell.strip().lower() for cell in cells], rows[1:]
+        if not rows:
+            raise error(path, "the file has a header but no rows", "export it again")
+    columns = next((shape for shape in shapes if set(shape) <= set(names)), None)
+    if columns is None:
+        raise error(path, f"its columns are {listing(names)}", remedy)
+    check_widths(path, rows, names)
+    twice = first_duplicate(name for name in names if name in (*columns, *single))
+    if twice is not None:
+        raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
+    return rows, names, columns
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -140,16 +154,6 @@ def check_widths(path: Path, rows: Sequence[Row], names: Sequence[str]) -> None:
 def is_data(cells: Sequence[str]) -> bool:
     """Whether a row is one of numbers (and perhaps a name before them) rather than a header."""
     return any(number(cell) is not None and cell.strip().lower() not in MISSING for cell in cells)
-
-
-def _default_columns(path: Path, cells: Sequence[str]) -> list[str]:
-    """Names of the columns of a file without a header."""
-    named = number(cells[0]) is None  # words before numbers name the rows
-    size = len(cells) - named
-    shape = next((shape for shape in SHAPES if len(shape) == size), None)
-    if shape is None:
-        raise error(path, f"row 1 has {len(cells)} columns and there is no header", EXPECTED)
-    return [*(["id"] if named else []), *shape]
 
 
 def number(cell: str) -> float | None:

@@ -22,8 +22,7 @@ from indexing.action.exemplars import moment_window
 from indexing.action.model import NUM_NEIGHBOURS, ShapeModel
 from indexing.action.stream import INTERPOLATION_MARGIN, Stream, moments, presence, wrong_contrast
 from indexing.cameras import y_up
-from indexing.clip import Clip
-from indexing.estimator import is_number
+from indexing.clip import Clip, is_number
 from indexing.joints import matched_all
 from indexing.recordings.decoding import (
     EDGE_TOLERANCE,

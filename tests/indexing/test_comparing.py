@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sklearn.metrics import cohen_kappa_score, confusion_matrix
 
-from indexing.comparing import NONE, ComparedSpan, ComparingOptions, SegmentCounts, compare, kappa, right_segments, time_table
+from indexing.comparing import NONE, ComparedSpan, SegmentCounts, compare, kappa, right_segments, time_table
 
 STEP = 0.01
 LENGTH = 20.0
@@ -173,7 +173,7 @@ def test_all_numbers_as_json():
     assert plain["by_label"]["squat"]["seconds_both"] == 5.0 and plain["seconds_compared"] == LENGTH
 
 
-def test_bad_input_says_what_is_wrong():
+def test_bad_input_says_what_is_wrong(monkeypatch):
     with pytest.raises(ValueError, match="a: 'squat' from 3 s to 2 s is no interval; give seconds, start first"):
         compare([span([("squat", 3, 2)], [])])
     with pytest.raises(ValueError, match="is no interval"):
@@ -182,8 +182,9 @@ def test_bad_input_says_what_is_wrong():
         with pytest.raises(ValueError, match=f"a: {start} s to {end} s is no span of time; give seconds, start first"):
             compare([ComparedSpan("a", start, end, [("squat", 0.0, 1.0)], [])])
     texts = [(f"remark {i}", float(i), i + 0.5) for i in range(4)]
+    monkeypatch.setattr("indexing.comparing.MAX_LABELS", 3)
     with pytest.raises(ValueError, match="4 different labels, of which 3 can be compared; are they free text"):
-        compare([span(texts, [])], ComparingOptions(labels=3))
+        compare([span(texts, [])])
 
 
 def test_many_labels_are_compared_with_those_near_them_only(monkeypatch):
@@ -202,20 +203,24 @@ def test_many_labels_are_compared_with_those_near_them_only(monkeypatch):
 
 
 @pytest.mark.slow
-def test_blocks_change_nothing_and_bound_what_is_held():
+def test_blocks_change_nothing_and_bound_what_is_held(monkeypatch):
     rng = np.random.default_rng(0)
     starts = np.sort(rng.uniform(0, 1000, size=(2, 1500)))
     sides = [[(f"l{rng.integers(300):03d}", a, a + 2.0) for a in side] for side in starts.tolist()]
     one = span(*sides, end=1002.0)
-    blocks = [compare([one], ComparingOptions(block=block)) for block in (7, 128, 10**6)]
+    blocks = []
+    for block in (7, 128, 10**6):
+        monkeypatch.setattr("indexing.comparing.BLOCK", block)
+        blocks.append(compare([one]))
     for other in blocks[1:]:
         assert np.allclose(blocks[0].seconds, other.seconds, atol=1e-9) and blocks[0].segments == other.segments
         assert other.by_label["l007"].both == pytest.approx(blocks[0].by_label["l007"].both)
     assert blocks[0].compared == pytest.approx(1002.0)
     held = []
     for block in (64, 10**6):
+        monkeypatch.setattr("indexing.comparing.BLOCK", block)
         tracemalloc.start()
-        compare([one], ComparingOptions(block=block))
+        compare([one])
         held.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert held[0] < 6e6 < 20e6 < held[1]

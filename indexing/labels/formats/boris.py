@@ -90,7 +90,7 @@ def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
         if mine is None or mine & media_files or not (media_files or with_media):
             _observation(out, (name, called[name]), observation, types, mine)
         else:
-            left[name] += len(_list(asked, observation.get("events"), f"observation {name!r}, events"))
+            left[name] += len(out.list_of(observation.get("events"), f"observation {name!r}, events", REMEDY))
     left += Counter()  # drops those without events
     if left:
         of = f"of other recordings than {asked.media or asked.recording} ({list_few(left)})"
@@ -132,29 +132,16 @@ def _observation(
     stretches = list(pair_events(out, events, types, where))
     if not stretches:
         return
-    offset = _offset(out, observation, where)
+    # what the observation's clock shows at the first frame of its first player
+    offset = out.seconds(observation.get("time offset") or 0.0, where, "time offset")
     spans = clock(out, observation, where, mine)
     cut = 0
     for number, stretch in enumerate(stretches):
-        subject, code, modifiers = stretch.key
         start, end = stretch.start - offset, stretch.end - offset
         pieces = split_by_media(start, end, spans) if spans else [("", start, end)]
         cut += len(pieces) > 1
-        comment, score = (stretch.comment, None) if called not in out.machine else split_score(stretch.comment)
-        for media, first, last in pieces:
-            if mine is None or media in mine or not spans:
-                out.add(
-                    code,
-                    round(first, 6),
-                    round(last, 6),
-                    f"{where}, event {number + 1}",
-                    subject=subject,
-                    media=media,
-                    observation=called,
-                    comment=comment,
-                    score=score,
-                    modifiers=() if not modifiers.strip("|") else tuple(modifiers.split("|")),
-                )
+        pieces = [piece for piece in pieces if mine is None or piece[0] in mine or not spans]
+        add_interval(out, stretch, pieces, called, f"{where}, event {number + 1}")
     if cut:
         out.note(f"{where}: {count(cut, 'label')} cut in two, where one file ends and the next begins")
     if not spans and out.asked.recording is not None:
@@ -166,7 +153,7 @@ def _events(out: Gathering, observation: Mapping[str, Any], where: str) -> list[
     found: list[Entry] = []
     timeless = 0
     pictures = observation.get("type") == "IMAGES"
-    for number, entry in enumerate(_list(out.asked, observation.get("events"), f"{where}, events"), start=1):
+    for number, entry in enumerate(out.list_of(observation.get("events"), f"{where}, events", REMEDY), start=1):
         here = f"{where}, event {number}"
         if not isinstance(entry, list) or len(entry) < 3:
             raise error(out.asked.path, f"{here} is {shown(entry)}, not [time, subject, code, modifiers, comment]", REMEDY)
@@ -232,6 +219,16 @@ def _asked_at_stop(out: Gathering, begun: dict[tuple[str, str, str], Entry], whe
     return found
 
 
+def add_interval(out: Gathering, interval: Interval, pieces: Sequence[tuple[str, float, float]], name: str, where: str) -> None:
+    """The labels of an interval, one for each file that is played then; what a program wrote has a score in its comment."""
+    subject, code, modifiers = interval.key
+    comment, score = split_score(interval.comment) if name in out.machine else (interval.comment, None)
+    fields = {"subject": subject, "comment": comment, "score": score, "observation": name}
+    fields["modifiers"] = tuple(modifiers.split("|")) if modifiers.strip("|") else ()
+    for media, start, end in pieces:
+        out.add(code, round(start, 6), round(end, 6), where, media=media, **fields)
+
+
 def join_comments(start: str, stop: str) -> str:
     """The comments at START and STOP, as one."""
     return " / ".join(comment for comment in (start, stop) if comment)
@@ -245,11 +242,6 @@ def split_score(comment: str) -> tuple[str, float | None]:
 
 
 # ---- clocks --------------------------------------------------------------------------------------------------------------
-def _offset(out: Gathering, observation: Mapping[str, Any], where: str) -> float:
-    """What the observation's clock shows at the first frame of its first player."""
-    return out.seconds(observation.get("time offset") or 0.0, where, "time offset")
-
-
 def clock(out: Gathering, observation: Mapping[str, Any], where: str, mine: set[str] | None) -> list[Span]:
     """When which file is played, on the clock of the first player: those of the player that plays the recording, else of the
     first."""
@@ -310,14 +302,6 @@ def files_of(observation: Mapping[str, Any]) -> list[str]:
 def _object(asked: Request, value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise error(asked.path, f"{where} is {shown(value)}, not an object", REMEDY)
-    return value
-
-
-def _list(asked: Request, value: Any, where: str) -> list[Any]:
-    if value is None:
-        return []
-    if not isinstance(value, list):
-        raise error(asked.path, f"{where} is {shown(value)}, not a list", REMEDY)
     return value
 
 
@@ -528,12 +512,11 @@ def _to_milli(value: Any) -> int | None:
 
 def _project_name(target: Target, known: Mapping[str, Any], media: str) -> str:
     """How the project calls a recording."""
-    asked = Request(target.into or target.path, media, target.name)
-    if target.name is not None:
-        return next(iter(of_recording(known, asked) or {media}))
     try:
-        return next(iter(of_recording(known, asked) or {media}))
+        return next(iter(of_recording(known, Request(target.into or target.path, media, target.name)) or {media}))
     except ValueError:  # the project does not have it yet
+        if target.name is not None:
+            raise
         return media
 
 

@@ -24,7 +24,7 @@ from indexing.labels.format import (
     parse_seconds,
     split_by_media,
 )
-from indexing.labels.formats.boris import MACHINE, Entry, Interval, join_comments, split_score
+from indexing.labels.formats.boris import MACHINE, Entry, Interval, add_interval, join_comments
 from indexing.labels.label import LabelFile
 from indexing.opening import Row, count, error, listing, shown
 
@@ -56,7 +56,6 @@ class Sitting:
 
     name: str
     offset: float = 0.0
-    machine: bool = False
     files: dict[str, None] = field(default_factory=dict)
     beside: list[str] = field(default_factory=list)
     lengths: list[float] = field(default_factory=list)
@@ -78,14 +77,13 @@ def read(rows: list[Row], asked: Request) -> LabelFile:
         if name not in sittings:
             offset = row.get("offset") or above.get("time offset (s)", "")
             sittings[name] = _sitting(out, name, offset, row, f"line {line}")
-            sittings[name].machine = (row.get("description") or above.get("description", "")).startswith(MACHINE)
+            if name and (row.get("description") or above.get("description", "")).startswith(MACHINE):
+                out.machine.setdefault(name)
         _row(out, sittings[name], row, [cells[i].strip() for i in modifiers if i < len(cells)], f"line {line}")
     for sitting in sittings.values():
         out.media.update(dict.fromkeys([*sitting.files, *sitting.beside]))
         if sitting.name:
             out.observations.setdefault(sitting.name)
-        if sitting.machine:
-            out.machine.setdefault(sitting.name)
     mine = of_recording(out.media, asked)
     for sitting in sittings.values():
         _place(out, sitting, mine)
@@ -185,22 +183,8 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
         if not spans and len(sitting.files) > 1 and media != next(iter(sitting.files)):
             lost[media] += 1
             continue
-        for name, first, last in pieces:
-            if mine is None or not name or name in mine:
-                subject, code, modifiers = stretch.key
-                comment, score = split_score(stretch.comment) if sitting.machine else (stretch.comment, None)
-                out.add(
-                    code,
-                    round(first, 6),
-                    round(last, 6),
-                    f"{where}, label {number}",
-                    subject=subject,
-                    media=name,
-                    observation=sitting.name,
-                    comment=comment,
-                    score=score,
-                    modifiers=tuple(modifiers.split("|")) if modifiers else (),
-                )
+        pieces = [piece for piece in pieces if mine is None or not piece[0] or piece[0] in mine]
+        add_interval(out, stretch, pieces, sitting.name, f"{where}, label {number}")
     if lost:
         said = f"of {list_few(lost)}, which is not played first, and the table does not say how long the first is"
         if mine is not None and mine & lost.keys():

@@ -60,7 +60,7 @@ def _regions(out: Gathering, task: Mapping[str, Any], where: str) -> Iterator[tu
         yield from _compact_regions(task)
         return
     for part in ("annotations", "completions", "predictions"):
-        for one in _list(out, task.get(part), f"{where}, {part}"):
+        for one in out.list_of(task.get(part), f"{where}, {part}", REMEDY):
             if not isinstance(one, dict):
                 continue  # exports without expanded predictions list their numbers
             if one.get("was_cancelled"):
@@ -68,7 +68,7 @@ def _regions(out: Gathering, task: Mapping[str, Any], where: str) -> Iterator[tu
                 continue
             machine = part == "predictions"
             who = text_of(one.get("model_version")) or "prediction" if machine else _who(one.get("completed_by"))
-            for region in _list(out, one.get("result"), f"{where}, result"):
+            for region in out.list_of(one.get("result"), f"{where}, result", REMEDY):
                 if isinstance(region, dict):
                     yield who, machine, region
 
@@ -133,14 +133,6 @@ def _frames(out: Gathering, one: Any, where: str) -> tuple[float, float]:
     if out.asked.fps is None:
         raise error(out.asked.path, "counts frames, and does not say how many a second has", "give them (--fps)")
     return (ends[0] - 1) / out.asked.fps, (ends[1] - 1) / out.asked.fps
-
-
-def _list(out: Gathering, value: Any, where: str) -> list[Any]:
-    if value is None:
-        return []
-    if not isinstance(value, list):
-        raise error(out.asked.path, f"{where} is {shown(value)}, not a list", REMEDY)
-    return value
 
 
 def write(labels: Sequence[Label], target: Target) -> list[str]:

@@ -93,8 +93,7 @@ def _to_int(value: Any) -> int | None:
 
 def _times(file: Hdf5, frames: int, options: Options) -> tuple[Array, Array | None]:
     """Frame numbers and, where they are known, seconds."""
-    fps, unit = _number(file.attribute("/", "fps")), file.attribute("/", "time_unit")
-    unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit
+    fps, unit = _number(file.attribute("/", "fps")), file.text("/", "time_unit")
     stamps = file.array("time", 1, "fiu") if "time" in file else np.arange(frames)
     if stamps.shape != (frames,):
         raise error(file.path, f"time has {len(stamps)} values for {frames} frames", REMEDY)
@@ -109,9 +108,8 @@ def _times(file: Hdf5, frames: int, options: Options) -> tuple[Array, Array | No
 
 def _up(file: Hdf5, dims: int) -> str:
     """Which way is up: as :meth:`indexing.Clip.to_movement` notes it, else as of pixels, and of rooms."""
-    found = file.attribute("/", "up")
-    found = found.decode("utf-8", "replace") if isinstance(found, bytes) else found
-    return found if isinstance(found, str) and found in UP_AXES[: 2 * (dims - 1)] else "-y" if dims == 2 else "z"
+    up = file.text("/", "up")
+    return up if up in UP_AXES[: 2 * (dims - 1)] else "-y" if dims == 2 else "z"
 
 
 def _number(value: Any) -> float | None:

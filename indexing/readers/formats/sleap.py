@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from indexing.clip import COARSEST, FINEST, ClipSet
+from indexing.clip import COARSEST, FINEST, ClipSet, is_number
 from indexing.opening import error, listing, parse_json, shown
 from indexing.readers.files import Format, Options, Source, read_columns
 from indexing.readers.hdf import Array, Hdf5, opened_hdf5
@@ -99,17 +99,14 @@ def _analysis(file: Hdf5) -> Recording:
         joints=joints,
         confidence=confidence,
         tracks=_number_duplicates(names or [""] * animals) * frames if animals > 1 or any(names) else None,
-        skeleton=_skeleton(file.path.stem, nodes, _bones(file, len(nodes))),
+        skeleton=Skeleton(file.path.stem, tuple(nodes), tuple(_bones(file, len(nodes)))),
     )
 
 
 def _axes(file: Hdf5, name: str, wanted: Sequence[str], usual: Sequence[str]) -> Array:
     """An array with its axes in the order wanted, from that of its attribute ``dims``, or the usual."""
-    said = file.attribute(name, "dims")
-    order = list(usual)
-    if isinstance(said, (str, bytes)):
-        text = said.decode("utf-8", "replace") if isinstance(said, bytes) else said
-        order = parse_json(file.path, text, EXPORT, f"{name}@dims")
+    text = file.text(name, "dims")
+    order = parse_json(file.path, text, EXPORT, f"{name}@dims") if text else list(usual)
     if not isinstance(order, list) or sorted(map(str, order)) != sorted(wanted):
         raise error(file.path, f"{name} has the axes {shown(order)}, not {', '.join(wanted)}", EXPORT)
     if math.prod(file.shape(name)) > WIDEST_BLOCK:
@@ -130,10 +127,6 @@ def _bones(file: Hdf5, nodes: int) -> list[tuple[int, int]]:
     if edges.ndim != 2 or edges.shape[1] != 2 or not edges.size or edges.max() >= nodes or edges.min() < 0:
         return []
     return [(int(a), int(b)) for a, b in edges]
-
-
-def _skeleton(name: str, nodes: Sequence[str], bones: Sequence[tuple[int, int]]) -> Skeleton:
-    return Skeleton(name, tuple(nodes), tuple(bones))
 
 
 # ---- projects ------------------------------------------------------------------------------------------------------------
@@ -164,15 +157,13 @@ def _project(file: Hdf5, options: Options) -> Recording:
         confidence=confidence,
         tracks=[names[i] if i >= 0 else None for i in track.tolist()] if (track >= 0).any() else None,
         times=order / rate if rate is not None else None,
-        skeleton=_skeleton(file.path.stem, nodes, bones),
+        skeleton=Skeleton(file.path.stem, tuple(nodes), tuple(bones)),
     )
 
 
 def _about(file: Hdf5) -> dict[str, Any]:
     """The project's JSON: its nodes and skeletons."""
-    raw = file.attribute("metadata", "json")
-    text = raw.decode("utf-8", "replace") if isinstance(raw, bytes) else str(raw or "")
-    about = parse_json(file.path, text, EXPORT, "metadata@json")
+    about = parse_json(file.path, file.text("metadata", "json"), EXPORT, "metadata@json")
     if not isinstance(about, dict) or not isinstance(about.get("nodes"), list) or not isinstance(about.get("skeletons"), list):
         raise error(file.path, "metadata@json has no nodes and skeletons", EXPORT)
     return about
@@ -232,7 +223,8 @@ def _points(file: Hdf5, instances: dict[str, Array], which: Array, nodes: int) -
     # made once each animal is known to have points of its own: no more than the file holds
     joints = np.full((len(which), nodes, 2), np.nan)
     confidence = np.full((len(which), nodes), np.nan)
-    shift = 0.5 if (_number(file.attribute("metadata", "format_id")) or SHIFTED) < SHIFTED else 0.0
+    version: Any = file.attribute("metadata", "format_id")
+    shift = 0.5 if is_number(version) and version < SHIFTED else 0.0
     for code, rows, found, start in tables:
         index = start[:, None] + np.arange(nodes)
         xy = np.stack([found["x"], found["y"]], axis=1).astype(np.float64)[index] - shift
@@ -295,10 +287,6 @@ def _tracks(file: Hdf5) -> list[Hashable | None]:
         one = parse_json(file.path, text, EXPORT, f"tracks_json[{i}]")
         names.append(str(one[1]) if isinstance(one, list) and len(one) > 1 else "")
     return _number_duplicates(names)
-
-
-def _number(value: Any) -> float | None:
-    return float(value) if isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value) else None
 
 
 def matches(source: Source) -> bool:

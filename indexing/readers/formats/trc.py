@@ -32,7 +32,7 @@ def read(source: Source, options: Options) -> ClipSet:
     path = source.path
     lines = [line.rstrip("\r") for line in read_text(path, REMEDY).split("\n")]
     about = _about(path, lines)
-    names, at = _names(path, lines)
+    names, at = _names(path, lines, about.get("nummarkers", ""))
     rows = [(i + 1, line) for i, line in enumerate(lines[at:], at) if line.strip()]
     if rows and rows[0][1].strip().lower().startswith("x1"):
         rows = rows[1:]
@@ -71,7 +71,7 @@ def _about(path: Path, lines: list[str]) -> dict[str, str]:
     return about
 
 
-def _names(path: Path, lines: list[str]) -> tuple[list[str], int]:
+def _names(path: Path, lines: list[str], count: str) -> tuple[list[str], int]:
     """Names of the markers, and the line after theirs."""
     at = next((i for i, line in enumerate(lines[:8]) if line.lower().lstrip().startswith("frame#")), None)
     if at is None:
@@ -84,9 +84,8 @@ def _names(path: Path, lines: list[str]) -> tuple[list[str], int]:
     if not names or twice is not None:
         said = "names no markers" if not names else f"names the marker {shown(twice)} twice"
         raise error(path, f"line {at + 1} {said}", "name every marker once")
-    said = _about(path, lines).get("nummarkers", "")
-    if said.isdecimal() and said != str(len(names)):
-        raise error(path, f"NumMarkers is {said[:9]}, but line {at + 1} names {len(names)} ({listing(names)})", REMEDY)
+    if count.isdecimal() and count != str(len(names)):
+        raise error(path, f"NumMarkers is {count[:9]}, but line {at + 1} names {len(names)} ({listing(names)})", REMEDY)
     return names, at + 1
 
 

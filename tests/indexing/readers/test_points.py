@@ -88,7 +88,7 @@ def test_csv_weights_and_static(tmp_path):
         ("x,y\n1,inf\n", "row 2, column 'y': 'inf' is not finite"),
         ("x,y\n1,2\n3\n", "row 3 has 1 cells, the first row 2"),
         ("u,v\n1,2\n", "its columns are u, v; name the columns x,y or x,y,z"),
-        ("1,2,3,4\n", "row 1 has 4 columns and there is no header"),
+        ("1,2,3,4\n", "row 1 has 4 columns, and no row names them"),
         ("id,x,y\na,1,2\nb,1,2\na,3,4\n", "row 4, column 'id': 'a' was in row 2, too"),
         ("id,x,y\n,1,2\n", "row 2, column 'id': is empty"),
         ("x,x,y\n1,2,3\n", "two columns 'x'"),
