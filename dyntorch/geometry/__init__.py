@@ -13,15 +13,15 @@ _HOME = {
     "undistort": "dyntorch.geometry.lens",
     "distort": "dyntorch.geometry.lens",
     "fit_distortion": "dyntorch.geometry.lens",
-    "line_camera": "dyntorch.geometry.lines",
+    "line_camera": "dyntorch.geometry.extensors",
     "triangulate": "dyntorch.geometry.triangulation",
     "resect": "dyntorch.geometry.triangulation",
     "reproject": "dyntorch.geometry.triangulation",
     "bundle_adjust": "dyntorch.geometry.bundle",
     "grassmann_tensor": "dyntorch.geometry.grassmann",
-    "joint_epipoles": "dyntorch.geometry.epipoles",
+    "joint_epipoles": "dyntorch.geometry.grassmann",
     "hyperplane_pair": "dyntorch.geometry.pairs",
-    "plane_motions": "dyntorch.geometry.plane_motion",
+    "plane_motions": "dyntorch.geometry.rigid",
     "two_bodies": "dyntorch.geometry.pairs",
 }
 __all__ = sorted(_HOME)

@@ -1,13 +1,12 @@
 """Ground-truth scenes for tests, benchmarks and experiments: one function per kind of motion, all batched."""
 
-from dyntorch.scenes.bodies import bodies, convergent_motions
+from dyntorch.scenes.bodies import TranslatingScene, bodies, convergent_motions, translating_planes
 from dyntorch.scenes.filmed import FilmedScene, NonrigidScene, filmed, nonrigid_pair
 from dyntorch.scenes.lifts import LiftedScene, lifted
 from dyntorch.scenes.plane import lines_concurrent, planar, translating_lines
 from dyntorch.scenes.scene import Scene
 from dyntorch.scenes.space import collineation, constant_velocity, dynamic, moving_points, two_view
 from dyntorch.scenes.streets import Street, StreetOptions, streets
-from dyntorch.scenes.translation import TranslatingScene, translating_planes
 
 __all__ = [
     "FilmedScene",

@@ -21,8 +21,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.invariants.dynamic_shape_tensor import DynamicShapeTensor, Form
-from dyntorch.shapes.basis import Fourier, Polynomial, Trajectory
-from dyntorch.shapes.theory import reference_plane_rows, six_point_rows
+from dyntorch.shapes.basis import Fourier, Polynomial, Trajectory, reference_plane_rows, six_point_rows
 from experiments.common.tables import NoiseConfig, Row, command, measured_on_one_thread
 
 PROTOTYPE = {5: 0.027, 8: 0.008, 14: 0.005}

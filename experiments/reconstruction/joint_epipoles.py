@@ -21,7 +21,7 @@ import tyro
 from torch import Tensor
 
 import dyntorch as dyn
-from dyntorch.geometry.epipoles import joint_epipoles_of_tensor
+from dyntorch.geometry.grassmann import joint_epipoles_of_tensor
 from dyntorch.scenes import LiftedScene, lifted
 from experiments.common.tables import NoiseConfig, command, noise_tables
 

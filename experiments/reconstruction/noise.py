@@ -27,9 +27,8 @@ from dyntorch import metrics, scenes
 from dyntorch.geometry.lift import upgrade
 from dyntorch.geometry.triangulation import resect, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
-from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjust_scene, distances
+from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, ViewTracks, adjust_scene, distances
 from experiments.common.tables import command, note
 
 SCENES, QUICK = 40, 8

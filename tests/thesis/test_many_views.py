@@ -89,7 +89,7 @@ def test_space_in_four_views_without_a_threshold():
     # static ones known, in a batch of two beside a problem that is not there
     both = [torch.stack([x, x * torch.nan]) for x in views]
     known = torch.arange(80) < 20
-    two = dyn.align_points(*both, "join", threshold=3 * sigma, static=known, generator=torch.Generator().manual_seed(0))
+    two = dyn.align_points(*both, model="join", threshold=3 * sigma, static=known, generator=torch.Generator().manual_seed(0))
     assert two.status.tolist() == [dyn.Status.OK, dyn.Status.TOO_FEW]
     assert float(off(two.collineations[0], A).max()) < 0.01 and float(two.collineations[1].abs().max()) == 0
 
@@ -100,8 +100,6 @@ def test_models_of_three_views_say_so():
         with pytest.raises(ValueError, match=f"model='{model}' takes three views, got 4; model='join' takes any number"):
             dyn.align_points(*views, model=model)
     with pytest.raises(ValueError, match="model must be one of"):
-        dyn.align_points(*views[:3], "bent")
-    with pytest.raises(ValueError, match="model stands behind the views or is given by name"):
-        dyn.align_points(*views[:3], "join", views[3])
+        dyn.align_points(*views[:3], model="bent")
     with pytest.raises(ValueError, match="has no estimation matrix"):
         _ = dyn.align_planar(*plane(4, 40, 0.5)[0]).solution.singular_values

@@ -11,8 +11,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.core.outcome import Status
-from dyntorch.geometry.plane_motion import CommonPlane, plane_motions
-from dyntorch.geometry.rigid import rotation_exponential
+from dyntorch.geometry.rigid import CommonPlane, plane_motions, rotation_exponential
 from dyntorch.tasks.align.result import Alignment
 
 F64 = torch.float64

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -11,12 +13,17 @@ from dyntorch.core.invariant import Invariant
 from dyntorch.core.limits import median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import Normalization, normalization, normalize_motion
+from dyntorch.core.outcome import is_failure
 from dyntorch.core.refine import Problem, refine_matches
 from dyntorch.core.residual import whiten, whitened_residual
 from dyntorch.core.solution import Solution
-from dyntorch.geometry.homogeneous import apply, homogeneous
-from dyntorch.numerics.blocks import each, map_blocks, uniform
-from dyntorch.numerics.nullspace import spectrum
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
+from dyntorch.invariants.dynamic_tensor import DynamicMotion
+from dyntorch.invariants.flats import flat_residual, nearest_flats
+from dyntorch.invariants.homography_tensor import HomographyTensor
+from dyntorch.invariants.join_tensor import JoinTensor
+from dyntorch.numerics.blocks import each, map_blocks, select, uniform
+from dyntorch.numerics.nullspace import null_space, spectrum
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
 
 NUM_LABEL_ROUNDS = 3  # of labelling and refining with the noise known
@@ -24,8 +31,10 @@ NUM_LABEL_ROUNDS_UNKNOWN_NOISE = 6  # turns with the noise to be found as well
 NOISE_TOLERANCE = 0.02  # relative change of the noise that needs no further round
 THRESHOLD_SIGMAS = 3.0  # a threshold, in standard deviations of the noise of one coordinate
 ROUGH_LABEL_FACTOR = 3.0  # width of the first labels over that of the noise, where the motion comes from a minimal sample
+MAX_TRAJECTORY_DISTANCE = 3.0  # standard deviations of the noise from a trajectory line
 MAX_WIDENING = 4.0  # of a limit by the uncertainty of the motion: a moving match called static gives a wrong motion
 NUM_LABEL_STEPS = 6  # of Levenberg-Marquardt between two labellings
+MIN_SINGULAR_RATIO = 1e-3  # of a collineation in normalized coordinates; usually above .1
 NUM_SCORED_MATCHES = 256  # that judge a hypothesis: enough to tell 5 % of agreement from none
 
 
@@ -80,6 +89,10 @@ class Evidence:
         transforms, actions = each(again, (self.norm.transforms, self.norm.actions))
         norm = Normalization(transforms, self.norm.primitives, actions)
         return Evidence(self.invariant, data, norm, each(again, self.views), again(self.floor))
+
+    def given_noise(self, threshold: float | None) -> Tensor | None:
+        """Standard deviation ``(b,)`` that a threshold stands for."""
+        return None if threshold is None else torch.full_like(self.floor, threshold / THRESHOLD_SIGMAS).maximum(self.floor)
 
     def weighted(self, weights: Tensor) -> Evidence:
         """With the matches of each problem weighted by ``(b,)``; 0 leaves a problem out."""
@@ -177,6 +190,26 @@ class Evidence:
         labels = torch.where(rough[:, None] & (labels == MOVING), OUTLIER, labels)
         return normalized_motion(self.refined(theta, labels, NUM_LABEL_STEPS))
 
+    def improve_starts(self, starts: list[Tensor], sigma: Tensor, *, sampled: bool) -> Tensor:
+        """All starts ``(b, p)`` after :meth:`improved`, ``(starts b, p)``; ``sampled``: the first is from a minimal sample."""
+        count, size = len(starts), len(sigma)
+        rough = (torch.arange(count, device=sigma.device).repeat_interleave(size) == 0) & sampled
+        return self.repeated(count).improved(torch.cat(starts), sigma.repeat(count), rough)
+
+    def best_start(self, theta: Tensor, sigma: Tensor) -> Tensor:
+        """Of several motions for each problem ``(starts b, p)`` the one of least cost, ``(b, p)``; no singular one."""
+        size = len(sigma)
+        count = len(theta) // size if size else 1
+        cost = torch.where(self._is_singular(theta), torch.inf, self.repeated(count).cost(theta, sigma.repeat(count)))
+        best = cost.unflatten(0, (count, size)).argmin(0)
+        return theta[best * size + torch.arange(size, device=best.device)]
+
+    def _is_singular(self, theta: Tensor) -> Tensor:
+        """Whether a motion takes the world to less than that, which fulfils every match and explains none."""
+        d = self.views[0].shape[-1] + 1
+        values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (-1, d, d)))
+        return (values[..., -1] < MIN_SINGULAR_RATIO * values[..., 0]).any(-1)
+
     def settled(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
         """Label and refine in turns, until the labels stay; ``estimate``: and the noise with them."""
         labels, steady = self.labels(theta, sigma), not estimate
@@ -194,6 +227,45 @@ class Evidence:
         return Labelled(theta, labels, sigma)
 
 
+def without_failures(refined: Solution, status: Tensor, labels: Tensor, worst: Tensor) -> Solution:
+    """The solution with its status and inliers; zero where there is none."""
+    none = is_failure(status)
+    assert refined.sigma is not None and refined.covariance is not None
+    return replace(
+        refined,
+        status=status,
+        tensor=select(~none, refined.tensor, 0.0),
+        normalized=select(~none, refined.normalized, 0.0),
+        covariance=torch.where(none[:, None, None], 0.0, refined.covariance),
+        sigma=torch.where(none, 0.0, refined.sigma),
+        uncertainty=torch.where(none, 0.0, worst),
+        inliers=labels != OUTLIER,
+    )
+
+
+def trajectory_lines(evidence: Evidence, best: Labelled, most: int) -> Tensor:
+    """How many lines hold the paths of all moving matches ``(b,)``, counted up to ``most``."""
+    parts = evidence.problem(best.labels).parts(best.theta)
+    places = torch.stack([evidence.views[0], *(apply(m, x) for m, x in zip(parts, evidence.views[1:], strict=True))])
+    ends = torch.stack([places[b] - places[a] for a, b in combinations(range(len(places)), 2)])
+    length, widest = ends.norm(dim=-1).max(dim=0)
+    along = ends.gather(0, widest[None, ..., None].expand_as(ends[:1]))[0] / length[..., None].clamp(min=1e-12)
+    problem = torch.arange(len(length), device=length.device)
+    left, count = best.labels == MOVING, torch.zeros(len(length), dtype=torch.long, device=length.device)
+    noise = MAX_TRAJECTORY_DISTANCE * (evidence.norm.scales[0] * best.sigma)[:, None]
+    for _ in range(most):
+        longest = torch.where(left, length, -1.0).argmax(-1)
+        centre, direction, base = places[:, problem, longest].mean(0), along[problem, longest], length[problem, longest]
+        offset = places - centre[:, None]
+        across = offset - (offset * direction[:, None]).sum(-1, keepdim=True) * direction[:, None]
+        # away from the path its line is known by angle only
+        reach = 1 + offset.norm(dim=-1) / base[:, None].clamp(min=1e-12)
+        count = count + left.any(-1)
+        left = left & ~(across.norm(dim=-1) <= noise * reach).all(0)
+        left = left.index_put((problem, longest), torch.zeros_like(problem, dtype=torch.bool))
+    return count
+
+
 def normalized_motion(solution: Solution) -> Tensor:
     """``(b, p)`` normalized motion of a solution."""
     return torch.cat([part.flatten(1) for part in solution.normalized_motion()], dim=-1)
@@ -207,15 +279,28 @@ BLOCK = 1 << 19
 """Numbers in the largest temporary of one block of the batch (4 MB)."""
 
 
-def static_consensus(
-    views: tuple[Tensor, ...],
-    pool: Tensor,
-    limit: Tensor | None,
-    samples: int,
-    generator: torch.Generator | None,
+def static_start(
+    evidence: Evidence, given: Tensor | None, samples: int, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor]:
+    """Motion ``(b, p)`` on which the most matches agree that they stand still, and the noise ``(b,)`` by their median."""
+    pool, d = evidence.data.weights > 0, evidence.views[0].shape[-1]
+    if evidence.data.static is not None:
+        known = pool & evidence.data.static
+        pool = torch.where((known.sum(-1) >= d + 2)[:, None], known, pool)
+    scale = evidence.norm.scales[0]
+    # each distance has the noise of two views
+    limit = None if given is None else 2 * three_sigma(evidence.still) * (ROUGH_LABEL_FACTOR * scale * given).square()
+    motion, square = _static_consensus(evidence.views, pool, limit, samples, generator)
+    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
+    variance = square / (2 * median(evidence.still))
+    return theta, variance.nan_to_num(posinf=1.0).sqrt() / scale if given is None else given
+
+
+def _static_consensus(
+    views: tuple[Tensor, ...], pool: Tensor, limit: Tensor | None, samples: int, generator: torch.Generator | None
 ) -> tuple[tuple[Tensor, ...], Tensor]:
-    r"""Collineations of view 2, 3, ... to view 1 on which the most matches agree, from samples of d + 2 matches. views
-    ``(b, n, d)``, pool ``(b, n)``, limit ``(b,)`` -> ``(b, d + 1, d + 1)``."""
+    """Collineations of view 2, 3, ... to view 1 on which the most matches agree, from samples of d + 2 matches, and the median
+    squared distance ``(b,)``."""
     b, n, d = views[0].shape
     device = views[0].device
     shuffled = (uniform(b, n, generator=generator, device=device) + 2.0 * ~pool).argsort(dim=-1)
@@ -255,7 +340,7 @@ def _search(
         score = torch.where(valid[:, None], torch.minimum(square, limit[:, None, None]), 0.0).sum(-1)
     best = score.argmin(-1)
     chosen_square = ordered[problem, best].sort(dim=-1).values.gather(-1, middle[:, :1])[:, 0]
-    return tuple(matrix[problem, best] for matrix in maps), chosen_square / (2 * median(4))
+    return tuple(matrix[problem, best] for matrix in maps), chosen_square
 
 
 def _collineation(target: Tensor, source: Tensor) -> Tensor:
@@ -268,3 +353,117 @@ def _collineation(target: Tensor, source: Tensor) -> Tensor:
     scaled = target[..., :-1, :].mT * (coordinates[0] / coordinates[1])[..., None, :]
     found = (scaled @ bases[1]).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     return found / torch.linalg.matrix_norm(found, keepdim=True).clamp(min=torch.finfo(found.dtype).tiny)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# More than three views: the motion of three views carried on to all others, and what is asked of all choices of views.
+
+
+NUM_RESECTION_SAMPLES = 256  # per view: 99.9 % to draw a clean one at 30 % wrong points
+RESECTION_SAMPLE_SIZE = 10  # 8 determine a collineation of the plane or of space
+NUM_RESECTION_ROUNDS = 4  # reweighted fits to all matches after that
+
+
+def moving_points(dim: int, views: int) -> Invariant:
+    """The invariant of points on straight lines of a plane or of space: for three views its tensor, for more the motion."""
+    if views > 3:
+        return DynamicMotion(dim, views, 2)
+    return HomographyTensor() if dim == 2 else JoinTensor()
+
+
+def motion_of_all(
+    evidence: Evidence, solve: Callable[[tuple[Tensor, ...]], Solution], given: Tensor | None, generator: torch.Generator | None
+) -> tuple[tuple[Tensor, ...], Solution]:
+    """The normalized collineations ``(b, d + 1, d + 1)`` from every view to the first, and the solution of three views behind
+    them."""
+    count = len(evidence.views)
+    three = (0, count // 2, count - 1)
+    found = solve(tuple(evidence.data.views[v] for v in three))
+    parts = tuple(part.reshape(-1, *part.shape[-2:]) for part in found.motion)
+    parts = normalize_motion(moving_points(parts[0].shape[-1] - 1, 3), parts, [evidence.norm.transforms[v] for v in three])
+    if count == 3:
+        return parts, found
+    sound = ~is_failure(found.status.reshape(-1))
+    eye = torch.eye(parts[0].shape[-1], dtype=parts[0].dtype, device=parts[0].device).expand_as(parts[0])
+    known = dict(zip(three, (eye, *(select(sound & p.isfinite().flatten(1).all(-1), p, eye) for p in parts)), strict=True))
+    planes, weights, noise = _flats_of(evidence, three, torch.stack([known[v] for v in three], dim=-3), given)
+    for v in range(1, count):
+        if v not in known:
+            known[v] = resect_view(planes, evidence.views[v], evidence.norm.scales[v] * noise, weights, generator)
+    return tuple(known[v] for v in range(1, count)), found
+
+
+def _flats_of(evidence: Evidence, three: tuple[int, ...], maps: Tensor, given: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Hyperplanes ``(b, n, d, d + 1)`` of view 1 that meet in the line or the point of each match, weights, and the noise
+    ``(b,)``."""
+    points = torch.stack([evidence.views[v] for v in three], dim=-2)
+    scales = torch.stack([evidence.norm.scales[v] for v in three], dim=-1)
+    dim = points.shape[-1]
+    line, point = (nearest_flats(maps, points, scales, step) for step in (2, 1))
+    moving, still = (at.residual.square().sum((-2, -1)) for at in (line, point))
+    present = evidence.data.weights > 0
+    middle = torch.where(present, moving, torch.nan).nanmedian(-1).values.nan_to_num(nan=1.0)
+    noise = (middle / median(dim - 1)).sqrt().maximum(evidence.floor) if given is None else given
+    square = noise.square()[:, None]
+    rests = still <= three_sigma(2 * dim) * square
+    if evidence.data.static is not None:
+        rests = rests | evidence.data.static
+    good = present & (rests | (moving <= three_sigma(dim - 1) * square))
+    thin = torch.nn.functional.pad(line.hyperplanes, (0, 0, 0, 1))
+    planes = torch.where(rests[..., None, None], point.hyperplanes, thin)
+    return planes, evidence.data.weights * good, noise
+
+
+def resect_view(planes: Tensor, x: Tensor, sigma: Tensor, weights: Tensor, generator: torch.Generator | None) -> Tensor:
+    r"""The collineation A of a view whose points lie on known flats of view 1: :math:`L_i A (x_i, 1) = 0`, robustly. planes
+    ``(b, n, d, d + 1)``, x ``(b, n, d)``, sigma ``(b,)``, weights ``(b, n)`` -> ``(b, d + 1, d + 1)``."""
+    b, n, _, size = planes.shape
+    p = homogeneous(x)
+    rows = (planes[..., :, None] * p[..., None, None, :]).flatten(-2)  # (b, n, d, N N)
+    drawn = uniform(b, NUM_RESECTION_SAMPLES, n, generator=generator, device=x.device).masked_fill(weights[:, None] <= 0, 2.0)
+    chosen = drawn.argsort(-1)[..., : min(n, RESECTION_SAMPLE_SIZE)]
+    problem = torch.arange(b, device=x.device)[:, None, None]
+    maps = null_space(rows[problem, chosen].flatten(2, 3))[..., 0, :].unflatten(-1, (size, size))
+    limit = (ROUGH_LABEL_FACTOR * sigma).square()[:, None] * three_sigma(size - 1)
+    best = ((_squares(planes, maps, p) / limit[..., None]).clamp(max=1.0) * weights[:, None]).sum(-1).argmin(-1)
+    found = maps[torch.arange(b, device=x.device), best]
+    for _ in range(NUM_RESECTION_ROUNDS):
+        square, length = _squares(planes, found[:, None], p)[:, 0], _lengths(planes, found[:, None])[:, 0]
+        trust = weights * (limit / (limit + square)).square()
+        scaled = rows * (trust.sqrt() / length)[..., None, None]
+        found = null_space(scaled.flatten(1, 2))[..., 0, :].unflatten(-1, (size, size))
+    return unit(found)
+
+
+def _lengths(planes: Tensor, maps: Tensor) -> Tensor:
+    """Size ``(b, maps, n)`` of the normals of the hyperplanes in the view."""
+    normals = (planes[:, None] @ maps[:, :, None])[..., :-1]
+    return normals.square().sum((-2, -1)).sqrt().clamp(min=torch.finfo(normals.dtype).tiny ** 0.25)
+
+
+def _squares(planes: Tensor, maps: Tensor, p: Tensor) -> Tensor:
+    """Squares ``(b, maps, n)`` of the distances of points from the hyperplanes, as if these were orthogonal."""
+    h = planes[:, None] @ maps[:, :, None]
+    normals = h[..., :-1].square().sum(-1).clamp(min=torch.finfo(h.dtype).tiny)
+    return ((h @ p[:, None, :, :, None])[..., 0].square() / normals).sum(-1)
+
+
+def three_of(data: Matches) -> list[Matches]:
+    """The matches of three views that may tell by themselves whether the motion is unique: of neighbours, and of the ends."""
+    count = len(data.views)
+    pairs = [(1, 2)] if count == 3 else [*((v, v + 1) for v in range(1, count - 1)), (1, count - 1)]
+    return [
+        Matches((data.views[0], data.views[a], data.views[b]), data.weights, data.static, data.batch, data.dtype, data.device)
+        for a, b in pairs
+    ]
+
+
+def still_but_one(motion: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor], limit: Tensor) -> Tensor:
+    """Matches ``(b, n)`` that stand still in all views but one, by squares of distances up to ``limit (b, 1)``."""
+    eye = torch.eye(motion[0].shape[-1], dtype=motion[0].dtype, device=motion[0].device).expand_as(motion[0])
+    maps = torch.stack([eye, *motion], dim=-3)
+    agree = []
+    for chosen in combinations(range(len(views)), len(views) - 1):
+        part = flat_residual(maps[:, list(chosen)], [views[v] for v in chosen], [scales[v] for v in chosen], 1)
+        agree.append(part.square().sum(-1) <= limit)
+    return torch.stack(agree).any(0)

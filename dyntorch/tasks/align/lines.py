@@ -28,8 +28,7 @@ from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations
 from dyntorch.numerics.messages import Message
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import THRESHOLD_SIGMAS
-from dyntorch.tasks.align.options import AlignOptions
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice, AlignOptions, alignment_of
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Lines that move in planes, static lines and static points between two views: residuals, refinement, labels.
@@ -436,18 +435,15 @@ def _result(
     status = torch.where(_has_alternatives(lines, theta, labels, points, doubtful, options), int(Status.AMBIGUOUS), status)
     status = torch.where(extent[:, 0] <= MIN_INFORMATION * extent[:, 1], int(Status.DEGENERATE), status)
     status = torch.where(usable, status, start.status.to(status))
-    none = is_failure(status)
-    labels = torch.where(none[:, None], OUTLIER, labels)
-    zero = none[:, None, None]
-    return Alignment(
-        A=data.back(torch.where(zero, 0.0, A)),
-        B=None,
-        labels=data.back(labels),
-        status=data.back(status),
-        sigma=data.back(torch.where(none, 0.0, sigma)),
-        covariance=data.back(torch.where(zero, 0.0, covariance * sigma.square()[:, None, None])),
+    return alignment_of(
+        data,
+        status,
+        (A,),
+        labels,
+        sigma,
+        covariance * sigma.square()[:, None, None],
         ambiguity=AMBIGUITY,
-        notices=_notices(rank, worst, none, status != Status.TOO_FEW, data.batch, options),
+        notices=_notices(rank, worst, is_failure(status), status != Status.TOO_FEW, data.batch, options),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,28 +11,201 @@ from torch import Tensor
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median, three_sigma
 from dyntorch.core.matches import Matches, matches
-from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
+from dyntorch.core.normalize import denormalize_motion
+from dyntorch.core.outcome import Notice, Status, has_inliers, in_order, is_failure, noting
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY, Solution
-from dyntorch.geometry.calibrated_cameras import calibrations
-from dyntorch.geometry.homogeneous import cofactors, homogeneous, inhomogeneous
+from dyntorch.geometry.bundle import calibrations
+from dyntorch.geometry.homogeneous import cofactors, homogeneous, nonzero_sign
+from dyntorch.geometry.rigid import CommonPlane, PlaneMotion, motion_over, plane_motions
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
-from dyntorch.numerics.blocks import one_thread, select
+from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.least_squares import LeastSquaresOptions, minimize
 from dyntorch.numerics.messages import Message
-from dyntorch.tasks.align.euclidean import euclidean
+from dyntorch.numerics.nullspace import eigenvalues
 from dyntorch.tasks.align.labelling import (
-    ROUGH_LABEL_FACTOR,
-    THRESHOLD_SIGMAS,
     Evidence,
     Labelled,
+    motion_of_all,
+    moving_points,
     normalized_motion,
-    static_consensus,
+    static_start,
+    still_but_one,
+    three_of,
+    trajectory_lines,
+    without_failures,
 )
-from dyntorch.tasks.align.options import AlignOptions
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
-from dyntorch.tasks.align.several import motion_of_all, moving_points, still_but_one, three_of
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice, AlignOptions, status_of_alignment
+
+# ----------------------------------------------------------------------------------------------------------------------
+# align_planar(calibration=): how calibrated cameras turned and moved, and the plane below the points.
+
+
+MAX_NORMAL_STEPS = 30  # of each descent on the normal of the plane
+LENGTH_ROUNDING = 1e-9  # relative deviation from equal lengths: homographies of pixels lose 6 of 16 digits
+MAX_EQUIVALENT_CHI_SQUARE = 9.0  # beyond the least, up to which a plane explains as well: three standard deviations
+MAX_HIDDEN_SHARE = 0.02  # of points behind cameras, beyond the least, up to which a plane shows them as well
+MIN_NORMAL_ANGLE = 0.03  # radians from which two normals are two
+MIN_NORMAL_DEVIATIONS = 3.0  # and besides so many standard deviations
+MAX_NORMAL_DEVIATION = 0.3  # radians; a camera that only turns leaves 1 and more
+MAX_CALIBRATION_MISFIT = 5.0  # chi-square over its quantile of three standard deviations
+MIN_LENGTH_DEVIATION = 0.003  # relative, that a calibration to two or three digits leaves
+
+
+class CalibratedViews(NamedTuple):
+    """Homographies between calibrated views of a plane, flat batch, and what was seen of it."""
+
+    inverse: Tensor
+    """``(b, v, 3, 3)`` N, every further view to view 1, of middle singular value 1 and the sign that keeps depths positive."""
+    covariance: Tensor
+    """``(b, 9 v, 9 v)`` of its entries; 0 where it is not known."""
+    known: Tensor
+    """``(b,)`` where it is."""
+    fine: Tensor
+    """``(b,)`` where there is a motion."""
+    rays: Tensor
+    """``(b, v + 1, n, 3)`` in calibrated coordinates, the first ones of view 1."""
+    counts: Tensor
+    """``(b, n)`` bool: matches that are inliers."""
+
+    @classmethod
+    def of(cls, solution: Solution, data: Matches, labels: Tensor, K: Tensor) -> CalibratedViews:
+        """Of a solution and its labels ``(b, n)``, with K ``(b, v + 1, 3, 3)``."""
+        back = torch.linalg.inv(K)
+        motion = denormalize_motion(solution.invariant, solution.normalized_motion(), solution.normalization.transforms)
+        solved = has_inliers(solution.status.reshape(-1))
+        A = torch.stack(list(motion), dim=1)
+        N = back[:, :1] @ A @ K[:, 1:]
+        fine = solved & N.isfinite().flatten(1).all(-1) & (torch.linalg.det(N) != 0).all(-1)
+        eye = torch.eye(3, dtype=N.dtype, device=N.device)
+        N = torch.where(fine[:, None, None, None], N, eye)
+        b, v = N.shape[:2]
+        # the entries of X A Y, row by row, are those of A times kron(X, Y^T)
+        by = torch.einsum("bij,bvlk->bvikjl", back[:, 0], K[:, 1:]).reshape(b, v, 9, 9)
+        rays = homogeneous(torch.stack(data.views, dim=1)) @ back.mT
+        counts = (labels != OUTLIER) & (data.weights > 0)
+        mapped = (N @ rays[:, 1:].mT)[..., 2, :]
+        sign = nonzero_sign((mapped.sign() * counts[:, None]).sum(-1))
+        scale = sign / torch.linalg.svdvals(N)[..., 1]
+        by = by * scale[..., None, None]
+        assert solution.covariance is not None
+        C = solution.covariance
+        known = fine & C.isfinite().flatten(1).all(-1)
+        C = torch.einsum("bvkp,bvpwq,bwlq->bvkwl", by, torch.where(C.isfinite(), C, 0.0).view(b, v, 9, v, 9), by)
+        C = torch.where(known[:, None, None], C.reshape(b, 9 * v, 9 * v), 0.0)
+        return cls(scale[..., None, None] * N, C, known, fine, rays, counts)
+
+    def repeated(self, count: int) -> CalibratedViews:
+        """Every problem so many times in a row."""
+        return CalibratedViews(*(part.repeat_interleave(count, 0) for part in self))
+
+    def plane(self) -> CommonPlane:
+        """The least squares problem of the normal."""
+        return CommonPlane(inverse=self.inverse, covariance=self.covariance, floor=LENGTH_ROUNDING)
+
+    def oriented(self, normal: Tensor) -> Tensor:
+        """The normals ``(b, 3)`` or their opposites, such that most of the plane that view 1 sees lies before it."""
+        depth = (self.rays[:, 0] @ normal[..., None])[..., 0]
+        return normal * nonzero_sign((depth.sign() * self.counts).sum(-1, keepdim=True))
+
+    def behind(self, normal: Tensor) -> Tensor:
+        """Greatest share over the views ``(b,)`` of matches whose ray meets the plane behind the camera."""
+        mapped = torch.cat([self.rays[:, :1], self.rays[:, 1:] @ self.inverse.mT], dim=1)
+        wrong = ((mapped @ normal[:, None, :, None])[..., 0] <= 0) & self.counts[:, None]
+        return (wrong.sum(-1) / self.counts.sum(-1).clamp(min=1)[:, None]).amax(-1)
+
+    def motion(self, normal: Tensor) -> PlaneMotion:
+        """Rotations and translations ``(b, v + 1, ...)`` of all views, the first included, above the plane of a normal."""
+        H = torch.linalg.inv_ex(self.plane().correct_homographies(normal))[0]
+        rotation, translation = motion_over(torch.where(H.isfinite(), H, 0.0), normal[:, None].expand(*H.shape[:2], 3))
+        eye = torch.eye(3, dtype=H.dtype, device=H.device).expand(len(H), 1, 3, 3)
+        return PlaneMotion(
+            torch.cat([eye, rotation], dim=1), torch.cat([torch.zeros_like(translation[:, :1]), translation], dim=1), normal
+        )
+
+
+class PlaneChoice(NamedTuple):
+    """The normal of each problem, and what speaks for it."""
+
+    normal: Tensor
+    """``(b, 3)``."""
+    other: Tensor
+    """``(b, 3)`` one that explains the homographies as well; 0 where there is none."""
+    cost: Tensor
+    """``(b,)`` chi-square of ``2 v - 2`` degrees of freedom."""
+    misfit: Tensor
+    """``(b,)`` rms of the conditions."""
+    deviation: Tensor
+    """``(b,)`` standard deviation of the normal in its worst direction, radians."""
+
+
+def chosen_plane(views: CalibratedViews) -> PlaneChoice:
+    """The plane that explains the homographies best, and before the cameras, from either solution of every view."""
+    inverse = views.inverse
+    b = len(inverse)
+    starts = plane_motions(torch.linalg.inv(inverse)).normal.flatten(1, 2)
+    count = starts.shape[1]
+    wide = views.repeated(count)
+    problem = wide.plane()
+    found = minimize(problem, problem.evaluate((starts.flatten(0, 1),)), LeastSquaresOptions(iterations=MAX_NORMAL_STEPS))
+    flat = wide.oriented(found.theta[0])
+    normal, cost, wrong = flat.view(b, count, 3), found.cost.view(b, count), wide.behind(flat).view(b, count)
+    fits = cost <= cost.amin(-1, keepdim=True) + MAX_EQUIVALENT_CHI_SQUARE
+    fits = fits & (wrong <= torch.where(fits, wrong, torch.inf).amin(-1, keepdim=True) + MAX_HIDDEN_SHARE)
+    best = torch.where(fits, cost, torch.inf).argmin(-1)
+    row = torch.arange(b, device=best.device)
+    chosen = normal[row, best]
+    r, turns, weight, _ = views.plane().weighted(chosen)
+    deviation = eigenvalues(turns.mT @ weight @ turns)[:, 0].clamp(min=torch.finfo(r.dtype).tiny).rsqrt()
+    apart = fits & ((normal - chosen[:, None]).norm(dim=-1) > MIN_NORMAL_ANGLE + MIN_NORMAL_DEVIATIONS * deviation[:, None])
+    second = normal[row, torch.where(apart, cost, torch.inf).argmin(-1)]
+    return PlaneChoice(
+        chosen,
+        torch.where(apart.any(-1)[:, None], second, 0.0),
+        cost[row, best],
+        r.square().mean(-1).sqrt(),
+        deviation,
+    )
+
+
+def euclidean(solution: Solution, data: Matches, labels: Tensor, K: Tensor) -> tuple[PlaneMotion, PlaneMotion, list[Notice]]:
+    """Motion of calibrated cameras above a plane, another that explains the matches as well, and what limits both. labels
+    ``(b, n)``, K ``(b, views, 3, 3)``."""
+    views = CalibratedViews.of(solution, data, labels, K)
+    choice = chosen_plane(views)
+    free = views.fine & (choice.deviation > MAX_NORMAL_DEVIATION)
+    several = views.fine & ~free & (choice.other != 0).any(-1)
+    degrees = 2 * views.inverse.shape[1] - 2
+    odd = views.known & (choice.cost > MAX_CALIBRATION_MISFIT * three_sigma(degrees)) & (choice.misfit > MIN_LENGTH_DEVIATION)
+    notices, note = noting(data.batch)
+    note(AlignNotice.PLANE_OPEN, choice.deviation.clamp(max=9.9), free)
+    note(AlignNotice.TWO_PLANES, _angle(choice.normal, choice.other), several)
+    note(AlignNotice.CALIBRATION, choice.misfit, odd & ~free)
+    first = views.motion(choice.normal)
+    second = views.motion(torch.where(several[:, None], choice.other, choice.normal))
+    return _to_batch(first, views.fine, ~free, data), _to_batch(second, several, several, data), notices
+
+
+def _angle(first: Tensor, second: Tensor) -> Tensor:
+    """Degrees between directions ``(b, 3)``."""
+    return torch.rad2deg(torch.atan2(torch.linalg.cross(first, second).norm(dim=-1), (first * second).sum(-1)))
+
+
+def _to_batch(motion: PlaneMotion, turned: Tensor, determined: Tensor, data: Matches) -> PlaneMotion:
+    """Zero where there is no rotation, and where the plane, in units of whose distance translations are, is not determined."""
+    both = turned & determined
+    return PlaneMotion(
+        data.back(torch.where(turned[:, None, None, None], motion.rotations, 0.0)),
+        data.back(torch.where(both[:, None, None], motion.translations, 0.0)),
+        data.back(torch.where(both[:, None], motion.normal, 0.0)),
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# align_planar(): the motion of a camera over a plane on which points stand still, move, or are mismatched.
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What should be known about the matches of a plane before its result is trusted.
@@ -52,11 +225,9 @@ MIN_STATIC_SUPPORT = 10  # static matches that decide such a family; a wrong mot
 STATIC_SUPPORT_FACTOR = 3.0  # static matches for each that is expected by chance, besides
 CHANCE_LIMIT_FACTOR = 3.0  # times the limit of static matches within which those that are static by chance spread evenly
 MIN_LINE_WIDTH = 3.0  # standard deviations of the noise across a line of points, below which they may as well lie on it
-MAX_TRAJECTORY_DISTANCE = 3.0  # standard deviations of the noise from a trajectory line
 NUM_PLANAR_SAMPLES = 1000  # of four: 96 % to draw four static ones where they are 24 % of all
 MAX_PLANAR_STEPS = 30  # of the final refinement
 MAX_DEVIATION = 0.5  # of the worst direction of a motion of norm 1, above which it is not known at all
-MIN_SINGULAR_RATIO = 1e-3  # of a homography in normalized coordinates; usually above .1
 MAX_NOISE_RATIO = 1.3  # shown by the inliers over assumed; random matches fill the limits evenly (1.7)
 MIN_NOISY_INLIER_SHARE = 0.7  # where the inliers show more noise than that
 MIN_SPARE_PLANAR = 8  # conditions beyond the 16 degrees of freedom that inliers must fulfil
@@ -70,8 +241,7 @@ def planar_notices(
     data = evidence.data
     rank, strength = tensor
     solved = ~is_failure(status)
-    moving = best.labels == MOVING
-    count = moving.sum(-1)
+    count = (best.labels == MOVING).sum(-1)
     found, note = noting(batch)
     full = HomographyTensor.width() - 1
     note(AlignNotice.DEGENERATE, rank, solved & (rank < full))
@@ -79,7 +249,7 @@ def planar_notices(
     family = (status == Status.AMBIGUOUS) & is_undecided(evidence, best, tensor)
     note(AlignNotice.OTHER_SOLUTION, (best.labels == STATIC).sum(-1), family)
     note(AlignNotice.FEW_MOVING, count, solved & (count < FEWEST), least=f"{FEWEST}")
-    lines = trajectory_lines(evidence, best, moving)
+    lines = trajectory_lines(evidence, best, LINES)
     note(AlignNotice.FEW_LINES, lines, solved & (lines > 0) & (lines < LINES), least=LINES)
     note(AlignNotice.ONE_LINE, lines, solved & (lines == 1))
     thin = thinness(evidence, best.sigma)
@@ -135,32 +305,6 @@ def unverified_matches(evidence: Evidence, best: Labelled) -> Tensor:
     limit = three_sigma(2) * best.sigma.square()[:, None]
     agree = torch.stack([pair.square().sum(-1) <= limit for pair in pairs])
     return agree.any(0) & (evidence.data.weights > 0)
-
-
-def trajectory_lines(evidence: Evidence, best: Labelled, moving: Tensor) -> Tensor:
-    """How many lines hold the paths of all moving matches ``(b,)``, counted up to LINES."""
-    parts = evidence.problem(best.labels).parts(best.theta)
-    places = torch.stack(
-        [evidence.views[0], *(inhomogeneous(homogeneous(x) @ m.mT) for m, x in zip(parts, evidence.views[1:], strict=True))]
-    )
-    ends = torch.stack([places[b] - places[a] for a, b in combinations(range(len(places)), 2)])
-    length, widest = ends.norm(dim=-1).max(dim=0)
-    along = ends.gather(0, widest[None, ..., None].expand(1, -1, -1, 2))[0] / length[..., None].clamp(min=1e-12)
-    normal = torch.stack([-along[..., 1], along[..., 0]], dim=-1)
-    problem = torch.arange(len(length), device=length.device)
-    left, count = moving, torch.zeros(len(length), dtype=torch.long, device=length.device)
-    noise = MAX_TRAJECTORY_DISTANCE * (evidence.norm.scales[0] * best.sigma)[:, None]
-    for _ in range(LINES):
-        longest = torch.where(left, length, -1.0).argmax(-1)
-        centre, across, base = places[:, problem, longest].mean(0), normal[problem, longest], length[problem, longest]
-        offset = places - centre[:, None]
-        distance = (offset * across[:, None]).sum(-1).abs()
-        # away from the path its line is known by angle only
-        reach = 1 + offset.norm(dim=-1) / base[:, None].clamp(min=1e-12)
-        count = count + left.any(-1)
-        left = left & ~(distance <= noise * reach).all(0)
-        left = left.index_put((problem, longest), torch.zeros_like(problem, dtype=torch.bool))
-    return count
 
 
 def thinness(evidence: Evidence, sigma: Tensor) -> Tensor:
@@ -317,48 +461,16 @@ def _align(
 
 def _search(evidence: Evidence, threshold: float | None, generator: torch.Generator | None, options: AlignOptions) -> Labelled:
     """The better one of the motions that the two searches start from, with its labels."""
-    size = len(evidence.floor)
-    given = None if threshold is None else torch.full_like(evidence.floor, threshold / THRESHOLD_SIGMAS).maximum(evidence.floor)
-    starts = [_from_static(evidence, given, generator, options)]
-    if MINIMAL <= evidence.data.count < FEW:
+    given, count = evidence.given_noise(threshold), evidence.data.count
+    starts = [static_start(evidence, given, options.num_samples or NUM_PLANAR_SAMPLES, generator)]
+    if MINIMAL <= count < FEW:
         starts.append(_from_all(evidence, given, generator))
-    if size and evidence.data.count >= (MINIMAL if given is not None else FEW):
+    if len(evidence.floor) and count >= (MINIMAL if given is not None else FEW):
         starts.append(_from_tensor(evidence, given, generator))
-    count = len(starts)
     # the smaller estimate is that of a motion most matches agree with; it may still be low, for static matches show half the noise
     sigma = given if given is not None else 1.5 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
-    several, noise = evidence.repeated(count), sigma.repeat(count)
-    rough = torch.arange(count, device=sigma.device).repeat_interleave(size) == 0
-    theta = several.improved(torch.cat([start for start, _ in starts]), noise, rough)
-    cost = torch.where(_singular(theta), torch.inf, several.cost(theta, noise))
-    best = cost.unflatten(0, (count, size)).argmin(0)
-    chosen = theta[best * size + torch.arange(size, device=best.device)]
-    return evidence.settled(chosen, sigma, estimate=given is None)
-
-
-def _singular(theta: Tensor) -> Tensor:
-    """Whether a motion ``(b, 9 maps)`` takes the plane to a line or a point, which fulfils every match and explains none."""
-    values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (-1, 3, 3)))
-    return (values[..., 2] < MIN_SINGULAR_RATIO * values[..., 0]).any(-1)
-
-
-def _from_static(
-    evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, options: AlignOptions
-) -> tuple[Tensor, Tensor]:
-    """Motion on which the most matches agree that they stand still, and the noise by their median."""
-    data = evidence.data
-    pool = data.weights > 0
-    if data.static is not None:
-        known = pool & data.static
-        pool = torch.where((known.sum(-1) >= 4)[:, None], known, pool)
-    scale = evidence.norm.scales[0]
-    # each distance has the noise of two views
-    limit = None if given is None else 2 * three_sigma(evidence.still) * (ROUGH_LABEL_FACTOR * scale * given).square()
-    motion, variance = static_consensus(evidence.views, pool, limit, options.num_samples or NUM_PLANAR_SAMPLES, generator)
-    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
-    # static_consensus divides by the median of 4 conditions; more views have more
-    variance = variance * (median(4) / median(evidence.still))
-    return theta, variance.nan_to_num(posinf=1.0).sqrt() / scale if given is None else given
+    theta = evidence.improve_starts([start for start, _ in starts], sigma, sampled=True)
+    return evidence.settled(evidence.best_start(theta, sigma), sigma, estimate=given is None)
 
 
 def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
@@ -410,25 +522,13 @@ def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tupl
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
-    assert refined.sigma is not None and refined.covariance is not None
+    assert refined.sigma is not None
     best = Labelled(theta, labels, best.sigma)
     tensor = tensor_rank(evidence.data.restrict(labels != OUTLIER), evidence, best.sigma)
     free = (worst > MAX_DEVIATION) | is_undecided(evidence, best, tensor)
     status = _status(evidence, best, refined.sigma, free, values[:, 0] <= MIN_INFORMATION * values[:, -1])
-    none = is_failure(status)
-    labels = torch.where(none[:, None], OUTLIER, labels)
-    zero = none[:, None, None]
-    solution = replace(
-        refined,
-        status=status,
-        tensor=select(~none, refined.tensor, 0.0),
-        normalized=select(~none, refined.normalized, 0.0),
-        covariance=torch.where(zero, 0.0, refined.covariance),
-        sigma=torch.where(none, 0.0, refined.sigma),
-        uncertainty=torch.where(none, 0.0, worst),
-        inliers=labels != OUTLIER,
-    )
-    return solution, replace(best, labels=labels), tensor
+    labels = torch.where(is_failure(status)[:, None], OUTLIER, labels)
+    return without_failures(refined, status, labels, worst), replace(best, labels=labels), tensor
 
 
 def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor) -> Tensor:
@@ -444,8 +544,4 @@ def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, und
         | (evidence.still * still + evidence.invariant.codim * moving < evidence.invariant.dof + MIN_SPARE_PLANAR)
     )
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    status = torch.full_like(present, int(Status.OK))
-    status = torch.where(free, int(Status.AMBIGUOUS), status)
-    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
-    status = torch.where(undetermined, int(Status.DEGENERATE), status)
-    return torch.where((present < MINIMAL) & (known < 4), int(Status.TOO_FEW), status)
+    return status_of_alignment(free, accident, undetermined, (present < MINIMAL) & (known < 4))

@@ -2,30 +2,211 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
+from dyntorch.core.fit import fit_matches
+from dyntorch.core.invariant import Invariant
+from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median
 from dyntorch.core.matches import Matches, matches
+from dyntorch.core.outcome import Notice, in_order, is_failure, noting
+from dyntorch.core.residual import whitened_residual
+from dyntorch.core.robust import robust_fit
+from dyntorch.core.solution import NOISY, Solution
+from dyntorch.invariants.join_tensor import JoinTensor
+from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.messages import Message
-from dyntorch.tasks.align import join, rigid, velocity
-from dyntorch.tasks.align.options import AlignOptions
-from dyntorch.tasks.align.result import Alignment
-from dyntorch.tasks.align.several import moving_points
+from dyntorch.tasks.align import rigid, velocity
+from dyntorch.tasks.align.labelling import (
+    Evidence,
+    Labelled,
+    motion_of_all,
+    moving_points,
+    normalized_motion,
+    static_start,
+    trajectory_lines,
+    without_failures,
+)
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice, AlignOptions, status_of_alignment
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Projective motions of a sensor among points of space that move on straight lines.
+
+
+MIN_JOIN = 47
+MIN_LABELLED_JOIN = 9
+"""Fewest matches where some are labelled static: five determine A and B, and room to tell static from moving."""
+MIN_MOVERS, MIN_LINES = 40, 10
+"""Moving matches, and lines they lie on, that determine the tensors where nothing stands still (thesis section 8.2)."""
+ENOUGH = 5  # static matches that determine A and B by themselves
+
+AMBIGUITY = Message(
+    "A and B are unique, each up to its scale, unless the steps of all points keep one ratio (constant velocity): then they are "
+    "known up to a velocity common to all points; use {arg:model='constant_velocity'}. A match that agrees in two views only "
+    "counts as "
+    "moving: a point that paused and a static point mismatched in the third view look the same."
+)
+
+
+MORE_VIEWS = Message(
+    "The collineations are unique, each up to its scale, unless the steps of all points keep one ratio (constant velocity): then "
+    "they are known up to a velocity common to all points. A match that agrees in all views but one counts as moving: a point that "
+    "paused and a static point mismatched in that view look the same."
+)
+
+
+MIN_JOIN_MATCHES = 60  # from which on the join tensor itself gives a start
+NUM_JOIN_SAMPLES = 1000  # of five: 97 % to draw five static ones where they are 20 % of all
+MAX_JOIN_STEPS = 30  # of the final refinement
+MAX_JOIN_DEVIATION = 0.5  # of the worst direction of a motion of norm 1, above which it is not known at all
+MIN_SPARE_JOIN = 10  # conditions beyond the degrees of freedom that inliers must fulfil
+
+
+def align_join(
+    data: Matches, threshold: float | None, model: str, generator: torch.Generator | None, options: AlignOptions
+) -> Alignment:
+    """:func:`dyntorch.align_points` with a join tensor, for checked matches."""
+    evidence = Evidence.of(moving_points(3, len(data.views)), data)
+    best = _search(evidence, threshold, model, generator, options)
+    solution, labels, worst = _solve(evidence, best)
+    outcome = solution.back(data)
+    A, B, *others = outcome.motion
+    assert outcome.sigma is not None and outcome.covariance is not None
+    return Alignment(
+        A=A,
+        B=B,
+        labels=data.back(labels),
+        status=outcome.status,
+        sigma=outcome.sigma,
+        covariance=outcome.covariance,
+        ambiguity=MORE_VIEWS if others else AMBIGUITY,
+        notices=_notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch, options),
+        solution=outcome,
+        others=tuple(others),
+    )
+
+
+def _search(
+    evidence: Evidence, threshold: float | None, model: str, generator: torch.Generator | None, options: AlignOptions
+) -> Labelled:
+    """The best of the motions that static samples and the tensors lead to."""
+    given = evidence.given_noise(threshold)
+    starts = [static_start(evidence, given, options.num_samples or NUM_JOIN_SAMPLES, generator)]
+    if evidence.data.count >= MIN_JOIN:
+        starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator))
+    full, size = model == "join" and evidence.data.count >= MIN_JOIN_MATCHES, len(evidence.floor)
+    if given is None:
+        if full:
+            starts.append(_from_tensor(JoinTensor(), evidence, None, generator))
+        # the least estimate is that of a motion most matches agree with; it may be low, for static matches show half the noise
+        sigma = 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
+        theta = evidence.improve_starts([start for start, _ in starts], sigma, sampled=True)
+    else:
+        sigma, theta = given, evidence.improve_starts([start for start, _ in starts], given, sampled=True)
+        # where the noise is known, so is whether the motion of the minimal tensor is the right one
+        doubt = _doubt(evidence, theta[-size:], given) if full else torch.zeros_like(given)
+        if bool(doubt.any()):
+            last, _ = _from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator)
+            theta = torch.cat([theta, evidence.improve_starts([last], given, sampled=False)])
+    return evidence.settled(evidence.best_start(theta, sigma), sigma, estimate=given is None)
+
+
+def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
+    """1 for problems ``(b,)`` whose motion fewer than half of the matches agree with, or fewer moving ones than determine one."""
+    labels, invariant = evidence.labels(theta, sigma), evidence.invariant
+    moving, agreeing, present = ((labels == MOVING).sum(-1), (labels != OUTLIER).sum(-1), (evidence.data.weights > 0).sum(-1))
+    return ((2 * agreeing <= present) | (moving * invariant.codim <= invariant.dof)).to(theta)
+
+
+def _from_tensor(
+    invariant: Invariant, evidence: Evidence, given: Tensor | None, generator: torch.Generator | None
+) -> tuple[Tensor, Tensor]:
+    """Motion of a tensor by robust estimation, and the noise that the median of all matches shows."""
+    data = evidence.data
+    # of so few matches no half determines a motion, so that the noise cannot be told from outliers
+    plain = (given is None and data.count < 3 * JoinTensor.dof) or not len(data.weights)
+
+    def solve(views: tuple[Tensor, ...]) -> Solution:
+        if plain:
+            return fit_matches(invariant, replace(data, views=views, static=None))
+        return robust_fit(invariant, *views, threshold=given, weights=data.weights, generator=generator)
+
+    motion, found = motion_of_all(evidence, solve, given, generator)
+    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
+    usable = theta.isfinite().all(-1) & ~is_failure(found.status.reshape(-1))
+    identity = torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(len(motion)) / 2
+    theta = torch.where(usable[:, None], theta, identity)
+    if given is not None:
+        return theta, given
+    if plain:
+        refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_JOIN_STEPS)
+        assert refined.sigma is not None
+        theta, noise = normalized_motion(refined), refined.sigma
+    else:
+        parts = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
+        moving = whitened_residual(evidence.invariant, parts, evidence.views, evidence.norm.scales).square().sum(-1)
+        middle = torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values
+        noise = (middle / median(evidence.invariant.codim)).sqrt()
+    return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
+
+
+def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
+    """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
+    refined = evidence.refined(best.theta, best.labels, MAX_JOIN_STEPS)
+    theta = normalized_motion(refined)
+    values, spread = evidence.information(theta, best.labels)
+    labels = evidence.labels(theta, best.sigma, spread)
+    worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
+    status = _status(evidence, replace(best, labels=labels), worst, values[:, 0] <= MIN_INFORMATION * values[:, -1])
+    labels = torch.where(is_failure(status)[:, None], OUTLIER, labels)
+    return without_failures(refined, status, labels, worst), labels, worst
+
+
+def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Tensor) -> Tensor:
+    usable = evidence.data.weights > 0
+    present = usable.sum(-1)
+    known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
+    still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
+    conditions = evidence.still * still + evidence.invariant.codim * moving
+    accident = (still + moving < MIN_CONSENSUS * present) | (conditions < evidence.invariant.dof + MIN_SPARE_JOIN)
+    accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
+    few = (present < MIN_JOIN) & (known < ENOUGH)
+    return status_of_alignment(worst > MAX_JOIN_DEVIATION, accident, undetermined, few)
+
+
+def _notices(
+    evidence: Evidence, best: Labelled, worst: Tensor, status: Tensor, batch: tuple[int, ...], options: AlignOptions
+) -> tuple[Notice, ...]:
+    solved = ~is_failure(status)
+    moving, still = (best.labels == MOVING).sum(-1), (best.labels == STATIC).sum(-1)
+    found, note = noting(batch)
+    note(AlignNotice.FEW_MOVING, moving, solved & (moving < MIN_MOVERS) & (still < ENOUGH), least=f"{MIN_MOVERS} and more")
+    note(AlignNotice.NEAR_STATIC, moving, solved & (moving < MIN_LINES) & (still >= ENOUGH), case="matches")
+    lines = trajectory_lines(evidence, best, MIN_LINES)
+    note(AlignNotice.FEW_LINES, lines, solved & (moving > lines) & (lines < MIN_LINES), least=MIN_LINES)
+    note(AlignNotice.UNCERTAIN, worst, solved & (worst > options.max_deviation), case="matches", what="motion")
+    return in_order(found)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# align_points(): the motion of a 3D sensor among points of space that stand still, move, or are mismatched.
+
 
 Model = Literal["join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid"]
 Motion = Literal["straight", "constant_velocity"]
 LEAST = {
-    "join": join.MINIMAL["join"],
-    "minimal_join": join.MINIMAL["minimal_join"],
+    "join": MIN_JOIN,
+    "minimal_join": MIN_JOIN,
     "constant_velocity": velocity.MINIMAL[False],
     "affine_constant_velocity": velocity.MINIMAL[True],
     "rigid": 3,
 }
-LABELLED = {**LEAST, "join": join.LABELLED, "minimal_join": join.LABELLED}
+LABELLED = {**LEAST, "join": MIN_LABELLED_JOIN, "minimal_join": MIN_LABELLED_JOIN}
 """Fewest matches where some are labelled static."""
 
 
@@ -34,7 +215,7 @@ def align_points(
     P1: Tensor,
     P2: Tensor,
     P3: Tensor,
-    *more: Tensor | Model,
+    *more: Tensor,
     model: Model = "join",
     motion: Motion = "straight",
     threshold: float | None = None,
@@ -105,7 +286,7 @@ def align_points(
         >>> bool((result.A - A).abs().max() < 0.05), bool((result.labels == 2).all())
         (True, True)
     """
-    views, model = _views_and_model((P1, P2, P3, *more), model)
+    views = (P1, P2, P3, *more)
     if model not in get_args(Model):
         raise ValueError(f"model must be one of {', '.join(get_args(Model))}, got {model!r}")
     if motion not in get_args(Motion):
@@ -127,27 +308,8 @@ def align_points(
         text = "align_points with {arg:model='{model}'} needs at least {least} matches, got {count}; add matches"
         raise ValueError(Message(text, model=model, least=least, count=data.count))
     with torch.no_grad():
-        return _dispatch(data, model, threshold, motion, generator, options)
-
-
-def _views_and_model(given: tuple[Tensor | Model, ...], model: Model) -> tuple[tuple[Tensor, ...], Model]:
-    """The views, and the model, which stood behind three of them before there could be more."""
-    last = given[-1]
-    if isinstance(last, str):
-        given, model = given[:-1], last
-    views = tuple(x for x in given if not isinstance(x, str))
-    if len(views) < len(given):
-        raise ValueError(
-            f"model stands behind the views or is given by name, got {[x for x in given if isinstance(x, str)]} before"
-        )
-    return views, model
-
-
-def _dispatch(
-    data: Matches, model: str, threshold: float | None, motion: str, generator: torch.Generator | None, options: AlignOptions
-) -> Alignment:
-    if model == "rigid":
-        return rigid.align_rigid(data, threshold, motion, generator, options)
-    if model in ("join", "minimal_join"):
-        return join.align_join(data, threshold, model, generator, options)
-    return velocity.align_velocity(data, threshold, model == "affine_constant_velocity", generator, options)
+        if model == "rigid":
+            return rigid.align_rigid(data, threshold, motion, generator, options)
+        if model in ("join", "minimal_join"):
+            return align_join(data, threshold, model, generator, options)
+        return velocity.align_velocity(data, threshold, model == "affine_constant_velocity", generator, options)

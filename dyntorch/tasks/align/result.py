@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, has_inliers
+from dyntorch.core.matches import Matches
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, has_inliers, is_failure
 from dyntorch.core.solution import Solution
-from dyntorch.geometry.plane_motion import PlaneMotion
+from dyntorch.geometry.rigid import PlaneMotion
 
 OUTLIER, STATIC, MOVING = 0, 1, 2
 
@@ -222,5 +223,51 @@ class Alignment(Outcome):
         return "\n".join(lines + self.warning_lines())
 
 
+def status_of_alignment(ambiguous: Tensor, accident: Tensor, undetermined: Tensor, few: Tensor) -> Tensor:
+    """The gravest status ``(b,)`` of: the noise leaves other motions, too little agrees, several fit exactly, too few matches."""
+    status = torch.where(ambiguous, int(Status.AMBIGUOUS), int(Status.OK))
+    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
+    status = torch.where(undetermined, int(Status.DEGENERATE), status)
+    return torch.where(few, int(Status.TOO_FEW), status)
+
+
+def alignment_of(
+    data: Matches, status: Tensor, motion: Sequence[Tensor], labels: Tensor, sigma: Tensor, covariance: Tensor, **more: Any
+) -> Alignment:
+    """The result of a flat batch in the caller's; zero, and all matches outliers, where there is no motion."""
+    none = is_failure(status)
+
+    def back(value: Tensor) -> Tensor:
+        return data.back(torch.where(none[(..., *[None] * (value.ndim - 1))], torch.zeros_like(value), value))
+
+    A, *others = map(back, motion)
+    return Alignment(
+        A=A,
+        B=others[0] if others else None,
+        labels=back(labels),
+        status=data.back(status),
+        sigma=back(sigma),
+        covariance=back(covariance),
+        **more,
+    )
+
+
 def _median(values: Tensor) -> float:
     return float(values.reshape(-1).double().nan_to_num().median())
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What a user of align_planar(), align_points() or align_lines() may know of his data, or pays with.
+
+
+@dataclass(frozen=True)
+class AlignOptions:
+    """What :func:`dyntorch.align_planar`, :func:`dyntorch.align_points` and :func:`dyntorch.align_lines` take and expect."""
+
+    num_samples: int | None = None
+    """Minimal samples drawn (time); None is what each model needs at 20 to 40 % of static matches: 60 to 2000."""
+    min_static_share: float = 0.1
+    """Share of the matches (and at least 3) that must have one velocity to be taken for the static background, where all are at
+    constant velocity."""
+    max_deviation: float = 0.05
+    """Standard deviation of the worst direction of a motion of norm 1 (rigid: radians, or sizes of the scene) without a notice."""

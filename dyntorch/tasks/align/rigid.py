@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dyntorch.core.limits import MIN_CONSENSUS, median, three_sigma
 from dyntorch.core.matches import Matches
-from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
+from dyntorch.core.outcome import Notice, in_order, is_failure, noting
 from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import similarity, skew
 from dyntorch.geometry.rigid import moved_by, rigid_alignment
@@ -18,8 +18,16 @@ from dyntorch.numerics.blocks import each, map_blocks, uniform
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import THRESHOLD_SIGMAS
-from dyntorch.tasks.align.options import AlignOptions
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
+from dyntorch.tasks.align.result import (
+    MOVING,
+    OUTLIER,
+    STATIC,
+    Alignment,
+    AlignNotice,
+    AlignOptions,
+    alignment_of,
+    status_of_alignment,
+)
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Two rigid motions from points that move: :math:`x_1, A x_2, B x_3` on a straight line, or at equal steps on it.
@@ -432,20 +440,20 @@ def _result(
     # a noise beyond the range of the numbers is not known, and nor is the covariance
     known = found.sigma.isfinite() & entries.isfinite().flatten(1).all(-1)
     entries = torch.where(known[:, None, None], entries, torch.inf)
-    u, _, _, _ = combinations(found.motions, sightings)
-    velocity = torch.where((labels == OUTLIER)[..., None], 0.0, -u / 2**0.5 / scale[:, None, None])
-    zero = none[:, None, None]
-    limits = _notices(labels, worst, found.grounded, none, motion, data.batch, options)
-    return Alignment(
-        A=data.back(torch.where(zero, 0.0, matrices[:, 0])),
-        B=data.back(torch.where(zero, 0.0, matrices[:, 1])),
-        labels=data.back(labels),
-        status=data.back(status),
-        sigma=data.back(torch.where(none, 0.0, found.sigma / scale)),
-        covariance=data.back(torch.where(zero, 0.0, entries)),
+    velocities = None
+    if motion == "constant_velocity":
+        u, _, _, _ = combinations(found.motions, sightings)
+        velocities = data.back(torch.where((labels == OUTLIER)[..., None], 0.0, -u / 2**0.5 / scale[:, None, None]))
+    return alignment_of(
+        data,
+        status,
+        matrices.unbind(1),
+        labels,
+        found.sigma / scale,
+        entries,
         ambiguity=AMBIGUITY[motion],
-        notices=limits,
-        velocities=data.back(torch.where(zero, 0.0, velocity)) if motion == "constant_velocity" else None,
+        notices=_notices(labels, worst, found.grounded, none, motion, data.batch, options),
+        velocities=velocities,
     )
 
 
@@ -479,11 +487,7 @@ def _status(
     present = (weights > 0).sum(-1)
     still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
     accident = (still + moving < MIN_CONSENSUS * present) | (6 * still + conditions * moving < dof + MIN_SPARE_RIGID) | noisy
-    status = torch.full_like(present, int(Status.OK))
-    status = torch.where(worst > MAX_RIGID_DEVIATION, int(Status.AMBIGUOUS), status)
-    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
-    status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
-    return torch.where(present < 3, int(Status.TOO_FEW), status)
+    return status_of_alignment(worst > MAX_RIGID_DEVIATION, accident, undetermined & ~accident, present < 3)
 
 
 def _to_point_units(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale: Tensor) -> tuple[Tensor, Tensor]:

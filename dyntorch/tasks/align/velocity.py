@@ -19,9 +19,17 @@ from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
 from dyntorch.numerics.blocks import map_blocks, uniform
 from dyntorch.numerics.least_squares import LeastSquaresOptions, derivatives, minimize
 from dyntorch.numerics.nullspace import spectrum
-from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, THRESHOLD_SIGMAS, Evidence
-from dyntorch.tasks.align.options import AlignOptions
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice
+from dyntorch.tasks.align.labelling import ROUGH_LABEL_FACTOR, Evidence
+from dyntorch.tasks.align.result import (
+    MOVING,
+    OUTLIER,
+    STATIC,
+    Alignment,
+    AlignNotice,
+    AlignOptions,
+    alignment_of,
+    status_of_alignment,
+)
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Points at constant velocity before projective or affine sensors: refinement, the static gauge, labels, the sensor's motion.
@@ -209,7 +217,7 @@ def align_velocity(
 ) -> Alignment:
     """:func:`dyntorch.align_points` with a model of constant velocity, for checked matches."""
     evidence = Evidence.of(ConstantVelocityTensor(), data)
-    given = None if threshold is None else torch.full_like(evidence.floor, threshold / THRESHOLD_SIGMAS).maximum(evidence.floor)
+    given = evidence.given_noise(threshold)
     start = (
         _affine_start(evidence, given, generator, options) if affine else _projective_start(evidence, given, threshold, generator)
     )
@@ -222,20 +230,17 @@ def align_velocity(
     worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
     status = _status(evidence, state, worst, extent[:, 0] <= MIN_INFORMATION * extent[:, 1], found, affine)
     none = is_failure(status)
-    labels = torch.where(none[:, None], OUTLIER, state.labels)
-    zero = none[:, None, None]
     velocities = world_velocities(evidence, state.theta)
-    velocities = torch.where((labels == OUTLIER)[..., None], 0.0, velocities)
-    return Alignment(
-        A=data.back(torch.where(zero, 0.0, motions[:, 0])),
-        B=data.back(torch.where(zero, 0.0, motions[:, 1])),
-        labels=data.back(labels),
-        status=data.back(status),
-        sigma=data.back(torch.where(none, 0.0, state.sigma)),
-        covariance=data.back(torch.where(zero, 0.0, covariance)),
+    return alignment_of(
+        data,
+        status,
+        motions.unbind(1),
+        state.labels,
+        state.sigma,
+        covariance,
         ambiguity=AMBIGUITY,
         notices=_notices(evidence, state, worst, none, affine, data.batch, options),
-        velocities=data.back(velocities),
+        velocities=data.back(torch.where((state.labels == OUTLIER)[..., None], 0.0, velocities)),
     )
 
 
@@ -265,10 +270,7 @@ def _affine_start(
     order = (draws + 2.0 * ~present[:, None]).argsort(-1)[..., :AFFINE_SAMPLE_SIZE]
     noise = None if given is None else given * size
 
-    def run(points: Tensor, weights: Tensor, index: Tensor, sigma: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-        return _affine_consensus(points, weights, index, sigma)
-
-    null, mean, ok = map_blocks(run, nine, data.weights, order, noise, size=VELOCITY_BLOCK)
+    null, mean, ok = map_blocks(_affine_consensus, nine, data.weights, order, noise, size=VELOCITY_BLOCK)
     theta = _affine_maps(null, mean, ok)
     parts = theta.unflatten(-1, (3, 4, 4)).clone()
     parts[..., :3, :] *= (scale / size).mT[..., None, None]
@@ -346,11 +348,9 @@ def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: 
         6 * still + 3 * moving < dof + MIN_SPARE_VELOCITY * (present > MINIMAL[affine] + 1)
     )
     accident = accident | (state.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    status = torch.where(worst > MAX_VELOCITY_DEVIATION, int(Status.AMBIGUOUS), torch.zeros_like(present))
-    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
-    status = torch.where(undetermined & ~accident, int(Status.DEGENERATE), status)
-    status = torch.where(found != Status.OK, found.to(status), status)
-    return torch.where(present < MINIMAL[affine], int(Status.TOO_FEW), status)
+    few = present < MINIMAL[affine]
+    status = status_of_alignment(worst > MAX_VELOCITY_DEVIATION, accident, undetermined & ~accident, few)
+    return torch.where((found != Status.OK) & ~few, found.to(status), status)
 
 
 def _notices(

@@ -16,8 +16,8 @@ from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import Notice, Status, is_failure, select_problem, solve_one_by_one, trim_padding
 from dyntorch.core.residual import sampson
 from dyntorch.core.robust import robust_fit
-from dyntorch.geometry.body import BodyProblem, FilmedBody, fit_body
 from dyntorch.geometry.homogeneous import homogeneous, similarity, skew
+from dyntorch.geometry.rigid import BodyProblem, FilmedBody, fit_body
 from dyntorch.geometry.triangulation import reproject, triangulate
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold, check_together, on_cpu

@@ -37,8 +37,7 @@ from dyntorch.tasks.planes.notices import (
     planes_notices,
     rotation_distance,
 )
-from dyntorch.tasks.planes.options import PlanesOptions
-from dyntorch.tasks.planes.problem import Layout, PlaneMatches, noise_variance, project_covariance, solve
+from dyntorch.tasks.planes.problem import Layout, PlaneMatches, PlanesOptions, noise_variance, project_covariance, solve
 
 # ----------------------------------------------------------------------------------------------------------------------
 # What translating_planes() returns: the homography at infinity, how every body moved, and its reconstruction.

@@ -8,17 +8,15 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Note, Status, in_order, is_failure, noting
-from dyntorch.geometry.bundle import bundle_adjust
-from dyntorch.geometry.calibrated_cameras import CalibratedCameras
+from dyntorch.geometry.bundle import CalibratedCameras, bundle_adjust
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.geometry.lift import change_frame, steadiest_frame
 from dyntorch.geometry.triangulation import unit_projections
 from dyntorch.tasks.reconstruct.diagnosis import NOISE_ROUNDING, unknowns
 from dyntorch.tasks.reconstruct.metric import WorldChanges, metric_frames
 from dyntorch.tasks.reconstruct.motions import Motion
-from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
-from dyntorch.tasks.reconstruct.scene import COST_TOLERANCE, LiftedState, Lifting, distances, positions, velocities
+from dyntorch.tasks.reconstruct.scene import COST_TOLERANCE, LiftedState, Lifting, ViewTracks, distances, positions, velocities
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,18 @@ from dyntorch.geometry.triangulation import unit_projections
 from dyntorch.numerics.blocks import map_blocks
 from dyntorch.numerics.nullspace import eigenvalues, spectrum
 from dyntorch.tasks.reconstruct.motions import Motion, smaller_motion
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
-from dyntorch.tasks.reconstruct.projections import ViewTracks, camera_unknowns, projections_of_tracks
-from dyntorch.tasks.reconstruct.result import ReconstructNotice
-from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, bodies_of, distances, has_points_behind, scene_of
+from dyntorch.tasks.reconstruct.result import ReconstructNotice, ReconstructOptions
+from dyntorch.tasks.reconstruct.scene import (
+    LiftedState,
+    Lifting,
+    ViewTracks,
+    bodies_of,
+    camera_unknowns,
+    distances,
+    has_points_behind,
+    projections_of_tracks,
+    scene_of,
+)
 
 # ----------------------------------------------------------------------------------------------------------------------
 # How well noise leaves the points of a lifted scene determined, cameras and all.

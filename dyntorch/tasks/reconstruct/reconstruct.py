@@ -11,15 +11,14 @@ from torch import Tensor
 
 from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import in_order, is_failure, noting
-from dyntorch.geometry.calibrated_cameras import calibrations
+from dyntorch.geometry.bundle import calibrations
 from dyntorch.geometry.triangulation import mask_missing
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.reconstruct.motions import Motion, as_motion
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
-from dyntorch.tasks.reconstruct.projections import ViewTracks
-from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
+from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice, ReconstructOptions
+from dyntorch.tasks.reconstruct.scene import ViewTracks
 from dyntorch.tasks.reconstruct.solver import choose, solve
 
 
@@ -68,7 +67,7 @@ def reconstruct(
             direction, or within parallel planes, need cameras that move, a static plane three of them.  See ``metric``,
             ``rotations``, ``translations`` and ``ambiguity`` of the result.
         generator: source of the random samples of the robust estimate.
-        options: :class:`~dyntorch.tasks.reconstruct.options.ReconstructOptions`; None = the defaults.
+        options: :class:`~dyntorch.tasks.reconstruct.result.ReconstructOptions`; None = the defaults.
 
     Returns:
         A :class:`~dyntorch.tasks.reconstruct.result.Reconstruction`: ``cameras (*batch, views, 3, d + 1)``,

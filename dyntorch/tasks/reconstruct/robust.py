@@ -18,9 +18,18 @@ from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import reproject, resect, triangulate
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.blocks import each, replace_problems, uniform
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
-from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, camera_unknowns, view_subsets
-from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, adjust_scene, distances, scene_of
+from dyntorch.tasks.reconstruct.result import ReconstructOptions
+from dyntorch.tasks.reconstruct.scene import (
+    LiftedState,
+    Lifting,
+    Projections,
+    ViewTracks,
+    adjust_scene,
+    camera_unknowns,
+    distances,
+    scene_of,
+    view_subsets,
+)
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Which observations agree with given projections: per point all of its views, or all but the fewest that spoil it.

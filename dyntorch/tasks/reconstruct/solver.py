@@ -16,18 +16,19 @@ from dyntorch.geometry.triangulation import triangulate, unit_projections
 from dyntorch.tasks.reconstruct.calibrated import metric_reconstruction, of_bodies
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
-from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, projections_of_tracks
-from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction, ReconstructNotice
+from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction, ReconstructNotice, ReconstructOptions
 from dyntorch.tasks.reconstruct.robust import have_outliers, moving_static_points, robust_projections, trim_outliers
 from dyntorch.tasks.reconstruct.scene import (
     LiftedState,
     Lifting,
+    Projections,
+    ViewTracks,
     adjust_scene,
     bodies_of,
     distances,
     fix_frame,
     positions,
+    projections_of_tracks,
     scene_of,
     velocities,
 )

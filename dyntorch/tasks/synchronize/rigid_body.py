@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.outcome import Notice
-from dyntorch.geometry.body import BodyProblem, FilmedBody, fit_body
 from dyntorch.geometry.homogeneous import homogeneous
-from dyntorch.geometry.rigid import nearest_rotation
+from dyntorch.geometry.rigid import BodyProblem, FilmedBody, fit_body, nearest_rotation
 from dyntorch.geometry.triangulation import resect, triangulate
 from dyntorch.numerics.least_squares import LeastSquaresOptions
 from dyntorch.numerics.subspaces import affine_factorization, metric_upgrade

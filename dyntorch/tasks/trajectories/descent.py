@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from dyntorch.geometry.extensors import plucker_form, skew_line
+from dyntorch.geometry.extensors import line_camera, nearest_line, plucker_form, skew_line
 from dyntorch.geometry.homogeneous import apply, finite_depth, homogeneous, similarity, skew
-from dyntorch.geometry.lines import line_camera, nearest_line
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.numerics.nullspace import eigenvalues
 

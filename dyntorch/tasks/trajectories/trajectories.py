@@ -12,9 +12,8 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit
 from dyntorch.core.outcome import Outcome, Status, is_failure
-from dyntorch.geometry.extensors import compound, skew_line
+from dyntorch.geometry.extensors import cameras_of_lines, compound, line_camera, lines_of_pencil, nearest_line, skew_line
 from dyntorch.geometry.homogeneous import inhomogeneous, unit
-from dyntorch.geometry.lines import cameras_of_lines, line_camera, lines_of_pencil, nearest_line
 from dyntorch.invariants.grassmann_tensor import GrassmannTensor
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
@@ -302,7 +301,7 @@ def trajectory_cameras(
 
     The determinant of the six rows :math:`x_i^T M_i` vanishes for a point on a line: 3^6 = 729 coefficients, 728 matches.  The
     tensor gives the line cameras up to a collineation of P^5, and the Klein quadric, which it has moved, the cameras
-    (:func:`~dyntorch.geometry.lines.cameras_of_lines`).  The distances from the images of the lines that this linear result
+    (:func:`~dyntorch.geometry.extensors.cameras_of_lines`).  The distances from the images of the lines that this linear result
     leaves are 200 to 400 times the noise with 728 matches and 17 times with 1500 (``python -m
     experiments.reconstruction.trajectories``); all
     cameras and lines are then adjusted together, which brings them down to the noise.

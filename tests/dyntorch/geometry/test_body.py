@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from dyntorch.geometry.body import BodyProblem, FilmedBody, fit_body
-from dyntorch.geometry.rigid import rotation_exponential
+from dyntorch.geometry.rigid import BodyProblem, FilmedBody, fit_body, rotation_exponential
 from dyntorch.numerics.least_squares import LeastSquaresOptions
 
 D = torch.float64

@@ -4,9 +4,8 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from dyntorch.geometry.epipoles import epipoles, joint_epipoles, joint_epipoles_of_tensor
 from dyntorch.geometry.extensors import compound, dual, meet, wedge
-from dyntorch.geometry.grassmann import grassmann_tensor
+from dyntorch.geometry.grassmann import epipoles, grassmann_tensor, joint_epipoles, joint_epipoles_of_tensor
 
 PIXELS = torch.tensor([[900.0, 3.0, 500.0], [0.0, 880.0, 400.0], [0.0, 0.0, 1.0]]).double()
 

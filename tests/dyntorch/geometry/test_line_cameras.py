@@ -3,8 +3,16 @@
 import pytest
 import torch
 
-from dyntorch.geometry.extensors import join, plucker_form
-from dyntorch.geometry.lines import camera_of_lines, cameras_of_lines, klein_frame, line_camera, lines_of_pencil, nearest_line
+from dyntorch.geometry.extensors import (
+    camera_of_lines,
+    cameras_of_lines,
+    join,
+    klein_frame,
+    line_camera,
+    lines_of_pencil,
+    nearest_line,
+    plucker_form,
+)
 
 J = plucker_form()
 

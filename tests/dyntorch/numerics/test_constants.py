@@ -22,11 +22,11 @@ from dyntorch.invariants import reprojection as shape_residual
 from dyntorch.numerics import eigenspaces, lags
 from dyntorch.numerics import lags as covariances
 from dyntorch.numerics.blocks import constant
+from dyntorch.shapes import basis as dynamic_shape_theory
 from dyntorch.shapes import lifted
 from dyntorch.shapes import static as shape_completion
 from dyntorch.shapes import static as shape_points
 from dyntorch.shapes import static as shape_rows
-from dyntorch.shapes import theory as dynamic_shape_theory
 from dyntorch.shapes.basis import Polynomial
 from dyntorch.tasks.planes import closed_forms as infinity_extensors
 from dyntorch.tasks.planes import problem as planes_problem

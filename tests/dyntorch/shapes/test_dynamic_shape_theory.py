@@ -5,8 +5,7 @@ import torch
 
 from dyntorch.invariants.dynamic_shape_tensor import annihilator, graph_of
 from dyntorch.numerics.nullspace import null_space
-from dyntorch.shapes.basis import Polynomial
-from dyntorch.shapes.theory import moving_point, reference_plane_rows, resultant, six_point_rows
+from dyntorch.shapes.basis import Polynomial, moving_point, reference_plane_rows, resultant, six_point_rows
 from tests.dyntorch.shapes.moving_views import LINEAR, SQUARE, draw, moving_views
 
 

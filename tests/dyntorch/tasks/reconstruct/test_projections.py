@@ -7,8 +7,8 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.tasks.reconstruct.motions import MOTIONS
-from dyntorch.tasks.reconstruct.projections import Projections, ViewTracks, mean_error, projections_of_tracks, view_subsets
 from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
+from dyntorch.tasks.reconstruct.scene import Projections, ViewTracks, mean_error, projections_of_tracks, view_subsets
 
 
 def tracks_of(name, n=60, seed=0, **options):

@@ -10,10 +10,9 @@ from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.triangulation import mask_missing, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS
-from dyntorch.tasks.reconstruct.options import ReconstructOptions
-from dyntorch.tasks.reconstruct.projections import ViewTracks, projections_of_tracks
+from dyntorch.tasks.reconstruct.result import ReconstructOptions
 from dyntorch.tasks.reconstruct.robust import bound, distance, freedom, have_outliers, noise, robust_projections, select_inliers
-from dyntorch.tasks.reconstruct.scene import Lifting, distances
+from dyntorch.tasks.reconstruct.scene import Lifting, ViewTracks, distances, projections_of_tracks
 
 
 def generator(seed=0):

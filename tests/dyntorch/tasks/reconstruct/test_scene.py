@@ -9,7 +9,6 @@ from dyntorch import metrics, scenes
 from dyntorch.core.outcome import Status
 from dyntorch.tasks.reconstruct import scene as module
 from dyntorch.tasks.reconstruct.motions import MOTIONS
-from dyntorch.tasks.reconstruct.projections import projections_of_tracks
 from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.scene import (
     LiftedState,
@@ -18,6 +17,7 @@ from dyntorch.tasks.reconstruct.scene import (
     distances,
     fix_frame,
     positions,
+    projections_of_tracks,
     scene_of,
     velocities,
 )

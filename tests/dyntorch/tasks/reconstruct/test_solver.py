@@ -14,9 +14,9 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.tasks.reconstruct import solver as lifted_choice
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
-from dyntorch.tasks.reconstruct.projections import ViewTracks
 from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.result import Reconstruction
+from dyntorch.tasks.reconstruct.scene import ViewTracks
 from dyntorch.tasks.reconstruct.solver import LABEL_COST, OUTLIER_COST, LiftedFit, _missing_input, penalized_cost
 
 
