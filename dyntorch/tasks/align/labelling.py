@@ -18,8 +18,7 @@ from dyntorch.core.refine import Problem, refine_matches
 from dyntorch.core.residual import whiten, whitened_residual
 from dyntorch.core.solution import Solution
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
-from dyntorch.invariants.dynamic_tensor import DynamicMotion
-from dyntorch.invariants.flats import flat_residual, nearest_flats
+from dyntorch.invariants.dynamic_tensor import DynamicMotion, flat_residual, nearest_flats
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.numerics.blocks import each, map_blocks, select, uniform
