@@ -24,6 +24,12 @@ def load_formats(room: str) -> dict[str, Any]:
     return dict(sorted(formats.items(), key=lambda item: item[1].order))
 
 
+def import_modules(package: str) -> None:
+    """Import all modules of a package, so that what registers itself in them is known."""
+    for module in iter_modules(import_module(package).__path__):
+        import_module(f"{package}.{module.name}")
+
+
 def list_programs(formats: Iterable[Any]) -> list[str]:
     """The programs that write some formats, each once, sorted without regard to capitals."""
     return sorted({program for each in formats for program in each.programs}, key=str.casefold)

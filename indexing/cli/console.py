@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dyntorch.numerics import as_python
 from indexing.opening import count as count  # by this name for all commands
@@ -75,7 +75,7 @@ def names(values: Sequence[object]) -> str:
     return ", ".join(map(str, values[:SHOWN])) + more
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[object]], title: str = "") -> None:
+def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
     """Print a table; columns of numbers (their headings end in a space) are aligned right."""
     from rich import box
     from rich.console import Console
@@ -88,7 +88,7 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]], title: str =
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 
-    drawn = Table(box=box.SIMPLE_HEAD, title=Text(title) if title else None, title_justify="left", pad_edge=False)
+    drawn = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name in columns:
         drawn.add_column(Text(name.strip()), justify="right" if name.endswith(" ") else "left", overflow="fold")
     for row in rows:
@@ -107,6 +107,20 @@ def show(summary: Summary) -> None:
             say(sentence)
     for line in (*summary.notes, *summary.closing):
         say(line)
+
+
+def present(report: Any, folder: Path | None, *further: str) -> int:
+    """Write a report where a folder is given, and print its summary and further lines: the exit code."""
+    from indexing.report.summary import summarize, write_report  # which draws: not needed for --help
+
+    summary, page = summarize(report), None
+    if folder is not None:
+        with progress("drawing the report", steps=False):
+            page = write_report(folder, report, summary)
+    show(summary)
+    for line in further:
+        say(line)
+    return finish(page, getattr(report, "refusal", None))
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,13 @@ from indexing import files
 from indexing.comparing import NONE, Agreement, ComparedSpan, SegmentCounts, compare
 from indexing.opening import count
 from indexing.report import pictures
-from indexing.report.page import Picture, bar, render, table_csv, write_files
-from indexing.report.recognition import TIMELINES, TIPS, duration, percent, timeline_name
+from indexing.report.canvas import Theme
+from indexing.report.page import Picture, bar, table_csv
+from indexing.report.recognition import OURS, TIMELINES, TIPS, duration, percent, timeline_name
 from indexing.report.results import cell
+from indexing.report.summary import Summary, Table, register_page
 
 FILES = ("report.html", "metrics.json", "manifest.json", "confusion.png", "confusion.csv", "timeline.png")
-OURS = r"confusion\.(png|csv)|timeline(-\d+)?\.png|events\.csv|repetitions\.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,50 +46,90 @@ class _Bar:
     margin: float = math.nan
 
 
-def write_agreement(folder: str | Path, report: AgreementReport) -> Path:
-    """Write a report into a folder: ``report.html``, ``metrics.json``, ``manifest.json``, ``confusion.png``, ``confusion.csv``
-    and ``timeline.png`` (``timeline-2.png``... of further recordings and people), each whole or not at all, ``report.html``
-    last."""
-    where = files.prepare(folder)
-    both = report.agreement
+@register_page(AgreementReport, "agreement", FILES, OURS)
+def summarize(report: AgreementReport) -> Summary:
+    """Everything that is said of how far two sets of labels agree."""
+    both, (known, found) = report.agreement, report.sides
     names = [*both.labels, NONE]
-    each = [(span, compare([span])) for span in report.spans]
-    drawn = {timeline_name(i): _timeline(span) for i, span in enumerate(report.spans[:TIMELINES])}
-    sides = f"seconds known ({report.sides[0]})", f"seconds found ({report.sides[1]})"
-    drawn_confusion = pictures.confusion(both.seconds.round(1), names, sides)
-    values: dict[str, Any] = {
-        "summary": describe_agreement(report),
-        "cards": _cards(both),
-        "notes": [("", "", note) for note in report.notes],
-        "timelines": [
-            (span_name(span), Picture(png, tips=_tips(span)[:TIPS]))
-            for span, png in zip(report.spans, drawn.values(), strict=False)
+    seconds = [
+        [name, *(f"{value:.1f}" if value >= 0.05 else "" for value in row)]
+        for name, row in zip(names, both.seconds.tolist(), strict=True)
+    ]
+    labels = [
+        "label",
+        "known (s) ",
+        "found (s) ",
+        "both (s) ",
+        "kappa ",
+        "known ",
+        "found ",
+        *(f"F1@{k:g} " for k in both.segments),
+    ]
+    drawn: dict[str, Any] = {timeline_name(i): partial(_timeline, span) for i, span in enumerate(report.spans[:TIMELINES])}
+    axes = f"seconds known ({known})", f"seconds found ({found})"
+    drawn["confusion.png"] = lambda theme: pictures.confusion(both.seconds.round(1), names, axes)
+    return Summary(
+        headline=describe_agreement(report), cards=_cards(both),
+        opening=[f"confusion over time, in seconds: rows are {known}, columns {found}"],
+        tables=[
+            Table(["", *(f"{name} " for name in names)], seconds), Table(labels, label_rows(both)),
+            Table(["overlap", "right ", "found ", "known ", "precision ", "recall ", "F1 "], overlap_rows(both)),
         ],
-        "hidden": len(report.spans) - len(drawn),
+        notes=[f"note: {note}" for note in report.notes], closing=[_agreement_sentence(report)], pictures=drawn,
+        files={
+            "confusion.csv": partial(confusion_csv, both), "metrics.json": partial(as_json, report),
+            files.MANIFEST: lambda: report.manifest,
+        },
+        values=partial(page_values, report),
+    )  # fmt: skip
+
+
+def page_values(report: AgreementReport) -> dict[str, Any]:
+    """Rows of the page's tables, and whose timelines are drawn."""
+    both = report.agreement
+    counts = zip(overlap_rows(both), both.segments.values(), strict=True)
+    return {
+        "timelines": [(timeline_name(i), span_name(span)) for i, span in enumerate(report.spans[:TIMELINES])],
+        "hidden": max(0, len(report.spans) - TIMELINES),
         "spans": [
             [span_name(span), duration(one.compared), _share(one.agreement), _number(one.kappa), _number(_last(one).f1)]
-            for span, one in each
+            for span, one in _compare_each(report)
         ],
         "heads": [(f"F1 at {overlap:g}", "number") for overlap in both.segments],
         "labels": label_rows(both),
-        "overlaps": [[*row, bar(0.0 if math.isnan(one.f1) else one.f1)] for row, one in _overlap_rows(both)],
-        "confusion": Picture(drawn_confusion),
+        "overlaps": [[*row, bar(0.0 if math.isnan(one.f1) else one.f1)] for row, one in counts],
     }
-    html = render("agreement", report, **values)
-    measured = {
-        **both.plain(),
+
+
+def _compare_each(report: AgreementReport) -> list[tuple[ComparedSpan, Agreement]]:
+    """Each recording and person by itself."""
+    return [(span, compare([span])) for span in report.spans]
+
+
+def as_json(report: AgreementReport) -> dict[str, Any]:
+    """All numbers: of all recordings together, and of each."""
+    return {
+        **report.agreement.plain(),
         "by_recording": [
             {"recording": span.name, "person": span.person, "start": span.start, "end": span.end, **_headline(one)}
-            for span, one in each
+            for span, one in _compare_each(report)
         ],
         "sides": {"known": report.sides[0], "found": report.sides[1]},
         "notes": list(report.notes),
     }
-    contents: dict[str, Any] = {**drawn, "confusion.png": drawn_confusion, "confusion.csv": confusion_csv(both)}
-    written = sorted([*contents, "metrics.json", files.MANIFEST, "report.html"])
-    files.remove_stale(where, written, OURS)
-    contents |= {"metrics.json": measured, files.MANIFEST: {**report.manifest, "files": written}, "report.html": html}
-    return write_files(folder, contents)
+
+
+def _agreement_sentence(report: AgreementReport) -> str:
+    """How much was compared, and how far both sides agree."""
+    both, spans = report.agreement, report.spans
+    people = sum(bool(span.person) for span in spans)
+    who = f" of {count(people, 'person', 'people')}" if people else ""
+    kappa = "does not exist (one label throughout)" if math.isnan(both.kappa) else f"{both.kappa:.3f}"
+    return (
+        f"{report.sides[1]} against {report.sides[0]}: {duration(both.compared)}{who} in "
+        f"{count(len({span.name for span in spans}), 'recording')}; "
+        f"the same in {100 * both.agreement:.1f} % of the time, Cohen's kappa over time {kappa}"
+    )
 
 
 def describe_agreement(report: AgreementReport) -> str:
@@ -118,12 +159,8 @@ def label_rows(both: Agreement) -> list[list[Any]]:
 
 def overlap_rows(both: Agreement) -> list[list[str]]:
     """Least overlap, segments right, found and known, precision, recall and F1."""
-    return [row for row, _ in _overlap_rows(both)]
-
-
-def _overlap_rows(both: Agreement) -> list[tuple[list[str], SegmentCounts]]:
     return [
-        ([f"{k:g}", f"{n.right:,}", f"{n.found:,}", f"{n.known:,}", *map(_number, (n.precision, n.recall, n.f1))], n)
+        [f"{k:g}", f"{n.right:,}", f"{n.found:,}", f"{n.known:,}", *map(_number, (n.precision, n.recall, n.f1))]
         for k, n in both.segments.items()
     ]
 
@@ -170,14 +207,11 @@ def _bars(span: ComparedSpan) -> tuple[list[_Bar], list[tuple[str, float, float]
     return [_Bar(*one) for one in sides[0]], sides[1]
 
 
-def _timeline(span: ComparedSpan) -> bytes:
+def _timeline(span: ComparedSpan, theme: Theme) -> Picture:
     found, known = _bars(span)
-    return pictures.timeline([span.start, span.end], np.zeros((2, 0)), [], found, known)
-
-
-def _tips(span: ComparedSpan) -> list[Any]:
-    found, known = _bars(span)
-    return pictures.timeline_tips([span.start, span.end], [], found, known)
+    ends = [span.start, span.end]
+    tips = pictures.timeline_tips(ends, [], found, known)
+    return Picture(pictures.timeline(ends, np.zeros((2, 0)), [], found, known), tips=tips[:TIPS])
 
 
 def _number(value: float) -> str:

@@ -18,11 +18,10 @@ from dyntorch.numerics import with_words
 from indexing.readers.matches import Matched, Photograph
 from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
 from indexing.report.page import ResultReport, markup, safe_cell, sentence, table_csv
-from indexing.report.summary import Summary, Table, notes_of, write_summary
+from indexing.report.summary import Summary, Table, register_page, warning_lines
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png")
-WRITTEN = (*FILES, "tracks.csv")  # the last one of videos
+FILES = ("report.html", "alignment.json", "labels.csv", "alignment.png", "tracks.csv")  # the last one of videos
 LABELS = ("outlier", "static", "moving")
 ROUNDING = 1e-14  # of the largest entry: what arithmetic leaves of a deviation that is zero (measured: 3e-17)
 PURPOSE = {
@@ -149,6 +148,7 @@ def describe(report: AlignmentReport) -> str:
     return f"Of {number:,} {what} in {len(report.views)} views, {'; '.join(parts)}. {PURPOSE[report.model]}"
 
 
+@register_page(AlignmentReport, "alignment", FILES)
 def summarize(report: AlignmentReport) -> Summary:
     """Everything that is said of an alignment."""
     known, poses = report.solved, report.poses
@@ -165,20 +165,21 @@ def summarize(report: AlignmentReport) -> Summary:
         plane = f"plane: normal ({normal}) before view 1; shifts in units of its distance"
         tables.append(Table(["camera against view 1", "turn ", "x ", "y ", "z "], cells, [plane]))
     return Summary(
-        headline=describe(report), tables=tables, notes=notes_of(report),
+        headline=describe(report), tables=tables, notes=warning_lines(report),
         closing=[f"open: {report.ambiguity}"] if known and report.ambiguity else [],
         pictures={"alignment.png": partial(picture_of, report)}, dark=bool(report.photographs),
         files={"labels.csv": partial(labels_csv, report), "alignment.json": partial(as_json, report), "tracks.csv": None},
+        values=partial(page_values, report),
     )  # fmt: skip
 
 
-def write_alignment(folder: str | Path, report: AlignmentReport) -> Path:
-    """Write a report into a folder: ``report.html``, ``alignment.json``, ``labels.csv`` and ``alignment.png``."""
+def page_values(report: AlignmentReport) -> dict[str, Any]:
+    """The page's tables of motions, and of rigid ones turns and shifts."""
     turns = []
     if report.model == "rigid":
         turns = [(angle, shift, float(np.linalg.norm(shift))) for angle, shift in map(turn_and_shift, report.motion)]
     motions = [(name, view, [[row[0], *map(_cell, row[1:])] for row in rows], one) for name, view, rows, one in report.shown]
-    return write_summary(folder, "alignment", report, summarize(report), motions=motions, turns=turns)
+    return {"motions": motions, "turns": turns}
 
 
 def _cell(number: tuple[str, str]) -> Any:

@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -21,15 +21,16 @@ from indexing import files
 from indexing.clip import Clip
 from indexing.opening import count
 from indexing.report.canvas import WIDTH, strip
-from indexing.report.page import LISTED, Script, even, markup, render, table_csv, write_files
+from indexing.report.page import LISTED, Script, even, markup, table_csv
 from indexing.report.pictures import colours
 from indexing.report.player import Player, players
-from indexing.report.recognition import duration, none
+from indexing.report.recognition import EVENTS_HEAD, OURS, duration, event_row, none, score_text
 from indexing.report.results import RecognitionReport, RecordingResult, by_recording, cell
+from indexing.report.summary import Summary, Table, register_page
 
 if TYPE_CHECKING:
     from indexing.archive.actions import ArchivedEvent
-    from indexing.archive.archive import ArchivedRecording, ArchiveInfo
+    from indexing.archive.archive import ArchivedRecording, ArchiveInfo, Verification
     from indexing.archive.search import Hit
 
 PICTURED = 60  # hits, or events of all actions, that are drawn
@@ -42,9 +43,9 @@ FILM = (8, 24, 10.0)  # frames of a film at least and at most, and of each secon
 AROUND = 0.7  # seconds of the recording before and after what is drawn, which say where a joint should be
 PLAYED, PLAYED_SECONDS = 12, 7200.0  # recordings, and seconds of them all, that have a player
 MARKS = 250  # events of a recording that its line of marks shows
-OURS = r"hits\.csv|events\.csv|repetitions\.csv|confusion\.png|timeline(-\d+)?\.png"  # of this and other reports
+MAX_EVENTS_PRINTED = 100  # events that are printed: all are in the report
+FILES = ("report.html", "hits.csv", "events.csv", "metrics.json", "manifest.json")
 HITS_HEAD = ("rank", "file", "start", "end", "score", "person", "mirrored")
-EVENTS_HEAD = ("file", "label", "start", "end", "score", "margin", "person")
 
 
 class Keeper(Protocol):
@@ -62,6 +63,8 @@ class SearchReport:
     archive: Keeper
     info: ArchiveInfo
     notes: Sequence[str] = ()
+    seconds: float = 0.0
+    mirror: bool = False
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -78,8 +81,10 @@ class FindReport:
     events: Sequence[ArchivedEvent]
     recordings: Sequence[ArchivedRecording]
     archive: Keeper
+    info: ArchiveInfo
     exemplars: Mapping[Hashable, Sequence[Clip]] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    seconds: float = 0.0
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -88,43 +93,133 @@ class FindReport:
         return f"Actions in an archive of {count(len({one.source for one in self.recordings}), 'recording')}"
 
 
-def write_search(folder: str | Path, report: SearchReport) -> Path:
-    """Write what resembles a query: ``report.html``, ``hits.csv``, ``metrics.json`` and ``manifest.json``."""
+@register_page(SearchReport, "hits", FILES, OURS)
+def summarize_search(report: SearchReport) -> Summary:
+    """Everything that is said of what resembles a query."""
     measured = measure_search(report)
+    return Summary(
+        headline=_search_words(report, measured), cards=_search_cards(report, measured), tables=_hits_tables(report),
+        notes=[f"note: {note}" for note in report.notes],
+        closing=[f"{count(len(report.hits), 'hit')} in {size_text(report.info)}, searched in {report.seconds:.1f} s"],
+        files={
+            "hits.csv": partial(hits_csv, report.hits), "metrics.json": lambda: measured, files.MANIFEST: lambda: report.manifest,
+        },
+        values=partial(_search_values, report),
+    )  # fmt: skip
+
+
+def _search_values(report: SearchReport) -> dict[str, Any]:
+    """The query, the hits that are drawn, and those that are listed."""
     rows = _hit_rows(report)
     scores = even([hit.score for hit in report.hits[:ROWS]])
     rest = [
         [f"{number}", hit.source, hit.person, *_when(hit.start, hit.end), score, "yes" if hit.mirrored else ""]
         for number, (hit, score) in enumerate(zip(report.hits[:ROWS], scores, strict=True), 1)
     ][len(rows) :]
-    html = render(
-        "hits", report, summary=_search_words(report, measured), cards=_search_cards(report, measured), notes=_notes_of(report),
-        query=strip(report.query, frames=8, alt="Key frames of the query") or none("no joint seen"),
-        rows=rows, rest=rest, unlisted=max(0, len(report.hits) - ROWS), sides=_sides(rows),
+    query = strip(report.query, frames=8, alt="Key frames of the query") or none("no joint seen")
+    return {"query": query, "rows": rows, "rest": rest, "unlisted": max(0, len(report.hits) - ROWS), "sides": _sides(rows)}
+
+
+@register_page(FindReport, "finds", FILES, OURS)
+def summarize_finds(report: FindReport) -> Summary:
+    """Everything that is said of where learned actions were found."""
+    measured, tables = measure_finds(report), _events_tables(report)
+    many = len(report.events) > MAX_EVENTS_PRINTED
+    where = f"{count(len(report.events), 'action')} found in {count(measured['recordings_with_events'], 'recording')} of"
+    return Summary(
+        headline=_find_words(report, measured), cards=_find_cards(measured), tables=tables,
+        notes=["note: each event, with its times, is in events.csv of a report (--report FOLDER)"] * many,
+        closing=[
+            f"{where if report.events else 'no action found in'} {size_text(report.info)}, searched in {report.seconds:.1f} s"
+        ],
+        files={
+            "events.csv": partial(events_csv, report.events), "metrics.json": lambda: measured,
+            files.MANIFEST: lambda: report.manifest,
+        },
+        values=partial(_find_values, report, measured),
     )  # fmt: skip
-    return _write(folder, report.manifest, {"hits.csv": hits_csv(report.hits), "metrics.json": measured, "report.html": html})
 
 
-def write_finds(folder: str | Path, report: FindReport) -> Path:
-    """Write where actions were found: ``report.html``, ``events.csv``, ``metrics.json`` and ``manifest.json``."""
-    measured = measure_finds(report)
+def _find_values(report: FindReport, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Actions and recordings with finds, drawn, counted and played."""
     paint = colours([*report.classes, *(event.label for event in report.events)])
-    played = _event_players(report)
-    actions = _actions(report)
-    html = render(
-        "finds", report, summary=_find_words(report, measured), cards=_find_cards(measured), notes=_notes_of(report),
-        actions=actions, counts=_count_rows(report), found=_recording_rows(report, paint), FIRST=FIRST, paint=paint, played=played,
-        script=Script("player.js") if played else None, unlisted=max(0, measured["recordings_with_events"] - LISTED),
-        sides=any(_sides(rows) for one in actions for _, rows in one["groups"]),
-    )  # fmt: skip
-    return _write(folder, report.manifest, {"events.csv": events_csv(report.events), "metrics.json": measured, "report.html": html})
+    played, actions = _event_players(report), _actions(report)
+    return {
+        "actions": actions, "counts": _count_rows(report), "found": _recording_rows(report, paint), "FIRST": FIRST, "paint": paint,
+        "played": played, "script": Script("player.js") if played else None,
+        "unlisted": max(0, measured["recordings_with_events"] - LISTED),
+        "sides": any(_sides(rows) for one in actions for _, rows in one["groups"]),
+    }  # fmt: skip
 
 
+# ---- what the terminal prints --------------------------------------------------------------------------------------------
+def size_text(info: ArchiveInfo) -> str:
+    """How many sources an archive holds, and for how long."""
+    return f"{count(info.sources, 'source')} ({duration(info.seconds)})"
+
+
+def _hits_tables(report: SearchReport) -> list[Table]:
+    hits, mirror = report.hits, report.mirror
+    people, scores = any(hit.person for hit in hits), even([hit.score for hit in hits])
+    rows = [
+        [f"{number}", hit.source, *[hit.person] * people, *_when(hit.start, hit.end), score, *["mirrored" * hit.mirrored] * mirror]
+        for number, (hit, score) in enumerate(zip(hits, scores, strict=True), 1)
+    ]
+    return [Table(["rank ", "source", *["person"] * people, "start (s) ", "end (s) ", "score ", *[""] * mirror], rows)] * bool(rows)
+
+
+def _events_tables(report: FindReport) -> list[Table]:
+    """Few events one by one; of many, how many there are of each action."""
+    events = report.events
+    if len(events) > MAX_EVENTS_PRINTED:
+        sources: dict[str, list[str]] = {str(label): [] for label in report.classes}
+        for event in events:
+            sources.setdefault(str(event.label), []).append(event.source)
+        rows: list[list[object]] = [[label, f"{len(where):,}", f"{len(set(where)):,}"] for label, where in sources.items()]
+        return [Table(["action", "times ", "sources "], rows)]
+    people = any(event.person for event in events)
+    scores, margins = even([event.score for event in events]), even([event.margin for event in events])
+    rows = [
+        [event.source, *[event.person] * people, event.label, *_when(event.start, event.end), score, margin]
+        for event, score, margin in zip(events, scores, margins, strict=True)
+    ]
+    return [Table(["source", *["person"] * people, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)] * bool(rows)
+
+
+def summarize_info(info: ArchiveInfo, recordings: Sequence[ArchivedRecording] | None = None) -> Summary:
+    """What is in an archive: its layouts, or all its recordings."""
+    table = Table(["joint layout", "joints ", "time "], [[name, joints, duration(s)] for name, joints, s in info.layouts])
+    if recordings is not None:
+        columns = ["source", "person", "start (s) ", "end (s) ", "stored (s) ", "joints"]
+        rows = [[one.source, one.person, *_when(one.start, one.end), f"{one.seconds:.1f}", one.layout] for one in recordings]
+        table = Table(columns, rows)
+    people = f" ({count(info.recordings, 'recording')} of one person each)" * (info.recordings != info.sources)
+    hours = info.seconds / 3600
+    each = f", {info.size / 1e6 / hours:.1f} MB an hour" * (hours >= 1)
+    closing = [
+        f"{count(info.sources, 'source')}{people}, {duration(info.seconds)}, {count(info.windows, 'window')}",
+        f"{info.size / 1e6:,.1f} MB in {count(info.segments, 'segment')}{each}; version {info.version}",
+    ]
+    if info.dead:
+        closing.append(f"{count(info.dead, 'window')} of what was removed still take space; later additions take it back")
+    return Summary(tables=[table], closing=closing)
+
+
+def summarize_verification(verification: Verification) -> Summary:
+    """Whether all of an archive is there, and what is left of interrupted additions."""
+    where = f"{count(verification.windows, 'window')} in {count(verification.segments, 'segment')}"
+    state = "all there, whole, and once" if verification.ok else count(len(verification.problems), "problem")
+    left = count(len(verification.orphans), "file")
+    note = f"note: {left} of interrupted additions hold nothing that is missed; the next addition takes them away"
+    return Summary(notes=[note] * bool(verification.orphans), closing=[f"{where}: {state}"])
+
+
+# ---- the files -----------------------------------------------------------------------------------------------------------
 def hits_csv(hits: Sequence[Hit]) -> str:
     """All hits as CSV, best first: ``rank,file,start,end,score,person,mirrored``; seconds with 3 decimals."""
     rows = [
         [
-            number, cell(hit.source), f"{hit.start:.3f}", f"{hit.end:.3f}", _number(hit.score), cell(hit.person),
+            number, cell(hit.source), f"{hit.start:.3f}", f"{hit.end:.3f}", score_text(hit.score), cell(hit.person),
             "yes" if hit.mirrored else "no",
         ]
         for number, hit in enumerate(hits, 1)
@@ -133,15 +228,8 @@ def hits_csv(hits: Sequence[Hit]) -> str:
 
 
 def events_csv(events: Sequence[ArchivedEvent]) -> str:
-    """All events as CSV: ``file,label,start,end,score,margin,person``, as a scan of the recordings writes them."""
-    rows = [
-        [
-            cell(event.source), cell(event.label), f"{event.start:.3f}", f"{event.end:.3f}", _number(event.score),
-            _number(event.margin), cell(event.person),
-        ]
-        for event in events
-    ]  # fmt: skip
-    return table_csv(EVENTS_HEAD, rows)
+    """All events as CSV, as a scan of the recordings writes them."""
+    return table_csv(EVENTS_HEAD, [event_row(event.source, event, event.person) for event in events])
 
 
 def measure_search(report: SearchReport) -> dict[str, Any]:
@@ -178,22 +266,6 @@ def measure_finds(report: FindReport) -> dict[str, Any]:
 
 
 # ---- what both pages share -----------------------------------------------------------------------------------------------
-def _write(folder: str | Path, manifest: Mapping[str, Any], contents: dict[str, Any]) -> Path:
-    where = files.prepare(folder)
-    names = sorted([*contents, files.MANIFEST])
-    files.remove_stale(where, names, OURS)
-    page = contents.pop("report.html")
-    return write_files(where, {**contents, files.MANIFEST: {**manifest, "files": names}, "report.html": page})
-
-
-def _notes_of(report: SearchReport | FindReport) -> list[tuple[str, str, str]]:
-    return [("", "", note) for note in report.notes]
-
-
-def _number(value: float) -> str:
-    return f"{value:.6g}" if np.isfinite(value) else ""
-
-
 def _when(start: float, end: float) -> tuple[str, str]:
     return f"{start:.2f}", f"{end:.2f}"
 

@@ -8,12 +8,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dyntorch import Status
 from dyntorch.core import Notice
 from indexing.opening import count
 from indexing.readers.matches import Photograph
@@ -29,13 +29,20 @@ from indexing.report.page import (
     table_csv,
 )
 from indexing.report.segmentation import STRAYS, mark_of
-from indexing.report.summary import Summary, Table, notes_of, write_summary
+from indexing.report.summary import Summary, Table, register_page, warning_lines
 from indexing.video.scene import evenly_spaced
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "tracks.csv", "segmentation.png")
+FILES = (
+    "report.html",
+    "segmentation.npz",
+    "segmentation.json",
+    "labels.csv",
+    "tracks.csv",
+    "segmentation.png",
+    "segmentation.mp4",
+)  # the last one of videos
 FILM = "segmentation.mp4"
-WRITTEN = (*FILES, FILM)  # the last one where there are pictures
 ALIVE = 3  # tracks that a frame must show of a body; fewer where it has fewer
 GEOMETRY = {False: "with depth: fundamental matrices", True: "a plane, or under a rotation alone: homographies"}
 
@@ -89,8 +96,6 @@ class BodiesReport(LabelledReport):
     @property
     def reason(self) -> str:
         """Why the data do not decide, and what to do; empty where they do."""
-        from dyntorch import Status
-
         return str(dataclasses.replace(self.result, notices=tuple(self.told)).refusal(self.words, Status[self.status]))
 
     @functools.cached_property
@@ -169,6 +174,7 @@ def rows_of(report: BodiesReport) -> list[list[str]]:
     return rows
 
 
+@register_page(BodiesReport, "bodies", FILES)
 def summarize(report: BodiesReport) -> Summary:
     """Everything that is said of bodies through many frames."""
     number, outliers = max(1, int(report.present.sum())), report.counts["outlier"]
@@ -180,37 +186,25 @@ def summarize(report: BodiesReport) -> Summary:
     rows.append([rest, f"{outliers:,}", f"{100 * outliers / number:.1f} %", "", "", "", ""])
     heads = ["body", "tracks ", "share ", "frames", "px per frame ", "noise rms px ", "geometry"]
     return Summary(
-        headline=describe(report), tables=[Table(heads, rows, report.errors)], notes=notes_of(report),
+        headline=describe(report), tables=[Table(heads, rows, report.errors)], notes=warning_lines(report),
         pictures={"segmentation.png": partial(picture_of, report)}, dark=bool(report.photographs),
         files={
             "labels.csv": partial(labels_csv, report), "tracks.csv": partial(tracks_csv, report),
             "segmentation.npz": partial(as_npz, report), "segmentation.json": partial(as_json, report), FILM: None,
         },
+        values=partial(page_values, report),
     )  # fmt: skip
 
 
-def write_bodies(folder: str | Path, report: BodiesReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
-    doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
-    values = {
-        "doubtful": doubtful,
-        "share": share,
-        "standing": static_text(report),
-        "rms": report.rms_text(),
-        "film": FILM,
-    }
-    return write_summary(folder, "bodies", report, summarize(report), **values, **_tables(report))
-
-
-def _tables(report: BodiesReport) -> dict[str, list[list[Any]]]:
-    """Rows of the page's tables: the bodies, and how many tracks of every known body were found to be of which."""
+def page_values(report: BodiesReport) -> dict[str, Any]:
+    """Rows of the page's table of bodies, and what else its template shows."""
     dot = '<span class="drawn" style="color:{colour}" aria-hidden="true">●</span> body {label}{still}'
     bodies: list[list[Any]] = []
     for label, row in enumerate(rows_of(report), start=1):
         still = ", stands still" if label == report.static else ""
         name = markup(dot, colour=colour_of(label), label=label, still=still)
         bodies.append([name, *row[:2], markup("{words}{span}", words=row[2], span=_span(report, label)), *row[3:]])
-    return {"bodies": bodies, "compared": report.compared}
+    return {**report.values, "standing": static_text(report), "film": FILM, "bodies": bodies}
 
 
 def _span(report: BodiesReport, label: int) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +98,12 @@ class LabelledReport(ResultReport):
 
         known, present = torch.from_numpy(self.known), torch.from_numpy(self.present)
         return float(metrics.misclassification(self.result.labels[present], known[present]))
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """What the templates of all such reports show: doubtful points, known labels, the residual."""
+        doubtful = ["doubtful" if odd else "" for odd in self.doubtful.tolist()]
+        return {"doubtful": doubtful, "compared": self.compared, "rms": self.rms_text(), "share": share}
 
     @property
     def errors(self) -> list[str]:

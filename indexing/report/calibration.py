@@ -8,6 +8,7 @@ import math
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +17,12 @@ from numpy.typing import NDArray
 
 from indexing import files
 from indexing.calibrate.rig import ASSOCIATED, CALIBRATION, drop_associated, rotation_vectors, toml_of, write_associated
+from indexing.clip import ClipSet
 from indexing.opening import parse_json, read_bytes, read_text
-from indexing.report.page import Picture, Script, even, markup, render, sentence, write_files
+from indexing.report.page import Script, even, markup, sentence
 from indexing.report.rig import array_of, heat_picture, plan_picture, scene
-from indexing.report.summary import Summary, Table
+from indexing.report.summary import Summary, Table, register_page, write_report
+from indexing.writers import encode
 
 if TYPE_CHECKING:
     from indexing.calibrate.left_right import SideExchange
@@ -52,11 +55,22 @@ class CalibrationReport:
     manifest: Mapping[str, Any] = field(default_factory=dict)
     afterwards: Sequence[str] = ()
     associated: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    folder: Path | None = None
+    """Where it was written."""
+    outputs: Sequence[str] = ()
+    """Names of all files of the folder."""
+    besides: Mapping[str, Any] = field(default_factory=dict)
+    """Contents of those that are not of the report; None removes one of an earlier run."""
 
     @property
     def title(self) -> str:
         """Heading of the page."""
         return self.heading or (f"{len(self.rig.names)} cameras, calibrated" if self.rig.ok else "The recordings do not decide")
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the recordings do not decide; None where they do."""
+        return None if self.rig.ok else self.rig.reason
 
     @functools.cached_property
     def notes(self) -> list[str]:
@@ -125,21 +139,16 @@ def write_calibration(folder: str | Path, report: CalibrationReport) -> tuple[Pa
     stale = old - {*found, *REPORT, *([ASSOCIATED] if done else [])}
     if stale and not rig.ok:
         notes.append(f"removed, as this run does not decide: {', '.join(sorted(stale))} of an earlier one")
-    report = replace(report, afterwards=(*report.afterwards, *notes), associated=done)
-    plan, heat = plan_picture(rig), heat_picture(rig)
     names = [*found, *REPORT, *([ASSOCIATED] if done else [])]
-    contents: dict[str, Any] = dict.fromkeys(name for name in stale if name != ASSOCIATED)
-    contents |= {**found, PLAN: plan, HEAT: heat, JSON: as_json(report, names), PAGE: page(report, plan, heat, names)}
     if ASSOCIATED in stale:
         drop_associated(where)
-    return write_files(where, contents), report
+    besides = {**dict.fromkeys(stale - {ASSOCIATED}), **found}
+    report = replace(report, afterwards=(*report.afterwards, *notes), associated=done, folder=where, outputs=names, besides=besides)
+    return write_report(where, report), report
 
 
 def _results(rig: CameraRig) -> tuple[dict[str, Any], list[str]]:
     """The files of a good rig by their names, and what to say about them."""
-    from indexing.clip import ClipSet
-    from indexing.writers import encode
-
     found: dict[str, Any] = {CALIBRATION: toml_of(rig)}
     notes: list[str] = []
     clips = rig.people
@@ -162,7 +171,7 @@ def _results(rig: CameraRig) -> tuple[dict[str, Any], list[str]]:
     return found, notes
 
 
-def as_json(report: CalibrationReport, names: Sequence[str] = ()) -> dict[str, Any]:
+def as_json(report: CalibrationReport) -> dict[str, Any]:
     """The result as numbers; a camera's time is the first one's times its rate plus its offset, in seconds."""
     rig, found = report.rig, report.rig.calibration
     times = array_of(found.times)
@@ -189,7 +198,7 @@ def as_json(report: CalibrationReport, names: Sequence[str] = ()) -> dict[str, A
             for notice in rig.with_camera_names.notices
         ],
         "notes": report.notes,
-        "files": sorted(names),
+        "files": sorted(report.outputs),
         "manifest": report.manifest,
     }  # fmt: skip
 
@@ -232,20 +241,18 @@ def offset_sigma(report: CalibrationReport, i: int) -> float:
 # The page.
 
 
-def page(report: CalibrationReport, plan: bytes | None, heat: bytes | None, names: Sequence[str] = ()) -> str:
-    """The page, with its pictures."""
+def page_values(report: CalibrationReport) -> dict[str, Any]:
+    """The scene, and rows of the page's tables."""
     rig = report.rig
     data, drawn = scene(rig)
-    values: dict[str, Any] = {
-        "rig": rig, "cards": cards(report), "noted": calibration_notes(report), "data": data, "drawn": drawn,
+    return {
+        "rig": rig, "noted": calibration_notes(report), "data": data, "scene_note": drawn,
         "script": Script("rig.js") if data else None,
-        "plan": Picture(plan) if plan else None, "heat": Picture(heat) if heat else None,
         "camera_rows": camera_rows(report), "clock_rows": clock_rows(report), "residual_rows": residual_rows(report),
         "lenses": sentence(f"focal lengths {rig.lenses.source}"), "unit": "m" if rig.calibration.metric else "units",
-        "unknown": rig.unknown, "files": file_rows(names),
+        "unknown": rig.unknown, "files": file_rows(report.outputs),
         "residual_heads": ["Joint", *((name, "number") for name in rig.names)], "joint_rows": joint_rows(report),
     }  # fmt: skip
-    return render("calibration", report, summary=summarize(report).headline, **values)
 
 
 def describe(report: CalibrationReport) -> str:
@@ -265,8 +272,9 @@ def describe(report: CalibrationReport) -> str:
     )
 
 
-def summarize(report: CalibrationReport, folder: Path | None = None) -> Summary:
-    """Everything that is said of a calibration that was written into a folder."""
+@register_page(CalibrationReport, "calibration", REPORT)
+def summarize(report: CalibrationReport) -> Summary:
+    """Everything that is said of a calibration, and of what was written of it."""
     rig = report.rig
     pixels = [f"{value:.1f}" if math.isfinite(value) else "none" for value in report.residual]
     rows = [
@@ -275,11 +283,14 @@ def summarize(report: CalibrationReport, folder: Path | None = None) -> Summary:
     ]
     unit = "m" if rig.calibration.metric else "no unit"
     closing = [f"open: {text}" for text in rig.unknown] if rig.ok else []
-    if folder is not None:
-        kept = sorted(name for name in earlier(folder) if not name.endswith((".png", ".html", ".json")))
-        closing.append(f"written to {folder}/: {', '.join(kept) or 'the report alone, and no calibration'}")
+    if report.folder is not None:
+        results = sorted(name for name in report.outputs if not name.endswith((".png", ".html", ".json")))
+        closing.append(f"written to {report.folder}/: {', '.join(results) or 'the report alone, and no calibration'}")
     return Summary(
-        headline=describe(report), notes=[f"note: {note}" for note in report.notes], closing=closing,
+        headline=describe(report), cards=cards(report), notes=[f"note: {note}" for note in report.notes], closing=closing,
+        pictures={PLAN: lambda theme: plan_picture(rig), HEAT: lambda theme: heat_picture(rig)},
+        files={JSON: partial(as_json, report)},
+        values=partial(page_values, report),
         tables=[Table(["camera", "focal length px ", f"position {unit} ", "clock s ", "residual px ", "agrees "], rows)],
     )  # fmt: skip
 

@@ -137,6 +137,11 @@ class ResultReport:
         return str(self.result.refusal(self.words, Status[self.status]))
 
     @property
+    def refusal(self) -> str | None:
+        """The same; None where the data decide."""
+        return None if self.status == "OK" else self.reason
+
+    @property
     def state(self) -> str:
         """The status in small letters."""
         return self.status.lower().replace("_", " ")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,11 @@ import numpy as np
 from indexing import files
 from indexing.opening import count
 from indexing.report import pictures
-from indexing.report.canvas import letters_without_font, strip
-from indexing.report.page import Picture, Script, bar, even, markup, render, table_csv, write_files
-from indexing.report.pictures import timeline_tips
+from indexing.report.canvas import Theme, letters_without_font, strip
+from indexing.report.page import Picture, Script, bar, even, markup, table_csv
 from indexing.report.player import Player, players
 from indexing.report.results import (
+    COUNTS,
     MEANING,
     RecognitionReport,
     RecordingResult,
@@ -25,6 +26,7 @@ from indexing.report.results import (
     confused_with,
     count_row,
     held_rows,
+    held_sentences,
     measure,
     missed_actions,
     overlapping,
@@ -32,15 +34,46 @@ from indexing.report.results import (
     repetitions_csv,
     seconds,
 )
+from indexing.report.summary import Summary, Table, register_page, write_report
 
 TIMELINES = 12  # recordings, or people in them, whose timeline is drawn, and recordings that have a player
 STRIPS = 60  # events that are shown as stick figures, over all recordings
 TIPS = 2000  # bars of a timeline that say what they are when pointed at
 ROWS = 1000  # events that are listed, over all recordings
 PERFORMANCES = 400  # performances that are listed of a recording
+MISSED = 5  # known actions that were not found and are printed
 LOST = 12  # known actions that were not found and are listed
+EVENTS_HEAD = ("file", "label", "start", "end", "score", "margin", "person")
 NONE = "n/a"  # shown where a number does not exist
-OURS = r"confusion\.png|timeline(-\d+)?\.png|events\.csv|repetitions\.csv"
+OURS = r"confusion\.(png|csv)|timeline(-\d+)?\.png|hits\.csv|events\.csv|repetitions\.csv"  # of this and other reports on actions
+
+
+@register_page(RecognitionReport, "recognition", stale=OURS)
+def summarize(report: RecognitionReport) -> Summary:
+    """Everything that is said of what was found in recordings, and of how well clips are recognized."""
+    measured, recordings = measure(report), report.recordings
+    tables = [_events_table(recordings), _counts_table(recordings)] if recordings else []
+    closing = (
+        [*held_sentences(recordings), _search_sentence(report, measured), *_truth_sentences(report, measured)] if recordings else []
+    )
+    drawn: dict[str, Any] = {name: partial(_timeline, one, span) for name, one, span in _timelines(recordings)}
+    if report.evaluations:
+        tables += _evaluation_tables(measured)
+        closing += _evaluation_sentences(report, measured)
+        confusion = measured["confusion"]
+        drawn["confusion.png"] = lambda theme: pictures.confusion(confusion["counts"], confusion["labels"])
+    counted = any(one.repetitions is not None for one in recordings)
+    return Summary(
+        headline=report.summary or describe(report, measured), cards=headline(report, measured),
+        tables=[table for table in tables if table.rows], closing=closing,
+        notes=[note if note.startswith("warning: ") else f"note: {note}" for note in report.notes], pictures=drawn,
+        files={
+            **({"events.csv": partial(events_csv, recordings)} if recordings else {}),
+            **({"repetitions.csv": partial(repetitions_csv, recordings)} if counted else {}),
+            "metrics.json": lambda: measured, files.MANIFEST: lambda: report.manifest,
+        },
+        values=partial(page_values, report, measured),
+    )  # fmt: skip
 
 
 def write_recognition(folder: str | Path, report: RecognitionReport) -> Path:
@@ -65,30 +98,103 @@ def write_recognition(folder: str | Path, report: RecognitionReport) -> Path:
         >>> sorted(file.name for file in path.parent.iterdir())
         ['confusion.png', 'manifest.json', 'metrics.json', 'report.html']
     """
-    where = files.prepare(folder)
-    measured = measure(report)
-    shown, drawn = of_recordings(report)
-    notes = [("", "", note) for note in report.notes]
+    return write_report(folder, report)
+
+
+def page_values(report: RecognitionReport, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """What the page says of each recording, its tables of settings and actions, and the player's script."""
+    recordings = of_recordings(report)
     values: dict[str, Any] = {
-        "shown": shown,
-        "cards": headline(report, measured),
-        "notes": notes,
-        "percent": percent,
-        "duration": duration,
-        "script": Script("player.js") if any(one["player"] is not None for one in shown) else None,
-    }
-    if report.evaluations:
-        drawn["confusion.png"] = pictures.confusion(measured["confusion"]["counts"], measured["confusion"]["labels"])
-        values |= {"confusion": Picture(drawn["confusion.png"]), **by_setting(report, measured), **by_class(measured)}
-    summary = report.summary or describe(report, measured)
-    html = render("recognition", report, summary=summary, measured=measured, TIMELINES=TIMELINES, STRIPS=STRIPS, **values)
-    contents: dict[str, Any] = {**drawn, **({"events.csv": events_csv(report.recordings)} if report.recordings else {})}
-    if any(recording.repetitions is not None for recording in report.recordings):
-        contents["repetitions.csv"] = repetitions_csv(report.recordings)
-    names = sorted([*contents, "metrics.json", files.MANIFEST, "report.html"])
-    files.remove_stale(where, names, OURS)
-    contents |= {"metrics.json": measured, files.MANIFEST: {**report.manifest, "files": names}, "report.html": html}
-    return write_files(folder, contents)
+        "shown": recordings, "measured": measured, "percent": percent, "duration": duration, "TIMELINES": TIMELINES,
+        "STRIPS": STRIPS,
+        "script": Script("player.js") if any(one["player"] is not None for one in recordings) else None,
+    }  # fmt: skip
+    return values | (by_setting(report, measured) | by_class(measured) if report.evaluations else {})
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tables and sentences of the terminal.
+
+
+def _events_table(results: Sequence[RecordingResult]) -> Table:
+    """The events, with the recording and the person where there are several."""
+    events = [(result, event) for result in results for event in result.events]
+    scores, margins = even([event.score for _, event in events]), even([event.margin for _, event in events])
+    columns, cells_of = _person_columns(results)
+    rows = [
+        [*cells_of(result), str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
+        for (result, event), score, margin in zip(events, scores, margins, strict=True)
+    ]
+    return Table([*columns, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)
+
+
+def _counts_table(results: Sequence[RecordingResult]) -> Table:
+    """How often each action was performed, and how."""
+    columns, cells_of = _person_columns(results)
+    return Table(
+        [*columns, *COUNTS], [[*cells_of(result), *count_row(each)] for result in results for each in result.repetitions or ()]
+    )
+
+
+def _person_columns(results: Sequence[RecordingResult]) -> tuple[list[str], Callable[[RecordingResult], list[str]]]:
+    """Headings that tell recordings and people apart, where there are several, and a result's cells below them."""
+    columns = {"recording": len({result.name for result in results}) > 1, "person": any(result.person for result in results)}
+    return (
+        [name for name, several in columns.items() if several],
+        lambda result: [result.name] * columns["recording"] + [result.person] * columns["person"],
+    )
+
+
+def _search_sentence(report: RecognitionReport, measured: Mapping[str, Any]) -> str:
+    """What was found, where, and how long it took; of a recording with several people, its length counts once."""
+    where = f"{count(measured['recordings'], 'recording')} ({measured['seconds']:.1f} s long)"
+    who = f" of {count(measured['people'], 'person', 'people')}" if measured["people"] else ""
+    actions = count(measured["events"], "action") if measured["events"] else "no action"
+    return f"{actions}{who} found in {where} in {report.timings.get('scan', 0.0):.1f} s"
+
+
+def _truth_sentences(report: RecognitionReport, measured: Mapping[str, Any]) -> list[str]:
+    """How many of the known actions an event of the same name overlaps, which are missed, and how much of what is reported is
+    right."""
+    if "known_events" not in measured:
+        return []
+    missed = [action for result in report.recordings for action in missed_actions(result)]
+    named = ", ".join(f"{label} at {start:.2f} to {end:.2f} s" for label, start, end in missed[:MISSED])
+    more = f" and {len(missed) - MISSED} more" if len(missed) > MISSED else ""
+    known = measured["known_events"]
+    sentence = f"{known - len(missed)} of {count(known, 'known action')} found" + (f"; missed: {named}{more}" if missed else "")
+    shares = [f"{name} {measured[name]:.3f}" for name in ("precision", "recall") if not np.isnan(measured[name])]
+    right = (
+        f"{measured['right_events']} of {measured['compared_events']} reported share half of their time or more with a known one"
+    )
+    return [sentence, *[f"{right} ({', '.join(shares)})"] * bool(shares)]
+
+
+def _evaluation_tables(measured: Mapping[str, Any]) -> list[Table]:
+    """Recall and precision of each action, and the accuracy by setting and group."""
+    rows = []
+    for name, row in measured["per_class"].items():
+        wrong = confused_with(measured["confusion"], name)
+        taken = f"{wrong[0]} ({wrong[1]})" if wrong else ""
+        if row["clips"]:
+            rows.append([name, row["clips"], f"{row['recall']:.3f}", f"{row['precision']:.3f}", taken])
+    by_setting = measured["accuracy_by_setting"]
+    accuracy = by_setting | {name: value for name, value in measured.get("accuracy_by_group", {}).items() if name not in by_setting}
+    settings = [[name, f"{value:.3f}"] for name, value in accuracy.items()] if set(accuracy) != {""} else []
+    return [
+        Table(["action", "clips ", "recall ", "precision ", "most often taken for"], rows),
+        Table(["setting", "accuracy "], settings),
+    ]
+
+
+def _evaluation_sentences(report: RecognitionReport, measured: Mapping[str, Any]) -> list[str]:
+    """The accuracy over all clips with its interval, and the time that it took."""
+    low, high = measured["accuracy_interval"]
+    learn, recognize = (report.timings.get(step, 0.0) for step in ("learn", "recognize"))
+    return [
+        f"accuracy {measured['accuracy']:.3f} ({measured['clips']:,} clips; 95 % interval {low:.3f} to {high:.3f})",
+        f"learned in {learn:.1f} s, recognized in {recognize:.1f} s",
+    ]
 
 
 def describe(report: RecognitionReport, measured: Mapping[str, Any]) -> str:
@@ -171,31 +277,38 @@ def _of_search(measured: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return items
 
 
-def of_recordings(report: RecognitionReport) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
-    """What the page says of each recording, person by person, and the timelines as files."""
+def _timelines(recordings: Sequence[RecordingResult]) -> list[tuple[str, RecordingResult, tuple[float, float]]]:
+    """Name of the picture, person and seconds shown, of those whose timeline is drawn."""
+    timelines = []
+    for people in by_recording(recordings):
+        span = (float(min(one.times[0] for one in people)), float(max(one.times[-1] for one in people)))
+        timelines += [(one, span) for one in people]
+    return [(timeline_name(i), *timeline) for i, timeline in enumerate(timelines[:TIMELINES])]
+
+
+def _timeline(recording: RecordingResult, span: tuple[float, float], theme: Theme) -> Picture:
+    bars = (recording.classes, recording.events, recording.truth, span)
+    drawn = pictures.timeline(recording.times, recording.scores, *bars)
+    return Picture(drawn, tips=pictures.timeline_tips(recording.times, *bars)[:TIPS])
+
+
+def of_recordings(report: RecognitionReport) -> list[dict[str, Any]]:
+    """What the page says of each recording, person by person."""
     groups = by_recording(report.recordings)
     play: list[Player | None] = [*players(groups[:TIMELINES], report), *[None] * len(groups[TIMELINES:])]
     shown: list[dict[str, Any]] = []
-    drawn: dict[str, bytes] = {}
     index = before = 0
     for people, player in zip(groups, play, strict=True):
         lanes = []
-        span = (float(min(one.times[0] for one in people)), float(max(one.times[-1] for one in people)))
         for recording in people:
-            picture = None
-            if index < TIMELINES:
-                at = (recording.classes, recording.events, recording.truth, span)
-                drawn[timeline_name(index)] = pictures.timeline(recording.times, recording.scores, *at)
-                tips = timeline_tips(recording.times, *at)
-                picture = Picture(drawn[timeline_name(index)], tips=tips[:TIPS])
-            lanes.append({**of_recording(report, recording, before), "picture": picture})
+            lanes.append({**of_recording(report, recording, before), "picture": timeline_name(index)})
             before += len(recording.events)
             index += 1
         shown.append({
             "name": people[0].name or "Recording", "lanes": lanes, "player": player, "seconds": seconds(people),
             "events": sum(len(one.events) for one in people), "held": held_rows(people), "meaning": MEANING, **counting(people),
         })  # fmt: skip
-    return shown, drawn
+    return shown
 
 
 def counting(people: Sequence[RecordingResult]) -> dict[str, Any]:
@@ -318,19 +431,22 @@ def timeline_name(index: int) -> str:
     return "timeline.png" if index == 0 else f"timeline-{index + 1}.png"
 
 
+def event_row(file: str, event: ReportedEvent, person: str) -> list[str]:
+    """A row of ``events.csv``: seconds with 3 decimals, an empty cell for no number and for whoever is alone."""
+    times, scores = [f"{event.start:.3f}", f"{event.end:.3f}"], map(score_text, (event.score, event.margin))
+    return [cell(file), cell(event.label), *times, *scores, cell(person)]
+
+
 def events_csv(recordings: Sequence[RecordingResult]) -> str:
-    """All events as CSV: ``file,label,start,end,score,margin,person``; seconds with 3 decimals, an empty cell for no number and for
-    whoever is alone."""
+    """All events as CSV."""
     rows = [
-        [
-            cell(recording.name), cell(event.label), f"{event.start:.3f}", f"{event.end:.3f}",
-            *map(_number, (event.score, event.margin)), cell(recording.person),
-        ]
+        event_row(recording.name, event, recording.person)
         for recording in recordings
         for event in sorted(recording.events, key=lambda event: event.start)
-    ]  # fmt: skip
-    return table_csv(["file", "label", "start", "end", "score", "margin", "person"], rows)
+    ]
+    return table_csv(EVENTS_HEAD, rows)
 
 
-def _number(value: float) -> str:
+def score_text(value: float) -> str:
+    """A score as a cell of CSV, empty where it is no number."""
     return f"{value:.6g}" if value is not None and np.isfinite(value) else ""

@@ -6,7 +6,6 @@ import functools
 import math
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,11 +33,18 @@ from indexing.report.canvas import (
     style,
 )
 from indexing.report.page import ResultReport, markup, matrix, npz, safe_cell, sentence, table_csv
-from indexing.report.summary import Summary, Table, notes_of, write_summary
+from indexing.report.summary import Summary, Table, register_page, warning_lines
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "reconstruction.npz", "reconstruction.json", "points.csv", "tracks.png", "scene.png")
-WRITTEN = (*FILES, "tracks.csv")  # the last one of videos
+FILES = (
+    "report.html",
+    "reconstruction.npz",
+    "reconstruction.json",
+    "points.csv",
+    "tracks.png",
+    "scene.png",
+    "tracks.csv",
+)  # the last one of videos
 ROUNDING = 1e-12
 LABELS = (("outlier", "static", "moving"), ("outlier", "body 1", "body 2"))
 ARRAYS = ("cameras", "points", "residuals", "inliers", "structure", "projections")
@@ -175,6 +181,7 @@ def describe(report: ReconstructionReport) -> str:
     return f"Of {number:,} points tracked through {views} views, {', '.join(parts)}. {PURPOSE.get(report.motion, '')}"
 
 
+@register_page(ReconstructionReport, "reconstruction", FILES)
 def summarize(report: ReconstructionReport) -> Summary:
     """Everything that is said of a reconstruction."""
     counts, known, failed = report.counts, report.solved, left_out(report)
@@ -187,7 +194,7 @@ def summarize(report: ReconstructionReport) -> Summary:
         rows = [[one.motion, f"{one.score:.6g}", f"{one.residual:.3g}"] for one in fitted]
         tables.append(Table(["model", "penalized cost ", "rms residual "], rows, [f"note: {failed}"] if failed else []))
     return Summary(
-        headline=describe(report), tables=tables, notes=notes_of(report),
+        headline=describe(report), tables=tables, notes=warning_lines(report),
         closing=[f"open: {report.ambiguity}"] if known and report.ambiguity else [],
         pictures={
             "tracks.png": partial(tracks_picture, report),
@@ -198,15 +205,11 @@ def summarize(report: ReconstructionReport) -> Summary:
             "points.csv": partial(points_csv, report), "reconstruction.npz": partial(as_npz, report),
             "reconstruction.json": partial(as_json, report), "tracks.csv": None,
         },
+        values=partial(page_values, report),
     )  # fmt: skip
 
 
-def write_reconstruction(folder: str | Path, report: ReconstructionReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
-    return write_summary(folder, "reconstruction", report, summarize(report), **page_tables(report))
-
-
-def page_tables(report: ReconstructionReport) -> dict[str, Any]:
+def page_values(report: ReconstructionReport) -> dict[str, Any]:
     """Rows of the page's tables: models, views and their cameras; and what to say about the models left out."""
     taken = markup('{name} <small class="none">taken</small>', name=report.motion)
     fitted = [one for one in report.result.candidates if math.isfinite(one.score)]

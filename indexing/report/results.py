@@ -137,6 +137,7 @@ class RecognitionReport:
         metrics: further numbers for metrics.json; those at its top level are shown as cards.
         baseline: name of the method behind the evaluations' ``baseline``, and how it works in a few words.
         notes: what a reader must know to judge the numbers, a sentence each.
+        timings: seconds of each step.
         manifest: of :func:`indexing.files.manifest`.
     """
 
@@ -148,6 +149,7 @@ class RecognitionReport:
     metrics: Mapping[str, Any] = field(default_factory=dict)
     baseline: tuple[str, str] = ("Baseline", "")
     notes: Sequence[str] = ()
+    timings: Mapping[str, float] = field(default_factory=dict)
     manifest: Mapping[str, Any] = field(default_factory=dict)
 
     def exemplar(self, event: ReportedEvent) -> Clip | None:

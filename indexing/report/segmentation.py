@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,11 +36,17 @@ from indexing.report.page import (
     sentence,
     table_csv,
 )
-from indexing.report.summary import Summary, Table, notes_of, write_summary
+from indexing.report.summary import Summary, Table, register_page, warning_lines
 
 FloatArray = NDArray[np.float64]
-FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png")
-WRITTEN = (*FILES, "tracks.csv")  # the last one of videos
+FILES = (
+    "report.html",
+    "segmentation.npz",
+    "segmentation.json",
+    "labels.csv",
+    "segmentation.png",
+    "tracks.csv",
+)  # the last one of videos
 MOTION = {
     "fundamental": "fundamental matrix: a rigid body with depth",
     "homography": "homography: a plane, or a body seen under a rotation alone",
@@ -94,6 +99,7 @@ def describe(report: SegmentationReport) -> str:
     return f"Of {number:,} matches of two images, {moved}{rest}.{lost}"
 
 
+@register_page(SegmentationReport, "segmentation", FILES)
 def summarize(report: SegmentationReport) -> Summary:
     """Everything that is said of a segmentation."""
     number, counts = report.seen, report.counts
@@ -105,24 +111,18 @@ def summarize(report: SegmentationReport) -> Summary:
     rest = "outliers" if report.models else "unlabelled"
     rows.append([rest, f"{counts['outlier']:,}", f"{100 * counts['outlier'] / number:.1f} %", "", ""])
     return Summary(
-        headline=describe(report), notes=notes_of(report),
+        headline=describe(report), notes=warning_lines(report),
         tables=[Table(["body", "matches ", "share ", "model", "noise rms px "], rows, report.errors)],
         pictures={"segmentation.png": partial(picture_of, report)}, dark=bool(report.photographs),
         files={
             "labels.csv": partial(labels_csv, report), "segmentation.npz": partial(as_npz, report),
             "segmentation.json": partial(as_json, report), "tracks.csv": None, "segmentation.mp4": None,
         },
+        values=partial(page_values, report),
     )  # fmt: skip
 
 
-def write_segmentation(folder: str | Path, report: SegmentationReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
-    doubtful = ["doubtful" if odd else "" for odd in report.doubtful.tolist()]
-    values = {"doubtful": doubtful, "share": share, "rms": report.rms_text(), **tables(report)}
-    return write_summary(folder, "segmentation", report, summarize(report), **values)
-
-
-def tables(report: SegmentationReport) -> dict[str, list[list[Any]]]:
+def page_values(report: SegmentationReport) -> dict[str, Any]:
     """Rows of the page's tables: the bodies, their matrices, and how many matches of every known body were found to be of which."""
     bodies, matrices = [], []
     for label, model in enumerate(report.models, start=1):
@@ -133,7 +133,7 @@ def tables(report: SegmentationReport) -> dict[str, list[list[Any]]]:
         bodies.append([markup(dot, colour=colour_of(label), label=label), *figures, doubtful, MOTION.get(model, model)])
         found = report.found.homographies if model == "homography" else report.found.fundamentals
         matrices.append([f"body {label}", model, matrix(found[label - 1])])
-    return {"bodies": bodies, "matrices": matrices, "compared": report.compared}
+    return {**report.values, "bodies": bodies, "matrices": matrices}
 
 
 def as_npz(report: SegmentationReport) -> bytes:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from indexing.opening import count
 from indexing.readers.matches import Photograph
 from indexing.report.canvas import LIGHT, Theme, draw_photograph, finish, foot, new_figure, png, shorten, style
 from indexing.report.page import bar, safe_cell, sentence, table_csv
-from indexing.report.summary import Summary, Table, write_summary
+from indexing.report.summary import Summary, Table, register_page
 
 FILES = ("report.html", "static.json", "images.csv", "pairs.csv", "static.png")
 PANELS, COLUMNS, WIDE, EDGE, HEAD, FOOT = 6, 3, 10.2, 0.15, 0.32, 0.5  # of the picture: images, and inches
@@ -42,6 +41,11 @@ class StaticReport:
     def title(self) -> str:
         """Heading of the page."""
         return self.heading or ("What stands still" if self.found.ok else "The matches do not decide what stands still")
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the matches do not decide; None where they do."""
+        return None if self.found.ok else self.found.reason
 
     @property
     def matches(self) -> int:
@@ -119,6 +123,7 @@ def as_json(report: StaticReport) -> dict[str, Any]:
     }
 
 
+@register_page(StaticReport, "static", FILES)
 def summarize(report: StaticReport) -> Summary:
     """Everything that is said of what stands still in a database."""
     found, rows = report.found, image_rows(report)
@@ -136,18 +141,18 @@ def summarize(report: StaticReport) -> Summary:
             "images.csv": partial(images_csv, report), "pairs.csv": partial(pairs_csv, report),
             "static.json": partial(as_json, report),
         },
+        values=partial(page_values, report),
     )  # fmt: skip
 
 
-def write_report(folder: str | Path, report: StaticReport) -> Path:
-    """Write a report into a folder: the files of :data:`FILES`, each whole or not at all, ``report.html`` last."""
+def page_values(report: StaticReport) -> dict[str, Any]:
+    """Rows of the page's tables."""
     images, pairs = image_rows(report), pair_rows(report)
-    values = {
+    return {
         "images": [[name, *(f"{n:,}" for n in row[:3]), bar(row[3]), "refused" if row[4] else ""] for name, *row in images],
         "pairs": [[f"{a} and {b}", *(f"{n:,}" for n in row[:5]), row[5]] for a, b, *row in pairs],
         "rows": ROWS,
     }
-    return write_summary(folder, "static", report, summarize(report), **values)
 
 
 def images_csv(report: StaticReport) -> str:

@@ -7,6 +7,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +17,8 @@ from numpy.typing import NDArray
 from dyntorch.numerics import as_python, with_words
 from indexing.opening import count
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
-from indexing.report.page import Picture, markup, render, sentence, write_files
-from indexing.report.summary import Summary, Table
+from indexing.report.page import markup, sentence
+from indexing.report.summary import Summary, Table, register_page
 from indexing.sync.breaks import RepairedClocks
 from indexing.sync.notices import accepted_notices
 from indexing.sync.people import Pairing, joint_names, person_label
@@ -133,6 +134,10 @@ class SyncReport:
     shifted: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     videos: Mapping[str, Any] = field(default_factory=dict)
     mended: RepairedClocks | None = None
+    checks: Sequence[str] = ()
+    """Names of the check videos."""
+    folder: Path | None = None
+    """Where it was written."""
     heading: str = ""
     words: Callable[[str, str | None], str] = as_python
     manifest: Mapping[str, Any] = field(default_factory=dict)
@@ -176,6 +181,11 @@ class SyncReport:
     def decided(self) -> int:
         """How many pairs decide by themselves."""
         return sum(bool(pair.shift.ok) for pair in self.pairs)
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the data do not decide, and what to do; None where they do."""
+        return None if self.ok else self.reason
 
     @property
     def reason(self) -> str:
@@ -243,8 +253,9 @@ def describe(report: SyncReport) -> str:
     )
 
 
-def summarize(report: SyncReport, folder: Path | None = None) -> Summary:
-    """Everything that is said of a synchronization that was written into a folder."""
+@register_page(SyncReport, "sync", FILES)
+def summarize(report: SyncReport) -> Summary:
+    """Everything that is said of a synchronization, and of what was written of it."""
     tables, closing = [_pairs_table(report)], []
     if len(report.clocks) > 2:
         tables.append(_clocks_table(report))
@@ -256,8 +267,11 @@ def summarize(report: SyncReport, folder: Path | None = None) -> Summary:
     refused = [pair for pair in report.pairs if not pair.shift.ok] if len(report.pairs) > 1 else []
     closing += [f"{pair.a.name} and {pair.b.name} refused: {pair.reason}" for pair in refused[:REFUSALS]]
     closing += [f"and {len(refused) - REFUSALS} more pairs refused"] if len(refused) > REFUSALS else []
-    closing += [*(f"note: {note}" for note in report.notes), *_written_sentences(report, folder)]
-    return Summary(headline=describe(report), tables=tables, closing=closing)
+    closing += [*(f"note: {note}" for note in report.notes), *_written_sentences(report)]
+    return Summary(
+        headline=describe(report), tables=tables, closing=closing, pictures={"curve.png": lambda theme: picture_of(report)},
+        files={"sync.json": partial(as_json, report)}, values=partial(page_values, report),
+    )  # fmt: skip
 
 
 def _clock_sentence(report: SyncReport) -> str:
@@ -311,12 +325,12 @@ def _clocks_table(report: SyncReport) -> Table:
     return Table([f"clock against {report.reference.name}", "offset s ", "± s ", "frames ", "rate ppm "], rows, below)
 
 
-def _written_sentences(report: SyncReport, folder: Path | None) -> list[str]:
+def _written_sentences(report: SyncReport) -> list[str]:
     """What was written besides the report, a sentence each."""
-    out = []
+    out, folder = [], report.folder or Path()
     for clock in (clock for clock in report.clocks if clock.take.spatial and clock.shifted is not None):
         assert clock.shifted is not None
-        where = Path(clock.shifted["folder"]) if folder is None else folder / clock.shifted["folder"]
+        where = folder / clock.shifted["folder"]
         out.append(
             f"motion capture: {where}, on the clock of {report.reference.name}, within {1000 * clock.shifted['rest']:.1f} ms"
         )
@@ -324,11 +338,10 @@ def _written_sentences(report: SyncReport, folder: Path | None) -> list[str]:
     if moved:
         rest = 1000 * max(clock.shifted["rest"] for clock in moved if clock.shifted is not None)
         written = ", ".join(clock.name for clock in moved)
-        where = Path("pose-sync") if folder is None else folder / "pose-sync"
-        out.append(f"shifted files: {where}/ ({written}), within {rest:.1f} ms of {report.reference.name}")
+        out.append(f"shifted files: {folder / 'pose-sync'}/ ({written}), within {rest:.1f} ms of {report.reference.name}")
     if report.videos:
         rest = 1000 * max(one["rest"] for one in report.videos["cameras"].values())
-        where = Path(report.videos["folder"]) if folder is None else folder / report.videos["folder"]
+        where = folder / report.videos["folder"]
         said = f"{count(len(report.videos['cameras']), 'video')} of {count(report.videos['frames'], 'frame')}"
         most = f"{rest:.1f} ms of {report.reference.name}{'' if report.mended is None else ' where frames were lost'}"
         out.append(f"videos: {where}/, {said}, {report.videos['fps']:.6g} per second, within {most}")
@@ -420,18 +433,12 @@ def _state(pair: Compared) -> Any:
     })  # fmt: skip
 
 
-def write_sync(folder: str | Path, report: SyncReport, videos: Sequence[str] = ()) -> Path:
-    """Write the report into a folder: ``curve.png``, ``sync.json`` and ``report.html``, each whole or not at all."""
-    drawn = picture_of(report)
-    return write_files(folder, {"curve.png": drawn, "sync.json": as_json(report), "report.html": page(report, drawn, videos)})
-
-
-def page(report: SyncReport, drawn: bytes, videos: Sequence[str] = ()) -> str:
-    """The page, with a picture of the curves."""
-    values: dict[str, Any] = {"noted": sync_notes(report), "clock_rows": clock_rows(report), "pair_rows": pair_rows(report)}
-    values["video_rows"] = video_rows(report)
-    values |= {"picture": Picture(drawn), "videos": videos, "drawn": DRAWN, "drift_of": drift_of, "ppm": ppm, "sigma": sigma_text}
-    return render("sync", report, summary=summarize(report).headline, **values)
+def page_values(report: SyncReport) -> dict[str, Any]:
+    """Rows of the page's tables, and how it writes numbers."""
+    return {
+        "noted": sync_notes(report), "clock_rows": clock_rows(report), "pair_rows": pair_rows(report),
+        "video_rows": video_rows(report), "max_pairs": DRAWN, "drift_of": drift_of, "ppm": ppm, "sigma": sigma_text,
+    }  # fmt: skip
 
 
 def as_json(report: SyncReport) -> dict[str, Any]:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from indexing import files
 from indexing.cameras import y_up
 from indexing.clip import Clip
+from indexing.opening import count
 from indexing.report.canvas import FACE, LIGHT, new_figure, png, shorten_all, style
-from indexing.report.page import Picture, markup, render, write_files
+from indexing.report.page import markup
+from indexing.report.summary import Summary, Table, register_page
 from indexing.skeleton import Skeleton, usual_layout
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
 
 Array = NDArray[np.float64]
+NOBODY = "Nobody could be left out (the clips have no field 'subject', or it is one person): the usual weights stand."
 COLUMNS = 5  # skeletons in a row
 PANEL = 1.62, 1.95  # inches
 PIECES = 16  # of a bone, each in its own colour
@@ -65,13 +68,13 @@ class BodyParts:
         return np.asarray(positive / np.maximum(positive.max(axis=1, keepdims=True), 1e-12))
 
 
-def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) -> BodyParts:
-    """What a fitted indexer says: how much the margin of an action grows when a joint is seen. groups ``(exemplars,)``."""
+def measure_body_parts(indexer: ActionIndexer) -> BodyParts:
+    """What a fitted indexer says: how much the margin of an action grows when a joint is seen."""
     import torch
 
     from indexing.action.learning import importance, typical
 
-    groups = getattr(indexer, "groups_", None) if groups is None else groups
+    groups = getattr(indexer, "groups_", None)
     numbers = None if groups is None else torch.from_numpy(np.unique(np.asarray(groups), return_inverse=True)[1])
     known = len(indexer.classes_)  # what follows is background
     examples = [indexer.exemplar(int(i)) for i in typical(indexer.model_)[:known]]
@@ -79,10 +82,10 @@ def measure_body_parts(indexer: ActionIndexer, groups: ArrayLike | None = None) 
     return BodyParts(indexer.classes_.tolist(), values, examples, indexer.skeleton_)
 
 
-def body_parts(parts: BodyParts, *, columns: int = COLUMNS) -> bytes:
+def body_parts(parts: BodyParts) -> bytes:
     """PNG: a skeleton per action, in its most telling pose; strong colour and thick lines where a joint matters."""
     number = len(parts.classes)
-    rows = -(-number // max(1, columns))
+    rows = -(-number // COLUMNS)
     columns = -(-number // rows)  # rows of about the same length
     width, height = PANEL[0] * columns + 0.2, PANEL[1] * rows + 0.42
     names = shorten_all(parts.classes, 20)
@@ -213,35 +216,81 @@ def _colours() -> Any:
     return LinearSegmentedColormap.from_list("parts", (LIGHT.line, *HOT))
 
 
-PICTURE = "body_parts.png"
-NOBODY = "Nobody could be left out (the clips have no field 'subject', or it is one person): the usual weights stand."
+# ----------------------------------------------------------------------------------------------------------------------
+# The page.
 
 
-def write_training(
-    folder: str | Path, indexer: ActionIndexer, clips: Sequence[Clip], notes: Sequence[str], manifest: Mapping[str, Any]
-) -> Path:
-    """Write a report into a folder: ``report.html``, ``body_parts.png``, ``metrics.json`` and ``manifest.json``."""
-    parts = measure_body_parts(indexer)
-    drawn = body_parts(parts)
-    names = [PICTURE, "metrics.json", files.MANIFEST, "report.html"]
-    said = [("", "", note) for note in notes]
-    report = {"title": f"{len(indexer.classes_)} actions learned", "notes": said, "manifest": manifest}
-    values = {"joints": telling_joints(parts), "weighing": _weight_rows(indexer), "examples": _examples(clips)}
-    summary = _summary(indexer, clips)
-    html = render("training", report, summary=summary, cards=_headline(indexer, clips), picture=Picture(drawn), **values)
-    contents = {PICTURE: drawn, "metrics.json": _metrics(indexer, parts), files.MANIFEST: {**manifest, "files": names}}
-    return write_files(folder, {**contents, "report.html": html})
+@dataclass(frozen=True, eq=False)
+class TrainingReport:
+    """What a model was learned from, into which file, and what a person should know of it."""
+
+    indexer: ActionIndexer
+    clips: Sequence[Clip]
+    notes: Sequence[str] = ()
+    closing: Sequence[str] = ()
+    manifest: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """Heading of the page."""
+        return f"{len(self.indexer.classes_)} actions learned"
+
+    @cached_property
+    def parts(self) -> BodyParts:
+        """How much each joint matters."""
+        return measure_body_parts(self.indexer)
 
 
-def _summary(indexer: ActionIndexer, clips: Sequence[Clip]) -> str:
+@register_page(TrainingReport, "training")
+def summarize(report: TrainingReport) -> Summary:
+    """Everything that is said of what was learned."""
+    indexer, clips = report.indexer, report.clips
+    rows = [
+        [label, len(mine), f"{sum(clip.duration for clip in mine):.1f}", ", ".join(sorted({_joints_text(clip) for clip in mine}))]
+        for label, mine in _by_label(clips).items()
+    ]
+    return Summary(
+        headline=describe(report), cards=_cards(indexer, clips),
+        tables=[Table(["action", "examples ", "seconds ", "joints "], rows)],
+        notes=[f"note: {note}" for note in [*report.notes, *_background_notes(indexer)]], closing=report.closing,
+        pictures={"body_parts.png": lambda theme: body_parts(report.parts)},
+        files={"metrics.json": lambda: _metrics(indexer, report.parts), files.MANIFEST: lambda: report.manifest},
+        values=lambda: {
+            "joints": telling_joints(report.parts), "weighing": _weight_rows(indexer),
+            "examples": [[label, f"{number:,}", seconds] for label, number, seconds, _ in rows],
+        },
+    )  # fmt: skip
+
+
+def _by_label(clips: Sequence[Clip]) -> dict[str, list[Clip]]:
+    groups: dict[str, list[Clip]] = {}
+    for clip in clips:
+        groups.setdefault(str(clip.label), []).append(clip)
+    return dict(sorted(groups.items()))
+
+
+def _joints_text(clip: Clip) -> str:
+    return f"{clip.joints.shape[1]} in {clip.dims}D"
+
+
+def _background_notes(indexer: ActionIndexer) -> list[str]:
+    """What the actions are told from, besides one another."""
+    model = indexer.model_
+    if not model.hidden:
+        return []
+    clips = int((model.labels >= model.known).sum())
+    return [f"told from a background of {count(clips, 'clip')} in {count(model.hidden, 'kind')}, which are never reported"]
+
+
+def describe(report: TrainingReport) -> str:
+    """What was learned, in plain words."""
+    indexer, clips = report.indexer, report.clips
     seconds = sum(clip.duration for clip in clips)
     words = [f"{len(indexer.classes_)} actions were learned from {len(clips)} clips ({seconds:.0f} s in all)."]
     if indexer.weights == "learned":
         people = people_left_out(indexer)
-        if people:
-            words.append(f"How the evidence is weighed was chosen by what serves people best who are left out ({people} people).")
-        else:
-            words.append(NOBODY)
+        chosen = f"How the evidence is weighed was chosen by what serves people best who are left out ({people} people)."
+        words.append(chosen if people else NOBODY)
     return " ".join(words)
 
 
@@ -251,7 +300,7 @@ def people_left_out(indexer: ActionIndexer) -> int:
     return people if people > 1 else 0
 
 
-def _headline(indexer: ActionIndexer, clips: Sequence[Clip]) -> list[tuple[str, str, str]]:
+def _cards(indexer: ActionIndexer, clips: Sequence[Clip]) -> list[tuple[str, str, str]]:
     counts = Counter(str(clip.label) for clip in clips)
     few, many = min(counts.values()), max(counts.values())
     people = {str(clip.meta["subject"]) for clip in clips if "subject" in clip.meta}
@@ -279,13 +328,6 @@ def _weight_rows(indexer: ActionIndexer) -> list[list[str]]:
         ["Depth for virtual views", depth],
         ["Joints weighed differently", learned if indexer.weights == "learned" else "no: weights were not learned"],
     ]
-
-
-def _examples(clips: Sequence[Clip]) -> list[list[str]]:
-    groups: dict[str, list[Clip]] = {}
-    for clip in clips:
-        groups.setdefault(str(clip.label), []).append(clip)
-    return [[label, f"{len(mine):,}", f"{sum(clip.duration for clip in mine):.1f}"] for label, mine in sorted(groups.items())]
 
 
 def _metrics(indexer: ActionIndexer, parts: BodyParts) -> dict[str, Any]:

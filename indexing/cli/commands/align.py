@@ -10,7 +10,7 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import with_words
-from indexing.cli.console import check_report, count, finish, flag_words, names, progress, show
+from indexing.cli.console import check_report, count, flag_words, names, present, progress
 from indexing.cli.flags.geometry import Align
 from indexing.cli.scenes import (
     Asked,
@@ -25,7 +25,7 @@ from indexing.cli.scenes import (
 )
 from indexing.files import manifest
 from indexing.readers.matches import Matched, read_matches
-from indexing.report.alignment import PURPOSE, WRITTEN, AlignmentReport, summarize, write_alignment
+from indexing.report.alignment import FILES, PURPOSE, AlignmentReport
 from indexing.video.scene import SCENE_FOLLOWING, THRESHOLD, SceneTracks
 
 SEVERAL = ("planar", "join", "minimal_join")
@@ -43,7 +43,7 @@ def run(flags: Align) -> int:
     asked.check(scene)
     inputs = [*(inputs_of(inputs) if scene else inputs), *calibration_files(flags.calibration)]
 
-    folder = check_report(flags.out, inputs, WRITTEN)
+    folder = check_report(flags.out, inputs, FILES)
     started = time.perf_counter()
     with progress("reading", steps=False):
         matched, tracks = _read(flags, asked if scene else None)
@@ -67,12 +67,7 @@ def run(flags: Align) -> int:
         photographs=photographs(tracks) if tracks else (),
         besides={"tracks.csv": tracks_csv(tracks)} if tracks else {},
     )
-    page = None
-    if folder is not None:
-        with progress("drawing the report", steps=False):
-            page = write_alignment(folder, report)
-    show(summarize(report))
-    return finish(page, None if report.status == "OK" else report.reason)
+    return present(report, folder)
 
 
 def _check(flags: Align) -> None:

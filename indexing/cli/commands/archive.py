@@ -17,15 +17,12 @@ import torch
 
 from indexing import Archive
 from indexing.action.indexer import ActionIndexer
-from indexing.archive.actions import ArchivedEvent
 from indexing.archive.archive import ArchiveInfo
-from indexing.archive.search import Hit
 from indexing.archive.sources import ArchiveSource, gather, stamp
 from indexing.archive.workers import QuietProcesses
 from indexing.archive.writer import Addition
 from indexing.cli.commands.scan import exemplars, within_label
 from indexing.cli.console import (
-    REPORT_FILES,
     Progress,
     check_report,
     complain,
@@ -33,8 +30,10 @@ from indexing.cli.console import (
     counting_bar,
     names,
     one_line,
+    present,
     progress,
     say,
+    show,
     table,
 )
 from indexing.cli.flags.archive import Add, Find, Info, Remove, Search, Verify
@@ -46,14 +45,10 @@ from indexing.cli.videos import watch_options
 from indexing.clip import Clip
 from indexing.files import manifest, plain
 from indexing.modelfile import model_kind
-from indexing.report.archive import FindReport, SearchReport, write_finds, write_search
-from indexing.report.page import even
+from indexing.report.archive import FILES, FindReport, SearchReport, size_text, summarize_info, summarize_verification
 from indexing.report.recognition import duration
 
 PROBLEMS, INTERRUPTED = 2, 130  # exit codes
-MAX_EVENTS_PRINTED = 100  # events that are printed: all are in the report
-
-
 # up to these one process is done before others, which take some 8 s to start on two cores, could have helped
 MAX_SOURCES_ALONE = 1000  # recordings to add
 MAX_BYTES_ALONE = 2**28  # of recordings to add
@@ -80,7 +75,7 @@ def add(flags: Add) -> int:
         complain(f"interrupted; {_kept_text(archive, before)}")
         return INTERRUPTED
     _added_show(done)
-    say(f"{archive.path}: {_size(archive.info())}; took {time.perf_counter() - started:.1f} s")
+    say(f"{archive.path}: {size_text(archive.info())}; took {time.perf_counter() - started:.1f} s")
     for failure in done.failed:
         complain(f"failed: {failure.reason or failure.source}")
     fine = bool(done.of("added") or done.of("replaced")) and not flags.strict
@@ -91,7 +86,7 @@ def search(flags: Search) -> int:
     """Search, print the hits, write the report."""
     check_workers(flags.workers, flags.dask)
     example = _example(flags.example)
-    folder = check_report(flags.report, [example.path], (*REPORT_FILES, "hits.csv"))
+    folder = check_report(flags.report, [example.path], FILES)
     with progress("loading", steps=False):
         archive = Archive(_absolute(flags.archive) if flags.dask else flags.archive)
         reading = watch_videos(flags.reading, [example.path], flags.report)
@@ -100,25 +95,9 @@ def search(flags: Search) -> int:
     started = time.perf_counter()
     with workforce(flags.workers, flags.dask, threads=True) as executor, progress("searching") as bar:
         hits = archive.search(clip, flags.k, executor, bar, flags.mirror)
-    seconds = time.perf_counter() - started
-    info = archive.info()
-    page = None if folder is None else _write_hits(flags, folder, archive, clip, hits, info, notes, seconds)
-    _hits_show(hits, flags.mirror)
-    for note in notes:
-        say(f"note: {note}")
-    say(f"{count(len(hits), 'hit')} in {_size(info)}, searched in {seconds:.1f} s")
-    if page is not None:
-        say(f"report: {page}")
-    return 0
-
-
-def _write_hits(
-    flags: Search, folder: Path, archive: Archive, clip: Clip, hits: list[Hit], info: ArchiveInfo, notes: list[str], seconds: float
-) -> Path:
-
-    about = _manifest("search", flags, [_example(flags.example).path], archive, info, {"search": seconds})
-    with progress("drawing the report", steps=False):
-        return write_search(folder, SearchReport(clip, hits, archive, info, notes, about))
+    seconds, info = time.perf_counter() - started, archive.info()
+    about = {} if folder is None else _manifest("search", flags, [example.path], archive, info, {"search": seconds})
+    return present(SearchReport(clip, hits, archive, info, notes, seconds, flags.mirror, about), folder)
 
 
 def find(flags: Find) -> int:
@@ -138,49 +117,21 @@ def find(flags: Find) -> int:
     with workforce(workers, flags.dask, info.recordings) as executor, rate("searching", info.recordings) as bar:
         events = archive.find(indexer, executor, bar)
     seconds = time.perf_counter() - started
-    page = None if folder is None else _write_events(flags, folder, archive, indexer, events, info, seconds)
-    _events_show(events, [str(label) for label in indexer.classes_])
-    where = len({event.source for event in events})
-    said = f"{count(len(events), 'action')} found in {count(where, 'recording')} of" if events else "no action found in"
-    say(f"{said} {_size(info)}, searched in {seconds:.1f} s")
-    if page is not None:
-        say(f"report: {page}")
-    return 0
-
-
-def _write_events(
-    flags: Find, folder: Path, archive: Archive, indexer: Any, events: list[ArchivedEvent], info: ArchiveInfo, seconds: float
-) -> Path:
-
-    about = _manifest("find", flags, [flags.model], archive, info, {"find": seconds})
+    about = {} if folder is None else _manifest("find", flags, [flags.model], archive, info, {"find": seconds})
     named = [dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar)) for event in events]
     classes = [str(label) for label in indexer.classes_]
-    report = FindReport(classes, named, archive.recordings(), archive, exemplars(indexer), manifest=about)
-    with progress("drawing the report", steps=False):
-        return write_finds(folder, report)
+    examples = {} if folder is None else exemplars(indexer)
+    recordings = archive.recordings()
+    report = FindReport(classes, named, recordings, archive, info, examples, seconds=seconds, manifest=about)
+    return present(report, folder)
 
 
 def info(flags: Info) -> int:
     """Count, and list."""
     with progress("counting", steps=False):
         archive = Archive(flags.archive)
-        info = archive.info()
-    if flags.sources:
-        rows = [
-            [one.source, one.person, f"{one.start:.2f}", f"{one.end:.2f}", f"{one.seconds:.1f}", one.layout]
-            for one in archive.recordings()
-        ]
-        table(["source", "person", "start (s) ", "end (s) ", "stored (s) ", "joints"], rows)
-    else:
-        lines = [[name, joints, _long(seconds)] for name, joints, seconds in info.layouts]
-        table(["joint layout", "joints ", "time "], lines)
-    people = f" ({count(info.recordings, 'recording')} of one person each)" * (info.recordings != info.sources)
-    hours = info.seconds / 3600
-    each = f", {info.size / 1e6 / hours:.1f} MB an hour" * (hours >= 1)
-    say(f"{count(info.sources, 'source')}{people}, {_long(info.seconds)}, {count(info.windows, 'window')}")
-    say(f"{info.size / 1e6:,.1f} MB in {count(info.segments, 'segment')}{each}; version {info.version}")
-    if info.dead:
-        say(f"{count(info.dead, 'window')} of what was removed still take space; later additions take it back")
+        summary = summarize_info(archive.info(), archive.recordings() if flags.sources else None)
+    show(summary)
     return 0
 
 
@@ -190,11 +141,7 @@ def verify(flags: Verify) -> int:
         found = Archive(flags.archive).verify()
     for problem in found.problems:
         complain(problem)
-    if found.orphans:
-        left = count(len(found.orphans), "file")
-        say(f"note: {left} of interrupted additions hold nothing that is missed; the next addition takes them away")
-    where = f"{count(found.windows, 'window')} in {count(found.segments, 'segment')}"
-    say(f"{where}: all there, whole, and once" if found.ok else f"{where}: {count(len(found.problems), 'problem')}")
+    show(summarize_verification(found))
     return 0 if found.ok else PROBLEMS
 
 
@@ -352,15 +299,6 @@ def read_query(example: Example, reading: Reading, select: Sequence[str]) -> tup
 
 
 # ---- what is printed -----------------------------------------------------------------------------------------------------
-def _long(seconds: float) -> str:
-
-    return duration(seconds)
-
-
-def _size(info: ArchiveInfo) -> str:
-    return f"{count(info.sources, 'source')} ({_long(info.seconds)})"
-
-
 def _kept_text(archive: Archive, before: int) -> str:
     """What an interrupted addition leaves."""
     again = "the same command goes on from there"
@@ -369,7 +307,7 @@ def _kept_text(archive: Archive, before: int) -> str:
     except ValueError:
         return f"nothing was added yet; {again}"
     new = max(0, info.windows - before)
-    return f"the archive is whole: {_size(info)}, {count(new, 'window')} of it new; {again}"
+    return f"the archive is whole: {size_text(info)}, {count(new, 'window')} of it new; {again}"
 
 
 def _added_show(done: Addition) -> None:
@@ -379,7 +317,7 @@ def _added_show(done: Addition) -> None:
         if some:
             fresh = outcome in ("added", "replaced")
             windows, seconds = sum(one.windows for one in some), sum(one.seconds for one in some)
-            rows.append([outcome, f"{len(some):,}", f"{windows:,}" if fresh else "", _long(seconds) if fresh else ""])
+            rows.append([outcome, f"{len(some):,}", f"{windows:,}" if fresh else "", duration(seconds) if fresh else ""])
     table(["", "sources ", "windows ", "time "], rows)
     reasons: dict[str, list[str]] = {}
     for one in done.sources:
@@ -387,39 +325,6 @@ def _added_show(done: Addition) -> None:
             reasons.setdefault(f"{one.reason}{', left out' * (one.outcome == 'left out')}", []).append(one.source)
     for reason, sources in reasons.items():
         say(f"note: {reason}: {names(sources)}")
-
-
-def _hits_show(hits: Sequence[Hit], mirror: bool) -> None:
-
-    people, scores = any(hit.person for hit in hits), even([hit.score for hit in hits])
-    rows = [
-        [
-            f"{number}", hit.source, *[hit.person] * people, f"{hit.start:.2f}", f"{hit.end:.2f}", score,
-            *["mirrored" * hit.mirrored] * mirror,
-        ]
-        for number, (hit, score) in enumerate(zip(hits, scores, strict=True), 1)
-    ]  # fmt: skip
-    if rows:
-        table(["rank ", "source", *["person"] * people, "start (s) ", "end (s) ", "score ", *[""] * mirror], rows)
-
-
-def _events_show(events: Sequence[ArchivedEvent], classes: Sequence[str]) -> None:
-    """Few events one by one; of many, how many there are of each action."""
-    if 0 < len(events) <= MAX_EVENTS_PRINTED:
-        people = any(event.person for event in events)
-        scores, margins = even([event.score for event in events]), even([event.margin for event in events])
-        rows: list[list[object]] = [
-            [event.source, *[event.person] * people, event.label, f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
-            for event, score, margin in zip(events, scores, margins, strict=True)
-        ]
-        table(["source", *["person"] * people, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)
-    elif events:
-        times: dict[str, list[str]] = {label: [] for label in classes}
-        for event in events:
-            times.setdefault(str(event.label), []).append(event.source)
-        rows = [[label, f"{len(where):,}", f"{len(set(where)):,}"] for label, where in times.items()]
-        table(["action", "times ", "sources "], rows)
-        say("note: each event, with its times, is in events.csv of a report (--report FOLDER)")
 
 
 def _manifest(

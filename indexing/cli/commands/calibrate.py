@@ -55,7 +55,7 @@ def run(flags: Calibrate) -> int:
             made = manifest({"command": "calibrate", **dataclasses.asdict(flags)}, inputs, None, timings)
             report = dataclasses.replace(report, manifest=made)
             page, report = write_calibration(folder, report)
-    show(summarize(report, folder))
+    show(summarize(report))
     return finish(page, None if rig.ok else rig.reason)
 
 

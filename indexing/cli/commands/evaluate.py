@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from indexing.action.indexer import ActionIndexer
 from indexing.cli.commands.scan import search
 from indexing.cli.commands.suggest import TIER
-from indexing.cli.console import Progress, check_report, count, names, progress, say, table
+from indexing.cli.console import Progress, check_report, names, present, progress
 from indexing.cli.flags.index import Evaluate, Scan
 from indexing.cli.flags.shared import Labelling
 from indexing.cli.inputs import assumed_rate_notes, read_clips, usable
@@ -23,14 +23,12 @@ from indexing.cli.labels import check_labelling, lasting, of_medium, open_marked
 from indexing.cli.protocol import Cameras, Fold, Viewing, check_classes, check_dims, draw_shots, splits, strangers
 from indexing.cli.videos import AsTheyAre, are_films, frame_rate, pixel_indexer, read_set, refuse_film_flags, refuse_keypoint_flags
 from indexing.clip import LabelledSet
-from indexing.comparing import NONE, Agreement, ComparedSpan, compare
+from indexing.comparing import ComparedSpan, compare
 from indexing.files import manifest
 from indexing.labels import Label, choose_labels
 from indexing.opening import error, listing
-from indexing.report import EvaluationResult, RecognitionReport, write_recognition
-from indexing.report.agreement import FILES, AgreementReport, label_rows, overlap_rows, write_agreement
-from indexing.report.recognition import duration
-from indexing.report.results import confused_with, recognition
+from indexing.report import EvaluationResult, RecognitionReport
+from indexing.report.agreement import FILES, AgreementReport
 
 REJECTED = "(rejected)"
 
@@ -52,19 +50,21 @@ def run(flags: Evaluate) -> int:
     timings = {"load": time.perf_counter() - started, "learn": 0.0, "recognize": 0.0}
     with progress("learning and recognizing") as bar:
         results = _measure(flags, clips, labels, folds, cameras, timings, bar)
-
-    measured = recognition([result for _, result in results])
     groups = _by_group(results) if flags.leave_out is not None else {}
-    page = None if folder is None else _write(flags, folder, [result for _, result in results], groups, notes, timings)
-    _show(measured, groups)
-    for note in notes:
-        say(note if note.startswith("warning") else f"note: {note}")
-    low, high = measured["accuracy_interval"]
-    say(f"accuracy {measured['accuracy']:.3f} ({measured['clips']:,} clips; 95 % interval {low:.3f} to {high:.3f})")
-    say(f"learned in {timings['learn']:.1f} s, recognized in {timings['recognize']:.1f} s")
-    if page is not None:
-        say(f"report: {page}")
-    return 0
+    report = RecognitionReport(
+        f"Recognition of {path(flags).name}",
+        evaluations=[result for _, result in results],
+        metrics={"accuracy_by_group": groups} if groups else {},
+        notes=notes,
+        timings=timings,
+        manifest={} if folder is None else _manifest(flags, [path(flags)], timings, flags.seed),
+    )
+    return present(report, folder)
+
+
+def _manifest(flags: Evaluate, inputs: Sequence[Path], timings: Mapping[str, float], seed: int | None = None) -> dict[str, Any]:
+    arguments = {"command": "index evaluate", **dataclasses.asdict(flags)}
+    return manifest(arguments, [path.expanduser() for path in inputs], seed, timings)
 
 
 def path(flags: Evaluate) -> Path:
@@ -151,49 +151,12 @@ def _indexer(flags: Evaluate, examples: list[Any]) -> Any:
     )  # fmt: skip
 
 
-def _write(
-    flags: Evaluate,
-    folder: Path,
-    results: list[EvaluationResult],
-    groups: dict[str, float],
-    notes: list[str],
-    timings: dict[str, float],
-) -> Path:
-
-    report = RecognitionReport(
-        f"Recognition of {path(flags).name}",
-        evaluations=results,
-        metrics={"accuracy_by_group": groups} if groups else {},
-        notes=notes,
-        manifest=manifest(
-            {"command": "index evaluate", **dataclasses.asdict(flags)}, [path(flags).expanduser()], flags.seed, timings
-        ),
-    )
-    with progress("drawing the report", steps=False):
-        return write_recognition(folder, report)
-
-
 def _by_group(results: list[tuple[str, EvaluationResult]]) -> dict[str, float]:
     """Accuracy of each group that was left out, over all cameras."""
     right: dict[str, list[bool]] = {}
     for name, result in results:
         right.setdefault(name, []).extend(str(a) == str(b) for a, b in zip(result.truth, result.predicted, strict=True))
     return {name: sum(values) / len(values) for name, values in right.items()}
-
-
-def _show(measured: Mapping[str, Any], groups: dict[str, float]) -> None:
-
-    rows = []
-    for name, row in measured["per_class"].items():
-        wrong = confused_with(measured["confusion"], name)
-        taken = f"{wrong[0]} ({wrong[1]})" if wrong else ""
-        if row["clips"]:
-            rows.append([name, row["clips"], f"{row['recall']:.3f}", f"{row['precision']:.3f}", taken])
-    table(["action", "clips ", "recall ", "precision ", "most often taken for"], rows)
-    settings = measured["accuracy_by_setting"]
-    shown = settings | {name: value for name, value in groups.items() if name not in settings}
-    if set(shown) != {""}:
-        table(["setting", "accuracy "], [[name, f"{value:.3f}"] for name, value in shown.items()])
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -224,16 +187,10 @@ def against_labels(command: Evaluate) -> int:
     inputs = [*command.clips, *command.labelling.labels, *([command.model] if command.model is not None else [])]
     folder = check_report(command.report, inputs, FILES)
     compared = _of_files(command) if command.model is None else _of_model(command)
-
-    both = compare(compared.spans)
-    page = None if folder is None else _write_agreement(command, folder, both, compared, inputs)
-    _show_agreement(both, compared.sides)
-    for note in compared.notes:
-        say(f"note: {note}")
-    say(_agreement_summary(both, compared))
-    if page is not None:
-        say(f"report: {page}")
-    return 0
+    spans, (known, found) = compared.spans, compared.sides
+    about = {} if folder is None else _manifest(command, inputs, compared.timings)
+    report = AgreementReport(f"{found} against {known}", compare(spans), spans, compared.sides, compared.notes, about)
+    return present(report, folder)
 
 
 def _of_model(command: Evaluate) -> _Compared:
@@ -385,42 +342,3 @@ def _subjects(
         shown or "(nobody)": tuple([one for one in side if one.subject.casefold() == name] for side in (known, found))  # type: ignore[misc]
         for name, shown in people.items()
     }
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# What is printed and written.
-
-
-def _show_agreement(both: Agreement, sides: tuple[str, str]) -> None:
-
-    say(f"confusion over time, in seconds: rows are {sides[0]}, columns {sides[1]}")
-    named = [*both.labels, NONE]
-    rows = [
-        [name, *(f"{value:.1f}" if value >= 0.05 else "" for value in row)]
-        for name, row in zip(named, both.seconds.tolist(), strict=True)
-    ]
-    table(["", *(f"{name} " for name in named)], rows)
-    head = ["label", "known (s) ", "found (s) ", "both (s) ", "kappa ", "known ", "found ", *(f"F1@{k:g} " for k in both.segments)]
-    table(head, label_rows(both))
-    table(["overlap", "right ", "found ", "known ", "precision ", "recall ", "F1 "], overlap_rows(both))
-
-
-def _agreement_summary(both: Agreement, compared: _Compared) -> str:
-
-    recordings = len({span.name for span in compared.spans})
-    people = sum(bool(span.person) for span in compared.spans)
-    who = f" of {count(people, 'person', 'people')}" if people else ""
-    kappa = "does not exist (one label throughout)" if both.kappa != both.kappa else f"{both.kappa:.3f}"
-    return (
-        f"{compared.sides[1]} against {compared.sides[0]}: {duration(both.compared)}{who} in {count(recordings, 'recording')}; "
-        f"the same in {100 * both.agreement:.1f} % of the time, Cohen's kappa over time {kappa}"
-    )
-
-
-def _write_agreement(command: Evaluate, folder: Path, both: Agreement, compared: _Compared, inputs: Sequence[Path]) -> Path:
-
-    arguments: dict[str, Any] = {"command": "index evaluate", **dataclasses.asdict(command)}
-    about = manifest(arguments, [path.expanduser() for path in inputs], timings=compared.timings)
-    title = f"{compared.sides[1]} against {compared.sides[0]}"
-    with progress("drawing the report", steps=False):
-        return write_agreement(folder, AgreementReport(title, both, compared.spans, compared.sides, compared.notes, about))

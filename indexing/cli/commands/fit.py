@@ -6,9 +6,10 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from indexing.action.indexer import ActionIndexer
-from indexing.cli.console import check_file, check_report, count, names, progress, say, table
+from indexing.cli.console import check_file, check_report, count, names, present, progress, say, table
 from indexing.cli.flags.index import Fit
 from indexing.cli.flags.shared import Example, Reading
 from indexing.cli.inputs import on_overlaps, on_range, parse_example, read_clips, read_examples, watch_videos
@@ -26,7 +27,7 @@ from indexing.cli.videos import (
 )
 from indexing.clip import Clip
 from indexing.files import manifest, prepare
-from indexing.report.training import write_training
+from indexing.report.training import TrainingReport
 
 
 def run(flags: Fit) -> int:
@@ -56,15 +57,10 @@ def run(flags: Fit) -> int:
         notes.append("--weights learned: nobody could be left out (no field 'subject', or one person), so the usual weights stand")
     prepare(output.parent)
     indexer.save(output)
-    page = None if folder is None else _write(flags, folder, indexer, clips, notes, paths)
-    _show(clips)
-    notes += _other_movement(indexer)
-    for note in notes:
-        say(f"note: {note}")
-    code = _report_written(output, seconds)
-    if page is not None:
-        say(f"report: {page}")
-    return code
+    about: dict[str, Any] = {}
+    if folder is not None:
+        about = manifest({"command": "index fit", **dataclasses.asdict(flags)}, [path.expanduser() for path in paths], flags.seed)
+    return present(TrainingReport(indexer, clips, notes, [_written_text(output, seconds)], about), folder)
 
 
 def _read(flags: Fit, examples: list[Example], reading: Reading) -> tuple[list[Clip], list[Clip], list[str]]:
@@ -78,13 +74,6 @@ def _read(flags: Fit, examples: list[Example], reading: Reading) -> tuple[list[C
     paths = [example.path for example in examples if example.label is None]
     marked = labelled_examples(flags.labelling, paths, reading, flags.unlabelled_is_background, clips)
     return [*clips, *marked.clips], [*background, *marked.background], notes + marked.notes
-
-
-def _write(flags: Fit, folder: Path, indexer: ActionIndexer, clips: list[Clip], notes: list[str], paths: list[Path]) -> Path:
-
-    about = manifest({"command": "index fit", **dataclasses.asdict(flags)}, [path.expanduser() for path in paths], flags.seed)
-    with progress("drawing the report", steps=False):
-        return write_training(folder, indexer, clips, notes, about)
 
 
 def _from_pixels(flags: Fit, examples: list[Example], output: Path) -> int:
@@ -113,7 +102,8 @@ def _from_pixels(flags: Fit, examples: list[Example], output: Path) -> int:
     table(["action", "examples ", "seconds "], lines)
     for note in [*notes, f"learned from pixels, at {indexer.fps:.3g} frames per second"]:
         say(f"note: {note}")
-    return _report_written(output, time.perf_counter() - started)
+    say(_written_text(output, time.perf_counter() - started))
+    return 0
 
 
 def _check_two(labels: Sequence[str], examples: Sequence[Example]) -> None:
@@ -122,26 +112,5 @@ def _check_two(labels: Sequence[str], examples: Sequence[Example]) -> None:
         raise ValueError(f"{files}: only one action ({labels[0]}); give examples of two or more, such as ordinary movement")
 
 
-def _other_movement(indexer: ActionIndexer) -> list[str]:
-    """What the actions are told from, besides one another."""
-    model = indexer.model_
-    if not model.hidden:
-        return []
-    clips = int((model.labels >= model.known).sum())
-    return [f"told from a background of {count(clips, 'clip')} in {count(model.hidden, 'kind')}, which are never reported"]
-
-
-def _report_written(output: Path, seconds: float) -> int:
-    say(f"learned in {seconds:.1f} s; model written to {output} ({max(1, round(output.stat().st_size / 1000)):,} kB)")
-    return 0
-
-
-def _show(clips: list[Clip]) -> None:
-    groups: dict[str, list[Clip]] = {}
-    for clip in clips:
-        groups.setdefault(str(clip.label), []).append(clip)
-    rows = []
-    for label, mine in sorted(groups.items()):
-        kinds = sorted({f"{clip.joints.shape[1]} in {clip.dims}D" for clip in mine})
-        rows.append([label, len(mine), f"{sum(clip.duration for clip in mine):.1f}", ", ".join(kinds)])
-    table(["action", "examples ", "seconds ", "joints "], rows)
+def _written_text(output: Path, seconds: float) -> str:
+    return f"learned in {seconds:.1f} s; model written to {output} ({max(1, round(output.stat().st_size / 1000)):,} kB)"

@@ -13,7 +13,7 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import with_words
-from indexing.cli.console import check_report, count, finish, flag_words, show
+from indexing.cli.console import check_report, count, flag_words, present
 from indexing.cli.console import progress as progress_of
 from indexing.cli.flags.geometry import Reconstruct
 from indexing.cli.scenes import (
@@ -30,7 +30,7 @@ from indexing.cli.scenes import (
 )
 from indexing.files import manifest
 from indexing.readers.tracks import TrackSet, exact, read_tracks
-from indexing.report.reconstruction import WRITTEN, ReconstructionReport, summarize, write_reconstruction
+from indexing.report.reconstruction import FILES, ReconstructionReport
 
 WORDS = flag_words("times", "static", "threshold", "motion", "calibration")
 UNFIXED = (
@@ -48,7 +48,7 @@ def run(flags: Reconstruct) -> int:
     _check_scene(flags, scene, asked)
     inputs = inputs_of(inputs) if scene else inputs
 
-    folder = check_report(flags.out, inputs, WRITTEN)
+    folder = check_report(flags.out, inputs, FILES)
     started = time.perf_counter()
     with progress_of("reading", steps=False):
         frames = None if flags.frames is None else [word.strip() for word in flags.frames.split(",")]
@@ -70,12 +70,7 @@ def run(flags: Reconstruct) -> int:
         photograph=photographs(followed)[0] if followed else None,
         besides={"tracks.csv": tracks_csv(followed)} if followed else {},
     )
-    page = None
-    if folder is not None:
-        with progress_of("drawing the report", steps=False):
-            page = write_reconstruction(folder, report)
-    show(summarize(report))
-    return finish(page, None if report.status == "OK" else report.reason)
+    return present(report, folder)
 
 
 def _check(flags: Reconstruct) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from indexing import ActionOptions
 from indexing.action.indexer import ActionIndexer
 from indexing.brightness.indexer import BrightnessIndexer
-from indexing.cli.console import Progress, check_report, count, names, progress, say, table
+from indexing.cli.console import Progress, check_report, names, present, progress
 from indexing.cli.flags.index import Scan
 from indexing.cli.inputs import KnownEvent, Lane, on_truth, read_recordings, read_truth, watch_videos
 from indexing.cli.labels import check_write, known_events, read_marked, write_found
@@ -24,10 +23,8 @@ from indexing.files import manifest
 from indexing.modelfile import model_kind
 from indexing.readers.formats.clipset import holds_frames
 from indexing.recordings.repetitions import count_repetitions
-from indexing.report import RecognitionReport, RecordingResult, write_recognition
-from indexing.report.page import even
-from indexing.report.results import COUNTS, by_recording, count_matches, count_row, held_sentences, missed_actions
-from indexing.report.results import seconds as lasts
+from indexing.report import RecognitionReport, RecordingResult
+from indexing.report.results import by_recording
 from indexing.scoring import Event
 
 RESTED = {"strict": 2.0, "usual": 1.0, "off": 0.0}
@@ -47,22 +44,20 @@ def run(flags: Scan) -> int:
     if target is not None:
         with progress(f"writing {target.name}", steps=False):
             notes += write_found(target, results, flags.recordings, flags.labelling)
-    page = None if folder is None else _write(flags, folder, indexer, results, notes, inputs, timings)
-    _scan_show(results)
-    _counts_show(results)
-    for note in notes:
-        say(f"note: {note}")
-    for sentence in held_sentences(results):
-        say(sentence)
-    say(_summary(results, timings["scan"]))
-    if any(result.truth is not None for result in results):
-        for sentence in [_against_truth(results), *_right(results)]:
-            say(sentence)
-    if target is not None:
-        say(f"written: {target}")
-    if page is not None:
-        say(f"report: {page}")
-    return 0
+    number = len(by_recording(results))
+    about: dict[str, Any] = {}
+    if folder is not None:
+        arguments, seed = {"command": "index scan", **dataclasses.asdict(flags)}, getattr(indexer, "random_state", None)
+        about = manifest(arguments, [path.expanduser() for path in inputs], seed, timings)
+    report = RecognitionReport(
+        f"Actions in {results[0].name}" if number == 1 else f"Actions in {number} recordings",
+        recordings=results,
+        exemplars=exemplars(indexer) if hasattr(indexer, "exemplar") else {},
+        notes=notes,
+        timings=timings,
+        manifest=about,
+    )
+    return present(report, folder, *([f"written: {target}"] if target is not None else []))
 
 
 def search(flags: Scan) -> tuple[Any, list[RecordingResult], list[str], dict[str, float]]:
@@ -143,23 +138,6 @@ def _scan(flags: Scan, indexer: Any, recording: Any, truth: list[KnownEvent] | N
         return RecordingResult(recording.name, None, times, classes, scores, events, truth)
 
 
-def _write(flags: Scan, folder: Path, indexer: Any, results: list[RecordingResult], notes: list[str], inputs: list[Path],
-    timings: dict[str, float],
-) -> Path:  # fmt: skip
-
-    number = len(by_recording(results))
-    arguments = {"command": "index scan", **dataclasses.asdict(flags)}
-    report = RecognitionReport(
-        f"Actions in {results[0].name}" if number == 1 else f"Actions in {number} recordings",
-        recordings=results,
-        exemplars=exemplars(indexer) if hasattr(indexer, "exemplar") else {},
-        notes=notes,
-        manifest=manifest(arguments, [path.expanduser() for path in inputs], getattr(indexer, "random_state", None), timings),
-    )
-    with progress("drawing the report", steps=False):
-        return write_recognition(folder, report)
-
-
 def _of_person(indexer: ActionIndexer, lane: Lane, truth: list[KnownEvent] | None, bar: Progress) -> RecordingResult:
     """One person of a recording: explained, and what was found counted."""
     assert lane.clip is not None
@@ -197,59 +175,3 @@ def _unknown(truth: Sequence[Sequence[KnownEvent] | None] | None, indexer: Any) 
     known = {str(label) for label in indexer.classes_}
     strange = sorted({str(label) for events in truth or [] for label, _, _ in events or []} - known)
     return [f"the model does not know {names(strange)}, which the known events name"] if strange else []
-
-
-def _scan_show(results: list[RecordingResult]) -> None:
-    """The events as a table, with the recording and the person where there are several."""
-    found = [(result, event) for result in results for event in result.events]
-    scores, margins = even([event.score for _, event in found]), even([event.margin for _, event in found])
-    columns, whose = _person_headings(results)
-    rows = [
-        [*whose(result), str(event.label), f"{event.start:.2f}", f"{event.end:.2f}", score, margin]
-        for (result, event), score, margin in zip(found, scores, margins, strict=True)
-    ]
-    if rows:
-        table([*columns, "action", "start (s) ", "end (s) ", "score ", "margin "], rows)
-
-
-def _counts_show(results: list[RecordingResult]) -> None:
-    """How often each action was performed, and how."""
-    columns, whose = _person_headings(results)
-    rows = [[*whose(result), *count_row(one)] for result in results for one in result.repetitions or ()]
-    if rows:
-        table([*columns, *COUNTS], rows)
-
-
-def _person_headings(results: Sequence[RecordingResult]) -> tuple[list[str], Callable[[RecordingResult], list[str]]]:
-    """Headings that tell recordings and people apart, where there are several, and a result's cells below them."""
-    named = {"recording": len({result.name for result in results}) > 1, "person": any(result.person for result in results)}
-    columns = [name for name, wanted in named.items() if wanted]
-    return columns, lambda result: [result.name] * named["recording"] + [result.person] * named["person"]
-
-
-def _summary(results: list[RecordingResult], seconds: float) -> str:
-    """What was found, where, and how long it took; of a recording with several people, its length counts once."""
-    found, files = sum(len(result.events) for result in results), by_recording(results)
-    length = sum(map(lasts, files))
-    where = f"{count(len(files), 'recording')} ({length:.1f} s long)"
-    people = sum(bool(result.person) for result in results)
-    who = f" of {count(people, 'person', 'people')}" if people else ""
-    return f"{count(found, 'action') if found else 'no action'}{who} found in {where} in {seconds:.1f} s"
-
-
-def _against_truth(results: list[RecordingResult]) -> str:
-    """How many of the known actions an event of the same name overlaps, and which are missed."""
-    lost = [(result, event) for result in results for event in missed_actions(result)]
-    known = sum(len(result.truth or ()) for result in results)
-    named = ", ".join(f"{label} at {start:.2f} to {end:.2f} s" for _, (label, start, end) in lost[:5])
-    more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
-    return f"{known - len(lost)} of {count(known, 'known action')} found" + (f"; missed: {named}{more}" if lost else "")
-
-
-def _right(results: list[RecordingResult]) -> list[str]:
-    """Precision and recall of what was reported, where both times overlap by half or more."""
-    compared = [result for result in results if result.truth is not None]
-    right, said = sum(map(count_matches, compared)), sum(len(result.events) for result in compared)
-    known = sum(len(result.truth or ()) for result in compared)
-    shares = [f"{name} {right / number:.3f}" for name, number in (("precision", said), ("recall", known)) if number]
-    return [f"{right} of {said} reported share half of their time or more with a known one ({', '.join(shares)})"] * bool(shares)

@@ -14,13 +14,13 @@ import dyntorch
 from dyntorch.numerics import with_words
 from indexing.cli.commands.segment_colmap import ColmapJob, run_colmap
 from indexing.cli.commands.segment_tracks import LEAST, BodiesJob, Given, read_given, run_bodies, unit_notes
-from indexing.cli.console import check_report, count, finish, flag_words, progress, show
+from indexing.cli.console import check_report, count, flag_words, present, progress
 from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import LEFT_OUT, PICTURE_FILES, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
 from indexing.files import manifest
 from indexing.readers.matches import MatchedPair, Photograph, read_image, read_pair
 from indexing.readers.tracks import holds_tracks
-from indexing.report.segmentation import WRITTEN, SegmentationReport, summarize, write_segmentation
+from indexing.report.segmentation import FILES, SegmentationReport
 from indexing.video.scene import SceneTracks
 
 WORDS = flag_words("bodies", "threshold", "spatial")
@@ -93,7 +93,7 @@ def _two_views(flags: Segment, files: list[Path], scene: bool, asked: Asked, giv
     inputs = [*files, *(path.expanduser() for path in flags.images or ())]
     inputs = inputs_of(inputs) if scene else inputs
 
-    folder = check_report(flags.out, inputs, WRITTEN)
+    folder = check_report(flags.out, inputs, FILES)
     started = time.perf_counter()
     with progress("reading", steps=False):
         pair, tracks = _pair(flags, files, scene, asked, given)
@@ -117,12 +117,7 @@ def _two_views(flags: Segment, files: list[Path], scene: bool, asked: Asked, giv
         manifest=manifest({"command": "segment", **dataclasses.asdict(flags)}, inputs, flags.seed, timings),
         besides={"tracks.csv": tracks_csv(tracks)} if tracks else {},
     )
-    page = None
-    if folder is not None:
-        with progress("drawing the report", steps=False):
-            page = write_segmentation(folder, report)
-    show(summarize(report))
-    return finish(page, None if report.status == "OK" else report.reason)
+    return present(report, folder)
 
 
 def _pair(

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from indexing.archive.workers import QuietProcesses
-from indexing.cli.console import check_folder, check_report, count, counting_bar, finish, keep, names, progress, show
+from indexing.cli.console import check_folder, check_report, count, counting_bar, keep, names, present, progress
 from indexing.colmap import MatchDatabase, check_target, find_static, read_database
 from indexing.colmap.masks import write_masks
 from indexing.colmap.pair_segmentation import colmap
 from indexing.colmap.static import MIN_PARALLEL_PAIRS
 from indexing.files import manifest
 from indexing.readers.matches import Photograph, read_image
-from indexing.report.static import FILES, StaticReport, images_drawn, summarize, write_report
+from indexing.report.static import FILES, StaticReport, images_drawn
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,7 @@ def run_colmap(job: ColmapJob, arguments: Mapping[str, Any]) -> int:
         notes=notes,
         manifest=manifest({"command": "segment", **arguments}, [database], job.seed, timings),
     )
-    with progress("drawing the report", steps=False):
-        page = write_report(folder, report)
-    show(summarize(report))
-    return finish(page, None if found.ok else found.reason)
+    return present(report, folder)
 
 
 def _workforce(pairs: int) -> contextlib.AbstractContextManager[Executor | None]:

@@ -14,12 +14,12 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import with_words
-from indexing.cli.console import check_report, count, finish, flag_words, progress, show
+from indexing.cli.console import check_report, count, flag_words, present, progress
 from indexing.cli.scenes import Asked, as_tracks, follow_whole, inputs_of, is_video, photographs, source_of
 from indexing.files import manifest
 from indexing.readers.matches import MatchedPair, Photograph
 from indexing.readers.tracks import TrackSet, read_tracks
-from indexing.report.bodies import FILM, PANELS, WRITTEN, BodiesReport, summarize, write_bodies
+from indexing.report.bodies import FILES, FILM, PANELS, BodiesReport
 from indexing.report.body_labels import colour_of
 from indexing.video.overlay import Overlay, write_overlay
 from indexing.video.scene import SceneTracks, evenly_spaced
@@ -99,7 +99,7 @@ def flat(tracks: TrackSet) -> Any:
 
 def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str, Any]) -> int:
     """Segment, draw, write, and say what was found."""
-    folder = check_report(job.out, job.inputs, WRITTEN)
+    folder = check_report(job.out, job.inputs, FILES)
     tracks = given.tracks
     notes = [*tracks.notes, *check_tracks(tracks, job)]
     pictures = Pictures.of(job, given)
@@ -117,14 +117,10 @@ def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str
         result=result, tracks=tracks, photographs=shown, size=job.size, heading=job.title, notes=notes, words=WORDS,
         manifest=manifest({"command": "segment", **arguments}, job.inputs, job.seed, timings),
     )  # fmt: skip
-    page = None
-    if folder is not None:
-        with progress("drawing the report", steps=False):
-            if pictures is not None and report.bodies:
-                report = pictures.filmed(report)
-            page = write_bodies(folder, report)
-    show(summarize(report))
-    return finish(page, None if report.status == "OK" else report.reason)
+    if folder is not None and pictures is not None and report.bodies:
+        with progress("drawing the video", steps=False):
+            report = pictures.filmed(report)
+    return present(report, folder)
 
 
 def check_tracks(tracks: TrackSet, job: BodiesJob) -> list[str]:

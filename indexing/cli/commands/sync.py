@@ -11,14 +11,14 @@ from typing import Any
 
 import dyntorch
 from dyntorch.numerics import Message, with_words
-from indexing.cli.console import check_report, count, finish, flag_words, names, progress, say, show
+from indexing.cli.console import check_report, count, flag_words, names, present, progress, say
 from indexing.cli.flags.cameras import Sync
 from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import refuse_range
 from indexing.cli.videos import find_keypoints, wants_keypoints
 from indexing.files import manifest, prepare
 from indexing.report.check_videos import drop_checks, names_of, write_checks
-from indexing.report.sync import FILES, SyncReport, summarize, write_sync
+from indexing.report.sync import FILES, SyncReport
 from indexing.sync.breaks import find_breaks
 from indexing.sync.calibration import named_lenses
 from indexing.sync.files import (
@@ -95,12 +95,10 @@ def _sync_scene(flags: Sync, found: dict[str, Path], trial: Trial | None) -> int
     with progress(f"comparing {count(pairs, 'pair')} of cameras") as done:
         report = _repair_clocks(flags, _solve(flags, takes, done, trial), done, trial)
     timings = {"read": read - started, "synchronize": time.perf_counter() - read}
-    page = None
     if folder is not None:
         made = manifest({"command": "sync", **dataclasses.asdict(flags)}, inputs, None, timings)
-        report, page = _write(flags, folder, dataclasses.replace(report, manifest=made), films, trial is not None)
-    show(summarize(report, folder))
-    return finish(page, None if report.ok else report.reason)
+        report = _write(flags, folder, dataclasses.replace(report, manifest=made, folder=folder), films, trial is not None)
+    return present(report, folder)
 
 
 def _check(flags: Sync) -> None:
@@ -232,8 +230,8 @@ def _solve(flags: Sync, takes: list[Take], done: Any, trial: Trial | None = None
 
 def _write(
     flags: Sync, folder: Path, report: SyncReport, films: list[CameraVideo] | None = None, trial: bool = False
-) -> tuple[SyncReport, Path]:
-    """The shifted files and the cut videos where the data decide, the check video where asked for, and the report."""
+) -> SyncReport:
+    """Write the shifted files and the cut videos where the data decide, and the check video where asked for."""
     prepare(folder)
     report, notes = _write_videos(flags, folder, report, films)  # first: what cannot be written is mostly this
     with progress("writing", steps=False):
@@ -241,14 +239,12 @@ def _write(
         notes = more + notes
         report, more = _write_mocap(folder, report)
         notes += more
-    videos: list[str] = []
-    with progress("writing", steps=False):
+        videos: list[str] = []
         if flags.check and any(len(pair.shift.peaks) for pair in report.pairs):  # of the best candidate, sure or not
             videos, failed = write_checks(folder, report)
             notes += failed
         drop_checks(folder, videos)
-        report = dataclasses.replace(report, afterwards=notes)
-        return report, write_sync(folder, report, videos)
+    return dataclasses.replace(report, afterwards=notes, checks=videos)
 
 
 def _write_videos(flags: Sync, folder: Path, report: SyncReport, films: list[CameraVideo] | None) -> tuple[SyncReport, list[str]]:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import functools
 import operator
-import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any, cast
 
 import tyro
+
+from indexing.registry import import_modules
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,7 @@ def command(words: str, order: int, module: str | None = None) -> Callable[[type
 @functools.cache
 def commands() -> tuple[Command, ...]:
     """All commands, in the order of ``--help``."""
-    for each in pkgutil.iter_modules(__path__):
-        import_module(f"{__name__}.{each.name}")
+    import_modules(__name__)
     return tuple(
         sorted(
             _COMMANDS.values(),

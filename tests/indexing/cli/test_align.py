@@ -27,8 +27,8 @@ from indexing.report.alignment import (
     labels_csv,
     transform_points,
     turn_and_shift,
-    write_alignment,
 )
+from indexing.report.summary import write_report
 
 SCRIPT = "<script>alert(1)</script>"
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -349,7 +349,7 @@ def report(**changes) -> AlignmentReport:
 
 
 def test_what_comes_from_files_is_escaped(tmp_path):
-    page = write_alignment(tmp_path, report()).read_text()
+    page = write_report(tmp_path, report()).read_text()
     assert SCRIPT not in page and "&lt;script&gt;" in page
     assert labels_csv(report()).splitlines() == [
         "id,label,name", f"{SCRIPT},1,static", "'=1+1,1,static", "-2,2,moving", "d,0,missing",
@@ -369,7 +369,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         {"A": np.diag([1.0, 1.0, 0.0])},
         {"covariance": np.full((18, 18), np.inf)},
     )):  # fmt: skip
-        page = write_alignment(tmp_path / str(i), report(**changes)).read_text()
+        page = write_report(tmp_path / str(i), report(**changes)).read_text()
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
         json.loads((tmp_path / str(i) / "alignment.json").read_text())
 

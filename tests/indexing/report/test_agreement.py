@@ -10,7 +10,8 @@ import pytest
 
 from indexing.comparing import ComparedSpan, compare
 from indexing.report import pictures
-from indexing.report.agreement import AgreementReport, describe_agreement, label_rows, overlap_rows, write_agreement
+from indexing.report.agreement import AgreementReport, describe_agreement, label_rows, overlap_rows
+from indexing.report.summary import write_report
 
 KNOWN = [("squat", 1.0, 4.0), ("kick", 5.0, 6.0), ("=wave", 12.0, 14.0)]
 FOUND = [("squat", 1.5, 4.0), ("<b>jump</b>", 5.0, 6.0)]
@@ -22,7 +23,7 @@ def report(**changes):
 
 
 def test_everything_is_written_and_says_the_same(tmp_path: Path) -> None:
-    page = write_agreement(tmp_path / "out", report(manifest={"time": "now", "seed": None}))
+    page = write_report(tmp_path / "out", report(manifest={"time": "now", "seed": None}))
     names = {path.name for path in page.parent.iterdir()}
     expected = {"report.html", "metrics.json", "manifest.json", "confusion.png", "confusion.csv", "timeline.png", "timeline-2.png"}
     assert names == expected and set(json.loads((page.parent / "manifest.json").read_text())["files"]) == expected
@@ -41,10 +42,10 @@ def test_everything_is_written_and_says_the_same(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_what_an_earlier_report_left_is_removed(tmp_path: Path) -> None:
-    write_agreement(tmp_path, report())
+    write_report(tmp_path, report())
     (tmp_path / "mine.txt").touch()
     spans = [ComparedSpan("a.json", 0.0, 20.0, KNOWN, FOUND)]
-    write_agreement(tmp_path, AgreementReport("one", compare(spans), spans))
+    write_report(tmp_path, AgreementReport("one", compare(spans), spans))
     assert not (tmp_path / "timeline-2.png").exists() and (tmp_path / "mine.txt").exists()
 
 
@@ -62,7 +63,7 @@ def test_rows_and_words() -> None:
 
 def test_nothing_at_all_is_still_a_page(tmp_path: Path) -> None:
     spans = [ComparedSpan("a", 0.0, 5.0, [], [])]
-    assert "Cohen" in write_agreement(tmp_path, AgreementReport("none", compare(spans), spans)).read_text()
+    assert "Cohen" in write_report(tmp_path, AgreementReport("none", compare(spans), spans)).read_text()
 
 
 def test_the_picture_takes_seconds_and_other_names_of_its_sides() -> None:

@@ -18,7 +18,8 @@ from indexing.archive.actions import ArchivedEvent
 from indexing.archive.search import Hit
 from indexing.clip import Clip
 from indexing.report import archive as pages
-from indexing.report.archive import FindReport, SearchReport, write_finds, write_search
+from indexing.report.archive import FindReport, SearchReport
+from indexing.report.summary import write_report
 from tests.indexing.report.test_page import SCRIPT, Page
 from tests.indexing.report.test_player import BROWSER
 
@@ -59,7 +60,7 @@ def searched(lab, hits, **fields):
 
 def found(lab, events, **fields):
     archive, _, examples = lab
-    return FindReport(ACTIONS, events, archive.recordings(), archive, examples, **fields)
+    return FindReport(ACTIONS, events, archive.recordings(), archive, archive.info(), examples, **fields)
 
 
 class Whole(Page):
@@ -86,7 +87,7 @@ def rows_of(path):
 # ---- search --------------------------------------------------------------------------------------------------------------
 def test_every_hit_is_drawn_and_plays_beside_the_query(lab, tmp_path):
     hits = [*hits_of(lab[1])[:8], hits_of(lab[1], mirrored=True)[8]]
-    text = checked(write_search(tmp_path / "out", searched(lab, hits, notes=["30 frames per second assumed"])))
+    text = checked(write_report(tmp_path / "out", searched(lab, hits, notes=["30 frames per second assumed"])))
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"report.html", "hits.csv", "metrics.json", "manifest.json"}
     assert text.count('class="pair"') == 9 and text.count('class="film"') == 17
@@ -110,7 +111,7 @@ def test_every_hit_is_drawn_and_plays_beside_the_query(lab, tmp_path):
 @pytest.mark.slow
 def test_many_hits_are_listed_and_the_rest_is_in_the_file(lab, tmp_path):
     hits = [Hit("week/monday.npz", "", 1.0, 2.0, -float(i)) for i in range(1200)]
-    path = write_search(tmp_path, searched(lab, hits))
+    path = write_report(tmp_path, searched(lab, hits))
     text = checked(path)
     assert text.count('class="pair"') == pages.PICTURED
     assert f"{pages.ROWS - pages.PICTURED} more without pictures" in text and "200 further hits in hits.csv only" in text
@@ -119,17 +120,17 @@ def test_many_hits_are_listed_and_the_rest_is_in_the_file(lab, tmp_path):
 
 def test_drawings_stop_where_a_page_would_grow_heavy(lab, tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "WEIGHT", 30_000)
-    text = checked(write_search(tmp_path, searched(lab, hits_of(lab[1]))))
+    text = checked(write_report(tmp_path, searched(lab, hits_of(lab[1]))))
     assert 1 <= text.count('class="pair"') < 9 and "more without pictures" in text
 
 
 def test_what_was_removed_meanwhile_is_said(lab, tmp_path):
-    text = checked(write_search(tmp_path, searched(lab, [Hit("week/gone.npz", "", 1.0, 2.0, 1.0)])))
+    text = checked(write_report(tmp_path, searched(lab, [Hit("week/gone.npz", "", 1.0, 2.0, 1.0)])))
     assert "no longer stored" in text and 'class="pair"' not in text
 
 
 def test_no_hit_is_a_page_too(lab, tmp_path):
-    text = checked(write_search(tmp_path, searched(lab, [])))
+    text = checked(write_report(tmp_path, searched(lab, [])))
     assert "Nothing was found" in text and "What resembles it" not in text
     assert (tmp_path / "hits.csv").read_text() == ",".join(pages.HITS_HEAD) + "\n"
 
@@ -138,17 +139,17 @@ def test_a_query_of_dots_and_one_that_shows_nothing(lab, tmp_path):
     archive, truth, _ = lab
     hits = hits_of(truth)[:2]
     dots = Clip(np.random.default_rng(0).normal(size=(20, 5, 2)), fps=10.0, name="dots")
-    text = checked(write_search(tmp_path / "a", SearchReport(dots, hits, archive, archive.info())))
+    text = checked(write_report(tmp_path / "a", SearchReport(dots, hits, archive, archive.info())))
     assert 'class="d"' in text and text.count('class="film"') == 4
     blank = Clip(np.full((20, 17, 2), np.nan), fps=10.0, name="blank")
-    text = checked(write_search(tmp_path / "b", SearchReport(blank, hits, archive, archive.info())))
+    text = checked(write_report(tmp_path / "b", SearchReport(blank, hits, archive, archive.info())))
     assert "no joint seen" in text and text.count('class="film"') == 2
 
 
 # ---- find ----------------------------------------------------------------------------------------------------------------
 def test_few_recordings_are_played(lab, tmp_path):
     events = events_of(lab[1])
-    text = checked(write_finds(tmp_path, found(lab, events)))
+    text = checked(write_report(tmp_path, found(lab, events)))
     assert {path.name for path in tmp_path.iterdir()} == {"report.html", "events.csv", "metrics.json", "manifest.json"}
     assert text.count('class="player"') == 3 and "data-player" in text
     assert SCRIPT not in text and text.count('class="marks"') == 3
@@ -185,7 +186,7 @@ def test_thousands_of_recordings_are_a_light_page(lab, tmp_path):
                 for label, start, end in truth[one.source]
                 if label != "wave" and i % 2
             ]
-    path = write_finds(tmp_path, FindReport(ACTIONS, events, recordings, Copies(), examples))
+    path = write_report(tmp_path, FindReport(ACTIONS, events, recordings, Copies(), archive.info(), examples))
     text = checked(path)
     assert path.stat().st_size < 2e6 and 'class="player"' not in text
     assert "The surest" in text and "The most doubtful" in text and "further recordings with finds in events.csv only" in text
@@ -196,13 +197,13 @@ def test_thousands_of_recordings_are_a_light_page(lab, tmp_path):
 
 
 def test_nothing_found_is_said(lab, tmp_path):
-    text = checked(write_finds(tmp_path, found(lab, [])))
+    text = checked(write_report(tmp_path, found(lab, [])))
     assert "None of the actions was found in 3 recordings" in text and 'class="player"' not in text
 
 
 def test_pages_replace_those_of_other_reports(lab, tmp_path):
-    write_finds(tmp_path, found(lab, events_of(lab[1])))
-    write_search(tmp_path, searched(lab, hits_of(lab[1])))
+    write_report(tmp_path, found(lab, events_of(lab[1])))
+    write_report(tmp_path, searched(lab, hits_of(lab[1])))
     assert {path.name for path in tmp_path.iterdir()} == {"report.html", "hits.csv", "metrics.json", "manifest.json"}
 
 
@@ -226,7 +227,7 @@ def test_a_film_has_as_many_steps_as_its_strip_has_frames(lab):
 @pytest.mark.skipif(BROWSER is None, reason="needs a browser: chromium or chrome")
 def test_a_film_slides_by_frame_by_frame(lab, tmp_path):
     """The box that plays all is ticked, and half of the time has passed: the strip stands at its middle frame."""
-    text = write_search(tmp_path, searched(lab, hits_of(lab[1])[:1])).read_text(encoding="utf-8")
+    text = write_report(tmp_path, searched(lab, hits_of(lab[1])[:1])).read_text(encoding="utf-8")
     text = re.sub(r'<meta http-equiv="Content[^>]*>', "", text).replace('class="all"', 'class="all" checked')
     script = """<script>setTimeout(() => {
       const strip = document.querySelector(".film .strip"), played = strip.getAnimations()[0];

@@ -16,7 +16,8 @@ from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.tasks.segment.result import TrackSegmentation
 from indexing.readers.matches import Photograph
 from indexing.readers.tracks import TrackSet
-from indexing.report.bodies import BodiesReport, as_json, describe, labels_csv, picture_of, rows_of, tracks_csv, write_bodies
+from indexing.report.bodies import BodiesReport, as_json, describe, labels_csv, picture_of, rows_of, tracks_csv
+from indexing.report.summary import write_report
 
 SCRIPT = "<script>alert(1)</script>"
 FRAMES = 6
@@ -61,7 +62,7 @@ def photographs(wide: int = 100, tall: int = 80) -> dict[int, Photograph]:
 
 @pytest.mark.slow
 def test_what_comes_from_files_is_escaped(tmp_path):
-    page = write_bodies(tmp_path, report(photographs=photographs())).read_text()
+    page = write_report(tmp_path, report(photographs=photographs())).read_text()
     assert SCRIPT not in page and "&lt;script&gt;" in page
     rows = list(csv.reader(labels_csv(report()).splitlines()))
     assert [row[0] for row in rows[1:4]] == [SCRIPT, "'=1+1", "-2"]
@@ -89,7 +90,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         report(photographs=photographs(200, 40)),
         report(static_body=0, by_time=True, times=np.arange(6) / 5, views=tuple(f"{k / 5:g}" for k in range(6))),
     )):  # fmt: skip
-        page = write_bodies(tmp_path / str(i), made).read_text()
+        page = write_report(tmp_path / str(i), made).read_text()
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
         found = json.loads((tmp_path / str(i) / "segmentation.json").read_text())
         assert len(found["bodies"]) == made.bodies
@@ -135,14 +136,14 @@ def test_the_summary(made, says):
 def test_frames_have_the_names_of_the_file_wherever_they_are_told(tmp_path):
     made = report(status=3, said=Told.CUT, told={"frames": 3})
     assert made.reason == "it changes at 30" and made.warnings[0][2] == "it changes at 30"
-    page = write_bodies(tmp_path, made).read_text()
+    page = write_report(tmp_path, made).read_text()
     assert "It changes at 30." in page and "Refused" in page
 
 
 def test_known_labels_are_compared(tmp_path):
     made = report(known=np.array([0, 2, 1, 0, 2, 1, 1, 1, 0]))
     assert made.misclassified == pytest.approx(2 / 8)
-    assert "Compared with the labels of the file" in write_bodies(tmp_path, made).read_text()
+    assert "Compared with the labels of the file" in write_report(tmp_path, made).read_text()
 
 
 def test_tracks_keep_their_names_and_times():

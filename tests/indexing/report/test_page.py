@@ -18,6 +18,7 @@ import pytest
 from indexing import files
 from indexing.report import EvaluationResult, RecognitionReport, RecordingResult, manifest, page, write_recognition
 from indexing.report.recognition import events_csv
+from indexing.report.summary import Summary
 from tests.indexing.report.people import Hit, person, recording
 
 PNG = struct.pack(">8sI4sII", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", 30, 30)
@@ -192,12 +193,12 @@ def test_a_file_in_the_way_is_refused_before_anything_is_written(tmp_path):
 def test_page_parts_escape_and_nest():
     notes = page.notes_of("", [("<k>", 1.0, "<m>")], ["<q>"])
     report = {"title": "<t>", "notes": notes, "manifest": {"a": {"b": [1, 2]}, "time": "<f>"}}
-    values = {"cards": [("<n>", "1", "<i>\x00")], "joints": [["<j>", "A & B"]]}
+    values = {"joints": [["<j>", "A & B"]]}
     drawn = {"picture": page.Picture(PNG, tips=[page.Tip(0, 0, 1, 1, "<u>")]), "weighing": [], "examples": []}
-    text = page.render("training", report, summary="<s>", **values, **drawn)
+    text = page.render("training", report, summary=Summary(headline="<s>", cards=[("<n>", "1", "<i>\x00")]), **values, **drawn)
     assert Page(text).bad == [] and "A &amp; B" in text and "<code>a.b</code>" in text and "<code>1 2</code>" in text
     assert not re.search(r"<(n|i|s|k|m|q|j|u|f|t)>", text) and "\x00" not in text
-    long = page.render("training", {**report, "manifest": {str(i): i for i in range(205)}}, summary="", **values, **drawn)
+    long = page.render("training", {**report, "manifest": {str(i): i for i in range(205)}}, summary=Summary(), **values, **drawn)
     assert "5 more lines" in long and "<code>199</code>" in long and "<code>200</code>" not in long
     assert 'width="100.0"' in page.bar(1.7) and 'width="0.0"' in page.bar(-1)
 

@@ -22,8 +22,8 @@ from indexing.report.reconstruction import (
     as_json,
     nearest_frame,
     points_csv,
-    write_reconstruction,
 )
+from indexing.report.summary import write_report
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -76,7 +76,7 @@ TWO = SimpleNamespace(name="two_bodies_2d", bodies=2, static=False)
 
 
 def test_what_comes_from_files_is_escaped(tmp_path):
-    page = write_reconstruction(tmp_path, report()).read_text()
+    page = write_report(tmp_path, report()).read_text()
     assert SCRIPT not in page and "&lt;script&gt;" in page
     rows = list(csv.reader(points_csv(report()).splitlines()))
     assert [row[0] for row in rows[1:]] == [SCRIPT, "'=1+1", "-2", "d", "e"]
@@ -94,7 +94,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         report(labels=np.zeros(5, dtype=int)),
         report(velocities=np.zeros((5, 2)), positions=np.stack([report().found.points] * 2)),
     )):  # fmt: skip
-        page = write_reconstruction(tmp_path / str(i), made).read_text()
+        page = write_report(tmp_path / str(i), made).read_text()
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
         json.loads((tmp_path / str(i) / "reconstruction.json").read_text())
 
@@ -130,11 +130,11 @@ def test_a_point_without_a_position_is_missing_where_too_few_views_show_it_and_a
 
 @pytest.mark.slow
 def test_what_a_refused_report_says_and_does_not(tmp_path):
-    write_reconstruction(tmp_path, report())
+    write_report(tmp_path, report())
     assert (tmp_path / "scene.png").exists()
     said = [Told.WEAK_STACK, Told.FEW, Told.BEHIND]
     made = report(status=Status.AMBIGUOUS, said=said, inliers=np.arange(10).reshape(2, 5) > 0)
-    page = write_reconstruction(tmp_path, made).read_text()
+    page = write_report(tmp_path, made).read_text()
     assert not (tmp_path / "scene.png").exists() and "The scene</h2>" not in page and page.count("early one centre") == 1
     assert "Refused: views too alike." in page and "Points behind a camera." in page and "No camera sees what is behind it" in page
     assert "1 single observation left out" in page

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from indexing.report.calibration import CalibrationReport, write_calibration
 from indexing.report.rig import MAX_VALUES, heat_picture, plan_picture, scene
 from tests.indexing.calibrate.scene import FPS, SIZE, rig, truth
 
@@ -128,7 +129,7 @@ def test_it_turns_and_plays_and_sees_what_a_camera_saw(tmp_path):
 
 @pytest.mark.skipif(BROWSER is None, reason="needs a browser: chromium or chrome")
 def test_it_plays_in_a_browser(tmp_path):
-    text = Path(rig().write(tmp_path / "out")).read_text(encoding="utf-8")
+    text = write_calibration(tmp_path / "out", CalibrationReport(rig()))[0].read_text(encoding="utf-8")
     free = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)  # which would stop the driver
     driver = f"<script>{DRIVER}; document.title = JSON.stringify(said);</script></body>"
     (tmp_path / "driven.html").write_text(free.replace("</body>", driver), encoding="utf-8")

@@ -20,8 +20,8 @@ from indexing.report.segmentation import (
     describe,
     labels_csv,
     picture_of,
-    write_segmentation,
 )
+from indexing.report.summary import write_report
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -62,7 +62,7 @@ def photograph(wide: int = 100, tall: int = 80) -> Photograph:
 
 @pytest.mark.slow
 def test_what_comes_from_files_is_escaped(tmp_path):
-    page = write_segmentation(tmp_path, report(photographs=[photograph(), photograph()])).read_text()
+    page = write_report(tmp_path, report(photographs=[photograph(), photograph()])).read_text()
     assert SCRIPT not in page and "&lt;script&gt;" in page
     rows = list(csv.reader(labels_csv(report()).splitlines()))
     assert [row[0] for row in rows[1:4]] == [SCRIPT, "'=1+1", "-2"]
@@ -84,7 +84,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         report(photographs=[photograph(200, 40), photograph(200, 40)]),
         report(pair=MatchedPair("m", "m", np.ones((8, 2)), np.ones((8, 2)), tuple("abcdefgh"))),
     )):  # fmt: skip
-        page = write_segmentation(tmp_path / str(i), made).read_text()
+        page = write_report(tmp_path / str(i), made).read_text()
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
         found = json.loads((tmp_path / str(i) / "segmentation.json").read_text())
         assert len(found["bodies"]) == made.bodies
@@ -120,19 +120,19 @@ def test_what_is_known_is_compared_and_what_is_refused_is_said_once(tmp_path):
     pair = report().pair
     known = MatchedPair(pair.path, "m", pair.x1, pair.x2, pair.ids, known=np.array([0, 2, 1, 0, 2, 1, 1, 1]))
     made = report(pair=known, status=Status.AMBIGUOUS, said=Told.UNCERTAIN)
-    page = write_segmentation(tmp_path, made).read_text()
+    page = write_report(tmp_path, made).read_text()
     assert "Compared with the labels of the file" in page and f"{100 * made.misclassified:.2g} %" in page
     assert "Refused: uncertain." in page and page.count("It is open.") == 2 and "<b>Uncertain." not in page
-    assert "Compared" not in write_segmentation(tmp_path, report()).read_text()
+    assert "Compared" not in write_report(tmp_path, report()).read_text()
 
 
 @pytest.mark.slow
 def test_outliers_are_counted_in_words(tmp_path):
-    page = write_segmentation(tmp_path, report(count=300)).read_text()
+    page = write_report(tmp_path, report(count=300)).read_text()
     assert "100 outliers<" in page and "100 outlier<" not in page
     labels = np.ones(300, dtype=int)
     labels[7] = 0
-    page = write_segmentation(tmp_path / "one", report(count=300, labels=labels)).read_text()
+    page = write_report(tmp_path / "one", report(count=300, labels=labels)).read_text()
     assert "1 outlier<" in page and "1 outliers" not in page and "under 1 % of the matches" in page
 
 

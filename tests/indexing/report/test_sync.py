@@ -14,7 +14,8 @@ import torch
 from dyntorch import Clocks, Shift
 from dyntorch.tasks.synchronize.result import Pair
 from indexing import Clip
-from indexing.report.sync import Compared, SyncReport, as_json, describe, page, picture_of, title_of, write_sync
+from indexing.report.summary import write_report
+from indexing.report.sync import Compared, SyncReport, as_json, describe, picture_of, title_of
 from indexing.skeleton import Skeleton
 from indexing.sync.people import Pairing
 from indexing.sync.recordings import Take
@@ -47,7 +48,7 @@ def one(found: Shift) -> Compared:
 
 
 def test_files_are_written_and_parse(tmp_path):
-    written = write_sync(tmp_path, report(manifest={"time": "now"}))
+    written = write_report(tmp_path, report(manifest={"time": "now"}))
     assert written.name == "report.html" and sorted(p.name for p in tmp_path.iterdir()) == ["curve.png", "report.html", "sync.json"]
     found = json.loads((tmp_path / "sync.json").read_text())
     assert found["cameras"][1]["rate"] == pytest.approx(1.00002) and found["pairs"][0]["wrong_points"] == ["hip (joint 1)"]
@@ -64,9 +65,9 @@ def test_what_two_cameras_say_in_words():
 
 
 @pytest.mark.slow
-def test_more_cameras_have_a_cycle_error_and_an_outlier():
-    three = report(3, outliers=[(0, 2)])
-    html = page(three, picture_of(three), ["check.mp4"])
+def test_more_cameras_have_a_cycle_error_and_an_outlier(tmp_path):
+    three = report(3, outliers=[(0, 2)], checks=["check.mp4"])
+    html = write_report(tmp_path, three).read_text()
     assert "12.3 ms" in html and "cam0&lt;b&gt; and cam2&lt;b&gt; stands out" in html and "3 of 3" in html and "check.mp4" in html
     assert "off the clocks of all cameras" in html and "3 cameras" in describe(three)
     assert as_json(three)["outlier_pair"] == ["cam0<b>", "cam2<b>"]
@@ -88,7 +89,7 @@ def test_curves_are_drawn_whatever_they_hold():
 def test_a_report_without_a_curve_is_written(tmp_path):
     none = torch.zeros(0, dtype=torch.float64)
     lost = shift(0.0, lags=none, scores=none, peaks=none.reshape(0, 2), sigma=math.inf, ok=False, reason="nothing moves")
-    written = write_sync(tmp_path, report(first=lost))
+    written = write_report(tmp_path, report(first=lost))
     assert "Refused." in written.read_text() and json.loads((tmp_path / "sync.json").read_text())["pairs"][0]["sigma"] is None
 
 
