@@ -155,7 +155,6 @@ def test_only_the_demo_and_the_background_use_the_actors():
         "indexing/action/background",
         "indexing/actors/",
         "indexing/cli/",
-        "indexing/demo",
         "indexing/examples",
     )
     found = offenders("indexing", lambda module, names: within(module, "indexing.actors") or (names and "actors" in names))

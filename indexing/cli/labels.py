@@ -9,12 +9,11 @@ from typing import Any
 
 from indexing.cli.console import check_file, count, names
 from indexing.cli.flags.shared import Example, Labelling, Reading
-from indexing.cli.inputs import KnownEvent, Lane, assumed_rate_notes, lanes_of, of_layout
-from indexing.cli.notes import clip_notes, on_examples
+from indexing.cli.inputs import KnownEvent, Lane, assumed_rate_notes, clip_notes, lanes_of, of_layout, on_examples
 from indexing.clip import Clip
 from indexing.files import prepare
 from indexing.joints import layout_of
-from indexing.labels import Label, LabelFile, choose_labels, open_labels, within, write_labels
+from indexing.labels import Label, LabelFile, choose_labels, open_labels, registered_formats, within, write_labels
 from indexing.labels.format import Request, of_recording, same_recording
 from indexing.opening import error, listing
 from indexing.report import RecordingResult
@@ -355,33 +354,29 @@ class _Unread:
 # What was found, as labels.
 
 
-BESIDE = (".eaf", ".boris")
-SEVERAL = (".boris", ".csv", ".tsv", ".json")
-WRITTEN = (".eaf", *SEVERAL)
-
-
 def check_write(
     path: Path | None, inputs: Sequence[Path], recordings: Sequence[Path], media: str | None = None, tier: str = "dyntorch"
 ) -> Path | None:
     """The file that labels will be written to, if it can be, said before anything is searched."""
     if path is None:
         return None
+    formats = {suffix: each for each in registered_formats().values() for suffix in each.written.values() if suffix}
     kind = path.suffix.lower()
-    if kind not in WRITTEN:
+    if kind not in formats:
+        suffixes = ", ".join(sorted(formats))
+        raise error(path, f"{kind or 'without an ending'} is no format that labels are written in", f"give one of {suffixes}")
+    if len(recordings) > 1 and formats[kind].one_recording:
         raise error(
-            path, f"{kind or 'without an ending'} is no format that labels are written in", f"give one of {', '.join(WRITTEN)}"
-        )
-    if len(recordings) > 1 and kind not in SEVERAL:
-        raise error(
-            path, f"an ELAN file is of one recording, and {len(recordings)} are given",
+            path, f"{formats[kind].title} is of one recording, and {len(recordings)} are given",
             f"write them one by one, or into one file such as {path.with_suffix('.boris').name} or {path.with_suffix('.csv').name}",
         )  # fmt: skip
     path = check_file(path, inputs)
     if not path.exists():
         return path
 
-    if kind not in BESIDE:  # no row of it says whether somebody made or corrected it
-        raise error(path, "is there already", "give another name, or a format that keeps what is there (.eaf, .boris)")
+    if not formats[kind].program:  # no row of it says whether somebody made or corrected it
+        beside = ", ".join(sorted(suffix for suffix, each in formats.items() if each.program))
+        raise error(path, "is there already", f"give another name, or a format that keeps what is there ({beside})")
     open_labels(path)
     # as it will be done, but for the labels, which nobody knows yet
     alone = recordings[0].expanduser() if len(recordings) == 1 else None

@@ -72,6 +72,8 @@ class LabelFormat:
     """Names by which it is written, and the suffix that means each; empty where only ``format=`` does."""
     program: str = ""
     """Whose files are written into where they are there, beside what a person made; empty: written anew."""
+    one_recording: bool = False
+    """Whether a file is of one recording only."""
 
 
 class Gathering:

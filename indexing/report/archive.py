@@ -30,8 +30,9 @@ from indexing.report.summary import Summary, Table, register_page
 
 if TYPE_CHECKING:
     from indexing.archive.actions import ArchivedEvent
-    from indexing.archive.archive import ArchivedRecording, ArchiveInfo, Verification
+    from indexing.archive.archive import ArchivedRecording, ArchiveInfo
     from indexing.archive.search import Hit
+    from indexing.archive.writer import Verification
 
 PICTURED = 60  # hits, or events of all actions, that are drawn
 WEIGHT = 2_000_000  # characters of drawings in a page, beyond which no more are drawn: layouts of 133 joints are heavy

@@ -15,10 +15,8 @@ from numpy.typing import NDArray
 
 from dyntorch import Status
 from dyntorch.core import Notice
-from indexing.opening import count
 from indexing.readers.matches import Photograph
 from indexing.readers.tracks import TrackSet
-from indexing.report.body_labels import LabelledReport, colour_of, share
 from indexing.report.canvas import LIGHT, Theme, draw_photograph, finish, foot, limits, new_figure, png, shorten, style
 from indexing.report.page import (
     even,
@@ -28,7 +26,7 @@ from indexing.report.page import (
     sentence,
     table_csv,
 )
-from indexing.report.segmentation import STRAYS, mark_of
+from indexing.report.segmentation import STRAYS, LabelledReport, colour_of, describe_labels, legend_handles, mark_of, share
 from indexing.report.summary import Summary, Table, register_page, warning_lines
 from indexing.video.scene import evenly_spaced
 
@@ -146,16 +144,8 @@ def static_text(report: BodiesReport) -> str:
 
 def describe(report: BodiesReport) -> str:
     """The result in plain words."""
-    number, counts, frames = int(report.present.sum()), report.counts, len(report.tracks.views)
-    if report.status != "OK":
-        start = f"The {number:,} tracks through {frames:,} frames do not decide what moves with what. {sentence(report.reason)}"
-        return start + " What follows is the best segmentation found, and not to be relied on." * (report.bodies > 0)
-    *most, last = [f"{counts[name]:,}" for name in report.names[1:]]
-    moved = f"{number - counts['outlier']:,} move "
-    moved += f"with one of {report.bodies} bodies ({', '.join(most)} and {last})" if most else "as one body"
-    rest = f"; {count(counts['outlier'], 'fits', 'fit')} none" * (counts["outlier"] > 0)
-    still = f" {sentence(static_text(report))}" if most else ""
-    return f"Of {number:,} tracks through {frames:,} frames, {moved}{rest}.{still}"
+    static = f" {sentence(static_text(report))}" * (report.bodies > 1)
+    return describe_labels(report, f"tracks through {len(report.tracks.views):,} frames", further=static)
 
 
 def rows_of(report: BodiesReport) -> list[list[str]]:
@@ -321,7 +311,8 @@ def picture_of(report: BodiesReport, theme: Theme = LIGHT) -> bytes:
             finish(panel, *box, True, shorten(_view_name(report, view), 60))
             if photograph is not None:
                 panel.set(xticks=[], yticks=[])
-        foot(figure, _handles(report, theme), columns=6, ink=theme.ink)
+        suffixes = [" (static)" * (label == report.static) for label in range(1, report.bodies + 1)]
+        foot(figure, legend_handles(report, suffixes, theme), columns=6, ink=theme.ink)
         return png(figure, tight=True)
 
 
@@ -378,18 +369,3 @@ def _draw(panel: Any, report: BodiesReport, view: int, theme: Theme) -> None:
         panel.add_collection(lines, autolim=False)
         look: Any = {"marker": mark_of(label), "edgecolor": theme.paper, "linewidth": 0.3}
         panel.scatter(*part[-1, mine].T, s=size, c=colour_of(label), zorder=2.5 + label, **look)
-
-
-def _handles(report: BodiesReport, theme: Theme) -> list[Any]:
-    """Entries of the legend: every body with its tracks, and the outliers."""
-    from matplotlib.lines import Line2D
-
-    counts, found = report.counts, []
-    for label in range(1, report.bodies + 1):
-        text = f"body {label}: {counts[f'body {label}']:,}" + " (static)" * (label == report.static)
-        found.append(Line2D([], [], color=colour_of(label), marker=mark_of(label), linestyle="", markersize=5.5, label=text))
-    if counts["outlier"]:
-        noun = "outlier" if report.bodies else "unlabelled"
-        text = f"{counts['outlier']:,} {noun}{'s' * (report.bodies > 0 and counts['outlier'] > 1)}"
-        found.append(Line2D([], [], color=theme.muted, marker="x", linestyle="", markersize=5, label=text))
-    return found

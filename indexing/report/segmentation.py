@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from indexing.opening import count
 from indexing.readers.matches import MatchedPair, Photograph
-from indexing.report.body_labels import COLOURS, LabelledReport, colour_of, share
 from indexing.report.canvas import (
     LIGHT,
     Theme,
@@ -28,6 +28,7 @@ from indexing.report.canvas import (
     style,
 )
 from indexing.report.page import (
+    ResultReport,
     even,
     markup,
     matrix,
@@ -39,6 +40,161 @@ from indexing.report.page import (
 from indexing.report.summary import Summary, Table, register_page, warning_lines
 
 FloatArray = NDArray[np.float64]
+SURE = 0.9  # probability of its label below which a point is called doubtful
+# neighbours in the list are apart for colour-blind eyes, too, on both papers and on gray
+COLOURS = ("#2f7fb8", "#e8741e", "#2fa36b", "#c2478f", "#b99a0d", "#7d62c9", "#1fa6a6", "#d1493f")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LabelledReport(ResultReport):
+    """A report on points (matches, tracks) that move each with a body, or with none."""
+
+    ABSENT: ClassVar[str] = ""
+    """What a point is called that nothing can be known of."""
+
+    @property
+    def present(self) -> NDArray[np.bool_]:
+        """``(n,)`` the points that something can be known of."""
+        raise NotImplementedError
+
+    @property
+    def known(self) -> NDArray[np.int64] | None:
+        """``(n,)`` labels that the file has; None where it has none."""
+        raise NotImplementedError
+
+    @property
+    def bodies(self) -> int:
+        """How many bodies."""
+        return int(self.found.bodies)
+
+    @property
+    def status(self) -> str:
+        """The status's name; that there are no bodies is no answer."""
+        status = super().status
+        return status if status != "OK" or self.bodies else "NO_CONSENSUS"
+
+    @property
+    def names(self) -> list[str]:
+        """What labels mean: outlier, body 1, body 2, ..."""
+        return ["outlier", *(f"body {i}" for i in range(1, self.bodies + 1))]
+
+    @property
+    def kinds(self) -> list[str]:
+        """What each point is: one of the names, or absent."""
+        labels, present = self.found.labels.tolist(), self.present.tolist()
+        return [self.names[label] if there else self.ABSENT for label, there in zip(labels, present, strict=True)]
+
+    @functools.cached_property
+    def counts(self) -> dict[str, int]:
+        """How many points of each kind, bodies first."""
+        kinds = self.kinds
+        return {name: kinds.count(name) for name in (*self.names[1:], "outlier", self.ABSENT)}
+
+    @property
+    def certainty(self) -> FloatArray:
+        """``(n,)`` probability of the label of each point; NaN where it is absent."""
+        own = np.take_along_axis(self.found.probabilities, self.found.labels[:, None], axis=1)[:, 0]
+        return np.where(self.present, own, np.nan)
+
+    @property
+    def doubtful(self) -> NDArray[np.bool_]:
+        """``(n,)`` points that might well have another label."""
+        return np.asarray(self.certainty < SURE)
+
+    def of(self, label: int) -> NDArray[np.bool_]:
+        """``(n,)`` the points with a label."""
+        return np.asarray(self.present & (self.found.labels == label))
+
+    def rms(self, label: int | None = None) -> float:
+        """Root mean square of the residuals of one body, or of all; NaN where there are no points."""
+        mine = self.present & (self.found.labels > 0) if label is None else self.of(label)
+        return float(np.sqrt(np.mean(np.square(self.found.residuals[mine])))) if mine.any() else float("nan")
+
+    def rms_text(self, label: int | None = None) -> str:
+        """The same in three digits, empty where there are no points."""
+        value = self.rms(label)
+        return f"{value:.3g}" if np.isfinite(value) else ""
+
+    @property
+    def misclassified(self) -> float | None:
+        """Share of the points that are not labelled as the file says, whatever the bodies' numbers; None where it does not say."""
+        if self.known is None or not self.bodies:
+            return None
+        import torch
+
+        from dyntorch import metrics
+
+        known, present = torch.from_numpy(self.known), torch.from_numpy(self.present)
+        return float(metrics.misclassification(self.result.labels[present], known[present]))
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """What the templates of all such reports show: doubtful points, known labels, the residual."""
+        doubtful = ["doubtful" if odd else "" for odd in self.doubtful.tolist()]
+        return {"doubtful": doubtful, "compared": self.compared, "rms": self.rms_text(), "share": share}
+
+    @property
+    def errors(self) -> list[str]:
+        """How many labels are wrong, in a sentence, where the file has labels."""
+        wrong = self.misclassified
+        return [] if wrong is None else [f"misclassified: {100 * wrong:.2f} % against the labels of the file"]
+
+    @property
+    def compared(self) -> list[list[str]]:
+        """A row for every body that the file knows: its name, and how many of its points were found to be of which body."""
+        if self.known is None or not self.bodies:
+            return []
+        rows = []
+        for label in sorted(np.unique(self.known[self.present]).tolist(), key=lambda label: (label == 0, label)):
+            of = self.found.labels[self.present & (self.known == label)]
+            cells = [int((of == i).sum()) for i in (*range(1, self.bodies + 1), 0)]
+            rows.append([f"body {label}" if label else "outlier", *(f"{cell:,}" if cell else "" for cell in cells)])
+        return rows
+
+
+def describe_labels(report: LabelledReport, points: str, where: str = "", further: str = "") -> str:
+    """What moves with what, in plain words; or why the data do not decide."""
+    number, counts = int(report.present.sum()), report.counts
+    if report.status != "OK":
+        start = f"The {number:,} {points} do not decide what moves with what. {sentence(report.reason)}"
+        return start + " What follows is the best segmentation found, and not to be relied on." * (report.bodies > 0)
+    *most, last = [f"{counts[name]:,}" for name in report.names[1:]]
+    moved = f"{number - counts['outlier']:,} move "
+    moved += f"with one of {report.bodies} bodies ({', '.join(most)} and {last})" if most else "as one body"
+    outliers = f"; {count(counts['outlier'], 'fits', 'fit')} none" * (counts["outlier"] > 0)
+    return f"Of {number:,} {points}{where}, {moved}{outliers}.{further}"
+
+
+def legend_handles(report: LabelledReport, suffixes: Sequence[str], theme: Theme) -> list[Any]:
+    """Entries of the legend: every body with its points and what else is said of it, and the outliers."""
+    from matplotlib.lines import Line2D
+
+    counts, handles = report.counts, []
+    for label, suffix in enumerate(suffixes, start=1):
+        text = f"body {label}: {counts[f'body {label}']:,}{suffix}"
+        handles.append(Line2D([], [], color=colour_of(label), marker=mark_of(label), linestyle="", markersize=5.5, label=text))
+    if counts["outlier"]:
+        noun = "outlier" if report.bodies else "unlabelled"
+        text = f"{counts['outlier']:,} {noun}{'s' * (report.bodies > 0 and counts['outlier'] > 1)}"
+        handles.append(Line2D([], [], color=theme.muted, marker="x", linestyle="", markersize=5, label=text))
+    return handles
+
+
+def share(part: int, whole: int) -> str:
+    """A share in whole percents."""
+    percent = 100 * part / max(1, whole)
+    return "under 1 %" if 0 < percent < 1 else f"{percent:.0f} %"
+
+
+def colour_of(label: int) -> str:
+    """The colour of a body."""
+    return COLOURS[(label - 1) % len(COLOURS)]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Matches of two images.
+
+
 FILES = (
     "report.html",
     "segmentation.npz",
@@ -87,16 +243,9 @@ class SegmentationReport(LabelledReport):
 
 def describe(report: SegmentationReport) -> str:
     """The result in plain words."""
-    number, counts = report.seen, report.counts
-    if report.status != "OK":
-        start = f"The {number:,} matches do not decide what moves with what. {sentence(report.reason)}"
-        return start + " What follows is the best segmentation found, and not to be relied on." * (report.bodies > 0)
-    *most, last = [f"{counts[f'body {i}']:,}" for i in range(1, report.bodies + 1)]
-    moved = f"{number - counts['outlier']:,} move "
-    moved += f"with one of {report.bodies} bodies ({', '.join(most)} and {last})" if most else "as one body"
-    rest = f"; {count(counts['outlier'], 'fits', 'fit')} none" * (counts["outlier"] > 0)
-    lost = f" {count(counts['missing'], 'more is', 'more are')} missing in an image." * (counts["missing"] > 0)
-    return f"Of {number:,} matches of two images, {moved}{rest}.{lost}"
+    missing = report.counts["missing"]
+    lost = f" {count(missing, 'more is', 'more are')} missing in an image." * (missing > 0)
+    return describe_labels(report, "matches", " of two images", lost)
 
 
 @register_page(SegmentationReport, "segmentation", FILES)
@@ -222,7 +371,8 @@ def picture_of(report: SegmentationReport, theme: Theme = LIGHT) -> bytes:
             finish(panel, *box, True, shorten(name, 50) + ", with the way to image 2" * (i == 0 and report.bodies > 0))
             if photograph is not None:
                 panel.set(xticks=[], yticks=[])
-        foot(figure, _handles(report, theme), columns=6, ink=theme.ink)
+        suffixes = [" (homography)" * (model == "homography") for model in report.models]
+        foot(figure, legend_handles(report, suffixes, theme), columns=6, ink=theme.ink)
         return png(figure, tight=True)
 
 
@@ -277,18 +427,3 @@ def _draw_points(panel: Any, points: FloatArray, label: int, size: float, theme:
 
 def mark_of(label: int) -> str:
     return MARKS[(label - 1) // len(COLOURS) % len(MARKS)]
-
-
-def _handles(report: SegmentationReport, theme: Theme) -> list[Any]:
-    """Entries of the legend: every body with its matches and its model, and the outliers."""
-    from matplotlib.lines import Line2D
-
-    counts, found = report.counts, []
-    for label, model in enumerate(report.models, start=1):
-        text = f"body {label}: {counts[f'body {label}']:,}" + " (homography)" * (model == "homography")
-        found.append(Line2D([], [], color=colour_of(label), marker=mark_of(label), linestyle="", markersize=5.5, label=text))
-    if counts["outlier"]:
-        noun = "outlier" if report.bodies else "unlabelled"
-        text = f"{counts['outlier']:,} {noun}{'s' * (report.bodies > 0 and counts['outlier'] > 1)}"
-        found.append(Line2D([], [], color=theme.muted, marker="x", linestyle="", markersize=5, label=text))
-    return found

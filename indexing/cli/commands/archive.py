@@ -36,10 +36,9 @@ from indexing.cli.console import (
     show,
     table,
 )
-from indexing.cli.flags.archive import Add, Find, Info, Remove, Search, Verify
+from indexing.cli.flags.recognition import Add, Find, Info, Remove, Search, Verify
 from indexing.cli.flags.shared import Example, Following, Reading
-from indexing.cli.inputs import CUT, assumed_rate_notes, parse_example, read_clips, watch_videos
-from indexing.cli.notes import clip_notes
+from indexing.cli.inputs import CUT, assumed_rate_notes, clip_notes, parse_example, read_clips, watch_videos
 from indexing.cli.protocol import choose, field_values
 from indexing.cli.videos import watch_options
 from indexing.clip import Clip

@@ -16,7 +16,7 @@ from indexing.action.indexer import ActionIndexer
 from indexing.cli.commands.scan import search
 from indexing.cli.commands.suggest import TIER
 from indexing.cli.console import Progress, check_report, names, present, progress
-from indexing.cli.flags.index import Evaluate, Scan
+from indexing.cli.flags.recognition import Evaluate, Scan
 from indexing.cli.flags.shared import Labelling
 from indexing.cli.inputs import assumed_rate_notes, read_clips, usable
 from indexing.cli.labels import check_labelling, lasting, of_medium, open_marked

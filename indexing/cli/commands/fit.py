@@ -10,7 +10,7 @@ from typing import Any
 
 from indexing.action.indexer import ActionIndexer
 from indexing.cli.console import check_file, check_report, count, names, present, progress, say, table
-from indexing.cli.flags.index import Fit
+from indexing.cli.flags.recognition import Fit
 from indexing.cli.flags.shared import Example, Reading
 from indexing.cli.inputs import on_overlaps, on_range, parse_example, read_clips, read_examples, watch_videos
 from indexing.cli.labels import check_labelling, film_examples, labelled_examples

@@ -13,10 +13,9 @@ from indexing import ActionOptions
 from indexing.action.indexer import ActionIndexer
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.cli.console import Progress, check_report, names, present, progress
-from indexing.cli.flags.index import Scan
-from indexing.cli.inputs import KnownEvent, Lane, on_truth, read_recordings, read_truth, watch_videos
+from indexing.cli.flags.recognition import Scan
+from indexing.cli.inputs import KnownEvent, Lane, on_classes, on_truth, read_recordings, read_truth, watch_videos
 from indexing.cli.labels import check_write, known_events, read_marked, write_found
-from indexing.cli.notes import on_classes
 from indexing.cli.videos import FilmRecording, are_films, read_films
 from indexing.clip import Clip
 from indexing.files import manifest

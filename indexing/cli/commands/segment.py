@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import os
 import time
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +15,21 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import with_words
-from indexing.cli.commands.segment_colmap import ColmapJob, run_colmap
-from indexing.cli.commands.segment_tracks import LEAST, BodiesJob, Given, read_given, run_bodies, unit_notes
-from indexing.cli.console import check_report, count, flag_words, present, progress
+from indexing.archive.workers import QuietProcesses
+from indexing.cli.commands.segment_tracks import LEAST, Given, read_given, run_bodies, track_inputs, unit_notes
+from indexing.cli.console import check_folder, check_report, count, counting_bar, flag_words, keep, names, present, progress
 from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import LEFT_OUT, PICTURE_FILES, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
+from indexing.colmap import MatchDatabase, check_target, find_static, read_database
+from indexing.colmap.masks import write_masks
+from indexing.colmap.pair_segmentation import colmap
+from indexing.colmap.static import MIN_PARALLEL_PAIRS
 from indexing.files import manifest
 from indexing.readers.matches import MatchedPair, Photograph, read_image, read_pair
 from indexing.readers.tracks import holds_tracks
 from indexing.report.segmentation import FILES, SegmentationReport
+from indexing.report.static import FILES as STATIC_FILES
+from indexing.report.static import StaticReport, images_drawn
 from indexing.video.scene import SceneTracks
 
 WORDS = flag_words("bodies", "threshold", "spatial")
@@ -39,12 +48,11 @@ def run(flags: Segment) -> int:
     started = time.perf_counter()
     given = None
     if whole:
-        job = _job(flags, files)
-        check_report(flags.out, job.inputs, ())
+        check_report(flags.out, track_inputs(flags), ())
         with progress("reading", steps=False):
             given = read_given(files, scene, asked, flags.key)
         if len(given.tracks.views) > 2:
-            return run_bodies(job, given, time.perf_counter() - started, dataclasses.asdict(flags))
+            return run_bodies(flags, given, time.perf_counter() - started)
     return _two_views(flags, files, scene, asked, given)
 
 
@@ -61,31 +69,7 @@ def _from_colmap(flags: Segment) -> int:
         raise ValueError(f"--bodies {flags.bodies} does not go with --colmap, whose pairs differ; leave it out")
     if flags.images is not None and len(flags.images) != 1:
         raise ValueError(f"--images: {len(flags.images)} are given; with --colmap, give the folder of the images")
-    job = ColmapJob(
-        database=flags.colmap,
-        out=flags.out,
-        images=None if flags.images is None else flags.images[0],
-        masks=flags.masks,
-        threshold=None if flags.threshold == "auto" else float(flags.threshold),
-        spatial=flags.spatial,
-        seed=flags.seed,
-        title=flags.title or "",
-    )
-    return run_colmap(job, dataclasses.asdict(flags))
-
-
-def _job(flags: Segment, files: list[Path]) -> BodiesJob:
-    """What is asked for of whole videos and of tracks."""
-    return BodiesJob(
-        files=files,
-        images=[path.expanduser() for path in flags.images or ()],
-        bodies=None if flags.bodies == "auto" else int(flags.bodies),
-        threshold=float(flags.threshold),
-        size=flags.size,
-        out=flags.out,
-        title=flags.title or "",
-        seed=flags.seed,
-    )
+    return run_colmap(flags)
 
 
 def _two_views(flags: Segment, files: list[Path], scene: bool, asked: Asked, given: Given | None) -> int:
@@ -229,3 +213,82 @@ def _solve(flags: Segment, pair: MatchedPair) -> Any:
         )
     except ValueError as problem:
         raise ValueError(f"{pair.path}: {with_words(problem, WORDS)}") from problem
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# ``--colmap``: which matches of a COLMAP database stand still, written as a database for its mapper.
+
+
+def run_colmap(flags: Segment) -> int:
+    """Read, divide, vote, write, and say what was found; the report goes into the folder ``NAME-report`` beside the database."""
+    if flags.colmap is None or flags.out is None:
+        raise ValueError("--colmap: where to? name the database to write, --out static.db")
+    database, out = flags.colmap.expanduser(), flags.out.expanduser()
+    images = flags.images[0] if flags.images else None
+    threshold = None if flags.threshold == "auto" else float(flags.threshold)
+    out = check_target(out, database)
+    check_folder(out.parent)
+    keep([database], [out])
+    folder = check_report(out.with_name(f"{out.stem}-report"), [database], STATIC_FILES)
+    masks = check_folder((flags.masks or out.with_name(f"{out.stem}-masks")).expanduser())
+    assert folder is not None
+    _check_images(images)
+    if images is not None and masks.resolve() == images.expanduser().resolve():
+        raise ValueError(f"--masks {masks}: is the folder of the images; give masks a folder of their own")
+    started = time.perf_counter()
+    with progress("reading", steps=False):
+        held = read_database(database)
+        colmap()
+        shown, notes = _photographs(held, images)
+    read = time.perf_counter()
+    with counting_bar(f"segmenting {count(len(held.pairs), 'pair')}", "pairs/s") as told, _workforce(len(held.pairs)) as executor:
+        found = find_static(held, threshold, flags.spatial, flags.seed, progress=told, executor=executor)
+    timings = {"read": read - started, "segment": time.perf_counter() - read}
+    if found.ok:
+        with progress("writing", steps=False):
+            write_masks(masks, found)
+            found.write(out)
+    report = StaticReport(
+        found=found,
+        written=str(out) if found.ok else "",
+        masks=str(masks) if found.ok else "",
+        photographs=shown,
+        heading=flags.title or "",
+        notes=notes,
+        manifest=manifest({"command": "segment", **dataclasses.asdict(flags)}, [database], flags.seed, timings),
+    )
+    return present(report, folder)
+
+
+def _workforce(pairs: int) -> contextlib.AbstractContextManager[Executor | None]:
+    """All cores, where that is worth it."""
+    cores = os.cpu_count() or 1
+    return contextlib.nullcontext() if cores < 2 or pairs < MIN_PARALLEL_PAIRS else QuietProcesses(cores)
+
+
+def _check_images(folder: Path | None) -> None:
+    if folder is not None and not folder.expanduser().is_dir():
+        what = "is a file" if folder.expanduser().exists() else "no such folder"
+        raise ValueError(f"--images {folder}: {what}; with --colmap, give the folder that the images were extracted from")
+
+
+def _photographs(database: MatchDatabase, folder: Path | None) -> tuple[dict[int, Photograph], list[str]]:
+    """Those of the images that the report draws, by their places, and what is to be said."""
+    if folder is None:
+        return {}, []
+
+    found, missing, other = {}, [], []
+    for place in images_drawn(database):
+        image = database.images[place]
+        path = folder.expanduser() / image.name
+        if not path.is_file():
+            missing.append(image.name)
+            continue
+        photograph = read_image(path)
+        if photograph.size == (float(image.camera.width), float(image.camera.height)):
+            found[place] = photograph
+        else:
+            other.append(image.name)
+    notes = [f"--images {folder} has no {names(missing)}; the report shows points alone"] if missing else []
+    notes += [f"{names(other)} in --images {folder} has another size than the database says, and is not drawn"] if other else []
+    return found, notes

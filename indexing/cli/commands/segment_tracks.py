@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,13 @@ import torch
 import dyntorch
 from dyntorch.numerics import with_words
 from indexing.cli.console import check_report, count, flag_words, present, progress
+from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import Asked, as_tracks, follow_whole, inputs_of, is_video, photographs, source_of
 from indexing.files import manifest
 from indexing.readers.matches import MatchedPair, Photograph
 from indexing.readers.tracks import TrackSet, read_tracks
 from indexing.report.bodies import FILES, FILM, PANELS, BodiesReport
-from indexing.report.body_labels import colour_of
+from indexing.report.segmentation import colour_of
 from indexing.video.overlay import Overlay, write_overlay
 from indexing.video.scene import SceneTracks, evenly_spaced
 from indexing.video.sequence import PictureSequence, chunks
@@ -49,23 +51,9 @@ class Given:
         return MatchedPair(tracks.path, Path(tracks.path).name, x1, x2, tracks.ids, weights, tracks.known, size)
 
 
-@dataclass(frozen=True)
-class BodiesJob:
-    """What is asked for."""
-
-    files: Sequence[Path]  # that were given
-    images: Sequence[Path] = ()  # a video, a folder, a pattern or pictures, of files of tracks; empty = none
-    bodies: int | None = None  # how many; None = as many as there are
-    threshold: float = 2.5  # pixels
-    size: tuple[float, float] | None = None  # width and height of the pictures; None = not known
-    out: Path | None = None  # folder of the report; None = print only
-    title: str = ""  # heading of the report
-    seed: int = 0  # of the random samples
-
-    @property
-    def inputs(self) -> list[Path]:
-        """The files that are read."""
-        return inputs_of([*self.files, *self.images])
+def track_inputs(flags: Segment) -> list[Path]:
+    """The files that are read."""
+    return inputs_of([path.expanduser() for path in (*flags.files, *(flags.images or ()))])
 
 
 def read_given(files: Sequence[Path], scene: bool, asked: Asked, key: str | None) -> Given:
@@ -97,33 +85,33 @@ def flat(tracks: TrackSet) -> Any:
     return tracks.values
 
 
-def run_bodies(job: BodiesJob, given: Given, read: float, arguments: Mapping[str, Any]) -> int:
+def run_bodies(flags: Segment, given: Given, read: float) -> int:
     """Segment, draw, write, and say what was found."""
-    folder = check_report(job.out, job.inputs, FILES)
+    folder = check_report(flags.out, track_inputs(flags), FILES)
     tracks = given.tracks
-    notes = [*tracks.notes, *check_tracks(tracks, job)]
-    pictures = Pictures.of(job, given)
+    notes = [*tracks.notes, *check_tracks(tracks, float(flags.threshold))]
+    pictures = Pictures.of(flags, given)
     started = time.perf_counter()
     seen = int((_frame_counts(tracks) > 1).sum())
     with progress(f"segmenting {count(seen, 'track')}", steps=False):
-        result = solve(tracks, job)
+        result = solve(tracks, flags)
     timings = {"read": read, "segment": time.perf_counter() - started}
     found = int(result.bodies)
-    if job.bodies is not None and 0 < found < job.bodies:
-        notes.append(f"--bodies asks for {job.bodies}, the tracks carry {found}")
+    if flags.bodies != "auto" and 0 < found < flags.bodies:
+        notes.append(f"--bodies asks for {flags.bodies}, the tracks carry {found}")
     notes += stretches(tracks, result)
-    shown = {} if pictures is None or folder is None else pictures.shown(given)
+    shown = {} if pictures is None or folder is None else pictures.read_photographs(given)
     report = BodiesReport(
-        result=result, tracks=tracks, photographs=shown, size=job.size, heading=job.title, notes=notes, words=WORDS,
-        manifest=manifest({"command": "segment", **arguments}, job.inputs, job.seed, timings),
+        result=result, tracks=tracks, photographs=shown, size=flags.size, heading=flags.title or "", notes=notes, words=WORDS,
+        manifest=manifest({"command": "segment", **dataclasses.asdict(flags)}, track_inputs(flags), flags.seed, timings),
     )  # fmt: skip
     if folder is not None and pictures is not None and report.bodies:
         with progress("drawing the video", steps=False):
-            report = pictures.filmed(report)
+            report = pictures.draw_video(report)
     return present(report, folder)
 
 
-def check_tracks(tracks: TrackSet, job: BodiesJob) -> list[str]:
+def check_tracks(tracks: TrackSet, threshold: float) -> list[str]:
     """What to say about the input."""
     values = flat(tracks)
     number = len(tracks.ids)
@@ -140,7 +128,7 @@ def check_tracks(tracks: TrackSet, job: BodiesJob) -> list[str]:
     if tracks.weights is not None and len(np.unique(tracks.weights[tracks.weights > 0])) > 1:
         notes.append("weights of 0 leave an observation out; all others count alike")
     extent = float(np.nanmax(np.nanmax(values, axis=(0, 1)) - np.nanmin(values, axis=(0, 1))))
-    return notes + unit_notes(tracks.path, extent, job.threshold, auto=False)
+    return notes + unit_notes(tracks.path, extent, threshold, auto=False)
 
 
 def unit_notes(path: str, extent: float, threshold: float | None, auto: bool = True) -> list[str]:
@@ -158,7 +146,7 @@ def _frame_counts(tracks: TrackSet) -> Any:
     return np.isfinite(tracks.values).all(axis=-1).sum(axis=0)
 
 
-def solve(tracks: TrackSet, job: BodiesJob) -> Any:
+def solve(tracks: TrackSet, flags: Segment) -> Any:
     """The segmentation, by the library.
 
     Raises:
@@ -170,9 +158,9 @@ def solve(tracks: TrackSet, job: BodiesJob) -> Any:
     try:
         return dyntorch.segment_tracks(
             torch.from_numpy(values),
-            bodies=job.bodies,
-            threshold=job.threshold,
-            generator=torch.Generator().manual_seed(job.seed),
+            bodies=None if flags.bodies == "auto" else int(flags.bodies),
+            threshold=float(flags.threshold),
+            generator=torch.Generator().manual_seed(flags.seed),
         )
     except ValueError as problem:
         raise ValueError(f"{tracks.path}: {with_words(problem, WORDS)}") from problem
@@ -201,14 +189,14 @@ class Pictures:
     frames: tuple[int, ...]  # number of the picture of each view
 
     @staticmethod
-    def of(job: BodiesJob, given: Given) -> Pictures | None:
-        """Those of the job, if there are any."""
+    def of(flags: Segment, given: Given) -> Pictures | None:
+        """Those that are asked for, if there are any."""
         if given.followed is not None:
-            return Pictures(source_of(job.files), given.followed.frames)
-        if not job.images or job.out is None:
+            return Pictures(source_of([path.expanduser() for path in flags.files]), given.followed.frames)
+        if not flags.images or flags.out is None:
             return None
 
-        source, views = source_of(job.images), given.tracks.views
+        source, views = source_of([path.expanduser() for path in flags.images]), given.tracks.views
         stream: Any = chunks(source)
         number = len(stream) if isinstance(stream, PictureSequence) else stream.info.frames
         if number == len(views):
@@ -217,10 +205,10 @@ class Pictures:
             numbers = [int(name) for name in views]
             if numbers == sorted(set(numbers)) and numbers[-1] < number:
                 return Pictures(source, tuple(numbers))
-        said = f"--images {job.images[0]}: {count(number, 'picture')}, and the tracks have {len(views)} frames"
+        said = f"--images {flags.images[0]}: {count(number, 'picture')}, and the tracks have {len(views)} frames"
         raise ValueError(f"{said} ({views[0]} to {views[-1]}); give a picture for each, or the whole video with frames from 0")
 
-    def shown(self, given: Given) -> dict[int, Photograph]:
+    def read_photographs(self, given: Given) -> dict[int, Photograph]:
         """Some of them, by their views."""
 
         if given.followed is not None:
@@ -238,7 +226,7 @@ class Pictures:
                 index += 1
         return found
 
-    def filmed(self, report: BodiesReport) -> BodiesReport:
+    def draw_video(self, report: BodiesReport) -> BodiesReport:
         """The report with the video in which the tracks are drawn."""
 
         from matplotlib.colors import to_rgb

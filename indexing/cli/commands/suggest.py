@@ -8,7 +8,7 @@ from typing import Any
 
 from indexing.action.indexer import ActionIndexer
 from indexing.cli.console import count, progress, say, table
-from indexing.cli.flags.index import Suggest
+from indexing.cli.flags.recognition import Suggest
 from indexing.cli.inputs import Lane, read_recordings, watch_videos
 from indexing.cli.labels import UNCONFIRMED, check_labelling, check_write, read_marked, write_to
 from indexing.labels import Label

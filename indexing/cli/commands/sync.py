@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import json
 import math
 import time
 from collections.abc import Sequence
@@ -16,8 +18,8 @@ from indexing.cli.flags.cameras import Sync
 from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import refuse_range
 from indexing.cli.videos import find_keypoints, wants_keypoints
+from indexing.clip import Clip
 from indexing.files import manifest, prepare
-from indexing.report.check_videos import drop_checks, names_of, write_checks
 from indexing.report.sync import FILES, SyncReport
 from indexing.sync.breaks import find_breaks
 from indexing.sync.calibration import named_lenses
@@ -40,6 +42,7 @@ from indexing.sync.recordings import By, Take, find_cameras, take_of
 from indexing.sync.synchronize import BY, Method, recording_notices
 from indexing.sync.synchronize import pair as compare_pair
 from indexing.sync.trimming import CameraVideo, check_videos, drop_videos, frame_clock, trim, trim_as_json, video_of, write_videos
+from indexing.video import write_check_video
 from indexing.video.reading import av, cv2
 
 WORDS = flag_words(
@@ -76,7 +79,7 @@ def _sync_scene(flags: Sync, found: dict[str, Path], trial: Trial | None) -> int
     """The cameras of one scene."""
     inputs = [*found.values(), *([flags.calibration.expanduser()] if flags.calibration else [])]
     out = trial.folder if trial is not None and flags.out is None else flags.out
-    folder = check_report(out, inputs, [*FILES, *names_of(list(found))])
+    folder = check_report(out, inputs, [*FILES, *check_names(list(found))])
     if folder is not None:
         check_target(folder, inputs)
     if folder is not None and flags.videos:
@@ -324,3 +327,48 @@ def _frame_shift(one: Plan) -> dict[str, Any]:
         "folder": f"pose-sync/{folder_of(one.take)}", "files": len(one.numbers), "shift": one.shift, "rest": one.rest,
         "repeated": one.repeated, "left_out": one.before,
     }  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Videos to check by: the reference camera beside each of the others, at the same moments.
+
+
+def check_names(cameras: Sequence[str]) -> list[str]:
+    """The files' names: ``check.mp4`` for two cameras, one for each but the reference for more."""
+    return ["check.mp4"] if len(cameras) == 2 else [f"check-{name}.mp4" for name in cameras[1:]]
+
+
+def write_checks(folder: Path, report: SyncReport) -> tuple[list[str], list[str]]:
+    """Write the videos: the names of those written, and notes on those that could not be."""
+    written, notes, takes, found = [], [], report.takes, report.compared
+    for i, name in enumerate(check_names([take.name for take in takes]), start=1):
+        people = found[0, i].people if (0, i) in found else (0, 0)
+        first, other = (_recording_of(take, person) for take, person in zip((takes[0], takes[i]), people, strict=True))
+        try:
+            write_check_video(folder / name, first, other, report.clocks[i], names=(takes[0].name, takes[i].name))
+            written.append(name)
+        except ValueError as problem:
+            notes.append(f"{name} was not written: {problem}")
+    return written, notes
+
+
+def drop_checks(folder: Path, written: Sequence[str]) -> None:
+    """Remove the check videos of an earlier run that this one did not write again: they show cameras of other files."""
+    try:
+        known = json.loads((folder / "sync.json").read_text(encoding="utf-8"))
+        asked = known["manifest"]["arguments"]
+        ours = asked["command"] == "sync" and asked["check"]
+        names = check_names([str(camera["name"]) for camera in known["cameras"]]) if ours else []
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    for name in set(names) - set(written):
+        if Path(name).name == name:
+            with contextlib.suppress(OSError):
+                (folder / name).unlink()
+
+
+def _recording_of(take: Take, person: int) -> Path | Clip:
+    if take.kind == "keypoints" and take.video is None:
+        return take.people[person]
+    assert take.path is not None  # the command line has no frames without a file
+    return take.path

@@ -259,7 +259,7 @@ def test_find_prints_events_and_writes_the_report(run, data: Path, tmp_path: Pat
 
 @pytest.mark.slow
 def test_many_events_are_counted(run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verbs, "MAX_EVENTS_PRINTED", 2)
+    monkeypatch.setattr("indexing.report.archive.MAX_EVENTS_PRINTED", 2)
     code, out, _ = run("find", "lab.archive", "-m", "moves.safetensors")
     assert code == 0 and "times" in out and "margin" not in out and "events.csv of a report" in out
     code, out, _ = run("find", "lab.archive", "-m", "moves.safetensors", "--reject", "1000")

@@ -244,7 +244,7 @@ def test_detections_of_several_recordings_in_one_file(run, refuse) -> None:
         assert run(f"index scan @/session.json @/later.json -m @/m.st --write found{suffix}")[0] == 0
         found = open_labels(f"found{suffix}")
         assert {Path(name).stem for name in found.media} == {"session", "later"}
-    refuse("index scan @/session.json @/later.json -m @/m.st --write two.eaf", "an ELAN file is of one recording", "two.boris")
+    refuse("index scan @/session.json @/later.json -m @/m.st --write two.eaf", "an ELAN .eaf is of one recording", "two.boris")
 
 
 @pytest.mark.slow
@@ -266,7 +266,7 @@ def test_scan_refuses_before_it_begins(refuse, data: Path, tmp_path: Path, monke
     refuse(f"{scan} --write folder.eaf", "is a folder")
     refuse(f"{scan} --truth @/session.csv --labels @/session.csv", "--truth", "--labels")
     (tmp_path / "file.csv").write_bytes((data / "session.csv").read_bytes())
-    refuse(f"{scan} --write file.csv", "is there already", ".eaf, .boris")
+    refuse(f"{scan} --write file.csv", "is there already", ".boris, .eaf")
     refuse(f"{scan} --write file.csv/found.csv", "is a file")
 
 
@@ -277,7 +277,7 @@ def test_corrections_are_not_written_over(refuse, tmp_path: Path, monkeypatch: p
     scan = "index scan @/session.json -m @/m.st --write"
     for suffix in (".csv", ".tsv", ".json"):  # no row says whether somebody corrected it
         write_labels(f"found{suffix}", found, recording="session.mp4")
-        refuse(f"{scan} found{suffix}", f"found{suffix}: is there already; give another name", ".eaf, .boris")
+        refuse(f"{scan} found{suffix}", f"found{suffix}: is there already; give another name", ".boris, .eaf")
     Path("keypoints.json").write_text('[{"image_id": 1, "keypoints": [1.0, 2.0, 0.5]}]')  # nor is what holds no labels ours
     refuse(f"{scan} keypoints.json", "keypoints.json: is there already")
     for tier, command in (("dyntorch", "scan"), ("to label", "suggest")):

@@ -14,7 +14,7 @@ from indexing import ActionIndexer, ActionOptions, Clip, ClipSet, synchronize
 from indexing.actors import Person, dataset
 from indexing.cli import main
 from indexing.cli.flags.shared import Reading
-from indexing.cli.notes import clip_notes
+from indexing.cli.inputs import clip_notes
 from indexing.recordings.decoding import Withheld
 from indexing.skeleton import BODY25, COCO17, Skeleton
 

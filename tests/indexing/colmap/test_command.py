@@ -13,17 +13,20 @@ import pytest
 from PIL import Image
 
 from indexing.cli import main
-from indexing.cli.commands.segment_colmap import ColmapJob, run_colmap
+from indexing.cli.commands.segment import run_colmap
+from indexing.cli.flags.geometry import Segment
 from indexing.report.static import FILES
 from tests.indexing.colmap.test_database import changed, sha256
+
+
+def flags(database, out, images=None, **others):
+    return Segment(files=(), colmap=database, out=out, images=None if images is None else (images,), **others)
 
 
 @pytest.fixture
 def quick(found, monkeypatch):
     """What was found once is found again at once."""
-    monkeypatch.setattr(
-        "indexing.cli.commands.segment_colmap.find_static", lambda database, *_, **__: replace(found, database=database)
-    )
+    monkeypatch.setattr("indexing.cli.commands.segment.find_static", lambda database, *_, **__: replace(found, database=database))
 
 
 @pytest.mark.slow
@@ -32,8 +35,8 @@ def test_everything_is_written(given, quick, tmp_path, capsys):
     (tmp_path / "images").mkdir()
     Image.fromarray(np.full((720, 960), 128, dtype=np.uint8)).save(tmp_path / "images" / "000.png")
     Image.fromarray(np.full((72, 96), 128, dtype=np.uint8)).save(tmp_path / "images" / "001.png")
-    job = ColmapJob(given, tmp_path / "static.db", images=tmp_path / "images", title="Street <1>")
-    assert run_colmap(job, {"colmap": str(given)}) == 0
+    job = flags(given, tmp_path / "static.db", images=tmp_path / "images", title="Street <1>")
+    assert run_colmap(job) == 0
     assert sha256(given) == before
     said = capsys.readouterr().out
     assert "stand still; 15 pairs have enough of them" in said
@@ -56,8 +59,8 @@ def test_everything_is_written(given, quick, tmp_path, capsys):
 @pytest.mark.slow
 def test_a_refusal_writes_a_report_and_no_database(given, found, tmp_path, monkeypatch, capsys):
     few = replace(found, refused=(0, 1, 2, 3), reason="fewer than 15 points stand still in 000.png, 4 of 6 images; add images")
-    monkeypatch.setattr("indexing.cli.commands.segment_colmap.find_static", lambda *_, **__: few)
-    assert run_colmap(ColmapJob(given, tmp_path / "static.db"), {}) == 3
+    monkeypatch.setattr("indexing.cli.commands.segment.find_static", lambda *_, **__: few)
+    assert run_colmap(flags(given, tmp_path / "static.db")) == 3
     assert "refused: fewer than 15 points stand still in 000.png" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["static-report"]
     assert "Refused" in (tmp_path / "static-report" / "report.html").read_text(encoding="utf-8")
@@ -69,22 +72,22 @@ def test_bad_input_is_one_line(given, tmp_path):
     (tmp_path / "there.db").touch()
     empty = changed(given, tmp_path / "empty.db", "DELETE FROM matches", "DELETE FROM two_view_geometries")
     cases = [
-        (ColmapJob(given, None), "where to"),
-        (ColmapJob(given, given), "is the database that is read"),
-        (ColmapJob(given, tmp_path / "there.db"), "is there already"),
-        (ColmapJob(given, tmp_path / "text.db" / "static.db"), "is a file"),
-        (ColmapJob(tmp_path / "none.db", out), "no such database"),
-        (ColmapJob(tmp_path / "text.db", out), "is no SQLite database"),
-        (ColmapJob(empty, out), "no matches; run a matcher first"),
-        (ColmapJob(given, out, images=tmp_path / "none"), "no such folder"),
-        (ColmapJob(given, out, images=given), "is a file"),
-        (ColmapJob(given, out, masks=given), "is a file"),
-        (ColmapJob(given, out, images=tmp_path, masks=tmp_path), "is the folder of the images"),
+        (flags(given, None), "where to"),
+        (flags(given, given), "is the database that is read"),
+        (flags(given, tmp_path / "there.db"), "is there already"),
+        (flags(given, tmp_path / "text.db" / "static.db"), "is a file"),
+        (flags(tmp_path / "none.db", out), "no such database"),
+        (flags(tmp_path / "text.db", out), "is no SQLite database"),
+        (flags(empty, out), "no matches; run a matcher first"),
+        (flags(given, out, images=tmp_path / "none"), "no such folder"),
+        (flags(given, out, images=given), "is a file"),
+        (flags(given, out, masks=given), "is a file"),
+        (flags(given, out, images=tmp_path, masks=tmp_path), "is the folder of the images"),
     ]
     before = set(tmp_path.iterdir())
     for job, said in cases:
         with pytest.raises(ValueError, match=said) as caught:
-            run_colmap(job, {})
+            run_colmap(job)
         assert "\n" not in str(caught.value)
     assert set(tmp_path.iterdir()) == before
 
@@ -93,7 +96,7 @@ def test_bad_input_is_one_line(given, tmp_path):
 def test_relative_names_and_home(given, quick, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert run_colmap(ColmapJob(given, Path("~/a.db"), masks=Path("black")), {}) == 0
+    assert run_colmap(flags(given, Path("~/a.db"), masks=Path("black"))) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a-report", "a.db", "black"]
 
 

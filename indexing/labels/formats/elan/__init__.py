@@ -305,4 +305,4 @@ def _linguistic_type(document: Document, at: int) -> list[Edit]:
     return [Edit(last, last, kind.encode())]
 
 
-FORMAT = LabelFormat("an ELAN .eaf", ("xml",), read, write=write, written={"elan": ".eaf"}, program="ELAN")
+FORMAT = LabelFormat("an ELAN .eaf", ("xml",), read, write=write, written={"elan": ".eaf"}, program="ELAN", one_recording=True)
