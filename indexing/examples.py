@@ -74,7 +74,7 @@ def _geometry(where: Path) -> None:
     bodies = scenes.bodies((110, 80, 50), bodies=3, sigma=0.4, outliers=0.2, generator=draw)
     np.savez(where / "matches.npz", x1=bodies.views[0].numpy(), x2=bodies.views[1].numpy())
     draw = torch.Generator().manual_seed(7)
-    scene = scenes.lifted("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=draw)
+    scene = scenes.lifted_points("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=draw)
     known = (scene.labels == 1) & (torch.rand(120, generator=draw) < 0.5)
     rows = [(view, point, *xy.tolist()) for view, points in enumerate(scene.tracks) for point, xy in enumerate(points)]
     _table(where / "tracks.csv", ("frame", "id", "x", "y"), [row for row in rows if np.isfinite(row[2])])

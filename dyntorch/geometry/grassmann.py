@@ -415,7 +415,7 @@ def joint_epipoles(projections: Sequence[Tensor]) -> JointEpipoles:
     lower, rows = _orthonormal_rows(views.double())
     centres = meet(*rows.unbind(-2))
     maps = compound(rows, 2)
-    others = [(maps[..., i, :, :] @ centres[..., _others(i), :].mT).mT for i in range(3)]
+    others = [(maps[..., i, :, :] @ centres[..., _other_views(i), :].mT).mT for i in range(3)]
     return _meeting(dual(torch.stack(others, dim=-3), 3, 2), lower, views.dtype)
 
 
@@ -445,7 +445,7 @@ def joint_epipoles_of_tensor(tensor: Tensor) -> JointEpipoles:
     return _meeting(lines, eye.expand(*lines.shape[:-2], 3, 3), tensor.dtype)
 
 
-def _others(view: int) -> list[int]:
+def _other_views(view: int) -> list[int]:
     return [j for j in range(3) if j != view]
 
 

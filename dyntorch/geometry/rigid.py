@@ -198,7 +198,7 @@ class CommonPlane(NormalEquations):
         wide = torch.einsum("bvcp,vw->bvcwp", own, torch.eye(v, dtype=H.dtype, device=H.device))
         return r.flatten(1), slopes(turned).mT.reshape(b, 2 * v, 2), wide.reshape(b, 2 * v, 9 * v)
 
-    def weighted(self, normal: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def whiten_conditions(self, normal: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Conditions, their derivatives by turns, :math:`S^{-1}` and :math:`C J^T`, by which N follows the conditions."""
         r, turns, by = self.linear(normal)
         spread = self.covariance @ by.mT
@@ -209,7 +209,7 @@ class CommonPlane(NormalEquations):
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost, gradient and matrix by the three entries of n; along n nothing changes."""
-        r, turns, inverse, _ = self.weighted(theta)
+        r, turns, inverse, _ = self.whiten_conditions(theta)
         J = turns @ tangent_basis(theta).mT
         weighed = J.mT @ inverse
         matrix = weighed @ J
@@ -218,7 +218,7 @@ class CommonPlane(NormalEquations):
 
     def correct_homographies(self, normal: Tensor) -> Tensor:
         """The homographies N next to the measured ones, in standard deviations, that fulfil the conditions."""
-        r, _, inverse, spread = self.weighted(normal)
+        r, _, inverse, spread = self.whiten_conditions(normal)
         return self.inverse - (spread @ inverse @ r[..., None])[..., 0].view_as(self.inverse)
 
 

@@ -374,7 +374,7 @@ class DynamicShapeTensor(Invariant):
         shapes = estimate.shapes
         if not self.projective and torch.is_grad_enabled() and (measured.requires_grad or weights.requires_grad):
             shapes = select(estimate.status == Status.OK, followed_shapes(shapes, measured, rows, weights), shapes)
-        return Estimate(concatenate_shapes(shapes), estimate.few, estimate.degenerate, ambiguous, estimate.uncertainty)
+        return Estimate(concatenate_shapes(shapes), estimate.underdetermined, estimate.degenerate, ambiguous, estimate.uncertainty)
 
     @on_class
     def compose(self, shapes: Tensor) -> Tensor:

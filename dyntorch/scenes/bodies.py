@@ -304,10 +304,10 @@ class TranslatingScene:
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> TranslatingScene:
         """The scene in another floating point type or on another device."""
 
-        def moved(x: Any) -> Any:
+        def move(x: Any) -> Any:
             return x.to(device=device, dtype=dtype) if isinstance(x, Tensor) else x
 
-        return TranslatingScene(**{field.name: moved(getattr(self, field.name)) for field in fields(self)})
+        return TranslatingScene(**{field.name: move(getattr(self, field.name)) for field in fields(self)})
 
 
 def translating_planes(

@@ -85,13 +85,13 @@ class LiftedScene:
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> LiftedScene:
         """The scene in another floating point type or on another device; labels stay integers."""
 
-        def moved(x: Any) -> Any:
+        def move(x: Any) -> Any:
             return x.to(device=device, dtype=dtype if x.is_floating_point() else None) if isinstance(x, Tensor) else x
 
-        return LiftedScene(**{field.name: moved(getattr(self, field.name)) for field in fields(self)})
+        return LiftedScene(**{field.name: move(getattr(self, field.name)) for field in fields(self)})
 
 
-def lifted(
+def lifted_points(
     motion: str,
     n: int = 60,
     views: int | None = None,

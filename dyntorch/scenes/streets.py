@@ -199,7 +199,7 @@ class _Scene:
         if cars is None:
             return None
         walls = street_walls(own, cars, junction, chance)
-        scene = _Scene(options, K, cameras, centres, walls.joined(cars), cars, 10 * chance.uniform(3))
+        scene = _Scene(options, K, cameras, centres, walls.with_cars(cars), cars, 10 * chance.uniform(3))
         return scene if scene.distinct() else None
 
     def distinct(self) -> bool:

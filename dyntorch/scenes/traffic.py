@@ -166,7 +166,7 @@ class Boxes:
     relief: Tensor  # ``(b,)`` metres that points lie behind the sides, at most
     body: Tensor  # ``(b,)`` 0 what stands, 1.. the cars
 
-    def joined(self, cars: Sequence[Drive]) -> Boxes:
+    def with_cars(self, cars: Sequence[Drive]) -> Boxes:
         """With cars that drive."""
         if not cars:
             return self
@@ -238,7 +238,7 @@ def _row(line: float, outward: float, span: tuple[float, float], across: bool, c
     """Houses from ``line`` outwards and what stands before them: x, y, z, heading, width, height, length, relief of each."""
     rows: list[list[float]] = []
 
-    def put(away: float, along: float, size: tuple[float, float, float], relief: float, lift: float = 0.0) -> None:
+    def add_box(away: float, along: float, size: tuple[float, float, float], relief: float, lift: float = 0.0) -> None:
         place = line + outward * away
         x, z = (along, place) if across else (place, along)
         rows.append([x, ROAD - lift, z, math.pi / 2 if across else 0.0, *size, relief])
@@ -247,20 +247,20 @@ def _row(line: float, outward: float, span: tuple[float, float], across: bool, c
     while along < span[1]:
         length = min(chance.between(6.0, 16.0), span[1] - along)
         if length > 2.0 and chance.whether(0.9):
-            put(5.0 + chance.between(0.0, 1.5), along + length / 2, (10.0, chance.between(4.0, 13.0), length), 0.3)
+            add_box(5.0 + chance.between(0.0, 1.5), along + length / 2, (10.0, chance.between(4.0, 13.0), length), 0.3)
         along += length + (chance.between(1.0, 5.0) if chance.whether(0.3) else 0.0)
     length, height, width = CAR
     for kind, apart in (("car", 7.0), ("pole", 14.0), ("tree", 16.0), ("bush", 8.0)):
         along = span[0] + apart * chance.between(0.0, 1.0)
         while along < span[1]:
             if kind == "car" and chance.whether(0.5):
-                put(-2.3, along, (width, height, length), 0.2)
+                add_box(-2.3, along, (width, height, length), 0.2)
             elif kind == "pole":
-                put(-0.9, along, (0.25, chance.between(3.0, 7.0), 0.25), 0.1)
+                add_box(-0.9, along, (0.25, chance.between(3.0, 7.0), 0.25), 0.1)
             elif kind == "tree" and chance.whether(0.5):
-                put(-0.8, along, (0.4, 2.5, 0.4), 0.1)
-                put(-0.8, along, (3.0, 3.0, 3.0), 1.5, 2.5)
+                add_box(-0.8, along, (0.4, 2.5, 0.4), 0.1)
+                add_box(-0.8, along, (3.0, 3.0, 3.0), 1.5, 2.5)
             elif kind == "bush" and chance.whether(0.4):
-                put(-0.5, along, (1.0, chance.between(0.5, 1.5), chance.between(1.0, 3.0)), 0.5)
+                add_box(-0.5, along, (1.0, chance.between(0.5, 1.5), chance.between(1.0, 3.0)), 0.5)
             along += apart * chance.between(0.8, 1.4)
     return rows

@@ -536,20 +536,20 @@ def _result(found: _DeformableFit, batch: torch.Size, like: Tensor) -> Deformabl
     """In the caller's batch, unit and dtype; zero where nothing was found."""
     model, bad = found.model, is_failure(found.status)
 
-    def shaped(value: Tensor) -> Tensor:
+    def to_caller(value: Tensor) -> Tensor:
         wide = bad[(..., *[None] * (value.ndim - 1))]
         return torch.where(wide, 0.0, value).reshape((*batch, *value.shape[1:])).to(like)
 
     size = found.scale[:, None, None, None]
     return DeformableShapes(
-        shapes=shaped(model.shapes * size),
-        coefficients=shaped(model.coefficients),
-        cameras=shaped(model.cameras),
-        rotations=shaped(model.turns),
-        offsets=shaped(model.offsets * size),
-        points=shaped(model.points * size),
+        shapes=to_caller(model.shapes * size),
+        coefficients=to_caller(model.coefficients),
+        cameras=to_caller(model.cameras),
+        rotations=to_caller(model.turns),
+        offsets=to_caller(model.offsets * size),
+        points=to_caller(model.points * size),
         metric=(found.metric & ~bad).reshape(batch),
-        residual=shaped(found.residual),
-        sigma=shaped(found.sigma),
+        residual=to_caller(found.residual),
+        sigma=to_caller(found.sigma),
         status=found.status.reshape(batch),
     )

@@ -54,7 +54,7 @@ class AffineViews:
     share: Tensor  # ``(b, views)`` weight of each view
     scale: Tensor  # ``(b, views)`` what the coordinates were divided by
 
-    def repeated(self, count: int) -> AffineViews:
+    def repeat(self, count: int) -> AffineViews:
         """The same problems ``count`` times, one after the other."""
         return AffineViews(*(part.repeat(count, *([1] * (part.ndim - 1))) for part in vars(self).values()))
 
@@ -354,7 +354,7 @@ class MovingShapes(Outcome):
     TASK = "fit_shapes"
 
     @property
-    def few(self) -> Tensor:
+    def underdetermined(self) -> Tensor:
         """``(*batch,)`` bool: fewer views than determine the shapes."""
         return self.status == Status.TOO_FEW
 
@@ -394,7 +394,7 @@ def fit_shapes(
         iterations: steps of the descent at most.
 
     Returns:
-        :class:`MovingShapes` in the dtype of x; zero shapes where ``few``.
+        :class:`MovingShapes` in the dtype of x; zero shapes where ``underdetermined``.
 
     Raises:
         ValueError: shapes that do not agree, or fewer than five points.
@@ -490,7 +490,7 @@ def _fit_from_starts(views: AffineViews, rows: Tensor, iterations: int) -> tuple
     made = [make(filled, rows, views.share) for make in (graph_start, window_start)]
     made += [pooled_start(filled, rows, views.share), _incremental_start(views, filled, rows)]
     starts = [torch.where(start.isfinite(), start, 0.0) for start in made if start is not None]
-    shapes, cost = descend(views.repeated(len(starts)), rows.repeat(len(starts), 1, 1), torch.cat(starts), START_STEPS)
+    shapes, cost = descend(views.repeat(len(starts)), rows.repeat(len(starts), 1, 1), torch.cat(starts), START_STEPS)
     cost = torch.where(cost.isfinite(), cost, torch.inf).unflatten(0, (len(starts), -1))
     best = cost.argmin(0)
     chosen = shapes.unflatten(0, (len(starts), -1))[best, torch.arange(len(best), device=best.device)]

@@ -332,14 +332,14 @@ class _Dater:
         periodic, step = self.basis.period is not None, self.times[1] - self.times[0]
         curve = self.costs(x, weights, self.times.expand(*x.shape[:2], -1))
         place, lone = lowest_minima(curve, periodic)
-        t, f, h = self.refined(x, weights, self.times[place], step)
+        t, f, h = self.refine_times(x, weights, self.times[place], step)
         f = torch.where(lone, torch.inf, f)
         order = f.argsort(-1)
         t, f, h = (part.gather(-1, order) for part in (t, f, h))
         second = torch.where(f[..., 1].isfinite(), t[..., 1], t[..., 0])
         return f[..., 0].clamp(0, 1), t[..., 0], h[..., 0].clamp(min=1e-300).rsqrt(), second, f[..., 1] - f[..., 0]
 
-    def beside(self, x: Tensor, weights: Tensor, t: Tensor) -> PerspectiveViews:
+    def project_at(self, x: Tensor, weights: Tensor, t: Tensor) -> PerspectiveViews:
         """Views ``(b, views, n, 2)`` at times ``(b, views, times)``."""
         shape = shapes_at(self.shapes, self.basis.rows(t).flatten(1, 2)).unflatten(1, t.shape[1:])
         many = (x[:, :, None].expand(*t.shape, *x.shape[-2:]), weights[:, :, None].expand(*t.shape, weights.shape[-1]))
@@ -347,16 +347,16 @@ class _Dater:
 
     def costs(self, x: Tensor, weights: Tensor, t: Tensor) -> Tensor:
         """With what the prior adds, ``(b, views, times)``."""
-        return self.beside(x, weights, t).residual.square().sum(-1)
+        return self.project_at(x, weights, t).residual.square().sum(-1)
 
-    def refined(self, x: Tensor, weights: Tensor, start: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def refine_times(self, x: Tensor, weights: Tensor, start: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Times, costs and curvatures at the minima next to ``start``; not more than a step away."""
         low, high = start - step, start + step
         if self.basis.period is None:
             low, high = low.clamp(min=self.times[0]), high.clamp(max=self.times[-1])
 
         def at(t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            found = self.beside(x, weights, t)
+            found = self.project_at(x, weights, t)
             speed = shapes_at(self.shapes, self.basis.slopes(t).flatten(1, 2)).unflatten(1, t.shape[1:])
             moved = (found.slopes @ speed[..., None])[..., 0].flatten(-2)
             slope = found.across(moved[..., None])[..., 0]

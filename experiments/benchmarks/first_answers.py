@@ -87,7 +87,7 @@ def examples(folder: Path) -> dict[str, list[str]]:
             people = [{"pose_keypoints_2d": np.nan_to_num(np.c_[joints, trust]).ravel().tolist()}]
             (folder / name / f"{name}_{i:012d}_keypoints.json").write_text(json.dumps({"people": people}))
     draw = torch.Generator().manual_seed(5)
-    lifted = scenes.lifted("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=draw)
+    lifted = scenes.lifted_points("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=draw)
     np.save(folder / "tracks.npy", lifted.tracks.numpy())
     return {
         "align": ["align", "a.csv", "b.csv", "c.csv", "--out", "align"],

@@ -31,7 +31,7 @@ class Config:
 
 def job(motion: str, n: int, views: int, batch: tuple[int, ...] = ()) -> Callable[[], object]:
     """The reconstruction of scenes with half a pixel of noise, outliers not excluded."""
-    scene = scenes.lifted(motion, n, views, sigma=0.5, batch=batch, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points(motion, n, views, sigma=0.5, batch=batch, generator=torch.Generator().manual_seed(0))
     return lambda: dyn.reconstruct(scene.tracks, motion, scene.times)
 
 

@@ -96,14 +96,14 @@ def reconstruct() -> Verb:
     from dyntorch import scenes
 
     g = draw(5)
-    scene = scenes.lifted("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=g)
+    scene = scenes.lifted_points("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=g)
     known = (scene.labels == 1) & (torch.rand(120, generator=g) < 0.5)
     return lambda: dyn.reconstruct(scene.tracks, "constant_velocity_3d", scene.times, static=known, threshold=1.5)
 
 
 def reconstruct_pair() -> Verb:
     """A body that bends, before two cameras."""
-    from dyntorch.scenes.filmed import nonrigid_pair
+    from dyntorch.scenes.two_cameras import nonrigid_pair
 
     scene = nonrigid_pair(12, 10, 90, sigma=0.3, offset=0.41, generator=draw())
     return lambda: dyn.reconstruct_pair(scene.a, scene.b, scene.offset, fps=scene.fps)

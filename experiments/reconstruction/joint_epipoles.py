@@ -2,8 +2,8 @@
 
     python -m experiments.reconstruction.joint_epipoles --quick
 
-Scenes of :func:`dyntorch.scenes.lifted`, ``constant_direction_3d`` (P^4 to P^2), first three views. The joint epipole of a view
-is the vanishing point of the direction; the figure is the angle in degrees, seen from the camera, between it and the true
+Scenes of :func:`dyntorch.scenes.lifted_points`, ``constant_direction_3d`` (P^4 to P^2), first three views. The joint epipole of a
+view is the vanishing point of the direction; the figure is the angle in degrees, seen from the camera, between it and the true
 direction, the median over views and scenes. "tensor" is the closed form that takes the tensor alone, "projections" goes through
 its cameras, "refined" through those of the refined tensor. The last table has planar constant velocities, where theory says there
 is none: its definedness, the least sine between the two lines that should meet.
@@ -22,7 +22,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.geometry.grassmann import joint_epipoles_of_tensor
-from dyntorch.scenes import LiftedScene, lifted
+from dyntorch.scenes import LiftedScene, lifted_points
 from experiments.common.tables import NoiseConfig, command, noise_tables
 
 PROFILE = dyn.GrassmannTensor(4, (2, 2, 1))
@@ -63,7 +63,7 @@ def angle(epipoles: Tensor, scene: LiftedScene) -> float:
 
 def line(n: int, sigma: float, scenes: int, seed: int) -> Sequence[str]:
     """One row over the noise."""
-    scene = lifted("constant_direction_3d", n, 3, batch=scenes, sigma=sigma, generator=torch.Generator().manual_seed(seed))
+    scene = lifted_points("constant_direction_3d", n, 3, batch=scenes, sigma=sigma, generator=torch.Generator().manual_seed(seed))
     views = scene.tracks.unbind(1)
     found = dyn.fit(PROFILE, *views)
     refined = dyn.refine(found, *views)
@@ -79,7 +79,7 @@ def undefined(n: int, sigma: float, scenes: int, seed: int) -> Sequence[str]:
     """One row over planar constant velocities."""
     cells = []
     for kind in ("constant_velocity_2d", "constant_direction_3d"):
-        scene = lifted(kind, n, 3, batch=scenes, sigma=sigma, generator=torch.Generator().manual_seed(seed))
+        scene = lifted_points(kind, n, 3, batch=scenes, sigma=sigma, generator=torch.Generator().manual_seed(seed))
         refined = dyn.refine(dyn.fit(PROFILE, *scene.tracks.unbind(1)), *scene.tracks.unbind(1))
         cells.append(f"{float(dyn.geometry.joint_epipoles(PROFILE.decompose(refined.tensor)).definedness.median()):.1g}")
     return str(n), f"{sigma:g}", *cells

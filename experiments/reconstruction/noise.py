@@ -101,7 +101,7 @@ def cell(setting: Setting, count: int, seed: int) -> str:
     """One line of the table."""
     motion = MOTIONS[setting.motion]
     draw = torch.Generator().manual_seed(seed)
-    scene = scenes.lifted(setting.motion, setting.points, setting.views, sigma=setting.sigma, batch=(count,), generator=draw)
+    scene = scenes.lifted_points(setting.motion, setting.points, setting.views, sigma=setting.sigma, batch=(count,), generator=draw)
     tracks = flat(scene.tracks, scene.times)
     lifting = Lifting.of(motion, tracks.times, tracks.x)
     truth = adjust_scene(
@@ -142,7 +142,7 @@ def _short(value: float) -> str:
 def bodies(name: str, views: int, points: int, sigma: float, reference: float, count: int, seed: int) -> str:
     """One line of the table of two bodies."""
     draw = torch.Generator().manual_seed(seed)
-    scene = scenes.lifted(name, points, views, sigma=sigma, batch=(count,), generator=draw)
+    scene = scenes.lifted_points(name, points, views, sigma=sigma, batch=(count,), generator=draw)
     found = dyn.reconstruct(scene.tracks, name, scene.times, threshold=float("inf"))
     # which body is called the first is arbitrary
     same = (found.labels == scene.labels).double().mean(-1)
@@ -164,7 +164,7 @@ def exact(count: int, seed: int) -> None:
         need = motion.tensor(views).minimal()
         need = max(need, (motion.k + 1) * (motion.k + 2) // 2 - 1) if motion.bodies > 1 else need
         draw = torch.Generator().manual_seed(seed)
-        scene = scenes.lifted(name, need, views, batch=(count,), generator=draw)
+        scene = scenes.lifted_points(name, need, views, batch=(count,), generator=draw)
         found = dyn.reconstruct(scene.tracks, name, scene.times, threshold=float("inf"))
         if motion.bodies > 1:
             error = metrics.body_error(found.points, scene.points, scene.labels).amax(-1)

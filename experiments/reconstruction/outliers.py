@@ -3,7 +3,7 @@
     python -m experiments.reconstruction.outliers
     python -m experiments.reconstruction.outliers --quick
 
-Scenes of ``dyntorch.scenes.lifted`` with 0.5 pixels of noise; of an outlier one view is displaced by up to 100 pixels in each
+Scenes of ``dyntorch.scenes.lifted_points`` with 0.5 pixels of noise; of an outlier one view is moved by up to 100 pixels in each
 coordinate.  The best is what the right points alone give.  A scene is a success if its status is the same as there (OK, or
 AMBIGUOUS where the noise hides the motion), more than 95 % of the right points are reconstructed and stay below 3 pixels in every
 view that counts, and the error of the positions is at most twice that of the best.  A scene is wrong if the status is OK, but
@@ -61,7 +61,7 @@ def measure(
 ) -> tuple[float, float, float, float]:
     """Shares of successes and of wrong scenes, median error over that of the right points alone, seconds per scene."""
     generator = torch.Generator().manual_seed(0)
-    scene = scenes.lifted(motion, n, views=views, sigma=SIGMA, outliers=share, batch=count, generator=generator)
+    scene = scenes.lifted_points(motion, n, views=views, sigma=SIGMA, outliers=share, batch=count, generator=generator)
     assert scene.lifts is not None
     clock = time.perf_counter()
     found = dyn.reconstruct(scene.tracks, motion, scene.times, threshold=threshold, generator=torch.Generator().manual_seed(1))

@@ -2,7 +2,7 @@
 
     python -m experiments.synchronization.cameras --quick
 
-Scenes of :func:`dyntorch.scenes.filmed` around one person: every camera pair shares the motion, and every further camera films it
+Scenes of :func:`dyntorch.scenes.filmed_person`: all pairs of cameras share the motion, and every further one sees it
 at an offset of its own. The error of a camera's offset against the first camera, in frames: of the direct pair alone, and of the
 clocks of all pairs together. In the second table one pair is given a wrong answer (half a second off, as sure as the others).
 """

@@ -65,7 +65,7 @@ def cameras_and_points() -> tuple[Tensor, Tensor, Tensor]:
 
 
 def tracks(motion: str, n: int, views: int, **options: Any) -> tuple[Tensor]:
-    return (scenes.lifted(motion, n, views=views, generator=draw(3), **{"sigma": 0.3, **options}).tracks,)
+    return (scenes.lifted_points(motion, n, views=views, generator=draw(3), **{"sigma": 0.3, **options}).tracks,)
 
 
 def driven() -> tuple[Tensor, Tensor]:
@@ -79,7 +79,7 @@ def planes(count: int = 5, bodies: int = 0) -> scenes.TranslatingScene:
 
 
 def filmed(n: int = 8, **options: Any) -> tuple[Tensor, Tensor]:
-    scene = scenes.filmed(n, 2.5, offset=0.2, noise=0.3, generator=draw(2), **options)
+    scene = scenes.filmed_person(n, 2.5, offset=0.2, noise=0.3, generator=draw(2), **options)
     return scene.a, scene.b
 
 
@@ -218,7 +218,7 @@ VERBS: tuple[Verb, ...] = (
     Verb("refine", planar, lambda *x: dyn.refine(dyn.fit(H, *x), *x)),
     Verb(
         "constrain",
-        lambda: scenes.lifted("constant_velocity_2d", 30, times=(0, 4, 9), sigma=0.3, generator=draw()).tracks.unbind(0),
+        lambda: scenes.lifted_points("constant_velocity_2d", 30, times=(0, 4, 9), sigma=0.3, generator=draw()).tracks.unbind(0),
         lambda *x: dyn.constrain(dyn.fit(dyn.GrassmannTensor(4, (2, 2, 1)), *x)),
     ),
     Verb(

@@ -19,7 +19,7 @@ def lifted(motion: str, times: tuple[float, ...], **fixed: Any) -> Callable[...,
     """The maker of views of points that are static in a higher space, with the projections from it."""
 
     def make(**options: Any) -> Scene:
-        made = scenes.lifted(motion, times=times, **fixed, **options)
+        made = scenes.lifted_points(motion, times=times, **fixed, **options)
         return Scene(made.tracks.unbind(-3), made.exact.unbind(-3), unit(made.projections).unbind(-3), made.labels, made.sigma)
 
     return make

@@ -21,7 +21,7 @@ from dyntorch.metrics import (
     rotation_error,
     translation_error,
 )
-from dyntorch.scenes import constant_velocity, lifted, planar
+from dyntorch.scenes import constant_velocity, lifted_points, planar
 
 MOTIONS = [
     "constant_direction_2d", "constant_velocity_2d", "constant_acceleration_2d", "constant_direction_3d",
@@ -284,7 +284,7 @@ def gauges(lifts, batch, seed=0, spread=1.0):
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("spread", [0.1, 1.0])
 def test_errors_are_blind_to_the_gauge(motion, spread):
-    scene = lifted(motion, 60, batch=6, generator=torch.Generator().manual_seed(0))
+    scene = lifted_points(motion, 60, batch=6, generator=torch.Generator().manual_seed(0))
     scale = random(6, 60, 1, seed=3)
     estimate = scale * (scene.structure @ gauges(scene.lifts, 6, spread=spread).mT)
     error = lifted_error(estimate, scene.structure, scene.lifts)
@@ -299,7 +299,7 @@ def test_errors_are_blind_to_the_gauge(motion, spread):
 def test_conditioning_does_not_matter(motion, unit):
     # other units of length, and times far from 0: a shift of time by 100 is a change of the lifted space
     near, far = ([start + s for s in (0.0, 1.0, 2.5, 4.0, 5.0)] for start in (0.0, 100.0))
-    scene, later = (lifted(motion, 60, times=t, batch=5, generator=torch.Generator().manual_seed(0)) for t in (near, far))
+    scene, later = (lifted_points(motion, 60, times=t, batch=5, generator=torch.Generator().manual_seed(0)) for t in (near, far))
     shift = torch.linalg.lstsq(later.lifts.flatten(0, 1), scene.lifts.flatten(0, 1)).solution.round()
     torch.testing.assert_close(later.lifts @ shift, scene.lifts)
     structure = scene.structure.clone()
@@ -313,7 +313,7 @@ def test_conditioning_does_not_matter(motion, unit):
 
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_errors_are_blind_to_nothing_else(motion):
-    scene = lifted(motion, 60, generator=torch.Generator().manual_seed(0))
+    scene = lifted_points(motion, 60, generator=torch.Generator().manual_seed(0))
     size = scene.structure.shape[-1]
     change = torch.eye(size, dtype=torch.float64) + 0.1 * random(20, size, size, seed=5)
     flat = gauge_algebra(scene.lifts).flatten(1)
@@ -330,7 +330,7 @@ def test_errors_are_blind_to_nothing_else(motion):
 
 def test_position_error_is_that_of_the_best_affinity():
     # static planar points have the collineations as their gauge; constant velocity from many views the affinities
-    scene = lifted("constant_velocity_2d", 400, 5, generator=torch.Generator().manual_seed(0))
+    scene = lifted_points("constant_velocity_2d", 400, 5, generator=torch.Generator().manual_seed(0))
     noise = torch.cat([0.01 * random(400, 2), torch.zeros(400, 1), 0.004 * random(400, 2, seed=1)], dim=-1)
     estimate = (scene.structure + noise) @ gauges(scene.lifts, 1)[0].mT
     error = lifted_error(estimate, scene.structure, scene.lifts)
@@ -344,7 +344,7 @@ def test_position_error_is_that_of_the_best_affinity():
 
 @pytest.mark.parametrize("motion", ["constant_velocity_2d", "constant_direction_3d", "constant_velocity_3d"])
 def test_the_gauge_of_a_noisy_estimate_does_not_matter(motion):
-    scene = lifted(motion, 60, 5, batch=5, generator=torch.Generator().manual_seed(0))
+    scene = lifted_points(motion, 60, 5, batch=5, generator=torch.Generator().manual_seed(0))
     noisy = scene.structure + 1e-3 * random(*scene.structure.shape)
     first = lifted_error(noisy, scene.structure, scene.lifts)
     second = lifted_error(noisy @ gauges(scene.lifts, 5).mT, scene.structure, scene.lifts)
@@ -353,7 +353,7 @@ def test_the_gauge_of_a_noisy_estimate_does_not_matter(motion):
 
 
 def test_gross_errors_and_failures():
-    scene = lifted("constant_velocity_3d", 60, batch=4, generator=torch.Generator().manual_seed(0))
+    scene = lifted_points("constant_velocity_3d", 60, batch=4, generator=torch.Generator().manual_seed(0))
     estimate = scene.structure @ gauges(scene.lifts, 4, spread=0.3).mT
     clean = lifted_error(estimate, scene.structure, scene.lifts)
     wrong = estimate.clone()
@@ -375,7 +375,7 @@ def test_gross_errors_and_failures():
 
 
 def test_batch_is_the_loop():
-    scene = lifted("constant_direction_3d", 40, 4, batch=(2, 3), generator=torch.Generator().manual_seed(0))
+    scene = lifted_points("constant_direction_3d", 40, 4, batch=(2, 3), generator=torch.Generator().manual_seed(0))
     noisy = scene.structure + 1e-2 * random(*scene.structure.shape)
     error = lifted_error(noisy, scene.structure, scene.lifts)
     for i in range(2):
@@ -387,7 +387,7 @@ def test_batch_is_the_loop():
 
 @pytest.mark.parametrize("motion", ["two_bodies_2d", "two_bodies_3d"])
 def test_body_error_is_blind_to_one_affinity_per_body(motion):
-    scene = lifted(motion, 60, batch=4, outliers=0.1, generator=torch.Generator().manual_seed(0))
+    scene = lifted_points(motion, 60, batch=4, outliers=0.1, generator=torch.Generator().manual_seed(0))
     d = scene.points.shape[-1]
     maps, shifts = 1e3 * random(4, 3, d, d), 1e5 * random(4, 3, 1, d, seed=1)
     body = scene.labels[..., None, None]

@@ -94,7 +94,9 @@ def test_a_distractor_has_the_legs_of_one_take_and_limbs_that_stay_of_one_length
 def test_a_rolled_camera_turns_the_image(people: scenes.Takes) -> None:
     still = scenes.Cameras(noise=0.0, spread=0.0)
     rolled = scenes.Cameras(noise=0.0, spread=0.0, roll=90.0)
-    first, second = (scenes.filmed(people.takes[0][::2], people, np.random.default_rng(4), one).joints for one in (still, rolled))
+    first, second = (
+        scenes.filmed_person(people.takes[0][::2], people, np.random.default_rng(4), one).joints for one in (still, rolled)
+    )
     np.testing.assert_allclose(np.abs(second), np.abs(first[..., ::-1]), atol=1e-5)
 
 

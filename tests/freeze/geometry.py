@@ -168,7 +168,7 @@ MOTIONS = {
 
 def tracks(motion: str, **options: Any) -> Any:
     given: dict[str, Any] = {"sigma": 2e-3 if motion.endswith("sensors") else 0.3, "outliers": 0.0, "generator": seed(7), **options}
-    return scenes.lifted(motion, MOTIONS[motion], **given)
+    return scenes.lifted_points(motion, MOTIONS[motion], **given)
 
 
 def reconstructed(motion: str, **options: Any) -> Any:
@@ -178,7 +178,7 @@ def reconstructed(motion: str, **options: Any) -> Any:
 
 
 def automatic() -> Any:
-    scene = scenes.lifted("constant_velocity_2d", 40, views=5, sigma=0.3, generator=seed(3))
+    scene = scenes.lifted_points("constant_velocity_2d", 40, views=5, sigma=0.3, generator=seed(3))
     return shown(dyn.reconstruct(scene.tracks, "auto", scene.times, generator=seed(0)))
 
 
@@ -227,14 +227,14 @@ def shifted(correspondence: bool, **options: Any) -> Any:
     if not correspondence:
         pair = scenes.nonrigid_pair(10, 8, 90, sigma=0.3, offset=0.2, generator=seed(1))
         return shown(dyn.synchronize(pair.a, pair.b, False, fps=pair.fps, generator=seed(0), **options))
-    scene = scenes.filmed(12, 3.0, offset=0.37, noise=0.7, missing=0.05, fps=(30.0, 25.0), generator=seed(1))
+    scene = scenes.filmed_person(12, 3.0, offset=0.37, noise=0.7, missing=0.05, fps=(30.0, 25.0), generator=seed(1))
     return shown(dyn.synchronize(scene.a, scene.b, True, times=scene.times, generator=seed(0), **options))
 
 
 @cache
 def clocks() -> Any:
     """Three cameras: a with b, b with a camera that saw a's picture late, and a with that."""
-    scene = scenes.filmed(12, 4.0, offset=0.2, noise=0.5, fps=(30.0, 30.0), generator=seed(2))
+    scene = scenes.filmed_person(12, 4.0, offset=0.2, noise=0.5, fps=(30.0, 30.0), generator=seed(2))
     return dyn.synchronize_cameras([scene.a, scene.b, scene.a[9:]], fps=30.0, max_shift=1.0, generator=seed(0))
 
 

@@ -13,7 +13,7 @@ import dyntorch as dyn
 from dyntorch import scenes
 
 RATE = 1.0004
-scene = scenes.filmed(15, 60.0, offset=0.40, rate=RATE, noise=2.0, generator=torch.Generator().manual_seed(2))
+scene = scenes.filmed_person(15, 60.0, offset=0.40, rate=RATE, noise=2.0, generator=torch.Generator().manual_seed(2))
 free = dyn.synchronize(scene.a, scene.b, fps=scene.fps)
 fixed = dyn.synchronize(scene.a, scene.b, fps=scene.fps, rate=1.0)
 print(free)

@@ -18,7 +18,7 @@ errors, bars, answered = [], [], []
 for level in LEVELS:
     found = []
     for seed in range(TAKES):
-        scene = scenes.filmed(15, 4.0, offset=0.31, noise=level, generator=torch.Generator().manual_seed(seed))
+        scene = scenes.filmed_person(15, 4.0, offset=0.31, noise=level, generator=torch.Generator().manual_seed(seed))
         shift = dyn.synchronize(scene.a, scene.b, fps=scene.fps)
         found.append((30 * abs(shift.offset - 0.31), 30 * shift.sigma, shift.ok))
     error, bar, ok = map(np.array, zip(*found, strict=True))

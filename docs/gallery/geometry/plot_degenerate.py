@@ -79,8 +79,8 @@ plt.show()
 
 # %%
 # A movement that repeats itself: every shift by a period fits equally well.
-once = scenes.filmed(15, 12.0, offset=0.5, noise=2.0, generator=torch.Generator().manual_seed(3))
-periodic = scenes.filmed(15, 12.0, offset=0.5, noise=2.0, walk=0.0, period=1.5, generator=torch.Generator().manual_seed(3))
+once = scenes.filmed_person(15, 12.0, offset=0.5, noise=2.0, generator=torch.Generator().manual_seed(3))
+periodic = scenes.filmed_person(15, 12.0, offset=0.5, noise=2.0, walk=0.0, period=1.5, generator=torch.Generator().manual_seed(3))
 figure, axes = plt.subplots(2, 1, sharex=True, figsize=(8, 4.6))
 for panel, scene, title in ((axes[0], once, "happens once"), (axes[1], periodic, "repeats itself every 1.5 s")):
     shift = dyn.synchronize(scene.a, scene.b, fps=scene.fps)

@@ -13,7 +13,7 @@ import dyntorch as dyn
 from dyntorch import scenes
 
 draw = torch.Generator().manual_seed(7)
-scene = scenes.lifted("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=draw)
+scene = scenes.lifted_points("constant_velocity_3d", 120, views=6, static=0.4, sigma=0.5, outliers=0.05, generator=draw)
 known = (scene.labels == 1) & (torch.rand(120, generator=draw) < 0.5)  # some points known to stand still
 found = dyn.reconstruct(scene.tracks, "constant_velocity_3d", scene.times, static=known, threshold=1.5)
 print(found)

@@ -73,27 +73,27 @@ class Evidence:
         return Evidence(invariant, flat, norm, norm.apply(invariant, flat.views), floor)
 
     @property
-    def still(self) -> int:
+    def static_conditions(self) -> int:
         """Conditions that a static match fulfils."""
         return sum(p.freedom() for p in self.invariant.primitives[1:])
 
-    def repeated(self, count: int) -> Evidence:
+    def repeat(self, count: int) -> Evidence:
         """The same problems several times, one block after the other."""
 
-        def again(x: Tensor) -> Tensor:
+        def tile(x: Tensor) -> Tensor:
             return x.repeat(count, *([1] * (x.ndim - 1)))
 
-        views, weights, static = each(again, (self.data.views, self.data.weights, self.data.static))
+        views, weights, static = each(tile, (self.data.views, self.data.weights, self.data.static))
         data = replace(self.data, views=views, weights=weights, static=static, batch=weights.shape[:1])
-        transforms, actions = each(again, (self.norm.transforms, self.norm.actions))
+        transforms, actions = each(tile, (self.norm.transforms, self.norm.actions))
         norm = Normalization(transforms, self.norm.primitives, actions)
-        return Evidence(self.invariant, data, norm, each(again, self.views), again(self.floor))
+        return Evidence(self.invariant, data, norm, each(tile, self.views), tile(self.floor))
 
     def given_noise(self, threshold: float | None) -> Tensor | None:
         """Standard deviation ``(b,)`` that a threshold stands for."""
         return None if threshold is None else torch.full_like(self.floor, threshold / THRESHOLD_SIGMAS).maximum(self.floor)
 
-    def weighted(self, weights: Tensor) -> Evidence:
+    def scale_weights(self, weights: Tensor) -> Evidence:
         """With the matches of each problem weighted by ``(b,)``; 0 leaves a problem out."""
         return replace(self, data=replace(self.data, weights=self.data.weights * weights[:, None]))
 
@@ -121,7 +121,7 @@ class Evidence:
         """How badly the motion explains the matches, ``(b,)``."""
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
-        still, path = three_sigma(self.still), three_sigma(self.invariant.codim)
+        still, path = three_sigma(self.static_conditions), three_sigma(self.invariant.codim)
         other = still + (moving.square().sum(-1) / variance).clamp(max=path)
         if self.data.static is not None:
             other = torch.where(self.data.static, still + path, other)
@@ -133,10 +133,10 @@ class Evidence:
         moving, resting = self.residuals(theta)
         variance = sigma.square()[:, None]
         path, still = moving.square().sum(-1), resting.square().sum(-1)
-        limits = [three_sigma(c) * variance for c in (self.invariant.codim, self.still)]
+        limits = [three_sigma(c) * variance for c in (self.invariant.codim, self.static_conditions)]
         agree = [path <= limits[0], still <= limits[1]]
         if spread is not None:
-            pieces = [self._widened(theta, spread, piece) for piece in self._pieces(theta)]
+            pieces = [self._widened_squares(theta, spread, piece) for piece in self._pieces(theta)]
             for k, (plain, limit) in enumerate(zip((path, still), limits, strict=True)):
                 widened = torch.cat([piece[k] for piece in pieces], dim=-1)
                 agree[k] = agree[k] | ((widened <= limit) & (plain <= MAX_WIDENING**2 * limit))
@@ -148,7 +148,7 @@ class Evidence:
     def _pieces(self, theta: Tensor) -> list[slice]:
         return self.problem(torch.zeros_like(self.data.weights)).pieces(theta.shape[-1])
 
-    def _widened(self, theta: Tensor, spread: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
+    def _widened_squares(self, theta: Tensor, spread: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
         """Squares ``(b, piece)`` of the two residuals whitened by the uncertainty of the motion as well."""
         views = tuple(x[:, piece] for x in self.views)
         problem = self.problem(torch.zeros_like(self.data.weights))
@@ -171,7 +171,7 @@ class Evidence:
         root = vectors * values.clamp(min=floor).rsqrt()[:, None, :]
         return values, root @ root.mT
 
-    def refined(self, theta: Tensor, labels: Tensor, steps: int) -> Solution:
+    def refine(self, theta: Tensor, labels: Tensor, steps: int) -> Solution:
         """Segmented refinement: moving matches by their Sampson distance, static ones by their disagreement."""
         problem = self.problem(labels)
         zero = torch.zeros(len(theta), dtype=torch.long, device=theta.device)
@@ -182,24 +182,24 @@ class Evidence:
         start = Solution(self.invariant, tensor, nothing, data, self.norm, tensor, status=zero, refined=parts)
         return refine_matches(start, data, steps)
 
-    def improved(self, theta: Tensor, sigma: Tensor, rough: Tensor) -> Tensor:
+    def improve(self, theta: Tensor, sigma: Tensor, rough: Tensor) -> Tensor:
         """One labelling and refinement; where ``rough (b,)``, the motion comes from a minimal sample of static matches."""
         labels = self.labels(theta, torch.where(rough, ROUGH_LABEL_FACTOR * sigma, sigma))
         # what a rough motion says about moving matches is left to chance
         labels = torch.where(rough[:, None] & (labels == MOVING), OUTLIER, labels)
-        return normalized_motion(self.refined(theta, labels, NUM_LABEL_STEPS))
+        return normalized_motion(self.refine(theta, labels, NUM_LABEL_STEPS))
 
     def improve_starts(self, starts: list[Tensor], sigma: Tensor, *, sampled: bool) -> Tensor:
-        """All starts ``(b, p)`` after :meth:`improved`, ``(starts b, p)``; ``sampled``: the first is from a minimal sample."""
+        """All starts ``(b, p)`` after :meth:`improve`, ``(starts b, p)``; ``sampled``: the first is from a minimal sample."""
         count, size = len(starts), len(sigma)
         rough = (torch.arange(count, device=sigma.device).repeat_interleave(size) == 0) & sampled
-        return self.repeated(count).improved(torch.cat(starts), sigma.repeat(count), rough)
+        return self.repeat(count).improve(torch.cat(starts), sigma.repeat(count), rough)
 
     def best_start(self, theta: Tensor, sigma: Tensor) -> Tensor:
         """Of several motions for each problem ``(starts b, p)`` the one of least cost, ``(b, p)``; no singular one."""
         size = len(sigma)
         count = len(theta) // size if size else 1
-        cost = torch.where(self._is_singular(theta), torch.inf, self.repeated(count).cost(theta, sigma.repeat(count)))
+        cost = torch.where(self._is_singular(theta), torch.inf, self.repeat(count).cost(theta, sigma.repeat(count)))
         best = cost.unflatten(0, (count, size)).argmin(0)
         return theta[best * size + torch.arange(size, device=best.device)]
 
@@ -209,7 +209,7 @@ class Evidence:
         values = torch.linalg.svdvals(theta.nan_to_num().unflatten(-1, (-1, d, d)))
         return (values[..., -1] < MIN_SINGULAR_RATIO * values[..., 0]).any(-1)
 
-    def settled(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
+    def iterate_labels(self, theta: Tensor, sigma: Tensor, *, estimate: bool) -> Labelled:
         """Label and refine in turns, until the labels stay; ``estimate``: and the noise with them."""
         labels, steady = self.labels(theta, sigma), not estimate
         for _ in range(NUM_LABEL_ROUNDS_UNKNOWN_NOISE if estimate else NUM_LABEL_ROUNDS):
@@ -218,7 +218,7 @@ class Evidence:
             if bool((new == labels).all()) and steady:
                 break
             labels = new
-            found = self.refined(theta, labels, NUM_LABEL_STEPS)
+            found = self.refine(theta, labels, NUM_LABEL_STEPS)
             theta = normalized_motion(found)
             if estimate and found.sigma is not None:
                 old, sigma = sigma, torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
@@ -288,10 +288,10 @@ def static_start(
         pool = torch.where((known.sum(-1) >= d + 2)[:, None], known, pool)
     scale = evidence.norm.scales[0]
     # each distance has the noise of two views
-    limit = None if given is None else 2 * three_sigma(evidence.still) * (ROUGH_LABEL_FACTOR * scale * given).square()
+    limit = None if given is None else 2 * three_sigma(evidence.static_conditions) * (ROUGH_LABEL_FACTOR * scale * given).square()
     motion, square = _static_consensus(evidence.views, pool, limit, samples, generator)
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
-    variance = square / (2 * median(evidence.still))
+    variance = square / (2 * median(evidence.static_conditions))
     return theta, variance.nan_to_num(posinf=1.0).sqrt() / scale if given is None else given
 
 

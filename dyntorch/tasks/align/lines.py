@@ -70,12 +70,12 @@ class Lines:
         floor = 100 * torch.finfo(torch.float64).eps / torch.stack(norm.scales).amin(0)
         return cls(data, norm.apply(TranslatingLinesMatrix(), data.views), moved, norm, floor)
 
-    def moving(self, theta: Tensor) -> Tensor:
+    def moving_residuals(self, theta: Tensor) -> Tensor:
         """Signed Sampson residual ``(b, n)`` of each line that may move, in the unit of the points."""
         tensor = TranslatingLinesMatrix.compose(theta.unflatten(-1, (4, 4)))
         return multilinear(TranslatingLinesMatrix(), tensor, self.views, self.norm.scales)
 
-    def still(self, theta: Tensor) -> Tensor:
+    def static_residuals(self, theta: Tensor) -> Tensor:
         """Distances ``(b, n, 6)`` of both points of a line in view 2, carried into view 1, from the line there; 4 conditions."""
         return _static_residuals(theta, self.norm.scales, self.views)
 
@@ -87,7 +87,12 @@ class Lines:
         """All weighted residuals ``(b, rows)`` of the labelled lines and the static points, in the unit of the points."""
         moving, still = self._roots(labels)
         return torch.cat(
-            [self.moving(theta) * moving, self.still(theta).flatten(1) * still, self.at_points(theta).flatten(1)], dim=-1
+            [
+                self.moving_residuals(theta) * moving,
+                self.static_residuals(theta).flatten(1) * still,
+                self.at_points(theta).flatten(1),
+            ],
+            dim=-1,
         )
 
     def problem(self, labels: Tensor) -> LinesProblem:
@@ -195,18 +200,18 @@ def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor,
     values, vectors = values[:, -DOF:], vectors[..., -DOF:]
     root = vectors * values.clamp(min=1e-12 * values[:, -1:].clamp(min=1e-300)).rsqrt()[:, None]
 
-    def measured(t: Tensor) -> Tensor:
+    def to_measured(t: Tensor) -> Tensor:
         part = denormalize_motion(TranslatingLinesMatrix(), (t.unflatten(-1, (4, 4)),), lines.norm.transforms)[0]
         return unit(part).flatten(-2)
 
-    place, moved = derivatives(measured, theta, root.movedim(-1, 0))
+    place, moved = derivatives(to_measured, theta, root.movedim(-1, 0))
     return values[:, [0, -1]], place.unflatten(-1, (4, 4)), moved.mT @ moved
 
 
 def _labels(lines: Lines, theta: Tensor, sigma: Tensor) -> Tensor:
     square, known = sigma.square()[:, None], lines.data.static
-    still = lines.still(theta).square().sum(-1) <= three_sigma(4) * square
-    path = lines.moving(theta).square() <= three_sigma(1) * square
+    still = lines.static_residuals(theta).square().sum(-1) <= three_sigma(4) * square
+    path = lines.moving_residuals(theta).square() <= three_sigma(1) * square
     path = path if known is None else path & ~known
     labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
     return torch.where(lines.data.weights > 0, labels, OUTLIER)
@@ -357,16 +362,16 @@ def _from_static(lines: Lines, bound: Tensor, generator: torch.Generator | None,
     found = spectrum(sample.mT @ sample)[1][..., 0]
     present = lines.data.weights > 0
 
-    def agree(motion: Tensor, times: float) -> Tensor:
+    def agreeing_lines(motion: Tensor, times: float) -> Tensor:
         """Which lines ``(b, samples, n)`` are where ``motion (b, samples, 16)`` takes them, to a multiple of the bound."""
         moved = homogeneous(second)[:, None] @ motion.unflatten(-1, (4, 4))[:, :, None].mT  # (b, samples, n, 2, 4)
         away = (moved @ planes[:, None].mT / moved[..., 3:]).square().amax((-2, -1)) / lines.norm.scales[0][:, None, None].square()
         return (away <= times**2 * bound[:, None, None]) & present[:, None]
 
-    support = agree(found, SAMPLE_THRESHOLD_FACTOR).sum(-1)
+    support = agreeing_lines(found, SAMPLE_THRESHOLD_FACTOR).sum(-1)
     best = found.gather(1, support.argmax(-1)[:, None, None].expand(-1, 1, 16))
     for times in (SAMPLE_THRESHOLD_FACTOR, SAMPLE_THRESHOLD_FACTOR / 2, 1.0):  # more lines and less noise in each turn
-        kept = rows * agree(best, times)[:, 0, :, None, None]
+        kept = rows * agreeing_lines(best, times)[:, 0, :, None, None]
         best = spectrum(torch.einsum("bnij,bnik->bjk", kept, kept))[1][:, None, :, 0]
     return best[:, 0]
 
@@ -378,7 +383,7 @@ def _select_start(
     present = lines.data.weights > 0
 
     def squares(motion: Tensor) -> Tensor:
-        return torch.where(present, lines.moving(motion).square().nan_to_num(torch.inf).minimum(bound[:, None]), 0.0)
+        return torch.where(present, lines.moving_residuals(motion).square().nan_to_num(torch.inf).minimum(bound[:, None]), 0.0)
 
     here = squares(theta)
     doubtful = usable & (((here < bound[:, None]) & present).sum(-1) < MIN_AGREEING_SHARE * present.sum(-1))
@@ -401,7 +406,7 @@ def _join_matches(data: Matches, points: tuple[Tensor, Tensor] | None) -> Matche
 
 def _noise(lines: Lines, theta: Tensor, plain: bool) -> Tensor:
     """Standard deviation of the noise ``(b,)`` that the start shows: of all lines, or by their median."""
-    square = lines.moving(theta).square()
+    square = lines.moving_residuals(theta).square()
     present = lines.data.weights > 0
     if plain:
         return (torch.where(present, square, 0.0).sum(-1) / present.sum(-1).clamp(min=1)).sqrt().maximum(lines.floor)

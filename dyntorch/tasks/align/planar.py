@@ -97,7 +97,7 @@ class CalibratedViews(NamedTuple):
         C = torch.where(known[:, None, None], C.reshape(b, 9 * v, 9 * v), 0.0)
         return cls(scale[..., None, None] * N, C, known, fine, rays, counts)
 
-    def repeated(self, count: int) -> CalibratedViews:
+    def repeat(self, count: int) -> CalibratedViews:
         """Every problem so many times in a row."""
         return CalibratedViews(*(part.repeat_interleave(count, 0) for part in self))
 
@@ -105,7 +105,7 @@ class CalibratedViews(NamedTuple):
         """The least squares problem of the normal."""
         return CommonPlane(inverse=self.inverse, covariance=self.covariance, floor=LENGTH_ROUNDING)
 
-    def oriented(self, normal: Tensor) -> Tensor:
+    def orient(self, normal: Tensor) -> Tensor:
         """The normals ``(b, 3)`` or their opposites, such that most of the plane that view 1 sees lies before it."""
         depth = (self.rays[:, 0] @ normal[..., None])[..., 0]
         return normal * nonzero_sign((depth.sign() * self.counts).sum(-1, keepdim=True))
@@ -147,17 +147,17 @@ def chosen_plane(views: CalibratedViews) -> PlaneChoice:
     b = len(inverse)
     starts = plane_motions(torch.linalg.inv(inverse)).normal.flatten(1, 2)
     count = starts.shape[1]
-    wide = views.repeated(count)
+    wide = views.repeat(count)
     problem = wide.plane()
     found = minimize(problem, problem.evaluate((starts.flatten(0, 1),)), LeastSquaresOptions(iterations=MAX_NORMAL_STEPS))
-    flat = wide.oriented(found.theta[0])
+    flat = wide.orient(found.theta[0])
     normal, cost, wrong = flat.view(b, count, 3), found.cost.view(b, count), wide.behind(flat).view(b, count)
     fits = cost <= cost.amin(-1, keepdim=True) + MAX_EQUIVALENT_CHI_SQUARE
     fits = fits & (wrong <= torch.where(fits, wrong, torch.inf).amin(-1, keepdim=True) + MAX_HIDDEN_SHARE)
     best = torch.where(fits, cost, torch.inf).argmin(-1)
     row = torch.arange(b, device=best.device)
     chosen = normal[row, best]
-    r, turns, weight, _ = views.plane().weighted(chosen)
+    r, turns, weight, _ = views.plane().whiten_conditions(chosen)
     deviation = eigenvalues(turns.mT @ weight @ turns)[:, 0].clamp(min=torch.finfo(r.dtype).tiny).rsqrt()
     apart = fits & ((normal - chosen[:, None]).norm(dim=-1) > MIN_NORMAL_ANGLE + MIN_NORMAL_DEVIATIONS * deviation[:, None])
     second = normal[row, torch.where(apart, cost, torch.inf).argmin(-1)]
@@ -283,7 +283,7 @@ def is_undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tenso
     if evidence.data.static is not None:
         family = family & ((still & evidence.data.static).sum(-1) < NOTICES_MINIMAL)
     square = evidence.residuals(best.theta)[1].square().sum(-1)
-    limit = CHANCE_LIMIT_FACTOR**2 * three_sigma(evidence.still) * best.sigma.square()[:, None]
+    limit = CHANCE_LIMIT_FACTOR**2 * three_sigma(evidence.static_conditions) * best.sigma.square()[:, None]
     beside = ((square <= limit) & ~still & (evidence.data.weights > 0)).sum(-1)
     return family & (still.sum(-1) < MIN_STATIC_SUPPORT + STATIC_SUPPORT_FACTOR * beside / (CHANCE_LIMIT_FACTOR**2 - 1))
 
@@ -292,7 +292,7 @@ def unverified_matches(evidence: Evidence, best: Labelled) -> Tensor:
     """Matches ``(b, n)`` that all views but one agree on as static, whatever that one says."""
     parts = evidence.problem(best.labels).parts(best.theta)
     if len(evidence.views) > 3:
-        limit = three_sigma(evidence.still - 2) * best.sigma.square()[:, None]
+        limit = three_sigma(evidence.static_conditions - 2) * best.sigma.square()[:, None]
         return still_but_one(parts, evidence.views, evidence.norm.scales, limit) & (evidence.data.weights > 0)
     first, second, third = evidence.views
     s1, s2, s3 = evidence.norm.scales
@@ -470,7 +470,7 @@ def _search(evidence: Evidence, threshold: float | None, generator: torch.Genera
     # the smaller estimate is that of a motion most matches agree with; it may still be low, for static matches show half the noise
     sigma = given if given is not None else 1.5 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
     theta = evidence.improve_starts([start for start, _ in starts], sigma, sampled=True)
-    return evidence.settled(evidence.best_start(theta, sigma), sigma, estimate=given is None)
+    return evidence.iterate_labels(evidence.best_start(theta, sigma), sigma, estimate=given is None)
 
 
 def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
@@ -502,7 +502,7 @@ def _from_all(evidence: Evidence, given: Tensor | None, generator: torch.Generat
         return fit_matches(HomographyTensor(), replace(data, views=views, static=None))
 
     theta, usable = _usable(*motion_of_all(evidence, solve, given, generator))
-    refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_PLANAR_STEPS)
+    refined = evidence.refine(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_PLANAR_STEPS)
     assert refined.sigma is not None
     return normalized_motion(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
 
@@ -517,7 +517,7 @@ def _usable(motion: tuple[Tensor, ...], found: Solution) -> tuple[Tensor, Tensor
 
 def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
     """The solution with its status, the final labels, none where there is no motion, and what the tensor alone rests on."""
-    refined = evidence.refined(best.theta, best.labels, MAX_PLANAR_STEPS)
+    refined = evidence.refine(best.theta, best.labels, MAX_PLANAR_STEPS)
     theta = normalized_motion(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
@@ -541,7 +541,7 @@ def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, und
     accident = (
         (share < MIN_CONSENSUS)
         | ((share < MIN_NOISY_INLIER_SHARE) & (shown > MAX_NOISE_RATIO * best.sigma))
-        | (evidence.still * still + evidence.invariant.codim * moving < evidence.invariant.dof + MIN_SPARE_PLANAR)
+        | (evidence.static_conditions * still + evidence.invariant.codim * moving < evidence.invariant.dof + MIN_SPARE_PLANAR)
     )
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     return status_of_alignment(free, accident, undetermined, (present < MINIMAL) & (known < 4))

@@ -111,9 +111,9 @@ def _search(
         # where the noise is known, so is whether the motion of the minimal tensor is the right one
         doubt = _doubt(evidence, theta[-size:], given) if full else torch.zeros_like(given)
         if bool(doubt.any()):
-            last, _ = _from_tensor(JoinTensor(), evidence.weighted(doubt), given, generator)
+            last, _ = _from_tensor(JoinTensor(), evidence.scale_weights(doubt), given, generator)
             theta = torch.cat([theta, evidence.improve_starts([last], given, sampled=False)])
-    return evidence.settled(evidence.best_start(theta, sigma), sigma, estimate=given is None)
+    return evidence.iterate_labels(evidence.best_start(theta, sigma), sigma, estimate=given is None)
 
 
 def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
@@ -144,7 +144,7 @@ def _from_tensor(
     if given is not None:
         return theta, given
     if plain:
-        refined = evidence.refined(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_JOIN_STEPS)
+        refined = evidence.refine(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_JOIN_STEPS)
         assert refined.sigma is not None
         theta, noise = normalized_motion(refined), refined.sigma
     else:
@@ -157,7 +157,7 @@ def _from_tensor(
 
 def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
     """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
-    refined = evidence.refined(best.theta, best.labels, MAX_JOIN_STEPS)
+    refined = evidence.refine(best.theta, best.labels, MAX_JOIN_STEPS)
     theta = normalized_motion(refined)
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
@@ -172,7 +172,7 @@ def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Ten
     present = usable.sum(-1)
     known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
     still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
-    conditions = evidence.still * still + evidence.invariant.codim * moving
+    conditions = evidence.static_conditions * still + evidence.invariant.codim * moving
     accident = (still + moving < MIN_CONSENSUS * present) | (conditions < evidence.invariant.dof + MIN_SPARE_JOIN)
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     few = (present < MIN_JOIN) & (known < ENOUGH)

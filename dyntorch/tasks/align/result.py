@@ -184,7 +184,7 @@ class Alignment(Outcome):
         "model",
     }
 
-    def flagged(self, code: NoticeCode | str) -> Tensor:
+    def has_notice(self, code: NoticeCode | str) -> Tensor:
         """Which problems have a notice of this code, ``(*batch,)`` bool.
 
         Raises:

@@ -335,7 +335,7 @@ def reconstruct_pair(
 
     Example:
         >>> import torch
-        >>> from dyntorch.scenes.filmed import nonrigid_pair
+        >>> from dyntorch.scenes.two_cameras import nonrigid_pair
         >>> from dyntorch.tasks.pair.pair import reconstruct_pair
         >>> scene = nonrigid_pair(12, 10, 90, sigma=0.3, offset=0.41, generator=torch.Generator().manual_seed(0))
         >>> found = reconstruct_pair(scene.a, scene.b, scene.offset, fps=scene.fps)

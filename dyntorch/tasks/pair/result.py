@@ -128,7 +128,7 @@ class PairReconstruction(Outcome):
 
         Example:
             >>> import torch
-            >>> from dyntorch.scenes.filmed import nonrigid_pair
+            >>> from dyntorch.scenes.two_cameras import nonrigid_pair
             >>> from dyntorch.tasks.pair.pair import reconstruct_pair
             >>> scene = nonrigid_pair(12, 10, 60, generator=torch.Generator().manual_seed(0))
             >>> found = reconstruct_pair(scene.a, scene.b, scene.offset, fps=scene.fps)

@@ -69,16 +69,16 @@ class GivenPlanes:
             frames = frames_of_matrices(h, f)
         hn, fn = normalize_homographies(h, frames), normalized_fundamentals(f, frames)
         return GivenPlanes(
-            hn, fn, seen.moved(frames, hn), more.moved(frames, fn), matched, frames, h * _there(hn), cameras, batch, H
+            hn, fn, seen.transform(frames, hn), more.transform(frames, fn), matched, frames, h * _there(hn), cameras, batch, H
         )
 
-    def used(self) -> Tensor:
+    def present(self) -> Tensor:
         """Which planes and bodies count, ``(b, p + m)`` bool."""
         return torch.cat([_there(self.homographies), _there(self.fundamentals)], dim=1)[..., 0, 0] > 0
 
     def rows(self) -> Pair:
         """How many residuals there are ``(b,)``, and how many beyond the degrees of freedom."""
-        used, p = self.used(), self.homographies.shape[1]
+        used, p = self.present(), self.homographies.shape[1]
         planes, bodies = used[:, :p].sum(-1).double(), used[:, p:].sum(-1).double()
         rows = 8 * planes + 7 * bodies
         if self.matched:
@@ -104,7 +104,7 @@ class PlaneSightings:
         empty = torch.zeros(batch, 0, 0, 2, dtype=torch.float64, device=device)
         return PlaneSightings((empty, empty), empty[..., 0])
 
-    def moved(self, frames: Pair, matrices: Tensor) -> PlaneSightings:
+    def transform(self, frames: Pair, matrices: Tensor) -> PlaneSightings:
         """In new coordinates, without the matches of matrices ``(b, k, 3, 3)`` that are missing."""
         weights = self.weights * _there(matrices)[..., 0] if self.weights.shape[1] else self.weights
         first, second = (apply(frame[:, None], x) * (weights > 0)[..., None] for frame, x in zip(frames, self.views, strict=True))

@@ -129,7 +129,7 @@ class Figures:
         return (groups < 2) | ((groups == 2) & (known < 2)) | parallel
 
     @cached_property
-    def alike(self) -> Tensor:
+    def same_epipole(self) -> Tensor:
         """Which pairs have one epipole within the noise, ``(b, c, c)`` bool; no pair with itself."""
         e = torch.where(self.moving[..., None], self.epipoles, 0.0)
         sign = (e @ e.mT).sign()
@@ -145,7 +145,7 @@ class Figures:
     def groups(self) -> tuple[Tensor, Tensor]:
         """How many bodies move, and of how many the fundamental matrix is known, given or from two planes; ``(b,)`` each."""
         count = self.epipoles.shape[1]
-        near = self.alike.double()
+        near = self.same_epipole.double()
         reach = near + torch.eye(count, dtype=near.dtype, device=near.device)
         for _ in range(count.bit_length()):
             reach = (reach @ reach).sign()
@@ -163,7 +163,7 @@ def planes_notices(
     missing = figures.used.shape[1] - used
     line, collinear = figures.line
     plane, coplanar = figures.plane
-    pairs = figures.alike.sum((-2, -1)) // 2
+    pairs = figures.same_epipole.sum((-2, -1)) // 2
     # one or two bodies are in one line and one plane by themselves
     several = enough & (figures.groups[0] >= 3)
     rows = {
@@ -219,7 +219,7 @@ def misfit(given: GivenPlanes, cost: Tensor, separate: Tensor) -> Misfit:
     r"""How far the planes and bodies are from one homography at infinity, and whether noise does not explain it. cost ``(b,)``,
     separate ``(b,)``."""
     rows, spare = given.rows()
-    sigma, used = (cost / spare.clamp(min=1)).sqrt(), given.used()
+    sigma, used = (cost / spare.clamp(min=1)).sqrt(), given.present()
     p = given.homographies.shape[1]
     if given.matched:
         planes, bodies = used[:, :p].sum(-1), used[:, p:].sum(-1)
@@ -286,6 +286,6 @@ def rotation_distance(given: GivenPlanes, infinity: Tensor, covariance: Tensor, 
     # from one residual, as of three planes, nobody knows the noise
     known = (status == Status.OK) & (given.rows()[1] > 1)
     # the fit of four small planes may be another minimum, far from what its covariance says
-    used, p = given.used(), given.homographies.shape[1]
+    used, p = given.present(), given.homographies.shape[1]
     known = known & ((used[:, :p].sum(-1) >= 5) | used[:, p:].any(-1) | (deviation < MAX_ROTATION_DISTANCE_DEVIATION))
     return distance, known & (distance > MAX_ROTATION_DISTANCE) & (distance > MIN_ROTATION_DEVIATIONS * deviation)

@@ -206,7 +206,7 @@ def outcome(given: GivenPlanes, found: tuple[Tensor, ...], method: str, refined:
     """The result with a flat batch."""
     theta, cost, covariance, undetermined, other, separate = found
     layout = Layout(given.homographies.shape[1], given.fundamentals.shape[1])
-    used = given.used()
+    used = given.present()
     planes, bodies = used[:, : layout.planes].sum(-1), used[:, layout.planes :].sum(-1)
     rows, spare = given.rows()
     covariance = noise_variance(cost, spare, options.risk)[:, None, None] * covariance
@@ -272,7 +272,7 @@ def _figures(layout: Layout, theta: Tensor, covariance: Tensor, used: Tensor) ->
     p = layout.planes
     at = 9 + 3 * torch.arange(p + layout.bodies, device=theta.device)[:, None] + torch.arange(3, device=theta.device)
     of_epipoles = covariance[:, at[:, :, None], at[:, None, :]]
-    at = layout.shared + 4 * torch.arange(p, device=theta.device)[:, None] + torch.arange(3, device=theta.device)
+    at = layout.shared_size + 4 * torch.arange(p, device=theta.device)[:, None] + torch.arange(3, device=theta.device)
     of_normals = covariance[:, at[:, :, None], at[:, None, :]]
     e, n, d = epipoles[:, :p], planes[..., :3], planes[..., 3].abs()
     size = torch.linalg.matrix_norm(infinity)[:, None] * d

@@ -89,14 +89,14 @@ class Layout:
     bodies: int
 
     @property
-    def shared(self) -> int:
+    def shared_size(self) -> int:
         """Size of the part that has one scale: the homography at infinity and the epipoles."""
         return 9 + 3 * (self.planes + self.bodies)
 
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return self.shared + 4 * self.planes
+        return self.shared_size + 4 * self.planes
 
     @staticmethod
     def pack(infinity: Tensor, epipoles: Tensor, planes: Tensor) -> Tensor:
@@ -105,13 +105,13 @@ class Layout:
 
     def unpack(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """``(*, 3, 3)`` homography at infinity, ``(*, p + m, 3)`` epipoles, ``(*, p, 4)`` planes."""
-        infinity, epipoles, planes = theta.split([9, self.shared - 9, 4 * self.planes], dim=-1)
+        infinity, epipoles, planes = theta.split([9, self.shared_size - 9, 4 * self.planes], dim=-1)
         count = self.planes + self.bodies
         return infinity.unflatten(-1, (3, 3)), epipoles.unflatten(-1, (count, 3)), planes.unflatten(-1, (self.planes, 4))
 
     def parts(self, theta: Tensor) -> tuple[Tensor, ...]:
         r"""The parts of any scale: each plane is homogeneous, and all projections :math:`[H_\infty \mid e_i]` share one scale."""
-        return theta.split([self.shared] + [4] * self.planes, dim=-1)
+        return theta.split([self.shared_size] + [4] * self.planes, dim=-1)
 
     def models(self, theta: Tensor) -> Tensor:
         """``(*, p + m, 3, 3)`` homographies of the planes, then fundamental matrices of the bodies."""
@@ -220,7 +220,7 @@ class PlanesProblem(NormalEquations):
         """Only some of the problems."""
         return replace(self, evidence=self.evidence.each(lambda x: x[keep]))
 
-    def repeated(self, count: int) -> PlanesProblem:
+    def repeat(self, count: int) -> PlanesProblem:
         """All problems ``count`` times, one round after the other."""
         return replace(self, evidence=self.evidence.each(lambda x: x.repeat(count, *[1] * (x.ndim - 1))))
 
@@ -388,7 +388,7 @@ def solve(
     matrices = PlanesProblem(layout, Matrices(torch.cat([homographies, fundamentals], dim=1), weights))
     first = starts(method, homographies, fundamentals, several=refine)
     theta = torch.cat([parameters(homographies, fundamentals, infinity) for infinity in first])
-    rounds = matrices.repeated(len(first))
+    rounds = matrices.repeat(len(first))
     if refine:
         start = rounds.evaluate((theta,))
         theta = minimize(rounds, start, LeastSquaresOptions(iterations=MAX_STEPS_ON_MATRICES)).theta[0]
@@ -397,7 +397,7 @@ def solve(
     problem = matrices if matches is None else PlanesProblem(layout, matches)
     if matches is not None:
         chosen = cost.flatten().isfinite().nonzero()[:, 0]
-        again = problem.repeated(len(cost)).subset(chosen)
+        again = problem.repeat(len(cost)).subset(chosen)
         if refine:
             start = again.evaluate((theta.flatten(0, 1)[chosen],))
             found = minimize(again, start, LeastSquaresOptions(iterations=options.max_steps))
@@ -476,7 +476,7 @@ def _gauges(layout: Layout, theta: Tensor) -> Tensor:
     """Directions ``(b, k, size)`` that change no matrix: scales of the common part, of every plane and of every epipole."""
     infinity, epipoles, planes = layout.unpack(theta)
     p = layout.planes
-    directions = [torch.cat([theta[:, : layout.shared], torch.zeros_like(theta[:, layout.shared :])], dim=-1)[:, None]]
+    directions = [torch.cat([theta[:, : layout.shared_size], torch.zeros_like(theta[:, layout.shared_size :])], dim=-1)[:, None]]
     which = torch.eye(p + layout.bodies, dtype=theta.dtype, device=theta.device)
     along = which[None, :, :, None] * epipoles[:, None]
     across = which[None, :, :p, None] * planes[:, None]

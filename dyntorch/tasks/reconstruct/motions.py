@@ -96,7 +96,7 @@ class Motion:
             if matrix.is_complex():
                 raise ValueError(f"the lift of {self.name!r} must be real, got {matrix.dtype}")
             object.__setattr__(self, "k", int(matrix.shape[1]) - 1)
-            self.centred([0.0])
+            self.centred_lifts([0.0])
 
     @property
     def dim(self) -> int:
@@ -120,7 +120,7 @@ class Motion:
                 raise ValueError(f"the lift of {self.name!r} is not finite {where}")
         return torch.stack(found)
 
-    def centred(self, times: Tensor | Sequence[float]) -> tuple[Tensor, Tensor, float]:
+    def centred_lifts(self, times: Tensor | Sequence[float]) -> tuple[Tensor, Tensor, float]:
         """Lifts at times counted from c, ``(views, d + 1, K)``, the R with ``lifts(times) = centred @ R``, and c.
 
         c is the mean time where the motion has a :attr:`shift`, else 0.
@@ -164,7 +164,7 @@ class Motion:
         enough = -(-(self.k + 1) // self.sensor)
         if self.lift is None or self.static:
             return max(2, enough)
-        return max(2, enough, least_views(self.centred(times)[0], self.sensor + 1))
+        return max(2, enough, least_views(self.centred_lifts(times)[0], self.sensor + 1))
 
     def minimal(self, times: Tensor | Sequence[float]) -> tuple[int, int]:
         """Fewest views, and fewest matches in them.
@@ -176,17 +176,17 @@ class Motion:
         tensor = self.tensor(min(views, self.k + 1))
         if self.lift is None or MOTIONS.get(self.name) is self or tensor.width() > COUNTED:
             return views, tensor.minimal()
-        lifts = self.centred(times)[0][: len(tensor.profile)]
+        lifts = self.centred_lifts(times)[0][: len(tensor.profile)]
         return views, _count_matches(tensor.profile, self.sensor, tuple(tuple(map(tuple, lift)) for lift in lifts.tolist()))
 
-    def least(self, times: Tensor | Sequence[float]) -> tuple[int, int]:
+    def min_views_and_tracks(self, times: Tensor | Sequence[float]) -> tuple[int, int]:
         """Fewest views and tracks of a reconstruction: :meth:`minimal`, and what tells two bodies apart."""
         views, matches = self.minimal(times)
         return views, max(matches, (self.k + 1) * (self.k + 2) // 2 - 1 if self.bodies > 1 else 0)
 
     def ambiguity(self, times: Tensor | Sequence[float]) -> int:
         """Dimension of the ambiguity from views at these times; without a lift that of the projections, all collineations."""
-        return (self.k + 1) ** 2 - 1 if self.lift is None else len(gauge_algebra(self.centred(times)[0])) - 1
+        return (self.k + 1) ** 2 - 1 if self.lift is None else len(gauge_algebra(self.centred_lifts(times)[0])) - 1
 
     def open_text(self, times: Tensor | Sequence[float]) -> str:
         """The ambiguity from views at these times in words: :attr:`leaves_open`, or its dimension.
@@ -288,7 +288,7 @@ def motion_table() -> str:
         >>> print(motion_table().splitlines()[3])
         constant_velocity_2d            3 views   13 tracks   The points move in a plane, each at its own constant velocity.
     """
-    needs = {motion.name: motion.least(range(12)) for motion in MOTIONS.values()}
+    needs = {motion.name: motion.min_views_and_tracks(range(12)) for motion in MOTIONS.values()}
     return "\n".join(
         f"{name:<30}{needs[name][0]:>3} views{needs[name][1]:>5} tracks   {motion.purpose}" for name, motion in MOTIONS.items()
     )

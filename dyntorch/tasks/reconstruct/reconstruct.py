@@ -84,7 +84,7 @@ def reconstruct(
     Example:
         >>> import torch, dyntorch as dyn
         >>> from dyntorch import metrics, scenes
-        >>> scene = scenes.lifted("constant_velocity_2d", 40, views=4, sigma=0.5, generator=torch.Generator().manual_seed(0))
+        >>> scene = scenes.lifted_points("constant_velocity_2d", 40, views=4, sigma=0.5, generator=torch.Generator().manual_seed(0))
         >>> found = dyn.reconstruct(scene.tracks, motion="constant_velocity_2d")
         >>> found.cameras.shape, found.points.shape, found.velocities.shape
         (torch.Size([4, 3, 3]), torch.Size([40, 2]), torch.Size([40, 2]))
@@ -266,7 +266,7 @@ def _check_enough(model: Motion, times: Tensor, x: Tensor) -> None:
             f"got {different} in {views} views" if different < views else f"{views} views at {times.tolist()} do not determine it"
         )
         raise ValueError(f"{model.name!r} needs views at {usual} different times or more, {hint}; add views at other times")
-    need = model.least(times)
+    need = model.min_views_and_tracks(times)
     if n < need[1]:
         raise ValueError(f"{model.name!r} needs at least {need[1]} tracks through {need[0]} views, got {n}; add tracks")
 

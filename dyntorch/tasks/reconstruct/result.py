@@ -223,7 +223,7 @@ class Reconstruction(Outcome):
         Example:
             >>> import torch, dyntorch as dyn
             >>> from dyntorch import scenes
-            >>> scene = scenes.lifted("constant_velocity_2d", 30, generator=torch.Generator().manual_seed(0))
+            >>> scene = scenes.lifted_points("constant_velocity_2d", 30, generator=torch.Generator().manual_seed(0))
             >>> found = dyn.reconstruct(scene.tracks, "constant_velocity_2d")
             >>> bool(torch.allclose(found.at(2.0), found.points + 2 * found.velocities))
             True

@@ -130,7 +130,7 @@ def _reject_views(tracks: ViewTracks, projections: Tensor, sigma: Tensor, proble
     others = 1 - torch.eye(views, dtype=tracks.x.dtype, device=tracks.x.device)
     while len(left):
         seen = alone.weights[:, :, 0] > 0
-        fewer = alone.repeated(views).only((alone.weights[:, None] * others[:, :, None]).flatten(0, 1))
+        fewer = alone.repeat(views).only((alone.weights[:, None] * others[:, :, None]).flatten(0, 1))
         square = distance(fewer, matrices.repeat_interleave(views, dim=0)).unflatten(0, (-1, views))[..., 0]
         least, worst = square.masked_fill(~seen, torch.inf).min(-1)
         alone = alone.only(alone.weights * others[worst][:, :, None])
@@ -159,7 +159,7 @@ class Consensus:
     lost: Tensor
     """``(b,)`` what the problems are judged by, less is better."""
 
-    def better(self, new: Consensus, at: Tensor) -> Consensus:
+    def merge_better(self, new: Consensus, at: Tensor) -> Consensus:
         """With the new ones of some problems, where they are better."""
         wins = new.lost < self.lost[at]
         return replace_problems(self, at[wins], each(lambda x: x[wins], new))
@@ -188,7 +188,7 @@ def consensus(
     stale = torch.zeros_like(everyone)
     best, ranks = search.run(tracks, subsets[:, 0], first, (START_SHARES[0],), sigma)
     for turn in range(1, options.max_search_rounds):
-        level, doubt = search.judged(tracks, best)
+        level, doubt = search.assess(tracks, best)
         hopeless = (best.square < FAR).any(-1) & (level * tracks.scales.amax(1) > HOPELESS_NOISE)
         left = everyone[
             (doubt | (search.weak(tracks, best) & (stale < CONFIRMING_ROUNDS))) & ~(hopeless & (turn >= MIN_HOPELESS_ROUNDS))
@@ -200,9 +200,9 @@ def consensus(
         starts = search.starts(some, views, best.square[left], ranks[left])
         new, rank = search.run(some, views, starts, START_SHARES, None if sigma is None else sigma[left])
         stale[left] = torch.where(new.lost < IMPROVEMENT_RATIO * best.lost[left], 0, stale[left] + 1)
-        best = best.better(new, left)
+        best = best.merge_better(new, left)
         ranks[left] += rank
-    return best, *search.judged(tracks, best)
+    return best, *search.assess(tracks, best)
 
 
 DRAWN_SHARE = 0.5  # of that part, that a start is drawn of
@@ -225,13 +225,13 @@ class _Search:
     ) -> tuple[Consensus, Tensor]:
         """The best of the starts ``(b, s, n)``, and the mean rank ``(b, n)`` of the points in all of them."""
         count = starts.shape[1]
-        work, chosen = _of_views(tracks, views).repeated(count), views.repeat_interleave(count, 0)
+        work, chosen = _of_views(tracks, views).repeat(count), views.repeat_interleave(count, 0)
         level = None if sigma is None else sigma.repeat_interleave(count)
         share = torch.tensor(shares, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
         kept, best = starts.flatten(0, 1), None
         for _ in range(CONCENTRATION_STEPS):
-            new = self._fitted(work, chosen, kept, level)
-            best = new if best is None else best.better(new, torch.arange(len(kept), device=kept.device))
+            new = self._fit(work, chosen, kept, level)
+            best = new if best is None else best.merge_better(new, torch.arange(len(kept), device=kept.device))
             near = _nearest(new.square, _num_points(work, share, self.invariant.minimal(), MIN_KEPT_RATIO))
             cut = self._level(work, new.square, level).square() * bound(freedom(work, self.invariant.k), INLIER_QUANTILE).amax(-1)
             kept = (near | (new.square <= cut[:, None])).to(kept.dtype)
@@ -243,7 +243,7 @@ class _Search:
     def starts(self, tracks: ViewTracks, views: Tensor, square: Tensor, ranks: Tensor) -> Tensor:
         """Random parts ``(b, s, n)`` of the points near the best projections so far, or in the mean of all."""
         count, minimal = len(START_SHARES), self.invariant.minimal()
-        work = _of_views(tracks, views).repeated(count)
+        work = _of_views(tracks, views).repeat(count)
         share = torch.tensor(START_SHARES, dtype=tracks.x.dtype, device=tracks.x.device).repeat(len(views))
         wanted = _num_points(work, share, minimal, MIN_KEPT_RATIO)
         drawn = _num_points(work, DRAWN_SHARE * share, minimal, MIN_DRAWN_RATIO)
@@ -254,7 +254,7 @@ class _Search:
         chosen = _nearest(number.masked_fill(~(pool & seen), torch.inf), drawn).to(square.dtype)
         return chosen.view(-1, count, chosen.shape[-1])
 
-    def judged(self, tracks: ViewTracks, found: Consensus) -> tuple[Tensor, Tensor]:
+    def assess(self, tracks: ViewTracks, found: Consensus) -> tuple[Tensor, Tensor]:
         """Noise and doubt ``(b,)``."""
         work = _of_views(tracks, found.chosen)
         level = self._level(work, found.square, self.sigma)
@@ -266,7 +266,7 @@ class _Search:
         few = seen * self.invariant.codim < SUFFICIENT_REDUNDANCY * self.invariant.dof
         return few | torch.full_like(few, self.sigma is None)
 
-    def _fitted(self, tracks: ViewTracks, views: Tensor, kept: Tensor, sigma: Tensor | None) -> Consensus:
+    def _fit(self, tracks: ViewTracks, views: Tensor, kept: Tensor, sigma: Tensor | None) -> Consensus:
         """Projections of these views from the points that are kept ``(b, n)``."""
         some = tracks.only(tracks.weights * kept[:, None])
         seen = (some.weights > 0).all(1).to(kept.dtype)

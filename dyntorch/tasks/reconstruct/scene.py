@@ -69,12 +69,12 @@ class ViewTracks:
         """Other weights."""
         return replace(self, weights=weights)
 
-    def resting(self) -> ViewTracks:
+    def static_points(self) -> ViewTracks:
         """The points known to stand still alone."""
         assert self.static is not None
         return self.only(self.weights * self.static[:, None])
 
-    def repeated(self, count: int) -> ViewTracks:
+    def repeat(self, count: int) -> ViewTracks:
         """Every problem so many times in a row."""
         x, weights, scales, transforms = (
             part.repeat_interleave(count, dim=0) for part in (self.x, self.weights, self.scales, self.transforms)
@@ -130,7 +130,7 @@ def projections_of_tracks(tracks: ViewTracks, invariant: GrassmannTensor, subset
     size = len(invariant.profile)
     subsets = view_subsets(tracks, size) if subsets is None else subsets
     b, count, _ = subsets.shape
-    many = tracks.repeated(count)
+    many = tracks.repeat(count)
     found = _from_subset(many, invariant, subsets.flatten(0, 1))
     if count == 1:
         return found
@@ -302,7 +302,7 @@ class Lifting:
     def of(cls, motion: Motion, times: Tensor, like: Tensor) -> Lifting:
         """The motion at these times, on the device of ``like``."""
         span = float(times.max() - times.min()) / max(1, len(times) - 1)
-        even, shift, origin = motion.centred(times)
+        even, shift, origin = motion.centred_lifts(times)
         lifts, root = balance_lifts(even)
         inverse = torch.linalg.inv(root)
         start, slope = motion.lifts([-origin])[0] @ inverse, motion.slope(-origin, span or 1.0) @ inverse
@@ -420,7 +420,7 @@ def _start_cameras(tracks: ViewTracks, number: int, lifting: Lifting, scale: Ten
     aided = bool(_static_points_suffice(tracks, lifting).all())
     window = middle_views(tracks.times, number)
     near = tracks.at(window)
-    near = near.resting() if aided else near
+    near = near.static_points() if aided else near
     cameras = tilt_infinity(static_cameras(near, lifting.motion.sensor, lifting.motion.dim), number)
     if len(window) == tracks.x.shape[1]:
         return cameras

@@ -169,28 +169,28 @@ def _result(
         limits += tuple(notices(ReconstructNotice.STATIC_MOVES, wrong, wrong > 0, batch))
     bad = is_failure(status)
 
-    def shaped(value: Tensor, none: float = 0.0) -> Tensor:
+    def to_batch(value: Tensor, none: float = 0.0) -> Tensor:
         wide = bad[(..., *[None] * (value.ndim - 1))]
         return torch.where(wide, torch.full_like(value, none), value).reshape((*batch, *value.shape[1:]))
 
     nan = float("nan")
     plain = Reconstruction(
         motion=motion,
-        cameras=shaped(unit_projections(back @ cameras)),
-        points=shaped(points, nan),
-        velocities=None if speed is None else shaped(speed, nan),
-        labels=shaped(torch.where(has_inliers(status)[:, None], labels, 0)),
-        residual=shaped((total / number.clamp(min=1)).sqrt()),
-        residuals=shaped(apart, nan),
-        sigma=shaped(sigma),
+        cameras=to_batch(unit_projections(back @ cameras)),
+        points=to_batch(points, nan),
+        velocities=None if speed is None else to_batch(speed, nan),
+        labels=to_batch(torch.where(has_inliers(status)[:, None], labels, 0)),
+        residual=to_batch((total / number.clamp(min=1)).sqrt()),
+        residuals=to_batch(apart, nan),
+        sigma=to_batch(sigma),
         status=status.reshape(batch),
-        structure=shaped(structure),
-        projections=shaped(unit_projections(back @ (projections if lifting is None else projections @ lifting.root))),
-        inliers=shaped(counted),
+        structure=to_batch(structure),
+        projections=to_batch(unit_projections(back @ (projections if lifting is None else projections @ lifting.root))),
+        inliers=to_batch(counted),
         times=tracks.times,
         ambiguity=_ambiguity_text(motion, tracks.times, tracks.static),
         notices=limits,
-        bodies=None if bodies is None else shaped(unit_projections(back[:, None] @ bodies)),
+        bodies=None if bodies is None else to_batch(unit_projections(back[:, None] @ bodies)),
     )
     if calibration is None:
         return plain
@@ -251,7 +251,7 @@ def choose(
     untried = tuple(Ranked(name, math.inf, math.nan, reason) for name, reason in reasons.items() if reason)
     if not models:
         first = MOTIONS[next(iter(reasons))]
-        need = first.least(tracks.times)
+        need = first.min_views_and_tracks(tracks.times)
         raise ValueError(
             f"no declared motion takes {views} views of {n} tracks; {first.name!r} needs {need[0]} views and {need[1]} tracks"
         )
@@ -301,7 +301,7 @@ def _missing_input(motion: Motion, times: Tensor, views: int, n: int) -> str:
     usual = motion.views(range(12))
     if views < usual:
         return f"needs {usual} views"
-    need = motion.least(times)
+    need = motion.min_views_and_tracks(times)
     if need[0] > views or (motion.lift is not None and motion.ambiguity(times) > motion.ambiguity(range(12))):
         return f"needs views at {usual} different times"
     if need[1] > n:

@@ -16,7 +16,7 @@ P4, P6 = dyn.GrassmannTensor(4, (2, 2, 1)), dyn.GrassmannTensor(6, (2, 2, 2, 1))
 
 
 def scene(motion, times, n, sigma, batch=4, seed=0):
-    made = scenes.lifted(motion, n, times=times, sigma=sigma, batch=batch, generator=torch.Generator().manual_seed(seed))
+    made = scenes.lifted_points(motion, n, times=times, sigma=sigma, batch=batch, generator=torch.Generator().manual_seed(seed))
     return made.tracks.unbind(-3), made.exact.unbind(-3), tuple(unit(made.projections).unbind(-3))
 
 

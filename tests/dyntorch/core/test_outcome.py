@@ -9,7 +9,7 @@ import dyntorch as dyn
 from dyntorch.core.outcome import Status, stack_results
 from dyntorch.geometry.lens import Division, fit_distortion
 from dyntorch.numerics import canonical_correlation, orthonormal_basis
-from dyntorch.scenes.filmed import filmed, nonrigid_pair
+from dyntorch.scenes.two_cameras import filmed_person, nonrigid_pair
 
 D = torch.float64
 
@@ -46,7 +46,9 @@ def test_stacked_fills_up_and_keeps_what_is_the_same():
 
 @pytest.fixture(scope="module")
 def takes():
-    scenes = [filmed(8, seconds=seconds, offset=0.2 * k, noise=0.3, generator=seeded(k)) for k, seconds in enumerate((2.0, 2.6))]
+    scenes = [
+        filmed_person(8, seconds=seconds, offset=0.2 * k, noise=0.3, generator=seeded(k)) for k, seconds in enumerate((2.0, 2.6))
+    ]
     return [one.a for one in scenes], [one.b for one in scenes]
 
 

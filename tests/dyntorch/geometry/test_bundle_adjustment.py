@@ -8,7 +8,7 @@ import torch
 from dyntorch.geometry.bundle import BundleProblem, bundle_adjust, point_information
 from dyntorch.geometry.triangulation import reproject
 from dyntorch.numerics.least_squares import Iterate
-from dyntorch.scenes import lifted
+from dyntorch.scenes import lifted_points
 
 
 def lift(dim, moving, views):
@@ -271,7 +271,7 @@ def test_misuse():
 
 
 def test_confined_points_stay_in_their_subspace_and_cost_least_there():
-    scene = lifted("constant_velocity_2d", 30, 5, static=0.5, sigma=0.5, generator=torch.Generator().manual_seed(7))
+    scene = lifted_points("constant_velocity_2d", 30, 5, static=0.5, sigma=0.5, generator=torch.Generator().manual_seed(7))
     assert scene.lifts is not None
     x, still = (scene.tracks - 500) / 300, torch.eye(5, dtype=torch.float64)[:, :3]
     frame = torch.tensor([[1 / 300, 0, -5 / 3], [0, 1 / 300, -5 / 3], [0, 0, 1]], dtype=torch.float64)

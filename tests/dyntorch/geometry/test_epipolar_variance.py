@@ -7,13 +7,13 @@ import torch
 
 from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, least_ratio, sampson_squared
 from dyntorch.geometry.homogeneous import homogeneous
-from dyntorch.scenes import filmed
+from dyntorch.scenes import filmed_person
 from tests.grid import grid
 
 
 def matches(seed=0, noise=1.0, n=12):
     """Normalized points ``(N, 2)`` of two cameras, and their noise."""
-    scene = filmed(n, seconds=1.0, noise=noise, generator=torch.Generator().manual_seed(seed))
+    scene = filmed_person(n, seconds=1.0, noise=noise, generator=torch.Generator().manual_seed(seed))
     flat = [x.flatten(0, 1) for x in (scene.a, scene.b)]
     scales = [float(x.std()) for x in flat]
     x1, x2 = ((x - x.mean(0)) / scale for x, scale in zip(flat, scales, strict=True))
@@ -99,7 +99,7 @@ def test_scale_and_place_of_the_points_do_not_matter():
 
 
 def test_exact_matches_give_the_fundamental_matrix():
-    scene = filmed(15, seconds=1.0, generator=torch.Generator().manual_seed(4))
+    scene = filmed_person(15, seconds=1.0, generator=torch.Generator().manual_seed(4))
     x1, x2 = (x.flatten(0, 1) / 500 - 1 for x in scene.exact)
     variance, F = epipolar_variance(moments_of(x1, x2))
     assert float(variance) < 1e-12

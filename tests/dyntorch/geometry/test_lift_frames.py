@@ -22,7 +22,7 @@ def draw(seed: int = 0) -> torch.Generator:
 def disguised(name: str, batch: int = 6, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Cameras and points of true scenes in a random frame of the ambiguity, each camera and point of any scale and sign."""
     views = max(4, scenes.lifts.KINDS[name].views)
-    scene = scenes.lifted(name, 40, views=views, batch=batch, generator=draw(seed))
+    scene = scenes.lifted_points(name, 40, views=views, batch=batch, generator=draw(seed))
     lifts, root = balance_lifts(MOTIONS[name].lifts(scene.times))
     algebra = gauge_algebra(lifts)
     rand = draw(seed + 1)
@@ -83,7 +83,7 @@ def test_a_problem_does_not_change_the_others() -> None:
 
 
 def test_steady_brings_the_chosen_points_to_rest() -> None:
-    scene = scenes.lifted("constant_velocity_2d", 30, static=0.4, generator=draw(2))
+    scene = scenes.lifted_points("constant_velocity_2d", 30, static=0.4, generator=draw(2))
     lifts, root = balance_lifts(MOTIONS["constant_velocity_2d"].lifts(scene.times))
     common = torch.eye(5, dtype=F64)
     common[3:, 2] = torch.tensor([0.7, -0.3])

@@ -133,7 +133,7 @@ def test_threads_do_not_disturb_each_other():
 
 
 CALLS = {
-    "reconstruct": "s = scenes.lifted('constant_velocity_2d', 40, views=4, sigma=0.5, generator=g); "
+    "reconstruct": "s = scenes.lifted_points('constant_velocity_2d', 40, views=4, sigma=0.5, generator=g); "
     "dyn.reconstruct(s.tracks, motion='constant_velocity_2d')",
     "align_planar": "dyn.align_planar(*scenes.planar(n=60, sigma=0.5, static=0.5, generator=g).views, generator=g)",
     "align_lines": "dyn.align_lines(*scenes.translating_lines(60, sigma=0.002, generator=g).views, threshold=0.006)",

@@ -5,7 +5,7 @@ from itertools import combinations
 import pytest
 import torch
 
-from dyntorch.scenes import lifted
+from dyntorch.scenes import lifted_points
 from dyntorch.scenes.lifts import KINDS
 from dyntorch.scenes.scene import OUTLIER
 
@@ -53,10 +53,10 @@ def rank(tracks, profile):
 @pytest.mark.parametrize("motion", KINDS)
 @pytest.mark.parametrize("views", [None, 6])
 def test_exact_tracks_are_the_projections_of_the_structure(motion, views):
-    scene = lifted(motion, 30, views, static=0.3, outliers=0.2, sigma=0.5, batch=(2, 2), generator=seeded())
+    scene = lifted_points(motion, 30, views, static=0.3, outliers=0.2, sigma=0.5, batch=(2, 2), generator=seeded())
     projections = scene.projections
-    lifted_points = scene.structure[..., None, :, :].expand(2, 2, projections.shape[2], *scene.structure.shape[-2:])
-    torch.testing.assert_close(project(lifted_points, projections), scene.exact, rtol=0, atol=1e-9)
+    points = scene.structure[..., None, :, :].expand(2, 2, projections.shape[2], *scene.structure.shape[-2:])
+    torch.testing.assert_close(project(points, projections), scene.exact, rtol=0, atol=1e-9)
     if scene.lifts is not None:
         torch.testing.assert_close(scene.cameras @ scene.lifts, projections)
     # enough equations for a point of P^k
@@ -66,7 +66,7 @@ def test_exact_tracks_are_the_projections_of_the_structure(motion, views):
 @pytest.mark.parametrize("motion", [m for m in KINDS if KINDS[m].bodies == 1])
 def test_points_move_as_the_name_says(motion):
     times = torch.tensor([0.0, 1.0, 2.5, 3.0, 7.0])
-    scene = lifted(motion, 2000, times=times, generator=seeded())
+    scene = lifted_points(motion, 2000, times=times, generator=seeded())
     d, t = KINDS[motion].dim, times.double()[:, None, None]
     x, v = scene.points, scene.velocities
     a = torch.zeros_like(x)
@@ -86,7 +86,7 @@ def test_points_move_as_the_name_says(motion):
 
 @pytest.mark.parametrize("motion", ["two_bodies_2d", "two_bodies_3d"])
 def test_bodies_move_as_a_whole(motion):
-    scene = lifted(motion, 40, 4, outliers=0.1, batch=3, generator=seeded())
+    scene = lifted_points(motion, 40, 4, outliers=0.1, batch=3, generator=seeded())
     assert scene.lifts is None and scene.velocities is None
     body2 = scene.structure[..., -1] == 1
     assert torch.equal(body2[scene.labels > 0], scene.labels[scene.labels > 0] == 2)
@@ -100,7 +100,7 @@ def test_bodies_move_as_a_whole(motion):
 
 @pytest.mark.parametrize("motion", [m for m in KINDS if not KINDS[m].sensors])
 def test_cameras_see_the_scene_in_front_of_them(motion):
-    scene = lifted(motion, 200, 6, batch=50, generator=seeded())
+    scene = lifted_points(motion, 200, 6, batch=50, generator=seeded())
     cameras = scene.cameras / scene.cameras[..., 2, :3].norm(dim=-1)[..., None, None]
     if KINDS[motion].dim == 3:
         depth = (torch.cat([scene.points, torch.ones_like(scene.points[..., :1])], -1)[:, None] @ cameras[..., 2, :, None])[..., 0]
@@ -135,11 +135,11 @@ def test_cameras_see_the_scene_in_front_of_them(motion):
     ],
 )
 def test_ranks_of_generic_scenes(motion, profile, expected):
-    assert rank(lifted(motion, 80, len(profile), generator=seeded(2)).exact, profile) == expected
+    assert rank(lifted_points(motion, 80, len(profile), generator=seeded(2)).exact, profile) == expected
 
 
 def test_rank_of_two_sensors_and_a_camera():
-    first, second, third = lifted(SENSORS, 80, generator=seeded()).exact
+    first, second, third = lifted_points(SENSORS, 80, generator=seeded()).exact
     camera = torch.tensor([[1.0, 0.2, 0.1, 0.0], [-0.1, 1.0, 0.3, 0.2], [0.1, -0.2, 0.2, 4.0]], dtype=torch.float64)
     image = project(torch.cat([third, torch.ones_like(third[:, :1])], -1)[None], camera[None])[0]
     assert rank([first, second, image], (3, 3, 1)) == (47, 48)
@@ -162,7 +162,7 @@ def test_rank_of_two_sensors_and_a_camera():
     ],
 )
 def test_ranks_of_static_points_and_of_one_body(motion, profile, expected):
-    assert rank(lifted(motion, 80, len(profile), static=1.0, generator=seeded(2)).exact, profile)[0] == expected
+    assert rank(lifted_points(motion, 80, len(profile), static=1.0, generator=seeded(2)).exact, profile)[0] == expected
 
 
 @pytest.mark.parametrize(
@@ -179,13 +179,13 @@ def test_ranks_of_static_points_and_of_one_body(motion, profile, expected):
 )
 def test_ranks_of_turning_and_of_uniformly_moving_cameras(motion, profile, drift, expected):
     times = [0.0, 1.0, 2.5, 3.0][: len(profile)]
-    scene = lifted(motion, 80, times=times, jitter=0.0, drift=drift, generator=seeded(2))
+    scene = lifted_points(motion, 80, times=times, jitter=0.0, drift=drift, generator=seeded(2))
     assert rank(scene.exact, profile)[0] == expected
 
 
 @pytest.mark.parametrize("motion", [VELOCITY_2D, VELOCITY_3D, SENSORS])
 def test_outliers_and_gaps_are_those_asked_for(motion):
-    scene = lifted(motion, 400, 6, sigma=0.0, outliers=0.25, missing=0.5, static=0.2, batch=2, generator=seeded())
+    scene = lifted_points(motion, 400, 6, sigma=0.0, outliers=0.25, missing=0.5, static=0.2, batch=2, generator=seeded())
     seen = scene.tracks.isfinite().all(-1)
     assert torch.equal(seen, ~scene.tracks.isnan().any(-1))
     k, size = scene.structure.shape[-1] - 1, scene.tracks.shape[-1]
@@ -200,7 +200,7 @@ def test_outliers_and_gaps_are_those_asked_for(motion):
 
 
 def test_noise_is_isotropic_of_the_given_size():
-    scene = lifted(VELOCITY_2D, 2000, sigma=0.5, generator=seeded())
+    scene = lifted_points(VELOCITY_2D, 2000, sigma=0.5, generator=seeded())
     noise = (scene.tracks - scene.exact).flatten(0, 1)
     torch.testing.assert_close(noise.std(0), torch.full((2,), 0.5, dtype=torch.float64), rtol=0.05, atol=0)
     assert scene.sigma == 0.5
@@ -209,11 +209,11 @@ def test_noise_is_isotropic_of_the_given_size():
 @pytest.mark.parametrize("motion", KINDS)
 def test_generator_reproduces_and_types_convert(motion):
     options = {"batch": 2, "sigma": 0.1, "outliers": 0.2, "missing": 0.1}
-    a, b, c = (lifted(motion, 20, generator=seeded(s), **options) for s in (5, 5, 6))
+    a, b, c = (lifted_points(motion, 20, generator=seeded(s), **options) for s in (5, 5, 6))
     torch.testing.assert_close(a.tracks, b.tracks, rtol=0, atol=0, equal_nan=True)
     assert torch.equal(a.labels, b.labels) and not torch.equal(a.exact, c.exact)
     assert (a.exact[0] - a.exact[1]).abs().max() > 1e-3
-    single = lifted(motion, 20, generator=seeded(5), dtype=torch.float32, **options)
+    single = lifted_points(motion, 20, generator=seeded(5), dtype=torch.float32, **options)
     assert single.exact.dtype == single.cameras.dtype == single.times.dtype == torch.float32 and single.labels.dtype == torch.int64
     torch.testing.assert_close(single.exact, a.exact.float(), rtol=1e-6, atol=1e-4)
 
@@ -221,13 +221,13 @@ def test_generator_reproduces_and_types_convert(motion):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: lifted("fast"), "motion must be one of"),
-        (lambda: lifted(VELOCITY_2D, 0), "n >= 1"),
-        (lambda: lifted(VELOCITY_2D, views=0), "views >= 1"),
-        (lambda: lifted(VELOCITY_2D, views=3, times=[0.0, 1.0]), "one per view"),
-        (lambda: lifted(VELOCITY_2D, missing=1.0), "missing is a share"),
-        (lambda: lifted(VELOCITY_2D, sigma=-1.0), "sigma must be"),
-        (lambda: lifted(VELOCITY_2D, outliers=2.0), "outliers is a share"),
+        (lambda: lifted_points("fast"), "motion must be one of"),
+        (lambda: lifted_points(VELOCITY_2D, 0), "n >= 1"),
+        (lambda: lifted_points(VELOCITY_2D, views=0), "views >= 1"),
+        (lambda: lifted_points(VELOCITY_2D, views=3, times=[0.0, 1.0]), "one per view"),
+        (lambda: lifted_points(VELOCITY_2D, missing=1.0), "missing is a share"),
+        (lambda: lifted_points(VELOCITY_2D, sigma=-1.0), "sigma must be"),
+        (lambda: lifted_points(VELOCITY_2D, outliers=2.0), "outliers is a share"),
     ],
 )
 def test_misuse_is_named(call, message):

@@ -99,7 +99,7 @@ def test_exact_views_give_the_shapes_and_the_times(functions, basis):
     rows = basis.rows(t)
     found = fit_shapes(x[:30], rows[:30])
     assert found.residual.max() < 1e-18
-    assert not found.few
+    assert not found.underdetermined
     assert not found.degenerate
     torch.testing.assert_close(planes(found.shapes, rows), planes(shapes, rows), atol=1e-7, rtol=0)
     seen = recover_times(found.shapes, basis, x[30:])
@@ -126,10 +126,10 @@ def test_few_frames_suffice_where_the_conditions_do():
     x, shapes = moving_views(LINEAR, t, n=14, noise=1e-6)
     rows = Polynomial(1).rows(t)
     five = fit_shapes(x[:5], rows[:5])
-    assert not five.few
+    assert not five.underdetermined
     assert (planes(five.shapes, rows) - planes(shapes, rows)).norm(dim=(-2, -1)).max() < 1e-3
     three = fit_shapes(x[:3], rows[:3])
-    assert three.few
+    assert three.underdetermined
     assert not three.shapes.any()
     assert three.uncertainty == torch.inf
 
@@ -146,7 +146,7 @@ def test_noise_is_the_noise_and_no_other_shapes_fit_better():
     views_of_one = centred_views(x[:1])
     g = torch.Generator().manual_seed(8)
     near = canonical_frame(found.shapes[:1] + 1e-3 * draw(50, *found.shapes.shape[1:], g=g))
-    many = views_of_one.repeated(50)
+    many = views_of_one.repeat(50)
     assert (cost_of(many, rows.expand(50, -1, -1), near) >= cost_of(views_of_one, wide[:1], found.shapes[:1])).all()
     # uncertainty: the error of the subspaces is of its size
     error = (planes(found.shapes, rows) - planes(shapes, rows)).norm(dim=(-2, -1)).mean(-1)
@@ -231,7 +231,7 @@ def test_one_bad_problem_leaves_the_others_as_they_are_and_batch_is_loop():
     x[0, 1] = torch.nan
     x[1, 0] = x[1, 0, :, :1]  # all points in one place
     found = fit_shapes(x, rows)
-    assert found.few.tolist() == [[False, True], [True, False]]
+    assert found.underdetermined.tolist() == [[False, True], [True, False]]
     assert all(part.isfinite().all() for part in (found.shapes, found.noise, found.residual))
     for i, j in ((0, 0), (1, 1)):
         torch.testing.assert_close(fit_shapes(x[i, j], rows).shapes, found.shapes[i, j], rtol=1e-6, atol=1e-8)

@@ -47,7 +47,7 @@ def table(path: Path, tracks: np.ndarray, times, static=None) -> Path:
 
 @pytest.fixture(scope="module")
 def scene():
-    return scenes.lifted("constant_velocity_2d", 50, times=TIMES, sigma=0.3, static=0.4, generator=draw(0))
+    return scenes.lifted_points("constant_velocity_2d", 50, times=TIMES, sigma=0.3, static=0.4, generator=draw(0))
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +164,7 @@ def test_numbers_of_frames_are_times_where_there_are_no_others(run):
 
 @pytest.mark.slow
 def test_two_bodies(run, tmp_path):
-    scene = scenes.lifted("two_bodies_3d", 60, views=4, sigma=0.3, generator=draw(1))
+    scene = scenes.lifted_points("two_bodies_3d", 60, views=4, sigma=0.3, generator=draw(1))
     table(tmp_path / "t.csv", scene.tracks.numpy(), range(4))
     assert run("t.csv --motion two_bodies_3d --threshold none --out out")[0] == 0
     labels = np.load("out/reconstruction.npz")["labels"]
@@ -175,7 +175,7 @@ def test_two_bodies(run, tmp_path):
 
 @pytest.mark.slow
 def test_the_model_is_chosen_and_the_others_listed(run, tmp_path):
-    scene = scenes.lifted("static_2d", 40, views=3, sigma=0.3, generator=draw(2))
+    scene = scenes.lifted_points("static_2d", 40, views=3, sigma=0.3, generator=draw(2))
     table(tmp_path / "t.csv", scene.tracks.numpy(), range(3))
     code, out, _ = run("t.csv --out out")
     assert code == 0 and re.search(r"static_2d +3 +40", out) and "penalized cost" in out

@@ -75,7 +75,7 @@ class TestPureTranslation:
         scene = scenes.translating_lines(60, batch=2, sigma=sigma, motion="translation", generator=draw(8))
         found = align_lines(*scene.views, threshold=0.015, generator=draw(9))
         assert bool((found.status != Status.OK).all())
-        assert bool(found.flagged("pure_translation").all())
+        assert bool(found.has_notice("pure_translation").all())
         assert "four degrees of freedom" in str(found.warnings[0]) and "static points" in str(found.warnings[0])
         assert "position and the scale" in found.ambiguity
 

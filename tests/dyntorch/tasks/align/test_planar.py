@@ -88,7 +88,7 @@ def test_exactly_static_scenes_are_solved_with_a_warning():
     assert error(result, scene.motion).max() < 1e-8
     assert (result.labels == 1).all()
     assert (result.status == Status.OK).all()
-    assert result.flagged("degenerate").all() and result.flagged(AlignNotice.FEW_MOVING).all()
+    assert result.has_notice("degenerate").all() and result.has_notice(AlignNotice.FEW_MOVING).all()
     ranks = [notice.value for notice in result.warnings if notice.code == AlignNotice.DEGENERATE]
     assert ranks == [10, 10]
 
@@ -97,7 +97,7 @@ def test_static_scenes_with_noise_are_flagged_and_as_good_as_two_homographies():
     scene = scenes.planar(100, batch=4, sigma=0.5, static=1.0, generator=generator(6))
     result = align_planar(*scene.views, generator=generator())
     assert (result.status == Status.OK).all()
-    assert result.flagged("near_static").all()
+    assert result.has_notice("near_static").all()
     pairs = [dyn.fit(dyn.Collineation(2), scene.views[0], x) for x in scene.views[1:]]
     direct = torch.stack(
         [grid_transfer_error(pair.motion[0], m, 640, 480) for pair, m in zip(pairs, scene.motion, strict=True)]
@@ -295,7 +295,7 @@ def test_misuse_is_refused_with_the_value_and_the_remedy(change, message):
 def test_unknown_notice_codes_are_refused():
     result = align_planar(*scenes.planar(40, generator=generator()).views, generator=generator())
     with pytest.raises(ValueError, match="'nonsense'"):
-        result.flagged("nonsense")
+        result.has_notice("nonsense")
     assert "Alignment(matches=40" in repr(result) and "moving" in repr(result)
 
 
@@ -311,7 +311,7 @@ def test_what_is_no_distance_is_refused(threshold):
 def test_equal_steps_without_static_points_are_never_ok(threshold):
     draw = torch.Generator().manual_seed(0)
     result = dyn.align_planar(*equal_steps(60, still=0.0, generator=draw), threshold=threshold, generator=draw)
-    assert result.status == dyn.Status.AMBIGUOUS and result.flagged("other_solution")
+    assert result.status == dyn.Status.AMBIGUOUS and result.has_notice("other_solution")
 
 
 @pytest.mark.slow

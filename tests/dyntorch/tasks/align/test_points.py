@@ -144,7 +144,7 @@ class TestRigid:
     def test_constant_velocity_without_background_says_so(self) -> None:
         scene = scenes.constant_velocity(20, batch=3, sigma=0.005, sensors="rigid", generator=draw(10))
         found = align_points(*scene.views, model="rigid", motion="constant_velocity", threshold=0.015, generator=draw(11)).check()
-        assert bool(found.flagged("common_velocity").all())
+        assert bool(found.has_notice("common_velocity").all())
         assert bool((second_difference((found.A, found.B), scene) < 0.05).all())
         assert found.velocities is not None
         assert float(found.velocities.mean(-2).norm(dim=-1).max()) < 1e-6
@@ -209,13 +209,13 @@ class TestAffineConstantVelocity:
         A, B = between(scene.motion)
         assert bool((torch.maximum(relative_error(found.A, A), relative_error(found.B, B)) < 0.03).all())
         assert label_scores(found.labels, scene.labels).recall.mean() > 0.95
-        assert not bool(found.flagged("common_velocity").any())
+        assert not bool(found.has_notice("common_velocity").any())
 
     def test_planar_velocities_are_degenerate(self) -> None:
         scene = scenes.constant_velocity(30, batch=2, velocities="planar", sensors="affine", generator=draw(4))
         found = align_points(*scene.views, model="affine_constant_velocity", threshold=1e-3, generator=draw(5))
         assert bool((found.status == Status.DEGENERATE).all())
-        assert bool(found.flagged("planar_velocities").all())
+        assert bool(found.has_notice("planar_velocities").all())
         assert bool((found.A == 0).all())
 
 
@@ -235,7 +235,7 @@ class TestProjective:
         scene = scenes.constant_velocity(60, velocities=velocities, generator=draw(2))
         found = align_points(*scene.views, model="constant_velocity", threshold=1e-3, generator=draw(3))
         assert int(found.status) != Status.OK
-        assert bool(found.flagged(code))
+        assert bool(found.has_notice(code))
 
     @pytest.mark.slow
     @pytest.mark.parametrize("model", ["join", "minimal_join"])

@@ -8,7 +8,7 @@ import torch
 from dyntorch import PairOptions
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.homogeneous import skew
-from dyntorch.scenes.filmed import nonrigid_pair
+from dyntorch.scenes.two_cameras import nonrigid_pair
 from dyntorch.tasks.pair import pair
 from dyntorch.tasks.pair.pair import reconstruct_pair
 from dyntorch.tasks.pair.result import PairNotice

@@ -74,7 +74,7 @@ def test_the_truth_has_no_residual():
         assert torch.allclose(
             problem.subset(torch.tensor([1])).normal_equations(theta[1:])[1], problem.normal_equations(theta)[1][1:]
         )
-        twice = problem.repeated(2).normal_equations(torch.cat([theta, theta]))[0]
+        twice = problem.repeat(2).normal_equations(torch.cat([theta, theta]))[0]
         assert twice.shape == (4,)
 
 

@@ -17,7 +17,7 @@ CV = "constant_velocity_2d"
 
 
 def tracks() -> Tensor:
-    return scenes.lifted(CV, 30, views=4, sigma=0.3, generator=torch.Generator().manual_seed(0)).tracks
+    return scenes.lifted_points(CV, 30, views=4, sigma=0.3, generator=torch.Generator().manual_seed(0)).tracks
 
 
 def half_lift(t: Tensor) -> Tensor:
@@ -120,13 +120,13 @@ def test_float32_times_that_are_exact_enough() -> None:
 
 
 def test_times_do_not_matter_where_nothing_moves() -> None:
-    x = scenes.lifted("static_2d", 30, views=2, sigma=0.3, generator=torch.Generator().manual_seed(0)).tracks.float()
+    x = scenes.lifted_points("static_2d", 30, views=2, sigma=0.3, generator=torch.Generator().manual_seed(0)).tracks.float()
     assert dyn.reconstruct(x, "static_2d", UNIX[:2].float()).status == Status.OK
 
 
 @pytest.mark.slow
 def test_static_of_any_kind() -> None:
-    scene = scenes.lifted(CV, 30, views=4, sigma=0.3, static=0.3, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points(CV, 30, views=4, sigma=0.3, static=0.3, generator=torch.Generator().manual_seed(0))
     known = scene.velocities.norm(dim=-1) < 1e-12
     assert known.any()
     first = dyn.reconstruct(scene.tracks, CV, static=known)
@@ -137,7 +137,7 @@ def test_static_of_any_kind() -> None:
 
 
 def test_no_static_point_is_none_given() -> None:
-    scene = scenes.lifted(CV, 30, views=4, sigma=0.3, static=0.3, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points(CV, 30, views=4, sigma=0.3, static=0.3, generator=torch.Generator().manual_seed(0))
     known = scene.velocities.norm(dim=-1) < 1e-12
     alone = dyn.reconstruct(scene.tracks, CV)
     nothing = dyn.reconstruct(scene.tracks, CV, static=[False] * 30)

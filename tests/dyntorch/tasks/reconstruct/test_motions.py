@@ -39,7 +39,7 @@ def test_a_declaration_is_all_that_others_read():
     wrong = []
     lines = motion_table().splitlines()
     for (name, motion), line in zip(MOTIONS.items(), lines, strict=True):
-        views, tracks = motion.least(range(12))
+        views, tracks = motion.min_views_and_tracks(range(12))
         smaller = [smaller_motion(entry) for entry in motion.smaller]
         facts = {
             "name": name == motion.name,
@@ -79,7 +79,7 @@ def test_counts_of_the_theory(name):
 
 @pytest.mark.parametrize("name", [name for name in TABLE if "bodies" not in name])
 def test_lifts_are_those_of_the_scenes(name):
-    scene = scenes.lifted(name, 3, times=TIMES, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points(name, 3, times=TIMES, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(as_motion(name).lifts(TIMES), scene.lifts)
 
 
@@ -149,7 +149,7 @@ def test_as_many_constants_as_coordinates_are_a_static_model():
 def test_lifts_are_good_far_from_0():
     for degree in (1, 2):
         motion = Motion(polynomial(2, 2, degree))
-        assert motion.lifts([1.7e9, 1.7e9 + 1]).isfinite().all() and len(motion.centred([1.7e9])[0]) == 1
+        assert motion.lifts([1.7e9, 1.7e9 + 1]).isfinite().all() and len(motion.centred_lifts([1.7e9])[0]) == 1
 
 
 def test_polynomial_lifts():

@@ -13,7 +13,7 @@ from dyntorch.tasks.reconstruct.scene import Projections, ViewTracks, mean_error
 
 def tracks_of(name, n=60, seed=0, **options):
     options = {"batch": (1,), **options}
-    scene = scenes.lifted(name, n, generator=torch.Generator().manual_seed(seed), **options)
+    scene = scenes.lifted_points(name, n, generator=torch.Generator().manual_seed(seed), **options)
     seen = scene.tracks.isfinite().all(-1).double()
     return scene, normalize_tracks(scene.tracks.nan_to_num(), seen, scene.times)
 
@@ -87,7 +87,7 @@ def test_parts_of_tracks():
     some = tracks.at(torch.tensor([3, 1]))
     assert torch.equal(some.x[:, 0], tracks.x[:, 3])
     assert some.times.tolist() == [3.0, 1.0]
-    twice = tracks.repeated(2)
+    twice = tracks.repeat(2)
     assert isinstance(twice, ViewTracks)
     assert torch.equal(twice.x[0], twice.x[1])
     assert torch.equal(twice.x[2], tracks.x[1])

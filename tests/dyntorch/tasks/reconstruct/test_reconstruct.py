@@ -27,7 +27,7 @@ def draw(seed: int = 0) -> torch.Generator:
 def scene_of(name: str, n: int = 60, **options: object) -> scenes.LiftedState:
     if "times" not in options:
         options.setdefault("views", max(4, KINDS[name].views))
-    return scenes.lifted(name, n, generator=draw(3), **options)
+    return scenes.lifted_points(name, n, generator=draw(3), **options)
 
 
 def error(found: Reconstruction, scene: scenes.LiftedState) -> Tensor:
@@ -163,7 +163,7 @@ def test_custom_lifts(lift) -> None:
     structure = torch.randn(60, size, generator=rand, dtype=F64)
     structure[:, rows - 1] = 1.0
     structure[:, rows:] *= 0.2
-    cameras = scenes.lifted(f"static_{rows - 1}d", 5, times=times, generator=rand).cameras
+    cameras = scenes.lifted_points(f"static_{rows - 1}d", 5, times=times, generator=rand).cameras
     lifts = motion.lifts(times)
     image = structure @ (cameras @ lifts).mT
     found = dyn.reconstruct(image[..., :2] / image[..., 2:], motion, times)
@@ -209,7 +209,7 @@ def test_one_wrong_track_is_found_without_losing_the_others() -> None:
 
 
 def test_a_moving_point_said_to_stand_still_is_named() -> None:
-    scene = scenes.lifted("constant_velocity_2d", 60, views=6, sigma=0.5, static=0.5, generator=draw(4))
+    scene = scenes.lifted_points("constant_velocity_2d", 60, views=6, sigma=0.5, static=0.5, generator=draw(4))
     given = (scene.labels == 1) & (scene.labels == 1).cumsum(-1).le(10)
     wrong = int((scene.labels == 2).nonzero()[0])
     given[wrong] = True
@@ -222,7 +222,7 @@ def test_a_moving_point_said_to_stand_still_is_named() -> None:
 @pytest.mark.slow
 def test_tracks_shorter_than_the_recording_lead_from_view_to_view() -> None:
     times = [0.4 * i for i in range(16)]
-    scene = scenes.lifted("constant_velocity_2d", 160, times=times, sigma=0.2, jitter=0.1, drift=2.0, generator=draw(2))
+    scene = scenes.lifted_points("constant_velocity_2d", 160, times=times, sigma=0.2, jitter=0.1, drift=2.0, generator=draw(2))
     start = torch.randint(-3, 12, (160,), generator=draw(3))
     frame = torch.arange(16)[:, None]
     tracks = torch.where(((frame < start) | (frame >= start + 8))[..., None], torch.nan, scene.tracks)
@@ -233,7 +233,7 @@ def test_tracks_shorter_than_the_recording_lead_from_view_to_view() -> None:
 
 @pytest.mark.slow
 def test_wrong_observations_in_most_tracks_cost_only_themselves() -> None:
-    scene = scenes.lifted("constant_velocity_2d", 80, times=[0.5 * i for i in range(10)], sigma=0.5, generator=draw(1))
+    scene = scenes.lifted_points("constant_velocity_2d", 80, times=[0.5 * i for i in range(10)], sigma=0.5, generator=draw(1))
     wrong = torch.rand(10, 80, generator=draw(4)) < 0.1
     off = 100 * (torch.rand(10, 80, 2, generator=draw(6), dtype=F64) - 0.5)
     tracks = torch.where(wrong[..., None], scene.tracks + off, scene.tracks)
@@ -246,7 +246,7 @@ def test_wrong_observations_in_most_tracks_cost_only_themselves() -> None:
 
 @pytest.mark.slow
 def test_options_decide() -> None:
-    scene = scenes.lifted("constant_velocity_2d", 60, views=4, outliers=0.3, sigma=0.3, generator=draw(3))
+    scene = scenes.lifted_points("constant_velocity_2d", 60, views=4, outliers=0.3, sigma=0.3, generator=draw(3))
 
     def found(**options: float) -> dyn.Reconstruction:
         given = dyn.ReconstructOptions(**options)

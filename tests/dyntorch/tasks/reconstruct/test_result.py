@@ -11,7 +11,7 @@ from dyntorch import scenes
 
 @pytest.mark.slow
 def test_repr_of_one_and_of_a_batch() -> None:
-    scene = scenes.lifted("constant_velocity_2d", 30, views=4, batch=2, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points("constant_velocity_2d", 30, views=4, batch=2, generator=torch.Generator().manual_seed(0))
     one = repr(dyn.reconstruct(scene.tracks[0], "constant_velocity_2d"))
     assert one.startswith("Reconstruction(constant_velocity_2d, views=4, points=30, batch=(): 1 OK)")
     assert "30 moving" in one and "velocity common to all points" in one
@@ -24,7 +24,7 @@ def test_repr_of_one_and_of_a_batch() -> None:
 
 
 def test_two_bodies_say_nothing_about_other_times() -> None:
-    scene = scenes.lifted("two_bodies_2d", 30, views=3, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points("two_bodies_2d", 30, views=3, generator=torch.Generator().manual_seed(0))
     found = dyn.reconstruct(scene.tracks, "two_bodies_2d")
     assert found.velocities is None and torch.equal(found.at(3.0), found.points)
     with pytest.raises(ValueError, match="says nothing about times between the views"):

@@ -29,7 +29,7 @@ def tracks_of(images, times):
 
 
 def problem(motion, n, batch=2, seed=0, **options):
-    scene = scenes.lifted(motion, n, batch=batch, sigma=options.pop("sigma", 0.5), generator=generator(seed), **options)
+    scene = scenes.lifted_points(motion, n, batch=batch, sigma=options.pop("sigma", 0.5), generator=generator(seed), **options)
     model = MOTIONS[motion]
     tracks = tracks_of(scene.tracks, scene.times)
     invariant = model.tensor(min(model.views(scene.times), model.k + 1))
@@ -110,7 +110,7 @@ def test_bodies_have_no_lift():
 
 
 def _bodies():
-    scene = scenes.lifted("two_bodies_3d", 60, batch=1, sigma=0.5, outliers=0.2, generator=generator())
+    scene = scenes.lifted_points("two_bodies_3d", 60, batch=1, sigma=0.5, outliers=0.2, generator=generator())
     return scene, tracks_of(scene.tracks, scene.times), MOTIONS["two_bodies_3d"].tensor(3), None
 
 

@@ -28,7 +28,7 @@ MOVING = [name for name, motion in MOTIONS.items() if motion.lift is not None an
 def solved(name, n, seed=0, **options):
     """Truth, tracks, lifting, projections and scene."""
     options = {"batch": (1,), **options}
-    truth = scenes.lifted(name, n, generator=torch.Generator().manual_seed(seed), **options)
+    truth = scenes.lifted_points(name, n, generator=torch.Generator().manual_seed(seed), **options)
     seen = truth.tracks.isfinite().all(-1).double()
     tracks = normalize_tracks(truth.tracks.nan_to_num(), seen, truth.times)
     motion = MOTIONS[name]

@@ -12,7 +12,7 @@ from dyntorch.tasks.reconstruct.scene import middle_views, static_cameras, stati
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_scene_at_rest_is_explained_exactly_and_stands_before_all_cameras(dim):
-    scene = scenes.lifted(f"static_{dim}d", 40, views=4, batch=(3,), generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points(f"static_{dim}d", 40, views=4, batch=(3,), generator=torch.Generator().manual_seed(0))
     tracks = normalize_tracks(scene.tracks, torch.ones_like(scene.tracks[..., 0]), scene.times)
     cameras = static_cameras(tracks, 2, dim)
     points = triangulate(cameras, tracks.x)

@@ -8,13 +8,13 @@ import torch
 
 from dyntorch.geometry.epipolar import epipolar_variance
 from dyntorch.geometry.homogeneous import homogeneous
-from dyntorch.scenes import filmed
+from dyntorch.scenes import filmed_person
 from dyntorch.tasks.synchronize.epipolar import Grid, Samples, ShiftDescent, epipolar_curve
 from dyntorch.tasks.synchronize.tracks import read_tracks, smooth_at
 
 
 def scene_of(seed=0, **more):
-    return filmed(10, **{"seconds": 2.0, "noise": 1.0, "generator": torch.Generator().manual_seed(seed)} | more)
+    return filmed_person(10, **{"seconds": 2.0, "noise": 1.0, "generator": torch.Generator().manual_seed(seed)} | more)
 
 
 def tracks_of(scene):
@@ -167,7 +167,7 @@ def sampson(F, p, q):
 
 
 def test_positions_between_the_steps_of_a_grid_are_those_of_smoothing():
-    scene = filmed(6, seconds=3.0, generator=seeded(1))
+    scene = filmed_person(6, seconds=3.0, generator=seeded(1))
     for noise in (0.0, 2.0):
         tracks = tracks_of_of_descent(scene, noise)[1]
         grid = Grid.of(tracks, FRAME)
@@ -203,7 +203,7 @@ def test_grids_have_no_weight_in_gaps_and_beyond_the_take():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_minimum_is_that_of_a_general_solver(seed):
-    a, b = tracks_of_of_descent(filmed(9, seconds=1.5, offset=0.113, generator=seeded(seed)), 1.0, seed)
+    a, b = tracks_of_of_descent(filmed_person(9, seconds=1.5, offset=0.113, generator=seeded(seed)), 1.0, seed)
     fit = ShiftDescent(a, b, FRAME).run(0.113)
     x1, _, w1 = smooth_at(a, a.times, FRAME)
     centre, size = torch.tensor([640.0, 480.0], dtype=torch.float64), 300.0
@@ -224,7 +224,7 @@ def test_the_minimum_is_that_of_a_general_solver(seed):
 
 
 def test_the_minimum_is_that_of_a_scan():
-    a, b = tracks_of_of_descent(filmed(12, seconds=3.0, offset=-0.217, generator=seeded(3)), 1.5, 3)
+    a, b = tracks_of_of_descent(filmed_person(12, seconds=3.0, offset=-0.217, generator=seeded(3)), 1.5, 3)
     descent = ShiftDescent(a, b, FRAME)
     fit = descent.run(-0.2)
     offsets = fit.offset + torch.linspace(-0.5, 0.5, 41, dtype=torch.float64) * FRAME
@@ -235,7 +235,7 @@ def test_the_minimum_is_that_of_a_scan():
 
 @pytest.mark.parametrize("start", [-1.4, -0.5, 0.0, 0.8, 1.5])
 def test_starts_within_a_frame_or_two_lead_to_the_same_minimum(start):
-    a, b = tracks_of_of_descent(filmed(12, seconds=3.0, offset=0.4, generator=seeded(4)), 1.0)
+    a, b = tracks_of_of_descent(filmed_person(12, seconds=3.0, offset=0.4, generator=seeded(4)), 1.0)
     fit = ShiftDescent(a, b, FRAME).run(0.4 + start * FRAME)
     assert fit.offset == pytest.approx(0.4, abs=0.03 * FRAME)
     again = ShiftDescent(a, b, FRAME).run(fit.offset)
@@ -243,12 +243,12 @@ def test_starts_within_a_frame_or_two_lead_to_the_same_minimum(start):
 
 
 def test_exact_cameras_give_the_fundamental_matrix_in_pixels():
-    scene = filmed(15, seconds=4.0, offset=0.3, generator=seeded(5))
+    scene = filmed_person(15, seconds=4.0, offset=0.3, generator=seeded(5))
     fit = ShiftDescent(*tracks_of_of_descent(scene), FRAME).run(0.3)
     F = fit.fundamental
     assert float(F.norm()) == pytest.approx(1.0)
     assert float(torch.linalg.svdvals(F)[2]) < 1e-12
-    x2 = filmed(15, seconds=4.0, generator=seeded(5)).exact[1]  # b at a's moments
+    x2 = filmed_person(15, seconds=4.0, generator=seeded(5)).exact[1]  # b at a's moments
     away = sampson(F, homogeneous(scene.exact[0].flatten(0, 1)), homogeneous(x2.flatten(0, 1)))
     assert float(away.square().mean().sqrt()) < 0.2  # what smoothing leaves
     assert fit.offset == pytest.approx(0.3, abs=0.005 * FRAME)
@@ -256,7 +256,7 @@ def test_exact_cameras_give_the_fundamental_matrix_in_pixels():
 
 @pytest.mark.slow
 def test_sigma_is_the_scatter_of_repeated_draws():
-    scene = filmed(12, seconds=2.5, offset=0.123, generator=seeded(6))
+    scene = filmed_person(12, seconds=2.5, offset=0.123, generator=seeded(6))
     fits = [ShiftDescent(*tracks_of_of_descent(scene, 1.5, seed), FRAME).run(0.123) for seed in range(30)]
     errors = torch.tensor([fit.offset - 0.123 for fit in fits], dtype=torch.float64)
     sigmas = torch.tensor([fit.sigma for fit in fits], dtype=torch.float64)
@@ -269,7 +269,7 @@ def test_sigma_is_the_scatter_of_repeated_draws():
 
 @pytest.mark.slow
 def test_fractions_of_a_frame_do_not_draw_the_estimate():
-    scenes = {phase: filmed(12, seconds=2.5, offset=phase * FRAME, generator=seeded(7)) for phase in (0.0, 0.25, 0.5)}
+    scenes = {phase: filmed_person(12, seconds=2.5, offset=phase * FRAME, generator=seeded(7)) for phase in (0.0, 0.25, 0.5)}
     for phase, scene in scenes.items():
         fits = [ShiftDescent(*tracks_of_of_descent(scene, 3.0, seed), FRAME).run(phase * FRAME) for seed in range(7)]
         errors = torch.tensor([fit.offset / FRAME - phase for fit in fits])
@@ -277,7 +277,7 @@ def test_fractions_of_a_frame_do_not_draw_the_estimate():
 
 
 def test_the_rate_is_found_with_its_sigma():
-    scene = filmed(10, seconds=12.0, rate=1.004, offset=0.3, generator=seeded(8))
+    scene = filmed_person(10, seconds=12.0, rate=1.004, offset=0.3, generator=seeded(8))
     fit = ShiftDescent(*tracks_of_of_descent(scene, 1.0), FRAME).run(0.32, 1.003, free_rate=True)
     assert abs(fit.rate - 1.004) < 4 * fit.rate_sigma < 1e-3
     assert fit.offset + fit.rate * fit.center == pytest.approx(0.3 + 1.004 * fit.center, abs=4 * fit.sigma)
@@ -287,14 +287,14 @@ def test_the_rate_is_found_with_its_sigma():
 
 
 def test_outliers_hardly_move_the_minimum():
-    clean = filmed(14, seconds=3.0, noise=1.0, offset=0.2, generator=seeded(9))
-    dirty = filmed(14, seconds=3.0, noise=1.0, offset=0.2, outliers=0.03, generator=seeded(9))
+    clean = filmed_person(14, seconds=3.0, noise=1.0, offset=0.2, generator=seeded(9))
+    dirty = filmed_person(14, seconds=3.0, noise=1.0, offset=0.2, outliers=0.03, generator=seeded(9))
     fits = [ShiftDescent(*tracks_of_of_descent(scene), FRAME).run(0.2) for scene in (clean, dirty)]
     assert fits[1].offset == pytest.approx(0.2, abs=5 * fits[0].sigma)
 
 
 def test_distances_are_those_of_each_frame_and_point():
-    scene = filmed(8, seconds=2.0, offset=0.2, missing=0.2, generator=seeded(10))
+    scene = filmed_person(8, seconds=2.0, offset=0.2, missing=0.2, generator=seeded(10))
     a, b = tracks_of_of_descent(scene, 1.0)
     fit = ShiftDescent(a, b, FRAME).run(0.2)
     x1, _, w1 = smooth_at(a, fit.times, FRAME)
@@ -309,13 +309,13 @@ def test_distances_are_those_of_each_frame_and_point():
 
 
 def test_too_little_in_common_is_none():
-    a, b = tracks_of_of_descent(filmed(12, seconds=2.0, generator=seeded()), 1.0)
+    a, b = tracks_of_of_descent(filmed_person(12, seconds=2.0, generator=seeded()), 1.0)
     assert ShiftDescent(a, b, FRAME).run(3.0) is None
     assert ShiftDescent(a, b, FRAME).run(0.0).effective > 20
 
 
 def test_long_takes_are_thinned():
-    a, b = tracks_of_of_descent(filmed(10, seconds=4.0, offset=0.2, generator=seeded(11)), 1.0)
+    a, b = tracks_of_of_descent(filmed_person(10, seconds=4.0, offset=0.2, generator=seeded(11)), 1.0)
     whole, thin = (
         ShiftDescent(a, b, FRAME).run(0.2),
         ShiftDescent(a, b, FRAME, rows=300).run(0.2),

@@ -8,7 +8,7 @@ import torch
 
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.geometry.lens import distort
-from dyntorch.scenes import filmed
+from dyntorch.scenes import filmed_person
 from dyntorch.tasks.synchronize.synchronize import synchronize
 
 FRAME = 1 / 30
@@ -19,7 +19,7 @@ def seeded(seed=0):
 
 
 def film(seed=0, **more):
-    return filmed(**{"noise": 1.0, "generator": seeded(seed)} | more)
+    return filmed_person(**{"noise": 1.0, "generator": seeded(seed)} | more)
 
 
 def synced(scene, **more):
@@ -346,7 +346,7 @@ STRAIGHT = (None, None)
 
 
 def film_of_refusal(seed=0, **more):
-    return filmed(**{"n": 10, "seconds": 2.5, "noise": 1.0, "generator": seeded(seed)} | more)
+    return filmed_person(**{"n": 10, "seconds": 2.5, "noise": 1.0, "generator": seeded(seed)} | more)
 
 
 def normal(seed, *shape):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dyntorch.scenes import filmed
+from dyntorch.scenes import filmed_person
 from dyntorch.tasks.synchronize.tracks import noise_ratio, read_tracks, reject_outliers, remove_positions, scale_frames, smooth_at
 
 
@@ -35,7 +35,7 @@ def line(tracks, j, moment, width):
 @pytest.mark.parametrize("width", [1 / 30, 0.1])
 def test_smoothing_is_weighted_least_squares_with_gaps_and_irregular_times(width):
     times = irregular(60)
-    scene = filmed(5, times=(times, times), noise=2.0, missing=0.2, generator=seeded())
+    scene = filmed_person(5, times=(times, times), noise=2.0, missing=0.2, generator=seeded())
     weights = torch.rand(len(times), 5, generator=seeded(3), dtype=torch.float64)
     tracks = tracks_of(scene.a, times=times, weights=weights)
     at = times[0] + (times[-1] - times[0]) * torch.rand(25, generator=seeded(4), dtype=torch.float64)
@@ -95,15 +95,15 @@ def test_noise_that_is_left_does_not_depend_on_the_place_between_frames():
 
 def test_the_noise_is_that_put_in_whatever_the_motion():
     for sigma in (0.5, 2.0):
-        scene = filmed(15, seconds=6.0, noise=sigma, missing=0.1, generator=seeded(2))
+        scene = filmed_person(15, seconds=6.0, noise=sigma, missing=0.1, generator=seeded(2))
         assert tracks_of(scene.a).noise == pytest.approx(sigma, rel=0.15)
-        scene = filmed(15, seconds=6.0, noise=sigma, outliers=0.05, generator=seeded(2))
+        scene = filmed_person(15, seconds=6.0, noise=sigma, outliers=0.05, generator=seeded(2))
         assert tracks_of(scene.a).noise == pytest.approx(1.25 * sigma, rel=0.15)  # four positions to a difference
-    assert tracks_of(filmed(15, generator=seeded(2)).a).noise < 0.1
+    assert tracks_of(filmed_person(15, generator=seeded(2)).a).noise < 0.1
 
 
 def test_the_change_of_coordinates_normalizes_what_is_seen():
-    scene = filmed(8, missing=0.2, generator=seeded())
+    scene = filmed_person(8, missing=0.2, generator=seeded())
     tracks = tracks_of(scene.a)
     seen = tracks.weights > 0
     found = tracks.x[seen] @ tracks.change[:2, :2].mT + tracks.change[:2, 2]
@@ -113,7 +113,7 @@ def test_the_change_of_coordinates_normalizes_what_is_seen():
 
 
 def test_noise_of_two_cameras_is_compared_within_bounds():
-    scene = filmed(12, seconds=6.0, generator=seeded(1))
+    scene = filmed_person(12, seconds=6.0, generator=seeded(1))
     noisy = [scene.exact[k] + torch.randn(scene.exact[k].shape, generator=seeded(k), dtype=torch.float64) for k in (0, 1)]
     a, b, large = tracks_of(noisy[0]), tracks_of(noisy[1]), tracks_of(3 * noisy[1])
     assert noise_ratio(a, b) == pytest.approx(1.0, rel=0.15)
@@ -191,7 +191,7 @@ def removed(before, after):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("noise", [0.0, 1.0, 4.0])
 def test_good_positions_stay(seed, noise):
-    tracks = tracks_of_of_cleaning(filmed(15, seconds=4.0, noise=noise, missing=0.1, generator=seeded(seed)).a)
+    tracks = tracks_of_of_cleaning(filmed_person(15, seconds=4.0, noise=noise, missing=0.1, generator=seeded(seed)).a)
     after = reject_outliers(tracks)
     assert float(removed(tracks, after).sum() / (tracks.weights > 0).sum()) < 0.03
     kept = after.weights > 0
@@ -201,7 +201,7 @@ def test_good_positions_stay(seed, noise):
 @pytest.mark.parametrize("share", [0.03, 0.15])
 def test_planted_outliers_go(share):
     for seed in range(3):
-        scene = filmed(15, seconds=4.0, noise=1.0, outliers=share, generator=seeded(seed))
+        scene = filmed_person(15, seconds=4.0, noise=1.0, outliers=share, generator=seeded(seed))
         tracks = tracks_of_of_cleaning(scene.a)
         far = (tracks.x - scene.exact[0]).norm(dim=-1) > 15  # beyond doubt: 15 standard deviations
         gone = removed(tracks, reject_outliers(tracks))
@@ -210,7 +210,7 @@ def test_planted_outliers_go(share):
 
 
 def test_one_wrong_position_goes_and_nothing_else():
-    x = filmed(6, seconds=2.0, noise=0.5, generator=seeded(1)).a
+    x = filmed_person(6, seconds=2.0, noise=0.5, generator=seeded(1)).a
     before = reject_outliers(tracks_of_of_cleaning(x))
     x[30, 2] += 40
     after = reject_outliers(tracks_of_of_cleaning(x))
@@ -247,7 +247,7 @@ def test_a_sudden_movement_stays():
 
 
 def test_what_scale_the_picture_has_does_not_matter():
-    x = filmed(8, seconds=2.0, noise=1.0, outliers=0.1, generator=seeded(3)).a
+    x = filmed_person(8, seconds=2.0, noise=1.0, outliers=0.1, generator=seeded(3)).a
     one, two = reject_outliers(tracks_of_of_cleaning(x)), reject_outliers(tracks_of_of_cleaning(4 * x + 1000))
     assert torch.equal(one.weights, two.weights)
 
@@ -258,7 +258,7 @@ def test_a_take_of_a_few_frames_is_left_alone():
 
 
 def test_weights_that_were_given_are_kept():
-    x = filmed(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
+    x = filmed_person(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
     weights = torch.rand(60, 5, generator=seeded(5), dtype=torch.float64)
     after = reject_outliers(read_tracks("a", x, 30.0, None, weights))
     kept = after.weights > 0
@@ -266,7 +266,7 @@ def test_weights_that_were_given_are_kept():
 
 
 def test_a_point_never_seen_does_no_harm():
-    x = filmed(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
+    x = filmed_person(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
     x[:, 2] = torch.nan
     after = reject_outliers(tracks_of_of_cleaning(x))
     assert not after.weights[:, 2].any() and after.x.isfinite().all()
@@ -281,7 +281,7 @@ def tracks_of_of_scaled(x, fps=30.0):
 
 
 def scene(**more):
-    return filmed(11, seconds=4.0, generator=torch.Generator().manual_seed(0), **more)
+    return filmed_person(11, seconds=4.0, generator=torch.Generator().manual_seed(0), **more)
 
 
 def test_medians_of_every_frame_are_nought():

@@ -54,7 +54,7 @@ class FilmedScene:
     wrong: Tensor
 
 
-def filmed(
+def filmed_person(
     n: int = 15,
     seconds: float = 4.0,
     *,

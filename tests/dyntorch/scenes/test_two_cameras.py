@@ -5,11 +5,11 @@ import torch
 
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.geometry.lens import Division
-from dyntorch.scenes import filmed
+from dyntorch.scenes import filmed_person
 
 
 def make(seed=0, **more):
-    return filmed(**{"generator": torch.Generator().manual_seed(seed)} | more)
+    return filmed_person(**{"generator": torch.Generator().manual_seed(seed)} | more)
 
 
 def test_the_pictures_are_those_of_the_cameras():
