@@ -57,7 +57,7 @@ def finish(page: object, refusal: str | None) -> int:
 def flag_words(*names: str, **own: str) -> Callable[[str, str | None], str]:
     """What the command line calls the arguments that a message of the library speaks of."""
 
-    def words(name: str, value: str | None) -> str:
+    def name_flag(name: str, value: str | None) -> str:
         if name in own:
             return own[name]
         if name not in names:
@@ -66,7 +66,7 @@ def flag_words(*names: str, **own: str) -> Callable[[str, str | None], str]:
         given = {None: "", "None": "auto", "True": ""}.get(value, (value or "").strip("'"))
         return f"--no-{flag}" if value == "False" else f"--{flag} {given}".rstrip()
 
-    return words
+    return name_flag
 
 
 def names(values: Sequence[object]) -> str:
@@ -208,6 +208,12 @@ def check_report(folder: Path | None, inputs: Iterable[Path], files: Iterable[st
     folder = check_folder(folder)
     keep(inputs, [folder / name for name in files])
     return folder
+
+
+def check_seed(seed: int) -> None:
+    """Raise where a seed is none."""
+    if seed < 0:
+        raise ValueError(f"--seed must be a whole number from 0, got {seed}")
 
 
 def keep(inputs: Iterable[Path], outputs: Iterable[Path]) -> None:

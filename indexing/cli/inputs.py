@@ -108,6 +108,22 @@ def refuse_range(path: Path) -> None:
         raise ValueError(f"{path}: seconds (@{seconds}) are for examples, and recordings are read as a whole; give {file}")
 
 
+def camera_numbers(flag: str, given: str | None, cameras: int | None) -> list[float | None]:
+    """One positive number for each camera, ``None`` where nothing was given; checked without a number of cameras."""
+    if given is None:
+        return [None] * (cameras or 0)
+    try:
+        values: list[float | None] = [float(word) for word in given.split(",")]
+    except ValueError:
+        values = []
+    if not values or not all(value is not None and 0 < value < math.inf for value in values):
+        unit, example = ("frames per second", "60,59.94") if flag == "fps" else ("pixels", "1510,1495,1502")
+        raise ValueError(f"--{flag} must be a positive number of {unit}, or one per camera as in {example}, got {given}")
+    if cameras is not None and len(values) not in (1, cameras):
+        raise ValueError(f"--{flag} gives {len(values)} numbers for {cameras} cameras; give one, or one per camera")
+    return values * ((cameras or 1) if len(values) == 1 else 1)
+
+
 def read_examples(examples: Sequence[Example], reading: Reading, select: Sequence[str]) -> tuple[list[Clip], list[str]]:
     """Labelled clips, and what a person should know about them."""
     clips: list[Clip] = []

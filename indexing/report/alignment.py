@@ -69,12 +69,12 @@ class AlignmentReport(ResultReport):
     @functools.cached_property
     def motion(self) -> list[FloatArray]:
         """A, B (with three views) and so on, from view 2, 3, ... to view 1."""
-        return [part for part in (self.found.A, self.found.B, *map(np.asarray, self.found.others)) if part is not None]
+        return [part for part in (self.arrays.A, self.arrays.B, *map(np.asarray, self.arrays.others)) if part is not None]
 
     @property
     def sigma(self) -> float:
         """Noise of one coordinate, in the unit of the views."""
-        return float(self.found.sigma)
+        return float(self.arrays.sigma)
 
     @property
     def ambiguity(self) -> str:
@@ -82,14 +82,14 @@ class AlignmentReport(ResultReport):
         return with_words(self.result.ambiguity, self.words)
 
     @property
-    def solved(self) -> bool:
+    def has_motion(self) -> bool:
         """Whether there is a motion at all, good or doubtful."""
         return all(np.isfinite(part).all() and np.abs(part).max() > 0 for part in self.motion)
 
     @property
-    def doubtful(self) -> bool:
+    def has_unverified(self) -> bool:
         """Whether there are matches that stand still between two of the views only."""
-        return bool(np.any(self.found.unverified))
+        return bool(np.any(self.arrays.unverified))
 
     @property
     def missing(self) -> NDArray[np.bool_]:
@@ -99,7 +99,7 @@ class AlignmentReport(ResultReport):
     @functools.cached_property
     def kinds(self) -> list[str]:
         """What each match is: outlier, static, moving or missing."""
-        labels = self.found.labels.tolist()
+        labels = self.arrays.labels.tolist()
         return ["missing" if gone else LABELS[label] for label, gone in zip(labels, self.missing.tolist(), strict=True)]
 
     @property
@@ -108,12 +108,12 @@ class AlignmentReport(ResultReport):
         return {name: self.kinds.count(name) for name in ("static", "moving", "outlier", "missing")}
 
     @functools.cached_property
-    def shown(self) -> list[tuple[str, int, list[list[Any]], bool]]:
+    def motion_rows(self) -> list[tuple[str, int, list[list[Any]], bool]]:
         """Of each motion: its name, the view that it leads from, its rows with deviations, and whether its last entry is 1."""
         out, start = [], 0
-        for view, (name, matrix) in enumerate(zip(ascii_uppercase, self.motion if self.solved else (), strict=False), start=2):
+        for view, (name, matrix) in enumerate(zip(ascii_uppercase, self.motion if self.has_motion else (), strict=False), start=2):
             block = slice(start, start := start + matrix.size)
-            values, spreads, scaled = display_scale(matrix, self.found.covariance[block, block])
+            values, spreads, scaled = display_scale(matrix, self.arrays.covariance[block, block])
             rows = [
                 [f"{name}, row {i}", *(figures(float(v), float(s)) for v, s in zip(*row, strict=True))]
                 for i, row in enumerate(zip(values, spreads, strict=True), start=1)
@@ -124,8 +124,8 @@ class AlignmentReport(ResultReport):
     @property
     def poses(self) -> list[tuple[int, float, list[float]]]:
         """Of calibrated cameras: view, turn in degrees against view 1, and shift in distances of the plane; empty without."""
-        found = self.found
-        if found.rotations is None or not self.solved:
+        found = self.arrays
+        if found.rotations is None or not self.has_motion:
             return []
         pairs = enumerate(zip(found.rotations, found.translations, strict=True), start=1)
         return [(view, turn_of(turn), shift.tolist()) for view, (turn, shift) in pairs if view > 1]
@@ -138,7 +138,7 @@ def describe(report: AlignmentReport) -> str:
     if report.status != "OK":
         start = f"The {number:,} {what} do not decide how the sensor moved."
         return f"{start} {sentence(report.reason)}" + (
-            " What follows is the best motion found, and not to be relied on." * report.solved
+            " What follows is the best motion found, and not to be relied on." * report.has_motion
         )
     parts = [f"{counts['static']:,} stand still and {counts['moving']:,} move"]
     if counts["outlier"]:
@@ -151,17 +151,17 @@ def describe(report: AlignmentReport) -> str:
 @register_page(AlignmentReport, "alignment", FILES)
 def summarize(report: AlignmentReport) -> Summary:
     """Everything that is said of an alignment."""
-    known, poses = report.solved, report.poses
+    known, poses = report.has_motion, report.poses
     row: list[object] = [len(report.ids), *(n if known or name == "missing" else "" for name, n in report.counts.items())]
     row += [f"{report.sigma:.3g}" if known else "", report.state]
     tables = [Table(["matches ", "static ", "moving ", "outliers ", "missing ", "noise ", "status"], [row])]
-    for name, view, rows, scaled in report.shown:
+    for name, view, rows, scaled in report.motion_rows:
         heading = f"{name}: view {view} to view 1" + ("" if scaled else ", norm 1")
         cells = [[f"row {i}", *(" ± ".join(filter(None, cell)) for cell in row[1:])] for i, row in enumerate(rows, start=1)]
         tables.append(Table([heading, *(f"column {j} " for j in range(1, len(cells[0])))], cells))
     if poses:
         cells = [[f"view {v}", f"{turn:.4g}°", *(f"{x:.4g}" for x in shift)] for v, turn, shift in poses]
-        normal = ", ".join(f"{x:.4g}" for x in report.found.normal)
+        normal = ", ".join(f"{x:.4g}" for x in report.arrays.normal)
         plane = f"plane: normal ({normal}) before view 1; shifts in units of its distance"
         tables.append(Table(["camera against view 1", "turn ", "x ", "y ", "z "], cells, [plane]))
     return Summary(
@@ -178,7 +178,7 @@ def page_values(report: AlignmentReport) -> dict[str, Any]:
     turns = []
     if report.model == "rigid":
         turns = [(angle, shift, float(np.linalg.norm(shift))) for angle, shift in map(turn_and_shift, report.motion)]
-    motions = [(name, view, [[row[0], *map(_cell, row[1:])] for row in rows], one) for name, view, rows, one in report.shown]
+    motions = [(name, view, [[row[0], *map(_cell, row[1:])] for row in rows], one) for name, view, rows, one in report.motion_rows]
     return {"motions": motions, "turns": turns}
 
 
@@ -190,14 +190,14 @@ def _cell(number: tuple[str, str]) -> Any:
 def as_json(report: AlignmentReport) -> dict[str, Any]:
     """The result as numbers: motion, labels, noise, covariance, status, warnings, and how it came about."""
     known: dict[str, Any] = {}
-    if report.solved:
-        spread = np.sqrt(np.clip(np.diagonal(report.found.covariance), 0, None))
+    if report.has_motion:
+        spread = np.sqrt(np.clip(np.diagonal(report.arrays.covariance), 0, None))
         spreads = np.split(spread, np.cumsum([part.size for part in report.motion])[:-1])
         known = dict(zip(ascii_uppercase, report.motion, strict=False))
         known |= {
             f"{name}_deviation": part.reshape(known[name].shape) for name, part in zip(ascii_uppercase, spreads, strict=False)
         }
-    unverified = report.found.unverified
+    unverified = report.arrays.unverified
     return {
         "status": report.status,
         "reason": report.reason or None,
@@ -208,14 +208,14 @@ def as_json(report: AlignmentReport) -> dict[str, Any]:
         "sigma": report.sigma,
         "threshold": report.threshold,
         **known,
-        "covariance": report.found.covariance if report.solved else None,
+        "covariance": report.arrays.covariance if report.has_motion else None,
         **_euclidean(report),
         "ambiguity": report.ambiguity,
         "warnings": report.warnings_json,
         "notes": list(report.notes),
         "ids": list(report.ids),
-        "labels": report.found.labels,
-        "velocities": report.found.velocities,
+        "labels": report.arrays.labels,
+        "velocities": report.arrays.velocities,
         "unverified": None if unverified is None else [report.ids[i] for i in np.flatnonzero(unverified)],
         "manifest": report.manifest,
     }
@@ -223,7 +223,7 @@ def as_json(report: AlignmentReport) -> dict[str, Any]:
 
 def _euclidean(report: AlignmentReport) -> dict[str, Any]:
     """Rotations, translations and the normal of the plane, and the other ones that fit as well; nothing without a calibration."""
-    found, names = report.found, ("rotations", "translations", "normal")
+    found, names = report.arrays, ("rotations", "translations", "normal")
     if not report.poses:
         return {}
     other = {name: part.numpy() for name, part in zip(names, found.other_motion, strict=True)}
@@ -232,7 +232,7 @@ def _euclidean(report: AlignmentReport) -> dict[str, Any]:
 
 def labels_csv(report: AlignmentReport) -> str:
     """``id,label,name`` of every match; 0 outlier or missing, 1 static, 2 moving."""
-    rows = zip(map(safe_cell, report.ids), report.found.labels.tolist(), report.kinds, strict=True)
+    rows = zip(map(safe_cell, report.ids), report.arrays.labels.tolist(), report.kinds, strict=True)
     return table_csv(["id", "label", "name"], list(rows))
 
 
@@ -298,7 +298,7 @@ WIDE = 0.62  # height over width of view 1, below which it gets the whole width
 
 def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
     """PNG: view 1, large, with the path of every moving match carried over from the other views; beside it the other views."""
-    kinds = np.array(report.kinds) if report.solved else np.where(report.missing, "missing", "unlabelled")
+    kinds = np.array(report.kinds) if report.has_motion else np.where(report.missing, "missing", "unlabelled")
     colours = {**COLOURS, "unlabelled": theme.muted}
     segments = report.segments
     axes_shown, turned = _axes(report)
@@ -307,7 +307,7 @@ def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
     boxes = [_box(points, kinds) for points in flat]
     if report.photographs:
         boxes = [(-0.5, wide - 0.5, -0.5, tall - 0.5) for wide, tall in (one.size for one in report.photographs)]
-    elif report.solved:
+    elif report.has_motion:
         boxes[0] = _widen_box(boxes[0], report, kinds, axes_shown)
     with style(theme):
         height, places = _layout([(box[3] - box[2]) / (box[1] - box[0]) for box in boxes])
@@ -317,7 +317,7 @@ def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
             panel = figure.add_axes((left / WIDTH, 1 - (top + tall) / height, width / WIDTH, tall / height))
             if report.photographs:
                 draw_photograph(panel, report.photographs[number - 1], theme)
-            if number == 1 and report.solved:
+            if number == 1 and report.has_motion:
                 _draw_paths(panel, report, kinds, axes_shown, box)
             _draw_points(panel, points, kinds, colours, large=number == 1, segments=segments)
             _finish(panel, box, turned)
@@ -332,24 +332,24 @@ def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
 def _layout(ratios: list[float]) -> tuple[float, list[Box]]:
     """Height of the figure, and left, top, width and height of every panel, in inches."""
 
-    def fitted(left: float, top: float, width: float, ratio: float, limit: float) -> Box:
+    def fit_panel(left: float, top: float, width: float, ratio: float, limit: float) -> Box:
         tall = min(limit, max(0.6, width * ratio))
         return left, top, min(width, tall / ratio), tall
 
     room = WIDTH - MARGIN
     half = (room - GAP) / 2
     if len(ratios) == 2:
-        found = [fitted(MARGIN + i * (half + GAP), TITLE, half, ratio, 5.5) for i, ratio in enumerate(ratios)]
+        found = [fit_panel(MARGIN + i * (half + GAP), TITLE, half, ratio, 5.5) for i, ratio in enumerate(ratios)]
     elif ratios[0] < WIDE:
-        first = fitted(MARGIN, TITLE, room, ratios[0], 5.0)
+        first = fit_panel(MARGIN, TITLE, room, ratios[0], 5.0)
         below = first[1] + first[3] + FOOT + TITLE
-        found = [first, *(fitted(MARGIN + i * (half + GAP), below, half, ratio, 4.0) for i, ratio in enumerate(ratios[1:]))]
+        found = [first, *(fit_panel(MARGIN + i * (half + GAP), below, half, ratio, 4.0) for i, ratio in enumerate(ratios[1:]))]
     else:
         large = 0.64 * (room - GAP)
-        found = [fitted(MARGIN, TITLE, large, ratios[0], 6.5)]
+        found = [fit_panel(MARGIN, TITLE, large, ratios[0], 6.5)]
         top = TITLE
         for ratio in ratios[1:]:
-            found.append(fitted(MARGIN + large + GAP, top, room - GAP - large, ratio, 3.2))
+            found.append(fit_panel(MARGIN + large + GAP, top, room - GAP - large, ratio, 3.2))
             top = found[-1][1] + found[-1][3] + FOOT + TITLE
     return max(place[1] + place[3] for place in found) + FOOT + 0.4, found
 
@@ -434,7 +434,7 @@ def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown:
     path = np.stack([report.views[0][moving], *others], axis=1)[..., shown]
     size = max(box[1] - box[0], box[3] - box[2])
     near = np.isfinite(path).all(axis=(1, 2)) & (np.abs(path - path[:, :1]).max(axis=(1, 2), initial=0) < 2 * size)
-    doubtful = np.zeros(len(path), dtype=bool) if report.found.unverified is None else report.found.unverified[moving]
+    doubtful = np.zeros(len(path), dtype=bool) if report.arrays.unverified is None else report.arrays.unverified[moving]
     if (near & doubtful).any():
         look: Any = {"linewidths": 0.9, "alpha": 0.6, "linestyles": (0, (2, 2))}
         panel.add_collection(LineCollection(list(path[near & doubtful]), colors=colour, **look))

@@ -320,7 +320,7 @@ class _Drawing:
         """Whether nothing more should be drawn."""
         return self.weight >= WEIGHT
 
-    def beside(self, found: Hit | ArchivedEvent, model: Any, seconds: float, what: str) -> list[Any]:
+    def draw_pair(self, found: Hit | ArchivedEvent, model: Any, seconds: float, what: str) -> list[Any]:
         """Key frames of what was found, and its film beside that of what it resembles, at the same pace."""
         try:
             clip = self.archive.clip(found.source, found.start - AROUND, found.end + AROUND, found.person)
@@ -350,7 +350,7 @@ def _hit_rows(report: SearchReport) -> list[list[Any]]:
             break
         small = (f"person {hit.person}" * bool(hit.person), "mirrored" * hit.mirrored)
         name = markup('<span class="rank">{number}</span> {who}', number=number, who=_who(hit.source, *small))
-        pictures = drawing.beside(hit, model, lasts, f"hit {number}")
+        pictures = drawing.draw_pair(hit, model, lasts, f"hit {number}")
         rows.append([name, _time(hit.start, hit.end), scores[number - 1], *pictures])
     return rows
 
@@ -457,7 +457,7 @@ def _event_rows(report: FindReport, drawing: _Drawing, events: Sequence[Archived
             return
         clip = _example(report, event)
         model = strip(clip, frames=frames_of(event.end - event.start)) if clip is not None else ""
-        pictures = drawing.beside(event, model, event.end - event.start, str(event.label))
+        pictures = drawing.draw_pair(event, model, event.end - event.start, str(event.label))
         yield [
             _who(event.source, f"person {event.person}" * bool(event.person)),
             _time(event.start, event.end),

@@ -62,17 +62,17 @@ class BodiesReport(LabelledReport):
         return np.asarray(self.there.sum(axis=0) > 1)
 
     @property
-    def known(self) -> NDArray[np.int64] | None:
+    def known_labels(self) -> NDArray[np.int64] | None:
         """``(n,)`` labels that the file has."""
         return self.tracks.known
 
     @property
     def static(self) -> int:
         """The body that stands still; 0 = the data do not say."""
-        return int(self.found.static_body) if int(self.found.static_body) <= self.bodies else 0
+        return int(self.arrays.static_body) if int(self.arrays.static_body) <= self.bodies else 0
 
     @functools.cached_property
-    def told(self) -> list[Notice]:
+    def named_notices(self) -> list[Notice]:
         """The notices, frames by their names: the library numbers them from 0."""
         found = []
         for notice in self.result.notices:
@@ -89,12 +89,12 @@ class BodiesReport(LabelledReport):
     @functools.cached_property
     def warnings(self) -> list[tuple[str, float, str]]:
         """Code, figure and sentence of every notice."""
-        return [(notice.code.value, notice.value, str(notice.text)) for notice in self.told]
+        return [(notice.code.value, notice.value, str(notice.text)) for notice in self.named_notices]
 
     @property
     def reason(self) -> str:
         """Why the data do not decide, and what to do; empty where they do."""
-        return str(dataclasses.replace(self.result, notices=tuple(self.told)).refusal(self.words, Status[self.status]))
+        return str(dataclasses.replace(self.result, notices=tuple(self.named_notices)).refusal(self.words, Status[self.status]))
 
     @functools.cached_property
     def there(self) -> NDArray[np.bool_]:
@@ -104,30 +104,30 @@ class BodiesReport(LabelledReport):
     @property
     def pairs(self) -> NDArray[np.int64]:
         """``(P, 2)`` places of the views that were compared."""
-        return np.asarray(self.found.pairs[(self.found.pairs >= 0).all(axis=-1)])
+        return np.asarray(self.arrays.pairs[(self.arrays.pairs >= 0).all(axis=-1)])
 
     def life(self, label: int) -> tuple[int, int] | None:
         """Places of the first and the last view that show a body; None = none does."""
-        mine = self.there[:, self.found.labels == label].sum(axis=1)
+        mine = self.there[:, self.arrays.labels == label].sum(axis=1)
         alive = np.flatnonzero((mine > 0) & (mine >= min(ALIVE, mine.max(initial=0))))
         return (int(alive[0]), int(alive[-1])) if len(alive) else None
 
     def motion(self, label: int) -> float:
         """Median way of a body's points in the picture, pixels per frame; the camera's own motion is in it."""
-        values = self.tracks.values[:, self.found.labels == label]
-        steps = np.linalg.norm(np.diff(values, axis=0), axis=-1) / self._apart[:, None]
+        values = self.tracks.values[:, self.arrays.labels == label]
+        steps = np.linalg.norm(np.diff(values, axis=0), axis=-1) / self._frame_gaps[:, None]
         steps = steps[np.isfinite(steps)]
         return float(np.median(steps)) if len(steps) else float("nan")
 
     def planar(self, label: int) -> bool | None:
         """Whether most pairs of views see a body as a plane, or under a rotation; None where no pair shows it."""
-        shown = np.abs(self.found.geometries[:, label - 1]).sum(axis=(1, 2)) > 0
-        flat = self.found.planar[:, label - 1]
+        shown = np.abs(self.arrays.geometries[:, label - 1]).sum(axis=(1, 2)) > 0
+        flat = self.arrays.planar[:, label - 1]
         shown |= flat
         return bool(flat[shown].mean() > 0.5) if shown.any() else None
 
     @functools.cached_property
-    def _apart(self) -> FloatArray:
+    def _frame_gaps(self) -> FloatArray:
         """Frames between a view and the next."""
         numbers = self.tracks.views
         if self.tracks.by_time or not all(re.fullmatch(r"-?\d+", name) for name in numbers):
@@ -160,7 +160,7 @@ def rows_of(report: BodiesReport) -> list[list[str]]:
         life, flat = report.life(label), report.planar(label)
         names = "" if life is None else f"{report.tracks.views[life[0]]} to {report.tracks.views[life[1]]}"
         figures = [f"{mine.sum():,}", share(int(mine.sum()), int(report.present.sum())), names, moved[label - 1], noise[label - 1]]
-        rows.append([*figures, f"{int((mine & report.doubtful).sum()):,}", "" if flat is None else GEOMETRY[flat]])
+        rows.append([*figures, f"{int((mine & report.is_doubtful).sum()):,}", "" if flat is None else GEOMETRY[flat]])
     return rows
 
 
@@ -199,7 +199,7 @@ def page_values(report: BodiesReport) -> dict[str, Any]:
 
 def _span(report: BodiesReport, label: int) -> Any:
     """How many tracks of a body each frame shows, as a small outline below the frames' names."""
-    mine = report.there[:, report.found.labels == label].sum(axis=1)
+    mine = report.there[:, report.arrays.labels == label].sum(axis=1)
     most, views = max(1, int(mine.max(initial=0))), len(mine)
     edge = " ".join(f"{100 * i / max(1, views - 1):.1f},{8 - 8 * n / most:.1f}" for i, n in enumerate(mine.tolist()))
     return markup(
@@ -211,7 +211,7 @@ def _span(report: BodiesReport, label: int) -> Any:
 
 def as_npz(report: BodiesReport) -> bytes:
     """All arrays, without pickle; ``tracks, ids, frames`` are those that were given."""
-    found, bodies = report.found, report.bodies
+    found, bodies = report.arrays, report.bodies
     compared = (found.pairs >= 0).all(axis=-1)
     arrays: dict[str, Any] = {name: getattr(found, name) for name in ("labels", "residuals", "threshold")}
     arrays |= {name: getattr(found, name)[compared][:, :bodies] for name in ("geometries", "homographies", "planar")}
@@ -244,11 +244,11 @@ def as_json(report: BodiesReport) -> dict[str, Any]:
         "bodies": bodies,
         "static_body": report.static or None,
         "counts": report.counts,
-        "doubtful": int(report.doubtful.sum()),
+        "doubtful": int(report.is_doubtful.sum()),
         "pairs": [[views[a], views[b]] for a, b in report.pairs.tolist()],
         "rms_residual": report.rms(),
-        "threshold": float(report.found.threshold),
-        "misclassified": report.misclassified,
+        "threshold": float(report.arrays.threshold),
+        "misclassified": report.misclassification,
         "warnings": report.warnings_json,
         "notes": list(report.notes),
         "manifest": report.manifest,
@@ -263,8 +263,8 @@ def labels_csv(report: BodiesReport) -> str:
         seen = np.flatnonzero(report.there[:, i])
         lived = [len(seen), views[seen[0]], views[seen[-1]]] if len(seen) else [0, "", ""]
         short = kind == "too short"
-        figures = ["" if short else f"{sure:.4f}", "" if short or not report.bodies else f"{report.found.residuals[i]:.6g}"]
-        rows.append([safe_cell(name), int(report.found.labels[i]), kind, *figures, *lived])
+        figures = ["" if short else f"{sure:.4f}", "" if short or not report.bodies else f"{report.arrays.residuals[i]:.6g}"]
+        rows.append([safe_cell(name), int(report.arrays.labels[i]), kind, *figures, *lived])
     return table_csv(["id", "label", "name", "probability", "residual", "frames", "first", "last"], rows)
 
 
@@ -278,7 +278,7 @@ def tracks_csv(report: BodiesReport) -> str:
         moment = [f"{tracks.times[view]:.6g}"] if tracks.times is not None and timed else []
         for i in np.flatnonzero(there).tolist():
             x, y = tracks.values[view, i, :2]
-            rows.append([name, *moment, safe_cell(tracks.ids[i]), f"{x:.4f}", f"{y:.4f}", int(report.found.labels[i])])
+            rows.append([name, *moment, safe_cell(tracks.ids[i]), f"{x:.4f}", f"{y:.4f}", int(report.arrays.labels[i])])
     head = ["time" if tracks.by_time else "frame", *(["time"] if timed else []), *head[1:]]
     return table_csv(head, rows)
 
@@ -359,10 +359,10 @@ def _draw(panel: Any, report: BodiesReport, view: int, theme: Theme) -> None:
     part = report.tracks.values[max(0, view - tail) : view + 1, :, :2]
     here = np.isfinite(part[-1]).all(axis=-1) & report.present
     size = float(np.clip(3000 / max(1, int(here.sum())), 3, 16))
-    strays = part[-1, here & (report.found.labels == 0)]
+    strays = part[-1, here & (report.arrays.labels == 0)]
     panel.scatter(*strays.T, s=0.8 * size, c=theme.muted, marker="x", linewidth=0.8, alpha=0.65, zorder=2)
     for label in range(1, report.bodies + 1):
-        mine = np.flatnonzero(here & (report.found.labels == label))
+        mine = np.flatnonzero(here & (report.arrays.labels == label))
         mine = mine[np.linspace(0, len(mine) - 1, min(len(mine), DRAWN)).round().astype(int)]
         ways = [path[np.isfinite(path).all(axis=1)] for path in part[:, mine].transpose(1, 0, 2)]
         lines = LineCollection(ways, colors=colour_of(label), linewidths=0.8, alpha=0.55, zorder=2 + label)

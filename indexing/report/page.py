@@ -66,7 +66,7 @@ class Picture:
         return round(width / PIXEL_RATIO), round(height / PIXEL_RATIO)
 
     @property
-    def least(self) -> int:
+    def min_width(self) -> int:
         """CSS pixels of its width below which its small print is lost: wide pictures scroll rather than shrink to dust."""
         width = self.size[0]
         return min(width, 680) if width <= 1100 else round(0.85 * width)
@@ -107,7 +107,7 @@ class ResultReport:
     """The heading where the data decide, and where they do not."""
 
     @functools.cached_property
-    def found(self) -> SimpleNamespace:
+    def arrays(self) -> SimpleNamespace:
         """The result's fields, tensors as numpy arrays."""
         values = {each.name: getattr(self.result, each.name) for each in fields(self.result)}
         return SimpleNamespace(**{name: value.numpy() if hasattr(value, "numpy") else value for name, value in values.items()})

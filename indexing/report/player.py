@@ -30,6 +30,8 @@ FOUND, KNOWN, HELD = range(3)  # kinds of bars of the strip
 
 TYPICAL_SECONDS = 600.0  # of one person, or of all together, that the coordinates of a page are for
 MAX_VALUES = 1_000_000  # coordinates of a page, whatever the length
+TYPICAL_VALUES = 300_000  # of all players of a page of a typical length: about a byte each, 0.4 MB of text
+FURTHER_VALUES = 100.0  # for each second beyond; as many as fit three poses a second of 17 joints
 EVENT_MARGIN_SECONDS = 0.5  # before and after an event that count as at it
 MAX_GAP_SECONDS = 0.5  # without a pose, more than lie between two on purpose, in which nobody is drawn
 GRID_STEPS = 240.0  # in a person's height: a joint is shown within a fifth of a percent of it
@@ -39,16 +41,6 @@ POSE_RATES = ((15.0, 15.0), (12.5, 12.5), (10.0, 10.0), (10.0, 5.0), (8.0, 3.0),
 """Poses per second at events and between them: the first that fit are used, and of the last as many as do."""
 MAX_BARS = 3000  # of the strip of a recording
 WIDE_SCENE = 4.0  # times a person's height, and twice what people need at one time: where it is wider, the picture follows them
-
-
-@dataclass(frozen=True)
-class PlayerOptions:
-    """How much of recordings a page holds, and how finely."""
-
-    values: int = 300_000
-    """Coordinates of all players of a page together at most: about a byte each, 0.4 MB of text."""
-    further: float = 100.0
-    """Coordinates for each second beyond; as many as fit three poses a second of 17 joints."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +69,7 @@ class _Part:
         np.add.at(steps, last, -1)
         return cls(recording, clip, np.cumsum(steps[:-1]) > 0)
 
-    def kept(self, rates: tuple[float, float]) -> Array:
+    def select_frames(self, rates: tuple[float, float]) -> Array:
         """The frames that are shown at these rates; the first and the last are."""
         rate = np.where(self.busy, *rates)
         steps = np.minimum(np.diff(self.clip.times) * rate[1:], 1.0)
@@ -100,45 +92,40 @@ class _Part:
         return found
 
 
-def players(
-    groups: Sequence[Sequence[RecordingResult]], report: RecognitionReport, options: PlayerOptions | None = None
-) -> list[Player | None]:
+def players(groups: Sequence[Sequence[RecordingResult]], report: RecognitionReport) -> list[Player | None]:
     """A player for each recording, person by person; ``None`` where there are no joints to show."""
-    options = options or PlayerOptions()
-    parts = [_parts(people, options) for people in groups]
-    rates, share = _rates([part for several in parts for part in several], options)
-    examples = _Examples(report, options)
-    return [_player(several, rates, share, examples, options) if several else None for several in parts]
+    parts = [_parts(people) for people in groups]
+    rates, share = _rates([part for several in parts for part in several])
+    examples = _Examples(report)
+    return [_player(several, rates, share, examples) if several else None for several in parts]
 
 
-def _parts(people: Sequence[RecordingResult], options: PlayerOptions) -> list[_Part]:
+def _parts(people: Sequence[RecordingResult]) -> list[_Part]:
     spans = [(event.start, event.end) for one in people for event in one.events]
     spans += [(start, end) for one in people for _, start, end in one.truth or ()]
     shown = [(one, one.clip) for one in people if one.clip is not None and one.clip.seen.any()]
     return [_Part.of(one, clip, spans, EVENT_MARGIN_SECONDS) for one, clip in shown]
 
 
-def _rates(parts: Sequence[_Part], options: PlayerOptions) -> tuple[tuple[float, float], float]:
+def _rates(parts: Sequence[_Part]) -> tuple[tuple[float, float], float]:
     """Poses per second that fit into a page, and the share of them that does where even the fewest are too many."""
     lasts = sum(float(np.minimum(np.diff(part.clip.times), 1.0).sum()) for part in parts)
-    room = min(MAX_VALUES, options.values + options.further * max(0.0, lasts - TYPICAL_SECONDS))
+    room = min(MAX_VALUES, TYPICAL_VALUES + FURTHER_VALUES * max(0.0, lasts - TYPICAL_SECONDS))
     for rates in POSE_RATES:
-        needed = sum(2 * part.clip.joints.shape[1] * len(part.kept(rates)) for part in parts)
+        needed = sum(2 * part.clip.joints.shape[1] * len(part.select_frames(rates)) for part in parts)
         if needed <= room:
             return rates, 1.0
     return POSE_RATES[-1], room / needed
 
 
-def _player(
-    parts: Sequence[_Part], rates: tuple[float, float], share: float, examples: _Examples, options: PlayerOptions
-) -> Player:
-    kept = [part.kept(rates) for part in parts]
+def _player(parts: Sequence[_Part], rates: tuple[float, float], share: float, examples: _Examples) -> Player:
+    kept = [part.select_frames(rates) for part in parts]
     if share < 1:
         kept = [frames[np.unique(np.linspace(0, len(frames) - 1, max(2, int(share * len(frames)))).astype(int))] for frames in kept]
     rates = (rates[0] * share, rates[1] * share)
     joints = [part.joints[frames] for part, frames in zip(parts, kept, strict=True)]
     unit = max(float(np.nanmedian([_height(one) for one in joints])), 1e-9) / GRID_STEPS
-    view, middle = _view(joints, [part.clip.times[one] for part, one in zip(parts, kept, strict=True)], unit, options)
+    view, middle = _view(joints, [part.clip.times[one] for part, one in zip(parts, kept, strict=True)], unit)
     people = []
     for part, frames, places in zip(parts, kept, joints, strict=True):
         times = np.round(1000 * part.clip.times[frames]).astype(np.int64)
@@ -193,8 +180,8 @@ def _bars(recording: RecordingResult) -> list[tuple[Any, int]]:
 class _Examples:
     """The examples that events are shown beside, each packed once."""
 
-    def __init__(self, report: RecognitionReport, options: PlayerOptions) -> None:
-        self.report, self.options = report, options
+    def __init__(self, report: RecognitionReport) -> None:
+        self.report = report
         self.drawn: list[dict[str, Any]] = []
         self.numbers: dict[int, int] = {}
 
@@ -205,15 +192,15 @@ class _Examples:
             return -1
         if id(clip) not in self.numbers and len(self.drawn) < MAX_EXAMPLES:
             self.numbers[id(clip)] = len(self.drawn)
-            self.drawn.append(self._packed(clip))
+            self.drawn.append(self._pack(clip))
         return self.numbers.get(id(clip), -1)
 
-    def _packed(self, clip: Clip) -> dict[str, Any]:
+    def _pack(self, clip: Clip) -> dict[str, Any]:
         frames = np.unique(np.linspace(0, len(clip) - 1, min(len(clip), MAX_EXAMPLE_POSES)).round().astype(int))
         part = _Part(RecordingResult("", clip, clip.times, (), np.zeros((len(clip), 0))), clip, np.zeros(len(clip), bool))
         joints = part.joints[frames]
         unit = max(_height(joints), 1e-9) / GRID_STEPS
-        view, middle = _view([joints], [clip.times[frames]], unit, self.options)
+        view, middle = _view([joints], [clip.times[frames]], unit)
         lasts = 1000 * clip.duration * len(clip) / max(1, len(clip) - 1)
         return {
             "joints": _text(pack_joints(joints, unit, middle)), "skeleton": _skeleton(clip), "view": view,
@@ -277,7 +264,7 @@ def _height(joints: Array) -> float:
     return float(np.median(size.max(axis=1)))
 
 
-def _view(joints: Sequence[Array], times: Sequence[Array], unit: float, options: PlayerOptions) -> tuple[list[float], Array]:
+def _view(joints: Sequence[Array], times: Sequence[Array], unit: float) -> tuple[list[float], Array]:
     """Width and height of the picture in steps of the grid, whether it follows people (1) or stands (0); and its middle."""
     every = np.concatenate([one.reshape(-1, 2) for one in joints])
     every = every[np.isfinite(every).all(axis=1)]

@@ -74,28 +74,28 @@ class ReconstructionReport(ResultReport):
     @functools.cached_property
     def labels(self) -> NDArray[np.int64]:
         """``(n,)`` 0 outlier or not found, 1 static, 2 moving; of two bodies 1 and 2."""
-        labels = self.found.labels
+        labels = self.arrays.labels
         return np.asarray(labels.clip(max=1) if self.result.motion.static and self.bodies == 1 else labels)
 
     @functools.cached_property
     def velocities(self) -> FloatArray | None:
         """``(n, d)`` per unit of the times; None = the model has none."""
-        return suppress_rounding(self.found.velocities, self.found.points, float(np.ptp(self.found.times)))
+        return suppress_rounding(self.arrays.velocities, self.arrays.points, float(np.ptp(self.arrays.times)))
 
     @functools.cached_property
     def positions(self) -> FloatArray:
         """``(views, n, d)`` at the times of the views; of two bodies the points, each in the frame of its body."""
-        return np.stack([self.result.at(float(moment)).numpy() for moment in self.found.times])
+        return np.stack([self.result.at(float(moment)).numpy() for moment in self.arrays.times])
 
     @property
     def residual(self) -> float:
         """Rms reprojection error."""
-        return float(self.found.residual)
+        return float(self.arrays.residual)
 
     @property
     def sigma(self) -> float:
         """Noise of one coordinate."""
-        return float(self.found.sigma)
+        return float(self.arrays.sigma)
 
     @property
     def poses(self) -> dict[str, Any]:
@@ -119,22 +119,22 @@ class ReconstructionReport(ResultReport):
     def single(self) -> int:
         """How many observations of points that fit do not."""
         given = np.isfinite(self.tracks.values).all(axis=-1)
-        return int((given & ~self.found.inliers)[:, self.labels > 0].sum())
+        return int((given & ~self.arrays.inliers)[:, self.labels > 0].sum())
 
     @property
-    def solved(self) -> bool:
+    def has_scene(self) -> bool:
         """Whether there is a scene at all, good or doubtful."""
-        return bool(np.isfinite(self.found.cameras).all() and np.abs(self.found.cameras).max() > 0 and self.placed.any())
+        return bool(np.isfinite(self.arrays.cameras).all() and np.abs(self.arrays.cameras).max() > 0 and self.has_position.any())
 
     @property
     def drawable(self) -> bool:
         """Whether there is a scene worth a picture: of one that the data do not decide, it would only mislead."""
-        return self.solved and self.status == "OK"
+        return self.has_scene and self.status == "OK"
 
     @property
-    def placed(self) -> NDArray[np.bool_]:
+    def has_position(self) -> NDArray[np.bool_]:
         """``(n,)`` points with a position."""
-        return np.asarray(np.isfinite(self.found.points).all(axis=1))
+        return np.asarray(np.isfinite(self.arrays.points).all(axis=1))
 
     @property
     def times(self) -> FloatArray:
@@ -146,12 +146,12 @@ class ReconstructionReport(ResultReport):
     def kinds(self) -> list[str]:
         """What each point is: outlier, static, moving (or body 1, body 2), or missing, where too few views show it."""
         names = np.array(LABELS[self.bodies > 1])
-        kinds = np.where(self.placed, names[self.labels], "outlier")
+        kinds = np.where(self.has_position, names[self.labels], "outlier")
         given = np.isfinite(self.tracks.values).all(axis=2)
         seen = (given if self.tracks.weights is None else given & (self.tracks.weights > 0)).sum(axis=0)
         # no more coordinates than the unknowns of a point fit any camera, and so place none
-        few = seen * self.tracks.values.shape[2] <= self.found.structure.shape[1] - 1
-        return [str(kind) for kind in np.where(few & ~self.placed, "missing", kinds)]
+        few = seen * self.tracks.values.shape[2] <= self.arrays.structure.shape[1] - 1
+        return [str(kind) for kind in np.where(few & ~self.has_position, "missing", kinds)]
 
     @property
     def counts(self) -> dict[str, int]:
@@ -175,7 +175,7 @@ def describe(report: ReconstructionReport) -> str:
         said = any(message in report.reason for _, _, message in report.warnings)  # then it is in the list that follows
         start = f"The {number:,} tracks through {views} views do not decide what the scene is."
         start += "" if said else f" {sentence(report.reason)}"
-        return start + " The numbers are those of the best scene found, and not to be relied on." * report.solved
+        return start + " The numbers are those of the best scene found, and not to be relied on." * report.has_scene
     verbs = {"static": "stand still", "moving": "move", "outlier": "do not fit", "missing": "are seen too rarely"}
     parts = [f"{many:,} {verbs.get(name, f'are on {name}')}" for name, many in counts.items() if many]
     return f"Of {number:,} points tracked through {views} views, {', '.join(parts)}. {PURPOSE.get(report.motion, '')}"
@@ -184,7 +184,7 @@ def describe(report: ReconstructionReport) -> str:
 @register_page(ReconstructionReport, "reconstruction", FILES)
 def summarize(report: ReconstructionReport) -> Summary:
     """Everything that is said of a reconstruction."""
-    counts, known, failed = report.counts, report.solved, left_out(report)
+    counts, known, failed = report.counts, report.has_scene, left_out(report)
     row: list[object] = [report.motion, len(report.tracks.views), len(report.tracks.ids)]
     row += [number if known or name == "missing" else "" for name, number in counts.items()]
     row += [f"{report.residual:.3g}" if known else "", report.state]
@@ -218,13 +218,13 @@ def page_values(report: ReconstructionReport) -> dict[str, Any]:
         for one in fitted
     ]
     views, cameras = [], []
-    for i, name in enumerate(report.tracks.views if report.solved else ()):
+    for i, name in enumerate(report.tracks.views if report.has_scene else ()):
         seen = np.isfinite(report.tracks.values[i]).all(axis=1)
-        residuals = report.found.residuals[i]
-        used = report.found.inliers[i] & np.isfinite(residuals)
+        residuals = report.arrays.residuals[i]
+        used = report.arrays.inliers[i] & np.isfinite(residuals)
         rms = f"{float(np.sqrt(np.mean(np.square(residuals[used])))):.3g}" if used.any() else ""
         views.append([name, f"{report.times[i]:.6g}", f"{seen.sum():,}", f"{(seen & ~used).sum():,}", rms])
-        cameras.append([name, matrix(report.found.cameras[i])])
+        cameras.append([name, matrix(report.arrays.cameras[i])])
     return {"models": models, "views": views, "cameras": cameras, "left_out": left_out(report), "moves": moves(report)}
 
 
@@ -236,7 +236,7 @@ def moves(report: ReconstructionReport) -> bool:
 def as_npz(report: ReconstructionReport) -> bytes:
     """All arrays, without pickle: cameras, points, velocities, labels, residuals, inliers, structure, projections, times, ids, and
     ``first_time``, the time in the files of the first view, which ``times`` count from."""
-    arrays: dict[str, Any] = {name: getattr(report.found, name) for name in ARRAYS}
+    arrays: dict[str, Any] = {name: getattr(report.arrays, name) for name in ARRAYS}
     arrays |= {"labels": report.labels, "times": report.times, "tracks": report.tracks.values, "ids": np.array(report.tracks.ids)}
     arrays |= {} if report.velocities is None else {"velocities": report.velocities}
     arrays |= {name: np.asarray(value) for name, value in report.poses.items()}
@@ -254,10 +254,10 @@ def as_json(report: ReconstructionReport) -> dict[str, Any]:
         "first_time": report.tracks.start,
         "tracks": len(report.tracks.ids),
         "counts": report.counts,
-        "residual": report.residual if report.solved else None,
-        "sigma": report.sigma if report.solved else None,
+        "residual": report.residual if report.has_scene else None,
+        "sigma": report.sigma if report.has_scene else None,
         "threshold": report.threshold,
-        "cameras": report.found.cameras if report.solved else None,
+        "cameras": report.arrays.cameras if report.has_scene else None,
         "ambiguity": report.ambiguity,
         **report.poses,
         "candidates": [
@@ -280,10 +280,10 @@ def suppress_rounding(velocities: FloatArray | None, points: FloatArray, span: f
 
 def points_csv(report: ReconstructionReport) -> str:
     """``id, label, name``, position at the first view, velocity, number of views that count, and rms residual of every point."""
-    points, residuals = report.found.points, report.found.residuals
+    points, residuals = report.arrays.points, report.arrays.residuals
     axes = "xyz"[: points.shape[1]]
     velocities = np.full_like(points, np.nan) if report.velocities is None else report.velocities
-    counted = np.where(report.found.inliers & np.isfinite(residuals), residuals, np.nan)
+    counted = np.where(report.arrays.inliers & np.isfinite(residuals), residuals, np.nan)
     seen = np.isfinite(counted).sum(axis=0)
     rms = np.sqrt(np.nansum(np.square(counted), axis=0) / np.maximum(seen, 1))
     rows: list[list[Any]] = []
@@ -355,8 +355,8 @@ def nearest_frame(report: ReconstructionReport) -> FloatArray:
     """Positions ``(views, n, d)`` carried by the affinity that brings the first ones nearest to their images in the first
     view."""
     image = report.tracks.values[0, :, :2]
-    fits = np.isfinite(image).all(axis=1) & report.placed & (report.labels > 0)
-    dim = report.found.points.shape[1]
+    fits = np.isfinite(image).all(axis=1) & report.has_position & (report.labels > 0)
+    dim = report.arrays.points.shape[1]
     if fits.sum() < dim + 1:
         return report.positions
     start = report.positions[0, fits]
@@ -378,8 +378,8 @@ def nearest_frame(report: ReconstructionReport) -> FloatArray:
 
 def _depth_order(report: ReconstructionReport, fits: NDArray[np.bool_], depth: FloatArray) -> float:
     """Whether a coordinate grows with the depth in the first view; no telling up to a collineation, but nearly always right."""
-    camera = report.found.cameras[0]
-    w = report.found.points[fits] @ camera[-1, :-1] + camera[-1, -1]
+    camera = report.arrays.cameras[0]
+    w = report.arrays.points[fits] @ camera[-1, :-1] + camera[-1, -1]
     return float(np.nan_to_num(np.sign(w.mean()) * np.cov(w, depth)[0, 1]))
 
 
@@ -518,7 +518,7 @@ def as_first_camera(report: ReconstructionReport) -> FloatArray | None:
     where no scene was decided on."""
     if not report.drawable or report.velocities is None:
         return None
-    camera = report.found.cameras[0]
+    camera = report.arrays.cameras[0]
     rays = report.positions @ camera[:, :-1].T + camera[:, -1]
     with np.errstate(divide="ignore", invalid="ignore"):
         seen: FloatArray = rays[..., :-1] / rays[..., -1:]

@@ -58,14 +58,14 @@ class LabelledReport(ResultReport):
         raise NotImplementedError
 
     @property
-    def known(self) -> NDArray[np.int64] | None:
+    def known_labels(self) -> NDArray[np.int64] | None:
         """``(n,)`` labels that the file has; None where it has none."""
         raise NotImplementedError
 
     @property
     def bodies(self) -> int:
         """How many bodies."""
-        return int(self.found.bodies)
+        return int(self.arrays.bodies)
 
     @property
     def status(self) -> str:
@@ -81,7 +81,7 @@ class LabelledReport(ResultReport):
     @property
     def kinds(self) -> list[str]:
         """What each point is: one of the names, or absent."""
-        labels, present = self.found.labels.tolist(), self.present.tolist()
+        labels, present = self.arrays.labels.tolist(), self.present.tolist()
         return [self.names[label] if there else self.ABSENT for label, there in zip(labels, present, strict=True)]
 
     @functools.cached_property
@@ -93,22 +93,22 @@ class LabelledReport(ResultReport):
     @property
     def certainty(self) -> FloatArray:
         """``(n,)`` probability of the label of each point; NaN where it is absent."""
-        own = np.take_along_axis(self.found.probabilities, self.found.labels[:, None], axis=1)[:, 0]
+        own = np.take_along_axis(self.arrays.probabilities, self.arrays.labels[:, None], axis=1)[:, 0]
         return np.where(self.present, own, np.nan)
 
     @property
-    def doubtful(self) -> NDArray[np.bool_]:
+    def is_doubtful(self) -> NDArray[np.bool_]:
         """``(n,)`` points that might well have another label."""
         return np.asarray(self.certainty < SURE)
 
     def of(self, label: int) -> NDArray[np.bool_]:
         """``(n,)`` the points with a label."""
-        return np.asarray(self.present & (self.found.labels == label))
+        return np.asarray(self.present & (self.arrays.labels == label))
 
     def rms(self, label: int | None = None) -> float:
         """Root mean square of the residuals of one body, or of all; NaN where there are no points."""
-        mine = self.present & (self.found.labels > 0) if label is None else self.of(label)
-        return float(np.sqrt(np.mean(np.square(self.found.residuals[mine])))) if mine.any() else float("nan")
+        mine = self.present & (self.arrays.labels > 0) if label is None else self.of(label)
+        return float(np.sqrt(np.mean(np.square(self.arrays.residuals[mine])))) if mine.any() else float("nan")
 
     def rms_text(self, label: int | None = None) -> str:
         """The same in three digits, empty where there are no points."""
@@ -116,37 +116,37 @@ class LabelledReport(ResultReport):
         return f"{value:.3g}" if np.isfinite(value) else ""
 
     @property
-    def misclassified(self) -> float | None:
+    def misclassification(self) -> float | None:
         """Share of the points that are not labelled as the file says, whatever the bodies' numbers; None where it does not say."""
-        if self.known is None or not self.bodies:
+        if self.known_labels is None or not self.bodies:
             return None
         import torch
 
         from dyntorch import metrics
 
-        known, present = torch.from_numpy(self.known), torch.from_numpy(self.present)
+        known, present = torch.from_numpy(self.known_labels), torch.from_numpy(self.present)
         return float(metrics.misclassification(self.result.labels[present], known[present]))
 
     @property
     def values(self) -> dict[str, Any]:
         """What the templates of all such reports show: doubtful points, known labels, the residual."""
-        doubtful = ["doubtful" if odd else "" for odd in self.doubtful.tolist()]
-        return {"doubtful": doubtful, "compared": self.compared, "rms": self.rms_text(), "share": share}
+        doubtful = ["doubtful" if odd else "" for odd in self.is_doubtful.tolist()]
+        return {"doubtful": doubtful, "compared": self.confusion_rows, "rms": self.rms_text(), "share": share}
 
     @property
     def errors(self) -> list[str]:
         """How many labels are wrong, in a sentence, where the file has labels."""
-        wrong = self.misclassified
+        wrong = self.misclassification
         return [] if wrong is None else [f"misclassified: {100 * wrong:.2f} % against the labels of the file"]
 
     @property
-    def compared(self) -> list[list[str]]:
+    def confusion_rows(self) -> list[list[str]]:
         """A row for every body that the file knows: its name, and how many of its points were found to be of which body."""
-        if self.known is None or not self.bodies:
+        if self.known_labels is None or not self.bodies:
             return []
         rows = []
-        for label in sorted(np.unique(self.known[self.present]).tolist(), key=lambda label: (label == 0, label)):
-            of = self.found.labels[self.present & (self.known == label)]
+        for label in sorted(np.unique(self.known_labels[self.present]).tolist(), key=lambda label: (label == 0, label)):
+            of = self.arrays.labels[self.present & (self.known_labels == label)]
             cells = [int((of == i).sum()) for i in (*range(1, self.bodies + 1), 0)]
             rows.append([f"body {label}" if label else "outlier", *(f"{cell:,}" if cell else "" for cell in cells)])
         return rows
@@ -226,17 +226,17 @@ class SegmentationReport(LabelledReport):
         return self.pair.seen
 
     @property
-    def known(self) -> NDArray[np.int64] | None:
+    def known_labels(self) -> NDArray[np.int64] | None:
         """``(n,)`` labels that the file has."""
         return self.pair.known
 
     @property
     def models(self) -> list[str]:
         """What each body's motion is: fundamental or homography."""
-        return [str(model) for model in self.found.models[: self.bodies]]
+        return [str(model) for model in self.arrays.models[: self.bodies]]
 
     @property
-    def seen(self) -> int:
+    def num_present(self) -> int:
         """How many matches are there in both images."""
         return int(self.present.sum())
 
@@ -251,7 +251,7 @@ def describe(report: SegmentationReport) -> str:
 @register_page(SegmentationReport, "segmentation", FILES)
 def summarize(report: SegmentationReport) -> Summary:
     """Everything that is said of a segmentation."""
-    number, counts = report.seen, report.counts
+    number, counts = report.num_present, report.counts
     noise = even([report.rms(label) for label in range(1, len(report.models) + 1)])
     rows: list[list[object]] = []
     for label, model in enumerate(report.models, start=1):
@@ -277,17 +277,17 @@ def page_values(report: SegmentationReport) -> dict[str, Any]:
     for label, model in enumerate(report.models, start=1):
         mine = report.of(label)
         dot = '<span class="drawn" style="color:{colour}" aria-hidden="true">●</span> body {label}'
-        figures = [f"{mine.sum():,}", share(int(mine.sum()), report.seen), report.rms_text(label)]
-        doubtful = f"{int((mine & report.doubtful).sum()):,}"
+        figures = [f"{mine.sum():,}", share(int(mine.sum()), report.num_present), report.rms_text(label)]
+        doubtful = f"{int((mine & report.is_doubtful).sum()):,}"
         bodies.append([markup(dot, colour=colour_of(label), label=label), *figures, doubtful, MOTION.get(model, model)])
-        found = report.found.homographies if model == "homography" else report.found.fundamentals
+        found = report.arrays.homographies if model == "homography" else report.arrays.fundamentals
         matrices.append([f"body {label}", model, matrix(found[label - 1])])
     return {**report.values, "bodies": bodies, "matrices": matrices}
 
 
 def as_npz(report: SegmentationReport) -> bytes:
     """All arrays, without pickle; ``x1, x2, ids, known`` are those that were given."""
-    found, bodies = report.found, report.bodies
+    found, bodies = report.arrays, report.bodies
     arrays: dict[str, Any] = {name: getattr(found, name) for name in ("labels", "residuals", "coherence", "threshold")}
     arrays |= {name: getattr(found, name)[:bodies] for name in ("fundamentals", "homographies")}
     arrays |= {"probabilities": found.probabilities[:, : bodies + 1], "models": np.array(report.models, dtype=np.str_)}
@@ -301,11 +301,11 @@ def as_json(report: SegmentationReport) -> dict[str, Any]:
         {
             "label": label,
             "matches": report.counts[f"body {label}"],
-            "share": report.counts[f"body {label}"] / max(1, report.seen),
+            "share": report.counts[f"body {label}"] / max(1, report.num_present),
             "model": model,
             "rms_residual": report.rms(label),
-            "fundamental": report.found.fundamentals[label - 1],
-            "homography": report.found.homographies[label - 1] if model == "homography" else None,
+            "fundamental": report.arrays.fundamentals[label - 1],
+            "homography": report.arrays.homographies[label - 1] if model == "homography" else None,
         }
         for label, model in enumerate(report.models, start=1)
     ]
@@ -316,10 +316,10 @@ def as_json(report: SegmentationReport) -> dict[str, Any]:
         "matches": len(report.pair.ids),
         "bodies": bodies,
         "counts": report.counts,
-        "doubtful": int(report.doubtful.sum()),
+        "doubtful": int(report.is_doubtful.sum()),
         "rms_residual": report.rms(),
-        "threshold": float(report.found.threshold),
-        "misclassified": report.misclassified,
+        "threshold": float(report.arrays.threshold),
+        "misclassified": report.misclassification,
         "warnings": report.warnings_json,
         "notes": list(report.notes),
         "manifest": report.manifest,
@@ -332,9 +332,9 @@ def labels_csv(report: SegmentationReport) -> str:
     columns = zip(report.pair.ids, report.pair.x1, report.pair.x2, report.kinds, report.certainty, strict=True)
     for i, (name, first, second, kind, sure) in enumerate(columns):
         places = [f"{value:.9g}" if np.isfinite(value) else "" for value in (*first, *second)]
-        residual = f"{report.found.residuals[i]:.6g}" if report.bodies else ""
+        residual = f"{report.arrays.residuals[i]:.6g}" if report.bodies else ""
         rest = ["", ""] if kind == "missing" else [f"{sure:.4f}", residual]
-        rows.append([safe_cell(name), *places, int(report.found.labels[i]), kind, *rest])
+        rows.append([safe_cell(name), *places, int(report.arrays.labels[i]), kind, *rest])
     return table_csv(["id", "x1", "y1", "x2", "y2", "label", "name", "probability", "residual"], rows)
 
 
@@ -355,7 +355,7 @@ def picture_of(report: SegmentationReport, theme: Theme = LIGHT) -> bytes:
     places = (report.pair.x1, report.pair.x2)
     photographs: list[Photograph | None] = [*report.photographs] or [None, None]
     boxes = [_box(report, i) for i in range(2)]
-    size = float(np.clip(4500 / max(1, len(report.found.labels)), 5, 20))
+    size = float(np.clip(4500 / max(1, len(report.arrays.labels)), 5, 20))
     with style(theme):
         figure, panels = _panels(boxes, bool(report.photographs))
         for i, (panel, points, photograph, box) in enumerate(zip(panels, places, photographs, boxes, strict=True)):
@@ -382,9 +382,9 @@ def _box(report: SegmentationReport, which: int) -> Box:
     if size is not None:
         return np.array([-0.5, -0.5]), np.array(size) - 0.5
     places = np.stack([report.pair.x1, report.pair.x2])
-    low, high = limits(places[:, report.found.labels > 0])
+    low, high = limits(places[:, report.arrays.labels > 0])
     every = limits(places[:, report.pair.seen], STRAYS)
-    if (report.found.labels > 0).any():
+    if (report.arrays.labels > 0).any():
         every = np.minimum(low, every[0]), np.maximum(high, every[1])
     sides = every[1] - every[0]
     room = np.maximum(0, SLIM * sides.max() - sides) / 2

@@ -29,7 +29,7 @@ COLOURS = {1: "#2f7fb8", -1: "#e8741e"}
 class StaticReport:
     """Everything that the report on a database says."""
 
-    found: StaticPoints
+    static: StaticPoints
     written: str = ""
     masks: str = ""
     photographs: Mapping[int, Photograph] = field(default_factory=dict)
@@ -40,48 +40,48 @@ class StaticReport:
     @property
     def title(self) -> str:
         """Heading of the page."""
-        return self.heading or ("What stands still" if self.found.ok else "The matches do not decide what stands still")
+        return self.heading or ("What stands still" if self.static.ok else "The matches do not decide what stands still")
 
     @property
     def refusal(self) -> str | None:
         """Why the matches do not decide; None where they do."""
-        return None if self.found.ok else self.found.reason
+        return None if self.static.ok else self.static.reason
 
     @property
     def matches(self) -> int:
         """Of all pairs of the database."""
-        return self.found.database.matches
+        return self.static.database.matches
 
     @property
-    def kept(self) -> int:
+    def num_static(self) -> int:
         """Matches that stand still."""
-        return sum(map(len, self.found.kept))
+        return sum(map(len, self.static.kept))
 
     @property
     def inliers(self) -> list[int]:
         """Verified static matches of each pair."""
-        return [len(geometry.inliers) for geometry in self.found.geometries]
+        return [len(geometry.inliers) for geometry in self.static.geometries]
 
     @property
-    def remarks(self) -> list[str]:
+    def all_notes(self) -> list[str]:
         """What a reader should note, a sentence each, less the refusal."""
-        return [*self.notes, *self.found.notes]
+        return [*self.notes, *self.static.notes]
 
 
 def describe(report: StaticReport) -> str:
     """The result in plain words."""
-    database = report.found.database
+    database = report.static.database
     given = f"{count(report.matches, 'match', 'matches')} of {count(len(database.pairs), 'pair')} of {len(database.images)} images"
-    if not report.found.ok:
-        return f"The {given} do not decide. {sentence(report.found.reason)} No database was written."
-    share = report.kept / max(1, report.matches)
+    if not report.static.ok:
+        return f"The {given} do not decide. {sentence(report.static.reason)} No database was written."
+    share = report.num_static / max(1, report.matches)
     enough = count(sum(map(bool, report.inliers)), "pair has", "pairs have")
-    return f"Of {given}, {report.kept:,} ({100 * share:.0f} %) stand still; {enough} enough of them."
+    return f"Of {given}, {report.num_static:,} ({100 * share:.0f} %) stand still; {enough} enough of them."
 
 
 def image_rows(report: StaticReport) -> list[list[Any]]:
     """Name, keypoints in matches, static ones, moving ones, spread of the static ones, and whether too few of them are left."""
-    found = report.found
+    found = report.static
     used: list[set[int]] = [set() for _ in found.database.images]
     for pair in found.database.pairs:
         used[pair.first].update(pair.matches[:, 0].tolist())
@@ -94,7 +94,7 @@ def image_rows(report: StaticReport) -> list[list[Any]]:
 
 def pair_rows(report: StaticReport) -> list[list[Any]]:
     """Names of both images, matches, bodies, how many of these stand still, matches kept, verified, and how the division ended."""
-    found, rows = report.found, []
+    found, rows = report.static, []
     for k, pair in enumerate(found.database.pairs):
         names = [found.database.images[place].name for place in (pair.first, pair.second)]
         static = int((found.signs[k] > 0).sum())
@@ -108,17 +108,17 @@ def as_json(report: StaticReport) -> dict[str, Any]:
     heads = ("name", "matched", "static", "moving", "spread", "refused")
     columns = ("first", "second", "matches", "bodies", "static_bodies", "kept", "verified", "division")
     return {
-        "status": "OK" if report.found.ok else "REFUSED",
-        "reason": report.found.reason or None,
+        "status": "OK" if report.static.ok else "REFUSED",
+        "reason": report.static.reason or None,
         "matches": report.matches,
-        "kept": report.kept,
+        "kept": report.num_static,
         "verified": sum(report.inliers),
-        "lead": report.found.lead,
+        "lead": report.static.lead,
         "images": [dict(zip(heads, row, strict=True)) for row in image_rows(report)],
         "pairs": [dict(zip(columns, row, strict=True)) for row in pair_rows(report)],
         "database": report.written or None,
         "masks": report.masks or None,
-        "notes": report.remarks,
+        "notes": report.all_notes,
         "manifest": report.manifest,
     }
 
@@ -126,7 +126,7 @@ def as_json(report: StaticReport) -> dict[str, Any]:
 @register_page(StaticReport, "static", FILES)
 def summarize(report: StaticReport) -> Summary:
     """Everything that is said of what stands still in a database."""
-    found, rows = report.found, image_rows(report)
+    found, rows = report.static, image_rows(report)
     given = f"{report.matches:,} matches of {count(len(found.database.pairs), 'pair')} of images"
     few = sorted(rows, key=lambda row: row[2])[:10] if len(rows) > 20 else rows
     cells = [[row[0], f"{row[1]:,}", f"{row[2]:,}", f"{row[3]:,}", f"{100 * row[4]:.0f} %"] for row in few]
@@ -134,7 +134,7 @@ def summarize(report: StaticReport) -> Summary:
     return Summary(
         headline=describe(report), opening=[describe(report) if found.ok else given],
         tables=[Table(["image", "matched ", "static ", "moving ", "spread "], cells, more)],
-        notes=[f"note: {note}" for note in report.remarks],
+        notes=[f"note: {note}" for note in report.all_notes],
         closing=[f"database: {report.written}", f"masks: {report.masks}"] if found.ok else [],
         pictures={"static.png": partial(picture_of, report)}, dark=bool(report.photographs),
         files={
@@ -181,7 +181,7 @@ def picture_of(report: StaticReport, theme: Theme = LIGHT) -> bytes:
     """PNG: keypoints in matches, by what is known of them."""
     from matplotlib.lines import Line2D
 
-    found = report.found
+    found = report.static
     places = images_drawn(found.database)
     columns = min(COLUMNS, len(places))
     rows = math.ceil(len(places) / columns)

@@ -101,7 +101,7 @@ class Compared:
         return person_label(self.a, self.pairing.people[0]), person_label(self.b, self.pairing.people[1])
 
     @property
-    def apart(self) -> float:
+    def offset_at_center(self) -> float:
         """Seconds between the clocks in the middle of the overlap."""
         return float(self.shift.at(self.shift.center)) - self.shift.center
 
@@ -178,7 +178,7 @@ class SyncReport:
         return bool(self.pairs[0].shift.ok if self.together is None else self.together.ok)
 
     @property
-    def decided(self) -> int:
+    def num_decided(self) -> int:
         """How many pairs decide by themselves."""
         return sum(bool(pair.shift.ok) for pair in self.pairs)
 
@@ -292,9 +292,9 @@ def _pairs_table(report: SyncReport) -> Table:
     for pair in report.pairs:
         shift, rival = pair.shift, pair.runner_up
         numbers = [
-            f"{pair.apart:+.4f}" if len(shift.peaks) else "none",
+            f"{pair.offset_at_center:+.4f}" if len(shift.peaks) else "none",
             f"{shift.sigma:.4f}" if shift.sigma < UNKNOWN else "unknown",
-            f"{pair.apart * shift.fps[1]:+.2f}" if len(shift.peaks) else "none",
+            f"{pair.offset_at_center * shift.fps[1]:+.2f}" if len(shift.peaks) else "none",
             ppm(shift.rate, shift.rate_sigma),
             f"{shift.confidence:.3f}",
         ]
@@ -409,7 +409,7 @@ def pair_rows(report: SyncReport) -> list[list[Any]]:
         off = f"{1000 * pair.residual:+.1f}" if np.isfinite(pair.residual) else ""
         rows.append([
             quiet(f"{pair.a.name} → {pair.b.name}", METHODS.get(shift.method, shift.method)),
-            f"{pair.apart:+.4f} ± {sigma_text(shift.sigma)}" if len(shift.peaks) else "none",
+            f"{pair.offset_at_center:+.4f} ± {sigma_text(shift.sigma)}" if len(shift.peaks) else "none",
             ppm(shift.rate),
             f"{shift.confidence:.3g}",
             "none" if rival is None else f"{rival[0]:+.3f}",
@@ -474,7 +474,7 @@ def _pair_json(pair: Compared) -> dict[str, Any]:
         "a": pair.a.name, "b": pair.b.name, "ok": shift.ok, "reason": pair.reason or None,
         "method": shift.method, "offset": shift.offset,
         "offset_frames": shift.frames, "sigma": shift.sigma, "rate": shift.rate, "rate_sigma": shift.rate_sigma,
-        "confidence": shift.confidence, "center": shift.center, "offset_at_center": pair.apart, "fps": list(shift.fps),
+        "confidence": shift.confidence, "center": shift.center, "offset_at_center": pair.offset_at_center, "fps": list(shift.fps),
         "peaks": [{"offset": offset, "score": score} for offset, score in shift.peaks.tolist()],
         "wrong_points": pair.wrong, "people": list(pair.people) if any(pair.people) else None, "residual": pair.residual,
         "fundamental": fundamental, "projection": None if shift.projection is None else shift.projection.tolist(),
@@ -528,7 +528,7 @@ def picture_of(report: SyncReport) -> bytes:
 def title_of(pair: Compared) -> str:
     """What a pair's curve says, in a line."""
     said = f"{shorten(pair.a.name, 24)} → {shorten(pair.b.name, 24)}: "
-    return said + (f"{pair.apart:+.4f} ± {pair.shift.sigma:.4f} s" if pair.shift.ok else "refused")
+    return said + (f"{pair.offset_at_center:+.4f} ± {pair.shift.sigma:.4f} s" if pair.shift.ok else "refused")
 
 
 def _draw_curve(panel: Any, pair: Compared) -> None:
@@ -542,7 +542,7 @@ def _draw_curve(panel: Any, pair: Compared) -> None:
     for rank, (offset, score) in reversed(list(enumerate(peaks.tolist()))):
         colour = BEST if rank == 0 else OTHER
         panel.plot([offset], [score], marker="o", markersize=5.5 if rank == 0 else 4, color=colour, zorder=5 - min(rank, 1))
-    panel.axvline(pair.apart, color=BEST, linewidth=0.8, alpha=0.6, zorder=2)
+    panel.axvline(pair.offset_at_center, color=BEST, linewidth=0.8, alpha=0.6, zorder=2)
     _finish(panel, title_of(pair))
     panel.set_ylabel("score", fontsize=8.5)
     panel.set_xlim(lags[0], lags[-1] if lags[-1] > lags[0] else lags[0] + 1)
@@ -554,7 +554,7 @@ def _draw_close(panel: Any, pair: Compared) -> None:
         panel.set_axis_off()
         return
     frame = 1.0 / pair.shift.fps[1]
-    at = (lags - pair.apart) / frame
+    at = (lags - pair.offset_at_center) / frame
     near = np.abs(at) <= NEAR
     panel.plot(at[near], scores[near], color=CURVE, linewidth=1.0, marker=".", markersize=4, zorder=3)
     spread = pair.shift.sigma / frame

@@ -10,7 +10,7 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import with_words
-from indexing.cli.console import check_report, count, flag_words, names, present, progress
+from indexing.cli.console import check_report, check_seed, count, flag_words, names, present, progress
 from indexing.cli.flags.geometry import Align
 from indexing.cli.scenes import (
     Asked,
@@ -76,8 +76,7 @@ def _check(flags: Align) -> None:
         raise ValueError("no files; give a file of points for each view, or one .npz or .c3d with all of them")
     if flags.threshold not in ("auto", None) and not 0 < float(flags.threshold) < float("inf"):
         raise ValueError(f"--threshold must be a positive distance in the unit of the files or auto, got {flags.threshold}")
-    if flags.seed < 0:
-        raise ValueError(f"--seed must be a whole number from 0, got {flags.seed}")
+    check_seed(flags.seed)
 
 
 def _read(flags: Align, asked: Asked | None) -> tuple[Matched, SceneTracks | None]:

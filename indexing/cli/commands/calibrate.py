@@ -15,7 +15,7 @@ from indexing.calibrate.body_height import check_height
 from indexing.cli.console import check_folder, count, finish, flag_words, progress, show
 from indexing.cli.flags.cameras import Calibrate
 from indexing.cli.flags.shared import Watched
-from indexing.cli.inputs import refuse_range
+from indexing.cli.inputs import camera_numbers, refuse_range
 from indexing.cli.videos import find_keypoints
 from indexing.files import manifest
 from indexing.report.calibration import CalibrationReport, check_folder_of, summarize, write_calibration
@@ -41,7 +41,7 @@ def run(flags: Calibrate) -> int:
     if folder is not None:
         check_folder_of(folder, inputs, flags.footage.people)
     started = time.perf_counter()
-    watched = find_keypoints(flags.footage, found.values(), folder, _numbers(flags, "fps", len(found))[0])
+    watched = find_keypoints(flags.footage, found.values(), folder, camera_numbers("fps", flags.fps, len(found))[0])
     with progress("reading", steps=False):
         takes = _read(flags, found, watched)
     read = time.perf_counter()
@@ -75,25 +75,8 @@ def _check(flags: Calibrate) -> str | None:
             raise ValueError(with_words(problem, WORDS)) from None
     if flags.footage.by == "pixels":
         raise ValueError("--by pixels: cameras are calibrated from the joints of people; leave it out")
-    _numbers(flags, "fps", None), _numbers(flags, "focal", None), _sizes(flags, None)
+    camera_numbers("fps", flags.fps, None), camera_numbers("focal", flags.focal, None), _sizes(flags, None)
     return clocks
-
-
-def _numbers(flags: Calibrate, flag: str, cameras: int | None) -> list[float | None]:
-    """One number for each camera."""
-    given: str | None = getattr(flags, flag)
-    if given is None:
-        return [None] * (cameras or 0)
-    try:
-        values: list[float | None] = [float(word) for word in given.split(",")]
-    except ValueError:
-        values = []
-    if not values or not all(value is not None and 0 < value < math.inf for value in values):
-        unit, example = ("frames per second", "60,59.94") if flag == "fps" else ("pixels", "1510,1495,1502")
-        raise ValueError(f"--{flag} must be a positive number of {unit}, or one per camera as in {example}, got {given}")
-    if cameras is not None and len(values) not in (1, cameras):
-        raise ValueError(f"--{flag} gives {len(values)} numbers for {cameras} cameras; give one, or one per camera")
-    return values * ((cameras or 1) if len(values) == 1 else 1)
 
 
 def _sizes(flags: Calibrate, cameras: int | None) -> list[tuple[int, int]] | None:
@@ -113,7 +96,7 @@ def _read(flags: Calibrate, found: dict[str, Path], watched: Watched) -> list[Ta
 
     options: dict[str, Any] = {"person": "auto" if flags.person == "everyone" else flags.person, "format": flags.format}
     options |= {"min_confidence": flags.min_confidence, "layout": flags.layout, "by": "keypoints"}
-    rates = _numbers(flags, "fps", len(found))
+    rates = camera_numbers("fps", flags.fps, len(found))
     try:
         return [
             take_of(path, name=name, fps=rate, keypoints=watched.files.get(path), **options)
@@ -125,7 +108,7 @@ def _read(flags: Calibrate, found: dict[str, Path], watched: Watched) -> list[Ta
 
 def _rig_priors(flags: Calibrate, cameras: int, clocks: str | None) -> RigPriors:
 
-    focal = _numbers(flags, "focal", cameras)
+    focal = camera_numbers("focal", flags.focal, cameras)
     return RigPriors(
         focal=None if flags.focal is None else [value for value in focal if value is not None],
         one_lens=flags.one_lens,

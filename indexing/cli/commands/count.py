@@ -25,9 +25,10 @@ CONFINED_MORE = (
 
 def run(flags: Count) -> int:
     """Count, and print."""
-    given, general = flags.matches.given(), flags.general != General() or bool(flags.motion.profile and not flags.configuration)
+    given = flags.matches.as_options()
+    general = flags.general != General() or bool(flags.motion.profile and not flags.configuration)
     if not general:
-        given |= flags.motion.given()
+        given |= flags.motion.as_options()
     if (flags.configuration != "") + general + (flags.dim_v is not None) > 1:
         raise ValueError("a configuration's name, numbers (--k, --views...) and --dim-v exclude each other; give one of them")
     if given and not flags.configuration and not (general and given.keys() <= set(CONFINED)):
@@ -70,7 +71,7 @@ def _print_general(flags: Count, given: dict[str, Any]) -> None:
     sizes = flags.general.views or (2,) * len(flags.motion.profile)
     if flags.general.k is None or not sizes:
         raise ValueError("numbers need at least --k, the dimension of the space, and --views, such as --k 2 --views 2 2 2")
-    numbers = asdict(flags.general) | flags.motion.given() | {"views": sizes} | given
+    numbers = asdict(flags.general) | flags.motion.as_options() | {"views": sizes} | given
     if len(flags.general.measure) == 1:
         numbers["measure"] = flags.general.measure[0]
     result = counting.count(numbers.pop("k"), seed=flags.seed, **numbers)

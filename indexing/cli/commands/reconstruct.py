@@ -13,8 +13,7 @@ import torch
 
 import dyntorch
 from dyntorch.numerics import with_words
-from indexing.cli.console import check_report, count, flag_words, present
-from indexing.cli.console import progress as progress_of
+from indexing.cli.console import check_report, check_seed, count, flag_words, present, progress
 from indexing.cli.flags.geometry import Reconstruct
 from indexing.cli.scenes import (
     Asked,
@@ -50,13 +49,13 @@ def run(flags: Reconstruct) -> int:
 
     folder = check_report(flags.out, inputs, FILES)
     started = time.perf_counter()
-    with progress_of("reading", steps=False):
+    with progress("reading", steps=False):
         frames = None if flags.frames is None else [word.strip() for word in flags.frames.split(",")]
         followed = follow(flags.files, asked, missing=True, fps=flags.fps) if scene else None
         filmed = as_tracks(followed, flags.files[0], _has_frame_times(flags)) if followed else None
         tracks = _with_times(flags, filmed or read_tracks(flags.files, frames=frames, key=flags.key, static=flags.static))
     read = time.perf_counter()
-    with progress_of(f"reconstructing {count(len(tracks.ids), 'track')}", steps=False):
+    with progress(f"reconstructing {count(len(tracks.ids), 'track')}", steps=False):
         result = _solve(flags, tracks)
     timings = {"read": read - started, "reconstruct": time.perf_counter() - read}
     limit = _limit(flags)
@@ -82,8 +81,7 @@ def _check(flags: Reconstruct) -> None:
         raise ValueError(f"--fps must be a positive number of frames per second, got {flags.fps:g}")
     if flags.fps is not None and flags.times is not None:
         raise ValueError("--fps and --times both give times; leave one out")
-    if flags.seed < 0:
-        raise ValueError(f"--seed must be a whole number from 0, got {flags.seed}")
+    check_seed(flags.seed)
 
 
 def _check_scene(flags: Reconstruct, scene: bool, asked: Asked) -> None:

@@ -140,16 +140,17 @@ def _scan(flags: Scan, indexer: Any, recording: Any, truth: list[KnownEvent] | N
 def _of_person(indexer: ActionIndexer, lane: Lane, truth: list[KnownEvent] | None, bar: Progress) -> RecordingResult:
     """One person of a recording: explained, and what was found counted."""
     assert lane.clip is not None
-    told = indexer.explain(lane.clip, bar)
-    counts = count_repetitions(lane.clip, told.events, exemplars(indexer))
+    explanation = indexer.explain(lane.clip, bar)
+    counts = count_repetitions(lane.clip, explanation.events, exemplars(indexer))
 
-    def named(event: Event) -> Event:
+    def renumber(event: Event) -> Event:
         return dataclasses.replace(event, exemplar=within_label(indexer, event.exemplar))
 
-    held = [dataclasses.replace(one, event=named(one.event)) for one in told.withheld]
+    classes, events = [str(label) for label in explanation.classes], list(map(renumber, explanation.events))
+    withheld = [dataclasses.replace(each, event=renumber(each.event)) for each in explanation.withheld]
     return RecordingResult(
-        lane.name, lane.clip, lane.times, [str(label) for label in told.classes], told.scores, list(map(named, told.events)), truth,
-        person=lane.person, withheld=held, repetitions=counts,
+        lane.name, lane.clip, lane.times, classes, explanation.scores, events, truth, person=lane.person, withheld=withheld,
+        repetitions=counts,
     )  # fmt: skip
 
 

@@ -17,7 +17,18 @@ import dyntorch
 from dyntorch.numerics import with_words
 from indexing.archive.workers import QuietProcesses
 from indexing.cli.commands.segment_tracks import LEAST, Given, read_given, run_bodies, track_inputs, unit_notes
-from indexing.cli.console import check_folder, check_report, count, counting_bar, flag_words, keep, names, present, progress
+from indexing.cli.console import (
+    check_folder,
+    check_report,
+    check_seed,
+    count,
+    counting_bar,
+    flag_words,
+    keep,
+    names,
+    present,
+    progress,
+)
 from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import LEFT_OUT, PICTURE_FILES, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
 from indexing.colmap import MatchDatabase, check_target, find_static, read_database
@@ -148,8 +159,7 @@ def _check(flags: Segment) -> None:
         raise ValueError("--images: its value is missing; give both images of matches, or the video or pictures of tracks")
     if flags.size is not None and flags.images is not None:
         raise ValueError("--size and --images both say how large the images are; leave one out")
-    if flags.seed < 0:
-        raise ValueError(f"--seed must be a whole number from 0, got {flags.seed}")
+    check_seed(flags.seed)
 
 
 def _check_kind(flags: Segment, scene: bool, whole: bool, asked: Asked) -> None:
@@ -249,7 +259,7 @@ def run_colmap(flags: Segment) -> int:
             write_masks(masks, found)
             found.write(out)
     report = StaticReport(
-        found=found,
+        static=found,
         written=str(out) if found.ok else "",
         masks=str(masks) if found.ok else "",
         photographs=shown,

@@ -238,7 +238,7 @@ class Pictures:
             points=tracks.values,
             frames=self.frames,
             size=next(iter(report.photographs.values())).size,
-            groups=report.found.labels,
+            groups=report.arrays.labels,
             names=[f"body {label}" + " (static)" * (label == report.static) for label in labels],
             colours=[_rgb(to_rgb(colour_of(label))) for label in labels],
             captions=_captions(tracks),

@@ -16,7 +16,7 @@ from dyntorch.numerics import Message, with_words
 from indexing.cli.console import check_report, count, flag_words, names, present, progress, say
 from indexing.cli.flags.cameras import Sync
 from indexing.cli.flags.shared import Watched
-from indexing.cli.inputs import refuse_range
+from indexing.cli.inputs import camera_numbers, refuse_range
 from indexing.cli.videos import find_keypoints, wants_keypoints
 from indexing.clip import Clip
 from indexing.files import manifest, prepare
@@ -123,17 +123,7 @@ def _check(flags: Sync) -> None:
 
 def _rates(flags: Sync, cameras: int | None) -> list[float | None]:
     """Frames per second of each camera."""
-    if flags.fps is None:
-        return [None] * (cameras or 0)
-    try:
-        rates: list[float | None] = [float(word) for word in flags.fps.split(",")]
-    except ValueError:
-        rates = []
-    if not rates or not all(rate is not None and 0 < rate < math.inf for rate in rates):
-        raise ValueError(f"--fps must be one positive number, or one per camera as in 60,59.94, got {flags.fps}")
-    if cameras is not None and len(rates) not in (1, cameras):
-        raise ValueError(f"--fps gives {len(rates)} rates for {cameras} cameras; give one, or one per camera")
-    return rates * ((cameras or 1) if len(rates) == 1 else 1)
+    return camera_numbers("fps", flags.fps, cameras)
 
 
 def _by(flags: Sync) -> By:
@@ -184,7 +174,7 @@ def _repair_clocks(flags: Sync, report: SyncReport, done: Any, trial: Trial | No
         return report
     if found.is_attributed:
         again = _solve(flags, list(found.takes), done, trial)
-        if again.ok >= report.ok and again.decided >= report.decided:
+        if again.ok >= report.ok and again.num_decided >= report.num_decided:
             return dataclasses.replace(again, takes=report.takes, remarks=report.remarks, mended=found)
     why = "fewer pairs decide when it is mended" if found.is_attributed else "other pairs of these cameras see nothing of it"
     doubts = [f"doubtful, and not mended, as {why}: {notice.text}" for notice in found.found.notices]

@@ -231,7 +231,7 @@ class Matches:
     general: tyro.conf.FlagCreatePairsOff[bool] = False
     """of shape_tensor: points in general position, in place of four in a plane"""
 
-    def given(self) -> dict[str, Any]:
+    def as_options(self) -> dict[str, Any]:
         """The options that were given."""
         return {name: value for name, value in asdict(self).items() if value is not None and value is not False and value != ()}
 
@@ -247,7 +247,7 @@ class Motion:
     camera: Literal["generic", "fixed", "constant_velocity", "along"] = "generic"
     """path of the camera: anywhere, in one place (it may rotate), at constant velocity, or along the motion at constant velocity"""
 
-    def given(self) -> dict[str, Any]:
+    def as_options(self) -> dict[str, Any]:
         """The options that were given."""
         return {name: value for name, value in asdict(self).items() if value not in ((), "generic")}
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -317,16 +315,6 @@ def test_an_input_is_not_overwritten(run, data, tmp_path):
     (tmp_path / "labels.csv").write_text(before)
     code, _, err = run("labels.csv @/b.csv @/c.csv --out .")
     assert code == 2 and "labels.csv: is an input" in err and (tmp_path / "labels.csv").read_text() == before
-
-
-@pytest.mark.slow
-def test_help_loads_nothing_heavy_and_names_the_models():
-    code = (
-        "import sys; from indexing.cli import main; main(['align', '--help']); main(['--help'])\n"
-        "print('loaded', *{'torch', 'sklearn', 'matplotlib'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1].strip() == "loaded" and "affine_constant_velocity" in done.stdout
 
 
 # ---- the report ----------------------------------------------------------------------------------------------------------

@@ -351,19 +351,6 @@ def test_the_bar_says_how_many_and_how_fast(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.slow
-def test_help_starts_without_the_heavy_libraries() -> None:
-    code = """
-import sys
-from indexing.cli import main
-codes = [main(line.split()) for line in ("archive", "archive add --help", "archive search --help", "archive find --help")]
-print("RESULT", codes, sorted({"torch", "sklearn", "matplotlib", "scipy", "dask", "numpy"} & set(sys.modules)))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "RESULT [0, 0, 0, 0] []"
-    assert "tcp://head:8786" in done.stdout and done.stderr == ""
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "said"),
     [

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -195,16 +193,6 @@ def test_foreign_files_stay(run, library):
     code, _, err = run(f"{THREE} --out out")
     assert code == 2 and "out/Calib_dyntorch.toml: is there, and not from this command; move it away" in err
     assert listed("out") == ["Calib_dyntorch.toml"] and Path("out/Calib_dyntorch.toml").read_text() == "mine"
-
-
-@pytest.mark.slow
-def test_help_loads_nothing_heavy():
-    code = (
-        "import sys; from indexing.cli import main; main(['calibrate', '--help'])\n"
-        "print('loaded', *{'torch', 'numpy', 'sklearn', 'matplotlib', 'av', 'cv2', 'scipy'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1].strip() == "loaded" and "--synchronized" in done.stdout and "--one-lens" in done.stdout
 
 
 # ---- the library itself --------------------------------------------------------------------------------------------------

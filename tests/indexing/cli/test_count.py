@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import pytest
 
@@ -164,15 +162,6 @@ def test_bad_input_is_one_line_and_code_2(run, words, message):
     code, out, err = run(*words.split())
     assert (code, out) == (2, "")
     assert err.startswith("dyntorch: ") and err.count("\n") == 1 and message in err
-
-
-@pytest.mark.slow
-def test_nothing_heavy_is_loaded():
-    code = (
-        "import sys; from indexing.cli import main; main(['count', 'join']); print(*{'torch', 'sklearn'} & set(sys.modules), 'end')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1].strip() == "end"
 
 
 def test_how_many_of_a_kind_count_at_most(run):

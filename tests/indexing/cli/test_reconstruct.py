@@ -6,8 +6,6 @@ import csv
 import dataclasses
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import get_args
 
@@ -296,15 +294,6 @@ def test_an_input_is_not_overwritten(run, data, tmp_path):
     (tmp_path / "points.csv").write_text(before)
     code, _, err = run("points.csv --out .")
     assert code == 2 and "points.csv: is an input" in err and (tmp_path / "points.csv").read_text() == before
-
-
-def test_help_loads_nothing_heavy_and_names_the_models():
-    code = (
-        "import sys; from indexing.cli import main; main(['reconstruct', '--help'])\n"
-        "print('loaded', *{'torch', 'numpy', 'sklearn', 'matplotlib'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1].strip() == "loaded" and "constant_velocity_planes_3d" in done.stdout
 
 
 def test_every_model_and_status_is_named():

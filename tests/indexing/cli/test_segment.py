@@ -6,8 +6,6 @@ import csv
 import dataclasses
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -294,15 +292,6 @@ def test_a_database_of_colmap_goes_its_own_way(run, monkeypatch):
     monkeypatch.setattr("indexing.cli.commands.segment.run_colmap", lambda flags: jobs.append(flags) or 3)
     assert run("--colmap a.db --out b.db --images photos --masks m --threshold auto --no-spatial --seed 4 --title Yard")[0] == 3
     assert jobs[0].colmap == Path("a.db") and jobs[0].images == (Path("photos"),)
-
-
-def test_help_loads_nothing_heavy():
-    code = (
-        "import sys; from indexing.cli import main; main(['segment', '--help'])\n"
-        "print('loaded', *{'torch', 'numpy', 'sklearn', 'matplotlib', 'PIL'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1].strip() == "loaded" and "--no-spatial" in done.stdout
 
 
 def test_every_status_has_a_reason():

@@ -94,7 +94,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
         found = json.loads((tmp_path / str(i) / "segmentation.json").read_text())
         assert len(found["bodies"]) == made.bodies
-        assert np.load(tmp_path / str(i) / "segmentation.npz")["labels"].tolist() == made.found.labels.tolist()
+        assert np.load(tmp_path / str(i) / "segmentation.npz")["labels"].tolist() == made.arrays.labels.tolist()
 
 
 def test_numbers_of_a_report():
@@ -111,9 +111,9 @@ def test_numbers_of_a_report():
 
 def test_bodies_that_leave():
     made = report(count=30)
-    made.tracks.values[3:, made.found.labels == 2] = np.nan
+    made.tracks.values[3:, made.arrays.labels == 2] = np.nan
     assert made.life(1) == (0, 5) and made.life(2) == (0, 2) and as_json(made)["bodies"][1]["last_frame"] == "20"
-    made.tracks.values[:, made.found.labels == 2] = np.nan
+    made.tracks.values[:, made.arrays.labels == 2] = np.nan
     assert report(labels=np.ones(9, dtype=int)).life(2) is None
 
 
@@ -142,7 +142,7 @@ def test_frames_have_the_names_of_the_file_wherever_they_are_told(tmp_path):
 
 def test_known_labels_are_compared(tmp_path):
     made = report(known=np.array([0, 2, 1, 0, 2, 1, 1, 1, 0]))
-    assert made.misclassified == pytest.approx(2 / 8)
+    assert made.misclassification == pytest.approx(2 / 8)
     assert "Compared with the labels of the file" in write_report(tmp_path, made).read_text()
 
 

@@ -14,7 +14,7 @@ import pytest
 from indexing.clip import Clip
 from indexing.recordings.decoding import Withheld
 from indexing.report import RecognitionReport, RecordingResult, player, write_recognition
-from indexing.report.player import PlayerOptions, players
+from indexing.report.player import players
 from indexing.report.results import by_recording
 from indexing.scoring import Event
 from indexing.skeleton import COCO17
@@ -113,11 +113,13 @@ def test_people_share_a_stage_and_who_is_away_is_not_drawn():
     assert shown["view"][2] == 1 and shown["view"][0] < 3 * 240  # the picture follows
 
 
-def test_between_events_fewer_poses_are_kept_where_not_all_fit():
+def test_between_events_fewer_poses_are_kept_where_not_all_fit(monkeypatch):
     report = RecognitionReport("t", recordings=[recording([Hit("squat", 2, 4)], frames=900)])
     (whole,) = players(by_recording(report.recordings), report)
     assert whole.rates == (15.0, 15.0)
-    (less,) = players(by_recording(report.recordings), report, PlayerOptions(values=2400, further=0.0))
+    monkeypatch.setattr(player, "FURTHER_VALUES", 0.0)
+    monkeypatch.setattr(player, "TYPICAL_VALUES", 2400)
+    (less,) = players(by_recording(report.recordings), report)
     at, between = less.rates
     assert at > between
     (who,) = json.loads(less.data)["people"]
@@ -125,7 +127,8 @@ def test_between_events_fewer_poses_are_kept_where_not_all_fit():
     busy = (times >= 1.5) & (times <= 4.5)
     assert busy.sum() / 3 == pytest.approx(at, rel=0.2) and (~busy).sum() / 27 == pytest.approx(between, rel=0.3)
     assert times[-1] == pytest.approx(899 / 30, abs=1e-3)
-    (least,) = players(by_recording(report.recordings), report, PlayerOptions(values=60, further=0.0))
+    monkeypatch.setattr(player, "TYPICAL_VALUES", 60)
+    (least,) = players(by_recording(report.recordings), report)
     assert len(json.loads(least.data)["people"][0]["joints"]) < 300 and least.rates[0] < 3  # never more than fits
 
 

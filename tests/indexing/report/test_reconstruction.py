@@ -118,7 +118,7 @@ def test_what_the_pictures_show(dim):
 
 def test_a_point_without_a_position_is_missing_where_too_few_views_show_it_and_an_outlier_otherwise():
     made = report()
-    values, points = np.repeat(report().tracks.values, 2, axis=0), made.found.points.copy()
+    values, points = np.repeat(report().tracks.values, 2, axis=0), made.arrays.points.copy()
     values[2:, 3], points[2:] = np.nan, np.nan  # four coordinates for the four unknowns of a point, eight, and four
     weights = np.ones((4, 5))
     weights[1:, 2] = 0

@@ -88,7 +88,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
         found = json.loads((tmp_path / str(i) / "segmentation.json").read_text())
         assert len(found["bodies"]) == made.bodies
-        assert np.load(tmp_path / str(i) / "segmentation.npz")["labels"].tolist() == made.found.labels.tolist()
+        assert np.load(tmp_path / str(i) / "segmentation.npz")["labels"].tolist() == made.arrays.labels.tolist()
 
 
 def test_numbers_of_a_report():
@@ -98,9 +98,9 @@ def test_numbers_of_a_report():
     assert made.rms() == pytest.approx(np.sqrt(7.5)) and np.isnan(report(0).rms())
     found = as_json(made)
     assert [part["share"] for part in found["bodies"]] == [2 / 7, 2 / 7] and found["doubtful"] == 0
-    doubtful = made.found.probabilities.copy()
+    doubtful = made.arrays.probabilities.copy()
     doubtful[1] = [0.2, 0.5, 0.3]
-    assert report(probabilities=doubtful).doubtful.tolist() == [False, True, *[False] * 6]
+    assert report(probabilities=doubtful).is_doubtful.tolist() == [False, True, *[False] * 6]
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_what_is_known_is_compared_and_what_is_refused_is_said_once(tmp_path):
     known = MatchedPair(pair.path, "m", pair.x1, pair.x2, pair.ids, known=np.array([0, 2, 1, 0, 2, 1, 1, 1]))
     made = report(pair=known, status=Status.AMBIGUOUS, said=Told.UNCERTAIN)
     page = write_report(tmp_path, made).read_text()
-    assert "Compared with the labels of the file" in page and f"{100 * made.misclassified:.2g} %" in page
+    assert "Compared with the labels of the file" in page and f"{100 * made.misclassification:.2g} %" in page
     assert "Refused: uncertain." in page and page.count("It is open.") == 2 and "<b>Uncertain." not in page
     assert "Compared" not in write_report(tmp_path, report()).read_text()
 

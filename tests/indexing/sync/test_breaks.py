@@ -167,5 +167,5 @@ def test_a_break_that_nothing_confirms_is_said_and_not_mended(doubtful, clips, t
     [said] = json.loads((tmp_path / "out" / "sync.json").read_text())["breaks"]
     assert said["camera"] == "b" and len(doubtful["times"]) == 9
     decided = {True: 3, False: 1}  # before, and mended
-    monkeypatch.setattr("indexing.report.sync.SyncReport.decided", property(lambda one: decided[one.takes[1].times[-1] < 4.1]))
+    monkeypatch.setattr("indexing.report.sync.SyncReport.num_decided", property(lambda one: decided[one.takes[1].times[-1] < 4.1]))
     assert main(line) == 0 and "as fewer pairs decide when it is mended: b lost 6 frames" in capsys.readouterr().out

@@ -51,20 +51,6 @@ def openpose(folder: Path, frames: int = 3) -> Path:
     return folder
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", ["@abc", "@1,5-3,5", "@1:05-1:10", "@-1-4", "@-"])
-def test_a_range_that_is_none_says_what_one_is(
-    wrong: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    openpose(tmp_path / "take")
-    assert main(["index", "fit", f"a=take{wrong}", "b=take", "-o", "m.safetensors"]) == 2
-    said = capsys.readouterr().err
-    assert (
-        said == f"dyntorch: example 'take{wrong}': {wrong} is no range; write @start-end in seconds, such as @1.5-4, @1.5- or @-4\n"
-    )
-
-
 def test_two_labels_are_one_too_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     openpose(tmp_path / "take")

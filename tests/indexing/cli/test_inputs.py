@@ -26,11 +26,22 @@ def clips():
     return {clip.label: clip for clip in dataset([Person.random(0)], ("squat", "wave", "kick"), azimuth=0.0, rng=0)}
 
 
-@pytest.fixture
-def run(tmp_path, monkeypatch, capsys, clips):
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def data(tmp_path_factory, clips):
+    """Folders ``squat``, ``wave`` and ``kick``, and the model ``m.safetensors`` of all three."""
+    folder = tmp_path_factory.mktemp("remarks")
     for name, clip in clips.items():
-        openpose(Path(name), [clip])
+        openpose(folder / name, [clip])
+    examples = [f"{name}={folder / name}" for name in clips]
+    assert main(["index", "fit", *examples, "--fps", "30", "-o", str(folder / "m.safetensors")]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys, data):
+    shutil.copytree(data, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
 
     def call(words):
         code = main(words.split())
@@ -93,15 +104,14 @@ RANGES = {
 
 @pytest.mark.parametrize("seconds", RANGES)
 def test_seconds_that_are_none(run, capsys, seconds):
-    main(["index", "fit", f"a=squat@{seconds}", "b=wave", "--fps", "30", "-o", "m.safetensors"])
+    main(["index", "fit", f"a=squat@{seconds}", "b=wave", "--fps", "30", "-o", "none.safetensors"])
     err = capsys.readouterr().err
-    assert RANGES[seconds] in err and err.count("\n") == 1 and not Path("m.safetensors").exists()
+    assert RANGES[seconds] in err and err.count("\n") == 1 and not Path("none.safetensors").exists()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["index scan wave@1-2 -m m.safetensors", "sync wave@1-2 squat", "convert wave@1-2 -o a.trc"])
 def test_seconds_of_recordings(run, command):
-    run("index fit squat=squat wave=wave --fps 30 -o m.safetensors")
     code, _, err = run(command)
     assert code == 2 and "wave@1-2: seconds (@1-2) are for examples, and recordings are read as a whole; give wave" in err
 
@@ -136,7 +146,6 @@ def test_notes_of_readers(clips):
 
 @pytest.mark.slow
 def test_recordings(run, clips):
-    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     wave = clips["wave"]
     openpose(Path("two"), [wave, clips["kick"].replace(joints=clips["kick"].joints + np.array([900.0, 0.0]))])
     openpose(Path("small"), [wave], scale=1 / 2000)
@@ -195,7 +204,6 @@ def people(path, frames):
 
 @pytest.mark.slow
 def test_everybody_in_view_is_scanned(run, clips):
-    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     left = np.concatenate([clips["wave"].joints, clips["wave"].joints[::-1]])
     right = np.concatenate([clips["squat"].joints, clips["squat"].joints]) + np.array([700.0, 0.0])
     frames = [[(4, pose)] for pose in left]
@@ -222,7 +230,6 @@ def test_everybody_in_view_is_scanned(run, clips):
 
 @pytest.mark.slow
 def test_whose_the_known_events_are(run, clips):
-    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     both = zip(clips["wave"].joints, clips["squat"].joints * 0.5 + 900.0, strict=False)
     people(Path("both.json"), [[(1, one), (2, other)] for one, other in both])
     scan = "index scan both.json -m m.safetensors --fps 30 --truth "
@@ -242,7 +249,6 @@ def test_whose_the_known_events_are(run, clips):
 
 @pytest.mark.slow
 def test_what_is_held_back_is_said_with_its_reason(run):
-    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     code, out, _ = run("index scan wave -m m.safetensors --fps 30 --reject 100 --report out")
     assert code == 0 and "no action found" in out and re.search(r"held back, below the level: 1 wave \(\d\.\d\d s\)", out)
     page = Path("out/report.html").read_text()
@@ -251,7 +257,6 @@ def test_what_is_held_back_is_said_with_its_reason(run):
 
 @pytest.mark.slow
 def test_how_strictly_rest_is_judged(run, monkeypatch):
-    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     original, asked = ActionIndexer.explain, []
 
     def explain(self, clip, progress=None):
@@ -272,7 +277,6 @@ def test_how_strictly_rest_is_judged(run, monkeypatch):
 
 @pytest.mark.slow
 def test_nobody_in_view_is_an_answer(run, tmp_path):
-    assert run("index fit squat=squat wave=wave kick=kick --fps 30 -o m.safetensors")[0] == 0
     openpose(Path("empty"), [Clip(np.full((40, 17, 2), np.nan))])
     code, out, err = run("index scan empty -m m.safetensors --fps 30 --report out")
     assert code == 0 and err == "" and "empty: nobody is in view in any of its 40 frames" in out
