@@ -110,9 +110,7 @@ __all__ = sorted([*_HOME, *_MODULES])
 
 
 def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        return import_module(_MODULES[name])
-    return _lazily(__name__, _HOME, name)
+    return import_module(_MODULES[name]) if name in _MODULES else _lazily(__name__, _HOME, name)
 
 
 def _lazily(package: str, home: Mapping[str, str], name: str) -> Any:

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.primitives import Point, Primitive
-from dyntorch.numerics.arguments import FARTHEST, check_tensor, refuse_vmap
+from dyntorch.numerics.arguments import FARTHEST, check_tensor, check_weights, refuse_vmap
+from dyntorch.numerics.blocks import select
 from dyntorch.numerics.function_transforms import is_transformed, over_problems
 
 WIDEST = 4096
@@ -82,21 +83,14 @@ def matches(
     elif label is not None:
         label = label.bool() if invariant.within == 2 else label.bool() * (invariant.within - 1)
     looked_at = home.type == "cpu" and not is_transformed(tuple(flat), weight)
-    if looked_at and bool(weight.detach().sum().isfinite()) and all(bool(_near(x.detach())) for x in flat):
-        # nothing is missing: one norm per view says so, and nothing is copied
-        return Matches(tuple(flat), weight, _labels(label, home), batch, first.dtype, first.device)
-    present = weight.isfinite()
-    for x in flat:
-        present = present & (x.abs() <= FARTHEST).flatten(2).all(-1)
-    clean = [torch.where(present[(..., *([None] * (x.ndim - 2)))], x, torch.zeros_like(x)) for x in flat]
-    return Matches(
-        tuple(clean),
-        torch.where(present, weight, torch.zeros_like(weight)),
-        _labels(label, home),
-        batch,
-        first.dtype,
-        first.device,
-    )
+    # one norm per view says that nothing is missing, and then nothing is copied
+    near = [torch.linalg.vector_norm(x.detach(), torch.inf) <= FARTHEST for x in flat if looked_at and x.numel()]
+    if not looked_at or not bool(weight.detach().sum().isfinite()) or not all(near):
+        present = weight.isfinite()
+        for x in flat:
+            present = present & (x.abs() <= FARTHEST).flatten(2).all(-1)
+        flat, weight = [select(present, x, 0.0) for x in flat], torch.where(present, weight, 0.0)
+    return Matches(tuple(flat), weight, None if label is None else label.to(home), batch, first.dtype, first.device)
 
 
 def check_plain(invariant: Invariant) -> None:
@@ -110,22 +104,15 @@ def check_plain(invariant: Invariant) -> None:
         )
 
 
-def _near(x: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(x, torch.inf) <= FARTHEST if x.numel() else torch.tensor(True)
-
-
 def _weights(given: Tensor | None, like: Tensor) -> Tensor:
     """``(b, n)`` float64."""
     if given is None:
         return torch.ones(like.shape[:2], dtype=like.dtype, device=like.device)
-    return over_problems(_not_negative, given).to(like)
+    return over_problems(_refuse_negative, given).to(like)
 
 
-def _not_negative(weights: Tensor) -> Tensor:
-    """The weights as they are."""
-    if bool((weights < 0).any()):
-        least = float(weights.detach().nan_to_num().min())
-        raise ValueError(f"weights must not be negative, got {least:g}; use 0 to leave a match out")
+def _refuse_negative(weights: Tensor) -> Tensor:
+    check_weights(weights, "a match")
     return weights
 
 
@@ -137,10 +124,6 @@ def relative_weights(weights: Tensor) -> Tensor:
 def largest_weights(weights: Tensor) -> Tensor:
     """``(*batch,)``, 0 without matches."""
     return weights.amax(-1) if weights.shape[-1] else weights.sum(-1)
-
-
-def _labels(label: Tensor | None, home: torch.device) -> Tensor | None:
-    return None if label is None else label.to(home)
 
 
 def _free_slots(invariant: Invariant, dimensions: Tensor | None, static: bool) -> Tensor:

@@ -78,7 +78,7 @@ def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     if invariant.motion_alone:
         return torch.stack(denormalize_motion(invariant, tensor.unbind(-3), actions), dim=-3)
     rank = len(invariant.shape())
-    return _unit_norm(tensor if invariant.intrinsic else _moved_axes(invariant, tensor, actions), rank, invariant.nullity)
+    return unit_tensors(tensor if invariant.intrinsic else _moved_axes(invariant, tensor, actions), rank, invariant.nullity)
 
 
 def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor]) -> Tensor:
@@ -93,7 +93,7 @@ def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     return torch.einsum(f"...{small},{maps}->...{large}", tensor, *ordered)
 
 
-def _unit_norm(result: Tensor, rank: int, nullity: int) -> Tensor:
+def unit_tensors(result: Tensor, rank: int, nullity: int = 1) -> Tensor:
     """Tensors of so many axes at norm 1, several of them orthonormal; zero ones stay zero."""
     largest = result.detach().flatten(-rank).abs().amax(-1)
     largest = largest.amax(-1, keepdim=True) if nullity > 1 else largest

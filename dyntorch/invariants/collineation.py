@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
 from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.invariants.agreement import static_residual
@@ -72,8 +73,7 @@ class Collineation(Invariant):
             >>> Collineation.compose(2 * torch.eye(4)).diagonal().tolist()
             [0.5, 0.5, 0.5, 0.5]
         """
-        norm = torch.linalg.matrix_norm(A, keepdim=True)
-        return A / torch.where(norm > 0, norm, torch.ones_like(norm))
+        return unit_tensors(A, 2)
 
     @staticmethod
     def decompose(tensor: Tensor) -> Tensor:

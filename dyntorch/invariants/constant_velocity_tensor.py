@@ -13,13 +13,14 @@ The third sensor may be a camera: :math:`A_2` is then 3 x 4.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
 from dyntorch.core.residual import residual_derivative, whiten
 from dyntorch.geometry.extensors import adjugate, back_project, compound, dual, join, project
@@ -69,15 +70,6 @@ def resting_residual(inverses: tuple[Tensor, ...], views: tuple[Tensor, ...], sc
 
 
 Motion = tuple[Tensor, Tensor, Tensor]
-
-
-class VelocityDegeneracy(NamedTuple):
-    """Evidence against a constant velocity tensor, ``(*batch,)`` each: small with good data, 1 for a zero tensor."""
-
-    misfit: Tensor
-    r"""The part :math:`\|T - \alpha \otimes Q - K \otimes \beta\| / \|T\|` that does not fit three projections from :math:`P^6`."""
-    infinity: Tensor
-    r""":math:`\sigma_4 / \sigma_3` of the equations of the plane at infinity of the third frame; 0 with a camera."""
 
 
 @dataclass(frozen=True)
@@ -163,25 +155,6 @@ class ConstantVelocityTensor(Invariant):
             True
         """
         return _solve(tensor)
-
-    @staticmethod
-    def diagnose(tensor: Tensor) -> VelocityDegeneracy:
-        """How far a tensor is from one of constant velocity; see :class:`VelocityDegeneracy`.
-
-        Args:
-            tensor: ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` of a camera.
-        """
-        exact = balance_views(unit_tensor(tensor))[0]
-        alpha, beta, q, k = structure(exact)
-        fitted = torch.einsum("...i,...kj->...ijk", alpha, q) + torch.einsum("...ki,...j->...ijk", k, beta)
-        left = (exact - fitted).flatten(-3).norm(dim=-1)
-        one = torch.ones_like(left)
-        misfit = torch.where(exact.flatten(-3).abs().amax(-1) > 0, left, one)
-        if tensor.shape[-1] == 3:
-            return VelocityDegeneracy(misfit.to(tensor.dtype), torch.zeros_like(misfit).to(tensor.dtype))
-        values = torch.linalg.svdvals(third_infinity(alpha, beta, q, k))
-        ratio = torch.where(values[..., 2] > 0, values[..., 3] / torch.where(values[..., 2] > 0, values[..., 2], one), one)
-        return VelocityDegeneracy(misfit.to(tensor.dtype), ratio.to(tensor.dtype))
 
     @staticmethod
     def transfer(tensor: Tensor, x1: Tensor | None = None, x2: Tensor | None = None, x3: Tensor | None = None) -> Tensor:
@@ -377,7 +350,7 @@ def constant_velocity_tensor(first: Tensor, second: Tensor, third: Tensor) -> Te
     second ``(*batch, 4, 4)``, third ``(*batch, 4, 4)`` -> ``(*batch, 4, 4, 4)``."""
     back0, back1 = adjugate(first), adjugate(second)
     moved = torch.einsum("...i,...kj->...ijk", back0[..., 3, :], 2 * third @ back1)
-    return _unit(moved - torch.einsum("...ki,...j->...ijk", third @ back0, back1[..., 3, :]))
+    return unit_tensors(moved - torch.einsum("...ki,...j->...ijk", third @ back0, back1[..., 3, :]), 3)
 
 
 def infinity_planes(tensor: Tensor) -> tuple[Tensor, Tensor]:
@@ -436,7 +409,7 @@ def unit_tensor(tensor: Tensor) -> Tensor:
         raise ValueError(f"tensor must be (*batch, 4, 4, 4), or (*batch, 4, 4, 3) of a camera, got {tuple(tensor.shape)}")
     good = tensor.isfinite().flatten(-3).all(-1)[..., None, None, None]
     exact = torch.where(good, tensor, torch.zeros_like(tensor)).double()
-    return _unit(exact)
+    return unit_tensors(exact, 3)
 
 
 def balance_views(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
@@ -450,7 +423,7 @@ def balance_views(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]
         factor = torch.cat([scale.expand_as(size[..., :-1]), torch.ones_like(last)], dim=-1)
         tensor = tensor / factor.unflatten(-1, [-1 if a == axis else 1 for a in (-3, -2, -1)])
         scales.append(factor)
-    return _unit(tensor), (scales[0], scales[1], scales[2])
+    return unit_tensors(tensor, 3), (scales[0], scales[1], scales[2])
 
 
 def complement_frame(plane: Tensor) -> Tensor:
@@ -522,9 +495,3 @@ def _upright(plane: Tensor) -> Tensor:
 def _last_row(matrix: Tensor) -> Tensor:
     """The row (0, 0, 0, 1)."""
     return torch.eye(4, dtype=matrix.dtype, device=matrix.device)[3:].expand(*matrix.shape[:-2], 1, 4)
-
-
-def _unit(tensor: Tensor) -> Tensor:
-    """Norm 1; zero stays zero."""
-    norm = tensor.flatten(-3).norm(dim=-1)[..., None, None, None]
-    return tensor / torch.where(norm > 0, norm, torch.ones_like(norm))

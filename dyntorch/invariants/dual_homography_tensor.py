@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Hyperplane, HyperplanesThrough, Primitive
 from dyntorch.geometry.extensors import join, plucker_form
 from dyntorch.geometry.homogeneous import cofactors, inhomogeneous, unit
@@ -135,8 +136,7 @@ class DualHomographyTensor(Invariant):
             got = f"{tuple(quadrifocal.shape)} and {tuple(line.shape)}"
             raise ValueError(f"quadrifocal must be (*batch, 3, 3, 3, 3) and line (*batch, 3), got {got}")
         tensor = torch.einsum("...ijkl,...l->...ijk", quadrifocal, line)
-        norm = torch.linalg.vector_norm(tensor, dim=(-3, -2, -1), keepdim=True)
-        return tensor / torch.where(norm > 0, norm, torch.ones_like(norm))
+        return unit_tensors(tensor, 3)
 
     @staticmethod
     def transfer(tensor: Tensor, lines: Tensor, source: int = 2, target: int = 1) -> Tensor:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Point, Primitive
 from dyntorch.core.residual import whiten
 from dyntorch.counting.dimension import dim_v
@@ -148,16 +149,8 @@ class DynamicTensor(Invariant):
             [[0.0, 1.0], [-1.0, 0.0]]
         """
         self._check(maps)
-        value = self._moved(maps)
-        flat = value.flatten(-self.views)
-        if self.nullity == 1:
-            norm = flat.norm(dim=-1, keepdim=True)
-            return (flat / norm.where(norm > 0, 1.0))[..., 0, :].unflatten(-1, (self.size,) * self.views)
-        # a zero motion has no forms: it stays zero, and any basis in its place keeps the derivative of the others finite
-        none = flat.abs().amax((-2, -1), keepdim=True) == 0
-        other = torch.eye(*flat.shape[-2:], dtype=flat.dtype, device=flat.device)
-        basis = torch.linalg.qr(torch.where(none, other, flat).mT)[0].mT
-        return torch.where(none, 0.0, basis).unflatten(-1, (self.size,) * self.views)
+        forms = self._moved(maps)
+        return unit_tensors(forms.squeeze(-self.views - 1) if self.nullity == 1 else forms, self.views, self.nullity)
 
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         if self.nullity > 1:

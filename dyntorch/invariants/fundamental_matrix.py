@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant
-from dyntorch.core.primitives import Hyperplane, Point
-from dyntorch.geometry.homogeneous import homogeneous, null_vectors, skew, unit
+from dyntorch.core.normalize import unit_tensors
+from dyntorch.core.primitives import Point
+from dyntorch.geometry.homogeneous import null_vectors, skew, unit
 
 
 class FundamentalMatrix(Invariant):
@@ -21,8 +21,8 @@ class FundamentalMatrix(Invariant):
     Example:
         >>> import torch
         >>> F = FundamentalMatrix.compose(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]))  # sideways: rows correspond
-        >>> FundamentalMatrix.epipolar_lines(F, torch.tensor([[4.0, 7.0]])).abs().round().tolist()
-        [[0.0, 1.0, 7.0]]
+        >>> (F @ torch.tensor([4.0, 7.0, 1.0]) * 2**0.5).round().tolist()  # the epipolar line -y + 7 = 0
+        [0.0, -1.0, 7.0]
     """
 
     primitives = (Point(2),) * 2
@@ -47,8 +47,7 @@ class FundamentalMatrix(Invariant):
             tensor(-0.7071)
         """
         tensor = skew(e2) @ A
-        norm = torch.linalg.matrix_norm(tensor, keepdim=True)
-        return tensor / torch.where(norm > 0, norm, torch.ones_like(norm))
+        return unit_tensors(tensor, 2)
 
     @staticmethod
     def decompose(tensor: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,32 +99,6 @@ class FundamentalMatrix(Invariant):
         """
         left, right = null_vectors(tensor.double())
         return _canonical(right).to(tensor.dtype), _canonical(left).to(tensor.dtype)
-
-    @staticmethod
-    def epipolar_lines(tensor: Tensor, x: Tensor, view: int = 2) -> Tensor:
-        r"""The lines of one view on which the matches of points of the other lie: :math:`l_2 = F p_1`, :math:`l_1 = F^T p_2`.
-
-        Args:
-            tensor: ``(*batch, 3, 3)``.
-            x: ``(*batch, n, 2)`` points of the other view.
-            view: the view of the lines, 1 or 2.
-
-        Returns:
-            ``(*batch, n, 3)`` lines with unit normals; zero for a point at the epipole, which has none.
-
-        Raises:
-            ValueError: view is not 1 or 2.
-
-        Example:
-            >>> import torch
-            >>> F = FundamentalMatrix.compose(torch.eye(3), torch.tensor([0.0, 1.0, 0.0]))
-            >>> FundamentalMatrix.epipolar_lines(F, torch.tensor([[4.0, 7.0]]), view=1).abs().tolist()
-            [[1.0, 0.0, 4.0]]
-        """
-        if view not in (1, 2):
-            raise ValueError(f"view must be 1 or 2, the view of the lines, got {view}")
-        line = homogeneous(x) @ (tensor.mT if view == 2 else tensor)
-        return Hyperplane(2).raw(line)
 
 
 def _canonical(vector: Tensor) -> Tensor:

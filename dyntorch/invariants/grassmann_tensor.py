@@ -8,6 +8,7 @@ from math import comb, prod
 from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
 from dyntorch.geometry.grassmann import candidates, grassmann_derivative, grassmann_tensor
 from dyntorch.geometry.grassmann_nearest import projections_of
@@ -122,10 +123,7 @@ class GrassmannTensor(Invariant):
             >>> GrassmannTensor(3, (2, 2)).compose(*P).norm().round(decimals=4)
             tensor(1.)
         """
-        tensor = grassmann_tensor(projections, self.profile)
-        order = len(self.profile)
-        norm = tensor.flatten(-order).norm(dim=-1)[(..., *[None] * order)]
-        return tensor / norm.where(norm > 0, 1.0)
+        return unit_tensors(grassmann_tensor(projections, self.profile), len(self.profile))
 
     def decompose(self, tensor: Tensor) -> tuple[Tensor, ...]:
         r"""The projections of the nearest Grassmann tensor, in closed form for a tensor that is one.

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Point
 from dyntorch.geometry.extensors import levi_civita
-from dyntorch.geometry.homogeneous import cofactors, homogeneous, inhomogeneous, unit
+from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.invariants.agreement import (
     point_error,
     static_map,
@@ -22,15 +21,6 @@ from dyntorch.invariants.agreement import (
 )
 from dyntorch.numerics.least_squares import normalized_derivative
 from dyntorch.numerics.nullspace import null_space
-
-
-class PlanarDegeneracy(NamedTuple):
-    """How far a tensor can be trusted to be that of a motion, ``(*batch,)`` each; see :meth:`HomographyTensor.diagnose`."""
-
-    condition_a: Tensor
-    condition_b: Tensor
-    misfit: Tensor
-    disagreement: Tensor
 
 
 class HomographyTensor(Invariant):
@@ -72,8 +62,7 @@ class HomographyTensor(Invariant):
             [0.0, 0.0, 1.0]
         """
         tensor = torch.linalg.cross(A.mT[..., :, None, :], B.mT[..., None, :, :], dim=-1).movedim(-1, -3)
-        norm = torch.linalg.vector_norm(tensor, dim=(-3, -2, -1), keepdim=True)
-        return tensor / torch.where(norm > 0, norm, torch.ones_like(norm))
+        return unit_tensors(tensor, 3)
 
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         # by hand, a fifth of the time: the tensor is linear in A and in B
@@ -114,47 +103,6 @@ class HomographyTensor(Invariant):
         a = _solution(balanced) * second[..., None, :] / first[..., :, None]
         b = _solution(balanced.mT) * third[..., None, :] / first[..., :, None]
         return unit(a).to(tensor.dtype), unit(b).to(tensor.dtype)
-
-    @staticmethod
-    def diagnose(tensor: Tensor) -> PlanarDegeneracy:
-        r"""Evidence that a tensor is of the form :math:`\epsilon(A, B)`.
-
-        Args:
-            tensor: ``(*batch, 3, 3, 3)``.
-
-        Returns:
-            ``condition_a``, ``condition_b``: :math:`\sigma_8 / \sigma_1` of the linear systems for A and B, about 0.3 when
-            healthy, 0 when they have more than one solution; ``misfit``: :math:`\|H - s\,\epsilon(A, B)\| / \|H\|` with the
-            best s; ``disagreement``: distance between :math:`A^{-1} B` and the map from view 3 to view 2 that the slices
-            :math:`H_{i \cdot\cdot}` give by themselves, both of norm 1.  For a zero tensor 0, 0, 1, 1.
-
-        Raises:
-            ValueError: another shape.
-
-        Example:
-            >>> import torch
-            >>> found = HomographyTensor.diagnose(HomographyTensor.compose(torch.eye(3).double(), torch.eye(3).double()))
-            >>> bool(found.misfit < 1e-9), bool(found.condition_a > 0.1)
-            (True, True)
-        """
-        a, b = HomographyTensor.decompose(tensor.double())
-        h, (_, second, third) = _balance_slices(tensor.double())
-        conditions = []
-        for slices in (h, h.mT):
-            # singular values of one problem that is not finite would stop the whole batch
-            values = torch.linalg.svdvals(torch.nan_to_num(_skew_system(slices), posinf=0.0, neginf=0.0))
-            conditions.append(values[..., 7] / values[..., 0].clamp(min=torch.finfo(values.dtype).tiny))
-        norm = torch.linalg.vector_norm(tensor.double(), dim=(-3, -2, -1), keepdim=True)
-        flat = (tensor / norm.clamp(min=torch.finfo(norm.dtype).tiny)).flatten(-3)
-        model = HomographyTensor.compose(a, b).flatten(-3)
-        misfit = (flat - (flat * model).sum(-1, keepdim=True) * model).norm(dim=-1)
-        own = unit(_solution(h.permute(*range(h.ndim - 3), -2, -1, -3)))
-        relative = unit(cofactors(a).mT @ b * second[..., :, None] / third[..., None, :])
-        difference = torch.linalg.matrix_norm(own - relative)
-        zero = norm.flatten(-3)[..., 0] == 0
-        one = torch.ones_like(misfit)
-        found = (*conditions, torch.where(zero, one, misfit), torch.where(zero, one, difference))
-        return PlanarDegeneracy(*(x.to(tensor.dtype) for x in found))
 
     @staticmethod
     def transfer(tensor: Tensor, x: Tensor, source: int = 2, target: int = 1) -> Tensor:

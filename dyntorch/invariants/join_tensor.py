@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant, on_class
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Point
 from dyntorch.geometry.extensors import join
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
@@ -129,11 +130,7 @@ class JoinTensor(CollinearPoints):
         """
         check_motion(A, B)
         eye = torch.eye(4, dtype=A.dtype, device=A.device)
-        flat = join_forms(A[..., None, :, :], B[..., None, :, :], eye).flatten(-3)
-        none = flat.abs().amax((-2, -1), keepdim=True) == 0
-        # a zero motion has no family: it stays zero, and any basis in its place keeps the derivative of the others finite
-        basis = torch.linalg.qr(torch.where(none, torch.eye(4, 64, dtype=A.dtype, device=A.device), flat).mT)[0].mT
-        return torch.where(none, torch.zeros_like(basis), basis).unflatten(-1, (4, 4, 4))
+        return unit_tensors(join_forms(A[..., None, :, :], B[..., None, :, :], eye), 3, nullity=4)
 
     @staticmethod
     def decompose(tensor: Tensor) -> tuple[Tensor, Tensor]:

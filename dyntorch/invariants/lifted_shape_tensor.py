@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from dyntorch.core.invariant import Frame, Invariant
-from dyntorch.core.matches import constellations
 from dyntorch.core.primitives import Equations
-from dyntorch.invariants.reprojection import CameraKind, looked_at, reprojection_derivative, reprojection_residual
-from dyntorch.numerics.least_squares import jacobian
-from dyntorch.numerics.nullspace import null_space
+from dyntorch.invariants.reprojection import PointShape, looked_at
 from dyntorch.shapes import lifted, static
 from dyntorch.shapes.lifted import Profile
 from dyntorch.shapes.static import AFFINE, GENERAL, PLANE
@@ -23,7 +18,7 @@ FRAMES = (GENERAL, PLANE, AFFINE)
 
 
 @dataclass(frozen=True, repr=False)
-class LiftedShapeTensor(Invariant):
+class LiftedShapeTensor(PointShape):
     r"""The shape of n points of :math:`P^k` from which projections :math:`P^k \to P^l` are eliminated; a match is one view.
 
     What :class:`~dyntorch.GrassmannTensor` is for points seen by given projections this is for projections of given points: its
@@ -91,9 +86,6 @@ class LiftedShapeTensor(Invariant):
     frame: str = GENERAL
     points: int | None = None
 
-    intrinsic = True
-    motion = (Frame(None),)
-
     def __post_init__(self) -> None:
         if self.frame not in FRAMES:
             raise ValueError(f"frame must be one of {', '.join(FRAMES)}, got {self.frame!r}")
@@ -105,7 +97,7 @@ class LiftedShapeTensor(Invariant):
                 "use 'general' or 'affine'"
             )
         if self.points is not None:
-            self._check_points(self.points)
+            self.check_points(self.points)
 
     @property
     def least(self) -> int:
@@ -114,37 +106,16 @@ class LiftedShapeTensor(Invariant):
         beside = max(2, -(-(self.l + 2) // self.l))
         return {GENERAL: general, PLANE: self.l + 2 + beside, AFFINE: self.k + 2}[self.frame]
 
-    def _check_points(self, n: int) -> None:
+    def check_points(self, n: int) -> None:
         if n < self.least:
             raise ValueError(f"{self._name()} needs at least {self.least} points, got {n}; add points")
         if self.frame == GENERAL and n > 2 * self.k + 2:
             raise ValueError(f"{self._name()} takes up to {2 * self.k + 2} points, got {n}; take as many of them")
 
     @property
-    def n(self) -> int:
-        """Points of one view."""
-        if self.points is None:
-            raise ValueError(f"{self!r} does not know its number of points; give it, {self._name()[:-1]}, points=...)")
-        return self.points
-
-    @property
     def profile(self) -> Profile:
         """Hyperplanes through each point behind the basis (``general``)."""
         return lifted.profile_of(self.k, self.n - self.k - 1)
-
-    @property
-    def cameras(self) -> CameraKind:
-        """The projections that are eliminated."""
-        return CameraKind(self.k, self.l, self.frame == AFFINE)
-
-    def bind_arguments(
-        self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
-    ) -> tuple[Invariant, tuple[Tensor, ...]]:
-        super().bind_arguments(views, weights, **given)
-        if self.points not in (None, len(views)):
-            raise ValueError(f"{self!r} takes {self.points} points, each (*batch, views, {self.l}), got {len(views)} arguments")
-        self._check_points(len(views))
-        return replace(self, points=len(views)), (constellations(self, views, self.l),)
 
     def fill_missing(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
         """Views that miss a point have no part in a fit, while the points that they show can still be measured."""
@@ -168,26 +139,6 @@ class LiftedShapeTensor(Invariant):
         if self.frame == GENERAL:
             return lifted.count_rows(self.k, self.l, self.profile)[1]
         return -(-(self.width() - self.nullity) // self.rows())
-
-    @property
-    def resolves_noise(self) -> bool:  # type: ignore[override]
-        """Not where points of the basis that nearly depend on each other make the frame of every view an accident."""
-        return self.frame == AFFINE
-
-    @property
-    def nullity(self) -> int:  # type: ignore[override]
-        return self.n - self.k - 1 if self.frame == AFFINE else 1
-
-    @property
-    def dof(self) -> int:  # type: ignore[override]
-        """Coordinates of the points less the collineations that keep the basis."""
-        n, k = self.n, self.k
-        return {GENERAL: k * (n - k - 2), PLANE: k * (n - k - 1) - k - 1, AFFINE: k * (n - k - 1)}[self.frame]
-
-    @property
-    def codim(self) -> int:  # type: ignore[override]
-        """Coordinates of a view less the freedom of its camera."""
-        return self.l * self.n - self.cameras.freedom
 
     def shape(self) -> tuple[int, ...]:
         if self.frame == AFFINE:
@@ -234,37 +185,17 @@ class LiftedShapeTensor(Invariant):
             >>> T.shape, bool(torch.allclose(T, LiftedShapeTensor(4).compose(2 * P)))  # homogeneous: the scale means nothing
             (torch.Size([30]), True)
         """
-        own = replace(self, points=int(points.shape[-2]))
-        whole = points if points.shape[-1] == self.k + 1 else torch.nn.functional.pad(points, (0, 1), value=1.0)
-        if whole.shape[-1] != self.k + 1:
-            raise ValueError(f"points must be (*batch, n, {self.k}) or homogeneous, (*batch, n, {self.k + 1}), got {points.shape}")
-        whole = static.standard(whole.double(), own.frame)
-        sound = whole.isfinite().flatten(-2).all(-1)[..., None, None]
-        whole = torch.where(
-            sound, whole, 1.0 if own.frame == PLANE else torch.eye(*whole.shape[-2:], device=whole.device).to(whole)
-        )
-        tensor = own._compose(whole)
-        if own.frame == GENERAL:
-            # what no view tells is left out: tensors of one shape are then equal
-            tensor = own.tensor_of(own.basis_of(tensor))
-        flat = tensor.flatten(-len(own.shape()))
-        norm = flat.norm(dim=-1, keepdim=True)
-        flat = torch.where(sound if own.nullity > 1 else sound[..., 0], flat / torch.where(norm > 0, norm, 1.0), 0.0)
-        return flat.unflatten(-1, own.shape()).to(points.dtype)
+        return self.compose_points(points)
 
-    def _compose(self, points: Tensor) -> Tensor:
-        """The tensor, of any scale, of points ``(*batch, n, k + 1)`` in the standard frame."""
-        if self.frame == AFFINE:
-            annihilator = null_space(points.mT, self.n - self.k - 1)
-            return annihilator.squeeze(-2) if self.nullity == 1 else annihilator
-        if self.frame == GENERAL:
-            # the scale of each point is that of the tensor
-            others = points[..., self.k + 1 :, :]
-            size = others.abs().amax(-1, keepdim=True)
-            return lifted.compose_entries(others / torch.where(size > 0, size, 1.0), self.profile)
+    def compose_standard(self, points: Tensor) -> Tensor:
+        if self.frame != GENERAL:
+            return super().compose_standard(points)
+        # the scale of each point is that of the tensor
         others = points[..., self.k + 1 :, :]
-        v = others[..., :-1] / others[..., -1:]
-        return v - v.mean(-2, keepdim=True)
+        size = others.abs().amax(-1, keepdim=True)
+        tensor = lifted.compose_entries(others / torch.where(size > 0, size, 1.0), self.profile)
+        # what no view tells is left out: tensors of one shape are then equal
+        return self.tensor_of(self.basis_of(tensor))
 
     def decompose(self, tensor: Tensor) -> Tensor:
         """The points behind a tensor, homogeneous ``(*batch, n, k + 1)``, in the frame that it leaves open; zero for a zero tensor.
@@ -305,17 +236,6 @@ class LiftedShapeTensor(Invariant):
                 f"frame 'general' and a basis ({self.k + 1}, {self.l + 1}) have a form, got {self!r}, {tuple(basis.shape)}"
             )
         return lifted.multilinear(tensor.double(), basis.double(), self.profile).to(tensor.dtype)
-
-    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
-        """Reprojection error ``(*batch, views, l n)`` of the points of each view, whose camera is found first."""
-        structure = static.standard(motion[0].double(), self.frame)
-        return reprojection_residual(structure, views[0].double(), scales[0].double(), self.cameras).to(views[0].dtype)
-
-    def linearize(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        shape = motion[0].shape[-2:]
-        value, slope = jacobian(lambda t: static.standard(t.unflatten(-1, shape), self.frame).flatten(-2), motion[0].flatten(-2))
-        error, derivative = reprojection_derivative(value.unflatten(-1, shape), views[0], scales[0], self.cameras)
-        return error.flatten(-2), slope @ derivative.flatten(-2).flatten(-3, -2).mT
 
     def score(self, tensor: Tensor, *points: Tensor) -> Tensor:
         r"""Algebraic score of views: how nearly the equations of the camera, given the shape, are dependent.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant, on_class
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Point, Primitive, Projected
 from dyntorch.geometry.extensors import meet
 from dyntorch.invariants.agreement import join_forms, motion_of_forms
@@ -94,7 +95,7 @@ class MinimalJoinTensor(CollinearPoints):
         right = torch.linalg.solve_ex(m @ m.mT, m)[0].mT
         centre = meet(*m.unbind(-2))
         b = B[..., None, :, :]
-        return _unit(join_forms(A[..., None, :, :], b @ right, (b @ centre[..., None])[..., 0]))
+        return unit_tensors(join_forms(A[..., None, :, :], b @ right, (b @ centre[..., None])[..., 0]), 3)
 
     @on_class
     def decompose(self, tensor: Tensor) -> tuple[Tensor, Tensor]:
@@ -126,7 +127,7 @@ class MinimalJoinTensor(CollinearPoints):
         """The tensors with the cameras put back, ``(*batch, c, 4, 4, 4)``, each of norm 1."""
         if tensor.shape[-4:] != (self.copies, 4, 4, 3):
             raise ValueError(f"tensor must be (*batch, {self.copies}, 4, 4, 3), one part per camera, got {tuple(tensor.shape)}")
-        return _unit(tensor @ self._cameras(tensor)[..., None, :, :])
+        return unit_tensors(tensor @ self._cameras(tensor)[..., None, :, :], 3)
 
     def _cameras(self, like: Tensor) -> Tensor:
         third = self.primitives[2]
@@ -151,10 +152,3 @@ def _check_cameras(cameras: Tensor) -> None:
         raise ValueError(f"cameras must be of rank 3; camera {flat[0]} is not: give three independent rows")
     if len(centres) > 1 and torch.linalg.svdvals(centres / centres.norm(dim=-1, keepdim=True))[1] < SAME_CENTRE:
         raise ValueError("all cameras have the same centre and say the same; give at least two cameras with different centres")
-
-
-def _unit(tensor: Tensor) -> Tensor:
-    """Frobenius norm 1 over the last three dimensions; zero stays zero."""
-    return torch.nn.functional.normalize(tensor.flatten(-3), dim=-1, eps=torch.finfo(tensor.dtype).tiny).unflatten(
-        -1, tensor.shape[-3:]
-    )

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
+from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.matches import constellations
 from dyntorch.geometry.homogeneous import unit_vectors
 from dyntorch.numerics.blocks import constant
-from dyntorch.numerics.nullspace import gram_null_space
-from dyntorch.shapes.static import local
+from dyntorch.numerics.least_squares import jacobian
+from dyntorch.numerics.nullspace import gram_null_space, null_space
+from dyntorch.shapes import static
+from dyntorch.shapes.static import AFFINE, GENERAL, PLANE, local
 
 STEPS = 2
 """Gauss-Newton steps from the algebraic point to the one of least reprojection error."""
@@ -180,3 +184,102 @@ def _maps(cameras: CameraKind, device: torch.device) -> Tensor:
         # the last row of the camera is (0, ..., 0, s)
         maps = maps[..., [*range(points * cameras.l), points * images - 1]]
     return maps.to(device)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What the tensors of the shape of points have in common.
+
+
+class PointShape(Invariant):
+    r"""Base of the tensors of n points of :math:`P^k` from which the projection of every view to :math:`P^l` is eliminated."""
+
+    k: int
+    l: int  # noqa: E741 - its name in the literature
+    frame: str
+    points: int | None
+    intrinsic = True
+    motion = (Frame(None),)
+
+    @property
+    def n(self) -> int:
+        """Points of one view."""
+        if self.points is None:
+            raise ValueError(f"{self!r} does not know its number of points; give it, {repr(self)[:-1]}, points=...)")
+        return self.points
+
+    def with_points(self, n: int) -> Self:
+        """The family's member for so many points."""
+        return replace(self, points=n)  # type: ignore[type-var]
+
+    def check_points(self, n: int) -> None:
+        """Raise a ``ValueError`` for numbers of points that the tensor does not take."""
+        raise NotImplementedError
+
+    @property
+    def cameras(self) -> CameraKind:
+        """The projections that are eliminated."""
+        return CameraKind(self.k, self.l, self.frame == AFFINE)
+
+    def bind_arguments(
+        self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
+    ) -> tuple[Invariant, tuple[Tensor, ...]]:
+        super().bind_arguments(views, weights, **given)
+        if self.points not in (None, len(views)):
+            raise ValueError(f"{self!r} takes {self.points} points, each (*batch, views, {self.l}), got {len(views)} arguments")
+        self.check_points(len(views))
+        return self.with_points(len(views)), (constellations(self, views, self.l),)
+
+    @property
+    def resolves_noise(self) -> bool:  # type: ignore[override]
+        """Not where points of the basis that nearly depend on each other make the frame of every view an accident."""
+        return self.frame == AFFINE
+
+    @property
+    def nullity(self) -> int:  # type: ignore[override]
+        return self.n - self.k - 1 if self.frame == AFFINE else 1
+
+    @property
+    def dof(self) -> int:  # type: ignore[override]
+        """Coordinates of the points less the collineations that keep the basis."""
+        n, k = self.n, self.k
+        return {GENERAL: k * (n - k - 2), PLANE: k * (n - k - 1) - k - 1, AFFINE: k * (n - k - 1)}[self.frame]
+
+    @property
+    def codim(self) -> int:  # type: ignore[override]
+        """Coordinates of a view less the freedom of its camera."""
+        return self.l * self.n - self.cameras.freedom
+
+    def compose_points(self, points: Tensor) -> Tensor:
+        """The tensor ``(*batch, [nullity,] *shape)`` of points ``(*batch, n, k)`` or homogeneous; 0 without a frame."""
+        own = self.with_points(int(points.shape[-2]))
+        whole = points if points.shape[-1] == self.k + 1 else torch.nn.functional.pad(points, (0, 1), value=1.0)
+        if whole.shape[-1] != self.k + 1:
+            raise ValueError(f"points must be (*batch, n, {self.k}) or homogeneous, (*batch, n, {self.k + 1}), got {points.shape}")
+        whole = static.standard(whole.double(), own.frame)
+        sound = whole.isfinite().flatten(-2).all(-1)[..., None, None]
+        stand_in = torch.ones_like(whole) if own.frame == PLANE else torch.eye(*whole.shape[-2:], device=whole.device).to(whole)
+        stand_in = torch.where(torch.arange(whole.shape[-2], device=whole.device)[:, None] > self.k, 1.0, stand_in)
+        flat = own.compose_standard(torch.where(sound, whole, stand_in)).flatten(-len(own.shape()))
+        norm = flat.norm(dim=-1, keepdim=True)
+        flat = torch.where(sound if own.nullity > 1 else sound[..., 0], flat / torch.where(norm > 0, norm, 1.0), 0.0)
+        return flat.unflatten(-1, own.shape()).to(points.dtype)
+
+    def compose_standard(self, points: Tensor) -> Tensor:
+        """The tensor, of any scale, of points ``(*batch, n, k + 1)`` in the standard frame."""
+        if self.frame == AFFINE:
+            annihilator = null_space(points.mT, self.nullity)
+            return annihilator.squeeze(-2) if self.nullity == 1 else annihilator
+        others = points[..., self.k + 1 :, :]
+        v = others[..., :-1] / others[..., -1:]
+        return v - v.mean(-2, keepdim=True)
+
+    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
+        """Reprojection error ``(*batch, views, l n)`` of the points of each view, whose camera is found first."""
+        structure = static.standard(motion[0].double(), self.frame)
+        return reprojection_residual(structure, views[0].double(), scales[0].double(), self.cameras).to(views[0].dtype)
+
+    def linearize(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        shape = motion[0].shape[-2:]
+        value, slope = jacobian(lambda t: static.standard(t.unflatten(-1, shape), self.frame).flatten(-2), motion[0].flatten(-2))
+        error, derivative = reprojection_derivative(value.unflatten(-1, shape), views[0], scales[0], self.cameras)
+        return error.flatten(-2), slope @ derivative.flatten(-2).flatten(-3, -2).mT

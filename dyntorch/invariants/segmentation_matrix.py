@@ -7,7 +7,7 @@ from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant
 from dyntorch.core.matrix import gram
-from dyntorch.core.normalize import hartley
+from dyntorch.core.normalize import hartley, unit_tensors
 from dyntorch.core.primitives import Monomials, Point
 from dyntorch.core.residual import algebraic, sampson
 from dyntorch.geometry.homogeneous import homogeneous, symmetric, unit
@@ -30,9 +30,7 @@ class RelationPair(Invariant):
     @staticmethod
     def product(first: Tensor, second: Tensor) -> Tensor:
         """The matrix S of two relations ``(*batch, 3, 3)``: ``(*batch, 6, 6)`` of norm 1; 0 where one of them is 0."""
-        product = product_matrix(first, second)
-        norm = torch.linalg.matrix_norm(product, keepdim=True)
-        return product / torch.where(norm > 0, norm, torch.ones_like(norm))
+        return unit_tensors(product_matrix(first, second), 2)
 
     def tensor_of(self, basis: Tensor) -> Tensor:
         """The matrix for plain monomials, of a null vector for isometric ones."""

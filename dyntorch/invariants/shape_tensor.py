@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from dyntorch.core.invariant import Frame, Invariant, on_class
-from dyntorch.core.matches import constellations
+from dyntorch.core.invariant import Invariant, on_class
 from dyntorch.core.primitives import Equations
 from dyntorch.geometry.homogeneous import unit_vectors
-from dyntorch.invariants.reprojection import CameraKind, looked_at, reprojection_derivative, reprojection_residual
-from dyntorch.numerics.least_squares import jacobian
-from dyntorch.numerics.nullspace import null_space
+from dyntorch.invariants.reprojection import CameraKind, PointShape, looked_at, reprojection_residual
 from dyntorch.shapes import static
 from dyntorch.shapes.static import AFFINE, GENERAL, PLANE, canonical, dual_cameras, lines_through, local, reference_cameras
 
-CAMERA = {GENERAL: CameraKind(), PLANE: CameraKind(), AFFINE: CameraKind(affine=True)}
 """The camera that each frame leaves open."""
 
 
@@ -28,7 +24,11 @@ def view_score(structure: Tensor, x: Tensor, frame: str) -> Tensor:
     x = torch.cat([torch.where(seen[..., None] > 0, x[..., :2], 0.0), seen[..., None]], dim=-1)
     if frame == AFFINE:
         factor, ones = local(x)[1], torch.ones_like(structure[..., 0, 0])
-        return reprojection_residual(structure, x, ones, CAMERA[frame]).norm(dim=-1) * factor / seen.sum(-1).clamp(min=1.0).sqrt()
+        return (
+            reprojection_residual(structure, x, ones, CameraKind(affine=True)).norm(dim=-1)
+            * factor
+            / seen.sum(-1).clamp(min=1.0).sqrt()
+        )
     others = unit_vectors(structure[..., 4:, :])
     cameras = torch.stack(dual_cameras(others) if frame == GENERAL else reference_cameras(others), dim=-3)
     q = canonical(x)[0] * seen[..., :4].amin(-1)[..., None, None]
@@ -46,7 +46,7 @@ ROWS = dict(zip(LEAST, (static.general_rows, static.plane_rows, static.affine_ro
 
 
 @dataclass(frozen=True, repr=False)
-class ShapeTensor(Invariant):
+class ShapeTensor(PointShape):
     r"""The shape of n points from which the camera is eliminated; a match is one view of all of them.
 
     The arguments of :func:`dyntorch.fit` are the points, ``p1, ..., pn``, each ``(*batch, views, 2)``.  Views are of uncalibrated
@@ -92,16 +92,16 @@ class ShapeTensor(Invariant):
     frame: str = GENERAL
     points: int | None = None
 
-    intrinsic = True
-    motion = (Frame(None),)
+    k = 3
+    l = 2  # noqa: E741 - its name in the literature
 
     def __post_init__(self) -> None:
         if self.frame not in LEAST:
             raise ValueError(f"frame must be one of {', '.join(LEAST)}, got {self.frame!r}")
         if self.points is not None:
-            self._check_points(self.points)
+            self.check_points(self.points)
 
-    def _check_points(self, n: int) -> None:
+    def check_points(self, n: int) -> None:
         if n < LEAST[self.frame]:
             remedy = "add points" if self.frame == AFFINE else "add points, or take ShapeTensor('affine') from 5 points on"
             raise ValueError(f"frame {self.frame!r} needs at least {LEAST[self.frame]} points, got {n}; {remedy}")
@@ -111,13 +111,6 @@ class ShapeTensor(Invariant):
             )
 
     @property
-    def n(self) -> int:
-        """Points of one view."""
-        if self.points is None:
-            raise ValueError(f"{self!r} does not know its number of points; give it, ShapeTensor({self.frame!r}, points)")
-        return self.points
-
-    @property
     def multilinear(self) -> bool:
         """Whether the tensor is a multilinear form of the points of a view."""
         return self.frame != AFFINE and self.n <= LARGEST
@@ -125,17 +118,13 @@ class ShapeTensor(Invariant):
     def bind_arguments(
         self, views: Sequence[Tensor], weights: Tensor | None = None, **given: Tensor
     ) -> tuple[Invariant, tuple[Tensor, ...]]:
-        super().bind_arguments(views, weights, **given)
-        if self.points not in (None, len(views)):
-            raise ValueError(f"{self!r} takes {self.points} points, each (*batch, views, 2), got {len(views)} arguments")
-        self._check_points(len(views))
-        x = constellations(self, views)
+        invariant, (x,) = super().bind_arguments(views, weights, **given)
         needed = x[..., 2] if self.frame == GENERAL else x[..., :4, 2]
         if self.frame != AFFINE:
             # a fit takes the view as missing, while the points that it shows can still be measured
             gone = (needed == 0).any(-1)[..., None, None] & (x[..., 2:] == 0)
             x = torch.cat([torch.where(gone, torch.nan, x[..., :2]), x[..., 2:]], dim=-1)
-        return replace(self, points=len(views)), (x,)
+        return invariant, (x,)
 
     def fill_missing(self, views: tuple[Tensor, ...], weights: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
         """Affine views with their missing points filled in, which must show at least five; other frames leave out rows."""
@@ -157,25 +146,6 @@ class ShapeTensor(Invariant):
         else:
             width, rows = (3 * (m - 1), 2 * m - 3) if self.frame == PLANE else (self.n - 1, 2)
         return (Equations((self.n, 3), width, ROWS[self.frame], rows),)
-
-    @property
-    def resolves_noise(self) -> bool:  # type: ignore[override]
-        """Not where three points of a basis nearly on a line make the frame of every view an accident."""
-        return self.frame == AFFINE
-
-    @property
-    def nullity(self) -> int:  # type: ignore[override]
-        return self.n - 4 if self.frame == AFFINE else 1
-
-    @property
-    def dof(self) -> int:  # type: ignore[override]
-        """Coordinates of the points less the collineations that keep the basis."""
-        return {GENERAL: 3 * (self.n - 5), PLANE: 3 * (self.n - 4) - 4, AFFINE: 3 * (self.n - 4)}[self.frame]
-
-    @property
-    def codim(self) -> int:  # type: ignore[override]
-        """Coordinates of a view less the freedom of its camera."""
-        return 2 * self.n - CAMERA[self.frame].freedom
 
     def shape(self) -> tuple[int, ...]:
         if self.frame == AFFINE:
@@ -223,28 +193,13 @@ class ShapeTensor(Invariant):
             >>> (ShapeTensor("affine").compose(P) * 2).abs().round(decimals=6).tolist()  # the diagonals of a square meet
             [1.0, 1.0, 1.0, 1.0, 0.0]
         """
-        own = replace(self, points=int(points.shape[-2]))
-        whole = points if points.shape[-1] == 4 else torch.nn.functional.pad(points, (0, 1), value=1.0)
-        whole = static.standard(whole.double(), own.frame)
-        sound = whole.isfinite().flatten(-2).all(-1)[..., None, None]
-        whole = torch.where(sound, whole, static.with_basis(torch.ones_like(whole[..., 4:, :]), own.frame))
-        tensor = own._compose(whole)
-        flat = tensor.flatten(-len(own.shape()))
-        norm = flat.norm(dim=-1, keepdim=True)
-        flat = torch.where(sound if own.nullity > 1 else sound[..., 0], flat / torch.where(norm > 0, norm, 1.0), 0.0)
-        return flat.unflatten(-1, own.shape()).to(points.dtype)
+        return self.compose_points(points)
 
-    def _compose(self, points: Tensor) -> Tensor:
-        """The tensor, of any scale, of points ``(*batch, n, 4)`` in the standard frame."""
-        others = points[..., 4:, :]
-        if self.frame == AFFINE:
-            annihilator = null_space(points.mT, self.n - 4)
-            return annihilator.squeeze(-2) if self.nullity == 1 else annihilator
-        if self.multilinear:
-            cameras = (static.dual_cameras if self.frame == GENERAL else static.reference_cameras)(others)
-            return static.form(cameras).unflatten(-1, self.shape())
-        v = others[..., :3] / others[..., 3:]
-        return v - v.mean(-2, keepdim=True)
+    def compose_standard(self, points: Tensor) -> Tensor:
+        if not self.multilinear:
+            return super().compose_standard(points)
+        cameras = (static.dual_cameras if self.frame == GENERAL else static.reference_cameras)(points[..., 4:, :])
+        return static.form(cameras).unflatten(-1, self.shape())
 
     @on_class
     def decompose(self, tensor: Tensor) -> Tensor:
@@ -271,19 +226,6 @@ class ShapeTensor(Invariant):
         """The points v ``(*batch, n - 4, 3)``, of sum 0, of flat tensors of a reference plane."""
         v = flat @ static.plane_inverse(self.n, flat.device).mT if self.multilinear else flat
         return v.unflatten(-1, (self.n - 4, 3))
-
-    def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
-        """Reprojection error ``(*batch, views, 2 n)`` of the points of each view, whose camera is found first."""
-        structure = static.standard(motion[0].double(), self.frame)
-        return reprojection_residual(structure, views[0].double(), scales[0].double(), CAMERA[self.frame]).to(views[0].dtype)
-
-    def linearize(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        value, slope = jacobian(
-            lambda t: static.standard(t.unflatten(-1, (self.n, 4)), self.frame).flatten(-2), motion[0].flatten(-2)
-        )
-        structure = value.unflatten(-1, (self.n, 4))
-        error, derivative = reprojection_derivative(structure, views[0], scales[0], CAMERA[self.frame])
-        return error.flatten(-2), slope @ derivative.flatten(-2).flatten(-3, -2).mT
 
     def score(self, tensor: Tensor, *points: Tensor) -> Tensor:
         r"""Algebraic score of views: how nearly the equations of the camera, given the shape, are dependent.

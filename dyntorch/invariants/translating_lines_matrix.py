@@ -7,11 +7,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Line, direction
 from dyntorch.core.residual import whiten
-from dyntorch.geometry.extensors import common_point, compound, compound_root, join, plucker_form, project, skew_line
-from dyntorch.geometry.homogeneous import hyperplanes_through, inhomogeneous
-from dyntorch.numerics.nullspace import null_space
+from dyntorch.geometry.extensors import compound, compound_root, plucker_form, project
 
 
 class TranslatingLinesMatrix(Invariant):
@@ -19,7 +18,7 @@ class TranslatingLinesMatrix(Invariant):
 
     The line before its motion meets the line after it: both lie in the plane it sweeps.  So do two points of a body that
     translates.  35 lines, if the points of a line may move at different speeds; lines that only translate, each by its own
-    vector, leave four more solutions (rank 31, see :meth:`pure_translation_family`) which two static points remove
+    vector, leave four more solutions (rank 31) which two static points remove
     (:meth:`static_point_lines`).  Two rigid translating bodies give rank 28, three or more 31.
 
     A line is two of its points ``(*batch, n, 2, 3)``, not the same ones in the two views, or Pluecker coordinates
@@ -55,8 +54,7 @@ class TranslatingLinesMatrix(Invariant):
             ``(*batch, 6, 6)`` of norm 1; the first axis takes lines of view 2.
         """
         lines = compound(matrix, 2).mT @ plucker_form(dtype=matrix.dtype, device=matrix.device)
-        norm = torch.linalg.matrix_norm(lines, keepdim=True)
-        return lines / torch.where(norm > 0, norm, torch.ones_like(norm))
+        return unit_tensors(lines, 2)
 
     @staticmethod
     def decompose(matrix: Tensor) -> Tensor:
@@ -101,56 +99,6 @@ class TranslatingLinesMatrix(Invariant):
         return Line().raw(lines) @ (matrix if source == 2 else matrix.mT) @ form
 
     @staticmethod
-    def transfer_points(matrix: Tensor, points: Tensor, source: int = 2) -> Tensor:
-        r"""Where a static point of one view lies in the other: the common point of three transferred lines through it.
-
-        Args:
-            matrix: ``(*batch, 6, 6)``.
-            points: ``(*batch, n, 3)``.
-            source: view of the points, 1 or 2.
-
-        Returns:
-            ``(*batch, n, 3)`` in the other view.
-
-        Raises:
-            ValueError: another view.
-
-        Example:
-            >>> import torch
-            >>> F = TranslatingLinesMatrix.compose(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])))
-            >>> TranslatingLinesMatrix.transfer_points(F, torch.tensor([[1.0, 2.0, 3.0]])).round(decimals=4).tolist()
-            [[2.0, 4.0, 6.0]]
-        """
-        stars = _star(points)
-        moved = TranslatingLinesMatrix.transfer(matrix, stars.flatten(-3, -2), source).unflatten(-2, stars.shape[-3:-1])
-        return inhomogeneous(common_point(normalize(moved, dim=-1)))
-
-    @staticmethod
-    def swept_plane(matrix: Tensor, l1: Tensor, l2: Tensor) -> Tensor:
-        r"""The plane in which the line of each match moves, in the frame of view 1: the join of :math:`l_1` and :math:`J F^T l_2`.
-
-        Args:
-            matrix: ``(*batch, 6, 6)``.
-            l1, l2: matches.
-
-        Returns:
-            ``(*batch, n, 4)`` of norm 1 (least squares where the lines do not quite meet); any plane through a line that is
-            static.
-
-        Example:
-            >>> import torch
-            >>> F = TranslatingLinesMatrix.compose(torch.eye(4))
-            >>> l1 = torch.tensor([[[0.0, 0.0, 5.0], [1.0, 0.0, 5.0]]])
-            >>> plane = TranslatingLinesMatrix.swept_plane(F, l1, l1 + torch.tensor([0.0, 1.0, 0.0]))
-            >>> (plane / plane[:, 2:3]).round(decimals=4).abs().tolist()
-            [[0.0, 0.0, 1.0, 5.0]]
-        """
-        first, second = Line().raw(l1), TranslatingLinesMatrix.transfer(matrix, l2)
-        # a plane contains a line if it contains the points where that meets the coordinate planes
-        points = torch.stack([normalize(first, dim=-1), normalize(second, dim=-1)], dim=-2)
-        return null_space(skew_line(points).flatten(-3, -2))[..., 0, :]
-
-    @staticmethod
     def static_point_lines(x1: Tensor, x2: Tensor, *, length: float = 1.0) -> tuple[Tensor, Tensor]:
         """Static points as matches of lines: every line through the point in view 1 meets every line through it in view 2.
 
@@ -180,34 +128,6 @@ class TranslatingLinesMatrix(Invariant):
             first[..., :, :, None, :, :].expand(*first.shape[:-2], 3, 2, 3).flatten(-5, -3),
             second[..., :, None, :, :, :].expand(*first.shape[:-3], 3, 3, 2, 3).flatten(-5, -3),
         )
-
-    @staticmethod
-    def pure_translation_family(matrix: Tensor, infinity: Tensor | None = None) -> Tensor:
-        r"""All matrices that lines fulfil which only translate, each by its own vector: a space of 5 dimensions.
-
-        In affine coordinates of the world, lines as moment and direction (m, w), translation keeps the direction, hence
-        :math:`w_2^T [s]_\times w_1 = 0`, :math:`w_2 \cdot m_1 = 0`, :math:`m_2 \cdot w_1 = 0`: nobody can tell the scale of the
-        second view (the ratio of the last two) nor its position (s).
-
-        Args:
-            matrix: ``(*batch, 4, 4)`` A, from view 2 to view 1.
-            infinity: ``(*batch, 4)`` plane at infinity in view 1, last coordinate not 0; default (0, 0, 0, 1), a metric sensor.
-
-        Returns:
-            ``(*batch, 5, 6, 6)`` orthonormal basis, whose span contains ``compose(matrix)``.
-
-        Example:
-            >>> import torch
-            >>> tuple(TranslatingLinesMatrix.pure_translation_family(torch.eye(4)).shape)
-            (5, 6, 6)
-        """
-        eye = torch.eye(4, dtype=matrix.dtype, device=matrix.device)
-        plane = eye[3] if infinity is None else infinity / infinity[..., 3:]
-        world = torch.cat([eye[:3].expand(*plane.shape[:-1], 3, 4), plane[..., None, :]], dim=-2)
-        right, left = compound(world, 2), compound(world @ matrix, 2)
-        family = left.mT[..., None, :, :] @ _translation_forms(matrix) @ right[..., None, :, :]
-        basis = torch.linalg.qr(family.flatten(-2).mT)[0].mT
-        return basis.unflatten(-1, (6, 6))
 
     def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Residual of lines that do not move: both points of view 2, mapped to view 1, lie on the line there, whitened.
@@ -248,22 +168,3 @@ def _across(direction: Tensor) -> Tensor:
     eye = torch.eye(3, dtype=direction.dtype, device=direction.device)
     w = torch.where(unit_direction[..., 2:] < 0, -unit_direction, unit_direction) + eye[2]
     return (eye - w[..., :, None] * w[..., None, :] / w[..., 2, None, None])[..., :2, :]
-
-
-def _star(points: Tensor) -> Tensor:
-    """Three independent unit lines ``(..., 3, 6)`` through each point ``(..., 3)``."""
-    p = torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)[..., None, :]
-    return join(normalize(p, dim=-1), hyperplanes_through(points))
-
-
-def _translation_forms(like: Tensor) -> Tensor:
-    """``(5, 6, 6)``: skew forms of the directions, and the two products of direction and moment."""
-    forms = torch.zeros(5, 6, 6, dtype=like.dtype, device=like.device)
-    direction = torch.tensor([2, 4, 5], device=like.device)
-    for a, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
-        forms[a, direction[i], direction[j]], forms[a, direction[j], direction[i]] = 1.0, -1.0
-    # w . m' is one half of the form J: 23 with 01, -13 with 02, 12 with 03 and so on
-    form = plucker_form(dtype=like.dtype, device=like.device)
-    forms[3][direction] = form[direction]
-    forms[4][:, direction] = form[:, direction]
-    return forms

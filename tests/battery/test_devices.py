@@ -107,7 +107,6 @@ USES: dict[str, tuple[Callable[[], Any], Callable[..., Any]]] = {
             H.transfer(s.tensor, y),
             H.trajectory(s.tensor, x, y),
             H.static_distance(s.tensor, x, y, z),
-            H.diagnose(s.tensor),
         ),
     ),
     "ConstantVelocityTensor": (

@@ -43,8 +43,7 @@ def shown(result: Any) -> dict[str, Any]:
 
 
 OWN = (
-    "transfer", "transfer_points", "trajectory", "trajectory_planes", "epipolar_lines", "concurrency", "diagnose", "epipoles",
-    "fundamentals", "pure_translation_family", "positions", "velocities", "swept_plane", "labels",
+    "transfer", "trajectory", "trajectory_planes", "concurrency", "epipoles", "fundamentals", "positions", "velocities", "labels",
 )  # fmt: skip
 
 
@@ -52,14 +51,12 @@ OWN = (
 def own(invariant: Any, name: str, found: dyn.Solution, views: tuple[Tensor, ...]) -> Any:
     """What an invariant alone answers of its tensor."""
     method, tensor, motion = getattr(invariant, name), found.tensor, found.motion
-    if name in ("diagnose", "epipoles", "fundamentals", "pure_translation_family"):
+    if name in ("epipoles", "fundamentals"):
         return method(tensor)
     if name in ("positions", "velocities"):
         return method(motion, *views)
     if name == "labels":
         return method(*invariant.fundamentals(tensor), *views)
-    if name == "swept_plane":
-        return method(tensor, *views)
     if name == "trajectory" and isinstance(invariant, dyn.ConstantVelocityTensor):
         return method(motion, *views)
     if name in ("trajectory", "trajectory_planes", "concurrency") or isinstance(invariant, dyn.ConstantVelocityTensor):

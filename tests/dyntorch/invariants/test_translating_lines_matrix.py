@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from dyntorch.core.primitives import Line
 from dyntorch.core.residual import multilinear
 from dyntorch.geometry.extensors import compound, plucker, plucker_form
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
@@ -119,45 +118,11 @@ def test_static_points_alone():
         TL.static_point_lines(x1, x2[:, :4])
 
 
-def test_pure_translation_family():
-    scene = translating_lines(120, motion="translation", sensors="projective", generator=generator(8))
-    (matrix,) = scene.motion
-    null = torch.linalg.svd(rows(*scene.views)).Vh[-5:]
-    # the plane at infinity of the world, as view 1 sees it: parallel lines of the world meet in it
-    infinity = infinity_of(scene)
-    family = TL.pure_translation_family(matrix, infinity).flatten(-2)
-    assert torch.allclose(family @ family.mT, torch.eye(5, dtype=torch.float64), atol=1e-12)
-    assert (rows(*scene.views) @ family.mT).abs().max() < 1e-11
-    assert torch.allclose(null.mT @ null, family.mT @ family, atol=1e-8)
-    member = TL.compose(matrix).flatten()
-    assert (member - family.mT @ (family @ member)).norm() < 1e-12
-    rigid = translating_lines(60, motion="translation", sensors="rigid", batch=3, generator=generator(9))
-    family = TL.pure_translation_family(*rigid.motion)
-    assert family.shape == (3, 5, 6, 6)
-    values = torch.einsum("bni,bkij,bnj->bkn", lines(rigid.views[1]), family, lines(rigid.views[0]))
-    assert values.abs().max() < 1e-12
-
-
-def infinity_of(scene):
-    """The plane that holds the meeting points of corresponding lines: they are parallel in the world."""
-    first = Line().raw(scene.exact[0])
-    second = Line().raw(move_ends(*scene.motion, scene.exact[1]))
-    points = []
-    for line1, line2 in zip(first, second, strict=True):
-        skew = torch.zeros(2, 4, 4, dtype=line1.dtype)
-        for k, line in enumerate((line1, line2 @ plucker_form())):
-            i, j = torch.triu_indices(4, 4, 1)
-            skew[k, i, j] = line
-        skew = skew - skew.mT
-        points.append(torch.linalg.svd(skew[0] @ skew[1]).U[:, 0])
-    return torch.linalg.svd(torch.stack(points)).Vh[-1]
-
-
-def test_transfer_of_lines_and_points():
+def test_transfer_of_lines():
     (matrix,) = translating_lines(1, batch=3, generator=generator(13)).motion
     form = TL.compose(matrix)
-    ends2, points2 = random(3, 8, 2, 3, seed=14), random(3, 8, 3, seed=15)
-    ends1, points1 = move_ends(matrix, ends2), apply(matrix, points2)
+    ends2 = random(3, 8, 2, 3, seed=14)
+    ends1 = move_ends(matrix, ends2)
     for found, expected in (
         (TL.transfer(form, ends2), lines(ends1)),
         (TL.transfer(form, plucker(ends2), source=2), lines(ends1)),
@@ -165,18 +130,8 @@ def test_transfer_of_lines_and_points():
     ):
         cosine = (torch.nn.functional.normalize(found, dim=-1) * expected).sum(-1).abs()
         assert torch.allclose(cosine, torch.ones_like(cosine), atol=1e-12)
-    assert (TL.transfer_points(form, points2) - points1).abs().max() < 1e-9
-    assert (TL.transfer_points(form, points1, source=1) - points2).abs().max() < 1e-9
     with pytest.raises(ValueError, match="source must be"):
         TL.transfer(form, ends1, source=3)
-
-
-def test_swept_plane_contains_both_lines():
-    scene = translating_lines(30, batch=2, generator=generator(16))
-    plane = TL.swept_plane(TL.compose(*scene.motion), *scene.views)
-    assert plane.shape == (2, 30, 4)
-    for ends in (scene.views[0], move_ends(*scene.motion, scene.views[1])):
-        assert torch.einsum("bnki,bni->bnk", homogeneous(ends), plane).abs().max() < 1e-10
 
 
 def reference_square(residual, views, scales):
@@ -245,7 +200,6 @@ def test_nothing_spoils_a_batch():
     for m in (zero, matrix[0]):
         assert TL().whitened_static_residual((m,), (same, same), ONES).isfinite().all()
         assert multilinear(TL(), TL.compose(m), (same, same), ONES).isfinite().all()
-        assert TL.swept_plane(TL.compose(m), same, same).isfinite().all()
     assert TL.decompose(bad.float()).dtype == torch.float32
     assert TL.decompose(bad[:0]).shape == (0, 4, 4)
     with pytest.raises(ValueError, match="matrix must be"):

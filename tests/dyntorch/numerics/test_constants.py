@@ -20,7 +20,6 @@ from dyntorch.invariants import dynamic_shape_tensor as dynamic_shape_rows
 from dyntorch.invariants import dynamic_tensor
 from dyntorch.invariants import reprojection as shape_residual
 from dyntorch.numerics import eigenspaces, lags
-from dyntorch.numerics import lags as covariances
 from dyntorch.numerics.blocks import constant
 from dyntorch.shapes import basis as dynamic_shape_theory
 from dyntorch.shapes import lifted
@@ -38,7 +37,6 @@ TABLES = [
     (lags._epipolar_places, (CPU,)),
     (lags._resection_places, (CPU,)),
     (epipolar_variance._plane, (CPU,)),
-    (covariances._packing, (3, CPU)),
     (extensors._levi_civita, (3, torch.float64, CPU)),
     (extensors._laplace, (4, 2, CPU)),
     (extensors._dual_signs, (4, 2, CPU)),
