@@ -290,8 +290,8 @@ def misclassification(labels: Tensor, truth: Tensor) -> Tensor:
             raise ValueError(f"{name} must be integers, 0 outlier, 1.. the bodies, got {given.dtype}")
         if (given < OUTLIER).any():
             raise ValueError(f"{name} must not be negative (0 is an outlier), got {int(given.min())}")
-    found, true = (_members(x.long().reshape(-1, x.shape[-1])) for x in (labels, truth))
-    common = (found.mT @ true).cpu()
+    estimated, true = (_members(x.long().reshape(-1, x.shape[-1])) for x in (labels, truth))
+    common = (estimated.mT @ true).cpu()
     best = [float(table[linear_sum_assignment(table.numpy(), maximize=True)].sum()) for table in common[:, 1:, 1:]]
     right = common[:, OUTLIER, OUTLIER] + common.new_tensor(best)
     return (1 - right / labels.shape[-1]).reshape(labels.shape[:-1]).to(labels.device)
@@ -374,16 +374,16 @@ def lifted_error(structure: Tensor, true: Tensor, lifts: Tensor, mask: Tensor | 
     return _errors(inhomogeneous((seen @ c[:, None, None, :, None])[..., 0]), placed, counts, valid, batch)
 
 
-def _errors(found: Tensor, placed: Tensor, counts: Tensor, valid: Tensor, batch: torch.Size) -> LiftedError:
+def _errors(estimated: Tensor, placed: Tensor, counts: Tensor, valid: Tensor, batch: torch.Size) -> LiftedError:
     """Medians of the distances of positions ``(b, views, n, d)`` and of their displacements."""
     many = counts.sum(-1).clamp(min=1)
     inside = torch.where(counts[:, None, :, None], placed, 0.0)
     centre = inside.sum(-2, keepdim=True) / many[:, None, None, None]
     radius = torch.where(counts[:, None], (placed - centre).square().sum(-1), 0.0).sum((-2, -1)) / (many * placed.shape[1])
-    moved, should = found[:, -1] - found[:, 0], placed[:, -1] - placed[:, 0]
+    moved, should = estimated[:, -1] - estimated[:, 0], placed[:, -1] - placed[:, 0]
     speed = torch.where(counts, should.square().sum(-1), 0.0).sum(-1) / many
     speed = torch.where(speed > 1e-18 * radius, speed, radius)
-    far = torch.where(valid[:, None], (found - placed).norm(dim=-1), torch.inf)
+    far = torch.where(valid[:, None], (estimated - placed).norm(dim=-1), torch.inf)
     off = torch.where(valid, (moved - should).norm(dim=-1), torch.inf)
     position = _median(far.flatten(1), counts[:, None].expand_as(far).flatten(1)) / radius.sqrt()
     return LiftedError(position.reshape(batch), (_median(off, counts) / speed.sqrt()).reshape(batch))

@@ -102,10 +102,10 @@ class Bundle:
         if self.invariant.starts is not None:
             return basis
         inv, own = self.invariant, basis.transpose(1, 2)
-        made = inv.compose(*inv.motion_of(inv.tensor_of(own if inv.copies else own[:, :, 0])))
-        made = inv.basis_of(made).reshape(own.shape).transpose(1, 2)
-        sound = made.isfinite().all(-1, keepdim=True) & (made.abs().amax(-1, keepdim=True) > 0)
-        return torch.where(sound.all(-2, keepdim=True).all(1, keepdim=True), made, basis)
+        composed = inv.compose(*inv.motion_of(inv.tensor_of(own if inv.copies else own[:, :, 0])))
+        composed = inv.basis_of(composed).reshape(own.shape).transpose(1, 2)
+        sound = composed.isfinite().all(-1, keepdim=True) & (composed.abs().amax(-1, keepdim=True) > 0)
+        return torch.where(sound.all(-2, keepdim=True).all(1, keepdim=True), composed, basis)
 
     def next(self, weights: Tensor, basis: Tensor) -> Tensor:
         """The same for weightings ``(b, c, K, n)`` of unscaled rows, by inverse iteration from the null spaces before."""
@@ -116,8 +116,8 @@ class Bundle:
         columns = basis.mT
         for _ in range(NUM_INVERSE_ITERATIONS):
             columns = orthonormal(torch.cholesky_solve(columns, factor))
-        found = columns.mT
-        return torch.where(found.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), found, basis)
+        iterate = columns.mT
+        return torch.where(iterate.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), iterate, basis)
 
     def _gram(self, weights: Tensor) -> Tensor:
         # all starts in one product: the matches are read once, however many weightings there are
@@ -290,7 +290,7 @@ class SearchResult(NamedTuple):
     agreeing: Tensor
     """``(b,)`` share of the starts that ended there, of so many that it says something, else 0."""
 
-    def better(self, new: SearchResult, at: Tensor) -> SearchResult:
+    def replace_worse(self, new: SearchResult, at: Tensor) -> SearchResult:
         """With the new ones of some problems, where they lose less."""
         wins = new.score < self.score[at]
         return replace_problems(self, at[wins], each(lambda x: x[wins], new))
@@ -338,18 +338,18 @@ class Search:
             starts: numbers of starts, one after the other.
         """
         cut = cut * self.unit
-        found = self._solve(self.everyone, cut, starts[0])
-        settled = torch.zeros_like(found.doubt)
+        result = self._solve(self.everyone, cut, starts[0])
+        settled = torch.zeros_like(result.doubt)
         enough = (self.weights > 0).sum(-1) >= self.invariant.minimal()
         for count in starts[1:]:
-            left = (found.doubt & enough & ~settled).nonzero()[:, 0]
+            left = (result.doubt & enough & ~settled).nonzero()[:, 0]
             if not len(left):
                 break
             new = self._solve(left, cut, count)
-            found = found.better(new, left)
+            result = result.replace_worse(new, left)
             # more starts would find it again
-            settled[left] = (new.agreeing >= MIN_AGREEING_STARTS) & (new.score <= self._equal_score(found.score[left]))
-        return found
+            settled[left] = (new.agreeing >= MIN_AGREEING_STARTS) & (new.score <= self._equal_score(result.score[left]))
+        return result
 
     def scale(self) -> Tensor:
         """Threshold ``(b,)`` from the data: least median of squares (annealed), and what 99 % of the inliers then keep."""

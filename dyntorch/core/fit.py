@@ -111,12 +111,12 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
         raise ValueError(f"{invariant!r} needs at least {invariant.minimal()} matches, got {data.count}; add matches")
     check_plain(invariant)
     solve = partial(_fit_blocks, invariant, normalize, torch.finfo(data.dtype).eps)
-    (whole, present), found = over_problems(solve, data.views, data.weights, data.static)
-    data = replace(data, views=whole, weights=present)
-    pairs = zip(invariant.primitives, found.transforms, strict=True)
-    norm = Normalization(found.transforms, tuple(p.normalize(t) for p, t in pairs), found.actions)
-    tensor, status, uncertainty = (data.back(part) for part in (found.tensor, found.status, found.uncertainty))
-    return Solution(invariant, tensor, uncertainty, data, norm, found.normalized, status=status)
+    (views, present), fits = over_problems(solve, data.views, data.weights, data.static)
+    data = replace(data, views=views, weights=present)
+    pairs = zip(invariant.primitives, fits.transforms, strict=True)
+    norm = Normalization(fits.transforms, tuple(p.normalize(t) for p, t in pairs), fits.actions)
+    tensor, status, uncertainty = (data.back(part) for part in (fits.tensor, fits.status, fits.uncertainty))
+    return Solution(invariant, tensor, uncertainty, data, norm, fits.normalized, status=status)
 
 
 class LinearFits(NamedTuple):
@@ -138,8 +138,8 @@ def _fit_blocks(
     views, weights = invariant.fill_missing(views, weights)
     count = weights.shape[-1]
     per_problem = count * max(1, invariant.copies or 1) * _largest(invariant)
-    most, least = (max(1, number // max(1, per_problem)) for number in (BLOCK, MIN_BLOCK))
-    size = min(most, max(least, -(-len(weights) // workers())))
+    max_size, min_size = (max(1, number // max(1, per_problem)) for number in (BLOCK, MIN_BLOCK))
+    size = min(max_size, max(min_size, -(-len(weights) // workers())))
     copies = with_copies(invariant, views, weights, static)
     return (views, weights), map_blocks(partial(_fit_block, invariant, normalize, precision), *copies, size=size)
 
@@ -181,8 +181,8 @@ def _fit_block(
     # coordinates may be so large or small that float64 holds no tensor of theirs
     back = denormalize(invariant, tensor, norm.actions)
     flat = back.detach().flatten(status.ndim)
-    held = flat.isfinite().all(-1) & (flat != 0).any(-1)
-    status = torch.where(held | is_failure(status), status, int(Status.DEGENERATE))
+    representable = flat.isfinite().all(-1) & (flat != 0).any(-1)
+    status = torch.where(representable | is_failure(status), status, int(Status.DEGENERATE))
     sound = ~is_failure(status)
     return LinearFits(select(sound, back, 0.0), select(sound, tensor, 0.0), status, uncertainty, norm.transforms, norm.actions)
 
@@ -232,34 +232,34 @@ def _solve_null_space(invariant: Invariant, rows: EstimationRows) -> tuple[Tenso
     few = present < width - nullity
     if rows.static is None:
         few = few | ((weights > 0).sum(-1) < invariant.minimal())
-    found, again = _null_space_by_rows(g, nullity, factor, torch.where(few, torch.inf, rows.rounding))
-    basis = found.basis
+    space, judged_by_rows = _null_space_by_rows(g, nullity, factor, torch.where(few, torch.inf, rows.rounding))
+    basis = space.basis
     spare = (present - (width - nullity)).clamp(min=0)
     # the noise that the solution leaves, per row, against what every other direction has
-    noise = found.residual.clamp(min=0).mean(-1) / spare.clamp(min=1)
-    square = torch.where(spare > 0, noise * found.competing, torch.zeros_like(noise)).detach()
+    noise = space.residual.clamp(min=0).mean(-1) / spare.clamp(min=1)
+    square = torch.where(spare > 0, noise * space.competing, torch.zeros_like(noise)).detach()
     trace = g.diagonal(dim1=-2, dim2=-1).sum(-1)
-    rounding = torch.finfo(g.dtype).eps * (trace * found.competing).detach()
+    rounding = torch.finfo(g.dtype).eps * (trace * space.competing).detach()
     exact = (rounding > MAX_GRAM_ROUNDING) & (rounding > 1e-3 * square)
-    exact = (exact.index_fill(0, again, True) if len(again) else exact) & ~found.degenerate
+    exact = (exact.index_fill(0, judged_by_rows, True) if len(judged_by_rows) else exact) & ~space.degenerate
     # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
     limit = 0.0 if invariant.intrinsic else MIN_CONDITION_OF_NOISE
-    weak = (spare > 0) & ~found.degenerate & (trace * found.competing > limit)
+    weak = (spare > 0) & ~space.degenerate & (trace * space.competing > limit)
     if invariant.copies is not None:
         weak = torch.zeros_like(weak)
     worn = exact & (rounding > MAX_GRADIENT_ROUNDING) & (rounding > square) & _needs_gradient(g)
     # an accelerator waits once per block for all answers: what a tensor and its status are must not depend on where it lives
     asked = int((exact & ~worn).any().long() + 2 * weak.any() + 4 * worn.any())
     if asked & 1:
-        basis = _with_matrix(basis, exact & ~worn, null_space, rows, invariant, host=bool(len(again)))
+        basis = _with_matrix(basis, exact & ~worn, null_space, rows, invariant, host=bool(len(judged_by_rows)))
     if asked & 4:
-        basis = _with_matrix(basis, worn, _preconditioned_null_space, rows, invariant, host=bool(len(again)))
+        basis = _with_matrix(basis, worn, _preconditioned_null_space, rows, invariant, host=bool(len(judged_by_rows)))
     ambiguous = square * present.clamp(min=1) > _ambiguity_limit(spare, width)
     if asked & 2:
         place = weak.nonzero(as_tuple=True)  # an accelerator waits here, and for every mask that is an index
         with torch.no_grad():
             ambiguous[place] |= within_noise(*rows.of(place).parts, basis[place], invariant.resolves_noise)
-    return basis, _status(few, found.degenerate, ambiguous), square.sqrt()
+    return basis, _status(few, space.degenerate, ambiguous), square.sqrt()
 
 
 def _ambiguity_limit(spare: Tensor, width: int) -> Tensor:
@@ -287,22 +287,22 @@ def _null_space_by_rows(
 ) -> tuple[GramNullSpace, Tensor]:
     r"""``gram_null_space`` whose ``degenerate`` does not depend on the device, and is what the rows say, not their squares.
     gram ``(b, ..., D, D)``, factor ``(k,)``, tolerance ``(b, ...)`` -> ``(k,)``."""
-    found = gram_null_space(gram, dim)
-    asked = tolerance.isfinite().expand_as(found.degenerate)
-    doubted = _some(found.degenerate & asked)
+    space = gram_null_space(gram, dim)
+    asked = tolerance.isfinite().expand_as(space.degenerate)
+    doubted = _some(space.degenerate & asked)
     if not len(doubted):
-        return found, doubted
+        return space, doubted
     if not on_host(gram):
-        found = _replace_problems(found, doubted, **vars(gram_null_space(gram[doubted].cpu(), dim)))
-        doubted = _some(found.degenerate & asked)
+        space = _replace_problems(space, doubted, **vars(gram_null_space(gram[doubted].cpu(), dim)))
+        doubted = _some(space.degenerate & asked)
         if not len(doubted):
-            return found, doubted
+            return space, doubted
     values = _singular_values(factor(doubted).detach().cpu(), gram.shape[-1])
     others, null = values[..., :-dim], values[..., -dim:].flip(-1)
     lost = others[..., -1] <= tolerance[doubted].cpu() * values[..., 0]
     # of a null space that is larger there is nothing to say
     competing = torch.where(lost[..., None], 1.0, others).square().reciprocal().sum(-1)
-    return _replace_problems(found, doubted, residual=null.square(), competing=competing, degenerate=lost), doubted
+    return _replace_problems(space, doubted, residual=null.square(), competing=competing, degenerate=lost), doubted
 
 
 def _some(flagged: Tensor) -> Tensor:
@@ -310,10 +310,10 @@ def _some(flagged: Tensor) -> Tensor:
     return flagged.flatten(1).any(-1).nonzero()[:, 0] if flagged.ndim > 1 else flagged.nonzero()[:, 0]
 
 
-def _replace_problems(found: GramNullSpace, place: Tensor, **parts: Tensor) -> GramNullSpace:
+def _replace_problems(space: GramNullSpace, place: Tensor, **parts: Tensor) -> GramNullSpace:
     """The null spaces with these parts of some problems."""
-    put = {name: (whole := getattr(found, name)).index_put((place,), part.to(whole.device)) for name, part in parts.items()}
-    return replace(found, **put)
+    put = {name: (values := getattr(space, name)).index_put((place,), part.to(values.device)) for name, part in parts.items()}
+    return replace(space, **put)
 
 
 def _singular_values(factor: Tensor, size: int) -> Tensor:
@@ -330,8 +330,8 @@ def _with_matrix(
     ``(*batch, nullity, D)``, exact ``(*batch,)``, solve ``(k, rows, D)``."""
     place = exact.nonzero(as_tuple=True)
     matrix = estimation_matrix(*rows.of(place).parts) if invariant.copies is None else estimation_matrix(*rows.parts)[place]
-    found = solve(matrix.cpu() if host else matrix, invariant.nullity)
-    return basis.index_put(place, found.to(basis.device))
+    solution = solve(matrix.cpu() if host else matrix, invariant.nullity)
+    return basis.index_put(place, solution.to(basis.device))
 
 
 def _needs_gradient(x: Tensor) -> bool:

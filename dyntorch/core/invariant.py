@@ -182,8 +182,8 @@ class Invariant:
 
     def motion_of(self, tensor: Tensor) -> tuple[Tensor, ...]:
         """The parts of the motion that :meth:`decompose` finds."""
-        found = self.decompose(tensor)
-        return found if isinstance(found, tuple) else (found,)
+        motion = self.decompose(tensor)
+        return motion if isinstance(motion, tuple) else (motion,)
 
     @property
     def copies(self) -> int | None:

@@ -95,9 +95,9 @@ def matches(
 
 def check_plain(invariant: Invariant) -> None:
     """Raise a ``ValueError`` for an invariant whose own numbers are inside of a transformation of ``torch.func``."""
-    held = [part for part in vars(invariant).values() if isinstance(part, Tensor)]
-    held += [part for primitive in invariant.primitives for part in vars(primitive).values() if isinstance(part, Tensor)]
-    if is_transformed(*held):
+    tensors = [part for part in vars(invariant).values() if isinstance(part, Tensor)]
+    tensors += [part for primitive in invariant.primitives for part in vars(primitive).values() if isinstance(part, Tensor)]
+    if is_transformed(*tensors):
         raise ValueError(
             f"{invariant!r} holds numbers that torch.func transforms (cameras, an interval of times): make it from what is not "
             "transformed, or give all problems at once, in leading dimensions"

@@ -111,8 +111,8 @@ def _moments(primitives: Sequence[Primitive], views: Sequence[Tensor], weights: 
 
 def _free_slots(views: int, static: Tensor) -> list[tuple[int, ...]]:
     """Which slots are free at once in some match."""
-    most = 1 if static.dtype == torch.bool else int(static.max()) if static.numel() else 0
-    return [slots for count in range(1, most + 1) for slots in combinations(range(views), count)]
+    max_free = 1 if static.dtype == torch.bool else int(static.max()) if static.numel() else 0
+    return [slots for count in range(1, max_free + 1) for slots in combinations(range(views), count)]
 
 
 def labelled_rows(primitives: Sequence[Primitive]) -> list[int]:

@@ -111,15 +111,17 @@ def unit_tensors(result: Tensor, rank: int, nullity: int = 1) -> Tensor:
 
 def denormalize_motion(invariant: Invariant, motion: Sequence[Tensor], transforms: Sequence[Tensor]) -> tuple[Tensor, ...]:
     r"""The motion of the measured coordinates: :math:`A = T_{target}^{-1} \hat A\, T_{source}`, canonical scale and sign."""
-    return tuple(_moved(part, frame, transforms, forward=False) for part, frame in zip(motion, invariant.motion, strict=True))
+    return tuple(
+        _change_frame(part, frame, transforms, forward=False) for part, frame in zip(motion, invariant.motion, strict=True)
+    )
 
 
 def normalize_motion(invariant: Invariant, motion: Sequence[Tensor], transforms: Sequence[Tensor]) -> tuple[Tensor, ...]:
     r"""The inverse of :func:`denormalize_motion`: :math:`\hat A = T_{target} A\, T_{source}^{-1}`."""
-    return tuple(_moved(part, frame, transforms, forward=True) for part, frame in zip(motion, invariant.motion, strict=True))
+    return tuple(_change_frame(part, frame, transforms, forward=True) for part, frame in zip(motion, invariant.motion, strict=True))
 
 
-def _moved(part: Tensor, frame: Frame, transforms: Sequence[Tensor], *, forward: bool) -> Tensor:
+def _change_frame(part: Tensor, frame: Frame, transforms: Sequence[Tensor], *, forward: bool) -> Tensor:
     matrix = part[..., None] if frame.vector else part
     for view, left in ((frame.target, True), (frame.source, False)):
         if view is None:

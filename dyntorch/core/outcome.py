@@ -50,9 +50,9 @@ def has_inliers(status: Tensor) -> Tensor:
     return (status == Status.OK) | (status == Status.AMBIGUOUS)
 
 
-def status_from(found: Iterable[Notice]) -> Tensor:
+def status_from(notices: Iterable[Notice]) -> Tensor:
     """The status of one problem with these notices: that of the first that refuses, OK without one."""
-    refused = next((notice.code.refuses for notice in found if notice.code.refuses is not None), Status.OK)
+    refused = next((notice.code.refuses for notice in notices if notice.code.refuses is not None), Status.OK)
     return torch.tensor(int(refused))
 
 
@@ -123,12 +123,12 @@ def notices(code: NoticeCode, values: Tensor, flagged: Tensor, batch: tuple[int,
     """A notice for every flagged problem. values ``(b,)``, flagged ``(b,)``."""
     # one copy: an accelerator would wait for every number
     figures = torch.where(flagged, values.detach().double(), torch.nan), flagged.double()
-    found = []
+    collected = []
     for flat, (value, counts) in enumerate(zip(*torch.stack(figures).tolist(), strict=True)):
         if counts:
             place = tuple(int(i) for i in np.unravel_index(flat, batch)) if batch else ()
-            found.append(Notice(code, value, more, place))
-    return found
+            collected.append(Notice(code, value, more, place))
+    return collected
 
 
 Note = Callable[..., None]
@@ -136,17 +136,17 @@ Note = Callable[..., None]
 
 def noting(batch: tuple[int, ...]) -> tuple[list[Notice], Note]:
     """An empty list, and what adds to it: :func:`notices` of a batch."""
-    found: list[Notice] = []
+    collected: list[Notice] = []
 
     def note(code: NoticeCode, values: Tensor, flagged: Tensor, **more: Any) -> None:
-        found.extend(notices(code, values, flagged, batch, **more))
+        collected.extend(notices(code, values, flagged, batch, **more))
 
-    return found, note
+    return collected, note
 
 
-def in_order(found: Iterable[Notice]) -> tuple[Notice, ...]:
+def in_order(notices: Iterable[Notice]) -> tuple[Notice, ...]:
     """Notices in the order of their problems."""
-    return tuple(sorted(found, key=lambda notice: notice.problem))
+    return tuple(sorted(notices, key=lambda notice: notice.problem))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -191,8 +191,8 @@ class Outcome:
         status = self._single() if status is None else status
         if status == Status.OK:
             return ""
-        told = [notice.text if words is None else notice.with_words(words).text for notice in self._telling(status)]
-        return "; ".join(told[:2]) or Message(self.REMEDIES[status], words or as_python)
+        messages = [notice.text if words is None else notice.with_words(words).text for notice in self._telling(status)]
+        return "; ".join(messages[:2]) or Message(self.REMEDIES[status], words or as_python)
 
     def check(self) -> Self:
         """Raise where any problem failed.
@@ -231,7 +231,7 @@ class Outcome:
         return refusing or self.notices
 
 
-def check_status(what: str, status: Tensor, said: Sequence[Notice] = (), remedies: Mapping[Status, str] = REMEDY) -> None:
+def check_status(what: str, status: Tensor, notices: Sequence[Notice] = (), remedies: Mapping[Status, str] = REMEDY) -> None:
     """Raise where any problem failed. status ``(*batch,)``."""
     refuse_vmap("status", status, "return what is needed from the function that is mapped, and look at its status behind that")
     flat = status.reshape(-1)
@@ -241,9 +241,9 @@ def check_status(what: str, status: Tensor, said: Sequence[Notice] = (), remedie
         if state != Status.OK and where:
             shown = ", ".join(map(str, where[:8])) + (", ..." if len(where) > 8 else "")
             problems = f"problem {shown} of {len(flat)}" if status.ndim else "the problem"
-            reasons = [str(notice) for notice in said if int(places[notice.problem]) in where]
-            known = f" ({'; '.join(reasons[:3])})" if reasons else ""
-            raise ValueError(f"{what}: {problems}: {state.name}; {Message(remedies[state])}{known}")
+            reasons = [str(notice) for notice in notices if int(places[notice.problem]) in where]
+            details = f" ({'; '.join(reasons[:3])})" if reasons else ""
+            raise ValueError(f"{what}: {problems}: {state.name}; {Message(remedies[state])}{details}")
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -257,59 +257,59 @@ def solve_one_by_one(batch: Sequence[int], solve: Callable[[int], Result], spare
     """The results of all problems, as :func:`stack_results` makes one of them."""
     if not prod(batch):
         raise ValueError(f"the batch {tuple(batch)} holds no problem; give one at least")
-    found: list[Result | str] = []
+    results: list[Result | str] = []
     errors = []
     for place in range(prod(batch)):
         try:
-            found.append(solve(place))
+            results.append(solve(place))
         except ValueError as problem:
             errors.append(problem)
-            found.append(str(problem))
-    if len(errors) == len(found):
+            results.append(str(problem))
+    if len(errors) == len(results):
         raise errors[0]
-    return stack_results([spare(one) if isinstance(one, str) else one for one in found], batch)
+    return stack_results([spare(one) if isinstance(one, str) else one for one in results], batch)
 
 
-def stack_results(found: Sequence[Result], batch: Sequence[int]) -> Result:
+def stack_results(results: Sequence[Result], batch: Sequence[int]) -> Result:
     """One result of several: tensors with the batch in front, numbers as tensors ``(*batch,)``, the notices of all problems."""
-    first = next((one for one in found if one is not None), None)
+    first = next((one for one in results if one is not None), None)
     if first is None:
-        return found[0]
+        return results[0]
     if isinstance(first, Tensor):
-        return _pad_and_stack([one if isinstance(one, Tensor) else first.new_full((0,) * first.ndim, 0) for one in found], batch)  # type: ignore[return-value]
+        return _pad_and_stack([one if isinstance(one, Tensor) else first.new_full((0,) * first.ndim, 0) for one in results], batch)  # type: ignore[return-value]
     if isinstance(first, bool | int | float):
         kind = torch.bool if isinstance(first, bool) else torch.float64 if isinstance(first, float) else torch.int64
-        return torch.tensor(found, dtype=kind).reshape(*batch)  # type: ignore[return-value]
+        return torch.tensor(results, dtype=kind).reshape(*batch)  # type: ignore[return-value]
     if is_dataclass(first) and not isinstance(first, type):
         parts: dict[str, Any] = {}
         for one in fields(first):
-            values = [getattr(result, one.name) for result in found]
+            values = [getattr(result, one.name) for result in results]
             parts[one.name] = _place_notices(values, batch) if one.name == "notices" else stack_results(values, batch)
         return replace(first, **parts)
-    tuples = isinstance(first, tuple) and all(isinstance(one, tuple) and len(one) == len(first) for one in found)
+    tuples = isinstance(first, tuple) and all(isinstance(one, tuple) and len(one) == len(first) for one in results)
     # tensors say no single word on whether they are equal
-    plain = not isinstance(first, tuple) or not any(isinstance(part, Tensor) for one in found for part in one)  # type: ignore[attr-defined]
-    if plain and all(one == first for one in found):
+    plain = not isinstance(first, tuple) or not any(isinstance(part, Tensor) for one in results for part in one)  # type: ignore[attr-defined]
+    if plain and all(one == first for one in results):
         return first
     if tuples:
-        return tuple(stack_results(part, batch) for part in zip(*found, strict=True))  # type: ignore[return-value]
-    return tuple(found)  # type: ignore[return-value]
+        return tuple(stack_results(part, batch) for part in zip(*results, strict=True))  # type: ignore[return-value]
+    return tuple(results)  # type: ignore[return-value]
 
 
 def _pad_and_stack(tensors: Sequence[Tensor], batch: Sequence[int]) -> Tensor:
     shape = [max(sizes) for sizes in zip(*(x.shape for x in tensors), strict=True)]
     like = tensors[0]
     blank = float("nan") if like.is_floating_point() else 0 if like.dtype == torch.bool else -1
-    whole = like.new_full((len(tensors), *shape), blank)
+    stacked = like.new_full((len(tensors), *shape), blank)
     for place, x in enumerate(tensors):
-        whole[place][tuple([slice(size) for size in x.shape])] = x
-    return whole.reshape(*batch, *shape)
+        stacked[place][tuple([slice(size) for size in x.shape])] = x
+    return stacked.reshape(*batch, *shape)
 
 
-def _place_notices(found: Sequence[Sequence[Notice]], batch: Sequence[int]) -> tuple[Notice, ...]:
+def _place_notices(notices: Sequence[Sequence[Notice]], batch: Sequence[int]) -> tuple[Notice, ...]:
     """Notices with the places of their problems."""
-    places = [tuple(int(i) for i in np.unravel_index(place, tuple(batch))) for place in range(len(found))]
-    return in_order(replace(notice, problem=place) for place, some in zip(places, found, strict=True) for notice in some)
+    places = [tuple(int(i) for i in np.unravel_index(place, tuple(batch))) for place in range(len(notices))]
+    return in_order(replace(notice, problem=place) for place, some in zip(places, notices, strict=True) for notice in some)
 
 
 def trim_padding(x: Tensor) -> Tensor:

@@ -133,8 +133,8 @@ class Primitive(ABC):
         for shape in self.shapes():
             if tuple(x.shape[x.ndim - len(shape) :]) == shape and x.ndim > len(shape):
                 return x.ndim - len(shape) - 1
-        known = " or ".join(f"(*batch, n, {', '.join(map(str, shape))})" for shape in self.shapes())
-        raise ValueError(f"expected {known}, got {tuple(x.shape)}")
+        expected = " or ".join(f"(*batch, n, {', '.join(map(str, shape))})" for shape in self.shapes())
+        raise ValueError(f"expected {expected}, got {tuple(x.shape)}")
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.dim})"
@@ -335,7 +335,7 @@ class HyperplanesThrough(Primitive):
 
     def components(self, x: Tensor) -> Tensor:
         self._check_single()
-        coordinates, sign = self._moving(x)[1:]
+        coordinates, sign = self._linear_minors(x)[1:]
         return torch.cat([torch.ones_like(x[..., :1]), (x[..., coordinates] * sign).flip(-1)], dim=-1).mT
 
     def vectors(self, x: Tensor) -> Tensor:
@@ -356,12 +356,12 @@ class HyperplanesThrough(Primitive):
 
     def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
         self._check_single()
-        place, _, sign = self._moving(gradient)
+        place, _, sign = self._linear_minors(gradient)
         return gradient[..., place] * sign
 
     def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
         self._check_single()
-        return torch.cat([torch.zeros_like(change[..., :1]), (change * self._moving(change)[2]).flip(-1)], dim=-1)
+        return torch.cat([torch.zeros_like(change[..., :1]), (change * self._linear_minors(change)[2]).flip(-1)], dim=-1)
 
     def slopes(self, gradient: Tensor) -> Tensor:
         """Derivatives ``(.., rows * order, n)`` of the forms of all rows by the coordinates on which each depends.
@@ -369,11 +369,11 @@ class HyperplanesThrough(Primitive):
         Args:
             gradient: ``(.., width, n)`` of the form by the vector.
         """
-        place, _, sign = self._moving(gradient)
+        place, _, sign = self._linear_minors(gradient)
         return gradient.index_select(-2, place) * sign[:, None]
 
-    def _moving(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        place, coordinates, sign = _moving_minors(self.dim, self.order, like.device)
+    def _linear_minors(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        place, coordinates, sign = _linear_minor_tables(self.dim, self.order, like.device)
         return place, coordinates, sign.to(like.dtype)
 
     def _check_single(self) -> None:
@@ -382,7 +382,7 @@ class HyperplanesThrough(Primitive):
 
 
 @constant
-def _moving_minors(dim: int, order: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+def _linear_minor_tables(dim: int, order: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """The minors of [I | -x] that are a coordinate up to sign, row by row of the compound: their places, coordinates, signs."""
     columns = {s: i for i, s in enumerate(combinations(range(dim + 1), order))}
     found = [

@@ -64,7 +64,7 @@ class Problem(NormalEquations):
         views, weights = tuple(x[:, piece] for x in self.views), self.weights[:, piece]
         still = None if self.static is None else self.static[:, piece]
         moving = weights if still is None else weights * (still == 0)
-        value, derivative = self.moving(theta, views)
+        value, derivative = self.linearize_moving(theta, views)
         root = moving.sqrt()[..., None].expand(*moving.shape, value.shape[1] // max(1, moving.shape[1])).flatten(1)
         value, derivative = value * root, derivative * root[:, None]
         if still is None:
@@ -72,13 +72,13 @@ class Problem(NormalEquations):
         values, slopes = [value], [derivative]
         for free in range(1, 2 if still.dtype == torch.bool else self.invariant.within):
             resting = (weights * (still == free)).sqrt()[..., None]
-            more = self.resting(theta, views, free)
+            more = self.linearize_static(theta, views, free)
             values.append((more[0].unflatten(1, (views[0].shape[1], -1)) * resting).flatten(1))
             wide = resting.expand(*resting.shape[:2], more[0].shape[1] // max(1, resting.shape[1])).flatten(1)
             slopes.append(more[1] * wide[:, None])
         return torch.cat(values, dim=-1), torch.cat(slopes, dim=-1)
 
-    def moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+    def linearize_moving(self, theta: Tensor, views: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that may move, and their derivative."""
         invariant, motion = self.invariant, self.parts(theta)
         known = invariant.linearize(motion, views, self.scales)
@@ -92,11 +92,11 @@ class Problem(NormalEquations):
         value, derivative = multilinear_derivative(invariant, tensor.unflatten(1, invariant.shape()), views, self.scales)
         return value, slope @ derivative.mT
 
-    def resting(self, theta: Tensor, views: tuple[Tensor, ...], free: int = 1) -> tuple[Tensor, Tensor]:
+    def linearize_static(self, theta: Tensor, views: tuple[Tensor, ...], free: int = 1) -> tuple[Tensor, Tensor]:
         """Unweighted residuals of matches that do not move, or move in so many dimensions less, and their derivative."""
         smaller = self.invariant.confine(free)
         if smaller is not None:
-            return replace(self, invariant=smaller).moving(theta, views)
+            return replace(self, invariant=smaller).linearize_moving(theta, views)
         return residual_derivative(self.invariant.whitened_static_residual, self.parts(theta), views, self.scales)
 
     def pieces(self, width: int) -> list[slice]:
@@ -308,9 +308,9 @@ def _of_transformed(solution: Solution, data: Matches, iterations: int) -> Solut
     invariant, norm, status = solution.invariant, solution.normalization, solution.status.reshape(-1)
     check_plain(invariant)
     # the tensor of problems that failed stays: flat, in float64
-    whole = solution.tensor.reshape(*status.shape, *solution.tensor.shape[solution.status.ndim :]).to(data.weights.dtype)
+    tensors = solution.tensor.reshape(*status.shape, *solution.tensor.shape[solution.status.ndim :]).to(data.weights.dtype)
 
-    def found(
+    def refine_flat(
         state: tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...] | None],
         transforms: tuple[Tensor, ...],
         views: tuple[Tensor, ...],
@@ -319,16 +319,16 @@ def _of_transformed(solution: Solution, data: Matches, iterations: int) -> Solut
     ) -> tuple[Tensor, Tensor, tuple[Tensor, ...], Tensor, Tensor]:
         tensor, normalized, status, refined = state
         flat = Matches(views, weights, static, weights.shape[:1], weights.dtype, weights.device)
-        known = Normalization.of(invariant, transforms)
+        norm_of_flat = Normalization.of(invariant, transforms)
         nothing = torch.zeros_like(normalized.flatten(1)[:, 0])
-        start = Solution(invariant, tensor, nothing, flat, known, normalized, refined=refined, status=status)
+        start = Solution(invariant, tensor, nothing, flat, norm_of_flat, normalized, refined=refined, status=status)
         result = refine_matches(start, flat, iterations)
         assert result.refined is not None and result.sigma is not None and result.covariance is not None
         return result.tensor, result.normalized, result.refined, result.sigma, result.covariance
 
-    state = whole, solution.normalized, status, solution.refined
+    state = tensors, solution.normalized, status, solution.refined
     tensor, normalized, refined, sigma, covariance = over_problems(
-        found, state, norm.transforms, data.views, data.weights, data.static
+        refine_flat, state, norm.transforms, data.views, data.weights, data.static
     )
     return replace(
         solution,
@@ -366,34 +366,34 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
     with torch.no_grad():
         start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
         scales, unit = relative([t[:, 0, 0] for t in frames])
-        found = map_blocks(run, start, views, scales, data.weights, data.static, size=size)
-        gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in found.terms)
-        found = Minimum(found.theta, found.cost / unit.square(), (gradient, matrix), found.steps)
+        minimum = map_blocks(run, start, views, scales, data.weights, data.static, size=size)
+        gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in minimum.terms)
+        minimum = Minimum(minimum.theta, minimum.cost / unit.square(), (gradient, matrix), minimum.steps)
         if not recorded:
-            return _apply_minimum(solution, data, motion, found)
-        open_ = unfinished_notices(found, invariant.dof, data.batch)
-    theta, cost = differentiable_minimum(solution, data, shapes, found)
-    refined = _apply_minimum(solution, data, motion, Minimum((theta,), cost, found.terms, found.steps))
+            return _apply_minimum(solution, data, motion, minimum)
+        open_ = unfinished_notices(minimum, invariant.dof, data.batch)
+    theta, cost = differentiable_minimum(solution, data, shapes, minimum)
+    refined = _apply_minimum(solution, data, motion, Minimum((theta,), cost, minimum.terms, minimum.steps))
     return replace(refined, notices=in_order((*solution.notices, *open_)))
 
 
-def _apply_minimum(solution: Solution, data: Matches, old: tuple[Tensor, ...], found: Minimum) -> Solution:
+def _apply_minimum(solution: Solution, data: Matches, old: tuple[Tensor, ...], minimum: Minimum) -> Solution:
     """The solution with the refined motion, where refinement was possible; elsewhere with the old one."""
     invariant, shapes = solution.invariant, tuple(part.shape[1:] for part in old)
-    good = found.cost.isfinite() & ~is_failure(solution.status.reshape(-1).to(found.cost.device))
-    motion = tuple(select(good, new, part) for new, part in zip(parts_of(found.theta[0], shapes), old, strict=True))
+    good = minimum.cost.isfinite() & ~is_failure(solution.status.reshape(-1).to(minimum.cost.device))
+    motion = tuple(select(good, new, part) for new, part in zip(parts_of(minimum.theta[0], shapes), old, strict=True))
     # tensors of copies have the axis of the copies behind the batch, like the transforms of the solution
     normalized = solution.base().compose(*(select(good, part, _any(part)) for part in motion))
     tensor = denormalize(invariant, normalized, solution.normalization.actions)
-    sigma = _noise(invariant, data, found.cost)
+    sigma = _noise(invariant, data, minimum.cost)
 
-    def moved(theta: Tensor) -> Tensor:
+    def denormalize_parts(theta: Tensor) -> Tensor:
         parts = denormalize_motion(invariant, parts_of(theta, shapes), frames)
         return torch.cat([part.flatten(theta.ndim - 1) for part in parts], dim=-1)
 
     frames = tuple(t.detach() for t in solution.frames())
     with torch.no_grad():
-        covariance = _covariance(moved, found, invariant.dof, sigma * largest_weights(data.weights).sqrt())
+        covariance = _covariance(denormalize_parts, minimum, invariant.dof, sigma * largest_weights(data.weights).sqrt())
     return replace(
         solution,
         tensor=select(data.back(good), data.back(tensor), solution.tensor),
@@ -417,18 +417,18 @@ def _noise(invariant: Invariant, data: Matches, cost: Tensor) -> Tensor:
     return torch.where(spare > 0, (mean / spare.clamp(min=1)).sqrt(), torch.inf)
 
 
-def _covariance(moved: Callable[[Tensor], Tensor], found: Minimum, dof: int, scale: Tensor) -> Tensor:
+def _covariance(denormalize_parts: Callable[[Tensor], Tensor], minimum: Minimum, dof: int, scale: Tensor) -> Tensor:
     r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof."""
-    values, vectors = spectrum(found.terms[1])
+    values, vectors = spectrum(minimum.terms[1])
     count = min(dof, values.shape[-1])
     values, vectors = values[..., -count:], vectors[..., -count:]
     root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]
-    _, derivative = jacobian(moved, found.theta[0])
+    _, derivative = jacobian(denormalize_parts, minimum.theta[0])
     spread = derivative.mT @ root
     covariance = (spread @ spread.mT) * scale.square()[:, None, None]
     # a motion without a matrix in the coordinates of the matches (singular) is not known at all, like one without spare matches
-    known = scale.isfinite() & covariance.isfinite().flatten(1).all(-1)
-    return torch.where(known[:, None, None], covariance, torch.inf)
+    determined = scale.isfinite() & covariance.isfinite().flatten(1).all(-1)
+    return torch.where(determined[:, None, None], covariance, torch.inf)
 
 
 def _any(part: Tensor) -> Tensor:
@@ -471,13 +471,13 @@ def needs_gradient(solution: Solution, data: Matches) -> bool:
 
 
 def differentiable_minimum(
-    solution: Solution, data: Matches, shapes: tuple[torch.Size, ...], found: Minimum
+    solution: Solution, data: Matches, shapes: tuple[torch.Size, ...], minimum: Minimum
 ) -> tuple[Tensor, Tensor]:
     """Parameters ``(b, p)`` of the minimum and its cost ``(b,)``, in the unit of the matches, with their derivatives."""
-    invariant, theta = solution.invariant, found.theta[0]
+    invariant, theta = solution.invariant, minimum.theta[0]
     count, labelled = len(data.views), data.static is not None
     cost = _cost(invariant, shapes, count, labelled)
-    free = flat_directions(found.terms[1], theta.shape[-1] - invariant.dof)
+    free = flat_directions(minimum.terms[1], theta.shape[-1] - invariant.dof)
     flat = *data.views, data.weights, *solution.normalization.transforms, *((data.static,) if data.static is not None else ())
     numbers = sum(x.numel() for x in data.views) * theta.shape[-1]
     size = max(1, GRADIENT_BLOCK * len(theta) // max(1, numbers))
@@ -513,13 +513,13 @@ def _cost(invariant: Invariant, shapes: tuple[torch.Size, ...], count: int, labe
     return cost
 
 
-def unfinished_notices(found: Minimum, dof: int, batch: tuple[int, ...]) -> list[Notice]:
+def unfinished_notices(minimum: Minimum, dof: int, batch: tuple[int, ...]) -> list[Notice]:
     """A notice for every problem whose next step would still be long and lower its cost."""
-    gradient, matrix = found.terms
+    gradient, matrix = minimum.terms
     values, vectors = spectrum(matrix)
     count = min(dof, values.shape[-1])
     values = values[..., -count:].clamp(min=torch.finfo(values.dtype).tiny)
     along = (vectors[..., -count:].mT @ gradient[..., None])[..., 0]
-    share = (along.square() / values).sum(-1) / found.cost.clamp(min=torch.finfo(values.dtype).tiny)
-    open_ = (share > UNFINISHED_DECREASE) & ((along / values).norm(dim=-1) > UNFINISHED_LENGTH) & found.cost.isfinite()
+    share = (along.square() / values).sum(-1) / minimum.cost.clamp(min=torch.finfo(values.dtype).tiny)
+    open_ = (share > UNFINISHED_DECREASE) & ((along / values).norm(dim=-1) > UNFINISHED_LENGTH) & minimum.cost.isfinite()
     return notices(RefineNotice.UNFINISHED, share, open_, batch)

@@ -94,16 +94,16 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
 def _distance_by_motion(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor], batch: torch.Size) -> Tensor:
     """Distances ``(*batch, n)``, within ``torch.func`` too: how a tensor decomposes is decided by its values."""
     axes = len(invariant.shape()) + (invariant.nullity > 1) + (invariant.copies is not None)
-    whole = torch.broadcast_shapes(batch, tensor.shape[: tensor.ndim - axes])
+    full_batch = torch.broadcast_shapes(batch, tensor.shape[: tensor.ndim - axes])
     places = [p.match_axis(x) for p, x in zip(invariant.primitives, views, strict=True)]
-    flat = [_flat(x, whole, place) for x, place in zip(views, places, strict=True)]
+    flat = [_flat(x, full_batch, place) for x, place in zip(views, places, strict=True)]
 
     def distance_of(tensor: Tensor, views: tuple[Tensor, ...]) -> Tensor:
         ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
         return distance(invariant, invariant.motion_of(tensor), views, ones)
 
-    result = over_problems(distance_of, _flat(tensor, whole, tensor.ndim - axes), tuple(flat))
-    return result.reshape(*whole, views[0].shape[places[0]])
+    result = over_problems(distance_of, _flat(tensor, full_batch, tensor.ndim - axes), tuple(flat))
+    return result.reshape(*full_batch, views[0].shape[places[0]])
 
 
 def _flat(x: Tensor, batch: torch.Size, leading: int) -> Tensor:

@@ -134,10 +134,10 @@ def _threshold(threshold: float | Tensor, data: Matches) -> Tensor:
     return value
 
 
-def _finish(search: Search, found: SearchResult, cut: Tensor, rounds: Sequence[int], *, estimate: bool) -> Solution:
+def _finish(search: Search, result: SearchResult, cut: Tensor, rounds: Sequence[int], *, estimate: bool) -> Solution:
     """Refine on the inliers, choose them again, and say how it ended."""
     invariant, data = search.invariant, search.data
-    solution = _solution(search, found)
+    solution = _solution(search, result)
     distance = distances(solution)
     for i, steps in enumerate(rounds):
         if estimate:
@@ -150,8 +150,8 @@ def _finish(search: Search, found: SearchResult, cut: Tensor, rounds: Sequence[i
     cut = _update_threshold(invariant, data, distance, cut) if estimate else cut
     evidence = search.evidence(solution.normalized, cut)
     # a tensor that the matches leave open has no motion, and so no inliers by it
-    exact = fit_matches(invariant, search.some.restrict(found.inliers)).status.reshape(-1).to(cut.device)
-    degenerate = (exact == int(Status.DEGENERATE)) & (found.evidence < 0)
+    exact = fit_matches(invariant, search.some.restrict(result.inliers)).status.reshape(-1).to(cut.device)
+    degenerate = (exact == int(Status.DEGENERATE)) & (result.evidence < 0)
     sigma = _sigma(invariant, data, distance, cut)
     if estimate:
         # with the noise unknown, a tensor whose inliers fill the scene has found nothing
@@ -171,16 +171,16 @@ def _within(data: Matches, distance: Tensor, cut: Tensor) -> Tensor:
     return (distance <= cut[:, None]) & (data.weights > 0)
 
 
-def _solution(search: Search, found: SearchResult) -> Solution:
+def _solution(search: Search, result: SearchResult) -> Solution:
     """The tensors found, as a solution in the coordinates of the search."""
     invariant, norm, data = search.invariant, search.norm, search.data
-    tensor = invariant.tensor_of(found.basis if invariant.copies else found.basis[:, 0])
+    tensor = invariant.tensor_of(result.basis if invariant.copies else result.basis[:, 0])
     nearest = invariant.normalize(norm.transforms).constrain(tensor)
     # 0 where there is none, which all matches would fulfil
     tensor = select((nearest != 0).flatten(1).any(-1), nearest, tensor)
     status = torch.full(tensor.shape[:1], int(Status.OK), device=tensor.device)
     back = data.back(denormalize(invariant, tensor, norm.actions))
-    nothing = data.back(torch.zeros_like(found.score))
+    nothing = data.back(torch.zeros_like(result.score))
     return Solution(invariant, back, nothing, data, norm, tensor, status=data.back(status))
 
 

@@ -58,8 +58,8 @@ class Solution(Outcome):
     @cached_property
     def motion(self) -> tuple[Tensor, ...]:
         """The parts of the motion in the coordinates of the matches; decomposed in normalized ones, which is more accurate."""
-        known = self.normalized, self.status.reshape(-1), self.normalization.transforms, self.refined
-        return tuple(self.matches.back(part) for part in over_problems(self._motion, *known))
+        state = self.normalized, self.status.reshape(-1), self.normalization.transforms, self.refined
+        return tuple(self.matches.back(part) for part in over_problems(self._motion, *state))
 
     def _motion(
         self, normalized: Tensor, status: Tensor, transforms: tuple[Tensor, ...], refined: tuple[Tensor, ...] | None

@@ -24,9 +24,9 @@ def lifted_shape(
     """Images P^k -> P^l of points of P^k, each a match, projections eliminated: lifted shape tensor."""
     if not 1 <= image < space:
         raise ValueError(f"projections lower the dimension: image must be 1 to space - 1, got space = {space}, image = {image}")
-    least = -(-(space + 1) * (image + 1) // image)
-    if not least <= points <= 2 * space + 2:
-        raise ValueError(f"points must be {least} to {2 * space + 2} for P^{space} -> P^{image}, got {points}")
+    min_points = -(-(space + 1) * (image + 1) // image)
+    if not min_points <= points <= 2 * space + 2:
+        raise ValueError(f"points must be {min_points} to {2 * space + 2} for P^{space} -> P^{image}, got {points}")
     others = points - space - 1
     even, more = divmod(space + 1, others)
     tables = Partitions(field, space + 1, (even + 1,) * more + (even,) * (others - more))
@@ -34,13 +34,13 @@ def lifted_shape(
         raise ValueError(f"{tables.width:,} unknowns are too many; up to {LARGEST:,} are counted, give fewer points or dimensions")
     shape = np.vstack([np.eye(space + 1, dtype=np.int64), field.random(others, space + 1)])
 
-    def seen() -> IntArray:
+    def image_rows() -> IntArray:
         return tables.rows(field.product(shape, field.random(space + 1, image + 1)))
 
     def constraints() -> IntArray:
         return tables.synthetic(points, image)
 
-    return [Step("synthetic", int(synthetic), constraints, constraint=True), Step("image", images, seen)]
+    return [Step("synthetic", int(synthetic), constraints, constraint=True), Step("image", images, image_rows)]
 
 
 def dynamic_shape(
@@ -65,7 +65,7 @@ def dynamic_shape(
         # the first four stand still in the plane Z = 0
         paths[1:, :4], paths[0, :4, 2] = 0, 0
 
-    def seen() -> IntArray:
+    def image_rows() -> IntArray:
         time = int(field.random(1)[0])
         x = places(time)
         row = _across(field, x) if coplanar_base else tables.rows(x)
@@ -76,15 +76,15 @@ def dynamic_shape(
             return np.zeros((1, 3 * size), dtype=np.int64)
         return field.kron(np.eye(size, dtype=np.int64), tables.synthetic(6, 2))
 
-    return [Step("synthetic", int(synthetic), constraints, constraint=True), Step("image", images, seen)]
+    return [Step("synthetic", int(synthetic), constraints, constraint=True), Step("image", images, image_rows)]
 
 
 def _across(field: Field, x: IntArray) -> IntArray:
     """The line through the images of points 5 and 6 in the frame of the first four: p5 x p6."""
     frame = x[:3]
     others = field.product(x[3:], field.inverse(frame))
-    one = np.array([pow(int(v), -1, field.prime) for v in others[0]], dtype=np.int64)
-    a, b = (p * one % field.prime for p in others[1:])
+    depth = np.array([pow(int(v), -1, field.prime) for v in others[0]], dtype=np.int64)
+    a, b = (p * depth % field.prime for p in others[1:])
     return np.array([[(int(a[i]) * int(b[j]) - int(a[j]) * int(b[i])) % field.prime for i, j in ((1, 2), (2, 0), (0, 1))]])
 
 
@@ -93,10 +93,10 @@ class Partitions:
 
     def __init__(self, field: Field, size: int, profile: Sequence[int]) -> None:
         self.field, self.size, self.profile = field, size, tuple(profile)
-        found = list(_ordered(tuple(range(size)), self.profile))
+        ordered = list(_ordered_partitions(tuple(range(size)), self.profile))
         places = [{chosen: i for i, chosen in enumerate(combinations(range(size), a))} for a in self.profile]
-        self.index = [np.array([places[j][parts[j]] for parts in found]) for j in range(len(self.profile))]
-        flat = [[i for part in parts for i in part] for parts in found]
+        self.index = [np.array([places[j][parts[j]] for parts in ordered]) for j in range(len(self.profile))]
+        flat = [[i for part in parts for i in part] for parts in ordered]
         odd = [sum(a > b for n, a in enumerate(order) for b in order[n + 1 :]) % 2 for order in flat]
         self.sign = np.where(np.array(odd) == 1, field.prime - 1, 1)
 
@@ -128,11 +128,11 @@ class Partitions:
         return self.field.null(np.vstack(views))
 
 
-def _ordered(left: tuple[int, ...], profile: tuple[int, ...]) -> list[tuple[tuple[int, ...], ...]]:
+def _ordered_partitions(left: tuple[int, ...], profile: tuple[int, ...]) -> list[tuple[tuple[int, ...], ...]]:
     if not profile:
         return [()]
     chosen = combinations(left, profile[0])
-    return [(part, *rest) for part in chosen for rest in _ordered(tuple(i for i in left if i not in part), profile[1:])]
+    return [(part, *rest) for part in chosen for rest in _ordered_partitions(tuple(i for i in left if i not in part), profile[1:])]
 
 
 def homography(
@@ -151,7 +151,7 @@ def dual_homography(
     """Lines of a plane that meet in a point, three views: dual homography tensor, 3x3x3."""
     dual = Views(field, 2, (2, 2, 2), ("join",) * 3)  # of the dual plane: its points are lines, its lines are pencils
     return [
-        Step("static point", static_points, lambda: dual.filled(dual.extensor(2))),
+        Step("static point", static_points, lambda: dual.star_rows(dual.extensor(2))),
         *_moving_points(dual, moving, static, labelled_static, (), ()),
     ]
 
@@ -189,10 +189,10 @@ def dynamic(
     join_of_points: list[Measure | int] = ["join"] * poses
     space = Views(field, dim, (dim,) * poses, join_of_points)
     return [
-        Step("labelled static", labelled_static, lambda: space.labelled(space.extensor(1), free=within - 1)),
-        Step("static", static, lambda: space.fixed(space.extensor(1))),
+        Step("labelled static", labelled_static, lambda: space.labelled_rows(space.extensor(1), free=within - 1)),
+        Step("static", static, lambda: space.static_rows(space.extensor(1))),
         *_confined_points(space, within, on_plane, on_line, static_on_plane, static_on_line),
-        Step("moving", moving, lambda: space.moving(space.extensor(within))),
+        Step("moving", moving, lambda: space.moving_rows(space.extensor(within))),
     ]
 
 
@@ -225,7 +225,7 @@ def lines(
     def direction() -> IntArray:
         return np.append(field.random(3), 0)
 
-    def translated(shift: IntArray) -> IntArray:
+    def translating_rows(shift: IntArray) -> IntArray:
         before = np.hstack([field.random(2, 3), np.ones((2, 1), dtype=np.int64)])
         return field.kron(*space.images([before, before + shift]))
 
@@ -236,16 +236,16 @@ def lines(
         return field.kron(*stars)
 
     def rigid(shift: IntArray) -> Callable[[], IntArray]:
-        return lambda: translated(shift)
+        return lambda: translating_rows(shift)
 
     return [
         Step("static point", static_points, static_point),
-        Step("static", static, lambda: space.fixed(space.extensor(2))),
-        Step("static on plane", static_on_plane, lambda: space.fixed(space.within(plane, 2))),
-        Step("on plane", on_plane, lambda: space.moving(plane, 2)),
+        Step("static", static, lambda: space.static_rows(space.extensor(2))),
+        Step("static on plane", static_on_plane, lambda: space.static_rows(space.within(plane, 2))),
+        Step("on plane", on_plane, lambda: space.moving_rows(plane, 2)),
         *(Step("object", number, rigid(direction())) for number in objects),
-        Step("translating", translating, lambda: translated(direction())),
-        Step("moving", moving, lambda: space.moving(space.extensor(3), 2)),
+        Step("translating", translating, lambda: translating_rows(direction())),
+        Step("moving", moving, lambda: space.moving_rows(space.extensor(3), 2)),
     ]
 
 
@@ -365,20 +365,20 @@ def by_numbers(
             )
         if not isinstance(kind, int) and m > size + (kind == "join"):
             raise ValueError(f"{m} points have no {kind} in a view of dimension {size}; views must be larger or m smaller")
-    for number, most, flat in ((on_line, 2, "a line"), (on_plane, k, f"a hyperplane of P^{k}")):
-        if number and m > most:
+    for number, max_points, flat in ((on_line, 2, "a line"), (on_plane, k, f"a hyperplane of P^{k}")):
+        if number and m > max_points:
             raise ValueError(f"{m} points span no extensor within {flat}; leave these matches out")
     space = Views(field, k, sizes, kinds, points=m)
     hyperplane, line = space.extensor(k), space.extensor(2)
 
     def within(flat: IntArray) -> Callable[[], IntArray]:
-        return lambda: space.moving(space.within(flat, min(r, len(flat))), m)
+        return lambda: space.moving_rows(space.within(flat, min(r, len(flat))), m)
 
     return [
-        Step("static", static, lambda: space.fixed(space.extensor(m))),
+        Step("static", static, lambda: space.static_rows(space.extensor(m))),
         Step("on line", on_line, within(line)),
         Step("on plane", on_plane, within(hyperplane)),
-        Step("general", matches, lambda: space.moving(space.extensor(r), m)),
+        Step("general", matches, lambda: space.moving_rows(space.extensor(r), m)),
     ]
 
 
@@ -393,19 +393,19 @@ def _moving_points(
     views: Views, moving: int | None, static: int, labelled_static: int, lines: Sequence[int], static_lines: Sequence[int],
     confined: Sequence[Step] = (),
 ) -> list[Step]:  # fmt: skip
-    def on(line: IntArray) -> Callable[[], IntArray]:
-        return lambda: views.moving(line)
+    def moving_rows_on(line: IntArray) -> Callable[[], IntArray]:
+        return lambda: views.moving_rows(line)
 
-    def fixed_on(line: IntArray) -> Callable[[], IntArray]:
-        return lambda: views.fixed(views.within(line))
+    def static_rows_on(line: IntArray) -> Callable[[], IntArray]:
+        return lambda: views.static_rows(views.within(line))
 
     return [
-        Step("labelled static", labelled_static, lambda: views.labelled(views.extensor(1))),
-        Step("static", static, lambda: views.fixed(views.extensor(1))),
-        *(Step("static line", number, fixed_on(views.extensor(2))) for number in static_lines),
-        *(Step("line", number, on(views.extensor(2))) for number in lines),
+        Step("labelled static", labelled_static, lambda: views.labelled_rows(views.extensor(1))),
+        Step("static", static, lambda: views.static_rows(views.extensor(1))),
+        *(Step("static line", number, static_rows_on(views.extensor(2))) for number in static_lines),
+        *(Step("line", number, moving_rows_on(views.extensor(2))) for number in lines),
         *confined,
-        Step("moving", moving, lambda: views.moving(views.extensor(2))),
+        Step("moving", moving, lambda: views.moving_rows(views.extensor(2))),
     ]
 
 
@@ -446,10 +446,10 @@ def _velocities(
 def _static_points(views: Views, static: int | None, coplanar: int, on_plane: int, on_line: int) -> list[Step]:
     plane, line = views.extensor(3), views.extensor(2)
     return [
-        Step("on line", on_line, lambda: views.fixed(views.within(line))),
-        Step("coplanar", coplanar, lambda: views.fixed(views.within(plane))),
-        Step("on plane", on_plane, lambda: views.fixed(views.within(plane))),
-        Step("static", static, lambda: views.fixed(views.extensor(1))),
+        Step("on line", on_line, lambda: views.static_rows(views.within(line))),
+        Step("coplanar", coplanar, lambda: views.static_rows(views.within(plane))),
+        Step("on plane", on_plane, lambda: views.static_rows(views.within(plane))),
+        Step("static", static, lambda: views.static_rows(views.extensor(1))),
     ]
 
 
@@ -459,15 +459,15 @@ def _confined_points(
     """Points that stay on one line, or in one hyperplane of the space (a plane of space), as far as their motion lets them."""
     hyperplane, line = views.extensor(views.k), views.extensor(2)
 
-    def moving(flat: IntArray) -> Callable[[], IntArray]:
-        return lambda: views.moving(views.within(flat, min(step, len(flat))))
+    def moving_rows(flat: IntArray) -> Callable[[], IntArray]:
+        return lambda: views.moving_rows(views.within(flat, min(step, len(flat))))
 
-    def fixed(flat: IntArray) -> Callable[[], IntArray]:
-        return lambda: views.fixed(views.within(flat))
+    def static_rows(flat: IntArray) -> Callable[[], IntArray]:
+        return lambda: views.static_rows(views.within(flat))
 
     return [
-        Step("static on line", static_on_line, fixed(line)),
-        Step("static on plane", static_on_plane, fixed(hyperplane)),
-        Step("on line", on_line, moving(line)),
-        Step("on plane", on_plane, moving(hyperplane)),
+        Step("static on line", static_on_line, static_rows(line)),
+        Step("static on plane", static_on_plane, static_rows(hyperplane)),
+        Step("on line", on_line, moving_rows(line)),
+        Step("on plane", on_plane, moving_rows(hyperplane)),
     ]

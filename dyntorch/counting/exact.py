@@ -50,11 +50,11 @@ class Field:
             return (terms % self.prime).sum(-right.ndim) % self.prime
         if left.shape[-1] > INNER:
             return (self.product(left[..., :INNER], right[:INNER]) + self.product(left[..., INNER:], right[INNER:])) % self.prime
-        whole, mask = right.astype(np.float64), (1 << PIECE) - 1
+        right_float, mask = right.astype(np.float64), (1 << PIECE) - 1
         total = np.zeros((), dtype=np.int64)
         for shift in (2 * PIECE, PIECE, 0):
             piece = ((left >> shift) & mask).astype(np.float64)
-            total = ((total << PIECE) + (piece @ whole).astype(np.int64)) % self.prime
+            total = ((total << PIECE) + (piece @ right_float).astype(np.int64)) % self.prime
         return total
 
     def kron(self, *factors: ArrayLike) -> IntArray:
@@ -102,10 +102,10 @@ class Field:
 
     def reduce(self, values: ArrayLike) -> IntArray:
         """Integers of any size as elements of the field."""
-        found = np.asarray(values)
-        if found.dtype.kind not in "iuO" or (found.dtype.kind == "O" and not all(isinstance(value, int) for value in found.flat)):
-            raise ValueError(f"the field has integers only, got {found.dtype}; scale fractions to integers first")
-        return (found % self.prime).astype(np.int64)
+        array = np.asarray(values)
+        if array.dtype.kind not in "iuO" or (array.dtype.kind == "O" and not all(isinstance(value, int) for value in array.flat)):
+            raise ValueError(f"the field has integers only, got {array.dtype}; scale fractions to integers first")
+        return (array % self.prime).astype(np.int64)
 
 
 class Echelon:
@@ -126,7 +126,7 @@ class Echelon:
         prime = self.field.prime
         rows = (rows - self.field.product(rows[:, self.pivots], self.basis)) % prime
         raised = np.zeros(len(rows), dtype=bool)
-        found: list[int] = []
+        pivots: list[int] = []
         for i in range(len(rows)):
             pivot = int((rows[i] != 0).argmax())
             if rows[i, pivot] == 0:
@@ -135,11 +135,11 @@ class Echelon:
             rows = (rows - rows[:, pivot, None] * scaled % prime) % prime
             rows[i] = scaled
             raised[i] = True
-            found.append(pivot)
+            pivots.append(pivot)
         new = rows[raised]
-        old = (self.basis - self.field.product(self.basis[:, found], new)) % prime
+        old = (self.basis - self.field.product(self.basis[:, pivots], new)) % prime
         self.basis = np.vstack([old, new])
-        self.pivots += found
+        self.pivots += pivots
         return raised
 
 
@@ -198,9 +198,9 @@ class Views:
     def images(self, primitives: Sequence[IntArray]) -> list[IntArray]:
         """What each view measures of its primitive: one row (``join``), or several (``hyper``)."""
         seen = [self.field.product(points, camera.T) for points, camera in zip(primitives, self.cameras, strict=True)]
-        return [self.measured(points, kind) for points, kind in zip(seen, self.measure, strict=True)]
+        return [self.measure_points(points, kind) for points, kind in zip(seen, self.measure, strict=True)]
 
-    def measured(self, points: IntArray, kind: Measure | int) -> IntArray:
+    def measure_points(self, points: IntArray, kind: Measure | int) -> IntArray:
         """What a view measures of the primitive that these points of it span, ``(rows, width)``."""
         if kind == "join":
             return self.field.join(points)[None]
@@ -211,22 +211,22 @@ class Views:
             else np.stack([self.field.join(through[list(c)]) for c in combinations(range(len(through)), int(kind))])
         )
 
-    def fixed(self, primitive: IntArray) -> IntArray:
+    def static_rows(self, primitive: IntArray) -> IntArray:
         """Rows of a primitive that does not move."""
         return self.field.kron(*self.images([primitive] * len(self.cameras)))
 
-    def moving(self, extensor: IntArray, number: int = 1) -> IntArray:
+    def moving_rows(self, extensor: IntArray, number: int = 1) -> IntArray:
         """Rows of a primitive spanned by this number of points that are anywhere within an extensor, in every view anew."""
         return self.field.kron(*self.images([self.within(extensor, number) for _ in self.cameras]))
 
-    def labelled(self, primitive: IntArray, free: int = 1) -> IntArray:
+    def labelled_rows(self, primitive: IntArray, free: int = 1) -> IntArray:
         """Rows of a primitive that is known not to move: any measurement of one view (or of more) completes those of the others."""
         seen = self.images([primitive] * len(self.cameras))
         anything = [np.eye(image.shape[1], dtype=np.int64) for image in seen]
         chosen = combinations(range(len(seen)), free)
         return np.vstack([self.field.kron(*(anything[v] if v in c else seen[v] for v in range(len(seen)))) for c in chosen])
 
-    def filled(self, extensor: IntArray) -> IntArray:
+    def star_rows(self, extensor: IntArray) -> IntArray:
         """Rows of an extensor, any point of which matches any other."""
         return self.field.kron(*(self.field.product(extensor, camera.T) for camera in self.cameras))
 
@@ -246,9 +246,9 @@ def check_size(k: int, views: Sequence[int], measure: Sequence[Measure | int], p
         if width > LARGEST:
             break
     if width > LARGEST or rows > LARGEST:
-        least = "at least " if width > LARGEST else ""
+        at_least = "at least " if width > LARGEST else ""
         raise ValueError(
-            f"{least}{max(width, rows):,} unknowns are too many; up to {LARGEST:,} are counted within a minute or so: "
+            f"{at_least}{max(width, rows):,} unknowns are too many; up to {LARGEST:,} are counted within a minute or so: "
             "take fewer or smaller views"
         )
 
@@ -291,7 +291,7 @@ class Tally:
         """Of everything so far."""
         return 0 if self.echelon is None else self.echelon.rank
 
-    def take(self, step: Step) -> None:
+    def add_step(self, step: Step) -> None:
         """Add the matches of a step to the profile; a constraint raises the rank only."""
         before = self.rank
         ranks = self.ranks(step)
@@ -301,23 +301,23 @@ class Tally:
 
     def ranks(self, step: Step) -> list[int]:
         """Rank after each match of a step; where their number is open, up to the last one that raises it."""
-        found: list[int] = []
+        ranks: list[int] = []
         last, idle, ended = self.rank, 0, False
-        while not ended and idle < step.patience and (step.matches is None or len(found) < step.matches):
-            block, ended = self._draw(step, None if step.matches is None else step.matches - len(found))
+        while not ended and idle < step.patience and (step.matches is None or len(ranks) < step.matches):
+            block, ended = self._draw(step, None if step.matches is None else step.matches - len(ranks))
             for rank in self._add(block):
                 last, idle = rank, 0 if rank > last else idle + 1
-                found.append(rank)
+                ranks.append(rank)
         if step.matches is None:
-            return found[: len(found) - idle]
-        if ended and len(found) < step.matches:
-            raise ValueError(f"the sampler ended after {len(found)} matches, {step.matches} were asked for")
-        return found + [self.rank] * (step.matches - len(found))
+            return ranks[: len(ranks) - idle]
+        if ended and len(ranks) < step.matches:
+            raise ValueError(f"the sampler ended after {len(ranks)} matches, {step.matches} were asked for")
+        return ranks + [self.rank] * (step.matches - len(ranks))
 
-    def _draw(self, step: Step, most: int | None) -> tuple[list[IntArray], bool]:
+    def _draw(self, step: Step, max_matches: int | None) -> tuple[list[IntArray], bool]:
         """The next matches, about a block of rows, and whether there are no others."""
         block: list[IntArray] = []
-        while sum(map(len, block)) < BLOCK and (most is None or len(block) < most):
+        while sum(map(len, block)) < BLOCK and (max_matches is None or len(block) < max_matches):
             try:
                 block.append(step.draw())
             except StopIteration:

@@ -160,7 +160,7 @@ class _Lifted:
 
         def draw() -> IntArray:
             point = self.field.random(self.dim + 1)
-            return self.views.fixed(np.append(point, rates(int(point[-1])) % self.field.prime)[None])
+            return self.views.static_rows(np.append(point, rates(int(point[-1])) % self.field.prime)[None])
 
         return Step(kind, matches, draw, patience=PATIENCE)
 
@@ -181,7 +181,7 @@ class _Lifted:
         def draw() -> IntArray:
             point = (origin + field.product(field.random(size), axes)) % field.prime
             rates = [field.product(field.random(len(ways)), ways) for _ in self.directions]
-            return self.views.fixed(np.concatenate([point, [1], *rates])[None])
+            return self.views.static_rows(np.concatenate([point, [1], *rates])[None])
 
         return Step(kind, matches, draw, patience=PATIENCE)
 
@@ -229,6 +229,6 @@ def _check(profile: Sequence[int], sensor: int, size: int, times: Sequence[int],
         )
     if times and len(times) != len(profile):
         raise ValueError(f"times must be one for each of {len(profile)} views, got {len(times)}")
-    known = [name for name in CAMERAS if along or name != "along"]
-    if camera not in known:
-        raise ValueError(f"camera must be one of {', '.join(known)}, got {camera!r}")
+    allowed = [name for name in CAMERAS if along or name != "along"]
+    if camera not in allowed:
+        raise ValueError(f"camera must be one of {', '.join(allowed)}, got {camera!r}")

@@ -191,17 +191,17 @@ def capacities(name: str, *, only: Sequence[str] = (), seed: int = 0, **settings
     """
     name, configure, usual = _configuration(name, dict(settings))
     _check(name, configure, settings)
-    found = []
+    result = []
     for option, default in _defaults(configure).items():
         if option in SETTINGS or isinstance(default, bool | str) or (only and option not in only):
             continue
         given: dict[str, Any] = {option: (1,) if isinstance(default, tuple) else 1}
         if option != usual:
             given[usual] = None
-        found.append(
+        result.append(
             max((_capacity(name, configure, prime, option, given | settings, seed) for prime in PRIMES), key=lambda c: c.rank)
         )
-    return tuple(found)
+    return tuple(result)
 
 
 def _capacity(name: str, configure: Configuration, prime: int, option: str, given: dict[str, Any], seed: int) -> Capacity:
@@ -214,13 +214,13 @@ def _capacity(name: str, configure: Configuration, prime: int, option: str, give
         else next(step for step in steps if step.kind.replace(" ", "_") in (option, option.removesuffix("s")))
     )
     tally = Tally(Field(prime, [seed, prime]))
-    tally.take(dataclasses.replace(chosen, matches=None))
+    tally.add_step(dataclasses.replace(chosen, matches=None))
     alone = tally.rank
     matches = sum(kind.useful for kind in tally.kinds)
     others = [step for step in steps if step is not chosen and step is not usual and step.matches]
     for step in (*others, usual):
         if step is not chosen:
-            tally.take(dataclasses.replace(step, matches=None) if step is usual else step)
+            tally.add_step(dataclasses.replace(step, matches=None) if step is usual else step)
     missing = sum(kind.useful for kind in tally.kinds) - matches
     return Capacity(option, matches, alone, missing, tally.rank)
 
@@ -260,20 +260,20 @@ def _defaults(configure: Configuration) -> dict[str, Any]:
 
 
 def _check(name: str, configure: Configuration, options: dict[str, Any]) -> None:
-    known = _defaults(configure)
+    defaults = _defaults(configure)
     for option, value in options.items():
-        if option not in known:
-            names = [other for other in known if other not in ("k", "sampler")]
+        if option not in defaults:
+            names = [other for other in defaults if other not in ("k", "sampler")]
             raise ValueError(f"{name} has no option {option}; it has {', '.join(names)}")
-        if isinstance(known[option], tuple):
+        if isinstance(defaults[option], tuple):
             if isinstance(value, str) or not isinstance(value, Sequence) or not all(map(_is_number, value)):
                 raise ValueError(f"{option} must be a list of numbers from 0 to {MOST:,}, got {value!r}")
-        elif isinstance(known[option], bool):
+        elif isinstance(defaults[option], bool):
             if not isinstance(value, bool):
                 raise ValueError(f"{option} must be True or False, got {value!r}")
         elif option == "camera":
             continue  # checked with the others of the views
-        elif option not in ("sampler", "measure") and not (value is None is known[option]) and not _is_number(value):
+        elif option not in ("sampler", "measure") and not (value is None is defaults[option]) and not _is_number(value):
             raise ValueError(f"{option} must be a number from 0 to {MOST:,}, got {value!r}")
 
 
@@ -293,7 +293,7 @@ def _sample(field: Field, *, sampler: Sampler, matches: int | None = None) -> li
 def _count(name: str, configure: Configuration, field: Field, options: dict[str, Any]) -> Count:
     steps, tally = configure(field, **options), Tally(field)
     for step in steps:
-        tally.take(step)
+        tally.add_step(step)
     rank, usual = tally.rank, steps[-1]
     more: int | None = 0
     if configure is _sample:

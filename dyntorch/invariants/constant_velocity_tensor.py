@@ -188,8 +188,8 @@ class ConstantVelocityTensor(Invariant):
             return inhomogeneous(torch.einsum("...ijk,...ni,...nj->...nk", tensor, given[0], given[1]))
         if tensor.shape[-1] == 3:
             raise ValueError("an image as the third view does not determine a point of space: give x1 and x2")
-        terms, known = ("...ijk,...nj->...nki", given[1]) if given[0] is None else ("...ijk,...ni->...nkj", given[0])
-        return inhomogeneous((adjugate(torch.einsum(terms, tensor, known)) @ given[2][..., None])[..., 0])
+        terms, point = ("...ijk,...nj->...nki", given[1]) if given[0] is None else ("...ijk,...ni->...nkj", given[0])
+        return inhomogeneous((adjugate(torch.einsum(terms, tensor, point)) @ given[2][..., None])[..., 0])
 
     @staticmethod
     def positions(motion: Motion, x1: Tensor, x2: Tensor, x3: Tensor) -> Tensor:

@@ -204,10 +204,10 @@ def plane_of(first: Tensor, second: Tensor) -> Tensor:
     across = torch.linalg.cross(vertex, epipole)
     # g G = moved + across a^T: what is orthogonal to the second term says g
     along = unit_vectors(torch.linalg.cross(vertex, across))[..., None, :]
-    known, wanted = (along @ second)[..., 0, :], (along @ moved)[..., 0, :]
-    square = known.square().sum(-1, keepdim=True)
-    scale = (known * wanted).sum(-1, keepdim=True) / torch.where(square > 0, square, 1.0)
+    row, target = (along @ second)[..., 0, :], (along @ moved)[..., 0, :]
+    square = row.square().sum(-1, keepdim=True)
+    scale = (row * target).sum(-1, keepdim=True) / torch.where(square > 0, square, 1.0)
     length = across.square().sum(-1, keepdim=True)
     rest = (across[..., None, :] @ (scale[..., None] * second - moved))[..., 0, :]
-    found = part + epipole[..., :, None] * (rest / torch.where(length > 0, length, 1.0))[..., None, :]
-    return unit(found)
+    homography = part + epipole[..., :, None] * (rest / torch.where(length > 0, length, 1.0))[..., None, :]
+    return unit(homography)

@@ -67,8 +67,8 @@ def graph_rows(measured: Tensor, trajectory: Trajectory, base: Base) -> Tensor:
 def span_rows(measured: Tensor) -> Tensor:
     """The two centred coordinates of each view, ``(*batch, views, 2, n - 1)``; 0 where a point is missing."""
     n = measured.shape[-2]
-    whole = (measured[..., 2] > 0).all(-1)[..., None, None]
-    return torch.where(whole, centred_views(measured[..., :2]).x.mT @ centring_basis(n, measured.device).mT, 0.0)
+    complete = (measured[..., 2] > 0).all(-1)[..., None, None]
+    return torch.where(complete, centred_views(measured[..., :2]).x.mT @ centring_basis(n, measured.device).mT, 0.0)
 
 
 def span_residual(measured: Tensor, basis: Tensor) -> Tensor:
@@ -132,8 +132,8 @@ def shapes_of_graph(unknowns: Tensor, n: int, trajectory: Trajectory, base: Base
     points = torch.cat([above, below], dim=-2)[..., basis_points_first(n, base, unknowns.device).argsort(), :]
     helmert = centring_basis(n, unknowns.device)
     problems = len(points)
-    found = shapes_through(helmert @ points, rows.expand(problems, *rows.shape), points.new_ones(problems, len(rows)))
-    return (helmert.mT @ found).reshape(*unknowns.shape[:-1], trajectory.size, n, 3)
+    shapes = shapes_through(helmert @ points, rows.expand(problems, *rows.shape), points.new_ones(problems, len(rows)))
+    return (helmert.mT @ shapes).reshape(*unknowns.shape[:-1], trajectory.size, n, 3)
 
 
 def concatenate_shapes(shapes: Tensor) -> Tensor:
@@ -146,7 +146,7 @@ def split_shapes(shapes: Tensor) -> Tensor:
     return shapes.unflatten(-1, (shapes.shape[-1] // 3, 3)).transpose(-3, -2)
 
 
-def framed_beside(shapes: Tensor) -> Tensor:
+def concatenate_framed(shapes: Tensor) -> Tensor:
     """Shapes ``(*batch, B, n, 3)`` in their canonical frame, side by side."""
     return concatenate_shapes(canonical_frame(shapes.reshape(-1, *shapes.shape[-3:])).reshape(shapes.shape))
 
@@ -262,7 +262,7 @@ class DynamicShapeTensor(Invariant):
         times = given.pop("times", None)
         for name in given:
             raise unknown_argument(self, name, "times")
-        self._enough(n)
+        self.check_points(n)
         if times is None:
             if self.form != "span":
                 raise ValueError(f"{self!r} needs times=, the time of each view (*batch, views); form='span' needs none")
@@ -273,11 +273,11 @@ class DynamicShapeTensor(Invariant):
             weight = option("weights", weights, tuple(times.shape[:-1]), times.shape[-1], points)
             interval = extremes(times if weight is None else torch.where(weight.reshape(times.shape) > 0, times, torch.nan))
         unit = self.trajectory.unit(times, interval.to(times)).to(points)
-        unit = torch.where(self._telling(points[..., 2] > 0), unit, torch.nan)  # such a view is no match
+        unit = torch.where(self._is_informative(points[..., 2] > 0), unit, torch.nan)  # such a view is no match
         measured = torch.cat([points, unit[..., None, None].expand(*points.shape[:-1], 1)], dim=-1)
         return replace(self, points=n, interval=interval), (measured,)
 
-    def _enough(self, n: int) -> None:
+    def check_points(self, n: int) -> None:
         least = 3 * self.trajectory.size + 2 if self.form == "span" else (MIN_PERSPECTIVE_POINTS if self.projective else 5)
         if n < least:
             raise ValueError(f"{self!r} needs at least {least} points, got {n}; add points, or use fewer functions of the time")
@@ -289,7 +289,7 @@ class DynamicShapeTensor(Invariant):
         """Whether the cameras are any of the plane."""
         return self.camera == "projective"
 
-    def _telling(self, seen: Tensor) -> Tensor:
+    def _is_informative(self, seen: Tensor) -> Tensor:
         """Whether views that see these points say anything, ``(*batch, views)``."""
         if self.form == "span":
             return seen.all(-1)
@@ -349,7 +349,7 @@ class DynamicShapeTensor(Invariant):
             return rows[..., 0, :] if self.nullity == 1 else rows
         if self.form == "basis":
             return annihilator(basis[..., 0, :], self.points, self.base)
-        return framed_beside(shapes_of_graph(basis[..., 0, :], self.points, self.trajectory, self.base))
+        return concatenate_framed(shapes_of_graph(basis[..., 0, :], self.points, self.trajectory, self.base))
 
     def basis_of(self, tensor: Tensor) -> Tensor:
         """The inverse of :meth:`tensor_of`."""
@@ -392,7 +392,7 @@ class DynamicShapeTensor(Invariant):
             rows = (shapes - shapes.mean(-2, keepdim=True)).mT @ centring_basis(n, shapes.device).mT
             return self.tensor_of(null_space(rows, n - 1 - shapes.shape[-1]))
         if self.form == "joint":
-            return framed_beside(split_shapes(shapes)) * 3**-0.5  # of three orthonormal columns
+            return concatenate_framed(split_shapes(shapes)) * 3**-0.5  # of three orthonormal columns
         tensor = annihilator(graph_of(split_shapes(shapes), self.trajectory, self.base), n, self.base)
         size = tensor.flatten(-3).norm(dim=-1)[..., None, None, None]
         return tensor / torch.where(size > 0, size, 1.0)
@@ -402,10 +402,10 @@ class DynamicShapeTensor(Invariant):
         """The shapes ``(*batch, n, 3 B)`` of the trajectories up to a constant affine frame; for the span some basis of it."""
         if self.form == "joint":
             return tensor
-        whole = tensor.double()
+        double = tensor.double()
         if self.form == "basis":
-            return framed_beside(self.shapes(whole)).to(tensor.dtype)
-        rows = whole if self.nullity > 1 else whole[..., None, :]
+            return concatenate_framed(self.shapes(double)).to(tensor.dtype)
+        rows = double if self.nullity > 1 else double[..., None, :]
         rows = torch.cat([rows, torch.ones_like(rows[..., :1, :])], dim=-2)
         return null_space(rows, 3 * self.trajectory.size).mT.to(tensor.dtype)
 
@@ -479,14 +479,14 @@ class DynamicShapeTensor(Invariant):
         if reach < 0:
             raise ValueError(f"reach must be 0 or more half lengths of the interval, got {reach!r}")
         recover = recover_perspective_times if self.projective else recover_times
-        found = recover(shapes, self.trajectory, measured[..., :2], seen, grid=grid, interval=(-reach, reach))
+        recovery = recover(shapes, self.trajectory, measured[..., :2], seen, grid=grid, interval=(-reach, reach))
         if self.interval is None:
-            return found
+            return recovery
         # the times of the training say how many digits they need: seconds since 1970 have more than the points
-        interval = self.interval.to(found.times.device)
+        interval = self.interval.to(recovery.times.device)
         scale = 1.0 if self.trajectory.period is not None else (interval[..., 1:] - interval[..., :1]).clamp(min=0) / 2
-        times, second = (self.trajectory.time(t.to(interval), interval) for t in (found.times, found.second))
-        return replace(found, times=times, second=second, sigma=found.sigma * scale)
+        times, second = (self.trajectory.time(t.to(interval), interval) for t in (recovery.times, recovery.second))
+        return replace(recovery, times=times, second=second, sigma=recovery.sigma * scale)
 
     @on_class
     def score(self, tensor: Tensor, *points: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -149,7 +149,7 @@ class DynamicTensor(Invariant):
             [[0.0, 1.0], [-1.0, 0.0]]
         """
         self._check(maps)
-        forms = self._moved(maps)
+        forms = self._carry_forms(maps)
         return unit_tensors(forms.squeeze(-self.views - 1) if self.nullity == 1 else forms, self.views, self.nullity)
 
     def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
@@ -160,11 +160,11 @@ class DynamicTensor(Invariant):
         slopes = []
         for v in range(1, views):
             # linear in each map: its axis i is left as it is, and entry (i, j) of the map takes it to j
-            rest = self._moved(motion, but=v).squeeze(-views - 1).movedim(v - views, -views).flatten(-views + 1)
+            rest = self._carry_forms(motion, but=v).squeeze(-views - 1).movedim(v - views, -views).flatten(-views + 1)
             put = rest[..., :, None, None, :] * eye[:, :, None]  # i, j, where it is taken, the other axes
             put = put.unflatten(-1, (size,) * (views - 1)).movedim(-views, v - views)
             slopes.append(put.flatten(-views).flatten(-3, -2))
-        return normalized_derivative(self._moved(motion).flatten(-views)[..., 0, :], torch.cat(slopes, dim=-2))
+        return normalized_derivative(self._carry_forms(motion).flatten(-views)[..., 0, :], torch.cat(slopes, dim=-2))
 
     def decompose(self, tensor: Tensor) -> tuple[Tensor, ...]:
         r"""The collineations behind a basis of vanishing forms, linearly.
@@ -199,8 +199,8 @@ class DynamicTensor(Invariant):
         stand_in = vanishing_forms(self.size, self.views, self.k, flat.device).flatten(1)
         rows = torch.where(none, stand_in, flat)
         basis = torch.linalg.qr(rows.mT)[0].mT if self.nullity > 1 else torch.nn.functional.normalize(rows, dim=-1)
-        found = collineations(basis.unflatten(-1, (self.size,) * self.views), self.views, self.k)
-        return tuple(torch.where(none, 0.0, part).to(tensor.dtype) for part in found)
+        maps = collineations(basis.unflatten(-1, (self.size,) * self.views), self.views, self.k)
+        return tuple(torch.where(none, 0.0, part).to(tensor.dtype) for part in maps)
 
     def transfer(self, tensor: Tensor, x: Tensor, source: int = 2, target: int = 1) -> Tensor:
         r"""Where static points of one view are in another: :math:`A_t^{-1} A_s p`.
@@ -259,8 +259,8 @@ class DynamicTensor(Invariant):
         points = torch.stack([x.double() for x in views], dim=-2).reshape(-1, count, self.views, self.n)
         maps = self._stack_maps(self.decompose(tensor.double()))
         maps = maps.expand(*batch, -1, -1, -1).reshape(-1, self.views, self.size, self.size)
-        found = nearest_flats(maps, points, torch.ones(len(maps), self.views, dtype=torch.float64, device=maps.device), self.k)
-        planes = torch.linalg.qr((found.hyperplanes @ maps[:, None, view - 1]).mT)[0].mT
+        nearest = nearest_flats(maps, points, torch.ones(len(maps), self.views, dtype=torch.float64, device=maps.device), self.k)
+        planes = torch.linalg.qr((nearest.hyperplanes @ maps[:, None, view - 1]).mT)[0].mT
         return planes.reshape(*batch, *planes.shape[1:]).to(views[0].dtype)
 
     def whitened_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor | None:
@@ -270,8 +270,8 @@ class DynamicTensor(Invariant):
         batch = torch.broadcast_shapes(*(part.shape[:-2] for part in motion), *(x.shape[:-2] for x in views))
         maps = self._stack_maps(motion).expand(*batch, -1, -1, -1).reshape(-1, self.views, self.size, self.size)
         flat = [x.expand(*batch, -1, -1).reshape(-1, *x.shape[-2:]).double() for x in views]
-        found = flat_residual(maps.double(), flat, [s.double().expand(batch).reshape(-1) for s in scales], self.k)
-        return found.reshape(*batch, *found.shape[1:]).to(views[0].dtype)
+        residual = flat_residual(maps.double(), flat, [s.double().expand(batch).reshape(-1) for s in scales], self.k)
+        return residual.reshape(*batch, *residual.shape[1:]).to(views[0].dtype)
 
     def linearize(
         self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]
@@ -285,17 +285,17 @@ class DynamicTensor(Invariant):
     def confine(self, free: int) -> Invariant | None:
         return None if self.k - free <= 1 else DynamicTensor(self.n, self.views, self.k - free)
 
-    def _moved(self, maps: tuple[Tensor, ...], but: int = -1) -> Tensor:
+    def _carry_forms(self, maps: tuple[Tensor, ...], but: int = -1) -> Tensor:
         """The forms ``(*batch, nullity, N, ..., N)`` of the maps, of any length; axis ``but`` is left as it is."""
         forms = vanishing_forms(self.size, self.views, self.k, maps[0].device).to(maps[0].dtype)
         batch = torch.broadcast_shapes(*(part.shape[:-2] for part in maps))
         return reduce(
-            lambda total, v: total if v == but else self._along(total, maps[v - 1], v),
+            lambda total, v: total if v == but else self._carry_axis(total, maps[v - 1], v),
             range(1, self.views),
             forms.expand(*batch, *forms.shape),
         )
 
-    def _along(self, forms: Tensor, matrix: Tensor, view: int) -> Tensor:
+    def _carry_axis(self, forms: Tensor, matrix: Tensor, view: int) -> Tensor:
         """One axis of the forms contracted with a map ``(*batch, N, N)``."""
         axis = view - self.views
         moved = forms.movedim(axis, -1)
@@ -347,9 +347,9 @@ class DynamicMotion(DynamicTensor):
 
     def whitened_static_residual(self, motion: tuple[Tensor, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...]) -> Tensor:
         """Distances of all views from the nearest static point, ``(*batch, n, m n)``, of n (m - 1) degrees of freedom."""
-        found = DynamicMotion(self.n, self.views, 1).whitened_residual(motion, views, scales)
-        assert found is not None
-        return found
+        residual = DynamicMotion(self.n, self.views, 1).whitened_residual(motion, views, scales)
+        assert residual is not None
+        return residual
 
     def __repr__(self) -> str:
         return f"DynamicMotion({self.n}, {self.views}, {self.k})"
@@ -369,15 +369,15 @@ def vanishing_forms(size: int, views: int, step: int, device: torch.device) -> T
     if size == views == step + 1:
         epsilon = levi_civita(size, device=device)
         return (epsilon / epsilon.norm())[None]
-    known: dict[tuple[int, ...], tuple[list[tuple[int, ...]], Tensor]] = {}
+    blocks: dict[tuple[int, ...], tuple[list[tuple[int, ...]], Tensor]] = {}
     rows: list[Tensor] = []
     place = torch.tensor([size ** (views - 1 - v) for v in range(views)])
     for indices in combinations_with_replacement(range(size), views):
         names = sorted(set(indices), key=lambda i: (-indices.count(i), i))
         pattern = tuple(indices.count(i) for i in names)
-        if pattern not in known:
-            known[pattern] = _block(pattern, step)
-        words, basis = known[pattern]
+        if pattern not in blocks:
+            blocks[pattern] = _block(pattern, step)
+        words, basis = blocks[pattern]
         where = torch.tensor([[names[letter] for letter in word] for word in words]) @ place
         block = torch.zeros(len(basis), size**views, dtype=torch.float64)
         block[:, where] = basis
@@ -390,21 +390,21 @@ def _block(pattern: tuple[int, ...], step: int) -> tuple[list[tuple[int, ...]], 
     letters = [letter for letter, count in enumerate(pattern) for _ in range(count)]
     words = sorted(set(permutations(letters)))
     number = {word: i for i, word in enumerate(words)}
-    made = set()
+    generated = set()
     for word in words:
         for slots in combinations(range(len(letters)), step + 1):
             # one generator for each set of words that differ by the order of these letters
             chosen = [word[s] for s in slots]
             if len(set(chosen)) == len(chosen) and chosen == sorted(chosen):
-                made.add((word, slots))
-    generators = torch.zeros(len(made), len(words), dtype=torch.float64)
-    for row, (word, slots) in enumerate(sorted(made)):
+                generated.add((word, slots))
+    generators = torch.zeros(len(generated), len(words), dtype=torch.float64)
+    for row, (word, slots) in enumerate(sorted(generated)):
         for order in permutations(range(len(slots))):
             other = list(word)
             for s, i in zip(slots, order, strict=True):
                 other[s] = word[slots[i]]
             generators[row, number[tuple(other)]] = _sign(order)
-    if not made:
+    if not generated:
         return words, generators
     _, values, basis = torch.linalg.svd(generators, full_matrices=False)
     return words, basis[: int((values > SMALL * values[0]).sum())]
@@ -455,12 +455,12 @@ def nearest_flats(maps: Tensor, points: Tensor, scales: Tensor, step: int) -> Fl
     size = vectors.shape[-1]
     count = size - step
     base, across = vectors[..., :count].mT, vectors[..., count:].mT
-    at, cost = _at(base, across, maps, p, s), torch.full(p.shape[:2], torch.inf, dtype=p.dtype, device=p.device)
+    at, cost = _linearize_at(base, across, maps, p, s), torch.full(p.shape[:2], torch.inf, dtype=p.dtype, device=p.device)
     for _ in range(STEPS):
         cost = at.residual.square().sum((-2, -1))
         pulled = at.slope.mT @ at.residual.flatten(-2)[..., None]
         move = -(at.inverse @ pulled)[..., 0].unflatten(-1, (count, step)) @ across
-        tried = _at(at.hyperplanes + move, across, maps, p, s)
+        tried = _linearize_at(at.hyperplanes + move, across, maps, p, s)
         new = tried.residual.square().sum((-2, -1))
         # where the points hardly move the flat may turn far: only what helps counts
         better = new < cost
@@ -471,7 +471,7 @@ def nearest_flats(maps: Tensor, points: Tensor, scales: Tensor, step: int) -> Fl
     return at
 
 
-def _at(hyperplanes: Tensor, across: Tensor, maps: Tensor, p: Tensor, s: Tensor) -> Flats:
+def _linearize_at(hyperplanes: Tensor, across: Tensor, maps: Tensor, p: Tensor, s: Tensor) -> Flats:
     """What belongs to given flats; ``across (b, n, k, N)`` is what displacements of the hyperplanes are made of."""
     residual, root, h = whitened_incidence(hyperplanes, maps, p, s)
     force = (root.mT @ residual[..., None])[..., 0]
@@ -514,19 +514,19 @@ def _differentiable_flats(hyperplanes: Tensor, maps: Tensor, points: Tensor, noi
     problems, count, c, size = hyperplanes.shape
     across = eigh(hyperplanes.mT @ hyperplanes)[1][..., : size - c].mT[..., :step, :]
 
-    def moved(by: Tensor, hyperplanes: Tensor, across: Tensor) -> Tensor:
+    def displace(by: Tensor, hyperplanes: Tensor, across: Tensor) -> Tensor:
         return hyperplanes + by.unflatten(-1, (c, across.shape[-2])) @ across
 
     def cost(by: Tensor, hyperplanes: Tensor, across: Tensor, points: Tensor, maps: Tensor, noise: Tensor) -> Tensor:
-        at = moved(by, hyperplanes, across)[:, None]
-        found = whitened_incidence(at, maps, homogeneous(points)[:, None], noise[:, None, :, None, None])
-        return found[0].square().sum((-3, -2, -1))
+        at = displace(by, hyperplanes, across)[:, None]
+        incidence = whitened_incidence(at, maps, homogeneous(points)[:, None], noise[:, None, :, None, None])
+        return incidence[0].square().sum((-3, -2, -1))
 
-    held = hyperplanes.flatten(0, 1), across.flatten(0, 1)
-    still = held[0].new_zeros(problems * count, c * across.shape[-2])
+    flat = hyperplanes.flatten(0, 1), across.flatten(0, 1)
+    zero = flat[0].new_zeros(problems * count, c * across.shape[-2])
     several = [x[:, None].expand(-1, count, *x.shape[1:]).flatten(0, 1) for x in (maps, noise)]
-    by = follow_minimum(cost, still, still.new_zeros(*still.shape, 0), *held, points.flatten(0, 1), *several)
-    return moved(by, *held).unflatten(0, (problems, count))
+    by = follow_minimum(cost, zero, zero.new_zeros(*zero.shape, 0), *flat, points.flatten(0, 1), *several)
+    return displace(by, *flat).unflatten(0, (problems, count))
 
 
 def flat_residual_derivative(maps: Tensor, views: Sequence[Tensor], scales: Sequence[Tensor], step: int) -> tuple[Tensor, Tensor]:
@@ -560,8 +560,8 @@ def forms_of_views(basis: Tensor, views: int, slots: Sequence[int], step: int) -
     parted = parted.flatten(lead, lead + len(slots) - 1)  # (*batch, nullity, N^(k+1), N^(m-k-1))
     trace = (parted @ parted.mT).sum(-3)
     eye = torch.eye(trace.shape[-1], dtype=basis.dtype, device=basis.device)
-    found = gram_null_space(parted.shape[-1] * eye - trace, comb(size, step + 1)).basis
-    return found.unflatten(-1, (size,) * len(slots))
+    basis_of_slots = gram_null_space(parted.shape[-1] * eye - trace, comb(size, step + 1)).basis
+    return basis_of_slots.unflatten(-1, (size,) * len(slots))
 
 
 def collineations(basis: Tensor, views: int, step: int) -> tuple[Tensor, ...]:

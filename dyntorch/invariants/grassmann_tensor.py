@@ -143,8 +143,8 @@ class GrassmannTensor(Invariant):
             >>> bool(torch.allclose(engine.compose(*engine.decompose(A)).abs(), A.abs()))
             True
         """
-        found = projections_of(tensor.double(), self.profile, self.sizes)
-        return tuple(part.to(tensor.dtype) for part in found)
+        projections = projections_of(tensor.double(), self.profile, self.sizes)
+        return tuple(part.to(tensor.dtype) for part in projections)
 
     def starts(self, tensor: Tensor) -> tuple[Tensor, ...]:
         """Projections of the tensor in closed form, ``(tries, *batch, l_i + 1, k + 1)``, which noise moves apart.

@@ -100,8 +100,8 @@ class HomographyTensor(Invariant):
             [1.0, 2.0, 2.0]
         """
         balanced, (first, second, third) = _balance_slices(tensor.double())
-        a = _solution(balanced) * second[..., None, :] / first[..., :, None]
-        b = _solution(balanced.mT) * third[..., None, :] / first[..., :, None]
+        a = _solve_skew_system(balanced) * second[..., None, :] / first[..., :, None]
+        b = _solve_skew_system(balanced.mT) * third[..., None, :] / first[..., :, None]
         return unit(a).to(tensor.dtype), unit(b).to(tensor.dtype)
 
     @staticmethod
@@ -248,7 +248,7 @@ def _skew_system(slices: Tensor) -> Tensor:
     return (half + half.transpose(-4, -3)).flatten(-5, -3).flatten(-2)
 
 
-def _solution(slices: Tensor) -> Tensor:
+def _solve_skew_system(slices: Tensor) -> Tensor:
     """The X ``(*batch, 3, 3)`` of :func:`_skew_system`; zero where all slices are."""
     found = null_space(_skew_system(slices))[..., 0, :].unflatten(-1, (3, 3))
     return torch.where((slices == 0).all(-1).all(-1).all(-1)[..., None, None], torch.zeros_like(found), found)

@@ -100,15 +100,15 @@ class LiftedShapeTensor(PointShape):
             self.check_points(self.points)
 
     @property
-    def least(self) -> int:
+    def min_points(self) -> int:
         """Fewest points of which a view says anything."""
         general = -(-(self.k + 1) * (self.l + 1) // self.l)
         beside = max(2, -(-(self.l + 2) // self.l))
         return {GENERAL: general, PLANE: self.l + 2 + beside, AFFINE: self.k + 2}[self.frame]
 
     def check_points(self, n: int) -> None:
-        if n < self.least:
-            raise ValueError(f"{self._name()} needs at least {self.least} points, got {n}; add points")
+        if n < self.min_points:
+            raise ValueError(f"{self._name()} needs at least {self.min_points} points, got {n}; add points")
         if self.frame == GENERAL and n > 2 * self.k + 2:
             raise ValueError(f"{self._name()} takes up to {2 * self.k + 2} points, got {n}; take as many of them")
 
@@ -210,13 +210,13 @@ class LiftedShapeTensor(PointShape):
             >>> bool(torch.allclose(family.compose(family.decompose(T)).abs(), T.abs()))
             True
         """
-        whole = tensor.double()
+        double = tensor.double()
         if self.frame == AFFINE:
-            points = static.affine_points(whole[..., None, :] if self.nullity == 1 else whole, self.k)
+            points = static.affine_points(double[..., None, :] if self.nullity == 1 else double, self.k)
         elif self.frame == GENERAL:
-            points = lifted.points_of(whole, self.k, self.l, self.profile)
+            points = lifted.points_of(double, self.k, self.l, self.profile)
         else:
-            points = static.plane_points(whole)
+            points = static.plane_points(double)
         return points.to(tensor.dtype)
 
     def multilinear(self, tensor: Tensor, basis: Tensor) -> Tensor:

@@ -117,9 +117,9 @@ def _check(x1: Tensor, x2: Tensor, bodies: int, weights: Tensor | None) -> Tenso
     check_matches(x1, x2, weights)
     if not isinstance(bodies, int) or isinstance(bodies, bool) or bodies < 1:
         raise ValueError(f"bodies must be a whole number, 1 or more, got {bodies!r}")
-    least, n = comb(bodies + 2, 2) ** 2 - 1, x1.shape[-2]
-    if n < least:
-        raise ValueError(f"the multibody matrix of {bodies} bodies takes {least} matches, got {n}: add {least - n}")
+    min_matches, n = comb(bodies + 2, 2) ** 2 - 1, x1.shape[-2]
+    if n < min_matches:
+        raise ValueError(f"the multibody matrix of {bodies} bodies takes {min_matches} matches, got {n}: add {min_matches - n}")
     finite = ((x1.abs() <= FARTHEST) & (x2.abs() <= FARTHEST)).all(-1)
     given = finite.double() if weights is None else weights.double()
     if given.shape != finite.shape or not bool((given >= 0).all()):
@@ -150,8 +150,8 @@ def _bodies(matrix: Tensor, first: Tensor, second: Tensor, bodies: int, weights:
     share = trust  # at first, matches where bodies cross count little
     for _ in range(ROUNDS):
         member = label[..., None, :] == torch.arange(bodies, device=label.device)[:, None]
-        found = null_space(row[..., None, :, :] * (member * share[..., None, :])[..., None])[..., 0, :].unflatten(-1, (3, 3))
-        fundamentals = FundamentalMatrix().constrain(found)
+        matrices = null_space(row[..., None, :, :] * (member * share[..., None, :])[..., None])[..., 0, :].unflatten(-1, (3, 3))
+        fundamentals = FundamentalMatrix().constrain(matrices)
         distances = [sampson(FundamentalMatrix, f, first[..., :2], second[..., :2]) for f in fundamentals.unbind(-3)]
         label = torch.stack(distances).argmin(dim=0)
         share = (weights > 0).to(trust.dtype)

@@ -130,15 +130,15 @@ class CameraKind:
 def reprojection_residual(structure: Tensor, x: Tensor, scale: Tensor, cameras: CameraKind) -> Tensor:
     r"""Reprojection error that no camera takes away, in standard deviations of noise, to first order. structure
     ``(*batch, n, k + 1)``, x ``(*batch, views, n, l + 1)``, scale ``(*batch,)`` -> ``(*batch, views, l n)``."""
-    at, known, _ = _linearize(structure, x, scale, cameras)
+    at, informative, _ = _linearize(structure, x, scale, cameras)
     error = at.error - (at.slope @ (at.inverse @ (at.slope.mT @ at.error[..., None])))[..., 0]
-    return torch.where(known[..., None], error[..., 0, :], torch.nan)
+    return torch.where(informative[..., None], error[..., 0, :], torch.nan)
 
 
 def reprojection_derivative(structure: Tensor, x: Tensor, scale: Tensor, cameras: CameraKind) -> tuple[Tensor, Tensor]:
     """The residual and its derivative ``(*batch, views, l n, n, k + 1)`` by the points; both 0 where a view says nothing."""
-    at, known, length = _linearize(structure, x, scale, cameras)
-    known = known[..., None, None]
+    at, informative, length = _linearize(structure, x, scale, cameras)
+    informative = informative[..., None, None]
     project = torch.eye(at.error.shape[-1], dtype=x.dtype, device=x.device) - (at.slope @ at.inverse @ at.slope.mT)[..., 0, :, :]
     error = (project @ at.error.mT)[..., 0]
     n, size = x.shape[-2], cameras.l
@@ -151,7 +151,7 @@ def reprojection_derivative(structure: Tensor, x: Tensor, scale: Tensor, cameras
     seen = looked_at(x)[..., None, None]
     own = torch.where(seen, own / length[..., None, None], 0.0)
     derivative = -torch.einsum("...cni,...nia->...cna", project.unflatten(-1, (n, size)), own)
-    return torch.where(known[..., 0], error, 0.0), torch.where(known[..., None], derivative, 0.0)
+    return torch.where(informative[..., 0], error, 0.0), torch.where(informative[..., None], derivative, 0.0)
 
 
 def looked_at(x: Tensor) -> Tensor:
@@ -252,14 +252,18 @@ class PointShape(Invariant):
     def compose_points(self, points: Tensor) -> Tensor:
         """The tensor ``(*batch, [nullity,] *shape)`` of points ``(*batch, n, k)`` or homogeneous; 0 without a frame."""
         own = self.with_points(int(points.shape[-2]))
-        whole = points if points.shape[-1] == self.k + 1 else torch.nn.functional.pad(points, (0, 1), value=1.0)
-        if whole.shape[-1] != self.k + 1:
+        standard = points if points.shape[-1] == self.k + 1 else torch.nn.functional.pad(points, (0, 1), value=1.0)
+        if standard.shape[-1] != self.k + 1:
             raise ValueError(f"points must be (*batch, n, {self.k}) or homogeneous, (*batch, n, {self.k + 1}), got {points.shape}")
-        whole = static.standard(whole.double(), own.frame)
-        sound = whole.isfinite().flatten(-2).all(-1)[..., None, None]
-        stand_in = torch.ones_like(whole) if own.frame == PLANE else torch.eye(*whole.shape[-2:], device=whole.device).to(whole)
-        stand_in = torch.where(torch.arange(whole.shape[-2], device=whole.device)[:, None] > self.k, 1.0, stand_in)
-        flat = own.compose_standard(torch.where(sound, whole, stand_in)).flatten(-len(own.shape()))
+        standard = static.standard(standard.double(), own.frame)
+        sound = standard.isfinite().flatten(-2).all(-1)[..., None, None]
+        stand_in = (
+            torch.ones_like(standard)
+            if own.frame == PLANE
+            else torch.eye(*standard.shape[-2:], device=standard.device).to(standard)
+        )
+        stand_in = torch.where(torch.arange(standard.shape[-2], device=standard.device)[:, None] > self.k, 1.0, stand_in)
+        flat = own.compose_standard(torch.where(sound, standard, stand_in)).flatten(-len(own.shape()))
         norm = flat.norm(dim=-1, keepdim=True)
         flat = torch.where(sound if own.nullity > 1 else sound[..., 0], flat / torch.where(norm > 0, norm, 1.0), 0.0)
         return flat.unflatten(-1, own.shape()).to(points.dtype)

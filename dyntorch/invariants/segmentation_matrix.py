@@ -63,9 +63,9 @@ class RelationPair(Invariant):
         half = 0.5 + 0.5 * torch.eye(3, dtype=form.dtype, device=form.device)
         lines = (form * half @ homogeneous(first)[..., None])[..., 0]
         labels = hyperplane_pair(lines, weights).labels
-        found = [_eight_points(first, second, (labels == k).double()) for k in (1, 2)]
-        one, two = (unit(frames[1].mT @ f @ frames[0]).to(tensor.dtype) for f in found)
-        return one, two
+        matrices = [_eight_points(first, second, (labels == k).double()) for k in (1, 2)]
+        F1, F2 = (unit(frames[1].mT @ f @ frames[0]).to(tensor.dtype) for f in matrices)
+        return F1, F2
 
     @staticmethod
     def labels(first: Tensor, second: Tensor, x1: Tensor, x2: Tensor) -> Tensor:

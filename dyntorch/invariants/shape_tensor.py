@@ -35,8 +35,8 @@ def view_score(structure: Tensor, x: Tensor, frame: str) -> Tensor:
     equations = (lines_through(q) @ cameras[..., None, :, :, :]).flatten(-3, -2)
     finite = equations.isfinite().flatten(-2).all(-1)  # a shape that could not be fitted has no cameras
     values = torch.linalg.svdvals(torch.where(finite[..., None, None], equations, 0.0))
-    known = finite & ((q != 0).any(-1).sum(-1) > 1)
-    return torch.where(known, values[..., 3] / values.norm(dim=-1).clamp(min=1e-300), torch.nan)
+    informative = finite & ((q != 0).any(-1).sum(-1) > 1)
+    return torch.where(informative, values[..., 3] / values.norm(dim=-1).clamp(min=1e-300), torch.nan)
 
 
 LEAST = {GENERAL: 6, PLANE: 6, AFFINE: 5}
@@ -132,11 +132,11 @@ class ShapeTensor(PointShape):
         if self.frame != AFFINE or not len(x) or bool(((x[..., 2] > 0) | (weights <= 0)[..., None]).all()):
             return views, weights
         near, factor = static.local(x)
-        filled, whole = static.complete_points(near[..., :2], x[..., 2] > 0, weights)
+        filled, complete = static.complete_points(near[..., :2], x[..., 2] > 0, weights)
         back = (filled - near[..., :2]) / factor[..., None, None]
         centre = (x[..., :2] * x[..., 2:]).sum(-2, keepdim=True) / x[..., 2:].sum(-2, keepdim=True).clamp(min=1.0)
         missing = torch.where(x[..., 2:] > 0, x[..., :2], centre + back)
-        return (torch.cat([missing, x[..., 2:]], dim=-1),), weights * whole
+        return (torch.cat([missing, x[..., 2:]], dim=-1),), weights * complete
 
     @property
     def primitives(self) -> tuple[Equations]:  # type: ignore[override]

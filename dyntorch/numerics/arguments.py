@@ -133,16 +133,16 @@ def move_to_device(value: Any, device: torch.device) -> Any:
         # a device without float64 gets float32
         return value.to(device, torch.float32 if device.type == "mps" and value.dtype == torch.float64 else value.dtype)
     if isinstance(value, torch.Generator):
-        return value if device != CPU or value.device == CPU else torch.Generator().manual_seed(_seed(value))
+        return value if device != CPU or value.device == CPU else torch.Generator().manual_seed(_draw_seed(value))
     if isinstance(value, Mapping):
         return {key: move_to_device(part, device) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
         parts = [move_to_device(part, device) for part in value]
         return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
     if _holds_fields(value):
-        held = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        values = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
         return dataclasses.replace(
-            value, **{name: move_to_device(part, device) for name, part in held.items() if any(True for _ in _tensors(part))}
+            value, **{name: move_to_device(part, device) for name, part in values.items() if any(True for _ in _tensors(part))}
         )
     return value
 
@@ -163,6 +163,6 @@ def _holds_fields(value: Any) -> bool:
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
-def _seed(generator: torch.Generator) -> int:
+def _draw_seed(generator: torch.Generator) -> int:
     """A number drawn from it: the next call draws another."""
     return int(torch.randint(2**31, (1,), generator=generator, device=generator.device))

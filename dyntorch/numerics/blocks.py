@@ -198,8 +198,8 @@ def rebuilt(record: Record, tensors: Iterator[Tensor]) -> Record:
     parts = _parts(record)
     if parts is None:
         return record
-    made, kind = [rebuilt(part, tensors) for part in parts], type(record)
-    return kind(made) if kind is tuple else kind(*made)  # type: ignore[call-arg]
+    built, kind = [rebuilt(part, tensors) for part in parts], type(record)
+    return kind(built) if kind is tuple else kind(*built)  # type: ignore[call-arg]
 
 
 def _parts(record: Any) -> Iterable[Any] | None:
@@ -247,11 +247,11 @@ def constant(make: Callable[Sizes, Table]) -> _lru_cache_wrapper[Table]:
 
     @lru_cache(maxsize=256)
     @wraps(make)
-    def made(*args: Sizes.args, **kwargs: Sizes.kwargs) -> Table:
+    def look_up(*args: Sizes.args, **kwargs: Sizes.kwargs) -> Table:
         with ThreadPoolExecutor(1) as alone:
             return alone.submit(make, *args, **kwargs).result()
 
-    return made
+    return look_up
 
 
 # ----------------------------------------------------------------------------------------------------------------------

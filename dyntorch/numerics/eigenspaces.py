@@ -104,8 +104,8 @@ def _unit(columns: Tensor) -> Tensor:
 def solve(right: Tensor, factor: Tensor) -> Tensor:
     """Solution for a lower Cholesky factor: for one column two triangular solves take half the time of cholesky_solve."""
     half = torch.linalg.solve_triangular(factor, right, upper=False)
-    whole: Tensor = torch.linalg.solve_triangular(factor.mT, half, upper=True)
-    return whole
+    solution: Tensor = torch.linalg.solve_triangular(factor.mT, half, upper=True)
+    return solution
 
 
 def fix_signs(vectors: Tensor) -> Tensor:
@@ -141,8 +141,8 @@ def by_inverse_iteration(gram: Tensor, dim: int) -> Eigenspace:
             rest = (sound & (bound > ANGLE)).nonzero()[:, 0]
             if len(rest) == 0:
                 break
-            again = newton(gram[rest], deflated[rest], vectors[rest], sigma[rest], competing[rest])
-            vectors[rest], values[rest], bound[rest] = again
+            corrected = newton(gram[rest], deflated[rest], vectors[rest], sigma[rest], competing[rest])
+            vectors[rest], values[rest], bound[rest] = corrected
     else:
         for _ in range(2):
             vectors, values, bound = newton(gram, deflated, vectors, sigma, competing)

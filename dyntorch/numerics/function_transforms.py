@@ -41,15 +41,15 @@ def over_problems(function: Callable[..., Record], *data: Any) -> Record:
     function ``(b, ...)``."""
     if not is_transformed(*data):
         return function(*data)
-    made: list[Record] = []
+    results_of: list[Record] = []
 
     def flat(*tensors: Tensor) -> Tensors:
         given = iter(tensors)
-        made[:] = [function(*(rebuilt(record, given) for record in data))]
-        return tuple(tensors_of(made[0]))
+        results_of[:] = [function(*(rebuilt(record, given) for record in data))]
+        return tuple(tensors_of(results_of[0]))
 
     results = _OverProblems.apply(flat, *tensors_of(data))  # type: ignore[no-untyped-call]
-    return rebuilt(made[0], iter(results))
+    return rebuilt(results_of[0], iter(results))
 
 
 class _OverProblems(torch.autograd.Function):
@@ -84,50 +84,52 @@ class _OverProblems(torch.autograd.Function):
     def vmap(
         info: Any, in_dims: tuple[int | None, ...], function: Callable[..., Tensors], *inputs: Tensor
     ) -> tuple[Tensors, tuple[int, ...]]:
-        whole = (merge_mapped_dimension(info, axis, x) for axis, x in zip(in_dims[1:], inputs, strict=True))
-        parts = tuple(split_again(info, part) for part in _OverProblems.apply(function, *whole))  # type: ignore[no-untyped-call]
+        merged = (merge_mapped_dimension(info, axis, x) for axis, x in zip(in_dims[1:], inputs, strict=True))
+        parts = tuple(split_again(info, part) for part in _OverProblems.apply(function, *merged))  # type: ignore[no-untyped-call]
         return parts, (0,) * len(parts)
 
 
 def _pulled_back(function: Callable[..., Tensors], count: int, *data: Tensor) -> Tensors:
     """Gradients by the inputs of floating point, given those by all outputs; differentiable where gradients are recorded."""
-    again, cotangents = torch.is_grad_enabled(), data[count:]
+    create_graph, cotangents = torch.is_grad_enabled(), data[count:]
     with torch.enable_grad():
         inputs, floating = _leaves(data[:count])
-        pairs = [(value, c) for value, c in zip(function(*inputs), cotangents, strict=True) if _moving(value)]
+        pairs = [(value, c) for value, c in zip(function(*inputs), cotangents, strict=True) if _is_differentiable(value)]
         values, along = [value for value, _ in pairs], [c for _, c in pairs]
-        found = grad(values, floating, along, create_graph=again, allow_unused=True) if pairs else (None,) * len(floating)
-    return tuple(torch.zeros_like(x) if part is None else part for x, part in zip(floating, found, strict=True))
+        gradients = (
+            grad(values, floating, along, create_graph=create_graph, allow_unused=True) if pairs else (None,) * len(floating)
+        )
+    return tuple(torch.zeros_like(x) if part is None else part for x, part in zip(floating, gradients, strict=True))
 
 
 def _pushed_forward(function: Callable[..., Tensors], count: int, *data: Tensor) -> Tensors:
     """Changes of all outputs, given those of the inputs of floating point: what is pulled back is linear in the cotangents."""
-    again, tangents = torch.is_grad_enabled(), data[count:]
+    create_graph, tangents = torch.is_grad_enabled(), data[count:]
     with torch.enable_grad():
         inputs, floating = _leaves(data[:count])
         values = function(*inputs)
-        moving = [value for value in values if _moving(value)]
+        moving = [value for value in values if _is_differentiable(value)]
         cotangents = [torch.zeros_like(value, requires_grad=True) for value in moving]
         pulled = grad(moving, floating, cotangents, create_graph=True, allow_unused=True) if moving else ()
         pairs = [(p, t) for p, t in zip(pulled, tangents, strict=False) if p is not None and p.requires_grad]
         slopes, along = [p for p, _ in pairs], [t for _, t in pairs]
-        found = grad(slopes, cotangents, along, create_graph=again, allow_unused=True) if pairs else ()
-    pushed = {id(value): part for value, part in zip(moving, found, strict=False) if part is not None}
+        changes = grad(slopes, cotangents, along, create_graph=create_graph, allow_unused=True) if pairs else ()
+    pushed = {id(value): part for value, part in zip(moving, changes, strict=False) if part is not None}
     return tuple(pushed.get(id(value), torch.zeros_like(value)) for value in values)
 
 
-def _moving(value: Tensor) -> bool:
+def _is_differentiable(value: Tensor) -> bool:
     return value.is_floating_point() and value.requires_grad
 
 
 def _leaves(inputs: Tensors) -> tuple[Tensors, Tensors]:
     """The inputs as variables, each of its own, and those of floating point."""
-    again = torch.is_grad_enabled()
+    recorded = torch.is_grad_enabled()
 
     def variable(x: Tensor) -> Tensor:
         if not x.is_floating_point():
             return x
-        return x.view_as(x) if again and x.requires_grad else x.detach().requires_grad_()
+        return x.view_as(x) if recorded and x.requires_grad else x.detach().requires_grad_()
 
     every = tuple(variable(x) for x in inputs)
     return every, tuple(x for x in every if x.is_floating_point())
@@ -135,8 +137,8 @@ def _leaves(inputs: Tensors) -> tuple[Tensors, Tensors]:
 
 def merge_mapped_dimension(info: Any, axis: int | None, tensor: Tensor) -> Tensor:
     """The dimension that vmap maps over as part of the batch."""
-    whole = tensor.expand(info.batch_size, *tensor.shape) if axis is None else tensor.movedim(axis, 0)
-    return whole.flatten(0, 1)
+    mapped = tensor.expand(info.batch_size, *tensor.shape) if axis is None else tensor.movedim(axis, 0)
+    return mapped.flatten(0, 1)
 
 
 def split_again(info: Any, part: Tensor) -> Tensor:

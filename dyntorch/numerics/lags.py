@@ -39,14 +39,14 @@ def correlate(a: Tensor, b: Tensor, lags: Lags, lift: Lift, per_point: bool = Fa
         # frames that no lag pairs with anything are left out
         early, late = max(0, -hi), max(0, lo)
         first, second = a[:, early : frames2 - lo], b[:, late : frames1 + hi]
-        found = result[..., lo - lags[0] : hi - lags[0] + 1]
-        _fill(found, first, second, lo + early - late, lift, per_point)
+        inside = result[..., lo - lags[0] : hi - lags[0] + 1]
+        _fill(inside, first, second, lo + early - late, lift, per_point)
     return result if per_point else result[:, 0]
 
 
-def _fill(found: Tensor, a: Tensor, b: Tensor, lo: int, lift: Lift, per_point: bool) -> None:
+def _fill(target: Tensor, a: Tensor, b: Tensor, lo: int, lift: Lift, per_point: bool) -> None:
     """Problems, and rows of the first sequence, in pieces that fit into memory."""
-    count, points, p, q, lags = found.shape
+    count, points, p, q, lags = target.shape
     length, block = _lengths(a.shape[1], b.shape[1], lo, lo + lags - 1)
     for problem in range(count):
         rows = max(1, ELEMENTS // (points * q * length))
@@ -54,11 +54,11 @@ def _fill(found: Tensor, a: Tensor, b: Tensor, lo: int, lift: Lift, per_point: b
             chosen = slice(row, row + rows)
             upper = partial(_rows_of, lift, chosen)
             spectrum = _spectrum(a[problem], b[problem], (lo, lo + lags - 1), (length, block), (upper, lift), per_point)
-            whole = torch.fft.irfft(spectrum, n=length)
+            correlations = torch.fft.irfft(spectrum, n=length)
             # in one block the lags count from the first frame, and negative ones from the end; in several from the first lag
             negative = -lo if block >= a.shape[1] else 0
-            found[problem, :, chosen, :, :negative] = whole[..., length - negative :]
-            found[problem, :, chosen, :, negative:] = whole[..., : lags - negative]
+            target[problem, :, chosen, :, :negative] = correlations[..., length - negative :]
+            target[problem, :, chosen, :, negative:] = correlations[..., : lags - negative]
 
 
 def _rows_of(lift: Lift, chosen: slice, x: Tensor) -> Tensor:
@@ -87,16 +87,16 @@ def _lengths(frames1: int, frames2: int, lo: int, hi: int) -> tuple[int, int]:
     """Length of the transforms, and of the blocks of the first sequence."""
     # milliseconds for 2001 lags by transforms of 2, 3, 4, 8 times as many frames, and of all: 10,000 frames of 20 + 20 rows
     # 22, 33, 52, 93, 65; 100,000 frames of 4 + 4 rows 16, 9, 8, 9, 24
-    whole = max(frames2 - lo, frames1 + hi)
+    full_length = max(frames2 - lo, frames1 + hi)
     width = hi - lo
     length = max(3 * (width + 1), 2048)
-    if 2 * whole <= 3 * length:
-        return _good(whole), frames1
-    length = _good(length)
+    if 2 * full_length <= 3 * length:
+        return _fft_length(full_length), frames1
+    length = _fft_length(length)
     return length, length - width
 
 
-def _good(least: int) -> int:
+def _fft_length(least: int) -> int:
     """The next length of the form 2^a 3^b 5^c, even."""
     best = 2 ** max((least - 1).bit_length(), 1)
     five = 1
@@ -134,7 +134,7 @@ def lag_products(a: Tensor, b: Tensor, lags: Lags | None = None) -> Tensor:
     ``(*batch, T2, q)`` -> ``(*batch, L, p, q)``."""
     span = _span(a, b, lags, 2)
     shape, first, second = _flat(a, b, 2)
-    return _batched(correlate(first[:, :, None], second[:, :, None], span, _channels).movedim(-1, 1), shape)
+    return _restore_batch(correlate(first[:, :, None], second[:, :, None], span, _channels).movedim(-1, 1), shape)
 
 
 def epipolar_moments(
@@ -142,8 +142,8 @@ def epipolar_moments(
 ) -> tuple[Tensor, Tensor]:
     r"""Moment matrices of the epipolar constraint of the same points in two cameras, at all lags. x1 ``(*batch, T1, n, 2)``, x2
     ``(*batch, T2, n, 2)``, weights ``(*batch, T1, n)`` -> ``(*batch, [n,] L, 9, 9)``."""
-    found, counts = _camera_moments(x1, x2, lags, weights, per_point)
-    return _places(found, _epipolar_places(found.device)), counts
+    products, counts = _camera_moments(x1, x2, lags, weights, per_point)
+    return _place_products(products, _epipolar_places(products.device)), counts
 
 
 def resection_moments(
@@ -157,8 +157,8 @@ def resection_moments(
             f"{tuple(points.shape)}"
         )
     span = _span(x, points, lags, 3)
-    found, counts = _lifted_moments(x, points, span, weights, _of_camera_and_space, per_point)
-    return _places(found, _resection_places(found.device)), counts
+    products, counts = _lifted_moments(x, points, span, weights, _of_camera_and_space, per_point)
+    return _place_products(products, _resection_places(products.device)), counts
 
 
 def lag_covariances(
@@ -169,7 +169,7 @@ def lag_covariances(
     shape, first, second = _flat(a, b, 2)
     given = weights or (a.new_ones(a.shape[-2]), b.new_ones(b.shape[-2]))
     w1, w2 = (_frame_weights(w, x, shape) for w, x in zip(given, (first, second), strict=True))
-    aa, bb, ab, counts = (_batched(x, shape) for x in _weighted_covariances(first, second, _span(a, b, lags, 2), w1, w2))
+    aa, bb, ab, counts = (_restore_batch(x, shape) for x in _weighted_covariances(first, second, _span(a, b, lags, 2), w1, w2))
     return aa, bb, ab, counts
 
 
@@ -214,11 +214,11 @@ def _lifted_moments(
     given: tuple[Tensor | None, Tensor | None] = weights or (None, None)
     x1, x2 = (torch.cat([x.double(), _point_weights(x, w)[..., None]], dim=-1) for x, w in zip((x1, x2), given, strict=True))
     shape, first, second = _flat(x1, x2, 3)
-    found = correlate(first, second, span, lift, per_point).flatten(-3, -2)
+    products = correlate(first, second, span, lift, per_point).flatten(-3, -2)
     one, two = (x[..., -1] if per_point else x[..., -1].flatten(1)[..., None] for x in (first, second))
-    counts = _counts(found[..., -1, :], one, two, per_point)
-    found = torch.where(counts[..., None, :] > 0, found, 0.0)
-    return _batched(found, shape), _batched(counts, shape)
+    counts = _counts(products[..., -1, :], one, two, per_point)
+    products = torch.where(counts[..., None, :] > 0, products, 0.0)
+    return _restore_batch(products, shape), _restore_batch(counts, shape)
 
 
 def _counts(sums: Tensor, w1: Tensor, w2: Tensor, per_point: bool) -> Tensor:
@@ -226,8 +226,8 @@ def _counts(sums: Tensor, w1: Tensor, w2: Tensor, per_point: bool) -> Tensor:
     # what has no overlap sums to rounding, and has to be 0
     norms = w1.square().sum(1).sqrt() * w2.square().sum(1).sqrt()
     counts = torch.where(sums > ROUNDING * (norms[..., None] if per_point else norms), sums, 0.0)
-    whole = all(bool(((w == 0) | (w == 1)).all()) for w in (w1, w2))
-    return counts.round() if whole else counts
+    binary = all(bool(((w == 0) | (w == 1)).all()) for w in (w1, w2))
+    return counts.round() if binary else counts
 
 
 def _point_weights(x: Tensor, weights: Tensor | None) -> Tensor:
@@ -252,7 +252,7 @@ def _check_weights(weights: Tensor) -> None:
         raise ValueError("weights must be finite and not negative: give 0 where a point is missing")
 
 
-def _places(found: Tensor, place: Tensor) -> Tensor:
+def _place_products(found: Tensor, place: Tensor) -> Tensor:
     """Matrices ``(*, L, ..., d, d)`` of the sums ``(*, p q, L)``; the lags stay last in memory."""
     return found.index_select(-2, place.flatten()).unflatten(-2, place.shape).movedim(-1, -1 - place.ndim)
 
@@ -287,13 +287,13 @@ def _flat(a: Tensor, b: Tensor, dims: int) -> tuple[tuple[int, ...], Tensor, Ten
     return tuple(shape), first, second
 
 
-def _batched(x: Tensor, shape: tuple[int, ...]) -> Tensor:
+def _restore_batch(x: Tensor, shape: tuple[int, ...]) -> Tensor:
     return x.reshape(*shape, *x.shape[1:])
 
 
 def _weighted_covariances(a: Tensor, b: Tensor, span: Lags, w1: Tensor, w2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Everything is a product of a weighted monomial of one sequence with one of the other; weights are ``(b, frames, 1)``."""
-    a, b = _centred(a, w1), _centred(b, w2)
+    a, b = _subtract_mean(a, w1), _subtract_mean(b, w2)
     sums = lag_products(torch.cat([w1 * a, w1], dim=-1), torch.cat([w2 * b, w2], dim=-1), span)
     counts = _counts(sums[..., -1, -1], w1, w2, per_point=False)
     share = torch.where(counts > 0, 1 / torch.where(counts > 0, counts, 1.0), 0.0)[..., None, None]
@@ -308,7 +308,7 @@ def _squares(x: Tensor, weights: Tensor) -> Tensor:
     return ((weights * x)[..., :, None] * x[..., None, :]).flatten(-2)
 
 
-def _centred(x: Tensor, weights: Tensor) -> Tensor:
+def _subtract_mean(x: Tensor, weights: Tensor) -> Tensor:
     x = torch.where(weights > 0, x, 0.0)
     total = weights.sum(1, keepdim=True)
     mean = (weights * x).sum(1, keepdim=True) / torch.where(total > 0, total, 1.0)

@@ -170,9 +170,9 @@ def damped_step(gradient: Tensor, matrix: Tensor, damping: Tensor, free: Tensor 
     floor = floor.add(largest, alpha=ridge) if ridge else floor
     # a parameter that stays has an equation of its own, step = 0
     floor = floor if free is None else floor + (1 - free)
-    held = matrix.clone()
-    held.diagonal(dim1=-2, dim2=-1).add_(floor)
-    factor, _ = torch.linalg.cholesky_ex(held)
+    damped = matrix.clone()
+    damped.diagonal(dim1=-2, dim2=-1).add_(floor)
+    factor, _ = torch.linalg.cholesky_ex(damped)
     step = torch.cholesky_solve(gradient[..., None], factor)[..., 0]
     return torch.where(step.isfinite(), step, 0.0)
 
@@ -191,22 +191,22 @@ def minimize(problem: LeastSquares, start: Iterate, options: LeastSquaresOptions
     return Minimum(at.theta, at.cost, at.terms, steps)
 
 
-def _until_done(problem: LeastSquares, whole: Iterate, damping: Tensor, options: LeastSquaresOptions, steps: Tensor) -> Iterate:
+def _until_done(problem: LeastSquares, start: Iterate, damping: Tensor, options: LeastSquaresOptions, steps: Tensor) -> Iterate:
     """Steps of every problem until it is done; their numbers are written into ``steps``."""
-    at, done = whole, ~whole.cost.isfinite()
+    at, done = start, ~start.cost.isfinite()
     left = torch.arange(done.shape[0], device=done.device)
     for count in range(options.iterations):
         # problems that are done leave: the slow ones do not make the others wait.  An accelerator is asked once per step, which
         # launches hundreds of kernels
         keep = (~done).nonzero()[:, 0]
         if keep.shape != left.shape:
-            whole = whole.replace_problems(left, at)
+            start = start.replace_problems(left, at)
             steps[left[done]] = count
             left, damping, at, problem = left[keep], damping[keep], at.subset(keep), problem.subset(keep)
         if not keep.shape[0]:
-            return whole
+            return start
         at, damping, done = _take_step(problem, at, damping, options)
-    return at if left.shape == steps.shape else whole.replace_problems(left, at)
+    return at if left.shape == steps.shape else start.replace_problems(left, at)
 
 
 def _take_step(problem: LeastSquares, at: Iterate, damping: Tensor, options: LeastSquaresOptions) -> tuple[Iterate, Tensor, Tensor]:
@@ -303,8 +303,8 @@ HESSIAN_BLOCK = 1 << 21
 def follow_minimum(cost: Cost, theta: Tensor, free: Tensor, *data: Tensor) -> Tensor:
     """A minimum as a function of the data: its value, with derivatives of every order by autograd. cost ``(b, p)``, theta
     ``(b, p)``, free ``(b, p, g)`` -> ``(b, p)``."""
-    found: Tensor = _Minimum.apply(cost, theta.detach(), free.detach(), *data)  # type: ignore[no-untyped-call]
-    return found
+    minimum: Tensor = _Minimum.apply(cost, theta.detach(), free.detach(), *data)  # type: ignore[no-untyped-call]
+    return minimum
 
 
 def flat_directions(matrix: Tensor, count: int) -> Tensor:
@@ -326,24 +326,24 @@ class _Minimum(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
-        again = torch.is_grad_enabled()
+        create_graph = torch.is_grad_enabled()
         theta, free, *data = ctx.saved_tensors
         wanted = ctx.needs_input_grad[3:]
         with torch.enable_grad():
             # aliases: the theta of this minimum is one variable, what it depends on another
-            theta = theta.view_as(theta) if again else theta.detach().requires_grad_()
-            given = [x.view_as(x) if again else x.detach() for x in data]
-            hessian = _hessian(ctx.cost, theta, given, again)
+            theta = theta.view_as(theta) if create_graph else theta.detach().requires_grad_()
+            given = [x.view_as(x) if create_graph else x.detach() for x in data]
+            hessian = _hessian(ctx.cost, theta, given, create_graph)
             sound = hessian.detach().flatten(1).isfinite().all(-1)
             right = _solve_sound(hessian, free, cotangent, sound)
-            variables = [x if again else x.requires_grad_() for x, want in zip(given, wanted, strict=True) if want]
+            variables = [x if create_graph else x.requires_grad_() for x, want in zip(given, wanted, strict=True) if want]
             (slope,) = grad(ctx.cost(theta, *given).sum(), theta, create_graph=True)
-            found = grad(slope, variables, -right, create_graph=again, allow_unused=True)
-        parts = iter(torch.zeros_like(x) if part is None else part for x, part in zip(variables, found, strict=True))
+            gradients = grad(slope, variables, -right, create_graph=create_graph, allow_unused=True)
+        parts = iter(torch.zeros_like(x) if part is None else part for x, part in zip(variables, gradients, strict=True))
         return None, None, None, *(select(sound, next(parts), 0.0) if want else None for want in wanted)
 
 
-def _hessian(cost: Cost, theta: Tensor, data: list[Tensor], again: bool) -> Tensor:
+def _hessian(cost: Cost, theta: Tensor, data: list[Tensor], create_graph: bool) -> Tensor:
     """``(b, p, p)``: several copies of all problems at once, each of which gives one row."""
     problems, size = theta.shape
     at_once = max(1, min(size, HESSIAN_BLOCK // max(1, sum(x.numel() for x in data))))
@@ -354,7 +354,7 @@ def _hessian(cost: Cost, theta: Tensor, data: list[Tensor], again: bool) -> Tens
         copies = [x.expand(count, *x.shape).flatten(0, 1) for x in data]
         (slope,) = grad(cost(several, *copies).sum(), several, create_graph=True)
         chosen = slope.unflatten(0, (count, problems))[..., start : start + count].diagonal(dim1=0, dim2=2)
-        rows.append(grad(chosen.sum(), several, create_graph=again)[0].unflatten(0, (count, problems)))
+        rows.append(grad(chosen.sum(), several, create_graph=create_graph)[0].unflatten(0, (count, problems)))
     return torch.cat(rows).movedim(0, 1)
 
 
@@ -365,6 +365,6 @@ def _solve_sound(hessian: Tensor, free: Tensor, right: Tensor, sound: Tensor) ->
     size = matrix.detach().abs().amax((-2, -1), keepdim=True)
     size = torch.where(size > 0, size, 1.0)
     across = right - (free @ (free.mT @ right[..., None]))[..., 0]
-    found, failed = torch.linalg.solve_ex(matrix / size + free @ free.mT, across[..., None])
+    solution, failed = torch.linalg.solve_ex(matrix / size + free @ free.mT, across[..., None])
     usable = (sound & (failed == 0))[:, None]
-    return torch.where(usable, found[..., 0] / size[..., 0], 0.0)
+    return torch.where(usable, solution[..., 0] / size[..., 0], 0.0)

@@ -79,14 +79,14 @@ def with_words(text: object, words: Words) -> str:
         >>> with_words(error, lambda name, value: f"--{name}"), with_words("a plain one", as_python)
         ('give --times', 'a plain one')
     """
-    said = text.args[0] if isinstance(text, Exception) and len(text.args) == 1 else text
-    return said.with_words(words) if isinstance(said, Message) else str(text)
+    message = text.args[0] if isinstance(text, Exception) and len(text.args) == 1 else text
+    return message.with_words(words) if isinstance(message, Message) else str(text)
 
 
 def with_names(text: object, names: Mapping[str, str]) -> str:
     """The same with the names of cameras."""
-    said = text.args[0] if isinstance(text, Exception) and len(text.args) == 1 else text
-    return said.with_names(names) if isinstance(said, Message) else str(text)
+    message = text.args[0] if isinstance(text, Exception) and len(text.args) == 1 else text
+    return message.with_names(names) if isinstance(message, Message) else str(text)
 
 
 class _Form(Formatter):
@@ -111,8 +111,8 @@ class _Form(Formatter):
         if format_spec == "pairs":
             return ", ".join(f"{self._name(i)}-{self._name(j)}" for i, j in value)
         if "|" in format_spec:
-            one, many = format_spec.split("|")
-            return (one if value == 1 else many).replace("#", f"{value:g}")
+            singular, plural = format_spec.split("|")
+            return (singular if value == 1 else plural).replace("#", f"{value:g}")
         return str(super().format_field(value, format_spec))
 
     def _name(self, camera: object) -> str:

@@ -69,10 +69,10 @@ def real_eigenvalues(matrix: Tensor) -> Tensor:
 
 def _even(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Matrices whose largest entry is 1, and its size ``(..., 1)``; entries that are not finite are 0."""
-    known = torch.where(matrix.isfinite(), matrix, 0.0)
-    size = known.detach().abs().amax((-2, -1), keepdim=True)
+    finite = torch.where(matrix.isfinite(), matrix, 0.0)
+    size = finite.detach().abs().amax((-2, -1), keepdim=True)
     size = torch.where(size > 0, size, 1.0)
-    return known / size, size[..., 0]
+    return finite / size, size[..., 0]
 
 
 def by_eigh(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -150,8 +150,8 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
     if gram.shape[-2] != size:
         raise ValueError(f"gram must be square (*batch, D, D), got {tuple(gram.shape)}; null_space takes rows")
     if gram.device.type == "mps":  # no float64
-        found = gram_null_space(gram.cpu(), dim)
-        return GramNullSpace(*(part.to(gram.device) for part in vars(found).values()))
+        space = gram_null_space(gram.cpu(), dim)
+        return GramNullSpace(*(part.to(gram.device) for part in vars(space).values()))
     basis, residual, competing, degenerate = NullSpaceOfGrams.apply(_flat(gram), dim, _of_grams)  # type: ignore[no-untyped-call]
     batch = gram.shape[:-2]
     return GramNullSpace(
@@ -171,15 +171,15 @@ def _flat(matrix: Tensor) -> Tensor:
     return matrix.reshape(prod(matrix.shape[:-2]), *matrix.shape[-2:])
 
 
-def _few(gram: Tensor) -> bool:
+def _is_small(gram: Tensor) -> bool:
     return on_host(gram) and gram.numel() <= FEW
 
 
 def _of_grams(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Basis, residual, competing and degenerate of all problems, in the dtype of the Grams."""
-    found = map_blocks(lambda block: _solve_gram(block.double(), dim), gram, size=block_size(gram))
-    basis, residual, competing = (part.to(gram.dtype) for part in found[:3])
-    return basis, residual, competing, found[3]
+    parts = map_blocks(lambda block: _solve_gram(block.double(), dim), gram, size=block_size(gram))
+    basis, residual, competing = (part.to(gram.dtype) for part in parts[:3])
+    return basis, residual, competing, parts[3]
 
 
 def _of_rows(matrix: Tensor, dim: int, keep: bool) -> tuple[Tensor, Tensor]:
@@ -205,16 +205,16 @@ def _solve_gram(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]
     scaled, scale, finite = unit_trace(gram)
     host = on_host(gram)
     squaring = host and dim == 1 < gram.shape[-1] <= SMALL
-    if dim == gram.shape[-1] or (_few(gram) and not (squaring and gram.numel() > FEWER)):
+    if dim == gram.shape[-1] or (_is_small(gram) and not (squaring and gram.numel() > FEWER)):
         vectors, values, competing, degenerate = by_eigh(scaled, dim)
     else:
         if squaring:
             vectors, values, competing, certified = by_squaring(scaled)
             degenerate = ~certified
         else:
-            found = by_inverse_iteration(scaled, dim)
-            vectors, values, competing = found.vectors, found.values, competing_sum(found.factor, found.vectors)
-            degenerate = ~found.certified | (found.competing <= (RESOLVED if host else NULL))
+            space = by_inverse_iteration(scaled, dim)
+            vectors, values, competing = space.vectors, space.values, competing_sum(space.factor, space.vectors)
+            degenerate = ~space.certified | (space.competing <= (RESOLVED if host else NULL))
         hard = degenerate.nonzero()[:, 0] if host else degenerate[:0]
         if len(hard):
             vectors[hard], values[hard], competing[hard], degenerate[hard] = by_eigh(scaled[hard], dim)
@@ -227,20 +227,20 @@ def _solve_rows(matrix: Tensor, gram: Tensor, dim: int) -> Tensor:
     scaled, scale, finite = unit_trace(gram)
     if dim == matrix.shape[-1]:
         return torch.where(finite[:, None, None], by_eigh(scaled, dim)[0], 0.0)
-    if _few(gram):
+    if _is_small(gram):
         values, vectors = eigh(scaled)
         return _with_svd(matrix, vectors[..., :dim].contiguous(), ~finite | (values[:, dim] < ACCURATE))
-    found = by_inverse_iteration(scaled, dim)
-    vectors = found.vectors
+    space = by_inverse_iteration(scaled, dim)
+    vectors = space.vectors
     if not on_host(matrix):
-        return torch.where(finite[:, None, None], _correct_by_newton(matrix, scale, vectors, found.deflated), 0.0)
-    slow = (finite & ~found.certified & (found.competing > ACCURATE)).nonzero()[:, 0]
+        return torch.where(finite[:, None, None], _correct_by_newton(matrix, scale, vectors, space.deflated), 0.0)
+    slow = (finite & ~space.certified & (space.competing > ACCURATE)).nonzero()[:, 0]
     if len(slow):
         vectors[slow] = by_eigh(scaled[slow], dim)[0]
-    inexact = (finite & found.certified & (found.competing <= ACCURATE) & (found.competing > RESOLVED)).nonzero()[:, 0]
+    inexact = (finite & space.certified & (space.competing <= ACCURATE) & (space.competing > RESOLVED)).nonzero()[:, 0]
     if len(inexact):
-        vectors[inexact] = _correct_by_newton(matrix[inexact], scale[inexact], vectors[inexact], found.deflated[inexact])
-    return _with_svd(matrix, vectors, ~(finite & (found.competing > torch.where(found.certified, RESOLVED, ACCURATE))))
+        vectors[inexact] = _correct_by_newton(matrix[inexact], scale[inexact], vectors[inexact], space.deflated[inexact])
+    return _with_svd(matrix, vectors, ~(finite & (space.competing > torch.where(space.certified, RESOLVED, ACCURATE))))
 
 
 def _correct_by_newton(matrix: Tensor, scale: Tensor, vectors: Tensor, deflated: Tensor) -> Tensor:
@@ -308,8 +308,8 @@ def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
     for j in range(vectors.shape[-1]):
         factor = _regularized_factor(add_to_diagonal(deflated.clone(), gram.shape[-1] * EPS - values[:, j, None]))
         columns.append(solve(gradient[..., j : j + 1], factor))
-    found = torch.cat(columns, dim=-1)
-    return found - vectors @ (vectors.mT @ found)
+    solution = torch.cat(columns, dim=-1)
+    return solution - vectors @ (vectors.mT @ solution)
 
 
 def eigenspace_derivative(gram: Tensor, vectors: Tensor, image: Tensor) -> Tensor:
@@ -327,9 +327,9 @@ def eigenspace_derivative(gram: Tensor, vectors: Tensor, image: Tensor) -> Tenso
     within = torch.eye(dim, dtype=gram.dtype, device=gram.device)
     operator = torch.einsum("...ij,kl->...ikjl", deflated, within) - torch.einsum("ij,...lk->...ikjl", eye, small)
     flat = operator.flatten(-4, -3).flatten(-2, -1)
-    found = torch.linalg.solve_ex(flat, right.flatten(-2)[..., None])[0][..., 0].unflatten(-1, (size, dim))
-    found = torch.where(usable, found, 0.0) * -scale
-    return found - vectors @ (vectors.mT @ found)
+    change = torch.linalg.solve_ex(flat, right.flatten(-2)[..., None])[0][..., 0].unflatten(-1, (size, dim))
+    change = torch.where(usable, change, 0.0) * -scale
+    return change - vectors @ (vectors.mT @ change)
 
 
 def gram_gradient(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:

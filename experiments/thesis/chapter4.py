@@ -173,7 +173,7 @@ def any_projection() -> Finding:
     for k, target in ((2, 1), (3, 2), (4, 2), (4, 3)):
         draw = seeded(40 + 10 * k + target)
         invariant = dyn.LiftedShapeTensor(k, target)
-        n, views = invariant.least, dyn.LiftedShapeTensor(k, target, points=invariant.least).minimal()
+        n, views = invariant.min_points, dyn.LiftedShapeTensor(k, target, points=invariant.min_points).minimal()
         P = normal(n, k + 1, draw=draw)
         images = torch.stack([inhomogeneous(P @ M.mT) for M in normal(views + 3, target + 1, k + 1, draw=draw)])
         other = torch.stack([inhomogeneous(normal(n, k + 1, draw=draw) @ M.mT) for M in normal(3, target + 1, k + 1, draw=draw)])

@@ -220,7 +220,7 @@ def _count_matches(profile: tuple[int, ...], sensor: int, lifts: tuple[tuple[tup
         cameras = [field.product(field.random(sensor + 1, len(lift)), lift) for lift in known]
         views = Views(field, k, (sensor,) * len(profile), profile, cameras)
         while True:
-            yield views.fixed(field.random(k + 1)[None])
+            yield views.static_rows(field.random(k + 1)[None])
 
     least = tensor.minimal()
     found = counting.count(points, matches=least + SPARE)

@@ -46,7 +46,7 @@ TABLES = [
     (grassmann._insertions, (4, 2, CPU)),
     (grassmann_nearest._determinant_rows, ((2, 1, 1), (3, 3, 3), CPU)),
     (grassmann_recovery.tables, ((2, 1, 1), (3, 3, 3), 2, CPU)),
-    (plane._moving_minors, (3, 2, CPU)),
+    (plane._linear_minor_tables, (3, 2, CPU)),
     (base.triangle, (4, CPU)),
     (base._above_the_diagonal, (CPU,)),
     (matrix._unpacking, ((3, 3), CPU)),

@@ -79,7 +79,7 @@ def test_pieces_for_memory_change_nothing(monkeypatch):
 
 def test_transforms_have_good_lengths():
     for least in (1, 2, 7, 11, 97, 1801, 2701, 3599, 4097, 10_007):
-        length = rest = correlation._good(least)
+        length = rest = correlation._fft_length(least)
         for prime in (2, 3, 5):
             while rest % prime == 0:
                 rest //= prime
