@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from indexing.phase.indexer import PhaseIndexer as PhaseIndexer
     from indexing.phase.model import PhaseOptions as PhaseOptions
     from indexing.scoring import Event as Event
-    from indexing.sync.options import SyncOptions as SyncOptions
+    from indexing.sync.recordings import SyncOptions as SyncOptions
     from indexing.sync.synchronize import synchronize as synchronize
 
 _HOME = {
@@ -48,7 +48,7 @@ _HOME = {
     "ArchiveOptions": "indexing.archive.writer",
     "BrightnessOptions": "indexing.brightness.descriptors",
     "PhaseOptions": "indexing.phase.model",
-    "SyncOptions": "indexing.sync.options",
+    "SyncOptions": "indexing.sync.recordings",
 }
 __all__ = sorted(_HOME)
 

@@ -69,6 +69,21 @@ def replacing(path: str | Path) -> Iterator[IO[bytes]]:
         raise
 
 
+@contextlib.contextmanager
+def replacing_folder(target: Path) -> Iterator[Path]:
+    """A folder to fill that appears whole or not at all: under a temporary name beside it, then in the place of an older one."""
+    recover_folder(target)
+    building = target.with_name(f".{target.name}-{secrets.token_hex(8)}.tmp")
+    try:
+        building.mkdir(parents=True)
+        yield building
+        replace_folder(building, target)
+    except OSError as error:
+        raise _unwritten(target, error) from error
+    finally:
+        shutil.rmtree(building, ignore_errors=True)
+
+
 def replace_folder(building: Path, target: Path) -> None:
     """Put a finished folder in the place of another one, of this file system."""
     old = target.with_name(f".{target.name}-{secrets.token_hex(8)}.old")

@@ -26,7 +26,7 @@ import dyntorch as dyn
 from dyntorch import metrics
 from experiments.common.tables import Row, command, measured_on_one_thread, note
 from experiments.recognition.protocol import data_folder
-from indexing.actors.sheets import RenderedVideo, render, sheet
+from indexing.actors.textured import RenderedVideo, render, sheet
 from indexing.video import Chunk, SceneTracks, track_scene
 from indexing.video.scene import SCENE_FOLLOWING, THRESHOLD
 

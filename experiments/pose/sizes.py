@@ -24,10 +24,9 @@ from experiments.recognition.protocol import Array
 from indexing import Clip
 from indexing.files import manifest, prepare, write_json
 from indexing.pose import PoseOptions
-from indexing.pose.blazepose import JOINTS
+from indexing.pose.blazepose import JOINTS, VideoPicture
 from indexing.pose.models import load_models
 from indexing.pose.networks import LiteNetworks
-from indexing.pose.regions import VideoPicture
 from indexing.pose.tracking import Tracker
 from indexing.video.reading import av, read_video
 

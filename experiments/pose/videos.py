@@ -35,12 +35,11 @@ from experiments.common.tables import Row, command, measured_on_one_thread
 from experiments.recognition.protocol import Array, data_folder
 from indexing import ActionIndexer, Clip
 from indexing.pose import PoseOptions, detect
-from indexing.pose.blazepose import JOINTS, PICTURE, REGION
+from indexing.pose.blazepose import JOINTS, PICTURE, REGION, VideoPicture
 from indexing.pose.chunks import plan, work
 from indexing.pose.detection import in_view
 from indexing.pose.models import load_models
 from indexing.pose.networks import LiteNetworks
-from indexing.pose.regions import VideoPicture
 from indexing.pose.tracking import Tracker
 from indexing.sync.synchronize import synchronize
 from indexing.video.reading import av

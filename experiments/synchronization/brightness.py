@@ -35,7 +35,7 @@ from indexing.actors.textured import Frames, film
 from indexing.skeleton import Skeleton
 from indexing.sync.brightness import brightness_shift
 from indexing.sync.brightness_features import motion
-from indexing.sync.options import Measure
+from indexing.sync.recordings import Measure
 
 FPS = 30.0
 EARLIER = 0.4  # of a take, at most, between the starts

@@ -1,7 +1,7 @@
 """Cameras calibrated from the people in view: recordings in, cameras on one clock and the movement in 3D out.
 
 ``pipeline`` holds :func:`calibrate` and its steps in order; ``camera_views`` brings recordings to the same joints on even grids,
-``body_height`` turns a person's height into a length between joints, ``priors`` reads what is given of lenses and clocks,
+``priors`` reads what is given of lenses and clocks, and turns a person's height into a length between joints,
 ``people`` identifies people across cameras, ``left_right`` mends exchanged sides; ``rig`` is the result (:class:`CameraRig`)
 and the files that other programs read.
 """

@@ -18,6 +18,7 @@ from indexing.opening import listing
 from indexing.remarks import is_normalized, remarks_on, same_clips
 from indexing.skeleton import Skeleton, usual_layout
 from indexing.sync.recordings import Take
+from indexing.video.reading import probe
 
 FloatArray = NDArray[np.float64]
 Size = tuple[int, int]
@@ -157,14 +158,13 @@ def to_pixels(take: Take, size: Size | None) -> tuple[Take, Size]:
         raise ValueError(Message(text, name=take.name))
     if take.people and is_normalized(take.people[0]):
         scale_remarks = {str(note) for note in remarks_on(take.people[:1])}
-        people, everyone = (tuple(_scale_clip(clip, size) for clip in clips) for clips in (take.people, take.everyone))
+        people, everyone = (
+            tuple(clip.replace(joints=clip.joints * np.asarray(size, dtype=np.float64)) for clip in clips)
+            for clips in (take.people, take.everyone)
+        )
         notes = tuple(note for note in take.notes if str(note) not in scale_remarks and "from 0 to 1" not in str(note))
         take = dataclasses.replace(take, people=people, everyone=everyone, notes=notes)
     return take, size
-
-
-def _scale_clip(clip: Clip, size: Size) -> Clip:
-    return clip.replace(joints=clip.joints * np.asarray(size, dtype=np.float64))
 
 
 def _own_size(take: Take) -> Size | None:
@@ -174,8 +174,6 @@ def _own_size(take: Take) -> Size | None:
         if said is not None and np.shape(said) == (2,):
             return int(said[0]), int(said[1])
     if take.path is not None and (take.video is not None or take.kind == "video"):
-        from indexing.video import probe
-
         info = probe(take.path)
         return info.width, info.height
     return None

@@ -7,17 +7,15 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
-from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 
-from dyntorch import Status
+from dyntorch import Calibration, Status
 from dyntorch.core import Notice, NoticeCode, Outcome, status_from
+from dyntorch.geometry import undistort
 from indexing.joints import canonical
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -38,21 +36,6 @@ LIMB_COST = 1.0  # nats per second of a limb whose state differs from that of th
 SWITCH_COST = 4.0  # nats of a change in one camera: keeps single frames from flickering
 MAX_FRAME_DISTANCE = 0.6  # frames from a moment within which a camera's frame stands for it
 MIN_TIE_SECONDS = 0.2  # from which on a tie is reported
-
-
-class KnownCameras(Protocol):
-    """What is known of the cameras: :class:`dyntorch.Calibration` is one."""
-
-    @property
-    def K(self) -> Tensor: ...
-    @property
-    def R(self) -> Tensor: ...
-    @property
-    def t(self) -> Tensor: ...
-    @property
-    def distortion(self) -> Tensor: ...
-    @property
-    def clocks(self) -> Any: ...
 
 
 class SideNotice(NoticeCode):
@@ -88,7 +71,7 @@ class SideCorrection(Outcome):
     """Left and right, as all cameras together see them."""
 
     tracks: tuple[Floats, ...]  # per camera ``(frames, n, 2)`` px as given, with what was exchanged put right
-    weights: tuple[Floats, ...] | None  # per camera ``(frames, n)``, None where none were given
+    weights: tuple[Floats, ...]  # per camera ``(frames, n)``
     exchanged: tuple[Booleans, ...]  # per camera ``(frames, people, 3)`` bool of :data:`LIMBS`
     exchanges: tuple[SideExchange, ...]  # the same as stretches, by camera and time
 
@@ -107,23 +90,21 @@ class SideCorrection(Outcome):
 
 def correct_sides(
     tracks: Sequence[ArrayLike],
-    cameras: KnownCameras,
+    cameras: Calibration,
     joints: Sequence[str],
     *,
     times: Sequence[ArrayLike] | None = None,
-    fps: float | Sequence[float] = 30.0,
     weights: Sequence[ArrayLike] | None = None,
 ) -> SideCorrection:
     r"""Which cameras show left as right, when, and of which limb; and the tracks with that put right. tracks
-    ``(frames, n, 2)``, times ``(frames,)``, weights ``(frames, n)``."""
-    x, w, moments, people = _check_tracks(tracks, cameras, joints, times, fps, weights)
+    ``(frames, n, 2)``, times ``(frames,)`` (30 a second by default), weights ``(frames, n)``."""
+    x, w, moments, people = _check_tracks(tracks, cameras, joints, times, weights)
     pairs = paired_joints(joints)
     untouched = tuple(np.zeros((len(one), people, len(LIMBS)), dtype=bool) for one in x)
-    given = None if weights is None else tuple(w)
     if not any(pairs.values()) or len(x) < 3:
         notices = [Notice(SideNotice.TWO if any(pairs.values()) else SideNotice.SIDELESS)]
         return SideCorrection(
-            status=status_from(()), notices=tuple(notices), tracks=tuple(x), weights=given, exchanged=untouched, exchanges=()
+            status=status_from(()), notices=tuple(notices), tracks=tuple(x), weights=tuple(w), exchanged=untouched, exchanges=()
         )  # fmt: skip
     grid, positions, trust = _resample(x, w, moments, cameras)
     exchanges: list[SideExchange] = []
@@ -146,7 +127,7 @@ def correct_sides(
         status=status_from(()),
         notices=tuple(notices),
         tracks=tuple(mended),
-        weights=None if weights is None else tuple(trusted),
+        weights=tuple(trusted),
         exchanged=untouched,
         exchanges=tuple(exchanges),
     )
@@ -170,10 +151,9 @@ def paired_joints(joints: Sequence[str]) -> dict[str, list[tuple[int, int]]]:
 
 def _check_tracks(
     tracks: Sequence[ArrayLike],
-    cameras: KnownCameras,
+    cameras: Calibration,
     joints: Sequence[str],
     times: Sequence[ArrayLike] | None,
-    fps: float | Sequence[float],
     weights: Sequence[ArrayLike] | None,
 ) -> tuple[list[Floats], list[Floats], list[Floats], int]:
     count = len(cameras.K)
@@ -187,46 +167,33 @@ def _check_tracks(
                 f"tracks[{k}]: expected (frames, people * {len(joints)} joints, 2) with the same people in every camera, "
                 f"got {one.shape}"
             )
-    rates = [float(fps)] * count if isinstance(fps, (int, float)) else [float(one) for one in fps]
-    if len(rates) != count or not all(math.isfinite(one) and one > 0 for one in rates):
-        raise ValueError(f"fps: expected a positive number, or one for each of {count} cameras, got {fps!r}")
-    moments = [np.arange(len(one)) / rate for one, rate in zip(x, rates, strict=True)]
-    if times is not None:
-        moments = [np.asarray(one, dtype=np.float64) for one in times]
-    w: list[Floats] = [np.asarray(np.isfinite(one).all(2), dtype=np.float64) for one in x]
-    if weights is not None:
-        given = [np.asarray(one, dtype=np.float64) for one in weights]
-        for k, (one, own) in enumerate(zip(given, w, strict=True)):
-            if one.shape != own.shape:
-                raise ValueError(f"weights[{k}]: expected {own.shape} as the tracks have it, got {one.shape}")
-        trust = [np.nan_to_num(np.clip(one, 0.0, None)) for one in given]
-        w = [np.asarray(own * one, dtype=np.float64) for one, own in zip(trust, w, strict=True)]
+    moments = [np.asarray(one, dtype=np.float64) for one in times or (np.arange(len(one)) / 30.0 for one in x)]
+    w: list[Floats] = []
+    for k, (given, own) in enumerate(zip(weights or (np.ones(one.shape[:2]) for one in x), x, strict=True)):
+        trust: Floats = np.asarray(given, dtype=np.float64)
+        if trust.shape != own.shape[:2]:
+            raise ValueError(f"weights[{k}]: expected {own.shape[:2]} as the tracks have it, got {trust.shape}")
+        w.append(np.where(np.isfinite(own).all(2), np.nan_to_num(np.clip(trust, 0.0, None)), 0.0))
     for k, (one, own) in enumerate(zip(moments, x, strict=True)):
         if one.shape != (len(own),) or not (np.diff(one) > 0).all():
             raise ValueError(f"times[{k}]: expected {len(own)} increasing seconds, got shape {one.shape}; give one for each frame")
     return x, w, moments, int(x[0].shape[1] // len(joints))
 
 
-def _clock(cameras: KnownCameras, camera: int) -> tuple[float, float]:
+def _clock(cameras: Calibration, camera: int) -> tuple[float, float]:
     """Offset and rate of a camera's clock."""
     return float(cameras.clocks.offsets[camera]), float(cameras.clocks.rates[camera])
 
 
-def _projections(cameras: KnownCameras) -> Floats:
+def _projections(cameras: Calibration) -> Floats:
     """``(c, 3, 4)`` of undistorted pixels."""
-    import torch
-
     return np.asarray((cameras.K @ torch.cat([cameras.R, cameras.t[..., None]], dim=-1)).numpy(), dtype=np.float64)
 
 
 def _resample(
-    x: Sequence[Floats], w: Sequence[Floats], moments: Sequence[Floats], cameras: KnownCameras
+    x: Sequence[Floats], w: Sequence[Floats], moments: Sequence[Floats], cameras: Calibration
 ) -> tuple[Floats, Floats, Floats]:
     """Common moments ``(T,)``, undistorted positions ``(T, c, n, 2)`` px and trust ``(T, c, n)`` there, by the nearest frames."""
-    import torch
-
-    from dyntorch.geometry import undistort
-
     common = [(one - _clock(cameras, k)[0]) / _clock(cameras, k)[1] for k, one in enumerate(moments)]
     steps = [float(np.median(np.diff(one))) for one in common if len(one) > 1]
     step = min(steps) if steps else 1.0

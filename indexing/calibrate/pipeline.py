@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
+import dyntorch
 from dyntorch import CalibrateOptions, Calibration, Clocks
 from dyntorch.numerics import Message, as_python
-from indexing.calibrate.body_height import Stature, scale_to_metres, standing_extent
 from indexing.calibrate.camera_views import (
     Joints,
     Size,
@@ -26,7 +26,7 @@ from indexing.calibrate.camera_views import (
 )
 from indexing.calibrate.left_right import SideExchange, correct_sides
 from indexing.calibrate.people import Association, associate
-from indexing.calibrate.priors import KnownLenses, given_clocks, known_lenses
+from indexing.calibrate.priors import KnownLenses, given_clocks, known_lenses, scale_to_metres, standing_extent
 from indexing.calibrate.rig import CameraRig
 from indexing.clip import Clip
 from indexing.joints import canonical
@@ -100,7 +100,7 @@ def calibrate(
         calibration: path of a calibration file: matrix and distortions of each camera, held.
         exif: focal lengths by the 35 mm equivalent that phones write into their files.
         height: metres, of the person standing (of several, the tallest): fixes the scale, by the joints' share of it
-            (:mod:`~indexing.calibrate.body_height`).
+            (:mod:`~indexing.calibrate.priors`).
         lengths: ``{("left_hip", "left_knee"): 0.43}``, metres, of the first person: fix the scale as well.
         clocks: ``"known"`` where frames of equal times were taken at once; the path of a ``sync.json``, whose clocks are held;
             or what :func:`dyntorch.calibrate` takes.
@@ -190,8 +190,9 @@ def calibrate_recordings(
     if known.height is not None and known.lengths:
         raise ValueError(Message("{arg:height} and {arg:length} both fix the scale; give one of them"))
     joints = select_common_joints([take.people[0] for take in takes], [take.name for take in takes])
-    stature = None if known.height is None else _body_height(joints, known.height)
-    lengths = _lengths(joints, known.named_lengths)
+    names = () if joints.skeleton is None else joints.skeleton.joints
+    stature = None if known.height is None else standing_extent(names, known.height)
+    lengths = _lengths(names, known.named_lengths)
     clocks = given_clocks(known.clocks, [take.name for take in takes])
     # 3. who is who
     clips, identities = _identify_people(takes, clocks, people)
@@ -213,7 +214,7 @@ def calibrate_recordings(
         remarks += _side_notes(views, exchanges)
     # 6. the scale
     if stature is not None and len(calibration.points):
-        calibration, stature = scale_to_metres(calibration, stature, joints.skeleton.joints if joints.skeleton else ())
+        calibration, stature = scale_to_metres(calibration, stature, names)
         remarks += [NO_STATURE] if stature is None else []
     remarks += [str(note) for note in getattr(identities, "notes", ())]
     return CameraRig(calibration, views, joints, lenses, stature, known.named_lengths, identities, exchanges, tuple(remarks), words)
@@ -243,14 +244,8 @@ def sizes_of(sizes: Any, cameras: int) -> list[Size | None]:
     return out * (cameras if len(out) == 1 else 1)
 
 
-def _body_height(joints: Joints, height: float) -> Stature:
-    names = () if joints.skeleton is None else joints.skeleton.joints
-    return standing_extent(names, height)
-
-
-def _lengths(joints: Joints, lengths: Mapping[tuple[str, str], float]) -> dict[tuple[int, int], float]:
+def _lengths(names: Sequence[str], lengths: Mapping[tuple[str, str], float]) -> dict[tuple[int, int], float]:
     """Known lengths by the numbers of their joints."""
-    names = () if joints.skeleton is None else joints.skeleton.joints
     index = {canonical(name): i for i, name in enumerate(names)}
     out = {}
     for ends, length in lengths.items():
@@ -307,7 +302,7 @@ def _correct_sides(views: list[View], found: Calibration, joints: Joints) -> tup
         times=[view.times for view in views],
         weights=[trust.numpy() for _, trust in tables],
     )
-    if not corrected.exchanges or corrected.weights is None:
+    if not corrected.exchanges:
         return views, ()
     parts = zip(views, corrected.tracks, corrected.weights, joints.places, strict=True)
     return [view.with_joints(tracks, trust, places) for view, tracks, trust, places in parts], corrected.exchanges
@@ -337,8 +332,6 @@ def _calibrate_cameras(
     options: CalibrateOptions | None,
 ) -> Calibration:
     """The library's calibration, on the seconds of the files."""
-    import dyntorch
-
     seen = [view.table(places) for view, places in zip(views, joints.places, strict=True)]
     try:
         return dyntorch.calibrate(

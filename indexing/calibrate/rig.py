@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import json
 import re
-import secrets
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,13 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.numerics import as_python, with_words
-from indexing.calibrate.body_height import Stature
 from indexing.calibrate.camera_views import Joints, View
-from indexing.calibrate.priors import KnownLenses
+from indexing.calibrate.priors import KnownLenses, Stature
 from indexing.clip import Clip, ClipSet
-from indexing.files import recover_folder, replace_folder, write_text
+from indexing.files import replacing_folder, write_text
 from indexing.opening import count
-from indexing.sync.files import Plan, openpose_files, plan, renumber
+from indexing.sync.files import Plan, keypoint_table, openpose_frame, plan, renumber, source_files
 
 if TYPE_CHECKING:
     from dyntorch import Calibration
@@ -279,63 +277,31 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 
 def write_associated(folder: Path, rig: CameraRig) -> dict[str, dict[str, Any]]:
     """Write ``pose-associated/<camera>_json/`` for every camera: all of them, or nothing."""
-    target = folder / ASSOCIATED
-    recover_folder(target)
-    building = folder / f".{ASSOCIATED}-{secrets.token_hex(8)}.tmp"
     clocks = rig.calibration.clocks
-    done: dict[str, dict[str, Any]] = {}
-    try:
+    entries: dict[str, dict[str, Any]] = {}
+    with replacing_folder(folder / ASSOCIATED) as building:
         for i, view in enumerate(rig.views):
-            one = plan(view.take, float(clocks.offsets[i]), float(clocks.rates[i]), rig.views[0].take.fps)
+            matched = plan(view.take, float(clocks.offsets[i]), float(clocks.rates[i]), rig.views[0].take.fps)
             name = f"{view.name}_json"
-            if len(one.rows):
-                _write_camera(building / name, view, one)
-            done[view.name] = {
-                "folder": f"{ASSOCIATED}/{name}",
-                "files": len(one.numbers),
-                "rest": one.rest,
-                "left_out": one.before,
-            }
-        replace_folder(building, target)
-    except OSError as problem:
-        raise ValueError(
-            f"cannot write {str(target)!r} ({problem.strerror or problem}); free the name or the disk, or choose another folder"
-        ) from problem
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
-    return done
+            if len(matched.rows):
+                _write_camera(building / name, view, matched)
+            entries[view.name] = {
+                "folder": f"{ASSOCIATED}/{name}", "files": len(matched.numbers), "rest": matched.rest, "left_out": matched.before,
+            }  # fmt: skip
+    return entries
 
 
-def _write_camera(folder: Path, view: View, one: Plan) -> None:
-    folder.mkdir(parents=True)
-    texts = _frames(view)
-    sources = openpose_files(one.take.path)
-    by_row = {}
-    if sources:
-        by_number = {int(np.rint(time * one.take.fps)): row for row, time in enumerate(one.take.times)}
-        by_row = {by_number[number]: path.name for number, path in sources.items() if number in by_number}
-    for number, row in zip(one.numbers.tolist(), one.rows.tolist(), strict=True):
-        name = renumber(by_row[row], number) if row in by_row else f"{view.name}_{number:06d}.json"
-        (folder / name).write_text(texts[row], encoding="utf-8")
-
-
-def _frames(view: View) -> list[str]:
-    """One text per frame of the recording, all people in each."""
-    times = view.take.times
+def _write_camera(folder: Path, view: View, matched: Plan) -> None:
+    folder.mkdir()
+    times, sources = view.take.times, source_files(view.take)
     joints = next(clip.joints.shape[1] for clip in view.people if clip is not None)
     tables = np.zeros((len(times), len(view.people), joints, 3))
     for who, clip in enumerate(view.people):
         if clip is not None:
-            rows, seen = np.searchsorted(times, clip.times), clip.seen
-            trust = seen.astype(np.float64) if clip.confidence is None else np.asarray(clip.confidence, dtype=np.float64)
-            tables[rows, who] = np.where(seen[..., None], np.concatenate([clip.joints, trust[..., None]], axis=2), 0.0)
-    return [
-        json.dumps({
-            "version": 1.3,
-            "people": [{"person_id": [who], "pose_keypoints_2d": flat.ravel().tolist()} for who, flat in enumerate(frame)],
-        })
-        for frame in tables
-    ]  # fmt: skip
+            tables[np.searchsorted(times, clip.times), who] = keypoint_table(clip)
+    for number, row in zip(matched.numbers.tolist(), matched.rows.tolist(), strict=True):
+        name = renumber(sources[row].name, number) if row in sources else f"{view.name}_{number:06d}.json"
+        (folder / name).write_text(openpose_frame(list(enumerate(tables[row]))), encoding="utf-8")
 
 
 def drop_associated(folder: Path) -> None:

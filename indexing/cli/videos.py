@@ -17,7 +17,7 @@ from indexing.cli.console import check_folder, count, counting_bar, names
 from indexing.cli.flags.shared import Example, Pixels, Reading, Watched, Watching
 from indexing.cli.protocol import choose
 from indexing.pose import models
-from indexing.pose.detection import NobodyInVideo, VideoTask, made_by, workers_here
+from indexing.pose.detection import NobodyInVideo, VideoTask, workers_here
 from indexing.pose.writing import KeypointFile, kept_file, keypoint_files
 from indexing.readers.files import VIDEOS, WatchOptions
 from indexing.readers.formats.clipset import Film, FilmSet, holds_frames, read_film_set
@@ -105,7 +105,7 @@ def _detect(
     for folder, some in folders.items():
         tasks = [VideoTask(video.expanduser(), footage.people, footage.every, fps, model.name) for video in some]
         with counting_bar(f"finding people in {count(len(some), 'video')}", "frames/s") as bar:
-            made = list(keypoint_files(tasks, folder, made_by(model), workers_here(), bar, json=False))
+            made = list(keypoint_files(tasks, folder, model, workers_here(), bar, json=False))
         for video, (_, one) in zip(some, made, strict=True):
             if not isinstance(one, KeypointFile | NobodyInVideo):
                 raise one

@@ -1,8 +1,8 @@
 """COLMAP without masks: which matches of its database stand still.
 
 ``database`` reads it and writes the copy, ``pair_segmentation`` divides each pair of images into bodies and lets COLMAP verify,
-``voting`` decides over all pairs which bodies are static, ``static`` holds :func:`find_static` and its stages in order, ``masks``
-draws what moves.
+``voting`` decides over all pairs which bodies are static, ``static`` holds :func:`find_static` and its stages in order, and draws
+masks around what moves.
 """
 
 from __future__ import annotations

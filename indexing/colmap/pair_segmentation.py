@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+import dyntorch as dyn
 from indexing.colmap.database import DatabaseImage, DatabasePair, MatchDatabase, PairGeometry
 from indexing.opening import clip_text, error
 
@@ -62,12 +65,7 @@ class SeenImage:
     points: FloatArray
 
 
-def prepare_images(database: MatchDatabase) -> list[SeenImage]:
-    """The images of a database."""
-    return [_prepare_image(database, image) for image in database.images]
-
-
-def _prepare_image(database: MatchDatabase, image: DatabaseImage) -> SeenImage:
+def prepare_image(database: MatchDatabase, image: DatabaseImage) -> SeenImage:
     known, module = image.camera, colmap()
     who = f"the camera of image {clip_text(image.name)}"
     try:
@@ -118,7 +116,7 @@ def left_open(pair: DatabasePair) -> PairBodies:
 @dataclass(frozen=True, eq=False)
 class PairTask:
     """A pair to divide: matches ``(m, 2)`` in both images, the rows of those that are divided, arguments of
-    :func:`dyntorch.segment`, and how many matches beside them label the others."""
+    :func:`dyntorch.segment`."""
 
     x1: FloatArray
     x2: FloatArray
@@ -126,7 +124,6 @@ class PairTask:
     threshold: float | None
     spatial: bool
     seed: int
-    beside: int
 
 
 def task(
@@ -136,15 +133,11 @@ def task(
     x1, x2 = images[pair.first].points[pair.matches[:, 0]], images[pair.second].points[pair.matches[:, 1]]
     draw = np.random.default_rng([seed, pair.first, pair.second])
     rows = np.sort(draw.permutation(len(x1))[: options.max_matches])
-    return PairTask(x1, x2, rows, threshold, spatial, int(draw.integers(2**31)), NUM_NEIGHBOURS)
+    return PairTask(x1, x2, rows, threshold, spatial, int(draw.integers(2**31)))
 
 
 def divide(task: PairTask) -> PairBodies:
     """The bodies of a pair, by :func:`dyntorch.segment`."""
-    import torch
-
-    import dyntorch as dyn
-
     x1, x2, rows = torch.from_numpy(task.x1), torch.from_numpy(task.x2), torch.from_numpy(task.rows)
     generator = torch.Generator().manual_seed(task.seed)
     found = dyn.segment(x1[rows], x2[rows], threshold=task.threshold, spatial=task.spatial, generator=generator)
@@ -158,12 +151,10 @@ def divide(task: PairTask) -> PairBodies:
 
 def _assign_others(task: PairTask, labels: IntArray, distances: FloatArray, threshold: float) -> IntArray:
     """The labels with those of the matches that were not divided: of the body of most matches beside them, if its motion agrees."""
-    from scipy.spatial import cKDTree
-
     places = np.concatenate([task.x1, task.x2], axis=1)
     rest = np.isfinite(places).all(axis=1) & ~np.isin(np.arange(len(labels)), task.rows)
     known = np.flatnonzero(labels > 0)
-    near = min(task.beside, len(known))
+    near = min(NUM_NEIGHBOURS, len(known))
     if not rest.any() or not near:
         return labels
     _, found = cKDTree(places[known]).query(places[rest], k=[*range(1, near + 1)])

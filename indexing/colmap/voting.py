@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -63,7 +65,7 @@ def vote(pairs: Sequence[DividedPair], cells: IntArray, image: IntArray) -> Vote
     lead, undecided = np.inf, list[int]()
     tried = np.zeros(len(pairs), dtype=bool)
     while True:
-        seeds = graph.seeds(signs, tried, NUM_SEED_PAIRS)
+        seeds = graph.seeds(signs, tried)
         if not len(seeds):
             break
         best, ahead = _answer(graph, seeds, signs)
@@ -89,7 +91,7 @@ def _answer(graph: _Graph, seeds: IntArray, signs: IntArray) -> tuple[IntArray, 
         found.append((float(graph.spread(static).sum()), mine, static))
     found.sort(key=lambda answer: -answer[0])
     spread, best, static = found[0]
-    others = [other for other, _, also in found[1:] if _overlap_share(static, also) < graph.alike]
+    others = [other for other, _, also in found[1:] if _overlap_share(static, also) < DUPLICATE_OVERLAP]
     before = float(graph.spread(graph.voted(signs) > 0).sum())  # of parts of the graph that were decided earlier
     return best, (spread - before) / max(max(others, default=0.0) - before, 1e-9) if others else np.inf
 
@@ -103,10 +105,8 @@ class _Graph:
     """Bodies of pairs (nodes) and the keypoints that they hold."""
 
     def __init__(self, pairs: Sequence[DividedPair], cells: IntArray, image: IntArray) -> None:
-        from scipy.sparse import coo_array
-
         bodies = [pair.bodies for pair in pairs]
-        self.nodes, self.alike = sum(bodies), DUPLICATE_OVERLAP
+        self.nodes = sum(bodies)
         self.pair = np.repeat(np.arange(len(pairs)), bodies)
         self.weights = np.repeat([SINGLE_BODY_WEIGHT if count == 1 else 1.0 for count in bodies], bodies)
         ends, nodes, links = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((2, 0), np.int64)]
@@ -150,7 +150,7 @@ class _Graph:
         """The images whose keypoints some bodies hold."""
         return [int(image) for image in np.unique(self.image[self.keypoint[nodes[self.node]]])]
 
-    def seeds(self, signs: IntArray, tried: NDArray[np.bool_], most: int) -> IntArray:
+    def seeds(self, signs: IntArray, tried: NDArray[np.bool_]) -> IntArray:
         """Bodies to start from: those of the largest pairs none of whose bodies has a sign, and of their part of the graph."""
         count = len(tried)
         signed = np.zeros(count, dtype=bool)
@@ -162,14 +162,11 @@ class _Graph:
         # of the part with the largest pair: elsewhere other bodies decide
         first = open_[np.argmax(sizes[open_])]
         open_ = open_[self.part[open_] == self.part[first]]
-        chosen = open_[np.argsort(-sizes[open_], kind="stable")][:most]
+        chosen = open_[np.argsort(-sizes[open_], kind="stable")][:NUM_SEED_PAIRS]
         return np.flatnonzero(np.isin(self.pair, chosen))
 
     def _parts(self, pairs: int) -> IntArray:
         """Connected parts of the graph, by pair: those that share keypoints."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
         keypoint = pairs + self.keypoint
         total = pairs + len(self.image)
         edges = coo_array((np.ones(len(keypoint)), (self.pair[self.node], keypoint)), shape=(total, total))

@@ -1,9 +1,8 @@
 """Videos to keypoints: people found and followed by BlazePose, offline and not smoothed.  Needs the extra ``pose`` and model files.
 
 The files are, in the order of the work: :mod:`~indexing.pose.models` (the model files, and how they are fetched),
-:mod:`~indexing.pose.networks` (their runtime), :mod:`~indexing.pose.blazepose` (what their numbers mean),
-:mod:`~indexing.pose.regions` (what is cut out of a picture), :mod:`~indexing.pose.tracking` (people from frame to frame),
-:mod:`~indexing.pose.chunks` (long videos), :mod:`~indexing.pose.reidentification` (who is who),
+:mod:`~indexing.pose.networks` (their runtime), :mod:`~indexing.pose.blazepose` (regions of a picture, and what the networks say of
+them), :mod:`~indexing.pose.tracking` (people from frame to frame, and who is who), :mod:`~indexing.pose.chunks` (long videos),
 :mod:`~indexing.pose.detection` (the verb) and :mod:`~indexing.pose.writing` (keypoint files).
 """
 

@@ -1,8 +1,8 @@
-"""What the numbers mean that BlazePose's two networks give: people in a picture, and the joints of one person.
+"""What BlazePose's two networks see and say: regions of a picture, people in it, and the joints of one person.
 
 The detector answers on a grid of anchors, of which each may give a box and four points; landmarks come as coordinates of a square
 region and as heatmaps, and the heatmaps refine the coordinates.  Coordinates here are parts of the picture or region, from 0 at its
-left or upper edge to 1 at the other.
+left or upper edge to 1 at the other; those of a whole video's picture are pixels as it is shown, from 0 to the width or height.
 
 Source: Bazarevsky et al., "BlazePose: On-device Real-time Body Pose tracking", 2020; the graphs of MediaPipe 0.10 (Apache-2.0) say
 how the outputs are read, and everything here is written from that description.
@@ -10,12 +10,17 @@ how the outputs are read, and everything here is written from that description.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
+
+from indexing.video.reading import Orientation, cv2, orientation
 
 Floats = NDArray[np.floating[Any]]
 
@@ -26,7 +31,6 @@ GRIDS = ((28, 2), (14, 2), (7, 6))  # cells per side, and anchors in each
 POINTS = 4  # of a detection: hips, circle about the body, shoulders, circle about the upper body
 LANDMARKS = 39  # 33 joints, two that say where the body is, four of the hands
 JOINTS, HIPS, CIRCLE = 33, 33, 34
-CLIPPED = 100.0  # of logits, before the exponential
 
 DUPLICATE_OVERLAP = 0.3  # of two boxes (intersection over union); MediaPipe's value
 HEATMAP_KERNEL = 7  # cells about a joint whose mean refines its place; MediaPipe's value
@@ -46,7 +50,7 @@ def anchors() -> Floats:
 
 def sigmoid(logits: Any) -> Floats:
     """Probabilities of logits."""
-    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(np.asarray(logits, dtype=np.float64), -CLIPPED, CLIPPED))))
+    return np.asarray(expit(np.asarray(logits, dtype=np.float64)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,3 +132,91 @@ def refine_by_heatmap(places: Floats, heatmap: Floats) -> Floats:
     weight = np.where(use, total, 1.0)
     moved = np.stack([(sure * x).sum(axis=(1, 2)) / weight / columns, (sure * y).sum(axis=(1, 2)) / weight / rows], axis=1)
     return np.asarray(np.where(use[:, None], moved, places))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Square regions of a picture, turned with the body: cut out as the networks want them, and what they say put back.
+
+
+Image = NDArray[np.uint8]
+
+MIN_REGION_SIDE = 12.0  # pixels in which nothing can be seen any more
+MAX_REGION_SIDE = 4.0  # longest sides of the picture
+
+
+@dataclass(frozen=True)
+class Region:
+    """A square: its centre and side in pixels, and by how much it is turned (radians, clockwise as seen)."""
+
+    x: float
+    y: float
+    side: float
+    turn: float = 0.0
+
+    def to_picture(self, places: Floats) -> Floats:
+        """``(..., 2)`` pixels of the picture, from parts of the region (0 to 1)."""
+        c, s = math.cos(self.turn), math.sin(self.turn)
+        return np.asarray((places - 0.5) * self.side @ np.array([[c, s], [-s, c]]) + [self.x, self.y])
+
+    def usable(self, width: int, height: int) -> bool:
+        """Whether anything can be seen in it: neither tiny nor huge, and its centre not far outside of the picture."""
+        if not all(map(math.isfinite, (self.x, self.y, self.side, self.turn))):
+            return False
+        reach = self.side / 2
+        near = -reach < self.x < width + reach and -reach < self.y < height + reach
+        return near and MIN_REGION_SIDE <= self.side <= MAX_REGION_SIDE * max(width, height)
+
+
+def about(centre: Floats, circle: Floats, expand: float) -> Region:
+    """The region about a body: its hips, and a point of the circle that holds it, which lies above the head of who stands
+    upright. centre, circle ``(2,)``."""
+    (x, y), (u, v) = centre.tolist(), circle.tolist()
+    return Region(x, y, 2 * expand * math.hypot(u - x, v - y), math.remainder(math.atan2(u - x, y - v), 2 * math.pi))
+
+
+class VideoPicture:
+    """One frame of a video, from which regions are cut; colours are converted once, and shrunk as far as a region allows."""
+
+    def __init__(self, frame: Any, size: tuple[int, int] | None = None, reformat: Callable[..., Any] | None = None) -> None:
+        self.upright: Orientation = orientation(frame)
+        self.stored = size or (frame.width, frame.height)
+        self.width, self.height = self.upright.size(*self.stored)
+        self._frame, self._reformat = frame, reformat or type(frame).reformat
+        self._levels: list[Image] = []
+
+    def level(self, shrunk: int) -> Image:
+        """RGB as stored, its sides halved so many times."""
+        if not self._levels:
+            self._levels = [self._reformat(self._frame, *self.stored, format="rgb24", interpolation="AREA").to_ndarray()]
+        while len(self._levels) <= shrunk:
+            last = self._levels[-1]
+            height, width = last.shape[0] // 2, last.shape[1] // 2
+            # of odd sides the last line is left out, so that places halve exactly
+            last = last[: 2 * height, : 2 * width]
+            self._levels.append(cv2().resize(last, (width, height), interpolation=cv2().INTER_AREA))
+        return self._levels[shrunk]
+
+    def cut(self, region: Region, side: int, fill: bool = False) -> Image:
+        """``(side, side, 3)`` the region, upright."""
+        scale = region.side / side
+        most = max(0, min(self.stored).bit_length() - 2)  # levels that have two pixels at least
+        shrunk = min(max(0, math.floor(math.log2(scale))), most) if scale > 1 else 0
+        mode = cv2().BORDER_CONSTANT if fill else cv2().BORDER_REPLICATE
+        flags = cv2().INTER_LINEAR | cv2().WARP_INVERSE_MAP
+        image = self.level(shrunk)
+        return np.asarray(cv2().warpAffine(image, self._map(region, side, shrunk), (side, side), flags=flags, borderMode=mode))
+
+    def _map(self, region: Region, side: int, shrunk: int) -> Floats:
+        """``(2, 3)`` from pixels of the region's image to those of a level, both counted from the middle of the first pixel."""
+        corners = region.to_picture(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+        corners = self._as_stored(corners)
+        axes = np.stack([corners[1] - corners[0], corners[2] - corners[0]], axis=1) / side
+        start = corners[0] + axes @ [0.5, 0.5]
+        return np.concatenate([axes, start[:, None]], axis=1) / 2**shrunk - [[0, 0, 0.5], [0, 0, 0.5]]
+
+    def _as_stored(self, places: Floats) -> Floats:
+        """Pixels as stored of pixels as shown."""
+        x, y = places.T
+        x = self.width - x if self.upright.flip_x else x
+        y = self.height - y if self.upright.flip_y else y
+        return np.stack([y, x] if self.upright.transpose else [x, y], axis=1)

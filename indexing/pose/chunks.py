@@ -7,7 +7,6 @@ number of workers there is, and however often the work was interrupted.
 from __future__ import annotations
 
 import hashlib
-import shutil
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -22,11 +21,9 @@ from numpy.typing import NDArray
 from indexing.clip import check_fps
 from indexing.files import prepare, replacing
 from indexing.opening import error, opened, size_of
-from indexing.pose.blazepose import JOINTS, Floats
+from indexing.pose.blazepose import JOINTS, Floats, VideoPicture
 from indexing.pose.networks import Networks
-from indexing.pose.regions import VideoPicture
-from indexing.pose.reidentification import Sightings
-from indexing.pose.tracking import PoseOptions, Sighting, Tracker
+from indexing.pose.tracking import PoseOptions, Sighting, Sightings, Tracker
 from indexing.readers.npz import NumpyArchive
 from indexing.video.reading import Video, VideoInfo, frame_times
 
@@ -224,8 +221,3 @@ class Store:
                 stream, times=seen.times, at=seen.at, tracks=seen.tracks, joints=seen.joints, confidence=seen.confidence,
                 crowd=seen.crowd, notes=np.array(seen.notes, dtype=np.str_),
             )  # fmt: skip
-
-
-def remove_chunks(folder: Path) -> None:
-    """Take a folder of finished pieces away."""
-    shutil.rmtree(folder, ignore_errors=True)

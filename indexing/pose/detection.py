@@ -2,7 +2,7 @@
 
 1. The file is looked at and cut into pieces (:mod:`indexing.pose.chunks`).
 2. Each piece is worked: people are found and followed from frame to frame (:mod:`indexing.pose.tracking`).
-3. Tracks of all pieces become people (:mod:`indexing.pose.reidentification`), and people clips.
+3. Tracks of all pieces become people (:mod:`indexing.pose.tracking`), and people clips.
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ from indexing.opening import count, error
 from indexing.pose.blazepose import JOINTS, Floats
 from indexing.pose.chunks import Piece, PieceLost, Stopped, Store, VideoPlan, plan, work
 from indexing.pose.models import ModelSet, load_models
-from indexing.pose.networks import LiteNetworks, NetworkMaker
-from indexing.pose.reidentification import Indices, Sightings, concatenate, identities, largest
-from indexing.pose.tracking import PoseOptions
+from indexing.pose.networks import LiteNetworks
+from indexing.pose.tracking import Indices, PoseOptions, Sightings, concatenate, identities, largest
 from indexing.readers.recording import MIN_CROWDED_SHARE, NobodySeen
 from indexing.skeleton import BLAZEPOSE33
 from indexing.video.reading import av, cv2
@@ -117,7 +116,7 @@ def detect(
     check(people, every, workers, fps)
     chosen = load_models(model, models)
     task = VideoTask(Path(path).expanduser(), people, every, fps, chosen.name, options or PoseOptions())
-    ((_, found),) = run([task], made_by(chosen), workers, as_frames(progress))
+    ((_, found),) = run([task], chosen, workers, as_frames(progress))
     if isinstance(found, ValueError):
         raise found
     return found.clips
@@ -162,7 +161,7 @@ class _Job:
 
 
 def run(
-    tasks: Sequence[VideoTask], networks: NetworkMaker, workers: int = 1, progress: FrameProgress | None = None
+    tasks: Sequence[VideoTask], models: ModelSet, workers: int = 1, progress: FrameProgress | None = None
 ) -> Iterator[tuple[VideoTask, Detected | ValueError]]:
     """Work on videos; each comes out as soon as it is done, in order, or with what is wrong with it."""
     av(), cv2()
@@ -181,7 +180,7 @@ def run(
         before = meter.of_thread()
         try:
             if not hasattr(own, "networks"):
-                own.networks = networks()
+                own.networks = LiteNetworks(models)
             seen = work(task, piece, own.networks, meter.add, lambda: halted.is_set() or job.problem is not None)
             if job.store is not None:
                 job.store.put(piece, seen)
@@ -301,11 +300,6 @@ def workers_here() -> int:
 def as_frames(progress: Progress | None) -> FrameProgress | None:
     """What is called with the share done, called with frames."""
     return None if progress is None else lambda done, total: progress(done / max(1, total))
-
-
-def made_by(models: ModelSet) -> NetworkMaker:
-    """What makes the networks of each thread."""
-    return lambda: LiteNetworks(models)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import os
 import struct
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -32,9 +32,6 @@ class Networks(Protocol):
 
     def landmarks(self, image: Image) -> tuple[Floats, float, Floats]:
         """``(39, 5)`` landmarks, the probability of a person, and ``(64, 64, 39)`` logits, of an RGB region ``(256, 256, 3)``."""
-
-
-NetworkMaker = Callable[[], Networks]
 
 
 class LiteNetworks:

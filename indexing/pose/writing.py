@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import secrets
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -15,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from indexing.clip import Clip, ClipSet
-from indexing.files import prepare, recover_folder, replace_folder
+from indexing.files import prepare, recover_folder, replacing_folder
 from indexing.opening import entries, error, is_regular, parse_json, read_text
 from indexing.pose.blazepose import Floats
-from indexing.pose.chunks import content_of, nearest, plan, remove_chunks
+from indexing.pose.chunks import content_of, nearest, plan
 from indexing.pose.detection import (
     Detected,
     FrameProgress,
@@ -28,13 +27,10 @@ from indexing.pose.detection import (
     VideoTask,
     as_frames,
     check,
-    made_by,
     run,
 )
-from indexing.pose.models import load_models
-from indexing.pose.networks import NetworkMaker
-from indexing.pose.reidentification import Indices
-from indexing.pose.tracking import PoseOptions
+from indexing.pose.models import ModelSet, load_models
+from indexing.pose.tracking import Indices, PoseOptions
 from indexing.readers.formats.clipset import read_clip_set
 from indexing.readers.npz import NumpyArchive
 
@@ -97,7 +93,7 @@ def keypoint_file(
     check(people, every, workers, fps)
     chosen = load_models(model, models)
     task = VideoTask(Path(video).expanduser(), people, every, fps, chosen.name, options or PoseOptions())
-    ((_, made),) = keypoint_files([task], Path(folder).expanduser(), made_by(chosen), workers, as_frames(progress), json, own)
+    ((_, made),) = keypoint_files([task], Path(folder).expanduser(), chosen, workers, as_frames(progress), json, own)
     if isinstance(made, ValueError):
         raise made
     return made
@@ -118,7 +114,7 @@ def kept_file(video: Path, folder: Path) -> Path | None:
 def keypoint_files(
     tasks: Sequence[VideoTask],
     folder: Path,
-    networks: NetworkMaker,
+    models: ModelSet,
     workers: int = 1,
     progress: FrameProgress | None = None,
     json: bool = True,
@@ -140,14 +136,14 @@ def keypoint_files(
     fresh = not folder.exists()
     if left:
         prepare(folder)
-    working = run(left, networks, workers, progress)
+    working = run(left, models, workers, progress)
     for number, (task, target) in enumerate(zip(tasks, targets, strict=True)):
         if number in there:
             yield task, there[number]
             continue
         same, found = next(working)
         if isinstance(found, NobodyInVideo):
-            remove_chunks(_parts(target))
+            shutil.rmtree(_parts(target), ignore_errors=True)
         made = found if isinstance(found, ValueError) else _write(same, found, target, json)
         with suppress(OSError):  # pieces that are kept for the next run stay
             _parts(target).rmdir()
@@ -214,7 +210,7 @@ def _write(task: VideoTask, found: Detected, target: Path, json: bool) -> Keypoi
     except ValueError as problem:
         return problem
     if task.parts is not None:
-        remove_chunks(task.parts)
+        shutil.rmtree(task.parts, ignore_errors=True)
     return KeypointFile(target, folder if with_json else None, found.clips, False, found)
 
 
@@ -276,9 +272,7 @@ def write_json_folder(clips: Sequence[Clip], numbers: Indices, times: Floats, fo
     rows: list[dict[int, int]] = [{nearest(times, time): row for row, time in enumerate(clip.times)} for clip in clips]
     ids = [clip.meta["person"] if clip.meta["followed"] == "ids" else -1 for clip in clips]
     mark = {key: str(clips[0].meta[key]) for key in (MADE_FROM, CONTENT)}
-    building = folder.with_name(f".{folder.name}-{secrets.token_hex(8)}.tmp")
-    try:
-        building.mkdir()
+    with replacing_folder(folder) as building:
         for k, number in enumerate(numbers.tolist()):
             people = [
                 {"person_id": [who], "pose_keypoints_2d": _flat(clip, row[k])}
@@ -288,12 +282,6 @@ def write_json_folder(clips: Sequence[Clip], numbers: Indices, times: Floats, fo
             frame = {"version": 1.3, "time": round(float(times[k]), 9), "people": people}
             (building / f"{_name(folder)}_{number:012d}_keypoints.json").write_text(dumps(frame), encoding="utf-8")
         (building / MARK).write_text(dumps(mark), encoding="utf-8")
-        replace_folder(building, folder)
-    except OSError as problem:
-        said = f"cannot be written ({problem.strerror or problem})"
-        raise error(folder, said, "free the disk, or choose another folder") from None
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
     return folder
 
 

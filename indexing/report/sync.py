@@ -19,10 +19,9 @@ from indexing.opening import count
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
 from indexing.report.page import markup, sentence
 from indexing.report.summary import Summary, Table, register_page
-from indexing.sync.breaks import RepairedClocks
-from indexing.sync.notices import accepted_notices
 from indexing.sync.people import Pairing, joint_names, person_label
-from indexing.sync.recordings import Take
+from indexing.sync.recordings import Take, accepted_notices
+from indexing.sync.synchronize import RepairedClocks
 
 if TYPE_CHECKING:
     from dyntorch import Shift

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool1d
 
-from dyntorch import Shift
-from dyntorch.core import Notice, status_from
+from dyntorch import Shift, Status
+from dyntorch.core import Notice, NoticeCode, status_from
 from dyntorch.numerics import Message, on_cpu, one_thread
 from indexing.sync.brightness_features import (
     KERNEL_HALF_FRAMES,
@@ -27,8 +27,67 @@ from indexing.sync.brightness_features import (
     sample,
     whiten,
 )
-from indexing.sync.notices import BrightnessNotice
-from indexing.sync.options import MEASURES, Measure
+from indexing.sync.recordings import MEASURES, Measure
+
+
+class BrightnessNotice(NoticeCode):
+    """Why the brightness of two videos does not decide, or what to know besides."""
+
+    FLICKER = (
+        "flicker",
+        "all of {camera:{which}} changes: its camera moves fast, or the light flickers; stabilize the video first",
+        Status.DEGENERATE,
+    )
+    """A picture that changes everywhere."""
+    STILL = "still", "nothing moves in {camera:{which}}; choose a take with motion", Status.DEGENERATE
+    """Nothing moves."""
+    CAMERA_MOVES = (
+        "camera_moves",
+        "{camera:{which}}: the camera moves ({value:.1f} px per frame); its motion was taken out approximately",
+    )
+    """A camera that moves."""
+    CROSSES = "crosses", "{camera:{which}}: motion crosses the image; a moving box follows it"
+    """Motion across the image."""
+    REPEATED = (
+        "repeated",
+        "another shift fits nearly as well ({value:.0f} % of the best score): the motion repeats, or there is too little of it; "
+        "film "
+        "longer and less regular motion, or give {arg:max_shift}",
+        Status.AMBIGUOUS,
+    )
+    """Another shift fits as well."""
+    HALVES = (
+        "halves",
+        "the halves of the overlap disagree with the whole (by {first:+.2f} and {second:+.2f} s): do both videos show the same "
+        "event? "
+        "Use a longer overlap, or keypoints",
+        Status.NO_CONSENSUS,
+    )
+    """The two halves of the overlap contradict the whole."""
+    KERNEL = (
+        "kernel",
+        {
+            "short": "the window kernel has too few frames, so the best shift is not confirmed; use a longer overlap, or keypoints",
+            "apart": "the window kernel says {value:+.2f} s from it, so the best shift is not confirmed; use a longer overlap, or "
+            "keypoints",
+        },
+        Status.NO_CONSENSUS,
+    )
+    """The second measure does not confirm the first."""
+    BACKWARDS = (
+        "backwards",
+        "{camera:b} fits as well when played backwards: the motion is symmetric in time, or of another time; use keypoints",
+        Status.AMBIGUOUS,
+    )
+    """Motion that looks the same backwards."""
+    EVIDENCE = (
+        "evidence",
+        "too little evidence ({value:.0f} of {needed:.0f}): similar motion of another time would fit about as well; use a longer "
+        "overlap, or keypoints",
+        Status.AMBIGUOUS,
+    )
+    """Too little evidence."""
+
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Two sequences of unit vectors against each other at all lags: scores, and the peaks of their curve.

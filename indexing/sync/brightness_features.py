@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.filters import get_gaussian_kernel1d
+from kornia.filters import gaussian_blur2d
+from kornia.geometry.transform import warp_affine
 from torch import Tensor
-from torch.nn.functional import avg_pool1d, conv1d, grid_sample, normalize
+from torch.nn.functional import avg_pool1d, max_pool1d, normalize
 
 from dyntorch.numerics import Message
 from indexing.brightness.descriptors import as_grey, blur, gradients, weighted_differences
@@ -59,15 +60,15 @@ WHITENING_HALF_WIDTH = 3  # Frames on either side that are whitened together (2 
 PROFILE_RIDGE = 0.05  # Ridge of the whitening over the largest eigenvalue (.03 / .2: .91 / .87).
 
 
-def whiten(first: Tensor, second: Tensor, reach: int = WHITENING_HALF_WIDTH, ridge: float = PROFILE_RIDGE) -> tuple[Tensor, Tensor]:
+def whiten(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
     r"""Both cameras' profiles in space and time: centred, whitened by the covariance that they share, of norm 1 per frame.
-    first, second ``(T, D)`` -> ``(T, (2 reach + 1) D)``."""
-    around = torch.arange(-reach, reach + 1)
+    first, second ``(T, D)`` -> ``(T, (2 half_width + 1) D)``."""
+    around = torch.arange(-WHITENING_HALF_WIDTH, WHITENING_HALF_WIDTH + 1)
     stacked = [z[(torch.arange(len(z))[:, None] + around).clamp(0, len(z) - 1)].flatten(1) for z in (first, second)]
     known = [y.isfinite().all(1) for y in stacked]
     centred = [y - y[seen].mean(0) for y, seen in zip(stacked, known, strict=True)]
     a, b = (y[seen] for y, seen in zip(centred, known, strict=True))
-    root = inverse_root((a.T @ a / len(a) + b.T @ b / len(b)) / 2, ridge)
+    root = inverse_root((a.T @ a / len(a) + b.T @ b / len(b)) / 2, PROFILE_RIDGE)
     one, two = (normalize((y @ root).nan_to_num(0.0), dim=1, eps=1e-9) for y in centred)
     return one, two
 
@@ -344,21 +345,21 @@ def _square(across: Tensor, along: Tensor, height: int) -> Tensor:
 
 def _smooth(values: Tensor, sigma: float) -> Tensor:
     """Gaussian mean over time of ``(T, n)``, renormalized at the ends."""
-    reach = max(1, int(3 * sigma))
-    kernel = get_gaussian_kernel1d(2 * reach + 1, sigma, device=values.device, dtype=values.dtype)[None]
-    weight = conv1d(values.new_ones(1, 1, len(values)), kernel, padding=reach)[0].T
-    return conv1d(values.T[:, None], kernel, padding=reach)[:, 0].T / weight
+    size = 2 * max(1, int(3 * sigma)) + 1
+    total, weight = (
+        gaussian_blur2d(x[None, None], (size, 1), (sigma, 1.0), "constant")[0, 0] for x in (values, torch.ones_like(values))
+    )
+    return total / weight
 
 
 def crop(frames: Tensor, where: Tensor, side: int) -> Tensor:
     """``(n, side, side)`` float32 crops of frames ``(n, h, w)`` in boxes ``(n, 3)``; the border is repeated outside the image."""
-    height, width = frames.shape[1:]
-    steps = (torch.arange(side, device=where.device) + 0.5) / side - 0.5
-    x, y, size = where.float().T[..., None]
-    gx = 2 * (x + steps * size) / width - 1
-    gy = 2 * (y + steps * size) / height - 1
-    grid = torch.stack([gx[:, None].expand(-1, side, -1), gy[..., None].expand(-1, -1, side)], dim=-1)
-    return grid_sample(as_grey(frames)[:, None], grid, padding_mode="border", align_corners=False)[:, 0]
+    x, y, size = where.float().T
+    scale = side / size
+    to_crop = torch.zeros(len(where), 2, 3, device=where.device)
+    to_crop[:, 0, 0] = to_crop[:, 1, 1] = scale
+    to_crop[:, :, 2] = (side - 1) / 2 - scale[:, None] * torch.stack([x - 0.5, y - 0.5], dim=1)
+    return warp_affine(as_grey(frames)[:, None], to_crop, (side, side), padding_mode="border", align_corners=True)[:, 0]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -508,5 +509,5 @@ def _crops(source: GrayVideo, where: Tensor, times: Tensor) -> tuple[Tensor, Ten
 
 def _all_known_within(known: Tensor, reach: int) -> Tensor:
     """``(T,)`` bool: whether all frames within ``reach`` are known."""
-    lost = torch.nn.functional.max_pool1d((~known).float()[None], 2 * reach + 1, 1, reach)[0]
+    lost = max_pool1d((~known).float()[None], 2 * reach + 1, 1, reach)[0]
     return lost == 0

@@ -14,30 +14,25 @@ from __future__ import annotations
 import json
 import math
 import re
-import secrets
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip
-from indexing.files import prepare, recover_folder, replace_folder, write_bytes
+from indexing.files import prepare, replacing_folder, write_bytes
 from indexing.opening import error, parse_json, read_text
 from indexing.readers.files import detect_json, frame_number, load_json
 from indexing.readers.recording import METRES
-from indexing.sync.recordings import Take
+from indexing.sync.recordings import Take, joint_weights
 
 POSE_FOLDER = "pose-sync"
 
 
 NEAR = 0.5 + 1e-6  # frames: no other frame is nearer
-
-
-EMPTY = json.dumps({"version": 1.3, "people": []})  # a frame that shows nobody
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +84,21 @@ def check_target(folder: Path, inputs: Sequence[Path]) -> None:
     same = [path for path in inputs if path.is_dir() and path.resolve() == folder.resolve()]
     if same:
         raise ValueError(f"{same[0]}: is an input, and files of the report among its frames would spoil it; choose another --out")
+    check_inputs(target, inputs)
+    if target.exists() and not owns_poses(folder):
+        raise not_ours(target)
+
+
+def check_inputs(target: Path, inputs: Sequence[Path]) -> None:
+    """Raise where a folder that is to be replaced holds an input."""
     inside = [path for path in inputs if target.resolve() in (path.resolve(), *path.resolve().parents)]
     if inside:
         raise ValueError(f"{inside[0]}: is an input, and {target} would be replaced; choose another folder for --out")
-    if target.exists() and not owns_poses(folder):
-        raise ValueError(f"{target}: is there, and not from this command; move it away, or choose another folder for --out")
+
+
+def not_ours(path: Path) -> ValueError:
+    """The error where something is there that this command did not write."""
+    return ValueError(f"{path}: is there, and not from this command; move it away, or choose another folder for --out")
 
 
 def owns_poses(folder: Path) -> bool:
@@ -108,18 +113,9 @@ def owns_poses(folder: Path) -> bool:
 def write_poses(folder: Path, plans: Sequence[Plan], count: int | None = None) -> Path:
     """Write ``pose-sync/<camera>_json/`` for every camera: all of them, or nothing."""
     target = folder / POSE_FOLDER
-    recover_folder(target)
-    building = folder / f".{POSE_FOLDER}-{secrets.token_hex(8)}.tmp"
-    try:
-        for one in (one for one in plans if len(one.rows)):
-            _write_camera(building / folder_of(one.take), one, count)
-        replace_folder(building, target)
-    except OSError as problem:
-        raise ValueError(
-            f"cannot write {str(target)!r} ({problem.strerror or problem}); free the name or the disk, or choose another folder"
-        ) from problem
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
+    with replacing_folder(target) as building:
+        for matched in (matched for matched in plans if len(matched.rows)):
+            _write_camera(building / folder_of(matched.take), matched, count)
     return target
 
 
@@ -138,27 +134,28 @@ def folder_of(take: Take) -> str:
     return take.path.name if own and take.path is not None else f"{take.name}_json"
 
 
-def _write_camera(folder: Path, one: Plan, count: int | None = None) -> None:
-    folder.mkdir(parents=True)
-    sources = openpose_files(one.take.path)
-    pairs = zip(one.numbers.tolist(), one.rows.tolist(), strict=True)
-    chosen = {number: row for number, row in pairs if number < (count or math.inf)}
-    written, like = set(), f"{one.take.name}_000000.json"
-    if sources:
-        by_number = {int(np.rint(time * one.take.fps)): row for row, time in enumerate(one.take.times)}
-        paths = {by_number[number]: path for number, path in sources.items() if number in by_number}
-        like = next(iter(sources.values())).name
-        for number, row in chosen.items():
-            if row in paths:
-                shutil.copyfile(paths[row], folder / renumber(paths[row].name, number))
-                written.add(number)
-    else:
-        texts = openpose_frames(one.take)
-        for number, row in chosen.items():
+def _write_camera(folder: Path, matched: Plan, count: int | None = None) -> None:
+    folder.mkdir()
+    sources = source_files(matched.take)
+    texts = [] if sources else openpose_frames(matched.take)
+    like = next(iter(sources.values())).name if sources else f"{matched.take.name}_000000.json"
+    written = set()
+    for number, row in zip(matched.numbers.tolist(), matched.rows.tolist(), strict=True):
+        if number >= (count or math.inf) or (sources and row not in sources):
+            continue
+        if sources:
+            shutil.copyfile(sources[row], folder / renumber(sources[row].name, number))
+        else:
             (folder / renumber(like, number)).write_text(texts[row], encoding="utf-8")
-            written.add(number)
+        written.add(number)
     for number in set(range(count or 0)) - written:
-        (folder / renumber(like, number)).write_text(EMPTY, encoding="utf-8")
+        (folder / renumber(like, number)).write_text(openpose_frame([]), encoding="utf-8")
+
+
+def source_files(take: Take) -> dict[int, Path]:
+    """Row of a frame -> its file, where the camera is a folder of OpenPose JSON."""
+    by_number = {int(np.rint(time * take.fps)): row for row, time in enumerate(take.times)}
+    return {by_number[number]: path for number, path in openpose_files(take.path).items() if number in by_number}
 
 
 def openpose_files(path: Path | None) -> dict[int, Path]:
@@ -182,21 +179,25 @@ def renumber(name: str, number: int) -> str:
 
 def openpose_frames(take: Take) -> list[str]:
     """A camera's people as OpenPose JSON, one text per frame; a joint not seen is 0, 0, 0."""
-    people: list[list[dict[str, Any]]] = [[] for _ in take.times]
+    people: list[list[tuple[int, NDArray[np.float64]]]] = [[] for _ in take.times]
     for index, clip in enumerate(take.everyone):
         rows = np.searchsorted(take.times, clip.times)
-        for row, flat in zip(rows.tolist(), _flat(clip), strict=True):
-            if flat is not None:
-                people[row].append({"person_id": [index if len(take.everyone) > 1 else -1], "pose_keypoints_2d": flat})
-    return [json.dumps({"version": 1.3, "people": present}) for present in people]
+        for row, table, seen in zip(rows.tolist(), keypoint_table(clip), np.asarray(clip.seen.any(axis=1)).tolist(), strict=True):
+            if seen:
+                people[row].append((index if len(take.everyone) > 1 else -1, table))
+    return [openpose_frame(present) for present in people]
 
 
-def _flat(clip: Clip) -> list[list[float] | None]:
-    """``x, y, c, x, y, c, ...`` of every frame; None where the person was not seen."""
-    seen = clip.seen
-    trust = seen.astype(np.float64) if clip.confidence is None else np.asarray(clip.confidence, dtype=np.float64)
-    table = np.where(seen[..., None], np.concatenate([clip.joints, trust[..., None]], axis=2), 0.0).reshape(len(clip), -1)
-    return [row if there else None for row, there in zip(table.tolist(), np.asarray(seen.any(axis=1)).tolist(), strict=True)]
+def openpose_frame(people: Sequence[tuple[int, NDArray[np.float64]]]) -> str:
+    """One frame's people, each a number and a table ``(joints, 3)`` of x, y and confidence."""
+    entries = [{"person_id": [who], "pose_keypoints_2d": table.ravel().tolist()} for who, table in people]
+    return json.dumps({"version": 1.3, "people": entries})
+
+
+def keypoint_table(clip: Clip) -> NDArray[np.float64]:
+    """``(frames, joints, 3)`` x, y and confidence of a 2D clip; 0 where a joint is not seen."""
+    table = np.concatenate([clip.joints, joint_weights(clip)[..., None]], axis=2)
+    return np.asarray(np.where(clip.seen[..., None], table, 0.0), dtype=np.float64)
 
 
 MOCAP_FOLDER = "mocap-sync"
@@ -265,11 +266,9 @@ def write_mocap(folder: Path, one: RetimedMocap) -> list[str]:
 def check_mocap(folder: Path, takes: Sequence[Path]) -> None:
     """Raise where the file would replace an input, or stand among files that this command did not write."""
     target = folder / MOCAP_FOLDER
-    inside = [path for path in takes if target.resolve() in path.resolve().parents]
-    if inside:
-        raise ValueError(f"{inside[0]}: is an input, and {target} would be replaced; choose another folder for --out")
+    check_inputs(target, takes)
     if target.exists() and not _owns_mocap(folder):
-        raise ValueError(f"{target}: is there, and not from this command; move it away, or choose another folder for --out")
+        raise not_ours(target)
 
 
 def drop_mocap(folder: Path) -> bool:

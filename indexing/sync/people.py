@@ -5,22 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dyntorch import Shift
 from dyntorch.core import Notice, status_from
 from indexing.clip import Clip
 from indexing.joints import has_names, places
 from indexing.skeleton import Skeleton, usual_layout
-from indexing.sync.notices import SyncNotice, accepted_notices
-from indexing.sync.recordings import FloatArray, Take
+from indexing.sync.recordings import FloatArray, SyncNotice, Take, accepted_notices
 
-if TYPE_CHECKING:
-    from dyntorch import Shift
-
-
-Solve = Callable[[Clip, Clip], "Shift"]
+Solve = Callable[[Clip, Clip], Shift]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +31,7 @@ class Pairing:
 NUM_THOROUGH_PAIRINGS = 3  # Pairings that are tried thoroughly where a fast look accepts none.
 
 
-def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> Pairing:
+def match_people(a: Take, b: Take, solve: Solve, trial: Solve) -> Pairing:
     """The pairing of people on which the evidence is best."""
     every = sorted(((i, j) for i in range(len(a.people)) for j in range(len(b.people))), key=sum)
     if len(every) == 1:
@@ -44,18 +39,15 @@ def match_people(a: Take, b: Take, solve: Solve, trial: Solve | None = None) -> 
     frame = 1.0 / min(a.fps, b.fps)
     found: list[Pairing] = []
     for i, j in every:
-        found.append(Pairing((trial or solve)(a.people[i], b.people[j]), (i, j)))
+        found.append(Pairing(trial(a.people[i], b.people[j]), (i, j)))
         if backing(found[-1], found, frame) > 1:  # two people of each camera say the same
             break
-    if trial is not None:  # the last word on the winner, or where none is sure, on the likeliest
-        ranked = sorted(found, key=lambda one: -one.shift.confidence)
-        likely = (
-            [decide(found, frame)] if any(one.shift.ok for one in found) else [(one, ()) for one in ranked[:NUM_THOROUGH_PAIRINGS]]
-        )
-        again = [Pairing(solve(a.people[one.people[0]], b.people[one.people[1]]), one.people, rivals) for one, rivals in likely]
-        best, rivals = (again[0], again[0].rivals) if len(again) == 1 else decide(again, frame)
-    else:
-        best, rivals = decide(found, frame)
+    # the last word on the winner, or where none is sure, on the likeliest
+    likely: list[tuple[Pairing, tuple[float, ...]]] = [decide(found, frame)]
+    if not any(pairing.shift.ok for pairing in found):
+        likely = [(pairing, ()) for pairing in sorted(found, key=lambda each: -each.shift.confidence)[:NUM_THOROUGH_PAIRINGS]]
+    again = [Pairing(solve(a.people[i], b.people[j]), (i, j), rivals) for (i, j), rivals in ((p.people, r) for p, r in likely)]
+    best, rivals = (again[0], again[0].rivals) if len(again) == 1 else decide(again, frame)
     shift = best.shift
     chosen = [f"{person_label(take, i)} of {take.name}" for take, i in zip((a, b), best.people, strict=True)]
     note = Notice(SyncNotice.PEOPLE, float(len(found)), {"first": chosen[0], "second": chosen[1]})

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 from indexing.opening import error, parse_toml, read_text
-from indexing.readers.files import VIDEOS
 from indexing.sync.calibration import Lens, named_lenses
 from indexing.sync.files import Plan
-from indexing.sync.recordings import Take, camera_name
+from indexing.sync.recordings import Take, camera_name, videos_named
+from indexing.video.reading import probe
 
 CONFIG, POSE, FILMS = "Config.toml", "pose", "videos"
 
@@ -42,8 +42,6 @@ class Trial:
 
     def rates(self) -> list[float | None]:
         """Frames per second of each camera: of its configuration, else of its video; None where nobody says."""
-        from indexing.video import probe
-
         films = [self.films.get(name) for name in self.cameras]
         return [self.fps or (None if film is None else probe(film).fps) for film in films]
 
@@ -71,7 +69,7 @@ def trial_of(folder: Path) -> Trial | None:
     cameras = _cameras(folder / POSE)
     if not configs or len(cameras) < 2:
         return None
-    films = {name: film for name in cameras if (film := _video_of(folder / FILMS, name)) is not None}
+    films = {name: videos[0] for name in cameras if (videos := videos_named(folder / FILMS, name))}
     homes = [folder] if (folder / CONFIG) == configs[0] else [folder.resolve().parent, folder]
     return Trial(folder, cameras, films, _frame_rate(configs), _calibration(homes))
 
@@ -106,11 +104,6 @@ def _last_number(name: str) -> tuple[bool, int]:
     """By what Pose2Sim sorts."""
     digits = "".join(letter if letter.isdecimal() else " " for letter in name).split()
     return (False, int(digits[-1])) if digits else (True, 0)
-
-
-def _video_of(folder: Path, name: str) -> Path | None:
-    files = sorted(folder.iterdir()) if folder.is_dir() else []
-    return next((file for file in files if file.suffix.lower() in VIDEOS and file.stem == name and file.is_file()), None)
 
 
 def _calibration(homes: Sequence[Path]) -> Path | None:

@@ -6,21 +6,102 @@ Motion capture is such a recording, too: people, or markers, in space.
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from dyntorch import Shift, Status, SynchronizeOptions
+from dyntorch.core import Notice, NoticeCode, Outcome, status_from
 from dyntorch.numerics import Message
 from indexing.clip import Clip, check_fps, stretches
 from indexing.movement import clips_of, is_dataset
 from indexing.readers.files import VIDEOS
 from indexing.remarks import FOLLOWED, remarks_on
-from indexing.sync.options import SyncOptions
+
+Measure = Literal["profile", "window"]
+"""What of the brightness is compared: the row-band profile, which the window kernel must confirm, or the window kernel alone."""
+MEASURES = ("profile", "window")
+
+
+@dataclass(frozen=True)
+class SyncOptions:
+    """What is known of the recordings, and what is paid, in :func:`indexing.synchronize`."""
+
+    min_frames: int = 12
+    """Frames of keypoints at least."""
+    min_margin: float = 0.2
+    """Risk of a wrong period: nats by which the best offset of corresponding keypoints must lead (see
+    :class:`dyntorch.SynchronizeOptions`)."""
+    num_candidates: int = 3
+    """People of a camera that are tried, besides the largest one of each frame: all pairings are compared."""
+
+    @property
+    def of_points(self) -> SynchronizeOptions:
+        """Those of :func:`dyntorch.synchronize`, for keypoints and tracks."""
+        return SynchronizeOptions(min_frames=self.min_frames, min_margin=self.min_margin)
+
+
+_METHODS = "tracks say {tracks}, brightness says {brightness}"
+
+
+class SyncNotice(NoticeCode):
+    """What to know of recordings, of the people in them, and of two methods that must agree."""
+
+    NOTE = "note", "{text}"
+    """What a reader says; ``camera`` is the recording that it speaks of."""
+    ASSUMED = "assumed_rate", "30 frames per second assumed for {names}; {arg:fps=} says otherwise"
+    """Files that do not say how many frames a second has."""
+    SAME = "same_recording", "{names} are the same recording"
+    """One recording given twice."""
+    METHODS = "methods", _METHODS
+    """What each method says."""
+    PEOPLE = "people", "several people in view: compared {first} with {second}, the best of {value:g} pairings"
+    """Who was compared."""
+    BY_PIXELS = "by_pixels", "the keypoints do not decide ({keypoints}); this is what the videos' pixels say"
+    """Keypoints of videos that do not decide, and pixels that do."""
+    NEITHER = "neither", "the pixels do not decide, either: {pixels}"
+    """Neither keypoints nor pixels of two videos decide."""
+    DISAGREE = (
+        "disagree",
+        f"{_METHODS}; record keypoints of the people, or a longer take with more motion",
+        Status.NO_CONSENSUS,
+    )
+    """Two methods that say different things."""
+    UNDECIDED = "undecided", "neither tracks nor brightness decide: {tracks}; {brightness}", Status.AMBIGUOUS
+    """Neither of two methods decides."""
+    FEW_TRACKS = (
+        "few_tracks",
+        "fewer than {needed} moving points could be followed in {names}; use keypoints",
+        Status.TOO_FEW,
+    )
+    """Nothing to follow."""
+    UNUSABLE = "unusable", "{text}", Status.TOO_FEW
+    """A method that cannot be tried."""
+    PAIRINGS = (
+        "pairings",
+        "one pairing of people says {value:+.3f} s, but pairings of other people say {rivals}; name one person per camera "
+        "({arg:person=}), or record one who moves otherwise",
+        Status.NO_CONSENSUS,
+    )
+    """Pairings of other people that are as sure."""
+
+
+def reader_notices(texts: Iterable[str], camera: str = "") -> list[Notice]:
+    """Notes of a reader as notices, of one recording or of all."""
+    return [Notice(SyncNotice.NOTE, 0.0, {"text": text, "camera": camera}) for text in texts]
+
+
+def accepted_notices(shift: Outcome) -> list[Notice]:
+    """The notices that refuse nothing."""
+    return [notice for notice in shift.notices if notice.code.refuses is None]
+
 
 FloatArray = NDArray[np.float64]
 
@@ -336,3 +417,25 @@ def _inside(folder: Path) -> list[Path]:
 
 def _is_frame(file: Path) -> bool:
     return file.suffix.lower() in (".json", ".txt") and not file.name.startswith(".")
+
+
+def undecided_shift(fps: tuple[float, float], method: str, *limits: Notice) -> Shift:
+    """What is said where there is nothing to compare."""
+    none = torch.zeros(0, dtype=torch.float64)
+    return Shift(
+        offset=0.0, sigma=math.inf, rate=1.0, rate_sigma=0.0, confidence=0.0, peaks=none.reshape(0, 2), method=method, fps=fps,
+        center=0.0, lags=none, scores=none, status=status_from(limits), notices=limits,
+    )  # fmt: skip
+
+
+def joint_weights(clip: Clip) -> FloatArray:
+    """``(frames, joints)`` how much the detector trusts each joint; 1 and 0 where it does not say."""
+    if clip.confidence is None:
+        return np.where(clip.seen, 1.0, 0.0)
+    return np.asarray(np.nan_to_num(np.clip(clip.confidence, 0.0, None)), dtype=np.float64)
+
+
+def videos_named(folder: Path, name: str) -> list[Path]:
+    """The video files of a folder that have a name, whatever their ending."""
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [file for file in files if file.suffix.lower() in VIDEOS and file.stem == name and file.is_file()]

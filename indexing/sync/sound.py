@@ -20,17 +20,17 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from dyntorch.core import Notice, status_from
-from indexing.sync.notices import SoundNotice
-
-if TYPE_CHECKING:
-    from dyntorch import Shift
+from dyntorch import Shift, Status
+from dyntorch.core import Notice, NoticeCode, status_from
+from indexing.opening import size_of
+from indexing.sync.recordings import undecided_shift
+from indexing.video.reading import av, open_video, packets
 
 Signal = NDArray[np.float32]
 
@@ -49,6 +49,46 @@ STEP_SECONDS = 0.01  # Step of the envelopes in which shifts are searched.
 # Average of magnitudes in the phase transform (margin, music at 10 dB, 0 / .05 / .5 Hz: 7.3 / 7.4 / 5.0).
 SPECTRUM_SMOOTHING_HERTZ = 0.05
 MIN_MODULATION_HERTZ = 0.5  # Slower changes of loudness are those of automatic gain.
+
+
+class SoundNotice(NoticeCode):
+    """What the sound of two videos says, and why it does not decide."""
+
+    NONE = "no_sound", "{camera:{which}} has no sound; use keypoints or pixels", Status.TOO_FEW
+    """A video without a stream of sound."""
+    SILENT = "silent", "the sound of {camera:{which}} is silence; use keypoints or pixels", Status.DEGENERATE
+    """A microphone that was off."""
+    SHORT = (
+        "short",
+        "the sounds overlap by less than {value:g} s at every shift that is searched; film longer, or raise {arg:max_shift}",
+        Status.TOO_FEW,
+    )
+    """Nothing to compare."""
+    NOTHING = (
+        "no_peak",
+        "no shift of the sound stands out: the microphones heard too little, or different things; clap at some uneven moments",
+        Status.AMBIGUOUS,
+    )
+    """No peak stands out."""
+    REPEATED = (
+        "sound_repeats",
+        "the sound repeats itself: {value:+.3f} s fits hardly better than {rivals} s; clap at some uneven moments",
+        Status.AMBIGUOUS,
+    )
+    """Several peaks, as of a metronome."""
+    AGREES = "sound_agrees", "sound agrees: {value:+.3f} s"
+    """The sound says the same; the value is how much later."""
+    OPEN = "sound_open", "the sound does not decide: {why}"
+    """The sound is no witness."""
+    ALONE = "sound_alone", "the sound says {offset} ± {sigma} s; {arg:method='sound'} takes its word"
+    """The sound decides where nothing else does."""
+    CONTRADICTS = (
+        "sound_contradicts",
+        "the sound says {offset} ± {sigma} s, and the pictures say {found} ± {own} s: one of them is wrong; {arg:method='sound'} "
+        "takes the word of the sound, {arg:sound=False} that of the pictures",
+        Status.NO_CONSENSUS,
+    )
+    """The sound says something else."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +190,6 @@ def phase_transform(curves: Signal, rate: float, smooth: float, slowest: float) 
 
 def read_sound(path: str | Path) -> Sound | None:
     """The sound of a video, on the clock of its pictures; None where it has none."""
-    from indexing.opening import size_of
-
     path = Path(path).expanduser()
     try:
         changed = path.stat().st_mtime_ns, size_of(path)
@@ -162,8 +200,6 @@ def read_sound(path: str | Path) -> Sound | None:
 
 @lru_cache(maxsize=16)
 def _read_sound(path: Path, changed: tuple[int, int]) -> Sound | None:
-    from indexing.video.reading import open_video
-
     with open_video(path) as (container, pictures):
         streams = [stream for stream in container.streams.audio if stream.codec_context is not None]
         if not streams:
@@ -186,8 +222,6 @@ MAX_TIMESTAMP_ERROR_SECONDS = 0.02  # Timestamps that are farther off the sample
 
 def _stretches(container: Any, stream: Any) -> Iterator[tuple[float, NDArray[np.int16]]]:
     """When each stretch of sound without a gap begins, and its samples at the common rate."""
-    from indexing.video.reading import av
-
     pieces: list[NDArray[np.int16]] = []
     began = expected = 0.0
     form: Any = None
@@ -213,8 +247,6 @@ def _stretches(container: Any, stream: Any) -> Iterator[tuple[float, NDArray[np.
 
 def _frames(container: Any, stream: Any) -> Iterator[Any]:
     """Frames of sound for as long as any can be decoded."""
-    from indexing.video.reading import av, packets
-
     for packet in packets(container, stream, []):
         try:
             decoded = packet.decode()
@@ -240,24 +272,14 @@ def sound_shift(
     """How the clock of one camera runs against that of another, by what their microphones heard."""
     missing = [which for which, one in zip("ab", (a, b), strict=True) if one is None]
     if a is None or b is None:
-        return _refuse(fps, *(Notice(SoundNotice.NONE, 0.0, {"which": which}) for which in missing))
+        return undecided_shift(fps, "sound", *(Notice(SoundNotice.NONE, 0.0, {"which": which}) for which in missing))
     dead = [Notice(SoundNotice.SILENT, 0.0, {"which": which}) for which, one in zip("ab", (a, b), strict=True) if one.silent]
     if dead:
-        return _refuse(fps, *dead)
+        return undecided_shift(fps, "sound", *dead)
     search = SoundSearch(a, b, max_shift, 0.0 if rate is None else rate - 1, rate is None)
     if not search.lags.size:
-        return _refuse(fps, Notice(SoundNotice.SHORT, MIN_OVERLAP_SECONDS))
+        return undecided_shift(fps, "sound", Notice(SoundNotice.SHORT, MIN_OVERLAP_SECONDS))
     return search.shift(fps)
-
-
-def _refuse(fps: tuple[float, float], *limits: Notice) -> Shift:
-    from dyntorch import Shift
-
-    none = torch.zeros(0, dtype=torch.float64)
-    return Shift(
-        offset=0.0, sigma=math.inf, rate=1.0, rate_sigma=0.0, confidence=0.0, peaks=none.reshape(0, 2), method="sound", fps=fps,
-        center=0.0, lags=none, scores=none, status=status_from(limits), notices=limits,
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -358,11 +380,9 @@ class SoundSearch:
 
     def shift(self, fps: tuple[float, float]) -> Shift:
         """The best shift, and whether it is to be believed."""
-        from dyntorch import Shift
-
         peaks = self.peaks()
         if not peaks:
-            return _refuse(fps, Notice(SoundNotice.NOTHING, 0.0))
+            return undecided_shift(fps, "sound", Notice(SoundNotice.NOTHING, 0.0))
         said = [self.stretch_scores(one) for one in peaks]
         order = sorted(range(len(peaks)), key=lambda i: -evidence_ratio(said[i]))  # a score is of chance where the overlap is short
         peaks, said = [peaks[i] for i in order], [said[i] for i in order]

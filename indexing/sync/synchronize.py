@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+import dyntorch
+from dyntorch import Clocks, Shift
 from dyntorch.core import Notice, status_from
 from dyntorch.numerics import Message, check_options, with_names
 from indexing.clip import Clip
 from indexing.remarks import is_normalized
-from indexing.sync.notices import SoundNotice, SyncNotice, accepted_notices, reader_notices
-from indexing.sync.options import MEASURES, Measure, SyncOptions
+from indexing.sync.brightness import brightness_shift
+from indexing.sync.brightness_features import MAX_IMAGE_SIDE
+from indexing.sync.calibration import lenses
 from indexing.sync.people import Pairing, common_joints, disagreements, jumps, match_people
-from indexing.sync.recordings import By, Take, take_of
-
-if TYPE_CHECKING:
-    from dyntorch import Shift
+from indexing.sync.recordings import (
+    MEASURES,
+    By,
+    Measure,
+    SyncNotice,
+    SyncOptions,
+    Take,
+    accepted_notices,
+    joint_weights,
+    reader_notices,
+    take_of,
+    undecided_shift,
+)
+from indexing.sync.sound import SoundNotice, check_by_sound, read_sound, sound_shift
+from indexing.video import Chunk, read_video, track_points
 
 Method = Literal["auto", "keypoints", "tracks", "brightness", "sound"]
 METHODS = ("auto", "keypoints", "tracks", "brightness", "sound")
@@ -142,8 +157,6 @@ def pair(
     **more: Any,
 ) -> Pairing:
     """:func:`synchronize` for recordings that were read, and which person of each it is about."""
-    from indexing.sync.calibration import lenses
-
     options = options or SyncOptions()
     _check(a, b, method, measure, options)
     lens = lenses(calibration, [take.name for take in (a, b) if not take.spatial])
@@ -196,8 +209,6 @@ def _compare(
 
 def compare_sound(a: Take, b: Take, **more: Any) -> Shift:
     """What the sound of two cameras says."""
-    from indexing.sync.sound import read_sound, sound_shift
-
     known = {name: value for name, value in more.items() if name in ("max_shift", "rate")}
     sounds = [None if take.footage is None else read_sound(take.footage) for take in (a, b)]
     return sound_shift(sounds[0], sounds[1], fps=(a.fps, b.fps), **known)
@@ -205,8 +216,6 @@ def compare_sound(a: Take, b: Take, **more: Any) -> Shift:
 
 def _with_sound(found: Pairing, a: Take, b: Take, more: dict[str, Any]) -> Pairing:
     """What was found, and what the sound of both cameras says to it, where they have any."""
-    from indexing.sync.sound import check_by_sound
-
     if a.footage is None or b.footage is None:
         return found
     try:
@@ -255,10 +264,6 @@ def _keypoints(
     a: Clip, b: Clip, correspondence: bool | None = None, quick: bool = False, *, options: SyncOptions, **more: Any
 ) -> Shift:
     """Two people, or one seen twice; ``quick`` looks for no lens distortion, drift, or weak perspective: 5 to 10 times faster."""
-    import torch
-
-    import dyntorch
-
     first, second, same, note = common_joints(a, b)
     if correspondence is None:
         correspondence = same
@@ -271,10 +276,7 @@ def _keypoints(
         more["calibration"] = more.get("calibration") or (None, None)
     clips = (first, second) if correspondence else (a, b)
     places = [torch.from_numpy(np.array(clip.joints, dtype=np.float64)) for clip in clips]
-    trust = [
-        np.where(clip.seen, 1.0, 0.0) if clip.confidence is None else np.nan_to_num(np.clip(clip.confidence, 0.0, None))
-        for clip in clips
-    ]
+    trust = [joint_weights(clip) for clip in clips]
     known = any(clip.confidence is not None for clip in clips)
     shift: Shift = dyntorch.synchronize(
         places[0],
@@ -333,10 +335,6 @@ def _identity_notices(a: Take, b: Take, found: Pairing) -> list[Notice]:
 # Synchronization where a camera gives no keypoints: tracks of whatever moves, and brightness, each a check of the other.
 
 
-if TYPE_CHECKING:
-    from dyntorch import Shift
-
-
 def synchronize_videos(
     a: Take, b: Take, method: str, measure: Measure = "profile", options: SyncOptions | None = None, **more: Any
 ) -> Shift:
@@ -352,7 +350,7 @@ def synchronize_videos(
         bright = _brightness(a, b, **brightness)
     except ValueError as problem:  # too short for it; the files can be read, as the tracks show
         said = problem.args[0] if problem.args else str(problem)
-        bright = refuse(a, b, Notice(SyncNotice.UNUSABLE, 0.0, {"text": said}), method="brightness")
+        bright = undecided_shift((a.fps, b.fps), "brightness", Notice(SyncNotice.UNUSABLE, 0.0, {"text": said}))
     return combine_methods(tracked, bright)
 
 
@@ -408,14 +406,12 @@ MIN_TRACKS = 4  # Moving points that must be followed in each video.
 
 def _tracks(a: Take, b: Take, *, calibration: Any = None, options: SyncOptions, **more: Any) -> Shift:
     """Different points in both: trajectories that span meeting subspaces."""
-    import dyntorch
-
     found = [points_of(take) for take in (a, b)]
     known = [notice for *_, more in found for notice in more]
     few = [take.name for take, (points, _, _) in zip((a, b), found, strict=True) if points.shape[1] < MIN_TRACKS]
     if few:
         values = {"needed": MIN_TRACKS, "names": " and ".join(few)}
-        return refuse(a, b, Notice(SyncNotice.FEW_TRACKS, 0.0, values), *known)
+        return undecided_shift((a.fps, b.fps), "subspace", Notice(SyncNotice.FEW_TRACKS, 0.0, values), *known)
     shift: Shift = dyntorch.synchronize(
         found[0][0],
         found[1][0],
@@ -433,8 +429,6 @@ def points_of(take: Take) -> tuple[Tensor, Tensor, list[Notice]]:
     if take.kind == "keypoints":
         clip = take.people[0]
         return torch.from_numpy(np.array(clip.joints, dtype=np.float64)), torch.from_numpy(clip.times.copy()), []
-    from indexing.video import track_points
-
     tracks = track_points(source_of(take))
     return tracks.points, tracks.times, reader_notices([f"{take.name}: {note}" for note in tracks.notes], take.name)
 
@@ -443,8 +437,6 @@ def source_of(take: Take) -> Any:
     """A video as the functions of :mod:`indexing.video` take it."""
     if take.path is not None:
         return take.path
-    from indexing.video import Chunk
-
     assert take.frames is not None
     return [Chunk(gray_of(take), take.times)]
 
@@ -460,21 +452,106 @@ def gray_of(take: Take) -> Any:
 
 def _brightness(a: Take, b: Take, **more: Any) -> Shift:
     """No points at all."""
-    from indexing.sync.brightness import brightness_shift
-    from indexing.sync.brightness_features import MAX_IMAGE_SIDE
-    from indexing.video import read_video
-
     sources = [iter(source_of(take)) if take.path is None else read_video(take.path, size=MAX_IMAGE_SIDE) for take in (a, b)]
     shift: Shift = brightness_shift(*sources, **more)
     return shift
 
 
-def refuse(a: Take, b: Take, *limits: Notice, method: str = "subspace") -> Shift:
-    """What is said where there is nothing to compare."""
-    from dyntorch import Shift
+# ----------------------------------------------------------------------------------------------------------------------
+# Clocks that break: frames that a camera lost, or wrote twice, without saying so.
 
-    none = torch.zeros(0, dtype=torch.float64)
-    return Shift(
-        offset=0.0, sigma=float("inf"), rate=1.0, rate_sigma=0.0, confidence=0.0, peaks=none.reshape(0, 2),
-        method=method, fps=(a.fps, b.fps), center=0.0, lags=none, scores=none, status=status_from(limits), notices=limits,
-    )  # fmt: skip
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RepairedClocks:
+    """Recordings whose clocks broke, with times as if they had not."""
+
+    found: Any
+    takes: tuple[Take, ...]
+
+    @property
+    def is_attributed(self) -> bool:
+        """Whether it is known whose clock broke, as far as it can be: of three cameras the other pairs of both must say so, too."""
+        return len(self.takes) == 2 or all(one.camera is not None for one in self.found.breaks)
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """Every break in plain types."""
+        return [
+            {
+                "camera": None if one.camera is None else self.takes[one.camera].name,
+                "candidates": [self.takes[camera].name for camera in one.candidates],
+                "times": list(one.moments), "sigma": one.sigma, "jump": one.jump, "jump_sigma": one.jump_sigma,
+                "frames": one.frames, "twice": one.doubled, "evidence": one.evidence, "residuals": list(one.residuals),
+            }
+            for one in self.found.breaks
+        ]  # fmt: skip
+
+
+def find_breaks(
+    takes: Sequence[Take],
+    compared: Mapping[tuple[int, int], Pairing],
+    together: Clocks | None = None,
+    *,
+    calibration: Any = None,
+    max_shift: float | None = None,
+) -> RepairedClocks | None:
+    """Where the clocks of cameras broke; None where they did not, or where nothing tells: other joints in each, or no
+    keypoints. compared ``(i, j)``."""
+    people = _people(takes, compared)
+    if people is None:
+        return None
+    lens = lenses(calibration, [take.name for take in takes])
+    known = any(clip.confidence is not None for clip in people)
+    given: dict[str, Any] = {
+        "times": tuple(torch.from_numpy(np.array(clip.times, dtype=np.float64)) for clip in people),
+        "weights": tuple(torch.from_numpy(joint_weights(clip)) for clip in people) if known else None,
+        "calibration": lens.values if lens else None,
+        "max_shift": max_shift,
+        "options": SyncOptions().of_points,
+    }
+    tracks = [torch.from_numpy(np.array(clip.joints, dtype=np.float64)) for clip in people]
+    if together is None:
+        found = dyntorch.tasks.breaks(tracks[0], tracks[1], compared[0, 1].shift, **given)
+    else:
+        found = dyntorch.tasks.camera_breaks(tracks, together, **given)
+    if not (found.ok and found.breaks):
+        return None
+    names = {str(i): take.name for i, take in enumerate(takes)}
+    named = dataclasses.replace(found, notices=tuple(notice.with_names(names) for notice in found.notices))
+    changes: list[Floats] = [times.numpy() - clip.times for times, clip in zip(found.times, people, strict=True)]
+    return RepairedClocks(
+        named,
+        tuple(retime(take, np.asarray(clip.times, np.float64), by) for take, clip, by in zip(takes, people, changes, strict=True)),
+    )
+
+
+def _people(takes: Sequence[Take], compared: Mapping[tuple[int, int], Pairing]) -> list[Clip] | None:
+    """The person of each camera, with joints that all of them have; None where they have other ones."""
+    if any(take.kind != "keypoints" or take.spatial for take in takes):
+        return None
+    chosen = []
+    for number, take in enumerate(takes):
+        mine = [(one.shift.confidence, one.people[pair.index(number)]) for pair, one in compared.items() if number in pair]
+        chosen.append(take.people[max(mine)[1]])
+    first = chosen[0]
+    for clip in chosen[1:]:
+        first, _, same, _ = common_joints(first, clip)
+        if not same:
+            return None
+    return [common_joints(first, clip)[1] for clip in chosen]
+
+
+def retime(take: Take, times: Floats, by: Floats) -> Take:
+    """A recording whose clock is changed. times ``(k,)``, by ``(k,)``."""
+
+    def new(old: Floats) -> Floats:
+        rows = np.clip(np.searchsorted(times, old + 1e-9, side="right") - 1, 0, len(times) - 1)
+        return np.asarray(old + by[rows], dtype=np.float64)
+
+    if not by.any():
+        return take
+    changed = {id(clip): clip.replace(times=new(np.asarray(clip.times, np.float64))) for clip in (*take.people, *take.everyone)}
+    people, everyone = (tuple(changed[id(clip)] for clip in clips) for clips in (take.people, take.everyone))
+    return dataclasses.replace(take, people=people, everyone=everyone, times=new(take.times))

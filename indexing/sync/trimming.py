@@ -8,34 +8,25 @@ a frame left out now and then, one that runs slower has one twice, and none is o
 from __future__ import annotations
 
 import math
-import secrets
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.files import recover_folder, replace_folder
+from indexing.files import recover_folder, replacing_folder
 from indexing.opening import entries, parse_json, read_text
-from indexing.readers.files import VIDEOS
-from indexing.sync.recordings import Take
+from indexing.sync.files import check_inputs, not_ours
+from indexing.sync.recordings import Take, videos_named
+from indexing.video.drawing import ClockRelation, add_video_stream
+from indexing.video.reading import Orientation, av, frame_times, orientation, read_video
 
 FOLDER = "synchronized_videos"
 Floats = NDArray[np.float64]
-
-
-class CameraClock(Protocol):
-    """What is needed of a camera's clock against the reference's."""
-
-    def at(self, times: Any) -> Any:
-        """Times of this clock, of the reference's."""
-
-    def inverse(self, times: Any) -> Any:
-        """Times of the reference's clock, of this one's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +90,8 @@ class Trim:
         return len(self.cuts[0].rows)
 
 
-def video_of(take: Take, times: Floats | None = None) -> CameraVideo:
-    """The video of a camera: what it is itself, what its keypoints were found in, or the one that lies beside them. times
-    ``(frames,)``."""
-    from indexing.video.reading import frame_times
-
+def video_of(take: Take) -> CameraVideo:
+    """The video of a camera: what it is itself, what its keypoints were found in, or the one that lies beside them."""
     path = take.footage or find_video(take)
     if path is None:
         where = take.path or take.name
@@ -112,7 +100,7 @@ def video_of(take: Take, times: Floats | None = None) -> CameraVideo:
             f"{take.name}.mp4 (or in a folder videos/ there)"
         )
     stamps = frame_times(path)[1]
-    return CameraVideo(take.name, path, stamps, frame_clock(take, path, stamps, times))
+    return CameraVideo(take.name, path, stamps, frame_clock(take, path, stamps))
 
 
 def find_video(take: Take) -> Path | None:
@@ -120,12 +108,8 @@ def find_video(take: Take) -> Path | None:
     if take.path is None or take.kind != "keypoints":
         return None
     home = take.path.resolve().parent
-    for folder in (home, home / "videos", home.parent / "videos"):
-        files = sorted(folder.iterdir()) if folder.is_dir() else []
-        found = [file for file in files if file.suffix.lower() in VIDEOS and file.stem == take.name and file.is_file()]
-        if len(found) == 1:
-            return found[0]
-    return None
+    videos = (videos_named(folder, take.name) for folder in (home, home / "videos", home.parent / "videos"))
+    return next((files[0] for files in videos if len(files) == 1), None)
 
 
 TIME_TOLERANCE_FRAMES = 0.25  # Within this the times of keypoints are those of the video's frames.
@@ -152,7 +136,7 @@ def frame_clock(take: Take, path: Path, stamps: Floats, mended: Floats | None = 
 MAX_FPS_DENOMINATOR = 1001  # Of the frame rate as a fraction: 30000/1001.
 
 
-def trim(films: Sequence[CameraVideo], clocks: Sequence[CameraClock], fps: float | None = None) -> Trim:
+def trim(films: Sequence[CameraVideo], clocks: Sequence[ClockRelation], fps: float | None = None) -> Trim:
     """Choose the frames of what all cameras recorded: at each moment the nearest one of each."""
     first = films[0]
     own = (len(first.times) - 1) / (first.times[-1] - first.times[0]) if len(first.times) > 1 else 0.0
@@ -193,15 +177,13 @@ def check_videos(folder: Path, inputs: Sequence[Path]) -> None:
     """Raise where the trimmed videos would replace an input, or files that this command did not write."""
     target = folder / FOLDER
     recover_folder(target)
-    inside = [path for path in inputs if target.resolve() in (path.resolve(), *path.resolve().parents)]
-    if inside:
-        raise ValueError(f"{inside[0]}: is an input, and {target} would be replaced; choose another folder for --out")
+    check_inputs(target, inputs)
     if target.exists() and not target.is_dir():
         raise ValueError(f"{target}: is a file, and a folder of this name is to be written; move it away")
     known = written_before(folder)
     other = next((file for file in entries(target) if file.name not in known), None) if target.exists() else None
     if other is not None:
-        raise ValueError(f"{other}: is there, and not from this command; move it away, or choose another folder for --out")
+        raise not_ours(other)
 
 
 def written_before(folder: Path) -> set[str]:
@@ -230,46 +212,31 @@ PROGRESS_FRAMES = 20  # Frames from one report of progress to the next.
 
 def write_videos(folder: Path, chosen: Trim, done: Callable[[float], None] | None = None) -> Path:
     """Write ``synchronized_videos/<camera>.mp4`` for every camera: all of them, or nothing."""
-    from indexing.video.reading import av
-
-    target = folder / FOLDER
-    building = folder / f".{FOLDER}-{secrets.token_hex(8)}.tmp"
-    total = chosen.frames * len(chosen.cuts)
-    try:
-        building.mkdir(parents=True)
+    target, total = folder / FOLDER, chosen.frames * len(chosen.cuts)
+    with replacing_folder(target) as building:
         for i, cut in enumerate(chosen.cuts):
             written = 0
-            for written in _encode(building / cut.file, cut, chosen.fps):
-                if done is not None and written % PROGRESS_FRAMES == 0:
-                    done((i * chosen.frames + written) / total)
+            try:
+                for written in _encode(building / cut.file, cut, chosen.fps):
+                    if done is not None and written % PROGRESS_FRAMES == 0:
+                        done((i * chosen.frames + written) / total)
+            except av().FFmpegError as problem:
+                raise OSError(problem.errno, problem.strerror) from problem
             if written < chosen.frames:
                 raise ValueError(
                     f"{cut.film.path}: reading stopped at frame {written} of {chosen.frames}; copy it again from the camera"
                 )
-        replace_folder(building, target)
-    except (OSError, av().FFmpegError) as problem:
-        said = getattr(problem, "strerror", None) or problem
-        raise ValueError(f"cannot write {str(target)!r} ({said}); free the name or the disk, or choose another folder") from problem
-    finally:
-        shutil.rmtree(building, ignore_errors=True)
     return target
 
 
 H264_CRF = "17"  # Quality of H.264: no visible difference from 18 down, nor for a keypoint detector.
-H264_PRESET = "veryfast"  # Speed for size.
 MPEG4_QSCALE = "2"  # Quality of MPEG-4, where there is no H.264.
 
 
 def _encode(path: Path, cut: Cut, fps: Fraction) -> Iterator[int]:
     """Write a file frame by frame; how many are written."""
-    from indexing.video.reading import av
-
-    codec, how = "mpeg4", {"qscale": MPEG4_QSCALE}
-    if "libx264" in av().codecs_available:
-        codec, how = "libx264", {"crf": H264_CRF, "preset": H264_PRESET}
     with av().open(str(path), "w", format="mp4") as container:
-        stream = container.add_stream(codec, rate=fps, options=how)
-        stream.pix_fmt = "yuv420p"
+        stream = add_video_stream(container, fps, H264_CRF, MPEG4_QSCALE)
         for number, frame in enumerate(_frames(cut)):
             if number == 0:
                 stream.width, stream.height = frame.width, frame.height
@@ -282,8 +249,6 @@ def _encode(path: Path, cut: Cut, fps: Fraction) -> Iterator[int]:
 
 def _frames(cut: Cut) -> Iterator[Any]:
     """PyAV's frame of every moment, upright, of even size."""
-    from indexing.video.reading import read_video
-
     wanted = cut.film.stamps[cut.rows]
     close = cut.film.frame / 4
     source = read_video(cut.film.path, start=max(0.0, float(wanted[0]) - 1.0)).stored()
@@ -305,8 +270,6 @@ def _frames(cut: Cut) -> Iterator[Any]:
 
 def _upright(frame: Any, shape: tuple[int, int] | None) -> Any:
     """A frame turned as the file asks for, of even size (a last row or column is cut), in the colours that play everywhere."""
-    from indexing.video.reading import Orientation, av, orientation
-
     turned = orientation(frame)
     if turned == Orientation() and frame.width % 2 == frame.height % 2 == 0 and shape in (None, (frame.width, frame.height)):
         return frame if frame.format.name == "yuv420p" else frame.reformat(format="yuv420p")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from indexing.video.check import write_check_video as write_check_video
+from indexing.video.drawing import write_check_video as write_check_video
 from indexing.video.motion import CameraMotion as CameraMotion
 from indexing.video.motion import Move as Move
 from indexing.video.motion import camera_motion as camera_motion

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from indexing.video.reading import Chunk, Source, cv2
 from indexing.video.sequence import chunks
@@ -172,7 +173,7 @@ def _fits(motion: Floats, source: Floats, target: Floats, within: float) -> NDAr
 
 
 def _shift(motion: Floats, shape: tuple[int, ...]) -> float:
-    corners = np.array([[0.0, 0], [shape[1], 0], [0, shape[0]], [shape[1], shape[0]]])
+    corners = _corners((shape[1], shape[0]))
     return float(np.linalg.norm(transform(motion, corners) - corners, axis=1).max())
 
 
@@ -241,17 +242,16 @@ class CameraMotion:
         return transform(self.path if times is None else self.at(times), np.asarray(points, np.float64))
 
 
-def camera_motion(source: str | Path | Source, *, threshold: float | None = None) -> CameraMotion:
+def camera_motion(source: str | Path | Source) -> CameraMotion:
     """Whether, when and by how much the camera moves, from the background of a video.
 
     Corners spread over the picture are followed from a key frame (KLT) and a similarity, or a homography where that explains
     more, is fitted to most of them (RANSAC), so that people who move in front do not count.  The camera is said to move where the
-    corners of the picture move by more than ``threshold`` within half a second.  A camera that changes its place (not only its
-    direction) in front of a deep scene has no such motion; the nearest one for the bulk of the background is found.
+    corners of the picture move by more than 0.2 % of the diagonal within half a second.  A camera that changes its place (not only
+    its direction) in front of a deep scene has no such motion; the nearest one for the bulk of the background is found.
 
     Args:
         source: a path, or chunks of grey frames.
-        threshold: pixels; default: 0.2 % of the diagonal.
 
     Returns:
         the motion in pixels of the video as shown (for chunks: of their frames).
@@ -275,7 +275,7 @@ def camera_motion(source: str | Path | Source, *, threshold: float | None = None
             builder.add(background, image)
         builder.times.extend(chunk.times.tolist())
     scale = getattr(stream, "scale", (1.0, 1.0)) if isinstance(source, (str, Path)) else (1.0, 1.0)
-    return builder.finish(scale, threshold, getattr(stream, "notes", ()))
+    return builder.finish(scale, getattr(stream, "notes", ()))
 
 
 class PathBuilder:
@@ -299,7 +299,7 @@ class PathBuilder:
         self.shape = image.shape
         return self.path[-1]
 
-    def finish(self, scale: tuple[float, float], threshold: float | None, notes: tuple[str, ...] = ()) -> CameraMotion:
+    def finish(self, scale: tuple[float, float], notes: tuple[str, ...]) -> CameraMotion:
         """The motion in pixels of the video, ``scale`` being pixels here per pixel there; ``notes`` of the reading come first."""
         if not self.times:
             raise ValueError("camera_motion: the video has no frames; give at least one chunk")
@@ -307,8 +307,9 @@ class PathBuilder:
         shrink = shrink_matrix(scale)
         path = np.linalg.inv(shrink) @ np.array(self.path) @ shrink
         size = (round(self.shape[1] / scale[0]), round(self.shape[0] / scale[1]))
-        limit = STATIC_CAMERA_MOTION * float(np.hypot(*size)) if threshold is None else threshold
-        corners = _smooth_corners(transform(path, _corners(size)).reshape(len(times), -1))
+        limit = STATIC_CAMERA_MOTION * float(np.hypot(*size))
+        # without jumps of one or two frames: no camera does that, but where somebody fills the picture the fit may
+        corners = median_filter(transform(path, _corners(size)).reshape(len(times), -1), (5, 1), mode="nearest")
         moments = _moments(times, corners, limit)
         kind = _kind(times, corners, moments, limit)
         if not moments and _extent(corners) > 3 * limit:
@@ -365,12 +366,6 @@ def warp(image: NDArray[np.uint8], matrix: Floats) -> NDArray[np.uint8]:
 def _corners(size: tuple[int, int]) -> Floats:
     width, height = size
     return np.array([[0.0, 0], [width, 0], [0, height], [width, height]])
-
-
-def _smooth_corners(corners: Floats) -> Floats:
-    """Without jumps of one or two frames: no camera does that, but where somebody fills the picture the fit may."""
-    padded = np.pad(corners, ((2, 2), (0, 0)), mode="edge")
-    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5, axis=0), axis=-1))
 
 
 def _extent(corners: Floats) -> float:

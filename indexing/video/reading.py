@@ -58,7 +58,6 @@ class VideoInfo:
         frames: how many there are; of several with one and the same time, one counts.
         duration: seconds from the first frame to the last.
         fps: frames per second by the timestamps: :math:`(\\text{frames} - 1) / \\text{duration}`.
-        nominal: frames per second that the file claims; 0 where it claims none.
         variable: whether the frames lie off an even grid by more than a tenth of a frame somewhere: then only times tell when
             a frame was taken, and frame number / fps does not.
         rotation: degrees clockwise by which frames are turned for showing (phones): 0, 90, 180 or 270.
@@ -77,7 +76,6 @@ class VideoInfo:
     frames: int
     duration: float
     fps: float
-    nominal: float
     variable: bool
     rotation: int
     mirrored: bool
@@ -225,7 +223,7 @@ def frame_times(path: str | Path, *, fps: float | None = None) -> tuple[VideoInf
     notes += _notes(uneven, dropped, repeated, claimed, times[-1] - start, upright)
     info = VideoInfo(
         path=Path(path), width=width, height=height, frames=len(times), duration=duration,
-        fps=(len(times) - 1) / duration if duration else nominal, nominal=nominal, variable=uneven > UNEVEN,
+        fps=(len(times) - 1) / duration if duration else nominal, variable=uneven > UNEVEN,
         rotation=upright.rotation, mirrored=upright.mirrored, start=float(start), repeated=repeated, dropped=dropped, codec=codec,
         notes=tuple(notes), timed=has_times,
     )  # fmt: skip

@@ -14,8 +14,8 @@ from torch import Tensor
 from dyntorch.numerics import check_options
 from indexing.video.motion import Floats, shrink_matrix, transform
 from indexing.video.reading import Chunk, Source, Video, cv2
-from indexing.video.sequence import PictureSequence, chunks
-from indexing.video.tracks import Book, FollowSettings
+from indexing.video.sequence import PictureSequence, chunks, select_frames
+from indexing.video.tracks import Book, FollowSettings, follow_both_ways
 
 Picture = NDArray[np.uint8]
 Images = list[Picture]
@@ -134,19 +134,34 @@ def track_scene(
         raise ValueError("track_scene: chunks that can be read only once, and two passes are needed; give a list of them")
     book, times, first, why = _follow(stream, wanted, options)
     taken = wanted.taken(times, first, name_of(source))
-    pictures = _pictures(stream, taken)
-    scale = getattr(stream, "scale", (1.0, 1.0))
+    pictures = [image.copy() for image in select_frames(stream, taken)]
     least = max(2, round(MIN_PRESENCE * len(taken))) if missing else len(taken)
     positions = _drop_rarely_seen(_refine_to_first(_at(book, [k - first for k in taken]), pictures), least)
-    shape = pictures[0].shape
-    shown = (round(shape[1] / scale[0]), round(shape[0] / scale[1]))
-    check(positions, taken, name_of(source))
+    return _scene_tracks(stream, name_of(source), positions, pictures, taken, times, why)
+
+
+def _scene_tracks(
+    stream: Iterable[Chunk],
+    name: str,
+    positions: Floats,
+    pictures: Images,
+    taken: list[int],
+    times: list[float],
+    why: str,
+    notes: Sequence[str] = (),
+    pictured: tuple[int, ...] | None = None,
+) -> SceneTracks:
+    """The result, in pixels of the video as shown, from positions ``(views, n, 2)`` in the pictures."""
+    check(positions, taken, name)
+    scale = getattr(stream, "scale", (1.0, 1.0))
+    height, width = pictures[0].shape
     points = transform(np.asarray(np.linalg.inv(shrink_matrix(scale)), np.float64), positions)
     moments = np.array([times[k] for k in taken])
-    known = isinstance(stream, PictureSequence) and stream.fps is None
-    notes = [frames_said(taken, moments, len(times), known) + why, *getattr(stream, "notes", ())]
+    untimed = isinstance(stream, PictureSequence) and stream.fps is None
+    shown = (round(width / scale[0]), round(height / scale[1]))
+    said = (frames_said(taken, moments, len(times), untimed) + why, *notes, *getattr(stream, "notes", ()))
     return SceneTracks(
-        torch.from_numpy(points), torch.from_numpy(moments), tuple(taken), len(times), shown, tuple(pictures), tuple(notes)
+        torch.from_numpy(points), torch.from_numpy(moments), tuple(taken), len(times), shown, tuple(pictures), said, pictured
     )
 
 
@@ -245,18 +260,6 @@ def _follow(stream: Iterable[Chunk], wanted: Wanted, options: SceneTrackOptions)
     return book, times, max(first, 0), why
 
 
-def _pictures(stream: Iterable[Chunk], taken: list[int]) -> Images:
-    """The frames that are taken, read once more."""
-    found: Images = []
-    index = 0
-    for chunk in stream:
-        found += [chunk.frames[k - index].copy() for k in taken if index <= k < index + len(chunk.frames)]
-        index += len(chunk.frames)
-        if index > taken[-1]:
-            break
-    return found
-
-
 def _at(book: Book, places: list[int]) -> Floats:
     """Positions ``(views, n, 2)`` of the tracks at these frames of the book, NaN where a track is not there."""
     kept = []
@@ -294,9 +297,7 @@ def refine_match(before: Picture, after: Picture, here: Floats, there: Floats) -
     """Where points ``here (n, 2)`` of one picture are in another, near ``there``; NaN where that is not so, there and back."""
     how = {"winSize": SCENE_FOLLOWING.patch, "maxLevel": 1, "criteria": (3, 30, 0.003), "flags": cv2().OPTFLOW_USE_INITIAL_FLOW}
     origin, goal = (np.ascontiguousarray(points, np.float32) for points in (here, there))
-    moved, ok, _ = cv2().calcOpticalFlowPyrLK(before, after, origin, goal.copy(), **how)
-    back, ok_back, _ = cv2().calcOpticalFlowPyrLK(after, before, moved, origin.copy(), **how)
-    good = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.linalg.norm(back - origin, axis=1) < SCENE_FOLLOWING.max_return_error)
+    moved, good = follow_both_ways(before, after, origin, goal.copy(), SCENE_FOLLOWING.max_return_error, **how)
     good &= np.linalg.norm(moved - goal, axis=1) < MAX_ANCHOR_CORRECTION
     return np.where(good[:, None], moved, np.nan).astype(np.float64)
 
@@ -346,7 +347,6 @@ def track_whole(
     frames: Sequence[int] | None = None,
     at: Sequence[float] | None = None,
     every: int | None = None,
-    fps: float | None = None,
     options: SceneTrackOptions | None = None,
 ) -> SceneTracks:
     """Follow every point that can be followed through a whole video, from where it appears to where it is lost.
@@ -362,7 +362,6 @@ def track_whole(
         frames: numbers of the frames to take, from 0; by default all, or of more than ``options.max_frames`` every so many.
         at: moments to take in seconds, instead: the first frame at or after each.
         every: every so many frames, instead.
-        fps: frames per second of pictures and of files without times.
         options: how many points and frames.
 
     Returns:
@@ -386,7 +385,7 @@ def track_whole(
     options = options or SceneTrackOptions()
     check_options(options, SceneTrackOptions)
     wanted = Wanted.of(frames, at, every, None)
-    stream = chunks(source, size=SCENE_FOLLOWING.working_side, fps=fps)
+    stream = chunks(source, size=SCENE_FOLLOWING.working_side)
     if iter(stream) is stream:
         raise ValueError("track_whole: chunks that can be read only once, and two passes are needed; give a list of them")
     step = 1 if frames or at or every else -(-_length(stream) // options.max_frames)
@@ -397,23 +396,14 @@ def track_whole(
     positions = select_longest(book.table(len(taken)), least, 2 * options.max_tracks)
     kept = evenly_spaced(len(taken), NUM_PICTURES)
     pictures: Images = []
-    positions = refine_along_spans(positions, _collect_pictures(_read(stream, taken), kept, pictures))
+    positions = refine_along_spans(positions, _collect_pictures(select_frames(stream, taken), kept, pictures))
     count = int((np.isfinite(positions[..., 0]).sum(axis=0) >= least).sum())
     positions = select_longest(positions, least, options.max_tracks)
-    scale = getattr(stream, "scale", (1.0, 1.0))
-    shape = pictures[0].shape
-    shown = (round(shape[1] / scale[0]), round(shape[0] / scale[1]))
-    check(positions, taken, named)
-    moments = np.array([times[k] for k in taken])
-    untimed = isinstance(stream, PictureSequence) and stream.fps is None
-    notes = [frames_said(taken, moments, len(times), untimed) + f"; at most {options.max_frames} are taken" * (step > 1)]
+    notes = []
     if count > options.max_tracks:
         notes.append(f"{options.max_tracks:,} of {count:,} points are used: those seen longest, and some of the others")
-    points = transform(np.asarray(np.linalg.inv(shrink_matrix(scale)), np.float64), positions)
-    return SceneTracks(
-        torch.from_numpy(points), torch.from_numpy(moments), tuple(taken), len(times), shown, tuple(pictures),
-        (*notes, *getattr(stream, "notes", ())), tuple(kept),
-    )  # fmt: skip
+    why = f"; at most {options.max_frames} are taken" * (step > 1)
+    return _scene_tracks(stream, named, positions, pictures, taken, times, why, notes, tuple(kept))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -529,18 +519,6 @@ def select_longest(positions: Floats, least: int, most: int) -> Floats:
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Second reading: each point compared with an earlier picture, span by span.
-
-
-def _read(stream: Iterable[Chunk], taken: list[int]) -> Iterator[Picture]:
-    """The frames that are taken, one by one."""
-    index, left = 0, set(taken)
-    for chunk in stream:
-        for image in chunk.frames:
-            if index in left:
-                yield image
-            index += 1
-        if index > taken[-1]:
-            return
 
 
 def _collect_pictures(pictures: Iterator[Picture], kept: list[int], out: Images) -> Iterator[Picture]:

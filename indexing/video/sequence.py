@@ -114,3 +114,15 @@ def chunks(source: Source | Sequence[str | Path], size: int | None = None, fps: 
         return PictureSequence(named, size, fps)
     given: Iterable[Chunk] = source  # type: ignore[assignment]
     return given
+
+
+def select_frames(stream: Iterable[Chunk], numbers: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+    """The frames of these numbers, which increase, one by one."""
+    wanted, index = set(numbers), 0
+    for chunk in stream:
+        for image in chunk.frames:
+            if index in wanted:
+                yield image
+            index += 1
+        if index > numbers[-1]:
+            return

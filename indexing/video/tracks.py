@@ -18,6 +18,7 @@ from indexing.video.sequence import chunks
 # ----------------------------------------------------------------------------------------------------------------------
 # Following single points, and where in the picture there is something to follow.
 
+NUM_POINTS = 200  # followed at a time
 STATIC_POINT_SHARE = 0.25  # of points on ground where nothing moves now: people who rest and move later
 MIN_TRACK_EXTENT = 3.0  # pixels from which a track may be worth keeping
 MIN_GRAY_CHANGE = 16  # levels over a chunk, after shrinking by four: beyond noise, where something moved
@@ -46,7 +47,7 @@ POINT_FOLLOWING = FollowSettings()
 class MovingArea:
     """Where something moves within a chunk, for each of its frames: a mask of the frame's size."""
 
-    def __init__(self, chunk: Chunk, path: list[Floats], change: float = MIN_GRAY_CHANGE):
+    def __init__(self, chunk: Chunk, path: list[Floats]):
         height, width = chunk.frames.shape[1:]
         self.shape = (height, width)
         self.shrink = shrink_matrix((0.25, 0.25))
@@ -60,7 +61,7 @@ class MovingArea:
             high = small if high is None else np.maximum(high, small)
         assert low is not None and high is not None
         changes = cv2().GaussianBlur(high - low, (5, 5), 0)
-        changed = (changes > max(change, 3 * float(np.median(changes)))).astype(np.uint8)
+        changed = (changes > max(MIN_GRAY_CHANGE, 3 * float(np.median(changes)))).astype(np.uint8)
         self.small = cv2().dilate(changed, np.ones((5, 5), np.uint8))
 
     def __call__(self, matrix: Floats) -> NDArray[np.uint8]:
@@ -74,11 +75,25 @@ def follow(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where points of one frame are in the next, and which of them can be trusted: following back ends where they came from."""
     how = {"winSize": settings.patch, "maxLevel": 3, "criteria": (3, 20, 0.01)}
-    ahead, found, _ = cv2().calcOpticalFlowPyrLK(before, after, points, None, **how)
-    back, found_back, _ = cv2().calcOpticalFlowPyrLK(after, before, ahead, None, **how)
-    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (np.linalg.norm(back - points, axis=1) < settings.max_return_error)
+    ahead, good = follow_both_ways(before, after, points, None, settings.max_return_error, **how)
     inside = ((ahead >= 2) & (ahead < np.array(after.shape[::-1]) - 2)).all(axis=1)
-    return np.asarray(ahead, np.float32), np.asarray(good & inside)
+    return ahead, good & inside
+
+
+def follow_both_ways(
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    points: NDArray[np.float32],
+    guess: NDArray[np.float32] | None,
+    max_return_error: float,
+    **how: Any,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where points ``(n, 2)`` of one frame are in another, and whether following them back ends where they came from."""
+    origin = None if guess is None else points.copy()
+    ahead, found, _ = cv2().calcOpticalFlowPyrLK(before, after, points, guess, **how)
+    back, found_back, _ = cv2().calcOpticalFlowPyrLK(after, before, ahead, origin, **how)
+    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (np.linalg.norm(back - points, axis=1) < max_return_error)
+    return np.asarray(ahead, np.float32), np.asarray(good)
 
 
 def patches(
@@ -135,10 +150,8 @@ class Tracks:
 def track_points(
     source: str | Path | Source,
     *,
-    count: int = 200,
     keep: int = 40,
     complete: float = 0.7,
-    motion: float | None = None,
 ) -> Tracks:
     """Follow points that move against the background through a video.
 
@@ -148,10 +161,8 @@ def track_points(
 
     Args:
         source: a path, or chunks of grey frames (one pass over them).
-        count: points followed at a time.
         keep: tracks returned at most.
         complete: least share of the frames in which a track must be there, in [0, 1].
-        motion: least extent of a track in pixels (of the middle nine tenths of its positions); default: 1 % of the diagonal.
 
     Returns:
         the tracks; none of them (``n = 0``), and a note, where nothing that moves could be followed long enough.
@@ -172,16 +183,16 @@ def track_points(
         >>> (tracks.points[-1] - tracks.points[0]).median(0).values.round().tolist()
         [57.0, 0.0]
     """
-    if count < 1 or keep < 1:
-        raise ValueError(f"track_points: count and keep must be at least 1, got count={count!r}, keep={keep!r}")
+    if keep < 1:
+        raise ValueError(f"track_points: keep must be at least 1, got {keep!r}")
     if not 0 <= complete <= 1:
         raise ValueError(f"track_points: complete is a share of the frames in [0, 1], got {complete!r}")
-    background, path, book = Background(), PathBuilder(), _MovingBook(count)
+    background, path, book = Background(), PathBuilder(), _MovingBook()
     previous: NDArray[np.uint8] | None = None
     for chunk in (stream := chunks(source, size=POINT_FOLLOWING.working_side)):
         moved = [path.add(background, image) for image in chunk.frames]
         path.times.extend(chunk.times.tolist())
-        where = MovingArea(chunk, moved, MIN_GRAY_CHANGE)
+        where = MovingArea(chunk, moved)
         for image, matrix in zip(chunk.frames, moved, strict=True):
             book.look(previous, image, where(matrix), matrix)
             previous = image
@@ -189,8 +200,8 @@ def track_points(
     if len(path.times) < 2:
         raise ValueError(f"track_points: the video has {len(path.times)} frame(s); tracks need at least 2")
     scale = getattr(stream, "scale", (1.0, 1.0)) if isinstance(source, (str, Path)) else (1.0, 1.0)
-    camera = path.finish(scale, None, getattr(stream, "notes", ()))
-    limit = MIN_MOTION * float(np.hypot(*camera.size)) if motion is None else motion
+    camera = path.finish(scale, getattr(stream, "notes", ()))
+    limit = MIN_MOTION * float(np.hypot(*camera.size))
     points, notes = _select(book, camera, scale, limit, complete, keep)
     notes += [*camera.notes, *([f"{camera}; it is taken out"] if camera.moves else [])]
     return Tracks(torch.from_numpy(points), torch.from_numpy(camera.times), camera.size, camera, tuple(notes))
@@ -280,8 +291,8 @@ class Book:
 class _MovingBook(Book):
     """Points that move: they are looked for where something does."""
 
-    def __init__(self, count: int):
-        super().__init__(count, POINT_FOLLOWING)
+    def __init__(self) -> None:
+        super().__init__(NUM_POINTS, POINT_FOLLOWING)
         self.moved: list[Floats] = []
         self.where = np.zeros((0, 0), np.uint8)
 

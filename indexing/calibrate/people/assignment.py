@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dyntorch.core import Notice
+from dyntorch import Clocks, Status, combine_shifts
+from dyntorch.core import Notice, NoticeCode
 from indexing.calibrate.people.pair_geometry import (
-    INITIAL_SIGMA,
     MAX_DETECTION_DISTANCE,
     NUM_REWEIGHTINGS,
     STRANGER_DISTANCE,
@@ -27,11 +27,10 @@ from indexing.calibrate.people.pair_geometry import (
     sum_over_time,
     synchronize_tracklets,
 )
-from indexing.calibrate.people.result import PeopleNotice
 from indexing.calibrate.people.tracklets import Booleans, Floats, Integers, Tracklets, cluster, exchange
 
 if TYPE_CHECKING:
-    from dyntorch import Calibration, Clocks
+    from dyntorch import Clocks
 
 Pair = tuple[int, int]
 
@@ -42,6 +41,41 @@ NUM_CLOCK_PAIRS = 3  # of each camera, where there are as many
 MAX_CLOCK_CHANGE = 1.0  # frames that undecided clocks by everybody may be off those by two people
 MAX_ITERATIONS = 6  # clustering tracklets and refitting pairwise geometry
 MIN_PERSON_SECONDS = 0.3  # that a person is seen by two cameras
+
+
+class PeopleNotice(NoticeCode):
+    """What to know of who is who in the cameras, or why it is not decided."""
+
+    NOBODY = (
+        "nobody",
+        "nobody is seen by two cameras for long enough ({value:g} s); film longer, or lower the confidence that joints need",
+        Status.TOO_FEW,
+    )
+    """Nobody to tell apart."""
+    CLOCKS = (
+        "clocks",
+        "the clocks of the cameras are not decided, so nobody can be compared: {reason}; give the clocks, or film longer",
+        Status.AMBIGUOUS,
+    )
+    """Clocks that the people do not decide."""
+    LOST = (
+        "unrelated",
+        "{names}: nobody there is somebody whom another camera shows; check that all cameras film the same people at the same "
+        "time, or leave it out",
+        Status.NO_CONSENSUS,
+    )
+    """A camera that shows other people, another time, or too little."""
+    ALIKE = (
+        "alike",
+        "{names}: persons {first} and {second} exchanged fit as well (by {value:.1f} nats): they do the same at the same time, or "
+        "are seen too shortly; add a camera, film them longer, or apart",
+        Status.AMBIGUOUS,
+    )
+    """Two people who can be exchanged in a camera."""
+    EXCHANGED = "exchanged", "{name}: the tracker exchanged people {value:g} times, mended ({times})"
+    """Numbers of a tracker that were mended."""
+    ALONE = "alone", "{name}: {value:.0f} % of the detections are nobody whom another camera shows, and are left out"
+    """Detections that belong to nobody."""
 
 
 def estimate_spanning_tree(views: Sequence[PieceView], known: Floats | None) -> tuple[Floats, dict[Pair, CameraPair], list[int]]:
@@ -100,23 +134,6 @@ class Assignment:
     def of(self, camera: int) -> Integers:
         """Labels of the pieces of a camera."""
         return self.labels[self.starts[camera] : self.starts[camera + 1]]
-
-
-def calibrated_pairs(views: Sequence[PieceView], clocks: Floats, calibration: Calibration) -> dict[Pair, CameraPair]:
-    """The relations of all pairs of known cameras: :math:`F = K_j^{-T} [t]_\\times R K_i^{-1}` with the motion R, t from i to j."""
-    K, R, t = (getattr(calibration, name).detach().numpy().astype(np.float64) for name in ("K", "R", "t"))
-    inverse = np.linalg.inv(K)
-    out = {}
-    for i, j in combinations(range(len(views)), 2):
-        turn = R[j] @ R[i].T
-        x, y, z = t[j] - turn @ t[i]
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        fundamental = inverse[j].T @ cross @ turn @ inverse[i]
-        norm = np.linalg.norm(fundamental)
-        if norm > 0:  # two cameras at one place have no epipolar geometry
-            sigma = INITIAL_SIGMA * np.sqrt(views[i].pieces.size * views[j].pieces.size)
-            out[i, j] = CameraPair(*relative_clock(clocks, i, j), fundamental / norm, float(sigma), held=True)
-    return out
 
 
 def _orient_pair(relations: dict[Pair, CameraPair], i: int, j: int, clock: tuple[float, float]) -> CameraPair | None:
@@ -191,7 +208,6 @@ def _refit_pairs(sorting: Assignment, both: dict[Pair, CommonFrames], clocks: Fl
 
 def estimate_clocks(sorting: Assignment, clocks: Floats, lost: Sequence[int]) -> tuple[Clocks | None, Floats, list[Notice]]:
     """The clocks of all cameras by everybody who was recognized, whether they are decided, and the table that follows from them."""
-    from dyntorch import combine_shifts
 
     pairs = _pairs_to_compare(sorting)
     people = _longest_seen(sorting)
@@ -264,7 +280,6 @@ def identities(sorting: Assignment) -> list[int]:
 
 MIN_SPLIT_EVIDENCE = 6.0  # nats on both sides of a split
 MAX_TEST_FRAMES = 60  # at which two people are exchanged to test whether they fit as well
-MAX_TEST_POINTS = 1000  # by which geometries are fitted then
 NUM_TEST_REWEIGHTINGS = 4  # steps of reweighted least squares then
 MAX_PARTNERS = 3  # cameras that a camera is compared with: those with most people in common
 TEST_SHIFTS = (-1.7, -1.1, -0.6, 0.6, 1.1, 1.7)  # seconds by which a camera is shifted to test whether its people fit at any time
@@ -417,9 +432,7 @@ class ExchangeTrial:
         return self.right - max(0.0, self._score(labels[0][:, None] == labels[1][None], self.both))
 
     def _score(self, matched: Booleans, both: CommonFrames) -> float:
-        start = self.relation
-        if not start.held:
-            start = replace(start, fundamental=np.full((3, 3), np.nan), sigma=both.spread)
+        start = replace(self.relation, fundamental=np.full((3, 3), np.nan), sigma=both.spread)
         again = fit_pair(start, both, matched, NUM_TEST_REWEIGHTINGS)
         if again is None:
             return 0.0

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dyntorch.core import Notice, status_from
+from dyntorch import Clocks, Status
+from dyntorch.core import Notice, Outcome, status_from
 from indexing.calibrate.people.assignment import (
     Assignment,
+    PeopleNotice,
     assign,
-    calibrated_pairs,
     certainties,
     estimate_clocks,
     estimate_spanning_tree,
@@ -23,14 +24,11 @@ from indexing.calibrate.people.assignment import (
     split_inconsistent,
 )
 from indexing.calibrate.people.pair_geometry import MIN_SEED_SECONDS, PieceView, arrange
-from indexing.calibrate.people.result import Association, PeopleNotice, TrackExchange
 from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Floats, Integers, sightings, split_tracks
 from indexing.clip import Clip
 from indexing.joints import has_names, places
+from indexing.skeleton import Skeleton
 from indexing.sync.recordings import Take
-
-if TYPE_CHECKING:
-    from dyntorch import Calibration, Clocks
 
 MIN_COMMON_JOINTS = 8  # of the same name in all cameras, as in synchronize
 MAX_SPLITS = 3  # times that tracklets are split where other cameras see two people in them
@@ -41,8 +39,6 @@ MAX_LISTED_TIMES = 4  # in a notice
 def associate(
     takes: Sequence[Take | Clip | Sequence[Clip]],
     clocks: Clocks | ArrayLike | None = None,
-    *,
-    calibration: Calibration | None = None,
 ) -> Association:
     r"""Who is who in cameras that nobody calibrated, by the epipolar distance over time.
 
@@ -61,15 +57,12 @@ def associate(
             Numbers may be exchanged where people cross, people may come and go, and some may not be there at all.
         clocks: where they are known: :class:`dyntorch.Clocks`, offsets ``(cameras,)`` in seconds, or ``(cameras, 2)`` offsets and
             rates, :math:`t_i = \text{rate}_i\, t + \text{offset}_i`.
-        calibration: the cameras where they are known, for a second and surer pass: clocks (unless they are given) and fundamental
-            matrices are theirs, and distances those of pixels without lens distortion.  The Sampson distance is then the
-            reprojection error of the point that two cameras see, to first order.
 
     Returns:
         The people of all cameras in one order; refused where clocks or identities are not decided.
 
     Raises:
-        ValueError: fewer than two cameras, people with other joints, or clocks or a calibration of other cameras.
+        ValueError: fewer than two cameras, people with other joints, or clocks of other cameras.
 
     Source:
         Clustering: Bansal, Blum and Chawla 2004, Correlation clustering; distances: Hartley and Zisserman, section 11.4.3.
@@ -90,19 +83,12 @@ def associate(
     everyone, names = _people(takes)
     joints = _common_joints(everyone, names)
     seen = [sightings(clips, name, places_) for clips, name, places_ in zip(everyone, names, joints, strict=True)]
-    if calibration is not None:
-        _check_cameras(calibration, len(seen))
-        seen = [_undistort(one, calibration, camera) for camera, one in enumerate(seen)]
-        clocks = calibration.clocks if clocks is None else clocks
     known = None if clocks is None else _clock_table(clocks, len(seen))
     views = [arrange(one, split_tracks(one)) for one in seen]
     if not any(len(one.pieces) for one in views):
         empty = Assignment(views, {}, np.zeros(0, dtype=np.int64))
-        return _result(everyone, empty, clocks, np.tile([0.0, 1.0], (len(seen), 1)), [_nobody_notice()])
-    if calibration is None or known is None:
-        times, relations, lost = estimate_spanning_tree(views, known)
-    else:
-        times, relations, lost = known, calibrated_pairs(views, known, calibration), []
+        return _result(everyone, empty, clocks, np.tile([0.0, 1.0], (len(seen), 1)), [])
+    times, relations, lost = estimate_spanning_tree(views, known)
     sorting = assign(views, times, relations)
     limits: list[Notice] = []
     if known is None:
@@ -113,9 +99,10 @@ def associate(
         if not changed:
             break
         sorting = assign(views, times, sorting.relations)
-    if calibration is None:
-        lost = sorted({*lost, *find_unrelated_cameras(sorting)})
-    limits += _unrelated_notice(lost, names) + find_ambiguous_people(sorting, names)
+    lost = sorted({*lost, *find_unrelated_cameras(sorting)})
+    if lost:
+        limits.append(Notice(PeopleNotice.LOST, float(len(lost)), {"names": ", ".join(names[k] for k in lost)}))
+    limits += find_ambiguous_people(sorting, names)
     return _result(everyone, sorting, clocks, times, limits)
 
 
@@ -178,8 +165,6 @@ def _common_joints(everyone: Sequence[Sequence[Clip]], names: Sequence[str]) -> 
 
 def _clock_table(clocks: Clocks | ArrayLike, cameras: int) -> Floats:
     """``(cameras, 2)`` offsets and rates."""
-    from dyntorch import Clocks
-
     if isinstance(clocks, Clocks):
         values = np.stack([clocks.offsets.numpy(), clocks.rates.numpy()], axis=1)
     else:
@@ -190,36 +175,8 @@ def _clock_table(clocks: Clocks | ArrayLike, cameras: int) -> Floats:
     return values
 
 
-def _check_cameras(calibration: Calibration, cameras: int) -> None:
-    if len(calibration.K) != cameras:
-        raise ValueError(f"calibration: is of {len(calibration.K)} cameras, and there are {cameras} takes; give one for each")
-
-
-def _undistort(seen: CameraSightings, calibration: Calibration, camera: int) -> CameraSightings:
-    """Without the distortion of the lens."""
-    import torch
-
-    from dyntorch.geometry import undistort
-
-    lens = calibration.distortion[camera]
-    if not bool(lens.any()):
-        return seen
-    flat = torch.from_numpy(seen.places.reshape(1, -1, 2))
-    straight = undistort(flat, calibration.K[camera][None], lens[None]).numpy().reshape(seen.places.shape)
-    known = np.isfinite(straight).all(-1)
-    return replace(seen, places=np.where(known[..., None], straight, np.nan), trust=np.where(known, seen.trust, 0.0))
-
-
-def _nobody_notice() -> Notice:
-    return Notice(PeopleNotice.NOBODY, MIN_SEED_SECONDS)
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # What is returned.
-
-
-def _unrelated_notice(lost: Sequence[int], names: Sequence[str]) -> list[Notice]:
-    return [Notice(PeopleNotice.LOST, float(len(lost)), {"names": ", ".join(names[k] for k in lost)})] if lost else []
 
 
 def _result(
@@ -229,11 +186,9 @@ def _result(
     times: Floats,
     limits: list[Notice],
 ) -> Association:
-    from dyntorch import Clocks
-
     groups = identities(sorting)
     if not groups and not limits:
-        limits = [_nobody_notice()]
+        limits = [Notice(PeopleNotice.NOBODY, MIN_SEED_SECONDS)]
     certain = certainties(sorting) if len(sorting.labels) else np.zeros(0)
     joints, confidence, tracks, certainty, left_out, exchanges = [], [], [], [], [], []
     notices: list[Notice] = []
@@ -306,3 +261,113 @@ def _camera_notices(one: PieceView, camera: int, moments: Sequence[TrackExchange
     if there and missed.sum() > MIN_REPORTED_SHARE * there:
         notices.append(Notice(PeopleNotice.ALONE, 100.0 * float(missed.sum()) / there, {"name": name, "camera": camera}))
     return notices
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is returned.
+
+
+@dataclass(frozen=True)
+class TrackExchange:
+    """A moment from which on a tracker gives a person another number.
+
+    Attributes:
+        camera: its number.
+        person: the identity.
+        time: seconds on the camera's clock.
+        before, after: the tracks of the camera that were and are this person.
+    """
+
+    camera: int
+    person: int
+    time: float
+    before: int
+    after: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Association(Outcome):
+    """Who is who in all cameras.
+
+    Attributes:
+        names: of the cameras.
+        times: per camera ``(frames,)`` seconds on its own clock.
+        joints: per camera ``(frames, people, joints, 2)`` px, NaN where somebody is not in view.  Person k is person k everywhere.
+        confidence: per camera ``(frames, people, joints)`` as given (1 where nobody gave any), 0 where not in view.
+        tracks: per camera ``(frames, people)``: the number of the clip that somebody is, -1 = not in view.
+        certainty: per camera ``(frames, people)``: probability that this is that person and no other one; NaN = not in view.
+        left_out: per camera ``(frames, clips)`` bool: detections that are nobody.
+        exchanges: what the trackers exchanged.
+        clocks: of all cameras as :class:`dyntorch.Clocks`, found or given; None where they were given as numbers, or nothing tells.
+        offsets_rates: ``(cameras, 2)`` the clocks that were used: seconds, and seconds per second.
+        fundamentals: of pairs (i, j) of cameras ``(3, 3)`` with x_j^T F x_i = 0, where the cameras have people in common.
+        sigmas: of the same pairs, px: how far the same person is from the epipolar lines.
+        skeletons: per camera, None = unknown.
+    """
+
+    names: tuple[str, ...]
+    times: tuple[Floats, ...]
+    joints: tuple[Floats, ...]
+    confidence: tuple[Floats, ...]
+    tracks: tuple[Integers, ...]
+    certainty: tuple[Floats, ...]
+    left_out: tuple[Booleans, ...]
+    exchanges: tuple[TrackExchange, ...]
+    clocks: Clocks | None
+    offsets_rates: Floats
+    fundamentals: Mapping[tuple[int, int], Floats]
+    sigmas: Mapping[tuple[int, int], float]
+    skeletons: tuple[Skeleton | None, ...]
+
+    TASK = "associate"
+
+    @property
+    def ok(self) -> bool:
+        """Whether the data decide."""
+        return bool(self.status == Status.OK)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know besides the reason."""
+        return tuple(notice.text for notice in self.notices if notice.code.refuses is None)
+
+    @property
+    def people(self) -> int:
+        """How many there are."""
+        return self.tracks[0].shape[1] if self.tracks else 0
+
+    @property
+    def mean_certainty(self) -> float:
+        """Mean certainty of everybody in every frame; NaN where nobody is."""
+        every = np.concatenate([one.ravel() for one in self.certainty]) if self.certainty else np.zeros(0)
+        known = every[np.isfinite(every)]
+        return float(known.mean()) if known.size else float("nan")
+
+    def check(self) -> Self:
+        """Raise where the data do not decide.
+
+        Raises:
+            ValueError: the reason.
+        """
+        if not self.ok:
+            raise ValueError(f"{self.TASK}: {self.reason}")
+        return self
+
+    def clips(self, camera: int) -> list[Clip]:
+        """The people of a camera, each a clip with all of its frames; ``meta["person"]`` is the identity."""
+        fps = 1.0 / float(np.median(np.diff(self.times[camera]))) if len(self.times[camera]) > 1 else 30.0
+        return [
+            Clip(
+                self.joints[camera][:, person], times=self.times[camera], confidence=self.confidence[camera][:, person], fps=fps,
+                name=self.names[camera], skeleton=self.skeletons[camera], up="-y", meta={"person": person},
+            )
+            for person in range(self.people)
+        ]  # fmt: skip
+
+    def __repr__(self) -> str:
+        state = "ok" if self.ok else f"refused: {self.reason}"
+        lines = [f"Association({self.people} people, {len(self.names)} cameras, certainty {self.mean_certainty:.3f}, {state})"]
+        for name, tracks in zip(self.names, self.tracks, strict=True):
+            seen = (tracks >= 0).mean(0) if len(tracks) else np.zeros(self.people)
+            lines.append(f"  {name}: in view " + ", ".join(f"{100 * share:.0f} %" for share in seen))
+        return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])

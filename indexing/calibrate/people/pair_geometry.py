@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
+import dyntorch
+from dyntorch import Shift
 from indexing.calibrate.people.tracklets import MIN_JOINTS, Booleans, CameraSightings, Floats, Integers, Tracklets, cluster
-
-if TYPE_CHECKING:
-    from dyntorch import Shift
 
 MAX_DETECTION_DISTANCE = 0.6  # frames from a moment within which a detection stands for it
 MAX_INTERPOLATED_FRAMES = 2.5  # between two detections
@@ -108,7 +108,6 @@ class CameraPair:
     fundamental: Floats
     sigma: float
     shift: Shift | None = None
-    held: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,23 +176,14 @@ def fit_pair(
     both: CommonFrames,
     matched: Booleans,
     rounds: int,
-    most: int | None = None,
 ) -> CameraPair | None:
     """The relation with the fundamental matrix and sigma of those who are the same, by reweighted least squares. matched
     ``(pieces_a, pieces_b)``."""
-    import torch
-
-    import dyntorch
-
     x1, x2, weight = _matched_points(both, matched)
-    every = 1 if most is None else max(1, math.ceil(len(x1) / most))
-    x1, x2, weight = x1[::every], x2[::every], weight[::every]
     if len(x1) < MIN_MATCHES:
         return None
     first, second = torch.from_numpy(x1), torch.from_numpy(x2)
     fundamental, sigma = relation.fundamental, relation.sigma
-    if relation.held:
-        return replace(relation, sigma=_robust_sigma(_sampson(fundamental, x1, x2)[0]))
     for _ in range(rounds):
         if np.isfinite(fundamental).all():
             r, gradient = _sampson(fundamental, x1, x2)
@@ -321,10 +311,6 @@ def _tracklet_points(one: PieceView, piece: int) -> tuple[Floats, Floats, Floats
 
 def synchronize_tracklets(a: tuple[Floats, Floats, Floats], b: tuple[Floats, Floats, Floats], quick: bool = False) -> Shift | None:
     """:func:`dyntorch.synchronize` of times, places ``(frames, n, 2)`` and trust; None where it takes neither."""
-    import torch
-
-    import dyntorch
-
     if min(len(a[0]), len(b[0])) < MIN_SYNCHRONIZE_FRAMES:
         return None
     more: dict[str, Any] = {}

@@ -11,7 +11,7 @@ from typing import Any
 
 from dyntorch.numerics import with_words
 from indexing.calibrate import CameraRig, RigPriors, calibrate_recordings
-from indexing.calibrate.body_height import check_height
+from indexing.calibrate.priors import check_height
 from indexing.cli.console import check_folder, count, finish, flag_words, progress, show
 from indexing.cli.flags.cameras import Calibrate
 from indexing.cli.flags.shared import Watched

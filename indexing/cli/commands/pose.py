@@ -13,7 +13,7 @@ from indexing.cli.flags.cameras import Pose
 from indexing.clip import check_fps
 from indexing.pose import models as files
 from indexing.pose import writing
-from indexing.pose.detection import VideoTask, made_by, workers_here
+from indexing.pose.detection import VideoTask, workers_here
 from indexing.pose.models import cache_folder
 from indexing.pose.writing import KeypointFile
 
@@ -58,7 +58,7 @@ def _work(flags: Pose, folder: Path) -> int:
     begun, rows, notes, failed, done = time.perf_counter(), [], [], [], 0
     try:
         with counting_bar("looking at " + count(len(tasks), "video"), "frames/s") as bar:
-            for task, made in writing.keypoint_files(tasks, folder, made_by(models), workers, bar, flags.json):
+            for task, made in writing.keypoint_files(tasks, folder, models, workers, bar, flags.json):
                 if isinstance(made, ValueError):
                     failed.append(made)
                     continue

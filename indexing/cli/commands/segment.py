@@ -32,7 +32,7 @@ from indexing.cli.console import (
 from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import LEFT_OUT, PICTURE_FILES, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
 from indexing.colmap import MatchDatabase, check_target, find_static, read_database
-from indexing.colmap.masks import write_masks
+from indexing.colmap.static import write_masks
 from indexing.colmap.pair_segmentation import colmap
 from indexing.colmap.static import MIN_PARALLEL_PAIRS
 from indexing.files import manifest

@@ -23,7 +23,7 @@ from indexing.readers.matches import MatchedPair, Photograph
 from indexing.readers.tracks import TrackSet, read_tracks
 from indexing.report.bodies import FILES, FILM, PANELS, BodiesReport
 from indexing.report.segmentation import colour_of
-from indexing.video.overlay import Overlay, write_overlay
+from indexing.video.drawing import Overlay, write_overlay
 from indexing.video.scene import SceneTracks, evenly_spaced
 from indexing.video.sequence import PictureSequence, chunks
 

@@ -21,7 +21,6 @@ from indexing.cli.videos import find_keypoints, wants_keypoints
 from indexing.clip import Clip
 from indexing.files import manifest, prepare
 from indexing.report.sync import FILES, SyncReport
-from indexing.sync.breaks import find_breaks
 from indexing.sync.calibration import named_lenses
 from indexing.sync.files import (
     MOCAP_FOLDER,
@@ -39,7 +38,7 @@ from indexing.sync.files import (
 from indexing.sync.people import Pairing
 from indexing.sync.pose2sim import Trial, numbers, shortest, trial_of, trials_in
 from indexing.sync.recordings import By, Take, find_cameras, take_of
-from indexing.sync.synchronize import BY, Method, recording_notices
+from indexing.sync.synchronize import BY, Method, find_breaks, recording_notices
 from indexing.sync.synchronize import pair as compare_pair
 from indexing.sync.trimming import CameraVideo, check_videos, drop_videos, frame_clock, trim, trim_as_json, video_of, write_videos
 from indexing.video import write_check_video

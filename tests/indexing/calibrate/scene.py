@@ -12,8 +12,8 @@ import torch
 from dyntorch import Calibration, Clocks, Status
 from dyntorch.core import Notice, NoticeCode, status_from
 from indexing.actors import Person, stream
-from indexing.calibrate.body_height import standing_extent
 from indexing.calibrate.camera_views import make_view, select_common_joints
+from indexing.calibrate.priors import standing_extent
 from indexing.calibrate.rig import CameraRig
 from indexing.clip import Clip
 from indexing.skeleton import COCO17

@@ -8,7 +8,6 @@ import torch
 
 from dyntorch import Status
 from indexing.calibrate.people import PeopleNotice, associate, tracklets
-from indexing.calibrate.people.assignment import calibrated_pairs
 from indexing.calibrate.people.pair_geometry import arrange, common_frames, distances
 from indexing.calibrate.people.tracklets import cluster, sightings, split_tracks
 from indexing.clip import Clip
@@ -89,31 +88,6 @@ STANDING_POINTS = np.random.default_rng(0).uniform([-0.8, -0.8, 0.1], [0.8, 0.8,
 def image(rig, camera, points):
     seen = points @ rig.R[camera].numpy().T + rig.t[camera].numpy()
     return seen[:, :2] / seen[:, 2:] * float(rig.K[camera, 0, 0]) + rig.K[camera, :2, 2].numpy()
-
-
-def test_known_cameras():
-    bent = cameras(AROUND, offsets=[0.0, 0.31, -0.22], k1=-0.15)
-    seen = filmed(crossing(np.random.default_rng(3)), bent)
-    found = associate([clips(one) for one in seen], calibration=bent)
-    assert found.ok and found.people == 2
-    assert right(found, [np.tile([0, 1], (150, 1))] * 3) > 0.99
-    assert max(found.sigmas.values()) < 4.0  # without the lens they would be off by more
-    with pytest.raises(ValueError, match="is of 3 cameras, and there are 2 takes"):
-        associate([clips(one) for one in seen[:2]], calibration=bent)
-
-
-def test_relations_of_known_cameras_hold_for_every_point():
-    rig = cameras(AROUND)
-    views = [
-        arrange(one, split_tracks(one))
-        for one in (sightings(clips(x), "") for x in filmed(crossing(np.random.default_rng(0)), rig, 20))
-    ]
-    relations = calibrated_pairs(views, np.tile([0.0, 1.0], (3, 1)), rig)
-    assert set(relations) == {(0, 1), (0, 2), (1, 2)}
-    for (i, j), relation in relations.items():
-        x, y = image(rig, i, STANDING_POINTS), image(rig, j, STANDING_POINTS)
-        away = distances(relation.fundamental, x[None, None], y[None, None])
-        assert np.abs(away).max() < 1e-6
 
 
 def test_distances_are_sampsons():

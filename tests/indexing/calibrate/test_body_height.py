@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexing.actors import Person, perform
-from indexing.calibrate.body_height import check_height, standing_extent
+from indexing.calibrate.priors import check_height, standing_extent
 from indexing.skeleton import BODY25, BODY25B, COCO17, HAND21, MEDIAPIPE33
 
 

@@ -104,7 +104,7 @@ def test_lenses_and_frame_rates():
         for k, f in enumerate(rates)
     ]
     given = [truth[0], turned(truth[1], slice(None)), *truth[2:]]
-    found = correct_sides(given, rig, NAMES, fps=rates)
+    found = correct_sides(given, rig, NAMES, times=[np.arange(len(one)) / rate for one, rate in zip(given, rates, strict=True)])
     assert (found.tracks[1] == truth[1]).all(2).all(1).mean() > 0.97
     assert all((own == right).all(2).all(1).mean() > 0.97 for own, right in zip(found.tracks, truth, strict=True))
 
@@ -161,8 +161,6 @@ def test_misfit_of_what_is_right_is_none(monkeypatch):
     [
         (lambda x: {"tracks": x[:3]}, "3 given, and there are 4 cameras"),
         (lambda x: {"tracks": [x[0][:, :5], *x[1:]]}, r"expected \(frames, people \* 13 joints, 2\)"),
-        (lambda x: {"fps": 0.0}, "positive number"),
-        (lambda x: {"fps": (30.0, 30.0)}, "one for each of 4 cameras"),
         (lambda x: {"times": [np.zeros(90)] * 4}, "increasing seconds"),
         (lambda x: {"weights": [np.ones((90, 2))] * 4}, "as the tracks have it"),
     ],

@@ -14,8 +14,8 @@ import dyntorch
 from dyntorch.core import Notice, status_from
 from indexing.calibrate import CameraRig, calibrate
 from indexing.calibrate import pipeline as verb
-from indexing.calibrate.body_height import scale_calibration, scale_to_metres, standing_extent
 from indexing.calibrate.people import PeopleNotice
+from indexing.calibrate.priors import scale_calibration, scale_to_metres, standing_extent
 from indexing.report.calibration import CalibrationReport, write_calibration
 from indexing.skeleton import COCO17
 from tests.indexing.calibrate.scene import FPS, LATE, SIZE, Asked, filmed, solved, truth, write_cameras

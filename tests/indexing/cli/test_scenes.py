@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from indexing.actors.sheets import render, sheet
+from indexing.actors.textured import render, sheet
 from indexing.cli import main
-from indexing.video.overlay import encode
+from indexing.video.drawing import encode
 
 SIZE, FRAMES = (240, 180), 10
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")

@@ -18,9 +18,9 @@ import dyntorch
 from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.numerics import Message
 from dyntorch.tasks.segment.result import TrackSegmentation
-from indexing.actors.sheets import render, sheet
+from indexing.actors.textured import render, sheet
 from indexing.report.bodies import FILES, FILM
-from indexing.video.overlay import encode
+from indexing.video.drawing import encode
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 

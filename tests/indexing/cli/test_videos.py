@@ -13,9 +13,8 @@ from indexing import Archive, ClipSet
 from indexing.cli import main
 from indexing.readers import read
 from indexing.readers.files import WatchOptions
-from indexing.sync.notices import SyncNotice
 from indexing.sync.people import Pairing
-from indexing.sync.recordings import take_of
+from indexing.sync.recordings import SyncNotice, take_of
 from tests.indexing.pose.conftest import seeing as seeing
 from tests.indexing.pose.test_detection import film, person
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from indexing.colmap.masks import draw_mask, gray_png, mask_name, write_masks
+from indexing.colmap.static import draw_mask, gray_png, mask_name, write_masks
 
 
 def test_masks_cover_the_moving_points_and_leave_the_static_ones(scene, found, tmp_path):

@@ -12,7 +12,7 @@ import pytest
 from experiments.segmentation.colmap import mapped, worst, write_scene
 from experiments.segmentation.photographs import photographs
 from indexing.colmap import StaticOptions, find_static, read_database
-from indexing.colmap.pair_segmentation import divide, prepare_images, select_pairs, task
+from indexing.colmap.pair_segmentation import divide, prepare_image, select_pairs, task
 from tests.indexing.colmap.test_database import changed, sha256
 
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -121,7 +121,7 @@ def test_of_each_image_the_pairs_with_most_matches_are_divided(found):
 
 def test_matches_beyond_the_most_join_those_beside_them(scene, found):
     """Half of the matches are divided, and nearly as many are labelled as if all were."""
-    images = prepare_images(found.database)
+    images = [prepare_image(found.database, image) for image in found.database.images]
     pair, whole = found.database.pairs[0], found.bodies[0]
     half = divide(task(pair, images, 2.5, True, 0, StaticOptions(max_matches=len(pair.matches) // 2)))
     still = scene.still(pair.first, pair.second, pair.matches)
@@ -136,7 +136,8 @@ def test_lens_distortion_is_undone(given, tmp_path):
     """A camera of COLMAP's model SIMPLE_RADIAL: number 2, with parameters f, cx, cy, k."""
     params = np.array([700.0, 480, 360, -0.1]).tobytes().hex()
     path = changed(given, tmp_path / "bent.db", f"UPDATE cameras SET model = 2, params = x'{params}'")
-    (image, *_), database = prepare_images(read_database(path)), read_database(path)
+    database = read_database(path)
+    image = prepare_image(database, database.images[0])
     rays = (image.points - [480, 360]) / 700
     bent = rays * (1 - 0.1 * (rays**2).sum(axis=1, keepdims=True)) * 700 + [480, 360]
     assert np.abs(bent - database.images[0].points).max() < 1e-3

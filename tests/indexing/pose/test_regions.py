@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from indexing.pose.blazepose import JOINTS, REGION
-from indexing.pose.regions import Region, VideoPicture, about
+from indexing.pose.blazepose import JOINTS, REGION, Region, VideoPicture, about
 from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
 
 av = pytest.importorskip("av")

@@ -8,9 +8,8 @@ from itertools import count
 import numpy as np
 import pytest
 
-from indexing.pose import reidentification as room
-from indexing.pose.reidentification import Sightings, concatenate, identities, largest
-from indexing.pose.tracking import windows
+from indexing.pose import tracking as room
+from indexing.pose.tracking import Sightings, concatenate, identities, largest, windows
 
 BODY = np.array([[0.0, 0.0], [20.0, 30.0], [10.0, 80.0]])
 

@@ -15,9 +15,9 @@ import dyntorch
 from dyntorch import Status
 from dyntorch.core import Notice, NoticeCode
 from indexing.cli import main
-from indexing.sync.breaks import find_breaks, retime
 from indexing.sync.people import Pairing
 from indexing.sync.recordings import take_of
+from indexing.sync.synchronize import find_breaks, retime
 from indexing.sync.trimming import FOLDER
 from tests.indexing.sync.footage import numbers_of, write_film
 from tests.indexing.sync.scene import FPS, cut, filmed, shift, write_openpose

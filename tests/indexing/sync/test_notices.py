@@ -8,7 +8,8 @@ from dyntorch.core import Notice
 from dyntorch.numerics import Message, with_names, with_words
 from dyntorch.tasks.synchronize.result import ClocksNotice, ShiftNotice
 from indexing.cli.commands.sync import WORDS
-from indexing.sync.notices import BrightnessNotice, SyncNotice
+from indexing.sync.brightness import BrightnessNotice
+from indexing.sync.recordings import SyncNotice
 
 NAMES = {"a": "left-1", "b": "right", "0": "left-1", "1": "mid", "2": "right"}
 

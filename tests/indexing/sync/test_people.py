@@ -9,9 +9,8 @@ import torch
 import dyntorch
 from indexing.clip import Clip
 from indexing.readers import read
-from indexing.sync.options import SyncOptions
 from indexing.sync.people import Pairing, decide, disagreements, jumps, match_people
-from indexing.sync.recordings import Take, take_of
+from indexing.sync.recordings import SyncOptions, Take, take_of
 from indexing.sync.synchronize import pair, synchronize
 from tests.indexing.sync.scene import FPS, cut, filmed, moved, shift, write_openpose
 

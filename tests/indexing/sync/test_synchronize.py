@@ -13,9 +13,8 @@ import dyntorch
 import indexing
 from indexing.clip import Clip, ClipSet
 from indexing.skeleton import COCO17, HALPE26, Skeleton
-from indexing.sync.options import SyncOptions
 from indexing.sync.people import common_joints
-from indexing.sync.recordings import take_of
+from indexing.sync.recordings import SyncOptions, take_of
 from indexing.sync.synchronize import combine_methods, recording_notices, synchronize
 from tests.indexing.sync.scene import FPS, SKIPPED, cut, moved, shift, told, write_openpose
 
@@ -268,9 +267,6 @@ def test_two_methods_that_agree_decide_and_two_that_do_not_refuse():
 @pytest.fixture
 def methods(monkeypatch, library):
     """Tracks and brightness, known: tracks of the values' first ``n`` points, brightness at +0.5 s."""
-    import indexing.sync.brightness
-    import indexing.video
-
     asked: dict = {"tracks": [], "brightness": [], "count": 12}
 
     def tracks(source, **_):
@@ -284,8 +280,8 @@ def methods(monkeypatch, library):
             raise ValueError("a: 5 frames are too few")
         return shift(-0.41, method="brightness", notes=("b: dark",), ok=not asked.get("dark"), reason="halves differ")
 
-    monkeypatch.setattr(indexing.video, "track_points", tracks, raising=False)
-    monkeypatch.setattr(indexing.sync.brightness, "brightness_shift", bright, raising=False)
+    monkeypatch.setattr("indexing.sync.synchronize.track_points", tracks)
+    monkeypatch.setattr("indexing.sync.synchronize.brightness_shift", bright)
     return asked
 
 

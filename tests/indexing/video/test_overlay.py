@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from indexing.video import Chunk
-from indexing.video.overlay import LARGER, STRIP, WIDEST, Overlay, write_overlay
+from indexing.video.drawing import LARGER, STRIP, WIDEST, Overlay, write_overlay
 
 RED, BLUE = (220, 40, 40), (40, 90, 220)
 

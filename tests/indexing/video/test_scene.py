@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from indexing.actors.sheets import render, sheet
+from indexing.actors.textured import render, sheet
 from indexing.video import Chunk, SceneTrackOptions, track_scene, track_whole
 from indexing.video.scene import (
     ANCHOR_SPAN,
