@@ -32,9 +32,8 @@ from indexing.cli.console import (
 from indexing.cli.flags.geometry import Segment
 from indexing.cli.scenes import LEFT_OUT, PICTURE_FILES, Asked, as_pair, follow, inputs_of, is_scene, photographs, tracks_csv
 from indexing.colmap import MatchDatabase, check_target, find_static, read_database
-from indexing.colmap.static import write_masks
 from indexing.colmap.pair_segmentation import colmap
-from indexing.colmap.static import MIN_PARALLEL_PAIRS
+from indexing.colmap.static import MIN_PARALLEL_PAIRS, write_masks
 from indexing.files import manifest
 from indexing.readers.matches import MatchedPair, Photograph, read_image, read_pair
 from indexing.readers.tracks import holds_tracks
