@@ -119,8 +119,6 @@ class BundleProblem(LeastSquares):
     """``(b, v, a + 1, k + 1)``, or None for the identity."""
     scale: Tensor | None
     """``(b,)`` the error beyond which one counts as an outlier, or None for least squares."""
-    loss: str
-    """How outliers count: ``"geman_mcclure"`` or ``"huber"``."""
     outside: Tensor | None = None
     """``(b, k + 1, k + 1, n)`` projector onto what is forbidden to each point, 0 for free points; None where all are free."""
     calibration: CalibratedCameras | None = None
@@ -151,11 +149,6 @@ class BundleProblem(LeastSquares):
         square = (images - self.x).square().sum(2)
         if self.scale is None:
             value, slope = square * self.weights, self.weights
-        elif self.loss == "huber":
-            c = self.scale[:, None, None]
-            inside = c / square.clamp(min=TINY).sqrt()  # below 1 beyond the scale
-            value = torch.where(inside < 1, c * (2 * square.sqrt() - c), square) * self.weights
-            slope = inside.clamp(max=1) * self.weights
         else:
             c = self.scale.square()[:, None, None]
             share = c / (c + square)
@@ -328,7 +321,6 @@ def _schur(reduced: Tensor, images: Tensor, slope: Tensor, world: Tensor) -> Ten
 BLOCK = 1 << 20
 """Entries of the largest arrays per block of the batch.  1000 problems of 3 views and 60 points take 0.15 ms per step each with
 2^20, 0.21 ms with 2^18 (a few slow problems at the end of a block cost as many calls as all of them) and 0.19 ms with 2^21."""
-LOSSES = ("geman_mcclure", "huber")
 
 
 @dataclass(frozen=True)
@@ -355,7 +347,6 @@ def bundle_adjust(
     *,
     iterations: int = 50,
     scale: Tensor | float | None = None,
-    loss: str = "geman_mcclure",
     tolerance: float = 1e-9,
     confined: Tensor | None = None,
     subspace: Tensor | None = None,
@@ -366,10 +357,7 @@ def bundle_adjust(
 
     Batched Levenberg-Marquardt; the points are eliminated by the Schur complement.  Every camera and point is kept at norm 1;
     the gauge (collineations of P^k, or what the lifts leave of them) is free, and damping handles it.  The cost never rises.
-    :math:`\rho(s) = s`, or with a scale c
-
-    .. math:: \rho(s) = \frac{c^2 s}{c^2 + s} \quad \text{(Geman-McClure)}, \qquad
-        \rho(s) = \min(s,\; 2 c \sqrt{s} - c^2 \text{ where } s > c^2) \quad \text{(Huber)}.
+    :math:`\rho(s) = s`, or with a scale c that of Geman and McClure, :math:`\rho(s) = c^2 s / (c^2 + s)`.
 
     Points seen in too few views (fewer than k equations), zero points and views without an image that counts stay as they are.
 
@@ -381,7 +369,6 @@ def bundle_adjust(
         lifts: :math:`B_i`, ``(views, a + 1, k + 1)`` or ``(*batch, views, a + 1, k + 1)``; None: the identity (a = k).
         iterations: at most so many steps.
         scale: error beyond which an image counts as an outlier, in the unit of ``x``, one or ``(*batch,)``; None: none does.
-        loss: ``"geman_mcclure"`` or ``"huber"``, used with a scale.
         tolerance: done where a step lowers the cost by less than this fraction.
         confined: ``(*batch, n)`` bool: points kept within a subspace of the constants, such as those known to stand still.  With
             several subspaces the number of each point's, from 1; 0 leaves it free.
@@ -396,7 +383,7 @@ def bundle_adjust(
         infinity; what of it is not finite comes back as 0.
 
     Raises:
-        ValueError: shapes that do not fit each other, another loss, or a scale that is not positive.
+        ValueError: shapes that do not fit each other, or a scale that is not positive.
 
     Source: Triggs et al. 2000, Bundle adjustment, a modern synthesis; cameras P^k -> P^l of thesis chapter 3.
 
@@ -410,7 +397,7 @@ def bundle_adjust(
         >>> bool(bundle_adjust(x, None, *start).cost < 1e-20)
         True
     """
-    batch = check(x, weights, cameras, structure, lifts, loss)
+    batch = check(x, weights, cameras, structure, lifts)
     count, (views, n, size) = prod(batch), x.shape[-3:]
     if calibration is not None and (calibration.shape[-3:] != (views, size + 1, size + 1) or turned not in (2, 3) or size < 2):
         want = f"(*batch, {views}, {size + 1}, {size + 1}) of images or 3D sensors, and turned 2 or 3"
@@ -440,7 +427,7 @@ def bundle_adjust(
     problems = max(1, min(BLOCK // max(1, width), -(-count // workers())))
     clean = each(lambda part: torch.where(part.isfinite(), part, 0.0), (cameras_, points))
     known = None if calibration is None else CalibratedCameras(flat(calibration, views, size + 1, size + 1), turned)
-    given = BundleProblem(flat(images, views, n, size).mT, w, lift, limit, loss, outside, known)
+    given = BundleProblem(flat(images, views, n, size).mT, w, lift, limit, outside, known)
     with torch.no_grad():
         found = map_blocks(run, given, *clean, size=problems)
     # what counts has to be finite; the rest stays as it is
@@ -481,7 +468,7 @@ def _scales(scale: Tensor | float, batch: torch.Size, device: torch.device) -> T
     return given.expand(batch).reshape(prod(batch))
 
 
-def check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor, lifts: Tensor | None, loss: str) -> torch.Size:
+def check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor, lifts: Tensor | None) -> torch.Size:
     """The batch."""
     check_tensor("x", x, "views", "n", "l")
     check_tensor("cameras", cameras, "views", "l + 1", "a + 1")
@@ -500,8 +487,6 @@ def check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor,
         raise ValueError(f"cameras have {wide[1]} columns for points of {wide[2]} coordinates; give lifts {wide}")
     if lifts is not None and lifts.shape[-3:] != wide:
         raise ValueError(f"lifts must be {wide} or (*batch, {wide[0]}, {wide[1]}, {wide[2]}), got {tuple(lifts.shape)}")
-    if loss not in LOSSES:
-        raise ValueError(f"loss must be one of {', '.join(LOSSES)}, got {loss!r}")
     for name, part, last in (("cameras", cameras, 3), ("structure", structure, 2)):
         if check_together(x=(x.double(), 3), **{name: (part.double(), last)}) != x.shape[:-3]:
             raise ValueError(f"{name} have batch {tuple(part.shape[:-last])}, x has {tuple(batch)}; expand x")
@@ -512,7 +497,7 @@ def check(x: Tensor, weights: Tensor | None, cameras: Tensor, structure: Tensor,
 # What images tell about each point of a bundle adjustment, and its covariance.
 
 
-def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None = None, lifts: Tensor | None = None) -> Tensor:
+def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None = None) -> Tensor:
     r"""What the images tell about each point, given the cameras. cameras ``(*batch, views, l + 1, a + 1)``, structure
     ``(*batch, n, k + 1)``, weights ``(*batch, views, n)`` -> ``(*batch, n, k + 1, k + 1)``."""
     check_tensor("cameras", cameras, "views", "l + 1", "a + 1")
@@ -521,7 +506,7 @@ def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None
         raise ValueError(f"cameras must be (*batch, views >= 1, l + 1 >= 2, a + 1), got {tuple(cameras.shape)}")
     batch, views, n = cameras.shape[:-3], cameras.shape[-3], structure.shape[-2]
     x = cameras.new_zeros(*batch, views, n, cameras.shape[-2] - 1)
-    check(x, weights, cameras, structure, lifts, LOSSES[0])
+    check(x, weights, cameras, structure, None)
     count = prod(batch)
 
     def flat(tensor: Tensor, *shape: int) -> Tensor:
@@ -530,7 +515,6 @@ def point_information(cameras: Tensor, structure: Tensor, weights: Tensor | None
     w = flat(mask_missing(x, weights)[1], views, n)
     points = normalize(flat(structure, *structure.shape[-2:]), dim=-1).mT
     w = w * (points != 0).any(1)[:, None]
-    lift = None if lifts is None else flat(lifts, *lifts.shape[-3:])
-    problem = BundleProblem(flat(x, views, n, x.shape[-1]).mT, w, lift, None, LOSSES[0])
+    problem = BundleProblem(flat(x, views, n, x.shape[-1]).mT, w, None, None)
     found = problem.information(flat(cameras, *cameras.shape[-3:]), points)
     return found.permute(0, 3, 1, 2).reshape(*batch, n, *found.shape[1:3]).to(cameras.dtype)

@@ -11,9 +11,7 @@ distance.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import prod
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,16 +28,13 @@ from dyntorch.shapes.moving import (
     MovingShapes,
     canonical,
     canonical_frame,
-    centred_views,
     checked_views,
     fit_shapes,
     shapes_at,
 )
-from dyntorch.shapes.times import TIME_STEPS, Recovery, lowest_minima, tried_times
+from dyntorch.shapes.times import Recovery, date_views
 
 CAMERA = 11
-CHUNK = 1 << 22
-"""Numbers in the largest temporary."""
 RIDGE = 1e-13
 CAMERA_STEPS = 2
 """Gauss-Newton steps from the linear camera."""
@@ -269,7 +264,6 @@ def recover_perspective_times(
     *,
     grid: int = 64,
     interval: tuple[float, float] = (-1.0, 1.0),
-    prior: float = 0.0,
 ) -> Recovery:
     r"""As :func:`~dyntorch.shapes.recover_times`, by perspective images of the shapes.
 
@@ -280,13 +274,12 @@ def recover_perspective_times(
         weights: ``(*batch, views, n)``, 0 = ignore.
         grid: times tried.
         interval: polynomial trajectories: times tried from and to.  Periodic ones are tried over the period.
-        prior: noise variance of the normalized views over that of the relative depths of the points; 0 believes any perspective.
 
     Returns:
         :class:`~dyntorch.shapes.Recovery` in the dtype of x.
 
     Raises:
-        ValueError: shapes that do not agree, or a grid of fewer than 3 times.
+        ValueError: shapes that do not agree, negative weights, or a grid of fewer than 3 times.
 
     Source: thesis chapter 4: one view of enough points determines the time.
 
@@ -300,75 +293,20 @@ def recover_perspective_times(
         >>> bool(found.residual < 1e-12), round(float(found.times), 6)
         (True, 0.3)
     """
-    batch = np.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
-    flat, count = prod(batch), x.shape[-3]
-    times = tried_times(shapes, basis, x, grid, interval)
-    wide = shapes.double().expand(*batch, *shapes.shape[-3:]).reshape(flat, *shapes.shape[-3:])
-    seen = x.double().expand(*batch, *x.shape[-3:]).reshape(flat, *x.shape[-3:])
-    weight = None if weights is None else weights.double().expand(*batch, *x.shape[-3:-1]).reshape(flat, *x.shape[-3:-1])
-    views = centred_views(seen, weight)
-    known = (views.share > 0) & ((views.weights > 0).sum(-1) > 5)
-    step = max(1, CHUNK // (grid * 50 * x.shape[-2] * max(1, flat)))
-    pieces = [slice(i, i + step) for i in range(0, max(1, count), step)]
-    dater = _Dater(wide, basis, times, prior)
-    parts = [dater(views.x[:, p], views.weights[:, p]) for p in pieces]
-    found = [torch.cat(part, dim=1) for part in zip(*parts, strict=True)]
-    middle = times[len(times) // 2]
-    none = (middle.new_tensor(1.0), middle, middle.new_tensor(torch.inf), middle, middle.new_tensor(0.0))
-    done = [torch.where(known, part, value).reshape(*batch, count).to(x.dtype) for part, value in zip(found, none, strict=True)]
-    return Recovery(*done, status=status_of(torch.zeros_like(known), ~known).reshape(*batch, count))
 
+    def image(shapes: Tensor, x: Tensor, weights: Tensor, t: Tensor) -> PerspectiveViews:
+        shape = shapes_at(shapes, basis.rows(t).flatten(1, 2)).unflatten(1, t.shape[1:])
+        return perspective(
+            x[:, :, None].expand(*t.shape, *x.shape[-2:]), weights[:, :, None].expand(*t.shape, weights.shape[-1]), shape, 0.0
+        )
 
-@dataclass(frozen=True)
-class _Dater:
-    """Residual, time, sigma, second and rise of some of the views, ``(b, views)`` each."""
+    def curve(shapes: Tensor, x: Tensor, weights: Tensor, times: Tensor) -> Tensor:
+        return image(shapes, x, weights, times.expand(*x.shape[:2], -1)).residual.square().sum(-1)
 
-    shapes: Tensor
-    basis: Trajectory
-    times: Tensor
-    prior: float
+    def slopes(shapes: Tensor, x: Tensor, weights: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        found = image(shapes, x, weights, t)
+        speed = shapes_at(shapes, basis.slopes(t).flatten(1, 2)).unflatten(1, t.shape[1:])
+        slope = found.across((found.slopes @ speed[..., None])[..., 0].flatten(-2)[..., None])[..., 0]
+        return found.residual.square().sum(-1), (found.residual * slope).sum(-1), slope.square().sum(-1)
 
-    def __call__(self, x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-        periodic, step = self.basis.period is not None, self.times[1] - self.times[0]
-        curve = self.costs(x, weights, self.times.expand(*x.shape[:2], -1))
-        place, lone = lowest_minima(curve, periodic)
-        t, f, h = self.refine_times(x, weights, self.times[place], step)
-        f = torch.where(lone, torch.inf, f)
-        order = f.argsort(-1)
-        t, f, h = (part.gather(-1, order) for part in (t, f, h))
-        second = torch.where(f[..., 1].isfinite(), t[..., 1], t[..., 0])
-        return f[..., 0].clamp(0, 1), t[..., 0], h[..., 0].clamp(min=1e-300).rsqrt(), second, f[..., 1] - f[..., 0]
-
-    def project_at(self, x: Tensor, weights: Tensor, t: Tensor) -> PerspectiveViews:
-        """Views ``(b, views, n, 2)`` at times ``(b, views, times)``."""
-        shape = shapes_at(self.shapes, self.basis.rows(t).flatten(1, 2)).unflatten(1, t.shape[1:])
-        many = (x[:, :, None].expand(*t.shape, *x.shape[-2:]), weights[:, :, None].expand(*t.shape, weights.shape[-1]))
-        return perspective(*many, shape, self.prior)
-
-    def costs(self, x: Tensor, weights: Tensor, t: Tensor) -> Tensor:
-        """With what the prior adds, ``(b, views, times)``."""
-        return self.project_at(x, weights, t).residual.square().sum(-1)
-
-    def refine_times(self, x: Tensor, weights: Tensor, start: Tensor, step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Times, costs and curvatures at the minima next to ``start``; not more than a step away."""
-        low, high = start - step, start + step
-        if self.basis.period is None:
-            low, high = low.clamp(min=self.times[0]), high.clamp(max=self.times[-1])
-
-        def at(t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            found = self.project_at(x, weights, t)
-            speed = shapes_at(self.shapes, self.basis.slopes(t).flatten(1, 2)).unflatten(1, t.shape[1:])
-            moved = (found.slopes @ speed[..., None])[..., 0].flatten(-2)
-            slope = found.across(moved[..., None])[..., 0]
-            return found.residual.square().sum(-1), (found.residual * slope).sum(-1), slope.square().sum(-1)
-
-        t, size = start, torch.ones_like(start)
-        f, gain, curvature = at(t)
-        for _ in range(TIME_STEPS):
-            trial = (t + size * gain / curvature.clamp(min=1e-300)).clamp(low, high)
-            fresh = at(trial)
-            better = fresh[0] < f
-            t = torch.where(better, trial, t)
-            f, gain, curvature = (torch.where(better, new, old) for new, old in zip(fresh, (f, gain, curvature), strict=True))
-            size = torch.where(better, 1.0, size / 4)
-        return t, f, curvature
+    return date_views(shapes, basis, x, weights, grid, interval, curve, slopes, width=50 * x.shape[-2], min_points=6)

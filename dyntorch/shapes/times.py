@@ -3,6 +3,7 @@ r"""When a single view of a moving shape was taken: the residual over a grid of 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import prod
 
@@ -100,6 +101,42 @@ def recover_times(
         >>> bool(found.residual < 1e-12), round(float(found.times), 6)
         (True, 0.3)
     """
+
+    def project_at(shapes: Tensor, x: Tensor, weights: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        x, weights = x[:, :, None], weights[:, :, None]
+        rows, slopes = (f(t).flatten(1, 2) for f in (basis.rows, basis.slopes))
+        shape, speed = (shapes_at(shapes, c).unflatten(1, t.shape[1:]) for c in (rows, slopes))
+        found = project(x, weights.expand(*t.shape, -1), shape)
+        seen = weights.sqrt()[..., None] * (speed - (speed * weights[..., None]).mean(-2, keepdim=True)) @ found.cameras
+        slope = seen - found.basis @ (found.basis.mT @ seen)
+        gain = (found.residual * slope).sum((-2, -1))
+        return found.residual.square().sum((-2, -1)), gain, slope.square().sum((-2, -1))
+
+    def curve(shapes: Tensor, x: Tensor, weights: Tensor, times: Tensor) -> Tensor:
+        return residuals_at(shapes, basis.rows(times), x, weights)
+
+    return date_views(shapes, basis, x, weights, grid, interval, curve, project_at, width=16, min_points=1)
+
+
+Curve = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+Slopes = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+
+
+def date_views(
+    shapes: Tensor,
+    basis: Trajectory,
+    x: Tensor,
+    weights: Tensor | None,
+    grid: int,
+    interval: tuple[float, float],
+    curve: Curve,
+    slopes: Slopes,
+    *,
+    width: int,
+    min_points: int,
+) -> Recovery:
+    """The times of views by their residuals: ``curve`` of (shapes, views, weights, times) over the grid, and ``slopes`` of (...,
+    times of each view) with what a Gauss-Newton step takes; ``width`` numbers per view and time."""
     check_weights(weights, "a point")
     times = tried_times(shapes, basis, x, grid, interval)
     batch = np.broadcast_shapes(shapes.shape[:-3], x.shape[:-3])
@@ -108,18 +145,25 @@ def recover_times(
     seen = x.double().expand(*batch, *x.shape[-3:]).reshape(flat, *x.shape[-3:])
     weight = None if weights is None else weights.double().expand(*batch, *x.shape[-3:-1]).reshape(flat, *x.shape[-3:-1])
     views = centred_views(seen, weight)
-    step = max(1, CHUNK // (grid * 16 * max(1, flat)))
-    pieces = [slice(i, i + step) for i in range(0, max(1, views.x.shape[1]), step)]
-    parts = [_recover(wide, basis, times, views.x[:, p], views.weights[:, p]) for p in pieces]
+    known = (views.share > 0) & ((views.weights > 0).sum(-1) >= min_points)
+    step = max(1, CHUNK // (grid * width * max(1, flat)))
+
+    def date(x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
+        place, lone = lowest_minima(curve(wide, x, weights, times), basis.period is not None)
+        within = times if basis.period is None else None
+        t, f, h = _refine(lambda t: slopes(wide, x, weights, t), times[place], times[1] - times[0], within)
+        f = torch.where(lone, torch.inf, f)
+        order = f.argsort(-1)
+        t, f, h = (part.gather(-1, order) for part in (t, f, h))
+        second = torch.where(f[..., 1].isfinite(), t[..., 1], t[..., 0])
+        return f[..., 0].clamp(0, 1), t[..., 0], h[..., 0].clamp(min=1e-300).rsqrt(), second, f[..., 1] - f[..., 0]
+
+    parts = [date(views.x[:, i : i + step], views.weights[:, i : i + step]) for i in range(0, max(1, known.shape[1]), step)]
     found = [torch.cat(part, dim=1) for part in zip(*parts, strict=True)]
-    known, middle = views.share > 0, times[len(times) // 2]
+    middle = times[len(times) // 2]
     none = (middle.new_tensor(1.0), middle, middle.new_tensor(torch.inf), middle, middle.new_tensor(0.0))
-    done = [
-        torch.where(known, part, value).reshape(*batch, known.shape[-1]).to(x.dtype)
-        for part, value in zip(found, none, strict=True)
-    ]
-    status = status_of(torch.zeros_like(known), ~known).reshape(*batch, known.shape[-1])
-    return Recovery(*(part.reshape(*batch, known.shape[-1]).to(x.dtype) for part in done), status=status)
+    done = [torch.where(known, part, value).reshape(*batch, -1).to(x.dtype) for part, value in zip(found, none, strict=True)]
+    return Recovery(*done, status=status_of(torch.zeros_like(known), ~known).reshape(*batch, known.shape[1]))
 
 
 def tried_times(shapes: Tensor, basis: Trajectory, x: Tensor, count: int, interval: tuple[float, float]) -> Tensor:
@@ -135,20 +179,6 @@ def tried_times(shapes: Tensor, basis: Trajectory, x: Tensor, count: int, interv
     if basis.period is None:
         return torch.linspace(*interval, count, dtype=torch.float64, device=x.device)
     return torch.arange(count, dtype=torch.float64, device=x.device) * (basis.period / count)
-
-
-def _recover(shapes: Tensor, basis: Trajectory, times: Tensor, x: Tensor, weights: Tensor) -> tuple[Tensor, ...]:
-    """Residual, time, sigma, second and rise of one piece of the views, ``(b, views)`` each."""
-    curve = residuals_at(shapes, basis.rows(times), x, weights)
-    start, lone = lowest_minima(curve, basis.period is not None)
-    step = times[1] - times[0]
-    within = times if basis.period is None else None
-    t, f, h = _refine(shapes, basis, times[start], step, x, weights, within)
-    f = torch.where(lone, torch.inf, f)
-    order = f.argsort(-1)
-    t, f, h = (part.gather(-1, order) for part in (t, f, h))
-    second = torch.where(f[..., 1].isfinite(), t[..., 1], t[..., 0])
-    return f[..., 0].clamp(0, 1), t[..., 0], h[..., 0].clamp(min=1e-300).rsqrt(), second, f[..., 1] - f[..., 0]
 
 
 def residuals_at(shapes: Tensor, rows: Tensor, x: Tensor, weights: Tensor) -> Tensor:
@@ -187,29 +217,12 @@ def lowest_minima(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
 
 
 def _refine(
-    shapes: Tensor,
-    basis: Trajectory,
-    start: Tensor,
-    step: Tensor,
-    x: Tensor,
-    weights: Tensor,
-    within: Tensor | None,
+    at: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]], start: Tensor, step: Tensor, within: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Times, residuals and curvatures ``(b, views, peaks)`` at the minima next to ``start``; not more than a step away."""
+    """Times, residuals and curvatures ``(b, views, minima)`` at the minima next to ``start``; not more than a step away."""
     low, high = start - step, start + step
     if within is not None:
         low, high = low.clamp(min=within[0]), high.clamp(max=within[-1])
-    x, weights = x[:, :, None], weights[:, :, None]
-
-    def at(t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        rows, slopes = (f(t).flatten(1, 2) for f in (basis.rows, basis.slopes))
-        shape, speed = (shapes_at(shapes, c).unflatten(1, t.shape[1:]) for c in (rows, slopes))
-        found = project(x, weights.expand(*t.shape, -1), shape)
-        seen = weights.sqrt()[..., None] * (speed - (speed * weights[..., None]).mean(-2, keepdim=True)) @ found.cameras
-        slope = seen - found.basis @ (found.basis.mT @ seen)
-        gain = (found.residual * slope).sum((-2, -1))
-        return found.residual.square().sum((-2, -1)), gain, slope.square().sum((-2, -1))
-
     t, size = start, torch.ones_like(start)
     f, gain, curvature = at(t)
     for _ in range(TIME_STEPS):

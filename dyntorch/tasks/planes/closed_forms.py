@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import prod
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -261,16 +260,12 @@ def ridge_solution(gram: Tensor, right: Tensor) -> Tensor:
     return (inverse @ right[..., None])[..., 0]
 
 
-def infinity_from_fundamentals(fundamentals: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def infinity_from_fundamentals(fundamentals: Tensor) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from two fundamental matrices of translating bodies, or more. fundamentals
-    ``(*batch, m, 3, 3)``, weights ``(*batch, m)`` -> ``(*batch, 3, 3)``."""
+    ``(*batch, m, 3, 3)`` -> ``(*batch, 3, 3)``."""
     if fundamentals.ndim < 3 or fundamentals.shape[-2:] != (3, 3) or fundamentals.shape[-3] < 2:
         raise ValueError(f"F must be (*batch, m, 3, 3) with m >= 2, got {tuple(fundamentals.shape)}")
     known = unit_vectors(finite_matrices(fundamentals)[0].flatten(-2))
-    if weights is not None:
-        if weights.shape != fundamentals.shape[:-2]:
-            raise ValueError(f"weights must be (*batch, m) = {tuple(fundamentals.shape[:-2])}, got {tuple(weights.shape)}")
-        known = known * weights.double().sqrt()[..., None]
     axes = torch.eye(9, dtype=known.dtype, device=known.device).unflatten(-1, (3, 3))
     products = axes.mT @ known.unflatten(-1, (3, 3))[..., None, :, :]
     # the equations in the columns: one for every entry, so that those off the diagonal weigh as much as in the norm
@@ -333,45 +328,31 @@ BLOCK = 1 << 19
 """Numbers per block of equations (4 MB): they stay in the cache."""
 
 
-def infinity_linear(
-    homographies: Tensor, weights: Tensor | None = None, fundamentals: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
+def infinity_linear(homographies: Tensor) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from four planes of translating bodies, or more: 64 linear unknowns. homographies
-    ``(*batch, n, 3, 3)``, weights ``(*batch, n)``, fundamentals ``(*batch, m, 3, 3)`` -> ``(*batch, 3, 3)``."""
-    m = 0 if fundamentals is None else fundamentals.shape[-3]
-    check_homographies(homographies, max(0, 4 - 2 * m))
-    return _solve(homographies, weights, fundamentals, 64)
+    ``(*batch, n, 3, 3)`` -> ``(*batch, 3, 3)``."""
+    check_homographies(homographies, 4)
+    return _solve(homographies, 64)
 
 
 def infinity_thesis(homographies: Tensor) -> tuple[Tensor, Tensor]:
     r"""The homography at infinity from five planes or more, by the double algebra of the thesis: 84 linear unknowns.
     homographies ``(*batch, n, 3, 3)`` -> ``(*batch, 3, 3)``."""
     check_homographies(homographies, 5)
-    return _solve(homographies, None, None, 84)
+    return _solve(homographies, 84)
 
 
-def _solve(planes: Tensor, weights: Tensor | None, fundamentals: Tensor | None, unknowns: int) -> tuple[Tensor, Tensor]:
+def _solve(planes: Tensor, unknowns: int) -> tuple[Tensor, Tensor]:
     """The solution among extensors of 64 or 84 unknowns."""
-    if weights is not None and weights.shape != planes.shape[:-2]:
-        raise ValueError(f"weights must be (*batch, n) = {tuple(planes.shape[:-2])}, got {tuple(weights.shape)}")
-    extensors = _plane_extensors(planes)
-    if weights is not None:
-        extensors = extensors * weights.double().sqrt()[..., None]
-    known = extensors.new_zeros(*planes.shape[:-3], 0, 9)
-    if fundamentals is not None:
-        known = unit_vectors(finite_matrices(fundamentals)[0].flatten(-2))
-    batch, device = np.broadcast_shapes(extensors.shape[:-2], known.shape[:-2]), planes.device
-    tables = _joins(3, unknowns, device), _joins(1, unknowns, device)
+    extensors, table, batch = _plane_extensors(planes), _joins(unknowns, planes.device), planes.shape[:-3]
 
-    def block(*parts: Tensor) -> tuple[Tensor, Tensor]:
-        pairs = zip(parts, tables, strict=True)
-        rows = torch.cat([(x @ t.flatten(1)).unflatten(-1, t.shape[1:]).flatten(1, 2) for x, t in pairs], dim=1)
+    def block(extensors: Tensor) -> tuple[Tensor, Tensor]:
+        rows = (extensors @ table.flatten(1)).unflatten(-1, table.shape[1:]).flatten(1, 2)
         return null_space(rows)[:, 0], torch.linalg.svdvals(rows.detach())
 
-    flat = [x.expand(*batch, -1, -1).reshape(prod(batch), *x.shape[-2:]) for x in (extensors, known)]
-    per_problem = sum(x.shape[1] * t[0].numel() for x, t in zip(flat, tables, strict=True))
-    vector, spectrum = map_blocks(block, *flat, size=max(1, BLOCK // max(1, per_problem)))
-    extensor = vector if unknowns == 84 else vector @ _invariant_basis(device)
+    flat = extensors.reshape(prod(batch), *extensors.shape[-2:])
+    vector, spectrum = map_blocks(block, flat, size=max(1, BLOCK // max(1, flat.shape[1] * table[0].numel())))
+    extensor = vector if unknowns == 84 else vector @ _invariant_basis(planes.device)
     transversal = subspace_of(extensor, 9, 3).unflatten(-1, (3, 3))
     return infinity_from_fundamentals(transversal)[0].reshape(*batch, 3, 3), spectrum.reshape(*batch, unknowns)
 
@@ -384,12 +365,10 @@ def _plane_extensors(planes: Tensor) -> Tensor:
 
 
 @constant
-def _joins(step: int, unknowns: int, device: torch.device) -> Tensor:
-    """The join with every unknown, as a linear map of an extensor: ``(binomial(9, step), equations, unknowns)``."""
-    basis = _invariant_basis(device) if unknowns == 64 else torch.eye(84, dtype=torch.float64, device=device)
-    count = 9 if step == 1 else 84
-    eye = torch.eye(count, dtype=torch.float64, device=device)
-    return wedge(eye[:, None, :], basis, 9, (step, 3)).mT.contiguous()
+def _joins(unknowns: int, device: torch.device) -> Tensor:
+    """The join with every unknown, as a linear map of an extensor: ``(84, equations, unknowns)``."""
+    eye = torch.eye(84, dtype=torch.float64, device=device)
+    return wedge(eye[:, None, :], _invariant_basis(device) if unknowns == 64 else eye, 9, (3, 3)).mT.contiguous()
 
 
 @constant

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from math import ceil, prod
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +19,7 @@ from dyntorch.numerics.nullspace import gram_null_space, null_space, spectrum
 MEMORY = 10
 PLAIN = 5  # iterations before the mixing starts
 WORSE = 2.0  # times the smallest residual so far: there a mixed step is given up
+MAX_ITERATIONS, DEPTH_TOLERANCE = 300, 1e-6  # of the depths: steps, and their change in one as a part of the residual
 EXACT = 1e-12  # residual of an exact solution; rounding alone leaves up to 1e-14, and more where structure is shallow
 BLOCK = 2**20  # depths per block
 
@@ -38,27 +37,13 @@ class ProjectiveFactorization(Outcome):
 
     TASK = "projective_factorization"
 
-    @property
-    def converged(self) -> Tensor:
-        """``(*batch,)`` bool: the depths no longer change."""
-        return self.status == Status.OK
-
-    def __iter__(self) -> Iterator[Tensor]:
-        """The parts, as of the tuple that this once was."""
-        return iter((self.projections, self.structure, self.residual, self.converged))
-
-    def __getitem__(self, part: int | slice) -> Any:
-        return tuple(self)[part]
-
     def __repr__(self) -> str:
         return self.head(views=self.projections.shape[-3], points=self.structure.shape[-2])
 
 
 @one_thread
 @on_cpu
-def projective_factorization(
-    tracks: Tensor, rank: int, weights: Tensor | None = None, *, iterations: int = 300, tolerance: float = 1e-6
-) -> ProjectiveFactorization:
+def projective_factorization(tracks: Tensor, rank: int, weights: Tensor | None = None) -> ProjectiveFactorization:
     r"""Depths with which the measurements have rank K: :math:`[\lambda_{ip}\,(x_{ip}, 1)] \approx [M_i]\,[Y_p]`.
 
     Alternates the best subspace of dimension K for the depths with the best depths for the subspace, on normalized views and
@@ -73,12 +58,10 @@ def projective_factorization(
         tracks: ``(*batch, views, n, l)`` in any unit.  **Only points measured in every view are used.**
         rank: K = k + 1: 4 for a static scene in space, 5 for planar points at constant velocity, 7 for those in space.
         weights: ``(*batch, views, n)``; a point with a 0, or a NaN coordinate, in any view is left out, all others count alike.
-        iterations: most iterations.
-        tolerance: of the change of the depths in one step, as a part of the residual.
 
     Returns:
-        projections, structure, residual, converged; without gradients.  A problem with too few complete points, or whose squared
-        coordinates leave the range of float64, has projections and structure 0, residual 1 and ``converged`` False.
+        Projections, structure and residual; without gradients.  A problem with too few complete points, or whose squared
+        coordinates leave the range of float64, has projections and structure 0 and residual 1, and is not OK.
 
     Raises:
         ValueError: shapes that do not fit, or fewer views or points than a reconstruction of this rank needs.
@@ -93,7 +76,7 @@ def projective_factorization(
         >>> images = Y @ M.mT
         >>> found = projective_factorization(images[..., :2] / images[..., 2:], 4)
         >>> again = found.structure @ found.projections.mT
-        >>> bool(found.converged), bool(torch.allclose(again[..., :2] / again[..., 2:], images[..., :2] / images[..., 2:]))
+        >>> bool(found.status == 0), bool(torch.allclose(again[..., :2] / again[..., 2:], images[..., :2] / images[..., 2:]))
         (True, True)
     """
     least = _check(tracks, rank, weights)
@@ -106,7 +89,7 @@ def projective_factorization(
     x = torch.where(complete[..., None, :, None], x, 0.0)
 
     def block(x: Tensor, complete: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return _factorize(x, complete, rank, iterations, tolerance)
+        return _factorize(x, complete, rank)
 
     count = prod(batch)
     problems = (x.reshape(count, views, n, size), complete.reshape(count, n))
@@ -136,12 +119,12 @@ def _check(tracks: Tensor, rank: int, weights: Tensor | None) -> int:
     return least
 
 
-def _factorize(x: Tensor, complete: Tensor, rank: int, iterations: int, tolerance: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _factorize(x: Tensor, complete: Tensor, rank: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """One block of problems ``(b, views, n, l)``, and which points ``(b, n)`` count."""
     share = complete.to(x.dtype) / complete.sum(-1, keepdim=True).clamp(min=1)
     rays, back = _rays(x, share[:, None, :, None])
     columns = share.sqrt()[:, None, :]
-    depths, converged = _solve(rays, columns, rank, iterations, tolerance)
+    depths, converged = _solve(rays, columns, rank)
     scaled, basis, residual = _subspace(depths, rays, rank)
     projections = back @ basis.unflatten(-2, (x.shape[1], x.shape[3] + 1))
     projections = projections / torch.linalg.matrix_norm(projections, keepdim=True)
@@ -162,7 +145,7 @@ def _rays(x: Tensor, part: Tensor) -> tuple[Tensor, Tensor]:
     return rays * (part > 0), similarity(1 / scale, -centre * scale[..., None])
 
 
-def _solve(rays: Tensor, columns: Tensor, rank: int, iterations: int, tolerance: float) -> tuple[Tensor, Tensor]:
+def _solve(rays: Tensor, columns: Tensor, rank: int) -> tuple[Tensor, Tensor]:
     """Depths ``(b, views, n)`` of the smallest residual that was met, and whether they no longer change ``(b,)``."""
     best = _balance((columns > 0).to(rays.dtype).expand(rays.shape[:-1]), columns, sweeps=10)
     smallest = torch.full_like(rays[:, 0, 0, 0], torch.inf)
@@ -170,11 +153,11 @@ def _solve(rays: Tensor, columns: Tensor, rank: int, iterations: int, tolerance:
     left = torch.arange(len(rays), device=rays.device)  # problems that still change
     depths, images, steps = best, best.new_empty(*best.shape, 0), best.new_empty(*best.shape, 0)
     best = best.clone()
-    for i in range(iterations):
+    for i in range(MAX_ITERATIONS):
         image, residual = _next(depths, rays[left], columns[left], rank)
         step = image - depths
         better = residual < smallest[left]
-        done = (step.square().sum((-2, -1)).sqrt() <= tolerance * residual) | (residual <= EXACT)
+        done = (step.square().sum((-2, -1)).sqrt() <= DEPTH_TOLERANCE * residual) | (residual <= EXACT)
         best[left[better | done]], smallest[left[better]] = depths[better | done], residual[better]
         converged[left[done]] = True
         if bool(done.all()):
@@ -235,6 +218,7 @@ def _mix(images: Tensor, steps: Tensor) -> Tensor:
 # Structure and velocities from many affine views at once: the factorization of constant velocity.
 
 
+MAX_SWEEPS, SWEEP_TOLERANCE = 100, 1e-8  # of the alternation, and the relative gain of one that ends it
 FLAT = 1e-9  # of the largest singular value: below it the measurements have no further dimension
 VELOCITY_BLOCK = 2**20  # measurements per block
 
@@ -256,26 +240,12 @@ class VelocityFactorization(Outcome):
 
     TASK = "velocity_factorization"
 
-    @property
-    def degenerate(self) -> Tensor:
-        """``(*batch,)`` bool: the tracks do not decide the result (see Args of the function), which then means nothing."""
-        return self.status != Status.OK
-
-    def __iter__(self) -> Iterator[Tensor]:
-        """The parts, as of the tuple that this once was."""
-        return iter((self.cameras, self.offsets, self.points, self.velocities, self.residual, self.degenerate))
-
-    def __getitem__(self, part: int | slice) -> Any:
-        return tuple(self)[part]
-
     def __repr__(self) -> str:
         return self.head(views=self.cameras.shape[-3], points=self.points.shape[-2])
 
 
 @one_thread
-def velocity_factorization(
-    tracks: Tensor, times: Tensor, dim: int = 3, weights: Tensor | None = None, *, iterations: int = 100, tolerance: float = 1e-8
-) -> VelocityFactorization:
+def velocity_factorization(tracks: Tensor, times: Tensor, dim: int = 3, weights: Tensor | None = None) -> VelocityFactorization:
     r"""Affine cameras and points at constant velocity: :math:`x_{ip} = A_i (X_p + t_i V_p) + b_i`.
 
     Without the mean of each view, the measurements have rank 2 d: :math:`W = [A_i,\ t_i A_i]\,[X_p; V_p]`.  A basis U of their
@@ -298,11 +268,10 @@ def velocity_factorization(
         times: ``(views,)`` or ``(*batch, views)``, three different ones at least; several views may share one.
         dim: d, 3 for space or 2 for a plane.
         weights: ``(*batch, views, n)``; a point with a 0, or a NaN coordinate, in any view is left out.
-        iterations: most sweeps of the alternation.
-        tolerance: of the relative change of the image distances in one sweep.
 
     Returns:
-        cameras, offsets, points, velocities, residual, degenerate; without gradients, and finite also where degenerate.
+        Cameras, offsets, points, velocities and residual; without gradients, and finite also where the status is not OK: there the
+        tracks do not decide the result.
 
     Raises:
         ValueError: shapes that do not fit, fewer views (5 for d = 3, 3 for d = 2), points or times than needed.
@@ -317,8 +286,8 @@ def velocity_factorization(
         >>> tracks = (X + times[:, None, None] * V) @ A.mT
         >>> found = velocity_factorization(tracks, times)
         >>> again = (found.points + times[:, None, None] * found.velocities) @ found.cameras.mT + found.offsets[:, None]
-        >>> bool(torch.allclose(again, tracks)), bool(found.degenerate)
-        (True, False)
+        >>> bool(torch.allclose(again, tracks)), bool(found.status == 0)
+        (True, True)
     """
     _check_moving(tracks, times, dim, weights)
     batch, (views, n, _) = tracks.shape[:-3], tracks.shape[-3:]
@@ -331,7 +300,7 @@ def velocity_factorization(
     t = times.detach().to(x).expand(*batch, views)
 
     def block(x: Tensor, t: Tensor, complete: Tensor) -> tuple[Tensor, ...]:
-        return _factorize_moving(x, t, complete, dim, iterations, tolerance)
+        return _factorize_moving(x, t, complete, dim)
 
     count = prod(batch)
     problems = (x.reshape(count, views, n, 2), t.reshape(count, views), complete.reshape(count, n))
@@ -362,7 +331,7 @@ def _check_moving(tracks: Tensor, times: Tensor, dim: int, weights: Tensor | Non
         raise ValueError(f"times must hold at least 3 different ones, got {int(different)}: velocities need views over time")
 
 
-def _factorize_moving(x: Tensor, t: Tensor, complete: Tensor, dim: int, iterations: int, tolerance: float) -> tuple[Tensor, ...]:
+def _factorize_moving(x: Tensor, t: Tensor, complete: Tensor, dim: int) -> tuple[Tensor, ...]:
     """One block of problems ``(b, views, n, 2)``, in normalized images and times, and back."""
     share = complete.to(x.dtype) / complete.sum(-1, keepdim=True).clamp(min=1)
     offsets = (x * share[:, None, :, None]).sum(-2)
@@ -375,7 +344,7 @@ def _factorize_moving(x: Tensor, t: Tensor, complete: Tensor, dim: int, iteratio
     tau = (t - start[:, None]) / unit[:, None]
     images = (x / scale).mT  # (b, views, 2, n)
     cameras, degenerate = _upgrade(images, tau, dim)
-    cameras, points, velocities, error = _alternate(images, tau, cameras, iterations, tolerance)
+    cameras, points, velocities, error = _alternate(images, tau, cameras)
     # the gauge: orthogonal cameras of the size of a scaled orthography with scale 1
     gram = (cameras.mT @ cameras).mean(1) * (dim / 2)
     factor, failed = torch.linalg.cholesky_ex(gram)
@@ -405,22 +374,20 @@ def _upgrade(images: Tensor, tau: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     return cameras, ambiguous | (values[:, 2 * dim - 1] <= FLAT * values[:, 0])
 
 
-def _alternate(
-    images: Tensor, tau: Tensor, cameras: Tensor, iterations: int, tolerance: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _alternate(images: Tensor, tau: Tensor, cameras: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Least squares in turn: structure ``(b, d, n)`` each for the cameras, cameras for the structure; and the squared error."""
     stacked, weight, dim = images.flatten(1, 2), tau[:, :, None, None], cameras.shape[-1]
     infinite = cameras.new_full((len(cameras),), torch.inf)
     result = [cameras.clone(), cameras.new_zeros(len(cameras), 2 * dim, images.shape[-1]), infinite]
     left = torch.arange(len(cameras), device=cameras.device)
     before = infinite.clone()
-    for _ in range(max(1, iterations)):
+    for _ in range(MAX_SWEEPS):
         motion = torch.cat([cameras, weight[left] * cameras], -1).flatten(1, 2)
         structure = _least_squares(motion, stacked[left])
         error = (stacked[left] - motion @ structure).square().sum((1, 2))
         for part, value in zip(result, (cameras, structure, error), strict=True):
             part[left] = value
-        more = (before - error > tolerance * error) & (error > 1e-28 * stacked[left].square().sum((1, 2)))
+        more = (before - error > SWEEP_TOLERANCE * error) & (error > 1e-28 * stacked[left].square().sum((1, 2)))
         left, before = left[more], error[more]
         if not len(left):
             break

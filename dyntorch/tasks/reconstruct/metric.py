@@ -5,8 +5,7 @@ A lift leaves open a linear space of changes S of the constants, each of which c
 
 .. math:: K_i^{-1} P_i\\, T_i(S)\\, \begin{pmatrix} I_d \\ 0 \end{pmatrix} \sim R_{i,:d},
 
-whatever the motion: the columns of the left are orthogonal and of one length.  In space that is linear in the dual absolute quadric
-of the constants, :math:`Q = S_{:d} S_{:d}^T`, because :math:`M_i Q M_i^T \sim K_i K_i^T` for the projections :math:`M_i = P_i B_i`.
+whatever the motion: the columns of the left are orthogonal and of one length.
 """
 
 from __future__ import annotations
@@ -34,8 +33,6 @@ class WorldChanges(NamedTuple):
     """``(views, dim, a + 1, a + 1)`` the collineations of the world at each view."""
     similar: Tensor
     """``(m, dim)`` orthonormal coordinates of the changes that are similarities of the world at all views."""
-    directions: Tensor | None
-    """``(dim, K, d)`` the first columns of S where they are the same for all views: factors of the quadric."""
     dim: int
     """d of the world."""
 
@@ -50,11 +47,7 @@ class WorldChanges(NamedTuple):
         against = torch.cat([(even - 2 * length * eye).flatten(2), below.flatten(2)], dim=-1).permute(0, 2, 1).flatten(0, 1)
         _, values, vh = torch.linalg.svd(against, full_matrices=True)
         rank = int((values > CONDITION_ROUNDING * values[:1].clamp(min=1.0)).sum())
-        stack = lifts.flatten(0, 1)
-        every = torch.eye(lifts.shape[1], dtype=lifts.dtype, device=lifts.device).repeat(len(lifts), 1)
-        right = torch.linalg.pinv(stack) @ every
-        shared = bool((stack @ right - every).abs().max() < CONDITION_ROUNDING)
-        return cls(algebra, worlds, vh[rank:], algebra @ right[:, :dim] if shared else None, dim)
+        return cls(algebra, worlds, vh[rank:], dim)
 
     @property
     def orbits(self) -> Tensor:
@@ -80,10 +73,6 @@ class MetricFrames(NamedTuple):
     family of frames is metric."""
     several: Tensor
     """``(b,)`` number of different frames that do as well and show as many points before the cameras."""
-    behind: Tensor
-    """``(b,)`` share of the points and views on the wrong side, in the best frame."""
-    spare: int
-    """Conditions beyond those that determine the frame."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +140,7 @@ def metric_frames(
     b, d = len(cameras), changes.dim
     share = (cameras != 0).flatten(2).any(-1).to(cameras.dtype)
     derivatives = torch.einsum("bvma,vpad->bvpmd", cameras, changes.worlds[..., :d])
-    starts = _starts(derivatives, share, cameras @ lifts, changes, d)
+    starts = _starts(derivatives, share, changes, d)
     count = starts.shape[1]
     whole = _Calibrating(derivatives, share, changes.orbits)
     wide = whole.subset(torch.arange(b, device=cameras.device).repeat_interleave(count))
@@ -173,14 +162,11 @@ def metric_frames(
     weak = values[:, len(changes.similar)] if values.shape[-1] > len(changes.similar) else torch.full_like(values[:, 0], torch.inf)
     views = share.sum(-1)
     rows = (d * (d + 1) // 2 - 1) * views + (d * views if cameras.shape[-2] > 3 else 0)
-    free = len(changes.algebra) - len(changes.similar)
     return MetricFrames(
         change[row, best],
         (value.square().sum((1, 2)) / rows.clamp(min=1)).sqrt(),
         weak / values[:, -1].clamp(min=torch.finfo(values.dtype).tiny),
         several,
-        wrong[row, best],
-        int(rows.amin()) - free if b else 0,
     )
 
 
@@ -221,10 +207,9 @@ def _behind(
     known = (structure != 0).any(-1)[:, None]
     world = world.reshape(-1, world.shape[-1])
     sign = (points @ world.mT).sum(-1).sign()
-    depth = torch.einsum("bvk,bskj,bsnj->bsvn", (cameras @ lifts)[..., -1, :], change, points) if cameras.shape[-2] == 3 else None
     mirrored = torch.zeros_like(theta[..., 0])
     if cameras.shape[-2] == 3:
-        assert depth is not None
+        depth = torch.einsum("bvk,bskj,bsnj->bsvn", (cameras @ lifts)[..., -1, :], change, points)
         seen = (weights > 0)[:, None] & known[..., None, :]
         side = depth.sign() * sign[..., None, :] * seen
         view = nonzero_sign(side.sum(-1))  # the camera may have either sign
@@ -242,18 +227,15 @@ def _behind(
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Where the descent starts: the quadric, linear in the cameras, and frames in which one camera already is calibrated.
+# Where the descent starts: frames in which one camera already is calibrated.
 
 
-def _starts(derivatives: Tensor, share: Tensor, projections: Tensor, changes: WorldChanges, d: int) -> Tensor:
+def _starts(derivatives: Tensor, share: Tensor, changes: WorldChanges, d: int) -> Tensor:
     """Coordinates ``(b, s, dim)`` of the changes to start from."""
     seen = share.argmax(-1)
     first = derivatives[torch.arange(len(seen), device=seen.device), seen][..., :3, :]
     targets = _targets(d).to(first)
-    found = [_calibrated_first(first, changes, targets)]
-    if d == 3 and derivatives.shape[-2] == 3 and changes.directions is not None:
-        found.append(_by_quadric(projections, share, changes))
-    starts = torch.cat(found, dim=1)
+    starts = _calibrated_first(first, changes, targets)
     return torch.where(starts.isfinite(), starts, 1.0)
 
 
@@ -276,7 +258,7 @@ def _targets(d: int) -> Tensor:
 
 NUM_INFINITY_DRAWS = 7  # planes at infinity around that of the given frame
 DRAW_SPREAD = 0.5  # of these draws, over the change of frame
-ALTERNATIONS = 20  # between a factor of the quadric and the changes that the motion allows
+ALTERNATIONS = 20  # between the turn of the first camera and the changes that the motion allows
 START_RIDGE = 1e-3  # weight with which a start stays where the frame is
 
 
@@ -300,47 +282,6 @@ def _calibrated_first(first: Tensor, changes: WorldChanges, targets: Tensor) -> 
     draw = torch.randn(NUM_INFINITY_DRAWS, len(same), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(first)
     around = theta + DRAW_SPREAD * theta.norm(dim=-1, keepdim=True) / len(same) ** 0.5 * draw
     return torch.cat([theta, around], dim=1)
-
-
-NUM_MIXTURES = 8  # of the two best quadrics: two views leave two
-
-
-def _by_quadric(projections: Tensor, share: Tensor, changes: WorldChanges) -> Tensor:
-    r"""Changes ``(b, s, dim)`` from the quadrics Q that solve :math:`M_i Q M_i^T \sim I`, least squares, and their mixtures."""
-    assert changes.directions is not None
-    columns = changes.directions
-    size = columns.shape[1]
-    products = torch.einsum("pkd,qjd->pqkj", columns, columns)
-    both = (products + products.mT).flatten(2).flatten(0, 1)
-    _, values, vh = torch.linalg.svd(both, full_matrices=False)
-    basis = vh[values > CONDITION_ROUNDING * values[0]].unflatten(-1, (size, size))
-    images = torch.einsum("bvmk,rkj,bvnj->bvmnr", projections, basis, projections) * share[..., None, None, None]
-    i, j = torch.tensor([0, 0, 1]), torch.tensor([1, 2, 2])
-    even = images.diagonal(dim1=2, dim2=3).mT  # (b, v, 3, r)
-    even = (even - even.mean(-2, keepdim=True)) * 0.5**0.5
-    # a camera's scale is nobody's business
-    scale = projections.square().sum((-2, -1)).clamp(min=1e-300)[..., None, None]
-    rows = (torch.cat([images[:, :, i, j], even], dim=2) / scale).flatten(1, 2)
-    rows = torch.cat([rows, rows.new_zeros(len(rows), max(0, rows.shape[-1] - rows.shape[-2]), rows.shape[-1])], dim=1)
-    null = torch.linalg.svd(rows, full_matrices=False).Vh[:, -2:].flip(1)
-    angle = torch.arange(NUM_MIXTURES, dtype=null.dtype, device=null.device) * (torch.pi / NUM_MIXTURES)
-    mixed = angle.cos()[:, None] * null[:, None, 0] + angle.sin()[:, None] * null[:, None, 1]
-    quadric = torch.einsum("bsr,rkj->bskj", mixed, basis)
-    quadric = quadric * nonzero_sign(quadric.diagonal(dim1=-2, dim2=-1).sum(-1))[..., None, None]
-    values, vectors = torch.linalg.eigh(quadric)
-    factor = vectors[..., -3:] * values[..., -3:].clamp(min=0).sqrt()[..., None, :]
-    # the factor is known up to a turn: the turn after which it is that of a change
-    flat = columns.flatten(1).mT
-    back = torch.linalg.pinv(flat)
-    turned = factor
-    for _ in range(ALTERNATIONS):
-        theta = torch.einsum("pr,bsr->bsp", back, turned.flatten(2))
-        nearest = torch.einsum("rp,bsp->bsr", flat, theta).unflatten(-1, columns.shape[1:])
-        turned = factor @ _polar(factor.mT @ nearest)
-    # what the quadric does not see, such as translations, stays what it is in the frame that is given
-    still = _identity_coordinates(changes)
-    inside = back @ (flat @ still)
-    return theta + torch.einsum("p,bs->bsp", (still - inside) / inside.norm(), theta.norm(dim=-1))
 
 
 def _identity_coordinates(changes: WorldChanges) -> Tensor:

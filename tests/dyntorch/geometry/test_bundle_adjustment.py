@@ -101,15 +101,15 @@ def test_the_cost_is_that_of_a_dense_minimization(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("loss", ["huber", "geman_mcclure", None])
-def test_a_step_solves_the_dense_damped_equations(name, loss):
+@pytest.mark.parametrize("robust", [True, False])
+def test_a_step_solves_the_dense_damped_equations(name, robust):
     """The Schur complement against the whole normal equations; the gradient of the robust cost by autograd."""
     x, cameras, structure, lifts = scene(name, (1,), noise=0.05)
     structure = structure / structure.norm(dim=-1, keepdim=True)
     weights = torch.rand(x.shape[:-1], generator=torch.Generator().manual_seed(1), dtype=torch.float64) + 0.5
     weights[:, 0, 3] = 0
-    scale = None if loss is None else torch.tensor([0.05]).double()
-    problem = BundleProblem(x.mT, weights, None if lifts is None else lifts[None], scale, str(loss))
+    scale = torch.tensor([0.05]).double() if robust else None
+    problem = BundleProblem(x.mT, weights, None if lifts is None else lifts[None], scale)
     at = Iterate((cameras, structure.mT.contiguous()), torch.zeros(1).double(), ())
     camera_step, point_step, gain = problem.step(at, torch.tensor([0.1]).double())
     split, theta = cameras.numel(), torch.cat([cameras.flatten(), structure.flatten()])
@@ -137,21 +137,18 @@ def test_a_step_solves_the_dense_damped_equations(name, loss):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("loss", ["huber", "geman_mcclure"])
-def test_outliers_do_not_move_the_robust_minimum(loss):
+def test_outliers_do_not_move_the_robust_minimum():
     x, cameras, structure, lifts = scene("static", noise=1e-3)
     clean = bundle_adjust(x, None, cameras, structure)
     x[0, 0] += 3.0
     plain = bundle_adjust(x, None, cameras, structure)
-    robust = bundle_adjust(x, None, clean.cameras, clean.structure, scale=5e-3, loss=loss, tolerance=1e-13, iterations=300)
+    robust = bundle_adjust(x, None, clean.cameras, clean.structure, scale=5e-3, tolerance=1e-13, iterations=300)
     good = errors(x, robust.cameras, robust.structure, lifts)[:, 1:].abs().max()
-    assert good < {"huber": 0.8, "geman_mcclure": 0.2}[loss] * errors(x, plain.cameras, plain.structure, lifts)[:, 1:].abs().max()
+    assert good < 0.2 * errors(x, plain.cameras, plain.structure, lifts)[:, 1:].abs().max()
     at = [t.clone().requires_grad_() for t in (robust.cameras, robust.structure)]
     square = errors(x, *at, lifts).square().sum(-1)
     c = 5e-3
-    rho = (
-        torch.where(square > c * c, 2 * c * square.sqrt() - c * c, square) if loss == "huber" else c * c * square / (c * c + square)
-    )
+    rho = c * c * square / (c * c + square)
     torch.testing.assert_close(rho.sum().detach(), robust.cost)
     rho.sum().backward()
     assert max(float(t.grad.abs().max()) for t in at) < 1e-5
@@ -237,15 +234,14 @@ def test_single_precision_and_an_empty_batch():
     assert bundle_adjust(x[:0], None, cameras[:0], structure[:0], lifts).cameras.shape == (0, 3, 3, 4)
 
 
-@pytest.mark.parametrize("name", ["plane, constant velocity", "3D sensors"])
-def test_the_information_is_the_gram_of_the_jacobian_of_each_point(name):
-    x, cameras, structure, lifts = scene(name, (2,))
+def test_the_information_is_the_gram_of_the_jacobian_of_each_point():
+    x, cameras, structure, _ = scene("static", (2,))
     weights = torch.rand(x.shape[:-1], generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     weights[0, 1:, 4] = 0
     structure = structure / structure.norm(dim=-1, keepdim=True)
-    found = point_information(cameras, 3 * structure, weights, lifts)
+    found = point_information(cameras, 3 * structure, weights)
     for b, j in ((0, 0), (1, 7)):
-        jacobian = torch.func.jacrev(lambda y, b=b: reproject(cameras[b] @ lifts, y[None])[:, 0])(structure[b, j])
+        jacobian = torch.func.jacrev(lambda y, b=b: reproject(cameras[b], y[None])[:, 0])(structure[b, j])
         expected = torch.einsum("v,vlk,vlm->km", weights[b, :, j], jacobian, jacobian)
         torch.testing.assert_close(found[b, j], expected)
 
@@ -264,8 +260,6 @@ def test_misuse():
         bundle_adjust(x, torch.ones(3), cameras, structure, lifts)
     with pytest.raises(ValueError, match="x must be"):
         bundle_adjust(x[0], None, cameras, structure, lifts)
-    with pytest.raises(ValueError, match="loss must be"):
-        bundle_adjust(x, None, cameras, structure, lifts, scale=1.0, loss="tukey")
     with pytest.raises(ValueError, match="scale must be positive"):
         bundle_adjust(x, None, cameras, structure, lifts, scale=0.0)
 

@@ -17,6 +17,7 @@ from dyntorch.tasks.planes.problem import (
     PlanesProblem,
     frames_of_calibration,
     frames_of_matrices,
+    noise_variance,
     parameters,
     project_covariance,
     starts,
@@ -138,3 +139,11 @@ def test_all_starts_meet_at_the_truth():
     assert len(several) == 3  # closed form, mixed, fundamental matrices
     for start in several:
         assert relative_error(start, infinity).max() < 1e-5
+
+
+@pytest.mark.parametrize("spare", [1, 4, 16, 200])
+def test_the_noise_is_underestimated_one_time_in_ten(spare):
+    cost = torch.randn(40000, spare, generator=torch.Generator().manual_seed(24), dtype=torch.float64).square().sum(-1)
+    found = noise_variance(cost, torch.tensor(float(spare), dtype=torch.float64), risk=0.1)
+    assert float((found < 1).double().mean()) == pytest.approx(0.1, abs=0.01)
+    assert noise_variance(cost[:1], torch.zeros(1, dtype=torch.float64), risk=0.1).tolist() == [0.0]
