@@ -105,7 +105,9 @@ def show(summary: Summary) -> None:
         table(one.columns, one.rows)
         for sentence in one.below:
             say(sentence)
-    for line in (*summary.notes, *summary.closing):
+    for note in summary.notes:
+        say(note if note.startswith("warning: ") else f"note: {note}")
+    for line in summary.closing:
         say(line)
 
 

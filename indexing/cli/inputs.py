@@ -42,12 +42,12 @@ def watch_videos(reading: Reading, paths: Iterable[Path], beside: Path | None) -
 def read_clips(reading: Reading, path: Path, label: str | None = None) -> ClipSet:
     """All clips of a file or folder: here alone paths become clips."""
     refuse_range(path)
-    found = reading.watched.files.get(path, path)
-    if isinstance(found, ValueError):
-        raise found
-    if found != path:  # keypoints of a video go by the name of the video
-        own = replace(reading, watched=Watched({}), size=None, fps=None)
-        return _rename_clips(read_clips(own, found, label), found, path)
+    source = reading.watched.files.get(path, path)
+    if isinstance(source, ValueError):
+        raise source
+    if source != path:  # keypoints of a video go by the name of the video
+        plain_reading = replace(reading, watched=Watched({}), size=None, fps=None)
+        return _rename_clips(read_clips(plain_reading, source, label), source, path)
     try:
         return read(
             path, format=reading.format, fps=reading.fps, person=reading.person, min_confidence=reading.min_confidence, label=label,
@@ -80,10 +80,10 @@ def parse_example(text: str) -> Example:
         return _trim_text(text)
     if not label.strip() or not rest:
         raise ValueError(f"example {text!r}: expected label=file, such as squat=a.json; give both the label and the file")
-    found = _trim_text(rest)
-    if "=" in rest and not found.path.expanduser().exists() and Path(file := rest.rpartition("=")[2]).expanduser().exists():
+    example = _trim_text(rest)
+    if "=" in rest and not example.path.expanduser().exists() and Path(file := rest.rpartition("=")[2]).expanduser().exists():
         raise ValueError(f"example {text!r}: two labels for {file}; give one, as in {label.strip()}={file}")
-    return Example(found.path, label.strip(), found.start, found.end)
+    return Example(example.path, label.strip(), example.start, example.end)
 
 
 def _trim_text(text: str) -> Example:
@@ -162,24 +162,24 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
 
 def of_layout(clips: Sequence[Clip], known: Skeleton | None, path: Path) -> tuple[list[Clip], list[str]]:
     """Clips with their joints in the order of those known, and a note where not all are used or nobody knows which is which."""
-    found = [match_joints(clip, known, str(path)) for clip in clips]
-    return [clip for clip, _ in found], list(dict.fromkeys(note for _, note in found if note))
+    matched = [match_joints(clip, known, str(path)) for clip in clips]
+    return [clip for clip, _ in matched], list(dict.fromkeys(note for _, note in matched if note))
 
 
 def _crop_example(clips: ClipSet, example: Example) -> tuple[ClipSet, list[str]]:
     """The seconds that count, and a note where the recording does not have all of them."""
     start, end = example.start if example.start is not None else -math.inf, example.end if example.end is not None else math.inf
-    found = ClipSet((clip.between(start, end) for clip in clips), clips.name)
-    alone = [clip for clip in found if len(clip) == 1]
-    if alone and len(alone) == len(found):
+    cropped = ClipSet((clip.between(start, end) for clip in clips), clips.name)
+    alone = [clip for clip in cropped if len(clip) == 1]
+    if alone and len(alone) == len(cropped):
         raise ValueError(
             f"{_range_text(example)}: one frame only lies in these seconds ({alone[0].times[0]:.6g} s); give more of them"
         )
     short = [clip for clip in clips if on_range(example, clip.times[0], clip.times[-1])]
     if not short:
-        return found, []
-    left = f"{found[0].duration:.3g} s of it" if len(clips) == 1 else "the rest of it"
-    return found, [f"{said}; {left} is used" for said in on_range(example, short[0].times[0], short[0].times[-1])]
+        return cropped, []
+    left = f"{cropped[0].duration:.3g} s of it" if len(clips) == 1 else "the rest of it"
+    return cropped, [f"{said}; {left} is used" for said in on_range(example, short[0].times[0], short[0].times[-1])]
 
 
 def on_range(example: Example, first: float, last: float) -> list[str]:
@@ -191,7 +191,7 @@ def on_range(example: Example, first: float, last: float) -> list[str]:
 
 def on_overlaps(examples: Sequence[Example]) -> list[str]:
     """On seconds of one file, keypoints or video, that are given to two actions."""
-    found = []
+    notes = []
     files: dict[Path, list[Example]] = {}
     for example in examples:
         if example.label is not None:
@@ -205,10 +205,10 @@ def on_overlaps(examples: Sequence[Example]) -> list[str]:
                     f"{one.path}: is given as {one.label} and as {other.label}; correct a label, or give the seconds of each"
                 )
             when = f"{start:g} s to the end" if end == math.inf else f"{start:g} to {end:g} s"
-            found.append(
+            notes.append(
                 f"{one.path}: {when} count both as {one.label} and as {other.label}; correct the ranges if they do not overlap"
             )
-    return first_sentences(found)
+    return first_sentences(notes)
 
 
 def _range_text(example: Example) -> str:
@@ -243,9 +243,9 @@ def usable(clips: ClipSet, path: Path) -> tuple[ClipSet, list[str]]:
 
 def assumed_rate_notes(clips: Sequence[Clip], path: Path | None = None) -> list[str]:
     """A note on clips whose frame rate nobody said: the names of recordings, or the number of clips of a set."""
-    found = [clip.name for clip in clips if clip.fps_assumed]
-    who = names(list(dict.fromkeys(found))) if path is None else f"{count(len(found), 'clip')} of {path}"
-    return [f"30 frames per second assumed for {who}; --fps says otherwise"] if found else []
+    assumed = [clip.name for clip in clips if clip.fps_assumed]
+    who = names(list(dict.fromkeys(assumed))) if path is None else f"{count(len(assumed), 'clip')} of {path}"
+    return [f"30 frames per second assumed for {who}; --fps says otherwise"] if assumed else []
 
 
 def read_recordings(
@@ -253,7 +253,7 @@ def read_recordings(
 ) -> tuple[list[Lane], list[str]]:
     """Recordings with names that differ, person by person, checked against the model, and what a reader should know about
     them."""
-    found: list[list[Lane]] = []
+    lanes_of_files: list[list[Lane]] = []
     notes: list[str] = []
     for path in paths:
         lanes, said = lanes_of(path, reading)
@@ -267,8 +267,8 @@ def read_recordings(
                     "actions are compared joint by joint: use the same pose estimator and joint layout for both"
                 )
         same = iter(_check_clips(clips, path))
-        found.append([replace(lane, clip=None if lane.clip is None else next(same)) for lane in lanes])
-    lanes = _distinguish_names(paths, found)
+        lanes_of_files.append([replace(lane, clip=None if lane.clip is None else next(same)) for lane in lanes])
+    lanes = _distinguish_names(paths, lanes_of_files)
     clips = [lane.clip for lane in lanes if lane.clip is not None]
     alone = [clip for clip in clips if "followed" not in clip.meta or clip.meta.get("person") is None]
     return lanes, notes + clip_notes(clips, reading) + on_gaps(alone) + assumed_rate_notes(clips)
@@ -310,7 +310,7 @@ def lanes_of(path: Path, reading: Reading) -> tuple[list[Lane], list[str]]:
 
 def on_truth(truth: Sequence[Sequence[KnownEvent] | None], recordings: Sequence[Any]) -> list[str]:
     """On known events that the recordings do not show; of videos that is not known before they are read."""
-    found = []
+    notes = []
     for one, events in zip(recordings, truth, strict=True):
         if not isinstance(one, Lane):
             continue
@@ -320,8 +320,8 @@ def on_truth(truth: Sequence[Sequence[KnownEvent] | None], recordings: Sequence[
             first = f"{label} at {start:g} to {end:g} s" + ", ..." * (len(out) > 1)
             who = f"{one.name}, person {one.person}," if one.person else one.name
             runs = f"{who} runs from {one.times[0]:.6g} to {one.times[-1]:.6g} s"
-            found.append(f"{runs}: {count(len(out), 'known event')} outside of it cannot be found ({first})")
-    return found
+            notes.append(f"{runs}: {count(len(out), 'known event')} outside of it cannot be found ({first})")
+    return notes
 
 
 def read_truth(
@@ -405,72 +405,72 @@ WORDS = flag_words("fps", "person", "min_confidence", "format", "layout", size="
 
 def clip_notes(clips: Sequence[Clip], reading: Reading) -> list[str]:
     """On clips of any use: who is in them, in which units, and at which rate."""
-    found = [*_people(clips, reading), *(with_words(one, WORDS) for one in remarks_on(clips, reading.size is not None))]
+    notes = [*_people(clips, reading), *(with_words(one, WORDS) for one in remarks_on(clips, reading.size is not None))]
     if reading.fps is not None and not SLOW <= reading.fps <= FAST and clips:
         length = max(clip.duration for clip in clips)
-        found.append(f"--fps {reading.fps:g}: the longest clip lasts {length:.3g} s then; is that so?")
-    return found
+        notes.append(f"--fps {reading.fps:g}: the longest clip lasts {length:.3g} s then; is that so?")
+    return notes
 
 
 def on_examples(clips: Sequence[Clip]) -> list[str]:
     """On clips to learn from."""
     still = [clip.name for clip in clips if _is_still(clip)]
-    found = [f"{names(list(dict.fromkeys(still)))}: nobody moves there; a pose is learned, not an action"] if still else []
+    notes = [f"{names(list(dict.fromkeys(still)))}: nobody moves there; a pose is learned, not an action"] if still else []
     lost: dict[int, list[str]] = {}
     for clip in clips:
         lost.setdefault(int((~clip.seen.any(axis=0)).sum()), []).append(clip.name)
-    found += [
+    notes += [
         f"{missing} of {count(clips[0].joints.shape[1], 'joint')} are never seen in {names(list(dict.fromkeys(which)))}; what they "
         "do is not learned"
         for missing, which in sorted(lost.items())
         if missing
     ]
-    return [*found, *on_classes([str(clip.label) for clip in clips])]
+    return [*notes, *on_classes([str(clip.label) for clip in clips])]
 
 
 def on_classes(labels: Sequence[str]) -> list[str]:
     """On what a model can tell apart."""
-    known = sorted(set(labels))
-    if len(known) != 2:
+    actions = sorted(set(labels))
+    if len(actions) != 2:
         return []
     return [
-        f"{known[0]} and {known[1]} are all that is known, and most of a recording looks like one of two: add examples of ordinary "
-        "movement, such as standing and walking about"
+        f"{actions[0]} and {actions[1]} are all that is known, and most of a recording looks like one of two: "
+        "add examples of ordinary movement, such as standing and walking about"
     ]
 
 
 def on_gaps(clips: Sequence[Clip]) -> list[str]:
     """On recordings that pause."""
-    found = []
+    notes = []
     for clip in clips:
         cuts = stretches(clip.times)
         if len(cuts) > 1:
             ends = [f"{clip.times[end - 1]:.6g}" for _, end in cuts[:-1].tolist()]
             listed = ", ".join(ends[:LISTED]) + " and more" * (len(ends) > LISTED)
-            found.append(f"{clip.name}: no frames for a while after {listed} s; its {len(cuts)} parts are searched by themselves")
-    return found
+            notes.append(f"{clip.name}: no frames for a while after {listed} s; its {len(cuts)} parts are searched by themselves")
+    return notes
 
 
 def on_people(name: str, crowd: Crowd) -> list[str]:
     """On who is in view, who comes and goes, and what was left out."""
-    found = []
+    notes = []
     if len(crowd.people) > 1:
-        told = "by the file's ids" if crowd.by_ids else "by position, as the file has no ids to rely on"
-        found.append(
-            f"{len(crowd.people)} people in view, told apart {told}; each is scanned by itself; --person largest follows one"
+        how = "by the file's ids" if crowd.by_ids else "by position, as the file has no ids to rely on"
+        notes.append(
+            f"{len(crowd.people)} people in view, told apart {how}; each is scanned by itself; --person largest follows one"
         )
     if not crowd.people:
-        found.append("nobody is in view for long enough to be scanned")
+        notes.append("nobody is in view for long enough to be scanned")
     if crowd.ghosts:
         reasons = ", ".join(f"{number} {reason}" for reason, number in crowd.ghosts.items())
-        found.append(f"{count(sum(crowd.ghosts.values()), 'track')} left out, as of no person ({reasons})")
+        notes.append(f"{count(sum(crowd.ghosts.values()), 'track')} left out, as of no person ({reasons})")
     if crowd.untracked:
-        found.append(f"{count(crowd.untracked, 'detection')} without an id left out; --person largest uses them")
-    found += first_sentences([_appears(one) for one in crowd.appearances])
-    found += first_sentences([_is_away(who, crowd) for who in dict.fromkeys(one.person for one in crowd.absences)])
+        notes.append(f"{count(crowd.untracked, 'detection')} without an id left out; --person largest uses them")
+    notes += first_sentences([_appears(one) for one in crowd.appearances])
+    notes += first_sentences([_is_away(who, crowd) for who in dict.fromkeys(one.person for one in crowd.absences)])
     swapped = "change places at {:.2f} s; their ids may be swapped there"
-    found += first_sentences([f"persons {one.first} and {one.second} {swapped.format(one.at)}" for one in crowd.exchanges])
-    return [f"{name}: {sentence}" for sentence in found]
+    notes += first_sentences([f"persons {one.first} and {one.second} {swapped.format(one.at)}" for one in crowd.exchanges])
+    return [f"{name}: {sentence}" for sentence in notes]
 
 
 def _appears(one: Appearance) -> str:
@@ -495,7 +495,7 @@ def first_sentences(sentences: Sequence[str]) -> list[str]:
 
 def _people(clips: Sequence[Clip], reading: Reading) -> list[str]:
 
-    found = []
+    notes = []
     for clip in clips:
         people = clip.meta.get("people")
         if people is None or reading.person not in FOLLOWED:
@@ -503,10 +503,10 @@ def _people(clips: Sequence[Clip], reading: Reading) -> list[str]:
         moments = jumps(clip) if clip.dims == 2 else []
         listed = ", ".join(f"{moment:.2f}" for moment in moments[:LISTED]) + " and more" * (len(moments) > LISTED)
         where = f", somebody else from {listed} s on" if moments else ""
-        found.append(
+        notes.append(
             f"{clip.name}: {people} people in view; followed is {FOLLOWED[reading.person]}{where}; --person says otherwise"
         )
-    return found
+    return notes
 
 
 def _is_still(clip: Clip) -> bool:

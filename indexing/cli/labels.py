@@ -13,8 +13,8 @@ from indexing.cli.inputs import KnownEvent, Lane, assumed_rate_notes, clip_notes
 from indexing.clip import Clip
 from indexing.files import prepare
 from indexing.joints import layout_of
-from indexing.labels import Label, LabelFile, choose_labels, open_labels, registered_formats, within, write_labels
-from indexing.labels.format import Request, of_recording, same_recording
+from indexing.labels import Label, LabelFile, choose_labels, open_labels, within, write_labels
+from indexing.labels.format import Request, of_recording, registered_formats, same_recording
 from indexing.opening import error, listing
 from indexing.report import RecordingResult
 from indexing.report.results import by_recording
@@ -56,7 +56,7 @@ def _why_nothing(notes: Sequence[str]) -> str:
 def read_marked(labelling: Labelling, lanes: Sequence[Any], reading: Reading) -> tuple[list[list[Label] | None], list[str]]:
     """The labels of each lane, those of moments left out; ``None`` where nothing is known of a person; and what to know of
     them."""
-    found: list[list[Label] | None] = [None] * len(lanes)
+    labels_of_lanes: list[list[Label] | None] = [None] * len(lanes)
     notes: list[str] = []
     recordings = list(dict.fromkeys(lane.name for lane in lanes))
     files = _of_recordings(labelling, recordings, reading)
@@ -69,8 +69,8 @@ def read_marked(labelling: Labelling, lanes: Sequence[Any], reading: Reading) ->
             notes += said
             for i, some in zip(mine, given, strict=True):
                 if some is not None:
-                    found[i] = [*(found[i] or []), *some]
-    return found, list(dict.fromkeys(notes))
+                    labels_of_lanes[i] = [*(labels_of_lanes[i] or []), *some]
+    return labels_of_lanes, list(dict.fromkeys(notes))
 
 
 def _rate(lanes: Sequence[Any], reading: Reading) -> float | None:
@@ -307,12 +307,12 @@ def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label]) -> tuple[list[Clip
 
 def _all_labels(labelling: Labelling, lane: Lane, reading: Reading) -> list[Label]:
     """All that is marked in a recording, of whatever tier and subject, and suggestions, too: none of it is background."""
-    found: list[Label] = []
+    labels: list[Label] = []
     for path in labelling.labels:
         file = open_marked(replace(labelling, tier=None), path, None, _rate([lane], reading))
         if not file.media or labelling.media is not None or any(of_medium(medium, [lane.name]) for medium in file.media):
-            found += open_marked(replace(labelling, tier=None), path, lane.name, _rate([lane], reading)).labels
-    return found
+            labels += open_marked(replace(labelling, tier=None), path, lane.name, _rate([lane], reading)).labels
+    return labels
 
 
 def _between(clip: Clip, labels: Sequence[Label]) -> list[Clip]:

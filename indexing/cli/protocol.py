@@ -32,11 +32,11 @@ def choose(clips: LabelledSet[Any], criteria: Sequence[str], flag: str) -> IntAr
         if not equals or not field.strip() or not wanted.strip():
             raise ValueError(f"{flag} {text!r}: expected field=value, such as view=1,2; {field_values(clips)}")
         values = column(clips, field.strip(), flag)
-        found = _matching(values, wanted)
-        if found is None:
+        matching = _matching(values, wanted)
+        if matching is None:
             listed = ", ".join(sorted({str(v) for v in values}, key=_natural)[:LISTED])
             raise ValueError(f"{flag} {text!r}: no clip of {clips.name} has such a value; {field.strip()!r} is one of {listed}")
-        keep &= found
+        keep &= matching
     if not keep.any():
         raise ValueError(f"{flag} {' '.join(criteria)}: no clip of {clips.name} meets all of it; {field_values(clips)}")
     return np.flatnonzero(keep)
@@ -215,15 +215,17 @@ def draw_shots(fold: Fold, labels: NDArray[np.str_], shots: int, seed: int) -> t
 def check_classes(folds: Sequence[Fold], labels: NDArray[np.str_], name: str) -> None:
     """Raise where fewer than two actions are left to learn."""
     for fold in folds:
-        found = np.unique(labels[fold.train])
-        if len(found) < 2:
+        classes = np.unique(labels[fold.train])
+        if len(classes) < 2:
             where = f" without {fold.name}" if fold.name else ""
-            raise ValueError(f"{name}: only one action ({found[0]}) to learn from{where}; choose training clips of at least two")
+            raise ValueError(f"{name}: only one action ({classes[0]}) to learn from{where}; choose training clips of at least two")
 
 
 def strangers(folds: Sequence[Fold], labels: NDArray[np.str_]) -> list[str]:
     """A note on test clips whose action was never learned."""
-    found = [label for fold in folds for label in labels[fold.test] if label not in set(labels[fold.train])]
-    if not found:
+    unlearned = [label for fold in folds for label in labels[fold.test] if label not in set(labels[fold.train])]
+    if not unlearned:
         return []
-    return [f"{count(len(found), 'test clip')} of actions that were not learned ({names(sorted(set(found)))}) count as wrong"]
+    return [
+        f"{count(len(unlearned), 'test clip')} of actions that were not learned ({names(sorted(set(unlearned)))}) count as wrong"
+    ]

@@ -154,10 +154,10 @@ def _check_moments(paths: Sequence[Path], source: Any, asked: Asked) -> None:
 
 def inputs_of(paths: Sequence[Path]) -> list[Path]:
     """The files that are read, for the manifest."""
-    found = []
+    files = []
     for path in (path.expanduser() for path in paths):
-        found += pictures_of(path) if path.is_dir() or is_pattern(path) else [path]
-    return found
+        files += pictures_of(path) if path.is_dir() or is_pattern(path) else [path]
+    return files
 
 
 def photographs(tracks: SceneTracks) -> list[Photograph]:
@@ -213,12 +213,12 @@ def calibration_files(given: str | None) -> list[Path]:
 def _inner(given: str) -> list[float] | None:
     """The four numbers of ``FX,FY,CX,CY``, or None for anything else."""
     try:
-        found = [float(word) for word in given.split(",")]
+        numbers = [float(word) for word in given.split(",")]
     except ValueError:
         return None
-    if len(found) != 4 or not all(math.isfinite(x) for x in found) or min(found[:2]) <= 0:
+    if len(numbers) != 4 or not all(math.isfinite(x) for x in numbers) or min(numbers[:2]) <= 0:
         raise ValueError(f"--calibration {given!r}: expected fx,fy,cx,cy in pixels, focal lengths positive, or a TOML file")
-    return found
+    return numbers
 
 
 def undistort_views(given: str | None, tracks: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -81,14 +81,14 @@ def find_keypoints(footage: Watching, paths: Iterable[Path], beside: Path | None
         home /= f"{footage.pose_model}-{footage.people}-{footage.every}"
     folders = _folders(videos, Path(_passing().name) if home is None else check_folder(home))
     there = {video: kept_file(video.expanduser(), folder) for folder, some in folders.items() for video in some if usual}
-    found: dict[Path, Path | ValueError] = {video: file for video, file in there.items() if file is not None}
-    again = f"{count(len(found), 'video')}: the keypoints that were kept in {home} are used"
-    notes = [again] if found else []
-    left = {folder: [video for video in some if video not in found] for folder, some in folders.items()}
+    keypoints: dict[Path, Path | ValueError] = {video: file for video, file in there.items() if file is not None}
+    again = f"{count(len(keypoints), 'video')}: the keypoints that were kept in {home} are used"
+    notes = [again] if keypoints else []
+    left = {folder: [video for video in some if video not in keypoints] for folder, some in folders.items()}
     if any(left.values()):
         made, said = _detect(footage, left, fps, home)
-        found, notes = found | made, [*notes, *said]
-    return Watched(found, tuple(notes))
+        keypoints, notes = keypoints | made, [*notes, *said]
+    return Watched(keypoints, tuple(notes))
 
 
 def _detect(
@@ -100,7 +100,7 @@ def _detect(
         model = models.load_models(None if footage.pose_model == "auto" else footage.pose_model)
     except ValueError as problem:
         raise ValueError(f"{videos[0]}: is a video, and its keypoints cannot be found: {problem}") from None
-    found: dict[Path, Path | ValueError] = {}
+    keypoints: dict[Path, Path | ValueError] = {}
     notes: list[str] = []
     for folder, some in folders.items():
         tasks = [VideoTask(video.expanduser(), footage.people, footage.every, fps, model.name) for video in some]
@@ -109,10 +109,10 @@ def _detect(
         for video, (_, one) in zip(some, made, strict=True):
             if not isinstance(one, KeypointFile | NobodyInVideo):
                 raise one
-            found[video] = one.path if isinstance(one, KeypointFile) else one
+            keypoints[video] = one.path if isinstance(one, KeypointFile) else one
             notes += [f"{video}: {note}" for note in getattr(getattr(one, "found", None), "notes", ())]
     kept = "" if home is None else f", kept in {home}/"
-    return found, [f"people in {count(len(videos), 'video')} found by BlazePose {model.name}, not smoothed{kept}", *notes]
+    return keypoints, [f"people in {count(len(videos), 'video')} found by BlazePose {model.name}, not smoothed{kept}", *notes]
 
 
 _PASSING: list[tempfile.TemporaryDirectory[str]] = []
@@ -238,17 +238,19 @@ class FilmRecording:
 
 def read_films(paths: Sequence[Path], reading: Reading) -> tuple[list[FilmRecording], list[str]]:
     """Videos, and the films of sets, with names that differ, and what a person should know about them."""
-    found: list[FilmRecording] = []
+    recordings: list[FilmRecording] = []
     notes: list[str] = []
     for path in paths:
         if holds_frames(path):
-            found += [FilmRecording(film.name, AsTheyAre().exemplar(film, i)) for i, film in enumerate(read_set(path, reading))]
+            recordings += [
+                FilmRecording(film.name, AsTheyAre().exemplar(film, i)) for i, film in enumerate(read_set(path, reading))
+            ]
             continue
         video = read_video(path.expanduser(), fps=reading.fps)
         notes += [f"{path}: {note}" for note in video.info.notes]
         twice = [other.name for other in paths].count(path.name) > 1
-        found.append(FilmRecording(str(path) if twice else path.name, video))
-    return found, notes
+        recordings.append(FilmRecording(str(path) if twice else path.name, video))
+    return recordings, notes
 
 
 def frame_rate(sources: Iterable[Any]) -> float:

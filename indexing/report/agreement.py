@@ -75,7 +75,7 @@ def summarize(report: AgreementReport) -> Summary:
             Table(["", *(f"{name} " for name in names)], seconds), Table(labels, label_rows(both)),
             Table(["overlap", "right ", "found ", "known ", "precision ", "recall ", "F1 "], overlap_rows(both)),
         ],
-        notes=[f"note: {note}" for note in report.notes], closing=[_agreement_sentence(report)], pictures=drawn,
+        notes=report.notes, closing=[_agreement_sentence(report)], pictures=drawn,
         files={
             "confusion.csv": partial(confusion_csv, both), "metrics.json": partial(as_json, report),
             files.MANIFEST: lambda: report.manifest,

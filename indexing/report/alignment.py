@@ -16,7 +16,19 @@ from numpy.typing import NDArray
 
 from dyntorch.numerics import with_words
 from indexing.readers.matches import Matched, Photograph
-from indexing.report.canvas import LIGHT, Theme, draw_photograph, new_figure, png, shorten, style
+from indexing.report.canvas import (
+    LIGHT,
+    Theme,
+    draw_photograph,
+    finish,
+    legend,
+    limits,
+    new_figure,
+    png,
+    shorten,
+    style,
+    widest_axes,
+)
 from indexing.report.page import ResultReport, markup, safe_cell, sentence, table_csv
 from indexing.report.summary import Summary, Table, register_page, warning_lines
 
@@ -285,12 +297,12 @@ def figures(value: float, spread: float) -> tuple[str, str]:
 # The picture of an alignment: view 1 with the paths of what moves, and the other views, coloured alike.
 
 
-Box = tuple[float, float, float, float]  # left, right, low, high
+Box = tuple[float, float, float, float]  # left, top, width, height
+Limits = tuple[FloatArray, FloatArray]  # low, high
 # apart for colour-blind eyes, too, on both papers; outliers are crosses besides
 COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "outlier": "#8b949c"}
 MARKS = {"static": "o", "moving": "o", "outlier": "x"}
 PATHS = 1500  # paths drawn; more are a blot
-ROOM = 0.06  # around the points, of their extent
 REACH = 0.6  # how far beyond view 1 paths are shown, of its extent
 WIDTH, MARGIN, GAP, TITLE, FOOT = 10.2, 0.65, 0.6, 0.3, 0.35  # inches
 WIDE = 0.62  # height over width of view 1, below which it gets the whole width
@@ -301,16 +313,16 @@ def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
     kinds = np.array(report.kinds) if report.has_motion else np.where(report.missing, "missing", "unlabelled")
     colours = {**COLOURS, "unlabelled": theme.muted}
     segments = report.segments
-    axes_shown, turned = _axes(report)
+    axes_shown, turned = widest_axes(report.views[0]), report.views[0].shape[-1] == 2
     # three views are drawn; the paths are those of all
     flat = [view[..., axes_shown] for view in report.views[:3]]
     boxes = [_box(points, kinds) for points in flat]
     if report.photographs:
-        boxes = [(-0.5, wide - 0.5, -0.5, tall - 0.5) for wide, tall in (one.size for one in report.photographs)]
+        boxes = [(np.full(2, -0.5), np.array(photograph.size) - 0.5) for photograph in report.photographs]
     elif report.has_motion:
         boxes[0] = _widen_box(boxes[0], report, kinds, axes_shown)
     with style(theme):
-        height, places = _layout([(box[3] - box[2]) / (box[1] - box[0]) for box in boxes])
+        height, places = _layout([float((high - low)[1] / (high - low)[0]) for low, high in boxes])
         figure = new_figure(WIDTH, height)
         for number, (points, place, box) in enumerate(zip(flat, places, boxes, strict=True), start=1):
             left, top, width, tall = place
@@ -320,12 +332,11 @@ def picture_of(report: AlignmentReport, theme: Theme = LIGHT) -> bytes:
             if number == 1 and report.has_motion:
                 _draw_paths(panel, report, kinds, axes_shown, box)
             _draw_points(panel, points, kinds, colours, large=number == 1, segments=segments)
-            _finish(panel, box, turned)
-            panel.set_title(f"view {number}: {shorten(report.names[number - 1], 40)}", fontsize=9, loc="left", parse_math=False)
+            finish(panel, *box, turned, f"view {number}: {shorten(report.names[number - 1], 40)}")
             if number == 1:
                 panel.set_xlabel("xyz"[axes_shown[0]])
                 panel.set_ylabel("xyz"[axes_shown[1]])
-        _legend(figure, kinds, colours, segments, theme.ink)
+        legend(figure, kinds, colours, theme.ink, lines=segments)
         return png(figure, tight=True)
 
 
@@ -354,42 +365,24 @@ def _layout(ratios: list[float]) -> tuple[float, list[Box]]:
     return max(place[1] + place[3] for place in found) + FOOT + 0.4, found
 
 
-def _axes(report: AlignmentReport) -> tuple[list[int], bool]:
-    """The two coordinates in which view 1 extends most, and whether the second points down, as in images."""
-    points = report.views[0].reshape(-1, report.views[0].shape[-1])
-    if points.shape[-1] == 2:
-        return [0, 1], True
-    spread = (
-        np.nan_to_num(np.nanpercentile(points, 95, axis=0) - np.nanpercentile(points, 5, axis=0)) if len(points) else np.ones(3)
-    )
-    return sorted(np.argsort(-spread, kind="stable")[:2].tolist()), False
+def _box(points: FloatArray, kinds: NDArray[Any]) -> Limits:
+    """Around the matches that fit; of all, where none does."""
+    fitting = np.isin(kinds, ("static", "moving"))
+    return limits(points[fitting if fitting.sum() > 1 else kinds != "missing"])
 
 
-def _box(points: FloatArray, kinds: NDArray[Any]) -> Box:
-    """Left, right, low, high of the matches that fit (of all, where none does), with room around."""
-    kept = np.isin(kinds, ("static", "moving"))
-    shown = points[kept if kept.sum() > 1 else kinds != "missing"].reshape(-1, 2)
-    if not len(shown):
-        return 0.0, 1.0, 0.0, 1.0
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    # points that all but coincide keep a box that the ticks can name
-    room = max(ROOM * float((high - low).max()), 1e-3 * float(np.abs(shown).max()), 1e-6)
-    return float(low[0] - room), float(high[0] + room), float(low[1] - room), float(high[1] + room)
-
-
-def _widen_box(box: Box, report: AlignmentReport, kinds: NDArray[Any], shown: list[int]) -> Box:
+def _widen_box(box: Limits, report: AlignmentReport, kinds: NDArray[Any], shown: list[int]) -> Limits:
     """The box of view 1 with the paths of what moves in it, as far as they do not lead far away."""
-    found = [
+    paths = [
         transform_points(matrix, view[kinds == "moving"])[..., shown].reshape(-1, 2)
         for view, matrix in zip(report.views[1:], report.motion, strict=True)
         if view.shape[-1] + 1 == matrix.shape[-1]
     ]
-    low, high = np.array(box[::2]), np.array(box[1::2])
+    low, high = box
     room = REACH * (high - low).max()
-    places = np.concatenate([low[None], high[None], *found])
+    places = np.concatenate([low[None], high[None], *paths])
     places = places[((places >= low - room) & (places <= high + room)).all(axis=1)]
-    least, most = places.min(axis=0), places.max(axis=0)
-    return float(least[0]), float(most[0]), float(least[1]), float(most[1])
+    return places.min(axis=0), places.max(axis=0)
 
 
 def as_segments(lines: FloatArray) -> FloatArray:
@@ -417,7 +410,7 @@ def transform_points(matrix: FloatArray, points: FloatArray) -> FloatArray:
     return out
 
 
-def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown: list[int], box: Box) -> None:
+def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown: list[int], box: Limits) -> None:
     from matplotlib.collections import LineCollection
 
     colour = COLOURS["moving"]
@@ -432,7 +425,7 @@ def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown:
         )
         return
     path = np.stack([report.views[0][moving], *others], axis=1)[..., shown]
-    size = max(box[1] - box[0], box[3] - box[2])
+    size = float((box[1] - box[0]).max())
     near = np.isfinite(path).all(axis=(1, 2)) & (np.abs(path - path[:, :1]).max(axis=(1, 2), initial=0) < 2 * size)
     doubtful = np.zeros(len(path), dtype=bool) if report.arrays.unverified is None else report.arrays.unverified[moving]
     if (near & doubtful).any():
@@ -471,43 +464,3 @@ def _draw_points(panel: Any, points: FloatArray, kinds: NDArray[Any], colours: d
         else:
             line = {"linewidth": 1.1} if kind == "outlier" else {"linewidth": 0}
             panel.scatter(*mine.T, s=size, c=colours[kind], marker=MARKS.get(kind, "o"), zorder=4, **line)
-
-
-def _finish(panel: Any, box: Box, turned: bool) -> None:
-    panel.set(xlim=box[:2], ylim=box[2:][::-1] if turned else box[2:])
-    panel.set_aspect("equal", adjustable="box", anchor="N")
-    panel.tick_params(length=2.5, labelsize=7.5)
-    panel.locator_params(nbins=6)
-    panel.ticklabel_format(useOffset=False)
-    for side in panel.spines.values():
-        side.set_linewidth(0.8)
-
-
-def _legend(figure: Any, kinds: NDArray[Any], colours: dict[str, str], segments: bool, ink: str) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = []
-    for kind in ("static", "moving", "outlier", "unlabelled"):
-        number = int((kinds == kind).sum())
-        if number:
-            mark = None if segments else MARKS.get(kind, "o")
-            look: Any = ("solid" if kind != "outlier" else "dotted") if segments else ""
-            handles.append(
-                Line2D(
-                    [],
-                    [],
-                    color=colours[kind],
-                    marker=mark,
-                    linestyle=look,
-                    markersize=5,
-                    label=f"{number:,} {kind}{'s' * (kind == 'outlier' and number > 1)}",
-                )
-            )
-    figure.legend(
-        handles=handles,
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0.25 / figure.get_figheight()),
-        ncols=4,
-        frameon=False,
-        labelcolor=ink,
-    )

@@ -21,7 +21,7 @@ from indexing import files
 from indexing.clip import Clip
 from indexing.opening import count
 from indexing.report.canvas import WIDTH, strip
-from indexing.report.page import LISTED, Script, even, markup, table_csv
+from indexing.report.page import LISTED, Script, even, markup, table_csv, time_cell
 from indexing.report.pictures import colours
 from indexing.report.player import Player, players
 from indexing.report.recognition import EVENTS_HEAD, OURS, duration, event_row, none, score_text
@@ -100,7 +100,7 @@ def summarize_search(report: SearchReport) -> Summary:
     measured = measure_search(report)
     return Summary(
         headline=_search_words(report, measured), cards=_search_cards(report, measured), tables=_hits_tables(report),
-        notes=[f"note: {note}" for note in report.notes],
+        notes=report.notes,
         closing=[f"{count(len(report.hits), 'hit')} in {size_text(report.info)}, searched in {report.seconds:.1f} s"],
         files={
             "hits.csv": partial(hits_csv, report.hits), "metrics.json": lambda: measured, files.MANIFEST: lambda: report.manifest,
@@ -129,7 +129,7 @@ def summarize_finds(report: FindReport) -> Summary:
     where = f"{count(len(report.events), 'action')} found in {count(measured['recordings_with_events'], 'recording')} of"
     return Summary(
         headline=_find_words(report, measured), cards=_find_cards(measured), tables=tables,
-        notes=["note: each event, with its times, is in events.csv of a report (--report FOLDER)"] * many,
+        notes=["each event, with its times, is in events.csv of a report (--report FOLDER)"] * many,
         closing=[
             f"{where if report.events else 'no action found in'} {size_text(report.info)}, searched in {report.seconds:.1f} s"
         ],
@@ -211,7 +211,7 @@ def summarize_verification(verification: Verification) -> Summary:
     where = f"{count(verification.windows, 'window')} in {count(verification.segments, 'segment')}"
     state = "all there, whole, and once" if verification.ok else count(len(verification.problems), "problem")
     left = count(len(verification.orphans), "file")
-    note = f"note: {left} of interrupted additions hold nothing that is missed; the next addition takes them away"
+    note = f"{left} of interrupted additions hold nothing that is missed; the next addition takes them away"
     return Summary(notes=[note] * bool(verification.orphans), closing=[f"{where}: {state}"])
 
 
@@ -269,15 +269,6 @@ def measure_finds(report: FindReport) -> dict[str, Any]:
 # ---- what both pages share -----------------------------------------------------------------------------------------------
 def _when(start: float, end: float) -> tuple[str, str]:
     return f"{start:.2f}", f"{end:.2f}"
-
-
-def _time(start: float, end: float) -> Any:
-    """When, how long, and what a clock shows then."""
-    minutes = f"{int(start) // 60 % 60:02d}:{int(start) % 60:02d}"
-    clock = f" · at {int(start) // 3600}:{minutes}" if end >= 60 else ""
-    return markup(
-        "{span}<small>{long} s long{clock}</small>", span=f"{start:.2f} to {end:.2f} s", long=f"{end - start:.1f}", clock=clock
-    )
 
 
 def _who(source: str, *more: str) -> Any:
@@ -351,7 +342,7 @@ def _hit_rows(report: SearchReport) -> list[list[Any]]:
         small = (f"person {hit.person}" * bool(hit.person), "mirrored" * hit.mirrored)
         name = markup('<span class="rank">{number}</span> {who}', number=number, who=_who(hit.source, *small))
         pictures = drawing.draw_pair(hit, model, lasts, f"hit {number}")
-        rows.append([name, _time(hit.start, hit.end), scores[number - 1], *pictures])
+        rows.append([name, time_cell(hit.start, hit.end), scores[number - 1], *pictures])
     return rows
 
 
@@ -378,10 +369,10 @@ def _search_cards(report: SearchReport, measured: Mapping[str, Any]) -> list[tup
 # ---- find ----------------------------------------------------------------------------------------------------------------
 def _by_label(report: FindReport) -> dict[str, list[ArchivedEvent]]:
     """The events of each action that has some, the most frequent first."""
-    found: dict[str, list[ArchivedEvent]] = {}
+    events_of: dict[str, list[ArchivedEvent]] = {}
     for event in report.events:
-        found.setdefault(str(event.label), []).append(event)
-    return dict(sorted(found.items(), key=lambda item: (-len(item[1]), item[0])))
+        events_of.setdefault(str(event.label), []).append(event)
+    return dict(sorted(events_of.items(), key=lambda item: (-len(item[1]), item[0])))
 
 
 def _find_words(report: FindReport, measured: Mapping[str, Any]) -> str:
@@ -410,26 +401,26 @@ def _find_cards(measured: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def _count_rows(report: FindReport) -> list[list[Any]]:
     """Of each action: how often, in how many recordings, seconds in all, and its scores."""
-    found = _by_label(report)
-    best = even([max((event.score for event in events), default=math.nan) for events in found.values()])
-    middle = even([float(np.median([event.score for event in events])) for events in found.values()])
+    events_of = _by_label(report)
+    best = even([max((event.score for event in events), default=math.nan) for events in events_of.values()])
+    middle = even([float(np.median([event.score for event in events])) for events in events_of.values()])
     rows: list[list[Any]] = [
         [
             label, f"{len(events):,}", f"{len({event.source for event in events}):,}",
             duration(sum(event.end - event.start for event in events)), top, usual,
         ]
-        for (label, events), top, usual in zip(found.items(), best, middle, strict=True)
+        for (label, events), top, usual in zip(events_of.items(), best, middle, strict=True)
     ]  # fmt: skip
-    absent = [name for name in map(str, report.classes) if name not in found]
+    absent = [name for name in map(str, report.classes) if name not in events_of]
     return rows + [[name, "0", "0", none("none"), "", ""] for name in absent]
 
 
 def _actions(report: FindReport) -> list[dict[str, Any]]:
     """Drawings of the surest and the most doubtful finds of each action."""
-    found, drawing = _by_label(report), _Drawing(report.archive)
-    room = min(max(PICTURED // max(len(found), 1), LEAST), MOST)
+    events_of, drawing = _by_label(report), _Drawing(report.archive)
+    room = min(max(PICTURED // max(len(events_of), 1), LEAST), MOST)
     out = []
-    for label, events in found.items():
+    for label, events in events_of.items():
         groups = []
         for title, some in _select_events(events, room):
             rows = list(_event_rows(report, drawing, some))
@@ -460,7 +451,7 @@ def _event_rows(report: FindReport, drawing: _Drawing, events: Sequence[Archived
         pictures = drawing.draw_pair(event, model, event.end - event.start, str(event.label))
         yield [
             _who(event.source, f"person {event.person}" * bool(event.person)),
-            _time(event.start, event.end),
+            time_cell(event.start, event.end),
             score,
             margin,
             *pictures,
@@ -477,17 +468,17 @@ def _recording_rows(report: FindReport, paint: Mapping[str, str]) -> list[list[A
     for one in report.recordings:
         low, high = spans.get(one.source, (math.inf, -math.inf))
         spans[one.source] = (min(low, one.start), max(high, one.end))
-    found: dict[str, list[ArchivedEvent]] = {}
+    events_of: dict[str, list[ArchivedEvent]] = {}
     for event in report.events:
-        found.setdefault(event.source, []).append(event)
+        events_of.setdefault(event.source, []).append(event)
     rows: list[list[Any]] = []
-    for source, events in sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))[:LISTED]:
+    for source, events in sorted(events_of.items(), key=lambda item: (-len(item[1]), item[0]))[:LISTED]:
         kinds = Counter(str(event.label) for event in events).most_common()
-        said = ", ".join(f"{number} {label}" for label, number in kinds[:6]) + f" and {len(kinds) - 6} more kinds" * (
+        counts_text = ", ".join(f"{number} {label}" for label, number in kinds[:6]) + f" and {len(kinds) - 6} more kinds" * (
             len(kinds) > 6
         )
         low, high = spans.get(source, (events[0].start, events[-1].end))
-        rows.append([_who(source, duration(high - low)), f"{len(events):,}", said, marks(events[:MARKS], low, high, paint)])
+        rows.append([_who(source, duration(high - low)), f"{len(events):,}", counts_text, marks(events[:MARKS], low, high, paint)])
     return rows
 
 

@@ -74,11 +74,11 @@ class BodiesReport(LabelledReport):
     @functools.cached_property
     def named_notices(self) -> list[Notice]:
         """The notices, frames by their names: the library numbers them from 0."""
-        found = []
+        notices = []
         for notice in self.result.notices:
             values = {key: self._frame(value) if key in ("frame", "frames") else value for key, value in notice.values.items()}
-            found.append(dataclasses.replace(notice, values=values).with_words(self.words))
-        return found
+            notices.append(dataclasses.replace(notice, values=values).with_words(self.words))
+        return notices
 
     def _frame(self, value: Any) -> Any:
         if isinstance(value, Sequence) and not isinstance(value, str):

@@ -19,7 +19,7 @@ from indexing import files
 from indexing.calibrate.rig import ASSOCIATED, CALIBRATION, drop_associated, rotation_vectors, toml_of, write_associated
 from indexing.clip import ClipSet
 from indexing.opening import parse_json, read_bytes, read_text
-from indexing.report.page import Script, even, markup, sentence
+from indexing.report.page import Script, even, notes_with_names, quiet, sentence
 from indexing.report.rig import array_of, heat_picture, plan_picture, scene
 from indexing.report.summary import Summary, Table, register_page, write_report
 from indexing.writers import encode
@@ -149,26 +149,26 @@ def write_calibration(folder: str | Path, report: CalibrationReport) -> tuple[Pa
 
 def _results(rig: CameraRig) -> tuple[dict[str, Any], list[str]]:
     """The files of a good rig by their names, and what to say about them."""
-    found: dict[str, Any] = {CALIBRATION: toml_of(rig)}
+    contents: dict[str, Any] = {CALIBRATION: toml_of(rig)}
     notes: list[str] = []
     clips = rig.people
     if not clips:
-        return found, ["no joint was seen by two cameras at once, so there is no movement in space"]
+        return contents, ["no joint was seen by two cameras at once, so there is no movement in space"]
     several = len(clips) > 1
     for suffix in (".trc", ".c3d"):
         for who, clip in enumerate(clips, start=1):
             name = f"{PEOPLE}_person{who}{suffix}" if several else f"{PEOPLE}{suffix}"
             try:
-                found[name] = encode([clip], Path(name))[0]
+                contents[name] = encode([clip], Path(name))[0]
             except ValueError as problem:
                 notes.append(f"{name} was not written: {problem}")
     with tempfile.TemporaryDirectory() as passing:
         path = Path(passing) / "clips.npz"
         ClipSet(clips, "people in space").save(path)
-        found[f"{PEOPLE}.npz"] = read_bytes(path)
+        contents[f"{PEOPLE}.npz"] = read_bytes(path)
     unit = "metres" if rig.calibration.metric else "units of the rig (the scale is unknown)"
     notes.append(f"{PEOPLE}: {unit}, y up; in {CALIBRATION} z is up: (x, y, z) there is (y, z, x) here, as Pose2Sim has it")
-    return found, notes
+    return contents, notes
 
 
 def as_json(report: CalibrationReport) -> dict[str, Any]:
@@ -246,7 +246,8 @@ def page_values(report: CalibrationReport) -> dict[str, Any]:
     rig = report.rig
     data, drawn = scene(rig)
     return {
-        "rig": rig, "noted": calibration_notes(report), "data": data, "scene_note": drawn,
+        "rig": rig, "noted": notes_with_names(rig.names, "" if rig.ok else rig.reason, report.notes),
+        "data": data, "scene_note": drawn,
         "script": Script("rig.js") if data else None,
         "camera_rows": camera_rows(report), "clock_rows": clock_rows(report), "residual_rows": residual_rows(report),
         "lenses": sentence(f"focal lengths {rig.lenses.source}"), "unit": "m" if rig.calibration.metric else "units",
@@ -287,7 +288,7 @@ def summarize(report: CalibrationReport) -> Summary:
         results = sorted(name for name in report.outputs if not name.endswith((".png", ".html", ".json")))
         closing.append(f"written to {report.folder}/: {', '.join(results) or 'the report alone, and no calibration'}")
     return Summary(
-        headline=describe(report), cards=cards(report), notes=[f"note: {note}" for note in report.notes], closing=closing,
+        headline=describe(report), cards=cards(report), notes=report.notes, closing=closing,
         pictures={PLAN: lambda theme: plan_picture(rig), HEAT: lambda theme: heat_picture(rig)},
         files={JSON: partial(as_json, report)},
         values=partial(page_values, report),
@@ -328,14 +329,6 @@ def _scale(rig: CameraRig) -> str:
     return "by known lengths"
 
 
-def calibration_notes(report: CalibrationReport) -> list[tuple[str, str, str]]:
-    """What a reader should note, as of :func:`indexing.report.page.remarks`; names of cameras keep their letters."""
-    names = tuple(report.rig.names)
-    said = [note[:1] * note.startswith(names) + sentence(note)[note.startswith(names) :] for note in report.notes]
-    refused = [("bad", "Refused.", sentence(report.rig.reason))] if not report.rig.ok else []
-    return [*refused, *(("", "", note) for note in said)]
-
-
 def focal_text(report: CalibrationReport, i: int) -> str:
     """A focal length with its standard deviation, or that it was held."""
     focal, sigma = float(report.rig.calibration.focals[i]), float(report.sigmas[i][FOCAL])
@@ -365,7 +358,7 @@ def camera_rows(report: CalibrationReport) -> list[list[Any]]:
     """The page's table of cameras."""
     found, rows = report.rig.calibration, []
     for i, view in enumerate(report.rig.views):
-        cell = markup("{name}<span class='quiet'>{path}</span>", name=view.name, path=view.take.path or "")
+        cell = quiet(view.name, view.take.path or "")
         size, k1, sigma = f"{view.size[0]}x{view.size[1]}", float(found.distortion[i, 0]), float(report.sigmas[i][K1])
         axis = array_of(found.R[i])[2]
         if not (np.isfinite(axis).all() and math.isfinite(k1)):

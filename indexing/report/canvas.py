@@ -6,7 +6,7 @@ import io
 import re
 import unicodedata
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -307,6 +307,30 @@ def foot(figure: Any, handles: list[Any], columns: int = 4, ink: str = LIGHT.ink
     """The legend at the foot of the figure."""
     anchor = (0.5, 0.28 / figure.get_figheight())
     figure.legend(handles=handles, loc="upper center", bbox_to_anchor=anchor, ncols=columns, frameon=False, labelcolor=ink)
+
+
+def legend(figure: Any, kinds: NDArray[Any], colours: Mapping[str, str], ink: str = LIGHT.ink, lines: bool = False) -> None:
+    """How many points (or lines) of every kind that there is, at the foot of the figure."""
+    from matplotlib.lines import Line2D
+
+    handles = []
+    line: Any
+    for kind, colour in colours.items():
+        number, stray = int((kinds == kind).sum()), kind == "outlier"
+        if number:
+            name = f"{kind}: {number:,}" if " " in kind else f"{number:,} {kind}{'s' * (stray and number > 1)}"
+            marker, line = (None, "dotted" if stray else "solid") if lines else ("x" if stray else "o", "")
+            handles.append(Line2D([], [], color=colour, marker=marker, linestyle=line, markersize=5, label=name))
+    foot(figure, handles, ink=ink)
+
+
+def widest_axes(points: FloatArray) -> list[int]:
+    """The two coordinates in which points ``(..., d)`` extend most, but for strays."""
+    flat = points.reshape(-1, points.shape[-1])
+    if flat.shape[-1] == 2:
+        return [0, 1]
+    low, high = np.nanpercentile(flat, [5, 95], axis=0) if len(flat) else (np.zeros(3), np.ones(3))
+    return sorted(np.argsort(-np.nan_to_num(high - low), kind="stable")[:2].tolist())
 
 
 def finish(panel: Any, low: FloatArray, high: FloatArray, down: bool, title: str) -> None:

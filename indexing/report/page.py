@@ -180,6 +180,13 @@ def notes_of(reason: str, warnings: Iterable[tuple[str, float, str]] = (), notes
     return out + [("", "", sentence(note)) for note in notes]
 
 
+def notes_with_names(names: Sequence[str], reason: str, notes: Iterable[str]) -> list[tuple[str, str, str]]:
+    """The same where notes may begin with the name of a camera, which keeps its letters."""
+    starts = tuple(names)
+    sentences = [note[:1] * note.startswith(starts) + sentence(note)[note.startswith(starts) :] for note in notes]
+    return [("bad", "Refused.", sentence(reason))] * bool(reason) + [("", "", text) for text in sentences]
+
+
 def clean(value: object) -> object:
     """Any value without the control characters that a page cannot hold."""
     return value if hasattr(value, "__html__") or isinstance(value, (int, float)) else _CONTROL.sub("", str(value))
@@ -215,6 +222,19 @@ def markup(html: str, **values: object) -> Markup:
     from markupsafe import Markup
 
     return Markup(html).format(**{name: clean(value) for name, value in values.items()})
+
+
+def quiet(text: object, beside: object) -> Markup:
+    """A table's cell with something in small print."""
+    return markup("{text}<span class='quiet'>{beside}</span>", text=text, beside=beside)
+
+
+def time_cell(start: float, end: float) -> Markup:
+    """A table's cell with seconds, and in small print how many they are and what a clock shows then."""
+    minutes, seconds = divmod(int(start), 60)
+    clock = f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}" if end >= 3600 else f"{minutes}:{seconds:02d} min"
+    small = f"{end - start:.1f} s long" + f" · at {clock}" * (end >= 60)
+    return markup("{span}<small>{small}</small>", span=f"{start:.2f} to {end:.2f} s", small=small)
 
 
 def matrix(values: Iterable[Iterable[float]]) -> Markup:

@@ -25,6 +25,7 @@ PALETTE = (
     "#0078b4", "#5a820a", "#820028", "#c85000", "#0a8278", "#785afa", "#464628", "#b45a6e", "#0a14d2", "#8c6e0a",
     "#c832be", "#005a1e", "#8c6450", "#643200", "#785a82", "#144650", "#aa0a00", "#463c3c", "#6e7864", "#5a6478",
 )  # fmt: skip
+MAX_LANES = 4
 STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400)  # seconds between ticks
 FRAME = "#e8741e"  # around found actions: stands out from the heat colours of both themes
 WIDTH, ABOVE, BESIDE = 10.2, 0.12, 0.85  # inches: of a timeline, above its bars, and for the scale on its right
@@ -288,26 +289,22 @@ def _draw_scale(figure: Any, image: Any, box: tuple[float, float, float, float])
 
 
 def _time_axis(axes: Any, view: _View) -> None:
+    from matplotlib.ticker import MultipleLocator
+
     step = next((step for step in STEPS if (view.high - view.low) / step <= 10), None)
     if step is not None:
-        axes.xaxis.set_major_locator(_multiple(step))
+        axes.xaxis.set_major_locator(MultipleLocator(step))
     axes.set_xlabel("time (s, min:s)" if view.minutes else "time (s)")
     if view.minutes:  # as video players show it
         axes.xaxis.set_major_formatter(lambda t, _: f"{t:g}\n{int(t) // 60}:{int(t) % 60:02d}" if t >= 0 else f"{t:g}")
 
 
-def _multiple(step: float) -> Any:
-    from matplotlib.ticker import MultipleLocator
-
-    return MultipleLocator(step)
-
-
-def _lanes(bars: Sequence[Bar], limit: int = 4) -> list[list[Bar]]:
-    """Bars that overlap go to separate lanes; beyond ``limit`` lanes they are drawn over each other."""
+def _lanes(bars: Sequence[Bar]) -> list[list[Bar]]:
+    """Bars that overlap go to separate lanes; beyond the fourth they are drawn over each other."""
     lanes: list[list[Bar]] = [[]]
     for bar in sorted(bars, key=lambda bar: bar[1]):
         free = next((lane for lane in lanes if not lane or lane[-1][2] <= bar[1]), None)
-        if free is None and len(lanes) < limit:
+        if free is None and len(lanes) < MAX_LANES:
             lanes.append([])
         (free if free is not None else lanes[-1]).append(bar)
     return lanes

@@ -13,7 +13,7 @@ from indexing import files
 from indexing.opening import count
 from indexing.report import pictures
 from indexing.report.canvas import Theme, letters_without_font, strip
-from indexing.report.page import Picture, Script, bar, even, markup, table_csv
+from indexing.report.page import Picture, Script, bar, even, markup, table_csv, time_cell
 from indexing.report.player import Player, players
 from indexing.report.results import (
     COUNTS,
@@ -66,7 +66,7 @@ def summarize(report: RecognitionReport) -> Summary:
     return Summary(
         headline=report.summary or describe(report, measured), cards=headline(report, measured),
         tables=[table for table in tables if table.rows], closing=closing,
-        notes=[note if note.startswith("warning: ") else f"note: {note}" for note in report.notes], pictures=drawn,
+        notes=report.notes, pictures=drawn,
         files={
             **({"events.csv": partial(events_csv, recordings)} if recordings else {}),
             **({"repetitions.csv": partial(repetitions_csv, recordings)} if counted else {}),
@@ -335,7 +335,7 @@ def of_recording(report: RecognitionReport, recording: RecordingResult, before: 
     scores, margins = even([event.score for event in events[:listed]]), even([event.margin for event in events[:listed]])
     rows: list[list[Any]] = []
     for number, (event, score, margin) in enumerate(zip(events[:listed], scores, margins, strict=True)):
-        rows.append([event.label, _when(event), score, margin])
+        rows.append([event.label, time_cell(event.start, event.end), score, margin])
         if recording.truth is not None:
             rows[-1].append(_verdict(event, overlapping(event, recording.truth)))
         if number < draw:
@@ -365,12 +365,6 @@ def _draw_event(report: RecognitionReport, recording: RecordingResult, event: Re
 def none(text: str) -> Any:
     """What stands in a table's cell where there is nothing."""
     return markup('<span class="none">{text}</span>', text=text)
-
-
-def _when(event: ReportedEvent) -> Any:
-    clock = f" · at {int(event.start) // 60}:{int(event.start) % 60:02d} min" if event.end >= 60 else ""
-    span = f"{event.start:.2f} to {event.end:.2f} s"
-    return markup("{span}<small>{long} s long{clock}</small>", span=span, long=f"{event.end - event.start:.1f}", clock=clock)
 
 
 def _verdict(event: ReportedEvent, known: str | None) -> Any:

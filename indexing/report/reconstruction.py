@@ -23,14 +23,15 @@ from indexing.report.canvas import (
     around,
     draw_photograph,
     finish,
-    foot,
     layout,
+    legend,
     limits,
     new_figure,
     png,
     sample,
     shorten,
     style,
+    widest_axes,
 )
 from indexing.report.page import ResultReport, markup, matrix, npz, safe_cell, sentence, table_csv
 from indexing.report.summary import Summary, Table, register_page, warning_lines
@@ -298,7 +299,8 @@ def points_csv(report: ReconstructionReport) -> str:
 
 
 # apart for colour-blind eyes, too, on both papers; outliers are crosses besides
-COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "body 1": "#2f7fb8", "body 2": "#e8741e", "outlier": "#8b949c"}
+COLOURS = {"static": "#2f7fb8", "moving": "#e8741e", "body 1": "#2f7fb8", "body 2": "#e8741e", "outlier": "#8b949c",
+           "unlabelled": LIGHT.muted}  # fmt: skip
 
 
 def kinds_of(report: ReconstructionReport) -> NDArray[Any]:
@@ -314,20 +316,6 @@ def colour_of(kind: str) -> str:
 def size_of(count: int) -> float:
     """Area of a mark, smaller where there are many."""
     return float(np.clip(2500 / max(1, count), 4, 22))
-
-
-def legend(figure: Any, kinds: NDArray[Any], ink: str = LIGHT.ink) -> None:
-    """How many tracks of every kind, at the foot of the figure."""
-    from matplotlib.lines import Line2D
-
-    handles = []
-    for kind in (*COLOURS, "unlabelled"):
-        number = int((kinds == kind).sum())
-        if number:
-            name = f"{number:,} {kind}{'s' * (kind == 'outlier' and number > 1)}" if " " not in kind else f"{kind}: {number:,}"
-            mark = "x" if kind == "outlier" else "o"
-            handles.append(Line2D([], [], color=colour_of(kind), marker=mark, linestyle="", markersize=5, label=name))
-    foot(figure, handles, ink=ink)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -347,7 +335,7 @@ def scene_picture(report: ReconstructionReport) -> bytes:
     with style():
         draw = _plan if positions.shape[-1] == 2 else _space
         figure = draw(report, positions, kinds)
-        legend(figure, kinds)
+        legend(figure, kinds, COLOURS)
         return png(figure, tight=True)
 
 
@@ -476,13 +464,13 @@ TRACKS_STRAYS = 0.995  # of the positions, those that a panel shows
 def tracks_picture(report: ReconstructionReport, theme: Theme = LIGHT) -> bytes:
     """PNG: the tracks through all views in the first one; beside them the same without the motion of the camera."""
     kinds = kinds_of(report)
-    measured = report.tracks.values[..., shown_axes(report.tracks.values)]
+    measured = report.tracks.values[..., widest_axes(report.tracks.values[0])]
     still = as_first_camera(report)
     panels: list[tuple[FloatArray, str]] = [
         (measured, f"as tracked, from {_view_heading(report.tracks.views[0], report.tracks.by_time)} on")
     ]
     if still is not None:
-        panels.append((still[..., shown_axes(report.tracks.values)], "as the first camera would see it, standing still"))
+        panels.append((still[..., widest_axes(report.tracks.values[0])], "as the first camera would see it, standing still"))
     kept = [points[:, kinds != "missing"] for points, _ in panels]
     boxes = [limits(points, TRACKS_STRAYS) for points in kept]
     if report.photograph is not None:
@@ -495,22 +483,12 @@ def tracks_picture(report: ReconstructionReport, theme: Theme = LIGHT) -> bytes:
                 draw_photograph(panel, report.photograph, theme)
             _draw(panel, points, kinds)
             finish(panel, *box, down, title)
-        legend(figure, kinds, theme.ink)
+        legend(figure, kinds, COLOURS, theme.ink)
         return png(figure, tight=True)
 
 
 def _view_heading(view: str, by_time: bool) -> str:
     return f"{'time' if by_time else 'frame'} {view}" if view.lstrip("-").replace(".", "", 1).isdigit() else shorten(view, 40)
-
-
-def shown_axes(values: FloatArray) -> list[int]:
-    """The two coordinates in which the first view extends most."""
-    if values.shape[-1] == 2:
-        return [0, 1]
-    first = values[0]
-    seen = first[np.isfinite(first).all(axis=1)]
-    spread = np.ptp(seen, axis=0) if len(seen) else np.ones(3)
-    return sorted(np.argsort(-spread, kind="stable")[:2].tolist())
 
 
 def as_first_camera(report: ReconstructionReport) -> FloatArray | None:

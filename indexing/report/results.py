@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from indexing.recordings.repetitions import RepetitionCount
 
 Truth = tuple[Hashable, float, float]
+MIN_OVERLAP = 0.5  # of the time of a reported and a known action, from which the first is right
 
 
 class ReportedEvent(Protocol):
@@ -269,10 +270,10 @@ def frame_accuracy(recording: RecordingResult) -> float:
 
 def frame_agreement(recording: RecordingResult) -> float:
     """Share of all frames for which the reported events say what is known: the same action, or none."""
-    said = np.full(len(recording.times), "", dtype=object)
+    reported = np.full(len(recording.times), "", dtype=object)
     for event in recording.events:
-        said[(recording.times >= event.start) & (recording.times <= event.end)] = str(event.label)
-    return float((said == _known_frames(recording)).mean())
+        reported[(recording.times >= event.start) & (recording.times <= event.end)] = str(event.label)
+    return float((reported == _known_frames(recording)).mean())
 
 
 def _known_frames(recording: RecordingResult) -> Any:
@@ -290,7 +291,7 @@ def confused_with(confusion: Mapping[str, Any], label: str) -> tuple[str, int] |
     return row.most_common(1)[0] if row else None
 
 
-def count_matches(recording: RecordingResult, overlap: float = 0.5) -> int:
+def count_matches(recording: RecordingResult) -> int:
     r"""How many events are right: each of a known action of its own, of the same name, with which it shares enough of the time,"""
     pairs = []
     for i, event in enumerate(recording.events):
@@ -300,7 +301,7 @@ def count_matches(recording: RecordingResult, overlap: float = 0.5) -> int:
                 pairs.append((shared / (max(event.end, end) - min(event.start, start)), i, j))
     used: set[tuple[str, int]] = set()
     for share, i, j in sorted(pairs, reverse=True):
-        if share >= overlap and not {("event", i), ("known", j)} & used:
+        if share >= MIN_OVERLAP and not {("event", i), ("known", j)} & used:
             used |= {("event", i), ("known", j)}
     return len(used) // 2
 
@@ -421,23 +422,23 @@ def cell(value: object) -> str:
 
 def held_back(recordings: Sequence[RecordingResult]) -> dict[str, dict[str, list[tuple[RecordingResult, float]]]]:
     """Reason -> label -> where and when: what was not reported; the most frequent first."""
-    found: dict[str, dict[str, list[tuple[RecordingResult, float]]]] = {}
+    withheld: dict[str, dict[str, list[tuple[RecordingResult, float]]]] = {}
     for recording in recordings:
         for one in recording.withheld:
-            found.setdefault(one.reason, {}).setdefault(str(one.event.label), []).append((recording, one.event.start))
-    reasons = sorted(found, key=lambda reason: -sum(map(len, found[reason].values())))
-    return {reason: dict(sorted(found[reason].items(), key=lambda item: -len(item[1]))) for reason in reasons}
+            withheld.setdefault(one.reason, {}).setdefault(str(one.event.label), []).append((recording, one.event.start))
+    reasons = sorted(withheld, key=lambda reason: -sum(map(len, withheld[reason].values())))
+    return {reason: dict(sorted(withheld[reason].items(), key=lambda item: -len(item[1]))) for reason in reasons}
 
 
 def held_times(where: Sequence[tuple[RecordingResult, float]], recordings: Sequence[RecordingResult]) -> str:
     """The first few times, with the recording where there are several, and how many more there are."""
     several = len({one.name for one in recordings}) > 1
-    said = []
+    times = []
     for recording, start in where[:TIMES]:
         who = f" of person {recording.person}" * bool(recording.person) + f" in {recording.name}" * several
-        said.append(f"{start:.2f} s{who}")
+        times.append(f"{start:.2f} s{who}")
     more = len(where) - TIMES
-    return ", ".join(said) + f" and {more} more" * (more > 0)
+    return ", ".join(times) + f" and {more} more" * (more > 0)
 
 
 def held_sentences(recordings: Sequence[RecordingResult]) -> list[str]:

@@ -134,7 +134,7 @@ def summarize(report: StaticReport) -> Summary:
     return Summary(
         headline=describe(report), opening=[describe(report) if found.ok else given],
         tables=[Table(["image", "matched ", "static ", "moving ", "spread "], cells, more)],
-        notes=[f"note: {note}" for note in report.all_notes],
+        notes=report.all_notes,
         closing=[f"database: {report.written}", f"masks: {report.masks}"] if found.ok else [],
         pictures={"static.png": partial(picture_of, report)}, dark=bool(report.photographs),
         files={

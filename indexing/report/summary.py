@@ -86,8 +86,7 @@ def summarize(report: Any) -> Summary:
 
 def warning_lines(report: ResultReport) -> list[str]:
     """The notes and warnings of a report as the terminal prints them, a line each."""
-    notes = [f"note: {note}" for note in report.notes]
-    return notes + [f"warning: {heading(code)}: {message}" for code, _, message in report.warnings]
+    return [*report.notes, *(f"warning: {heading(code)}: {message}" for code, _, message in report.warnings)]
 
 
 def write_report(folder: str | Path, report: Any, summary: Summary | None = None) -> Path:

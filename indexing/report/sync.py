@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dyntorch.numerics import as_python, with_words
 from indexing.opening import count
 from indexing.report.canvas import LIGHT, new_figure, png, shorten, style
-from indexing.report.page import markup, sentence
+from indexing.report.page import markup, notes_with_names, quiet, sentence
 from indexing.report.summary import Summary, Table, register_page
 from indexing.sync.people import Pairing, joint_names, person_label
 from indexing.sync.recordings import Take, accepted_notices
@@ -363,13 +363,6 @@ def ppm(rate: float, sigma: float | None = None) -> str:
     return "0" if rate == 1 or not (much or sigma) else f"{much:+d}" + ("" if sigma is None else f" ± {PPM * sigma:.0f}")
 
 
-def sync_notes(report: SyncReport) -> list[tuple[str, str, str]]:
-    """What a reader should note, as of :func:`indexing.report.page.remarks`; names of cameras keep their letters."""
-    names = tuple(report.names)
-    said = [note[:1] * note.startswith(names) + sentence(note)[note.startswith(names) :] for note in report.notes]
-    return [("bad", "Refused.", sentence(report.reason))] * bool(report.reason) + [("", "", note) for note in said]
-
-
 def clock_rows(report: SyncReport) -> list[list[Any]]:
     """The page's table of clocks."""
     rows = []
@@ -418,11 +411,6 @@ def pair_rows(report: SyncReport) -> list[list[Any]]:
     return rows
 
 
-def quiet(text: object, beside: object) -> Any:
-    """A table's cell with something in small print."""
-    return markup("{text}<span class='quiet'>{beside}</span>", text=text, beside=beside)
-
-
 def _state(pair: Compared) -> Any:
     good, bad = markup('<span class="good">ok</span>'), markup('<span class="bad">refused</span>: {why}', why=pair.reason)
     people = f"compared: {pair.people[0]} with {pair.people[1]}" if any(pair.people) else ""
@@ -435,7 +423,8 @@ def _state(pair: Compared) -> Any:
 def page_values(report: SyncReport) -> dict[str, Any]:
     """Rows of the page's tables, and how it writes numbers."""
     return {
-        "noted": sync_notes(report), "clock_rows": clock_rows(report), "pair_rows": pair_rows(report),
+        "noted": notes_with_names(report.names, report.reason, report.notes),
+        "clock_rows": clock_rows(report), "pair_rows": pair_rows(report),
         "video_rows": video_rows(report), "max_pairs": DRAWN, "drift_of": drift_of, "ppm": ppm, "sigma": sigma_text,
     }  # fmt: skip
 
@@ -526,8 +515,8 @@ def picture_of(report: SyncReport) -> bytes:
 
 def title_of(pair: Compared) -> str:
     """What a pair's curve says, in a line."""
-    said = f"{shorten(pair.a.name, 24)} → {shorten(pair.b.name, 24)}: "
-    return said + (f"{pair.offset_at_center:+.4f} ± {pair.shift.sigma:.4f} s" if pair.shift.ok else "refused")
+    names = f"{shorten(pair.a.name, 24)} → {shorten(pair.b.name, 24)}: "
+    return names + (f"{pair.offset_at_center:+.4f} ± {pair.shift.sigma:.4f} s" if pair.shift.ok else "refused")
 
 
 def _draw_curve(panel: Any, pair: Compared) -> None:
@@ -567,8 +556,8 @@ def _draw_close(panel: Any, pair: Compared) -> None:
 def _curve(pair: Compared) -> tuple[FloatArray, FloatArray]:
     """The finite part of the curve."""
     lags, scores = (np.asarray(values.detach().cpu().numpy(), dtype=np.float64) for values in (pair.shift.lags, pair.shift.scores))
-    known = np.isfinite(scores)
-    return lags[known], scores[known]
+    finite = np.isfinite(scores)
+    return lags[finite], scores[finite]
 
 
 def _finish(panel: Any, title: str) -> None:

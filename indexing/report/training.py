@@ -108,7 +108,7 @@ def telling_joints(parts: BodyParts) -> list[list[Any]]:
     names = parts.skeleton.joints if parts.skeleton is not None else tuple(f"joint {i}" for i in range(parts.shares.shape[1]))
     rows: list[list[Any]] = []
     for label, share in zip(parts.classes, parts.shares, strict=True):
-        first = [f"{_plain_name(names[j])} ({share[j]:.0%})" for j in np.argsort(-share)[:NAMED] if share[j] > 0]
+        first = [f"{names[j].replace('_', ' ')} ({share[j]:.0%})" for j in np.argsort(-share)[:NAMED] if share[j] > 0]
         rows.append([label, ", ".join(first) or markup('<span class="none">none stands out</span>')])
     return rows
 
@@ -206,10 +206,6 @@ def _bones(skeleton: Skeleton | None) -> list[tuple[int, int]]:
     return [(a, b) for a, b in skeleton.bones if not (face[a] or face[b])]
 
 
-def _plain_name(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def _colours() -> Any:
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -252,7 +248,7 @@ def summarize(report: TrainingReport) -> Summary:
     return Summary(
         headline=describe(report), cards=_cards(indexer, clips),
         tables=[Table(["action", "examples ", "seconds ", "joints "], rows)],
-        notes=[f"note: {note}" for note in [*report.notes, *_background_notes(indexer)]], closing=report.closing,
+        notes=[*report.notes, *_background_notes(indexer)], closing=report.closing,
         pictures={"body_parts.png": lambda theme: body_parts(report.parts)},
         files={"metrics.json": lambda: _metrics(indexer, report.parts), files.MANIFEST: lambda: report.manifest},
         values=lambda: {

@@ -176,14 +176,13 @@ def workforce(
     if dask is not None:
         return _cluster(dask)
     if threads:
-        return contextlib.nullcontext() if workers is None else _threads(workers)
+        return (
+            contextlib.nullcontext()
+            if workers is None
+            else ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
+        )
     number = min(workers or os.cpu_count() or 1, tasks or 1)
     return contextlib.nullcontext() if number == 1 else _processes(number)
-
-
-def _threads(workers: int) -> Executor:
-
-    return ThreadPoolExecutor(workers, initializer=torch.set_num_threads, initargs=(1,))
 
 
 @contextmanager

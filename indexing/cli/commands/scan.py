@@ -164,11 +164,11 @@ def within_label(indexer: ActionIndexer, exemplar: int | None) -> int | None:
 
 def exemplars(indexer: ActionIndexer) -> dict[Any, list[Clip]]:
     """Label -> the clips it was learned from."""
-    found: dict[Any, list[Clip]] = {}
+    clips: dict[Any, list[Clip]] = {}
     for index in range(len(indexer.model_.labels)):
         clip = indexer.exemplar(index)
-        found.setdefault(clip.label, []).append(clip)
-    return found
+        clips.setdefault(clip.label, []).append(clip)
+    return clips
 
 
 def _unknown(truth: Sequence[Sequence[KnownEvent] | None] | None, indexer: Any) -> list[str]:

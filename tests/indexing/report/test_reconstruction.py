@@ -92,7 +92,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         report(2, motion=TWO, velocities=None),
         report(3, motion=TWO, velocities=None),
         report(labels=np.zeros(5, dtype=int)),
-        report(velocities=np.zeros((5, 2)), positions=np.stack([report().found.points] * 2)),
+        report(velocities=np.zeros((5, 2)), positions=np.stack([report().arrays.points] * 2)),
     )):  # fmt: skip
         page = write_report(tmp_path / str(i), made).read_text()
         assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
