@@ -107,7 +107,7 @@ class Agreement:
     segments: Mapping[float, SegmentCounts]
 
     @property
-    def compared(self) -> float:
+    def total_seconds(self) -> float:
         """Seconds, of all people."""
         return float(self.seconds.sum())
 
@@ -119,9 +119,9 @@ class Agreement:
     @property
     def agreement(self) -> float:
         """Share of the time in which both say the same; NaN where no time is compared."""
-        return float(np.trace(self.seconds)) / self.compared if self.compared > 0 else math.nan
+        return float(np.trace(self.seconds)) / self.total_seconds if self.total_seconds > 0 else math.nan
 
-    def plain(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """All numbers in the types of JSON."""
         by_label = {
             name: {
@@ -134,7 +134,7 @@ class Agreement:
             for name, one in self.by_label.items()
         }
         return {
-            "seconds_compared": self.compared,
+            "seconds_compared": self.total_seconds,
             "agreement": self.agreement,
             "kappa": self.kappa,
             "at_overlap": _at_overlap(self.segments),
@@ -228,14 +228,14 @@ def time_table(lengths: FloatArray, known: NDArray[np.bool_], found: NDArray[np.
     r"""``(n + 1, n + 1)`` seconds, rows known, columns found, the last of both no label; it sums to the sum of the lengths."""
     both = known & found
     each = np.maximum(np.maximum(known.sum(axis=1), found.sum(axis=1)), 1)
-    apart = each - both.sum(axis=1)
+    num_unmatched = each - both.sum(axis=1)
     share = lengths / each
-    rest = []
+    unmatched = []
     for side in (known, found):
         alone = side & ~both
-        rest.append(np.column_stack([alone, apart - alone.sum(axis=1)]).astype(np.float64))
-    spread = np.divide(share, apart, out=np.zeros(len(lengths)), where=apart > 0)
-    table = (rest[0] * spread[:, None]).T @ rest[1]
+        unmatched.append(np.column_stack([alone, num_unmatched - alone.sum(axis=1)]).astype(np.float64))
+    spread = np.divide(share, num_unmatched, out=np.zeros(len(lengths)), where=num_unmatched > 0)
+    table = (unmatched[0] * spread[:, None]).T @ unmatched[1]
     table[np.arange(both.shape[1]), np.arange(both.shape[1])] += share @ both
     return np.asarray(table)
 
@@ -245,9 +245,9 @@ def kappa(table: FloatArray) -> float:
     total = float(table.sum())
     if not total > 0:
         return math.nan
-    said = float(np.trace(table)) / total
+    message = float(np.trace(table)) / total
     chance = float(table.sum(axis=1) @ table.sum(axis=0)) / total**2
-    return (said - chance) / (1 - chance) if chance < 1 - SHARE_EPSILON else math.nan
+    return (message - chance) / (1 - chance) if chance < 1 - SHARE_EPSILON else math.nan
 
 
 def _one_against_all(lasting: FloatArray, total: float) -> float:

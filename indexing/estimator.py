@@ -17,7 +17,7 @@ from torch import Tensor
 from indexing.action.inputs import check_labels
 from indexing.clip import is_number
 from indexing.modelfile import Parts, read_model, usable, write_model
-from indexing.opening import shown
+from indexing.opening import quote
 
 Options = TypeVar("Options")
 
@@ -81,13 +81,13 @@ def read_options(kind: type[Options], header: Mapping[str, Any]) -> Options | No
     if changed is None:
         return None
     if not isinstance(changed, dict):
-        raise ValueError(f"options: expected fields with their values, got {shown(changed)}")
+        raise ValueError(f"options: expected fields with their values, got {quote(changed)}")
     hints, usual = get_type_hints(kind), kind()
     for name, value in changed.items():
         if name not in hints:
-            raise ValueError(f"options: there is no {shown(name)}")
+            raise ValueError(f"options: there is no {quote(name)}")
         if not _fits(value, hints[name]):
-            raise ValueError(f"options.{name}: expected a value like {getattr(usual, name)!r}, got {shown(value)}")
+            raise ValueError(f"options.{name}: expected a value like {getattr(usual, name)!r}, got {quote(value)}")
     return replace(cast("Any", usual), **{name: _tuples(value) for name, value in changed.items()})
 
 
@@ -120,7 +120,7 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
         """Raise on parameters that make no sense, naming the parameter and what it accepts."""
         for name, rule in self.RULES.items():
             if not rule.accepts(getattr(self, name)):
-                raise ValueError(f"{name} must be {rule.wanted}, got {shown(getattr(self, name))}")
+                raise ValueError(f"{name} must be {rule.wanted}, got {quote(getattr(self, name))}")
         check_device(self.device)
 
     def saved_parameters(self) -> dict[str, Any]:

@@ -143,10 +143,10 @@ def write_text(path: str | Path, text: str) -> Path:
 
 def write_json(path: str | Path, value: Any) -> Path:
     """Write JSON whole or not at all: arrays as lists, paths as text, and NaN or infinity as ``null`` (JSON has neither)."""
-    return write_text(path, json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    return write_text(path, json.dumps(to_json_types(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
-def plain(value: Any) -> Any:
+def to_json_types(value: Any) -> Any:
     """The value in the types that JSON knows; what has no such form becomes its ``str``."""
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()
@@ -155,13 +155,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {field.name: to_json_types(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {str(plain(key)): plain(item) for key, item in value.items()}
+        return {str(to_json_types(key)): to_json_types(item) for key, item in value.items()}
     if isinstance(value, (set, frozenset)):
-        return sorted((plain(item) for item in value), key=str)
+        return sorted((to_json_types(item) for item in value), key=str)
     if isinstance(value, Sequence) and not isinstance(value, (bytes, bytearray)):
-        return [plain(item) for item in value]
+        return [to_json_types(item) for item in value]
     return str(value)
 
 
@@ -196,9 +196,9 @@ def manifest(
             versions[name] = None
     return {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "arguments": plain(arguments),
-        "seed": plain(seed),
-        "timings": plain(timings or {}),
+        "arguments": to_json_types(arguments),
+        "seed": to_json_types(seed),
+        "timings": to_json_types(timings or {}),
         "versions": versions,
         "platform": {"system": platform.platform(), "machine": platform.machine(), "processors": os.cpu_count()},
         "inputs": {str(path): _hashes(Path(path)) for path in inputs},

@@ -58,8 +58,8 @@ def has_names(skeleton: Skeleton | None) -> bool:
 
 def layout_of(clips: Sequence[Clip]) -> Skeleton | None:
     """Whose names the joints of many clips go by: the first with names, else the first with bones."""
-    known = [clip.skeleton for clip in clips if clip.skeleton is not None]
-    return next((skeleton for skeleton in known if has_names(skeleton)), known[0] if known else None)
+    skeletons = [clip.skeleton for clip in clips if clip.skeleton is not None]
+    return next((skeleton for skeleton in skeletons if has_names(skeleton)), skeletons[0] if skeletons else None)
 
 
 def match_joints(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Clip, str]:
@@ -84,14 +84,14 @@ def match_joints(clip: Clip, known: Skeleton | None, who: str = "") -> tuple[Cli
     joints[:, gone] = np.nan
     if confidence is not None:
         confidence[:, gone] = 0.0
-    said = ""
+    message = ""
     if missing:
-        said = f"{who}: {shared} of the {len(known.joints)} joints learned are in it; not {_list_some(missing)}"
+        message = f"{who}: {shared} of the {len(known.joints)} joints learned are in it; not {_list_some(missing)}"
     elif shared < len(own.joints):
-        said = f"{who}: of its {len(own.joints)} joints ({own.name}) the {shared} learned ({known.name}) are used"
-    if said and (own.name in MEASURED) != (known.name in MEASURED):
-        said += "; one layout is of markers or a depth sensor, so joints of the same name lie near each other, not on each other"
-    return clip.replace(joints=joints, confidence=confidence, skeleton=known), said
+        message = f"{who}: of its {len(own.joints)} joints ({own.name}) the {shared} learned ({known.name}) are used"
+    if message and (own.name in MEASURED) != (known.name in MEASURED):
+        message += "; one layout is of markers or a depth sensor, so joints of the same name lie near each other, not on each other"
+    return clip.replace(joints=joints, confidence=confidence, skeleton=known), message
 
 
 def places(own: Skeleton, known: Skeleton) -> list[int]:
@@ -100,9 +100,11 @@ def places(own: Skeleton, known: Skeleton) -> list[int]:
     words = [canonical(joint) for joint in own.joints]
     wanted = [canonical(joint) for joint in known.joints]
     alike = {word: i for i, word in enumerate(words) if words.count(word) == 1 and wanted.count(word) == 1}
-    found = [index.get(_letters(joint), -1) for joint in known.joints]
-    taken = set(found)
-    return [alike.get(word, -1) if i < 0 and alike.get(word, -1) not in taken else i for i, word in zip(found, wanted, strict=True)]
+    indices = [index.get(_letters(joint), -1) for joint in known.joints]
+    taken = set(indices)
+    return [
+        alike.get(word, -1) if i < 0 and alike.get(word, -1) not in taken else i for i, word in zip(indices, wanted, strict=True)
+    ]
 
 
 def canonical(joint: str) -> str:
@@ -122,13 +124,13 @@ def _of_body(known: Skeleton) -> list[int]:
     return body or list(range(len(known.joints)))
 
 
-def matched_all(clips: Sequence[Clip], known: Skeleton | None) -> list[Clip]:
+def match_all(clips: Sequence[Clip], known: Skeleton | None) -> list[Clip]:
     """:func:`match_joints` clips, with a warning where not all joints are used."""
-    found = [match_joints(clip, known, f"clip {i}" + (f" ({clip.name!r})" if clip.name else "")) for i, clip in enumerate(clips)]
-    partly = [note for (clip, note), given in zip(found, clips, strict=True) if note and clip is not given]
+    matches = [match_joints(clip, known, f"clip {i}" + (f" ({clip.name!r})" if clip.name else "")) for i, clip in enumerate(clips)]
+    partly = [note for (clip, note), given in zip(matches, clips, strict=True) if note and clip is not given]
     if partly:
         warnings.warn(partly[0] + (f" (and {len(partly) - 1} more clips)" if len(partly) > 1 else ""), stacklevel=4)
-    return [clip for clip, _ in found]
+    return [clip for clip, _ in matches]
 
 
 def _note_unnamed(clip: Clip, known: Skeleton | None, who: str) -> str:
@@ -195,12 +197,12 @@ def rank_layouts(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None
     some = np.asarray(joints[np.unique(np.linspace(0, len(joints) - 1, MAX_FRAMES).round().astype(int))], dtype=np.float64)
     some = np.where(np.abs(some) <= LARGEST, some, np.nan)
     ups = [axis for axis in UP_AXES if "xyz".index(axis[-1]) < joints.shape[2]] if up is None else [up]
-    found = []
+    fits = []
     for layout in layouts:
         bones = _bones(some, layout)
         best = max(((_posture(some, layout, axis), axis) for axis in ups), default=(-1.0, "y"))
-        found.append(LayoutFit(layout, bones, *best))
-    return sorted(found, key=lambda fit: -fit.value)
+        fits.append(LayoutFit(layout, bones, *best))
+    return sorted(fits, key=lambda fit: -fit.value)
 
 
 def recognize_layout(joints: FloatArray, layouts: Sequence[Skeleton], up: str | None) -> LayoutFit | None:
@@ -216,10 +218,10 @@ def choose_layout(
     up: str | None,
 ) -> tuple[Skeleton | None, dict[str, str], str | None]:
     """The layout of joints whose number alone is known."""
-    found = recognize_layout(joints, layouts, up) if len(joints) else None
-    if found is not None:
-        said = {} if found.layout is usual else {"layout": f"recognized: {found.layout.name}"}
-        return found.layout, said, found.up
+    fit = recognize_layout(joints, layouts, up) if len(joints) else None
+    if fit is not None:
+        message = {} if fit.layout is usual else {"layout": f"recognized: {fit.layout.name}"}
+        return fit.layout, message, fit.up
     if usual is None or len(layouts) < 2:
         return usual, {}, None
     others = " or ".join(layout.name for layout in layouts if layout is not usual)
@@ -230,9 +232,9 @@ def estimate_up(joints: FloatArray, names: Sequence[str], usual: str) -> str:
     """The direction that is up for a body whose joints have names; the usual one where the body does not show it."""
     words = [canonical(name) for name in names]
     plain = {word.replace("_", ""): word for word in HEIGHT}
-    known = [plain.get(word, plain.get(re.sub("^(left|right)", "", word), f"joint {i}")) for i, word in enumerate(words)]
-    found = rank_layouts(joints, [Skeleton("", tuple(known))], None)[0]
-    return found.up if found.posture >= MIN_POSTURE else usual
+    joints_of_body = [plain.get(word, plain.get(re.sub("^(left|right)", "", word), f"joint {i}")) for i, word in enumerate(words)]
+    fit = rank_layouts(joints, [Skeleton("", tuple(joints_of_body))], None)[0]
+    return fit.up if fit.posture >= MIN_POSTURE else usual
 
 
 def check_named_layout(path: Path, name: str, joints: int, own: Skeleton | None = None) -> Skeleton:
@@ -242,12 +244,12 @@ def check_named_layout(path: Path, name: str, joints: int, own: Skeleton | None 
         same = ", ".join(one.name for one in candidates(joints)) or "none"
         what = f"has {joints} joints, but layout={layout.name} has {len(layout.joints)}"
         raise error(path, what, f"name another one (of {joints} joints: {same}), or leave it out")
-    known = {canonical(joint) for joint in layout.joints}
+    layout_joints = {canonical(joint) for joint in layout.joints}
     pairs = zip(own.joints if own is not None else (), layout.joints, strict=False)  # names that the layout has elsewhere
-    other = next(((a, b) for a, b in pairs if canonical(a) in known and canonical(a) != canonical(b)), None)
-    if other is not None:
-        said = f"names its joints itself ({other[0]} where layout={layout.name} has {other[1]})"
-        raise error(path, said, Message("leave {arg:layout=} out, or correct the names in the file"))
+    mismatch = next(((a, b) for a, b in pairs if canonical(a) in layout_joints and canonical(a) != canonical(b)), None)
+    if mismatch is not None:
+        message = f"names its joints itself ({mismatch[0]} where layout={layout.name} has {mismatch[1]})"
+        raise error(path, message, Message("leave {arg:layout=} out, or correct the names in the file"))
     return layout
 
 
@@ -269,10 +271,10 @@ def _posture(joints: FloatArray, layout: Skeleton, up: str) -> float:
     usual = np.array([HEIGHT.get(name, np.nan) for name in names])
     high = (-1 if up.startswith("-") else 1) * joints[..., "xyz".index(up[-1])]
     seen = np.isfinite(usual) & np.isfinite(high)
-    kept = seen.sum(axis=1) >= MIN_JOINTS
-    if not kept.any():
+    usable = seen.sum(axis=1) >= MIN_JOINTS
+    if not usable.any():
         return -1.0
-    seen, high = seen[kept], np.where(seen, high, 0.0)[kept]
+    seen, high = seen[usable], np.where(seen, high, 0.0)[usable]
     usual = np.where(seen, usual, 0.0)
     share = seen.sum(axis=1, keepdims=True)
     a, b = (np.where(seen, values - values.sum(axis=1, keepdims=True) / share, 0.0) for values in (high, usual))

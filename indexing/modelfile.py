@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from indexing.files import write_bytes
-from indexing.opening import VALUE, clip_text, error, parse_json, shown, size_of
+from indexing.opening import VALUE, clip_text, error, parse_json, quote, size_of
 from indexing.skeleton import Skeleton
 
 HEADER = "dyntorch"  # the metadata entry that holds the JSON
@@ -41,14 +41,14 @@ def write_model(
     """Write a fitted estimator, atomically."""
     from safetensors.torch import save as to_bytes
 
-    kept = {name: _to_plain(value) for name, value in parameters.items() if name != "device"}
-    for name, value in kept.items():
+    stored = {name: _to_plain(value) for name, value in parameters.items() if name != "device"}
+    for name, value in stored.items():
         try:
             json.dumps(value)
         except TypeError as problem:
             what = f"a model file holds text, numbers and lists only ({problem})"
             raise ValueError(f"{name}: {what}; set it to one of these") from None
-    header = json.dumps({"format": kind, "version": version, "parameters": kept, **about})
+    header = json.dumps({"format": kind, "version": version, "parameters": stored, **about})
     alone = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     write_bytes(Path(path), to_bytes(alone, metadata={HEADER: header}))
 
@@ -57,11 +57,11 @@ def read_model(path: str | Path, kind: str, version: int) -> tuple[dict[str, Any
     """What :func:`write_model` wrote: the header, and the tensors."""
     header, tensors = _open(Path(path), with_tensors=True)
     if header.get("format") != kind:
-        found = header.get("format", "nothing that dyntorch wrote")
-        said = f"is {found if isinstance(found, str) and len(found) < VALUE else shown(found)}, but {kind} is expected"
-        raise error(path, said, "give the file that was saved from such an indexer")
+        actual = header.get("format", "nothing that dyntorch wrote")
+        message = f"is {actual if isinstance(actual, str) and len(actual) < VALUE else quote(actual)}, but {kind} is expected"
+        raise error(path, message, "give the file that was saved from such an indexer")
     if header.get("version") != version:
-        raise error(path, f"model version {shown(header.get('version'))}, this program reads {version}", AGAIN)
+        raise error(path, f"model version {quote(header.get('version'))}, this program reads {version}", AGAIN)
     return header, Parts(tensors)
 
 
@@ -77,16 +77,16 @@ def labels_to_json(classes: NDArray[Any]) -> dict[str, Any]:
     return {"values": classes.tolist(), "dtype": classes.dtype.str}
 
 
-def labels_from_json(found: Mapping[str, Any]) -> NDArray[Any]:
+def labels_from_json(stored: Mapping[str, Any]) -> NDArray[Any]:
     """What :func:`labels_to_json` made, in the dtype it had."""
-    values, dtype = found["values"], np.dtype(found["dtype"])
+    values, dtype = stored["values"], np.dtype(stored["dtype"])
     text = dtype.kind in "UO"
     one_kind = all(isinstance(v, str) if text else isinstance(v, (int, float)) and abs(v) < np.inf for v in values)
     if dtype.kind not in "UiufbO" or dtype.itemsize > 4 * LETTERS or not one_kind or len(set(values)) < len(values) or not values:
-        raise ValueError(f"classes: {shown(values)} of type {dtype} are no labels")
+        raise ValueError(f"classes: {quote(values)} of type {dtype} are no labels")
     classes = np.array(values, dtype=dtype)
     if classes.tolist() != values:
-        raise ValueError(f"classes: {shown(values)} do not fit their type {dtype}")
+        raise ValueError(f"classes: {quote(values)} do not fit their type {dtype}")
     return classes
 
 
@@ -95,11 +95,11 @@ def skeleton_to_json(skeleton: Skeleton | None) -> list[Any] | None:
     return None if skeleton is None else [skeleton.name, list(skeleton.joints), [list(bone) for bone in skeleton.bones]]
 
 
-def skeleton_from_json(found: Any, joints: int) -> Skeleton | None:
+def skeleton_from_json(stored: Any, joints: int) -> Skeleton | None:
     """What :func:`skeleton_to_json` made."""
-    if found is None:
+    if stored is None:
         return None
-    name, names, bones = found
+    name, names, bones = stored
     if not isinstance(name, str) or len(names) != joints or not all(isinstance(joint, str) for joint in names):
         raise ValueError(f"skeleton: {len(names)} names for {joints} joints")
     return Skeleton(name, tuple(names), tuple((int(a), int(b)) for a, b in bones))
@@ -108,14 +108,14 @@ def skeleton_from_json(found: Any, joints: int) -> Skeleton | None:
 def number(value: Any, name: str, least: float = -LARGE, most: float = LARGE) -> float:
     """A number of the header."""
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not least <= value <= most:
-        raise ValueError(f"{name}: expected a number from {least:g} to {most:g}, got {shown(value)}")
+        raise ValueError(f"{name}: expected a number from {least:g} to {most:g}, got {quote(value)}")
     return float(value)
 
 
 def read_integer(value: Any, name: str, least: int, most: int) -> int:
     """A whole number of the header."""
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-        raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {shown(value)}")
+        raise ValueError(f"{name}: expected a whole number from {least} to {most}, got {quote(value)}")
     return value
 
 
@@ -125,8 +125,8 @@ def usable(path: str | Path) -> Iterator[None]:
     try:
         yield
     except MISFITS as problem:
-        said = f"not a model that can be used ({type(problem).__name__}: {clip_text(problem, 3 * VALUE)})"
-        raise error(path, said, AGAIN) from None
+        message = f"not a model that can be used ({type(problem).__name__}: {clip_text(problem, 3 * VALUE)})"
+        raise error(path, message, AGAIN) from None
 
 
 class Parts:
@@ -140,37 +140,37 @@ class Parts:
 
     def real(self, name: str, *shape: int | None, least: float = -LARGE, most: float = LARGE) -> Tensor:
         """Finite numbers of 32 or 64 bits; ``None`` in ``shape`` stands for any number."""
-        found = self._shaped(name, shape, torch.float32, torch.float64)
-        if not bool(((found >= least) & (found <= most)).all()):
+        values = self._require_shape(name, shape, torch.float32, torch.float64)
+        if not bool(((values >= least) & (values <= most)).all()):
             raise ValueError(f"{name}: expected numbers from {least:g} to {most:g}")
-        return found
+        return values
 
-    def whole(self, name: str, *shape: int | None, below: int = 2**62) -> Tensor:
+    def integers(self, name: str, *shape: int | None, below: int = 2**62) -> Tensor:
         """Whole numbers from 0, and below a limit."""
-        found = self._shaped(name, shape, torch.int64)
-        if not bool(((found >= 0) & (found < below)).all()):
+        values = self._require_shape(name, shape, torch.int64)
+        if not bool(((values >= 0) & (values < below)).all()):
             raise ValueError(f"{name}: expected whole numbers from 0 to {below - 1}")
-        return found
+        return values
 
     def every(self, name: str, *shape: int | None, below: int) -> Tensor:
         """Whole numbers below a limit, each of which comes."""
-        found = self.whole(name, *shape, below=below)
-        if len(found.unique()) != below:
+        values = self.integers(name, *shape, below=below)
+        if len(values.unique()) != below:
             raise ValueError(f"{name}: expected each of the numbers from 0 to {below - 1}")
-        return found
+        return values
 
     def truth(self, name: str, *shape: int | None) -> Tensor:
         """Truth values."""
-        return self._shaped(name, shape, torch.bool).view(torch.uint8) != 0  # a file may hold other bytes than 0 and 1
+        return self._require_shape(name, shape, torch.bool).view(torch.uint8) != 0  # a file may hold other bytes than 0 and 1
 
-    def _shaped(self, name: str, shape: tuple[int | None, ...], *kinds: torch.dtype) -> Tensor:
-        found = self.tensors[name]
-        fits = found.ndim == len(shape) and all(side in (None, n) for side, n in zip(shape, found.shape, strict=False))
-        if not fits or found.dtype not in kinds:
+    def _require_shape(self, name: str, shape: tuple[int | None, ...], *kinds: torch.dtype) -> Tensor:
+        values = self.tensors[name]
+        fits = values.ndim == len(shape) and all(side in (None, n) for side, n in zip(shape, values.shape, strict=False))
+        if not fits or values.dtype not in kinds:
             wanted = ", ".join("any" if side is None else str(side) for side in shape)
-            got = f"{found.dtype} {tuple(found.shape)}".replace("torch.", "")
+            got = f"{values.dtype} {tuple(values.shape)}".replace("torch.", "")
             raise ValueError(f"{name}: expected {str(kinds[0]).removeprefix('torch.')} ({wanted}), got {got}")
-        return found
+        return values
 
 
 @dataclass(frozen=True)
@@ -212,8 +212,8 @@ def read_fields(kind: type, parts: Parts, sizes: dict[str, int], before: str = "
         if type(None) in kinds and not any(other == name or other.startswith(name) for other in parts.tensors):
             out[each] = None
         elif how.kind == "part":
-            known = {own: sizes.get(size) if isinstance(size, str) else size for own, size in how.limits.items()}
-            inner = {own: size for own, size in {**sizes, **known}.items() if size is not None}
+            given = {own: sizes.get(size) if isinstance(size, str) else size for own, size in how.limits.items()}
+            inner = {own: size for own, size in {**sizes, **given}.items() if size is not None}
             made: Any = next(one for one in kinds if is_dataclass(one))
             out[each] = made(**read_fields(made, parts, inner, name))
             outer = {own: how.limits.get(own, own) for own in inner}
@@ -248,8 +248,8 @@ def _open(path: Path, with_tensors: bool) -> tuple[dict[str, Any], dict[str, Ten
             # cloned, since tensors of the file lie at odd addresses, where products may be rounded otherwise in the last bit
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()} if with_tensors else {}  # noqa: SIM118
     except (SafetensorError, OSError, *MISFITS) as problem:
-        said = f"not a model file (safetensors says: {clip_text(problem, 2 * VALUE)})"
-        raise error(path, said, "give the file that 'index fit' wrote") from None
+        message = f"not a model file (safetensors says: {clip_text(problem, 2 * VALUE)})"
+        raise error(path, message, "give the file that 'index fit' wrote") from None
     header = parse_json(path, text or "{}", AGAIN, "its header is damaged")
     if not isinstance(header, dict):
         raise error(path, "its header is damaged (no table of values)", AGAIN)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip, ClipSet, FloatArray, check_fps
-from indexing.opening import clip_text, listing, shown
+from indexing.opening import clip_text, listing, quote
 from indexing.skeleton import Skeleton
 
 AXES = {
@@ -52,10 +52,10 @@ def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, n
     times, rate, assumed = _times(dataset, attrs, len(position), fps, name)
     joints, people = _names(dataset, "keypoints", position.shape[2]), _names(dataset, "individuals", position.shape[1])
     bones = _skeleton(attrs, joints, name)
-    known: NDArray[np.bool_] = np.asarray(~np.isnan(position).any(axis=3))
+    visible: NDArray[np.bool_] = np.asarray(~np.isnan(position).any(axis=3))
     clips = []
     for i in range(position.shape[1]):
-        if not known[:, i].any():
+        if not visible[:, i].any():
             continue
         sure = None if confidence is None else confidence[:, i]
         if sure is not None and np.isnan(sure).all():
@@ -65,7 +65,7 @@ def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, n
             Clip(
                 np.ascontiguousarray(position[:, i]),
                 times=times,
-                confidence=None if sure is None else np.where(np.isnan(sure), known[:, i], sure),
+                confidence=None if sure is None else np.where(np.isnan(sure), visible[:, i], sure),
                 fps=rate,
                 fps_assumed=assumed,
                 label=_label(attrs),
@@ -123,17 +123,17 @@ def _coordinate(dataset: Any, axis: str) -> np.ndarray[Any, Any] | None:
     coords = getattr(dataset, "coords", None)
     for name in AXES[axis]:
         try:
-            found = coords[name]  # type: ignore[index]
+            coordinate = coords[name]  # type: ignore[index]
         except (KeyError, TypeError, IndexError):
             continue
-        return np.atleast_1d(np.asarray(getattr(found, "values", found)))
+        return np.atleast_1d(np.asarray(getattr(coordinate, "values", coordinate)))
     return None
 
 
 def _names(dataset: Any, axis: str, count: int) -> list[str]:
     """Names of the entries of an axis; none where the dataset has none, or not as many."""
-    found = _coordinate(dataset, axis)
-    return [str(name) for name in found] if found is not None and found.shape == (count,) else []
+    coordinate = _coordinate(dataset, axis)
+    return [str(name) for name in coordinate] if coordinate is not None and coordinate.shape == (count,) else []
 
 
 def _spatial(dataset: Any, axes: tuple[str, ...], values: FloatArray, who: str) -> list[int]:
@@ -150,22 +150,22 @@ def _confidence(dataset: Any, position: FloatArray, who: str) -> FloatArray | No
     if not hasattr(getattr(dataset, "confidence", None), "dims"):
         return None
     values, axes = _values(dataset, "confidence", who)
-    found = _reorder(values, axes, ("time", "individuals", "keypoints", "space"))
-    if found.shape != (*position.shape[:3], 1):
+    confidence = _reorder(values, axes, ("time", "individuals", "keypoints", "space"))
+    if confidence.shape != (*position.shape[:3], 1):
         raise ValueError(
             f"{who}: confidence has the axes {listing(axes)} and the shape {values.shape}, which do not fit position; {NEEDED}"
         )
-    return np.asarray(found[..., 0])
+    return np.asarray(confidence[..., 0])
 
 
 def _times(
     dataset: Any, attrs: Mapping[str, Any], frames: int, fps: float | None, who: str
 ) -> tuple[FloatArray, float | None, bool]:
     """Seconds of the frames, frames per second, and whether nobody said how many."""
-    known = attrs.get("fps")
-    known = float(known) if isinstance(known, (int, float, np.integer, np.floating)) and known > 0 else None
-    rate = check_fps(30.0 if fps is None and known is None else known or fps, f"{who}: ")
-    assumed = known is None and fps is None
+    stated_fps = attrs.get("fps")
+    stated_fps = float(stated_fps) if isinstance(stated_fps, (int, float, np.integer, np.floating)) and stated_fps > 0 else None
+    rate = check_fps(30.0 if fps is None and stated_fps is None else stated_fps or fps, f"{who}: ")
+    assumed = stated_fps is None and fps is None
     stamps = _coordinate(dataset, "time")
     if stamps is None:
         return np.arange(frames) / rate, rate, assumed
@@ -173,18 +173,18 @@ def _times(
         raise ValueError(f"{who}: time has the shape {stamps.shape} for {frames} frames; {NEEDED}")
     if stamps.dtype.kind in "mM":  # durations, or dates, of which the first begins the clock
         begin = stamps[0] if stamps.dtype.kind == "M" else np.timedelta64(0)
-        return np.asarray((stamps - begin) / np.timedelta64(1, "s")), known, False
+        return np.asarray((stamps - begin) / np.timedelta64(1, "s")), stated_fps, False
     if stamps.dtype.kind not in "fiu":
-        raise ValueError(f"{who}: time holds {shown(stamps.flat[0].item())}; give seconds, or numbers of frames")
-    unit = attrs.get("time_unit") or ("frames" if known is None else "seconds")
+        raise ValueError(f"{who}: time holds {quote(stamps.flat[0].item())}; give seconds, or numbers of frames")
+    unit = attrs.get("time_unit") or ("frames" if stated_fps is None else "seconds")
     if unit not in ("seconds", "frames"):
-        raise ValueError(f"{who}: time_unit is {shown(unit)}; it must be 'seconds' or 'frames'")
-    return (stamps.astype(np.float64), known, False) if unit == "seconds" else (stamps / rate, rate, assumed)
+        raise ValueError(f"{who}: time_unit is {quote(unit)}; it must be 'seconds' or 'frames'")
+    return (stamps.astype(np.float64), stated_fps, False) if unit == "seconds" else (stamps / rate, rate, assumed)
 
 
 def _label(attrs: Mapping[str, Any]) -> str | int | None:
-    found = attrs.get("label")
-    return found.item() if isinstance(found, np.generic) else found if isinstance(found, (str, int)) else None
+    label = attrs.get("label")
+    return label.item() if isinstance(label, np.generic) else label if isinstance(label, (str, int)) else None
 
 
 def _up(attrs: Mapping[str, Any], dims: int) -> str:

@@ -45,8 +45,8 @@ KINDS: tuple[tuple[Callable[[int], bool], str, str], ...] = (
 # ---- messages ------------------------------------------------------------------------------------------------------------
 def error(path: str | Path, what: object, remedy: str) -> ValueError:
     """The one shape of every message, a line that is never long: file, what is wrong, what to do."""
-    said, help_ = (part if isinstance(part, Message) else clip_text(part) for part in (what, remedy))
-    return ValueError(Message("{path}: {what}; {remedy}", path=str(path), what=said, remedy=help_))
+    message, help_ = (part if isinstance(part, Message) else clip_text(part) for part in (what, remedy))
+    return ValueError(Message("{path}: {what}; {remedy}", path=str(path), what=message, remedy=help_))
 
 
 def clip_text(text: object, most: int = SAID) -> str:
@@ -58,11 +58,11 @@ def clip_text(text: object, most: int = SAID) -> str:
     return plain if len(plain) <= most else f"{plain[: most - 3 - half]}...{plain[len(plain) - half :]}"
 
 
-def shown(value: Any) -> str:
+def quote(value: Any) -> str:
     """A received value for a message: its ``repr``, of which only the ends are shown where it is long.
 
     Example:
-        >>> shown("12"), shown(10**99)
+        >>> quote("12"), quote(10**99)
         ("'12'", '1000000000000000000000000000...00000000000000000000000000000')
     """
     if type(value) is int and value.bit_length() < VALUE:
@@ -86,8 +86,8 @@ def count(number: int, one: str, many: str = "") -> str:
 
 def listing(names: Iterable[object], most: int = LISTED) -> str:
     """The first names, each clipped."""
-    found = [clip_text(name, VALUE // 3) or "(unnamed)" for name, _ in zip(names, range(most + 1), strict=False)]
-    return ", ".join(found[:most]) + ", ..." * (len(found) > most) or "none"
+    clipped = [clip_text(name, VALUE // 3) or "(unnamed)" for name, _ in zip(names, range(most + 1), strict=False)]
+    return ", ".join(clipped[:most]) + ", ..." * (len(clipped) > most) or "none"
 
 
 def first_duplicate(names: Iterable[Any]) -> Any:
@@ -101,17 +101,17 @@ def first_duplicate(names: Iterable[Any]) -> Any:
 def size_of(path: str | Path, remedy: str = "check the path", what: str = "file") -> int:
     """Bytes of a regular file."""
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except OSError as problem:
         raise _unreachable(path, problem, remedy, what) from None
     except ValueError:  # a null character
-        raise error(shown(str(path)), "no file can have this name", "check the path") from None
-    kind = next(((said, do) for test, said, do in KINDS if test(found.st_mode)), None)
-    if kind is None and not stat.S_ISREG(found.st_mode):
+        raise error(quote(str(path)), "no file can have this name", "check the path") from None
+    kind = next(((message, do) for test, message, do in KINDS if test(status.st_mode)), None)
+    if kind is None and not stat.S_ISREG(status.st_mode):
         kind = "is a device, not a file", "give a file"
     if kind is not None:
         raise error(path, *kind)
-    return found.st_size
+    return status.st_size
 
 
 def is_regular(path: str | Path) -> bool:
@@ -142,20 +142,20 @@ def entries(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def opened(path: str | Path, remedy: str = "check the path") -> Iterator[BinaryIO]:
+def open_file(path: str | Path, remedy: str = "check the path") -> Iterator[BinaryIO]:
     """A regular file, to be read; an error of the disk while it is read names the file, too."""
     size_of(path, remedy)
     try:
         with open(path, "rb") as file:
             yield file
     except OSError as problem:
-        said = f"cannot be read ({problem.strerror or problem})"
-        raise error(path, said, "check its permissions and the disk that holds it") from None
+        message = f"cannot be read ({problem.strerror or problem})"
+        raise error(path, message, "check its permissions and the disk that holds it") from None
 
 
 def head_of(path: str | Path, length: int = 512) -> bytes:
     """The first bytes of a file."""
-    with opened(path) as file:
+    with open_file(path) as file:
         head = file.read(length)
     if not head.strip():
         raise error(path, "the file is empty", "export it again")
@@ -164,7 +164,7 @@ def head_of(path: str | Path, length: int = 512) -> bytes:
 
 def read_bytes(path: str | Path, remedy: str = "check the path") -> bytes:
     """All of a file."""
-    with opened(path, remedy) as file:
+    with open_file(path, remedy) as file:
         size = os.fstat(file.fileno()).st_size
         if size > LARGEST:
             raise error(path, f"has {size / 2**30:.1f} GB, more than can be read at once", "split the recording")
@@ -198,8 +198,8 @@ def parse_json(path: str | Path, text: str, remedy: str, where: str = "") -> Any
     try:
         return json.loads(text)
     except json.JSONDecodeError as problem:
-        said = f"{before}not valid JSON at line {problem.lineno}, column {problem.colno} ({problem.msg})"
-        raise error(path, said, remedy) from None
+        message = f"{before}not valid JSON at line {problem.lineno}, column {problem.colno} ({problem.msg})"
+        raise error(path, message, remedy) from None
     except RecursionError:
         raise error(path, f"{before}the JSON is nested too deeply", remedy) from None
     except ValueError:  # more digits than Python reads
@@ -238,7 +238,7 @@ def _depth(text: str) -> int:
 # ---- tables --------------------------------------------------------------------------------------------------------------
 def read_rows(path: str | Path, remedy: str = TABLE_REMEDY, missing: str = "check the path", numbers: bool = True) -> Iterator[Row]:
     """Line number (1-based) and cells of every row of a table that is not blank; commas, semicolons or tabs separate cells."""
-    with opened(path, missing) as file:
+    with open_file(path, missing) as file:
         if os.fstat(file.fileno()).st_size > LARGEST:
             raise error(path, "is larger than any table of points", "split the recording")
         text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")

@@ -21,12 +21,12 @@ FOLLOWED = {"largest": "the largest", "confident": "the one that the detector tr
 """Who of several people is followed, in words, by the rules of :mod:`indexing.readers.recording`."""
 
 
-def remarks_on(clips: Sequence[Clip], sized: bool = False) -> list[Message]:
+def describe_issues(clips: Sequence[Clip], sized: bool = False) -> list[Message]:
     """What to know of clips besides who is in them: shape of the image, layout of the joints, clock."""
-    found = [] if sized else _group(clips, lambda clip: _STRETCHED if is_normalized(clip) else "")
-    found += _group(clips, _layout)
-    found += _group(clips, _lag)
-    return found
+    messages = [] if sized else _group(clips, lambda clip: _STRETCHED if is_normalized(clip) else "")
+    messages += _group(clips, _layout)
+    messages += _group(clips, _lag)
+    return messages
 
 
 _STRETCHED = "coordinates from 0 to 1, so the shape of the image is not known and people may be stretched; give {arg:size=}"
@@ -56,11 +56,11 @@ def _lag(clip: Clip) -> str:
     return "may be smoothed by MediaPipe, whose tracking lags by up to 2.4 frames where movement is quick; 'dyntorch pose' does not"
 
 
-def _group(clips: Sequence[Clip], told: Callable[[Clip], str]) -> list[Message]:
+def _group(clips: Sequence[Clip], sentence_of: Callable[[Clip], str]) -> list[Message]:
     """One message for all clips of which the same is to be said."""
     who: dict[str, dict[str, None]] = {}
     for clip in clips:
-        sentence = told(clip)
+        sentence = sentence_of(clip)
         if sentence:
             who.setdefault(sentence, {})[clip.name or "clip"] = None
     return [Message("{names}: " + sentence, names=_names(list(named))) for sentence, named in who.items()]
@@ -74,13 +74,13 @@ def same_clips(clips: Sequence[Clip]) -> list[tuple[int, int]]:
     """Pairs of clips that hold the same joints, each later one with its first: one recording given twice, whatever it is
     called."""
     first: dict[tuple[tuple[int, ...], bytes], int] = {}
-    found = []
+    pairs = []
     for i, clip in enumerate(clips):
         key = clip.joints.shape, _digest(clip.joints)
-        other = first.setdefault(key, i)
-        if other != i:
-            found.append((other, i))
-    return found
+        earlier = first.setdefault(key, i)
+        if earlier != i:
+            pairs.append((earlier, i))
+    return pairs
 
 
 def _digest(joints: FloatArray) -> bytes:

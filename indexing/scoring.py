@@ -88,7 +88,7 @@ def events(
     # once flicker is gone, what it parted is one again
     long = [(a, b) for a, b in runs if edges[b + 1] - edges[a] >= MIN_EVENT_SECONDS]
     runs = _bridge_gaps(long, state, edges, MAX_GAP_SECONDS)
-    found = []
+    events_ = []
     for first, last in runs:
         label, inside = int(state[first]), np.arange(first, last + 1)
         inside = inside[state[inside] == label]
@@ -96,8 +96,8 @@ def events(
             continue
         others = np.delete(scores[inside], label, axis=1).max(axis=1)
         score, margin = float(top[inside].mean()), float((top[inside] - others).mean())
-        found.append(Event(classes[label], float(edges[first]), float(edges[last + 1]), score, margin))
-    return found
+        events_.append(Event(classes[label], float(edges[first]), float(edges[last + 1]), score, margin))
+    return events_
 
 
 def _bridge_gaps(runs: list[tuple[int, int]], state: Array, edges: Array, gap: float) -> list[tuple[int, int]]:

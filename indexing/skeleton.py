@@ -42,10 +42,10 @@ def candidates(joints: int) -> tuple[Skeleton, ...]:
 def layout_named(name: str) -> Skeleton:
     """A layout by its name, whatever its capitals and hyphens."""
     plain = {re.sub(r"[\W_]+", "", known_name.lower()): layout for known_name, layout in LAYOUTS.items()}
-    found = plain.get(re.sub(r"[\W_]+", "", str(name).lower()))
-    if found is None:
+    layout = plain.get(re.sub(r"[\W_]+", "", str(name).lower()))
+    if layout is None:
         raise ValueError(f"layout {str(name)[:60]!r}: there is none of this name; use one of {', '.join(LAYOUTS)}")
-    return found
+    return layout
 
 
 COCO17 = from_names(

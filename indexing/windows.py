@@ -60,16 +60,16 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
         rows = np.flatnonzero(judged)
         far, spread = _deviations(places, times[frame], rows, around[rows], NUM_COMPARED)
         if once == 0:
-            told = rows % stride == 0
-            usual = MAX_USUAL_FACTOR * _share(far[told].max(axis=1), clip[rows[told]], len(starts) - 1, USUAL_SHARE)
+            sampled = rows % stride == 0
+            usual = MAX_USUAL_FACTOR * _share(far[sampled].max(axis=1), clip[rows[sampled]], len(starts) - 1, USUAL_SHARE)
         bad = (far > MAX_SPREADS * spread + (usual + floor)[clip[rows], None]).any(axis=1)
         if not bad.any():
             break
         wrong[frame[rows[bad]], joint[rows[bad]]] = True
         # whoever had a wrong neighbour is asked once more
-        found = np.zeros(len(joint) + 1, dtype=np.intp)
-        found[rows[bad] + 1] = 1
-        first, last = found.cumsum()[around.T]
+        changed = np.zeros(len(joint) + 1, dtype=np.intp)
+        changed[rows[bad] + 1] = 1
+        first, last = changed.cumsum()[around.T]
         touched, asked = last > first, np.zeros_like(there)
         asked[frame[touched], joint[touched]] = True
     return wrong
@@ -185,7 +185,7 @@ class Ragged:
     seen: NDArray[np.bool_]  # (clips, joints): seen at least once; the others are zeros in `joints`
 
 
-def ragged(clips: Sequence[Clip], repair: bool = False) -> Ragged:
+def concatenate_clips(clips: Sequence[Clip], repair: bool = False) -> Ragged:
     """Lay clips end to end and fill what is missing by linear interpolation in time, joint by joint."""
     joints = np.concatenate([y_up(clip) for clip in clips]).astype(np.float32)
     times = np.concatenate([clip.times for clip in clips])
@@ -238,15 +238,15 @@ def check_clips(
         if clip.joints.shape[1] != expected:
             other = "the fitted clips have" if joints is not None else "clip 0 has"
             raise ValueError(f"{who}: joints: {clip.joints.shape[1]} joints, but {other} {expected}; use clips of one joint layout")
-        reason = unusable(clip, fewest)
+        reason = describe_unusable(clip, fewest)
         if reason:
             raise ValueError(f"{who}: joints: {reason}; leave the clip out")
-        reason = None if recordings else torn(clip)
+        reason = None if recordings else describe_gap(clip)
         if reason:
             raise ValueError(f"{who}: times: {reason}")
 
 
-def torn(clip: Clip) -> str | None:
+def describe_gap(clip: Clip) -> str | None:
     """Why a clip's times are not those of one performance, and what to do, or ``None``."""
     steps = np.diff(clip.times)
     if len(steps) == 0 or steps.max() <= GAP:
@@ -264,7 +264,7 @@ def torn(clip: Clip) -> str | None:
     return None
 
 
-def unusable(clip: Clip, fewest: int = 2, point: bool = False) -> str | None:
+def describe_unusable(clip: Clip, fewest: int = 2, point: bool = False) -> str | None:
     """Why a clip cannot be compared with others, or ``None``; ``fewest``: frames it must have; ``point``: one joint is enough."""
     if len(clip) < fewest:
         return "one frame only, but an action needs at least two"
@@ -293,22 +293,22 @@ def sample(source: Ragged, owner: NDArray[np.intp], start: FloatArray, end: Floa
     out = torch.empty(len(owner), length, joints, dims)
     step = max(1, CHUNK // (length * SUBSAMPLES * joints * dims))
     for at in range(0, len(owner), step):
-        own, lo, hi = owner[at : at + step], start[at : at + step], end[at : at + step]
-        moment = ((lo[:, None] + (hi - lo)[:, None] * slots) - begin[own, None]) / span[own, None]
-        moment = np.clip(moment, 0.0, 1.0) + 2.0 * own[:, None]
+        owners, lo, hi = owner[at : at + step], start[at : at + step], end[at : at + step]
+        moment = ((lo[:, None] + (hi - lo)[:, None] * slots) - begin[owners, None]) / span[owners, None]
+        moment = np.clip(moment, 0.0, 1.0) + 2.0 * owners[:, None]
         right = np.clip(
-            np.searchsorted(clock, moment, side="right"), source.starts[own, None] + 1, source.starts[own + 1, None] - 1
+            np.searchsorted(clock, moment, side="right"), source.starts[owners, None] + 1, source.starts[owners + 1, None] - 1
         )
         left = right - 1
         gap = clock[right] - clock[left]
         weight = np.clip((moment - clock[left]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0).astype(np.float32)
         low = source.joints[left]
         values = low + weight[..., None, None] * (source.joints[right] - low)
-        out[at : at + step] = torch.from_numpy(values.reshape(len(own), length, SUBSAMPLES, joints, dims).mean(axis=2))
+        out[at : at + step] = torch.from_numpy(values.reshape(len(owners), length, SUBSAMPLES, joints, dims).mean(axis=2))
     return out
 
 
-def whole(source: Ragged, length: int, crop: tuple[float, float] = (0.0, 1.0)) -> Tensor:
+def resample_clips(source: Ragged, length: int, crop: tuple[float, float] = (0.0, 1.0)) -> Tensor:
     """Every clip as one window: the part between two fractions of its duration.  ``(clips, length, joints, dims)``."""
     begin, finish = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
     span = finish - begin

@@ -22,7 +22,7 @@ from indexing.action.bank import Bank, Copy, JointMetric, Windows, between, chan
 from indexing.archive import search
 from indexing.archive.search import Hit
 from indexing.archive.tracks import WINDOW_LENGTH
-from indexing.windows import ragged, sample
+from indexing.windows import concatenate_clips, sample
 
 STEP = 0.1  # seconds between windows
 PART = 100  # recordings that are cut at once: bounds memory
@@ -97,13 +97,13 @@ def cut(clips: Sequence[Clip], duration: float, step: float) -> tuple[Array, Arr
 
 def windows_at(clips: Sequence[Clip], owner: Array, start: Array, duration: float, length: int) -> Windows:
     """Windows of some clips."""
-    source = ragged(clips)
+    source = concatenate_clips(clips)
     return Windows(sample(source, owner, start, start + duration, length), torch.from_numpy(source.seen[owner]))
 
 
 def asked(clips: Sequence[Clip], length: int) -> Windows:
     """Queries, each as one window."""
-    source = ragged(clips)
+    source = concatenate_clips(clips)
     first, last = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
     return Windows(sample(source, np.arange(len(clips)), first, last, length), torch.from_numpy(source.seen))
 

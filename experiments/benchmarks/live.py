@@ -72,7 +72,7 @@ def followed(indexer: ActionIndexer, clip: Clip, at_once: int, lag: float | None
     for at in range(0, len(clip), at_once):
         before = time.process_time()
         found += live.push(clip.joints[at : at + at_once], clip.times[at : at + at_once]).events
-        slowest, kept = max(slowest, time.process_time() - before), max(kept, live.buffered)
+        slowest, kept = max(slowest, time.process_time() - before), max(kept, live.num_frames)
     found += live.finish().events
     speed = len(clip) / (time.process_time() - begin)
     return {"events": found, "speed": speed, "slowest": slowest, "kept": kept, "lag": live.lag}

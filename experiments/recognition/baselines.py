@@ -13,7 +13,7 @@ from torch import Tensor
 
 from indexing import Clip
 from indexing.action.bank import channel
-from indexing.windows import ragged, whole
+from indexing.windows import concatenate_clips, resample_clips
 
 Array = NDArray[Any]
 
@@ -34,12 +34,12 @@ class Nearest(ABC):
     def fit(self, clips: Sequence[Clip], labels: Array) -> Self:
         """Keep the exemplars."""
         self.labels = np.asarray(labels)
-        self.bank = self.describe(whole(ragged(clips), self.LENGTH))
+        self.bank = self.describe(resample_clips(concatenate_clips(clips), self.LENGTH))
         return self
 
     def distances(self, clips: Sequence[Clip]) -> Array:
         """``(clips, exemplars)``."""
-        return self.between(self.describe(whole(ragged(clips), self.LENGTH)), self.bank)
+        return self.between(self.describe(resample_clips(concatenate_clips(clips), self.LENGTH)), self.bank)
 
     def predict(self, clips: Sequence[Clip]) -> Array:
         """The label of the nearest exemplar."""

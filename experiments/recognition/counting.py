@@ -32,7 +32,7 @@ from indexing import ActionIndexer, Clip, PhaseIndexer
 from indexing.actors import ACTIONS, Person, dataset, detect, perform, stream
 from indexing.recordings.repetitions import count_repetitions
 from indexing.scoring import Event
-from indexing.windows import ragged, sample
+from indexing.windows import concatenate_clips, sample
 
 TURNS = (0, 90)
 ONCE = ("sit_down", "stand_up")  # cannot be repeated without the other between
@@ -107,7 +107,7 @@ def repeated_sets(actions: Sequence[str], number: int, seed: int) -> list[Repeat
 # ---- peers -------------------------------------------------------------------------------------------------------------
 def poses(clip: Clip, spans: Sequence[tuple[float, float]]) -> list[Array]:
     """``(samples, joints * 2)`` of each span, at an even rate, about their centre."""
-    source, out = ragged([clip]), []
+    source, out = concatenate_clips([clip]), []
     for start, end in spans:
         count = max(2, round((end - start) * RATE))
         x = sample(source, np.zeros(1, int), np.array([start]), np.array([end]), count)[0].double().numpy()

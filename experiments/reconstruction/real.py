@@ -60,7 +60,7 @@ from experiments.reconstruction.data import (
 )
 from experiments.reconstruction.pictures import drive_picture, people_picture, traffic_picture
 from experiments.reconstruction.traffic import asked, auto_rows, bodies_rows, threshold_rows, traffic_rows
-from indexing.files import manifest, plain, prepare, write_json
+from indexing.files import manifest, prepare, to_json_types, write_json
 
 SPATIAL = ("constant_direction_3d", "constant_velocity_planes_3d", "constant_velocity_3d")
 SHARES = (0.0, 0.03, 0.1, 0.3, 1.0)
@@ -259,7 +259,7 @@ def run(config: Config) -> None:
     drive_picture(drive.world, drive.found, config.out / "drive.png")
     inputs = [folder / name for name in ("hopkins155.npz", "argoverse2", "cmu_mocap_60fps.npz")]
     about = manifest(vars(config), inputs, seed=config.seed, timings={"all": time.perf_counter() - begin})
-    write_json(config.out / "figures.json", {"manifest": about, "tables": plain(tables)})
+    write_json(config.out / "figures.json", {"manifest": about, "tables": to_json_types(tables)})
     note(f"written: {config.out}, {time.perf_counter() - begin:.0f} s")
 
 

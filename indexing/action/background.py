@@ -24,12 +24,12 @@ from indexing.action.learning import Lesson, learn
 from indexing.action.model import ShapeModel, class_scores
 from indexing.actors import ACTIONS, dataset
 from indexing.clip import Clip, stretches
-from indexing.joints import FEWEST, has_names, match_joints, matched_all
+from indexing.joints import FEWEST, has_names, match_all, match_joints
 from indexing.recordings.decoding import Explanation, Withheld
 from indexing.recordings.evidence import MIN_CYCLIC
 from indexing.scoring import Event
 from indexing.skeleton import Skeleton
-from indexing.windows import check_clips, ragged, sample
+from indexing.windows import check_clips, concatenate_clips, sample
 
 NUM_PEOPLE = 2  # synthetic people who perform other actions
 NUM_CAMERAS = 2  # that see each of their performances
@@ -111,7 +111,7 @@ def cut_background(background: Iterable[Any], fps: float, joints: int, skeleton:
     """Recordings of other movement, cut into pieces as long as an action."""
     try:
         clips = [part for item in as_clips(background, fps) for part in (item if isinstance(item, tuple) else (item,))]
-        clips = matched_all(clips, skeleton)
+        clips = match_all(clips, skeleton)
         check_clips(clips, joints, recordings=True)
     except ValueError as problem:
         raise ValueError(f"background: {problem}") from None
@@ -183,7 +183,7 @@ def segment_evidence(model: ShapeModel, clip: Clip, events: Sequence[Event], len
     """``(events,)`` the evidence of segments of a recording, each asked as if it had been cut out by hand."""
     if not events:
         return np.zeros(0)
-    source, owner = ragged([clip]), np.zeros(len(events), dtype=np.intp)
+    source, owner = concatenate_clips([clip]), np.zeros(len(events), dtype=np.intp)
     begin, end = (np.array([getattr(event, name) for event in events]) for name in ("start", "end"))
     windows = Windows(sample(source, owner, begin, end, length), torch.from_numpy(source.seen[owner]))
     return np.asarray(model.evidence(windows.to(model.labels.device)).cpu().numpy())

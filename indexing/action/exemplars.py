@@ -17,7 +17,7 @@ from indexing.cameras import rotation, virtual
 from indexing.clip import Clip, FloatArray, stretches
 from indexing.modelfile import part, store
 from indexing.skeleton import Skeleton
-from indexing.windows import Ragged, ragged, sample, whole
+from indexing.windows import Ragged, concatenate_clips, resample_clips, sample
 
 MAX_WINDOWS = 500  # exemplars by whose distances between joints a layout is recognized
 MAX_DISTORTION = 0.25  # of the mean joint distance: the right layout fits to .02-.12 (one clip: .25), wrong ones to .34-.71
@@ -237,10 +237,10 @@ class Exemplars:
 def cut_exemplars(clips: Sequence[Clip], plan: ExemplarPlan, random_state: np.random.Generator) -> Exemplars:
     """Cut everything that is kept of the clips; 3D clips are rendered, first as seen along z, then from around."""
     images = [_render(clip, 0.0, VIEW_ELEVATION, random_state) for clip in clips]
-    source = ragged(images, plan.repair)
+    source = concatenate_clips(images, plan.repair)
     seen = torch.from_numpy(source.seen)
     crops = CROPS if plan.search else CROPS[:1]
-    cropped = stack([Windows(whole(source, plan.length, crop), seen) for crop in crops])
+    cropped = stack([Windows(resample_clips(source, plan.length, crop), seen) for crop in crops])
     views = [_view(clips, source, plan, random_state) for _ in range(plan.views)]
     seconds = torch.tensor([clip_seconds(clip) for clip in images], dtype=torch.float32)
     window = moment_window(plan.window, seconds)
@@ -305,7 +305,7 @@ def _view(clips: Sequence[Clip], source: Ragged, plan: ExemplarPlan, random_stat
             else clip
             for i, clip in enumerate(clips)
         ]
-        source = ragged(lifted, plan.repair)
+        source = concatenate_clips(lifted, plan.repair)
     begin, end = source.times[source.starts[:-1]], source.times[source.starts[1:] - 1]
     values = sample(source, np.arange(count), begin + low * (end - begin), begin + high * (end - begin), plan.length)
     if plan.turned and not solid.all():

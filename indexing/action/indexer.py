@@ -48,7 +48,7 @@ from indexing.recordings.decoding import Explanation, Withheld, decode
 from indexing.recordings.live import ActionStream, LiveSource
 from indexing.scoring import Event, join_labels, probabilities, refuse, reject_threshold, same_label
 from indexing.skeleton import Skeleton
-from indexing.windows import ragged, repair_clip, whole
+from indexing.windows import concatenate_clips, repair_clip, resample_clips
 
 Array = NDArray[Any]
 
@@ -375,9 +375,9 @@ class ActionIndexer(SavedClassifier):
     def _queries(self, clips: Iterable[Any]) -> Windows:
         check_is_fitted(self, "model_")
         found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_)
-        source = ragged(found, self.repair)
+        source = concatenate_clips(found, self.repair)
         check_common(found, source.seen, self.model_.shown())
-        return Windows(whole(source, self.length), torch.from_numpy(source.seen)).to(self.device)
+        return Windows(resample_clips(source, self.length), torch.from_numpy(source.seen)).to(self.device)
 
     def _model(self) -> ShapeModel:
         check_is_fitted(self, "model_")

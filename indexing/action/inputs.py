@@ -14,11 +14,11 @@ from dyntorch.numerics import affine_factorization, metric_upgrade
 from indexing.action.bank import COMMON
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
-from indexing.joints import layout_of, matched_all
+from indexing.joints import layout_of, match_all
 from indexing.movement import clip_of, clips_of, is_dataset
 from indexing.remarks import same_clips
 from indexing.skeleton import Skeleton
-from indexing.windows import check_clips, ragged, sample, torn
+from indexing.windows import check_clips, concatenate_clips, describe_gap, sample
 
 # share of the energy; a detector's noise leaves .002-.005, views that lag by .3 s .006-.04, another action .01-.05
 MAX_UNEXPLAINED = 0.01
@@ -40,7 +40,7 @@ def combine(views: tuple[Clip, ...]) -> list[Clip]:
                 "views of one performance must be 2D with the same joints: "
                 f"view 0 is {first.joints.shape[1:]}, view {i} {view.joints.shape[1:]}"
             )
-        reason = torn(view)
+        reason = describe_gap(view)
         if reason:
             raise ValueError(f"view {i} of {first.name!r}: times: {reason}")
     start, end = max(view.times[0] for view in views), min(view.times[-1] for view in views)
@@ -49,7 +49,7 @@ def combine(views: tuple[Clip, ...]) -> list[Clip]:
     if len(views) < 3:
         return list(views)
     steps = max(4, round((end - start) * float(first.fps or 30.0)))
-    source = ragged(list(views))
+    source = concatenate_clips(list(views))
     seen = source.seen.all(axis=0)
     if seen.sum() < 4:
         return list(views)
@@ -109,7 +109,7 @@ def gather(
     items = as_clips(clips, fps)
     skeleton = skeleton or layout_of([view for item in items for view in (item if isinstance(item, tuple) else [item])])
     for i, given in enumerate(items):
-        views = matched_all(given if isinstance(given, tuple) else [given], skeleton)
+        views = match_all(given if isinstance(given, tuple) else [given], skeleton)
         item = tuple(views) if isinstance(given, tuple) else views[0]
         parts = combine(item) if isinstance(item, tuple) else [item]
         found += parts
@@ -132,7 +132,7 @@ def check_queries(
         if isinstance(item, tuple):
             raise ValueError(f"clips: item {i} holds {len(item)} views; a query is one view, so predict each view and compare")
         found.append(item)
-    found = matched_all(found, skeleton)
+    found = match_all(found, skeleton)
     check_clips(found, joints, fewest=fewest, recordings=recordings)
     return [virtual(clip, 0.0, 0.1) if clip.dims == 3 else clip for clip in found]
 

@@ -38,7 +38,7 @@ from indexing.action.bank import (
 from indexing.action.exemplars import Exemplars
 from indexing.action.joint_weights import MOST_WEIGHT, JointWeights
 from indexing.modelfile import Parts, number, part, read_fields, store
-from indexing.opening import shown
+from indexing.opening import quote
 from indexing.scoring import SHARPNESS
 
 TURNED_CARD_WEIGHT = 0.3  # one shot +1.3 %, Florence3D +.8 %; .6 is too much
@@ -57,10 +57,10 @@ NEAREST_WEIGHT = 1.5  # of scorer A against B, standardized over classes; 1 .. 2
 class PairwiseMachine:
     """One support vector machine per pair of classes, over a precomputed kernel."""
 
-    support: Tensor = field(metadata=store("whole", "rows"))
+    support: Tensor = field(metadata=store("integers", "rows"))
     dual: Tensor = field(metadata=store("real", "others", "rows"))
     intercept: Tensor = field(metadata=store("real", "pairs"))
-    counts: Tensor = field(metadata=store("whole", "classes", below=2**31))
+    counts: Tensor = field(metadata=store("integers", "classes", below=2**31))
 
     @classmethod
     def fit(cls, kernel: Tensor, classes: np.ndarray, penalty: float = PENALTY) -> PairwiseMachine:
@@ -385,7 +385,7 @@ def read_shape_model(
     sizes = _sizes(parts, classes + hidden, joints, length, crops)
     view, scorer, trained = header["view"], header["scorer"], "scales" in parts
     if view != header["parameters"]["view"] or scorer not in SCORERS or trained != (scorer != "nearest"):
-        raise ValueError(f"view, scorer: {shown(view)} and {shown(scorer)} do not fit the rest")
+        raise ValueError(f"view, scorer: {quote(view)} and {quote(scorer)} do not fit the rest")
     stored_fields = read_fields(ShapeModel, parts, sizes)
     if sizes["views"] % sizes["exemplars"]:
         raise ValueError(f"views: {sizes['views']} windows of {sizes['exemplars']} exemplars")

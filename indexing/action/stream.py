@@ -14,7 +14,7 @@ from indexing.action.bank import Windows, channel, stack
 from indexing.action.exemplars import MAX_SAMPLED_MOMENTS
 from indexing.action.model import ShapeModel
 from indexing.clip import Clip, stretches
-from indexing.windows import Ragged, ragged, sample
+from indexing.windows import Ragged, concatenate_clips, sample
 
 MIN_SHOWN_SHARE = 0.3  # of a window's frames that must show the person
 INTERPOLATION_MARGIN = 2.0  # seconds of frames on both sides of a block from which missing joints are interpolated
@@ -154,7 +154,7 @@ def around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -> 
         first = max(low, min(int(np.searchsorted(clip.times, mine[0] - margin)), high - 2))
         last = min(high, max(int(np.searchsorted(clip.times, mine[-1] + margin, side="right")), first + 2))
         pieces.append(clip.replace(joints=clip.joints[first:last], times=clip.times[first:last], confidence=None))
-    return ragged(pieces), own
+    return concatenate_clips(pieces), own
 
 
 def windows_at(source: Ragged, owner: Array, middle: Array, seconds: float, length: int) -> Windows:

@@ -29,7 +29,7 @@ from indexing.archive.workers import InOrder, WorkerLost
 from indexing.cameras import y_up
 from indexing.clip import Clip
 from indexing.scoring import Event
-from indexing.windows import ragged, unusable
+from indexing.windows import concatenate_clips, describe_unusable
 
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
@@ -115,7 +115,7 @@ def probes_of(snapshot: Snapshot, indexer: ActionIndexer) -> dict[int, tuple[Pro
         if any(clip is None for clip in facing):
             continue
         clips = [clip.replace(joints=y_up(clip), up="y") for clip in facing if clip is not None]
-        source = ragged(clips)
+        source = concatenate_clips(clips)
         all_of = [probe_of(source, i, layout, rate, tempo, moving=True) for i in range(len(clips)) for tempo in TEMPOS]
         found[number] = tuple(probe for probe in all_of if probe is not None)
     return found
@@ -177,7 +177,7 @@ def _events(task: FindTask, segment: ArchiveSegment, tracks: Sequence[int]) -> l
         return []
     times, joints = np.concatenate([one for one, _ in clips]), np.concatenate([one for _, one in clips])
     clip = Clip(joints, times=times, skeleton=task.layout.skeleton)
-    if unusable(clip):
+    if describe_unusable(clip):
         return []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that the model has other joints, too, is so of every recording

@@ -27,7 +27,7 @@ from indexing.archive.tracks import WINDOW_LENGTH, Layout, images
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.cameras import y_up
 from indexing.clip import Clip, FloatArray
-from indexing.windows import Ragged, interpolate_gaps, ragged, repair_clip, sample, unusable, whole
+from indexing.windows import Ragged, concatenate_clips, describe_unusable, interpolate_gaps, repair_clip, resample_clips, sample
 
 Progress = Callable[[float], None] | None
 
@@ -82,7 +82,7 @@ def check_example(clip: Clip, min_duration: float) -> Clip:
     there = np.flatnonzero(clip.seen.any(axis=1))
     if not len(there):
         raise ValueError(f"{who}: nobody is in view in any frame; give a clip that shows the movement")
-    reason = unusable(clip)
+    reason = describe_unusable(clip)
     if reason:
         raise ValueError(f"{who}: {reason}; give a clip that shows the movement")
     clip = repair_clip(clip.replace(joints=clip.joints[there], times=clip.times[there], confidence=None))
@@ -128,7 +128,7 @@ def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], mi
         # an image and its mirror image are of one shape: only the joints change places
         clips += [one.replace(joints=one.joints[:, swap]) for one in clips]
         windows = _whole_windows(clips, WINDOW_LENGTH)
-    source = ragged(clips)
+    source = concatenate_clips(clips)
     coarse, fine = (
         [
             probe_of(source, i, layout, rate, tempo, samples, mirrored=i >= count)
@@ -141,8 +141,8 @@ def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], mi
 
 
 def _whole_windows(clips: Sequence[Clip], length: int) -> Windows:
-    source = ragged(clips)
-    return Windows(whole(source, length), torch.from_numpy(source.seen))
+    source = concatenate_clips(clips)
+    return Windows(resample_clips(source, length), torch.from_numpy(source.seen))
 
 
 def probe_of(

@@ -26,7 +26,7 @@ from indexing.movement import clips_of, is_dataset
 from indexing.opening import parse_json, read_text, size_of
 from indexing.pose import available, keypoint_file
 from indexing.readers.files import VIDEOS, WatchOptions, frame_number
-from indexing.remarks import remarks_on
+from indexing.remarks import describe_issues
 from indexing.skeleton import Skeleton
 
 MAX_FRAME_BYTES = 2**22  # of a JSON file that may be one frame of many
@@ -329,7 +329,7 @@ def _people(source: ArchiveSource, reading: Mapping[str, Any]) -> tuple[list[tup
     except NobodySeen:
         return [], "nobody is in view in any frame"
     notes = ["30 frames per second assumed"] if any(clip.fps_assumed for clip in clips) else []
-    note = "; ".join([*notes, *(str(one).removeprefix(f"{source.path.name}: ") for one in remarks_on(clips))])
+    note = "; ".join([*notes, *(str(one).removeprefix(f"{source.path.name}: ") for one in describe_issues(clips))])
     if of_recording(clips):
         crowd = tracked_people(clips, source.name)
         return [(source.name, who.name, who.clip) for who in crowd.people], note

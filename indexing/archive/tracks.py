@@ -20,7 +20,7 @@ from indexing.cameras import rotation, y_up
 from indexing.clip import Clip, FloatArray
 from indexing.joints import FEWEST, has_names, places
 from indexing.skeleton import Skeleton
-from indexing.windows import interpolate_gaps, ragged, repair_clip, sample
+from indexing.windows import concatenate_clips, interpolate_gaps, repair_clip, sample
 
 MISSING = -(2**15)  # stored coordinate of a joint that was not seen
 LARGEST = 2**15 - 2  # of the others
@@ -101,7 +101,7 @@ def _track(joints: FloatArray, times: FloatArray, storage: StorageFormat, record
     if count < storage.min_duration * storage.rate + 1 or len(times) < 2:
         return None
     joints = _without_slips(joints)
-    source = ragged([Clip(joints, times=times)])
+    source = concatenate_clips([Clip(joints, times=times)])
     at = times[0] + np.arange(count) / storage.rate
     half = 0.5 / storage.rate
     values = sample(source, np.zeros(count, dtype=np.intp), at - half, at + half, 1)[:, 0].numpy().astype(np.float64)

@@ -37,7 +37,7 @@ from indexing.estimator import (
     one_of,
 )
 from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_fields, tensors_of
-from indexing.opening import shown
+from indexing.opening import quote
 from indexing.scoring import SHARPNESS, Event, join_labels, probabilities, refuse, reject_threshold
 
 MIN_WINDOW_FRAMES = 5.0  # of exercises at 15 per second, 0 / 60 degrees, 3 name .816 / .690 of the frames, 5 .821 / .751
@@ -157,7 +157,7 @@ class BrightnessIndexer(SavedClassifier):
         parameters = dict(header["parameters"])
         weight = parameters.pop("temporal_weight", 0.0)  # of older files
         if weight != 0.0:
-            raise ValueError(f"temporal_weight={shown(weight)}: window kernels are no longer mixed into scores")
+            raise ValueError(f"temporal_weight={quote(weight)}: window kernels are no longer mixed into scores")
         return parameters
 
     def _export_state(self) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
@@ -326,5 +326,5 @@ def _read_exemplars(parts: Parts, classes: int) -> VideoExemplars:
     sizes = {"classes": classes, "descriptor": LENGTH}
     found = VideoExemplars(**read_fields(VideoExemplars, parts, sizes))
     if not bool((found.lengths > 0).all()) or int(found.lengths.sum()) != sizes["frames"]:
-        raise ValueError(f"lengths: videos of {shown(found.lengths.tolist())} frames, and {sizes['frames']} are there")
+        raise ValueError(f"lengths: videos of {quote(found.lengths.tolist())} frames, and {sizes['frames']} are there")
     return replace(found, motion=found.motion.float())

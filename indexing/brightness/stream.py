@@ -27,7 +27,7 @@ class VideoExemplars:
     """Learned videos, one after the other."""
 
     motion: Tensor = field(metadata=store("real", "frames", "descriptor", least=-LONGEST, most=LONGEST))
-    lengths: Tensor = field(metadata=store("whole", "videos", below=FRAMES))  # ``(videos,)`` frames
+    lengths: Tensor = field(metadata=store("integers", "videos", below=FRAMES))  # ``(videos,)`` frames
     labels: Tensor = field(metadata=store("every", "videos", below="classes"))  # ``(videos,)`` numbers of classes
 
     @classmethod

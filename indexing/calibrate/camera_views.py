@@ -15,7 +15,7 @@ from dyntorch.numerics import Message
 from indexing.clip import Clip
 from indexing.joints import canonical, has_names
 from indexing.opening import listing
-from indexing.remarks import is_normalized, remarks_on, same_clips
+from indexing.remarks import describe_issues, is_normalized, same_clips
 from indexing.skeleton import Skeleton, usual_layout
 from indexing.sync.recordings import Take
 from indexing.video.reading import probe
@@ -157,7 +157,7 @@ def to_pixels(take: Take, size: Size | None) -> tuple[Take, Size]:
         text = "{name}: the size of its picture is not known; give {arg:size=} such as 1920x1080, of all cameras or of each"
         raise ValueError(Message(text, name=take.name))
     if take.people and is_normalized(take.people[0]):
-        scale_remarks = {str(note) for note in remarks_on(take.people[:1])}
+        scale_remarks = {str(note) for note in describe_issues(take.people[:1])}
         people, everyone = (
             tuple(clip.replace(joints=clip.joints * np.asarray(size, dtype=np.float64)) for clip in clips)
             for clips in (take.people, take.everyone)

@@ -20,14 +20,14 @@ from indexing.cli.protocol import choose
 from indexing.cli.videos import find_keypoints
 from indexing.clip import Clip, ClipSet, FloatArray, stretches
 from indexing.joints import layout_of, match_joints
-from indexing.opening import clip_text, read_rows, shown
+from indexing.opening import clip_text, quote, read_rows
 from indexing.readers import read
 from indexing.readers.recording import NobodySeen
 from indexing.recordings.people import Appearance, Crowd, of_recording, tracked_people
-from indexing.remarks import FOLLOWED, remarks_on
+from indexing.remarks import FOLLOWED, describe_issues
 from indexing.skeleton import Skeleton
 from indexing.sync.people import jumps
-from indexing.windows import unusable
+from indexing.windows import describe_unusable
 
 TRIM = re.compile(r"(?P<path>.+)@(?P<start>\d+(\.\d*)?|\.\d+)?-(?P<end>\d+(\.\d*)?|\.\d+)?")
 CUT = 0.1  # seconds that an example may end before it was said to: nobody counts frames
@@ -219,7 +219,7 @@ def _range_text(example: Example) -> str:
 def _check_clips(clips: Sequence[Clip], path: Path) -> list[Clip]:
 
     for clip in clips:
-        reason = unusable(clip)
+        reason = describe_unusable(clip)
         if reason and len(clip) == 1 and path.suffix.lower() == ".json" and path.is_file():
             raise ValueError(
                 f"{path}: {reason}; leave it out, or give the folder {path.parent} if every frame is a file of its own"
@@ -231,7 +231,7 @@ def _check_clips(clips: Sequence[Clip], path: Path) -> list[Clip]:
 
 def usable(clips: ClipSet, path: Path) -> tuple[ClipSet, list[str]]:
     """The clips with a label that can be compared, and a note on those left out."""
-    reasons = [unusable(clip) or ("its action is not known" if clip.label is None else None) for clip in clips]
+    reasons = [describe_unusable(clip) or ("its action is not known" if clip.label is None else None) for clip in clips]
     bad = [i for i, reason in enumerate(reasons) if reason]
     if not bad:
         return clips, []
@@ -385,7 +385,7 @@ def _event(path: Path, line: int, row: dict[str, str]) -> KnownEvent:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise ValueError(f"{path}: line {line}, column {column!r}: {shown(row[column])} is no number; give seconds")
+            raise ValueError(f"{path}: line {line}, column {column!r}: {quote(row[column])} is no number; give seconds")
         seconds.append(value)
     if not seconds[0] <= seconds[1]:
         raise ValueError(f"{path}: line {line}: ends at {seconds[1]:g} s, but starts at {seconds[0]:g} s; give start first")
@@ -405,7 +405,7 @@ WORDS = flag_words("fps", "person", "min_confidence", "format", "layout", size="
 
 def clip_notes(clips: Sequence[Clip], reading: Reading) -> list[str]:
     """On clips of any use: who is in them, in which units, and at which rate."""
-    notes = [*_people(clips, reading), *(with_words(one, WORDS) for one in remarks_on(clips, reading.size is not None))]
+    notes = [*_people(clips, reading), *(with_words(one, WORDS) for one in describe_issues(clips, reading.size is not None))]
     if reading.fps is not None and not SLOW <= reading.fps <= FAST and clips:
         length = max(clip.duration for clip in clips)
         notes.append(f"--fps {reading.fps:g}: the longest clip lasts {length:.3g} s then; is that so?")

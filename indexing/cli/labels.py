@@ -18,7 +18,7 @@ from indexing.labels.format import Request, of_recording, registered_formats, sa
 from indexing.opening import error, listing
 from indexing.report import RecordingResult
 from indexing.report.results import by_recording
-from indexing.windows import unusable
+from indexing.windows import describe_unusable
 
 UNCONFIRMED = "?"
 """What a label begins with that was suggested, and that nobody has corrected."""
@@ -286,7 +286,7 @@ def _cut_out(clip: Clip, lane: Lane, labels: Sequence[Label]) -> tuple[list[Clip
     for one in inside:
         shown = (clip.times >= one.start) & (clip.times <= one.end)
         part = clip.between(one.start, one.end) if shown.any() else None
-        why = "it lasts no frame" if part is None else unusable(part, MIN_EXAMPLE_FRAMES)
+        why = "it lasts no frame" if part is None else describe_unusable(part, MIN_EXAMPLE_FRAMES)
         if part is None or why is not None or len(part) < MIN_EXAMPLE_FRAMES:
             short.append(f"{one.label} at {one.start:.6g} to {one.end:.6g} s: {why or f'{len(part or ())} frames'}")
             continue

@@ -29,7 +29,7 @@ from indexing.labels.format import (
     same_recording,
 )
 from indexing.labels.label import Label, LabelFile, within
-from indexing.opening import count, error, is_regular, listing, shown, without_garbage_collection
+from indexing.opening import count, error, is_regular, listing, quote, without_garbage_collection
 
 __all__ = ["Label", "LabelFile", "choose_labels", "open_labels", "read_labels", "within", "write_labels"]
 
@@ -82,19 +82,19 @@ def open_labels(
     """
     if format is not None and format not in registered_formats():
         names = ", ".join(sorted(registered_formats()))
-        raise error(path, f"unknown format={shown(format)}", f"use one of {names}, or leave it out to detect it")
+        raise error(path, f"unknown format={quote(format)}", f"use one of {names}, or leave it out to detect it")
     if fps is not None and not 0 < fps < math.inf:
-        raise error(path, f"fps={shown(fps)} is no frame rate", "give frames per second, such as 29.97")
+        raise error(path, f"fps={quote(fps)} is no frame rate", "give frames per second, such as 29.97")
     asked = Request(Path(path), recording, media, observation, subject, tier, fps)
     with without_garbage_collection():
         detected, data = detect(asked.path)
         if format is not None and format != detected:
-            said = f"is of the format {detected!r}, not {format!r}"
-            raise error(path, said, "leave format= out to detect it")
-        return _asked_for(registered_formats()[detected].read(data, asked), asked)
+            message = f"is of the format {detected!r}, not {format!r}"
+            raise error(path, message, "leave format= out to detect it")
+        return _select_requested(registered_formats()[detected].read(data, asked), asked)
 
 
-def choose_labels(found: LabelFile) -> LabelFile:
+def choose_labels(file: LabelFile) -> LabelFile:
     """The labels of one hand: those of people where a program's stand beside them, of the one observation that there is.
 
     Raises:
@@ -108,11 +108,11 @@ def choose_labels(found: LabelFile) -> LabelFile:
             ...
         ValueError: a.boris: has labels of 2 observations (Ann, Ben); choose one (--observation NAME)
     """
-    labels, notices = list(found.labels), list(found.notices)
-    programs = set(found.machine)
+    labels, notices = list(file.labels), list(file.notices)
+    programs = set(file.machine)
     people = [label for label in labels if not programs & {label.observation, label.tier}]
     if people and len(people) < len(labels):
-        names = [name for name in found.machine if any(name in (label.observation, label.tier) for label in labels)]
+        names = [name for name in file.machine if any(name in (label.observation, label.tier) for label in labels)]
         verb = "--tier" if any(label.tier in names for label in labels) else "--observation"
         notices.append(
             f"{count(len(labels) - len(people), 'label')} left out: a program found them ({listing(names)}); {verb} NAME reads them"
@@ -120,12 +120,12 @@ def choose_labels(found: LabelFile) -> LabelFile:
         labels = people
     observations = list(dict.fromkeys(label.observation for label in labels))
     if len(observations) > 1:
-        said = f"has labels of {len(observations)} observations ({listing(observations)})"
-        raise error(found.path, said, "choose one (--observation NAME)")
+        message = f"has labels of {len(observations)} observations ({listing(observations)})"
+        raise error(file.path, message, "choose one (--observation NAME)")
     tiers = list(dict.fromkeys(label.tier for label in labels))
     if len(tiers) > 1:
         notices.append(f"labels of {len(tiers)} tiers are taken together ({listing(tiers)}); --tier NAME takes one")
-    return replace(found, labels=tuple(labels), notices=tuple(notices))
+    return replace(file, labels=tuple(labels), notices=tuple(notices))
 
 
 def read_labels(path: str | Path, **selection: Any) -> list[Label]:
@@ -144,35 +144,35 @@ def read_labels(path: str | Path, **selection: Any) -> list[Label]:
         >>> read_labels(path)
         [Label(0.5, 0.5, 'clap'), Label(1.5, 4.0, 'squat')]
     """
-    found = choose_labels(open_labels(path, **selection))
-    for notice in found.notices:
+    file = choose_labels(open_labels(path, **selection))
+    for notice in file.notices:
         warnings.warn(f"{path}: {notice}", UserWarning, stacklevel=2)
-    return list(found.labels)
+    return list(file.labels)
 
 
-def _asked_for(found: LabelFile, asked: Request) -> LabelFile:
+def _select_requested(file: LabelFile, asked: Request) -> LabelFile:
     """The labels of the recording, observation, subject and tier that somebody asked for."""
-    labels: Iterable[Label] = found.labels
-    notices = list(found.notices)
+    labels: Iterable[Label] = file.labels
+    notices = list(file.notices)
     for what, wanted, known in (
-        ("observation", asked.observation, found.observations),
-        ("tier", asked.tier, found.tiers),
-        ("subject", asked.subject, found.subjects),
+        ("observation", asked.observation, file.observations),
+        ("tier", asked.tier, file.tiers),
+        ("subject", asked.subject, file.subjects),
     ):
         if wanted is not None:
             if wanted not in known:
-                raise error(asked.path, f"has no {what} {shown(wanted)}, only {listing(known)}", f"give one of these (--{what})")
+                raise error(asked.path, f"has no {what} {quote(wanted)}, only {listing(known)}", f"give one of these (--{what})")
             labels = [label for label in labels if getattr(label, what) == wanted]
-    mine = of_recording(found.media, asked)
+    mine = of_recording(file.media, asked)
     names = [name for name in (asked.observation, asked.tier) if name is not None]
-    watched = (one for one in found.watched if (not names or one[0] in names) and (mine is None or one[1] in mine))
+    watched = (one for one in file.watched if (not names or one[0] in names) and (mine is None or one[1] in mine))
     if mine is not None:
         others = Counter(label.media for label in labels if label.media and label.media not in mine)
         labels = [label for label in labels if not label.media or label.media in mine]
         if others:
             total = sum(others.values())
             notices.append(f"{count(total, 'label')} left out: of other recordings ({list_few(others)})")
-    return replace(found, labels=tuple(labels), watched=tuple(watched), notices=tuple(notices))
+    return replace(file, labels=tuple(labels), watched=tuple(watched), notices=tuple(notices))
 
 
 # ---- writing -----------------------------------------------------------------------------------------------------------
@@ -230,15 +230,16 @@ def write_labels(
     name, known = _format(target, format)
     _check(target, duration, fps, tier)
     source = _source(target, into, known)
-    own = str(recording) if recording is not None else ""
-    if own:  # labels may name the video, and the recording be its keypoints
-        own = next(
-            (label.media for label in labels if label.media and same_recording(label.media, own)), _find_video(own, target, name)
+    video = str(recording) if recording is not None else ""
+    if video:  # labels may name the video, and the recording be its keypoints
+        video = next(
+            (label.media for label in labels if label.media and same_recording(label.media, video)),
+            _find_video(video, target, name),
         )
-    sound, notices = _clean_labels(labels, own)
-    if own and known.program and source is None and Path(own).suffix.lower() not in FILMS:
-        notices.append(f"{base_name(own)} is no video: {known.program} asks for one when you open {target.name}")
-    recordings = dict.fromkeys(([own] if own else []) + [label.media for label in sound])
+    sound, notices = _clean_labels(labels, video)
+    if video and known.program and source is None and Path(video).suffix.lower() not in FILMS:
+        notices.append(f"{base_name(video)} is no video: {known.program} asks for one when you open {target.name}")
+    recordings = dict.fromkeys(([video] if video else []) + [label.media for label in sound])
     if (dry and not known.program) or known.write is None:
         return notices
     where = Target(target, tuple(recordings), source, tier, duration, fps, annotator, media, dry, name)
@@ -249,29 +250,29 @@ def _format(path: Path, name: str | None) -> tuple[str, LabelFormat]:
     """What is written."""
     written = {each: (suffix, known) for known in registered_formats().values() for each, suffix in known.written.items()}
     if name is not None and name not in written:
-        raise error(path, f"unknown format={shown(name)}", f"use one of {', '.join(sorted(written))}")
+        raise error(path, f"unknown format={quote(name)}", f"use one of {', '.join(sorted(written))}")
     if name is None:
         name = next((each for each, (suffix, _) in written.items() if suffix and suffix == path.suffix.lower()), None)
     if name is None:
         suffixes = sorted(suffix for suffix, _ in written.values() if suffix)
-        said = f"the suffix {path.suffix!r} does not say which format to write"
-        raise error(path, said, f"end the name in one of {', '.join(suffixes)}, or give format=")
+        message = f"the suffix {path.suffix!r} does not say which format to write"
+        raise error(path, message, f"end the name in one of {', '.join(suffixes)}, or give format=")
     return name, written[name][1]
 
 
 def _check(path: Path, duration: float | None, fps: float | None, tier: str) -> None:
     for what, value in (("duration", duration), ("fps", fps)):
         if value is not None and not 0 < value < math.inf:
-            raise error(path, f"{what}={shown(value)} cannot be", "give a positive number, or leave it out")
+            raise error(path, f"{what}={quote(value)} cannot be", "give a positive number, or leave it out")
     if not tier.strip() or not tier.isprintable():
-        raise error(path, f"tier={shown(tier)} is no name", "give a name of letters")
+        raise error(path, f"tier={quote(tier)} is no name", "give a name of letters")
 
 
 def _source(path: Path, into: str | Path | None, known: LabelFormat) -> Path | None:
     """The file whose content is taken over, if any."""
     if into is not None and not known.program:
-        kept = [suffix for each in registered_formats().values() if each.program for suffix in each.written.values()]
-        raise error(path, f"labels cannot be written beside those of {into}", f"write {listing(kept)}")
+        suffixes = [suffix for each in registered_formats().values() if each.program for suffix in each.written.values()]
+        raise error(path, f"labels cannot be written beside those of {into}", f"write {listing(suffixes)}")
     if into is not None:
         return Path(into)
     return path if known.program and is_regular(path) else None
@@ -294,7 +295,7 @@ def _find_video(recording: str, target: Path, name: str) -> str:
 
 def _clean_labels(labels: Sequence[Label], recording: str) -> tuple[list[Label], list[str]]:
     """Labels in characters that every format can write, each with its recording."""
-    found, changed = [], 0
+    cleaned, changed = [], 0
     named = [label for label in labels if label.label.strip()]
     for label in named:
         texts = {name: getattr(label, name) for name in ("label", "subject", "media", "tier", "observation", "comment")}
@@ -303,7 +304,7 @@ def _clean_labels(labels: Sequence[Label], recording: str) -> tuple[list[Label],
         changed += sound != texts or modifiers != label.modifiers
         sound |= {"media": sound["media"] or recording, "modifiers": modifiers}
         sound |= {name: sound[name].strip() for name in ("label", "subject", "tier", "observation")}
-        found.append(replace(label, **sound))
+        cleaned.append(replace(label, **sound))
     nameless = len(labels) - len(named)
     notices = [f"{count(nameless, 'label')} without a name left out"] * bool(nameless)
-    return found, notices + [f"control characters in {count(changed, 'label')} became \ufffd"] * bool(changed)
+    return cleaned, notices + [f"control characters in {count(changed, 'label')} became \ufffd"] * bool(changed)

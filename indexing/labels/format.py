@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from indexing.labels.label import NUM_NAMED, Label, LabelFile, in_order, list_spots
-from indexing.opening import clip_text, count, error, head_of, listing, parse_json, read_rows, read_text, shown
+from indexing.labels.label import NUM_NAMED, Label, LabelFile, list_spots, sort_key
+from indexing.opening import clip_text, count, error, head_of, listing, parse_json, quote, read_rows, read_text
 from indexing.registry import load_formats
 
 TIME_REMEDY = "give seconds"
@@ -97,13 +97,13 @@ class Gathering:
         begin, stop = self.seconds(start, where, "start"), self.seconds(end, where, "end")
         if stop < begin:
             raise error(self.asked.path, f"{where}: ends at {stop:g} s, but starts at {begin:g} s", "give start first")
-        found = Label(begin, stop, label.strip(), **fields)
-        if found.label:
-            self.labels.append(found)
+        entry = Label(begin, stop, label.strip(), **fields)
+        if entry.label:
+            self.labels.append(entry)
         else:
-            self._nameless.append(found)
+            self._nameless.append(entry)
         for names, field_ in NAMES.items():
-            if name := getattr(found, field_):
+            if name := getattr(entry, field_):
                 getattr(self, names).setdefault(name)
 
     def seconds(self, value: Any, where: str, what: str) -> float:
@@ -113,13 +113,13 @@ class Gathering:
         else:
             number = parse_seconds(value) if isinstance(value, str) else math.nan
         if not math.isfinite(number):
-            raise error(self.asked.path, f"{where}: {what} {shown(value)} is no time", TIME_REMEDY)
+            raise error(self.asked.path, f"{where}: {what} {quote(value)} is no time", TIME_REMEDY)
         return number
 
     def list_of(self, value: Any, where: str, remedy: str) -> list[Any]:
         """A list of the file; an empty one where nothing is there."""
         if value is not None and not isinstance(value, list):
-            raise error(self.asked.path, f"{where} is {shown(value)}, not a list", remedy)
+            raise error(self.asked.path, f"{where} is {quote(value)}, not a list", remedy)
         return value or []
 
     def note(self, notice: str) -> None:
@@ -132,16 +132,16 @@ class Gathering:
         if self._nameless:
             where = list_spots(self._nameless)
             self.note(f"{count(len(self._nameless), 'label')} without a name left out ({where})")
-        kept = self.labels
-        if len(set(kept)) < len(kept):
-            twice = [label for label, times in Counter(kept).items() if times > 1]
-            kept = list(dict.fromkeys(kept))
-            again = len(self.labels) - len(kept)
+        labels = self.labels
+        if len(set(labels)) < len(labels):
+            twice = [label for label, times in Counter(labels).items() if times > 1]
+            labels = list(dict.fromkeys(labels))
+            again = len(self.labels) - len(labels)
             self.note(f"{count(again, 'label')} left out: there twice ({list_spots(twice)})")
         return LabelFile(
             path=self.asked.path,
             format=self.format,
-            labels=tuple(sorted(kept, key=in_order)),
+            labels=tuple(sorted(labels, key=sort_key)),
             **{name: tuple(getattr(self, name)) for name in (*NAMES, "machine", "watched", "notices")},
         )
 
@@ -173,7 +173,7 @@ def text_of(value: Any) -> str:
     """What a JSON file has for a name: text, or a number that somebody wrote for one; empty where it is neither."""
     if isinstance(value, str):
         return value
-    return shown(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else ""
+    return quote(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else ""
 
 
 def list_few(names: Iterable[object]) -> str:
@@ -198,8 +198,8 @@ def seal(*parts: object) -> str:
 
 def correction_error(target: Target, what: str) -> ValueError:
     """What was found is corrected where it stands: nobody loses that without a word."""
-    said = f"{what} is not as dyntorch wrote it: somebody has corrected it"
-    return error(target.into or target.path, said, "rename it to take it over, delete it, or write to another file")
+    message = f"{what} is not as dyntorch wrote it: somebody has corrected it"
+    return error(target.into or target.path, message, "rename it to take it over, delete it, or write to another file")
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -239,9 +239,9 @@ def detect(path: Path) -> tuple[str, Any]:
 def _parse(path: Path) -> tuple[str, Any]:
     """The kind of a file, and what it holds."""
     head = head_of(path)
-    for magic, said, remedy in FOREIGN:
+    for magic, message, remedy in FOREIGN:
         if head.startswith(magic):
-            raise error(path, said, remedy)
+            raise error(path, message, remedy)
     begin = head.removeprefix(b"\xef\xbb\xbf").lstrip()
     if begin.startswith(b"<"):
         return "xml", None
@@ -278,14 +278,14 @@ class Span:
 
 def split_by_media(start: float, end: float, spans: Sequence[Span]) -> list[tuple[str, float, float]]:
     """A stretch of a clock, by the files that are played then: each file with start and end on its own clock."""
-    found = []
+    pieces = []
     for number, span in enumerate(spans):
         first = -math.inf if number == 0 else span.begin
         last = math.inf if number == len(spans) - 1 else span.end
         inside = first <= start < last if start == end else start < last and end > first
         if inside:
-            found.append((span.media, max(start, first) - span.begin, min(end, last) - span.begin))
-    return found
+            pieces.append((span.media, max(start, first) - span.begin, min(end, last) - span.begin))
+    return pieces
 
 
 def base_name(name: str) -> str:
@@ -300,20 +300,20 @@ def of_recording(names: Iterable[str], asked: Request) -> set[str] | None:
     if asked.media is not None:
         same = {name for name in known if name == asked.media} or {name for name in known if base_name(name) == asked.media}
         if not same:
-            said = f"has no labels of {asked.media}, only of {listing(known)}"
-            raise error(asked.path, said, "give one of these names (--media)")
+            message = f"has no labels of {asked.media}, only of {listing(known)}"
+            raise error(asked.path, message, "give one of these names (--media)")
         return same
     if asked.recording is None or not known:
         return None
     ranks = {name: _likeness(name, str(asked.recording)) for name in known}
     best = max(ranks.values())
     if not best:
-        own = base_name(str(asked.recording))
-        raise error(asked.path, f"its labels are of {listing(known)}, not of {own}", REMEDY)
-    found = [name for name in known if ranks[name] == best]
-    if len(found) > 1:
-        raise error(asked.path, f"{base_name(str(asked.recording))} may be any of {listing(found)}", REMEDY)
-    return set(found)
+        recording = base_name(str(asked.recording))
+        raise error(asked.path, f"its labels are of {listing(known)}, not of {recording}", REMEDY)
+    best_names = [name for name in known if ranks[name] == best]
+    if len(best_names) > 1:
+        raise error(asked.path, f"{base_name(str(asked.recording))} may be any of {listing(best_names)}", REMEDY)
+    return set(best_names)
 
 
 def same_recording(name: str, other: str) -> bool:

@@ -54,8 +54,8 @@ class Label:
         if not (math.isfinite(self.start) and math.isfinite(self.end)):
             raise ValueError(f"label {clip_text(self.label)!r}: start={self.start}, end={self.end}; give finite seconds")
         if self.end < self.start:
-            said = f"ends at {self.end:g} s, but starts at {self.start:g} s"
-            raise ValueError(f"label {clip_text(self.label)!r}: {said}; give start first")
+            message = f"ends at {self.end:g} s, but starts at {self.start:g} s"
+            raise ValueError(f"label {clip_text(self.label)!r}: {message}; give start first")
 
     @property
     def point(self) -> bool:
@@ -68,15 +68,15 @@ class Label:
         return self.end - self.start
 
     def __repr__(self) -> str:
-        said = [f"{self.start!r}, {self.end!r}, {self.label!r}"]
+        message = [f"{self.start!r}, {self.end!r}, {self.label!r}"]
         for name in ("subject", "media", "tier", "observation", "comment", "modifiers", "score"):
             value: Any = getattr(self, name)
             if value not in ("", (), None):
-                said.append(f"{name}={value!r}")
-        return f"Label({', '.join(said)})"
+                message.append(f"{name}={value!r}")
+        return f"Label({', '.join(message)})"
 
 
-def in_order(label: Label) -> tuple[float, float, str, str, str]:
+def sort_key(label: Label) -> tuple[float, float, str, str, str]:
     """By which labels are sorted."""
     return label.start, label.end, label.label, label.subject, label.tier
 
@@ -153,8 +153,8 @@ def within(
 
 def list_spots(labels: Iterable[Label]) -> str:
     """The first of some labels, for a notice."""
-    found = [describe_spot(label) for label in islice(labels, NUM_NAMED + 1)]
-    return ", ".join(found[:NUM_NAMED]) + ", ..." * (len(found) > NUM_NAMED)
+    spots = [describe_spot(label) for label in islice(labels, NUM_NAMED + 1)]
+    return ", ".join(spots[:NUM_NAMED]) + ", ..." * (len(spots) > NUM_NAMED)
 
 
 def describe_spot(label: Label) -> str:

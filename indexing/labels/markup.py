@@ -60,8 +60,8 @@ class _Parser:
             self.parser.Parse(self.data, True)
             root: Element = self.builder.close()
         except expat.ExpatError as problem:
-            said = f"is no sound XML at line {problem.lineno}, column {problem.offset + 1} ({expat.ErrorString(problem.code)})"
-            raise error(self.path, said, REMEDY) from None
+            message = f"is no sound XML at line {problem.lineno}, column {problem.offset + 1} ({expat.ErrorString(problem.code)})"
+            raise error(self.path, message, REMEDY) from None
         except (LookupError, UnicodeError):  # an encoding that Python does not know
             raise error(self.path, "is XML in an unknown encoding", "save it in UTF-8") from None
         finally:  # handlers hold on to this object, and it to them

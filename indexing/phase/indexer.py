@@ -29,7 +29,7 @@ from indexing.modelfile import (
     tensors_of,
 )
 from indexing.modelfile import read_integer as whole_number
-from indexing.opening import shown
+from indexing.opening import quote
 from indexing.phase.learning import learn_model
 from indexing.phase.model import (
     MIN_CALIBRATED_CLASSES,
@@ -373,5 +373,5 @@ class PhaseIndexer(SavedClassifier):
 
 def _flags(values: Any, name: str, count: int) -> NDArray[np.bool_]:
     if not isinstance(values, list) or len(values) != count or not all(isinstance(value, bool) for value in values):
-        raise ValueError(f"{name}: expected {count} truth values, got {shown(values)}")
+        raise ValueError(f"{name}: expected {count} truth values, got {quote(values)}")
     return np.array(values, dtype=bool)

@@ -18,7 +18,7 @@ from indexing.action.bank import EPSILON, Windows, between, cosine_distance, sta
 from indexing.cameras import virtual, y_up
 from indexing.clip import Clip
 from indexing.modelfile import part, store
-from indexing.windows import ragged
+from indexing.windows import concatenate_clips
 
 NUM_TURNS = 8  # views of a clip in 3D
 ELEVATIONS = (0.05, 0.3)  # radians, of their cameras, in turn
@@ -41,7 +41,7 @@ class Learned:
 
 def training_frames(clips: Sequence[Clip]) -> Learned:
     """All frames of images, missing joints interpolated in time (a joint that a clip never shows is not seen)."""
-    source = ragged(clips)
+    source = concatenate_clips(clips)
     clip = torch.from_numpy(np.repeat(np.arange(len(clips)), np.diff(source.starts)))
     frames = Windows(torch.from_numpy(source.joints).double()[:, None], torch.from_numpy(source.seen)[clip])
     return Learned(frames, clip, torch.from_numpy(source.times))

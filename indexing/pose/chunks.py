@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from indexing.clip import check_fps
 from indexing.files import prepare, replacing
-from indexing.opening import error, opened, size_of
+from indexing.opening import error, open_file, size_of
 from indexing.pose.blazepose import JOINTS, Floats, VideoPicture
 from indexing.pose.networks import Networks
 from indexing.pose.tracking import PoseOptions, Sighting, Sightings, Tracker
@@ -95,7 +95,7 @@ def content_of(path: Path) -> str:
     """What tells a file from others: its size, and what stands at both its ends."""
     size = size_of(path)
     hashed = hashlib.sha256(str(size).encode())
-    with opened(path) as stream:
+    with open_file(path) as stream:
         hashed.update(stream.read(HEAD_BLOCK))
         stream.seek(max(0, size - HEAD_BLOCK))
         hashed.update(stream.read(HEAD_BLOCK))

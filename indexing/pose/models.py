@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import IO
 
 from indexing.files import prepare, write_bytes
-from indexing.opening import error, is_regular, opened, size_of
+from indexing.opening import error, is_regular, open_file, size_of
 
 VARIABLE = "DYNTORCH_POSE_MODELS"
 AGAIN = "fetch the model files again: dyntorch pose --get-models"
@@ -142,7 +142,7 @@ def _is_present(folder: Path, file: ModelFile) -> bool:
 
 def _read_checked(path: Path, file: ModelFile) -> bytes:
     """The bytes of a file that is what it should be."""
-    with opened(path) as stream:
+    with open_file(path) as stream:
         data = stream.read(file.size + 1)
     if len(data) != file.size or hashlib.sha256(data).hexdigest() != file.sha256:
         raise error(path, "is not the file that is known under this name (by its SHA-256)", AGAIN)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import Clip, ClipSet
-from indexing.opening import error, shown, without_garbage_collection
+from indexing.opening import error, quote, without_garbage_collection
 from indexing.readers.files import Options, Source, WatchOptions, detect, open_source, registered_formats
 from indexing.readers.recording import NobodySeen, merge_people, to_clips
 from indexing.registry import format_names
@@ -36,13 +36,13 @@ def read(
         watching=watching,
     )  # fmt: skip
     if format is not None and format not in FORMATS:
-        raise ValueError(f"{path}: unknown format={shown(format)}; use one of {', '.join(FORMATS)}, or leave it out to detect it")
+        raise ValueError(f"{path}: unknown format={quote(format)}; use one of {', '.join(FORMATS)}, or leave it out to detect it")
     with without_garbage_collection():
         source = open_source(path)
         name = format or detect(source)
         if name == "video":
             return read_video(source, options)
-        source.need(name, *registered_formats()[name].kinds)
+        source.require_kind(name, *registered_formats()[name].kinds)
         return registered_formats()[name].read(source, options)
 
 
@@ -68,7 +68,7 @@ def read_video(source: Source, options: Options) -> ClipSet:
     if available() is None:
         raise error(source.path, "is a video, and there is no pose model to find the people in it", f"{FETCH}, or give keypoints")
     how = options.watching or WatchOptions()
-    found = merge_people(detect(source.path, how.people, model=how.model, every=how.every, fps=options.fps).clips)
-    if found is None:
+    recording = merge_people(detect(source.path, how.people, model=how.model, every=how.every, fps=options.fps).clips)
+    if recording is None:
         raise NobodySeen(source.path, np.zeros(0, dtype=np.int64))
-    return to_clips(source.path, found, options)
+    return to_clips(source.path, recording, options)

@@ -96,8 +96,8 @@ def read(path: Path) -> PointSequence:
 
 def _frequency(parameters: Parameters, data: bytes) -> float:
     """Frames per second, of the parameter or of the header; 0 where neither is one."""
-    found = parameters.values.get("POINT:RATE")
-    rates = [*(found.ravel()[:1].tolist() if isinstance(found, np.ndarray) else []), *parameters.reals(data[20:24]).tolist()]
+    stated = parameters.values.get("POINT:RATE")
+    rates = [*(stated.ravel()[:1].tolist() if isinstance(stated, np.ndarray) else []), *parameters.reals(data[20:24]).tolist()]
     return next((float(rate) for rate in rates if COARSEST <= rate <= FINEST), 0.0)
 
 
@@ -108,7 +108,7 @@ def _reals(data: bytes, kind: str) -> FloatArray:
 
 def _parameters(data: bytes, at: int) -> Parameters:
     """All parameters: groups (negative numbers) and their values, one record after the other."""
-    found = Parameters(data[at + 3])
+    parameters = Parameters(data[at + 3])
     groups: dict[int, str] = {}
     records: list[tuple[int, str, Any]] = []
     at += 4
@@ -118,16 +118,16 @@ def _parameters(data: bytes, at: int) -> Parameters:
             break
         name = data[at + 2 : at + 2 + abs(length)].decode("ascii", "replace").strip().upper()  # negative: locked
         link = at + 2 + abs(length)
-        step = struct.unpack_from(f"{found.order}h", data, link)[0]
+        step = struct.unpack_from(f"{parameters.order}h", data, link)[0]
         if group < 0:
             groups[-group] = name
         else:
-            records.append((group, name, _value(found, data, link + 2)))
+            records.append((group, name, _value(parameters, data, link + 2)))
         if step <= 0:
             break
         at = link + step
-    found.values.update({f"{groups.get(group, group)}:{name}": value for group, name, value in records})
-    return found
+    parameters.values.update({f"{groups.get(group, group)}:{name}": value for group, name, value in records})
+    return parameters
 
 
 def _texts(value: Any) -> list[str]:

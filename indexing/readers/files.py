@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from indexing.clip import ClipSet, FloatArray, check_fps, is_number
-from indexing.opening import VALUE, clip_text, entries, error, head_of, listing, parse_json, read_rows, read_text, shown, size_of
-from indexing.readers.hdf import opened_hdf5
+from indexing.opening import VALUE, clip_text, entries, error, head_of, listing, parse_json, quote, read_rows, read_text, size_of
+from indexing.readers.hdf import open_hdf5
 from indexing.registry import list_programs, load_formats
 from indexing.skeleton import layout_named
 
@@ -43,7 +43,7 @@ class Source:
     kind: str
     data: Any = None
 
-    def need(self, name: str, *kinds: str) -> None:
+    def require_kind(self, name: str, *kinds: str) -> None:
         """Refuse an input that cannot be of the format ``name``."""
         if self.kind not in kinds:
             raise error(
@@ -114,12 +114,12 @@ def _refuse_binary(path: Path, suffix: str, head: bytes) -> None:
 
 def _arrays(folder: Path, visible: Sequence[Path]) -> list[Path]:
     """The arrays of a recording of FreeMoCap, whose folder has them two floors down."""
-    found = [entry for entry in visible if entry.suffix.lower() == ".npy"]
+    arrays = [entry for entry in visible if entry.suffix.lower() == ".npy"]
     for name in ("output_data", "raw_data"):
         inside = next((entry for entry in visible if entry.name == name and entry.is_dir()), None)
         if inside is not None:
-            found += _arrays(inside, entries(inside))
-    return found
+            arrays += _arrays(inside, entries(inside))
+    return arrays
 
 
 def _open_folder(folder: Path) -> Source:
@@ -164,8 +164,8 @@ def _skip_content(path: Path) -> None:
 def frame_number(name: str) -> int | None:
     """The frame number in a file name: before ``_keypoints``, else the last number before the suffix."""
     stem = re.sub(r"\.\w+$", "", name)
-    found = re.search(r"(\d{1,18})_keypoints", stem) or re.search(r"(\d{1,18})\D*$", stem)  # 18 digits fit int64
-    return int(found.group(1)) if found else None
+    match = re.search(r"(\d{1,18})_keypoints", stem) or re.search(r"(\d{1,18})\D*$", stem)  # 18 digits fit int64
+    return int(match.group(1)) if match else None
 
 
 def load_json(path: Path) -> Any:
@@ -207,7 +207,7 @@ def _number(path: Path, line: int, column: str, cell: str) -> float:
         return float(cell)
     except ValueError:
         raise error(
-            path, f"row {line}, column {shown(column)}: {shown(cell)} is not a number", "correct the cell or leave it empty"
+            path, f"row {line}, column {quote(column)}: {quote(cell)} is not a number", "correct the cell or leave it empty"
         ) from None
 
 
@@ -286,7 +286,7 @@ def detect(source: Source) -> str:
     if source.kind == "video":
         return "video"
     if source.kind == "hdf5":
-        with opened_hdf5(source.path) as file:
+        with open_hdf5(source.path) as file:
             return _detect_opened(replace(source, data=file))
     return _detect_opened(source)
 
@@ -312,16 +312,16 @@ def _detect_opened(source: Source) -> str:
     if name is None:
         programs = list_programs(registered_formats().values())
         writers = f"{', '.join(programs[:-1])} or {programs[-1]}"
-        said = f"export what {writers} write, or a clip set, or say the format (--format, format=)"
-        raise error(source.path, _describe(source.kind, data), said)
+        message = f"export what {writers} write, or a clip set, or say the format (--format, format=)"
+        raise error(source.path, _describe(source.kind, data), message)
     return name
 
 
 def _first_match(samples: Iterable[Source]) -> str | None:
     """The first format that takes the first sample that any takes."""
     for sample in samples:
-        for name, known in registered_formats().items():
-            if sample.kind in known.kinds and known.matches(sample):
+        for name, entry in registered_formats().items():
+            if sample.kind in entry.kinds and entry.matches(sample):
                 return name
     return None
 

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import LARGEST, VALUE, clip_text, error, listing, opened, shown, size_of
+from indexing.opening import LARGEST, VALUE, clip_text, error, listing, open_file, quote, size_of
 
 HEAP = b"GCOL\x01\0\0\0"
 AGAIN = "export or copy it again"
@@ -51,10 +51,10 @@ class Hdf5:
         """What a group holds, less links that lead out of the file; empty where there is no such group."""
 
         def inside() -> list[str]:
-            found = self._handle[group] if group == "/" or self._hard(group) else None
-            if found is None or not hasattr(found, "keys"):
+            node = self._handle[group] if group == "/" or self._hard(group) else None
+            if node is None or not hasattr(node, "keys"):
                 return []
-            kinds = {name: type(found.get(name, getlink=True)).__name__ for name in found}
+            kinds = {name: type(node.get(name, getlink=True)).__name__ for name in node}
             return [name for name, kind in kinds.items() if kind in ("HardLink", "SoftLink")]
 
         return self._guard(inside, group)
@@ -64,7 +64,7 @@ class Hdf5:
         data = self._dataset(name)
         if data.dtype.kind not in kinds or (ndim is not None and data.ndim != ndim):
             what = f"{data.ndim} axes of {data.dtype}" if data.dtype.kind != "O" else "text"
-            raise error(self.path, f"{shown(name)} has {what}, which it cannot have", AGAIN)
+            raise error(self.path, f"{quote(name)} has {what}, which it cannot have", AGAIN)
         return np.asarray(self._guard(lambda: data[()], name))
 
     def records(self, name: str, fields: tuple[str, ...]) -> dict[str, Array]:
@@ -73,15 +73,15 @@ class Hdf5:
         there = data.dtype.names or ()
         missing = [field for field in fields if field not in there]
         if missing or data.ndim != 1:
-            raise error(self.path, f"{shown(name)} has no field {shown((missing or fields)[0])} (it has {listing(there)})", AGAIN)
+            raise error(self.path, f"{quote(name)} has no field {quote((missing or fields)[0])} (it has {listing(there)})", AGAIN)
         kinds = {field: data.dtype[field].base.kind for field in fields}
         odd = [field for field, kind in kinds.items() if kind not in "biufS"]
         if odd:
-            raise error(self.path, f"{shown(name)}: {shown(odd[0])} has values that are no numbers", AGAIN)
+            raise error(self.path, f"{quote(name)}: {quote(odd[0])} has values that are no numbers", AGAIN)
         if data.dtype.hasobject:  # a piece of a heap may be the field of every record, and is copied for each
-            raise error(self.path, f"{shown(name)} has fields that are neither numbers nor text of one length", AGAIN)
-        whole = self._guard(lambda: data[()], name)
-        return {field: np.asarray(whole[field]) for field in fields}
+            raise error(self.path, f"{quote(name)} has fields that are neither numbers nor text of one length", AGAIN)
+        table = self._guard(lambda: data[()], name)
+        return {field: np.asarray(table[field]) for field in fields}
 
     def fields(self, name: str) -> tuple[str, ...]:
         """Names of the fields of a table; empty where there is no such table."""
@@ -95,9 +95,9 @@ class Hdf5:
         """The texts of a dataset with one axis, or of none (a single text)."""
         data = self._dataset(name)
         if data.ndim > 1 or data.size > MOST_TEXTS_BLOCK or data.dtype.kind not in "OS":
-            raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
+            raise error(self.path, f"{quote(name)} is no list of names", AGAIN)
         if data.dtype.kind == "O" and self._guard(lambda: data.id.get_type().get_class(), name) != TEXT:
-            raise error(self.path, f"{shown(name)} is no list of names", AGAIN)
+            raise error(self.path, f"{quote(name)} is no list of names", AGAIN)
         if data.dtype.kind == "O":
             self._check_lengths(data, name)
         return [_text(value) for value in np.atleast_1d(self._guard(lambda: data[()], name))]
@@ -106,7 +106,7 @@ class Hdf5:
         """Refuse texts that say they are longer than the file, alone or together: the library would make room for each of
         them."""
         total = 0
-        with opened(self.path) as file:
+        with open_file(self.path) as file:
             for offset, size, packed in self._guard(lambda: _places(data), name):
                 file.seek(min(offset, self._size))
                 raw = file.read(min(size, ENTRY * MOST_TEXTS_BLOCK))
@@ -114,7 +114,7 @@ class Hdf5:
                 total += int(lengths.sum(dtype=np.uint64))
                 if total > self._size:
                     what = "a text longer" if (lengths > self._size).any() else "texts that are together longer"
-                    raise error(self.path, f"{shown(name)} has {what} than the file (which may be truncated)", AGAIN)
+                    raise error(self.path, f"{quote(name)} has {what} than the file (which may be truncated)", AGAIN)
 
     def attribute(self, name: str, key: str) -> Any:
         """An attribute of a group or dataset, text as ``str`` or ``bytes``; ``None`` where there is none."""
@@ -137,19 +137,19 @@ class Hdf5:
 
     def _dataset(self, name: str) -> Any:
         """A dataset that is what it says."""
-        found = self._guard(lambda: self._handle[name] if self._hard(name) else None, name)
-        if found is None or not hasattr(found, "shape"):
-            raise error(self.path, f"has no dataset {shown(name)} (it has {listing(self.names())})", AGAIN)
+        dataset = self._guard(lambda: self._handle[name] if self._hard(name) else None, name)
+        if dataset is None or not hasattr(dataset, "shape"):
+            raise error(self.path, f"has no dataset {quote(name)} (it has {listing(self.names())})", AGAIN)
 
-        if self._guard(lambda: bool(found.external) or bool(found.is_virtual), name):
-            raise error(self.path, f"{shown(name)} is kept in another file", "copy its values into one file")
-        if self._guard(lambda: found.shape is None, name):
-            raise error(self.path, f"{shown(name)} is empty", AGAIN)
-        size, stored = self._guard(lambda: (math.prod(found.shape) * found.dtype.itemsize, found.id.get_storage_size()), name)
+        if self._guard(lambda: bool(dataset.external) or bool(dataset.is_virtual), name):
+            raise error(self.path, f"{quote(name)} is kept in another file", "copy its values into one file")
+        if self._guard(lambda: dataset.shape is None, name):
+            raise error(self.path, f"{quote(name)} is empty", AGAIN)
+        size, stored = self._guard(lambda: (math.prod(dataset.shape) * dataset.dtype.itemsize, dataset.id.get_storage_size()), name)
         large, times = PLENTY_BLOCK
         if size > LARGEST or stored > self._size or size > max(large, times * stored):
-            raise error(self.path, f"{shown(name)} would take {size / 2**30:.1f} GB of {stored / 2**20:.1f} MB", AGAIN)
-        return found
+            raise error(self.path, f"{quote(name)} would take {size / 2**30:.1f} GB of {stored / 2**20:.1f} MB", AGAIN)
+        return dataset
 
     def _hard(self, name: str) -> bool:
         """Whether every step of a path is there, in this very file."""
@@ -167,12 +167,12 @@ class Hdf5:
         except DAMAGED as problem:
             if type(problem) is ValueError and str(self.path) in str(problem):
                 raise
-            said = f"{shown(name)} cannot be read ({clip_text(problem, VALUE)}; the file may be truncated)"
-            raise error(self.path, said, AGAIN) from None
+            message = f"{quote(name)} cannot be read ({clip_text(problem, VALUE)}; the file may be truncated)"
+            raise error(self.path, message, AGAIN) from None
 
 
 @contextmanager
-def opened_hdf5(path: Path) -> Iterator[Hdf5]:
+def open_hdf5(path: Path) -> Iterator[Hdf5]:
     """An HDF5 file, to be read."""
     size = size_of(path)
     try:
@@ -183,8 +183,8 @@ def opened_hdf5(path: Path) -> Iterator[Hdf5]:
     try:
         handle = h5py.File(path, "r", locking=False)
     except DAMAGED as problem:
-        said = f"cannot be read as HDF5 ({clip_text(problem, VALUE)}; the file may be truncated)"
-        raise error(path, said, AGAIN) from None
+        message = f"cannot be read as HDF5 ({clip_text(problem, VALUE)}; the file may be truncated)"
+        raise error(path, message, AGAIN) from None
     try:
         yield Hdf5(path, handle, size)
     finally:
@@ -193,7 +193,7 @@ def opened_hdf5(path: Path) -> Iterator[Hdf5]:
 
 def _check_heaps(path: Path) -> None:
     """Refuse a heap of texts with an empty piece of free space: the library would go from it to itself without end."""
-    with opened(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with open_file(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         at = data.find(HEAP)
         while at >= 0:
             size = min(int.from_bytes(data[at + 8 : at + 16], "little"), len(data) - at)
@@ -211,8 +211,8 @@ def _check_heaps(path: Path) -> None:
 
 def _places(data: Any) -> list[tuple[int, int, bool]]:
     """Where a dataset keeps its values: offset and size of each block, and whether it is packed."""
-    whole = data.file.id.get_create_plist()
-    if whole.get_sizes() != (8, 8) or whole.get_userblock():
+    creation = data.file.id.get_create_plist()
+    if creation.get_sizes() != (8, 8) or creation.get_userblock():
         raise ValueError("text is kept in an uncommon way")
     if data.chunks is None:
         offset = data.id.get_offset()
@@ -221,14 +221,14 @@ def _places(data: Any) -> list[tuple[int, int, bool]]:
         return [] if offset is None else [(offset, ENTRY * data.size, False)]
     plan = data.id.get_create_plist()
     filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
-    found = []
+    blocks = []
     for i in range(data.id.get_num_chunks()):
         one = data.id.get_chunk_info(i)
         used = [number for k, number in enumerate(filters) if not one.filter_mask >> k & 1]  # a set bit: it was passed over
         if used not in ([], [GZIP]):
             raise ValueError("text is packed in an uncommon way")
-        found.append((one.byte_offset, one.size, bool(used)))
-    return found
+        blocks.append((one.byte_offset, one.size, bool(used)))
+    return blocks
 
 
 def _lengths(raw: bytes, packed: bool) -> Array:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import VALUE, clip_text, error, first_duplicate, head_of, listing, shown, size_of
+from indexing.opening import VALUE, clip_text, error, first_duplicate, head_of, listing, quote, size_of
 from indexing.readers import c3d, points
 from indexing.readers.npz import NumpyArchive, read_npy
 from indexing.readers.points import BoolArray, FloatArray, PointSequence, PointSet, as_view
@@ -55,12 +55,12 @@ def read_matches(
         if resting:
             raise error(paths[0], "holds static points, too", "leave --static-points out")
         resting, _ = _read_views([Path(path).expanduser() for path in static_points], None)
-    matched = match(views)
+    matched = match_views(views)
     if not resting:
         return matched
     if not matched.lines:
         raise error(resting[0].path, "static points are for lines", "mark static matches by a column static instead")
-    points = match(resting)
+    points = match_views(resting)
     if points.lines or points.dims != (3,) * len(matched.views):
         raise error(
             resting[0].path, f"{len(points.views)} files of {points.dims[0]}D static points", "give 3D points for each view"
@@ -103,23 +103,23 @@ def _read_views(paths: Sequence[Path], frames: tuple[int, ...] | None) -> tuple[
     for path in paths:
         if read_head(path).startswith(b"PK"):
             raise error(path, "an .npz holds all views", "give it alone")
-        found = open_points(path)
-        if isinstance(found, PointSequence):
+        loaded = open_points(path)
+        if isinstance(loaded, PointSequence):
             if len(paths) > 1:
-                raise error(path, f"holds {len(found.values)} frames", "give one such file alone, with --frames")
-            return found.views(frames), []
-        views.append(found)
+                raise error(path, f"holds {len(loaded.values)} frames", "give one such file alone, with --frames")
+            return loaded.views(frames), []
+        views.append(loaded)
     if frames is not None:
         raise error(paths[0], "has no frames", "leave --frames out; it is for .c3d, and .npy of shape (frames, n, d)")
     return views, []
 
 
-def match(views: Sequence[PointSet]) -> Matched:
+def match_views(views: Sequence[PointSet]) -> Matched:
     """Rows that correspond: by name where all views have names, otherwise by row."""
     first = views[0]
-    other = next((view for view in views if view.lines != first.lines), None)
-    if other is not None:
-        points, lines = (first, other) if other.lines else (other, first)
+    odd = next((view for view in views if view.lines != first.lines), None)
+    if odd is not None:
+        points, lines = (first, odd) if odd.lines else (odd, first)
         raise error(lines.path, f"holds lines, but {points.path} points", "give one kind")
     names = tuple(view.path for view in views)
     if all(view.ids is not None for view in views):
@@ -131,8 +131,8 @@ def match(views: Sequence[PointSet]) -> Matched:
         notes.append(f"rows were matched by their order, not by name, because {bare} has no column of names")
     longer = next((view for view in views if len(view.values) != len(first.values)), None)
     if longer is not None:
-        said = f"has {len(longer.values)} rows, {first.path} {len(first.values)}"
-        raise error(longer.path, said, "give a row per match in every file, or a column id to match the rows by")
+        message = f"has {len(longer.values)} rows, {first.path} {len(first.values)}"
+        raise error(longer.path, message, "give a row per match in every file, or a column id to match the rows by")
     ids = next((view.ids for view in views if view.ids is not None), None) or tuple(str(i + 1) for i in range(len(first.values)))
     weights, static = _weights_and_static(views)
     return Matched(tuple(view.values for view in views), ids, names, weights, static, (), tuple(notes))
@@ -143,8 +143,8 @@ def _match_by_name(views: Sequence[PointSet], names: tuple[str, ...]) -> Matched
     shared = [name for name in places[0] if all(name in place for place in places[1:])]
     if not shared:
         mine, theirs = next(iter(places[0])), next(iter(places[1]))
-        said = f"no name is in all of {', '.join(names)} (it has {shown(mine)}, where {names[1]} has {shown(theirs)})"
-        raise error(names[0], said, "name the same match the same, or leave the column out to match rows by their order")
+        message = f"no name is in all of {', '.join(names)} (it has {quote(mine)}, where {names[1]} has {quote(theirs)})"
+        raise error(names[0], message, "name the same match the same, or leave the column out to match rows by their order")
     notes = []
     lost = sorted({name for place in places for name in place} - set(shared))
     if lost:
@@ -206,7 +206,7 @@ class MatchedPair:
     size: tuple[float, float] | None = None  # width and height of the images; None = the file does not say
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def complete(self) -> NDArray[np.bool_]:
         """``(n,)`` matches that are there in both images."""
         return np.asarray(np.isfinite(np.concatenate([self.x1, self.x2], axis=1)).all(axis=1))
 
@@ -268,7 +268,7 @@ def _read_archive(path: Path, pair: str | None) -> MatchedPair:
     twice = first_duplicate(ids or ())
     if twice is not None:
         raise error(
-            path, f"{before}ids: {shown(twice)} names several matches", "give each match a name of its own, or leave ids out"
+            path, f"{before}ids: {quote(twice)} names several matches", "give each match a name of its own, or leave ids out"
         )
     return _build_pair(path, pair or before.rstrip("/") or path.name, x1, x2, ids, **_pair_marks(path, extra))
 
@@ -279,7 +279,7 @@ def _select_pair(path: Path, names: list[str], pair: str | None) -> str:
     pairs = listing(name.rstrip("/") for name in several)
     if pair is not None and f"{pair}/x1" not in names and (several or "x1" in names):
         raise error(
-            path, f"has no pair {shown(pair)}", f"its pairs are {pairs}" if several else "it holds one pair: leave --pair out"
+            path, f"has no pair {quote(pair)}", f"its pairs are {pairs}" if several else "it holds one pair: leave --pair out"
         )
     if pair is None and "x1" not in names and len(several) > 1:
         raise error(path, f"holds {len(several)} pairs ({pairs})", f"say which: --pair {clip_text(several[0].rstrip('/'), VALUE)}")
@@ -297,25 +297,25 @@ def _pair_marks(path: Path, extra: Mapping[str, Any]) -> dict[str, Any]:
     for kind, values in extra.items():
         if kind != "ids" and values.dtype.kind not in "fiub":
             raise error(path, f"{kind} holds values of type {values.dtype}", "give numbers")
-    found: dict[str, Any] = {}
+    marks: dict[str, Any] = {}
     if "weights" in extra:
         weights = np.nan_to_num(extra["weights"].astype(np.float64), posinf=-1)
         if (weights < 0).any():
             at = int(np.flatnonzero(weights < 0)[0])
             raise error(path, f"match {at + 1}: the weight is {extra['weights'][at]:g}", "weights are 0 or more, and finite")
-        found["weights"] = weights
+        marks["weights"] = weights
     if "label" in extra:
         labels = extra["label"].astype(np.float64)
         odd = np.flatnonzero(~(np.isfinite(labels) & (labels >= 0) & (labels < MAX_LABEL) & (labels == np.round(labels))))
         if len(odd):
-            said = f"match {odd[0] + 1}: the label is {labels[odd[0]]:g}"
-            raise error(path, said, "labels are 0 for an outlier, 1, 2, ... for the bodies; or leave them out")
-        found["known"] = labels.astype(np.int64)
+            message = f"match {odd[0] + 1}: the label is {labels[odd[0]]:g}"
+            raise error(path, message, "labels are 0 for an outlier, 1, 2, ... for the bodies; or leave them out")
+        marks["known"] = labels.astype(np.int64)
     if "wh" in extra:
         size = extra["wh"].astype(np.float64).ravel()
         if len(size) == 2 and np.isfinite(size).all() and (size > 0).all():
-            found["size"] = (float(size[0]), float(size[1]))
-    return found
+            marks["size"] = (float(size[0]), float(size[1]))
+    return marks
 
 
 # ---- tables --------------------------------------------------------------------------------------------------------------
@@ -374,8 +374,8 @@ def read_image(path: str | Path) -> Photograph:
                 size = (float(turned.width), float(turned.height))
                 gray = _to_gray(turned)
     except (*DAMAGED_IMAGE, Image.DecompressionBombError) as problem:
-        said = f"cannot be read as an image ({type(problem).__name__})"
-        raise error(path, said, "save it again as png or jpg") from None
+        message = f"cannot be read as an image ({type(problem).__name__})"
+        raise error(path, message, "save it again as png or jpg") from None
     return Photograph(path.name, gray, size)
 
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import VALUE, clip_text, error, opened, shown, size_of
+from indexing.opening import VALUE, clip_text, error, open_file, quote, size_of
 
 Array = NDArray[Any]
 Take = Callable[[int], bytes]
@@ -68,17 +68,19 @@ class NumpyArchive(Mapping[str, Array]):
         try:
             self._zip = zipfile.ZipFile(path)
         except DAMAGED as problem:
-            said = f"cannot be read as numpy data: it is not an .npz file ({clip_text(problem, VALUE)}; the file may be truncated)"
-            raise error(path, said, "write or copy it again") from None
+            message = (
+                f"cannot be read as numpy data: it is not an .npz file ({clip_text(problem, VALUE)}; the file may be truncated)"
+            )
+            raise error(path, f"cannot be read as numpy data: {message}", "write or copy it again") from None
         self._members = {info.filename.removesuffix(".npy"): info for info in self._zip.infolist()}
 
     def __getitem__(self, name: str) -> Array:
-        where, take = f"array {shown(name)}", self._open_member(name)
+        where, take = f"array {quote(name)}", self._open_member(name)
         header, info = _header(self.path, where, take, self._members[name].file_size), self._members[name]
         large, times = PLENTY
         if header.size > max(large, times * info.compress_size):
-            said = f"{where} would unpack to {header.size / 2**30:.1f} GB from {info.compress_size / 2**20:.1f} MB"
-            raise error(self.path, said, "if that is what it holds, write it with numpy.savez instead of savez_compressed")
+            message = f"{where} would unpack to {header.size / 2**30:.1f} GB from {info.compress_size / 2**20:.1f} MB"
+            raise error(self.path, message, "if that is what it holds, write it with numpy.savez instead of savez_compressed")
         return _values(self.path, where, take, header)
 
     def __iter__(self) -> Iterator[str]:
@@ -92,11 +94,11 @@ class NumpyArchive(Mapping[str, Array]):
 
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of an array, which is not read."""
-        return _header(self.path, f"array {shown(name)}", self._open_member(name), self._members[name].file_size).shape
+        return _header(self.path, f"array {quote(name)}", self._open_member(name), self._members[name].file_size).shape
 
     def _open_member(self, name: str) -> Take:
         """A member to read from; whatever goes wrong with its packing is said in one line."""
-        info, where = self._members[name], f"array {shown(name)}"
+        info, where = self._members[name], f"array {quote(name)}"
         if info.flag_bits & ENCRYPTED:
             raise error(self.path, f"{where} is encrypted", "save it without a password")
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -106,20 +108,20 @@ class NumpyArchive(Mapping[str, Array]):
         if info.file_size > times * info.compress_size + more:
             raise error(self.path, f"{where} cannot have the {info.file_size} bytes that the archive says", AGAIN)
 
-        def guarded(read: Callable[[], Any]) -> Any:
+        def guard_read(read: Callable[[], Any]) -> Any:
             try:
                 return read()
             except DAMAGED as problem:
-                said = f"{where} cannot be read ({clip_text(problem, VALUE)}; the file may be truncated)"
-                raise error(self.path, said, "write or copy it again") from None
+                message = f"{where} cannot be read ({clip_text(problem, VALUE)}; the file may be truncated)"
+                raise error(self.path, message, "write or copy it again") from None
 
-        stream = guarded(lambda: self._zip.open(info))
-        return lambda count: guarded(lambda: stream.read(count))
+        stream = guard_read(lambda: self._zip.open(info))
+        return lambda count: guard_read(lambda: stream.read(count))
 
 
 def read_npy(path: Path) -> Array:
     """The array of an ``.npy`` file."""
-    with opened(path) as file:
+    with open_file(path) as file:
         header = _header(path, "the array", file.read, size_of(path))
         return _values(path, "the array", file.read, header)
 
@@ -145,18 +147,20 @@ def _header(path: Path, where: str, take: Take, size: int) -> Header:
     except NO_HEADER:
         raise error(path, f"{where} cannot be read: its header is damaged (the file may be truncated)", AGAIN) from None
     if dtype.hasobject:
-        said = f"{where} cannot be read: it holds Python objects, which would need pickle"
-        raise error(path, said, "save numbers or text: numpy.asarray(values, dtype=...)")
+        message = f"{where} cannot be read: it holds Python objects, which would need pickle"
+        raise error(path, message, "save numbers or text: numpy.asarray(values, dtype=...)")
     if dtype.kind not in KINDS:
         raise error(path, f"{where} holds records, not plain values", "save each field as an array")
-    found = Header(shape, dtype, fortran, before + length)
+    header = Header(shape, dtype, fortran, before + length)
     sides = math.prod(side for side in shape if side)
-    if len(shape) > AXES or min(shape, default=0) < 0 or (not found.size and sides > EMPTY):
-        raise error(path, f"{where} cannot have the shape {shown(shape)}", AGAIN)
-    if found.length + found.size != size:
-        said = f"{where} cannot be read as numpy data: it declares {found.size} bytes, and {max(0, size - found.length)} are there"
-        raise error(path, f"{said} (the file may be truncated)", "write or copy it again")
-    return found
+    if len(shape) > AXES or min(shape, default=0) < 0 or (not header.size and sides > EMPTY):
+        raise error(path, f"{where} cannot have the shape {quote(shape)}", AGAIN)
+    if header.length + header.size != size:
+        message = (
+            f"{where} cannot be read as numpy data: it declares {header.size} bytes, and {max(0, size - header.length)} are there"
+        )
+        raise error(path, f"{message} (the file may be truncated)", "write or copy it again")
+    return header
 
 
 def _values(path: Path, where: str, take: Take, header: Header) -> Array:

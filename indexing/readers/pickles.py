@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import LARGEST, VALUE, clip_text, error, read_bytes, shown
+from indexing.opening import LARGEST, VALUE, clip_text, error, quote, read_bytes
 
 REMEDY = "save it again with nothing in it but numpy arrays of numbers, text, lists and dictionaries"
 # steps of pickles by their names: containers, numbers, text, bytes, the memo, and calls of the names below
@@ -64,11 +64,11 @@ class _Kind:
     def __init__(self, code: Any) -> None:
         code = code.decode("latin-1") if isinstance(code, bytes) and len(code) <= LONGEST_CODE else code
         if not isinstance(code, str) or len(code) > LONGEST_CODE or not code[1:].isdigit() or code[:1] not in PLAIN:
-            raise Refused(f"an array of {shown(code)}, neither numbers nor text")
+            raise Refused(f"an array of {quote(code)}, neither numbers nor text")
         try:
             self.dtype = np.dtype(code)
         except (TypeError, ValueError):
-            raise Refused(f"an array of {shown(code)}, which numpy does not know") from None
+            raise Refused(f"an array of {quote(code)}, which numpy does not know") from None
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, tuple) or len(state) < 5 or any(part is not None for part in state[2:5]):
@@ -146,8 +146,8 @@ class _Reader(pickle._Unpickler):
 
     def load(self) -> Any:
         """The value, or :class:`Refused`."""
-        own: Any = pickle  # what its reader in Python is made of, which the stubs do not list
-        self._unframer = own._Unframer(self._file_read, self._file_readline)  # type: ignore[attr-defined]
+        internals: Any = pickle  # what its reader in Python is made of, which the stubs do not list
+        self._unframer = internals._Unframer(self._file_read, self._file_readline)  # type: ignore[attr-defined]
         self.read, self.readinto, self.readline = self._unframer.read, self._unframer.readinto, self._unframer.readline
         self.metastack: list[Any] = []
         self.stack: list[Any] = []
@@ -159,19 +159,19 @@ class _Reader(pickle._Unpickler):
                 raise EOFError("it ends before its value")
             step = _STEPS.get(key[0])
             if step is None:
-                raise Refused(_OTHER.get(key[0], f"the step {shown(key)}"))
+                raise Refused(_OTHER.get(key[0], f"the step {quote(key)}"))
             try:
                 step(self)
-            except own._Stop as stop:
+            except internals._Stop as stop:
                 return stop.value
         raise Refused("more steps than its size allows")
 
     def find_class(self, module: str, name: str) -> Any:
         """A stand-in, whatever the file names."""
-        found = self._known.get((module.replace("__builtin__", "builtins"), name))
-        if found is None:
+        stand_in = self._known.get((module.replace("__builtin__", "builtins"), name))
+        if stand_in is None:
             raise Refused(f"the name {clip_text(f'{module}.{name}', VALUE)}")
-        return found
+        return stand_in
 
     def persistent_load(self, pid: Any) -> Any:
         raise Refused("a persistent id")
@@ -202,7 +202,7 @@ class _Reader(pickle._Unpickler):
 
     def _encode(self, text: Any, encoding: Any = None) -> bytes:
         if not isinstance(text, str) or encoding not in LATIN:
-            raise Refused(f"text in the encoding {shown(encoding)}")
+            raise Refused(f"text in the encoding {quote(encoding)}")
         self.bytes_of(len(text))
         return text.encode("latin-1")
 
@@ -235,7 +235,7 @@ def _fill(into: Any, items: list[Any]) -> None:
         if type(key) not in KEYS:
             raise Refused(f"a key of the type {clip_text(type(key).__name__, VALUE)}")
         if type(key) is int and abs(key) > WHOLE:
-            raise Refused(f"the key {shown(key)}")
+            raise Refused(f"the key {quote(key)}")
         if type(key) in (int, float) and len(into) >= NUMBERED_BLOCK:
             raise Refused(f"more than {NUMBERED_BLOCK} numbers as keys")
         into[key] = value
@@ -251,10 +251,10 @@ def _values(data: Any, kind: Any, shape: Any, order: Any, bytes_of: Callable[[in
     if not isinstance(data, bytes):
         raise Refused("an array of Python objects")
     if len(shape) > 32 or max(shape, default=0) >= 2**63 or math.prod(shape) * kind.dtype.itemsize != len(data):
-        raise Refused(f"an array of {len(data)} bytes for the shape {shown(shape)}")
+        raise Refused(f"an array of {len(data)} bytes for the shape {quote(shape)}")
     if not len(data):
         if max(shape, default=0) > LARGEST or (not kind.dtype.itemsize and math.prod(shape) > 1):  # numpy makes U0 a U1
-            raise Refused(f"an array of the shape {shown(shape)}")
+            raise Refused(f"an array of the shape {quote(shape)}")
         return np.zeros(shape, kind.dtype)
     return np.frombuffer(data, kind.dtype).reshape(shape, order=order)
 
@@ -282,8 +282,8 @@ def unpickle_bytes(path: Path, data: bytes, where: str) -> Any:
     except Refused as refused:
         raise error(path, f"{who} holds {refused}, which is not read from a file", REMEDY) from None
     except Exception as problem:  # a program that does not run fails in as many ways as there are steps
-        said = clip_text(f"{type(problem).__name__}: {problem}", VALUE)
-        raise error(path, f"{who} cannot be read ({said}; the file may be truncated)", REMEDY) from None
+        message = clip_text(f"{type(problem).__name__}: {problem}", VALUE)
+        raise error(path, f"{who} cannot be read ({message}; the file may be truncated)", REMEDY) from None
 
 
 def _replace_parts(value: Any, seen: dict[int, Any]) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import Row, error, first_duplicate, listing, read_bytes, shown
+from indexing.opening import Row, error, first_duplicate, listing, quote, read_bytes
 from indexing.opening import read_rows as rows_of
 from indexing.readers.npz import NumpyArchive
 from indexing.readers.npz import read_npy as read_npy_file
@@ -135,7 +135,7 @@ def split_header(
     check_widths(path, rows, names)
     twice = first_duplicate(name for name in names if name in (*columns, *single))
     if twice is not None:
-        raise error(path, f"there are two columns {shown(twice)}", "leave one of them out")
+        raise error(path, f"there are two columns {quote(twice)}", "leave one of them out")
     return rows, names, columns
 
 
@@ -174,7 +174,7 @@ def column_values(path: Path, rows: Sequence[Row], names: Sequence[str], columns
             if value is None or math.isinf(value):
                 what = "is not a number" if value is None else "is not finite"
                 raise error(
-                    path, f"row {line}, column {shown(name)}: {shown(cells[place])} {what}", "correct the cell or leave it empty"
+                    path, f"row {line}, column {quote(name)}: {quote(cells[place])} {what}", "correct the cell or leave it empty"
                 )
             out[i, j] = value
     return out
@@ -185,16 +185,16 @@ def row_names(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequ
     column = next((names.index(name) for name in known if name in names), None)
     if column is None:
         return None
-    found: dict[str, int] = {}
+    lines: dict[str, int] = {}
     for line, cells in rows:
         name = cells[column].strip()
         if not name:
-            raise error(path, f"row {line}, column {shown(names[column])}: is empty", "name the row, or leave the column out")
-        if name in found:
-            said = f"row {line}, column {shown(names[column])}: {shown(name)} was in row {found[name]}, too"
-            raise error(path, said, "give each row a name of its own")
-        found[name] = line
-    return tuple(found)
+            raise error(path, f"row {line}, column {quote(names[column])}: is empty", "name the row, or leave the column out")
+        if name in lines:
+            message = f"row {line}, column {quote(names[column])}: {quote(name)} was in row {lines[name]}, too"
+            raise error(path, message, "give each row a name of its own")
+        lines[name] = line
+    return tuple(lines)
 
 
 def optional_column(path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str]) -> FloatArray | None:
@@ -238,7 +238,7 @@ def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
         raise error(path, f"its arrays are {listing(names)}", KEYS)
     unknown = [name for name in names if name not in EXTRA and not (name[:1] == prefix and name[1:] in ("1", "2", "3"))]
     if unknown:
-        raise error(path, f"has an array {shown(unknown[0])}, which is not known", KEYS)
+        raise error(path, f"has an array {quote(unknown[0])}, which is not known", KEYS)
     wanted = [f"{prefix}{i}" for i in ((1, 2) if prefix == "l" else (1, 2, 3))]
     missing = [name for name in wanted if name not in names]
     if missing:
@@ -313,7 +313,7 @@ def read_ply(path: Path) -> PointSet:
     names = [name for name, _ in kinds]
     missing = [name for name in "xyz" if name not in names]
     if missing:
-        raise error(path, f"its vertices have no property {shown(missing[0])} (they have {listing(names)})", "export x, y, z")
+        raise error(path, f"its vertices have no property {quote(missing[0])} (they have {listing(names)})", "export x, y, z")
     if not element.rows:
         raise error(path, "has no vertices", "export a point cloud")
     read_rows = _ply_rows if order == "" else _ply_records
@@ -348,7 +348,7 @@ def _ply_header(path: Path, data: bytes) -> tuple[str, list[PlyElement], int]:
             elif words[:1] == ["property"] and elements[-1].properties is not None:
                 elements[-1].properties.append((words[2], PLY_TYPES[words[1]]))
         except (IndexError, KeyError, ValueError):
-            raise error(path, f"the PLY header has the line {shown(line)}, which makes no sense", "export it again") from None
+            raise error(path, f"the PLY header has the line {quote(line)}, which makes no sense", "export it again") from None
     if order is None:
         raise error(path, "the PLY header has no format", "export it again")
     return order, elements, newline + 1
@@ -368,7 +368,7 @@ def _ply_rows(path: Path, data: bytes, order: str, before: list[PlyElement], ele
             try:
                 columns[name][i] = float(word)
             except ValueError:
-                raise error(path, f"vertex {i + 1}, {shown(name)}: {shown(word)} is not a number", "correct the value") from None
+                raise error(path, f"vertex {i + 1}, {quote(name)}: {quote(word)} is not a number", "correct the value") from None
     return columns
 
 
@@ -376,7 +376,7 @@ def _ply_records(path: Path, data: bytes, order: str, before: list[PlyElement], 
     skip = 0
     for other in before:
         if other.properties is None:
-            raise error(path, f"the lists of {shown(other.name)} come before the vertices", "export a point cloud only")
+            raise error(path, f"the lists of {quote(other.name)} come before the vertices", "export a point cloud only")
         skip += other.rows * _ply_type(order, other).itemsize
     kind = _ply_type(order, element)
     if len(data) < skip + element.rows * kind.itemsize:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dyntorch.numerics import Message
 from indexing.clip import LARGEST, Clip, ClipSet, FloatArray
 from indexing.joints import check_named_layout, choose_layout, estimate_up
-from indexing.opening import error, shown
+from indexing.opening import error, quote
 from indexing.readers.files import Options
 from indexing.skeleton import LAYOUTS, Skeleton
 
@@ -76,13 +76,13 @@ def select_people(path: Path, recording: Recording, person: str) -> list[tuple[H
     tracked = ids is not None
     if ids is None:
         ids = link_by_position(recording.at, recording.joints)
-    known = np.maximum(ids, 0)
-    total = np.bincount(known, weight * (ids >= 0))
+    safe_ids = np.maximum(ids, 0)
+    total = np.bincount(safe_ids, weight * (ids >= 0))
     if person == "tracked":
-        count = np.bincount(known, ids >= 0) if tracked else np.zeros(len(total))
+        count = np.bincount(safe_ids, ids >= 0) if tracked else np.zeros(len(total))
         best = np.lexsort((total, count))[-1]
         return [(names[best] if tracked else None, np.flatnonzero(ids == best))]
-    rank = np.where(ids >= 0, total[known], -1.0)
+    rank = np.where(ids >= 0, total[safe_ids], -1.0)
     order = np.lexsort((weight, rank, recording.at))  # by frame, and within it the best last
     last = np.append(np.diff(recording.at[order]) > 0, True)
     return [(None, order[last])]
@@ -141,13 +141,13 @@ def _latest(waiting: IntArray, at: IntArray, last: IntArray, most: int) -> IntAr
     return waiting[frames >= np.partition(frames, -most)[-most]]
 
 
-def _distances(awaited: FloatArray, found: FloatArray, size: FloatArray) -> FloatArray:
+def _distances(awaited: FloatArray, candidates: FloatArray, size: FloatArray) -> FloatArray:
     """``(awaited, found)`` mean joint distance in units of ``size``; infinite where no joint is shown by both."""
-    apart = np.linalg.norm(awaited[:, None] - found[None], axis=3)
-    both = ~np.isnan(apart)
+    distances = np.linalg.norm(awaited[:, None] - candidates[None], axis=3)
+    both = ~np.isnan(distances)
     shared = both.sum(axis=2)
     usable = (shared > 0) & (size > 0)
-    mean = np.where(both, apart, 0.0).sum(axis=2) / np.maximum(shared, 1)
+    mean = np.where(both, distances, 0.0).sum(axis=2) / np.maximum(shared, 1)
     return np.where(usable, mean / np.where(usable, size, 1.0), np.inf)
 
 
@@ -197,7 +197,7 @@ def parse_numbers(path: Path, where: str, value: Any) -> FloatArray:
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):  # of whole numbers of hundreds of digits
-        raise error(path, f"{where}: expected numbers, got {shown(value)}", "export the file again") from None
+        raise error(path, f"{where}: expected numbers, got {quote(value)}", "export the file again") from None
 
 
 def frame_numbers(path: Path, values: FloatArray) -> IntArray:
@@ -236,27 +236,27 @@ def collect_detections(path: Path, frames: Sequence[tuple[int, Sequence[Detectio
     """A recording from the people of each frame."""
     frames = sorted(frames, key=lambda frame: frame[0])
     if frames and max(abs(frames[0][0]), abs(frames[-1][0])) >= LAST_FRAME:
-        raise error(path, f"frame number {shown(frames[-1][0])} is beyond any recording", "number images by frame")
-    found = [(i, number, person) for i, (number, people) in enumerate(frames) for person in people]
-    if not found:
+        raise error(path, f"frame number {quote(frames[-1][0])} is beyond any recording", "number images by frame")
+    detections = [(i, number, person) for i, (number, people) in enumerate(frames) for person in people]
+    if not detections:
         raise NobodySeen(path, np.array([number for number, _ in frames], dtype=np.int64))
-    shape = found[0][2].joints.shape
-    for _, number, person in found:
+    shape = detections[0][2].joints.shape
+    for _, number, person in detections:
         if person.joints.shape != shape:
             raise error(
                 path,
-                f"frame {number} has a person with joints {person.joints.shape}, frame {found[0][1]} one with {shape}",
+                f"frame {number} has a person with joints {person.joints.shape}, frame {detections[0][1]} one with {shape}",
                 "export every person with the same joint layout, or one file per layout",
             )
     confidence = None
-    if any(person.confidence is not None for *_, person in found):
-        confidence = np.stack([np.ones(shape[0]) if p.confidence is None else p.confidence for *_, p in found])
+    if any(person.confidence is not None for *_, person in detections):
+        confidence = np.stack([np.ones(shape[0]) if p.confidence is None else p.confidence for *_, p in detections])
     return Recording(
         frames=np.array([number for number, _ in frames], dtype=np.int64),
-        at=np.array([i for i, *_ in found], dtype=np.int64),
-        joints=np.stack([person.joints for *_, person in found]),
+        at=np.array([i for i, *_ in detections], dtype=np.int64),
+        joints=np.stack([person.joints for *_, person in detections]),
         confidence=confidence,
-        tracks=[person.track for *_, person in found],
+        tracks=[person.track for *_, person in detections],
     )
 
 
@@ -267,10 +267,10 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
     name = path.name or path.resolve().name
     each = options.person in ("all", "everyone")
     ids = _read_ids(recording)[0] if each else None
-    own = {"followed": "position"} if ids is None else {"followed": "ids", "untracked": int((ids < 0).sum())}
+    followed = {"followed": "position"} if ids is None else {"followed": "ids", "untracked": int((ids < 0).sum())}
     crowd = np.bincount(recording.at)
     others = {"people": int(crowd.max())} if (crowd > 1).mean() > MIN_CROWDED_SHARE else {}
-    known = dict(recording.meta)
+    meta = dict(recording.meta)
     clips = []
     for track, rows in select_people(path, recording, options.person):
         # each person's clip spans what was seen of that person
@@ -287,7 +287,7 @@ def to_clips(path: Path, recording: Recording, options: Options) -> ClipSet:
                 name=f"{name}#{track}" if one else name,
                 skeleton=recording.skeleton,
                 up=recording.up,
-                meta={**known, "person": track, **own} if each else known | others,
+                meta={**meta, "person": track, **followed} if each else meta | others,
                 fps_assumed=recording.times is None and options.fps is None,
             )
         )
@@ -331,13 +331,17 @@ class NobodySeen(ValueError):
 def _assign_layout(path: Path, recording: Recording, options: Options) -> Recording:
     """Which joint is which: as the caller says, or where only their number is known, as the body looks."""
     if options.layout is not None:
-        own = None if any(recording.skeleton is one for one in LAYOUTS.values()) else recording.skeleton  # by its number alone
+        file_layout = (
+            None if any(recording.skeleton is one for one in LAYOUTS.values()) else recording.skeleton
+        )  # by its number alone
         meta = {key: value for key, value in recording.meta.items() if key != "layout"}
-        return replace(recording, skeleton=check_named_layout(path, options.layout, recording.joints.shape[1], own), meta=meta)
+        return replace(
+            recording, skeleton=check_named_layout(path, options.layout, recording.joints.shape[1], file_layout), meta=meta
+        )
     if not recording.layouts:
         return recording
-    layout, said, _ = choose_layout(recording.joints, recording.skeleton, recording.layouts, recording.up)
-    return replace(recording, skeleton=layout, meta={**recording.meta, **said})
+    layout, message, _ = choose_layout(recording.joints, recording.skeleton, recording.layouts, recording.up)
+    return replace(recording, skeleton=layout, meta={**recording.meta, **message})
 
 
 def _select_frames(times: FloatArray, at: IntArray, away: float) -> IntArray:
@@ -384,8 +388,8 @@ def _mask(path: Path, recording: Recording, min_confidence: float) -> Recording:
         )
     if (np.abs(joints[~missing]) > LARGEST).any():
         row, joint = np.argwhere((np.abs(joints) > LARGEST).any(axis=2) & ~missing)[0]
-        said = f"frame {recording.frames[recording.at[row]]}, joint {joint}: infinite coordinates, or beyond {LARGEST:g}"
-        raise error(path, said, "leave them empty")
+        message = f"frame {recording.frames[recording.at[row]]}, joint {joint}: infinite coordinates, or beyond {LARGEST:g}"
+        raise error(path, message, "leave them empty")
     joints[missing] = np.nan
     keep = np.asarray(~missing.all(axis=1))
     if not keep.any():
@@ -410,8 +414,8 @@ def _times(path: Path, recording: Recording, fps: float | None) -> tuple[FloatAr
         return recording.frames / rate, rate
     bad = np.flatnonzero(~(np.abs(recording.times) < LAST_FRAME))
     if bad.size:
-        said = f"frame {recording.frames[bad[0]]} has no time, or one beyond any recording"
-        raise error(path, said, Message("give every row a time, or drop the column and use {arg:fps=}"))
+        message = f"frame {recording.frames[bad[0]]} has no time, or one beyond any recording"
+        raise error(path, message, Message("give every row a time, or drop the column and use {arg:fps=}"))
     back = np.flatnonzero(np.diff(recording.times) <= 0)
     if back.size:
         a, b = recording.times[back[0] : back[0] + 2]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from indexing.opening import VALUE, Row, check_dense, clip_text, error, head_of, is_regular, listing, shown, size_of
+from indexing.opening import VALUE, Row, check_dense, clip_text, error, head_of, is_regular, listing, quote, size_of
 from indexing.readers.matches import open_points
 from indexing.readers.npz import NumpyArchive, read_npy
 from indexing.readers.points import (
@@ -54,7 +54,7 @@ class TrackSet:
         if self.times is None:
             return self
         first = float(self.times[0])
-        views = since(self.times) if self.by_time else self.views
+        views = relative_names(self.times) if self.by_time else self.views
         return replace(self, views=views, times=self.times - first, start=self.start + first)
 
     def select(self, frames: Sequence[str]) -> TrackSet:
@@ -74,7 +74,7 @@ class TrackSet:
             weights=None if self.weights is None else self.weights[at],
         )
 
-    def seen(self, least: int = 2) -> TrackSet:
+    def drop_short(self, least: int = 2) -> TrackSet:
         """Without the tracks that fewer views see: of these nothing can be known."""
         count = np.isfinite(self.values).all(axis=-1).sum(axis=0)
         kept = count >= least
@@ -82,7 +82,7 @@ class TrackSet:
             return self
         lost = int((~kept).sum())
         was = "track is seen in fewer than {} views and was" if lost == 1 else "tracks are seen in fewer than {} views and were"
-        said = f"{lost} {was.format(least)} left out"
+        message = f"{lost} {was.format(least)} left out"
         return replace(
             self,
             values=self.values[:, kept],
@@ -90,18 +90,18 @@ class TrackSet:
             weights=None if self.weights is None else self.weights[:, kept],
             static=None if self.static is None else self.static[kept],
             known=None if self.known is None else self.known[kept],
-            notes=(*self.notes, said),
+            notes=(*self.notes, message),
         )
 
 
-def since(times: FloatArray) -> tuple[str, ...]:
+def relative_names(times: FloatArray) -> tuple[str, ...]:
     """Times since the first, in as many decimals as they have; in full where that would give two the same name."""
     finest = float(np.spacing(np.abs(times).max()))
     short = tuple(f"{step:.10g}" for step in np.round(times - times[0], int(np.floor(-np.log10(finest)))))
-    return short if len(set(short)) == len(short) else tuple(exact(time - times[0]) for time in times)
+    return short if len(set(short)) == len(short) else tuple(shortest_repr(time - times[0]) for time in times)
 
 
-def exact(value: float) -> str:
+def shortest_repr(value: float) -> str:
     """A number with all the digits that it has, and no more."""
     return repr(float(value)).removesuffix(".0")
 
@@ -121,7 +121,7 @@ TIMES = ("time", "t", "seconds", "timestamp")
 EXPECTED = "name the columns frame (or time), id, x, y, and z for 3D points"
 
 
-def heading(path: Path) -> list[str]:
+def read_headings(path: Path) -> list[str]:
     """The headings of a table, in small letters; empty where its first row is data."""
     rows = read_rows(path)
     return [cell.strip().lower() for cell in rows[0][1]] if rows and not is_data(rows[0][1]) else []
@@ -134,7 +134,7 @@ def is_long(names: Sequence[str]) -> bool:
 
 def check_headings(path: Path) -> None:
     """Raise on a table that is neither of tracks nor of the points of one view, with the columns that tracks need."""
-    names = heading(path)
+    names = read_headings(path)
     if not names and read_rows(path):
         raise error(path, "row 1 holds numbers, and no row names the columns", EXPECTED)
     if names and not ({"x", "y"} <= set(names) or {"x1", "y1"} <= set(names)):
@@ -143,7 +143,7 @@ def check_headings(path: Path) -> None:
 
 def read_long(path: Path) -> TrackSet:
     """The tracks of a table; rows that are absent and cells that are empty are missing observations."""
-    rows, names = read_rows(path)[1:], heading(path)
+    rows, names = read_rows(path)[1:], read_headings(path)
     if not rows:
         raise error(path, "the file has a header but no rows", "export it again")
     check_widths(path, rows, names)
@@ -155,63 +155,62 @@ def read_long(path: Path) -> TrackSet:
     assert viewed is not None  # is_long
     axes = [axis for axis in ("x", "y", "z") if axis in names]
     xyz = column_values(path, rows, names, axes)
-    place = _present(path, rows, names, viewed)
+    place = _complete_column(path, rows, names, viewed)
     moments, views = np.unique(place, return_inverse=True)
     ids: dict[str, int] = {}
     columns = np.array([ids.setdefault(_point_name(path, line, cells[point], names[point]), len(ids)) for line, cells in rows])
-    _once(path, rows, names[point], views, columns, moments)
+    _check_unique(path, rows, names[point], views, columns, moments)
     shape = (len(moments), len(ids))
     same = "give a point the same name, and a frame the same number, in all of its rows"
     check_dense(path, len(moments) * len(ids), len(rows), f"{len(moments)} views and {len(ids)} points", same)
     values = np.full((*shape, len(axes)), np.nan)
     values[views, columns] = xyz
     return TrackSet(
-        str(path), values, tuple(ids), tuple(exact(moment) for moment in moments),
+        str(path), values, tuple(ids), tuple(shortest_repr(moment) for moment in moments),
         None if timed is None else moments if timed == viewed else _times(path, rows, names, timed, views, moments),
         _weights(path, rows, names, views, columns, shape), _static(path, rows, names, columns, len(ids)),
         by_time=timed == viewed,
     )  # fmt: skip
 
 
-def _present(path: Path, rows: Sequence[Row], names: Sequence[str], column: str) -> FloatArray:
+def _complete_column(path: Path, rows: Sequence[Row], names: Sequence[str], column: str) -> FloatArray:
     """A column of numbers of which none may be missing."""
-    found = column_values(path, rows, names, [column])[:, 0]
-    if np.isnan(found).any():
-        line = rows[int(np.flatnonzero(np.isnan(found))[0])][0]
-        raise error(path, f"row {line}, column {shown(column)}: is empty", "every row needs the view that it belongs to")
-    return found
+    values = column_values(path, rows, names, [column])[:, 0]
+    if np.isnan(values).any():
+        line = rows[int(np.flatnonzero(np.isnan(values))[0])][0]
+        raise error(path, f"row {line}, column {quote(column)}: is empty", "every row needs the view that it belongs to")
+    return values
 
 
 def _point_name(path: Path, line: int, cell: str, column: str) -> str:
     if not cell.strip():
-        raise error(path, f"row {line}, column {shown(column)}: is empty", "name the point")
+        raise error(path, f"row {line}, column {quote(column)}: is empty", "name the point")
     return cell.strip()
 
 
-def _once(path: Path, rows: Sequence[Row], point: str, views: IntArray, columns: IntArray, moments: FloatArray) -> None:
+def _check_unique(path: Path, rows: Sequence[Row], point: str, views: IntArray, columns: IntArray, moments: FloatArray) -> None:
     before: dict[tuple[int, int], int] = {}
     for (line, cells), view, column in zip(rows, views.tolist(), columns.tolist(), strict=True):
         if (view, column) in before:
-            again = f"was in frame {exact(moments[view])} before, in row {before[view, column]}"
-            said = f"row {line}: point {column + 1} of the file {again}"
+            again = f"was in frame {shortest_repr(moments[view])} before, in row {before[view, column]}"
+            message = f"row {line}: point {column + 1} of the file {again}"
             raise error(
                 path,
-                f"{said} (row: {clip_text(', '.join(cells), VALUE)})",
-                f"give each point one row per frame; column {shown(point)} names it",
+                f"{message} (row: {clip_text(', '.join(cells), VALUE)})",
+                f"give each point one row per frame; column {quote(point)} names it",
             )
         before[view, column] = line
 
 
 def _times(path: Path, rows: Sequence[Row], names: Sequence[str], column: str, views: IntArray, moments: FloatArray) -> FloatArray:
-    found = _present(path, rows, names, column)
-    out = found[np.unique(views, return_index=True)[1]]
-    wrong = np.flatnonzero(found != out[views])
+    stamps = _complete_column(path, rows, names, column)
+    out = stamps[np.unique(views, return_index=True)[1]]
+    wrong = np.flatnonzero(stamps != out[views])
     if len(wrong):
         line, view = rows[wrong[0]][0], views[wrong[0]]
-        said = (
-            f"row {line}: frame {exact(moments[view])} has the {column} {exact(found[wrong[0]])} here and {exact(out[view])} before"
-        )
-        raise error(path, said, "a view has one time")
+        here, before = shortest_repr(stamps[wrong[0]]), shortest_repr(out[view])
+        message = f"row {line}: frame {shortest_repr(moments[view])} has the {column} {here} here and {before} before"
+        raise error(path, message, "a view has one time")
     return out
 
 
@@ -221,12 +220,12 @@ def _weights(
     column = next((name for name in WEIGHTS if name in names), None)
     if column is None:
         return None
-    found = np.nan_to_num(column_values(path, rows, names, [column])[:, 0])
-    if (found < 0).any():
-        at = int(np.flatnonzero(found < 0)[0])
-        raise error(path, f"row {rows[at][0]}, column {shown(column)}: the weight is {found[at]:g}", "weights are 0 or more")
+    values = np.nan_to_num(column_values(path, rows, names, [column])[:, 0])
+    if (values < 0).any():
+        at = int(np.flatnonzero(values < 0)[0])
+        raise error(path, f"row {rows[at][0]}, column {quote(column)}: the weight is {values[at]:g}", "weights are 0 or more")
     out = np.zeros(shape)
-    out[views, columns] = found
+    out[views, columns] = values
     return out
 
 
@@ -234,9 +233,9 @@ def _static(path: Path, rows: Sequence[Row], names: Sequence[str], columns: IntA
     """A point is static where all of its rows say so."""
     if not set(STATIC) & set(names):
         return None
-    found = np.asarray(flags(path, rows, names))
+    marks = np.asarray(flags(path, rows, names))
     out = np.ones(count, dtype=bool)
-    out[columns[~found]] = False
+    out[columns[~marks]] = False
     return out
 
 
@@ -295,7 +294,7 @@ def _select_prefix(path: Path, names: list[str], key: str | None) -> tuple[str, 
         return "", key
     if key is not None and key not in several:
         known = f"its sequences are {listing(several)}" if several else f"its arrays are {listing(names)}"
-        raise error(path, f"has no {'sequence' if several else 'array'} {shown(key)}", known)
+        raise error(path, f"has no {'sequence' if several else 'array'} {quote(key)}", known)
     if key is None and several:
         raise error(
             path, f"holds {len(several)} sequences ({listing(several, 4)})", f"say which: --key {clip_text(several[0], VALUE)}"
@@ -329,12 +328,12 @@ def read_tracks(
     files = [Path(path).expanduser() for path in paths]
     if not files:
         raise ValueError(f"no files; {FORMATS}")
-    found = _read(files, key)
+    tracks = _read(files, key)
     if frames is not None:
-        found = found.select(frames)
-    if len(found.views) < 2:
-        raise error(found.path, f"holds {len(found.views)} view", FORMATS)
-    return found if static is None else replace(found, static=_static_points(static.expanduser(), found.ids))
+        tracks = tracks.select(frames)
+    if len(tracks.views) < 2:
+        raise error(tracks.path, f"holds {len(tracks.views)} view", FORMATS)
+    return tracks if static is None else replace(tracks, static=_static_points(static.expanduser(), tracks.ids))
 
 
 def _read(files: Sequence[Path], key: str | None) -> TrackSet:
@@ -343,7 +342,7 @@ def _read(files: Sequence[Path], key: str | None) -> TrackSet:
     if key is not None:
         raise error(files[0], f"--key {key}: has no keys", "leave --key out; it is for .npz with several sequences or arrays")
     if len(files) == 1 and _is_text(files[0]):
-        if is_long(heading(files[0])):
+        if is_long(read_headings(files[0])):
             return read_long(files[0])
         check_headings(files[0])
     opened = [open_points(path) for path in files]
@@ -372,7 +371,7 @@ def holds_tracks(path: Path) -> bool:
             return "x1" not in names and bool({"tracks", "y"} & set(names))
         if start.startswith(b"\x93NUMPY"):
             return read_npy(path).ndim == 3
-        return _is_text(path) and is_long(heading(path))
+        return _is_text(path) and is_long(read_headings(path))
     except ValueError:
         return False
 
@@ -393,8 +392,8 @@ def _match_views(views: Sequence[PointSet]) -> TrackSet:
     first = views[0]
     odd = next((view for view in views if view.values.shape[1] != first.values.shape[1]), None)
     if odd is not None:
-        said = f"holds {odd.values.shape[1]}D points, {first.path} {first.values.shape[1]}D"
-        raise error(odd.path, said, "give one kind")
+        message = f"holds {odd.values.shape[1]}D points, {first.path} {first.values.shape[1]}D"
+        raise error(odd.path, message, "give one kind")
     if all(view.ids is not None for view in views):
         places = {name: i for i, name in enumerate(dict.fromkeys(name for view in views for name in view.ids or ()))}
         rows = [np.array([places[name] for name in view.ids or ()]) for view in views]
@@ -402,8 +401,8 @@ def _match_views(views: Sequence[PointSet]) -> TrackSet:
     else:
         longer = next((view for view in views if len(view.values) != len(first.values)), None)
         if longer is not None:
-            said = f"has {len(longer.values)} rows, {first.path} {len(first.values)}"
-            raise error(longer.path, said, "give a row per track in every file, or a column id to match the rows by")
+            message = f"has {len(longer.values)} rows, {first.path} {len(first.values)}"
+            raise error(longer.path, message, "give a row per track in every file, or a column id to match the rows by")
         rows, ids = [np.arange(len(first.values))] * len(views), default_names(len(first.values))
     values = np.full((len(views), len(ids), first.values.shape[1]), np.nan)
     weights = np.ones(values.shape[:2])
@@ -439,5 +438,5 @@ def _static_points(path: Path, ids: Sequence[str]) -> BoolArray:
     named = {cells[column].strip(): line for i, (line, cells) in enumerate(rows) if marks is None or marks[i]}
     stranger = next((name for name in named if name not in set(ids)), None)
     if stranger is not None:
-        raise error(path, f"row {named[stranger]}: no track is named {shown(stranger)}", f"the tracks are {listing(ids, 4)}")
+        raise error(path, f"row {named[stranger]}: no track is named {quote(stranger)}", f"the tracks are {listing(ids, 4)}")
     return np.array([name in named for name in ids])

@@ -22,7 +22,7 @@ from indexing.action.stream import ActionOptions, Progress, Stream, StreamScan, 
 from indexing.clip import Clip
 from indexing.recordings.evidence import MIN_CYCLIC, Array, Durations, Lattice, level, machine_scores, whole_scores
 from indexing.scoring import Event, event_levels
-from indexing.windows import Ragged, ragged
+from indexing.windows import Ragged, concatenate_clips
 
 WHOLE_WEIGHT = 1.0  # of the nearest whole exemplars
 MACHINE_WEIGHT = 0.8  # of the kernel machine (UTKinect without it: .813 for .843)
@@ -81,9 +81,9 @@ class Stretch:
     whole: Array
     frames: tuple[int, int]
 
-    def cut(self, chosen: Array, length: int) -> Windows:
+    def resample(self, chosen: Array, length: int) -> Windows:
         """Some windows, resampled."""
-        return self.lattice.cut(self.source, 0, chosen, length)
+        return self.lattice.resample(self.source, 0, chosen, length)
 
 
 def decode(
@@ -99,7 +99,7 @@ def decode(
     wholes = level(np.concatenate([one.whole.ravel() for one in stretches]) if stretches else np.zeros(0))
     scores = np.full((len(clip), model.classes), log_scores(np.zeros(1))[0])
     background = np.ones(len(clip))
-    found: list[Event] = []
+    events: list[Event] = []
     held: list[Withheld] = []
     for one in stretches:
         values, calm, absent = segment_values(model, one, durations, wholes, stream.length, options)
@@ -111,19 +111,19 @@ def decode(
         scores[first:end] = log_scores(inside)[cell]
         background[first:end] = 1.0 - inside.sum(axis=1).clip(0.0, 1.0)[cell]
         mine = _merge_segments(model, one, segments, durations, stream.length)
-        found += events_of(model, one, mine, values, classes, stream.length)
+        events += events_of(model, one, mine, values, classes, stream.length)
         # what would be there, did rest and absence count as movement, and is not
         awake = np.minimum(calm, options.min_quality * _unit(one, durations))
         restless, _ = best_tiling(one.lattice.windows, values + absent, awake)
-        silent = [part for part in _merge_segments(model, one, restless, durations, stream.length) if not _meets(part, mine)]
+        silent = [part for part in _merge_segments(model, one, restless, durations, stream.length) if not _overlaps(part, mine)]
         reasons: list[Reason] = ["nobody there" if not one.present[part.first : part.last].any() else "at rest" for part in silent]
-        told = events_of(model, one, silent, values, classes, stream.length)
-        held += [Withheld(event, reason) for event, reason in zip(told, reasons, strict=True)]
-    found, low = _apply_level(model, found, rate)
+        silent_events = events_of(model, one, silent, values, classes, stream.length)
+        held += [Withheld(event, reason) for event, reason in zip(silent_events, reasons, strict=True)]
+    events, low = _apply_level(model, events, rate)
     if progress is not None:
         progress(1.0)
     held = sorted([*held, *low], key=lambda each: each.event.start)
-    return Explanation(clip.times, tuple(classes), scores, found, held, background)
+    return Explanation(clip.times, tuple(classes), scores, events, held, background)
 
 
 def log_scores(likely: Array) -> Array:
@@ -152,12 +152,12 @@ def _stretches(
         cells = np.stack([np.interp(middle, at, column) for column in contrast[part].T], axis=1)
         motion = np.interp(middle, at, moments.motion[part])
         present = np.interp(middle, at, moments.present[part].astype(float)) > 0.5
-        source = ragged([clip.replace(joints=clip.joints[frames], times=times, confidence=None)])
+        source = concatenate_clips([clip.replace(joints=clip.joints[frames], times=times, confidence=None)])
 
-        def cut(chosen: Array, lattice: Lattice = lattice, source: Ragged = source) -> Windows:
-            return lattice.cut(source, 0, chosen, stream.length)
+        def resample(chosen: Array, lattice: Lattice = lattice, source: Ragged = source) -> Windows:
+            return lattice.resample(source, 0, chosen, stream.length)
 
-        whole = whole_scores(model, lattice, cut, durations)
+        whole = whole_scores(model, lattice, resample, durations)
         out.append(Stretch(source, lattice, cells, cells / spread, motion, present, whole, (frames.start, frames.stop)))
         if progress is not None:
             progress(0.5 + 0.4 * (number + 1) / len(moments.stretches))
@@ -190,12 +190,12 @@ def _worth(model: ShapeModel, one: Stretch, durations: Durations, wholes: tuple[
     weight = 1 - CYCLIC_WHOLE_LOSS * cyclic
     quality += WHOLE_WEIGHT * weight * whole
     prior = durations.likelihoods(lattice.seconds, model.labels.cpu().numpy())
-    told = lasts * quality + DURATION_WEIGHT * prior - SEGMENT_COST - absent
+    without_machine = lasts * quality + DURATION_WEIGHT * prior - SEGMENT_COST - absent
     share = MACHINE_WEIGHT * lasts * weight
     proxy = whole - whole.mean(axis=1, keepdims=True)
     proxy /= np.maximum(proxy.std(axis=1, keepdims=True), 1e-9)
     background = (options.min_quality + options.rest_weight * rest + unseen) * _unit(one, durations)
-    return _Worth(told + share * proxy, told, share, background, absent)
+    return _Worth(without_machine + share * proxy, without_machine, share, background, absent)
 
 
 def segment_values(
@@ -207,7 +207,7 @@ def segment_values(
     if model.kernels is not None:
         total = through(one.lattice.windows, worth.values, worth.background)
         survivors = np.flatnonzero(total >= total.max() - MAX_VALUE_GAP)
-        machine = machine_scores(model, lambda chosen: one.cut(chosen, length), survivors)
+        machine = machine_scores(model, lambda chosen: one.resample(chosen, length), survivors)
         worth.values[survivors] = worth.told[survivors] + worth.share[survivors] * machine
     return worth.values, worth.background, worth.absent
 
@@ -215,8 +215,8 @@ def segment_values(
 def _rest_evidence(model: ShapeModel, one: Stretch) -> Array:
     """``(cells,)`` -1 where a person moves e times more than calm moments of what it looks like, 1 where e times less."""
     still, calm = motion_levels(model)
-    own = np.minimum(still, calm[one.contrast.argmax(axis=1)])
-    return np.asarray(np.log(np.maximum(own, 1e-30) / np.maximum(one.motion, 1e-30)).clip(-1.0, 1.0))
+    reference = np.minimum(still, calm[one.contrast.argmax(axis=1)])
+    return np.asarray(np.log(np.maximum(reference, 1e-30) / np.maximum(one.motion, 1e-30)).clip(-1.0, 1.0))
 
 
 def _merge_segments(
@@ -228,7 +228,7 @@ def _merge_segments(
         before = out[-1] if out else None
         touch = before is not None and before.last == part.first and before.label == part.label
         cycle = durations.cyclic[part.label] > MIN_CYCLIC
-        if before is not None and touch and (cycle or _goes_on(model, one, before, part, length)):
+        if before is not None and touch and (cycle or _continues(model, one, before, part, length)):
             longer = part.window if part.last - part.first > before.last - before.first else before.window
             out[-1] = TiledSegment(before.first, part.last, part.label, before.value + part.value, longer)
         else:
@@ -236,17 +236,17 @@ def _merge_segments(
     return out
 
 
-def _goes_on(model: ShapeModel, one: Stretch, before: TiledSegment, after: TiledSegment, length: int) -> bool:
+def _continues(model: ShapeModel, one: Stretch, before: TiledSegment, after: TiledSegment, length: int) -> bool:
     """Whether the pose between two segments is one from within the action, and not one that it begins or ends with."""
-    seen = _heights(one.cut(np.array([before.window, after.window]), length).values.to(model.labels.device))
+    seam = _heights(one.resample(np.array([before.window, after.window]), length).values.to(model.labels.device))
     mine = (model.labels == before.label).nonzero()[:, 0]
     shown = model.exemplars.crop(0)[mine].values
     if model.symmetry is not None:
         shown = torch.cat([shown, mirror(shown, model.symmetry)])
-    known = _heights(shown)
-    exemplar = known[(seen[:, None] - known).square().mean(dim=(0, 2, 3)).argmin()]
-    apart = ((seen[0, -1] + seen[1, 0]) / 2 - exemplar).square().mean(dim=1).sqrt()
-    ends, within = (apart[0] + apart[-1]) / 2, apart[2:-2].min() if len(apart) > 4 else apart.max()
+    exemplars = _heights(shown)
+    exemplar = exemplars[(seam[:, None] - exemplars).square().mean(dim=(0, 2, 3)).argmin()]
+    distance = ((seam[0, -1] + seam[1, 0]) / 2 - exemplar).square().mean(dim=1).sqrt()
+    ends, within = (distance[0] + distance[-1]) / 2, distance[2:-2].min() if len(distance) > 4 else distance.max()
     return bool(ends > MIN_SEAM_RATIO * within)
 
 
@@ -262,32 +262,32 @@ def events_of(
     """Segments as they are told: score: mean contrast of their moments; margin: what they are worth above the next class."""
     if not parts:
         return []
-    windows = one.cut(np.array([part.window for part in parts]), length).to(model.labels.device)
+    windows = one.resample(np.array([part.window for part in parts]), length).to(model.labels.device)
     residual = model.whole_residuals(windows, torch.arange(len(model.labels), device=model.labels.device))
     others = model.labels[None] != torch.tensor([part.label for part in parts], device=model.labels.device)[:, None]
     nearest = residual.masked_fill(others, torch.inf).argmin(dim=1).tolist()
-    found = []
+    events = []
     for part, exemplar in zip(parts, nearest, strict=True):
         score = float(one.raw[part.first : part.last, part.label].mean())
         next_best = np.delete(values[part.window], part.label).max(initial=-np.inf)
         margin = float(values[part.window, part.label] - next_best) if np.isfinite(next_best) else 0.0
         start, end = one.lattice.edges[part.first], one.lattice.edges[part.last]
-        found.append(Event(classes[part.label], float(start), float(end), score, margin, exemplar))
-    return found
+        events.append(Event(classes[part.label], float(start), float(end), score, margin, exemplar))
+    return events
 
 
-def _meets(part: TiledSegment, others: Sequence[TiledSegment]) -> bool:
+def _overlaps(part: TiledSegment, others: Sequence[TiledSegment]) -> bool:
     """Whether a segment shares any cell with some others."""
     return any(min(part.last, other.last) > max(part.first, other.first) for other in others)
 
 
-def _apply_level(model: ShapeModel, found: list[Event], rate: float | None) -> tuple[list[Event], list[Withheld]]:
+def _apply_level(model: ShapeModel, events: list[Event], rate: float | None) -> tuple[list[Event], list[Withheld]]:
     """Those events that reach the level that was asked for, and those that do not."""
     if rate is None:
-        return found, []
+        return events, []
     _, floor = event_levels(wrong_contrast(model), rate, 1.0, (-np.inf, -np.inf))
-    high = [event for event in found if event.score >= floor]
-    return high, [Withheld(event, "below the level") for event in found if event.score < floor]
+    high = [event for event in events if event.score >= floor]
+    return high, [Withheld(event, "below the level") for event in events if event.score < floor]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -317,16 +317,16 @@ def best_tiling(windows: Array, values: Array, background: Array) -> tuple[list[
     label = values.argmax(axis=1) if len(values) else np.empty(0, dtype=np.intp)
     best = values.max(axis=1) if len(values) else np.empty(0)
     total, chosen = _forward(windows, best, background)
-    found: list[TiledSegment] = []
+    segments: list[TiledSegment] = []
     edge = len(background)
     while edge > 0:
         window = int(chosen[edge])
         if window < 0:
             edge -= 1
             continue
-        found.append(TiledSegment(int(windows[window, 0]), edge, int(label[window]), float(best[window]), window))
+        segments.append(TiledSegment(int(windows[window, 0]), edge, int(label[window]), float(best[window]), window))
         edge = int(windows[window, 0])
-    return found[::-1], float(total[-1])
+    return segments[::-1], float(total[-1])
 
 
 def through(windows: Array, values: Array, background: Array) -> Array:

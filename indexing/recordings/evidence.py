@@ -43,9 +43,9 @@ class Durations:
     def of(cls, model: ShapeModel, window: float, stride: float) -> Durations:
         """Of a model; where its file does not say, from how many short windows each exemplar was cut into."""
         labels = model.labels.cpu().numpy()
-        kept = model.exemplars.seconds
+        stored = model.exemplars.seconds
         counts = np.bincount(model.exemplars.owner.cpu().numpy(), minlength=len(labels))
-        seconds = (window + stride * (counts - 1.0)) if kept is None else kept.cpu().numpy().astype(float)
+        seconds = (window + stride * (counts - 1.0)) if stored is None else stored.cpu().numpy().astype(float)
         seconds = np.maximum(seconds, 1e-3)
         low, high = CYCLIC_CORRELATION
         again = np.zeros(len(labels)) if model.exemplars.cyclic is None else model.exemplars.cyclic.cpu().numpy()
@@ -67,8 +67,8 @@ class Durations:
         """``(durations, classes)`` log likelihood of each duration, a kernel density around the exemplars of each class."""
         least = 1e-9  # seconds: windows of one length are equal up to the rounding of their edges
         durations, again = np.unique(np.maximum(np.round(durations / least), 1.0) * least, return_inverse=True)
-        apart = np.log(durations)[:, None] - np.log(self.seconds)[None]
-        near = np.nan_to_num(np.exp(-0.5 * (apart / LOG_DURATION_SIGMA) ** 2))
+        log_ratio = np.log(durations)[:, None] - np.log(self.seconds)[None]
+        near = np.nan_to_num(np.exp(-0.5 * (log_ratio / LOG_DURATION_SIGMA) ** 2))
         each = [near[:, labels == c].mean(axis=1) for c in range(len(self.typical))]
         return np.log(np.stack(each, axis=1) + MIN_DURATION_LIKELIHOOD).astype(np.float32)[again]
 
@@ -110,7 +110,7 @@ class Lattice:
             out[some] = (total[last[some]] - total[first[some]]) / (last[some] - first[some])[:, None]
         return out
 
-    def cut(self, source: Ragged, stretch: int, chosen: Array, length: int) -> Windows:
+    def resample(self, source: Ragged, stretch: int, chosen: Array, length: int) -> Windows:
         """Some windows, resampled."""
         first, last = self.windows[chosen].T
         owner = np.full(len(chosen), stretch)
@@ -118,7 +118,7 @@ class Lattice:
         return Windows(values, torch.from_numpy(source.seen[owner]))
 
 
-def whole_scores(model: ShapeModel, lattice: Lattice, cut: Callable[[Array], Windows], durations: Durations) -> Array:
+def whole_scores(model: ShapeModel, lattice: Lattice, resample: Callable[[Array], Windows], durations: Durations) -> Array:
     """``(W, classes)`` minus the mean residual to the nearest whole exemplars of each class that last about as long; NaN: none."""
     labels = model.labels.cpu().numpy()
     out = np.full((len(lattice.windows), model.classes), np.nan, dtype=np.float32)
@@ -132,18 +132,18 @@ def whole_scores(model: ShapeModel, lattice: Lattice, cut: Callable[[Array], Win
         chosen = torch.from_numpy(near).to(model.labels.device)
         for at in range(0, len(rows), BLOCK):
             some = rows[at : at + BLOCK]
-            residual = model.whole_residuals(cut(some).to(chosen.device), chosen).cpu().numpy()
+            residual = model.whole_residuals(resample(some).to(chosen.device), chosen).cpu().numpy()
             for c in np.unique(labels[near]).tolist():
                 mine = residual[:, labels[near] == c]
-                kept = min(NUM_NEIGHBOURS, mine.shape[1])
-                out[some, c] = -np.partition(mine, kept - 1, axis=1)[:, :kept].mean(axis=1)
+                count_ = min(NUM_NEIGHBOURS, mine.shape[1])
+                out[some, c] = -np.partition(mine, count_ - 1, axis=1)[:, :count_].mean(axis=1)
     return out
 
 
-def machine_scores(model: ShapeModel, cut: Callable[[Array], Windows], chosen: Array) -> Array:
+def machine_scores(model: ShapeModel, resample: Callable[[Array], Windows], chosen: Array) -> Array:
     """``(chosen, classes)`` of the kernel machine, standardized over the classes of each window."""
     parts = [
-        standardize(model.machine_scores(cut(chosen[at : at + BLOCK]).to(model.labels.device))).cpu().numpy()
+        standardize(model.machine_scores(resample(chosen[at : at + BLOCK]).to(model.labels.device))).cpu().numpy()
         for at in range(0, len(chosen), BLOCK)
     ]
     return np.concatenate(parts) if parts else np.zeros((0, model.classes))

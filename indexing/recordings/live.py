@@ -23,7 +23,7 @@ from indexing.action.model import NUM_NEIGHBOURS, ShapeModel
 from indexing.action.stream import INTERPOLATION_MARGIN, Stream, moments, presence, wrong_contrast
 from indexing.cameras import y_up
 from indexing.clip import Clip, is_number
-from indexing.joints import matched_all
+from indexing.joints import match_all
 from indexing.recordings.decoding import (
     EDGE_TOLERANCE,
     TEMPERATURE,
@@ -38,7 +38,7 @@ from indexing.recordings.decoding import (
 from indexing.recordings.evidence import DURATION_REACH, MAX_TEMPO_FACTOR, MIN_CYCLIC, Durations, Lattice
 from indexing.scoring import Event, event_levels
 from indexing.skeleton import Skeleton
-from indexing.windows import Ragged, ragged, repair_clip
+from indexing.windows import Ragged, concatenate_clips, repair_clip
 
 # of the usual duration of the longest action, looked at after a moment before it is decided; of half of it long actions are missed
 BLOCK_SECONDS = 0.5  # of frames that a stream looks at together: a part of its lag, and the fewer the more it costs
@@ -85,11 +85,11 @@ class _Cells:
     def __len__(self) -> int:
         return len(self.raw)
 
-    def joined(self, other: Self) -> Self:
+    def concatenate(self, other: Self) -> Self:
         """These and then others."""
         return replace(self, **{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
 
-    def after(self, count: int) -> Self:
+    def skip(self, count: int) -> Self:
         """All but the first ones."""
         return replace(self, **{f.name: getattr(self, f.name)[count:] for f in fields(self)})
 
@@ -134,11 +134,11 @@ class RunningLevel:
         """Count further values."""
         there = values[np.isfinite(values)]
         if len(there):
-            kept = min(self.count, max(self.memory - len(there), 0.0))
-            share = len(there) / (kept + len(there))
+            weight = min(self.count, max(self.memory - len(there), 0.0))
+            share = len(there) / (weight + len(there))
             self.mean += share * (float(there.mean()) - self.mean)
             self.square += share * (float(np.square(there, dtype=np.float64).mean()) - self.square)
-            self.count = kept + len(there)
+            self.count = weight + len(there)
 
     def level(self) -> tuple[float, float]:
         """Mean and standard deviation; 1 where nothing differs."""
@@ -190,39 +190,39 @@ class ActionStream:
         self._running: _Running | None = None  # decided, and perhaps going on
 
     @property
-    def buffered(self) -> int:
+    def num_frames(self) -> int:
         """Frames that are kept now."""
         return len(self._at)
 
     @one_thread
     def push(self, joints: Any, times: Any = None) -> LiveAnswer:
         """One more frame, or several. joints ``(joints, 2 | 3)``."""
-        frames, at, steps = self._checked(joints, times)
+        frames, at, steps = self._check_frames(joints, times)
         fresh = steps > self._look.window
         parts = np.concatenate([[0], np.flatnonzero(fresh[1:]) + 1, [len(at)]])
-        told: list[LiveAnswer] = []
+        answers: list[LiveAnswer] = []
         for begin, end in zip(parts[:-1].tolist(), parts[1:].tolist(), strict=True):
             if fresh[begin]:
-                told += self._end()
+                answers += self._end()
                 self._open(float(at[begin]))
-            told += self._take(frames[begin:end], at[begin:end] - self._begin)
-        return self._joined(told)
+            answers += self._append_frames(frames[begin:end], at[begin:end] - self._begin)
+        return self._merge_answers(answers)
 
     @one_thread
     def finish(self) -> LiveAnswer:
         """All that is left, decided as if nothing followed.  Frames that are pushed later begin anew."""
-        told = self._joined(self._end())
+        answer = self._merge_answers(self._end())
         self._count, self._last, self._steps = 0, -np.inf, np.empty(0)
         self._open(0.0)
-        return told
+        return answer
 
     @one_thread
     def latest(self) -> LiveAnswer:
         """The frames that are not decided yet, and the events among them, as it looks now: later frames may change both."""
-        return self._rest()[0]
+        return self._answer_remaining()[0]
 
     # ---- frames ------------------------------------------------------------------------------------------------------
-    def _checked(self, joints: Any, times: Any) -> tuple[Array, Array, Array]:
+    def _check_frames(self, joints: Any, times: Any) -> tuple[Array, Array, Array]:
         """Frames ``(F, joints, 2)`` in the layout of the exemplars and y up, their times, and how long after the one before."""
         frames = np.asarray(joints)
         frames = frames[None] if frames.ndim == 2 else frames
@@ -248,11 +248,11 @@ class ActionStream:
         upright = y_up(clip)[..., :2].astype(np.float32)
         return np.where((self._place < 0)[:, None], np.float32(np.nan), upright[:, self._place]), clip.times, steps
 
-    def _take(self, frames: Array, at: Array) -> list[LiveAnswer]:
+    def _append_frames(self, frames: Array, at: Array) -> list[LiveAnswer]:
         """Frames of the stretch that goes on: blocks end where the clock says, however many frames come at once."""
         self._raw, self._good = np.concatenate([self._raw, frames]), np.concatenate([self._good, frames])
         self._at = np.concatenate([self._at, at])
-        told: list[LiveAnswer] = []
+        answers: list[LiveAnswer] = []
         block = BLOCK_SECONDS
         while self._at[-1] >= (self._blocks + 1) * block:
             self._blocks += 1
@@ -263,8 +263,8 @@ class ActionStream:
                 self._describe(frames_, cells)
             undecided = len(self._cells) - self._horizon
             if undecided >= 0:
-                told += self._decide(frames_, undecided + 1)
-        return told
+                answers += self._decide(frames_, undecided + 1)
+        return answers
 
     def _end(self) -> list[LiveAnswer]:
         """The rest of a stretch, after which nothing follows."""
@@ -272,7 +272,7 @@ class ActionStream:
             cells = max(1, round(float(self._at[-1]) / self._step)) - self._first - len(self._cells)
             if cells > 0:
                 self._describe(len(self._at), cells)
-        return self._rest()
+        return self._answer_remaining()
 
     # ---- what frames say ---------------------------------------------------------------------------------------------
     def _describe(self, frames: int, count: int) -> None:
@@ -286,16 +286,16 @@ class ActionStream:
             self._good[fresh:frames] = repair_clip(near).joints[fresh - begin :]
             near = near.replace(joints=self._good[begin:frames])
         middle = (first + np.arange(count) + 0.5) * self._step
-        own = np.zeros(count, dtype=np.intp)
-        scores, motion = moments(model, ragged([near]), own, middle, self._look)
-        present = presence(near, np.array([[0, len(near)]]), middle, own, self._look)
+        owner = np.zeros(count, dtype=np.intp)
+        scores, motion = moments(model, concatenate_clips([near]), owner, middle, self._look)
+        present = presence(near, np.array([[0, len(near)]]), middle, owner, self._look)
         contrast = np.where(present[:, None], scores - scores.mean(axis=1, keepdims=True), 0.0)
-        cells = _Cells(contrast, motion, present, self._whole(frames, first, count))
+        cells = _Cells(contrast, motion, present, self._whole_scores(frames, first, count))
         self._contrast.push(contrast[present])
         self._wholes.push(cells.whole)
-        self._cells = self._cells.joined(cells)
+        self._cells = self._cells.concatenate(cells)
 
-    def _whole(self, frames: int, first: int, count: int) -> Array:
+    def _whole_scores(self, frames: int, first: int, count: int) -> Array:
         """``(count, lengths, classes)`` ``whole_scores`` of the windows that end in each cell, from one comparison."""
         model = self.source.model
         last = first + 1 + np.arange(count)
@@ -305,7 +305,7 @@ class ActionStream:
         if not len(row):
             return out
         lattice = Lattice(np.arange(last[-1] + 1) * self._step, np.stack([begin[row, which], last[row]], axis=1))
-        windows = lattice.cut(self._source(frames), 0, np.arange(len(row)), self._look.length).to(self._look.device)
+        windows = lattice.resample(self._source(frames), 0, np.arange(len(row)), self._look.length).to(self._look.device)
         every = torch.arange(len(model.labels), device=model.labels.device)
         residual, labels = model.whole_residuals(windows, every).cpu().numpy(), model.labels.cpu().numpy()
         tempo = np.abs(np.log(self._durations.seconds / (self._lengths[:, None] * self._step)))
@@ -318,10 +318,10 @@ class ActionStream:
         return out
 
     def _source(self, frames: int) -> Ragged:
-        return ragged([Clip(self._good[:frames], times=self._at[:frames])])
+        return concatenate_clips([Clip(self._good[:frames], times=self._at[:frames])])
 
     # ---- what is decided ---------------------------------------------------------------------------------------------
-    def _explained(self, frames: int) -> _Tiled:
+    def _decode(self, frames: int) -> _Tiled:
         """The best explanation of all that is known and not decided."""
         model, cells = self.source.model, self._cells
         count = len(cells)
@@ -339,32 +339,32 @@ class ActionStream:
         likely = posterior(lattice.windows, values, calm, TEMPERATURE)
         return _Tiled(one, values, {each.first: each for each in segments}, likely)
 
-    def _rest(self) -> list[LiveAnswer]:
+    def _answer_remaining(self) -> list[LiveAnswer]:
         """All that is left, as if nothing followed."""
         if len(self._cells):
-            return [self._tell(self._explained(len(self._at)), None)[0]]
-        silent = self._silent(slice(self._told, None))
-        return [silent if self._running is None else replace(silent, events=self._loud([self._running.event]))]
+            return [self._select_decided(self._decode(len(self._at)), None)[0]]
+        silent = self._unknown_scores(slice(self._told, None))
+        return [silent if self._running is None else replace(silent, events=self._select_reported([self._running.event]))]
 
     def _decide(self, frames: int, count: int) -> list[LiveAnswer]:
         """Decide what begins in the first ``count`` cells, tell it, and forget what nothing needs any more."""
-        told, edge, self._running = self._tell(self._explained(frames), count)
-        self._told += len(told.times)
+        answer, edge, self._running = self._select_decided(self._decode(frames), count)
+        self._told += len(answer.times)
         self._first += edge
-        self._cells = self._cells.after(edge)
+        self._cells = self._cells.skip(edge)
         reach = self._first * self._step - self._ahead - INTERPOLATION_MARGIN
-        kept = max(0, min(self._told, int(np.searchsorted(self._at, reach))))
-        self._raw, self._good, self._at, self._told = self._raw[kept:], self._good[kept:], self._at[kept:], self._told - kept
-        return [told]
+        first = max(0, min(self._told, int(np.searchsorted(self._at, reach))))
+        self._raw, self._good, self._at, self._told = self._raw[first:], self._good[first:], self._at[first:], self._told - first
+        return [answer]
 
-    def _tell(self, tiled: _Tiled, count: int | None) -> tuple[LiveAnswer, int, _Running | None]:
+    def _select_decided(self, tiled: _Tiled, count: int | None) -> tuple[LiveAnswer, int, _Running | None]:
         """What begins in the first ``count`` cells, the edge that it reaches to, and the event that may go on there."""
         known, edge, running = len(self.classes), 0, self._running
         done: list[Event] = []
         while edge < (len(self._cells) if count is None else count):
             part = tiled.segments.get(edge)
             edge = edge + 1 if part is None else part.last
-            mine = None if part is None or part.label >= known or not self._evident(tiled, part) else part
+            mine = None if part is None or part.label >= known or not self._has_evidence(tiled, part) else part
             goes_on = mine is not None and running is not None and running.label == mine.label
             if running is not None and not (goes_on and self._durations.cyclic[running.label] > MIN_CYCLIC):
                 done.append(running.event)
@@ -379,14 +379,14 @@ class ActionStream:
         rows = slice(self._told, max(last, self._told))
         cell = np.searchsorted(edges, self._at[rows] + EDGE_TOLERANCE, side="right") - 1
         scores = log_scores(tiled.likely)[np.clip(cell, 0, len(tiled.likely) - 1), :known]
-        return LiveAnswer(self._at[rows] + self._begin, scores, self._loud(done)), edge, running
+        return LiveAnswer(self._at[rows] + self._begin, scores, self._select_reported(done)), edge, running
 
-    def _evident(self, tiled: _Tiled, part: TiledSegment) -> bool:
+    def _has_evidence(self, tiled: _Tiled, part: TiledSegment) -> bool:
         """Whether a segment has the evidence that is asked for where there is a background, as if it had been cut out by hand."""
         model = self.source.model
         if not model.hidden or not np.isfinite(self.source.least):
             return True
-        windows = tiled.one.cut(np.array([part.window]), self._look.length).to(model.labels.device)
+        windows = tiled.one.resample(np.array([part.window]), self._look.length).to(model.labels.device)
         return float(model.evidence(windows)[0]) >= self.source.least
 
     def _event(self, tiled: _Tiled, part: TiledSegment) -> Event:
@@ -395,21 +395,21 @@ class ActionStream:
         last = float(self._at[-1])
         return replace(event, start=min(event.start, last) + self._begin, end=min(event.end, last) + self._begin)
 
-    def _loud(self, events: list[Event]) -> list[Event]:
+    def _select_reported(self, events: list[Event]) -> list[Event]:
         """Those that reach the level that was asked for."""
         return [event for event in events if event.score >= self._floor]
 
-    def _silent(self, rows: slice) -> LiveAnswer:
+    def _unknown_scores(self, rows: slice) -> LiveAnswer:
         """Frames of which nothing can be said."""
         at = self._at[rows]
         least = log_scores(np.zeros(1))[0]
         return LiveAnswer(at + self._begin, np.full((len(at), len(self.classes)), least))
 
-    def _joined(self, told: list[LiveAnswer]) -> LiveAnswer:
+    def _merge_answers(self, answers: list[LiveAnswer]) -> LiveAnswer:
         """One answer of several."""
-        told = [self._silent(slice(0, 0)), *told]
-        events = [event for one in told for event in one.events]
-        return LiveAnswer(np.concatenate([one.times for one in told]), np.concatenate([one.scores for one in told]), events)
+        answers = [self._unknown_scores(slice(0, 0)), *answers]
+        events = [event for one in answers for event in one.events]
+        return LiveAnswer(np.concatenate([one.times for one in answers]), np.concatenate([one.scores for one in answers]), events)
 
 
 def _grid(durations: Durations, num_durations: int) -> tuple[float, Array]:
@@ -424,7 +424,7 @@ def _places(source: LiveSource, up: str, skeleton: Skeleton | None) -> Array:
     """``(joints,)`` where each joint that was learned stands in a frame, -1 where it is in none."""
     count = source.joints if skeleton is None else len(skeleton.joints)
     numbers = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], axis=1)[None]
-    (clip,) = matched_all([Clip(numbers, up=up, skeleton=skeleton, name="stream")], source.skeleton)
+    (clip,) = match_all([Clip(numbers, up=up, skeleton=skeleton, name="stream")], source.skeleton)
     if clip.joints.shape[1] != source.joints:
         raise ValueError(
             f"skeleton: {clip.joints.shape[1]} joints, but the fitted clips have {source.joints}; use frames of one joint layout"

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from indexing.clip import Clip, FloatArray
-from indexing.windows import unusable
+from indexing.windows import describe_unusable
 
 IntArray = NDArray[np.intp]
 GhostReason = Literal["too short", "too few joints", "at one place"]
@@ -109,8 +109,8 @@ def of_recording(clips: Sequence[Clip]) -> bool:
 def tracked_people(clips: Sequence[Clip], name: str = "", min_seconds: float = 0.5) -> Crowd:
     """The people of one recording from its identities; tracks of less than ``min_seconds`` in view are ghosts of the detector."""
     by_ids = clips[0].meta["followed"] == "ids"
-    whole = by_ids or clips[0].meta["person"] is None
-    parts = list(clips) if whole else [part for clip in clips for part in _split_absences(clip)]
+    is_complete = by_ids or clips[0].meta["person"] is None
+    parts = list(clips) if is_complete else [part for clip in clips for part in _split_absences(clip)]
     step = _step(clips)
     length = max(clip.times[-1] for clip in clips) - min(clip.times[0] for clip in clips) + step
     least = min(MIN_JOINTS, max(int(clip.seen.sum(axis=1).max()) for clip in clips))
@@ -175,7 +175,7 @@ def _ghost(clip: Clip, step: float, length: float, least: int, min_seconds: floa
         return "too short"
     if np.median(joints[shown]) < least:
         return "too few joints"
-    return "at one place" if unusable(clip, point=True) else None
+    return "at one place" if describe_unusable(clip, point=True) else None
 
 
 def _overlap(tracks: Sequence[_Track]) -> bool:
@@ -212,7 +212,7 @@ def _appearances(names: Sequence[str], tracks: Sequence[_Track]) -> list[Appeara
     if not tracks:
         return []
     begin = min(float(track.times[0]) for track in tracks)
-    found = []
+    appearances = []
     for who, track in zip(names, tracks, strict=True):
         at = float(track.times[0])
         candidates: list[tuple[bool, float, str]] = []
@@ -228,8 +228,8 @@ def _appearances(names: Sequence[str], tracks: Sequence[_Track]) -> list[Appeara
                 candidates.append((near, float(left.times[before]), other))
         if candidates and at > begin:
             near, since, other = max(candidates)
-            found.append(Appearance(who, at, other, since, near))
-    return sorted(found, key=lambda one: one.at)
+            appearances.append(Appearance(who, at, other, since, near))
+    return sorted(appearances, key=lambda one: one.at)
 
 
 def _distance(left: _Track, row: int, track: _Track) -> float:
@@ -241,15 +241,15 @@ def _distance(left: _Track, row: int, track: _Track) -> float:
 def _exchanges(names: Sequence[str], tracks: Sequence[_Track]) -> list[Exchange]:
     """Where two identities are, from one frame to the next, at each other's places."""
     leaps = [(who, track, _leaps(track)) for who, track in zip(names, tracks, strict=True)]
-    found = []
+    exchanges = []
     for (first, a, mine), (second, b, other) in combinations([one for one in leaps if len(one[2])], 2):
         for at in np.intersect1d(mine, other).tolist():
             now, then = _pair(a, at), _pair(b, at)
-            own = min(_mean(now[1] - now[0]), _mean(then[1] - then[0]))
+            own_distance = min(_mean(now[1] - now[0]), _mean(then[1] - then[0]))
             crossed = max(_mean(now[1] - then[0]), _mean(then[1] - now[0]))
-            if own > MIN_EXCHANGE_RATIO * crossed:
-                found.append(Exchange(first, second, float(at)))
-    return sorted(found, key=lambda one: one.at)
+            if own_distance > MIN_EXCHANGE_RATIO * crossed:
+                exchanges.append(Exchange(first, second, float(at)))
+    return sorted(exchanges, key=lambda one: one.at)
 
 
 def _leaps(track: _Track) -> FloatArray:
@@ -257,9 +257,9 @@ def _leaps(track: _Track) -> FloatArray:
     if len(track.times) < 2:
         return np.empty(0)
     joints = track.clip.joints[track.rows]
-    apart = np.linalg.norm(np.diff(joints, axis=0), axis=2)
-    known = np.isfinite(apart)
-    mean = np.where(known, apart, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    distance = np.linalg.norm(np.diff(joints, axis=0), axis=2)
+    known = np.isfinite(distance)
+    mean = np.where(known, distance, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     return np.asarray(track.times[1:][(mean > MAX_JUMP * track.size) & (np.diff(track.times) <= MIN_ABSENCE)])
 
 
@@ -269,8 +269,8 @@ def _pair(track: _Track, at: float) -> tuple[Any, Any]:
     return joints[track.rows[row - 1]], joints[track.rows[row]]
 
 
-def _mean(apart: FloatArray) -> float:
+def _mean(differences: FloatArray) -> float:
     """Mean length over the joints that both show; infinite where there is none."""
-    lengths = np.linalg.norm(apart, axis=1)
+    lengths = np.linalg.norm(differences, axis=1)
     known = np.isfinite(lengths)
     return float(lengths[known].mean()) if known.any() else np.inf

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from indexing.action.exemplars import mirror_permutation
 from indexing.clip import Clip
 from indexing.scoring import Event
-from indexing.windows import Ragged, ragged, sample, whole
+from indexing.windows import Ragged, concatenate_clips, resample_clips, sample
 
 Array = NDArray[Any]
 Unit = Literal["performance", "cycle"]
@@ -100,7 +100,7 @@ def count_repetitions(
     """Count what was found in a recording, one entry per label in order of the labels' first performance."""
     if not events:
         return []
-    found, repaired = [], _Repaired.of(clip)
+    counts, repaired = [], _Repaired.of(clip)
     for label in dict.fromkeys(event.label for event in sorted(events, key=lambda event: event.start)):
         mine = sorted((event for event in events if event.label == label), key=lambda event: event.start)
         given = list(exemplars.get(label, ()))
@@ -117,12 +117,12 @@ def count_repetitions(
         pattern = _pattern(shown_clips)
         spans = _spans(mine, events)
         tracks = [_track(repaired, start, end) for start, end, _ in spans]
-        pattern = _unbroken(tracks, pattern)
+        pattern = _inner_pattern(tracks, pattern)
         performances: list[Repetition] = []
         for track, (_, _, inside) in zip(tracks, spans, strict=True):
             performances += _count_span(track, inside, pattern)
-        found.append(RepetitionCount(label, tuple(performances), "cycle" if pattern.period else "performance"))
-    return sorted(found, key=lambda one: one.performances[0].start if one.performances else np.inf)
+        counts.append(RepetitionCount(label, tuple(performances), "cycle" if pattern.period else "performance"))
+    return sorted(counts, key=lambda one: one.performances[0].start if one.performances else np.inf)
 
 
 def _event_exemplars(clip: Clip, events: Sequence[Event]) -> list[Clip]:
@@ -184,7 +184,7 @@ class _Repaired(NamedTuple):
 
     @classmethod
     def of(cls, clip: Clip) -> _Repaired:
-        source = ragged([clip], repair=True)
+        source = concatenate_clips([clip], repair=True)
         y = source.joints[:, source.seen[0], 1]
         return cls(source, max(float(np.median(y.max(axis=1) - y.min(axis=1))), 1e-9) if y.shape[1] else 1.0)
 
@@ -217,22 +217,22 @@ def _period(poses: Array, shortest: float, longest: float) -> tuple[float, float
     if high <= low + 2:
         return 0.0, 1.0, 1.0
     energy = np.square(x).sum(axis=1)
-    apart = np.array(
+    depth = np.array(
         [
             1 - 2 * (x[k:] * x[: len(x) - k]).sum() / max(energy[k:].sum() + energy[: len(x) - k].sum(), 1e-30)
             for k in range(high + 1)
         ]
     )
-    dips = [k for k in range(max(low, 1), high) if apart[k] <= apart[k - 1] and apart[k] < apart[k + 1]]
+    dips = [k for k in range(max(low, 1), high) if depth[k] <= depth[k - 1] and depth[k] < depth[k + 1]]
     if not dips:
         return 0.0, 1.0, 1.0
-    level = max(1.3 * min(apart[k] for k in dips), MAX_PERIODIC_DEPTH / 2)
-    best = next(k for k in dips if apart[k] <= level)
+    level = max(1.3 * min(depth[k] for k in dips), MAX_PERIODIC_DEPTH / 2)
+    best = next(k for k in dips if depth[k] <= level)
     box, most = np.ones(min(max(1, best // 2), len(x) - best)), energy[best:] + energy[: len(x) - best]
     worst = np.convolve(np.square(x[best:] - x[: len(x) - best]).sum(axis=1), box, "valid") / np.maximum(
         np.convolve(most, box, "valid"), 1e-30
     )
-    return best / SAMPLE_RATE, float(apart[best]), float(worst.max())
+    return best / SAMPLE_RATE, float(depth[best]), float(worst.max())
 
 
 def _detect_rest(track: _RepeatedTrack) -> Array:
@@ -252,18 +252,18 @@ def _stretches(on: Array) -> Array:
     return np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int))).reshape(-1, 2)
 
 
-def _liveliest(track: _RepeatedTrack) -> slice:
+def _longest_motion(track: _RepeatedTrack) -> slice:
     """The longest part without a rest."""
     parts = _stretches(~_detect_rest(track))
     return slice(*parts[(parts[:, 1] - parts[:, 0]).argmax()]) if len(parts) else slice(0, len(track.times))
 
 
-def _unbroken(tracks: Sequence[_RepeatedTrack], pattern: _Pattern) -> _Pattern:
+def _inner_pattern(tracks: Sequence[_RepeatedTrack], pattern: _Pattern) -> _Pattern:
     """A movement that goes on for longer than its exemplars, because it repeats a part of them, is counted by that part."""
     if pattern.period or not pattern.shown:
         return pattern
     lasts = [len(one.heights) / SAMPLE_RATE for one in pattern.shown]
-    part = max((track.poses[_liveliest(track)] for track in tracks), key=len)
+    part = max((track.poses[_longest_motion(track)] for track in tracks), key=len)
     if len(part) < MIN_UNBROKEN_FACTOR * max(lasts) * SAMPLE_RATE:
         return pattern
     seconds, depth, _ = _period(part, MIN_CYCLE_SECONDS, MAX_INNER_CYCLE * min(lasts))
@@ -275,8 +275,10 @@ def _pattern(shown: Sequence[Clip]) -> _Pattern:
     parts = []
     for clip in shown:
         track = _track(_Repaired.of(clip), float(clip.times[0]), float(clip.times[-1]))
-        source = ragged([clip])
-        swap = mirror_permutation(clip.skeleton, whole(source, 12)) if clip.dims == 2 or clip.skeleton is not None else None
+        source = concatenate_clips([clip])
+        swap = (
+            mirror_permutation(clip.skeleton, resample_clips(source, 12)) if clip.dims == 2 or clip.skeleton is not None else None
+        )
         seconds, depth, worst = _period(track.poses, MIN_CYCLE_SECONDS, MAX_CYCLE_SECONDS)
         depth = depth if worst <= MAX_WORST_DEPTH else 1.0
         parts.append((track.heights, None if swap is None else swap.numpy(), seconds, depth))
@@ -297,8 +299,8 @@ def _pattern(shown: Sequence[Clip]) -> _Pattern:
 def _mean_cycle(heights: Array, seconds: float) -> Array:
     m = max(4, round(seconds * SAMPLE_RATE))
     phase = np.arange(len(heights)) / (SAMPLE_RATE * seconds)
-    apart = (phase[:, None] - np.arange(m) / m + 0.5) % 1.0 - 0.5
-    weight = np.exp(-0.5 * np.square(apart * m)) + 1e-9
+    phase_distance = (phase[:, None] - np.arange(m) / m + 0.5) % 1.0 - 0.5
+    weight = np.exp(-0.5 * np.square(phase_distance * m)) + 1e-9
     return np.asarray((weight / weight.sum(axis=0)).T @ heights)
 
 
@@ -377,11 +379,11 @@ def _runs(path: Array, m: int, turns: bool) -> list[tuple[int, Array]]:
 
 def _learn_course(x: Array, path: Array, m: int) -> Array | None:
     """``(m, d)`` mean sample at every place; None where too few are known."""
-    known = np.unique(path[path < m])
-    if len(known) < 3:
+    places = np.unique(path[path < m])
+    if len(places) < 3:
         return None
-    means = np.stack([x[path == place].mean(axis=0) for place in known])
-    return np.stack([np.interp(np.arange(m), known, column) for column in means.T], axis=1)
+    means = np.stack([x[path == place].mean(axis=0) for place in places])
+    return np.stack([np.interp(np.arange(m), places, column) for column in means.T], axis=1)
 
 
 def _even(course: Array, path: Array, turns: bool, first: int) -> Array:
@@ -404,7 +406,7 @@ def _even(course: Array, path: Array, turns: bool, first: int) -> Array:
 def _beginnings(track: _RepeatedTrack, pattern: _Pattern) -> list[tuple[float, Array, int]]:
     """Cost, path and length of the courses that fit best: exemplars, their mirror images, and the span's own cycle."""
     x, turns, still = _with_velocities(track.heights), pattern.period > 0, _detect_rest(track)
-    found: list[tuple[float, Array, int]] = []
+    starts: list[tuple[float, Array, int]] = []
     for shown in pattern.shown:
         for heights in [shown.heights] if shown.swap is None else [shown.heights, shown.heights[:, shown.swap]]:
             tried = []
@@ -413,17 +415,17 @@ def _beginnings(track: _RepeatedTrack, pattern: _Pattern) -> list[tuple[float, A
                 course = _resample(heights, m, turns)
                 course = _with_velocities(np.concatenate([course] * 3))[m : 2 * m] if turns else _with_velocities(course)
                 tried.append((*_follow_course(*_costs(x, course, turns, FIRST_UNEXPLAINED_COST, None, still), turns), m))
-            found.append(min(tried, key=lambda one: one[0]))
-    found = sorted(found, key=lambda one: one[0])[:NUM_STARTS]
+            starts.append(min(tried, key=lambda one: one[0]))
+    starts = sorted(starts, key=lambda one: one[0])[:NUM_STARTS]
     if turns:
-        part = _liveliest(track)
+        part = _longest_motion(track)
         seconds, depth, _ = _period(track.poses[part], max(0.3, pattern.period / 2), 2 * pattern.period)
         if depth < 0.8:
             m = max(4, round(seconds * SAMPLE_RATE))
             path = np.full(len(x), m)
             path[part] = (np.arange(part.stop - part.start) / (seconds * SAMPLE_RATE) * m).astype(int) % m
-            found.append((0.0, path, m))
-    return found
+            starts.append((0.0, path, m))
+    return starts
 
 
 def _count_span(track: _RepeatedTrack, events: Sequence[Event], pattern: _Pattern) -> list[Repetition]:

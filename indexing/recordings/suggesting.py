@@ -33,7 +33,7 @@ from indexing.action.stream import motion_levels, motion_of
 from indexing.clip import Clip, stretches
 from indexing.recordings.evidence import Durations
 from indexing.scoring import probabilities
-from indexing.windows import ragged, repair_clip, sample
+from indexing.windows import concatenate_clips, repair_clip, sample
 
 if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
@@ -122,13 +122,13 @@ def suggest(
     options = options or SuggestOptions()
     if number < 1:
         raise ValueError(f"number={number}: suggests nothing; give 1 or more")
-    found = []
+    pooled = []
     for index, clip in enumerate(clips):
         done = [] if labelled is None else labelled[index]
-        found.append(parts_of(indexer, clip, done))
+        pooled.append(parts_of(indexer, clip, done))
         if progress is not None:
             progress(0.9 * (index + 1) / len(clips))
-    parts = _pool_parts(found, options)
+    parts = _pool_parts(pooled, options)
     if parts is None:
         return []
     classes = indexer.classes_.tolist()
@@ -161,7 +161,7 @@ def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span]) -> Re
     spans = spans[[_share(span, labelled) < MAX_LABELLED_SHARE for span in spans.tolist()]]
     if not len(spans):
         return None
-    source = ragged([repair_clip(image) if indexer.repair else image])
+    source = concatenate_clips([repair_clip(image) if indexer.repair else image])
     nobody = np.zeros(len(spans), dtype=np.intp)
     values = sample(source, nobody, spans[:, 0] - begin, spans[:, 1] - begin, indexer.length)
     windows = Windows(values, torch.from_numpy(source.seen[nobody]))
@@ -173,13 +173,13 @@ def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span]) -> Re
     return RecordingParts(nobody, spans, windows, worth)
 
 
-def _cut_parts(told: Explanation, clip: Clip, unit: float) -> list[Span]:
+def _cut_parts(explanation: Explanation, clip: Clip, unit: float) -> list[Span]:
     """Spans of what was found, and of what lies between, in seconds of the recording's clock."""
     out: list[Span] = []
-    found = sorted((event.start, event.end) for event in told.events)
+    spans = sorted((event.start, event.end) for event in explanation.events)
     for first, end in stretches(clip.times).tolist():
         edge, last = float(clip.times[first]), float(clip.times[end - 1])
-        inside = [(max(a, edge), min(b, last)) for a, b in found if b > edge and a < last]
+        inside = [(max(a, edge), min(b, last)) for a, b in spans if b > edge and a < last]
         for start, stop in [*inside, (last, last)]:
             if start - edge >= unit / 2:
                 out += _pieces(edge, start, unit)
@@ -201,16 +201,16 @@ def _share(span: Sequence[float], others: Sequence[Span]) -> float:
     return sum(max(0.0, min(end, b) - max(start, a)) for a, b in others) / max(end - start, 1e-9)
 
 
-def _pool_parts(found: Sequence[RecordingParts | None], options: SuggestOptions) -> RecordingParts | None:
+def _pool_parts(recordings: Sequence[RecordingParts | None], options: SuggestOptions) -> RecordingParts | None:
     """The parts of all recordings that are worth anything, thinned out evenly where they are too many to be compared."""
-    several = [(number, parts) for number, parts in enumerate(found) if parts is not None and parts.worth.any()]
+    several = [(number, parts) for number, parts in enumerate(recordings) if parts is not None and parts.worth.any()]
     if not several:
         return None
     owner = np.concatenate([np.full(int(parts.worth.sum()), number) for number, parts in several])
     spans = np.concatenate([parts.spans[parts.worth] for _, parts in several])
     windows = stack([parts.windows[torch.from_numpy(parts.worth)] for _, parts in several])
-    kept = np.unique(np.linspace(0, len(owner) - 1, options.max_candidates).round().astype(np.intp))
-    return RecordingParts(owner[kept], spans[kept], windows[torch.from_numpy(kept)], np.ones(len(kept), dtype=bool))
+    selected = np.unique(np.linspace(0, len(owner) - 1, options.max_candidates).round().astype(np.intp))
+    return RecordingParts(owner[selected], spans[selected], windows[torch.from_numpy(selected)], np.ones(len(selected), dtype=bool))
 
 
 def compare_parts(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Array, Array, float]:
@@ -218,15 +218,15 @@ def compare_parts(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Arra
     far examples of different actions are apart, which is far."""
     model = indexer.model_
     likely = probabilities(model.scores(windows).cpu().numpy(), model.blend.sharpness)
-    known = model.exemplars.crop(0)
-    everything = stack([known, windows])
+    exemplars = model.exemplars.crop(0)
+    everything = stack([exemplars, windows])
     copies = [Copy(everything)]
     if model.symmetry is not None and bool(model.mirrored.any()):
         copies.append(Copy(everything, None, model.symmetry))
     term = fusion(("epi",))
     (table,) = fused_residuals(everything, [Bank(copies, planes_of(model.metric))], [term])
     residual = np.exp(table.cpu().numpy() / sum(term.powers))
-    count = len(known)
+    count = len(exemplars)
     labels = model.labels.cpu().numpy()
     others = np.where(labels[:, None] != labels[None], residual[:count, :count], np.inf).min(axis=1)
     finite = others[np.isfinite(others)]

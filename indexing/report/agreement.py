@@ -92,7 +92,7 @@ def page_values(report: AgreementReport) -> dict[str, Any]:
         "timelines": [(timeline_name(i), span_name(span)) for i, span in enumerate(report.spans[:TIMELINES])],
         "hidden": max(0, len(report.spans) - TIMELINES),
         "spans": [
-            [span_name(span), duration(one.compared), _share(one.agreement), _number(one.kappa), _number(_last(one).f1)]
+            [span_name(span), duration(one.total_seconds), _share(one.agreement), _number(one.kappa), _number(_last(one).f1)]
             for span, one in _compare_each(report)
         ],
         "heads": [(f"F1 at {overlap:g}", "number") for overlap in both.segments],
@@ -109,7 +109,7 @@ def _compare_each(report: AgreementReport) -> list[tuple[ComparedSpan, Agreement
 def as_json(report: AgreementReport) -> dict[str, Any]:
     """All numbers: of all recordings together, and of each."""
     return {
-        **report.agreement.plain(),
+        **report.agreement.to_json(),
         "by_recording": [
             {"recording": span.name, "person": span.person, "start": span.start, "end": span.end, **_headline(one)}
             for span, one in _compare_each(report)
@@ -126,7 +126,7 @@ def _agreement_sentence(report: AgreementReport) -> str:
     who = f" of {count(people, 'person', 'people')}" if people else ""
     kappa = "does not exist (one label throughout)" if math.isnan(both.kappa) else f"{both.kappa:.3f}"
     return (
-        f"{report.sides[1]} against {report.sides[0]}: {duration(both.compared)}{who} in "
+        f"{report.sides[1]} against {report.sides[0]}: {duration(both.total_seconds)}{who} in "
         f"{count(len({span.name for span in spans}), 'recording')}; "
         f"the same in {100 * both.agreement:.1f} % of the time, Cohen's kappa over time {kappa}"
     )
@@ -137,7 +137,7 @@ def describe_agreement(report: AgreementReport) -> str:
     both = report.agreement
     known, found = report.sides
     last = _last(both)
-    words = [f"{duration(both.compared)} of {count(len(report.spans), 'recording')} compared: {found} against {known}."]
+    words = [f"{duration(both.total_seconds)} of {count(len(report.spans), 'recording')} compared: {found} against {known}."]
     if not math.isnan(both.agreement):
         words.append(f"They say the same in {percent(both.agreement)} of the time.")
     words.append(
@@ -185,12 +185,12 @@ def _cards(both: Agreement) -> list[tuple[str, str, str]]:
         ("F1", _number(last.f1), "of segments that share half of their time or more"),
         ("Precision", _number(last.precision), f"{last.right} of {last.found} found"),
         ("Recall", _number(last.recall), f"{last.right} of {last.known} known"),
-        ("Compared", duration(both.compared), count(len(both.labels), "label")),
+        ("Compared", duration(both.total_seconds), count(len(both.labels), "label")),
     ]
 
 
 def _headline(both: Agreement) -> dict[str, float]:
-    return {"seconds": both.compared, "agreement": both.agreement, "kappa": both.kappa, "f1": _last(both).f1}
+    return {"seconds": both.total_seconds, "agreement": both.agreement, "kappa": both.kappa, "f1": _last(both).f1}
 
 
 def _last(both: Agreement) -> SegmentCounts:

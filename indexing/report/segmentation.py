@@ -223,7 +223,7 @@ class SegmentationReport(LabelledReport):
     @property
     def present(self) -> NDArray[np.bool_]:
         """``(n,)`` matches that are there in both images."""
-        return self.pair.seen
+        return self.pair.complete
 
     @property
     def known_labels(self) -> NDArray[np.int64] | None:
@@ -383,7 +383,7 @@ def _box(report: SegmentationReport, which: int) -> Box:
         return np.array([-0.5, -0.5]), np.array(size) - 0.5
     places = np.stack([report.pair.x1, report.pair.x2])
     low, high = limits(places[:, report.arrays.labels > 0])
-    every = limits(places[:, report.pair.seen], STRAYS)
+    every = limits(places[:, report.pair.complete], STRAYS)
     if (report.arrays.labels > 0).any():
         every = np.minimum(low, every[0]), np.maximum(high, every[1])
     sides = every[1] - every[0]

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from indexing.opening import VALUE, clip_text, error, listing, parse_toml, read_text, shown
+from indexing.opening import VALUE, clip_text, error, listing, parse_toml, quote, read_text
 
 LARGEST = 1e7  # pixels: focal lengths and centres have some thousand
 REMEDY = "give a .toml with matrix (3, 3) and distortions for every camera, as Pose2Sim writes it"
@@ -69,7 +69,7 @@ def read_calibration(path: str | Path) -> list[Lens]:
             if len(distortions) not in (0, 4, 5, 8):
                 raise error(path, f"[{section}] distortions: expected 4, 5 or 8 numbers, got {len(distortions)}", REMEDY)
             name = values.get("name", key)
-            name = name if isinstance(name, str) else shown(name)
+            name = name if isinstance(name, str) else quote(name)
             lens = Lens(name, matrix / matrix[2, 2], distortions, bool(values.get("fisheye", False)), _size(values.get("size")))
             found.append(lens)
     if not found:

@@ -23,7 +23,7 @@ from dyntorch.numerics import Message
 from indexing.clip import Clip, check_fps, stretches
 from indexing.movement import clips_of, is_dataset
 from indexing.readers.files import VIDEOS
-from indexing.remarks import FOLLOWED, remarks_on
+from indexing.remarks import FOLLOWED, describe_issues
 
 Measure = Literal["profile", "window"]
 """What of the brightness is compared: the row-band profile, which the window kernel must confirm, or the window kernel alone."""
@@ -233,7 +233,7 @@ def _of_clips(name: str, path: Path | None, people: list[Clip]) -> Take:
     known = [clip.replace(name=name) for clip in people[:1]] if name else people[:1]  # a camera goes by its own name
     return Take(
         name, "keypoints", path, seen, seen, fps=rate, fps_assumed=first.fps_assumed, times=times, count=len(times),
-        notes=tuple(remarks_on(known)),
+        notes=tuple(describe_issues(known)),
     )  # fmt: skip
 
 

@@ -79,17 +79,17 @@ def markers_of(clips: Sequence[Clip], path: Path, units: str | None = None) -> M
         notes.append("confidences are left out, which the format has no place for")
     if any(clip.fps_assumed for clip in clips):
         notes.append(f"{float(first.fps or 30.0):g} frames per second are assumed, as nobody said how many")
-    said, guessed = _units(clips, units)
+    unit, guessed = _units(clips, units)
     if guessed:
-        notes.append(Message("the units are not known: by the size of the body, {units}; {arg:units} says otherwise", units=said))
-    told = float(first.fps or 30.0)
-    return Markers(tuple(names), times, places, _rate(times, told), told, said, first.up, tuple(notes))
+        notes.append(Message("the units are not known: by the size of the body, {units}; {arg:units} says otherwise", units=unit))
+    stated_fps = float(first.fps or 30.0)
+    return Markers(tuple(names), times, places, _rate(times, stated_fps), stated_fps, unit, first.up, tuple(notes))
 
 
-def _rate(times: FloatArray, told: float) -> float:
+def _rate(times: FloatArray, stated: float) -> float:
     """Frames per second: as they are told, where the times agree."""
-    usual = 1 / float(np.median(np.diff(times))) if len(times) > 1 else told
-    return told if abs(usual / told - 1) < MAX_UNEVENNESS else usual
+    usual = 1 / float(np.median(np.diff(times))) if len(times) > 1 else stated
+    return stated if abs(usual / stated - 1) < MAX_UNEVENNESS else usual
 
 
 def people_of(clips: Sequence[Clip], path: Path) -> list[str]:
@@ -133,9 +133,9 @@ def align_clips(clips: Sequence[Clip]) -> tuple[FloatArray, FloatArray]:
 
 def _units(clips: Sequence[Clip], asked: str | None) -> tuple[str, bool]:
     """What coordinates are in, and whether that is a guess."""
-    known = clips[0].meta.get("units") if asked is None else asked
-    if isinstance(known, str) and UNIT.fullmatch(known):
-        return known, False
+    stated = clips[0].meta.get("units") if asked is None else asked
+    if isinstance(stated, str) and UNIT.fullmatch(stated):
+        return stated, False
     if clips[0].dims == 2:
         return "px", False
     sizes = []

@@ -15,7 +15,7 @@ from indexing.action.bank import Windows
 from indexing.actors import ACTIONS, Person, dataset, stream
 from indexing.actors.textured import film
 from indexing.cli import main
-from indexing.windows import ragged, whole
+from indexing.windows import concatenate_clips, resample_clips
 from tests.indexing.sync.scene import filmed, shift
 
 FILMED = ["squat", "wave", "bow", "punch", "kick"]
@@ -60,8 +60,8 @@ def windows_of() -> Callable[[Sequence[Clip]], Windows]:
     """Clips as whole windows of 12 steps."""
 
     def make(clips: Sequence[Clip], length: int = 12) -> Windows:
-        source = ragged(list(clips))
-        return Windows(whole(source, length), torch.from_numpy(source.seen))
+        source = concatenate_clips(list(clips))
+        return Windows(resample_clips(source, length), torch.from_numpy(source.seen))
 
     return make
 

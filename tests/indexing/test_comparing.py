@@ -84,7 +84,7 @@ def test_time_with_several_labels_is_shared_evenly(seed):
         for (a, b), share in shared(mine, theirs).items():
             expected[names.index(a), names.index(b)] += share * STEP
     assert np.allclose(both.seconds, expected)
-    assert both.compared == pytest.approx(LENGTH)
+    assert both.total_seconds == pytest.approx(LENGTH)
     for label, one in both.by_label.items():
         here, there = (np.array([label in frame for frame in framed(side)]) for side in (known, found))
         assert (one.known, one.found, one.both) == pytest.approx([STEP * x.sum() for x in (here, there, here & there)])
@@ -143,7 +143,7 @@ def test_people_and_recordings_are_compared_each_with_their_own():
     one, other = [("squat", 1.0, 3.0)], [("squat", 10.0, 12.0)]
     apart = compare([span(one, other, person="1"), span(other, one, person="2")])
     assert apart.by_label["squat"].both == 0.0 and apart.segments[0.1] == SegmentCounts(0, 2, 2)
-    assert apart.compared == pytest.approx(2 * LENGTH)
+    assert apart.total_seconds == pytest.approx(2 * LENGTH)
     parts = [compare([span(one, one)]), compare([span(other, one)])]
     together = compare([span(one, one), span(other, one, "b")])
     assert np.allclose(together.seconds, parts[0].seconds + parts[1].seconds)
@@ -159,7 +159,7 @@ def test_labels_are_cut_at_the_ends_and_moments_count_for_nothing():
 def test_what_does_not_exist_is_no_number():
     nothing = compare([span([], [])])
     assert nothing.labels == () and math.isnan(nothing.kappa) and nothing.agreement == 1.0
-    assert math.isnan(nothing.segments[0.5].f1) and nothing.compared == pytest.approx(LENGTH)
+    assert math.isnan(nothing.segments[0.5].f1) and nothing.total_seconds == pytest.approx(LENGTH)
     assert math.isnan(compare([]).agreement) and math.isnan(kappa(np.zeros((2, 2))))
     missed = compare([span([("squat", 1.0, 2.0)], [])])
     assert math.isnan(missed.segments[0.5].precision) and missed.segments[0.5].recall == 0.0 and missed.kappa == 0.0
@@ -167,7 +167,7 @@ def test_what_does_not_exist_is_no_number():
 
 
 def test_all_numbers_as_json():
-    plain = compare([span([("squat", 0.0, 5.0)], [("squat", 0.0, 5.0), ("jump", 6.0, 7.0)])]).plain()
+    plain = compare([span([("squat", 0.0, 5.0)], [("squat", 0.0, 5.0), ("jump", 6.0, 7.0)])]).to_json()
     assert plain["at_overlap"]["0.5"] == {"right": 1, "found": 2, "known": 1, "precision": 0.5, "recall": 1.0, "f1": 2 / 3}
     assert plain["confusion_seconds"]["labels"] == ["jump", "squat", NONE]
     assert plain["by_label"]["squat"]["seconds_both"] == 5.0 and plain["seconds_compared"] == LENGTH
@@ -215,7 +215,7 @@ def test_blocks_change_nothing_and_bound_what_is_held(monkeypatch):
     for other in blocks[1:]:
         assert np.allclose(blocks[0].seconds, other.seconds, atol=1e-9) and blocks[0].segments == other.segments
         assert other.by_label["l007"].both == pytest.approx(blocks[0].by_label["l007"].both)
-    assert blocks[0].compared == pytest.approx(1002.0)
+    assert blocks[0].total_seconds == pytest.approx(1002.0)
     held = []
     for block in (64, 10**6):
         monkeypatch.setattr("indexing.comparing.BLOCK", block)

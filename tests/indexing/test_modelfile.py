@@ -232,10 +232,10 @@ def test_a_model_is_kept_by_its_fields() -> None:
 
 def test_parts_and_values_say_what_they_expect() -> None:
     parts = Parts({"a": torch.arange(6).reshape(2, 3), "b": torch.ones(2)})
-    assert parts.whole("a", None, 3).shape == (2, 3)
+    assert parts.integers("a", None, 3).shape == (2, 3)
     assert parts.every("a", 2, 3, below=6).numel() == 6
     with pytest.raises(ValueError, match=r"a: expected int64 \(any, 4\), got int64 \(2, 3\)"):
-        parts.whole("a", None, 4)
+        parts.integers("a", None, 4)
     with pytest.raises(ValueError, match=r"b: expected numbers from 2 to 3"):
         parts.real("b", 2, least=2, most=3)
     with pytest.raises(ValueError, match="a: expected each of the numbers from 0 to 9"):

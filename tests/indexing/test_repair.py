@@ -14,7 +14,7 @@ from indexing.windows import (
     NOISE_FLOOR,
     NUM_COMPARED,
     USUAL_SHARE,
-    ragged,
+    concatenate_clips,
     wrong_joints,
 )
 
@@ -116,9 +116,9 @@ def test_repair_interpolates_what_was_wrong():
     clean, times = walk()
     joints = clean.copy()
     joints[33, 2] = 50
-    source = ragged([Clip(joints, times=times), Clip(clean, times=times)], repair=True)
+    source = concatenate_clips([Clip(joints, times=times), Clip(clean, times=times)], repair=True)
     np.testing.assert_allclose(source.joints[:80], clean, atol=0.02)
-    assert np.abs(ragged([Clip(joints, times=times)]).joints - clean).max() > 40
+    assert np.abs(concatenate_clips([Clip(joints, times=times)]).joints - clean).max() > 40
 
 
 def test_repair_helps_where_joints_jump():

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from indexing import Clip
-from indexing.windows import SUBSAMPLES, check_clips, ragged, sample, unusable, whole
+from indexing.windows import SUBSAMPLES, check_clips, concatenate_clips, describe_unusable, resample_clips, sample
 
 
 def irregular(seed, frames=17, joints=5, dims=2, start=0.0):
@@ -37,7 +37,7 @@ CLIPS = [irregular(0), irregular(1, frames=2), irregular(2, frames=60, start=1e5
 
 
 def test_whole_clips_against_interpolation():
-    got = whole(ragged(CLIPS), 12)
+    got = resample_clips(concatenate_clips(CLIPS), 12)
     assert got.shape == (4, 12, 5, 2) and got.dtype == torch.float32
     for clip, window in zip(CLIPS, got, strict=True):
         np.testing.assert_allclose(window, slow_window(clip, clip.times[0], clip.times[-1], 12), atol=2e-5)
@@ -45,7 +45,7 @@ def test_whole_clips_against_interpolation():
 
 @pytest.mark.parametrize("crop", [(0.0, 0.7), (0.15, 1.0), (0.3, 0.4)])
 def test_crops_are_parts_of_the_duration(crop):
-    got = whole(ragged(CLIPS), 9, crop)
+    got = resample_clips(concatenate_clips(CLIPS), 9, crop)
     for clip, window in zip(CLIPS, got, strict=True):
         low, high = (clip.times[0] + share * clip.duration for share in crop)
         np.testing.assert_allclose(window, slow_window(clip, low, high, 9), atol=2e-5)
@@ -56,7 +56,7 @@ def test_windows_anywhere_also_beyond_the_ends():
     owner = np.array([2, 0, 0, 3, 1, 2])
     start = np.array([clips[i].times[0] for i in owner]) + np.array([-0.5, 0.1, -9.0, 0.3, 0.0, 3.0])
     end = start + np.array([1.0, 0.4, 2.0, 1.5, 5.0, 90.0])
-    got = sample(ragged(clips), owner, start, end, 8)
+    got = sample(concatenate_clips(clips), owner, start, end, 8)
     for i, window in enumerate(got):
         clip = clips[owner[i]]
         # the first and last frame are repeated outside: that is what np.interp does too
@@ -64,7 +64,7 @@ def test_windows_anywhere_also_beyond_the_ends():
 
 
 def test_the_result_does_not_depend_on_the_chunk(monkeypatch):
-    source = ragged(CLIPS)
+    source = concatenate_clips(CLIPS)
     owner, start = np.arange(4).repeat(3), np.zeros(12)
     begin = np.array([clip.times[0] for clip in CLIPS])[owner] + start
     expected = sample(source, owner, begin, begin + 0.5, 6)
@@ -73,14 +73,14 @@ def test_the_result_does_not_depend_on_the_chunk(monkeypatch):
 
 
 def test_clips_do_not_leak_into_one_another():
-    together = whole(ragged(CLIPS), 7)
-    alone = torch.cat([whole(ragged([clip]), 7) for clip in CLIPS])
+    together = resample_clips(concatenate_clips(CLIPS), 7)
+    alone = torch.cat([resample_clips(concatenate_clips([clip]), 7) for clip in CLIPS])
     torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)
 
 
 def test_missing_joints_are_interpolated_in_time():
     clips = [with_holes(clip, seed=i) for i, clip in enumerate(CLIPS)]
-    source = ragged(clips)
+    source = concatenate_clips(clips)
     for i, clip in enumerate(clips):
         part = source.joints[source.starts[i] : source.starts[i + 1]]
         for j in range(5):
@@ -94,7 +94,7 @@ def test_missing_joints_are_interpolated_in_time():
 def test_a_joint_with_one_coordinate_missing_is_missing():
     joints = CLIPS[0].joints.copy()
     joints[4, 1, 0] = np.nan
-    filled = ragged([CLIPS[0].replace(joints=joints)]).joints[4, 1]
+    filled = concatenate_clips([CLIPS[0].replace(joints=joints)]).joints[4, 1]
     ok = np.arange(17) != 4
     expected = [np.interp(CLIPS[0].times[4], CLIPS[0].times[ok], joints[ok, 1, d]) for d in range(2)]
     np.testing.assert_allclose(filled, expected, atol=1e-5)
@@ -103,21 +103,21 @@ def test_a_joint_with_one_coordinate_missing_is_missing():
 def test_never_seen_joints_are_marked_and_zero():
     joints = CLIPS[0].joints.copy()
     joints[:, 3] = np.nan
-    source = ragged([CLIPS[1], CLIPS[0].replace(joints=joints), CLIPS[2]])
+    source = concatenate_clips([CLIPS[1], CLIPS[0].replace(joints=joints), CLIPS[2]])
     assert source.seen.tolist() == [[True] * 5, [True, True, True, False, True], [True] * 5]
     assert (source.joints[source.starts[1] : source.starts[2], 3] == 0).all()
-    assert torch.isfinite(whole(source, 6)).all()
+    assert torch.isfinite(resample_clips(source, 6)).all()
 
 
 def test_y_points_up_in_windows():
     clip = irregular(5)
-    np.testing.assert_allclose(ragged([clip.replace(up="-y")]).joints, clip.joints * [1, -1], rtol=1e-6)
+    np.testing.assert_allclose(concatenate_clips([clip.replace(up="-y")]).joints, clip.joints * [1, -1], rtol=1e-6)
 
 
 def test_frame_rate_changes_nothing_that_moves_linearly():
     direction = np.array([[[3.0, 1.0], [0.0, -2.0]]])
     slow, fast = (Clip(np.linspace(0, 1, n)[:, None, None] * direction, fps=n - 1) for n in (5, 81))
-    got = whole(ragged([slow, fast]), 10)
+    got = resample_clips(concatenate_clips([slow, fast]), 10)
     torch.testing.assert_close(got[0], got[1], atol=1e-6, rtol=0)
 
 
@@ -138,7 +138,7 @@ def test_unusable_clips_are_named(bad, message):
     clip = Clip(bad, name="bad")
     with pytest.raises(ValueError, match=r"clip 1 \('bad'\): joints: " + message + ".*; leave the clip out"):
         check_clips([GOOD, clip])
-    assert unusable(GOOD) is None and unusable(clip) is not None
+    assert describe_unusable(GOOD) is None and describe_unusable(clip) is not None
 
 
 def test_joint_counts_must_agree():
@@ -153,5 +153,5 @@ def test_joint_counts_must_agree():
 def test_half_missing_and_still_but_not_collapsed_clips_are_usable():
     joints = GOOD.joints.copy()
     joints[1:] = np.nan
-    assert unusable(Clip(joints)) is None
-    assert unusable(Clip(np.repeat(GOOD.joints[:1], 4, axis=0))) is None
+    assert describe_unusable(Clip(joints)) is None
+    assert describe_unusable(Clip(np.repeat(GOOD.joints[:1], 4, axis=0))) is None

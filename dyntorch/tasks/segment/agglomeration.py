@@ -224,7 +224,7 @@ class NearPairs:
         """Of pairs of frames ``(p, 2)``."""
         first, second = torch.tensor(list(pairs), device=film.x.device).reshape(-1, 2).unbind(-1)
         x1, x2 = film.x[first], film.x[second]
-        self.seen = film.seen[first] & film.seen[second]
+        self.seen = film.drop_short[first] & film.drop_short[second]
         moved = (x2 - x1).norm(dim=-1) / film.pixel
         self.precision = self.seen / (1 + moved / DOUBLED_VARIANCE_MOTION) / film.pixel**2
         self.first, self.second = homogeneous(x1), homogeneous(x2)

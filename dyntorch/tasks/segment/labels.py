@@ -255,12 +255,12 @@ def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film
 def widths(film: TrackSet, member: Tensor) -> Tensor:
     """How wide bodies of members ``(K, n)`` are: the share ``(K,)`` of the cells of a grid over the picture that they are seen in,
     of those that anything is seen in, in the mean over the frames."""
-    there = film.x[film.seen]
+    there = film.x[film.drop_short]
     low, high = there.quantile(there.new_tensor([0.01, 0.99]), dim=0)
     cell = ((film.x - low) / (high - low).clamp(min=1e-12) * NUM_WIDTH_CELLS).long().clamp(0, NUM_WIDTH_CELLS - 1)
     place = cell[..., 0] * NUM_WIDTH_CELLS + cell[..., 1]
     shares = []
-    for seen, where in zip(film.seen, place, strict=True):
+    for seen, where in zip(film.drop_short, place, strict=True):
         if not bool(seen.any()):
             continue
         grid = torch.zeros(len(member), NUM_WIDTH_CELLS**2, dtype=torch.float64, device=member.device)

@@ -334,9 +334,9 @@ def _refusal(film: TrackSet, request: TrackRequest) -> Notice | None:
     if cut is not None:
         values = {"frame": cut.frame, "case": "jump" if cut.jump else ""}
         return Notice(TrackNotice.CUT, cut.jump or cut.share, values)
-    low = torch.where(film.seen[..., None], film.x, torch.inf).amin(0)
-    high = torch.where(film.seen[..., None], film.x, -torch.inf).amax(0)
-    way = (high - low).norm(dim=-1)[film.seen.any(0)] / film.pixel
+    low = torch.where(film.drop_short[..., None], film.x, torch.inf).amin(0)
+    high = torch.where(film.drop_short[..., None], film.x, -torch.inf).amax(0)
+    way = (high - low).norm(dim=-1)[film.drop_short.any(0)] / film.pixel
     farthest, least = float(way.quantile(0.95)), request.options.min_motion
     if farthest < least:
         return Notice(TrackNotice.STILL, farthest * request.pixel, {"least": least * request.pixel})
@@ -345,7 +345,7 @@ def _refusal(film: TrackSet, request: TrackRequest) -> Notice | None:
 
 def _draw_tracks(film: TrackSet, request: TrackRequest) -> Tensor:
     """Indices of the tracks that the search looks at: all, or a random part of very many."""
-    alive = film.seen.any(0).nonzero().flatten()
+    alive = film.drop_short.any(0).nonzero().flatten()
     most = request.options.max_searched
     if len(alive) <= most:
         return alive
@@ -355,7 +355,7 @@ def _draw_tracks(film: TrackSet, request: TrackRequest) -> Tensor:
 
 def _start(film: TrackSet, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
     """What the search for bodies starts from: links, pairs of frames and pieces of the searched tracks."""
-    part = TrackSet(film.x[:, searched], film.seen[:, searched], film.pixel, film.change)
+    part = TrackSet(film.x[:, searched], film.drop_short[:, searched], film.pixel, film.change)
     inner = kernel[searched]
     inner = (inner + inner.mT) / 2
     sparse = strongest(inner, NUM_TRACK_NEIGHBOURS)
@@ -374,7 +374,7 @@ def _label_all(film: TrackSet, pairs: list[FramePair], kernel: Tensor, searched:
     count = film.x.shape[1]
     member = torch.zeros(found.bodies, count, dtype=torch.float64, device=film.x.device)
     member[:, searched] = found.member[0].double()
-    rest = film.seen.any(0)
+    rest = film.drop_short.any(0)
     rest[searched] = False
     rest = rest.nonzero().flatten()
     if len(rest):
@@ -400,7 +400,7 @@ def _outcome(
 ) -> TrackSegmentation:
     """Labels by size, with motions, the body that stands still, and what limits all that."""
     count = tracks.shape[1]
-    alive = film.seen.any(0)
+    alive = film.drop_short.any(0)
     labels = member.argmax(0)
     geometry = chosen.candidate.geometry
     far = distances(pairs, geometry, count)

@@ -48,7 +48,7 @@ from experiments.alignment.real.pictures import board_picture, shares_picture, t
 from experiments.common.real_data import Board, Traffic, board, traffic
 from experiments.common.tables import Row, command, markdown, note
 from experiments.recognition.protocol import data_folder
-from indexing.files import manifest, plain, prepare, write_json
+from indexing.files import manifest, prepare, to_json_types, write_json
 
 SHARES = (1.0, 0.5, 0.25, 0.1, 0.0)
 HELD_OUT = 4
@@ -283,7 +283,7 @@ def run(config: Config) -> None:
     board_picture(seen, errors, config.out / "board.png")
     inputs = [folder / "hopkins155.npz", folder / "caliscope_4_cam_recording.npz"]
     about = manifest(vars(config), inputs, seed=config.seed, timings={"all": time.perf_counter() - start})
-    write_json(config.out / "figures.json", {"manifest": about, "tables": plain(tables)})
+    write_json(config.out / "figures.json", {"manifest": about, "tables": to_json_types(tables)})
     note(f"written: {config.out}, {time.perf_counter() - start:.0f} s")
 
 

@@ -41,7 +41,7 @@ from experiments.alignment.real.solvers import Matrices, Solver, aligned, gap, l
 from experiments.common.real_data import Drive, drives, takes
 from experiments.common.tables import Row, command, markdown, note
 from experiments.recognition.protocol import data_folder
-from indexing.files import manifest, plain, prepare, write_json
+from indexing.files import manifest, prepare, to_json_types, write_json
 
 STEPS = (1, 3, 5)  # sweeps, 0.1 s each
 THRESHOLD = 0.1
@@ -180,7 +180,7 @@ def run(config: Config) -> None:
         print(markdown(rows, name), flush=True)
     inputs = [folder / "argoverse2", folder / "cmu_mocap_60fps.npz"]
     about = manifest(vars(config), inputs, seed=config.seed, timings={"all": time.perf_counter() - begin})
-    write_json(config.out / "figures.json", {"manifest": about, "tables": plain(tables)})
+    write_json(config.out / "figures.json", {"manifest": about, "tables": to_json_types(tables)})
     note(f"written: {config.out}, {time.perf_counter() - begin:.0f} s")
 
 

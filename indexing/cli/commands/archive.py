@@ -42,7 +42,7 @@ from indexing.cli.inputs import CUT, assumed_rate_notes, clip_notes, parse_examp
 from indexing.cli.protocol import choose, field_values
 from indexing.cli.videos import watch_options
 from indexing.clip import Clip
-from indexing.files import manifest, plain
+from indexing.files import manifest, to_json_types
 from indexing.modelfile import model_kind
 from indexing.report.archive import FILES, FindReport, SearchReport, size_text, summarize_info, summarize_verification
 from indexing.report.recognition import duration
@@ -332,4 +332,4 @@ def _manifest(
     made = manifest(
         {"command": f"archive {verb}", **dataclasses.asdict(command)}, [path.expanduser() for path in inputs], timings=timings
     )
-    return {**made, "archive": {"path": str(archive.path), **plain(info)}}
+    return {**made, "archive": {"path": str(archive.path), **to_json_types(info)}}

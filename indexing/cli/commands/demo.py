@@ -22,7 +22,7 @@ from indexing.files import manifest
 from indexing.report import EvaluationResult, RecognitionReport, RecordingResult, write_recognition
 from indexing.report.results import frame_accuracy, missed_actions
 from indexing.skeleton import COCO17
-from indexing.windows import ragged, whole
+from indexing.windows import concatenate_clips, resample_clips
 
 
 def run(flags: Demo) -> int:
@@ -172,7 +172,7 @@ def nearest_2d(examples: Sequence[Clip], labels: Sequence[Any] | NDArray[Any], q
 
 
 def _shapes(clips: Sequence[Clip]) -> NDArray[np.float64]:
-    values = whole(ragged(clips), STEPS).numpy().astype(np.float64)
+    values = resample_clips(concatenate_clips(clips), STEPS).numpy().astype(np.float64)
     hips = [COCO17.joints.index(f"{side}_hip") for side in ("left", "right")]
     shapes = (values - values[:, :, hips].mean(axis=2, keepdims=True)).reshape(len(values), -1)
     return np.asarray(shapes / np.linalg.norm(shapes, axis=1, keepdims=True))

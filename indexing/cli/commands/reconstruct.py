@@ -28,7 +28,7 @@ from indexing.cli.scenes import (
     undistort_views,
 )
 from indexing.files import manifest
-from indexing.readers.tracks import TrackSet, exact, read_tracks
+from indexing.readers.tracks import TrackSet, read_tracks, shortest_repr
 from indexing.report.reconstruction import FILES, ReconstructionReport
 
 WORDS = flag_words("times", "static", "threshold", "motion", "calibration")
@@ -128,9 +128,9 @@ def _with_times(flags: Reconstruct, tracks: TrackSet) -> TrackSet:
             notes.append(f"times are {unit}, because the files have none; --times or --fps give others")
         else:
             times = times / flags.fps
-    timed = dataclasses.replace(tracks.seen(), times=times).since_first()
+    timed = dataclasses.replace(tracks.drop_short(), times=times).since_first()
     if timed.start != 0:
-        notes.append(f"time 0 of the result is the first view, at {exact(timed.start)}")
+        notes.append(f"time 0 of the result is the first view, at {shortest_repr(timed.start)}")
     return dataclasses.replace(timed, notes=(*timed.notes, *notes))
 
 

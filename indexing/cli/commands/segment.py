@@ -94,7 +94,7 @@ def _two_views(flags: Segment, files: list[Path], scene: bool, asked: Asked, giv
         shown = photographs(tracks) if tracks else _images(flags, given is not None)
     notes = [*(tracks.notes if tracks else ()), *_notes(flags, pair, shown)]
     read = time.perf_counter()
-    with progress(f"segmenting {count(int(pair.seen.sum()), 'match', 'matches')}", steps=False):
+    with progress(f"segmenting {count(int(pair.complete.sum()), 'match', 'matches')}", steps=False):
         result = _solve(flags, pair)
     timings = {"read": read - started, "segment": time.perf_counter() - read}
     found = int(result.bodies)
@@ -185,7 +185,7 @@ def _check_kind(flags: Segment, scene: bool, whole: bool, asked: Asked) -> None:
 
 def _notes(flags: Segment, pair: MatchedPair, shown: list[Photograph]) -> list[str]:
     """What to say about the input."""
-    seen = pair.seen
+    seen = pair.complete
     number, lost = int(seen.sum()), int((~seen).sum())
     if number < LEAST:
         said = f"{pair.path}: x1, x2 hold {number} complete matches{f' and {lost} with a missing coordinate' * (lost > 0)}"

@@ -14,8 +14,8 @@ from typing import Any
 
 from indexing.files import write_json
 from indexing.labels.format import Gathering, LabelFormat, Request, Target, text_of
-from indexing.labels.label import Label, LabelFile, in_order
-from indexing.opening import error, shown
+from indexing.labels.label import Label, LabelFile, sort_key
+from indexing.opening import error, quote
 
 REMEDY = "write segments as {'segment': [start, end], 'label': name}"
 TEXTS = ("subject", "tier", "observation", "comment")
@@ -27,10 +27,10 @@ def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
     for video, number, segment in _segments(out, data):
         where = f"video {video!r}, segment {number}"
         if not isinstance(segment, dict):
-            raise error(asked.path, f"{where} is {shown(segment)}", REMEDY)
+            raise error(asked.path, f"{where} is {quote(segment)}", REMEDY)
         times = segment.get("segment")
         if not isinstance(times, list) or len(times) != 2:
-            raise error(asked.path, f"{where}: 'segment' is {shown(times)}, not [start, end]", REMEDY)
+            raise error(asked.path, f"{where}: 'segment' is {quote(times)}, not [start, end]", REMEDY)
         score, modifiers = segment.get("score"), segment.get("modifiers")
         if score is not None:
             score = out.seconds(score, where, "score")
@@ -53,22 +53,22 @@ def _segments(out: Gathering, data: Mapping[str, Any]) -> Iterator[tuple[str, in
     for part, key in (("database", "annotations"), ("results", None)):
         videos = data.get(part) or {}
         if not isinstance(videos, dict):
-            raise error(asked.path, f"{part!r} is {shown(videos)}, no object of videos", REMEDY)
+            raise error(asked.path, f"{part!r} is {quote(videos)}, no object of videos", REMEDY)
         for video, held in videos.items():
             out.watched.setdefault(("", video))
             out.media.setdefault(video)
-            found = held.get(key) if key is not None and isinstance(held, dict) else held
-            if found is None:
+            segments = held.get(key) if key is not None and isinstance(held, dict) else held
+            if segments is None:
                 continue
-            if not isinstance(found, list):
-                raise error(asked.path, f"video {video!r}: {shown(found)} is no list of segments", REMEDY)
-            yield from ((video, number, segment) for number, segment in enumerate(found, start=1))
+            if not isinstance(segments, list):
+                raise error(asked.path, f"video {video!r}: {quote(segments)} is no list of segments", REMEDY)
+            yield from ((video, number, segment) for number, segment in enumerate(segments, start=1))
 
 
 def write(labels: Sequence[Label], target: Target) -> list[str]:
     """Write results where labels have scores, annotations where they have none; seconds to the microsecond."""
     videos: dict[str, list[dict[str, Any]]] = {media: [] for media in target.media}
-    for label in sorted(labels, key=in_order):
+    for label in sorted(labels, key=sort_key):
         more = {name: getattr(label, name) for name in (*TEXTS, "modifiers", "score") if getattr(label, name) not in ("", (), None)}
         segment = {"segment": [round(label.start, 6), round(label.end, 6)], "label": label.label}
         videos.setdefault(label.media, []).append(segment | more)

@@ -36,8 +36,8 @@ from indexing.labels.format import (
     split_by_media,
     text_of,
 )
-from indexing.labels.label import Label, LabelFile, in_order
-from indexing.opening import clip_text, count, error, listing, parse_json, read_text, shown
+from indexing.labels.label import Label, LabelFile, sort_key
+from indexing.opening import clip_text, count, error, listing, parse_json, quote, read_text
 
 REMEDY = "save the project again in BORIS"
 MACHINE = "dyntorch:"  # how the description of an observation begins that a program wrote
@@ -104,21 +104,21 @@ def _by_machine(observation: Mapping[str, Any]) -> bool:
 
 def _names(observations: Mapping[str, Any]) -> dict[str, str]:
     """What each observation is called here: of those that a program wrote, the further ones as the first."""
-    found = {}
+    names = {}
     for name, observation in observations.items():
         first = NUMBERED.sub("", name)
         same = first in observations and _by_machine(observations[first]) and _by_machine(observation)
-        found[name] = first if same else name
-    return found
+        names[name] = first if same else name
+    return names
 
 
 def ethogram(asked: Request, conf: Any) -> dict[str, bool]:
     """Behaviours, and whether each is a state, which lasts."""
-    found = {}
+    lasting = {}
     for key, behaviour in _object(asked, conf or {}, "behaviors_conf").items():
         entry = _object(asked, behaviour, f"behaviors_conf {key!r}")
-        found[text_of(entry.get("code"))] = text_of(entry.get("type")).lower().startswith("state")
-    return found
+        lasting[text_of(entry.get("code"))] = text_of(entry.get("type")).lower().startswith("state")
+    return lasting
 
 
 # ---- one observation -----------------------------------------------------------------------------------------------------
@@ -150,45 +150,45 @@ def _observation(
 
 def _events(out: Gathering, observation: Mapping[str, Any], where: str) -> list[Entry]:
     """The entries with a time, in order of it."""
-    found: list[Entry] = []
+    entries: list[Entry] = []
     timeless = 0
     pictures = observation.get("type") == "IMAGES"
     for number, entry in enumerate(out.list_of(observation.get("events"), f"{where}, events", REMEDY), start=1):
         here = f"{where}, event {number}"
         if not isinstance(entry, list) or len(entry) < 3:
-            raise error(out.asked.path, f"{here} is {shown(entry)}, not [time, subject, code, modifiers, comment]", REMEDY)
+            raise error(out.asked.path, f"{here} is {quote(entry)}, not [time, subject, code, modifiers, comment]", REMEDY)
         if entry[0] in (None, "NA") and pictures:
             timeless += 1
             continue
         names = [*entry[1:5], "", "", ""][:4]
         bad = next((value for value in names if not (value is None or isinstance(value, (str, int, float)))), None)
         if bad is not None:
-            raise error(out.asked.path, f"{here}: {shown(bad)} is no name", REMEDY)
+            raise error(out.asked.path, f"{here}: {quote(bad)} is no name", REMEDY)
         subject, code, modifiers, comment = (text_of(value) for value in names)
-        found.append(Entry(out.seconds(entry[0], here, "time"), (subject, code, modifiers), comment))
+        entries.append(Entry(out.seconds(entry[0], here, "time"), (subject, code, modifiers), comment))
     if timeless:
         out.note(f"{where}: {count(timeless, 'event')} left out: of pictures without a time")
-    found.sort(key=lambda event: event.time)
-    return found
+    entries.sort(key=lambda event: event.time)
+    return entries
 
 
 def pair_events(out: Gathering, events: Sequence[Entry], types: Mapping[str, bool], where: str) -> Iterator[Interval]:
     """Point events as they are, and each START with its STOP."""
     begun: dict[tuple[str, str, str], Entry] = {}
     unknown: Counter[str] = Counter()
-    found: list[Interval] = []
+    intervals: list[Interval] = []
     for event in events:
         lasts = types.get(event.key[1])
         if lasts is None:
             unknown[event.key[1]] += 1
         elif not lasts:
-            found.append(Interval(event.time, event.time, event.key, event.comment))
+            intervals.append(Interval(event.time, event.time, event.key, event.comment))
         elif event.key in begun:
             start = begun.pop(event.key)
-            found.append(Interval(start.time, event.time, event.key, join_comments(start.comment, event.comment)))
+            intervals.append(Interval(start.time, event.time, event.key, join_comments(start.comment, event.comment)))
         else:
             begun[event.key] = event
-    found += _asked_at_stop(out, begun, where)
+    intervals += _pair_modified_stops(out, begun, where)
     for code, times in unknown.items():
         out.note(f"{where}: {count(times, 'event')} left out: {code!r} is not in the ethogram, so nobody knows START from STOP")
     for event in begun.values():
@@ -196,12 +196,12 @@ def pair_events(out: Gathering, events: Sequence[Entry], types: Mapping[str, boo
         of = f" of {subject}" * bool(subject) + f" ({modifiers})" * (modifiers not in UNMODIFIED)
         never = f"{code!r}{of} starts at {event.time:.6g} s and never stops"
         out.note(f"{where}: {never}; left out (BORIS: Observations > Close unpaired events)")
-    yield from sorted(found, key=lambda stretch: stretch.start)
+    yield from sorted(intervals, key=lambda stretch: stretch.start)
 
 
-def _asked_at_stop(out: Gathering, begun: dict[tuple[str, str, str], Entry], where: str) -> list[Interval]:
+def _pair_modified_stops(out: Gathering, begun: dict[tuple[str, str, str], Entry], where: str) -> list[Interval]:
     """States whose modifiers were asked for at STOP only: the START has none.  They are taken out of ``begun``."""
-    found = []
+    intervals = []
     for event in sorted(begun.values(), key=lambda event: event.time):
         subject, code, modifiers = event.key
         if modifiers.strip("|") in UNMODIFIED and event.key in begun:
@@ -213,10 +213,10 @@ def _asked_at_stop(out: Gathering, begun: dict[tuple[str, str, str], Entry], whe
             if later:
                 stop = min(later, key=lambda other: other.time)
                 del begun[event.key], begun[stop.key]
-                found.append(Interval(event.time, stop.time, stop.key, join_comments(event.comment, stop.comment)))
-    if found:
-        out.note(f"{where}: {count(len(found), 'state')} without modifiers at START paired with the STOP that has them")
-    return found
+                intervals.append(Interval(event.time, stop.time, stop.key, join_comments(event.comment, stop.comment)))
+    if intervals:
+        out.note(f"{where}: {count(len(intervals), 'state')} without modifiers at START paired with the STOP that has them")
+    return intervals
 
 
 def add_interval(out: Gathering, interval: Interval, pieces: Sequence[tuple[str, float, float]], name: str, where: str) -> None:
@@ -236,9 +236,9 @@ def join_comments(start: str, stop: str) -> str:
 
 def split_score(comment: str) -> tuple[str, float | None]:
     """A comment of ours without the score that it begins with, and the score."""
-    found = SCORE.fullmatch(comment)
-    number = parse_seconds(found["score"]) if found else math.nan
-    return (found["comment"] or "", number) if found and math.isfinite(number) else (comment, None)
+    match = SCORE.fullmatch(comment)
+    number = parse_seconds(match["score"]) if match else math.nan
+    return (match["comment"] or "", number) if match and math.isfinite(number) else (comment, None)
 
 
 # ---- clocks --------------------------------------------------------------------------------------------------------------
@@ -286,12 +286,12 @@ def _players(observation: Mapping[str, Any]) -> dict[str, list[str]]:
     players = observation.get("file")
     if not isinstance(players, dict) or observation.get("type") not in (None, "MEDIA"):
         return {}
-    found = {
+    players_ = {
         str(player): [name for name in files if isinstance(name, str) and name]
         for player, files in players.items()
         if isinstance(files, list)
     }
-    return {player: found[player] for player in sorted(found, key=lambda text: (len(text), text)) if found[player]}
+    return {player: players_[player] for player in sorted(players_, key=lambda text: (len(text), text)) if players_[player]}
 
 
 def files_of(observation: Mapping[str, Any]) -> list[str]:
@@ -301,7 +301,7 @@ def files_of(observation: Mapping[str, Any]) -> list[str]:
 
 def _object(asked: Request, value: Any, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise error(asked.path, f"{where} is {shown(value)}, not an object", REMEDY)
+        raise error(asked.path, f"{where} is {quote(value)}, not an object", REMEDY)
     return value
 
 
@@ -384,15 +384,15 @@ def _add_behaviours(draft: Draft, labels: Sequence[Label]) -> None:
     known = ethogram(Request(draft.target.into or draft.target.path), conf)
     keys = {text_of(one.get("key")).lower() for one in conf.values()}
     by_name: dict[str, list[Label]] = {}
-    for label in sorted(labels, key=in_order):
+    for label in sorted(labels, key=sort_key):
         by_name.setdefault(label.label, []).append(label)
     for name, own in by_name.items():
         code, lasts = name, any(_milli(label.end) > _milli(label.start) for label in own)
         while known.get(code) is False and lasts:  # there as a point event: BORIS cannot tell how long it lasts
             code += " (state)"
         if code != name:
-            said = f"{clip_text(name, 40)!r} is a point event in the project; its labels, some of which last, are written as"
-            draft.notices.append(f"{said} {clip_text(code, 50)!r}")
+            message = f"{clip_text(name, 40)!r} is a point event in the project; its labels, some of which last, are written as"
+            draft.notices.append(f"{message} {clip_text(code, 50)!r}")
         if code not in known:
             known[code] = lasts
             key = next((letter for letter in (code[:1].lower(), *ascii_lowercase, *digits) if letter not in keys), "")
@@ -457,7 +457,7 @@ def _write_observations(draft: Draft, labels: Sequence[Label]) -> None:
     groups |= {("", media): [] for media in target.media if media in empty}
     there = {media: _project_name(target, known, media) for _, media in groups}
     replaced = [[there[media]] for observation, media in groups if not observation]
-    kept = _select_others(target, before, replaced)
+    others = _select_others(target, before, replaced)
     written: dict[str, Any] = {}
     for (observation, media), own in groups.items():
         base = base_name(there[media])
@@ -466,7 +466,7 @@ def _write_observations(draft: Draft, labels: Sequence[Label]) -> None:
         layers = _split_layers(own)
         for number, layer in enumerate(layers):
             name = (observation or f"{target.tier} {base}".strip()) + f" ({number + 1})" * (number > 0)
-            if name in kept or name in written:
+            if name in others or name in written:
                 raise error(
                     target.into or target.path, f"somebody's observation is called {name!r}", "rename it, or write to another file"
                 )
@@ -475,7 +475,7 @@ def _write_observations(draft: Draft, labels: Sequence[Label]) -> None:
                 by = f" ({target.annotator})" * bool(target.annotator)
                 mark = _seal(name, written[name], len(layers))
                 written[name]["description"] = f"{MACHINE} found by a program, confirmed by nobody{by} [{mark}]"
-    draft.project["observations"] = kept | written
+    draft.project["observations"] = others | written
 
 
 def _select_others(target: Target, before: Mapping[str, Any], replaced: Sequence[list[str]]) -> dict[str, Any]:
@@ -487,8 +487,8 @@ def _select_others(target: Target, before: Mapping[str, Any], replaced: Sequence
     }
     for name, one in old.items():
         number = sum(files_of(other) == files_of(one) for other in old.values())
-        found = SEAL.search(text_of(one.get("description")))
-        if found is None or found[1] != _seal(name, one, number):
+        mark = SEAL.search(text_of(one.get("description")))
+        if mark is None or mark[1] != _seal(name, one, number):
             raise correction_error(target, f"observation {clip_text(name)!r}")
     return {name: one for name, one in before.items() if name not in old}
 
@@ -524,7 +524,7 @@ def _split_layers(labels: Sequence[Label]) -> list[list[Label]]:
     """Labels such that in each layer a subject does a thing once at a time; one layer at least."""
     layers: list[list[Label]] = [[]]
     ends: list[dict[tuple[str, str, str], int]] = [{}]
-    for label in sorted(labels, key=in_order):
+    for label in sorted(labels, key=sort_key):
         key = (label.subject, label.label, _format_modifiers(label))
         start = _milli(label.start)
         at = next((i for i, last in enumerate(ends) if last.get(key, -math.inf) <= start), len(layers))

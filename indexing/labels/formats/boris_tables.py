@@ -26,7 +26,7 @@ from indexing.labels.format import (
 )
 from indexing.labels.formats.boris import MACHINE, Entry, Interval, add_interval, join_comments
 from indexing.labels.label import LabelFile
-from indexing.opening import Row, count, error, listing, shown
+from indexing.opening import Row, count, error, listing, quote
 
 COLUMNS = {
     "observation": ("observation id",),
@@ -95,11 +95,11 @@ def _header(asked: Request, rows: Sequence[Row]) -> tuple[int, dict[str, int], l
     for at, (_, cells) in enumerate(rows):
         names = [cell.strip().lower() for cell in cells]
         first = {column: next((name for name in known if name in names), None) for column, known in COLUMNS.items()}
-        found = {column: names.index(name) for column, name in first.items() if name is not None}
-        if "code" in found and ("time" in found or {"start", "stop"} <= found.keys()):
-            if "time" in found and "start" not in found and "kind" not in found:
+        columns = {column: names.index(name) for column, name in first.items() if name is not None}
+        if "code" in columns and ("time" in columns or {"start", "stop"} <= columns.keys()):
+            if "time" in columns and "start" not in columns and "kind" not in columns:
                 raise error(asked.path, "has no column 'Behavior type' or 'Status', which tells START from STOP", REMEDY)
-            return at, found, [i for i, name in enumerate(names) if name == "modifiers" or name.startswith("modifier #")]
+            return at, columns, [i for i, name in enumerate(names) if name == "modifiers" or name.startswith("modifier #")]
     raise error(asked.path, "has no row with the columns 'Behavior' and 'Time', or 'Start (s)' and 'Stop (s)'", REMEDY)
 
 
@@ -160,7 +160,7 @@ def _event(out: Gathering, sitting: Sitting, event: Entry, kind: str, media: str
         else:
             sitting.stray.append(of)
     else:
-        raise error(out.asked.path, f"{where}: {shown(kind)} is none of START, STOP and POINT", REMEDY)
+        raise error(out.asked.path, f"{where}: {quote(kind)} is none of START, STOP and POINT", REMEDY)
 
 
 def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
@@ -173,8 +173,8 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
     if sitting.timeless:
         out.note(f"{where}: {count(sitting.timeless, 'event')} left out: of pictures without a time")
     if mine is not None and mine & set(sitting.beside) and not mine & set(sitting.files):
-        said = f"{where} plays {listing(mine)} beside {listing(sitting.files)}, and the table does not say how they are shifted"
-        raise error(out.asked.path, said, "give the project (.boris)")
+        message = f"{where} plays {listing(mine)} beside {listing(sitting.files)}, and the table does not say how they are shifted"
+        raise error(out.asked.path, message, "give the project (.boris)")
     spans = _spans(sitting)
     lost: Counter[str] = Counter()
     for number, (stretch, media) in enumerate(sorted(sitting.stretches, key=lambda pair: pair[0].start), start=1):
@@ -186,10 +186,10 @@ def _place(out: Gathering, sitting: Sitting, mine: set[str] | None) -> None:
         pieces = [piece for piece in pieces if mine is None or not piece[0] or piece[0] in mine]
         add_interval(out, stretch, pieces, sitting.name, f"{where}, label {number}")
     if lost:
-        said = f"of {list_few(lost)}, which is not played first, and the table does not say how long the first is"
+        message = f"of {list_few(lost)}, which is not played first, and the table does not say how long the first is"
         if mine is not None and mine & lost.keys():
-            raise error(out.asked.path, f"{where} has labels {said}", "give the project (.boris)")
-        out.note(f"{where}: {count(sum(lost.values()), 'label')} left out: {said}; the project (.boris) does")
+            raise error(out.asked.path, f"{where} has labels {message}", "give the project (.boris)")
+        out.note(f"{where}: {count(sum(lost.values()), 'label')} left out: {message}; the project (.boris) does")
 
 
 def _spans(sitting: Sitting) -> list[Span]:

@@ -15,8 +15,8 @@ from typing import Any
 
 from indexing.files import write_json
 from indexing.labels.format import Gathering, LabelFormat, Request, Target, base_name, parse_whole, text_of
-from indexing.labels.label import Label, LabelFile, in_order
-from indexing.opening import clip_text, count, error, shown
+from indexing.labels.label import Label, LabelFile, sort_key
+from indexing.opening import clip_text, count, error, quote
 
 REMEDY = "export it again from Label Studio as JSON"
 SOUND = ("labels", "timeserieslabels")
@@ -27,20 +27,20 @@ TEXTS = ("subject", "tier")
 def read(data: Any, asked: Request) -> LabelFile:
     """Read an export."""
     out = Gathering(asked, "label_studio")
-    other: Counter[str] = Counter()
+    untimed: Counter[str] = Counter()
     for number, task in enumerate(data if isinstance(data, list) else [data], start=1):
         if not isinstance(task, dict):
-            raise error(asked.path, f"task {number} is {shown(task)}", REMEDY)
+            raise error(asked.path, f"task {number} is {quote(task)}", REMEDY)
         media = _media(task)
         if media:
             out.media.setdefault(media)
         for who, machine, region in _regions(out, task, f"task {number}"):
             if machine:
                 out.machine.setdefault(who)
-            _region(out, region, media, who, f"task {number}, region {clip_text(text_of(region.get('id')), 20) or '?'}", other)
-    if other:
-        kinds = ", ".join(f"{clip_text(kind, 20) or 'without a type'}: {times}" for kind, times in other.most_common(3))
-        out.note(f"{count(sum(other.values()), 'region')} left out: they mark no time ({kinds})")
+            _region(out, region, media, who, f"task {number}, region {clip_text(text_of(region.get('id')), 20) or '?'}", untimed)
+    if untimed:
+        kinds = ", ".join(f"{clip_text(kind, 20) or 'without a type'}: {times}" for kind, times in untimed.most_common(3))
+        out.note(f"{count(sum(untimed.values()), 'region')} left out: they mark no time ({kinds})")
     return out.finish()
 
 
@@ -49,9 +49,9 @@ def _media(task: Mapping[str, Any]) -> str:
     data = task.get("data")
     data = data if isinstance(data, dict) else task
     named = [data.get(key) for key in ("video", "video_url", "audio", "url")]
-    found = next((value for value in [*named, *data.values()] if isinstance(value, str) and re.search(r"\.\w{2,5}$", value)), "")
-    name = base_name(found).rpartition("=")[2]
-    return UPLOAD.sub("", name) if "/upload/" in found else name
+    address = next((value for value in [*named, *data.values()] if isinstance(value, str) and re.search(r"\.\w{2,5}$", value)), "")
+    name = base_name(address).rpartition("=")[2]
+    return UPLOAD.sub("", name) if "/upload/" in address else name
 
 
 def _regions(out: Gathering, task: Mapping[str, Any], where: str) -> Iterator[tuple[str, bool, dict[str, Any]]]:
@@ -89,21 +89,21 @@ def _who(found: Any) -> str:
     return f"annotator {found}" if isinstance(found, int) else text_of(found)
 
 
-def _region(out: Gathering, region: Mapping[str, Any], media: str, who: str, where: str, other: Counter[str]) -> None:
+def _region(out: Gathering, region: Mapping[str, Any], media: str, who: str, where: str, untimed: Counter[str]) -> None:
     """The labels of a region: one for each of its names and ranges."""
     value, kind = region.get("value"), text_of(region.get("type"))
     if not isinstance(value, dict):
-        other[kind] += 1
+        untimed[kind] += 1
         return
-    found = value.get(kind) or value.get("timelinelabels")
-    names = found if isinstance(found, list) else []
+    value_names = value.get(kind) or value.get("timelinelabels")
+    names = value_names if isinstance(value_names, list) else []
     times: list[tuple[Any, Any]]
     if isinstance(value.get("ranges"), list):
         times = [_frames(out, one, where) for one in value["ranges"]]
     elif kind in SOUND and "text" not in value and "start" in value:  # with text, they count its letters
         times = [(value["start"], value.get("end"))]
     else:
-        other[kind] += 1
+        untimed[kind] += 1
         return
     meta = region.get("meta")
     meta = meta if isinstance(meta, dict) else {}
@@ -129,7 +129,7 @@ def _frames(out: Gathering, one: Any, where: str) -> tuple[float, float]:
     """The times of the first and the last frame of a range."""
     ends = [parse_whole(one.get(key)) if isinstance(one, dict) else None for key in ("start", "end")]
     if ends[0] is None or ends[1] is None:
-        raise error(out.asked.path, f"{where}: {shown(one)} is no range of frames", REMEDY)
+        raise error(out.asked.path, f"{where}: {quote(one)} is no range of frames", REMEDY)
     if out.asked.fps is None:
         raise error(out.asked.path, "counts frames, and does not say how many a second has", "give them (--fps)")
     return (ends[0] - 1) / out.asked.fps, (ends[1] - 1) / out.asked.fps
@@ -140,7 +140,7 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
     if target.fps is None:
         raise error(target.path, "Label Studio counts frames, and nobody says how many a second has", "give them (--fps)")
     tasks: dict[str, dict[str, list[dict[str, Any]]]] = {media: {} for media in target.media}
-    for number, label in enumerate(sorted(labels, key=in_order)):
+    for number, label in enumerate(sorted(labels, key=sort_key)):
         tasks.setdefault(label.media, {}).setdefault(label.observation, []).append(_result(label, number, target.fps))
     made = [
         {

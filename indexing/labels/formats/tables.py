@@ -16,8 +16,8 @@ from typing import Any
 
 from indexing.files import write_text
 from indexing.labels.format import Gathering, LabelFormat, Request, Target, parse_seconds, parse_whole
-from indexing.labels.label import Label, LabelFile, in_order
-from indexing.opening import Row, clip_text, error, listing, shown
+from indexing.labels.label import Label, LabelFile, sort_key
+from indexing.opening import Row, clip_text, error, listing, quote
 
 COLUMNS = {
     "label": ("label", "action", "behavior", "behaviour", "class", "event", "code", "annotation", "value"),
@@ -44,8 +44,8 @@ def read(rows: list[Row], asked: Request) -> LabelFile:
     columns = _columns(asked.path, rows[0][1])
     framed = "start" not in columns
     if framed and asked.fps is None:
-        said = f"counts frames (column {rows[0][1][columns['start_frame']]!r}), and does not say how many a second has"
-        raise error(asked.path, said, "give them (--fps)")
+        message = f"counts frames (column {rows[0][1][columns['start_frame']]!r}), and does not say how many a second has"
+        raise error(asked.path, message, "give them (--fps)")
     for line, cells in rows[1:]:
         row = {name: cells[i].strip() if i < len(cells) else "" for name, i in columns.items()}
         where = f"line {line}"
@@ -69,20 +69,20 @@ def read(rows: list[Row], asked: Request) -> LabelFile:
 def _columns(path: Path, header: Sequence[str]) -> dict[str, int]:
     """Where each column stands."""
     names = [cell.strip().lower() for cell in header]
-    found: dict[str, int] = {}
+    columns: dict[str, int] = {}
     for column, synonyms in COLUMNS.items():
         at = [names.index(name) for name in synonyms if name in names]
         if at:
-            found[column] = at[0]
-    lacking = [] if "label" in found else ["label"]
-    if not {"start", "end"} <= found.keys() and not {"start", "duration"} <= found.keys():
-        if {"start_frame", "end_frame"} <= found.keys():
-            found.pop("start", None)
+            columns[column] = at[0]
+    lacking = [] if "label" in columns else ["label"]
+    if not {"start", "end"} <= columns.keys() and not {"start", "duration"} <= columns.keys():
+        if {"start_frame", "end_frame"} <= columns.keys():
+            columns.pop("start", None)
         else:
-            lacking += [name for name in ("start", "end") if name not in found]
+            lacking += [name for name in ("start", "end") if name not in columns]
     if lacking:
         raise error(path, f"has no column {lacking[0]!r} (the first line has {listing(header, 5)})", FORM)
-    return found
+    return columns
 
 
 def _seconds(out: Gathering, row: dict[str, str], where: str) -> tuple[float, float]:
@@ -99,8 +99,8 @@ def _frames(out: Gathering, row: dict[str, str], where: str) -> tuple[float, flo
     for column in ("start_frame", "end_frame"):
         number = parse_whole(row[column])
         if number is None:
-            said = f"{where}: column {column!r}: {shown(row[column])} is no frame number"
-            raise error(out.asked.path, said, "count frames from 0")
+            message = f"{where}: column {column!r}: {quote(row[column])} is no frame number"
+            raise error(out.asked.path, message, "count frames from 0")
         times.append(number / (out.asked.fps or math.nan))
     return times[0], times[1]
 
@@ -110,7 +110,7 @@ def _score(path: Path, text: str, where: str) -> float | None:
         return None
     number = parse_seconds(text)
     if not math.isfinite(number):
-        raise error(path, f"{where}: column 'score': {shown(text)} is no number", "leave it empty where there is none")
+        raise error(path, f"{where}: column 'score': {quote(text)} is no number", "leave it empty where there is none")
     return number
 
 
@@ -121,7 +121,7 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
     table = csv.writer(stream, delimiter="\t" if target.format == "tsv" else ",", lineterminator="\n")
     table.writerow(filled)
     notices: dict[str, None] = {}
-    for label in sorted(labels, key=in_order):
+    for label in sorted(labels, key=sort_key):
         if any("|" in modifier for modifier in label.modifiers):
             notices[f"modifiers with | become several ({clip_text(label.modifiers, 40)})"] = None
         table.writerow([_cell(getattr(label, name)) for name in filled])

@@ -15,8 +15,8 @@ from typing import Any
 
 from indexing.files import write_json
 from indexing.labels.format import NUM_HEADER_ROWS, Gathering, LabelFormat, Request, Target, base_name, of_recording, text_of
-from indexing.labels.label import Label, LabelFile, in_order
-from indexing.opening import Row, clip_text, count, error, parse_json, read_text, shown
+from indexing.labels.label import Label, LabelFile, sort_key
+from indexing.opening import Row, clip_text, count, error, parse_json, quote, read_text
 
 REMEDY = "save or export it again from VIA 3"
 MACHINE = "dyntorch"  # the description of attributes that a program wrote
@@ -61,7 +61,7 @@ def _read_project(out: Gathering, data: Mapping[str, Any]) -> None:
     for name, one in data["metadata"].items():
         where = f"metadata {clip_text(name, 24)!r}"
         if not isinstance(one, dict):
-            raise error(out.asked.path, f"{where} is {shown(one)}", REMEDY)
+            raise error(out.asked.path, f"{where} is {quote(one)}", REMEDY)
         seen = shown_in.get(text_of(one.get("vid")), [files.get(text_of(one.get("vid")), "")])
         media = next((file for file in seen if mine and file in mine), seen[0] if seen else "")
         _segment(out, where, one.get("z"), one.get("xy"), one.get("av"), attributes, media, left)
@@ -87,7 +87,7 @@ def _segment(
         left["of a whole file"] += 1
         return
     if len(times) > 2:
-        raise error(out.asked.path, f"{where}: {shown(times)} is no segment", REMEDY)
+        raise error(out.asked.path, f"{where}: {quote(times)} is no segment", REMEDY)
     fields: dict[str, Any] = {}
     names: list[tuple[str, str]] = []
     for attribute, value in values.items() if isinstance(values, dict) else ():
@@ -173,7 +173,7 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
         number_of[tier]: _attribute(tier, SELECT, {code: name for name, code in codes[tier].items()}, MACHINE) for tier in tiers
     } | {field_of[name]: _attribute(name, TEXT, {}, "") for name in more}
     metadata = {}
-    for number, label in enumerate(sorted(labels, key=in_order)):
+    for number, label in enumerate(sorted(labels, key=sort_key)):
         tier = label.tier or target.tier
         values = {number_of[tier]: codes[tier][label.label]}
         values |= {field_of[name]: _text(getattr(label, name)) for name in more if getattr(label, name) not in ("", (), None)}
@@ -198,8 +198,8 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
 
 
 def _attribute(name: str, kind: int, options: dict[str, str], description: str) -> dict[str, Any]:
-    said = {"aname": name, "anchor_id": "FILE1_Z2_XY0", "type": kind, "desc": description}
-    return said | {"options": options, "default_option_id": ""}
+    message = {"aname": name, "anchor_id": "FILE1_Z2_XY0", "type": kind, "desc": description}
+    return message | {"options": options, "default_option_id": ""}
 
 
 def _text(value: Any) -> str:

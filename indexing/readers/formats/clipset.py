@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from indexing.clip import UP_AXES, Clip, ClipSet, FloatArray, LabelledSet
 from indexing.files import replacing
 from indexing.joints import check_named_layout, choose_layout
-from indexing.opening import error, listing, shown
+from indexing.opening import error, listing, quote
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.npz import NumpyArchive
 from indexing.readers.recording import merge_people, to_clips
@@ -83,7 +83,7 @@ def _actions(path: Path, labels: list[Hashable | None]) -> dict[str, Array]:
     if not whole:
         odd = next(label for label in given if not isinstance(label, (int, np.integer)) or isinstance(label, bool) or label < 0)
         raise error(
-            path, f"the label {shown(odd)} cannot be written with the others", "use text for all labels, or integers from 0 for all"
+            path, f"the label {quote(odd)} cannot be written with the others", "use text for all labels, or integers from 0 for all"
         )
     return {"action": np.array([-1 if label is None else label for label in labels])}
 
@@ -109,14 +109,14 @@ def _column(path: Path, clips: list[Clip], key: str) -> Array:
     lacking = [clip.name or str(i) for i, clip in enumerate(clips) if key not in clip.meta]
     if lacking:
         raise error(
-            path, f"the clip {shown(lacking[0])} has no field {shown(key)}, other clips have", "give it to every clip, or to none"
+            path, f"the clip {quote(lacking[0])} has no field {quote(key)}, other clips have", "give it to every clip, or to none"
         )
     try:
         column = np.asarray([clip.meta[key] for clip in clips])
     except ValueError:
         column = np.empty(0, dtype=object)
     if column.dtype.kind not in "biufU":
-        raise error(path, f"the field {shown(key)} is not numbers or text of one shape", "convert it, or drop it from Clip.meta")
+        raise error(path, f"the field {quote(key)} is not numbers or text of one shape", "convert it, or drop it from Clip.meta")
     return column
 
 
@@ -145,7 +145,7 @@ def require_array(path: Path, data: Mapping[str, Array], key: str, ndim: int) ->
     if key not in data:
         raise error(
             path,
-            f"is not a clip set: it has no {shown(key)} (it has {listing(data)})",
+            f"is not a clip set: it has no {quote(key)} (it has {listing(data)})",
             f"save {FORMS.get(key, key)}, offsets (N + 1), action (N)",
         )
     if data[key].ndim != ndim:
@@ -237,8 +237,8 @@ def frame_times(
     """``(F,)`` seconds, or None where neither times nor frame numbers are known."""
     key = next((key for key in ("times", "frame") if key in data), None)
     if rate.dtype.kind not in "fiu" or not ((rate >= SLOWEST).all() and (rate <= FASTEST).all()):
-        said = f"fps must be positive, from {SLOWEST:g} to {FASTEST:g}"
-        raise error(path, said, "save frames per second, one value or one per clip")
+        message = f"fps must be positive, from {SLOWEST:g} to {FASTEST:g}"
+        raise error(path, message, "save frames per second, one value or one per clip")
     if key is None:
         return None
     stamps = data[key]
@@ -250,8 +250,8 @@ def frame_times(
     odd = np.flatnonzero(~(np.abs(stamps) < LAST))
     if odd.size:
         owner = int(np.searchsorted(offsets, odd[0], side="right")) - 1
-        said = f"clip {shown(names[owner])}: {key} must increase, but row {odd[0]} has {stamps[odd[0]]:g}"
-        raise error(path, said, "save seconds, or numbers of frames, of a recording")
+        message = f"clip {quote(names[owner])}: {key} must increase, but row {odd[0]} has {stamps[odd[0]]:g}"
+        raise error(path, message, "save seconds, or numbers of frames, of a recording")
     forward = stamps[1:] > stamps[:-1]
     forward[offsets[1:-1] - 1] = True  # a new clip may start anywhere
     if not forward.all():
@@ -259,7 +259,7 @@ def frame_times(
         clip = int(np.searchsorted(offsets, row, side="right")) - 1
         raise error(
             path,
-            f"clip {shown(names[clip])}: {key} must increase, but row {row} has {stamps[row]:g} after {stamps[row - 1]:g}",
+            f"clip {quote(names[clip])}: {key} must increase, but row {row} has {stamps[row]:g} after {stamps[row - 1]:g}",
             "sort the frames and drop repeated ones",
         )
     return np.asarray(stamps if key == "times" else stamps / np.repeat(rate.astype(np.float64), np.diff(offsets)))
@@ -323,9 +323,9 @@ def read_clip_set(
     up = per_clip(path, data, "up", count, "y")
     wrong = next((axis for axis in dict.fromkeys(map(str, up)) if axis not in UP_AXES or (axis.endswith("z") and dims == 2)), None)
     if wrong is not None:
-        raise error(path, f"up is {shown(wrong)} for {dims}D joints", f"save one of {', '.join(UP_AXES)} (z only for 3D joints)")
+        raise error(path, f"up is {quote(wrong)} for {dims}D joints", f"save one of {', '.join(UP_AXES)} (z only for 3D joints)")
     meta = {key: values for key, values in clip_meta(data, count, "joints").items() if key != "layout" or layout is None}
-    skeleton, said = _layout(path, data, joints, [str(axis) for axis in dict.fromkeys(up.tolist())], layout)
+    skeleton, message = _layout(path, data, joints, [str(axis) for axis in dict.fromkeys(up.tolist())], layout)
     clips = []
     for i, (start, end) in enumerate(pairwise(offsets.tolist())):
         known = None if confidence is None or np.isnan(confidence[start:end]).all() else confidence[start:end]
@@ -340,7 +340,7 @@ def read_clip_set(
                     name=names[i],
                     skeleton=skeleton,
                     up=str(up[i]),
-                    meta={**{key: to_python(values[i]) for key, values in meta.items()}, **said},
+                    meta={**{key: to_python(values[i]) for key, values in meta.items()}, **message},
                     fps_assumed=bool(assumed[i]),
                 )
             )
@@ -374,8 +374,8 @@ def _layout(
         return check_named_layout(path, name, joints.shape[1], own), {}
     if "joint_names" in data or len(ups) != 1:
         return own, {}
-    layout, said, _ = choose_layout(joints, None, candidates(joints.shape[1]), ups[0])
-    return layout or own, said
+    layout, message, _ = choose_layout(joints, None, candidates(joints.shape[1]), ups[0])
+    return layout or own, message
 
 
 def _skeleton(path: Path, data: Mapping[str, Array], joints: int) -> Skeleton | None:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from indexing.clip import ClipSet
-from indexing.opening import error, shown
+from indexing.opening import error, quote
 from indexing.readers.files import Format, Options, Source, frame_number
 from indexing.readers.recording import Detection, collect_detections, parse_flat_joints, to_clips, track_id
 from indexing.skeleton import Skeleton, usual_layout
@@ -31,8 +31,8 @@ def read(source: Source, options: Options) -> ClipSet:
             raise error(source.path, f"{where}: needs image_id and keypoints", REMEDY)
         image = person["image_id"]
         if not isinstance(image, (int, str)):
-            raise error(source.path, f"{where}: image_id must be a number or a file name, got {shown(image)}", REMEDY)
-        where = f"{where} (image_id {shown(image)}), keypoints"
+            raise error(source.path, f"{where}: image_id must be a number or a file name, got {quote(image)}", REMEDY)
+        where = f"{where} (image_id {quote(image)}), keypoints"
         detections = frames.setdefault(image, [])
         if person["keypoints"]:
             detections.append(Detection(*parse_flat_joints(source.path, where, person["keypoints"]), _track(person)))
@@ -74,12 +74,12 @@ def _numbers(source: Source, images: dict[Hashable, Any]) -> dict[Hashable, int]
         number = name if isinstance(name, int) else frame_number(str(name))
         if number is None:
             raise error(
-                source.path, f"image {shown(name)} has no number in its name", "name the images by frame number, e.g. 000012.jpg"
+                source.path, f"image {quote(name)} has no number in its name", "name the images by frame number, e.g. 000012.jpg"
             )
         if number in owner:
             raise error(
                 source.path,
-                f"images {shown(owner[number])} and {shown(name)} are both frame {number}",
+                f"images {quote(owner[number])} and {quote(name)} are both frame {number}",
                 "give one recording per file, with images numbered by frame",
             )
         numbers[image], owner[number] = number, name

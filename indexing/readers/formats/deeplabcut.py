@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import ClipSet, FloatArray
-from indexing.opening import error, listing, shown
+from indexing.opening import error, listing, quote
 from indexing.readers.files import Format, Options, Source, frame_number, read_columns
-from indexing.readers.hdf import AGAIN, Hdf5, opened_hdf5
+from indexing.readers.hdf import AGAIN, Hdf5, open_hdf5
 from indexing.readers.pickles import unpickle_bytes
 from indexing.readers.recording import IntArray, Recording, to_clips
 from indexing.skeleton import Skeleton
@@ -32,7 +32,7 @@ REMEDY = "export with deeplabcut.analyze_videos(..., save_as_csv=True) or analyz
 def read(source: Source, options: Options) -> ClipSet:
     """Read a DeepLabCut CSV or HDF5; times are frame number / fps."""
     if source.kind == "hdf5":
-        with opened_hdf5(source.path) as file:
+        with open_hdf5(source.path) as file:
             frame = read_frame(file)
         layout = _layout(source, frame.header["bodyparts"], frame.header["coords"], frame.header.get("individuals"))
         table = frame.values[:, _columns(layout)]
@@ -40,7 +40,7 @@ def read(source: Source, options: Options) -> ClipSet:
     header = {row[0].strip().lower(): [cell.strip() for cell in row] for row in source.data[:4]}
     lacking = [name for name in ("bodyparts", "coords") if name not in header]
     if lacking:
-        raise error(source.path, f"has no header row {shown(lacking[0])} among the first four rows", REMEDY)
+        raise error(source.path, f"has no header row {quote(lacking[0])} among the first four rows", REMEDY)
     if len({len(row) for row in header.values()}) > 1:
         raise error(source.path, "the header rows have different lengths", REMEDY)
     individuals = header.get("individuals")
@@ -93,7 +93,7 @@ def _layout(source: Source, parts: list[str], coords: list[str], individuals: li
         if its.keys() != first.keys():
             raise error(
                 source.path,
-                f"the individual {shown(animal)} has other body parts than the first",
+                f"the individual {quote(animal)} has other body parts than the first",
                 "export animals of one kind per file",
             )
     return layout
@@ -104,7 +104,7 @@ def _frames(source: Source, keys: list[str]) -> IntArray:
     numbers = [int(key) if key.isdecimal() and len(key) < 16 else frame_number(key) for key in keys]
     if None in numbers:
         raise error(
-            source.path, f"frame {shown(keys[numbers.index(None)])} has no number", "number the frames, or the images by frame"
+            source.path, f"frame {quote(keys[numbers.index(None)])} has no number", "number the frames, or the images by frame"
         )
     return np.array(numbers, dtype=np.int64)
 
@@ -156,7 +156,7 @@ def read_frame(file: Hdf5) -> HdfFrame:
     if kind == "frame_table":
         return _read_table(file, key)
     if kind != "frame":
-        raise error(file.path, f"{shown(key)} is a {shown(kind)} of pandas, not a data frame", AGAIN)
+        raise error(file.path, f"{quote(key)} is a {quote(kind)} of pandas, not a data frame", AGAIN)
     return _read_fixed(file, key)
 
 
@@ -177,8 +177,8 @@ def _read_fixed(file: Hdf5, key: str) -> HdfFrame:
         if file.attribute(f"{key}/block{i}_values", "transposed") in (0, None) and values.shape != (len(rows), len(parts[0])):
             values = values.T
         if values.shape != (len(rows), len(parts[0])):
-            said = f"{key}: {len(rows)} rows and {len(parts[0])} columns, but values {values.shape}"
-            raise error(file.path, said, AGAIN)
+            message = f"{key}: {len(rows)} rows and {len(parts[0])} columns, but values {values.shape}"
+            raise error(file.path, message, AGAIN)
         if columns and len(parts) != len(columns[0]):
             raise error(file.path, f"{key}: blocks with {len(columns[0])} and {len(parts)} rows of column names", AGAIN)
         columns.append(parts)
@@ -193,7 +193,7 @@ def _read_table(file: Hdf5, key: str) -> HdfFrame:
     fields = file.fields(table)
     blocks = [name for name in fields if name.startswith("values_block_")]
     if not blocks or "index" not in fields or len(blocks) > MOST_BLOCK:
-        raise error(file.path, f"{shown(table)} has the fields {listing(fields)}, no index and values", AGAIN)
+        raise error(file.path, f"{quote(table)} has the fields {listing(fields)}, no index and values", AGAIN)
     parts: list[tuple[str, ...]] = []
     for block in blocks:
         kind = file.attribute(table, f"{block}_kind")
@@ -205,7 +205,7 @@ def _read_table(file: Hdf5, key: str) -> HdfFrame:
     values = [np.asarray(records[block], dtype=np.float64).reshape(len(records["index"]), -1) for block in blocks]
     levels = {len(one) for one in parts}
     if len(levels) != 1 or sum(block.shape[1] for block in values) != len(parts):
-        raise error(file.path, f"{shown(table)} has {len(parts)} names for {sum(b.shape[1] for b in values)} columns", AGAIN)
+        raise error(file.path, f"{quote(table)} has {len(parts)} names for {sum(b.shape[1] for b in values)} columns", AGAIN)
     header = [[one[k] for one in parts] for k in range(levels.pop())]
     return _build_frame(file, header, _level_names(file, key), values, [_to_text(name) for name in records["index"].tolist()])
 
@@ -247,14 +247,14 @@ def _read_name_rows(file: Hdf5, name: str, levels: int) -> list[list[str]]:
     found = []
     for k in range(levels):
         if levels * math.prod(file.shape(f"{name}_label{k}")) > NAMES_BLOCK:
-            raise error(file.path, f"{shown(name)} has more names than any table of points", AGAIN)
+            raise error(file.path, f"{quote(name)} has more names than any table of points", AGAIN)
         words = _read_texts(file, f"{name}_level{k}")
         which = file.array(f"{name}_label{k}", 1, "iu").astype(np.int64)
         if which.size and not (which.min() >= -1 and which.max() < len(words)):
-            raise error(file.path, f"{shown(name)} names columns by words that are not there", AGAIN)
+            raise error(file.path, f"{quote(name)} names columns by words that are not there", AGAIN)
         found.append([words[i] if i >= 0 else "" for i in which.tolist()])
     if not found or len({len(row) for row in found}) > 1:
-        raise error(file.path, f"{shown(name)} has rows of column names of different lengths", AGAIN)
+        raise error(file.path, f"{quote(name)} has rows of column names of different lengths", AGAIN)
     return found
 
 
@@ -267,7 +267,7 @@ def _read_axis(file: Hdf5, name: str, variety: str, levels: int) -> list[str]:
 
 def _read_texts(file: Hdf5, name: str) -> list[str]:
     if math.prod(file.shape(name)) > NAMES_BLOCK:
-        raise error(file.path, f"{shown(name)} has more names than any table of points", AGAIN)
+        raise error(file.path, f"{quote(name)} has more names than any table of points", AGAIN)
     data = file.array(name, 1, "iufS")
     return [_to_text(value) for value in data.tolist()]
 
@@ -280,7 +280,7 @@ def _count(file: Hdf5, key: str, name: str) -> int:
     value: Any = file.attribute(key, name)
     number = int(value) if isinstance(value, (int, np.integer)) else -1
     if not 0 < number <= MOST_BLOCK:
-        raise error(file.path, f"{shown(key)}: {name} is {shown(value)}", AGAIN)
+        raise error(file.path, f"{quote(key)}: {name} is {quote(value)}", AGAIN)
     return number
 
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from indexing.clip import Clip, ClipSet, FloatArray
-from indexing.opening import VALUE, check_dense, error, shown
+from indexing.opening import VALUE, check_dense, error, quote
 from indexing.readers.files import Format, Options, Source, read_columns
 from indexing.readers.recording import IntArray, Recording, frame_numbers, to_clips
 from indexing.skeleton import HAND21, MEDIAPIPE33, Skeleton
@@ -194,7 +194,7 @@ def _widen(
         if highest > MOST:
             raise error(
                 source.path,
-                f"landmark {shown(highest)} is beyond any MediaPipe model",
+                f"landmark {quote(highest)} is beyond any MediaPipe model",
                 f"number landmarks from 0 or 1 to at most {MOST}",
             )
         names = [str(i) for i in range(min(1, *map(int, names)), highest + 1)]
@@ -207,7 +207,7 @@ def _widen(
     cells, counts = np.unique(person * len(names) + joint, return_counts=True)
     if (counts > 1).any():
         twice = names[int(cells[np.argmax(counts > 1)]) % len(names)]
-        raise error(source.path, f"landmark {shown(twice)} comes twice in a frame", "drop repeated rows, or add a column 'person'")
+        raise error(source.path, f"landmark {quote(twice)} comes twice in a frame", "drop repeated rows, or add a column 'person'")
     check_dense(source.path, len(keys) * len(names), len(rows), f"{len(keys)} people and {len(names)} landmarks", ONE_NAME)
     table = np.full((len(keys), len(names), rows.shape[1]), np.nan)
     table[person, joint] = rows

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import COARSEST, FINEST, UP_AXES, ClipSet
-from indexing.opening import error, listing, shown
+from indexing.opening import error, listing, quote
 from indexing.readers.files import Format, Options, Source
-from indexing.readers.hdf import Array, Hdf5, opened_hdf5
+from indexing.readers.hdf import Array, Hdf5, open_hdf5
 from indexing.readers.recording import Recording, to_clips
 from indexing.skeleton import Skeleton
 
@@ -24,7 +24,7 @@ REMEDY = "save it again from movement, with dataset.to_netcdf(path)"
 
 def read(source: Source, options: Options) -> ClipSet:
     """Read a data set of poses."""
-    with opened_hdf5(source.path) as file:
+    with open_hdf5(source.path) as file:
         recording = _recording(file, options)
     return to_clips(source.path, recording, options)
 
@@ -37,8 +37,8 @@ def _recording(file: Hdf5, options: Options) -> Recording:
     frames = len(position)
     fits = position.size and position.shape[1:] == (len(animals), len(joints), len(space))
     if not fits or space not in (["x", "y"], ["x", "y", "z"]):
-        said = f"{len(animals)} individuals, {len(joints)} keypoints and the axes {listing(space)}"
-        raise error(file.path, f"position is {position.shape} for {said}", REMEDY)
+        message = f"{len(animals)} individuals, {len(joints)} keypoints and the axes {listing(space)}"
+        raise error(file.path, f"position is {position.shape} for {message}", REMEDY)
     confidence = None
     if "confidence" in file:
         confidence, _ = _axes(file, "confidence", AXES[:3])
@@ -101,7 +101,7 @@ def _times(file: Hdf5, frames: int, options: Options) -> tuple[Array, Array | No
         return np.arange(frames), stamps.astype(np.float64)
     whole = np.rint(stamps).astype(np.float64)
     if not (np.abs(whole) < 2**53).all() or (np.diff(whole) <= 0).any():
-        raise error(file.path, f"time ({shown(unit)}) must be frame numbers that increase", REMEDY)
+        raise error(file.path, f"time ({quote(unit)}) must be frame numbers that increase", REMEDY)
     rate = options.fps or fps
     return whole.astype(np.int64), whole / rate if rate is not None else None
 

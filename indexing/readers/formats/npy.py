@@ -34,11 +34,11 @@ def recording_of(joints: FloatArray, confidence: FloatArray | None = None) -> Re
     """A recording of one body of unknown layout, and the direction that is up in it where the body shows that."""
     usual, flat = usual_layout(joints.shape[1]), joints.shape[2] == 2
     could = candidates(joints.shape[1])
-    layout, said, up = choose_layout(joints, usual, could, "-y" if flat else None)
-    if layout is not None and not said:  # the file says nothing of it
-        said = {"layout": f"recognized: {layout.name}"}
+    layout, message, up = choose_layout(joints, usual, could, "-y" if flat else None)
+    if layout is not None and not message:  # the file says nothing of it
+        message = {"layout": f"recognized: {layout.name}"}
     frames = np.arange(len(joints))
-    return Recording(frames, frames, joints, confidence, skeleton=layout, up=up or ("-y" if flat else "y"), meta=said)
+    return Recording(frames, frames, joints, confidence, skeleton=layout, up=up or ("-y" if flat else "y"), meta=message)
 
 
 def split_confidence(path: Path, values: FloatArray) -> tuple[FloatArray, FloatArray | None]:
@@ -52,8 +52,8 @@ def split_confidence(path: Path, values: FloatArray) -> tuple[FloatArray, FloatA
     if float(flat.max()) - float(flat.min()) > SURE_PIXELS:
         return rest, np.where(np.isfinite(third), third, 0.0)
     if flat.min() >= 0 and flat.max() <= 1:
-        said = "x, y and the third number are all from 0 to 1: it may be depth or confidence"
-        raise error(path, said, "save array[..., :2], or a clip set with confidence")
+        message = "x, y and the third number are all from 0 to 1: it may be depth or confidence"
+        raise error(path, message, "save array[..., :2], or a clip set with confidence")
     return values, None
 
 

@@ -50,18 +50,18 @@ def _people(source: Source, number: int, frame: Any) -> list[Detection]:
     people = frame.get("people", frame.get("bodies")) if isinstance(frame, dict) else None
     if not isinstance(people, list) or not all(isinstance(person, dict) for person in people):
         raise error(source.path, f"frame {number}: no list 'people'", "write OpenPose JSON with --write_json, one file per frame")
-    found = []
+    detections = []
     for i, person in enumerate(people):
         where = f"frame {number}, person {i}"
         track = track_id(person.get("person_id", person.get("idx")))  # [-1] unless a tracker ran
         flat_2d = next((person[key] for key in ("pose_keypoints_2d", "pose_keypoints", "joints") if person.get(key)), None)
         if flat_2d:
-            found.append(Detection(*parse_flat_joints(source.path, f"{where}, pose_keypoints_2d", flat_2d), track))
+            detections.append(Detection(*parse_flat_joints(source.path, f"{where}, pose_keypoints_2d", flat_2d), track))
         elif person.get("pose_keypoints_3d"):
-            found.append(
+            detections.append(
                 Detection(*parse_flat_joints(source.path, f"{where}, pose_keypoints_3d", person["pose_keypoints_3d"], 4), track)
             )
-    return found
+    return detections
 
 
 def matches(source: Source) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import Clip, ClipSet
-from indexing.opening import LARGEST, clip_text, error, listing, shown, size_of
+from indexing.opening import LARGEST, clip_text, error, listing, quote, size_of
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.pickles import read_pickle
 from indexing.readers.recording import IntArray, NobodySeen, Recording, to_clips
@@ -49,21 +49,21 @@ def read(source: Source, options: Options) -> ClipSet:
             raise error(source.path, f"annotation {i}: the same array again and again", REMEDY)
         label = options.label if options.label is not None else _label(source, i, one)
         try:
-            found = to_clips(source.path, recording, replace(options, label=label))
+            recorded = to_clips(source.path, recording, replace(options, label=label))
         except NobodySeen as nothing:
             nobody = nothing
             continue
-        for clip in found:
-            who = clip.name[len(found.name) :]  # which person, where each has a clip
+        for clip in recorded:
+            who = clip.name[len(recorded.name) :]  # which person, where each has a clip
             clips.append(clip.replace(name=f"{name}{who}", meta={**clip.meta, **_about(one), **parts(name)}))
     if nobody is not None and not clips:
         raise nobody
     return ClipSet(clips, source.path.name)
 
 
-def _is_empty(one: Any) -> bool:
+def _is_empty(annotation: Any) -> bool:
     """Whether an annotation has no people: a detector found nobody."""
-    keypoint = one.get("keypoint") if isinstance(one, dict) else None
+    keypoint = annotation.get("keypoint") if isinstance(annotation, dict) else None
     return isinstance(keypoint, np.ndarray) and keypoint.ndim == 4 and keypoint.shape[0] == 0
 
 
@@ -73,12 +73,12 @@ def _annotation(source: Source, index: int, one: Any) -> tuple[Recording, str]:
         has = f"has {listing(one)}" if isinstance(one, dict) else f"is a {type(one).__name__}"
         raise error(source.path, f"annotation {index}: no array 'keypoint' (it {has})", REMEDY)
     name = clip_text(one["frame_dir"]) if isinstance(one.get("frame_dir"), str) else f"{source.path.stem}[{index}]"
-    where, keypoint = f"annotation {index} ({shown(name)})", one["keypoint"]
+    where, keypoint = f"annotation {index} ({quote(name)})", one["keypoint"]
     if keypoint.ndim == 3:
         keypoint = keypoint[None]
     if keypoint.ndim != 4 or keypoint.shape[3] not in (2, 3) or keypoint.dtype.kind not in "fiu" or not all(keypoint.shape):
-        said = f"{where}: keypoint must be (people, frames, joints, 2 or 3), got {keypoint.dtype} {keypoint.shape}"
-        raise error(source.path, said, REMEDY)
+        message = f"{where}: keypoint must be (people, frames, joints, 2 or 3), got {keypoint.dtype} {keypoint.shape}"
+        raise error(source.path, message, REMEDY)
     people, frames, joints, dims = keypoint.shape
     score = one.get("keypoint_score")
     if score is not None:
@@ -97,19 +97,19 @@ def _annotation(source: Source, index: int, one: Any) -> tuple[Recording, str]:
     return Recording(np.arange(frames), at, table, score, tracks, None, usual, up, could), name
 
 
-def _label(source: Source, index: int, one: dict[str, Any]) -> Hashable | None:
-    label = one.get("label")
+def _label(source: Source, index: int, annotation: dict[str, Any]) -> Hashable | None:
+    label = annotation.get("label")
     label = label.item() if isinstance(label, (np.generic, np.ndarray)) and label.size == 1 else label
     if label is None or isinstance(label, str) or (isinstance(label, int) and not isinstance(label, bool) and label < 2**63):
         return None if isinstance(label, int) and label < 0 else label
-    raise error(source.path, f"annotation {index}: label must be a number or text, got {shown(label)}", REMEDY)
+    raise error(source.path, f"annotation {index}: label must be a number or text, got {quote(label)}", REMEDY)
 
 
-def _about(one: dict[str, Any]) -> dict[str, Any]:
+def _about(annotation: dict[str, Any]) -> dict[str, Any]:
     """What else is known of a clip, where it is a number or a few."""
     about = {}
     for key in ("img_shape", "original_shape"):
-        value = one.get(key)
+        value = annotation.get(key)
         if isinstance(value, (tuple, list)) and len(value) == 2 and all(isinstance(side, (int, np.integer)) for side in value):
             about[key] = tuple(int(side) for side in value)
     return about
@@ -121,7 +121,7 @@ def _splits(source: Source, data: Any) -> Any:
     if split is None:
         return lambda name: {}
     if not isinstance(split, dict) or not all(isinstance(names, list) for names in split.values()):
-        raise error(source.path, f"split must be lists of names, got {shown(split)}", REMEDY)
+        raise error(source.path, f"split must be lists of names, got {quote(split)}", REMEDY)
     # one list may be every part of the set; a name, and a part of a clip's, take a byte of the file at least
     if sum(map(len, split.values())) + len(split) * len(data["annotations"]) > size_of(source.path):
         raise error(source.path, f"split has {len(split)} parts with more names than the file has bytes", REMEDY)

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import COARSEST, FINEST, ClipSet, is_number
-from indexing.opening import error, listing, parse_json, shown
+from indexing.opening import error, listing, parse_json, quote
 from indexing.readers.files import Format, Options, Source, read_columns
-from indexing.readers.hdf import Array, Hdf5, opened_hdf5
+from indexing.readers.hdf import Array, Hdf5, open_hdf5
 from indexing.readers.recording import Recording, frame_numbers, to_clips
 from indexing.skeleton import Skeleton
 
@@ -36,7 +36,7 @@ def read(source: Source, options: Options) -> ClipSet:
     """Read SLEAP's files; times are ``frame_idx`` / fps, the project's own fps where it knows it."""
     if source.kind == "csv":
         return to_clips(source.path, _csv(source), options)
-    with opened_hdf5(source.path) as file:
+    with open_hdf5(source.path) as file:
         recording = _project(file, options) if "instances" in file else _analysis(file)
     return to_clips(source.path, recording, options)
 
@@ -48,7 +48,7 @@ def _csv(source: Source) -> Recording:
     lacking = ["frame_idx"] * ("frame_idx" not in index) + [f"{node}.y" for node in nodes if f"{node}.y" not in index]
     if lacking or not nodes:
         raise error(
-            source.path, f"has no column {shown((lacking or ['<node>.x'])[0])}", "export with SLEAP's File > Export Analysis CSV"
+            source.path, f"has no column {quote((lacking or ['<node>.x'])[0])}", "export with SLEAP's File > Export Analysis CSV"
         )
     scored = all(f"{node}.score" in index for node in nodes)
     kinds = ("x", "y", "score") if scored else ("x", "y")
@@ -83,8 +83,8 @@ def _analysis(file: Hdf5) -> Recording:
     tracks = _axes(file, "tracks", ("frame", "track", "node", "xy"), ("track", "xy", "node", "frame"))
     frames, animals, points, axes = tracks.shape
     if axes not in (2, 3) or points != len(nodes) or (names and len(names) != animals) or not tracks.size:
-        said = f"tracks hold {animals} animals with {points} points of {axes} coordinates in {frames} frames"
-        raise error(file.path, f"{said}, but there are {len(nodes)} node_names and {len(names)} track_names", EXPORT)
+        message = f"tracks hold {animals} animals with {points} points of {axes} coordinates in {frames} frames"
+        raise error(file.path, f"{message}, but there are {len(nodes)} node_names and {len(names)} track_names", EXPORT)
     scores = None
     if "point_scores" in file:
         scores = _axes(file, "point_scores", ("frame", "track", "node"), ("track", "node", "frame"))
@@ -108,9 +108,9 @@ def _axes(file: Hdf5, name: str, wanted: Sequence[str], usual: Sequence[str]) ->
     text = file.text(name, "dims")
     order = parse_json(file.path, text, EXPORT, f"{name}@dims") if text else list(usual)
     if not isinstance(order, list) or sorted(map(str, order)) != sorted(wanted):
-        raise error(file.path, f"{name} has the axes {shown(order)}, not {', '.join(wanted)}", EXPORT)
+        raise error(file.path, f"{name} has the axes {quote(order)}, not {', '.join(wanted)}", EXPORT)
     if math.prod(file.shape(name)) > WIDEST_BLOCK:
-        raise error(file.path, f"{name} is {shown(file.shape(name))}, more animals and frames than any recording", EXPORT)
+        raise error(file.path, f"{name} is {quote(file.shape(name))}, more animals and frames than any recording", EXPORT)
     return file.array(name, len(wanted), "f").transpose([order.index(axis) for axis in wanted])
 
 
@@ -178,9 +178,11 @@ def _one_video(file: Hdf5, video: Array) -> float | None:
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         about, names = [], []
     if len(used) > 1:
-        told = listing(str(names[i]).replace("\\", "/").rpartition("/")[2] if i < len(names) else i for i in used)
+        video_names = listing(str(names[i]).replace("\\", "/").rpartition("/")[2] if i < len(names) else i for i in used)
         raise error(
-            file.path, f"has labels in {len(used)} videos ({told})", "export each video by itself: File > Export Analysis HDF5"
+            file.path,
+            f"has labels in {len(used)} videos ({video_names})",
+            "export each video by itself: File > Export Analysis HDF5",
         )
     try:
         fps = about[used[0]]["backend"].get("fps")
@@ -203,9 +205,9 @@ def _instances(file: Hdf5, frames: dict[str, Array], instances: dict[str, Array]
         hand = np.flatnonzero(kind[a:b] == HAND) + a
         if not len(hand):
             continue
-        rest = np.flatnonzero(kind[a:b] != HAND) + a
-        same = np.isin(track[rest], track[hand]) | (track[rest] < 0) | np.isin(rest, corrected[hand])
-        keep[rest[same]] = False
+        predicted = np.flatnonzero(kind[a:b] != HAND) + a
+        same = np.isin(track[predicted], track[hand]) | (track[predicted] < 0) | np.isin(predicted, corrected[hand])
+        keep[predicted[same]] = False
     return np.flatnonzero(keep)
 
 
@@ -225,12 +227,12 @@ def _points(file: Hdf5, instances: dict[str, Array], which: Array, nodes: int) -
     confidence = np.full((len(which), nodes), np.nan)
     version: Any = file.attribute("metadata", "format_id")
     shift = 0.5 if is_number(version) and version < SHIFTED else 0.0
-    for code, rows, found, start in tables:
+    for code, rows, records, start in tables:
         index = start[:, None] + np.arange(nodes)
-        xy = np.stack([found["x"], found["y"]], axis=1).astype(np.float64)[index] - shift
-        xy[~found["visible"][index].astype(bool)] = np.nan
+        xy = np.stack([records["x"], records["y"]], axis=1).astype(np.float64)[index] - shift
+        xy[~records["visible"][index].astype(bool)] = np.nan
         joints[rows] = xy
-        confidence[rows] = found["score"][index] if code == PREDICTED else 1.0
+        confidence[rows] = records["score"][index] if code == PREDICTED else 1.0
     return joints, _scores(joints, confidence) if (kind == PREDICTED).any() else None
 
 
@@ -238,13 +240,13 @@ def _own_points(
     file: Hdf5, table: str, code: int, instances: dict[str, Array], which: Array, nodes: int
 ) -> tuple[dict[str, Array], Array]:
     """A table of points, and where those of each animal begin; no two animals share points."""
-    found = file.records(table, ("x", "y", "visible", *(("score",) if code == PREDICTED else ())))
+    records = file.records(table, ("x", "y", "visible", *(("score",) if code == PREDICTED else ())))
     start, end = (instances[name][which].astype(np.int64) for name in ("point_id_start", "point_id_end"))
-    if (end - start != nodes).any() or start.min() < 0 or end.max() > len(found["x"]):
+    if (end - start != nodes).any() or start.min() < 0 or end.max() > len(records["x"]):
         raise error(file.path, f"{table}: an animal has no {nodes} points, as its skeleton has nodes", EXPORT)
-    if len(which) * nodes > len(found["x"]):
-        raise error(file.path, f"{table}: {len(which)} animals of {nodes} points share {len(found['x'])}", EXPORT)
-    return found, start
+    if len(which) * nodes > len(records["x"]):
+        raise error(file.path, f"{table}: {len(which)} animals of {nodes} points share {len(records['x'])}", EXPORT)
+    return records, start
 
 
 def _nodes(file: Hdf5, about: dict[str, Any], which: int) -> tuple[list[str], list[tuple[int, int]]]:
@@ -264,7 +266,7 @@ def _nodes(file: Hdf5, about: dict[str, Any], which: int) -> tuple[list[str], li
 def _edges(links: Any, place: dict[int, int]) -> list[tuple[int, int]]:
     """Bones of a skeleton; pairs of sides are links, too, of another type, which is written out where it comes first."""
     types: list[int] = []
-    found = []
+    bones = []
     try:
         for link in links:
             kind = link.get("type") or {"py/id": 1}
@@ -274,10 +276,10 @@ def _edges(links: Any, place: dict[int, int]) -> list[tuple[int, int]]:
             else:
                 value = types[int(kind["py/id"]) - 1] if types else 1
             if value == 1:
-                found.append((place[int(link["source"])], place[int(link["target"])]))
+                bones.append((place[int(link["source"])], place[int(link["target"])]))
     except (KeyError, IndexError, TypeError, ValueError, AttributeError):
         return []  # bones are a convenience
-    return found
+    return bones
 
 
 def _tracks(file: Hdf5) -> list[Hashable | None]:

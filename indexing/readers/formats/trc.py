@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from indexing.clip import COARSEST, FINEST, ClipSet, FloatArray
-from indexing.opening import WIDEST, error, first_duplicate, listing, read_text, shown
+from indexing.opening import WIDEST, error, first_duplicate, listing, quote, read_text
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.recording import IntArray, build_marker_recording, frame_numbers, to_clips
 
@@ -56,8 +56,8 @@ def read(source: Source, options: Options) -> ClipSet:
 def restore_steady_times(times: FloatArray, frames: IntArray, rate: float) -> FloatArray:
     """Times that are those of frames at a steady rate but for the digits that were written, exactly so; others as they are."""
     even = times[0] + (frames - frames[0]) / rate
-    apart = np.abs(times - even).max() * rate if np.isfinite(times).all() else np.inf
-    return even if MIN_ROUNDING < apart <= MAX_ROUNDING else times
+    rounding = np.abs(times - even).max() * rate if np.isfinite(times).all() else np.inf
+    return even if MIN_ROUNDING < rounding <= MAX_ROUNDING else times
 
 
 def _about(path: Path, lines: list[str]) -> dict[str, str]:
@@ -67,7 +67,7 @@ def _about(path: Path, lines: list[str]) -> dict[str, str]:
     about = dict(zip((word.strip().lower() for word in lines[1].split()), lines[2].split(), strict=False))
     about["units"] = about.get("units", "m").lower()
     if about["units"] not in UNITS:
-        raise error(path, f"line 3: Units is {shown(about['units'])}", f"write one of {', '.join(UNITS[:5])}")
+        raise error(path, f"line 3: Units is {quote(about['units'])}", f"write one of {', '.join(UNITS[:5])}")
     return about
 
 
@@ -82,8 +82,8 @@ def _names(path: Path, lines: list[str], count: str) -> tuple[list[str], int]:
     names = [cell.strip() for cell in cells[2:] if cell.strip()]
     twice = first_duplicate(names)
     if not names or twice is not None:
-        said = "names no markers" if not names else f"names the marker {shown(twice)} twice"
-        raise error(path, f"line {at + 1} {said}", "name every marker once")
+        message = "names no markers" if not names else f"names the marker {quote(twice)} twice"
+        raise error(path, f"line {at + 1} {message}", "name every marker once")
     if count.isdecimal() and count != str(len(names)):
         raise error(path, f"NumMarkers is {count[:9]}, but line {at + 1} names {len(names)} ({listing(names)})", REMEDY)
     return names, at + 1
@@ -97,17 +97,17 @@ def _row(path: Path, number: int, line: str, names: list[str]) -> FloatArray:
         raise error(path, f"line {number} has {len(cells)} cells, but there are {len(names)} markers", REMEDY)
     if len(cells) < 2:
         raise error(path, f"line {number} has no frame and time", "the file may be truncated: export it again")
-    found = np.full(width, np.nan)
+    values = np.full(width, np.nan)
     for column, cell in enumerate(cells[:width]):
         word = cell.strip()
         if word.lower() in MISSING:
             continue
         try:
-            found[column] = float(word)
+            values[column] = float(word)
         except ValueError:
             what = "Frame#" if column == 0 else "Time" if column == 1 else names[(column - 2) // 3]
-            raise error(path, f"line {number}, {shown(what)}: {shown(cell)} is no number", "correct it or leave it empty") from None
-    return found
+            raise error(path, f"line {number}, {quote(what)}: {quote(cell)} is no number", "correct it or leave it empty") from None
+    return values
 
 
 def _rate(path: Path, about: dict[str, str]) -> float | None:
@@ -116,7 +116,7 @@ def _rate(path: Path, about: dict[str, str]) -> float | None:
     except ValueError:
         return None
     if not COARSEST <= rate <= FINEST:
-        raise error(path, f"line 3: DataRate is {shown(about['datarate'])}", "write frames per second")
+        raise error(path, f"line 3: DataRate is {quote(about['datarate'])}", "write frames per second")
     return rate
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from indexing.clip import LARGEST, ClipSet, FloatArray
-from indexing.opening import VALUE, clip_text, error, parse_json, read_text, shown
+from indexing.opening import VALUE, clip_text, error, parse_json, quote, read_text
 from indexing.readers.files import Format, FrameFile, Options, Source
 from indexing.readers.recording import Detection, collect_detections, parse_numbers, to_clips, track_id
 from indexing.skeleton import usual_layout
@@ -92,7 +92,7 @@ def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
     odd = np.argwhere(~(np.abs(table) < LARGEST))
     if len(odd):
         file, n, words = lines[odd[0][0]]
-        raise error(file.path, f"line {n} holds {shown(words[odd[0][1]])}", TEXT_REMEDY)
+        raise error(file.path, f"line {n} holds {quote(words[odd[0][1]])}", TEXT_REMEDY)
     dims, extras = _layout(source, table)
     joints = table[:, 5 : width - extras].reshape(len(table), -1, dims)
     tracks = table[:, -1].astype(int).tolist() if _last_is_id(table, extras) else [None] * len(table)

@@ -34,8 +34,8 @@ KEEP_TIMES = "write .trc, .nc or .npz, which keep times"
 
 def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple[bytes, list[str]]:
     """The people of one recording, frame by frame at one rate, and what the format has no place for."""
-    found = markers_of(clips, path, units)
-    spaced, first = _even(found, path)
+    markers = markers_of(clips, path, units)
+    spaced, first = _resample_evenly(markers, path)
     frames, count = spaced.places.shape[:2]
     if count > WORD // 4:
         raise error(path, f"has {count} points, and C3D holds {WORD // 4}", "write .npz")
@@ -55,29 +55,29 @@ def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple
     return bytes(header) + parameters + body, list(spaced.notes)
 
 
-def _even(found: Markers, path: Path) -> tuple[Markers, int]:
+def _resample_evenly(markers: Markers, path: Path) -> tuple[Markers, int]:
     """All frames of a grid of even times, and the number of the first, from 1."""
-    rate, steps, off = _grid(found.times, found.rate)
+    rate, steps, off = _grid(markers.times, markers.rate)
     if off.max() > MAX_UNEVENNESS:  # frames left out of a faster recording, as of one of which every fifth is kept, or so
-        other = _grid(found.times, found.numbered)
-        rate, steps, off = other if other[2].max() <= MAX_UNEVENNESS else (rate, steps, off)
+        alternative = _grid(markers.times, markers.numbered)
+        rate, steps, off = alternative if alternative[2].max() <= MAX_UNEVENNESS else (rate, steps, off)
     if off.max() > MAX_UNEVENNESS:
         at = int(off.argmax())
-        what = f"times are uneven (frame {at} at {found.times[at]:.6g} s is {off[at]:.2g} frames off {rate:.6g} per second)"
+        what = f"times are uneven (frame {at} at {markers.times[at]:.6g} s is {off[at]:.2g} frames off {rate:.6g} per second)"
         raise error(path, f"{what}, and C3D has a rate only", KEEP_TIMES)
     if steps[-1] + 1 > max(MAX_GRID_RATIO * len(steps), MAX_GAP_FRAMES):
         raise error(path, f"is nearly all gap: {len(steps)} of {steps[-1] + 1} frames are there", KEEP_TIMES)
-    first = round(float(found.times[0]) * rate) + 1
-    notes = list(found.notes)
-    if not 1 <= first <= WORD or abs((first - 1) / rate - float(found.times[0])) > MAX_UNEVENNESS / rate:
+    first = round(float(markers.times[0]) * rate) + 1
+    notes = list(markers.notes)
+    if not 1 <= first <= WORD or abs((first - 1) / rate - float(markers.times[0])) > MAX_UNEVENNESS / rate:
         first = 1
-        notes.append(f"it begins at {found.times[0]:.6g} s, which is 0 in the file")
+        notes.append(f"it begins at {markers.times[0]:.6g} s, which is 0 in the file")
     absent = int(steps[-1]) + 1 - len(steps)
     if absent:
         notes.append(f"{absent} of {absent + len(steps)} frames are not there, and are written as if nothing was seen in them")
-    places = np.full((int(steps[-1]) + 1, *found.places.shape[1:]), np.nan, found.places.dtype)
-    places[steps] = found.places
-    return replace(found, places=places, rate=rate, notes=tuple(notes)), first
+    places = np.full((int(steps[-1]) + 1, *markers.places.shape[1:]), np.nan, markers.places.dtype)
+    places[steps] = markers.places
+    return replace(markers, places=places, rate=rate, notes=tuple(notes)), first
 
 
 def _grid(times: FloatArray, about: float) -> tuple[float, NDArray[np.int64], FloatArray]:
@@ -91,16 +91,16 @@ def _grid(times: FloatArray, about: float) -> tuple[float, NDArray[np.int64], Fl
     return rate, steps, off
 
 
-def _parameters(found: Markers, first: int, path: Path) -> bytes:
+def _parameters(markers: Markers, first: int, path: Path) -> bytes:
     """The groups POINT, TRIAL, ANALOG and MANUFACTURER, filled to whole blocks."""
-    frames, count = found.places.shape[:2]
+    frames, count = markers.places.shape[:2]
     last = first + frames - 1
-    right, upwards = SCREEN[found.up]
-    names = [_name(name, path) for name in found.names]
-    points = [_integers("USED", [count]), _reals("SCALE", [-1.0]), _reals("RATE", [found.rate])]
+    right, upwards = SCREEN[markers.up]
+    names = [_name(name, path) for name in markers.names]
+    points = [_integers("USED", [count]), _reals("SCALE", [-1.0]), _reals("RATE", [markers.rate])]
     # as many as a word says; of longer recordings programs look at LONG_FRAMES, or at the fields of TRIAL
     points += [_integers("FRAMES", [min(frames, WORD)]), _reals("LONG_FRAMES", [float(frames)])]
-    points += [_texts("UNITS", [found.units]), _texts("X_SCREEN", [right]), _texts("Y_SCREEN", [upwards])]
+    points += [_texts("UNITS", [markers.units]), _texts("X_SCREEN", [right]), _texts("Y_SCREEN", [upwards])]
     for begin in range(0, count, LABELS):
         more = "" if not begin else str(begin // LABELS + 1)
         points += [

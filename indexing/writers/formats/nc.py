@@ -73,18 +73,18 @@ def dataset_of(clips: Sequence[Clip], path: Path = Path("dataset")) -> Any:
 
 def _attributes(clip: Clip, unit: str) -> dict[str, Any]:
     """What movement expects, and what a clip knows besides: plain values only, as netCDF holds no others."""
-    found: dict[str, Any] = {"source_software": "dyntorch", "ds_type": "poses", "time_unit": unit, "up": clip.up}
+    attributes: dict[str, Any] = {"source_software": "dyntorch", "ds_type": "poses", "time_unit": unit, "up": clip.up}
     if unit == "seconds":
-        found["fps"] = float(clip.fps or 30.0)
+        attributes["fps"] = float(clip.fps or 30.0)
     if clip.name:
-        found["source_file"] = clip.name
+        attributes["source_file"] = clip.name
     if isinstance(clip.label, (str, int)):
-        found["label"] = clip.label
+        attributes["label"] = clip.label
     if clip.skeleton is not None:
-        found["skeleton"] = clip.skeleton.name
+        attributes["skeleton"] = clip.skeleton.name
         if clip.skeleton.bones:
-            found["bones"] = np.array(clip.skeleton.bones, dtype=np.int32).ravel()
-    return found
+            attributes["bones"] = np.array(clip.skeleton.bones, dtype=np.int32).ravel()
+    return attributes
 
 
 FORMAT = Writer(("movement",), encode)

@@ -16,21 +16,21 @@ if TYPE_CHECKING:
 
 def encode(clips: Sequence[Clip], path: Path, units: str | None = None) -> tuple[bytes, list[str]]:
     """The people of one recording as text, and what it has no place for."""
-    found = markers_of(clips, path, units)
-    numbers = frame_numbers(found.times, found.rate)
-    frames, count = found.places.shape[:2]
-    rate = repr(round(found.rate, 6))
+    markers = markers_of(clips, path, units)
+    numbers = frame_numbers(markers.times, markers.rate)
+    frames, count = markers.places.shape[:2]
+    rate = repr(round(markers.rate, 6))
     head = [
         ["PathFileType", "4", "(X/Y/Z)", path.name],
         ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"],
-        [rate, rate, str(frames), str(count), found.units, rate, str(numbers[0]), str(frames)],
-        ["Frame#", "Time", *(cell for name in found.names for cell in (name.replace("\t", " "), "", ""))],
+        [rate, rate, str(frames), str(count), markers.units, rate, str(numbers[0]), str(frames)],
+        ["Frame#", "Time", *(cell for name in markers.names for cell in (name.replace("\t", " "), "", ""))],
         ["", "", *(f"{axis}{i + 1}" for i in range(count) for axis in "XYZ")],
     ]
     lines = ["\t".join(row).rstrip("\t") if i < 4 else "\t".join(row) for i, row in enumerate(head)] + [""]
-    for number, time, places in zip(numbers, found.times.tolist(), found.places, strict=True):
+    for number, time, places in zip(numbers, markers.times.tolist(), markers.places, strict=True):
         lines.append("\t".join([str(number), repr(time), *_cells(places)]))
-    return ("\n".join(lines) + "\n").encode("utf-8", "backslashreplace"), list(found.notes)
+    return ("\n".join(lines) + "\n").encode("utf-8", "backslashreplace"), list(markers.notes)
 
 
 def frame_numbers(times: FloatArray, rate: float) -> list[int]:

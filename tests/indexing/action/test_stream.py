@@ -10,7 +10,7 @@ from indexing import ActionIndexer, Event, PhaseIndexer
 from indexing.action.exemplars import slide
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.scoring import events, probabilities, reject_threshold, smooth
-from indexing.windows import ragged
+from indexing.windows import concatenate_clips
 
 KNOWN = ("squat", "wave", "bow", "jumping_jack", "kick", "walk")
 ORDER = ("squat", "wave", "bow", "kick", "jumping_jack", "squat", "walk", "wave")
@@ -285,9 +285,9 @@ def test_phases_of_recordings_with_gaps():
 def test_short_windows_of_an_example_stay_inside_its_parts():
     clip = dataset([Person.random(0)], KNOWN[:1], azimuth=0.0, rng=0)[0]
     held = clip.replace(times=clip.times + np.where(clip.times > clip.duration / 2, 1.4, 0.0), fps=None)
-    source = ragged([held])
+    source = concatenate_clips([held])
     moments, owner = slide(source, 12, 0.5, 0.1)
-    whole, _ = slide(ragged([clip]), 12, 0.5, 0.1)
+    whole, _ = slide(concatenate_clips([clip]), 12, 0.5, 0.1)
     assert (owner == 0).all() and len(moments) < len(whole)
     speed = moments.values.diff(dim=1).square().sum((1, 2, 3))
     assert speed.min() > 0.1 * whole.values.diff(dim=1).square().sum((1, 2, 3)).min()  # none is a frozen pose

@@ -10,7 +10,7 @@ from indexing.archive.segments import ArchiveSegment, write_segment
 from indexing.archive.sketches import Candidates, Probe, correlation, orthonormal, refine_candidates, resembling, scan
 from indexing.archive.tracks import Layout, StorageFormat, tracks_of
 from indexing.clip import Clip
-from indexing.windows import ragged
+from indexing.windows import concatenate_clips
 
 STORAGE = StorageFormat()
 
@@ -61,7 +61,7 @@ def reference(segment, probe):
 def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=False, samples=4):
     rows = slice(round(begin * segment.rate), round((begin + seconds) * segment.rate) + 1)
     joints = segment.positions(track)[rows]
-    source = ragged([Clip(joints, times=np.arange(len(joints)) / segment.rate)])
+    source = concatenate_clips([Clip(joints, times=np.arange(len(joints)) / segment.rate)])
     return probe_of(source, 0, layout, segment.rate, tempo, samples, moving=moving)
 
 
@@ -208,7 +208,7 @@ def test_a_track_as_long_as_the_window_is_found_wherever_it_lies(tmp_path):
         tracks = [track for number, clip in enumerate(clips) for track in tracks_of(clip, STORAGE, number)]
         layout = Layout.learn(tracks, None, STORAGE)
         stored = ArchiveSegment.open(tmp_path / write_segment(tmp_path, tracks, layout, STORAGE).file)
-        source = ragged([Clip(stored.positions(1), times=np.arange(len(tracks[1])) / stored.rate)])
+        source = concatenate_clips([Clip(stored.positions(1), times=np.arange(len(tracks[1])) / stored.rate)])
         found = scan(stored, [probe_of(source, 0, layout, stored.rate, 1.0)], 10)
         assert found.track[0] == 1 and found.score[0] > 0.999
 

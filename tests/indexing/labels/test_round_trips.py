@@ -10,7 +10,7 @@ from random import Random
 import pytest
 
 from indexing.labels import Label, open_labels, write_labels
-from indexing.labels.label import in_order
+from indexing.labels.label import sort_key
 from indexing.opening import first_duplicate
 
 SUFFIX = {"boris": ".boris", "elan": ".eaf", "csv": ".csv", "tsv": ".tsv"}
@@ -85,7 +85,7 @@ def comparable(labels: list[Label], name: str) -> list[Label]:
         if name == "label_studio":
             label = replace(label, observation="" if label.observation == "dyntorch" else label.observation)
         out.append(replace(label, start=round(label.start, 6), end=round(label.end, 6)))
-    return sorted(out, key=lambda label: (in_order(label), repr(label)))
+    return sorted(out, key=lambda label: (sort_key(label), repr(label)))
 
 
 @pytest.mark.parametrize("seed", range(12))

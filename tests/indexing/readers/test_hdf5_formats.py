@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from indexing.readers import read, read_clip
-from indexing.readers.hdf import opened_hdf5
+from indexing.readers.hdf import open_hdf5
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17
 from tests.indexing.readers import tools
@@ -315,7 +315,7 @@ def test_texts_whose_lengths_cannot_be_seen_are_refused(where: str, person: np.n
     if where == "aside":
         with h5py.File(tmp_path / "b.slp", "w", userblock_size=512) as file:
             file.create_dataset("names", data=["A"], dtype=h5py.string_dtype())
-        with opened_hdf5(tmp_path / "b.slp") as file, pytest.raises(ValueError, match="text is kept in an uncommon way"):
+        with open_hdf5(tmp_path / "b.slp") as file, pytest.raises(ValueError, match="text is kept in an uncommon way"):
             file.texts("names")
         return
 
@@ -362,7 +362,7 @@ def test_many_texts_in_an_attribute_are_not_read(person: np.ndarray, tmp_path: P
     with h5py.File(path, "r+") as file:
         file.attrs.create("many", ["a", "b"], dtype=h5py.string_dtype())
         file.attrs["one"] = "a"
-    with opened_hdf5(path) as file:
+    with open_hdf5(path) as file:
         assert (file.attribute("/", "many"), file.attribute("/", "one")) == (None, "a")
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from indexing.cli.inputs import read_truth
-from indexing.opening import clip_text, parse_json, read_text, shown
+from indexing.opening import clip_text, parse_json, quote, read_text
 from indexing.readers import npz as npz_gate
 from indexing.readers import read
 from indexing.readers.formats.clipset import read_film_set
@@ -273,12 +273,12 @@ def test_parameters_of_c3d_are_held_against_the_file(tmp_path: Path) -> None:
 # ---- messages ------------------------------------------------------------------------------------------------------------
 def test_messages_are_short_and_of_one_line() -> None:
     assert clip_text("a\x1b[31m\nb") == "a?[31m b"
-    assert len(shown(10**4000)) < 60
-    assert len(shown([[["x" * 10**6]]] * 10**5)) <= 60
+    assert len(quote(10**4000)) < 60
+    assert len(quote([[["x" * 10**6]]] * 10**5)) <= 60
     deep: Any = []
     for _ in range(10_000):
         deep = [deep]
-    assert len(shown(deep)) <= 60
+    assert len(quote(deep)) <= 60
     with pytest.raises(ValueError, match=r"a\.json: frame 3: not valid JSON at line 1, column 1 \(Expecting value\); again"):
         parse_json("a.json", "", "again", "frame 3")
     with pytest.raises(ValueError, match="no file can have this name; check the path"):

@@ -33,7 +33,7 @@ def test_tables(tmp_path, text, ids):
 
 def test_columns_that_are_known(tmp_path):
     found = read_pair(table(tmp_path / "m.csv", "x1,y1,x2,y2,label,weight\n1,2,3,4,2,0.5\n5,,7,8,0,"))
-    assert found.known.tolist() == [2, 0] and found.weights.tolist() == [0.5, 0] and found.seen.tolist() == [True, False]
+    assert found.known.tolist() == [2, 0] and found.weights.tolist() == [0.5, 0] and found.complete.tolist() == [True, False]
 
 
 def test_arrays(tmp_path):

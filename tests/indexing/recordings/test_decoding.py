@@ -8,7 +8,7 @@ import pytest
 from indexing import ActionIndexer
 from indexing.action.exemplars import recurrence
 from indexing.actors import Person, dataset, detect, perform, stream
-from indexing.windows import ragged
+from indexing.windows import concatenate_clips
 
 KNOWN = ("squat", "wave", "bow", "kick", "walk")
 
@@ -66,7 +66,7 @@ def test_models_that_do_not_say_how_long_their_exemplars_last(indexer, three):
 def test_cycles_are_told_from_what_is_performed_once():
     person = Person.random(4)
     clips = [detect(perform(name, person, rng=1), azimuth=0.0, rng=1) for name in ("jumping_jack", "bow", "squat")]
-    jack, bow, squat = recurrence(ragged(clips)).tolist()
+    jack, bow, squat = recurrence(concatenate_clips(clips)).tolist()
     assert jack > 0.6 and bow < 0.4 and squat < 0.4
 
 

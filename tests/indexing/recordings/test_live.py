@@ -111,7 +111,7 @@ def test_memory_does_not_grow(indexer, seen):
         joints = clip.joints if i % 2 == 0 else clip.joints[::-1]
         for at in range(0, len(clip), 25):
             found += live.push(joints[at : at + 25], clip.times[at : at + 25] + i * (clip.times[-1] + 1 / 30)).events
-            kept.append(live.buffered)
+            kept.append(live.num_frames)
     assert max(kept) < 30 * (live.lag + 6.0) and max(kept[-50:]) <= max(kept[:50]) + 30
     assert len(found) >= 2 * len(truth)
     arrays = [value for value in vars(live).values() if isinstance(value, np.ndarray)]
@@ -196,9 +196,9 @@ def test_windows_say_what_they_say_in_the_whole(indexer, seen, monkeypatch):
     source = replace(indexer.stream().source, repair=False)
     live = ActionStream(source, None, clip.up, None)
     live.push(clip.joints[:300], clip.times[:300])
-    one = live._explained(live.buffered).one
+    one = live._decode(live.num_frames).one
     with torch.no_grad():
-        whole = whole_scores(live.source.model, one.lattice, lambda rows: one.cut(rows, indexer.length), live._durations)
+        whole = whole_scores(live.source.model, one.lattice, lambda rows: one.resample(rows, indexer.length), live._durations)
     assert np.array_equal(np.isnan(whole), np.isnan(one.whole))
     assert np.nanmax(np.abs(whole - one.whole)) < 1e-3
 
@@ -246,5 +246,5 @@ def test_time_does_not_go_back(indexer, seen):
     with pytest.raises(ValueError, match="comes after"):
         live.push(clip.joints[5], clip.times[5])
     live.push(clip.joints[10], clip.times[10])  # what was refused has left nothing behind
-    assert live.buffered == 11
+    assert live.num_frames == 11
     assert isinstance(live.latest().times[-1], float) and live.latest().times[-1] == clip.times[10]

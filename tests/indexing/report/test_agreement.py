@@ -34,7 +34,7 @@ def test_everything_is_written_and_says_the_same(tmp_path: Path) -> None:
     assert measured["by_recording"][1]["kappa"] == 0.0 and measured["notes"] == ["a note"]
     table = list(csv.reader((page.parent / "confusion.csv").open(encoding="utf-8")))
     assert table[0] == ["known \\ found", "<b>jump</b>", "'=wave", "kick", "squat", "(none)"]
-    assert sum(float(cell) for row in table[1:] for cell in row[1:]) == pytest.approx(both.compared)
+    assert sum(float(cell) for row in table[1:] for cell in row[1:]) == pytest.approx(both.total_seconds)
     text = page.read_text(encoding="utf-8")
     assert "&lt;b&gt;jump" in text and "<b>jump" not in text and "<script" not in text and "b.json, person 2" in text
     assert f"{both.kappa:.3f}" in text and "a note" in text

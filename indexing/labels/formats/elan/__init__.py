@@ -18,9 +18,9 @@ from xml.sax.saxutils import escape, quoteattr
 from indexing.files import write_bytes
 from indexing.labels.format import LabelFormat, Request, Target, base_name, correction_error, of_recording, seal
 from indexing.labels.formats.elan.reading import MACHINE, REMEDY, media_of, read, tier_of
-from indexing.labels.label import Label, in_order, list_spots
+from indexing.labels.label import Label, list_spots, sort_key
 from indexing.labels.markup import Placed, parse_xml
-from indexing.opening import count, error, listing, read_bytes, shown
+from indexing.opening import count, error, listing, quote, read_bytes
 
 ENCODING = re.compile(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([^\"']*)")
 NUMBERED = re.compile(r" \(\d+\)$")
@@ -126,8 +126,8 @@ class Document:
 def write(labels: Sequence[Label], target: Target) -> list[str]:
     """Write an ELAN file, or tiers into one."""
     if len(target.media) > 1:
-        said = f"an ELAN file is of one recording, and these labels are of {len(target.media)} ({listing(target.media)})"
-        raise error(target.path, said, "write a file for each")
+        message = f"an ELAN file is of one recording, and these labels are of {len(target.media)} ({listing(target.media)})"
+        raise error(target.path, message, "write a file for each")
     media = target.media[0] if target.media else ""
     document = Document(target.into or target.path, _empty(target, media) if target.into is None else read_bytes(target.into))
     rows, notices = _rows(labels, target, _origin(document, target, media))
@@ -140,8 +140,8 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
     parse_xml(target.path, bytes(data), lambda placed, parent: True)  # what was put together is sound, or nothing is written
     if not target.dry:
         write_bytes(target.path, bytes(data))
-    kept = {"comment": "comments", "modifiers": "modifiers", "score": "scores", "observation": "observations"}
-    lost = [what for name, what in kept.items() if any(getattr(label, name) not in ("", (), None) for label in labels)]
+    fields = {"comment": "comments", "modifiers": "modifiers", "score": "scores", "observation": "observations"}
+    lost = [what for name, what in fields.items() if any(getattr(label, name) not in ("", (), None) for label in labels)]
     return notices + [f"ELAN keeps no {' and no '.join(lost)}"] * bool(lost)
 
 
@@ -149,9 +149,9 @@ def _empty(target: Target, media: str) -> bytes:
     """A document without tiers."""
     held = ""
     if media:
-        whole = Path(os.path.expanduser(media))
-        address = whole.absolute().as_uri() if "://" not in media else media
-        kind = MIME.get(whole.suffix.lower(), "unknown")
+        file = Path(os.path.expanduser(media))
+        address = file.absolute().as_uri() if "://" not in media else media
+        kind = MIME.get(file.suffix.lower(), "unknown")
         held = f"{LINE}    <MEDIA_DESCRIPTOR MEDIA_URL={quoteattr(address)} MIME_TYPE={quoteattr(kind)}"
         held += f" RELATIVE_MEDIA_URL={quoteattr('./' + base_name(media))}/>"
     date = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
@@ -160,16 +160,16 @@ def _empty(target: Target, media: str) -> bytes:
 
 def _origin(document: Document, target: Target, media: str) -> float:
     """What the recording's clock shows when that of the document shows 0, in milliseconds."""
-    known = media_of(document.root)
-    mine = of_recording([name for name, *_ in known], Request(document.path, media or None, target.name))
-    return next((origin for name, _, origin in known if mine is None or name in mine), 0.0)
+    media_entries = media_of(document.root)
+    mine = of_recording([name for name, *_ in media_entries], Request(document.path, media or None, target.name))
+    return next((origin for name, _, origin in media_entries if mine is None or name in mine), 0.0)
 
 
 def _rows(labels: Sequence[Label], target: Target, origin: float) -> tuple[list[TierRow], list[str]]:
     """The tiers to write: one a person, more where labels overlap."""
     rows: dict[tuple[str, str], list[TierRow]] = {}
     early = []
-    for label in sorted(labels, key=in_order):
+    for label in sorted(labels, key=sort_key):
         begin, end = (round(1000 * time - origin) for time in (label.start, label.end))
         if begin < 0:
             early.append(label)
@@ -186,8 +186,8 @@ def _rows(labels: Sequence[Label], target: Target, origin: float) -> tuple[list[
         row.annotations.append((begin, end, label.label))
     if not labels:  # nothing was found: that is what the tier says
         rows[target.tier, ""] = [TierRow(target.tier, target.tier, "", [])]
-    said = f"{count(len(early), 'label')} left out: before the time at which the ELAN file begins ({list_spots(early)})"
-    return [row for group in rows.values() for row in group], [said] * bool(early)
+    message = f"{count(len(early), 'label')} left out: before the time at which the ELAN file begins ({list_spots(early)})"
+    return [row for group in rows.values() for row in group], [message] * bool(early)
 
 
 # ---- edits ---------------------------------------------------------------------------------------------------------------
@@ -249,7 +249,7 @@ def _check_unchanged(document: Document, target: Target, old: Sequence[Placed]) 
         ours = document.ours.get(part.element, ())
         there = [(document.times.get(begin, 0), document.times.get(end, 0), value) for begin, end, value in ours]
         if tier.annotator != f"{MACHINE} {_seal(tier.name, tier.participant, layers, there)}":
-            raise correction_error(target, f"tier {shown(tier.name)}")
+            raise correction_error(target, f"tier {quote(tier.name)}")
 
 
 def _check_free(document: Document, old: Sequence[Placed], rows: Sequence[TierRow]) -> None:
@@ -258,10 +258,10 @@ def _check_free(document: Document, old: Sequence[Placed], rows: Sequence[TierRo
     for part in document.parts("TIER"):
         tier = tier_of(part.element)
         if tier.name not in gone and any(row.name == tier.name for row in rows):
-            raise error(document.path, f"somebody's tier is called {shown(tier.name)}", "rename it, or write to another file")
+            raise error(document.path, f"somebody's tier is called {quote(tier.name)}", "rename it, or write to another file")
         if tier.name not in gone and tier.parent in gone:
-            said = f"tier {shown(tier.name)} hangs on {shown(tier.parent)}, which would be replaced"
-            raise error(document.path, said, "free that tier in ELAN, or write to another file")
+            message = f"tier {quote(tier.name)} hangs on {quote(tier.parent)}, which would be replaced"
+            raise error(document.path, message, "free that tier in ELAN, or write to another file")
 
 
 def _number(prefix: str, name: str) -> int:
@@ -274,8 +274,8 @@ def _into_order(document: Document, order: Placed, slots: str) -> Edit:
     """New time slots, after those that are there."""
     text = document.data[order.first : order.last]
     if text.endswith(b"/>"):
-        whole = text[:-2].rstrip() + f">{slots}{LINE}</TIME_ORDER>".encode() if slots else text
-        return Edit(order.first, order.last, whole)
+        element = text[:-2].rstrip() + f">{slots}{LINE}</TIME_ORDER>".encode() if slots else text
+        return Edit(order.first, order.last, element)
     at = order.first + text.rindex(b"</")
     while document.data[at - 1 : at].isspace():
         at -= 1

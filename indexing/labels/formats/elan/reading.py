@@ -18,7 +18,7 @@ from xml.etree.ElementTree import Element
 from indexing.labels.format import Gathering, Request, base_name, of_recording, parse_whole
 from indexing.labels.label import NUM_NAMED, LabelFile
 from indexing.labels.markup import Placed, parse_xml
-from indexing.opening import clip_text, count, error, first_duplicate, listing, read_bytes, shown
+from indexing.opening import clip_text, count, error, first_duplicate, listing, quote, read_bytes
 
 
 def read(_: Any, asked: Request) -> LabelFile:
@@ -30,10 +30,10 @@ def read(_: Any, asked: Request) -> LabelFile:
         raise error(asked.path, f"is XML, but no ELAN file (its root is {clip_text(root.tag, 40)})", "export an .eaf from ELAN")
     units = next((head.get("TIME_UNITS", "milliseconds") for head in root.iterfind("HEADER")), "milliseconds")
     if units != "milliseconds":
-        raise error(asked.path, f"TIME_UNITS is {shown(units)}, not milliseconds", "save it again in a newer ELAN")
+        raise error(asked.path, f"TIME_UNITS is {quote(units)}, not milliseconds", "save it again in a newer ELAN")
     tiers = _tiers(asked, root, parts)
-    place(out, tiers, parts.slots)
-    take_over(asked, tiers, constraints(root))
+    assign_times(out, tiers, parts.slots)
+    inherit_times(asked, tiers, constraints(root))
     media, origin = _medium(out, root)
     for tier in tiers:
         out.tiers.setdefault(tier.plain_name)
@@ -68,8 +68,8 @@ class TierParts:
         if parent.tag == "TIME_ORDER":
             self._slot(placed.element)
         elif parent.tag == "TIER" and placed.element.tag == "ANNOTATION":
-            found = self.annotations.setdefault(parent, [])
-            found += [_annotation(self.asked, parent.get("TIER_ID", ""), one) for one in placed.element]
+            annotations = self.annotations.setdefault(parent, [])
+            annotations += [_annotation(self.asked, parent.get("TIER_ID", ""), one) for one in placed.element]
         else:
             return False
         return True
@@ -77,22 +77,22 @@ class TierParts:
     def _slot(self, slot: Element) -> None:
         name, value = slot.get("TIME_SLOT_ID", ""), slot.get("TIME_VALUE")
         if name in self.slots:
-            raise error(self.asked.path, f"time slot {shown(name)} is there twice", REMEDY)
+            raise error(self.asked.path, f"time slot {quote(name)} is there twice", REMEDY)
         number = None if value is None else parse_whole(value)
         if value is not None and number is None:
-            said = f"time slot {shown(name)}: TIME_VALUE {shown(value)} is no whole number of milliseconds"
-            raise error(self.asked.path, said, REMEDY)
+            message = f"time slot {quote(name)}: TIME_VALUE {quote(value)} is no whole number of milliseconds"
+            raise error(self.asked.path, message, REMEDY)
         self.slots[name] = number
 
 
 def vocabulary(root: Element) -> dict[str, str]:
     """Values of the entries of controlled vocabularies, by id."""
-    found = {}
+    values = {}
     for entry in root.iter("CV_ENTRY_ML"):
         value = entry.find("CVE_VALUE")
         if value is not None and value.text:
-            found[entry.get("CVE_ID", "")] = value.text
-    return found
+            values[entry.get("CVE_ID", "")] = value.text
+    return values
 
 
 def constraints(root: Element) -> dict[str, str]:
@@ -103,27 +103,27 @@ def constraints(root: Element) -> dict[str, str]:
 def _tiers(asked: Request, root: Element, parts: TierParts) -> list[Tier]:
     """All tiers; their names and the ids of their annotations differ, their parents are there."""
     values = vocabulary(root)
-    found = []
+    tiers = []
     for element in root.iterfind("TIER"):
         tier = tier_of(element)
         tier.annotations = parts.annotations.get(element, [])
         for one in tier.annotations:
             if not one.value.strip():
                 one.value = values.get(one.entry, "")
-        found.append(tier)
-    twice = first_duplicate(tier.name for tier in found)
+        tiers.append(tier)
+    twice = first_duplicate(tier.name for tier in tiers)
     if twice is not None:
-        raise error(asked.path, f"two tiers are called {shown(twice)}", "rename one (ELAN: Tier > Change Tier Attributes)")
-    _check_parents(asked, found)
+        raise error(asked.path, f"two tiers are called {quote(twice)}", "rename one (ELAN: Tier > Change Tier Attributes)")
+    _check_parents(asked, tiers)
     kinds = constraints(root)
-    lost = next((tier for tier in found if tier.kind and tier.kind not in kinds), None)
+    lost = next((tier for tier in tiers if tier.kind and tier.kind not in kinds), None)
     if lost is not None:
-        said = f"tier {shown(lost.name)}: its linguistic type {shown(lost.kind)} is not there"
-        raise error(asked.path, said, "give it another one (ELAN: Tier > Change Tier Attributes)")
-    same = first_duplicate(one.name for tier in found for one in tier.annotations)
+        message = f"tier {quote(lost.name)}: its linguistic type {quote(lost.kind)} is not there"
+        raise error(asked.path, message, "give it another one (ELAN: Tier > Change Tier Attributes)")
+    same = first_duplicate(one.name for tier in tiers for one in tier.annotations)
     if same is not None:
-        raise error(asked.path, f"two annotations have the id {shown(same)}", REMEDY)
-    return found
+        raise error(asked.path, f"two annotations have the id {quote(same)}", REMEDY)
+    return tiers
 
 
 def tier_of(element: Element) -> Tier:
@@ -140,9 +140,9 @@ def _check_parents(asked: Request, tiers: Sequence[Tier]) -> None:
         seen: dict[str, None] = {}
         while name not in fine:
             if name not in above:
-                raise error(asked.path, f"tier {shown(next(reversed(seen)))}: its parent tier {shown(name)} is not there", REMEDY)
+                raise error(asked.path, f"tier {quote(next(reversed(seen)))}: its parent tier {quote(name)} is not there", REMEDY)
             if name in seen:
-                raise error(asked.path, f"tier {shown(name)} is its own parent, by way of {listing(seen, 4)}", REMEDY)
+                raise error(asked.path, f"tier {quote(name)} is its own parent, by way of {listing(seen, 4)}", REMEDY)
             seen[name] = None
             name = above[name]
         fine.update(seen)
@@ -156,31 +156,31 @@ def _annotation(asked: Request, tier: str, element: Element) -> Annotation:
         return Annotation(name, text, (element.get("TIME_SLOT_REF1", ""), element.get("TIME_SLOT_REF2", "")), entry=entry)
     if element.tag == "REF_ANNOTATION":
         return Annotation(name, text, None, element.get("ANNOTATION_REF", ""), element.get("PREVIOUS_ANNOTATION", ""), entry)
-    raise error(asked.path, f"tier {shown(tier)}: holds {clip_text(element.tag, 40)}, which is no annotation", REMEDY)
+    raise error(asked.path, f"tier {quote(tier)}: holds {clip_text(element.tag, 40)}, which is no annotation", REMEDY)
 
 
 def media_of(root: Element) -> list[tuple[str, str, float]]:
     """Name, address and origin (milliseconds) of each medium; the whole address is the name where two files have the same."""
-    found = []
+    entries = []
     for one in root.iterfind("HEADER/MEDIA_DESCRIPTOR"):
         address = one.get("MEDIA_URL") or one.get("RELATIVE_MEDIA_URL") or ""
-        found.append((base_name(address), address, float(parse_whole(one.get("TIME_ORIGIN", "0")) or 0)))
-    if not found:
+        entries.append((base_name(address), address, float(parse_whole(one.get("TIME_ORIGIN", "0")) or 0)))
+    if not entries:
         old = next((head.get("MEDIA_FILE", "") for head in root.iterfind("HEADER")), "")
-        found = [(base_name(old), old, 0.0)] if old else []
-    names = [name for name, *_ in found]
-    return [(name if names.count(name) == 1 else address, address, origin) for name, address, origin in found]
+        entries = [(base_name(old), old, 0.0)] if old else []
+    names = [name for name, *_ in entries]
+    return [(name if names.count(name) == 1 else address, address, origin) for name, address, origin in entries]
 
 
 def _medium(out: Gathering, root: Element) -> tuple[str, float]:
     """The medium that is the recording, or the first, and its origin in milliseconds."""
-    known = media_of(root)
-    out.media.update(dict.fromkeys(name for name, *_ in known))
+    entries = media_of(root)
+    out.media.update(dict.fromkeys(name for name, *_ in entries))
     mine = of_recording(out.media, out.asked)
-    name, _, origin = next((one for one in known if mine is None or one[0] in mine), ("", "", 0.0))
-    if mine is None and len({origin for *_, origin in known}) > 1:
+    name, _, origin = next((one for one in entries if mine is None or one[0] in mine), ("", "", 0.0))
+    if mine is None and len({origin for *_, origin in entries}) > 1:
         out.note(f"has media that begin at other times ({listing(out.media)}); times are those of {name}")
-    if not known and out.asked.recording is not None:
+    if not entries and out.asked.recording is not None:
         out.note(f"names no media file; its clock is taken for that of {out.asked.recording}")
     return name, origin
 
@@ -233,23 +233,23 @@ class Tier:
         return plain.removesuffix(f"@{self.participant}") if self.participant else plain
 
 
-def place(out: Gathering, tiers: Sequence[Tier], slots: Mapping[str, float | None]) -> None:
+def assign_times(out: Gathering, tiers: Sequence[Tier], slots: Mapping[str, float | None]) -> None:
     """Give annotations the times of their slots; those of slots without one lie evenly between their neighbours."""
-    known = {name: time for name, time in slots.items() if time is not None}
+    times = {name: time for name, time in slots.items() if time is not None}
     for tier in tiers:
         for one in tier.annotations:
             for slot in one.slots or ():
                 if slot not in slots:
-                    said = f"tier {shown(tier.name)}, annotation {one.name}: its time slot {shown(slot)} is not there"
-                    raise error(out.asked.path, said, REMEDY)
-    between = _fill(tiers, known, slots) if len(known) < len(slots) else 0
+                    message = f"tier {quote(tier.name)}, annotation {one.name}: its time slot {quote(slot)} is not there"
+                    raise error(out.asked.path, message, REMEDY)
+    between = _fill(tiers, times, slots) if len(times) < len(slots) else 0
     nowhere = []
     for tier in tiers:
         for one in tier.annotations:
             if one.slots is None:
                 continue
-            if one.slots[0] in known and one.slots[1] in known:
-                one.time = known[one.slots[0]], known[one.slots[1]]
+            if one.slots[0] in times and one.slots[1] in times:
+                one.time = times[one.slots[0]], times[one.slots[1]]
             else:
                 nowhere.append(f"{one.name} of {tier.name}")
     if between:
@@ -258,44 +258,44 @@ def place(out: Gathering, tiers: Sequence[Tier], slots: Mapping[str, float | Non
         out.note(f"{count(len(nowhere), 'annotation')} left out: without a time ({listing(nowhere, NUM_NAMED)})")
 
 
-def _fill(tiers: Sequence[Tier], known: dict[str, float], slots: Mapping[str, float | None]) -> int:
+def _fill(tiers: Sequence[Tier], times: dict[str, float], slots: Mapping[str, float | None]) -> int:
     """Times of slots that nobody set; of how many at which annotations begin or end."""
     for tier in tiers:
-        _interpolate(tier, known)
-    _between_neighbours(known, list(slots))
+        _interpolate(tier, times)
+    _between_neighbours(times, list(slots))
     used = {slot for tier in tiers for one in tier.annotations for slot in one.slots or ()}
-    return sum(slots[slot] is None and slot in known for slot in used)
+    return sum(slots[slot] is None and slot in times for slot in used)
 
 
-def _interpolate(tier: Tier, known: dict[str, float]) -> None:
+def _interpolate(tier: Tier, times: dict[str, float]) -> None:
     """Times of slots at which one annotation of a tier ends and the next begins."""
     following = {one.slots[0]: one.slots[1] for one in tier.annotations if one.slots is not None}
     for one in tier.annotations:
-        if one.slots is None or one.slots[0] not in known or one.slots[1] in known:
+        if one.slots is None or one.slots[0] not in times or one.slots[1] in times:
             continue
         chain = [*one.slots]
-        while chain[-1] not in known and chain[-1] in following and len(chain) <= len(following) + 1:
+        while chain[-1] not in times and chain[-1] in following and len(chain) <= len(following) + 1:
             chain.append(following[chain[-1]])
-        if chain[-1] in known:
-            first, last, parts = known[chain[0]], known[chain[-1]], len(chain) - 1
+        if chain[-1] in times:
+            first, last, parts = times[chain[0]], times[chain[-1]], len(chain) - 1
             for number, slot in enumerate(chain[1:-1], start=1):
-                known[slot] = first + (last - first) * number / parts
+                times[slot] = first + (last - first) * number / parts
 
 
-def _between_neighbours(known: dict[str, float], order: Sequence[str]) -> None:
+def _between_neighbours(times: dict[str, float], order: Sequence[str]) -> None:
     """Times of slots that no chain of annotations leads to: evenly between those before and after them in the file."""
     last = -1
     for at, name in enumerate(order):
-        if name not in known:
+        if name not in times:
             continue
-        if last >= 0 and at - last > 1 and known[order[last]] <= known[name]:
-            first, step = known[order[last]], (known[name] - known[order[last]]) / (at - last)
+        if last >= 0 and at - last > 1 and times[order[last]] <= times[name]:
+            first, step = times[order[last]], (times[name] - times[order[last]]) / (at - last)
             for number in range(last + 1, at):
-                known[order[number]] = first + step * (number - last)
+                times[order[number]] = first + step * (number - last)
         last = at
 
 
-def take_over(asked: Request, tiers: Sequence[Tier], asks: dict[str, str]) -> None:
+def inherit_times(asked: Request, tiers: Sequence[Tier], asks: dict[str, str]) -> None:
     """Give annotations of symbolic tiers the time of their parent, or their share of it."""
     by_name = {one.name: one for tier in tiers for one in tier.annotations}
     home = {one.name: tier for tier in tiers for one in tier.annotations}
@@ -321,13 +321,13 @@ def _upwards(
     """An annotation and those above it, up to one whose time is settled."""
     seen: set[str] = set()
     while one.name not in settled:
-        where = f"tier {shown(home[one.name].name)}, annotation {one.name}"
+        where = f"tier {quote(home[one.name].name)}, annotation {one.name}"
         if one.name in seen:
             raise error(asked.path, f"{where}: it is its own parent, by way of {listing(seen, 4)}", REMEDY)
         seen.add(one.name)
         yield one
         if one.parent not in by_name:
-            raise error(asked.path, f"{where}: its parent {shown(one.parent)} is not there", REMEDY)
+            raise error(asked.path, f"{where}: its parent {quote(one.parent)} is not there", REMEDY)
         one = by_name[one.parent]
 
 
@@ -336,7 +336,7 @@ def _shares(asked: Request, tier: Tier) -> dict[str, tuple[int, int]]:
     families: dict[str, list[Annotation]] = {}
     for one in tier.annotations:
         families.setdefault(one.parent, []).append(one)
-    found = {}
+    shares = {}
     for family in families.values():
         after = {one.previous: one for one in family if one.previous}
         chain: list[Annotation] = []
@@ -346,9 +346,9 @@ def _shares(asked: Request, tier: Tier) -> dict[str, tuple[int, int]]:
                 chain.append(link)
                 link = after.get(link.name)
         if len(chain) != len(family):
-            told = {one.name for one in chain}
-            lost = next(one for one in family if one.name not in told)
-            where = f"tier {shown(tier.name)}, annotation {lost.name}"
-            raise error(asked.path, f"{where}: that before it, {shown(lost.previous)}, is not of the same parent", REMEDY)
-        found.update({one.name: (number, len(chain)) for number, one in enumerate(chain)})
-    return found
+            chained = {one.name for one in chain}
+            lost = next(one for one in family if one.name not in chained)
+            where = f"tier {quote(tier.name)}, annotation {lost.name}"
+            raise error(asked.path, f"{where}: that before it, {quote(lost.previous)}, is not of the same parent", REMEDY)
+        shares.update({one.name: (number, len(chain)) for number, one in enumerate(chain)})
+    return shares
