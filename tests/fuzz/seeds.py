@@ -402,7 +402,7 @@ def _tracks(folder: Path) -> list[Seed]:
 
     def read(path: Path) -> Any:
         found = read_tracks([path], key="a" if path.name == "tracks_c.npz" else None)
-        _ = found.since_first().seen(), found.views
+        _ = found.since_first().drop_short(), found.views
         return found
 
     def marked(path: Path) -> Any:

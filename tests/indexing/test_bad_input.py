@@ -13,33 +13,26 @@ def good(seed=0, **known):
     return Clip(np.random.default_rng(seed).normal(size=(FRAMES, JOINTS, 2)).cumsum(axis=0), **known)
 
 
-def bad_array(kind):
-    x = good().joints.copy()
-    return {
-        "two axes": x[:, 0],
-        "five axes": x[None, None],
-        "four coordinates": np.concatenate([x, x], axis=2),
-        "no frames": x[:0],
-        "one frame": x[:1],
-        "fewer joints": x[:, :5],
-        "all zero": 0 * x,
-        "all NaN": np.nan * x,
-        "constant": 0 * x + 3,
-        "infinite": np.where(np.arange(FRAMES)[:, None, None] == 3, np.inf, x),
-        "text": "squat.json",
-        "a number": 3.0,
-        "nothing": None,
-        "words": [[["a", "b"]] * JOINTS] * FRAMES,
-        "ragged": [[[1.0, 2.0]], [[1.0, 2.0], [3.0, 4.0]]],
-        "complex": x * 1j,
-        "a dictionary": {"joints": x},
-    }[kind]
-
-
-KINDS = (
-    "two axes", "five axes", "four coordinates", "no frames", "one frame", "fewer joints", "all zero", "all NaN", "constant",
-    "infinite", "text", "a number", "nothing", "words", "ragged", "complex", "a dictionary",
-)  # fmt: skip
+X = good().joints.copy()
+BAD_ARRAYS = {
+    "two axes": X[:, 0],
+    "five axes": X[None, None],
+    "four coordinates": np.concatenate([X, X], axis=2),
+    "no frames": X[:0],
+    "one frame": X[:1],
+    "fewer joints": X[:, :5],
+    "all zero": 0 * X,
+    "all NaN": np.nan * X,
+    "constant": 0 * X + 3,
+    "infinite": np.where(np.arange(FRAMES)[:, None, None] == 3, np.inf, X),
+    "text": "squat.json",
+    "a number": 3.0,
+    "nothing": None,
+    "words": [[["a", "b"]] * JOINTS] * FRAMES,
+    "ragged": [[[1.0, 2.0]], [[1.0, 2.0], [3.0, 4.0]]],
+    "complex": X * 1j,
+    "a dictionary": {"joints": X},
+}
 
 
 def state(indexer):
@@ -65,9 +58,9 @@ def unchanged(indexer, others, before):
 
 
 # ---- clips -------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BAD_ARRAYS)
 def test_bad_clips_are_named_everywhere(kind, unchanged):
-    bad = bad_array(kind)
+    bad = BAD_ARRAYS[kind]
     clips = [good(0), good(1), bad]
     for verb in (
         lambda: unchanged.fit(clips, ["a", "b", "a"]),

@@ -1,12 +1,19 @@
 """Joints are matched by name: the order in which a file lists them means nothing."""
 
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from indexing import ActionIndexer, Clip, PhaseIndexer
+from indexing import ActionIndexer, Clip, ClipSet, PhaseIndexer
 from indexing.actors import Person, dataset, detect, stream
-from indexing.joints import canonical, layout_of, match_joints, places
+from indexing.joints import canonical, layout_of, match_joints, places, rank_layouts, recognize_layout
+from indexing.readers import read, read_clip
 from indexing.skeleton import (
+    BLAZEPOSE33,
     BODY25,
     BODY25B,
     COCO17,
@@ -16,10 +23,15 @@ from indexing.skeleton import (
     HAND21,
     KINECT20,
     LAYOUTS,
+    MEDIAPIPE33,
     NTU25,
     WHOLEBODY133,
     Skeleton,
+    candidates,
+    layout_named,
+    usual_layout,
 )
+from tests.indexing.readers import tools
 
 KNOWN = ("squat", "wave", "jumping_jack")
 ORDER = np.random.default_rng(0).permutation(17)
@@ -160,3 +172,187 @@ def test_openpose_layouts_share_what_they_share():
         (a.name, b.name): sum(i >= 0 for i in places(a, b)) for a in (BODY25, BODY25B, HALPE26) for b in (BODY25, BODY25B, HALPE26)
     }
     assert found["BODY_25", "Halpe-26"] == 25 and found["BODY_25B", "Halpe-26"] == 24 and found["BODY_25", "BODY_25B"] == 23
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Layouts: by the names of a file, by what a body looks like where there are none, or as a person says
+
+
+BODIES = [layout for layout in LAYOUTS.values() if layout not in (HAND21, BLAZEPOSE33)]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=lambda layout: layout.name)
+def test_layouts_are_whole(layout: Skeleton) -> None:
+    assert len(set(layout.joints)) == len(layout.joints)
+    connected = {i for bone in layout.bones for i in bone}
+    assert {joint for i, joint in enumerate(layout.joints) if i not in connected and not joint.startswith(("face", "mouth"))} <= {
+        *("left_eye_inner", "left_eye_outer", "right_eye_inner", "right_eye_outer", "left_pinky", "right_pinky", "left_thumb"),
+        *("right_thumb", "left_hip", "right_hip"),
+    }
+    swapped = {joint.replace("left", "*").replace("right", "left").replace("*", "right") for joint in layout.joints}
+    assert swapped == set(layout.joints)  # whoever has a left one has a right one
+    pairs = {frozenset(layout.joints[i] for i in bone) for bone in layout.bones}
+    mirrored = {frozenset(j.replace("left", "*").replace("right", "left").replace("*", "right") for j in pair) for pair in pairs}
+    assert mirrored == pairs
+    assert layout_named(layout.name.lower().replace("-", "")) is layout
+
+
+def test_numbers_of_joints() -> None:
+    sizes = {layout.name: len(layout.joints) for layout in LAYOUTS.values()}
+    assert sizes == {
+        "COCO-17": 17, "H36M-17": 17, "BODY_25": 25, "BODY_25B": 25, "NTU-25": 25, "Kinect-20": 20, "Halpe-26": 26,
+        "Halpe-136": 136, "COCO-WholeBody-133": 133, "MediaPipe-33": 33, "blazepose33": 33, "MediaPipe-hand-21": 21,
+        "OpenPose-COCO-18": 18,
+        "OpenPose-MPI-15": 15,
+    }  # fmt: skip
+    assert [usual_layout(n) for n in (17, 25, 26, 33, 133, 136, 20)] == [
+        COCO17, BODY25, HALPE26, MEDIAPIPE33, WHOLEBODY133, HALPE136, None,
+    ]  # fmt: skip
+    assert candidates(17) == (COCO17, H36M17) and candidates(25) == (BODY25, BODY25B, NTU25) and candidates(9) == ()
+
+
+@pytest.mark.parametrize(
+    ("layout", "places"),
+    [
+        (BODY25B, {"left_hip": 11, "upper_neck": 17, "head_top": 18, "left_big_toe": 19, "right_heel": 24}),
+        (H36M17, {"root": 0, "right_hip": 1, "left_ankle": 6, "head": 10, "left_shoulder": 11, "right_wrist": 16}),
+        (NTU25, {"head_center": 3, "left_hand": 7, "right_shoulder": 8, "left_hip": 12, "spine_shoulder": 20, "right_thumb": 24}),
+        (KINECT20, {"hip_center": 0, "head_center": 3, "left_shoulder": 4, "right_hand": 11, "left_hip": 12, "right_foot": 19}),
+        (HALPE136, {"head": 17, "hip": 19, "right_heel": 25, "face_0": 26, "left_hand_wrist": 94, "right_hand_wrist": 115}),
+        (WHOLEBODY133, {"left_big_toe": 17, "right_heel": 22, "face_0": 23, "left_hand_wrist": 91, "right_hand_wrist": 112}),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_joints_are_where_the_tool_puts_them(layout: Skeleton, places: dict[str, int]) -> None:
+    assert {name: layout.joints.index(name) for name in places} == places
+
+
+# ---- by what a body looks like -------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("dims", [2, 3])
+@pytest.mark.parametrize("layout", [layout for layout in BODIES if len(layout.joints) <= 33], ids=lambda layout: layout.name)
+def test_a_body_is_recognized_among_its_rivals(layout: Skeleton, dims: int) -> None:
+    body = tools.standing(layout, dims=dims)
+    found = recognize_layout(body, candidates(len(layout.joints)), "-y" if dims == 2 else "y")
+    assert found is not None and found.layout is layout
+    found = recognize_layout(body, candidates(len(layout.joints)), None)
+    assert found is not None and (found.layout is layout, found.up) == (True, "-y" if dims == 2 else "y")
+
+
+def test_what_is_up_is_found_in_three_dimensions() -> None:
+    body = tools.standing(NTU25, dims=3)
+    turned = body[..., [0, 2, 1]]
+    for points, up in ((body, "y"), (turned, "z"), (-turned, "-z"), (-body, "-y")):
+        found = recognize_layout(points, candidates(25), None)
+        assert found is not None and (found.layout, found.up) == (NTU25, up)
+
+
+def test_points_of_no_body_are_not_recognized() -> None:
+    rng = np.random.default_rng(0)
+    for joints in (17, 20, 25):
+        assert recognize_layout(rng.normal(size=(50, joints, 2)), candidates(joints), "-y") is None
+        assert recognize_layout(np.full((5, joints, 2), np.nan), candidates(joints), "-y") is None
+        assert recognize_layout(np.zeros((5, joints, 2)), candidates(joints), None) is None
+    assert recognize_layout(rng.normal(size=(50, 9, 2)), candidates(9), "-y") is None
+    lying = tools.standing(BODY25)[..., ::-1]
+    assert recognize_layout(lying, candidates(25), "-y") is None
+
+
+def test_half_a_body_and_missing_joints_do_not_matter_much() -> None:
+    body = tools.standing(BODY25B, frames=60)
+    body[np.random.default_rng(0).random(body.shape[:2]) < 0.4] = np.nan
+    found = recognize_layout(body, candidates(25), "-y")
+    assert found is not None and found.layout is BODY25B
+    best, second, _ = rank_layouts(body, candidates(25), "-y")
+    assert best.layout is BODY25B and best.bones < 0.5 < second.bones
+
+
+# ---- in files ------------------------------------------------------------------------------------------------------------
+def openpose(folder: Path, body: np.ndarray) -> Path:
+    folder.mkdir()
+    for i, frame in enumerate(body):
+        flat = np.c_[frame, np.ones(len(frame))].ravel().tolist()
+        (folder / f"a_{i:012d}_keypoints.json").write_text(json.dumps({"people": [{"pose_keypoints_2d": flat}]}))
+    return folder
+
+
+@pytest.mark.parametrize("layout", [BODY25, BODY25B])
+def test_openpose_writes_two_layouts_of_25(layout: Skeleton, tmp_path: Path) -> None:
+    clip = read_clip(openpose(tmp_path / "a", tools.standing(layout)))
+    assert clip.skeleton is layout
+    assert clip.meta == ({} if layout is BODY25 else {"layout": "recognized: BODY_25B"})
+
+
+def test_what_is_not_clear_is_said_and_a_person_decides(tmp_path: Path) -> None:
+    folder = openpose(tmp_path / "a", tools.standing(BODY25B)[..., ::-1])
+    clip = read_clip(folder)
+    assert (clip.skeleton, clip.meta) == (BODY25, {"layout": "guessed: BODY_25, not BODY_25B"})
+    clip = read_clip(folder, layout="body25b")
+    assert (clip.skeleton, clip.meta) == (BODY25B, {})
+    with pytest.raises(
+        ValueError, match=r"a: has 25 joints, but layout=COCO-17 has 17; name another one \(of 25 joints: BODY_25, "
+    ):
+        read(folder, layout="COCO-17")
+    with pytest.raises(ValueError, match=r"layout 'nothing': there is none of this name; use one of COCO-17, "):
+        read(folder, layout="nothing")
+
+
+@pytest.mark.parametrize("layout", [COCO17, H36M17, KINECT20, NTU25, BODY25B])
+def test_clip_sets_without_names(layout: Skeleton, tmp_path: Path) -> None:
+    body = tools.standing(layout, dims=3)
+    np.savez(tmp_path / "set.npz", joints=np.concatenate([body, body]), offsets=[0, 12, 24], fps=30.0)
+    clips = read(tmp_path / "set.npz")
+    assert all(clip.skeleton is layout for clip in clips)
+    assert clips.column("layout").tolist() == [f"recognized: {layout.name}"] * 2
+    clips.save(tmp_path / "copy.npz")
+    again = ClipSet.load(tmp_path / "copy.npz")
+    assert [clip.skeleton for clip in again] == [layout] * 2 and again.column("layout").tolist() == clips.column("layout").tolist()
+    other = read(tmp_path / "set.npz", layout={17: "COCO-17", 20: "Kinect-20", 25: "BODY_25"}[len(layout.joints)])
+    assert other[0].skeleton is usual_layout(len(layout.joints)) or layout is KINECT20
+    assert "layout" not in other.fields
+    assert "layout" not in read(tmp_path / "copy.npz", layout=layout.name).fields
+
+
+def test_clip_sets_whose_bodies_show_nothing_stay_without_names(tmp_path: Path) -> None:
+    np.savez(tmp_path / "set.npz", joints=np.random.default_rng(0).normal(size=(9, 17, 2)))
+    (clip,) = read(tmp_path / "set.npz")
+    assert (clip.skeleton, dict(clip.meta)) == (None, {})
+    names = [f"mine{i}" for i in range(17)]
+    np.savez(tmp_path / "named.npz", joints=tools.standing(COCO17, dims=3), joint_names=names)
+    (clip,) = read(tmp_path / "named.npz")
+    assert clip.skeleton is not None and clip.skeleton.joints == tuple(names)
+    (clip,) = read(tmp_path / "named.npz", layout="COCO-17")
+    assert clip.skeleton is COCO17
+
+
+def test_what_readers_say_of_some_clips_does_not_keep_a_set_from_being_saved(tmp_path: Path) -> None:
+    body = tools.standing(COCO17)
+    np.savez(tmp_path / "set.npz", joints=body, up="-y")
+    found = read_clip(tmp_path / "set.npz")
+    assert "layout" in found.meta
+    ClipSet([found, found.replace(meta={})]).save(tmp_path / "both.npz")
+    assert "layout" not in ClipSet.load(tmp_path / "both.npz").fields
+
+
+def test_a_lifter_of_mmpose_gives_the_joints_of_human36m(tmp_path: Path) -> None:
+    body = tools.standing(H36M17, dims=3)[..., [0, 2, 1]]  # z up
+    frames = [{"frame_id": i, "instances": [{"keypoints": f.tolist(), "keypoint_scores": [1.0] * 17}]} for i, f in enumerate(body)]
+    (tmp_path / "bare.json").write_text(json.dumps(frames))
+    clip = read_clip(tmp_path / "bare.json")
+    assert (clip.skeleton, clip.up, clip.dims) == (H36M17, "z", 3)
+    names = [name.replace("ankle", "foot") for name in H36M17.joints]
+    meta = {"dataset_name": "h36m", "keypoint_id2name": {str(i): name for i, name in enumerate(names)}, "skeleton_links": []}
+    (tmp_path / "named.json").write_text(json.dumps({"meta_info": meta, "instance_info": frames}))
+    clip = read_clip(tmp_path / "named.json")
+    assert clip.skeleton is not None and clip.skeleton.joints == H36M17.joints
+
+
+def test_a_layout_does_not_overrule_names_that_a_file_carries(tmp_path):
+    joints = np.random.default_rng(0).normal(size=(9, 17, 2)) * 50 + 300
+    mixed = Skeleton("mine", (COCO17.joints[1], COCO17.joints[0], *COCO17.joints[2:]))
+    for name, own in (("named", mixed), ("numbered", Skeleton("any", tuple(map(str, range(17)))))):
+        ClipSet([Clip(joints, skeleton=own, up="-y", fps=30.0)]).save(tmp_path / f"{name}.npz")
+    with pytest.raises(ValueError, match=r"named.npz: names its joints itself \(left_eye where layout=COCO-17 has nose\); leave"):
+        read(tmp_path / "named.npz", layout="COCO-17")
+    assert read(tmp_path / "numbered.npz", layout="COCO-17")[0].skeleton.joints == COCO17.joints
+    np.save(tmp_path / "bare.npy", joints)
+    assert read(tmp_path / "bare.npy", layout="H36M-17")[0].skeleton.name == "H36M-17"

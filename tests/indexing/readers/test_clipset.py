@@ -10,8 +10,9 @@ import pytest
 
 from indexing.clip import Clip, ClipSet
 from indexing.readers import read
-from indexing.readers.formats.clipset import read_clip_set, write_clip_set
+from indexing.readers.formats.clipset import FilmSet, holds_frames, read_clip_set, read_film_set, write_clip_set
 from indexing.skeleton import COCO17, Skeleton
+from tests.indexing.readers.tools import refused
 
 
 def contents(**changes: Any) -> dict[str, Any]:
@@ -28,7 +29,7 @@ def contents(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.fixture
-def save(tmp_path: Path):  # type: ignore[no-untyped-def]
+def save(tmp_path: Path):
     def write(**changes: Any) -> Path:
         path = tmp_path / "moves.npz"
         np.savez(path, **contents(**changes))
@@ -37,7 +38,7 @@ def save(tmp_path: Path):  # type: ignore[no-untyped-def]
     return write
 
 
-def test_clips_labels_names_and_fields(save) -> None:  # type: ignore[no-untyped-def]
+def test_clips_labels_names_and_fields(save) -> None:
     clips = read(save())
     assert [len(clip) for clip in clips] == [4, 5]
     assert clips.labels.tolist() == ["sit", "run"]
@@ -52,7 +53,7 @@ def test_clips_labels_names_and_fields(save) -> None:  # type: ignore[no-untyped
     assert clips[0].skeleton is None
 
 
-def test_without_fps_30_is_assumed_and_said(save) -> None:  # type: ignore[no-untyped-def]
+def test_without_fps_30_is_assumed_and_said(save) -> None:
     clip = read(save())[0]
     assert clip.fps_assumed
     assert clip.times[1] == pytest.approx(1 / 30)
@@ -62,21 +63,21 @@ def test_without_fps_30_is_assumed_and_said(save) -> None:  # type: ignore[no-un
 
 
 @pytest.mark.parametrize(("fps", "rates"), [(60.0, [60, 60]), (np.array([25.0, 50.0]), [25, 50])])
-def test_fps_of_the_file_wins(save, fps: Any, rates: list[float]) -> None:  # type: ignore[no-untyped-def]
+def test_fps_of_the_file_wins(save, fps: Any, rates: list[float]) -> None:
     clips = read(save(fps=fps), fps=10.0)
     assert [clip.fps for clip in clips] == rates
     assert [clip.times[1] for clip in clips] == [1 / rate for rate in rates]
     assert not any(clip.fps_assumed for clip in clips)
 
 
-def test_frame_numbers_give_times(save) -> None:  # type: ignore[no-untyped-def]
+def test_frame_numbers_give_times(save) -> None:
     frame = np.array([252, 254, 260, 262, 0, 1, 2, 5, 9], dtype=np.uint16)
     clips = read(save(frame=frame, fps=10.0))
     assert clips[0].times.tolist() == [25.2, 25.4, 26.0, 26.2]
     assert clips[1].times.tolist() == [0.0, 0.1, 0.2, 0.5, 0.9]
 
 
-def test_times_are_taken_as_they_are(save) -> None:  # type: ignore[no-untyped-def]
+def test_times_are_taken_as_they_are(save) -> None:
     times = np.array([0.0, 0.1, 0.25, 0.3, 5.0, 5.1, 5.2, 5.3, 5.4])
     clips = read(save(times=times, frame=np.arange(9)))
     np.testing.assert_array_equal(np.concatenate([clip.times for clip in clips]), times)
@@ -93,12 +94,12 @@ def test_times_are_taken_as_they_are(save) -> None:  # type: ignore[no-untyped-d
         ({"action": np.array(["hop", "run"]), "action_names": None}, ["hop", "run"]),
     ],
 )
-def test_labels(save, changes: dict[str, Any], labels: list[Any]) -> None:  # type: ignore[no-untyped-def]
+def test_labels(save, changes: dict[str, Any], labels: list[Any]) -> None:
     assert [clip.label for clip in read(save(**changes))] == labels
     assert [clip.label for clip in read(save(**changes), label="x")] == ["x", "x"]
 
 
-def test_skeleton_up_names_and_confidence(save) -> None:  # type: ignore[no-untyped-def]
+def test_skeleton_up_names_and_confidence(save) -> None:
     confidence = np.linspace(0.1, 0.9, 27).reshape(9, 3)
     path = save(
         confidence=confidence,
@@ -117,7 +118,7 @@ def test_skeleton_up_names_and_confidence(save) -> None:  # type: ignore[no-unty
     assert read(save(bones=np.array([[0, 2]], dtype=np.uint8)))[0].skeleton == Skeleton("moves", ("0", "1", "2"), ((0, 2),))
 
 
-def test_one_clip_needs_no_offsets(save) -> None:  # type: ignore[no-untyped-def]
+def test_one_clip_needs_no_offsets(save) -> None:
     clips = read(save(offsets=None, action=None, subject=None, split=None))
     assert [len(clip) for clip in clips] == [9]
 
@@ -158,20 +159,8 @@ def test_one_clip_needs_no_offsets(save) -> None:  # type: ignore[no-untyped-def
         ({"up": "z"}, ("up", "3D")),
     ],
 )
-def test_contradictions_are_refused(save, changes: dict[str, Any], words: tuple[str, ...]) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ValueError, match=r"moves\.npz: ") as caught:
-        read(save(**changes))
-    assert "\n" not in str(caught.value)
-    for word in words:
-        assert word in str(caught.value)
-
-
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
-def test_a_truncated_file_is_refused(save, share: float) -> None:  # type: ignore[no-untyped-def]
-    path = save()
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
-    with pytest.raises(ValueError, match=r"moves\.npz: .*truncated.*again"):
-        read(path)
+def test_contradictions_are_refused(save, changes: dict[str, Any], words: tuple[str, ...]) -> None:
+    refused(save(**changes), *words)
 
 
 def test_damaged_data_is_refused(tmp_path: Path) -> None:
@@ -188,10 +177,8 @@ def test_damaged_data_is_refused(tmp_path: Path) -> None:
     ("options", "words"),
     [({"min_confidence": 0.5}, ("no confidence", "at 0")), ({"size": (640, 480)}, ("size", "leave size out"))],
 )
-def test_options_that_a_set_cannot_take(save, options: dict[str, Any], words: tuple[str, ...]) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(ValueError, match=r"moves\.npz: ") as caught:
-        read(save(), **options)
-    assert all(word in str(caught.value) for word in words)
+def test_options_that_a_set_cannot_take(save, options: dict[str, Any], words: tuple[str, ...]) -> None:
+    refused(save(), *words, **options)
 
 
 def varied() -> list[Clip]:
@@ -252,9 +239,7 @@ def test_integer_labels_round_trip(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path: Path, clips: list[Clip], words: tuple[str, ...]) -> None:
     path = tmp_path / "set.npz"
-    with pytest.raises(ValueError, match=r"set\.npz: ") as caught:
-        write_clip_set(clips, path)
-    assert all(word in str(caught.value) for word in words)
+    refused(path, *words, action=lambda _: write_clip_set(clips, path))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -277,3 +262,49 @@ def test_writing_is_atomic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="nowhere does not exist; create it"):
         write_clip_set([Clip(np.ones((2, 3, 2)))], tmp_path / "nowhere" / "set.npz")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Film sets: frames in place of joints, everything else as in a clip set
+
+
+FRAMES = np.arange(9 * 4 * 5, dtype=np.uint8).reshape(9, 4, 5)
+WHOLE = {"frames": FRAMES, "offsets": [0, 4, 9], "action": [1, 0], "action_names": ["run", "sit"], "subject": [7, 8], "fps": 10.0}
+
+
+def test_what_is_written_is_read(tmp_path):
+    np.savez(tmp_path / "films.npz", **WHOLE)
+    films = read_film_set(tmp_path / "films.npz")
+    assert isinstance(films, FilmSet) and films.labels.tolist() == ["sit", "run"]
+    assert np.array_equal(films[1].frames, FRAMES[4:]) and films[1].times.tolist() == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    assert [film.label for film in films.select(subject=8)] == ["run"]
+    assert films.fields == ("subject",) and films[0].duration == pytest.approx(0.3)
+
+
+def test_times_and_frame_numbers_start_at_zero_in_every_film(tmp_path):
+    np.savez(tmp_path / "a.npz", **WHOLE, frame=[3, 4, 6, 7, 0, 1, 2, 3, 5])
+    films = read_film_set(tmp_path / "a.npz")
+    assert films[0].times.tolist() == pytest.approx([0, 0.1, 0.3, 0.4])
+
+
+def test_frames_are_told_from_joints(tmp_path):
+    np.savez(tmp_path / "films.npz", **WHOLE)
+    np.savez(tmp_path / "clips.npz", joints=np.ones((4, 3, 2)))
+    (tmp_path / "broken.npz").write_bytes(b"PK nothing")
+    found = [holds_frames(tmp_path / name) for name in ("films.npz", "clips.npz", "broken.npz", "absent.npz")]
+    assert found == [True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"frames": FRAMES.astype(float)}, "uint8"),
+        ({"frames": FRAMES[0]}, "3 dimensions"),
+        ({"offsets": [0, 4, 8]}, "frames has 9 frames"),
+        ({"action": [0]}, "action has 1 values for 2"),
+        ({"fps": 0.0}, "fps must be positive"),
+    ],
+)
+def test_bad_sets_are_refused(tmp_path, change, says):
+    np.savez(tmp_path / "films.npz", **(WHOLE | change))
+    refused(tmp_path / "films.npz", says, action=read_film_set)

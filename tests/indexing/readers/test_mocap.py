@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from indexing.readers import read, read_clip
-from indexing.skeleton import MEDIAPIPE33
+from indexing.readers.recording import NobodySeen
+from indexing.skeleton import COCO17, H36M17, HALPE26, HALPE136, MEDIAPIPE33, WHOLEBODY133
+from tests.fuzz.seeds import c3d
+from tests.indexing.readers import tools
 from tests.indexing.readers.tools import refused
 
 POINTS = np.random.default_rng(0).normal(size=(5, 3, 3)) * 2 + 5  # metres, beyond 0 to 1
@@ -113,3 +119,280 @@ def test_tables_without_z_of_every_point(tmp_path: Path) -> None:
     refused(tmp_path / "flat.csv", "has no z of a", format="mocap")
     (tmp_path / "none.csv").write_text("date,price\n1,2\n")
     refused(tmp_path / "none.csv", "hip_x, hip_y, hip_z", format="mocap")
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Marker files (TRC, C3D), arrays of numpy, folders of FreeMoCap, and AlphaPose
+
+
+HALPE_POINTS = tools.standing(HALPE26, dims=3)
+HALPE_NAMES = HALPE26.joints
+
+
+# ---- TRC -----------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("mm", 0.001), ("cm", 0.01)])
+def test_trc_is_metres_with_its_own_times(units: str, scale: float, tmp_path: Path) -> None:
+    points = HALPE_POINTS.copy()
+    points[2, 3] = np.nan
+    points[4, 5] = 0.0
+    clip = read_clip(tools.trc(tmp_path / "a.trc", points, HALPE_NAMES, rate=100.0, units=units))
+    points[4, 5] = np.nan
+    np.testing.assert_allclose(clip.joints, scale * points, atol=1e-6)
+    np.testing.assert_allclose(clip.times, np.arange(12) / 100, atol=1e-9)
+    assert (clip.up, clip.fps, clip.fps_assumed, clip.confidence) == ("y", pytest.approx(100), False, None)
+    assert clip.skeleton is not None and clip.skeleton.joints == HALPE_NAMES
+
+
+def test_trc_that_starts_later_keeps_its_clock(tmp_path: Path) -> None:
+    path = tools.trc(tmp_path / "a.trc", HALPE_POINTS, HALPE_NAMES, start=301)
+    text = path.read_text().split("\n")
+    path.write_text(
+        "\n".join([*text[:5], *(re.sub(r"^(\d+)\t([\d.]+)", lambda m: f"{m[1]}\t{float(m[2]) + 5:.6f}", t) for t in text[5:])])
+    )
+    assert read_clip(path).times[0] == pytest.approx(5.0)
+    path.write_text("\n".join([*text[:5], *(re.sub(r"^(\d+)\t[\d.]+", r"\1\t", t) for t in text[5:])]))
+    np.testing.assert_allclose(read_clip(path).times, np.arange(12) / 60)  # no times: frame number / DataRate
+
+
+@pytest.mark.parametrize("up", [(0, 2, 1), (0, 1, 2)])
+def test_the_direction_up_is_the_bodys(up: tuple[int, int, int], tmp_path: Path) -> None:
+    clip = read_clip(tools.trc(tmp_path / "a.trc", HALPE_POINTS[..., list(up)], HALPE_NAMES))
+    assert clip.up == ("z" if up[1] == 2 else "y")
+    assert read_clip(tools.trc(tmp_path / "b.trc", HALPE_POINTS[..., list(up)], [f"M{i}" for i in range(26)])).up == "y"
+
+
+def test_people_of_a_marker_file_have_names_before_a_colon(tmp_path: Path) -> None:
+    both = np.concatenate([HALPE_POINTS, HALPE_POINTS + 2.0], axis=1)
+    names = [f"{who}:{joint}" for who in ("anna", "ben") for joint in HALPE_NAMES]
+    clips = read(tools.trc(tmp_path / "a.trc", both, names), person="all")
+    assert [clip.meta["person"] for clip in clips] == ["anna", "ben"]
+    np.testing.assert_allclose(clips[1].joints, HALPE_POINTS + 2.0, atol=1e-6)
+    (alone,) = read(tools.trc(tmp_path / "b.trc", HALPE_POINTS, names[:26]))
+    assert alone.skeleton is not None and alone.skeleton.joints == HALPE_NAMES
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("PathFileType", "PathFileTyp", ("",)),
+        ("Frame#", "Rows", ("begins with Frame#",)),
+        ("\tm\t", "\tfeet\t", ("Units is 'feet'",)),
+        ("nose", "left_eye", ("names the marker 'left_eye' twice",)),
+        ("12\t26", "12\t25", ("NumMarkers is 25, but line 4 names 26",)),
+        ("1\t0.000000", "x\t0.000000", ("line 6, 'Frame#': 'x' is no number",)),
+        ("0.016667", "abc", ("line 7, 'Time'", "'abc'")),
+        ("3\t0.033333", "2\t0.033333", ("frame numbers must increase",)),
+        ("0.033333", "0.016667", ("times must increase",)),
+        ("\n3\t0.033333", "\n3\t0.033333\t" + "1\t" * 90, ("line 8 has", "26 markers")),
+        ("60.0\t60.0\t12", "1e30\t60.0\t12", ("DataRate",)),
+        ("\n1\t0.000000", "\n1\tinf", ("no time, or one beyond any recording",)),
+    ],
+)
+def test_broken_marker_files_are_refused(old: str, new: str, words: tuple[str, ...], tmp_path: Path) -> None:
+    path = tools.trc(tmp_path / "a.trc", HALPE_POINTS, HALPE_NAMES)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    refused(path, *words)
+
+
+def test_marker_files_that_are_cut_off_or_empty(tmp_path: Path) -> None:
+    path = tools.trc(tmp_path / "a.trc", HALPE_POINTS, HALPE_NAMES)
+    lines = path.read_text().split("\n")
+    for count, word in ((2, "three lines of header"), (4, "no frames"), (5, "no frames")):
+        path.write_text("\n".join(lines[:count]))
+        refused(path, word)
+    path.write_text("\n".join([*lines[:9], lines[9][:1]]))
+    refused(path, "line 10 has no frame and time")
+    path = tools.trc(tmp_path / "b.trc", np.full_like(HALPE_POINTS, np.nan), HALPE_NAMES)
+    with pytest.raises(NobodySeen):
+        read(path)
+
+
+# ---- C3D -----------------------------------------------------------------------------------------------------------------
+def test_c3d_is_a_recording(tmp_path: Path) -> None:
+    (tmp_path / "a.c3d").write_bytes(c3d())
+    clip = read_clip(tmp_path / "a.c3d", fps=50.0)
+    assert (len(clip), clip.joints.shape[1:], clip.up) == (5, (4, 3), "z")
+    assert clip.skeleton is not None and clip.skeleton.joints == ("mk0", "mk1", "mk2", "mk3")
+    np.testing.assert_allclose(clip.times, np.arange(5) / 50)
+    (tmp_path / "b.c3d").write_bytes(c3d()[:700])
+    refused(tmp_path / "b.c3d", "truncated")
+    (tmp_path / "c.c3d").write_bytes(b"something else altogether")
+    refused(tmp_path / "c.c3d", "C3D")
+
+
+# ---- arrays --------------------------------------------------------------------------------------------------------------
+def test_arrays_have_the_layout_and_the_direction_of_their_body(tmp_path: Path) -> None:
+    for layout, turn, up in ((COCO17, [0, 1, 2], "y"), (H36M17, [0, 2, 1], "z"), (MEDIAPIPE33, [0, 2, 1], "z")):
+        np.save(tmp_path / "a.npy", tools.standing(layout, dims=3)[..., turn])
+        clip = read_clip(tmp_path / "a.npy")
+        assert (clip.skeleton, clip.up, clip.dims, clip.fps_assumed) == (layout, up, 3, True)
+    np.save(tmp_path / "a.npy", tools.standing(COCO17).astype(np.float32))
+    clip = read_clip(tmp_path / "a.npy", fps=25.0)
+    assert (clip.skeleton, clip.up, dict(clip.meta)) == (COCO17, "-y", {"layout": "recognized: COCO-17"})
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(9, 17, 2)))
+    assert read_clip(tmp_path / "a.npy").meta == {"layout": "guessed: COCO-17, not H36M-17"}
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(9, 7, 3)))
+    assert read_clip(tmp_path / "a.npy").skeleton is None
+
+
+def test_a_third_number_beside_pixels_is_the_confidence(tmp_path: Path) -> None:
+    pixels = tools.standing(COCO17)
+    third = np.random.default_rng(0).uniform(0.1, 1, (*pixels.shape[:2], 1))
+    np.save(tmp_path / "a.npy", np.concatenate([pixels, third], axis=2))
+    clip = read_clip(tmp_path / "a.npy")
+    np.testing.assert_array_equal(clip.joints, pixels)
+    np.testing.assert_array_equal(clip.confidence, third[..., 0])
+    np.save(tmp_path / "a.npy", np.concatenate([pixels / 1000, third], axis=2))
+    refused(tmp_path / "a.npy", "it may be depth or confidence")
+
+
+@pytest.mark.parametrize("shape", [(3,), (4, 4), (2, 3, 4), (0, 17, 2), (2, 3, 4, 5)])
+def test_arrays_that_are_no_joints_over_time_are_refused(shape: tuple[int, ...], tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros(shape))
+    refused(tmp_path / "a.npy", "not joints over time", "np.savez(file, joints=array, fps=...)")
+
+
+def test_arrays_that_are_cut_off_or_of_objects_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", tools.standing(COCO17))
+    (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:500])
+    refused(tmp_path / "a.npy", "truncated")
+    np.save(tmp_path / "b.npy", np.array([{}, None], dtype=object), allow_pickle=True)
+    refused(tmp_path / "b.npy", "Python objects")
+    np.save(tmp_path / "c.npy", np.zeros((5, 17, 2)))
+    with pytest.raises(NobodySeen):
+        read(tmp_path / "c.npy")
+
+
+# ---- FreeMoCap -----------------------------------------------------------------------------------------------------------
+BODY = 1000 * tools.standing(MEDIAPIPE33, dims=3)[..., [0, 2, 1]]
+
+
+@pytest.mark.parametrize("name", ["body", "skeleton", "old", "raw"])
+def test_a_recording_of_freemocap_opens_by_any_of_its_folders(name: str, tmp_path: Path) -> None:
+    folder = tools.freemocap(tmp_path / "session", BODY, name=name)
+    given = [folder, folder / "output_data", *(folder / "output_data").rglob("*[3d,l]_*.npy" if name != "raw" else "*3dData*.npy")]
+    for path in [path for path in given if "hand" not in path.name or path == folder]:
+        if path.name.startswith("mediapipe_right_hand"):
+            continue
+        clip = read_clip(path, fps=30.0)
+        np.testing.assert_allclose(clip.joints, BODY)
+        assert (clip.skeleton, clip.up, clip.dims) == (MEDIAPIPE33, "z", 3)
+    assert read_clip(folder).name == "session"
+
+
+def test_without_3d_every_camera_of_freemocap_is_a_clip(tmp_path: Path) -> None:
+    cameras = np.stack([np.concatenate([tools.standing(MEDIAPIPE33, seed=i), np.ones((12, 33, 1))], axis=2) for i in range(3)])
+    cameras[2] = np.nan  # saw nobody
+    clips = read(tools.freemocap(tmp_path / "session", cameras=np.pad(cameras, ((0, 0), (0, 0), (0, 42), (0, 0)))))
+    assert [clip.name for clip in clips] == ["session[0]", "session[1]"]
+    assert clips.column("camera").tolist() == [0, 1]
+    np.testing.assert_allclose(clips[1].joints, cameras[1, ..., :2])
+    assert (clips[0].up, clips[0].skeleton) == ("-y", MEDIAPIPE33)
+
+
+def test_folders_of_arrays_that_are_no_body_are_refused(tmp_path: Path) -> None:
+    folder = tools.freemocap(tmp_path / "session", BODY)
+    (folder / "output_data" / "mediapipe_body_3d_xyz.npy").unlink()
+    refused(folder, "no array of a body (it has mediapipe")
+    np.save(folder / "output_data" / "mediapipe_body_3d_xyz.npy", BODY[:, :20])
+    with pytest.raises(ValueError, match=r"without the 33 points of a body"):
+        read(folder)
+    np.save(folder / "output_data" / "mediapipe_body_3d_xyz.npy", BODY[..., :2])
+    with pytest.raises(ValueError, match=r"have 2 coordinates"):
+        read(folder)
+    (tmp_path / "empty" / "output_data").mkdir(parents=True)
+    refused(tmp_path / "empty", "no array of a body (it has none)")
+
+
+# ---- AlphaPose -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("form", ["coco", "open", "cmu"])
+@pytest.mark.parametrize("layout", [COCO17, HALPE26, WHOLEBODY133, HALPE136], ids=lambda layout: layout.name)
+def test_alphapose_writes_layouts_by_their_number(layout: Any, form: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    person = np.concatenate(
+        [rng.uniform(10, 400, (6, len(layout.joints), 2)), rng.uniform(0.1, 1, (6, len(layout.joints), 1))], axis=2
+    )
+    clip = read_clip(tools.alphapose(tmp_path / "alphapose-results.json", [person], form))
+    assert clip.skeleton is layout
+    np.testing.assert_allclose(clip.joints, person[..., :2])
+    np.testing.assert_allclose(clip.confidence, person[..., 2])
+    np.testing.assert_allclose(clip.times, np.arange(6) / 30)
+
+
+def test_people_of_alphapose_have_ids_where_it_tracked(tmp_path: Path, person: np.ndarray) -> None:
+    far = person.copy()
+    far[..., 0] += 300
+    clips = read(tools.alphapose(tmp_path / "alphapose-results.json", [person, far]), person="all")
+    assert [clip.meta["person"] for clip in clips] == [1, 2]
+
+
+# ---- MediaPipe's smoothing -----------------------------------------------------------------------------------------------
+def smoothed(points: np.ndarray, fps: float = 30.0, lowest: float = 0.05, beta: float = 80.0) -> np.ndarray:
+    """The filter of MediaPipe's landmarks: a low pass whose frequency rises with the speed, in body heights per second."""
+
+    def share(frequency: Any) -> Any:
+        return 1 / (1 + fps / (2 * np.pi * frequency))
+
+    size = float(np.ptp(points[..., 1]))
+    out, speed = points.copy(), np.zeros_like(points[0])
+    for i in range(1, len(points)):
+        speed += share(1.0) * ((points[i] - points[i - 1]) * fps / size - speed)
+        weight = share(lowest + beta * np.abs(speed))
+        out[i] = weight * points[i] + (1 - weight) * out[i - 1]
+    return out
+
+
+def landmarks(path: Path, points: np.ndarray) -> Path:
+    names = MEDIAPIPE33.joints
+    lines = ["frame," + ",".join(f"{name}_{kind}" for name in names for kind in ("x", "y", "visibility"))]
+    lines += [f"{i}," + ",".join(f"{x:.6f},{y:.6f},0.9" for x, y in frame) for i, frame in enumerate(points / 1000)]
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.003, 0.005, 0.01])
+def test_what_mediapipe_smoothed_is_always_said(noise: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    calm = np.clip(np.sin(np.arange(240) / 30), 0, None)[:, None, None]  # moves, and rests
+    body = tools.standing(MEDIAPIPE33, frames=1) + 80 * calm * rng.normal(size=(1, 33, 2))
+    raw = body + noise * 500 * rng.normal(size=body.shape)
+    assert read_clip(landmarks(tmp_path / "a.csv", smoothed(raw))).meta == {"may_lag": True}
+    said = read_clip(landmarks(tmp_path / "b.csv", raw)).meta
+    assert said == {} or noise < 0.003  # noise at rest shows that nothing was smoothed
+
+
+def test_other_tables_are_not_mediapipes(tmp_path: Path, person: np.ndarray) -> None:
+    rows = ["frame," + ",".join(f"{name}_{kind}" for name in COCO17.joints for kind in ("x", "y"))]
+    rows += [f"{i}," + ",".join(f"{v:.3f}" for v in frame[:, :2].ravel()) for i, frame in enumerate(person)]
+    (tmp_path / "a.csv").write_text("\n".join(rows))
+    assert "may_lag" not in read_clip(tmp_path / "a.csv").meta
+
+
+# ---- what is not read ----------------------------------------------------------------------------------------------------
+def test_frames_of_a_set_are_its_times(tmp_path: Path) -> None:
+    frame = [2, 4, 20, 22, 30]
+    np.savez(tmp_path / "a.npz", joints=tools.standing(COCO17)[:5], frame=frame, fps=10.0)
+    (clip,) = read(tmp_path / "a.npz")
+    np.testing.assert_allclose(clip.times, np.array(frame) / 10)
+    np.savez(tmp_path / "b.npz", joints=tools.standing(COCO17)[:5], frame=frame)
+    (clip,) = read(tmp_path / "b.npz", fps=5.0)
+    np.testing.assert_allclose(clip.times, np.array(frame) / 5)
+    np.savez(tmp_path / "c.npz", joints=tools.standing(COCO17)[:5], frame=frame[:4])
+    refused(tmp_path / "c.npz", "frame must be 5 numbers")
+
+
+def test_netcdf_3_says_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "a.nc").write_bytes(b"CDF\x01" + bytes(60))
+    refused(tmp_path / "a.nc", "netCDF file of version 3", "engine='h5netcdf'")
+
+
+def test_hdf5_of_something_else_says_what_it_has(tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["temperature"] = [1.0, 2.0]
+    refused(tmp_path / "a.h5", "HDF5 without keypoints that a reader knows (it has temperature)")
+    (tmp_path / "b.json").write_text(json.dumps([1]))
+    refused(tmp_path / "b.json", "JSON without keypoints")

@@ -36,7 +36,7 @@ def test_what_an_archive_knows_besides(tmp_path):
     np.savez(tmp_path / "a.npz", **{"desk/y": np.nan_to_num(VALUES), "desk/vis": seen, "desk/s": np.array([2, 1], np.uint8)})
     found = read_tracks([tmp_path / "a.npz"], key="desk")
     np.testing.assert_array_equal(found.values, VALUES)
-    assert found.known.tolist() == [2, 1] and found.seen(3).known.tolist() == [2]
+    assert found.known.tolist() == [2, 1] and found.drop_short(3).known.tolist() == [2]
     np.savez(tmp_path / "b.npz", tracks=VALUES, labels=np.array([0.5, 1]), visible=seen[:2])  # neither can be meant
     found = read_tracks([tmp_path / "b.npz"])
     assert found.known is None
@@ -116,8 +116,8 @@ def test_static_points_from_a_file(write):
 
 def test_tracks_seen_once_are_left_out(write):
     found = read_tracks([write("frame,id,x,y,static\n0,a,1,2,1\n1,a,1,2,1\n0,b,1,2,0\n")])
-    kept = found.seen()
-    assert kept.ids == ("a",) and kept.static.tolist() == [True] and kept.seen() is kept
+    kept = found.drop_short()
+    assert kept.ids == ("a",) and kept.static.tolist() == [True] and kept.drop_short() is kept
     assert kept.notes == ("1 track is seen in fewer than 2 views and was left out",)
 
 
@@ -127,8 +127,6 @@ def test_tracks_seen_once_are_left_out(write):
     [
         ("frame,id,x,y\n", r"t\.csv: the file has a header but no rows"),
         ("frame,x,y\n0,1,2\n", r"no column names the points \(its columns are frame, x, y\); name the columns"),
-        ("frame,id,x,y\n0,a,1\n", r"row 2 has 3 cells, the first row 4"),
-        ("frame,id,x,y\n0,a,1,u\n", r"row 2, column 'y': 'u' is not a number"),
         ("frame,id,x,y\n,a,1,2\n", r"row 2, column 'frame': is empty"),
         ("frame,id,x,y\n0,,1,2\n", r"row 2, column 'id': is empty"),
         ("frame,id,x,y\n0,a,1,2\n1,a,1,2\n0,a,1,2\n", r"row 4: .* in frame 0 before, in row 2 .*; give each point one row"),
@@ -163,9 +161,6 @@ def test_bad_arrays(tmp_path):
     refused(r"holds 2 sequences \(a, b\); say which: --key a", **{"a/y": VALUES, "b/y": VALUES})
     with pytest.raises(ValueError, match=r"has no sequence 'c'; its sequences are a, b"):
         read_tracks([tmp_path / "t.npz"], key="c")
-    (tmp_path / "t.npz").write_bytes(b"PK\3\4 broken")
-    with pytest.raises(ValueError, match=r"t\.npz: cannot be read as numpy data"):
-        read_tracks([tmp_path / "t.npz"])
 
 
 def test_other_refusals(write, tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from indexing.readers.matches import MAX_SIDE, read_image, read_pair
+from tests.indexing.readers.tools import refused
 
 X1, X2 = np.arange(20.0).reshape(10, 2), np.arange(20.0, 40.0).reshape(10, 2)
 
@@ -58,21 +59,15 @@ def test_arrays(tmp_path):
         (",".join("abcdefghij") + "\n" + "1," * 9 + "1", "its columns are a, b, c, d, e, f, g, h, ...; name the columns"),
         ("1,2,3\n4,5,6", "row 1 has 3 columns, and no row names them; name the columns x1,y1,x2,y2"),
         ("1,2,3,4,1\n1,2,3,4,1", "row 1 has 5 columns"),
-        ("1,2,3,4\n1,2,3", "row 2 has 3 cells, the first row 4"),
-        ("1,2,3,4\n1,2,3,inf", "row 2, column 'y2': 'inf' is not finite"),
-        ("x1,y1,x2,y2\n1,2,3,abc", "row 2, column 'y2': 'abc' is not a number"),
         ("x1,y1,x2,y2,x1\n1,2,3,4,5", "there are two columns 'x1'"),
         ("x1,y1,x2,y2,label\n1,2,3,4,1.5", "match 1: the label is 1.5; labels are 0 for an outlier"),
         ("x1,y1,x2,y2,label\n1,2,3,4,", "match 1: the label is nan"),
         ("x1,y1,x2,y2,label\n1,2,3,4,cup", "row 2, column 'label': 'cup' is not a number"),
         ("x1,y1,x2,y2,weight\n1,2,3,4,-1", "match 1: the weight is -1; weights are 0 or more"),
-        ("id,x1,y1,x2,y2\na,1,2,3,4\na,1,2,3,4", "row 3, column 'id': 'a' was in row 2, too"),
     ],
 )
 def test_bad_tables_name_file_field_and_remedy(tmp_path, text, says):
-    with pytest.raises(ValueError, match=r"m\.csv: ") as caught:
-        read_pair(table(tmp_path / "m.csv", text))
-    assert says in str(caught.value) and "\n" not in str(caught.value) and "; " in str(caught.value)
+    refused(table(tmp_path / "m.csv", text), says, action=read_pair)
 
 
 @pytest.mark.parametrize(
@@ -99,19 +94,13 @@ def test_bad_tables_name_file_field_and_remedy(tmp_path, text, says):
 )
 def test_bad_arrays_name_file_field_and_remedy(tmp_path, arrays, says):
     np.savez(tmp_path / "m.npz", **arrays)
-    with pytest.raises(ValueError, match=r"m\.npz") as caught:
-        read_pair(tmp_path / "m.npz")
-    assert says in str(caught.value) and "\n" not in str(caught.value) and "; " in str(caught.value)
+    refused(tmp_path / "m.npz", says, action=read_pair)
 
 
-def test_an_array_of_another_shape_and_a_broken_archive(tmp_path):
+def test_an_array_of_another_shape(tmp_path):
     np.save(tmp_path / "m.npy", X1)
     with pytest.raises(ValueError, match=r"m\.npy: the array has shape \(10, 2\); matches are \(n, 4\)"):
         read_pair(tmp_path / "m.npy")
-    np.savez(tmp_path / "m.npz", x1=X1, x2=X2)
-    (tmp_path / "cut.npz").write_bytes((tmp_path / "m.npz").read_bytes()[:300])
-    with pytest.raises(ValueError, match=r"cut\.npz: cannot be read as numpy data"):
-        read_pair(tmp_path / "cut.npz")
 
 
 def test_photographs_keep_the_size_of_the_file(tmp_path):

@@ -7,6 +7,7 @@ import json
 import pickle
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -206,59 +207,92 @@ def test_an_infinite_coordinate_is_named(person: np.ndarray, tmp_path: Path) -> 
 
 
 # ---- hostile -------------------------------------------------------------------------------------------------------------
-def test_links_out_of_the_file_are_not_followed(person: np.ndarray, tmp_path: Path) -> None:
-    other = tools.sleap_analysis(tmp_path / "other.h5", {"a": person}, NAMES)
-    path = tools.sleap_analysis(tmp_path / "a.h5", {"a": person}, NAMES)
-
-    def outside(file: Any) -> None:
-        del file["tracks"]
-        file["tracks"] = h5py.ExternalLink(str(other), "/tracks")
-
-    refused(changed(path, outside), "without keypoints")
-    path = tools.sleap_analysis(tmp_path / "b.h5", {"a": person}, NAMES)
-
-    def softly(file: Any) -> None:
-        file["real"] = h5py.ExternalLink(str(other), "/tracks")
-        del file["tracks"]
-        file["tracks"] = h5py.SoftLink("/real")
-
-    refused(changed(path, softly), "no dataset 'tracks'")
+OTHER = "other.h5"  # beside the file that is changed
 
 
-def test_values_kept_in_other_files_are_not_read(person: np.ndarray, tmp_path: Path) -> None:
-    (tmp_path / "secret").write_bytes(bytes(8 * 2 * 17 * 6))
-    path = tools.sleap_analysis(tmp_path / "a.h5", {"a": person}, NAMES)
-
-    def elsewhere(file: Any) -> None:
-        del file["tracks"]
-        file.create_dataset("tracks", (1, 2, 17, 6), "f8", external=[(str(tmp_path / "secret"), 0, 8 * 2 * 17 * 6)])
-
-    refused(changed(path, elsewhere), "kept in another file")
-
-    def virtual(file: Any) -> None:
-        del file["tracks"]
-        layout = h5py.VirtualLayout((1, 2, 17, 6), "f8")
-        layout[:] = h5py.VirtualSource(str(tmp_path / "x.h5"), "tracks", (1, 2, 17, 6))
-        file.create_virtual_dataset("tracks", layout)
-
-    refused(changed(path, virtual), "kept in another file")
+def link_outside(file: Any) -> None:
+    del file["tracks"]
+    file["tracks"] = h5py.ExternalLink(OTHER, "/tracks")
 
 
-def test_declared_sizes_are_checked_before_anything_is_made(person: np.ndarray, tmp_path: Path) -> None:
-    path = tools.sleap_analysis(tmp_path / "a.h5", {"a": person}, NAMES)
+def link_softly_outside(file: Any) -> None:
+    file["real"] = h5py.ExternalLink(OTHER, "/tracks")
+    del file["tracks"]
+    file["tracks"] = h5py.SoftLink("/real")
 
-    def bomb(file: Any) -> None:
-        del file["tracks"], file["point_scores"]
-        file.create_dataset("tracks", (1, 2, 17, 3_000_000), "f8", chunks=(1, 2, 17, 1000), compression="gzip")  # nothing stored
 
-    refused(changed(path, bomb), "would take 0.8 GB of 0.0 MB")
-    path = tools.deeplabcut(tmp_path / "b.h5", person, NAMES, "fixed")
+def keep_values_elsewhere(file: Any) -> None:
+    del file["tracks"]
+    file.create_dataset("tracks", (1, 2, 17, 6), "f8", external=[(OTHER, 0, 8 * 2 * 17 * 6)])
 
-    def wide(file: Any) -> None:
-        del file["df_with_missing/block0_values"]
-        file["df_with_missing"].create_dataset("block0_values", (10**7, 51), "f8", chunks=(1000, 51))
 
-    refused(changed(path, wide), "would take")
+def keep_values_virtually(file: Any) -> None:
+    del file["tracks"]
+    layout = h5py.VirtualLayout((1, 2, 17, 6), "f8")
+    layout[:] = h5py.VirtualSource(OTHER, "tracks", (1, 2, 17, 6))
+    file.create_virtual_dataset("tracks", layout)
+
+
+def declare_much(file: Any) -> None:
+    del file["tracks"], file["point_scores"]
+    file.create_dataset("tracks", (1, 2, 17, 3_000_000), "f8", chunks=(1, 2, 17, 1000), compression="gzip")  # nothing stored
+
+
+def declare_many_rows(file: Any) -> None:
+    del file["df_with_missing/block0_values"]
+    file["df_with_missing"].create_dataset("block0_values", (10**7, 51), "f8", chunks=(1000, 51))
+
+
+def name_by_rows_of_any_length(file: Any) -> None:
+    del file["tracks_json"]
+    file.create_dataset("tracks_json", (2,), dtype=h5py.vlen_dtype(np.float64))
+
+
+def add_field_of_any_length(file: Any) -> None:
+    old = file["pred_points"][()]
+    new = np.zeros(len(old), dtype=[*old.dtype.descr, ("more", h5py.vlen_dtype(np.uint8))])
+    for field in old.dtype.names:
+        new[field] = old[field]
+    new["more"] = [np.zeros(1, np.uint8) for _ in new]
+    del file["pred_points"]
+    file.create_dataset("pred_points", data=new, dtype=new.dtype)
+
+
+def leave_no_joints(file: Any) -> None:
+    put(file, "position", np.zeros((10**9, 2, 0, 1)))
+    put(file, "keypoints", np.zeros(0, h5py.string_dtype()))
+
+
+class Harm:
+    def __reduce__(self) -> Any:
+        return builtins.eval, ("1/0",)
+
+
+def run_pickle(file: Any) -> None:
+    file["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(pickle.dumps(Harm(), 0))
+
+
+HOSTILE: list[tuple[str, Callable[[Any], None], tuple[str, ...]]] = [
+    ("sleap analysis", link_outside, ("without keypoints",)),
+    ("sleap analysis", link_softly_outside, ("no dataset 'tracks'",)),
+    ("sleap analysis", keep_values_elsewhere, ("kept in another file",)),
+    ("sleap analysis", keep_values_virtually, ("kept in another file",)),
+    ("sleap analysis", declare_much, ("would take 0.8 GB of 0.0 MB",)),
+    ("deeplabcut fixed", declare_many_rows, ("would take",)),
+    ("sleap project tracked", name_by_rows_of_any_length, ("is no list of names",)),
+    ("sleap project tracked", add_field_of_any_length, ("'pred_points' has fields that are neither numbers nor text of one",)),
+    ("movement", leave_no_joints, ("position is (1000000000, 1, 0, 2)",)),
+    ("deeplabcut table", run_pickle, ("the pickle holds the name", "eval")),
+]
+
+
+def test_hostile_files_are_refused_before_anything_is_followed_made_or_run(person: np.ndarray, tmp_path: Path) -> None:
+    tools.sleap_analysis(tmp_path / OTHER, {"a": person}, NAMES)
+    cases = {
+        change.__name__: partial(refused, changed(MAKERS[maker](tmp_path / f"{change.__name__}.h5", person), change), *words)
+        for maker, change, words in HOSTILE
+    }
+    assert tools.list_failures(cases) == {}
 
 
 def test_heaps_of_text_without_end_are_refused_before_the_library_walks_them(person: np.ndarray, tmp_path: Path) -> None:
@@ -332,31 +366,6 @@ def test_texts_whose_lengths_cannot_be_seen_are_refused(where: str, person: np.n
     refused(changed(path, hidden), "in an uncommon way")
 
 
-def test_rows_of_any_length_are_no_names(person: np.ndarray, tmp_path: Path) -> None:
-    path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
-
-    def rows(file: Any) -> None:
-        del file["tracks_json"]
-        file.create_dataset("tracks_json", (2,), dtype=h5py.vlen_dtype(np.float64))
-
-    refused(changed(path, rows), "is no list of names")
-
-
-def test_records_with_fields_of_any_length_are_refused(person: np.ndarray, tmp_path: Path) -> None:
-    path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
-
-    def more(file: Any) -> None:
-        old = file["pred_points"][()]
-        new = np.zeros(len(old), dtype=[*old.dtype.descr, ("more", h5py.vlen_dtype(np.uint8))])
-        for field in old.dtype.names:
-            new[field] = old[field]
-        new["more"] = [np.zeros(1, np.uint8) for _ in new]
-        del file["pred_points"]
-        file.create_dataset("pred_points", data=new, dtype=new.dtype)
-
-    refused(changed(path, more), "'pred_points' has fields that are neither numbers nor text of one length")
-
-
 def test_many_texts_in_an_attribute_are_not_read(person: np.ndarray, tmp_path: Path) -> None:
     path = tools.sleap_analysis(tmp_path / "a.h5", {"a": person}, NAMES)
     with h5py.File(path, "r+") as file:
@@ -397,30 +406,6 @@ def test_animals_are_checked_before_room_is_made_for_them(
     with monkeypatch.context() as patch:
         patch.setattr(np, "full", checked)
         refused(changed(path, wide), "pred_points: an animal has no 1500 points")
-
-
-def test_poses_of_no_joints_are_refused_whatever_their_number_of_frames(person: np.ndarray, tmp_path: Path) -> None:
-    path = tools.movement(tmp_path / "a.nc", {"id": person}, NAMES)
-
-    def none(file: Any) -> None:
-        put(file, "position", np.zeros((10**9, 2, 0, 1)))
-        put(file, "keypoints", np.zeros(0, h5py.string_dtype()))
-
-    refused(changed(path, none), "position is (1000000000, 1, 0, 2)")
-
-
-class Harm:
-    def __reduce__(self) -> Any:
-        return builtins.eval, ("1/0",)
-
-
-def test_a_pickle_in_an_attribute_runs_nothing(person: np.ndarray, tmp_path: Path) -> None:
-    path = tools.deeplabcut(tmp_path / "a.h5", person, NAMES)
-
-    def harm(file: Any) -> None:
-        file["df_with_missing/table"].attrs["values_block_0_kind"] = np.bytes_(pickle.dumps(Harm(), 0))
-
-    refused(changed(path, harm), "the pickle holds the name", "eval")
 
 
 TUPLE_KEY = b"})" + b"2\x86" * 60 + b"Ns."

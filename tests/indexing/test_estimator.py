@@ -6,6 +6,7 @@ check is skipped, which proves nothing.  What those checks are for is tested her
 
 from __future__ import annotations
 
+import inspect
 import pydoc
 from collections.abc import Callable
 from copy import deepcopy
@@ -94,16 +95,12 @@ class Case:
         return self.kind(**{**self.options, **options})
 
 
-WRONG_KEYPOINTS = {
-    "view": "front", "weights": "odd", "scorer": "best", "mirror": "maybe", "reject": "often", "fps": 0.0, "length": 3, "tempi": (),
-    "window": -1.0, "virtual_views": -1, "random_state": "x", "device": "abacus",
-}  # fmt: skip
 WRONG_FRAMES = {
     "harmonics": 0, "course": "often", "reject": "often", "fps": 0.0, "mirror": "maybe", "window": -1.0, "device": "abacus",
 }  # fmt: skip
 SMALL = {"length": 8, "search": False, "virtual_views": 1, "tempi": (1.0,)}
 CASES = [
-    Case("keypoints", ActionIndexer, keypoints, {"length": 8}, WRONG_KEYPOINTS, {"scorer": ["nearest", "both"]}, 1e-3, True, True),
+    Case("keypoints", ActionIndexer, keypoints, {"length": 8}, {}, {"scorer": ["nearest", "both"]}, 1e-3, True, True),
     *(
         Case(name, ActionIndexer, keypoints, {**SMALL, **options}, {}, {}, 1e-3, options.get("scorer") != "nearest", True)
         for name, options in (
@@ -363,3 +360,25 @@ def cross_validation_chooses_among_lists_of_clips(case: Case) -> None:
     search = GridSearchCV(case.make(), case.grid, cv=splits[:1], error_score="raise").fit(lesson.items, lesson.labels)
     assert set(search.best_params_) == set(case.grid) and search.classes_.tolist() == list(FEW) and search.best_score_ > 0.5
     assert search.score(lesson.asked, lesson.truth) > 0.6
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The promises of :mod:`tests.indexing.test_estimator` for every indexer.
+
+
+SLOW = ("one_example_of_each_class_is_enough", "an_accelerator_answers_the_same")
+"""Promises that take many fits."""
+
+
+@pytest.mark.parametrize(
+    ("case", "check"),
+    [
+        pytest.param(case, check, id=f"{case.name}-{check.__name__}", marks=pytest.mark.slow if check.__name__ in SLOW else ())
+        for case in CASES
+        for check, applies in CHECKS
+        if applies(case)
+    ],
+)
+def test_promise(case, check, tmp_path):
+    needs_a_folder = "path" in inspect.signature(check).parameters
+    check(case, tmp_path) if needs_a_folder else check(case)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from indexing.readers import read, read_clip
+from tests.indexing.readers.tools import refused
 
 FRAMES = 5
 
@@ -93,7 +94,5 @@ def test_several_people(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_broken_is_named(tmp_path: Path, frames: dict[int, list[str]], words: tuple[str, ...]) -> None:
-    with pytest.raises(ValueError) as caught:  # noqa: PT011
-        read(write(tmp_path / "labels", frames))
-    for word in words:
-        assert word in str(caught.value), str(caught.value)
+    path = write(tmp_path / "labels", frames)
+    refused(path / words[0] if words[0].endswith(".txt") else path, *words[1:], action=lambda _: read(path))
