@@ -70,11 +70,6 @@ def check_device(device: str) -> None:
         raise ValueError(f"device {device!r} is not there: {str(error).splitlines()[0]}; use device='cpu'") from None
 
 
-def changed_options(options: Any) -> dict[str, Any]:
-    """The fields of options that differ from their defaults, as JSON holds them."""
-    return {each.name: getattr(options, each.name) for each in fields(options) if getattr(options, each.name) != each.default}
-
-
 def read_options(kind: type[Options], header: Mapping[str, Any]) -> Options | None:
     """The options of a model file: ``None`` where all of them were the defaults, as in files that know none."""
     changed = header["parameters"].get("options")
@@ -126,8 +121,9 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     def saved_parameters(self) -> dict[str, Any]:
         """The parameters as a model file holds them: options only where they are not the defaults."""
         parameters: dict[str, Any] = self.get_params()
-        changed = changed_options(parameters.pop("options")) if parameters.get("options") is not None else {}
-        parameters.pop("options", None)
+        options = parameters.pop("options", None)
+        each = {} if options is None else {one.name: (getattr(options, one.name), one.default) for one in fields(options)}
+        changed = {name: value for name, (value, default) in each.items() if value != default}
         return parameters | ({"options": changed} if changed else {})
 
     def score(self, clips: Iterable[Any], labels: ArrayLike, sample_weight: ArrayLike | None = None) -> float:

@@ -53,6 +53,7 @@ def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, n
     joints, people = _names(dataset, "keypoints", position.shape[2]), _names(dataset, "individuals", position.shape[1])
     bones = _skeleton(attrs, joints, name)
     visible: NDArray[np.bool_] = np.asarray(~np.isnan(position).any(axis=3))
+    stated_up = attrs["up"] if isinstance(attrs.get("up"), str) else "-y" if position.shape[3] == 2 else "z"
     clips = []
     for i in range(position.shape[1]):
         if not visible[:, i].any():
@@ -71,7 +72,7 @@ def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, n
                 label=_label(attrs),
                 name=name if who is None else f"{name}#{who}",
                 skeleton=bones,
-                up=up or _up(attrs, position.shape[3]),
+                up=up or stated_up,
                 meta={} if who is None else {"person": who, "followed": "ids", "untracked": 0},
             )
         )
@@ -185,10 +186,6 @@ def _times(
 def _label(attrs: Mapping[str, Any]) -> str | int | None:
     label = attrs.get("label")
     return label.item() if isinstance(label, np.generic) else label if isinstance(label, (str, int)) else None
-
-
-def _up(attrs: Mapping[str, Any], dims: int) -> str:
-    return str(attrs["up"]) if isinstance(attrs.get("up"), str) else ("-y" if dims == 2 else "z")
 
 
 def _skeleton(attrs: Mapping[str, Any], joints: list[str], who: str) -> Skeleton | None:

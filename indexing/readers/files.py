@@ -148,17 +148,14 @@ def _open_folder(folder: Path) -> Source:
             numbered[number] = file
         for file in files:
             size_of(file)  # a folder or a pipe among them is named before any of them is read
-        read = load_json if suffix == ".json" else _skip_content
+        # text files are read by the one format that uses them
+        read = load_json if suffix == ".json" else lambda path: None
         return Source(folder, f"{suffix[1:]} folder", [FrameFile(n, f, read(f)) for n, f in sorted(numbered.items())])
     arrays = _arrays(folder, visible)
     if arrays:
         return Source(folder, "npy folder", arrays)
     inside = listing((entry.name for entry in visible), 5) if visible else "nothing"
     raise error(folder, f"the folder has no .json or .txt keypoint files (it has {inside})", "give the folder of one recording")
-
-
-def _skip_content(path: Path) -> None:
-    """Text files are read by the one format that uses them."""
 
 
 def frame_number(name: str) -> int | None:

@@ -71,7 +71,7 @@ def select_people(path: Path, recording: Recording, person: str) -> list[tuple[H
         raise error(path, what, Message("use {arg:person='largest'} or 'tracked'"))
     if alone:
         return [(None, np.arange(len(recording.at)))]
-    area = _areas(recording.joints)
+    area = np.sort(_extents(recording.joints), axis=1)[:, -2:].prod(axis=1)  # of the box; in 3D, of its largest face
     weight = recording.confidence.mean(axis=1) if person == "confident" and recording.confidence is not None else area
     tracked = ids is not None
     if ids is None:
@@ -155,11 +155,6 @@ def _extents(joints: FloatArray) -> FloatArray:
     """``(m, d)`` sides of the boxes around the joints seen."""
     seen = ~np.isnan(joints)
     return np.asarray(np.where(seen, joints, -np.inf).max(axis=1) - np.where(seen, joints, np.inf).min(axis=1))
-
-
-def _areas(joints: FloatArray) -> FloatArray:
-    """``(m,)`` area of the box around the joints seen; in 3D, of its largest face."""
-    return np.asarray(np.sort(_extents(joints), axis=1)[:, -2:].prod(axis=1))
 
 
 FOLLOWING = ("person", "followed", "untracked", "people")  # what is known of a clip because of who is followed in it

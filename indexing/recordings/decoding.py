@@ -115,7 +115,11 @@ def decode(
         # what would be there, did rest and absence count as movement, and is not
         awake = np.minimum(calm, options.min_quality * _unit(one, durations))
         restless, _ = best_tiling(one.lattice.windows, values + absent, awake)
-        silent = [part for part in _merge_segments(model, one, restless, durations, stream.length) if not _overlaps(part, mine)]
+        silent = [
+            part
+            for part in _merge_segments(model, one, restless, durations, stream.length)
+            if not any(min(part.last, other.last) > max(part.first, other.first) for other in mine)
+        ]
         reasons: list[Reason] = ["nobody there" if not one.present[part.first : part.last].any() else "at rest" for part in silent]
         silent_events = events_of(model, one, silent, values, classes, stream.length)
         held += [Withheld(event, reason) for event, reason in zip(silent_events, reasons, strict=True)]
@@ -274,11 +278,6 @@ def events_of(
         start, end = one.lattice.edges[part.first], one.lattice.edges[part.last]
         events.append(Event(classes[part.label], float(start), float(end), score, margin, exemplar))
     return events
-
-
-def _overlaps(part: TiledSegment, others: Sequence[TiledSegment]) -> bool:
-    """Whether a segment shares any cell with some others."""
-    return any(min(part.last, other.last) > max(part.first, other.first) for other in others)
 
 
 def _apply_level(model: ShapeModel, events: list[Event], rate: float | None) -> tuple[list[Event], list[Withheld]]:

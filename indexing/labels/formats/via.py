@@ -49,7 +49,10 @@ def read(data: Mapping[str, Any] | list[Row], asked: Request) -> LabelFile:
 
 def _read_project(out: Gathering, data: Mapping[str, Any]) -> None:
     attributes = _attributes(data.get("attribute"))
-    files = {name: _name(one) for name, one in data["file"].items()}
+    files = {
+        name: base_name(text_of(one.get("fname")) or text_of(one.get("src"))) if isinstance(one, dict) else ""
+        for name, one in data["file"].items()
+    }
     views = data.get("view")
     shown_in: dict[str, list[str]] = {}
     for name, view in views.items() if isinstance(views, dict) else ():
@@ -70,10 +73,6 @@ def _read_project(out: Gathering, data: Mapping[str, Any]) -> None:
 
 def _attributes(found: Any) -> Attributes:
     return {name: one for name, one in found.items() if isinstance(one, dict)} if isinstance(found, dict) else {}
-
-
-def _name(one: Any) -> str:
-    return base_name(text_of(one.get("fname")) or text_of(one.get("src"))) if isinstance(one, dict) else ""
 
 
 def _segment(

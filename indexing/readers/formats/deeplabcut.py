@@ -112,7 +112,7 @@ def _frames(source: Source, keys: list[str]) -> IntArray:
 def matches(source: Source) -> bool:
     """A table that begins with the rows of DeepLabCut, or one of pandas in HDF5."""
     if source.kind == "hdf5":
-        return holds_frame(source.data)
+        return bool(_keys(source.data))
     first = [row[0].strip().lower() for row in source.data[:2]]
     return first[0] == "scorer" or first[1:] in (["bodyparts"], ["individuals"])
 
@@ -139,11 +139,6 @@ class HdfFrame:
     header: dict[str, list[str]]
     values: FloatArray
     index: list[str]
-
-
-def holds_frame(file: Hdf5) -> bool:
-    """Whether pandas wrote the file."""
-    return bool(_keys(file))
 
 
 def read_frame(file: Hdf5) -> HdfFrame:

@@ -78,17 +78,14 @@ def _names(file: Hdf5, name: str) -> list[str]:
     """What the axes of an array are called: by the numbers that netCDF gives them, else in the order in which movement has
     them."""
     numbers = file.attribute(name, "_Netcdf4Coordinates")
-    axes = {_to_int(file.attribute(axis, "_Netcdf4Dimid")): axis for axis in AXES if axis in file}
+    ids = {axis: file.attribute(axis, "_Netcdf4Dimid") for axis in AXES if axis in file}
+    axes = {number if isinstance(number, int | np.integer) else None: axis for axis, number in ids.items()}
     if isinstance(numbers, np.ndarray) and numbers.ndim == 1 and numbers.dtype.kind in "iu" and None not in axes:
         found = [axes.get(int(number), str(number)) for number in numbers[: len(AXES) + 1]]
         if len(found) == len(file.shape(name)):
             return found
     usual = [axis for axis in USUAL if axis != "space" or name == "position"]
     return [axis for axis in usual if axis in file or axis in ("time", "space")]
-
-
-def _to_int(value: Any) -> int | None:
-    return int(value) if isinstance(value, (int, np.integer)) else None
 
 
 def _times(file: Hdf5, frames: int, options: Options) -> tuple[Array, Array | None]:
