@@ -153,7 +153,7 @@ class Evidence:
         views = tuple(x[:, piece] for x in self.views)
         problem = self.problem(torch.zeros_like(self.data.weights))
         squares = []
-        for value, derivative in (problem.moving(theta, views), problem.resting(theta, views)):
+        for value, derivative in (problem.linearize_moving(theta, views), problem.linearize_static(theta, views)):
             e = value.unflatten(1, (views[0].shape[1], -1))
             j = derivative.mT.unflatten(1, e.shape[1:])  # (b, n, c, p)
             eye = torch.eye(j.shape[-2], dtype=theta.dtype, device=theta.device)
