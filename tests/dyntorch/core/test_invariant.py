@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.core.invariant import ARGUMENTS, Frame, Invariant, as_invariant, on_class
+from dyntorch.core.invariant import ARGUMENTS, Invariant, as_invariant, on_class
 from dyntorch.core.primitives import HyperplanesThrough, Line, Point
 
 
@@ -28,19 +28,6 @@ def test_sizes_follow_from_the_declaration(primitives, nullity, layout, expected
     Declared.primitives, Declared.nullity, Declared.layout = primitives, nullity, layout
     for invariant in (Declared, Declared()):
         assert (invariant.shape(), invariant.width(), invariant.rows(), invariant.minimal()) == expected
-
-
-def test_counts_of_the_thesis():
-    expected = {
-        dyn.FundamentalMatrix: 8,
-        dyn.HomographyTensor: 26,
-        dyn.DualHomographyTensor: 26,
-        dyn.JoinTensor: 60,
-        dyn.MinimalJoinTensor: 47,
-        dyn.ConstantVelocityTensor: 21,
-        dyn.TranslatingLinesMatrix: 35,
-    }
-    assert {kind: kind.minimal() for kind in expected} == expected
 
 
 def test_defaults_leave_everything_as_it_is():
@@ -80,11 +67,6 @@ def test_as_invariant():
     for wrong in ("HomographyTensor", 3, torch.rand, int):
         with pytest.raises(ValueError, match=r"expected an invariant such as dyntorch\.HomographyTensor, got "):
             as_invariant(wrong)
-
-
-def test_frames_say_what_they_map():
-    assert Frame(0, 1) == Frame(target=0, source=1, vector=False)
-    assert [f.target for f in dyn.ConstantVelocityTensor.motion] == [0, 1, 2]
 
 
 def test_the_arguments_that_a_misspelt_one_is_compared_with_are_those_of_the_verbs():

@@ -4,9 +4,7 @@ import pytest
 import torch
 
 from dyntorch.core.primitives import Hyperplane, HyperplanesThrough, Line, Point, Projected
-from tests.battery.references import free_vectors, plucker, subdeterminants
-
-G = torch.Generator()
+from tests.battery.references import plucker, subdeterminants
 
 
 def random(*shape, seed=0):
@@ -172,19 +170,6 @@ def test_several_hyperplanes_have_no_single_vector(d):
     for call in (lambda p: p.pullback(x, x), lambda p: p.pushforward(x, x)):
         with pytest.raises(NotImplementedError, match="no single vector"):
             call(HyperplanesThrough(d))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("primitive", "x"), ALL)
-def test_what_is_free_when_the_match_is_static(primitive, x):
-    free = primitive.free(x)
-    assert free.shape[-3:] == (5, primitive.width, primitive.width)
-    torch.testing.assert_close(free @ free, free)
-    if isinstance(primitive, Line) and x.shape[-1] == 3:
-        basis = torch.stack(free_vectors(primitive, x[0, 0]))
-        torch.testing.assert_close(free[0, 0], basis.T @ basis)
-    elif not isinstance(primitive, Line):
-        torch.testing.assert_close(free, torch.eye(primitive.width).double().expand_as(free))
 
 
 def test_cameras_of_normalized_points_are_well_conditioned():

@@ -1,11 +1,16 @@
-"""Whitened disagreement of static points: covariance by finite differences, true geometric distance, chi-square, infinity."""
+"""Whitened disagreement of static points, collinearity of moving ones: against brute force, their statistics and derivatives."""
+
+from __future__ import annotations
+
+import math
 
 import pytest
 import torch
 
 from dyntorch.core.residual import whiten
-from dyntorch.geometry.homogeneous import apply
-from dyntorch.invariants.agreement import static_residual
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
+from dyntorch.invariants.agreement import collinearity, join_forms, motion_of_forms, static_residual
+from dyntorch.scenes import moving_points
 
 
 def random(*shape, seed=0):
@@ -87,3 +92,195 @@ def test_points_at_infinity_stay_finite_in_value_and_gradient():
     w.sum().backward()
     assert w.isfinite().all()
     assert x2.grad.isfinite().all()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Collinearity of three points: against a brute-force geometric distance; the motion of forms.
+
+
+ONE = torch.ones((), dtype=torch.float64)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def random_collinearity(*shape, seed=0):
+    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+def noisy(sigmas, *, seed, **options):
+    scene = moving_points(generator=generator(seed), **options)
+    g = generator(seed + 1)
+    views = tuple(x + s * torch.randn(x.shape, generator=g, dtype=x.dtype) for x, s in zip(scene.exact, sigmas, strict=True))
+    return scene, views, tuple(ONE * s for s in sigmas)
+
+
+def geometric_distance(motion, views, scales):
+    """The smallest weighted move of all nine coordinates of each match that puts its three points on a line, by Gauss-Newton.
+
+    The line and the places on it are the unknowns: start point, direction, two places; the third is the start itself.
+    """
+    inverse = [torch.eye(4, dtype=torch.float64), *(torch.linalg.inv(m) for m in motion)]
+    first = [views[0], apply(motion[0], views[1]), apply(motion[1], views[2])]
+    direction = first[2] - first[0]
+    place = [((y - first[0]) * direction).sum(-1, keepdim=True) / direction.square().sum(-1, keepdim=True) for y in first[1:]]
+    found = torch.cat([first[0], direction, *place], dim=-1)
+
+    def residual(p, x):
+        start, along, a, b = p[:3], p[3:6], p[6], p[7]
+        points = (start, start + a * along, start + b * along)
+        return torch.cat([(apply(m, q[None])[0] - y) / s for m, q, y, s in zip(inverse, points, x, scales, strict=True)])
+
+    jacobian = torch.func.vmap(torch.func.jacfwd(residual))
+    value = torch.func.vmap(residual)
+    for _ in range(12):
+        r, j = value(found, views), jacobian(found, views)
+        # two directions of the eight parameters do not change the points: the least squares solution of smallest norm
+        found = found - (torch.linalg.pinv(j, rtol=1e-10) @ r[..., None])[..., 0]
+    return value(found, views).norm(dim=-1)
+
+
+@pytest.mark.parametrize("sigmas", [(1e-3, 1e-3, 1e-3), (2e-4, 2e-3, 6e-4)])
+def test_equals_the_geometric_distance_to_first_order(sigmas):
+    scene, views, scales = noisy(sigmas, n=200, seed=1)
+    distance = collinearity(scene.motion, views, scales).norm(dim=-1)
+    exact = geometric_distance(scene.motion, views, scales)
+    assert exact.min() > 0.01
+    # a second-order difference: relative to one standard deviation it is of the order of the noise over the motion
+    assert (distance - exact).abs().max() < 0.05
+    assert (distance - exact).abs().median() < 2e-3
+
+
+@pytest.mark.parametrize(("sigmas", "static", "expected"), [
+    ((0.002, 0.002, 0.002), 0.0, 1.0),
+    ((0.001, 0.008, 0.003), 0.0, 1.0),
+    ((0.002, 0.002, 0.002), 1.0, 0.5),
+])  # fmt: skip
+def test_square_sum_has_the_declared_mean(sigmas, static, expected):
+    scene, views, scales = noisy(sigmas, n=10000, batch=3, static=static, seed=2)
+    half = collinearity(scene.motion, views, scales).square().sum(-1).mean() / 2
+    # 30000 squares of two degrees of freedom: the mean is known to 0.6 %
+    assert abs(half - expected) < (0.02 if static == 0 else 0.04)
+
+
+def test_scales_of_motion_and_unit_do_not_matter():
+    scene, views, scales = noisy((0.01,) * 3, n=30, batch=2, seed=5)
+    expected = collinearity(scene.motion, views, scales)
+    torch.testing.assert_close(collinearity((-3 * scene.motion[0], 0.2 * scene.motion[1]), views, scales), expected)
+    metre = torch.diag(torch.tensor([1000.0, 1000.0, 1000.0, 1.0], dtype=torch.float64))
+    motion = [metre @ m @ torch.linalg.inv(metre) for m in scene.motion]
+    got = collinearity(tuple(motion), tuple(1000 * x for x in views), tuple(1000 * s for s in scales))
+    torch.testing.assert_close(got, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_swapping_the_outer_views_changes_nothing_but_the_frame():
+    """Rigid frames: whichever of the three views the residual is written in, its norm is the same."""
+    scene, views, scales = noisy((0.01, 0.02, 0.03), n=40, sensors="rigid", seed=6)
+    a, b = scene.motion
+    back = torch.linalg.inv(b)
+    other = collinearity((back @ a, back), (views[2], views[1], views[0]), (scales[2], scales[1], scales[0]))
+    torch.testing.assert_close(other.norm(dim=-1), collinearity(scene.motion, views, scales).norm(dim=-1))
+
+
+@pytest.mark.parametrize("static", [0.0, 1.0])
+def test_forward_derivative_equals_finite_differences(static):
+    scene, views, scales = noisy((0.005,) * 3, n=300, static=static, seed=8)
+    step = tuple(0.3 * random_collinearity(4, 4, seed=s) for s in (80, 81))
+
+    def residual(a, b):
+        return collinearity((a, b), views, scales)
+
+    _, tangent = torch.func.jvp(residual, scene.motion, step)
+    h = 1e-6
+    plus, minus = (residual(*(m + sign * h * d for m, d in zip(scene.motion, step, strict=True))) for sign in (1, -1))
+    error = ((plus - minus) / (2 * h) - tangent).norm(dim=-1) / tangent.norm(dim=-1)
+    assert error.median() < 1e-6
+    # static points have no direction of their own, so that a few are strongly curved; none jumps
+    assert error.max() < (1e-5 if static == 0 else 1e-2)
+
+
+def test_jacobian_is_continuous_along_a_path():
+    """From one motion to another in small steps: residual and Jacobian move in proportion, up to their common sign."""
+    scene, views, scales = noisy((0.01,) * 3, n=60, seed=9)
+    step = tuple(0.05 * random_collinearity(4, 4, seed=s) for s in (90, 91))
+
+    def residual(t):
+        return collinearity(tuple(m + t * d for m, d in zip(scene.motion, step, strict=True)), views, scales)
+
+    times = torch.linspace(0, 1, 101, dtype=torch.float64)
+    value, tangent = torch.func.vmap(lambda t: torch.func.jvp(residual, (t,), (torch.ones_like(t),)))(times)
+    jumps = torch.stack([(s * value[1:] - value[:-1] - 0.005 * (s * tangent[1:] + tangent[:-1])).norm(dim=-1) for s in (1.0, -1.0)])
+    size = 1 + value[1:].norm(dim=-1) + tangent[1:].norm(dim=-1)
+    assert (jumps.amin(0) < 1e-3 * size).all()
+    turned = jumps[1] < jumps[0]
+    # where the middle point is farther from the other two than they are from each other: once at most, and rare
+    assert turned.sum(0).max() <= 1 and turned.double().mean() < 0.005
+
+
+@pytest.mark.parametrize("case", ["all equal", "two equal", "there and back", "zero motion", "singular motion", "at infinity"])
+def test_degenerate_matches_give_finite_values_and_derivatives(case):
+    eye, x = torch.eye(4, dtype=torch.float64), random_collinearity(5, 3, seed=11)
+    a, b, views = eye, eye, (x, x, x)
+    if case == "two equal":
+        views = (x, x, x + 1)
+    elif case == "there and back":
+        views = (x, x + 1, x)
+    elif case == "zero motion":
+        a = b = 0 * eye
+    elif case == "singular motion":
+        a = torch.diag(torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64))
+        views = (x, x + 1, x + 2)
+    elif case == "at infinity":
+        a = eye[[3, 1, 2, 0]]
+        views = (x, x * torch.tensor([0.0, 1.0, 1.0], dtype=torch.float64), x)
+
+    def residual(a, b, one, two, three):
+        return collinearity((a, b), (one, two, three), (ONE,) * 3)
+
+    assert residual(a, b, *views).isfinite().all()
+    for part in torch.func.jacfwd(residual, argnums=(0, 1, 2, 3, 4))(a, b, *views):
+        assert part.isfinite().all()
+
+
+def test_exact_static_points_among_moving_ones_leave_finite_gradients():
+    scene = moving_points(20, static=0.5, generator=generator(12))
+    inputs = [x.clone().requires_grad_() for x in (*scene.motion, *scene.exact)]
+    collinearity(tuple(inputs[:2]), tuple(inputs[2:]), (ONE,) * 3).square().sum().backward()
+    assert all(x.grad.isfinite().all() for x in inputs)
+
+
+def test_nan_stays_in_its_own_match():
+    scene, views, scales = noisy((0.01,) * 3, n=5, seed=13)
+    expected = collinearity(scene.motion, views, scales)
+    broken = (views[0], views[1].clone(), views[2])
+    broken[1][2] = math.nan
+    got = collinearity(scene.motion, broken, scales)
+    assert torch.equal(got[[0, 1, 3, 4]], expected[[0, 1, 3, 4]])
+
+
+def test_forms_are_determinants():
+    a, b, v = random_collinearity(3, 4, 4, seed=14), random_collinearity(3, 4, 4, seed=15), random_collinearity(3, 4, seed=16)
+    p, q, r = (homogeneous(random_collinearity(3, 3, seed=s)) for s in (17, 18, 19))
+    value = torch.einsum("zijk,zi,zj,zk->z", join_forms(a, b, v), p, q, r)
+    columns = torch.stack([p, (a @ q[..., None])[..., 0], (b @ r[..., None])[..., 0], v], dim=-1)
+    torch.testing.assert_close(value, torch.linalg.det(columns))
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_motion_of_two_forms_or_more(count):
+    a, b = random_collinearity(5, 4, 4, seed=20), random_collinearity(5, 4, 4, seed=21)
+    forms = join_forms(a[:, None], b[:, None], random_collinearity(5, count, 4, seed=22))
+    for got, true in zip(motion_of_forms(forms), (a, b), strict=True):
+        torch.testing.assert_close(got, unit(true), atol=1e-11, rtol=0)
+
+
+def test_zero_forms_have_a_finite_motion_and_leave_the_others_alone():
+    forms = join_forms(
+        random_collinearity(3, 1, 4, 4, seed=26), random_collinearity(3, 1, 4, 4, seed=27), torch.eye(4, dtype=torch.float64)
+    )
+    expected = motion_of_forms(forms)
+    forms[1] = 0
+    for got, true in zip(motion_of_forms(forms), expected, strict=True):
+        assert got.isfinite().all()
+        torch.testing.assert_close(got[[0, 2]], true[[0, 2]], atol=1e-12, rtol=0)

@@ -1,11 +1,9 @@
-"""Counting against every rank that is known for these configurations, brute force and identities of the field."""
+"""Counting against every rank that is known for these configurations, samplers and identities."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from itertools import combinations, product
-from math import comb, prod
 
 import numpy as np
 import pytest
@@ -13,123 +11,11 @@ import pytest
 from dyntorch.counting import (  # fmt: skip
     CONFIGURATIONS,
     Count,
-    Field,
     count,
     dim_v,
-    dim_v_closed_form,
     options_of,
-    partitions,
-    semistandard_tableaux,
-    standard_tableaux,
 )
-from dyntorch.counting.exact import LARGEST, Echelon
-from dyntorch.counting.ranks import PRIMES
-
-# ---------------------------------------------------------------------------------------------------- dim V
-
-
-@pytest.mark.parametrize(
-    ("n", "m", "k", "dimension"),
-    [
-        (3, 3, 2, 26),
-        (4, 3, 2, 60),
-        (3, 3, 1, 10),
-        (4, 3, 1, 20),
-        (3, 4, 2, 72),
-        (2, 3, 2, 8),
-        (2, 3, 1, 4),
-        (4, 4, 3, 255),
-        (4, 4, 2, 210),
-    ],
-)
-def test_dimensions_quoted_in_the_literature(n, m, k, dimension):
-    assert dim_v(n, m, k) == dimension
-
-
-def test_dimension_has_the_limits_of_fixed_and_of_free_points():
-    for n, m in product(range(1, 6), range(1, 6)):
-        assert dim_v(n, m, 0) == 0
-        assert dim_v(n, m, 1) == comb(n + m - 1, m)  # symmetric tensors
-        assert dim_v(n, m, m) == dim_v(n, m, m + 3) == n**m
-        assert dim_v(n, m, n) == n**m  # n vectors span everything
-
-
-def test_closed_forms_equal_the_sum():
-    checked = 0
-    for n, m, codim in product(range(1, 7), range(1, 7), (1, 2, 3)):
-        if m >= codim:
-            assert dim_v_closed_form(n, m, codim) == dim_v(n, m, m - codim)
-            checked += 1
-    assert checked == 6 * (6 + 5 + 4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("n", range(1, 6))
-def test_dimension_equals_brute_force_rank(n):
-    for m in range(1, 6):
-        for k in range(1, m + 1):
-            if n**m <= 700:
-                assert count(n - 1, views=[n - 1] * m, r=min(k, n)).rank == dim_v(n, m, k), (n, m, k)
-
-
-def test_all_tableaux_together_fill_the_space():
-    for n, m in product(range(1, 6), range(1, 8)):
-        assert sum(standard_tableaux(shape) * semistandard_tableaux(shape, n) for shape in partitions(m)) == n**m
-    assert dim_v(3, 100, 1) == comb(102, 2)  # short partitions only, of 190 million
-
-
-def tableaux(shape, n, strict_rows):
-    """Fillings by 1..n with increasing columns, by trying them all."""
-    boxes = [(i, j) for i, length in enumerate(shape) for j in range(length)]
-    good = 0
-    for values in product(range(n), repeat=len(boxes)):
-        at = dict(zip(boxes, values, strict=True))
-        columns = all(at[i, j] < at[i + 1, j] for i, j in boxes if (i + 1, j) in at)
-        rows = all(at[i, j] + strict_rows <= at[i, j + 1] for i, j in boxes if (i, j + 1) in at)
-        good += columns and rows and (not strict_rows or len(set(values)) == len(boxes))
-    return good
-
-
-@pytest.mark.parametrize("m", [1, 2, 3, 4, 5])
-def test_hook_lengths_equal_enumeration(m):
-    for shape in partitions(m):
-        assert standard_tableaux(shape) == tableaux(shape, m, 1)
-        assert semistandard_tableaux(shape, 3) == tableaux(shape, 3, 0)
-
-
-def test_condition_n_at_least_m_is_not_needed():
-    """The thesis asks n >= m >= k and uses V(2,3,2) and V(3,4,2)."""
-    assert dim_v(2, 3, 2) == count(1, views=[1, 1, 1], r=2).rank == 8
-    assert dim_v(3, 4, 2) == count(2, views=[2] * 4, r=2).rank == 72
-
-
-def test_excluded_partitions_are_those_of_smaller_numbers_only_up_to_2k_plus_2():
-    """The thesis states it for all m."""
-    number = [len(list(partitions(size))) for size in range(9)]
-    for m in range(1, 9):
-        for k in range(1, m + 1):
-            excluded = sum(len(shape) > k for shape in partitions(m))
-            assert (excluded == sum(number[: m - k])) == (m <= 2 * k + 2), (m, k)
-    assert sum(len(shape) > 1 for shape in partitions(5)) == 6 != sum(number[:4])
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: dim_v(0, 3, 2), "n must be an integer of at least 1, got 0"),
-        (lambda: dim_v(3, 3, -1), "k must be"),
-        (lambda: dim_v(3, 2.5, 1), "m must be"),
-        (lambda: dim_v(True, 3, 1), "n must be"),
-        (lambda: dim_v_closed_form(3, 3, 4), "codim must be 1, 2 or 3, got 4"),
-        (lambda: dim_v_closed_form(3, 2, 3), "m must be an integer of at least 3"),
-    ],
-)
-def test_dimension_misuse(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
-# ------------------------------------------------------------------------------------- ranks by name and by numbers
+from dyntorch.counting.exact import LARGEST
 
 
 def ranks(counted: Count):
@@ -326,10 +212,6 @@ def test_static_points_repair_translating_lines():
     assert [count("lines", static_points=k, objects=[60, 60]).rank for k in (0, 2)] == [28, 35]
 
 
-def test_smaller_constant_velocity_tensor_takes_more_matches():
-    assert count("constant_velocity_3x4x4").minimal == 24 > count("constant_velocity").minimal == 21
-
-
 def test_static_points_of_a_join_in_more_views_follow_dim_v():
     assert count(3, views=[3] * 4).rank == dim_v(4, 4, 1) == 35
 
@@ -501,81 +383,6 @@ def test_structure_equations_of_constant_velocity_have_rank_11_of_14():
     assert ranks(count(equations))[:2] == (11, 14)
 
 
-# ------------------------------------------------------------------------------------------------- the field
-
-
-@pytest.mark.parametrize("prime", [7, *PRIMES])
-def test_field_arithmetic_equals_python_integers(prime):
-    field = Field(prime, seed=3)
-    for inner in (3, 2100):  # few and many entries go different ways
-        a, b = field.random(5, inner), field.random(inner, 4)
-        expected = [[sum(x * y for x, y in zip(row, column, strict=True)) % prime for column in b.T.tolist()] for row in a.tolist()]
-        assert field.product(a, b).tolist() == expected
-        assert field.product(a, b[:, 0]).tolist() == [row[0] for row in expected]
-        assert field.product(a[0], b).tolist() == expected[0]
-    largest = np.full((2, 2048), prime - 1)
-    assert (field.product(largest, largest.T) == 2048 % prime).all()  # (-1)(-1), 2048 times
-    x, y = field.random(2, 3), field.random(2, 2)
-    rows = [[i * j % prime for i in p for j in q] for p in x.tolist() for q in y.tolist()]
-    assert field.kron(x, y).tolist() == rows
-
-
-def test_moduli_are_prime():
-    for prime in PRIMES:
-        assert all(prime % divisor for divisor in [2, *range(3, int(prime**0.5) + 1, 2)])
-
-
-def test_join_has_the_order_and_signs_of_minors():
-    field = Field(PRIMES[0])
-    assert field.join([[1, 0, 0, 0], [0, 1, 0, 0]]).tolist() == [1, 0, 0, 0, 0, 0]
-    points = np.array([[2, 3, 5, 7], [11, 13, 17, 19], [23, 29, 31, 37]])
-    for size in (1, 2, 3):
-        chosen = [round(np.linalg.det(points[:size][:, list(columns)])) for columns in combinations(range(4), size)]
-        signed = field.join(points[:size])
-        assert np.where(signed > PRIMES[0] // 2, signed - PRIMES[0], signed).tolist() == chosen
-
-
-def test_null_space_and_inverse():
-    field = Field(PRIMES[1], seed=1)
-    matrix = field.product(field.random(5, 2), field.random(2, 6))
-    basis = field.null(matrix)
-    assert basis.shape == (4, 6)
-    assert not field.product(matrix, basis.T).any()
-    square = field.random(5, 5)
-    assert (field.product(square, field.inverse(square)) == np.eye(5)).all()
-    with pytest.raises(ValueError, match="no inverse"):
-        field.inverse([[1, 2], [2, 4]])
-
-
-def test_echelon_says_which_rows_raise_the_rank_however_they_are_grouped():
-    field = Field(11, seed=5)
-    rows = field.product(field.random(30, 6), field.random(6, 9))
-    rows[3], rows[4] = 0, rows[1]
-    one, many = Echelon(field, 9), Echelon(field, 9)
-    singly = np.concatenate([one.add(row[None]) for row in rows])
-    assert (many.add(rows) == singly).all()
-    assert singly.sum() == one.rank == many.rank <= 6
-    for i in range(len(rows)):  # the first rows up to i, counted anew
-        fresh = Echelon(field, 9)
-        fresh.add(rows[: i + 1])
-        assert fresh.rank == singly[: i + 1].sum()
-    identity = many.basis[:, many.pivots]
-    assert (identity == np.eye(many.rank)).all()
-
-
-def test_rank_agrees_with_floating_point_on_small_integers():
-    generator = np.random.default_rng(0)
-    for _ in range(20):
-        matrix = generator.integers(-3, 4, (6, 4)) @ generator.integers(-3, 4, (4, 7))
-        field = Field(PRIMES[0])
-        echelon = Echelon(field, 7)
-        echelon.add(field.reduce(matrix))
-        assert echelon.rank == np.linalg.matrix_rank(matrix.astype(float))
-
-
-# ------------------------------------------------------------------------------------------- result and misuse
-
-
 def test_result_reads_well():
     text = str(count("homography", static=12, moving=10))
     assert text == (
@@ -664,16 +471,6 @@ def wide(field):
 def test_count_misuse(what, options, message):
     with pytest.raises(ValueError, match=message):
         count(what, **options)
-
-
-def test_field_needs_a_modulus_that_fits():
-    with pytest.raises(ValueError, match="prime must lie"):
-        Field(2**31 + 11)
-
-
-def test_width_is_the_product_of_the_views():
-    for name, views in {"homography": (3, 3, 3), "join": (4, 4, 4), "minimal_join": (4, 4, 3), "lines": (6, 6)}.items():
-        assert count(name).width == prod(views)
 
 
 def test_counting_does_not_load_torch():

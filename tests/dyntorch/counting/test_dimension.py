@@ -1,0 +1,118 @@
+"""Dimensions of V(n, m, k): the literature, closed forms, brute force, tableaux by enumeration."""
+
+from __future__ import annotations
+
+from itertools import product
+from math import comb
+
+import pytest
+
+from dyntorch.counting import (  # fmt: skip
+    count,
+    dim_v,
+    dim_v_closed_form,
+    partitions,
+    semistandard_tableaux,
+    standard_tableaux,
+)
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "k", "dimension"),
+    [
+        (3, 3, 2, 26),
+        (4, 3, 2, 60),
+        (3, 3, 1, 10),
+        (4, 3, 1, 20),
+        (3, 4, 2, 72),
+        (2, 3, 2, 8),
+        (2, 3, 1, 4),
+        (4, 4, 3, 255),
+        (4, 4, 2, 210),
+    ],
+)
+def test_dimensions_quoted_in_the_literature(n, m, k, dimension):
+    assert dim_v(n, m, k) == dimension
+
+
+def test_dimension_has_the_limits_of_fixed_and_of_free_points():
+    for n, m in product(range(1, 6), range(1, 6)):
+        assert dim_v(n, m, 0) == 0
+        assert dim_v(n, m, 1) == comb(n + m - 1, m)  # symmetric tensors
+        assert dim_v(n, m, m) == dim_v(n, m, m + 3) == n**m
+        assert dim_v(n, m, n) == n**m  # n vectors span everything
+
+
+def test_closed_forms_equal_the_sum():
+    checked = 0
+    for n, m, codim in product(range(1, 7), range(1, 7), (1, 2, 3)):
+        if m >= codim:
+            assert dim_v_closed_form(n, m, codim) == dim_v(n, m, m - codim)
+            checked += 1
+    assert checked == 6 * (6 + 5 + 4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", range(1, 6))
+def test_dimension_equals_brute_force_rank(n):
+    for m in range(1, 6):
+        for k in range(1, m + 1):
+            if n**m <= 700:
+                assert count(n - 1, views=[n - 1] * m, r=min(k, n)).rank == dim_v(n, m, k), (n, m, k)
+
+
+def test_all_tableaux_together_fill_the_space():
+    for n, m in product(range(1, 6), range(1, 8)):
+        assert sum(standard_tableaux(shape) * semistandard_tableaux(shape, n) for shape in partitions(m)) == n**m
+    assert dim_v(3, 100, 1) == comb(102, 2)  # short partitions only, of 190 million
+
+
+def tableaux(shape, n, strict_rows):
+    """Fillings by 1..n with increasing columns, by trying them all."""
+    boxes = [(i, j) for i, length in enumerate(shape) for j in range(length)]
+    good = 0
+    for values in product(range(n), repeat=len(boxes)):
+        at = dict(zip(boxes, values, strict=True))
+        columns = all(at[i, j] < at[i + 1, j] for i, j in boxes if (i + 1, j) in at)
+        rows = all(at[i, j] + strict_rows <= at[i, j + 1] for i, j in boxes if (i, j + 1) in at)
+        good += columns and rows and (not strict_rows or len(set(values)) == len(boxes))
+    return good
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 4, 5])
+def test_hook_lengths_equal_enumeration(m):
+    for shape in partitions(m):
+        assert standard_tableaux(shape) == tableaux(shape, m, 1)
+        assert semistandard_tableaux(shape, 3) == tableaux(shape, 3, 0)
+
+
+def test_condition_n_at_least_m_is_not_needed():
+    """The thesis asks n >= m >= k and uses V(2,3,2) and V(3,4,2)."""
+    assert dim_v(2, 3, 2) == count(1, views=[1, 1, 1], r=2).rank == 8
+    assert dim_v(3, 4, 2) == count(2, views=[2] * 4, r=2).rank == 72
+
+
+def test_excluded_partitions_are_those_of_smaller_numbers_only_up_to_2k_plus_2():
+    """The thesis states it for all m."""
+    number = [len(list(partitions(size))) for size in range(9)]
+    for m in range(1, 9):
+        for k in range(1, m + 1):
+            excluded = sum(len(shape) > k for shape in partitions(m))
+            assert (excluded == sum(number[: m - k])) == (m <= 2 * k + 2), (m, k)
+    assert sum(len(shape) > 1 for shape in partitions(5)) == 6 != sum(number[:4])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: dim_v(0, 3, 2), "n must be an integer of at least 1, got 0"),
+        (lambda: dim_v(3, 3, -1), "k must be"),
+        (lambda: dim_v(3, 2.5, 1), "m must be"),
+        (lambda: dim_v(True, 3, 1), "n must be"),
+        (lambda: dim_v_closed_form(3, 3, 4), "codim must be 1, 2 or 3, got 4"),
+        (lambda: dim_v_closed_form(3, 2, 3), "m must be an integer of at least 3"),
+    ],
+)
+def test_dimension_misuse(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
