@@ -17,10 +17,7 @@ from dyntorch.metrics import relative_error
 from tests.battery.cases import CASES, moved_views
 from tests.battery.references import apart, matrices, noisy, spans
 from tests.battery.steps import equal_steps
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
+from tests.draws import seeded
 
 
 @pytest.mark.parametrize("case", CASES, ids=repr)

@@ -8,12 +8,9 @@ from dyntorch.core.invariant import Frame, Invariant
 from dyntorch.core.normalize import denormalize, denormalize_motion, normalization, normalize_motion
 from dyntorch.core.primitives import Point
 from tests.battery.cases import CASES
+from tests.draws import random
 
 SIMPLE = [case for case in CASES if case.invariant.copies is None]
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def raw(case, n=30, batch=(4,)):

@@ -5,11 +5,7 @@ import torch
 
 from dyntorch.core.primitives import Hyperplane, HyperplanesThrough, Line, Point, Projected
 from tests.battery.references import plucker, subdeterminants
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
+from tests.draws import random
 
 CAMERAS = random(2, 3, 4, seed=9)
 ALL = [

@@ -17,12 +17,9 @@ from dyntorch.core.refine import RefineNotice, constrain_matches
 from tests.battery.cases import CASES
 from tests.battery.projections import unit
 from tests.battery.references import noisy
+from tests.draws import seeded
 
 COLLINEATION = next(case for case in CASES if repr(case) == "Collineation(2)")
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def test_covariance_is_the_formula():
@@ -290,14 +287,10 @@ def test_tensors_that_do_not_stand_alone():
 H = dyn.HomographyTensor
 
 
-def seeded_refine_gradient(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
 def line(sigma: float = 0.02) -> tuple[Tensor, Tensor]:
     """Matches of a collineation of the line."""
-    x = torch.randn(8, 1, generator=seeded_refine_gradient(), dtype=torch.float64)
-    y = (2 * x + 1) / (0.3 * x + 3) + sigma * torch.randn(8, 1, generator=seeded_refine_gradient(1), dtype=torch.float64)
+    x = torch.randn(8, 1, generator=seeded(), dtype=torch.float64)
+    y = (2 * x + 1) / (0.3 * x + 3) + sigma * torch.randn(8, 1, generator=seeded(1), dtype=torch.float64)
     return x, y
 
 
@@ -345,8 +338,8 @@ def test_derivatives_by_matches_and_weights_up_to_the_second():
 @pytest.mark.slow
 @pytest.mark.parametrize("labelled", [False, True])
 def test_torch_func_agrees_with_autograd(labelled):
-    views = scenes.planar(40, sigma=0.5, batch=2, static=0.3, generator=seeded_refine_gradient()).views
-    static = torch.rand(2, 40, generator=seeded_refine_gradient(2)) < 0.2 if labelled else None
+    views = scenes.planar(40, sigma=0.5, batch=2, static=0.3, generator=seeded()).views
+    static = torch.rand(2, 40, generator=seeded(2)) < 0.2 if labelled else None
 
     def value(views: tuple[Tensor, ...], static: Tensor | None) -> Tensor:
         found = dyn.refine(dyn.fit(H, *views, static=static), *views)
@@ -360,14 +353,14 @@ def test_torch_func_agrees_with_autograd(labelled):
     for way in ways:
         for one, other in zip(way, expected, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9 * float(other.abs().max()))
-    tangents = tuple(torch.randn(x.shape, generator=seeded_refine_gradient(5), dtype=x.dtype) for x in views)
+    tangents = tuple(torch.randn(x.shape, generator=seeded(5), dtype=x.dtype) for x in views)
     moved = torch.func.jvp(lambda *v: value(v, static), views, tangents)[1]
     torch.testing.assert_close(moved, sum((a * b).sum() for a, b in zip(expected, tangents, strict=True)), rtol=1e-6, atol=1e-10)
 
 
 def test_inliers_of_a_robust_fit_are_weights_that_stay():
-    views = tuple(x.requires_grad_() for x in scenes.planar(100, sigma=0.5, outliers=0.3, generator=seeded_refine_gradient()).views)
-    robust = dyn.robust_fit(H, *views, threshold=1.5, generator=seeded_refine_gradient())
+    views = tuple(x.requires_grad_() for x in scenes.planar(100, sigma=0.5, outliers=0.3, generator=seeded()).views)
+    robust = dyn.robust_fit(H, *views, threshold=1.5, generator=seeded())
     found = torch.autograd.grad(dyn.refine(robust, *views).tensor.sin().sum(), views)
     weights = robust.inliers.double()
     same = dyn.refine(replace(robust, inliers=None), *views, weights=weights)
@@ -378,7 +371,7 @@ def test_inliers_of_a_robust_fit_are_weights_that_stay():
 
 
 def test_problems_that_failed_have_gradients_of_zero_and_leave_the_others_alone():
-    views = [x.clone() for x in scenes.planar(40, sigma=0.5, batch=3, generator=seeded_refine_gradient()).views]
+    views = [x.clone() for x in scenes.planar(40, sigma=0.5, batch=3, generator=seeded()).views]
     views[0][1] = torch.nan
     views[1][2] = 1.0
     views = [x.requires_grad_() for x in views]
@@ -394,7 +387,7 @@ def test_problems_that_failed_have_gradients_of_zero_and_leave_the_others_alone(
 
 
 def test_a_descent_that_ended_early_says_so_where_gradients_are_wanted():
-    views = scenes.planar(60, sigma=3.0, batch=2, generator=seeded_refine_gradient()).views
+    views = scenes.planar(60, sigma=3.0, batch=2, generator=seeded()).views
     solution = dyn.fit(H, *views)
     assert dyn.refine(solution, *views, iterations=1).notices == ()
     for x in views:
@@ -408,7 +401,7 @@ def test_a_descent_that_ended_early_says_so_where_gradients_are_wanted():
 
 
 def test_exact_matches_have_finite_gradients_without_a_notice():
-    views = tuple(x.requires_grad_() for x in scenes.planar(40, generator=seeded_refine_gradient()).views)
+    views = tuple(x.requires_grad_() for x in scenes.planar(40, generator=seeded()).views)
     found = dyn.refine(dyn.fit(H, *views), *views)
     assert found.notices == ()
     for one in torch.autograd.grad(found.tensor.sin().sum(), views):

@@ -10,12 +10,9 @@ from dyntorch import scenes
 from dyntorch.core.residual import distance, multilinear, multilinear_derivative, whiten
 from tests.battery.cases import CASES
 from tests.battery.references import noisy
+from tests.draws import random
 
 FORMS = [case for case in CASES if case.invariant.rows() == 1 and case.nullity == 1 and case.invariant.copies is None]
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 6])

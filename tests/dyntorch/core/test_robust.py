@@ -21,10 +21,7 @@ from dyntorch.core.normalize import denormalize
 from dyntorch.scenes.scene import OUTLIER
 from tests.battery.cases import CASES as KNOWN
 from tests.battery.cases import Case
-
-
-def seeded(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
+from tests.draws import seeded
 
 
 def planar(batch: int | tuple[int, ...] = (), outliers: float = 0.4, n: int = 120, **more: Any) -> scenes.Scene:

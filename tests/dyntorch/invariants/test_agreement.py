@@ -11,10 +11,7 @@ from dyntorch.core.residual import whiten
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.agreement import collinearity, join_forms, motion_of_forms, static_residual
 from dyntorch.scenes import moving_points
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from tests.draws import random, seeded
 
 
 def collineations(count, d, *batch, seed=0):
@@ -101,17 +98,9 @@ def test_points_at_infinity_stay_finite_in_value_and_gradient():
 ONE = torch.ones((), dtype=torch.float64)
 
 
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def random_collinearity(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
-
-
 def noisy(sigmas, *, seed, **options):
-    scene = moving_points(generator=generator(seed), **options)
-    g = generator(seed + 1)
+    scene = moving_points(generator=seeded(seed), **options)
+    g = seeded(seed + 1)
     views = tuple(x + s * torch.randn(x.shape, generator=g, dtype=x.dtype) for x, s in zip(scene.exact, sigmas, strict=True))
     return scene, views, tuple(ONE * s for s in sigmas)
 
@@ -186,7 +175,7 @@ def test_swapping_the_outer_views_changes_nothing_but_the_frame():
 @pytest.mark.parametrize("static", [0.0, 1.0])
 def test_forward_derivative_equals_finite_differences(static):
     scene, views, scales = noisy((0.005,) * 3, n=300, static=static, seed=8)
-    step = tuple(0.3 * random_collinearity(4, 4, seed=s) for s in (80, 81))
+    step = tuple(0.3 * random(4, 4, seed=s) for s in (80, 81))
 
     def residual(a, b):
         return collinearity((a, b), views, scales)
@@ -203,7 +192,7 @@ def test_forward_derivative_equals_finite_differences(static):
 def test_jacobian_is_continuous_along_a_path():
     """From one motion to another in small steps: residual and Jacobian move in proportion, up to their common sign."""
     scene, views, scales = noisy((0.01,) * 3, n=60, seed=9)
-    step = tuple(0.05 * random_collinearity(4, 4, seed=s) for s in (90, 91))
+    step = tuple(0.05 * random(4, 4, seed=s) for s in (90, 91))
 
     def residual(t):
         return collinearity(tuple(m + t * d for m, d in zip(scene.motion, step, strict=True)), views, scales)
@@ -220,7 +209,7 @@ def test_jacobian_is_continuous_along_a_path():
 
 @pytest.mark.parametrize("case", ["all equal", "two equal", "there and back", "zero motion", "singular motion", "at infinity"])
 def test_degenerate_matches_give_finite_values_and_derivatives(case):
-    eye, x = torch.eye(4, dtype=torch.float64), random_collinearity(5, 3, seed=11)
+    eye, x = torch.eye(4, dtype=torch.float64), random(5, 3, seed=11)
     a, b, views = eye, eye, (x, x, x)
     if case == "two equal":
         views = (x, x, x + 1)
@@ -244,7 +233,7 @@ def test_degenerate_matches_give_finite_values_and_derivatives(case):
 
 
 def test_exact_static_points_among_moving_ones_leave_finite_gradients():
-    scene = moving_points(20, static=0.5, generator=generator(12))
+    scene = moving_points(20, static=0.5, generator=seeded(12))
     inputs = [x.clone().requires_grad_() for x in (*scene.motion, *scene.exact)]
     collinearity(tuple(inputs[:2]), tuple(inputs[2:]), (ONE,) * 3).square().sum().backward()
     assert all(x.grad.isfinite().all() for x in inputs)
@@ -260,8 +249,8 @@ def test_nan_stays_in_its_own_match():
 
 
 def test_forms_are_determinants():
-    a, b, v = random_collinearity(3, 4, 4, seed=14), random_collinearity(3, 4, 4, seed=15), random_collinearity(3, 4, seed=16)
-    p, q, r = (homogeneous(random_collinearity(3, 3, seed=s)) for s in (17, 18, 19))
+    a, b, v = random(3, 4, 4, seed=14), random(3, 4, 4, seed=15), random(3, 4, seed=16)
+    p, q, r = (homogeneous(random(3, 3, seed=s)) for s in (17, 18, 19))
     value = torch.einsum("zijk,zi,zj,zk->z", join_forms(a, b, v), p, q, r)
     columns = torch.stack([p, (a @ q[..., None])[..., 0], (b @ r[..., None])[..., 0], v], dim=-1)
     torch.testing.assert_close(value, torch.linalg.det(columns))
@@ -269,16 +258,14 @@ def test_forms_are_determinants():
 
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_motion_of_two_forms_or_more(count):
-    a, b = random_collinearity(5, 4, 4, seed=20), random_collinearity(5, 4, 4, seed=21)
-    forms = join_forms(a[:, None], b[:, None], random_collinearity(5, count, 4, seed=22))
+    a, b = random(5, 4, 4, seed=20), random(5, 4, 4, seed=21)
+    forms = join_forms(a[:, None], b[:, None], random(5, count, 4, seed=22))
     for got, true in zip(motion_of_forms(forms), (a, b), strict=True):
         torch.testing.assert_close(got, unit(true), atol=1e-11, rtol=0)
 
 
 def test_zero_forms_have_a_finite_motion_and_leave_the_others_alone():
-    forms = join_forms(
-        random_collinearity(3, 1, 4, 4, seed=26), random_collinearity(3, 1, 4, 4, seed=27), torch.eye(4, dtype=torch.float64)
-    )
+    forms = join_forms(random(3, 1, 4, 4, seed=26), random(3, 1, 4, 4, seed=27), torch.eye(4, dtype=torch.float64))
     expected = motion_of_forms(forms)
     forms[1] = 0
     for got, true in zip(motion_of_forms(forms), expected, strict=True):

@@ -6,10 +6,7 @@ import torch
 
 from dyntorch import scenes
 from dyntorch.invariants.collineation import Collineation
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from tests.draws import random
 
 
 def scene(n, matches, **options):

@@ -9,17 +9,10 @@ import torch
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor, infinity_planes
 from dyntorch.scenes import constant_velocity
+from tests.draws import random, seeded
 
 CV = ConstantVelocityTensor
 ONES = (torch.ones((), dtype=torch.float64),) * 3
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
 
 
 def rows(views):
@@ -84,12 +77,12 @@ def test_compose_is_cramers_rule_in_p6(height):
     ],
 )
 def test_degenerate_ranks(options, expected):
-    assert rank(constant_velocity(80, generator=generator(2), **options).views) == expected
+    assert rank(constant_velocity(80, generator=seeded(2), **options).views) == expected
 
 
 @pytest.mark.parametrize(("still", "moving"), [(5, 16), (10, 11), (15, 9), (20, 9)])
 def test_static_matches_replace_moving_ones(still, moving):
-    static, scene = (constant_velocity(n, static=s, generator=generator(3)) for n, s in ((still, 1.0), (moving, 0.0)))
+    static, scene = (constant_velocity(n, static=s, generator=seeded(3)) for n, s in ((still, 1.0), (moving, 0.0)))
     assert rank(join_scenes(scene, static)) == 63
     assert rank(tuple(x[:-1] for x in join_scenes(static, scene))) < 63
 
@@ -104,7 +97,7 @@ def test_dof_is_the_rank_of_compose(height):
 
 
 def test_epipoles_are_fourfold_defective_eigenvalues():
-    tensor = CV.compose(*constant_velocity(5, generator=generator(4)).motion)
+    tensor = CV.compose(*constant_velocity(5, generator=seeded(4)).motion)
     alpha, _ = infinity_planes(tensor)
     a, b = random(2, 4, seed=5)
     first, second = (torch.einsum("i,ijk->kj", c, tensor) for c in (a, b))
@@ -124,7 +117,7 @@ def test_epipoles_are_fourfold_defective_eigenvalues():
 
 @pytest.mark.parametrize("camera", [False, True])
 def test_maps_are_the_true_ones_up_to_an_affinity_and_a_velocity(camera):
-    scene = constant_velocity(30, batch=5, camera=camera, generator=generator(10))
+    scene = constant_velocity(30, batch=5, camera=camera, generator=seeded(10))
     found = CV.decompose(CV.compose(*scene.motion))
     x, v = scene.extras["points"], scene.extras["velocities"]
     y = CV.positions(found, *scene.views)
@@ -141,7 +134,7 @@ def test_maps_are_the_true_ones_up_to_an_affinity_and_a_velocity(camera):
 
 @pytest.mark.parametrize("camera", [False, True])
 def test_gauge_changes_nothing(camera):
-    scene = constant_velocity(10, camera=camera, generator=generator(12))
+    scene = constant_velocity(10, camera=camera, generator=seeded(12))
     affinity = torch.eye(4, dtype=torch.float64)
     affinity[:3] += 0.3 * random(3, 4, seed=13)
     moved = []
@@ -158,7 +151,7 @@ def test_gauge_changes_nothing(camera):
 
 @pytest.mark.parametrize("camera", [False, True])
 def test_static_points_fix_the_common_velocity(camera):
-    scene = constant_velocity(40, batch=3, static=0.2, camera=camera, generator=generator(16))
+    scene = constant_velocity(40, batch=3, static=0.2, camera=camera, generator=seeded(16))
     still = ~scene.extras["moving"]
     broken = torch.where(still[..., None], scene.views[0], scene.views[0].clone().fill_(float("nan")))
     maps = CV.fix_gauge(CV.decompose(CV.compose(*scene.motion)), broken, *scene.views[1:], weights=still.double())
@@ -180,7 +173,7 @@ def test_static_points_fix_the_common_velocity(camera):
 
 
 def test_transfer_between_all_views():
-    scene = constant_velocity(30, batch=2, generator=generator(17))
+    scene = constant_velocity(30, batch=2, generator=seeded(17))
     tensor = CV.compose(*scene.motion)
     x1, x2, x3 = scene.views
     assert (CV.transfer(tensor, x1, x2) - x3).abs().max() < 1e-10
@@ -188,7 +181,7 @@ def test_transfer_between_all_views():
     assert (CV.transfer(tensor, x2=x2, x3=x3) - x1).abs().max() < 1e-9
     with pytest.raises(ValueError, match="two of x1, x2, x3"):
         CV.transfer(tensor, x1)
-    seen = constant_velocity(30, camera=True, generator=generator(17))
+    seen = constant_velocity(30, camera=True, generator=seeded(17))
     assert (CV.transfer(CV.compose(*seen.motion), *seen.views[:2]) - seen.views[2]).abs().max() < 1e-9
     with pytest.raises(ValueError, match="does not determine"):
         CV.transfer(CV.compose(*seen.motion), x2=seen.views[1], x3=seen.views[2])
@@ -196,7 +189,7 @@ def test_transfer_between_all_views():
 
 @pytest.mark.parametrize("camera", [False, True])
 def test_trajectories_pass_through_the_positions(camera):
-    scene = constant_velocity(12, camera=camera, generator=generator(18))
+    scene = constant_velocity(12, camera=camera, generator=seeded(18))
     for view in (1, 2, 3):
         line = CV.trajectory(scene.motion, *scene.views, view=view)
         for time in (-1.0, 0.0, 3.0):
@@ -219,7 +212,7 @@ def place(i, j):
 
 def test_camera_of_space_points_gives_the_third_sensor():
     """The image tensor sees only M A_2; the predicted positions and the points in space give A_2 itself."""
-    scene = constant_velocity(40, generator=generator(19))
+    scene = constant_velocity(40, generator=seeded(19))
     m = random(3, 4, seed=20)
     first, second, seen = CV.decompose(CV.compose(scene.motion[0], scene.motion[1], m @ scene.motion[2]))
     y = CV.positions((first, second, seen), *scene.views[:2], apply(m, scene.views[2]))[..., 2, :]
@@ -240,7 +233,7 @@ def reference_square(residual, views, scales):
 
 @pytest.mark.parametrize("camera", [False, True])
 def test_whitened_residuals_against_automatic_derivatives(camera):
-    scene = constant_velocity(6, camera=camera, static=0.5, sigma=0.02, generator=generator(21))
+    scene = constant_velocity(6, camera=camera, static=0.5, sigma=0.02, generator=seeded(21))
     scales = (1.0, 0.5, 2.0)
     inverse = [torch.linalg.inv(m) for m in scene.motion[:2]]
 
@@ -271,8 +264,8 @@ def test_residuals_follow_chi_squared(camera):
     sigma = 1e-3
     invariant = CV("image" if camera else "space")
     scales = tuple(torch.tensor(sigma, dtype=torch.float64) for _ in range(3))
-    moving = constant_velocity(4000, camera=camera, sigma=sigma, generator=generator(22))
-    still = constant_velocity(4000, camera=camera, static=1.0, sigma=sigma, generator=generator(23))
+    moving = constant_velocity(4000, camera=camera, sigma=sigma, generator=seeded(22))
+    still = constant_velocity(4000, camera=camera, static=1.0, sigma=sigma, generator=seeded(23))
     for scene, method, freedom in (
         (moving, invariant.whitened_residual, 2 if camera else 3),
         (still, invariant.whitened_static_residual, 5 if camera else 6),
@@ -284,7 +277,7 @@ def test_residuals_follow_chi_squared(camera):
 
 
 def test_nothing_spoils_a_batch():
-    tensor = CV.compose(*constant_velocity(1, batch=6, generator=generator(31)).motion)
+    tensor = CV.compose(*constant_velocity(1, batch=6, generator=seeded(31)).motion)
     bad = tensor.clone()
     bad[1], bad[2], bad[3] = 0.0, float("nan"), random(4, 4, 4, seed=40)
     bad[4] = torch.einsum("i,j,k->ijk", *random(3, 4, seed=41))

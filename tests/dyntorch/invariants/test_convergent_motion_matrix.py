@@ -10,14 +10,7 @@ from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.invariants.segmentation_matrix import SegmentationMatrix
 from dyntorch.metrics import relative_error
 from dyntorch.scenes import convergent_motions
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+from tests.draws import random, seeded
 
 
 def motion(*batch, seed=0):
@@ -37,7 +30,7 @@ def value(matrix, x1, x2):
 
 @pytest.mark.parametrize("parallel", [False, True])
 def test_scene_is_what_it_says(parallel):
-    scene = convergent_motions(40, batch=5, parallel=parallel, generator=generator())
+    scene = convergent_motions(40, batch=5, parallel=parallel, generator=seeded())
     F, G = scene.motion
     H, e2 = (scene.extras[name] for name in ("homography", "epipole"))
     own = torch.where(scene.labels == 1, value(F, *scene.views), value(G, *scene.views))
@@ -105,7 +98,7 @@ def test_decompose_returns_the_motion_in_either_order():
 
 @pytest.mark.parametrize(("parallel", "n"), [(False, 35), (False, 60), (True, 60)])
 def test_exact_matches_give_plane_vertex_and_epipole(parallel, n):
-    scene = convergent_motions(n, batch=20, parallel=parallel, generator=generator(1))
+    scene = convergent_motions(n, batch=20, parallel=parallel, generator=seeded(1))
     solution = dyn.fit(ConvergentMotionMatrix, *scene.views)
     assert solution.status.eq(dyn.Status.OK).double().mean() >= 0.95
     K = scene.extras["calibration"]
@@ -124,7 +117,7 @@ def test_exact_matches_give_plane_vertex_and_epipole(parallel, n):
 
 
 def test_true_parameters_are_better_than_the_linear_ones_under_noise():
-    scene = convergent_motions(200, batch=8, sigma=0.3, generator=generator(1))
+    scene = convergent_motions(200, batch=8, sigma=0.3, generator=seeded(1))
     solution = dyn.fit(ConvergentMotionMatrix, *scene.views)
     for _ in range(4):
         weights = SegmentationMatrix.reweight(solution.tensor, *scene.views)

@@ -6,13 +6,10 @@ import torch
 from dyntorch.core.residual import whiten
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.dual_homography_tensor import DualHomographyTensor, quadrifocal
+from tests.draws import random
 
 LINES, POINTS = DualHomographyTensor("lines"), DualHomographyTensor("points")
 ONES = (torch.ones(()).double(),) * 3
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def near_identity(*batch, seed=0):

@@ -11,6 +11,7 @@ from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
 from dyntorch.numerics.least_squares import jacobian
 from tests.battery.projections import minors, tensor_error
 from tests.battery.references import subdeterminants
+from tests.draws import random
 
 TRIFOCAL = dyn.GrassmannTensor(3, (2, 1, 1))
 # k, profile, dimensions of the views
@@ -31,10 +32,6 @@ FAMILIES = [
     (6, (3, 3, 1), 3),
     (6, (3, 3, 1), (3, 3, 2)),
 ]
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def projections(invariant, *batch, seed=0):

@@ -7,12 +7,9 @@ from torch.nn.functional import normalize
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.homography_tensor import HomographyTensor
+from tests.draws import random
 
 ONES = (torch.ones(()).double(),) * 3
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def scene(n, **options):

@@ -7,16 +7,9 @@ from dyntorch.core.invariant import as_invariant
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.scenes import moving_points
+from tests.draws import random, seeded
 
 ONE = torch.ones((), dtype=torch.float64)
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
 
 
 def rows(*points):
@@ -43,7 +36,7 @@ def test_declaration():
     ("still", "moving", "expected"), [(0, 59, 59), (0, 60, 60), (0, 90, 60), (20, 40, 60), (40, 39, 59), (40, 0, 20), (10, 45, 55)]
 )
 def test_rank_of_static_and_moving_matches(still, moving, expected):
-    pieces = [moving_points(n, static=s, generator=generator(1), sensors="affine") for n, s in ((still, 1.0), (moving, 0.0)) if n]
+    pieces = [moving_points(n, static=s, generator=seeded(1), sensors="affine") for n, s in ((still, 1.0), (moving, 0.0)) if n]
     # the same sensors serve both: map the points of the second scene by those of the first
     sensors = pieces[0].extras["sensors"]
     points = []
@@ -80,7 +73,7 @@ def test_family_holds_all_determinants_and_is_orthonormal():
 
 @pytest.mark.parametrize(("source", "target"), [(1, 2), (1, 3), (2, 1), (2, 3), (3, 1), (3, 2)])
 def test_transfer_between_all_views(source, target):
-    scene = moving_points(15, batch=2, static=1.0, generator=generator(21))
+    scene = moving_points(15, batch=2, static=1.0, generator=seeded(21))
     tensor = JoinTensor.compose(*scene.motion)
     got = JoinTensor.transfer(tensor, scene.exact[source - 1], source, target)
     torch.testing.assert_close(got, scene.exact[target - 1], atol=1e-9, rtol=0)
@@ -88,7 +81,7 @@ def test_transfer_between_all_views(source, target):
 
 @pytest.mark.parametrize("view", [1, 2, 3])
 def test_trajectory_joins_the_positions(view):
-    scene = moving_points(15, batch=2, generator=generator(22))
+    scene = moving_points(15, batch=2, generator=seeded(22))
     others = [v for v in range(3) if v != view - 1]
     frames = [torch.eye(4, dtype=torch.float64).expand(2, 4, 4), *scene.motion]
     tensor = JoinTensor.compose(*scene.motion)
@@ -105,14 +98,14 @@ def test_trajectory_joins_the_positions(view):
     assert torch.minimum((line - expected).norm(dim=-1), (line + expected).norm(dim=-1)).max() < 1e-8
     # the pencil has rank 2, and none is left where the point stays
     assert (torch.linalg.svdvals(planes)[..., 2] < 1e-10).all()
-    still = moving_points(15, batch=2, static=1.0, generator=generator(22))
+    still = moving_points(15, batch=2, static=1.0, generator=seeded(22))
     rest = JoinTensor.trajectory_planes(JoinTensor.compose(*still.motion), *(still.exact[v] for v in others), view)
     assert rest.abs().max() < 1e-10
     assert JoinTensor.trajectory(JoinTensor.compose(*still.motion), *(still.exact[v] for v in others), view).isfinite().all()
 
 
 def test_static_distance_tells_static_from_moving():
-    scene = moving_points(400, static=0.5, sigma=0.005, generator=generator(23))
+    scene = moving_points(400, static=0.5, sigma=0.005, generator=seeded(23))
     distance = JoinTensor.static_distance(JoinTensor.compose(*scene.motion), *scene.views) / 0.005
     still = scene.labels == 1
     assert abs(distance[still].square().mean() - 6) < 0.8
@@ -120,7 +113,7 @@ def test_static_distance_tells_static_from_moving():
 
 
 def test_static_residual_has_six_degrees_of_freedom():
-    scene = moving_points(5000, batch=2, static=1.0, sigma=0.003, generator=generator(24))
+    scene = moving_points(5000, batch=2, static=1.0, sigma=0.003, generator=seeded(24))
     residual = as_invariant(JoinTensor).whitened_static_residual(scene.motion, scene.views, (0.003 * ONE,) * 3)
     assert residual.shape == (2, 5000, 6)
     assert abs(residual.square().sum(-1).mean() / 6 - 1) < 0.02

@@ -10,14 +10,7 @@ from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.metrics import relative_error
 from dyntorch.scenes import moving_points
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+from tests.draws import random, seeded
 
 
 def rank(matrix):
@@ -110,7 +103,7 @@ def test_batch_equals_loop_with_cameras_of_each_problem():
 @pytest.mark.parametrize(("source", "target"), [(1, 2), (1, 3), (2, 1), (2, 3), (3, 1), (3, 2)])
 @pytest.mark.parametrize("count", [2, None])
 def test_transfer_between_all_views(source, target, count):
-    scene = moving_points(15, batch=2, static=1.0, generator=generator(45))
+    scene = moving_points(15, batch=2, static=1.0, generator=seeded(45))
     invariant = MinimalJoinTensor() if count is None else MinimalJoinTensor(random(count, 3, 4, seed=46))
     tensor = invariant.compose(*scene.motion)
     got = invariant.transfer(tensor, scene.exact[source - 1], source, target)
@@ -119,7 +112,7 @@ def test_transfer_between_all_views(source, target, count):
 
 @pytest.mark.parametrize("view", [1, 2, 3])
 def test_trajectories_are_those_of_the_join_tensor(view):
-    scene = moving_points(15, batch=2, generator=generator(47))
+    scene = moving_points(15, batch=2, generator=seeded(47))
     given = [x for v, x in enumerate(scene.exact, start=1) if v != view]
     line = MinimalJoinTensor.trajectory(MinimalJoinTensor.compose(*scene.motion), *given, view)
     expected = JoinTensor.trajectory(JoinTensor.compose(*scene.motion), *given, view)
@@ -127,7 +120,7 @@ def test_trajectories_are_those_of_the_join_tensor(view):
 
 
 def test_residuals_are_those_of_the_join_tensor():
-    scene = moving_points(30, batch=2, sigma=0.01, static=0.5, generator=generator(48))
+    scene = moving_points(30, batch=2, sigma=0.01, static=0.5, generator=seeded(48))
     scales = tuple(torch.full((2,), s, dtype=torch.float64) for s in (0.01, 0.02, 0.03))
     one, other = as_invariant(MinimalJoinTensor), as_invariant(JoinTensor)
     for name in ("whitened_residual", "whitened_static_residual"):

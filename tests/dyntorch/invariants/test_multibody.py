@@ -11,19 +11,12 @@ from dyntorch.geometry.pairs import product_matrix
 from dyntorch.invariants.multibody import multibody_lines, multibody_matrix
 from dyntorch.metrics import relative_error
 from dyntorch.scenes import two_view
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+from tests.draws import random, seeded
 
 
 def scene(*batch, counts, sigma=0.0, seed=0):
     """Matches of bodies with their own motions, true labels from 1, true fundamental matrices."""
-    made = [two_view(n, batch=batch, sigma=sigma, generator=generator(seed + 17 * k)) for k, n in enumerate(counts)]
+    made = [two_view(n, batch=batch, sigma=sigma, generator=seeded(seed + 17 * k)) for k, n in enumerate(counts)]
     x1, x2 = (torch.cat([s.views[v] for s in made], dim=-2) for v in range(2))
     labels = torch.repeat_interleave(torch.arange(1, 1 + len(counts)), torch.tensor(counts)).expand(*batch, -1)
     return x1, x2, labels, torch.stack([s.motion[0] for s in made], dim=-3)
@@ -83,7 +76,7 @@ def test_ranks_of_two_bodies(counts, rank):
 def test_a_single_body_or_a_planar_one_is_degenerate_and_alone():
     x1, x2, labels, _ = scene(3, counts=(40, 40))
     plane = x1[1] @ random(2, 2, seed=3) + 5  # an affinity
-    x1[0], x2[0] = two_view(80, generator=generator()).views
+    x1[0], x2[0] = two_view(80, generator=seeded()).views
     x2[1] = torch.where((labels[1] == 2)[:, None], plane, x2[1])
     found = multibody_matrix(x1, x2, 2)
     assert found.degenerate.tolist() == [True, True, False]

@@ -6,6 +6,7 @@ import torch
 import dyntorch as dyn
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.invariants.reprojection import linearize, residual, residual_derivative
+from tests.draws import random
 
 PROFILES = [
     dyn.GrassmannTensor(3, (2, 1, 1)),
@@ -14,10 +15,6 @@ PROFILES = [
     dyn.GrassmannTensor(6, (3, 3, 1), (3, 3, 2)),
     dyn.GrassmannTensor(3, (1, 1, 1, 1), (1, 2, 1, 2)),
 ]
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def scene(invariant, n, *batch, seed=0):

@@ -5,12 +5,9 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.scenes import bodies
+from tests.draws import random
 
 SM, FM = dyn.SegmentationMatrix, dyn.FundamentalMatrix
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def scene(n=80, seed=0, **options):

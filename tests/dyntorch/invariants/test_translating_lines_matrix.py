@@ -8,17 +8,10 @@ from dyntorch.geometry.extensors import compound, plucker, plucker_form
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.scenes import translating_lines
+from tests.draws import random, seeded
 
 TL = TranslatingLinesMatrix
 ONES = (torch.ones((), dtype=torch.float64),) * 2
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
 
 
 def wedge(p, q):
@@ -62,7 +55,7 @@ def test_compose_is_the_determinant_of_four_points():
     determinant = torch.linalg.det(torch.cat([p, q], dim=-2))
     value = torch.einsum("ni,ij,nj->n", plucker(ends2), form, plucker(ends1))
     assert torch.allclose(value / determinant, (value / determinant)[0], rtol=1e-9)
-    scene = translating_lines(50, generator=generator(3))
+    scene = translating_lines(50, generator=seeded(3))
     assert (rows(*scene.views) @ TL.compose(*scene.motion).flatten()).abs().max() < 1e-13
 
 
@@ -79,7 +72,7 @@ def test_compose_is_the_determinant_of_four_points():
     ],
 )
 def test_ranks(options, expected):
-    scene = translating_lines(150, generator=generator(4), **options)
+    scene = translating_lines(150, generator=seeded(4), **options)
     assert rank(rows(*scene.views)) == expected
     if expected in (31, 35):
         assert rank(rows(*(x[:expected] for x in scene.views))) == expected
@@ -94,7 +87,7 @@ def test_ranks(options, expected):
     ],
 )
 def test_static_points_complete_the_rank(options, expected):
-    scene = translating_lines(150, static_points=len(expected), generator=generator(5), **options)
+    scene = translating_lines(150, static_points=len(expected), generator=seeded(5), **options)
     found = []
     for k in range(len(expected)):
         l1, l2 = TL.static_point_lines(scene.extras["points1"][:k], scene.extras["points2"][:k])
@@ -103,7 +96,7 @@ def test_static_points_complete_the_rank(options, expected):
 
 
 def test_static_points_alone():
-    scene = translating_lines(1, batch=2, static_points=5, generator=generator(6))
+    scene = translating_lines(1, batch=2, static_points=5, generator=seeded(6))
     x1, x2 = scene.extras["points1"], scene.extras["points2"]
     l1, l2 = TL.static_point_lines(x1, x2, length=2.0)
     assert l1.shape == l2.shape == (2, 45, 2, 3)
@@ -119,7 +112,7 @@ def test_static_points_alone():
 
 
 def test_transfer_of_lines():
-    (matrix,) = translating_lines(1, batch=3, generator=generator(13)).motion
+    (matrix,) = translating_lines(1, batch=3, generator=seeded(13)).motion
     form = TL.compose(matrix)
     ends2 = random(3, 8, 2, 3, seed=14)
     ends1 = move_ends(matrix, ends2)
@@ -143,7 +136,7 @@ def reference_square(residual, views, scales):
 
 
 def test_static_residual_against_automatic_derivatives():
-    scene = translating_lines(8, static=0.5, sigma=0.02, generator=generator(20))
+    scene = translating_lines(8, static=0.5, sigma=0.02, generator=seeded(20))
     (matrix,) = scene.motion
     scales = tuple(torch.tensor(s, dtype=torch.float64) for s in (1.0, 0.5))
     found = TL().whitened_static_residual(scene.motion, scene.views, scales).square().sum(-1)
@@ -167,15 +160,15 @@ def test_static_residual_against_automatic_derivatives():
     still = ~scene.extras["moving"]
     assert torch.allclose(found[still], exact[still], rtol=0.1)
     assert (found[~still] > 50 * found[still].median()).all()
-    clean = translating_lines(10, static=1.0, generator=generator(21))
+    clean = translating_lines(10, static=1.0, generator=seeded(21))
     assert TL().whitened_static_residual(clean.motion, clean.views, ONES).abs().max() < 1e-10
     assert TL().whitened_static_residual(clean.motion, tuple(map(plucker, clean.views)), ONES).abs().max() < 1e-9
 
 
 def test_residuals_follow_chi_squared():
     sigma = torch.tensor(1e-3, dtype=torch.float64)
-    moving = translating_lines(4000, sigma=float(sigma), generator=generator(22))
-    still = translating_lines(4000, static=1.0, sigma=float(sigma), generator=generator(23))
+    moving = translating_lines(4000, sigma=float(sigma), generator=seeded(22))
+    still = translating_lines(4000, static=1.0, sigma=float(sigma), generator=seeded(23))
     square = multilinear(TL(), TL.compose(*moving.motion), moving.views, (sigma, sigma)).square()
     assert square.mean().item() == pytest.approx(1, abs=4 * (2 / 4000) ** 0.5)
     square = TL().whitened_static_residual(still.motion, still.views, (sigma, sigma)).square().sum(-1)

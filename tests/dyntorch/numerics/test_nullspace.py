@@ -6,13 +6,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from dyntorch.numerics import eigenspaces, nullspace
 from dyntorch.numerics.nullspace import eigenvalues, eigh, gram_null_space, null_space, spectrum
+from tests.draws import random
 from tests.grid import grid
 
 aten = torch.ops.aten
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def rotation(*shape, seed=0):

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dyntorch.numerics import affine_factorization, canonical_correlation, metric_upgrade, orthonormal_basis
+from tests.draws import random as random_factorization
 from tests.grid import grid
 
 
@@ -158,10 +159,6 @@ def test_other_numbers_of_shared_directions_are_refused(shared):
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Affine factorization and metric upgrade: exact on exact views, and honest where the views do not decide.
-
-
-def random_factorization(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def orthographic(azimuth, elevation=0.0, scale=1.0):
