@@ -558,15 +558,47 @@ reconstruct 33 to 1,000."""
 
 ROOMS = ("core", "geometry", "invariants", "numerics", "shapes", "tasks")
 """Faces that hand on public names beside those of the top level."""
-NOT_VERBS = set(
-    "counting metrics motions scenes on_cpu one_thread Message Notice NoticeCode Outcome named with_words as_python status_from "
-    "check_options map_blocks BodyModel LineStatus Status Motion MotionName MOTION_MODELS Polynomial Fourier Invariant "
-    # results
-    "Alignment Calibration Clocks DeformableShapes MovingShapes PairReconstruction Reconstruction Recovery Segmentation Shift Solution "
-    "TrackSegmentation TranslatingPlanes "
-    # invariants: tests/battery/on_input.py takes each of them to a device
-    "Collineation ConstantVelocityTensor ConvergentMotionMatrix DualHomographyTensor FundamentalMatrix GrassmannTensor "
-    "HomographyTensor JoinTensor MinimalJoinTensor SegmentationMatrix TranslatingLinesMatrix".split()
-)
-NOT_VERBS |= {name for face in (dyn, *(getattr(dyn, room) for room in ROOMS)) for name in face.__all__ if name.endswith("Options")}
+NOT_VERBS = {
+    **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
+    **dict.fromkeys(("on_cpu", "one_thread"), "decorators of verbs"),
+    **dict.fromkeys(
+        ("Message", "Notice", "NoticeCode", "Outcome", "named", "with_words", "as_python", "status_from"), "what results say"
+    ),
+    "check_options": "looks at no tensor",
+    "map_blocks": "computes nothing by itself",
+    **dict.fromkeys(
+        ("BodyModel", "LineStatus", "Status", "Motion", "MotionName", "MOTION_MODELS", "Polynomial", "Fourier", "Invariant"),
+        "names and numbers",
+    ),
+    **dict.fromkeys(
+        (
+            "Alignment",
+            "Calibration",
+            "Clocks",
+            "DeformableShapes",
+            "MovingShapes",
+            "PairReconstruction",
+            "Reconstruction",
+            "Recovery",
+            "Segmentation",
+            "Shift",
+            "Solution",
+            "TrackSegmentation",
+            "TranslatingPlanes",
+        ),
+        "results",
+    ),
+    **dict.fromkeys(
+        (name for face in (dyn, *(getattr(dyn, room) for room in ROOMS)) for name in face.__all__ if name.endswith("Options")),
+        "options of verbs",
+    ),
+    **dict.fromkeys(
+        (
+            *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor"),
+            *("FundamentalMatrix", "GrassmannTensor", "HomographyTensor", "JoinTensor", "MinimalJoinTensor", "SegmentationMatrix"),
+            "TranslatingLinesMatrix",
+        ),
+        "invariants: tests/battery/on_input.py takes each of them to a device",
+    ),
+}
 """Public names that compute nothing by themselves."""
