@@ -130,6 +130,24 @@ def test_meet_of_lines_and_planes():
     assert torch.equal(meet(planes[0]), dual(planes[0], 4, 1))
 
 
+def test_meets_of_extensors_are_the_shuffle_formula():
+    """The meet of joins, dual to the join of the duals, is the sum of det(part of A, B) times the rest of A over all shuffles."""
+    for n, k, m in ((3, 2, 2), (4, 3, 2), (4, 2, 3), (4, 3, 3), (5, 3, 3), (5, 4, 2)):
+        a, b = random(k, n, seed=n), random(m, n, seed=10 * k + m)
+        A, B = join(*a), join(*b)
+        rest = k + m - n
+        shuffles = torch.zeros(comb(n, rest), dtype=torch.float64)
+        for chosen in combinations(range(k), n - m):
+            others = [i for i in range(k) if i not in chosen]
+            sign = (-1) ** sum(x > y for x, y in combinations((*chosen, *others), 2))
+            det = torch.linalg.det(torch.cat([a[list(chosen)], b]))
+            shuffles += sign * det * (join(*a[others]) if others else 1.0)
+        found = dual(wedge(dual(A, n, k), dual(B, n, m), n, (n - k, n - m)), n, 2 * n - k - m)
+        torch.testing.assert_close(found * (found @ shuffles).sign(), shuffles, rtol=1e-9, atol=1e-12)
+        if rest == 1:  # the common point lies in both
+            assert all(wedge(found, E, n, (1, step)).abs().max() < 1e-12 * E.norm() for E, step in ((A, k), (B, m)) if step < n)
+
+
 def test_meet_of_two_planes_is_the_join_of_two_of_their_points():
     p, q, r, s = (homogeneous(x) for x in random(4, 6, 3))
     line = join(p, q)
