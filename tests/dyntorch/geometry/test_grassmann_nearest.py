@@ -7,7 +7,8 @@ from dyntorch.geometry.extensors import compound
 from dyntorch.geometry.grassmann import grassmann_tensor
 from dyntorch.geometry.grassmann_nearest import _Nearest, projections_of
 from dyntorch.numerics.least_squares import jacobian
-from tests.dyntorch.geometry.test_grassmann_recovery import CASES, distance, random, relative, scene
+from tests.dyntorch.geometry.test_grassmann import CASES, distance, relative, scene
+from tests.dyntorch.geometry.test_grassmann import random_candidates as random
 
 FULL = [((3, 1), (3, 3)), ((2, 2, 2), (3, 2, 3))]
 LINE = ((1, 1, 1), (2, 2, 2))

@@ -1,16 +1,27 @@
 """Homogeneous coordinates: finite at infinity, in value and gradient; collineations, canonical signs, hyperplane bases."""
 
+from itertools import combinations_with_replacement
+
 import pytest
 import torch
+from torch.nn.functional import normalize
 
+from dyntorch.core.primitives import Monomials
 from dyntorch.geometry.homogeneous import (
     apply,
+    cofactors,
+    collecting,
     homogeneous,
     hyperplanes_through,
     inhomogeneous,
+    monomial_derivatives,
+    monomials,
+    multiplicity,
     nonzero_sign,
+    null_vectors,
     similarity,
     skew,
+    symmetric,
     two_sided,
     unit,
     unit_vectors,
@@ -176,3 +187,168 @@ def test_a_product_from_both_sides_is_a_matrix_on_entries():
     found = two_sided(A, B)
     assert found.shape == (4, 15, 8)
     torch.testing.assert_close((found @ X.flatten(1)[..., None])[..., 0], (A @ X @ B).flatten(1))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# 3 x 3 cofactors and null vectors: against inverses and singular vectors; pixels, noise, rank below two, gradients.
+
+
+def rank_two(*batch, seed=0):
+    return random(*batch, 3, 2, seed=seed) @ random(*batch, 2, 3, seed=seed + 1)
+
+
+def angle(a, b):
+    return torch.linalg.cross(normalize(a, dim=-1), normalize(b, dim=-1)).norm(dim=-1)
+
+
+def test_cofactors_are_the_scaled_inverse_transpose():
+    m = random(50, 3, 3)
+    torch.testing.assert_close(cofactors(m), torch.linalg.det(m)[:, None, None] * torch.linalg.inv(m).mT)
+    torch.testing.assert_close(cofactors(m[0] @ m[1]), cofactors(m[0]) @ cofactors(m[1]))
+
+
+def test_null_vectors_of_rank_two():
+    m = rank_two(200)
+    left, right = null_vectors(m)
+    assert (left[:, None] @ m).abs().max() < 1e-12
+    assert (m @ right[..., None]).abs().max() < 1e-12
+    torch.testing.assert_close(left.norm(dim=-1), torch.ones(200).double())
+    torch.testing.assert_close(right.norm(dim=-1), torch.ones(200).double())
+
+
+@pytest.mark.parametrize("noise", [1e-6, 1e-2, 0.1])
+def test_noisy_matrices_give_the_smallest_singular_vectors(noise):
+    m = rank_two(500) + noise * random(500, 3, 3, seed=9)
+    u, s, vt = torch.linalg.svd(m)
+    clear = s[:, 2] < 0.6 * s[:, 1]
+    assert clear.sum() > 300
+    left, right = null_vectors(m[clear])
+    assert angle(left, u[clear][..., 2]).max() < 1e-9
+    assert angle(right, vt[clear][:, 2]).max() < 1e-9
+
+
+def test_units_of_the_coordinates_do_not_matter():
+    # pixels beside the constant 1, exaggerated; the last singular value of such a matrix is known to 1e-4 of the middle one
+    rows, columns = torch.tensor([1e-6, 1e-6, 1.0]).double(), torch.tensor([1.0, 1e6, 1e6]).double()
+    m = rank_two(100)
+    left, right = null_vectors(m)
+    scaled_left, scaled_right = null_vectors(rows[:, None] * m * columns)
+    for plain, scaled, factor in ((left, scaled_left, rows), (right, scaled_right, columns)):
+        assert angle(plain, scaled * factor).max() < 1e-10
+
+
+def test_rank_below_two_is_zero_and_does_not_touch_the_others():
+    m = torch.stack([torch.zeros(3, 3), torch.ones(3, 3), rank_two(), torch.full((3, 3), torch.nan)]).double().requires_grad_()
+    left, right = null_vectors(m)
+    assert torch.equal(left[:2], torch.zeros(2, 3).double())
+    assert torch.equal(right[:2], torch.zeros(2, 3).double())
+    (left[:3].square().sum() + right[:3].sum()).backward()
+    assert m.grad[:3].isfinite().all()
+    torch.testing.assert_close(torch.stack([left[2], right[2]]), torch.stack(null_vectors(m[2])), rtol=0, atol=0)
+
+
+def test_gradients():
+    m = rank_two(3).requires_grad_()
+
+    def projectors(m):
+        return tuple(v[..., :, None] * v[..., None, :] for v in null_vectors(m))
+
+    assert torch.autograd.gradcheck(projectors, m)
+    assert torch.autograd.gradcheck(cofactors, m)
+
+
+def test_wrong_shapes_are_refused():
+    for function in (cofactors, null_vectors):
+        with pytest.raises(ValueError, match=r"\(2, 4\)"):
+            function(torch.zeros(2, 4))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Monomials of points: values one by one, the action of collineations, derivatives by autograd, rotations.
+
+
+ALL = [Monomials(d, k, isometric) for d in (1, 2, 3) for k in (1, 2, 4) for isometric in (False, True)]
+
+
+def random_monomials(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def lift(x):
+    return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
+
+
+@pytest.mark.parametrize("primitive", ALL)
+def test_values_and_shapes(primitive):
+    x = random_monomials(2, 5, primitive.dim)
+    products = [torch.stack([lift(x)[..., i] for i in place], -1).prod(-1) for place in places(primitive)]
+    counts = [len(set(permutations(place))) for place in places(primitive)]
+    scale = torch.tensor(counts).double().sqrt() if primitive.isometric else torch.ones(len(counts)).double()
+    expected = torch.stack(products, dim=-1) * scale
+    torch.testing.assert_close(primitive.raw(x), expected)
+    torch.testing.assert_close(primitive.components(x), expected.mT)
+    torch.testing.assert_close(primitive.vectors(x), expected[..., None, :])
+    assert primitive.width == expected.shape[-1] and primitive.match_axis(x) == 1
+    rows, columns = torch.triu_indices(primitive.width, primitive.width)
+    torch.testing.assert_close(primitive.pack(x), (expected[..., rows] * expected[..., columns]).mT)
+    with pytest.raises(ValueError, match=r"expected \(\*batch, n, \d.*\), got \(2, 5, 17\)"):
+        primitive.match_axis(torch.zeros(2, 5, 17))
+
+
+def places(primitive):
+    return list(combinations_with_replacement(range(primitive.dim + 1), primitive.degree))
+
+
+def permutations(place):
+    if len(place) < 2:
+        return [place]
+    return [(place[i], *rest) for i in range(len(place)) for rest in permutations(place[:i] + place[i + 1 :])]
+
+
+def test_order_of_the_plane():
+    assert Monomials().raw(torch.tensor([[2.0, 3.0]])).tolist() == [[4.0, 6.0, 2.0, 9.0, 3.0, 1.0]]
+    assert multiplicity(2, 2, torch.device("cpu")).tolist() == [1, 2, 2, 1, 2, 1]
+    assert symmetric(2, torch.device("cpu")).tolist() == [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+    p = random_monomials(3)
+    collect = collecting(2, 2, torch.device("cpu"))
+    torch.testing.assert_close(torch.kron(p, p), collect.mT @ torch.stack([p[i] * p[j] for i in range(3) for j in range(i, 3)]))
+
+
+@pytest.mark.parametrize("primitive", ALL)
+def test_action_is_that_of_the_moved_point(primitive):
+    d = primitive.dim
+    frames, x = torch.eye(d + 1).double() + 0.3 * random_monomials(2, d + 1, d + 1, seed=1), random_monomials(2, 5, d)
+    moved = lift(x) @ frames.mT
+    image = primitive.raw(moved[..., :-1] / moved[..., -1:]) * moved[..., -1:] ** primitive.degree
+    torch.testing.assert_close(primitive.raw(x) @ primitive.action(frames).mT, image)
+
+
+@pytest.mark.parametrize("primitive", ALL)
+def test_pullback_and_pushforward_are_the_derivative(primitive):
+    x, slope = random_monomials(2, 5, primitive.dim), random_monomials(2, 5, primitive.width, seed=1)
+    change = random_monomials(2, 5, primitive.dim, seed=2)
+    value, along = torch.func.jvp(primitive.raw, (x,), (change,))
+    torch.testing.assert_close(primitive.pushforward(x, change), along)
+    torch.testing.assert_close(primitive.pullback(x, slope), torch.func.vjp(primitive.raw, x)[1](slope)[0])
+    assert value.shape == slope.shape
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+def test_vectors_that_do_not_end_in_one(degree):
+    p = random_monomials(5, 3)
+    expected = torch.stack([p[:, list(c)].prod(-1) for c in combinations_with_replacement(range(3), degree)])
+    torch.testing.assert_close(monomials(p.mT, degree), expected)
+    slopes = torch.func.vmap(torch.func.jacrev(lambda v: monomials(v[:, None], degree)[:, 0]))(p)
+    torch.testing.assert_close(monomial_derivatives(p, degree, 3), slopes)
+    torch.testing.assert_close(monomial_derivatives(p, degree, 2), slopes[..., :2])
+
+
+def test_isometric_ones_turn_with_the_point():
+    for degree in (1, 2, 3):
+        primitive = Monomials(degree).normalize(torch.eye(3))
+        assert primitive.isometric
+        turn = torch.linalg.qr(random_monomials(3, 3)).Q
+        action = primitive.action(turn)
+        torch.testing.assert_close(action @ action.mT, torch.eye(primitive.width).double())
+        x = random_monomials(5, 2)
+        torch.testing.assert_close(primitive.raw(x).norm(dim=-1), lift(x).norm(dim=-1) ** degree)

@@ -7,19 +7,28 @@ import torch
 
 from dyntorch import metrics, scenes
 from dyntorch.core.outcome import Status
+from dyntorch.geometry.triangulation import reproject, triangulate
 from dyntorch.tasks.reconstruct import scene as module
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.scene import (
     LiftedState,
     Lifting,
+    Projections,
+    ViewTracks,
     adjust_scene,
     distances,
     fix_frame,
+    mean_error,
+    middle_views,
     positions,
     projections_of_tracks,
     scene_of,
+    static_cameras,
+    static_constants,
+    tilt_infinity,
     velocities,
+    view_subsets,
 )
 
 MOVING = [name for name, motion in MOTIONS.items() if motion.lift is not None and not motion.static]
@@ -135,3 +144,136 @@ def test_velocities_are_the_derivatives_of_positions():
     before, after = (positions(scene.structure, motion.lifts([t])[0] @ inverse) for t in (-1e-4, 1e-4))
     expected = (after - before) / 2e-4
     torch.testing.assert_close(velocities(scene.structure, lifting.start, lifting.slope), expected, rtol=1e-4, atol=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Projections and points of P^k from tracks: choices of views, exactness, failures as data.
+
+
+def tracks_of(name, n=60, seed=0, **options):
+    options = {"batch": (1,), **options}
+    scene = scenes.lifted_points(name, n, generator=torch.Generator().manual_seed(seed), **options)
+    seen = scene.tracks.isfinite().all(-1).double()
+    return scene, normalize_tracks(scene.tracks.nan_to_num(), seen, scene.times)
+
+
+def tensor_of(name, times):
+    motion = MOTIONS[name]
+    return motion.tensor(min(motion.views(times), motion.k + 1))
+
+
+@pytest.mark.parametrize(
+    "name", ["constant_velocity_2d", "constant_velocity_planes_3d", "constant_velocity_3d_sensors", "two_bodies_3d"]
+)
+@pytest.mark.parametrize("more", [0, 2])
+def test_noise_free_tracks_are_explained_exactly(name, more):
+    views = MOTIONS[name].views(torch.arange(6.0)) + more
+    _, tracks = tracks_of(name, views=views, batch=(2,))
+    found = projections_of_tracks(tracks, tensor_of(name, tracks.times))
+    assert found.status.tolist() == [Status.OK] * 2
+    torch.testing.assert_close(reproject(found.projections, found.structure), tracks.x, rtol=0, atol=1e-9)
+    assert bool((mean_error(tracks, found) < 1e-18).all())
+
+
+def test_batch_equals_loop_and_a_failed_problem_stays_alone():
+    _, tracks = tracks_of("constant_velocity_2d", views=4, batch=(3,), sigma=0.5)
+    weights = tracks.weights.clone()
+    weights[1, :, 5:] = 0  # too few for any tensor
+    tracks = tracks.only(weights)
+    invariant = tensor_of("constant_velocity_2d", tracks.times)
+    found = projections_of_tracks(tracks, invariant)
+    assert found.status.tolist() == [Status.OK, Status.TOO_FEW, Status.OK]
+    assert not found.projections[1].any()
+    assert not found.structure[1].any()
+    for i in range(3):
+        alone = projections_of_tracks(tracks.subset(torch.tensor([i])), invariant)
+        images = reproject(alone.projections, alone.structure)
+        torch.testing.assert_close(images[0], reproject(found.projections, found.structure)[i], rtol=1e-6, atol=1e-6)
+
+
+def test_choices_are_all_views_or_those_seen_most_and_spread():
+    _, tracks = tracks_of("constant_velocity_2d", views=3)
+    assert view_subsets(tracks, 3).tolist() == [[[0, 1, 2]]]
+    _, tracks = tracks_of("constant_velocity_2d", views=5)
+    assert view_subsets(tracks, 3)[0, 0].tolist() == [0, 2, 4]
+    weights = tracks.weights.clone()
+    weights[:, 2, 10:] = 0
+    assert not (view_subsets(tracks.only(weights), 3)[0, :3] == 2).any()
+    _, tracks = tracks_of("constant_velocity_3d", views=12)
+    few = view_subsets(tracks, 4)
+    assert few.shape == (1, 6, 4)
+    assert bool((few.diff(dim=-1) > 0).all())
+
+
+def test_mean_error_is_that_of_each_observation_and_counts_lost_points():
+    _, tracks = tracks_of("constant_velocity_2d", n=13, views=3, sigma=0.5)
+    draw = torch.Generator().manual_seed(1)
+    M = torch.rand(1, 3, 3, 5, generator=draw, dtype=torch.float64)
+    Y = torch.rand(1, 13, 5, generator=draw, dtype=torch.float64)
+    Y[0, 4] = 0
+    total = 0.0
+    for v in range(3):
+        for j in range(13):
+            q = M[0, v] @ Y[0, j]
+            error = 1.0 if j == 4 else float((tracks.x[0, v, j] - q[:2] / q[2]).square().sum())
+            total += float(tracks.weights[0, v, j]) * error
+    found = Projections(M, Y, torch.zeros(1, dtype=torch.long))
+    assert float(mean_error(tracks, found)) == pytest.approx(total / 39)
+
+
+def test_parts_of_tracks():
+    _, tracks = tracks_of("constant_velocity_2d", views=4, batch=(2,))
+    some = tracks.at(torch.tensor([3, 1]))
+    assert torch.equal(some.x[:, 0], tracks.x[:, 3])
+    assert some.times.tolist() == [3.0, 1.0]
+    twice = tracks.repeat(2)
+    assert isinstance(twice, ViewTracks)
+    assert torch.equal(twice.x[0], twice.x[1])
+    assert torch.equal(twice.x[2], tracks.x[1])
+    assert torch.equal(tracks.subset(torch.tensor([1])).weights[0], tracks.weights[1])
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Starts without a tensor: exact for a scene at rest, and frames that differ by a collineation of the world.
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_scene_at_rest_is_explained_exactly_and_stands_before_all_cameras(dim):
+    scene = scenes.lifted_points(f"static_{dim}d", 40, views=4, batch=(3,), generator=torch.Generator().manual_seed(0))
+    tracks = normalize_tracks(scene.tracks, torch.ones_like(scene.tracks[..., 0]), scene.times)
+    cameras = static_cameras(tracks, 2, dim)
+    points = triangulate(cameras, tracks.x)
+    torch.testing.assert_close(reproject(cameras, points), tracks.x, rtol=0, atol=1e-9)
+    points = points / points[..., -1:]
+    depth = (points[:, None] @ cameras.mT)[..., -1]
+    assert bool((depth * depth[:, :1, :1].sign() > 0).all())
+    deviation = points[..., :-1].std(1)
+    torch.testing.assert_close(deviation, torch.ones_like(deviation), rtol=0.05, atol=0)
+
+
+def test_frames_are_collineations_of_the_first():
+    cameras = torch.rand(2, 4, 3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.equal(tilt_infinity(cameras, 0), cameras)
+    frames = [torch.linalg.lstsq(cameras.flatten(0, 2), tilt_infinity(cameras, k).flatten(0, 2)).solution for k in (1, 2)]
+    for frame in frames:
+        torch.testing.assert_close(frame[:-1], torch.eye(4, dtype=torch.float64)[:-1])
+    assert not torch.allclose(frames[0], frames[1])
+
+
+def test_constants_of_resting_points_do_not_move_them():
+    times = torch.arange(4.0)
+    lifts = MOTIONS["constant_velocity_3d"].lifts(times)
+    still = static_constants(lifts)
+    assert still.shape == (7, 4)
+    torch.testing.assert_close(still.mT @ still, torch.eye(4, dtype=torch.float64))
+    places = lifts @ still
+    torch.testing.assert_close(places, places[:1].expand_as(places))
+    always = torch.stack([torch.eye(3, 4, dtype=torch.float64).roll(int(t), 1) for t in range(4)])
+    assert static_constants(always).shape == (4, 0)
+
+
+def test_middle_views_are_neighbours_in_time():
+    assert middle_views(torch.tensor([0.0, 1.0, 2.0])).tolist() == [0, 1, 2]
+    many = torch.tensor([7.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    assert middle_views(many).tolist() == [2, 3, 4, 5, 6, 7]
+    assert middle_views(many, 1).tolist() == [2, 3, 4, 5, 6]
