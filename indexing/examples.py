@@ -18,7 +18,7 @@ import torch
 from dyntorch import scenes
 from indexing import files
 from indexing.actors import Person, dataset, detect, perform, stream
-from indexing.actors.textured import film
+from indexing.actors.textured import render_clip
 from indexing.clip import Clip, ClipSet
 from indexing.video.reading import av
 
@@ -131,7 +131,7 @@ def _week(where: Path) -> None:
 def _write_videos(where: Path, with_videos: bool) -> None:
     """Grey films: a set of two people, and as videos the actions of one and a recording of the other."""
     solid = [[perform(action, Person.random(person), fps=FILM_FPS, rng=person) for action in FILMED] for person in (1, 2)]
-    parts = [[film(clip, azimuth=0, rng=i + 10 * k) for i, clip in enumerate(clips)] for k, clips in enumerate(solid)]
+    parts = [[render_clip(clip, azimuth=0, rng=i + 10 * k) for i, clip in enumerate(clips)] for k, clips in enumerate(solid)]
     every = [part for person in parts for part in person]
     np.savez(
         where / "films.npz", frames=np.concatenate(every), offsets=np.cumsum([0, *map(len, every)]), action=[*FILMED, *FILMED],
@@ -141,7 +141,7 @@ def _write_videos(where: Path, with_videos: bool) -> None:
         for action, part in zip(FILMED, parts[0], strict=True):
             _video(where / f"{action}.mp4", part)
         session, _ = stream(["kick", "squat", "jumping_jack"], Person.random(2), fps=FILM_FPS, rng=4)
-        _video(where / "filmed.mp4", film(session, azimuth=0, rng=20))
+        _video(where / "filmed.mp4", render_clip(session, azimuth=0, rng=20))
 
 
 def _video(path: Path, frames: NDArray[np.uint8]) -> None:

@@ -118,7 +118,7 @@ def followed(video: RenderedVideo, **options: object) -> SceneTracks:
 def track_errors(video: RenderedVideo, tracks: SceneTracks) -> Floats:
     """Pixels of every point of the first picture from its truth in the others; those on edges have none."""
     points, frames = tracks.points.numpy(), tracks.frames
-    found = [np.linalg.norm(video.followed(points[0], frames[0], frames[k]) - points[k], axis=1) for k in range(1, len(frames))]
+    found = [np.linalg.norm(video.transfer(points[0], frames[0], frames[k]) - points[k], axis=1) for k in range(1, len(frames))]
     errors = np.concatenate(found)
     return np.asarray(errors[np.isfinite(errors)])
 
@@ -142,7 +142,7 @@ def aligned(config: Config) -> list[Row]:
         tracks_of.append(track_errors(video, tracks))
         found = dyn.align_planar(*tracks.points, threshold=THRESHOLD, generator=torch.Generator().manual_seed(0))
         solved += int(found.status == dyn.Status.OK)
-        shown = video.shown(tracks.points[0].numpy(), tracks.frames[0])
+        shown = video.visible_sheets(tracks.points[0].numpy(), tracks.frames[0])
         truth = np.where(video.bodies[shown] > 0, 2, 1)
         known = (shown >= 0) & (found.labels.numpy() > 0)
         labels.append(float((found.labels.numpy() == truth)[known].mean()))
@@ -169,11 +169,11 @@ def segmented(config: Config) -> list[Row]:
         found = dyn.segment(*tracks.points, generator=torch.Generator().manual_seed(0))
         first, second = tracks.frames
         points = tracks.points[0].numpy()
-        shown = video.shown(points, first)
+        shown = video.visible_sheets(points, first)
         truth = torch.from_numpy(np.where(shown >= 0, video.bodies[shown] + 1, 0))
         kept = truth > 0
         wrong.append(float(metrics.misclassification(found.labels[kept], truth[kept])))
-        exact = torch.from_numpy(video.followed(points, first, second))
+        exact = torch.from_numpy(video.transfer(points, first, second))
         for body in (1, 2):
             mine = truth == body
             label = int(found.labels[mine & (found.labels > 0)].mode().values)
@@ -207,7 +207,7 @@ def reconstructed(config: Config) -> list[Row]:
         for k, frame in enumerate(tracks.frames):
             rays = torch.cat([found.at(float(tracks.times[k])), torch.ones_like(found.points[:, :1])], dim=1) @ found.cameras[k].mT
             predicted = (rays[:, :2] / rays[:, 2:]).numpy()
-            off = np.linalg.norm(predicted - video.followed(start, tracks.frames[0], frame), axis=1)[fits]
+            off = np.linalg.norm(predicted - video.transfer(start, tracks.frames[0], frame), axis=1)[fits]
             away.append(off[np.isfinite(off)])
         note(f"planar {seed}: {int(fits.sum())} points, residual {residuals[-1]:.3f} px")
     setting = f"{config.scenes} videos, 8 frames"

@@ -187,11 +187,13 @@ def brightness(verb: str) -> Callable[[], Verb]:
     def make() -> Verb:
         from indexing import BrightnessIndexer
         from indexing.actors import Person, dataset
-        from indexing.actors.textured import film
+        from indexing.actors.textured import render_clip
 
         moves = ["squat", "jumping_jack", "kick"]
         solid = [dataset([Person.random(person)], moves, azimuth=None, rng=person) for person in (1, 2)]
-        shown, asked = ([film(clip, azimuth=0, rng=i + 10 * k) for i, clip in enumerate(clips)] for k, clips in enumerate(solid))
+        shown, asked = (
+            [render_clip(clip, azimuth=0, rng=i + 10 * k) for i, clip in enumerate(clips)] for k, clips in enumerate(solid)
+        )
         if verb == "fit":
             return lambda: BrightnessIndexer(fps=30.0).fit(shown, moves)
         seen = BrightnessIndexer(fps=30.0).fit(shown, moves)

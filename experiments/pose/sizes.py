@@ -53,7 +53,7 @@ class Config:
 
 def pictures(path: Path, scale: float, far: bool, every: int) -> Iterator[VideoPicture]:
     """The frames of a video, smaller."""
-    for i, (frame, _) in enumerate(read_video(path).stored()):
+    for i, (frame, _) in enumerate(read_video(path).stored_frames()):
         if i % every:
             continue
         size = round(frame.width * scale), round(frame.height * scale)

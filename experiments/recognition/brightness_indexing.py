@@ -35,7 +35,7 @@ from experiments.recognition import protocol
 from experiments.recognition.brightness_baselines import BASELINES, FrameNearest, Frames, WindowKernels
 from experiments.recognition.protocol import Array
 from indexing import Clip
-from indexing.actors.textured import film
+from indexing.actors.textured import render_clip
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.skeleton import COCO17
 from indexing.sync.brightness_features import motion
@@ -146,7 +146,7 @@ def films(seed: int) -> list[Filmed]:
         clip = clip.replace(joints=clip.joints[::step], times=clip.times[::step])
         views = {"learned": 0.0} | {str(turn): float(turn) for turn in TURNS}
         videos = {
-            view: film(clip, azimuth=turn, rng=np.random.default_rng([seed, number, k]))
+            view: render_clip(clip, azimuth=turn, rng=np.random.default_rng([seed, number, k]))
             for k, (view, turn) in enumerate(views.items())
         }
         at = np.minimum((clip.times * 30 / protocol.RATIO + 1e-6).astype(int), len(one.labels) - 1)

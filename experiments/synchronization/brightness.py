@@ -31,7 +31,7 @@ from experiments.common.tables import NoiseConfig, Row, aligned, command, measur
 from experiments.recognition.protocol import data_folder
 from indexing import Clip
 from indexing.actors import ACTIONS, Person, stream
-from indexing.actors.textured import Frames, film
+from indexing.actors.textured import Frames, render_clip
 from indexing.skeleton import Skeleton
 from indexing.sync.brightness import brightness_shift
 from indexing.sync.brightness_features import motion
@@ -127,7 +127,7 @@ def pairs(source: Source, frames: int, noise: float, turn: float, distance: floa
         azimuth, by = rng.uniform(0, 360), rng.uniform(-turn, turn)
         away = rng.uniform(0.85, 1.15) * distance
         first, second = (
-            film(
+            render_clip(
                 clip, azimuth=angle, elevation=rng.uniform(-0.25, 0.1), distance=away * rng.uniform(0.9, 1.1), noise=noise, rng=rng
             )
             for angle in (azimuth, azimuth + by)

@@ -30,7 +30,7 @@ _LIMBS = ((5, 7), (7, 9), (6, 8), (8, 10), (11, 13), (13, 15), (12, 14), (14, 16
 _BODY = (*_LIMBS, (5, 6), (11, 12), (5, 11), (6, 12), (_NECK, _PELVIS), (_NECK, _HEAD))
 
 
-def film(
+def render_clip(
     clip: Clip,
     *,
     azimuth: float,
@@ -172,7 +172,7 @@ class RenderedVideo:
     maps: Floats  # ``(T, sheets, 3, 3)`` texture pixels -> image pixels (pixel centres are whole numbers)
     bodies: NDArray[np.int64]  # ``(sheets,)`` which motion carries each
 
-    def shown(self, points: Floats, frame: int) -> NDArray[np.int64]:
+    def visible_sheets(self, points: Floats, frame: int) -> NDArray[np.int64]:
         """``(n,)`` the sheet that is seen at points ``(n, 2)`` of a frame; -1 where there is none, or an edge within two pixels."""
         height, width = self.seen.shape[1:]
         found = np.full(len(points), -1)
@@ -184,9 +184,9 @@ class RenderedVideo:
             found[i] = around[2, 2] if (around == around[2, 2]).all() else -1
         return found
 
-    def followed(self, points: Floats, first: int, second: int) -> Floats:
-        """Where points ``(n, 2)`` of one frame are in another, seen there or not; NaN where :meth:`shown` knows no sheet."""
-        sheets = self.shown(points, first)
+    def transfer(self, points: Floats, first: int, second: int) -> Floats:
+        """Where points ``(n, 2)`` of one frame are in another, seen there or not; NaN where no sheet is visible in the first."""
+        sheets = self.visible_sheets(points, first)
         out = np.full(points.shape, np.nan)
         for k in np.unique(sheets[sheets >= 0]).tolist():
             mine = sheets == k

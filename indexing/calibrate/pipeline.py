@@ -340,7 +340,7 @@ def _calibrate_cameras(
             times=[torch.from_numpy(view.times) for view in views],
             sizes=[view.size for view in views],
             focal=None if lenses.focals is None or lenses.lenses is not None else list(lenses.focals),
-            calibration=lenses.given,
+            calibration=lenses.calibration,
             clocks=clocks,
             lengths=dict(lengths) or None,
             weights=[trust for _, trust in seen],

@@ -42,7 +42,7 @@ class KnownLenses:
     notes: tuple[str, ...] = ()  # what to say about it
 
     @property
-    def given(self) -> list[tuple[Tensor, Tensor | None]] | None:
+    def calibration(self) -> list[tuple[Tensor, Tensor | None]] | None:
         """Matrix and distortion of each camera, as :func:`dyntorch.calibrate` takes them; None where they are not known."""
         if self.lenses is None:
             return None
@@ -398,11 +398,12 @@ def _trunk_and_leg(body: FloatArray, names: Sequence[str]) -> tuple[float, Float
         for part in ("shoulder", "hip", "knee", "ankle")
     )
 
-    def usual(a: FloatArray, b: FloatArray) -> float:
+    def median_distance(a: FloatArray, b: FloatArray) -> float:
         far = np.linalg.norm(a - b, axis=-1)
         return float(np.nanmedian(far)) if np.isfinite(far).any() else math.nan
 
-    length = usual(shoulders.mean(axis=1), hips.mean(axis=1)) + usual(hips, knees) + usual(knees, ankles)
+    trunk = median_distance(shoulders.mean(axis=1), hips.mean(axis=1))
+    length = trunk + median_distance(hips, knees) + median_distance(knees, ankles)
     known = np.isfinite(ankles[..., 2]).any(axis=1)
     above = np.full(len(body), np.nan)
     above[known] = shoulders[known].mean(axis=1)[:, 2] - np.nanmin(ankles[known, :, 2], axis=1)

@@ -84,10 +84,6 @@ class MatchDatabase:
         """Of all pairs."""
         return sum(len(pair.matches) for pair in self.pairs)
 
-    def called(self, pair: DatabasePair) -> str:
-        """A pair by the names of its images."""
-        return f"{self.images[pair.first].name} and {self.images[pair.second].name}"
-
 
 @dataclass(frozen=True, eq=False)
 class PairGeometry:

@@ -77,8 +77,8 @@ def vote(pairs: Sequence[DividedPair], cells: IntArray, image: IntArray) -> Vote
         else:
             tried[graph.pair[told]] = True
             undecided += graph.images_of(told)
-    keypoints = graph.carried(signs)
-    split = np.split(graph.joined(signs), np.cumsum([pair.bodies for pair in pairs])[:-1]) if pairs else []
+    keypoints = graph.propagate_votes(signs)
+    split = np.split(graph.restore_static(signs), np.cumsum([pair.bodies for pair in pairs])[:-1]) if pairs else []
     return Votes(keypoints, tuple(split), float(lead), graph.spread(keypoints > 0), tuple(sorted(set(undecided))))
 
 
@@ -86,13 +86,13 @@ def _answer(graph: _Graph, seeds: IntArray, signs: IntArray) -> tuple[IntArray, 
     """The best answer from any of the bodies, beside the signs that stand already, and its lead over the next one."""
     found = []
     for seed in seeds.tolist():
-        mine = graph.settled(graph.started(seed, signs))
-        static = graph.voted(mine) > 0
+        mine = graph.propagate_signs(graph.seed_signs(seed, signs))
+        static = graph.mean_votes(mine) > 0
         found.append((float(graph.spread(static).sum()), mine, static))
     found.sort(key=lambda answer: -answer[0])
     spread, best, static = found[0]
     others = [other for other, _, also in found[1:] if _overlap_share(static, also) < DUPLICATE_OVERLAP]
-    before = float(graph.spread(graph.voted(signs) > 0).sum())  # of parts of the graph that were decided earlier
+    before = float(graph.spread(graph.mean_votes(signs) > 0).sum())  # of parts of the graph that were decided earlier
     return best, (spread - before) / max(max(others, default=0.0) - before, 1e-9) if others else np.inf
 
 
@@ -172,14 +172,14 @@ class _Graph:
         edges = coo_array((np.ones(len(keypoint)), (self.pair[self.node], keypoint)), shape=(total, total))
         return np.asarray(connected_components(edges, directed=False)[1][:pairs], dtype=np.int64)
 
-    def started(self, seed: int, signs: IntArray) -> IntArray:
+    def seed_signs(self, seed: int, signs: IntArray) -> IntArray:
         """The signs that stand, and one body static in its pair."""
         mine = signs.copy()
         mine[self.pair == self.pair[seed]] = -1
         mine[seed] = 1
         return mine
 
-    def settled(self, signs: IntArray) -> IntArray:
+    def propagate_signs(self, signs: IntArray) -> IntArray:
         """Signs of all bodies that keypoints lead to, from those of some."""
         for _ in range(MAX_ITERATIONS):
             agreement, known = self.agreement(signs)
@@ -189,13 +189,13 @@ class _Graph:
             beside = np.zeros(int(self.pair.max(initial=-1)) + 1, dtype=bool)
             beside[self.pair[new > 0]] = True
             new = np.where(~told & (new == 0) & beside[self.pair], -1, new)
-            new = self._one(new, np.where(told, agreement * known, self.sizes))
+            new = self._keep_one_static(new, np.where(told, agreement * known, self.sizes))
             if np.array_equal(new, signs):
                 break
             signs = new
         return signs
 
-    def _one(self, signs: IntArray, support: FloatArray) -> IntArray:
+    def _keep_one_static(self, signs: IntArray, support: FloatArray) -> IntArray:
         """At most one static body in a pair, the one with most support: the pair says that they move apart."""
         static = np.flatnonzero(signs > 0)
         order = static[np.lexsort((-support[static], self.pair[static]))]
@@ -205,7 +205,7 @@ class _Graph:
         signs[rest] = -1
         return signs
 
-    def joined(self, signs: IntArray) -> IntArray:
+    def restore_static(self, signs: IntArray) -> IntArray:
         """The signs, with the parts of the scene that some pairs take for bodies of their own static again."""
         agreement, known = self.agreement(signs)
         again = (signs < 0) & (known >= MIN_SHARED_KEYPOINTS) & (agreement >= MIN_AGREEMENT)
@@ -232,12 +232,12 @@ class _Graph:
         )
         return votes, total
 
-    def voted(self, signs: IntArray) -> FloatArray:
+    def mean_votes(self, signs: IntArray) -> FloatArray:
         """``(q,)`` mean vote on every keypoint, 0 where there is none."""
         votes, total = self._sums(signs)
         return np.asarray(votes / np.maximum(total, 1e-9))
 
-    def carried(self, signs: IntArray) -> FloatArray:
+    def propagate_votes(self, signs: IntArray) -> FloatArray:
         """The same with the votes on the keypoints that a keypoint is matched with."""
         own, total = self._sums(signs)
         mean = own / np.maximum(total, 1e-9)

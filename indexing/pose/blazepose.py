@@ -196,7 +196,7 @@ class VideoPicture:
             self._levels.append(cv2().resize(last, (width, height), interpolation=cv2().INTER_AREA))
         return self._levels[shrunk]
 
-    def cut(self, region: Region, side: int, fill: bool = False) -> Image:
+    def extract_region(self, region: Region, side: int, fill: bool = False) -> Image:
         """``(side, side, 3)`` the region, upright."""
         scale = region.side / side
         most = max(0, min(self.stored).bit_length() - 2)  # levels that have two pixels at least

@@ -142,7 +142,7 @@ def work(task: VideoPlan, piece: Piece, networks: Networks, moved: Callable[[], 
 def _decode(task: VideoPlan, video: Video) -> Iterator[tuple[Any, float]]:
     """The frames of a video as they are stored, and their times."""
     try:
-        yield from video.stored()
+        yield from video.stored_frames()
     except ValueError as problem:
         _check_unchanged(task)
         raise PieceLost(*problem.args) from problem
@@ -207,7 +207,7 @@ class Store:
             return None
         return found if len(found.joints) == len(found.at) == len(found.tracks) == len(found.confidence) else None
 
-    def put(self, piece: Piece, seen: Sightings) -> None:
+    def save(self, piece: Piece, seen: Sightings) -> None:
         """Keep a finished piece."""
         with self._lock:
             if not self.folder.is_dir():

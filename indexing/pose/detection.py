@@ -169,7 +169,7 @@ def run(
     meter = _Meter(sum(job.plan.frames for job in jobs if job.plan is not None), progress)
     own, halted = threading.local(), threading.Event()
 
-    def one(job: _Job, task: VideoPlan, piece: Piece) -> Sightings:
+    def work_piece(job: _Job, task: VideoPlan, piece: Piece) -> Sightings:
         begun = time.perf_counter()
         kept = None if job.store is None else job.store.get(piece)
         if kept is not None:
@@ -183,7 +183,7 @@ def run(
                 own.networks = LiteNetworks(models)
             seen = work(task, piece, own.networks, meter.add, lambda: halted.is_set() or job.problem is not None)
             if job.store is not None:
-                job.store.put(piece, seen)
+                job.store.save(piece, seen)
         except PieceLost:
             raise
         except ValueError as problem:
@@ -194,11 +194,11 @@ def run(
         meter.add(len(piece.frames) - (meter.of_thread() - before))
         return seen
 
-    with ALONE.kept(), ThreadPoolExecutor(workers) as pool:
+    with SINGLE_THREADED.hold(), ThreadPoolExecutor(workers) as pool:
         try:
             for job in jobs:
                 if job.plan is not None:
-                    job.pieces = [pool.submit(one, job, job.plan, piece) for piece in job.plan.pieces]
+                    job.pieces = [pool.submit(work_piece, job, job.plan, piece) for piece in job.plan.pieces]
             for job in jobs:
                 yield job.task, _outcome(job)
         finally:
@@ -265,7 +265,7 @@ class _Meter:
         return getattr(self._own, "frames", 0)
 
 
-class _Alone:
+class _SingleThreadedOpenCV:
     """OpenCV without threads of its own, while anybody works: on pictures this small they only wait for each other."""
 
     def __init__(self) -> None:
@@ -273,7 +273,7 @@ class _Alone:
         self._users, self._before = 0, 0
 
     @contextmanager
-    def kept(self) -> Iterator[None]:
+    def hold(self) -> Iterator[None]:
         """As long as this lasts; the last one who leaves gives the threads back."""
         with self._lock:
             if not self._users:
@@ -289,7 +289,7 @@ class _Alone:
                     cv2().setNumThreads(self._before)
 
 
-ALONE = _Alone()  # the process has one OpenCV
+SINGLE_THREADED = _SingleThreadedOpenCV()  # the process has one OpenCV
 
 
 def workers_here() -> int:

@@ -117,12 +117,12 @@ class Tracker:
     def _follow(self, picture: VideoPicture, time: float) -> None:
         kept = []
         for one in self._followed:
-            region = self._awaited(one, time)
+            region = self._predict_region(one, time)
             if self._update(one, picture, region, time):
                 kept.append(one)
-        self._followed = self._apart(kept)
+        self._followed = self._remove_duplicates(kept)
 
-    def _awaited(self, one: _Followed, time: float) -> Region:
+    def _predict_region(self, one: _Followed, time: float) -> Region:
         """Where to look for somebody: where the body was, or farther along if it moves by more than noise does."""
         step = time - one.time
         dx, dy = one.speed[0] * step, one.speed[1] * step
@@ -140,10 +140,10 @@ class Tracker:
         if step > 0:
             one.speed = (following.x - one.region.x) / step, (following.y - one.region.y) / step
         one.leap = math.hypot(following.x - region.x, following.y - region.y) / self._radius(following)
-        self._seen(one, seen, region, following, time)
+        self._record(one, seen, region, following, time)
         return True
 
-    def _seen(self, one: _Followed, seen: Landmarks, region: Region, following: Region, time: float) -> None:
+    def _record(self, one: _Followed, seen: Landmarks, region: Region, following: Region, time: float) -> None:
         one.joints = region.to_picture(seen.places[:JOINTS])
         one.confidence, one.region, one.time = seen.confidence[:JOINTS], following, time
 
@@ -151,23 +151,23 @@ class Tracker:
         """What a region shows and the next region; None where nobody is in it."""
         if not region.usable(picture.width, picture.height):
             return None
-        seen = landmarks(*self.networks.landmarks(picture.cut(region, REGION)))
+        seen = landmarks(*self.networks.landmarks(picture.extract_region(region, REGION)))
         if not (seen.present >= MIN_PRESENCE and np.isfinite(seen.places).all()):
             return None
         hips, circle = region.to_picture(seen.places[[HIPS, CIRCLE]])
         following = about(hips, circle, REGION_SCALE)
         return (seen, following) if following.usable(picture.width, picture.height) else None
 
-    def _apart(self, people: list[_Followed]) -> list[_Followed]:
+    def _remove_duplicates(self, people: list[_Followed]) -> list[_Followed]:
         """Without those who sit on somebody else: the one that leapt farther goes, of equals the later one."""
         gone: set[int] = set()
         for i, one in enumerate(people):
             for other in people[i + 1 :]:
-                if one.number not in gone and other.number not in gone and self._alike(one, other):
+                if one.number not in gone and other.number not in gone and self._are_duplicates(one, other):
                     gone.add(one.number if one.leap > other.leap + DUPLICATE_RADII else other.number)
         return [one for one in people if one.number not in gone]
 
-    def _alike(self, one: _Followed, other: _Followed) -> bool:
+    def _are_duplicates(self, one: _Followed, other: _Followed) -> bool:
         apart = float(np.linalg.norm(one.joints - other.joints, axis=1).mean())
         return apart < DUPLICATE_RADII * max(self._radius(one.region), self._radius(other.region))
 
@@ -194,7 +194,7 @@ class Tracker:
                 if not closer or (self._followed if self.people == 1 else len(self._followed) >= self.people):
                     break
                 self._looked_closer = time
-            found = [region for region in self._detect(picture, shrink) if not self._known(region)]
+            found = [region for region in self._detect(picture, shrink) if not self._is_followed(region)]
             if shrink == 1:
                 self.crowd.append(len(found) + len(self._followed))
             for region in found:
@@ -214,7 +214,7 @@ class Tracker:
         least = self.options.min_score if shrink == 1 else self.options.min_closer_score
         found: list[Region] = []
         for window in windows(picture.width, picture.height, max(picture.width, picture.height) / shrink):
-            seen = candidates(*self.networks.detector(picture.cut(window, PICTURE, fill=True)), least)
+            seen = candidates(*self.networks.detector(picture.extract_region(window, PICTURE, fill=True)), least)
             found += [about(hips, circle, REGION_SCALE) for hips, circle, *_ in window.to_picture(seen.points)]
         return self._distinct(found)[:MAX_CANDIDATES]
 
@@ -226,7 +226,7 @@ class Tracker:
                 kept.append(region)
         return kept
 
-    def _known(self, region: Region) -> bool:
+    def _is_followed(self, region: Region) -> bool:
         return any(self._same_place(region, one.region) for one in self._followed)
 
     def _same_place(self, a: Region, b: Region) -> bool:
@@ -244,9 +244,9 @@ class Tracker:
         if seen is None:
             return
         one = _Followed(self.begun, following, np.empty(0), np.empty(0), time)
-        self._seen(one, seen, used, following, time)
+        self._record(one, seen, used, following, time)
         others = [other for other in self._followed if other is not instead]
-        if any(self._alike(one, other) for other in self._followed):
+        if any(self._are_duplicates(one, other) for other in self._followed):
             return
         self.begun += 1
         self._followed = [*others, one]

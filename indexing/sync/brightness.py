@@ -119,7 +119,7 @@ class Curve:
     counts: Tensor
 
     @property
-    def best(self) -> int:
+    def best_lag(self) -> int:
         """The lag of the highest score."""
         return int(self.lags[self.scores.argmax()])
 
@@ -304,7 +304,7 @@ def evaluate(
     if not bool(curve.scores.isfinite().any()):  # nothing moves in one of them
         nowhere = max(lags[0], min(0, lags[1]))
         return Verdict(curve, nowhere, (nowhere, nowhere), None, 1.0, 1.0, 0.0, measure)
-    best = curve.best
+    best = curve.best_lag
     others = [
         float(curve.scores[k])
         for k in curve.peaks(MIN_PEAK_SEPARATION_FRAMES // 2)
@@ -333,7 +333,7 @@ def _rows(a: Sampled, b: Sampled, measure: Measure) -> tuple[Tensor, Tensor]:
 def _halves(one: torch.Tensor, two: torch.Tensor, best: int, lags: tuple[int, int]) -> tuple[int, int]:
     low, high = max(0, -best), min(len(one), len(two) - best)
     middle = (low + high) // 2
-    first, second = (part_curve(one, two, rows).within(*lags).best for rows in (slice(low, middle), slice(middle, high)))
+    first, second = (part_curve(one, two, rows).within(*lags).best_lag for rows in (slice(low, middle), slice(middle, high)))
     return first, second
 
 
@@ -348,7 +348,7 @@ def _kernel_opinion(a: Sampled, b: Sampled, lags: tuple[int, int], best: int) ->
         return None, 0.0
     one, two = kernel_descriptors(a.kernels, b.kernels)
     curve = score_curve(one, two, MIN_KERNEL_OVERLAP_SHARE * shorter).within(*lags)
-    found = curve.best if bool(curve.scores.isfinite().any()) else None
+    found = curve.best_lag if bool(curve.scores.isfinite().any()) else None
     overlap = min(len(one), len(two) - best) - max(0, -best)
     return found, evidence(one, two, best) if overlap >= MIN_KERNELS else 0.0
 

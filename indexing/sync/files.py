@@ -46,7 +46,7 @@ class Plan:
     before: int
 
     @property
-    def repeated(self) -> int:
+    def num_repeated(self) -> int:
         """How many frames stand for more than one moment."""
         return len(self.rows) - len(np.unique(self.rows))
 

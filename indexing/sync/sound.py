@@ -227,7 +227,7 @@ def _stretches(container: Any, stream: Any) -> Iterator[tuple[float, NDArray[np.
     form: Any = None
     resampler: Any = None
 
-    def closed() -> NDArray[np.int16]:
+    def flush() -> NDArray[np.int16]:
         pieces.extend(made.to_ndarray()[0] for made in resampler.resample(None))
         return np.concatenate(pieces) if pieces else np.zeros(0, np.int16)
 
@@ -236,13 +236,13 @@ def _stretches(container: Any, stream: Any) -> Iterator[tuple[float, NDArray[np.
         now = (frame.sample_rate, frame.layout.name, frame.format.name)
         if resampler is None or abs(time - expected) > MAX_TIMESTAMP_ERROR_SECONDS or now != form:
             if resampler is not None:
-                yield began, closed()
+                yield began, flush()
             pieces, form, began = [], now, time
             expected, resampler = time, av().AudioResampler(format="s16", layout="mono", rate=SAMPLE_RATE)
         pieces.extend(made.to_ndarray()[0] for made in resampler.resample(frame))
         expected += frame.samples / frame.sample_rate
     if resampler is not None:
-        yield began, closed()
+        yield began, flush()
 
 
 def _frames(container: Any, stream: Any) -> Iterator[Any]:

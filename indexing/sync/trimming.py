@@ -58,7 +58,7 @@ class Cut:
         return f"{self.film.name}.mp4"
 
     @property
-    def repeated(self) -> int:
+    def num_repeated(self) -> int:
         """How many frames stand for more than one moment."""
         return len(self.rows) - len(np.unique(self.rows))
 
@@ -72,7 +72,7 @@ class Cut:
         first, last = int(self.rows[0]), int(self.rows[-1])
         return {
             "file": f"{FOLDER}/{self.file}", "of": str(self.film.path), "frames": len(self.rows), "first": first, "last": last,
-            "repeated": self.repeated, "left_out": self.left_out, "rest": self.rest,
+            "repeated": self.num_repeated, "left_out": self.left_out, "rest": self.rest,
         }  # fmt: skip
 
 
@@ -251,7 +251,7 @@ def _frames(cut: Cut) -> Iterator[Any]:
     """PyAV's frame of every moment, upright, of even size."""
     wanted = cut.film.stamps[cut.rows]
     close = cut.film.frame / 4
-    source = read_video(cut.film.path, start=max(0.0, float(wanted[0]) - 1.0)).stored()
+    source = read_video(cut.film.path, start=max(0.0, float(wanted[0]) - 1.0)).stored_frames()
     shape: tuple[int, int] | None = None
     here: Any = None
     made: Any = None

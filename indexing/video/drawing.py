@@ -211,7 +211,7 @@ def write_check_video(
         )
     rate = min(left.fps, FASTEST)
     moments = start + np.arange(1 + math.floor((stop - start) * rate + 1e-6)) / rate
-    pictures = zip(left.shown(moments), right.shown(np.asarray(shift.at(moments), np.float64)), strict=True)
+    pictures = zip(left.nearest_frames(moments), right.nearest_frames(np.asarray(shift.at(moments), np.float64)), strict=True)
     frames = (_compose(*pair, names) for pair in pictures)
     return write_bytes(path, encode(frames, rate))
 
@@ -225,7 +225,7 @@ class _Film:
         self.size = (_even(info.width * height / info.height), height)
         self.fps, self.first, self.last = info.fps, 0.0, info.duration
 
-    def shown(self, moments: NDArray[np.float64]) -> Iterator[tuple[Image, float]]:
+    def nearest_frames(self, moments: NDArray[np.float64]) -> Iterator[tuple[Image, float]]:
         """Of each moment (in order), the nearest frame and its time; holds a few frames at a time."""
         start = max(0.0, float(moments[0]) - 1.0)
         video = read_video(self.video.path, gray=False, size=self.size, start=start, chunk=8)
@@ -257,7 +257,7 @@ class _Figure:
         skeleton = clip.skeleton or usual_layout(clip.joints.shape[1])
         self.bones = skeleton.bones if skeleton else ()
 
-    def shown(self, moments: NDArray[np.float64]) -> Iterator[tuple[Image, float]]:
+    def nearest_frames(self, moments: NDArray[np.float64]) -> Iterator[tuple[Image, float]]:
         """Of each moment, the nearest frame drawn, and its time."""
         for moment in moments.tolist():
             i = int(np.argmin(np.abs(self.times - moment)))

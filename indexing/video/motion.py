@@ -232,7 +232,7 @@ class CameraMotion:
         after = np.minimum(after, len(self.times) - 1)
         return np.asarray(self.path[np.where(times - self.times[before] <= self.times[after] - times, before, after)])
 
-    def still(self, points: Floats, times: Floats | None = None) -> Floats:
+    def stabilize_points(self, points: Floats, times: Floats | None = None) -> Floats:
         """Points ``(frames, n, 2)`` as the first frame's camera would have seen them (exact for pans, or far backgrounds).
 
         Args:

@@ -96,7 +96,7 @@ class Orientation:
     flip_y: bool = False
 
     @property
-    def mirrored(self) -> bool:
+    def is_mirrored(self) -> bool:
         """Whether no rotation alone does it."""
         return self.transpose ^ self.flip_x ^ self.flip_y
 
@@ -104,7 +104,7 @@ class Orientation:
     def rotation(self) -> int:
         """Degrees clockwise, of what is done after the mirroring (left-right), if there is one."""
         # what a left-right mirror before the turn leaves: x flips along the stored x, which is the shown y after a transposition
-        flip_x = self.flip_x ^ (self.mirrored and not self.transpose)
+        flip_x = self.flip_x ^ (self.is_mirrored and not self.transpose)
         return (90 if flip_x else 270) if self.transpose else (180 if flip_x else 0)
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -224,8 +224,8 @@ def frame_times(path: str | Path, *, fps: float | None = None) -> tuple[VideoInf
     info = VideoInfo(
         path=Path(path), width=width, height=height, frames=len(times), duration=duration,
         fps=(len(times) - 1) / duration if duration else nominal, variable=uneven > UNEVEN,
-        rotation=upright.rotation, mirrored=upright.mirrored, start=float(start), repeated=repeated, dropped=dropped, codec=codec,
-        notes=tuple(notes), timed=has_times,
+        rotation=upright.rotation, mirrored=upright.is_mirrored, start=float(start), repeated=repeated, dropped=dropped,
+        codec=codec, notes=tuple(notes), timed=has_times,
     )  # fmt: skip
     return info, times - start
 
@@ -283,7 +283,7 @@ def _notes(uneven: float, dropped: int, repeated: int, claimed: float | None, en
         notes.append(f"variable frame rate (frames up to {uneven:.1f} frames off an even grid{gaps}): timestamps are used")
     if repeated:
         notes.append(f"{repeated} frames repeat the time of another one and are left out")
-    if upright.mirrored:
+    if upright.is_mirrored:
         notes.append("the file asks for mirrored pictures (selfie camera): shown mirrored, as the file says")
     return notes + cut_off(claimed, end)
 
@@ -354,14 +354,14 @@ class Video:
     def _frames(self) -> Iterator[tuple[NDArray[np.uint8], float]]:
         """Upright frames of the span, one by one, with their times."""
         shape: _Shape | None = None
-        for frame, time in self.stored():
+        for frame, time in self.stored_frames():
             if shape is None:
                 shape = _Shape(frame, self.size, self.gray)
                 self.scale = shape.scale
             yield shape(frame), time
         self.notes += () if shape is None else shape.notes
 
-    def stored(self) -> Iterator[tuple[Any, float]]:
+    def stored_frames(self) -> Iterator[tuple[Any, float]]:
         """PyAV's own frames of the span, as they are stored (not turned, in the file's colours), one by one, with their times."""
         self.notes = ()
         start, stop = self.span

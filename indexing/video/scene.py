@@ -133,7 +133,7 @@ def track_scene(
     if iter(stream) is stream:
         raise ValueError("track_scene: chunks that can be read only once, and two passes are needed; give a list of them")
     book, times, first, why = _follow(stream, wanted, options)
-    taken = wanted.taken(times, first, name_of(source))
+    taken = wanted.frame_numbers(times, first, name_of(source))
     pictures = [image.copy() for image in select_frames(stream, taken)]
     least = max(2, round(MIN_PRESENCE * len(taken))) if missing else len(taken)
     positions = _drop_rarely_seen(_refine_to_first(_at(book, [k - first for k in taken]), pictures), least)
@@ -205,7 +205,7 @@ class Wanted:
             raise ValueError(f"{name}: has {count} frame{'s' * (count != 1)}, and motion needs at least 2; give a longer video")
         return count
 
-    def taken(self, times: list[float], first: int, name: str) -> list[int]:
+    def frame_numbers(self, times: list[float], first: int, name: str) -> list[int]:
         """Numbers of the frames that are taken, of those that were read, ``first`` being the first that was followed."""
         count = self.enough(times, name)
         if self.frames is not None:
@@ -391,7 +391,7 @@ def track_whole(
     step = 1 if frames or at or every else -(-_length(stream) // options.max_frames)
     book, times = _follow_all(stream, wanted, step, options)
     named = name_of(source)
-    taken = wanted.taken(times, 0, named) if frames or at or every else list(range(0, wanted.enough(times, named), step))
+    taken = wanted.frame_numbers(times, 0, named) if frames or at or every else list(range(0, wanted.enough(times, named), step))
     least = max(2, min(MIN_TRACK_FRAMES, len(taken) // 2))
     positions = select_longest(book.table(len(taken)), least, 2 * options.max_tracks)
     kept = evenly_spaced(len(taken), NUM_PICTURES)
@@ -478,13 +478,13 @@ def _frame_selector(wanted: Wanted, step: int) -> Callable[[int, float], bool]:
     if wanted.at is not None:
         left = list(wanted.at)
 
-        def reached(index: int, time: float) -> bool:
+        def is_due(index: int, time: float) -> bool:
             due = bool(left) and time >= left[0] - 1e-6
             while left and time >= left[0] - 1e-6:
                 left.pop(0)
             return due
 
-        return reached
+        return is_due
     return lambda index, time: index % (wanted.every or step) == 0
 
 

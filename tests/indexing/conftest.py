@@ -13,7 +13,7 @@ import dyntorch
 from indexing import ActionIndexer, Clip, ClipSet
 from indexing.action.bank import Windows
 from indexing.actors import ACTIONS, Person, dataset, stream
-from indexing.actors.textured import film
+from indexing.actors.textured import render_clip
 from indexing.cli import main
 from indexing.windows import concatenate_clips, resample_clips
 from tests.indexing.sync.scene import filmed, shift
@@ -115,7 +115,9 @@ def library(monkeypatch):
 def two_films(actions, seed, frames=120, image=(80, 60), turn=35.0, noise=2.0):
     clip, _ = stream(actions, Person.random(seed), rng=seed, rest=(0.1, 0.4))
     clip = clip.between(0.0, (frames - 1) / 30.0 + 1e-6)
-    return tuple(film(clip, azimuth=angle, image=image, noise=noise, rng=seed + k) for k, angle in enumerate((10.0, 10.0 + turn)))
+    return tuple(
+        render_clip(clip, azimuth=angle, image=image, noise=noise, rng=seed + k) for k, angle in enumerate((10.0, 10.0 + turn))
+    )
 
 
 @pytest.fixture(scope="session")

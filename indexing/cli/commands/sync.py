@@ -314,7 +314,7 @@ def early(plans: list[Plan], reference: str) -> list[str]:
 def _frame_shift(one: Plan) -> dict[str, Any]:
     return {
         "folder": f"pose-sync/{folder_of(one.take)}", "files": len(one.numbers), "shift": one.shift, "rest": one.rest,
-        "repeated": one.repeated, "left_out": one.before,
+        "repeated": one.num_repeated, "left_out": one.before,
     }  # fmt: skip
 
 

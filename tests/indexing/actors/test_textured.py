@@ -6,7 +6,7 @@ import torch
 
 from indexing import Clip
 from indexing.actors import Person, perform
-from indexing.actors.textured import film
+from indexing.actors.textured import render_clip
 from indexing.skeleton import COCO17
 from indexing.sync.brightness_features import boxes, motion
 
@@ -14,7 +14,7 @@ CLIP = perform("wave", Person(), fps=15.0)
 
 
 def test_films_are_reproducible_and_differ_between_cameras():
-    one, again, other = (film(CLIP, azimuth=0.0, image=(80, 60), rng=seed) for seed in (1, 1, 2))
+    one, again, other = (render_clip(CLIP, azimuth=0.0, image=(80, 60), rng=seed) for seed in (1, 1, 2))
     assert one.shape == (len(CLIP), 60, 80) and one.dtype == np.uint8
     assert np.array_equal(one, again)
     assert np.corrcoef(one[0].ravel(), other[0].ravel())[0, 1] < 0.3
@@ -23,9 +23,9 @@ def test_films_are_reproducible_and_differ_between_cameras():
 
 def test_only_the_person_moves():
     still = CLIP.replace(joints=np.repeat(CLIP.joints[:1], len(CLIP), axis=0))
-    frames = film(still, azimuth=0.0, noise=0.0)
+    frames = render_clip(still, azimuth=0.0, noise=0.0)
     assert (frames == frames[0]).all()
-    where, _ = boxes(motion(torch.from_numpy(film(CLIP, azimuth=0.0, noise=0.0))), 15.0)
+    where, _ = boxes(motion(torch.from_numpy(render_clip(CLIP, azimuth=0.0, noise=0.0))), 15.0)
     assert where[0, 1] < 60  # the waving arm is above the middle
 
 
@@ -41,4 +41,4 @@ BAD = {
 def test_what_cannot_be_filmed(words):
     clip, options = BAD[words]
     with pytest.raises(ValueError, match=words):
-        film(clip, azimuth=0.0, **options)
+        render_clip(clip, azimuth=0.0, **options)

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from sklearn.base import clone
 
 from indexing.actors import Person, perform
-from indexing.actors.textured import film
+from indexing.actors.textured import render_clip
 from indexing.brightness.descriptors import BrightnessOptions
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.video import Chunk
@@ -21,7 +21,8 @@ ACTIONS = ("squat", "jumping_jack", "bow")
 
 def videos(who, image=(48, 36)):
     return [
-        film(perform(action, Person.random(who), fps=15.0, rng=who), azimuth=0, image=image, rng=10 * who) for action in ACTIONS
+        render_clip(perform(action, Person.random(who), fps=15.0, rng=who), azimuth=0, image=image, rng=10 * who)
+        for action in ACTIONS
     ]
 
 
@@ -162,7 +163,7 @@ def test_unknown_actions_are_rejected(indexer, learned, asked):
 
 def test_mirrored_exemplars_count_unless_sides_matter(indexer, learned):
     assert indexer.flip_
-    wave = film(perform("wave", Person(), fps=15.0), azimuth=0, image=(48, 36), rng=3)
+    wave = render_clip(perform("wave", Person(), fps=15.0), azimuth=0, image=(48, 36), rng=3)
     sided = clone(indexer).fit([wave, wave[:, :, ::-1].copy()], ["right", "left"])
     assert not sided.flip_
     mirrored = wave[:, :, ::-1].copy()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from indexing.actors import Person, perform
-from indexing.actors.textured import film
+from indexing.actors.textured import render_clip
 from indexing.cli import main
 
 FPS = 15
@@ -14,7 +14,7 @@ ACTIONS = ("squat", "jumping_jack")
 
 
 def acted(action, who):
-    return film(perform(action, Person.random(who), fps=FPS, rng=who), azimuth=0, image=(48, 36), rng=10 * who)
+    return render_clip(perform(action, Person.random(who), fps=FPS, rng=who), azimuth=0, image=(48, 36), rng=10 * who)
 
 
 def written(path, frames):

@@ -117,8 +117,8 @@ def test_work_side_by_side_gives_the_threads_of_opencv_back(monkeypatch):
 
     counting = Counting()
     monkeypatch.setattr(detection, "cv2", lambda: counting)
-    alone = type(detection.ALONE)()  # that of the process may be kept by work that another test left
-    one, other = alone.kept(), alone.kept()
+    alone = type(detection.SINGLE_THREADED)()  # that of the process may be kept by work that another test left
+    one, other = alone.hold(), alone.hold()
     one.__enter__()
     other.__enter__()
     assert counting.threads == 1

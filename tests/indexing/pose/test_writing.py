@@ -272,7 +272,7 @@ def test_kept_pieces_of_other_arguments_or_cut_off_ones_are_not_used(tmp_path, s
 @pytest.mark.slow
 def test_a_piece_that_cannot_be_kept_ends_the_video_and_the_next_run_completes_it(tmp_path, seeing, monkeypatch):
     path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
-    expected, put, failed = detect(path, options=SHORT), Store.put, []
+    expected, put, failed = detect(path, options=SHORT), Store.save, []
 
     def full_once(self, piece, seen):
         if piece.number == 1 and not failed:
@@ -280,7 +280,7 @@ def test_a_piece_that_cannot_be_kept_ends_the_video_and_the_next_run_completes_i
             raise ValueError("cannot write 'x' (No space left on device); free the disk")
         put(self, piece, seen)
 
-    monkeypatch.setattr(Store, "put", full_once)
+    monkeypatch.setattr(Store, "save", full_once)
     with pytest.raises(ValueError, match="No space left on device"):
         keypoint_file(path, folder, json=True, options=SHORT)
     assert [entry.name for entry in folder.iterdir()] == [".a.parts"] and len(list((folder / ".a.parts").iterdir())) == 1

@@ -155,9 +155,9 @@ def test_scores_leave_out_missing_frames_and_short_overlaps():
 def test_part_of_the_first_keeps_the_lags():
     a = unit(60, 3)
     b = torch.cat([unit(11, 5), a])
-    assert score_curve(a, b, 20).best == 11
-    assert part_curve(a, b, slice(35, 50)).best == 11
-    assert part_curve(a, b, slice(35, 50)).within(-5, 5).best != 11
+    assert score_curve(a, b, 20).best_lag == 11
+    assert part_curve(a, b, slice(35, 50)).best_lag == 11
+    assert part_curve(a, b, slice(35, 50)).within(-5, 5).best_lag != 11
 
 
 def test_peaks_and_parabola():
@@ -166,7 +166,7 @@ def test_peaks_and_parabola():
     scores = torch.exp(-((x - 3.3) ** 2) / 20) + 0.5 * torch.exp(-((x + 12) ** 2) / 20)
     curve = Curve(lags, scores, torch.ones(41))
     assert curve.lags[curve.peaks(4)].tolist() == [3, -12]
-    assert curve.best + curve.offset(curve.best) == pytest.approx(3.3, abs=0.01)
+    assert curve.best_lag + curve.offset(curve.best_lag) == pytest.approx(3.3, abs=0.01)
     assert curve.offset(-20) == 0.0
     assert curve.within(-20, 3).offset(3) == 0.0
 

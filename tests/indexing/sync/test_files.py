@@ -27,7 +27,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated
 def test_equal_numbers_are_equal_moments():
     take = take_of(np.ones((50, 3, 2)), fps=30.0)
     same = plan(take, -0.4, 1.0, 30.0)  # this camera began 0.4 s later: its frame 0 is the reference's frame 12
-    assert same.numbers.tolist() == list(range(12, 62)) and same.shift == -12 and same.before == same.repeated == 0
+    assert same.numbers.tolist() == list(range(12, 62)) and same.shift == -12 and same.before == same.num_repeated == 0
     assert same.rest < 1e-9
     for offset, rate, fps, frames in ((0.41, 1.0, 25.0, 30.0), (-0.2, 1.0003, 60.0, 30.0), (0.013, 0.9998, 30.0, 59.94)):
         other = take_of(np.ones((4000, 3, 2)), fps=frames)

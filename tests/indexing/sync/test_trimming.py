@@ -83,9 +83,9 @@ def test_a_rate_that_drifts_leaves_a_frame_out_now_and_then():
     times = np.arange(3000) / 30
     films = [CameraVideo(name, Path(name), times, times) for name in "ab"]
     chosen = trim(films, [Clock(Take("a", "video"), 0.0, 0.0), Clock(Take("b", "video"), 0.0, 0.0, 1.001)])
-    assert chosen.cuts[0].left_out == 0 and chosen.cuts[1].left_out == 3 and chosen.cuts[1].repeated == 0
+    assert chosen.cuts[0].left_out == 0 and chosen.cuts[1].left_out == 3 and chosen.cuts[1].num_repeated == 0
     slower = trim(films, [Clock(Take("a", "video"), 0.0, 0.0), Clock(Take("b", "video"), 0.0, 0.0, 0.999)])
-    assert slower.cuts[1].repeated == 3 and max(cut.rest for cut in slower.cuts) <= 0.5 / 30 + 1e-9
+    assert slower.cuts[1].num_repeated == 3 and max(cut.rest for cut in slower.cuts) <= 0.5 / 30 + 1e-9
     exact = trim([CameraVideo("a", Path("a"), times * 1.001, times * 1.001)], [Clock(Take("a", "video"), 0.0, 0.0)])
     assert (exact.fps.numerator, exact.fps.denominator) == (30000, 1001) and np.array_equal(exact.cuts[0].rows, np.arange(3000))
 

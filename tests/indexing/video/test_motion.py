@@ -118,8 +118,8 @@ def test_tracks_lose_the_cameras_motion(motion_of):
     camera = motion_of(pan, 75)
     wall = np.array([[200.0, 50], [250, 200]])
     seen = transform(np.array([pan(i) for i in range(75)]), wall)
-    np.testing.assert_allclose(camera.still(seen), np.broadcast_to(wall, (75, 2, 2)), atol=0.7)
-    np.testing.assert_allclose(camera.still(seen[::2], camera.times[::2] + 0.001), camera.still(seen)[::2])
+    np.testing.assert_allclose(camera.stabilize_points(seen), np.broadcast_to(wall, (75, 2, 2)), atol=0.7)
+    np.testing.assert_allclose(camera.stabilize_points(seen[::2], camera.times[::2] + 0.001), camera.stabilize_points(seen)[::2])
 
 
 @pytest.mark.slow

@@ -84,7 +84,7 @@ def test_times_are_known_before_anything_is_decoded(write, stamps):
     video = read_video(path)
     np.testing.assert_allclose(times, gather(video)[1], atol=1e-9)
     assert info == probe(path) and info.timed
-    stored = [(frame.width, time) for frame, time in video.stored()]
+    stored = [(frame.width, time) for frame, time in video.stored_frames()]
     assert stored == [(64, time) for time in gather(video)[1].tolist()]
 
 

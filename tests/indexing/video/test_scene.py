@@ -48,7 +48,7 @@ def stream(video, frames=slice(None)):
 
 def errors(video, tracks):
     points = tracks.points.numpy()
-    true = video.followed(points[0], tracks.frames[0], tracks.frames[-1])
+    true = video.transfer(points[0], tracks.frames[0], tracks.frames[-1])
     off = np.linalg.norm(points[-1] - true, axis=1)
     return off[np.isfinite(off)]
 
@@ -57,21 +57,21 @@ def test_truth_of_sheets(video):
     """A point that is followed shows the same texture: grey levels differ by noise and interpolation alone."""
     x, y = np.meshgrid(np.arange(10.0, 190, 7), np.arange(10.0, 140, 7))
     points = np.stack([x.ravel(), y.ravel()], axis=1)
-    there = video.followed(points, 0, 13)
-    kept = (video.shown(points, 0) >= 0) & (video.shown(there, 13) == video.shown(points, 0))
+    there = video.transfer(points, 0, 13)
+    kept = (video.visible_sheets(points, 0) >= 0) & (video.visible_sheets(there, 13) == video.visible_sheets(points, 0))
     gray = [
         cv2.remap(video.frames[k].astype(np.float32), *(p[kept].astype(np.float32).T[..., None]), cv2.INTER_LINEAR).ravel()
         for k, p in ((0, points), (13, there))
     ]
     assert kept.sum() > 150 and np.corrcoef(gray)[0, 1] > 0.98
-    assert set(video.bodies[video.shown(points, 0)[kept]]) == {0, 1}
+    assert set(video.bodies[video.visible_sheets(points, 0)[kept]]) == {0, 1}
 
 
 @pytest.mark.slow
 def test_background_and_what_moves_are_followed(video):
     tracks = track_scene(stream(video), frames=(0, 6, 13), options=OPTIONS)
     assert tracks.frames == (0, 6, 13) and tracks.times.tolist() == [0.0, 0.6, 1.3] and tracks.size == SIZE
-    bodies = video.bodies[video.shown(tracks.points[0].numpy(), 0)]
+    bodies = video.bodies[video.visible_sheets(tracks.points[0].numpy(), 0)]
     assert (bodies == 0).sum() > 60 and (bodies == 1).sum() > 8
     off = errors(video, tracks)
     assert np.median(off) < 0.3 and (off > 1).mean() < 0.05
@@ -182,12 +182,12 @@ def test_no_point_has_to_last(walk):
     seen = tracks.points.isfinite().all(-1).numpy()
     assert tracks.points.shape[0] == LONG_FRAMES == len(tracks.frames) and seen.any(axis=1).all()
     lasting = tracks.points[0, seen.all(axis=0)].numpy()
-    assert (walk.shown(lasting, 0) != 0).all()  # the wall is another one at the end
+    assert (walk.visible_sheets(lasting, 0) != 0).all()  # the wall is another one at the end
     assert (seen.sum(axis=0) >= MIN_TRACK_FRAMES).all() and tracks.notes[0].startswith("frames 0 to 39 of the 40 that were read")
     off = []
     for i, places in enumerate(tracks.points.numpy().transpose(1, 0, 2)):
         first, last = np.flatnonzero(seen[:, i])[[0, -1]]
-        off.append(np.linalg.norm(walk.followed(places[None, first], first, last)[0] - places[last]))
+        off.append(np.linalg.norm(walk.transfer(places[None, first], first, last)[0] - places[last]))
     off = np.array(off)
     assert np.nanmedian(off) < 0.3 and (off > 2).mean() < 0.08
 
