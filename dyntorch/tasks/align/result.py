@@ -265,7 +265,8 @@ class AlignOptions:
     """What :func:`dyntorch.align_planar`, :func:`dyntorch.align_points` and :func:`dyntorch.align_lines` take and expect."""
 
     num_samples: int | None = None
-    """Minimal samples drawn (time); None is what each model needs at 20 to 40 % of static matches: 60 to 2000."""
+    """Minimal samples drawn (time); None is what each model needs at 20 to 40 % of static matches: 150 to 2000.  Rigid and
+    projective constant-velocity motions have fixed numbers of their own."""
     min_static_share: float = 0.1
     """Share of the matches (and at least 3) that must have one velocity to be taken for the static background, where all are at
     constant velocity."""
