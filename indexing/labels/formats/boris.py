@@ -223,7 +223,7 @@ def add_interval(out: Gathering, interval: Interval, pieces: Sequence[tuple[str,
     """The labels of an interval, one for each file that is played then; what a program wrote has a score in its comment."""
     subject, code, modifiers = interval.key
     comment, score = split_score(interval.comment) if name in out.machine else (interval.comment, None)
-    fields = {"subject": subject, "comment": comment, "score": score, "observation": name}
+    fields: dict[str, Any] = {"subject": subject, "comment": comment, "score": score, "observation": name}
     fields["modifiers"] = tuple(modifiers.split("|")) if modifiers.strip("|") else ()
     for media, start, end in pieces:
         out.add(code, round(start, 6), round(end, 6), where, media=media, **fields)
