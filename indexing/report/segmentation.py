@@ -233,7 +233,7 @@ class SegmentationReport(LabelledReport):
     @property
     def models(self) -> list[str]:
         """What each body's motion is: fundamental or homography."""
-        return [str(model) for model in self.arrays.models[: self.bodies]]
+        return [str(model) for model in self.result.models[: self.bodies]]
 
     @property
     def num_present(self) -> int:

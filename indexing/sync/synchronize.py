@@ -483,7 +483,7 @@ class RepairedClocks:
                 "camera": None if one.camera is None else self.takes[one.camera].name,
                 "candidates": [self.takes[camera].name for camera in one.candidates],
                 "times": list(one.moments), "sigma": one.sigma, "jump": one.jump, "jump_sigma": one.jump_sigma,
-                "frames": one.frames, "twice": one.doubled, "evidence": one.evidence, "residuals": list(one.residuals),
+                "frames": one.frames, "twice": one.is_doubled, "evidence": one.evidence, "residuals": list(one.residuals),
             }
             for one in self.found.breaks
         ]  # fmt: skip

@@ -29,7 +29,7 @@ from dyntorch.geometry.homogeneous import cofactors, skew
 from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.tasks.calibrate.averaging import Graph, first_cameras, nearest_points, viewing_rays
-from dyntorch.tasks.calibrate.input import MIN_NOISE, Rig, RigViews, Seen
+from dyntorch.tasks.calibrate.input import MIN_NOISE, Rig, RigViews, Sightings
 
 TURN, MOVE, LENS, CLOCK = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
 """Places of a camera's parameters: rotation vector and translation; logarithm of the focal length, k1, k2; offset, log rate."""
@@ -100,7 +100,7 @@ class RigNormal:
     gradient: Tensor
     """``(b, P)``."""
 
-    def eliminated(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def eliminate_points(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Solutions ``(b, G, 3, P + 1)`` of all columns by the points; matrix and gradient that are left of the cameras."""
         diagonal = self.matrix.diagonal(dim1=-2, dim2=-1)
         held = self.matrix.clone()
@@ -149,7 +149,7 @@ class RigAdjustment(LeastSquares):
         """The damped Gauss-Newton step."""
         state = RigState(*at.theta)
         normal = self.linear(state)
-        solved, reduced, gradient = normal.eliminated(damping)
+        solved, reduced, gradient = normal.eliminate_points(damping)
         if self.basis.shape[1]:
             moves = damped_step(gradient @ self.basis, self.basis.mT @ reduced @ self.basis, damping) @ self.basis.mT
         else:
@@ -169,7 +169,7 @@ class RigAdjustment(LeastSquares):
             state.points - points,
         )
 
-    def agreement(self, state: RigState, seen: Seen) -> tuple[Tensor, Tensor]:
+    def agreement(self, state: RigState, seen: Sightings) -> tuple[Tensor, Tensor]:
         """Errors ``(b, c, T, n, 2)`` px and what the quadratic model weighs them by ``(b, c, T, n)``."""
         error = images(state, self.views.centers) - seen.x
         spread = self.sigma.square()[..., None, None]
@@ -420,7 +420,7 @@ def adjust_bundle(views: RigViews, start: RigState, freedom: Freedom) -> RigSolu
             problem = _problem(views, state, freedom.whole, freedom.priors)
         state = _descend(problem, state, steps)
     normal = problem.linear(state)
-    _, reduced, _ = normal.eliminated(torch.zeros(1, dtype=torch.float64))
+    _, reduced, _ = normal.eliminate_points(torch.zeros(1, dtype=torch.float64))
     covariance = _autocorrelation_factor(problem, state) * camera_covariance(
         reduced[0], freedom.shape, gauge(state.R[0], state.t[0])
     )
@@ -440,7 +440,7 @@ def _problem(views: RigViews, state: RigState, basis: Tensor, priors: Priors) ->
     """With positions that are seen now, and the noise that is left now."""
     b, c = state.R.shape[:2]
     unit = torch.ones(b, c, dtype=torch.float64)
-    start = RigAdjustment(views, views.steady(state.clocks), unit, NOISE_FREEDOM, priors, basis)
+    start = RigAdjustment(views, views.steady_weights(state.clocks), unit, NOISE_FREEDOM, priors, basis)
     return replace(start, sigma=_noise(state, start))
 
 

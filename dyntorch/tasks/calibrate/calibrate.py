@@ -148,20 +148,16 @@ def check_sigmas(found: RigSolution, rig: Rig, options: CalibrateOptions) -> Not
     variance = found.covariance.diagonal(dim1=-2, dim2=-1)
     if len(rig.tracks) == 2 and not bool(rig.focals.isfinite().any()) and not rig.one_lens:
         return Notice(CalibrationNotice.TWO_FOCALS)
-    focal = variance[:, 6].sqrt()
     pose = found.pose
-    if float(focal.max()) > options.max_focal_sigma:
-        case = "line" if are_collinear(pose.centers) else ""
-        which = tuple((focal > options.max_focal_sigma).nonzero().flatten().tolist())
-        return Notice(CalibrationNotice.FOCAL, 100 * float(focal.max()), {"case": case, "cameras": which})
-    turn = torch.rad2deg(variance[:, :3].sum(-1).sqrt())
-    if float(turn.max()) > options.max_rotation_sigma:
-        which = tuple((turn > options.max_rotation_sigma).nonzero().flatten().tolist())
-        return Notice(CalibrationNotice.ROTATION, float(turn.max()), {"cameras": which})
-    away = variance[:, 3:6].sum(-1).sqrt() / (pose.centers - pose.middle).norm(dim=-1)
-    if float(away.max()) > options.max_center_sigma:
-        which = tuple((away > options.max_center_sigma).nonzero().flatten().tolist())
-        return Notice(CalibrationNotice.CENTER, 100 * float(away.max()), {"cameras": which})
+    center = variance[:, 3:6].sum(-1).sqrt() / (pose.centers - pose.middle).norm(dim=-1)
+    for code, unit, sigma, limit in (
+        (CalibrationNotice.FOCAL, 100, variance[:, 6].sqrt(), options.max_focal_sigma),
+        (CalibrationNotice.ROTATION, 1, torch.rad2deg(variance[:, :3].sum(-1).sqrt()), options.max_rotation_sigma),
+        (CalibrationNotice.CENTER, 100, center, options.max_center_sigma),
+    ):
+        if float(sigma.max()) > limit:
+            case = {"case": "line"} if code == CalibrationNotice.FOCAL and are_collinear(pose.centers) else {}
+            return Notice(code, unit * float(sigma.max()), {"cameras": tuple((sigma > limit).nonzero().flatten().tolist()), **case})
     return None
 
 
@@ -287,36 +283,31 @@ def calibrate(
     if sizes is None:
         raise ValueError("sizes: give the width and height of the pictures in px, (w, h), or one pair per camera")
     rig = read_rig(tracks, fps, times, sizes, focal, calibration, weights, one_lens, Scale(height, lengths))
+    n = rig.tracks[0].x.shape[1]
     # 1. clocks
     found_clocks = _clocks(rig, clocks, max_shift, rate)
-    told = _clock_notices(found_clocks)
+    notices = _clock_notices(found_clocks)
     if bool(found_clocks.offsets.isnan().any()):
-        return _failure(rig, found_clocks, told)
+        return Calibration.unknown(rig.sizes, n, found_clocks, rig.fps, notices)
     # 2. first cameras
     values = torch.stack([found_clocks.offsets, found_clocks.rates], dim=-1)
     views = common_views(rig.tracks, rig.centers, values)
     own = torch.stack([(values[:, 1] - 1) * views.middle + values[:, 0], values[:, 1].log()], dim=-1)
-    n = rig.tracks[0].x.shape[1]
-    used = views.some(max(1, math.ceil(options.max_positions / n)))
+    used = views.thin(max(1, math.ceil(options.max_positions / n)))
     graph = pair_graph(used, own, options.min_matches)
     hopeless = check_matches(graph, rig, options) or check_motion(rig)
     if hopeless is not None:
-        return _failure(rig, found_clocks, (*told, hopeless))
+        return Calibration.unknown(rig.sizes, n, found_clocks, rig.fps, (*notices, hopeless))
     freedom = Freedom.of(rig, own, clocks is not None, rate is not None, found_clocks.rate_sigmas)
-    few = used.some(NUM_START_MOMENTS)
+    few = used.thin(NUM_START_MOMENTS)
     starts, worse = compare_starts(rig, few, graph, own, freedom)
     # 3. space and time at once
     best = adjust_bundle(used, starts.of(torch.tensor([0])), freedom)
     halves = _adjust_halves(used, best, freedom)
     # 4. the world, and the points of every frame
     others = [(pose_of(starts, k), float(worse[k])) for k in range(1, len(worse))]
-    limits = [
-        check_plane(graph),
-        check_sigmas(best, rig, options),
-        check_rivals(pose_of(starts), others),
-        check_halves(halves),
-    ]
-    return _result(rig, views, best, found_clocks, [*told, *(limit for limit in limits if limit is not None)])
+    limits = [check_plane(graph), check_sigmas(best, rig, options), check_rivals(pose_of(starts), others), check_halves(halves)]
+    return _result(rig, views, best, found_clocks, [*notices, *(limit for limit in limits if limit is not None)])
 
 
 def _clocks(rig: Rig, clocks: Any, max_shift: float | None, rate: float | None) -> Clocks:
@@ -353,9 +344,9 @@ def _adjust_halves(views: RigViews, best: RigSolution, freedom: Freedom) -> tupl
     for part in (views.between(-math.inf, 0.0), views.between(0.0, math.inf)):
         if not len(part.times) or float(part.times.abs().max()) < MIN_HALF_SECONDS:
             return None
-        if int((part.steady(best.state.clocks) > 0).sum()) < MIN_HALF_POSITIONS:
+        if int((part.steady_weights(best.state.clocks) > 0).sum()) < MIN_HALF_POSITIONS:
             return None
-        few = part.some(NUM_START_MOMENTS)
+        few = part.thin(NUM_START_MOMENTS)
         found.append(adjust_bundle(few, best.state, held))
     return found[0], found[1]
 
@@ -428,8 +419,3 @@ def _covariance_in_world(covariance: Tensor, world: World) -> Tensor:
     change = torch.eye(covariance.shape[-1], dtype=torch.float64)
     change[3:6, 3:6] = world.scale * world.turn
     return change @ covariance @ change.mT
-
-
-def _failure(rig: Rig, clocks: Clocks, limits: tuple[Notice, ...]) -> Calibration:
-    """A result without cameras."""
-    return Calibration.unknown(rig.sizes, rig.tracks[0].x.shape[1], clocks, rig.fps, limits)

@@ -234,7 +234,7 @@ def _check_scale(scale: Scale, points: int) -> None:
 # What the cameras saw, at common moments: tracks smoothed by the same kernel, read at any time of any clock.
 
 
-class Seen(NamedTuple):
+class Sightings(NamedTuple):
     """Positions at common moments."""
 
     x: Tensor
@@ -256,7 +256,7 @@ class RigViews:
     frames: Tensor  # ``(c,)`` seconds from one frame to the next
     noise: Tensor  # ``(c,)`` of the tracks, over its geometric mean
 
-    def at(self, clocks: Tensor, shift: float = 0.0) -> Seen:
+    def at(self, clocks: Tensor, shift: float = 0.0) -> Sightings:
         """What is seen with clocks ``(b, c, 2)``: against the reference clock at the middle, and the logarithm of the rate."""
         shape = (len(clocks), len(self.times), self.grids[0].x.shape[1])
         parts = []
@@ -264,15 +264,15 @@ class RigViews:
             own = clocks[:, i, 1:].exp() * self.times + clocks[:, i, :1] + (self.middle + shift * float(self.frames[i]))
             x, v, w = grid.at(own.flatten())
             parts.append((x.view(*shape, 2), v.view(*shape, 2), w.view(shape)))
-        return Seen(*(torch.stack(part, dim=1) for part in zip(*parts, strict=True)))
+        return Sightings(*(torch.stack(part, dim=1) for part in zip(*parts, strict=True)))
 
-    def steady(self, clocks: Tensor) -> Tensor:
+    def steady_weights(self, clocks: Tensor) -> Tensor:
         """Weights ``(b, c, T, n)`` of positions that two cameras see, and a frame before and after, too: clocks may move so far."""
         now, before, after = (self.at(clocks, shift).weights for shift in (0.0, -1.0, 1.0))
         steady = torch.where((before > 0) & (after > 0), now, 0.0)
         return steady * ((steady > 0).sum(1, keepdim=True) >= 2)
 
-    def some(self, count: int) -> RigViews:
+    def thin(self, count: int) -> RigViews:
         """About ``count`` of the moments, evenly spread."""
         return replace(self, times=self.times[:: max(1, len(self.times) // count)])
 
@@ -294,9 +294,9 @@ def common_views(tracks: Sequence[Tracks], centers: Tensor, clocks: Tensor) -> R
     step = max(t.step / r for t, (_, r) in zip(tracks, clocks.tolist(), strict=True))
     # the second start and the last end but one may lie in a gap, or in one camera's run alone
     if not any(max(a[0], b[0]) + step < min(a[1], b[1]) for a, b in combinations(runs, 2)):
-        said = ", ".join(f"camera {i} {a:.3g} to {b:.3g} s" for i, (a, b) in enumerate(runs))
+        spans = ", ".join(f"camera {i} {a:.3g} to {b:.3g} s" for i, (a, b) in enumerate(runs))
         raise ValueError(
-            f"tracks: no two cameras run at the same time ({said} of the reference clock): check clocks, fps and times"
+            f"tracks: no two cameras run at the same time ({spans} of the reference clock): check clocks, fps and times"
         )
     middle = 0.5 * (start + end)
     times = start - middle + step * torch.arange(math.floor((end - start) / step + 1e-9) + 1, dtype=torch.float64)

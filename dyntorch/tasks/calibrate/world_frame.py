@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -23,30 +25,20 @@ def rigid_pairs(points: Tensor, known: Tensor, spread: float) -> tuple[Tensor, T
     n = points.shape[1]
     if n < 2:
         return torch.zeros(0, 2, dtype=torch.long), points.new_zeros(0), points.new_zeros(0)
-    one, other = torch.tensor(list(combinations(range(n), 2))).unbind(-1)
-    both = known[:, one] & known[:, other]
-    far = torch.where(both, (points[:, one] - points[:, other]).norm(dim=-1), torch.nan)
+    first, second = torch.tensor(list(combinations(range(n), 2))).unbind(-1)
+    both = known[:, first] & known[:, second]
+    far = torch.where(both, (points[:, first] - points[:, second]).norm(dim=-1), torch.nan)
     length = far.nanmedian(0).values
     # two people may keep their distance for half of the time: nine tenths of it count
     away = (far - length).abs().nanquantile(0.9, dim=0) / 1.645
     share = (away / length).nan_to_num(torch.inf)
-    root = list(range(n))
-
-    def find(place: int) -> int:
-        while root[place] != place:
-            place = root[place]
-        return place
-
-    chosen = []
-    for k in share.argsort(stable=True).tolist():
-        a, b = find(int(one[k])), find(int(other[k]))
-        if share[k] > spread:
-            break
-        if a != b:
-            root[a] = b
-            chosen.append(k)
-    kept = torch.tensor(sorted(chosen), dtype=torch.long)
-    return torch.stack([one[kept], other[kept]], dim=-1), length[kept], share[kept]
+    order = share.argsort(stable=True)
+    # ranks: exact data have shares of 0, which would be no edges
+    rank = order.argsort()[share <= spread] + 1
+    ends = torch.stack([first, second], dim=-1)[share <= spread]
+    tree = minimum_spanning_tree(coo_array((rank.numpy(), tuple(ends.mT.numpy())), shape=(n, n)).tocsr())
+    chosen = order[torch.from_numpy(tree.data).long() - 1].sort().values
+    return torch.stack([first[chosen], second[chosen]], dim=-1), length[chosen], share[chosen]
 
 
 def bodies(ends: Tensor, points: int) -> list[list[int]]:
@@ -57,11 +49,10 @@ def bodies(ends: Tensor, points: int) -> list[list[int]]:
         >>> bodies(torch.tensor([[0, 1], [3, 4], [1, 2]]), 6)
         [[0, 1, 2], [3, 4]]
     """
-    label = list(range(points))
-    for a, b in ends.tolist():
-        label = [label[a] if one == label[b] else one for one in label]
-    groups = [[k for k in range(points) if label[k] == one] for one in dict.fromkeys(label)]
-    return sorted((group for group in groups if len(group) > 1), key=lambda group: -len(group))
+    graph = coo_array((torch.ones(len(ends)).numpy(), tuple(ends.mT.numpy())), shape=(points, points))
+    count, labels = connected_components(graph, directed=False)
+    groups = [[k for k in range(points) if labels[k] == label] for label in range(count)]
+    return sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,7 @@ class Motions:
         """Rows, with those that were left out."""
         return len(self.x) + self.dropped
 
-    def compressed(self) -> Motions:
+    def compress(self) -> Motions:
         """The same products of columns in no more rows than there are columns."""
         columns = torch.cat([self.x.flatten(1), self.y.flatten(1)], dim=1)
         if len(columns) <= columns.shape[1]:
@@ -334,7 +334,7 @@ COARSE_STEP = 3e-3  # radians, to which all peaks are refined
 
 def _directions(x: Tensor, y: Tensor, noise: tuple[float, float], start: Tensor | None = None) -> Tensor:
     """Angles ``(2,)`` of the epipolar normals; from a start, those that the mean places agree with as well."""
-    motions, coarse = _motions(x, y, noise).compressed(), COARSE_STEP
+    motions, coarse = _motions(x, y, noise).compress(), COARSE_STEP
     if start is not None:
         return refine_directions(motions, start, step=2 * coarse, affine=True)[0]
     found = [refine_directions(motions, start, coarse) for start in peaks(motions)]
@@ -361,9 +361,9 @@ def _beyond_chance(motions: Motions, angles: Tensor, num_draws: int) -> float:
     levels = []
     for _ in range(num_draws):
         signs = torch.randint(0, 2, (len(motions.y),), generator=generator).to(motions.y) * 2 - 1
-        other = replace(motions, y=motions.y * signs[:, None, None]).compressed()
+        other = replace(motions, y=motions.y * signs[:, None, None]).compress()
         levels.append(refine_directions(other, peaks(other)[0], COARSE_STEP)[1])
-    level = float(likelihood(motions.compressed(), angles[None])[0])
+    level = float(likelihood(motions.compress(), angles[None])[0])
     return (level - max(levels)) / max(max(levels) - min(levels), 1e-9 * abs(level), 1e-300)
 
 
@@ -471,7 +471,7 @@ def _denoise(x: Tensor, noise: float, good: Tensor) -> Tensor:
         return x
     z = cosines(x[:, good])
     found = x.clone()
-    found[:, good] = inverse_cosines(Prior.of(z, noise**2).denoised(z))
+    found[:, good] = inverse_cosines(Prior.of(z, noise**2).denoise(z))
     return found
 
 

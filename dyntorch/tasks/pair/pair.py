@@ -126,12 +126,7 @@ def _merge_motions(first: BodyMotion, second: BodyMotion, shared: tuple[Tensor, 
 
 
 def _body_reconstruction(
-    seen: Overlap,
-    body: FilmedBody,
-    first: BodyMotion,
-    second: BodyMotion,
-    threshold: float | None,
-    explained: float,
+    seen: Overlap, body: FilmedBody, first: BodyMotion, second: BodyMotion, threshold: float | None, explained: float
 ) -> PairReconstruction:
     n, m, frames = seen.a.shape[1], seen.b.shape[1], len(seen.times)
     kept = torch.cat([first.points, second.points])

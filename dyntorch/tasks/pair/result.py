@@ -23,9 +23,8 @@ class PairNotice(NoticeCode):
     """Points seen in too few frames."""
     SHORT_OVERLAP = (
         "short_overlap",
-        "the cameras have {value:# frame|# frames} in common, {needed} are needed; check {arg:shift} and {arg:fps}, film "
-        "longer, or take "
-        "fewer points",
+        "the cameras have {value:# frame|# frames} in common, {needed} are needed; check {arg:shift} and {arg:fps}, film longer, "
+        "or take fewer points",
         Status.TOO_FEW,
     )
     """Two cameras have too few frames in common."""
@@ -33,8 +32,7 @@ class PairNotice(NoticeCode):
         "few_points",
         {
             "shown": "camera {camera:{which}} shows {value:# point|# points} in half of the frames, {needed} are needed; track "
-            "more, or "
-            "longer",
+            "more, or longer",
             "explained": "the cameras explain {a:# point|# points} of {camera:a} and {b:g} of {camera:b} of each other; check the "
             "{arg:shift}, or that both show one scene",
         },
@@ -76,8 +74,7 @@ class PairNotice(NoticeCode):
     FREE_PLACES = (
         "free_places",
         "the mean places of the {a} and {b} points do not follow from their motions (residual {value:.2g} px without them): "
-        "motions "
-        "are right, places along the lines of sight are a guess",
+        "motions are right, places along the lines of sight are a guess",
     )
     """The mean places of the points do not follow from their motions."""
 

@@ -29,12 +29,7 @@ OVERLAP_ROUNDING = 1e-6  # share of a frame by which a moment may be outside of 
 
 
 def overlap(
-    a: Tensor,
-    b: Tensor,
-    shift: Shift | float,
-    *,
-    fps: float | Sequence[float] | None = None,
-    times: Sequence[Any] | None = None,
+    a: Tensor, b: Tensor, shift: Shift | float, *, fps: float | Sequence[float] | None = None, times: Sequence[Any] | None = None
 ) -> Overlap:
     """Both cameras at a's frame times. a ``(frames, n, 2)``, b ``(frames, m, 2)``."""
     rates, clocks = _clocks(shift, fps, times)
@@ -213,7 +208,7 @@ class Prior:
         found = Prior(spectrum, z.new_ones(n), torch.eye(n, dtype=z.dtype, device=z.device), variance)
         root = spectrum.sqrt()[:, None, None]
         for _ in range(EM_ITERATIONS):
-            hidden = (found.denoised(z) / root).mT.flatten(0, 1)
+            hidden = (found.denoise(z) / root).mT.flatten(0, 1)
             left = (found.energies * (1 - found.shares())).sum(0) * 2
             moment = (hidden.mT @ hidden + found.modes @ torch.diag(left) @ found.modes.mT) / (2 * len(z))
             energies, modes = torch.linalg.eigh(moment)
@@ -225,7 +220,7 @@ class Prior:
         power = self.spectrum[:, None] * self.energies
         return power / (power + self.variance)
 
-    def denoised(self, z: Tensor) -> Tensor:
+    def denoise(self, z: Tensor) -> Tensor:
         """The expected motion given ``(T - 1, n, 2)`` (Wiener)."""
         shares = self.shares()[..., None]
         return self.modes @ ((self.modes.mT @ z) * shares)

@@ -119,11 +119,11 @@ def _turn(match: Tensor, weight: Tensor, planes: Tensor) -> Tensor:
     nearer = (planes @ homogeneous(match).mT).detach().abs().argmin(dim=-2, keepdim=True)
     share = weight[..., None, :] * (nearer == torch.arange(2, device=nearer.device)[:, None])
     centre = share @ match / share.sum(-1, keepdim=True).clamp(min=TINY)
-    apart = (match[..., None, :, :] - centre[..., None, :]) * share.sqrt()[..., None]
-    found = gram_null_space(apart.mT @ apart)
-    normal = found.basis[..., 0, :]
+    centred = (match[..., None, :, :] - centre[..., None, :]) * share.sqrt()[..., None]
+    null = gram_null_space(centred.mT @ centred)
+    normal = null.basis[..., 0, :]
     fresh = torch.cat([normal, -(normal * centre).sum(-1, keepdim=True)], dim=-1)
-    few = found.degenerate | ((share > 0).sum(-1) < 4)
+    few = null.degenerate | ((share > 0).sum(-1) < 4)
     return torch.where(few[..., None], planes, fresh)
 
 

@@ -51,12 +51,12 @@ def preference_kernel(film: TrackSet, searched: Tensor, generator: torch.Generat
     for pair in select_near_pairs(film, KERNEL_GAPS, KERNEL_PAIRS_PER_GAP, MIN_KERNEL_TRACKS):
         both = film.pair(pair)
         column = place[both.index]
-        own = (column >= 0).nonzero().flatten()
-        if len(own) < MIN_KERNEL_TRACKS:
+        searched_rows = (column >= 0).nonzero().flatten()
+        if len(searched_rows) < MIN_KERNEL_TRACKS:
             continue
-        liked = _rank_hypotheses(both, own, generator, num_hypotheses)
-        shared = liked @ liked[own].mT
-        rows, columns = both.index[:, None], column[own][None]
+        liked = _rank_hypotheses(both, searched_rows, generator, num_hypotheses)
+        shared = liked @ liked[searched_rows].mT
+        rows, columns = both.index[:, None], column[searched_rows][None]
         kernel[rows, columns] += shared
         met[rows, columns] += 1
     kernel = kernel / met.clamp(min=1)
@@ -116,8 +116,8 @@ def homography_of_four(x1: Tensor, x2: Tensor) -> Tensor:
         weights = cofactors(points[..., :3]).mT @ points[..., 3:]
         return points[..., :3] * weights.mT
 
-    found = basis(x2) @ cofactors(basis(x1)).mT
-    return found / found.flatten(-2).norm(dim=-1).clamp(min=1e-300)[..., None, None]
+    homographies = basis(x2) @ cofactors(basis(x1)).mT
+    return homographies / homographies.flatten(-2).norm(dim=-1).clamp(min=1e-300)[..., None, None]
 
 
 def fundamental_of_eight(x1: Tensor, x2: Tensor) -> Tensor:
@@ -151,10 +151,10 @@ def common_share(kernel: Tensor) -> float:
     return float(kernel.topk(min(5, kernel.shape[1]), dim=-1).values.mean(-1).median())
 
 
-def strongest(kernel: Tensor, neighbours: int) -> Tensor:
+def keep_strongest(kernel: Tensor, neighbours: int) -> Tensor:
     """A symmetric kernel ``(m, m)`` with the largest entries of every row or column alone."""
-    kept = min(neighbours, len(kernel) - 1)
-    least = kernel.topk(kept, dim=-1).values[:, -1:]
+    count = min(neighbours, len(kernel) - 1)
+    least = kernel.topk(count, dim=-1).values[:, -1:]
     sparse = torch.where((kernel >= least) & (kernel > 0), kernel, 0.0)
     return torch.maximum(sparse, sparse.mT)
 
@@ -183,16 +183,16 @@ MIN_COMMON_MEMBERS = 3  # tracks of a group that a pair of frames must show
 NEVER_COMMON_SEPARATION = 1e3  # of groups that no pair of frames shows together: they merge last
 
 
-def pieces(sparse: Tensor, count: int) -> Tensor:
+def cut_into_pieces(sparse: Tensor, count: int) -> Tensor:
     """Labels ``(n,)`` from 0 of so many pieces of a graph ``(n, n)``, by normalized cuts."""
     # tracks without links are a piece's worth of trouble: all get a little of everything
     graph = sparse.double() + 1e-6 * float(sparse.max().clamp(min=1e-12))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a graph of several components is welcome
-        found = spectral_clustering(
+        labels = spectral_clustering(
             graph.cpu().numpy(), n_clusters=count, eigen_solver="arpack", assign_labels="cluster_qr", random_state=0
         )
-    return torch.from_numpy(found).long().to(sparse.device)
+    return torch.from_numpy(labels).long().to(sparse.device)
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class NearPairs:
         """Of pairs of frames ``(p, 2)``."""
         first, second = torch.tensor(list(pairs), device=film.x.device).reshape(-1, 2).unbind(-1)
         x1, x2 = film.x[first], film.x[second]
-        self.seen = film.drop_short[first] & film.drop_short[second]
+        self.seen = film.seen[first] & film.seen[second]
         moved = (x2 - x1).norm(dim=-1) / film.pixel
         self.precision = self.seen / (1 + moved / DOUBLED_VARIANCE_MOTION) / film.pixel**2
         self.first, self.second = homogeneous(x1), homogeneous(x2)
@@ -233,7 +233,7 @@ class NearPairs:
         self.upper = torch.triu_indices(9, 9, device=film.x.device)
         self.count = self.seen.sum(0).double()
 
-    def squares(self, group: Tensor, scale: float, rounds: int = 2) -> tuple[Tensor, Tensor]:
+    def squared_distances(self, group: Tensor, scale: float, rounds: int = 2) -> tuple[Tensor, Tensor]:
         """Squared distances in pixels at rest of the tracks of a group ``(n,)`` bool from its motion."""
         index = group.nonzero().flatten()
         live = (self.seen[:, index].sum(-1) >= MIN_COMMON_MEMBERS).nonzero().flatten()
@@ -262,7 +262,7 @@ class NearPairs:
         gram[..., self.upper[1], self.upper[0]] = sums
         return null_vector(gram)
 
-    def meetings(self, groups: Tensor) -> tuple[Tensor, Tensor]:
+    def count_meetings(self, groups: Tensor) -> tuple[Tensor, Tensor]:
         """Tracks of each group ``(g, n)`` that are seen beside others of each group, and their sightings there, ``(g, g)`` both."""
         member, seen = groups.double(), self.seen.double()
         there = ((seen @ member.mT) >= MIN_COMMON_MEMBERS).double()  # (p, g)
@@ -271,7 +271,7 @@ class NearPairs:
 
     def cost(self, group: Tensor, scale: float) -> float:
         """Cost of a group ``(n,)`` bool: the squared distances of all sightings over the noise, each at most the cap."""
-        square, seen = self.squares(group, scale)
+        square, seen = self.squared_distances(group, scale)
         return float(((square / scale**2).clamp(max=MAX_SQUARED_DISTANCE) * seen).sum())
 
 
@@ -287,9 +287,9 @@ class GroupCosts:
     @staticmethod
     def of(near: NearPairs, kernel: Tensor, groups: Tensor) -> GroupCosts:
         """With the noise of groups ``(g, n)`` bool that are surely pure."""
-        found = [near.squares(group, FIRST_PIECE_NOISE_PIXELS) for group in groups]
-        own = torch.cat([square[seen] for square, seen in found])
-        noise = (float(own.median()) / median(1)) ** 0.5 if len(own) else FIRST_PIECE_NOISE_PIXELS
+        distances = [near.squared_distances(group, FIRST_PIECE_NOISE_PIXELS) for group in groups]
+        squares = torch.cat([square[seen] for square, seen in distances])
+        noise = (float(squares.median()) / median(1)) ** 0.5 if len(squares) else FIRST_PIECE_NOISE_PIXELS
         alike = (kernel - CHANCE_PREFERENCE_SHARE).clamp(min=0)
         return GroupCosts(near, alike, COST_SCALE_FACTOR * max(noise, MIN_PIECE_NOISE_PIXELS))
 
@@ -305,7 +305,7 @@ class GroupCosts:
         """Of all pairs of groups ``(g, n)`` bool."""
         first, second = torch.triu_indices(len(groups), len(groups), 1, device=groups.device)
         alone, joint = self.cost(groups), self.cost(groups[first] | groups[second])
-        size, seen = self.near.meetings(groups)
+        size, seen = self.near.count_meetings(groups)
         between = (groups.float() @ self.alike @ groups.float().mT).double()
         either, other = (first, second), (second, first)
         return Separation(
@@ -322,18 +322,18 @@ def merge_pieces(judge: GroupCosts, labels: Tensor, counts: Sequence[int]) -> di
     """Labels ``(n,)`` from 0 with each number of bodies, from pieces ``(n,)`` that are joined one pair after the other."""
     groups = one_hot(labels, int(labels.max()) + 1) > 0
     groups = groups[groups.any(-1)]
-    found: dict[int, Tensor] = {}
+    labels_by_count: dict[int, Tensor] = {}
     while True:
         if len(groups) in counts:
-            found[len(groups)] = groups.long().argmax(0)
+            labels_by_count[len(groups)] = groups.long().argmax(0)
         if len(groups) <= max(1, min(counts)):
-            return found
+            return labels_by_count
         pairs = judge.separation(groups)
         weakest = int(pairs.value(PIECE_LINK_WEIGHT).argmin())
-        one, other = int(pairs.first[weakest]), int(pairs.second[weakest])
-        rest = torch.ones(len(groups), dtype=torch.bool, device=groups.device)
-        rest[[one, other]] = False
-        groups = torch.cat([groups[rest], (groups[one] | groups[other])[None]])
+        first, second = int(pairs.first[weakest]), int(pairs.second[weakest])
+        remaining = torch.ones(len(groups), dtype=torch.bool, device=groups.device)
+        remaining[[first, second]] = False
+        groups = torch.cat([groups[remaining], (groups[first] | groups[second])[None]])
 
 
 def weakest_separation(judge: GroupCosts, candidate: Candidates, weight: float) -> float:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from dyntorch.geometry.epipolar import sampson_squared
@@ -57,7 +60,7 @@ class Links:
         """Weighted sums over the neighbours: ``(*, n)`` to ``(*, n)``."""
         return values @ self._matrices[values.dtype]
 
-    def cut(self, members: Tensor) -> Tensor:
+    def cut_weight(self, members: Tensor) -> Tensor:
         """Sum of the links between different bodies: members ``(*batch, K, n)``, 0 or 1, to ``(*batch,)``."""
         return (self.weight.sum() - (members * self.pull(members)).sum((-2, -1))) / 2
 
@@ -69,30 +72,16 @@ class Links:
         return Links(index.clamp(min=0), torch.where(index >= 0, self.weight[keep], 0.0))
 
     def components(self, least: float, among: Tensor) -> Tensor:
-        """Connected components of the links above ``least`` among some matches ``(n,)`` bool: ``(n,)``, the least index of
-        each."""
-        joined = (self.weight > least) & among[:, None] & among[self.index]
-        found = torch.arange(len(self.index), device=self.index.device)
-        target = torch.cat([found[:, None], torch.where(joined, self.index, found[:, None])], dim=-1)
-        while True:
-            # the least label of the neighbours, then of the match that carries that label
-            spread = found[target].amin(-1)
-            spread = spread[spread]
-            if torch.equal(spread, found):
-                return found
-            found = spread
+        """Numbers ``(n,)`` of the connected components of the links above ``least`` among some matches ``(n,)`` bool."""
+        row, slot = ((self.weight > least) & among[:, None] & among[self.index]).nonzero(as_tuple=True)
+        ends, size = (row.cpu().numpy(), self.index[row, slot].cpu().numpy()), len(self.index)
+        graph = coo_array((np.ones(len(row)), ends), shape=(size, size))
+        return torch.from_numpy(connected_components(graph, directed=False)[1]).long().to(row.device)
 
 
-@dataclass(frozen=True)
-class Coherence:
-    """The graph of one problem of n matches."""
-
-    values: Tensor  # ``(n,)`` in [0, 1], how well a match moves like its neighbours of both images
-    links: Links  # how well two neighbours move alike
-
-
-def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None) -> Coherence:
-    r"""Deviation of each match from the affine motion of its neighbours, in both directions. x1 ``(n, 2)``, among ``(n,)``."""
+def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None) -> tuple[Tensor, Links]:
+    """How well each match moves like its neighbours of both images, ``(n,)`` in [0, 1], by its deviation from their affine motion,
+    and links by how well two neighbours move alike. x1 ``(n, 2)``, among ``(n,)``."""
     among = torch.ones_like(x1[:, 0], dtype=torch.bool) if among is None else among
     fresh = _first_of_copies(x1, x2, among, scale / 6)
     values = torch.ones_like(x1[:, 0])
@@ -100,7 +89,7 @@ def coherence(x1: Tensor, x2: Tensor, scale: float, among: Tensor | None = None)
         # the first pass finds most wrong matches, which then no longer stand between the neighbours of the others
         trusted = values > MIN_NEIGHBOUR_COHERENCE
         values, linked = _measure_coherence(x1, x2, fresh & trusted, scale)
-    return Coherence(values, _links(*linked, among))
+    return values, _links(*linked, among)
 
 
 def _measure_coherence(x1: Tensor, x2: Tensor, eligible: Tensor, scale: float) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
@@ -211,15 +200,15 @@ def _common_motions(da: Tensor, db: Tensor, usable: Tensor) -> Tensor:
         score = weight.sum(-1)
         mode = weight @ factor / score.clamp(min=torch.finfo(da.dtype).tiny)[:, None]
     order = score.argsort(descending=True, stable=True)
-    kept: list[complex] = []
+    factors: list[complex] = []
     for (real, imaginary), share in zip(mode[order].tolist(), (score[order] / len(factor)).tolist(), strict=True):
-        found = complex(real, imaginary)
-        found = 1.0 if abs(found - 1) <= MAX_IDENTITY_DISTANCE else found
-        if share >= (MIN_FURTHER_FACTOR_SHARE if kept else MIN_FIRST_FACTOR_SHARE) and all(
-            abs(found - other) > MIN_FACTOR_SEPARATION * abs(other) for other in kept
+        candidate = complex(real, imaginary)
+        candidate = 1.0 if abs(candidate - 1) <= MAX_IDENTITY_DISTANCE else candidate
+        if share >= (MIN_FURTHER_FACTOR_SHARE if factors else MIN_FIRST_FACTOR_SHARE) and all(
+            abs(candidate - other) > MIN_FACTOR_SEPARATION * abs(other) for other in factors
         ):
-            kept.append(found)
-    return torch.tensor([[[z.real, -z.imag], [z.imag, z.real]] for z in kept or [1.0]], dtype=da.dtype, device=da.device)
+            factors.append(candidate)
+    return torch.tensor([[[z.real, -z.imag], [z.imag, z.real]] for z in factors or [1.0]], dtype=da.dtype, device=da.device)
 
 
 def _reach(da: Tensor, usable: Tensor, eligible: Tensor) -> Tensor:
@@ -273,11 +262,11 @@ def energy(view: View, fundamentals: Tensor, member: Tensor) -> Tensor:
     r"""Cost of labellings with their fundamental matrices: fundamentals ``(B, K, 3, 3)``, member ``(B, K, n)`` -> ``(B,)``."""
     square = sampson_squared(fundamentals, view.x1, view.x2) / (SAMPSON_NOISE_PIXELS * view.pixel) ** 2
     distances = (square.clamp(max=ENERGY_MAX_SQUARED_DISTANCE) * member).sum((-2, -1))
-    cost = relief(view, fundamentals, member)
-    return distances + CUT_COST * view.links.cut(member) + PARALLAX_WEIGHT * (cost * member).sum((-2, -1))
+    cost = relief_cost(view, fundamentals, member)
+    return distances + CUT_COST * view.links.cut_weight(member) + PARALLAX_WEIGHT * (cost * member).sum((-2, -1))
 
 
-def relief(view: View, fundamentals: Tensor, member: Tensor, min_scale: float = MIN_PARALLAX_PIXELS) -> Tensor:
+def relief_cost(view: View, fundamentals: Tensor, member: Tensor, min_scale: float = MIN_PARALLAX_PIXELS) -> Tensor:
     r"""Cost ``(B, K, n)`` of the parallax of every match beside every body:
     :math:`(\nu + 1) \log(1 + p^2 / \nu t^2) + \log t^2`."""
     value, scale = parallax(view, fundamentals, member, min_scale)
@@ -290,9 +279,9 @@ def parallax(view: View, fundamentals: Tensor, member: Tensor, min_scale: float 
     first, second = homogeneous(view.x1), homogeneous(view.x2)
     epipole = null_vectors(fundamentals)[0]
     mapped = first @ (skew(epipole) @ fundamentals).mT
-    other = torch.linalg.cross(second.expand_as(mapped), epipole[..., None, :].expand_as(mapped))
+    across_epipole = torch.linalg.cross(second.expand_as(mapped), epipole[..., None, :].expand_as(mapped))
     this = torch.linalg.cross(second.expand_as(mapped), mapped)
-    depth = -(this * other).sum(-1) / other.square().sum(-1).clamp(min=1e-20)
+    depth = -(this * across_epipole).sum(-1) / across_epipole.square().sum(-1).clamp(min=1e-20)
     # how far the image moves with depth
     across = epipole[..., None, :2] * mapped[..., 2:] - mapped[..., :2] * epipole[..., None, 2:]
     lever = across.norm(dim=-1) / (mapped[..., 2] + depth * epipole[..., None, 2]).square().clamp(min=1e-12) / view.pixel

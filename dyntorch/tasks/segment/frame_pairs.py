@@ -44,7 +44,7 @@ class TrackSet:
     """The tracks of one problem, centred and of about unit size, all frames alike."""
 
     x: Tensor  # ``(frames, n, 2)``, 0 where a track is missing
-    drop_short: Tensor  # ``(frames, n)`` bool
+    seen: Tensor  # ``(frames, n)`` bool
     pixel: float  # a pixel of the options, in these coordinates
     change: Tensor  # ``(3, 3)`` similarity from pixels to them
 
@@ -63,8 +63,8 @@ class TrackSet:
     @cached_property
     def ends(self) -> tuple[Tensor, Tensor]:
         """``(n,)`` the first and the last frame that shows a track; of one that none shows the last is before the first."""
-        number = torch.arange(len(self.drop_short), device=self.drop_short.device)[:, None]
-        return torch.where(self.drop_short, number, len(self.drop_short)).amin(0), torch.where(self.drop_short, number, -1).amax(0)
+        number = torch.arange(len(self.seen), device=self.seen.device)[:, None]
+        return torch.where(self.seen, number, len(self.seen)).amin(0), torch.where(self.seen, number, -1).amax(0)
 
     @cached_property
     def lengths(self) -> Tensor:
@@ -75,7 +75,7 @@ class TrackSet:
     def pair(self, frames: Pair) -> FramePair:
         """Two frames."""
         first, second = frames
-        index = (self.drop_short[first] & self.drop_short[second]).nonzero().flatten()
+        index = (self.seen[first] & self.seen[second]).nonzero().flatten()
         x1, x2 = self.x[first][index], self.x[second][index]
         moved = (x2 - x1).norm(dim=-1) / self.pixel
         none = Links(index[:, None][:, :0], x1[:, :0])
@@ -92,23 +92,23 @@ def space_pairs(count: int, gap: int, most: int) -> list[Pair]:
 
 def select_near_pairs(film: TrackSet, gaps: tuple[int, ...], starts: int, common: int) -> list[Pair]:
     """Pairs of frames with the given gaps, evenly spread; in a video longer than its tracks there are more of them."""
-    count = len(film.drop_short)
+    count = len(film.seen)
     length = float(film.lengths.double().median())
     most = round(starts * max(1.0, count / max(length, 4.0) / 1.5))
-    found = dict.fromkeys(pair for gap in gaps for pair in space_pairs(count, min(gap, count - 1), most))
-    return [pair for pair in found if _num_common_tracks(film, pair) >= common]
+    pairs = dict.fromkeys(pair for gap in gaps for pair in space_pairs(count, min(gap, count - 1), most))
+    return [pair for pair in pairs if _num_common_tracks(film, pair) >= common]
 
 
 def select_frame_pairs(film: TrackSet, max_pairs: int) -> list[Pair]:
     """The pairs of frames that bodies are judged by: wide ones, narrower ones for short tracks, all tracks in some of them."""
-    count = len(film.drop_short)
+    count = len(film.seen)
     common = min(MIN_COMMON_TRACKS, max(8, film.x.shape[1] // 2))
     gap = int(min(count - 1, max(1.0, float(film.lengths.double().quantile(LENGTH_QUANTILE)) - 1)))
     offered: dict[Pair, Tensor] = {}
     for _ in range(NUM_GAP_HALVINGS):
         step = max(1, gap // 2)
         for a in {*range(0, count - gap, step), count - 1 - gap}:
-            both = film.drop_short[a] & film.drop_short[a + gap]
+            both = film.seen[a] & film.seen[a + gap]
             if int(both.sum()) >= common:
                 offered[a, a + gap] = both
         gap = max(1, gap // 2)
@@ -117,16 +117,16 @@ def select_frame_pairs(film: TrackSet, max_pairs: int) -> list[Pair]:
     pairs = list(offered)
     both = torch.stack([offered[pair] for pair in pairs]).double()
     wide = torch.tensor([float(b - a) for a, b in pairs], dtype=both.dtype, device=both.device).sqrt()
-    have, kept = torch.zeros_like(both[0]), torch.zeros(len(pairs), dtype=torch.bool, device=both.device)
+    have, selected = torch.zeros_like(both[0]), torch.zeros(len(pairs), dtype=torch.bool, device=both.device)
     alive = int((both.sum(0) > 0).sum())
-    while not bool(kept.all()) and int(kept.sum()) < max_pairs:
-        if int(kept.sum()) >= MIN_FRAME_PAIRS and float(have.sum()) >= MEAN_PAIRS_PER_TRACK * alive:
+    while not bool(selected.all()) and int(selected.sum()) < max_pairs:
+        if int(selected.sum()) >= MIN_FRAME_PAIRS and float(have.sum()) >= MEAN_PAIRS_PER_TRACK * alive:
             break
-        gain = (both @ (1 / (1 + have)) * wide).masked_fill(kept, -1.0)
+        gain = (both @ (1 / (1 + have)) * wide).masked_fill(selected, -1.0)
         best = int(gain.argmax())
-        kept[best] = True
+        selected[best] = True
         have += both[best]
-    return sorted(pair for pair, taken in zip(pairs, kept.tolist(), strict=True) if taken)
+    return sorted(pair for pair, taken in zip(pairs, selected.tolist(), strict=True) if taken)
 
 
 @dataclass(frozen=True)
@@ -143,13 +143,13 @@ def find_scene_cut(film: TrackSet) -> SceneCut | None:
     """The first cut of a video, if there is one."""
     first, last = film.ends
     steps = []
-    for frame in range(1, len(film.drop_short)):
+    for frame in range(1, len(film.seen)):
         before, after = (first < frame) & (last >= frame - 1), (first <= frame) & (last >= frame)
         across = before & after
         least = float(torch.minimum(before.sum(), after.sum()))
         if least >= MIN_COMMON_TRACKS and float(across.sum()) < MAX_CUT_SURVIVAL * least:
             return SceneCut(frame, float(across.sum()) / least)
-        both = film.drop_short[frame - 1] & film.drop_short[frame]
+        both = film.seen[frame - 1] & film.seen[frame]
         steps.append((film.x[frame] - film.x[frame - 1])[both].norm(dim=-1) / film.pixel)
     usual = [float(step.median()) for step in steps if len(step)]
     if len(usual) > 2:
@@ -161,4 +161,4 @@ def find_scene_cut(film: TrackSet) -> SceneCut | None:
 
 
 def _num_common_tracks(film: TrackSet, pair: Pair) -> int:
-    return int((film.drop_short[pair[0]] & film.drop_short[pair[1]]).sum())
+    return int((film.seen[pair[0]] & film.seen[pair[1]]).sum())

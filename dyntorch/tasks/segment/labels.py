@@ -51,22 +51,16 @@ class Labelling:
 
     def of(self, bodies: Tensor) -> Labelling:
         """With these bodies alone (indices or bool): what belonged to others belongs to none."""
-        kept = self.probabilities[1:][bodies]
-        return Labelling(torch.cat([1 - kept.sum(0, keepdim=True), kept]).clamp(min=0), self.fundamentals[bodies])
+        probabilities = self.probabilities[1:][bodies]
+        return Labelling(torch.cat([1 - probabilities.sum(0, keepdim=True), probabilities]).clamp(min=0), self.fundamentals[bodies])
 
 
 def label_matches(
-    view: View,
-    found: Tensor,
-    fundamentals: Tensor,
-    weights: Tensor,
-    threshold: float,
-    scale: float | None,
-    share: float,
+    view: View, labels: Tensor, fundamentals: Tensor, weights: Tensor, threshold: float, scale: float | None, share: float
 ) -> Labelling:
     r"""Labels and geometries in turns: a mean field of the costs found ``(n,)``, fundamentals ``(K, 3, 3)``, weights ``(n,)``."""
-    numbers = torch.arange(1, len(fundamentals) + 1, device=found.device)[:, None]
-    members = found == numbers
+    numbers = torch.arange(1, len(fundamentals) + 1, device=labels.device)[:, None]
+    members = labels == numbers
     gain = ASSIGNMENT_GAIN * members.to(weights.dtype) if scale is not None else 0.0
     strange = _nonconformity_cost(view, members, scale)
     links = _normalize_links(view.links)
@@ -116,16 +110,9 @@ def _normalize_links(links: Links) -> Links:
 TINY = 1e-30
 
 
-@dataclass(frozen=True)
-class Models:
-    """Models of K bodies."""
-
-    homographies: Tensor  # ``(K, 3, 3)`` of norm 1, best fits, whatever the choice
-    planar: Tensor  # ``(K,)`` bool, the homography explains the body
-
-
-def select_models(view: View, fundamentals: Tensor, members: Tensor) -> Models:
-    r"""The model with the smaller robust information criterion,"""
+def select_models(view: View, fundamentals: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
+    """The best homographies ``(K, 3, 3)`` of K bodies, of norm 1, and whether they explain them, ``(K,)`` bool: their robust
+    information criterion is smaller than that of the fundamental matrices."""
     # weights are relative: they count as so many equal ones
     members = members * (members.sum(-1) / members.square().sum(-1).clamp(min=TINY))[:, None]
     epipolar = sampson_squared(fundamentals, view.x1, view.x2)
@@ -135,7 +122,7 @@ def select_models(view: View, fundamentals: Tensor, members: Tensor) -> Models:
     first = _criterion(epipolar / noise, members, 3, 7)
     second = _criterion(planar / noise, members, 2, 8)
     off = ((planar > (OFF_PLANE_DISTANCE * THRESHOLD_PIXELS * view.pixel) ** 2) * members).sum(-1) / members.sum(-1).clamp(min=TINY)
-    return Models(plane, (second < first) & (off <= MAX_OFF_PLANE_SHARE))
+    return plane, (second < first) & (off <= MAX_OFF_PLANE_SHARE)
 
 
 def _noise(square: Tensor, members: Tensor) -> Tensor:
@@ -172,12 +159,12 @@ def significant(view: View, fundamentals: Tensor, labels: Tensor, false_alarms: 
     threshold = THRESHOLD_PIXELS * view.pixel
     near = sampson_squared(fundamentals, view.x1, view.x2) <= threshold**2
     chance = max(_chance(x, threshold) for x in (view.x1, view.x2))
-    found = []
+    believed = []
     for number, close in enumerate(near, start=1):
         own = labels == number
         count, among = int((own & close).sum()), int((own | (labels == 0)).sum())
-        found.append(count > SAMPLE and _alarms(among, count, chance) < log(false_alarms))
-    return torch.tensor(found, dtype=torch.bool, device=labels.device)
+        believed.append(count > SAMPLE and _alarms(among, count, chance) < log(false_alarms))
+    return torch.tensor(believed, dtype=torch.bool, device=labels.device)
 
 
 def _chance(x: Tensor, threshold: float) -> float:
@@ -213,12 +200,12 @@ def distances(pairs: Sequence[FramePair], geometry: Geometry, count: int) -> Ten
     """Sampson distances ``(P, K, n)`` in pixels of all tracks from all bodies, whose geometry is ``(1, K, 3, 3)`` for every pair;
     NaN where a track is not in the pair, or the body's motion between its frames is not known."""
     bodies = geometry[0].shape[1]
-    found = torch.full((len(pairs), bodies, count), torch.nan, dtype=torch.float64, device=geometry[0].device)
-    for row, pair, F in zip(found, pairs, geometry, strict=True):
+    result = torch.full((len(pairs), bodies, count), torch.nan, dtype=torch.float64, device=geometry[0].device)
+    for row, pair, F in zip(result, pairs, geometry, strict=True):
         square = sampson_squared(F[0], pair.view.x1, pair.view.x2)
-        known = (F[0] != 0).any(-1).any(-1)
-        row[:, pair.index] = torch.where(known[:, None], square.sqrt() / pair.view.pixel, torch.nan)
-    return found
+        has_motion = (F[0] != 0).any(-1).any(-1)
+        row[:, pair.index] = torch.where(has_motion[:, None], square.sqrt() / pair.view.pixel, torch.nan)
+    return result
 
 
 def outliers(distance: Tensor, labels: Tensor, support: Tensor) -> Tensor:
@@ -228,39 +215,31 @@ def outliers(distance: Tensor, labels: Tensor, support: Tensor) -> Tensor:
     return usual > torch.where(support > MIN_SUPPORT, MAX_SUPPORTED_DISTANCE_PIXELS, MAX_BODY_DISTANCE_PIXELS)
 
 
-@dataclass(frozen=True)
-class BodyMotions:
-    """Of K bodies between the frames of P pairs, in the coordinates of the input: F and H ``(P, K, 3, 3)``, planar ``(P, K)``."""
-
-    fundamentals: Tensor
-    homographies: Tensor
-    planar: Tensor
-
-
-def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film: TrackSet) -> BodyMotions:
-    """With members ``(K, n)``, 0 or 1; 0 where two frames have too few of them in common."""
+def motions(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor, film: TrackSet) -> tuple[Tensor, Tensor, Tensor]:
+    """F and H ``(P, K, 3, 3)`` of bodies between the frames of P pairs, in the coordinates of the input, and which are planes
+    ``(P, K)``: members ``(K, n)``, 0 or 1; 0 where two frames have too few of them in common."""
     back = torch.linalg.inv(film.change)
     fundamentals, homographies, planar = [], [], []
     for pair, F in zip(pairs, geometry, strict=True):
         some = member[:, pair.index]
         there = some.sum(-1) >= MIN_BODY_TRACKS
-        models = select_models(pair.view, F[0], some)
-        flat = there & models.planar
+        planes, flat = select_models(pair.view, F[0], some)
+        flat = there & flat
         fundamentals.append(torch.where(there[:, None, None], unit(film.change.mT @ F[0] @ film.change), 0.0))
-        homographies.append(torch.where(flat[:, None, None], unit(back @ models.homographies @ film.change), 0.0))
+        homographies.append(torch.where(flat[:, None, None], unit(back @ planes @ film.change), 0.0))
         planar.append(flat)
-    return BodyMotions(torch.stack(fundamentals), torch.stack(homographies), torch.stack(planar))
+    return torch.stack(fundamentals), torch.stack(homographies), torch.stack(planar)
 
 
 def widths(film: TrackSet, member: Tensor) -> Tensor:
     """How wide bodies of members ``(K, n)`` are: the share ``(K,)`` of the cells of a grid over the picture that they are seen in,
     of those that anything is seen in, in the mean over the frames."""
-    there = film.x[film.drop_short]
+    there = film.x[film.seen]
     low, high = there.quantile(there.new_tensor([0.01, 0.99]), dim=0)
     cell = ((film.x - low) / (high - low).clamp(min=1e-12) * NUM_WIDTH_CELLS).long().clamp(0, NUM_WIDTH_CELLS - 1)
     place = cell[..., 0] * NUM_WIDTH_CELLS + cell[..., 1]
     shares = []
-    for seen, where in zip(film.drop_short, place, strict=True):
+    for seen, where in zip(film.seen, place, strict=True):
         if not bool(seen.any()):
             continue
         grid = torch.zeros(len(member), NUM_WIDTH_CELLS**2, dtype=torch.float64, device=member.device)
@@ -281,14 +260,14 @@ def find_static_body(film: TrackSet, member: Tensor) -> int | None:
 
 def distances_from_cameras(tracks: Tensor, member: Tensor, cameras: Tensor, pairs: Sequence[FramePair]) -> Tensor:
     """Median Sampson distances ``(K,)`` of bodies of members ``(K, n)`` from the motion of cameras ``(frames, 3, 4)``."""
-    found: list[list[Tensor]] = [[] for _ in member]
+    samples: list[list[Tensor]] = [[] for _ in member]
     for pair in pairs:
         first, second = cameras[pair.frames[0]], cameras[pair.frames[1]]
         centre = torch.linalg.svd(first)[2][-1]
         F = unit(skew(second @ centre) @ second @ torch.linalg.pinv(first))
         x1, x2 = (tracks[frame][pair.index] for frame in pair.frames)
         distance = sampson_squared(F, x1, x2).sqrt()
-        for own, some in zip(found, member[:, pair.index] > 0, strict=True):
+        for own, some in zip(samples, member[:, pair.index] > 0, strict=True):
             own.append(distance[some])
     none = tracks.new_tensor(torch.inf)
-    return torch.stack([torch.cat(own).median() if sum(map(len, own)) else none for own in found])
+    return torch.stack([torch.cat(own).median() if sum(map(len, own)) else none for own in samples])

@@ -1,21 +1,20 @@
-"""What segment() returns: which match moves with which body, how each body moved, and how sure that is."""
+"""What segment() and segment_tracks() return: what moves with which body, how each body moved, and how sure that is."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
+import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import NoticeCode, Outcome, Status
-
-OUTLIER = 0
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status
 
 
 class SegmentNotice(NoticeCode):
-    """What limits a segmentation, and how it is said."""
+    """What limits a segmentation of matches or of tracks, and how it is said."""
 
     COARSE = (
         "coarse",
@@ -24,107 +23,37 @@ class SegmentNotice(NoticeCode):
     """The threshold is large beside the spread of the points."""
     FEWER_BODIES = (
         "fewer_bodies",
-        "{asked:# body was|# bodies were} asked for, the matches carry {value:g}; ask for fewer, or add matches of the others",
+        {
+            "": "{asked:# body was|# bodies were} asked for, the matches carry {value:g}; ask for fewer, or add matches of the "
+            "others",
+            "tracks": "{asked:# body was|# bodies were} asked for, the tracks carry {value:g}; ask for fewer, or give more tracks "
+            "of the others",
+        },
     )
-    """The matches carry fewer bodies than were asked for."""
+    """The data carry fewer bodies than were asked for."""
     SPARE_BODY = (
         "spare_body",
-        "{value:# body explains|# bodies explain} the matches no worse than {asked}: one may be a part of another; ask for fewer",
+        {
+            "": "{value:# body explains|# bodies explain} the matches no worse than {asked}: one may be a part of another; ask for "
+            "fewer",
+            "tracks": "two of the {asked} bodies move nearly alike: one may be a part of the other; ask for fewer",
+        },
     )
-    """Fewer bodies than were asked for explain the matches as well."""
+    """Fewer bodies than were asked for explain the data as well."""
     UNDECIDED = (
         "undecided",
         "two views hardly decide: another segmentation costs {value:.2g} more, and from 1 on it would be clear; follow the points "
         "through more frames (segment_tracks)",
     )
     """Another segmentation costs about as much."""
-    REPEATED = (
-        "repeated",
-        "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches",
-    )
+    REPEATED = ("repeated", "a share of {value:.2g} of the matches repeats others and says nothing new; remove repeated matches")
     """Many matches are the same."""
     INCOHERENT = (
         "incoherent",
         "the share of matches that move like their neighbours is {value:.2g}; try {arg:spatial=False} if bodies interleave",
     )
     """Few matches move like their neighbours."""
-
-
-class BodyModel(StrEnum):
-    """What two views say of the motion of one body."""
-
-    FUNDAMENTAL = "fundamental"
-    """A rigid body with depth: a fundamental matrix."""
-    HOMOGRAPHY = "homography"
-    """A plane, or a body seen under a rotation alone: a homography, and no unique fundamental matrix."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Segmentation(Outcome):
-    """Bodies in two views.
-
-    Where problems of a batch have different numbers of bodies, K is the largest; what is behind ``bodies`` is 0.
-
-    Attributes:
-        labels: ``(*batch, n)`` int64, 0 outlier, 1..K the bodies: the larger first, of equally large ones that of
-            the earliest match.
-        bodies: ``(*batch,)`` int64, how many bodies.
-        fundamentals: ``(*batch, K, 3, 3)`` of norm 1, :math:`x_2^T F x_1 = 0`.  Where ``models`` says homography, F is one of the
-            family :math:`[e]_\\times H` that fit the matches alike.
-        homographies: ``(*batch, K, 3, 3)`` of norm 1, view 1 to view 2; 0 where ``models`` says fundamental.
-        models: for one problem a tuple of K :class:`BodyModel`, for a batch nested tuples.
-        probabilities: ``(*batch, n, K + 1)``: column 0 outlier, then the bodies; rows sum to 1 (0 for missing matches).
-        residuals: ``(*batch, n)`` Sampson distance from the own body's model, for outliers from the nearest body's, in the unit of
-            the points; 0 where there is no body.  Labels are found by the fundamental matrices: where ``models`` says homography,
-            a few matches of the body may be far from its plane.
-        coherence: ``(*batch, n)`` in [0, 1]: how well a match moves like its neighbours in both images; 0 where ``spatial=False``.
-        threshold: ``(*batch,)`` Sampson distance that divides inliers from outliers where nothing else is known, as in
-            :func:`dyntorch.segment`, in the unit of the points.
-    """
-
-    labels: Tensor
-    bodies: Tensor
-    fundamentals: Tensor
-    homographies: Tensor
-    models: tuple[Any, ...]
-    probabilities: Tensor
-    residuals: Tensor
-    coherence: Tensor
-    threshold: Tensor
-
-    TASK = "segment"
-    REMEDIES: ClassVar[Mapping[Status, str]] = {
-        Status.TOO_FEW: "too few matches are present in both images; give more",
-        Status.DEGENERATE: "several segmentations fit all matches exactly; add matches in general position",
-        Status.AMBIGUOUS: "other segmentations fit as well; add matches, or say how many {arg:bodies} there are",
-        Status.NO_CONSENSUS: "no body moves so that enough of the matches agree; raise {arg:threshold}, or clean the matches",
-    }
-
-    def __repr__(self) -> str:
-        lines = [self.head(matches=self.labels.shape[-1])]
-        if not self.status.ndim:
-            lines += [
-                f"  body {number}: {int((self.labels == number).sum())} matches, {model}"
-                for number, model in enumerate(self.models, start=1)
-            ]
-            lines.append(f"  outliers: {int((self.labels == OUTLIER).sum())}")
-        elif self.bodies.numel():
-            lines.append(f"  bodies: {int(self.bodies.min())} to {int(self.bodies.max())}")
-        return "\n".join(lines + self.warning_lines())
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# What segment_tracks() returns: which track moves with which body, how each body moved, and which one rests.
-
-
-class TrackNotice(NoticeCode):
-    """What limits a segmentation of tracks, and how it is said."""
-
-    SHORT = (
-        "short",
-        "no track is in two frames; give tracks that are followed from frame to frame",
-        Status.TOO_FEW,
-    )
+    SHORT = ("short", "no track is in two frames; give tracks that are followed from frame to frame", Status.TOO_FEW)
     """All tracks are shorter than two frames."""
     FEW_COMMON = (
         "few_common",
@@ -149,27 +78,14 @@ class TrackNotice(NoticeCode):
         Status.DEGENERATE,
     )
     """The frames show two scenes."""
-    INCOHERENT = (
-        "incoherent",
+    UNRELATED = (
+        "unrelated",
         "the tracks move each by itself: a usual one has {value:.0%} of what it prefers in common with the most alike, as random "
         "tracks have; clean the tracks, or follow more points",
         Status.NO_CONSENSUS,
     )
     """Tracks have no motion in common."""
-    FEWER_BODIES = (
-        "fewer_bodies",
-        "{asked:# body was|# bodies were} asked for, the tracks carry {value:g}; ask for fewer, or give more tracks of the others",
-    )
-    """The tracks carry fewer bodies than were asked for."""
-    SPARE_BODY = (
-        "spare_body",
-        "two of the {asked} bodies move nearly alike: one may be a part of the other; ask for fewer",
-    )
-    """Two of the bodies that were asked for are hardly separate."""
-    ONE_BODY = (
-        "one_body",
-        "all tracks move as one body: nothing moves against the rest",
-    )
+    ONE_BODY = ("one_body", "all tracks move as one body: nothing moves against the rest")
     """There is one body."""
     UNSURE_STATIC = (
         "unsure_static",
@@ -183,8 +99,113 @@ class TrackNotice(NoticeCode):
     """The declared cameras agree with no body."""
 
 
+class BodyModel(StrEnum):
+    """What two views say of the motion of one body."""
+
+    FUNDAMENTAL = "fundamental"
+    """A rigid body with depth: a fundamental matrix."""
+    HOMOGRAPHY = "homography"
+    """A plane, or a body seen under a rotation alone: a homography, and no unique fundamental matrix."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class TrackSegmentation(Outcome):
+class BodySegmentation(Outcome):
+    """What both segmentations say of n matches or tracks; where problems of a batch have different numbers of bodies, K is the
+    largest, and what is behind ``bodies`` is 0."""
+
+    labels: Tensor
+    bodies: Tensor
+    homographies: Tensor
+    planar: Tensor
+    probabilities: Tensor
+    residuals: Tensor
+    threshold: Tensor
+
+    UNIT: ClassVar[str] = "matches"
+    """What is labelled."""
+
+    def note(self, number: int) -> str:
+        """What else is to be said of a body in the representation of a single problem."""
+        raise NotImplementedError
+
+    def in_dtype(self, dtype: torch.dtype) -> Self:
+        """With floating-point parts of this type, and 0 where a batch is filled up."""
+        parts: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
+        for name, value in parts.items():
+            if isinstance(value, Tensor) and value.is_floating_point():
+                parts[name] = value.nan_to_num(nan=0.0).to(dtype)
+        return replace(self, **parts)
+
+    def __repr__(self) -> str:
+        lines = [self.head(**{self.UNIT: self.labels.shape[-1]})]
+        if not self.status.ndim:
+            counts = torch.bincount(self.labels, minlength=int(self.bodies) + 1).tolist()
+            lines += [f"  body {number}: {counts[number]} {self.UNIT}{self.note(number)}" for number in range(1, len(counts))]
+            lines.append(f"  outliers: {counts[0]}")
+        elif self.bodies.numel():
+            lines.append(f"  bodies: {int(self.bodies.min())} to {int(self.bodies.max())}")
+        return "\n".join(lines + self.warning_lines())
+
+
+def count_notices(count: int, asked: int | None, spare: bool, **values: str) -> list[Notice]:
+    """What to say where another number of bodies was asked for than the data carry."""
+    if asked is not None and count < asked:
+        return [Notice(SegmentNotice.FEWER_BODIES, float(count), {"asked": asked, **values})]
+    return [Notice(SegmentNotice.SPARE_BODY, count - 1.0, {"asked": asked, **values})] if asked is not None and spare else []
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Segmentation(BodySegmentation):
+    """Bodies in two views.
+
+    Where problems of a batch have different numbers of bodies, K is the largest; what is behind ``bodies`` is 0.
+
+    Attributes:
+        labels: ``(*batch, n)`` int64, 0 outlier, 1..K the bodies: the larger first, of equally large ones that of
+            the earliest match.
+        bodies: ``(*batch,)`` int64, how many bodies.
+        fundamentals: ``(*batch, K, 3, 3)`` of norm 1, :math:`x_2^T F x_1 = 0`.  Where ``planar``, F is one of the family
+            :math:`[e]_\\times H` that fit the matches alike.
+        homographies: ``(*batch, K, 3, 3)`` of norm 1, view 1 to view 2; 0 where not ``planar``.
+        planar: ``(*batch, K)`` bool: two views show the body as a plane, or under a rotation alone; see ``models``.
+        probabilities: ``(*batch, n, K + 1)``: column 0 outlier, then the bodies; rows sum to 1 (0 for missing matches).
+        residuals: ``(*batch, n)`` Sampson distance from the own body's model, for outliers from the nearest body's, in the unit of
+            the points; 0 where there is no body.  Labels are found by the fundamental matrices: where ``planar``, a few matches of
+            the body may be far from its plane.
+        coherence: ``(*batch, n)`` in [0, 1]: how well a match moves like its neighbours in both images; 0 where ``spatial=False``.
+        threshold: ``(*batch,)`` Sampson distance that divides inliers from outliers where nothing else is known, as in
+            :func:`dyntorch.segment`, in the unit of the points.
+    """
+
+    fundamentals: Tensor
+    coherence: Tensor
+
+    TASK = "segment"
+    REMEDIES: ClassVar[Mapping[Status, str]] = {
+        Status.TOO_FEW: "too few matches are present in both images; give more",
+        Status.DEGENERATE: "several segmentations fit all matches exactly; add matches in general position",
+        Status.AMBIGUOUS: "other segmentations fit as well; add matches, or say how many {arg:bodies} there are",
+        Status.NO_CONSENSUS: "no body moves so that enough of the matches agree; raise {arg:threshold}, or clean the matches",
+    }
+
+    @property
+    def models(self) -> tuple[Any, ...]:
+        """For one problem a tuple of K :class:`BodyModel`, for a batch nested tuples."""
+
+        def models_of(planar: Tensor, bodies: Tensor) -> tuple[Any, ...]:
+            if bodies.ndim:
+                return tuple(map(models_of, planar, bodies))
+            return tuple(BodyModel.HOMOGRAPHY if flat else BodyModel.FUNDAMENTAL for flat in planar[: int(bodies)].tolist())
+
+        return models_of(self.planar, self.bodies)
+
+    def note(self, number: int) -> str:
+        """The model of a body."""
+        return f", {self.models[number - 1]}"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrackSegmentation(BodySegmentation):
     """Bodies in the tracks of a video.
 
     Where problems of a batch have different numbers of bodies or pairs, K and P are the largest; what is behind is 0, in
@@ -206,17 +227,11 @@ class TrackSegmentation(Outcome):
         threshold: ``(*batch,)`` as given.
     """
 
-    labels: Tensor
-    bodies: Tensor
     static_body: Tensor
     pairs: Tensor
     geometries: Tensor
-    homographies: Tensor
-    planar: Tensor
-    probabilities: Tensor
-    residuals: Tensor
-    threshold: Tensor
 
+    UNIT = "tracks"
     TASK = "segment_tracks"
     REMEDIES: ClassVar[Mapping[Status, str]] = {
         Status.TOO_FEW: "too few tracks are in two frames at once; give more, or longer ones",
@@ -225,13 +240,6 @@ class TrackSegmentation(Outcome):
         Status.NO_CONSENSUS: "no body moves so that enough of the tracks agree; raise {arg:threshold}, or clean the tracks",
     }
 
-    def __repr__(self) -> str:
-        lines = [self.head(tracks=self.labels.shape[-1])]
-        if not self.status.ndim:
-            for number in range(1, int(self.bodies) + 1):
-                rests = ", stands still" if number == int(self.static_body) else ""
-                lines.append(f"  body {number}: {int((self.labels == number).sum())} tracks{rests}")
-            lines.append(f"  outliers: {int((self.labels == 0).sum())}")
-        elif self.bodies.numel():
-            lines.append(f"  bodies: {int(self.bodies.min())} to {int(self.bodies.max())}")
-        return "\n".join(lines + self.warning_lines())
+    def note(self, number: int) -> str:
+        """Whether a body stands still."""
+        return ", stands still" if number == int(self.static_body) else ""

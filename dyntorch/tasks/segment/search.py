@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.core.fit import fit
 from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import descend, fit_fundamental, sample_fundamentals
-from dyntorch.invariants.segmentation_matrix import SegmentationMatrix
 from dyntorch.numerics.blocks import uniform
 from dyntorch.tasks.segment.coherence import ENERGY_MAX_SQUARED_DISTANCE, SAMPSON_NOISE_PIXELS, Links, View, energy, mean_field
 
@@ -36,7 +34,6 @@ POOL_CUT_COST = 3.0  # of a link of weight 1 between two bodies in the search
 MAX_STARTS = 6  # of each kind
 MAX_SETS = 400  # followed from one geometry to the next
 MAX_LABEL_OVERLAP = 0.97  # share of the matches in the same groups above which two labellings are one
-MATRIX_MATCHES = 40  # that a segmentation matrix takes
 DESCENT_SCHEDULE = (2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 1.0, 1.0)  # noise in the rounds, over that at the end
 DESCENT_NOISE_PIXELS = 0.5  # at the end: finer than in the final energy, for small bodies to hold their own
 NUM_DESCENT_LABEL_UPDATES = 3  # of the mean field in each round
@@ -51,7 +48,6 @@ NUM_FIRST_GEOMETRIES = 40  # that sets start from
 MAX_SUPPORT_OVERLAP = 0.97  # intersection over union above which one of two geometries is enough
 NUM_DESCENDED_SETS = 30  # for each number of bodies
 MIN_BODY_GAIN = 5.0  # in units of the root of the number of matches: by chance 2 to 5, small bodies 8
-NUM_MATRIX_ROUNDS = 3  # of the weights of the segmentation matrix
 
 
 def affine_flows(x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: float, generator: torch.Generator | None) -> Tensor:
@@ -84,15 +80,15 @@ def affine_flows(x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: fl
 
 def _patches(x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: torch.Generator | None) -> Tensor:
     """Members ``(runs, width, n)`` of patches: nearest matches in place and motion of seeds that are far from each other."""
-    apart = _scaled_distances(x) + _scaled_distances(motion)
+    distance = _scaled_distances(x) + _scaled_distances(motion)
     runs, count = len(bodies), len(x)
     seeds = (uniform(runs, 1, generator=generator, device=x.device) * count).long().clamp(max=count - 1)
     for _ in range(1, width):
-        far = apart[seeds].amin(1).double().cumsum(-1)
+        far = distance[seeds].amin(1).double().cumsum(-1)
         pick = uniform(runs, 1, generator=generator, device=x.device) * far[:, -1:]
         seeds = torch.cat([seeds, torch.searchsorted(far, pick).clamp(max=count - 1)], dim=-1)
     sizes = torch.tensor(PATCH_SIZES, device=x.device)[torch.arange(runs, device=x.device) % len(PATCH_SIZES)]
-    order = apart[seeds].topk(min(max(PATCH_SIZES), count), dim=-1, largest=False).indices
+    order = distance[seeds].topk(min(max(PATCH_SIZES), count), dim=-1, largest=False).indices
     chosen = (torch.arange(order.shape[-1], device=x.device) < sizes[:, None, None].clamp(max=max(4, count // 2))).expand_as(order)
     return torch.zeros(runs, width, count, dtype=torch.float32, device=x.device).scatter_(-1, order, chosen.float())
 
@@ -116,6 +112,13 @@ class Starts:
 
     labels: Tensor
     fundamentals: Tensor
+
+
+def draw_subset(count: int, most: int, generator: torch.Generator | None, device: torch.device) -> Tensor:
+    """``(count,)`` bool: all, or a random part of very many: what is dense beside the noise shows no motion of its own."""
+    if count <= most:
+        return torch.ones(count, dtype=torch.bool, device=device)
+    return uniform(count, generator=generator, device=device).argsort().argsort() < most
 
 
 def one_hot(labels: Tensor, width: int) -> Tensor:
@@ -149,8 +152,8 @@ def fit_pool(view: View, groups: Tensor) -> Tensor:
 def fit_labellings(view: View, labels: Tensor, count: int) -> Starts:
     """Labellings ``(s, n)`` with the geometries of their bodies."""
     member = one_hot(labels, count)
-    found = fit_fundamental(view.x1, view.x2, member.flatten(0, 1), (POOL_FIT_SCALES_PIXELS[0] * view.pixel,), steps=2)[0]
-    return Starts(labels, found.unflatten(0, member.shape[:2]))
+    fundamentals = fit_fundamental(view.x1, view.x2, member.flatten(0, 1), (POOL_FIT_SCALES_PIXELS[0] * view.pixel,), steps=2)[0]
+    return Starts(labels, fundamentals.unflatten(0, member.shape[:2]))
 
 
 def best_sets(cost: Tensor, most: int, first: int | None = None) -> list[Tensor]:
@@ -158,10 +161,10 @@ def best_sets(cost: Tensor, most: int, first: int | None = None) -> list[Tensor]
     single = cost.float()
     size = len(single)
     sets = single.sum(-1).argsort(stable=True)[: size if first is None else first, None]
-    found = [sets]
+    sets_by_size = [sets]
     for count in range(2, most + 1):
         if not len(sets):  # fewer geometries than bodies
-            found.append(sets.new_zeros(0, count))
+            sets_by_size.append(sets.new_zeros(0, count))
             continue
         least = single[sets].amin(1)
         grown = torch.stack([torch.minimum(row, single).sum(-1) for row in least])
@@ -170,50 +173,32 @@ def best_sets(cost: Tensor, most: int, first: int | None = None) -> list[Tensor]
         candidates = candidates[(candidates.diff(dim=-1) > 0).all(-1)]
         different = list(dict.fromkeys(map(tuple, candidates.tolist())))[:MAX_SETS]
         sets = torch.tensor(different, dtype=torch.long, device=cost.device).view(-1, count)
-        found.append(sets)
-    return found
+        sets_by_size.append(sets)
+    return sets_by_size
 
 
 def select_distinct(view: View, starts: Starts) -> Starts:
     """Up to ``MAX_STARTS`` starts that differ, the cheapest first, with enough matches in every body."""
     count = starts.fundamentals.shape[-3]
     member = one_hot(starts.labels, count)
-    cost = (rough_cost(view, starts.fundamentals) * member).sum((-2, -1)) + POOL_CUT_COST * view.links.cut(member)
+    cost = (rough_cost(view, starts.fundamentals) * member).sum((-2, -1)) + POOL_CUT_COST * view.links.cut_weight(member)
     cost = torch.where(member.sum(-1).amin(-1) >= MIN_BODY_MATCHES, cost, torch.inf)
     order = cost.argsort(stable=True)
     order = order[cost[order].isfinite()]
     flat = member[order].float().flatten(0, 1)
     shared = (flat @ flat.mT).unflatten(0, (-1, count)).unflatten(-1, (-1, count))
     alike = (shared.amax(1).sum(-1) > MAX_LABEL_OVERLAP * flat.shape[-1]).tolist()
-    kept: list[int] = []
+    selected: list[int] = []
     for index in range(len(order)):
-        if len(kept) < MAX_STARTS and not any(alike[other][index] for other in kept):
-            kept.append(index)
-    return Starts(starts.labels[order[kept]], starts.fundamentals[order[kept]])
+        if len(selected) < MAX_STARTS and not any(alike[other][index] for other in selected):
+            selected.append(index)
+    return Starts(starts.labels[order[selected]], starts.fundamentals[order[selected]])
 
 
 def set_starts(pool: Tensor, cost: Tensor, sets: Tensor) -> Starts:
     """The starts of the first sets ``(s, K)`` of geometries ``(P, 3, 3)``: each match to the one of least cost ``(P, n)``."""
     chosen = sets[: 8 * MAX_STARTS]
     return Starts(cost[chosen].argmin(1), pool[chosen])
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Pairs of geometries by the segmentation matrix, among the starts of a segmentation.
-
-
-def matrix_pairs(view: View, groups: Tensor, rounds: int) -> Tensor:
-    """Geometries ``(2 g, 3, 3)`` of the segmentation matrices of groups ``(b, n)``, 0 and 1; those too small are left out."""
-    groups = groups[groups.sum(-1) >= MATRIX_MATCHES]
-    x1, x2 = (x.expand(len(groups), -1, -1) for x in (view.x1, view.x2))
-    weights = groups
-    for _ in range(rounds if len(groups) else 0):
-        tensor = fit(SegmentationMatrix, x1, x2, weights=weights).tensor
-        weights = groups * SegmentationMatrix.reweight(tensor, x1, x2)
-    if not len(groups):
-        return view.x1.new_zeros(0, 3, 3)
-    found = torch.cat(SegmentationMatrix.fundamentals(fit(SegmentationMatrix, x1, x2, weights=weights).tensor))
-    return found[found.isfinite().all((-2, -1)) & (found != 0).any((-2, -1))]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -258,44 +243,28 @@ def descend_starts(view: View, starts: Sequence[Starts]) -> dict[int, list[Candi
     fundamentals[rows] = geometry
     fundamentals = fundamentals.unflatten(0, present.shape)
     total = energy(view, fundamentals, hard)
-    whole = ~((hard.sum(-1) < MIN_BODY_MATCHES) & present).any(-1)
-    found: dict[int, list[Candidate]] = {}
+    sound = ~((hard.sum(-1) < MIN_BODY_MATCHES) & present).any(-1)
+    candidates: dict[int, list[Candidate]] = {}
     for count in sorted({s.fundamentals.shape[1] for s in starts}):
-        these = ((bodies == count) & whole).nonzero().flatten()
+        these = ((bodies == count) & sound).nonzero().flatten()
         these = these[total[these].argsort(stable=True)]
-        found[count] = [Candidate(float(total[i]), labels[i], fundamentals[i, :count]) for i in these.tolist()]
-    return found
+        candidates[count] = [Candidate(float(total[i]), labels[i], fundamentals[i, :count]) for i in these.tolist()]
+    return candidates
 
 
-def search(
-    view: View, counts: Sequence[int], generator: torch.Generator | None, extra: Sequence[Tensor] = (), *, num_starts: int
-) -> dict[int, list[Candidate]]:
-    """Segmentations into each number of bodies, the cheapest first.
-
-    Args:
-        view: matches, without outliers.
-        counts: numbers of bodies.
-        generator: source of all randomness.
-        extra: further labellings ``(n,)`` from 0 to start from.
-
-    Returns:
-        Candidates for each number; none where no start had so many bodies of enough matches.
-    """
+def search(view: View, counts: Sequence[int], generator: torch.Generator | None, num_starts: int) -> dict[int, list[Candidate]]:
+    """Segmentations of matches, without outliers, into each number of bodies, the cheapest first; none where no start had so many
+    bodies of enough matches."""
     flows = sorted({max(2, count + more) for count in counts for more in (0, 1)})
     plan = torch.tensor(flows, device=view.x1.device).repeat(num_starts if len(flows) > 2 else 2 * num_starts)
     labels = affine_flows(view.x1, view.x2, view.links, plan, MIN_FLOW_NOISE_PIXELS * view.pixel, generator)
-    widths = [(labels, int(plan.max())), *((x[None], int(x.max()) + 1) for x in extra), (torch.zeros_like(labels[:1]), 1)]
-    pool = fit_pool(view, torch.cat([one_hot(x, width).flatten(0, 1) for x, width in widths]))
-    if max(counts) > 1:
-        # linear: the search improves it, and its weights would take longer than all flows
-        pool = torch.cat([pool, matrix_pairs(view, torch.ones_like(view.x1[None, :, 0]), rounds=0)])
+    pool = fit_pool(view, torch.cat([one_hot(labels, int(plan.max())).flatten(0, 1), torch.ones_like(view.x1[None, :, 0])]))
     cost = smooth_costs(rough_cost(view, pool), view)
     sets = best_sets(cost, max(counts))
     starts = []
     for count in counts:
         starts.append(set_starts(pool, cost, sets[count - 1]))
-        groups = [labels[plan == count], *(x[None] for x in extra if int(x.max()) + 1 == count)]
-        starts += [fit_labellings(view, x, count) for x in groups if len(x)]
+        starts += [fit_labellings(view, labels[plan == count], count)] if count in flows else []
     return descend_starts(view, [select_distinct(view, start) for start in starts])
 
 
@@ -319,8 +288,8 @@ def search_samples(
         if count <= len(pool):
             chosen = sets[count - 1][:NUM_DESCENDED_SETS]
             starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
-    found = descend_starts(view, starts) if starts else {}
-    return {count: _rank_candidates(view, found.get(count, [])) for count in counts}
+    candidates = descend_starts(view, starts) if starts else {}
+    return {count: _rank_candidates(view, candidates.get(count, [])) for count in counts}
 
 
 def _rank_candidates(view: View, candidates: list[Candidate]) -> list[Candidate]:
@@ -354,7 +323,7 @@ def _remove_duplicates(view: View, pool: Tensor) -> Tensor:
 def _pool(view: View, least: int, most: int, generator: torch.Generator | None, max_samples: int) -> Tensor:
     """Geometries ``(P, 3, 3)``: of samples from all matches, then from those that sets of one, two, ... leave unexplained."""
     left = torch.ones_like(view.x1[None, :, 0])
-    pool = matrix_pairs(view, left[: most - 1], NUM_MATRIX_ROUNDS)  # none for a single body
+    pool = view.x1.new_zeros(0, 3, 3)
     last = ENERGY_MAX_SQUARED_DISTANCE * len(view.x1)
     for count in range(1, most + 1):
         pool = _remove_duplicates(
@@ -386,11 +355,11 @@ def _sample_geometries(view: View, weight: Tensor, parts: int, generator: torch.
     best, votes = view.x1.new_zeros(0, 3, 3), single.new_zeros(0)
     drawn, needed = 0, 1.0
     while drawn < min(needed, max_samples / parts):
-        found, valid = sample_fundamentals(view.x1, view.x2, weight[None], SAMPLES_AT_ONCE // parts, generator)
+        geometries, valid = sample_fundamentals(view.x1, view.x2, weight[None], SAMPLES_AT_ONCE // parts, generator)
         drawn += SAMPLES_AT_ONCE // parts
-        found = found[valid]
-        totals = [_votes(part, x1, x2, single, SAMPLE_DISTANCE_PIXELS * view.pixel) for part in found.float().split(BLOCK)]
-        best, votes = torch.cat([best, found]), torch.cat([votes, *totals])
+        geometries = geometries[valid]
+        totals = [_votes(part, x1, x2, single, SAMPLE_DISTANCE_PIXELS * view.pixel) for part in geometries.float().split(BLOCK)]
+        best, votes = torch.cat([best, geometries]), torch.cat([votes, *totals])
         votes, place = votes.topk(min(NUM_DESCENDED_SAMPLES // parts, len(votes)))
         best = best[place]
         share = float(votes[0] / single.sum()) if len(votes) else 0.0

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from math import inf, prod
+from dataclasses import dataclass, fields, replace
+from math import inf, nan
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from dyntorch.core.limits import median
 from dyntorch.core.matches import matches
-from dyntorch.core.outcome import Notice, Status, noting
+from dyntorch.core.outcome import Notice, Status, stack_results
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import similarity, unit
 from dyntorch.geometry.homography import homography_sampson_squared
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
-from dyntorch.numerics.blocks import one_thread, uniform
+from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.messages import Message
 from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS, Links, View, coherence
-from dyntorch.tasks.segment.labels import Labelling, Models, label_matches, select_models, significant
-from dyntorch.tasks.segment.result import BodyModel, Segmentation, SegmentNotice
-from dyntorch.tasks.segment.search import MIN_BODY_MATCHES, Candidate, one_hot, search, search_samples
+from dyntorch.tasks.segment.labels import Labelling, label_matches, select_models, significant
+from dyntorch.tasks.segment.result import Segmentation, SegmentNotice, count_notices
+from dyntorch.tasks.segment.search import MIN_BODY_MATCHES, Candidate, draw_subset, one_hot, search, search_samples
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,6 @@ BODY_PENALTY = 4.5  # in units of the root of the number of matches
 BODY_PENALTY_GEOMETRY_ONLY = 6.2  # spurious bodies explain up to 4.9, true ones 7.6 and more
 SAME_SEGMENTATION_SHARE = 0.9  # share of equal labels from which two segmentations are one
 MIN_RUNNER_UP_COST = 1.0  # beyond the least cost, in units of the root of the number of matches
-MIN_UNEXPLAINED_MATCHES = 10  # linked matches without a body from which one body more is tried
-MIN_UNEXPLAINED_SHARE = 0.08  # their share of all linked ones
 FAR_DISTANCE = 20.0  # from the middle, over the median one: garbage where neighbours do not matter
 MAX_DISTANCE = 1e3  # from the middle of the matches, over the median one, to which farther ones are moved
 MAX_RELATIVE_THRESHOLD = 0.2  # over the spread of the points, from which the problem is refused
@@ -72,13 +71,22 @@ MIN_LINKED_SHARE = 0.3  # of the matches, without a notice
 
 
 @dataclass(frozen=True)
+class Request:
+    """What was asked for, as in :func:`dyntorch.segment`."""
+
+    bodies: int | None
+    threshold: float | None
+    spatial: bool
+    generator: torch.Generator | None
+    options: SegmentOptions
+
+
+@dataclass(frozen=True)
 class CountSelection:
     """The segmentation that was chosen."""
 
     candidate: Candidate  # itself
     spare: bool = False  # whether fewer bodies than were asked for cost less, penalties included
-    further: Candidate | None = None
-    """The best segmentation into one body more, where their number was open."""
     rival: float = inf
     """What the best other segmentation into as many costs more, in units of the root of the number of matches."""
 
@@ -86,36 +94,36 @@ class CountSelection:
 def select_count(search: Search, matches: int, bodies: int | None, penalty: float, max_bodies: int) -> CountSelection | None:
     """The best segmentation of so many matches into ``bodies``, or, for None, into the number of least penalized cost."""
     room = max(1, matches // MIN_BODY_MATCHES)
-    known: dict[int, Candidate] = {}
+    best_by_count: dict[int, Candidate] = {}
     rivals: dict[int, float] = {}
 
-    def penalized(count: int) -> float:
-        return known[count].energy + penalty * count * matches**0.5
+    def penalized_cost(count: int) -> float:
+        return best_by_count[count].energy + penalty * count * matches**0.5
 
     def cheapest(counts: Sequence[int]) -> dict[int, Candidate]:
-        found = {count: candidates for count, candidates in search(counts).items() if candidates}
-        rivals.update({count: _runner_up_cost(candidates) / matches**0.5 for count, candidates in found.items()})
-        return {count: candidates[0] for count, candidates in found.items()}
+        results = {count: candidates for count, candidates in search(counts).items() if candidates}
+        rivals.update({count: _runner_up_cost(candidates) / matches**0.5 for count, candidates in results.items()})
+        return {count: candidates[0] for count, candidates in results.items()}
 
     if bodies is not None:
         for count in range(min(bodies, room), 0, -1):
             # one body fewer tells whether so many were needed
-            known |= cheapest(range(max(1, count - 1), count + 1))
-            if count in known:
-                spare = count > 1 and count - 1 in known and penalized(count - 1) < penalized(count)
-                return CountSelection(known[count], spare, rival=rivals[count])
+            best_by_count |= cheapest(range(max(1, count - 1), count + 1))
+            if count in best_by_count:
+                spare = count > 1 and count - 1 in best_by_count and penalized_cost(count - 1) < penalized_cost(count)
+                return CountSelection(best_by_count[count], spare, rival=rivals[count])
         return None
     top = 0
     while top < min(room, max_bodies):
         last, top = top, min(top + (NUM_FURTHER_COUNTS if top else NUM_FIRST_COUNTS), room, max_bodies)
-        known |= cheapest(range(last + 1, top + 1))
-        chosen = min(known, key=penalized, default=0)
+        best_by_count |= cheapest(range(last + 1, top + 1))
+        chosen = min(best_by_count, key=penalized_cost, default=0)
         if chosen < top:
             break
-    if not known:
+    if not best_by_count:
         return None
-    count = min(known, key=penalized)
-    return CountSelection(known[count], further=known.get(count + 1), rival=rivals[count])
+    count = min(best_by_count, key=penalized_cost)
+    return CountSelection(best_by_count[count], rival=rivals[count])
 
 
 def _runner_up_cost(candidates: Sequence[Candidate]) -> float:
@@ -145,12 +153,10 @@ class PreparedMatches:
     scale: float  # of both
     coherence: Tensor  # ``(m,)`` in [0, 1]
     keep: Tensor  # indices among the m of those that may belong to a body
-    groups: Tensor  # ``(k,)`` of the kept ones, linked groups from 0; empty where neighbours do not matter
     searched: Tensor  # indices among the kept ones of those that the search looks at
-    repeated: float  # share of matches that repeat others
 
     @property
-    def linked(self) -> float:
+    def linked_share(self) -> float:
         """Share of the matches that may belong to a body."""
         return len(self.keep) / max(1, len(self.present))
 
@@ -161,73 +167,50 @@ class PreparedMatches:
         return full
 
 
-@dataclass(frozen=True)
-class SegmentedProblem:
-    """Result of one problem of n matches with K = ``count`` bodies."""
-
-    labels: Tensor  # ``(n,)``
-    probabilities: Tensor  # ``(n, K + 1)``
-    fundamentals: Tensor  # ``(K, 3, 3)``
-    homographies: Tensor
-    models: tuple[BodyModel, ...]  # K of them
-    residuals: Tensor  # ``(n,)``
-    coherence: Tensor
-    threshold: Tensor  # ``()``
-    status: Status  # of the problem
-    repeated: float  # share of matches that repeat others
-    linked: float  # share of matches that move like neighbours of theirs
-    spare: bool = False  # whether fewer bodies than were asked for explain the matches as well
-    coarse: float = 0.0  # the threshold over the spread of the points, where it is too large to tell anything; else 0
-    rival: float = inf  # what the best other segmentation costs more, in units of the root of the number of matches
-
-    @property
-    def count(self) -> int:
-        """Bodies."""
-        return len(self.models)
-
-
-def no_bodies(weights: Tensor, threshold: float, status: Status, repeated: float, linked: float = 0.0) -> SegmentedProblem:
+def _no_bodies(weights: Tensor, threshold: float, status: Status, notices: Sequence[Notice]) -> Segmentation:
     """No bodies: all matches ``(n,)`` are outliers, those with weight surely."""
-    none = torch.zeros(0, 3, 3, dtype=torch.float64, device=weights.device)
-    return SegmentedProblem(
+    none = torch.zeros(0, 3, 3, dtype=torch.float64)
+    return Segmentation(
         labels=torch.zeros_like(weights, dtype=torch.long),
-        probabilities=(weights > 0).double()[:, None],
-        fundamentals=none,
+        bodies=torch.tensor(0),
         homographies=none,
-        models=(),
+        planar=torch.zeros(0, dtype=torch.bool),
+        probabilities=(weights > 0).double()[:, None],
         residuals=torch.zeros_like(weights),
-        coherence=torch.zeros_like(weights),
         threshold=weights.new_tensor(threshold),
-        status=status,
-        repeated=repeated,
-        linked=linked,
+        fundamentals=none,
+        coherence=torch.zeros_like(weights),
+        status=torch.tensor(int(status)),
+        notices=tuple(notices),
     )
 
 
-def describe_bodies(
-    given: PreparedMatches, labelled: Labelling, threshold: float, bodies: int | None, spare: bool
-) -> SegmentedProblem:
+def _describe_bodies(
+    given: PreparedMatches, labelled: Labelling, threshold: float, request: Request, chosen: CountSelection, notices: list[Notice]
+) -> Segmentation:
     """The labels in order of size, with the model of every body."""
     labelled = _sort_bodies(labelled)
     labels, fundamentals = labelled.labels, labelled.fundamentals
     count = len(fundamentals)
+    rival = [Notice(SegmentNotice.UNDECIDED, chosen.rival)] if count > 1 and chosen.rival < MIN_RUNNER_UP_COST else []
+    notices = [*count_notices(count, request.bodies, chosen.spare), *rival, *notices]
     if not count:
-        return no_bodies(given.weights, threshold, Status.NO_CONSENSUS, given.repeated, given.linked)
-    models = select_models(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present])
-    planar = unit(torch.linalg.inv(given.second) @ models.homographies @ given.first)
-    return SegmentedProblem(
+        return _no_bodies(given.weights, threshold, Status.NO_CONSENSUS, notices)
+    homographies, planar = select_models(given.view, fundamentals, one_hot(labels - 1, count) * given.weights[given.present])
+    residuals = _residuals(given.view, labels, fundamentals, homographies, planar) / given.scale
+    homographies = unit(torch.linalg.inv(given.second) @ homographies @ given.first)
+    return Segmentation(
         labels=given.spread(labels),
+        bodies=torch.tensor(count),
+        homographies=torch.where(planar[:, None, None], homographies, 0.0),
+        planar=planar,
         probabilities=given.spread(labelled.probabilities.mT),
-        fundamentals=unit(given.second.mT @ fundamentals @ given.first),
-        homographies=torch.where(models.planar[:, None, None], planar, 0.0),
-        models=tuple(BodyModel.HOMOGRAPHY if flat else BodyModel.FUNDAMENTAL for flat in models.planar.tolist()),
-        residuals=given.spread(_residuals(given.view, labels, fundamentals, models) / given.scale),
-        coherence=given.spread(given.coherence),
+        residuals=given.spread(residuals),
         threshold=given.weights.new_tensor(threshold),
-        status=Status.OK if bodies is None or count == bodies else Status.NO_CONSENSUS,
-        repeated=given.repeated,
-        linked=given.linked,
-        spare=spare,
+        fundamentals=unit(given.second.mT @ fundamentals @ given.first),
+        coherence=given.spread(given.coherence),
+        status=torch.tensor(int(Status.OK if request.bodies in (None, count) else Status.NO_CONSENSUS)),
+        notices=tuple(notices),
     )
 
 
@@ -238,69 +221,28 @@ def _sort_bodies(labelled: Labelling) -> Labelling:
     return labelled.of(order[members.sum(-1)[order] >= MIN_BODY_MATCHES])
 
 
-def _residuals(view: View, labels: Tensor, fundamentals: Tensor, models: Models) -> Tensor:
+def _residuals(view: View, labels: Tensor, fundamentals: Tensor, homographies: Tensor, planar: Tensor) -> Tensor:
     """Distances ``(n,)`` from the own body, of outliers from the nearest one."""
     epipolar = sampson_squared(fundamentals, view.x1, view.x2)
-    planar = homography_sampson_squared(models.homographies, view.x1, view.x2)
-    square = torch.where(models.planar[:, None], planar, epipolar)
+    square = torch.where(planar[:, None], homography_sampson_squared(homographies, view.x1, view.x2), epipolar)
     own = square.gather(0, (labels - 1).clamp(min=0)[None])[0]
     return torch.where(labels > 0, own, square.amin(0)).sqrt()
-
-
-def segmentation_notices(found: list[SegmentedProblem], bodies: int | None, batch: tuple[int, ...]) -> tuple[Notice, ...]:
-    """What limits the results of a batch."""
-    if not found:
-        return ()
-
-    def figures(name: str) -> Tensor:
-        return torch.tensor([float(getattr(problem, name)) for problem in found], dtype=torch.float32)
-
-    count, repeated, linked, coarse, rival = map(figures, ("count", "repeated", "linked", "coarse", "rival"))
-    tried = torch.tensor([outcome.status != Status.TOO_FEW for outcome in found])
-    spatial = linked < 1.0  # where neighbours do not matter, all matches count
-    said, note = noting(batch)
-    tried = tried & (coarse == 0)
-    note(SegmentNotice.COARSE, coarse, coarse > 0)
-    if bodies is not None:
-        note(SegmentNotice.FEWER_BODIES, count, tried & (count < bodies), asked=bodies)
-        # where a body got lost, the notice above says so
-        spare = torch.tensor([outcome.spare for outcome in found]) & (count == bodies)
-        note(SegmentNotice.SPARE_BODY, count - 1, spare, asked=bodies)
-    note(SegmentNotice.UNDECIDED, rival, tried & (count > 1) & (rival < MIN_RUNNER_UP_COST))
-    note(SegmentNotice.REPEATED, repeated, repeated > MAX_REPEATED_SHARE)
-    note(SegmentNotice.INCOHERENT, linked, tried & spatial & (linked < MIN_LINKED_SHARE))
-    return tuple(said)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
 # One problem of segment(): from matches of two views to labelled bodies, through what moves alike.
 
 
-MEDIANS = {BodyModel.FUNDAMENTAL: median(1) ** 0.5, BodyModel.HOMOGRAPHY: median(2) ** 0.5}
-"""Median Sampson distance of inliers, in units of the noise of a coordinate."""
-
-
-@dataclass(frozen=True)
-class Request:
-    """What was asked for, as in :func:`dyntorch.segment`."""
-
-    bodies: int | None
-    threshold: float | None
-    spatial: bool
-    generator: torch.Generator | None
-    options: SegmentOptions
-
-
-def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request) -> SegmentedProblem:
+def solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request) -> Segmentation:
     """Segment one problem of matches ``(n, 2)`` with weights ``(n,)``, 0 = missing."""
     if request.threshold is not None:
         return _solve(x1, x2, weights, request, request.threshold)
     size = _diagonal(x1[weights > 0])
     first = _solve(x1, x2, weights, request, FIRST_THRESHOLD * size if size > 0 else 1.0)
-    if not first.count:
+    if not int(first.bodies):
         return first
     # the median distance in standard deviations: in one dimension from epipolar lines, in two from the points of a plane
-    medians = first.labels.new_tensor([MEDIANS[model] for model in first.models], dtype=x1.dtype)
+    medians = x1.new_tensor([median(1), median(2)])[first.planar.long()].sqrt()
     inlier = first.labels > 0
     noise = float((first.residuals[inlier] / medians[first.labels[inlier] - 1]).median())
     return _solve(x1, x2, weights, request, max(THRESHOLD_SIGMAS * noise, 1e-6 * size))
@@ -314,59 +256,48 @@ def _diagonal(x: Tensor) -> float:
     return float((high - low).norm()) / 0.9
 
 
-def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float) -> SegmentedProblem:
+def _solve(x1: Tensor, x2: Tensor, weights: Tensor, request: Request, threshold: float) -> Segmentation:
     options = request.options
     present = (weights > 0).nonzero().flatten()
     distinct, *places = (len(torch.unique(x[present], dim=0)) for x in (torch.cat([x1, x2], dim=-1), x1, x2))
     # points that are all in one place of a view fit any motion of that place
     distinct = min(places) if min(places) < MIN_BODY_MATCHES + 1 else distinct
     repeated = 1 - distinct / len(present) if len(present) else 0.0
+    notices = [Notice(SegmentNotice.REPEATED, repeated)] if repeated > MAX_REPEATED_SHARE else []
     if distinct < MIN_BODY_MATCHES + 1:
-        return no_bodies(weights, threshold, Status.TOO_FEW, repeated)
-    given = _prepare_matches(x1[present], x2[present], weights, present, threshold, request, repeated)
-    if THRESHOLD_PIXELS * given.view.pixel > MAX_RELATIVE_THRESHOLD:
-        refused = no_bodies(weights, threshold, Status.AMBIGUOUS, repeated, given.linked)
-        return replace(refused, coarse=THRESHOLD_PIXELS * given.view.pixel)
+        return _no_bodies(weights, threshold, Status.TOO_FEW, notices)
+    given = _prepare_matches(x1[present], x2[present], weights, present, threshold, request)
+    coarse = THRESHOLD_PIXELS * given.view.pixel
+    if coarse > MAX_RELATIVE_THRESHOLD:
+        return _no_bodies(weights, threshold, Status.AMBIGUOUS, [Notice(SegmentNotice.COARSE, coarse), *notices])
+    notices += [Notice(SegmentNotice.INCOHERENT, given.linked_share)] if given.linked_share < MIN_LINKED_SHARE else []
     part = given.view.subset(given.keep[given.searched])
 
-    def searched(counts: Sequence[int]) -> dict[int, list[Candidate]]:
+    def find_candidates(counts: Sequence[int]) -> dict[int, list[Candidate]]:
         if not request.spatial:
             return search_samples(part, counts, request.generator, options.max_samples)
-        groups = given.groups[given.searched]
-        extra = [groups] if int(groups.max()) < options.max_bodies else []
-        return search(part, counts, request.generator, extra, num_starts=options.num_starts)
+        return search(part, counts, request.generator, options.num_starts)
 
     penalty = BODY_PENALTY if request.spatial else BODY_PENALTY_GEOMETRY_ONLY
     chosen = (
-        select_count(searched, len(part.x1), request.bodies, penalty, options.max_bodies)
+        select_count(find_candidates, len(part.x1), request.bodies, penalty, options.max_bodies)
         if len(part.x1) > MIN_BODY_MATCHES
         else None
     )
     if chosen is None:
-        return no_bodies(weights, threshold, Status.NO_CONSENSUS, repeated, given.linked)
+        return _no_bodies(weights, threshold, Status.NO_CONSENSUS, [*count_notices(0, request.bodies, False), *notices])
     labelled = _label_all(given, chosen.candidate, request)
-    left = _num_unexplained(given, labelled)
-    if chosen.further is not None and left >= max(MIN_UNEXPLAINED_MATCHES, MIN_UNEXPLAINED_SHARE * len(given.keep)):
-        # matches that move like their neighbours and fit no body: there is another one, which the truncated distances hid
-        other = _label_all(given, chosen.further, request)
-        labelled = other if _num_unexplained(given, other) < 0.5 * left else labelled
-    return replace(describe_bodies(given, labelled, threshold, request.bodies, chosen.spare), rival=chosen.rival)
+    return _describe_bodies(given, labelled, threshold, request, chosen, notices)
 
 
 def _label_all(given: PreparedMatches, candidate: Candidate, request: Request) -> Labelling:
     """Labels of all matches by a segmentation of those that were searched."""
-    found = torch.zeros_like(given.present)
-    found[given.keep[given.searched]] = candidate.labels + 1
+    labels = torch.zeros_like(given.present)
+    labels[given.keep[given.searched]] = candidate.labels + 1
     pixel = given.view.pixel
-    near, share = (MATCH_NOISE_PIXELS * pixel, 1 - given.linked) if request.spatial else (None, request.options.outlier_share)
+    near, share = (MATCH_NOISE_PIXELS * pixel, 1 - given.linked_share) if request.spatial else (None, request.options.outlier_share)
     labelled = label_matches(
-        given.view,
-        found,
-        candidate.fundamentals,
-        given.weights[given.present],
-        THRESHOLD_PIXELS * pixel,
-        near,
-        share,
+        given.view, labels, candidate.fundamentals, given.weights[given.present], THRESHOLD_PIXELS * pixel, near, share
     )
     if request.spatial:
         return labelled
@@ -374,19 +305,8 @@ def _label_all(given: PreparedMatches, candidate: Candidate, request: Request) -
     return labelled.of(significant(given.view, labelled.fundamentals, labelled.labels, request.options.false_alarms))
 
 
-def _num_unexplained(given: PreparedMatches, labelled: Labelling) -> int:
-    """How many of the kept matches became outliers."""
-    return int((labelled.labels[given.keep] == 0).sum()) if len(given.groups) else 0
-
-
 def _prepare_matches(
-    x1: Tensor,
-    x2: Tensor,
-    weights: Tensor,
-    present: Tensor,
-    threshold: float,
-    request: Request,
-    repeated: float,
+    x1: Tensor, x2: Tensor, weights: Tensor, present: Tensor, threshold: float, request: Request
 ) -> PreparedMatches:
     """The present matches ``(m, 2)`` around 0 and of about unit size, by one scale: distances stay comparable."""
     centres = x1.median(0).values, x2.median(0).values
@@ -399,34 +319,19 @@ def _prepare_matches(
     a, b = (((x - centre) * scale).clamp(-MAX_DISTANCE, MAX_DISTANCE) for x, centre in zip((x1, x2), centres, strict=True))
     pixel = threshold / THRESHOLD_PIXELS * float(scale)
     values = torch.zeros_like(a[:, 0])
-    some = _draw_subset(len(a), request.generator, a.device, request.options.max_searched)
+    some = draw_subset(len(a), request.options.max_searched, request.generator, a.device)
     if request.spatial:
-        graph = coherence(a, b, MATCH_NOISE_PIXELS * pixel, some)
-        values, links = graph.values, graph.links
-        keep, groups = _groups(values, links)
+        values, links = coherence(a, b, MATCH_NOISE_PIXELS * pixel, some)
+        # in linked groups large enough for a body
+        component = links.components(MIN_LINK_WEIGHT, values > MIN_COHERENCE)
+        keep = (torch.bincount(component)[component] >= MIN_BODY_MATCHES).nonzero().flatten()
     else:
         links = Links(torch.zeros(len(a), 0, dtype=torch.long, device=a.device), a.new_zeros(len(a), 0))
         # without neighbours nothing but the place tells garbage, one of which can spoil the depth of a whole body
         keep = (torch.cat([a, b], dim=-1).norm(dim=-1) < FAR_DISTANCE).nonzero().flatten()
-        groups = keep[:0]
     view = View(a, b, pixel, links)
     searched = some[keep].nonzero().flatten()
-    return PreparedMatches(weights, present, view, first, second, float(scale), values, keep, groups, searched, repeated)
-
-
-def _draw_subset(count: int, generator: torch.Generator | None, device: torch.device, max_searched: int) -> Tensor:
-    """``(m,)`` bool: all matches, or a random part of very many: what is dense beside the noise shows no motion of its own."""
-    if count <= max_searched:
-        return torch.ones(count, dtype=torch.bool, device=device)
-    return uniform(count, generator=generator, device=device).argsort().argsort() < max_searched
-
-
-def _groups(values: Tensor, links: Links) -> tuple[Tensor, Tensor]:
-    """The matches in linked groups large enough for a body, and these groups, from 0."""
-    component = links.components(MIN_LINK_WEIGHT, values > MIN_COHERENCE)
-    _, group, size = component.unique(return_inverse=True, return_counts=True)
-    keep = (size[group] >= MIN_BODY_MATCHES).nonzero().flatten()
-    return keep, torch.unique(group[keep], return_inverse=True)[1]
+    return PreparedMatches(weights, present, view, first, second, float(scale), values, keep, searched)
 
 
 MIN_MATCHES = 8
@@ -500,38 +405,14 @@ def segment(
             f"x1 is {tuple(x1.shape)}: problems of one match each; for points as OpenCV gives them, use x1[:, 0], x2[:, 0]"
         )
     _check_counts(bodies, data.count)
+    request = Request(bodies, threshold, spatial, generator, options)
     with torch.no_grad():
-        found = [
-            solve(first, second, weight, Request(bodies, threshold, spatial, generator, options))
-            for first, second, weight in zip(*data.views, data.weights, strict=True)
-        ]
-    width = max([outcome.count for outcome in found], default=0)
-
-    def stacked(name: str, shape: tuple[int, ...]) -> Tensor:
-        """One part of all outcomes, bodies padded with 0."""
-        parts = [getattr(outcome, name) for outcome in found]
-        result = torch.zeros(len(parts), *shape, dtype=torch.float64, device=data.weights.device)
-        for row, part in zip(result, parts, strict=True):
-            row[tuple(slice(0, size) for size in part.shape)] = part
-        return data.back(result)
-
-    def numbers(values: list[int]) -> Tensor:
-        return data.back(torch.tensor(values, dtype=torch.long, device=data.weights.device))
-
-    n = data.count
-    return Segmentation(
-        labels=data.back(torch.stack([x.labels for x in found]) if found else torch.zeros(0, n, dtype=torch.long)),
-        bodies=numbers([outcome.count for outcome in found]),
-        fundamentals=stacked("fundamentals", (width, 3, 3)),
-        homographies=stacked("homographies", (width, 3, 3)),
-        models=_nest_models([outcome.models for outcome in found], data.batch),
-        probabilities=stacked("probabilities", (n, width + 1)),
-        residuals=stacked("residuals", (n,)),
-        coherence=stacked("coherence", (n,)),
-        status=numbers([int(outcome.status) for outcome in found]),
-        threshold=stacked("threshold", ()),
-        notices=segmentation_notices(found, bodies, data.batch),
-    )
+        results = [solve(a, b, w, request) for a, b, w in zip(*data.views, data.weights, strict=True)]
+    if results:
+        return stack_results(results, data.batch).in_dtype(x1.dtype) if data.batch else results[0].in_dtype(x1.dtype)
+    none = _no_bodies(torch.zeros(data.count, dtype=torch.float64), nan, Status.OK, ())
+    tensors: dict[str, Any] = {one.name: getattr(none, one.name) for one in fields(none) if one.name != "notices"}
+    return replace(none, **{name: x.new_zeros(*data.batch, *x.shape) for name, x in tensors.items()}).in_dtype(x1.dtype)
 
 
 def _check_counts(bodies: int | None, count: int) -> None:
@@ -554,11 +435,3 @@ def _check_counts(bodies: int | None, count: int) -> None:
             "most": count // MIN_BODY_MATCHES,
         }
         raise ValueError(Message(text, **values))
-
-
-def _nest_models(models: list[tuple[BodyModel, ...]], batch: tuple[int, ...]) -> tuple[object, ...]:
-    """Models of a flat batch in its shape."""
-    if not batch:
-        return models[0]
-    step = prod(batch[1:])
-    return tuple(_nest_models(models[i * step : (i + 1) * step], batch[1:]) for i in range(batch[0]))

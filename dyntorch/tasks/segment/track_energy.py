@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import descend, fit_fundamental
-from dyntorch.tasks.segment.coherence import Links, mean_field, relief
+from dyntorch.tasks.segment.coherence import Links, mean_field, relief_cost
 from dyntorch.tasks.segment.frame_pairs import FramePair
 from dyntorch.tasks.segment.search import one_hot
 
@@ -131,7 +131,7 @@ def costs(
     for pair, F in zip(evidence.pairs, geometry, strict=True):
         cost = student_cost(squares(pair, F) / scale.square()[:, None, None])
         if member is not None and relief_weight > 0:
-            cost = cost + relief_weight * relief(pair.view, F, member[..., pair.index].double(), MIN_TRACK_PARALLAX_PIXELS)
+            cost = cost + relief_weight * relief_cost(pair.view, F, member[..., pair.index].double(), MIN_TRACK_PARALLAX_PIXELS)
         total[..., pair.index] += cost
     return total * evidence.share()
 
@@ -140,8 +140,8 @@ def descend_labels(evidence: TrackEvidence, labels: Tensor, bodies: int) -> Cand
     """Labels and epipolar geometries in turns, from several labellings ``(B, n)`` from 0."""
     count = len(labels)
     member = one_hot(labels, bodies).float()
-    found = fit_groups(evidence.pairs, member.flatten(0, 1), FIRST_FIT_SCALES_PIXELS)
-    geometry = [F.unflatten(0, (count, bodies)) for F in found]
+    fits = fit_groups(evidence.pairs, member.flatten(0, 1), FIRST_FIT_SCALES_PIXELS)
+    geometry = [F.unflatten(0, (count, bodies)) for F in fits]
 
     def turn(member: Tensor, geometry: Geometry) -> tuple[Tensor, Tensor]:
         scale = noise(evidence.pairs, geometry, member)
@@ -172,7 +172,7 @@ def energy(
     member = one_hot(labels, geometry[0].shape[1])
     own = (costs(evidence, geometry, scale, member, relief_weight) * member).sum((-2, -1))
     seen = float((evidence.count > 0).sum())
-    total = own + 2 * EFFECTIVE_PAIRS * seen * scale.log() + evidence.links.cut(member)
+    total = own + 2 * EFFECTIVE_PAIRS * seen * scale.log() + evidence.links.cut_weight(member)
     return torch.where(member.sum(-1).amin(-1) >= MIN_BODY_TRACKS, total, torch.inf)
 
 

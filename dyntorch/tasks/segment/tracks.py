@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import log, log1p
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,25 +13,25 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice, Status, select_problem, solve_one_by_one, status_from
 from dyntorch.geometry.pairs import order_of_bodies
 from dyntorch.numerics.arguments import check_options, check_threshold, on_cpu
-from dyntorch.numerics.blocks import one_thread, uniform
+from dyntorch.numerics.blocks import one_thread
 from dyntorch.tasks.segment.agglomeration import (
     MIN_KERNEL_TRACKS,
     NEGLIGIBLE_LINKS,
     GroupCosts,
     NearPairs,
     common_share,
+    cut_into_pieces,
+    keep_strongest,
     links_of,
     merge_pieces,
-    pieces,
     preference_kernel,
-    strongest,
     weakest_separation,
 )
 from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS
 from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs
 from dyntorch.tasks.segment.labels import distances, distances_from_cameras, find_static_body, motions, outliers
-from dyntorch.tasks.segment.result import TrackNotice, TrackSegmentation
-from dyntorch.tasks.segment.search import one_hot
+from dyntorch.tasks.segment.result import SegmentNotice, TrackSegmentation, count_notices
+from dyntorch.tasks.segment.search import draw_subset, one_hot
 from dyntorch.tasks.segment.segment import MIN_MATCHES
 from dyntorch.tasks.segment.track_energy import (
     MIN_BODY_TRACKS,
@@ -92,7 +91,7 @@ class Start:
         most = max(int(cut.max()) + 1 for cut in self.cuts)
         return [merge_pieces(self.judge, cut, range(1, most + 1)) for cut in self.cuts]
 
-    def best(self, bodies: int, thorough: bool = False) -> Candidates | None:
+    def select_best(self, bodies: int, thorough: bool = False) -> Candidates | None:
         """The best segmentation into so many bodies: separate, and of little cost; None where there is none."""
         starts = [tree[bodies] for tree in self.trees if bodies in tree]
         if not starts:
@@ -103,63 +102,56 @@ class Start:
                     exchanges = Exchanges(self.evidence, cut)
                     starts += [exchanges.improve(tree[bodies], weight) for weight in EXCHANGE_CUT_WEIGHTS]
         distinct = [x for place, x in enumerate(starts) if not any(torch.equal(x, other) for other in starts[:place])]
-        found = descend_labels(self.evidence, torch.stack(distinct), bodies)
-        values = [self._value(found.of(which), thorough) for which in range(len(distinct))]
+        candidates = descend_labels(self.evidence, torch.stack(distinct), bodies)
+        values = [self._value(candidates.of(which), thorough) for which in range(len(distinct))]
         best = max(range(len(values)), key=values.__getitem__)
-        return found.of(best) if values[best] > float("-inf") else None
+        return candidates.of(best) if values[best] > float("-inf") else None
 
     def _value(self, one: Candidates, thorough: bool) -> float:
         """How good a segmentation is beside others into as many bodies."""
         if not bool(one.energy.isfinite()):
             return float("-inf")
-        apart = weakest_separation(self.judge, one, SEPARATION_LINK_WEIGHT) if one.bodies > 1 else 0.0
+        separation = weakest_separation(self.judge, one, SEPARATION_LINK_WEIGHT) if one.bodies > 1 else 0.0
         count = len(self.evidence.count)
         if not thorough:
-            return apart - ENERGY_WEIGHT * float(one.energy) / count
+            return separation - ENERGY_WEIGHT * float(one.energy) / count
         cost = energy(self.evidence, one.geometry, one.labels, one.scale, COMPARISON_RELIEF_WEIGHT)
-        cut = self.evidence.links.cut(one_hot(one.labels, one.bodies).double())
-        return SEPARATION_WEIGHT * apart - float(cost + (COMPARISON_CUT_WEIGHT - 1) * cut) / count
+        cut = self.evidence.links.cut_weight(one_hot(one.labels, one.bodies).double())
+        return SEPARATION_WEIGHT * separation - float(cost + (COMPARISON_CUT_WEIGHT - 1) * cut) / count
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """The segmentation that was chosen, and whether one body less would do."""
-
-    candidate: Candidates
-    spare: bool = False
-
-
-def bodies_of(start: Start, bodies: int | None, max_bodies: int) -> Chosen | None:
-    """The best segmentation into ``bodies``, or fewer where there are no so many; for None into as many as there are."""
+def select_bodies(start: Start, bodies: int | None, max_bodies: int) -> tuple[Candidates, bool] | None:
+    """The best segmentation into ``bodies``, or fewer where there are no so many, and whether one body less would do; for None into
+    as many as there are."""
     if bodies is not None:
         for number in range(bodies, 0, -1):
-            found = start.best(number, thorough=len(start.evidence.pairs) >= MIN_EXCHANGE_PAIRS)
-            if found is not None:
-                fewer = start.best(number - 1) if number > 1 else None
-                return Chosen(found, fewer is not None and evidence_of_another(start, fewer, found) < 0)
+            candidate = start.select_best(number, thorough=len(start.evidence.pairs) >= MIN_EXCHANGE_PAIRS)
+            if candidate is not None:
+                fewer = start.select_best(number - 1) if number > 1 else None
+                return candidate, fewer is not None and evidence_of_another(start, fewer, candidate) < 0
         return None
-    chosen = start.best(1)
+    chosen = start.select_best(1)
     if chosen is None:
         return None
     for number in range(2, max_bodies + 1):
-        more = start.best(number)
+        more = start.select_best(number)
         if more is None or evidence_of_another(start, chosen, more) < 0:
             break
         chosen = more
-    return Chosen(chosen)
+    return chosen, False
 
 
 def evidence_of_another(start: Start, fewer: Candidates, more: Candidates) -> float:
     r"""Logarithm of the odds that there is one body more,"""
     member = one_hot(more.labels[0], more.bodies) > 0
     before = one_hot(fewer.labels[0], fewer.bodies) > 0
-    apart = start.judge.separation(member)
+    separation = start.judge.separation(member)
     # the two bodies whose union is most like a body of the other segmentation
-    union = (member[apart.first] | member[apart.second]).double()
+    union = (member[separation.first] | member[separation.second]).double()
     shared = union @ before.double().mT
     likeness = shared / (union.sum(-1, keepdim=True) + before.double().sum(-1) - shared)
     split = int(likeness.amax(-1).argmax())
-    ratio, links = apart.ratio()[split], apart.links[split] + NEGLIGIBLE_LINKS
+    ratio, links = separation.ratio()[split], separation.links[split] + NEGLIGIBLE_LINKS
     saved = float(fewer.energy - more.energy) / len(start.evidence.count) ** 0.5
     return float(
         ANOTHER_BODY_LOGIT
@@ -267,10 +259,10 @@ def segment_tracks(
 
     with torch.no_grad():
         if batch:
-            found = solve_one_by_one(batch, solve, lambda said: _no_bodies(tracks.shape[-2], request, [], Status.TOO_FEW))
+            result = solve_one_by_one(batch, solve, lambda said: _no_bodies(tracks.shape[-2], request, [], Status.TOO_FEW))
         else:
-            found = solve(0)
-    return _to_dtype(found, tracks.dtype)
+            result = solve(0)
+    return result.in_dtype(tracks.dtype)
 
 
 def _check(tracks: Tensor, bodies: int | None, cameras: Tensor | None, generator: torch.Generator | None) -> None:
@@ -304,27 +296,28 @@ def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> Tra
     seen = tracks.isfinite().all(-1)
     # 1. what is there: tracks in two frames at least, frames with tracks in common, motion, one scene
     if not bool((seen.sum(0) > 1).any()):
-        return _no_bodies(count, request, [Notice(TrackNotice.SHORT)])
+        return _no_bodies(count, request, [Notice(SegmentNotice.SHORT)])
     film = TrackSet.of(torch.where((seen.sum(0) > 1)[:, None], tracks, torch.nan), request.pixel)
     refused = _refusal(film, request)
     frames = [] if refused else select_frame_pairs(film, options.max_frame_pairs)
     if refused or not frames:
         common = int((film.seen[:-1] & film.seen[1:]).sum(-1).max())
-        few = Notice(TrackNotice.FEW_COMMON, float(common), {"least": MIN_MATCHES})
+        few = Notice(SegmentNotice.FEW_COMMON, float(common), {"least": MIN_MATCHES})
         return _no_bodies(count, request, [refused or few])
     # 2. which tracks move alike, and the bodies of those that are searched
-    searched = _draw_tracks(film, request)
+    alive = film.seen.any(0).nonzero().flatten()
+    searched = alive[draw_subset(len(alive), options.max_searched, request.generator, alive.device)]
     kernel = preference_kernel(film, searched, request.generator, options.num_hypotheses)
     alike = common_share(kernel[searched])
     if alike < MIN_COMMON_PREFERENCES + MIN_COMMON_PREFERENCES_GROWTH * log(len(searched)):
-        return _no_bodies(count, request, [Notice(TrackNotice.INCOHERENT, alike)])
+        return _no_bodies(count, request, [Notice(SegmentNotice.UNRELATED, alike)])
     start = _start(film, frames, kernel, searched, request)
-    chosen = bodies_of(start, request.bodies, options.max_bodies)
+    chosen = select_bodies(start, request.bodies, options.max_bodies)
     if chosen is None:
         return _no_bodies(count, request, [], Status.NO_CONSENSUS)
     # 3. all tracks follow, and what belongs to no body is told
     pairs = [film.pair(pair) for pair in frames]
-    member = _label_all(film, pairs, kernel, searched, chosen.candidate)
+    member = _label_all(film, pairs, kernel, searched, chosen[0])
     return _outcome(tracks, cameras, film, pairs, kernel, searched, member, chosen, request)
 
 
@@ -333,48 +326,38 @@ def _refusal(film: TrackSet, request: TrackRequest) -> Notice | None:
     cut = find_scene_cut(film)
     if cut is not None:
         values = {"frame": cut.frame, "case": "jump" if cut.jump else ""}
-        return Notice(TrackNotice.CUT, cut.jump or cut.share, values)
-    low = torch.where(film.drop_short[..., None], film.x, torch.inf).amin(0)
-    high = torch.where(film.drop_short[..., None], film.x, -torch.inf).amax(0)
-    way = (high - low).norm(dim=-1)[film.drop_short.any(0)] / film.pixel
+        return Notice(SegmentNotice.CUT, cut.jump or cut.share, values)
+    low = torch.where(film.seen[..., None], film.x, torch.inf).amin(0)
+    high = torch.where(film.seen[..., None], film.x, -torch.inf).amax(0)
+    way = (high - low).norm(dim=-1)[film.seen.any(0)] / film.pixel
     farthest, least = float(way.quantile(0.95)), request.options.min_motion
     if farthest < least:
-        return Notice(TrackNotice.STILL, farthest * request.pixel, {"least": least * request.pixel})
+        return Notice(SegmentNotice.STILL, farthest * request.pixel, {"least": least * request.pixel})
     return None
-
-
-def _draw_tracks(film: TrackSet, request: TrackRequest) -> Tensor:
-    """Indices of the tracks that the search looks at: all, or a random part of very many."""
-    alive = film.drop_short.any(0).nonzero().flatten()
-    most = request.options.max_searched
-    if len(alive) <= most:
-        return alive
-    order = uniform(len(alive), generator=request.generator, device=alive.device).argsort()
-    return alive[order[:most]].sort().values
 
 
 def _start(film: TrackSet, frames: Sequence[tuple[int, int]], kernel: Tensor, searched: Tensor, request: TrackRequest) -> Start:
     """What the search for bodies starts from: links, pairs of frames and pieces of the searched tracks."""
-    part = TrackSet(film.x[:, searched], film.drop_short[:, searched], film.pixel, film.change)
+    part = TrackSet(film.x[:, searched], film.seen[:, searched], film.pixel, film.change)
     inner = kernel[searched]
     inner = (inner + inner.mT) / 2
-    sparse = strongest(inner, NUM_TRACK_NEIGHBOURS)
+    sparse = keep_strongest(inner, NUM_TRACK_NEIGHBOURS)
     pairs = [part.pair(pair) for pair in frames]
     evidence = TrackEvidence.of(pairs, links_of(sparse, TRACK_CUT_COST))
     beside = select_near_pairs(part, MERGE_GAPS, MERGE_PAIRS_PER_GAP, MIN_KERNEL_TRACKS)
     near = NearPairs(part, beside or frames)
     least, most = request.bodies or 1, max(1, len(searched) // MIN_PIECE_TRACKS)
-    cuts = [pieces(sparse, max(min(number, most), min(least, most))) for number in PIECE_COUNTS]
+    cuts = [cut_into_pieces(sparse, max(min(number, most), min(least, most))) for number in PIECE_COUNTS]
     judge = GroupCosts.of(near, inner, one_hot(cuts[0], int(cuts[0].max()) + 1) > 0)
     return Start(evidence, judge, cuts)
 
 
-def _label_all(film: TrackSet, pairs: list[FramePair], kernel: Tensor, searched: Tensor, found: Candidates) -> Tensor:
+def _label_all(film: TrackSet, pairs: list[FramePair], kernel: Tensor, searched: Tensor, candidate: Candidates) -> Tensor:
     """Probabilities ``(K, n)`` of all tracks: those searched have theirs, the others those of what they move like."""
     count = film.x.shape[1]
-    member = torch.zeros(found.bodies, count, dtype=torch.float64, device=film.x.device)
-    member[:, searched] = found.member[0].double()
-    rest = film.drop_short.any(0)
+    member = torch.zeros(candidate.bodies, count, dtype=torch.float64, device=film.x.device)
+    member[:, searched] = candidate.member[0].double()
+    rest = film.seen.any(0)
     rest[searched] = False
     rest = rest.nonzero().flatten()
     if len(rest):
@@ -382,7 +365,7 @@ def _label_all(film: TrackSet, pairs: list[FramePair], kernel: Tensor, searched:
         weight = near.values.double() / near.values.double().sum(-1, keepdim=True).clamp(min=1e-9)
         pulled = (member[:, searched][:, near.indices] * weight).sum(-1) * TRACK_CUT_COST
         evidence = TrackEvidence.of(pairs, no_links(count, film.x.device))
-        cost = costs(evidence, found.geometry, found.scale, member[None])[0][:, rest]
+        cost = costs(evidence, candidate.geometry, candidate.scale, member[None])[0][:, rest]
         member[:, rest] = torch.softmax(pulled - cost, dim=0)
     return member
 
@@ -395,14 +378,14 @@ def _outcome(
     kernel: Tensor,
     searched: Tensor,
     member: Tensor,
-    chosen: Chosen,
+    chosen: tuple[Candidates, bool],
     request: TrackRequest,
 ) -> TrackSegmentation:
     """Labels by size, with motions, the body that stands still, and what limits all that."""
     count = tracks.shape[1]
-    alive = film.drop_short.any(0)
+    alive = film.seen.any(0)
     labels = member.argmax(0)
-    geometry = chosen.candidate.geometry
+    geometry, spare = chosen[0].geometry, chosen[1]
     far = distances(pairs, geometry, count)
     wrong = outliers(far, labels, _support(kernel, labels[searched], labels)) | ~alive
     hard = one_hot(labels, len(member)) * ~wrong
@@ -414,9 +397,10 @@ def _outcome(
     named = torch.where(hard.any(0), hard.argmax(0) + 1, 0)
     own = far.gather(1, (named - 1).clamp(min=0).expand(len(far), 1, -1))[:, 0]
     nearest = torch.where(named > 0, own.square().nanmean(0), far.square().nanmean(0).nan_to_num(nan=torch.inf).amin(0))
-    moved = motions(pairs, [F[:, order] for F in geometry], hard, film)
+    fundamentals, homographies, planar = motions(pairs, [F[:, order] for F in geometry], hard, film)
     static, notices = _static(tracks, cameras, film, hard, pairs, request)
-    notices = [*_count_notices(len(order), chosen, request), *notices]
+    lone = [Notice(SegmentNotice.ONE_BODY, 1.0)] if request.bodies is None and len(order) == 1 else []
+    notices = [*count_notices(len(order), request.bodies, spare, case="tracks"), *lone, *notices]
     bodies = member / member.sum(0).clamp(min=1e-12) * (named > 0)
     missing = (named == 0) & alive
     return TrackSegmentation(
@@ -424,9 +408,9 @@ def _outcome(
         bodies=torch.tensor(len(order)),
         static_body=torch.tensor(static),
         pairs=torch.tensor([pair.frames for pair in pairs]),
-        geometries=moved.fundamentals,
-        homographies=moved.homographies,
-        planar=moved.planar,
+        geometries=fundamentals,
+        homographies=homographies,
+        planar=planar,
         probabilities=torch.cat([missing.double()[None], bodies]).mT,
         residuals=torch.where(nearest.isfinite(), nearest, 0.0).sqrt() * request.pixel,
         threshold=torch.tensor(request.threshold, dtype=torch.float64),
@@ -442,17 +426,6 @@ def _support(kernel: Tensor, searched: Tensor, labels: Tensor) -> Tensor:
     return (same.sum(-1) / top.values.sum(-1).clamp(min=1e-9)).double()
 
 
-def _count_notices(found: int, chosen: Chosen, request: TrackRequest) -> list[Notice]:
-    said = []
-    if request.bodies is not None and found < request.bodies:
-        said.append(Notice(TrackNotice.FEWER_BODIES, float(found), {"asked": request.bodies}))
-    elif request.bodies is not None and chosen.spare:
-        said.append(Notice(TrackNotice.SPARE_BODY, 0.0, {"asked": request.bodies}))
-    if request.bodies is None and found == 1:
-        said.append(Notice(TrackNotice.ONE_BODY, 1.0))
-    return said
-
-
 def _static(
     tracks: Tensor, cameras: Tensor | None, film: TrackSet, hard: Tensor, pairs: list[FramePair], request: TrackRequest
 ) -> tuple[int, list[Notice]]:
@@ -462,11 +435,11 @@ def _static(
         best = int(off.argmin())
         if float(off[best]) <= MAX_CAMERA_DISTANCE * request.threshold:
             return best + 1, []
-        return 0, [Notice(TrackNotice.DISAGREEING, float(off[best]))]
+        return 0, [Notice(SegmentNotice.DISAGREEING, float(off[best]))]
     rests = find_static_body(film, hard)
     if rests is not None:
         return rests + 1, []
-    return 0, [Notice(TrackNotice.UNSURE_STATIC, float(hard.sum(-1).max() / hard.sum()))]
+    return 0, [Notice(SegmentNotice.UNSURE_STATIC, float(hard.sum(-1).max() / hard.sum()))]
 
 
 def _no_bodies(count: int, request: TrackRequest, notices: list[Notice], status: Status | None = None) -> TrackSegmentation:
@@ -486,13 +459,3 @@ def _no_bodies(count: int, request: TrackRequest, notices: list[Notice], status:
         status=status_from(notices) if status is None else torch.tensor(int(status)),
         notices=tuple(notices),
     )
-
-
-def _to_dtype(found: TrackSegmentation, dtype: torch.dtype) -> TrackSegmentation:
-    """With floating-point parts of the type of the tracks, and 0 where a batch is filled up."""
-    parts: dict[str, Any] = {}
-    for one in fields(found):
-        value = getattr(found, one.name)
-        if isinstance(value, Tensor) and value.is_floating_point():
-            parts[one.name] = value.nan_to_num(nan=0.0).to(dtype)
-    return replace(found, **parts)

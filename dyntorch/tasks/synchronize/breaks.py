@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,26 +96,26 @@ def breaks(
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"breaks are told by corresponding points; a has {a.shape[1]} and b {b.shape[1]}: give the same ones")
     clocks = first.times + origin, second.times + origin
-    told = None
+    significant = None
     if not (first.static or second.static):
         start = shift.since(-origin)
         rates = (1.0, shift.rate) if shift.rate != 1 else (1.0,)
         evidence = JumpEvidence(first, second, rates, start.offset if start.sigma < math.inf else None, max_shift, options)
-        told = evidence.select_significant()
-    if told is None or not told[0].jumps:
+        significant = evidence.select_significant()
+    if significant is None or not significant[0].jumps:
         return _without_breaks(shift, clocks)
-    course, nats, residuals = told
-    found = _clock_breaks(course, nats, residuals, *evidence.sizes(course), (first, second), origin)
+    course, nats, residuals = significant
+    clock_breaks = _clock_breaks(course, nats, residuals, *evidence.sizes(course), (first, second), origin)
     a_times, b_times = repair_clocks(
-        first, second, course.rate, course.offset, _snap_to_frames(course, found, (first.step, second.step))
+        first, second, course.rate, course.offset, _snap_to_frames(course, clock_breaks, (first.step, second.step))
     )
     new = a_times.times + origin, b_times.times + origin
     again = synchronize(a, b, times=new, max_shift=max_shift, calibration=calibration, weights=weights, options=options)
     if not again.ok or evidence.is_contradicted(course):
         refused = (Notice(BreakNotice.UNDECIDED, 0.0, {"said": again.reason or "pieces of the take contradict each other"}),)
         return Breaks((), clocks, shift, status=status_from(refused), notices=refused)
-    limits = tuple(_notice(one) for one in found)
-    return Breaks(found, new, again, status=status_from(limits), notices=limits)
+    limits = tuple(_notice(one) for one in clock_breaks)
+    return Breaks(clock_breaks, new, again, status=status_from(limits), notices=limits)
 
 
 def _without_breaks(shift: Shift, clocks: tuple[Tensor, Tensor]) -> Breaks:
@@ -133,14 +133,14 @@ def _clock_breaks(
 ) -> tuple[ClockBreak, ...]:  # fmt: skip
     """The jumps as breaks of one or the other camera."""
     a, b = tracks
-    offset, found = course.offset, []
-    for jump, size, sigma, told, residual in zip(course.jumps, sizes, sigmas, nats, residuals, strict=True):
+    offset, result = course.offset, []
+    for jump, size, sigma, gain, residual in zip(course.jumps, sizes, sigmas, nats, residuals, strict=True):
         moments = jump.moment + origin, jump.moment * course.rate + offset + origin
         loser = 1 if size < 0 else 0  # it lost frames, or the other one has some twice
         lost = abs(size) / (b if loser else a).step / (1.0 if loser else course.rate)
         whole = round(lost)
         fits = whole >= 1 and abs(lost - whole) <= max(WHOLE_FRAME_TOLERANCE, 3 * sigma / (b if loser else a).step)
-        found.append(
+        result.append(
             ClockBreak(
                 candidates=(loser, 1 - loser),
                 moments=(moments[loser], moments[1 - loser]),
@@ -148,18 +148,18 @@ def _clock_breaks(
                 jump=size,
                 jump_sigma=sigma,
                 frames=whole if fits else None,
-                evidence=told,
+                evidence=gain,
                 residuals=(residual, course.fit.residual),
             )
         )
         offset += jump.size
-    return tuple(found)
+    return tuple(result)
 
 
-def _snap_to_frames(course: PiecewiseOffset, found: Sequence[ClockBreak], steps: tuple[float, float]) -> tuple[Jump, ...]:
+def _snap_to_frames(course: PiecewiseOffset, clock_breaks: Sequence[ClockBreak], steps: tuple[float, float]) -> tuple[Jump, ...]:
     """The jumps by whole frames where those fit, else by as much as was measured."""
     exact = []
-    for jump, one in zip(course.jumps, found, strict=True):
+    for jump, one in zip(course.jumps, clock_breaks, strict=True):
         size = one.jump
         if one.frames is not None:
             size = one.frames * steps[0] * course.rate if size > 0 else -one.frames * steps[1]
@@ -174,7 +174,7 @@ def _notice(one: ClockBreak) -> Notice:
         "case": ("frames" if one.frames is not None else "seconds") + ("" if one.camera is None else " of one"),
         "which": one.candidates[0], "other": one.candidates[-1], "at": one.moments[0], "there": one.moments[-1], "lost": lost,
     }  # fmt: skip
-    return Notice(BreakNotice.TWICE if one.doubled else BreakNotice.LOST, one.evidence, values)
+    return Notice(BreakNotice.TWICE if one.is_doubled else BreakNotice.LOST, one.evidence, values)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -250,36 +250,44 @@ def camera_breaks(
         [(1, 5)]
     """
     count = len(tracks)
-    every: dict[str, Sequence[Any] | None] = {
-        "fps": [float(fps)] * count if isinstance(fps, (int, float)) else fps,
-        "times": times,
-        "calibration": calibration,
-        "weights": weights,
-    }
+    every = per_camera(count, fps=fps, times=times, calibration=calibration, weights=weights)
+    own_times = _own_times(tracks, every.get("fps"), times)
+    results: dict[tuple[int, int], Breaks] = {}
+    for (i, j), shift in clocks.shifts.items():
+        try:
+            results[i, j] = breaks(tracks[i], tracks[j], shift, max_shift=max_shift, options=options, **of_pair(every, i, j))
+        except ValueError as error:
+            raise ValueError(f"cameras {i} and {j}: {error}") from error
+    sure = {pair: one for pair, one in results.items() if one.ok}
+    blames = [
+        Blame(pair, _reference(clocks, pair[0], one.moments[one.candidates.index(0)]), one)
+        for pair, result in sure.items()
+        for one in result.breaks
+    ]
+    broken = tuple(
+        one for group in _group_by_moment(blames) for one in _attribute_to_cameras(group, sorted(sure), count, own_times)
+    )
+    limits: tuple[Notice, ...] = tuple(_notice(one) for one in broken)
+    if not sure:
+        reason = next((one.reason for one in results.values()), "no pair was compared")
+        limits = (Notice(BreakNotice.UNDECIDED, 0.0, {"said": reason}),)
+    new = tuple(repair_times(clock, camera, broken) for camera, clock in enumerate(own_times))
+    return Breaks(broken, new, clocks, status=status_from(limits), notices=limits)
+
+
+def per_camera(count: int, **given: Any) -> dict[str, Sequence[Any]]:
+    """Arguments with a value for each camera; of those that are not given, none."""
+    fps = given.get("fps")
+    every = {**given, "fps": [float(fps)] * count if isinstance(fps, (int, float)) else fps}
     for name, values in every.items():
         if values is not None and len(values) != count:
             raise ValueError(f"{name}: {len(values)} values for {count} cameras; give one per camera")
-    own = _own_times(tracks, every["fps"], times)
-    found: dict[tuple[int, int], Breaks] = {}
-    for (i, j), shift in clocks.shifts.items():
-        given: dict[str, Any] = {name: (values[i], values[j]) for name, values in every.items() if values is not None}
-        try:
-            found[i, j] = breaks(tracks[i], tracks[j], shift, max_shift=max_shift, options=options, **given)
-        except ValueError as error:
-            raise ValueError(f"cameras {i} and {j}: {error}") from error
-    sure = {pair: one for pair, one in found.items() if one.ok}
-    blames = [
-        Blame(pair, _reference(clocks, pair[0], one.moments[one.candidates.index(0)]), one)
-        for pair, told in sure.items()
-        for one in told.breaks
-    ]
-    broken = tuple(one for group in _group_by_moment(blames) for one in _attribute_to_cameras(group, sorted(sure), count, own))
-    limits: tuple[Notice, ...] = tuple(_notice(one) for one in broken)
-    if not sure:
-        said = next((one.reason for one in found.values()), "no pair was compared")
-        limits = (Notice(BreakNotice.UNDECIDED, 0.0, {"said": said}),)
-    new = tuple(repair_times(clock, camera, broken) for camera, clock in enumerate(own))
-    return Breaks(broken, new, clocks, status=status_from(limits), notices=limits)
+    return {name: values for name, values in every.items() if values is not None}
+
+
+def of_pair(every: Mapping[str, Sequence[Any]], i: int, j: int) -> dict[str, Any]:
+    """The arguments of two cameras."""
+    return {name: (values[i], values[j]) for name, values in every.items()}
 
 
 def _own_times(tracks: Sequence[Tensor], fps: Sequence[Any] | None, times: Sequence[Tensor] | None) -> list[Tensor]:
@@ -314,7 +322,7 @@ def _attribute_to_cameras(
     group: list[Blame], pairs: Sequence[tuple[int, int]], count: int, times: Sequence[Tensor]
 ) -> list[ClockBreak]:
     """Cameras that broke at about one moment: as long as there is something to explain, the one that explains most of it."""
-    left, found = list(group), []
+    left, attributed = list(group), []
     while left:
         ranked = []
         for camera in range(count):
@@ -325,13 +333,13 @@ def _attribute_to_cameras(
         ranked.sort(key=lambda one: one[:2], reverse=True)
         best, second = ranked[0], ranked[1]
         if best[1] >= 2 and best[:2] > second[:2]:
-            found.append(_of_camera(best[2], best[3], times))
+            attributed.append(_of_camera(best[2], best[3], times))
             left = [one for one in left if one not in best[3]]
         else:
             one = max(left, key=lambda blame: blame.one.evidence)
-            found.append(dataclasses.replace(one.one, candidates=tuple(one.pair[k] for k in one.one.candidates)))
+            attributed.append(dataclasses.replace(one.one, candidates=tuple(one.pair[k] for k in one.one.candidates)))
             left = [other for other in left if not set(other.pair) & set(one.pair)]
-    return found
+    return attributed
 
 
 def _largest_agreeing_set(mine: list[Blame], camera: int, times: Sequence[Tensor]) -> list[Blame]:
@@ -373,7 +381,7 @@ def repair_times(times: Tensor, camera: int, broken: Sequence[ClockBreak]) -> Te
             continue
         size = one.seconds(step)
         later = times > one.moments[0]
-        if not one.doubled:
+        if not one.is_doubled:
             new = torch.where(later, new + size, new)
             continue
         squeezed = later & (times <= one.moments[0] + size)

@@ -15,7 +15,7 @@ from torch import Tensor
 from dyntorch.core.outcome import Notice, status_from
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
-from dyntorch.tasks.synchronize.breaks import camera_breaks
+from dyntorch.tasks.synchronize.breaks import camera_breaks, of_pair, per_camera
 from dyntorch.tasks.synchronize.result import Clocks, ClocksNotice, Pair, Shift, SynchronizeOptions
 from dyntorch.tasks.synchronize.synchronize import synchronize
 
@@ -54,8 +54,8 @@ FIXED_RATE_SIGMA = 1e-9  # The same where no pair searched it.
 def network(shifts: Mapping[tuple[int, int], Shift], cameras: int) -> Network:
     """The pairs' candidates, times and costs."""
     ends, every = torch.tensor(list(shifts)).reshape(-1, 2), list(shifts.values())
-    found = [_candidates(shift) for shift in every]
-    offsets = torch.stack([offset for offset, _ in found])
+    candidates = [_candidates(shift) for shift in every]
+    offsets = torch.stack([offset for offset, _ in candidates])
     center = torch.tensor([_finite(shift.center, 0.0) for shift in every], dtype=torch.float64)
     moments = torch.cat([center[:, None], center[:, None] + offsets], dim=1)
     total, count = torch.zeros(2, cameras, dtype=torch.float64).unbind(0)
@@ -73,7 +73,7 @@ def network(shifts: Mapping[tuple[int, int], Shift], cameras: int) -> Network:
     )
     gain = torch.tensor([_span(shift) for shift in every], dtype=torch.float64) / (2.5 * torch.hypot(sigma, slack))
     gain = gain.clamp(min=1).log()
-    cost = torch.stack([cost for _, cost in found])
+    cost = torch.stack([cost for _, cost in candidates])
     none = torch.tensor([_wrong(shift) for shift in every], dtype=torch.float64)
     rate = torch.tensor([_finite(shift.rate, 1.0) for shift in every], dtype=torch.float64).log()
     weight = torch.tensor([_trust(shift) for shift in every], dtype=torch.float64)
@@ -149,13 +149,13 @@ class Reading:
 def readings(net: Network, reference: int) -> list[Reading]:
     """The likeliest readings that differ in some clock, best first."""
     logs, starts = _search(net, reference)
-    found: dict[tuple[int, ...], Reading] = {}
+    refined: dict[tuple[int, ...], Reading] = {}
     for one_log, one_start in zip(logs, starts, strict=True):
         reading = refine_reading(net, reference, one_log, one_start)
-        if reading.labels not in found or reading.cost < found[reading.labels].cost:
-            found[reading.labels] = reading
+        if reading.labels not in refined or reading.cost < refined[reading.labels].cost:
+            refined[reading.labels] = reading
     different: list[Reading] = []
-    for reading in sorted(found.values(), key=lambda one: one.cost):
+    for reading in sorted(refined.values(), key=lambda one: one.cost):
         if all(differing_cameras(net, reading, other) for other in different):
             different.append(reading)
     return different
@@ -253,13 +253,13 @@ def _distinct(starts: Tensor, cost: Tensor, allowed: float) -> Tensor:
     order = torch.stack([cheap, complete], dim=1).flatten()
     filled = torch.nan_to_num(starts[order], nan=1e15)
     close = torch.cdist(filled, filled, p=torch.inf) <= allowed
-    kept: list[int] = []
+    selected: list[int] = []
     free = torch.ones(len(order), dtype=torch.bool)
     for index in range(len(order)):
-        if free[index] and len(kept) < BEAM_WIDTH:
-            kept.append(index)
+        if free[index] and len(selected) < BEAM_WIDTH:
+            selected.append(index)
             free &= ~close[index]
-    return order[kept]
+    return order[selected]
 
 
 MAX_REWEIGHTINGS = 5  # Reweighted least squares of a state.
@@ -378,32 +378,23 @@ def synchronize_cameras(
         raise ValueError(f"tracks: {count} camera given, two are needed at least")
     if breaks and not correspondence:
         raise ValueError("breaks are told by corresponding points: give correspondence=True, or leave breaks out")
-    every: dict[str, Sequence[Any] | None] = {
-        "fps": [float(fps)] * count if isinstance(fps, (int, float)) else fps,
-        "times": times,
-        "calibration": calibration,
-        "weights": weights,
-    }
-    for name, values in every.items():
-        if values is not None and len(values) != count:
-            raise ValueError(f"{name}: {len(values)} values for {count} cameras; give one per camera")
+    every = per_camera(count, fps=fps, times=times, calibration=calibration, weights=weights)
     if pair is None:
         pair = partial(synchronize, options=options)
     shifts = {}
     for i, j in combinations(range(count), 2) if pairs is None else pairs:
         _check_pair((i, j), count)
-        given: dict[str, Any] = {name: (values[i], values[j]) for name, values in every.items() if values is not None}
         try:
-            shifts[i, j] = pair(tracks[i], tracks[j], correspondence, max_shift=max_shift, **given, **further)
+            shifts[i, j] = pair(tracks[i], tracks[j], correspondence, max_shift=max_shift, **of_pair(every, i, j), **further)
         except ValueError as error:
             raise ValueError(f"cameras {i} and {j}: {error}") from error
     clocks = combine_shifts(shifts, count, reference)
     if not breaks:
         return clocks
-    found = camera_breaks(tracks, clocks, max_shift=max_shift, options=options, **every)
-    given = {name: values for name, values in every.items() if name not in ("fps", "times")}
+    broken = camera_breaks(tracks, clocks, max_shift=max_shift, options=options, **every)
+    given: dict[str, Any] = {name: values for name, values in every.items() if name not in ("fps", "times")}
     again = partial(synchronize_cameras, max_shift=max_shift, reference=reference, pairs=pairs, pair=pair, options=options)
-    return replace(again(tracks, times=found.times, **given, **further) if found.breaks else clocks, breaks=found)
+    return replace(again(tracks, times=broken.times, **given, **further) if broken.breaks else clocks, breaks=broken)
 
 
 @on_cpu
@@ -503,9 +494,9 @@ def _pairs(net: Network, shifts: Mapping[tuple[int, int], Shift], best: Reading)
         i, j = ends
         label = best.labels[edge]
         at, seen = net.times[edge, 0], net.times[edge, 1 + max(label, 0)]
-        said = best.logs[j].exp() * (at / best.logs[i].exp() - best.starts[i] + best.starts[j])
+        expected = best.logs[j].exp() * (at / best.logs[i].exp() - best.starts[i] + best.starts[j])
         value = float(seen + net.means[j] - at - net.means[i])
-        rows.append(Pair(ends, value, shift.sigma, float(seen - said), label, shift.ok))
+        rows.append(Pair(ends, value, shift.sigma, float(seen - expected), label, shift.ok))
     return tuple(rows)
 
 
@@ -515,11 +506,11 @@ def _cycles(
     """What is missing after going round each triangle of pairs that are used, in seconds."""
     step: dict[tuple[int, int], tuple[float, float]] = {}  # rate and offset of one clock against another
     for row in table:
-        if row.used:
+        if row.is_used:
             (i, j), shift = row.cameras, shifts[row.cameras]
             offset = row.shift - shift.center * (shift.rate - 1)
             step[i, j], step[j, i] = (shift.rate, offset), (1 / shift.rate, -offset / shift.rate)
-    found = []
+    errors = []
     for triple in combinations(range(net.cameras), 3):
         way = [(triple[k], triple[(k + 1) % 3]) for k in range(3)]
         if all(ends in step for ends in way):
@@ -527,8 +518,8 @@ def _cycles(
             for ends in way:
                 rate, offset = step[ends]
                 time = rate * time + offset
-            found.append((triple, time - start))
-    return found
+            errors.append((triple, time - start))
+    return errors
 
 
 MIN_LOG_ODDS = log(10)  # Log odds of the best reading over another that differs in cameras tied by accepted pairs.
@@ -536,11 +527,7 @@ MIN_LOG_ODDS_OF_REFUSED = log(300)  # The same where they differ in others: refu
 
 
 def _refusal(
-    net: Network,
-    shifts: Mapping[tuple[int, int], Shift],
-    best: Reading,
-    rivals: Sequence[Reading],
-    reference: int,
+    net: Network, shifts: Mapping[tuple[int, int], Shift], best: Reading, rivals: Sequence[Reading], reference: int
 ) -> Notice | None:
     """Why the pairs do not decide; None where they do."""
     lost = best.starts.isnan().nonzero().flatten().tolist()
@@ -574,23 +561,23 @@ def _surely_tied(shifts: Mapping[tuple[int, int], Shift], best: Reading, referen
 
 def _notices(table: Sequence[Pair], cameras: int, shifts: Mapping[tuple[int, int], Shift]) -> tuple[Notice, ...]:
     """What to know besides."""
-    found = []
-    degree = [sum(row.used and camera in row.cameras for row in table) for camera in range(cameras)]
+    notices = []
+    degree = [sum(row.is_used and camera in row.cameras for row in table) for camera in range(cameras)]
     alone = tuple(camera for camera in range(cameras) if degree[camera] == 1)
     if cameras == 2:
-        found.append(Notice(ClocksNotice.TWO))
+        notices.append(Notice(ClocksNotice.TWO))
     elif alone:
-        found.append(Notice(ClocksNotice.ALONE, float(len(alone)), {"cameras": alone}))
+        notices.append(Notice(ClocksNotice.ALONE, float(len(alone)), {"cameras": alone}))
     for row in table:
         values = {"pair": (row.cameras,), "peak": _place(row.peak)}
-        if row.outlier and row.used:
-            found.append(Notice(ClocksNotice.OUTLIER, row.shift, {"case": "used", **values}))
+        if row.outlier and row.is_used:
+            notices.append(Notice(ClocksNotice.OUTLIER, row.shift, {"case": "used", **values}))
         elif row.outlier:
-            found.append(Notice(ClocksNotice.OUTLIER, row.residual, {"case": "unused", **values}))
-        elif row.used and not row.ok and cameras > 2:
-            found.append(Notice(ClocksNotice.CONFIRMED, row.shift, values))
+            notices.append(Notice(ClocksNotice.OUTLIER, row.residual, {"case": "unused", **values}))
+        elif row.is_used and not row.ok and cameras > 2:
+            notices.append(Notice(ClocksNotice.CONFIRMED, row.shift, values))
     of_pairs = [(ends, note) for ends, shift in shifts.items() for note in shift.notes]
-    return (*found, *(Notice(ClocksNotice.OF_PAIR, 0.0, {"pair": (ends,), "note": note}) for ends, note in of_pairs))
+    return (*notices, *(Notice(ClocksNotice.OF_PAIR, 0.0, {"pair": (ends,), "note": note}) for ends, note in of_pairs))
 
 
 def _place(peak: int) -> str:

@@ -35,7 +35,7 @@ from dyntorch.tasks.synchronize.subspace import (
     subspace_curve,
     subspace_shift,
 )
-from dyntorch.tasks.synchronize.tracks import MAX_FRAME_RATE_ERROR, RATE_SIGNIFICANCE_SIGMAS, Tracks, smooth_at
+from dyntorch.tasks.synchronize.tracks import MAX_FRAME_RATE_ERROR, RATE_SIGNIFICANCE_SIGMAS, Tracks, lag_range, smooth_at
 
 MIN_STEP_SECONDS = 1 / 30  # Step of the search at least: faster videos say no more.
 MIN_SECONDS_FOR_RATE = 20.0  # Overlap from which clock rates are searched.
@@ -43,28 +43,25 @@ MIN_SECONDS_FOR_RATE = 20.0  # Overlap from which clock rates are searched.
 
 def different_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: float | None, options: SynchronizeOptions) -> Shift:
     """The shift of cameras that see different points of one motion."""
-    for name, value, known in (
-        ("measure", options.measure, MEASURES),
-        ("camera_model", options.camera_model, ("auto", *KINDS)),
-    ):
+    for name, value, known in (("measure", options.measure, MEASURES), ("camera_model", options.camera_model, ("auto", *KINDS))):
         if value not in known:
             raise ValueError(f"options.{name} must be one of {', '.join(known)}, got {value!r}")
     step = max(a.step, b.step, MIN_STEP_SECONDS)
     a, b = _orient_axes(a, b, step, rate or 1.0, max_shift)
-    found = _Samples(a, b, step, rate or 1.0)
-    curve = found.curve(max_shift)
-    best = found.shift(curve)
+    samples = _Samples(a, b, step, rate or 1.0)
+    curve = samples.curve(max_shift)
+    best = samples.shift(curve)
     rate_sigma = 0.0
     span = min(float(t.times[-1] - t.times[0]) for t in (a, b))
     if rate is None and span > MIN_SECONDS_FOR_RATE and math.isfinite(best.sigma):
         # a shift that is sure of itself is near enough everywhere; one that is not may be smeared by a wrong rate
-        settled = _rate_by_windows(curve, best, step) if best.ok else _rate_by_search(a, b, step, span, found.lag(best.position))
+        settled = _rate_by_windows(curve, best, step) if best.ok else _rate_by_search(a, b, step, span, samples.lag(best.position))
         ratio, rate_sigma = settled
         if ratio != 1:
-            found = _Samples(a, b, step, ratio)
-            curve = found.curve(max_shift)
-            best = found.shift(curve)
-    body = _result(a, b, found, curve, _refuse_coarse(best, step, max(a.step, b.step)), rate_sigma)
+            samples = _Samples(a, b, step, ratio)
+            curve = samples.curve(max_shift)
+            best = samples.shift(curve)
+    body = _result(a, b, samples, curve, _refuse_coarse(best, step, max(a.step, b.step)), rate_sigma)
     spaces = row_space_shift(a, b, step=step, rate=body.rate, max_shift=max_shift, around=body.offset, options=options)
     if options.measure == options.camera_model == "auto":
         return _test_time_reversal(_refine_by_combinations(a, b, _decide(body, spaces)), curve)
@@ -108,10 +105,10 @@ def _refine_by_combinations(a: Tracks, b: Tracks, shift: Shift) -> Shift:
         return shift
     turned = a.x.shape[-1] == 3  # the fit goes from the camera to the space
     offset, rate = (-shift.offset / shift.rate, 1 / shift.rate) if turned else (shift.offset, shift.rate)
-    found = fit_combination(b, a, offset, rate) if turned else fit_combination(a, b, offset, rate)
-    if found is None:
+    fit = fit_combination(b, a, offset, rate) if turned else fit_combination(a, b, offset, rate)
+    if fit is None:
         return shift
-    place, sigma = (-found.offset * shift.rate, found.sigma * shift.rate) if turned else (found.offset, found.sigma)
+    place, sigma = (-fit.offset * shift.rate, fit.sigma * shift.rate) if turned else (fit.offset, fit.sigma)
     sigma = math.hypot(sigma, (place - shift.offset) / 2)
     if sigma > shift.sigma:
         return shift
@@ -219,11 +216,9 @@ class _Samples:
 
     def curve(self, max_shift: float | None, around: float = 0.0) -> SubspaceCurve:
         """At all lags of a's clock within ``max_shift`` seconds of ``around``."""
-        lo, hi = 1 - len(self.first), len(self.second) - 1
-        if max_shift is not None:
-            low, high = (((around + sign * max_shift) / self.rate - self.start) / self.step for sign in (-1, 1))
-            lo, hi = min(max(lo, math.ceil(low - 1e-9)), hi), max(min(hi, math.floor(high + 1e-9)), lo)
-        return subspace_curve(self.first, self.second, self.wa, self.wb, (lo, max(lo, hi)), step=self.step)
+        frames = len(self.first), len(self.second)
+        lags = lag_range(frames, self.start, self.step, self.rate, max_shift, around, at_least_one=True)
+        return subspace_curve(self.first, self.second, self.wa, self.wb, lags, step=self.step)
 
     def shift(self, curve: SubspaceCurve) -> SubspaceShift:
         return subspace_shift(curve, start=self.start, step=self.step)
@@ -253,15 +248,15 @@ def _rate_by_windows(curve: SubspaceCurve, best: SubspaceShift, step: float) -> 
     lag, reach = round(best.position), round(RATE_SEARCH_SECONDS / step)
     begin, end = max(0, reach - lag), min(len(first.rows), len(second.rows) - lag)
     size = min(round(RATE_WINDOW_SECONDS / step), (end - begin) // 4)
-    found = []
+    windows = []
     for start in range(begin, end - size + 1, size):
         parts = _slice_body(first, start, start + size), _slice_body(second, start + lag - reach, start + lag + size + reach)
         local = subspace_shift(bodies_curve(*parts, (0, 2 * reach), step), step=1.0)
         if math.isfinite(local.sigma) and local.probability > MIN_WINDOW_PROBABILITY and 1 < local.position < 2 * reach - 1:
-            found.append((start + size / 2, local.position, max(local.sigma, MIN_WINDOW_SIGMA_FRAMES)))
-    if len(found) < 3:
+            windows.append((start + size / 2, local.position, max(local.sigma, MIN_WINDOW_SIGMA_FRAMES)))
+    if len(windows) < 3:
         return 1.0, math.inf
-    times, shifts, sigmas = torch.tensor(found, dtype=torch.float64).unbind(1)
+    times, shifts, sigmas = torch.tensor(windows, dtype=torch.float64).unbind(1)
     slopes = torch.combinations(shifts).diff(dim=1)[:, 0] / torch.combinations(times).diff(dim=1)[:, 0]
     slope = slopes.median()
     away = shifts - slope * times
@@ -357,7 +352,7 @@ class RowSpaceShift:
     @property
     def ok(self) -> bool:
         """Whether the lag is beyond doubt."""
-        return _accepts(self.clearness, self.votes)
+        return self.strength >= 1
 
     @property
     def strength(self) -> float:
@@ -367,20 +362,21 @@ class RowSpaceShift:
     @property
     def peaks(self) -> Tensor:
         """``(k, 2)`` lag in seconds and score of local maxima, best first, the first one between frames."""
-        scores, kept = self.curve.totals, list[int]()
+        scores, selected = self.curve.totals, list[int]()
         for place in scores.argsort(descending=True)[:MAX_RANKED_LAGS].tolist():
-            away = all(abs(float(self.curve.lags[place] - self.curve.lags[other])) > self.curve.apart for other in kept)
+            away = all(abs(float(self.curve.lags[place] - self.curve.lags[other])) > self.curve.apart for other in selected)
             if away and math.isfinite(float(scores[place])):
-                kept.append(place)
-        kept = kept[:NUM_PEAKS]
-        found = torch.stack([self.seconds[kept], scores[kept]], dim=1)
-        found[0, 0] = self.lag
-        return found
+                selected.append(place)
+        selected = selected[:NUM_PEAKS]
+        peaks = torch.stack([self.seconds[selected], scores[selected]], dim=1)
+        peaks[0, 0] = self.lag
+        return peaks
 
     @property
     def confidence(self) -> float:
         """Probability that the lag is right, from how clear it is."""
-        return _sigmoid((_strength(self.clearness, self.votes) - 1) * CLEARNESS_ODDS + math.log(19))
+        odds = (self.strength - 1) * CLEARNESS_ODDS + math.log(19)
+        return 1 / (1 + math.exp(-max(min(odds, 700.0), -700.0)))
 
     def exchange(self, rate: float) -> RowSpaceShift:
         """The same with a and b exchanged; ``rate`` of the new b's clock."""
@@ -395,14 +391,6 @@ LONE_CLEARNESS = 3.0  # How much more a single hypothesis needs; in proportion b
 def _strength(clearness: float, votes: float) -> float:
     """Clearness over what these votes need: 1 decides."""
     return clearness / (MIN_CLEARNESS + (1 - votes) * LONE_CLEARNESS)
-
-
-def _accepts(clearness: float, votes: float) -> bool:
-    return _strength(clearness, votes) >= 1
-
-
-def _sigmoid(x: float) -> float:
-    return 1 / (1 + math.exp(-max(min(x, 700.0), -700.0)))
 
 
 MIN_STRENGTH_FOR_REJECTION = 0.35  # Relative clearness below which no track is rejected.
@@ -429,10 +417,10 @@ def row_space_shift(
     if lags is None:
         return None
     kinds = kind_moments(films, lags)
-    found = hypotheses(kinds)
-    if not found:
+    scored = hypotheses(kinds)
+    if not scored:
         return None
-    best, votes = _select_clearest(found)
+    best, votes = _select_clearest(scored)
     kept = tuple(torch.ones(x.x.shape[1], dtype=torch.bool, device=x.x.device) for x in (a, b))
     if MIN_STRENGTH_FOR_REJECTION < _strength(best.clearness, votes) < 1:
         without = _reject_tracks(kinds, best)
@@ -440,8 +428,8 @@ def row_space_shift(
             fewer = hypotheses([one.only(*without) for one in kinds])
             chosen, agree = _select_clearest(fewer)
             if _strength(chosen.clearness, agree) > MIN_CLEARNESS_GAIN * _strength(best.clearness, votes):
-                best, votes, kept, found = chosen, agree, without, fewer
-    kind, place = _locate_between_frames(films.only(*kept), found, best)
+                best, votes, kept, scored = chosen, agree, without, fewer
+    kind, place = _locate_between_frames(films.only(*kept), scored, best)
     seconds = (start + best.lags * step) * rate
     lag, sigma, foreign = (start + place.lag * step) * rate, place.sigma * step * rate, (~kept[0], ~kept[1])
     return RowSpaceShift(lag, sigma, kind, best.clearness, votes, best.margin, best, seconds, foreign)
@@ -453,40 +441,39 @@ MAX_LAGS = 1_200  # Lags; of longer searches those near the best one of shape an
 def _lag_range(films: TrackPair, start: float, max_shift: float | None, around: float) -> tuple[int, int] | None:
     """First and last lag, frames."""
     ta, tb = films.times
-    lo, hi = 1 - len(ta), len(tb) - 1
-    if max_shift is not None:
-        low, high = ((sign * max_shift / films.rate - start) / films.step for sign in (-1, 1))
-        lo, hi = max(lo, math.ceil(low - 1e-9)), min(hi, math.floor(high + 1e-9))
+    lo, hi = lag_range((len(ta), len(tb)), start, films.step, films.rate, max_shift)
     if hi - lo >= MAX_LAGS:
         middle = min(max(round((around - start) / films.step), lo), hi)
         lo, hi = max(lo, middle - MAX_LAGS // 2), min(hi, middle + MAX_LAGS // 2)
     return (lo, hi) if hi - lo >= 2 else None
 
 
-def _select_clearest(found: list[Hypothesis]) -> tuple[Hypothesis, float]:
+def _select_clearest(scored: list[Hypothesis]) -> tuple[Hypothesis, float]:
     """The clearest, and the share of all that say the same lag."""
-    best = max(found, key=lambda one: one.clearness)
-    place = float(best.lags[best.best])
-    return best, sum(abs(float(one.lags[one.best]) - place) <= best.apart for one in found) / len(found)
+    best = max(scored, key=lambda one: one.clearness)
+    place = float(best.lags[best.best_index])
+    return best, sum(abs(float(one.lags[one.best_index]) - place) <= best.apart for one in scored) / len(scored)
 
 
 EQUIVALENT_NATS_SHARE = 0.75  # Share of the nats of the best kind of camera from which another one is equivalent.
 
 
-def _locate_between_frames(films: TrackPair, found: list[Hypothesis], best: Hypothesis) -> tuple[Kind, Place]:
+def _locate_between_frames(films: TrackPair, scored: list[Hypothesis], best: Hypothesis) -> tuple[Kind, Place]:
     """Of the kinds that say the same lag, the one with most nats at its place: cameras as they are leave but noise
     unexplained."""
-    lag = float(best.lags[best.best])
-    same = [one for one in found if abs(float(one.lags[one.best]) - lag) <= best.apart]
+    lag = float(best.lags[best.best_index])
+    same = [one for one in scored if abs(float(one.lags[one.best_index]) - lag) <= best.apart]
     fixed = [one for one in same if one.kind == "affine"]
     chosen = [
-        max(part, key=lambda one: float(one.totals[one.best])) for part in (fixed, [x for x in same if x not in fixed]) if part
+        max(part, key=lambda one: float(one.totals[one.best_index]))
+        for part in (fixed, [x for x in same if x not in fixed])
+        if part
     ]
     places = [(one.kind, refine_lag(films, one)) for one in chosen]
     kind, first = max(places, key=lambda pair: pair[1].nats)
     rivals = [place for _, place in places if place.nats > EQUIVALENT_NATS_SHARE * first.nats]
-    apart = max((abs(place.lag - first.lag) for place in rivals), default=0.0) / 2
-    return kind, replace(first, sigma=math.hypot(first.sigma, apart))
+    half_range = max((abs(place.lag - first.lag) for place in rivals), default=0.0) / 2
+    return kind, replace(first, sigma=math.hypot(first.sigma, half_range))
 
 
 MAX_REJECTED_SHARE = 0.34  # Share of a camera's tracks that may be rejected.
@@ -496,24 +483,24 @@ MIN_TRACKS = 3  # Tracks that stay at least.
 def _reject_tracks(kinds: list[KindMoments], best: Hypothesis) -> tuple[Tensor, Tensor] | None:
     """Tracks of a and of b ``(n,)``, ``(m,)`` bool that are left when those go, one by one, without which a lag stands out more."""
     counts = [kinds[0].films.a.x.shape[1], kinds[0].films.b.x.shape[1]]
-    kept = [torch.ones(count, dtype=torch.bool) for count in counts]
+    remaining = [torch.ones(count, dtype=torch.bool) for count in counts]
     tried = [one for one in kinds if one.kind == best.kind]
     clearest = best.clearness
     for _ in range(math.ceil(MAX_REJECTED_SHARE * max(counts))):
-        found: tuple[float, int, int] | None = None
+        rejection: tuple[float, int, int] | None = None
         for side in (1,) if kinds[0].films.spatial else (0, 1):
-            if int(kept[side].sum()) <= max(MIN_TRACKS, (1 - MAX_REJECTED_SHARE) * counts[side]):
+            if int(remaining[side].sum()) <= max(MIN_TRACKS, (1 - MAX_REJECTED_SHARE) * counts[side]):
                 continue
-            for point in kept[side].nonzero()[:, 0].tolist():
-                rest = [mask.clone() for mask in kept]
+            for point in remaining[side].nonzero()[:, 0].tolist():
+                rest = [mask.clone() for mask in remaining]
                 rest[side][point] = False
                 clear = max(
                     (h.clearness for one in tried if (h := one.only(*rest).hypothesis(best.level)) is not None), default=0.0
                 )
-                if found is None or clear > found[0]:
-                    found = clear, side, point
-        if found is None or found[0] < clearest * MIN_CLEARNESS_GAIN:
+                if rejection is None or clear > rejection[0]:
+                    rejection = clear, side, point
+        if rejection is None or rejection[0] < clearest * MIN_CLEARNESS_GAIN:
             break
-        clearest = found[0]
-        kept[found[1]][found[2]] = False
-    return (kept[0], kept[1]) if not all(bool(mask.all()) for mask in kept) else None
+        clearest = rejection[0]
+        remaining[rejection[1]][rejection[2]] = False
+    return (remaining[0], remaining[1]) if not all(bool(mask.all()) for mask in remaining) else None

@@ -16,7 +16,7 @@ from dyntorch.geometry.epipolar import epipolar_variance, gradient_moments, rank
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics.lags import epipolar_moments
 from dyntorch.numerics.least_squares import damped_step
-from dyntorch.tasks.synchronize.tracks import Tracks, noise_ratio, smooth_at
+from dyntorch.tasks.synchronize.tracks import Tracks, lag_range, noise_ratio, smooth_at
 
 MIN_PEAK_SEPARATION_FRAMES = 2.5  # Within this peaks are one, and halves of a take agree.
 MIN_HALF_OVERLAP_SHARE = 0.5  # Share of the largest overlap below which a half of the take does not score a lag.
@@ -50,11 +50,7 @@ class Samples:
 
     def lags(self, max_shift: float | None) -> tuple[int, int]:
         """First and last lag, in steps, with some overlap and shifts within ``max_shift`` seconds."""
-        lo, hi = 1 - len(self.x1), len(self.x2) - 1
-        if max_shift is not None:
-            lo = max(lo, math.ceil((-max_shift / self.rate - self.start) / self.step - 1e-9))
-            hi = min(hi, math.floor((max_shift / self.rate - self.start) / self.step + 1e-9))
-        return lo, hi
+        return lag_range((len(self.x1), len(self.x2)), self.start, self.step, self.rate, max_shift)
 
     def only(self, points: Tensor) -> Samples:
         """These points ``(n,)`` bool alone."""
@@ -127,11 +123,11 @@ def epipolar_curve(samples: Samples, max_shift: float | None = None, overlap: fl
     r"""Scores at all lags."""
     overlap = MIN_OVERLAP_SHARE if overlap is None else overlap
     lo, hi = samples.lags(max_shift)
-    found = [_score_chunk(samples, first, min(first + PIECE - 1, hi)) for first in range(lo, hi + 1, PIECE)]
-    if not found:
+    chunks = [_score_chunk(samples, first, min(first + PIECE - 1, hi)) for first in range(lo, hi + 1, PIECE)]
+    if not chunks:
         empty = samples.x1.new_zeros(0)
         return Curve(empty, empty, empty, empty, samples.rate, 1.0)
-    variance, counts = (torch.cat(parts) for parts in zip(*found, strict=True))
+    variance, counts = (torch.cat(parts) for parts in zip(*chunks, strict=True))
     judged = (counts >= overlap * counts.max()) & (counts >= MIN_CURVE_PAIRS) & variance.isfinite()
     level = variance[judged].median() if bool(judged.any()) else variance.new_ones(())
     tiny = torch.finfo(variance.dtype).tiny
@@ -181,8 +177,7 @@ class Grid:
         x, v, weights = smooth_at(tracks, at, width)
         speed = float(torch.where(weights > 0, v.square().sum(-1), torch.nan).nanmedian()) ** 0.5
         wider = min(
-            max(1 + VELOCITY_WIDTH_SLOPE * tracks.noise / max(speed * width, 1e-300), MIN_VELOCITY_WIDTH),
-            MAX_VELOCITY_WIDTH,
+            max(1 + VELOCITY_WIDTH_SLOPE * tracks.noise / max(speed * width, 1e-300), MIN_VELOCITY_WIDTH), MAX_VELOCITY_WIDTH
         )
         _, calm, _ = smooth_at(tracks, at, wider * width)
         return Grid(start, step, x, v, calm, weights)
@@ -357,17 +352,10 @@ class ShiftDescent:
         tangent = self._tangent(state.F)
         J = torch.cat([rows.products @ tangent.mT, rows.along[:, None], (rows.along * (rows.times - state.center))[:, None]], 1)
         J = J if free_rate else J[:, :-1]
-        w = rows.weights()
-        scale = J.square().mul(w[:, None]).sum(0).sqrt().clamp(min=1e-300)
-        H = (J / scale).mT @ (J / scale * w[:, None])
-        inverse = torch.linalg.pinv(H, hermitian=True, rtol=1e-12) / scale[:, None] / scale
-        influence = (J * (w * rows.residual)[:, None]) @ inverse[:, len(tangent) :]
-        frames = torch.zeros(len(self.times), influence.shape[1], dtype=J.dtype, device=J.device)
-        frames.index_add_(0, rows.frames, influence)
+        frames = self._influence(rows, J, J.shape[1] - len(tangent))[1]
         step = float(self.times[1] - self.times[0]) if len(self.times) > 1 else self.frame
         sigmas = long_run_sigma(
-            frames,
-            round(min(MAX_CORRELATION_SECONDS, float(rows.times[-1] - rows.times[0]) / MIN_CORRELATION_BLOCKS) / step),
+            frames, round(min(MAX_CORRELATION_SECONDS, float(rows.times[-1] - rows.times[0]) / MIN_CORRELATION_BLOCKS) / step)
         )
         scale_of = rows.scale()
         F = self._denormalize(state.F)
@@ -387,6 +375,15 @@ class ShiftDescent:
             effective=float(rows.sure.sum() / rows.sure.max()) / max(1.0, correlated),
         )
 
+    def _influence(self, rows: Residuals, J: Tensor, last: int) -> tuple[Tensor, Tensor]:
+        """What every residual ``(m, last)`` and every frame ``(frames, last)`` adds to the last parameters, of derivatives J."""
+        w = rows.weights()
+        scale = J.square().mul(w[:, None]).sum(0).sqrt().clamp(min=1e-300)
+        H = (J / scale).mT @ (J / scale * w[:, None])
+        inverse = torch.linalg.pinv(H, hermitian=True, rtol=1e-12) / scale[:, None] / scale
+        influence = (J * (w * rows.residual)[:, None]) @ inverse[:, -last:]
+        return influence, J.new_zeros(len(self.times), last).index_add_(0, rows.frames, influence)
+
     def jumps(self, fit: EpipolarFit, moments: Sequence[float]) -> tuple[Tensor, Tensor]:
         """What the offset changes by, beyond the fit, after each of some moments of a's clock: seconds ``(k,)``, and their
         standard deviations."""
@@ -398,13 +395,7 @@ class ShiftDescent:
         tangent = self._tangent(F / F.norm())
         later = [rows.along * (rows.times > moment) for moment in moments]
         J = torch.cat([rows.products @ tangent.mT, torch.stack([rows.along, *later], dim=1)], dim=1)
-        w = rows.weights()
-        scale = J.square().mul(w[:, None]).sum(0).sqrt().clamp(min=1e-300)
-        H = (J / scale).mT @ (J / scale * w[:, None])
-        inverse = torch.linalg.pinv(H, hermitian=True, rtol=1e-12) / scale[:, None] / scale
-        influence = (J * (w * rows.residual)[:, None]) @ inverse[:, -len(later) :]
-        frames = torch.zeros(len(self.times), len(later), dtype=J.dtype, device=J.device)
-        frames.index_add_(0, rows.frames, influence)
+        influence, frames = self._influence(rows, J, len(later))
         memory = min(MAX_CORRELATION_SECONDS, float(rows.times[-1] - rows.times[0]) / MIN_CORRELATION_BLOCKS)
         sigmas = SIGMA_INFLATION * long_run_sigma(frames, round(memory / self.frame))
         return -influence.sum(0), sigmas.hypot(torch.as_tensor(MIN_SIGMA_FRAMES * self.frame))

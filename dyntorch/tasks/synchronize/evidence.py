@@ -84,11 +84,11 @@ class Attempt:
         """Shifts at the center and scores of the curve's peaks; the fit's own first."""
         if self.fit is None:
             return []
-        found = [(self._shift(lag), score) for lag, score in self.curve.peaks(4 * NUM_PEAKS)]
-        here = [score for shift, score in found if self._is_own_peak(shift)]
+        maxima = [(self._shift(lag), score) for lag, score in self.curve.peaks(4 * NUM_PEAKS)]
+        here = [score for shift, score in maxima if self._is_own_peak(shift)]
         own = here[0] if here else self._score(self.fit.shift)
         # a higher maximum of the curve that a descent found no better is none
-        others = [(shift, min(score, own)) for shift, score in found if not self._is_own_peak(shift)]
+        others = [(shift, min(score, own)) for shift, score in maxima if not self._is_own_peak(shift)]
         return [(self.fit.shift, own), *others[: NUM_PEAKS - 1]]
 
     @cached_property
@@ -109,9 +109,9 @@ class Attempt:
         level = max(self.curve.level, 1e-300)
         for k, (shift, _) in enumerate(self.peaks[: NUM_COMPETING_PEAKS + 1]):
             offset = shift - (self.fit.rate - 1) * self.fit.center
-            found = [descent.variance(offset + float(step), self.fit.rate) for step in steps]
+            variances = [descent.variance(offset + float(step), self.fit.rate) for step in steps]
             # exact data: a step of the own peak is as far from its bottom as the nearest step of a rival's may be
-            least = min(found) if k else min(found[NUM_FRACTIONS // 2 - 1], found[NUM_FRACTIONS // 2 + 1])
+            least = min(variances) if k else min(variances[NUM_FRACTIONS // 2 - 1], variances[NUM_FRACTIONS // 2 + 1])
             rough[k] = -0.5 * math.log(max(least, 1e-300) / level)
         return rough
 
@@ -325,16 +325,16 @@ MIN_POINTS_FOR_REJECTION = 8  # Points below which none can be rejected.
 MAX_SUBSET_LAGS = 800  # Lags of that search; longer ones go in coarser steps.
 
 
-def consistent_points(a: Tracks, b: Tracks, found: Attempt, generator: Generator | None = None) -> Tensor | None:
+def consistent_points(a: Tracks, b: Tracks, attempt: Attempt, generator: Generator | None = None) -> Tensor | None:
     """Points ``(n,)`` bool whose epipolar residual agrees with the others' at one and the same shift; None where there are too
     few."""
     n = a.x.shape[1]
-    lo, hi = found.samples.lags(found.max_shift)
+    lo, hi = attempt.samples.lags(attempt.max_shift)
     if n < MIN_POINTS_FOR_REJECTION or lo > hi:
         return None
-    step = found.step * max(1, -(-(hi - lo) // MAX_SUBSET_LAGS))
-    samples = found.model.samples.of(a, b, step, found.samples.rate)
-    moments, counts = samples.moments(samples.lags(found.max_shift), per_point=True)
+    step = attempt.step * max(1, -(-(hi - lo) // MAX_SUBSET_LAGS))
+    samples = attempt.model.samples.of(a, b, step, attempt.samples.rate)
+    moments, counts = samples.moments(samples.lags(attempt.max_shift), per_point=True)
     total = counts.sum(0)
     judged = (total >= MIN_OVERLAP_SHARE * total.max()) & (total >= MIN_CURVE_PAIRS)
     if not bool(judged.any()):
@@ -353,5 +353,5 @@ def consistent_points(a: Tracks, b: Tracks, found: Attempt, generator: Generator
     assert best is not None
     each = best[1]
     level = each[each <= best[0]].median()
-    kept = ~(each > MAX_RESIDUAL_RATIO**2 * level)
-    return kept if int(kept.sum()) >= MIN_INLIER_SHARE * n else None
+    consistent = ~(each > MAX_RESIDUAL_RATIO**2 * level)
+    return consistent if int(consistent.sum()) >= MIN_INLIER_SHARE * n else None

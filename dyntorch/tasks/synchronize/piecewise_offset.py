@@ -312,10 +312,7 @@ class JumpEvidence:
             return None
         scale = min(courses, key=lambda one: one.fit.residual).scale
         penalty = JUMP_PENALTY
-        return min(
-            courses,
-            key=lambda one: self._cost(one.fit, scale) + penalty * (len(one.jumps) + (one.rate != given)),
-        )
+        return min(courses, key=lambda one: self._cost(one.fit, scale) + penalty * (len(one.jumps) + (one.rate != given)))
 
     def _cost(self, fit: EpipolarFit, scale: Tensor) -> float:
         """Nats of all residuals of a fit, for as many as there could be."""

@@ -22,8 +22,9 @@ from dyntorch.tasks.synchronize.subspace import (
     MIN_OVERLAP_SECONDS,
     MIN_OVERLAP_SHARE,
     MIN_PEAK_SEPARATION_SECONDS,
+    local_maxima,
 )
-from dyntorch.tasks.synchronize.tracks import MAX_RATE_DEVIATION, MIN_SECONDS_FOR_RATE, RATE_SIGNIFICANCE_SIGMAS, Tracks
+from dyntorch.tasks.synchronize.tracks import MAX_RATE_DEVIATION, MIN_SECONDS_FOR_RATE, RATE_SIGNIFICANCE_SIGMAS, Tracks, lag_range
 
 # ----------------------------------------------------------------------------------------------------------------------
 # One body's attitude in time before two cameras, q_b = x q_a y in quaternions: at all lags by FFT.
@@ -291,9 +292,9 @@ def projective_points(a: Tracks, b: Tracks, *, max_shift: float | None, rate: fl
     if options.body_measure not in MEASURES:
         raise ValueError(f"options.body_measure must be {' or '.join(MEASURES)}, got {options.body_measure!r}")
     motions = [body_motion(name, tracks, options) for name, tracks in (("a", a), ("b", b))]
-    wrong = tuple(motion for motion in motions if isinstance(motion, Notice))
+    wrong = [motion for motion in motions if isinstance(motion, Notice)]
     if wrong:
-        return _refuse(a, b, wrong)
+        return Shift.unknown("projective", (1 / a.step, 1 / b.step), wrong)
     poses = [
         Poses.of(motion, tracks.times) for motion, tracks in zip(motions, (a, b), strict=True) if isinstance(motion, BodyMotion)
     ]
@@ -307,12 +308,12 @@ def match_motions(
     curve = _curve(first, second, a, b, rate or 1.0, max_shift, options)
     top = curve.maxima()
     if not top:
-        return _refuse(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
+        return Shift.unknown("projective", (1 / a.step, 1 / b.step), [Notice(ShiftNotice.SHORT_OVERLAP)])
     problem, theta = _starts(first, second, curve, top)
     found = minimize(problem, problem.evaluate(theta), LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-9))
     misfits = (found.cost / 6).sqrt()
     if not bool(misfits.isfinite().any()):
-        return _refuse(a, b, (Notice(ShiftNotice.SHORT_OVERLAP),))
+        return Shift.unknown("projective", (1 / a.step, 1 / b.step), [Notice(ShiftNotice.SHORT_OVERLAP)])
     best = misfits.argmin()
     alone = replace(problem.subset(best[None]), start=found.theta[0][best][None])
     theta = tuple(part[best][None] for part in found.theta)
@@ -343,14 +344,7 @@ class _Curve:
 
     def maxima(self) -> list[int]:
         """Local maxima, the best first, none near a better one."""
-        scores = self.scores.nan_to_num(nan=-math.inf)
-        padded = torch.nn.functional.pad(scores, (1, 1), value=-math.inf)
-        top = ((scores >= padded[:-2]) & (scores >= padded[2:]) & self.judged).nonzero()[:, 0]
-        kept: list[int] = []
-        for i in top[scores[top].argsort(descending=True, stable=True)].tolist():
-            if all(abs(i - j) * self.step > MIN_PEAK_SEPARATION_SECONDS + 1e-9 for j in kept):
-                kept.append(i)
-        return kept[:NUM_PEAKS]
+        return local_maxima(self.scores.nan_to_num(nan=-math.inf), MIN_PEAK_SEPARATION_SECONDS / self.step)[:NUM_PEAKS]
 
 
 def _curve(
@@ -367,11 +361,7 @@ def _curve(
         rows.append(held[torch.where(index < 0, known.int().argmax(), index)])
         weights.append(known.double())
     start = float(b.times[0]) / rate - float(a.times[0])
-    lo, hi = 1 - len(rows[0]), len(rows[1]) - 1
-    if max_shift is not None:
-        low, high = ((sign * max_shift / rate - start) / step for sign in (-1, 1))
-        lo, hi = min(max(lo, math.ceil(low - 1e-9)), hi), max(min(hi, math.floor(high + 1e-9)), lo)
-    lags = (lo, max(lo, hi))
+    lags = lag_range((len(rows[0]), len(rows[1])), start, step, rate, max_shift, at_least_one=True)
     spins = [quaternions(part[..., :3].nan_to_num()) for part in rows]
     squares, counts, x, y = attitude_curve(spins[0], spins[1], weights[0], weights[1], lags)
     if options.body_measure == "rank":
@@ -416,14 +406,7 @@ MIN_SIGMA_SECONDS = 1e-6  # Error of a shift at least: poses between frames are 
 
 
 def _summarize(
-    problem: SharedMotion,
-    theta: Tensors,
-    starts: Tensor,
-    clocks: Tensor,
-    misfits: Tensor,
-    curve: _Curve,
-    a: Tracks,
-    b: Tracks,
+    problem: SharedMotion, theta: Tensors, starts: Tensor, clocks: Tensor, misfits: Tensor, curve: _Curve, a: Tracks, b: Tracks
 ) -> Shift:
     offset, rate = theta[0][0].tolist()
     first = max(float(a.times[0]), (float(b.times[0]) - offset) / rate)
@@ -474,12 +457,3 @@ def _refusal(best: float, margin: float, sigma: float, shifts: Tensor, curve: _C
     if not float(inner[0]) - 1e-9 <= float(shifts[0]) <= float(inner[-1]) + 1e-9:
         return Notice(ShiftNotice.EDGE, float(shifts[0]), {"best": float(shifts[0])})
     return None
-
-
-def _refuse(a: Tracks, b: Tracks, limits: tuple[Notice, ...]) -> Shift:
-    none = torch.zeros(0, dtype=torch.float64, device=a.x.device)
-    fps = 1 / a.step, 1 / b.step
-    return Shift(
-        0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), "projective", fps, 0.0, none, none,
-        status=status_from(limits), notices=limits,
-    )  # fmt: skip

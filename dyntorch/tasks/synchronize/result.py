@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Self
@@ -10,7 +11,7 @@ from typing import Any, Literal, Self
 import torch
 from torch import Tensor
 
-from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status
+from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, status_from
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,7 @@ class ShiftNotice(NoticeCode):
         "blunt",
         {
             "small": "the motion is too small for its noise: the best shift, {best:+.3g} s, is uncertain by {value:.2g} s or "
-            "more; film "
-            "larger or faster movements",
+            "more; film larger or faster movements",
             "known": "the best shift is only known to {value:.3f} s: film longer, or a larger motion",
             "rough": "the best shift is only known roughly: film longer, or a larger motion",
             "frame": "the best shift is uncertain by {value:.2g} s, frames are {frame:.2g} s apart: film longer, or larger motion",
@@ -80,13 +80,11 @@ class ShiftNotice(NoticeCode):
     REPEATED = (
         "repeated",
         {
-            "rivals": "the motion repeats itself or is too small: {best:+.3g} s fits hardly better than {rivals}; film "
-            "something that "
-            "happens once, or narrow {arg:max_shift}",
+            "rivals": "the motion repeats itself or is too small: {best:+.3g} s fits hardly better than {rivals}; film something "
+            "that happens once, or narrow {arg:max_shift}",
             "itself": "the motion repeats itself, and another shift fits as well: film something that does not",
             "others": "other shifts fit about as well (seconds: {rivals}), as where the motion repeats itself: film something "
-            "that does "
-            "not",
+            "that does not",
             "unclear": "the best shift is not clear of others (seconds: {rivals}): film longer, or a larger motion",
         },
         Status.AMBIGUOUS,
@@ -102,8 +100,7 @@ class ShiftNotice(NoticeCode):
     HALVES = (
         "halves",
         "the halves of the take say {halves}, more than {apart:g} frames from {best:+.3g} s: the cameras may show different "
-        "events, "
-        "overlap too little, or one of them moved",
+        "events, overlap too little, or one of them moved",
         Status.NO_CONSENSUS,
     )
     """The two halves of the take contradict the whole."""
@@ -169,10 +166,7 @@ class ShiftNotice(NoticeCode):
     """What was fitted are lenses, too."""
     LEFT_OUT = "left_out", "{value:g} of {points} points never agree with the others and were left out: {which}"
     """Points that are never consistent with the others."""
-    FOREIGN = (
-        "foreign",
-        "{value:g} of {points} tracks of {camera:{which}} have no part in the motion and were left out: {tracks}",
-    )
+    FOREIGN = ("foreign", "{value:g} of {points} tracks of {camera:{which}} have no part in the motion and were left out: {tracks}")
     """Tracks that go their own way."""
     MOVED = "moved", "each half of the take fits much better by itself: a camera may have moved"
     """A camera that moved."""
@@ -257,6 +251,15 @@ class Shift(ClockOutcome):
 
     TASK = "synchronize"
 
+    @staticmethod
+    def unknown(method: str, fps: tuple[float, float], notices: Sequence[Notice], points: Tensor | None = None) -> Shift:
+        """No shift, and the reasons."""
+        none = torch.zeros(0, dtype=torch.float64)
+        return Shift(
+            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), method, fps, 0.0, none, none, points,
+            status=status_from(notices), notices=tuple(notices),
+        )  # fmt: skip
+
     @property
     def frames(self) -> float:
         """The offset in frames of b."""
@@ -337,7 +340,7 @@ class Pair:
     """Whether the pair decides on its own."""
 
     @property
-    def used(self) -> bool:
+    def is_used(self) -> bool:
         """Whether the pair takes part in the result."""
         return self.peak >= 0
 
@@ -358,10 +361,7 @@ class ClocksNotice(NoticeCode):
     """Cameras that no pair ties to the reference."""
     REFUSED = (
         "refused",
-        {
-            "pairs": "{cameras:cameras}: too few sure pairs, {refused:pairs} refused ({first})",
-            "pair": "{first}",
-        },
+        {"pairs": "{cameras:cameras}: too few sure pairs, {refused:pairs} refused ({first})", "pair": "{first}"},
         Status.AMBIGUOUS,
     )
     """Too few pairs decide by themselves."""
@@ -493,11 +493,7 @@ class BreakNotice(NoticeCode):
         },
     )
     """Frames are there twice."""
-    UNDECIDED = (
-        "undecided",
-        "whether a clock breaks is not decided, as no single shift is sure: {said}",
-        Status.AMBIGUOUS,
-    )
+    UNDECIDED = ("undecided", "whether a clock breaks is not decided, as no single shift is sure: {said}", Status.AMBIGUOUS)
     """Not even pieces of the take can be synchronized."""
 
 
@@ -536,7 +532,7 @@ class ClockBreak:
         return self.moments[0]
 
     @property
-    def doubled(self) -> bool:
+    def is_doubled(self) -> bool:
         """Whether frames are there twice, as far as is known."""
         return self.camera is not None and self.jump > 0
 

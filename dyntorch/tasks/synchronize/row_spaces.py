@@ -231,7 +231,7 @@ class Hypothesis:
         return (self.scores * self.counts * self.samples).nan_to_num(-math.inf)
 
     @cached_property
-    def best(self) -> int:
+    def best_index(self) -> int:
         """Entry of the best lag."""
         return int(self.totals.argmax())
 
@@ -246,15 +246,15 @@ class Hypothesis:
         return self._over(self.totals)[1]
 
     def _over(self, totals: Tensor) -> tuple[float, float]:
-        away = ((self.lags - self.lags[self.best]).abs() > self.apart) & totals.isfinite()
-        if int(away.sum()) < 3 or not math.isfinite(float(totals[self.best])):
+        away = ((self.lags - self.lags[self.best_index]).abs() > self.apart) & totals.isfinite()
+        if int(away.sum()) < 3 or not math.isfinite(float(totals[self.best_index])):
             return 0.0, 0.0
         count = self.counts * self.samples
-        per_frame = totals / count.clamp(min=1e-9) * count[self.best]
+        per_frame = totals / count.clamp(min=1e-9) * count[self.best_index]
         found = []
         for values in (totals, per_frame):
             rest = values[away]
-            margin = float(values[self.best] - rest.max())
+            margin = float(values[self.best_index] - rest.max())
             found.append((margin, margin / max(float(rest.std()), 1e-12 + 1e-6 * float(rest.abs().max()))))
         return min(m for m, _ in found), min(c for _, c in found)
 
@@ -375,7 +375,7 @@ NUM_ZOOM_ALTERNATIONS = 3  # Alternations of zoom and lag.
 
 def refine_lag(films: TrackPair, found: Hypothesis) -> Place:
     """Lag of most information near a hypothesis's best; of cameras that may zoom, with the ratio of their zooms."""
-    start = float(found.lags[found.best])
+    start = float(found.lags[found.best_index])
     plain = _climb(_LagScore(films, found.kind, found.level, around=start), start)
     if found.kind == "affine" or films.options.measure not in ("auto", "log_determinant"):
         return plain

@@ -78,8 +78,7 @@ def _descend_from_peaks(a: Tracks, b: Tracks, curves: list[Curve], step: float, 
     free_rate = search.free_rate
     frame = max(a.step, b.step)
     starts = sorted(
-        ((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(NUM_PEAKS)),
-        reverse=True,
+        ((score, lag * curve.rate, curve.rate) for curve in curves for lag, score in curve.peaks(NUM_PEAKS)), reverse=True
     )
     if not starts:
         return None
@@ -90,15 +89,15 @@ def _descend_from_peaks(a: Tracks, b: Tracks, curves: list[Curve], step: float, 
     while widths[-1] > frame:
         widths.append(max(frame, widths[-1] / 3))
     descent = search.model.descent(a, b, step)
-    found = []
+    fits = []
     for score, offset, rate in starts[: NUM_PEAKS if several else 1]:
         fit = descent.run(offset, rate, free_rate=free_rate and step > frame)
         if fit is not None:
             # the curve's variance counts everything, the fit's robust residual nothing that is far: both have a say
-            found.append((score - math.log(max(fit.residual, 1e-300)) + 0.5 * math.log(fit.effective), fit))
-    if not found:
+            fits.append((score - math.log(max(fit.residual, 1e-300)) + 0.5 * math.log(fit.effective), fit))
+    if not fits:
         return None
-    best = max(found, key=lambda pair: pair[0])[1]
+    best = max(fits, key=lambda pair: pair[0])[1]
     for width in widths[1:]:
         descent = search.model.descent(a, b, width)
         best = descent.run(best.offset, best.rate, free_rate=free_rate) or best
@@ -129,7 +128,7 @@ def _select_rate(descent: ShiftDescent, fit: EpipolarFit) -> EpipolarFit:
 class SamePointsResult:
     """The best attempt and what it took."""
 
-    found: Attempt
+    attempt: Attempt
     notices: tuple[Notice, ...]
     seen: Tensor  # ``(n,)`` bool, points that both cameras show at all
 
@@ -162,33 +161,33 @@ def search_same_points(
         return SamePointsResult(dataclasses.replace(search_shift(a, b, search), fit=None), (), seen)
     if camera == "affine":
         return SamePointsResult(_search_affine(a, b, search), (), seen)
-    found = _search_without_outliers(a, b, search)
-    if not found.accepted_shift and rate is None:
-        found = _select_attempt(found, _search_rates(a, b, search, span))
-    known: tuple[Notice, ...] = ()
-    if lenses and found.fit is not None and found.normalized_residual > MIN_ROUGHNESS_FOR_LENSES:
-        found, known = _search_undistorted(found, a, b, search)
-    if camera == "auto" and model is EPIPOLAR and not found.accepted_shift:
+    attempt = _search_without_outliers(a, b, search)
+    if not attempt.accepted_shift and rate is None:
+        attempt = _select_attempt(attempt, _search_rates(a, b, search, span))
+    notices: tuple[Notice, ...] = ()
+    if lenses and attempt.fit is not None and attempt.normalized_residual > MIN_ROUGHNESS_FOR_LENSES:
+        attempt, notices = _search_undistorted(attempt, a, b, search)
+    if camera == "auto" and model is EPIPOLAR and not attempt.accepted_shift:
         scaled = _search_affine(a, b, search)
         # without the place in the picture a gait repeats itself, so that affine cameras alone may be sure of a wrong period
-        if scaled.accepted_shift and _same_shift(scaled, found):
+        if scaled.accepted_shift and _same_shift(scaled, attempt):
             return SamePointsResult(scaled, (Notice(ShiftNotice.AFFINE),), seen)
-    return SamePointsResult(found, known if found.accepted_shift else (), seen)
+    return SamePointsResult(attempt, notices if attempt.accepted_shift else (), seen)
 
 
 def _search_without_outliers(a: Tracks, b: Tracks, search: ShiftSearch) -> Attempt:
     """An attempt with all points, and one without those that do not fit, where that may be why it fails."""
-    found = search_shift(a, b, search)
-    pruned = _reject_positions(found)
+    attempt = search_shift(a, b, search)
+    pruned = _reject_positions(attempt)
     if pruned is not None:
         a, b = pruned
-        found = _select_attempt(found, dataclasses.replace(search_shift(a, b, search), positions_removed=True))
-    if found.accepted_shift and not bool(_suspected_points(found).any()):
-        return found
-    points = consistent_points(a, b, found, search.generator) if search.options.reject_points else None
+        attempt = _select_attempt(attempt, dataclasses.replace(search_shift(a, b, search), positions_removed=True))
+    if attempt.accepted_shift and not bool(_suspected_points(attempt).any()):
+        return attempt
+    points = consistent_points(a, b, attempt, search.generator) if search.options.reject_points else None
     if points is None or bool(points.all()):
-        return found
-    return _select_attempt(found, dataclasses.replace(search_shift(a, b, search, points), positions_removed=pruned is not None))
+        return attempt
+    return _select_attempt(attempt, dataclasses.replace(search_shift(a, b, search, points), positions_removed=pruned is not None))
 
 
 OUTLIER_SIGMAS = 6.0  # Robust sigmas from the fit at which a position is an outlier.
@@ -197,10 +196,10 @@ NUM_STRETCHES = 8  # Stretches of the take that are tested for it.
 NEGLIGIBLE_OUTLIER_SHARE = 0.01  # Share of outliers that makes no difference to an accepted fit.
 
 
-def _reject_positions(found: Attempt) -> tuple[Tracks, Tracks] | None:
+def _reject_positions(attempt: Attempt) -> tuple[Tracks, Tracks] | None:
     """Tracks without the positions far from the fit, in both cameras: whose is wrong is not known; None where all is well."""
-    fit = found.fit
-    if fit is None or len(fit.times) != len(found.a.times):
+    fit = attempt.fit
+    if fit is None or len(fit.times) != len(attempt.a.times):
         return None
     far = fit.distances.abs() > OUTLIER_SIGMAS
     seen = fit.distances.isfinite()
@@ -209,17 +208,17 @@ def _reject_positions(found: Attempt) -> tuple[Tracks, Tracks] | None:
     parts = [
         (float(one.sum()), float(all_.sum())) for one, all_ in zip(far.chunk(NUM_STRETCHES), seen.chunk(NUM_STRETCHES), strict=True)
     ]
-    if found.accepted_shift and float(far.double().mean()) < NEGLIGIBLE_OUTLIER_SHARE:
+    if attempt.accepted_shift and float(far.double().mean()) < NEGLIGIBLE_OUTLIER_SHARE:
         return None  # the weights of the fit are enough
     # a stretch that does not fit is no outlier: it contradicts
     if not bool(far.any()) or any(lost > MAX_OUTLIER_SHARE * whole for lost, whole in parts):
         return None
     frames, joints = far.nonzero().unbind(1)
     there = fit.times[frames] * fit.rate + fit.offset
-    nearest = (there[:, None] - found.b.times).abs().argmin(1)
-    other = torch.zeros_like(found.b.weights, dtype=torch.bool)
+    nearest = (there[:, None] - attempt.b.times).abs().argmin(1)
+    other = torch.zeros_like(attempt.b.weights, dtype=torch.bool)
     other[nearest, joints] = True
-    return remove_positions(found.a, far), remove_positions(found.b, other)
+    return remove_positions(attempt.a, far), remove_positions(attempt.b, other)
 
 
 MAX_RATE_STEPS = 2_000  # Steps of a take for a search over rates, of a tenth of a second at least.
@@ -264,31 +263,31 @@ def _same_shift(one: Attempt, other: Attempt) -> bool:
 SUSPECT_RESIDUAL_RATIO = 3.0  # Residual over the usual one beyond which a point is suspected.
 
 
-def _suspected_points(found: Attempt) -> Tensor:
+def _suspected_points(attempt: Attempt) -> Tensor:
     """``(n,)`` of the points that took part: whether their residual is out of all proportion."""
-    assert found.fit is not None
-    own = found.fit.distances.abs().nanmedian(0).values * 1.4826
+    assert attempt.fit is not None
+    own = attempt.fit.distances.abs().nanmedian(0).values * 1.4826
     return own.nan_to_num(0.0) > SUSPECT_RESIDUAL_RATIO
 
 
-def _search_undistorted(found: Attempt, a: Tracks, b: Tracks, search: ShiftSearch) -> tuple[Attempt, tuple[Notice, ...]]:
+def _search_undistorted(attempt: Attempt, a: Tracks, b: Tracks, search: ShiftSearch) -> tuple[Attempt, tuple[Notice, ...]]:
     """Once more with lenses fitted at the shift found, where they are significant."""
-    assert found.fit is not None
-    fit = found.fit
-    x1, _, w1 = smooth_at(found.a, fit.times, found.frame)
-    x2, _, w2 = smooth_at(found.b, fit.times * fit.rate + fit.offset, found.frame)
+    assert attempt.fit is not None
+    fit = attempt.fit
+    x1, _, w1 = smooth_at(attempt.a, fit.times, attempt.frame)
+    x2, _, w2 = smooth_at(attempt.b, fit.times * fit.rate + fit.offset, attempt.frame)
     lens = fit_distortion(x1.flatten(0, 1), x2.flatten(0, 1), (w1 * w2).flatten())
     if not lens.significant:
-        return found, ()
+        return attempt, ()
     straight = []
     for tracks, one in zip((a, b), lens.lenses, strict=True):
         x = one.undistort(tracks.x)
         seen = x.isfinite().all(-1)
         straight.append(dataclasses.replace(tracks, x=torch.where(seen[..., None], x, 0.0), weights=tracks.weights * seen))
-    again = search_shift(straight[0], straight[1], search, found.points)
-    better = again.fit is not None and again.fit.residual < fit.residual and _select_attempt(found, again) is again
+    again = search_shift(straight[0], straight[1], search, attempt.points)
+    better = again.fit is not None and again.fit.residual < fit.residual and _select_attempt(attempt, again) is again
     values = {"a": lens.lambda_a, "b": lens.lambda_b}
-    return (again, (Notice(ShiftNotice.LENS, 0.0, values),)) if better else (found, ())
+    return (again, (Notice(ShiftNotice.LENS, 0.0, values),)) if better else (attempt, ())
 
 
 MAX_CAMERA_MOTION_RATIO = 1.35  # Residual over that of each half by itself beyond which a camera may have moved.
@@ -296,49 +295,44 @@ MAX_CAMERA_MOTION_RATIO = 1.35  # Residual over that of each half by itself beyo
 
 def shift_of(result: SamePointsResult) -> Shift:
     """The result of an attempt."""
-    found, limits = result.found, result.notices
-    fps = 1 / found.a.step, 1 / found.b.step
-    fit = found.fit
-    points = found.points & result.seen
+    attempt, limits = result.attempt, result.notices
+    fps = 1 / attempt.a.step, 1 / attempt.b.step
+    fit = attempt.fit
+    points = attempt.points & result.seen
     if fit is None:
-        none = torch.zeros(0, dtype=torch.float64)
-        limits = (_refuse_without_peak(found),)
-        return Shift(
-            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), found.method, fps, 0.0, none, none, result.seen,
-            status=status_from(limits), notices=limits,
-        )  # fmt: skip
-    if not found.accepted_shift:
-        limits = (_refusal(found), *limits)
-    wrong = (result.seen & ~found.points).nonzero()[:, 0].tolist()
+        return Shift.unknown(attempt.method, fps, [_refuse_without_peak(attempt)], result.seen)
+    if not attempt.accepted_shift:
+        limits = (_refusal(attempt), *limits)
+    wrong = (result.seen & ~attempt.points).nonzero()[:, 0].tolist()
     if wrong:
         which = ", ".join(str(point) for point in wrong)
         limits = (*limits, Notice(ShiftNotice.LEFT_OUT, float(len(wrong)), {"points": len(points), "which": which}))
-    if found.accepted_shift and found.camera_motion_ratio > MAX_CAMERA_MOTION_RATIO:
-        limits = (*limits, Notice(ShiftNotice.MOVED, found.camera_motion_ratio))
-    lags = found.curve.rate * (found.curve.lags + fit.center) - fit.center
+    if attempt.accepted_shift and attempt.camera_motion_ratio > MAX_CAMERA_MOTION_RATIO:
+        limits = (*limits, Notice(ShiftNotice.MOVED, attempt.camera_motion_ratio))
+    lags = attempt.curve.rate * (attempt.curve.lags + fit.center) - fit.center
     return Shift(
         offset=fit.offset,
-        sigma=found.sigma,
+        sigma=attempt.sigma,
         rate=fit.rate,
         rate_sigma=fit.rate_sigma,
-        confidence=found.confidence,
-        peaks=torch.tensor(found.peaks, dtype=torch.float64),
-        method=found.method,
+        confidence=attempt.confidence,
+        peaks=torch.tensor(attempt.peaks, dtype=torch.float64),
+        method=attempt.method,
         fps=fps,
         center=fit.center,
         lags=lags,
-        scores=found.curve.scores,
+        scores=attempt.curve.scores,
         points=points,
-        fundamental=fit.fundamental if found.method == "epipolar" else None,
-        projection=fit.fundamental if found.method == "camera" else None,
+        fundamental=fit.fundamental if attempt.method == "epipolar" else None,
+        projection=fit.fundamental if attempt.method == "camera" else None,
         status=status_from(limits),
         notices=limits,
     )
 
 
-def _refuse_without_peak(found: Attempt) -> Notice:
+def _refuse_without_peak(attempt: Attempt) -> Notice:
     """Why no shift stands out."""
-    for name, tracks in (("a", found.a), ("b", found.b)):
+    for name, tracks in (("a", attempt.a), ("b", attempt.b)):
         if not bool((tracks.weights > 0).any()):
             return Notice(ShiftNotice.NO_POINT, 0.0, {"which": name})
         if tracks.static:
@@ -349,28 +343,28 @@ def _refuse_without_peak(found: Attempt) -> Notice:
 MAX_SIGMA_OF_PEAK_FRAMES = 10.0  # Sigma from which no shift stands out at all, frames.
 
 
-def _refusal(found: Attempt) -> Notice:
+def _refusal(attempt: Attempt) -> Notice:
     """Why the data do not decide."""
-    fit = found.fit
+    fit = attempt.fit
     assert fit is not None
-    if fit.sigma > MAX_SIGMA_OF_PEAK_FRAMES * found.frame:
-        return _refuse_without_peak(found)
+    if fit.sigma > MAX_SIGMA_OF_PEAK_FRAMES * attempt.frame:
+        return _refuse_without_peak(attempt)
     if (
-        found.halves_agree
-        and found.margin >= found.required_margin
-        and found.time_reversal_margin < found.required_time_reversal_margin
+        attempt.halves_agree
+        and attempt.margin >= attempt.required_margin
+        and attempt.time_reversal_margin < attempt.required_time_reversal_margin
     ):
-        return Notice(ShiftNotice.BACKWARDS, found.time_reversal_margin)
-    if found.at_search_end:
+        return Notice(ShiftNotice.BACKWARDS, attempt.time_reversal_margin)
+    if attempt.at_search_end:
         return Notice(ShiftNotice.EDGE, fit.shift, {"best": fit.shift})
-    if not found.precise:
+    if not attempt.precise:
         return Notice(ShiftNotice.BLUNT, fit.sigma, {"case": "small", "best": fit.shift})
-    if found.margin < found.required_margin and len(found.peaks) > 1:
-        least = found.misfits[0] - found.required_margin
-        near = [shift for (shift, _), misfit in zip(found.peaks, found.misfits, strict=True) if misfit > least]
+    if attempt.margin < attempt.required_margin and len(attempt.peaks) > 1:
+        least = attempt.misfits[0] - attempt.required_margin
+        near = [shift for (shift, _), misfit in zip(attempt.peaks, attempt.misfits, strict=True) if misfit > least]
         rivals = ", ".join(f"{shift:+.3g} s" for shift in near[1:4])
-        return Notice(ShiftNotice.REPEATED, found.margin, {"case": "rivals", "best": found.peaks[0][0], "rivals": rivals})
-    first, second = found.halves
-    shifts = (f"{fit.shift + away * found.frame:+.3g} s" for away in (first, second))
+        return Notice(ShiftNotice.REPEATED, attempt.margin, {"case": "rivals", "best": attempt.peaks[0][0], "rivals": rivals})
+    first, second = attempt.halves
+    shifts = (f"{fit.shift + away * attempt.frame:+.3g} s" for away in (first, second))
     said = " and ".join("nothing" if "nan" in shift else shift for shift in shifts)
-    return Notice(ShiftNotice.HALVES, 0.0, {"halves": said, "apart": found.half_disagreement, "best": fit.shift})
+    return Notice(ShiftNotice.HALVES, 0.0, {"halves": said, "apart": attempt.half_disagreement, "best": fit.shift})

@@ -110,9 +110,8 @@ def split_points(body: Body) -> tuple[Body, Body]:
     return first, second
 
 
-SIZE_KERNEL_SECONDS = (
-    1 / 3
-)  # Standard deviation of the kernel for the size of the body in the image (half to six times as much are alike to 1 %).
+# Standard deviation of the kernel for the size of the body in the image (half to six times as much are alike to 1 %).
+SIZE_KERNEL_SECONDS = 1 / 3
 # Noise variance of the rows over that of third differences: cameras are not affine (1 to 4 are alike, 8 is 4 % worse).
 NOISE_FACTOR = 2.0
 
@@ -170,9 +169,9 @@ def fill_gaps(x: Tensor, seen: Tensor) -> Tensor:
         if not bool(open_.any()):
             return result
         share = _convolve(seen.double(), width)
-        found = _convolve(torch.where(seen[..., None], x, 0.0), width) / share.clamp(min=1e-12)[..., None]
+        filled = _convolve(torch.where(seen[..., None], x, 0.0), width) / share.clamp(min=1e-12)[..., None]
         take = open_ & (share > 0.1)
-        result, open_ = torch.where(take[..., None], found, result), open_ & ~take
+        result, open_ = torch.where(take[..., None], filled, result), open_ & ~take
     count = seen.sum(0).clamp(min=1)[:, None]
     mean = torch.where(seen[..., None], x, 0.0).sum(0) / count
     return torch.where(open_[..., None], mean, result)
@@ -256,15 +255,7 @@ class SubspaceCurve:
         return self.scores / self.counts.clamp(min=1.0)
 
 
-def subspace_curve(
-    a: Tensor,
-    b: Tensor,
-    wa: Tensor,
-    wb: Tensor,
-    lags: tuple[int, int],
-    *,
-    step: float = STEP,
-) -> SubspaceCurve:
+def subspace_curve(a: Tensor, b: Tensor, wa: Tensor, wb: Tensor, lags: tuple[int, int], *, step: float = STEP) -> SubspaceCurve:
     r"""Evidence for every lag between the tracks of two static cameras that need not have a point in common. a ``(Ta, n, 2)``,
     b ``(Tb, m, 2)``, wa ``(Ta, n)``, wb ``(Tb, m)``."""
     if a.shape[-1] == 3:
@@ -287,8 +278,7 @@ def bodies_curve(first: Body, second: Body, lags: tuple[int, int], step: float =
     """The same of what is prepared."""
     shape, height, motion, counts = _curves(first, second, lags)
     judged = counts >= max(
-        MIN_OVERLAP_SHARE * min(float(first.weights.sum()), float(second.weights.sum())),
-        MIN_OVERLAP_SECONDS / step - 1e-9,
+        MIN_OVERLAP_SHARE * min(float(first.weights.sum()), float(second.weights.sum())), MIN_OVERLAP_SECONDS / step - 1e-9
     )
     if bool(judged.any()):
         chance = _chance_bias(first, second.time_reversed, counts, judged, lags)
@@ -303,14 +293,14 @@ def bodies_curve(first: Body, second: Body, lags: tuple[int, int], step: float =
 def _curves(a: Body, b: Body, lags: tuple[int, int]) -> list[Tensor]:
     """Information of shapes, of heights and of motions, and counts, at all lags."""
     weights = None if bool((a.weights > 0).all() and (b.weights > 0).all()) else (a.weights, b.weights)
-    found = []
+    chunks = []
     for lo in range(lags[0], lags[1] + 1, PIECE):
         span = lo, min(lo + PIECE - 1, lags[1])
         aa, bb, ab, counts = lag_covariances(a.rows, b.rows, span, weights)
         *motion, _ = lag_covariances(a.motion, b.motion, span, weights)
         upright = _vertical((aa, bb, ab), (a.dims, b.dims))
-        found.append((_mutual_information(aa, bb, ab), _mutual_information(*upright), _motion_information(*motion), counts))
-    return [torch.cat(parts) for parts in zip(*found, strict=True)]
+        chunks.append((_mutual_information(aa, bb, ab), _mutual_information(*upright), _motion_information(*motion), counts))
+    return [torch.cat(parts) for parts in zip(*chunks, strict=True)]
 
 
 NUM_CHANCE_LAGS = 40  # Lags at which the bias by chance is measured.
@@ -320,7 +310,7 @@ def _chance_bias(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[i
     """What shapes and heights ``(L, 2)`` of different events tell about each other: a line in 1 / count, through some lags."""
     at = judged.nonzero()[:, 0]
     at = at[torch.linspace(0, len(at) - 1, min(NUM_CHANCE_LAGS, len(at))).round().long().to(at.device)]
-    told, inverse, n = [], [], a.rows.shape[1]
+    shared, inverse, n = [], [], a.rows.shape[1]
     for lag in (at + lags[0]).tolist():
         start, end = max(0, -lag), min(len(a.rows), len(b.rows) - lag)
         seen = a.weights[start:end] * b.weights[start + lag : end + lag] > 0
@@ -329,11 +319,11 @@ def _chance_bias(a: Body, b: Body, counts: Tensor, judged: Tensor, lags: tuple[i
         share = 1 / max(len(both), 1)
         c = (share * both.mT @ both)[None]
         parts = c[:, :n, :n], c[:, n:, n:], c[:, :n, n:]
-        told.append(torch.cat([_mutual_information(*parts), _mutual_information(*_vertical(parts, (a.dims, b.dims)))]))
+        shared.append(torch.cat([_mutual_information(*parts), _mutual_information(*_vertical(parts, (a.dims, b.dims)))]))
         inverse.append([1.0, share])
     design = torch.tensor(inverse, dtype=torch.float64, device=counts.device)
     # the default driver reads an order of pivots that nobody wrote: last digits that differ from run to run (pytorch issue 187411)
-    line = torch.linalg.lstsq(design, torch.stack(told), driver="gelsd").solution
+    line = torch.linalg.lstsq(design, torch.stack(shared), driver="gelsd").solution
     return line[0] + line[1] / counts.clamp(min=1.0)[:, None]
 
 
@@ -341,8 +331,8 @@ def information(shape: Tensor, motion: Tensor, bodies: tuple[Body, Body]) -> Ten
     """Evidence per second ``(L,)`` of joint covariances of the bodies' shapes and motions; chance is in it."""
     dims, n = (bodies[0].dims, bodies[1].dims), bodies[0].rows.shape[1]
     parts = _parts(shape, n)
-    told = SHAPE_SAMPLE_RATE * _mutual_information(*parts) + HEIGHT_SAMPLE_RATE * _mutual_information(*_vertical(parts, dims))
-    return told + MOTION_SAMPLE_RATE * _motion_information(*_parts(motion, dims[0]))
+    shared = SHAPE_SAMPLE_RATE * _mutual_information(*parts) + HEIGHT_SAMPLE_RATE * _mutual_information(*_vertical(parts, dims))
+    return shared + MOTION_SAMPLE_RATE * _motion_information(*_parts(motion, dims[0]))
 
 
 _Parts = tuple[Tensor, Tensor, Tensor]
@@ -403,10 +393,10 @@ def self_similarity(curve: SubspaceCurve, best: int, apart: float) -> float:
     padded = torch.nn.functional.pad(both, (1, 1), value=math.inf)
     peak = (both >= padded[:-2]) & (both >= padded[2:])
     rivals = rivals[(rivals.abs() <= reach) & (rivals.abs() > apart)] + reach
-    found = both[rivals[peak[rivals]]]
-    if not len(found):
+    repeats = both[rivals[peak[rivals]]]
+    if not len(repeats):
         return 0.0
-    own, other = float(both[reach]), float(found.max())
+    own, other = float(both[reach]), float(repeats.max())
     return other / own if own > 0 else math.inf
 
 
@@ -433,10 +423,10 @@ def jackknife_sigma(curve: SubspaceCurve, lag: int) -> float:
     motions: list[Tensor] = []
     for at in range(lag - 1, lag + 2):
         w = a.weights[start:end] * b.weights[start + at : end + at]
-        for kept, x, y in ((shapes, a.rows, b.rows), (motions, a.motion, b.motion)):
+        for moments, x, y in ((shapes, a.rows, b.rows), (motions, a.motion, b.motion)):
             both = torch.cat([x[start:end], y[start + at : end + at], torch.ones_like(w)[:, None]], dim=1) * w[:, None]
-            kept.append(torch.stack([part.mT @ part for part in both.split(sizes)]))
-    shape, motion = (_leave_one_out(torch.stack(kept)) for kept in (shapes, motions))
+            moments.append(torch.stack([part.mT @ part for part in both.split(sizes)]))
+    shape, motion = (_leave_one_out(torch.stack(moments)) for moments in (shapes, motions))
     before, here, after = information(shape, motion, (a, b)).unflatten(0, (3, NUM_JACKKNIFE_BLOCKS))
     bend = float((before - 2 * here + after).mean())
     return math.sqrt((NUM_JACKKNIFE_BLOCKS - 1) * float(((after - before) / 2).var(correction=0))) / -bend if bend < 0 else math.inf
@@ -491,7 +481,7 @@ def subspace_shift(curve: SubspaceCurve, *, start: float = 0.0, step: float = ST
     if int(judged.sum()) < 3:
         return SubspaceShift(0.0, math.inf, curve.scores.new_zeros(0, 2), 0.0, 0.0, Notice(ShiftNotice.SHORT_OVERLAP))
     scores = curve.scores.nan_to_num(-math.inf)
-    top = _maxima(scores, MIN_PEAK_SEPARATION_SECONDS / step)
+    top = local_maxima(scores, MIN_PEAK_SEPARATION_SECONDS / step)
     positions = [_between(scores, i) for i in top[:NUM_PEAKS]]
     places = torch.tensor([p for p, _ in positions], dtype=scores.dtype, device=scores.device)
     peaks = torch.stack([curve.lags[0] + places, scores[top[:NUM_PEAKS]]], dim=1)
@@ -513,17 +503,17 @@ def subspace_shift(curve: SubspaceCurve, *, start: float = 0.0, step: float = ST
     return SubspaceShift(position, sigma, peaks, probability, margin, refusal)
 
 
-def _maxima(scores: Tensor, apart: float) -> list[int]:
+def local_maxima(scores: Tensor, separation: float) -> list[int]:
     """Local maxima, best first, none within so many frames of a better one."""
     padded = torch.nn.functional.pad(scores, (1, 1), value=-math.inf)
     top = ((scores >= padded[:-2]) & (scores >= padded[2:]) & scores.isfinite()).nonzero()[:, 0]
-    kept: list[int] = []
-    for i in top[scores[top].argsort(descending=True)].tolist():
-        if all(abs(i - j) > apart + 1e-9 for j in kept):
-            kept.append(i)
-        if len(kept) > 4 * NUM_PEAKS:
+    selected: list[int] = []
+    for i in top[scores[top].argsort(descending=True, stable=True)].tolist():
+        if all(abs(i - j) > separation + 1e-9 for j in selected):
+            selected.append(i)
+        if len(selected) > 4 * NUM_PEAKS:
             break
-    return kept
+    return selected
 
 
 def _between(scores: Tensor, i: int) -> tuple[float, float]:
@@ -545,7 +535,7 @@ def _probability(scores: Tensor, best: int) -> float:
 def _margin(curve: SubspaceCurve, best: int, apart: float) -> float:
     """Nats per frame over the best other maximum, times the best one's frames."""
     rates = torch.where(curve.scores.isfinite(), curve.rates, -math.inf)
-    others = [i for i in _maxima(rates, apart) if abs(i - best) > apart + 1e-9]
+    others = [i for i in local_maxima(rates, apart) if abs(i - best) > apart + 1e-9]
     return float((rates[best] - rates[others[0]]) * curve.counts[best]) if others else float(curve.scores[best])
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from dyntorch.core.outcome import Notice, select_problem, solve_one_by_one, status_from, trim_padding
+from dyntorch.core.outcome import Notice, select_problem, solve_one_by_one, trim_padding
 from dyntorch.geometry.lens import undistort_points
 from dyntorch.numerics.arguments import check_options, check_together, on_cpu
 from dyntorch.numerics.blocks import one_thread
@@ -230,13 +230,7 @@ def _undistort(name: str, tracks: Tracks, lens: Any) -> Tracks:
 
 
 def synchronize_batch(
-    verb: Callable[..., Shift],
-    a: Tensor,
-    b: Tensor,
-    *,
-    times: tuple[Any, Any] | None,
-    weights: tuple[Any, Any] | None,
-    **more: Any,
+    verb: Callable[..., Shift], a: Tensor, b: Tensor, *, times: tuple[Any, Any] | None, weights: tuple[Any, Any] | None, **more: Any
 ) -> Shift:
     """The shifts of all problems, one after the other: a search shares nothing between takes. a ``(*batch, frames_a, n, 2)``,
     b ``(*batch, frames_b, m, 2)``, times ``(frames,)``, weights ``(*batch, frames, n)``."""
@@ -249,12 +243,7 @@ def synchronize_batch(
         return verb(*takes, times=clocks, weights=trust, **more)
 
     def spare(said: str) -> Shift:
-        none = torch.zeros(0, dtype=torch.float64, device=a.device)
-        limits = (Notice(ShiftNotice.UNUSABLE, 0.0, {"said": said}),)
-        return Shift(
-            0.0, math.inf, 1.0, 0.0, 0.0, none.reshape(0, 2), "none", (math.nan, math.nan), 0.0, none, none,
-            status=status_from(limits), notices=limits,
-        )  # fmt: skip
+        return Shift.unknown("none", (math.nan, math.nan), [Notice(ShiftNotice.UNUSABLE, 0.0, {"said": said})])
 
     return solve_one_by_one(batch, solve, spare)
 

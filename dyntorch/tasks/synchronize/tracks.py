@@ -54,7 +54,7 @@ class Tracks:
     @cached_property
     def scale(self) -> float:
         """Root mean square distance of the points from their mean."""
-        return float(self.centred.square().sum(-1).mul(self.weights).sum().div(self.weights.sum().clamp(min=1e-300)).sqrt())
+        return float(self.centred_points.square().sum(-1).mul(self.weights).sum().div(self.weights.sum().clamp(min=1e-300)).sqrt())
 
     @cached_property
     def static(self) -> bool:
@@ -64,7 +64,7 @@ class Tracks:
         return bool((torch.where(share > 0, away, 0.0).amax(0).sqrt() <= 1e-6 * self.scale).all())
 
     @cached_property
-    def centred(self) -> Tensor:
+    def centred_points(self) -> Tensor:
         """Points about their mean over the take; 0 where missing."""
         share = (self.weights / self.weights.sum().clamp(min=1e-300))[..., None]
         return torch.where(share > 0, self.x - (self.x * share).sum((0, 1)), 0.0)
@@ -158,8 +158,7 @@ def _check_dense(name: str, times: Tensor) -> None:
     raise ValueError(
         Message(
             "times of {camera:{which}} run over {span:.3g} s, but it has {count} frames {step:.3g} s apart, and none for "
-            "{gap:.3g} s after "
-            "{last:.6g} s; give the frames on one side of that gap",
+            "{gap:.3g} s after {last:.6g} s; give the frames on one side of that gap",
             which=name,
             span=span,
             count=len(times),
@@ -168,6 +167,19 @@ def _check_dense(name: str, times: Tensor) -> None:
             last=float(times[at]),
         )
     )
+
+
+def lag_range(
+    frames: tuple[int, int], start: float, step: float, rate: float, max_shift: float | None, around: float = 0.0, *,
+    at_least_one: bool = False,
+) -> tuple[int, int]:  # fmt: skip
+    """First and last lag, in steps, with some overlap, and shifts of b's clock within ``max_shift`` seconds of ``around``."""
+    lo, hi = 1 - frames[0], frames[1] - 1
+    if max_shift is None:
+        return lo, hi
+    low, high = (((around + sign * max_shift) / rate - start) / step for sign in (-1, 1))
+    first, last = max(lo, math.ceil(low - 1e-9)), min(hi, math.floor(high + 1e-9))
+    return (min(first, hi), max(last, min(first, hi))) if at_least_one else (first, last)
 
 
 def remove_positions(tracks: Tracks, bad: Tensor) -> Tracks:

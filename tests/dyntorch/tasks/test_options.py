@@ -1,9 +1,9 @@
-"""Options of the verbs: frozen, nested by stage, every field said in a sentence and read by its room."""
+"""Options of the verbs: frozen, flat, every field said in a sentence and read by its room."""
 
 import ast
 import inspect
 import re
-from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
+from dataclasses import FrozenInstanceError, fields, replace
 from pathlib import Path
 
 import pytest
@@ -21,49 +21,18 @@ def room_of(kind):
     return Path(dyn.__file__).parent.joinpath(*kind.__module__.split(".")[1:-1])
 
 
-def stages(kind):
-    """Every class of numbers with the name by which it is read: the stages, or the options themselves where there are none."""
-    options = kind()
-    nested = {one.name: getattr(options, one.name) for one in fields(options) if is_dataclass(getattr(options, one.name))}
-    return nested or {"options": options}
-
-
-def own_stages(kind):
-    """Those that are not the options of another verb, which answers for them itself."""
-    return {name: part for name, part in stages(kind).items() if type(part).__module__ == kind.__module__}
-
-
 @pytest.mark.parametrize("kind", KINDS, ids=NAMES)
-def test_options_are_frozen_and_nested_by_stage(kind):
-    assert set(stages(kind)) in ({"options"}, {one.name for one in fields(kind)})
-    for part in stages(kind).values():
-        assert fields(part)
-        with pytest.raises(FrozenInstanceError):
-            setattr(part, fields(part)[0].name, 0)
-
-
-@pytest.mark.parametrize("kind", KINDS, ids=NAMES)
-def test_every_field_is_said_in_a_sentence(kind):
+def test_options_are_frozen_and_said_and_read(kind):
+    with pytest.raises(FrozenInstanceError):
+        setattr(kind(), fields(kind)[0].name, 0)
     tree = ast.parse(Path(inspect.getsourcefile(kind)).read_text(encoding="utf-8"))
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    for part in own_stages(kind).values():
-        stage = classes[type(part).__name__]
-        assert ast.get_docstring(stage)
-        for before, after in zip(stage.body[1::2], stage.body[2::2], strict=True):
-            assert isinstance(before, ast.AnnAssign), stage.name
-            assert isinstance(after, ast.Expr) and len(after.value.value) > 10, f"{stage.name}.{ast.unparse(before.target)}"
-
-
-@pytest.mark.parametrize("kind", KINDS, ids=NAMES)
-def test_every_field_is_read_where_it_decides(kind):
-    files = [path for path in sorted(room_of(kind).rglob("*.py")) if path.name != "options.py"]
-    text = " ".join(path.read_text(encoding="utf-8") for path in files)
-    read = set(re.findall(r"(?=\b(\w+)\s*\.(\w+)\b)", text))
-    called = re.findall(r"(\w+)(?:: \w+)? = options\.(\w+)\n", text)
-    for stage, part in own_stages(kind).items():
-        # a function that takes one stage calls it options, or gives it a name of its own
-        names = {stage, "options"} | {name for name, meant in called if meant == stage}
-        assert {one.name for one in fields(part) if not {(name, one.name) for name in names} & read} == set(), stage
+    (node,) = [one for one in tree.body if isinstance(one, ast.ClassDef) and one.name == kind.__name__]
+    assert ast.get_docstring(node)
+    for before, after in zip(node.body[1::2], node.body[2::2], strict=True):
+        assert isinstance(before, ast.AnnAssign), node.name
+        assert isinstance(after, ast.Expr) and len(after.value.value) > 10, ast.unparse(before.target)
+    text = " ".join(path.read_text(encoding="utf-8") for path in sorted(room_of(kind).rglob("*.py")))
+    assert not {one.name for one in fields(kind)} - set(re.findall(r"\boptions\s*\.(\w+)\b", text))
 
 
 def plane():

@@ -15,7 +15,7 @@ import torch
 import dyntorch
 from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.numerics import Message
-from dyntorch.tasks.segment.result import BodyModel, Segmentation
+from dyntorch.tasks.segment.result import Segmentation
 from indexing.report.segmentation import FILES
 
 # torch's own, when it first loads its transforms; hidden outside of tests
@@ -102,8 +102,9 @@ def solved(monkeypatch, scene):
         residuals = torch.where(labels == 0, 9.0, 0.25 * labels).double()
         limit = torch.tensor(float(options["threshold"] or 1.5))
         return Segmentation(
-            labels, torch.tensor(2), torch.from_numpy(fundamentals), homographies, (BodyModel.FUNDAMENTAL, BodyModel.HOMOGRAPHY),
-            probabilities * seen[:, None], residuals, torch.ones(len(x1)), limit, status=torch.tensor(0),
+            labels=labels, bodies=torch.tensor(2), homographies=homographies, planar=torch.tensor([False, True]),
+            probabilities=probabilities * seen[:, None], residuals=residuals, threshold=limit,
+            fundamentals=torch.from_numpy(fundamentals), coherence=torch.ones(len(x1)), status=torch.tensor(0),
         )  # fmt: skip
 
     monkeypatch.setattr(dyntorch, "segment", segment, raising=False)
@@ -200,7 +201,8 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, solved, monkeypatc
         found = solve(x1, x2, **options)
         zero = torch.zeros(0, 3, 3)
         return dataclasses.replace(
-            found, labels=0 * found.labels, bodies=torch.tensor(0), fundamentals=zero, homographies=zero, models=(),
+            found, labels=0 * found.labels, bodies=torch.tensor(0), fundamentals=zero, homographies=zero,
+            planar=torch.zeros(0, dtype=torch.bool),
             probabilities=found.probabilities[:, :1], residuals=0 * found.residuals,
         )  # fmt: skip
 

@@ -46,12 +46,11 @@ def report(bodies: int = 2, count: int = 8, **changes) -> SegmentationReport:
     result = {
         "labels": labels, "bodies": np.array(bodies), "fundamentals": np.tile(np.eye(3), (bodies, 1, 1)),
         "homographies": np.zeros((bodies, 3, 3)), "probabilities": probabilities, "residuals": np.full(count, 0.5),
-        "coherence": np.ones(count), "status": np.array(0), "threshold": np.array(2.5),
+        "coherence": np.ones(count), "status": np.array(0), "threshold": np.array(2.5), "planar": np.zeros(bodies, dtype=bool),
     }  # fmt: skip
     known = {name: torch.as_tensor(changes.pop(name, value)) for name, value in result.items()}
-    models = tuple(changes.pop("models", ["fundamental"] * bodies))
     said = (Notice(changes.pop("said", Told.HOSTILE), 1.0),)
-    found = Segmentation(**known, models=models, notices=said)
+    found = Segmentation(**known, notices=said)
     pair = MatchedPair("m.csv", SCRIPT, x1, x2, ids)
     return SegmentationReport(**{"result": found, "pair": pair, "heading": SCRIPT, "notes": [SCRIPT], **changes})
 
@@ -78,7 +77,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         report(0, status=Status.NO_CONSENSUS),
         report(11, 40),  # more bodies than colours
         report(labels=np.zeros(8, dtype=int)),
-        report(models=["fundamental", "homography"], homographies=np.tile(np.eye(3), (2, 1, 1))),
+        report(planar=np.array([False, True]), homographies=np.tile(np.eye(3), (2, 1, 1))),
         report(size=(640.0, 200.0)),
         report(photographs=[photograph(), photograph(60, 90)]),
         report(photographs=[photograph(200, 40), photograph(200, 40)]),

@@ -8,7 +8,7 @@ import torch
 
 from dyntorch.numerics.least_squares import Iterate
 from dyntorch.tasks.calibrate.bundle import PARAMETERS, Priors, RigAdjustment, RigState, camera_covariance, gauge, images
-from dyntorch.tasks.calibrate.input import Seen
+from dyntorch.tasks.calibrate.input import Sightings
 from tests.dyntorch.tasks.calibrate.rigs import exponential, pictures
 
 F64 = torch.float64
@@ -32,7 +32,7 @@ class Lines:
     def at(self, clocks):
         own = clocks[..., 1:].exp() * self.times + clocks[..., :1]
         x = self.start + self.slope * own[..., None, None]
-        return Seen(x, self.slope.expand_as(x), self.known.expand(x.shape[:-1]))
+        return Sightings(x, self.slope.expand_as(x), self.known.expand(x.shape[:-1]))
 
 
 def world(seed=0):
@@ -214,7 +214,7 @@ def test_changes_of_the_world_leave_every_image():
 def test_covariances_are_those_of_the_whole_information_without_the_world():
     problem, state = world(seed=6)
     normal = problem.linear(state)
-    _, reduced, _ = normal.eliminated(torch.zeros(1, dtype=F64))
+    _, reduced, _ = normal.eliminate_points(torch.zeros(1, dtype=F64))
     unseen = gauge(state.R[0], state.t[0])
     found = camera_covariance(reduced[0], torch.eye(COUNT, dtype=F64), unseen)
     # independent: all unknowns, with changes of the cameras' world forbidden by Lagrange's multipliers

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import pytest
 import torch
 
 from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import sampson_squared
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
+from dyntorch.metrics import relative_error
 from dyntorch.tasks.segment import agglomeration
 from dyntorch.tasks.segment.agglomeration import (
     CHANCE_PREFERENCE_SHARE,
@@ -15,10 +20,14 @@ from dyntorch.tasks.segment.agglomeration import (
     PIECE_LINK_WEIGHT,
     GroupCosts,
     NearPairs,
+    affine_map,
+    cut_into_pieces,
+    fundamental_of_eight,
+    homography_of_four,
+    keep_strongest,
+    links_of,
     merge_pieces,
-    pieces,
     preference_kernel,
-    strongest,
 )
 from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, select_near_pairs
 from dyntorch.tasks.segment.search import one_hot
@@ -41,8 +50,9 @@ def groups_of(labels: torch.Tensor) -> torch.Tensor:
     return one_hot(labels, int(labels.max()) + 1) > 0
 
 
-def kernel_of(scene: Shot) -> torch.Tensor:
-    return preference_kernel(scene.film(), torch.arange(len(scene.labels)), draw(), 100)
+def kernel_of(scene: Shot, searched: torch.Tensor | None = None) -> torch.Tensor:
+    everything = torch.arange(len(scene.labels)) if searched is None else searched
+    return preference_kernel(scene.film(), everything, draw(), HYPOTHESES)
 
 
 def halves(scene: Shot) -> torch.Tensor:
@@ -55,14 +65,14 @@ def judge_of(scene: Shot, labels: torch.Tensor) -> GroupCosts:
 
 
 def rms(near: NearPairs, group: torch.Tensor) -> float:
-    square, seen = near.squares(group, 0.15)
+    square, seen = near.squared_distances(group, 0.15)
     return float(square[seen].mean().sqrt())
 
 
 def test_groups_that_move_as_one_are_on_their_epipolar_lines():
     scene = shot((40, 30), sigma=0.0)
     near = near_of(scene)
-    square, seen = near.squares(scene.labels == 1, 0.15)
+    square, seen = near.squared_distances(scene.labels == 1, 0.15)
     assert square.shape == seen.shape == (len(near.seen), 40)
     pure = [rms(near, scene.labels == body) for body in (1, 2)]
     assert max(pure) < 1e-4 and rms(near, scene.labels > 0) > 100 * max(pure)
@@ -75,7 +85,7 @@ def test_distances_are_those_of_the_motion_that_most_tracks_have():
     pairs = select_near_pairs(film, (5,), 3, 16)
     near = NearPairs(film, pairs)
     own = scene.labels == 1
-    for row, (a, b) in zip(near.squares(own, 0.15, rounds=8)[0], pairs, strict=True):
+    for row, (a, b) in zip(near.squared_distances(own, 0.15, rounds=8)[0], pairs, strict=True):
         exact = sampson_squared(scene.fundamental(0, a, b), scene.tracks[a][own], scene.tracks[b][own])
         known = exact / (1 + (scene.tracks[b] - scene.tracks[a])[own].norm(dim=-1) / DOUBLED_VARIANCE_MOTION)
         assert float(row[1:].max()) < 0.05 < 0.3 * float(known[0])
@@ -88,7 +98,7 @@ def test_costs_count_sightings_up_to_a_cap():
     groups = torch.stack([scene.labels == 1, scene.labels == 2, scene.labels > 0])
     cost = judge.cost(groups)
     for found, group in zip(cost.tolist(), groups, strict=True):
-        square, seen = judge.near.squares(group, judge.scale)
+        square, seen = judge.near.squared_distances(group, judge.scale)
         known = (square / judge.scale**2).clamp(max=MAX_SQUARED_DISTANCE)[seen].sum()
         assert found == pytest.approx(float(known), rel=1e-9)
         assert found <= MAX_SQUARED_DISTANCE * float(judge.near.count[group].sum())
@@ -99,7 +109,7 @@ def test_sightings_are_those_of_the_pairs_of_frames():
     scene = shot((40,))
     scene.tracks[:5, :10] = torch.nan
     near = near_of(scene)
-    square, seen = near.squares(torch.ones(40, dtype=torch.bool), 0.15)
+    square, seen = near.squared_distances(torch.ones(40, dtype=torch.bool), 0.15)
     assert bool(square.isfinite().all()) and int(seen.sum()) == int(near.seen.sum())
     assert near.count.tolist() == near.seen.sum(0).tolist() and float(near.count[0]) < float(near.count[20])
 
@@ -107,12 +117,12 @@ def test_sightings_are_those_of_the_pairs_of_frames():
 @pytest.mark.parametrize("count", [2, 6])
 def test_pieces_of_two_bodies_are_pure(count):
     scene = shot((40, 40), sigma=0.05)
-    found = pieces(strongest(kernel_of(scene), 8), count)
+    found = cut_into_pieces(keep_strongest(kernel_of(scene), 8), count)
     assert found.shape == (80,) and sorted(found.unique().tolist()) == list(range(count))
     for piece in range(count):
         inside = scene.labels[found == piece]
         assert float((inside == inside.mode().values).double().mean()) > 0.9
-    again = pieces(strongest(kernel_of(scene), 8), count)
+    again = cut_into_pieces(keep_strongest(kernel_of(scene), 8), count)
     assert found.tolist() == again.tolist()
 
 
@@ -120,11 +130,11 @@ def test_pieces_of_a_graph_of_two_components():
     sparse = torch.zeros(20, 20)
     sparse[:10, :10], sparse[10:, 10:] = 0.5, 0.5
     sparse.fill_diagonal_(0.0)
-    found = pieces(sparse, 2)
+    found = cut_into_pieces(sparse, 2)
     assert bool((found[:10] == found[0]).all()) and bool((found[10:] == found[10]).all()) and found[0] != found[10]
     lonely = torch.zeros(25, 25)
     lonely[:20, :20] = sparse
-    assert pieces(lonely, 2).shape == (25,)  # tracks without links get a label, too
+    assert cut_into_pieces(lonely, 2).shape == (25,)  # tracks without links get a label, too
 
 
 def test_true_bodies_are_farther_apart_than_halves_of_one():
@@ -190,3 +200,158 @@ def test_merged_labels_are_nested_and_end_at_the_bodies():
     truth = scene.labels[:, None] == scene.labels
     assert bool(((found[3][:, None] == found[3]) == truth).all())
     assert sorted(merge_pieces(judge, halves(scene), [2, 4])) == [2, 4]
+
+
+SOLVERS = ((affine_map, 3), (homography_of_four, 4), (fundamental_of_eight, 8))
+HYPOTHESES = 100
+
+
+def points(*size: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*size, 2, generator=draw(seed), dtype=F64) - 0.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_affine_maps_take_three_points_to_three(seed):
+    x1, x2 = points(3, seed=seed), points(3, seed=seed + 10)
+    found = affine_map(x1, x2)
+    known = torch.linalg.solve(homogeneous(x1), x2).mT
+    torch.testing.assert_close(found[:2], known, rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(found[2], torch.tensor([0.0, 0, 1], dtype=F64), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_homographies_of_four_points_are_those_of_opencv(seed):
+    square = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
+    x1, x2 = square + 0.4 * points(4, seed=seed), square + 0.4 * points(4, seed=seed + 10)
+    found = homography_of_four(x1, x2)
+    known = torch.from_numpy(cv2.getPerspectiveTransform(x1.float().numpy(), x2.float().numpy()))
+    assert float(found.norm()) == pytest.approx(1.0)
+    torch.testing.assert_close(unit(found), unit(known), rtol=0, atol=1e-4)
+    torch.testing.assert_close(apply(found, x1), x2, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_matrices_of_eight_matches_are_the_null_vectors_and_the_truth(seed):
+    scene = shot((30,), sigma=0.0, seed=seed)
+    film = scene.film()
+    x1, x2 = film.x[0][::3][:8], film.x[-1][::3][:8]
+    found = fundamental_of_eight(x1, x2)
+    rows = (homogeneous(x2)[:, :, None] * homogeneous(x1)[:, None]).flatten(1)
+    known = torch.linalg.svd(rows)[2][-1].reshape(3, 3)
+    assert float(found.norm()) == pytest.approx(1.0)
+    assert float(relative_error(found, known)) < 1e-5
+    back = film.change.inverse()
+    true = back.mT @ scene.fundamental(0, 0, 9) @ back
+    assert float(relative_error(found, true)) < 1e-4
+
+
+@pytest.mark.parametrize(("solver", "count"), SOLVERS)
+def test_batches_are_loops(solver, count):
+    x1, x2 = points(2, 5, count), points(2, 5, count, seed=1)
+    found = solver(x1, x2)
+    assert found.shape == (2, 5, 3, 3)
+    for i in range(2):
+        for j in range(5):
+            torch.testing.assert_close(found[i, j], solver(x1[i, j], x2[i, j]), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize(("solver", "count"), SOLVERS)
+@pytest.mark.parametrize("case", ["one point", "a line", "nothing moves", "zero"])
+def test_degenerate_samples_are_finite(solver, count, case):
+    x1, x2 = points(4, count), points(4, count, seed=1)
+    if case == "one point":
+        x1 = x1[:, :1].expand_as(x1).clone()
+    elif case == "a line":
+        x1 = torch.stack([x1[..., 0], 2 * x1[..., 0] + 0.25], -1)
+    elif case == "nothing moves":
+        x2 = x1.clone()
+    else:
+        x1, x2 = torch.zeros_like(x1), torch.zeros_like(x2)
+    assert bool(solver(x1, x2).isfinite().all())
+
+
+def test_the_kernel_is_symmetric_between_0_and_1_and_knows_the_bodies():
+    scene = shot((40, 30, 20))
+    kernel = kernel_of(scene)
+    assert kernel.shape == (90, 90) and kernel.dtype == torch.float32
+    assert bool((kernel >= 0).all()) and bool((kernel <= 1 + 1e-6).all()) and bool((kernel.diagonal() == 0).all())
+    torch.testing.assert_close(kernel, kernel.mT, rtol=0, atol=1e-6)
+    alike = scene.labels[:, None] == scene.labels
+    alike.fill_diagonal_(False)
+    others = scene.labels[:, None] != scene.labels
+    for body in (1, 2, 3):
+        own = scene.labels == body
+        assert float(kernel[own][alike[own]].mean()) > 1.4 * float(kernel[own][others[own]].mean())
+    top = kernel.topk(3).indices
+    assert float((scene.labels[top] == scene.labels[:, None]).double().mean()) > 0.9
+
+
+def test_a_kernel_of_some_tracks_has_a_column_for_each():
+    scene = shot((40, 30))
+    searched = torch.arange(0, 70, 2)
+    kernel = kernel_of(scene, searched)
+    assert kernel.shape == (70, 35)
+    assert bool((kernel[searched, torch.arange(35)] == 0).all())
+    assert bool((kernel[1::2].sum(-1) > 0).all())  # those that are not searched are compared, too
+    best = kernel.argmax(-1)
+    assert float((scene.labels[searched][best] == scene.labels).double().mean()) > 0.9
+
+
+def twins(frames: int):
+    """A scene in which track 32 goes beside track 0."""
+    scene = shot((20, 12), frames=frames)
+    copy = scene.tracks[:, :1] + 3.0
+    return replace(scene, tracks=torch.cat([scene.tracks, copy], 1), labels=torch.cat([scene.labels, scene.labels[:1]]))
+
+
+def test_a_track_has_most_in_common_with_one_beside_it(monkeypatch):
+    monkeypatch.setattr(agglomeration, "KERNEL_GAPS", (1,))
+    kernel = kernel_of(twins(frames=2))
+    assert float(kernel[0, 32]) > 0.5 and int(kernel[0].argmax()) == 32
+    # one pair of frames: the share of preferences is a multiple of 1 / (3 h)
+    few = 3 * round(agglomeration.PREFERRED_SHARE * HYPOTHESES)
+    torch.testing.assert_close(kernel * few, (kernel * few).round(), rtol=0, atol=1e-3)
+
+
+def test_the_kernel_is_the_mean_over_the_pairs_that_show_both():
+    scene = twins(frames=6)
+    scene.tracks[4:, 32] = torch.nan  # it counts by what is there
+    assert float(kernel_of(scene)[0, 32]) > 0.7
+
+
+def test_tracks_that_never_meet_have_nothing_in_common():
+    scene = shot((50,), frames=8)
+    tracks = scene.tracks.clone()
+    tracks[4:, :25] = torch.nan
+    tracks[:4, 25:] = torch.nan
+    apart = replace(scene, tracks=tracks)
+    assert select_near_pairs(apart.film(), agglomeration.KERNEL_GAPS, 3, agglomeration.MIN_KERNEL_TRACKS)
+    kernel = kernel_of(apart)
+    assert bool((kernel[:25, 25:] == 0).all()) and bool((kernel[25:, :25] == 0).all())
+    assert bool(kernel.isfinite().all()) and float(kernel[:25, :25].sum()) > 0 and float(kernel[25:, 25:].sum()) > 0
+
+
+def test_the_strongest_of_every_row_or_column_are_kept():
+    draws = torch.rand(30, 30, generator=draw())
+    kernel = (draws + draws.mT) / 2
+    kernel.fill_diagonal_(0.0)
+    sparse = keep_strongest(kernel, 4)
+    assert bool((sparse == sparse.mT).all())
+    assert bool(((sparse == 0) | (sparse == kernel)).all())
+    rank = kernel.argsort(-1, descending=True).argsort(-1) < 4
+    assert bool(((sparse > 0) == (rank | rank.mT)).all())
+    assert bool((keep_strongest(kernel[:3, :3], 10) == kernel[:3, :3]).all())  # fewer tracks than neighbours
+
+
+def test_links_weigh_about_the_total_for_each_track():
+    kernel = kernel_of(shot((40, 30)))
+    sparse = keep_strongest(kernel, 10)
+    links = links_of(sparse, 18.0)
+    dense = torch.zeros_like(sparse, dtype=F64).scatter_add_(1, links.index, links.weight)
+    torch.testing.assert_close(dense, dense.mT, rtol=0, atol=1e-5)
+    assert bool(((dense > 0) == (sparse > 0)).all())
+    torch.testing.assert_close(dense.sum(-1).mean(), torch.tensor(18.0, dtype=F64), rtol=0.1, atol=0)
+    degree = sparse.sum(-1)
+    torch.testing.assert_close(dense[0], (18 * sparse[0] / (degree[0] * degree).sqrt()).double(), rtol=1e-4, atol=1e-6)
+    doubled = links_of(sparse, 36.0)
+    torch.testing.assert_close(doubled.weight, 2 * links.weight, rtol=1e-5, atol=0)

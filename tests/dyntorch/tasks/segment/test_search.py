@@ -2,40 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import inf
 
 import pytest
 import torch
 
+import dyntorch as dyn
 from dyntorch import scenes
-from dyntorch.core.outcome import Status
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
-from dyntorch.tasks.segment.coherence import View, coherence, energy
-from dyntorch.tasks.segment.result import BodyModel
-from dyntorch.tasks.segment.search import Candidate, search
-from dyntorch.tasks.segment.segment import no_bodies, segmentation_notices, select_count
+from dyntorch.tasks.segment import segment
+from dyntorch.tasks.segment.coherence import (
+    ENERGY_MAX_SQUARED_DISTANCE,
+    SAMPSON_NOISE_PIXELS,
+    coherence,
+    energy,
+    mean_field,
+)
+from dyntorch.tasks.segment.search import MIN_BODY_MATCHES, Candidate, affine_flows, search, search_samples
+from dyntorch.tasks.segment.segment import select_count
+from tests.dyntorch.tasks.segment.videos import F64, draw, view_of
 
-F64 = torch.float64
 SCALE = 1 / 200
 
 
-def draw(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def view_of(n, bodies=None, seed: int = 0, **options):
+def scene_view(n, bodies=None, seed: int = 0, **options):
     """Matches of a scene around 0 at unit size, and their labels from 1."""
     scene = scenes.bodies(n, bodies, generator=draw(seed), **options)
-    x1, x2 = (x * SCALE - torch.tensor([1.6, 1.2], dtype=F64) for x in scene.views)
-    return View(x1, x2, SCALE, coherence(x1, x2, 3 * SCALE).links), scene.labels
+    return view_of(scene), scene.labels
 
 
 @pytest.mark.parametrize("bodies", [1, 2, 3])
 @pytest.mark.parametrize("sigma", [0.0, 0.5])
 def test_bodies_are_all_right(bodies, sigma):
-    view, truth = view_of(50 * bodies, bodies, seed=3, sigma=sigma)
+    view, truth = scene_view(50 * bodies, bodies, seed=3, sigma=sigma)
     best = search(view, [bodies], draw(), num_starts=16)[bodies][0]
     assert float(misclassification(best.labels + 1, truth)) <= (0.0 if sigma == 0 else 0.01)
     square = sampson_squared(best.fundamentals, view.x1, view.x2).gather(0, best.labels[None])[0]
@@ -43,7 +43,7 @@ def test_bodies_are_all_right(bodies, sigma):
 
 
 def test_several_numbers_of_bodies_at_once():
-    view, truth = view_of(120, 2, seed=1, sigma=0.3)
+    view, truth = scene_view(120, 2, seed=1, sigma=0.3)
     found = search(view, [1, 2, 3], draw(), num_starts=16)
     assert sorted(found) == [1, 2, 3]
     for count, candidates in found.items():
@@ -62,32 +62,16 @@ def test_several_numbers_of_bodies_at_once():
     assert float(misclassification(found[2][0].labels + 1, truth)) == 0.0
 
 
-def test_further_labellings_are_starts():
-    view, truth = view_of(90, 3, seed=2, sigma=0.3)
-    found = search(view, [3], draw(), [truth - 1, torch.zeros_like(truth)], num_starts=16)[3]
-    assert float(misclassification(found[0].labels + 1, truth)) == 0.0
-    # nothing found is cheaper than what the truth leads to
-    assert found[0].energy <= search(view, [3], draw(), num_starts=16)[3][0].energy + 1e-9
-
-
 @pytest.mark.parametrize(("n", "count"), [(20, 3), (13, 2), (8, 2)])
 def test_too_few_matches_for_so_many_bodies(n, count):
-    view, _ = view_of(n, 2, sigma=0.3)
+    view, _ = scene_view(n, 2, sigma=0.3)
     assert search(view, [count], draw(), num_starts=16).get(count, []) == []
 
 
 def test_few_matches_are_one_body():
-    view, _ = view_of(8, 1, sigma=0.3)
+    view, _ = scene_view(8, 1, sigma=0.3)
     (best, *_) = search(view, [1], draw(), num_starts=16)[1]
     assert bool((best.labels == 0).all()) and bool(best.fundamentals.isfinite().all())
-
-
-def test_randomness_comes_from_the_generator():
-    view, _ = view_of(60, 2, seed=4, sigma=0.5)
-    first, second = (search(view, [2, 3], draw(5), num_starts=16) for _ in range(2))
-    for count in (2, 3):
-        assert [c.energy for c in first[count]] == [c.energy for c in second[count]]
-        assert all(torch.equal(a.labels, b.labels) for a, b in zip(first[count], second[count], strict=True))
 
 
 @pytest.mark.parametrize(("moved", "costs", "rival"), [(0, 5.0, inf), (4, 5.0, inf), (40, 5.0, 0.5), (40, 30.0, 3.0)])
@@ -104,9 +88,135 @@ def test_another_segmentation_of_little_more_cost_is_a_rival(moved, costs, rival
     assert chosen is not None and chosen.rival == pytest.approx(rival)
 
 
-@pytest.mark.parametrize(("rival", "said"), [(0.5, True), (3.0, False), (inf, False)])
-def test_two_views_that_hardly_decide_say_so(rival, said):
-    problem = no_bodies(torch.ones(30, dtype=F64), 2.5, Status.OK, 0.0, 1.0)
-    problem = replace(problem, models=(BodyModel.FUNDAMENTAL,) * 2, rival=rival)
-    told = [str(notice) for notice in segmentation_notices([problem], None, ())]
-    assert any("through more frames" in text for text in told) is said
+@pytest.mark.parametrize(("margin", "said"), [(inf, True), (0.0, False)])
+def test_two_views_that_hardly_decide_say_so(monkeypatch, margin, said):
+    monkeypatch.setattr(segment, "MIN_RUNNER_UP_COST", margin)
+    scene = scenes.bodies(60, 2, sigma=0.5, generator=draw(4))
+    monkeypatch.setattr(segment, "_runner_up_cost", lambda candidates: 1.0)
+    assert ("through more frames" in repr(dyn.segment(*scene.views, 2, generator=draw()))) is said
+
+
+NOISE = 0.005
+
+
+def two_flows(interleaved: bool = False):
+    """Matches, their links and labels: a half of the image turns, the other shrinks and moves."""
+    x1 = 2 * torch.rand(120, 2, generator=draw(), dtype=F64) - 1
+    labels = torch.arange(120) % 2 if interleaved else (x1[:, 0] > 0.1).long()
+    first = x1 @ torch.tensor([[0.98, -0.2], [0.2, 0.98]], dtype=F64).mT + torch.tensor([0.1, 0.0], dtype=F64)
+    second = 0.9 * x1 + torch.tensor([-0.3, 0.35], dtype=F64)
+    x2 = torch.where(labels[:, None] == 0, first, second) + NOISE * torch.randn(120, 2, generator=draw(1), dtype=F64)
+    return x1, x2, coherence(x1, x2, 3 * NOISE)[1], labels
+
+
+def agreement(found, labels):
+    same = (found == labels).double().mean(-1)
+    return torch.maximum(same, 1 - same)
+
+
+@pytest.mark.parametrize(("interleaved", "share"), [(False, 0.9), (True, 0.5)])
+def test_two_flows_are_recovered(interleaved, share):
+    x1, x2, links, labels = two_flows(interleaved)
+    found = affine_flows(x1, x2, links, torch.full((16,), 2), NOISE, draw(2))
+    assert found.shape == (16, 120) and found.dtype == torch.long
+    right = agreement(found, labels)
+    assert float(right.max()) == 1.0 and float((right > 0.97).double().mean()) >= share
+
+
+def test_runs_have_their_own_number_of_flows():
+    x1, x2, links, _ = two_flows()
+    bodies = torch.tensor([1, 2, 3, 4, 2, 1])
+    found = affine_flows(x1, x2, links, bodies, NOISE, draw())
+    assert bool((found >= 0).all()) and bool((found.amax(-1) < bodies).all())
+
+
+def test_few_and_equal_matches():
+    for n in (4, 8):
+        x = torch.rand(n, 2, generator=draw(), dtype=F64)
+        for x1, x2 in ((x, x), (x[:1].expand(n, 2), x[:1].expand(n, 2)), (x, x[:1].expand(n, 2))):
+            found = affine_flows(x1, x2, coherence(x1, x2, NOISE)[1], torch.tensor([1, 2, 3]), NOISE, draw())
+            assert found.shape == (3, n) and bool((found.amax(-1) < torch.tensor([1, 2, 3])).all())
+
+
+def test_mean_field_one_match_at_a_time():
+    _, _, links, _ = two_flows()
+    cost = 3 * torch.rand(2, 3, 120, generator=draw(3), dtype=F64)
+    found = mean_field(cost, links, 2.0, 3)
+    member = torch.softmax(-cost, 1)
+    for _ in range(3):
+        fresh = torch.zeros_like(member)
+        for i in range(120):
+            pull = (member[..., links.index[i]] * links.weight[i]).sum(-1)
+            fresh[..., i] = torch.softmax(2.0 * pull - cost[..., i], -1)
+        member = (member + fresh) / 2
+    torch.testing.assert_close(found, member)
+    torch.testing.assert_close(found.sum(1), torch.ones(2, 120, dtype=F64))
+    # from a start, without links, it goes half of the way to the softmax each time
+    start = torch.full_like(cost, 1 / 3)
+    alone = mean_field(cost, links, 0.0, 2, start)
+    torch.testing.assert_close(alone, (start + 3 * torch.softmax(-cost, 1)) / 4)
+    # what is absent is nowhere
+    absent = cost.clone()
+    absent[0, 2] = torch.inf
+    assert bool((mean_field(absent, links, 2.0, 3)[0, 2] == 0).all())
+
+
+def segmented(scene, bodies):
+    found = dyn.segment(*scene.views, bodies=bodies, spatial=False, generator=draw())
+    return found, float(misclassification(found.labels, scene.labels))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "bodies", "outliers"), [((60, 60), 2, 0.0), ((60, 60), None, 0.2), ((60, 60, 60), 3, 0.2)])
+def test_interleaved_bodies_are_found(n, bodies, outliers):
+    scene = scenes.bodies(n, sigma=0.3, outliers=outliers, interleaved=True, generator=draw())
+    found, error = segmented(scene, bodies)
+    assert int(found.bodies) == len(n)
+    assert int(found.status) == dyn.Status.OK
+    assert error < 0.06
+
+
+@pytest.mark.slow
+def test_two_fifths_of_outliers_do_no_harm():
+    scene = scenes.bodies((100, 100), sigma=0.3, outliers=0.4, interleaved=True, generator=draw(1))
+    assert segmented(scene, 2)[1] < 0.06
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3])
+def test_one_body_is_one(outliers):
+    scene = scenes.bodies((100,), sigma=0.3, outliers=outliers, interleaved=True, generator=draw(2))
+    assert int(segmented(scene, None)[0].bodies) == 1
+
+
+@pytest.mark.slow
+def test_candidates_are_ordered_and_cost_their_distances():
+    scene = scenes.bodies((40, 40), sigma=0.3, outliers=0.2, interleaved=True, generator=draw(4))
+    view = view_of(scene, linked=False)
+    found = search_samples(view, [1, 2, 3], draw(), max_samples=24000)
+    assert sorted(found) == [1, 2, 3]
+    for count, candidates in found.items():
+        energies = [candidate.energy for candidate in candidates]
+        assert energies == sorted(energies)
+        square = torch.stack([sampson_squared(x.fundamentals, view.x1, view.x2).amin(0) for x in candidates])
+        cost = (square / (SAMPSON_NOISE_PIXELS * view.pixel) ** 2).clamp(max=ENERGY_MAX_SQUARED_DISTANCE).sum(-1).min()
+        assert energies[0] == pytest.approx(float(cost))
+        for candidate in candidates:
+            square = sampson_squared(candidate.fundamentals, view.x1, view.x2)
+            near = square.argmin(0)[square.amin(0) < ENERGY_MAX_SQUARED_DISTANCE * (SAMPSON_NOISE_PIXELS * view.pixel) ** 2]
+            assert int(torch.bincount(near, minlength=count).min()) >= MIN_BODY_MATCHES
+
+
+@pytest.mark.parametrize("count", [8, 12, 20])
+def test_few_matches_and_matches_without_bodies_are_answered(count):
+    x = 500 * torch.rand(2, count, 2, generator=draw(6), dtype=torch.float64)
+    for bodies in (1, None):
+        found = dyn.segment(x[0], x[1], bodies=bodies, spatial=False, generator=draw())
+        assert found.labels.shape == (count,)
+        assert bool(found.fundamentals.isfinite().all())
+
+
+def test_matches_at_rest_are_answered():
+    x = 500 * torch.rand(60, 2, generator=draw(7), dtype=torch.float64)
+    found = dyn.segment(x, x, spatial=False, generator=draw())
+    assert int(found.bodies) <= 1
+    assert bool(found.fundamentals.isfinite().all())

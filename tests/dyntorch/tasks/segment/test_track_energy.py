@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from dyntorch.geometry.epipolar import sampson_squared
+from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment import track_energy
-from dyntorch.tasks.segment.coherence import Links, relief
-from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, select_frame_pairs
+from dyntorch.tasks.segment.coherence import Links, relief_cost
+from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, TrackSet, select_frame_pairs
 from dyntorch.tasks.segment.search import one_hot
 from dyntorch.tasks.segment.track_energy import (
     EFFECTIVE_PAIRS,
@@ -22,6 +23,7 @@ from dyntorch.tasks.segment.track_energy import (
     MIN_TRACK_PARALLAX_PIXELS,
     RELIEF_WEIGHT,
     TRACK_FREEDOM,
+    Exchanges,
     TrackEvidence,
     costs,
     descend_labels,
@@ -32,6 +34,7 @@ from dyntorch.tasks.segment.track_energy import (
     squares,
     student_cost,
 )
+from dyntorch.tasks.segment.tracks import EXCHANGE_CUT_WEIGHTS
 from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
 
 HERE = torch.device("cpu")
@@ -135,7 +138,7 @@ def test_the_energy_is_the_sum_that_is_said():
     labels = scene.labels - 1
     total = 0.0
     reliefs = [
-        relief(pair.view, F, member[..., pair.index], MIN_TRACK_PARALLAX_PIXELS)[0]
+        relief_cost(pair.view, F, member[..., pair.index], MIN_TRACK_PARALLAX_PIXELS)[0]
         for pair, F in zip(evidence.pairs, geometry, strict=True)
     ]
     for track in range(28):
@@ -211,3 +214,44 @@ def test_starts_side_by_side_are_those_one_by_one():
     alone = descend_labels(evidence, wrong[None], 2)
     assert both.labels[1].tolist() == alone.labels[0].tolist()
     torch.testing.assert_close(both.energy[:1], alone.energy, rtol=1e-4, atol=1e-3)
+
+
+COUNTS = (48, 40)
+
+
+def exchanges() -> tuple[Exchanges, torch.Tensor, torch.Tensor]:
+    """Of six pieces, three of each of two bodies, without links: the labels of the pieces and of the bodies, from 0."""
+    scene = shot(COUNTS, frames=6, sigma=0.1)
+    film = TrackSet.of(scene.tracks)
+    pairs = [film.pair(pair) for pair in select_frame_pairs(film, 64)]
+    evidence = TrackEvidence.of(pairs, no_links(sum(COUNTS), film.x.device))
+    truth = scene.labels - 1
+    place = torch.cat([torch.arange(count) * 3 // count for count in COUNTS])
+    return Exchanges(evidence, 3 * truth + place), 3 * truth + place, truth
+
+
+@pytest.mark.parametrize("weight", EXCHANGE_CUT_WEIGHTS)
+@pytest.mark.parametrize("wrong", [(), (1,), (0, 4)])
+def test_pieces_in_the_wrong_body_are_put_right(wrong, weight):
+    search, pieces, truth = exchanges()
+    labels = truth.clone()
+    for piece in wrong:
+        labels[pieces == piece] = 1 - labels[pieces == piece]
+    found = search.improve(labels, weight)
+    assert float(misclassification(found + 1, truth + 1)) == 0.0
+
+
+def test_bodies_stay_as_many_as_they_are(monkeypatch):
+    search, _, truth = exchanges()
+    for most in (track_energy.MAX_EXCHANGES, 1):
+        monkeypatch.setattr(track_energy, "MAX_EXCHANGES", most)
+        one = Exchanges(search.evidence, search.cut)
+        assert len(one.improve(1 - truth, 1.0).unique()) == 2
+
+
+def test_sets_of_pieces_are_fitted_once():
+    search, _, truth = exchanges()
+    search.improve(truth, 1.0)
+    known = dict(search.known)
+    search.improve(truth, 1.0)
+    assert search.known == known

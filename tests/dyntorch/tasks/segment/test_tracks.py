@@ -14,7 +14,7 @@ from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment import agglomeration, frame_pairs
 from dyntorch.tasks.segment import tracks as module
-from dyntorch.tasks.segment.result import TrackNotice
+from dyntorch.tasks.segment.result import SegmentNotice
 from tests.battery.pretend_device import pretend_device
 from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
 
@@ -67,7 +67,7 @@ def test_the_number_of_bodies_is_found(counts):
     found = segmented(scene.tracks)
     assert int(found.bodies) == len(counts)
     assert wrong(found, scene.labels) <= 0.05
-    assert (TrackNotice.ONE_BODY in codes(found)) == (len(counts) == 1)
+    assert (SegmentNotice.ONE_BODY in codes(found)) == (len(counts) == 1)
 
 
 @pytest.mark.slow
@@ -196,14 +196,14 @@ def test_parts_of_the_result_fit_together():
 def test_declared_cameras_name_what_rests():
     scene = shot((40, 36))
     found = segmented(scene.tracks, 2)
-    assert int(found.static_body) == 0 and codes(found) == [TrackNotice.UNSURE_STATIC]
+    assert int(found.static_body) == 0 and codes(found) == [SegmentNotice.UNSURE_STATIC]
     first = int(found.labels[scene.labels == 1].mode().values)
     found = segmented(scene.tracks, 2, cameras=scene.cameras)
     assert int(found.static_body) == first and not found.notices
     moving = segmented(scene.tracks, 2, cameras=scene.projections[:, 1])
     assert int(moving.static_body) == 3 - first
     strange = segmented(scene.tracks, 2, cameras=scene.cameras.flip(0)[:, [1, 0, 2]])
-    assert int(strange.static_body) == 0 and codes(strange) == [TrackNotice.DISAGREEING]
+    assert int(strange.static_body) == 0 and codes(strange) == [SegmentNotice.DISAGREEING]
 
 
 # ---- what it must not depend on ----------------------------------------------------------------------------------------
@@ -325,11 +325,11 @@ def jump() -> torch.Tensor:
 @pytest.mark.parametrize(
     ("tracks", "notice", "status", "words"),
     [
-        (alone_in_a_frame, TrackNotice.SHORT, Status.TOO_FEW, "no track is in two frames"),
-        (never_together, TrackNotice.FEW_COMMON, Status.TOO_FEW, "more than 5 tracks in common"),
-        (lambda: shot((60,), moves=0.0, sigma=0.0).tracks, TrackNotice.STILL, Status.DEGENERATE, "nothing moves"),
-        (cut, TrackNotice.CUT, Status.DEGENERATE, "a cut at frame 6"),
-        (jump, TrackNotice.CUT, Status.DEGENERATE, "jump at frame 4"),
+        (alone_in_a_frame, SegmentNotice.SHORT, Status.TOO_FEW, "no track is in two frames"),
+        (never_together, SegmentNotice.FEW_COMMON, Status.TOO_FEW, "more than 5 tracks in common"),
+        (lambda: shot((60,), moves=0.0, sigma=0.0).tracks, SegmentNotice.STILL, Status.DEGENERATE, "nothing moves"),
+        (cut, SegmentNotice.CUT, Status.DEGENERATE, "a cut at frame 6"),
+        (jump, SegmentNotice.CUT, Status.DEGENERATE, "jump at frame 4"),
     ],
     ids=["short", "few common", "still", "cut", "jump"],
 )
@@ -346,13 +346,13 @@ def test_fewer_bodies_than_were_asked_for():
     found = segmented(scene.tracks, 3)
     assert int(found.bodies) < 3 and int(found.status) == Status.NO_CONSENSUS
     if int(found.bodies):
-        assert TrackNotice.FEWER_BODIES in codes(found) and "3 bodies were asked for" in repr(found)
+        assert SegmentNotice.FEWER_BODIES in codes(found) and "3 bodies were asked for" in repr(found)
 
 
 @pytest.mark.slow
 def test_a_spare_body_is_said():
     found = segmented(shot((80,), seed=2).tracks, 2)
-    assert TrackNotice.SPARE_BODY in codes(found) or int(found.bodies) < 2
+    assert SegmentNotice.SPARE_BODY in codes(found) or int(found.bodies) < 2
 
 
 GOOD = shot((8,), frames=4).tracks
@@ -403,7 +403,7 @@ def test_random_tracks_are_no_bodies(count, frames):
 def test_options_decide():
     scene = shot((45, 25, 20), seed=2)
     assert int(segmented(scene.tracks, options=replace(QUICK, max_bodies=2)).bodies) == 2
-    assert TrackNotice.STILL in codes(segmented(scene.tracks, options=replace(QUICK, min_motion=1e3)))
+    assert SegmentNotice.STILL in codes(segmented(scene.tracks, options=replace(QUICK, min_motion=1e3)))
     assert len(segmented(scene.tracks, 3, options=replace(QUICK, max_frame_pairs=6)).pairs) == 6
 
 

@@ -1,4 +1,4 @@
-"""Small videos of rigid bodies with the truth, by which the stages of segment_tracks are tested."""
+"""Small videos of rigid bodies with the truth, and views of two, by which the stages of both verbs are tested."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from torch import Tensor
 
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, skew, unit
 from dyntorch.geometry.rigid import rotation_exponential
+from dyntorch.scenes.scene import Scene
+from dyntorch.tasks.segment.coherence import Links, View, coherence
 from dyntorch.tasks.segment.frame_pairs import TrackSet
 
 F64 = torch.float64
@@ -45,6 +47,13 @@ class Shot:
 
 def draw(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def view_of(scene: Scene, pixel: float = 1 / 200, linked: bool = True) -> View:
+    """The matches of a scene around 0, at a pixel's size."""
+    x1, x2 = (x * pixel - torch.tensor([320.0, 240.0], dtype=F64) * pixel for x in scene.views)
+    none = Links(torch.zeros(len(x1), 0, dtype=torch.long), torch.zeros(len(x1), 0, dtype=F64))
+    return View(x1, x2, pixel, coherence(x1, x2, 3 * pixel)[1] if linked else none)
 
 
 def shot(

@@ -132,7 +132,7 @@ def test_three_cameras_tell_which(three, camera, change, sign):
     (one,) = clocks.breaks.breaks
     assert one.camera == camera
     assert one.frames == 5
-    assert one.doubled == (sign > 0)
+    assert one.is_doubled == (sign > 0)
     assert one.jump == pytest.approx(sign * 5 / FPS, abs=0.4 / FPS)
     assert abs(one.time - 99.5 / FPS) < 0.3
     assert clocks.offsets.tolist() == pytest.approx([0.0, OFFSET, -0.2], abs=0.3 / FPS)

@@ -49,7 +49,7 @@ def test_exact_pairs_give_exact_clocks():
     assert torch.allclose(clocks.offsets, torch.tensor(offsets, dtype=torch.float64), atol=1e-9)
     assert torch.allclose(clocks.rates, torch.tensor(rates, dtype=torch.float64), rtol=0, atol=1e-12)
     assert clocks.ok and clocks.outliers == [] and clocks.cycle_error < 1e-9
-    assert all(row.used and abs(row.residual) < 1e-9 for row in clocks.pairs)
+    assert all(row.is_used and abs(row.residual) < 1e-9 for row in clocks.pairs)
 
 
 def test_any_camera_is_the_reference_and_clocks_convert():
@@ -122,7 +122,7 @@ def test_a_pair_off_by_a_period_is_named(wrong):
     assert clocks.ok and clocks.outliers == [wrong]
     assert torch.allclose(clocks.offsets, torch.tensor([0.0, 1.25, -1.5, 0.75], dtype=torch.float64), atol=0.02)
     row = next(row for row in clocks.pairs if row.cameras == wrong)
-    assert not row.used and row.residual == pytest.approx(0.533, abs=0.02)
+    assert not row.is_used and row.residual == pytest.approx(0.533, abs=0.02)
     assert any("contradicts the others by +0.5" in note for note in clocks.notes)
 
 

@@ -74,11 +74,8 @@ def test_gaps_and_places_beyond_the_take_have_no_weight():
 def test_weights_are_those_of_the_frames_near_by():
     weights = torch.full((40, 1), 0.25)
     weights[20:] = 0.75
-    _, _, sure = smooth_at(
-        tracks_of(torch.zeros(40, 1, 2), weights=weights),
-        torch.tensor([0.3, 1.0], dtype=torch.float64),
-        1 / 30,
-    )
+    at = torch.tensor([0.3, 1.0], dtype=torch.float64)
+    _, _, sure = smooth_at(tracks_of(torch.zeros(40, 1, 2), weights=weights), at, 1 / 30)
     assert sure[:, 0].tolist() == pytest.approx([0.25, 0.75], rel=0.02)
 
 
@@ -180,10 +177,6 @@ def test_misuse_names_the_field_and_the_remedy(arguments, words):
 # Positions that are elsewhere: planted ones go, good ones stay.
 
 
-def tracks_of_of_cleaning(x):
-    return read_tracks("a", x, 30.0, None, None)
-
-
 def removed(before, after):
     return (before.weights > 0) & (after.weights == 0)
 
@@ -191,7 +184,7 @@ def removed(before, after):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("noise", [0.0, 1.0, 4.0])
 def test_good_positions_stay(seed, noise):
-    tracks = tracks_of_of_cleaning(filmed_person(15, seconds=4.0, noise=noise, missing=0.1, generator=seeded(seed)).a)
+    tracks = tracks_of(filmed_person(15, seconds=4.0, noise=noise, missing=0.1, generator=seeded(seed)).a)
     after = reject_outliers(tracks)
     assert float(removed(tracks, after).sum() / (tracks.weights > 0).sum()) < 0.03
     kept = after.weights > 0
@@ -202,7 +195,7 @@ def test_good_positions_stay(seed, noise):
 def test_planted_outliers_go(share):
     for seed in range(3):
         scene = filmed_person(15, seconds=4.0, noise=1.0, outliers=share, generator=seeded(seed))
-        tracks = tracks_of_of_cleaning(scene.a)
+        tracks = tracks_of(scene.a)
         far = (tracks.x - scene.exact[0]).norm(dim=-1) > 15  # beyond doubt: 15 standard deviations
         gone = removed(tracks, reject_outliers(tracks))
         assert float((far & gone).sum() / far.sum()) > 0.93
@@ -211,9 +204,9 @@ def test_planted_outliers_go(share):
 
 def test_one_wrong_position_goes_and_nothing_else():
     x = filmed_person(6, seconds=2.0, noise=0.5, generator=seeded(1)).a
-    before = reject_outliers(tracks_of_of_cleaning(x))
+    before = reject_outliers(tracks_of(x))
     x[30, 2] += 40
-    after = reject_outliers(tracks_of_of_cleaning(x))
+    after = reject_outliers(tracks_of(x))
     assert after.weights[30, 2] == 0
     assert int((before.weights != after.weights).sum()) <= 2
 
@@ -221,40 +214,33 @@ def test_one_wrong_position_goes_and_nothing_else():
 def test_a_point_at_rest_keeps_its_positions():
     x = 100 + 0.5 * torch.randn(100, 3, 2, generator=seeded(), dtype=torch.float64)
     x[:, 1] = 100.0  # a detector that says exactly the same
-    tracks = tracks_of_of_cleaning(x)
+    tracks = tracks_of(x)
     assert float(removed(tracks, reject_outliers(tracks)).float().mean()) < 0.02
     assert not removed(tracks, reject_outliers(tracks))[:, 1].any()
 
 
-def test_positions_in_whole_pixels_stay():
-    x = (100 + 0.3 * torch.randn(100, 4, 2, generator=seeded(), dtype=torch.float64)).round()
-    tracks = tracks_of_of_cleaning(x)
-    assert float(removed(tracks, reject_outliers(tracks)).float().mean()) < 0.02
-
-
-def test_movement_after_rest_stays():
+def test_rounding_and_sudden_movements_stay():
     t = torch.arange(120, dtype=torch.float64) / 30
-    x = (100 + 50 * torch.where(t > 2, (2 * torch.pi * t).sin(), 0.0))[:, None, None].expand(120, 1, 2)
-    tracks = tracks_of_of_cleaning(x)
-    assert int(removed(tracks, reject_outliers(tracks)).sum()) <= 2
-
-
-def test_a_sudden_movement_stays():
-    x = 0.5 * torch.randn(80, 1, 2, generator=seeded(2), dtype=torch.float64)
-    x[40:] += 200.0  # and stays there
-    tracks = tracks_of_of_cleaning(x)
-    assert int(removed(tracks, reject_outliers(tracks)).sum()) <= 4  # at the step itself
+    step = 0.5 * torch.randn(80, 1, 2, generator=seeded(2), dtype=torch.float64)
+    step[40:] += 200.0  # and stays there
+    cases = {
+        "whole pixels": ((100 + 0.3 * torch.randn(100, 4, 2, generator=seeded(), dtype=torch.float64)).round(), 15),
+        "movement after rest": ((100 + 50 * torch.where(t > 2, (2 * torch.pi * t).sin(), 0.0))[:, None, None].expand(120, 1, 2), 2),
+        "a step": (step, 4),  # at the step itself
+    }
+    lost = {name: int(removed(tracks_of(x), reject_outliers(tracks_of(x))).sum()) for name, (x, _) in cases.items()}
+    assert not {name: number for name, number in lost.items() if number > cases[name][1]}
 
 
 def test_what_scale_the_picture_has_does_not_matter():
     x = filmed_person(8, seconds=2.0, noise=1.0, outliers=0.1, generator=seeded(3)).a
-    one, two = reject_outliers(tracks_of_of_cleaning(x)), reject_outliers(tracks_of_of_cleaning(4 * x + 1000))
+    one, two = reject_outliers(tracks_of(x)), reject_outliers(tracks_of(4 * x + 1000))
     assert torch.equal(one.weights, two.weights)
 
 
 def test_a_take_of_a_few_frames_is_left_alone():
     x = torch.randn(5, 2, 2, generator=seeded())
-    assert torch.equal(reject_outliers(tracks_of_of_cleaning(x)).weights, tracks_of_of_cleaning(x).weights)
+    assert torch.equal(reject_outliers(tracks_of(x)).weights, tracks_of(x).weights)
 
 
 def test_weights_that_were_given_are_kept():
@@ -268,7 +254,7 @@ def test_weights_that_were_given_are_kept():
 def test_a_point_never_seen_does_no_harm():
     x = filmed_person(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
     x[:, 2] = torch.nan
-    after = reject_outliers(tracks_of_of_cleaning(x))
+    after = reject_outliers(tracks_of(x))
     assert not after.weights[:, 2].any() and after.x.isfinite().all()
 
 
@@ -276,16 +262,12 @@ def test_a_point_never_seen_does_no_harm():
 # Tracks about their middle: place and distance of the person go, everything else stays.
 
 
-def tracks_of_of_scaled(x, fps=30.0):
-    return read_tracks("a", x, fps, None, None)
-
-
 def scene(**more):
     return filmed_person(11, seconds=4.0, generator=torch.Generator().manual_seed(0), **more)
 
 
 def test_medians_of_every_frame_are_nought():
-    found = scale_frames(tracks_of_of_scaled(scene(noise=1.0).a))
+    found = scale_frames(tracks_of(scene(noise=1.0).a))
     assert torch.allclose(found.x.median(1).values, torch.zeros(120, 2, dtype=torch.float64), atol=1e-9)
 
 
@@ -294,22 +276,19 @@ def test_place_and_distance_are_taken_out():
     t = torch.arange(120, dtype=torch.float64)[:, None, None] / 30
     path = torch.cat([300 * (0.7 * t).sin(), 20 * t], dim=-1)
     # constant factors change the unit alone
-    one, moved = (
-        scale_frames(tracks_of_of_scaled(x)),
-        scale_frames(tracks_of_of_scaled(3 * x + path)),
-    )
+    one, moved = scale_frames(tracks_of(x)), scale_frames(tracks_of(3 * x + path))
     assert torch.allclose(moved.x, 3 * one.x, atol=1e-6)
     slow = 1 + 0.2 * t / 4  # somebody who comes nearer
-    near = scale_frames(tracks_of_of_scaled(slow * x))
+    near = scale_frames(tracks_of(slow * x))
     ratio = (near.x.norm(dim=-1) / one.x.norm(dim=-1).clamp(min=1e-9))[15:-15].median(1).values
     assert float(ratio.max() / ratio.min()) < 1.03  # of 1.15
 
 
 def test_one_wrong_point_moves_nothing_else():
-    tracks = tracks_of_of_scaled(scene(noise=1.0).a)
+    tracks = tracks_of(scene(noise=1.0).a)
     x = tracks.x.clone()
     x[:, 4] += 500.0
-    good, bad = scale_frames(tracks), scale_frames(tracks_of_of_scaled(x))
+    good, bad = scale_frames(tracks), scale_frames(tracks_of(x))
     rest = torch.arange(11) != 4
     away = (good.x - bad.x)[:, rest].norm(dim=-1)
     assert float(away.median()) < 0.2 * float(good.x[:, rest].norm(dim=-1).median())
@@ -318,13 +297,13 @@ def test_one_wrong_point_moves_nothing_else():
 def test_missing_positions_stay_missing():
     x = scene(noise=1.0, missing=0.3).a
     x[50] = torch.nan
-    found = scale_frames(tracks_of_of_scaled(x))
+    found = scale_frames(tracks_of(x))
     assert bool(found.x.isfinite().all()) and not found.x[found.weights == 0].any()
     assert torch.equal(found.weights > 0, x.isfinite().all(-1))
 
 
 @pytest.mark.parametrize("frames", [1, 2])
 def test_takes_of_a_frame_or_two(frames):
-    found = scale_frames(tracks_of_of_scaled(torch.rand(frames, 5, 2, generator=torch.Generator().manual_seed(1))))
+    found = scale_frames(tracks_of(torch.rand(frames, 5, 2, generator=torch.Generator().manual_seed(1))))
     assert bool(found.x.isfinite().all())
-    assert bool(scale_frames(tracks_of_of_scaled(torch.full((frames, 5, 2), torch.nan))).x.isfinite().all())
+    assert bool(scale_frames(tracks_of(torch.full((frames, 5, 2), torch.nan))).x.isfinite().all())
