@@ -10,35 +10,19 @@ measure a line. "four points" is the tensor of the four static points that suffi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.metrics import grid_transfer_error
 from dyntorch.scenes import Scene, lines_concurrent
-from experiments.common.tables import NoiseConfig, command, noise_tables
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
 
 SETTINGS = tuple((n, sigma) for n in (30, 60, 120, 300) for sigma in (0.1, 0.5, 1.0))
 OUTLIERS = 0.2
 DUAL = dyn.DualHomographyTensor
 HEAD = ("lines", "noise px", "linear px", "refined px", "robust, 20 % outliers px", "inliers kept", "four points px")
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Errors of the dual homography tensor over the number of lines and the noise."""
-
-    scenes: int = 40
-    """Scenes per cell."""
-    quick: bool = False
-    """Only noise of 0.5 pixels, 20 scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/dual_homography.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def error(motion: Sequence[Tensor], scene: Scene) -> float:
@@ -72,13 +56,9 @@ def line(n: int, sigma: float, scenes: int, seed: int) -> Sequence[str]:
     return str(n), f"{sigma:g}", *errors, third, kept, f"{error(DUAL.decompose(four.tensor), scene):.2g}"
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
-    scenes = min(config.scenes, 20) if config.quick else config.scenes
+@experiment(SceneConfig(scenes=40), quick={"scenes": 20})
+def tables(config: SceneConfig) -> Tables:
+    """Errors over the number of lines and the noise."""
     chosen = [setting for setting in SETTINGS if not config.quick or setting[1] == 0.5]
-    title = f"error over an image of 640 x 480, medians of {scenes} scenes"
-    noise_tables({title: lambda: (HEAD, [line(*setting, scenes, config.seed) for setting in chosen])}, config)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.dual_homography")))
+    lines = [line(*setting, config.scenes, config.seed) for setting in chosen]
+    yield f"error over an image of 640 x 480, medians of {config.scenes} scenes", Words(HEAD, lines)

@@ -9,7 +9,7 @@ each kind by themselves and together with the usual ones; ``dyntorch count NAME 
 from __future__ import annotations
 
 from dyntorch import counting
-from experiments.common.tables import aligned, command
+from experiments.common.runner import BaseConfig, Tables, Words, experiment
 from indexing.cli.commands.count import purpose
 
 WORDS = {
@@ -47,12 +47,9 @@ def rows(name: str) -> list[tuple[str, ...]]:
     return table
 
 
-def run() -> None:
-    """Print a table of every configuration, and what each of them is."""
+@experiment(BaseConfig())
+def tables(_: BaseConfig) -> Tables:
+    """Every configuration, and what each of them is."""
     head = ("configuration", "matches that", "count at most", "rank by themselves", "general ones needed besides")
-    print(aligned(head, [row for name in counting.CONFIGURATIONS for row in rows(name)]))
-    print("\n" + aligned(("configuration", "of"), [(name, purpose(name)) for name in counting.CONFIGURATIONS]))
-
-
-if __name__ == "__main__":
-    command(run)
+    yield "Minimal conditions", Words(head, [row for name in counting.CONFIGURATIONS for row in rows(name)])
+    yield "Configurations", Words(("configuration", "of"), [(name, purpose(name)) for name in counting.CONFIGURATIONS])

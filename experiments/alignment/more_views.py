@@ -10,37 +10,20 @@ a grid on the picture in pixels, or over the cube of the scene in units of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
-
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.metrics import grid_transfer_error
-from experiments.common.tables import NoiseConfig, aligned, command, note
-from indexing.files import manifest, write_json
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import note
 
 COUNTS = (3, 4, 5, 6, 8, 12)
 OUTLIERS = 0.1
 MATCHES = {"plane": 80, "space": 100}
 NOISE = {"plane": 0.5, "space": 5e-3}
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Errors of the motion of two views over the number of views that are aligned together."""
-
-    scenes: int = 12
-    """Scenes per cell."""
-    quick: bool = False
-    """Only 3, 4 and 6 views, 4 scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/more_views.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def cube_error(found: Tensor, true: Tensor) -> Tensor:
@@ -84,7 +67,7 @@ def measured(kind: str, counts: tuple[int, ...], number: int, seed: int) -> list
     return rows
 
 
-def table(rows: list[dict[str, float]], unit: str) -> str:
+def table(rows: list[dict[str, float]], unit: str) -> Words:
     """The rows, with the error over that of three views."""
     head = ("views", f"error of A, B ({unit})", "over that of 3 views", "labels right", "outliers found", "OK")
     lines = [
@@ -98,26 +81,15 @@ def table(rows: list[dict[str, float]], unit: str) -> str:
         )
         for row in rows
     ]
-    return aligned(head, lines)
+    return Words(head, lines)
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file.
-
-    Raises:
-        ValueError: no scenes, or a file that cannot be written.
-    """
-    target = config.target()
-    counts, number = ((3, 4, 6), min(config.scenes, 4)) if config.quick else (COUNTS, config.scenes)
-    found = {kind: measured(kind, counts, number, config.seed) for kind in ("plane", "space")}
-    shares = f"all of them move, {OUTLIERS:.0%} wrong in view 3, no label given; medians of {number} scenes"
-    print(f"\npoints of a plane on straight lines: {MATCHES['plane']} matches, {NOISE['plane']:g} px of noise; {shares}\n")
-    print(table(found["plane"], "px over the image"))
-    print(f"\npoints of space on straight lines: {MATCHES['space']} matches, noise {NOISE['space']:g}, scene +-2; {shares}\n")
-    print(table(found["space"], "units over the scene"))
-    write_json(target, {"manifest": manifest(vars(config), seed=config.seed), "rows": found})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.more_views")))
+@experiment(SceneConfig(scenes=12), quick={"scenes": 4})
+def tables(config: SceneConfig) -> Tables:
+    """Errors of the motion of two views over the number of views that are aligned together."""
+    counts = (3, 4, 6) if config.quick else COUNTS
+    shares = f"all of them move, {OUTLIERS:.0%} wrong in view 3, no label given; medians of {config.scenes} scenes"
+    title = f"points of a plane on straight lines: {MATCHES['plane']} matches, {NOISE['plane']:g} px of noise; {shares}"
+    yield title, table(measured("plane", counts, config.scenes, config.seed), "px over the image")
+    title = f"points of space on straight lines: {MATCHES['space']} matches, noise {NOISE['space']:g}, scene +-2; {shares}"
+    yield title, table(measured("space", counts, config.scenes, config.seed), "units over the scene")

@@ -9,12 +9,7 @@ the worse one of A and B: the first in normalized coordinates, the second over a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
-
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
@@ -22,8 +17,8 @@ from dyntorch.core.normalize import normalize_motion
 from dyntorch.metrics import grid_transfer_error, label_scores, relative_error
 from dyntorch.scenes import Scene, planar
 from dyntorch.tasks.align.planar import align_planar
-from experiments.common.tables import NoiseConfig, aligned, command, note
-from indexing.files import manifest, write_json
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import note
 
 COLUMNS = ("linear", "refined", "static: linear", "static: refined", "static: segmented")
 STATIC = 0.4
@@ -44,16 +39,6 @@ GOALS: dict[tuple[int, float], tuple[Cell, ...]] = {
     (500, 1.0): ((0.0026, 0.76), (0.0014, 0.42), (0.0039, 1.1), (0.0017, 0.49), (0.0011, 0.31)),
     (500, 2.0): ((0.0062, 1.7), (0.0033, 0.91), (0.0089, 2.4), (0.0035, 0.94), (0.0025, 0.60)),
 }
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Errors of the homography tensor over the number of matches and the noise."""
-
-    quick: bool = False
-    """Only the rows with up to 100 matches and 0.5 pixels, 60 scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/homography_tensor_noise.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def errors(motion: tuple[Tensor, Tensor], solution: dyn.Solution, scene: Scene) -> Cell:
@@ -83,7 +68,7 @@ def row(n: int, sigma: float, scenes: int, seed: int) -> tuple[list[Cell], float
     return cells, float(recall)
 
 
-def table(measured: dict[tuple[int, float], tuple[list[Cell], float]]) -> str:
+def table(measured: dict[tuple[int, float], tuple[list[Cell], float]]) -> Words:
     """Measured, in brackets the goal, and the ratio of the two, per cell."""
     head: tuple[str, ...] = ("N", "noise px", *COLUMNS, "recall of labels")
     lines = []
@@ -92,31 +77,17 @@ def table(measured: dict[tuple[int, float], tuple[list[Cell], float]]) -> str:
         for (relative, grid), (goal, pixels) in zip(cells, GOALS[n, sigma], strict=True):
             texts.append(f"{relative:.2g}/{grid:.2g} ({goal:.2g}/{pixels:.2g}) x{relative / goal:.2f}/{grid / pixels:.2f}")
         lines.append((str(n), f"{sigma:g}", *texts, f"{recall:.3f}"))
-    return aligned(head, lines)
+    return Words(head, lines)
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file.
-
-    Raises:
-        ValueError: no scenes, or a file that cannot be written.
-    """
-    target = config.target()
-    chosen = [key for key in GOALS if not config.quick or (key[0] <= 100 and key[1] == 0.5)]
-    scenes = min(config.scenes, 60) if config.quick else config.scenes
+@experiment(SceneConfig(), quick={"scenes": 60})
+def tables(config: SceneConfig) -> Tables:
+    """Errors of the homography tensor over the number of matches and the noise; quick: up to 100 matches, 0.5 px."""
     measured = {}
-    for n, sigma in chosen:
-        measured[n, sigma] = row(n, sigma, scenes, config.seed)
+    for n, sigma in [key for key in GOALS if not config.quick or (key[0] <= 100 and key[1] == 0.5)]:
+        measured[n, sigma] = row(n, sigma, config.scenes, config.seed)
         note(f"{n} matches, {sigma:g} px")
-    print(f"\nrelative error / pixels (goal) and their ratios, medians of {scenes} scenes; static: {STATIC:.0%} of the points\n")
-    print(table(measured))
-    rows = [
-        {"matches": n, "sigma": sigma, "recall": recall, **dict(zip(COLUMNS, cells, strict=True))}
-        for (n, sigma), (cells, recall) in measured.items()
-    ]
-    write_json(target, {"manifest": manifest(vars(config), seed=config.seed), "rows": rows})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.planar_noise")))
+    title = (
+        f"relative error / pixels (goal) and their ratios, medians of {config.scenes} scenes; static: {STATIC:.0%} of the points"
+    )
+    yield title, table(measured)

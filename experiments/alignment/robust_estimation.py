@@ -13,19 +13,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.limits import quantile
 from dyntorch.scenes.scene import OUTLIER, Scene
-from experiments.common.tables import Row, command, measured
-from indexing.files import prepare
+from experiments.common.runner import SceneConfig, Tables, experiment
+from experiments.common.tables import Row
 
 KEPT = 0.95
 
@@ -53,31 +50,23 @@ TASKS = {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(SceneConfig):
     """Robust estimation over shares of outliers, beside the goals."""
 
     outliers: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
     """Shares of wrong matches."""
-    scenes: int = 128
-    """Scenes per row."""
     matches: int = 200
     """Matches per scene."""
-    quick: bool = False
-    """16 scenes, and only 20 and 40 % outliers."""
     estimate: bool = False
     """Do not give the threshold, but have it estimated."""
-    threads: int = 0
-    """CPU threads of torch; 0 leaves its default."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/robust_estimation.json")
-    """Where the results and this configuration are written as JSON."""
 
 
-def measure(task: Task, share: float, config: Config, count: int) -> tuple[float, float, float]:
+def measure(task: Task, share: float, config: Config) -> tuple[float, float, float]:
     """Share of successes, median RMS distance of the exact true matches in units of the noise, milliseconds per scene."""
     found, errors, times = [], [], []
     threshold = None if config.estimate else task.sigma * quantile(0.995, task.invariant.codim) ** 0.5
-    for seed, start in enumerate(range(0, count, task.batch)):
-        size = min(task.batch, count - start)
+    for seed, start in enumerate(range(0, config.scenes, task.batch)):
+        size = min(task.batch, config.scenes - start)
         made = task.scene(
             n=config.matches, batch=size, sigma=task.sigma, outliers=share, generator=torch.Generator().manual_seed(seed)
         )
@@ -99,9 +88,8 @@ def measure(task: Task, share: float, config: Config, count: int) -> tuple[float
 def table(name: str, config: Config) -> list[Row]:
     """Success, accuracy and time of one invariant over the shares of outliers."""
     task, rows = TASKS[name], []
-    shares, count = ((0.2, 0.4), 16) if config.quick else (config.outliers, config.scenes)
-    for share in shares:
-        success, error, milliseconds = measure(task, share, config, count)
+    for share in config.outliers:
+        success, error, milliseconds = measure(task, share, config)
         setting = f"{share:.0%} outliers"
         goal = task.goals.get(share)
         rows += [
@@ -112,21 +100,9 @@ def table(name: str, config: Config) -> list[Row]:
     return rows
 
 
-def run(config: Config) -> None:
-    """Print every table, then write the file.
-
-    Raises:
-        ValueError: nothing to measure, or a share outside 0 to 1.
-    """
-    if config.scenes < 1 or config.matches < 60:
-        raise ValueError(f"scenes must be at least 1 and matches at least 60, got {config.scenes} and {config.matches}")
-    target = config.out.expanduser()
-    prepare(target.parent)
-    if config.threads > 0:
-        torch.set_num_threads(config.threads)
+@experiment(Config(scenes=128), quick={"scenes": 16, "outliers": (0.2, 0.4)})
+def tables(config: Config) -> Tables:
+    """Success, accuracy and time of every invariant over the shares of outliers."""
     dyn.robust_fit(dyn.HomographyTensor, *scenes.planar(60, batch=4, sigma=0.5).views, threshold=1.5)  # first calls are slow
-    measured(list(TASKS), lambda name: table(name, config), target, vars(config))
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.robust_estimation")))
+    for name in TASKS:
+        yield name, table(name, config)

@@ -9,7 +9,6 @@ at the true motion: what no other start can undercut.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -21,7 +20,8 @@ from dyntorch import scenes
 from dyntorch.core.normalize import normalize_motion
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.metrics import point_error
-from experiments.common.tables import Row, command, markdown, note
+from experiments.common.runner import SceneConfig, Tables, experiment
+from experiments.common.tables import Row, note
 
 SCENES = 60
 WITHIN = 1.1  # of the reference
@@ -141,19 +141,8 @@ def rows(name: str, count: int, quick: bool, seed: int = 0) -> list[Row]:
     return found
 
 
-def run() -> None:
-    """Print the three tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="10 scenes, at most 100 matches")
-    parser.add_argument("--scenes", type=int, default=None, help=f"scenes per cell (default {SCENES})")
-    parser.add_argument("--only", choices=list(TABLES), default=None, help="one of the tables")
-    options = parser.parse_args()
-    count = options.scenes if options.scenes is not None else (10 if options.quick else SCENES)
-    if count < 1:
-        raise ValueError(f"--scenes must be 1 or more, got {count}")
-    for name in [options.only] if options.only else TABLES:
-        print(markdown(rows(name, count, options.quick), f"{name}: median error over {count} scenes"))
-
-
-if __name__ == "__main__":
-    command(run)
+@experiment(SceneConfig(scenes=SCENES), quick={"scenes": 10})
+def tables(config: SceneConfig) -> Tables:
+    """Every cell of the three tables beside its reference; quick: at most 100 matches."""
+    for name in TABLES:
+        yield f"{name}: median error over {config.scenes} scenes", rows(name, config.scenes, config.quick, config.seed)

@@ -12,19 +12,16 @@ homography are the identity.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 
 import dyntorch as dyn
 from dyntorch import metrics
-from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.runner import SceneConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition.protocol import data_folder
 from indexing.actors.textured import RenderedVideo, render, sheet
 from indexing.video import Chunk, SceneTracks, track_scene
@@ -38,20 +35,15 @@ RECORDED = ("pose2sim/cam01.mp4", "pose2sim/cam02.mp4")
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(SceneConfig):
     """Videos to tracks to tensors, with truth."""
 
-    scenes: int = 3
-    """Rendered videos of each kind."""
     frames: int = 40
     """Of each."""
     noise: float = 2.0
     """Grey levels, standard deviation."""
     recorded: bool = False
     """The videos of the folder DYNTORCH_DATA as well."""
-    seed: int = 1
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/videos.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def turned(axis: Floats, angle: float) -> Floats:
@@ -239,17 +231,11 @@ def recordings(config: Config) -> list[Row]:
     return rows
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file."""
-    tables: dict[str, Callable[[Config], list[Row]]] = {
-        "a wall with posters that slide": aligned,
-        "a room with a box that moves": segmented,
-        "a wall with posters, reconstructed": reconstructed,
-    }
+@experiment(Config(scenes=3, seed=1), quick={"scenes": 1})
+def tables(config: Config) -> Tables:
+    """Rendered videos, and those of the folder DYNTORCH_DATA."""
+    yield "a wall with posters that slide", aligned(config)
+    yield "a room with a box that moves", segmented(config)
+    yield "a wall with posters, reconstructed", reconstructed(config)
     if config.recorded:
-        tables["recorded by fixed cameras"] = recordings
-    measured_on_one_thread(tables, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.videos")))
+        yield "recorded by fixed cameras", recordings(config)

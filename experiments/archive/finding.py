@@ -25,9 +25,9 @@ from unittest import mock
 import numpy as np
 import tyro
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.tables import command, note
+from experiments.common.timing import threads
 from experiments.recognition import protocol
 from experiments.recognition.detection import SETS, Recording, Task, actor_tasks, exercise_tasks, joined_tasks
 from experiments.recognition.detection_metrics import f1

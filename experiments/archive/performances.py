@@ -29,9 +29,9 @@ import numpy as np
 import tyro
 
 from experiments.archive.exhaustive import STEP, Measure, exact, hits, metric_of, rankings, warped
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.tables import Row, command, note
+from experiments.common.timing import threads
 from experiments.recognition import protocol
 from experiments.recognition.baselines import WarpedNearest
 from experiments.recognition.protocol import Array

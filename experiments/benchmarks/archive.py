@@ -27,8 +27,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from experiments.benchmarks.interleaved import interleaved
 from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.timing import interleaved
 from indexing import Archive, Clip, ClipSet
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.archive.workers import QuietProcesses

@@ -27,8 +27,8 @@ from dyntorch.core.invariant import as_invariant
 from dyntorch.core.matrix import estimation_matrix
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import Scene
-from experiments.benchmarks.interleaved import interleaved, threads
 from experiments.common.tables import Row, command, markdown, note
+from experiments.common.timing import interleaved, threads
 from indexing.files import manifest, prepare, write_json
 
 SCENES: dict[str, tuple[Any, Callable[..., Scene]]] = {

@@ -15,8 +15,8 @@ import tyro
 
 import dyntorch as dyn
 from dyntorch import scenes
-from experiments.benchmarks.interleaved import interleaved, threads
 from experiments.common.tables import Row, command, markdown
+from experiments.common.timing import interleaved, threads
 
 
 @dataclass(frozen=True)

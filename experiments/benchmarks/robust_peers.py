@@ -21,8 +21,8 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import homogeneous
-from experiments.benchmarks.interleaved import interleaved
 from experiments.common.tables import Row, command, markdown, note
+from experiments.common.timing import interleaved
 from indexing.files import manifest, prepare, write_json
 
 THRESHOLD = 1.5

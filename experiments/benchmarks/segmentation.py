@@ -25,8 +25,8 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.metrics import misclassification
-from experiments.benchmarks.interleaved import interleaved
 from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.timing import interleaved
 from experiments.recognition.protocol import DATA
 from experiments.segmentation.data import Pair, motion_pairs
 

@@ -29,8 +29,8 @@ from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics import lags
 from dyntorch.numerics.lags import Lags
 from dyntorch.tasks.synchronize.subspace import subspace_curve
-from experiments.benchmarks.interleaved import interleaved
 from experiments.common.tables import Row, command, measured_on_one_thread
+from experiments.common.timing import interleaved
 
 GOALS = {"same": 0.05, "different": 0.3, "ratio": 200.0}
 """Seconds, seconds, and times the speed of a decomposition per shift."""

@@ -16,15 +16,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
 from experiments.calibration.crowd import Crowd, CrowdSpec, crowd, share_right
 from experiments.calibration.rigs import Motion, RigSpec, motions
-from experiments.common.tables import NoiseConfig, command, noise_tables
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
 from indexing.calibrate.people import Association, associate
 
 GOAL = 0.98
@@ -53,18 +50,6 @@ HEAD = (
     "clock, frames",
     "seconds",
 )
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Identities of people across cameras."""
-
-    scenes: int = 20
-    """Rigs per line; a fifth of them from 5 people on."""
-    quick: bool = False
-    """Two rigs, of the first two lines."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/calibration-people.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -113,9 +98,9 @@ def taken(found: Association, scene: Crowd) -> float:
     return somebody / false if false else float("nan")
 
 
-def line(name: str, spec: CrowdSpec, config: Config, bodies: list[Motion]) -> Sequence[str]:
+def line(name: str, spec: CrowdSpec, config: SceneConfig, bodies: list[Motion]) -> Sequence[str]:
     """A line of the table."""
-    rigs = 2 if config.quick else max(1, config.scenes // 5) if spec.people >= LARGE else config.scenes
+    rigs = max(1, config.scenes // 5) if spec.people >= LARGE else config.scenes
     trials = [trial(crowd(config.seed + k, spec, bodies)) for k in range(rigs)]
     right = np.array([one.right for one in trials])
     false, clocks = (np.array([getattr(one, key) for one in trials]) for key in ("false", "clock"))
@@ -133,12 +118,9 @@ def line(name: str, spec: CrowdSpec, config: Config, bodies: list[Motion]) -> Se
     )
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
+@experiment(SceneConfig(scenes=20), quick={"scenes": 2})
+def tables(config: SceneConfig) -> Tables:
+    """Identities of people across cameras; quick: the first two lines."""
     bodies = motions()
-    chosen = list(SETTINGS.items())[:2] if config.quick else list(SETTINGS.items())
-    noise_tables({"identities of people": lambda: (HEAD, [line(name, spec, config, bodies) for name, spec in chosen])}, config)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.calibration.people")))
+    chosen = list(SETTINGS.items())[: 2 if config.quick else None]
+    yield "identities of people", Words(HEAD, [line(name, spec, config, bodies) for name, spec in chosen])

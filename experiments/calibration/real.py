@@ -9,24 +9,20 @@ much as this.  Errors are those after the similarity between both worlds; joints
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.geometry.rigid import rotation_exponential
 from experiments.calibration.rigs import turned
-from experiments.common.tables import aligned, command, note
+from experiments.common.runner import BaseConfig, Tables, Words, experiment
+from experiments.common.tables import note
 from experiments.recognition.protocol import data_folder
-from indexing.files import manifest, prepare, write_json
 
 STARTS = ((0, 5, 3, 8), (0, 12, 7, 2), (9, 0, 4, 6), (0, 0, 0, 0))
 """First frames of the cameras: how late each was started."""
@@ -34,14 +30,6 @@ LENGTH = 88
 """Frames that are left of each."""
 TRUSTED = 0.3
 """Confidence from which on a joint is taken as seen."""
-
-
-@dataclass(frozen=True)
-class Config:
-    """The balancing person."""
-
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/calibration_real.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -83,24 +71,16 @@ def row(recording: Recording, cameras: Sequence[int], starts: Sequence[int], tol
     return [", ".join(map(str, [i + 1 for i in keep])), str(tuple(starts)), told, *values, f"{seconds:.1f}", said]
 
 
-def main(config: Config) -> None:
-    """Print the table."""
-    target = config.out.expanduser()
-    prepare(target.parent)
+@experiment(BaseConfig())
+def tables(config: BaseConfig) -> Tables:
+    """The balancing person against the board."""
     recording = balancing()
     lines = []
-    for starts in STARTS:
+    for starts in STARTS[: 1 if config.quick else None]:
         for told in ("nothing", "one lens", "focal lengths"):
             note(f"... {starts}, {told}")
             lines.append(row(recording, range(4), starts, told))
     for cameras in ((0, 1), (0, 2), (1, 3), (0, 1, 2), (1, 2, 3)):
         lines.append(row(recording, cameras, STARTS[0], "focal lengths"))
     head = ["cameras", "first frames", "told", "rotation, deg", "worst, deg", "focal, %", "clock, frames", "CPU s", "said"]
-    print(f"\n### Against the board\n\n{aligned(head, lines)}", flush=True)
-    rows = [dict(zip(head, line, strict=True)) for line in lines]
-    write_json(target, {"manifest": manifest(dataclasses.asdict(config)), "rows": rows})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: main(tyro.cli(Config, description=__doc__)))
+    yield "Against the board", Words(head, lines)

@@ -12,17 +12,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from experiments.calibration.rigs import BODY, Motion, Rig, RigSpec, motions, virtual_rig
-from experiments.common.tables import NoiseConfig, command, noise_tables
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
 from indexing.calibrate.left_right import LIMBS, correct_sides, paired_joints
 
 WORDS = {
@@ -32,18 +29,6 @@ WORDS = {
 JOINTS = tuple(f"{'left' if name[0] == 'l' else 'right'}_{WORDS[name[1:]]}" if name[1:] in WORDS else name for name in BODY)
 CASES = ("nothing", "mirrored", "stretches")
 HEAD = ("cameras", "exchanged", "wrong as given", "wrong as mended", "rigs without any", "seconds")
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Sides of people across cameras."""
-
-    scenes: int = 20
-    """Rigs per line."""
-    quick: bool = False
-    """Two rigs, four cameras."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/calibration-sides.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def drawn(rng: np.random.Generator, case: str, cameras: int, frames: int) -> NDArray[np.bool_]:
@@ -69,11 +54,11 @@ def turned(rig: Rig, exchanged: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
     return out
 
 
-def line(cameras: int, case: str, config: Config, bodies: list[Motion]) -> Sequence[str]:
+def line(cameras: int, case: str, config: SceneConfig, bodies: list[Motion]) -> Sequence[str]:
     """A line of the table."""
     given, mended, seconds = [], [], []
     there = [k for k, limb in enumerate(LIMBS) if paired_joints(JOINTS)[limb]]
-    for seed in range(2 if config.quick else config.scenes):
+    for seed in range(config.scenes):
         rig = virtual_rig(config.seed + seed, RigSpec(cameras=cameras), bodies)
         exchanged = drawn(np.random.default_rng([config.seed + seed, cameras]), case, cameras, len(rig.tracks[0]))
         known: Any = SimpleNamespace(
@@ -95,12 +80,9 @@ def line(cameras: int, case: str, config: Config, bodies: list[Motion]) -> Seque
     )
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
+@experiment(SceneConfig(scenes=20), quick={"scenes": 2})
+def tables(config: SceneConfig) -> Tables:
+    """Sides of people across cameras; quick: four cameras."""
     bodies = motions()
     chosen = [(cameras, case) for cameras in ((4,) if config.quick else (3, 4, 6, 8)) for case in CASES]
-    noise_tables({"left and right": lambda: (HEAD, [line(cameras, case, config, bodies) for cameras, case in chosen])}, config)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.calibration.sides")))
+    yield "left and right", Words(HEAD, [line(cameras, case, config, bodies) for cameras, case in chosen])

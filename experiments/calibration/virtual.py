@@ -11,27 +11,24 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import get_context
-from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.geometry.rigid import rotation_exponential
 from experiments.calibration.rigs import Rig, RigErrors, RigSpec, errors, motions, project, virtual_rig
-from experiments.common.tables import Row, command, measured
-from indexing.files import prepare
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Virtual rigs."""
 
     rigs: int = 20
@@ -40,10 +37,6 @@ class Config:
     """Seed of the first."""
     workers: int = 2
     """Processes, each on one thread; seconds are those of the processor."""
-    quick: bool = False
-    """Three rigs per row."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/calibration_virtual.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +139,7 @@ def _in_line(rig: Rig) -> tuple[Tensor, Tensor]:
 
 def outcomes(case: Case, config: Config) -> list[Outcome]:
     """Of all rigs of a row, side by side."""
-    seeds = range(config.first, config.first + (3 if config.quick else config.rigs))
+    seeds = range(config.first, config.first + config.rigs)
     if config.workers == 1:
         return [outcome(case, seed) for seed in seeds]
     os.environ["OMP_NUM_THREADS"] = "1"
@@ -201,21 +194,10 @@ def refusals(config: Config, name: str) -> list[Row]:
     return [Row("refused", f"of {len(found)}: {most}", len(reasons), len(found))]
 
 
-def tables(config: Config) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
-    """All tables by name."""
+@experiment(Config(), quick={"rigs": 3})
+def tables(config: Config) -> Tables:
+    """Rigs that are to be calibrated, and those that are to be refused."""
     for name in CASES:
-        yield name, lambda name=name: accuracy(config, name)  # type: ignore[misc]
+        yield name, accuracy(config, name)
     for name in SPOILED:
-        yield name, lambda name=name: refusals(config, name)  # type: ignore[misc]
-
-
-def main(config: Config) -> None:
-    """Print every table."""
-    target = config.out.expanduser()
-    prepare(target.parent)
-    every: dict[str, Any] = dict(tables(config))
-    measured(list(every), lambda name: every[name](), target, dataclasses.asdict(config))
-
-
-if __name__ == "__main__":
-    command(lambda: main(tyro.cli(Config, description=__doc__)))
+        yield name, refusals(config, name)

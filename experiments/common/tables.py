@@ -11,8 +11,8 @@ from typing import Annotated, TypeVar
 
 import tyro
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.results import published
+from experiments.common.timing import threads
 from indexing.files import manifest, prepare, write_json
 
 C = TypeVar("C")

@@ -27,10 +27,10 @@ import numpy as np
 import torch
 import tyro
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.plots import bars
 from experiments.common.tables import Row, command, note
+from experiments.common.timing import threads
 from experiments.recognition import protocol
 from experiments.recognition.brightness_baselines import BASELINES, FrameNearest, Frames, WindowKernels
 from experiments.recognition.protocol import Array

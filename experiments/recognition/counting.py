@@ -24,9 +24,9 @@ import numpy as np
 import tyro
 from scipy.signal import find_peaks
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.tables import Row, command, note
+from experiments.common.timing import threads
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip, PhaseIndexer
 from indexing.actors import ACTIONS, Person, dataset, detect, perform, stream

@@ -28,9 +28,9 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 import tyro
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.tables import command, note
+from experiments.common.timing import threads
 from experiments.recognition import protocol
 from experiments.recognition.contenders import NAMES, Method, Part, check_methods, sliding
 from experiments.recognition.detection_metrics import edit_score, f1, mean_average_precision, segments

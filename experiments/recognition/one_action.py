@@ -23,9 +23,9 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.tables import command, note
+from experiments.common.timing import threads
 from experiments.recognition import protocol
 from experiments.recognition.detection_metrics import overlap
 from experiments.recognition.novelty import named

@@ -24,10 +24,10 @@ import numpy as np
 import tyro
 from sklearn.metrics import roc_auc_score
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.plots import curves
 from experiments.common.tables import command, note
+from experiments.common.timing import threads
 from experiments.recognition import protocol
 from experiments.recognition.contenders import NAMES, OPTIONS, Method, check_methods, contender
 from experiments.recognition.novelty import ways

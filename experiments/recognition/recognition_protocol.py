@@ -24,10 +24,10 @@ import numpy as np
 import tyro
 from sklearn.metrics import confusion_matrix
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.plots import curves, heat
 from experiments.common.tables import Row, command, note
+from experiments.common.timing import threads
 from experiments.recognition import protocol
 from experiments.recognition.action_recognition import FILES, TITLES
 from experiments.recognition.contenders import NAMES, OPTIONS, Method, check_methods, contender

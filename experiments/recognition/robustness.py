@@ -21,10 +21,10 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from experiments.benchmarks.interleaved import threads
 from experiments.common.book import Book
 from experiments.common.plots import curves
 from experiments.common.tables import Row, command, note
+from experiments.common.timing import threads
 from experiments.recognition import protocol
 from experiments.recognition.contenders import NAMES, Method, check_methods, contender
 from experiments.recognition.corruptions import KINDS

@@ -18,9 +18,9 @@ go around by 180 degrees in 60 frames at 15 Hz.
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +30,8 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch.shapes import deformable_shapes
 from experiments.common.real_data import takes
-from experiments.common.tables import command, note
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import note
 
 FRAMES, STEP, NOISE, SIZE, BESIDE, ELEVATION = 60, 4, 2.0, 400 / 1.7, math.radians(60), 0.2
 TRAINING = 3
@@ -151,6 +152,14 @@ def gaps(images: Tensor, share: float, seed: int) -> Tensor:
     return torch.where(torch.rand(images.shape[:-1], generator=draw)[..., None] < share, torch.nan, images)
 
 
+@dataclass(frozen=True)
+class Config(SceneConfig):
+    """Shapes that deform."""
+
+    windows: int = 1
+    """Windows per take at most."""
+
+
 def windows(training: bool, around: float, per_take: int) -> list[Window]:
     """Some windows of every take that is long enough."""
     found = []
@@ -170,7 +179,7 @@ def best(settings: tuple[float, ...], method: Callable[[Window, float], Tensor],
     return settings[int(np.argmin(scores))]
 
 
-def table(around: float, per_take: int) -> None:
+def table(around: float, per_take: int) -> Words:
     """The table of one path of the cameras."""
     training, test = windows(True, around, 1)[::TRAINING], windows(False, around, per_take)
     joints = [take.joints[::STEP] for take in takes() if take.name[:2] in ("01", "03")]
@@ -186,12 +195,14 @@ def table(around: float, per_take: int) -> None:
         ("deformable_shapes", lambda one, k: deformable(one.images, int(k)), SHAPES),
         ("deformable_shapes, 20 % missing", lambda one, k: deformable(gaps(one.images, 0.2, 1), int(k)), SHAPES),
     ]
+    lines = []
     for name, method, settings in chosen:
         setting = best(settings, method, training) if len(settings) > 1 else 0
         scores = [100 * error(method(one, setting), one.points) for one in test]
         what = f"{setting:g}" if len(settings) > 1 else "-"
-        print(f"| {name} | {what} | {np.median(scores):.3g} | {np.max(scores):.3g} |", flush=True)
+        lines.append((name, what, f"{np.median(scores):.3g}", f"{np.max(scores):.3g}"))
         note(name)
+    return Words(("method", "chosen", "error, %, median", "worst"), lines)
 
 
 def _mean_shape(frames: Tensor) -> Tensor:
@@ -206,15 +217,15 @@ def _mean_shape(frames: Tensor) -> Tensor:
 # ---- shapes whose truth is few ---------------------------------------------------------------------------------------
 
 
-def synthetic(count: int) -> None:
+def synthetic(count: int) -> Words:
     """Random bases: error of the metric points by noise, number of shapes and share of missing images."""
-    print("| basis | points | frames | noise, % of the size | missing, % | two views, % | deformable_shapes, % |")
-    print("|---|---|---|---|---|---|---|")
+    lines = []
     for basis, n, noise, missing in ((2, 20, 0.0, 0.0), (2, 20, 1.0, 0.0), (3, 30, 1.0, 0.0), (3, 30, 3.0, 0.0), (3, 30, 1.0, 0.3)):
         scores = [_once(basis, n, noise / 100, missing, seed) for seed in range(count)]
         first, second = (float(np.median([score[k] for score in scores])) for k in (0, 1))
         alone = "-" if missing else f"{100 * first:.2g}"
-        print(f"| {basis} | {n} | {FRAMES} | {noise:g} | {100 * missing:g} | {alone} | {100 * second:.2g} |", flush=True)
+        lines.append((f"{basis}", f"{n}", f"{FRAMES}", f"{noise:g}", f"{100 * missing:g}", alone, f"{100 * second:.2g}"))
+    return Words(("basis", "points", "frames", "noise, % of the size", "missing, %", "two views, %", "deformable_shapes, %"), lines)
 
 
 def _once(basis: int, n: int, noise: float, missing: float, seed: int) -> tuple[float, float]:
@@ -238,19 +249,9 @@ def _once(basis: int, n: int, noise: float, missing: float, seed: int) -> tuple[
     return error(plain, points), error(deformable_shapes(seen[0], seen[1], basis, lengths=pairs).points, points)
 
 
-def run() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=10, help="synthetic scenes per row")
-    parser.add_argument("--windows", type=int, default=1, help="windows per take at most")
-    options = parser.parse_args()
-    if options.scenes < 1 or options.windows < 1:
-        raise ValueError(f"--scenes and --windows must be 1 or more, got {options.scenes} and {options.windows}")
-    synthetic(options.scenes)
+@experiment(Config(scenes=10))
+def tables(config: Config) -> Tables:
+    """Random bases, then captured bodies."""
+    yield "random bases, medians", synthetic(config.scenes)
     for name, around in (("cameras that stand still", 0.0), ("cameras that go around by 180 degrees", math.pi)):
-        print(f"\n{name}: CMU motion capture, 31 joints\n\n| method | chosen | error, %, median | worst |\n|---|---|---|---|")
-        table(around, options.windows)
-
-
-if __name__ == "__main__":
-    command(run)
+        yield f"{name}: CMU motion capture, 31 joints", table(around, config.windows)

@@ -11,7 +11,6 @@ any length.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.counting.exact import Echelon, Field
-from experiments.common.tables import command
+from experiments.common.runner import BaseConfig, Tables, Words, experiment
 
 PRIME = 2**31 - 1
 Array = NDArray[np.int64]
@@ -169,6 +168,14 @@ def excess(kind: Kind, B: int, T: int, n: int, seed: int = 0) -> int:
     return count - rank.rank - (kind.frame + B * B - 1 + kind.scales(T))
 
 
+@dataclass(frozen=True)
+class Config(BaseConfig):
+    """Counts of shapes that deform."""
+
+    shapes: int = 3
+    """Basis shapes up to which is counted."""
+
+
 def least(kind: Kind, B: int, most: int = 16) -> tuple[str, str, str]:
     """What stays open of many frames and points, the least frames (of many points) and the least points (of many frames)."""
     T, n = most, 14
@@ -182,17 +189,9 @@ def least(kind: Kind, B: int, most: int = 16) -> tuple[str, str, str]:
     return "0", str(frames), str(points)
 
 
-def run() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shapes", type=int, default=3, help="basis shapes up to which is counted")
-    options = parser.parse_args()
-    print("| cameras | B | open dimensions, 16 frames of 14 points | least frames (14 points) | least points (16 frames) |")
-    print("|---|---|---|---|---|")
-    for kind in KINDS:
-        for B in range(2, options.shapes + 1):
-            print(f"| {kind.name} | {B} | {' | '.join(least(kind, B))} |", flush=True)
-
-
-if __name__ == "__main__":
-    command(run)
+@experiment(Config(), quick={"shapes": 2})
+def tables(config: Config) -> Tables:
+    """Every kind of cameras, by the number of basis shapes."""
+    head = ("cameras", "B", "open dimensions, 16 frames of 14 points", "least frames (14 points)", "least points (16 frames)")
+    lines = [(kind.name, str(B), *least(kind, B)) for kind in KINDS for B in range(2, config.shapes + 1)]
+    yield "dimensions that stay open", Words(head, lines)

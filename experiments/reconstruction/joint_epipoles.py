@@ -12,18 +12,14 @@ is none: its definedness, the least sine between the two lines that should meet.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.geometry.grassmann import joint_epipoles_of_tensor
 from dyntorch.scenes import LiftedScene, lifted_points
-from experiments.common.tables import NoiseConfig, command, noise_tables
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
 
 PROFILE = dyn.GrassmannTensor(4, (2, 2, 1))
 SETTINGS = tuple((n, sigma) for n in (20, 60, 200) for sigma in (0.0, 0.1, 0.5, 1.0))
@@ -31,18 +27,6 @@ HEAD = ("points", "noise px", "tensor deg", "projections deg", "refined deg", "d
 NONE = ("points", "noise px", "definedness", "of a common direction")
 FOCAL = 1300.0
 """Of the cameras of these scenes, about: an angle from pixels."""
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Angle of the joint epipole over the points and the noise."""
-
-    scenes: int = 40
-    """Scenes per cell."""
-    quick: bool = False
-    """Only noise of 0.5 pixels, 10 scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/joint_epipoles.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def angle(epipoles: Tensor, scene: LiftedScene) -> float:
@@ -85,16 +69,11 @@ def undefined(n: int, sigma: float, scenes: int, seed: int) -> Sequence[str]:
     return str(n), f"{sigma:g}", *cells
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file."""
-    scenes = min(config.scenes, 10) if config.quick else config.scenes
+@experiment(SceneConfig(scenes=40), quick={"scenes": 10})
+def tables(config: SceneConfig) -> Tables:
+    """Angle of the joint epipole over the points and the noise."""
     chosen = [setting for setting in SETTINGS if not config.quick or setting[1] == 0.5]
-    tables = {
-        f"angle to the true direction, medians of {scenes} scenes": lambda: (HEAD, [line(*s, scenes, config.seed) for s in chosen]),
-        "planar constant velocities have none": lambda: (NONE, [undefined(*s, scenes, config.seed) for s in chosen]),
-    }
-    noise_tables(tables, config)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.reconstruction.joint_epipoles")))
+    lines = [line(*setting, config.scenes, config.seed) for setting in chosen]
+    yield f"angle to the true direction, medians of {config.scenes} scenes", Words(HEAD, lines)
+    lines = [undefined(*setting, config.scenes, config.seed) for setting in chosen]
+    yield "planar constant velocities have none", Words(NONE, lines)

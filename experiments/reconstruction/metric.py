@@ -15,7 +15,6 @@ The scenes are written from the definitions (points, velocities, K [R | t]), not
 
 from __future__ import annotations
 
-import argparse
 from unittest.mock import patch
 
 import torch
@@ -26,11 +25,12 @@ from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.tasks.reconstruct import calibrated
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from experiments.common.tables import command, note
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import note
 
 K = torch.tensor([[1300.0, 0.0, 500.0], [0.0, 1280.0, 480.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 AXES = {"constant_direction_2d": 1, "constant_direction_3d": 1, "constant_velocity_planes_3d": 2}
-POINTS, SCENES, QUICK, PIXELS, SENSOR = 60, 40, 5, 0.5, 1e-3
+POINTS, PIXELS, SENSOR = 60, 0.5, 1e-3
 
 
 def scenes(motion: Motion, views: int, count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -84,7 +84,7 @@ def turned(found: Reconstruction, R: Tensor) -> Tensor:
     return torch.rad2deg(sine.clamp(max=1).asin()).amax(-1)
 
 
-def row(name: str, views: int, count: int, seed: int) -> str:
+def row(name: str, views: int, count: int, seed: int) -> list[str]:
     """One line of the table."""
     motion = MOTIONS[name]
     x, X, R = scenes(motion, views, count, seed)
@@ -106,7 +106,7 @@ def row(name: str, views: int, count: int, seed: int) -> str:
     cells = [_of(errors(clean, X)[settled]), _percent(errors(found, X)[settled]), _percent(errors(start, X)[settled])]
     cells += [_percent(errors(plain, X)), f"{float(turned(found, R)[settled].median()):.2g}"]
     cells += [f"{int(found.metric.sum())} of {count}", str(several)]
-    return f"| {name} | {views} | " + " | ".join(cells) + " |"
+    return [name, str(views), *cells]
 
 
 def _of(values: Tensor) -> str:
@@ -117,25 +117,17 @@ def _percent(values: Tensor) -> str:
     return f"{100 * float(values.median()):.2g} / {100 * float(values.max()):.2g}"
 
 
-def run() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} scenes")
-    parser.add_argument("--scenes", type=int, default=None, help=f"scenes per row (default {SCENES})")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    count = options.scenes if options.scenes is not None else (QUICK if options.quick else SCENES)
-    if count < 1:
-        raise ValueError(f"--scenes must be 1 or more, got {count}")
-    print(f"{count} scenes a row, {POINTS} points, {PIXELS} px; median / worst; problems with several metric frames left out\n")
-    print("| motion | views | exact | points, % | closed form, % | affinity, % | rotation, deg | metric | open |")
-    print("|---|---|---|---|---|---|---|---|---|")
+@experiment(SceneConfig(scenes=40), quick={"scenes": 5})
+def tables(config: SceneConfig) -> Tables:
+    """Every motion at its least number of views, and three more."""
+    head = ("motion", "views", "exact", "points, %", "closed form, %", "affinity, %", "rotation, deg", "metric", "open")
+    lines = []
     for name, motion in MOTIONS.items():
         least = motion.views(torch.arange(6.0))
         for views in (least, least + 3):
-            print(row(name, views, count, options.seed), flush=True)
+            lines.append(row(name, views, config.scenes, config.seed))
             note(f"{name}, {views} views")
-
-
-if __name__ == "__main__":
-    command(run)
+    title = (
+        f"{config.scenes} scenes a row, {POINTS} points, {PIXELS} px; median / worst; problems with several metric frames left out"
+    )
+    yield title, Words(head, lines)

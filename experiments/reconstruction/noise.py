@@ -16,7 +16,7 @@ errors without noise at the minimal number of matches.
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -29,9 +29,16 @@ from dyntorch.geometry.triangulation import resect, triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.scene import LiftedState, Lifting, ViewTracks, adjust_scene, distances
-from experiments.common.tables import command, note
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import note
 
-SCENES, QUICK = 40, 8
+
+@dataclass(frozen=True)
+class Config(SceneConfig):
+    """Errors of reconstructions."""
+
+    exact: bool = False
+    """Without noise, at the minimal number of matches."""
 
 
 class Setting(NamedTuple):
@@ -97,7 +104,7 @@ def motion_lifts(scene: scenes.LiftedScene) -> Tensor:
     return scene.lifts
 
 
-def cell(setting: Setting, count: int, seed: int) -> str:
+def cell(setting: Setting, count: int, seed: int) -> list[str]:
     """One line of the table."""
     motion = MOTIONS[setting.motion]
     draw = torch.Generator().manual_seed(seed)
@@ -123,7 +130,7 @@ def cell(setting: Setting, count: int, seed: int) -> str:
         row = " / ".join(_short(figures[name][place]) for name in ("linear", "constrained", "ours", "truth"))
         columns.append(f"{row} ({'-' if reference is None else _short(reference)})")
     name = f"{setting.motion}, {setting.views} views, {setting.points} points, {setting.sigma:g} px"
-    return f"| {name} | {' | '.join(columns)} | {reached:.2f} |"
+    return [name, *columns, f"{reached:.2f}"]
 
 
 def _figures(
@@ -139,7 +146,7 @@ def _short(value: float) -> str:
     return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
-def bodies(name: str, views: int, points: int, sigma: float, reference: float, count: int, seed: int) -> str:
+def bodies(name: str, views: int, points: int, sigma: float, reference: float, count: int, seed: int) -> list[str]:
     """One line of the table of two bodies."""
     draw = torch.Generator().manual_seed(seed)
     scene = scenes.lifted_points(name, points, views, sigma=sigma, batch=(count,), generator=draw)
@@ -148,17 +155,17 @@ def bodies(name: str, views: int, points: int, sigma: float, reference: float, c
     same = (found.labels == scene.labels).double().mean(-1)
     wrong = 1 - torch.maximum(same, 1 - same)
     error = metrics.body_error(found.points, scene.points, scene.labels)
-    columns = (
+    return [
+        f"{name}, {views} views, {points} points, {sigma:g} px",
         f"{float(found.residual.median()):.2g}",
         f"{100 * float(error.median()):.2g} ({reference:g})",
         f"{100 * float(wrong.mean()):.2g}",
-    )
-    return f"| {name}, {views} views, {points} points, {sigma:g} px | {' | '.join(columns)} |"
+    ]
 
 
-def exact(count: int, seed: int) -> None:
+def exact(count: int, seed: int) -> list[list[str]]:
     """Errors without noise at the minimal number of matches and views."""
-    print("| motion | views | matches | residual (px), median / worst | position error, median / worst |\n|---|---|---|---|---|")
+    lines = []
     for name, motion in MOTIONS.items():
         views = motion.views(torch.arange(6.0))
         need = motion.tensor(views).minimal()
@@ -171,35 +178,22 @@ def exact(count: int, seed: int) -> None:
         else:
             error = metrics.lifted_error(found.structure, scene.structure, motion_lifts(scene)).position
         row = f"{float(found.residual.median()):.1e} / {float(found.residual.max()):.1e}"
-        print(f"| {name} | {views} | {need} | {row} | {float(error.median()):.1e} / {float(error.max()):.1e} |")
+        lines.append([name, str(views), str(need), row, f"{float(error.median()):.1e} / {float(error.max()):.1e}"])
+    return lines
 
 
-def run() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help=f"{QUICK} scenes")
-    parser.add_argument("--scenes", type=int, default=None, help=f"scenes per row (default {SCENES})")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--exact", action="store_true", help="without noise, at the minimal number of matches")
-    parser.add_argument("--only", default="", help="rows whose motion contains this")
-    options = parser.parse_args()
-    count = options.scenes if options.scenes is not None else (QUICK if options.quick else SCENES)
-    if count < 1:
-        raise ValueError(f"--scenes must be 1 or more, got {count}")
-    if options.exact:
-        exact(count, options.seed)
+@experiment(Config(scenes=40), quick={"scenes": 8})
+def tables(config: Config) -> Tables:
+    """With noise, or (exact) without, at the minimal number of matches."""
+    if config.exact:
+        head = ("motion", "views", "matches", "residual (px), median / worst", "position error, median / worst")
+        yield "without noise", Words(head, exact(config.scenes, config.seed))
         return
-    print(f"medians over {count} scenes: linear / constrained / reconstruct / from the truth (reference)\n")
-    print("| | reprojection rms, px | position error, % | velocity error, % | reached |\n|---|---|---|---|---|")
+    title = f"medians over {config.scenes} scenes: linear / constrained / reconstruct / from the truth (reference)"
+    lines = []
     for setting in TABLE:
-        if options.only in setting.motion:
-            print(cell(setting, count, options.seed), flush=True)
-            note(f"{setting.motion}, {setting.views} views")
-    print("\n| | reprojection rms, px | affine error of a body, % (reference) | wrong labels, % |\n|---|---|---|---|")
-    for name, views, points, sigma, reference in BODIES:
-        if options.only in name:
-            print(bodies(name, views, points, sigma, reference, count, options.seed), flush=True)
-
-
-if __name__ == "__main__":
-    command(run)
+        note(f"{setting.motion}, {setting.views} views")
+        lines.append(cell(setting, config.scenes, config.seed))
+    yield title, Words(("", "reprojection rms, px", "position error, %", "velocity error, %", "reached"), lines)
+    lines = [bodies(*case, config.scenes, config.seed) for case in BODIES]
+    yield "two bodies", Words(("", "reprojection rms, px", "affine error of a body, % (reference)", "wrong labels, %"), lines)

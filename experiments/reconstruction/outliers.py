@@ -14,16 +14,13 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 
 import dyntorch as dyn
 from dyntorch import metrics, scenes
-from experiments.common.tables import Row, command, measured
-from indexing.files import prepare
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 
 SIGMA, NEAR, KEPT, CLOSE, WRONG = 0.5, 3.0, 0.95, 2.0, 3.0
 SETTINGS: dict[str, tuple[tuple[int, int, int], ...]] = {
@@ -39,21 +36,15 @@ GOALS = {("constant_velocity_2d", 3): 0.3, ("constant_direction_3d", 3): 0.3}
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Reconstruction over shares of outliers, beside the goals."""
 
     outliers: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3)
     """Shares of wrong tracks."""
     motions: tuple[str, ...] = tuple(SETTINGS)
     """Models."""
-    quick: bool = False
-    """An eighth of the scenes, and only the least views and points of each model."""
     estimate: bool = False
     """Do not give the threshold, but have it estimated."""
-    threads: int = 0
-    """CPU threads of torch; 0 leaves its default."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/lifted_outliers.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def measure(
@@ -101,21 +92,8 @@ def table(motion: str, config: Config) -> list[Row]:
     return rows
 
 
-def run(config: Config) -> None:
-    """Print every table, then write the file.
-
-    Raises:
-        ValueError: an unknown model.
-    """
-    unknown = set(config.motions) - set(SETTINGS)
-    if unknown:
-        raise ValueError(f"motions must be among {', '.join(SETTINGS)}, got {', '.join(sorted(unknown))}")
-    target = config.out.expanduser()
-    prepare(target.parent)
-    if config.threads > 0:
-        torch.set_num_threads(config.threads)
-    measured(config.motions, lambda motion: table(motion, config), target, vars(config))
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.reconstruction.outliers")))
+@experiment(Config())
+def tables(config: Config) -> Tables:
+    """Every model over the shares of outliers; quick: an eighth of the scenes, the least views and points."""
+    for motion in config.motions:
+        yield motion, table(motion, config)

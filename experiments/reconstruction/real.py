@@ -25,15 +25,11 @@ by a model that is not in the list: planar velocities before 3D sensors.
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 
 import dyntorch as dyn
 from dyntorch import metrics
@@ -43,8 +39,8 @@ from dyntorch.tasks.reconstruct.motions import MOTIONS, polynomial
 from dyntorch.tasks.reconstruct.result import Reconstruction
 from experiments.alignment.real.solvers import listed, median
 from experiments.common.real_data import Take, takes, traffic
-from experiments.common.tables import Row, command, markdown, note
-from experiments.recognition.protocol import data_folder
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.reconstruction.data import (
     Boxes,
     World,
@@ -58,9 +54,7 @@ from experiments.reconstruction.data import (
     scene_error,
     seen,
 )
-from experiments.reconstruction.pictures import drive_picture, people_picture, traffic_picture
-from experiments.reconstruction.traffic import asked, auto_rows, bodies_rows, threshold_rows, traffic_rows
-from indexing.files import manifest, prepare, to_json_types, write_json
+from experiments.reconstruction.traffic import auto_rows, bodies_rows, threshold_rows, traffic_rows
 
 SPATIAL = ("constant_direction_3d", "constant_velocity_planes_3d", "constant_velocity_3d")
 SHARES = (0.0, 0.03, 0.1, 0.3, 1.0)
@@ -69,17 +63,11 @@ LOST = 1.02
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Reconstruction on the recordings in the folder DYNTORCH_DATA."""
 
-    quick: bool = False
-    """Few sequences, crowds and windows."""
     crowds: int = 3
     """Random crowds per line."""
-    seed: int = 0
-    """Of all random choices."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/real_lifted")
-    """Where the figures (figures.json) and the pictures are written."""
 
 
 # ---- people and drives -------------------------------------------------------------------------------------------------
@@ -135,22 +123,17 @@ def judged_row(label: str, prefix: str, some: Sequence[Judged]) -> Row:
     return Row(label, setting, median([float(one.error.position) for one in some]))
 
 
-def people_rows(pool: list[Take], config: Config) -> tuple[list[Row], dict[str, list[float]]]:
+def people_rows(pool: list[Take], config: Config) -> list[Row]:
     """Errors against the share of the true way off straight lines, and of true motion in shorter times."""
     rows: list[Row] = []
-    curves: dict[str, list[float]] = {"position": [], "velocity": [], "position, adjusted from the truth": []}
     cases = [(4, share) for share in SHARES[:: 2 if config.quick else 1]] + [(2, 1.0), (1, 1.0)]
     for spacing, share in cases:
         draw = torch.Generator().manual_seed(config.seed)
-        worlds = [crowd(pool, spacing, 7, draw).bent(share) for _ in range(2 if config.quick else config.crowds)]
+        worlds = [crowd(pool, spacing, 7, draw).bent(share) for _ in range(config.crowds)]
         for name in ("constant_velocity_3d",) if share < 1 else ("constant_velocity_3d", "constant_direction_3d", "static_3d"):
             some = [judged(world, name, torch.Generator().manual_seed(config.seed + i)) for i, world in enumerate(worlds)]
             rows.append(judged_row(name, f"{spacing * 100 / 6:.0f} ms, {share:.0%} of the way off: ", some))
-            if name == "constant_velocity_3d" and spacing == 4:
-                curves["position"].append(median([float(one.error.position) for one in some]))
-                curves["velocity"].append(median([float(one.error.velocity) for one in some]))
-                curves["position, adjusted from the truth"].append(median([float(one.best.position) for one in some]))
-    return rows, curves
+    return rows
 
 
 def drives_rows(logs: list[Boxes], config: Config) -> list[Row]:
@@ -221,47 +204,17 @@ def factorization_rows(pool: list[Take], config: Config) -> list[Row]:
     return rows
 
 
-def run(config: Config) -> None:
-    """Print every table, then write the figures and the pictures."""
-    folder, begin = data_folder(), time.perf_counter()
-    prepare(config.out)
-    sequences, pool, logs = traffic(), takes()[1::2], boxes()
-    sequences = [one for one in sequences if one.name in ("cars2B", "cars5", "cars9")] if config.quick else sequences
-    tables: dict[str, list[Row]] = {}
-
-    def table(title: str, rows: list[Row]) -> None:
-        tables[title] = rows
-        print(markdown(rows, title), flush=True)
-        note(f"... {time.perf_counter() - begin:.0f} s")
-
-    steps = (2,) if config.quick else (2, 4)
-    rows, waits = traffic_rows(sequences, steps, config.seed)
-    table("Traffic: a held-out frame", rows)
-    table("Traffic: thresholds", threshold_rows(sequences[:1] if config.quick else sequences[1::3], config.seed))
-    table("Two bodies: labels", bodies_rows(pairs()[::6] if config.quick else pairs()))
-    table("Traffic: which motion?", auto_rows(sequences[:1] if config.quick else sequences[1::3]))
-    rows, curves = people_rows(pool, config)
-    table("People before virtual cameras", rows)
-    table("Boxes of traffic before virtual cameras", drives_rows(logs, config))
-    table("Boxes of traffic as the sensor measured them", sensor_rows(logs, config))
-    table("Factorizations of people", factorization_rows(pool, config))
-    shown = next(one for one in sequences if one.name == "cars5")
-    case = asked(shown, 4, True, torch.Generator().manual_seed(config.seed))
-    assert case is not None
-    when = torch.tensor(case.frames).double()
-    # all cars drive along one road: the plane's velocities are known up to more than static points fix, the common direction's not
-    found = dyn.reconstruct(shown.tracks[case.frames], "constant_direction_2d", when, static=case.known, threshold=math.inf)
-    traffic_picture(shown.tracks, case.frames, found, shown.background, waits, steps, config.out / "traffic.png")
-    world = crowd(pool, 4, 7, torch.Generator().manual_seed(config.seed)).bent(0.1)
-    one = judged(world, "constant_velocity_3d", torch.Generator().manual_seed(config.seed))
-    people_picture(one.world, one.found, curves, SHARES[::2] if config.quick else SHARES, config.out / "people.png")
-    drive = judged(logs[0].window(0, 4, 7)[0], "constant_velocity_planes_3d", torch.Generator().manual_seed(config.seed))
-    drive_picture(drive.world, drive.found, config.out / "drive.png")
-    inputs = [folder / name for name in ("hopkins155.npz", "argoverse2", "cmu_mocap_60fps.npz")]
-    about = manifest(vars(config), inputs, seed=config.seed, timings={"all": time.perf_counter() - begin})
-    write_json(config.out / "figures.json", {"manifest": about, "tables": to_json_types(tables)})
-    note(f"written: {config.out}, {time.perf_counter() - begin:.0f} s")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.reconstruction.real")))
+@experiment(Config(), quick={"crowds": 2})
+def tables(config: Config) -> Tables:
+    """Traffic, pairs of bodies, people and boxes; quick: few sequences, crowds and windows."""
+    sequences = [one for one in traffic() if not config.quick or one.name in ("cars2B", "cars5", "cars9")]
+    some = sequences[:1] if config.quick else sequences[1::3]
+    pool, logs = takes()[1::2], boxes()
+    yield "Traffic: a held-out frame", traffic_rows(sequences, (2,) if config.quick else (2, 4), config.seed)
+    yield "Traffic: thresholds", threshold_rows(some, config.seed)
+    yield "Two bodies: labels", bodies_rows(pairs()[:: 6 if config.quick else 1])
+    yield "Traffic: which motion?", auto_rows(some)
+    yield "People before virtual cameras", people_rows(pool, config)
+    yield "Boxes of traffic before virtual cameras", drives_rows(logs, config)
+    yield "Boxes of traffic as the sensor measured them", sensor_rows(logs, config)
+    yield "Factorizations of people", factorization_rows(pool, config)

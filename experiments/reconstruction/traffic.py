@@ -101,10 +101,9 @@ WAYS: dict[str, Way] = {
 }
 
 
-def traffic_rows(sequences: list[Traffic], steps: Sequence[int], seed: int) -> tuple[list[Row], dict[str, list[float]]]:
+def traffic_rows(sequences: list[Traffic], steps: Sequence[int], seed: int) -> list[Row]:
     """Distances in held-out frames, medians over the sequences."""
     rows: list[Row] = []
-    curves: dict[str, list[float]] = {}
     for within in (True, False):
         for step in steps:
             draw = torch.Generator().manual_seed(seed)
@@ -113,11 +112,10 @@ def traffic_rows(sequences: list[Traffic], steps: Sequence[int], seed: int) -> t
                 found = [solve(case) for case in cases]
                 cars, others = ([case.error(x, cars) for case, (x, _) in zip(cases, found, strict=True)] for cars in (True, False))
                 place = "between" if within else "after"
-                curves.setdefault(f"{name}, {place}", []).append(median(cars))
                 setting = f"held out {place} frames {step} apart, {len(cases)} sequences; background {median(others):.2f} px, "
                 setting += f"off by more than {WRONG:g} px in {sum(x > WRONG for x in others)}; worst cars {max(cars):.3g} px; "
                 rows.append(Row(name, setting + f"{listed(Counter(s for _, s in found))}; cars", median(cars), unit=" px"))
-    return rows, curves
+    return rows
 
 
 def threshold_rows(sequences: list[Traffic], seed: int) -> list[Row]:

@@ -13,23 +13,21 @@ drone moves, the line is triangulated from asynchronous detections alone and com
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
 from dyntorch.geometry.extensors import plucker
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.tasks.trajectories.trajectories import LineStatus, points_on_lines, trajectory_cameras, triangulate_trajectories
-from experiments.common.tables import command, note
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import note
 from experiments.recognition.protocol import data_folder
-from indexing.files import manifest, prepare, write_json
 
 Array = NDArray[Any]
 CAMERAS = (0, 2, 3, 4, 5)  # camera 1 has a variable frame rate
@@ -37,18 +35,6 @@ RATE = 5.0  # Hz of the track, to start from
 FRAMES = 59.94006  # per second of camera 0, whose frames are the common time
 MOVING, STRAIGHT = 2.0, 0.05
 """m/s, and metres from the chord, that a piece of the track must be above and below."""
-
-
-@dataclass(frozen=True)
-class Config:
-    """Straight trajectories from views at different times."""
-
-    scenes: int = 20
-    """Synthetic scenes of 200 points per row."""
-    seed: int = 0
-    """Of the scenes, and of the choice of views."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/trajectories.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +87,7 @@ def scene(shape: tuple[int, int], n: int, noise: float, generator: torch.Generat
     return cameras, x, points, lines
 
 
-def synthetic(views: int, noise: float, config: Config, generator: torch.Generator) -> dict[str, float]:
+def synthetic(views: int, noise: float, config: SceneConfig, generator: torch.Generator) -> dict[str, float]:
     """One row of the noise table."""
     cameras, x, points, lines = scene((config.scenes, views), 200, noise, generator)
     found = triangulate_trajectories(cameras, x)
@@ -120,7 +106,7 @@ def synthetic(views: int, noise: float, config: Config, generator: torch.Generat
     }
 
 
-def uncalibrated(n: int, noise: float, config: Config) -> dict[str, float]:
+def uncalibrated(n: int, noise: float, config: SceneConfig) -> dict[str, float]:
     """One row of the table of six uncalibrated views, one scene: noise that the residuals show, px, before and after adjustment."""
     x = scene((1, 6), n, noise, torch.Generator().manual_seed(config.seed))[1][0]
     row: dict[str, float] = {"matches": n, "noise": noise}
@@ -268,30 +254,22 @@ def real(data: Flight, length: float, count: int | None, seed: int) -> dict[str,
     }
 
 
-def table(rows: list[dict[str, float]], title: str) -> str:
-    """Rows as a Markdown table."""
-    head = list(rows[0])
-    lines = [f"\n### {title}\n", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join(f"{row[name]:.3g}" for name in head) + " |" for row in rows])
+def table(rows: list[dict[str, float]]) -> Words:
+    """Figures in words."""
+    return Words(list(rows[0]), [[f"{value:.3g}" for value in row.values()] for row in rows])
 
 
-def run(config: Config) -> None:
-    """Print both tables and write them."""
-    target = config.out.expanduser()
-    prepare(target.parent)
+@experiment(SceneConfig(scenes=20), quick={"scenes": 2})
+def tables(config: SceneConfig) -> Tables:
+    """Synthetic scenes of 200 points, one uncalibrated scene, and a drone; quick: the first."""
     generator = torch.Generator().manual_seed(config.seed)
     noise = [synthetic(v, 0.5, config, generator) for v in (4, 5, 6, 8)]
-    print(table(noise, "Synthetic, medians: 1 - cos of lines in R^6, points in units of a scene of radius 1"))
-    tensors = [uncalibrated(n, noise, config) for n, noise in ((728, 0.0), (728, 0.01), (1500, 0.1), (1500, 0.5), (3000, 0.5))]
-    print(table(tensors, "Six uncalibrated views: noise that the residuals show, px"))
+    yield "Synthetic, medians: 1 - cos of lines in R^6, points in units of a scene of radius 1", table(noise)
+    if config.quick:
+        return
+    cases = ((728, 0.0), (728, 0.01), (1500, 0.1), (1500, 0.5), (3000, 0.5))
+    yield "Six uncalibrated views: noise that the residuals show, px", table([uncalibrated(*case, config) for case in cases])
     data = flight()
     note(f"clock of the track: {data.clock[0]:.4f} samples/s, {data.clock[1]:.2f} at time 0")
     rows = [real(data, length, count, config.seed) for length in (0.5, 1.0) for count in (5, 8, 16, None)]
-    print(table(rows, "Drone, pieces of straight flight: medians and 90 %, degrees and metres against RTK"))
-    tables = {"synthetic": noise, "uncalibrated": tensors, "real": rows}
-    write_json(target, {"manifest": manifest(vars(config), seed=config.seed), **tables})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.reconstruction.trajectories")))
+    yield "Drone, pieces of straight flight: medians and 90 %, degrees and metres against RTK", table(rows)

@@ -16,7 +16,7 @@ Compared, by peak signal to noise ratio, with the image that this camera would h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -28,9 +28,10 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.tasks.reconstruct.result import Reconstruction
-from experiments.common.tables import command, note
+from experiments.common.runner import BaseConfig, Tables, Words, experiment
+from experiments.common.tables import note
 from experiments.reconstruction.crossroads import CARS, HEIGHT, SAMPLES, WIDTH, camera, observe, render
-from indexing.files import manifest, prepare, write_json
+from indexing.files import prepare
 
 TIMES = (0.0, 1.0, 2.3, 3.0)
 FLIGHT = ((-17.0, -24.0, 37.0), (-8.0, -31.0, 35.0), (4.0, -30.0, 36.0), (13.0, -25.0, 39.0))
@@ -41,17 +42,13 @@ MARGIN = 1.2  # the ground is not taken from so many sizes of a car around its m
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Synthesis of unseen views of a crossroads."""
 
     sigma: float = 0.3
     """Noise of a coordinate of the tracks, pixels."""
     still: int = 40
     """Tracks on the ground."""
-    seed: int = 0
-    """Of the noise and the tracks on the ground."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/view_synthesis.json")
-    """Where the figures and this configuration are written as JSON."""
     picture: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("docs/view_synthesis.png")
     """Where the picture is written."""
 
@@ -180,13 +177,13 @@ def _faded(images: Tensor, time: float) -> Tensor:
     return torch.lerp(images[before], images[after], min(1.0, (time - TIMES[before]) / (TIMES[after] - TIMES[before])))
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The figures in Markdown."""
-    lines = [["PSNR in dB: all / cars", *METHODS], ["---"] * (len(METHODS) + 1)]
+def table(rows: Sequence[dict[str, Any]]) -> Words:
+    """The figures in words."""
+    lines = []
     for row in rows:
         name = f"t = {row['time']:g}, {100 * row['covered']:.0f} % covered"
         lines.append([name, *(f"{row['psnr'][m]:.1f} / {row['psnr_cars'][m]:.1f}" for m in METHODS)])
-    return "\n".join(f"| {' | '.join(cell.ljust(22) for cell in line)} |" for line in lines)
+    return Words(["PSNR in dB: all / cars", *METHODS], lines)
 
 
 def picture(images: Tensor, tracks: Tensor, rows: Sequence[dict[str, Any]], path: Path) -> None:
@@ -234,7 +231,8 @@ def picture(images: Tensor, tracks: Tensor, rows: Sequence[dict[str, Any]], path
     few.save(path, optimize=True)
 
 
-def main(config: Config) -> None:
+@experiment(Config())
+def tables(config: Config) -> Tables:
     """Draw, reconstruct, synthesize, compare."""
     generator = torch.Generator().manual_seed(config.seed)
     cameras = torch.stack([camera(place) for place in FLIGHT])
@@ -254,15 +252,5 @@ def main(config: Config) -> None:
     for time, place in UNSEEN:
         view = resected(found.points[known], apply(camera(place), still[known[static]]))
         rows.append(compare(images, scene_of(found), true, view, camera(place), time))
-    print(table(rows))
+    yield "PSNR of views that nobody took", table(rows)
     picture(images, tracks, rows, config.picture)
-    figures = [{key: value for key, value in row.items() if key not in ("image", "truth")} for row in rows]
-    prepare(config.out.parent)
-    write_json(
-        config.out, {"views": figures, "residual": float(found.residual), "manifest": manifest(asdict(config), (), config.seed)}
-    )
-    note(f"wrote {config.picture} and {config.out}")
-
-
-if __name__ == "__main__":
-    command(lambda: main(tyro.cli(Config, description=__doc__)))

@@ -9,16 +9,12 @@ under the better naming, means over the scenes. 14 matches are the least (7 on e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 
 import dyntorch as dyn
 from dyntorch.metrics import misclassification
-from experiments.common.tables import NoiseConfig, command, noise_tables
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
 from experiments.thesis.definitions import normal, seeded
 
 SETTINGS = tuple((n, sigma) for n in (14, 20, 60, 200) for sigma in (0.0, 0.5, 1.0, 2.0))
@@ -27,18 +23,6 @@ SIZE = 50.0
 LEAST = 35
 S = dyn.SegmentationMatrix
 HEAD = ("matches", "noise px", "affine", "segmentation matrix", "segment")
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Wrong labels of two bodies in affine views over the matches and the noise."""
-
-    scenes: int = 40
-    """Scenes per cell."""
-    quick: bool = False
-    """Only noise of 0.5 pixels, 20 scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/affine_bodies.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def line(n: int, sigma: float, scenes: int, seed: int) -> Sequence[str]:
@@ -62,13 +46,9 @@ def line(n: int, sigma: float, scenes: int, seed: int) -> Sequence[str]:
     return str(n), f"{sigma:g}", *cells, *["-"] * (3 - len(cells))
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
-    scenes = min(config.scenes, 20) if config.quick else config.scenes
+@experiment(SceneConfig(scenes=40), quick={"scenes": 20})
+def tables(config: SceneConfig) -> Tables:
+    """Wrong labels of two bodies in affine views over the matches and the noise."""
     chosen = [setting for setting in SETTINGS if not config.quick or setting[1] == 0.5]
-    title = f"wrong labels, means of {scenes} scenes"
-    noise_tables({title: lambda: (HEAD, [line(*setting, scenes, config.seed) for setting in chosen])}, config)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.segmentation.affine_bodies")))
+    lines = [line(*setting, config.scenes, config.seed) for setting in chosen]
+    yield f"wrong labels, means of {config.scenes} scenes", Words(HEAD, lines)

@@ -21,13 +21,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
-from experiments.common.tables import Row, command, measured_on_one_thread
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.segmentation.photographs import FOCAL, HEIGHT, WIDTH, Photographs, photographs
 from indexing.colmap import find_static, read_database
 
@@ -38,18 +38,6 @@ GUESS = 1.15
 """The focal length that COLMAP starts from, over the true one."""
 SMALLEST = 3
 """Images of a model: COLMAP would throw away those of fewer than ten."""
-
-
-@dataclass(frozen=True)
-class Config:
-    """COLMAP's mapper alone and after the static points were found."""
-
-    quick: bool = False
-    """Three scenes."""
-    seed: int = 0
-    """Of the scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/colmap.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +151,7 @@ def compared(bodies: int, seed: int) -> Compared:
     return Compared(bodies, total, scene.share, alone, after, precision, recall, found.lead, seconds)
 
 
-def table(config: Config) -> list[Row]:
+def table(config: BaseConfig) -> list[Row]:
     """Every scene, and how many are within 1 %."""
     chosen = list(enumerate(BODIES))[:: 4 if config.quick else 1]
     runs = [compared(bodies, config.seed + number) for number, bodies in chosen]
@@ -194,14 +182,8 @@ def _summary(runs: Sequence[Compared]) -> list[Row]:
     ]
 
 
-TABLES = {"Rendered scenes of which 60 % of the matches move, through COLMAP": table}
-
-
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
+@experiment(BaseConfig())
+def tables(config: BaseConfig) -> Tables:
+    """COLMAP's mapper alone and after the static points were found; quick: three scenes."""
     colmap()
-    measured_on_one_thread(TABLES, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.segmentation.colmap")))
+    yield "Rendered scenes of which 60 % of the matches move, through COLMAP", table(config)

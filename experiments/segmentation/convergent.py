@@ -11,18 +11,14 @@ limit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.metrics import misclassification, relative_error
 from dyntorch.scenes import Scene, convergent_motions
-from experiments.common.tables import NoiseConfig, command, noise_tables
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
 
 KIND = dyn.ConvergentMotionMatrix
 SETTINGS = tuple((n, sigma) for n in (60, 200, 500) for sigma in (0.1, 0.5, 1.0))
@@ -39,18 +35,6 @@ HEAD = (
     "road: linear",
     "road: refined",
 )
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Wrong labels and the homography of the plane over the matches and the noise."""
-
-    scenes: int = 20
-    """Scenes per cell."""
-    quick: bool = False
-    """Only noise of 0.5 pixels, 5 scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/convergent.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def wrong(labels: Tensor, scene: Scene) -> float:
@@ -91,13 +75,9 @@ def line(n: int, sigma: float, scenes: int, seed: int) -> Sequence[str]:
     return str(n), f"{sigma:g}", *(f"{share:.1%}" for share in shares.tolist()), *(f"{error:.2g}" for error in errors.tolist())
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
-    scenes = min(config.scenes, 5) if config.quick else config.scenes
+@experiment(SceneConfig(scenes=20), quick={"scenes": 5})
+def tables(config: SceneConfig) -> Tables:
+    """Wrong labels and the homography of the plane over the matches and the noise."""
     chosen = [setting for setting in SETTINGS if not config.quick or setting[1] == 0.5]
-    title = f"wrong labels (means) and error of the road (medians), {scenes} scenes a row"
-    noise_tables({title: lambda: (HEAD, [line(*setting, scenes, config.seed) for setting in chosen])}, config)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.segmentation.convergent")))
+    lines = [line(*setting, config.scenes, config.seed) for setting in chosen]
+    yield f"wrong labels (means) and error of the road (medians), {config.scenes} scenes a row", Words(HEAD, lines)

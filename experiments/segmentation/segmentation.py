@@ -20,17 +20,15 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean, median, pstdev
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 
 import dyntorch as dyn
 from dyntorch.metrics import misclassification
-from experiments.common.tables import Row, command, measured_on_one_thread
-from experiments.recognition.protocol import data_folder
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.segmentation.data import Pair, hopkins_pairs, motion_pairs
 
 THRESHOLDS = (2.0, 2.5, 3.0)
@@ -59,15 +57,11 @@ AdelaideRMF, Prog-X by its own notebook: 10.9 over 18 pairs, in brackets above p
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Segmentation into bodies on the recordings in the folder DYNTORCH_DATA."""
 
     seeds: int = 5
     """Runs per pair of AdelaideRMF; Hopkins155 has one."""
-    quick: bool = False
-    """Every fourth pair of AdelaideRMF with one seed, every eighth sequence of Hopkins155."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/segmentation.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +89,7 @@ def segmented(
 
 def adelaide(config: Config) -> list[Row]:
     """Every pair, and their mean."""
-    pairs, seeds = (motion_pairs()[::4], 1) if config.quick else (motion_pairs(), config.seeds)
+    pairs, seeds = motion_pairs()[:: 4 if config.quick else 1], config.seeds
     runs = {
         threshold: {pair.name: [segmented(pair, None, threshold, seed) for seed in range(seeds)] for pair in pairs}
         for threshold in (DEFAULT, *(t for t in THRESHOLDS if t != DEFAULT))
@@ -165,24 +159,9 @@ def hopkins(config: Config) -> list[Row]:
     return rows + [Row(f"worst, K known: {p.name}", f"{p.bodies} bodies", known[p.name].error, unit=" %") for p in worst]
 
 
-TABLES = {
-    "AdelaideRMF, two views of moved objects": adelaide,
-    "Hopkins155, first and last frame": hopkins,
-}
-
-
-def run(config: Config) -> None:
-    """Print every table, then write the file.
-
-    Raises:
-        ValueError: no data folder, no seeds, or a file that cannot be written.
-    """
-    if config.seeds < 1:
-        raise ValueError(f"seeds must be at least 1, got {config.seeds}")
-    data_folder()
-    measured_on_one_thread(TABLES, config, config.out)
-    print(PUBLISHED)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.segmentation.segmentation")))
+@experiment(Config(), quick={"seeds": 1})
+def tables(config: Config) -> Tables:
+    """Recordings of the folder DYNTORCH_DATA; quick: every fourth pair of AdelaideRMF, every eighth sequence of Hopkins155."""
+    yield "AdelaideRMF, two views of moved objects", adelaide(config)
+    yield "Hopkins155, first and last frame", hopkins(config)
+    yield "", PUBLISHED

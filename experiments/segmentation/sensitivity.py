@@ -12,20 +12,14 @@ of bodies are one).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean
 from types import ModuleType
-from typing import Annotated
 from unittest.mock import patch
-
-import tyro
 
 from dyntorch.tasks.segment import coherence, labels, search
 from dyntorch.tasks.segment import segment as two_views
-from experiments.benchmarks.interleaved import threads
-from experiments.common.tables import NoiseConfig, Row, aligned, command, measured
-from experiments.recognition.protocol import data_folder
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import Row
 from experiments.segmentation.data import hopkins_pairs, motion_pairs
 from experiments.segmentation.segmentation import left_out, segmented
 
@@ -50,18 +44,6 @@ VARIED: tuple[tuple[ModuleType, str, tuple[float, float]], ...] = (
 DEFAULT = "as shipped"
 
 
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """The constants of the segmentation, one at a time, on the recordings in the folder DYNTORCH_DATA."""
-
-    scenes: int = 3
-    """Seeds per pair of AdelaideRMF."""
-    quick: bool = False
-    """Three constants."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/segmentation_sensitivity.json")
-    """Where the results and this configuration are written as JSON."""
-
-
 Errors = dict[str, float]
 """Percent by the name of a pair."""
 
@@ -81,8 +63,9 @@ def hopkins() -> tuple[Errors, float]:
     return {name: fmean(found) for name, found in errors.items()}, 100 * right
 
 
-def sensitivity(config: Config) -> list[Row]:
-    """Every setting, and what choosing among them on other recordings gives."""
+@experiment(SceneConfig(scenes=3))
+def tables(config: SceneConfig) -> Tables:
+    """The constants of the segmentation, one at a time; quick: three of them.  Scenes are seeds per pair of AdelaideRMF."""
     module, name, _ = VARIED[0]
     settings = [(DEFAULT, module, name, getattr(module, name))]
     for module, name, values in VARIED[:: 5 if config.quick else 1]:
@@ -94,7 +77,8 @@ def sensitivity(config: Config) -> list[Row]:
             second[setting], shares[setting] = hopkins()
     mean = {setting: (fmean(first[setting].values()), fmean(second[setting].values()), shares[setting]) for setting in first}
     lines = [(setting, *(f"{figure:.2f}" for figure in figures)) for setting, figures in mean.items()]
-    print(aligned(("constant", "AdelaideRMF, K unknown, %", "Hopkins155, K known, %", "Hopkins155, K right, %"), lines))
+    head = ("constant", "AdelaideRMF, K unknown, %", "Hopkins155, K known, %", "Hopkins155, K right, %")
+    yield "The constants of the segmentation, one at a time", Words(head, lines)
     rows = []
     for column, (task, goal) in enumerate((("AdelaideRMF, K unknown", 1.0), ("Hopkins155, K known", 2.0))):
         figures = [found[column] for found in mean.values()]
@@ -105,20 +89,4 @@ def sensitivity(config: Config) -> list[Row]:
             Row(task, f"greatest of {len(figures)} settings", max(figures), goal, at_most=True, unit=" %"),
             Row(task, "setting chosen on the others", left, goal, at_most=True, unit=" %"),
         ]
-    return rows
-
-
-def run(config: Config) -> None:
-    """Print the table, then write the file.
-
-    Raises:
-        ValueError: no data folder, or a file that cannot be written.
-    """
-    data_folder()
-    target = config.target()
-    with threads(1):
-        measured(["The constants of the segmentation, one at a time"], lambda _: sensitivity(config), target, vars(config))
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.segmentation.sensitivity")))
+    yield "Beside the goals", rows

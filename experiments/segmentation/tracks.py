@@ -23,19 +23,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import fmean, median
-from typing import Annotated
 
 import torch
-import tyro
 
 import dyntorch as dyn
 from dyntorch.metrics import misclassification
 from dyntorch.scenes import StreetOptions, streets
-from experiments.benchmarks.interleaved import threads
-from experiments.common.tables import Row, command, measured_on_one_thread, note
-from experiments.recognition.protocol import data_folder
+from experiments.common.runner import SceneConfig, Tables, experiment
+from experiments.common.tables import Row, note
+from experiments.common.timing import threads
 from experiments.segmentation.data import Pair, Tracks, hopkins_tracks, kt3d_tracks, mtpv_tracks
 
 WORST = 5
@@ -64,21 +61,13 @@ Not verified, from memory only, their tables could not be read here: KT3DMoSeg 7
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(SceneConfig):
     """Segmentation of tracks into bodies, on the recordings in the folder DYNTORCH_DATA and on streets made for it."""
 
     only: tuple[str, ...] = ()
     """Names of tables; all where none is named."""
-    quick: bool = False
-    """Every fourth sequence of KT3DMoSeg and MTPV62, every eighth of Hopkins155, 6 streets."""
-    scenes: int = 18
-    """Streets of a kind."""
-    seed: int = 0
-    """Of the search; the streets have seeds of their own."""
     first: int = 1000
     """Seed of the first street."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/segmentation-tracks.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -189,16 +178,12 @@ def made_streets(
 ) -> list[Tracks]:
     """Streets of 2, 3, 4, 2, ... bodies with noise ``sigma`` px; their seeds begin ``later`` than the configuration says."""
     found = []
-    for number in range(_scenes(config)):
+    for number in range(config.scenes):
         seed = config.first + later + number
         draw = torch.Generator().manual_seed(seed)
         street = streets(2 + number % 3, tracks=tracks, sigma=sigma, options=options, generator=draw)
         found.append(Tracks(f"street {seed}: {', '.join(street.kinds)}", street.tracks, street.labels))
     return found
-
-
-def _scenes(config: Config) -> int:
-    return min(6, config.scenes) if config.quick else config.scenes
 
 
 def street_table(config: Config) -> list[Row]:
@@ -258,22 +243,17 @@ TABLES: dict[str, tuple[str, Callable[[Config], list[Row]]]] = {
 }
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file.
+@experiment(Config(scenes=18), quick={"scenes": 6})
+def tables(config: Config) -> Tables:
+    """Recordings of the folder DYNTORCH_DATA, and streets made for it; quick: every fourth or eighth recording.
 
     Raises:
-        ValueError: no data folder, an unknown table, no scenes, or a file that cannot be written.
+        ValueError: no data folder, or an unknown table.
     """
     unknown = [name for name in config.only if name not in TABLES]
     if unknown:
         raise ValueError(f"only must name tables of {', '.join(TABLES)}, got {', '.join(unknown)}")
-    if config.scenes < 1:
-        raise ValueError(f"scenes must be at least 1, got {config.scenes}")
-    data_folder()
-    chosen = config.only or tuple(TABLES)
-    measured_on_one_thread({TABLES[name][0]: TABLES[name][1] for name in chosen}, config, config.out)
-    print(PUBLISHED)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.segmentation.tracks")))
+    for name in config.only or tuple(TABLES):
+        title, table = TABLES[name]
+        yield title, table(config)
+    yield "", PUBLISHED

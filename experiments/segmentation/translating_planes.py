@@ -11,12 +11,9 @@ the latter at the true parameters.  The second table has bodies with depth, whos
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
@@ -27,8 +24,8 @@ from dyntorch.scenes import TranslatingScene, translating_planes
 from dyntorch.tasks.planes.input import GivenPlanes
 from dyntorch.tasks.planes.planes import translating_planes as solve
 from dyntorch.tasks.planes.problem import Layout, PlaneMatches, PlanesProblem, parameters
-from experiments.common.tables import NoiseConfig, aligned, command, note
-from indexing.files import manifest, write_json
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import note
 
 COLUMNS = ("thesis", "linear", "closed form", "matrices", "matches", "from truth")
 NONE = float("nan")
@@ -66,18 +63,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "two planes on one body": {"shared": 2},
     "a static plane": {"static": True},
 }
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Error of the homography at infinity over the number of planes and the noise."""
-
-    scenes: int = 60
-    """Scenes per cell."""
-    quick: bool = False
-    """Only noise of 0.5 pixels, 30 scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/translating_planes.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def frames(scene: TranslatingScene, H: Tensor, F: Tensor) -> GivenPlanes:
@@ -158,45 +143,28 @@ def cell(value: float | None, reference: float) -> str:
     return shown + (f" ({reference:.2g})" if reference == reference else "")
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file.
-
-    Raises:
-        ValueError: no scenes, or a file that cannot be written.
-    """
-    target = config.target()
-    scenes = min(config.scenes, 30) if config.quick else config.scenes
-    rows, lines = [], []
+@experiment(SceneConfig(scenes=60), quick={"scenes": 30})
+def tables(config: SceneConfig) -> Tables:
+    """Error of the homography at infinity over the number of planes and the noise; quick: 0.5 px."""
+    lines = []
     for (n, sigma), reference in REFERENCE.items():
-        if config.quick and sigma != 0.5:
-            continue
-        note(f"{n} planes, {sigma:g} px")
-        draw = torch.Generator().manual_seed(config.seed)
-        measured = estimates(translating_planes(n, batch=scenes, sigma=sigma, generator=draw))
-        rows.append({"planes": n, "bodies": 0, "sigma": sigma, **measured})
-        cells = [cell(measured.get(name), known) for name, known in zip(COLUMNS, reference, strict=True)]
-        lines.append([str(n), f"{sigma:g}", *cells])
-    print(f"\nrelative error of the homography at infinity (reference), medians of {scenes} scenes\n")
-    print(aligned(("planes", "noise px", *COLUMNS), lines), flush=True)
+        if not config.quick or sigma == 0.5:
+            note(f"{n} planes, {sigma:g} px")
+            draw = torch.Generator().manual_seed(config.seed)
+            measured = estimates(translating_planes(n, batch=config.scenes, sigma=sigma, generator=draw))
+            cells = [cell(measured.get(name), known) for name, known in zip(COLUMNS, reference, strict=True)]
+            lines.append([str(n), f"{sigma:g}", *cells])
+    title = f"relative error of the homography at infinity (reference), medians of {config.scenes} scenes"
+    yield title, Words(("planes", "noise px", *COLUMNS), lines)
     lines = []
     for (n, m, sigma), linear in BODIES.items():
-        if config.quick and sigma != 0.5:
-            continue
-        measured = with_bodies(n, m, sigma, scenes, torch.Generator().manual_seed(config.seed))
-        rows.append({"planes": n, "bodies": m, "sigma": sigma, **measured})
-        lines.append([str(n), str(m), f"{sigma:g}", cell(measured["matrices"], linear), cell(measured["matches"], NONE)])
-    print("\nwith bodies of known fundamental matrix\n")
-    print(aligned(("planes", "bodies", "noise px", "matrices", "matches"), lines), flush=True)
+        if not config.quick or sigma == 0.5:
+            measured = with_bodies(n, m, sigma, config.scenes, torch.Generator().manual_seed(config.seed))
+            lines.append([str(n), str(m), f"{sigma:g}", cell(measured["matrices"], linear), cell(measured["matches"], NONE)])
+    yield "with bodies of known fundamental matrix", Words(("planes", "bodies", "noise px", "matrices", "matches"), lines)
     lines = []
     for kind in KINDS:
         for n in (3, 4, 5):
-            status, named = degenerate(kind, n, min(scenes, 20), torch.Generator().manual_seed(config.seed))
-            lines.append([kind, str(n), status, named])
-    print("\nexact homographies in special position\n")
-    print(aligned(("position", "planes", "status OK", "said"), lines), flush=True)
-    write_json(target, {"manifest": manifest(vars(config), seed=config.seed), "rows": rows})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.segmentation.translating_planes")))
+            draw = torch.Generator().manual_seed(config.seed)
+            lines.append([kind, str(n), *degenerate(kind, n, min(config.scenes, 20), draw)])
+    yield "exact homographies in special position", Words(("position", "planes", "status OK", "said"), lines)

@@ -26,8 +26,8 @@ import tyro
 from numpy.typing import NDArray
 
 from dyntorch import Shift
-from experiments.benchmarks.interleaved import threads
 from experiments.common.tables import NoiseConfig, Row, aligned, command, measured, note
+from experiments.common.timing import threads
 from experiments.recognition.protocol import data_folder
 from indexing import Clip
 from indexing.actors import ACTIONS, Person, stream

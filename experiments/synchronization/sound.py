@@ -24,8 +24,8 @@ import tyro
 from numpy.typing import NDArray
 
 from dyntorch import Shift
-from experiments.benchmarks.interleaved import threads
 from experiments.common.tables import NoiseConfig, Row, command, measured
+from experiments.common.timing import threads
 from indexing.sync.sound import Sound, sound_shift
 
 Floats = NDArray[np.float64]

@@ -1,7 +1,4 @@
-"""Chapter 1 of the thesis, checked: projective spaces, extensors, trajectories and the counts of its overview.
-
-python -m experiments.thesis.chapter1
-"""
+"""Chapter 1 of the thesis, checked: projective spaces, extensors, trajectories and the counts of its overview."""
 
 from __future__ import annotations
 
@@ -25,7 +22,7 @@ from experiments.thesis.definitions import (
     rank,
     seeded,
 )
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(1, "projective spaces, extensors, trajectories")
 EXACT = 1e-8
@@ -171,7 +168,3 @@ def fundamentals() -> Finding:
 @CHAPTER.states("1.5, p. 13", "points of constant velocity are treated in chapter 6", "in chapter 3")
 def reference() -> Finding:
     return Finding(False, "chapter 3 lifts constant velocity to P^4 (planar) and P^6 (space)")
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

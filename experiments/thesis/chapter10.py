@@ -1,7 +1,5 @@
 """Chapter 10 of the thesis, checked: its discussion, what it leaves open, and what has come of that.
 
-    python -m experiments.thesis.chapter10
-
 **From a tensor to its cameras, in general** (open in 10.1). The Grassmann tensor of projections M_1, ..., M_v of P^k with the
 profile (a_1, ..., a_v), a_1 + ... + a_v = k + 1, holds the determinants of a_i rows of every M_i. Closed form, up to a
 collineation of P^k:
@@ -31,7 +29,7 @@ import torch
 import dyntorch as dyn
 from experiments.thesis.chapter9 import PRIME, rank_mod
 from experiments.thesis.definitions import apart, collineations, homogeneous, mapped, normal, products, rank, seeded, uniform
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(10, "conclusions and what was open")
 PROFILES = (
@@ -130,7 +128,3 @@ def conditions() -> Finding:
     found = [counted["static_on_plane"], counted["static_on_line"]]
     said = f"static points of join tensors on one plane: {found[0]} (by definition {own[0]}), on one line {found[1]} ({own[1]})"
     return Finding(found == own and own[0] == 10, said)
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

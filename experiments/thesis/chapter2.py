@@ -1,7 +1,5 @@
 """Chapter 2 of the thesis, checked: homography tensors, of three views of planar points that stay or move along lines.
 
-    python -m experiments.thesis.chapter2
-
 The chapter is a reprint (Shashua and Wolf, ECCV 2000); its counts are repeated in chapters 1 and 9, and "paper" names what is not.
 """
 
@@ -23,7 +21,7 @@ from experiments.thesis.definitions import (
     rank,
     seeded,
 )
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(2, "homography tensors")
 H, DUAL = dyn.HomographyTensor, dyn.DualHomographyTensor
@@ -158,7 +156,3 @@ def stability() -> Finding:
     middle = {name: float(torch.tensor(values).median()) for name, values in errors.items()}
     holds = middle["refined"] < middle["tensor"] and middle["static homography"] < middle["tensor"]
     return Finding(holds, "grid error at noise .002: " + ", ".join(f"{name} {value:.4f}" for name, value in middle.items()))
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

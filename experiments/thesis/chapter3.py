@@ -1,7 +1,5 @@
 """Chapter 3 of the thesis, checked: scenes with linear motion lifted to projections from P^k to P^2.
 
-    python -m experiments.thesis.chapter3
-
 The chapter is a reprint (Wolf and Shashua, IJCV 2002); its counts and tools are named in chapters 1, 8 and 10, "paper" names
 what is not.
 """
@@ -13,7 +11,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from experiments.thesis.definitions import apart, cameras, homogeneous, inhomogeneous, normal, rank, seeded, uniform
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(3, "projections from P^k to P^2")
 EXACT = 1e-6
@@ -136,7 +134,3 @@ def bodies() -> Finding:
         same = (labels == labels[0]) == (second[:, 0] == 0)
         shares.append(float(same.double().mean()))
     return Finding(min(shares) == 1, f"5 + 4 planar points, two views: {shares[0]:.0%}; 8 + 6 points, three views: {shares[1]:.0%}")
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

@@ -1,7 +1,5 @@
 """Chapter 4 and section 9.2 of the thesis, checked: shape tensors, of points that stay and of points that move.
 
-    python -m experiments.thesis.chapter4
-
 The chapter is a reprint (Levin, Wolf and Shashua, CVPR 2001); its aim stands in section 1.3, the eight-point tensor in section 9.2.
 """
 
@@ -25,7 +23,7 @@ from experiments.thesis.definitions import (
     seeded,
     uniform,
 )
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(4, "shape tensors")
 EXACT = 1e-6
@@ -199,7 +197,3 @@ def perspective() -> Finding:
         read = found.invariant.recover(found.tensor, *images[20:].unbind(1)).times
         errors.append(float((read - times[20:]).abs().median()))
     return Finding(errors[1] < 1e-5, f"cameras 8 away of points of size 1: affine form {errors[0]:.3f}, projective {errors[1]:.0e}")
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

@@ -1,7 +1,5 @@
 """Chapter 5 of the thesis, checked: independently translating planes in two views, by a common transversal.
 
-    python -m experiments.thesis.chapter5
-
 The chapter is a reprint (Wolf and Shashua, ICCV 2001); its argument and counts are repeated in section 1.4.
 """
 
@@ -13,7 +11,7 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch.geometry.extensors import join
 from experiments.thesis.definitions import apart, normal, rank, rotation, seeded, skew, uniform
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(5, "translating planes")
 EXACT = 1e-6
@@ -129,7 +127,3 @@ def known_fundamentals() -> Finding:
 def wording() -> Finding:
     _, _, F = planes(3, seeded(11))
     return Finding(rank(F.flatten(1)) == 1, f"one pair of views, three bodies: rank of their F {rank(F.flatten(1))}")
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

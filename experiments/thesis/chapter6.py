@@ -1,7 +1,5 @@
 """Chapter 6 of the thesis, checked: two bodies in two views, the segmentation matrix.
 
-    python -m experiments.thesis.chapter6
-
 The chapter is a reprint (Wolf and Shashua, CVPR 2001); its idea stands in section 1.4, and "paper" names what does not.
 """
 
@@ -23,7 +21,7 @@ from experiments.thesis.definitions import (
     skew,
     uniform,
 )
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(6, "the segmentation matrix")
 S = dyn.SegmentationMatrix
@@ -159,7 +157,3 @@ def convergent() -> Finding:
     truth = [skew(c) @ H for c in (e, v)]
     errors = [max(apart(found[k], truth[j]) for k, j in ((0, i), (1, 1 - i))) for i in (0, 1)]
     return Finding(min(errors) < 1e-6, f"30 static and 30 moving points: both matrices to {min(errors):.0e}")
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

@@ -1,7 +1,5 @@
 """Chapter 7 of the thesis, checked: two fixed affine cameras that see different points of a non-rigid scene, at different times.
 
-    python -m experiments.thesis.chapter7
-
 The chapter is a reprint (Wolf and Zomet, ECCV 2002 workshop); its setting and claims stand in sections 1.4, 1.5 and 10.1.
 """
 
@@ -14,7 +12,7 @@ from torch import Tensor
 
 import dyntorch as dyn
 from experiments.thesis.definitions import homogeneous, normal, rank, rotation, seeded, uniform
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(7, "synchronization and reconstruction from different points")
 FRAMES, FPS = 150, 25.0
@@ -163,7 +161,3 @@ def same_points() -> Finding:
         a, b = (view[start : start + FRAMES] for view, start in zip(views, starts, strict=True))
         errors.append(abs(float(dyn.synchronize(a, b, fps=(FPS, FPS), max_shift=1.2).offset) * FPS - shift))
     return Finding(max(errors) < 0.05, f"at .5 px: {TAKES} takes to {max(errors):.3f} frame")
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

@@ -1,7 +1,4 @@
-"""Chapter 8 of the thesis, checked: points and lines that move, measured by 3D sensors that move.
-
-python -m experiments.thesis.chapter8
-"""
+"""Chapter 8 of the thesis, checked: points and lines that move, measured by 3D sensors that move."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ from experiments.thesis.definitions import (
     seeded,
     uniform,
 )
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(8, "3D to 3D alignment")
 JOIN, MINIMAL, VELOCITY, LINES = dyn.JoinTensor, dyn.MinimalJoinTensor, dyn.ConstantVelocityTensor, dyn.TranslatingLinesMatrix
@@ -393,7 +390,3 @@ def repaired() -> Finding:
         holds &= bool(found.status == dyn.Status.OK) and error < EXACT
         said.append(f"{count or 80} objects: A to {error:.0e}")
     return Finding(holds, "; ".join(said))
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

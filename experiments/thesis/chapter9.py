@@ -1,7 +1,5 @@
 """Chapter 9 of the thesis, checked: the dimensions of spaces of multilinear constraints, by representation theory.
 
-    python -m experiments.thesis.chapter9
-
 Every count is compared with a rank by its definition: products of random vectors of a prime field, by elimination in integers, in
 this file; the library computes the same counts by hook lengths.
 """
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dyntorch.counting import count, dim_v, partitions, semistandard_tableaux, standard_tableaux
-from experiments.thesis.statements import Chapter, Finding, main
+from experiments.thesis.statements import Chapter, Finding
 
 CHAPTER = Chapter(9, "counting")
 PRIME = 1_000_003
@@ -145,7 +143,3 @@ def correspondence() -> Finding:
 def questions() -> Finding:
     answers = count("fundamental").rank, count("trifocal", coplanar=60).rank, count(3, views=[2, 2, 2]).rank
     return Finding(answers == (8, 21, 17), f"8 points (rank {answers[0]} of 9); {answers[1]} constraints; rank {answers[2]} of 27")
-
-
-if __name__ == "__main__":
-    main([CHAPTER])

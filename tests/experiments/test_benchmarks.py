@@ -9,7 +9,7 @@ import torch
 
 from dyntorch import scenes
 from experiments.benchmarks import first_answers, fits, neighbours, null_space, robust_peers, synchronization
-from experiments.benchmarks.interleaved import interleaved, threads
+from experiments.common.timing import interleaved, threads
 
 
 def figures(rows, word):

@@ -78,19 +78,18 @@ METHODS: dict[str, tuple[str, Solver]] = {
 }
 
 
-def bodies_rows(pool: list[Take], crowds: int, seed: int) -> tuple[list[Row], dict[str, list[float]], Crowd]:
-    """Errors on the test takes with the spacing chosen on the training takes; the errors on those; a crowd to show."""
+def bodies_rows(pool: list[Take], crowds: int, seed: int) -> list[Row]:
+    """Errors on the test takes with the spacing chosen on the training takes."""
     training, test = pool[::2], pool[1::2]
     rows: list[Row] = []
-    curves: dict[str, list[float]] = {}
     for name, (kind, solve) in METHODS.items():
         note(f"... bodies, {name}")
-        curves[name] = []
+        training_errors: list[float] = []
         for spacing in SPACINGS:
             draw = torch.Generator().manual_seed(seed)
             some = [crowd(training, spacing, kind, draw) for _ in range(max(1, crowds // 2))]
-            curves[name].append(median([gap(solve(c.views, c.motion)[0], c.motion, c.views) for c in some]))
-        best = SPACINGS[min(range(len(SPACINGS)), key=curves[name].__getitem__)]
+            training_errors.append(median([gap(solve(c.views, c.motion)[0], c.motion, c.views) for c in some]))
+        best = SPACINGS[min(range(len(SPACINGS)), key=training_errors.__getitem__)]
         draw = torch.Generator().manual_seed(seed + 1)
         asked = [crowd(test, best, kind, draw) for _ in range(crowds)]
         found = [solve(c.views, c.motion) for c in asked]
@@ -101,4 +100,4 @@ def bodies_rows(pool: list[Take], crowds: int, seed: int) -> tuple[list[Row], di
         setting += f"(rms {bent.square().mean().sqrt():.1f}); {listed(Counter(state for _, state in found))}; worst "
         setting += f"{1000 * max(errors):.3g} mm, median"
         rows.append(Row(name, setting, 1000 * median(errors), unit=" mm"))
-    return rows, curves, crowd(test, SPACINGS[-1], "rigid", torch.Generator().manual_seed(seed + 2))
+    return rows

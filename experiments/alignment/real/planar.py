@@ -29,26 +29,20 @@ is not independent.  Medians are over the triples whose status is OK; where thes
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
-from typing import Annotated
 
 import kornia
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
-from experiments.alignment.real.pictures import board_picture, shares_picture, traffic_picture
 from experiments.common.real_data import Board, Traffic, board, traffic
-from experiments.common.tables import Row, command, markdown, note
-from experiments.recognition.protocol import data_folder
-from indexing.files import manifest, prepare, to_json_types, write_json
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 
 SHARES = (1.0, 0.5, 0.25, 0.1, 0.0)
 HELD_OUT = 4
@@ -59,17 +53,11 @@ LOOSE = 2.0
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The homography tensor on the recordings in the folder DYNTORCH_DATA."""
 
-    quick: bool = False
-    """Few sequences, instants and shares."""
     threshold: float = 1.5
     """Pixels, the same everywhere: the library's default."""
-    seed: int = 0
-    """Of all random choices."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/real_planar")
-    """Where the figures (figures.json) and the pictures are written."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +105,11 @@ def scored(sequence: Traffic, frames: tuple[int, int, int], config: Config, keep
     return Scored(sequence.name, views, sequence.background, found)
 
 
-def traffic_rows(sequences: list[Traffic], config: Config) -> tuple[list[Row], list[Scored]]:
+def traffic_rows(sequences: list[Traffic], config: Config) -> list[Row]:
     """Labels and motion of every sequence, means over the triples."""
-    rows, shown = [], []
+    rows = []
     for sequence in sequences:
         found = [scored(sequence, frames, config) for frames in triples(len(sequence.tracks))]
-        shown.append(found[0])
         back, cars = sequence.background, ~sequence.background
         states = Counter(dyn.Status(int(one.result.status)).name for one in found)
         codes = Counter(notice.code.value for one in found for notice in one.result.warnings)
@@ -140,7 +127,7 @@ def traffic_rows(sequences: list[Traffic], config: Config) -> tuple[list[Row], l
         rows.append(
             Row(sequence.name, f"{points}; {kinds}; {figures}; {_listed(states)}; {_listed(codes)}; labels right", accuracy)
         )
-    return rows, shown
+    return rows
 
 
 def ransac(views: tuple[Tensor, ...], threshold: float) -> Tensor:
@@ -150,9 +137,8 @@ def ransac(views: tuple[Tensor, ...], threshold: float) -> Tensor:
     return torch.as_tensor(matrix).double()
 
 
-def share_rows(sequences: list[Traffic], config: Config) -> tuple[list[Row], dict[str, list[list[float]]]]:
+def share_rows(sequences: list[Traffic], config: Config) -> list[Row]:
     """Errors as background points are taken away: ours and homographies by RANSAC, medians over sequences."""
-    curves: dict[str, list[list[float]]] = {"align_planar": [], "homography, RANSAC": []}
     rows = []
     shares = SHARES[::2] if config.quick else SHARES
     for share in shares:
@@ -167,12 +153,11 @@ def share_rows(sequences: list[Traffic], config: Config) -> tuple[list[Row], dic
             torch.manual_seed(config.seed)
             theirs.append(transfer(ransac(tuple(x[keep] for x in one.views), config.threshold), one.views, one.background))
         for name, values in (("align_planar", ours), ("homography, RANSAC", theirs)):
-            curves[name].append(values)
             setting = f"{share:.0%} of the background, median of {len(values)} sequences"
             rows.append(
                 Row(name, setting + (f"; {_listed(states)}" if name == "align_planar" else ""), _median(values), unit=" px")
             )
-    return rows, curves
+    return rows
 
 
 # ---- the board ---------------------------------------------------------------------------------------------------------
@@ -229,28 +214,27 @@ def board_errors(seen: Board, views: tuple[Tensor, Tensor, Tensor], config: Conf
     return errors
 
 
-def board_rows(seen: Board, config: Config) -> tuple[list[Row], dict[str, dict[str, list[float]]]]:
+def board_rows(seen: Board, config: Config) -> list[Row]:
     """Errors of the held-out corners, medians over instants."""
     draw = torch.Generator().manual_seed(config.seed)
     kinds = {
         "one camera, three instants": [((c, c, c), gap) for c in (1, 2) for gap in (2, 4)],
         "three cameras, one instant each": [((1, 2, 3), 1), ((3, 2, 1), 2), ((2, 1, 3), 1)],
     }
-    rows, everything = [], {}
+    rows = []
     for kind, settings in kinds.items():
         found = [views for cameras, gap in settings for views in instants(seen, cameras, gap)]
         errors = [board_errors(seen, views, config, draw) for views in (found[::8] if config.quick else found)]
         if not errors:
             continue
-        everything[kind] = {key: [one[key] for one in errors] for key in errors[0]}
         for way in WAYS:
-            values = torch.tensor(everything[kind][way])
+            values = torch.tensor([one[way] for one in errors])
             ok = values[values.isfinite()]
             setting = (
                 f"{way}; {len(ok)} of {len(values)} triples OK, {int((ok > WRONG).sum())} of them off by more than {WRONG:g} px"
             )
             rows.append(Row(kind, setting + "; median where OK", float(ok.median()) if len(ok) else float("inf"), unit=" px"))
-    return rows, everything
+    return rows
 
 
 def _median(values: list[float]) -> float:
@@ -261,31 +245,10 @@ def _listed(counts: Counter[str]) -> str:
     return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
 
 
-def run(config: Config) -> None:
-    """Print every table, then write the figures and the pictures."""
-    folder, start = data_folder(), time.perf_counter()
-    prepare(config.out)
-    sequences = traffic()
-    sequences = [one for one in sequences if one.name in ("cars1", "cars2B", "cars3")] if config.quick else sequences
-    tables: dict[str, list[Row]] = {}
-    note("... traffic")
-    tables["Traffic: labels and motion (means of 3 triples)"], shown = traffic_rows(sequences, config)
-    note("... traffic with less background")
-    tables["Traffic with less background"], curves = share_rows(sequences, config)
-    note("... board")
-    seen = board()
-    tables["Board moved by hand: held-out corners"], errors = board_rows(seen, config)
-    for title, rows in tables.items():
-        print(markdown(rows, title), flush=True)
-    traffic_picture(shown, config.out / "traffic.png")
-    shares = SHARES[::2] if config.quick else SHARES
-    shares_picture({k: torch.tensor(v) for k, v in curves.items()}, shares, config.out / "traffic_background.png")
-    board_picture(seen, errors, config.out / "board.png")
-    inputs = [folder / "hopkins155.npz", folder / "caliscope_4_cam_recording.npz"]
-    about = manifest(vars(config), inputs, seed=config.seed, timings={"all": time.perf_counter() - start})
-    write_json(config.out / "figures.json", {"manifest": about, "tables": to_json_types(tables)})
-    note(f"written: {config.out}, {time.perf_counter() - start:.0f} s")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.real.planar")))
+@experiment(Config())
+def tables(config: Config) -> Tables:
+    """Traffic, traffic with less background, and the board."""
+    sequences = [one for one in traffic() if not config.quick or one.name in ("cars1", "cars2B", "cars3")]
+    yield "Traffic: labels and motion (means of 3 triples)", traffic_rows(sequences, config)
+    yield "Traffic with less background", share_rows(sequences, config)
+    yield "Board moved by hand: held-out corners", board_rows(board(), config)

@@ -22,26 +22,19 @@ At so short steps joints nearly keep their velocity, and the velocity common to 
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import metrics
-from dyntorch.geometry.homogeneous import apply
-from experiments.alignment.real.bodies import SPACINGS, bodies_rows
-from experiments.alignment.real.pictures import bodies_picture, drive_picture, movers_picture
+from experiments.alignment.real.bodies import bodies_rows
 from experiments.alignment.real.solvers import Matrices, Solver, aligned, gap, listed, median, rigid_ransac, tensor
 from experiments.common.real_data import Drive, drives, takes
-from experiments.common.tables import Row, command, markdown, note
-from experiments.recognition.protocol import data_folder
-from indexing.files import manifest, prepare, to_json_types, write_json
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 
 STEPS = (1, 3, 5)  # sweeps, 0.1 s each
 THRESHOLD = 0.1
@@ -51,17 +44,11 @@ WRONG = 0.1
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The tensors of space on the recordings in the folder DYNTORCH_DATA."""
 
-    quick: bool = False
-    """Few triples and crowds."""
     crowds: int = 6
     """Random crowds of the test takes (half as many of the training takes per spacing)."""
-    seed: int = 0
-    """Of all random choices."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/real_space")
-    """Where the figures (figures.json) and the pictures are written."""
 
 
 # ---- drives ------------------------------------------------------------------------------------------------------------
@@ -126,11 +113,10 @@ def pose_errors(found: Matrices, true: Matrices) -> list[float]:
     return [x if x == x else float("inf") for x in (rotation, max(float(s.norm()) for s in shift), rest)]
 
 
-def movers_rows(logs: list[Drive], config: Config, step: int = 3) -> tuple[list[Row], dict[str, Tensor]]:
+def movers_rows(logs: list[Drive], config: Config, step: int = 3) -> list[Row]:
     """Pose errors against the share of movers, medians over the triples of both logs."""
     methods = ("rigid RANSAC", "align_points, straight", "align_points, constant velocity")
     rows: list[Row] = []
-    curves: dict[str, list[list[float]]] = {name: [] for name in methods}
     for share in SHARES:
         errors: dict[str, list[list[float]]] = {name: [] for name in methods}
         states: dict[str, Counter[str]] = {name: Counter() for name in methods}
@@ -150,39 +136,17 @@ def movers_rows(logs: list[Drive], config: Config, step: int = 3) -> tuple[list[
                     states[name].update(notice.code.value for notice in one.warnings)
         for name in methods:
             middle = torch.tensor(errors[name]).median(0).values.tolist()
-            curves[name].append(middle)
             shift = f"translation {middle[1]:.2g} m, up to a common velocity {middle[2]:.2g} m"
             setting = f"{share:.0%} movers: {shift}; {listed(states[name])}".rstrip("; ")
             rows.append(Row(name, setting + "; rotation", middle[0], unit=" degrees"))
-    return rows, {name: torch.tensor(values) for name, values in curves.items()}
+    return rows
 
 
-def run(config: Config) -> None:
-    """Print every table, then write the figures and the pictures."""
-    folder, begin = data_folder(), time.perf_counter()
-    prepare(config.out)
-    logs, tables = drives(), dict[str, list[Row]]()
-    note("... drives")
-    tables["Drives: status of the projective tensors"] = tensor_rows(logs, config)
+@experiment(Config(), quick={"crowds": 2})
+def tables(config: Config) -> Tables:
+    """Drives and bodies."""
+    logs = drives()
+    yield "Drives: status of the projective tensors", tensor_rows(logs, config)
     title = f"Drives: rigid motion against the share of movers, 0.3 s between sweeps, threshold {THRESHOLD} m"
-    tables[title], curves = movers_rows(logs, config)
-    movers_picture(curves, SHARES, config.out / "movers.png")
-    views, _, _, _ = logs[0].triple(100, 5)
-    seen = dyn.align_points(*views, model="rigid", threshold=THRESHOLD, generator=torch.Generator().manual_seed(config.seed))
-    drive_picture(views, seen, config.out / "drive.png")
-    tables["Bodies: error of A and B"], errors, shown = bodies_rows(takes(), 2 if config.quick else config.crowds, config.seed)
-    one = dyn.align_points(*shown.views, model="rigid", generator=torch.Generator().manual_seed(0))
-    assert one.B is not None
-    placed = torch.stack([shown.views[0], apply(one.A, shown.views[1]), apply(one.B, shown.views[2])])
-    upright = apply(torch.linalg.inv(shown.sensors[0]), placed)
-    bodies_picture(upright, one.labels, errors, SPACINGS, config.out / "bodies.png")
-    for name, rows in tables.items():
-        print(markdown(rows, name), flush=True)
-    inputs = [folder / "argoverse2", folder / "cmu_mocap_60fps.npz"]
-    about = manifest(vars(config), inputs, seed=config.seed, timings={"all": time.perf_counter() - begin})
-    write_json(config.out / "figures.json", {"manifest": about, "tables": to_json_types(tables)})
-    note(f"written: {config.out}, {time.perf_counter() - begin:.0f} s")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.alignment.real.space")))
+    yield title, movers_rows(logs, config)
+    yield "Bodies: error of A and B", bodies_rows(takes(), config.crowds, config.seed)
