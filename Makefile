@@ -65,79 +65,12 @@ fuzz: install
 bench: install
 	@echo "All benchmarks: about half an hour on quiet cores, longer on busy ones; each says what it does and prints its table as it ends."
 	$(PIP) --constraint constraints.txt --editable '.[experiments,cluster]'
-	$(BIN)/python -m experiments.benchmarks.null_space
-	$(BIN)/python -m experiments.benchmarks.fits
-	$(BIN)/python -m experiments.benchmarks.robust_peers
-	$(BIN)/python -m experiments.benchmarks.lifted
-	$(BIN)/python -m experiments.benchmarks.segmentation
-	$(BIN)/python -m experiments.benchmarks.synchronization
-	$(BIN)/python -m experiments.benchmarks.action_indexer
-	$(BIN)/python -m experiments.benchmarks.brightness_indexer
-	$(BIN)/python -m experiments.benchmarks.live
-	$(BIN)/python -m experiments.benchmarks.archive
+	$(BIN)/python -m experiments.common.results benchmarks
 
 tables: install
-	@echo "All tables: hours.  Each is a command of its own, below, and prints its table as it ends."
+	@echo "All tables: hours.  Each page of docs/results names its command, which prints the table and writes it into the page."
 	$(PIP) --constraint constraints.txt --editable '.[experiments]'
-	$(BIN)/python -m experiments.thesis.checked
-	$(BIN)/python -m experiments.alignment.planar_noise
-	$(BIN)/python -m experiments.alignment.more_views
-	$(BIN)/python -m experiments.alignment.minimal_conditions
-	$(BIN)/python -m experiments.alignment.space_noise
-	$(BIN)/python -m experiments.alignment.robust_estimation
-	$(BIN)/python -m experiments.alignment.dual_homography
-	$(BIN)/python -m experiments.alignment.lines
-	$(BIN)/python -m experiments.reconstruction.noise
-	$(BIN)/python -m experiments.reconstruction.outliers
-	$(BIN)/python -m experiments.reconstruction.trajectories
-	$(BIN)/python -m experiments.reconstruction.joint_epipoles
-	$(BIN)/python -m experiments.segmentation.matrix_noise
-	$(BIN)/python -m experiments.segmentation.translating_planes
-	$(BIN)/python -m experiments.segmentation.affine_bodies
-	$(BIN)/python -m experiments.segmentation.convergent
-	$(BIN)/python -m experiments.segmentation.multibody
-	$(BIN)/python -m experiments.segmentation.segmentation
-	$(BIN)/python -m experiments.segmentation.sensitivity
-	$(BIN)/python -m experiments.segmentation.tracks
-	$(BIN)/python -m experiments.segmentation.colmap
-	$(BIN)/python -m experiments.pose.videos
-	$(BIN)/python -m experiments.pose.sizes
-	$(BIN)/python -m experiments.labels.suggesting
-	$(BIN)/python -m experiments.labels.story
-	$(BIN)/python -m experiments.synchronization.synchronization
-	$(BIN)/python -m experiments.synchronization.brightness
-	$(BIN)/python -m experiments.synchronization.mocap
-	$(BIN)/python -m experiments.synchronization.sound
-	$(BIN)/python -m experiments.synchronization.silent
-	$(BIN)/python -m experiments.synchronization.breaks
-	$(BIN)/python -m experiments.calibration.virtual
-	$(BIN)/python -m experiments.calibration.real
-	$(BIN)/python -m experiments.calibration.people
-	$(BIN)/python -m experiments.calibration.sides
-	$(BIN)/python -m experiments.synchronization.cameras
-	$(BIN)/python -m experiments.reconstruction.pair
-	$(BIN)/python -m experiments.reconstruction.bodies
-	$(BIN)/python -m experiments.reconstruction.real
-	$(BIN)/python -m experiments.alignment.real.planar
-	$(BIN)/python -m experiments.synchronization.real
-	$(BIN)/python -m experiments.alignment.real.space
-	$(BIN)/python -m experiments.recognition.action_recognition
-	$(BIN)/python -m experiments.recognition.action_baselines
-	$(BIN)/python -m experiments.recognition.dynamic_shape
-	$(BIN)/python -m experiments.recognition.shape_tensor
-	$(BIN)/python -m experiments.recognition.recognition_protocol
-	$(BIN)/python -m experiments.recognition.open_set
-	$(BIN)/python -m experiments.recognition.detection
-	$(BIN)/python -m experiments.recognition.counting
-	$(BIN)/python -m experiments.recognition.one_action
-	$(BIN)/python -m experiments.recognition.robustness
-	$(BIN)/python -m experiments.recognition.gait
-	$(BIN)/python -m experiments.recognition.near_cameras
-	$(BIN)/python -m experiments.recognition.brightness_indexing
-	$(BIN)/python -m experiments.recognition.gestures
-	$(BIN)/python -m experiments.archive.moments --windows 300000 --queries 100 --durations 1 2
-	$(BIN)/python -m experiments.archive.performances --changes --most 60
-	$(BIN)/python -m experiments.archive.growth
+	$(BIN)/python -m experiments.common.results
 
 docs: install
 	@echo "The documentation: one to three minutes, in which the examples of the gallery run; then open site/index.html."

@@ -19,16 +19,12 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 from unittest import mock
 
 import numpy as np
-import tyro
 
-from experiments.common.book import Book
-from experiments.common.tables import command, note
-from experiments.common.timing import threads
-from experiments.recognition import protocol
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import note
 from experiments.recognition.detection import SETS, Recording, Task, actor_tasks, exercise_tasks, joined_tasks
 from experiments.recognition.detection_metrics import f1
 from indexing import ActionIndexer, Archive
@@ -43,19 +39,15 @@ JITTER = 0.002  # of the image's extent: what a detector says of who stands
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Learned actions in an archive."""
 
     sets: tuple[SETS, ...] = ("utkinect, evenly", "exercises", "actors")
     """Which recordings."""
     turn: int = 0
     """Degrees that the camera is turned; the other side of each set where it is not 0."""
-    seed: int = 0
-    """Of noise, cameras and drawn actions."""
     folds: int = 5
     """Folds of each set at most."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/archive-finding")
-    """Where tables (JSON) are written."""
 
 
 @dataclass
@@ -144,12 +136,12 @@ def looked_at(archive: Archive, indexer: ActionIndexer) -> tuple[int, int]:
     return looked, total
 
 
-def run(config: Config) -> None:
-    """Print the table and write the file."""
+@experiment(Config(), quick={"sets": ("actors",), "folds": 1})
+def tables(config: Config) -> Tables:
+    """Learned actions in an archive."""
     rng = np.random.default_rng(config.seed)
-    book = Book(config.out)
     lines: dict[str, list[float]] = {}
-    with threads(1), warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         for name in config.sets:
             tallies = {kind: Tally() for kind in ("all actions", "three actions", "three actions, and standing")}
@@ -165,11 +157,4 @@ def run(config: Config) -> None:
                 ask(few, asked, tallies["three actions"])
                 ask(few, [with_standing(one, rng) for one in asked], tallies["three actions, and standing"])
             lines |= {f"{name}, {kind}": tally.line() for kind, tally in tallies.items()}
-    book.grid(f"camera turned by {'0 degrees' if config.turn == 0 else 'the other angle'}", COLUMNS, lines)
-    files = {"exercises": "mocap6_exercises", "florence3d": "florence3d"}
-    inputs = {protocol.data_folder() / f"{files.get(name, 'utkinect')}.npz" for name in config.sets if name != "actors"}
-    book.close(vars(config), sorted(inputs), seed=config.seed)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.archive.finding")))
+    yield f"camera turned by {'0 degrees' if config.turn == 0 else 'the other angle'}", Grid(COLUMNS, lines)

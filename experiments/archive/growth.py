@@ -36,15 +36,14 @@ import tyro
 from safetensors import safe_open
 from safetensors.numpy import load_file, save
 
-from experiments.archive.scenes import FILE, Question, captured, distractors, every_take, questions
-from experiments.common.book import Book
+from experiments.archive.scenes import Question, captured, distractors, every_take, questions
 from experiments.common.plots import COLOURS, MARKS
-from experiments.common.results import RESULTS
-from experiments.common.tables import Row, command, note
-from experiments.recognition.protocol import Array, data_folder
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
+from experiments.recognition.protocol import Array
 from indexing import Archive, ArchiveOptions, ClipSet
 from indexing.archive.catalogue import Catalogue, RecordingRow, SegmentRow, SourceRow
-from indexing.files import replacing, write_bytes
+from indexing.files import replacing
 from indexing.report.canvas import LIGHT, new_figure, png, style
 
 HOUR = 3600.0
@@ -57,7 +56,7 @@ WAIT = 0.005  # seconds between two looks at the memory
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Time and space of an archive that grows, made of captured and invented people of the folder DYNTORCH_DATA."""
 
     hours: tuple[int, ...] = (10, 30, 100, 300, 1000)
@@ -70,12 +69,8 @@ class Config:
     """Of each duration, cold."""
     threads: int = 2
     """Cores."""
-    seed: int = 0
-    """Of people, cameras and noise."""
     folder: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Where the archive grows: 6 GB; by default a temporary folder."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/archive_growth")
-    """Where tables (JSON) and the picture are written."""
 
 
 # ---- an archive multiplied ---------------------------------------------------------------------------------------------
@@ -318,8 +313,8 @@ def drawn(hours: Sequence[int], seconds: dict[str, list[float]], megabytes: list
         return png(figure)
 
 
-def tables(config: Config, folder: Path, book: Book) -> bytes:
-    """Grow, ask, print; the picture."""
+def grown(config: Config, folder: Path) -> tuple[Grid, bytes]:
+    """Grow and ask: the table, and the picture."""
     archive = recorded(folder, config.hours[0], config.seed)
     original, done = Original.of(archive), 1
     names = [f"{kind}, query of {one:g} s" for kind in ("warm", "cold") for one in config.durations]
@@ -357,28 +352,19 @@ def tables(config: Config, folder: Path, book: Book) -> bytes:
         "on disk (MB)",
         "MB an hour",
     ]
-    book.grid(f"an archive that grows, {config.threads} cores", columns, lines, rows)
-    return drawn(config.hours, seconds, sizes)
+    return Grid(columns, lines, rows), drawn(config.hours, seconds, sizes)
 
 
-def run(config: Config) -> None:
-    """Print the table, draw the picture, write the file.
+@experiment(Config(), quick={"hours": (1, 2), "queries": 1, "cold": 1}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """Time and space of an archive that grows.
 
     Raises:
-        ValueError: no data folder, sizes that do not grow, nothing to ask, or a folder that holds something.
+        ValueError: no data folder, sizes that do not grow, or a folder that holds something.
     """
     if list(config.hours) != sorted(set(config.hours)) or not config.hours or config.hours[0] < 1:
         raise ValueError(f"hours must grow, from 1 or more, got {config.hours}")
-    if min(config.queries, config.cold, config.threads) < 1 or not config.durations:
-        raise ValueError(f"queries, cold and threads must be at least 1, got {config.queries}, {config.cold} and {config.threads}")
-    inputs, book = [data_folder() / FILE], Book(config.out)
     with tempfile.TemporaryDirectory(dir=config.folder) as folder:
-        picture = tables(config, Path(folder) / "growing.archive", book)
-    book.picture("growth", picture)
-    if config == Config() and RESULTS.is_dir():
-        write_bytes(RESULTS / PICTURE, picture)
-    book.close(vars(config), inputs, seed=config.seed)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.archive.growth")))
+        table, picture = grown(config, Path(folder) / "growing.archive")
+    yield f"an archive that grows, {config.threads} cores", table
+    yield "archive-growth", picture

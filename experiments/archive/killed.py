@@ -29,13 +29,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
-from experiments.common.book import Book
-from experiments.common.tables import Row, command, note
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
 from indexing import Archive, ArchiveOptions, Clip, ClipSet
 from indexing.archive.catalogue import Catalogue
 from indexing.archive.search import Hit
@@ -49,7 +48,7 @@ COLUMNS = ("times", "disturbed", "sources kept", "leftovers", "unreadable", "los
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """What is left of an archive whose adders are killed."""
 
     kills: int = 50
@@ -58,10 +57,6 @@ class Config:
     """That are added each time."""
     seconds: float = 8.0
     """Of each."""
-    seed: int = 0
-    """Of movements and moments."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/archive_killed")
-    """Where tables (JSON) are written."""
 
 
 # ---- what is added -------------------------------------------------------------------------------------------------------
@@ -189,7 +184,7 @@ def forkserver() -> Any:
     """Where processes come from: one that has imported everything, and has no threads."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(
-        ["experiments.common.book", "indexing.archive.archive", "indexing.readers.formats.clipset", "indexing.recordings.people"]
+        ["experiments.common.runner", "indexing.archive.archive", "indexing.readers.formats.clipset", "indexing.recordings.people"]
     )
     return context
 
@@ -412,17 +407,10 @@ def summed(trials: Sequence[Trial]) -> list[Any]:
     ]  # fmt: skip
 
 
-def run(config: Config) -> None:
-    """Disturb, look, print the table, write the file.
-
-    Raises:
-        ValueError: nothing to kill, or nothing to add.
-    """
-    if min(config.kills, config.sources) < 1 or config.seconds < 4:
-        raise ValueError(
-            f"kills and sources must be at least 1 and seconds 4, got {config.kills}, {config.sources} and {config.seconds:g}"
-        )
-    book, lines, rows = Book(config.out), dict[str, list[Any]](), list[Row]()
+@experiment(Config(), quick={"kills": 2, "sources": 4}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """What is left of an archive whose adders are killed."""
+    lines, rows = dict[str, list[Any]](), list[Row]()
     with tempfile.TemporaryDirectory() as folder:
         stage = Stage.build(Path(folder), config.sources, config.seconds)
         for place, (name, disturb) in enumerate(DISTURBANCES.items()):
@@ -438,9 +426,4 @@ def run(config: Config) -> None:
             note(f"... {name}: {lines[name]}")
             wrong = sum(trial.lost + trial.twice + len(trial.problems) + trial.changed for trial in trials)
             rows.append(Row(name, "windows lost or twice, archives unreadable, hits that differ", wrong, 0, at_most=True))
-        book.grid(f"{config.sources} sources added to an archive, disturbed at random moments", COLUMNS, lines, rows)
-    book.close(vars(config), seed=config.seed)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.archive.killed")))
+    yield f"{config.sources} sources added to an archive, disturbed at random moments", Grid(COLUMNS, lines, rows)

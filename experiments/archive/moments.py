@@ -24,16 +24,14 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 from unittest import mock
 
 import numpy as np
-import tyro
 
 from experiments.archive.exhaustive import cosine, exact, hits, metric_of, rankings
 from experiments.archive.scenes import (
     CEILING,
-    FILE,
     ROLLED,
     Cameras,
     Question,
@@ -43,10 +41,9 @@ from experiments.archive.scenes import (
     every_take,
     questions,
 )
-from experiments.common.book import Book
-from experiments.common.tables import Row, command, note
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition.corruptions import missing_bursts
-from experiments.recognition.protocol import data_folder
 from indexing import Archive, Clip, ClipSet
 from indexing.archive import search
 from indexing.archive.search import Hit, candidates, check_example, merge_candidates, queries_of, suppress_overlaps
@@ -62,7 +59,7 @@ WAYS = ARCHIVE, EXHAUSTIVE, WIDE, SKETCHES, PLAIN, HEIGHTS
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Recall of an archive's search on captured moments among distractors, of the folder DYNTORCH_DATA."""
 
     windows: int = 300_000
@@ -75,10 +72,6 @@ class Config:
     """How many windows are compared exactly, in the last table."""
     asked: float = 1.0
     """Seconds of a query in the tables after the first."""
-    seed: int = 0
-    """Of the distractors, the cameras and the moments."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/archive_moments")
-    """Where tables (JSON) are written."""
 
 
 # ---- what is right -----------------------------------------------------------------------------------------------------
@@ -136,7 +129,7 @@ def bounded(archive: Archive, count: int) -> Archive:
 
 
 # ---- tables ------------------------------------------------------------------------------------------------------------
-def by_duration(archive: Archive, clips: Sequence[Clip], people: Takes, config: Config, book: Book) -> None:
+def by_duration(archive: Archive, clips: Sequence[Clip], people: Takes, config: Config) -> Grid:
     """Every way to compare, at every duration."""
     lines: dict[str, list[float]] = {name: [] for name in WAYS}
     rows: list[Row] = []
@@ -153,10 +146,10 @@ def by_duration(archive: Archive, clips: Sequence[Clip], people: Takes, config: 
         goal = GOAL_SHARE * recall(found[EXHAUSTIVE])[1]
         rows.append(Row(f"moment of {duration:g} s", "recall@10, .95 of exhaustive", ten, goal))
     columns = [f"{duration:g} s @{k}" for duration in config.durations for k in AT]
-    book.grid(f"the same moment by another camera, {config.windows:,} windows, {config.queries} queries each", columns, lines, rows)
+    return Grid(columns, lines, rows)
 
 
-def by_difficulty(archive: Archive, clips: Sequence[Clip], people: Takes, config: Config, book: Book) -> None:
+def by_difficulty(archive: Archive, clips: Sequence[Clip], people: Takes, config: Config) -> Tables:
     """Moments of one duration, asked in other ways."""
 
     def drawn(cameras: Cameras) -> list[Question]:
@@ -179,7 +172,7 @@ def by_difficulty(archive: Archive, clips: Sequence[Clip], people: Takes, config
         found = [searched(archive, asked), sketched(archive, asked), wide[EXHAUSTIVE], wide[HEIGHTS]]
         lines[title] = [share for places in found for share in recall(places)]
     columns = [f"{name} @{k}" for name in (ARCHIVE, SKETCHES, EXHAUSTIVE, HEIGHTS) for k in AT]
-    book.grid(f"moments of {config.asked:g} s, asked in other ways", columns, lines)
+    yield f"moments of {config.asked:g} s, asked in other ways", Grid(columns, lines)
     changed: dict[str, tuple[Archive, dict[str, Any]]] = {
         f"{count} candidates": (bounded(archive, count), {}) for count in config.candidates
     }
@@ -196,7 +189,7 @@ def by_difficulty(archive: Archive, clips: Sequence[Clip], people: Takes, config
         options[title] = [*recall(places), (time.perf_counter() - clock) / len(usual)]
     places = searched(archive, usual, mirror=True)
     options["mirror images, too"] = [*recall(places), np.nan]
-    book.grid(f"moments of {config.asked:g} s, searched in other ways", [*(f"@{k}" for k in AT), "s a query"], options)
+    yield f"moments of {config.asked:g} s, searched in other ways", Grid([*(f"@{k}" for k in AT), "s a query"], options)
 
 
 def blinded(question: Question, rng: np.random.Generator) -> Question:
@@ -220,25 +213,19 @@ def recorded(config: Config, people: Takes) -> list[Clip]:
     return [*clips, *distractors(people, left, rng)]
 
 
-def run(config: Config) -> None:
-    """Print the tables, write the file.
+@experiment(Config(), quick={"queries": 2, "durations": (1.0,)}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """Recall of an archive's search on captured moments among distractors.
 
     Raises:
-        ValueError: no data folder, fewer windows than the takes have, or nothing to ask.
+        ValueError: no data folder, or fewer windows than the takes have.
     """
-    if config.queries < 1 or not config.durations:
-        raise ValueError(f"queries must be at least 1 and durations one or more, got {config.queries} and {config.durations}")
     people = captured()
-    book = Book(config.out)
     clips = recorded(config, people)
     with tempfile.TemporaryDirectory() as folder:
         archive = Archive(Path(folder) / "moments.archive")
         note(f"... adding {len(clips)} recordings")
         archive.add(ClipSet(clips))
-        by_duration(archive, clips, people, config, book)
-        by_difficulty(archive, clips, people, config, book)
-    book.close(vars(config), [data_folder() / FILE], seed=config.seed)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.archive.moments")))
+        title = f"the same moment by another camera, {config.windows:,} windows, {config.queries} queries each"
+        yield title, by_duration(archive, clips, people, config)
+        yield from by_difficulty(archive, clips, people, config)

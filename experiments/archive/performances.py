@@ -22,16 +22,14 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from unittest import mock
 
 import numpy as np
-import tyro
 
 from experiments.archive.exhaustive import STEP, Measure, exact, hits, metric_of, rankings, warped
-from experiments.common.book import Book
-from experiments.common.tables import Row, command, note
-from experiments.common.timing import threads
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition import protocol
 from experiments.recognition.baselines import WarpedNearest
 from experiments.recognition.protocol import Array
@@ -99,7 +97,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Other people's performances, found in an archive: recordings of the folder DYNTORCH_DATA."""
 
     sets: tuple[SETS, ...] = ("utkinect", "florence3d", "exercises")
@@ -114,10 +112,6 @@ class Config:
     """Seconds of a run of exercises that ask."""
     most: int = 0
     """Queries per set at most, drawn at random; 0: all."""
-    seed: int = 0
-    """Of the cameras and the noise."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/archive_performances")
-    """Where tables (JSON) are written."""
 
 
 # ---- who asks whom -----------------------------------------------------------------------------------------------------
@@ -271,7 +265,7 @@ def measured(way: Way, tasks: Sequence[Task], archives: Sequence[Archive], turn:
 
 
 # ---- tables ------------------------------------------------------------------------------------------------------------
-def tables(name: SETS, config: Config, book: Book) -> None:
+def both_views(name: SETS, config: Config) -> Tables:
     """Both views of one set."""
     tasks = tasks_of(name, config)
     asked, archived = sum(len(task.queries) for task in tasks), np.mean([len(task.archived) for task in tasks])
@@ -296,11 +290,12 @@ def tables(name: SETS, config: Config, book: Book) -> None:
             if config.dtw:
                 goal = max(ten[WARPED], ten[CLIPS]) if turn else None
                 rows.append(Row(f"{name}, {turn}°", "P@10, above DTW", ten[ARCHIVE], goal))
-            book.grid(f"{name}, asked from {turn} degrees, {asked} queries", COLUMNS, lines, rows)
+            yield f"{name}, asked from {turn} degrees, {asked} queries", Grid(COLUMNS, lines, rows)
 
 
-def run(config: Config) -> None:
-    """Print the tables, write the file.
+@experiment(Config(), quick={"sets": ("florence3d",), "changes": (), "dtw": False, "most": 4})
+def tables(config: Config) -> Tables:
+    """Other people's performances, found in an archive.
 
     Raises:
         ValueError: no data folder, a change that is not known, or aeon is not installed though it is asked for.
@@ -310,13 +305,5 @@ def run(config: Config) -> None:
         raise ValueError(f"changes: {strange[0]!r} is none of {', '.join(CHANGED)}")
     if config.dtw:
         warped()
-    inputs = [protocol.data_folder() / f"{FILES[name]}.npz" for name in config.sets]
-    book = Book(config.out)
-    with threads(1):
-        for name in config.sets:
-            tables(name, config, book)
-    book.close(vars(config), inputs, seed=config.seed)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.archive.performances")))
+    for name in config.sets:
+        yield from both_views(name, config)

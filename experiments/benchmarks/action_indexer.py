@@ -20,13 +20,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from experiments.benchmarks.workloads import EXEMPLARS, QUERIES
-from experiments.common.tables import Row, command, markdown, note
-from indexing.files import manifest, prepare, write_json
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 
 PLAIN, SEARCH, WARPING, PART, SCAN = "plain", "search", "warping", "scan 20 minutes", "scan 1 hour"
 PLAIN_ONE, SEARCH_ONE = "plain, one query", "search, one query"
@@ -40,7 +38,7 @@ STARTS = {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Speed and memory of the action indexer, beside the goals."""
 
     rounds: int = 3
@@ -49,8 +47,6 @@ class Config:
     """How often every start-up is timed."""
     threads: int = 0
     """CPU threads; 0 leaves torch's default."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_action_indexer.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def measure(workloads: Sequence[str], rounds: int, threads: int) -> dict[str, list[dict[str, Any]]]:
@@ -134,25 +130,12 @@ def has_aeon() -> bool:
     return find_spec("aeon") is not None
 
 
-def run(config: Config) -> None:
-    """Measure, print the table, write the file.
+@experiment(Config(), quick={"rounds": 1, "starts": 1}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """Every workload, and start-ups.
 
     Raises:
-        ValueError: nothing to repeat, or a workload failed.
+        ValueError: a workload failed.
     """
-    if config.rounds < 1 or config.starts < 1:
-        raise ValueError(f"rounds and starts must be at least 1, got {config.rounds} and {config.starts}")
-    target = config.out.expanduser()
-    prepare(target.parent)
     names = [PLAIN, SEARCH, PLAIN_ONE, SEARCH_ONE, *([WARPING] if has_aeon() else []), PART, SCAN, MANY, FIT, LEARNED]
-    found, starts = measure(names, config.rounds, config.threads), start_ups(config.starts)
-    rows = table(found, starts)
-    print(markdown(rows, "Speed and memory of the action indexer"), flush=True)
-    load = os.getloadavg() if hasattr(os, "getloadavg") else ()
-    about = {"manifest": manifest(vars(config)), "load": load, "raw": found, "starts": starts}
-    write_json(target, {**about, "table": [{**vars(row), "reached": row.reached} for row in rows]})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.benchmarks.action_indexer")))
+    yield "Speed and memory of the action indexer", table(measure(names, config.rounds, config.threads), start_ups(config.starts))

@@ -22,12 +22,12 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
-from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.common.timing import interleaved
 from indexing import Archive, Clip, ClipSet
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
@@ -41,7 +41,7 @@ WORKERS = 2
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Speed of adding to an archive."""
 
     hours: float = 1.0
@@ -58,10 +58,6 @@ class Config:
     """How often everything is timed."""
     dask: bool = True
     """Whether to measure a cluster, too."""
-    seed: int = 0
-    """Of the people and the noise."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_archive.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 # ---- recordings --------------------------------------------------------------------------------------------------------
@@ -224,19 +220,8 @@ def agreement(archives: dict[str, Archive], executors: dict[str, Executor], conf
     return alike / len(clips)
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file.
-
-    Raises:
-        ValueError: nothing to measure, Dask is not installed, or a file that cannot be written.
-    """
-    if min(config.rounds, config.files, config.queries, config.frames) < 1 or not min(config.hours, config.minutes) > 0:
-        raise ValueError(
-            f"rounds, files, queries and frames must be at least 1, got {config.rounds}, {config.files}, {config.queries} and "
-            f"{config.frames}; hours and minutes more than 0, got {config.hours} and {config.minutes}"
-        )
-    measured_on_one_thread({"Adding to an archive": adding, "Two workers": two_workers}, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, description=__doc__)))
+@experiment(Config(), quick={"hours": 0.05, "frames": 90, "files": 2, "minutes": 0.5, "queries": 2, "rounds": 1, "dask": False})
+def tables(config: Config) -> Tables:
+    """Adding by one process and by two workers."""
+    yield "Adding to an archive", adding(config)
+    yield "Two workers", two_workers(config)

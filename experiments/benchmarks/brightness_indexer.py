@@ -14,16 +14,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 
-from experiments.common.tables import Row, command, measured_on_one_thread, note
 from indexing.brightness.descriptors import LENGTH
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.brightness.stream import VideoExemplars
 
@@ -33,7 +32,7 @@ CLASSES, TRACK = 10, 100  # frames of one exemplar
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Speed of the brightness indexer, beside the goal."""
 
     library: tuple[int, ...] = (1_500, 10_000)
@@ -42,8 +41,6 @@ class Config:
     """Of the video that is scored."""
     rounds: int = 5
     """How often each is measured."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_brightness_indexer.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def texture(frames: int, width: int, height: int) -> NDArray[np.uint8]:
@@ -103,10 +100,7 @@ def table(config: Config) -> list[Row]:
     return rows
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
-    measured_on_one_thread({"Brightness indexer": table}, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, description=__doc__)))
+@experiment(Config(), quick={"library": (300,), "frames": 40, "rounds": 1})
+def tables(config: Config) -> Tables:
+    """Files, and pictures pushed one by one."""
+    yield "Brightness indexer", table(config)

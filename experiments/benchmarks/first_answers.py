@@ -17,14 +17,14 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, cast
+from typing import cast
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from experiments.benchmarks.verbs import VERBS
-from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 
 Array = NDArray[np.float64]
 FIRST, WARM, SHELL = 1.0, 0.5, 4.0  # seconds
@@ -33,13 +33,11 @@ ONE = "import sys; from experiments.benchmarks.first_answers import answer; answ
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """First answers beside the goals."""
 
     only: str = ""
     """Verbs and commands whose name holds this."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_first_answers.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def answer(name: str) -> None:
@@ -119,10 +117,8 @@ def commands(config: Config) -> list[Row]:
     return rows
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file."""
-    measured_on_one_thread({"Verbs": verbs, "Commands": commands}, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, description=__doc__)))
+@experiment(Config(), quick={"only": "fit"})
+def tables(config: Config) -> Tables:
+    """Verbs in processes of their own, and commands from the shell."""
+    yield "Verbs", verbs(config)
+    yield "Commands", commands(config)

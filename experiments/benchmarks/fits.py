@@ -12,13 +12,12 @@ All candidates of a row take turns in one process; the figures are medians, the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
@@ -27,9 +26,9 @@ from dyntorch.core.invariant import as_invariant
 from dyntorch.core.matrix import estimation_matrix
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import Scene
-from experiments.common.tables import Row, command, markdown, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.common.timing import interleaved, threads
-from indexing.files import manifest, prepare, write_json
 
 SCENES: dict[str, tuple[Any, Callable[..., Scene]]] = {
     "HomographyTensor": (dyn.HomographyTensor, scenes.planar),
@@ -40,15 +39,11 @@ SCENES: dict[str, tuple[Any, Callable[..., Scene]]] = {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Whole fits against rows + SVD, kornia and OpenCV."""
 
     rounds: int = 7
     """How often every candidate runs."""
-    quick: bool = False
-    """Small batches and few rounds: checks that everything runs, the figures mean nothing."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_fits.json")
-    """Where the results are written as JSON; a plot goes beside it."""
 
 
 def rows_and_svd(invariant: Any, views: tuple[Tensor, ...]) -> Tensor:
@@ -61,7 +56,7 @@ def rows_and_svd(invariant: Any, views: tuple[Tensor, ...]) -> Tensor:
 
 def large(config: Config, device: str) -> list[Row]:
     """Section 1."""
-    batch, n, rounds = (16, 80, 1) if config.quick else (1024, 200, config.rounds)
+    (batch, n), rounds = (16, 80) if config.quick else (1024, 200), config.rounds
     rows = []
     for name, (invariant, scene) in SCENES.items():
         note(f"... {name} on {device}")
@@ -210,40 +205,11 @@ def _memory(field: str) -> float:
     return int(text.split(f"{field}:")[1].split()[0]) / 1024
 
 
-def plot(rows: list[Row], path: Path) -> None:
-    """Bars: how many times faster, with the goal 1 as a line."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    chosen = [row for row in rows if "times faster" in row.task]
-    figure, axes = plt.subplots(figsize=(8, 0.5 * len(chosen) + 1))
-    labels = [row.task.replace(": times faster than ", ", against ").replace(": times faster", "") for row in chosen]
-    axes.barh(labels[::-1], [row.measured for row in chosen][::-1], color="#2a6f97")
-    axes.bar_label(axes.containers[0], fmt="%.1fx", padding=3)  # type: ignore[arg-type]
-    axes.axvline(1, color="0.3", linewidth=1)
-    axes.set_xlabel("times faster, one core (rows + torch.linalg.svd, unless named)")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
-def run() -> None:
-    config = tyro.cli(Config, description=__doc__)
-    prepare(config.out.parent)
-    sections = {"Large invariants": large(config, "cpu"), "Small invariants": small(config), "Growth": growth(config)}
+@experiment(Config(), quick={"rounds": 1}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """Whole fits against rows + SVD, kornia and OpenCV; quick: small batches, the figures mean nothing."""
+    yield "Large invariants", large(config, "cpu")
+    yield "Small invariants", small(config)
+    yield "Growth", growth(config)
     if torch.cuda.is_available():
-        sections["Large invariants on the GPU"] = large(config, "cuda")
-    else:
-        note("no CUDA device: the rows of the GPU are left out")
-    for title, rows in sections.items():
-        print(markdown(rows, title))
-    everything = [row for rows in sections.values() for row in rows]
-    plot(everything, config.out.with_suffix(".png"))
-    write_json(config.out, {"settings": manifest(vars(config)), "rows": [asdict(row) for row in everything]})
-
-
-if __name__ == "__main__":
-    command(run)
+        yield "Large invariants on the GPU", large(config, "cuda")

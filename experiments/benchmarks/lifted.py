@@ -11,16 +11,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-import tyro
 
 import dyntorch as dyn
 from dyntorch import scenes
-from experiments.common.tables import Row, command, markdown
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.common.timing import interleaved, threads
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Settings of the benchmark."""
 
     rounds: int = 7
@@ -67,14 +67,8 @@ def rows(config: Config, count: int) -> list[Row]:
     ]
 
 
-def run() -> None:
-    """Print the table."""
-    config = tyro.cli(Config, description=__doc__)
-    found = rows(config, 1)
-    if torch.get_num_threads() > 1:
-        found += rows(config, torch.get_num_threads())
-    print(markdown(found, "Reconstruction by lifted projections"))
-
-
-if __name__ == "__main__":
-    command(run)
+@experiment(Config(), quick={"rounds": 1, "batch": 10}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """On one thread, and on all."""
+    several = torch.get_num_threads()
+    yield "Reconstruction by lifted projections", [*rows(config, 1), *(rows(config, several) if several > 1 else [])]

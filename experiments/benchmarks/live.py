@@ -13,13 +13,12 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
-from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition.detection_metrics import f1
 from indexing import ActionIndexer, Clip
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
@@ -31,7 +30,7 @@ PUSHES = {"single frames": 1, "one second": 30}
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Speed of a stream of the action indexer, and what it finds."""
 
     exemplars: tuple[int, ...] = (26, 100)
@@ -44,10 +43,6 @@ class Config:
     """Degrees that their camera is turned."""
     lags: tuple[float | None, ...] = (None, 5.0)
     """Seconds; ``None``: the stream's own."""
-    seed: int = 0
-    """Of the people and the noise."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_live.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @cache
@@ -110,18 +105,8 @@ def finds(config: Config) -> list[Row]:
     return rows
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file.
-
-    Raises:
-        ValueError: nothing to measure, or a file that cannot be written.
-    """
-    if min(config.rounds, config.people, *config.exemplars) < 1:
-        raise ValueError(
-            f"rounds, people and exemplars must be at least 1, got {config.rounds}, {config.people}, {config.exemplars}"
-        )
-    measured_on_one_thread({"Speed of a stream of the action indexer": speeds, "F1 of its events": finds}, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, description=__doc__)))
+@experiment(Config(), quick={"exemplars": (13,), "rounds": 1, "people": 1})
+def tables(config: Config) -> Tables:
+    """Speed of a stream, and what it finds."""
+    yield "Speed of a stream of the action indexer", speeds(config)
+    yield "F1 of its events", finds(config)

@@ -14,22 +14,16 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from statistics import median
-from typing import Annotated
 
 import torch
-import tyro
-from rich import box
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from dyntorch.numerics.nullspace import gram_null_space, null_space
-from experiments.common.tables import command, note
-from indexing.files import manifest, prepare, write_json
+from experiments.common.runner import BaseConfig, Tables, Words, experiment
+from experiments.common.tables import note
 
 ANGLE = 1e-10
 ROWS = 200
@@ -37,17 +31,13 @@ SOLVE, MINIMAL, BACKWARD, GRAM = "null space", "D - 1 rows", "forward + backward
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Speed and accuracy of batched null spaces."""
 
     batch: int = 1024
     """Problems per call."""
     rounds: int = 7
     """How often the two sides take turns."""
-    quick: bool = False
-    """Small batch, one round: a smoke test; goals are not judged."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_null_space.json")
-    """Where the results are written as JSON; the plot goes beside it as PNG."""
 
 
 @dataclass(frozen=True)
@@ -223,67 +213,24 @@ def measure(config: Config) -> list[Figure]:
     return figures
 
 
-def table(figures: list[Figure], batch: int) -> Table:
+def table(figures: list[Figure]) -> Words:
     """The figures beside their goals; what could not be measured says so."""
-    shown = Table(title=f"Null spaces, batch of {batch}, float64, µs per problem", box=box.MARKDOWN)
-    for name in ("task", "where", "D", "dim", "reference", "ours", "ratio", "goal", "reached", "largest angle"):
-        shown.add_column(name, justify="left" if name in ("task", "where") else "right", no_wrap=True)
+    head = ("task", "where", "D", "dim", "reference", "ours", "ratio", "goal", "reached", "largest angle")
+    lines: list[Sequence[str]] = []
     for one in figures:
         goal = "" if one.goal is None else f">= {one.goal:g}"
         reached = {None: "", True: "yes", False: "NO"}[one.reached]
         times = (f"{one.reference:.1f}", f"{one.ours:.1f}", f"{one.ratio:.2f}")
-        shown.add_row(one.task, one.where, str(one.size), str(one.dim), *times, goal, reached, f"{one.angle:.0e}")
+        lines.append((one.task, one.where, str(one.size), str(one.dim), *times, goal, reached, f"{one.angle:.0e}"))
     wheres = [one.where for one in figures]
     if not any("threads" in where for where in wheres):
-        shown.add_row("several threads", "skipped: one core")
+        lines.append(("several threads", "skipped: one core", *[""] * 8))
     if not torch.cuda.is_available():
-        shown.add_row("CUDA", "skipped: no device")
-    return shown
+        lines.append(("CUDA", "skipped: no device", *[""] * 8))
+    return Words(head, lines)
 
 
-def plot(figures: list[Figure], path: Path) -> None:
-    """Time per problem over D, both sides."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    canvas = plt.figure(figsize=(6, 4), layout="constrained")
-    axes = canvas.subplots()
-    for task, style in ((SOLVE, "-"), (MINIMAL, "--")):
-        chosen = [one for one in figures if one.task == task and one.where == "1 thread" and one.dim == 1]
-        sizes = [one.size for one in chosen]
-        axes.plot(sizes, [one.reference for one in chosen], f"o{style}", color="tab:gray", label=f"svd, {task}")
-        axes.plot(sizes, [one.ours for one in chosen], f"o{style}", color="tab:blue", label=f"dyntorch, {task}")
-    axes.set(xlabel="D (columns)", ylabel="µs per problem, one thread", xscale="log", yscale="log")
-    axes.set_xticks([9, 27, 36, 48, 64], ["9", "27", "36", "48", "64"], minor=False)
-    axes.minorticks_off()
-    axes.grid(alpha=0.3)
-    axes.legend()
-    canvas.savefig(str(path), dpi=150)
-    plt.close()
-
-
-def run(config: Config) -> None:
-    """Measure, print the table, write the file and the plot.
-
-    Raises:
-        ValueError: nothing to measure.
-    """
-    if config.batch < 1 or config.rounds < 1:
-        raise ValueError(f"batch and rounds must be at least 1, got {config.batch} and {config.rounds}")
-    if config.quick:
-        config = Config(batch=min(config.batch, 32), rounds=1, quick=True, out=config.out)
-    target = config.out.expanduser()
-    prepare(target.parent)
-    figures = measure(config)
-    Console(width=132).print(table(figures, config.batch))
-    load = os.getloadavg() if hasattr(os, "getloadavg") else ()
-    found = [{**asdict(one), "ratio": one.ratio, "reached": one.reached} for one in figures]
-    write_json(target, {"manifest": manifest(vars(config)), "load": load, "table": found})
-    plot(figures, target.with_suffix(".png"))
-    note(f"written: {target} and {target.with_suffix('.png').name}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.benchmarks.null_space")))
+@experiment(Config(), quick={"batch": 32, "rounds": 1}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """Every comparison that this machine can make; quick: goals are not judged."""
+    yield f"Null spaces, batch of {config.batch}, float64, µs per problem", table(measure(config))

@@ -10,35 +10,29 @@ inliers from the estimate.  All candidates of a row take turns; the figures are 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Any
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import homogeneous
-from experiments.common.tables import Row, command, markdown, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.common.timing import interleaved
-from indexing.files import manifest, prepare, write_json
 
 THRESHOLD = 1.5
 Estimate = Callable[[], Tensor]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Robust two-view fits against OpenCV, PoseLib and kornia."""
 
     rounds: int = 3
     """How often every candidate runs."""
-    quick: bool = False
-    """Few problems: checks that everything runs, the figures mean nothing."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_robust_peers.json")
-    """Where the results are written as JSON."""
 
 
 def loop(x1: Tensor, x2: Tensor, solve: Callable[[Any, Any], Any]) -> Tensor:
@@ -100,7 +94,7 @@ def error(kind: str, estimate: Tensor, exact: tuple[Tensor, Tensor], inlier: Ten
 
 def measure(kind: str, share: float, config: Config) -> list[Row]:
     """All candidates on the same problems."""
-    batch, n, rounds = (4, 200, 1) if config.quick else (64, 500, config.rounds)
+    batch, n = (4, 200) if config.quick else (64, 500)
     generator = torch.Generator().manual_seed(0)
     if kind == "fundamental matrix":
         scene = scenes.two_view(n=n, batch=batch, sigma=0.5, outliers=share, generator=generator)
@@ -120,7 +114,7 @@ def measure(kind: str, share: float, config: Config) -> list[Row]:
 
     candidates: dict[str, Estimate] = {"dyntorch, one batch": ours, **peers(kind, x1, x2)}
     note(f"... {kind}, {share:.0%} outliers")
-    seconds = interleaved(candidates, rounds)
+    seconds = interleaved(candidates, config.rounds)
     rows = []
     for name, run in candidates.items():
         setting = f"{share:.0%} outliers, {batch} x {n}"
@@ -129,13 +123,8 @@ def measure(kind: str, share: float, config: Config) -> list[Row]:
     return rows
 
 
-def run() -> None:
-    config = tyro.cli(Config, description=__doc__)
-    prepare(config.out.parent)
-    rows = [row for kind in ("fundamental matrix", "homography") for share in (0.3, 0.5) for row in measure(kind, share, config)]
-    print(markdown(rows, "Robust two-view fits"))
-    write_json(config.out, {"manifest": manifest(vars(config)), "rows": [asdict(row) for row in rows]})
-
-
-if __name__ == "__main__":
-    command(run)
+@experiment(Config(), quick={"rounds": 1}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """Against OpenCV, PoseLib and kornia; quick: few problems, the figures mean nothing."""
+    settings = [(kind, share) for kind in ("fundamental matrix", "homography") for share in (0.3, 0.5)]
+    yield "Robust two-view fits", [row for setting in settings for row in measure(*setting, config)]

@@ -15,17 +15,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.metrics import misclassification
-from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.common.timing import interleaved
 from experiments.recognition.protocol import DATA
 from experiments.segmentation.data import Pair, motion_pairs
@@ -43,17 +42,13 @@ Segmenter = Callable[[Pair, int | None, int], Tensor]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Segmentation into bodies beside greedy RANSAC."""
 
     rounds: int = 3
     """How often every candidate runs."""
     batch: int = 1000
     """Exact problems of two bodies in one batch."""
-    quick: bool = False
-    """Two pairs, once: checks that everything runs."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_segmentation.json")
-    """Where the results are written as JSON."""
 
 
 def ours(pair: Pair, bodies: int | None, seed: int) -> Tensor:
@@ -142,7 +137,7 @@ def compared(title: str, pairs: Sequence[Pair], config: Config, goal: float, wro
         for known in (True, False)
         for name, segmenter in segmenters.items()
     }
-    seconds = interleaved(candidates, 1 if config.quick else config.rounds)
+    seconds = interleaved(candidates, config.rounds)
     rows = []
     for name, candidate in candidates.items():
         mine = name.startswith("dyntorch")
@@ -182,7 +177,7 @@ def large(config: Config) -> list[Row]:
 
 def batch(config: Config) -> list[Row]:
     """Many exact problems of two bodies at once, by the segmentation matrix: fit, split, label."""
-    count = 20 if config.quick else config.batch
+    count = config.batch
     scene = scenes.bodies((40, 40), batch=count, interleaved=True, generator=torch.Generator().manual_seed(0))
     x1, x2 = scene.views
     labels = scene.labels
@@ -193,7 +188,7 @@ def batch(config: Config) -> list[Row]:
         pair = dyn.FundamentalMatrix.compose(first, e), dyn.FundamentalMatrix.compose(second, f)
         labels = dyn.SegmentationMatrix.labels(*pair, x1, x2)
 
-    each = interleaved({"batch": run}, 1 if config.quick else config.rounds)["batch"] / count * 1e3
+    each = interleaved({"batch": run}, config.rounds)["batch"] / count * 1e3
     error = 100 * float(misclassification(labels, scene.labels).mean())
     return [
         Row("segmentation matrix", f"{count} exact problems of 80 matches, each", each, GOALS["batch"], at_most=True, unit=" ms"),
@@ -201,13 +196,9 @@ def batch(config: Config) -> list[Row]:
     ]
 
 
-TABLES = {"Pairs of photographs": real, "Many matches": large, "Exact problems in a batch": batch}
-
-
-def run(config: Config) -> None:
-    """Print every table, then write the file."""
-    measured_on_one_thread(TABLES, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, description=__doc__)))
+@experiment(Config(), quick={"rounds": 1, "batch": 20})
+def tables(config: Config) -> Tables:
+    """Beside greedy RANSAC; quick: two pairs."""
+    yield "Pairs of photographs", real(config)
+    yield "Many matches", large(config)
+    yield "Exact problems in a batch", batch(config)

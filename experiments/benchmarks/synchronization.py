@@ -16,11 +16,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 from dyntorch import synchronize
@@ -29,7 +26,8 @@ from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.numerics import lags
 from dyntorch.numerics.lags import Lags
 from dyntorch.tasks.synchronize.subspace import subspace_curve
-from experiments.common.tables import Row, command, measured_on_one_thread
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.common.timing import interleaved
 
 GOALS = {"same": 0.05, "different": 0.3, "ratio": 200.0}
@@ -40,15 +38,11 @@ LEAST = 0.3
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Speed of the scores of all shifts."""
 
     rounds: int = 9
     """How often every candidate runs."""
-    quick: bool = False
-    """Short takes, once: checks that everything runs."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/benchmark_synchronization.json")
-    """Where the results are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -175,11 +169,11 @@ def same_points(config: Config) -> list[Row]:
     takes, rows, name = people(frames, 17, 7 if config.quick else 137), [], "moments by FFT"
     for window in ((-(frames // 2), frames // 2), None):
         run = _of(epipolar_scores, takes, window)
-        seconds = interleaved({name: run}, _rounds(config))[name]
+        seconds = interleaved({name: run}, config.rounds)[name]
         title = f"same points, {frames} frames, 17 joints, {_number(takes, window)} shifts"
         rows.append(Row(f"{title}, time", name, seconds, None if config.quick else GOALS["same"], at_most=True, unit=" s"))
         rows.append(_error(title, name, run(), takes, window))
-    whole = interleaved({"synchronize": lambda: synchronize(takes.a, takes.b, fps=30.0)}, _rounds(config))["synchronize"]
+    whole = interleaved({"synchronize": lambda: synchronize(takes.a, takes.b, fps=30.0)}, config.rounds)["synchronize"]
     rows.append(Row(f"same points, {frames} frames, 17 joints, the whole verb, time", "dyntorch.synchronize", whole, unit=" s"))
     reach = frames // 2
     reference = sampled(lambda near: epipolar_by_svd(takes, near), reach)
@@ -202,7 +196,7 @@ def different_points(config: Config) -> list[Row]:
     takes, rows = combinations(frames, 28, RANK, 7 if config.quick else 137), []
     for window in ((-(frames // 2), frames // 2), None):
         candidates = {name: _of(score, takes, window) for name, score in DIFFERENT.items()}
-        seconds = interleaved(candidates, _rounds(config))
+        seconds = interleaved(candidates, config.rounds)
         title = f"different points, {frames} frames, 28 + 28 rows, {_number(takes, window)} shifts"
         for name, run in candidates.items():
             goal = None if config.quick else GOALS["different"]
@@ -217,7 +211,7 @@ def long_takes(config: Config) -> list[Row]:
     takes, window = combinations(frames, 20, RANK, reach // 3), (-reach, reach)
     title = f"{frames} frames, 20 + 20 rows, {2 * reach + 1} shifts"
     fast = _of(canonical_sums, takes, window, RANK)
-    seconds = interleaved({"dyntorch": fast}, _rounds(config))["dyntorch"]
+    seconds = interleaved({"dyntorch": fast}, config.rounds)["dyntorch"]
     reference = sampled(lambda near: canonical_by_svd(takes, near, RANK), reach)
     return [
         Row(f"{title}, time", "compressed, covariances by FFT", seconds, unit=" s"),
@@ -250,27 +244,15 @@ def _number(takes: Takes, window: Lags | None) -> int:
     return len(takes.a) + len(takes.b) - 1 if window is None else window[1] - window[0] + 1
 
 
-def _rounds(config: Config) -> int:
-    return 1 if config.quick else config.rounds
-
-
 def _error(title: str, name: str, scores: Tensor, takes: Takes, window: Lags | None) -> Row:
     """Frames between the best shift and the true one."""
     first = 1 - len(takes.a) if window is None else window[0]
     return Row(f"{title}, error", name, abs(int(scores.argmax()) + first - takes.shift), 0.0, at_most=True, unit=" frames")
 
 
-def run(config: Config) -> None:
-    """Measure and print; the rows go to the file.
-
-    Raises:
-        ValueError: no rounds.
-    """
-    if config.rounds < 1:
-        raise ValueError(f"rounds must be at least 1, got {config.rounds}")
-    tables = {"same points": same_points, "different points": different_points, "long takes": long_takes}
-    measured_on_one_thread(tables, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.benchmarks.synchronization")))
+@experiment(Config(), quick={"rounds": 1})
+def tables(config: Config) -> Tables:
+    """Quick: short takes."""
+    yield "same points", same_points(config)
+    yield "different points", different_points(config)
+    yield "long takes", long_takes(config)

@@ -1,6 +1,8 @@
 """The pages of ``docs/results``: each states its command, which, run as the page says, writes what it prints into the page.
 
 Any other settings (``--quick``, fewer scenes) leave the page as it is.  A script that has no page gets one at its first run.
+
+``python -m experiments.common.results [ROOM...]`` runs the commands of all pages, or of those of some rooms, one after the other.
 """
 
 from __future__ import annotations
@@ -11,8 +13,10 @@ import os
 import platform
 import re
 import shlex
+import shutil
+import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -40,12 +44,13 @@ class Tee(io.StringIO):
 
 
 @contextlib.contextmanager
-def published(module: str, words: Sequence[str], folder: Path = RESULTS) -> Iterator[None]:
+def published(module: str, words: Sequence[str], pictures: Mapping[str, Path], folder: Path = RESULTS) -> Iterator[None]:
     """Write what is printed inside into the page of a module of ``experiments``, if the page is about these words.
 
     Args:
         module: as ``python -m`` names it.
         words: the arguments that it was given.
+        pictures: files by name, as they are when the run has ended; one that the page shows is copied beside it.
         folder: of the pages; where there is none (a wheel has no documentation), nothing is written.
     """
     if not module.startswith("experiments.") or not folder.is_dir():
@@ -60,6 +65,9 @@ def published(module: str, words: Sequence[str], folder: Path = RESULTS) -> Iter
         print(f"{target.name} stays as it is: it is about another command", file=sys.stderr)
         return
     write_text(target, f"{head}{MARK}\n\n## As printed\n\n{_machine()}\n\n{as_markdown(said.getvalue())}\n")
+    for name, picture in pictures.items():
+        if f"({name}.png)" in head:
+            shutil.copyfile(picture, folder / f"{name}.png")
     print(f"written: {target}", file=sys.stderr)
 
 
@@ -115,3 +123,16 @@ def _machine() -> str:
 def _cpuinfo() -> str:
     path = Path("/proc/cpuinfo")
     return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+
+
+def run_pages(rooms: Sequence[str]) -> None:
+    """Run the command of every page, or of the pages of some rooms."""
+    for page in sorted(RESULTS.glob("*.md")):
+        stated = COMMAND.search(page.read_text(encoding="utf-8").partition(MARK)[0])
+        if stated and (not rooms or stated["module"].split(".")[1] in rooms):
+            print(f"... {page.stem}", file=sys.stderr, flush=True)
+            subprocess.run([sys.executable, "-m", stated["module"], *shlex.split(stated["words"])], check=False)
+
+
+if __name__ == "__main__":
+    run_pages(sys.argv[1:])

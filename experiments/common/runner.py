@@ -15,7 +15,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
@@ -80,12 +80,14 @@ class Experiment(Generic[C]):
         tables: yields them; what lies between two of them is the time that the second takes.
         default: the configuration; ``quick``: the fields that are others with ``--quick``.
         one_thread: torch computes on one thread, so that times are comparable and results the same anywhere.
+        pictures: files of those that a run has written.
     """
 
     tables: Callable[[C], Tables]
     default: C
     quick: Mapping[str, Any]
     one_thread: bool
+    pictures: dict[str, Path] = field(default_factory=dict)
 
     def configure(self, words: Sequence[str]) -> C:
         """The configuration that a command line asks for.
@@ -96,10 +98,10 @@ class Experiment(Generic[C]):
         module = sys.modules[self.tables.__module__]
         default = replace(self.default, **self.quick) if "--quick" in words else self.default
         config = tyro.cli(type(default), args=words, default=default, description=module.__doc__)
-        for field in fields(config):
-            least, value = getattr(self.default, field.name), getattr(config, field.name)
-            if type(least) is int and least >= 1 > value and field.name != "seed":
-                raise ValueError(f"--{field.name.replace('_', '-')} must be at least 1, got {value}")
+        for name in (entry.name for entry in fields(config)):
+            usual, value = getattr(self.default, name), getattr(config, name)
+            if type(usual) is int and usual >= 1 > value and name != "seed":
+                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {value}")
         return config
 
     def run(self, config: C, name: str) -> None:
@@ -116,7 +118,8 @@ class Experiment(Generic[C]):
             clock = time.perf_counter()
             for title, table in self.tables(config):
                 if isinstance(table, bytes):
-                    note(f"picture: {write_bytes(folder / f'{title}.png', table)}")
+                    self.pictures[title] = write_bytes(folder / f"{title}.png", table)
+                    note(f"picture: {self.pictures[title]}")
                     continue
                 now = time.perf_counter()
                 seconds[title], clock = now - clock, now
@@ -135,7 +138,7 @@ class Experiment(Generic[C]):
         about = sys.modules["__main__"].__spec__
         module = about.name if about else Path(sys.argv[0]).stem
         try:
-            with published(module, sys.argv[1:]):
+            with published(module, sys.argv[1:], self.pictures):
                 self.run(self.configure(sys.argv[1:]), page_name(module) if "." in module else module)
         except ValueError as problem:
             print(f"error: {problem}", file=sys.stderr)

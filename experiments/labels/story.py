@@ -25,13 +25,11 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
-from experiments.common.book import Book
-from experiments.common.tables import Row, command, note
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
 from indexing import Clip
 from indexing.actors import Person, detect, stream
 from indexing.comparing import ComparedSpan, compare
@@ -46,7 +44,7 @@ GOAL = 60.0  # seconds
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """How long an hour's recording takes."""
 
     minutes: float = 60.0
@@ -55,10 +53,6 @@ class Config:
     """Events that the person corrects."""
     azimuth: float = 45.0
     """Degrees that the camera is turned."""
-    seed: int = 0
-    """Of the person, the actions and the noise."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/labels_story")
-    """Where the table is written as JSON."""
 
 
 def recorded(config: Config) -> tuple[Clip, list[Label]]:
@@ -112,15 +106,9 @@ def agreement(found: list[Label], truth: list[Label], end: float) -> list[float]
     return [*(one.f1 for one in both.segments.values()), both.kappa]
 
 
-def run(config: Config) -> None:
-    """Print the tables, write the file.
-
-    Raises:
-        ValueError: nothing to record or to correct, or a command that fails.
-    """
-    if config.minutes <= 0 or config.corrections < 0:
-        raise ValueError(f"minutes must be positive and corrections not negative, got {config.minutes} and {config.corrections}")
-    book = Book(config.out)
+@experiment(Config(), quick={"minutes": 2.0, "corrections": 2}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """How long an hour's recording takes, and what is found in it."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         keypoints, labels, model = folder / "hour.npz", folder / "hour.eaf", folder / "moves.safetensors"
@@ -150,12 +138,7 @@ def run(config: Config) -> None:
     title = (
         f"seconds, {len(clip):,} frames with {len(truth)} performances, {len(first)} labels and {config.corrections} corrections"
     )
-    book.grid(title, ("on the clock", "of the processor"), lines, goals)
+    yield title, Grid(("on the clock", "of the processor"), lines, goals)
     found = {"five labels": (before, first), "and the corrections": (after, mine)}
     table = {name: [len(given), len(events), *agreement(events, truth, clip.duration)] for name, (events, given) in found.items()}
-    book.grid("what is found", ("labels", "found", "F1@0.1", "F1@0.25", "F1@0.5", "kappa"), table)
-    book.close(vars(config), seed=config.seed)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.labels.story")))
+    yield "what is found", Grid(("labels", "found", "F1@0.1", "F1@0.25", "F1@0.5", "kappa"), table)

@@ -19,15 +19,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import tyro
 
-from experiments.common.book import Book
-from experiments.common.tables import command, note
-from experiments.common.timing import threads
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import note
 from experiments.recognition import protocol
 from experiments.recognition.detection import Recording, end_to_end
 from experiments.recognition.detection_metrics import segments
@@ -53,7 +50,7 @@ Marked = tuple[int, str, float, float]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """What labels teach, suggested ones and any."""
 
     sets: tuple[SETS, ...] = ("exercises", "actors")
@@ -62,8 +59,6 @@ class Config:
     """Labels after which the model is asked; as many at a time are chosen as lie between."""
     seeds: int = 3
     """Repetitions with other first labels, and other people."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/labels_suggesting")
-    """Where the tables are written as JSON."""
 
 
 # ---- recordings --------------------------------------------------------------------------------------------------------
@@ -205,37 +200,29 @@ def course(name: SETS, way: str, counts: Sequence[int], seed: int) -> tuple[list
     return shares, kinds
 
 
-def run(config: Config) -> None:
-    """Print the tables and write the file.
+FILES = {"exercises": "mocap6_exercises", "utkinect": "utkinect"}
+
+
+@experiment(Config(), quick={"sets": ("actors",), "counts": (4,), "seeds": 1})
+def tables(config: Config) -> Tables:
+    """What labels teach, suggested ones and any.
 
     Raises:
-        ValueError: nothing to repeat, counts that do not grow from 3 on, or no data folder.
+        ValueError: counts that do not grow from 3 on, or no data folder.
     """
-    if config.seeds < 1 or list(config.counts) != sorted(set(config.counts)) or not config.counts or config.counts[0] < 3:
-        raise ValueError(f"seeds must be 1 or more and counts grow from 3 on, got {config.seeds} and {config.counts}")
-    files = [protocol.data_folder() / f"{file}.npz" for name, file in FILES.items() if name in config.sets]
-    book = Book(config.out)
+    if list(config.counts) != sorted(set(config.counts)) or not config.counts or config.counts[0] < 3:
+        raise ValueError(f"counts must grow from 3 on, got {config.counts}")
     for name in config.sets:
         found = {}
-        with threads(1), warnings.catch_warnings():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that one part is labelled twice
             for way in WAYS:
                 note(f"... {name}, {way}")
                 found[way] = np.array([course(name, way, config.counts, seed) for seed in range(config.seeds)])
         columns = [f"{count} labels" for count in config.counts]
-        book.grid(
-            f"{name}: frames that are right", columns, {way: values[:, 0].mean(axis=0).tolist() for way, values in found.items()}
-        )
+        right = {way: values[:, 0].mean(axis=0).tolist() for way, values in found.items()}
+        yield f"{name}: frames that are right", Grid(columns, right)
         spread = {way: values[:, 0].std(axis=0).tolist() for way, values in found.items()}
-        book.grid(f"{name}: standard deviation over {config.seeds} repetitions", columns, spread)
-        book.grid(
-            f"{name}: actions that are known", columns, {way: values[:, 1].mean(axis=0).tolist() for way, values in found.items()}
-        )
-    book.close(vars(config), files, seed=config.seeds)
-
-
-FILES = {"exercises": "mocap6_exercises", "utkinect": "utkinect"}
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.labels.suggesting")))
+        yield f"{name}: standard deviation over {config.seeds} repetitions", Grid(columns, spread)
+        known = {way: values[:, 1].mean(axis=0).tolist() for way, values in found.items()}
+        yield f"{name}: actions that are known", Grid(columns, known)

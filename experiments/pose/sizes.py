@@ -18,11 +18,10 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from experiments.common.tables import aligned, command, note
+from experiments.common.runner import BaseConfig, Tables, Words, experiment
 from experiments.pose.videos import CAMERAS, FPS, camera, seen
 from experiments.recognition.protocol import Array
 from indexing import Clip
-from indexing.files import manifest, prepare, write_json
 from indexing.pose import PoseOptions
 from indexing.pose.blazepose import JOINTS, VideoPicture
 from indexing.pose.models import load_models
@@ -36,7 +35,7 @@ NEAR, TRUSTED = 1 / 3, 0.5
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """People who get smaller and smaller."""
 
     models: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -45,10 +44,6 @@ class Config:
     """Which network."""
     every: int = 2
     """Of the frames, one in so many is looked at."""
-    quick: bool = False
-    """Three sizes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/pose_sizes.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def pictures(path: Path, scale: float, far: bool, every: int) -> Iterator[VideoPicture]:
@@ -102,26 +97,12 @@ def row(height: int, far: bool, config: Config, networks: LiteNetworks) -> list[
     return [f"{height}", f"{np.concatenate(hits).mean():.3f}", *told]
 
 
-def run(config: Config) -> None:
-    """Print both tables, then write the file.
-
-    Raises:
-        ValueError: no data folder, no model files, or a file that cannot be written.
-    """
-    target = config.out.expanduser()
-    prepare(target.parent)
+@experiment(Config())
+def tables(config: Config) -> Tables:
+    """Shrunk pictures, and people far away; quick: three sizes."""
     chosen: Any = config.model
     networks = LiteNetworks(load_models(chosen, config.models))
-    kept = {}
     head = ("body (pixels)", "found", "error, median", "error, 90 %")
     for title, far in (("Shrunk", False), ("Far", True)):
-        note(f"... {title}")
         lines = [row(height, far, config, networks) for height in (HEIGHTS[::4] if config.quick else HEIGHTS)]
-        print(f"\n### {title}\n\n{aligned(head, lines)}", flush=True)
-        kept[title] = [dict(zip(head, line, strict=True)) for line in lines]
-    write_json(target, {"manifest": manifest(vars(config)), "tables": kept})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.pose.sizes")))
+        yield title, Words(head, lines)

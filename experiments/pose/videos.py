@@ -31,7 +31,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from experiments.common.tables import Row, command, measured_on_one_thread
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.recognition.protocol import Array, data_folder
 from indexing import ActionIndexer, Clip
 from indexing.pose import PoseOptions, detect
@@ -54,15 +55,11 @@ GOALS_TIME = {"heavy": 60.0, "full": 25.0}
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Poses in the real videos of the folder DYNTORCH_DATA."""
 
     models: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Of the model files."""
-    quick: bool = False
-    """Three signs, two cuts, one model."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/pose.json")
-    """Where the results and this configuration are written as JSON."""
 
     @property
     def names(self) -> Sequence[Any]:
@@ -198,17 +195,10 @@ def asked(clips: Sequence[Clip], labels: Array, learned: Array, left: Array) -> 
     return np.asarray(indexer.predict([clips[i] for i in left]) == labels[left])
 
 
-TABLES = {"Found": found, "Time": milliseconds, "Synchronization from video alone": synchronized, "Arm raises": arms}
-
-
-def run(config: Config) -> None:
-    """Print every table, then write the file.
-
-    Raises:
-        ValueError: no data folder, no model files, or a file that cannot be written.
-    """
-    measured_on_one_thread(TABLES, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.pose.videos")))
+@experiment(Config())
+def tables(config: Config) -> Tables:
+    """The videos of the folder DYNTORCH_DATA; quick: three signs, two cuts, one model."""
+    yield "Found", found(config)
+    yield "Time", milliseconds(config)
+    yield "Synchronization from video alone", synchronized(config)
+    yield "Arm raises", arms(config)

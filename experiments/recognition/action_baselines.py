@@ -14,20 +14,18 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 
-from experiments.common.tables import Row, command, markdown, note
+from experiments.common.runner import BaseConfig, Tables, Words, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition import protocol
 from experiments.recognition.baselines import ImageNearest, WarpedNearest
 from experiments.recognition.protocol import TURNS, Classifier, Rendered
 from indexing import ActionIndexer
-from indexing.files import manifest, prepare, write_json
 
 Array = NDArray[Any]
 TITLES = {"utkinect": "UTKinect", "florence3d": "Florence3D"}
@@ -37,7 +35,7 @@ GOAL_RATIO = 100.0  # times faster per query than DTW
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The action indexer and the usual baselines, side by side, on the recordings in the folder DYNTORCH_DATA."""
 
     sets: tuple[Literal["utkinect", "florence3d"], ...] = ("utkinect", "florence3d")
@@ -48,8 +46,6 @@ class Config:
     """Timed repeats of every prediction of the first seed."""
     threads: int = 1
     """CPU threads of every method; with more than one, times on a machine that does other work too are wild."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/action_baselines.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -116,15 +112,14 @@ def compare(name: str, config: Config) -> dict[str, Measured]:
     return {method: Measured(np.array([one[method] for one in found]), milliseconds[method]) for method in found[0]}
 
 
-def overview(found: Mapping[str, Measured]) -> str:
-    """Accuracy per turn, time and its ratio to ours, as a Markdown table."""
-    lines = ["| method | " + " | ".join(f"{turn}°" for turn in TURNS) + " | ms per query | ratio to ours |"]
-    lines.append("|---" * (len(TURNS) + 3) + "|")
+def overview(found: Mapping[str, Measured]) -> Words:
+    """Accuracy per turn, time and its ratio to ours."""
+    lines = []
     ours = found[OURS].milliseconds
     for name, one in found.items():
-        turns = " | ".join(f"{value:.3f}" for value in one.accuracy.mean(axis=0))
-        lines.append(f"| {name} | {turns} | {one.milliseconds:.3f} | {one.milliseconds / ours:.2f} |")
-    return "\n".join(lines)
+        turns = (f"{value:.3f}" for value in one.accuracy.mean(axis=0))
+        lines.append([name, *turns, f"{one.milliseconds:.3f}", f"{one.milliseconds / ours:.2f}"])
+    return Words(["method", *(f"{turn}°" for turn in TURNS), "ms per query", "ratio to ours"], lines)
 
 
 def goals(name: str, found: Mapping[str, Measured]) -> list[Row]:
@@ -144,33 +139,19 @@ def goals(name: str, found: Mapping[str, Measured]) -> list[Row]:
     return rows
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file.
+@experiment(Config(), quick={"sets": ("florence3d",), "seeds": 1, "repeats": 1}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """Every set: all methods, then ours against time warping.
 
     Raises:
-        ValueError: no data folder, a missing file, nothing to repeat, or no aeon.
+        ValueError: no data folder, or no aeon.
     """
-    if min(config.seeds, config.repeats, config.threads) < 1:
-        raise ValueError(f"seeds, repeats and threads must be at least 1, got {config.seeds}, {config.repeats}, {config.threads}")
-    folder = protocol.data_folder()
-    target = config.out.expanduser()
-    prepare(target.parent)
     torch.set_num_threads(config.threads)
     try:
         WarpedNearest()
     except ImportError:
         raise ValueError("aeon is not installed; pip install 'dyntorch[experiments]'") from None
-    tables = {}
     for name in config.sets:
         found = compare(name, config)
-        rows = goals(name, found)
-        print(f"\n### {TITLES[name]}\n\n{overview(found)}\n\n{markdown(rows)}", flush=True)
-        kept = {method: {"accuracy": one.accuracy, "ms_per_query": one.milliseconds} for method, one in found.items()}
-        tables[name] = {"methods": kept, "goals": [{**vars(row), "reached": row.reached} for row in rows]}
-    about = manifest(vars(config), [folder / f"{name}.npz" for name in config.sets], seed=config.seeds)
-    write_json(target, {"manifest": about, "threads": torch.get_num_threads(), "turns": TURNS, "tables": tables})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.action_baselines")))
+        yield TITLES[name], overview(found)
+        yield f"{TITLES[name]}, beside time warping", goals(name, found)

@@ -15,22 +15,17 @@ kept apart for acceptance and had no part in it.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import torch
-import tyro
 from numpy.typing import NDArray
 
-from experiments.common.tables import Row, command, markdown, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.recognition import protocol
 from indexing import ActionIndexer
-from indexing.files import manifest, prepare, write_json
 
 SetName = Literal["utkinect", "florence3d", "jhmdb", "mocap6"]
 TITLES = {"utkinect": "UTKinect", "florence3d": "Florence3D", "jhmdb": "JHMDB", "mocap6": "exercise streams"}
@@ -44,7 +39,7 @@ GOALS_STREAMS = (0.90, 0.84)
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Accuracy of the action indexer on the recordings in the folder DYNTORCH_DATA, beside the goals."""
 
     sets: tuple[SetName, ...] = ("utkinect", "florence3d", "jhmdb", "mocap6")
@@ -53,26 +48,6 @@ class Config:
     """Repetitions with other noise, cameras and virtual views."""
     draws: int = 5
     """Random choices of the few examples, per number of examples."""
-    threads: int = 0
-    """CPU threads of torch; 0 leaves its default."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/action_recognition.json")
-    """Where the results and this configuration are written as JSON."""
-
-
-@dataclass
-class Results:
-    """Rows and seconds of every table."""
-
-    rows: dict[str, list[Row]] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def add(self, title: str, table: Callable[[], list[Row]]) -> None:
-        """Compute one table and print it."""
-        note(f"... {title}")
-        start = time.perf_counter()
-        self.rows[title] = table()
-        self.seconds[title] = time.perf_counter() - start
-        print(markdown(self.rows[title], title), flush=True)
 
 
 def spread(values: NDArray[Any]) -> float | None:
@@ -143,38 +118,16 @@ def streams(config: Config) -> list[Row]:
     ]
 
 
-def run(config: Config) -> None:
-    """Print every table, then write the file.
-
-    Raises:
-        ValueError: no data folder, a missing file, or nothing to repeat.
-    """
-    if config.seeds < 1 or config.draws < 1:
-        raise ValueError(f"seeds and draws must be at least 1, got {config.seeds} and {config.draws}")
-    folder = protocol.data_folder()
-    target = config.out.expanduser()
-    prepare(target.parent)
-    if config.threads > 0:
-        torch.set_num_threads(config.threads)
-    results = Results()
+@experiment(Config(), quick={"sets": ("florence3d",), "seeds": 1, "draws": 1})
+def tables(config: Config) -> Tables:
+    """Every set, and of UTKinect few examples."""
     for name in config.sets:
         if name in GOALS_2D:
-            results.add(f"{TITLES[name]}, exemplars in one 2D view", partial(turned, name, config, solid=False))
-            results.add(f"{TITLES[name]}, 3D exemplars", partial(turned, name, config, solid=True))
+            yield f"{TITLES[name]}, exemplars in one 2D view", turned(name, config, solid=False)
+            yield f"{TITLES[name]}, 3D exemplars", turned(name, config, solid=True)
         if name == "utkinect":
-            results.add("Few examples", partial(few_shots, name, config))
+            yield "Few examples", few_shots(name, config)
         if name == "jhmdb":
-            results.add("JHMDB, official splits, view='same'", partial(official_splits, config))
+            yield "JHMDB, official splits, view='same'", official_splits(config)
         if name == "mocap6":
-            results.add("Exercise streams, per-frame accuracy", partial(streams, config))
-    goals = [row.reached for rows in results.rows.values() for row in rows if row.reached is not None]
-    print(f"\n{sum(goals)} of {len(goals)} goals reached, {sum(results.seconds.values()):.0f} s")
-    inputs = [folder / f"{FILES[name]}.npz" for name in config.sets]
-    about = manifest(vars(config), inputs, seed=config.seeds, timings=results.seconds)
-    rows = {title: [{**vars(row), "reached": row.reached} for row in table] for title, table in results.rows.items()}
-    write_json(target, {"manifest": about, "indexer": ActionIndexer().get_params(), "tables": rows})
-    note(f"written: {target}")
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.action_recognition")))
+            yield "Exercise streams, per-frame accuracy", streams(config)

@@ -20,17 +20,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 import torch
-import tyro
 
-from experiments.common.book import Book
-from experiments.common.plots import bars
-from experiments.common.tables import Row, command, note
-from experiments.common.timing import threads
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition import protocol
 from experiments.recognition.brightness_baselines import BASELINES, FrameNearest, Frames, WindowKernels
 from experiments.recognition.protocol import Array
@@ -91,17 +87,13 @@ class Pixels:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Recognition from pixels, on the recordings in the folder DYNTORCH_DATA."""
 
     sets: tuple[Literal["arms", "exercises"], ...] = ("arms", "exercises")
     """Which recordings."""
     methods: tuple[Method, ...] = ("ours", "whole image", "thesis kernel", "activity correlation", "energy grid", "HOG")
     """Which methods; goals are those of the first."""
-    seed: int = 0
-    """Of textures, backgrounds and sensor noise of the films."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/brightness_indexing")
-    """Where tables (JSON) and pictures are written."""
 
 
 def contender(method: Method, fps: float) -> Callable[[], Recognizer]:
@@ -194,30 +186,8 @@ def exercises(make: Callable[[], Recognizer], streams: Sequence[Filmed]) -> tupl
     return (right / max(1, count)).tolist(), count
 
 
-def run(config: Config) -> None:
-    """Print the tables, draw the pictures, write the file.
-
-    Raises:
-        ValueError: no data folder, a missing file, or no method.
-    """
-    if not config.methods:
-        raise ValueError("methods: give at least one")
-    folder = protocol.data_folder()
-    book = Book(config.out)
-    shown: dict[str, dict[str, list[float]]] = {}
-    with threads(1):
-        if "arms" in config.sets:
-            shown["arm raises"] = table_arms(config, book)
-        if "exercises" in config.sets:
-            shown["exercises"] = table_exercises(config, book)
-    groups = {"arm raises": ["videos", "moving frames"], "exercises": [f"turned {turn}" for turn in TURNS]}
-    book.picture("brightness_indexing", bars({name: (groups[name], lines) for name, lines in shown.items()}))
-    files = {"arms": "armraise_gray160x120.npz", "exercises": "mocap6_exercises.npz"}
-    book.close(vars(config), [folder / files[name] for name in config.sets], seed=config.seed)
-
-
-def table_arms(config: Config, book: Book) -> dict[str, list[float]]:
-    """Print one table; returns shares by method."""
+def table_arms(config: Config) -> Grid:
+    """Shares by method."""
     videos, actions, people = arm_raises()
     lines, shown = {}, {}
     for method in config.methods:
@@ -231,12 +201,11 @@ def table_arms(config: Config, book: Book) -> dict[str, list[float]]:
         Row("arm raises", "videos recognized", first[0] * len(videos), GOALS_ARMS[0]),
         Row("arm raises", "moving frames", first[1], GOALS_ARMS[1]),
     ]
-    book.grid("Arm raises, from one person to the other", ["videos", "moving frames", "least margin", "CPU seconds"], lines, rows)
-    return shown
+    return Grid(["videos", "moving frames", "least margin", "CPU seconds"], lines, rows)
 
 
-def table_exercises(config: Config, book: Book) -> dict[str, list[float]]:
-    """Print one table; returns shares by method."""
+def table_exercises(config: Config) -> Grid:
+    """Shares by method."""
     note("... filming")
     streams = films(config.seed)
     shown, count = {}, 0
@@ -245,9 +214,19 @@ def table_exercises(config: Config, book: Book) -> dict[str, list[float]]:
         shown[NAMES.get(method, method)], count = exercises(contender(method, FILM_FPS), streams)
     first = shown[NAMES.get(config.methods[0], config.methods[0])]
     rows = [Row("exercises", f"turned {turn} degrees", first[k], GOALS_FILMS[k]) for k, turn in enumerate(TURNS)]
-    book.grid(f"Exercises on film, {count} frames, other person", [f"{turn}°" for turn in TURNS], shown, rows)
-    return shown
+    return Grid([f"{turn}°, {count} frames" for turn in TURNS], shown, rows)
 
 
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.brightness_indexing")))
+@experiment(Config(), quick={"sets": ("arms",), "methods": ("ours",)})
+def tables(config: Config) -> Tables:
+    """Recordings of the folder DYNTORCH_DATA; the seed is that of textures, backgrounds and sensor noise of the films.
+
+    Raises:
+        ValueError: no data folder, a missing file, or no method.
+    """
+    if not config.methods:
+        raise ValueError("methods: give at least one")
+    if "arms" in config.sets:
+        yield "Arm raises, from one person to the other", table_arms(config)
+    if "exercises" in config.sets:
+        yield "Exercises on film, other person", table_exercises(config)

@@ -17,16 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import tyro
 from scipy.signal import find_peaks
 
-from experiments.common.book import Book
-from experiments.common.tables import Row, command, note
-from experiments.common.timing import threads
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip, PhaseIndexer
 from indexing.actors import ACTIONS, Person, dataset, detect, perform, stream
@@ -60,7 +57,7 @@ class RepeatedSet:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Repetitions of synthetic actors, counted."""
 
     people: tuple[int, ...] = (1, 3)
@@ -73,8 +70,6 @@ class Config:
     """First seed: parameters were chosen on seeds below 100."""
     actions: tuple[str, ...] = ACTIONS
     """Which actions."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/counting")
-    """Where tables (JSON) are written."""
 
 
 # ---- sets --------------------------------------------------------------------------------------------------------------
@@ -212,7 +207,7 @@ def within_one(errors: Array) -> list[float]:
     return [float(v) if any_known else np.nan for v, any_known in zip(right, np.atleast_1d(known.any(axis=0)), strict=True)]
 
 
-def tables(found: dict[tuple[str, Kind, int], Array], people: int, book: Book) -> None:
+def learned_from(found: dict[tuple[str, Kind, int], Array], people: int) -> Tables:
     """Shares counted to within one, by kind and view and by action, and the mean absolute errors."""
     who = "one person" if people == 1 else f"{people} people"
     shares, off = {}, {}
@@ -226,8 +221,8 @@ def tables(found: dict[tuple[str, Kind, int], Array], people: int, book: Book) -
             mean = np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
             shares[name], off[name] = within_one(errors), mean.tolist()
             rows.append(Row(name, f"counted within one, learned from {who}", shares[name][WAYS.index("counted")], GOAL))
-    book.grid(f"share of the sets counted to within one, learned from {who}", WAYS, shares, rows)
-    book.grid(f"mean absolute error, learned from {who}", WAYS, off)
+    yield f"share of the sets counted to within one, learned from {who}", Grid(WAYS, shares, rows)
+    yield f"mean absolute error, learned from {who}", Grid(WAYS, off)
     each = {
         f"{action}, {turn}°": [
             within_one(np.concatenate([found[action, kind, turn] for kind in KINDS if (action, kind, turn) in found])[:, :-1])[k]
@@ -237,27 +232,19 @@ def tables(found: dict[tuple[str, Kind, int], Array], people: int, book: Book) -
         for action in dict.fromkeys(action for action, _, _ in found)
         for turn in TURNS
     }
-    book.grid(f"by action, learned from {who}", ["counted", "counted, true events", "events of other labels"], each)
+    yield f"by action, learned from {who}", Grid(["counted", "counted, true events", "events of other labels"], each)
 
 
-def run(config: Config) -> None:
-    """Print the tables, write the file.
+@experiment(Config(), quick={"people": (1,), "seeds": 1, "actions": ACTIONS[:2]})
+def tables(config: Config) -> Tables:
+    """Repetitions of synthetic actors, counted.
 
     Raises:
-        ValueError: nothing to repeat, nobody to learn from, or an action that actors do not know.
+        ValueError: an action that actors do not know.
     """
-    if min(config.sets, config.seeds, *config.people) < 1:
-        raise ValueError(f"sets, seeds and people must be at least 1, got {config.sets}, {config.seeds} and {config.people}")
     unknown = [action for action in config.actions if action not in ACTIONS]
     if unknown or len(config.actions) < 2:
         raise ValueError(f"actions: give two or more of {', '.join(ACTIONS)}, got {', '.join(config.actions)}")
-    book = Book(config.out)
-    with threads(1):
-        for people in config.people:
-            note(f"... learned from {people}")
-            tables(measure(config, people), people, book)
-    book.close(vars(config), seed=config.first)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.counting")))
+    for people in config.people:
+        note(f"... learned from {people}")
+        yield from learned_from(measure(config, people), people)

@@ -22,22 +22,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
-import tyro
 
-from experiments.common.book import Book
-from experiments.common.tables import command, note
-from experiments.common.timing import threads
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import note
 from experiments.recognition import protocol
 from experiments.recognition.contenders import NAMES, Method, Part, check_methods, sliding
 from experiments.recognition.detection_metrics import edit_score, f1, mean_average_precision, segments
 from experiments.recognition.protocol import Array
 from indexing import Clip
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
-from indexing.report import pictures
 from indexing.scoring import Event, events
 
 SETS = Literal["utkinect", "utkinect, evenly", "florence3d", "exercises", "actors"]
@@ -80,7 +76,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Untrimmed detection on the exercise streams of the folder DYNTORCH_DATA and on synthetic actors."""
 
     sets: tuple[SETS, ...] = ("utkinect", "utkinect, evenly", "florence3d", "exercises", "actors")
@@ -97,8 +93,6 @@ class Config:
     """Actions in each of them."""
     seeds: int = 1
     """Repetitions with other noise, cameras, and actors."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/detection")
-    """Where tables (JSON) and pictures are written."""
 
 
 # ---- recordings --------------------------------------------------------------------------------------------------------
@@ -218,15 +212,6 @@ def evaluate(tasks: Sequence[Task], method: Method, seed: int, without: Part | N
     return {(turn, reading): figures(answers[turn], reading) for turn in turns for reading in READINGS}
 
 
-def timeline(task: Task, turn: int, method: Method) -> bytes:
-    """Picture of the scores of the first recording over time, with what was found and what is true."""
-    learned: Any = sliding(method).fit(task.clips, task.labels)
-    one = task.asked[turn][0]
-    scores, found = learned.scan(one.clip)
-    known = [(each.label, each.start, each.end) for each in one.truth]
-    return pictures.timeline(one.clip.times, scores, learned.classes_.tolist(), found, known)
-
-
 def tasks_of(name: SETS, config: Config, seed: int) -> list[Task]:
     """The tasks of one set."""
     if name == "exercises":
@@ -236,37 +221,26 @@ def tasks_of(name: SETS, config: Config, seed: int) -> list[Task]:
     return joined_tasks(name.split(",")[0], name.endswith("evenly"), config.longest, seed)
 
 
-def run(config: Config) -> None:
-    """Print the tables, draw the pictures, write the file.
+@experiment(Config(), quick={"sets": ("actors",), "methods": ("equal",), "parts": (), "streams": 1, "actions": 3})
+def tables(config: Config) -> Tables:
+    """Every set at every turn of the camera.
 
     Raises:
-        ValueError: no data folder though exercises are asked for, nothing to repeat, or a method that cannot be made.
+        ValueError: no data folder though recordings are asked for, or a method that cannot be made.
     """
-    if min(config.seeds, config.streams, config.actions) < 1:
-        raise ValueError(f"seeds, streams and actions must be at least 1, got {config.seeds}, {config.streams}, {config.actions}")
     check_methods(config.methods)
-    files = {"utkinect": "utkinect", "utkinect, evenly": "utkinect", "florence3d": "florence3d", "exercises": "mocap6_exercises"}
-    inputs = [protocol.data_folder() / f"{file}.npz" for file in sorted({files[name] for name in config.sets if name in files})]
-    book = Book(config.out)
     for name in config.sets:
         tasks = [tasks_of(name, config, seed) for seed in range(config.seeds)]
         ways: dict[str, tuple[Method, Part | None]] = {NAMES[method]: (method, None) for method in config.methods}
         ways |= {f"ours without {part}": ("equal", part) for part in config.parts}
         found = {}
-        with threads(1):
-            for title, (method, part) in ways.items():
-                note(f"... {name}, {title}")
-                found[title] = [evaluate(each, method, seed, part) for seed, each in enumerate(tasks)]
+        for title, (method, part) in ways.items():
+            note(f"... {name}, {title}")
+            found[title] = [evaluate(each, method, seed, part) for seed, each in enumerate(tasks)]
         for turn in tasks[0][0].asked:
             lines = {
                 f"{title}, {reading}": np.mean([one[turn, reading] for one in found[title]], axis=0).tolist()
                 for reading in READINGS
                 for title in ways
             }
-            book.grid(f"{name}, camera turned {turn} degrees", COLUMNS, lines)
-            book.picture(f"{name.replace(', ', '_')}_{turn}", timeline(tasks[0][0], turn, config.methods[0]))
-    book.close(vars(config), inputs, seed=config.seeds)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.detection")))
+            yield f"{name}, camera turned {turn} degrees", Grid(COLUMNS, lines)

@@ -12,17 +12,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
-from pathlib import Path
-from typing import Annotated, cast
+from typing import cast
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from dyntorch.invariants.dynamic_shape_tensor import DynamicShapeTensor, Form
 from dyntorch.shapes.basis import Fourier, Polynomial, Trajectory, reference_plane_rows, six_point_rows
-from experiments.common.tables import NoiseConfig, Row, command, measured_on_one_thread
+from experiments.common.runner import SceneConfig, Tables, experiment
+from experiments.common.tables import Row
 
 PROTOTYPE = {5: 0.027, 8: 0.008, 14: 0.005}
 """Points to median error of t on [-1, 1], four basis points."""
@@ -44,16 +43,6 @@ TRAJECTORIES: dict[str, Trajectory] = {
 
 
 @dataclass(frozen=True)
-class Config(NoiseConfig):
-    """What is measured."""
-
-    scenes: int = 60
-    """Scenes per cell."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/dynamic_shape.json")
-    """Where the results and this configuration are written as JSON."""
-
-
-@dataclass(frozen=True)
 class Views:
     """Single views ``(scenes, frames + VIEWS, n, 2)`` of moving points, and their times; the last ones are to be dated."""
 
@@ -72,7 +61,7 @@ class Views:
         return self.x[:, self.frames :].unbind(-2)
 
 
-def views(config: NoiseConfig, trajectory: Trajectory, n: int, *, noise: float = NOISE, frames: int = FRAMES) -> Views:
+def views(config: SceneConfig, trajectory: Trajectory, n: int, *, noise: float = NOISE, frames: int = FRAMES) -> Views:
     """Random scenes; polynomial trajectories on [-1, 1], periodic ones over the period."""
     g = torch.Generator().manual_seed(config.seed)
     total, scenes = frames + VIEWS, config.scenes
@@ -113,7 +102,7 @@ def row(task: str, setting: str, value: float, goal: float | None = None) -> Row
     return Row(task, setting, 1e3 * value, None if goal is None else 1e3 * goal, at_most=True, unit="e-3")
 
 
-def times(config: Config) -> list[Row]:
+def times(config: SceneConfig) -> list[Row]:
     """Constant velocity beside the prototype, and other trajectories."""
     rows = []
     for name, trajectory in TRAJECTORIES.items():
@@ -128,7 +117,7 @@ def times(config: Config) -> list[Row]:
     return rows
 
 
-def noises(config: Config) -> list[Row]:
+def noises(config: SceneConfig) -> list[Row]:
     """Against the noise, 14 points of constant velocity."""
     values = (0.0, 0.01, 0.05) if config.quick else (0.0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
     found = [(noise, views(config, Polynomial(1), 14, noise=noise)) for noise in values]
@@ -137,7 +126,7 @@ def noises(config: Config) -> list[Row]:
     ]
 
 
-def frames(config: Config) -> list[Row]:
+def frames(config: SceneConfig) -> list[Row]:
     """Against the number of frames, 14 points of constant velocity, noise 1 %."""
     values = (10, 40) if config.quick else (7, 8, 10, 15, 20, 40, 80, 160)
     found = [(frames, views(config, Polynomial(1), 14, frames=frames)) for frames in values]
@@ -156,12 +145,12 @@ def least(rows: Tensor, wanted: int) -> int:
     raise AssertionError
 
 
-def counts(config: Config) -> list[Row]:
+def counts(config: SceneConfig) -> list[Row]:
     """Least numbers of frames, from ranks."""
     rows = []
     for (form, n), goal in LEAST.items():
         size = (n - 2) // 3 if form == "span" else 2
-        one = views(NoiseConfig(scenes=1, seed=config.seed), Polynomial(size - 1), n, noise=0.0)
+        one = views(SceneConfig(scenes=1, seed=config.seed), Polynomial(size - 1), n, noise=0.0)
         kind = DynamicShapeTensor(Polynomial(size - 1), form=form)
         invariant, measured = kind.bind_arguments(one.seen, times=one.times[:, : one.frames])
         found = least(invariant.primitives[0].vectors(measured[0])[0], invariant.width() - invariant.nullity)
@@ -184,17 +173,10 @@ def _images(start: Tensor, velocity: Tensor, t: Tensor, cameras: Tensor) -> Tens
     return points[..., :2] / points[..., 2:]
 
 
-TABLES = {"times": times, "noise": noises, "frames": frames, "counts": counts}
-
-
-def run() -> None:
-    """Print the tables."""
-    config = tyro.cli(Config, description=__doc__)
-    if config.quick:
-        config = Config(scenes=min(config.scenes, 10), quick=True, seed=config.seed, out=config.out)
-    config.target()
-    measured_on_one_thread(TABLES, config, config.out)
-
-
-if __name__ == "__main__":
-    command(run)
+@experiment(SceneConfig(scenes=60), quick={"scenes": 10})
+def tables(config: SceneConfig) -> Tables:
+    """Times of single views, by trajectory, noise and number of frames; and the least numbers."""
+    yield "times", times(config)
+    yield "noise", noises(config)
+    yield "frames", frames(config)
+    yield "counts", counts(config)

@@ -18,15 +18,14 @@ from collections import defaultdict
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score
 
-from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition.gait_data import OTHERS, Frames, Split, split, walks
 from indexing.phase.indexer import PhaseIndexer
 
@@ -37,7 +36,7 @@ ZERO = 12  # training clips that the zero of phases is taken from
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Walking from single frames, on the recordings in the folder DYNTORCH_DATA."""
 
     takes: tuple[str, ...] = ()
@@ -48,8 +47,6 @@ class Config:
     """Repetitions with other cameras and noise."""
     noise: float = 0.02
     """m: on every 3D joint coordinate."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/gait.json")
-    """Where the results are written as JSON; the picture goes beside it."""
 
 
 @dataclass
@@ -191,7 +188,7 @@ def judge(answer: Answer, data: Split) -> tuple[float, float, float]:
 
 def table(config: Config, views: int) -> list[Row]:
     """All methods, with so many views per training take."""
-    takes = config.takes or tuple(walks())
+    takes = config.takes or tuple(walks())[: 1 if config.quick else None]
     figures: dict[str, Figures] = defaultdict(Figures)
     for take in takes:
         for seed in range(config.seeds):
@@ -207,46 +204,8 @@ def table(config: Config, views: int) -> list[Row]:
     return [row for name, reached in figures.items() for row in reached.rows(name, setting, name == OURS)]
 
 
-def picture(config: Config) -> None:
-    """Recovered phase over time, frame by frame, of every walking take (results/ only: other people's data)."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from experiments.alignment.real.pictures import LINES, save
-
-    takes = list(config.takes or walks())
-    figure, axes = plt.subplots(len(takes), 1, figsize=(12, 1.8 * len(takes)), squeeze=False, layout="constrained")
-    for axis, take in zip(axes[:, 0], takes, strict=True):
-        data = split(take, config.views[0], 0, config.noise)
-        answer = asked(learn(data, given=True))
-        start = 0.0
-        for clip in [clip for clip in data.test if clip.label == "walk"][:8]:
-            seconds = start + clip.clip.times
-            axis.plot(seconds, clip.phase % 1.0, ".", color="#c9ced6", markersize=7)
-            axis.plot(seconds, answer(clip)[1], ".", color=LINES[1], markersize=3)
-            axis.axvline(start, color="#c9ced6", linewidth=0.5)
-            start = float(seconds[-1]) + 0.05
-        axis.set_title(
-            f"{take}: phase from single frames (blue), from the ankles in 3D (grey); a new camera at every line", fontsize=8
-        )
-        axis.set_ylim(0, 1)
-    target = config.out.expanduser().with_suffix(".png")
-    save(figure, target)
-    note(f"written: {target}")
-
-
-def main() -> None:
-    """Print the tables and draw the picture."""
-    config = tyro.cli(Config, description=Config.__doc__)
-    tables: dict[str, Callable[[Config], list[Row]]] = {
-        f"walking against {', '.join(OTHERS)}; {views} view(s) per take": lambda c, v=views: table(c, v)  # type: ignore[misc]
-        for views in config.views
-    }
-    measured_on_one_thread(tables, config, config.out)
-    picture(config)
-
-
-if __name__ == "__main__":
-    command(main)
+@experiment(Config(), quick={"views": (1,)})
+def tables(config: Config) -> Tables:
+    """All methods, by views per training take; quick: the first take."""
+    for views in config.views:
+        yield f"walking against {', '.join(OTHERS)}; {views} view(s) per take", table(config, views)

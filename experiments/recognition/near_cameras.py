@@ -12,20 +12,18 @@ degrees, 15 mm of noise: ``ActionIndexer`` as it is, and the nearest exemplar by
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 from torch import Tensor
 
 from dyntorch.numerics import canonical_correlation, orthonormal_basis
-from experiments.common.tables import Row, command, measured_on_one_thread, note
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition import gait
 from experiments.recognition.gait_data import Split, split, walks
 from experiments.recognition.protocol import ELEVATION, SPREAD, leave_one_subject_out, load_set
@@ -42,7 +40,7 @@ TURNS = (45, 90)
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """People near the camera, on the recordings in the folder DYNTORCH_DATA."""
 
     distances: tuple[float, ...] = (2.0, 3.0, 4.5, 10.0)
@@ -51,10 +49,6 @@ class Config:
     """Walking takes that are asked, one at a time."""
     subjects: int = 5
     """Of UTKinect."""
-    seed: int = 0
-    """Of cameras and noise."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/near_cameras.json")
-    """Where the results are written as JSON."""
 
 
 def followed(clip: Clip) -> Clip:
@@ -163,15 +157,8 @@ def fundamental(query: Tensor, bank: Tensor) -> Tensor:
     return torch.linalg.eigvalsh(moments[..., place[i[:, None], i], place[j[:, None], j]])[..., 0]
 
 
-def main() -> None:
-    """Print the tables."""
-    config = tyro.cli(Config, description=Config.__doc__)
-    tables: dict[str, Callable[[Config], list[Row]]] = {
-        "phase of single frames, walking against five other actions; learned from 4.5 m": phases,
-        "actions of whole clips, UTKinect, one exemplar view at 4.5 m": actions,
-    }
-    measured_on_one_thread(tables, config, config.out)
-
-
-if __name__ == "__main__":
-    command(main)
+@experiment(Config(), quick={"distances": (4.5,), "takes": 1, "subjects": 2})
+def tables(config: Config) -> Tables:
+    """Frames, then clips."""
+    yield "phase of single frames, walking against five other actions; learned from 4.5 m", phases(config)
+    yield "actions of whole clips, UTKinect, one exemplar view at 4.5 m", actions(config)

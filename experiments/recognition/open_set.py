@@ -17,17 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import tyro
 from sklearn.metrics import roc_auc_score
 
-from experiments.common.book import Book
-from experiments.common.plots import curves
-from experiments.common.tables import command, note
-from experiments.common.timing import threads
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import note
 from experiments.recognition import protocol
 from experiments.recognition.contenders import NAMES, OPTIONS, Method, check_methods, contender
 from experiments.recognition.novelty import ways
@@ -39,7 +35,7 @@ NONE = "(none)"
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Unknown actions, on recordings in the folder DYNTORCH_DATA."""
 
     sets: tuple[Literal["utkinect", "florence3d"], ...] = ("utkinect", "florence3d")
@@ -56,8 +52,6 @@ class Config:
     """Repetitions: every class is held out once in each."""
     ways: bool = True
     """Whether other ways to tell unknown actions are compared (:mod:`experiments.recognition.novelty`)."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/open_set")
-    """Where tables (JSON) and pictures are written."""
 
 
 @dataclass
@@ -154,7 +148,7 @@ def rates(answers: Answers, wanted: Sequence[float]) -> list[tuple[float, float,
     ]
 
 
-def tables(name: str, config: Config, book: Book) -> None:
+def unknown_actions(name: str, config: Config) -> Tables:
     """Measure one set."""
     found = {}
     for method in config.methods:
@@ -162,44 +156,26 @@ def tables(name: str, config: Config, book: Book) -> None:
         found[method] = ask(name, method, config)
     areas = {turn: {k: v for method in config.methods for k, v in auroc(found[method][turn]).items()} for turn in config.turns}
     lines = {kind: [areas[turn][kind] for turn in config.turns] for kind in areas[config.turns[0]]}
-    book.grid(f"{name}, AUROC of known against unknown", [f"{turn}°" for turn in config.turns], lines)
-    lines, panels = {}, {}
+    yield f"{name}, AUROC of known against unknown", Grid([f"{turn}°" for turn in config.turns], lines)
+    lines = {}
     for method in (method for method in config.methods if method in OPTIONS):
         for turn in config.turns:
             got = rates(found[method][turn], config.rates)
             for rate, (alarms, kept, right) in zip(config.rates, got, strict=True):
                 lines[f"{NAMES[method]}, {turn}°, asked {rate:g}"] = [alarms, kept, right]
-            panels[f"{name}, {NAMES[method]}, {turn}°"] = {
-                "false alarms got": (config.rates, [one[0] for one in got]),
-                "known clips, accepted": (config.rates, [one[1] for one in got]),
-                "known clips, right": (config.rates, [one[2] for one in got]),
-                "as asked": (config.rates, config.rates),
-            }
     if lines:
-        book.grid(f"{name}, false alarms", ["false alarms got", "known accepted", "known right"], lines)
-        book.picture(f"rates_{name}", curves(panels, "false-alarm rate asked for", "share", bottom=0.0))
+        yield f"{name}, false alarms", Grid(["false alarms got", "known accepted", "known right"], lines)
 
 
-def run(config: Config) -> None:
-    """Print the tables, draw the pictures, write the file.
+@experiment(Config(), quick={"sets": ("florence3d",), "methods": ("equal",), "turns": (0,), "ways": False})
+def tables(config: Config) -> Tables:
+    """Known against unknown actions, and false alarms.
 
     Raises:
-        ValueError: no data folder, nothing held out or too much, a rate that is none, or a method that cannot be made.
+        ValueError: no data folder, too much held out, a rate that is none, or a method that cannot be made.
     """
-    if config.draws < 1 or not 1 <= config.held_out <= 7:
-        raise ValueError(f"draws must be at least 1 and held-out 1 to 7, got draws={config.draws}, held-out={config.held_out}")
-    if not config.rates or not all(0 < rate < 1 for rate in config.rates):
-        raise ValueError(f"rates must be between 0 and 1, at least one, got {config.rates}")
-    if not config.turns or not config.sets:
-        raise ValueError("turns and sets must name at least one each")
+    if config.held_out > 7 or not config.rates or not all(0 < rate < 1 for rate in config.rates):
+        raise ValueError(f"held-out must be 1 to 7, rates between 0 and 1, got {config.held_out} and {config.rates}")
     check_methods(config.methods)
-    folder = protocol.data_folder()
-    book = Book(config.out)
-    with threads(1):
-        for name in config.sets:
-            tables(name, config, book)
-    book.close(vars(config), [folder / f"{name}.npz" for name in config.sets], seed=config.draws)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.open_set")))
+    for name in config.sets:
+        yield from unknown_actions(name, config)

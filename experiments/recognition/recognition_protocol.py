@@ -17,23 +17,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import tyro
-from sklearn.metrics import confusion_matrix
 
-from experiments.common.book import Book
-from experiments.common.plots import curves, heat
-from experiments.common.tables import Row, command, note
-from experiments.common.timing import threads
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition import protocol
 from experiments.recognition.action_recognition import FILES, TITLES
 from experiments.recognition.contenders import NAMES, OPTIONS, Method, check_methods, contender
 from experiments.recognition.protocol import TURNS, Array, Classifier, Rendered
 from indexing import Clip
-from indexing.report import pictures
 
 Table = Literal["cross-subject", "cross-view", "few-shot", "jhmdb"]
 FOLDS = 5
@@ -45,7 +39,7 @@ GOALS_FEW = {1: 0.80, 2: 0.87, 5: 0.93}
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """The protocol of recognition, on recordings in the folder DYNTORCH_DATA."""
 
     tables: tuple[Table, ...] = ("cross-subject", "cross-view", "few-shot", "jhmdb")
@@ -60,8 +54,6 @@ class Config:
     """Choices of the few examples, each with other noise and cameras."""
     examples: tuple[int, ...] = (1, 2, 5, 10)
     """Per class."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/recognition_protocol")
-    """Where tables (JSON) and pictures are written."""
 
 
 Make = Callable[[], Classifier]
@@ -78,8 +70,8 @@ def answers(make: Make, rendered: Rendered) -> Array:
     return out
 
 
-def cross_subject(name: str, config: Config, book: Book) -> None:
-    """Accuracy by turn, and the confusions of the first method."""
+def cross_subject(name: str, config: Config) -> tuple[str, Grid]:
+    """Accuracy by turn."""
     clips = protocol.load_set(FILES[name])
     found: dict[Method, list[Array]] = {method: [] for method in config.methods}
     for seed in range(config.seeds):
@@ -94,12 +86,7 @@ def cross_subject(name: str, config: Config, book: Book) -> None:
         for k, turn in enumerate(TURNS)
     ]
     lines = {NAMES[method]: [*value.tolist(), float(value.mean())] for method, value in right.items()}
-    book.grid(f"{TITLES[name]}, other people", [*(f"{turn}°" for turn in TURNS), "mean"], lines, rows)
-    classes = np.unique(clips.labels)
-    said = np.concatenate([one.reshape(-1) for one in found[first]])
-    true = np.tile(clips.labels, len(said) // len(clips))
-    counts = confusion_matrix(true, said, labels=classes)
-    book.picture(f"confusion_{name}", pictures.confusion(counts, classes.tolist()))
+    return "other people", Grid([*(f"{turn}°" for turn in TURNS), "mean"], lines, rows)
 
 
 def cameras(
@@ -114,7 +101,7 @@ def cameras(
     return sources, exemplars, queries, clips.labels, protocol.merged(clips.column("subject"), FOLDS)
 
 
-def cross_view(name: str, config: Config, book: Book) -> None:
+def cross_view(name: str, config: Config) -> tuple[str, Grid]:
     """Accuracy from every camera (row) to every other (column)."""
     found: dict[Method, list[Array]] = {method: [] for method in config.methods}
     sources: dict[str, list[int]] = {}
@@ -131,14 +118,12 @@ def cross_view(name: str, config: Config, book: Book) -> None:
                     said = np.asarray(learned.predict(asked)).reshape(len(AZIMUTHS), len(test))
                     table[row] += np.sum(said == labels[test], axis=1) / len(labels)
             found[method].append(table)
-    tables = {NAMES[method]: np.mean(values, axis=0) for method, values in found.items()}
-    lines = {f"{method}, learned at {row}": table[i].tolist() for method, table in tables.items() for i, row in enumerate(sources)}
-    book.grid(f"{TITLES[name]}, other people, from camera to camera", [f"{turn}°" for turn in AZIMUTHS], lines)
-    down, across = list(sources), [f"{turn}°" for turn in AZIMUTHS]
-    book.picture(f"cross_view_{name}", heat(tables, down, across, ("learned from", "asked from")))
+    shares = {NAMES[method]: np.mean(values, axis=0) for method, values in found.items()}
+    lines = {f"{method}, learned at {row}": table[i].tolist() for method, table in shares.items() for i, row in enumerate(sources)}
+    return "other people, from camera to camera", Grid([f"{turn}°" for turn in AZIMUTHS], lines)
 
 
-def few_shot(name: str, config: Config, book: Book) -> None:
+def few_shot(name: str, config: Config) -> tuple[str, Grid]:
     """Accuracy against the number of examples per class, mean over the turns."""
     clips = protocol.load_set(FILES[name])
     found = {method: np.zeros((config.draws, len(config.examples))) for method in config.methods}
@@ -157,12 +142,10 @@ def few_shot(name: str, config: Config, book: Book) -> None:
         for k, count in enumerate(config.examples)
         if name == "utkinect"
     ]
-    book.grid(f"{TITLES[name]}, examples per class", config.examples, lines, goals)
-    panels = {TITLES[name]: {method: (config.examples, value) for method, value in lines.items()}}
-    book.picture(f"few_shot_{name}", curves(panels, "examples per class", "accuracy, mean of the turns", ticks=True))
+    return "examples per class", Grid(config.examples, lines, goals)
 
 
-def jhmdb(config: Config, book: Book) -> None:
+def jhmdb(config: Config) -> Grid:
     """Official splits."""
     clips = protocol.load_set(FILES["jhmdb"])
     found = {}
@@ -176,30 +159,21 @@ def jhmdb(config: Config, book: Book) -> None:
     lines = {NAMES[method]: [*values, float(np.mean(values))] for method, values in found.items()}
     first = config.methods[0]
     row = Row("JHMDB", f"{NAMES[first]}, mean of 3 splits", float(np.mean(found[first])), GOAL_JHMDB)
-    book.grid("JHMDB, official splits", ["split 1", "split 2", "split 3", "mean"], lines, [row])
+    return Grid(["split 1", "split 2", "split 3", "mean"], lines, [row])
 
 
-def run(config: Config) -> None:
-    """Print the tables, draw the pictures, write the file.
+@experiment(Config(), quick={"tables": ("cross-subject",), "sets": ("florence3d",), "methods": ("equal",)})
+def tables(config: Config) -> Tables:
+    """Every table on every set.
 
     Raises:
-        ValueError: no data folder, a missing file, nothing to repeat, or a method that cannot be made.
+        ValueError: no data folder, a missing file, or a method that cannot be made.
     """
-    if min(config.seeds, config.draws, *config.examples) < 1:
-        raise ValueError(f"seeds, draws and examples must be at least 1, got {config.seeds}, {config.draws}, {config.examples}")
     check_methods(config.methods)
-    folder = protocol.data_folder()
-    book = Book(config.out)
-    tables = {"cross-subject": cross_subject, "cross-view": cross_view, "few-shot": few_shot}
-    names = list(config.sets) + ["jhmdb"] * ("jhmdb" in config.tables)
-    with threads(1):
-        for table in config.tables:
-            for name in config.sets if table in tables else ():
-                tables[table](name, config, book)
-        if "jhmdb" in config.tables:
-            jhmdb(config, book)
-    book.close(vars(config), [folder / f"{FILES[name]}.npz" for name in names], seed=config.seeds)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.recognition_protocol")))
+    for kind in config.tables:
+        if kind == "jhmdb":
+            yield "JHMDB, official splits", jhmdb(config)
+            continue
+        for name in config.sets:
+            title, table = {"cross-subject": cross_subject, "cross-view": cross_view, "few-shot": few_shot}[kind](name, config)
+            yield f"{TITLES[name]}, {title}", table

@@ -15,16 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import tyro
 
-from experiments.common.book import Book
-from experiments.common.plots import curves
-from experiments.common.tables import Row, command, note
-from experiments.common.timing import threads
+from experiments.common.runner import BaseConfig, Grid, Tables, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition import protocol
 from experiments.recognition.contenders import NAMES, Method, check_methods, contender
 from experiments.recognition.corruptions import KINDS
@@ -44,7 +40,7 @@ ASKED = {
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Accuracy against the corruption of queries, on recordings in the folder DYNTORCH_DATA."""
 
     data: Literal["utkinect", "florence3d"] = "utkinect"
@@ -55,8 +51,6 @@ class Config:
     """Which methods; the goals are those of the first."""
     seeds: int = 2
     """Repetitions with other noise, cameras and corruptions."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/robustness")
-    """Where tables (JSON) and pictures are written."""
 
 
 def corrupted(rendered: Rendered, kind: str, amount: float, seed: int) -> dict[int, tuple[Clip, ...]]:
@@ -104,21 +98,18 @@ def losses(kind: str, found: Array) -> list[Row]:
     return [Row("loss of accuracy", f"{kind}: {ASKED[kind]:g}", float(lost.mean()), LOSS, spread, at_most=True)]
 
 
-def run(config: Config) -> None:
-    """Print the tables, draw the curves, write the file.
+@experiment(Config(), quick={"kinds": tuple(KINDS)[:1], "methods": ("equal",), "seeds": 1})
+def tables(config: Config) -> Tables:
+    """A table per kind of corruption.
 
     Raises:
-        ValueError: no data folder, an unknown kind, nothing to repeat, or a method that cannot be made.
+        ValueError: no data folder, an unknown kind, or a method that cannot be made.
     """
     unknown = [kind for kind in config.kinds if kind not in KINDS]
-    if unknown or not config.kinds or config.seeds < 1:
-        raise ValueError(
-            f"kinds must be some of {', '.join(map(repr, KINDS))} and seeds at least 1, got {config.kinds}, {config.seeds}"
-        )
+    if unknown or not config.kinds:
+        raise ValueError(f"kinds must be some of {', '.join(map(repr, KINDS))}, got {config.kinds}")
     check_methods(config.methods)
-    book = Book(config.out)
-    with threads(1):
-        found = measure(protocol.load_set(config.data), config)
+    found = measure(protocol.load_set(config.data), config)
     for kind in config.kinds:
         _, unit, amounts = KINDS[kind]
         lines = {
@@ -126,16 +117,5 @@ def run(config: Config) -> None:
             for method, one in found.items()
             for k, turn in enumerate(TURNS)
         }
-        book.grid(f"{kind} ({unit})", [f"{amount:g}" for amount in amounts], lines, losses(kind, found[config.methods[0]][kind]))
-    for k, turn in enumerate(TURNS):
-        panels = {
-            kind: {NAMES[method]: (KINDS[kind][2], one[kind].mean(axis=0)[:, k].tolist()) for method, one in found.items()}
-            for kind in config.kinds
-        }
-        words = [KINDS[kind][1] for kind in config.kinds]
-        book.picture(f"robustness_{turn}", curves(panels, words, f"accuracy, turned {turn} degrees"))
-    book.close(vars(config), [protocol.data_folder() / f"{config.data}.npz"], seed=config.seeds)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.robustness")))
+        rows = losses(kind, found[config.methods[0]][kind])
+        yield f"{kind} ({unit})", Grid([f"{amount:g}" for amount in amounts], lines, rows)

@@ -12,16 +12,12 @@ without the tensor.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
 
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
-from experiments.common.tables import NoiseConfig, command, noise_tables
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
 from experiments.thesis.definitions import cameras, homogeneous, mapped, normal, seeded
 
 SETTINGS: tuple[tuple[str, int, int], ...] = (
@@ -41,18 +37,6 @@ TURN = 1.0
 DIFFERENCE = 0.15
 """Of each coordinate, between both shapes, where the shapes have standard deviation 1."""
 HEAD = ("form", "points", "views", "noise px", "right", "score of the shape px", "of another px", "nearest view right")
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Static shape tensors over the points, the views and the noise."""
-
-    scenes: int = 40
-    """Scenes per cell."""
-    quick: bool = False
-    """Only noise of 0.5 pixels, 20 scenes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/shape_tensor.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def shape(form: str, n: int, draw: torch.Generator) -> Tensor:
@@ -108,14 +92,9 @@ def line(form: str, n: int, views: int, sigma: float, scenes: int, seed: int) ->
     return form, str(n), str(views), f"{sigma:g}", f"{shares[0]:.2f}", f"{middle[0]:.2g}", f"{middle[1]:.2g}", f"{shares[1]:.2f}"
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
-    scenes = min(config.scenes, 20) if config.quick else config.scenes
+@experiment(SceneConfig(scenes=40), quick={"scenes": 20})
+def tables(config: SceneConfig) -> Tables:
+    """Static shape tensors over the points, the views and the noise."""
     noises = (0.5,) if config.quick else NOISES
-    lines = [(*setting, sigma) for setting in SETTINGS for sigma in noises]
-    title = f"one new image, {scenes} shapes a row"
-    noise_tables({title: lambda: (HEAD, [line(*setting, scenes, config.seed) for setting in lines])}, config)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.recognition.shape_tensor")))
+    lines = [line(*setting, sigma, config.scenes, config.seed) for setting in SETTINGS for sigma in noises]
+    yield f"one new image, {config.scenes} shapes a row", Words(HEAD, lines)

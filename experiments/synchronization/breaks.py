@@ -12,19 +12,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
-from typing import Annotated
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 import dyntorch as dyn
 from experiments.calibration.rigs import Motion, RigSpec, motions, virtual_rig
-from experiments.common.tables import NoiseConfig, command, noise_tables
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
 
 FPS, FRAMES = 30.0, 600
 CHANGES = (0, 1, 2, 3, 6, 12, -2, -6)
@@ -32,26 +28,14 @@ CHANGES = (0, 1, 2, 3, 6, 12, -2, -6)
 HEAD = ("broken", "takes", "right", "another count", "none told", "refused", "moment, s (worst)", "processor s")
 
 
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Broken clocks."""
-
-    scenes: int = 10
-    """Takes per line; four times as many where nothing broke."""
-    quick: bool = False
-    """Two takes per line."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/breaks.json")
-    """Where the results and this configuration are written as JSON."""
-
-
 def broken(x: Tensor, at: int, lost: int) -> Tensor:
     """A recording ``(frames, n, 2)`` without ``lost`` frames from ``at`` on, or with so many of those before it twice."""
     return torch.cat([x[:at], x[at + lost :]])
 
 
-def line(lost: int, config: Config, bodies: Sequence[Motion]) -> Sequence[str]:
+def line(lost: int, config: SceneConfig, bodies: Sequence[Motion]) -> Sequence[str]:
     """A line of the table."""
-    takes = (2 if config.quick else config.scenes) * (1 if lost else 4)
+    takes = config.scenes * (1 if lost else 4)
     right = other = none = refused = 0
     away, seconds = [], []
     for k in range(takes):
@@ -75,11 +59,8 @@ def line(lost: int, config: Config, bodies: Sequence[Motion]) -> Sequence[str]:
     return name, str(takes), str(right), str(other), str(none), str(refused), told, f"{median(seconds):.1f}"
 
 
-def run(config: Config) -> None:
-    """Print the table, then write the file."""
+@experiment(SceneConfig(scenes=10), quick={"scenes": 2})
+def tables(config: SceneConfig) -> Tables:
+    """Broken clocks: so many takes per line, four times as many where nothing broke."""
     bodies = [body for body in motions() if len(body.joints) > 1.1 * FRAMES / FPS * body.fps]
-    noise_tables({"broken clocks": lambda: (HEAD, [line(lost, config, bodies) for lost in CHANGES])}, config)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.synchronization.breaks")))
+    yield "broken clocks", Words(HEAD, [line(lost, config, bodies) for lost in CHANGES])

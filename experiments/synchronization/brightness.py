@@ -18,16 +18,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from numpy.typing import NDArray
 
 from dyntorch import Shift
-from experiments.common.tables import NoiseConfig, Row, aligned, command, measured, note
-from experiments.common.timing import threads
+from experiments.common.runner import SceneConfig, Tables, Words, experiment
+from experiments.common.tables import Row, note
 from experiments.recognition.protocol import data_folder
 from indexing import Clip
 from indexing.actors import ACTIONS, Person, stream
@@ -44,19 +43,11 @@ CUTS = (0, 6, -9, 15, -20)  # frames cut off the start of b; negative: off a
 
 
 @dataclass(frozen=True)
-class Config(NoiseConfig):
+class Config(SceneConfig):
     """Synchronization of videos by brightness, on figures that move like the people in the folder DYNTORCH_DATA."""
 
-    scenes: int = 40
-    """Pairs of videos per set."""
-    quick: bool = False
-    """A quarter of the pairs."""
     measure: Measure = "profile"
     """The profile that the window kernel must confirm, or the thesis's window kernel alone."""
-    seed: int = 11
-    """Of the figures; 1 and 2 were used to choose constants."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/brightness_synchronization.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 class Pair(NamedTuple):
@@ -165,8 +156,7 @@ def figures(config: Config, name: str) -> list[Row]:
     """The rows of one set of figures."""
     _, kind, frames, noise, turn = next(each for each in SETS if each[0] == name)
     source = acted if kind == "actors" else captured(kind == "across")
-    count = max(2, config.scenes // 4) if config.quick else config.scenes
-    films = pairs(source, frames, noise, turn, 6.0 if kind == "across" else 3.4, count, config.seed)
+    films = pairs(source, frames, noise, turn, 6.0 if kind == "across" else 3.4, config.scenes, config.seed)
     measure = config.measure
     found = [shifted(p.a, p.b, measure) for p in films]
     hits = [right(s, p.shift) for s, p in zip(found, films, strict=True)]
@@ -177,8 +167,8 @@ def figures(config: Config, name: str) -> list[Row]:
     unrelated = sum(shifted(p.a, q.b, measure).ok for p, q in zip(films, others, strict=True) if q is not None)
     backwards = sum(shifted(p.a, p.b[::-1].copy(), measure).ok for p in films)
     errors = [s.frames - p.shift for s, p in zip(found, films, strict=True) if s.ok]
-    note(f"{name}: {count} pairs, error of the believed {np.sqrt(np.mean(np.square(errors or [np.nan]))):.2f} frames RMS")
-    setting = f"{count} pairs"
+    note(f"{name}: {config.scenes} pairs, error of the believed {np.sqrt(np.mean(np.square(errors or [np.nan]))):.2f} frames RMS")
+    setting = f"{config.scenes} pairs"
     goal = 0.95 if kind == "place" and turn == 60 and measure == "profile" else None
     return [
         Row("within 1 frame", setting, float(np.mean(hits)), goal),
@@ -199,7 +189,7 @@ def recorded(path: Path) -> tuple[NDArray[np.uint8], float]:
         return frames, float(file.streams.video[0].average_rate or FPS)
 
 
-def real_pair(config: Config) -> list[Row]:
+def real_pair(config: Config) -> tuple[Words, list[Row]]:
     """The two cameras of a recording, cut by known numbers of frames."""
     folder = data_folder() / "pose2sim"
     (a, rate_a), (b, rate_b) = (recorded(folder / name) for name in ("cam01.mp4", "cam02.mp4"))
@@ -210,9 +200,8 @@ def real_pair(config: Config) -> list[Row]:
         hit = right(shift, -cut)
         hits, believed, wrong = hits + hit, believed + shift.ok, wrong + (shift.ok and not hit)
         lines.append((str(-cut), f"{shift.frames:.2f}", "yes" if shift.ok else "no", shift.reason))
-    print(aligned(("true shift, frames", "found", "believed", "reason"), lines))
     setting = f"{len(cuts)} cuts"
-    return [
+    return Words(("true shift, frames", "found", "believed", "reason"), lines), [
         Row("within 1 frame", setting, hits / len(cuts)),
         Row("believed", setting, believed / len(cuts)),
         Row("wrong among the believed", setting, float(wrong), 0.0, at_most=True),
@@ -222,18 +211,11 @@ def real_pair(config: Config) -> list[Row]:
 REAL = "two cameras of a recording"
 
 
-def run(config: Config) -> None:
-    """Print the tables, then write the file.
-
-    Raises:
-        ValueError: no data folder, or a file that cannot be written.
-    """
-    data_folder()
-    target = config.target()
-    names = [*(each[0] for each in SETS), REAL]
-    with threads(1):
-        measured(names, lambda name: real_pair(config) if name == REAL else figures(config, name), target, vars(config))
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.synchronization.brightness")))
+@experiment(Config(scenes=40, seed=11), quick={"scenes": 10})
+def tables(config: Config) -> Tables:
+    """Sets of figures, and a recording; seeds 1 and 2 were used to choose constants."""
+    for name, *_ in SETS:
+        yield name, figures(config, name)
+    words, rows = real_pair(config)
+    yield f"{REAL}, cut by cut", words
+    yield REAL, rows

@@ -23,17 +23,15 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import fmean, median
-from typing import Annotated
 
 import numpy as np
 import torch
-import tyro
 from torch import Generator, Tensor
 
 import dyntorch as dyn
-from experiments.common.tables import Row, command, measured_on_one_thread
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.recognition.protocol import data_folder
 from experiments.synchronization.data import MOVING, RECORDED, SAME, Filming, Motion, draw, gaps, image, moving, played, seeded
 from experiments.synchronization.motions import periodic_motion, still_motion
@@ -56,22 +54,11 @@ WITHIN = 0.5
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """A camera against motion capture."""
 
     cases: int = 16
     """Virtual cases per table of people, of the markers a quarter of it, and trials per kind that is undecidable."""
-    quick: bool = False
-    """4 cases per table."""
-    seed: int = 0
-    """Of motions, cameras and noise."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/mocap_synchronization.json")
-    """Where the results and this configuration are written as JSON."""
-
-    @property
-    def count(self) -> int:
-        """Cases per table."""
-        return min(self.cases, 4) if self.quick else self.cases
 
 
 @dataclass(frozen=True)
@@ -163,11 +150,11 @@ def lifting() -> tuple[Motion, float, int]:
 def cases(config: Config, *, same: bool) -> list[Take]:
     """People, then the box."""
     found = []
-    for index in range(config.count):
+    for index in range(config.cases):
         motion, seconds, setting, generator = person(index, config, same=same)
         found.append(replace(recorded(motion, seconds, setting, generator), name="people"))
     motion, seconds, count = lifting()
-    for index in range(max(config.count // 4, 1)):
+    for index in range(max(config.cases // 4, 1)):
         generator = seeded(config.seed, 43, index)
         order = torch.randperm(count, generator=generator).tolist()
         seen, others = order[: count // 3], order[count // 3 :]
@@ -219,7 +206,7 @@ def undecidable(config: Config, *, same: bool) -> list[Row]:
     }
     rows = []
     for name, make in kinds.items():
-        takes = [make(index) for index in range(config.count)]
+        takes = [make(index) for index in range(config.cases)]
         found, _ = solved(takes, same=same)
         reasons = [one.notices[0].code.name.lower() for one in found if not one.ok]
         said = ", ".join(f"{reasons.count(code)} {code}" for code in dict.fromkeys(reasons))
@@ -267,24 +254,11 @@ def keypoints(config: Config) -> list[Row]:
     return rows + [replace(row, task=f"different points, {row.task}") for row in rows_of(other, same=False, goal=0.0)]
 
 
-TABLES = {
-    "Same points": lambda config: rows_of(cases(config, same=True), same=True, goal=1.0),
-    "Different points": lambda config: rows_of(cases(config, same=False), same=False, goal=0.8),
-    "Undecidable, same points": lambda config: undecidable(config, same=True),
-    "Undecidable, different points": lambda config: undecidable(config, same=False),
-    "Detected keypoints, 100 frames": keypoints,
-}
-
-
-def run(config: Config) -> None:
-    """Print every table, then write the file.
-
-    Raises:
-        ValueError: no data folder, or a file that cannot be written.
-    """
-    data_folder()
-    measured_on_one_thread(TABLES, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.synchronization.mocap")))
+@experiment(Config(), quick={"cases": 4})
+def tables(config: Config) -> Tables:
+    """Virtual cases, those that are undecidable, and detected keypoints."""
+    yield "Same points", rows_of(cases(config, same=True), same=True, goal=1.0)
+    yield "Different points", rows_of(cases(config, same=False), same=False, goal=0.8)
+    yield "Undecidable, same points", undecidable(config, same=True)
+    yield "Undecidable, different points", undecidable(config, same=False)
+    yield "Detected keypoints, 100 frames", keypoints(config)

@@ -22,16 +22,16 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from statistics import fmean, median
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 import dyntorch as dyn
-from experiments.common.tables import Row, command, measured_on_one_thread
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.recognition.protocol import Array, data_folder
 from experiments.synchronization.baselines import pose2sim
 from experiments.synchronization.data import Pair
@@ -47,16 +47,6 @@ SHIFTS = (-20.0, -7.0, 0.0, 3.0, 12.0, -5.25, 8.4)
 TRIMS = (0, 7, -12)
 """Frames at 60 fps cut from the start of the second video, or from that of the first where negative."""
 METHODS: tuple[Literal["tracks", "brightness"], ...] = ("brightness", "tracks")
-
-
-@dataclass(frozen=True)
-class Config:
-    """Synchronization of the real recordings in the folder DYNTORCH_DATA."""
-
-    quick: bool = False
-    """Three pairs of drone cameras, two shifts of the keypoints, one of the videos."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/real_synchronization.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +92,7 @@ def flights() -> list[Flight]:
     return pairs
 
 
-def drone(config: Config) -> list[Row]:
+def drone(config: BaseConfig) -> list[Row]:
     """Every pair: error in the middle, frames of the second camera; error of the rate."""
     rows, near, trusted = [], [], []
     for flight in flights()[:: 4 if config.quick else 1]:
@@ -151,7 +141,7 @@ def between(tracks: Tensor, share: float) -> Tensor:
     return out
 
 
-def keypoint_pairs(config: Config) -> Iterator[tuple[str, Pair]]:
+def keypoint_pairs(config: BaseConfig) -> Iterator[tuple[str, Pair]]:
     """Every shift of every pair of cameras; kind of the shift."""
     cameras, fps = people()
     for i, j in combinations(range(len(cameras)), 2):
@@ -161,7 +151,7 @@ def keypoint_pairs(config: Config) -> Iterator[tuple[str, Pair]]:
         yield "half frames, 30 fps", Pair("", cameras[i, ::2], cameras[j, 1::2], (fps / 2, fps / 2), -0.5 / (fps / 2))
 
 
-def keypoints(config: Config) -> list[Row]:
+def keypoints(config: BaseConfig) -> list[Row]:
     """Errors in frames, of the library and of Pose2Sim's procedure."""
     pairs: dict[str, list[Pair]] = {}
     for kind, pair in keypoint_pairs(config):
@@ -184,7 +174,7 @@ def keypoints(config: Config) -> list[Row]:
     return rows
 
 
-def videos(config: Config) -> list[Row]:
+def videos(config: BaseConfig) -> list[Row]:
     """Errors of the pair of videos in frames, by method and trim; what is refused is not wrong."""
     films = [gray(data_folder() / "pose2sim" / f"{name}.mp4") for name in ("cam01", "cam02")]
     rows = []
@@ -211,22 +201,9 @@ def _said(found: dyn.Shift) -> str:
     return f"{found.method}, {'ok' if found.ok else 'refused (' + found.reason + ')'}, {sigma}"
 
 
-TABLES = {
-    "Drone, one point, nine minutes": drone,
-    "Detected keypoints, 100 frames": keypoints,
-    "Videos": videos,
-}
-
-
-def run(config: Config) -> None:
-    """Print every table, then write the file.
-
-    Raises:
-        ValueError: no data folder, or a file that cannot be written.
-    """
-    data_folder()
-    measured_on_one_thread(TABLES, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.synchronization.real")))
+@experiment(BaseConfig())
+def tables(config: BaseConfig) -> Tables:
+    """Recordings of the folder DYNTORCH_DATA; quick: three pairs of drone cameras, two shifts of keypoints, one of videos."""
+    yield "Drone, one point, nine minutes", drone(config)
+    yield "Detected keypoints, 100 frames", keypoints(config)
+    yield "Videos", videos(config)

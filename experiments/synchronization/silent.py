@@ -38,12 +38,12 @@ import dyntorch as dyn
 from dyntorch.numerics.blocks import one_thread
 from experiments.common.plots import COLOURS
 from experiments.common.real_data import Take
-from experiments.common.results import RESULTS
-from experiments.common.tables import aligned, command, note
+from experiments.common.runner import BaseConfig, Tables, Words, experiment
+from experiments.common.tables import note
 from experiments.recognition.protocol import data_folder
 from experiments.synchronization.data import SIZE, Pair, cmu_pair, draw, moving, seeded
 from experiments.synchronization.motions import periodic_pair, reversed_pair, still_pair, unrelated_pair
-from indexing.files import manifest, prepare, write_bytes, write_json
+from indexing.files import prepare
 from indexing.report.canvas import LIGHT, new_figure, png, style
 
 KINDS = ("periodic", "still", "backwards", "other take", "same person", "other person", "mirrored", "good")
@@ -61,13 +61,12 @@ GOAL = 1 / 500
 """Share of the traps that are called ok and wrong."""
 THRESHOLDS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.97, 0.98, 0.99, 0.994, 0.996, 1.0)
 """Confidence from which an answer would be believed."""
-PICTURE = "synchronization-silent.png"
 SWAPPED = (0, 2, 1, 5, 6, 3, 4, 7, 8, 9, 11, 10, 12, 15, 16, 13, 14)
 """Which of the 17 joints a detector calls by the name of each in a mirrored film: left ones right, and right ones left."""
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Silent errors of synchronization, on the motion capture in the folder DYNTORCH_DATA."""
 
     trials: int = 2000
@@ -76,19 +75,20 @@ class Config:
     """Takes and seeds that the thresholds were chosen on, instead of the others."""
     workers: int = 2
     """Processes."""
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("results/silent")
-    """Folder of the results.  Trials that are there already are not computed again, so that a run that was stopped goes on: empty
-    it for another version of the library."""
 
     @property
     def indices(self) -> range:
         """Of all trials, good pairs included."""
         return range(math.ceil(self.trials * len(KINDS) / (len(KINDS) - 1)))
 
+    answers: Annotated[Path, tyro.conf.arg(metavar="FOLDER")] = Path("results/silent")
+    """Of the answers.  Trials that are there already are not computed again, so that a run that was stopped goes on: empty it for
+    another version of the library."""
+
     @property
     def kept(self) -> Path:
         """The file of answers, one a line."""
-        return self.out.expanduser() / ("training.jsonl" if self.training else "trials.jsonl")
+        return self.answers.expanduser() / ("training.jsonl" if self.training else "trials.jsonl")
 
 
 @dataclass(frozen=True)
@@ -311,35 +311,18 @@ def drawn(every: Sequence[Answer]) -> bytes:
         return png(figure)
 
 
-def run(config: Config) -> None:
-    """Ask, print the tables, keep the answers and the picture.
-
-    Raises:
-        ValueError: no data folder, no trials, or a file that cannot be written.
-    """
-    if config.trials < 1 or config.workers < 1:
-        raise ValueError(f"trials and workers must be at least 1, got {config.trials} and {config.workers}")
-    data_folder()
-    prepare(config.out.expanduser())
+@experiment(Config(), quick={"trials": 20}, one_thread=False)
+def tables(config: Config) -> Tables:
+    """Ask, and keep the answers."""
+    prepare(config.answers.expanduser())
     every = answers(config)
-    head: tuple[str, ...] = ("points", "kind", "trials", "ok and right", "ok and wrong", "processor s")
-    print(f"\n### Silent errors\n\n{aligned(head, table(every))}", flush=True)
+    yield "Silent errors", Words(("points", "kind", "trials", "ok and right", "ok and wrong", "processor s"), table(every))
     lines = []
     for points in (*POINTS, "both"):
         of = [one for one in every if points in (one.points, "both")]
         refused, silent = shares(of, lambda one: one.ok)
         lines.append((points, f"{silent:.4f}", f"{GOAL:.4f}", "yes" if silent <= GOAL else "NO", f"{refused:.3f}"))
-    print(f"\n### Share\n\n{aligned(('points', 'silent', 'goal', 'reached', 'good refused'), lines)}", flush=True)
+    yield "Share", Words(("points", "silent", "goal", "reached", "good refused"), lines)
     levels = [(f"{level:g}", f"{refused:.3f}", f"{silent:.4f}") for level, refused, silent in curve(every)]
-    head = ("confidence from", "good refused", "silent")
-    print(f"\n### As the threshold of the confidence moves\n\n{aligned(head, levels)}", flush=True)
-    figures = {"manifest": manifest(vars(config)), "answers": [asdict(one) for one in every]}
-    write_json(config.out.expanduser() / "silent.json", figures)
-    picture = drawn(every)
-    write_bytes(config.out.expanduser() / PICTURE, picture)
-    if RESULTS.is_dir() and config == Config(workers=config.workers, out=config.out):
-        write_bytes(RESULTS / PICTURE, picture)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.synchronization.silent")))
+    yield "As the threshold of the confidence moves", Words(("confidence from", "good refused", "silent"), levels)
+    yield "synchronization-silent", drawn(every)

@@ -14,18 +14,15 @@ figures are of others.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
 
 from dyntorch import Shift
-from experiments.common.tables import NoiseConfig, Row, command, measured
-from experiments.common.timing import threads
+from experiments.common.runner import SceneConfig, Tables, experiment
+from experiments.common.tables import Row
 from indexing.sync.sound import Sound, sound_shift
 
 Floats = NDArray[np.float64]
@@ -38,20 +35,6 @@ APART = 20.0  # seconds between the starts, at most
 DRIFT = 50e-6  # between the clocks, at most
 SPEED = 343.0  # metres per second
 RIGHT = 0.02  # seconds within which an offset is right: less than a frame
-
-
-@dataclass(frozen=True)
-class Config(NoiseConfig):
-    """Synchronization by sound, on made-up recordings."""
-
-    scenes: int = 20
-    """Pairs of recordings per kind of sound and level of noise."""
-    quick: bool = False
-    """A quarter of the pairs."""
-    seed: int = 100
-    """Of the recordings; those below 100 were used to choose constants."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/sound_synchronization.json")
-    """Where the results and this configuration are written as JSON."""
 
 
 def _spots(rng: np.random.Generator, seconds: float, gap: Callable[[], float]) -> list[int]:
@@ -216,11 +199,11 @@ def off(found: Shift, truth: Pair) -> float:
     return float(found.at(found.center)) - (found.center * truth.rate + truth.offset)
 
 
-def together(config: Config, kind: str) -> list[Row]:
+def together(config: SceneConfig, kind: str) -> list[Row]:
     """Pairs that heard one sound."""
     rows = []
     for decibels in NOISES:
-        pairs = [pair(kind, decibels, config.seed + i) for i in range(_many(config))]
+        pairs = [pair(kind, decibels, config.seed + i) for i in range(config.scenes)]
         found = [sound_shift(one.a, one.b) for one in pairs]
         errors = np.array([off(shift, one) for shift, one in zip(found, pairs, strict=True)])
         believed = np.array([bool(shift.ok) for shift in found])
@@ -240,12 +223,12 @@ def together(config: Config, kind: str) -> list[Row]:
     return rows
 
 
-def shorter(config: Config) -> list[Row]:
+def shorter(config: SceneConfig) -> list[Row]:
     """Pairs of shorter recordings, which overlap by two thirds at least."""
     rows = []
     for seconds in SHORTER:
         for kind in ("claps", "speech", "steps", "music"):
-            pairs = [pair(kind, NOISES[0], config.seed + i, seconds) for i in range(_many(config))]
+            pairs = [pair(kind, NOISES[0], config.seed + i, seconds) for i in range(config.scenes)]
             found = [sound_shift(one.a, one.b) for one in pairs]
             wrong = sum(bool(shift.ok) and abs(off(shift, one)) > RIGHT for shift, one in zip(found, pairs, strict=True))
             setting = f"{kind}, {len(pairs)} pairs of {seconds:g} s, {NOISES[0]:+d} dB"
@@ -256,9 +239,9 @@ def shorter(config: Config) -> list[Row]:
     return rows
 
 
-def unrelated(config: Config) -> list[Row]:
+def unrelated(config: SceneConfig) -> list[Row]:
     """Microphones that heard different things."""
-    rows, many, kinds = [], _many(config), list(SOURCES)
+    rows, many, kinds = [], config.scenes, list(SOURCES)
     for seconds in (LONG, SHORTER[1]):
         for name, others in (("one kind of sound", [0]), ("two kinds", [1, 2])):
             believed = tried = 0
@@ -273,18 +256,10 @@ def unrelated(config: Config) -> list[Row]:
     return rows
 
 
-def _many(config: Config) -> int:
-    return max(2, config.scenes // 4) if config.quick else config.scenes
-
-
-def main(config: Config) -> None:
-    """Run all sets."""
-    target = config.target()
-    sets: dict[str, Callable[[], list[Row]]] = {kind: lambda kind=kind: together(config, kind) for kind in SOURCES}  # type: ignore[misc]
-    sets |= {"shorter recordings": lambda: shorter(config), "unrelated": lambda: unrelated(config)}
-    with threads(1):
-        measured(list(sets), lambda name: sets[name](), target, vars(config))
-
-
-if __name__ == "__main__":
-    command(lambda: main(tyro.cli(Config)))
+@experiment(SceneConfig(scenes=20, seed=100), quick={"scenes": 5})
+def tables(config: SceneConfig) -> Tables:
+    """Made-up recordings, so many pairs per kind of sound and level of noise; seeds below 100 were used to choose constants."""
+    for kind in SOURCES:
+        yield kind, together(config, kind)
+    yield "shorter recordings", shorter(config)
+    yield "unrelated", unrelated(config)

@@ -14,15 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import fmean, median
-from typing import Annotated, Any, Protocol
-
-import tyro
+from typing import Any, Protocol
 
 import dyntorch as dyn
-from experiments.common.tables import Row, command, measured_on_one_thread
-from experiments.recognition.protocol import data_folder
+from experiments.common.runner import BaseConfig, Tables, experiment
+from experiments.common.tables import Row
 from experiments.synchronization.baselines import activity, pose2sim, vertical
 from experiments.synchronization.data import Pair, cmu_pair, cmu_pairs, moving, seeded
 from experiments.synchronization.motions import long_take, periodic_pair, reversed_pair, still_pair, unrelated_pair
@@ -54,24 +51,13 @@ Method = Callable[[Pair], Found]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(BaseConfig):
     """Synchronization of virtual cameras around the motion capture in the folder DYNTORCH_DATA."""
 
     trials: int = 100
     """Pairs per figure."""
-    quick: bool = False
-    """15 pairs per figure, and takes of two minutes only once."""
     max_shift: float = 2.0
     """Seconds: how far every method searches."""
-    seed: int = 0
-    """Of the pairs."""
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE")] = Path("results/synchronization.json")
-    """Where the results and this configuration are written as JSON."""
-
-    @property
-    def count(self) -> int:
-        """Pairs per figure."""
-        return min(self.trials, 15) if self.quick else self.trials
 
 
 @dataclass(frozen=True)
@@ -119,7 +105,7 @@ def same(config: Config) -> list[Row]:
     methods = {name: library(config, camera=name) for name in ("auto", "perspective", "affine")} | others(config)
     rows = []
     for index, noise in enumerate(NOISE):
-        pairs = cmu_pairs(config.count, config.seed, noise_mm=noise)
+        pairs = cmu_pairs(config.trials, config.seed, noise_mm=noise)
         for name, method in methods.items():
             found = summary(pairs, [method(pair) for pair in pairs])
             goal = PROTOTYPE["auto"][index] if name == "auto" else None
@@ -135,7 +121,7 @@ def different(config: Config) -> list[Row]:
     methods = {"subspace": library(config, correspondence=False)} | others(config)
     rows = []
     for noise in NOISE:
-        pairs = cmu_pairs(config.count, config.seed, noise_mm=noise, points="different")
+        pairs = cmu_pairs(config.trials, config.seed, noise_mm=noise, points="different")
         for name, method in methods.items():
             found = summary(pairs, [method(pair) for pair in pairs])
             judged = name == "subspace" and noise == 15
@@ -156,7 +142,7 @@ def robustness(config: Config) -> list[Row]:
     }
     rows = []
     for name, (settings, goal) in cases.items():
-        pairs = cmu_pairs(config.count, config.seed, **settings)
+        pairs = cmu_pairs(config.trials, config.seed, **settings)
         answers = [library(config)(pair) for pair in pairs]
         found = summary(pairs, answers)
         rows.append(Row("right", f"{name}; {found}", found.right, goal))
@@ -185,7 +171,7 @@ def refusal(config: Config) -> list[Row]:
 
     def draw(build: Callable[..., Pair], two: bool = False, **settings: Any) -> list[Pair]:
         pairs = []
-        for index in range(config.count):
+        for index in range(config.trials):
             which = [takes[(index * (1 + 5 * k) + 7 * k) % len(takes)].joints for k in range(1 + two)]
             if two and which[0] is which[1]:
                 which[1] = takes[(index + 1) % len(takes)].joints
@@ -237,33 +223,18 @@ def frame_rates(config: Config) -> list[Row]:
     rows = []
     for fps in RATES:
         for points in ("same", "different"):
-            pairs = cmu_pairs(config.count, config.seed, fps=fps, frames=round(4 * fps[0]), max_shift=fps[0], points=points)
+            pairs = cmu_pairs(config.trials, config.seed, fps=fps, frames=round(4 * fps[0]), max_shift=fps[0], points=points)
             found = summary(pairs, [library(config, correspondence=points == "same")(pair) for pair in pairs])
             rows.append(Row("right", f"{fps[0]:g} and {fps[1]:g} fps, {points} points; {found}", found.right))
     return rows
 
 
-TABLES = {
-    "Same joints": same,
-    "Different joints": different,
-    "Bad detections": robustness,
-    "Refusal": refusal,
-    "Two clocks": clocks,
-    "Frame rates": frame_rates,
-}
-
-
-def run(config: Config) -> None:
-    """Print every table, then write the file.
-
-    Raises:
-        ValueError: no data folder, no trials, or a file that cannot be written.
-    """
-    if config.trials < 1:
-        raise ValueError(f"trials must be at least 1, got {config.trials}")
-    data_folder()
-    measured_on_one_thread(TABLES, config, config.out)
-
-
-if __name__ == "__main__":
-    command(lambda: run(tyro.cli(Config, prog="python -m experiments.synchronization.synchronization")))
+@experiment(Config(), quick={"trials": 15})
+def tables(config: Config) -> Tables:
+    """Every table; quick: takes of two minutes only once."""
+    yield "Same joints", same(config)
+    yield "Different joints", different(config)
+    yield "Bad detections", robustness(config)
+    yield "Refusal", refusal(config)
+    yield "Two clocks", clocks(config)
+    yield "Frame rates", frame_rates(config)

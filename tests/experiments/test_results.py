@@ -33,7 +33,7 @@ def test_a_command_writes_its_page_only_as_the_page_says(tmp_path, capsys, words
     page = tmp_path / "some.md"
     head = f"# Some\n\nWhat it is.\n\n`DYNTORCH_DATA=... python -m experiments.some --scenes 20`\n\n{MARK}"
     page.write_text(head + "\n\nold table\n", encoding="utf-8")
-    with published("experiments.some", words, tmp_path):
+    with published("experiments.some", words, {}, tmp_path):
         print("| new |\n|---|\n\ntwo\nlines")
     assert capsys.readouterr().out.startswith("| new |")
     text = page.read_text(encoding="utf-8")
@@ -44,7 +44,7 @@ def test_a_command_writes_its_page_only_as_the_page_says(tmp_path, capsys, words
 
 def test_a_new_script_gets_a_page(tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules["__main__"], "__doc__", "What was asked.\n\nMore.")
-    with published("experiments.benchmarks.new_one", ["--seeds", "2"], tmp_path):
+    with published("experiments.benchmarks.new_one", ["--seeds", "2"], {}, tmp_path):
         print("| a |\n|---|")
     text = (tmp_path / "benchmarks-new_one.md").read_text(encoding="utf-8")
     assert text.startswith(
@@ -53,13 +53,13 @@ def test_a_new_script_gets_a_page(tmp_path, monkeypatch):
 
 
 def test_what_fails_writes_nothing(tmp_path):
-    with pytest.raises(ValueError, match="no data"), published("experiments.some", [], tmp_path):
+    with pytest.raises(ValueError, match="no data"), published("experiments.some", [], {}, tmp_path):
         raise ValueError("no data")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_written_without_a_folder_of_pages_or_for_other_programs(tmp_path):
-    with published("experiments.some", [], tmp_path / "none"), published("pytest.__main__", [], tmp_path):
+    with published("experiments.some", [], {}, tmp_path / "none"), published("pytest.__main__", [], {}, tmp_path):
         print("| a |")
     assert list(tmp_path.iterdir()) == []
 

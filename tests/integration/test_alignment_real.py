@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +12,9 @@ import dyntorch as dyn
 from dyntorch import metrics
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
 from experiments.alignment.real import planar as real_planar
-from experiments.alignment.real import space as real_space
-from experiments.alignment.real.bodies import Crowd, crowd
+from experiments.alignment.real.bodies import crowd
 from experiments.alignment.real.solvers import aligned, gap, rigid_ransac
 from experiments.common import real_data
-from experiments.common.tables import Row
 
 pytestmark = pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data")
 
@@ -117,20 +113,3 @@ def test_rigid_sensors_among_bodies_that_all_move() -> None:
     # joints nearly keep their velocity, so that static ones alone tell the velocity common to all
     assert np.median(turns) < 2
     assert np.median(ours) < 0.05 < 0.2 < np.median(none)
-
-
-@pytest.mark.slow
-def test_one_command_writes_figures_and_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(real_space, "STEPS", (3,))
-    monkeypatch.setattr(real_space, "SHARES", (0.0, 1.0))
-    monkeypatch.setattr(real_space, "PROJECTIVE", real_space.PROJECTIVE[:3])
-
-    def one_crowd(pool: list[real_data.Take], crowds: int, seed: int) -> tuple[list[Row], dict[str, list[float]], Crowd]:
-        return [], {"none": [1.0] * 3}, crowd(pool[:3], 1, "rigid", torch.Generator().manual_seed(seed))
-
-    monkeypatch.setattr(real_space, "bodies_rows", one_crowd)
-    real_space.run(real_space.Config(quick=True, out=tmp_path))
-    written = json.loads((tmp_path / "figures.json").read_text())
-    assert len(written["tables"]) == 3
-    assert (tmp_path / "movers.png").stat().st_size > 10_000
-    assert (tmp_path / "bodies.png").stat().st_size > 10_000

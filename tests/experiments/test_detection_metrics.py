@@ -1,15 +1,11 @@
-"""Detection metrics against cases worked out by hand, and the detection experiment on short synthetic streams."""
+"""Metrics of detection against cases worked out by hand."""
 
 from __future__ import annotations
-
-import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from experiments.recognition import detection
-from experiments.recognition.contenders import OPTIONS, sliding
 from experiments.recognition.detection_metrics import (
     average_precision,
     edit_distance,
@@ -19,8 +15,6 @@ from experiments.recognition.detection_metrics import (
     overlap,
     segments,
 )
-from experiments.recognition.short_windows import at_rest
-from indexing.actors import dataset
 from indexing.scoring import Event
 
 
@@ -106,37 +100,3 @@ def test_edit_score_looks_at_the_order_only() -> None:
 def test_finds_in_strange_actions_are_left_out() -> None:
     strange = [seg("?", 4, 6)]
     assert detection.outside([seg("a", 4.5, 6.4), seg("b", 5.5, 8)], strange) == [seg("b", 5.5, 8)]
-
-
-@pytest.mark.slow
-def test_streams_of_actors_are_found(tmp_path: Path, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(detection, "ACTIONS", ("squat", "wave", "jumping_jack", "kick"))
-    monkeypatch.setattr(detection, "PEOPLE", 2)
-    monkeypatch.setitem(OPTIONS, "equal", {"scorer": "nearest", "search": False, "virtual_views": 0})
-    monkeypatch.setattr(detection.pictures, "timeline", lambda times, scores, classes, found, known: str(known).encode())
-    few = {"sets": ("actors",), "methods": ("equal", "image"), "parts": ("rest",), "streams": 1, "actions": 3}
-    detection.run(detection.Config(**few, out=tmp_path))
-    tables = json.loads((tmp_path / "figures.json").read_text())["tables"]
-    lines = tables["actors, camera turned 60 degrees"]["lines"]
-    names = ("ours", "2D nearest neighbour", "ours without rest")
-    assert set(lines) == {f"{name}, {how}" for name in names for how in ("every frame", "found")}
-    assert lines["ours, every frame"][0] > 0.7  # frames
-    assert (tmp_path / "actors_60.png").read_text().count("(") == 3  # the true segments
-    assert "mAP@0.5" in capsys.readouterr().out
-
-
-def test_a_sliding_baseline_differs_in_the_distance_only() -> None:
-    clips = list(dataset(1, ["squat", "wave"], fps=12.0))
-    labels = np.array(["squat", "wave"])
-    baseline, ours = sliding("image").fit(clips, labels), sliding("equal").fit(clips, labels)
-    assert baseline.classes_.tolist() == ours.classes_.tolist() == ["squat", "wave"]
-    scores, events = baseline.scan(clips[0])
-    np.testing.assert_array_equal(scores, baseline.score_frames(clips[0]))
-    assert events == baseline.find(clips[0])
-    assert not np.allclose(scores, ours.score_frames(clips[0]))
-
-
-def test_an_action_calmer_than_the_others_is_not_taken_for_rest():
-    contrast, calm = np.array([[2.8, -2.8], [-2.8, 2.8], [2.8, -2.8]]), np.array([0.05, 0.3])
-    motion = np.array([0.06, 0.06, 0.03])  # of the calm action as it is, of the other one, and of a person who stands
-    assert at_rest(contrast, motion, 0.1, calm, (1.0, 4.0)).tolist() == [False, True, True]
