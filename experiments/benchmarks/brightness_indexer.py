@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from indexing.brightness.descriptors import LENGTH
 from experiments.common.runner import BaseConfig, Tables, experiment
 from experiments.common.tables import Row, note
+from indexing.brightness.descriptors import LENGTH
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.brightness.stream import VideoExemplars
 
