@@ -25,7 +25,7 @@ import tyro
 from experiments.common.results import page_name, published
 from experiments.common.tables import Row, aligned, markdown, note
 from experiments.common.timing import threads
-from indexing.files import manifest, plain, prepare, write_bytes, write_json
+from indexing.files import manifest, prepare, to_json_types, write_bytes, write_json
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Experiment(Generic[C]):
         if reached:
             print(f"\n{sum(reached)} of {len(reached)} goals reached, {sum(seconds.values()):.0f} s")
         about = manifest(vars(config), seed=config.seed, timings=seconds)
-        note(f"written: {write_json(folder / f'{name}.json', {'manifest': about, 'tables': plain(contents)})}")
+        note(f"written: {write_json(folder / f'{name}.json', {'manifest': about, 'tables': to_json_types(contents)})}")
 
     def main(self) -> None:
         """Run as a command: what is printed goes into the page of the module; bad input is one line on stderr and exit code 2."""
