@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,15 +82,33 @@ def random_clip() -> Callable[..., Clip]:
 
 
 @pytest.fixture
-def run(request, data, tmp_path, monkeypatch, capsys):
-    """Runs the module's ``COMMAND`` in an empty folder; ``@/`` in a word stands for the folder of the module's ``data``."""
+def run(request, tmp_path, monkeypatch, capsys):
+    """Runs a command in an empty folder: a line, or words, after the module's ``COMMAND``; ``@/`` in a word stands for the
+    folder of the module's ``data``, and where the module says ``ONE_LINE`` the lines of a table are joined."""
+    data = request.getfixturevalue("data") if hasattr(request.module, "data") else ""
     monkeypatch.chdir(tmp_path)
     capsys.readouterr()
 
-    def call(line: str) -> tuple[int, str, str]:
-        code = main([request.module.COMMAND, *(word.replace("@/", f"{data}/") for word in line.split())])
+    def call(*words: str | Path) -> tuple[int, str, str]:
+        first = getattr(request.module, "COMMAND", "").split()
+        rest = shlex.split(str(words[0])) if len(words) == 1 else map(str, words)
+        code = main([*first, *(word.replace("@/", f"{data}/") for word in rest)])
         said = capsys.readouterr()
-        return code, said.out, said.err
+        return code, " ".join(said.out.split()) if hasattr(request.module, "ONE_LINE") else said.out, said.err
+
+    return call
+
+
+@pytest.fixture
+def refuse(run, tmp_path):
+    """Runs a command that must end with 2, one line with all the given words, and nothing written."""
+
+    def call(*words: str | Path, says: Sequence[str]) -> None:
+        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        code, out, err = run(*words)
+        assert (code, out) == (2, "") and err.startswith("dyntorch: ") and err.count("\n") == 1, (out, err)
+        assert [word for word in says if word not in err] == [], err
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
     return call
 

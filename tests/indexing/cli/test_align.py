@@ -127,21 +127,15 @@ def test_the_same_seed_gives_the_same_result(run):
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["join", "minimal_join", "constant_velocity", "affine_constant_velocity"])
 def test_other_models_of_points(run, tmp_path, model):
-    # a bound of three to six times the noise: the search is over at its first starts
-    sensors = "affine" if model.startswith("affine") else "projective"
-    if "velocity" in model:
-        scene = scenes.constant_velocity(80, sigma=0.002, static=0.3, sensors=sensors, generator=draw(5))
-    else:
-        scene = scenes.moving_points(100, sigma=0.001, static=0.3, sensors=sensors, generator=draw(4))
+    sensors, velocity = "affine" if model.startswith("affine") else "projective", "velocity" in model
+    make = scenes.constant_velocity if velocity else scenes.moving_points
+    scene = make(80, sigma=0.001, static=0.3, sensors=sensors, generator=draw(5))
     np.savez(tmp_path / "m.npz", **{f"P{i}": view.numpy() for i, view in enumerate(scene.views, start=1)})
-    assert run(f"m.npz --model {model} --threshold 0.006 --out out")[0] == 0
-    found = read()
-    if "velocity" in model:
-        truth = (scene.motion[0] @ torch.linalg.inv(scene.motion[1])).numpy()
-        assert np.linalg.norm(np.array(found["A"]) - truth / np.linalg.norm(truth) * np.sign(truth[3, 3])) < 0.05
-        assert np.array(found["velocities"]).shape == (80, 3)
-    else:
-        assert np.linalg.norm(np.array(found["B"]) - scene.motion[1].numpy()) < 0.05
+    assert run(f"m.npz --model {model} --threshold 0.006 --out out")[0] == 0  # six times the noise: over at the first starts
+    found, (A, B) = read(), scene.motion
+    truth = (A @ torch.linalg.inv(B) if velocity else B).numpy()
+    error = np.array(found["A" if velocity else "B"]) - truth / np.linalg.norm(truth) * (np.sign(truth[3, 3]) if velocity else 1)
+    assert np.linalg.norm(error) < 0.05 and (np.shape(found["velocities"]) == (80, 3)) == velocity
 
 
 @pytest.mark.slow

@@ -67,19 +67,6 @@ def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     return call
 
 
-@pytest.fixture
-def refuse(run):
-    """A command that must end with 2 and one line with all the given words."""
-
-    def call(*words: str, says: tuple[str, ...]) -> None:
-        code, out, err = run(*words)
-        assert code == 2 and out == "" and err.startswith("dyntorch: ") and err.count("\n") == 1, (out, err)
-        for word in says:
-            assert word in err
-
-    return call
-
-
 # ---- add -----------------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_add_says_what_became_of_each(run, data: Path, tmp_path: Path) -> None:

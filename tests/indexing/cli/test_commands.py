@@ -58,37 +58,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs a command in an empty folder; ``@`` in a word stands for the folder of the data."""
-    monkeypatch.chdir(tmp_path)
-    capsys.readouterr()
-
-    def call(*words: str | Path) -> tuple[int, str, str]:
-        code = main([str(word).replace("@/", f"{data}/") for word in words])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return call
-
-
-@pytest.fixture
-def refuse(run, tmp_path: Path):
-    """Runs a command that must end with 2, one line with all the given words, and nothing written."""
-
-    def call(*words: str | Path, says: tuple[str, ...]) -> str:
-        before = sorted(tmp_path.rglob("*"))
-        code, out, err = run(*words)
-        assert code == 2 and out == ""
-        assert err.startswith("dyntorch: ") and err.count("\n") == 1 and err.endswith("\n"), err
-        for word in says:
-            assert word in err
-        assert sorted(tmp_path.rglob("*")) == before
-        return err
-
-    return call
-
-
 # ---- the program ---------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_help_starts_without_the_heavy_libraries() -> None:

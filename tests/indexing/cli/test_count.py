@@ -6,17 +6,7 @@ import json
 
 import pytest
 
-from indexing.cli import main
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]):
-    def call(*words: str) -> tuple[int, str, str]:
-        code = main(["count", *words])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return call
+COMMAND = "count"
 
 
 def cells(text: str) -> list[list[str]]:

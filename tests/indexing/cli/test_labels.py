@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +17,8 @@ from indexing.cli.flags.shared import Example, Labelling, Reading
 from indexing.cli.labels import check_write, film_examples
 from indexing.labels import Label, open_labels, write_labels
 from tests.indexing.cli.test_commands import coco
+
+ONE_LINE = True
 
 DONE = ["kick", "wave", "squat", "kick", "wave", "squat"]
 SEVERAL = (".boris", ".csv", ".tsv", ".json")
@@ -60,31 +61,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs a command in an empty folder; ``@`` stands for the folder of the data."""
-    monkeypatch.chdir(tmp_path)
-    capsys.readouterr()
-
-    def call(line: str) -> tuple[int, str, str]:
-        code = main([word.replace("@/", f"{data}/") for word in shlex.split(line)])
-        said = capsys.readouterr()
-        return code, " ".join(said.out.split()), said.err
-
-    return call
-
-
-@pytest.fixture
-def refuse(run, tmp_path: Path):
-    """Runs a command that must end with 2 and one line with all the words, and write nothing."""
-
-    def call(line: str, *words: str) -> None:
-        before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-        code, out, err = run(line)
-        assert (code, out) == (2, "") and err.count("\n") == 1, (out, err)
-        assert [word for word in words if word not in err] == [], err
-        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-
-    return call
+def refuse(refuse):
+    """The same with the words after the line."""
+    return lambda line, *words: refuse(line, says=words)
 
 
 def table(path: Path, *rows: str, head: str = "label,start,end") -> Path:

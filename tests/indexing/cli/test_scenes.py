@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from indexing.actors.textured import render, sheet
-from indexing.cli import main
 from indexing.video.drawing import encode
 
 SIZE, FRAMES = (240, 180), 10
@@ -42,20 +41,6 @@ def data(tmp_path_factory):
     (folder / "none").mkdir()
     np.savez(folder / "m.npz", x1=np.zeros((9, 2)), x2=np.zeros((9, 2)))
     return folder
-
-
-@pytest.fixture
-def run(data, tmp_path, monkeypatch, capsys):
-    """Runs a command in an empty folder; ``@/`` in a word stands for the folder of the data."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(line: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = main([word.replace("@/", f"{data}/") for word in line.split()])
-        said = capsys.readouterr()
-        return code, said.out, said.err
-
-    return call
 
 
 def table(path):

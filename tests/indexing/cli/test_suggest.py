@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 import pytest
@@ -12,6 +11,9 @@ from indexing.actors import Person, detect, stream
 from indexing.cli import main
 from indexing.labels import open_labels
 from tests.indexing.cli.test_commands import coco
+
+COMMAND = "index suggest"
+ONE_LINE = True
 
 DONE = ["squat", "kick", "wave", "bow", "squat"]
 
@@ -27,20 +29,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "session.csv").write_text("\n".join(["label,start,end", rows[0], rows[2]]) + "\n")
     assert main(["index", "fit", f"{folder}/session.json", "--labels", f"{folder}/session.csv", "-o", f"{folder}/m.st"]) == 0
     return folder
-
-
-@pytest.fixture
-def run(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """Runs the command in an empty folder; ``@`` stands for the folder of the data."""
-    monkeypatch.chdir(tmp_path)
-    capsys.readouterr()
-
-    def call(line: str) -> tuple[int, str, str]:
-        code = main(["index", "suggest", *(word.replace("@/", f"{data}/") for word in shlex.split(line))])
-        said = capsys.readouterr()
-        return code, " ".join(said.out.split()), said.err
-
-    return call
 
 
 @pytest.mark.slow
