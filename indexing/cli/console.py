@@ -170,9 +170,6 @@ def counting_bar(what: str, unit: str) -> Iterator[Callable[[int, int], None] | 
 # Where commands write: checked before the work begins, and never over their own inputs.
 
 
-REPORT_FILES = ("report.html", "metrics.json", "manifest.json", "events.csv", "confusion.png", "timeline.png")
-
-
 def check_folder(folder: Path) -> Path:
     """The folder, if files can be written in it; it is not made yet, so that a failure later leaves nothing behind."""
     folder = folder.expanduser()
@@ -203,7 +200,7 @@ def check_file(path: Path, inputs: Iterable[Path]) -> Path:
     return path
 
 
-def check_report(folder: Path | None, inputs: Iterable[Path], files: Iterable[str] = REPORT_FILES) -> Path | None:
+def check_report(folder: Path | None, inputs: Iterable[Path], files: Iterable[str]) -> Path | None:
     """The folder of a report, if it can be written and no file of the report would replace an input."""
     if folder is None:
         return None

@@ -36,6 +36,7 @@ from indexing.report.results import (
 )
 from indexing.report.summary import Summary, Table, register_page, write_report
 
+FILES = ("report.html", "metrics.json", "manifest.json", "events.csv", "repetitions.csv", "confusion.png", "timeline.png")
 TIMELINES = 12  # recordings, or people in them, whose timeline is drawn, and recordings that have a player
 STRIPS = 60  # events that are shown as stick figures, over all recordings
 TIPS = 2000  # bars of a timeline that say what they are when pointed at
@@ -48,7 +49,7 @@ NONE = "n/a"  # shown where a number does not exist
 OURS = r"confusion\.(png|csv)|timeline(-\d+)?\.png|hits\.csv|events\.csv|repetitions\.csv"  # of this and other reports on actions
 
 
-@register_page(RecognitionReport, "recognition", stale=OURS)
+@register_page(RecognitionReport, "recognition", FILES, OURS)
 def summarize(report: RecognitionReport) -> Summary:
     """Everything that is said of what was found in recordings, and of how well clips are recognized."""
     measured, recordings = measure(report), report.recordings

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from indexing.action.indexer import ActionIndexer
 
 Array = NDArray[np.float64]
+FILES = ("report.html", "metrics.json", "manifest.json", "body_parts.png")
 NOBODY = "Nobody could be left out (the clips have no field 'subject', or it is one person): the usual weights stand."
 COLUMNS = 5  # skeletons in a row
 PANEL = 1.62, 1.95  # inches
@@ -237,7 +238,7 @@ class TrainingReport:
         return measure_body_parts(self.indexer)
 
 
-@register_page(TrainingReport, "training")
+@register_page(TrainingReport, "training", FILES)
 def summarize(report: TrainingReport) -> Summary:
     """Everything that is said of what was learned."""
     indexer, clips = report.indexer, report.clips

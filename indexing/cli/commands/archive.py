@@ -102,7 +102,7 @@ def search(flags: Search) -> int:
 def find(flags: Find) -> int:
     """Search everything, count, write the report."""
     check_workers(flags.workers, flags.dask)
-    folder = check_report(flags.report, [flags.model])
+    folder = check_report(flags.report, [flags.model], FILES)
     with progress("loading", steps=False):
         archive = Archive(_absolute(flags.archive) if flags.dask else flags.archive)
         info = archive.info()

@@ -20,6 +20,7 @@ from indexing.clip import Clip
 from indexing.examples import write_examples
 from indexing.files import manifest
 from indexing.report import EvaluationResult, RecognitionReport, RecordingResult, write_recognition
+from indexing.report.recognition import FILES
 from indexing.report.results import frame_accuracy, missed_actions
 from indexing.skeleton import COCO17
 from indexing.windows import concatenate_clips, resample_clips
@@ -30,7 +31,7 @@ def run(flags: Demo) -> int:
     if flags.examples is not None:
         return _examples(flags.examples)
     started = time.perf_counter()
-    folder = check_report(flags.out, [])
+    folder = check_report(flags.out, [], FILES)
     assert folder is not None
     with progress("performing, learning, recognizing") as bar:
         shown = demonstrate(people=flags.people, seed=flags.seed, progress=bar)

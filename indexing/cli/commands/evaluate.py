@@ -28,7 +28,9 @@ from indexing.files import manifest
 from indexing.labels import Label, choose_labels
 from indexing.opening import error, listing
 from indexing.report import EvaluationResult, RecognitionReport
-from indexing.report.agreement import FILES, AgreementReport
+from indexing.report.agreement import FILES as AGREEMENT_FILES
+from indexing.report.agreement import AgreementReport
+from indexing.report.recognition import FILES
 
 REJECTED = "(rejected)"
 
@@ -38,7 +40,7 @@ def run(flags: Evaluate) -> int:
     if flags.labelling.labels:
         return against_labels(flags)
     check_labelling(flags.labelling, [], False)
-    folder = check_report(flags.report, [path(flags)])
+    folder = check_report(flags.report, [path(flags)], FILES)
     started = time.perf_counter()
     with progress("loading", steps=False):
         clips, cameras, notes = _read_videos(flags) if are_films([path(flags)]) else _load(flags)
@@ -185,7 +187,7 @@ def against_labels(command: Evaluate) -> int:
         flag = f"--{given[0].replace('_', '-')}"
         raise ValueError(f"{flag}: of clip sets only, but --labels says what is compared; leave one of them out")
     inputs = [*command.clips, *command.labelling.labels, *([command.model] if command.model is not None else [])]
-    folder = check_report(command.report, inputs, FILES)
+    folder = check_report(command.report, inputs, AGREEMENT_FILES)
     compared = _of_files(command) if command.model is None else _of_model(command)
     spans, (known, found) = compared.spans, compared.sides
     about = {} if folder is None else _manifest(command, inputs, compared.timings)

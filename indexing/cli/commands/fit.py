@@ -27,7 +27,7 @@ from indexing.cli.videos import (
 )
 from indexing.clip import Clip
 from indexing.files import manifest, prepare
-from indexing.report.training import TrainingReport
+from indexing.report.training import FILES, TrainingReport
 
 
 def run(flags: Fit) -> int:
@@ -37,7 +37,7 @@ def run(flags: Fit) -> int:
     examples = [parse_example(text) for text in flags.examples]
     check_labelling(flags.labelling, examples, flags.unlabelled_is_background)
     paths = [example.path for example in examples] + list(flags.background) + list(flags.labelling.labels)
-    output, folder = check_file(flags.output, paths), check_report(flags.report, paths)
+    output, folder = check_file(flags.output, paths), check_report(flags.report, paths, FILES)
     if not count_as_keypoints(flags.reading.footage, [example.path for example in examples]):
         return _from_pixels(flags, examples, output)
     refuse_film_flags(flags.pixels)

@@ -23,6 +23,7 @@ from indexing.modelfile import model_kind
 from indexing.readers.formats.clipset import holds_frames
 from indexing.recordings.repetitions import count_repetitions
 from indexing.report import RecognitionReport, RecordingResult
+from indexing.report.recognition import FILES
 from indexing.report.results import by_recording
 from indexing.scoring import Event
 
@@ -37,7 +38,8 @@ def run(flags: Scan) -> int:
     if flags.truth is not None and flags.labelling.labels:
         raise ValueError(f"--truth {flags.truth}: --labels says what is known, too; give one of them")
     inputs = [*flags.recordings, flags.model, *([flags.truth] if flags.truth is not None else [])]
-    folder, target = check_report(flags.report, inputs), check_write(flags.write, inputs, flags.recordings, flags.labelling.media)
+    folder = check_report(flags.report, inputs, FILES)
+    target = check_write(flags.write, inputs, flags.recordings, flags.labelling.media)
     inputs += flags.labelling.labels
     indexer, results, notes, timings = search(flags)
     if target is not None:
