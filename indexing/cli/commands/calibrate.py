@@ -13,7 +13,7 @@ from dyntorch.numerics import with_words
 from indexing.calibrate import CameraRig, RigPriors, calibrate_recordings
 from indexing.calibrate.priors import check_height
 from indexing.cli.console import check_folder, count, finish, flag_words, progress, show
-from indexing.cli.flags.cameras import Calibrate
+from indexing.cli.flags.geometry import Calibrate
 from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import camera_numbers, refuse_range
 from indexing.cli.videos import find_keypoints

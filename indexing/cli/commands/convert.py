@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dyntorch.numerics import with_words
 from indexing.cli.console import check_file, check_folder, count, flag_words, keep, names, progress, say
-from indexing.cli.flags.cameras import Convert
+from indexing.cli.flags.geometry import Convert
 from indexing.cli.inputs import assumed_rate_notes, clip_notes, read_clips
 from indexing.clip import Clip, ClipSet
 from indexing.files import prepare, write_bytes

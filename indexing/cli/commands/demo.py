@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from indexing.action.indexer import ActionIndexer
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
 from indexing.cli.console import Progress, check_folder, check_report, count, progress, say, table
-from indexing.cli.flags.cameras import Demo
+from indexing.cli.flags.geometry import Demo
 from indexing.clip import Clip
 from indexing.examples import write_examples
 from indexing.files import manifest

@@ -9,7 +9,7 @@ import numpy as np
 
 from indexing.cli.commands.archive import INTERRUPTED, PROBLEMS, check_workers
 from indexing.cli.console import check_folder, complain, count, counting_bar, progress, say, table
-from indexing.cli.flags.cameras import Pose
+from indexing.cli.flags.geometry import Pose
 from indexing.clip import check_fps
 from indexing.pose import models as files
 from indexing.pose import writing

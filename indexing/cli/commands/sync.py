@@ -14,7 +14,7 @@ from typing import Any
 import dyntorch
 from dyntorch.numerics import Message, with_words
 from indexing.cli.console import check_report, count, flag_words, names, present, progress, say
-from indexing.cli.flags.cameras import Sync
+from indexing.cli.flags.geometry import Sync
 from indexing.cli.flags.shared import Watched
 from indexing.cli.inputs import camera_numbers, refuse_range
 from indexing.cli.videos import find_keypoints, wants_keypoints
