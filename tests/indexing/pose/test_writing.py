@@ -321,14 +321,14 @@ def test_a_video_that_is_gone_or_changed_meanwhile_makes_nothing_final(tmp_path,
 
 
 def test_pieces_that_cannot_be_decoded_are_left_out_and_said(tmp_path, seeing, monkeypatch):
-    path, stored = film(tmp_path, [[walk(i)] for i in range(50)]), Video.stored
+    path, stored = film(tmp_path, [[walk(i)] for i in range(50)]), Video.stored_frames
 
     def damaged(self):
         if 0.8 < self.span[0] < 1.2:
             raise ValueError("nothing can be decoded")
         return stored(self)
 
-    monkeypatch.setattr(Video, "stored", damaged)
+    monkeypatch.setattr(Video, "stored_frames", damaged)
     made = keypoint_file(path, tmp_path / "pose", options=SHORT, json=True)
     assert made.found.notes == ("1 part of it cannot be decoded (nothing can be decoded)",)
     assert len(made.clips[0]) == 35 and len(frames_in(made.folder)) == 35
