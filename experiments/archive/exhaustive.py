@@ -18,7 +18,7 @@ from torch import Tensor
 from experiments.recognition.baselines import WarpedNearest
 from experiments.recognition.protocol import Array
 from indexing import Archive, Clip
-from indexing.action.bank import Bank, Copy, JointMetric, Windows, between, channel, fused_residuals, fusion, planes_of
+from indexing.action.bank import Bank, Copy, JointMetric, Windows, channel, compare_windows, fused_residuals, planes_of
 from indexing.archive import search
 from indexing.archive.search import Hit
 from indexing.archive.tracks import WINDOW_LENGTH
@@ -39,7 +39,7 @@ class Measure:
 
 def metric_of(archive: Archive) -> JointMetric:
     """How much joints count in the exact comparison of an archive of one joint layout."""
-    (layout,) = archive._opened().contents.layouts.values()
+    (layout,) = archive._open_snapshot().contents.layouts.values()
     return layout.joint_metric()
 
 
@@ -48,7 +48,7 @@ def exact(metric: JointMetric) -> Measure:
     planes = planes_of(metric)
 
     def compare(queries: Windows, windows: Windows) -> Tensor:
-        return -fused_residuals(queries, [Bank([Copy(windows)], planes)], [fusion(("epi",))])[0]
+        return -fused_residuals(queries, [Bank([Copy(windows)], planes)], [("epi",)])[0]
 
     return Measure(WINDOW_LENGTH, compare)
 
@@ -63,7 +63,7 @@ def cosine(heights: bool, length: int = 12) -> Measure:
     def compare(queries: Tensor, windows: Tensor, _: Tensor | slice) -> Tensor:
         return describe(queries) @ describe(windows).mT
 
-    return Measure(length, lambda queries, windows: between(queries, windows, compare, -1.0))
+    return Measure(length, lambda queries, windows: compare_windows(queries, windows, compare, -1.0))
 
 
 def warped() -> Measure:

@@ -126,7 +126,7 @@ def ask(indexer: ActionIndexer, recordings: Sequence[Recording], tally: Tally) -
 
 def looked_at(archive: Archive, indexer: ActionIndexer) -> tuple[int, int]:
     """Poses that the sketches leave, and all."""
-    snapshot = archive._opened()
+    snapshot = archive._open_snapshot()
     probes = probes_of(snapshot, indexer)
     looked = total = 0
     for row, segment in zip(snapshot.contents.segments, snapshot.segments, strict=True):

@@ -103,7 +103,7 @@ class Original:
         with safe_open(path, framework="numpy") as file:
             about = dict(file.metadata())
         return cls(
-            catalogue, segments[0], load_file(path), about, tuple(catalogue.recordings()), tuple(catalogue.sources().values())
+            catalogue, segments[0], load_file(path), about, tuple(catalogue.moment()[1]), tuple(catalogue.sources().values())
         )
 
     @property

@@ -130,7 +130,7 @@ class Stage:
 
 def contents(folder: Path) -> Counter[tuple[str, int]]:
     """Every recording with its windows."""
-    return Counter((row.name, row.windows) for row in Catalogue(folder).recordings())
+    return Counter((row.name, row.windows) for row in Catalogue(folder).moment()[1])
 
 
 # ---- what is left --------------------------------------------------------------------------------------------------------
@@ -157,7 +157,7 @@ def aftermath(stage: Stage, folder: Path, disturbed: bool, problems: Sequence[st
     found = [*problems, *readable(stage, folder)]
     checked, kept = Archive(folder).verify(), len(contents(folder)) - len(stage.earlier)
     done = Archive(folder, OPTIONS).add(stage.new)
-    found += [one.reason for one in done.failed]
+    found += [one.reason for one in done.failures]
     after = Archive(folder).verify()
     found += [f"after adding again: {problem}" for problem in (*after.problems, *after.orphans)]
     (expected, hits), now = stage.expected, contents(folder)
@@ -319,7 +319,7 @@ def workers_killed(stage: Stage, times: int, rng: np.random.Generator) -> list[T
             done = Archive(folder, OPTIONS).add(stage.new, executor=pool)
             timer.cancel()
             disturbed = bool(getattr(pool, "_broken", False))
-        problems = [one.reason for one in done.failed]
+        problems = [one.reason for one in done.failures]
         trials.append(aftermath(stage, folder, disturbed, problems))
     return trials
 
@@ -335,7 +335,7 @@ def deadly_sources(stage: Stage, times: int, rng: np.random.Generator) -> list[T
         given.insert(int(rng.integers(len(files) + 1)), deadly)
         with QuietProcesses(2) as pool:
             done = Archive(folder, OPTIONS).add(given, executor=pool)
-        failed = [one.source for one in done.failed]
+        failed = [one.source for one in done.failures]
         problems = [] if failed == ["deadly"] else [f"failed: {failed}"]
         kept = len(contents(folder)) - len(stage.earlier)
         trial = aftermath(stage, folder, True, problems)

@@ -98,7 +98,7 @@ def searched(archive: Archive, asked: Sequence[Question], mirror: bool = False) 
 
 def sketched(archive: Archive, asked: Sequence[Question]) -> list[float]:
     """Places by the archive's sketches: the stages of a search before the exact comparison, neighbours merged."""
-    snapshot = archive._opened()
+    snapshot = archive._open_snapshot()
     places = []
     for one in asked:
         queries = queries_of(check_example(one.clip, snapshot.contents.storage.min_duration), snapshot.contents)
@@ -176,7 +176,7 @@ def by_difficulty(archive: Archive, clips: Sequence[Clip], people: Takes, config
     changed: dict[str, tuple[Archive, dict[str, Any]]] = {
         f"{count} candidates": (bounded(archive, count), {}) for count in config.candidates
     }
-    changed |= {"nothing refined": (archive, {"SHIFTS": (0.0,), "STRETCHES": (1.0,)})}
+    changed |= {"nothing refined": (archive, {"SHIFTS": (0.0,)})}
     changed |= {"the query's tempo only": (archive, {"TEMPOS": (1.0,)})}
     options = {}
     for title, (other, constants) in changed.items():

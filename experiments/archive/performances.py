@@ -52,7 +52,7 @@ CHANGED: dict[str, dict[str, Any]] = {
     "archive, scanned in 16 steps": {"NUM_SAMPLES": 16},
     "archive, refined in 4 steps": {"NUM_FINE_SAMPLES": 4},
     "archive, candidates farther apart": {"MIN_SEPARATION": 0.35},
-    "archive, nothing refined": {"SHIFTS": (0.0,), "STRETCHES": (1.0,)},
+    "archive, nothing refined": {"SHIFTS": (0.0,)},
     "archive, 30 candidates": {"num_candidates": 30},
     "archive, 100 candidates": {"num_candidates": 100},
     "archive, 300 candidates": {"num_candidates": 300},

@@ -112,7 +112,7 @@ def added(folder: Path, sources: Any, executor: Executor | None = None) -> Archi
         ValueError: something could not be added.
     """
     archive = Archive(folder)
-    failed = archive.add(sources, executor=executor).failed
+    failed = archive.add(sources, executor=executor).failures
     if failed:
         raise ValueError(f"could not be added: {failed[0].reason}")
     return archive

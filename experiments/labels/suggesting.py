@@ -157,7 +157,7 @@ def right(indexer: ActionIndexer, asked: Sequence[Recording]) -> float:
     """The share of the frames that are right: the action, or none where some frames have none."""
     good: list[Array] = []
     for one in asked:
-        told = indexer.explain(one.clip)
+        told = indexer.decode(one.clip)
         if (one.labels == NONE).any():
             said = np.full(len(one.times), NONE, dtype=one.labels.dtype)
             for event in told.events:

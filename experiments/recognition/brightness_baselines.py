@@ -21,8 +21,8 @@ from torch.nn.functional import avg_pool2d, normalize
 
 from experiments.recognition.protocol import Array
 from indexing.brightness.descriptors import SMALLEST, blur, describe_cells, gradients
-from indexing.brightness.footage import Shrinker
-from indexing.brightness.stream import VideoExemplars, Warping, library
+from indexing.brightness.stream import VideoExemplars, Warping, build_library
+from indexing.brightness.videos import Shrinker
 from indexing.sync.brightness_features import CROP_SIDE, boxes, crop, inverse_root, motion, window_kernels
 from indexing.video import Chunk, track_points
 
@@ -116,7 +116,7 @@ class FrameNearest:
         lengths = torch.tensor([len(one) for one in rows])
         every = torch.cat(rows)
         kept = VideoExemplars(every, lengths, torch.from_numpy(numbers))
-        self.library = library(kept, len(self.classes_), flip=False)
+        self.library = build_library(kept, len(self.classes_), flip=False)
         return self
 
     def answer(self, video: Frames) -> tuple[Array, Array]:

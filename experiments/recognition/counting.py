@@ -5,7 +5,7 @@
 Learned from one clip per action and person, seen at azimuth 0; asked of sets of one action by other people, seen from azimuth 0 and
 90 by a noisy detector that loses joints.  *In a row*: one repetition touches the next.  *With rests*: the person stands for .6 to
 1.5 s between them; actions that are cycles (walk, run, jumping jacks) come in bouts of three, and all their cycles count.  What the
-recording holds is found by the indexer (:meth:`~indexing.ActionIndexer.explain`), so that a wrong label costs what it hides.
+recording holds is found by the indexer (:meth:`~indexing.ActionIndexer.decode`), so that a wrong label costs what it hides.
 
 All ways of counting are given the same events.  *Events*: their number.  *Counted*: :func:`~indexing.recordings.repetitions.
 count_repetitions`.  *Peaks* of the first principal component of the poses, at least half of its range high.  *Autocorrelation*: how

@@ -109,7 +109,7 @@ def _against_people(clips: Sequence[Clip], labels: Array, name: str) -> Callable
     taught = [named(clip, name) for clip in clips]
     people = [match_joints(clip, taught[0].skeleton)[0] for clip in dataset(2, azimuth=[40.0, 160.0, 280.0], rng=0)]
     indexer = ActionIndexer(scorer="nearest", virtual_views=0, mirror=False).fit(taught, labels, background=people)
-    known = indexer.model_.known
+    known = indexer.model_.num_known
 
     def say(asked: Sequence[Clip]) -> Tensor:
         scores = indexer.model_.plain_scores(indexer._queries([named(clip, name) for clip in asked]))

@@ -20,7 +20,7 @@ from indexing import ActionIndexer, ActionOptions, Clip
 from indexing.action import exemplars
 from indexing.action.bank import stack
 from indexing.action.model import ShapeModel
-from indexing.action.stream import BLOCK, Stream, StreamScan, around, motion_levels, scan, windows_at, wrong_contrast
+from indexing.action.stream import BLOCK, Stream, StreamScan, frames_around, motion_levels, scan, windows_at, wrong_contrast
 from indexing.scoring import Event, event_levels, events, smooth
 from indexing.windows import repair_clip
 
@@ -80,7 +80,7 @@ class ShortWindows:
 
 def frame_scores(clip: Clip, found: StreamScan, pool: float) -> Array:
     """``(frames, classes)``: the window scores, pooled and read off at the clip's own frames."""
-    scores = np.full((len(clip), found.scores.shape[1]), found.nothing)
+    scores = np.full((len(clip), found.scores.shape[1]), found.floor_score)
     for windows, frames in found.parts():
         at = found.times[windows]
         pooled = smooth(found.scores[windows], at, pool)
@@ -161,7 +161,7 @@ def _with_exemplars(
     owner = np.searchsorted(clip.times[cuts[:, 0]], middles, side="right") - 1
     queries = []
     for some in np.split(np.arange(len(found)), np.flatnonzero(np.diff(middles // (BLOCK * BLOCK_STEP))) + 1):
-        source, own = around(clip, cuts, middles[some], owner[some], stream)
+        source, own = frames_around(clip, cuts, middles[some], owner[some], stream)
         queries.append(windows_at(source, own, middles[some], stream.window, stream.length))
     residual = model.moment_residuals(stack(queries).to(stream.device))
     owners = model.labels[model.exemplars.owner]

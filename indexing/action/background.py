@@ -47,18 +47,18 @@ Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class OtherMovement:
+class BackgroundClips:
     """Clips that are not the action, and of which kind each is: kinds are classes of the model that are never reported."""
 
     clips: tuple[Clip, ...] = ()
     kinds: tuple[str, ...] = ()
-    sure: tuple[bool, ...] = ()
+    trusted: tuple[bool, ...] = ()
 
     def __len__(self) -> int:
         return len(self.clips)
 
-    def __add__(self, other: OtherMovement) -> OtherMovement:
-        return OtherMovement(self.clips + other.clips, self.kinds + other.kinds, self.sure + other.sure)
+    def __add__(self, other: BackgroundClips) -> BackgroundClips:
+        return BackgroundClips(self.clips + other.clips, self.kinds + other.kinds, self.trusted + other.trusted)
 
     @property
     def numbers(self) -> Array:
@@ -66,14 +66,14 @@ class OtherMovement:
         return np.asarray(np.unique(np.array(self.kinds, dtype=str), return_inverse=True)[1])
 
 
-def _collect(found: Sequence[tuple[str, Clip]], sure: bool) -> OtherMovement:
-    return OtherMovement(tuple(clip for _, clip in found), tuple(kind for kind, _ in found), (sure,) * len(found))
+def _collect(found: Sequence[tuple[str, Clip]], trusted: bool) -> BackgroundClips:
+    return BackgroundClips(tuple(clip for _, clip in found), tuple(kind for kind, _ in found), (trusted,) * len(found))
 
 
 ORDERS = ("backwards", "halves exchanged", "another order")
 
 
-def played_otherwise(clips: Sequence[Clip], ordered: bool, random_state: np.random.Generator) -> OtherMovement:
+def replay_clips(clips: Sequence[Clip], ordered: bool, random_state: np.random.Generator) -> BackgroundClips:
     """The clips with the movement of each joint done by another one, and in another order."""
     found = []
     for clip in clips:
@@ -93,21 +93,23 @@ def played_otherwise(clips: Sequence[Clip], ordered: bool, random_state: np.rand
     return _collect(found, False)
 
 
-def perform_other_actions(skeleton: Skeleton | None, dims: int, random_state: np.random.Generator) -> OtherMovement:
+def perform_other_actions(skeleton: Skeleton | None, dims: int, random_state: np.random.Generator) -> BackgroundClips:
     """Synthetic people who do everyday actions, each seen from somewhere; nothing where the joints cannot be told by name."""
     if not has_names(skeleton):
-        return OtherMovement()
+        return BackgroundClips()
     azimuth = None if dims == 3 else [float(a) for a in random_state.uniform(0.0, 360.0, NUM_CAMERAS)]
     found = []
     for clip in dataset(NUM_PEOPLE, ACTIONS, azimuth=azimuth, rng=random_state):
         try:
             found.append((str(clip.label), match_joints(clip, skeleton)[0]))
         except ValueError:  # too few joints have these names
-            return OtherMovement()
+            return BackgroundClips()
     return _collect(found, False)
 
 
-def cut_background(background: Iterable[Any], fps: float, joints: int, skeleton: Skeleton | None, seconds: float) -> OtherMovement:
+def cut_background(
+    background: Iterable[Any], fps: float, joints: int, skeleton: Skeleton | None, seconds: float
+) -> BackgroundClips:
     """Recordings of other movement, cut into pieces as long as an action."""
     try:
         clips = [part for item in as_clips(background, fps) for part in (item if isinstance(item, tuple) else (item,))]
@@ -115,7 +117,7 @@ def cut_background(background: Iterable[Any], fps: float, joints: int, skeleton:
         check_clips(clips, joints, recordings=True)
     except ValueError as problem:
         raise ValueError(f"background: {problem}") from None
-    found = [piece for number, clip in enumerate(clips) for piece in _pieces(clip, number, seconds)]
+    found = [piece for number, clip in enumerate(clips) for piece in _cut_pieces(clip, number, seconds)]
     if not found:
         raise ValueError(
             f"background: no {seconds:.3g} s without a gap in {len(clips)} clips show anybody; give a recording of other movement"
@@ -124,7 +126,7 @@ def cut_background(background: Iterable[Any], fps: float, joints: int, skeleton:
     return _collect([found[i] for i in kept], True)
 
 
-def _pieces(clip: Clip, number: int, seconds: float) -> list[tuple[str, Clip]]:
+def _cut_pieces(clip: Clip, number: int, seconds: float) -> list[tuple[str, Clip]]:
     """Pieces of a recording, half a piece apart; neighbours are of one kind, of which a recording gives a few."""
     found = []
     for first, end in stretches(clip.times).tolist():
@@ -172,9 +174,9 @@ def event_level(model: ShapeModel, rate: float | None) -> float:
     own = torch.nn.functional.one_hot(labels, model.classes).bool()
     mean = (total / torch.bincount(owner, minlength=len(labels))[:, None]).masked_fill(own, torch.nan)
     contrast = (mean - mean.nanmean(dim=1, keepdim=True)).masked_fill(own, -torch.inf)
-    best, other = contrast[:, : model.known].amax(dim=1), contrast[:, model.known :].amax(dim=1)
+    best, other = contrast[:, : model.num_known].amax(dim=1), contrast[:, model.num_known :].amax(dim=1)
     wrong = torch.where(best > other, best, -torch.inf)
-    if model.known == 1:
+    if model.num_known == 1:
         wrong = wrong[labels > 0]  # nothing is left that its own exemplars could be taken for
     return float(np.quantile(wrong.cpu().numpy(), 1 - rate, method="higher"))
 
@@ -189,7 +191,7 @@ def segment_evidence(model: ShapeModel, clip: Clip, events: Sequence[Event], len
     return np.asarray(model.evidence(windows.to(model.labels.device)).cpu().numpy())
 
 
-def without_background(
+def remove_background(
     told: Explanation, classes: Sequence[Any], least: float, enough: Callable[[Sequence[Event]], NDArray[np.bool_]]
 ) -> Explanation:
     """What is said of the known actions: other movement is left out, or told as held back where it has their evidence."""

@@ -94,28 +94,21 @@ TERMS: dict[str, Callable[[Entries, Tensor, Tensor], Tensor]] = {
 }
 
 
-@dataclass(frozen=True)
-class Fusion:
-    """What a residual is made of: terms that all channels have, and the power of each channel."""
-
-    terms: tuple[str, ...]
-    powers: tuple[float, ...]
+Terms = tuple[str, ...]  # that are fused in all channels
 
 
-def fuse_terms(left: Sequence[Tensor], right: Sequence[Tensor], fusions: Sequence[Fusion], epsilon: float) -> list[Tensor]:
-    r"""``(Q, E)`` products :math:`\prod_c \prod_{\text{terms}} (r_c + \epsilon)^{w_c}` of residuals, of each fusion."""
-    found: list[Tensor | None] = [None] * len(fusions)
+def fuse_terms(left: Sequence[Tensor], right: Sequence[Tensor], fusions: Sequence[Terms], epsilon: float) -> list[Tensor]:
+    r"""``(Q, E)`` products :math:`\prod_c \prod_{\text{terms}} (r_c + \epsilon)` of residuals, of each fusion."""
+    tables: list[Tensor | None] = [None] * len(fusions)
     for i in range(len(left) // 2):
-        (u, own), (v, other) = left[2 * i : 2 * i + 2], right[2 * i : 2 * i + 2]
+        (u, left_factor), (v, right_factor) = left[2 * i : 2 * i + 2], right[2 * i : 2 * i + 2]
         c = entries(u, v)
-        for number, fusion in enumerate(fusions):
-            for term in fusion.terms:
-                residual = TERMS[term](c, own, other).neg_().add_(1.0 + epsilon).clamp_(min=epsilon)
-                if fusion.powers[i] != 1:
-                    residual.pow_(fusion.powers[i])
-                before = found[number]
-                found[number] = residual if before is None else before.mul_(residual)
-    return [table for table in found if table is not None]
+        for number, terms in enumerate(fusions):
+            for term in terms:
+                residual = TERMS[term](c, left_factor, right_factor).neg_().add_(1.0 + epsilon).clamp_(min=epsilon)
+                table = tables[number]
+                tables[number] = residual if table is None else table.mul_(residual)
+    return [table for table in tables if table is not None]
 
 
 WHITENING_POWER = 0.25  # of the joint metric: UTKinect .909 -> .919, few shots +3 %; .5 whitens too much
@@ -148,7 +141,7 @@ def channel(windows: Tensor, name: str) -> Tensor:
     raise ValueError(f"unknown channel {name!r}; known: {', '.join(CHANNELS)}")
 
 
-def order_free(windows: Tensor, whole_image: bool = False) -> Tensor:
+def order_free_moments(windows: Tensor, whole_image: bool = False) -> Tensor:
     r"""Three moments of the joints that forget when in the window something happened. windows ``(batch, length, joints, 2)`` ->
     ``(3, batch, size * size)``."""
     still = channel(windows, "frame")
@@ -189,12 +182,8 @@ class JointMetric:
         values, vectors = torch.linalg.eigh(sigma)
         return ((vectors * (values.clamp(min=0) + self.floor) ** -self.power) @ vectors.mT).float()
 
-    def apply(self, windows: Tensor, name: str, joints: Tensor | slice = slice(None)) -> Tensor:
-        """``(N, length' * joints, dims)``: a channel of the windows, weighted and laid out as tall matrices."""
-        return laid_out(windows, name, self.weights(name, joints)).mT
 
-
-def laid_out(windows: Tensor, name: str, weights: Tensor | None) -> Tensor:
+def flatten_channel(windows: Tensor, name: str, weights: Tensor | None) -> Tensor:
     """``(N, dims, length' * joints)``: each coordinate of a channel in one piece, its joints weighted."""
     x = channel(windows, name).movedim(-1, 1)
     return (x if weights is None else x @ weights.to(x).mT).flatten(2)
@@ -208,7 +197,7 @@ VALUE_BLOCK = 2**21  # the same where values are compared, not what is described
 ROW_BLOCK = 128  # queries among them: enough for a fast matrix product
 QUERY_BLOCK = 256  # queries that one worker describes at once: bounds memory
 TINY = 1e-12  # norm of heights, in images of norm 1, below which they are none
-KEPT_BLOCK = 2**25  # bytes of the descriptions that a bank keeps: 32 MB; those it needed last stay in any case
+MAX_CACHE_BYTES = 2**25  # bytes of the descriptions that a bank keeps: 32 MB; those it needed last stay in any case
 
 
 @dataclass(frozen=True)
@@ -251,10 +240,12 @@ def stack(parts: list[Windows]) -> Windows:
     return Windows(torch.cat([part.values for part in parts]), torch.cat([part.seen for part in parts]))
 
 
-COMMON = 3  # joints that two windows must share: two always fit one another
+MIN_SHARED_JOINTS = 3  # joints that two windows must share: two always fit one another
 
 
-def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Tensor | slice], Tensor], worst: float) -> Tensor:
+def compare_windows(
+    query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Tensor | slice], Tensor], worst: float
+) -> Tensor:
     """Fill a ``(queries, bank)`` table from ``compare(queries, bank, joints)`` of values, on the joints both sides saw."""
     groups = list(patterns(bank.seen))
     out = query.values.new_empty(len(query), len(bank))
@@ -273,7 +264,7 @@ def between(query: Windows, bank: Windows, compare: Callable[[Tensor, Tensor, Te
 def _shared_joints(seen: Tensor, known: Tensor) -> Tensor | slice | None:
     """The joints that both sides saw; ``None`` where they are too few."""
     both = seen & known
-    if int(both.sum()) < min(COMMON, len(both)):
+    if int(both.sum()) < min(MIN_SHARED_JOINTS, len(both)):
         return None
     return slice(None) if bool(both.all()) else both.nonzero()[:, 0]
 
@@ -284,7 +275,7 @@ def _shared_joints(seen: Tensor, known: Tensor) -> Tensor | slice | None:
 
 
 @dataclass(frozen=True)
-class Described:
+class Description:
     """Windows as they are compared: tensors whose first axis is the windows'."""
 
     parts: tuple[Tensor, ...]
@@ -292,8 +283,8 @@ class Described:
     def __len__(self) -> int:
         return len(self.parts[0])
 
-    def __getitem__(self, index: Tensor | slice) -> Described:
-        return Described(tuple(part[index] for part in self.parts))
+    def __getitem__(self, index: Tensor | slice) -> Description:
+        return Description(tuple(part[index] for part in self.parts))
 
     @property
     def size(self) -> int:
@@ -301,9 +292,9 @@ class Described:
         return sum(part.numel() * part.element_size() for part in self.parts)
 
 
-Describe = Callable[[Tensor], Described]  # of ``(N, length, joints, 2)`` values among some joints
+Describe = Callable[[Tensor], Description]  # of ``(N, length, joints, 2)`` values among some joints
 Describer = Callable[[Tensor | slice], Describe]  # makes it for some joints
-Compare = Callable[[Described, Described], Sequence[Tensor]]  # ``(Q, E)`` tables
+Compare = Callable[[Description, Description], Sequence[Tensor]]  # ``(Q, E)`` tables
 
 
 @dataclass(frozen=True)
@@ -313,10 +304,6 @@ class Copy:
     windows: Windows
     numbers: Tensor | None = None
     symmetry: Tensor | None = None
-
-    def only(self, mine: Tensor) -> Copy:
-        """Of some exemplars, ``(N,)`` bool."""
-        return dataclasses.replace(self, numbers=mine.nonzero()[:, 0] if self.numbers is None else self.numbers[mine[self.numbers]])
 
     def groups(self) -> Iterator[tuple[Tensor | None, Tensor]]:
         """``(numbers, joints seen)`` of the exemplars that show the same joints."""
@@ -337,7 +324,7 @@ class Facing:
     """Windows of a copy that show the same joints, as they face queries that show the same joints."""
 
     numbers: Tensor | None
-    described: Described | None = None
+    described: Description | None = None
     describe: Describe | None = None
     key: tuple[int, ...] = ()
 
@@ -346,7 +333,7 @@ class Facing:
         """Bytes of what is kept."""
         return 0 if self.described is None else self.described.size
 
-    def chosen(self, numbers: Tensor, place: Tensor) -> Facing:
+    def select(self, numbers: Tensor, place: Tensor) -> Facing:
         """Some exemplars only, given their numbers and the place of every exemplar among these, -1 without one."""
         if self.numbers is None:
             return self if self.described is None else dataclasses.replace(self, described=self.described[numbers])
@@ -361,7 +348,7 @@ class Bank:
 
     def __init__(self, copies: Sequence[Copy], describer: Describer) -> None:
         self._copies, self._describer = copies, describer
-        self._kept: dict[tuple[bool, ...], list[Facing]] = {}
+        self._cache: dict[tuple[bool, ...], list[Facing]] = {}
 
     def __len__(self) -> int:
         return len(self._copies[0].windows)
@@ -369,34 +356,34 @@ class Bank:
     def facing(self, seen: Tensor) -> list[Facing]:
         """All copies, as they face queries that saw these joints."""
         key = tuple(seen.tolist())
-        found = self._kept.pop(key, None)
+        found = self._cache.pop(key, None)
         if found is None:
-            found = [one for copy in self._copies for one in self._described(copy, seen)]
-        self._kept[key] = found  # the last one is the one used last
-        for old in list(self._kept)[:-1]:
-            if sum(one.size for faced in list(self._kept.values()) for one in faced) <= KEPT_BLOCK:
+            found = [one for copy in self._copies for one in self._describe_copy(copy, seen)]
+        self._cache[key] = found  # the last one is the one used last
+        for old in list(self._cache)[:-1]:
+            if sum(one.size for faced in list(self._cache.values()) for one in faced) <= MAX_CACHE_BYTES:
                 break
-            self._kept.pop(old, None)
+            self._cache.pop(old, None)
         return found
 
-    def _described(self, copy: Copy, seen: Tensor) -> Iterator[Facing]:
+    def _describe_copy(self, copy: Copy, seen: Tensor) -> Iterator[Facing]:
         for numbers, known in copy.groups():
             joints, count = _shared_joints(seen, known), len(copy.windows) if numbers is None else len(numbers)
             if joints is None or not count:
                 yield Facing(numbers)
                 continue
-            describe = partial(_among, joints, self._describer(joints))
+            describe = partial(_describe_joints, joints, self._describer(joints))
             blocks = (slice(at, at + QUERY_BLOCK) for at in range(0, count, QUERY_BLOCK))
             parts = [describe(copy.values(some if numbers is None else numbers[some])) for some in blocks]
-            described = Described(tuple(torch.cat(same) for same in zip(*(one.parts for one in parts), strict=True)))
+            described = Description(tuple(torch.cat(same) for same in zip(*(one.parts for one in parts), strict=True)))
             yield Facing(numbers, described, describe, (id(self._describer), *(seen & known).tolist()))
 
 
-def _among(joints: Tensor | slice, describe: Describe, values: Tensor) -> Described:
+def _describe_joints(joints: Tensor | slice, describe: Describe, values: Tensor) -> Description:
     return describe(values[:, :, joints])
 
 
-def least_over_copies(
+def min_over_copies(
     query: Windows, banks: Sequence[Bank], compare: Compare, worst: Sequence[float], chosen: Tensor | None = None
 ) -> list[Tensor]:
     """``(queries, exemplars)`` tables, each the least over the exemplars' copies of what ``compare`` says."""
@@ -410,7 +397,7 @@ def least_over_copies(
     for rows, seen in patterns(query.seen):
         faced = [one for bank in banks for one in bank.facing(seen)]
         if place is not None and chosen is not None:
-            faced = [one.chosen(chosen, place) for one in faced]
+            faced = [one.select(chosen, place) for one in faced]
         faced.sort(key=lambda one: one.key)
         every = len(rows) == len(query)
         values = query.values if every else query.values[rows]
@@ -429,7 +416,7 @@ def _tables(faced: list[Facing], compare: Compare, worst: Sequence[float], width
     tables = tuple(values.new_full((len(values), width), torch.inf) for _ in worst)
     block = PAIR_BLOCK if values.device.type == "cpu" else DEVICE_BLOCK
     for _, alike in groupby(faced, key=lambda one: one.key):
-        query: Described | None = None
+        query: Description | None = None
         for one in alike:
             if one.describe is None or one.described is None:
                 for table, bound in zip(tables, worst, strict=True):
@@ -456,51 +443,28 @@ def _lower(table: Tensor, columns: Tensor | None, values: Tensor) -> None:
         table.index_copy_(1, columns, torch.minimum(table.index_select(1, columns), values))
 
 
-def fused_residual(
-    query: Windows,
-    copies: Sequence[Windows],
-    metric: JointMetric,
-    channels: tuple[str, ...] = NEAREST,
-    weights: Tensor | None = None,
-    terms: tuple[str, ...] = ("epi",),
-) -> Tensor:
-    r"""Residual of every query to every exemplar, the best over the exemplar's copies (crops, mirror images)."""
-    if not copies:
-        raise ValueError("no exemplar to compare with")
-    bank = Bank([Copy(windows) for windows in copies], planes_of(metric, channels))
-    return fused_residuals(query, [bank], [fusion(terms, channels, weights)])[0]
-
-
-def fused_residuals(query: Windows, banks: Sequence[Bank], fusions: Sequence[Fusion], chosen: Tensor | None = None) -> list[Tensor]:
-    """The same of banks of planes (:func:`planes_of`): a ``(queries, chosen)`` table for each fusion."""
-    worst = [(1.0 + EPSILON) ** (len(one.terms) * sum(one.powers)) for one in fusions]
-    tables = least_over_copies(
-        query, banks, lambda left, right: fuse_terms(left.parts, right.parts, fusions, EPSILON), worst, chosen
-    )
+def fused_residuals(query: Windows, banks: Sequence[Bank], fusions: Sequence[Terms], chosen: Tensor | None = None) -> list[Tensor]:
+    r"""Residual of every query to every exemplar of banks of planes (:func:`planes_of`), the best over its copies (crops, mirror
+    images): a ``(queries, chosen)`` table for each fusion of terms."""
+    worst = [(1.0 + EPSILON) ** (len(terms) * len(NEAREST)) for terms in fusions]
+    tables = min_over_copies(query, banks, lambda left, right: fuse_terms(left.parts, right.parts, fusions, EPSILON), worst, chosen)
     return [table.log_() for table in tables]
 
 
-def fusion(terms: tuple[str, ...], channels: tuple[str, ...] = NEAREST, weights: Tensor | None = None) -> Fusion:
-    """Terms in channels that count as the weights say."""
-    if not channels or not terms:
-        raise ValueError("no channel to compare")
-    return Fusion(terms, (1.0,) * len(channels) if weights is None else tuple(weights.tolist()))
-
-
-def planes_of(metric: JointMetric, channels: tuple[str, ...] = NEAREST) -> Describer:
+def planes_of(metric: JointMetric) -> Describer:
     """A describer for :class:`Bank`: windows as planes, in each channel."""
 
     @lru_cache(maxsize=8)  # banks of all crops ask for the same joints, one after the other
     def weights(joints: tuple[int, ...] | None) -> list[Tensor | None]:
         chosen = slice(None) if joints is None else torch.tensor(joints, device=metric.covariance.device)
-        return [metric.weights(name, chosen) for name in channels]
+        return [metric.weights(name, chosen) for name in NEAREST]
 
     def among(joints: Tensor | slice) -> Describe:
         each = weights(None if isinstance(joints, slice) else tuple(joints.tolist()))
 
-        def describe(values: Tensor) -> Described:
-            pairs = [factorize(laid_out(values, name, some)) for name, some in zip(channels, each, strict=True)]
-            return Described(tuple(part for pair in pairs for part in pair))
+        def describe(values: Tensor) -> Description:
+            pairs = [factorize(flatten_channel(values, name, some)) for name, some in zip(NEAREST, each, strict=True)]
+            return Description(tuple(part for pair in pairs for part in pair))
 
         return describe
 
@@ -526,7 +490,7 @@ class Kernels:
     def fit(self, windows: Windows) -> Tensor:
         """Set the scales from training windows and return their ``(N, N)`` kernel matrix."""
         chosen = windows[torch.arange(0, len(windows), max(1, len(windows) // MAX_SCALE_WINDOWS))]
-        tables = least_over_copies(
+        tables = min_over_copies(
             chosen, [self.bank(chosen)], lambda left, right: list(self._distances(left, right)), [1.0] * self.count
         )
         self.scales = torch.stack([kernel_scale(table, KERNEL_WIDTH) for table in tables])
@@ -542,28 +506,28 @@ class Kernels:
             raise ValueError("the kernels have no scales yet; fit them first")
         slopes = (-1.0 / self.scales).tolist()
 
-        def total(left: Described, right: Described) -> list[Tensor]:
+        def total(left: Description, right: Description) -> list[Tensor]:
             kernels = (distance.mul_(slope).exp_() for slope, distance in zip(slopes, self._distances(left, right), strict=True))
             out = next(kernels)
             for kernel in kernels:
                 out.add_(kernel)
             return [out.div_(len(slopes))]
 
-        return least_over_copies(query, [bank if isinstance(bank, Bank) else self.bank(bank)], total, [0.0])[0]
+        return min_over_copies(query, [bank if isinstance(bank, Bank) else self.bank(bank)], total, [0.0])[0]
 
-    def _describe(self, values: Tensor) -> Described:
+    def _describe(self, values: Tensor) -> Description:
         """Unit images and how much larger they are than their heights, where bases are compared these; then moments."""
         parts = []
         for name in CHANNELS:
-            image = laid_out(values, name, None)
+            image = flatten_channel(values, name, None)
             unit = _flat(image).view_as(image)
             parts += [unit, 1 / unit[:, 1].norm(dim=1, keepdim=True).clamp(min=TINY)]
             parts += [factorize(image)[0]] if self.one_side else []
         for whole_image in (False, True)[: 1 + self.one_side]:
-            parts += [_flat(moment) for moment in order_free(values, whole_image)]
-        return Described(tuple(parts))
+            parts += [_flat(moment) for moment in order_free_moments(values, whole_image)]
+        return Description(tuple(parts))
 
-    def _distances(self, left: Described, right: Described) -> Iterator[Tensor]:
+    def _distances(self, left: Description, right: Description) -> Iterator[Tensor]:
         """``(Q, E)`` distances, one kernel after the other."""
         each = 3 if self.one_side else 2
         pairs = list(zip(left.parts, right.parts, strict=True))

@@ -28,13 +28,13 @@ MAX_CHANCE_RATIO = 0.5  # of their mean distortion, which the right layout stays
 def mirror_permutation(skeleton: Skeleton | None, windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
     """``(joints,)`` index of every joint's mirror image (itself on the midline), or ``None`` where it cannot be told."""
     if skeleton is not None:
-        named = from_names(skeleton.joints)
+        named = permutation_from_names(skeleton.joints)
         if named is not None:
             return named
-    return from_data(windows, seen)
+    return permutation_from_layouts(windows, seen)
 
 
-def from_names(names: tuple[str, ...]) -> Tensor | None:
+def permutation_from_names(names: tuple[str, ...]) -> Tensor | None:
     """From names that say left and right (``left_knee``, ``LKnee``, ``knee.r``...); ``None`` where no pair is found."""
     index = {name: i for i, name in enumerate(names)}
     swap = list(range(len(names)))
@@ -95,7 +95,7 @@ _LAYOUTS: dict[int, tuple[tuple[tuple[int, int], ...], ...]] = {
 }  # fmt: skip
 
 
-def from_data(windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
+def permutation_from_layouts(windows: Tensor, seen: Tensor | None = None) -> Tensor | None:
     r"""The common layout with this number of joints whose mirror image keeps the distances between joints. windows
     ``(N, length, joints, 2)``."""
     joints = windows.shape[2]
@@ -204,7 +204,7 @@ class Exemplars:
         count = len(self)
         return self.views[slice(index * count, (index + 1) * count)]
 
-    def only(self, chosen: torch.Tensor) -> Exemplars:
+    def select(self, chosen: torch.Tensor) -> Exemplars:
         """Some of them, ``(N,)`` bool."""
         count, moments = len(self), chosen[self.owner]
 
@@ -215,7 +215,7 @@ class Exemplars:
         owner = (torch.cumsum(chosen, 0) - 1)[self.owner[moments]]
         return Exemplars(copies(self.crops), copies(self.views), self.moments[moments], owner, self.solid[chosen], seconds, cyclic)
 
-    def extended(self, other: Exemplars) -> Exemplars:
+    def join(self, other: Exemplars) -> Exemplars:
         """These and then the others."""
         mine, theirs = len(self), len(other)
 

@@ -14,14 +14,14 @@ from sklearn.utils.validation import check_is_fitted
 from dyntorch.numerics import one_thread
 from indexing.action.background import (
     FALSE_ALARM_RATE,
-    OtherMovement,
+    BackgroundClips,
     cut_background,
     event_level,
     find_similar_kinds,
     perform_other_actions,
-    played_otherwise,
+    remove_background,
+    replay_clips,
     segment_evidence,
-    without_background,
 )
 from indexing.action.bank import Windows
 from indexing.action.exemplars import (
@@ -186,7 +186,6 @@ class ActionIndexer(SavedClassifier):
             "view": model.view,
             "scorer": model.scorer,
             "blend": dataclasses.asdict(model.blend),
-            "parts": [model.parts.gain, model.parts.sigma],
             "groups": None if self.groups_ is None else self.groups_.tolist(),
             "skeleton": skeleton_to_json(self.skeleton_),
         }
@@ -229,53 +228,55 @@ class ActionIndexer(SavedClassifier):
             ValueError: naming the clip or the parameter, what is wrong and what to do.
         """
         self.check_parameters()
-        found, owners = gather(clips, self.fps)
-        people = gather_groups(found, owners, groups)
-        values = gather_labels(found, owners, labels)
+        items, owners = gather(clips, self.fps)
+        people = gather_groups(items, owners, groups)
+        values = gather_labels(items, owners, labels)
         classes, numbers = np.unique(values, return_inverse=True)
         rng = np.random.default_rng(self.random_state)
-        other = self._other_movement(found, len(classes) == 1, background)
-        plan = self._plan(_default_views(found))
-        exemplars = cut_exemplars([*found, *other.clips], plan, rng)
+        other = self._make_background(items, len(classes) == 1, background)
+        plan = self._plan(NUM_VIEWS_SOLID if any(clip.dims == 3 for clip in items) else NUM_VIEWS)
+        exemplars = cut_exemplars([*items, *other.clips], plan, rng)
         numbers = np.concatenate([numbers, len(classes) + other.numbers])
         if people is not None:
             people = np.concatenate([people, [f"background: {kind}" for kind in other.kinds]])
         if len(classes) == 1:
-            kept = self._unlike(exemplars, numbers, 1, np.arange(len(numbers)) < len(found), other)
-            if not kept[len(found) :].any():
+            chosen = self._select_exemplars(exemplars, numbers, 1, np.arange(len(numbers)) < len(items), other)
+            if not chosen[len(items) :].any():
                 raise ValueError(
                     f"labels: only one class ({classes[0]!r}), and however its clips are played otherwise they come out the same; "
                     "give background=, a recording of other movement, or clips of a second action"
                 )
-            exemplars, numbers, people = _only(kept, exemplars, numbers, people)
-        given = slice(len(found), len(found) + sum(other.sure))
-        return self._learn(exemplars, classes, numbers, layout_of(found), people, given)
+            exemplars, numbers, people = _select(chosen, exemplars, numbers, people)
+        given = slice(len(items), len(items) + sum(other.trusted))
+        return self._learn(exemplars, classes, numbers, layout_of(items), people, given)
 
-    def _other_movement(self, found: Sequence[Clip], alone: bool, background: Iterable[Any] | None) -> OtherMovement:
+    def _make_background(self, clips: Sequence[Clip], alone: bool, background: Iterable[Any] | None) -> BackgroundClips:
         """What is not one of the actions: what was given, and where there is one action alone what is made."""
-        skeleton = layout_of(found)
-        other = OtherMovement()
+        skeleton = layout_of(clips)
+        other = BackgroundClips()
         if background is not None:
-            lengths = [clip_seconds(clip) for clip in found]
-            other += cut_background(background, self.fps, found[0].joints.shape[1], skeleton, float(np.median(lengths)))
+            lengths = [clip_seconds(clip) for clip in clips]
+            other += cut_background(background, self.fps, clips[0].joints.shape[1], skeleton, float(np.median(lengths)))
         if alone:
             # a generator of its own: what is made does not hang on how the exemplars are seen
             rng = np.random.default_rng(0)
-            people = perform_other_actions(skeleton, 3 if all(clip.dims == 3 for clip in found) else 2, rng)
-            other += people + played_otherwise(found, not len(people), rng)
+            people = perform_other_actions(skeleton, 3 if all(clip.dims == 3 for clip in clips) else 2, rng)
+            other += people + replay_clips(clips, not len(people), rng)
         return other
 
-    def _unlike(self, exemplars: Exemplars, numbers: Array, known: int, new: Array, other: OtherMovement | None = None) -> Array:
+    def _select_exemplars(
+        self, exemplars: Exemplars, numbers: Array, num_known: int, new: Array, background: BackgroundClips | None = None
+    ) -> Array:
         """``(N,)`` bool, all exemplars but the background that comes out too much like new ones."""
-        hidden = numbers >= known
-        asked = torch.from_numpy(new | hidden)
-        own = np.where(hidden, numbers - known + 1, 0)[new | hidden]
-        kinds = other.kinds if other is not None else ("",) * int(hidden.sum())
-        kept = np.ones(len(numbers), dtype=bool)
-        kept[hidden] = ~find_similar_kinds(exemplars.only(asked), own, kinds)
-        if other is not None:
-            kept[hidden] |= np.array(other.sure)
-        return kept
+        hidden = numbers >= num_known
+        compared = new | hidden
+        labels = np.where(hidden, numbers - num_known + 1, 0)[compared]
+        kinds = background.kinds if background is not None else ("",) * int(hidden.sum())
+        chosen = np.ones(len(numbers), dtype=bool)
+        chosen[hidden] = ~find_similar_kinds(exemplars.select(torch.from_numpy(compared)), labels, kinds)
+        if background is not None:
+            chosen[hidden] |= np.array(background.trusted)
+        return chosen
 
     @one_thread
     def partial_fit(
@@ -289,28 +290,28 @@ class ActionIndexer(SavedClassifier):
         if not hasattr(self, "model_"):
             return self.fit(clips, labels, groups)
         self.check_parameters()
-        found, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_)
-        people = gather_groups(found, owners, groups)
+        items, owners = gather(clips, self.fps, self.n_joints_, self.skeleton_)
+        people = gather_groups(items, owners, groups)
         if self.weights == "learned" and (people is None) != (self.groups_ is None):
             here, there = ("these clips", "the earlier ones") if people is not None else ("the earlier clips", "these")
             raise ValueError(f"groups: {here} say who performs, {there} do not; give groups=, or clips with the field 'subject'")
         both = None if people is None or self.groups_ is None else np.concatenate([self.groups_, people])
-        values = gather_labels(found, owners, labels)
+        values = gather_labels(items, owners, labels)
         before = self.model_.labels.numpy()
-        named = before < self.model_.known  # the others are background
-        known, fresh = np.unique(join_labels(self.classes_[before[named]], values), return_inverse=True)
-        numbers = np.concatenate([before - self.model_.known + len(known), fresh[named.sum() :]])
-        numbers[: len(before)][named] = fresh[: named.sum()]
+        known = before < self.model_.num_known  # the others are background
+        all_classes, joined = np.unique(join_labels(self.classes_[before[known]], values), return_inverse=True)
+        numbers = np.concatenate([before - self.model_.num_known + len(all_classes), joined[known.sum() :]])
+        numbers[: len(before)][known] = joined[: known.sum()]
         check_plan(self, len(CROPS) if self.search else 1, self.model_.exemplars)
         plan = self._plan(len(self.model_.exemplars.views) // len(before))
         seed = 0 if self.random_state is None else self.random_state
         rng = np.random.default_rng([seed, len(before)])
-        extended = self.model_.exemplars.extended(cut_exemplars(found, plan, rng))
+        exemplars = self.model_.exemplars.join(cut_exemplars(items, plan, rng))
         if self.model_.hidden:
-            kept = self._unlike(extended, numbers, len(known), np.arange(len(numbers)) >= len(before))
-            if len(known) > 1 or kept[numbers >= len(known)].any():
-                extended, numbers, both = _only(kept, extended, numbers, both)
-        return self._learn(extended, known, numbers, self.skeleton_, both)
+            chosen = self._select_exemplars(exemplars, numbers, len(all_classes), np.arange(len(numbers)) >= len(before))
+            if len(all_classes) > 1 or chosen[numbers >= len(all_classes)].any():
+                exemplars, numbers, both = _select(chosen, exemplars, numbers, both)
+        return self._learn(exemplars, all_classes, numbers, self.skeleton_, both)
 
     def _plan(self, views: int) -> ExemplarPlan:
         views = views if self.virtual_views is None else self.virtual_views
@@ -326,14 +327,9 @@ class ActionIndexer(SavedClassifier):
         given: slice = slice(0, 0),
     ) -> Self:
         """Learn everything, and only then change anything; given: exemplars of background that are known not to be the action."""
-        symmetry = None
+        originals, symmetry = exemplars.crop(0), None
         if self.mirror:
-            originals = exemplars.crop(0)
-            symmetry = mirror_permutation(
-                skeleton,
-                originals.values[:MAX_WINDOWS],
-                originals.seen[:MAX_WINDOWS],
-            )
+            symmetry = mirror_permutation(skeleton, originals.values[:MAX_WINDOWS], originals.seen[:MAX_WINDOWS])
         if self.mirror is True and symmetry is None:
             raise ValueError(
                 "mirror=True: the joints' mirror images are not known; give clips a skeleton with names, or mirror='auto'"
@@ -354,7 +350,7 @@ class ActionIndexer(SavedClassifier):
         model = learn(there, labels, len(classes) + hidden, lesson).to("cpu")
         if len(classes) == 1 and given.stop > given.start:
             # these tell by themselves how near other movement comes to the action
-            model = dataclasses.replace(model, evidence_out=model.evidence(exemplars.crop(0)[given]))
+            model = dataclasses.replace(model, evidence_out=model.evidence(originals[given]))
         self.model_ = model
         self.groups_ = groups
         self.classes_ = classes
@@ -364,19 +360,23 @@ class ActionIndexer(SavedClassifier):
         return self
 
     def _calibrate(self) -> None:
-        self.reject_threshold_ = reject_threshold(self._rate, self.model_.evidence_out, self.model_.judged)
+        self.reject_threshold_ = reject_threshold(self._rate, self.model_.evidence_out, self.model_.num_calibration_classes)
 
     @property
     def _rate(self) -> float | None:
         """The rate of false alarms that is asked for: of one action alone there is always one."""
         return FALSE_ALARM_RATE if self.reject is None and len(self.classes_) == 1 else self.reject
 
+    @property
+    def _evidence_level(self) -> float:
+        return -np.inf if self.reject_threshold_ is None else self.reject_threshold_
+
     # ---- recognition -------------------------------------------------------------------------------------------------
     def _queries(self, clips: Iterable[Any]) -> Windows:
         check_is_fitted(self, "model_")
-        found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_)
-        source = concatenate_clips(found, self.repair)
-        check_common(found, source.seen, self.model_.shown())
+        items = check_queries(clips, self.fps, self.n_joints_, self.skeleton_)
+        source = concatenate_clips(items, self.repair)
+        check_common(items, source.seen, self.model_.joint_sets())
         return Windows(resample_clips(source, self.length), torch.from_numpy(source.seen)).to(self.device)
 
     def _model(self) -> ShapeModel:
@@ -414,7 +414,7 @@ class ActionIndexer(SavedClassifier):
         model = self._model()
         nearest = None if self.reject_threshold_ is None else model.nearest_scores(query)
         numbers = model.scores(query, nearest).argmax(dim=1).cpu().numpy()
-        refused = numbers >= model.known
+        refused = numbers >= model.num_known
         labels = self.classes_[np.where(refused, 0, numbers)]
         if self.reject_threshold_ is not None:
             refused = refused | (model.evidence(query, nearest) < self.reject_threshold_).cpu().numpy()
@@ -425,39 +425,31 @@ class ActionIndexer(SavedClassifier):
         return Stream(self.length, self.window, tuple(self.tempi), self.device, self.options or ActionOptions())
 
     @one_thread
-    def explain(self, clip: Any, progress: Callable[[float], None] | None = None) -> Explanation:
+    def decode(self, clip: Any, progress: Callable[[float], None] | None = None) -> Explanation:
         """An untrimmed recording as segments: scores of its frames, events, and what was held back and why.
 
         Args:
             progress: called with the share done, 0..1.
         """
         check_is_fitted(self, "model_")
-        (found,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, recordings=True)
-        begin = float(found.times[0])
-        times = found.times
-        found = found.replace(times=found.times - begin)  # rounding must not depend on what the clock shows
-        found = repair_clip(found) if self.repair else found
+        (recording,) = check_queries([clip], self.fps, self.n_joints_, self.skeleton_, recordings=True)
+        times, begin = recording.times, float(recording.times[0])
+        recording = recording.replace(times=times - begin)  # rounding must not depend on what the clock shows
+        recording = repair_clip(recording) if self.repair else recording
         model = self._model()
-        rate = None if model.hidden else self.reject
-        told = decode(
-            model,
-            found,
-            self._stream(),
-            [*self.classes_.tolist(), *(("background", i) for i in range(model.hidden))],
-            rate,
-            progress,
-        )
+        labels = [*self.classes_.tolist(), *(("background", i) for i in range(model.hidden))]
+        result = decode(model, recording, self._stream(), labels, None if model.hidden else self.reject, progress)
         if model.hidden:
-            floor, least = event_level(model, self._rate), -np.inf if self.reject_threshold_ is None else self.reject_threshold_
-            told = without_background(
-                told, self.classes_.tolist(), floor, lambda some: segment_evidence(model, found, some, self.length) >= least
+            floor, level = event_level(model, self._rate), self._evidence_level
+            result = remove_background(
+                result, self.classes_.tolist(), floor, lambda some: segment_evidence(model, recording, some, self.length) >= level
             )
 
-        def later(event: Event) -> Event:
+        def shift(event: Event) -> Event:
             return dataclasses.replace(event, start=event.start + begin, end=event.end + begin)
 
-        held = [Withheld(later(one.event), one.reason) for one in told.withheld]
-        return dataclasses.replace(told, times=times, events=[later(event) for event in told.events], withheld=held)
+        withheld = [Withheld(shift(one.event), one.reason) for one in result.withheld]
+        return dataclasses.replace(result, times=times, events=[shift(event) for event in result.events], withheld=withheld)
 
     @one_thread
     def scan(self, clip: Any, progress: Callable[[float], None] | None = None) -> tuple[Array, list[Event]]:
@@ -466,8 +458,8 @@ class ActionIndexer(SavedClassifier):
         Args:
             progress: called with the share done, 0..1.
         """
-        told = self.explain(clip, progress)
-        return told.scores, list(told.events)
+        result = self.decode(clip, progress)
+        return result.scores, list(result.events)
 
     @one_thread
     def score_frames(self, clip: Any, progress: Callable[[float], None] | None = None) -> Array:
@@ -511,7 +503,7 @@ class ActionIndexer(SavedClassifier):
             tuple(self.classes_.tolist()),
             self._stream(),
             self._rate if model.hidden else self.reject,
-            -np.inf if self.reject_threshold_ is None else self.reject_threshold_,
+            self._evidence_level,
             self.repair,
             self.n_joints_,
             self.skeleton_,
@@ -534,14 +526,10 @@ class ActionIndexer(SavedClassifier):
         return Clip(joints, label=label, skeleton=self.skeleton_, name=f"exemplar {index}", **timing)
 
 
-def _default_views(clips: Sequence[Clip]) -> int:
-    return NUM_VIEWS_SOLID if any(clip.dims == 3 for clip in clips) else NUM_VIEWS
-
-
-def _only(kept: Array, exemplars: Exemplars, numbers: Array, people: Array | None) -> tuple[Exemplars, Array, Array | None]:
+def _select(chosen: Array, exemplars: Exemplars, numbers: Array, people: Array | None) -> tuple[Exemplars, Array, Array | None]:
     """Some exemplars, their classes numbered anew, and who performs them."""
-    numbers = np.unique(numbers[kept], return_inverse=True)[1]
-    return exemplars.only(torch.from_numpy(kept)), numbers, None if people is None else people[kept]
+    numbers = np.unique(numbers[chosen], return_inverse=True)[1]
+    return exemplars.select(torch.from_numpy(chosen)), numbers, None if people is None else people[chosen]
 
 
 def _groups(names: Any, exemplars: int) -> Array | None:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from dyntorch.numerics import affine_factorization, metric_upgrade
-from indexing.action.bank import COMMON
+from indexing.action.bank import MIN_SHARED_JOINTS
 from indexing.cameras import virtual
 from indexing.clip import Clip, as_clip
 from indexing.joints import layout_of, match_all
@@ -20,15 +20,14 @@ from indexing.remarks import same_clips
 from indexing.skeleton import Skeleton
 from indexing.windows import check_clips, concatenate_clips, describe_gap, sample
 
-# share of the energy; a detector's noise leaves .002-.005, views that lag by .3 s .006-.04, another action .01-.05
+# share of the energy that one rigid space-time shape may leave; of synthetic people a detector's noise leaves .002-.005, views that
+# lag by .3 s .006-.04, views of another action .01-.05
 MAX_UNEXPLAINED = 0.01
+
+Array = NDArray[Any]
 
 # ----------------------------------------------------------------------------------------------------------------------
 # One performance seen by several synchronized cameras -> one exemplar in 3D, where the views decide its shape.
-
-
-# Share of the energy that one rigid space-time shape may leave unexplained.  On synthetic people a detector's noise leaves
-# .002-.005, views that lag by .3 s .006-.04, views of another action .01-.05.
 
 
 def combine(views: tuple[Clip, ...]) -> list[Clip]:
@@ -57,11 +56,8 @@ def combine(views: tuple[Clip, ...]) -> list[Clip]:
     shape, cameras, left = affine_factorization(windows[:, :, torch.from_numpy(seen)].flatten(1, 2))
     metric, decided = metric_upgrade(shape, cameras)
     if not bool(decided) or float(left) > MAX_UNEXPLAINED:
-        why = (
-            f"{float(left):.0%} of the motion is not one rigid space-time shape"
-            if decided
-            else "the cameras stand too close together"
-        )
+        unexplained = f"{float(left):.0%} of the motion is not one rigid space-time shape"
+        why = unexplained if decided else "the cameras stand too close together"
         warnings.warn(
             f"views of {first.name!r} do not decide a 3D shape ({why}); each is used as an example of its own", stacklevel=2
         )
@@ -70,9 +66,6 @@ def combine(views: tuple[Clip, ...]) -> list[Clip]:
     joints[:, seen] = metric.reshape(steps, int(seen.sum()), 3).numpy()
     slots = (np.arange(steps) + 0.5) / steps
     return [first.replace(joints=joints, times=start + (end - start) * slots, confidence=None, up="y")]
-
-
-Array = NDArray[Any]
 
 
 def as_clips(clips: Iterable[Any], fps: float) -> list[Clip | tuple[Clip, ...]]:
@@ -140,12 +133,12 @@ def check_queries(
 def check_common(clips: list[Clip], seen: NDArray[np.bool_], known: NDArray[np.bool_]) -> None:
     """Raise where a query shares too few joints with every exemplar to be compared at all. seen ``(clips, joints)``."""
     most = (seen.astype(int) @ known.astype(int).T).max(axis=1)
-    few = np.flatnonzero(most < min(COMMON, seen.shape[1]))
+    few = np.flatnonzero(most < min(MIN_SHARED_JOINTS, seen.shape[1]))
     if len(few):
         clip = clips[few[0]]
         raise ValueError(
-            f"clip {few[0]} ({clip.name!r}): joints: it shares {most[few[0]]} joints with the learned clips, {COMMON} are needed; "
-            "leave it out, or learn from clips that show these joints"
+            f"clip {few[0]} ({clip.name!r}): joints: it shares {most[few[0]]} joints with the learned clips, "
+            f"{MIN_SHARED_JOINTS} are needed; leave it out, or learn from clips that show these joints"
         )
 
 

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from indexing.action.bank import COVARIANCE_FLOOR, WHITENING_POWER, JointMetric, Kernels, Windows, stack
 from indexing.action.exemplars import CARD_PITCH_SIGMA, MAX_SAMPLED_MOMENTS, Exemplars, turn
-from indexing.action.joint_weights import JointWeights, learn_joint_weights
 from indexing.action.model import (
     NEAREST_WEIGHT,
     PENALTY,
@@ -187,7 +186,6 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
     none, share = torch.zeros_like(labels, dtype=torch.bool), float(exemplars.solid.float().mean())
     model = ShapeModel(
         exemplars, labels, classes, lesson.view, lesson.scorer, metric, lesson.symmetry, none,
-        JointWeights.equal(originals.values.shape[2], labels.device),
         nothing, torch.zeros_like(exemplars.owner, dtype=nothing.dtype), None, None, None,
         blend=Blend(
             nearest=share * NEAREST_WEIGHT_SOLID + (1 - share) * NEAREST_WEIGHT, sharpness=SHARPNESS
@@ -197,28 +195,12 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
     if lesson.symmetry is not None:
         model = dataclasses.replace(model, mirrored=_mirror_is_same_action(model, originals) if lesson.guard else ~none)
     model = _with_hubs(model, originals)
-    if lesson.learned and lesson.view == "any" and lesson.groups is not None:
-        parts = _parts(model, lesson)
-        if parts.learned:
-            model = _with_hubs(dataclasses.replace(model, parts=parts, hub=nothing), originals)
     trained = None
     if lesson.scorer != "nearest":
         model, trained = _with_machine(model, one_side=lesson.view == "same")
     if lesson.learned and lesson.groups is not None:
         model = dataclasses.replace(model, blend=learn_blend(model, lesson.groups, trained))
     return _with_evidence(model, originals)
-
-
-def _parts(model: ShapeModel, lesson: Lesson) -> JointWeights:
-    """How much each joint counts, learned across views of 3D exemplars: of turned cards nothing can be learned."""
-    asked = asked_views(model)[1:]
-    if not asked or not bool(model.exemplars.solid.all()):
-        return model.parts
-    owner = torch.arange(len(model.labels), device=model.labels.device).repeat(len(asked))
-    groups, symmetry = lesson.groups, lesson.symmetry
-    return learn_joint_weights(
-        stack(asked), owner, model.copies(), model.metric, model.labels, groups=groups, hub=model.hub, symmetry=symmetry
-    )
 
 
 def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
@@ -265,12 +247,12 @@ def _profiles(tables: list[Tensor], labels: Tensor, classes: int, hidden: int) -
 def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
     """The evidence that exemplars would have for other classes, were their own class unknown; of all that could be taken for
     one."""
-    if model.known == 1:
+    if model.num_known == 1:
         return _between_kinds(tables[0], model)
     found, refused = [], []
     for c in range(model.classes):
         mine, rest = model.labels == c, model.labels != c
-        classes, hidden = model.classes - 1, model.hidden - (c >= model.known)
+        classes, hidden = model.classes - 1, model.hidden - (c >= model.num_known)
         if classes == hidden:  # no known class is left
             continue
         labels = model.labels[rest] - (model.labels[rest] > c).long()
@@ -290,10 +272,10 @@ def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
 
 def _between_kinds(residual: Tensor, model: ShapeModel) -> Tensor:
     """How near exemplars of background come to every kind that is not theirs: as near another movement comes to the action."""
-    rows = model.labels >= model.known
+    rows = model.labels >= model.num_known
     scores = class_scores(residual[rows], model.labels, model.classes)
     foreign = torch.nn.functional.one_hot(model.labels[rows], model.classes) == 0
-    return scores[:, model.known :][foreign[:, model.known :]]
+    return scores[:, model.num_known :][foreign[:, model.num_known :]]
 
 
 def _hub(residual: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
@@ -333,11 +315,11 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
 # joint's importance is its linear share in the margin of the true action, over all that can be seen beside it.
 
 
-def importance(model: ShapeModel, groups: Tensor | None = None, seed: int = 0) -> Tensor:
+def importance(model: ShapeModel, groups: Tensor | None = None) -> Tensor:
     r"""Linear share of every joint in the margin of every action. model ``(N,)`` -> ``(classes, joints)``."""
     originals, labels = model.exemplars.crop(0), model.labels
     groups = torch.arange(len(labels), device=labels.device) if groups is None else groups.to(labels.device)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     asked = _sample_queries(labels, generator)
     query, truth = originals[asked], labels[asked]
     hidden = groups[asked][:, None] == groups[None]

@@ -23,7 +23,6 @@ from torch import Tensor
 from indexing.action.bank import (
     CHANNELS,
     EPSILON,
-    NEAREST,
     Bank,
     Copy,
     Describer,
@@ -31,12 +30,10 @@ from indexing.action.bank import (
     Kernels,
     Windows,
     fused_residuals,
-    fusion,
     mirror,
     planes_of,
 )
 from indexing.action.exemplars import Exemplars
-from indexing.action.joint_weights import MOST_WEIGHT, JointWeights
 from indexing.modelfile import Parts, number, part, read_fields, store
 from indexing.opening import quote
 from indexing.scoring import SHARPNESS
@@ -159,7 +156,7 @@ class Blend:
     sharpness: float = SHARPNESS
 
 
-class Kept:
+class Cache:
     """What a model makes on first use and keeps; copies of it and what is saved of it start with nothing."""
 
     def __init__(self) -> None:
@@ -171,8 +168,8 @@ class Kept:
             self._made[name] = make()
         return self._made[name]
 
-    def __reduce__(self) -> tuple[type[Kept], tuple[()]]:
-        return Kept, ()
+    def __reduce__(self) -> tuple[type[Cache], tuple[()]]:
+        return Cache, ()
 
 
 @dataclass(frozen=True)
@@ -187,7 +184,6 @@ class ShapeModel:
     metric: JointMetric = field(metadata=part(""))
     symmetry: Tensor | None = field(metadata=store("every", "joints", below="joints"))  # of the mirror image's joints
     mirrored: Tensor = field(metadata=store("truth", "exemplars"))  # which exemplars also count mirrored
-    parts: JointWeights = field(metadata=part())  # how much each joint and each channel of A counts
     hub: Tensor = field(metadata=store("real", "exemplars"))  # how close an exemplar is to other classes
     moment_hub: Tensor = field(metadata=store("real", "moments"))  # the same of its short windows
     kernels: Kernels | None
@@ -198,59 +194,47 @@ class ShapeModel:
     blend: Blend = field(default_factory=lambda: Blend())
     profiles: ClassProfiles | None = field(default=None, metadata=part())  # of the exemplars' class scores; older files have none
     hidden: int = 0
-    kept: Kept = field(default_factory=lambda: Kept(), init=False, repr=False, compare=False)  # exemplars as they are compared
+    cache: Cache = field(default_factory=lambda: Cache(), init=False, repr=False, compare=False)  # exemplars as they are compared
 
     def to(self, device: str | torch.device) -> ShapeModel:
         """The model on another device, the same one again for the next call."""
         if torch.device(device) == self.labels.device:
             return self
-        there: ShapeModel = self.kept.get(torch.device(device), lambda: self._there(device))
+        there: ShapeModel = self.cache.get(torch.device(device), lambda: self._copy_to(device))
         return there
 
-    def _there(self, device: str | torch.device) -> ShapeModel:
+    def _copy_to(self, device: str | torch.device) -> ShapeModel:
         moved: dict[str, Any] = {f.name: _to_device(getattr(self, f.name), device) for f in dataclasses.fields(self) if f.init}
         return dataclasses.replace(self, **moved)
 
-    def shown(self) -> NDArray[np.bool_]:
+    def joint_sets(self) -> NDArray[np.bool_]:
         """``(sets, joints)`` the sets of joints that exemplars show."""
-        return np.asarray(self.kept.get("shown", lambda: self.exemplars.crop(0).seen.unique(dim=0).cpu().numpy()))
+        return np.asarray(self.cache.get("shown", lambda: self.exemplars.crop(0).seen.unique(dim=0).cpu().numpy()))
 
     # ---- scoring -------------------------------------------------------------------------------------------------
-    def copies(self) -> list[Windows]:
-        """The exemplars' crops and mirror images, each a list of N windows."""
-        plain = [self.exemplars.crop(i) for i in range(len(self.exemplars.crops) // max(1, len(self.exemplars)))]
-        if self.symmetry is None or not bool(self.mirrored.any()):
-            return plain
-        return plain + [mirror_some(one, self.symmetry, self.mirrored) for one in plain]
-
     def _copies(self, windows: Windows, mirrored: Tensor) -> list[Copy]:
         """Windows, and the mirror images of those that count mirrored, too."""
         if self.symmetry is None or not bool(mirrored.any()):
             return [Copy(windows)]
         return [Copy(windows), Copy(windows, None if bool(mirrored.all()) else mirrored.nonzero()[:, 0], self.symmetry)]
 
-    def _crops(self, learned: bool, count: int | None = None) -> list[Bank]:
-        """Banks of the exemplars' crops (the first ones), under the learned weights or all alike."""
+    def _crops(self, count: int | None) -> list[Bank]:
+        """Banks of the exemplars' crops (the first ones)."""
 
-        def make() -> list[list[Bank]]:
+        def make() -> list[Bank]:
             count = len(self.exemplars.crops) // max(1, len(self.exemplars))
-            copies = [self._copies(self.exemplars.crop(i), self.mirrored) for i in range(count)]
-            return self.parts.banks(copies, self.metric, self.labels) if learned else [[Bank(one, self._planes)] for one in copies]
+            return [Bank(self._copies(self.exemplars.crop(i), self.mirrored), self._planes) for i in range(count)]
 
-        return [bank for crop in self.kept.get(("crops", learned), make)[:count] for bank in crop]
+        banks: list[Bank] = self.cache.get("crops", make)
+        return banks[:count]
 
     @property
     def _planes(self) -> Describer:
         """What describes windows where all joints count alike, always the same one."""
-        return self.kept.get("planes", lambda: planes_of(self.metric))
+        return self.cache.get("planes", lambda: planes_of(self.metric))
 
     def _residuals(self, query: Windows, crops: int | None, chosen: Tensor | None) -> Tensor:
-        epipolar, turned = self.parts.fusion, fusion(("turned",))
-        if self.parts.learned:
-            (near,) = fused_residuals(query, self._crops(True, crops), [epipolar], chosen)
-            (card,) = fused_residuals(query, self._crops(False, crops), [turned], chosen)
-        else:  # both from the same products
-            near, card = fused_residuals(query, self._crops(False, crops), [epipolar, turned], chosen)
+        near, card = fused_residuals(query, self._crops(crops), [("epi",), ("turned",)], chosen)
         hub = self.hub if chosen is None else self.hub[chosen]
         return near.add_(card, alpha=TURNED_CARD_WEIGHT).sub_(hub)
 
@@ -269,7 +253,7 @@ class ShapeModel:
             moments, owner = self.exemplars.moments, self.exemplars.owner
             return Bank(self._copies(moments, self.mirrored[owner]), self._planes)
 
-        (found,) = fused_residuals(query, [self.kept.get("moments", make)], [fusion(MOMENT_TERMS)])
+        (found,) = fused_residuals(query, [self.cache.get("moments", make)], [MOMENT_TERMS])
         return found.sub_(self.moment_hub)
 
     def moment_scores(self, query: Windows) -> Tensor:
@@ -285,7 +269,7 @@ class ShapeModel:
         """``(Q, classes)`` scorer B."""
         if self.kernels is None or self.support is None or self.machine is None:
             raise ValueError("this model has no kernel machine")
-        return self.machine(self.kernels(query, self.kept.get("support", partial(self.kernels.bank, self.support))))
+        return self.machine(self.kernels(query, self.cache.get("support", partial(self.kernels.bank, self.support))))
 
     def scores(self, query: Windows, nearest: Tensor | None = None) -> Tensor:
         """``(Q, classes)`` larger is better: A, B, or the blend, standardized over the classes of each query."""
@@ -298,7 +282,7 @@ class ShapeModel:
 
     def evidence(self, query: Windows, nearest: Tensor | None = None) -> Tensor:
         """``(Q,)`` how well a query shows one of the known actions rather than another one."""
-        if self.known == 1:
+        if self.num_known == 1:
             return self.plain_scores(query)[:, 0]
         nearest = self.nearest_scores(query) if nearest is None else nearest
         unusual = None
@@ -319,18 +303,18 @@ class ShapeModel:
         """``(Q, N)`` minus the logarithm of the kernel between queries and exemplars."""
         if self.kernels is None:
             raise ValueError("this model has no kernels")
-        bank = self.kept.get("originals", partial(self.kernels.bank, self.exemplars.crop(0)))
+        bank = self.cache.get("originals", partial(self.kernels.bank, self.exemplars.crop(0)))
         return -(self.kernels(query, bank) + EPSILON).log()
 
     @property
-    def known(self) -> int:
+    def num_known(self) -> int:
         """How many classes are answers."""
         return self.classes - self.hidden
 
     @property
-    def judged(self) -> int:
+    def num_calibration_classes(self) -> int:
         """How many classes tell, one after the other left out, what evidence an unknown action has for the known ones."""
-        return self.classes if self.known > 1 else self.hidden
+        return self.classes if self.num_known > 1 else self.hidden
 
 
 def class_scores(residuals: Tensor, labels: Tensor, classes: int) -> Tensor:
@@ -375,6 +359,7 @@ def _to_device(value: object, device: str | torch.device) -> object:
 
 
 SCORERS = ("nearest", "kernel", "both")
+MAX_WEIGHT = 1e6  # of a scorer
 MIN_SCALE = 1e-7  # of a kernel, over distances from 0 to 2
 
 
@@ -398,10 +383,12 @@ def read_shape_model(
         counts = stored_fields["machine"].counts
         if int(counts.sum()) != sizes["rows"]:
             raise ValueError(f"machine.counts: {int(counts.sum())} support vectors, and {sizes['rows']} are there")
-    blend = {name: number(value, name, 0, MOST_WEIGHT) for name, value in header["blend"].items()}
-    weights = _read_joint_weights(stored_fields.pop("parts"), header["parts"])
+    blend = {name: number(value, name, 0, MAX_WEIGHT) for name, value in header["blend"].items()}
+    joint_weights = [tensor for name, tensor in parts.tensors.items() if name.startswith("parts.")]
+    if any(bool((tensor != 1).any()) for tensor in joint_weights):
+        raise ValueError("parts: weights of single joints are no longer learned")  # of older files
     about = {"classes": sizes["classes"], "view": view, "scorer": scorer, "kernels": kernels, "blend": Blend(**blend)}
-    return ShapeModel(**stored_fields, **about, parts=weights, hidden=hidden)
+    return ShapeModel(**stored_fields, **about, hidden=hidden)
 
 
 def _sizes(parts: Parts, classes: int, joints: int, length: int, crops: int) -> dict[str, int]:
@@ -411,14 +398,5 @@ def _sizes(parts: Parts, classes: int, joints: int, length: int, crops: int) -> 
         raise ValueError(f"{exemplars} exemplars of {classes} classes")
     return {
         "classes": classes, "others": classes - 1, "pairs": classes * (classes - 1) // 2, "exemplars": exemplars,
-        "crops": exemplars * crops, "length": length, "joints": joints, "channels": len(CHANNELS), "nearest": len(NEAREST),
+        "crops": exemplars * crops, "length": length, "joints": joints, "channels": len(CHANNELS),
     }  # fmt: skip
-
-
-def _read_joint_weights(stored_weights: JointWeights, learned: Any) -> JointWeights:
-    joints, by_class = stored_weights.joints, stored_weights.by_class
-    weights = joints if by_class is None else joints[:, None] * by_class
-    if not bool((weights.sum(-1) > 0).all()) or not bool(stored_weights.channels.sum() > 0):
-        raise ValueError("parts: no joint or no channel counts")
-    gain, sigma = (number(value, "parts") for value in learned)
-    return dataclasses.replace(stored_weights, gain=gain, sigma=sigma)

@@ -68,7 +68,7 @@ class StreamScan:
     owner: Array
 
     @property
-    def nothing(self) -> float:
+    def floor_score(self) -> float:
         """The score of every class where nobody is seen: no better than the worst moment."""
         return float(self.scores[self.present].min()) if self.present.any() else 0.0
 
@@ -116,12 +116,12 @@ def scan(model: ShapeModel, clip: Clip, stream: Stream, progress: Progress = Non
     scores, motion = np.empty((len(at), model.classes)), np.empty(len(at))
     for begin in range(0, len(at), BLOCK):
         part = slice(begin, begin + BLOCK)
-        source, own = around(clip, cuts, at[part], owner[part], stream)
+        source, own = frames_around(clip, cuts, at[part], owner[part], stream)
         scores[part], motion[part] = moments(model, source, own, at[part], stream)
         if progress is not None:
             progress(min(1.0, (begin + BLOCK) / len(at)))
     found_ = StreamScan(at, scores, motion, presence(clip, cuts, at, owner, stream), cuts, owner)
-    scores[~found_.present] = found_.nothing  # where nobody is seen nothing is said
+    scores[~found_.present] = found_.floor_score  # where nobody is seen nothing is said
     return found_
 
 
@@ -144,7 +144,7 @@ def presence(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -
     return np.asarray(high - low >= np.maximum(2.0, MIN_SHOWN_SHARE * span * rate))
 
 
-def around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -> tuple[Ragged, Array]:
+def frames_around(clip: Clip, cuts: Array, at: Array, owner: Array, stream: Stream) -> tuple[Ragged, Array]:
     """The frames that windows centred at some times can touch, and some more to interpolate missing joints from."""
     margin = max(stream.tempi) * stream.window + INTERPOLATION_MARGIN
     used, own = np.unique(owner, return_inverse=True)
@@ -190,5 +190,5 @@ def motion_levels(model: ShapeModel) -> tuple[float, Array]:
         each = np.array([np.quantile(motion[labels == c], CALM_QUANTILE) for c in range(model.classes)])
         return float(np.quantile(motion, STILL_QUANTILE)), each
 
-    levels: tuple[float, Array] = model.kept.get(("motion levels", STILL_QUANTILE, CALM_QUANTILE), make)
+    levels: tuple[float, Array] = model.cache.get(("motion levels", STILL_QUANTILE, CALM_QUANTILE), make)
     return levels

@@ -1,7 +1,7 @@
-"""Finding: all actions of a learned model in everything, recording by recording, as the indexer explains them.
+"""Finding: all actions of a learned model in everything, recording by recording, as the indexer decodes them.
 
-The sketches tell first where somebody moves at all as an exemplar does (:func:`indexing.archive.sketches.resembling`); what they
-leave is explained by the indexer itself.  Workers need the file of a segment and the model, and nothing else.
+The sketches say first where somebody moves at all as an exemplar does (:func:`indexing.archive.sketches.mark_resembling`); what
+they leave is decoded by the indexer itself.  Workers need the file of a segment and the model, and nothing else.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Catalogue
 from indexing.archive.search import Snapshot, probe_of
 from indexing.archive.segments import ArchiveSegment
-from indexing.archive.sketches import Probe, resembling
+from indexing.archive.sketches import Probe, mark_resembling
 from indexing.archive.tracks import Layout
-from indexing.archive.workers import InOrder, WorkerLost
+from indexing.archive.workers import InOrder, check_done
 from indexing.cameras import y_up
 from indexing.clip import Clip
 from indexing.scoring import Event
@@ -85,13 +85,10 @@ def find(
             "estimator for both"
         )
     tasks = _tasks(snapshot, probes, data)
-    names = catalogue.named([number for task in tasks for number, _ in task.recordings])
+    names = catalogue.recordings_by_id([number for task in tasks for number, _ in task.recordings])
     found: list[ArchivedEvent] = []
     for done, (task, events) in enumerate(InOrder(find_in, executor, tries=2)(tasks), 1):
-        if isinstance(events, WorkerLost):
-            if not task.path.exists():
-                raise FileNotFoundError(str(task.path))
-            raise ValueError(f"{task.path}: could not be searched: {events}; try again, or with fewer workers")
+        check_done(task.path, events)
         for number, event in events:
             row = names.get(number)
             if row is not None:
@@ -186,7 +183,7 @@ def _events(task: FindTask, segment: ArchiveSegment, tracks: Sequence[int]) -> l
 
 def marked_rows(track: ArchiveSegment, probes: Sequence[Probe]) -> NDArray[np.bool_]:
     """``(rows,)`` the poses of a track that are looked at: of what moves as an exemplar does, and a margin around it."""
-    mask, margin = resembling(track, probes, MIN_CORRELATION, MIN_MOTION_SHARE), round(MARGIN_SECONDS * track.rate)
+    mask, margin = mark_resembling(track, probes, MIN_CORRELATION, MIN_MOTION_SHARE), round(MARGIN_SECONDS * track.rate)
     total = np.concatenate([[0], np.cumsum(mask)])
     index = np.arange(len(mask))
     return np.asarray(total[np.minimum(index + margin + 1, len(mask))] > total[np.maximum(index - margin, 0)])

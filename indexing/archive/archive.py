@@ -18,7 +18,7 @@ from indexing.archive import writer
 from indexing.archive.catalogue import Catalogue, drop_recordings, storable
 from indexing.archive.search import Hit, Shortlist, Snapshot, check_example, queries_of, search
 from indexing.archive.segments import ArchiveSegment
-from indexing.archive.sources import Taken, gather, keeping, poses_of
+from indexing.archive.sources import SourceInput, assign_pose_folders, gather, poses_of
 from indexing.archive.writer import MAX_ATTEMPTS, Addition, ArchiveOptions, Verification, verify
 from indexing.clip import Clip
 
@@ -95,7 +95,7 @@ class Archive:
 
     def __len__(self) -> int:
         """Windows: poses from which one of the shortest duration lasts."""
-        return self._catalogue().contents().windows if self._made() else 0
+        return self._catalogue().contents().windows if self._exists() else 0
 
     def __repr__(self) -> str:
         return f"Archive({str(self.path)!r}, {len(self):,} windows)"
@@ -103,7 +103,7 @@ class Archive:
     # ---- what is in it -----------------------------------------------------------------------------------------------
     def add(
         self,
-        sources: Taken | Iterable[Taken],
+        sources: SourceInput | Iterable[SourceInput],
         executor: Executor | None = None,
         progress: Progress = None,
         reading: Mapping[str, Any] | None = None,
@@ -127,7 +127,7 @@ class Archive:
         Raises:
             ValueError: another process adds, or the archive cannot be written.
         """
-        listed = keeping(gather(sources), self.path)
+        listed = assign_pose_folders(gather(sources), self.path)
         catalogue = Catalogue.make(self.path, self.options.storage)
         return writer.add(catalogue, listed, self.options, executor, dict(reading or {}), progress)
 
@@ -138,7 +138,7 @@ class Archive:
             ValueError: there is none of this name, or another process writes.
         """
         catalogue, name = self._catalogue(), storable(os.fspath(source))
-        with catalogue.alone():
+        with catalogue.write_lock():
             resolved = storable(str(Path(source).expanduser().resolve()))
             mine = [row for row in catalogue.sources().values() if name in (row.name, row.path) or resolved == row.path != ""]
             if not mine:
@@ -194,13 +194,13 @@ class Archive:
         Raises:
             ValueError: there is none of this name, or nothing of it in that time.
         """
-        clip = self._again(lambda: self._stored(source, person))
+        clip = self._retry(lambda: self._read_recording(source, person))
         lowest = -np.inf if start is None else start - 0.5 / (clip.fps or 1.0)
         return clip.between(lowest, np.inf if end is None else end + 0.5 / (clip.fps or 1.0))
 
-    def _stored(self, source: str, person: str) -> Clip:
+    def _read_recording(self, source: str, person: str) -> Clip:
         """All of a recording's first image."""
-        snapshot = self._opened()
+        snapshot = self._open_snapshot()
         rows = [row for row in self._catalogue().by_name(storable(source)) if person in ("", row.person)]
         if not rows:
             who = f" with a person {person!r}" if person else ""
@@ -234,10 +234,10 @@ class Archive:
         """
         if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
             raise ValueError(f"k must be a whole number of hits, 1 or more, got {k!r}")
-        return self._again(lambda: self._searched(clip, int(k), executor, progress, mirror))
+        return self._retry(lambda: self._search(clip, int(k), executor, progress, mirror))
 
-    def _searched(self, clip: Clip, k: int, executor: Executor | None, progress: Progress, mirror: bool) -> list[Hit]:
-        snapshot = self._opened()
+    def _search(self, clip: Clip, k: int, executor: Executor | None, progress: Progress, mirror: bool) -> list[Hit]:
+        snapshot = self._open_snapshot()
         if not snapshot.contents.windows:
             raise ValueError(f"{self.path}: holds no movement yet; add recordings first")
         example = check_example(clip, snapshot.contents.storage.min_duration)
@@ -248,7 +248,7 @@ class Archive:
         where = [
             (snapshot.segments[i], int(t)) for i, t in zip(found.places.segment.tolist(), found.places.track.tolist(), strict=True)
         ]
-        names = self._catalogue().named([int(segment.tracks[track, 0]) for segment, track in where])
+        names = self._catalogue().recordings_by_id([int(segment.tracks[track, 0]) for segment, track in where])
         hits: list[Hit] = []
         for i, (segment, track) in enumerate(where):
             row = names.get(int(segment.tracks[track, 0]))
@@ -272,22 +272,22 @@ class Archive:
         """
         from indexing.archive.actions import find
 
-        return self._again(lambda: find(self._opened(), self._catalogue(), model, executor, progress))
+        return self._retry(lambda: find(self._open_snapshot(), self._catalogue(), model, executor, progress))
 
     def verify(self) -> Verification:
         """Whether every window of the catalogue is there, whole, and once; reads everything."""
         return verify(self._catalogue())
 
     # ---- inside ------------------------------------------------------------------------------------------------------
-    def _made(self) -> bool:
+    def _exists(self) -> bool:
         return self.path.is_dir() and any(self.path.iterdir())
 
     def _catalogue(self) -> Catalogue:
-        if not self._made():
+        if not self._exists():
             raise ValueError(f"{self.path}: is no archive yet; add recordings first")
         return Catalogue(self.path)
 
-    def _again(self, question: Callable[[], T]) -> T:
+    def _retry(self, question: Callable[[], T]) -> T:
         """The answer to a question; asked again where segments were put together meanwhile."""
         for _ in range(MAX_ATTEMPTS - 1):
             with contextlib.suppress(FileNotFoundError):
@@ -298,7 +298,7 @@ class Archive:
         except FileNotFoundError as problem:
             raise ValueError(f"{problem.filename}: is missing; dyntorch archive verify says what is lost") from None
 
-    def _opened(self) -> Snapshot:
+    def _open_snapshot(self) -> Snapshot:
         """As it is now; what was mapped before and has not changed stays mapped."""
         catalogue = self._catalogue()
         if self._snapshot is not None and self._snapshot.contents.generation == catalogue.generation():

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from indexing.archive.tracks import Layout, StorageFormat, layout_key
-from indexing.skeleton import Skeleton
+from indexing.modelfile import skeleton_from_json, skeleton_to_json
 
 VERSION = 1
 LOCK_SECONDS = 30.0  # that a reader waits for a commit
@@ -212,7 +212,7 @@ class Catalogue:
         try:
             facts = dict(connection.execute("SELECT key, value FROM meta").fetchall())
             layouts = {
-                row[0]: Layout.load(row[3], row[1], _skeleton(row[2]))
+                row[0]: Layout.load(row[3], row[1], skeleton_from_json(json.loads(row[2] or "null"), row[1]))
                 for row in connection.execute("SELECT id, joints, skeleton, learned FROM layouts")
             }
             segments = tuple(SegmentRow(*row) for row in connection.execute("SELECT * FROM segments ORDER BY id"))
@@ -247,21 +247,11 @@ class Catalogue:
         with self.reading() as connection:
             return {row[1]: SourceRow(*row) for row in connection.execute("SELECT * FROM sources ORDER BY id")}
 
-    def recordings(self, segment: int | None = None) -> list[RecordingRow]:
-        """All recordings, or those of a segment."""
-        where, given = ("", ()) if segment is None else (" WHERE segment = ?", (segment,))
-        with self.reading() as connection:
-            return [RecordingRow(*row) for row in connection.execute(f"SELECT * FROM recordings{where} ORDER BY id", given)]
-
-    def named(self, numbers: Sequence[int]) -> dict[int, RecordingRow]:
+    def recordings_by_id(self, numbers: Sequence[int]) -> dict[int, RecordingRow]:
         """Some recordings, by number."""
-        found: dict[int, RecordingRow] = {}
         with self.reading() as connection:
-            for number in dict.fromkeys(numbers):
-                row = connection.execute("SELECT * FROM recordings WHERE id = ?", (number,)).fetchone()
-                if row is not None:
-                    found[number] = RecordingRow(*row)
-        return found
+            rows = [connection.execute("SELECT * FROM recordings WHERE id = ?", (number,)).fetchone() for number in set(numbers)]
+        return {row[0]: RecordingRow(*row) for row in rows if row is not None}
 
     def by_name(self, name: str) -> list[RecordingRow]:
         """The recordings that a name, or a source's name or path, stands for."""
@@ -276,7 +266,7 @@ class Catalogue:
 
     # ---- writing -----------------------------------------------------------------------------------------------------
     @contextlib.contextmanager
-    def alone(self) -> Iterator[None]:
+    def write_lock(self) -> Iterator[None]:
         """Hold the archive against others who write; whoever dies lets go of it."""
         with contextlib.ExitStack() as stack:
             try:
@@ -293,7 +283,7 @@ class Catalogue:
                 ) from None
             yield  # closing lets go of it
 
-    def held(self) -> bool:
+    def is_locked(self) -> bool:
         """Whether somebody writes right now."""
         lock = self.folder / LOCK
         try:
@@ -341,11 +331,10 @@ def _create(connection: sqlite3.Connection, storage: StorageFormat) -> None:
 
 def add_layout(connection: sqlite3.Connection, layout: Layout) -> int:
     """Register what was learned of a layout; its number."""
-    skeleton = layout.skeleton
-    said = None if skeleton is None else json.dumps([skeleton.name, skeleton.joints, skeleton.bones])
-    values = (storable(layout_key(layout.joints, skeleton)), layout.joints, said, layout.dump())
-    found = connection.execute("INSERT INTO layouts (key, joints, skeleton, learned) VALUES (?, ?, ?, ?)", values)
-    return int(found.lastrowid or 0)
+    skeleton = None if layout.skeleton is None else json.dumps(skeleton_to_json(layout.skeleton))
+    values = (storable(layout_key(layout.joints, layout.skeleton)), layout.joints, skeleton, layout.dump())
+    cursor = connection.execute("INSERT INTO layouts (key, joints, skeleton, learned) VALUES (?, ?, ?, ?)", values)
+    return int(cursor.lastrowid or 0)
 
 
 def drop_recordings(connection: sqlite3.Connection, source: int) -> int:
@@ -356,13 +345,6 @@ def drop_recordings(connection: sqlite3.Connection, source: int) -> int:
         (source, source),
     )
     return int(connection.execute("DELETE FROM recordings WHERE source = ?", (source,)).rowcount)
-
-
-def _skeleton(text: str | None) -> Skeleton | None:
-    if text is None:
-        return None
-    name, joints, bones = json.loads(text)
-    return Skeleton(name, tuple(joints), tuple((int(a), int(b)) for a, b in bones))
 
 
 @contextlib.contextmanager

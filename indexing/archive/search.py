@@ -19,12 +19,12 @@ import torch
 from numpy.typing import NDArray
 
 from dyntorch.numerics import one_thread
-from indexing.action.bank import NEAREST, Bank, Copy, JointMetric, Windows, fused_residuals, fusion, planes_of
+from indexing.action.bank import Bank, Copy, JointMetric, Windows, fused_residuals, planes_of
 from indexing.archive.catalogue import Contents
 from indexing.archive.segments import ArchiveSegment
 from indexing.archive.sketches import TASK_BLOCK, Candidates, Probe, orthonormal, refine_candidates, scan
 from indexing.archive.tracks import WINDOW_LENGTH, Layout, images
-from indexing.archive.workers import InOrder, WorkerLost
+from indexing.archive.workers import InOrder, check_done
 from indexing.cameras import y_up
 from indexing.clip import Clip, FloatArray
 from indexing.windows import Ragged, concatenate_clips, describe_unusable, interpolate_gaps, repair_clip, resample_clips, sample
@@ -32,7 +32,6 @@ from indexing.windows import Ragged, concatenate_clips, describe_unusable, inter
 Progress = Callable[[float], None] | None
 
 TEMPOS = (0.8, 1.0, 1.25)  # durations that are searched, in those of the query: people differ
-SCANNED_TEMPOS = (1.0,)  # durations that everything is scanned with
 # durations of a recording up to which its first and last windows are compared: they may lie between two steps of the scan
 MAX_TRIMMED = 2.0
 NUM_SAMPLES = 4  # steps that a window is divided into by the scan, where its duration allows
@@ -40,7 +39,6 @@ NUM_FINE_SAMPLES = 16  # the same of the windows that are kept
 MAX_SCANNED_WINDOWS = 2000  # of the scan that are compared at all tempos by more samples, and moved to the pose where they fit best
 MIN_SEPARATION = 0.05  # durations between two candidates; of right ones among ten in exercises, .2 finds .49, .05 .54
 SHIFTS = (-0.1, -0.05, 0.0, 0.05, 0.1)  # durations, in its own, by which a candidate is moved where it is compared exactly
-STRETCHES = (1.0,)  # durations of a candidate then, besides the tempos: .9 and 1.1 add nothing
 MAX_REFINED = 100  # best candidates that are moved and stretched
 MAX_OVERLAP = 0.5  # of the shorter of two hits of one person, from which they are one
 MAX_EXAMPLE_SECONDS = 30.0  # a longer example is no movement but a recording
@@ -119,7 +117,6 @@ def queries_of(clip: Clip, contents: Contents, mirrored: bool = False) -> dict[i
 
 def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], mirrored: bool) -> Query:
     clips = [one.replace(joints=y_up(one), up="y", confidence=None) for one in images(clip, views)]
-    windows = _whole_windows(clips, WINDOW_LENGTH)
     count = len(clips)
     if mirrored:
         swap = layout.swap
@@ -127,22 +124,17 @@ def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], mi
             raise ValueError(f"{clip.name!r}: which joints are left and right cannot be told; name the joints, or search as it is")
         # an image and its mirror image are of one shape: only the joints change places
         clips += [one.replace(joints=one.joints[:, swap]) for one in clips]
-        windows = _whole_windows(clips, WINDOW_LENGTH)
     source = concatenate_clips(clips)
     coarse, fine = (
         [
             probe_of(source, i, layout, rate, tempo, samples, mirrored=i >= count)
             for i in range(len(clips))
-            for tempo in dict.fromkeys((*SCANNED_TEMPOS, *TEMPOS))
+            for tempo in dict.fromkeys((1.0, *TEMPOS))
         ]
         for samples in (NUM_SAMPLES, NUM_FINE_SAMPLES)
     )
+    windows = Windows(resample_clips(source, WINDOW_LENGTH), torch.from_numpy(source.seen))
     return Query(windows, tuple(one for one in coarse if one is not None), tuple(one for one in fine if one is not None))
-
-
-def _whole_windows(clips: Sequence[Clip], length: int) -> Windows:
-    source = concatenate_clips(clips)
-    return Windows(resample_clips(source, length), torch.from_numpy(source.seen))
 
 
 def probe_of(
@@ -174,7 +166,7 @@ def probe_of(
         return None
     moved = float(((each - mean) ** 2).sum() / max(float((each**2).sum()), 1e-30))
     longest = int(MAX_TRIMMED * seconds * rate)
-    return Probe(image, mirrored, seconds, stride, codes, moved, tempo in SCANNED_TEMPOS, longest)
+    return Probe(image, mirrored, seconds, stride, codes, moved, tempo == 1, longest)
 
 
 # ---- the archive, and the stages of a search -----------------------------------------------------------------------------
@@ -244,10 +236,6 @@ class Shortlist:
     def __getitem__(self, index: NDArray[np.intp] | slice) -> Shortlist:
         return Shortlist(self.places[index], self.probe[index], self.score[index], self.mirrored[index])
 
-    def at(self, places: Places, score: FloatArray) -> Shortlist:
-        """The same windows elsewhere, with other scores."""
-        return replace(self, places=places, score=score)
-
 
 def search(
     snapshot: Snapshot, queries: Mapping[int, Query], k: int, num_candidates: int, executor: Executor | None, progress: Progress
@@ -288,10 +276,7 @@ def candidates(tasks: Sequence[ScanTask], executor: Executor | None, progress: P
         if executor is None and threads > 1 and len(tasks) > 1:
             executor = stack.enter_context(ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)))
         for task, result in InOrder(scan_task, executor, tries=2)(tasks):
-            if isinstance(result, WorkerLost):
-                if not task.path.exists():
-                    raise FileNotFoundError(str(task.path))
-                raise ValueError(f"{task.path}: could not be searched: {result}; try again, or with fewer workers")
+            check_done(task.path, result)
             found.append((task.segment, result))
             if progress is not None:
                 progress(0.9 * len(found) / len(tasks))
@@ -306,7 +291,7 @@ def merge_candidates(
     rate = snapshot.contents.storage.rate
     best = _refine(snapshot, queries, scanned)
     segment = np.repeat([i for i, _ in best], [len(one) for _, one in best]).astype(np.intp)
-    every = Candidates.joined([one for _, one in best])
+    every = Candidates.concatenate([one for _, one in best])
     track, row, probe, score = every.track, every.row, every.probe, every.score.astype(float)
     asked = [queries[rows[i].layout].fine[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
     middle = (row + np.array([one.span / 2 for one in asked])) / rate
@@ -330,7 +315,7 @@ def _refine(
 ) -> list[tuple[int, Candidates]]:
     """The best of all scans, by more samples and to the pose: ``(segment, candidates)``."""
     rows = snapshot.contents.segments
-    every = Candidates.joined([one for _, one in scanned])
+    every = Candidates.concatenate([one for _, one in scanned])
     scan_of = np.repeat(np.arange(len(scanned)), [len(one) for _, one in scanned])
     best = np.argsort(-every.score, kind="stable")[:MAX_SCANNED_WINDOWS]
     out: list[tuple[int, Candidates]] = []
@@ -346,22 +331,22 @@ def _refine(
 
 
 def residuals(
-    example: Windows, image: NDArray[np.intp], places: Places, segments: Sequence[ArchiveSegment], metric: JointMetric, length: int
+    example: Windows, image: NDArray[np.intp], places: Places, segments: Sequence[ArchiveSegment], metric: JointMetric
 ) -> FloatArray:
     """``(places,)`` fused residual between each window and the image of the example that it is compared with."""
     if not len(places):
         return np.zeros(0)
-    windows = cut_windows(places, segments, length)
-    (table,) = fused_residuals(example, [Bank([Copy(windows)], planes_of(metric))], [fusion(("epi",), NEAREST)])
+    windows = cut_windows(places, segments)
+    (table,) = fused_residuals(example, [Bank([Copy(windows)], planes_of(metric))], [("epi",)])
     found = table.double().numpy()[image, np.arange(len(places))]
     # a window that shows none of the joints fits everything
     return np.asarray(np.where(windows.seen.any(dim=1).numpy(), found, np.inf))
 
 
-def cut_windows(places: Places, segments: Sequence[ArchiveSegment], length: int) -> Windows:
+def cut_windows(places: Places, segments: Sequence[ArchiveSegment]) -> Windows:
     """Windows resampled from the stored joints, gaps bridged in time, as the indexer cuts them from a clip."""
     joints = segments[int(places.segment[0])].joints.shape[1]
-    values = torch.empty(len(places), length, joints, 2)
+    values = torch.empty(len(places), WINDOW_LENGTH, joints, 2)
     seen = torch.empty(len(places), joints, dtype=torch.bool)
     for number in np.unique(places.segment).tolist():
         mine = np.flatnonzero(places.segment == number)
@@ -375,27 +360,23 @@ def cut_windows(places: Places, segments: Sequence[ArchiveSegment], length: int)
         starts = np.concatenate([[0], np.cumsum(counts)])
         step = np.arange(starts[-1]) - np.repeat(starts[:-1], counts) + np.repeat(first, counts)
         source = interpolate_gaps(segment.poses(np.repeat(track, counts), step), step / segment.rate, starts)
-        values[mine] = sample(source, np.arange(len(mine)), begin, end, length)
+        values[mine] = sample(source, np.arange(len(mine)), begin, end, WINDOW_LENGTH)
         seen[mine] = torch.from_numpy(source.seen)
     return Windows(values, seen)
 
 
 def rank(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortlist, k: int) -> Shortlist:
     """Candidates by their exact residual, best first; the best ones moved and stretched to where it is least."""
-    shortlist = _sort_shortlist(shortlist.at(shortlist.places, _scores(snapshot, queries, shortlist)))
+    shortlist = _sort_shortlist(replace(shortlist, score=_scores(snapshot, queries, shortlist)))
     best = shortlist[: max(MAX_REFINED, 4 * k)]
     middle, half = (best.places.begin + best.places.end) / 2, (best.places.end - best.places.begin) / 2
-    parts = [
-        replace(best.places, begin=middle + (2 * shift - stretch) * half, end=middle + (2 * shift + stretch) * half)
-        for shift in SHIFTS
-        for stretch in STRETCHES
-    ]
+    parts = [replace(best.places, begin=middle + (2 * shift - 1) * half, end=middle + (2 * shift + 1) * half) for shift in SHIFTS]
     if not len(best):
         return best
-    tried = np.stack([_scores(snapshot, queries, best.at(part, best.score)) for part in parts])
+    tried = np.stack([_scores(snapshot, queries, replace(best, places=part)) for part in parts])
     which, index = np.argmax(tried, axis=0), np.arange(len(best))
     begin, end = (np.stack([getattr(part, name) for part in parts])[which, index] for name in ("begin", "end"))
-    return _sort_shortlist(best.at(replace(best.places, begin=begin, end=end), tried[which, index]))
+    return _sort_shortlist(replace(best, places=replace(best.places, begin=begin, end=end), score=tried[which, index]))
 
 
 def _scores(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortlist) -> FloatArray:
@@ -408,7 +389,7 @@ def _scores(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortli
         query = queries[number]
         image = np.array([query.fine[p].image for p in shortlist.probe[mine].tolist()], dtype=np.intp)
         metric = snapshot.contents.layouts[number].joint_metric()
-        out[mine] = -residuals(query.windows, image, shortlist.places[mine], snapshot.segments, metric, WINDOW_LENGTH)
+        out[mine] = -residuals(query.windows, image, shortlist.places[mine], snapshot.segments, metric)
     return out
 
 

@@ -25,6 +25,7 @@ from safetensors.numpy import save
 
 from indexing.archive.tracks import Layout, StorageFormat, Track, positions
 from indexing.files import replacing, sha256_of
+from indexing.modelfile import skeleton_to_json
 
 FORMAT, VERSION = "dyntorch.archive-segment", 1
 HEADER = 2**26  # bytes of a header at most
@@ -59,12 +60,11 @@ def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, storage
         "steps": np.array([track.scale for track in tracks], dtype=np.float64),
         "layout": np.frombuffer(layout.dump(), dtype=np.int8),
     }
-    skeleton = layout.skeleton
     about = {
         "format": FORMAT,
         "version": str(VERSION),
         "rate": str(storage.rate),
-        "skeleton": json.dumps(None if skeleton is None else [skeleton.name, skeleton.joints, skeleton.bones]),
+        "skeleton": json.dumps(skeleton_to_json(layout.skeleton)),
     }
     name = f"{secrets.token_hex(8)}.safetensors"
     data = save(tensors, about)
@@ -76,7 +76,7 @@ def write_segment(folder: Path, tracks: Sequence[Track], layout: Layout, storage
     return WrittenSegment(name, len(data), hashlib.sha256(data).hexdigest())
 
 
-def intact(path: Path, sha256: str) -> bool:
+def is_intact(path: Path, sha256: str) -> bool:
     """Whether a file is there and still what was written."""
     try:
         return sha256_of(path) == sha256

@@ -64,7 +64,7 @@ class Candidates:
         return len(self.score)
 
     @classmethod
-    def joined(cls, parts: Sequence[Candidates]) -> Candidates:
+    def concatenate(cls, parts: Sequence[Candidates]) -> Candidates:
         """Several, one after the other."""
         types = {"score": np.float32, "track": np.int64, "row": np.int64, "probe": np.int64}
         arrays = ([np.zeros(0, kind), *(getattr(part, name) for part in parts)] for name, kind in types.items())
@@ -73,13 +73,13 @@ class Candidates:
     def __getitem__(self, index: NDArray[np.intp]) -> Candidates:
         return Candidates(self.score[index], self.track[index], self.row[index], self.probe[index])
 
-    def best(self, count: int) -> Candidates:
+    def top(self, count: int) -> Candidates:
         """The best ones; equal ones in the order in which they lie."""
         if len(self) > count > 0:  # sorting all takes ten times as long
-            return self[np.flatnonzero(self.score >= np.partition(self.score, -count)[-count])]._sorted(count)
-        return self._sorted(count)
+            return self[np.flatnonzero(self.score >= np.partition(self.score, -count)[-count])]._rank(count)
+        return self._rank(count)
 
-    def _sorted(self, count: int) -> Candidates:
+    def _rank(self, count: int) -> Candidates:
         return self[np.lexsort((self.probe, self.row, self.track, -self.score))[:count]]
 
 
@@ -121,7 +121,7 @@ def scan(
         keep: windows at most; dead: recordings that were removed; begin, end: rows at which windows may begin.
     """
     end = len(segment.codes) if end is None else min(end, len(segment.codes))
-    found = _Kept(keep)
+    found = _TopWindows(keep)
     gone = np.isin(segment.tracks[:, 0], list(dead)) if dead else np.zeros(len(segment), dtype=bool)
     groups = sorted({(probe.stride, probe.samples) for probe in probes if probe.everywhere})
     for stride, samples in groups:
@@ -138,7 +138,7 @@ def scan(
                     found.add(score[better].numpy(), ((better + low) * stride).numpy(), i)
     for i, probe in enumerate(probes):
         if probe.stride > 1 or not probe.everywhere:
-            _take_ends(found, segment, gone, probe, i, (begin, end))
+            _scan_ends(found, segment, gone, probe, i, (begin, end))
     return found.candidates(segment)
 
 
@@ -162,7 +162,7 @@ def refine_candidates(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Se
             best, count = each.argmax(axis=1), np.arange(len(each))
             row[fits], score[fits] = begin[count, best], each[count, best]
             parts.append(Candidates(score, track, row, np.full(len(row), index)))
-    return Candidates.joined(parts)
+    return Candidates.concatenate(parts)
 
 
 def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -179,8 +179,8 @@ def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) 
     return out.reshape(first.shape)
 
 
-def _take_ends(
-    found: _Kept, segment: ArchiveSegment, gone: NDArray[np.bool_], probe: Probe, number: int, inner: tuple[int, int]
+def _scan_ends(
+    found: _TopWindows, segment: ArchiveSegment, gone: NDArray[np.bool_], probe: Probe, number: int, inner: tuple[int, int]
 ) -> None:
     """The first and the last window of each short track: they may lie between two steps of the scan."""
     rows = segment.tracks[:, 3]
@@ -194,7 +194,9 @@ def _take_ends(
         found.add(score[better], first[better], number)
 
 
-def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float, quiet: float = 0.0) -> NDArray[np.bool_]:
+def mark_resembling(
+    segment: ArchiveSegment, probes: Sequence[Probe], min_correlation: float, min_motion: float
+) -> NDArray[np.bool_]:
     """``(rows,)`` the poses of windows that move as an example does, well enough."""
     marks = np.zeros(len(segment.codes) + 1, dtype=np.int64)
     none = np.zeros(len(segment), dtype=bool)
@@ -208,10 +210,10 @@ def resembling(segment: ArchiveSegment, probes: Sequence[Probe], least: float, q
             scores = _scores(x, gram, mine, resting)
             energy = _window_sums(gram[0] + gram[2], samples)
             moved = 1.0 - (resting[0] + resting[2]) / torch.where(energy > 0, energy, 1.0)
-            scores[moved < quiet * torch.tensor([[probe.moved] for probe in mine])] = -1.0
+            scores[moved < min_motion * torch.tensor([[probe.moved] for probe in mine])] = -1.0
             best = scores.amax(dim=0)
             best[torch.from_numpy(_outside(segment, none, low, len(best), samples, stride))] = -1.0
-            begin = (np.flatnonzero(best.numpy() >= least) + low) * stride
+            begin = (np.flatnonzero(best.numpy() >= min_correlation) + low) * stride
             np.add.at(marks, begin, 1)
             np.add.at(marks, np.minimum(begin + (samples - 1) * stride + 1, len(marks) - 1), -1)
     return np.asarray(np.cumsum(marks[:-1]) > 0)
@@ -269,7 +271,7 @@ def _outside(
     return np.asarray(np.cumsum(steps[:-1]) <= 0)
 
 
-class _Kept:
+class _TopWindows:
     """The best windows so far: what is certainly not among them is not looked at."""
 
     def __init__(self, keep: int) -> None:
@@ -300,4 +302,4 @@ class _Kept:
     def candidates(self, segment: ArchiveSegment) -> Candidates:
         scores, rows, probes = self._all()
         track = np.searchsorted(segment.firsts, rows, side="right") - 1
-        return Candidates(scores, track, rows - segment.firsts[track], probes).best(self.keep)
+        return Candidates(scores, track, rows - segment.firsts[track], probes).top(self.keep)

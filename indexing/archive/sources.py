@@ -34,7 +34,7 @@ POSES = "poses"  # the folder of an archive in which the keypoints of videos are
 KEYPOINT_FILES = (".json", ".npz", ".csv")  # suffixes that are looked into where a folder is given
 READING = {"person": "everyone"}  # how files are read where nothing else is said
 
-Taken = Clip | LabelledSet[Clip] | str | os.PathLike[str]
+SourceInput = Clip | LabelledSet[Clip] | str | os.PathLike[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class ReadSource:
 # ---- what there is to add ------------------------------------------------------------------------------------------------
 
 
-def gather(given: Taken | Iterable[Taken]) -> list[ArchiveSource]:
+def gather(given: SourceInput | Iterable[SourceInput]) -> list[ArchiveSource]:
     """All sources, folders walked, each once."""
     single = isinstance(given, (Clip, str, os.PathLike)) or is_dataset(given)
     listed: list[Any] = [given] if single else list(given)  # type: ignore[arg-type]
@@ -167,7 +167,7 @@ def _begins(name: str, stem: str) -> bool:
     return name.startswith(stem) and (not rest[:1].isalnum() or rest.startswith("DLC"))
 
 
-def keeping(sources: Sequence[ArchiveSource], archive: Path) -> list[ArchiveSource]:
+def assign_pose_folders(sources: Sequence[ArchiveSource], archive: Path) -> list[ArchiveSource]:
     """The sources, of which videos know where the archive keeps their keypoints."""
     return [replace(one, poses=poses_of(archive, one.key)) if _is_video(one.path) else one for one in sources]
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 MIN_TASKS_AHEAD = 32  # nobody says how many workers a cluster has
@@ -26,6 +27,14 @@ Result = TypeVar("Result")
 
 class WorkerLost(Exception):
     """A task's workers died every time, or the task did not reach one."""
+
+
+def check_done(path: Path, result: object) -> None:
+    """Raise where nobody could search a segment: FileNotFoundError where its file went meanwhile."""
+    if isinstance(result, WorkerLost):
+        if not path.exists():
+            raise FileNotFoundError(str(path))
+        raise ValueError(f"{path}: could not be searched: {result}; try again, or with fewer workers")
 
 
 class QuietProcesses(ProcessPoolExecutor):

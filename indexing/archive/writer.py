@@ -11,15 +11,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from dyntorch.numerics import one_thread
 from indexing.archive.catalogue import Catalogue, Contents, RecordingRow, SegmentRow, SourceRow, add_layout, drop_recordings
-from indexing.archive.segments import ArchiveSegment, WrittenSegment, damage_error, intact, write_segment
-from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, Stamp, failure_text, read_source, reading_key, stamp
+from indexing.archive.segments import ArchiveSegment, WrittenSegment, damage_error, is_intact, write_segment
+from indexing.archive.sources import ArchiveSource, ReadRecording, ReadSource, failure_text, read_source, reading_key, stamp
 from indexing.archive.tracks import MAX_LEARNED_POSES, Layout, StorageFormat, Track, layout_key, total_windows, windows_of
 from indexing.archive.workers import InOrder, WorkerLost
 from indexing.opening import count, listing
@@ -86,7 +86,7 @@ class Addition:
         return tuple(one for one in self.sources if one.outcome == outcome)
 
     @property
-    def failed(self) -> tuple[SourceOutcome, ...]:
+    def failures(self) -> tuple[SourceOutcome, ...]:
         """Sources that could not be read, with their reasons."""
         return self.of("failed")
 
@@ -116,19 +116,6 @@ class Verification:
         return not self.problems
 
 
-@dataclass(eq=False)
-class Staged:
-    """Sources that were read and are not committed yet."""
-
-    sources: list[tuple[ArchiveSource, ReadSource]] = field(default_factory=list)
-    since: float = 0.0
-
-    @property
-    def windows(self) -> int:
-        """Of all."""
-        return sum(read.windows for _, read in self.sources)
-
-
 @one_thread
 def add(
     catalogue: Catalogue,
@@ -139,7 +126,7 @@ def add(
     progress: Progress,
 ) -> Addition:
     """Add what is new or has changed; see :meth:`indexing.Archive.add`."""
-    with catalogue.alone():
+    with catalogue.write_lock():
         remove_orphans(catalogue)
         adder = Adder(catalogue, options, reading)
         outcomes: dict[str, SourceOutcome] = {}
@@ -147,7 +134,7 @@ def add(
         work = InOrder(partial(read_source, reading=dict(reading), storage=adder.storage), executor, TASKS_AHEAD, MAX_TRIES)
         try:
             for done, (source, read) in enumerate(work(news), 1):
-                outcomes[source.key] = adder.take(source, read)
+                outcomes[source.key] = adder.stage(source, read)
                 if progress is not None:
                     progress(done / len(news))
         finally:
@@ -204,9 +191,10 @@ class Adder:
         self.storage = contents.storage
         self.known = catalogue.sources()
         self.layouts = {layout_key(one.joints, one.skeleton): (number, one) for number, one in contents.layouts.items()}
-        self.staged = Staged(since=time.monotonic())
+        self.batch: list[tuple[ArchiveSource, ReadSource]] = []
+        self.since = time.monotonic()
 
-    def take(self, source: ArchiveSource, read: ReadSource | WorkerLost) -> SourceOutcome:
+    def stage(self, source: ArchiveSource, read: ReadSource | WorkerLost) -> SourceOutcome:
         """What becomes of a source."""
         if isinstance(read, WorkerLost):
             return SourceOutcome(source.name, "failed", f"{source.name}: {read}; leave it out, or give its worker more memory")
@@ -214,30 +202,25 @@ class Adder:
             return SourceOutcome(source.name, "failed", read.failure)
         row = self.known.get(source.key)
         if row is not None and row.reading == _reading_of(source, self.reading) and row.sha256 == read.stamp.sha256:
-            self._touch(row, read.stamp)
+            with self.catalogue.writing() as connection:  # the same content at another time
+                times = (read.stamp.size, read.stamp.modified, row.id)
+                connection.execute("UPDATE sources SET size = ?, modified = ? WHERE id = ?", times)
             return SourceOutcome(source.name, "known", row.note)
-        self.staged.sources.append((source, read))
-        if (
-            self.staged.windows >= self.options.max_segment_windows
-            or time.monotonic() - self.staged.since >= self.options.commit_seconds
-        ):
+        self.batch.append((source, read))
+        full = sum(each.windows for _, each in self.batch) >= self.options.max_segment_windows
+        if full or time.monotonic() - self.since >= self.options.commit_seconds:
             self.commit()
         outcome: Outcome = "left out" if not read.windows else "added" if row is None else "replaced"
         return SourceOutcome(source.name, outcome, read.note, read.windows, read.seconds)
 
-    def _touch(self, row: SourceRow, now: Stamp) -> None:
-        """The same content at another time."""
-        with self.catalogue.writing() as connection:
-            connection.execute("UPDATE sources SET size = ?, modified = ? WHERE id = ?", (now.size, now.modified, row.id))
-
     def commit(self) -> None:
         """Write what is staged as segments, and let the catalogue know: all of it or nothing."""
-        staged, self.staged = self.staged, Staged(since=time.monotonic())
-        if not staged.sources:
+        batch, self.batch, self.since = self.batch, [], time.monotonic()
+        if not batch:
             return
         number = self._first_number()
         numbered: list[tuple[int, int, ReadRecording]] = []  # (source, number, recording)
-        for i, (_, read) in enumerate(staged.sources):
+        for i, (_, read) in enumerate(batch):
             for one in read.recordings:
                 numbered.append((i, number, one))
                 number += 1
@@ -250,7 +233,7 @@ class Adder:
                 made = write_segment(self.catalogue.segments_folder, [*older, *tracks], layout, self.storage)
                 windows = total_windows(older, self.storage) + sum(one.windows for _, one in mine)
                 written[key] = PreparedSegment(layout, made, windows, joined)
-            self._enter(staged, numbered, written)
+            self._enter(batch, numbered, written)
             _unlink(self.catalogue, [row for one in written.values() for row in one.joined])
         except BaseException:
             with contextlib.suppress(OSError, ValueError):
@@ -283,7 +266,7 @@ class Adder:
 
     def _enter(
         self,
-        staged: Staged,
+        batch: Sequence[tuple[ArchiveSource, ReadSource]],
         numbered: Sequence[tuple[int, int, ReadRecording]],
         written: Mapping[str, PreparedSegment],
     ) -> None:
@@ -296,7 +279,7 @@ class Adder:
                 segments[key] = enter_segment(connection, one.made, number, one.windows, one.joined)
                 if one.joined:
                     connection.execute("UPDATE layouts SET learned = ? WHERE id = ?", (one.layout.dump(), number))
-            rows = [_enter_source(connection, source, read, self.reading) for source, read in staged.sources]
+            rows = [_enter_source(connection, source, read, self.reading) for source, read in batch]
             connection.executemany(
                 "INSERT INTO recordings VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 [
@@ -356,7 +339,7 @@ def tidy(catalogue: Catalogue, options: ArchiveOptions) -> None:
         batch: list[SegmentRow] = []
         with contextlib.suppress(ValueError):  # what it would have freed or put together is no part of what was asked for
             for row in due:
-                if row.dead < row.windows and not intact(catalogue.segments_folder / row.file, row.sha256):
+                if row.dead < row.windows and not is_intact(catalogue.segments_folder / row.file, row.sha256):
                     continue
                 batch.append(row)
                 if sum(one.windows - one.dead for one in batch) >= options.max_segment_windows:
@@ -377,11 +360,12 @@ def _merge_segments(catalogue: Catalogue, rows: Sequence[SegmentRow], layout: La
 
 def live_tracks(catalogue: Catalogue, row: SegmentRow) -> list[Track]:
     """What is in a segment, without what was removed."""
-    live = {one.id for one in catalogue.recordings(row.id)}
+    with catalogue.reading() as connection:
+        live = {number for (number,) in connection.execute("SELECT id FROM recordings WHERE segment = ?", (row.id,))}
     if not live:
         return []
     path = catalogue.segments_folder / row.file
-    if not intact(path, row.sha256):
+    if not is_intact(path, row.sha256):
         raise damage_error(path, "it is not what was written")
     segment = ArchiveSegment.open(path)
     return [segment.track(i) for i in range(len(segment)) if int(segment.tracks[i, 0]) in live]
@@ -421,7 +405,7 @@ def verify(catalogue: Catalogue) -> Verification:
             break
     left = tuple(path.name for path in orphans(catalogue))
     # whoever adds right now has files that are no leftovers
-    return Verification(contents.windows, len(contents.segments), tuple(problems), () if catalogue.held() else left)
+    return Verification(contents.windows, len(contents.segments), tuple(problems), () if catalogue.is_locked() else left)
 
 
 def _problems(folder: Path, contents: Contents, recordings: Sequence[RecordingRow], sources: Sequence[SourceRow]) -> list[str]:
@@ -455,7 +439,7 @@ def _segment_problems(
 ) -> list[str]:
     path, lost = folder / row.file, _loss_text(recordings, names)
     try:
-        if path.stat().st_size != row.size or not intact(path, row.sha256):
+        if path.stat().st_size != row.size or not is_intact(path, row.sha256):
             return [f"{path}: is not what was written; {lost}"]
         segment = ArchiveSegment.open(path)
     except OSError as problem:

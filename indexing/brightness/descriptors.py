@@ -10,7 +10,7 @@ import torch
 from kornia.filters import gaussian_blur2d, spatial_gradient3d
 from torch import Tensor
 
-from indexing.brightness.footage import Shrinker
+from indexing.brightness.videos import Shrinker
 
 GRADIENT_EPSILON = 0.02  # grey 0..1: gradients below this are not divided by (theory: within noise from .01 to .05)
 
@@ -24,7 +24,7 @@ def blur(frames: Tensor, sigma: float) -> Tensor:
     """Frames ``(T, h, w)`` smoothed by a Gaussian of ``sigma`` pixels."""
     size = 2 * int(3 * sigma + 0.5) + 1
     size = min(size, 2 * ((min(frames.shape[-2:]) - 1) // 2) + 1)
-    return gaussian_blur2d(frames[:, None], (size, size), (sigma, sigma))[:, 0]
+    return gaussian_blur2d(frames[None], (size, size), (sigma, sigma))[0]
 
 
 def gradients(frames: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -162,23 +162,23 @@ def pool_cells(maps: Tensor, boxes: Tensor, cells: int = CELLS) -> Tensor:
     return (along[:, :, None, :, :height] @ bands).flatten(2)
 
 
-def describe_cells(cells: Tensor, soft: float = SOFT_NORM) -> Tensor:
+def describe_cells(cells: Tensor) -> Tensor:
     r"""Descriptor :math:`f = s / (\|s\| + .005)` with :math:`s = \sqrt{cells}`: shorter than 1, and near 0 where nothing moves."""
     root = cells.sqrt()
-    return root / (root.norm(dim=-1, keepdim=True) + soft)
+    return root / (root.norm(dim=-1, keepdim=True) + SOFT_NORM)
 
 
-def profile(cells: Tensor, count: int = CELLS) -> Tensor:
-    """``(..., 3 * count)`` motion sideways, down and up in each row of cells ``(..., 4 * count * count)``."""
-    right, left, down, up = cells.unflatten(-1, (4, count, count)).sum(-1).unbind(-2)
+def profile(cells: Tensor) -> Tensor:
+    """``(..., 24)`` motion sideways, down and up in each row of cells ``(..., 256)``."""
+    right, left, down, up = cells.unflatten(-1, (4, CELLS, CELLS)).sum(-1).unbind(-2)
     return torch.cat([right + left, down, up], dim=-1)
 
 
-def mirror_rows(rows: Tensor, count: int = CELLS) -> Tensor:
+def mirror_rows(rows: Tensor) -> Tensor:
     """Descriptors of the same video seen in a mirror: right and left change places; a row profile at the end stays."""
-    size = 4 * count**2
+    size = 4 * CELLS**2
     grids, rest = rows.split([rows.shape[1] // size * size, rows.shape[1] % size], dim=1)
-    maps = grids.unflatten(1, (-1, 4, count, count)).flip(4)
+    maps = grids.unflatten(1, (-1, 4, CELLS, CELLS)).flip(4)
     return torch.cat([maps[:, :, [1, 0, 2, 3]].flatten(1), rest], dim=1)
 
 
@@ -242,7 +242,7 @@ class Sight:
             boxes[:, 0, 2:].clamp_(min=MIN_BOX * height)
             boxes[:, 2, 2:].clamp_(min=height)
         cells = pool_cells(maps, boxes)
-        grids, rows = (describe_cells(part, SOFT_NORM) for part in (cells[:, :2], profile(cells.flip(1)[:, :2])))
+        grids, rows = (describe_cells(part) for part in (cells[:, :2], profile(cells.flip(1)[:, :2])))
         weights = _weights(SHARES, maps.dtype, maps.device)
         return torch.cat([grids.flatten(1), rows.flatten(1)], dim=1).mul_(weights)
 

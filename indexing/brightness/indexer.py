@@ -14,18 +14,18 @@ from sklearn.utils.validation import check_is_fitted
 from dyntorch.numerics import one_thread
 from indexing.action.inputs import check_labels
 from indexing.brightness.descriptors import LENGTH, SMALLEST, BrightnessOptions, Optics
-from indexing.brightness.footage import Footage, footage, gather
 from indexing.brightness.stream import (
     BrightnessStream,
     Recognizer,
     VideoExemplars,
-    found_events,
+    build_library,
+    find_events,
     learn_descriptors,
-    library,
     mirrors_matter,
     recognize,
     wrong_evidence,
 )
+from indexing.brightness.videos import Footage, footage, gather
 from indexing.clip import is_number
 from indexing.estimator import (
     POSITIVE,
@@ -205,7 +205,7 @@ class BrightnessIndexer(SavedClassifier):
         old = len(self.exemplars_.labels)
         more = self._exemplars(found, numbers[old:])
         labels = torch.cat([torch.from_numpy(numbers[:old]), more.labels])
-        return self._learn(self.exemplars_.extended(more, labels), known)
+        return self._learn(self.exemplars_.join(more, labels), known)
 
     def _exemplars(self, videos: list[Footage], numbers: Array) -> VideoExemplars:
         views = learn_descriptors(videos, self._optics())
@@ -227,7 +227,7 @@ class BrightnessIndexer(SavedClassifier):
 
     def _recognizer(self, exemplars: VideoExemplars, classes: int, flip: bool) -> Recognizer:
         window, pool = max(MIN_WINDOW_FRAMES, self.window * self.fps), max(1.0, self.pool * self.fps)
-        placed = library(exemplars.to(self.device), classes, flip, self._options.num_directions)
+        placed = build_library(exemplars.to(self.device), classes, flip, self._options.num_directions)
         return Recognizer(self._optics(), placed, window, pool)
 
     def _optics(self) -> Optics:
@@ -304,7 +304,7 @@ class BrightnessIndexer(SavedClassifier):
         """
         times, scores, energy = self._scan(video, progress)
         wrong = wrong_evidence(self.recognizer_, self.exemplars_)[1]
-        return times, scores, found_events(scores, times, energy, self.classes_, wrong, self.reject)
+        return times, scores, find_events(scores, times, energy, self.classes_, wrong, self.reject)
 
     def _scan(self, video: Any, progress: Callable[[float], None] | None) -> tuple[Array, Array, Array]:
         check_is_fitted(self, "exemplars_")

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from dyntorch.numerics import one_thread
 from indexing.brightness.descriptors import Optics, Sight, merge_motion, mirror_rows
-from indexing.brightness.footage import Footage, Resampler
+from indexing.brightness.videos import Footage, Resampler
 from indexing.modelfile import store
 from indexing.scoring import Event, event_levels, events
 
-FRAMES = 2**31  # of a video, at most
-LONGEST = 1.001  # of the entries of a unit vector, with rounding
+MAX_FRAMES = 2**31  # of a video, at most
+MAX_ENTRY = 1.001  # of the entries of a unit vector, with rounding
 GAP = 2  # empty rows before each track: no step leads from one track into the next
 
 
@@ -26,8 +26,8 @@ GAP = 2  # empty rows before each track: no step leads from one track into the n
 class VideoExemplars:
     """Learned videos, one after the other."""
 
-    motion: Tensor = field(metadata=store("real", "frames", "descriptor", least=-LONGEST, most=LONGEST))
-    lengths: Tensor = field(metadata=store("integers", "videos", below=FRAMES))  # ``(videos,)`` frames
+    motion: Tensor = field(metadata=store("real", "frames", "descriptor", least=-MAX_ENTRY, most=MAX_ENTRY))
+    lengths: Tensor = field(metadata=store("integers", "videos", below=MAX_FRAMES))  # ``(videos,)`` frames
     labels: Tensor = field(metadata=store("every", "videos", below="classes"))  # ``(videos,)`` numbers of classes
 
     @classmethod
@@ -35,7 +35,7 @@ class VideoExemplars:
         """Of the descriptors of each video."""
         return cls(torch.cat(videos), torch.tensor([len(one) for one in videos]), labels)
 
-    def extended(self, others: VideoExemplars, labels: Tensor) -> VideoExemplars:
+    def join(self, others: VideoExemplars, labels: Tensor) -> VideoExemplars:
         """With further videos; ``labels`` are those of all."""
         return VideoExemplars(torch.cat([self.motion, others.motion]), torch.cat([self.lengths, others.lengths]), labels)
 
@@ -58,7 +58,7 @@ class Library:
     basis: Tensor  # ``(D, K)`` directions in which the exemplars differ most, orthonormal
 
 
-def library(exemplars: VideoExemplars, classes: int, flip: bool, num_directions: int = 96) -> Library:
+def build_library(exemplars: VideoExemplars, classes: int, flip: bool, num_directions: int = 96) -> Library:
     """Lay out the tracks of all exemplars, mirrored ones too where ``flip``, in so many directions."""
     videos, labels = exemplars.videos(), exemplars.labels.tolist()
     rows, gaps, bounds, at = [], [], [0] * (classes + 1), 0
@@ -108,8 +108,8 @@ BLOCK = 32  # frames compared at once: library rows are read once per block
 class Warping:
     """The state of one stream against a library."""
 
-    def __init__(self, source: Library, window: float, slack: float = SLACK) -> None:
-        self.source, self.keep, self.slack = source, 1 - 1 / window, slack
+    def __init__(self, source: Library, window: float) -> None:
+        self.source, self.keep = source, 1 - 1 / window
         self.state = source.rows.new_zeros(len(source.rows))
         self.held = 1.0
 
@@ -125,7 +125,7 @@ class Warping:
         before = self.state
         known = []
         for state in states:
-            torch.sub(before, self.slack, out=slower)
+            torch.sub(before, SLACK, out=slower)
             best = slower.clone()
             torch.maximum(best[2:], slower[:-2], out=best[2:])
             torch.maximum(best[1:], before[:-1], out=best[1:])
@@ -159,27 +159,26 @@ class Recognizer:
 class Pool:
     r"""Running mean of scores over frames in which something moves."""
 
-    def __init__(self, classes: int, frames: float, sharp: float = MEAN_SHARPNESS) -> None:
-        self.sharp = sharp
+    def __init__(self, classes: int, frames: float) -> None:
         self.keep = 1 - 1 / max(frames, 1.0)
         self.total, self.weight = np.zeros(classes), 0.0
 
     def push(self, scores: Array, energy: Array) -> Array:
         """``(n, classes)`` means after each of ``n`` more frames; 0 before anything has moved."""
-        totals, weights = energy[:, None] * np.exp(self.sharp * scores), energy.copy()
+        totals, weights = energy[:, None] * np.exp(MEAN_SHARPNESS * scores), energy.copy()
         for t in range(len(totals)):
             totals[t] += self.keep * self.total
             weights[t] += self.keep * self.weight
             self.total, self.weight = totals[t], weights[t]
-        return _mean(totals, weights[:, None], self.sharp)
+        return _mean(totals, weights[:, None])
 
     def mean(self) -> Array:
         """``(classes,)`` the mean now."""
-        return _mean(self.total, self.weight, self.sharp)
+        return _mean(self.total, self.weight)
 
 
-def _mean(total: Array, weight: Any, sharp: float) -> Array:
-    return np.asarray(np.log(np.maximum(total / np.maximum(weight, 1e-12), 1.0)) / sharp)
+def _mean(total: Array, weight: Any) -> Array:
+    return np.asarray(np.log(np.maximum(total / np.maximum(weight, 1e-12), 1.0)) / MEAN_SHARPNESS)
 
 
 class BrightnessStream:
@@ -190,8 +189,8 @@ class BrightnessStream:
         self.sight = Sight(source.optics, name)
         self.resample = Resampler(source.optics.fps, fps)
         self.warping = Warping(source.library, source.window)
-        self.pool = Pool(classes, source.pool, MEAN_SHARPNESS)
-        self.whole = Pool(classes, float("inf"), MEAN_SHARPNESS)
+        self.pool = Pool(classes, source.pool)
+        self.whole = Pool(classes, float("inf"))
         self.pushed = self.compared = 0
         self.latest = np.zeros(classes)
         self.energy = 0.0
@@ -206,7 +205,7 @@ class BrightnessStream:
     @one_thread
     def scan(self, frames: Any, times: Any = None) -> tuple[Array, Array]:
         """Scores ``(n, classes)`` and energies ``(n,)`` (0 where nothing moves, else below 1) after each of n more frames."""
-        with torch.inference_mode():  # a seventh of the time of single frames
+        with torch.no_grad():
             return self._scan(frames, times)
 
     def _scan(self, frames: Any, times: Any) -> tuple[Array, Array]:
@@ -239,15 +238,15 @@ def recognize(stream: BrightnessStream, video: Footage) -> Array:
 
 def learn_descriptors(videos: list[Footage], optics: Optics) -> list[list[Tensor]]:
     """Descriptors of videos to learn from: what a stream of each would give, and what a stream would give that began earlier."""
-    first = [_looked_at(video, optics, None) for video in videos]
+    first = [_describe_video(video, optics, None) for video in videos]
     moved = [seen for _, seen in first if seen is not None]
     if not moved:
         return [[one] for one, _ in first]
-    again = [_looked_at(video, optics, seen)[0] for video, seen in zip(videos, merge_motion(moved), strict=True)]
+    again = [_describe_video(video, optics, seen)[0] for video, seen in zip(videos, merge_motion(moved), strict=True)]
     return [[one, other] for (one, _), other in zip(first, again, strict=True)]
 
 
-def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Tensor, Tensor | None]:
+def _describe_video(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Descriptors of a whole video, and where something has moved in the end."""
     sight, resample = Sight(optics, video.name, seen), Resampler(optics.fps, video.own_rate)
     found = torch.cat([sight.push(resample.push(sight.small(frames), times)[0]) for frames, times in video]).cpu()
@@ -265,8 +264,8 @@ def _looked_at(video: Footage, optics: Optics, seen: Tensor | None) -> tuple[Ten
 def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch.Tensor, Array]:
     """What exemplars find in other actions: the evidence of each ``(videos,)``, the contrast of moving frames ``(frames,)``."""
     best, contrasts = [], []
-    for i in _sample_exemplars(exemplars, MAX_ASKED):
-        stream, seen = _fresh(source), exemplars.videos()[i]
+    for i in _sample_exemplars(exemplars):
+        stream, seen = _new_stream(source), exemplars.videos()[i]
         label = int(exemplars.labels[i])
         scores, energy = stream.compare(seen.to(source.optics.device))
         others = np.delete(scores, label, axis=1)[energy >= QUIET_ENERGY]
@@ -277,8 +276,8 @@ def wrong_evidence(source: Recognizer, exemplars: VideoExemplars) -> tuple[torch
 
 def mirrors_matter(source: Recognizer, exemplars: VideoExemplars) -> bool:
     """Whether some exemplar's mirror image looks clearly more like another action than like its own."""
-    for i in _sample_exemplars(exemplars, MAX_ASKED):
-        stream, seen = _fresh(source), exemplars.videos()[i]
+    for i in _sample_exemplars(exemplars):
+        stream, seen = _new_stream(source), exemplars.videos()[i]
         stream.compare(mirror_rows(seen).to(source.optics.device))
         scores = stream.whole.mean()
         label = int(exemplars.labels[i])
@@ -287,18 +286,18 @@ def mirrors_matter(source: Recognizer, exemplars: VideoExemplars) -> bool:
     return False
 
 
-def found_events(scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None) -> list[Event]:
+def find_events(scores: Array, times: Array, energy: Array, classes: Array, wrong: Array, rate: float | None) -> list[Event]:
     """Events of scored frames: where the contrast of the best class exceeds what wrong actions reach at a rate."""
     contrast = scores - scores.mean(axis=1, keepdims=True)
     peak, floor = event_levels(wrong, FALSE_ALARM_RATE if rate is None else rate, EXTENT_RATE, (MIN_CONTRAST, MIN_CONTRAST))
     return events(contrast, times, classes.tolist(), peak, floor, energy < QUIET_ENERGY)
 
 
-def _sample_exemplars(exemplars: VideoExemplars, most: int) -> list[int]:
+def _sample_exemplars(exemplars: VideoExemplars) -> list[int]:
     """Exemplars to ask, spread over all of them."""
     count = len(exemplars.labels)
-    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, MAX_ASKED))})
 
 
-def _fresh(source: Recognizer) -> BrightnessStream:
+def _new_stream(source: Recognizer) -> BrightnessStream:
     return BrightnessStream(source, len(source.library.bounds) - 1, "exemplar", None)

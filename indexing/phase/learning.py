@@ -14,9 +14,9 @@ from indexing.action.bank import Windows, stack
 from indexing.clip import Clip
 from indexing.phase.model import (
     Course,
-    Learned,
     PhaseModel,
     PhaseOptions,
+    TrainingFrames,
     learn_course,
     normalize_frames,
     training_frames,
@@ -98,7 +98,7 @@ def _local(x: Tensor, seconds: Tensor, options: PhaseOptions) -> list[tuple[slic
 
 
 @on_cpu
-def in_step(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions) -> list[Tensor] | None:
+def synchronize_cycles(clips: list[tuple[Tensor, Tensor]], options: PhaseOptions) -> list[Tensor] | None:
     """Phases in [0, 1) of the frames of clips of one action that repeats; ``None`` where it does not. clips ``(F, n, 2)``."""
     local = [_local(*clip, options=options) for clip in clips]
     depths = sorted(min(depth for _, _, depth in parts) for parts in local)
@@ -195,8 +195,8 @@ def learn_model(
     course: str,
     mirror: str | bool,
     swap: Swap,
-    device: torch.device | str = "cpu",
-    camera: str = "affine",
+    device: torch.device | str,
+    camera: str,
     options: PhaseOptions,
 ) -> tuple[PhaseModel, list[bool]]:
     """The model, on the CPU, and which classes are their own mirror image half a cycle later. clips ``(clips,)``."""
@@ -210,11 +210,11 @@ def learn_model(
     for c in range(int(label.max()) + 1):
         mine = [k for k in range(len(clips)) if int(label[k]) == c]
         of = [learned.clip == k for k in mine]
-        parts = [Learned(learned.frames[at], learned.clip[at], learned.times[at]) for at in of]
+        parts = [TrainingFrames(learned.frames[at], learned.clip[at], learned.times[at]) for at in of]
         given = [phases[k] for k in mine]
         found, repeats = _phases(parts, given, course, options)
         one = _concatenate(parts, found)
-        if repeats and twin is not None and (mirror is True or _own_mirror(one, twin, options)):
+        if repeats and twin is not None and (mirror is True or _is_own_mirror(one, twin, options)):
             one = _with_mirror(one, twin)
             mirrored.append(True)
         else:
@@ -228,22 +228,26 @@ def learn_model(
     return replace(model, wrong=wrong_scores(model, learned, label.to(learned.clip.device))).to("cpu"), mirrored
 
 
-Phased = tuple[Learned, Tensor]
+Phased = tuple[TrainingFrames, Tensor]
 
 
 def _phases(
-    parts: Sequence[Learned], given: Sequence[Tensor | None], course: str, options: PhaseOptions
+    parts: Sequence[TrainingFrames], given: Sequence[Tensor | None], course: str, options: PhaseOptions
 ) -> tuple[list[Tensor], bool]:
     """Phases of the frames of every clip, and whether the action repeats."""
     known = [values for values in given if values is not None]
     if len(known) == len(given):
         repeats = course == "periodic" or (course == "auto" and _wraps(known))
         return [values.remainder(1.0) if repeats else values.clamp(0, 1) for values in known], repeats
-    stepped = None if course == "once" else in_step([(part.frames.values[:, 0], part.times) for part in parts], options=options)
+    stepped = (
+        None
+        if course == "once"
+        else synchronize_cycles([(part.frames.values[:, 0], part.times) for part in parts], options=options)
+    )
     if stepped is None:
         if course == "periodic":
             raise ValueError("course='periodic': no period was found in the clips; give longer ones, or phases")
-        return [_once(part.times) for part in parts], False
+        return [_phase_by_time(part.times) for part in parts], False
     for harmonics in COARSE_HARMONICS:
         found = _fit_course(_concatenate(parts, stepped), MAX_COARSE_FRAMES, harmonics, True)
         stepped = [
@@ -260,17 +264,17 @@ def _wraps(known: Sequence[Tensor]) -> bool:
     return bool((values.nan_to_num(0.5) > 1).any() or (values.nan_to_num(0.5) < 0).any() or (steps < -0.5).any())
 
 
-def _once(seconds: Tensor) -> Tensor:
+def _phase_by_time(seconds: Tensor) -> Tensor:
     return (seconds - seconds[0]) / (seconds[-1] - seconds[0])
 
 
-def _concatenate(parts: Sequence[Learned], phases: Sequence[Tensor]) -> Phased:
+def _concatenate(parts: Sequence[TrainingFrames], phases: Sequence[Tensor]) -> Phased:
     """All frames of an action whose phase is known."""
     phase = torch.cat(list(phases))
     known = phase.isfinite()
     frames = stack([part.frames for part in parts])
     clip, times = (torch.cat([getattr(part, name) for part in parts]) for name in ("clip", "times"))
-    return Learned(frames[known], clip[known], times[known]), phase[known]
+    return TrainingFrames(frames[known], clip[known], times[known]), phase[known]
 
 
 def _spread(one: Phased, most: int) -> Phased:
@@ -278,7 +282,7 @@ def _spread(one: Phased, most: int) -> Phased:
     if len(phase) <= most:
         return one
     at = torch.linspace(0, len(phase) - 1, most).round().long()
-    return Learned(learned.frames[at], learned.clip[at], learned.times[at]), phase[at]
+    return TrainingFrames(learned.frames[at], learned.clip[at], learned.times[at]), phase[at]
 
 
 def _fit_course(one: Phased, most: int, harmonics: int, repeats: bool) -> Course:
@@ -306,19 +310,21 @@ def _card(frames: Windows, width: float) -> Windows:
 def _with_mirror(one: Phased, swap: Tensor) -> Phased:
     learned, phase = one
     twice = (torch.cat([part, part]) for part in (learned.clip, learned.times))
-    return Learned(stack([learned.frames, _twins(learned.frames, swap)]), *twice), torch.cat([phase, (phase + 0.5).remainder(1.0)])
+    return TrainingFrames(stack([learned.frames, _twins(learned.frames, swap)]), *twice), torch.cat(
+        [phase, (phase + 0.5).remainder(1.0)]
+    )
 
 
-def _own_mirror(one: Phased, swap: Tensor, options: PhaseOptions) -> bool:
+def _is_own_mirror(one: Phased, swap: Tensor, options: PhaseOptions) -> bool:
     """Whether the mirrored frames fit the course half a cycle later."""
     learned, phase = _spread(one, MAX_COARSE_FRAMES)
     found = _fit_course((learned, phase), MAX_COARSE_FRAMES, MIRROR_HARMONICS, True)
 
-    def left(frames: Windows, at: Tensor) -> tuple[Tensor, Tensor]:
+    def mean_residuals(frames: Windows, at: Tensor) -> tuple[Tensor, Tensor]:
         curve = found.curve(frames, options.num_phases)
         count = curve.shape[1]
         return curve.gather(1, (at * count).round().long().remainder(count)[:, None]).mean().log(), curve.mean().log()
 
-    own, _ = left(learned.frames, phase)
-    other, anywhere = left(_twins(learned.frames, swap), phase + 0.5)
+    own, _ = mean_residuals(learned.frames, phase)
+    other, anywhere = mean_residuals(_twins(learned.frames, swap), phase + 0.5)
     return bool(other - own < MAX_MIRROR_SHARE * (anywhere - own))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from dyntorch import Fourier, Polynomial
 from dyntorch.numerics import orthonormal_basis
 from indexing import scoring
-from indexing.action.bank import EPSILON, Windows, between, cosine_distance, stack
+from indexing.action.bank import EPSILON, Windows, compare_windows, cosine_distance, stack
 from indexing.cameras import virtual, y_up
 from indexing.clip import Clip
 from indexing.modelfile import part, store
@@ -27,24 +27,24 @@ MIN_FRAME_JOINTS = 6  # joints: an affine camera takes any four anywhere, so fiv
 
 
 @dataclass(frozen=True)
-class Learned:
+class TrainingFrames:
     """Training frames end to end: the frames, and for each its clip ``(F,)`` and its time in seconds ``(F,)``."""
 
     frames: Windows
     clip: Tensor
     times: Tensor
 
-    def to(self, device: torch.device | str) -> Learned:
+    def to(self, device: torch.device | str) -> TrainingFrames:
         """The same on another device."""
-        return Learned(self.frames.to(device), self.clip.to(device), self.times.to(device))
+        return TrainingFrames(self.frames.to(device), self.clip.to(device), self.times.to(device))
 
 
-def training_frames(clips: Sequence[Clip]) -> Learned:
+def training_frames(clips: Sequence[Clip]) -> TrainingFrames:
     """All frames of images, missing joints interpolated in time (a joint that a clip never shows is not seen)."""
     source = concatenate_clips(clips)
     clip = torch.from_numpy(np.repeat(np.arange(len(clips)), np.diff(source.starts)))
     frames = Windows(torch.from_numpy(source.joints).double()[:, None], torch.from_numpy(source.seen)[clip])
-    return Learned(frames, clip, torch.from_numpy(source.times))
+    return TrainingFrames(frames, clip, torch.from_numpy(source.times))
 
 
 def query_frames(clip: Clip) -> Windows:
@@ -73,22 +73,29 @@ def image_distance(query: Windows, bank: Windows) -> Tensor:
     def compare(a: Tensor, b: Tensor, _: Tensor | slice) -> Tensor:
         return cosine_distance(centre(a).flatten(1), centre(b).flatten(1))
 
-    return between(query, bank, compare, worst=1.0)
+    return compare_windows(query, bank, compare, worst=1.0)
 
 
 def shape_distance(query: Windows, shapes: Windows) -> Tensor:
     r""":math:`\|(I - \Pi_g)\bar x\|^2`: the part of each frame ``(Q, shapes)`` that no affine image of a shape explains."""
 
-    def compare(a: Tensor, b: Tensor, joints: Tensor | slice) -> Tensor:
-        if a.shape[2] < MIN_FRAME_JOINTS:
-            return a.new_ones(len(a), len(b))
-        basis = orthonormal_basis(centre(b)[:, 0])
-        x = centre(a)[:, 0]
-        x = x / x.flatten(1).norm(dim=1).clamp(min=1e-300)[:, None, None]
+    def residual(x: Tensor, basis: Tensor) -> Tensor:
         inner = x.mT.flatten(0, 1) @ basis.permute(1, 0, 2).flatten(1)
-        return (1 - inner.square().reshape(len(a), 2, len(b), 3).sum((1, 3))).clamp(0, 1)
+        return (1 - inner.square().reshape(len(x), 2, len(basis), 3).sum((1, 3))).clamp(0, 1)
 
-    return between(query, shapes, compare, worst=1.0)
+    return _compare_shapes(query, shapes, MIN_FRAME_JOINTS, residual)
+
+
+def _compare_shapes(query: Windows, shapes: Windows, min_joints: int, residual: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """What is left of frames of norm 1, given the basis of each shape; all of it where too few joints are seen."""
+
+    def compare(a: Tensor, b: Tensor, _: Tensor | slice) -> Tensor:
+        if a.shape[2] < min_joints:
+            return a.new_ones(len(a), len(b))
+        x = centre(a)[:, 0]
+        return residual(x / x.flatten(1).norm(dim=1).clamp(min=1e-300)[:, None, None], orthonormal_basis(centre(b)[:, 0]))
+
+    return compare_windows(query, shapes, compare, worst=1.0)
 
 
 def centre(x: Tensor) -> Tensor:
@@ -144,16 +151,11 @@ def _energy(gram: Tensor, right: Tensor, kappa: float) -> Tensor:
 def perspective_distance(query: Windows, shapes: Windows, kappa: float) -> Tensor:
     """As :func:`shape_distance`, ``(Q, shapes)``, by cameras that may lean."""
 
-    def compare(a: Tensor, b: Tensor, joints: Tensor | slice) -> Tensor:
-        if a.shape[2] < MIN_FRAME_JOINTS + 1:
-            return a.new_ones(len(a), len(b))
-        basis = orthonormal_basis(centre(b)[:, 0])
-        x = centre(a)[:, 0]
-        x = x / x.flatten(1).norm(dim=1).clamp(min=1e-300)[:, None, None]
-        step = max(1, LEAN_BLOCK // max(1, len(b)))
+    def residual(x: Tensor, basis: Tensor) -> Tensor:
+        step = max(1, LEAN_BLOCK // max(1, len(basis)))
         return torch.cat([leaning(part, basis, kappa) for part in x.split(step)]).clamp(0, 1)
 
-    return between(query, shapes, compare, worst=1.0)
+    return _compare_shapes(query, shapes, MIN_FRAME_JOINTS + 1, residual)
 
 
 RIDGE = 1e-4  # of the mean diagonal; 1e-5 is as good, 1e-3 costs .5 and 1e-2 4 degrees
@@ -331,7 +333,7 @@ class PhaseModel:
     courses: tuple[Course, ...]
     wrong: Tensor = field(metadata=store("real", None))
     options: PhaseOptions
-    camera: str = "affine"
+    camera: str
 
     def to(self, device: torch.device | str) -> PhaseModel:
         """The same on another device."""
@@ -410,7 +412,7 @@ def _lowest(curve: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
 Array = NDArray[Any]
 
 
-def wrong_scores(model: PhaseModel, learned: Learned, label: Tensor) -> Tensor:
+def wrong_scores(model: PhaseModel, learned: TrainingFrames, label: Tensor) -> Tensor:
     """``(seconds,)`` the best mean score of training seconds in a model that their class was left out of."""
     if len(model.courses) < MIN_CALIBRATED_CLASSES:
         return torch.zeros(0, dtype=torch.float64)

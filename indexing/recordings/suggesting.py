@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 
 from dyntorch.numerics import one_thread
-from indexing.action.bank import Bank, Copy, Windows, fused_residuals, fusion, planes_of, stack
+from indexing.action.bank import NEAREST, Bank, Copy, Windows, fused_residuals, planes_of, stack
 from indexing.action.inputs import check_queries
 from indexing.action.stream import motion_levels, motion_of
 from indexing.clip import Clip, stretches
@@ -157,7 +157,7 @@ def parts_of(indexer: ActionIndexer, clip: Clip, labelled: Sequence[Span]) -> Re
     begin = float(image.times[0])
     image = image.replace(times=image.times - begin)
     unit = Durations.of(model, indexer.window, 0.3 * indexer.window).unit
-    spans = np.array(_cut_parts(indexer.explain(clip), clip, max(unit, MIN_PART_SECONDS))).reshape(-1, 2)
+    spans = np.array(_cut_parts(indexer.decode(clip), clip, max(unit, MIN_PART_SECONDS))).reshape(-1, 2)
     spans = spans[[_share(span, labelled) < MAX_LABELLED_SHARE for span in spans.tolist()]]
     if not len(spans):
         return None
@@ -223,9 +223,8 @@ def compare_parts(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Arra
     copies = [Copy(everything)]
     if model.symmetry is not None and bool(model.mirrored.any()):
         copies.append(Copy(everything, None, model.symmetry))
-    term = fusion(("epi",))
-    (table,) = fused_residuals(everything, [Bank(copies, planes_of(model.metric))], [term])
-    residual = np.exp(table.cpu().numpy() / sum(term.powers))
+    (table,) = fused_residuals(everything, [Bank(copies, planes_of(model.metric))], [("epi",)])
+    residual = np.exp(table.cpu().numpy() / len(NEAREST))
     count = len(exemplars)
     labels = model.labels.cpu().numpy()
     others = np.where(labels[:, None] != labels[None], residual[:count, :count], np.inf).min(axis=1)

@@ -16,8 +16,8 @@ from torch.nn.functional import avg_pool1d, max_pool1d, normalize
 
 from dyntorch.numerics import Message
 from indexing.brightness.descriptors import as_grey, blur, gradients, weighted_differences
-from indexing.brightness.footage import SHRINKING_BLOCK as FOOTAGE_BLOCK
-from indexing.brightness.footage import Shrinker
+from indexing.brightness.videos import SHRINKING_BLOCK as FOOTAGE_BLOCK
+from indexing.brightness.videos import Shrinker
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The row-band profile: how much moves up, down and sideways, at which height of the box, frame by frame.

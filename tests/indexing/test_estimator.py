@@ -335,7 +335,7 @@ def what_is_loaded_answers_the_same(case: Case, path: Path) -> None:
 TAUGHT_BY: dict[type, tuple[str, Callable[..., torch.Tensor]]] = {
     ActionIndexer: ("indexing.action.indexer.learn", lambda exemplars, labels, *_: exemplars.crops.values),
     PhaseIndexer: ("indexing.phase.learning.learn_course", lambda frames, *_: frames),
-    BrightnessIndexer: ("indexing.brightness.indexer.library", lambda exemplars, *_: exemplars.motion),
+    BrightnessIndexer: ("indexing.brightness.indexer.build_library", lambda exemplars, *_: exemplars.motion),
 }
 """What does the work of ``fit``, and a tensor that it is given."""
 

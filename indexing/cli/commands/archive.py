@@ -75,10 +75,10 @@ def add(flags: Add) -> int:
         return INTERRUPTED
     _added_show(done)
     say(f"{archive.path}: {size_text(archive.info())}; took {time.perf_counter() - started:.1f} s")
-    for failure in done.failed:
+    for failure in done.failures:
         complain(f"failed: {failure.reason or failure.source}")
     fine = bool(done.of("added") or done.of("replaced")) and not flags.strict
-    return PROBLEMS if done.failed and not fine else 0
+    return PROBLEMS if done.failures and not fine else 0
 
 
 def search(flags: Search) -> int:

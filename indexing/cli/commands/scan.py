@@ -142,7 +142,7 @@ def _scan(flags: Scan, indexer: Any, recording: Any, truth: list[KnownEvent] | N
 def _of_person(indexer: ActionIndexer, lane: Lane, truth: list[KnownEvent] | None, bar: Progress) -> RecordingResult:
     """One person of a recording: explained, and what was found counted."""
     assert lane.clip is not None
-    explanation = indexer.explain(lane.clip, bar)
+    explanation = indexer.decode(lane.clip, bar)
     counts = count_repetitions(lane.clip, explanation.events, exemplars(indexer))
 
     def renumber(event: Event) -> Event:

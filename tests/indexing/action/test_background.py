@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from indexing import ActionIndexer, Clip
 from indexing.action import background as of_background
-from indexing.action.background import OtherMovement, cut_background, perform_other_actions, played_otherwise
+from indexing.action.background import BackgroundClips, cut_background, perform_other_actions, replay_clips
 from indexing.actors import Person, dataset, detect, stream
 from indexing.skeleton import COCO17, OPENPOSE18
 
@@ -46,24 +46,28 @@ def test_one_action_is_told_from_everything_else(alone, others):
     assert np.mean(said[others.labels == "squat"] == "squat") == 1.0 and np.mean(said[others.labels != "squat"] == "squat") <= 0.25
 
 
-def test_scores_are_of_the_known_actions(alone, others):
+def test_scores_are_of_the_known_actions_and_models_come_back_from_their_files(alone, others, tmp_path):
     assert alone.decision_function(others).shape == alone.predict_proba(others).shape == (len(others), 1)
     likely = alone.predict_proba(others)[:, 0]
     assert (likely >= 0).all() and (likely <= 1).all()
     assert likely[others.labels == "squat"].min() > np.median(likely[others.labels != "squat"])
+    alone.save(tmp_path / "squat.safetensors")
+    again = ActionIndexer.load(tmp_path / "squat.safetensors")
+    assert again.model_.hidden == alone.model_.hidden and again.reject_threshold_ == alone.reject_threshold_
+    assert again.predict(others).tolist() == alone.predict(others).tolist()
 
 
 @pytest.mark.slow
 def test_a_recording_holds_the_one_action(alone, session):
     clip, truth = session
-    told = alone.explain(clip)
+    told = alone.decode(clip)
     squats = [(start, end) for label, start, end in truth if label == "squat"]
     assert told.classes == ("squat",) and told.scores.shape == (len(clip), 1)
     assert [event.label for event in told.events] == ["squat"] * len(squats)
     for event, (start, end) in zip(told.events, squats, strict=True):
         assert min(event.end, end) - max(event.start, start) > 0.5 * (end - start)
     assert {one.event.label for one in told.withheld} <= {"squat"}
-    least = ActionIndexer(virtual_views=2, reject=-1e9).fit([alone.exemplar(0)], ["squat"]).explain(clip)  # nothing is below it
+    least = ActionIndexer(virtual_views=2, reject=-1e9).fit([alone.exemplar(0)], ["squat"]).decode(clip)  # nothing is below it
     assert "other movement" in {one.reason for one in least.withheld}
     assert told.background is not None and (told.background >= 0).all() and (told.background <= 1).all()
 
@@ -75,14 +79,6 @@ def test_the_rate_sets_the_level(squat):
         for rate in (0.02, None, 0.5)
     )
     assert strict > usual > loose  # where nothing is said a rate is asked for all the same
-
-
-def test_models_come_back_from_their_files(alone, others, tmp_path):
-    path = tmp_path / "squat.safetensors"
-    alone.save(path)
-    again = ActionIndexer.load(path)
-    assert again.model_.hidden == alone.model_.hidden and again.reject_threshold_ == alone.reject_threshold_
-    assert again.predict(others).tolist() == alone.predict(others).tolist()
 
 
 def test_files_that_know_neither_background_nor_profiles_are_read(others, tmp_path):
@@ -130,14 +126,14 @@ def test_what_is_made(monkeypatch):
     monkeypatch.setattr(of_background, "NUM_CAMERAS", 1)
     clip = Clip(np.random.default_rng(0).normal(size=(20, 17, 2)), skeleton=COCO17)
     rng = np.random.default_rng(0)
-    played = played_otherwise([clip], True, rng)
-    assert all(one.joints.shape == clip.joints.shape for one in played.clips) and not any(played.sure)
+    played = replay_clips([clip], True, rng)
+    assert all(one.joints.shape == clip.joints.shape for one in played.clips) and not any(played.trusted)
     for one, kind in zip(played.clips, played.kinds, strict=True):
         assert np.allclose(one.joints.mean(axis=0), clip.joints.mean(axis=0), atol=1e-5), kind  # other movement about the same pose
     people = perform_other_actions(OPENPOSE18, 2, rng)
     assert len(set(people.kinds)) == 13 and {one.joints.shape[1:] for one in people.clips} == {(18, 2)}
     assert len(perform_other_actions(None, 2, rng)) == 0
-    assert len(people + played) == len(people) + len(played) and len(OtherMovement()) == 0
+    assert len(people + played) == len(people) + len(played) and len(BackgroundClips()) == 0
 
 
 def test_recordings_are_cut_into_pieces_as_long_as_the_action(monkeypatch):
@@ -145,26 +141,23 @@ def test_recordings_are_cut_into_pieces_as_long_as_the_action(monkeypatch):
     monkeypatch.setattr(of_background, "MAX_KINDS", 3)
     clip = Clip(np.random.default_rng(0).normal(size=(600, 5, 2)), fps=30.0)
     pieces = cut_background([clip], 30.0, 5, None, 2.0)
-    assert len(pieces) == 10 and len(set(pieces.kinds)) == 3 and all(pieces.sure)
+    assert len(pieces) == 10 and len(set(pieces.kinds)) == 3 and all(pieces.trusted)
     assert {round(piece.duration, 1) for piece in pieces.clips} == {2.0}
     short = cut_background([clip.replace(joints=clip.joints[:20], times=clip.times[:20])], 30.0, 5, None, 2.0)
     assert len(short) == 1
 
 
-@pytest.mark.parametrize(
-    ("background", "message"),
-    [
+def test_bad_backgrounds(squat):
+    for background, message in (
         ([], "background: clips: the list is empty"),
         ([np.zeros((0, 17, 2))], "background: "),
         ([np.full((30, 17, 2), np.nan)], "background: clip 0.*joint"),
         ([np.random.default_rng(0).normal(size=(30, 9, 2))], "background: clip 0.*9 joints, but the fitted clips have 17"),
         (3, "background: clips: expected a list"),
         (["session.json"], "background: clips: item 0 is text"),
-    ],
-)
-def test_bad_backgrounds(squat, background, message):
-    with pytest.raises(ValueError, match=message):
-        ActionIndexer().fit([squat], ["squat"], background=background)
+    ):
+        with pytest.raises(ValueError, match=message):
+            ActionIndexer().fit([squat], ["squat"], background=background)
 
 
 def test_an_action_that_is_the_same_however_it_is_played(monkeypatch):

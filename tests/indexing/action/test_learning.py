@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from indexing import ActionIndexer
-from indexing.action.bank import JointMetric, Windows, fused_residual
-from indexing.action.joint_weights import JointWeights
+from indexing.action.bank import EPSILON, JointMetric, factorize, flatten_channel, fuse_terms
 from indexing.action.learning import BLENDS, _fewest_mistakes, _fit_sharpness, blend_scores, leave_out
 from indexing.action.model import Blend, evidence
 from indexing.actors import Person, dataset
@@ -20,16 +19,6 @@ ACTIONS = ("squat", "wave", "kick", "bow", "punch")
 @pytest.fixture(scope="module")
 def lesson():
     return dataset([Person.random(i) for i in range(3)], ACTIONS, azimuth=0.0, rng=1)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def equal_joints():
-    """The weights of joints take seconds to learn, and have tests of their own."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "indexing.action.learning.learn_joint_weights", lambda query, *_, **__: JointWeights.equal(query.values.shape[2])
-        )
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -95,19 +84,16 @@ def test_a_learned_indexer_knows_who_performs(learned, lesson):
 
 
 def test_turned_cards_fit_one_another():
-    draw = torch.Generator().manual_seed(3)
-    cards = torch.rand(2, 6, 5, 2, generator=draw)
-    seen = torch.ones(2, 5, dtype=torch.bool)
-    metric = JointMetric.learn(cards, seen, 0.25)
-    behind = cards * torch.tensor([-1.0, 1.0])
-    table = fused_residual(Windows(behind, seen), [Windows(cards, seen)], metric, ("clip",), terms=("turned",)).exp()
-    assert table.diagonal().max() < 1e-3 + 1e-5 and table[0, 1] > 0.01
+    cards = torch.rand(2, 6, 5, 2, generator=torch.Generator().manual_seed(3))
+    weights = JointMetric.learn(cards, torch.ones(2, 5, dtype=torch.bool), 0.25).weights("clip")
+    behind, there = (flatten_channel(x, "clip", weights) for x in (cards * torch.tensor([-1.0, 1.0]), cards))
+    (table,) = fuse_terms(factorize(behind), factorize(there), [("turned",)], EPSILON)
+    assert table.diagonal().max() < EPSILON + 1e-5 and table[0, 1] > 0.01
     # brute force over turns: x of a card that is seen from elsewhere shrinks by the cosine
-    a, b = (metric.apply(x, "clip") for x in (behind, cards))
-    a, b = a[0] / a[0].norm(), b[1] / b[1].norm()
-    x, y = ((a[:, i] * b[:, i]).sum() for i in (0, 1))
+    a, b = behind[0] / behind[0].norm(), there[1] / there[1].norm()
+    x, y = (a * b).sum(dim=1)
     best = float((x * torch.linspace(0, 2 * torch.pi, 2000).cos() + y).max())
-    assert float(table[0, 1]) == pytest.approx(1 - best + 1e-3, abs=1e-4)
+    assert float(table[0, 1]) == pytest.approx(1 - best + EPSILON, abs=1e-4)
 
 
 def test_known_from_unknown():

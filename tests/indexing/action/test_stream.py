@@ -9,7 +9,6 @@ import pytest
 from indexing import ActionIndexer, Event, PhaseIndexer
 from indexing.action.exemplars import slide
 from indexing.actors import ACTIONS, Person, dataset, detect, stream
-from indexing.scoring import events, probabilities, reject_threshold, smooth
 from indexing.windows import concatenate_clips
 
 KNOWN = ("squat", "wave", "bow", "jumping_jack", "kick", "walk")
@@ -40,27 +39,22 @@ def hits(found, truth):
 
 
 @pytest.mark.slow
-def test_score_frames(indexer, recordings):
+def test_frames_have_scores_and_events_whatever_the_clock(indexer, recordings):
     clips, truth = recordings
     for clip in clips:
-        scores = indexer.score_frames(clip)
-        assert scores.shape == (len(clip), len(KNOWN))
-        assert np.isfinite(scores).all()
+        late = clip.replace(times=clip.times + 500.0, fps=None)
+        results = [indexer.scan(one) for one in (clip, late)]
+        for one, (scores, events) in zip((clip, late), results, strict=True):
+            assert scores.shape == (len(clip), len(KNOWN)) and np.isfinite(scores).all()
+            assert events and all(isinstance(event, Event) for event in events)
+            assert all(one.times[0] <= e.start < e.end <= one.times[-1] for e in events)
+            assert all(a.end <= b.start for a, b in pairwise(events))
+            assert all(e.label in indexer.classes_ and np.isfinite([e.score, e.margin]).all() and e.margin >= 0 for e in events)
+            assert all(indexer.classes_[indexer.model_.labels[e.exemplar]] == e.label for e in events)
         assert frame_accuracy(indexer, clip, truth) > 0.7
-
-
-@pytest.mark.slow
-def test_find_contract(indexer, recordings):
-    clips, _ = recordings
-    for clip in clips:
-        late = clip.replace(times=clip.times + 1000.0, fps=None)
-        for one in (clip, late):
-            found = indexer.find(one)
-            assert found and all(isinstance(event, Event) for event in found)
-            assert all(one.times[0] <= e.start < e.end <= one.times[-1] for e in found)
-            assert all(a.end <= b.start for a, b in pairwise(found))
-            assert all(e.label in indexer.classes_ and np.isfinite([e.score, e.margin]).all() and e.margin >= 0 for e in found)
-            assert all(indexer.classes_[indexer.model_.labels[e.exemplar]] == e.label for e in found)
+        np.testing.assert_allclose(results[0][0], results[1][0], atol=0.05)
+        for a, b in zip(results[0][1], results[1][1], strict=True):
+            assert (a.label, a.start, a.end) == (b.label, *(pytest.approx(t - 500, abs=0.02) for t in (b.start, b.end)))
 
 
 def test_most_true_actions_are_found(indexer, recordings):
@@ -69,20 +63,15 @@ def test_most_true_actions_are_found(indexer, recordings):
     assert np.mean(hits(indexer.find(clips[1]), truth)) >= 0.6
 
 
-def test_labels_keep_their_type(recordings):
-    lesson = dataset([Person.random(0)], KNOWN, azimuth=0.0, rng=0)
-    indexer = ActionIndexer(scorer="nearest").fit(lesson, np.arange(10, 16))
-    found = indexer.find(recordings[0][0])
-    assert found and {e.label for e in found} <= set(range(10, 16))
-
-
 @pytest.mark.slow
-def test_the_clock_of_the_recording_does_not_matter(indexer, recordings):
+def test_labels_keep_their_type_and_arrays_have_the_rate_of_the_indexer(recordings):
     clip = recordings[0][0]
-    late = clip.replace(times=clip.times + 500.0, fps=None)
-    np.testing.assert_allclose(indexer.score_frames(late), indexer.score_frames(clip), atol=0.05)
-    for a, b in zip(indexer.find(clip), indexer.find(late), strict=True):
-        assert (a.label, a.start, a.end) == (b.label, pytest.approx(b.start - 500, abs=0.02), pytest.approx(b.end - 500, abs=0.02))
+    lesson = dataset([Person.random(0)], KNOWN, azimuth=0.0, rng=0)
+    events = ActionIndexer(scorer="nearest").fit(lesson, np.arange(10, 16)).find(clip)
+    assert events and {e.label for e in events} <= set(range(10, 16))
+    fast = ActionIndexer(scorer="nearest", fps=60.0).fit(lesson)
+    assert max(e.end for e in fast.find(clip.joints * [1, -1])) <= (len(clip) - 1) / 60.0
+    assert ActionIndexer(scorer="nearest", reject=1e9).fit(lesson).find(clip) == []
 
 
 @pytest.mark.slow
@@ -94,22 +83,13 @@ def test_the_frame_rate_does_not_matter(indexer, recordings):
     assert frame_accuracy(indexer, half, truth) > 0.7
 
 
-def test_arrays_are_scanned_at_the_rate_of_the_indexer(recordings):
+def test_recordings_shorter_than_a_window(indexer, recordings):
     clip = recordings[0][0]
-    lesson = dataset([Person.random(0)], KNOWN, azimuth=0.0, rng=0)
-    fast = ActionIndexer(scorer="nearest", fps=60.0).fit(lesson)
-    upright = clip.joints * [1, -1]
-    assert max(e.end for e in fast.find(upright)) <= (len(clip) - 1) / 60.0
-
-
-@pytest.mark.parametrize("frames", [2, 3, 10, 25])
-def test_recordings_shorter_than_a_window(indexer, recordings, frames):
-    clip = recordings[0][0]
-    short = clip.between(clip.times[40], clip.times[39 + frames])
-    assert len(short) == frames
-    scores = indexer.score_frames(short)
-    assert scores.shape == (frames, len(KNOWN)) and np.isfinite(scores).all()
-    assert all(short.times[0] <= e.start < e.end <= short.times[-1] for e in indexer.find(short))
+    for frames in (2, 3, 10, 25):
+        short = clip.between(clip.times[40], clip.times[39 + frames])
+        scores = indexer.score_frames(short)
+        assert scores.shape == (frames, len(KNOWN)) and np.isfinite(scores).all()
+        assert all(short.times[0] <= e.start < e.end <= short.times[-1] for e in indexer.find(short)), frames
 
 
 def test_joints_lost_for_a_while_do_not_break_the_scan(indexer, recordings):
@@ -131,74 +111,6 @@ def test_progress_grows_to_one(indexer, recordings, monkeypatch):
     monkeypatch.undo()
     # scores are logarithms of likelihoods: of the faintest, rounding is seen
     np.testing.assert_allclose(np.exp(blocks), np.exp(indexer.score_frames(recordings[0][0])), atol=5e-3)
-
-
-def test_a_high_threshold_finds_nothing(recordings):
-    lesson = dataset([Person.random(0)], KNOWN, azimuth=0.0, rng=0)
-    assert ActionIndexer(scorer="nearest", reject=1e9).fit(lesson).find(recordings[0][0]) == []
-
-
-# ---- scoring: pure functions -------------------------------------------------------------------------------------------
-def test_smooth_is_a_centred_mean():
-    rng = np.random.default_rng(0)
-    times, scores = np.cumsum(rng.uniform(0.05, 0.2, 40)), rng.normal(size=(40, 3))
-    got = smooth(scores, times, 0.8)
-    for i, t in enumerate(times):
-        np.testing.assert_allclose(got[i], scores[np.abs(times - t) <= 0.4 + 1e-9].mean(axis=0))
-    np.testing.assert_allclose(smooth(scores, times, 0.0), scores)
-
-
-def test_events_by_hand():
-    times = np.arange(10) * 0.5
-    scores = np.full((10, 2), -1.0)
-    scores[1:4, 0], scores[4:6, 1], scores[8, 1] = 5.0, 3.0, 0.5
-    found = events(scores, times, ["a", "b"], 1.0, 1.0)
-    assert [(e.label, e.start, e.end, e.score, e.margin) for e in found] == [
-        ("a", 0.25, 1.75, 5.0, 6.0),
-        ("b", 1.75, 2.75, 3.0, 4.0),
-    ]
-    assert events(scores, times, ["a", "b"], 9.0, 1.0) == []
-    assert [e.label for e in events(scores, times, ["a", "b"], -5.0, -5.0)][:1] == ["a"]
-
-
-def test_events_reach_the_ends_and_flicker_is_dropped():
-    times = np.arange(6) * 0.15
-    scores = np.array([[2.0, 0], [2, 0], [2, 0], [2, 0], [0, 2], [2, 0]])
-    assert [(e.label, e.start, round(e.end, 3)) for e in events(scores, times, [0, 1], 1.0, 1.0)] == [(0, 0.0, 0.525)]
-
-
-def test_flicker_and_short_gaps_do_not_part_an_event():
-    times = np.arange(20) * 0.1
-    scores = np.tile([2.0, 0.0], (20, 1))
-    scores[8], scores[14] = [0.0, 2.0], [0.5, 0.0]
-    (event,) = events(scores, times, ["a", "b"], 1.5, 1.0)
-    assert (event.label, event.start, event.end, event.score) == ("a", 0.0, times[-1], 2.0)
-
-
-def test_an_event_needs_its_peak_but_reaches_to_its_floor():
-    times = np.arange(12) * 0.2
-    scores = np.zeros((12, 2))
-    scores[2:10, 0], scores[5, 0] = 1.5, 3.0
-    assert [(e.start, e.end) for e in events(scores, times, ["a", "b"], 2.5, 1.0)] == [(pytest.approx(0.3), pytest.approx(1.9))]
-    assert events(scores, times, ["a", "b"], 3.5, 1.0) == []
-
-
-def test_probabilities_follow_the_scores():
-    scores = np.random.default_rng(1).normal(size=(5, 4)) * [[1], [10], [1e-6], [1e4], [0]]
-    chances = probabilities(scores)
-    np.testing.assert_allclose(chances.sum(axis=1), 1)
-    np.testing.assert_array_equal(chances[:4].argmax(axis=1), scores[:4].argmax(axis=1))
-    np.testing.assert_allclose(chances[4], 0.25)
-    np.testing.assert_allclose(probabilities(scores * 7 + 3)[0], chances[0])
-
-
-def test_reject_threshold():
-    import torch
-
-    wrong = torch.arange(101.0)
-    assert reject_threshold(None, wrong) is None
-    assert reject_threshold(0.1, wrong) == pytest.approx(90)
-    assert reject_threshold(-3.5, wrong) == -3.5 and reject_threshold(7, wrong) == 7
 
 
 # ---- nobody there, nothing done ------------------------------------------------------------------------------------------

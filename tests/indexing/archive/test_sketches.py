@@ -7,7 +7,7 @@ import torch
 from indexing.archive import sketches
 from indexing.archive.search import probe_of
 from indexing.archive.segments import ArchiveSegment, write_segment
-from indexing.archive.sketches import Candidates, Probe, correlation, orthonormal, refine_candidates, resembling, scan
+from indexing.archive.sketches import Candidates, Probe, correlation, mark_resembling, orthonormal, refine_candidates, scan
 from indexing.archive.tracks import Layout, StorageFormat, tracks_of
 from indexing.clip import Clip
 from indexing.windows import concatenate_clips
@@ -52,9 +52,7 @@ def reference(segment, probe):
     for track, (first, rows) in enumerate(segment.tracks[:, 2:4].tolist()):
         for row in range(rows - probe.span):
             if (first + row) % probe.stride == 0:
-                window, example = planes(segment, probe, track, row)
-                cosines = np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)
-                found[track, row] = cosines[0] ** 2
+                found[track, row] = squared_cosine(*planes(segment, probe, track, row))
     return found
 
 
@@ -73,8 +71,7 @@ def test_correlation_is_that_of_the_planes():
     gram = torch.tensor(np.einsum("ndk,nek->den", windows, windows))
     found = correlation(c, torch.stack([gram[0, 0], gram[0, 1], gram[1, 1]]))[0]
     for window, value in zip(windows, found.tolist(), strict=True):
-        cosines = np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)
-        assert value == pytest.approx(cosines[0] ** 2, abs=1e-4)
+        assert value == pytest.approx(squared_cosine(window, example), abs=1e-4)
 
 
 def test_windows_of_nothing_resemble_nothing():
@@ -82,19 +79,21 @@ def test_windows_of_nothing_resemble_nothing():
     assert correlation(c, torch.zeros(3, 3)).tolist() == [[0.0, 0.0, 0.0]]
 
 
-@pytest.mark.parametrize("seconds", [0.5, 1.0, 2.5])
-def test_scan_is_the_best_of_every_window(segment, seconds):
+def squared_cosine(window, example):
+    """The largest canonical correlation of two planes, by numpy."""
+    return np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)[0] ** 2
+
+
+def test_scan_is_the_best_of_every_window(segment):
     stored, layout = segment
-    asked = probe(stored, layout, seconds)
-    every = reference(stored, asked)
-    found = scan(stored, [asked], 10_000)
-    assert len(found) >= 3
-    for score, track, row in zip(found.score.tolist(), found.track.tolist(), found.row.tolist(), strict=True):
-        window, example = planes(stored, asked, track, row)
-        cosines = np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)
-        assert score == pytest.approx(cosines[0] ** 2, abs=1e-3)
-    assert found.score[0] >= max(every.values()) - 1e-3
-    assert found.track[0] == 0 and abs(found.row[0] / stored.rate - 4.0) <= 1 / stored.rate + 0.1 * seconds
+    for seconds in (0.5, 1.0, 2.5):
+        example = probe(stored, layout, seconds)
+        result = scan(stored, [example], 10_000)
+        assert len(result) >= 3
+        for score, track, row in zip(result.score.tolist(), result.track.tolist(), result.row.tolist(), strict=True):
+            assert score == pytest.approx(squared_cosine(*planes(stored, example, track, row)), abs=1e-3), seconds
+        assert result.score[0] >= max(reference(stored, example).values()) - 1e-3
+        assert result.track[0] == 0 and abs(result.row[0] / stored.rate - 4.0) <= 1 / stored.rate + 0.1 * seconds
 
 
 def test_another_camera_sees_the_same(segment):
@@ -113,27 +112,16 @@ def test_another_camera_sees_the_same(segment):
     assert value > 0.99  # two planes of one space of three dimensions share a line
 
 
-@pytest.mark.parametrize("block", [7, 64])
-def test_blocks_change_nothing(segment, block, monkeypatch):
+def test_blocks_parts_and_the_number_that_is_asked_for_change_nothing(segment, monkeypatch):
     stored, layout = segment
-    asked = [probe(stored, layout, 1.0), probe(stored, layout, 1.5, tempo=1.25)]
-    whole = scan(stored, asked, 500)
-    monkeypatch.setattr(sketches, "BLOCK", block)
-    assert same(whole, scan(stored, asked, 500))
-
-
-def test_parts_are_the_whole(segment):
-    stored, layout = segment
-    asked = [probe(stored, layout, 1.0)]
-    whole = scan(stored, asked, 500)
-    parts = [scan(stored, asked, 500, begin=at, end=at + 90) for at in range(0, len(stored.codes), 90)]
-    assert same(whole, Candidates.joined(parts).best(500))
-
-
-def test_the_best_are_kept(segment):
-    stored, layout = segment
-    asked = [probe(stored, layout, 0.5)]
-    assert same(scan(stored, asked, 500).best(5), scan(stored, asked, 5))
+    both = [probe(stored, layout, 1.0), probe(stored, layout, 1.5, tempo=1.25)]
+    whole = scan(stored, both, 500)
+    parts = [scan(stored, both, 500, begin=at, end=at + 90) for at in range(0, len(stored.codes), 90)]
+    assert same(whole, Candidates.concatenate(parts).top(500))
+    assert same(whole.top(5), scan(stored, both, 5))
+    for block in (7, 64):
+        monkeypatch.setattr(sketches, "BLOCK", block)
+        assert same(whole, scan(stored, both, 500)), block
 
 
 def test_removed_recordings_are_not_found(segment):
@@ -161,8 +149,7 @@ def test_candidates_settle_where_they_fit_best(segment):
     for begin, row, score in zip(start.tolist(), moved.row.tolist(), moved.score.tolist(), strict=True):
         values = {}
         for at in range(begin + offset - half, begin + offset + half + 1):
-            window, example = planes(stored, exact, 0, at)
-            values[at] = np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)[0] ** 2
+            values[at] = squared_cosine(*planes(stored, exact, 0, at))
         assert score == pytest.approx(max(values.values()), abs=1e-3) and values[row] == pytest.approx(score, abs=1e-3)
     assert moved.score[0] > 0.999 and exact.samples > 2 * asked.samples
 
@@ -185,7 +172,7 @@ def test_only_movement_counts_where_it_is_asked_for(tmp_path):
     tracks = tracks_of(Clip(image(points, rng) + rng.normal(size=(360, 9, 2)), fps=30.0), STORAGE)
     layout = Layout.learn(tracks, None, STORAGE)
     stored = ArchiveSegment.open(tmp_path / write_segment(tmp_path, tracks, layout, STORAGE).file)
-    marked = resembling(stored, [probe(stored, layout, 1.5, begin=2.0, moving=True)], 0.6, 0.2)
+    marked = mark_resembling(stored, [probe(stored, layout, 1.5, begin=2.0, moving=True)], 0.6, 0.2)
     assert marked[31:50].all() and not marked[85:].any()
 
 

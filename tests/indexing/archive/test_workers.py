@@ -156,7 +156,7 @@ def test_a_source_that_kills_its_workers_costs_no_other(
     with quick_pool(1) as pool:
         done = archive.add([*clips[:2], deadly, *clips[2:]], executor=pool)
     assert [one.outcome for one in done.sources] == ["added", "added", "failed", "added", "added"]
-    (failed,) = done.failed
+    (failed,) = done.failures
     assert failed.source == "deadly" and failed.reason.startswith("deadly: no worker could do it in 3 tries (BrokenProcessPool")
     assert failed.reason.endswith("leave it out, or give its worker more memory") and "\n" not in failed.reason
     assert [row.source for row in archive.recordings()] == list("0123") and archive.verify().ok
@@ -207,7 +207,9 @@ def test_an_executor_that_has_ended_is_said(tmp_path: Path, moves: Callable[...,
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
     done = Archive(tmp_path / "a").add(moves(0, name="x"), executor=pool)
-    assert done.failed[0].reason.startswith("x: no worker could do it in 3 tries (RuntimeError: cannot schedule new futures after")
+    assert done.failures[0].reason.startswith(
+        "x: no worker could do it in 3 tries (RuntimeError: cannot schedule new futures after"
+    )
 
 
 def test_whoever_stops_leaves_no_tasks_behind() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from indexing.brightness.descriptors import LENGTH
-from indexing.brightness.stream import MEAN_SHARPNESS, SLACK, Pool, VideoExemplars, Warping, library
+from indexing.brightness.stream import MEAN_SHARPNESS, SLACK, Pool, VideoExemplars, Warping, build_library
 
 
 def exemplars(lengths=(5, 3, 7), labels=(1, 0, 1)):
@@ -16,7 +16,7 @@ def test_warping_is_the_loop_of_its_definition():
     parts = exemplars()
     queries = torch.rand(9, LENGTH, generator=torch.Generator().manual_seed(1)) / 20
     window = 4.0
-    found = Warping(library(parts, 2, False), window).push(queries)
+    found = Warping(build_library(parts, 2, False), window).push(queries)
     keep = 1 - 1 / window
     tracks = [one.numpy() for one in parts.videos()]
     states = [np.zeros(len(track)) for track in tracks]
@@ -36,7 +36,7 @@ def test_warping_is_the_loop_of_its_definition():
 
 def test_chunks_do_not_matter():
     parts = exemplars()
-    placed = library(parts, 2, True)
+    placed = build_library(parts, 2, True)
     queries = torch.rand(50, LENGTH, generator=torch.Generator().manual_seed(2)) / 20
     stream = Warping(placed, 5.0)
     chunked = torch.cat([stream.push(part) for part in queries.split([1, 0, 16, 33])])

@@ -257,15 +257,15 @@ def test_what_is_held_back_is_said_with_its_reason(run):
 
 @pytest.mark.slow
 def test_how_strictly_rest_is_judged(run, monkeypatch):
-    original, asked = ActionIndexer.explain, []
+    original, asked = ActionIndexer.decode, []
 
-    def explain(self, clip, progress=None):
+    def decode(self, clip, progress=None):
         asked.append(self.options.rest_weight)
         told = original(self, clip, progress)
         held = [Withheld(event, "at rest") for event in told.events]
         return dataclasses.replace(told, events=[], withheld=held)
 
-    monkeypatch.setattr(ActionIndexer, "explain", explain)
+    monkeypatch.setattr(ActionIndexer, "decode", decode)
     for rest in ("strict", "usual", "off"):
         out = run(f"index scan wave -m m.safetensors --fps 30 --rest {rest}")[1]
         assert re.search(r"held back, at rest: \d+ wave", out) and "no action found" in out

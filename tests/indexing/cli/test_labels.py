@@ -235,7 +235,7 @@ def test_labels_are_what_is_known(run) -> None:
 
 @pytest.mark.slow
 def test_scan_refuses_before_it_begins(refuse, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ActionIndexer, "explain", None)  # whoever gets so far fails
+    monkeypatch.setattr(ActionIndexer, "decode", None)  # whoever gets so far fails
     (tmp_path / "broken.eaf").write_text("<ANNOTATION_DOCUMENT>")
     scan = "index scan @/session.json -m @/m.st"
     refuse(f"{scan} --write found.txt", "found.txt", ".txt is no format", ".eaf")
@@ -251,7 +251,7 @@ def test_scan_refuses_before_it_begins(refuse, data: Path, tmp_path: Path, monke
 
 @pytest.mark.slow
 def test_corrections_are_not_written_over(refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ActionIndexer, "explain", None)  # said before anything is searched
+    monkeypatch.setattr(ActionIndexer, "decode", None)  # said before anything is searched
     found = [Label(1, 3, "kick", score=2.0), Label(4, 6, "wave", score=1.0)]
     scan = "index scan @/session.json -m @/m.st --write"
     for suffix in (".csv", ".tsv", ".json"):  # no row says whether somebody corrected it

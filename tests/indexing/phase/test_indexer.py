@@ -64,6 +64,9 @@ def test_a_frame_is_judged_alone(fitted, asked):
     part = fitted.score_frames(clip.replace(joints=clip.joints[5:8], times=clip.times[5:8], confidence=None))
     assert np.allclose(whole[5:8], part, atol=1e-9)
     assert np.allclose(fitted.decision_function([clip])[0], whole.mean(0))
+    one = clip.replace(joints=clip.joints[3:4], times=clip.times[3:4], confidence=None)
+    assert np.allclose(fitted.score_frames(one), whole[3:4], atol=1e-4)
+    assert np.allclose(fitted.phase(one), fitted.phase(clip)[3:4], atol=1e-4)
 
 
 def test_missing_joints(fitted, asked):
@@ -116,18 +119,23 @@ def test_depth_is_used():
     assert found.predict([detect(clip, azimuth=70.0, rng=3) for clip in solid]).tolist() == ["squat", "kick"]
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"harmonics": 0}, "harmonics must be"),
-        ({"course": "often"}, "course must be"),
-        ({"window": -1.0}, "window must be"),
-        ({"device": "nowhere"}, "device 'nowhere'"),
-    ],
-)
-def test_bad_parameters(train, parameters, message):
-    with pytest.raises(ValueError, match=message):
-        PhaseIndexer(**parameters).fit(train)
+def test_bad_parameters(train):
+    for parameters, message in (
+        ({"harmonics": 0}, "harmonics must be"), ({"course": "often"}, "course must be"), ({"window": -1.0}, "window must be"),
+        ({"device": "nowhere"}, "device 'nowhere'"), ({"reject": 0.1}, "which takes 3 classes, got 2"),
+        ({"reject": 1.1, "none_label": "walk"}, "none_label='walk' is one of the learned labels"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            PhaseIndexer(**parameters).fit(train)
+    with pytest.raises(ValueError, match=r"one entry per clip \(6\), got 1"):
+        PhaseIndexer().fit(train, phases=[None])
+    with pytest.raises(ValueError, match="its phases have shape"):
+        PhaseIndexer().fit(train, phases=[np.zeros(3)] * 6)
+    with pytest.raises(ValueError, match="no period was found"):
+        PhaseIndexer(course="periodic").fit([Clip(x) for x in np.random.default_rng(0).normal(size=(2, 9, 17, 2))], ["a", "b"])
+    few = [clip.replace(joints=clip.joints[:, :5], confidence=None, skeleton=None) for clip in train]
+    with pytest.raises(ValueError, match="5 joints, but a frame needs 6"):
+        PhaseIndexer().fit(few)
 
 
 def test_what_was_never_learned_is_refused_and_not_found():
@@ -162,35 +170,6 @@ def test_levels_of_events():
     assert event_levels(wrong, None) == pytest.approx((0.9, 0.83))
     assert event_levels(wrong[:0], None) == event_levels(wrong - 9, None) == (0.3, 0.0)
     assert event_levels(wrong, 1.5) == (1.5, 1.5)
-
-
-def test_a_rate_needs_three_classes_and_none_is_not_a_label(train):
-    with pytest.raises(ValueError, match="which takes 3 classes, got 2"):
-        PhaseIndexer(reject=0.1).fit(train)
-    with pytest.raises(ValueError, match="none_label='walk' is one of the learned labels"):
-        PhaseIndexer(reject=1.1, none_label="walk").fit(train)
-
-
-def test_bad_phases(train):
-    with pytest.raises(ValueError, match=r"one entry per clip \(6\), got 1"):
-        PhaseIndexer().fit(train, phases=[None])
-    with pytest.raises(ValueError, match="its phases have shape"):
-        PhaseIndexer().fit(train, phases=[np.zeros(3)] * 6)
-    with pytest.raises(ValueError, match="no period was found"):
-        PhaseIndexer(course="periodic").fit([Clip(x) for x in np.random.default_rng(0).normal(size=(2, 9, 17, 2))], ["a", "b"])
-
-
-def test_a_clip_may_be_a_single_frame(fitted, asked):
-    clip = asked[0]
-    one = clip.replace(joints=clip.joints[3:4], times=clip.times[3:4], confidence=None)
-    assert np.allclose(fitted.score_frames(one), fitted.score_frames(clip)[3:4], atol=1e-4)
-    assert np.allclose(fitted.phase(one), fitted.phase(clip)[3:4], atol=1e-4)
-
-
-def test_five_joints_tell_no_phase(train):
-    few = [clip.replace(joints=clip.joints[:, :5], confidence=None, skeleton=None) for clip in train]
-    with pytest.raises(ValueError, match="5 joints, but a frame needs 6"):
-        PhaseIndexer().fit(few)
 
 
 @pytest.mark.slow

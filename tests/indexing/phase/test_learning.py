@@ -6,7 +6,7 @@ import torch
 
 from indexing.action.bank import Windows
 from indexing.phase.indexer import smooth_phases
-from indexing.phase.learning import in_step, period
+from indexing.phase.learning import period, synchronize_cycles
 from indexing.phase.model import PhaseOptions, learn_course
 
 
@@ -56,7 +56,7 @@ def test_two_views_are_brought_into_step():
         (moving(seconds / tempo + start) @ camera, seconds)
         for camera, tempo, start in zip(cameras, (1.0, 1.3), (0.0, 0.4), strict=True)
     ]
-    first, second = in_step(clips, PhaseOptions())
+    first, second = synchronize_cycles(clips, PhaseOptions())
     apart = (first - seconds) - (second - seconds / 1.3 - 0.4)
     apart = apart - apart.mean().round()
     assert torch.exp(2j * np.pi * apart).mean().angle().abs() / (2 * np.pi) < 0.05
@@ -65,7 +65,7 @@ def test_two_views_are_brought_into_step():
 def test_what_does_not_repeat_has_no_cycle():
     seconds = torch.arange(0, 3, 1 / 25, dtype=torch.float64)
     camera = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.4, 0.1]], dtype=torch.float64)
-    assert in_step([(moving(seconds / 3, periodic=False) @ camera, seconds)], PhaseOptions()) is None
+    assert synchronize_cycles([(moving(seconds / 3, periodic=False) @ camera, seconds)], PhaseOptions()) is None
 
 
 def test_neighbours_lower_the_noise_of_a_phase_and_skip_what_is_not_known():

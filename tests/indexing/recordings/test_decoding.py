@@ -40,7 +40,7 @@ def test_three_squats_are_three_events(indexer, three):
 
 def test_an_explanation_agrees_with_itself(indexer, three):
     clip, _ = three
-    told = indexer.explain(clip)
+    told = indexer.decode(clip)
     assert told.scores.shape == (len(clip), len(KNOWN)) and np.array_equal(told.times, clip.times)
     assert told.background.min() >= 0 and told.background.max() <= 1
     for event in told.events:
@@ -53,7 +53,7 @@ def test_an_explanation_agrees_with_itself(indexer, three):
 def test_what_a_level_refuses_is_held_back(indexer, three):
     clip, _ = three
     strict = ActionIndexer(scorer="nearest", reject=1e6).fit(dataset([Person.random(0)], KNOWN, azimuth=0.0, rng=0))
-    told = strict.explain(clip)
+    told = strict.decode(clip)
     low = [one for one in told.withheld if one.reason == "below the level"]
     assert list(told.events) == [] and [one.event.label for one in low] == ["squat"] * 3
 

@@ -58,7 +58,7 @@ def plain(events):
 def test_a_stream_finds_what_is_found_in_the_whole(indexer, seen):
     clip, truth = seen
     times, scores, events, rest, _ = pushed(indexer.stream(up=clip.up), clip, 10)
-    found, whole = events + rest, indexer.explain(clip)
+    found, whole = events + rest, indexer.decode(clip)
     assert np.array_equal(times, clip.times) and scores.shape == (len(clip), len(KNOWN)) and np.isfinite(scores).all()
     assert [event.label for event in found] == [event.label for event in whole.events] == [name for name, _, _ in truth]
     assert all(overlapped(event, start, end) > 0.5 for event, (_, start, end) in zip(found, truth, strict=True))

@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from indexing.brightness.descriptors import blur, gradients, weighted_differences
-from indexing.brightness.footage import Resampler
+from indexing.brightness.videos import Resampler
 from indexing.sync import brightness_features as features
 from indexing.sync.brightness_features import (
     CROP_SIDE,
