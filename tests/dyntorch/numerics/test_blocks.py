@@ -346,7 +346,7 @@ TABLES = [
     (epipolar_descent._tables, (torch.float64, CPU)),
     (epipolar_descent._pairs, (CPU,)),
     (epipole_pairs._product_table, (CPU,)),
-    (infinity_extensors._joins, (3, 64, CPU)),
+    (infinity_extensors._joins, (64, CPU)),
     (infinity_extensors._invariant_basis, (CPU,)),
     (monomials.symmetric, (2, CPU)),
     (monomials.factors, (2, 2, CPU)),
