@@ -37,9 +37,8 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save
 
 from experiments.archive.scenes import Question, captured, distractors, every_take, questions
-from experiments.common.plots import COLOURS, MARKS
 from experiments.common.runner import BaseConfig, Grid, Tables, experiment
-from experiments.common.tables import Row, note
+from experiments.common.tables import COLOURS, MARKS, Row, note
 from experiments.recognition.protocol import Array
 from indexing import Archive, ArchiveOptions, ClipSet
 from indexing.archive.catalogue import Catalogue, RecordingRow, SegmentRow, SourceRow

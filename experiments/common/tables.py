@@ -6,6 +6,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+COLOURS = ("#0b4a60", "#e07b39", "#6aa84f", "#8e5ea2", "#b3123a", "#59636d")
+MARKS = ("o", "s", "^", "D", "v", "P")
+
 
 @dataclass(frozen=True)
 class Row:

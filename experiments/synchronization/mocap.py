@@ -33,8 +33,21 @@ import dyntorch as dyn
 from experiments.common.runner import BaseConfig, Tables, experiment
 from experiments.common.tables import Row
 from experiments.recognition.protocol import data_folder
-from experiments.synchronization.data import MOVING, RECORDED, SAME, Filming, Motion, draw, gaps, image, moving, played, seeded
-from experiments.synchronization.motions import periodic_motion, still_motion
+from experiments.synchronization.data import (
+    MOVING,
+    RECORDED,
+    SAME,
+    Filming,
+    Motion,
+    draw,
+    gaps,
+    image,
+    moving,
+    periodic_motion,
+    played,
+    seeded,
+    still_motion,
+)
 from experiments.synchronization.real import people
 from indexing.joints import places
 from indexing.skeleton import LAYOUTS, Skeleton

@@ -36,13 +36,22 @@ from torch import Generator, Tensor
 
 import dyntorch as dyn
 from dyntorch.numerics.blocks import one_thread
-from experiments.common.plots import COLOURS
 from experiments.common.real_data import Take
 from experiments.common.runner import BaseConfig, Tables, Words, experiment
-from experiments.common.tables import note
+from experiments.common.tables import COLOURS, note
 from experiments.recognition.protocol import data_folder
-from experiments.synchronization.data import SIZE, Pair, cmu_pair, draw, moving, seeded
-from experiments.synchronization.motions import periodic_pair, reversed_pair, still_pair, unrelated_pair
+from experiments.synchronization.data import (
+    SIZE,
+    Pair,
+    cmu_pair,
+    draw,
+    moving,
+    periodic_pair,
+    reversed_pair,
+    seeded,
+    still_pair,
+    unrelated_pair,
+)
 from indexing.files import prepare
 from indexing.report.canvas import LIGHT, new_figure, png, style
 

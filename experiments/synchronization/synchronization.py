@@ -21,8 +21,18 @@ import dyntorch as dyn
 from experiments.common.runner import BaseConfig, Tables, experiment
 from experiments.common.tables import Row
 from experiments.synchronization.baselines import activity, pose2sim, vertical
-from experiments.synchronization.data import Pair, cmu_pair, cmu_pairs, moving, seeded
-from experiments.synchronization.motions import long_take, periodic_pair, reversed_pair, still_pair, unrelated_pair
+from experiments.synchronization.data import (
+    Pair,
+    cmu_pair,
+    cmu_pairs,
+    long_take,
+    moving,
+    periodic_pair,
+    reversed_pair,
+    seeded,
+    still_pair,
+    unrelated_pair,
+)
 
 NOISE = (0.0, 15.0, 30.0, 60.0)
 """mm."""

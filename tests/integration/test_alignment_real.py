@@ -12,8 +12,8 @@ import dyntorch as dyn
 from dyntorch import metrics
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
 from experiments.alignment.real import planar as real_planar
-from experiments.alignment.real.bodies import crowd
 from experiments.alignment.real.solvers import aligned, gap, rigid_ransac
+from experiments.alignment.real.space import crowd
 from experiments.common import real_data
 
 pytestmark = pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data")
