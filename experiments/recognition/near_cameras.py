@@ -25,7 +25,7 @@ from dyntorch.numerics import canonical_correlation, orthonormal_basis
 from experiments.common.runner import BaseConfig, Tables, experiment
 from experiments.common.tables import Row, note
 from experiments.recognition import gait
-from experiments.recognition.gait_data import Split, split, walks
+from experiments.recognition.gait import Split, split, walks
 from experiments.recognition.protocol import ELEVATION, SPREAD, leave_one_subject_out, load_set
 from indexing import ActionIndexer, Clip
 from indexing.action.bank import channel

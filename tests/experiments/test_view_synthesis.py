@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from dyntorch.geometry.homogeneous import apply
-from experiments.reconstruction import crossroads, view_synthesis
-from experiments.reconstruction.crossroads import CARS, HEIGHT, WIDTH, camera, observe, render
-from experiments.reconstruction.view_synthesis import Scene, psnr, synthesize
+from experiments.reconstruction import view_synthesis
+from experiments.reconstruction.view_synthesis import CARS, HEIGHT, WIDTH, Scene, camera, observe, psnr, render, synthesize
 
 
 @pytest.fixture(autouse=True)
