@@ -13,7 +13,7 @@ from experiments.reconstruction.view_synthesis import CARS, HEIGHT, WIDTH, Scene
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """One ray per pixel: a blockier image, four times as fast."""
-    monkeypatch.setattr(crossroads, "SAMPLES", 1)
+    monkeypatch.setattr(view_synthesis, "SAMPLES", 1)
     monkeypatch.setattr(view_synthesis, "SAMPLES", 1)
 
 
