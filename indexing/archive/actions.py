@@ -88,8 +88,7 @@ def find(
     names = catalogue.recordings_by_id([number for task in tasks for number, _ in task.recordings])
     found: list[ArchivedEvent] = []
     for done, (task, events) in enumerate(InOrder(find_in, executor, tries=2)(tasks), 1):
-        check_done(task.path, events)
-        for number, event in events:
+        for number, event in check_done(task.path, events):
             row = names.get(number)
             if row is not None:
                 found.append(ArchivedEvent(**{**vars(event), "source": row.name, "person": row.person}))

@@ -276,8 +276,7 @@ def candidates(tasks: Sequence[ScanTask], executor: Executor | None, progress: P
         if executor is None and threads > 1 and len(tasks) > 1:
             executor = stack.enter_context(ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)))
         for task, result in InOrder(scan_task, executor, tries=2)(tasks):
-            check_done(task.path, result)
-            found.append((task.segment, result))
+            found.append((task.segment, check_done(task.path, result)))
             if progress is not None:
                 progress(0.9 * len(found) / len(tasks))
     return found

@@ -29,12 +29,13 @@ class WorkerLost(Exception):
     """A task's workers died every time, or the task did not reach one."""
 
 
-def check_done(path: Path, result: object) -> None:
-    """Raise where nobody could search a segment: FileNotFoundError where its file went meanwhile."""
+def check_done(path: Path, result: Result | WorkerLost) -> Result:
+    """The result; raises where nobody could search a segment, FileNotFoundError where its file went meanwhile."""
     if isinstance(result, WorkerLost):
         if not path.exists():
             raise FileNotFoundError(str(path))
         raise ValueError(f"{path}: could not be searched: {result}; try again, or with fewer workers")
+    return result
 
 
 class QuietProcesses(ProcessPoolExecutor):
