@@ -111,7 +111,10 @@ def _fft_length(least: int) -> int:
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Covariances of sequences, and sequences compressed to their leading directions.
+# Covariances of sequences: of windows by running sums, and compressed to their leading directions.
+
+
+MIN_PIECE = 64  # frames in one piece of running sums
 
 
 def compress(rows: Tensor, rank: int | None = None, noise: float | None = None) -> Tensor:
@@ -127,6 +130,58 @@ def compress(rows: Tensor, rank: int | None = None, noise: float | None = None) 
     if noise is not None:
         rank = max(int((values > noise**2).sum(-1).max()), 1)
     return centred @ directions[..., p - (rank or 1) :].flip(-1)
+
+
+def window_covariances(x: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Covariances and means of the frames of a window, for many windows, by running sums. x ``(b, T, p)``, start ``(L,)``, end
+    ``(L,)`` -> ``(b, L, p, p)``."""
+    p = x.shape[-1]
+    both = _sums_before(torch.cat([x.new_ones(*x.shape[:-1], 1), x], dim=-1), torch.cat([start, end]))
+    sums = both[..., len(start) :] - both[..., : len(start)]
+    sums *= 1 / sums[:, :1].clone().round().clamp(min=1.0)
+    mean, packed = sums[:, 1 : p + 1], sums[:, p + 1 :]
+    row = 0
+    for i in range(p):  # row by row: the cache holds what is read again
+        packed[:, row : row + p - i] -= mean[:, i : i + 1] * mean[:, i:]
+        row += p - i
+    whole = packed.index_select(1, _packing(p, x.device).flatten())
+    return whole.unflatten(1, (p, p)).movedim(-1, 1), mean.mT
+
+
+def _sums_before(x: Tensor, at: Tensor) -> Tensor:
+    """Products of the coordinates j >= i, added up over the frames before each of ``at``: ``(b, pairs, len(at))``."""
+    b, frames, p = x.shape
+    pairs = p * (p + 1) // 2
+    result = x.new_zeros(b, pairs, len(at))
+    carry = x.new_zeros(b, pairs, 1)
+    rows, columns = torch.triu_indices(p, p, device=x.device).unbind()
+    size = max(ELEMENTS // (8 * b * pairs), MIN_PIECE)
+    at = at.to(x.device).clamp(max=frames)
+    for begin in range(0, frames, size):
+        block = x[:, begin : begin + size]
+        asked = ((at > begin) & (at <= begin + size)).nonzero()[:, 0]
+        if len(asked):
+            sums = _products(block).cumsum_(-1).add_(carry)
+            result[..., asked] = sums.index_select(-1, at[asked] - begin - 1)
+            carry = sums[..., -1:]
+        else:
+            carry = carry + (block.mT @ block)[:, rows, columns, None]
+    return result
+
+
+def _products(x: Tensor) -> Tensor:
+    """Products ``(b, pairs, t)`` of the coordinates j >= i of frames ``(b, t, p)``."""
+    channels = x.mT.contiguous()
+    return torch.cat([channels[:, i : i + 1] * channels[:, i:] for i in range(x.shape[-1])], dim=1)
+
+
+@constant
+def _packing(size: int, device: torch.device) -> Tensor:
+    """Which pair j >= i each entry of a symmetric matrix is."""
+    rows, columns = torch.triu_indices(size, size)
+    table = torch.zeros(size, size, dtype=torch.long)
+    table[rows, columns] = table[columns, rows] = torch.arange(len(rows))
+    return table.to(device)
 
 
 def lag_products(a: Tensor, b: Tensor, lags: Lags | None = None) -> Tensor:
@@ -166,11 +221,21 @@ def lag_covariances(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     r"""Covariances of two sequences of vectors over the frames that overlap, about the means there, at all lags. a
     ``(*batch, T1, p)``, b ``(*batch, T2, q)``, weights ``(*batch, T1)`` -> ``(*batch, L, p, p)``."""
+    lo, hi = _span(a, b, lags, 2)
     shape, first, second = _flat(a, b, 2)
-    given = weights or (a.new_ones(a.shape[-2]), b.new_ones(b.shape[-2]))
-    w1, w2 = (_frame_weights(w, x, shape) for w, x in zip(given, (first, second), strict=True))
-    aa, bb, ab, counts = (_restore_batch(x, shape) for x in _weighted_covariances(first, second, _span(a, b, lags, 2), w1, w2))
-    return aa, bb, ab, counts
+    if weights is not None:
+        w1, w2 = (_frame_weights(w, x, shape) for w, x in zip(weights, (first, second), strict=True))
+        aa, bb, ab, counts = _weighted_covariances(first, second, (lo, hi), w1, w2)
+        return _restore_batch(aa, shape), _restore_batch(bb, shape), _restore_batch(ab, shape), _restore_batch(counts, shape)
+    first, second = first - first.mean(1, keepdim=True), second - second.mean(1, keepdim=True)
+    start, end = _overlap(a.shape[-2], b.shape[-2], (lo, hi))
+    lag = torch.arange(lo, hi + 1)
+    counts = (end - start).double().to(a.device)
+    aa, mean_a = window_covariances(first, start, end)
+    bb, mean_b = window_covariances(second, start + lag, end + lag)
+    ab = lag_products(first, second, (lo, hi)) / counts.clamp(min=1.0)[:, None, None]
+    ab -= mean_a[..., :, None] * mean_b[..., None, :]
+    return _restore_batch(aa, shape), _restore_batch(bb, shape), _restore_batch(ab, shape), counts
 
 
 def _channels(x: Tensor) -> Tensor:
@@ -289,6 +354,13 @@ def _flat(a: Tensor, b: Tensor, dims: int) -> tuple[tuple[int, ...], Tensor, Ten
 
 def _restore_batch(x: Tensor, shape: tuple[int, ...]) -> Tensor:
     return x.reshape(*shape, *x.shape[1:])
+
+
+def _overlap(frames1: int, frames2: int, lags: Lags) -> tuple[Tensor, Tensor]:
+    """First frame of the first sequence in the overlap, and the one past the last."""
+    lag = torch.arange(lags[0], lags[1] + 1)
+    start = (-lag).clamp(min=0, max=frames1)
+    return start, torch.maximum((frames2 - lag).clamp(max=frames1), start)
 
 
 def _weighted_covariances(a: Tensor, b: Tensor, span: Lags, w1: Tensor, w2: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -324,6 +324,7 @@ def test_every_public_verb_runs_on_one_thread():
 
 CPU = torch.device("cpu")
 TABLES = [
+    (lags._packing, (3, CPU)),
     (lags._epipolar_places, (CPU,)),
     (lags._resection_places, (CPU,)),
     (epipolar_variance._plane, (CPU,)),
