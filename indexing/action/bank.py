@@ -97,15 +97,19 @@ TERMS: dict[str, Callable[[Entries, Tensor, Tensor], Tensor]] = {
 Terms = tuple[str, ...]  # that are fused in all channels
 
 
-def fuse_terms(left: Sequence[Tensor], right: Sequence[Tensor], fusions: Sequence[Terms], epsilon: float) -> list[Tensor]:
-    r"""``(Q, E)`` products :math:`\prod_c \prod_{\text{terms}} (r_c + \epsilon)` of residuals, of each fusion."""
+def fuse_terms(
+    left: Sequence[Tensor], right: Sequence[Tensor], fusions: Sequence[Terms], powers: Sequence[float], epsilon: float
+) -> list[Tensor]:
+    r"""``(Q, E)`` products :math:`\prod_c \prod_{\text{terms}} (r_c + \epsilon)^{w_c}` of residuals, of each fusion."""
     tables: list[Tensor | None] = [None] * len(fusions)
-    for i in range(len(left) // 2):
+    for i, power in enumerate(powers):
         (u, left_factor), (v, right_factor) = left[2 * i : 2 * i + 2], right[2 * i : 2 * i + 2]
         c = entries(u, v)
         for number, terms in enumerate(fusions):
             for term in terms:
                 residual = TERMS[term](c, left_factor, right_factor).neg_().add_(1.0 + epsilon).clamp_(min=epsilon)
+                if power != 1:
+                    residual.pow_(power)
                 table = tables[number]
                 tables[number] = residual if table is None else table.mul_(residual)
     return [table for table in tables if table is not None]
@@ -151,6 +155,13 @@ def order_free_moments(windows: Tensor, whole_image: bool = False) -> Tensor:
     return torch.stack([(x.mT @ x).flatten(-2) for x in (still, moving, change)])
 
 
+def fill_unseen(windows: Tensor, seen: Tensor) -> Tensor:
+    """Joints never seen, ``(N, joints)``, moved to the middle of the others, where they change no mean."""
+    known = seen[:, None, :, None].to(windows)
+    middle = (windows * known).sum(dim=2, keepdim=True) / known.sum(dim=2, keepdim=True).clamp(min=1.0)
+    return torch.where(known > 0, windows, middle)
+
+
 @dataclass(frozen=True)
 class JointMetric:
     r"""How much each direction of joint space counts, per channel: :math:`W = (\Sigma + \lambda I)^{-\alpha}`."""
@@ -162,10 +173,7 @@ class JointMetric:
     @classmethod
     def learn(cls, windows: Tensor, seen: Tensor, power: float, floor: float = COVARIANCE_FLOOR) -> JointMetric:
         """From windows ``(N, length, joints, dims)`` and the joints seen in each, ``(N, joints)``."""
-        # joints never seen go to the middle of the others, where they change no mean
-        known = seen[:, None, :, None].to(windows)
-        middle = (windows * known).sum(dim=2, keepdim=True) / known.sum(dim=2, keepdim=True).clamp(min=1.0)
-        windows = torch.where(known > 0, windows, middle)
+        windows = fill_unseen(windows, seen)
         covariances = []
         for name in CHANNELS:
             x = channel(windows, name) * seen[:, None, :, None]
@@ -305,6 +313,11 @@ class Copy:
     numbers: Tensor | None = None
     symmetry: Tensor | None = None
 
+    def select(self, chosen: Tensor) -> Copy:
+        """Of some exemplars, ``(N,)`` bool."""
+        numbers = chosen.nonzero()[:, 0] if self.numbers is None else self.numbers[chosen[self.numbers]]
+        return dataclasses.replace(self, numbers=numbers)
+
     def groups(self) -> Iterator[tuple[Tensor | None, Tensor]]:
         """``(numbers, joints seen)`` of the exemplars that show the same joints."""
         seen = self.windows.seen if self.numbers is None else self.windows.seen[self.numbers]
@@ -443,11 +456,21 @@ def _lower(table: Tensor, columns: Tensor | None, values: Tensor) -> None:
         table.index_copy_(1, columns, torch.minimum(table.index_select(1, columns), values))
 
 
-def fused_residuals(query: Windows, banks: Sequence[Bank], fusions: Sequence[Terms], chosen: Tensor | None = None) -> list[Tensor]:
+def fused_residuals(
+    query: Windows,
+    banks: Sequence[Bank],
+    fusions: Sequence[Terms],
+    chosen: Tensor | None = None,
+    powers: Sequence[float] = (1.0,) * len(NEAREST),
+) -> list[Tensor]:
     r"""Residual of every query to every exemplar of banks of planes (:func:`planes_of`), the best over its copies (crops, mirror
-    images): a ``(queries, chosen)`` table for each fusion of terms."""
-    worst = [(1.0 + EPSILON) ** (len(terms) * len(NEAREST)) for terms in fusions]
-    tables = min_over_copies(query, banks, lambda left, right: fuse_terms(left.parts, right.parts, fusions, EPSILON), worst, chosen)
+    images): a ``(queries, chosen)`` table for each fusion of terms. powers: of the channels."""
+    worst = [(1.0 + EPSILON) ** (len(terms) * sum(powers)) for terms in fusions]
+
+    def fuse(left: Description, right: Description) -> list[Tensor]:
+        return fuse_terms(left.parts, right.parts, fusions, powers, EPSILON)
+
+    tables = min_over_copies(query, banks, fuse, worst, chosen)
     return [table.log_() for table in tables]
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from indexing.action.bank import COVARIANCE_FLOOR, WHITENING_POWER, JointMetric, Kernels, Windows, stack
 from indexing.action.exemplars import CARD_PITCH_SIGMA, MAX_SAMPLED_MOMENTS, Exemplars, turn
+from indexing.action.joint_weights import JointWeights, learn_joint_weights
 from indexing.action.model import (
     NEAREST_WEIGHT,
     PENALTY,
@@ -195,12 +196,31 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
     if lesson.symmetry is not None:
         model = dataclasses.replace(model, mirrored=_mirror_is_same_action(model, originals) if lesson.guard else ~none)
     model = _with_hubs(model, originals)
+    weights = _learn_joint_weights(model, lesson)
+    if weights is not None:
+        model = _with_hubs(dataclasses.replace(model, joint_weights=weights, hub=nothing), originals)
     trained = None
     if lesson.scorer != "nearest":
         model, trained = _with_machine(model, one_side=lesson.view == "same")
     if lesson.learned and lesson.groups is not None:
         model = dataclasses.replace(model, blend=learn_blend(model, lesson.groups, trained))
     return _with_evidence(model, originals)
+
+
+def _learn_joint_weights(model: ShapeModel, lesson: Lesson) -> JointWeights | None:
+    """How much each joint counts, learned across views of 3D exemplars: of turned cards nothing can be learned."""
+    if not lesson.learned or lesson.view != "any" or lesson.groups is None or not bool(model.exemplars.solid.all()):
+        return None
+    asked, count = asked_views(model)[1:], len(model.labels)
+    if not asked:
+        return None
+    copies = [model.exemplars.crop(i) for i in range(len(model.exemplars.crops) // count)]
+    if model.symmetry is not None and bool(model.mirrored.any()):
+        copies += [mirror_some(crop, model.symmetry, model.mirrored) for crop in copies]
+    owner = torch.arange(count, device=model.labels.device).repeat(len(asked))
+    return learn_joint_weights(
+        stack(asked), owner, copies, model.metric, model.labels, groups=lesson.groups, hub=model.hub, symmetry=lesson.symmetry
+    )
 
 
 def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:

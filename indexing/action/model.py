@@ -23,6 +23,7 @@ from torch import Tensor
 from indexing.action.bank import (
     CHANNELS,
     EPSILON,
+    NEAREST,
     Bank,
     Copy,
     Describer,
@@ -34,6 +35,7 @@ from indexing.action.bank import (
     planes_of,
 )
 from indexing.action.exemplars import Exemplars
+from indexing.action.joint_weights import MAX_WEIGHT, JointWeights
 from indexing.modelfile import Parts, number, part, read_fields, store
 from indexing.opening import quote
 from indexing.scoring import SHARPNESS
@@ -193,6 +195,7 @@ class ShapeModel:
     evidence_out: Tensor = field(default_factory=lambda: torch.zeros(0), metadata=store("real", None))
     blend: Blend = field(default_factory=lambda: Blend())
     profiles: ClassProfiles | None = field(default=None, metadata=part())  # of the exemplars' class scores; older files have none
+    joint_weights: JointWeights | None = field(default=None, metadata=part("parts"))  # of A, where they are not equal
     hidden: int = 0
     cache: Cache = field(default_factory=lambda: Cache(), init=False, repr=False, compare=False)  # exemplars as they are compared
 
@@ -218,15 +221,15 @@ class ShapeModel:
             return [Copy(windows)]
         return [Copy(windows), Copy(windows, None if bool(mirrored.all()) else mirrored.nonzero()[:, 0], self.symmetry)]
 
-    def _crops(self, count: int | None) -> list[Bank]:
-        """Banks of the exemplars' crops (the first ones)."""
+    def _crops(self, count: int | None, weights: JointWeights | None = None) -> list[Bank]:
+        """Banks of the exemplars' crops (the first ones), under weights or with all joints alike."""
 
-        def make() -> list[Bank]:
+        def make() -> list[list[Bank]]:
             count = len(self.exemplars.crops) // max(1, len(self.exemplars))
-            return [Bank(self._copies(self.exemplars.crop(i), self.mirrored), self._planes) for i in range(count)]
+            crops = [self._copies(self.exemplars.crop(i), self.mirrored) for i in range(count)]
+            return weights.banks(crops, self.metric, self.labels) if weights else [[Bank(one, self._planes)] for one in crops]
 
-        banks: list[Bank] = self.cache.get("crops", make)
-        return banks[:count]
+        return [bank for crop in self.cache.get(("crops", weights is None), make)[:count] for bank in crop]
 
     @property
     def _planes(self) -> Describer:
@@ -234,7 +237,12 @@ class ShapeModel:
         return self.cache.get("planes", lambda: planes_of(self.metric))
 
     def _residuals(self, query: Windows, crops: int | None, chosen: Tensor | None) -> Tensor:
-        near, card = fused_residuals(query, self._crops(crops), [("epi",), ("turned",)], chosen)
+        weights = self.joint_weights
+        if weights is None:  # both from the same products
+            near, card = fused_residuals(query, self._crops(crops), [("epi",), ("turned",)], chosen)
+        else:
+            (near,) = fused_residuals(query, self._crops(crops, weights), [("epi",)], chosen, weights.channels.tolist())
+            (card,) = fused_residuals(query, self._crops(crops), [("turned",)], chosen)
         hub = self.hub if chosen is None else self.hub[chosen]
         return near.add_(card, alpha=TURNED_CARD_WEIGHT).sub_(hub)
 
@@ -359,7 +367,6 @@ def _to_device(value: object, device: str | torch.device) -> object:
 
 
 SCORERS = ("nearest", "kernel", "both")
-MAX_WEIGHT = 1e6  # of a scorer
 MIN_SCALE = 1e-7  # of a kernel, over distances from 0 to 2
 
 
@@ -384,9 +391,11 @@ def read_shape_model(
         if int(counts.sum()) != sizes["rows"]:
             raise ValueError(f"machine.counts: {int(counts.sum())} support vectors, and {sizes['rows']} are there")
     blend = {name: number(value, name, 0, MAX_WEIGHT) for name, value in header["blend"].items()}
-    joint_weights = [tensor for name, tensor in parts.tensors.items() if name.startswith("parts.")]
-    if any(bool((tensor != 1).any()) for tensor in joint_weights):
-        raise ValueError("parts: weights of single joints are no longer learned")  # of older files
+    weights = stored_fields["joint_weights"]
+    if weights is not None and not weights.is_usable:
+        raise ValueError("parts: no joint or no channel counts")
+    if weights is not None and weights.is_uniform:
+        stored_fields["joint_weights"] = None  # older files hold equal ones
     about = {"classes": sizes["classes"], "view": view, "scorer": scorer, "kernels": kernels, "blend": Blend(**blend)}
     return ShapeModel(**stored_fields, **about, hidden=hidden)
 
@@ -398,5 +407,5 @@ def _sizes(parts: Parts, classes: int, joints: int, length: int, crops: int) -> 
         raise ValueError(f"{exemplars} exemplars of {classes} classes")
     return {
         "classes": classes, "others": classes - 1, "pairs": classes * (classes - 1) // 2, "exemplars": exemplars,
-        "crops": exemplars * crops, "length": length, "joints": joints, "channels": len(CHANNELS),
+        "crops": exemplars * crops, "length": length, "joints": joints, "channels": len(CHANNELS), "nearest": len(NEAREST),
     }  # fmt: skip

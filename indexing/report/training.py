@@ -314,6 +314,8 @@ def _weight_rows(indexer: ActionIndexer) -> list[list[str]]:
     model, blend = indexer.model_, indexer.model_.blend
     total = blend.kernel + blend.nearest
     depth = "of the 3D examples" if bool(model.exemplars.solid.any()) else "none: bodies stay flat, as in the image"
+    equal = "no: equal weights serve people best who are left out" if people_left_out(indexer) else "no: nobody could be left out"
+    learned = equal if model.joint_weights is None else "yes"
     shares = {"nearest": blend.nearest / total, "kernel": blend.kernel / total}
     if model.scorer != "both":
         shares = {name: float(name == model.scorer) for name in shares}
@@ -321,6 +323,7 @@ def _weight_rows(indexer: ActionIndexer) -> list[list[str]]:
         ["Nearest example, whatever the viewpoint", f"{shares['nearest']:.0%}"],
         ["Kernel machine over virtual views", f"{shares['kernel']:.0%}"],
         ["Depth for virtual views", depth],
+        ["Joints weighed differently", learned if indexer.weights == "learned" else "no: weights were not learned"],
     ]
 
 
@@ -332,4 +335,5 @@ def _metrics(indexer: ActionIndexer, parts: BodyParts) -> dict[str, Any]:
         "joints": list(joints),
         "importance": parts.importance.tolist(),
         "blend": {"kernel": blend.kernel, "nearest": blend.nearest, "sharpness": blend.sharpness},
+        "joint_weights_learned": indexer.model_.joint_weights is not None,
     }

@@ -30,8 +30,9 @@ from indexing.action.bank import (
     order_free_moments,
     planes_of,
 )  # fmt: skip
+from indexing.action.joint_weights import JointWeights
 from indexing.action.model import MOMENT_TERMS, PENALTY, TURNED_CARD_WEIGHT, PairwiseMachine, mirror_some
-from tests.indexing.residuals import fused_residual
+from tests.indexing.residuals import fused_residual, weighted_residual
 
 LENGTH, JOINTS = 8, 6
 
@@ -114,10 +115,10 @@ def test_the_metric_keeps_the_rank_condition_and_the_residual_of_two_views_is_th
     assert float(fused_residual(pair[0], [pair[1]], metric)) == pytest.approx(3 * np.log(EPSILON), abs=0.5)
 
 
-def slow_residual(query, exemplar, metric, terms):
+def slow_residual(query, exemplar, metric, terms, powers):
     """One pair in float64: SVD bases, and only the joints that both saw."""
     total, both = 0.0, (query[1] & exemplar[1]).nonzero()[:, 0]
-    for name in NEAREST:
+    for name, power in zip(NEAREST, powers, strict=True):
         w = metric.weights(name, slice(None) if len(both) == JOINTS else both)
         a, b = (
             torch.einsum("jk,tkd->tjd", w.double(), channel(values[None, :, both].double(), name)[0]).flatten(0, 1)
@@ -131,22 +132,23 @@ def slow_residual(query, exemplar, metric, terms):
                 across, heights = (a[:, 0] @ b[:, 0], a[:, 1] @ b[:, 1])
                 across = across.abs() if term == "turned" else across
                 r = 1 - (across + heights) / (a.norm() * b.norm())
-            total += float(torch.log(r + EPSILON))
+            total += power * float(torch.log(r + EPSILON))
     return total
 
 
 def test_residuals_against_singular_values_pair_by_pair(monkeypatch):
-    for holes, terms in product((False, True), (("epi",), ("epi", "turned", "nn"))):
+    for (holes, powers), terms in product(((False, (1.0, 1.0, 1.0)), (True, (0.5, 1.0, 2.0))), (("epi",), ("epi", "turned", "nn"))):
         query, bank, second = random_windows(5, 7, holes), random_windows(7, 8, holes), random_windows(7, 9)
         metric = metric_of(bank)
-        table = fused_residual(query, [bank, second], metric, terms)
+        table = fused_residual(query, [bank, second], metric, terms, powers)
         for i, j in product(range(5), range(7)):
             pair = (query.values[i], query.seen[i])
-            expected = min(slow_residual(pair, (x.values[j], x.seen[j]), metric, terms) for x in (bank, second))
-            assert float(table[i, j]) == pytest.approx(expected, abs=5e-3), (holes, terms)
+            expected = min(slow_residual(pair, (x.values[j], x.seen[j]), metric, terms, powers) for x in (bank, second))
+            assert float(table[i, j]) == pytest.approx(expected, abs=5e-3), (holes, terms, powers)
         with monkeypatch.context() as patch:
             patch.setattr("indexing.action.bank.PAIR_BLOCK", 4)
-            torch.testing.assert_close(fused_residual(query, [bank, second], metric, terms), table, atol=1e-5, rtol=0)
+            tiled = fused_residual(query, [bank, second], metric, terms, powers)
+            torch.testing.assert_close(tiled, table, atol=1e-5, rtol=0)
 
 
 def test_pairs_with_too_few_common_joints_get_the_worst_residual():
@@ -196,6 +198,16 @@ def test_a_bank_is_the_least_over_its_copies_and_their_mirror_images():
     chosen = torch.tensor([1, 2, 6])
     for table, part in zip(tables, fused_residuals(query, [kept], fusions, chosen), strict=True):
         torch.testing.assert_close(part, table[:, chosen], atol=1e-4, rtol=0)
+
+
+def test_each_class_keeps_its_own_weights():
+    query, bank = random_windows(5, 25), random_windows(6, 26, holes=True)
+    metric, labels = metric_of(bank), torch.tensor([0, 1, 2, 0, 1, 2])
+    weights = JointWeights(random(3, JOINTS, seed=27).exp(), torch.tensor([0.5, 1.0, 1.5]), random(3, JOINTS, seed=28).exp())
+    (banks,) = weights.banks([[Copy(bank), Copy(bank, torch.arange(3), SWAP)]], metric, labels)
+    (table,) = fused_residuals(query, banks, [("epi",)], powers=weights.channels.tolist())
+    expected = weighted_residual(query, [bank, mirror_some(bank, SWAP, torch.arange(6) < 3)], metric, labels, weights)
+    torch.testing.assert_close(table, expected, atol=1e-4, rtol=0)
 
 
 def counted(metric):
@@ -249,14 +261,19 @@ def slow_residuals(model, query, crops, chosen):
     copies = [windows for i in range(crops) for windows in (model.exemplars.crop(i),)]
     copies += [mirror_some(windows, model.symmetry, model.mirrored) for windows in copies]
     copies = [windows[chosen] for windows in copies]
-    epipolar, turned = (fused_residual(query, copies, model.metric, (term,)) for term in ("epi", "turned"))
+    epipolar = weighted_residual(query, copies, model.metric, model.labels[chosen], model.joint_weights)
+    turned = fused_residual(query, copies, model.metric, ("turned",))
     return epipolar + TURNED_CARD_WEIGHT * turned - model.hub[chosen]
 
 
 @pytest.mark.slow
-def test_a_model_scores_as_if_it_kept_nothing(fitted):
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_model_scores_as_if_it_kept_nothing(fitted, learned):
     _, model, _ = fitted
     query = random_windows(5, 35, holes=True)
+    if learned:
+        weights = JointWeights(random(3, JOINTS, seed=36).exp(), torch.tensor([0.5, 1.0, 1.5]))
+        model = dataclasses.replace(model, joint_weights=weights)
     every, some = torch.arange(12), torch.tensor([0, 3, 4, 9])
     for _ in range(2):
         crops = len(model.exemplars.crops) // len(model.exemplars)

@@ -83,11 +83,24 @@ def test_a_learned_indexer_knows_who_performs(learned, lesson):
         ActionIndexer(weights="learned").fit(lesson, groups=[1, 2])
 
 
+@pytest.mark.slow
+def test_joints_that_wander_count_less():
+    rng, clips = np.random.default_rng(0), []
+    for clip in dataset(4, ACTIONS, azimuth=None, rng=1):
+        junk = np.cumsum(rng.normal(size=(len(clip), 6, 3)), axis=0)
+        joints = np.concatenate([clip.joints, clip.joints.mean() + 2 * junk / np.abs(junk).max()], axis=1)
+        clips.append(clip.replace(joints=joints, confidence=None, skeleton=None))
+    model = ActionIndexer(weights="learned", scorer="nearest", virtual_views=2).fit(clips).model_
+    weights = model.joint_weights.joints.mean(dim=0)
+    assert weights[:-6].mean() > 2 * weights[-6:].mean()
+    assert ActionIndexer(scorer="nearest", virtual_views=2).fit(clips).model_.joint_weights is None
+
+
 def test_turned_cards_fit_one_another():
     cards = torch.rand(2, 6, 5, 2, generator=torch.Generator().manual_seed(3))
     weights = JointMetric.learn(cards, torch.ones(2, 5, dtype=torch.bool), 0.25).weights("clip")
     behind, there = (flatten_channel(x, "clip", weights) for x in (cards * torch.tensor([-1.0, 1.0]), cards))
-    (table,) = fuse_terms(factorize(behind), factorize(there), [("turned",)], EPSILON)
+    (table,) = fuse_terms(factorize(behind), factorize(there), [("turned",)], (1.0,), EPSILON)
     assert table.diagonal().max() < EPSILON + 1e-5 and table[0, 1] > 0.01
     # brute force over turns: x of a card that is seen from elsewhere shrinks by the cosine
     a, b = behind[0] / behind[0].norm(), there[1] / there[1].norm()

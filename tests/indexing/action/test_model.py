@@ -136,16 +136,35 @@ def test_headers_that_miss_something_or_make_no_sense_are_refused(saved, tmp_pat
         refused(path)
 
 
-def test_files_from_before_depth_and_weights_of_joints_went_are_read_where_they_decided_nothing(saved, tmp_path):
+def test_files_from_before_depth_went_are_read_where_it_decided_nothing(saved, tmp_path):
     (tensors, header), path = contents(saved), tmp_path / "m.safetensors"
     old = header | {"layout": None, "parts": [0.0, 0.0], "parameters": header["parameters"] | {"depth": "auto"}}
-    ones = {"parts.joints": torch.ones(3, 17), "parts.channels": torch.ones(3)}
-    write(path, tensors | ones, old)
-    assert ActionIndexer.load(path).get_params() == ActionIndexer.load(saved).get_params()
-    write(path, tensors | ones | {"parts.by_class": torch.full((4, 17), 0.5)}, old)
-    refused(path, "weights of single joints are no longer learned")
+    write(path, tensors | {"parts.joints": torch.ones(3, 17), "parts.channels": torch.ones(3)}, old)
+    loaded = ActionIndexer.load(path)
+    assert loaded.get_params() == ActionIndexer.load(saved).get_params() and loaded.model_.joint_weights is None
     write(path, tensors, old | {"layout": {"joints": ["nose"], "photograph": True}})
     refused(path, "depth of 2D examples is no longer guessed")
+
+
+def test_weights_of_joints_survive_and_are_refused_where_nothing_counts(saved, test, tmp_path):
+    (tensors, header), path = contents(saved), tmp_path / "m.safetensors"
+    draw = torch.Generator().manual_seed(0)
+    weights = {
+        "parts.joints": torch.rand(3, 17, generator=draw), "parts.channels": torch.tensor([0.5, 1.0, 1.5]),
+        "parts.by_class": torch.rand(4, 17, generator=draw),
+    }  # fmt: skip
+    write(path, tensors | weights, header)
+    loaded, equal = ActionIndexer.load(path), ActionIndexer.load(saved)
+    loaded.save(tmp_path / "again.safetensors")
+    assert contents(tmp_path / "again.safetensors")[0].keys() == tensors.keys() | weights.keys()
+    again = ActionIndexer.load(tmp_path / "again.safetensors")
+    np.testing.assert_array_equal(again.decision_function(test), loaded.decision_function(test))
+    assert np.abs(loaded.decision_function(test) - equal.decision_function(test)).max() > 1e-3
+    for name, value in weights.items():
+        write(path, tensors | weights | {name: torch.zeros_like(value)}, header)
+        refused(path, "no joint or no channel counts")
+        write(path, tensors | weights | {name: value[:-1].contiguous()}, header)
+        refused(path)
 
 
 def test_tensors_that_are_missing_or_do_not_fit_together_are_refused(saved, tmp_path):

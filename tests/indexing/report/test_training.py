@@ -38,6 +38,7 @@ def test_the_report_says_what_was_learned(folder):
     html = (folder / "out" / "report.html").read_text()
     assert "3 actions learned" in html and "Which body parts matter" in html and "weights were not learned" in html
     measured = json.loads((folder / "out" / "metrics.json").read_text())
+    assert measured["joint_weights_learned"] is False
     assert measured["actions"] == ["kick", "squat", "wave"] and len(measured["importance"]) == 3
     assert len(measured["joints"]) == len(measured["importance"][0]) == 17
     assert (folder / "out" / "body_parts.png").read_bytes().startswith(b"\x89PNG")
