@@ -100,7 +100,7 @@ def table(config: Config) -> list[Row]:
     return rows
 
 
-@experiment(Config(), quick={"library": (300,), "frames": 40, "rounds": 1})
+@experiment(Config(), quick={"library": (1500,), "frames": 40, "rounds": 1})
 def tables(config: Config) -> Tables:
     """Files, and pictures pushed one by one."""
     yield "Brightness indexer", table(config)

@@ -14,7 +14,6 @@ from experiments.reconstruction.view_synthesis import CARS, HEIGHT, WIDTH, Scene
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """One ray per pixel: a blockier image, four times as fast."""
     monkeypatch.setattr(view_synthesis, "SAMPLES", 1)
-    monkeypatch.setattr(view_synthesis, "SAMPLES", 1)
 
 
 def truth(cameras: torch.Tensor) -> Scene:
