@@ -341,8 +341,8 @@ def lifted_error(structure: Tensor, true: Tensor, lifts: Tensor, mask: Tensor | 
 
     Example:
         >>> import torch
-        >>> from dyntorch.scenes import lifted
-        >>> scene = lifted("constant_velocity_2d", 20, generator=torch.Generator().manual_seed(0))
+        >>> from dyntorch.scenes import lifted_points
+        >>> scene = lifted_points("constant_velocity_2d", 20, generator=torch.Generator().manual_seed(0))
         >>> gauge = torch.eye(5, dtype=torch.float64)
         >>> gauge[3, 2] = 0.7  # a common velocity
         >>> error = lifted_error(scene.structure @ gauge.mT, scene.structure, scene.lifts)

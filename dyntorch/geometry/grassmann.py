@@ -268,9 +268,9 @@ def _rows(minors: Tensor, table: Tables) -> list[Tensor]:
         product = known - _minors(minors, i, q).view(len(minors), *split)  # (r, j, s, t): b_t c_j
         left, right = _rank_one(product.permute(0, 1, 4, 3, 2).reshape(len(minors), split[0] * split[3], split[2] * split[1]))
         block[i, q], block[q, i] = left.unflatten(-1, (split[0], split[3])), right.unflatten(-1, (split[2], split[1]))
-    for i, q in combinations(views[1:], 2):
-        scale = _scale(_minors(minors, 0, i, q), block, i, q)[:, None, None]
-        block[i, q], block[q, i] = block[i, q] * scale, block[q, i] / scale
+    for q in views[2:]:
+        for i, scale in enumerate(_scales(minors, block, q), 1):
+            block[i, q], block[q, i] = block[i, q] * scale[:, None, None], block[q, i] / scale[:, None, None]
     result = []
     for i in views:
         below = torch.cat([block[i, q] for q in views], dim=-1)
@@ -299,8 +299,40 @@ def _rank_one(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return unit_vectors(left) * root, right * root
 
 
-def _scale(minors: Tensor, block: dict[tuple[int, int], Tensor], i: int, q: int) -> Tensor:
-    r"""The factor of block (i, q) relative to those of view 0, ``(b,)``."""
+def _scales(minors: Tensor, block: dict[tuple[int, int], Tensor], q: int) -> list[Tensor]:
+    """Factors of the blocks (i, q), 0 < i < q, relative to those of view 0, ``(b,)`` each."""
+    roots, errors = zip(*[_roots(_minors(minors, 0, i, q), block, i, q) for i in range(1, q)], strict=True)
+    if q < 3 or any(size > 2 for size in minors.shape[1 : q + 2]):
+        return [_pick(*pair) for pair in zip(roots, errors, strict=True)]
+    # in images of one dimension the triple with view 0 has two exact roots: the triples with view 1 choose
+    first, second = roots[0][:, :, None], roots[1][:, None]
+    joint = errors[0][:, :, None] + errors[1][:, None] + _triple_error(minors, block, (2, q), first, second)
+    result = [_pick(part.expand(-1, 4, 4).flatten(1), joint.flatten(1)) for part in (first, second)]
+    for i in range(3, q):
+        again = _triple_error(minors, block, (i, q), result[0][:, None], roots[i - 1])
+        result.append(_pick(roots[i - 1], errors[i - 1] + again))
+    return result
+
+
+def _pick(roots: Tensor, errors: Tensor) -> Tensor:
+    """The root of the least error, ``(b,)``."""
+    return roots.gather(-1, errors.argmin(-1, keepdim=True))[:, 0]
+
+
+def _triple_error(
+    minors: Tensor, block: dict[tuple[int, int], Tensor], views: tuple[int, int], first: Tensor, second: Tensor
+) -> Tensor:
+    """Squared error of the minor of views 1, i, q, one-dimensional images, for factors ``(b, ...)`` of the blocks (1, q), (i, q)."""
+    shape = (-1, *[1] * (first.ndim - 1))
+    names = (1, *views)
+    (d, ab, ac), (ba, e, bc), (ca, cb, f) = ([block[row, column].view(shape) for column in names] for row in names)
+    fixed = d * e * f - d * bc * cb - e * ac * ca - f * ab * ba
+    determinant = fixed + ab * (bc * second) * (ca / first) + (ac * first) * ba * (cb / second)
+    return (determinant - _minors(minors, *names).view(shape)).square()
+
+
+def _roots(minors: Tensor, block: dict[tuple[int, int], Tensor], i: int, q: int) -> tuple[Tensor, Tensor]:
+    r"""Candidates of the factor of block (i, q) relative to those of view 0, and their squared errors, ``(b, 4)`` each."""
     # all with the dimensions (batch, b, j, c, g, d, t)
     (bj, bg, bt), (cj, cg, ct), (dj, dg, dt) = (
         [_axes(block[u, v], a, b) for b, v in enumerate((0, i, q))] for a, u in enumerate((0, i, q))
@@ -318,8 +350,7 @@ def _scale(minors: Tensor, block: dict[tuple[int, int], Tensor], i: int, q: int)
     # the real part of a complex root is one more candidate, and never the best
     roots = torch.linalg.eigvals(companion.nan_to_num(0.0, 1e100, -1e100)).real * unit[:, None]
     roots = torch.where(roots == 0, unit[:, None], roots)[..., None]
-    best = (roots * x[:, None] + y[:, None] / roots - z[:, None]).square().sum(-1).argmin(-1, keepdim=True)
-    return roots[..., 0].gather(-1, best)[:, 0]
+    return roots[..., 0], (roots * x[:, None] + y[:, None] / roots - z[:, None]).square().sum(-1)
 
 
 def _axes(block: Tensor, row: int, column: int) -> Tensor:

@@ -140,7 +140,7 @@ def lifted_points(
 
     Example:
         >>> import torch
-        >>> scene = lifted("constant_velocity_2d", 20, views=5, batch=2, generator=torch.Generator().manual_seed(0))
+        >>> scene = lifted_points("constant_velocity_2d", 20, views=5, batch=2, generator=torch.Generator().manual_seed(0))
         >>> tuple(scene.tracks.shape), tuple(scene.lifts.shape), tuple(scene.cameras.shape), tuple(scene.structure.shape)
         ((2, 5, 20, 2), (5, 3, 5), (2, 5, 3, 3), (2, 20, 5))
         >>> q = scene.structure[:, None] @ scene.projections.mT

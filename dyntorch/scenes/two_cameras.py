@@ -92,7 +92,7 @@ def filmed_person(
         generator: source of all randomness.
 
     Example:
-        >>> scene = filmed(12, seconds=2.0, fps=(30.0, 25.0), offset=0.3, generator=torch.Generator().manual_seed(0))
+        >>> scene = filmed_person(12, seconds=2.0, fps=(30.0, 25.0), offset=0.3, generator=torch.Generator().manual_seed(0))
         >>> scene.a.shape, scene.b.shape
         (torch.Size([60, 12, 2]), torch.Size([50, 12, 2]))
     """

@@ -94,9 +94,9 @@ class BrightnessIndexer(SavedClassifier):
 
     Example:
         >>> from indexing.actors import Person, perform
-        >>> from indexing.actors.textured import film
+        >>> from indexing.actors.textured import render_clip
         >>> def video(action, who):
-        ...     return film(perform(action, Person.random(who), rng=who), azimuth=0, image=(80, 60), rng=who)
+        ...     return render_clip(perform(action, Person.random(who), rng=who), azimuth=0, image=(80, 60), rng=who)
         >>> indexer = BrightnessIndexer().fit([video("wave", 0), video("squat", 0)], ["wave", "squat"])
         >>> [str(label) for label in indexer.predict([video("squat", 1), video("wave", 1)])]
         ['squat', 'wave']

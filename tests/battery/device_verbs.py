@@ -562,7 +562,7 @@ NOT_VERBS = {
     **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
     **dict.fromkeys(("on_cpu", "one_thread"), "decorators of verbs"),
     **dict.fromkeys(
-        ("Message", "Notice", "NoticeCode", "Outcome", "named", "with_words", "as_python", "status_from"), "what results say"
+        ("Message", "Notice", "NoticeCode", "Outcome", "with_names", "with_words", "as_python", "status_from"), "what results say"
     ),
     "check_options": "looks at no tensor",
     "map_blocks": "computes nothing by itself",

@@ -13,7 +13,6 @@ import dyntorch as dyn
 from experiments.common import real_data
 from experiments.reconstruction import data as lifted_data
 from experiments.reconstruction import real as real_lifted
-from experiments.reconstruction import traffic as lifted_traffic
 from experiments.reconstruction.data import declared, predicted
 
 pytestmark = pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data")
@@ -24,12 +23,12 @@ def test_cars_are_where_constant_velocity_puts_them_in_a_frame_that_was_not_used
     sequences = {one.name: one for one in real_data.traffic()}
     ours, still, background = [], [], []
     for name in ("cars2_07", "cars5", "cars7", "cars9"):
-        case = lifted_traffic.asked(sequences[name], 2, True, torch.Generator().manual_seed(0))
+        case = real_lifted.asked(sequences[name], 2, True, torch.Generator().manual_seed(0))
         assert case is not None
-        there, _ = lifted_traffic.model("constant_velocity_2d")(case)
+        there, _ = real_lifted.model("constant_velocity_2d")(case)
         ours.append(case.error(there, cars=True))
         background.append(case.error(there, cars=False))
-        still.append(case.error(lifted_traffic.put(case)[0], cars=True))
+        still.append(case.error(real_lifted.put(case)[0], cars=True))
     assert np.median(ours) < 0.5 * np.median(still)
     assert np.median(background) < 1
 

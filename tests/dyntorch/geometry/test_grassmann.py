@@ -521,3 +521,13 @@ def test_refusals():
         epipoles([])
     with pytest.raises(ValueError, match="profile"):
         joint_epipoles_of_tensor(random(3, 3, 6))
+
+
+@pytest.mark.parametrize("k", [3, 4, 5])
+def test_candidates_of_images_of_one_dimension_have_the_tensor_that_they_come_from(k):
+    """Each triple of views alone leaves two roots; only together do the triples say which."""
+    generator = torch.Generator().manual_seed(k)
+    views = [torch.randn(40, 2, k + 1, generator=generator, dtype=torch.float64) for _ in range(k + 1)]
+    tensor = normalize(grassmann_tensor(views, (1,) * (k + 1)).flatten(1), dim=-1)
+    flat = grassmann_tensor(candidates(tensor.view(-1, *(2,) * (k + 1)), (1,) * (k + 1), (2,) * (k + 1)), (1,) * (k + 1)).flatten(2)
+    assert (1 - (normalize(flat, dim=-1) * tensor).sum(-1).abs()).max() < 1e-7

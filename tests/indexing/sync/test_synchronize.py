@@ -344,7 +344,7 @@ def broken_clocks(times, jump=LOST / FPS):
     """What the breaks_library says: b lost frames."""
     later = [times[0], times[1] + jump * (torch.arange(len(times[1])) >= AT)]
     one = SimpleNamespace(
-        camera=None, candidates=(1, 0), moments=(2.0, 2.1), sigma=0.02, jump=-jump, jump_sigma=0.001, frames=LOST, doubled=False,
+        camera=None, candidates=(1, 0), moments=(2.0, 2.1), sigma=0.02, jump=-jump, jump_sigma=0.001, frames=LOST, is_doubled=False,
         evidence=90.0, residuals=(9.0, 2.0),
     )  # fmt: skip
     notice = Notice(Broke.LOST, float(LOST))
