@@ -322,7 +322,7 @@ def _pick(roots: Tensor, errors: Tensor) -> Tensor:
 def _triple_error(
     minors: Tensor, block: dict[tuple[int, int], Tensor], views: tuple[int, int], first: Tensor, second: Tensor
 ) -> Tensor:
-    """Squared error of the minor of views 1, i, q, one-dimensional images, for factors ``(b, ...)`` of the blocks (1, q), (i, q)."""
+    """Squared error of the minor of views 1, i, q of dimension one, for factors ``(b, ...)`` of the blocks (1, q), (i, q)."""
     shape = (-1, *[1] * (first.ndim - 1))
     names = (1, *views)
     (d, ab, ac), (ba, e, bc), (ca, cb, f) = ([block[row, column].view(shape) for column in names] for row in names)
