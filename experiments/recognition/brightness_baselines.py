@@ -34,6 +34,7 @@ QUIET = 0.006  # grey 0..1 per frame
 SIZE, HALF, PATCH = 80, 5, 5  # of the thesis kernel: px of the longer side, frames on either side, px (theory: 10 px at 160 px)
 RIDGE = 0.02  # of its whitening
 CEILING = 1.05  # of scores in the log: as for the brightness indexer
+SOFT_NORM = 0.02  # added to the norm of what points move: near 0 where nothing does
 
 
 def cropped(frames: Frames, fps: float) -> Tensor:
@@ -81,7 +82,8 @@ def tracks(frames: Frames, fps: float) -> Tensor:
     near = (1 - (place[..., None] - 0.5 - torch.arange(CELLS)).abs()).clamp(min=0)  # (F, n, 2, cells): bilinear shares
     ways = torch.cat([speed, -speed], dim=2).clamp(min=0)
     cells = torch.einsum("fni,fnj,fnk->fkij", near[:, :, 1], near[:, :, 0], ways).flatten(1)
-    return describe_cells(cells.float(), 0.02)
+    root = cells.float().sqrt()
+    return root / (root.norm(dim=-1, keepdim=True) + SOFT_NORM)
 
 
 def _cells(maps: Tensor) -> Tensor:
