@@ -30,6 +30,9 @@ ROWS = 200
 SOLVE, MINIMAL, BACKWARD, GRAM = "null space", "D - 1 rows", "forward + backward", "Gram given"
 
 
+CLOCK_TICK = 1e-7  # seconds: processor time of a tiny batch can read as 0
+
+
 @dataclass(frozen=True)
 class Config(BaseConfig):
     """Speed and accuracy of batched null spaces."""
@@ -69,7 +72,7 @@ class Figure:
 
     @property
     def ratio(self) -> float:
-        return self.reference / self.ours
+        return self.reference / max(self.ours, CLOCK_TICK)
 
     @property
     def reached(self) -> bool | None:
