@@ -12,7 +12,7 @@ PIP = $(BIN)/python -m pip install --quiet
 
 # what computes, apart from reading, drawing and the command line
 NUMERICAL := tests/dyntorch tests/battery tests/test_readme.py tests/indexing/action tests/indexing/archive tests/indexing/brightness tests/indexing/phase tests/indexing/recordings tests/indexing/sync \
-  tests/indexing/test_estimators.py dyntorch
+  tests/indexing/test_estimator.py dyntorch
 
 .PHONY: install demo test test-slow test-all portable lint bench fuzz tables docs clean
 

@@ -302,7 +302,7 @@ ELEMENTWISE = {
     # of words and checks, not of numbers
     "as_python",
     "check_options",
-    "named",
+    "with_names",
     "status_from",
     "with_words",
 }

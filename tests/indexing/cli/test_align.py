@@ -132,7 +132,7 @@ def test_other_models_of_points(run, tmp_path, model):
     scene = make(80, sigma=0.001, static=0.3, sensors=sensors, generator=draw(5))
     np.savez(tmp_path / "m.npz", **{f"P{i}": view.numpy() for i, view in enumerate(scene.views, start=1)})
     assert run(f"m.npz --model {model} --threshold 0.006 --out out")[0] == 0  # six times the noise: over at the first starts
-    found, (A, B) = read(), scene.motion
+    found, A, B = read(), *scene.motion[:2]
     truth = (A @ torch.linalg.inv(B) if velocity else B).numpy()
     error = np.array(found["A" if velocity else "B"]) - truth / np.linalg.norm(truth) * (np.sign(truth[3, 3]) if velocity else 1)
     assert np.linalg.norm(error) < 0.05 and (np.shape(found["velocities"]) == (80, 3)) == velocity

@@ -207,7 +207,7 @@ def test_takes_of_videos(films, model):
 def test_what_pixels_say_where_keypoints_do_not_decide(films, model, monkeypatch):
     verb = importlib.import_module("indexing.sync.synchronize")
     a, b = (take_of(films / name) for name in ("nod.mp4", "session.mp4"))
-    open_ = verb.refuse(a, b, Notice(SyncNotice.FEW_TRACKS, 0.0, {"needed": 9, "names": "both"}))
+    open_ = verb.undecided_shift((a.fps, b.fps), "subspace", Notice(SyncNotice.FEW_TRACKS, 0.0, {"needed": 9, "names": "both"}))
     monkeypatch.setattr(verb, "match_people", lambda *args, **how: Pairing(open_, (0, 0)))
     monkeypatch.setattr(verb, "synchronize_videos", lambda *args, **how: open_)
     told = verb.pair(a, b).shift
