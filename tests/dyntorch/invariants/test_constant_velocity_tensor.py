@@ -106,8 +106,7 @@ def test_epipoles_are_fourfold_defective_eigenvalues():
     left = pencil - ratio * torch.eye(4, dtype=pencil.dtype)
     assert torch.linalg.matrix_rank(left, rtol=1e-9) == 1
     assert (left @ left).abs().max() < 1e-10 * left.abs().max()
-    # the eigenvalues keep half of the digits, their mean all
-    assert (torch.linalg.eigvals(pencil) - ratio).abs().max() > 1e-10 * ratio.abs()
+    # the eigenvalues may keep half of the digits only, their mean keeps all
     assert abs(pencil.trace() / 4 - ratio) < 1e-11 * ratio.abs()
     # hence the determinant of a slice is the fourth power of a linear form
     slices = torch.einsum("ni,ijk->nkj", random(20, 4, seed=6), tensor)
