@@ -78,7 +78,8 @@ def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     if invariant.motion_alone:
         return torch.stack(denormalize_motion(invariant, tensor.unbind(-3), actions), dim=-3)
     rank = len(invariant.shape())
-    return unit_tensors(tensor if invariant.intrinsic else _moved_axes(invariant, tensor, actions), rank, invariant.nullity)
+    result = tensor if invariant.intrinsic else _moved_axes(invariant, tensor, actions)
+    return unit_tensors(_largest_to_one(result, rank, invariant.nullity), rank, invariant.nullity)
 
 
 def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor]) -> Tensor:
@@ -93,14 +94,19 @@ def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     return torch.einsum(f"...{small},{maps}->...{large}", tensor, *ordered)
 
 
-def unit_tensors(result: Tensor, rank: int, nullity: int = 1) -> Tensor:
-    """Tensors of so many axes at norm 1, several of them orthonormal; zero ones stay zero."""
+def _largest_to_one(result: Tensor, rank: int, nullity: int) -> Tensor:
+    """Tensors of so many axes with entries up to 1, whose squares stay within the range of numbers."""
     largest = result.detach().flatten(-rank).abs().amax(-1)
     largest = largest.amax(-1, keepdim=True) if nullity > 1 else largest
-    result = result / torch.where(largest > 0, largest, 1.0)[(..., *([None] * rank))]
+    return result / torch.where(largest > 0, largest, 1.0)[(..., *([None] * rank))]
+
+
+def unit_tensors(result: Tensor, rank: int, nullity: int = 1) -> Tensor:
+    """Tensors of so many axes at norm 1, several of them orthonormal; zero ones stay zero."""
     if nullity == 1:
         norm = result.flatten(-rank).norm(dim=-1)[(..., *([None] * rank))]
         return result / torch.where(norm > 0, norm, 1.0)
+    result = _largest_to_one(result, rank, nullity)
     flat = result.flatten(-rank)
     # the derivative of the triangular factorization of a failed (zero) problem would be NaN: any basis stands in for it
     none = flat.abs().amax((-2, -1), keepdim=True) == 0
