@@ -79,7 +79,9 @@ def denormalize(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
         return torch.stack(denormalize_motion(invariant, tensor.unbind(-3), actions), dim=-3)
     rank = len(invariant.shape())
     result = tensor if invariant.intrinsic else _moved_axes(invariant, tensor, actions)
-    return unit_tensors(_largest_to_one(result, rank, invariant.nullity), rank, invariant.nullity)
+    if invariant.nullity == 1:
+        result = _largest_to_one(result, rank)
+    return unit_tensors(result, rank, invariant.nullity)
 
 
 def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor]) -> Tensor:
@@ -94,11 +96,10 @@ def _moved_axes(invariant: Invariant, tensor: Tensor, actions: Sequence[Tensor])
     return torch.einsum(f"...{small},{maps}->...{large}", tensor, *ordered)
 
 
-def _largest_to_one(result: Tensor, rank: int, nullity: int) -> Tensor:
-    """Tensors of so many axes with entries up to 1, whose squares stay within the range of numbers."""
-    largest = result.detach().flatten(-rank).abs().amax(-1)
-    largest = largest.amax(-1, keepdim=True) if nullity > 1 else largest
-    return result / torch.where(largest > 0, largest, 1.0)[(..., *([None] * rank))]
+def _largest_to_one(result: Tensor, axes: int) -> Tensor:
+    """Tensors whose largest entry over so many last axes is 1: the squares of all stay within the range of numbers."""
+    largest = result.detach().flatten(-axes).abs().amax(-1)
+    return result / torch.where(largest > 0, largest, 1.0)[(..., *([None] * axes))]
 
 
 def unit_tensors(result: Tensor, rank: int, nullity: int = 1) -> Tensor:
@@ -106,7 +107,7 @@ def unit_tensors(result: Tensor, rank: int, nullity: int = 1) -> Tensor:
     if nullity == 1:
         norm = result.flatten(-rank).norm(dim=-1)[(..., *([None] * rank))]
         return result / torch.where(norm > 0, norm, 1.0)
-    result = _largest_to_one(result, rank, nullity)
+    result = _largest_to_one(result, rank + 1)
     flat = result.flatten(-rank)
     # the derivative of the triangular factorization of a failed (zero) problem would be NaN: any basis stands in for it
     none = flat.abs().amax((-2, -1), keepdim=True) == 0

@@ -143,7 +143,7 @@ def candidates(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int], tri
         raise ValueError(f"tries must be at least 1, got {tries}")
     batch = tensor.shape[: tensor.ndim - len(sizes)]
     with torch.no_grad():
-        scaled, sound = unit_tensors(tensor.reshape(prod(batch), *tensor.shape[len(batch) :]))
+        scaled, sound = normalize_tensors(tensor.reshape(prod(batch), *tensor.shape[len(batch) :]))
         found = _recover(scaled, tables(tuple(profile), tuple(sizes), tries, tensor.device))
         parts = balance_projections([torch.where(sound[:, None, None], part, torch.zeros_like(part)) for part in found])
     return tuple(part.reshape(tries, *batch, *part.shape[-2:]).to(tensor.dtype) for part in parts)
@@ -161,7 +161,7 @@ def check(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int]) -> None:
         )
 
 
-def unit_tensors(tensor: Tensor) -> tuple[Tensor, Tensor]:
+def normalize_tensors(tensor: Tensor) -> tuple[Tensor, Tensor]:
     """Tensors ``(b, ...)`` as float64 of norm 1, and which were sound ``(b,)``; the others become constant."""
     flat = tensor.flatten(1).double()
     largest = flat.detach().abs().amax(-1, keepdim=True)

@@ -16,9 +16,9 @@ from dyntorch.geometry.grassmann import (
     check,
     grassmann_derivative,
     grassmann_tensor,
+    normalize_tensors,
     rotate_tensors,
     tables,
-    unit_tensors,
 )
 from dyntorch.geometry.homogeneous import unit_vectors
 from dyntorch.numerics.blocks import constant, map_blocks
@@ -44,7 +44,7 @@ def projections_of(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int])
     r"""Projections of the Grassmann tensor nearest to T: :math:`\max_M \langle A(M), T \rangle^2 / (|A(M)|^2 |T|^2)`."""
     check(tensor, profile, sizes)
     batch = tensor.shape[: tensor.ndim - len(sizes)]
-    scaled, sound = unit_tensors(tensor.reshape(prod(batch), *tensor.shape[len(batch) :]))
+    scaled, sound = normalize_tensors(tensor.reshape(prod(batch), *tensor.shape[len(batch) :]))
     # in turned images no minor vanishes for all projections of a kind, as many do for [I | 0]
     table = tables(tuple(profile), tuple(sizes), 1, tensor.device)
     target = rotate_tensors(scaled, table.compounds)[0]

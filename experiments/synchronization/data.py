@@ -18,12 +18,16 @@ from torch import Generator, Tensor
 from experiments.common.real_data import Take, takes
 
 
-def periodic_pair(joints: Tensor, generator: Generator, **settings: Any) -> Pair:
-    """Two cameras around a person who repeats .8 to 1.4 s of a take in place, exactly."""
+def _film_motion(motion: Motion, generator: Generator, settings: dict[str, Any]) -> Pair:
+    """The two cameras, at a random shift."""
     filming = Filming(**settings)
-    motion = periodic_motion(joints, generator)
     largest = filming.max_shift / filming.rates[0]
     return filmed(motion, draw(-largest, largest, generator), filming, generator)
+
+
+def periodic_pair(joints: Tensor, generator: Generator, **settings: Any) -> Pair:
+    """Two cameras around a person who repeats .8 to 1.4 s of a take in place, exactly."""
+    return _film_motion(periodic_motion(joints, generator), generator, settings)
 
 
 def periodic_motion(joints: Tensor, generator: Generator) -> Motion:
@@ -48,10 +52,7 @@ def periodic_motion(joints: Tensor, generator: Generator) -> Motion:
 
 def still_pair(joints: Tensor, generator: Generator, **settings: Any) -> Pair:
     """Two cameras around a person who stands as in one frame of a take and sways by 3 mm."""
-    filming = Filming(**settings)
-    motion = still_motion(joints, generator)
-    largest = filming.max_shift / filming.rates[0]
-    return filmed(motion, draw(-largest, largest, generator), filming, generator)
+    return _film_motion(still_motion(joints, generator), generator, settings)
 
 
 def still_motion(joints: Tensor, generator: Generator) -> Motion:
