@@ -12,7 +12,7 @@ from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.matches import check_plain, check_views
 from dyntorch.numerics.arguments import FARTHEST
 from dyntorch.numerics.blocks import select
-from dyntorch.numerics.function_transforms import over_problems
+from dyntorch.numerics.function_transforms import is_transformed, over_problems
 from dyntorch.numerics.least_squares import by_match, flatten_parts, parts_of
 
 SINGULAR = 1e-14  # squared gradient, in normalized units, added where value and gradient vanish together (static points)
@@ -84,15 +84,17 @@ def sampson(invariant: Invariant | type[Invariant], tensor: Tensor, *views: Tens
     invariant, views = as_invariant(invariant).bind_arguments(views, **given)
     _check(invariant, tensor, views)
     views, missing = _mask_missing(invariant, views)
+    ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
     if invariant.single():
-        ones = (torch.ones((), dtype=tensor.dtype, device=tensor.device),) * len(views)
         return _infinite(multilinear(invariant, tensor, views, ones).abs(), missing)
+    if not is_transformed(tensor, views):
+        return _infinite(distance(invariant, invariant.motion_of(tensor), views, ones), missing)
     check_plain(invariant)
-    return _infinite(_distance_by_motion(invariant, tensor, views, missing.shape[:-1]), missing)
+    return _infinite(_distance_by_problem(invariant, tensor, views, missing.shape[:-1]), missing)
 
 
-def _distance_by_motion(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor], batch: torch.Size) -> Tensor:
-    """Distances ``(*batch, n)``, within ``torch.func`` too: how a tensor decomposes is decided by its values."""
+def _distance_by_problem(invariant: Invariant, tensor: Tensor, views: Sequence[Tensor], batch: torch.Size) -> Tensor:
+    """Distances ``(*batch, n)`` within ``torch.func``: how a tensor decomposes is decided by its values."""
     axes = len(invariant.shape()) + (invariant.nullity > 1) + (invariant.copies is not None)
     full_batch = torch.broadcast_shapes(batch, tensor.shape[: tensor.ndim - axes])
     places = [p.match_axis(x) for p, x in zip(invariant.primitives, views, strict=True)]

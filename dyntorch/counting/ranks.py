@@ -198,13 +198,11 @@ def capacities(name: str, *, only: Sequence[str] = (), seed: int = 0, **settings
         given: dict[str, Any] = {option: (1,) if isinstance(default, tuple) else 1}
         if option != usual:
             given[usual] = None
-        result.append(
-            max((_capacity(name, configure, prime, option, given | settings, seed) for prime in PRIMES), key=lambda c: c.rank)
-        )
+        result.append(max((_capacity(configure, prime, option, given | settings, seed) for prime in PRIMES), key=lambda c: c.rank))
     return tuple(result)
 
 
-def _capacity(name: str, configure: Configuration, prime: int, option: str, given: dict[str, Any], seed: int) -> Capacity:
+def _capacity(configure: Configuration, prime: int, option: str, given: dict[str, Any], seed: int) -> Capacity:
     steps = configure(Field(prime, [seed, prime]), **given)
     usual = steps[-1]
     # of defaults, such as the other body's matches, none

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -23,7 +23,6 @@ ATTEMPTS = 200
 ALONG = 8
 """Draws of points until a body that is seen has its number of tracks."""
 
-Light = Literal["day", "night"]
 
 CAR_TRACK_SHARE = (0.035, 0.25)  # share of the tracks that one car has, from and to
 MAX_DENSITY = 25.0  # tracks that a car has at most per 1000 square pixels where it is largest, of 500 in all

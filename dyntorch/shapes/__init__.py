@@ -1,8 +1,7 @@
 """Shapes of points seen by uncalibrated cameras, every view by another one: standing still (``static``), or moving in time.
 
 ``basis`` says how a point may move, ``moving`` finds the shapes, ``times`` when a new view was taken; ``projective`` does both for
-perspective views, ``lifted`` is of shapes of P^k; ``deformable`` finds shapes that deform in unknown ways, before two cameras;
-``theory`` holds what the thesis proves of dynamic shape tensors and nothing else needs.
+perspective views, ``lifted`` is of shapes of P^k; ``deformable`` finds shapes that deform in unknown ways, before two cameras.
 """
 
 from __future__ import annotations

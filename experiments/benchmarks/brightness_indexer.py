@@ -3,9 +3,9 @@
     python -m experiments.benchmarks.brightness_indexer
 
 Needs no recordings: the exemplars are random descriptors, laid out as learned ones (each frame twice, see
-:func:`indexing.brightness.stream.learned`), and the video is a moving texture.  One thread; processor time of this process, and the
-fastest of several rounds: others at work slow the caches down.  ``file`` scores an array in chunks of 32 frames; ``live`` pushes
-single frames.  Mirrored exemplars double the library.
+:func:`indexing.brightness.stream.build_library`), and the video is a moving texture. One thread; processor time of this process,
+and the fastest of several rounds: others at work slow the caches down. ``file`` scores an array in chunks of 32 frames; ``live``
+pushes single frames. Mirrored exemplars double the library.
 """
 
 from __future__ import annotations

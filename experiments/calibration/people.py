@@ -2,7 +2,7 @@
 
     DYNTORCH_DATA=... python -m experiments.calibration.people
 
-Virtual rigs (:mod:`experiments.calibration.rigs`, :mod:`experiments.calibration.people`): motion capture on paths that cross, 300
+Virtual rigs (:mod:`experiments.calibration.rigs`): motion capture on paths that cross, 300
 frames at 30 fps, focal lengths of 1100 to 1800 px, 6 px of heavy-tailed noise, 10 % of the joints missing, clocks unknown (up to 25
 frames of 60 fps apart); every tracker has numbers of its own and exchanges two people in half of the encounters in which their
 boxes overlap.  *Hidden*: the one behind is not found while more than half of the box is covered.  *False*: share of the frames in

@@ -2,7 +2,8 @@
 
 Any other settings (``--quick``, fewer scenes) leave the page as it is.  A script that has no page gets one at its first run.
 
-``python -m experiments.common.results [ROOM...]`` runs the commands of all pages, or of those of some rooms, one after the other.
+``python -m experiments.common.results [ROOM...]`` runs the commands of all pages but those of
+``benchmarks``, or of those of some rooms, one after the other.
 """
 
 from __future__ import annotations
@@ -126,12 +127,18 @@ def _cpuinfo() -> str:
 
 
 def run_pages(rooms: Sequence[str]) -> None:
-    """Run the command of every page, or of the pages of some rooms."""
+    """Run the command of every page of some rooms; without rooms of all but ``benchmarks``, which is timed."""
+    failed = []
     for page in sorted(RESULTS.glob("*.md")):
         stated = COMMAND.search(page.read_text(encoding="utf-8").partition(MARK)[0])
-        if stated and (not rooms or stated["module"].split(".")[1] in rooms):
+        room = stated["module"].split(".")[1] if stated else ""
+        if stated and (room in rooms if rooms else room != "benchmarks"):
             print(f"... {page.stem}", file=sys.stderr, flush=True)
-            subprocess.run([sys.executable, "-m", stated["module"], *shlex.split(stated["words"])], check=False)
+            command = [sys.executable, "-m", stated["module"], *shlex.split(stated["words"])]
+            if subprocess.run(command, check=False).returncode:
+                failed.append(page.stem)
+    if failed:
+        raise SystemExit(f"not all went through: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

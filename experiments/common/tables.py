@@ -30,10 +30,9 @@ class Row:
         return self.measured <= self.goal if self.at_most else self.measured >= self.goal
 
 
-def markdown(rows: Sequence[Row], title: str = "") -> str:
-    """The rows as a Markdown table, ready for the README."""
-    text = aligned(("task", "setting", "measured", "goal", "reached"), [_cells(row) for row in rows])
-    return f"\n### {title}\n\n{text}" if title else text
+def markdown(rows: Sequence[Row]) -> str:
+    """The rows as a Markdown table."""
+    return aligned(("task", "setting", "measured", "goal", "reached"), [_cells(row) for row in rows])
 
 
 def aligned(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

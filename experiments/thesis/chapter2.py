@@ -12,13 +12,11 @@ import dyntorch as dyn
 from experiments.thesis.definitions import (
     apart,
     collineations,
-    homogeneous,
     lines_through,
     mapped,
+    matrix_rank,
     normal,
     on_lines,
-    products,
-    rank,
     seeded,
 )
 from experiments.thesis.statements import Chapter, Finding
@@ -34,11 +32,6 @@ def scene(points: Tensor, draw: torch.Generator) -> tuple[tuple[Tensor, ...], Te
     A, B = collineations(2, 2, draw)
     views = points[0], mapped(points[1], torch.linalg.inv(A)), mapped(points[2], torch.linalg.inv(B))
     return views, A, B
-
-
-def matrix_rank(views: tuple[Tensor, ...]) -> int:
-    """Of the estimation matrix, from its definition."""
-    return rank(products(*(homogeneous(view) for view in views)))
 
 
 def on_given_lines(counts: list[int], draw: torch.Generator) -> Tensor:

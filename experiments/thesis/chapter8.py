@@ -13,6 +13,7 @@ from experiments.thesis.definitions import (
     homogeneous,
     inhomogeneous,
     mapped,
+    matrix_rank,
     normal,
     on_lines,
     products,
@@ -32,11 +33,6 @@ def scene(points: Tensor, draw: torch.Generator) -> tuple[tuple[Tensor, ...], Te
     """Three measurements of points ``(3, n, 3)`` by a sensor that moves, and the collineations A, B to the first."""
     A, B = collineations(2, 3, draw)
     return (points[0], mapped(points[1], torch.linalg.inv(A)), mapped(points[2], torch.linalg.inv(B))), A, B
-
-
-def matrix_rank(views: tuple[Tensor, ...]) -> int:
-    """Of the estimation matrix, from its definition."""
-    return rank(products(*(homogeneous(view) for view in views)))
 
 
 @CHAPTER.states("8, p. 99", "five matches of static points are sufficient for a collineation; a rigid motion follows from an SVD")

@@ -58,6 +58,11 @@ def products(*factors: Tensor) -> Tensor:
     return rows
 
 
+def matrix_rank(views: tuple[Tensor, ...]) -> int:
+    """Of the estimation matrix of points, from its definition."""
+    return rank(products(*(homogeneous(view) for view in views)))
+
+
 def rotation(angles: Tensor) -> Tensor:
     """Of three angles, about the axes in turn."""
     skew = torch.zeros(3, 3, 3, dtype=torch.float64)

@@ -17,6 +17,7 @@ from indexing.joints import canonical, has_names
 from indexing.opening import listing
 from indexing.remarks import describe_issues, is_normalized, same_clips
 from indexing.skeleton import Skeleton, usual_layout
+from indexing.sync.people import MIN_COMMON_JOINTS
 from indexing.sync.recordings import Take
 from indexing.video.reading import probe
 
@@ -25,7 +26,6 @@ Size = tuple[int, int]
 
 MAX_CAMERAS = 8  # two at least
 MIN_FRAMES = 12  # of each camera that show somebody: what clocks are estimated from
-MIN_SHARED_JOINTS = 8  # that a camera shares with another one, as for two layouts in synchronize
 PICTURE_MARGIN = 0.1  # of width or height; detectors guess cut-off joints up to .05 outside (RTMPose)
 MAX_OUTSIDE_SHARE = 0.05  # of the joints beyond that margin before the size is wrong
 MAX_CLOCK_SPAN = 20.0  # times its frames that a recording's clock may run over
@@ -126,12 +126,12 @@ def _match_joint_names(layouts: Sequence[Skeleton], names: Sequence[str]) -> Joi
     kept = [word for word in called if sum(word in own for own in words) > 1]
     for name, own, layout in zip(names, words, layouts, strict=True):
         most = max(len(own.keys() & other.keys()) for other in words if other is not own)
-        if most < MIN_SHARED_JOINTS:
+        if most < MIN_COMMON_JOINTS:
             text = (
                 "{name}: its joints ({own}) share {most} names with those of any other camera, and {needed} are needed; "
                 "use files of one kind of pose estimator"
             )
-            raise ValueError(Message(text, name=name, own=listing(layout.joints), most=most, needed=MIN_SHARED_JOINTS))
+            raise ValueError(Message(text, name=name, own=listing(layout.joints), most=most, needed=MIN_COMMON_JOINTS))
     index = {word: i for i, word in enumerate(kept)}
     bones: dict[tuple[int, int], None] = {}
     for layout in layouts:

@@ -25,7 +25,7 @@ GhostReason = Literal["too short", "too few joints", "at one place"]
 
 
 MIN_SHARE = 0.5  # of the recording: whoever is in view for so much of it is a person, however short the recording
-MIN_JOINTS = 3  # seen in half the frames: of fewer nothing can be compared (indexing.action.bank.COMMON)
+MIN_JOINTS = 3  # seen in half the frames: of fewer nothing can be compared (indexing.action.bank.MIN_SHARED_JOINTS)
 MIN_ABSENCE = 1.0  # seconds out of view, from which on a person has left; detectors lose a person for less
 MAX_RETURN_DISTANCE = 1.0  # box diagonals between where one left and another appears: there it may be the same
 MAX_JUMP = 0.5  # box diagonals from one frame to the next: the reader's reach for one person

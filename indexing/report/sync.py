@@ -102,7 +102,7 @@ class Compared:
     @property
     def offset_at_center(self) -> float:
         """Seconds between the clocks in the middle of the overlap."""
-        return float(self.shift.at(self.shift.center)) - self.shift.center
+        return self.pairing.offset_at_center
 
     @property
     def wrong(self) -> list[str]:

@@ -35,6 +35,11 @@ POSE_FOLDER = "pose-sync"
 NEAR = 0.5 + 1e-6  # frames: no other frame is nearer
 
 
+def count_repeated(rows: NDArray[np.int64]) -> int:
+    """How many of the frames ``(n,)`` stand more than once."""
+    return len(rows) - len(np.unique(rows))
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """Which frame of a camera stands for which moment of the reference. numbers ``(k,)``, rows ``(k,)``."""
@@ -48,7 +53,7 @@ class Plan:
     @property
     def num_repeated(self) -> int:
         """How many frames stand for more than one moment."""
-        return len(self.rows) - len(np.unique(self.rows))
+        return count_repeated(self.rows)
 
     @property
     def shift(self) -> int | None:

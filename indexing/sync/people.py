@@ -27,6 +27,11 @@ class Pairing:
     rivals: tuple[float, ...] = ()
     sound: Shift | None = None
 
+    @property
+    def offset_at_center(self) -> float:
+        """Seconds between the clocks in the middle of the overlap."""
+        return float(self.shift.at(self.shift.center)) - self.shift.center
+
 
 NUM_THOROUGH_PAIRINGS = 3  # Pairings that are tried thoroughly where a fast look accepts none.
 
@@ -71,13 +76,9 @@ OFFSET_TOLERANCE_SIGMAS = 3  # beside the sum of their standard deviations times
 
 def contradict(one: Pairing, other: Pairing, frame: float) -> bool:
     """Whether two answers differ by more than what both leave open."""
-    return abs(_middle(one) - _middle(other)) > OFFSET_TOLERANCE_FRAMES * frame + OFFSET_TOLERANCE_SIGMAS * (
+    return abs(one.offset_at_center - other.offset_at_center) > OFFSET_TOLERANCE_FRAMES * frame + OFFSET_TOLERANCE_SIGMAS * (
         one.shift.sigma + other.shift.sigma
     )
-
-
-def _middle(pairing: Pairing) -> float:
-    return float(pairing.shift.at(pairing.shift.center)) - pairing.shift.center
 
 
 def person_label(take: Take, index: int) -> str:
@@ -95,7 +96,7 @@ def decide(found: Sequence[Pairing], frame: float) -> tuple[Pairing, tuple[float
     ranked = sorted(found, key=lambda pairing: (-behind[id(pairing)], -pairing.shift.confidence))
     best = ranked[0]
     rivals = [
-        _middle(pairing)
+        pairing.offset_at_center
         for pairing in ranked[1:]
         if behind[id(pairing)] >= max(1, behind[id(best)])
         and pairing.shift.confidence >= MIN_CONFIDENCE_RATIO * best.shift.confidence

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from indexing.files import recover_folder, replacing_folder
 from indexing.opening import entries, parse_json, read_text
-from indexing.sync.files import check_inputs, not_ours
+from indexing.sync.files import check_inputs, count_repeated, not_ours
 from indexing.sync.recordings import Take, videos_named
 from indexing.video.drawing import ClockRelation, add_video_stream
 from indexing.video.reading import Orientation, av, frame_times, orientation, read_video
@@ -60,7 +60,7 @@ class Cut:
     @property
     def num_repeated(self) -> int:
         """How many frames stand for more than one moment."""
-        return len(self.rows) - len(np.unique(self.rows))
+        return count_repeated(self.rows)
 
     @property
     def left_out(self) -> int:

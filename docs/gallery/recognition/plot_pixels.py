@@ -11,11 +11,11 @@ import numpy as np
 
 from indexing import BrightnessIndexer
 from indexing.actors import Person, dataset
-from indexing.actors.textured import film
+from indexing.actors.textured import render_clip
 
 ACTIONS = ["squat", "jumping_jack", "kick"]
 solid = [dataset([Person.random(person)], ACTIONS, azimuth=None, fps=15.0, rng=person) for person in (1, 2)]
-shown, asked = ([film(clip, azimuth=0, rng=i + 10 * k) for i, clip in enumerate(clips)] for k, clips in enumerate(solid))
+shown, asked = ([render_clip(clip, azimuth=0, rng=i + 10 * k) for i, clip in enumerate(clips)] for k, clips in enumerate(solid))
 indexer = BrightnessIndexer(fps=15.0).fit(shown, ACTIONS)
 print(indexer.predict(asked))
 

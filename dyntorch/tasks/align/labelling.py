@@ -226,11 +226,12 @@ class Evidence:
         return Labelled(theta, labels, sigma)
 
 
-def without_failures(refined: Solution, status: Tensor, labels: Tensor, worst: Tensor) -> Solution:
-    """The solution with its status and inliers; zero where there is none."""
+def without_failures(refined: Solution, status: Tensor, labels: Tensor, worst: Tensor) -> tuple[Solution, Tensor]:
+    """The solution with its status and inliers, zero where there is none, and the labels, all outliers there."""
     none = is_failure(status)
+    labels = torch.where(none[:, None], OUTLIER, labels)
     assert refined.sigma is not None and refined.covariance is not None
-    return replace(
+    solution = replace(
         refined,
         status=status,
         tensor=select(~none, refined.tensor, 0.0),
@@ -240,6 +241,7 @@ def without_failures(refined: Solution, status: Tensor, labels: Tensor, worst: T
         uncertainty=torch.where(none, 0.0, worst),
         inliers=labels != OUTLIER,
     )
+    return solution, labels
 
 
 def trajectory_lines(evidence: Evidence, best: Labelled, most: int) -> Tensor:

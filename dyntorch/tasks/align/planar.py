@@ -527,8 +527,8 @@ def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tupl
     tensor = tensor_rank(evidence.data.restrict(labels != OUTLIER), evidence, best.sigma)
     free = (worst > MAX_DEVIATION) | is_undecided(evidence, best, tensor)
     status = _status(evidence, best, refined.sigma, free, values[:, 0] <= MIN_INFORMATION * values[:, -1])
-    labels = torch.where(is_failure(status)[:, None], OUTLIER, labels)
-    return without_failures(refined, status, labels, worst), replace(best, labels=labels), tensor
+    solution, labels = without_failures(refined, status, labels, worst)
+    return solution, replace(best, labels=labels), tensor
 
 
 def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor) -> Tensor:

@@ -163,8 +163,7 @@ def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
     status = _status(evidence, replace(best, labels=labels), worst, values[:, 0] <= MIN_INFORMATION * values[:, -1])
-    labels = torch.where(is_failure(status)[:, None], OUTLIER, labels)
-    return without_failures(refined, status, labels, worst), labels, worst
+    return *without_failures(refined, status, labels, worst), worst
 
 
 def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Tensor) -> Tensor:

@@ -232,14 +232,17 @@ def status_of_alignment(ambiguous: Tensor, accident: Tensor, undetermined: Tenso
 
 
 def alignment_of(
-    data: Matches, status: Tensor, motion: Sequence[Tensor], labels: Tensor, sigma: Tensor, covariance: Tensor, **more: Any
-) -> Alignment:
-    """The result of a flat batch in the caller's; zero, and all matches outliers, where there is no motion."""
+    data: Matches, status: Tensor, motion: Sequence[Tensor], labels: Tensor, sigma: Tensor, covariance: Tensor,
+    velocities: Tensor | None = None, **more: Any,
+) -> Alignment:  # fmt: skip
+    """The result of a flat batch in the caller's; zero, and all matches outliers without velocity, where there is no motion."""
     none = is_failure(status)
 
     def back(value: Tensor) -> Tensor:
         return data.back(torch.where(none[(..., *[None] * (value.ndim - 1))], torch.zeros_like(value), value))
 
+    if velocities is not None:
+        velocities = back(torch.where((labels == OUTLIER)[..., None], 0.0, velocities))
     A, *others = map(back, motion)
     return Alignment(
         A=A,
@@ -248,6 +251,7 @@ def alignment_of(
         status=data.back(status),
         sigma=back(sigma),
         covariance=back(covariance),
+        velocities=velocities,
         **more,
     )
 

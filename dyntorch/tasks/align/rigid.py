@@ -443,7 +443,7 @@ def _result(
     velocities = None
     if motion == "constant_velocity":
         u, _, _, _ = combinations(found.motions, sightings)
-        velocities = data.back(torch.where((labels == OUTLIER)[..., None], 0.0, -u / 2**0.5 / scale[:, None, None]))
+        velocities = -u / 2**0.5 / scale[:, None, None]
     return alignment_of(
         data,
         status,

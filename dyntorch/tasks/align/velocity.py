@@ -230,7 +230,6 @@ def align_velocity(
     worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
     status = _status(evidence, state, worst, extent[:, 0] <= MIN_INFORMATION * extent[:, 1], found, affine)
     none = is_failure(status)
-    velocities = world_velocities(evidence, state.theta)
     return alignment_of(
         data,
         status,
@@ -240,7 +239,7 @@ def align_velocity(
         covariance,
         ambiguity=AMBIGUITY,
         notices=_notices(evidence, state, worst, none, affine, data.batch, options),
-        velocities=data.back(torch.where((state.labels == OUTLIER)[..., None], 0.0, velocities)),
+        velocities=world_velocities(evidence, state.theta),
     )
 
 

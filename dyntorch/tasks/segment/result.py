@@ -133,7 +133,7 @@ class BodySegmentation(Outcome):
         parts: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
         for name, value in parts.items():
             if isinstance(value, Tensor) and value.is_floating_point():
-                parts[name] = value.nan_to_num(nan=0.0).to(dtype)
+                parts[name] = torch.where(value.isnan(), 0.0, value).to(dtype)
         return replace(self, **parts)
 
     def __repr__(self) -> str:

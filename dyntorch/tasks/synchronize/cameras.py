@@ -451,7 +451,7 @@ def combine_shifts(shifts: Mapping[tuple[int, int], Shift], cameras: int, refere
     here = net.ends[used, 0]
     center = float((net.times[used, 0] / rates[here] - best.starts[here]).mean()) if used else 0.0
     table = _pairs(net, shifts, best)
-    cycles = _cycles(net, shifts, best, table)
+    cycles = _cycles(net, shifts, table)
     refusal = _refusal(net, shifts, best, rivals, reference)
     limits = (*(() if refusal is None else (refusal,)), *_notices(table, cameras, shifts))
     return Clocks(
@@ -501,7 +501,7 @@ def _pairs(net: Network, shifts: Mapping[tuple[int, int], Shift], best: Reading)
 
 
 def _cycles(
-    net: Network, shifts: Mapping[tuple[int, int], Shift], best: Reading, table: Sequence[Pair]
+    net: Network, shifts: Mapping[tuple[int, int], Shift], table: Sequence[Pair]
 ) -> list[tuple[tuple[int, int, int], float]]:
     """What is missing after going round each triangle of pairs that are used, in seconds."""
     step: dict[tuple[int, int], tuple[float, float]] = {}  # rate and offset of one clock against another

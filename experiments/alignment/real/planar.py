@@ -40,6 +40,7 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch.geometry.homogeneous import apply
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment
+from experiments.alignment.real.solvers import listed, median
 from experiments.common.real_data import Board, Traffic, board, traffic
 from experiments.common.runner import BaseConfig, Tables, experiment
 from experiments.common.tables import Row
@@ -124,9 +125,7 @@ def traffic_rows(sequences: list[Traffic], config: Config) -> list[Row]:
         kinds += f"cars outlier {mean([one.share(OUTLIER, cars) for one in found]):.3f}"
         sigma, error = mean([float(one.result.sigma) for one in found]), mean([one.error for one in found])
         figures = f"sigma {sigma:.2f} px, error of the background {error:.2f} px"
-        rows.append(
-            Row(sequence.name, f"{points}; {kinds}; {figures}; {_listed(states)}; {_listed(codes)}; labels right", accuracy)
-        )
+        rows.append(Row(sequence.name, f"{points}; {kinds}; {figures}; {listed(states)}; {listed(codes)}; labels right", accuracy))
     return rows
 
 
@@ -154,9 +153,7 @@ def share_rows(sequences: list[Traffic], config: Config) -> list[Row]:
             theirs.append(transfer(ransac(tuple(x[keep] for x in one.views), config.threshold), one.views, one.background))
         for name, values in (("align_planar", ours), ("homography, RANSAC", theirs)):
             setting = f"{share:.0%} of the background, median of {len(values)} sequences"
-            rows.append(
-                Row(name, setting + (f"; {_listed(states)}" if name == "align_planar" else ""), _median(values), unit=" px")
-            )
+            rows.append(Row(name, setting + (f"; {listed(states)}" if name == "align_planar" else ""), median(values), unit=" px"))
     return rows
 
 
@@ -235,14 +232,6 @@ def board_rows(seen: Board, config: Config) -> list[Row]:
             )
             rows.append(Row(kind, setting + "; median where OK", float(ok.median()) if len(ok) else float("inf"), unit=" px"))
     return rows
-
-
-def _median(values: list[float]) -> float:
-    return float(torch.tensor(values).median())
-
-
-def _listed(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
 
 
 @experiment(Config())

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,9 +27,6 @@ from indexing.calibrate.people.pair_geometry import (
     synchronize_tracklets,
 )
 from indexing.calibrate.people.tracklets import Booleans, Floats, Integers, Tracklets, cluster, exchange
-
-if TYPE_CHECKING:
-    from dyntorch import Clocks
 
 Pair = tuple[int, int]
 

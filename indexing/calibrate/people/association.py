@@ -28,9 +28,9 @@ from indexing.calibrate.people.tracklets import Booleans, CameraSightings, Float
 from indexing.clip import Clip
 from indexing.joints import has_names, places
 from indexing.skeleton import Skeleton
+from indexing.sync.people import MIN_COMMON_JOINTS
 from indexing.sync.recordings import Take
 
-MIN_COMMON_JOINTS = 8  # of the same name in all cameras, as in synchronize
 MAX_SPLITS = 3  # times that tracklets are split where other cameras see two people in them
 MIN_REPORTED_SHARE = 0.02  # of the detections that are nobody
 MAX_LISTED_TIMES = 4  # in a notice
@@ -176,7 +176,7 @@ def _clock_table(clocks: Clocks | ArrayLike, cameras: int) -> Floats:
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# What is returned.
+# Putting the result together.
 
 
 def _result(

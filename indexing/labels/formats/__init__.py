@@ -1,1 +1,1 @@
-"""One file or room a format of labels: it declares ``FORMAT`` (:class:`indexing.labels.label.LabelFormat`)."""
+"""One file or room a format of labels: it declares ``FORMAT`` (:class:`indexing.labels.format.LabelFormat`)."""
