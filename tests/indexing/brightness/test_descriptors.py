@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from indexing.brightness.descriptors import (
+    FEW_FRAMES,
     GRADIENT_EPSILON,
     MIN_CHANGE,
     SOFT_NORM,
@@ -13,8 +14,10 @@ from indexing.brightness.descriptors import (
     MotionMaps,
     as_grey,
     blur,
+    blur_small,
     describe_cells,
     gradients,
+    inner_gradients,
     mirror_rows,
     pool_cells,
     profile,
@@ -72,6 +75,14 @@ def test_maps_do_not_know_the_sign_of_the_contrast():
     torch.testing.assert_close(
         MotionMaps(SIGMA, QUIET).push(1 - frames)[0], MotionMaps(SIGMA, QUIET).push(frames)[0], atol=1e-5, rtol=1e-4
     )
+
+
+def test_tables_are_kornias():
+    for count in (3, FEW_FRAMES + 2, FEW_FRAMES + 3):
+        frames = video(count)
+        torch.testing.assert_close(blur_small(frames, SIGMA), blur(frames, SIGMA))
+        for part, expected in zip(inner_gradients(frames), gradients(frames), strict=True):
+            torch.testing.assert_close(part, expected[1:-1])
 
 
 def slow_box(change):
