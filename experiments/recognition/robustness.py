@@ -70,11 +70,22 @@ def accuracies(rendered: Rendered, kinds: Sequence[str], method: Method, seed: i
         learned = contender(method, seed)()
         learned.fit([rendered.exemplars[i] for i in train], rendered.labels[train])
         queries = [clips[i] for views in asked.values() for clips in views.values() for i in test]
-        answers = np.asarray(learned.predict(queries)).reshape(len(asked), len(rendered.queries), len(test))
+        answers = answered(learned, queries).reshape(len(asked), len(rendered.queries), len(test))
         for key, one in zip(asked, answers, strict=True):
             right[key] += np.sum(one == rendered.labels[test], axis=1)
     count = len(rendered.labels)
     return {kind: np.array([right[kind, amount] / count for amount in KINDS[kind][2]]) for kind in kinds}
+
+
+def answered(learned: protocol.Classifier, queries: Sequence[Clip]) -> Array:
+    """Labels; a query that the method refuses (with most frames dropped it is no longer one performance) has none, and is wrong."""
+    try:
+        return np.asarray(learned.predict(queries))
+    except ValueError:
+        if len(queries) == 1:
+            return np.array([None])
+        half = len(queries) // 2
+        return np.concatenate([answered(learned, queries[:half]), answered(learned, queries[half:])])
 
 
 def measure(clips: ClipSet, config: Config) -> dict[Method, dict[str, Array]]:
