@@ -231,6 +231,9 @@ def test_repr_says_what_matters():
     scene = scenes.translating_planes(3, 0, shared=2, batch=2, generator=draw(18))
     text = repr(translating_planes(scene.homographies))
     assert text.startswith("TranslatingPlanes(planes=3, bodies=0, batch=(2,): ") and "shared_body: 2 of 2 problems" in text
+    for planes, shared, said in ((4, 2, False), (3, 3, True)):
+        found = translating_planes(scenes.translating_planes(planes, shared=shared, generator=draw(38)).homographies)
+        assert ("three planes do not suffice then" in repr(found)) is said
 
 
 @pytest.mark.parametrize(
@@ -264,18 +267,17 @@ def test_repr_says_what_matters():
         ({"body_matches": (torch.ones(2, 9, 2),)}, "body_matches must be two views, .* got 1: Tensor"),
         ({"body_matches": (torch.ones(2, 9, 2), None)}, "body_matches must be two views, .* got 2: Tensor, NoneType"),
         ({}, "needs H"),
+        (
+            {"H": torch.ones(3, 3, 3), "fundamentals": torch.ones(1, 3, 3)} | dict.fromkeys(("x1", "x2"), torch.ones(3, 9, 2)),
+            "planes or of the bodies only",
+        ),
+        ({"H": torch.ones(3, 3, 3), "options": {}}, r"options must be PlanesOptions, got \{\}; use dataclasses\.replace"),
     ],
 )
 def test_misuse_is_refused_in_one_line(arguments, message):
     with pytest.raises(ValueError, match=message) as raised:
         translating_planes(**arguments)
     assert "\n" not in str(raised.value)
-
-
-def test_matches_of_planes_alone_are_refused_beside_bodies():
-    scene = scenes.translating_planes(3, 1, generator=draw(19))
-    with pytest.raises(ValueError, match="planes or of the bodies only"):
-        translating_planes(scene.homographies, fundamentals=scene.body_fundamentals, x1=scene.x1, x2=scene.x2)
 
 
 def test_nonsense_gets_a_status():
@@ -318,8 +320,3 @@ def test_options_decide():
     assert away[1] < 0.2 * away[0]
     careful = translating_planes(**matches, options=replace(shipped, risk=1e-6))
     assert float(careful.uncertainty) > float(translating_planes(**matches).uncertainty)
-
-
-def test_options_are_of_the_verb():
-    with pytest.raises(ValueError, match=r"options must be PlanesOptions, got \{\}; use dataclasses\.replace"):
-        translating_planes(torch.eye(3).expand(3, 3, 3), options={})

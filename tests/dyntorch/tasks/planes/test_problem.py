@@ -95,13 +95,6 @@ def test_the_cost_of_matches_is_the_least_correction_in_pixels():
     assert torch.allclose(cost, least, rtol=1e-2)
 
 
-def test_layout_packs_and_unpacks():
-    theta = torch.arange(2 * LAYOUT.size, dtype=F64).unflatten(0, (2, -1))
-    infinity, epipoles, planes = LAYOUT.unpack(theta)
-    assert infinity.shape == (2, 3, 3) and epipoles.shape == (2, 5, 3) and planes.shape == (2, 3, 4)
-    assert torch.equal(LAYOUT.pack(infinity, epipoles, planes), theta)
-
-
 def test_projected_is_the_covariance_of_unit_vectors():
     vector = torch.randn(5, generator=draw(2), dtype=F64)
     root = 1e-4 * torch.randn(5, 5, generator=draw(3), dtype=F64)

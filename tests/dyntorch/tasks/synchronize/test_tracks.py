@@ -69,13 +69,10 @@ def test_gaps_and_places_beyond_the_take_have_no_weight():
     _, _, sure = smooth_at(tracks_of(x), at, 1 / 30)
     assert (sure > 0).tolist() == [[False, False], [True, True], [True, False], [True, True], [False, False]]
     assert torch.allclose(sure[1], torch.ones(2, dtype=torch.float64), atol=0.01)
-
-
-def test_weights_are_those_of_the_frames_near_by():
+    # and elsewhere that of the frames near by
     weights = torch.full((40, 1), 0.25)
     weights[20:] = 0.75
-    at = torch.tensor([0.3, 1.0], dtype=torch.float64)
-    _, _, sure = smooth_at(tracks_of(torch.zeros(40, 1, 2), weights=weights), at, 1 / 30)
+    _, _, sure = smooth_at(tracks_of(torch.zeros(40, 1, 2), weights=weights), torch.tensor([0.3, 1.0]).double(), 1 / 30)
     assert sure[:, 0].tolist() == pytest.approx([0.25, 0.75], rel=0.02)
 
 
@@ -135,18 +132,12 @@ def test_missing_positions_and_weights_of_zero_are_the_same():
     cut = remove_positions(tracks_of(x), weights == 0)
     assert torch.equal(cut.x, one.x) and torch.equal(cut.weights, one.weights)
     assert torch.equal(one.only(torch.tensor([True, False, True])).x, one.x[:, [0, 2]])
-
-
-def test_times_are_the_frames_or_those_given():
     assert torch.allclose(tracks_of(torch.zeros(4, 1, 2), 25.0).times, torch.tensor([0, 0.04, 0.08, 0.12], dtype=torch.float64))
     found = tracks_of(torch.zeros(4, 1, 2), times=torch.tensor([5.0, 5.1, 5.2, 5.5]))
     assert found.step == pytest.approx(0.1, rel=1e-5) and found.times[0] == 5
 
 
-GOOD = torch.zeros(5, 2, 2)
-
-
-RISING = torch.arange(5.0)
+GOOD, RISING = torch.zeros(5, 2, 2), torch.arange(5.0)
 
 
 @pytest.mark.parametrize(
@@ -238,21 +229,14 @@ def test_what_scale_the_picture_has_does_not_matter():
     assert torch.equal(one.weights, two.weights)
 
 
-def test_a_take_of_a_few_frames_is_left_alone():
-    x = torch.randn(5, 2, 2, generator=seeded())
-    assert torch.equal(reject_outliers(tracks_of(x)).weights, tracks_of(x).weights)
-
-
-def test_weights_that_were_given_are_kept():
+def test_what_outliers_have_no_say_in():
+    few = torch.randn(5, 2, 2, generator=seeded())
+    assert torch.equal(reject_outliers(tracks_of(few)).weights, tracks_of(few).weights)
     x = filmed_person(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
     weights = torch.rand(60, 5, generator=seeded(5), dtype=torch.float64)
-    after = reject_outliers(read_tracks("a", x, 30.0, None, weights))
+    after = reject_outliers(tracks_of(x, weights=weights))
     kept = after.weights > 0
     assert torch.equal(after.weights[kept], weights[kept])
-
-
-def test_a_point_never_seen_does_no_harm():
-    x = filmed_person(5, seconds=2.0, noise=1.0, generator=seeded(4)).a
     x[:, 2] = torch.nan
     after = reject_outliers(tracks_of(x))
     assert not after.weights[:, 2].any() and after.x.isfinite().all()
@@ -263,12 +247,7 @@ def test_a_point_never_seen_does_no_harm():
 
 
 def scene(**more):
-    return filmed_person(11, seconds=4.0, generator=torch.Generator().manual_seed(0), **more)
-
-
-def test_medians_of_every_frame_are_nought():
-    found = scale_frames(tracks_of(scene(noise=1.0).a))
-    assert torch.allclose(found.x.median(1).values, torch.zeros(120, 2, dtype=torch.float64), atol=1e-9)
+    return filmed_person(11, seconds=4.0, generator=seeded(), **more)
 
 
 def test_place_and_distance_are_taken_out():
@@ -294,16 +273,16 @@ def test_one_wrong_point_moves_nothing_else():
     assert float(away.median()) < 0.2 * float(good.x[:, rest].norm(dim=-1).median())
 
 
-def test_missing_positions_stay_missing():
+def test_medians_of_every_frame_are_nought_and_missing_positions_stay_missing():
     x = scene(noise=1.0, missing=0.3).a
     x[50] = torch.nan
+    assert torch.allclose(scale_frames(tracks_of(scene(noise=1.0).a)).x.median(1).values, torch.zeros(120, 2).double(), atol=1e-9)
     found = scale_frames(tracks_of(x))
     assert bool(found.x.isfinite().all()) and not found.x[found.weights == 0].any()
     assert torch.equal(found.weights > 0, x.isfinite().all(-1))
 
 
-@pytest.mark.parametrize("frames", [1, 2])
-def test_takes_of_a_frame_or_two(frames):
-    found = scale_frames(tracks_of(torch.rand(frames, 5, 2, generator=torch.Generator().manual_seed(1))))
-    assert bool(found.x.isfinite().all())
-    assert bool(scale_frames(tracks_of(torch.full((frames, 5, 2), torch.nan))).x.isfinite().all())
+def test_takes_of_a_frame_or_two():
+    for frames in (1, 2):
+        for x in (torch.rand(frames, 5, 2, generator=seeded(1)), torch.full((frames, 5, 2), torch.nan)):
+            assert bool(scale_frames(tracks_of(x)).x.isfinite().all())
