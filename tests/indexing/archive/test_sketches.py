@@ -56,11 +56,11 @@ def reference(segment, probe):
     return found
 
 
-def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=False, samples=4):
+def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=False):
     rows = slice(round(begin * segment.rate), round((begin + seconds) * segment.rate) + 1)
     joints = segment.positions(track)[rows]
     source = concatenate_clips([Clip(joints, times=np.arange(len(joints)) / segment.rate)])
-    return probe_of(source, 0, layout, segment.rate, tempo, samples, moving=moving)
+    return probe_of(source, 0, layout, segment.rate, tempo, moving=moving)
 
 
 def test_correlation_is_that_of_the_planes():
@@ -92,6 +92,7 @@ def test_scan_is_the_best_of_every_window(segment):
         assert len(result) >= 3
         for score, track, row in zip(result.score.tolist(), result.track.tolist(), result.row.tolist(), strict=True):
             assert score == pytest.approx(squared_cosine(*planes(stored, example, track, row)), abs=1e-3), seconds
+        assert (result.row >= 0).all() and (result.row + example.span < stored.tracks[result.track, 3]).all(), seconds
         assert result.score[0] >= max(reference(stored, example).values()) - 1e-3
         assert result.track[0] == 0 and abs(result.row[0] / stored.rate - 4.0) <= 1 / stored.rate + 0.1 * seconds
 
@@ -124,45 +125,18 @@ def test_blocks_parts_and_the_number_that_is_asked_for_change_nothing(segment, m
         assert same(whole, scan(stored, both, 500)), block
 
 
-def test_removed_recordings_are_not_found(segment):
+def test_candidates_settle_where_they_fit_best_at_every_tempo(segment):
     stored, layout = segment
-    found = scan(stored, [probe(stored, layout)], 500, dead=frozenset({1}))
-    assert len(found) and not (stored.tracks[found.track, 0] == 1).any()
-
-
-def test_no_window_lies_in_two_tracks(segment):
-    stored, layout = segment
-    asked = probe(stored, layout, 2.0)
-    found = scan(stored, [asked], 10_000)
-    assert (found.row >= 0).all() and (found.row + asked.span < stored.tracks[found.track, 3]).all()
-    assert 2 not in found.track  # .7 s is shorter than the window
-
-
-def test_candidates_settle_where_they_fit_best(segment):
-    stored, layout = segment
-    asked = probe(stored, layout, 2.5)
-    exact = probe(stored, layout, 2.5, samples=16)
-    start = np.array([60, 58, 150])
-    found = Candidates(np.zeros(3, np.float32), np.zeros(3, np.int64), start, np.zeros(3, np.int64))
-    moved = refine_candidates(stored, [asked], [exact], found)
-    half, offset = asked.stride // 2, (asked.span - exact.span) // 2
-    for begin, row, score in zip(start.tolist(), moved.row.tolist(), moved.score.tolist(), strict=True):
-        values = {}
-        for at in range(begin + offset - half, begin + offset + half + 1):
-            values[at] = squared_cosine(*planes(stored, exact, 0, at))
-        assert score == pytest.approx(max(values.values()), abs=1e-3) and values[row] == pytest.approx(score, abs=1e-3)
-    assert moved.score[0] > 0.999 and exact.samples > 2 * asked.samples
-
-
-def test_candidates_settle_at_every_tempo(segment):
-    stored, layout = segment
-    asked = probe(stored, layout, 2.0)
-    tempos = [probe(stored, layout, 2.0, tempo=tempo, samples=16) for tempo in (0.8, 1.0, 1.25)]
-    found = Candidates(np.zeros(1, np.float32), np.zeros(1, np.int64), np.array([60]), np.zeros(1, np.int64))
-    moved = refine_candidates(stored, [asked], tempos, found)
-    assert moved.probe.tolist() == [0, 1, 2] and moved.score.argmax() == 1
-    middles = moved.row + np.array([one.span / 2 for one in tempos])
-    assert np.abs(middles - (60 + asked.span / 2)).max() <= asked.stride / 2 + 1
+    probes = [probe(stored, layout, 2.5, tempo=tempo) for tempo in (0.8, 1.0, 1.25)]
+    start, scanned = np.array([60, 58, 150]), probes[1]
+    found = Candidates(np.zeros(3, np.float32), np.zeros(3, np.int64), start, np.ones(3, np.int64))
+    moved = refine_candidates(stored, probes, found)
+    assert moved.probe.tolist() == np.repeat(range(3), 3).tolist() and moved.score.argmax() == 3 and moved.score[3] > 0.999
+    for number, begin, row, score in zip(moved.probe, np.tile(start, 3), moved.row, moved.score, strict=True):
+        fine, half = probes[number], scanned.stride // 2
+        middle = begin + (scanned.span - fine.span) // 2
+        values = {at: squared_cosine(*planes(stored, fine, 0, at)) for at in range(middle - half, middle + half + 1)}
+        assert [score, values[row]] == pytest.approx([max(values.values())] * 2, abs=1e-3)
 
 
 def test_only_movement_counts_where_it_is_asked_for(tmp_path):

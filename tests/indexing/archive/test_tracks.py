@@ -14,8 +14,6 @@ from indexing.archive.tracks import (
     StorageFormat,
     images,
     layout_key,
-    positions,
-    seen_around,
     tracks_of,
     windows_of,
 )
@@ -50,13 +48,6 @@ def test_rate_is_steady_whatever_the_clock():
     assert np.abs(track.positions()[1:-1] - swinging(at - 1000)[1:-1]).max() < 2.0
 
 
-def test_y_is_up():
-    t = np.arange(60) / 30
-    (down,) = tracks_of(Clip(swinging(t), times=t, up="-y"), STORAGE)
-    (up,) = tracks_of(Clip(swinging(t), times=t), STORAGE)
-    assert np.allclose(down.positions() * [1, -1], up.positions(), atol=0.1)
-
-
 def test_gaps_part_tracks_and_short_ones_are_left_out():
     t = np.concatenate([np.arange(60) / 30, 10 + np.arange(10) / 30, 20 + np.arange(90) / 30])
     tracks = tracks_of(Clip(swinging(t), times=t), STORAGE)
@@ -78,13 +69,6 @@ def test_a_joint_that_is_lost_for_long_is_missing_and_bridged_otherwise():
     assert seen[:, 0].all() and not seen[:, 2].any() and seen[:, 3:].all()
     assert not seen[35:85, 1].any() and seen[:29, 1].all() and seen[92:, 1].all()
     assert np.isnan(track.positions()[40, 1]).all()
-
-
-def test_sightings_around_a_moment():
-    seen = np.array([[True, False], [True, True], [False, False], [True, True]])
-    assert seen_around(seen, np.array([0.0, 1.0, 2.0, 3.0]), np.array([0.4, 2.0, 3.4]), 1.5).tolist() == [
-        [True, False], [False, False], [True, True],
-    ]  # fmt: skip
 
 
 def test_movement_in_3d_is_kept_from_two_sides():
@@ -113,13 +97,6 @@ def test_nothing_is_kept_of_nothing():
 
 def test_windows_are_counted_by_the_shortest():
     assert [windows_of(rows, STORAGE) for rows in (0, 8, 9, 100)] == [0, 0, 1, 92]
-
-
-def test_positions_of_many_tracks_at_once():
-    stored = np.arange(24, dtype=np.int16).reshape(3, 4, 2)
-    origins, steps = np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]), np.array([0.1, 0.2, 0.3])
-    each = [positions(stored[i], origins[i], steps[i]) for i in range(3)]
-    assert np.allclose(positions(stored, origins[:, None], steps[:, None, None]), each)
 
 
 # ---- layouts -------------------------------------------------------------------------------------------------------------

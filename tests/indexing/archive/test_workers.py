@@ -58,11 +58,6 @@ def test_killed_adders_leave_an_archive(stage: Stage) -> None:
 
 
 @pytest.mark.slow
-def test_interrupted_adders_leave_an_archive(stage: Stage) -> None:
-    unharmed(killed.interrupted(stage, 1, np.random.default_rng(2)))
-
-
-@pytest.mark.slow
 def test_an_adder_killed_between_segment_and_catalogue_leaves_a_file(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     from indexing.archive import writer
 
@@ -118,16 +113,6 @@ def test_a_killed_adder_lets_go_of_the_archive(stage: Stage) -> None:
 
 
 # ---- a full disk ---------------------------------------------------------------------------------------------------------
-@pytest.mark.slow
-def test_a_full_disk_is_one_line(stage: Stage) -> None:
-    try:
-        trials = killed.disk_full(stage, 2, np.random.default_rng(5))
-    except PermissionError:
-        pytest.skip("this user may not mount a small file system")
-    unharmed(trials)
-    assert trials[0].disturbed and trials[0].kept == 0
-
-
 @pytest.mark.slow
 def test_files_that_may_not_grow_are_one_line(stage: Stage) -> None:
     """As on a full disk, where nobody may mount one: no file may be larger than one segment is."""
@@ -280,15 +265,6 @@ def test_threads_answer_the_same(tmp_path: Path, laboratory, in_process) -> None
     with ThreadPoolExecutor(3) as threads:
         _same(tmp_path / "a", threads, laboratory, in_process)
     assert torch.get_num_threads() == before
-
-
-def test_a_cluster_answers_the_same(tmp_path: Path, laboratory, in_process) -> None:
-    distributed = pytest.importorskip("dask.distributed")
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        _same(tmp_path / "a", client.get_executor(), laboratory, in_process)
 
 
 def test_a_broken_pool_is_replaced(tmp_path: Path, quick_pool: Callable[[int], Executor], laboratory, in_process) -> None:

@@ -25,7 +25,6 @@ from indexing.readers import FORMATS
 from indexing.readers.files import PEOPLE
 
 ACTIONS = ("squat", "wave", "kick")
-SCRIPT = "<script>alert(1)</script>"
 
 
 def coco(path: Path, clip: Clip, joints: int = 17) -> Path:
@@ -60,10 +59,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 # ---- the program ---------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
-def test_help_starts_without_the_heavy_libraries() -> None:
+def test_help_starts_without_the_heavy_libraries_in_half_a_second() -> None:
     code = """
-import sys
+import sys, time
 from indexing.cli import main
+main(["index", "--help"])
+assert time.process_time() < 0.5
 from indexing.cli.flags import commands
 lines = ["", "--help", "index", "archive", "--version", *(f"{command.words} --help" for command in commands())]
 codes = {main(line.split()) for line in lines}
@@ -76,13 +77,6 @@ print("RESULT", codes, heavy, main(["count", "join"]), {"torch", "sklearn"} & se
     assert [word for word in words if word not in done.stdout] == []
 
 
-@pytest.mark.slow
-def test_help_starts_in_half_a_second_of_work() -> None:
-    code = "import time; from indexing.cli import main; main(['index', '--help']); print(time.process_time())"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert float(done.stdout.split()[-1]) < 0.5
-
-
 def test_a_broken_pipe_is_quiet() -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "indexing.cli", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -91,15 +85,6 @@ def test_a_broken_pipe_is_quiet() -> None:
         err = child.stderr.read()
         assert child.wait() == 141
     assert err == b""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "words",
-    [["synchronise"], ["index", "foo"], ["index", "fit", "a=b", "--ouput", "m"], ["index", "scan", "x"], ["demo", "--people", "x"]],
-)
-def test_what_does_not_exist_is_refused_in_one_line(refuse, words: list[str]) -> None:
-    refuse(*words, says=("--help",))
 
 
 def test_interrupted_leaves_nothing(run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,14 +105,14 @@ def test_choices_are_those_of_the_readers() -> None:
 # ---- fit -----------------------------------------------------------------------------------------------------------------
 def test_fit_writes_a_model_and_says_what_it_learned(run, data: Path) -> None:
     code, out, err = run(
-        "index", "fit", "squat=@/squat.json", "squat=@/wave.json@0.5-1.5", "high kick=@/kick.json", "-o", "new/m.safetensors",
+        "index", "fit", "squat=@/squat.json", "squat=@/wave.json@0.5-1.5", "[red] kick=@/kick.json", "-o", "new/m.safetensors",
         "--no-mirror", "--reject", "0.1", "--seed", "3",
     )  # fmt: skip
     assert code == 0 and err == ""
-    assert "high kick" in out and "17 in 2D" in out and "m.safetensors" in out
+    assert "[red] kick" in out and "17 in 2D" in out and "m.safetensors" in out
     assert "30 frames per second assumed for squat.json" in out
     model = ActionIndexer.load("new/m.safetensors")
-    assert model.classes_.tolist() == ["high kick", "squat"] and model.model_.labels.tolist() == [1, 1, 0]
+    assert model.classes_.tolist() == ["[red] kick", "squat"] and model.model_.labels.tolist() == [1, 1, 0]
     assert (model.mirror, model.reject, model.random_state) == (False, 0.1, 3)
 
 
@@ -135,14 +120,6 @@ def test_fit_from_a_clip_set_with_a_selection(run) -> None:
     code, out, _ = run("index", "fit", "@/set.npz", "--select", "azimuth=0", "--select", "subject=0,1", "-o", "m.safetensors")
     assert code == 0 and "assumed" not in out
     assert len(ActionIndexer.load("m.safetensors").model_.labels) == 2 * len(ACTIONS)
-
-
-def test_fit_leaves_unusable_clips_of_a_set_out_and_says_so(run, data: Path, tmp_path: Path) -> None:
-    clips = list(ClipSet.load(data / "set.npz"))
-    clips[4] = clips[4].replace(joints=np.full_like(clips[4].joints, np.nan), confidence=None)
-    ClipSet(clips).save(tmp_path / "holes.npz")
-    code, out, _ = run("index", "fit", "holes.npz", "-o", "m.safetensors")
-    assert code == 0 and f"1 clip of holes.npz left out; the first, {clips[4].name}: no joint was seen" in out
 
 
 def test_examples_are_read_from_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,16 +198,6 @@ def test_scan_of_several_recordings_tells_them_apart(run, data: Path, tmp_path: 
     code, out, _ = run("index", "scan", "@/session.json", "b/session.json", "-m", "@/moves.safetensors", "--fps", "30")
     assert code == 0 and "2 recordings" in out and "b/session.json" in out and "assumed" not in out
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b"]
-
-
-@pytest.mark.slow
-def test_labels_are_escaped_in_the_page(run) -> None:
-    words = [f"{SCRIPT}=@/kick.json", "[red]=@/wave.json", "squat=@/squat.json"]
-    assert run("index", "fit", *words, "-o", "m.safetensors")[0] == 0
-    code, out, _ = run("index", "scan", "@/session.json", "-m", "m.safetensors", "--report", "out", "--reject", "-100")
-    assert code == 0 and "[red]" in out
-    page = Path("out/report.html").read_text()
-    assert page.count("<script") == 1 and "&lt;script&gt;" in page  # the player's
 
 
 @pytest.mark.slow
@@ -410,12 +377,6 @@ def test_demo_reports_recognition_from_other_viewpoints(run) -> None:
     assert "Frames right" in page and "2D nearest neighbour" in page
     made = json.loads(Path("shown/manifest.json").read_text())
     assert {"learn", "recognize", "search"} <= set(made["timings"])
-
-
-def test_demo_refuses_bad_input(refuse, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    refuse("demo", "--people", "0", says=("people", "1 or more"))
-    refuse("demo", "--out", "file", says=("'file' is a file",))
 
 
 def test_what_libraries_tell_programmers_is_not_shown(run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from indexing import Clip
 from indexing.cli import main
+from tests.indexing.sync.scene import write_openpose
 
 
 @pytest.mark.parametrize(
@@ -30,6 +32,8 @@ from indexing.cli import main
             "--person zz: choose from all, confident, everyone, largest, tracked; see dyntorch index scan --help",
         ),
         ("index scan x -m m --persn all", "unknown option --persn; did you mean --person? see dyntorch index scan --help"),
+        ("synchronise", "unknown command synchronise"),
+        ("archive serch a b", "unknown command serch; did you mean search? choose from add, search, find, info, verify, remove"),
         ("sync a b --fps 30 x", "unexpected 'x'; leave it out; see dyntorch sync --help"),
         ("index scan x", "missing: --model FILE (what 'dyntorch index fit' wrote); see dyntorch index scan --help"),
         (
@@ -40,36 +44,19 @@ from indexing.cli import main
 )
 def test_one_clear_line(line: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(line.split()) == 2
-    assert capsys.readouterr().err == f"dyntorch: {said}\n"
+    err = capsys.readouterr().err
+    assert err.startswith(f"dyntorch: {said}") and err.count("\n") == 1 and "--help" in err
 
 
-def openpose(folder: Path, frames: int = 3) -> Path:
-    folder.mkdir()
-    for i in range(frames):
-        people = [{"pose_keypoints_2d": [1.0 + i, 2.0, 0.9] * 25}]
-        (folder / f"{folder.name}_{i:012d}_keypoints.json").write_text(json.dumps({"people": people}))
-    return folder
-
-
-def test_two_labels_are_one_too_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_examples_that_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
-    openpose(tmp_path / "take")
-    assert main(["index", "fit", "a=b=take", "b=take", "-o", "m.safetensors"]) == 2
-    assert capsys.readouterr().err == "dyntorch: example 'a=b=take': two labels for take; give one, as in a=take\n"
-
-
-def test_a_frame_given_as_a_recording_is_told_its_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    file = next(openpose(tmp_path / "take").relative_to(tmp_path).iterdir())
-    assert main(["index", "fit", f"a={file}", "b=take", "-o", "m.safetensors"]) == 2
-    assert "or give the folder take if every frame is a file of its own" in capsys.readouterr().err
-
-
-def test_a_file_of_no_known_format_is_answered_without_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "x.json").write_text('{"some": "thing"}')
-    assert main(["index", "fit", f"a={tmp_path / 'x.json'}", "b=take", "-o", f"{tmp_path / 'm'}"]) == 2
-    said = capsys.readouterr().err
-    assert "export what AlphaPose, COCO, DeepLabCut, FreeMoCap, MediaPipe, MMPose, movement, " in said
-    assert "indexing.readers" not in said
+    write_openpose(Path("take"), [Clip(np.ones((3, 25, 2)))])
+    Path("x.json").write_text('{"some": "thing"}')
+    for words, said in {
+        "a=b=take b=take": "example 'a=b=take': two labels for take; give one, as in a=take\n",
+        "a=take/take_000000000001_keypoints.json b=take": "or give the folder take if every frame is a file of its own",
+        "a=x.json b=take": "export what AlphaPose, COCO, DeepLabCut, FreeMoCap, MediaPipe, MMPose, movement, ",
+    }.items():
+        assert main(["index", "fit", *words.split(), "-o", "m.safetensors"]) == 2
+        err = capsys.readouterr().err
+        assert said in err and "indexing.readers" not in err

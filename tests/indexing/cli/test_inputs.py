@@ -285,16 +285,3 @@ def test_nobody_in_view_is_an_answer(run, tmp_path):
     ClipSet([Clip(np.full((20, 17, 2), np.nan), name=name, skeleton=COCO17) for name in "ab"]).save("set.npz")
     code, out, _ = run("index scan set.npz -m m.safetensors")
     assert code == 0 and "set.npz: nobody is in view in any frame of" in out and "no action found in 2 recordings" in out
-
-
-def test_many_examples_are_compared_within_their_files(monkeypatch, tmp_path):
-    from indexing.cli.flags.shared import Example
-    from indexing.cli.inputs import on_overlaps
-
-    asked = []
-    monkeypatch.setattr(Path, "resolve", lambda path, strict=False: asked.append(path) or path)
-    examples = [Example(tmp_path / f"{i}.json", f"label {i % 2}", 0.0, 2.0) for i in range(500)]
-    assert on_overlaps([*examples, Example(tmp_path / "7.json", "other", 1.0, 3.0)]) == [
-        f"{tmp_path / '7.json'}: 1 to 2 s count both as label 1 and as other; correct the ranges if they do not overlap"
-    ]
-    assert len(asked) == 501  # each once

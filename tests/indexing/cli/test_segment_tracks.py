@@ -16,7 +16,6 @@ import torch
 
 import dyntorch
 from dyntorch.core.outcome import Notice, NoticeCode
-from dyntorch.numerics import Message
 from dyntorch.tasks.segment.result import TrackSegmentation
 from indexing.actors.textured import render, sheet
 from indexing.report.bodies import FILES, FILM
@@ -241,24 +240,6 @@ def test_a_scene_that_changes_is_refused_with_its_frame(run, solved, monkeypatch
     assert "The scene changes at frame 8" in page and "not to be relied on" in page and read()["status"] == "AMBIGUOUS"
 
 
-def test_tracks_that_cannot_decide_are_refused(run, solved, monkeypatch):
-    solve = dyntorch.segment_tracks
-
-    def nothing(tracks, **options):
-        found = solve(tracks, **options)
-        empty = {name: getattr(found, name)[:, :0] for name in ("geometries", "homographies", "planar")}
-        return dataclasses.replace(
-            found, labels=0 * found.labels, bodies=torch.tensor(0), static_body=torch.tensor(0), residuals=0 * found.residuals,
-            probabilities=found.probabilities[:, :1], **empty,
-        )  # fmt: skip
-
-    monkeypatch.setattr(dyntorch, "segment_tracks", nothing)
-    code, out, err = run("@/t.csv --out out")
-    assert code == 3 and err.startswith("dyntorch: refused: ") and err.count("\n") == 1 and re.search(r"unlabelled +49", out)
-    assert read()["status"] == "NO_CONSENSUS" and read()["bodies"] == [] and read()["static_body"] is None
-    assert "do not decide" in Path("out/report.html").read_text()
-
-
 BAD = {
     "@/space.npz": "space.npz: holds 3D points, and segment takes what a camera sees",
     "@/short.npz": "short.npz: none of its 20 tracks is seen in two frames; a point keeps its id from frame to frame",
@@ -290,22 +271,6 @@ def test_bad_input_is_one_line_and_code_2(run, solved, tmp_path, line):
     code, out, err = run(line)
     assert (code, out) == (2, "") and list(tmp_path.iterdir()) == []
     assert err.startswith("dyntorch: ") and err.count("\n") == 1 and BAD[line] in err
-
-
-def test_what_the_library_refuses_names_the_file(run, monkeypatch):
-    def refuse(*x, **options):
-        raise ValueError(Message("{arg:bodies=40} need 280 tracks; lower {arg:bodies=}"))
-
-    monkeypatch.setattr(dyntorch, "segment_tracks", refuse, raising=False)
-    code, _, err = run("@/t.csv --bodies 40")
-    assert code == 2 and re.fullmatch(r"dyntorch: \S+t\.csv: --bodies 40 need 280 tracks; lower --bodies\n", err)
-
-
-def test_an_input_is_not_overwritten(run, data, solved):
-    before = (data / "t.csv").read_text()
-    Path("tracks.csv").write_text(before)
-    code, _, err = run("tracks.csv --out .")
-    assert code == 2 and "tracks.csv: is an input" in err and Path("tracks.csv").read_text() == before
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from indexing.comparing import ComparedSpan, compare
-from indexing.report import pictures
 from indexing.report.agreement import AgreementReport, describe_agreement, label_rows, overlap_rows
 from indexing.report.summary import write_report
 
@@ -40,16 +39,7 @@ def test_everything_is_written_and_says_the_same(tmp_path: Path) -> None:
     assert f"{both.kappa:.3f}" in text and "a note" in text
 
 
-@pytest.mark.slow
-def test_what_an_earlier_report_left_is_removed(tmp_path: Path) -> None:
-    write_report(tmp_path, report())
-    (tmp_path / "mine.txt").touch()
-    spans = [ComparedSpan("a.json", 0.0, 20.0, KNOWN, FOUND)]
-    write_report(tmp_path, AgreementReport("one", compare(spans), spans))
-    assert not (tmp_path / "timeline-2.png").exists() and (tmp_path / "mine.txt").exists()
-
-
-def test_rows_and_words() -> None:
+def test_rows_and_words(tmp_path: Path) -> None:
     both = report().agreement
     rows = {row[0]: row for row in label_rows(both)}
     assert rows["squat"][1:4] == ["3.0", "5.0", "2.5"] and rows["squat"][5:7] == ["1", "2"]
@@ -58,13 +48,5 @@ def test_rows_and_words() -> None:
     assert "1 of 4 segments found share half of their time or more with one of 3 known." in describe_agreement(report())
     nothing = [ComparedSpan("a", 0.0, 5.0, [], [])]
     assert overlap_rows(compare(nothing))[0] == ["0.1", "0", "0", "0", "n/a", "n/a", "n/a"]
-    assert "100.0%" in describe_agreement(AgreementReport("none", compare(nothing), nothing))
-
-
-def test_nothing_at_all_is_still_a_page(tmp_path: Path) -> None:
-    spans = [ComparedSpan("a", 0.0, 5.0, [], [])]
-    assert "Cohen" in write_report(tmp_path, AgreementReport("none", compare(spans), spans)).read_text()
-
-
-def test_the_picture_takes_seconds_and_other_names_of_its_sides() -> None:
-    assert pictures.confusion([[1.5, 0.0], [0.0, 20.3]], ["a", "b"], ("yours", "mine")).startswith(b"\x89PNG")
+    none = AgreementReport("none", compare(nothing), nothing)
+    assert "100.0%" in describe_agreement(none) and "Cohen" in write_report(tmp_path, none).read_text()

@@ -124,12 +124,12 @@ def test_drawings_stop_where_a_page_would_grow_heavy(lab, tmp_path, monkeypatch)
     assert 1 <= text.count('class="pair"') < 9 and "more without pictures" in text
 
 
-def test_what_was_removed_meanwhile_is_said(lab, tmp_path):
-    text = checked(write_report(tmp_path, searched(lab, [Hit("week/gone.npz", "", 1.0, 2.0, 1.0)])))
+def test_nothing_found_is_a_page_too(lab, tmp_path):
+    text = checked(write_report(tmp_path, found(lab, [])))
+    assert "None of the actions was found in 3 recordings" in text and 'class="player"' not in text
+    text = checked(write_report(tmp_path, searched(lab, [Hit("week/gone.npz", "", 1.0, 2.0, 1.0)])))  # removed meanwhile
     assert "no longer stored" in text and 'class="pair"' not in text
-
-
-def test_no_hit_is_a_page_too(lab, tmp_path):
+    assert {path.name for path in tmp_path.iterdir()} == {"report.html", "hits.csv", "metrics.json", "manifest.json"}
     text = checked(write_report(tmp_path, searched(lab, [])))
     assert "Nothing was found" in text and "What resembles it" not in text
     assert (tmp_path / "hits.csv").read_text() == ",".join(pages.HITS_HEAD) + "\n"
@@ -196,32 +196,11 @@ def test_thousands_of_recordings_are_a_light_page(lab, tmp_path):
     assert len(rows_of(tmp_path / "events.csv")) == len(events) == 3000
 
 
-def test_nothing_found_is_said(lab, tmp_path):
-    text = checked(write_report(tmp_path, found(lab, [])))
-    assert "None of the actions was found in 3 recordings" in text and 'class="player"' not in text
-
-
-def test_pages_replace_those_of_other_reports(lab, tmp_path):
-    write_report(tmp_path, found(lab, events_of(lab[1])))
-    write_report(tmp_path, searched(lab, hits_of(lab[1])))
-    assert {path.name for path in tmp_path.iterdir()} == {"report.html", "hits.csv", "metrics.json", "manifest.json"}
-
-
 def test_marks_are_where_events_are():
     events = [ArchivedEvent("a", 10.0, 20.0, 1.0, 1.0, source="x"), ArchivedEvent("b", 99.0, 99.01, 1.0, 1.0, source="x")]
     drawn = str(pages.marks(events, 0.0, 100.0, {"a": "#111111", "b": "#222222"}))
     assert '<rect x="100.0" width="100.0" height="10" fill="#111111"/>' in drawn
     assert '<rect x="990.0" width="3.0" height="10" fill="#222222"/>' in drawn  # never too thin to see
-
-
-def test_a_film_has_as_many_steps_as_its_strip_has_frames(lab):
-    from indexing.report.canvas import strip
-
-    clip = lab[2]["squat"][0]
-    drawing = strip(clip, frames=11)
-    assert 'style="--steps:11;--lasts:1.50s"' in pages.hover_strip(drawing, 1.5)
-    assert 'class="film turned"' in pages.hover_strip(drawing, 1.5, mirrored=True)
-    assert pages.hover_strip("", 1.0) == ""
 
 
 @pytest.mark.skipif(BROWSER is None, reason="needs a browser: chromium or chrome")

@@ -46,9 +46,8 @@ def test_everything_is_written_and_said(tmp_path):
     assert np.shape(said["residuals"]) == (3, 17) and said["residuals"][1][3] is None and said["joints"][5] == "left_shoulder"
     one = said["cameras"][1]
     assert one["focal"] == 1500 and one["focal_sigma"] == pytest.approx(15) and one["offset"] == pytest.approx(-0.4)
-    assert (
-        np.shape(one["covariance"]) == (11, 11) and len(said["covariance_of"]) == 11 and one["offset_sigma"] == pytest.approx(5e-4)
-    )
+    assert np.shape(one["covariance"]) == (11, 11) and len(said["covariance_of"]) == 11
+    assert one["offset_sigma"] == pytest.approx(5e-4)
     assert np.allclose(one["center"], [0.5, 4.2, 1.7]) and said["scale"]["height"] == 1.75
     assert said["point_sigma"] == pytest.approx(0.006) and said["clock_confidence"] == 0.99 and "± 6 mm" in text
     assert {notice["code"] for notice in said["notices"]} == {"note"} and said["manifest"]["arguments"]["command"] == "calibrate"
@@ -68,9 +67,8 @@ def test_a_refusal_leaves_nothing_that_could_be_taken_for_good(tmp_path):
 
 def test_nothing_found_is_a_page_too(tmp_path):
     base = rig(ok=False).calibration
-    empty = {
-        name: torch.full_like(getattr(base, name), torch.nan) for name in ("K", "R", "t", "distortion", "covariance", "residuals")
-    }
+    names = ("K", "R", "t", "distortion", "covariance", "residuals")
+    empty = {name: torch.full_like(getattr(base, name), torch.nan) for name in names}
     empty |= {"inliers": torch.full((3,), torch.nan), "times": base.times[:0], "points": base.points[:0], "metric": False}
     clocks = replace(base.clocks, offsets=torch.tensor([0.0, torch.nan, torch.nan]))
     found = rig(ok=False, **{**empty, "metric": False, "clocks": clocks})
@@ -86,9 +84,7 @@ def test_what_is_somebody_elses_stays(tmp_path):
         folder = tmp_path / name.replace(".", "_")
         folder.mkdir()
         (folder / name).write_text("mine")
-        with pytest.raises(
-            ValueError, match=f"{name}: is there, and not from this command; move it away, or choose another folder"
-        ):
+        with pytest.raises(ValueError, match=f"{name}: is there, and not from this command; move it away, or choose another"):
             write_calibration(folder, CalibrationReport(rig()))
         assert listed(folder) == [name] and (folder / name).read_text() == "mine"
     write_calibration(tmp_path / "good", CalibrationReport(rig()))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
+from io import BytesIO
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from dyntorch import Segmentation, Status
 from dyntorch.core.outcome import Notice, NoticeCode
@@ -136,10 +138,7 @@ def test_outliers_are_counted_in_words(tmp_path):
 
 
 def test_panels_are_never_slim():
-    from io import BytesIO
-
-    from PIL import Image
-
+    assert len({colour_of(label) for label in range(1, 9)}) == 8  # neighbouring bodies differ
     line = np.linspace([0, 0], [1, 500], 8)
     image = Image.open(BytesIO(picture_of(report(pair=MatchedPair("m", "m", line, line, tuple("abcdefgh"))), LIGHT)))
     assert image.width > 0.4 * image.height
@@ -147,10 +146,6 @@ def test_panels_are_never_slim():
 
 @pytest.mark.slow
 def test_photographs_are_faded_and_wide_ones_stacked():
-    from io import BytesIO
-
-    from PIL import Image
-
     def shape(made, theme=LIGHT):
         image = Image.open(BytesIO(picture_of(made, theme)))
         return image.size, np.asarray(image.convert("L")).mean()
@@ -159,7 +154,3 @@ def test_photographs_are_faded_and_wide_ones_stacked():
     assert wide > 2 * tall and light > 190 and shape(report(photographs=[photograph(), photograph()]), DARK)[1] < 80
     (wide, tall), _ = shape(report(photographs=[photograph(200, 60), photograph(200, 60)]))
     assert tall > 0.5 * wide
-
-
-def test_neighbouring_bodies_have_different_colours():
-    assert len({colour_of(label) for label in range(1, 9)}) == 8
