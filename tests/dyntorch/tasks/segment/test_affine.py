@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.metrics import relative_error
 from dyntorch.tasks.segment.affine import affine_segmentation
@@ -78,24 +79,6 @@ def test_noise(n, most):
         assert 0.4 < found.residuals.square().mean().sqrt() < 0.55
 
 
-def test_residuals_are_the_distances_in_the_image_pair():
-    x1, x2, _, _ = bodies(counts=(15, 15), sigma=1.0)
-    found = affine_segmentation(x1, x2)
-    F = found.fundamentals[found.labels - 1]
-    p1, p2 = homogeneous(x1), homogeneous(x2)
-    gradient = torch.cat([(F @ p1[..., None])[:, :2, 0], (F.mT @ p2[..., None])[:, :2, 0]], -1)
-    expected = torch.einsum("ni,nij,nj->n", p2, F, p1).abs() / gradient.norm(dim=-1)
-    torch.testing.assert_close(found.residuals, expected)
-
-
-def test_a_planar_body_is_degenerate_and_alone():
-    x1, x2, _, _ = bodies(counts=(20, 20))
-    flat1, flat2, _, _ = bodies(counts=(20, 20), planar=True)
-    found = affine_segmentation(torch.stack([x1, flat1]), torch.stack([x2, flat2]))
-    assert found.degenerate.tolist() == [False, True]
-    assert found.fundamentals.isfinite().all()
-
-
 def test_missing_matches_weigh_nothing():
     x1, x2, labels, _ = bodies(counts=(15, 15))
     broken = x1.clone()
@@ -109,9 +92,11 @@ def test_missing_matches_weigh_nothing():
     assert found.residuals[[3, 20]].tolist() == [0, 0]
     assert wrong(found.labels[kept], labels[kept]) == 0
     torch.testing.assert_close(found.fundamentals, fewer.fundamentals)
-    none = affine_segmentation(torch.full_like(x1, torch.nan), x2)
-    assert none.degenerate
-    assert none.fundamentals.isfinite().all()
+    # a planar body is degenerate and alone, as nothing is
+    flat1, flat2, _, _ = bodies(counts=(15, 15), planar=True)
+    found = affine_segmentation(torch.stack([x1, flat1, x1 * torch.nan]), torch.stack([x2, flat2, x2]))
+    assert found.degenerate.tolist() == [False, True, True]
+    assert found.fundamentals.isfinite().all()
 
 
 def test_batch_equals_loop_and_dtype_is_kept():
@@ -122,6 +107,9 @@ def test_batch_equals_loop_and_dtype_is_kept():
             one = affine_segmentation(x1[i, j], x2[i, j])
             torch.testing.assert_close(found.fundamentals[i, j], one.fundamentals)
             assert torch.equal(found.labels[i, j], one.labels)
+            # residuals are the distances in the image pair
+            distance = sampson_squared(one.fundamentals, x1[i, j], x2[i, j]).sqrt()
+            torch.testing.assert_close(found.residuals[i, j], distance.gather(0, one.labels[None] - 1)[0])
     small = affine_segmentation(x1.float(), x2.float())
     assert small.fundamentals.dtype == small.residuals.dtype == torch.float32
     assert wrong(small.labels, found.labels).max() < 0.05
@@ -136,14 +124,14 @@ def test_gradients():
 
 def test_misuse():
     x1, x2, _, _ = bodies(counts=(7, 6))
-    with pytest.raises(ValueError, match="take 14 matches, got 13: add 1"):
-        affine_segmentation(x1, x2)
-    with pytest.raises(ValueError, match="of one shape"):
-        affine_segmentation(x1, x2[:-1])
-    with pytest.raises(ValueError, match=r"x1 must be a torch.Tensor, got ndarray; use torch.as_tensor"):
-        affine_segmentation(x1.numpy(), x2.numpy())
-    with pytest.raises(ValueError, match=r"weights must be a torch.Tensor, got list"):
-        affine_segmentation(x1, x2, [1.0] * 13)
+    for given, words in (
+        ((x1, x2), "take 14 matches, got 13: add 1"),
+        ((x1, x2[:-1]), "of one shape"),
+        ((x1.numpy(), x2.numpy()), r"x1 must be a torch.Tensor, got ndarray; use torch.as_tensor"),
+        ((x1, x2, [1.0] * 13), r"weights must be a torch.Tensor, got list"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            affine_segmentation(*given)
 
 
 def test_results_print_in_two_lines():

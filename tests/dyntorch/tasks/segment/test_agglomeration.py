@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import cv2
 import pytest
@@ -64,18 +65,16 @@ def judge_of(scene: Shot, labels: torch.Tensor) -> GroupCosts:
     return GroupCosts.of(near_of(scene), kernel_of(scene), groups_of(labels))
 
 
-def rms(near: NearPairs, group: torch.Tensor) -> float:
-    square, seen = near.squared_distances(group, 0.15)
-    return float(square[seen].mean().sqrt())
-
-
 def test_groups_that_move_as_one_are_on_their_epipolar_lines():
     scene = shot((40, 30), sigma=0.0)
+    scene.tracks[:5, :10] = torch.nan
     near = near_of(scene)
-    square, seen = near.squared_distances(scene.labels == 1, 0.15)
-    assert square.shape == seen.shape == (len(near.seen), 40)
-    pure = [rms(near, scene.labels == body) for body in (1, 2)]
-    assert max(pure) < 1e-4 and rms(near, scene.labels > 0) > 100 * max(pure)
+    body, whole = scene.labels == 1, scene.labels > 0
+    (pure, seen), (mixed, both) = (near.squared_distances(group, 0.15) for group in (body, whole))
+    assert bool(mixed.isfinite().all()) and float(pure[seen].mean().sqrt()) < 1e-4 < 1e-2 < float(mixed[both].mean().sqrt())
+    # as often as pairs of frames show them
+    assert seen.shape == (len(near.seen), 40) and int(both.sum()) == int(near.seen.sum())
+    assert near.count.tolist() == near.seen.sum(0).tolist() and float(near.count[0]) < float(near.count[20])
 
 
 def test_distances_are_those_of_the_motion_that_most_tracks_have():
@@ -105,75 +104,42 @@ def test_costs_count_sightings_up_to_a_cap():
     assert float(cost[2]) > 2 * float(cost[0] + cost[1])
 
 
-def test_sightings_are_those_of_the_pairs_of_frames():
-    scene = shot((40,))
-    scene.tracks[:5, :10] = torch.nan
-    near = near_of(scene)
-    square, seen = near.squared_distances(torch.ones(40, dtype=torch.bool), 0.15)
-    assert bool(square.isfinite().all()) and int(seen.sum()) == int(near.seen.sum())
-    assert near.count.tolist() == near.seen.sum(0).tolist() and float(near.count[0]) < float(near.count[20])
-
-
-@pytest.mark.parametrize("count", [2, 6])
-def test_pieces_of_two_bodies_are_pure(count):
+def test_pieces_of_two_bodies_are_pure():
     scene = shot((40, 40), sigma=0.05)
-    found = cut_into_pieces(keep_strongest(kernel_of(scene), 8), count)
-    assert found.shape == (80,) and sorted(found.unique().tolist()) == list(range(count))
-    for piece in range(count):
-        inside = scene.labels[found == piece]
-        assert float((inside == inside.mode().values).double().mean()) > 0.9
-    again = cut_into_pieces(keep_strongest(kernel_of(scene), 8), count)
-    assert found.tolist() == again.tolist()
-
-
-def test_pieces_of_a_graph_of_two_components():
-    sparse = torch.zeros(20, 20)
-    sparse[:10, :10], sparse[10:, 10:] = 0.5, 0.5
-    sparse.fill_diagonal_(0.0)
-    found = cut_into_pieces(sparse, 2)
+    sparse = keep_strongest(kernel_of(scene), 8)
+    for count in (2, 6):
+        found = cut_into_pieces(sparse, count)
+        assert found.shape == (80,) and sorted(found.unique().tolist()) == list(range(count))
+        for piece in range(count):
+            inside = scene.labels[found == piece]
+            assert float((inside == inside.mode().values).double().mean()) > 0.9
+        assert found.tolist() == cut_into_pieces(sparse, count).tolist()
+    graph = torch.zeros(25, 25)  # of two components and tracks without links
+    graph[:10, :10], graph[10:20, 10:20] = 0.5, 0.5
+    graph.fill_diagonal_(0.0)
+    found = cut_into_pieces(graph[:20, :20], 2)
     assert bool((found[:10] == found[0]).all()) and bool((found[10:] == found[10]).all()) and found[0] != found[10]
-    lonely = torch.zeros(25, 25)
-    lonely[:20, :20] = sparse
-    assert cut_into_pieces(lonely, 2).shape == (25,)  # tracks without links get a label, too
+    assert cut_into_pieces(graph, 2).shape == (25,)
 
 
 def test_true_bodies_are_farther_apart_than_halves_of_one():
     scene = shot((40, 40, 40), sigma=0.1)
-    judge = judge_of(scene, halves(scene))
-    apart = judge.separation(groups_of(halves(scene)))
-    value = apart.value(PIECE_LINK_WEIGHT)
-    same = apart.first // 2 == apart.second // 2
-    assert len(value) == 15 and int(same.sum()) == 3
-    assert float(value[same].max()) < float(value[~same].min())
-    assert float(apart.excess[same].max()) < float(apart.excess[~same].min())
-    assert float(apart.links[same].min()) > float(apart.links[~same].max())
-    assert float(apart.ratio()[same].max()) < float(apart.ratio()[~same].min())
-
-
-def test_separation_says_what_it_says():
-    scene = shot((40, 30))
-    judge, groups = judge_of(scene, halves(scene)), groups_of(halves(scene))
+    kernel, groups = kernel_of(scene), groups_of(halves(scene))
+    judge = GroupCosts.of(near_of(scene), kernel, groups)
     apart = judge.separation(groups)
-    place = 1  # groups 0 and 2
+    same = apart.first // 2 == apart.second // 2
+    assert len(same) == 15 and int(same.sum()) == 3
+    for value in (apart.value(PIECE_LINK_WEIGHT), apart.excess, -apart.links, apart.ratio()):
+        assert float(value[same].max()) < float(value[~same].min())
+    place = 1  # groups 0 and 2, by the definitions
     one, other = groups[0], groups[2]
     assert (int(apart.first[place]), int(apart.second[place])) == (0, 2)
     cost = judge.cost(torch.stack([one, other, one | other])).tolist()
     seen = [float(judge.near.count[some].sum()) for some in (one, other)]
     assert float(apart.excess[place]) == pytest.approx((cost[2] - cost[0] - cost[1]) / min(seen), rel=1e-6)
     assert float(apart.own[place]) == pytest.approx((cost[0] + cost[1]) / sum(seen), rel=1e-6)
-    links = float((kernel_of(scene) - CHANCE_PREFERENCE_SHARE).clamp(min=0)[one][:, other].sum())
+    links = float((kernel - CHANCE_PREFERENCE_SHARE).clamp(min=0)[one][:, other].sum())
     assert float(apart.links[place]) == pytest.approx(links / min(int(one.sum()), int(other.sum())), rel=1e-4)
-
-
-def test_groups_that_never_meet_are_joined_last():
-    scene = shot((40, 40, 40), frames=12, sigma=0.1)
-    scene.tracks[6:, 40:80] = torch.nan
-    scene.tracks[:6, 80:] = torch.nan  # body 3 comes when body 2 has gone
-    judge = judge_of(scene, halves(scene))
-    found = merge_pieces(judge, halves(scene), [2, 3])
-    truth = scene.labels[:, None] == scene.labels
-    assert bool(((found[3][:, None] == found[3]) == truth).all())
-    assert bool((found[2][:40] == found[2][0]).all())
 
 
 def test_the_judge_knows_the_noise_and_remembers_costs():
@@ -190,16 +156,21 @@ def test_the_judge_knows_the_noise_and_remembers_costs():
 
 def test_merged_labels_are_nested_and_end_at_the_bodies():
     scene = shot((40, 40, 40), sigma=0.1)
-    judge = judge_of(scene, halves(scene))
+    judge, truth = judge_of(scene, halves(scene)), scene.labels[:, None] == scene.labels
     found = merge_pieces(judge, halves(scene), range(1, 7))
     assert sorted(found) == [1, 2, 3, 4, 5, 6]
     assert all(sorted(labels.unique().tolist()) == list(range(count)) for count, labels in found.items())
     for count in range(1, 6):
         coarse, fine = found[count], found[count + 1]
         assert all(len(coarse[fine == piece].unique()) == 1 for piece in range(count + 1))
-    truth = scene.labels[:, None] == scene.labels
     assert bool(((found[3][:, None] == found[3]) == truth).all())
     assert sorted(merge_pieces(judge, halves(scene), [2, 4])) == [2, 4]
+    scene = shot((40, 40, 40), frames=12, sigma=0.1)
+    scene.tracks[6:, 40:80] = torch.nan
+    scene.tracks[:6, 80:] = torch.nan  # body 3 comes when body 2 has gone: they are joined last
+    found = merge_pieces(judge_of(scene, halves(scene)), halves(scene), [2, 3])
+    assert bool(((found[3][:, None] == found[3]) == truth).all())
+    assert bool((found[2][:40] == found[2][0]).all())
 
 
 SOLVERS = ((affine_map, 3), (homography_of_four, 4), (fundamental_of_eight, 8))
@@ -210,64 +181,36 @@ def points(*size: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(*size, 2, generator=draw(seed), dtype=F64) - 0.5
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_affine_maps_take_three_points_to_three(seed):
-    x1, x2 = points(3, seed=seed), points(3, seed=seed + 10)
-    found = affine_map(x1, x2)
-    known = torch.linalg.solve(homogeneous(x1), x2).mT
-    torch.testing.assert_close(found[:2], known, rtol=1e-8, atol=1e-8)
-    torch.testing.assert_close(found[2], torch.tensor([0.0, 0, 1], dtype=F64), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_homographies_of_four_points_are_those_of_opencv(seed):
-    square = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
-    x1, x2 = square + 0.4 * points(4, seed=seed), square + 0.4 * points(4, seed=seed + 10)
-    found = homography_of_four(x1, x2)
-    known = torch.from_numpy(cv2.getPerspectiveTransform(x1.float().numpy(), x2.float().numpy()))
-    assert float(found.norm()) == pytest.approx(1.0)
-    torch.testing.assert_close(unit(found), unit(known), rtol=0, atol=1e-4)
-    torch.testing.assert_close(apply(found, x1), x2, rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_matrices_of_eight_matches_are_the_null_vectors_and_the_truth(seed):
-    scene = shot((30,), sigma=0.0, seed=seed)
-    film = scene.film()
-    x1, x2 = film.x[0][::3][:8], film.x[-1][::3][:8]
-    found = fundamental_of_eight(x1, x2)
-    rows = (homogeneous(x2)[:, :, None] * homogeneous(x1)[:, None]).flatten(1)
-    known = torch.linalg.svd(rows)[2][-1].reshape(3, 3)
-    assert float(found.norm()) == pytest.approx(1.0)
-    assert float(relative_error(found, known)) < 1e-5
-    back = film.change.inverse()
-    true = back.mT @ scene.fundamental(0, 0, 9) @ back
-    assert float(relative_error(found, true)) < 1e-4
+def test_solvers_of_few_matches():
+    for seed in range(3):
+        x1, x2 = points(3, seed=seed), points(3, seed=seed + 10)
+        found = affine_map(x1, x2)
+        torch.testing.assert_close(found[:2], torch.linalg.solve(homogeneous(x1), x2).mT, rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(found[2], torch.tensor([0.0, 0, 1], dtype=F64), rtol=0, atol=1e-9)
+        square = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]], dtype=F64)
+        x1, x2 = square + 0.4 * points(4, seed=seed), square + 0.4 * points(4, seed=seed + 10)
+        found = homography_of_four(x1, x2)
+        known = torch.from_numpy(cv2.getPerspectiveTransform(x1.float().numpy(), x2.float().numpy()))
+        assert float(found.norm()) == pytest.approx(1.0)
+        torch.testing.assert_close(unit(found), unit(known), rtol=0, atol=1e-4)
+        torch.testing.assert_close(apply(found, x1), x2, rtol=0, atol=1e-8)
+        scene = shot((30,), sigma=0.0, seed=seed)
+        film = scene.film()
+        found = fundamental_of_eight(film.x[0][::3][:8], film.x[-1][::3][:8])
+        back = film.change.inverse()
+        assert float(found.norm()) == pytest.approx(1.0)
+        assert float(relative_error(found, back.mT @ scene.fundamental(0, 0, 9) @ back)) < 1e-4
 
 
 @pytest.mark.parametrize(("solver", "count"), SOLVERS)
-def test_batches_are_loops(solver, count):
+def test_batches_of_samples_are_loops_and_degenerate_ones_finite(solver, count):
     x1, x2 = points(2, 5, count), points(2, 5, count, seed=1)
     found = solver(x1, x2)
-    assert found.shape == (2, 5, 3, 3)
-    for i in range(2):
-        for j in range(5):
-            torch.testing.assert_close(found[i, j], solver(x1[i, j], x2[i, j]), rtol=1e-6, atol=1e-8)
-
-
-@pytest.mark.parametrize(("solver", "count"), SOLVERS)
-@pytest.mark.parametrize("case", ["one point", "a line", "nothing moves", "zero"])
-def test_degenerate_samples_are_finite(solver, count, case):
-    x1, x2 = points(4, count), points(4, count, seed=1)
-    if case == "one point":
-        x1 = x1[:, :1].expand_as(x1).clone()
-    elif case == "a line":
-        x1 = torch.stack([x1[..., 0], 2 * x1[..., 0] + 0.25], -1)
-    elif case == "nothing moves":
-        x2 = x1.clone()
-    else:
-        x1, x2 = torch.zeros_like(x1), torch.zeros_like(x2)
-    assert bool(solver(x1, x2).isfinite().all())
+    for i, j in product(range(2), range(5)):
+        torch.testing.assert_close(found[i, j], solver(x1[i, j], x2[i, j]), rtol=1e-6, atol=1e-8)
+    line = torch.stack([x1[..., 0], 2 * x1[..., 0] + 0.25], -1)
+    for a, b in ((x1[..., :1, :].expand_as(x1), x2), (line, x2), (x1, x1), (0 * x1, 0 * x2)):
+        assert bool(solver(a, b).isfinite().all())
 
 
 def test_the_kernel_is_symmetric_between_0_and_1_and_knows_the_bodies():
@@ -277,24 +220,18 @@ def test_the_kernel_is_symmetric_between_0_and_1_and_knows_the_bodies():
     assert bool((kernel >= 0).all()) and bool((kernel <= 1 + 1e-6).all()) and bool((kernel.diagonal() == 0).all())
     torch.testing.assert_close(kernel, kernel.mT, rtol=0, atol=1e-6)
     alike = scene.labels[:, None] == scene.labels
-    alike.fill_diagonal_(False)
-    others = scene.labels[:, None] != scene.labels
     for body in (1, 2, 3):
         own = scene.labels == body
-        assert float(kernel[own][alike[own]].mean()) > 1.4 * float(kernel[own][others[own]].mean())
+        count = int(own.sum())
+        inside = float(kernel[own][alike[own]].sum()) / (count * (count - 1))
+        assert inside > 1.4 * float(kernel[own][~alike[own]].mean())
     top = kernel.topk(3).indices
     assert float((scene.labels[top] == scene.labels[:, None]).double().mean()) > 0.9
-
-
-def test_a_kernel_of_some_tracks_has_a_column_for_each():
-    scene = shot((40, 30))
-    searched = torch.arange(0, 70, 2)
-    kernel = kernel_of(scene, searched)
-    assert kernel.shape == (70, 35)
-    assert bool((kernel[searched, torch.arange(35)] == 0).all())
-    assert bool((kernel[1::2].sum(-1) > 0).all())  # those that are not searched are compared, too
-    best = kernel.argmax(-1)
-    assert float((scene.labels[searched][best] == scene.labels).double().mean()) > 0.9
+    searched = torch.arange(0, 90, 2)  # a column for each of these
+    some = kernel_of(scene, searched)
+    assert some.shape == (90, 45) and bool((some[searched, torch.arange(45)] == 0).all())
+    assert bool((some[1::2].sum(-1) > 0).all())  # those that are not searched are compared, too
+    assert float((scene.labels[searched][some.argmax(-1)] == scene.labels).double().mean()) > 0.9
 
 
 def twins(frames: int):
@@ -305,6 +242,9 @@ def twins(frames: int):
 
 
 def test_a_track_has_most_in_common_with_one_beside_it(monkeypatch):
+    scene = twins(frames=6)
+    scene.tracks[4:, 32] = torch.nan  # the mean over the pairs that show both
+    assert float(kernel_of(scene)[0, 32]) > 0.7
     monkeypatch.setattr(agglomeration, "KERNEL_GAPS", (1,))
     kernel = kernel_of(twins(frames=2))
     assert float(kernel[0, 32]) > 0.5 and int(kernel[0].argmax()) == 32
@@ -313,20 +253,11 @@ def test_a_track_has_most_in_common_with_one_beside_it(monkeypatch):
     torch.testing.assert_close(kernel * few, (kernel * few).round(), rtol=0, atol=1e-3)
 
 
-def test_the_kernel_is_the_mean_over_the_pairs_that_show_both():
-    scene = twins(frames=6)
-    scene.tracks[4:, 32] = torch.nan  # it counts by what is there
-    assert float(kernel_of(scene)[0, 32]) > 0.7
-
-
 def test_tracks_that_never_meet_have_nothing_in_common():
     scene = shot((50,), frames=8)
-    tracks = scene.tracks.clone()
-    tracks[4:, :25] = torch.nan
-    tracks[:4, 25:] = torch.nan
-    apart = replace(scene, tracks=tracks)
-    assert select_near_pairs(apart.film(), agglomeration.KERNEL_GAPS, 3, agglomeration.MIN_KERNEL_TRACKS)
-    kernel = kernel_of(apart)
+    scene.tracks[4:, :25] = torch.nan
+    scene.tracks[:4, 25:] = torch.nan
+    kernel = kernel_of(scene)
     assert bool((kernel[:25, 25:] == 0).all()) and bool((kernel[25:, :25] == 0).all())
     assert bool(kernel.isfinite().all()) and float(kernel[:25, :25].sum()) > 0 and float(kernel[25:, 25:].sum()) > 0
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dyntorch import scenes
+from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import apply, homogeneous, skew, unit
 from dyntorch.tasks.segment import coherence as module
 from dyntorch.tasks.segment.coherence import (
@@ -31,7 +32,9 @@ from dyntorch.tasks.segment.coherence import (
     energy,
     parallax,
 )
-from tests.dyntorch.tasks.segment.videos import F64, draw, view_of
+from dyntorch.tasks.segment.search import one_hot
+from dyntorch.tasks.segment.track_energy import no_links
+from tests.dyntorch.tasks.segment.videos import F64, draw, true_view
 
 SCALE = 0.01
 
@@ -115,7 +118,7 @@ def test_formula_one_match_at_a_time():
     assert bool((found[1].weight >= 0).all()) and bool((found[1].weight <= 1).all())
 
 
-def test_links_are_symmetric_and_gathered_alike(monkeypatch):
+def test_links_are_symmetric_gathered_cut_and_taken_in_part(monkeypatch):
     links = coherence(*mixed(), SCALE)[1]
     full = torch.zeros(40, 40, dtype=F64)
     for i in range(40):
@@ -125,58 +128,38 @@ def test_links_are_symmetric_and_gathered_alike(monkeypatch):
     assert bool((full.diagonal() == 0).all())
     values = torch.randn(2, 3, 40, generator=draw(1), dtype=F64)
     torch.testing.assert_close(links.pull(values), values @ full)
+    labels = torch.randint(0, 3, (2, 40), generator=draw(2))
+    expected = [full[row[:, None] != row].sum() / 2 for row in labels]
+    torch.testing.assert_close(links.cut_weight(one_hot(labels, 3)), torch.stack(expected))
+    keep = torch.randperm(40, generator=draw(3))[:23]
+    torch.testing.assert_close(dense(links.subset(keep)), full[keep][:, keep])
     monkeypatch.setattr(module, "DENSE", 10)
     torch.testing.assert_close(Links(links.index, links.weight).pull(values), values @ full)
 
 
-def test_cut_is_the_sum_over_pairs_in_different_bodies():
-    links = coherence(*mixed(), SCALE)[1]
-    full = dense(links)
-    labels = torch.randint(0, 3, (2, 40), generator=draw(2))
-    members = (labels[:, None] == torch.arange(3)[:, None]).to(F64)
-    expected = [sum(full[i, j] for i in range(40) for j in range(i) if row[i] != row[j]) for row in labels]
-    torch.testing.assert_close(links.cut_weight(members), torch.stack(expected))
-
-
-def test_subset_keeps_the_links_among_its_matches():
-    links = coherence(*mixed(), SCALE)[1]
-    keep = torch.randperm(40, generator=draw(3))[:23]
-    torch.testing.assert_close(dense(links.subset(keep)), dense(links)[keep][:, keep])
-
-
 def test_components_of_a_chain_and_without_links():
-    n = 50
+    n, everything = 50, torch.ones(50, dtype=torch.bool)
     index = torch.stack([(torch.arange(n) - 1).clamp(min=0), (torch.arange(n) + 1).clamp(max=n - 1)], dim=-1)
     chain = Links(index, torch.ones(n, 2, dtype=F64))
-    assert bool((chain.components(0.5, torch.ones(n, dtype=torch.bool)) == 0).all())
-    split = torch.ones(n, dtype=torch.bool)
-    split[20] = False
-    assert chain.components(0.5, split).bincount().tolist() == [20, 1, n - 21]
-    none = Links(torch.zeros(n, 0, dtype=torch.long), torch.zeros(n, 0, dtype=F64))
-    everything = torch.ones(n, dtype=torch.bool)
+    assert bool((chain.components(0.5, everything) == 0).all())
+    assert chain.components(0.5, torch.arange(n) != 20).bincount().tolist() == [20, 1, n - 21]
+    none = no_links(n, index.device)
     assert torch.equal(none.components(0.5, everything), torch.arange(n))
     assert bool((none.pull(torch.ones(2, n, dtype=F64)) == 0).all())
     assert none.subset(torch.arange(7)).index.shape == (7, 0)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.7])
-def test_placing_and_turning_the_images_changes_nothing(angle):
-    x1, x2 = mixed()
-    turn, shift = similarity(1.0, angle), torch.tensor([30.0, -7.0], dtype=F64)
-    found = coherence(x1, x2, SCALE)
-    moved = coherence(x1 @ turn.mT + shift, x2 @ turn.mT - shift, SCALE)
-    torch.testing.assert_close(moved[0], found[0], rtol=0, atol=1e-9)
-    scaled = coherence(250 * x1, 250 * x2, 250 * SCALE)
-    torch.testing.assert_close(scaled[0], found[0], rtol=0, atol=1e-9)
-    torch.testing.assert_close(dense(scaled[1]), dense(found[1]), rtol=0, atol=1e-9)
-
-
-def test_views_and_order_of_matches_do_not_matter():
+def test_place_turn_scale_views_and_order_of_the_matches_do_not_matter():
     x1, x2 = mixed()
     found = coherence(x1, x2, SCALE)
-    swapped = coherence(x2, x1, SCALE)
-    torch.testing.assert_close(swapped[0], found[0])
-    torch.testing.assert_close(dense(swapped[1]), dense(found[1]))
+    shift = torch.tensor([30.0, -7.0], dtype=F64)
+    for angle in (0.0, 0.7):
+        turn = similarity(1.0, angle)
+        moved = coherence(x1 @ turn.mT + shift, x2 @ turn.mT - shift, SCALE)
+        torch.testing.assert_close(moved[0], found[0], rtol=0, atol=1e-9)
+    for other in (coherence(250 * x1, 250 * x2, 250 * SCALE), coherence(x2, x1, SCALE)):
+        torch.testing.assert_close(other[0], found[0], rtol=0, atol=1e-9)
+        torch.testing.assert_close(dense(other[1]), dense(found[1]), rtol=0, atol=1e-9)
     order = torch.randperm(40, generator=draw(6))
     # not the two repeated ones, of which one or the other may be a neighbour
     torch.testing.assert_close(coherence(x1[order], x2[order], SCALE)[0], found[0][order], rtol=0, atol=1e-9)
@@ -188,11 +171,12 @@ def test_affine_fields_are_coherent_and_random_matches_are_not():
     found = coherence(x1, points(150, 1), SCALE)
     assert float(found[0].mean()) < 0.1
     assert int(found[1].components(0.3, found[0] > 0.2).unique(return_counts=True)[1].max()) < 7
-    # wrong matches among right ones
     x2 = affine(x1, 0.002)
     x2[:75] = points(75, 2)
-    values = coherence(x1, x2, SCALE)[0]
-    assert float((values[75:] > 0.35).double().mean()) > 0.97 and float((values[:75] < 0.2).double().mean()) > 0.9
+    assert right_from_wrong(coherence(x1, x2, SCALE)[0], 75)
+    for n in (1, 2, 3, 9):
+        found = coherence(points(n), affine(points(n)), SCALE)
+        assert found[0].shape == (n,) and bool(found[0].isfinite().all()) and found[1].index.shape[0] == n
 
 
 def test_repeated_matches_confirm_nothing():
@@ -205,24 +189,25 @@ def test_repeated_matches_confirm_nothing():
     assert bool((same[0] == 0).all()) and bool((same[1].weight == 0).all())
 
 
-@pytest.mark.parametrize(("zoom", "angle"), [(2.0, 0.0), (0.5, 0.0), (1.0, math.pi / 2), (1.5, -2.0)])
-def test_common_zoom_and_rotation_are_recognized(zoom, angle):
-    x1 = points(200)
-    x2 = x1 @ similarity(zoom, angle).mT + 0.5 + 0.002 * torch.randn(200, 2, generator=draw(7), dtype=F64)
-    x2[:60] = zoom * points(60, 8)
-    values = coherence(x1, x2, SCALE)[0]
-    assert float((values[60:] > 0.35).double().mean()) > 0.97 and float((values[:60] < 0.2).double().mean()) > 0.9
+def right_from_wrong(values, wrong: int) -> bool:
+    """The first matches are wrong."""
+    right, random = (values[wrong:] > 0.35).double().mean(), (values[:wrong] < 0.2).double().mean()
+    return float(right) > 0.97 and float(random) > 0.9
 
 
-@pytest.mark.parametrize("angle", [math.pi / 2, 2.0, math.pi])
-def test_a_part_that_turns_far_is_as_coherent_as_the_rest(angle):
+def test_common_zoom_and_rotation_are_recognized_and_parts_that_turn_far():
     x1 = points(200)
-    right = x1[:, 0] > 0.7
     noise = 0.002 * torch.randn(200, 2, generator=draw(7), dtype=F64)
-    x2 = torch.where(right[:, None], x1 @ similarity(1.0, angle).mT, x1 + 0.1) + noise
-    found = coherence(x1, x2, SCALE)
-    assert float(found[0][right].median()) > 0.7 and float(found[0][~right].median()) > 0.7
-    assert float(found[1].cut_weight(torch.stack([right, ~right]).double())) < 0.1 * float(found[1].weight.sum()) / 2
+    for zoom, angle in ((2.0, 0.0), (0.5, 0.0), (1.0, math.pi / 2), (1.5, -2.0)):
+        x2 = x1 @ similarity(zoom, angle).mT + 0.5 + noise
+        x2[:60] = zoom * points(60, 8)
+        assert right_from_wrong(coherence(x1, x2, SCALE)[0], 60), (zoom, angle)
+    right = x1[:, 0] > 0.7
+    for angle in (math.pi / 2, 2.0, math.pi):
+        x2 = torch.where(right[:, None], x1 @ similarity(1.0, angle).mT, x1 + 0.1) + noise
+        values, links = coherence(x1, x2, SCALE)
+        assert float(values[right].median()) > 0.7 and float(values[~right].median()) > 0.7
+        assert float(links.cut_weight(torch.stack([right, ~right]).double())) < 0.1 * float(links.weight.sum()) / 2
 
 
 def test_conformity_asks_the_members_of_each_body_alone():
@@ -239,27 +224,15 @@ def test_conformity_asks_the_members_of_each_body_alone():
     assert bool((conformity(x1, x2, torch.zeros(1, 120, dtype=torch.bool), SCALE) == 0).all())
 
 
-def test_few_matches():
-    for n in (1, 2, 3, 9):
-        found = coherence(points(n), affine(points(n)), SCALE)
-        assert found[0].shape == (n,) and bool(found[0].isfinite().all())
-        assert found[1].index.shape[0] == n
-
-
 PIXEL = 1 / 200
-NONE = Links(torch.zeros(0, 0, dtype=torch.long), torch.zeros(0, 0, dtype=F64))
+NONE = no_links(0, torch.device("cpu"))
 
 
 def scene_view(seed: int = 0, **options) -> tuple[View, torch.Tensor, torch.Tensor]:
     """Two bodies around 0 at unit size, their matrices and labels from 0."""
     scene = scenes.bodies(60, 2, generator=draw(seed), **options)
-    T = torch.tensor([[PIXEL, 0, -1.6], [0, PIXEL, -1.2], [0, 0, 1]], dtype=F64)
-    inverse = torch.linalg.inv(T)
-    return view_of(scene, PIXEL), unit(inverse.mT @ torch.stack(scene.motion) @ inverse), scene.labels - 1
-
-
-def one_hot(labels):
-    return (labels == torch.arange(2)[:, None]).to(F64)
+    view, F = true_view(scene, PIXEL)
+    return view, F, scene.labels - 1
 
 
 def plane_and_points(count: int = 40):
@@ -275,61 +248,43 @@ def plane_and_points(count: int = 40):
     return unit(skew(epipole) @ H), H, x1, second
 
 
-def test_energy_is_the_sum_over_matches_and_pairs():
+def test_energy_is_the_sum_over_matches_and_pairs_and_empty_bodies_cost_nothing():
     view, F, labels = scene_view(sigma=1.0)
     labels = torch.stack([labels, labels.roll(3)])
-    member = torch.stack([one_hot(row) for row in labels])
-    found = energy(view, F.expand(2, 2, 3, 3), member)
-    relief, scale = parallax(view, F.expand(2, 2, 3, 3), member)
-    full = view.links.pull(torch.eye(60, dtype=F64))
+    fundamentals, member = F.expand(2, 2, 3, 3), one_hot(labels, 2)
+    found = energy(view, fundamentals, member)
+    relief, scale = parallax(view, fundamentals, member)
+    full = dense(view.links)
+    square = sampson_squared(F, view.x1, view.x2) / (SAMPSON_NOISE_PIXELS * PIXEL) ** 2
+    nu = PARALLAX_FREEDOM
     for b, row in enumerate(labels.tolist()):
         expected = 0.0
         for i, k in enumerate(row):
-            one, two = homogeneous(view.x1[i]), homogeneous(view.x2[i])
-            line, other = F[k] @ one, F[k].mT @ two
-            square = float((two @ line) ** 2 / (line[:2] @ line[:2] + other[:2] @ other[:2]))
-            expected += min(square / (SAMPSON_NOISE_PIXELS * PIXEL) ** 2, ENERGY_MAX_SQUARED_DISTANCE)
+            expected += min(float(square[k, i]), ENERGY_MAX_SQUARED_DISTANCE)
             expected += sum(CUT_COST * float(full[i, j]) for j in range(i) if row[j] != k)
             p, t = float(relief[b, k, i]), float(scale[b, k])
-            nu = PARALLAX_FREEDOM
             expected += PARALLAX_WEIGHT * ((nu + 1) * math.log(1 + p * p / (nu * t)) + math.log(t))
         assert float(found[b]) == pytest.approx(expected, rel=1e-9)
     assert found[0] < found[1]
-
-
-def test_empty_bodies_cost_nothing():
-    view, F, labels = scene_view(sigma=0.5)
-    member = one_hot(labels)
-    found = energy(view, F[None], member[None])
-    more = energy(
-        view,
-        torch.cat([F, torch.zeros(1, 3, 3, dtype=F64)])[None],
-        torch.cat([member, torch.zeros(1, 60, dtype=F64)])[None],
-    )
-    torch.testing.assert_close(more, found)
-
-
-def test_points_of_a_plane_have_no_parallax():
-    F, _, x1, second = plane_and_points()
-    view = View(x1, second(torch.zeros(40)), PIXEL, NONE)
-    value, scale = parallax(view, F[None, None], torch.ones(1, 1, 40, dtype=F64))
-    assert float(value.abs().max()) < 1e-5
-    torch.testing.assert_close(scale, torch.full((1, 1), MIN_PARALLAX_PIXELS**2, dtype=F64))
+    none = torch.zeros(2, 1, 3, 3, dtype=F64)
+    torch.testing.assert_close(energy(view, torch.cat([fundamentals, none], 1), one_hot(labels, 3)), found)
 
 
 def test_parallax_is_the_way_along_the_epipolar_line_in_pixels():
     F, H, x1, second = plane_and_points()
+    value, scale = parallax(View(x1, second(torch.zeros(40)), PIXEL, NONE), F[None, None], torch.ones(1, 1, 40, dtype=F64))
+    assert float(value.abs().max()) < 1e-5  # none of points of the plane
+    torch.testing.assert_close(scale, torch.full((1, 1), MIN_PARALLAX_PIXELS**2, dtype=F64))
     step = torch.zeros(40, dtype=F64)
     step[:12] = 1e-4 * torch.linspace(-1, 1, 12, dtype=F64)
-    member = (step == 0).to(F64)[None, None]  # the plane is that of the others
-    value, _ = parallax(View(x1, second(step), PIXEL, NONE), F[None, None], member)
+    member, view = (step == 0).to(F64)[None, None], View(x1, second(step), PIXEL, NONE)  # the plane is that of the others
+    value, _ = parallax(view, F[None, None], member)
     way = (second(step) - apply(H, x1)).norm(dim=-1) / PIXEL
     torch.testing.assert_close(value[0, 0, :12].abs(), way[:12], rtol=1e-3, atol=1e-7)
     # to both sides of the plane
     assert bool((value[0, 0, :6] * value[0, 0, 6:12].flip(0) < 0).all())
     for factor in (-1.0, 7.0, 1e-3):
-        scaled, _ = parallax(View(x1, second(step), PIXEL, NONE), factor * F[None, None], member)
-        torch.testing.assert_close(scaled.abs(), value.abs(), rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(parallax(view, factor * F[None, None], member)[0].abs(), value.abs(), rtol=1e-6, atol=1e-6)
 
 
 def test_a_few_points_off_the_plane_do_not_bend_it():
@@ -353,7 +308,7 @@ def test_scale_is_that_of_students_distribution():
 def test_batches_are_loops_and_subsets_are_views_of_their_own():
     view, F, labels = scene_view(1, sigma=0.5)
     turned = torch.stack([F, F.flip(0), F])
-    member = torch.stack([one_hot(labels), one_hot(labels), one_hot(labels.roll(7))])
+    member = one_hot(torch.stack([labels, labels, labels.roll(7)]), 2)
     value, scale = parallax(view, turned, member)
     total = energy(view, turned, member)
     for b in range(3):
@@ -373,7 +328,7 @@ def test_absent_bodies_and_matches_at_the_epipole_stay_finite():
     for matrices in (F[None], torch.zeros(1, 2, 3, 3, dtype=F64)):
         value, scale = parallax(view, matrices, nothing)
         assert bool(value.isfinite().all()) and bool(scale.isfinite().all())
-        assert bool(energy(view, matrices, one_hot(labels)[None]).isfinite().all())
+        assert bool(energy(view, matrices, one_hot(labels, 2)[None]).isfinite().all())
     # zoom: the epipole is a point of the image
     F, zoom = skew(torch.tensor([0.0, 0.0, 1.0], dtype=F64)), view.x1.clone()
     zoom[0] = 0.0

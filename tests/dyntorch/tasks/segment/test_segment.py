@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -10,7 +11,9 @@ import torch
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.core.outcome import Status
-from dyntorch.geometry.homogeneous import apply, homogeneous
+from dyntorch.geometry.epipolar import sampson_squared
+from dyntorch.geometry.homogeneous import apply
+from dyntorch.geometry.homography import homography_sampson_squared
 from dyntorch.metrics import misclassification, relative_error
 from dyntorch.tasks.segment.result import SegmentNotice
 from tests.dyntorch.tasks.segment.videos import F64, draw
@@ -18,12 +21,38 @@ from tests.dyntorch.tasks.segment.videos import F64, draw
 NAMES = ("labels", "bodies", "fundamentals", "homographies", "probabilities", "residuals", "coherence", "status", "threshold")
 
 
+def scene_of(n: int = 80, bodies: int = 2, seed: int = 1, **options):
+    return scenes.bodies(n, bodies, **{"sigma": 0.5, **options}, generator=draw(seed))
+
+
 def two_bodies(seed: int = 0, **options):
-    return scenes.bodies(120, 2, **{"sigma": 0.5, "outliers": 0.2, **options}, generator=draw(seed))
+    return scene_of(120, 2, seed, **{"outliers": 0.2, **options})
+
+
+def random_points(n: int, seed: int) -> torch.Tensor:
+    return 500 * torch.rand(n, 2, generator=draw(seed), dtype=F64)
+
+
+def codes(found):
+    return {notice.code for notice in found.warnings}
+
+
+def checked(x1, x2, seed: int = 0, **options):
+    """The result, its parts checked against each other."""
+    found = dyn.segment(x1, x2, generator=draw(seed), **options)
+    batch, n, count = x1.shape[:-2], x1.shape[-2], found.fundamentals.shape[-3]
+    assert found.labels.shape == found.residuals.shape == found.coherence.shape == (*batch, n)
+    assert found.probabilities.shape == (*batch, n, count + 1)
+    assert found.homographies.shape == found.fundamentals.shape == (*batch, count, 3, 3)
+    assert found.bodies.shape == found.status.shape == found.threshold.shape == batch
+    assert all(bool(getattr(found, name).isfinite().all()) for name in NAMES[:8])
+    assert bool((found.labels >= 0).all()) and bool((found.labels <= found.bodies[..., None]).all())
+    assert repr(found).startswith("Segmentation(")
+    return found
 
 
 def segmented(scene, seed: int = 9, **options):
-    return dyn.segment(*scene.views, generator=draw(seed), **options)
+    return checked(*scene.views, seed, **options)
 
 
 def error(found, scene) -> float:
@@ -81,42 +110,15 @@ def test_parts_of_the_result_fit_together():
     torch.testing.assert_close(found.probabilities.sum(-1), torch.ones(120, dtype=F64))
     assert torch.equal(found.probabilities.argmax(-1), found.labels)
     assert float(found.threshold) == 2.5
-    squares = []
-    for F, H, model in zip(found.fundamentals, found.homographies, found.models, strict=True):
-        one, two = homogeneous(x1), homogeneous(x2)
-        if model == dyn.tasks.BodyModel.FUNDAMENTAL:
-            line, other = one @ F.mT, two @ F
-            squares.append((two * line).sum(-1) ** 2 / (line[:, :2].square().sum(-1) + other[:, :2].square().sum(-1)))
-        else:
-            mapped = one @ H.mT
-            c = mapped[:, :2] - x2 * mapped[:, 2:]
-            third = -mapped[:, 2, None, None] * torch.eye(2, dtype=F64)
-            J = torch.cat([H[:2, :2] - x2[:, :, None] * H[2, :2], third], dim=-1)
-            squares.append((c * torch.linalg.solve(J @ J.mT, c)).sum(-1))
-    distance = torch.stack(squares).sqrt()
+    flat = torch.tensor([model == dyn.tasks.BodyModel.HOMOGRAPHY for model in found.models])[:, None]
+    squares = homography_sampson_squared(found.homographies, x1, x2), sampson_squared(found.fundamentals, x1, x2)
+    distance = torch.where(flat, *squares).sqrt()
     own = distance.gather(0, (found.labels - 1).clamp(min=0)[None])[0]
     torch.testing.assert_close(found.residuals, torch.where(found.labels > 0, own, distance.amin(0)), rtol=1e-5, atol=1e-6)
     assert float(found.residuals[found.labels > 0].max()) < 3 * 2.5
-
-
-@pytest.mark.slow
-def test_batches_are_loops():
-    scene = scenes.bodies(60, 2, batch=(2, 2), sigma=0.5, outliers=0.1, generator=draw(4))
-    x1, x2 = scene.views
-    found = dyn.segment(x1, x2, generator=draw(5))
-    assert found.labels.shape == (2, 2, 60) and found.status.shape == (2, 2) and found.fundamentals.shape[:2] == (2, 2)
-    generator = draw(5)
-    for i in range(2):
-        for j in range(2):
-            one = dyn.segment(x1[i, j], x2[i, j], generator=generator)
-            count = int(one.bodies)
-            assert torch.equal(found.labels[i, j], one.labels) and int(found.bodies[i, j]) == count
-            assert found.models[i][j] == one.models
-            torch.testing.assert_close(found.fundamentals[i, j, :count], one.fundamentals)
-            assert bool((found.fundamentals[i, j, count:] == 0).all())
-            torch.testing.assert_close(found.probabilities[i, j, :, : count + 1], one.probabilities)
-            torch.testing.assert_close(found.residuals[i, j], one.residuals)
-    assert "batch=(2, 2): 4 OK" in repr(found) and "bodies: 2 to 2" in repr(found)
+    assert found.check() is found and found.warnings == ()
+    text = repr(found)
+    assert "matches=120" in text and "1 OK" in text and "body 2:" in text and "outliers:" in text
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-300, 1e-150, 1e300])
@@ -137,36 +139,22 @@ def test_tiny_and_huge_matches_fail_alone(views, scale):
 
 
 @pytest.mark.slow
-def test_generator_is_the_only_randomness():
-    scene = two_bodies(5)
-    first, second = segmented(scene, 1), segmented(scene, 1)
-    assert all(torch.equal(getattr(first, name), getattr(second, name)) for name in NAMES)
-
-
-@pytest.mark.slow
-def test_order_of_matches_and_of_views_do_not_matter():
+def test_order_of_matches_and_views_unit_and_origin_do_not_matter():
     scene = two_bodies(6)
     x1, x2 = scene.views
     found = segmented(scene)
     order = torch.randperm(120, generator=draw(7))
-    mixed = dyn.segment(x1[order], x2[order], generator=draw(8))
+    mixed = checked(x1[order], x2[order], 8)
     assert float(misclassification(mixed.labels, found.labels[order])) <= 0.02
-    swapped = dyn.segment(x2, x1, generator=draw(8))
+    swapped = checked(x2, x1, 8)
     assert float(misclassification(swapped.labels, found.labels)) <= 0.02
     # bodies of nearly the same size may change places
     turned = swapped.fundamentals.mT
     cross = relative_error(turned[:, None].expand(2, 2, 3, 3), found.fundamentals.expand(2, 2, 3, 3))
     assert float(cross.amin(1).max()) < 0.02
-
-
-@pytest.mark.slow
-def test_unit_and_origin_of_the_coordinates_do_not_matter():
-    scene = two_bodies(7)
-    x1, x2 = scene.views
-    found = segmented(scene)
     shift = torch.tensor([300.0, -200.0], dtype=F64)
     for scale in (3.0, 1e-4, 1e5):
-        moved = dyn.segment(scale * (x1 + shift), scale * (x2 - shift), threshold=2.5 * scale, generator=draw(9))
+        moved = checked(scale * (x1 + shift), scale * (x2 - shift), 9, threshold=2.5 * scale)
         assert torch.equal(moved.labels, found.labels) and moved.models == found.models
         torch.testing.assert_close(moved.residuals / scale, found.residuals, rtol=1e-4, atol=1e-5)
 
@@ -183,64 +171,44 @@ def test_dtype_of_the_input_is_that_of_the_result(dtype):
 
 
 @pytest.mark.slow
-def test_missing_matches_and_those_without_weight_are_absent():
-    scene = two_bodies(9)
+def test_missing_matches_and_those_without_weight_are_absent_and_weights_are_relative():
+    scene = two_bodies(9, planar=(1,))
     x1, x2 = scene.views
     found = segmented(scene)
-    stray = torch.rand(20, 2, generator=draw(1), dtype=F64) * 300
+    stray = random_points(20, 1)
     wide1, wide2 = torch.cat([stray, x1]), torch.cat([stray.flip(0), x2])
     weights = torch.ones(140, dtype=F64)
     weights[:20] = 0.0
-    without = dyn.segment(wide1, wide2, weights=weights, generator=draw(9))
     missing1, missing2 = wide1.clone(), wide2.clone()
     missing1[:10], missing2[10:20] = torch.nan, torch.inf
-    missing = dyn.segment(missing1, missing2, generator=draw(9))
-    for result in (without, missing):
+    for result in (checked(wide1, wide2, 9, weights=weights), checked(missing1, missing2, 9)):
         assert torch.equal(result.labels[20:], found.labels) and bool((result.labels[:20] == 0).all())
         torch.testing.assert_close(result.fundamentals, found.fundamentals)
         assert bool((result.probabilities[:20] == 0).all()) and bool((result.residuals[:20] == 0).all())
         assert bool((result.coherence[:20] == 0).all())
-
-
-@pytest.mark.slow
-def test_weights_are_relative():
-    scene = two_bodies(10, planar=(1,))
-    found = segmented(scene)
     for weight in (1e-6, 1e6):
         scaled = segmented(scene, weights=torch.full((120,), weight, dtype=F64))
         assert torch.equal(scaled.labels, found.labels) and scaled.models == found.models
         torch.testing.assert_close(scaled.fundamentals, found.fundamentals, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("sigma", [0.2, 1.0])
-def test_threshold_is_estimated(sigma):
-    scene = two_bodies(11, sigma=sigma)
-    found = segmented(scene, threshold=None)
-    assert 3 * sigma < float(found.threshold) < 7.5 * sigma
-    assert error(found, scene) <= 0.05
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.1, 1.0])
-def test_threshold_is_estimated_from_planes(sigma):
+def test_threshold_is_estimated():
     """The distance from a homography has two components, that from an epipolar line one."""
-    draw = torch.Generator().manual_seed(3)
-    scene = scenes.bodies(200, bodies=2, planar=(1, 2), sigma=sigma, generator=draw)
-    found = dyn.segment(*scene.views, threshold=None, generator=draw)
-    assert found.models == (dyn.tasks.BodyModel.HOMOGRAPHY,) * 2
-    assert float(found.threshold) == pytest.approx(5 * sigma, rel=0.25)
+    for sigma in (0.1, 0.2, 1.0):
+        scene = two_bodies(11, sigma=sigma)
+        found = segmented(scene, threshold=None)
+        assert 3 * sigma < float(found.threshold) < 7.5 * sigma and error(found, scene) <= 0.05
+        planes = segmented(scene_of(200, 2, 3, planar=(1, 2), sigma=sigma), threshold=None)
+        assert planes.models == (dyn.tasks.BodyModel.HOMOGRAPHY,) * 2
+        assert float(planes.threshold) == pytest.approx(5 * sigma, rel=0.25)
 
 
 @pytest.mark.slow
-def test_check_repr_and_notices():
+def test_one_bad_problem_leaves_the_others_alone_and_is_named():
     scene = two_bodies(12)
-    found = segmented(scene)
-    assert found.check() is found and found.warnings == ()
-    text = repr(found)
-    assert "matches=120" in text and "1 OK" in text and "body 2:" in text and "outliers:" in text
     x1, x2 = scene.views
-    apart = torch.rand(120, 2, generator=draw(2), dtype=F64) * 400
-    failed = dyn.segment(torch.stack([x1, x1]), torch.stack([x2, apart]), bodies=2, generator=draw(9))
+    failed = checked(torch.stack([x1, x1]), torch.stack([x2, random_points(120, 2)]), 9, bodies=2)
     assert failed.status.tolist() == [Status.OK, Status.NO_CONSENSUS]
     with pytest.raises(ValueError, match="problem 1 of 2: NO_CONSENSUS"):
         failed.check()
@@ -248,7 +216,6 @@ def test_check_repr_and_notices():
         (SegmentNotice.FEWER_BODIES, (1,)),
         (SegmentNotice.INCOHERENT, (1,)),
     }
-    # the other problem is not touched
     assert torch.equal(failed.labels[0], segmented(scene, bodies=2).labels)
 
 
@@ -296,38 +263,6 @@ def test_the_default_dtype_decides_nothing(dtype, spatial):
         torch.testing.assert_close(getattr(found, name), getattr(known, name), rtol=0, atol=0)
 
 
-def test_options_are_of_the_verb():
-    with pytest.raises(ValueError, match=r"options must be SegmentOptions, got \{\}; use dataclasses\.replace"):
-        segmented(two_bodies(), options={})
-
-
-def scene_of(n: int = 80, bodies: int = 2, **options):
-    return scenes.bodies(n, bodies, **{"sigma": 0.5, **options}, generator=draw(1))
-
-
-def random_points(n: int, seed: int) -> torch.Tensor:
-    return 500 * torch.rand(n, 2, generator=draw(seed), dtype=F64)
-
-
-def checked(x1, x2, **options):
-    """The result, its parts checked against each other."""
-    found = dyn.segment(x1, x2, generator=draw(), **options)
-    batch, n, count = x1.shape[:-2], x1.shape[-2], found.fundamentals.shape[-3]
-    assert found.labels.shape == found.residuals.shape == found.coherence.shape == (*batch, n)
-    assert found.probabilities.shape == (*batch, n, count + 1)
-    assert found.homographies.shape == found.fundamentals.shape == (*batch, count, 3, 3)
-    assert found.bodies.shape == found.status.shape == found.threshold.shape == batch
-    for part in (found.fundamentals, found.homographies, found.probabilities, found.residuals, found.coherence):
-        assert bool(part.isfinite().all())
-    assert bool((found.labels >= 0).all()) and bool((found.labels <= found.bodies[..., None]).all())
-    assert repr(found).startswith("Segmentation(")
-    return found
-
-
-def codes(found):
-    return {notice.code for notice in found.warnings}
-
-
 X1, X2 = scene_of().views
 
 
@@ -355,6 +290,9 @@ X1, X2 = scene_of().views
         ("must be a torch.Tensor, got list", {"x1": X1.tolist()}),
         ("weights must not be negative, got -1", {"weights": -torch.ones(80)}),
         ("weights must be", {"weights": torch.ones(79)}),
+        (r"options must be SegmentOptions, got \{\}; use dataclasses\.replace", {"options": {}}),
+        (r"x1\[:, 0\]", {"x1": X1[:, None], "x2": X2[:, None]}),
+        ("manual_seed", {"generator": 0}),
     ],
 )
 def test_misuse_is_refused_in_one_line(message, arguments):
@@ -429,19 +367,18 @@ def test_matches_on_one_line(bodies):
     assert int(found.bodies) >= 1 and float((found.labels > 0).double().mean()) > 0.9
 
 
+def test_copies_of_one_match_may_be_the_majority():
+    scene = scene_of(120, 2)
+    place = torch.cat([torch.zeros(300, dtype=torch.long), torch.arange(120)])
+    found = checked(*(50 * x[place] for x in scene.views), threshold=2.5 * 50)
+    assert float(misclassification(found.labels[300:], scene.labels)) <= 0.03
+
+
 def test_copies_of_matches_change_nothing_but_a_notice():
     scene = scene_of(80, 2, outliers=0.2)
     found = checked(*(x.repeat(3, 1) for x in scene.views))
     assert float(misclassification(found.labels, scene.labels.repeat(3))) <= 0.03
     assert torch.equal(found.labels[:80], found.labels[80:160]) and codes(found) == {SegmentNotice.REPEATED}
-
-
-@pytest.mark.parametrize("unit", [1.0, 50.0])
-def test_copies_of_one_match_may_be_the_majority(unit):
-    scene = scene_of(120, 2)
-    place = torch.cat([torch.zeros(300, dtype=torch.long), torch.arange(120)])
-    found = checked(*(unit * x[place] for x in scene.views), threshold=2.5 * unit)
-    assert float(misclassification(found.labels[300:], scene.labels)) <= 0.03
 
 
 @pytest.mark.slow
@@ -471,15 +408,25 @@ def test_empty_batches(batch):
 
 
 @pytest.mark.slow
-def test_one_bad_problem_leaves_the_others_alone():
+def test_batches_are_loops():
     scene = scenes.bodies(60, 2, batch=(2, 3), sigma=0.5, generator=draw(2))
     x1, x2 = (x.clone() for x in scene.views)
     x1[0, 1], x2[1, 0] = torch.nan, random_points(60, 5)
-    found = checked(x1, x2)
+    found = checked(x1, x2, 5)
     assert found.status.tolist() == [[Status.OK, Status.TOO_FEW, Status.OK], [Status.NO_CONSENSUS, Status.OK, Status.OK]]
     good = found.status == Status.OK
     assert float(misclassification(found.labels[good], scene.labels[good]).max()) <= 0.04
     assert [[len(models) for models in row] for row in found.models] == found.bodies.tolist() == [[2, 0, 2], [0, 2, 2]]
+    assert "batch=(2, 3)" in repr(found) and "4 OK" in repr(found) and "bodies: 0 to 2" in repr(found)
+    generator = draw(5)
+    for place in product(range(2), range(3)):
+        one = dyn.segment(x1[place], x2[place], generator=generator)
+        count = int(one.bodies)
+        assert torch.equal(found.labels[place], one.labels) and found.models[place[0]][place[1]] == one.models
+        torch.testing.assert_close(found.fundamentals[place][:count], one.fundamentals)
+        assert bool((found.fundamentals[place][count:] == 0).all())
+        torch.testing.assert_close(found.probabilities[place][:, : count + 1], one.probabilities)
+        torch.testing.assert_close(found.residuals[place], one.residuals)
 
 
 @pytest.mark.slow
@@ -504,15 +451,3 @@ def test_a_threshold_in_another_unit_is_named():
     assert int(found.status) == Status.AMBIGUOUS and int(found.bodies) == 0
     assert [notice.code for notice in found.warnings] == [SegmentNotice.COARSE]
     assert int(dyn.segment(*(x / 640 for x in scene.views), threshold=2.5 / 640).bodies) == 2
-
-
-def test_points_in_the_shape_of_opencv_are_named():
-    x = torch.rand(20, 1, 2)
-    with pytest.raises(ValueError, match=r"x1\[:, 0\]"):
-        dyn.segment(x, x)
-
-
-def test_a_seed_is_no_generator():
-    x = torch.rand(20, 2)
-    with pytest.raises(ValueError, match="manual_seed"):
-        dyn.segment(x, x, generator=0)

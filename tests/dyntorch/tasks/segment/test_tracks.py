@@ -15,7 +15,6 @@ from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment import agglomeration, frame_pairs
 from dyntorch.tasks.segment import tracks as module
 from dyntorch.tasks.segment.result import SegmentNotice
-from tests.battery.pretend_device import pretend_device
 from tests.dyntorch.tasks.segment.videos import F64, Shot, draw, shot
 
 QUICK = dyn.TrackSegmentOptions(max_frame_pairs=8, num_hypotheses=100)
@@ -40,13 +39,6 @@ def wrong(found, labels) -> float:
 
 def codes(found) -> list:
     return [one.code for one in found.notices]
-
-
-def same(one, other, **tolerance) -> None:
-    for field in fields(one):
-        value, known = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(value, torch.Tensor):
-            torch.testing.assert_close(value, known, equal_nan=True, check_dtype=True, msg=field.name, **tolerance)
 
 
 # ---- labels ------------------------------------------------------------------------------------------------------------
@@ -89,7 +81,7 @@ def partial() -> Shot:
 
 
 @pytest.mark.slow
-def test_partial_tracks_and_a_body_that_appears_late():
+def test_partial_tracks_bodies_that_never_meet_and_empty_frames():
     scene = partial()
     found = segmented(scene.tracks, 3).check()
     assert wrong(found, scene.labels) <= 0.05
@@ -97,15 +89,15 @@ def test_partial_tracks_and_a_body_that_appears_late():
     gone = found.pairs[:, 0] < 4
     assert bool(gone.any()) and bool((found.geometries[gone, late - 1] == 0).all())
     assert bool((found.geometries[~gone, late - 1].norm(dim=(-2, -1)) > 0.9).any())
-
-
-@pytest.mark.slow
-def test_bodies_that_never_meet():
     scene = shot((50, 30, 25), frames=12, seed=3)
     scene.tracks[6:, 50:80] = torch.nan
     scene.tracks[:6, 80:] = torch.nan
-    found = segmented(scene.tracks, 3)
+    assert wrong(segmented(scene.tracks, 3), scene.labels) <= 0.05
+    scene = shot((50, 30), frames=8)
+    scene.tracks[[0, 4]] = torch.nan
+    found = segmented(scene.tracks, 2)
     assert wrong(found, scene.labels) <= 0.05
+    assert not bool((found.pairs == 0).any()) and not bool((found.pairs == 4).any())
 
 
 @pytest.mark.slow
@@ -156,15 +148,6 @@ def test_two_or_three_frames(frames):
     assert wrong(found, scene.labels) <= 0.05
 
 
-@pytest.mark.slow
-def test_frames_that_show_nothing():
-    scene = shot((50, 30), frames=8)
-    scene.tracks[[0, 4]] = torch.nan
-    found = segmented(scene.tracks, 2)
-    assert wrong(found, scene.labels) <= 0.05
-    assert not bool((found.pairs == 0).any()) and not bool((found.pairs == 4).any())
-
-
 # ---- parts of the result -----------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_parts_of_the_result_fit_together():
@@ -198,46 +181,45 @@ def test_declared_cameras_name_what_rests():
     found = segmented(scene.tracks, 2)
     assert int(found.static_body) == 0 and codes(found) == [SegmentNotice.UNSURE_STATIC]
     first = int(found.labels[scene.labels == 1].mode().values)
-    found = segmented(scene.tracks, 2, cameras=scene.cameras)
-    assert int(found.static_body) == first and not found.notices
-    moving = segmented(scene.tracks, 2, cameras=scene.projections[:, 1])
-    assert int(moving.static_body) == 3 - first
-    strange = segmented(scene.tracks, 2, cameras=scene.cameras.flip(0)[:, [1, 0, 2]])
-    assert int(strange.static_body) == 0 and codes(strange) == [SegmentNotice.DISAGREEING]
+    cameras = torch.stack([scene.cameras, scene.projections[:, 1], scene.cameras.flip(0)[:, [1, 0, 2]]])
+    batch = segmented(scene.tracks.expand(3, -1, -1, -1), 2, cameras=cameras)
+    assert batch.static_body.tolist() == [first, 3 - first, 0]
+    assert [(one.code, one.problem) for one in batch.notices] == [(SegmentNotice.DISAGREEING, (2,))]
+    assert segmented(scene.tracks, 2, cameras=scene.cameras).static_body == first
 
 
 # ---- what it must not depend on ----------------------------------------------------------------------------------------
 @pytest.mark.slow
-def test_the_order_of_tracks_permutes_labels_only():
-    scene = shot((50, 30))
-    order = torch.randperm(80, generator=draw(7))
-    one, other = segmented(scene.tracks, 2), segmented(scene.tracks[:, order], 2)
-    assert other.labels.tolist() == one.labels[order].tolist()
-
-
-@pytest.mark.slow
-def test_shift_and_scale_of_pixels_change_nothing():
+def test_order_unit_origin_and_precision_of_the_tracks_do_not_matter():
     scene = shot((50, 30))
     one = segmented(scene.tracks, 2)
+    order = torch.randperm(80, generator=draw(7))
+    assert segmented(scene.tracks[:, order], 2).labels.tolist() == one.labels[order].tolist()
     other = segmented(0.01 * scene.tracks - 4.0, 2, threshold=0.025)
     assert other.labels.tolist() == one.labels.tolist() and other.pairs.tolist() == one.pairs.tolist()
     torch.testing.assert_close(other.residuals, 0.01 * one.residuals, rtol=0.05, atol=1e-4)
+    single = segmented(scene.tracks.float(), 2)
+    values = [getattr(single, field.name) for field in fields(single)]
+    assert {x.dtype for x in values if isinstance(x, torch.Tensor) and x.is_floating_point()} == {torch.float32}
+    assert float((one.labels == single.labels).double().mean()) > 0.95
 
 
 @pytest.mark.slow
-def test_the_same_generator_gives_the_same():
-    scene = partial()
-    same(segmented(scene.tracks, 3), segmented(scene.tracks, 3), rtol=0, atol=0)
-
-
-@pytest.mark.slow
-def test_without_a_generator_the_global_one_decides():
-    scene = shot((50, 30), frames=4)
-    found = []
-    for _ in range(2):
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_the_default_dtype_decides_nothing_and_the_global_generator_draws(dtype):
+    tracks = shot((45, 25), frames=6).tracks.to(dtype)
+    before, found = torch.get_default_dtype(), []
+    for default in (torch.float32, F64):
         torch.manual_seed(3)
-        found.append(segmented(scene.tracks, 2, generator=None))
-    same(*found, rtol=0, atol=0)
+        torch.set_default_dtype(default)
+        try:
+            found.append(segmented(tracks, 2, generator=None))
+        finally:
+            torch.set_default_dtype(before)
+    for field in fields(found[0]):
+        value, known = (getattr(one, field.name) for one in found)
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(value, known, rtol=0, atol=0, equal_nan=True, msg=field.name)
 
 
 @pytest.mark.slow
@@ -258,35 +240,6 @@ def test_a_batch_is_a_loop_and_one_bad_problem_harms_no_other():
         assert bool((both.geometries[place, P:] == 0).all()) and bool((both.geometries[place, :, K:] == 0).all())
         torch.testing.assert_close(both.probabilities[place, :, : K + 1], one.probabilities)
         torch.testing.assert_close(both.residuals[place], one.residuals)
-
-
-@pytest.mark.slow
-def test_cameras_of_a_batch():
-    scene = shot((40, 36), frames=6)
-    cameras = torch.stack([scene.cameras, scene.projections[:, 1]])
-    found = segmented(scene.tracks.expand(2, -1, -1, -1), 2, cameras=cameras)
-    rests = [int(found.labels[0][scene.labels == 1].mode().values), int(found.labels[1][scene.labels == 2].mode().values)]
-    assert found.static_body.tolist() == rests
-
-
-@pytest.mark.slow
-def test_single_precision_in_and_out():
-    scene = shot((50, 30), frames=6)
-    one, other = segmented(scene.tracks, 2), segmented(scene.tracks.float(), 2)
-    floats = [getattr(other, field.name) for field in fields(other) if isinstance(getattr(other, field.name), torch.Tensor)]
-    assert {value.dtype for value in floats if value.is_floating_point()} == {torch.float32}
-    assert float((one.labels == other.labels).double().mean()) > 0.95
-
-
-@pytest.mark.slow
-def test_the_result_is_where_the_tracks_are():
-    home = pretend_device()
-    scene = shot((50, 30), frames=6)
-    found = segmented(scene.tracks.to(home), 2, cameras=scene.cameras.to(home))
-    here = segmented(scene.tracks, 2, cameras=scene.cameras)
-    values = [getattr(found, field.name) for field in fields(found)]
-    assert all(value.device == home for value in values if isinstance(value, torch.Tensor))
-    assert found.labels.cpu().tolist() == here.labels.tolist()
 
 
 # ---- what is refused, and what is said ---------------------------------------------------------------------------------
@@ -379,16 +332,12 @@ GOOD = shot((8,), frames=4).tracks
         (GOOD, {"cameras": torch.full((4, 3, 4), torch.nan)}, "cameras hold numbers that are not finite; give"),
         (GOOD, {"generator": 7}, r"generator must be a torch.Generator or None, got 7; use torch.Generator\(\)"),
         (GOOD, {"options": dyn.SegmentOptions()}, "options must be TrackSegmentOptions, got SegmentOptions"),
+        (torch.zeros(0, 5, 20, 2), {}, "holds no problem; give one at least"),
     ],
 )
 def test_bad_input_is_refused_with_the_value_and_a_remedy(tracks, given, words):
     with pytest.raises(ValueError, match=words):
         dyn.segment_tracks(tracks, **given)
-
-
-def test_an_empty_batch_is_refused():
-    with pytest.raises(ValueError, match="holds no problem; give one at least"):
-        segmented(torch.zeros(0, 5, 20, 2))
 
 
 @pytest.mark.parametrize(("count", "frames"), [(20, 5), (120, 12)])
@@ -405,17 +354,3 @@ def test_options_decide():
     assert int(segmented(scene.tracks, options=replace(QUICK, max_bodies=2)).bodies) == 2
     assert SegmentNotice.STILL in codes(segmented(scene.tracks, options=replace(QUICK, min_motion=1e3)))
     assert len(segmented(scene.tracks, 3, options=replace(QUICK, max_frame_pairs=6)).pairs) == 6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
-def test_the_default_dtype_decides_nothing(dtype):
-    tracks = shot((45, 25)).tracks.to(dtype)
-    known = segmented(tracks, 2)
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(F64)
-    try:
-        found = segmented(tracks, 2)
-    finally:
-        torch.set_default_dtype(before)
-    same(found, known, rtol=0, atol=0)

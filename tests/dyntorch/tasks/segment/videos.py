@@ -11,8 +11,9 @@ from torch import Tensor
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, skew, unit
 from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.scenes.scene import Scene
-from dyntorch.tasks.segment.coherence import Links, View, coherence
-from dyntorch.tasks.segment.frame_pairs import TrackSet
+from dyntorch.tasks.segment.coherence import View, coherence
+from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet
+from dyntorch.tasks.segment.track_energy import no_links
 
 F64 = torch.float64
 K = torch.tensor([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]], dtype=F64)
@@ -40,6 +41,12 @@ class Shot:
         centre = torch.linalg.svd(a)[2][-1]
         return unit(skew(b @ centre) @ b @ torch.linalg.pinv(a))
 
+    def truth(self, pairs: Sequence[FramePair]) -> list[Tensor]:
+        """Of all bodies, ``(1, K, 3, 3)`` for every pair, in the coordinates of the film."""
+        back = self.film().change.inverse()
+        bodies = range(self.projections.shape[1])
+        return [torch.stack([back.mT @ self.fundamental(k, *pair.frames) @ back for k in bodies])[None] for pair in pairs]
+
     def film(self, pixel: float = 1.0) -> TrackSet:
         """As the stages see it."""
         return TrackSet.of(self.tracks, pixel)
@@ -52,8 +59,13 @@ def draw(seed: int = 0) -> torch.Generator:
 def view_of(scene: Scene, pixel: float = 1 / 200, linked: bool = True) -> View:
     """The matches of a scene around 0, at a pixel's size."""
     x1, x2 = (x * pixel - torch.tensor([320.0, 240.0], dtype=F64) * pixel for x in scene.views)
-    none = Links(torch.zeros(len(x1), 0, dtype=torch.long), torch.zeros(len(x1), 0, dtype=F64))
-    return View(x1, x2, pixel, coherence(x1, x2, 3 * pixel)[1] if linked else none)
+    return View(x1, x2, pixel, coherence(x1, x2, 3 * pixel)[1] if linked else no_links(len(x1), x1.device))
+
+
+def true_view(scene: Scene, pixel: float, linked: bool = True) -> tuple[View, Tensor]:
+    """The same, and the true fundamental matrices ``(K, 3, 3)`` of the bodies there."""
+    back = torch.tensor([[1 / pixel, 0, 320.0], [0, 1 / pixel, 240.0], [0, 0, 1]], dtype=F64)
+    return view_of(scene, pixel, linked), unit(back.mT @ torch.stack(scene.motion) @ back)
 
 
 def shot(
