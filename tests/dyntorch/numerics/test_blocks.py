@@ -16,52 +16,34 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.core import matrix
-from dyntorch.core import primitives as base
-from dyntorch.core import primitives as plane
-from dyntorch.geometry import epipolar, extensors, grassmann, grassmann_nearest
-from dyntorch.geometry import epipolar as epipolar_variance
-from dyntorch.geometry import epipolar_fit as epipolar_descent
-from dyntorch.geometry import extensors as exterior
-from dyntorch.geometry import grassmann as grassmann_recovery
-from dyntorch.geometry import homogeneous as monomials
-from dyntorch.geometry import pairs as epipole_pairs
-from dyntorch.invariants import dynamic_shape_tensor as dynamic_shape_rows
-from dyntorch.invariants import dynamic_tensor
-from dyntorch.invariants import reprojection as shape_residual
+from dyntorch.core import matrix, primitives
+from dyntorch.geometry import epipolar, epipolar_fit, extensors, grassmann, grassmann_nearest, homogeneous, pairs
+from dyntorch.invariants import dynamic_shape_tensor, dynamic_tensor, reprojection
 from dyntorch.numerics import eigenspaces, lags
 from dyntorch.numerics.blocks import LARGE, constant, each, map_blocks, one_thread, select, workers
-from dyntorch.shapes import basis as dynamic_shape_theory
-from dyntorch.shapes import lifted
-from dyntorch.shapes import static as shape_completion
-from dyntorch.shapes import static as shape_points
-from dyntorch.shapes import static as shape_rows
+from dyntorch.shapes import basis, lifted, static
 from dyntorch.shapes.basis import Polynomial
-from dyntorch.tasks.planes import closed_forms as infinity_extensors
-from dyntorch.tasks.planes import problem as planes_problem
-from dyntorch.tasks.planes import problem as planes_starts
+from dyntorch.tasks.planes import closed_forms, problem
 from dyntorch.tasks.synchronize import projective
+from experiments.common.timing import threads as torch_threads
 from tests.grid import grid
 
 
 @pytest.fixture
 def two_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
+    with torch_threads(2):
+        yield
 
 
 @grid(("batch", [0, 1, 6, 7, 23]), ("threads", [1, 2]))
 def test_blocks_equal_the_whole(batch, threads):
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    x = torch.arange(batch * 3.0).reshape(batch, 3)
-    y = torch.arange(batch)
-    total, twice = map_blocks(lambda a, b: (a.sum(-1) + b, 2 * a), x, y, size=3)
-    torch.set_num_threads(before)
-    assert torch.equal(total, x.sum(-1) + y)
-    assert torch.equal(twice, 2 * x)
+    x, y = torch.arange(batch * 3.0).reshape(batch, 3), torch.arange(batch)
+    with torch_threads(threads):
+        total, twice = map_blocks(lambda a, b: (a.sum(-1) + b, 2 * a), x, y, size=3)
+        single = map_blocks(torch.neg, x, size=2)
+        nested = map_blocks(lambda x: map_blocks(torch.neg, x, size=1), x, size=2)  # blocks inside blocks wait for no others
+    assert torch.equal(total, x.sum(-1) + y) and torch.equal(twice, 2 * x)
+    assert torch.equal(single, -x) and torch.equal(nested, -x)
 
 
 class Pair(NamedTuple):
@@ -77,23 +59,18 @@ class Given:
     flags: torch.Tensor | None = None
 
 
-@pytest.mark.parametrize("batch", [0, 1, 7])
-@pytest.mark.parametrize("threads", [1, 2])
+@grid(("batch", [0, 1, 7]), ("threads", [1, 2]))
 def test_records_go_in_and_come_back_as_records(batch, threads):
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
     a, b = torch.arange(batch * 2.0).reshape(batch, 2), torch.arange(batch)
     given = Given((a, 2 * a), "names stay", Pair(b, (None, 3 * b)))
 
     def block(one, scale, nothing):
-        assert (
-            isinstance(one, Given) and isinstance(one.pair, Pair) and (one.name, one.flags, nothing) == ("names stay", None, None)
-        )
+        assert isinstance(one, Given) and isinstance(one.pair, Pair) and (one.name, one.flags, nothing) == (given.name, None, None)
         assert len(one.views[1]) == len(one.pair.total) == len(scale) <= 3
         return Given((one.views[1] * scale[:, None],), one.name, Pair(one.pair.rest[1] + one.pair.total, (None, scale)))
 
-    found = map_blocks(block, given, b, None, size=3)
-    torch.set_num_threads(before)
+    with torch_threads(threads):
+        found = map_blocks(block, given, b, None, size=3)
     assert isinstance(found, Given) and isinstance(found.pair, Pair) and (found.name, found.flags) == ("names stay", None)
     assert torch.equal(found.views[0], 2 * a * b[:, None]) and torch.equal(found.pair.total, 4 * b)
     assert found.pair.rest[0] is None and torch.equal(found.pair.rest[1], b)
@@ -117,34 +94,25 @@ def test_select_takes_whole_problems():
     assert torch.equal(select(mask, mask.double(), 5.0), torch.tensor([[1.0, 5.0], [5.0, 1.0]]).double())
 
 
-def test_a_single_tensor_comes_back_as_a_tensor(two_threads):
-    assert torch.equal(map_blocks(torch.neg, torch.arange(5), size=2), -torch.arange(5))
+def threads_elsewhere():
+    """What a thread that starts now is given."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(torch.get_num_threads).result()
 
 
-def test_blocks_run_at_the_same_time_in_other_threads(two_threads):
+def test_blocks_run_at_the_same_time_in_other_threads_of_one(two_threads):
     meeting = threading.Barrier(2, timeout=60)  # broken, hence an error, unless two blocks are there together
 
     def block(x):
         meeting.wait()
-        return torch.full_like(x, threading.get_ident())
+        return torch.full_like(x, threading.get_ident()), torch.full_like(x, torch.get_num_threads())
 
-    found = map_blocks(block, torch.zeros(4, dtype=torch.int64), size=2)
-    assert threading.get_ident() not in found.tolist()
-    assert len(set(found.tolist())) == 2
-
-
-def test_workers_have_one_thread_and_everybody_else_keeps_theirs(two_threads):
-    def block(x):
-        time.sleep(0.01)  # both workers take part
-        return torch.full_like(x, torch.get_num_threads())
-
-    seen = []
-    assert set(map_blocks(block, torch.zeros(8), size=1).tolist()) == {1.0}
-    assert torch.get_num_threads() == 2
-    other = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
-    other.start()
-    other.join()
-    assert seen == [2]
+    found, counts = map_blocks(block, torch.zeros(4, dtype=torch.int64), size=2)
+    assert threading.get_ident() not in found.tolist() and len(set(found.tolist())) == 2 and counts.tolist() == [1] * 4
+    assert torch.get_num_threads() == threads_elsewhere() == 2  # everybody else keeps theirs
+    with torch_threads(1):
+        alone = map_blocks(lambda x: torch.full_like(x, threading.get_ident()), torch.zeros(4, dtype=torch.int64), size=1)
+    assert set(alone.tolist()) == {threading.get_ident()}
 
 
 def test_grad_mode_is_the_callers(two_threads):
@@ -156,27 +124,6 @@ def test_grad_mode_is_the_callers(two_threads):
         assert not map_blocks(torch.square, x, size=2).requires_grad
     with torch.inference_mode():
         assert map_blocks(torch.square, x, size=2).is_inference()
-
-
-def test_one_thread_stays_in_the_calling_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    found = map_blocks(lambda x: torch.full_like(x, threading.get_ident()), torch.zeros(4, dtype=torch.int64), size=1)
-    torch.set_num_threads(before)
-    assert set(found.tolist()) == {threading.get_ident()}
-
-
-def test_an_error_in_a_block_reaches_the_caller(two_threads):
-    def block(x):
-        raise KeyError("block")
-
-    with pytest.raises(KeyError, match="block"):
-        map_blocks(block, torch.zeros(4), size=1)
-
-
-def test_blocks_inside_blocks_do_not_wait_for_each_other(two_threads):
-    found = map_blocks(lambda x: map_blocks(torch.neg, x, size=1), torch.arange(8), size=2)
-    assert torch.equal(found, -torch.arange(8))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
@@ -198,20 +145,23 @@ def test_a_forked_process_gets_a_pool_of_its_own(two_threads):
     pytest.fail("the child waits for threads that did not survive the fork")
 
 
-def test_misuse_is_refused():
+def test_misuse_is_refused_and_an_error_in_a_block_reaches_the_caller(two_threads):
     with pytest.raises(ValueError, match=r"same leading dimension.*\(2,\).*\(3,\)"):
         map_blocks(torch.add, torch.zeros(2), torch.zeros(3), size=1)
-    with pytest.raises(ValueError, match="same leading dimension"):
-        map_blocks(torch.neg, torch.tensor(1.0), size=1)
-    with pytest.raises(ValueError, match="same leading dimension"):
-        map_blocks(torch.neg, size=1)
+    for nothing in ((torch.tensor(1.0),), ()):
+        with pytest.raises(ValueError, match="same leading dimension"):
+            map_blocks(torch.neg, *nothing, size=1)
     with pytest.raises(ValueError, match="size must be at least 1"):
         map_blocks(torch.neg, torch.zeros(2), size=0)
 
+    def fail(*_):
+        raise KeyError("block")
 
-def threads_seen(seen):
-    seen.append(torch.get_num_threads())
-    return torch.get_num_threads()
+    with pytest.raises(KeyError, match="block"):
+        map_blocks(fail, torch.zeros(4), size=1)
+    with pytest.raises(KeyError, match="block"):
+        one_thread(fail)()
+    assert torch.get_num_threads() == workers() == 2  # the setting comes back
 
 
 def test_public_functions_run_on_one_thread_and_their_blocks_on_those_of_the_caller(two_threads):
@@ -219,6 +169,8 @@ def test_public_functions_run_on_one_thread_and_their_blocks_on_those_of_the_cal
     assert inside() == (1, 2) and (torch.get_num_threads(), workers()) == (2, 2)
     nested = one_thread(lambda: (inside(), torch.get_num_threads()))
     assert nested() == ((1, 2), 1) and torch.get_num_threads() == 2
+    one_thread(threads_elsewhere)()
+    assert threads_elsewhere() == 2  # what starts in the meantime does not stay on one
     # the blocks of a decorated function still get two workers, which start no teams
     names, seen = set(), []
 
@@ -231,30 +183,6 @@ def test_public_functions_run_on_one_thread_and_their_blocks_on_those_of_the_cal
     started = threading.Barrier(2)
     one_thread(lambda: map_blocks(block, torch.zeros(2), size=1))()
     assert len(names) == 2 and seen == [1, 1] and torch.get_num_threads() == 2
-
-
-def test_the_setting_comes_back_after_an_error(two_threads):
-    def fail():
-        raise KeyError
-
-    with pytest.raises(KeyError):
-        one_thread(fail)()
-    assert torch.get_num_threads() == 2 and workers() == 2
-
-
-def test_threads_that_start_meanwhile_get_the_setting_of_the_caller(two_threads):
-    seen = []
-
-    def body():
-        other = threading.Thread(target=threads_seen, args=(seen,))
-        other.start()
-        other.join()
-
-    one_thread(body)()
-    other = threading.Thread(target=threads_seen, args=(seen,))
-    other.start()
-    other.join()
-    assert seen == [2, 2]
 
 
 def test_callers_in_several_threads_do_not_disturb_each_other(two_threads):
@@ -277,7 +205,10 @@ def test_callers_in_several_threads_do_not_disturb_each_other(two_threads):
 
 def test_one_large_problem_may_use_the_threads_of_the_caller(two_threads):
     def run(count):
-        return one_thread(lambda: map_blocks(lambda x: torch.full_like(x[:, 0], threads_seen([])), torch.zeros(1, count), size=1))()
+        def counted(x):
+            return torch.full_like(x[:, 0], torch.get_num_threads())
+
+        return one_thread(lambda: map_blocks(counted, torch.zeros(1, count), size=1))()
 
     assert run(10).item() == 1 and run(LARGE).item() == 2 and torch.get_num_threads() == 2
 
@@ -290,21 +221,10 @@ def test_public_functions_leave_inference_mode():
 
 
 ELEMENTWISE = {
-    "undistort",
-    "distort",
-    "reproject",
-    "sampson",
-    "algebraic",
-    "grassmann_tensor",
-    "line_camera",
-    "points_on_lines",
+    *("undistort", "distort", "reproject", "sampson", "algebraic", "grassmann_tensor", "line_camera", "points_on_lines"),
     "combine_shifts",
     # of words and checks, not of numbers
-    "as_python",
-    "check_options",
-    "with_names",
-    "status_from",
-    "with_words",
+    *("as_python", "check_options", "with_names", "status_from", "with_words"),
 }
 """Without a search or a factorization: torch starts threads for them only above 32,768 numbers, where they pay."""
 
@@ -323,112 +243,82 @@ def test_every_public_verb_runs_on_one_thread():
 
 
 CPU = torch.device("cpu")
-TABLES = [
-    (lags._packing, (3, CPU)),
-    (lags._epipolar_places, (CPU,)),
-    (lags._resection_places, (CPU,)),
-    (epipolar_variance._plane, (CPU,)),
-    (extensors._levi_civita, (3, torch.float64, CPU)),
-    (extensors._laplace, (4, 2, CPU)),
-    (extensors._dual_signs, (4, 2, CPU)),
-    (exterior._splits, (4, 2, 1, CPU)),
-    (dynamic_tensor.vanishing_forms, (2, 3, 2, CPU)),
-    (grassmann._removals, (4, 2, CPU)),
-    (grassmann._insertions, (4, 2, CPU)),
-    (grassmann_nearest._determinant_rows, ((2, 1, 1), (3, 3, 3), CPU)),
-    (grassmann_recovery.tables, ((2, 1, 1), (3, 3, 3), 2, CPU)),
-    (plane._linear_minor_tables, (3, 2, CPU)),
-    (base.triangle, (4, CPU)),
-    (base._above_the_diagonal, (CPU,)),
-    (matrix._unpacking, ((3, 3), CPU)),
-    (eigenspaces._generic, (5, 2, CPU)),
-    (epipolar.polar, (torch.float64, CPU)),
-    (epipolar._places, (CPU,)),
-    (epipolar_descent._tables, (torch.float64, CPU)),
-    (epipolar_descent._pairs, (CPU,)),
-    (epipole_pairs._product_table, (CPU,)),
-    (infinity_extensors._joins, (64, CPU)),
-    (infinity_extensors._invariant_basis, (CPU,)),
-    (monomials.symmetric, (2, CPU)),
-    (monomials.factors, (2, 2, CPU)),
-    (monomials.collecting, (2, 2, CPU)),
-    (monomials.multiplicity, (2, 2, CPU)),
-    (planes_problem._parameter_places, (3, 1, CPU)),
-    (planes_starts._frames, (CPU,)),
-    (projective._products, (CPU,)),
-    (shape_completion._choices, (8, CPU)),
-    (shape_points._basis, ("plane", 4, CPU)),
-    (lifted.partitions, (3, (2, 2), CPU)),
-    (lifted.chosen_basis, (3, 2, CPU)),
-    (shape_points.plane_inverse, (6, CPU)),
-    (shape_rows.centring_basis, (5, CPU)),
-    (shape_rows.free, (6, CPU)),
-    (shape_rows.plane_map, (6, CPU)),
-    (shape_residual._maps, (shape_residual.CameraKind(affine=True), CPU)),
-    (dynamic_shape_rows.basis_points_first, (6, (0, 1, 2, 3), CPU)),
-    (dynamic_shape_rows._nodes, (Polynomial(1), CPU)),
-    (dynamic_shape_rows._samples, (Polynomial(1), CPU)),
-    (dynamic_shape_theory._to_powers, (3, CPU)),
-]
+TABLES = {
+    **dict.fromkeys((lags._epipolar_places, lags._resection_places, epipolar._plane, epipolar._places), (CPU,)),
+    **dict.fromkeys((primitives._above_the_diagonal, epipolar_fit._pairs, pairs._product_table, projective._products), (CPU,)),
+    **dict.fromkeys((closed_forms._invariant_basis, problem._frames), (CPU,)),
+    **dict.fromkeys((epipolar.polar, epipolar_fit._tables), (torch.float64, CPU)),
+    **dict.fromkeys((extensors._laplace, extensors._dual_signs, grassmann._removals, grassmann._insertions), (4, 2, CPU)),
+    **dict.fromkeys((homogeneous.factors, homogeneous.collecting, homogeneous.multiplicity), (2, 2, CPU)),
+    **dict.fromkeys((static.plane_inverse, static.centring_basis, static.free, static.plane_map), (6, CPU)),
+    **dict.fromkeys((dynamic_shape_tensor._nodes, dynamic_shape_tensor._samples), (Polynomial(1), CPU)),
+    **dict.fromkeys((lags._packing, basis._to_powers), (3, CPU)),
+    **dict.fromkeys((primitives._linear_minor_tables, lifted.chosen_basis), (3, 2, CPU)),
+    extensors._levi_civita: (3, torch.float64, CPU),
+    extensors._splits: (4, 2, 1, CPU),
+    dynamic_tensor.vanishing_forms: (2, 3, 2, CPU),
+    grassmann_nearest._determinant_rows: ((2, 1, 1), (3, 3, 3), CPU),
+    grassmann.tables: ((2, 1, 1), (3, 3, 3), 2, CPU),
+    primitives.triangle: (4, CPU),
+    matrix._unpacking: ((3, 3), CPU),
+    eigenspaces._generic: (5, 2, CPU),
+    closed_forms._joins: (64, CPU),
+    homogeneous.symmetric: (2, CPU),
+    problem._parameter_places: (3, 1, CPU),
+    static._choices: (8, CPU),
+    static._basis: ("plane", 4, CPU),
+    lifted.partitions: (3, (2, 2), CPU),
+    reprojection._maps: (reprojection.CameraKind(affine=True), CPU),
+    dynamic_shape_tensor.basis_points_first: (6, (0, 1, 2, 3), CPU),
+}
 """All of them: the last test says so."""
 
 
 def tensors(table):
     if isinstance(table, torch.Tensor):
         return [table]
-    return [t for part in (table if isinstance(table, tuple) else vars(table).values()) for t in tensors_of(part)]
+    parts = table if isinstance(table, tuple) else vars(table).values()
+    return [t for part in parts if isinstance(part, torch.Tensor | tuple) for t in tensors(part)]
 
 
-def tensors_of(part):
-    return tensors(part) if isinstance(part, torch.Tensor | tuple) else []
+def is_plain(tensor):
+    wrapped = torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+    return not (wrapped or tensor.is_inference() or tensor.requires_grad) and tensor.device == CPU
 
 
-def within_grad(function):
-    torch.func.grad(lambda x: (function(), x)[1])(torch.ones(()))
+def beside(function):
+    return lambda x: (function(), x)[1]
 
 
-def within_vmap(function):
-    torch.func.vmap(lambda x: (function(), x)[1])(torch.ones(2))
-
-
-def within_jvp(function):
-    torch.func.vmap(lambda t: torch.func.jvp(lambda x: (function(), x)[1], (torch.ones(()),), (t,)))(torch.ones(2))
-
-
-def within_inference(function):
-    with torch.inference_mode():
+def under(context, function):
+    with context:
         function()
 
 
-def on_another_device(function):
-    with torch.device("meta"):
-        function()
+AROUND = {
+    "grad": lambda f: torch.func.grad(beside(f))(torch.ones(())),
+    "vmap": lambda f: torch.func.vmap(beside(f))(torch.ones(2)),
+    "jvp": lambda f: torch.func.vmap(lambda t: torch.func.jvp(beside(f), (torch.ones(()),), (t,)))(torch.ones(2)),
+    "inference": lambda f: under(torch.inference_mode(), f),
+    "another device": lambda f: under(torch.device("meta"), f),
+}
 
 
-@pytest.mark.parametrize("around", [within_grad, within_vmap, within_jvp, within_inference, on_another_device])
+@pytest.mark.parametrize("around", AROUND)
 def test_what_surrounds_the_first_call_leaves_no_trace(around):
     failures = []
-    for table, sizes in TABLES:
-        for other, _ in TABLES:  # some are made from others
+    for table, sizes in TABLES.items():
+        for other in TABLES:  # some are made from others
             other.cache_clear()
-        around(lambda table=table, sizes=sizes: table(*sizes))
+        AROUND[around](lambda table=table, sizes=sizes: table(*sizes))
         once = table.cache_info().currsize == 1
         cached = tensors(table(*sizes))
         table.cache_clear()
         fresh = tensors(table(*sizes))
-        if not (once and len(cached) == len(fresh) > 0 and all(map(plain_and_equal, cached, fresh))):
+        equal = all(is_plain(x) and x.equal(y) for x, y in zip(cached, fresh, strict=False))
+        if not (once and len(cached) == len(fresh) > 0 and equal):
             failures.append(table.__name__)
     assert failures == []
-
-
-def plain_and_equal(tensor, expected):
-    return (
-        not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
-        and not tensor.is_inference()
-        and not tensor.requires_grad
-        and tensor.device == CPU
-        and tensor.equal(expected)
-    )
 
 
 def test_a_mistake_is_the_callers():
@@ -442,7 +332,7 @@ def test_a_mistake_is_the_callers():
 
 @pytest.mark.slow
 def test_no_other_function_caches_tensors():
-    listed = {table.__name__ for table, _ in TABLES}
+    listed = {table.__name__ for table in TABLES}
     decorated, cached = set(), set()
     for path in sorted(Path(extensors.__file__).parents[1].rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

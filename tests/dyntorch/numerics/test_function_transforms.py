@@ -87,16 +87,11 @@ def test_records_counts_and_inputs_that_go_out():
     found, plain = vmap(parts)(x, y), decided(x, y)
     torch.testing.assert_close(found, plain)
     assert not is_transformed(x, y) and found.positive.dtype == torch.int64
+    assert over_problems(decided, x, y).given is y  # without a transformation it is the call itself
     slope = vmap(grad(lambda y, x: parts(x, y).given.square().sum()))(y, x)
     torch.testing.assert_close(slope, 2 * y)
     tangent = jvp(lambda x: over_problems(decided, x[None], y[:1])[0], (x[0],), (y[0],))[1]
     torch.testing.assert_close(tangent[0], jvp(lambda x: smooth(x, y[0]), (x[0],), (y[0],))[1])
-
-
-def test_without_a_transformation_it_is_the_call_itself():
-    x, y = data(3, 4)
-    found = over_problems(decided, x, y)
-    assert found.given is y
 
 
 def test_what_nothing_depends_on_has_derivative_zero():

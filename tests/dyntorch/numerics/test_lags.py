@@ -5,8 +5,6 @@ import pytest
 import torch
 
 from dyntorch.numerics import lags
-from dyntorch.numerics import lags as correlation
-from dyntorch.numerics.lags import correlate
 from tests.grid import grid
 
 WINDOWS = [
@@ -63,16 +61,15 @@ def test_products_equal_the_loop(frames1, frames2, window):
 )
 def test_blocks_of_long_takes_equal_the_loop(frames1, frames2, window):
     a, b = normal(0, frames1, 2), normal(1, frames2, 2)
-    assert correlation._lengths(frames1, frames2, *window)[1] < frames1 / 3
+    assert lags._lengths(frames1, frames2, *window)[1] < frames1 / 3
     assert_same(lags.lag_products(a, b, window), products(a, b, window))
 
 
 def test_pieces_for_memory_change_nothing(monkeypatch):
     a, b = normal(0, 2, 50, 7), normal(1, 2, 60, 5)
     expected = lags.lag_products(a, b, (-9, 9)), *lags.lag_covariances(a, b, (-9, 9))
-    monkeypatch.setattr(correlation, "ELEMENTS", 5 * 80 * 2)
-    monkeypatch.setattr("dyntorch.numerics.lags.ELEMENTS", 1)
-    monkeypatch.setattr("dyntorch.numerics.lags.MIN_PIECE", 4)
+    monkeypatch.setattr(lags, "ELEMENTS", 1)
+    monkeypatch.setattr(lags, "MIN_PIECE", 4)
     found = lags.lag_products(a, b, (-9, 9)), *lags.lag_covariances(a, b, (-9, 9))
     for x, y in zip(found, expected, strict=True):
         assert_same(x, y)
@@ -80,7 +77,7 @@ def test_pieces_for_memory_change_nothing(monkeypatch):
 
 def test_transforms_have_good_lengths():
     for least in (1, 2, 7, 11, 97, 1801, 2701, 3599, 4097, 10_007):
-        length = rest = correlation._fft_length(least)
+        length = rest = lags._fft_length(least)
         for prime in (2, 3, 5):
             while rest % prime == 0:
                 rest //= prime
@@ -138,14 +135,6 @@ def test_moments_equal_the_loop(frames1, frames2, window):
         assert torch.equal(number == 0, combine(counts) == 0) and (found[number == 0] == 0).all()
 
 
-def test_the_vector_is_the_constraint():
-    x1, x2 = normal(0, 1, 1, 2), normal(1, 1, 1, 2)
-    F = normal(2, 3, 3)
-    found, _ = lags.epipolar_moments(x1, x2, (0, 0))
-    value = one(x2[0, 0]) @ F @ one(x1[0, 0])
-    assert F.flatten() @ found[0] @ F.flatten() == pytest.approx(float(value) ** 2, rel=1e-12)
-
-
 def test_without_weights_what_is_not_finite_is_missing():
     x1, x2, weights = points(8, 9, 4)
     found, counts = lags.epipolar_moments(x1, x2)
@@ -169,7 +158,7 @@ def test_batches_of_moments_equal_single_ones():
 def test_moments_of_long_takes_equal_those_of_the_whole(monkeypatch):
     x1, x2, weights = points(9000, 9100, 2)
     found, counts = lags.epipolar_moments(x1, x2, (-20, 20), weights)
-    monkeypatch.setattr(correlation, "_lengths", lambda frames1, frames2, lo, hi: (18_432, frames1))
+    monkeypatch.setattr(lags, "_lengths", lambda frames1, frames2, lo, hi: (18_432, frames1))
     expected, number = lags.epipolar_moments(x1, x2, (-20, 20), weights)
     assert_same(found, expected)
     assert_same(counts, number)
@@ -209,15 +198,6 @@ def test_covariances_equal_those_of_every_overlap(frames1, frames2, window, weig
             assert (x[k] - y).abs().max() < 1e-10
 
 
-def test_a_taken_frame_is_a_weight_of_zero():
-    a, b, w = normal(0, 20, 2), normal(1, 20, 2), torch.ones(20)
-    w[:5] = 0
-    found = lags.lag_covariances(a, b, (0, 3), (w, torch.ones(20)))
-    expected = lags.lag_covariances(a[5:], b[5:], (0, 3))
-    for x, y in zip(found, expected, strict=True):
-        assert_same(x, y)
-
-
 def test_compression_keeps_what_is_above_the_noise():
     mixed = normal(0, 500, 3) @ normal(1, 3, 12) + 7.0
     noisy = mixed + 1e-3 * normal(2, 500, 12)
@@ -243,6 +223,10 @@ X = torch.zeros(4, 3, 2)
             (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), torch.ones(3, 3))), r"weights must be \(4, 3\)"),
             (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), -torch.ones(4, 3))), r"not negative"),
             (lambda: lags.lag_covariances(X[0], X[0], weights=(torch.ones(2), torch.ones(3))), r"weights must be .*one per frame"),
+            (
+                lambda: lags.resection_moments(X.mT, X),
+                r"frames, n, 2\) in a camera and \(\*batch, frames, n, 3\) in space",
+            ),
             (lambda: lags.compress(X), r"either rank or noise"),
             (lambda: lags.compress(X, rank=3), r"rank must be from 1 to the 2 rows, got 3"),
         ],
@@ -261,7 +245,7 @@ def test_the_engine_lifts_blocks_not_sequences():
         return x.movedim(1, -1)
 
     x = normal(0, 1, 20_000, 1, 1)
-    correlate(x, x, (-5, 5), lift)
+    lags.correlate(x, x, (-5, 5), lift)
     assert max(seen) <= 2048
 
 
@@ -281,8 +265,3 @@ def test_resection_moments_equal_the_loop(per_point):
         expected = torch.einsum("tn,tnk,tni,tnj->nkij", w, of_image[a], X[b], X[b])
         assert_same(found[:, k] if per_point else found[k], expected if per_point else expected.sum(0))
         assert torch.allclose(counts[:, k] if per_point else counts[k], w.sum(0) if per_point else w.sum())
-
-
-def test_resection_moments_of_what_is_no_camera_and_space_are_refused():
-    with pytest.raises(ValueError, match=r"\(\*batch, frames, n, 2\) in a camera and \(\*batch, frames, n, 3\) in space"):
-        lags.resection_moments(normal(0, 5, 3, 3), normal(1, 5, 3, 2))
