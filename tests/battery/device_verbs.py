@@ -34,7 +34,7 @@ class Verb:
     @property
     def waits(self) -> int:
         """Most host waits of this call."""
-        return WAITS.get(self.name.split()[0], (0, ""))[0]
+        return WAITS.get(self.name.split()[0], 0)
 
     def __repr__(self) -> str:
         return self.name.replace(" ", "-")
@@ -66,6 +66,10 @@ def cameras_and_points() -> tuple[Tensor, Tensor, Tensor]:
 
 def tracks(motion: str, n: int, views: int, **options: Any) -> tuple[Tensor]:
     return (scenes.lifted_points(motion, n, views=views, generator=draw(3), **{"sigma": 0.3, **options}).tracks,)
+
+
+def two_bodies() -> tuple[Tensor, ...]:
+    return scenes.bodies((30, 30), sigma=0.3, generator=draw(1)).views
 
 
 def driven() -> tuple[Tensor, Tensor]:
@@ -110,9 +114,8 @@ def paths() -> tuple[Tensor, Tensor]:
 
 def deforming_images() -> tuple[Tensor, Tensor]:
     """Images of a thing that is a mixture of two shapes, by two affine cameras fixed to each other."""
-    draw = torch.Generator().manual_seed(5)
-    mixed = torch.randn(20, 2, generator=draw, dtype=F64) @ torch.randn(2, 30, generator=draw, dtype=F64)
-    first, second = (mixed.unflatten(1, (10, 3)) @ torch.randn(2, 3, 2, generator=draw, dtype=F64)[:, None]).unbind(0)
+    mixed = randn(20, 2, seed=5) @ randn(2, 30, seed=6)
+    first, second = (mixed.unflatten(1, (10, 3)) @ randn(2, 1, 3, 2, seed=7)).unbind(0)
     return first, second
 
 
@@ -179,6 +182,16 @@ def affine_bodies() -> tuple[Tensor, Tensor]:
     return points[:, :2], torch.cat([points[:12] @ cameras[0], points[12:] @ cameras[1] + 0.3])
 
 
+def lens() -> tuple[Tensor, ...]:
+    """Pixels, matrix and distortion."""
+    matrix = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=F64)
+    return randn(9, 2) * 100 + 300, matrix, torch.tensor([-0.2, 0.05, 0, 0], dtype=F64)
+
+
+def motion_and_views() -> tuple[Any, ...]:
+    return scenes.planar(40, generator=draw(3)).motion, *planar()
+
+
 def shift(offset: float) -> dyn.Shift:
     """A shift that stands out alone."""
     peaks, none = torch.tensor([[offset, 1.0]], dtype=F64), torch.zeros(0, dtype=F64)
@@ -209,11 +222,10 @@ def without_frame(result: tuple[Any, ...]) -> tuple[Any, ...]:
 
 # ---- the table ---------------------------------------------------------------------------------------------------------
 H = dyn.HomographyTensor
+LENS = (torch.diag(torch.tensor([1000.0, 1000, 1])), [-0.1, 0, 0, 0])
 VERBS: tuple[Verb, ...] = (
     Verb("fit", planar, lambda *x: dyn.fit(H, *x)),
-    Verb(
-        "fit weights", lambda: (*planar(), torch.rand(40, dtype=F64, generator=draw())), lambda *x: dyn.fit(H, *x[:3], weights=x[3])
-    ),
+    Verb("fit weights", lambda: (*planar(), randn(40).abs()), lambda *x: dyn.fit(H, *x[:3], weights=x[3])),
     Verb("robust_fit", planar, lambda *x: dyn.robust_fit(H, *x, threshold=1.5, generator=draw())),
     Verb("refine", planar, lambda *x: dyn.refine(dyn.fit(H, *x), *x)),
     Verb(
@@ -221,14 +233,8 @@ VERBS: tuple[Verb, ...] = (
         lambda: scenes.lifted_points("constant_velocity_2d", 30, times=(0, 4, 9), sigma=0.3, generator=draw()).tracks.unbind(0),
         lambda *x: dyn.constrain(dyn.fit(dyn.GrassmannTensor(4, (2, 2, 1)), *x)),
     ),
-    Verb(
-        "sampson", lambda: (scenes.planar(40, generator=draw(3)).motion, *planar()), lambda m, *x: dyn.sampson(H, H.compose(*m), *x)
-    ),
-    Verb(
-        "algebraic",
-        lambda: (scenes.planar(40, generator=draw(3)).motion, *planar()),
-        lambda m, *x: dyn.core.algebraic(H, H.compose(*m), *x),
-    ),
+    Verb("sampson", motion_and_views, lambda m, *x: dyn.sampson(H, H.compose(*m), *x)),
+    Verb("algebraic", motion_and_views, lambda m, *x: dyn.core.algebraic(H, H.compose(*m), *x)),
     Verb("null_space", lambda: (randn(3, 12, 9),), dyn.null_space),
     Verb("align_planar", planar, lambda *x: dyn.align_planar(*x, threshold=1.5, generator=draw())),
     Verb(
@@ -286,26 +292,10 @@ VERBS: tuple[Verb, ...] = (
         lambda: scenes.translating_lines(60, sigma=1e-4, generator=draw()).views,
         lambda *x: dyn.align_lines(*x, threshold=0.01, generator=draw()),
     ),
-    Verb(
-        "segment",
-        lambda: scenes.bodies((30, 30), sigma=0.3, generator=draw(1)).views,
-        lambda *x: dyn.segment(*x, bodies=2, spatial=False, generator=draw()),
-    ),
-    Verb(
-        "segment spatial",
-        lambda: scenes.bodies((30, 30), sigma=0.3, generator=draw(1)).views,
-        lambda *x: dyn.segment(*x, generator=draw()),
-    ),
-    Verb(
-        "segment_tracks",
-        lambda: driven()[:1],
-        lambda x: dyn.segment_tracks(x, 2, generator=draw()),
-    ),
-    Verb(
-        "segment_tracks cameras",
-        driven,
-        lambda x, cameras: dyn.segment_tracks(x, 2, cameras=cameras, generator=draw()),
-    ),
+    Verb("segment", two_bodies, lambda *x: dyn.segment(*x, bodies=2, spatial=False, generator=draw())),
+    Verb("segment spatial", two_bodies, lambda *x: dyn.segment(*x, generator=draw())),
+    Verb("segment_tracks", lambda: driven()[:1], lambda x: dyn.segment_tracks(x, 2, generator=draw())),
+    Verb("segment_tracks cameras", driven, lambda x, cameras: dyn.segment_tracks(x, 2, cameras=cameras, generator=draw())),
     Verb("translating_planes", lambda: (planes().homographies,), dyn.translating_planes),
     Verb(
         "translating_planes bodies",
@@ -318,11 +308,7 @@ VERBS: tuple[Verb, ...] = (
             lambda motion=motion, n=n, v=v: tracks(motion, n, v),
             lambda x, motion=motion: dyn.reconstruct(x, motion, generator=draw()),
         )
-        for motion, n, v in (
-            ("static_2d", 12, 3),
-            ("constant_velocity_2d", 24, 4),
-            ("two_bodies_2d", 24, 3),
-        )
+        for motion, n, v in (("static_2d", 12, 3), ("constant_velocity_2d", 24, 4), ("two_bodies_2d", 24, 3))
     ),
     Verb("reconstruct auto", lambda: tracks("constant_velocity_2d", 30, 4), lambda x: dyn.reconstruct(x, "auto", generator=draw())),
     Verb(
@@ -335,15 +321,7 @@ VERBS: tuple[Verb, ...] = (
     Verb(
         "synchronize calibration",
         filmed,
-        lambda a, b: dyn.synchronize(
-            a,
-            b,
-            fps=30.0,
-            rate=1.0,
-            max_shift=1.0,
-            generator=draw(),
-            calibration=((torch.diag(torch.tensor([1000.0, 1000, 1])), [-0.1, 0, 0, 0]),) * 2,
-        ),
+        lambda a, b: dyn.synchronize(a, b, fps=30.0, rate=1.0, max_shift=1.0, generator=draw(), calibration=(LENS,) * 2),
     ),
     Verb("synchronize different", nonrigid, lambda a, b: dyn.synchronize(a, b, False, fps=25.0, max_shift=1.0, generator=draw())),
     Verb(
@@ -377,24 +355,8 @@ VERBS: tuple[Verb, ...] = (
         lambda: scenes.two_view(60, sigma=0.1, generator=draw()).views,
         lambda *x: dyn.geometry.fit_distortion(*x, sizes=((640, 480),) * 2),
     ),
-    Verb(
-        "undistort",
-        lambda: (
-            randn(9, 2) * 100 + 300,
-            torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=F64),
-            torch.tensor([-0.2, 0.05, 0, 0], dtype=F64),
-        ),
-        dyn.geometry.undistort,
-    ),
-    Verb(
-        "distort",
-        lambda: (
-            randn(9, 2) * 100 + 300,
-            torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=F64),
-            torch.tensor([-0.2, 0.05, 0, 0], dtype=F64),
-        ),
-        dyn.geometry.distort,
-    ),
+    Verb("undistort", lens, dyn.geometry.undistort),
+    Verb("distort", lens, dyn.geometry.distort),
     Verb("triangulate_trajectories", paths, dyn.triangulate_trajectories),
     Verb(
         "triangulate_trajectories four-views",  # two lines meet the rays of four views: which is first is chance
@@ -511,46 +473,38 @@ VERBS: tuple[Verb, ...] = (
     Verb("metric_upgrade", lambda: dyn.numerics.affine_factorization(*affine_tracks())[:2], dyn.numerics.metric_upgrade),
 )
 
-ASKED = "one for every question on values: what is given, what decides"
-LENT = "computes on the CPU (dyntorch.numerics.arguments.on_cpu): one copy for every tensor that comes in"
-FITS = "for every fit one for the certificates of the null space and one for what looks weak; one where weights are given"
-STEPS = "one for every step of a descent, on whether all problems are done, beside hundreds of kernels"
 WAITS = {
-    "fit": (3, FITS),
-    "robust_fit": (35, f"{FITS}; {STEPS}; one for every round of starts"),
-    "refine": (32, f"{FITS}; {STEPS}"),
-    "constrain": (32, f"{FITS}; {STEPS}"),
-    "align_planar": (120, f"{FITS}; {STEPS}; one for every notice"),
-    "align_points": (150, f"{FITS}; {STEPS}; one for every notice"),
-    "align_lines": (60, f"{FITS}; {STEPS}; one for every notice"),
-    "translating_planes": (150, f"{FITS}; {STEPS}; one for every notice"),
-    "bundle_adjust": (50, STEPS),
-    "fit_shapes": (60, STEPS),
-    "fit_perspective_shapes": (150, STEPS),
-    "recover_perspective_times": (2, ASKED),
-    "deformable_shapes": (16, STEPS),
-    "ShapeTensor": (40, f"{FITS}; {STEPS}"),
-    "LiftedShapeTensor": (60, f"{FITS}; {STEPS}"),
-    "DynamicShapeTensor": (60, f"{FITS}; {STEPS}"),
-    "DynamicTensor": (40, f"{FITS}; {STEPS}"),
-    "velocity_factorization": (8, ASKED),
-    "affine_factorization": (1, ASKED),
-    "metric_upgrade": (4, ASKED),
-    "recover_times": (1, ASKED),
-    **dict.fromkeys(("triangulate_trajectories", "hyperplane_pair", "two_bodies"), (1, ASKED)),
-    **dict.fromkeys(("affine_segmentation", "multibody_matrix"), (1, ASKED)),
-    **dict.fromkeys(("trajectory_cameras", "projective_factorization"), (1, LENT)),
-    "segment": (2, LENT),
-    "segment_tracks": (2, LENT),
-    "reconstruct": (2, LENT),
-    "synchronize": (2, LENT),
-    "synchronize_cameras": (3, LENT),
-    "breaks": (2, LENT),
-    "camera_breaks": (3, LENT),
-    "combine_shifts": (12, LENT),
-    "calibrate": (3, LENT),
-    "reconstruct_pair": (2, LENT),
-    "fit_distortion": (2, LENT),
+    # for every fit one for the certificates of the null space and one for what looks weak; one where weights are given; one for
+    # every step of a descent, on whether all problems are done, beside hundreds of kernels; one for every round of starts or notice
+    "fit": 3,
+    "robust_fit": 35,
+    "refine": 32,
+    "constrain": 32,
+    "align_planar": 120,
+    "align_points": 150,
+    "align_lines": 60,
+    "translating_planes": 150,
+    "bundle_adjust": 50,
+    "fit_shapes": 60,
+    "fit_perspective_shapes": 150,
+    "deformable_shapes": 16,
+    "ShapeTensor": 40,
+    "LiftedShapeTensor": 60,
+    "DynamicShapeTensor": 60,
+    "DynamicTensor": 40,
+    # one for every question on values: what is given, what decides
+    "recover_perspective_times": 2,
+    "velocity_factorization": 8,
+    "metric_upgrade": 4,
+    **dict.fromkeys(("affine_factorization", "recover_times", "triangulate_trajectories", "hyperplane_pair", "two_bodies"), 1),
+    **dict.fromkeys(("affine_segmentation", "multibody_matrix"), 1),
+    # computes on the CPU (dyntorch.numerics.arguments.on_cpu): one copy for every tensor that comes in
+    **dict.fromkeys(("trajectory_cameras", "projective_factorization"), 1),
+    **dict.fromkeys(("segment", "segment_tracks", "reconstruct", "synchronize", "breaks", "reconstruct_pair", "fit_distortion"), 2),
+    "synchronize_cameras": 3,
+    "camera_breaks": 3,
+    "calibrate": 3,
+    "combine_shifts": 12,
 }
 """Public names that wait for the device, how often a call of the table does at most, and why.  Measured: 2 (fit), 17, 27, 5, 64,
 7 to 75, 22 and 58 to 86, 34 (fit_shapes), 7 to 24 (ShapeTensor), 7 to 41; before they were lent to the CPU: synchronize 300 to 900,
@@ -558,47 +512,24 @@ reconstruct 33 to 1,000."""
 
 ROOMS = ("core", "geometry", "invariants", "numerics", "shapes", "tasks")
 """Faces that hand on public names beside those of the top level."""
+PUBLIC = {name: getattr(face, name) for face in (dyn, *(getattr(dyn, room) for room in ROOMS)) for name in face.__all__}
 NOT_VERBS = {
-    **dict.fromkeys(("counting", "metrics", "motions", "scenes"), "modules"),
-    **dict.fromkeys(("on_cpu", "one_thread"), "decorators of verbs"),
-    **dict.fromkeys(
-        ("Message", "Notice", "NoticeCode", "Outcome", "with_names", "with_words", "as_python", "status_from"), "what results say"
-    ),
-    "check_options": "looks at no tensor",
-    "map_blocks": "computes nothing by itself",
-    **dict.fromkeys(
-        ("BodyModel", "LineStatus", "Status", "Motion", "MotionName", "MOTION_MODELS", "Polynomial", "Fourier", "Invariant"),
-        "names and numbers",
-    ),
-    **dict.fromkeys(
-        (
-            "Alignment",
-            "Calibration",
-            "Clocks",
-            "DeformableShapes",
-            "MovingShapes",
-            "PairReconstruction",
-            "Reconstruction",
-            "Recovery",
-            "Segmentation",
-            "Shift",
-            "Solution",
-            "TrackSegmentation",
-            "TranslatingPlanes",
-        ),
-        "results",
-    ),
-    **dict.fromkeys(
-        (name for face in (dyn, *(getattr(dyn, room) for room in ROOMS)) for name in face.__all__ if name.endswith("Options")),
-        "options of verbs",
-    ),
-    **dict.fromkeys(
-        (
-            *("Collineation", "ConstantVelocityTensor", "ConvergentMotionMatrix", "DualHomographyTensor"),
-            *("FundamentalMatrix", "GrassmannTensor", "HomographyTensor", "JoinTensor", "MinimalJoinTensor", "SegmentationMatrix"),
-            "TranslatingLinesMatrix",
-        ),
-        "invariants: tests/battery/on_input.py takes each of them to a device",
-    ),
-}
+    *("counting", "metrics", "motions", "scenes"),  # modules
+    *(
+        "on_cpu",
+        "one_thread",
+        "map_blocks",
+        "check_options",
+        "with_names",
+        "with_words",
+        "as_python",
+        "status_from",
+    ),  # tools of verbs
+    # names, numbers and what results say
+    *("Message", "Notice", "BodyModel", "LineStatus", "Status", "Motion", "MotionName", "MOTION_MODELS", "Polynomial", "Fourier"),
+    *("NoticeCode", "Invariant", "MovingShapes", "Recovery", "Outcome"),
+    *(name for name in PUBLIC if name.endswith("Options")),
+    # results, and invariants: tests/battery/on_input.py takes each of them to a device
+    *(name for name, value in PUBLIC.items() if isinstance(value, type) and issubclass(value, dyn.core.Outcome | dyn.Invariant)),
+} - {verb.name.split()[0] for verb in VERBS}
 """Public names that compute nothing by themselves."""

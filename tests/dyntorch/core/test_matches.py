@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
-from dyntorch.core.matches import Matches, matches
+from dyntorch.core.matches import matches
 
 H = dyn.HomographyTensor()
 
@@ -56,26 +56,20 @@ def test_missing_ends_of_lines_and_weights_that_are_not_numbers():
     assert matches(dyn.TranslatingLinesMatrix(), (l1[0, :, 0].repeat(1, 2), l2[0, :, 0].repeat(1, 2))).count == 3
 
 
+def test_options_broadcast_over_the_batch_and_are_kept_by_a_part():
+    static = torch.tensor([True, False, False, True])
+    data = matches(H, views(2, 3), torch.arange(4.0).double(), static)
+    assert data.weights.tolist() == [[0.0, 1.0, 2.0, 3.0]] * 6 and data.static.tolist() == [static.tolist()] * 6
+    less = data.restrict(static.expand(6, 4))
+    assert less.weights.tolist() == [[0.0, 0.0, 0.0, 3.0]] * 6 and less.static is data.static and less.batch == (2, 3)
+
+
 def test_gradients_pass_and_missing_ones_are_zero():
     given = [x.requires_grad_() for x in views(2)]
     with torch.no_grad():
         given[0][0, 0] = torch.nan
     sum(x.sum() for x in matches(H, given).views).backward()
     assert given[0].grad[0, 0].tolist() == [0.0, 0.0] and given[0].grad[1].eq(1).all() and given[1].grad[0, 0].eq(0).all()
-
-
-def test_options_broadcast_over_the_batch():
-    static = torch.tensor([True, False, False, True])
-    data = matches(H, views(2, 3), torch.arange(4.0).double(), static)
-    assert data.weights.tolist() == [[0.0, 1.0, 2.0, 3.0]] * 6 and data.static.tolist() == [static.tolist()] * 6
-
-
-def test_restricted_keeps_labels_and_weights():
-    data = matches(H, views(2), torch.full((2, 4), 3.0).double(), torch.ones(4, dtype=torch.bool))
-    keep = torch.tensor([[True, False, True, True], [False, True, True, True]])
-    less = data.restrict(keep)
-    assert isinstance(less, Matches)
-    assert torch.equal(less.weights, 3.0 * keep.double()) and less.static is data.static and less.batch == (2,)
 
 
 def test_a_class_of_numbers_that_is_not_a_tensor_is_named():

@@ -8,14 +8,10 @@ import torch
 import dyntorch as dyn
 from dyntorch.core.outcome import Status, stack_results
 from dyntorch.geometry.lens import Division, fit_distortion
-from dyntorch.numerics import canonical_correlation, orthonormal_basis
 from dyntorch.scenes.two_cameras import filmed_person, nonrigid_pair
+from tests.draws import seeded
 
 D = torch.float64
-
-
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
 
 
 def padded(takes):
@@ -113,17 +109,3 @@ def test_fit_distortion_in_batches():
     assert not bool(whole.significant[2]) and float(whole.lambda_a[2]) == 0 and float(whole.sigmas[0][2]) == float("inf")
     with pytest.raises(ValueError, match=r"matches must be \(\*batch, N, 2\)"):
         fit_distortion(a, b[:, :10])
-
-
-@pytest.mark.parametrize("shared", [1, 2])
-def test_canonical_correlation_in_batches(shared):
-    draw = seeded(0)
-    first = orthonormal_basis(torch.randn(2, 3, 4, 9, 2, generator=draw, dtype=D))
-    second = orthonormal_basis(torch.randn(3, 5, 9, 2, generator=draw, dtype=D))
-    table = canonical_correlation(first, second, shared=shared)
-    assert table.shape == (2, 3, 4, 5)
-    for i in range(2):
-        for j in range(3):
-            torch.testing.assert_close(
-                table[i, j], canonical_correlation(first[i, j], second[j], shared=shared), atol=1e-12, rtol=0
-            )
