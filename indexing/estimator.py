@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar, cast, get_args, get_type_hints
+from typing import Any, ClassVar, Self, TypeVar, cast, get_type_hints
 
 import numpy as np
 import torch
@@ -81,25 +81,9 @@ def read_options(kind: type[Options], header: Mapping[str, Any]) -> Options | No
     for name, value in changed.items():
         if name not in hints:
             raise ValueError(f"options: there is no {quote(name)}")
-        if not _fits(value, hints[name]):
+        if not (is_whole(value) if hints[name] is int else is_number(value)):
             raise ValueError(f"options.{name}: expected a value like {getattr(usual, name)!r}, got {quote(value)}")
-    return replace(cast("Any", usual), **{name: _tuples(value) for name, value in changed.items()})
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value of a file is what a field of options holds: a number, or a list of such where it is a tuple."""
-    kinds = get_args(hint)
-    if not kinds:
-        return is_whole(value) if hint is int else hint is float and is_number(value)
-    if not isinstance(value, list) or not value:
-        return False
-    if kinds[-1] is Ellipsis:
-        return all(_fits(one, kinds[0]) for one in value)
-    return len(value) == len(kinds) and all(map(_fits, value, kinds))
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+    return replace(cast("Any", usual), **changed)
 
 
 class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]

@@ -218,11 +218,6 @@ def learn_joint_weights(
     r"""Weights :math:`w \ge 0` of joints and channels under which exemplars of other groups name the queries best, if any do better
     than equal ones. groups ``(N,)``, hub ``(N,)``, symmetry ``(joints,)``."""
     home, count, classes = labels.device, query.values.shape[2], int(labels.max()) + 1
-    if not len(owner) == len(query) or not len(groups) == len(hub) == len(labels) == len(copies[0]):
-        raise ValueError(
-            f"owner ({len(owner)}) needs one entry per query ({len(query)}); labels ({len(labels)}), groups ({len(groups)}) and "
-            f"hub ({len(hub)}) one per exemplar ({len(copies[0])})"
-        )
     candidates = _have_others(labels, groups)[owner].nonzero()[:, 0]
     if len(labels[owner[candidates]].unique()) < 2:
         return None

@@ -78,61 +78,39 @@ def test_bad_clips_are_named_everywhere(kind, unchanged):
             verb(bad)
 
 
-@pytest.mark.parametrize("clips", [[], (), iter([]), np.empty((0, 5, 17, 2))], ids=["list", "tuple", "iterator", "array"])
-def test_an_empty_list(clips, unchanged):
-    for verb in (lambda: unchanged.fit(clips, []), lambda: unchanged.partial_fit(clips, []), lambda: unchanged.predict(clips)):
-        with pytest.raises(ValueError, match="clips: the list is empty; give at least one clip"):
-            verb()
+ONE, LIST = good(), r"clips: expected a list of clips or arrays, got .*; put a single clip in a list: \[clip\]"
+SHORT, SOLID = Clip(X[:1], name="squat-3"), Clip(np.random.default_rng(0).normal(size=(FRAMES, JOINTS, 3)))
+NOT_CLIPS = [
+    *((clips, "clips: the list is empty; give at least one clip") for clips in ([], (), iter([]), np.empty((0, 5, 17, 2)))),
+    *((value, LIST) for value in (ONE, "clips.npz", b"x", None, 5)),
+    (X, "several clips are a list"),
+    ([Clip(X[:, :5])], r"clip 0: joints: 5 joints, but the fitted clips have 17; use clips of one joint layout"),
+    ([ONE, SHORT], r"clip 1 \('squat-3'\): joints: one frame only"),
+    ([ONE, (ONE, good(1))], "item 1 holds 2 views; a query is one view"),
+]
+NOT_VIEWS = [
+    ((ONE, Clip(X[:, :5])), "same joints"),
+    ((ONE, SOLID), "must be 2D"),
+    ((ONE, ONE.replace(times=np.arange(FRAMES) + 100.0, fps=None)), "share no time"),
+    ((ONE, ONE.replace(joints=X * np.nan)), "no joint was seen"),
+    ((ONE, None), "array of numbers"),
+]
 
 
-@pytest.mark.parametrize("clips", [good(), "clips.npz", b"x", None, 5, 2.0], ids=lambda v: type(v).__name__)
-def test_something_other_than_a_list(clips, unchanged):
-    for verb in (lambda: unchanged.fit(clips, ["a"]), lambda: unchanged.predict(clips)):
-        with pytest.raises(
-            ValueError, match=r"clips: expected a list of clips or arrays, got .*; put a single clip in a list: \[clip\]"
-        ):
-            verb()
-
-
-def test_one_array_instead_of_a_list_says_what_a_clip_is(unchanged):
-    with pytest.raises(ValueError, match="several clips are a list"):
-        unchanged.predict(good().joints)
-
-
-def test_the_number_of_joints_is_that_of_the_fit(unchanged):
-    with pytest.raises(ValueError, match=r"clip 0: joints: 5 joints, but the fitted clips have 17; use clips of one joint layout"):
-        unchanged.predict([Clip(good().joints[:, :5])])
-
-
-def test_names_of_clips_are_in_the_message(unchanged):
-    with pytest.raises(ValueError, match=r"clip 1 \('squat-3'\): joints: one frame only"):
-        unchanged.predict([good(), Clip(good().joints[:1], name="squat-3")])
-
-
-def test_several_views_are_no_query(unchanged):
-    with pytest.raises(ValueError, match="item 1 holds 2 views; a query is one view"):
-        unchanged.predict([good(), (good(), good(1))])
-
-
-@pytest.mark.parametrize(
-    ("views", "message"),
-    [
-        ((good(), Clip(good().joints[:, :5])), "same joints"),
-        ((good(), Clip(np.random.default_rng(0).normal(size=(FRAMES, JOINTS, 3)))), "must be 2D"),
-        ((good(), good().replace(times=np.arange(FRAMES) + 100.0, fps=None)), "share no time"),
-        ((good(), good().replace(joints=good().joints * np.nan)), "no joint was seen"),
-        ((good(), None), "array of numbers"),
-    ],
-)
-def test_views_that_do_not_belong_together(views, message, unchanged):
-    for indexer in (ActionIndexer(), unchanged):
+def test_queries_and_views_that_are_none_are_named(unchanged):
+    for clips, message in NOT_CLIPS:
         with pytest.raises(ValueError, match=message):
-            indexer.fit([good(), views], ["a", "b"])
-
-
-def test_the_item_is_counted_as_the_user_does(unchanged):
-    with pytest.raises(ValueError, match=r"(clip|item) 1\b"):
-        unchanged.fit([(good(), good(1)), Clip(good().joints[:1]), good(2)], ["a", "b", "a"])
+            unchanged.predict(clips)
+    for clips, message in NOT_CLIPS[:9]:
+        for verb in (unchanged.fit, unchanged.partial_fit):
+            with pytest.raises(ValueError, match=message):
+                verb(clips, [])
+    for views, message in NOT_VIEWS:
+        for indexer in (ActionIndexer(), unchanged):
+            with pytest.raises(ValueError, match=message):
+                indexer.fit([ONE, views], ["a", "b"])
+    with pytest.raises(ValueError, match=r"(clip|item) 1\b"):  # counted as the user does
+        unchanged.fit([(ONE, good(1)), SHORT, good(2)], ["a", "b", "a"])
 
 
 def flat(joints=JOINTS, seed=0):
@@ -163,52 +141,40 @@ def test_a_crash_in_learning_changes_nothing(unchanged, monkeypatch):
 
 
 # ---- labels ------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("labels", "message"),
-    [
-        (["a", None, "b"], "label of clip 1 is missing"),
-        ([1.0, np.nan, 2.0], "label of clip 1 is missing"),
-        (np.array(["a", np.nan, "b"], dtype=object), "label of clip 1 is missing"),
-        (["a", float("nan"), "b"], "label of clip 1 is missing"),
-        (["a", "b"], r"labels: expected one per clip \(3\), got shape \(2,\)"),
-        (["a", "b", "a", "b"], "expected one per clip"),
-        ([["a"], ["b"], ["a"]], "expected one per clip"),
-        ([["a"], ["b", "c"], ["a"]], "labels"),
-        ("abc", "expected one per clip"),
-        (None, r"labels: none given, and clip 0 \(''\) has no label; pass fit\(clips, labels\)"),
-        (np.array(["a", 1, "b"], dtype=object), "labels"),
-    ],
-    ids=str,
-)
-def test_bad_labels(labels, message, unchanged):
+LABELS = [
+    (["a", None, "b"], "label of clip 1 is missing"),
+    ([1.0, np.nan, 2.0], "label of clip 1 is missing"),
+    (np.array(["a", np.nan, "b"], dtype=object), "label of clip 1 is missing"),
+    (["a", float("nan"), "b"], "label of clip 1 is missing"),
+    (["a", "b"], r"labels: expected one per clip \(3\), got shape \(2,\)"),
+    ([["a"], ["b"], ["a"]], "expected one per clip"),
+    ([["a"], ["b", "c"], ["a"]], "labels"),
+    ("abc", "expected one per clip"),
+    (None, r"labels: none given, and clip 0 \(''\) has no label; pass fit\(clips, labels\)"),
+    ([1, "wave", 2], "labels: text and numbers are mixed"),
+]
+
+
+def test_bad_labels(unchanged, indexer, others):
     clips = [good(s) for s in range(3)]
-    for indexer in (ActionIndexer(), unchanged):
-        with pytest.raises(ValueError, match=message):
-            indexer.fit(clips, labels)
-
-
-def test_clips_whose_own_label_is_missing(unchanged):
+    for labels, message in LABELS:
+        for one in (ActionIndexer(), unchanged):
+            with pytest.raises(ValueError, match=message):
+                one.fit(clips, labels)
     for label in (None, float("nan")):
         with pytest.raises(ValueError, match=r"clip 1 .*label|label of clip 1"):
             unchanged.fit([good(0, label="a"), good(1, label=label), good(2, label="b")])
-
-
-@pytest.mark.parametrize("labels", [[None], [np.nan], ["a", "b"], [3]], ids=str)
-def test_bad_labels_for_learning_on(labels, unchanged):
-    with pytest.raises(ValueError, match="labels"):
-        unchanged.partial_fit([good()], labels)
-
-
-def test_labels_never_learned_count_as_wrong(indexer, others):
-    truth = others[:4].labels.astype(object)
-    truth[:2] = "never learned"
-    assert indexer.score(others[:4], truth) == (indexer.predict(others[2:4]) == truth[2:]).mean() / 2
-
-
-@pytest.mark.parametrize("labels", [["a"], ["a"] * 3, [["a", "b"]]], ids=str)
-def test_score_needs_one_label_per_clip(labels, unchanged):
-    with pytest.raises(ValueError, match=r"labels: expected one per clip \(2\)"):
-        unchanged.score([good(), good(1)], labels)
+    for more in ([None], [np.nan], ["a", "b"], [3]):
+        with pytest.raises(ValueError, match="labels"):
+            unchanged.partial_fit([good()], more)
+    for truth in (["a"], ["a"] * 3, [["a", "b"]]):
+        with pytest.raises(ValueError, match=r"labels: expected one per clip \(2\)"):
+            unchanged.score([good(), good(1)], truth)
+    with pytest.raises(ValueError, match="none_label=-1 is one of the learned labels; choose another"):
+        ActionIndexer(scorer="nearest", reject=0.1).fit(clips, [-1, 0, 1])
+    never = others[:4].labels.astype(object)
+    never[:2] = "never learned"  # counts as wrong
+    assert indexer.score(others[:4], never) == (indexer.predict(others[2:4]) == never[2:]).mean() / 2
 
 
 # ---- parameters --------------------------------------------------------------------------------------------------------
@@ -236,13 +202,13 @@ def test_bad_parameters_are_named(name, value, unchanged):
     unchanged.set_params(**{name: old})
 
 
-@pytest.mark.parametrize("change", [{"length": 20}, {"search": False}, {"virtual_views": 2}], ids=str)
-def test_windows_cut_otherwise_cannot_be_added(change, unchanged, lesson):
-    old = {name: unchanged.get_params()[name] for name in change}
-    unchanged.set_params(**change)
-    with pytest.raises(ValueError, match=next(iter(change))):
-        unchanged.partial_fit(lesson[:2])
-    unchanged.set_params(**old)
+def test_windows_cut_otherwise_cannot_be_added(unchanged, lesson):
+    for change in ({"length": 20}, {"search": False}, {"virtual_views": 2}):
+        old = {name: unchanged.get_params()[name] for name in change}
+        unchanged.set_params(**change)
+        with pytest.raises(ValueError, match=next(iter(change))):
+            unchanged.partial_fit(lesson[:2])
+        unchanged.set_params(**old)
 
 
 # ---- comparisons that would mean nothing ---------------------------------------------------------------------------------
@@ -259,18 +225,6 @@ def test_a_query_without_common_joints_is_refused():
     with pytest.raises(ValueError, match="shares 0 joints with the learned clips, 3 are needed"):
         indexer.predict([keep(lesson[0], lower)])
     assert list(indexer.predict([keep(lesson[0], slice(0, 13))])) == ["squat"]
-
-
-def test_the_none_label_must_not_be_an_action():
-    lesson = dataset([Person.random(1)], ["squat", "wave", "kick"], azimuth=0.0, rng=0)
-    with pytest.raises(ValueError, match="none_label=-1 is one of the learned labels; choose another"):
-        ActionIndexer(scorer="nearest", reject=0.1).fit(lesson, [-1, 0, 1])
-
-
-def test_text_and_numbers_are_not_mixed():
-    lesson = dataset([Person.random(1)], ["squat", "wave", "kick"], azimuth=0.0, rng=0)
-    with pytest.raises(ValueError, match="labels: text and numbers are mixed"):
-        ActionIndexer(scorer="nearest").fit(lesson, [1, "wave", 2])
 
 
 def test_huge_coordinates_are_refused():

@@ -29,13 +29,10 @@ def test_events_by_hand():
     assert [e.label for e in events(scores, times, ["a", "b"], -5.0, -5.0)][:1] == ["a"]
 
 
-def test_events_reach_the_ends_and_flicker_is_dropped():
+def test_events_reach_the_ends_and_flicker_and_short_gaps_do_not_part_them():
     times = np.arange(6) * 0.15
     scores = np.array([[2.0, 0], [2, 0], [2, 0], [2, 0], [0, 2], [2, 0]])
     assert [(e.label, e.start, round(e.end, 3)) for e in events(scores, times, [0, 1], 1.0, 1.0)] == [(0, 0.0, 0.525)]
-
-
-def test_flicker_and_short_gaps_do_not_part_an_event():
     times = np.arange(20) * 0.1
     scores = np.tile([2.0, 0.0], (20, 1))
     scores[8], scores[14] = [0.0, 2.0], [0.5, 0.0]
@@ -65,3 +62,6 @@ def test_reject_threshold():
     assert reject_threshold(None, wrong) is None
     assert reject_threshold(0.1, wrong) == pytest.approx(90)
     assert reject_threshold(-3.5, wrong) == -3.5 and reject_threshold(7, wrong) == 7
+    # the rate of the next unknown action counts classes
+    assert reject_threshold(0.1, wrong[:100], 19) == pytest.approx(99 * 0.9 * 20 / 19)
+    assert reject_threshold(0.1, wrong[:100], 5) == 99.0 and reject_threshold(-2.0, wrong, 5) == -2.0

@@ -90,28 +90,21 @@ def test_joint_metric_by_definition():
         values, vectors = np.linalg.eigh(sigma + 0.1 * np.eye(JOINTS))
         np.testing.assert_allclose(metric.weights(name), vectors @ np.diag(values**-0.25) @ vectors.T, atol=1e-5)
     assert metric_of(windows, power=0.0).weights("clip") is None
-
-
-def test_joint_metric_ignores_where_the_image_has_its_origin():
-    windows = random_windows(9, seed=2, holes=True)
-    moved = Windows((windows.values + 50) * windows.seen[:, None, :, None], windows.seen)
-    torch.testing.assert_close(metric_of(moved).covariance, metric_of(windows).covariance, atol=1e-3, rtol=0)
-
-
-def two_views(seed, offset=0.0):
-    shape = random(LENGTH * JOINTS, 3, seed=seed).double()
-    views = [shape @ random(3, 2, seed=seed + i).double() + offset * i for i in (1, 2)]
-    return torch.stack(views).unflatten(1, (LENGTH, JOINTS))
+    holed = random_windows(9, seed=2, holes=True)
+    moved = Windows((holed.values + 50) * holed.seen[:, None, :, None], holed.seen)  # the image has its origin elsewhere
+    torch.testing.assert_close(metric_of(moved).covariance, metric_of(holed).covariance, atol=1e-3, rtol=0)
 
 
 def test_the_metric_keeps_the_rank_condition_and_the_residual_of_two_views_is_the_noise_floor():
-    views, metric = two_views(3, offset=5.0), metric_of(random_windows(7, seed=6))
+    shape = random(LENGTH * JOINTS, 3, seed=3).double()
+    views = torch.stack([shape @ random(3, 2, seed=3 + i).double() + 5.0 * i for i in (1, 2)]).unflatten(1, (LENGTH, JOINTS))
+    metric = metric_of(random_windows(7, seed=6))
     for name in CHANNELS:
         weights = metric.weights(name)
         a, b = (flatten_channel(view[None], name, weights).mT for view in views)
         assert (a - channel(views[:1], name).flatten(1, 2)).abs().max() > 1e-3  # it does weigh
         assert abs(float(canonical_correlation(torch.linalg.qr(a).Q, torch.linalg.qr(b).Q)) - 1) < 1e-6
-    pair = [Windows(view[None].float(), torch.ones(1, JOINTS, dtype=torch.bool)) for view in two_views(10)]
+    pair = [Windows(view[None].float(), torch.ones(1, JOINTS, dtype=torch.bool)) for view in views]
     assert float(fused_residual(pair[0], [pair[1]], metric)) == pytest.approx(3 * np.log(EPSILON), abs=0.5)
 
 
@@ -200,31 +193,15 @@ def test_a_bank_is_the_least_over_its_copies_and_their_mirror_images():
         torch.testing.assert_close(part, table[:, chosen], atol=1e-4, rtol=0)
 
 
-def test_each_class_keeps_its_own_weights():
-    query, bank = random_windows(5, 25), random_windows(6, 26, holes=True)
-    metric, labels = metric_of(bank), torch.tensor([0, 1, 2, 0, 1, 2])
-    weights = JointWeights(random(3, JOINTS, seed=27).exp(), torch.tensor([0.5, 1.0, 1.5]), random(3, JOINTS, seed=28).exp())
-    (banks,) = weights.banks([[Copy(bank), Copy(bank, torch.arange(3), SWAP)]], metric, labels)
-    (table,) = fused_residuals(query, banks, [("epi",)], powers=weights.channels.tolist())
-    expected = weighted_residual(query, [bank, mirror_some(bank, SWAP, torch.arange(6) < 3)], metric, labels, weights)
-    torch.testing.assert_close(table, expected, atol=1e-4, rtol=0)
-
-
-def counted(metric):
-    """A describer that says how many windows it described."""
-    seen, planes = [], planes_of(metric)
-
-    def among(joints):
-        describe = planes(joints)
-        return lambda values: (seen.append(len(values)), describe(values))[1]
-
-    return seen, among
-
-
 def test_exemplars_are_described_once_for_every_set_of_joints(monkeypatch):
     bank, first, second = random_windows(9, 29), random_windows(2, 30), random_windows(3, 31)
     second.seen[:, 2] = False
-    described, describer = counted(metric_of(bank))
+    described, planes = [], planes_of(metric_of(bank))
+
+    def describer(joints):
+        describe = planes(joints)
+        return lambda values: (described.append(len(values)), describe(values))[1]
+
     kept = Bank([Copy(bank), Copy(bank, torch.arange(4), SWAP)], describer)
     answers = [fused_residuals(query, [kept], [("epi",)])[0] for query in (first, second, first, second)]
     assert described == [9, 4, 2, 9, 4, 3, 2, 3]

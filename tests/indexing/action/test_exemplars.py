@@ -35,12 +35,8 @@ def test_sides_in_names():
         for i, j in enumerate(swap.tolist()):
             mirrored = skeleton.joints[i].replace("left", "@").replace("right", "left").replace("@", "right")
             assert skeleton.joints[j] == mirrored
-
-
-def test_names_come_before_data():
-    names = ("left_a", "right_a", *(f"x{i}" for i in range(15)))
-    swap = mirror_permutation(Skeleton("odd", names), torch.zeros(1, 4, 17, 2))
-    assert swap.tolist() == [1, 0, *range(2, 17)]
+    odd = Skeleton("odd", ("left_a", "right_a", *(f"x{i}" for i in range(15))))
+    assert mirror_permutation(odd, torch.zeros(1, 4, 17, 2)).tolist() == [1, 0, *range(2, 17)]  # names come before data
 
 
 @pytest.mark.slow
@@ -61,35 +57,25 @@ def test_layouts_are_recognized_without_names(windows_of, lesson):
         assert model.symmetry is not None and model.symmetry.tolist() == COCO
 
 
-def test_mirroring_twice_gives_the_window_back():
-    x = torch.randn(3, 8, 6, 2)
-    swap = torch.tensor([0, 2, 1, 3, 5, 4])
-    assert torch.equal(mirror(mirror(x, swap), swap), x)
+def test_mirrored_and_turned_cards():
+    x, swap = torch.randn(2, 8, 6, 2), torch.tensor([0, 2, 1, 3, 5, 4])
     once = mirror(x, swap)
-    torch.testing.assert_close(once[:, :, 1, 0], -x[:, :, 2, 0])
-    torch.testing.assert_close(once[:, :, 1, 1], x[:, :, 2, 1])
-
-
-def test_a_turned_card_keeps_its_heights_and_is_squeezed():
-    x = torch.randn(2, 8, 6, 2)
+    assert torch.equal(mirror(once, swap), x)
+    torch.testing.assert_close(once[:, :, 1], x[:, :, 2] * torch.tensor([-1.0, 1.0]))
     centred = x - x.mean(dim=(1, 2), keepdim=True)
-    got = turn(x, np.array([np.pi / 3, np.pi]), np.zeros(2))
-    torch.testing.assert_close(got[..., 1], centred[..., 1], atol=1e-5, rtol=0)
-    torch.testing.assert_close(got[..., 0], centred[..., 0] * torch.tensor([0.5, -1.0])[:, None, None], atol=1e-5, rtol=0)
-
-
-def in_the_mirror(clip):
-    swap = torch.tensor(COCO)
-    return clip.replace(joints=mirror(torch.from_numpy(clip.joints.copy())[None], swap)[0].numpy(), up=clip.up)
+    turned = turn(x, np.array([np.pi / 3, np.pi]), np.zeros(2))
+    torch.testing.assert_close(turned[..., 1], centred[..., 1], atol=1e-5, rtol=0)  # keeps its heights, and is squeezed
+    torch.testing.assert_close(turned[..., 0], centred[..., 0] * torch.tensor([0.5, -1.0])[:, None, None], atol=1e-5, rtol=0)
 
 
 def sides(actions, people, azimuth, rng):
     """Every action once as it is and once mirrored, as 2D clips about x = 0."""
-    clips = dataset(people, actions, azimuth=azimuth, rng=rng, image=(1280, 720))
-    centred = [clip.replace(joints=clip.joints - [640.0, 0.0]) for clip in clips]
-    return [clip.replace(label=f"right {clip.label}") for clip in centred], [
-        in_the_mirror(clip).replace(label=f"left {clip.label}") for clip in centred
-    ]
+    right, left = [], []
+    for clip in dataset(people, actions, azimuth=azimuth, rng=rng, image=(1280, 720)):
+        joints = clip.joints - [640.0, 0.0]
+        right.append(clip.replace(joints=joints, label=f"right {clip.label}"))
+        left.append(clip.replace(joints=mirror(torch.from_numpy(joints)[None], torch.tensor(COCO))[0], label=f"left {clip.label}"))
+    return right, left
 
 
 def test_left_and_right_as_different_actions_are_not_mirrored():

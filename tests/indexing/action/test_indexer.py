@@ -31,24 +31,17 @@ def test_one_example_recognizes_other_people_from_other_viewpoints(indexer, less
 
 
 @pytest.mark.slow
-def test_each_scorer_is_what_it_says(lesson, others):
-    both = ActionIndexer().fit(lesson)
-    for name, scores in (("nearest", both.model_.nearest_scores), ("kernel", both.model_.machine_scores)):
+def test_each_scorer_is_what_it_says_and_fewer_exemplars(indexer, lesson, others):
+    for name, scores in (("nearest", indexer.model_.nearest_scores), ("kernel", indexer.model_.machine_scores)):
         alone = ActionIndexer(scorer=name).fit(lesson)
-        query = alone._queries(others)
-        np.testing.assert_allclose(alone.decision_function(others), scores(query).numpy(), atol=1e-4)
-        assert not np.allclose(alone.decision_function(others), both.decision_function(others))
-
-
-@pytest.mark.slow
-def test_each_scorer_alone_and_fewer_exemplars(lesson, others):
-    for options in ({"scorer": "nearest"}, {"scorer": "kernel"}, {"virtual_views": 0, "search": False}):
-        plain = ActionIndexer(**options).fit(lesson)
-        assert plain.score(others, others.labels) > (0.8 if "search" in options else 0.88), options
+        found = alone.decision_function(others)
+        np.testing.assert_allclose(found, scores(alone._queries(others)).numpy(), atol=1e-4)
+        assert not np.allclose(found, indexer.decision_function(others)) and alone.score(others, others.labels) > 0.88, name
+    plain = ActionIndexer(virtual_views=0, search=False).fit(lesson)
+    assert plain.score(others, others.labels) > 0.8
     assert len(plain.model_.exemplars.crops) == 13 and not len(plain.model_.exemplars.views)
-    same = ActionIndexer(view="same").fit(lesson)
     seen = dataset([Person.random(1), Person.random(2)], ACTIONS, azimuth=5.0, rng=9)
-    assert same.score(seen, seen.labels) > 0.9
+    assert ActionIndexer(view="same").fit(lesson).score(seen, seen.labels) > 0.9
 
 
 @pytest.mark.slow
@@ -61,14 +54,10 @@ def test_learned_weights(few):
 
 
 @pytest.mark.slow
-def test_3d_exemplars_recognize_2d_queries(lesson_3d, others):
+def test_3d_exemplars_recognize_2d_queries_and_go_with_2d_ones(lesson_3d, others, few):
     solid = ActionIndexer().fit(lesson_3d)
     assert solid.score(others, others.labels) > 0.85
     assert solid.score(lesson_3d, lesson_3d.labels) > 0.9  # 3D queries are seen along z
-
-
-@pytest.mark.slow
-def test_2d_and_3d_exemplars_together(few):
     train, test = few
     mixed = [*train[:4], *(perform(action, Person.random(30), rng=3) for action in FEW)]
     assert ActionIndexer().fit(mixed).score(test, test.labels) == 1.0
@@ -217,32 +206,17 @@ def test_partial_fit_keeps_every_exemplar_with_its_own_copies(crowd):
     assert len(grown.model_.exemplars.views) == len(order.model_.exemplars.views)
 
 
-def test_new_classes_appear_and_old_ones_stay(crowd):
-    train, test = crowd
-    one = train.select(subject=0)
-    indexer = ActionIndexer().fit(one.select(action=FEW[:2]))
-    assert indexer.classes_.tolist() == ["squat", "wave"]
-    indexer.partial_fit(one.select(action=["jumping_jack"]))  # a longer name than any before, and one class alone
-    assert indexer.classes_.tolist() == ["jumping_jack", "squat", "wave"]
-    asked = test.select(action=["jumping_jack", "squat", "wave"])
-    assert indexer.score(asked, asked.labels) == 1.0
-
-
-def test_partial_fit_with_numbers(crowd):
+def test_partial_fit_keeps_old_classes_and_the_type_of_labels(crowd, tmp_path):
     one = crowd[0].select(subject=0, action=FEW)
-    indexer = ActionIndexer().partial_fit(one[:3], [5, 3, 9]).partial_fit(one[3:], [1])
+    ActionIndexer(random_state=None).partial_fit(one[:3], [5, 3, 9]).save(tmp_path / "m.safetensors")
+    indexer = ActionIndexer.load(tmp_path / "m.safetensors").partial_fit(one[3:], [1])
     assert indexer.classes_.tolist() == [1, 3, 5, 9] and indexer.classes_.dtype.kind == "i"
     assert indexer.predict(one).tolist() == [5, 3, 9, 1]
     with pytest.raises(ValueError, match="labels: the fitted labels are of type int64, the new ones <U3"):
         indexer.partial_fit(one[3:], ["bow"])
-
-
-def test_partial_fit_without_a_seed(crowd, tmp_path):
-    one = crowd[0].select(subject=0, action=FEW)
-    indexer = ActionIndexer(random_state=None).fit(one[:3])
-    indexer.save(tmp_path / "m.safetensors")
-    loaded = ActionIndexer.load(tmp_path / "m.safetensors").partial_fit(one[3:])
-    assert loaded.predict(one).tolist() == one.labels.tolist()
+    named = ActionIndexer().fit(one[:2]).partial_fit(one[3:], ["jumping_jack"])  # a longer name than any before, and alone
+    assert named.classes_.tolist() == ["jumping_jack", "squat", "wave"]
+    assert named.predict([*one[:2], one[3]]).tolist() == ["squat", "wave", "jumping_jack"]
 
 
 # ---- reject ------------------------------------------------------------------------------------------------------------
@@ -270,34 +244,26 @@ def test_a_stricter_rate_refuses_more_and_known_actions_pass(crowd):
     indexer = ActionIndexer(scorer="nearest", none_label="none")
     answers = [indexer.set_params(reject=rate).fit(train).predict(test) for rate in (0.5, 0.1, 0.02)]
     refused = [(answer == "none").mean() for answer in answers]
-    assert refused == sorted(refused)
-    assert refused[1] < 0.15  # known actions by other people
+    assert refused == sorted(refused) and refused[1] < 0.15  # known actions by other people
     assert (answers[1] == test.labels).mean() > 0.85
 
 
 @pytest.mark.slow
-def test_reject_only_ever_replaces_answers(crowd):
+def test_reject_only_ever_replaces_answers_and_a_threshold_is_taken_as_it_is(crowd):
     train, test = crowd
     train = train.select(subject=[0, 1])
     free, bound = ActionIndexer().fit(train), ActionIndexer(reject=0.02, none_label="none").fit(train)
     np.testing.assert_array_equal(free.decision_function(test), bound.decision_function(test))
-    answers = bound.predict(test)
+    evidence, answers = bound.evidence(test), bound.predict(test)
     kept = answers != "none"
     np.testing.assert_array_equal(answers[kept], free.predict(test)[kept])
-    np.testing.assert_array_equal(kept, bound.evidence(test) >= bound.reject_threshold_)
-
-
-@pytest.mark.slow
-def test_a_threshold_is_taken_as_it_is(crowd):
-    train, test = (clips.select(action=FEW) for clips in crowd)
-    evidence = ActionIndexer().fit(train).evidence(test)
+    np.testing.assert_array_equal(kept, evidence >= bound.reject_threshold_)
     level = float(np.median(evidence))
     assert level > 1
-    indexer = ActionIndexer(reject=level, none_label="none").fit(train)
-    assert indexer.reject_threshold_ == level
-    np.testing.assert_array_equal(indexer.predict(test) == "none", evidence < level)
-    assert (ActionIndexer(reject=1e9, none_label="none").fit(train).predict(test) == "none").all()
-    assert (ActionIndexer(reject=-1e9, none_label="none").fit(train).predict(test) != "none").all()
+    for threshold in (level, 1e9, -1e9):
+        indexer = bound.set_params(reject=threshold).fit(train)
+        assert indexer.reject_threshold_ == threshold
+        np.testing.assert_array_equal(indexer.predict(test) == "none", evidence < threshold)
 
 
 @pytest.mark.slow

@@ -8,10 +8,10 @@ import torch
 
 from indexing import ActionIndexer
 from indexing.action.bank import EPSILON, JointMetric, factorize, flatten_channel, fuse_terms
-from indexing.action.learning import BLENDS, _fewest_mistakes, _fit_sharpness, blend_scores, leave_out
+from indexing.action.learning import BLENDS, _fewest_mistakes, _fit_sharpness, leave_out
 from indexing.action.model import Blend, evidence
 from indexing.actors import Person, dataset
-from indexing.scoring import probabilities, reject_threshold
+from indexing.scoring import probabilities
 
 ACTIONS = ("squat", "wave", "kick", "bow", "punch")
 
@@ -63,11 +63,6 @@ def test_sharpness_is_the_likeliest():
     certain = 5.0 * torch.nn.functional.one_hot(truth, 4).double()  # nobody was ever wrong: the fewer asked, the less it says
     few, many = (_fit_sharpness(Blend(), certain, truth, exemplars).sharpness for exemplars in (8, 800))
     assert few < many < 16
-
-
-def test_blended_is_the_weighted_sum():
-    evidence = torch.rand(2, 3, 4, generator=torch.Generator().manual_seed(2))
-    assert torch.allclose(blend_scores(evidence, Blend(2.0, 0.5)), 2 * evidence[0] + 0.5 * evidence[1])
 
 
 @pytest.mark.slow
@@ -122,18 +117,3 @@ def test_known_from_unknown():
     assert auroc(lambda x: evidence(x, 6)) > auroc(lambda x: x.max(dim=1).values) > 0.6
     few = scores[:, :2]
     assert torch.equal(evidence(few, 2), few.max(dim=1).values)
-
-
-def test_the_rate_of_the_next_unknown_action_counts_classes():
-    wrong = torch.arange(100.0)
-    assert reject_threshold(0.1, wrong) == pytest.approx(89.1)
-    assert reject_threshold(0.1, wrong, 19) == pytest.approx(99 * 0.9 * 20 / 19)
-    assert reject_threshold(0.1, wrong, 5) == 99.0 and reject_threshold(-2.0, wrong, 5) == -2.0
-
-
-@pytest.mark.slow
-def test_evidence_is_what_rejection_stands_on(lesson):
-    evidence = ActionIndexer(virtual_views=2).fit(lesson).evidence(lesson)
-    threshold = 1.5 + float(np.abs(evidence).max())
-    assert (ActionIndexer(virtual_views=2, reject=threshold, none_label="none").fit(lesson).predict(lesson) == "none").all()
-    assert (ActionIndexer(virtual_views=2, reject=-threshold, none_label="none").fit(lesson).predict(lesson) != "none").all()

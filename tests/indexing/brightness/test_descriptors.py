@@ -12,7 +12,6 @@ from indexing.brightness.descriptors import (
     BrightnessOptions,
     MotionBox,
     MotionMaps,
-    as_grey,
     blur,
     blur_small,
     describe_cells,
@@ -53,11 +52,7 @@ def test_blur_keeps_the_mean_and_fits_small_frames(rng):
     assert blur(torch.from_numpy(rng.random((2, 5, 9))), 3.0).shape == (2, 5, 9)
 
 
-def test_grey_is_from_0_to_1():
-    assert as_grey(torch.tensor([255], dtype=torch.uint8)).tolist() == [1.0]
-
-
-def test_maps_are_kornias_gradients_of_the_frame_before():
+def test_maps_are_kornias_gradients_of_the_frame_before_and_do_not_know_the_sign_of_the_contrast():
     frames = video()
     maps, change = MotionMaps(SIGMA, QUIET).push(frames)
     gx, gy, gt = gradients(blur(frames, SIGMA))
@@ -68,13 +63,7 @@ def test_maps_are_kornias_gradients_of_the_frame_before():
         torch.testing.assert_close(maps[t], expected)
         torch.testing.assert_close(change[t], gt[t - 1].abs())
     assert not maps[0].any()
-
-
-def test_maps_do_not_know_the_sign_of_the_contrast():
-    frames = video()
-    torch.testing.assert_close(
-        MotionMaps(SIGMA, QUIET).push(1 - frames)[0], MotionMaps(SIGMA, QUIET).push(frames)[0], atol=1e-5, rtol=1e-4
-    )
+    torch.testing.assert_close(MotionMaps(SIGMA, QUIET).push(1 - frames)[0], maps, atol=1e-5, rtol=1e-4)
 
 
 def test_tables_are_kornias():
@@ -99,15 +88,12 @@ def slow_box(change):
     return np.array(out)
 
 
-def test_the_box_is_that_of_a_loop_in_any_chunks():
+def test_the_box_is_that_of_a_loop_in_any_chunks_and_without_motion_the_image():
     change = 0.05 * video(40, 12, 16) * (video(40, 12, 16, 1) > 0.9)
     expected = slow_box(change.double().numpy())
     box = MotionBox(150.0)
     found = torch.cat([box.push(part) for part in change.double().split([1, 7, 20, 12])])
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9)
-
-
-def test_a_box_without_motion_is_the_image():
     assert MotionBox(150.0).push(torch.zeros(2, 12, 16))[1].tolist() == pytest.approx([8, 6, 20.8, 20.8])
 
 
