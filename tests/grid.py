@@ -39,3 +39,15 @@ def grid(*axes: tuple[str | Sequence[str], Sequence[Any]]) -> Callable[[Callable
         return test
 
     return decorate
+
+
+def assert_refused(*cases: tuple[Callable[[], object], str], error: type[Exception] = ValueError) -> None:
+    """Every call raises the error in the words beside it; lists all that do not."""
+    failures = []
+    for number, (call, words) in enumerate(cases):
+        try:
+            with pytest.raises(error, match=words):
+                call()
+        except (AssertionError, pytest.fail.Exception) as failure:
+            failures.append(f"{number} ({words}): {str(failure)[:300]}")
+    assert not failures, f"{len(failures)} calls are not refused as they should be:\n" + "\n".join(failures)

@@ -7,8 +7,9 @@ from dyntorch.geometry.extensors import compound
 from dyntorch.geometry.grassmann import grassmann_tensor
 from dyntorch.geometry.grassmann_nearest import _Nearest, projections_of
 from dyntorch.numerics.least_squares import jacobian
+from tests.draws import random, seeded
 from tests.dyntorch.geometry.test_grassmann import CASES, distance, relative, scene
-from tests.dyntorch.geometry.test_grassmann import random_candidates as random
+from tests.grid import assert_refused
 
 FULL = [((3, 1), (3, 3)), ((2, 2, 2), (3, 2, 3))]
 LINE = ((1, 1, 1), (2, 2, 2))
@@ -147,7 +148,21 @@ def test_the_gradient_at_an_exact_tensor_is_the_projector_on_the_tangents():
     torch.testing.assert_close(derivative * derivative.trace().sign(), basis.T @ basis, rtol=0, atol=1e-9)
 
 
-def test_zero_and_not_finite_tensors():
+def test_bad_tensors():
+    """Refused where the numbers do not fit; finite far from any projection; zero, and alone in it, where they are not finite."""
+    assert_refused(
+        (lambda: projections_of(random(3, 3, 3), (2, 2, 0), (3, 3, 3)), "profile must have 1 to m_i rows"),
+        (lambda: projections_of(random(3, 3), (2, 2, 1), (3, 3, 3)), "is floating point"),
+    )
+    for profile, sizes in (((2, 2, 1), (3, 3, 3)), LINE):
+        tensor = random(*noisy(profile, sizes, 4).shape, seed=3).requires_grad_()
+        found = projections_of(tensor, profile, sizes)
+        assert all(part.isfinite().all() for part in found)
+        assert torch.autograd.grad(sum(part.sum() for part in found), tensor)[0].isfinite().all()
+        assert (distance(found, tensor, profile) < 1).all()
+    one = torch.zeros(1, 3, 3, 3, dtype=torch.float64)
+    one[0, 0, 1, 2] = 1.0  # a single minor is a tensor of its own, with many projections of rank below three
+    assert distance(projections_of(one, (2, 2, 1), (3, 3, 3)), one, (2, 2, 1)).max() < 1e-12
     profile, sizes = (2, 2, 1), (3, 3, 3)
     tensor = noisy(profile, sizes, 4)
     tensor[0], tensor[2, 1, 1, 1], tensor[3, 0, 0, 0] = 0.0, torch.nan, torch.inf
@@ -166,30 +181,9 @@ def test_zero_and_not_finite_tensors():
     torch.testing.assert_close(gradient[1], expected[0], rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.slow
-def test_tensors_far_from_any_projection_stay_finite():
-    for profile, sizes in (((2, 2, 1), (3, 3, 3)), LINE):
-        shape = noisy(profile, sizes, 20).shape
-        tensor = random(*shape, seed=3).requires_grad_()
-        found = projections_of(tensor, profile, sizes)
-        assert all(part.isfinite().all() for part in found)
-        assert torch.autograd.grad(sum(part.sum() for part in found), tensor)[0].isfinite().all()
-        assert (distance(found, tensor, profile) < 1).all()
-    one = torch.zeros(1, 3, 3, 3, dtype=torch.float64)
-    one[0, 0, 1, 2] = 1.0  # a single minor is a tensor of its own, with many projections of rank below three
-    assert distance(projections_of(one, (2, 2, 1), (3, 3, 3)), one, (2, 2, 1)).max() < 1e-12
-
-
-def test_misuse():
-    with pytest.raises(ValueError, match="profile must have 1 to m_i rows"):
-        projections_of(random(3, 3, 3), (2, 2, 0), (3, 3, 3))
-    with pytest.raises(ValueError, match="is floating point"):
-        projections_of(random(3, 3), (2, 2, 1), (3, 3, 3))
-
-
 def test_second_derivatives_of_the_nearest_tensor():
     """Of a noisy tensor, composed again: free of the gauge of the projections."""
-    draw = torch.Generator().manual_seed(4)
+    draw = seeded(4)
     true = grassmann_tensor(torch.randn(3, 3, 4, generator=draw, dtype=torch.float64), (2, 1, 1))
     noisy = true / true.norm() + 0.01 * torch.randn(true.shape, generator=draw, dtype=torch.float64)
 

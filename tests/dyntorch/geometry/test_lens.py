@@ -9,6 +9,7 @@ from dyntorch.geometry import lens as lens_module
 from dyntorch.geometry.epipolar_fit import Frames
 from dyntorch.geometry.lens import Division, LensDescent, LensMatches, distort, fit_distortion, undistort, undistort_points
 from dyntorch.scenes import two_view
+from tests.grid import assert_refused
 
 K = torch.tensor([[1100.0, 0.0, 950.0], [0.0, 1080.0, 530.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 LENSES = {
@@ -29,7 +30,7 @@ def lens(name):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_removal_equals_opencv_inside_the_image(name):
+def test_removal_and_distortion_equal_opencv_and_are_inverse_inside_the_image(name):
     cv2 = pytest.importorskip("cv2")
     x, dist = pixels(), lens(name)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-13)
@@ -37,20 +38,10 @@ def test_removal_equals_opencv_inside_the_image(name):
     given = {"R": None, "P": K.numpy(), "criteria": criteria}
     expected = iterated(x.numpy()[:, None], K.numpy(), dist.numpy(), **given)[:, 0]
     assert (undistort(x, K, dist) - torch.from_numpy(expected)).abs().max() < 1e-6
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_distortion_equals_opencv(name):
-    cv2 = pytest.importorskip("cv2")
-    rays = torch.cat([(pixels() - K[:2, 2]) / K[[0, 1], [0, 1]], torch.ones(200, 1, dtype=torch.float64)], dim=1)
-    expected = cv2.projectPoints(rays.numpy(), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), K.numpy(), lens(name).numpy())[0][:, 0]
-    assert torch.allclose(distort(pixels(), K, lens(name)), torch.from_numpy(expected), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_removal_inverts_distortion(name):
-    x = pixels()
-    assert torch.allclose(distort(undistort(x, K, lens(name)), K, lens(name)), x, rtol=0, atol=1e-8)
+    rays = torch.cat([(x - K[:2, 2]) / K[[0, 1], [0, 1]], torch.ones(200, 1, dtype=torch.float64)], dim=1)
+    expected = cv2.projectPoints(rays.numpy(), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), K.numpy(), dist.numpy())[0][:, 0]
+    assert torch.allclose(distort(x, K, dist), torch.from_numpy(expected), rtol=0, atol=1e-9)
+    assert torch.allclose(distort(undistort(x, K, dist), K, dist), x, rtol=0, atol=1e-8)
 
 
 def test_batches_equal_loops_and_float32_keeps_its_type():
@@ -116,8 +107,6 @@ def test_division_without_a_size_uses_the_box_of_the_points():
     x = torch.tensor([[[0.0, 0.0], [torch.nan, 9.0]], [[6.0, 2.0], [3.0, 8.0]]])
     lens = Division.of(x)
     assert (lens.centre.tolist(), lens.radius) == ([3.0, 4.0], 5.0)
-    with pytest.raises(ValueError, match="no point is seen"):
-        Division.of(torch.full((3, 2), torch.nan))
 
 
 def test_calibrations_as_users_write_them():
@@ -126,26 +115,6 @@ def test_calibrations_as_users_write_them():
     assert torch.equal(undistort_points(x, (K.tolist(), None)), x)
     expected = undistort(x, K, lens("five"))
     assert torch.equal(undistort_points(x, (K.numpy(), [LENSES["five"]])), expected)
-
-
-@pytest.mark.parametrize(
-    ("calibration", "words"),
-    [
-        (K, r"None or \(K, dist\), got Tensor"),
-        ((K[:2], [0.0] * 4), r"K must be \[\[fx"),
-        ((K.mT, [0.0] * 4), r"K must be \[\[fx"),
-        ((K, [0.0] * 14), "fisheye, thin prism and tilted lenses are not supported"),
-        ((K, [float("nan")] * 4), "dist must be finite"),
-    ],
-)
-def test_calibrations_that_are_none(calibration, words):
-    with pytest.raises(ValueError, match=words):
-        undistort_points(pixels(3), calibration)
-
-
-def test_points_of_a_wrong_shape():
-    with pytest.raises(ValueError, match=r"points must be \(\*batch, n, 2\), got \(3,\)"):
-        distort(torch.zeros(3), K, lens("four"))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -175,6 +144,7 @@ def test_exact_matches_give_the_lenses(strengths):
     fit = fit_distortion(*seen(strengths), sizes=(SIZE, SIZE))
     assert (fit.lambda_a, fit.lambda_b) == pytest.approx(strengths, abs=1e-4)
     assert fit.significant and fit.gain > 0.9
+    assert fit.note.startswith("lens distortion fitted, lambda = ") and "give calibration" in fit.note
 
 
 @pytest.mark.slow
@@ -185,16 +155,14 @@ def test_noisy_matches_give_the_lenses_within_their_sigmas():
     sigmas = torch.tensor([fit.sigmas for fit in fits], dtype=torch.float64)
     assert 0.4 < float((errors / sigmas).square().mean().sqrt()) < 2
     assert all(fit.significant for fit in fits)
-
-
-@pytest.mark.slow
-def test_ideal_cameras_are_left_alone():
+    # ideal cameras are left alone
     fits = [fit_distortion(*seen((0.0, 0.0), noise=1.0, seed=seed), sizes=(SIZE, SIZE)) for seed in range(6)]
-    assert not any(fit.significant for fit in fits)
-    assert all(fit.gain < 0.05 for fit in fits)
+    assert not any(fit.significant or fit.gain >= 0.05 for fit in fits)
 
 
-def test_wrong_matches_and_missing_ones():
+def test_wrong_matches_missing_ones_and_too_few():
+    fit = fit_distortion(*seen((-0.3, -0.3), n=30), sizes=(SIZE, SIZE))
+    assert (fit.lambda_a, fit.gain, fit.significant) == (0.0, 0.0, False)
     a, b = seen((-0.2, -0.1), noise=0.5)
     generator = torch.Generator().manual_seed(5)
     b[::7] += 60 * torch.randn(len(b[::7]), 2, generator=generator, dtype=b.dtype)
@@ -226,18 +194,6 @@ def test_a_lens_of_another_model_is_approximated():
     bent = [distort(x, K, torch.tensor([-0.25, 0.08, 0.0, 0.0], dtype=torch.float64)) for x in views]
     fit = fit_distortion(*bent, sizes=(SIZE, SIZE))
     assert fit.significant and fit.gain > 0.8 and fit.lambda_a < -0.05
-
-
-def test_too_few_matches_decide_nothing():
-    a, b = seen((-0.3, -0.3), n=30)
-    fit = fit_distortion(a, b, sizes=(SIZE, SIZE))
-    assert (fit.lambda_a, fit.gain, fit.significant) == (0.0, 0.0, False)
-
-
-@pytest.mark.slow
-def test_the_note_tells_what_to_give():
-    note = fit_distortion(*seen((-0.2, -0.1)), sizes=(SIZE, SIZE)).note
-    assert note.startswith("lens distortion fitted, lambda = -0.200 and -0.100") and "give calibration" in note
 
 
 def test_distances_are_the_constraint_by_its_gradient_in_measured_pixels():
@@ -272,19 +228,6 @@ def test_the_descent_never_rises_and_keeps_fixed_lenses():
         assert torch.equal(found.lens, start.lens) != lens
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ((torch.zeros(5, 2), torch.zeros(4, 2)), r"matches must be \(N, 2\) in both cameras, got \(5, 2\) and \(4, 2\)"),
-        ((torch.zeros(5, 2), torch.zeros(5, 2), torch.ones(4)), r"weights must be \(5,\), one per match, got \(4,\)"),
-        ((torch.full((5, 2), torch.nan), torch.zeros(5, 2)), "no point is seen"),
-    ],
-)
-def test_misuse_is_named(arguments, words):
-    with pytest.raises(ValueError, match=words):
-        fit_distortion(*arguments)
-
-
 @pytest.mark.slow
 def test_what_decides_that_there_is_distortion(monkeypatch):
     matches = seen((-0.2, -0.1))
@@ -294,3 +237,20 @@ def test_what_decides_that_there_is_distortion(monkeypatch):
     monkeypatch.setattr(lens_module, "MIN_MATCHES", 10**6)
     many = fit_distortion(*matches, sizes=(SIZE, SIZE))
     assert not many.significant and many.sigmas == (math.inf, math.inf)
+
+
+def test_misuse():
+    five, gone = torch.zeros(5, 2), torch.full((5, 2), torch.nan)
+    fisheye = "fisheye, thin prism and tilted lenses are not supported"
+    assert_refused(
+        (lambda: undistort_points(pixels(3), K), r"None or \(K, dist\), got Tensor"),
+        (lambda: undistort_points(pixels(3), (K[:2], [0.0] * 4)), r"K must be \[\[fx"),
+        (lambda: undistort_points(pixels(3), (K.mT, [0.0] * 4)), r"K must be \[\[fx"),
+        (lambda: undistort_points(pixels(3), (K, [0.0] * 14)), fisheye),
+        (lambda: undistort_points(pixels(3), (K, [float("nan")] * 4)), "dist must be finite"),
+        (lambda: distort(torch.zeros(3), K, lens("four")), r"points must be \(\*batch, n, 2\), got \(3,\)"),
+        (lambda: fit_distortion(five, five[:4]), r"matches must be \(N, 2\) in both cameras, got \(5, 2\) and \(4, 2\)"),
+        (lambda: fit_distortion(five, five, torch.ones(4)), r"weights must be \(5,\), one per match, got \(4,\)"),
+        (lambda: fit_distortion(gone, five), "no point is seen"),
+        (lambda: Division.of(gone), "no point is seen"),
+    )

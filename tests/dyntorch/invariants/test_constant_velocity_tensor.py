@@ -1,11 +1,10 @@
 """Constant velocity: against Cramer's rule in P^6, brute-force ranks, finite differences and the truth of synthetic scenes."""
 
-import itertools
-
 import numpy as np
 import pytest
 import torch
 
+from dyntorch.geometry.extensors import wedge
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor, infinity_planes
 from dyntorch.scenes import constant_velocity
@@ -13,26 +12,6 @@ from tests.draws import random, seeded
 
 CV = ConstantVelocityTensor
 ONES = (torch.ones((), dtype=torch.float64),) * 3
-
-
-def rows(views):
-    """Rows P0 x P1 x L of all matches, with planes L from an SVD of the third point."""
-    p0, p1, p2 = (homogeneous(x) for x in views)
-    planes = torch.linalg.svd(p2[..., None, :]).Vh[..., 1:, :]
-    return torch.einsum("...ni,...nj,...nrk->...nrijk", p0, p1, planes).flatten(-3).flatten(-3, -2)
-
-
-def rank(views):
-    matrix = rows(views)
-    return int(torch.linalg.matrix_rank(matrix / matrix.norm(dim=-1, keepdim=True), rtol=1e-9))
-
-
-def join_scenes(*scenes):
-    """Matches of several scenes before the sensors of the first."""
-    maps = scenes[0].motion
-    return tuple(
-        torch.cat([apply(maps[t], s.extras["points"] + t * s.extras["velocities"]) for s in scenes], dim=-2) for t in range(3)
-    )
 
 
 def distance(first, second):
@@ -66,36 +45,6 @@ def test_compose_is_cramers_rule_in_p6(height):
         assert cosine == pytest.approx(1, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"static": 1.0}, 36),
-        ({"velocities": "equal"}, 36),
-        ({"velocities": "linear"}, 49),
-        ({"velocities": "planar"}, 58),
-        ({}, 63),
-    ],
-)
-def test_degenerate_ranks(options, expected):
-    assert rank(constant_velocity(80, generator=seeded(2), **options).views) == expected
-
-
-@pytest.mark.parametrize(("still", "moving"), [(5, 16), (10, 11), (15, 9), (20, 9)])
-def test_static_matches_replace_moving_ones(still, moving):
-    static, scene = (constant_velocity(n, static=s, generator=seeded(3)) for n, s in ((still, 1.0), (moving, 0.0)))
-    assert rank(join_scenes(scene, static)) == 63
-    assert rank(tuple(x[:-1] for x in join_scenes(static, scene))) < 63
-
-
-@pytest.mark.parametrize("height", [4, 3])
-def test_dof_is_the_rank_of_compose(height):
-    maps = tuple(random(4 if t < 2 else height, 4, seed=t) for t in range(3))
-    jacobian = torch.autograd.functional.jacobian(CV.compose, maps)
-    stacked = torch.cat([j.flatten(3).flatten(0, 2) for j in jacobian], dim=-1)
-    invariant = CV("space" if height == 4 else "image")
-    assert int(torch.linalg.matrix_rank(stacked, rtol=1e-10)) == invariant.dof
-
-
 def test_epipoles_are_fourfold_defective_eigenvalues():
     tensor = CV.compose(*constant_velocity(5, generator=seeded(4)).motion)
     alpha, _ = infinity_planes(tensor)
@@ -121,10 +70,7 @@ def test_maps_are_the_true_ones_up_to_an_affinity_and_a_velocity(camera):
     x, v = scene.extras["points"], scene.extras["velocities"]
     y = CV.positions(found, *scene.views)
     # an affinity of space-time: y_t = L x + t (L v + u) + c
-    base = homogeneous(x)
-    truth = torch.cat(
-        [torch.stack([base, torch.cat([x + t * v, torch.ones_like(x[..., :1])], -1)], -2)[..., 1, :] for t in range(3)], -2
-    )
+    truth = torch.cat([homogeneous(x + t * v) for t in range(3)], -2)
     design = torch.cat([truth, torch.cat([torch.full((5, 30, 1), float(t), dtype=x.dtype) for t in range(3)], -2)], -1)
     target = torch.cat([y[..., t, :] for t in range(3)], -2)
     solution = torch.linalg.lstsq(design, target).solution
@@ -193,20 +139,10 @@ def test_trajectories_pass_through_the_positions(camera):
         line = CV.trajectory(scene.motion, *scene.views, view=view)
         for time in (-1.0, 0.0, 3.0):
             point = homogeneous(apply(scene.motion[view - 1], scene.extras["points"] + time * scene.extras["velocities"]))
-            if line.shape[-1] == 3:
-                missed = (point * line).sum(-1)
-            else:
-                missed = torch.stack([
-                    line[:, place(j, k)] * point[:, i] - line[:, place(i, k)] * point[:, j] + line[:, place(i, j)] * point[:, k]
-                    for i, j, k in itertools.combinations(range(4), 3)
-                ])  # fmt: skip
+            missed = (point * line).sum(-1) if line.shape[-1] == 3 else wedge(line, point, 4, (2, 1))
             assert missed.abs().max() < 1e-10
     with pytest.raises(ValueError, match="view must be"):
         CV.trajectory(scene.motion, *scene.views, view=0)
-
-
-def place(i, j):
-    return list(itertools.combinations(range(4), 2)).index((i, j))
 
 
 def test_camera_of_space_points_gives_the_third_sensor():

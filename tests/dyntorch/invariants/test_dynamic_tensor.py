@@ -1,5 +1,7 @@
 """Dynamic tensors against brute force: the forms that vanish, their derivatives, and the distance from the nearest flat."""
 
+from functools import reduce
+
 import numpy as np
 import pytest
 import torch
@@ -7,50 +9,40 @@ from scipy.optimize import minimize
 
 import dyntorch as dyn
 from dyntorch import counting, scenes
+from dyntorch.geometry.extensors import levi_civita
 from dyntorch.invariants.dynamic_tensor import flat_residual, flat_residual_derivative, forms_of_views, vanishing_forms
-
-CPU = torch.device("cpu")
-
-
-SIZES = [(2, 2, 1), (2, 5, 1), (3, 3, 2), (3, 4, 2), (3, 4, 1), (4, 4, 3), (4, 3, 2), (3, 5, 2)]
+from tests.draws import random, seeded
+from tests.grid import assert_refused
 
 
-@pytest.mark.parametrize(("size", "views", "step"), SIZES)
+@pytest.mark.parametrize(
+    ("size", "views", "step"), [(2, 2, 1), (2, 5, 1), (3, 3, 2), (3, 4, 2), (3, 4, 1), (4, 4, 3), (4, 3, 2), (3, 5, 2)]
+)
 def test_vanishing_forms_are_the_complement_of_products_within_a_subspace(size, views, step):
-    forms = vanishing_forms(size, views, step, CPU).flatten(1)
+    forms = vanishing_forms(size, views, step, torch.device("cpu")).flatten(1)
     assert len(forms) == size**views - counting.dim_v(size, views, step)
     torch.testing.assert_close(forms @ forms.T, torch.eye(len(forms), dtype=torch.float64))
-    draw = torch.Generator().manual_seed(0)
-    for _ in range(5):
-        span = torch.randn(step, size, generator=draw, dtype=torch.float64)
-        row = torch.ones(1, dtype=torch.float64)
-        for _ in range(views):
-            row = torch.kron(row, torch.randn(step, generator=draw, dtype=torch.float64) @ span)
+    for seed in range(5):
+        row = reduce(torch.kron, random(views, step, seed=seed) @ random(step, size, seed=10 + seed))
         assert (forms @ row).abs().max() < 1e-12 * row.norm()
 
 
 def test_forms_of_some_views_are_found_within_those_of_all():
-    draw = torch.Generator().manual_seed(1)
-    A = torch.eye(3) + 0.3 * torch.randn(4, 3, 3, generator=draw, dtype=torch.float64)
+    A = torch.eye(3) + 0.3 * random(4, 3, 3, seed=1)
     basis = dyn.DynamicTensor(2, 5, 2).compose(*A)
     for slots in ((0, 1, 2), (0, 2, 4), (1, 3, 4)):
         found = forms_of_views(basis, 5, slots, 2)[0]
         maps = [torch.eye(3).double(), *A]
         a, b, c = (maps[s] for s in slots)
-        wanted = torch.einsum("uvw,ui,vj,wk->ijk", torch.from_numpy(epsilon()), a, b, c)
+        wanted = torch.einsum("uvw,ui,vj,wk->ijk", levi_civita(3), a, b, c)
         assert abs(float((found * wanted / wanted.norm()).sum())) == pytest.approx(1, abs=1e-9)
-
-
-def epsilon():
-    return np.array([[[(i - j) * (j - k) * (k - i) / 2 for k in range(3)] for j in range(3)] for i in range(3)])
 
 
 @pytest.mark.parametrize("numbers", [(2, 3, 2), (3, 4, 3), (1, 2, 1)])
 def test_derivative_of_the_tensor_is_right(numbers):
     invariant = dyn.DynamicTensor(*numbers)
-    draw = torch.Generator().manual_seed(2)
     size = invariant.size
-    motion = tuple(torch.randn(2, size, size, generator=draw, dtype=torch.float64) for _ in range(invariant.views - 1))
+    motion = random(invariant.views - 1, 2, size, size, seed=2).unbind(0)
     value, slope = invariant.compose_derivative(motion)
     torch.testing.assert_close(value, invariant.compose(*motion).flatten(1))
     theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
@@ -65,7 +57,7 @@ def test_derivative_of_the_tensor_is_right(numbers):
 def test_distance_is_the_least_one_to_exact_matches(dim, views, step):
     """By a general search over the flat and the positions within it, from the true ones."""
     sigma, n = 2e-2, 4
-    scene = scenes.dynamic(dim, views, step, n, sigma=sigma, generator=torch.Generator().manual_seed(3))
+    scene = scenes.dynamic(dim, views, step, n, sigma=sigma, generator=seeded(3))
     invariant = dyn.DynamicTensor(dim, views, step)
     found = dyn.sampson(invariant, invariant.compose(*scene.motion), *scene.views)
     maps = np.stack([np.eye(dim + 1), *(m.numpy() for m in scene.motion)])
@@ -91,7 +83,7 @@ def test_distance_is_the_least_one_to_exact_matches(dim, views, step):
 
 @pytest.mark.parametrize(("dim", "views", "step"), [(3, 4, 2), (3, 5, 3), (2, 4, 1), (4, 5, 2)])
 def test_derivative_of_the_distance_is_right(dim, views, step):
-    scene = scenes.dynamic(dim, views, step, 6, batch=2, sigma=1e-2, generator=torch.Generator().manual_seed(4))
+    scene = scenes.dynamic(dim, views, step, 6, batch=2, sigma=1e-2, generator=seeded(4))
     size = dim + 1
     scales = [torch.tensor([1.0, 2.0]).double() * (v + 1) for v in range(views)]
 
@@ -100,19 +92,17 @@ def test_derivative_of_the_distance_is_right(dim, views, step):
 
     theta = torch.cat([m.flatten(1) for m in scene.motion], dim=-1)
     value, derivative = flat_residual_derivative(stacked(theta), scene.views, scales, step)
-    draw, h = torch.Generator().manual_seed(5), 1e-6
-    for _ in range(3):
-        along = torch.randn(theta.shape, generator=draw, dtype=torch.float64)
+    for along in random(3, *theta.shape, seed=5):
         squares = [
-            flat_residual(stacked(theta + s * along), scene.views, scales, step).flatten(1).square().sum(-1) for s in (h, -h)
+            flat_residual(stacked(theta + s * along), scene.views, scales, step).flatten(1).square().sum(-1) for s in (1e-6, -1e-6)
         ]
-        expected = (squares[0] - squares[1]) / (2 * h)
+        expected = (squares[0] - squares[1]) / 2e-6
         torch.testing.assert_close(2 * (along[:, None] @ derivative)[:, 0].mul(value).sum(-1), expected, rtol=1e-5, atol=1e-8)
 
 
 def test_points_that_stand_still_have_a_distance_as_well():
     """The flat is open there: the distance stays below that of a point, above that of the best of many lines."""
-    scene = scenes.dynamic(3, 4, 2, 50, sigma=1e-3, static=1.0, generator=torch.Generator().manual_seed(7))
+    scene = scenes.dynamic(3, 4, 2, 50, sigma=1e-3, static=1.0, generator=seeded(7))
     on_lines, at_points = dyn.DynamicTensor(3, 4, 2), dyn.DynamicTensor(3, 4, 1)
     line = dyn.sampson(on_lines, on_lines.compose(*scene.motion), *scene.views).square() / 1e-6
     point = dyn.sampson(at_points, at_points.compose(*scene.motion), *scene.views).square() / 1e-6
@@ -122,21 +112,22 @@ def test_points_that_stand_still_have_a_distance_as_well():
 
 
 def test_mixed_scenes_are_what_they_say():
-    scene = scenes.dynamic(3, 4, 3, 30, mixed=True, generator=torch.Generator().manual_seed(9))
+    scene = scenes.dynamic(3, 4, 3, 30, mixed=True, generator=seeded(9))
     maps = (torch.eye(4).double(), *scene.motion)
     p = [torch.cat([x, torch.ones_like(x[:, :1])], dim=-1) for x in scene.exact]
     p = torch.stack([x @ m.T for x, m in zip(p, maps, strict=True)], dim=1)
     ranks = torch.linalg.matrix_rank(torch.nn.functional.normalize(p, dim=-1), rtol=1e-9)
     assert torch.equal(ranks, scene.extras["dimensions"]) and set(ranks.tolist()) == {1, 2, 3}
-    with pytest.raises(ValueError, match="must be 1 or more, got 0, 3, 2"):
-        scenes.dynamic(0)
 
 
-def test_wrong_shapes_are_named():
+def test_misuse():
     invariant = dyn.DynamicTensor(2, 4, 2)
-    with pytest.raises(ValueError, match=r"has 3 maps \(\*batch, 3, 3\), got \[\(3, 3\)\]"):
-        invariant.compose(torch.eye(3))
-    with pytest.raises(ValueError, match=r"must be \(\*batch, 9, 3, 3, 3, 3\), got \(3, 3, 3\)"):
-        invariant.decompose(torch.zeros(3, 3, 3))
-    with pytest.raises(ValueError, match="expected 4 views and one of their numbers, got 1 views and view=1"):
-        invariant.flats(torch.zeros(9, 3, 3, 3, 3), torch.zeros(1, 2))
+    assert_refused(
+        (lambda: scenes.dynamic(0), "must be 1 or more, got 0, 3, 2"),
+        (lambda: invariant.compose(torch.eye(3)), r"has 3 maps \(\*batch, 3, 3\), got \[\(3, 3\)\]"),
+        (lambda: invariant.decompose(torch.zeros(3, 3, 3)), r"must be \(\*batch, 9, 3, 3, 3, 3\), got \(3, 3, 3\)"),
+        (
+            lambda: invariant.flats(torch.zeros(9, 3, 3, 3, 3), torch.zeros(1, 2)),
+            "expected 4 views and one of their numbers, got 1 views and view=1",
+        ),
+    )

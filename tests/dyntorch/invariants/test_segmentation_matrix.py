@@ -4,32 +4,16 @@ import pytest
 import torch
 
 import dyntorch as dyn
+from dyntorch.geometry.homogeneous import homogeneous
 from dyntorch.scenes import bodies
-from tests.draws import random
+from tests.draws import random, seeded
+from tests.dyntorch.geometry.test_pairs import pair_error
 
 SM, FM = dyn.SegmentationMatrix, dyn.FundamentalMatrix
 
 
 def scene(n=80, seed=0, **options):
-    return bodies(n, options.pop("bodies", 2), interleaved=True, generator=torch.Generator().manual_seed(seed), **options)
-
-
-def lift(x):
-    return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
-
-
-def epipolar(F, x1, x2):
-    return torch.einsum("...na,...ab,...nb->...n", lift(x2), F, lift(x1))
-
-
-def pair_error(found, true):
-    found, true = ([m / torch.linalg.matrix_norm(m, keepdim=True) for m in pair] for pair in (found, true))
-
-    def apart(a, b):
-        return torch.minimum(torch.linalg.matrix_norm(a - b), torch.linalg.matrix_norm(a + b))
-
-    orders = [torch.maximum(apart(found[0], true[k]), apart(found[1], true[1 - k])) for k in (0, 1)]
-    return torch.minimum(*orders)
+    return bodies(n, options.pop("bodies", 2), interleaved=True, generator=seeded(seed), **options)
 
 
 def wrong(labels, true):
@@ -38,9 +22,8 @@ def wrong(labels, true):
     return torch.minimum(share, 1 - share)
 
 
-def test_counts_and_layout():
-    assert (SM.minimal(), SM.width(), SM.rows(), SM.shape(), SM.axes()) == (35, 36, 1, (6, 6), (1, 0))
-    assert SM().dof == 14
+def epipolar(F, x1, x2):
+    return torch.einsum("...na,...ab,...nb->...n", homogeneous(x2), F, homogeneous(x1))
 
 
 def test_form_is_the_product_of_the_epipolar_forms():
@@ -52,7 +35,9 @@ def test_form_is_the_product_of_the_epipolar_forms():
     torch.testing.assert_close(found * (product[:, :1] / found[:, :1]), product)
     torch.testing.assert_close(torch.linalg.matrix_norm(S), torch.ones(3).double())
     # the first axis is of view 2: monomials 00, 01, 02, 11, 12, 22
-    nu1, nu2 = (torch.stack([lift(x)[..., i] * lift(x)[..., j] for i in range(3) for j in range(i, 3)], -1) for x in (x1, x2))
+    nu1, nu2 = (
+        torch.stack([homogeneous(x)[..., i] * homogeneous(x)[..., j] for i in range(3) for j in range(i, 3)], -1) for x in (x1, x2)
+    )
     torch.testing.assert_close(torch.einsum("bna,bac,bnc->bn", nu2, S, nu1), found)
 
 
@@ -99,7 +84,7 @@ def test_labels_are_those_of_the_nearer_body():
     x1, x2 = found.views
     distances = []
     for f in F:
-        line2, line1 = lift(x1) @ f.mT, lift(x2) @ f
+        line2, line1 = homogeneous(x1) @ f.mT, homogeneous(x2) @ f
         size = line1[:, :2].square().sum(-1) + line2[:, :2].square().sum(-1)
         distances.append(epipolar(f, x1, x2).abs() / size.sqrt())
     torch.testing.assert_close(SM.labels(*F, x1, x2), 1 + torch.stack(distances).argmin(0))

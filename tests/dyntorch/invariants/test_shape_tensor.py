@@ -14,7 +14,8 @@ from dyntorch.shapes import static as shape_rows
 from dyntorch.shapes.static import dual_cameras, reference_cameras
 from tests.battery.references import rank
 from tests.battery.shape_cases import LIFTED_CASES, SHAPE_CASES
-from tests.draws import random
+from tests.draws import random, seeded
+from tests.grid import assert_refused
 
 EVERY = [*SHAPE_CASES, *LIFTED_CASES]
 STATIC = [case for case in SHAPE_CASES if not case.timed]
@@ -85,7 +86,7 @@ def test_structure_of_a_composed_tensor_gives_it_back(case):
     scaled = homogeneous * torch.linspace(0.5, 2, case.n).double()[:, None].mul(torch.tensor(-1.0)) ** 3
     assert case.apart(case.invariant.compose(scaled), tensor) < 1e-10
     # a collineation of space (affinity) is what is left open
-    moved = homogeneous @ (torch.eye(size) + 0.1 * torch.randn(size, size, generator=torch.Generator().manual_seed(0))).double()
+    moved = homogeneous @ (torch.eye(size) + 0.1 * random(size, size))
     moved = moved if case.frame != "affine" else torch.cat([moved[..., :-1], homogeneous[..., -1:]], -1)
     assert case.apart(case.invariant.compose(moved), tensor) < 1e-10
     assert case.invariant.decompose(torch.zeros_like(tensor)).abs().max() == 0
@@ -98,7 +99,7 @@ def test_batch_is_loop_and_order_and_weights_of_views_are_what_they_should_be(ca
     alone = case.fit(tuple(p[1, 0] for p in points))
     assert case.apart(whole.tensor[1, 0], alone.tensor) < case.exact and whole.status.shape == (2, 2)
     torch.testing.assert_close(whole.singular_values[1, 0], alone.singular_values)
-    order = torch.randperm(case.many, generator=torch.Generator().manual_seed(0))
+    order = torch.randperm(case.many, generator=seeded())
     assert case.apart(case.fit(tuple(p[..., order, :] for p in points)).tensor, whole.tensor) < case.exact
     kept = case.fit(tuple(p[..., 2:, :] for p in points))
     weights = torch.ones(case.many, dtype=torch.float64)
@@ -112,6 +113,10 @@ def test_batch_is_loop_and_order_and_weights_of_views_are_what_they_should_be(ca
     twice = case.fit(tuple(torch.cat([p, p[..., :3, :]], -2) for p in points))
     weights = torch.tensor([2.0] * 3 + [1.0] * (case.many - 3)).double()
     assert case.apart(case.fit(points, weights=weights).tensor, twice.tensor) < case.exact
+    rounded = tuple(p.float() for p in points)
+    single = case.fit(rounded)
+    dtypes = (single.tensor, *single.motion, case.sampson(single.tensor, rounded), case.invariant.compose(single.motion[0]))
+    assert {part.dtype for part in dtypes} == {torch.float32} and case.apart(single.tensor.double(), whole.tensor) < 1e-3
     empty = case.fit(tuple(p[:0] for p in points)).check()
     assert empty.tensor.shape[:2] == (0, 2) and empty.motion[0].shape[:2] == (0, 2)
 
@@ -134,24 +139,13 @@ def test_one_bad_problem_leaves_the_others_alone(case):
         found.check()
 
 
-@most
-def test_float32_in_and_out(case):
-    points, shape = case.scene(case.many, batch=(2,), seed=7)
-    points = tuple(p.float() for p in points)
-    solution = ok(case.fit(points))
-    assert solution.tensor.dtype == solution.motion[0].dtype == torch.float32
-    assert case.apart(solution.tensor.double(), case.invariant.compose(shape)) < 1e-3
-    assert case.sampson(solution.tensor, points).dtype == torch.float32
-    assert case.invariant.compose(shape.float()).dtype == torch.float32
-
-
 @pytest.mark.parametrize("case", [SHAPE_CASES[i] for i in (0, 5, 7, 9, 10)], ids=repr)
 def test_gradients(case):
     for views in (case.minimal, case.minimal + 2):
         points, _ = case.scene(views, seed=8, sigma=0.2)
         times = points[case.n :]
         x = ((torch.stack(points[: case.n], -2) - 300) / 100).requires_grad_()
-        weight = torch.randn(case.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        weight = random(case.size)
 
         def gauge_free(x, case=case, times=times, weight=weight):
             tensor = case.fit((*x.unbind(-2), *times)).tensor.reshape(-1, case.size)
@@ -217,7 +211,7 @@ def test_refinement_lowers_the_distances(case):
 def test_missing_points_lose_their_own_rows_only(case):
     points, shape = case.scene(12, batch=(4,), seed=11)
     x = torch.stack(points, -2)
-    gone = torch.rand(x.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.15
+    gone = torch.rand(x.shape[:-1], generator=seeded(1)) < 0.15
     if case.frame == "plane":
         gone[..., :4] = False
     assert (gone.any(-1).sum(-1) > 2).all()
@@ -235,41 +229,15 @@ def test_missing_points_lose_their_own_rows_only(case):
 def test_a_basis_without_a_frame_is_degenerate(case):
     _, shape = case.scene(1, batch=(2,), seed=12)
     shape[0, 2] = 0.4 * shape[0, 0] + 0.6 * shape[0, 1]  # three points of a line
-    turn = torch.linalg.qr(torch.randn(2, MANY, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)).Q
+    turn = torch.linalg.qr(random(2, MANY, 3, 3)).Q
     seen = shape[:, None] @ turn.mT
     points = (500 * seen[..., :2] / (6 + seen[..., 2:])).unbind(-2)
     for given in (points, tuple(p.float() for p in points)):
         assert dyn.fit(case.invariant, *given).status.tolist() == [dyn.Status.DEGENERATE, dyn.Status.OK]
     assert case.invariant.compose(shape)[0].abs().max() == 0
     if case.n == 8:  # nearly on a line: the frames of the views are what the noise makes of them
-        g = torch.Generator().manual_seed(1)
-        noisy = [p + torch.randn(p.shape, generator=g, dtype=torch.float64) for p in points]
+        noisy = [p + random(*p.shape, seed=i) for i, p in enumerate(points)]
         assert dyn.fit(case.invariant, *noisy).status.tolist() == [dyn.Status.AMBIGUOUS, dyn.Status.OK]
-
-
-def test_misuse_is_a_value_error_with_its_remedy():
-    points, _ = SHAPE_CASES[2].scene(4)
-    tensor = dyn.fit(ShapeTensor, *points).tensor
-    for call, message in (
-        (lambda: dyn.fit(ShapeTensor, *points[:5]), r"'general' needs at least 6 points, got 5; .*'affine'"),
-        (lambda: dyn.fit(ShapeTensor("affine"), *points[:4]), "at least 5 points, got 4; add points"),
-        (lambda: dyn.fit(ShapeTensor, *points, *points), "takes 6, 7 or 8 points, got 16"),
-        (lambda: dyn.fit(ShapeTensor("general", 7), *points), "takes 7 points, .* got 8 arguments"),
-        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7][:, :1]), r"point 8 .*expected \(\*batch, n, 2\)"),
-        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7][:2]), "all points need the same"),
-        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7].float()), "all points need one dtype"),
-        (lambda: dyn.fit(ShapeTensor, *points, static=torch.ones(4)), "no rows for labelled static"),
-        (lambda: dyn.robust_fit(ShapeTensor, *points), "fit again with weights"),
-        (lambda: dyn.core.algebraic(ShapeTensor, tensor, *points), "no single algebraic residual"),
-        (lambda: dyn.sampson(ShapeTensor, tensor[0], *points), r"must be \(\*batch, 3, 3, 3, 3\)"),
-        (lambda: ShapeTensor("metric"), "one of general, plane, affine, got 'metric'"),
-        (lambda: ShapeTensor.minimal(), "does not know its number of points"),
-        (lambda: ShapeTensor.decompose(tensor), "does not know its number of points"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            call()
-    with pytest.raises(TypeError, match="no argument 'times'"):
-        dyn.fit(ShapeTensor, *points, times=points[0])
 
 
 def test_affine_views_that_share_no_basis_stay_incomplete():
@@ -289,7 +257,6 @@ def test_affine_views_that_share_no_basis_stay_incomplete():
 # The algebra against what it is derived from: determinants, closed forms, exact counts.
 
 
-CPU = torch.device("cpu")
 FREE = {("general", 6): 5, ("general", 7): 11, ("general", 8): 23, ("plane", 6): 3, ("plane", 7): 6, ("plane", 8): 9}
 
 
@@ -330,7 +297,7 @@ def test_closed_forms_beside_a_reference_plane():
 @pytest.mark.parametrize(("frame", "n"), FREE)
 def test_free_coefficients_are_those_that_exact_counts_leave(frame, n):
     general = frame == "general"
-    basis = shape_rows.free(n, CPU) if general else shape_rows.plane_map(n, CPU).mT
+    basis = shape_rows.free(n, torch.device("cpu")) if general else shape_rows.plane_map(n, torch.device("cpu")).mT
     assert rank(basis) == FREE[frame, n]
     if (frame, n) != ("plane", 8):  # among the tests of counting
         synthetic = counting.count("shape_tensor", points=n, general=general, synthetic=True, images=0)
@@ -341,15 +308,12 @@ def test_free_coefficients_are_those_that_exact_counts_leave(frame, n):
     places = torch.cat([torch.eye(3), torch.ones(1, 3)]).double() if general else random(50, 3)
     rows = shape_rows._products(torch.nn.functional.normalize(places, dim=-1)[:, None].expand(-1, n - 4, 3))
     assert (rows @ basis.mT).abs().max() < 1e-12
-
-
-def test_synthetic_constraints_of_eight_points_with_a_reference_plane_are_dim_v():
-    assert 81 - rank(shape_rows.plane_map(8, CPU)) == counting.dim_v(3, 4, 2) == 72
-    # products of vectors within planes span what annihilates the tensors: nine dimensions are left
-    planes = random(200, 2, 3)
-    vectors = [random(200, 1, 2, seed=s) @ planes for s in range(1, 5)]
-    products = torch.einsum("na,nb,nc,nd->nabcd", *(u[:, 0] for u in vectors)).flatten(1)
-    assert rank(products) == 72 and (products @ shape_rows.plane_map(8, CPU)).abs().max() < 1e-10
+    if (frame, n) == ("plane", 8):
+        # products of vectors within planes span what annihilates the tensors: nine dimensions are left
+        assert 81 - FREE[frame, n] == counting.dim_v(3, 4, 2) == 72
+        vectors = random(4, 200, 1, 2) @ random(200, 2, 3, seed=1)
+        products = torch.einsum("na,nb,nc,nd->nabcd", *vectors[:, :, 0]).flatten(1)
+        assert rank(products) == 72 and (products @ basis.mT).abs().max() < 1e-10
 
 
 @pytest.mark.parametrize("case", [c for c in SHAPE_CASES if (c.frame, c.n) in FREE], ids=repr)
@@ -361,16 +325,6 @@ def test_the_tensor_is_the_null_vector_of_all_coefficients(case):
     assert rank(rows) == rows.shape[1] - 1
     null = torch.linalg.svd(rows).Vh[-1].reshape(case.invariant.shape())
     assert case.apart(null, case.invariant.compose(shape)) < 1e-7
-
-
-def test_affine_annihilator_holds_barycentric_coordinates():
-    shape = random(6, 3)
-    tensor = ShapeTensor("affine").compose(shape)
-    torch.testing.assert_close(tensor @ tensor.mT, torch.eye(2).double())
-    homogeneous = torch.nn.functional.pad(shape, (0, 1), value=1.0)
-    weights = homogeneous[4:] @ torch.linalg.inv(homogeneous[:4])
-    rows = torch.cat([weights, -torch.eye(2).double()], dim=-1)
-    torch.testing.assert_close(rows @ tensor.mT @ tensor, rows)
 
 
 def test_frame_of_the_view_is_that_of_the_four_points():
@@ -390,3 +344,25 @@ def test_frame_of_the_view_is_that_of_the_four_points():
     size = shape_rows.local(x)[1][:, None]
     measured = turns.square().sum(-1).mean(0).sqrt() / (1e-6 * size)
     assert ((measured / noise > 0.2) & (measured / noise < 1.5)).all()
+
+
+def test_misuse_is_a_value_error_with_its_remedy():
+    points, _ = SHAPE_CASES[2].scene(4)
+    tensor = dyn.fit(ShapeTensor, *points).tensor
+    assert_refused(
+        (lambda: dyn.fit(ShapeTensor, *points[:5]), r"'general' needs at least 6 points, got 5; .*'affine'"),
+        (lambda: dyn.fit(ShapeTensor("affine"), *points[:4]), "at least 5 points, got 4; add points"),
+        (lambda: dyn.fit(ShapeTensor, *points, *points), "takes 6, 7 or 8 points, got 16"),
+        (lambda: dyn.fit(ShapeTensor("general", 7), *points), "takes 7 points, .* got 8 arguments"),
+        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7][:, :1]), r"point 8 .*expected \(\*batch, n, 2\)"),
+        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7][:2]), "all points need the same"),
+        (lambda: dyn.fit(ShapeTensor, *points[:7], points[7].float()), "all points need one dtype"),
+        (lambda: dyn.fit(ShapeTensor, *points, static=torch.ones(4)), "no rows for labelled static"),
+        (lambda: dyn.robust_fit(ShapeTensor, *points), "fit again with weights"),
+        (lambda: dyn.core.algebraic(ShapeTensor, tensor, *points), "no single algebraic residual"),
+        (lambda: dyn.sampson(ShapeTensor, tensor[0], *points), r"must be \(\*batch, 3, 3, 3, 3\)"),
+        (lambda: ShapeTensor("metric"), "one of general, plane, affine, got 'metric'"),
+        (lambda: ShapeTensor.minimal(), "does not know its number of points"),
+        (lambda: ShapeTensor.decompose(tensor), "does not know its number of points"),
+    )
+    assert_refused((lambda: dyn.fit(ShapeTensor, *points, times=points[0]), "no argument 'times'"), error=TypeError)

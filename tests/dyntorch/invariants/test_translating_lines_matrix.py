@@ -29,10 +29,6 @@ def rows(l1, l2):
     return torch.einsum("ni,nj->nij", lines(l2), lines(l1)).flatten(1)
 
 
-def rank(matrix):
-    return int(torch.linalg.matrix_rank(matrix, rtol=1e-9))
-
-
 def distance(first, second):
     a, b = first.flatten(-2), second.flatten(-2)
     return torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1))
@@ -40,10 +36,6 @@ def distance(first, second):
 
 def move_ends(matrix, ends):
     return apply(matrix, ends.flatten(-3, -2)).unflatten(-2, ends.shape[-3:-1])
-
-
-def test_declaration():
-    assert (TL.minimal(), TL.width(), TL.rows(), TL.shape(), TL.axes()) == (35, 36, 1, (6, 6), (1, 0))
 
 
 def test_compose_is_the_determinant_of_four_points():
@@ -59,48 +51,13 @@ def test_compose_is_the_determinant_of_four_points():
     assert (rows(*scene.views) @ TL.compose(*scene.motion).flatten()).abs().max() < 1e-13
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({}, 35),
-        ({"motion": "translation"}, 31),
-        ({"static": 1.0}, 20),
-        ({"motion": "objects", "objects": 1}, 20),
-        ({"motion": "objects", "objects": 2}, 28),
-        ({"motion": "objects", "objects": 3}, 31),
-        ({"motion": "objects", "objects": 4}, 31),
-    ],
-)
-def test_ranks(options, expected):
-    scene = translating_lines(150, generator=seeded(4), **options)
-    assert rank(rows(*scene.views)) == expected
-    if expected in (31, 35):
-        assert rank(rows(*(x[:expected] for x in scene.views))) == expected
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"motion": "translation"}, [31, 34, 35]),
-        ({"motion": "objects", "objects": 2}, [28, 34, 35]),
-        ({"motion": "objects", "objects": 1}, [20, 28, 33, 34, 35]),
-    ],
-)
-def test_static_points_complete_the_rank(options, expected):
-    scene = translating_lines(150, static_points=len(expected), generator=seeded(5), **options)
-    found = []
-    for k in range(len(expected)):
-        l1, l2 = TL.static_point_lines(scene.extras["points1"][:k], scene.extras["points2"][:k])
-        found.append(rank(torch.cat([rows(*scene.views), rows(l1, l2)])))
-    assert found == expected
-
-
 def test_static_points_alone():
     scene = translating_lines(1, batch=2, static_points=5, generator=seeded(6))
     x1, x2 = scene.extras["points1"], scene.extras["points2"]
     l1, l2 = TL.static_point_lines(x1, x2, length=2.0)
     assert l1.shape == l2.shape == (2, 45, 2, 3)
-    assert [rank(rows(l1[0, : 9 * k], l2[0, : 9 * k])) for k in range(1, 6)] == [9, 17, 24, 30, 35]
+    ranks = [torch.linalg.matrix_rank(rows(l1[0, : 9 * k], l2[0, : 9 * k]), rtol=1e-9) for k in range(1, 6)]
+    assert ranks == [9, 17, 24, 30, 35]
     values = torch.einsum("bni,bij,bnj->bn", lines(l2), TL.compose(*scene.motion), lines(l1))
     assert values.abs().max() < 1e-13
     assert torch.equal(l1[..., 0, :], x1.repeat_interleave(9, dim=-2)) and torch.equal(

@@ -6,12 +6,10 @@ import torch
 from dyntorch.geometry.homogeneous import apply, homogeneous, skew, unit
 from dyntorch.metrics import relative_error
 from dyntorch.scenes import bodies, translating_planes
+from tests.draws import seeded
+from tests.grid import assert_refused
 
 K = torch.tensor([[800.0, 0.0, 320.0], [0.0, 800.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def epipolar(scene, views, body):
@@ -112,23 +110,6 @@ def test_the_seed_decides_and_precision_is_as_asked():
     torch.testing.assert_close(single.views[1], a.views[1].float(), rtol=1e-5, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: bodies(1, 2), "at least one match"),
-        (lambda: bodies(10, 0), "at least one match"),
-        (lambda: bodies((5, 0)), "at least one match"),
-        (lambda: bodies((5, 5), 3), "one n per body"),
-        (lambda: bodies(10, 2, planar=(3,)), "planar must name bodies from 1 to 2"),
-        (lambda: bodies(10, 2, rotating=(0,)), "rotating must name"),
-        (lambda: bodies(10, outliers=1.2), "outliers is a share"),
-    ],
-)
-def test_misuse_is_named(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # Scenes of planes and bodies that translate independently are what they say they are.
 
@@ -148,12 +129,11 @@ def test_planes_and_bodies_obey_their_matrices():
     assert relative_error(second, skew(scene.epipoles[..., :4, :]) @ scene.infinity[:, None]).max() < 1e-9
     depth = 1 / (homogeneous(scene.x1) @ scene.normals[..., None])
     assert bool((depth > 0).all()) and scene.body_x1.shape == (3, 2, 20, 2)
-
-
-def test_noise_is_that_of_both_views():
     noisy, exact = (translating_planes(3, n=500, sigma=s, generator=seeded(1)) for s in (0.5, 0.0))
     for a, b in ((noisy.x1, exact.x1), (noisy.x2, exact.x2)):
         assert float((a - b).std()) == pytest.approx(0.5, rel=0.05)
+    single = translating_planes(3, dtype=torch.float32, generator=seeded())
+    assert single.x1.dtype == single.infinity.dtype == torch.float32 and single.sigma == 0.0
 
 
 def test_special_positions():
@@ -167,9 +147,17 @@ def test_special_positions():
     assert relative_error(static.homographies[:, 4], static.infinity).max() < 1e-12
 
 
-def test_other_types_and_bad_input():
-    scene = translating_planes(3, dtype=torch.float32, generator=seeded())
-    assert scene.x1.dtype == scene.infinity.dtype == torch.float32 and scene.sigma == 0.0
-    for wrong in ({"planes": -1}, {"patch": 0.0}, {"shared": 9}, {"bodies": -2}):
-        with pytest.raises(ValueError, match="expected planes"):
-            translating_planes(**wrong)
+def test_misuse_is_named():
+    assert_refused(
+        (lambda: bodies(1, 2), "at least one match"),
+        (lambda: bodies(10, 0), "at least one match"),
+        (lambda: bodies((5, 0)), "at least one match"),
+        (lambda: bodies((5, 5), 3), "one n per body"),
+        (lambda: bodies(10, 2, planar=(3,)), "planar must name bodies from 1 to 2"),
+        (lambda: bodies(10, 2, rotating=(0,)), "rotating must name"),
+        (lambda: bodies(10, outliers=1.2), "outliers is a share"),
+        (lambda: translating_planes(planes=-1), "expected planes"),
+        (lambda: translating_planes(patch=0.0), "expected planes"),
+        (lambda: translating_planes(shared=9), "expected planes"),
+        (lambda: translating_planes(bodies=-2), "expected planes"),
+    )

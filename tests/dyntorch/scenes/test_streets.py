@@ -8,10 +8,8 @@ import torch
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.scenes import StreetOptions, streets
 from dyntorch.scenes.traffic import CAR, ROAD, Boxes, Chance, driven, drives, rotations, street_walls
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
+from tests.draws import seeded
+from tests.grid import assert_refused
 
 
 @pytest.fixture(scope="module")
@@ -19,19 +17,15 @@ def street():
     return streets(3, 20, 300, generator=seeded(5))
 
 
-def projected(street):
-    return inhomogeneous(homogeneous(street.points) @ street.cameras.mT)
-
-
 def test_tracks_are_projections_of_the_points_up_to_noise(street):
     seen = street.exact.isfinite().all(-1)
     assert torch.equal(seen, street.tracks.isfinite().all(-1))
-    torch.testing.assert_close(projected(street)[seen], street.exact[seen])
+    image = homogeneous(street.points) @ street.cameras.mT
+    torch.testing.assert_close(inhomogeneous(image)[seen], street.exact[seen])
     off = (street.tracks - street.exact)[seen]
     # the drift adds to sigma = .5
     assert 0.4 < off.std() < 1.2 and off.mean().abs() < 0.1
-    depth = (homogeneous(street.points) @ street.cameras.mT)[..., 2]
-    assert depth[seen].min() > 1.9
+    assert image[..., 2][seen].min() > 1.9
 
 
 def test_bodies_move_rigidly_and_the_street_not_at_all(street):
@@ -160,9 +154,8 @@ def test_nobody_drives_through_anybody():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
+def test_misuse_is_named():
+    assert_refused(
         (lambda: streets(0), "bodies >= 1"),
         (lambda: streets(2, 4), "frames >= 5"),
         (lambda: streets(4, tracks=60), "at least 120 tracks, got tracks=60"),
@@ -170,8 +163,4 @@ def test_nobody_drives_through_anybody():
         (lambda: streets(outliers=1.5), "outliers is a share"),
         (lambda: streets(options=StreetOptions(traffic=("flying",))), "traffic must name some of slower"),
         (lambda: streets(2, 6, 60, options=StreetOptions(visible=1e6)), "no street with bodies=2"),
-    ],
-)
-def test_misuse_is_named(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+    )

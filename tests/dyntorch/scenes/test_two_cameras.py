@@ -20,6 +20,7 @@ def test_the_pictures_are_those_of_the_cameras():
     value = ((homogeneous(still.exact[1]) @ scene.fundamental) * homogeneous(scene.exact[0])).sum(-1)
     assert float(value.abs().max()) < 1e-9 and float(scene.fundamental.norm()) == pytest.approx(1)
     assert bool(((scene.a > 0) & (scene.a < torch.tensor([1280.0, 960.0]))).all())
+    assert torch.equal(make(3, noise=1.0).b, make(3, noise=1.0).b) and not torch.equal(make(3).points, make(4).points)
 
 
 def test_clocks_run_as_told():
@@ -65,8 +66,3 @@ def test_motion_repeats_only_where_asked_to():
     for free in (make(walk=0.0), make(period=1.0)):
         assert float((free.points[30:] - free.points[:-30]).norm(dim=-1).mean()) > 0.03
     assert float(make(walk=2.0).points.mean(1).std(0).max()) > float(make(walk=0.0).points.mean(1).std(0).max())
-
-
-def test_a_generator_repeats():
-    assert torch.equal(make(3, noise=1.0).b, make(3, noise=1.0).b)
-    assert not torch.equal(make(3).points, make(4).points)
