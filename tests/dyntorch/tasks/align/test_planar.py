@@ -31,26 +31,18 @@ def visible(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("static", "outliers"), [(0.3, 0.2), (0.1, 0.3)])
+@pytest.mark.parametrize(("static", "outliers"), [(0.3, 0.2), (0.1, 0.3), (0.0, 0.4)])
 @pytest.mark.parametrize("threshold", [1.5, None])
 def test_outliers_are_found_and_the_motion_survives_them(static, outliers, threshold):
     draw = generator(1)
-    scene = scenes.planar(100, batch=3, sigma=0.5, static=static, outliers=outliers, generator=draw)
+    scene = scenes.planar(100 if static else 200, batch=3, sigma=0.5, static=static, outliers=outliers, generator=draw)
     result = align_planar(*scene.views, threshold=threshold, generator=draw)
     assert (result.status == Status.OK).all()
     assert error(result, scene.motion).max() < 3
     right = (result.labels == scene.labels)[visible(scene)]
     assert right.double().mean() > 0.95  # an outlier may come to lie near its line by chance
     assert (result.sigma - 0.5).abs().max() < 0.2
-
-
-@pytest.mark.slow
-def test_all_moving_and_forty_percent_outliers():
-    draw = generator(2)
-    scene = scenes.planar(200, batch=2, sigma=0.5, outliers=0.4, generator=draw)
-    result = align_planar(*scene.views, generator=draw)
-    assert (error(result, scene.motion) < 3).double().mean() >= 0.95
-    assert (result.labels == scene.labels).double().mean() > 0.95
+    assert static or codes(result) <= {AlignNotice.UNVERIFIED}
 
 
 @pytest.mark.slow
@@ -98,18 +90,13 @@ def test_static_scenes_with_noise_are_flagged_and_as_good_as_two_homographies():
     result = align_planar(*scene.views, generator=generator())
     assert (result.status == Status.OK).all()
     assert result.has_notice("near_static").all()
+    with pytest.raises(ValueError, match="'nonsense'"):
+        result.has_notice("nonsense")
     pairs = [dyn.fit(dyn.Collineation(2), scene.views[0], x) for x in scene.views[1:]]
     direct = torch.stack(
         [grid_transfer_error(pair.motion[0], m, 640, 480) for pair, m in zip(pairs, scene.motion, strict=True)]
     ).amax(0)
     assert error(result, scene.motion).median() < 1.05 * direct.median()
-
-
-@pytest.mark.slow
-def test_a_scene_that_moves_is_not_called_static():
-    scene = scenes.planar(100, batch=2, sigma=0.5, generator=generator(7))
-    result = align_planar(*scene.views, generator=generator())
-    assert codes(result) <= {AlignNotice.UNVERIFIED}
 
 
 def on_lines(count, n, sigma, seed):
@@ -142,13 +129,6 @@ def test_few_trajectory_lines_are_counted(count, expected):
     assert (AlignNotice.ONE_LINE in codes(result)) == (count == 1)
 
 
-def test_few_moving_points_are_counted():
-    scene = scenes.planar(80, sigma=0.5, static=0.9, generator=generator(9))
-    result = align_planar(*scene.views, generator=generator())
-    assert [notice.value for notice in result.warnings if notice.code == "few_moving"] == [8.0]
-    assert AlignNotice.FEW_MOVING.value in repr(result)
-
-
 @pytest.mark.slow
 def test_mismatches_of_static_points_are_reported_as_unverified():
     scene = scenes.planar(100, sigma=0.3, static=0.5, generator=generator(10))
@@ -173,6 +153,19 @@ def test_labelled_static_matches_are_never_called_moving():
     assert error(result, scene.motion).max() < 3
     assert not (result.labels[known] == 2).any()
     assert result.labels[0, first] == 0 and (result.labels == 0).sum() <= 3
+
+
+def test_single_precision_few_moving_points_and_empty_batches():
+    scene = scenes.planar(80, sigma=0.5, static=0.9, generator=generator(9)).to(torch.float32)
+    result = align_planar(*scene.views, generator=generator())
+    assert result.A.dtype == result.covariance.dtype == torch.float32 and result.labels.dtype == torch.int64
+    assert result.solution is not None and result.solution.tensor.dtype == torch.float32
+    assert error(result, scene.motion) < 2
+    assert [notice.value for notice in result.warnings if notice.code == "few_moving"] == [8.0]
+    assert all(words in repr(result) for words in ("Alignment(matches=80", "8 moving", AlignNotice.FEW_MOVING.value))
+    empty = align_planar(*torch.zeros(3, 0, 40, 2))
+    assert empty.A.shape == (0, 3, 3) and empty.labels.shape == (0, 40) and empty.warnings == ()
+    assert "empty" in repr(empty)
 
 
 @pytest.mark.slow
@@ -213,34 +206,21 @@ def test_covariance_is_the_spread_over_repeated_noise():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.0, 0.5])
-def test_points_on_a_line_determine_nothing(sigma):
+def test_points_on_a_line_equal_repeated_and_random_ones_determine_nothing():
     draw = generator(15)
     t = torch.rand(3, 40, 1, generator=draw, dtype=torch.float64) * 500
     line = t * torch.tensor([1.0, 0.5]).double() + torch.tensor([20.0, 30.0]).double()
-    views = line + sigma * torch.randn(line.shape, generator=draw, dtype=torch.float64)
-    result = align_planar(*views, generator=generator())
-    assert result.status != Status.OK
-    assert AlignNotice.COLLINEAR in codes(result)
-    assert result.A.isfinite().all() and result.covariance.isfinite().all()
-
-
-@pytest.mark.slow
-def test_equal_points_and_duplicates_are_degenerate():
-    same = torch.full((40, 2), 3.0, dtype=torch.float64)
-    assert align_planar(same, same, same, generator=generator()).status == Status.DEGENERATE
-    scene = scenes.planar(13, sigma=0.5, generator=generator(16))
-    twice = [x.repeat(3, 1) for x in scene.views]
+    for sigma in (0.0, 0.5):
+        views = line + sigma * torch.randn(line.shape, generator=draw, dtype=torch.float64)
+        result = align_planar(*views, generator=generator())
+        assert result.status != Status.OK and AlignNotice.COLLINEAR in codes(result)
+        assert result.A.isfinite().all() and result.covariance.isfinite().all()
+    assert align_planar(*torch.full((3, 40, 2), 3.0).double(), generator=generator()).status == Status.DEGENERATE
+    twice = [x.repeat(3, 1) for x in scenes.planar(13, sigma=0.5, generator=generator(16)).views]
     assert align_planar(*twice, generator=generator()).status != Status.OK
-
-
-@pytest.mark.slow
-def test_random_matches_are_refused():
-    draw = generator(17)
-    views = torch.rand(3, 1, 40, 2, generator=draw, dtype=torch.float64) * 500
+    random = torch.rand(3, 1, 40, 2, generator=generator(17), dtype=torch.float64) * 500
     for threshold in (1.5, None):
-        result = align_planar(*views, threshold=threshold, generator=draw)
-        assert (result.status != Status.OK).all()
+        assert (align_planar(*random, threshold=threshold, generator=generator()).status != Status.OK).all()
 
 
 @pytest.mark.slow
@@ -258,65 +238,36 @@ def test_weights_of_zero_and_missing_matches_are_left_out():
     assert none.status == Status.TOO_FEW and (none.A == 0).all() and (none.labels == 0).all()
 
 
-def test_an_empty_batch_is_an_empty_result():
-    result = align_planar(*torch.zeros(3, 0, 40, 2))
-    assert result.A.shape == (0, 3, 3) and result.labels.shape == (0, 40) and result.warnings == ()
-    assert "empty" in repr(result)
-
-
-def test_the_dtype_of_the_result_is_that_of_the_matches():
-    scene = scenes.planar(80, sigma=0.5, static=0.4, generator=generator(19)).to(torch.float32)
-    result = align_planar(*scene.views, generator=generator())
-    assert result.A.dtype == result.covariance.dtype == torch.float32 and result.labels.dtype == torch.int64
-    assert error(result, scene.motion) < 2
-    assert result.solution is not None and result.solution.tensor.dtype == torch.float32
+NO_DISTANCE = r"threshold must be a positive distance .*, got .*; None estimates it"
+BAD = ("wide", 0, -1.0, float("nan"), float("inf"), torch.ones(2))
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda v: {"x1": v[0][:20], "x2": v[1][:20], "x3": v[2][:20]}, "at least 26 matches, got 20"),
-        (lambda v: {"x1": v[0], "x2": v[1][:30], "x3": v[2]}, "same"),
-        (lambda v: {"x1": v[0], "x2": v[1].float(), "x3": v[2]}, "one dtype"),
-        (lambda v: {"x1": v[0][:, :1], "x2": v[1], "x3": v[2]}, "view 1"),
-        (lambda v: {"x1": v[0], "x2": v[1], "x3": v[2], "threshold": 0.0}, "threshold must be .*got 0.0"),
-        (lambda v: {"x1": v[0], "x2": v[1], "x3": v[2], "threshold": float("nan")}, "threshold"),
-        (lambda v: {"x1": v[0], "x2": v[1], "x3": v[2], "weights": -torch.ones(40)}, "not be negative"),
-        (lambda v: {"x1": v[0], "x2": v[1], "x3": v[2], "static": torch.ones(39, dtype=torch.bool)}, "static must be"),
-        (lambda v: {"x1": v[0].tolist(), "x2": v[1], "x3": v[2]}, "torch.Tensor"),
+        (lambda v: {"x2": v[1][:30]}, "same"),
+        (lambda v: {"x2": v[1].float()}, "one dtype"),
+        (lambda v: {"x1": v[0][:, :1]}, "view 1"),
+        *((lambda v, bad=bad: {"threshold": bad}, NO_DISTANCE) for bad in BAD),
+        (lambda v: {"weights": -torch.ones(40)}, "not be negative"),
+        (lambda v: {"static": torch.ones(39, dtype=torch.bool)}, "static must be"),
+        (lambda v: {"x1": v[0].tolist()}, "torch.Tensor"),
     ],
 )
 def test_misuse_is_refused_with_the_value_and_the_remedy(change, message):
     views = scenes.planar(40, generator=generator()).views
     with pytest.raises(ValueError, match=message):
-        align_planar(**change(views))
-
-
-def test_unknown_notice_codes_are_refused():
-    result = align_planar(*scenes.planar(40, generator=generator()).views, generator=generator())
-    with pytest.raises(ValueError, match="'nonsense'"):
-        result.has_notice("nonsense")
-    assert "Alignment(matches=40" in repr(result) and "moving" in repr(result)
-
-
-@pytest.mark.parametrize("threshold", ["wide", 0, -1.0, float("nan"), float("inf"), torch.ones(2)])
-def test_what_is_no_distance_is_refused(threshold):
-    views = scenes.planar(30, generator=torch.Generator().manual_seed(0)).views
-    with pytest.raises(ValueError, match=r"threshold must be a positive distance .*, got .*; None estimates it"):
-        align_planar(*views, threshold=threshold)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("threshold", [1.5, None])
-def test_equal_steps_without_static_points_are_never_ok(threshold):
-    draw = torch.Generator().manual_seed(0)
-    result = dyn.align_planar(*equal_steps(60, still=0.0, generator=draw), threshold=threshold, generator=draw)
-    assert result.status == dyn.Status.AMBIGUOUS and result.has_notice("other_solution")
+        align_planar(**{**dict(zip(("x1", "x2", "x3"), views, strict=True)), **change(views)})
 
 
 @pytest.mark.slow
 def test_static_points_choose_among_the_cameras_that_equal_steps_leave():
-    draw = torch.Generator().manual_seed(1)
-    result = dyn.align_planar(*equal_steps(60, still=0.4, generator=draw), generator=draw)
-    assert result.status == dyn.Status.OK and (result.labels[:24] == 1).double().mean() > 0.9
+    for threshold in (1.5, None):
+        draw = generator()
+        result = align_planar(*equal_steps(60, still=0.0, generator=draw), threshold=threshold, generator=draw)
+        assert result.status == Status.AMBIGUOUS and result.has_notice("other_solution")
+    draw = generator(1)
+    result = align_planar(*equal_steps(60, still=0.4, generator=draw), generator=draw)
+    assert result.status == Status.OK and (result.labels[:24] == 1).double().mean() > 0.9
     torch.testing.assert_close(result.A / result.A[2, 2], torch.eye(3, dtype=torch.float64), atol=2.0, rtol=0)

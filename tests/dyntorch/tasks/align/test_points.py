@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from dyntorch import scenes
@@ -41,23 +42,11 @@ def second_difference(motion: tuple[Tensor, ...], scene: scenes.Scene) -> Tensor
 
 
 class TestRigidAlgebra:
-    def test_alignment_against_the_quaternion_solution(self) -> None:
+    def test_alignment_against_scipy(self) -> None:
         x, y = torch.randn(2, 9, 3, generator=draw(), dtype=F64)
         found = rigid_alignment(x, y)
-        # Horn 1987: the rotation is the eigenvector of a symmetric 4 x 4 matrix
-        m = (y - y.mean(0)).mT @ (x - x.mean(0))
-        delta = torch.stack([m[1, 2] - m[2, 1], m[2, 0] - m[0, 2], m[0, 1] - m[1, 0]])
-        horn = torch.zeros(4, 4, dtype=F64)
-        horn[0, 0], horn[0, 1:], horn[1:, 0] = m.trace(), delta, delta
-        horn[1:, 1:] = m + m.mT - m.trace() * torch.eye(3, dtype=F64)
-        w, i, j, k = torch.linalg.eigh(horn).eigenvectors[:, -1]
-        rotation = torch.stack(
-            [
-                torch.stack([1 - 2 * (j * j + k * k), 2 * (i * j - k * w), 2 * (i * k + j * w)]),
-                torch.stack([2 * (i * j + k * w), 1 - 2 * (i * i + k * k), 2 * (j * k - i * w)]),
-                torch.stack([2 * (i * k - j * w), 2 * (j * k + i * w), 1 - 2 * (i * i + j * j)]),
-            ]
-        )
+        first, second = x - x.mean(0), y - y.mean(0)
+        rotation = torch.from_numpy(Rotation.align_vectors(first.numpy(), second.numpy())[0].as_matrix())
         torch.testing.assert_close(found[:3, :3], rotation)
         torch.testing.assert_close(found[:3, 3], x.mean(0) - rotation @ y.mean(0))
 
@@ -106,6 +95,9 @@ class TestRigid:
             assert bool((rotation_error(estimated, true) < 1e-5).all())
             assert bool((translation_error(estimated, true) < 1e-7).all())
         assert bool((found.labels == MOVING).all())
+        # alignment that takes movers for noise
+        naive = rigid_alignment(scene.views[0], scene.views[1])
+        assert float(rotation_error(naive, scene.motion[0]).min()) > 0.1
 
     @pytest.mark.parametrize("threshold", [0.03, None])
     def test_movers_alone_with_outliers(self, threshold: float | None) -> None:
@@ -115,13 +107,6 @@ class TestRigid:
         assert bool((translation_error(found.B, scene.motion[1]) < 0.06).all())
         assert label_scores(found.labels, scene.labels).recall.mean() > 0.97
         assert bool(((found.sigma / 0.01 - 1).abs() < 0.35).all())
-
-    def test_beats_alignment_that_takes_movers_for_noise(self) -> None:
-        scene = scenes.moving_points(25, batch=6, sigma=0.01, sensors="rigid", generator=draw(4))
-        found = align_points(*scene.views, model="rigid", threshold=0.03, generator=draw(5))
-        naive = rigid_alignment(scene.views[0], scene.views[1])
-        ours, theirs = (rotation_error(m, scene.motion[0]).median() for m in (found.A, naive))
-        assert ours < theirs / 10
 
     def test_static_and_moving_are_told_apart(self) -> None:
         scene = scenes.moving_points(40, batch=4, sigma=0.01, static=0.5, sensors="rigid", generator=draw(6))
@@ -178,19 +163,14 @@ class TestRigid:
         with pytest.raises(ValueError, match=r"problem 1 of \d: TOO_FEW"):
             found.check()
 
-    def test_points_on_a_line_are_not_ok(self) -> None:
-        t = torch.linspace(0, 5, 15, dtype=F64)[:, None]
-        x = t * torch.tensor([1.0, 2.0, 3.0], dtype=F64)
-        found = align_points(x, x + 1, x + 2, model="rigid", threshold=0.01, generator=draw(19))
+    def test_points_on_a_line_or_in_one_place_are_not_ok(self) -> None:
+        line = torch.linspace(0, 5, 15, dtype=F64)[:, None] * torch.tensor([1.0, 2.0, 3.0], dtype=F64)
+        found = align_points(line, line + 1, line + 2, model="rigid", threshold=0.01, generator=draw(19))
         assert int(found.status) in (Status.DEGENERATE, Status.AMBIGUOUS)
-        assert bool(found.A.isfinite().all()) and bool(found.covariance.isfinite().all())
-
-    @pytest.mark.parametrize("threshold", [0.01, None])
-    def test_all_points_equal(self, threshold: float | None) -> None:
-        x = torch.ones(12, 3, dtype=F64)
-        found = align_points(x, x, x, model="rigid", threshold=threshold, generator=draw(20))
-        assert int(found.status) != Status.OK
-        assert bool(found.A.isfinite().all())
+        same = torch.ones(12, 3, dtype=F64)
+        alike = [align_points(same, same, same, model="rigid", threshold=t, generator=draw(20)) for t in (0.01, None)]
+        assert all(int(one.status) != Status.OK for one in alike)
+        assert all(bool(one.A.isfinite().all()) and bool(one.covariance.isfinite().all()) for one in (found, *alike))
 
 
 class TestAffineConstantVelocity:
@@ -256,13 +236,13 @@ class TestProjective:
 
     @pytest.mark.slow
     def test_one_trajectory_line_is_flagged(self) -> None:
-        eye = torch.eye(4, dtype=F64)
         t = torch.linspace(-2, 2, 48, dtype=F64)[:, None] * torch.tensor([1.0, 0.5, 0.2], dtype=F64)
         speed = torch.rand(48, 1, generator=draw(8), dtype=F64)
-        x2, x3 = t + speed, t + 2.5 * speed
-        found = align_points(t, x2, x3, threshold=0.01, generator=draw(9))
-        assert int(found.status) != Status.OK
-        assert bool(found.A.isfinite().all()) and eye.shape == found.A.shape
+        found = align_points(t, t + speed, t + 2.5 * speed, threshold=0.01, generator=draw(9))
+        assert int(found.status) != Status.OK and bool(found.A.isfinite().all())
+
+
+X1, X2, X3 = scenes.moving_points(30, generator=draw()).views
 
 
 @pytest.mark.parametrize(
@@ -272,35 +252,27 @@ class TestProjective:
         ({"motion": "curved", "model": "rigid"}, "motion must be one of straight.*got 'curved'"),
         ({"motion": "constant_velocity"}, "belongs to model='rigid'"),
         ({"threshold": 0.0}, "threshold must be a positive distance.*got 0.0"),
-        ({"threshold": float("nan")}, "threshold must be a positive distance"),
         ({}, "needs at least 47 matches, got 30; add matches"),
         ({"weights": -torch.ones(30, dtype=F64)}, "weights must not be negative"),
         ({"static": torch.zeros(7, dtype=torch.bool)}, r"static must be .*30.*got \(7,\)"),
+        ({"P2": X2.float()}, "one dtype"),
+        ({"P2": X2[..., :2]}, "view 2"),
+        ({"P2": X2[:29]}, "same"),
     ],
 )
-def test_misuse(change: dict[str, object], text: str) -> None:
-    views = scenes.moving_points(30, generator=draw()).views
+def test_misuse(change: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        align_points(*views, **change)  # type: ignore[arg-type]
-
-
-def test_misuse_of_the_views() -> None:
-    x1, x2, x3 = scenes.moving_points(50, generator=draw()).views
-    with pytest.raises(ValueError, match="one dtype"):
-        align_points(x1, x2.float(), x3)
-    with pytest.raises(ValueError, match="view 2"):
-        align_points(x1, x2[..., :2], x3)
-    with pytest.raises(ValueError, match="same"):
-        align_points(x1, x2[:49], x3)
+        align_points(**{"P1": X1, "P2": X2, "P3": X3, **change})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["join", "rigid", "constant_velocity", "affine_constant_velocity"])
 def test_random_matches_are_refused_with_the_noise_unknown(model: Model) -> None:
-    views = [100 * torch.randn(60, 3, generator=draw(i), dtype=torch.float64) for i in range(3)]
-    found = align_points(*views, model=model, generator=draw(0))
-    assert int(found.status) != Status.OK
-    assert not found.covariance.isnan().any()
+    found = align_points(*torch.randn(3, 60, 3, generator=draw(50), dtype=F64), model=model, generator=draw(51))
+    # what the best of no good samples lacks depends on the last digits
+    assert found.status in (Status.NO_CONSENSUS, Status.DEGENERATE)
+    assert not found.covariance.isnan().any() and not found.labels.any()
+    assert found.sigma == 0 and "0 static, 0 moving, 60 outlier" in repr(found)
 
 
 def test_empty_batch_and_float32() -> None:
@@ -330,12 +302,3 @@ def test_the_full_tensor_is_only_searched_for_where_the_minimal_one_leaves_doubt
     asked = [(name, where.tolist()) for name, where in searched]
     assert asked == [("MinimalJoinTensor", [True, True]), ("JoinTensor", [True, False])]
     assert (found.status == Status.OK).all() and ((found.labels != OUTLIER).sum(-1) > 65).all()
-
-
-@pytest.mark.slow
-def test_random_clouds_leave_no_labels_and_no_noise():
-    clouds = torch.randn(3, 60, 3, generator=torch.Generator().manual_seed(50), dtype=torch.float64)
-    found = align_points(*clouds, generator=torch.Generator().manual_seed(51))
-    # what the best of no good samples lacks depends on the last digits
-    assert found.status in (Status.NO_CONSENSUS, Status.DEGENERATE)
-    assert not found.labels.any() and found.sigma == 0 and "0 static, 0 moving, 60 outlier" in repr(found)
