@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from dyntorch import scenes
-from dyntorch.core.normalize import hartley
 from dyntorch.core.outcome import Status
-from dyntorch.geometry.triangulation import mask_missing, triangulate
+from dyntorch.geometry.triangulation import triangulate
 from dyntorch.tasks.reconstruct.motions import MOTIONS
+from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.result import ReconstructOptions
 from dyntorch.tasks.reconstruct.robust import bound, distance, freedom, have_outliers, noise, robust_projections, select_inliers
-from dyntorch.tasks.reconstruct.scene import Lifting, ViewTracks, distances, projections_of_tracks
+from dyntorch.tasks.reconstruct.scene import Lifting, distances, projections_of_tracks
 
 
 def generator(seed=0):
@@ -20,12 +20,7 @@ def generator(seed=0):
 
 
 def tracks_of(images, times):
-    x, weights = mask_missing(images, None)
-    transforms = hartley(x.unsqueeze(-2), (weights > 0).to(x.dtype))
-    scales = transforms[..., 0, 0]
-    moved = torch.where((weights > 0)[..., None], x * scales[..., None, None] + transforms[..., None, :-1, -1], 0.0)
-    share = scales.square().mean(-1, keepdim=True) / scales.square()
-    return ViewTracks(moved, weights * share[..., None], scales, transforms, times)
+    return normalize_tracks(images.nan_to_num(), images.isfinite().all(-1).double(), times)
 
 
 def problem(motion, n, batch=2, seed=0, **options):
@@ -33,7 +28,7 @@ def problem(motion, n, batch=2, seed=0, **options):
     model = MOTIONS[motion]
     tracks = tracks_of(scene.tracks, scene.times)
     invariant = model.tensor(min(model.views(scene.times), model.k + 1))
-    return scene, tracks, invariant, Lifting.of(model, scene.times, tracks.x)
+    return scene, tracks, invariant, model.lift and Lifting.of(model, scene.times, tracks.x)
 
 
 def kept_and_let_in(scene, fewer):
@@ -102,16 +97,11 @@ def test_exact_tracks_with_outliers_are_solved_exactly():
 
 
 def test_bodies_have_no_lift():
-    scene, tracks, invariant, _ = _bodies()
-    found, fewer = robust_projections(tracks, invariant, None, 1.5, generator(1), options=ReconstructOptions())
+    scene, tracks, invariant, lifting = problem("two_bodies_3d", 60, batch=1, outliers=0.2)
+    found, fewer = robust_projections(tracks, invariant, lifting, 1.5, generator(1), options=ReconstructOptions())
     kept, _ = kept_and_let_in(scene, fewer)
     assert found.status.tolist() == [Status.OK]
     assert float(kept) > 0.95
-
-
-def _bodies():
-    scene = scenes.lifted_points("two_bodies_3d", 60, batch=1, sigma=0.5, outliers=0.2, generator=generator())
-    return scene, tracks_of(scene.tracks, scene.times), MOTIONS["two_bodies_3d"].tensor(3), None
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.5])

@@ -15,12 +15,10 @@ from dyntorch.tasks.reconstruct.scene import (
     LiftedState,
     Lifting,
     Projections,
-    ViewTracks,
     adjust_scene,
     distances,
     fix_frame,
     mean_error,
-    middle_views,
     positions,
     projections_of_tracks,
     scene_of,
@@ -111,16 +109,6 @@ def test_no_scene_costs_infinity_and_leaves_the_others_alone():
     again = scene_of(tracks, found, lifting)
     assert bool(again.cost[1].isinf())
     torch.testing.assert_close(again.cost[[0, 2]], scene.cost[[0, 2]], rtol=1e-6, atol=0)
-
-
-@pytest.mark.slow
-def test_batch_equals_loop():
-    _, tracks, lifting, found, scene = solved("constant_velocity_3d", 60, views=4, sigma=0.2, batch=(2,))
-    for i in range(2):
-        one = torch.tensor([i])
-        part = replace(found, projections=found.projections[one], structure=found.structure[one], status=found.status[one])
-        alone = scene_of(tracks.subset(one), part, lifting)
-        torch.testing.assert_close(alone.cost, scene.cost[one], rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_velocity_3d", "constant_direction_3d"])
@@ -221,18 +209,6 @@ def test_mean_error_is_that_of_each_observation_and_counts_lost_points():
     assert float(mean_error(tracks, found)) == pytest.approx(total / 39)
 
 
-def test_parts_of_tracks():
-    _, tracks = tracks_of("constant_velocity_2d", views=4, batch=(2,))
-    some = tracks.at(torch.tensor([3, 1]))
-    assert torch.equal(some.x[:, 0], tracks.x[:, 3])
-    assert some.times.tolist() == [3.0, 1.0]
-    twice = tracks.repeat(2)
-    assert isinstance(twice, ViewTracks)
-    assert torch.equal(twice.x[0], twice.x[1])
-    assert torch.equal(twice.x[2], tracks.x[1])
-    assert torch.equal(tracks.subset(torch.tensor([1])).weights[0], tracks.weights[1])
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts without a tensor: exact for a scene at rest, and frames that differ by a collineation of the world.
 
@@ -270,10 +246,3 @@ def test_constants_of_resting_points_do_not_move_them():
     torch.testing.assert_close(places, places[:1].expand_as(places))
     always = torch.stack([torch.eye(3, 4, dtype=torch.float64).roll(int(t), 1) for t in range(4)])
     assert static_constants(always).shape == (4, 0)
-
-
-def test_middle_views_are_neighbours_in_time():
-    assert middle_views(torch.tensor([0.0, 1.0, 2.0])).tolist() == [0, 1, 2]
-    many = torch.tensor([7.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    assert middle_views(many).tolist() == [2, 3, 4, 5, 6, 7]
-    assert middle_views(many, 1).tolist() == [2, 3, 4, 5, 6]
