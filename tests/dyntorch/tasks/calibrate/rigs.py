@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tests.draws import seeded
+
 F64 = torch.float64
 
 
@@ -61,7 +63,7 @@ class Motion:
     """n points on smooth ways of their own, at any time."""
 
     def __init__(self, n=8, seed=0, place=(0.0, 0.0, 0.0), flat=False):
-        way = torch.randn(3, n, 3, generator=torch.Generator().manual_seed(seed), dtype=F64)
+        way = torch.randn(3, n, 3, generator=seeded(seed), dtype=F64)
         self.base, self.one, self.other = 0.4 * way[0] + torch.tensor(place, dtype=F64), way[1], way[2]
         self.factor = torch.tensor([1.0, 1.0, 0.0 if flat else 1.0], dtype=F64)
 
@@ -76,7 +78,7 @@ def filmed(
     times=None,
 ):  # fmt: skip
     """What cameras around a motion see; camera i's clock is rate_i t + offset_i."""
-    draw = torch.Generator().manual_seed(100 + seed)
+    draw = seeded(100 + seed)
     offsets, rates = offsets or [0.0] * cameras, rates or [1.0] * cameras
     focals = focals or [1500.0] * cameras
     fps = [fps] * cameras if isinstance(fps, float) else fps

@@ -14,19 +14,20 @@ from dyntorch.tasks.calibrate.averaging import (
     position_cameras,
     relative_rotations,
 )
+from tests.draws import seeded
 from tests.dyntorch.tasks.calibrate.rigs import exponential, shape_error
 
 F64 = torch.float64
 
 
 def turns(c, seed=0):
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     return torch.stack([exponential(torch.randn(3, generator=g, dtype=F64)) for _ in range(c)])
 
 
 def rig(c=4, m=60, line=False, seed=0):
     """Rotations, centres, points and rays in the cameras' frames, all points before all cameras."""
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     R = torch.stack([exponential(0.2 * torch.randn(3, generator=g, dtype=F64)) for _ in range(c)])
     centers = torch.randn(c, 3, generator=g, dtype=F64)
     if line:
@@ -88,7 +89,7 @@ def test_a_wrong_pair_drops_out(monkeypatch):
 @pytest.mark.parametrize("line", [False, True])
 def test_positions_from_rays_are_exact(line):
     R, centers, points, rays = rig(line=line, seed=2)
-    weights = (torch.rand(4, 60, generator=torch.Generator().manual_seed(3), dtype=F64) > 0.2).double()
+    weights = (torch.rand(4, 60, generator=seeded(3), dtype=F64) > 0.2).double()
     weights[:, :10] = 1.0
     found, met = position_cameras(R, rays, weights)
     both = weights.sum(0) >= 2

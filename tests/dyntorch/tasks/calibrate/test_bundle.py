@@ -9,6 +9,7 @@ import torch
 from dyntorch.numerics.least_squares import Iterate
 from dyntorch.tasks.calibrate.bundle import PARAMETERS, Priors, RigAdjustment, RigState, camera_covariance, gauge, images
 from dyntorch.tasks.calibrate.input import Sightings
+from tests.draws import seeded
 from tests.dyntorch.tasks.calibrate.rigs import exponential, pictures
 
 F64 = torch.float64
@@ -37,7 +38,7 @@ class Lines:
 
 def world(seed=0):
     """A problem away from its minimum, and where it is."""
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
 
     def draw(*size):
         return torch.randn(*size, generator=g, dtype=F64)

@@ -12,11 +12,12 @@ from dyntorch import scenes
 from dyntorch.core.outcome import Status
 from dyntorch.scenes.lifts import KINDS
 from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
+from tests.draws import seeded
 
 
 def solved(name: str, sigma: float = 0.5, **options: object) -> Reconstruction:
     views = max(5, KINDS[name].views)
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     scene = scenes.lifted_points(name, 80, views=views, batch=3, sigma=sigma, generator=generator, **options)
     return dyn.reconstruct(scene.tracks, name, scene.times, threshold=math.inf)
 
@@ -76,7 +77,7 @@ def test_one_body(name: str) -> None:
 
 @pytest.mark.slow
 def test_collinear_images() -> None:
-    scene = scenes.lifted_points("constant_velocity_2d", 40, views=4, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points("constant_velocity_2d", 40, views=4, generator=seeded())
     tracks = scene.tracks.clone()
     tracks[..., 1] = 2 * tracks[..., 0]
     found = dyn.reconstruct(tracks, "constant_velocity_2d")
@@ -85,7 +86,7 @@ def test_collinear_images() -> None:
 
 
 def test_tracks_of_one_observation_have_no_position() -> None:
-    scene = scenes.lifted_points("constant_velocity_2d", 60, views=4, sigma=0.3, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points("constant_velocity_2d", 60, views=4, sigma=0.3, generator=seeded())
     tracks = scene.tracks.clone()
     tracks[1:, :4] = torch.nan
     found = dyn.reconstruct(tracks, "constant_velocity_2d")

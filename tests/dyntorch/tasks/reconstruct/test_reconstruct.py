@@ -15,20 +15,17 @@ from dyntorch.core.outcome import Status
 from dyntorch.scenes.lifts import KINDS
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
 from dyntorch.tasks.reconstruct.result import Reconstruction, ReconstructNotice
+from tests.draws import seeded
 
 F64 = torch.float64
 NAMES = list(KINDS)
 LIFTED = [name for name in NAMES if MOTIONS[name].lift is not None]
 
 
-def draw(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
 def scene_of(name: str, n: int = 60, **options: object) -> scenes.LiftedState:
     if "times" not in options:
         options.setdefault("views", max(4, KINDS[name].views))
-    return scenes.lifted_points(name, n, generator=draw(3), **options)
+    return scenes.lifted_points(name, n, generator=seeded(3), **options)
 
 
 def error(found: Reconstruction, scene: scenes.LiftedState) -> Tensor:
@@ -70,18 +67,6 @@ def test_cameras_points_and_velocities_agree(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_direction_3d", "two_bodies_2d"])
-def test_batch_is_loop(name: str) -> None:
-    scene = scene_of(name, batch=(3,), sigma=0.5)
-    whole = dyn.reconstruct(scene.tracks, name)
-    for i in range(3):
-        one = dyn.reconstruct(scene.tracks[i], name)
-        torch.testing.assert_close(one.residuals, whole.residuals[i], rtol=1e-5, atol=1e-5)
-        if scene.lifts is not None:
-            assert float(metrics.lifted_error(one.structure, whole.structure[i], scene.lifts).position) < 1e-4
-
-
-@pytest.mark.slow
 def test_a_lost_problem_leaves_the_others_alone() -> None:
     scene = scene_of("constant_direction_3d", batch=(3,))
     tracks = scene.tracks.clone()
@@ -100,6 +85,8 @@ def test_static_points_fix_the_common_motion(name: str) -> None:
     found = dyn.reconstruct(scene.tracks, name, static=still)
     assert bool((found.velocities[still].abs() < 1e-8).all())
     assert bool((found.velocities[~still].norm(dim=-1).median() > 1e-2).all())
+    half = dyn.reconstruct(scene.tracks, name, static=still & (torch.arange(60) % 2 == 0))
+    assert torch.equal(half.labels, scene.labels)  # also the static points that were not given
 
 
 def test_float32_and_units() -> None:
@@ -148,7 +135,7 @@ def test_custom_lifts(lift) -> None:
     times = [0.0, 1.0, 2.5, 3.0, 4.2]
     motion = Motion(lift, lift.__name__)
     rows, size = lift(torch.tensor(0.0)).shape
-    rand = draw(1)
+    rand = seeded(1)
     structure = torch.randn(60, size, generator=rand, dtype=F64)
     structure[:, rows - 1] = 1.0
     structure[:, rows:] *= 0.2
@@ -171,20 +158,13 @@ def test_known_static_points_determine_what_the_tensor_does_not() -> None:
     structure = torch.where(still[..., None], structure, torch.cat([structure[..., :3], columns], -1))
     images = structure[..., None, :, :] @ scene.projections.mT
     exact = images[..., :2] / images[..., 2:]
-    tracks = exact + 0.3 * torch.randn(exact.shape, generator=draw(4), dtype=F64)
+    tracks = exact + 0.3 * torch.randn(exact.shape, generator=seeded(4), dtype=F64)
     linear = dyn.fit(MOTIONS["constant_velocity_2d"].tensor(3), *exact[:3])
     assert linear.status == Status.DEGENERATE
     found = dyn.reconstruct(tracks, "constant_velocity_2d", scene.times, static=still)
     assert found.status == Status.OK
     assert float(found.velocities[still].abs().max()) < 1e-9
     assert float(metrics.lifted_error(found.structure, structure, scene.lifts).position) < 0.05
-
-
-def test_labels_of_exact_tracks() -> None:
-    scene = scene_of("constant_velocity_2d", static=0.4)
-    given = (scene.labels == 1) & (torch.arange(scene.labels.shape[-1]) % 2 == 0)
-    found = dyn.reconstruct(scene.tracks, "constant_velocity_2d", scene.times, static=given)
-    assert torch.equal(found.labels, scene.labels)  # also the static points that were not given
 
 
 def test_one_wrong_track_is_found_without_losing_the_others() -> None:
@@ -198,7 +178,7 @@ def test_one_wrong_track_is_found_without_losing_the_others() -> None:
 
 
 def test_a_moving_point_said_to_stand_still_is_named() -> None:
-    scene = scenes.lifted_points("constant_velocity_2d", 60, views=6, sigma=0.5, static=0.5, generator=draw(4))
+    scene = scenes.lifted_points("constant_velocity_2d", 60, views=6, sigma=0.5, static=0.5, generator=seeded(4))
     given = (scene.labels == 1) & (scene.labels == 1).cumsum(-1).le(10)
     wrong = int((scene.labels == 2).nonzero()[0])
     given[wrong] = True
@@ -211,8 +191,8 @@ def test_a_moving_point_said_to_stand_still_is_named() -> None:
 @pytest.mark.slow
 def test_tracks_shorter_than_the_recording_lead_from_view_to_view() -> None:
     times = [0.4 * i for i in range(16)]
-    scene = scenes.lifted_points("constant_velocity_2d", 160, times=times, sigma=0.2, jitter=0.1, drift=2.0, generator=draw(2))
-    start = torch.randint(-3, 12, (160,), generator=draw(3))
+    scene = scenes.lifted_points("constant_velocity_2d", 160, times=times, sigma=0.2, jitter=0.1, drift=2.0, generator=seeded(2))
+    start = torch.randint(-3, 12, (160,), generator=seeded(3))
     frame = torch.arange(16)[:, None]
     tracks = torch.where(((frame < start) | (frame >= start + 8))[..., None], torch.nan, scene.tracks)
     found = dyn.reconstruct(tracks, "constant_velocity_2d", scene.times, threshold=math.inf)
@@ -222,9 +202,9 @@ def test_tracks_shorter_than_the_recording_lead_from_view_to_view() -> None:
 
 @pytest.mark.slow
 def test_wrong_observations_in_most_tracks_cost_only_themselves() -> None:
-    scene = scenes.lifted_points("constant_velocity_2d", 80, times=[0.5 * i for i in range(10)], sigma=0.5, generator=draw(1))
-    wrong = torch.rand(10, 80, generator=draw(4)) < 0.1
-    off = 100 * (torch.rand(10, 80, 2, generator=draw(6), dtype=F64) - 0.5)
+    scene = scenes.lifted_points("constant_velocity_2d", 80, times=[0.5 * i for i in range(10)], sigma=0.5, generator=seeded(1))
+    wrong = torch.rand(10, 80, generator=seeded(4)) < 0.1
+    off = 100 * (torch.rand(10, 80, 2, generator=seeded(6), dtype=F64) - 0.5)
     tracks = torch.where(wrong[..., None], scene.tracks + off, scene.tracks)
     found = dyn.reconstruct(tracks, "constant_velocity_2d", scene.times, threshold=1.5)
     assert found.status == Status.OK
@@ -235,13 +215,13 @@ def test_wrong_observations_in_most_tracks_cost_only_themselves() -> None:
 
 @pytest.mark.slow
 def test_options_decide() -> None:
-    scene = scenes.lifted_points("constant_velocity_2d", 60, views=4, outliers=0.3, sigma=0.3, generator=draw(3))
+    scene = scenes.lifted_points("constant_velocity_2d", 60, views=4, outliers=0.3, sigma=0.3, generator=seeded(3))
 
     def found(**options: float) -> dyn.Reconstruction:
         given = dyn.ReconstructOptions(**options)
         return dyn.reconstruct(scene.tracks, "constant_velocity_2d", threshold=1.5, generator=source, options=given)
 
-    source = draw(5)
+    source = seeded(5)
     assert int(found().status) == Status.OK
     assert int(found(min_inlier_share=0.9).status) == Status.NO_CONSENSUS
     assert int(found(max_uncertainty=0.0).status) == Status.AMBIGUOUS
@@ -261,7 +241,7 @@ CV = "constant_velocity_2d"
 
 
 def tracks() -> Tensor:
-    return scenes.lifted_points(CV, 30, views=4, sigma=0.3, generator=torch.Generator().manual_seed(0)).tracks
+    return scenes.lifted_points(CV, 30, views=4, sigma=0.3, generator=seeded()).tracks
 
 
 def half_lift(t: Tensor) -> Tensor:
@@ -356,16 +336,14 @@ def test_float32_times_that_are_exact_enough() -> None:
     with pytest.raises(ValueError, match=r"times reach 1e\+06, .* in torch.float32 .*count times from the first view"):
         dyn.reconstruct(x.float(), CV, [1e6, 1e6 + 1, 1e6 + 2, 1e6 + 3])
     assert dyn.reconstruct(x.float(), CV, [1e3, 1e3 + 1, 1e3 + 2, 1e3 + 3]).status == Status.OK
-
-
-def test_times_do_not_matter_where_nothing_moves() -> None:
-    x = scenes.lifted_points("static_2d", 30, views=2, sigma=0.3, generator=torch.Generator().manual_seed(0)).tracks.float()
+    # nor do they matter where nothing moves
+    x = scenes.lifted_points("static_2d", 30, views=2, sigma=0.3, generator=seeded()).tracks.float()
     assert dyn.reconstruct(x, "static_2d", UNIX[:2].float()).status == Status.OK
 
 
 @pytest.mark.slow
 def test_static_of_any_kind() -> None:
-    scene = scenes.lifted_points(CV, 30, views=4, sigma=0.3, static=0.3, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points(CV, 30, views=4, sigma=0.3, static=0.3, generator=seeded())
     known = scene.velocities.norm(dim=-1) < 1e-12
     assert known.any()
     first = dyn.reconstruct(scene.tracks, CV, static=known)
@@ -376,7 +354,7 @@ def test_static_of_any_kind() -> None:
 
 
 def test_no_static_point_is_none_given() -> None:
-    scene = scenes.lifted_points(CV, 30, views=4, sigma=0.3, static=0.3, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points(CV, 30, views=4, sigma=0.3, static=0.3, generator=seeded())
     known = scene.velocities.norm(dim=-1) < 1e-12
     alone = dyn.reconstruct(scene.tracks, CV)
     nothing = dyn.reconstruct(scene.tracks, CV, static=[False] * 30)

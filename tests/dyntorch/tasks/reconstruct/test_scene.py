@@ -14,7 +14,6 @@ from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.scene import (
     LiftedState,
     Lifting,
-    Projections,
     adjust_scene,
     distances,
     fix_frame,
@@ -23,11 +22,10 @@ from dyntorch.tasks.reconstruct.scene import (
     projections_of_tracks,
     scene_of,
     static_cameras,
-    static_constants,
-    tilt_infinity,
     velocities,
     view_subsets,
 )
+from tests.draws import seeded
 
 MOVING = [name for name, motion in MOTIONS.items() if motion.lift is not None and not motion.static]
 
@@ -35,7 +33,7 @@ MOVING = [name for name, motion in MOTIONS.items() if motion.lift is not None an
 def solved(name, n, seed=0, **options):
     """Truth, tracks, lifting, projections and scene."""
     options = {"batch": (1,), **options}
-    truth = scenes.lifted_points(name, n, generator=torch.Generator().manual_seed(seed), **options)
+    truth = scenes.lifted_points(name, n, generator=seeded(seed), **options)
     seen = truth.tracks.isfinite().all(-1).double()
     tracks = normalize_tracks(truth.tracks.nan_to_num(), seen, truth.times)
     motion = MOTIONS[name]
@@ -100,17 +98,6 @@ def test_where_no_views_share_enough_points_the_scene_is_found_without_a_tensor(
     assert bool((scene.cost < 1.01 * from_truth(truth, tracks, lifting).cost).all())
 
 
-def test_no_scene_costs_infinity_and_leaves_the_others_alone():
-    _, tracks, lifting, found, scene = solved("constant_velocity_3d", 60, views=4, sigma=0.2, batch=(3,))
-    weights = tracks.weights.clone()
-    weights[1, :, 8:] = 0
-    tracks = tracks.only(weights)
-    found = projections_of_tracks(tracks, MOTIONS["constant_velocity_3d"].tensor(4))
-    again = scene_of(tracks, found, lifting)
-    assert bool(again.cost[1].isinf())
-    torch.testing.assert_close(again.cost[[0, 2]], scene.cost[[0, 2]], rtol=1e-6, atol=0)
-
-
 @pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_velocity_3d", "constant_direction_3d"])
 def test_the_frame_is_finite_round_and_brings_static_points_to_rest(name):
     truth, tracks, lifting, _, scene = solved(name, 60, views=6, static=0.3, batch=(2,))
@@ -126,21 +113,13 @@ def test_the_frame_is_finite_round_and_brings_static_points_to_rest(name):
     )
 
 
-def test_velocities_are_the_derivatives_of_positions():
-    _, _, lifting, _, scene = solved("constant_acceleration_2d", 60, views=6)
-    motion, inverse = MOTIONS["constant_acceleration_2d"], torch.linalg.inv(lifting.root)
-    before, after = (positions(scene.structure, motion.lifts([t])[0] @ inverse) for t in (-1e-4, 1e-4))
-    expected = (after - before) / 2e-4
-    torch.testing.assert_close(velocities(scene.structure, lifting.start, lifting.slope), expected, rtol=1e-4, atol=1e-6)
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # Projections and points of P^k from tracks: choices of views, exactness, failures as data.
 
 
 def tracks_of(name, n=60, seed=0, **options):
     options = {"batch": (1,), **options}
-    scene = scenes.lifted_points(name, n, generator=torch.Generator().manual_seed(seed), **options)
+    scene = scenes.lifted_points(name, n, generator=seeded(seed), **options)
     seen = scene.tracks.isfinite().all(-1).double()
     return scene, normalize_tracks(scene.tracks.nan_to_num(), seen, scene.times)
 
@@ -193,29 +172,13 @@ def test_choices_are_all_views_or_those_seen_most_and_spread():
     assert bool((few.diff(dim=-1) > 0).all())
 
 
-def test_mean_error_is_that_of_each_observation_and_counts_lost_points():
-    _, tracks = tracks_of("constant_velocity_2d", n=13, views=3, sigma=0.5)
-    draw = torch.Generator().manual_seed(1)
-    M = torch.rand(1, 3, 3, 5, generator=draw, dtype=torch.float64)
-    Y = torch.rand(1, 13, 5, generator=draw, dtype=torch.float64)
-    Y[0, 4] = 0
-    total = 0.0
-    for v in range(3):
-        for j in range(13):
-            q = M[0, v] @ Y[0, j]
-            error = 1.0 if j == 4 else float((tracks.x[0, v, j] - q[:2] / q[2]).square().sum())
-            total += float(tracks.weights[0, v, j]) * error
-    found = Projections(M, Y, torch.zeros(1, dtype=torch.long))
-    assert float(mean_error(tracks, found)) == pytest.approx(total / 39)
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # Starts without a tensor: exact for a scene at rest, and frames that differ by a collineation of the world.
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_scene_at_rest_is_explained_exactly_and_stands_before_all_cameras(dim):
-    scene = scenes.lifted_points(f"static_{dim}d", 40, views=4, batch=(3,), generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points(f"static_{dim}d", 40, views=4, batch=(3,), generator=seeded())
     tracks = normalize_tracks(scene.tracks, torch.ones_like(scene.tracks[..., 0]), scene.times)
     cameras = static_cameras(tracks, 2, dim)
     points = triangulate(cameras, tracks.x)
@@ -225,24 +188,3 @@ def test_a_scene_at_rest_is_explained_exactly_and_stands_before_all_cameras(dim)
     assert bool((depth * depth[:, :1, :1].sign() > 0).all())
     deviation = points[..., :-1].std(1)
     torch.testing.assert_close(deviation, torch.ones_like(deviation), rtol=0.05, atol=0)
-
-
-def test_frames_are_collineations_of_the_first():
-    cameras = torch.rand(2, 4, 3, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert torch.equal(tilt_infinity(cameras, 0), cameras)
-    frames = [torch.linalg.lstsq(cameras.flatten(0, 2), tilt_infinity(cameras, k).flatten(0, 2)).solution for k in (1, 2)]
-    for frame in frames:
-        torch.testing.assert_close(frame[:-1], torch.eye(4, dtype=torch.float64)[:-1])
-    assert not torch.allclose(frames[0], frames[1])
-
-
-def test_constants_of_resting_points_do_not_move_them():
-    times = torch.arange(4.0)
-    lifts = MOTIONS["constant_velocity_3d"].lifts(times)
-    still = static_constants(lifts)
-    assert still.shape == (7, 4)
-    torch.testing.assert_close(still.mT @ still, torch.eye(4, dtype=torch.float64))
-    places = lifts @ still
-    torch.testing.assert_close(places, places[:1].expand_as(places))
-    always = torch.stack([torch.eye(3, 4, dtype=torch.float64).roll(int(t), 1) for t in range(4)])
-    assert static_constants(always).shape == (4, 0)

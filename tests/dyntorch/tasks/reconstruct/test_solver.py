@@ -18,12 +18,13 @@ from dyntorch.tasks.reconstruct.reconstruct import normalize_tracks
 from dyntorch.tasks.reconstruct.result import Reconstruction
 from dyntorch.tasks.reconstruct.scene import ViewTracks
 from dyntorch.tasks.reconstruct.solver import LABEL_COST, OUTLIER_COST, LiftedFit, _missing_input, penalized_cost
+from tests.draws import seeded
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["static_3d", "constant_velocity_2d", "constant_direction_3d", "two_bodies_3d"])
 def test_the_model_of_the_scene(name: str) -> None:
-    scene = scenes.lifted_points(name, 80, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
+    scene = scenes.lifted_points(name, 80, views=4, sigma=0.5, generator=seeded(7))
     found = dyn.reconstruct(scene.tracks, "auto", threshold=math.inf)
     assert found.motion.name == name and found.status == Status.OK
     scores = [one.score for one in found.candidates]
@@ -32,7 +33,7 @@ def test_the_model_of_the_scene(name: str) -> None:
 
 
 def test_formula() -> None:
-    scene = scenes.lifted_points("constant_velocity_2d", 10, views=3, generator=torch.Generator().manual_seed(0))
+    scene = scenes.lifted_points("constant_velocity_2d", 10, views=3, generator=seeded())
     weights = torch.ones(1, 3, 10, dtype=torch.float64)
     tracks = normalize_tracks(scene.tracks[None], weights, scene.times)
     apart = torch.full((1, 3, 10), 0.5, dtype=torch.float64)
@@ -51,7 +52,7 @@ def test_formula() -> None:
 
 @pytest.mark.slow
 def test_models_that_were_not_tried_say_why() -> None:
-    scene = scenes.lifted_points("constant_direction_2d", 30, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
+    scene = scenes.lifted_points("constant_direction_2d", 30, views=4, sigma=0.5, generator=seeded(7))
     found = dyn.reconstruct(scene.tracks, "auto", threshold=math.inf)
     reasons = {one.motion: one.reason for one in found.candidates if one.reason}
     assert reasons == {"constant_acceleration_2d": "needs 40 tracks", "constant_velocity_3d": "needs 40 tracks"}
@@ -61,9 +62,6 @@ def test_models_that_were_not_tried_say_why() -> None:
     assert _missing_input(MOTIONS["constant_velocity_2d"], times, 4, 30) == "needs views at 3 different times"
     assert _missing_input(MOTIONS["constant_velocity_3d"], times[:2], 2, 30) == "needs 4 views"
     assert _missing_input(MOTIONS["static_3d"], times, 4, 30) == ""
-
-
-def test_fewest_tracks_of_two_bodies() -> None:
     assert MOTIONS["two_bodies_3d"].min_views_and_tracks(torch.arange(5.0)) == (3, 14)
 
 
@@ -81,8 +79,8 @@ def test_models_are_all_fitted_robustly_only_where_outliers_mislead_least_square
         return tried[-1]
 
     monkeypatch.setattr(lifted_choice, "solve", noted)
-    scene = scenes.lifted_points("constant_velocity_2d", 80, views=4, sigma=0.5, generator=torch.Generator().manual_seed(7))
-    tracks, draw = scene.tracks.clone(), torch.Generator().manual_seed(1)
+    scene = scenes.lifted_points("constant_velocity_2d", 80, views=4, sigma=0.5, generator=seeded(7))
+    tracks, draw = scene.tracks.clone(), seeded(1)
     # 2.5 px is no gross error
     off = 2.5 * torch.ones(1, 2) if wrong == 1 else 100 * torch.randn(wrong, 2, generator=draw)
     tracks[2, :wrong] += off.double()

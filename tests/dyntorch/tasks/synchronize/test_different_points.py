@@ -10,16 +10,13 @@ from dyntorch import scenes
 from dyntorch.tasks.synchronize.different_points import _refuse_coarse
 from dyntorch.tasks.synchronize.subspace import SubspaceShift
 from dyntorch.tasks.synchronize.synchronize import synchronize
+from tests.draws import random, seeded
 
 FRAME = 1 / 30
 
 
 def uniform(seed, *shape):
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def normal(seed, *shape):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.rand(*shape, generator=seeded(seed), dtype=torch.float64)
 
 
 class Body:
@@ -27,14 +24,14 @@ class Body:
 
     def __init__(self, seed=0, ways=6):
         self.places = 0.3 * torch.arange(400, dtype=torch.float64) - 20
-        self.values = normal(seed, 400, ways)
+        self.values = random(400, ways, seed=seed)
 
     def film(self, times, points, key, noise=0.5):
         near = torch.exp(-0.5 * ((times[:, None] - self.places) / 0.25).square())  # smooth noise in time
         ways = near @ self.values
-        place = 400 + 60 * normal(key, 1, points, 2)
-        mix = 12 * normal(key + 1, ways.shape[1], points, 2) + 20 * normal(key + 2, ways.shape[1], 1, 2)
-        return place + torch.einsum("tk,knd->tnd", ways, mix) + noise * normal(key + 3, len(times), points, 2)
+        place = 400 + 60 * random(1, points, 2, seed=key)
+        mix = 12 * random(ways.shape[1], points, 2, seed=key + 1) + 20 * random(ways.shape[1], 1, 2, seed=key + 2)
+        return place + torch.einsum("tk,knd->tnd", ways, mix) + noise * random(len(times), points, 2, seed=key + 3)
 
 
 def clock(seconds, fps):
@@ -54,12 +51,12 @@ def synced(a, b, **more):
 @pytest.mark.slow
 def test_the_same_tracks_get_the_same_digits():
     """Least squares by the default driver would read memory that nobody wrote."""
-    scene = scenes.nonrigid_pair(10, 8, 90, sigma=0.3, offset=0.2, generator=torch.Generator().manual_seed(1))
+    scene = scenes.nonrigid_pair(10, 8, 90, sigma=0.3, offset=0.2, generator=seeded(1))
 
     def found(turn):
         for n in range(1, 40):  # what memory that was freed holds is something else every time
-            torch.randint(0, 3, (n,), dtype=torch.int32, generator=torch.Generator().manual_seed(turn))
-        shift = synchronize(scene.a, scene.b, correspondence=False, fps=scene.fps, generator=torch.Generator().manual_seed(0))
+            torch.randint(0, 3, (n,), dtype=torch.int32, generator=seeded(turn))
+        shift = synchronize(scene.a, scene.b, correspondence=False, fps=scene.fps, generator=seeded())
         return [shift.offset, shift.sigma, shift.rate, shift.confidence, *shift.peaks.flatten().tolist(), *shift.scores.tolist()]
 
     first = np.array(found(0))
@@ -184,7 +181,7 @@ def test_a_shift_that_is_not_known_to_a_frame_of_fast_cameras_is_refused():
 @pytest.mark.parametrize("sigma", [0.0, 0.5])
 def test_straight_lines_at_constant_velocity_carry_no_time(sigma):
     # the size of the whole grows and shrinks about the middle of either take, which looked like one event
-    generator = torch.Generator().manual_seed(9010)
+    generator = seeded(9010)
     frames = torch.arange(120, dtype=torch.float64)[:, None, None]
 
     def tracks(n):

@@ -10,20 +10,16 @@ from dyntorch import synchronize, synchronize_cameras
 from dyntorch.numerics.lags import resection_moments
 from dyntorch.tasks.synchronize.motion_capture import (
     SpaceDescent,
-    SpaceSamples,
     _CombinationProblem,
     camera_variance,
     fit_combination,
 )
 from dyntorch.tasks.synchronize.result import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import read_tracks
+from tests.draws import seeded
 
 FPS, RECORDED = 30.0, 120.0
 OFFSET = 1.2345
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
 
 
 def normal(*shape, generator):
@@ -236,19 +232,6 @@ def test_points_in_a_plane_have_a_variance_and_nothing_has_none():
     assert nothing.isinf().all() and (camera == 0).all()
 
 
-def test_both_orders_have_the_same_moments():
-    film, space = taken(16, seconds=2.0, recorded=3.0, fps=(FPS, FPS))
-    a, b = (read_tracks(name, x, FPS, None, None) for name, x in zip("ab", (film, space), strict=True))
-    one, two = (SpaceSamples.of(*both, 1 / FPS) for both in ((a, b), (b, a)))
-    (first, counts), (second, back) = one.moments((-20, 30)), two.moments((-30, 20))
-    assert torch.allclose(first, second.flip(0)) and torch.equal(counts, back.flip(0))
-    variance, cameras = one.solve(first)
-    each, _ = one.moments((-20, 30), per_point=True)
-    shares = one.variances_by(cameras[5], each[:, 5])
-    weights = each[:, 5, 0] @ cameras[5, 2] @ cameras[5, 2]  # squared depths: what each point's variance counts for
-    assert float((shares * weights).sum() / weights.sum()) == pytest.approx(float(variance[5]), rel=1e-6)
-
-
 @pytest.mark.parametrize("swapped", [False, True])
 def test_the_derivatives_are_those_of_the_residuals(swapped):
     film, space = taken(17, noise=0.0)
@@ -262,7 +245,7 @@ def test_the_derivatives_are_those_of_the_residuals(swapped):
     changed = descent._residuals(camera, ahead, times)
     numeric = (changed.residual - rows.residual) / 1e-4
     assert float((numeric - rows.along).abs().median()) < 0.03 * float(rows.along.abs().median())
-    step = 1e-6 * normal(3, 4, generator=seeded(0))
+    step = 1e-6 * normal(3, 4, generator=seeded())
     moved = descent._residuals(camera + step, at, times).residual - rows.residual
     assert torch.allclose(rows.products @ step.flatten(), moved, atol=1e-3 * float(moved.abs().max()))
 

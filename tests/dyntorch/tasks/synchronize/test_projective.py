@@ -13,17 +13,14 @@ from dyntorch.tasks.synchronize.result import SynchronizeOptions
 from dyntorch.tasks.synchronize.rigid_body import body_motion
 from dyntorch.tasks.synchronize.synchronize import synchronize
 from dyntorch.tasks.synchronize.tracks import read_tracks
+from tests.draws import random
 
 D = torch.float64
 FAST = SynchronizeOptions(focal_lengths=(9.0,), num_views=14)
 
 
-def normal(seed, *shape):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=D)
-
-
 def attitudes(frames, seed=0, size=0.08):
-    return rotation_exponential(size * normal(seed, frames, 3).cumsum(0))
+    return rotation_exponential(size * random(frames, 3, seed=seed).cumsum(0))
 
 
 def test_quaternions_are_the_rotations_and_neighbours_stay_near():
@@ -35,7 +32,7 @@ def test_quaternions_are_the_rotations_and_neighbours_stay_near():
 
 @pytest.mark.slow
 def test_attitudes_at_all_lags_are_those_of_a_search():
-    x, y = (rotation_exponential(normal(seed, 3)) for seed in (1, 2))
+    x, y = (rotation_exponential(random(3, seed=seed)) for seed in (1, 2))
     a = attitudes(40)
     b = x @ a[4:] @ y
     angles, counts, _, _ = attitude_curve(quaternions(a), quaternions(b), torch.ones(40), torch.ones(36), (-10, 10))
@@ -45,7 +42,7 @@ def test_attitudes_at_all_lags_are_those_of_a_search():
         own, other = a[: 36 - lag], b[lag:36]
         best = math.inf
         for start in range(6):
-            left, right = rotation_exponential(normal(10 + start, 3)), rotation_exponential(normal(20 + start, 3))
+            left, right = rotation_exponential(random(3, seed=10 + start)), rotation_exponential(random(3, seed=20 + start))
             for _ in range(200):
                 u, _, v = torch.linalg.svd((other @ (own @ right).mT).sum(0))
                 left = u @ torch.diag(torch.tensor([1.0, 1.0, torch.det(u @ v)], dtype=D)) @ v
@@ -57,8 +54,8 @@ def test_attitudes_at_all_lags_are_those_of_a_search():
 
 
 def test_rank_test_is_exact_at_the_right_frame():
-    poses = torch.cat([attitudes(160), normal(3, 160, 3, 1).cumsum(0)], -1)
-    turn, seat = normal(4, 3, 3), torch.cat([normal(5, 3, 4), torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=D)])
+    poses = torch.cat([attitudes(160), random(160, 3, 1, seed=3).cumsum(0)], -1)
+    turn, seat = random(3, 3, seed=4), torch.cat([random(3, 4, seed=5), torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=D)])
     b = (turn @ poses @ seat + torch.tensor([0.0, 0.0, 0.0, 2.0], dtype=D))[9:]
     left, counts = rank_curve(poses, b, torch.ones(160), torch.ones(151), (-40, 40))
     assert int(left.argmin()) - 40 == -9 and float(left.min()) < 1e-12 and float(left.sort().values[1]) > 1e-4
@@ -71,15 +68,15 @@ def test_rank_test_is_exact_at_the_right_frame():
 
 def test_derivatives_of_the_shared_motion():
     def poses(seed, frames, scale):
-        turns = rotation_exponential((0.1 * normal(seed, frames, 3)).cumsum(0))
-        values = torch.cat([quaternions(turns), normal(seed + 1, frames, 3).cumsum(0)], -1)
+        turns = rotation_exponential((0.1 * random(frames, 3, seed=seed)).cumsum(0))
+        values = torch.cat([quaternions(turns), random(frames, 3, seed=seed + 1).cumsum(0)], -1)
         return Poses(torch.arange(frames, dtype=D) / 30, values, scale * torch.eye(6, dtype=D).expand(frames, 6, 6))
 
     # the weights are constants of a step: only b's, which do not turn with the parameters, are compared
     a, b = poses(1, 30, 0.0), poses(3, 34, 1.0)
     problem = SharedMotion(a, b, torch.tensor([[0.06, 1.0]], dtype=D), 0.05, torch.ones(15, dtype=D))
-    turns = [rotation_exponential(normal(seed, 1, 3)) for seed in (5, 6)]
-    theta = (problem.start.clone(), *turns, normal(7, 1, 7))
+    turns = [rotation_exponential(random(1, 3, seed=seed)) for seed in (5, 6)]
+    theta = (problem.start.clone(), *turns, random(1, 7, seed=7))
     slope = problem.linear(theta)[1]
     for k in range(15):
         near = 1e-6 if k else 1e-7
@@ -96,10 +93,10 @@ def film(points, turns, place):
 
 
 def body_tracks(points=None, frames=40, turning=1.0, noise=0.3, seed=0):
-    points = 0.3 * normal(seed, 7, 3) if points is None else points
-    turns = rotation_exponential(turning * 0.06 * normal(seed + 1, frames, 3).cumsum(0))
-    x = film(points, turns, 0.02 * normal(seed + 2, frames, 3).cumsum(0))
-    return x + noise * normal(seed + 3, *x.shape)
+    points = 0.3 * random(7, 3, seed=seed) if points is None else points
+    turns = rotation_exponential(turning * 0.06 * random(frames, 3, seed=seed + 1).cumsum(0))
+    x = film(points, turns, 0.02 * random(frames, 3, seed=seed + 2).cumsum(0))
+    return x + noise * random(*x.shape, seed=seed + 3)
 
 
 def motion_of(x):
@@ -114,10 +111,10 @@ def smooth(x):
 @pytest.mark.parametrize(
     ("tracks", "code"),
     [
-        (lambda: body_tracks(0.3 * normal(0, 5, 3)), "few_on_body"),
-        (lambda: body_tracks(0.3 * normal(0, 8, 3) * torch.tensor([1.0, 1.0, 0.0])), "flat_body"),
+        (lambda: body_tracks(0.3 * random(5, 3, seed=0)), "few_on_body"),
+        (lambda: body_tracks(0.3 * random(8, 3, seed=0) * torch.tensor([1.0, 1.0, 0.0])), "flat_body"),
         (lambda: body_tracks(turning=0.0, noise=0.0), "no_turn"),
-        (lambda: smooth(200 * normal(9, 40, 6, 2)) + 100 * normal(8, 6, 2), "no_body"),
+        (lambda: smooth(200 * random(40, 6, 2, seed=9)) + 100 * random(6, 2, seed=8), "no_body"),
     ],
 )
 def test_what_a_camera_alone_is_refused_for(tracks, code):
@@ -128,7 +125,7 @@ def test_what_a_camera_alone_is_refused_for(tracks, code):
 
 @pytest.mark.slow
 def test_gaps_and_lost_points_are_left_out():
-    x = body_tracks(0.3 * normal(0, 8, 3), frames=60)
+    x = body_tracks(0.3 * random(8, 3, seed=0), frames=60)
     whole = motion_of(x)
     x[10:20, 0], x[30:36, 3:], x[:, 7] = math.nan, math.nan, math.nan
     found = motion_of(x)

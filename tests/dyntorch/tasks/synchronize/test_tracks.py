@@ -8,10 +8,7 @@ import torch
 
 from dyntorch.scenes import filmed_person
 from dyntorch.tasks.synchronize.tracks import noise_ratio, read_tracks, reject_outliers, remove_positions, scale_frames, smooth_at
-
-
-def seeded(seed=0):
-    return torch.Generator().manual_seed(seed)
+from tests.draws import seeded
 
 
 def tracks_of(x, fps=30.0, times=None, weights=None):
@@ -191,6 +188,7 @@ def test_planted_outliers_go(share):
         gone = removed(tracks, reject_outliers(tracks))
         assert float((far & gone).sum() / far.sum()) > 0.93
         assert float((gone & ~far).sum() / (~far).sum()) < 0.03
+        assert torch.equal(gone, removed(tracks, reject_outliers(tracks_of(4 * scene.a + 1000))))  # whatever the scale
 
 
 def test_one_wrong_position_goes_and_nothing_else():
@@ -221,12 +219,6 @@ def test_rounding_and_sudden_movements_stay():
     }
     lost = {name: int(removed(tracks_of(x), reject_outliers(tracks_of(x))).sum()) for name, (x, _) in cases.items()}
     assert not {name: number for name, number in lost.items() if number > cases[name][1]}
-
-
-def test_what_scale_the_picture_has_does_not_matter():
-    x = filmed_person(8, seconds=2.0, noise=1.0, outliers=0.1, generator=seeded(3)).a
-    one, two = reject_outliers(tracks_of(x)), reject_outliers(tracks_of(4 * x + 1000))
-    assert torch.equal(one.weights, two.weights)
 
 
 def test_what_outliers_have_no_say_in():

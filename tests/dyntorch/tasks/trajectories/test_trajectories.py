@@ -7,11 +7,12 @@ from dyntorch import TrajectoryOptions
 from dyntorch.geometry.extensors import plucker
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
 from dyntorch.tasks.trajectories.trajectories import LineStatus, points_on_lines, trajectory_cameras, triangulate_trajectories
+from tests.draws import seeded
 
 
 def scene(views, n, batch=(), *, sigma=0.0, centres=None, seed=0):
     """Cameras at 5 units around points that jump along lines: cameras, images, points ``(*batch, views, n, 3)`` and lines."""
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
 
     def random(*shape):
         return torch.randn(*batch, *shape, generator=g, dtype=torch.float64)
@@ -94,7 +95,7 @@ def test_noise_is_estimated_and_the_uncertainty_is_honest():
     told = triangulate_trajectories(cameras, x, sigma=0.5)
     torch.testing.assert_close(told.lines, found.lines)
     x, _ = still(cameras, x, points, 30)
-    resting = x[..., :30, :] + 0.5 * torch.randn(5, 8, 30, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    resting = x[..., :30, :] + 0.5 * torch.randn(5, 8, 30, 2, generator=seeded(1), dtype=torch.float64)
     kinds = triangulate_trajectories(cameras, resting, sigma=0.5).kinds
     assert (kinds == LineStatus.STATIC).double().mean() > 0.98
 
@@ -108,7 +109,7 @@ def test_refinement_is_a_minimum():
         return (inhomogeneous(image) - x).square().sum((0, -1))
 
     torch.testing.assert_close((cost(found.lines) / 6).sqrt(), found.residual)
-    g = torch.Generator().manual_seed(3)
+    g = seeded(3)
     ends = found.points[[0, -1]].movedim(0, 1)  # two points of each line
     for _ in range(50):
         moved = ends + 1e-4 * torch.randn(ends.shape, generator=g, dtype=torch.float64)
@@ -117,7 +118,7 @@ def test_refinement_is_a_minimum():
 
 def test_a_change_of_the_world_and_the_images_commutes():
     cameras, x, _, _ = scene(6, 20, sigma=0.5)
-    T = torch.eye(4).double() + 0.05 * torch.randn(4, 4, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    T = torch.eye(4).double() + 0.05 * torch.randn(4, 4, generator=seeded(4), dtype=torch.float64)
     shift = torch.tensor([[0.0, -2.0, 10.0], [2.0, 0.0, -30.0], [0.0, 0.0, 1.0]]).double()  # a similarity of scale 2
     one, two = triangulate_trajectories(cameras, x), triangulate_trajectories(shift @ cameras @ T, apply(shift.expand(6, 3, 3), x))
     torch.testing.assert_close(apply(T.expand(6, 4, 4), two.points), one.points, rtol=1e-6, atol=1e-6)
@@ -155,7 +156,7 @@ def test_missing_views_weights_batches_and_failures():
 
 def test_gradients_of_points():
     cameras, x, _, _ = scene(6, 2, sigma=0.5)
-    w = torch.randn(6, 2, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    w = torch.randn(6, 2, 3, generator=seeded(5), dtype=torch.float64)
 
     def value(x):
         return (triangulate_trajectories(cameras, x, sigma=0.5).points * w).sum()
