@@ -225,7 +225,7 @@ H = dyn.HomographyTensor
 LENS = (torch.diag(torch.tensor([1000.0, 1000, 1])), [-0.1, 0, 0, 0])
 VERBS: tuple[Verb, ...] = (
     Verb("fit", planar, lambda *x: dyn.fit(H, *x)),
-    Verb("fit weights", lambda: (*planar(), randn(40).abs()), lambda *x: dyn.fit(H, *x[:3], weights=x[3])),
+    Verb("fit weights", lambda: (*planar(), torch.linspace(0.5, 1.5, 40, dtype=F64)), lambda *x: dyn.fit(H, *x[:3], weights=x[3])),
     Verb("robust_fit", planar, lambda *x: dyn.robust_fit(H, *x, threshold=1.5, generator=draw())),
     Verb("refine", planar, lambda *x: dyn.refine(dyn.fit(H, *x), *x)),
     Verb(

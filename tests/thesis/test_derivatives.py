@@ -5,13 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from torch.func import grad, hessian, jacrev, jvp, vmap
+from torch.func import grad, jacrev, jvp, vmap
 
 import dyntorch as dyn
-
-
-def drawn(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from tests.draws import random as drawn
 
 
 def moving_points_of_a_plane(n: int, seed: int = 0, noise: float = 1e-3) -> tuple[Tensor, ...]:
@@ -120,17 +117,3 @@ def test_a_missing_point_does_not_spoil_the_gradient_of_the_others():
         slopes = torch.autograd.grad(found.tensor.sin().sum(), inputs)
         assert all(s.isfinite().all() for s in slopes)
         assert slopes[0][torch.isnan(x)].eq(0).all() and slopes[0][7].eq(0).all()
-
-
-@pytest.mark.slow
-def test_hessian_of_the_noise_that_refinement_leaves():
-    """Chapter 2's criterion at its minimum: the second derivative of the least cost, by finite differences of the first."""
-    y = drawn(7, 1)
-    x = (2 * y + 1) / (0.3 * y + 3) + 0.02 * drawn(7, 1, seed=1)
-
-    def noise(x: Tensor) -> Tensor:
-        return dyn.refine(dyn.fit(dyn.Collineation(1), x, y), x, y).sigma
-
-    found, h = hessian(noise)(x)[:, 0, :, 0], 1e-4
-    slopes = [(grad(noise)(x + h * e[:, None]) - grad(noise)(x - h * e[:, None]))[:, 0] / (2 * h) for e in torch.eye(7).double()]
-    torch.testing.assert_close(found, torch.stack(slopes), rtol=1e-3, atol=1e-4 * float(found.abs().max()))

@@ -95,7 +95,7 @@ def test_the_error_falls_with_the_matches_and_their_noise() -> None:
 
 
 def test_both_solutions_of_one_homography_compose_it_and_one_is_true() -> None:
-    """H = R + t n^T for both, at either side of the plane; opencv finds the same two."""
+    """H = R + t n^T for both, at either side of the plane."""
     R, t, n = rotation_exponential(0.4 * normal_numbers(0, 20, 3)), 0.5 * normal_numbers(1, 20, 3), normal_numbers(2, 20, 3)
     n = n / n.norm(dim=-1, keepdim=True) * n[:, 2:].sign()
     H = R + t[..., None] * n[:, None]
@@ -107,22 +107,6 @@ def test_both_solutions_of_one_homography_compose_it_and_one_is_true() -> None:
     assert float(near.max()) < 1e-7
     still = plane_motions(R)
     assert float(still.translations.abs().max()) < 1e-12 and float((still.rotations - R[:, None]).abs().max()) < 1e-7
-
-
-def test_opencv_decomposes_into_the_same_motions() -> None:
-    cv2 = pytest.importorskip("cv2")
-    R, t, n = rotation_exponential(0.4 * normal_numbers(3, 5, 3)), 0.3 * normal_numbers(4, 5, 3), normal_numbers(5, 5, 3)
-    n = n / n.norm(dim=-1, keepdim=True) * n[:, 2:].sign()
-    for H in R + t[..., None] * n[:, None]:
-        _, turns, shifts, normals = cv2.decomposeHomographyMat((K @ H @ K.inverse()).numpy(), K.numpy())
-        found = plane_motions(H)
-        for i in range(2):
-            mine = torch.cat([found.rotations[i].reshape(-1), (found.translations[i][:, None] * found.normal[i]).reshape(-1)])
-            theirs = [
-                torch.cat([torch.from_numpy(a).reshape(-1), torch.from_numpy(b @ c.T).reshape(-1)])
-                for a, b, c in zip(turns, shifts, normals, strict=True)
-            ]
-            assert min(float((mine - other).abs().max()) for other in theirs) < 1e-6
 
 
 def test_derivatives_of_the_conditions_against_differences() -> None:

@@ -10,27 +10,10 @@ import pytest
 import torch
 
 import dyntorch as dyn
+from tests.thesis.test_minimal_conditions import PRIME, rank
 
 D = torch.float64
-PRIME = 2_147_483_629
 FPS = 30.0
-
-
-def rank_mod(rows):
-    """The exact rank of a list of rows of integers over the prime field."""
-    rows, rank = [[int(v) % PRIME for v in row] for row in rows], 0
-    for column in range(len(rows[0])):
-        pivot = next((i for i in range(rank, len(rows)) if rows[i][column]), None)
-        if pivot is None:
-            continue
-        rows[rank], rows[pivot] = rows[pivot], rows[rank]
-        inverse = pow(rows[rank][column], -1, PRIME)
-        for i in range(rank + 1, len(rows)):
-            factor = rows[i][column] * inverse % PRIME
-            if factor:
-                rows[i] = [(x - factor * y) % PRIME for x, y in zip(rows[i], rows[rank], strict=True)]
-        rank += 1
-    return rank
 
 
 def cayley(a, b, c):
@@ -57,12 +40,12 @@ def test_exact_ranks_of_measurements_scaled_by_depth():
         points = [[*draw(3), 1] for _ in range(n)]
         table = []
         for motion in motions:
-            placed = [[sum(m * x for m, x in zip(row, point, strict=True)) for row in motion] + [1] for point in points]
+            placed = [[sum(m * x for m, x in zip(row, point, strict=True)) % PRIME for row in motion] + [1] for point in points]
             table.append([sum(p * x for p, x in zip(row, point, strict=True)) for point in placed for row in camera])
         return table
 
     def joined(*parts):
-        return rank_mod([[*chain(*row)] for row in zip(*parts, strict=True)])
+        return rank([[*chain(*row)] for row in zip(*parts, strict=True)])
 
     a, b, one = filmed(draw(3, 4)), filmed(draw(3, 4)), [[1]] * frames
     # a camera's 12 rows are combinations of the 12 entries of the motion and of 1: each a space of 12 dimensions
