@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import pickle
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +17,7 @@ from indexing.labels.format import registered_formats as label_formats
 from indexing.readers import FORMATS
 from indexing.readers.files import detect, open_source
 from tests.indexing.readers import tools
+from tests.indexing.readers.test_files import SAMPLES
 
 FRAMES, JOINTS = 8, 17
 
@@ -53,7 +53,7 @@ def _registered(folder: Path, known: list[Seed]) -> list[Seed]:
     """A file of every format of keypoints that has none above, as the test of its reader makes it."""
     lacking = set(FORMATS) - {detect(open_source(seed.path)) for seed in known if seed.read is keypoints}
     seeds = []
-    for number, make_sample in enumerate(tools.samples().values() if lacking else ()):
+    for number, make_sample in enumerate(SAMPLES.values() if lacking else ()):
         place = folder / f"sample{number}"
         place.mkdir()
         path = make_sample(place).path
@@ -182,7 +182,7 @@ def _arrays(folder: Path, people: np.ndarray) -> list[Seed]:
     data = folder / "freemocap" / "output_data"
     data.mkdir(parents=True)
     np.save(data / "mediapipe_body_3d_xyz.npy", body)
-    written(folder / "recording.c3d", c3d())
+    written(folder / "recording.c3d", tools.c3d())
     one = {"label": 1, "img_shape": (480, 640), "keypoint": people[None, ..., :2], "keypoint_score": people[None, ..., 2]}
     annotations = [{"frame_dir": f"clip{i}", "total_frames": FRAMES, **one} for i in range(2)]
     for protocol in (0, 4):
@@ -317,23 +317,6 @@ def points(path: Path) -> Any:
     return read_matches([path], frames=(1, 2, 3)) if path.suffix == ".c3d" else open_points(path)
 
 
-def c3d(frames: int = 5, count: int = 4) -> bytes:
-    """A C3D file of reals, with names of its markers."""
-
-    def parameter(name: str, code: int, sides: tuple[int, ...], raw: bytes, last: bool = False) -> bytes:
-        body = struct.pack("bB", code, len(sides)) + bytes(sides) + raw + b"\0"
-        return struct.pack("bb", len(name), 1) + name.encode() + struct.pack("<h", 0 if last else 2 + len(body)) + body
-
-    group = struct.pack("bb", 5, -1) + b"POINT" + struct.pack("<h", 3) + b"\0"
-    names = b"".join(f"mk{i}".encode().ljust(4) for i in range(count))
-    section = group + parameter("LABELS", -1, (4, count), names) + parameter("FRAMES", 2, (), struct.pack("<h", frames), last=True)
-    section = (bytes([1, 80, 2, 84]) + section).ljust(1024, b"\0")
-    head = struct.pack("<BB4HHfHH", 2, 80, count, 0, 1, frames, 0, -1.0, 4, 0).ljust(512, b"\0")
-    rng = np.random.default_rng(0)
-    values = np.concatenate([rng.normal(size=(frames, count, 3)) * 100, np.zeros((frames, count, 1))], 2)
-    return head + section + values.astype("<f4").tobytes()
-
-
 def _points(folder: Path) -> list[Seed]:
     rng = np.random.default_rng(1)
     xy, xyz = rng.uniform(0, 500, (12, 2)).round(2), rng.normal(size=(12, 3)).round(3)
@@ -359,7 +342,7 @@ def _points(folder: Path) -> list[Seed]:
         "lines.csv": lines,
         "ascii.ply": ascii_ply,
         "binary.ply": binary,
-        "marks.c3d": c3d(),
+        "marks.c3d": tools.c3d(),
     }
     for name, value in files.items():
         written(folder / name, value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ def coco_results(person: np.ndarray, image: Callable[[int], Any] = int, **extra:
 
 
 def coco_dataset(person: np.ndarray, offset: int = 100) -> dict[str, Any]:
-    people = [{"id": i, "image_id": offset + i, "category_id": 1, "keypoints": triples(p)} for i, p in enumerate(person)]
+    people = [{"id": i, "image_id": offset + i, "keypoints": triples(p), "track_id": 3} for i, p in enumerate(person)]
     return {
         "images": [{"id": offset + i, "file_name": f"walk/{i:06d}.jpg", "width": 640, "height": 480} for i in range(len(person))],
         "annotations": people,
@@ -74,7 +75,7 @@ VARIANTS: dict[str, Callable[[np.ndarray], Any]] = {
     "mmpose inferencer": lambda p: [{"frame_id": i, "instances": [mmpose_instance(one)]} for i, one in enumerate(p)],
     "mmpose demo": lambda p: {
         "meta_info": META,
-        "instance_info": [{"frame_id": i + 1, "instances": [mmpose_instance(one)]} for i, one in enumerate(p)],
+        "instance_info": [{"frame_id": i + 1, "instances": [mmpose_instance(one, track_id=4)]} for i, one in enumerate(p)],
     },
     "mmpose nested": lambda p: [[mmpose_instance(one) | {"keypoints": [one[:, :2].tolist()]}] for one in p],
     "ultralytics frames": lambda p: [[yolo_person(one)] for one in p],
@@ -254,17 +255,17 @@ Rows = Sequence[Sequence[Any]]
 NAMES = COCO17.joints
 
 
+def save_rows(path: Path, rows: Rows, delimiter: str = ",") -> Path:
+    cells = [["" if cell is None or cell != cell else str(cell) for cell in row] for row in rows]
+    if delimiter == ";":  # a spreadsheet in a country with decimal commas
+        cells = [[cell.replace(".", ",") if cell[-1:].isdigit() else cell for cell in row] for row in cells]
+    path.write_text("".join(f"{delimiter.join(row)}\n" for row in cells))
+    return path
+
+
 @pytest.fixture
 def write_csv(tmp_path: Path) -> Callable[..., Path]:
-    def write(rows: Rows, name: str = "take.csv", delimiter: str = ",") -> Path:
-        path = tmp_path / name
-        cells = [["" if cell is None or cell != cell else str(cell) for cell in row] for row in rows]
-        if delimiter == ";":  # a spreadsheet in a country with decimal commas
-            cells = [[cell.replace(".", ",") if cell[-1:].isdigit() else cell for cell in row] for row in cells]
-        path.write_text("".join(f"{delimiter.join(row)}\n" for row in cells))
-        return path
-
-    return write
+    return partial(save_rows, tmp_path / "take.csv")
 
 
 def deeplabcut(person: np.ndarray, index: Callable[[int], Any] = int) -> list[list[Any]]:

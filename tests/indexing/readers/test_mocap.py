@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
 from indexing.readers import read, read_clip
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17, H36M17, HALPE26, HALPE136, MEDIAPIPE33, WHOLEBODY133
-from tests.fuzz.seeds import c3d
+from tests.grid import grid
 from tests.indexing.readers import tools
 from tests.indexing.readers.tools import refused
 
@@ -37,8 +37,7 @@ def table(
     return path
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-@pytest.mark.parametrize("first", ["time", "t", "Seconds", "frame", None])
+@grid(("delimiter", [",", ";", "\t"]), ("first", ["time", "t", "Seconds", "frame", None]))
 def test_coordinates_and_times_are_those_of_the_table(tmp_path: Path, first: str | None, delimiter: str) -> None:
     clip = read_clip(table(tmp_path / "a.csv", POINTS, first=first, delimiter=delimiter), fps=50.0)
     np.testing.assert_array_equal(clip.joints, POINTS)
@@ -78,37 +77,33 @@ def test_a_row_per_point_and_people_in_a_column(tmp_path: Path) -> None:
     np.testing.assert_allclose(second.joints - first.joints, 9)
 
 
-def test_a_confidence_is_kept(tmp_path: Path) -> None:
-    clip = read_clip(table(tmp_path / "a.csv", POINTS, more="score"))
-    assert clip.dims == 3 and clip.confidence is not None and (clip.confidence == 0.5).all()
-
-
-@pytest.mark.parametrize(
-    ("names", "more", "scale", "dims"),
-    [
-        (MEDIAPIPE33.joints, "visibility", 1000.0, 2),
-        (MEDIAPIPE33.joints, "visibility", 1.0, 2),
-        (MEDIAPIPE33.joints, "", 1.0, 2),
-        (NAMES, "visibility", 1000.0, 2),
-        (NAMES, "confidence", 1.0, 2),
-        (NAMES, "confidence", 1000.0, 3),
-        (NAMES, "", 1000.0, 3),
-        (MEDIAPIPE33.joints[11:], "", 1000.0, 3),
-    ],
+@grid(
+    (
+        ("names", "more", "scale", "dims"),
+        [
+            (MEDIAPIPE33.joints, "visibility", 1000.0, 2),
+            (MEDIAPIPE33.joints, "visibility", 1.0, 2),
+            (MEDIAPIPE33.joints, "", 1.0, 2),
+            (NAMES, "visibility", 1000.0, 2),
+            (NAMES, "confidence", 1.0, 2),
+            (NAMES, "confidence", 1000.0, 3),
+            (NAMES, "", 1000.0, 3),
+            (MEDIAPIPE33.joints[11:], "", 1000.0, 3),
+        ],
+    )
 )
 def test_what_tells_them_from_mediapipe(tmp_path: Path, names: Sequence[str], more: str, scale: float, dims: int) -> None:
     points = scale * np.random.default_rng(1).uniform(0.1, 0.9, size=(4, len(names), 3))
-    assert read_clip(table(tmp_path / "a.csv", points, names, more=more)).dims == dims
+    clip = read_clip(table(tmp_path / "a.csv", points, names, more=more))
+    assert clip.dims == dims
+    assert (clip.confidence is not None) == bool(more) and (not more or (clip.confidence == 0.5).all())
 
 
-@pytest.mark.parametrize(
-    ("names", "scale", "word"), [(NAMES, 1.0, "from 0 to 1"), (MEDIAPIPE33.joints, 1000.0, "MediaPipe's landmarks")]
-)
-def test_what_may_be_either_is_refused_until_it_is_said(tmp_path: Path, names: Sequence[str], scale: float, word: str) -> None:
-    points = scale * np.random.default_rng(1).uniform(0.1, 0.9, size=(4, len(names), 3))
-    path = table(tmp_path / "a.csv", points, names)
-    refused(path, word, "format='mocap'", "format='mediapipe'")
-    assert read_clip(path, format="mocap").dims == 3 and read_clip(path, format="mediapipe").dims == 2
+def test_what_may_be_either_is_refused_until_it_is_said(tmp_path: Path) -> None:
+    for names, scale, word in ((NAMES, 1.0, "from 0 to 1"), (MEDIAPIPE33.joints, 1000.0, "MediaPipe's landmarks")):
+        path = table(tmp_path / "a.csv", scale * np.random.default_rng(1).uniform(0.1, 0.9, size=(4, len(names), 3)), names)
+        refused(path, word, "format='mocap'", "format='mediapipe'")
+        assert read_clip(path, format="mocap").dims == 3 and read_clip(path, format="mediapipe").dims == 2
 
 
 def test_tables_without_z_of_every_point(tmp_path: Path) -> None:
@@ -130,7 +125,7 @@ HALPE_NAMES = HALPE26.joints
 
 
 # ---- TRC -----------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("mm", 0.001), ("cm", 0.01)])
+@grid((("units", "scale"), [("m", 1.0), ("mm", 0.001), ("cm", 0.01)]))
 def test_trc_is_metres_with_its_own_times(units: str, scale: float, tmp_path: Path) -> None:
     points = HALPE_POINTS.copy()
     points[2, 3] = np.nan
@@ -154,11 +149,10 @@ def test_trc_that_starts_later_keeps_its_clock(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_clip(path).times, np.arange(12) / 60)  # no times: frame number / DataRate
 
 
-@pytest.mark.parametrize("up", [(0, 2, 1), (0, 1, 2)])
-def test_the_direction_up_is_the_bodys(up: tuple[int, int, int], tmp_path: Path) -> None:
-    clip = read_clip(tools.trc(tmp_path / "a.trc", HALPE_POINTS[..., list(up)], HALPE_NAMES))
-    assert clip.up == ("z" if up[1] == 2 else "y")
-    assert read_clip(tools.trc(tmp_path / "b.trc", HALPE_POINTS[..., list(up)], [f"M{i}" for i in range(26)])).up == "y"
+def test_the_direction_up_is_the_bodys(tmp_path: Path) -> None:
+    for axes, up in (([0, 2, 1], "z"), ([0, 1, 2], "y")):
+        assert read_clip(tools.trc(tmp_path / "a.trc", HALPE_POINTS[..., axes], HALPE_NAMES)).up == up
+        assert read_clip(tools.trc(tmp_path / "b.trc", HALPE_POINTS[..., axes], [f"M{i}" for i in range(26)])).up == "y"
 
 
 def test_people_of_a_marker_file_have_names_before_a_colon(tmp_path: Path) -> None:
@@ -171,52 +165,46 @@ def test_people_of_a_marker_file_have_names_before_a_colon(tmp_path: Path) -> No
     assert alone.skeleton is not None and alone.skeleton.joints == HALPE_NAMES
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("PathFileType", "PathFileTyp", ("",)),
-        ("Frame#", "Rows", ("begins with Frame#",)),
-        ("\tm\t", "\tfeet\t", ("Units is 'feet'",)),
-        ("nose", "left_eye", ("names the marker 'left_eye' twice",)),
-        ("12\t26", "12\t25", ("NumMarkers is 25, but line 4 names 26",)),
-        ("1\t0.000000", "x\t0.000000", ("line 6, 'Frame#': 'x' is no number",)),
-        ("0.016667", "abc", ("line 7, 'Time'", "'abc'")),
-        ("3\t0.033333", "2\t0.033333", ("frame numbers must increase",)),
-        ("0.033333", "0.016667", ("times must increase",)),
-        ("\n3\t0.033333", "\n3\t0.033333\t" + "1\t" * 90, ("line 8 has", "26 markers")),
-        ("60.0\t60.0\t12", "1e30\t60.0\t12", ("DataRate",)),
-        ("\n1\t0.000000", "\n1\tinf", ("no time, or one beyond any recording",)),
-    ],
-)
-def test_broken_marker_files_are_refused(old: str, new: str, words: tuple[str, ...], tmp_path: Path) -> None:
+BROKEN = [
+    ("PathFileType", "PathFileTyp", ("",)),
+    ("Frame#", "Rows", ("begins with Frame#",)),
+    ("\tm\t", "\tfeet\t", ("Units is 'feet'",)),
+    ("nose", "left_eye", ("names the marker 'left_eye' twice",)),
+    ("12\t26", "12\t25", ("NumMarkers is 25, but line 4 names 26",)),
+    ("1\t0.000000", "x\t0.000000", ("line 6, 'Frame#': 'x' is no number",)),
+    ("0.016667", "abc", ("line 7, 'Time'", "'abc'")),
+    ("3\t0.033333", "2\t0.033333", ("frame numbers must increase",)),
+    ("0.033333", "0.016667", ("times must increase",)),
+    ("\n3\t0.033333", "\n3\t0.033333\t" + "1\t" * 90, ("line 8 has", "26 markers")),
+    ("60.0\t60.0\t12", "1e30\t60.0\t12", ("DataRate",)),
+    ("\n1\t0.000000", "\n1\tinf", ("no time, or one beyond any recording",)),
+]
+
+
+def test_broken_marker_files_are_refused(tmp_path: Path) -> None:
     path = tools.trc(tmp_path / "a.trc", HALPE_POINTS, HALPE_NAMES)
     text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
-    refused(path, *words)
-
-
-def test_marker_files_that_are_cut_off_or_empty(tmp_path: Path) -> None:
-    path = tools.trc(tmp_path / "a.trc", HALPE_POINTS, HALPE_NAMES)
-    lines = path.read_text().split("\n")
-    for count, word in ((2, "three lines of header"), (4, "no frames"), (5, "no frames")):
-        path.write_text("\n".join(lines[:count]))
-        refused(path, word)
-    path.write_text("\n".join([*lines[:9], lines[9][:1]]))
-    refused(path, "line 10 has no frame and time")
-    path = tools.trc(tmp_path / "b.trc", np.full_like(HALPE_POINTS, np.nan), HALPE_NAMES)
+    lines = text.split("\n")
+    cases = [(text.replace(old, new, 1), words) for old, new, words in BROKEN if old in text]
+    assert len(cases) == len(BROKEN)
+    cases += [
+        ("\n".join(lines[:count]), (word,)) for count, word in ((2, "three lines of header"), (4, "no frames"), (5, "no frames"))
+    ]
+    for content, words in [*cases, ("\n".join([*lines[:9], lines[9][:1]]), ("line 10 has no frame and time",))]:
+        path.write_text(content)
+        refused(path, *words)
     with pytest.raises(NobodySeen):
-        read(path)
+        read(tools.trc(tmp_path / "b.trc", np.full_like(HALPE_POINTS, np.nan), HALPE_NAMES))
 
 
 # ---- C3D -----------------------------------------------------------------------------------------------------------------
 def test_c3d_is_a_recording(tmp_path: Path) -> None:
-    (tmp_path / "a.c3d").write_bytes(c3d())
+    (tmp_path / "a.c3d").write_bytes(tools.c3d())
     clip = read_clip(tmp_path / "a.c3d", fps=50.0)
     assert (len(clip), clip.joints.shape[1:], clip.up) == (5, (4, 3), "z")
     assert clip.skeleton is not None and clip.skeleton.joints == ("mk0", "mk1", "mk2", "mk3")
     np.testing.assert_allclose(clip.times, np.arange(5) / 50)
-    (tmp_path / "b.c3d").write_bytes(c3d()[:700])
+    (tmp_path / "b.c3d").write_bytes(tools.c3d()[:700])
     refused(tmp_path / "b.c3d", "truncated")
     (tmp_path / "c.c3d").write_bytes(b"something else altogether")
     refused(tmp_path / "c.c3d", "C3D")
@@ -248,38 +236,34 @@ def test_a_third_number_beside_pixels_is_the_confidence(tmp_path: Path) -> None:
     refused(tmp_path / "a.npy", "it may be depth or confidence")
 
 
-@pytest.mark.parametrize("shape", [(3,), (4, 4), (2, 3, 4), (0, 17, 2), (2, 3, 4, 5)])
-def test_arrays_that_are_no_joints_over_time_are_refused(shape: tuple[int, ...], tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros(shape))
-    refused(tmp_path / "a.npy", "not joints over time", "np.savez(file, joints=array, fps=...)")
-
-
-def test_arrays_that_are_cut_off_or_of_objects_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", tools.standing(COCO17))
-    (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:500])
-    refused(tmp_path / "a.npy", "truncated")
-    np.save(tmp_path / "b.npy", np.array([{}, None], dtype=object), allow_pickle=True)
-    refused(tmp_path / "b.npy", "Python objects")
-    np.save(tmp_path / "c.npy", np.zeros((5, 17, 2)))
+def test_arrays_that_are_no_joints_over_time_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    for shape in ((3,), (4, 4), (2, 3, 4), (0, 17, 2), (2, 3, 4, 5)):
+        np.save(path, np.zeros(shape))
+        refused(path, "not joints over time", "np.savez(file, joints=array, fps=...)")
+    np.save(path, tools.standing(COCO17))
+    path.write_bytes(path.read_bytes()[:500])
+    refused(path, "truncated")
+    np.save(path, np.array([{}, None], dtype=object), allow_pickle=True)
+    refused(path, "Python objects")
+    np.save(path, np.zeros((5, 17, 2)))
     with pytest.raises(NobodySeen):
-        read(tmp_path / "c.npy")
+        read(path)
 
 
 # ---- FreeMoCap -----------------------------------------------------------------------------------------------------------
 BODY = 1000 * tools.standing(MEDIAPIPE33, dims=3)[..., [0, 2, 1]]
 
 
-@pytest.mark.parametrize("name", ["body", "skeleton", "old", "raw"])
+@grid(("name", ["body", "skeleton", "old", "raw"]))
 def test_a_recording_of_freemocap_opens_by_any_of_its_folders(name: str, tmp_path: Path) -> None:
-    folder = tools.freemocap(tmp_path / "session", BODY, name=name)
-    given = [folder, folder / "output_data", *(folder / "output_data").rglob("*[3d,l]_*.npy" if name != "raw" else "*3dData*.npy")]
-    for path in [path for path in given if "hand" not in path.name or path == folder]:
-        if path.name.startswith("mediapipe_right_hand"):
-            continue
+    folder = tools.freemocap(tmp_path / name / "session", BODY, name=name)
+    bodies = [path for path in (folder / "output_data").rglob("*.npy") if "hand_3d" not in path.name]
+    for path in [folder, folder / "output_data", *bodies]:
         clip = read_clip(path, fps=30.0)
         np.testing.assert_allclose(clip.joints, BODY)
         assert (clip.skeleton, clip.up, clip.dims) == (MEDIAPIPE33, "z", 3)
-    assert read_clip(folder).name == "session"
+    assert len(bodies) == 1 and read_clip(folder).name == "session"
 
 
 def test_without_3d_every_camera_of_freemocap_is_a_clip(tmp_path: Path) -> None:
@@ -294,38 +278,27 @@ def test_without_3d_every_camera_of_freemocap_is_a_clip(tmp_path: Path) -> None:
 
 def test_folders_of_arrays_that_are_no_body_are_refused(tmp_path: Path) -> None:
     folder = tools.freemocap(tmp_path / "session", BODY)
-    (folder / "output_data" / "mediapipe_body_3d_xyz.npy").unlink()
+    path = folder / "output_data" / "mediapipe_body_3d_xyz.npy"
+    path.unlink()
     refused(folder, "no array of a body (it has mediapipe")
-    np.save(folder / "output_data" / "mediapipe_body_3d_xyz.npy", BODY[:, :20])
-    with pytest.raises(ValueError, match=r"without the 33 points of a body"):
-        read(folder)
-    np.save(folder / "output_data" / "mediapipe_body_3d_xyz.npy", BODY[..., :2])
-    with pytest.raises(ValueError, match=r"have 2 coordinates"):
-        read(folder)
+    for values, said in ((BODY[:, :20], "without the 33 points of a body"), (BODY[..., :2], "have 2 coordinates")):
+        np.save(path, values)
+        with pytest.raises(ValueError, match=said):
+            read(folder)
     (tmp_path / "empty" / "output_data").mkdir(parents=True)
     refused(tmp_path / "empty", "no array of a body (it has none)")
 
 
 # ---- AlphaPose -----------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("form", ["coco", "open", "cmu"])
-@pytest.mark.parametrize("layout", [COCO17, HALPE26, WHOLEBODY133, HALPE136], ids=lambda layout: layout.name)
+@grid(("form", ["coco", "open", "cmu"]), ("layout", [COCO17, HALPE26, WHOLEBODY133, HALPE136]))
 def test_alphapose_writes_layouts_by_their_number(layout: Any, form: str, tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    person = np.concatenate(
-        [rng.uniform(10, 400, (6, len(layout.joints), 2)), rng.uniform(0.1, 1, (6, len(layout.joints), 1))], axis=2
-    )
+    rng, count = np.random.default_rng(0), len(layout.joints)
+    person = np.concatenate([rng.uniform(10, 400, (6, count, 2)), rng.uniform(0.1, 1, (6, count, 1))], axis=2)
     clip = read_clip(tools.alphapose(tmp_path / "alphapose-results.json", [person], form))
     assert clip.skeleton is layout
     np.testing.assert_allclose(clip.joints, person[..., :2])
     np.testing.assert_allclose(clip.confidence, person[..., 2])
     np.testing.assert_allclose(clip.times, np.arange(6) / 30)
-
-
-def test_people_of_alphapose_have_ids_where_it_tracked(tmp_path: Path, person: np.ndarray) -> None:
-    far = person.copy()
-    far[..., 0] += 300
-    clips = read(tools.alphapose(tmp_path / "alphapose-results.json", [person, far]), person="all")
-    assert [clip.meta["person"] for clip in clips] == [1, 2]
 
 
 # ---- MediaPipe's smoothing -----------------------------------------------------------------------------------------------
@@ -352,7 +325,7 @@ def landmarks(path: Path, points: np.ndarray) -> Path:
     return path
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.001, 0.003, 0.005, 0.01])
+@grid(("noise", [0.0, 0.001, 0.003, 0.005, 0.01]))
 def test_what_mediapipe_smoothed_is_always_said(noise: float, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     calm = np.clip(np.sin(np.arange(240) / 30), 0, None)[:, None, None]  # moves, and rests
@@ -371,28 +344,9 @@ def test_other_tables_are_not_mediapipes(tmp_path: Path, person: np.ndarray) -> 
 
 
 # ---- what is not read ----------------------------------------------------------------------------------------------------
-def test_frames_of_a_set_are_its_times(tmp_path: Path) -> None:
-    frame = [2, 4, 20, 22, 30]
-    np.savez(tmp_path / "a.npz", joints=tools.standing(COCO17)[:5], frame=frame, fps=10.0)
-    (clip,) = read(tmp_path / "a.npz")
-    np.testing.assert_allclose(clip.times, np.array(frame) / 10)
-    np.savez(tmp_path / "b.npz", joints=tools.standing(COCO17)[:5], frame=frame)
-    (clip,) = read(tmp_path / "b.npz", fps=5.0)
-    np.testing.assert_allclose(clip.times, np.array(frame) / 5)
-    np.savez(tmp_path / "c.npz", joints=tools.standing(COCO17)[:5], frame=frame[:4])
-    refused(tmp_path / "c.npz", "frame must be 5 numbers")
-
-
-def test_netcdf_3_says_what_to_do(tmp_path: Path) -> None:
+def test_other_netcdf_and_hdf5_say_what_they_are(tmp_path: Path) -> None:
     (tmp_path / "a.nc").write_bytes(b"CDF\x01" + bytes(60))
     refused(tmp_path / "a.nc", "netCDF file of version 3", "engine='h5netcdf'")
-
-
-def test_hdf5_of_something_else_says_what_it_has(tmp_path: Path) -> None:
-    import h5py
-
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["temperature"] = [1.0, 2.0]
     refused(tmp_path / "a.h5", "HDF5 without keypoints that a reader knows (it has temperature)")
-    (tmp_path / "b.json").write_text(json.dumps([1]))
-    refused(tmp_path / "b.json", "JSON without keypoints")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,8 @@ import pytest
 
 from indexing.readers.matches import Matched, open_points, read_matches
 from indexing.readers.points import PointSequence
-from tests.indexing.readers.tools import refused
+from tests.grid import grid
+from tests.indexing.readers.tools import c3d, refused
 
 XYZ = np.array([[1.0, 2.0, 3.0], [-4.5, 5.0, 6.25], [7.0, 8.0, -9.0]])
 
@@ -24,29 +24,6 @@ def ply(path: Path, order: str, rows: bytes, properties: str = "", count: int = 
     properties = properties or "".join(f"property float {axis}\n" for axis in "xyz")
     head = f"ply\nformat {order} 1.0\ncomment made here\n{before}element vertex {count}\n{properties}"
     path.write_bytes(f"{head}element face 0\nproperty list uchar int vertex_indices\nend_header\n".encode() + rows)
-    return path
-
-
-def c3d(
-    path: Path, places: np.ndarray, labels: list[str], *, order: str = "<", scale: float = -1.0, first: int = 1, analog: int = 0
-) -> Path:
-    """A C3D file, written after the user guide: header, parameters (POINT:LABELS), frames of x, y, z, residual."""
-    frames, count = places.shape[:2]
-    processor = {"<": 84, ">": 86}[order]
-    record = b""
-    letters = max(map(len, labels))
-    data = "".join(label.ljust(letters) for label in labels).encode()
-    body = struct.pack("bB", -1, 2) + bytes([letters, count]) + data + b"\0"
-    for number, name, rest in ((-1, b"POINT", b"\0"), (1, b"LABELS", body)):
-        record += struct.pack("bb", len(name), number) + name + struct.pack(f"{order}h", len(rest) + 2) + rest
-    parameters = (bytes([1, 80, 1, processor]) + record).ljust(512, b"\0")
-    header = bytes([2, 0x50]) + struct.pack(f"{order}5H", count, analog, first, first + frames - 1, 0)
-    header += struct.pack(f"{order}f", scale) + struct.pack(f"{order}2H", 3, analog and 1)
-    seen = np.isfinite(places).all(axis=-1, keepdims=True)
-    four = np.concatenate([np.nan_to_num(places) / (1 if scale < 0 else scale), np.where(seen, 0.0, -1.0)], axis=-1)
-    rows = np.concatenate([four.reshape(frames, -1), np.full((frames, analog), 77)], axis=1)
-    rows = rows.astype(f"{order}f4") if scale < 0 else rows.round().astype(f"{order}i2")
-    path.write_bytes(header.ljust(512, b"\0") + parameters + rows.tobytes())
     return path
 
 
@@ -161,12 +138,12 @@ def test_ply_binary_cut_short(tmp_path):
 
 
 # ---- C3D -----------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize(("scale", "analog"), [(-0.1, 0), (-0.1, 3), (0.5, 0), (0.5, 4)])
+@grid(("order", ["<", ">"]), (("scale", "analog"), [(-0.1, 0), (-0.1, 3), (0.5, 0), (0.5, 4)]))
 def test_c3d(tmp_path, order, scale, analog):
     places = np.stack([XYZ + 10 * frame for frame in range(5)])
     places[2, 1] = np.nan
-    path = c3d(tmp_path / "walk.c3d", places, ["LKNE", "head", "head"], order=order, scale=scale, first=11, analog=analog)
+    path = tmp_path / "walk.c3d"
+    path.write_bytes(c3d(places, ["LKNE", "head", "head"], order=order, scale=scale, first=11, analog=analog))
     found = open_points(path)
     assert isinstance(found, PointSequence) and found.ids == ("LKNE", "head#2", "head#3") and found.first == 11
     np.testing.assert_allclose(found.values, places, atol=abs(scale) / 2 if scale > 0 else 0)
@@ -177,25 +154,24 @@ def test_c3d(tmp_path, order, scale, analog):
 
 def test_c3d_reals_of_dec_processors(tmp_path):
     """Such reals have their halves swapped and are four times as large."""
-    path = c3d(tmp_path / "a.c3d", XYZ[None], ["a", "b", "c"])
-    data = bytearray(path.read_bytes())
-    halves = (np.frombuffer(bytes(data[1024:]), "<f4") * 4).astype("<f4").view("<u2").reshape(-1, 2)[:, ::-1]
-    data[1024:] = halves.tobytes()
-    data[12:16] = (np.array([-4.0], "<f4").view("<u2")[::-1]).tobytes()
+    data = bytearray(c3d(XYZ[None]))
+    for at in (slice(1024, None), slice(12, 16)):
+        data[at] = (np.frombuffer(bytes(data[at]), "<f4") * 4).view("<u2").reshape(-1, 2)[:, ::-1].tobytes()
     data[515] = 85
-    path.write_bytes(bytes(data))
-    np.testing.assert_array_equal(open_points(path).values[0], XYZ)
+    (tmp_path / "a.c3d").write_bytes(bytes(data))
+    np.testing.assert_array_equal(open_points(tmp_path / "a.c3d").values[0], XYZ)
 
 
 def test_c3d_refused(tmp_path):
-    path = c3d(tmp_path / "a.c3d", np.stack([XYZ] * 5), ["a", "b", "c"])
-    with pytest.raises(ValueError, match=r"has 5 frames \(1 to 5\); say which are the views: --frames 1,3,5"):
-        read_matches([path])
-    with pytest.raises(ValueError, match="has no frame 6; its frames are 1 to 5"):
-        read_matches([path], frames=(1, 2, 6))
-    with pytest.raises(ValueError, match="give one such file alone"):
-        read_matches([path, path])
-    whole = path.read_bytes()
+    path, whole = tmp_path / "a.c3d", c3d(np.stack([XYZ] * 5))
+    path.write_bytes(whole)
+    for paths, frames, says in (
+        ([path], None, r"has 5 frames \(1 to 5\); say which are the views: --frames 1,3,5"),
+        ([path], (1, 2, 6), "has no frame 6; its frames are 1 to 5"),
+        ([path, path], None, "give one such file alone"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            read_matches(paths, frames=frames)
     for data, says in (
         (whole[:-1], "has 4 of 5 frames"),
         (whole[:600], "C3D header"),

@@ -10,6 +10,7 @@ import pytest
 
 from indexing.readers import read, read_clip, recording
 from indexing.readers.recording import link_by_position
+from tests.grid import grid
 
 Write = Callable[..., Path]
 FRAMES = 8
@@ -35,10 +36,12 @@ def corner(clip_joints: np.ndarray) -> list[float]:
     return clip_joints[:, 0, 0].tolist()
 
 
-@pytest.mark.parametrize(("rule", "who"), [("largest", BIG), ("confident", SMALL), ("tracked", BIG)])
-def test_the_order_of_people_in_the_file_does_not_matter(openpose_folder: Write, rule: str, who: np.ndarray) -> None:
-    clip = read_clip(openpose_folder(shuffled(BIG, SMALL)), person=rule)
-    np.testing.assert_array_equal(clip.joints, who[..., :2])
+def test_the_order_of_people_in_the_file_does_not_matter(openpose_folder: Write) -> None:
+    folder = openpose_folder(shuffled(BIG, SMALL))
+    for rule, who in (("largest", BIG), ("confident", SMALL), ("tracked", BIG)):
+        np.testing.assert_array_equal(read_clip(folder, person=rule).joints, who[..., :2])
+    with pytest.raises(ValueError, match=r"take: person='all' needs tracked people, but it has no person ids; run a tracker"):
+        read(folder, person="all")
 
 
 def test_largest_does_not_hop_when_another_is_larger_for_a_moment(openpose_folder: Write) -> None:
@@ -75,11 +78,6 @@ def test_broken_tracks_of_one_person_join(openpose_folder: Write) -> None:
     assert read_clip(folder, person="tracked").seen.any(axis=1).sum() == 4
 
 
-def test_one_person_far_apart_between_frames_stays_one(openpose_folder: Write) -> None:
-    clip = read_clip(openpose_folder({i: [walk(500.0 * i, 60)[i]] for i in range(FRAMES)}), person="tracked")
-    assert clip.seen.all()
-
-
 def test_all_gives_one_clip_per_id_that_spans_what_was_seen(openpose_folder: Write) -> None:
     frames = {i: [BIG[i]] + ([SMALL[i]] if i in (2, 3, 5) else []) for i in range(FRAMES)}
     clips = read(openpose_folder(frames, ids={i: [3, 7][: len(people)] for i, people in frames.items()}), person="all", fps=10.0)
@@ -88,13 +86,6 @@ def test_all_gives_one_clip_per_id_that_spans_what_was_seen(openpose_folder: Wri
     assert [len(clip) for clip in clips] == [8, 4]
     assert clips[1].times.tolist() == [0.2, 0.3, 0.4, 0.5]
     assert clips[1].seen.any(axis=1).tolist() == [True, True, False, True]
-    with pytest.raises(ValueError, match="holds 2 clips"):
-        read_clip(openpose_folder(frames, "more", ids={i: [3, 7][: len(p)] for i, p in frames.items()}), person="all")
-
-
-def test_all_needs_ids(openpose_folder: Write) -> None:
-    with pytest.raises(ValueError, match=r"take: person='all' needs tracked people, but it has no person ids; run a tracker"):
-        read(openpose_folder(shuffled(BIG, SMALL)), person="all")
 
 
 def test_ids_that_repeat_in_a_frame_are_no_identities(openpose_folder: Write) -> None:
@@ -119,11 +110,16 @@ def test_confident_needs_confidences(write_json: Write) -> None:
         read(write_json([two]), person="confident")
 
 
-def test_link_waits_for_people_and_does_not_reach_too_far() -> None:
-    box = np.array([[0.0, 0.0], [10.0, 20.0]])
-    at = np.array([0, 0, 1, 4, 4])
-    joints = np.stack([box, box + 100, box + 1, box + 101, box + 300])
+BOX = np.array([[0.0, 0.0], [10.0, 20.0]])
+
+
+def test_link_waits_for_people_and_does_not_reach_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    at, joints = np.array([0, 0, 1, 4, 4]), np.stack([BOX, BOX + 100, BOX + 1, BOX + 101, BOX + 300])
     assert link_by_position(at, joints).tolist() == [0, 1, 0, 1, 2]
+    at, joints = np.arange(3), np.stack([BOX, BOX + 5, BOX + 10])
+    assert link_by_position(at, joints).tolist() == [0, 0, 0]
+    monkeypatch.setattr(recording, "MAX_STEP_DIAGONALS", 0.1)
+    assert link_by_position(at, joints).tolist() == [0, 1, 2]
 
 
 def test_link_compares_only_joints_that_both_show() -> None:
@@ -137,7 +133,7 @@ def test_link_compares_only_joints_that_both_show() -> None:
     assert link_by_position(np.array([0, 1]), np.stack([half, hidden])).tolist() == [0, 1]
 
 
-@pytest.mark.parametrize("seed", range(5))
+@grid(("seed", range(5)))
 def test_identities_do_not_depend_on_the_order_within_frames(seed: int) -> None:
     rng = np.random.default_rng(seed)
     people = rng.uniform(0, 2000, size=(5, 1, 1, 2)) + rng.normal(scale=40, size=(5, 1, 6, 2)) + rng.normal(size=(5, 20, 6, 2))
@@ -158,36 +154,25 @@ def test_strangers_in_every_frame_are_compared_with_the_latest_only(monkeypatch:
         return distances(awaited, found, size)
 
     monkeypatch.setattr(recording, "_distances", counted)
-    box = np.array([[0.0, 0.0], [10.0, 20.0]])
     at = np.repeat(np.arange(4 * WAITING), 2)
-    joints = box + 1000.0 * np.arange(len(at))[:, None, None]
+    joints = BOX + 1000.0 * np.arange(len(at))[:, None, None]
     assert link_by_position(at, joints).tolist() == list(range(len(at)))
     assert max(compared) == 2 * WAITING and sum(compared) <= len(at) * WAITING
 
 
 def test_who_was_seen_lately_is_waited_for_however_many_come_and_go() -> None:
-    box = np.array([[0.0, 0.0], [10.0, 20.0]])
     frames = 3 * WAITING
-    strangers = box + 1000.0 * np.arange(1, frames + 1)[:, None, None]
+    strangers = BOX + 1000.0 * np.arange(1, frames + 1)[:, None, None]
     at = np.concatenate([np.arange(frames), np.arange(0, frames, WAITING // 2)])
-    ids = link_by_position(at, np.concatenate([strangers, np.repeat(box[None], 6, axis=0)]))
+    ids = link_by_position(at, np.concatenate([strangers, np.repeat(BOX[None], 6, axis=0)]))
     assert len(set(ids[frames:].tolist())) == 1 and len(set(ids.tolist())) == frames + 1
 
 
 def test_a_crowd_larger_than_what_is_waited_for_is_followed() -> None:
-    box = np.array([[0.0, 0.0], [10.0, 20.0]])
-    crowd = box + 100.0 * np.arange(WAITING + 40)[:, None, None]
+    crowd = BOX + 100.0 * np.arange(WAITING + 40)[:, None, None]
     ids = link_by_position(np.repeat(np.arange(3), len(crowd)), np.concatenate([crowd, crowd + 1, crowd[::-1] + 2]))
     first, second, third = ids.reshape(3, -1)
     assert (first == second).all() and (first == third[::-1]).all()
-
-
-def test_how_far_a_person_may_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    box = np.array([[0.0, 0.0], [10.0, 20.0]])
-    at, joints = np.arange(3), np.stack([box, box + 5, box + 10])
-    assert link_by_position(at, joints).tolist() == [0, 0, 0]
-    monkeypatch.setattr(recording, "MAX_STEP_DIAGONALS", 0.1)
-    assert link_by_position(at, joints).tolist() == [0, 1, 2]
 
 
 def test_everyone_says_how_people_are_followed(openpose_folder: Write) -> None:
@@ -199,13 +184,15 @@ def test_everyone_says_how_people_are_followed(openpose_folder: Write) -> None:
     assert one.meta == {"person": 9, "followed": "ids", "untracked": FRAMES}
 
 
-def test_everyone_of_one_person_is_the_whole_recording(openpose_folder: Write) -> None:
+def test_one_person_far_apart_between_frames_is_the_whole_recording(openpose_folder: Write) -> None:
     frames = {i: [walk(500.0 * i, 60)[i]] if i not in (0, 3) else [] for i in range(FRAMES)}
     folder = openpose_folder(frames)
     (alone,) = read(folder, person="everyone")
-    largest = read_clip(folder)
-    np.testing.assert_array_equal(alone.joints, largest.joints)
-    assert alone.name == largest.name and alone.meta == {"person": None, "followed": "position"}
+    for rule in ("largest", "tracked"):
+        clip = read_clip(folder, person=rule)
+        np.testing.assert_array_equal(alone.joints, clip.joints)
+        assert alone.name == clip.name
+    assert alone.meta == {"person": None, "followed": "position"}
 
 
 def test_a_person_s_clip_keeps_no_frames_of_long_absences(openpose_folder: Write, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,13 +12,8 @@ VALUES = np.array([[[1.0, 2.0], [3.0, 4.0]], [[5.0, 6.0], [NAN, NAN]], [[7.0, 8.
 
 
 @pytest.fixture
-def write(tmp_path: Path):
-    def put(text: str, name: str = "t.csv") -> Path:
-        path = tmp_path / name
-        path.write_text(text)
-        return path
-
-    return put
+def write(write_json):
+    return lambda text, name="t.csv": write_json(text, name)
 
 
 # ---- what is read --------------------------------------------------------------------------------------------------------
@@ -29,6 +22,8 @@ def test_a_table_with_frames_and_times(write):
     assert found.ids == ("p", "q") and found.views == ("10", "20", "30") and found.static is None and found.weights is None
     np.testing.assert_array_equal(found.values, VALUES)
     np.testing.assert_array_equal(found.times, [0, 0.5, 2])
+    found = read_tracks([write(",frame,id,x,y\n0,0,a,1,2\n1,1,a,3,4\n")])  # an index without a heading
+    np.testing.assert_array_equal(found.values[:, 0], [[1, 2], [3, 4]])
 
 
 def test_what_an_archive_knows_besides(tmp_path):
@@ -68,11 +63,6 @@ def test_times_of_day_name_the_views_in_full_and_then_from_the_first(write):
     assert found.views == ("1700000000.25", "1700000000.45", "1700000001.25")
     short = found.select(found.views[1:]).since_first()
     assert short.views == ("0", "0.8") and short.start == 1700000000.45 and short.times[0] == 0
-
-
-def test_an_index_without_a_heading_is_no_data(write):
-    found = read_tracks([write(",frame,id,x,y\n0,0,a,1,2\n1,1,a,3,4\n")])
-    np.testing.assert_array_equal(found.values[:, 0], [[1, 2], [3, 4]])
 
 
 def test_columns_of_static_points_weights_and_depth(write):
@@ -122,26 +112,26 @@ def test_tracks_seen_once_are_left_out(write):
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("frame,id,x,y\n", r"t\.csv: the file has a header but no rows"),
-        ("frame,x,y\n0,1,2\n", r"no column names the points \(its columns are frame, x, y\); name the columns"),
-        ("frame,id,x,y\n,a,1,2\n", r"row 2, column 'frame': is empty"),
-        ("frame,id,x,y\n0,,1,2\n", r"row 2, column 'id': is empty"),
-        ("frame,id,x,y\n0,a,1,2\n1,a,1,2\n0,a,1,2\n", r"row 4: .* in frame 0 before, in row 2 .*; give each point one row"),
-        ("frame,time,id,x,y\n0,0,a,1,2\n0,1,b,1,2\n", r"row 3: frame 0 has the time 1 here and 0 before; a view has one time"),
-        ("frame,id,x,y,weight\n0,a,1,2,-1\n", r"row 2, column 'weight': the weight is -1"),
-        ("frame,id,x,y\n0,a,1,2\n0,b,1,2\n", r"holds 1 view"),
-        ("id,x,y\na,1,2\n", r"holds the points of one view; give a table with columns frame"),
-        ("", r"the file is empty"),
-        ("0,a,1,2\n1,a,1,2\n", r"row 1 holds numbers, and no row names the columns; name the columns frame \(or time\), id, x, y"),
-        ("frame,id,x\n0,a,1\n", r"its columns are frame, id, x; name the columns frame \(or time\), id, x, y"),
-    ],
-)
-def test_bad_tables(write, text, says):
-    with pytest.raises(ValueError, match=says):
-        read_tracks([write(text)])
+BAD_TABLES = [
+    ("frame,id,x,y\n", r"t\.csv: the file has a header but no rows"),
+    ("frame,x,y\n0,1,2\n", r"no column names the points \(its columns are frame, x, y\); name the columns"),
+    ("frame,id,x,y\n,a,1,2\n", r"row 2, column 'frame': is empty"),
+    ("frame,id,x,y\n0,,1,2\n", r"row 2, column 'id': is empty"),
+    ("frame,id,x,y\n0,a,1,2\n1,a,1,2\n0,a,1,2\n", r"row 4: .* in frame 0 before, in row 2 .*; give each point one row"),
+    ("frame,time,id,x,y\n0,0,a,1,2\n0,1,b,1,2\n", r"row 3: frame 0 has the time 1 here and 0 before; a view has one time"),
+    ("frame,id,x,y,weight\n0,a,1,2,-1\n", r"row 2, column 'weight': the weight is -1"),
+    ("frame,id,x,y\n0,a,1,2\n0,b,1,2\n", r"holds 1 view"),
+    ("id,x,y\na,1,2\n", r"holds the points of one view; give a table with columns frame"),
+    ("", r"the file is empty"),
+    ("0,a,1,2\n1,a,1,2\n", r"row 1 holds numbers, and no row names the columns; name the columns frame \(or time\), id, x, y"),
+    ("frame,id,x\n0,a,1\n", r"its columns are frame, id, x; name the columns frame \(or time\), id, x, y"),
+]
+
+
+def test_bad_tables(write):
+    for text, says in BAD_TABLES:
+        with pytest.raises(ValueError, match=says):
+            read_tracks([write(text)])
 
 
 def test_bad_arrays(tmp_path):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from indexing.readers import read, read_clip
+from tests.grid import grid
 from tests.indexing.readers.tools import refused
 
 FRAMES = 5
@@ -15,16 +15,10 @@ FRAMES = 5
 
 def lines(joints: np.ndarray, dims: int, confidence: bool, track: int | None) -> list[str]:
     """One line per frame of ``(frames, n, 3)`` normalized joints."""
-    out = []
-    for one in joints:
-        low, high = one[:, :2].min(axis=0), one[:, :2].max(axis=0)
-        numbers = [0, *(low + high) / 2, *(high - low), *one[:, :dims].ravel()]
-        out.append(
-            " ".join(
-                [*(f"{x:g}" for x in numbers), *(["0.871"] if confidence else []), *([str(track)] if track is not None else [])]
-            )
-        )
-    return out
+    low, high = joints[..., :2].min(axis=1), joints[..., :2].max(axis=1)
+    more = [0.871] * confidence + ([] if track is None else [track])
+    rows = ([0, *(a + b) / 2, *(b - a), *one[:, :dims].ravel(), *more] for a, b, one in zip(low, high, joints, strict=True))
+    return [" ".join(f"{x:g}" for x in row) for row in rows]
 
 
 def write(folder: Path, frames: dict[int, list[str]]) -> Path:
@@ -40,10 +34,7 @@ def person(n: int, seed: int = 0) -> np.ndarray:
     return np.concatenate([joints, rng.uniform(0.4, 0.99, size=(FRAMES, n, 1))], axis=2)
 
 
-@pytest.mark.parametrize("n", [17, 12, 21, 9])
-@pytest.mark.parametrize("dims", [2, 3])
-@pytest.mark.parametrize("confidence", [False, True])
-@pytest.mark.parametrize("track", [None, 4])
+@grid(("n", [17, 12, 21, 9]), ("dims", [2, 3]), ("confidence", [False, True]), ("track", [None, 4]))
 def test_every_kind_of_line(tmp_path: Path, n: int, dims: int, confidence: bool, track: int | None) -> None:
     joints = person(n)
     folder = write(tmp_path / "labels", {i + 1: [line] for i, line in enumerate(lines(joints, dims, confidence, track))})
@@ -84,15 +75,17 @@ def test_several_people(tmp_path: Path) -> None:
     assert sorted(clip.meta["person"] for clip in read(folder, person="all")) == [1, 2]
 
 
-@pytest.mark.parametrize(
-    ("frames", "words"),
-    [
-        ({1: []}, ("labels", "no person was detected in any of 1 frames", "threshold")),
-        ({1: ["0 0.5 0.5 0.1 0.1"]}, ("labels", "0 numbers after the box", "pose model")),
-        ({1: ["0 0.5 x"]}, ("walk_1.txt", "line 1 is not a list of numbers", "save_txt=True")),
-        ({1: ["0 .5 .5 .1 .1 .5 .5 .9"], 2: ["0 .5 .5 .1 .1 .5 .5"]}, ("walk_2.txt", "line 1 has 7 numbers", "8", "same model")),
-    ],
-)
-def test_what_is_broken_is_named(tmp_path: Path, frames: dict[int, list[str]], words: tuple[str, ...]) -> None:
-    path = write(tmp_path / "labels", frames)
-    refused(path / words[0] if words[0].endswith(".txt") else path, *words[1:], action=lambda _: read(path))
+def test_what_is_broken_is_named(tmp_path: Path) -> None:
+    for i, (frames, words) in enumerate(
+        (
+            ({1: []}, ("", "no person was detected in any of 1 frames", "threshold")),
+            ({1: ["0 0.5 0.5 0.1 0.1"]}, ("", "0 numbers after the box", "pose model")),
+            ({1: ["0 0.5 x"]}, ("walk_1.txt", "line 1 is not a list of numbers", "save_txt=True")),
+            (
+                {1: ["0 .5 .5 .1 .1 .5 .5 .9"], 2: ["0 .5 .5 .1 .1 .5 .5"]},
+                ("walk_2.txt", "line 1 has 7 numbers", "same model"),
+            ),
+        )
+    ):
+        path = write(tmp_path / f"{i}", frames)
+        refused(path / words[0], *words[1:], action=lambda _, path=path: read(path))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import pickle
 import re
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import pytest
 
+from indexing.joints import HEIGHT
 from indexing.readers import read
 from indexing.readers.recording import NobodySeen
 from indexing.skeleton import COCO17, Skeleton
@@ -32,13 +33,6 @@ class Sample:
     layout: Skeleton | None = COCO17  # whose names the joints have; None: others
     dims: int = 2
     clips: int = 1
-
-
-def samples() -> dict[str, Callable[[Path], Sample]]:
-    """What writes a file into a folder, by the tool that writes such files: ``SAMPLES`` of the tests in this folder."""
-    tests = sorted(path for path in Path(__file__).parent.glob("test_*.py") if "\nSAMPLES" in path.read_text(encoding="utf-8"))
-    modules = [import_module(f"tests.indexing.readers.{path.stem}") for path in tests]
-    return {tool: make for module in modules for tool, make in module.SAMPLES.items()}
 
 
 def list_failures(cases: Mapping[str, Callable[[], None]]) -> dict[str, str]:
@@ -330,25 +324,40 @@ def pyskl(
 
 def standing(layout: Any, frames: int = 12, dims: int = 2, seed: int = 0) -> np.ndarray:
     """``(frames, joints, dims)`` somebody who stands and moves a little, in pixels (y down) or metres (y up)."""
-    from indexing.joints import HEIGHT
-
     rng = np.random.default_rng(seed)
     arms = {"elbow": 0.63, "wrist": 0.49, "hand": 0.46, "hand_tip": 0.43, "thumb": 0.45, "pinky": 0.45, "index": 0.44}
     names = [joint.removeprefix("left_").removeprefix("right_") for joint in layout.joints]
     high = np.array([HEIGHT.get(name, arms.get(name, 0.9)) for name in names])
-    wide = {
-        "eye": 0.02,
-        "ear": 0.04,
-        "hip": 0.09,
-        "knee": 0.1,
-        "ankle": 0.1,
-        "heel": 0.1,
-        "foot": 0.1,
-        "big_toe": 0.1,
-        "small_toe": 0.13,
-    }
+    wide = {"eye": 0.02, "ear": 0.04, "hip": 0.09} | dict.fromkeys(("knee", "ankle", "heel", "foot", "big_toe"), 0.1)
     side = np.array([(joint.startswith("left_")) * 1.0 - joint.startswith("right_") for joint in layout.joints])
     across = side * np.array([wide.get(name, 0.13) for name in names])
     body = np.stack([across, high, 0.05 * np.ones(len(high))], axis=1)
     moved = body + 0.01 * rng.normal(size=(frames, len(high), 3)) + 0.002 * np.arange(frames)[:, None, None]
     return moved if dims == 3 else np.stack([400 + 500 * moved[..., 0], 900 - 500 * moved[..., 1]], axis=2)
+
+
+def c3d(
+    places: np.ndarray | None = None,
+    labels: Sequence[str] = (),
+    order: str = "<",
+    scale: float = -1,
+    first: int = 1,
+    analog: int = 0,
+) -> bytes:
+    """A C3D file, written after the user guide: header, parameters (POINT:LABELS), frames of x, y, z, residual."""
+    places = np.random.default_rng(0).normal(size=(5, 4, 3)) * 100 if places is None else places
+    labels = labels or [f"mk{i}" for i in range(places.shape[1])]
+    frames, count = places.shape[:2]
+    letters = max(map(len, labels))
+    body = struct.pack("bB", -1, 2) + bytes([letters, count]) + "".join(label.ljust(letters) for label in labels).encode() + b"\0"
+    record = b""
+    for number, name, rest in ((-1, b"POINT", b"\0"), (1, b"LABELS", body)):
+        record += struct.pack("bb", len(name), number) + name + struct.pack(f"{order}h", len(rest) + 2) + rest
+    parameters = (bytes([1, 80, 1, {"<": 84, ">": 86}[order]]) + record).ljust(512, b"\0")
+    header = bytes([2, 0x50]) + struct.pack(f"{order}5H", count, analog, first, first + frames - 1, 0)
+    header += struct.pack(f"{order}f", scale) + struct.pack(f"{order}2H", 3, analog and 1)
+    seen = np.isfinite(places).all(axis=-1, keepdims=True)
+    four = np.concatenate([np.nan_to_num(places) / (1 if scale < 0 else scale), np.where(seen, 0.0, -1.0)], axis=-1)
+    rows = np.concatenate([four.reshape(frames, -1), np.full((frames, analog), 77)], axis=1)
+    rows = rows.astype(f"{order}f4") if scale < 0 else rows.round().astype(f"{order}i2")
+    return header.ljust(512, b"\0") + parameters + rows.tobytes()
