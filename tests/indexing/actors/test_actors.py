@@ -7,6 +7,7 @@ from indexing.actors import ACTIONS, Person, dataset, detect, perform, stream
 from indexing.actors.perform import interpolate
 from indexing.cameras import virtual
 from indexing.skeleton import COCO17
+from tests.grid import grid
 
 AT = {name: i for i, name in enumerate(COCO17.joints)}
 RIGID = [bone for bone in COCO17.bones if set(bone) not in ({5, 11}, {6, 12})]  # the waist turns: shoulder to hip is no bone
@@ -30,51 +31,25 @@ def bend(joints, side, names):
     return (np.cross(b - a, c - b) * (left - right)).sum(axis=1) / np.linalg.norm(left - right, axis=1)
 
 
-def test_clips_are_labelled_coco_clips_of_natural_length(clips):
+def test_clips_are_labelled_of_natural_length_and_move_as_bodies_do(clips):
     for _, clip in clips:
-        assert clip.label in ACTIONS
-        assert clip.joints.shape[1:] == (17, 3)
-        assert clip.skeleton == COCO17
-        assert clip.up == "y"
+        assert clip.label in ACTIONS and clip.joints.shape[1:] == (17, 3) and clip.skeleton == COCO17 and clip.up == "y"
         assert np.isfinite(clip.joints).all()
         assert 1.2 < clip.duration < 5.0
-
-
-def test_bones_keep_their_length(clips):
-    for _, clip in clips:
         for a, b in RIGID:
-            length = np.linalg.norm(clip.joints[:, a] - clip.joints[:, b], axis=1)
-            assert np.ptp(length) < 1e-9
+            assert np.ptp(np.linalg.norm(clip.joints[:, a] - clip.joints[:, b], axis=1)) < 1e-9
         spine = np.linalg.norm(clip.joints[:, 5:7].mean(axis=1) - clip.joints[:, 11:13].mean(axis=1), axis=1)
         assert np.ptp(spine) < 1e-9
-
-
-def test_lowest_foot_is_on_the_floor_except_in_flight(clips):
-    for _, clip in clips:
-        lowest = clip.joints[:, 15:17, 1].min(axis=1)
+        lowest = clip.joints[:, 15:17, 1].min(axis=1)  # the floor, except in flight
         assert np.abs(lowest).max() < 1e-9 or (clip.label in FLYING and lowest.min() > -1e-9 and 0.03 < lowest.max() < 0.25)
         assert clip.joints[..., 1].min() > -0.05  # no hand or knee through the floor
-    assert {clip.label for _, clip in clips if clip.joints[:, 15:17, 1].min(axis=1).max() > 0.03} == set(FLYING)
-
-
-def test_standing_feet_do_not_slide(clips):
-    for _, clip in clips:
-        if clip.label not in ("walk", "run", "jumping_jack"):
-            path = np.ptp(clip.joints[:, 15:17][..., [0, 2]], axis=0).max(axis=1)
-            assert path.min() < 0.06
-
-
-def test_knees_only_bend_backwards(clips):
-    for _, clip in clips:
+        if clip.label not in ("walk", "run", "jumping_jack"):  # standing feet do not slide
+            assert np.ptp(clip.joints[:, 15:17][..., [0, 2]], axis=0).max(axis=1).min() < 0.06
         for side in ("left", "right"):
             assert bend(clip.joints, side, ("hip", "knee", "ankle")).min() > -1e-3
-
-
-def test_elbows_bend_forwards(clips):
-    for _, clip in clips:
-        if clip.label in ("walk", "run", "bow", "squat"):  # the arms keep near the sagittal plane
-            for side in ("left", "right"):
+            if clip.label in ("walk", "run", "bow", "squat"):  # the arms keep near the sagittal plane
                 assert bend(clip.joints, side, ("shoulder", "elbow", "wrist")).max() < 1e-3
+    assert {clip.label for _, clip in clips if clip.joints[:, 15:17, 1].min(axis=1).max() > 0.03} == set(FLYING)
 
 
 def test_each_action_does_what_it_is_called():
@@ -95,13 +70,12 @@ def test_each_action_does_what_it_is_called():
     assert height["pick_up"][:, AT["right_wrist"]].min() < 0.25
 
 
-@pytest.mark.parametrize("action", ["walk", "run"])
-def test_arms_swing_against_the_legs(action):
-    joints = perform(action, Person()).joints
-    forward = -joints[..., 2]
-    legs = forward[:, AT["left_ankle"]] - forward[:, AT["right_ankle"]]
-    arms = forward[:, AT["left_wrist"]] - forward[:, AT["right_wrist"]]
-    assert np.corrcoef(legs, arms)[0, 1] < -0.8
+def test_arms_swing_against_the_legs():
+    for action in ("walk", "run"):
+        forward = -perform(action, Person()).joints[..., 2]
+        legs = forward[:, AT["left_ankle"]] - forward[:, AT["right_ankle"]]
+        arms = forward[:, AT["left_wrist"]] - forward[:, AT["right_wrist"]]
+        assert np.corrcoef(legs, arms)[0, 1] < -0.8
 
 
 def test_left_handers_are_the_mirror_image():
@@ -160,15 +134,12 @@ def test_stream_truth_is_ordered_and_inside():
     assert speed < 10.0  # no jump where actions meet rests
     low = clip.between(truth[1][2], truth[2][1]).joints[:, 11:13, 1]
     assert low.max() < 0.62  # seated between sit_down and stand_up
-
-
-def test_stream_rests_are_quiet():
     clip, truth = stream(["jumping_jack", "run"], Person(), rng=0, rest=(1.0, 1.0))
-    rest = clip.between(truth[0][2] + 0.05, truth[1][1] - 0.05).joints
+    rest = clip.between(truth[0][2] + 0.05, truth[1][1] - 0.05).joints  # is quiet
     assert np.abs(np.diff(rest, axis=0)).max() * 30 < 0.3
 
 
-@pytest.mark.parametrize("dropout", [0.0, 0.05, 0.3])
+@grid(("dropout", [0.0, 0.05, 0.3]))
 def test_dropout_is_about_as_asked_and_only_nan(dropout):
     clips = [detect(perform(action, Person(), rng=1), azimuth=60.0, rng=i, dropout=dropout) for i, action in enumerate(ACTIONS)]
     lost = np.concatenate([~clip.seen.ravel() for clip in clips])
@@ -231,9 +202,8 @@ def test_interpolation_keeps_between_its_keys():
     np.testing.assert_allclose(interpolate(times, values, times), values, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
+def test_misuse_says_what_to_do():
+    for call, message in (
         (lambda: perform("fly", Person()), "unknown action 'fly'.*walk, run, squat"),
         (lambda: stream(["walk", "fly"], Person()), "unknown action 'fly'"),
         (lambda: perform("walk", Person(), fps=0.0), "fps"),
@@ -246,8 +216,6 @@ def test_interpolation_keeps_between_its_keys():
         (lambda: detect(perform("bow", Person()), azimuth=0.0, noise=-1.0), "noise"),
         (lambda: detect(perform("bow", Person()), azimuth=0.0, distance=0.3), "distance"),
         (lambda: detect(detect(perform("bow", Person()), azimuth=0.0), azimuth=0.0), "17 COCO joints"),
-    ],
-)
-def test_misuse_says_what_to_do(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()

@@ -37,8 +37,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("words", BAD)
-def test_what_cannot_be_filmed(words):
-    clip, options = BAD[words]
-    with pytest.raises(ValueError, match=words):
-        render_clip(clip, azimuth=0.0, **options)
+def test_what_cannot_be_filmed():
+    for words, (clip, options) in BAD.items():
+        with pytest.raises(ValueError, match=words):
+            render_clip(clip, azimuth=0.0, **options)

@@ -99,20 +99,13 @@ def test_parts_of_the_graph_are_decided_by_themselves():
     assert [signs.tolist() for signs in found.signs] == [[-1, 1], [-1, 1], [1, -1]]
 
 
-def test_a_single_body_stands_still():
+def test_a_single_body_stands_still_pairs_without_bodies_learn_from_the_others_and_nothing_is_nothing():
     world = World()
     found = world.voted([world.pair(i, j, 0) for i, j in PAIRS])
     assert np.isinf(found.lead) and (found.keypoints > 0).all()
-
-
-def test_pairs_without_bodies_learn_from_the_others():
     world = World(MIDDLE)
     pairs = [world.pair(i, j, 0, 1) if j < 4 else world.pair(i, j) for i, j in PAIRS]
     known = world.voted(pairs).keypoints.reshape(IMAGES, -1)
     assert (known[:4] != 0).all() and not known[4].any()  # nothing is of a body there
-
-
-def test_nothing_at_all():
-    world = World(MIDDLE)
     found = world.voted([world.pair(0, 1)])
     assert not found.keypoints.any() and [len(signs) for signs in found.signs] == [0]

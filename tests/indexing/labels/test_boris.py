@@ -56,24 +56,18 @@ def test_states_are_paired_by_subject_behaviour_and_modifiers(tmp_path: Path) ->
     assert (found.observations, found.subjects, found.media, found.notices) == (("one",), ("Ann", "Ben"), ("session.mp4",), ())
 
 
-def test_what_never_stops_is_named(tmp_path: Path) -> None:
+def test_states_that_never_stop_or_have_modifiers_at_stop_and_an_offset(tmp_path: Path) -> None:
     events = [*EVENTS, [9.0, "Ann", "squat", "", ""], [10.0, "", "wave", "", ""]]
     found = open_labels(project(tmp_path / "a.boris", {"one": observation(events)}))
     assert len(found.labels) == 3
     assert "'squat' of Ann starts at 9 s and never stops; left out" in found.notices[1]
     assert "1 event left out: 'wave' is not in the ethogram" in found.notices[0]
-
-
-def test_modifiers_asked_for_at_stop(tmp_path: Path) -> None:
     events = [[1.0, "", "squat", "None", ""], [2.0, "", "squat", "deep", ""]]
     found = open_labels(project(tmp_path / "a.boris", {"one": observation(events)}))
     assert [(label.start, label.end, label.modifiers) for label in found.labels] == [(1.0, 2.0, ("deep",))]
     assert "paired with the STOP" in found.notices[0]
-
-
-def test_the_time_offset_is_not_of_the_recording(tmp_path: Path) -> None:
-    shifted = [[time + 100, *rest] for time, *rest in EVENTS]
-    found = open_labels(project(tmp_path / "a.boris", {"one": observation(shifted, **{"time offset": 100.0})}))
+    shifted = observation([[time + 100, *rest] for time, *rest in EVENTS], **{"time offset": 100.0})
+    found = open_labels(project(tmp_path / "a.boris", {"one": shifted}))  # the offset is not of the recording
     assert [label.start for label in found.labels] == [1.5, 2.0, 2.5]
 
 
@@ -109,18 +103,12 @@ def test_without_a_length_nobody_knows_when_the_second_file_begins(tmp_path: Pat
         open_labels(project(tmp_path / "a.boris", {"one": one}))
 
 
-def test_several_observations_and_none_chosen(tmp_path: Path) -> None:
-    path = project(tmp_path / "a.boris", {"Ann 1": observation(EVENTS), "Ben 1": observation(EVENTS[1:2])})
-    with pytest.raises(ValueError, match=r"has labels of 2 observations \(Ann 1, Ben 1\); choose one \(--observation NAME\)"):
-        read_labels(path)
-    assert len(read_labels(path, observation="Ben 1")) == 1
-    with pytest.raises(ValueError, match=r"has no observation 'Cid', only Ann 1, Ben 1; give one of these \(--observation\)"):
-        read_labels(path, observation="Cid")
-
-
-def test_the_recording_chooses_its_observation(tmp_path: Path) -> None:
+def test_a_name_or_the_recording_chooses_the_observation(tmp_path: Path) -> None:
     other = observation(EVENTS[1:2], {"1": ["other.mp4"]})
     path = project(tmp_path / "a.boris", {"one": observation(EVENTS), "two": other})
+    assert len(read_labels(path, observation="two")) == 1
+    with pytest.raises(ValueError, match=r"has no observation 'Cid', only one, two; give one of these \(--observation\)"):
+        read_labels(path, observation="Cid")
     found = choose_labels(open_labels(path, recording=tmp_path / "other.json"))
     assert [label.observation for label in found.labels] == ["two"]
     assert "1 observation left out: of other recordings" in found.notices[0]
@@ -136,19 +124,16 @@ def test_a_live_observation_has_no_file(tmp_path: Path) -> None:
     assert "names no media file; its clock is taken for that of x.json" in found.notices[0]
 
 
-@pytest.mark.parametrize(
-    ("event", "said"),
-    [
+def test_events_that_are_none(tmp_path: Path) -> None:
+    for event, said in (
         ([None, "", "clap", "", ""], "event 1: time None is no time; give seconds"),
         (["soon", "", "clap", "", ""], "event 1: time 'soon' is no time"),
         ([float("nan"), "", "clap", "", ""], "event 1: time nan is no time"),
         (["x"], r"event 1 is \['x'\], not \[time, subject, code"),
         ([1, {}, "clap", "", ""], "event 1: {} is no name"),
-    ],
-)
-def test_events_that_are_none(tmp_path: Path, event: list[Any], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        open_labels(project(tmp_path / "a.boris", {"one": observation([event])}))
+    ):
+        with pytest.raises(ValueError, match=said):
+            open_labels(project(tmp_path / "a.boris", {"one": observation([event])}))
 
 
 # ---- beside a person's ---------------------------------------------------------------------------------------------------
@@ -176,17 +161,6 @@ def test_detections_have_observations_of_their_own(tmp_path: Path) -> None:
         (2.0, 4.0, "again", 1.0),
         (7.0, 7.0, "", None),
     ]
-
-
-def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
-    path = project(tmp_path / "a.boris", {"one": observation(EVENTS)})
-    write_labels(path, FOUND, recording="session.mp4")
-    write_labels(path, FOUND[:1], recording="other.mp4")
-    write_labels(path, [], recording="session.mp4")
-    found = open_labels(path)
-    assert found.observations == ("one", "dyntorch other.mp4", "dyntorch session.mp4")
-    assert found.machine == ("dyntorch other.mp4", "dyntorch session.mp4")
-    assert len(found.labels) == 4
 
 
 def test_corrections_are_not_written_over(tmp_path: Path) -> None:
@@ -245,22 +219,15 @@ def test_a_point_event_of_the_project_cannot_last(tmp_path: Path) -> None:
     assert [(label.start, label.end, label.label) for label in labels] == [(1, 2, "clap (state)"), (3, 3, "squat")]
 
 
-def test_an_observation_of_a_person_is_not_overwritten(tmp_path: Path) -> None:
+def test_nothing_of_a_person_is_overwritten(tmp_path: Path) -> None:
     path = project(tmp_path / "a.boris", {"dyntorch session.mp4": observation(EVENTS)})
     before = path.read_bytes()
-    with pytest.raises(
-        ValueError, match=r"somebody's observation is called 'dyntorch session\.mp4'; rename it, or write to another file"
-    ):
+    said = r"somebody's observation is called 'dyntorch session\.mp4'; rename it, or write to another file"
+    with pytest.raises(ValueError, match=said):
         write_labels(path, FOUND, recording="session.mp4")
+    write_labels(tmp_path / "b.boris", FOUND, recording="other.mp4", into=path)
     assert path.read_bytes() == before
-
-
-def test_into_another_file(tmp_path: Path) -> None:
-    path = project(tmp_path / "a.boris", {"one": observation(EVENTS)})
-    before = path.read_bytes()
-    write_labels(tmp_path / "b.boris", FOUND, recording="session.mp4", into=path)
-    assert path.read_bytes() == before
-    assert open_labels(tmp_path / "b.boris").observations[0] == "one"
+    assert open_labels(tmp_path / "b.boris").observations[0] == "dyntorch session.mp4"
 
 
 def test_what_boris_checks_holds(tmp_path: Path) -> None:
@@ -317,12 +284,12 @@ def test_tabular_events_below_their_observation(tmp_path: Path) -> None:
     assert "1 event left out: START without STOP, or the other way round (squat at 19 s)" in found.notices[0]
 
 
-@pytest.mark.parametrize("source", ["a.mp4;b.mp4", "player #1: a.mp4;b.mp4 player #2: c.mp4"])
-def test_other_ways_to_name_the_files(source: str, tmp_path: Path) -> None:
-    row = f"one,2024,,90,Media file(s),{source},0.0,60.000;30.000,25.000,Ann,clap,,,,POINT,70.5,b.mp4,NA,NA,"
+def test_other_ways_to_name_the_files(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    path.write_text(NEW_HEAD + row)
-    assert [(label.start, label.media) for label in open_labels(path).labels] == [(10.5, "b.mp4")]
+    for source in ("a.mp4;b.mp4", "player #1: a.mp4;b.mp4 player #2: c.mp4"):
+        row = f"one,2024,,90,Media file(s),{source},0.0,60.000;30.000,25.000,Ann,clap,,,,POINT,70.5,b.mp4,NA,NA,"
+        path.write_text(NEW_HEAD + row)
+        assert [(label.start, label.media) for label in open_labels(path).labels] == [(10.5, "b.mp4")]
 
 
 def test_tabular_events_with_all_in_every_row(tmp_path: Path) -> None:

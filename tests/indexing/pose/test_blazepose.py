@@ -22,10 +22,9 @@ from indexing.pose.blazepose import (
     candidates,
     landmarks,
     merge_overlapping,
-    overlaps,
     refine_by_heatmap,
-    sigmoid,
 )  # fmt: skip
+from tests.grid import grid
 from tests.indexing.pose.scene import SceneNetworks, drawn, joints_of, written
 
 
@@ -53,17 +52,11 @@ def test_a_candidate_is_measured_from_its_anchor():
     np.testing.assert_allclose(found.scores, 1 / (1 + np.exp(-1)))
 
 
-def test_nobody_is_no_candidate():
+def test_nobody_and_values_that_are_none_are_no_candidates():
     found = candidates(np.zeros((2254, 12)), np.full(2254, -3.0))
     assert len(found) == 0 and found.boxes.shape == (0, 4) and found.points.shape == (0, 4, 2)
-
-
-def test_values_that_are_none_are_left_out():
-    raw = np.zeros((2254, 12))
-    raw[:, 2:4] = 20
-    raw[:3] = np.nan
-    logits = np.full(2254, -9.0)
-    logits[:4] = 5
+    raw, logits = np.zeros((2254, 12)), np.full(2254, -9.0)
+    raw[:, 2:4], raw[:3], logits[:4] = 20, np.nan, 5
     assert len(candidates(raw, logits)) == 1
 
 
@@ -86,7 +79,7 @@ def brute_merge(scores, boxes, values, threshold):
     return out
 
 
-@pytest.mark.parametrize("seed", range(5))
+@grid(("seed", range(5)))
 def test_people_are_merged_as_box_after_box_says(seed):
     rng = np.random.default_rng(seed)
     corner, size = rng.uniform(0, 1, (40, 2)), rng.uniform(0.1, 0.4, (40, 2))
@@ -98,10 +91,6 @@ def test_people_are_merged_as_box_after_box_says(seed):
         np.testing.assert_allclose(found.scores[i], score)
         np.testing.assert_allclose(found.boxes[i], box)
         np.testing.assert_allclose(found.points[i], point)
-
-
-def test_boxes_that_only_touch_do_not_overlap():
-    assert overlaps(np.array([0, 0, 1, 1.0]), np.array([[1, 0, 2, 1.0], [0, 0, 1, 1], [0, 0, 0, 0]])).tolist() == [0, 1, 0]
 
 
 def brute_refine(places, heatmap, kernel=7, sure=0.5):
@@ -122,24 +111,19 @@ def brute_refine(places, heatmap, kernel=7, sure=0.5):
     return out
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_refinement_is_the_mean_of_the_cells_about_a_joint(seed, monkeypatch):
-    rng = np.random.default_rng(seed)
-    places, heatmap = rng.uniform(-0.1, 1.1, (39, 2)), rng.normal(-3, 2, (64, 64, 39))
-    heatmap[..., ::3] -= 20  # nowhere sure
-    got = refine_by_heatmap(places, heatmap)
-    np.testing.assert_allclose(got, brute_refine(places, heatmap), atol=1e-12)
-    assert (got[1::3] != places[1::3]).any() and (got[::3] == places[::3]).all()
-    monkeypatch.setattr(blazepose, "HEATMAP_KERNEL", 3)
-    monkeypatch.setattr(blazepose, "MIN_HEATMAP_PEAK", 0.2)
-    np.testing.assert_allclose(refine_by_heatmap(places, heatmap), brute_refine(places, heatmap, 3, 0.2), atol=1e-12)
-
-
-def test_places_that_are_none_stay_so():
-    places = np.full((39, 2), np.nan)
-    places[1] = np.inf
-    got = refine_by_heatmap(places, np.zeros((HEATMAP, HEATMAP, LANDMARKS)))
-    assert np.isnan(got[0]).all() and np.isinf(got[1]).all()
+@pytest.mark.parametrize(("kernel", "sure"), [(7, 0.5), (3, 0.2)])
+def test_refinement_is_the_mean_of_the_cells_about_a_joint(kernel, sure, monkeypatch):
+    monkeypatch.setattr(blazepose, "HEATMAP_KERNEL", kernel)
+    monkeypatch.setattr(blazepose, "MIN_HEATMAP_PEAK", sure)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        places, heatmap = rng.uniform(-0.1, 1.1, (39, 2)), rng.normal(-3, 2, (64, 64, 39))
+        heatmap[..., ::3] -= 20  # nowhere sure
+        got = refine_by_heatmap(places, heatmap)
+        np.testing.assert_allclose(got, brute_refine(places, heatmap, kernel, sure), atol=1e-12)
+        assert (got[1::3] != places[1::3]).any() and (got[::3] == places[::3]).all()
+        places[:2] = np.array([[np.nan], [np.inf]])
+        np.testing.assert_array_equal(refine_by_heatmap(places, heatmap)[:2], places[:2])
 
 
 def test_landmarks_come_in_parts_of_the_region_with_the_lower_probability():
@@ -152,15 +136,11 @@ def test_landmarks_come_in_parts_of_the_region_with_the_lower_probability():
     assert found.present == 0.75 and PICTURE == 224
 
 
-def test_huge_logits_are_no_overflow():
-    assert sigmoid([-1e9, 0, 1e9]).tolist() == pytest.approx([0, 0.5, 1])
-
-
 av = pytest.importorskip("av")
 pytest.importorskip("cv2")
 
 
-@pytest.mark.parametrize("degrees", [0, 30, 90, 135, 180, -60])
+@grid(("degrees", [0, 30, 90, 135, 180, -60]))
 def test_a_region_is_turned_so_that_the_body_stands_upright(degrees):
     angle = math.radians(degrees)
     hips, up = np.array([300.0, 200.0]), np.array([math.sin(angle), -math.cos(angle)])
@@ -181,9 +161,7 @@ def frame_of(tmp_path, image, rotation=None):
     return next(av.open(str(path)).decode(video=0))
 
 
-@pytest.mark.parametrize("size", [(321, 243), (1280, 720)])
-@pytest.mark.parametrize("degrees", [0, 40, 170])
-@pytest.mark.parametrize("scale", [0.1, 0.3])
+@grid(("size", [(321, 243), (1280, 720)]), ("degrees", [40, 170]), ("scale", [0.1, 0.3]))
 def test_what_is_seen_in_a_region_is_put_back_where_it_is(tmp_path, size, degrees, scale):
     width, height = (side // 2 * 2 for side in size)
     hips, length = np.array([0.45 * width, 0.55 * height]), scale * height
@@ -221,13 +199,10 @@ def test_levels_halve_exactly_and_odd_lines_are_left_out(tmp_path):
     np.testing.assert_allclose(picture.level(1), base.reshape(23, 2, 31, 2, 3).mean(axis=(1, 3)), atol=1)
 
 
-def test_the_edge_goes_on_or_is_black(tmp_path):
-    picture = VideoPicture(frame_of(tmp_path, np.full((64, 64, 3), 200, np.uint8)))
-    outside = Region(0, 32, 64)
+def test_the_edge_goes_on_or_is_black_and_frames_of_another_size_are_brought_to_the_first_ones(tmp_path):
+    frame = frame_of(tmp_path, np.full((64, 64, 3), 200, np.uint8))
+    picture, outside = VideoPicture(frame), Region(0, 32, 64)
     assert picture.extract_region(outside, 64).min() > 190
     assert (picture.extract_region(outside, 64, fill=True)[:, :30] == 0).all()
-
-
-def test_frames_of_another_size_are_brought_to_the_first_ones(tmp_path):
-    picture = VideoPicture(frame_of(tmp_path, np.full((64, 64, 3), 90, np.uint8)), (32, 48))
+    picture = VideoPicture(frame, (32, 48))
     assert (picture.width, picture.height) == (32, 48) and picture.level(0).shape == (48, 32, 3)

@@ -49,16 +49,13 @@ def runtime(monkeypatch):
     monkeypatch.setattr(networks, "import_module", lambda name: room)
 
 
-def test_pictures_are_given_from_minus_one_to_one_and_outputs_known_by_size(runtime):
+def test_pictures_are_given_in_the_range_of_each_network_and_outputs_known_by_size(runtime):
     both = LiteNetworks(MODELS)
     for level, mean in ((0, -1), (255, 1)):
         raw, logits = both.detector(np.full((224, 224, 3), level, np.uint8))
         assert raw.shape == (2254, 12) and logits.shape == (2254,)
         assert raw[0, 0] == pytest.approx(mean) and logits[1] == pytest.approx(mean + 1)
-
-
-def test_regions_are_given_from_zero_to_one(runtime):
-    values, present, heatmap = LiteNetworks(MODELS).landmarks(np.full((256, 256, 3), 255, np.uint8))
+    values, present, heatmap = both.landmarks(np.full((256, 256, 3), 255, np.uint8))
     assert values.shape == (39, 5) and heatmap.shape == (64, 64, 39)
     assert present == pytest.approx(1) and values[0, 1] == pytest.approx(2) and heatmap[0, 0, 1] == pytest.approx(2)
 

@@ -10,6 +10,7 @@ import pytest
 
 from indexing.pose import tracking as room
 from indexing.pose.tracking import Sightings, concatenate, identities, largest, windows
+from tests.grid import grid
 
 BODY = np.array([[0.0, 0.0], [20.0, 30.0], [10.0, 80.0]])
 
@@ -33,18 +34,9 @@ def test_a_track_goes_on_where_another_ended_soon_and_nearby():
     assert groups(tracks((0, 20, 0, 0, 1), (50, 59, 8, 0, 1))) == [[0], [1]]  # three seconds later
     assert groups(tracks((0, 20, 0, 0, 1), (22, 59, 90, 0, 1))) == [[1], [0]]  # two bodies away
     assert groups(tracks((0, 20, 0, 0, 1), (50, 59, 8, 0, 1)), max_absence=5.0) == [[0, 1]]
-
-
-def test_two_who_are_there_at_once_are_two():
-    assert groups(tracks((0, 40, 0, 0, 1), (30, 59, 5, 0, 1))) == [[0], [1]]
-
-
-def test_at_a_cut_everybody_goes_on_with_the_nearest():
+    assert groups(tracks((0, 40, 0, 0, 1), (30, 59, 5, 0, 1))) == [[0], [1]]  # both there at once
     cut = tracks((0, 29, 0, 0, 1), (0, 29, 30, 0, 1.1), (30, 59, 31, 0, 1.1), (30, 59, 1, 0, 1))
-    assert groups(cut) == [[1, 2], [0, 3]]
-
-
-def test_the_largest_over_time_comes_first():
+    assert groups(cut) == [[1, 2], [0, 3]]  # everybody goes on with the nearest, the largest over time first
     assert groups(tracks((0, 59, 0, 0, 1), (0, 9, 300, 0, 2))) == [[0], [1]]
     assert groups(tracks((0, 59, 0, 0, 1), (0, 39, 300, 0, 2))) == [[1], [0]]
 
@@ -56,14 +48,11 @@ def test_one_sighting_a_frame_is_of_the_largest_who_is_there():
     assert seen.tracks[rows].tolist() == [0] * 20 + [1] * 20 + [0] * 20
 
 
-def test_parts_joined_keep_their_tracks_apart():
+def test_parts_joined_keep_their_tracks_apart_and_nobody_is_nobody():
     one, other = tracks((0, 3, 0, 0, 1), frames=4), tracks((1, 2, 0, 0, 1), (2, 3, 90, 0, 1), frames=4)
     both = concatenate([one, other])
     assert both.at.tolist() == [0, 1, 2, 3, 5, 6, 6, 7] and len(both.times) == 8
     assert both.tracks.tolist() == [0, 0, 0, 0, 1, *other.tracks[1:] + 1]
-
-
-def test_nobody_is_nobody():
     nobody = Sightings(np.arange(3.0), *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 3, 2)), np.zeros((0, 3)))
     assert identities(nobody) == [] and largest(nobody, []).tolist() == []
     assert concatenate([nobody, nobody]).times.tolist() == [0, 1, 2, 0, 1, 2]
@@ -95,7 +84,7 @@ def every_pair(seen: Sightings, max_absence: float) -> list[list[int]]:
     return [people[k].tolist() for k in sorted(range(len(people)), key=lambda k: (-areas[k], people[k][0]))]
 
 
-@pytest.mark.parametrize("seed", range(60))
+@grid(("seed", range(60)))
 def test_who_may_return_is_found_as_among_everybody(seed):
     rng = np.random.default_rng(seed)
     first = rng.integers(0, 50, rng.integers(1, 25))
@@ -129,7 +118,7 @@ def test_thousands_of_tracks_are_not_compared_with_each_other(monkeypatch):
     assert len(identities(seen)) == number
 
 
-@pytest.mark.parametrize(("width", "height", "shrink"), [(1920, 1080, 1), (1920, 1080, 2), (1080, 1920, 3), (640, 640, 2)])
+@grid((("width", "height", "shrink"), [(1920, 1080, 1), (1920, 1080, 2), (1080, 1920, 3), (640, 640, 2)]))
 def test_windows_cover_a_picture_and_overlap(width, height, shrink):
     side = max(width, height) / shrink
     found = windows(width, height, side)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -99,15 +100,16 @@ def test_what_is_there_is_not_made_again(tmp_path, seeing):
     moved.parent.mkdir()
     moved.write_bytes(path.read_bytes())
     assert keypoint_file(moved, tmp_path / "pose").reused
+    before = frames_in(first.folder)
+    shutil.rmtree(first.folder)  # a folder of JSON that is gone comes back
+    assert keypoint_file(path, tmp_path / "pose", json=True).reused and frames_in(first.folder) == before
 
 
-@pytest.mark.parametrize("how", [{"people": 2}, {"every": 2}, {"model": "full"}, {"options": SHORT}])
-def test_other_arguments_make_another_file(tmp_path, seeing, how):
+def test_other_arguments_make_another_file(tmp_path, seeing):
     path = film(tmp_path, [[walk(i)] for i in range(12)])
-    keypoint_file(path, tmp_path / "pose")
-    again = keypoint_file(path, tmp_path / "pose", **how)
-    assert not again.reused and same(again.clips, read_clip_set(again.path))
-    assert not keypoint_file(path, tmp_path / "pose").reused
+    for how in ({}, {"people": 2}, {"every": 2}, {"model": "full"}, {"options": SHORT}):
+        made = keypoint_file(path, tmp_path / "pose", **how)
+        assert not made.reused and same(made.clips, read_clip_set(made.path))
 
 
 def test_another_video_of_the_same_name_is_refused_before_any_work(tmp_path, seeing):
@@ -137,36 +139,32 @@ def test_a_folder_of_one_video_follows_its_content(tmp_path, seeing):
     assert not again.reused and len(read_clip_set(again.path)[0]) == 14
 
 
-@pytest.mark.parametrize("asked", [True, False])
-def test_other_arguments_leave_no_stale_json(tmp_path, seeing, asked):
+def test_other_arguments_leave_no_stale_json(tmp_path, seeing):
     path, folder = film(tmp_path, [[walk(i)] for i in range(12)]), tmp_path / "pose"
     keypoint_file(path, folder, json=True)
-    made = keypoint_file(path, folder, every=3, json=asked)
-    assert not made.reused and made.folder == folder / "a_json" and len(frames_in(made.folder)) == 4
-    again = keypoint_file(path, folder, every=3, json=asked)
-    assert again.reused and again.folder == made.folder
+    for every, asked in ((3, True), (4, False)):
+        made = keypoint_file(path, folder, every=every, json=asked)
+        assert not made.reused and made.folder == folder / "a_json" and len(frames_in(made.folder)) == 12 // every
+        again = keypoint_file(path, folder, every=every, json=asked)
+        assert again.reused and again.folder == made.folder
 
 
 def test_json_and_clip_set_agree_after_a_kill_between_them(tmp_path, seeing, monkeypatch):
     path, folder = film(tmp_path, [[walk(i)] for i in range(12)]), tmp_path / "pose"
+
+    def killed(**how):
+        with monkeypatch.context() as patch:
+            patch.setattr(ClipSet, "save", lambda self, path: (_ for _ in ()).throw(KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                keypoint_file(path, folder, json=True, **how)
+
+    killed()
+    assert (folder / "a_json").is_dir() and not (folder / "a.npz").exists()
     before = frames_in(keypoint_file(path, folder, json=True).folder)
-    with monkeypatch.context() as patch:
-        patch.setattr(ClipSet, "save", lambda self, path: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            keypoint_file(path, folder, every=3, json=True)
+    assert sorted(entry.name for entry in folder.iterdir()) == ["a.npz", "a_json"]
+    killed(every=3)
     assert frames_in(folder / "a_json") != before
     assert keypoint_file(path, folder).reused and frames_in(folder / "a_json") == before
-
-
-def test_a_folder_of_json_that_is_gone_comes_back(tmp_path, seeing):
-    path = film(tmp_path, [[walk(i)] for i in range(12)])
-    made = keypoint_file(path, tmp_path / "pose", json=True)
-    before = frames_in(made.folder)
-    for file in made.folder.iterdir():
-        file.unlink()
-    made.folder.rmdir()
-    assert keypoint_file(path, tmp_path / "pose", json=True).reused
-    assert frames_in(made.folder) == before
 
 
 def test_files_of_others_are_left_alone(tmp_path, seeing):
@@ -174,6 +172,13 @@ def test_files_of_others_are_left_alone(tmp_path, seeing):
     np.savez(tmp_path / "a.npz", joints=np.ones((3, 2, 2)))
     with pytest.raises(ValueError, match=r"a\.npz: is there, and no keypoint file of 'dyntorch pose'; move it away"):
         keypoint_file(path, tmp_path)
+    clips = detect(path)
+    (tmp_path / "none").touch()
+    with pytest.raises(ValueError, match=r"cannot write '.*a_json' \(Not a directory\); free the name or the disk"):
+        write_json_folder(clips, np.arange(12), clips[0].times, tmp_path / "none" / "a_json")
+    with pytest.raises(ValueError, match="no person was found"):
+        keypoint_file(film(tmp_path, [[]] * 5, "b.mp4"), tmp_path / "pose", json=True)
+    assert not (tmp_path / "pose").exists()
 
 
 @pytest.mark.slow
@@ -226,13 +231,6 @@ def test_what_somebody_keeps_in_our_folder_is_not_lost(tmp_path, seeing):
     assert (made.folder / "notes.txt").exists() and keypoint_file(path, folder).reused
 
 
-def test_a_folder_of_json_that_cannot_be_made_is_one_line(tmp_path, seeing):
-    clips = detect(film(tmp_path, [[walk(i)] for i in range(5)]))
-    (tmp_path / "none").touch()
-    with pytest.raises(ValueError, match=r"cannot write '.*a_json' \(Not a directory\); free the name or the disk"):
-        write_json_folder(clips, np.arange(5), clips[0].times, tmp_path / "none" / "a_json")
-
-
 @pytest.mark.slow
 def test_an_interrupted_video_goes_on_where_it_was_and_comes_out_the_same(tmp_path, seeing):
     path = film(tmp_path, [[walk(i), person(280, 200, 45)] for i in range(50)])
@@ -244,17 +242,6 @@ def test_an_interrupted_video_goes_on_where_it_was_and_comes_out_the_same(tmp_pa
     assert same(made.clips, expected) and same(read_clip_set(made.path), expected)
     assert sum(one.looks["landmarks"] for one in seeing[before:]) < 2 * 30  # of a hundred
     assert [entry.name for entry in folder.iterdir()] == ["a.npz"]
-
-
-def test_what_was_killed_before_the_clip_set_was_written_goes_on(tmp_path, seeing, monkeypatch):
-    path = film(tmp_path, [[walk(i)] for i in range(12)])
-    with monkeypatch.context() as patch:
-        patch.setattr(ClipSet, "save", lambda self, path: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            keypoint_file(path, tmp_path / "pose", json=True)
-    assert (tmp_path / "pose" / "a_json").is_dir() and not (tmp_path / "pose" / "a.npz").exists()
-    keypoint_file(path, tmp_path / "pose", json=True)
-    assert sorted(entry.name for entry in (tmp_path / "pose").iterdir()) == ["a.npz", "a_json"]
 
 
 @pytest.mark.slow
@@ -362,13 +349,6 @@ def test_a_clip_set_that_cannot_be_written_ends_only_its_video(tmp_path, seeing,
     (_, one), (_, two) = keypoint_files(tasks, folder, ModelSet("heavy", b"", b"", ()), json=False)
     assert str(one) == "cannot write 'a.npz'" and two.path == folder / "b.npz"
     assert sorted(entry.name for entry in folder.iterdir()) == [".a.parts", "b.npz"]
-
-
-def test_a_video_without_anybody_writes_nothing(tmp_path, seeing):
-    path = film(tmp_path, [[]] * 5)
-    with pytest.raises(ValueError, match="no person was found"):
-        keypoint_file(path, tmp_path / "pose", json=True)
-    assert not (tmp_path / "pose").exists()
 
 
 def test_untimed_files_are_one_piece(tmp_path, seeing):
