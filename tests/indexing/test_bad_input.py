@@ -225,8 +225,3 @@ def test_a_query_without_common_joints_is_refused():
     with pytest.raises(ValueError, match="shares 0 joints with the learned clips, 3 are needed"):
         indexer.predict([keep(lesson[0], lower)])
     assert list(indexer.predict([keep(lesson[0], slice(0, 13))])) == ["squat"]
-
-
-def test_huge_coordinates_are_refused():
-    with pytest.raises(ValueError, match="joints contains infinite or huge values"):
-        Clip(np.full((4, 3, 2), 1e12))

@@ -73,11 +73,17 @@ def test_the_order_of_the_joints_does_not_matter(lesson, recording, kind):
     )
 
 
-def test_a_layout_that_holds_the_other(lesson, recording):
+def test_layouts_that_hold_one_another(lesson, recording):
     indexer = ActionIndexer(scorer="nearest").fit(lesson, lesson.labels)
     with pytest.warns(UserWarning, match=r"of its 25 joints \(BODY_25\) the 17 learned \(COCO-17\) are used"):
         scores = indexer.score_frames(as_body25(recording))
     np.testing.assert_array_equal(scores, indexer.score_frames(recording))
+    hand = Skeleton("mouse", ("snout", "tail", *(f"paw_{i}" for i in range(14)), "nose"))
+    with pytest.raises(ValueError, match=r"clip 0 .*: joints: 1 of its 17 \(snout, tail, paw_0, paw_1, ...\) have names of the 17"):
+        indexer.predict([lesson[0].replace(skeleton=hand)])
+    wide = indexer.fit([as_body25(clip) for clip in lesson], lesson.labels)
+    with pytest.warns(UserWarning, match=r"17 of the 25 joints learned are in it; not neck, mid_hip"):
+        wide.predict([recording])
 
 
 def test_joints_that_a_clip_does_not_have_are_not_seen(lesson, recording):
@@ -89,13 +95,6 @@ def test_joints_that_a_clip_does_not_have_are_not_seen(lesson, recording):
     assert clip.joints.shape[1] == 17 and not clip.seen[:, [3, 4]].any() and clip.skeleton is COCO17
     assert said == "a.json: 15 of the 17 joints learned are in it; not left_ear, right_ear"
     np.testing.assert_array_equal(clip.joints[:, few], part.joints)
-
-
-def test_layouts_that_share_too_little_are_refused(lesson):
-    indexer = ActionIndexer(scorer="nearest").fit(lesson, lesson.labels)
-    hand = Skeleton("mouse", ("snout", "tail", *(f"paw_{i}" for i in range(14)), "nose"))
-    with pytest.raises(ValueError, match=r"clip 0 .*: joints: 1 of its 17 \(snout, tail, paw_0, paw_1, ...\) have names of the 17"):
-        indexer.predict([lesson[0].replace(skeleton=hand)])
 
 
 def test_layouts_without_names_that_contradict_each_other_are_refused():
@@ -118,60 +117,34 @@ def test_a_model_of_any_layout_of_a_body_takes_coco(recording, learned):
         np.testing.assert_array_equal(clip.joints[:, learned.joints.index(name)], recording.joints[:, COCO17.joints.index(name)])
     assert (said == "") == (learned is COCO17)
     assert ("near each other" in said) == (learned in (H36M17, KINECT20, NTU25))
-
-
-def test_faces_and_fingers_do_not_make_another_layout(recording):
-    for learned, count in ((WHOLEBODY133, 133), (HALPE136, 136)):
-        said = match_joints(recording, learned, "a.json")[1]
-        assert said.startswith(f"a.json: 17 of the {count} joints learned are in it; not ")
+    if learned in (WHOLEBODY133, HALPE136):  # faces and fingers do not make another layout
+        assert said.startswith(f"a.json: 17 of the {len(learned.joints)} joints learned are in it; not ")
     with pytest.raises(ValueError, match=r"0 of its 17 \(nose, left_eye, right_eye, left_ear, ...\) have names of the 21 joints"):
         match_joints(recording, HAND21)
 
 
-def test_a_model_of_openpose_scans_coco(recording):
-    lesson = dataset([Person.random(0)], KNOWN, azimuth=0.0, rng=0)
-    wide = [as_body25(clip) for clip in lesson]
-    indexer = ActionIndexer(scorer="nearest").fit(wide, lesson.labels)
-    with pytest.warns(UserWarning, match=r"17 of the 25 joints learned are in it; not neck, mid_hip"):
-        indexer.predict([recording])
+SAME = [
+    ("LShoulder", "left_shoulder"), ("RBigToe", "right_big_toe"), ("knee.R", "right_knee"), ("l_ankle", "Left Ankle"),
+    ("lhip", "left_hip"), ("MidHip", "hip"), ("pelvis", "mid_hip"), ("root", "CHip"), ("Head", "head_top"),
+    ("mouth_left", "left_mouth"),
+]  # fmt: skip
+NEAR = [
+    ("neck", "upper_neck"), ("head", "head_center"), ("left_hip", "mid_hip"), ("spine_base", "mid_hip"), ("neck", "thorax"),
+    ("left_foot_index", "left_big_toe"), ("rear", "right_ear"), ("left_foot", "left_ankle"), ("hip_center", "root"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("one", "other"),
-    [
-        ("LShoulder", "left_shoulder"), ("RBigToe", "right_big_toe"), ("knee.R", "right_knee"), ("l_ankle", "Left Ankle"),
-        ("lhip", "left_hip"), ("MidHip", "hip"), ("pelvis", "mid_hip"), ("root", "CHip"), ("Head", "head_top"),
-        ("mouth_left", "left_mouth"),
-    ],
-)  # fmt: skip
-def test_the_same_point_in_other_words(one, other):
-    assert canonical(one) == canonical(other)
-    assert places(Skeleton("a", ("x", one)), Skeleton("b", (other,))) == [1]
-
-
-@pytest.mark.parametrize(
-    ("one", "other"),
-    [
-        ("neck", "upper_neck"), ("head", "head_center"), ("left_hip", "mid_hip"), ("spine_base", "mid_hip"), ("neck", "thorax"),
-        ("left_foot_index", "left_big_toe"), ("rear", "right_ear"), ("left_foot", "left_ankle"), ("hip_center", "root"),
-    ],
-)  # fmt: skip
-def test_points_that_are_only_near_are_others(one, other):
-    assert canonical(one) != canonical(other)
-    assert places(Skeleton("a", (one,)), Skeleton("b", (other,))) == [-1]
-
-
-def test_two_joints_with_names_for_one_point_are_taken_by_their_own(recording):
+def test_the_same_point_in_other_words_and_points_that_are_only_near():
+    for one, other in SAME:
+        assert canonical(one) == canonical(other) and places(Skeleton("a", ("x", one)), Skeleton("b", (other,))) == [1], one
+    for one, other in NEAR:
+        assert canonical(one) != canonical(other) and places(Skeleton("a", (one,)), Skeleton("b", (other,))) == [-1], one
+    # two joints with names for one point are taken by their own
     assert places(Skeleton("a", ("hip", "mid_hip")), Skeleton("b", ("mid_hip", "hip"))) == [1, 0]
     assert places(Skeleton("a", ("hip", "root", "nose")), Skeleton("b", ("pelvis", "nose"))) == [-1, 2]  # which one nobody knows
     assert places(Skeleton("a", ("hip",)), Skeleton("b", ("hip", "pelvis"))) == [0, -1]
-
-
-def test_openpose_layouts_share_what_they_share():
-    found = {
-        (a.name, b.name): sum(i >= 0 for i in places(a, b)) for a in (BODY25, BODY25B, HALPE26) for b in (BODY25, BODY25B, HALPE26)
-    }
-    assert found["BODY_25", "Halpe-26"] == 25 and found["BODY_25B", "Halpe-26"] == 24 and found["BODY_25", "BODY_25B"] == 23
+    shared = [sum(i >= 0 for i in places(a, b)) for a, b in ((BODY25, HALPE26), (BODY25B, HALPE26), (BODY25, BODY25B))]
+    assert shared == [25, 24, 23]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -205,9 +178,8 @@ def test_numbers_of_joints() -> None:
         "OpenPose-COCO-18": 18,
         "OpenPose-MPI-15": 15,
     }  # fmt: skip
-    assert [usual_layout(n) for n in (17, 25, 26, 33, 133, 136, 20)] == [
-        COCO17, BODY25, HALPE26, MEDIAPIPE33, WHOLEBODY133, HALPE136, None,
-    ]  # fmt: skip
+    usual = {17: COCO17, 25: BODY25, 26: HALPE26, 33: MEDIAPIPE33, 133: WHOLEBODY133, 136: HALPE136, 20: None}
+    assert {count: usual_layout(count) for count in usual} == usual
     assert candidates(17) == (COCO17, H36M17) and candidates(25) == (BODY25, BODY25B, NTU25) and candidates(9) == ()
 
 
@@ -228,22 +200,15 @@ def test_joints_are_where_the_tool_puts_them(layout: Skeleton, places: dict[str,
 
 
 # ---- by what a body looks like -------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("dims", [2, 3])
 @pytest.mark.parametrize("layout", [layout for layout in BODIES if len(layout.joints) <= 33], ids=lambda layout: layout.name)
-def test_a_body_is_recognized_among_its_rivals(layout: Skeleton, dims: int) -> None:
-    body = tools.standing(layout, dims=dims)
-    found = recognize_layout(body, candidates(len(layout.joints)), "-y" if dims == 2 else "y")
-    assert found is not None and found.layout is layout
-    found = recognize_layout(body, candidates(len(layout.joints)), None)
-    assert found is not None and (found.layout is layout, found.up) == (True, "-y" if dims == 2 else "y")
-
-
-def test_what_is_up_is_found_in_three_dimensions() -> None:
-    body = tools.standing(NTU25, dims=3)
-    turned = body[..., [0, 2, 1]]
-    for points, up in ((body, "y"), (turned, "z"), (-turned, "-z"), (-body, "-y")):
-        found = recognize_layout(points, candidates(25), None)
-        assert found is not None and (found.layout, found.up) == (NTU25, up)
+def test_a_body_is_recognized_among_its_rivals_and_what_is_up(layout: Skeleton) -> None:
+    flat, solid = (tools.standing(layout, dims=dims) for dims in (2, 3))
+    turned = solid[..., [0, 2, 1]]
+    for points, up, said in (
+        (flat, "-y", "-y"), (flat, "-y", None), (solid, "y", "y"), (solid, "y", None), (turned, "z", None), (-turned, "-z", None),
+    ):  # fmt: skip
+        found = recognize_layout(points, candidates(len(layout.joints)), said)
+        assert found is not None and found.layout is layout and (said is not None or found.up == up)
 
 
 def test_points_of_no_body_are_not_recognized() -> None:
@@ -322,13 +287,9 @@ def test_clip_sets_whose_bodies_show_nothing_stay_without_names(tmp_path: Path) 
     assert clip.skeleton is not None and clip.skeleton.joints == tuple(names)
     (clip,) = read(tmp_path / "named.npz", layout="COCO-17")
     assert clip.skeleton is COCO17
-
-
-def test_what_readers_say_of_some_clips_does_not_keep_a_set_from_being_saved(tmp_path: Path) -> None:
-    body = tools.standing(COCO17)
-    np.savez(tmp_path / "set.npz", joints=body, up="-y")
-    found = read_clip(tmp_path / "set.npz")
-    assert "layout" in found.meta
+    np.savez(tmp_path / "flat.npz", joints=tools.standing(COCO17), up="-y")
+    found = read_clip(tmp_path / "flat.npz")
+    assert "layout" in found.meta  # what readers say of some clips does not keep a set from being saved
     ClipSet([found, found.replace(meta={})]).save(tmp_path / "both.npz")
     assert "layout" not in ClipSet.load(tmp_path / "both.npz").fields
 

@@ -21,6 +21,7 @@ from indexing.windows import (
     check_clips,
     concatenate_clips,
     describe_unusable,
+    repair_clip,
     resample_clips,
     sample,
     wrong_joints,
@@ -55,50 +56,33 @@ def slow_window(clip, start, end, length):
 CLIPS = [irregular(0), irregular(1, frames=2), irregular(2, frames=60, start=1e5), irregular(3, start=-7.0)]
 
 
-def test_whole_clips_against_interpolation():
-    got = resample_clips(concatenate_clips(CLIPS), 12)
-    assert got.shape == (4, 12, 5, 2) and got.dtype == torch.float32
-    for clip, window in zip(CLIPS, got, strict=True):
-        np.testing.assert_allclose(window, slow_window(clip, clip.times[0], clip.times[-1], 12), atol=2e-5)
+def test_clips_and_crops_against_interpolation():
+    for crop in ((0.0, 1.0), (0.0, 0.7), (0.15, 1.0), (0.3, 0.4)):
+        got = resample_clips(concatenate_clips(CLIPS), 9, crop)
+        assert got.shape == (4, 9, 5, 2) and got.dtype == torch.float32
+        for clip, window in zip(CLIPS, got, strict=True):
+            low, high = (clip.times[0] + share * clip.duration for share in crop)
+            np.testing.assert_allclose(window, slow_window(clip, low, high, 9), atol=2e-5)
 
 
-@pytest.mark.parametrize("crop", [(0.0, 0.7), (0.15, 1.0), (0.3, 0.4)])
-def test_crops_are_parts_of_the_duration(crop):
-    got = resample_clips(concatenate_clips(CLIPS), 9, crop)
-    for clip, window in zip(CLIPS, got, strict=True):
-        low, high = (clip.times[0] + share * clip.duration for share in crop)
-        np.testing.assert_allclose(window, slow_window(clip, low, high, 9), atol=2e-5)
-
-
-def test_windows_anywhere_also_beyond_the_ends():
+def test_windows_anywhere_also_beyond_the_ends_in_any_chunks(monkeypatch):
     clips = [with_holes(clip, seed=i) for i, clip in enumerate(CLIPS)]
     owner = np.array([2, 0, 0, 3, 1, 2])
     start = np.array([clips[i].times[0] for i in owner]) + np.array([-0.5, 0.1, -9.0, 0.3, 0.0, 3.0])
     end = start + np.array([1.0, 0.4, 2.0, 1.5, 5.0, 90.0])
     got = sample(concatenate_clips(clips), owner, start, end, 8)
     for i, window in enumerate(got):
-        clip = clips[owner[i]]
         # the first and last frame are repeated outside: that is what np.interp does too
-        np.testing.assert_allclose(window, slow_window(clip, start[i], end[i], 8), atol=2e-5)
-
-
-def test_the_result_does_not_depend_on_the_chunk(monkeypatch):
-    source = concatenate_clips(CLIPS)
-    owner, start = np.arange(4).repeat(3), np.zeros(12)
-    begin = np.array([clip.times[0] for clip in CLIPS])[owner] + start
-    expected = sample(source, owner, begin, begin + 0.5, 6)
+        np.testing.assert_allclose(window, slow_window(clips[owner[i]], start[i], end[i], 8), atol=2e-5)
     monkeypatch.setattr("indexing.windows.CHUNK", 6 * SUBSAMPLES * 5 * 2 * 5)
-    assert torch.equal(sample(source, owner, begin, begin + 0.5, 6), expected)
+    assert torch.equal(sample(concatenate_clips(clips), owner, start, end, 8), got)
 
 
-def test_clips_do_not_leak_into_one_another():
-    together = resample_clips(concatenate_clips(CLIPS), 7)
-    alone = torch.cat([resample_clips(concatenate_clips([clip]), 7) for clip in CLIPS])
-    torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)
-
-
-def test_missing_joints_are_interpolated_in_time():
+def test_missing_joints_are_interpolated_in_time_and_y_points_up():
     clips = [with_holes(clip, seed=i) for i, clip in enumerate(CLIPS)]
+    half = clips[0].joints.copy()
+    half[np.isfinite(half).all(axis=2).argmax(axis=0), np.arange(5), 0] = np.nan  # one coordinate missing: the joint is
+    clips[0] = clips[0].replace(joints=half, up="-y")
     source = concatenate_clips(clips)
     for i, clip in enumerate(clips):
         part = source.joints[source.starts[i] : source.starts[i + 1]]
@@ -107,16 +91,7 @@ def test_missing_joints_are_interpolated_in_time():
             assert source.seen[i, j] == ok.any()
             for d in range(2):
                 expected = np.interp(clip.times, clip.times[ok], clip.joints[ok, j, d]) if ok.any() else np.zeros(len(clip))
-                np.testing.assert_allclose(part[:, j, d], expected, atol=1e-5)
-
-
-def test_a_joint_with_one_coordinate_missing_is_missing():
-    joints = CLIPS[0].joints.copy()
-    joints[4, 1, 0] = np.nan
-    filled = concatenate_clips([CLIPS[0].replace(joints=joints)]).joints[4, 1]
-    ok = np.arange(17) != 4
-    expected = [np.interp(CLIPS[0].times[4], CLIPS[0].times[ok], joints[ok, 1, d]) for d in range(2)]
-    np.testing.assert_allclose(filled, expected, atol=1e-5)
+                np.testing.assert_allclose(part[:, j, d], expected * (-1 if d and clip.up == "-y" else 1), atol=1e-5)
 
 
 def test_never_seen_joints_are_marked_and_zero():
@@ -126,11 +101,6 @@ def test_never_seen_joints_are_marked_and_zero():
     assert source.seen.tolist() == [[True] * 5, [True, True, True, False, True], [True] * 5]
     assert (source.joints[source.starts[1] : source.starts[2], 3] == 0).all()
     assert torch.isfinite(resample_clips(source, 6)).all()
-
-
-def test_y_points_up_in_windows():
-    clip = irregular(5)
-    np.testing.assert_allclose(concatenate_clips([clip.replace(up="-y")]).joints, clip.joints * [1, -1], rtol=1e-6)
 
 
 def test_frame_rate_changes_nothing_that_moves_linearly():
@@ -144,36 +114,23 @@ def test_frame_rate_changes_nothing_that_moves_linearly():
 GOOD = Clip(np.random.default_rng(0).normal(size=(5, 4, 2)), name="good")
 
 
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
+def test_unusable_clips_and_other_joint_counts_are_named():
+    for bad, message in (
         (GOOD.joints[:1], "one frame only"),
         (np.full((5, 4, 2), np.nan), r"no joint was seen in any frame \(all NaN\)"),
         (np.zeros((5, 4, 2)), r"all joints are at one place in all frames \(all 0\)"),
         (np.full((5, 4, 2), 3.5), r"all joints are at one place.*all 3.5"),
-    ],
-)
-def test_unusable_clips_are_named(bad, message):
-    clip = Clip(bad, name="bad")
-    with pytest.raises(ValueError, match=r"clip 1 \('bad'\): joints: " + message + ".*; leave the clip out"):
-        check_clips([GOOD, clip])
-    assert describe_unusable(GOOD) is None and describe_unusable(clip) is not None
-
-
-def test_joint_counts_must_agree():
-    other = Clip(np.random.default_rng(1).normal(size=(5, 3, 2)))
-    with pytest.raises(ValueError, match=r"clip 1: joints: 3 joints, but clip 0 has 4"):
-        check_clips([GOOD, other])
-    with pytest.raises(ValueError, match=r"clip 0 \('good'\): joints: 4 joints, but the fitted clips have 17"):
-        check_clips([GOOD], joints=17)
-    check_clips([GOOD, GOOD], joints=4)
-
-
-def test_half_missing_and_still_but_not_collapsed_clips_are_usable():
+    ):
+        with pytest.raises(ValueError, match=r"clip 1 \('bad'\): joints: " + message + ".*; leave the clip out"):
+            check_clips([GOOD, Clip(bad, name="bad")])
     joints = GOOD.joints.copy()
     joints[1:] = np.nan
-    assert describe_unusable(Clip(joints)) is None
-    assert describe_unusable(Clip(np.repeat(GOOD.joints[:1], 4, axis=0))) is None
+    for usable in (GOOD.joints, joints, np.repeat(GOOD.joints[:1], 4, axis=0)):
+        assert describe_unusable(Clip(usable)) is None
+    with pytest.raises(ValueError, match=r"clip 1: joints: 3 joints, but clip 0 has 4"):
+        check_clips([GOOD, Clip(GOOD.joints[:, :3])])
+    with pytest.raises(ValueError, match=r"clip 0 \('good'\): joints: 4 joints, but the fitted clips have 17"):
+        check_clips([GOOD], joints=17)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -242,11 +199,10 @@ def test_planted_jumps_are_found_and_only_those():
     np.testing.assert_array_equal(joints, before)
 
 
-@pytest.mark.parametrize("change", [lambda j: j, lambda j: np.repeat(j[:1], len(j), axis=0), lambda j: j[:4], lambda j: j[::4]])
-def test_right_joints_are_left_alone(change):
+@pytest.mark.parametrize("rows", [np.arange(80), np.zeros(80, int), np.arange(4), np.arange(0, 80, 4)])
+def test_right_joints_are_left_alone(rows):
     joints, times = walk()
-    rows = change(np.arange(80)[:, None])[:, 0]
-    assert not wrong_in(change(joints), times[: len(rows)] if len(rows) == 80 else times[rows]).any()
+    assert not wrong_in(joints[rows], times[: len(rows)] if len(rows) == 80 else times[rows]).any()
 
 
 def test_gaps_and_frame_rate_do_not_make_a_movement_look_wrong():
@@ -273,16 +229,13 @@ def test_unit_and_other_clips_do_not_matter():
         assert together.sum() == apart.sum() == 1
 
 
-def test_repair_interpolates_what_was_wrong():
+def test_repair_interpolates_what_was_wrong_and_helps_to_recognize():
     clean, times = walk()
     joints = clean.copy()
     joints[33, 2] = 50
     source = concatenate_clips([Clip(joints, times=times), Clip(clean, times=times)], repair=True)
     np.testing.assert_allclose(source.joints[:80], clean, atol=0.02)
     assert np.abs(concatenate_clips([Clip(joints, times=times)]).joints - clean).max() > 40
-
-
-def test_repair_helps_where_joints_jump():
     few, rng = ("squat", "wave", "kick", "bow"), np.random.default_rng(0)
     train, test = (dataset([Person.random(seed)], few, azimuth=60.0 * seed, rng=seed) for seed in (0, 1))
     jumpy = [c.replace(joints=c.joints + 400 * (rng.random(c.joints.shape[:2]) < 0.05)[..., None]) for c in test]
@@ -290,16 +243,12 @@ def test_repair_helps_where_joints_jump():
 
 
 def test_long_recordings_are_mended_in_parts(monkeypatch):
-    from indexing.clip import Clip
-    from indexing.windows import repair_clip
-
     rng = np.random.default_rng(5)
-    walk = np.linspace(0, 3, 400)[:, None, None] + np.arange(4.0)[:, None] + 0.005 * rng.normal(size=(400, 4, 2))
-    clean = Clip(walk, fps=30.0)
+    joints = np.linspace(0, 3, 400)[:, None, None] + np.arange(4.0)[:, None] + 0.005 * rng.normal(size=(400, 4, 2))
+    clean = Clip(joints, fps=30.0)
     assert repair_clip(clean) is clean
-    walk[[30, 199, 200, 350], [0, 1, 2, 3]] += 2.0
-    broken = Clip(walk, fps=30.0)
-    whole = repair_clip(broken)
+    joints[[30, 199, 200, 350], [0, 1, 2, 3]] += 2.0
+    whole = repair_clip(Clip(joints, fps=30.0))
     assert np.argwhere(~whole.seen).tolist() == [[30, 0], [199, 1], [200, 2], [350, 3]]
     monkeypatch.setattr(windows, "MAX_FRAMES_JUDGED", 100)
-    assert np.array_equal(repair_clip(broken).seen, whole.seen)
+    assert np.array_equal(repair_clip(Clip(joints, fps=30.0)).seen, whole.seen)
