@@ -12,7 +12,7 @@ from indexing.calibrate.people.pair_geometry import arrange, common_frames, dist
 from indexing.calibrate.people.tracklets import cluster, sightings, split_tracks
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton
-from tests.indexing.calibrate.crowd import LAYOUT, NAMES, Person, cameras, clips, crossing, filmed
+from tests.indexing.calibrate.crowd import NAMES, Person, cameras, clips, crossing, filmed
 
 AROUND = (0.2, 1.5, 3.6)
 
@@ -73,21 +73,14 @@ def test_exchanged_numbers_are_mended_and_clocks_found(scene):
 def test_fundamental_matrices_are_those_of_the_cameras(scene):
     rig, tracks, _, _ = scene
     found = associate([clips(one) for one in tracks], clocks=rig.clocks.offsets.numpy())
-    points = STANDING_POINTS
+    points = torch.from_numpy(np.random.default_rng(0).uniform([-0.8, -0.8, 0.1], [0.8, 0.8, 1.7], (40, 3)))
+    seen = (points @ rig.R.mT + rig.t[:, None]) @ rig.K.mT
+    x = (seen / seen[..., 2:]).numpy()
     for (i, j), matrix in found.fundamentals.items():
-        x, y = (image(rig, camera, points) for camera in (i, j))
-        line = np.c_[x, np.ones(len(x))] @ matrix.T
-        away = np.abs((np.c_[y, np.ones(len(y))] * line).sum(1)) / np.linalg.norm(line[:, :2], axis=1)
+        line = x[i] @ matrix.T
+        away = np.abs((x[j] * line).sum(1)) / np.linalg.norm(line[:, :2], axis=1)
         assert np.median(away) < 4.0
     assert found.clocks is None and np.allclose(found.offsets_rates[:, 0], rig.clocks.offsets)
-
-
-STANDING_POINTS = np.random.default_rng(0).uniform([-0.8, -0.8, 0.1], [0.8, 0.8, 1.7], (40, 3))
-
-
-def image(rig, camera, points):
-    seen = points @ rig.R[camera].numpy().T + rig.t[camera].numpy()
-    return seen[:, :2] / seen[:, 2:] * float(rig.K[camera, 0, 0]) + rig.K[camera, :2, 2].numpy()
 
 
 def test_distances_are_sampsons():
@@ -163,22 +156,21 @@ def test_nobody():
     assert "nobody is seen" in found.reason and np.isnan(found.mean_certainty)
 
 
-@pytest.mark.parametrize(
-    ("takes", "more", "said"),
-    [
-        (lambda x: [x], {}, "two at least"),
-        (lambda x: [x, []], {}, "no people given"),
-        (lambda x: [x, [Clip(np.zeros((20, 5, 3)) + np.arange(3), fps=30.0, name="deep")]], {}, "deep: has 3D joints"),
-        (lambda x: [x, [*x, Clip(np.zeros((20, 5, 2)), fps=30.0)]], {}, "people of one camera have the same"),
-        (lambda x: [x, [Clip(np.zeros((20, 5, 2)), fps=30.0)]], {}, "have no names"),
-        (lambda x: [x, x], {"clocks": [0.0]}, "for each of 2 cameras"),
-        (lambda x: [x, x], {"clocks": [[0.0, 1.0], [0.0, -1.0]]}, "for each of 2 cameras"),
-    ],
-)
-def test_bad_input(takes, more, said):
+def test_bad_input():
     x = clips(np.zeros((20, 1, len(NAMES), 2)) + np.arange(20)[:, None, None, None])
-    with pytest.raises((ValueError, TypeError), match=said):
-        associate(takes(x), **more)
+    deep = Clip(np.zeros((20, 5, 3)) + np.arange(3), fps=30.0, name="deep")
+    bare = Clip(np.zeros((20, 5, 2)), fps=30.0)
+    for takes, more, said in (
+        ([x], {}, "two at least"),
+        ([x, []], {}, "no people given"),
+        ([x, [deep]], {}, "deep: has 3D joints"),
+        ([x, [*x, bare]], {}, "people of one camera have the same"),
+        ([x, [bare]], {}, "have no names"),
+        ([x, x], {"clocks": [0.0]}, "for each of 2 cameras"),
+        ([x, x], {"clocks": [[0.0, 1.0], [0.0, -1.0]]}, "for each of 2 cameras"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=said):
+            associate(takes, **more)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -217,41 +209,22 @@ def test_common_moments_of_another_clock():
     assert np.abs(both.b[:2, 0] - expected).max() < 1e-9
 
 
-def random_scores(seed, n=7):
-    rng = np.random.default_rng(seed)
-    scores = np.triu(rng.standard_normal((n, n)) * 3, 1)
-    conflicts = np.triu(rng.uniform(size=(n, n)) < 0.3, 1)
-    return scores + scores.T, conflicts | conflicts.T
-
-
-def total(scores, labels):
-    return sum(scores[p, q] for p in range(len(labels)) for q in range(p) if labels[p] == labels[q])
-
-
-def partitions(n):
-    """All labelings up to the names of the groups."""
-    out = [[0]]
-    for _ in range(n - 1):
-        out = [[*one, k] for one in out for k in range(max(one) + 2)]
-    return out
-
-
 def test_clusters_are_nearly_always_the_best_of_all():
+    every = [[0]]
+    for _ in range(6):  # all labelings up to the names of the groups
+        every = [[*one, k] for one in every for k in range(max(one) + 2)]
     best_of_all = 0
-    every = [np.array(one) for one in partitions(7)]
     for seed in range(12):
-        scores, conflicts = random_scores(seed)
-        labels = cluster(scores, conflicts, np.arange(7.0))
-        assert not (conflicts & (labels[:, None] == labels)).any()
-        most = max(total(scores, one) for one in every if not (conflicts & (one[:, None] == one)).any())
-        best_of_all += total(scores, labels) > most - 1e-9
+        rng = np.random.default_rng(seed)
+        scores, conflicts = np.triu(rng.standard_normal((7, 7)) * 3, 1), np.triu(rng.uniform(size=(7, 7)) < 0.3, 1)
+        conflicts |= conflicts.T
+        same = [np.equal.outer(one, one) for one in (cluster(scores + scores.T, conflicts, np.arange(7.0)), *every)]
+        mine, *others = [scores[one].sum() for one in same if not (conflicts & one).any()]
+        assert not (conflicts & same[0]).any()
+        best_of_all += mine > max(others) - 1e-9
     assert best_of_all >= 9
-
-
-def test_no_clusters_of_nothing():
-    assert cluster(np.zeros((0, 0)), np.zeros((0, 0), dtype=bool)).shape == (0,)
-    labels = cluster(np.full((3, 3), -1.0), np.zeros((3, 3), dtype=bool))
-    assert sorted(labels.tolist()) == [0, 1, 2]
+    assert cluster(np.zeros((0, 0)), np.zeros((0, 0), dtype=bool), np.zeros(0)).shape == (0,)
+    assert sorted(cluster(np.full((3, 3), -1.0), np.zeros((3, 3), dtype=bool), np.arange(3.0)).tolist()) == [0, 1, 2]
 
 
 def test_two_groups_exchange_what_comes_after(monkeypatch):
@@ -264,7 +237,3 @@ def test_two_groups_exchange_what_comes_after(monkeypatch):
     conflicts[0, 1] = conflicts[1, 0] = conflicts[2, 3] = conflicts[3, 2] = True
     labels = cluster(scores, conflicts, np.array([0.0, 0.0, 1.0, 1.0]))
     assert labels[0] == labels[3] != labels[1] == labels[2]
-
-
-def test_layout_of_the_scene():
-    assert len(LAYOUT.joints) == 13 and torch.float64 == cameras((0.0,)).K.dtype

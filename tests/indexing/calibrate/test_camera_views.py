@@ -23,7 +23,7 @@ def moving(frames=30, joints=17, seed=0):
 
 
 # ---- frames --------------------------------------------------------------------------------------------------------------
-def test_frames_keep_their_times_and_joints_their_confidence():
+def test_frames_keep_their_times_and_joints_their_confidence_and_people_stand_side_by_side():
     joints, kept = moving(), np.r_[4:10, 13:30]
     joints[7, 3] = np.nan
     trust = np.linspace(0.1, 1, 30 * 17).reshape(30, 17)
@@ -34,13 +34,9 @@ def test_frames_keep_their_times_and_joints_their_confidence():
     assert np.array_equal(tracks.numpy(), joints[kept], equal_nan=True) and float(weights[3, 3]) == 0
     weights[3, 3] = trust[7, 3]
     assert np.array_equal(weights.numpy(), trust[kept])
-
-
-def test_people_stand_side_by_side_and_who_is_not_there_is_missing():
     a, b = clip(moving(seed=1)), clip(moving(20, seed=2), times=(np.arange(20) + 5) / FPS)
-    view = make_view(take_of([a, b], name="x"), [a, None, b], SIZE)
-    tracks, weights = view.table(range(17))
-    assert tracks.shape == (30, 51, 2) and weights.shape == (30, 51) and bool(tracks[:, 17:34].isnan().all())
+    tracks, weights = make_view(take_of([a, b], name="x"), [a, None, b], SIZE).table(range(17))
+    assert tracks.shape == (30, 51, 2) and weights.shape == (30, 51) and bool(tracks[:, 17:34].isnan().all())  # who is missing
     assert torch.equal(tracks[:, :17], torch.tensor(a.joints)) and torch.equal(tracks[5:25, 34:], torch.tensor(b.joints))
 
 
@@ -55,31 +51,23 @@ def test_a_clock_that_runs_over_hardly_any_frames_is_refused():
 # ---- joints --------------------------------------------------------------------------------------------------------------
 def test_layouts_are_joined_by_names():
     halves = Skeleton("upper", (*COCO17.joints[:13], "neck"), ((0, 13),))
-    clips = [Clip(np.zeros((1, len(one.joints), 2)), skeleton=one) for one in (COCO17, BODY25, halves)]
+    clips = [clip(moving(20, len(one.joints)), skeleton=one) for one in (COCO17, BODY25, halves)]
     found = select_common_joints(clips, ["a", "b", "c"])
     assert found.skeleton.joints == (*COCO17.joints, "neck")  # all that two of them have
-    for place, layout in zip(found.places, (COCO17, BODY25, halves), strict=True):
-        for i, joint in zip(place, found.skeleton.joints, strict=True):
-            assert (layout.joints[i] == joint) if i >= 0 else joint not in layout.joints
+    for one, place in zip(clips, found.places, strict=True):
+        tracks = make_view(take_of(one, name="x"), [one], SIZE).table(place)[0]
+        for i, (at, joint) in enumerate(zip(place, found.skeleton.joints, strict=True)):
+            assert (one.skeleton.joints[at] == joint) if at >= 0 else joint not in one.skeleton.joints
+            expected = one.joints[:, at] if at >= 0 else np.full((20, 2), np.nan)  # missing where a camera lacks it
+            assert np.array_equal(tracks[:, i], expected, equal_nan=True)
     assert "COCO-17, BODY_25, upper: 18 joints" in found.note and (17, 0) in found.skeleton.bones
     same = select_common_joints(clips[:1] * 3, ["a", "b", "c"])
     assert same.skeleton is COCO17 and same.places == (tuple(range(17)),) * 3 and same.note == ""
-
-
-def test_joints_of_one_camera_that_another_lacks_are_missing_there():
-    clips = [clip(moving(20, len(one.joints)), skeleton=one) for one in (COCO17, BODY25)]
-    found = select_common_joints(clips, ["a", "b"])
-    tracks = [make_view(take_of(c, name="x"), [c], SIZE).table(p)[0] for c, p in zip(clips, found.places, strict=True)]
-    assert found.count == 17 and torch.equal(tracks[1][:, 0], torch.tensor(clips[1].joints[:, 0]))
-    assert torch.equal(tracks[1][:, 5], torch.tensor(clips[1].joints[:, BODY25.joints.index("left_shoulder")]))
-
-
-def test_layouts_that_cannot_be_joined():
-    body, hand = (Clip(np.zeros((1, len(one.joints), 2)), skeleton=one) for one in (COCO17, HAND21))
+    hand = Clip(np.zeros((1, 21, 2)), skeleton=HAND21)
     with pytest.raises(
         ValueError, match=r"a: its joints \(nose, .*\) share 0 names with those of any other camera, and 8 are needed"
     ):
-        select_common_joints([body, hand], ["a", "b"])
+        select_common_joints([clips[0], hand], ["a", "b"])
     bare = [Clip(np.zeros((1, n, 2))) for n in (14, 15)]
     with pytest.raises(ValueError, match="a: has 14 joints without names, b has 15, so nobody knows which is which; give layout="):
         select_common_joints(bare, ["a", "b"])
@@ -87,18 +75,13 @@ def test_layouts_that_cannot_be_joined():
 
 
 # ---- pictures ------------------------------------------------------------------------------------------------------------
-def test_sizes_from_wherever_they_are_known():
+def test_sizes_from_wherever_they_are_known_and_coordinates_from_0_to_1_become_pixels():
     named = take_of(clip(moving(), meta={"size": np.array([640, 480])}), name="a")
     assert to_pixels(named, None)[1] == (640, 480) and to_pixels(named, (1920, 1080))[1] == (1920, 1080)
     with pytest.raises(ValueError, match="b: the size of its picture is not known; give size= such as 1920x1080"):
         to_pixels(take_of(clip(moving()), name="b"), None)
-
-
-def test_coordinates_from_0_to_1_become_pixels():
-    joints = moving()
-    shares = clip(joints / np.array(SIZE), name="n")
-    take, size = to_pixels(take_of(shares, name="n"), SIZE)
-    assert np.allclose(take.people[0].joints, joints) and np.allclose(take.everyone[0].joints, joints) and size == SIZE
+    take, size = to_pixels(take_of(clip(moving() / np.array(SIZE), name="n"), name="n"), SIZE)
+    assert np.allclose(take.people[0].joints, moving()) and np.allclose(take.everyone[0].joints, moving()) and size == SIZE
     assert not any("0 to 1" in str(note) for note in take.notes)
 
 
@@ -131,12 +114,13 @@ def test_cameras_that_are_none_of_one_rig():
 
 
 def test_cameras_without_a_common_time():
-    a, b, c = clip(moving(seed=1)), clip(moving(seed=2)), clip(moving(seed=3), times=100 + np.arange(30) / FPS)
-    views = [make_view(take_of(one, name=name), [one], SIZE) for one, name in ((a, "a"), (b, "b"), (c, "c"))]
+    clips = {name: clip(moving(seed=i), times=100 * (i == 2) + np.arange(30) / FPS) for i, name in enumerate("abc")}
+    views = [make_view(take_of(one, name=name), [one], SIZE) for name, one in clips.items()]
     known = torch.tensor([[0.0, 1.0]] * 3, dtype=torch.float64)
     check_overlap(views[:2], known[:2])
     with pytest.raises(
         ValueError, match=r"c recorded from 100.000 to 100.967 s, a from 0.000 to 0.967 s of one clock: .* no time in"
     ):
         check_overlap(views, known)
-    check_overlap(views, torch.tensor([[0.0, 1.0], [0.0, 1.0], [100.0, 1.0]], dtype=torch.float64))
+    known[2, 0] = 100.0
+    check_overlap(views, known)

@@ -7,6 +7,7 @@ import pytest
 
 from indexing.calibrate import left_right
 from indexing.calibrate.left_right import LIMBS, SideNotice, _reprojection_cost, _viterbi, correct_sides, paired_joints
+from indexing.skeleton import BODY25, COCO17
 from tests.indexing.calibrate.crowd import NAMES, cameras, crossing, filmed
 
 AROUND = (0.2, 1.5, 3.1, 4.6)
@@ -29,9 +30,10 @@ def scene(count=1, azimuths=AROUND, noise=4.0, frames=90):
     return rig, [one.reshape(frames, -1, 2) for one in seen]
 
 
-def test_a_mirrored_camera_is_outvoted():
-    rig, truth = scene()
-    given = [*truth[:2], turned(truth[2], slice(None)), truth[3]]
+@pytest.mark.parametrize("count", [3, 4])
+def test_a_mirrored_camera_is_outvoted(count):
+    rig, truth = scene(azimuths=AROUND[:count])
+    given = [*truth[:2], turned(truth[2], slice(None)), *truth[3:]]
     found = correct_sides(given, rig, NAMES)
     assert found.ok and [e.limb for e in found.exchanges] == ["body"]
     assert found.exchanges[0].camera == 2 and found.exchanges[0].start == 0.0 and found.exchanges[0].evidence > 0
@@ -40,10 +42,20 @@ def test_a_mirrored_camera_is_outvoted():
     assert found.notices[0].code is SideNotice.MENDED and "body of person 0 exchanged in camera 2" in found.notices[0].text
 
 
-def test_three_cameras_outvote_one():
-    rig, truth = scene(azimuths=AROUND[:3])
-    found = correct_sides([turned(truth[0], slice(None)), *truth[1:]], rig, NAMES)
-    assert all(np.array_equal(own, right) for own, right in zip(found.tracks, truth, strict=True))
+@pytest.mark.parametrize(
+    ("count", "mirrored", "names", "said"),
+    [
+        (2, 1, NAMES, SideNotice.TWO),
+        (4, 2, NAMES, SideNotice.TIED),  # as many for as against
+        (4, 0, [f"joint_{k}" for k in range(len(NAMES))], SideNotice.SIDELESS),
+    ],
+)
+def test_what_nothing_decides_is_left_and_said(count, mirrored, names, said):
+    rig, truth = scene(azimuths=AROUND[:count])
+    given = [turned(one, slice(None)) if i < mirrored else one for i, one in enumerate(truth)]
+    found = correct_sides(given, rig, names)
+    assert found.ok and {notice.code for notice in found.notices} == {said} and not found.exchanges
+    assert all(np.array_equal(own, one) for own, one in zip(found.tracks, given, strict=True))
 
 
 def test_stretches_of_a_limb_are_mended_within_a_few_frames():
@@ -64,36 +76,16 @@ def test_stretches_of_a_limb_are_mended_within_a_few_frames():
     assert found.weights[1][30, right] == 0.25 and found.weights[1][30, left] == 1.0  # trust goes with the position
 
 
-def test_nothing_is_exchanged_where_nothing_is():
+def test_nothing_is_exchanged_where_nothing_is_and_people_side_by_side():
     rig, truth = scene(noise=8.0)
     truth[0][10:30, 4:9] = np.nan
     found = correct_sides(truth, rig, NAMES)
     assert not found.exchanges
     assert all(np.array_equal(own, right, equal_nan=True) for own, right in zip(found.tracks, truth, strict=True))
-
-
-def test_people_side_by_side():
     rig, truth = scene(2)
-    given = [turned(truth[0], slice(30, 70), person=1), *truth[1:]]
-    found = correct_sides(given, rig, NAMES)
+    found = correct_sides([turned(truth[0], slice(30, 70), person=1), *truth[1:]], rig, NAMES)
     assert {(e.camera, e.person) for e in found.exchanges} == {(0, 1)}
     assert (found.tracks[0] != truth[0]).any(2).any(1).sum() <= 3
-
-
-def test_two_cameras_are_left_as_they_are():
-    rig, truth = scene(azimuths=AROUND[:2])
-    given = [turned(truth[0], slice(None)), truth[1]]
-    found = correct_sides(given, rig, NAMES)
-    assert found.ok and found.notices[0].code is SideNotice.TWO
-    assert np.array_equal(found.tracks[0], given[0]) and not found.exchanges
-
-
-def test_as_many_for_as_against_are_left_and_said():
-    rig, truth = scene()
-    given = [turned(truth[0], slice(None)), turned(truth[1], slice(None)), *truth[2:]]
-    found = correct_sides(given, rig, NAMES)
-    assert {notice.code for notice in found.notices} == {SideNotice.TIED}
-    assert all(np.array_equal(own, one) for own, one in zip(found.tracks, given, strict=True))
 
 
 def test_lenses_and_frame_rates():
@@ -109,36 +101,26 @@ def test_lenses_and_frame_rates():
     assert all((own == right).all(2).all(1).mean() > 0.97 for own, right in zip(found.tracks, truth, strict=True))
 
 
-def test_joints_without_sides():
-    rig, truth = scene()
-    found = correct_sides(truth, rig, [f"joint_{k}" for k in range(len(NAMES))])
-    assert [notice.code for notice in found.notices] == [SideNotice.SIDELESS] and not found.exchanges
-
-
 def test_limbs_of_layouts():
-    from indexing.skeleton import BODY25, COCO17
-
-    coco = paired_joints(COCO17.joints)
+    coco, body = (paired_joints(layout.joints) for layout in (COCO17, BODY25))
     assert len(coco["trunk"]) == 4 and len(coco["arms"]) == 2 and len(coco["legs"]) == 2  # eyes, ears, shoulders and hips
-    for pairs in (coco, paired_joints(BODY25.joints)):
+    assert len(body["legs"]) == 5
+    for pairs in (coco, body):
         every = [joint for limb in LIMBS for pair in pairs[limb] for joint in pair]
         assert len(set(every)) == len(every)
-    assert len(paired_joints(BODY25.joints)["legs"]) == 5
 
 
 def test_viterbi_is_the_best_of_all_ways():
-    rng = np.random.default_rng(0)
     states = np.array(list(product((0, 1), repeat=2)))
-    for _ in range(20):
-        energy = rng.uniform(0, 3, (5, 4))
-        found = _viterbi(energy, states, 0.7)
+    steps = np.abs(states[:, None] - states).sum(-1)
+    for seed in range(20):
+        energy = np.random.default_rng(seed).uniform(0, 3, (5, 4))
 
         def cost(way, energy=energy):
-            return sum(energy[t, s] for t, s in enumerate(way)) + 0.7 * sum(
-                abs(states[a] - states[b]).sum() for a, b in pairwise(way)
-            )
+            return energy[range(5), way].sum() + 0.7 * sum(steps[a, b] for a, b in pairwise(way))
 
-        assert cost(found) == pytest.approx(min(cost(way) for way in product(range(4), repeat=5)))
+        best = min(cost(list(way)) for way in product(range(4), repeat=5))
+        assert cost(list(_viterbi(energy, states, 0.7))) == pytest.approx(best)
 
 
 def test_misfit_of_what_is_right_is_none(monkeypatch):
@@ -156,17 +138,13 @@ def test_misfit_of_what_is_right_is_none(monkeypatch):
     assert _reprojection_cost(x, weight, P, 500.0)[0] == 0.5
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda x: {"tracks": x[:3]}, "3 given, and there are 4 cameras"),
-        (lambda x: {"tracks": [x[0][:, :5], *x[1:]]}, r"expected \(frames, people \* 13 joints, 2\)"),
-        (lambda x: {"times": [np.zeros(90)] * 4}, "increasing seconds"),
-        (lambda x: {"weights": [np.ones((90, 2))] * 4}, "as the tracks have it"),
-    ],
-)
-def test_bad_input(change, said):
-    rig, truth = scene()
-    given = {"tracks": truth, "cameras": rig, "joints": NAMES, **change(truth)}
-    with pytest.raises(ValueError, match=said):
-        correct_sides(**given)
+def test_bad_input():
+    rig, x = scene()
+    for change, said in (
+        ({"tracks": x[:3]}, "3 given, and there are 4 cameras"),
+        ({"tracks": [x[0][:, :5], *x[1:]]}, r"expected \(frames, people \* 13 joints, 2\)"),
+        ({"times": [np.zeros(90)] * 4}, "increasing seconds"),
+        ({"weights": [np.ones((90, 2))] * 4}, "as the tracks have it"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            correct_sides(**{"tracks": x, "cameras": rig, "joints": NAMES, **change})

@@ -47,23 +47,17 @@ def test_a_calibration_file_is_matched_by_names(tmp_path):
     assert known_lenses(TAKES, SIZES).calibration is None
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (section("cam1") + section("cam2"), r"its cameras are cam1, cam2, and cam1, cam2, cam3"),
-        (section("cam1") + section("cam2") + section("cam3", more="fisheye = true"), r"\[cam3\] has a fisheye lens"),
-        (
-            section("cam1") + section("cam2") + section("cam3", more="size = [640, 480]"),
-            r"cam3 \(640x480, its pictures 1920x1080\)",
-        ),
-        (section("cam1") + section("cam2") + section("cam3", fx=0), "with positive focal lengths"),
-    ],
-)
-def test_files_that_do_not_fit(tmp_path, content, said):
-    file = tmp_path / "Calib.toml"
-    file.write_text(content)
-    with pytest.raises(ValueError, match=said):
-        known_lenses(TAKES, SIZES, calibration=file)
+def test_files_that_do_not_fit(tmp_path):
+    file, two = tmp_path / "Calib.toml", section("cam1") + section("cam2")
+    for content, said in (
+        ("", r"its cameras are cam1, cam2, and cam1, cam2, cam3"),
+        (section("cam3", more="fisheye = true"), r"\[cam3\] has a fisheye lens"),
+        (section("cam3", more="size = [640, 480]"), r"cam3 \(640x480, its pictures 1920x1080\)"),
+        (section("cam3", fx=0), "with positive focal lengths"),
+    ):
+        file.write_text(two + content)
+        with pytest.raises(ValueError, match=said):
+            known_lenses(TAKES, SIZES, calibration=file)
 
 
 @pytest.mark.slow
@@ -142,35 +136,23 @@ def test_the_extent_is_that_of_winters_table():
     no_face = [joint for joint in COCO17.joints if "shoulder" in joint or "ankle" in joint]
     assert standing_extent(no_face, 1.0).extent == pytest.approx(0.818 - 0.039) and standing_extent(no_face, 1.0).sigma > 0.01
     assert standing_extent(["LAnkle", "REye", "hip"], 1.7).tops == ("REye",)
+    tall = np.ptp(perform("wave", Person(), fps=30.0, rng=0).joints[0, :, 1])  # a synthetic person, of lengths of its own
+    assert standing_extent(COCO17.joints, 1.7).extent == pytest.approx(tall, rel=0.12)
     for layout in (COCO17, BODY25):
         one = standing_extent(layout.joints, 1.75)
         assert 0.005 < one.sigma / one.extent < 0.025 and f"{one.height:g} m" in one.note and "Drillis" in one.note
 
 
-def test_a_body_that_stands_has_about_this_extent():
-    """Synthetic people are built from lengths of their own: head to ankle within a few percent of the table."""
-    solid = perform("wave", Person(), fps=30.0, rng=0)
-    tall = np.ptp(solid.joints[0, :, 1])
-    assert standing_extent(COCO17.joints, 1.7).extent == pytest.approx(tall, rel=0.12)
-
-
-@pytest.mark.parametrize(
-    ("height", "said"),
-    [
+def test_no_height_of_a_person():
+    for height, said in (
         (0.0, "got 0"), (17.0, "got 17"), (-1.7, "got -1.7"), (float("nan"), "got nan"),
         (175.0, "got 175; in centimetres? give 1.75"),
         (1750.0, "got 1750; in millimetres? give 1.75"), (5.9, "got 5.9; in feet? give 1.8"),
         (69.0, "got 69; in inches? give 1.75"),
-    ],
-)  # fmt: skip
-def test_no_height_of_a_person(height, said):
-    with pytest.raises(ValueError, match="height must be that of a standing person in metres") as problem:
-        check_height(height)
-    assert str(problem.value).endswith(said)
-
-
-def test_joints_that_no_height_says_anything_of():
-    with pytest.raises(ValueError, match="do not reach from the head or the shoulders to the feet"):
-        standing_extent(HAND21.joints, 1.75)
-    with pytest.raises(ValueError, match="do not reach"):
-        standing_extent((), 1.75)
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="height must be that of a standing person in metres") as problem:
+            check_height(height)
+        assert str(problem.value).endswith(said)
+    for joints in (HAND21.joints, ()):
+        with pytest.raises(ValueError, match="do not reach from the head or the shoulders to the feet"):
+            standing_extent(joints, 1.75)

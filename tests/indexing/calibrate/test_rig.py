@@ -79,15 +79,7 @@ def test_the_movement_is_y_up_in_all_formats_and_learned_from(tmp_path):
     assert model.predict([filmed()[2][0].between(0.0, 0.9)]) == ["squat"]
 
 
-def test_an_unknown_scale_is_not_called_metres(tmp_path):
-    found = rig(metric=False)
-    found.save_people(tmp_path / "p.trc")
-    found.save_cameras(tmp_path / "c.toml")
-    assert "\tunknown\t" in (tmp_path / "p.trc").read_text() and 'units = "unknown"' in (tmp_path / "c.toml").read_text()
-    assert "units" not in ClipSet.load(tmp_path / "p.trc")[0].meta and found.people[0].meta["units"] == "unknown"
-
-
-def test_a_refused_rig_saves_nothing(tmp_path):
+def test_a_refused_rig_saves_nothing_and_an_unknown_scale_is_not_called_metres(tmp_path):
     found = rig(ok=False)
     for save in (lambda: found.save_cameras(tmp_path / "c.toml"), lambda: found.save_people(tmp_path / "p.trc"), found.check):
         with pytest.raises(
@@ -95,6 +87,11 @@ def test_a_refused_rig_saves_nothing(tmp_path):
         ):
             save()
     assert list(tmp_path.iterdir()) == [] and "refused" in repr(found)
+    found = rig(metric=False)
+    found.save_people(tmp_path / "p.trc")
+    found.save_cameras(tmp_path / "c.toml")
+    assert "\tunknown\t" in (tmp_path / "p.trc").read_text() and 'units = "unknown"' in (tmp_path / "c.toml").read_text()
+    assert "units" not in ClipSet.load(tmp_path / "p.trc")[0].meta and found.people[0].meta["units"] == "unknown"
 
 
 def test_keypoint_files_on_one_clock_with_people_in_one_order(tmp_path):

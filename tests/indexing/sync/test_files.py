@@ -40,11 +40,6 @@ def test_equal_numbers_are_equal_moments():
     assert len(over.rows) == 0 and over.before == 50 and over.rest == 0 and over.shift is None
 
 
-def test_names_keep_their_form():
-    assert renumber("a1_000000000012_keypoints.json", 7) == "a1_000000000007_keypoints.json"
-    assert renumber("cam01.99.json", 1234) == "cam01.1234.json" and renumber("000.json", 5) == "005.json"
-
-
 def test_shifted_folders(tmp_path, cameras):
     source = write_openpose(tmp_path / "cam2_json", [cut(cameras[0], 0, 20), moved(cut(cameras[0], 0, 20), 700.0)], missing=(7,))
     take = take_of(source, fps=FPS)
@@ -55,11 +50,13 @@ def test_shifted_folders(tmp_path, cameras):
         text = (target / "cam2_json" / names[i if i < 3 else i - 1]).read_text()
         assert text == (source / f"cam2_json_{i + 4:012d}_keypoints.json").read_text()
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
-
-
-def test_frames_without_people_are_shifted_as_well(tmp_path, cameras):
+    for name, number, renamed in (
+        ("a1_000000000012_keypoints.json", 7, "a1_000000000007_keypoints.json"), ("cam01.99.json", 1234, "cam01.1234.json"),
+        ("000.json", 5, "005.json"),
+    ):  # fmt: skip
+        assert renumber(name, number) == renamed  # names keep their form
     gone = cut(cameras[0], 0, 12).joints.copy()
-    gone[:4] = np.nan
+    gone[:4] = np.nan  # frames without people are shifted as well
     take = take_of(write_openpose(tmp_path / "cam1", [Clip(gone, fps=FPS)]), fps=FPS)
     assert take.count == 12 and len(list((write_poses(tmp_path, [plan(take, 0.0, 1.0, FPS)]) / "cam1_json").iterdir())) == 12
 
@@ -109,8 +106,7 @@ def camera(azimuth: float = 30.0) -> Clip:
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mocap")
     recorded = scene()[0]
-    millimetres = recorded.replace(joints=1000 * recorded.joints, meta={"units": "mm"})
-    write([millimetres], folder / "vicon.c3d", "mm")
+    write([recorded.replace(joints=1000 * recorded.joints, meta={"units": "mm"})], folder / "vicon.c3d", "mm")
     write([recorded], folder / "vicon.trc", "m")
     write_openpose(folder / "cam1", [camera()])
     header = ["time", *(f"{name}_{axis}" for name in recorded.skeleton.joints for axis in "xyz")]
@@ -119,26 +115,20 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def assert_found(shift, sign=1, within=0.5):
-    assert shift.ok, shift.reason
-    assert abs(sign * shift.offset - LATE / FPS) < within / FPS
-
-
-@pytest.mark.parametrize("name", ["vicon.c3d", "vicon.trc", "points.csv"])
-def test_files_of_motion_capture_are_compared_with_keypoints(data, name):
-    shift = synchronize(camera(), data / name)
-    assert_found(shift)
-    assert shift.method == "camera" and shift.projection is not None and shift.fps[1] == pytest.approx(RECORDED)
-
-
-def test_joints_of_the_same_names_are_the_same_points_in_any_order():
-    recorded, seen = scene()[0], camera()
-    names = recorded.skeleton.joints
+def test_motion_capture_is_compared_with_keypoints(data):
+    recorded, names = scene()[0], scene()[0].skeleton.joints
     order = np.random.default_rng(0).permutation(len(names))
     shuffled = recorded.replace(joints=recorded.joints[:, order], skeleton=Skeleton("markers", tuple(names[k] for k in order)))
-    shift = synchronize(seen, shuffled)
-    assert_found(shift)
-    assert shift.method == "camera" and any(f"share {len(names)} joints" in note for note in shift.notes)
+    found = {what: synchronize(camera(), what) for what in (shuffled, *(data / f"vicon.{end}" for end in ("c3d", "trc")))}
+    for what, one in found.items():
+        assert one.ok and abs(one.offset - LATE / FPS) < 0.5 / FPS, what
+        assert one.method == "camera" and one.projection is not None and one.fps[1] == pytest.approx(RECORDED)
+    # joints of the same names are the same points in any order
+    assert any(f"share {len(names)} joints" in note for note in found[shuffled].notes)
+    turned = synchronize(recorded.joints, camera().joints, fps=(RECORDED, FPS))  # either may be the first, and arrays do
+    assert turned.ok and abs(turned.offset + LATE / FPS) < 0.5 / FPS
+    with pytest.raises(ValueError, match="vicon and vicon both hold points in space"):
+        synchronize(data / "vicon.c3d", data / "vicon.trc")
 
 
 @pytest.mark.slow
@@ -150,40 +140,28 @@ def test_markers_of_other_names_are_different_points():
     assert abs(shift.offset - LATE / FPS) < 2 / FPS  # squats, kicks and waves of one person may be too few to be sure of
 
 
-def test_either_may_be_the_first_and_arrays_do():
-    assert_found(synchronize(scene()[0].joints, camera().joints, fps=(RECORDED, FPS)), sign=-1)
-
-
-def test_two_motion_captures_are_no_cameras(data):
-    with pytest.raises(ValueError, match="vicon and vicon both hold points in space"):
-        synchronize(data / "vicon.c3d", data / "vicon.trc")
-
-
 @pytest.mark.slow
 def test_the_command_writes_motion_capture_on_the_clock_of_the_camera(data, tmp_path, capsys):
-    assert main(["sync", str(data / "cam1"), str(data / "vicon.c3d"), "--fps", "30", "--out", str(tmp_path / "out")]) == 0
+    out = tmp_path / "out"
+    assert main(["sync", str(data / "cam1"), str(data / "vicon.c3d"), "--fps", "30", "--out", str(out)]) == 0
     said = capsys.readouterr().out
     assert "mocap-sync/vicon.c3d, on the clock of cam1" in said and "pose-sync/ (cam1)" in said
-    results = json.loads((tmp_path / "out" / "sync.json").read_text())
+    results = json.loads((out / "sync.json").read_text())
     offset = results["cameras"][1]["offset"]
     assert offset == pytest.approx(LATE / FPS, abs=0.5 / FPS)
     assert results["pairs"][0]["method"] == "camera" and np.shape(results["pairs"][0]["projection"]) == (3, 4)
-    (moved,) = read(tmp_path / "out" / MOCAP_FOLDER / "vicon.c3d")
+    (moved,) = read(out / MOCAP_FOLDER / "vicon.c3d")
     first = round(offset * RECORDED)
     assert results["cameras"][1]["shifted"]["left_out"] == first and len(moved) == len(scene()[0]) - first
     assert moved.times[0] == 0 and moved.fps == pytest.approx(RECORDED)
     assert np.abs(moved.joints - scene()[0].joints[first:]).max() < 1e-5  # metres as read; nothing is interpolated
     # a run that writes none removes it
-    assert main(["sync", str(data / "vicon.c3d"), str(data / "cam1"), "--fps", "30", "--out", str(tmp_path / "out")]) == 0
-    assert not (tmp_path / "out" / MOCAP_FOLDER).exists()
+    assert main(["sync", str(data / "vicon.c3d"), str(data / "cam1"), "--fps", "30", "--out", str(out)]) == 0
+    assert not (out / MOCAP_FOLDER).exists()
     assert "mocap-sync of an earlier run was removed" in capsys.readouterr().out
-    frames = sorted((tmp_path / "out" / "pose-sync" / "cam1_json").iterdir())
+    frames = sorted((out / "pose-sync" / "cam1_json").iterdir())
     assert abs(int(frames[0].name.split("_")[1]) - LATE) <= 1  # frame k is at k / 30 s of the motion capture
-
-
-@pytest.mark.slow
-def test_a_table_of_points_in_space_is_motion_capture(data, tmp_path):
-    out = tmp_path / "out"
+    # a table of points in space is motion capture, too
     assert main(["sync", str(data / "cam1"), str(data / "points.csv"), "--fps", "30", "--out", str(out)]) == 0
     results = json.loads((out / "sync.json").read_text())
     assert results["pairs"][0]["method"] == "camera"

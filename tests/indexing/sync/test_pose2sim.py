@@ -61,29 +61,21 @@ def test_lenses_that_do_not_fit_are_said(tmp_path):
     assert "cam1 has a fisheye lens" in trial_of(trial).lenses(["cam1", "cam2"])[1][0]
 
 
-@pytest.mark.parametrize(
-    ("above", "own", "rate"),
-    [
-        (None, "frame_rate = 60", 60),
+def test_the_frame_rate_of_a_trial_or_of_its_session(tmp_path):
+    trial = empty(tmp_path / "trial", "cam1", "cam2")
+    for above, own, rate in (
+        ("", "frame_rate = 60", 60),
         ("frame_rate = 120", "", 120),
         ("frame_rate = 120", "frame_rate = 60", 60),
         ("frame_rate = 120", "frame_rate = 'auto'", None),
-    ],
-)
-def test_the_frame_rate_of_a_trial_or_of_its_session(tmp_path, above, own, rate):
-    trial = empty(tmp_path / "trial", "cam1", "cam2")
-    (trial / "Config.toml").write_text(f"[project]\n{own}\n")
-    if above is not None:
+    ):
+        (trial / "Config.toml").write_text(f"[project]\n{own}\n")
         (tmp_path / "Config.toml").write_text(f"[project]\n{above}\n")
-    assert trial_of(trial).fps == rate
-
-
-@pytest.mark.parametrize("rate", ["0", "-1", "true", "'fast'", "nan"])
-def test_a_frame_rate_that_is_none(tmp_path, rate):
-    trial = empty(tmp_path, "cam1", "cam2")
-    (trial / "Config.toml").write_text(f"[project]\nframe_rate = {rate}\n")
-    with pytest.raises(ValueError, match=r"Config\.toml: \[project\] frame_rate: expected a positive number or 'auto', got"):
-        trial_of(trial)
+        assert trial_of(trial).fps == rate
+    for wrong in ("0", "-1", "true", "'fast'", "nan"):
+        (trial / "Config.toml").write_text(f"[project]\nframe_rate = {wrong}\n")
+        with pytest.raises(ValueError, match=r"Config\.toml: \[project\] frame_rate: expected a positive number or 'auto', got"):
+            trial_of(trial)
 
 
 def test_a_session(tmp_path):

@@ -37,44 +37,33 @@ def test_frame_numbers_do_not_drift_from_rounded_times():
     take = take_of(Clip(joints, times=np.round(np.arange(300) / 30, 4)))  # steps of 0.0333 and 0.0334 s: 30.03 by their median
     assert take.fps == pytest.approx(30, rel=1e-5) and plan(take, 0.0, 1.0, take.fps).rest < 2e-4
     assert take_of(Clip(joints[::2], times=np.arange(0, 300, 2) / 29.97)).fps == pytest.approx(14.985)
+    for fps in (1e-300, 1e300, 0.0, -30.0, float("nan")):  # no camera has it
+        with pytest.raises(ValueError, match="fps must be"):
+            take_of(joints, fps=fps)
 
 
 # ---- gaps, and points ------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("gap", [864000.0, 1e9, 1e12])
 def test_of_a_take_that_is_nearly_all_gap_the_longest_stretch_is_compared(cameras, gap):
-    late = np.where(np.arange(len(cameras[1])) < len(cameras[1]) - 20, 0.0, gap)
-    torn = cameras[1].replace(times=cameras[1].times + late, fps=None, name="cam2")
+    kept = len(cameras[1]) - 20
+    jump = np.arange(kept + 20) >= kept
+    torn, paused = (cameras[1].replace(times=cameras[1].times + late * jump, fps=None, name="cam2") for late in (gap, 120.0))
     take = take_of(torn, name="cam2")
-    kept = len(torn) - 20
     assert take.count == len(torn) and [len(clip) for clip in take.people] == [kept]
     assert f"cam2: nearly all gap: only its {kept} frames from 0 to {torn.times[kept - 1]:.6g} s are compared" in take.notes
     found = plan(take, 0.0, 1.0, 30.0)  # what is written are all frames, as many as there are
     assert len(found.numbers) == len(torn) and found.rest < 1e-3
+    pause = take_of(paused, name="cam2")  # is no gap of a take
+    assert [len(clip) for clip in pause.people] == [len(paused)] and pause.notes == ()
 
 
-def test_pauses_of_a_recording_are_no_gap_of_a_take(cameras):
-    paused = cameras[1].replace(times=cameras[1].times + np.where(np.arange(len(cameras[1])) < 50, 0.0, 120.0), fps=None)
-    assert [len(clip) for clip in take_of(paused, name="cam2").people] == [len(paused)] and take_of(paused, name="cam2").notes == ()
-
-
-@pytest.mark.parametrize("fps", [1e-300, 1e300, 0.0, -30.0, float("nan")])
-def test_rates_that_no_camera_has(cameras, fps):
-    with pytest.raises(ValueError, match="fps must be"):
-        take_of(cameras[0].joints, fps=fps)
-
-
-def test_a_tracked_point_is_one_and_the_same(tmp_path):
-    rng = np.random.default_rng(0)
-    places = np.cumsum(rng.normal(scale=40.0, size=(60, 2)), axis=0)
+def test_a_tracked_point_is_one_and_points_that_are_told_apart_stay_two(tmp_path):
+    places = np.cumsum(np.random.default_rng(0).normal(scale=40.0, size=(60, 2)), axis=0)
     head = ["scorer,me,me,me", "bodyparts,ball,ball,ball", "coords,x,y,likelihood"]
     rows = [f"{i},{x:.3f},{y:.3f},1.0" for i, (x, y) in enumerate(places) if i != 30]
     (tmp_path / "ballDLC_resnet50.csv").write_text("\n".join([*head, *rows]) + "\n")
     take = take_of(tmp_path / "ballDLC_resnet50.csv", fps=30.0)
     assert [len(clip) for clip in take.people] == [59] and take.count == 59
-
-
-def test_points_that_are_told_apart_stay_two():
     t = np.arange(40)
     one, two = np.stack([4.0 * t, 0.0 * t], 1), np.stack([160 - 4.0 * t, 0.0 * t + 90], 1)
-    joints = np.stack([one, two], 1).reshape(80, 1, 2)
-    assert link_by_position(np.repeat(t, 2), joints).tolist() == [0, 1] * 40
+    assert link_by_position(np.repeat(t, 2), np.stack([one, two], 1).reshape(80, 1, 2)).tolist() == [0, 1] * 40

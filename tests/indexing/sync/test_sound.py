@@ -28,29 +28,19 @@ def scene() -> np.ndarray:
 
 # ---- what is found -------------------------------------------------------------------------------------------------------
 def test_two_microphones_agree_to_a_millisecond(scene):
-    found = sound_shift(heard(scene, STARTS[0]), heard(scene, STARTS[1], seed=1))
+    first, second = heard(scene, STARTS[0]), heard(scene, STARTS[1], seed=1)
+    found = sound_shift(first, second)
     assert found.ok and found.method == "sound" and found.confidence > 0.99 and found.rate == 1
     assert found.offset == pytest.approx(LATER, abs=1e-3)
     assert found.sigma == pytest.approx(np.hypot(0.015, 3 / 343), rel=0.05)  # distance and latency, not the fit, are what is unsure
     assert found.peaks[0, 0].item() == pytest.approx(LATER, abs=0.02) and (found.peaks[1:, 1] < found.peaks[0, 1]).all()
     assert found.lags[found.scores.argmax()].item() == pytest.approx(LATER, abs=0.02)
-
-
-def test_the_starts_on_the_clocks_of_the_pictures_count(scene):
-    first = dataclasses.replace(heard(scene, STARTS[0]), start=0.25)
-    assert sound_shift(first, heard(scene, STARTS[1], seed=1)).offset == pytest.approx(LATER - 0.25, abs=1e-3)
-
-
-def test_other_rates_and_types_of_samples(scene):
-    whole = microphone(scene, STARTS[0], 25.0, 0)
-    half = Sound((whole[::2] / 32768).astype(np.float32), RATE / 2)
-    assert sound_shift(half, heard(scene, STARTS[1], seed=1)).offset == pytest.approx(LATER, abs=2e-3)
-
-
-def test_noise_and_levels(scene):
+    # the starts on the clocks of the pictures count
+    assert sound_shift(dataclasses.replace(first, start=0.25), second).offset == pytest.approx(LATER - 0.25, abs=1e-3)
+    half = Sound((first.samples[::2] / 32768).astype(np.float32), RATE / 2)  # another rate, and another type of samples
+    assert sound_shift(half, second).offset == pytest.approx(LATER, abs=2e-3)
     loud, quiet = heard(scene, STARTS[0], noise=0.1), heard(scene, STARTS[1], seed=1, noise=0.1)
-    quiet = dataclasses.replace(quiet, samples=quiet.samples // 50)
-    found = sound_shift(loud, quiet)
+    found = sound_shift(loud, dataclasses.replace(quiet, samples=quiet.samples // 50))
     assert found.ok and found.offset == pytest.approx(LATER, abs=3e-3)
 
 
@@ -58,21 +48,15 @@ def test_noise_and_levels(scene):
 def test_a_clock_that_drifts(scene, monkeypatch):
     gained = 1 + 1.5e-4
     second = microphone(scene, STARTS[1], 30.0, 1)
-    moments = np.arange(int(28 * RATE)) / gained
-    slower = np.interp(moments, np.arange(len(second)), second).astype(np.int16)
-    found = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE))
-    middle = found.center
-    assert found.at(middle) == pytest.approx(gained * (middle + LATER), abs=1e-3)
+    slower = np.interp(np.arange(int(28 * RATE)) / gained, np.arange(len(second)), second).astype(np.int16)
+    pair = heard(scene, STARTS[0], 36.0), Sound(slower, RATE)
+    found = sound_shift(*pair)
+    assert found.at(found.center) == pytest.approx(gained * (found.center + LATER), abs=1e-3)
     monkeypatch.setattr("indexing.sync.sound.MIN_SECONDS_FOR_RATE", 10.0)
-    short = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE))
+    short, held = sound_shift(*pair), sound_shift(*pair, rate=1.0)
     assert short.rate == pytest.approx(gained, abs=4 * short.rate_sigma) and 0 < short.rate_sigma < 5e-5
-    held = sound_shift(heard(scene, STARTS[0], 36.0), Sound(slower, RATE), rate=1.0)
     assert held.rate == 1 and held.rate_sigma == 0
-
-
-@pytest.mark.slow
-def test_a_long_recording_whose_ends_are_many_steps_apart():
-    scene, gained = noises(140.0, 4), 1 + 2e-4
+    scene = noises(140.0, 4)  # a long one, whose ends are many steps apart
     slower = np.interp(np.arange(int(130 * RATE)) / gained, np.arange(len(scene)), scene)
     found = sound_shift(Sound(scene.astype(np.float32), RATE), Sound(slower.astype(np.float32), RATE))
     assert found.ok and found.rate == pytest.approx(gained, abs=5e-6) and found.offset == pytest.approx(0.0, abs=1e-3)
@@ -96,15 +80,6 @@ def test_unrelated_sounds_are_refused():
     assert not any(one.ok for one in found) and all("no shift of the sound stands out" in one.reason for one in found)
 
 
-def test_one_clap_fits_any_other_clap():
-    made = []
-    for at in (4.0, 7.0):
-        samples = np.random.default_rng(int(at)).normal(size=12 * RATE) * 1e-3
-        samples[int(at * RATE) :][:500] += np.random.default_rng(9).normal(size=500)
-        made.append(Sound(samples.astype(np.float32), RATE))
-    assert not sound_shift(*made).ok
-
-
 @pytest.mark.slow
 def test_a_metronome_is_refused_and_says_why():
     click = clicks(40.0)
@@ -116,11 +91,17 @@ def test_a_metronome_is_refused_and_says_why():
     assert not found.ok and "the sound repeats itself" in found.reason
 
 
-def test_silence_and_no_sound(scene):
+def test_silence_no_sound_and_one_clap(scene):
     speaking, off = heard(scene, 3.0), Sound(np.zeros(25 * RATE, np.int16), RATE)
     assert "the sound of b is silence" in sound_shift(speaking, off).reason.replace("camera ", "")
     assert "has no sound" in sound_shift(None, speaking).reason and off.silent and not speaking.silent
     assert not sound_shift(speaking, Sound(np.full(50, 900, np.int16), RATE)).ok  # a few milliseconds
+    made = []
+    for at in (4.0, 7.0):  # one clap fits any other clap
+        samples = np.random.default_rng(int(at)).normal(size=12 * RATE) * 1e-3
+        samples[int(at * RATE) :][:500] += np.random.default_rng(9).normal(size=500)
+        made.append(Sound(samples.astype(np.float32), RATE))
+    assert not sound_shift(*made).ok
     with pytest.raises(ValueError, match=r"one channel \(n,\) of numbers, got shape \(3, 2\)"):
         Sound(np.zeros((3, 2)), RATE)
     with pytest.raises(ValueError, match="positive number of samples per second, got 0"):

@@ -56,7 +56,8 @@ def clocks(takes: list[Take]) -> list[Clock]:
 
 
 def test_equal_frames_at_equal_moments(takes, tmp_path):
-    chosen = trim([video_of(take) for take in takes], clocks(takes))
+    films = [video_of(take) for take in takes]
+    chosen = trim(films, clocks(takes))
     done: list[float] = []
     target = write_videos(tmp_path, chosen, done.append)
     shown = {name: np.array(numbers_of(target / f"{name}.mp4")) for name in CAMERAS}
@@ -69,32 +70,26 @@ def test_equal_frames_at_equal_moments(takes, tmp_path):
     said = trim_as_json(chosen)
     assert said["fps"] == 30 and said["frames"] == 49 and said["cameras"]["a"]["repeated"] == said["cameras"]["a"]["left_out"] == 0
     assert said["cameras"]["c"]["repeated"] > 0 and said["cameras"]["c"]["rest"] <= 0.5 / 25 + 1e-6
-
-
-def test_another_frame_rate(takes, tmp_path):
-    chosen = trim([video_of(take) for take in takes], clocks(takes), fps=15)
-    assert chosen.fps == 15 and chosen.frames in (24, 25)
-    write_videos(tmp_path, chosen)
-    shown = [np.array(numbers_of(tmp_path / FOLDER / f"{name}.mp4")) for name in CAMERAS]
-    assert {len(numbers) for numbers in shown} == {chosen.frames} and np.allclose(np.diff(shown[0]), SCENE / 15, atol=4)
+    slow = trim(films, clocks(takes), fps=15)
+    write_videos(tmp_path / "slow", slow)
+    numbers = [np.array(numbers_of(tmp_path / "slow" / FOLDER / f"{name}.mp4")) for name in CAMERAS]
+    assert slow.fps == 15 and slow.frames in (24, 25) and {len(one) for one in numbers} == {slow.frames}
+    assert np.allclose(np.diff(numbers[0]), SCENE / 15, atol=4)
+    away = clocks(takes)
+    away[1] = dataclasses.replace(away[1], offset=-50.0)
+    with pytest.raises(ValueError, match=r"^[ac] ended 4\d\.\d\d s before b began, so no moment is in the videos of all cameras"):
+        trim(films, away)
 
 
 def test_a_rate_that_drifts_leaves_a_frame_out_now_and_then():
     times = np.arange(3000) / 30
     films = [CameraVideo(name, Path(name), times, times) for name in "ab"]
-    chosen = trim(films, [Clock(Take("a", "video"), 0.0, 0.0), Clock(Take("b", "video"), 0.0, 0.0, 1.001)])
-    assert chosen.cuts[0].left_out == 0 and chosen.cuts[1].left_out == 3 and chosen.cuts[1].num_repeated == 0
-    slower = trim(films, [Clock(Take("a", "video"), 0.0, 0.0), Clock(Take("b", "video"), 0.0, 0.0, 0.999)])
+    a = Clock(Take("a", "video"), 0.0, 0.0)
+    faster, slower = (trim(films, [a, Clock(Take("b", "video"), 0.0, 0.0, rate)]) for rate in (1.001, 0.999))
+    assert faster.cuts[0].left_out == 0 and faster.cuts[1].left_out == 3 and faster.cuts[1].num_repeated == 0
     assert slower.cuts[1].num_repeated == 3 and max(cut.rest for cut in slower.cuts) <= 0.5 / 30 + 1e-9
-    exact = trim([CameraVideo("a", Path("a"), times * 1.001, times * 1.001)], [Clock(Take("a", "video"), 0.0, 0.0)])
+    exact = trim([CameraVideo("a", Path("a"), times * 1.001, times * 1.001)], [a])
     assert (exact.fps.numerator, exact.fps.denominator) == (30000, 1001) and np.array_equal(exact.cuts[0].rows, np.arange(3000))
-
-
-def test_no_moment_in_common_is_said(takes):
-    films, away = [video_of(take) for take in takes], clocks(takes)
-    away[1] = dataclasses.replace(away[1], offset=-50.0)
-    with pytest.raises(ValueError, match=r"^[ac] ended 4\d\.\d\d s before b began, so no moment is in the videos of all cameras"):
-        trim(films, away)
 
 
 def test_a_turned_video_of_odd_size_is_written_upright(tmp_path):
