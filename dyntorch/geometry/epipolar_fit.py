@@ -110,20 +110,16 @@ def _descend(data: PairMonomials, F: Tensor, weights: Tensor, scales: Sequence[f
     size = max(1, BLOCK // max(1, weights.shape[-1]))
 
     def block(F: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        return _descend_block(tables, F, weights, scales, steps)
+        options, frames, found = replace(DESCENT, iterations=steps), Frames.of(F), None
+        for scale in scales:
+            problem = EpipolarProblem(tables, weights, 1 / max(scale, LEAST) ** 2)
+            start = problem.evaluate((frames.turns, frames.core)) if found is None else problem.evaluate_at_scale(found)
+            found = minimize(problem, start, options)
+        assert found is not None
+        return found.terms[0].unflatten(-1, (3, 3)), found.cost
 
     found, cost = map_blocks(block, F, weights, size=size)
     return found, cost
-
-
-def _descend_block(tables: Products, F: Tensor, weights: Tensor, scales: Sequence[float], steps: int) -> tuple[Tensor, Tensor]:
-    options, frames, found = replace(DESCENT, iterations=steps), Frames.of(F), None
-    for scale in scales:
-        problem = EpipolarProblem(tables, weights, 1 / max(scale, LEAST) ** 2)
-        start = problem.evaluate((frames.turns, frames.core)) if found is None else problem.evaluate_at_scale(found)
-        found = minimize(problem, start, options)
-    assert found is not None
-    return found.terms[0].unflatten(-1, (3, 3)), found.cost
 
 
 @dataclass(frozen=True)

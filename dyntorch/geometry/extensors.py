@@ -48,24 +48,22 @@ def compound(matrix: Tensor, order: int) -> Tensor:
 def _expand(matrix: Tensor, smaller: Tensor, order: int) -> Tensor:
     """Minors of one order from those of the order below, by Laplace expansion along the first row."""
     rows, columns = matrix.shape[-2:]
-    first, rest, _, _ = _laplace(rows, order, matrix.device)
-    _, _, taken, left = _laplace(columns, order, matrix.device)
+    (first, *_), (rest, *_) = _laplace(rows, order, matrix.device)
+    columns_of = zip(*_laplace(columns, order, matrix.device), strict=True)
     terms = (
-        (-1) ** j * matrix[..., first[:, None], taken[j][None, :]] * smaller[..., rest[:, None], left[j][None, :]]
-        for j in range(order)
+        (-1) ** j * matrix[..., first[:, None], c] * smaller[..., rest[:, None], left] for j, (c, left) in enumerate(columns_of)
     )
     return torch.stack(list(terms)).sum(0)
 
 
 @constant
-def _laplace(n: int, order: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _laplace(n: int, order: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Index tables of a Laplace expansion of the minors of ``order`` among ``n`` lines."""
     place = {c: i for i, c in enumerate(combinations(range(n), order - 1))}
     sets = list(combinations(range(n), order))
     taken = [[c[j] for c in sets] for j in range(order)]
     left = [[place[c[:j] + c[j + 1 :]] for c in sets] for j in range(order)]
-    chosen, place_left = torch.tensor(taken, device=device), torch.tensor(left, device=device)
-    return chosen[0], place_left[0], chosen, place_left
+    return torch.tensor(taken, device=device), torch.tensor(left, device=device)
 
 
 def join(*points: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Homogeneous coordinates, to and from them without NaN; canonical scales and signs; hyperplanes of a point."""
+"""Homogeneous coordinates, to and from them without NaN; canonical scales and signs; monomials."""
 
 from __future__ import annotations
 
@@ -92,15 +92,6 @@ def similarity(scale: Tensor, centre: Tensor) -> Tensor:
     eye = torch.eye(d + 1, dtype=centre.dtype, device=centre.device)
     upper = torch.cat([eye[:d, :d].expand(*centre.shape, d), -centre[..., None]], dim=-1) * scale[..., None, None]
     return torch.cat([upper, eye[d:].expand(*upper.shape[:-2], 1, d + 1)], dim=-2)
-
-
-def hyperplanes_through(x: Tensor) -> Tensor:
-    r"""Orthonormal basis of the hyperplanes through each point: :math:`N (x, 1) = 0`, :math:`N N^T = I`. x ``(*batch, n, d)``
-    -> ``(*batch, n, d, d + 1)``."""
-    s = (1 + x.square().sum(-1, keepdim=True)).sqrt()
-    eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-    outer = (x / s)[..., :, None] * (x / (s + 1))[..., None, :]
-    return torch.cat([eye - outer, -(x / s)[..., None]], dim=-1)
 
 
 def two_sided(A: Tensor, B: Tensor) -> Tensor:

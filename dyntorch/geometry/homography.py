@@ -92,16 +92,12 @@ def descend_homography(
     size = max(1, BLOCK // max(1, weights.shape[-1]))
 
     def block(H: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        return _descend(H, x1, x2, weights, inverse, cap, steps)
+        problem = HomographyProblem(x1, x2, weights, inverse, cap)
+        found = minimize(problem, problem.evaluate((H,)), replace(DESCENT, iterations=steps))
+        return found.theta[0], found.cost
 
     found, cost = map_blocks(block, H, weights, size=size)
     return found, cost
-
-
-def _descend(H: Tensor, x1: Tensor, x2: Tensor, weights: Tensor, inverse: float, cap: float, steps: int) -> tuple[Tensor, Tensor]:
-    problem = HomographyProblem(x1, x2, weights, inverse, cap)
-    found = minimize(problem, problem.evaluate((H,)), replace(DESCENT, iterations=steps))
-    return found.theta[0], found.cost
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from dyntorch.geometry.triangulation import unit_projections
 from dyntorch.numerics.nullspace import null_space
 
 DRAWS = 16
-"""Random members of the solution space among which the best conditioned one is taken."""
+"""Random members of a solution space, or of the ambiguity with one plane at infinity, among which the best conditioned is taken."""
 ZERO = 1e-8
 """Relative size of a singular value of matrices made of lifts alone that counts as 0: the known motions give below 1e-11 or above
 0.1 (3 to 12 views from time 0, 100 and 1000)."""
@@ -72,10 +72,15 @@ def upgrade(projections: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
     # a generator of its own: the same projections get the same frame
     draw = torch.randn(DRAWS, dim, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(basis)
     trial = torch.einsum("dk,...kij->...dij", draw, basis)
-    values = torch.linalg.svdvals(trial.detach().nan_to_num())
-    best = (values[..., -1] / values[..., 0].clamp(min=torch.finfo(values.dtype).tiny)).argmax(-1)
-    T = trial.gather(-3, best[..., None, None, None].expand(*batch, 1, size, size)).squeeze(-3)
+    T = _best_conditioned(trial, trial.detach())
     return T, projections @ T[..., None, :, :] @ torch.linalg.pinv(lifts)
+
+
+def _best_conditioned(trial: Tensor, matrices: Tensor) -> Tensor:
+    """Of trials ``(*batch, draws, K, K)`` that whose matrix has the best condition."""
+    values = torch.linalg.svdvals(matrices.nan_to_num())
+    best = (values[..., -1] / values[..., 0].clamp(min=torch.finfo(values.dtype).tiny)).argmax(-1)
+    return trial.take_along_dim(best[..., None, None, None], dim=-3).squeeze(-3)
 
 
 def least_views(lifts: Tensor, rows: int) -> int:
@@ -104,12 +109,6 @@ def least_views(lifts: Tensor, rows: int) -> int:
 # images stay what they are.
 
 
-TOLERANCE = 1e-8
-"""Of a matrix made of lifts alone, relative: below it a change of the world belongs to the ambiguity."""
-FRAMES_DRAWS = 16
-"""Members of the ambiguity with the same plane at infinity among which the one that leaves the points roundest is taken."""
-
-
 def change_frame(G: Tensor, cameras: Tensor, structure: Tensor, lifts: Tensor) -> tuple[Tensor, Tensor]:
     r"""Cameras :math:`P_i B_i G^{-1} B_i^+` and points :math:`G Y` after a change of frame, for any scale of both. G
     ``(*batch, K, K)``, cameras ``(*batch, views, m, a + 1)``, structure ``(*batch, n, K)``, lifts ``(views, a + 1, K)``."""
@@ -126,8 +125,8 @@ def finite(cameras: Tensor, structure: Tensor, lifts: Tensor, algebra: Tensor, w
     last = lifts[:, -1]
     rows = torch.einsum("j,djk->dk", last[0], algebra)
     values, vh = torch.linalg.svd(rows, full_matrices=False)[1:]
-    rank = int((values > TOLERANCE * values[0]).sum())
-    if bool(((last - last[0]).norm(dim=-1) > TOLERANCE * last.norm()).any()) or rank == 1:
+    rank = int((values > ZERO * values[0]).sum())
+    if bool(((last - last[0]).norm(dim=-1) > ZERO * last.norm()).any()) or rank == 1:
         # the homogeneous coordinate changes with time, or is what it is up to its sign
         sign = nonzero_sign((structure @ last[0]).sign().sum(-1))
         return G, cameras * sign[..., None, None, None], structure * sign[..., None, None]
@@ -156,19 +155,17 @@ def _member(functional: Tensor, rows: Tensor, algebra: Tensor, structure: Tensor
     """Of some members of the algebra that have this last row the one that brings the points into the roundest shape."""
     size = algebra.shape[-1]
     _, scales, vh = torch.linalg.svd(rows.mT, full_matrices=True)
-    free = vh[int((scales > TOLERANCE * scales[0]).sum()) :]
+    free = vh[int((scales > ZERO * scales[0]).sum()) :]
     start = functional @ torch.linalg.pinv(rows)
     # draws of its own: the same points get the same frame
-    draw = torch.randn(FRAMES_DRAWS, len(free), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(rows)
+    draw = torch.randn(DRAWS, len(free), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(rows)
     spread = start.norm(dim=-1)[..., None, None] * draw / max(1, len(free)) ** 0.5
     trial = torch.einsum("...sd,dij->...sij", start[..., None, :] + spread @ free, algebra)
     moments = structure.mT @ structure
     trace = moments.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None].clamp(min=torch.finfo(moments.dtype).tiny)
     eye = torch.eye(size, dtype=rows.dtype, device=rows.device)
     shape = torch.linalg.cholesky_ex(moments / trace + 1e-9 * eye)[0]
-    values = torch.linalg.svdvals((trial @ shape[..., None, :, :]).nan_to_num())
-    best = (values[..., -1] / values[..., 0].clamp(min=torch.finfo(values.dtype).tiny)).argmax(-1)
-    return trial.gather(-3, best[..., None, None, None].expand(*best.shape, 1, size, size)).squeeze(-3)
+    return _best_conditioned(trial, trial @ shape[..., None, :, :])
 
 
 def _before(cameras: Tensor, structure: Tensor, lifts: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -202,9 +199,9 @@ def steadiest_frame(structure: Tensor, lifts: Tensor, start: Tensor, algebra: Te
     G = eye.expand(*structure.shape[:-2], size, size)
     fixed = torch.einsum("ai,dij->daj", start, algebra).flatten(1).mT
     values, vh = torch.linalg.svd(fixed, full_matrices=True)[1:]
-    free = torch.einsum("cd,dij->cij", vh[int((values > TOLERANCE * values[0]).sum()) :], algebra)
+    free = torch.einsum("cd,dij->cij", vh[int((values > ZERO * values[0]).sum()) :], algebra)
     change = (lifts - lifts.mean(0)).flatten(0, 1)
-    if not len(free) or change.norm() < TOLERANCE:
+    if not len(free) or change.norm() < ZERO:
         return G
     depth = (structure @ lifts[0, -1])[..., None]
     unit = structure / torch.where(depth.abs() > 1e-12, depth, 1.0) * weights[..., None]
@@ -239,7 +236,7 @@ def center_frame(structure: Tensor, lifts: Tensor, weights: Tensor) -> Tensor:
     G = same = torch.eye(lifts.shape[-1], dtype=x.dtype, device=x.device).expand(*structure.shape[:-2], -1, -1)
     # a matrix of one kind that the lifts allow tells that they allow the kind, whatever the points
     for scale, example in ((factor, eye + torch.ones_like(eye).triu()), (plain, 2 * eye)):
-        if _induced_map(_world(example, torch.ones_like(eye[:1])), lifts)[1] < TOLERANCE:
+        if _induced_map(_world(example, torch.ones_like(eye[:1])), lifts)[1] < ZERO:
             G = _induced_map(_world(torch.linalg.inv_ex(scale)[0], mean), lifts)[0]
             break
     return torch.where(counted & G.isfinite().flatten(-2).all(-1)[..., None, None], G, same)

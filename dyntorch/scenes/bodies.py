@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous, skew, unit
-from dyntorch.scenes.scene import OUTLIER, Draw, Scene, calibration
+from dyntorch.scenes.scene import OUTLIER, Draw, Scene, calibration, convert
 
 WIDTH, HEIGHT, FOCAL = 640.0, 480.0, 800.0
 SPACING = 0.15
@@ -303,11 +302,7 @@ class TranslatingScene:
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> TranslatingScene:
         """The scene in another floating point type or on another device."""
-
-        def move(x: Any) -> Any:
-            return x.to(device=device, dtype=dtype) if isinstance(x, Tensor) else x
-
-        return TranslatingScene(**{field.name: move(getattr(self, field.name)) for field in fields(self)})
+        return convert(self, dtype, device)
 
 
 def translating_planes(

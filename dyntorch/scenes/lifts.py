@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
-from dyntorch.scenes.scene import OUTLIER, Draw, calibration, looking_at
+from dyntorch.scenes.scene import OUTLIER, Draw, calibration, convert, looking_at
 
 CENTRE, FOCAL, DISTANCE = 500.0, 1300.0, 4.0
 SPEED, ACCELERATION = 0.12, 0.03  # rms, scene units (the rms radius is 1) per unit of time and per its square
@@ -84,11 +84,7 @@ class LiftedScene:
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> LiftedScene:
         """The scene in another floating point type or on another device; labels stay integers."""
-
-        def move(x: Any) -> Any:
-            return x.to(device=device, dtype=dtype if x.is_floating_point() else None) if isinstance(x, Tensor) else x
-
-        return LiftedScene(**{field.name: move(getattr(self, field.name)) for field in fields(self)})
+        return convert(self, dtype, device)
 
 
 def lifted_points(

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from dyntorch.geometry.homogeneous import skew, unit
+from dyntorch.numerics.blocks import each
 
 OUTLIER, STATIC, MOVING = 0, 1, 2
+
+
+Record = TypeVar("Record")
+
+
+def convert(record: Record, dtype: torch.dtype | None, device: torch.device | str | None = None) -> Record:
+    """A record with its tensors in another floating point type or on another device; integers stay integers."""
+    return each(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None), record)
 
 
 @dataclass(frozen=True)
@@ -37,18 +47,8 @@ class Scene:
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Scene:
         """The scene in another floating point type or on another device; labels stay integers, flags stay booleans."""
-
-        def move(x: Tensor) -> Tensor:
-            return x.to(device=device, dtype=dtype if x.is_floating_point() else None)
-
-        return replace(
-            self,
-            views=tuple(map(move, self.views)),
-            exact=tuple(map(move, self.exact)),
-            motion=tuple(map(move, self.motion)),
-            labels=move(self.labels),
-            extras={name: move(x) for name, x in self.extras.items()},
-        )
+        extras = {name: convert(x, dtype, device) for name, x in self.extras.items()}
+        return replace(convert(self, dtype, device), extras=extras)
 
 
 class Draw:

@@ -10,7 +10,7 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
+from dyntorch.geometry.homogeneous import apply, homogeneous
 from dyntorch.scenes.traffic import CAR, ROAD, Boxes, Chance, Drive, Kind, driven, drives, rotations, street_walls
 
 SIZE, FOCAL, PRINCIPAL = (1242, 375), 721.0, (609.5, 172.8)
@@ -130,7 +130,7 @@ def streets(
         >>> street = streets(3, generator=torch.Generator().manual_seed(0))
         >>> tuple(street.tracks.shape), street.labels.unique().tolist(), tuple(street.cameras.shape)
         ((20, 500, 2), [1, 2, 3], (20, 3, 4))
-        >>> seen = inhomogeneous(homogeneous(street.points) @ street.cameras.mT)
+        >>> seen = apply(street.cameras, street.points)
         >>> bool(((seen - street.exact).norm(dim=-1).nan_to_num() < 1e-6).all())
         True
     """
@@ -208,11 +208,11 @@ class _Scene:
         for k, car in enumerate(self.cars):
             now, after = car.corners()[:-1], car.corners()[1:]
             seen = self.inside(now, self.cameras[:-1]) & self.inside(after, self.cameras[1:])
-            true = _image(self.cameras[1:], after)
+            true = apply(self.cameras[1:], after)
             for motion in [still, *motions[:k], *motions[k + 1 :]]:
                 turn = motion[1:, :, :3] @ motion[:-1, :, :3].mT
                 shift = motion[1:, :, 3] - (turn @ motion[:-1, :, 3:])[..., 0]
-                other = _image(self.cameras[1:], now @ turn.mT + shift[:, None])
+                other = apply(self.cameras[1:], now @ turn.mT + shift[:, None])
                 apart = torch.where(seen, (other - true).norm(dim=-1), torch.nan).nanmedian(dim=1).values
                 if float(apart.nan_to_num().max()) < self.options.visible:
                     return False
@@ -220,14 +220,14 @@ class _Scene:
 
     def inside(self, points: Tensor, cameras: Tensor) -> Tensor:
         """``(frames, m)`` whether the picture shows ``points (frames, m, 3)``, were nothing in between."""
-        x = _image(cameras, points)
+        x = apply(cameras, points)
         depth = (homogeneous(points) @ cameras.mT)[..., 2]
         return (depth > NEAREST) & (x >= 0).all(-1) & (x[..., 0] <= SIZE[0] - 1) & (x[..., 1] <= SIZE[1] - 1)
 
     def frame_of(self, car: Drive) -> tuple[Tensor, Tensor, Tensor]:
         """Rectangles around a car, ``(frames, 2)`` low and high corners within the picture, and areas, 0 where it is not seen."""
         corners = car.corners()
-        x = _image(self.cameras, corners)
+        x = apply(self.cameras, corners)
         depth = (homogeneous(corners) @ self.cameras.mT)[..., 2]
         size = x.new_tensor([SIZE[0] - 1, SIZE[1] - 1])
         low, high = x.amin(1).clamp(min=0).minimum(size), x.amax(1).clamp(min=0).minimum(size)
@@ -305,7 +305,7 @@ class _Scene:
         frames = torch.arange(len(self.cameras))
         moved = torch.stack([self.boxes.world(t, box.clamp(min=0), local) for t in frames.tolist()])
         points = torch.where((box >= 0)[None, :, None], moved, point)
-        image = _image(self.cameras, points)
+        image = apply(self.cameras, points)
         step = torch.nn.functional.pad(image.diff(dim=0).norm(dim=-1), (0, 0, 1, 0))
         after = frames[:, None] >= start
         life = (chance.uniform(len(start)).log() / math.log(1 - self.options.loss)).ceil() if self.options.loss > 0 else torch.inf
@@ -381,11 +381,6 @@ def _looking(own: Drive, options: StreetOptions, chance: Chance) -> tuple[Tensor
     nod = torch.stack([one, zero, zero, zero, pitch.cos(), -pitch.sin(), zero, pitch.sin(), pitch.cos()], -1).unflatten(-1, (3, 3))
     lean = torch.stack([roll.cos(), -roll.sin(), zero, roll.sin(), roll.cos(), zero, zero, zero, one], -1).unflatten(-1, (3, 3))
     return centres, lean @ nod @ rotations(own.heading).mT
-
-
-def _image(cameras: Tensor, points: Tensor) -> Tensor:
-    """``(frames, m, 2)`` px of ``points (frames, m, 3)``."""
-    return inhomogeneous(homogeneous(points) @ cameras.mT)
 
 
 def _first(part: _Part, count: int) -> _Part:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, skew
+from dyntorch.geometry.homogeneous import apply, skew
 from dyntorch.geometry.lens import Division
 from dyntorch.scenes.scene import calibration, looking_at
 
@@ -101,7 +101,7 @@ def filmed_person(
     cameras = _cameras(generator)
     # b films a's moments (t_b - offset) / rate
     points = position(clocks[0]), position((clocks[1] - offset) / rate)
-    exact = _image(cameras[0], points[0]), _image(cameras[1], points[1])
+    exact = apply(cameras[0], points[0]), apply(cameras[1], points[1])
     mistaken = torch.zeros(n, dtype=torch.bool).index_fill(0, torch.randperm(n, generator=generator)[:wrong], True)
     own = torch.arange(n)
     seen = exact[0], exact[1][:, torch.where(mistaken, (own + 1) % n, own)]
@@ -159,10 +159,6 @@ def _cameras(generator: torch.Generator | None) -> Tensor:
     K[:, :2, 2] = torch.tensor(SIZE, dtype=torch.float64) / 2
     up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).expand(2, 3)
     return K @ looking_at(eye, torch.zeros_like(eye), up)
-
-
-def _image(camera: Tensor, points: Tensor) -> Tensor:
-    return inhomogeneous(homogeneous(points) @ camera.mT)
 
 
 def _fundamental(cameras: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from dyntorch.geometry.epipolar import (
 )
 from dyntorch.geometry.epipolar_fit import draw, sample_fundamentals, seven_point
 from dyntorch.geometry.homogeneous import homogeneous, unit
+from dyntorch.metrics import relative_error
 from dyntorch.scenes import filmed_person, two_view
 from tests.draws import random, seeded
 from tests.grid import grid
@@ -40,11 +41,6 @@ def moments_of(x1, x2):
     return z.mT @ z
 
 
-def distance(F, G):
-    """Of matrices of norm 1, whatever their signs."""
-    return torch.minimum((F - G).flatten(-2).norm(dim=-1), (F + G).flatten(-2).norm(dim=-1))
-
-
 def rms(F, x1, x2):
     return sampson_squared(F, x1, x2).mean(-1).sqrt()
 
@@ -58,7 +54,7 @@ def test_seven_points_determine_a_singular_matrix_among_at_most_three():
     assert (products(x1[chosen], x2[chosen])[:, None] @ F.flatten(-2)[..., None]).abs().max() < 1e-12
     assert torch.linalg.det(F).abs().max() < 1e-13
     torch.testing.assert_close(F.flatten(-2).norm(dim=-1), valid.double())
-    best = torch.where(valid, distance(F, truth), 2.0).amin(-1)
+    best = torch.where(valid, relative_error(F, truth), 2.0).amin(-1)
     assert best.median() < 1e-12
     assert best.max() < 1e-6
 
@@ -74,7 +70,7 @@ def test_seven_point_finds_the_real_roots_that_numpy_finds():
         assert len(real) == valid[sample].sum()
         for a in real:
             expected = unit(torch.as_tensor(a * null[0] + null[1]))
-            assert distance(F[sample], expected).min() < 1e-6
+            assert relative_error(F[sample], expected).min() < 1e-6
 
 
 def test_seven_point_of_special_pencils():
@@ -133,10 +129,10 @@ def test_eight_point_is_hartleys_for_every_weighting(sigma):
     weights[5] *= (x1 - x1[0]).norm(dim=-1) < 0.4
     F = eight_point(x1, x2, weights)
     for k in range(6):
-        assert distance(unit(F[k]), reference_eight_point(x1, x2, weights[k])) < (1e-5 if k == 5 else 1e-7)
+        assert relative_error(unit(F[k]), reference_eight_point(x1, x2, weights[k])) < (1e-5 if k == 5 else 1e-7)
     assert torch.linalg.det(F).abs().max() < 1e-15
     if sigma == 0.0:
-        assert distance(F, truth).max() < 1e-8
+        assert relative_error(F, truth).max() < 1e-8
 
 
 def test_weighing_by_the_gradient_gets_nearer_to_the_least_sampson_distance():
@@ -218,8 +214,8 @@ def test_samples_of_a_pool_fit_the_pool():
     assert F.shape == (3, 30, 3, 3)
     assert torch.equal(F, again)
     assert not valid[2].any()
-    assert distance(F[0], truth).min() < 1e-8
-    assert distance(F[1], other[2]).min() < 1e-8
+    assert relative_error(F[0], truth).min() < 1e-8
+    assert relative_error(F[1], other[2]).min() < 1e-8
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -6,8 +6,9 @@ import torch
 from dyntorch.geometry.epipolar import PairMonomials, affine_fundamental, eight_point, sampson_squared
 from dyntorch.geometry.epipolar_fit import Frames, Products, _normal_equations, descend, fit_fundamental
 from dyntorch.geometry.homogeneous import skew, unit
+from dyntorch.metrics import relative_error
 from tests.draws import random
-from tests.dyntorch.geometry.test_epipolar import distance, rms, scene
+from tests.dyntorch.geometry.test_epipolar import rms, scene
 
 ONES = torch.ones(1, 60, dtype=torch.float64)
 
@@ -16,7 +17,7 @@ def test_frames_hold_the_nearest_matrix_of_rank_two_and_stay_frames():
     F = random(20, 3, 3)
     u, s, vt = torch.linalg.svd(F)
     expected = unit((u[..., :2] * s[:, None, :2]) @ vt[:, :2])
-    assert distance(Frames.of(F).matrix().unflatten(-1, (3, 3)), expected).max() < 1e-12
+    assert relative_error(Frames.of(F).matrix().unflatten(-1, (3, 3)), expected).max() < 1e-12
     frames, step = Frames.of(F).retract(random(20, 7, seed=1)), 1e-3 * random(20, 7, seed=2)
     torch.testing.assert_close(frames.turns @ frames.turns.mT, torch.eye(3).double().expand(20, 2, 3, 3))
     torch.testing.assert_close(frames.matrix().norm(dim=-1), torch.ones(20).double())
@@ -74,7 +75,7 @@ def test_descent_never_gets_worse_and_is_that_of_each_problem():
     assert (cost(F) <= before + 1e-12).all()
     assert (cost(F)[20:30] < 0.5 * before[20:30]).sum() >= 8
     single = torch.cat([descend(starts[k : k + 1], x1, x2, weights[k : k + 1], 0.02, 4) for k in (0, 7, 25)])
-    assert distance(F[[0, 7, 25]], single).max() < 1e-6
+    assert relative_error(F[[0, 7, 25]], single).max() < 1e-6
     assert descend(starts[:0], x1, x2, weights[:0], 0.02).shape == (0, 3, 3)
 
 
@@ -109,6 +110,6 @@ def test_fit_never_loses_a_given_start():
     F, cost = fit_fundamental(x1, x2, ONES, scales=(0.1, 0.002), starts=given, steps=3)
     start = (sampson_squared(truth, x1, x2) / 0.002**2).clamp(max=2.25).sum()
     assert cost <= start + 1e-9
-    assert distance(F, truth) < 0.05
+    assert relative_error(F, truth) < 0.05
     with pytest.raises(ValueError, match="scales must be positive"):
         fit_fundamental(x1, x2, ONES, scales=(0.0,))

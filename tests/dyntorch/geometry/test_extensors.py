@@ -26,6 +26,7 @@ from dyntorch.geometry.extensors import (
     wedge,
 )
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
+from dyntorch.metrics import relative_error
 from tests.draws import random
 from tests.grid import assert_refused, grid
 
@@ -255,12 +256,6 @@ def test_batches_broadcast_and_gradients_exist_in_every_mode():
 J = plucker_form()
 
 
-def parallel(a, b, axes=2):
-    """Largest 1 - |cos| of tensors up to scale."""
-    a, b = a.flatten(-axes), b.flatten(-axes)
-    return float((1 - ((a * b).sum(-1) / (a.norm(dim=-1) * b.norm(dim=-1))).abs()).max())
-
-
 def misfit(cameras, found):
     """Reference: residual of the best T with found_i ~ cameras_i T, all of norm 1, and the gap to the next best."""
     views = len(cameras)
@@ -287,7 +282,7 @@ def test_a_line_camera_maps_joins_to_cross_products():
 def test_camera_of_lines_is_the_inverse(scale):
     P = random(7, 2, 3, 4)
     found = camera_of_lines(scale * line_camera(P))
-    assert parallel(P, found) < 1e-14
+    assert relative_error(found, P).max() < 1e-9
     torch.testing.assert_close(found.flatten(-2).norm(dim=-1), torch.ones(7, 2, dtype=torch.float64))
     # what is no camera is data
     bad = torch.stack([line_camera(P[0, 0]), torch.full((3, 6), torch.nan).double(), torch.zeros(3, 6).double()])
@@ -348,7 +343,7 @@ def test_a_pencil_of_complexes_has_two_lines_or_none():
     basis = torch.linalg.qr(torch.stack([first, second], dim=-1)).Q.T
     lines, real = lines_of_pencil(*basis)
     assert bool(real)
-    assert min(parallel(lines, torch.stack(pair), 1) for pair in ((first, second), (second, first))) < 1e-14
+    assert min(relative_error(lines, torch.stack(pair), dims=1).max() for pair in ((first, second), (second, first))) < 1e-7
     plus = torch.eye(6, dtype=torch.float64)[:2] @ (torch.eye(6) + J) / 2**0.5
     lines, real = lines_of_pencil(*plus)  # positive for the form: no line in it
     assert not bool(real)

@@ -1,6 +1,5 @@
 """Grassmann tensors against determinants one by one, finite differences at singular minors, and Cauchy-Binet."""
 
-from itertools import combinations, product
 from math import comb
 
 import pytest
@@ -19,6 +18,8 @@ from dyntorch.geometry.grassmann import (
     rotate_tensors,
     tables,
 )
+from dyntorch.metrics import relative_error
+from tests.battery.projections import minors
 from tests.draws import random, seeded
 from tests.grid import assert_refused
 
@@ -45,22 +46,12 @@ def projections(profile, rows, *batch, seed=0):
     return [random(*batch, m, sum(profile), seed=10 * seed + i) for i, m in enumerate(rows)]
 
 
-def brute(views, profile):
-    """Reference: every entry by its own determinant."""
-    subsets = [list(combinations(range(m.shape[-2]), a)) for m, a in zip(views, profile, strict=True)]
-    entries = [
-        torch.linalg.det(torch.cat([m[..., list(rows), :] for m, rows in zip(views, chosen, strict=True)], -2))
-        for chosen in product(*subsets)
-    ]
-    return torch.stack(entries, -1).unflatten(-1, [len(s) for s in subsets])
-
-
 @pytest.mark.parametrize(("profile", "rows"), PROFILES)
 def test_every_entry_is_a_determinant(profile, rows):
     views = projections(profile, rows, 2)
     tensor = grassmann_tensor(views, profile)
     assert tensor.shape == (2, *(comb(m, a) for m, a in zip(rows, profile, strict=True)))
-    torch.testing.assert_close(tensor, brute(views, profile), rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close(tensor.flatten(1), minors(profile, views), rtol=1e-9, atol=1e-10)
 
 
 def test_batches_broadcast():
@@ -122,6 +113,10 @@ def scene(profile, sizes, *batch, seed=0):
     return [random(*batch, m, sum(profile), seed=seed + i) for i, m in enumerate(sizes)]
 
 
+def distance(projections, tensor, profile):
+    return relative_error(grassmann_tensor(projections, profile), tensor, dims=len(profile))
+
+
 def relative(result, views):
     """Reference: the smallest of the singular values of R_i H = s_i M_i in H and all s_i, relative to the next, per problem."""
     size, count = views[0].shape[-1], len(views)
@@ -135,14 +130,6 @@ def relative(result, views):
         s = torch.linalg.svdvals(torch.cat(blocks))
         ratios.append(float(s[-1] / s[-2]))
     return torch.tensor(ratios)
-
-
-def distance(projections, tensor, profile):
-    views = len(profile)
-    found, target = grassmann_tensor(projections, profile).flatten(-views), tensor.flatten(-views)
-    found, target = (x / x.norm(dim=-1, keepdim=True) for x in (found, target))
-    cosine = (found * target).sum(-1, keepdim=True)
-    return (found - cosine.sign() * target).norm(dim=-1)
 
 
 @pytest.mark.parametrize(("profile", "sizes"), CASES)
@@ -250,10 +237,6 @@ def test_rotated_is_the_tensor_of_rotated_images():
 PIXELS = torch.tensor([[900.0, 3.0, 500.0], [0.0, 880.0, 400.0], [0.0, 0.0, 1.0]]).double()
 
 
-def angle(a, b):
-    return torch.linalg.cross(normalize(a, dim=-1), normalize(b, dim=-1)).norm(dim=-1)
-
-
 def common_direction(*batch, seed=0):
     """Projections P^4 -> P^2 of points of space that move in one direction, and the images of that direction."""
     cameras = random(*batch, 3, 3, 4, seed=seed)
@@ -273,7 +256,7 @@ def constant_velocity(*batch, seed=0):
 def test_joint_epipoles_are_the_vanishing_points_of_the_common_direction():
     views, vanishing = common_direction(40)
     found = joint_epipoles(views.unbind(-3))
-    assert angle(found.epipoles, vanishing).max() < 1e-10
+    assert relative_error(found.epipoles, vanishing, dims=1).max() < 1e-10
     assert found.definedness.min() > 1e-4
 
 
@@ -282,7 +265,7 @@ def test_any_projective_frame_and_pixels():
     plain = joint_epipoles(views.unbind(-3))
     moved = PIXELS @ views @ random(20, 1, 5, 5, seed=5)
     found = joint_epipoles((moved * random(20, 3, 1, 1, seed=6)).unbind(-3))
-    assert angle(found.epipoles @ torch.linalg.inv(PIXELS).mT, vanishing).max() < 1e-8
+    assert relative_error(found.epipoles @ torch.linalg.inv(PIXELS).mT, vanishing, dims=1).max() < 1e-8
     pixels_alone = joint_epipoles((PIXELS @ views).unbind(-3))
     torch.testing.assert_close(pixels_alone.definedness, plain.definedness)
 
@@ -301,7 +284,7 @@ def test_epipoles_lie_on_the_transversal_of_the_centres():
         # two of its points: skew form of the line, u -> u meet line
         points = torch.stack([dual(wedge(dual(transversal, 5, 2), h, 5, (3, 1)), 5, 4) for h in random(2, 10, 5, seed=8)], -1)
         for point in (views[:, view] @ points).unbind(-1):
-            assert angle(point, found.epipoles[:, view]).max() < 1e-8
+            assert relative_error(point, found.epipoles[:, view], dims=1).max() < 1e-8
 
 
 def test_lines_are_the_images_of_the_centres():
@@ -317,7 +300,7 @@ def test_constant_velocities_in_the_plane_have_none():
     views, infinity = constant_velocity(20)
     found = joint_epipoles(views.unbind(-3))
     assert found.definedness.max() < 1e-10
-    assert angle(found.lines, infinity[..., None, :].expand_as(found.lines)).max() < 1e-9
+    assert relative_error(found.lines, infinity[..., None, :].expand_as(found.lines), dims=1).max() < 1e-9
     from_tensor = joint_epipoles_of_tensor(grassmann_tensor(views.unbind(-3), (2, 2, 1)))
     assert from_tensor.definedness.max() < 1e-5
     assert (from_tensor.epipoles.isfinite() & found.epipoles.isfinite()).all()
@@ -328,9 +311,9 @@ def test_the_tensor_alone_knows_them(scene):
     views = random(30, 3, 3, 5, seed=4) if scene == "random" else common_direction(30, seed=9)[0]
     tensor = grassmann_tensor(views.unbind(-3), (2, 2, 1))
     found, expected = joint_epipoles_of_tensor(-7 * tensor), joint_epipoles(views.unbind(-3))
-    assert angle(found.epipoles, expected.epipoles).median() < 1e-12
-    assert angle(found.epipoles, expected.epipoles).max() < 1e-7
-    assert angle(found.lines, expected.lines).max() < 1e-7
+    assert relative_error(found.epipoles, expected.epipoles, dims=1).median() < 1e-12
+    assert relative_error(found.epipoles, expected.epipoles, dims=1).max() < 1e-7
+    assert relative_error(found.lines, expected.lines, dims=1).max() < 1e-7
 
 
 def test_slices_of_the_tensor_are_homographies_that_share_an_eigenspace():
@@ -343,7 +326,7 @@ def test_slices_of_the_tensor_are_homographies_that_share_an_eigenspace():
     # two points of P^4 with the same first image: the slice maps their second images to their third ones
     homography = torch.einsum("i,ijk->kj", p, points)
     same_plane = y + torch.linalg.svd(views[0]).Vh[3:].mT @ random(2, seed=13)
-    assert angle(homography @ (views[1] @ same_plane), views[2] @ same_plane) < 1e-12
+    assert relative_error(homography @ (views[1] @ same_plane), views[2] @ same_plane, dims=1) < 1e-12
     # another slice is proportional to it on the image of the first centre
     other = torch.einsum("i,ijk->kj", random(3, seed=14), points)
     line = views[1] @ torch.linalg.svd(views[0]).Vh[3:].mT
@@ -361,7 +344,7 @@ def test_epipoles_of_points_that_move_in_one_direction_of_the_plane():
         assert (found[:, i, i] == 0).all()
         for j in range(3):
             if i != j:  # the vanishing point of the direction
-                assert angle(found[:, i, j], cameras[:, i, :, 0]).max() < 1e-9
+                assert relative_error(found[:, i, j], cameras[:, i, :, 0], dims=1).max() < 1e-9
 
 
 def test_batch_is_loop_and_nan_stays_alone():

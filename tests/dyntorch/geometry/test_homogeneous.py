@@ -12,7 +12,6 @@ from dyntorch.geometry.homogeneous import (
     cofactors,
     collecting,
     homogeneous,
-    hyperplanes_through,
     inhomogeneous,
     monomial_derivatives,
     monomials,
@@ -26,6 +25,7 @@ from dyntorch.geometry.homogeneous import (
     unit,
     unit_vectors,
 )
+from dyntorch.metrics import relative_error
 from tests.draws import random
 from tests.grid import assert_refused, grid
 
@@ -74,7 +74,6 @@ def test_gradients():
 
     for function, given in (
         (inhomogeneous, point),
-        (hyperplanes_through, random(3, 3).requires_grad_()),
         (projectors, m),
         (cofactors, m),
         (apply, (random(2, 3, 4, seed=2).requires_grad_(), random(2, 5, 3, seed=3).requires_grad_())),
@@ -146,23 +145,6 @@ def test_similarity_scales_about_the_centre(d):
     torch.testing.assert_close(torch.linalg.det(t), s**d)
 
 
-@pytest.mark.parametrize("d", [1, 2, 3, 6])
-def test_hyperplanes_are_orthonormal_and_pass_through_the_point(d):
-    x = random(4, 10, d) * torch.logspace(-3, 3, 10, dtype=torch.float64)[:, None]
-    n = hyperplanes_through(x)
-    assert n.shape == (4, 10, d, d + 1)
-    torch.testing.assert_close(n @ n.mT, torch.eye(d, dtype=torch.float64).expand(4, 10, d, d), rtol=0, atol=1e-13)
-    p = normalize(homogeneous(x), dim=-1)
-    assert (n @ p[..., None]).abs().max() < 1e-14
-
-
-def test_hyperplanes_are_smooth():
-    # around a small loop the basis comes back to itself, without a jump
-    angles = torch.linspace(0, 2 * torch.pi, 2000, dtype=torch.float64)
-    n = hyperplanes_through(random(1, 2) + torch.stack([angles.cos(), angles.sin()], -1))
-    assert (n[1:] - n[:-1]).abs().max() < 0.01
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_unit_vectors_and_signs_leave_zero_alone(dtype):
     x = random(4, 3).to(dtype)
@@ -194,10 +176,6 @@ def rank_two(*batch, seed=0):
     return random(*batch, 3, 2, seed=seed) @ random(*batch, 2, 3, seed=seed + 1)
 
 
-def angle(a, b):
-    return torch.linalg.cross(normalize(a, dim=-1), normalize(b, dim=-1)).norm(dim=-1)
-
-
 def test_cofactors_are_the_scaled_inverse_transpose():
     m = random(50, 3, 3)
     torch.testing.assert_close(cofactors(m), torch.linalg.det(m)[:, None, None] * torch.linalg.inv(m).mT)
@@ -220,8 +198,8 @@ def test_noisy_matrices_give_the_smallest_singular_vectors(noise):
     clear = s[:, 2] < 0.6 * s[:, 1]
     assert clear.sum() > 300
     left, right = null_vectors(m[clear])
-    assert angle(left, u[clear][..., 2]).max() < 1e-9
-    assert angle(right, vt[clear][:, 2]).max() < 1e-9
+    assert relative_error(left, u[clear][..., 2], dims=1).max() < 1e-9
+    assert relative_error(right, vt[clear][:, 2], dims=1).max() < 1e-9
 
 
 def test_units_of_the_coordinates_do_not_matter():
@@ -231,7 +209,7 @@ def test_units_of_the_coordinates_do_not_matter():
     left, right = null_vectors(m)
     scaled_left, scaled_right = null_vectors(rows[:, None] * m * columns)
     for plain, scaled, factor in ((left, scaled_left, rows), (right, scaled_right, columns)):
-        assert angle(plain, scaled * factor).max() < 1e-10
+        assert relative_error(plain, scaled * factor, dims=1).max() < 1e-10
 
 
 def test_rank_below_two_is_zero_and_does_not_touch_the_others():

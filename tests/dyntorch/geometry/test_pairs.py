@@ -9,6 +9,7 @@ from torch.nn.functional import normalize
 
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.geometry.pairs import factor_product, hyperplane_pair, order_of_bodies, product_matrix, two_bodies
+from dyntorch.metrics import relative_error
 from dyntorch.scenes import bodies
 from tests.draws import random, seeded
 from tests.grid import assert_refused
@@ -24,17 +25,12 @@ def pairs(*batch, n=30, size=5, first=0.6, seed=0):
     return points * random(*batch, n, 1, seed=seed + 2), planes, labels
 
 
-def sine(a, b):
-    a, b = normalize(a, dim=-1), normalize(b, dim=-1)
-    return (a - (a * b).sum(-1, keepdim=True) * b).norm(dim=-1)
-
-
 @pytest.mark.parametrize("size", [3, 4, 5, 7])
 def test_exact_pairs(size):
     points, planes, labels = pairs(20, size=size, n=60)
     found = hyperplane_pair(points)
     assert (found.labels == labels).all()
-    assert sine(found.hyperplanes, planes).max() < 1e-10
+    assert relative_error(found.hyperplanes, planes, dims=1).max() < 1e-10
     torch.testing.assert_close(found.hyperplanes.norm(dim=-1), torch.ones(20, 2).double())
     own = found.distances.gather(-2, (labels - 1)[:, None])[:, 0]
     assert own.max() < 1e-20
@@ -45,7 +41,7 @@ def test_exact_pairs(size):
 def test_minimal_counts(size, least, first):
     points, planes, labels = pairs(50, n=least, size=size, first=first / least)
     found = hyperplane_pair(points)
-    assert sine(found.hyperplanes, planes).amax(-1).median() < 1e-10
+    assert relative_error(found.hyperplanes, planes, dims=1).amax(-1).median() < 1e-10
     assert (found.labels == labels).all(-1).double().mean() >= 0.96
     with pytest.raises(ValueError, match=f"take {least} points, structure has {least - 1}: add 1"):
         hyperplane_pair(points[:, 1:])
@@ -58,7 +54,7 @@ def test_two_bodies_that_hardly_separate():
     found = hyperplane_pair(points @ frame.mT)
     assert found.labels.tolist() == [1] * 25 + [2] * 15
     expected = torch.tensor([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -0.1, 1.0]]).double() @ torch.linalg.inv(frame)
-    assert sine(found.hyperplanes, expected).max() < 1e-9
+    assert relative_error(found.hyperplanes, expected, dims=1).max() < 1e-9
 
 
 def noisy(batch, seed=0, level=0.03):
@@ -80,7 +76,10 @@ def wrong(found, labels):
 def test_information_makes_hyperplanes_better():
     points, planes, _, information = noisy(60, level=0.01)
     plain, informed = hyperplane_pair(points), hyperplane_pair(points, information=information)
-    assert sine(informed.hyperplanes, planes).median() < 0.7 * sine(plain.hyperplanes, planes).median()
+    assert (
+        relative_error(informed.hyperplanes, planes, dims=1).median()
+        < 0.7 * relative_error(plain.hyperplanes, planes, dims=1).median()
+    )
 
 
 def test_distances_with_information_and_their_changes_of_frame():
@@ -94,12 +93,12 @@ def test_distances_with_information_and_their_changes_of_frame():
     for k in range(6):
         alone = hyperplane_pair(points[k], information=information[k])
         assert (found.labels[k] == alone.labels).all() and (batch.labels.view(6, 40)[k] == alone.labels).all()
-        assert sine(batch.hyperplanes.view(6, 2, 4)[k], alone.hyperplanes).max() < 1e-9
+        assert relative_error(batch.hyperplanes.view(6, 2, 4)[k], alone.hyperplanes, dims=1).max() < 1e-9
     frame, scale = random(4, 4, seed=30), random(6, 40, 1, seed=31)
     back = torch.linalg.inv(frame)
     moved = hyperplane_pair((points * scale) @ frame.mT, information=back.mT @ information @ back / scale[..., None].square())
     assert (moved.labels == found.labels).all()
-    assert sine(moved.hyperplanes, found.hyperplanes @ back).max() < 1e-3
+    assert relative_error(moved.hyperplanes, found.hyperplanes @ back, dims=1).max() < 1e-3
     torch.testing.assert_close(moved.distances.amin(-2), found.distances.amin(-2), atol=0.1, rtol=0.1)
 
 
@@ -108,7 +107,7 @@ def test_noise_without_information():
     found = hyperplane_pair(normalize(points, dim=-1) + 0.003 * random(50, 40, 5, seed=9))
     # only points next to both hyperplanes can be wrong
     assert wrong(found, labels).mean() < 0.02
-    assert sine(found.hyperplanes, planes).median() < 0.01
+    assert relative_error(found.hyperplanes, planes, dims=1).median() < 0.01
 
 
 def test_weights_zero_and_nan_are_absent():
@@ -121,7 +120,7 @@ def test_weights_zero_and_nan_are_absent():
     keep = torch.tensor([i for i in range(30) if i not in (4, 9)])
     assert (found.labels[:, keep] == labels[:, keep]).all()
     assert (found.labels[:, [4, 9]] == 0).all()
-    assert sine(found.hyperplanes, planes).max() < 1e-10
+    assert relative_error(found.hyperplanes, planes, dims=1).max() < 1e-10
     assert found.distances.isfinite().all()
     assert (hyperplane_pair(points[:, keep]).labels == found.labels[:, keep]).all()
 
@@ -171,15 +170,9 @@ def rank_two(*batch, seed=0):
     return form / torch.linalg.matrix_norm(form, keepdim=True)
 
 
-def apart(first, second):
-    """Distance of matrices up to scale."""
-    a, b = (m / torch.linalg.matrix_norm(m, keepdim=True) for m in (first, second))
-    return torch.minimum(torch.linalg.matrix_norm(a - b), torch.linalg.matrix_norm(a + b))
-
-
 def pair_error(found, true):
     """The worse of both forms in the better order."""
-    orders = [torch.maximum(apart(found[0], true[k]), apart(found[1], true[1 - k])) for k in (0, 1)]
+    orders = [torch.maximum(relative_error(found[0], true[k]), relative_error(found[1], true[1 - k])) for k in (0, 1)]
     return torch.minimum(*orders)
 
 
@@ -219,7 +212,7 @@ def test_factors_of_a_product():
     # the order is that of the forms alone
     again = factor_product(product_matrix(2 * g, f))
     for one, other in zip(found, again, strict=True):
-        assert apart(one, other).max() < 1e-8
+        assert relative_error(one, other).max() < 1e-8
     scene = bodies(20, batch=60, interleaved=True, generator=seeded())  # in pixels
     assert pair_error(factor_product(product_matrix(*scene.motion)), scene.motion).max() < 1e-8
 

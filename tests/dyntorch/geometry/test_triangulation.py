@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dyntorch.geometry.triangulation import mask_missing, reproject, resect, triangulate
+from dyntorch.metrics import relative_error
 from tests.draws import random, seeded
 from tests.grid import assert_refused
 
@@ -23,9 +24,7 @@ def scene(k, dim, views, n=40, batch=(), seed=0):
 
 def apart(a, b, dims=1):
     """Largest distance of matrices or vectors up to scale and sign."""
-    a, b = a.flatten(-dims), b.flatten(-dims)
-    a, b = a / a.norm(dim=-1, keepdim=True), b / b.norm(dim=-1, keepdim=True)
-    return (a * (a * b).sum(-1, keepdim=True) - b).norm(dim=-1).max()
+    return relative_error(a, b, dims=dims).max()
 
 
 def test_reproject_is_the_division_by_the_depth():

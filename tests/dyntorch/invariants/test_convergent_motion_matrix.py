@@ -19,11 +19,6 @@ def motion(*batch, seed=0):
     return eye + 0.3 * random(*batch, 3, 3, seed=seed), random(*batch, 3, seed=seed + 1), random(*batch, 3, seed=seed + 2)
 
 
-def apart(first, second):
-    """Relative error of points up to scale."""
-    return relative_error(first[..., None], second[..., None])
-
-
 def value(matrix, x1, x2):
     return torch.einsum("...ni,...ij,...nj->...n", homogeneous(x2), matrix, homogeneous(x1))
 
@@ -84,8 +79,8 @@ def test_decompose_returns_the_motion_in_either_order():
     H, e2, v2 = motion(50)
     found = ConvergentMotionMatrix.decompose(ConvergentMotionMatrix.compose(H, e2, v2))
     assert relative_error(found[0], H).max() < 1e-7
-    straight = torch.maximum(apart(found[1], e2), apart(found[2], v2))
-    swapped = torch.maximum(apart(found[1], v2), apart(found[2], e2))
+    straight = torch.maximum(relative_error(found[1], e2, dims=1), relative_error(found[2], v2, dims=1))
+    swapped = torch.maximum(relative_error(found[1], v2, dims=1), relative_error(found[2], e2, dims=1))
     assert torch.minimum(straight, swapped).max() < 1e-8
     failed = ConvergentMotionMatrix.decompose(torch.zeros(2, 6, 6))
     assert all((part == 0).all() and part.dtype == torch.float32 for part in failed)
@@ -105,7 +100,7 @@ def test_exact_matches_give_plane_vertex_and_epipole(parallel, n):
         assert relative_error(found, true)[good].max() < 1e-5
     assert (gap[good] > 1e-3).all()
     v1 = ConvergentMotionMatrix.vertices(H, v2)[0]
-    assert apart(v1, torch.linalg.solve(scene.extras["homography"], scene.extras["vertex"]))[good].max() < 1e-5
+    assert relative_error(v1, torch.linalg.solve(scene.extras["homography"], scene.extras["vertex"]), dims=1)[good].max() < 1e-5
     F, G = ConvergentMotionMatrix.factors(H, e2, v2)
     if n > 35:
         assert torch.equal(SegmentationMatrix.labels(F, G, *scene.views), scene.labels)

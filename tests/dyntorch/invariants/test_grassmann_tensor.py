@@ -10,7 +10,7 @@ from dyntorch import scenes
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
 from dyntorch.numerics.least_squares import jacobian
 from tests.battery.projections import minors, tensor_error
-from tests.battery.references import subdeterminants
+from tests.battery.references import rank, subdeterminants
 from tests.draws import random, seeded
 from tests.grid import assert_refused
 
@@ -35,18 +35,18 @@ FAMILIES = [
 ]
 
 
-def projections(invariant, *batch, seed=0):
+def projections(invariant, *batch, seed=0, last=0.2):
     """Random projections of norm 1 that see random points at finite places."""
     found = []
     for i, m in enumerate(invariant.sizes):
         matrix = random(*batch, m, invariant.k + 1, seed=100 * seed + i)
-        matrix[..., -1, :] *= 0.2
+        matrix[..., -1, :] *= last
         matrix[..., -1, -1] = 1.0
         found.append(matrix / matrix.norm(dim=(-2, -1), keepdim=True))
     return tuple(found)
 
 
-def images(motion, n, seed=50, structure=None):
+def images(motion, n=0, seed=50, structure=None):
     """What the projections see of points near the origin."""
     world = homogeneous(random(*motion[0].shape[:-2], n, motion[0].shape[-1] - 1, seed=seed)) if structure is None else structure
     return tuple(inhomogeneous(world @ m.mT) for m in motion)
@@ -59,11 +59,6 @@ def rows(profile, match):
         planes = torch.cat([torch.eye(len(x), dtype=torch.float64), -x[:, None]], dim=1)
         total = torch.stack([torch.kron(a, b) for a in total for b in subdeterminants(planes, order)])
     return total
-
-
-def rank(matrix):
-    s = torch.linalg.svdvals(matrix)
-    return int((s > 1e-10 * s[0]).sum())
 
 
 def sight(order):

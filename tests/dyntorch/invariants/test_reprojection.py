@@ -7,6 +7,7 @@ import dyntorch as dyn
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous
 from dyntorch.invariants.reprojection import linearize, residual, residual_derivative
 from tests.draws import random
+from tests.dyntorch.invariants.test_grassmann_tensor import images, projections
 
 PROFILES = [
     dyn.GrassmannTensor(3, (2, 1, 1)),
@@ -19,17 +20,7 @@ PROFILES = [
 
 def scene(invariant, n, *batch, seed=0):
     """Random projections and points ``(*batch, n, K)`` at finite places."""
-    motion = []
-    for i, m in enumerate(invariant.sizes):
-        matrix = random(*batch, m, invariant.k + 1, seed=100 * seed + i)
-        matrix[..., -1, :] *= 0.1
-        matrix[..., -1, -1] = 1.0
-        motion.append(matrix)
-    return tuple(motion), homogeneous(random(*batch, n, invariant.k, seed=100 * seed + 50))
-
-
-def images(motion, structure):
-    return tuple(inhomogeneous(structure @ m.mT) for m in motion)
+    return projections(invariant, *batch, seed=seed, last=0.1), homogeneous(random(*batch, n, invariant.k, seed=100 * seed + 50))
 
 
 def scales_of(motion, values):
@@ -46,7 +37,7 @@ def noisy(views, scales, size, seed=9):
 def test_square_sums_follow_chi_square(invariant):
     motion, structure = scene(invariant, 4000)
     scales = scales_of(motion, (1.0, 3.0, 0.5, 2.0))
-    views = noisy(images(motion, structure), scales, 1e-5)
+    views = noisy(images(motion, structure=structure), scales, 1e-5)
     square = (invariant.whitened_residual(motion, views, scales) / 1e-5).square().sum(-1)
     freedom = invariant.codim
     assert abs(float(square.mean()) - freedom) < 5 * (2 * freedom / 4000) ** 0.5
@@ -62,7 +53,7 @@ def test_it_is_the_least_reprojection_error(invariant):
     """Newton's method on the points, by automatic differentiation."""
     motion, structure = scene(invariant, 20)
     scales = scales_of(motion, (1.0, 3.0, 0.5, 2.0))
-    views = noisy(images(motion, structure), scales, 1e-3)
+    views = noisy(images(motion, structure=structure), scales, 1e-3)
 
     def cost(y, *x):
         seen = zip(motion, x, scales, strict=True)
@@ -97,7 +88,7 @@ def test_derivative_by_finite_differences(invariant):
         columns = torch.eye(theta.shape[-1], dtype=torch.float64) * step
         return torch.stack([(function(theta + c) - function(theta - c)) / (2 * step) for c in columns], dim=1)
 
-    exact = images(motion, structure)
+    exact = images(motion, structure=structure)
     value, derivative = invariant.linearize(motion, exact, scales)
     assert value.abs().max() < 1e-10
     expected = slopes(lambda t: invariant.whitened_residual(parts(t), exact, scales).flatten(1))
@@ -115,7 +106,7 @@ def test_nothing_depends_on_the_frame_of_the_space_or_on_scales():
     invariant = PROFILES[2]
     motion, structure = scene(invariant, 15)
     scales = scales_of(motion, (1.0,) * 4)
-    views = noisy(images(motion, structure), scales, 1e-3)
+    views = noisy(images(motion, structure=structure), scales, 1e-3)
     change = torch.eye(7, dtype=torch.float64) + 0.3 * random(7, 7, seed=4)
     moved = tuple(f * m @ change for f, m in zip((2.0, -0.1, 30.0, -5.0), motion, strict=True))
     torch.testing.assert_close(residual(moved, views, scales), residual(motion, views, scales), rtol=1e-4, atol=1e-9)
@@ -125,7 +116,7 @@ def test_batch_is_loop():
     invariant = PROFILES[1]
     motion, structure = scene(invariant, 9, 2, 3)
     scales = scales_of(motion, (1.0, 2.0, 3.0))
-    views = noisy(images(motion, structure), scales, 1e-2)
+    views = noisy(images(motion, structure=structure), scales, 1e-2)
     whole = residual(motion, views, scales)
     for i in range(2):
         for j in range(3):
@@ -136,7 +127,7 @@ def test_batch_is_loop():
 def test_degenerate_matches_stay_finite():
     motion, structure = scene(PROFILES[1], 6)
     scales = scales_of(motion, (1.0,) * 3)
-    views = [x.clone() for x in images(motion, structure)]
+    views = [x.clone() for x in images(motion, structure=structure)]
     # at infinity in a view, in a centre of one, and projections that see nothing
     structure[0] = torch.linalg.svd(motion[0][2:]).Vh[2]
     structure[1] = torch.linalg.svd(motion[0]).Vh[4]

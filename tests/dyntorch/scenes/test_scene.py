@@ -5,8 +5,9 @@ import torch
 from torch.nn.functional import normalize
 
 from dyntorch.geometry.extensors import compound, plucker, plucker_form
-from dyntorch.geometry.homogeneous import apply, homogeneous, hyperplanes_through, unit
+from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.scenes import collineation, constant_velocity, lines_concurrent, moving_points, planar, translating_lines, two_view
+from tests.battery.projections import hyperplanes
 from tests.draws import random, seeded
 from tests.grid import assert_refused, grid
 
@@ -161,7 +162,7 @@ def test_two_views_obey_the_epipolar_constraint():
 def test_collineations_map_their_matches(dim):
     scene = collineation(dim, 20, batch=3, generator=seeded())
     torch.testing.assert_close(apply(scene.motion[0], scene.exact[1]), scene.exact[0])
-    design = (hyperplanes_through(scene.exact[0])[0][..., :, :, None] * homogeneous(scene.exact[1])[0][:, None, None, :]).flatten(2)
+    design = (hyperplanes(scene.exact[0])[0][..., :, :, None] * homogeneous(scene.exact[1])[0][:, None, None, :]).flatten(2)
     assert rank(design.flatten(0, 1)) == (dim + 1) ** 2 - 1
 
 
@@ -169,7 +170,7 @@ def design_of(name, scene):
     """Estimation matrix of one invariant, row by row from its definition."""
     x = [lift(centred(v)) for v in scene.exact]
     if name == "constant_velocity":
-        planes = hyperplanes_through(centred(scene.exact[2]))
+        planes = hyperplanes(centred(scene.exact[2]))
         return rows(x[0][:, None], x[1][:, None], planes).flatten(0, 1)
     if name == "minimal_join":
         return rows(x[0], x[1], x[2] @ random(3, 4, seed=9).T)
