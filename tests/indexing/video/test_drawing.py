@@ -136,8 +136,5 @@ def test_only_the_frames_taken_are_written_and_large_ones_are_made_smaller():
     frames, rate = decoded(write_overlay(gray(9, 1301, 651), overlay(3, (1301.0, 651.0), (0, 4, 8)), 1.0))
     assert len(frames) == 3 and rate == pytest.approx(8, abs=0.1)
     assert frames[0].shape[1] == WIDEST and frames[0].shape[0] % 2 == 0
-
-
-def test_a_video_that_ends_too_early_is_refused():
     with pytest.raises(ValueError, match="the video has no frame 5, in which points are to be drawn; give the one"):
         write_overlay(gray(5), overlay())

@@ -100,21 +100,15 @@ def test_following_and_what_cannot_be_followed():
     assert not follow(image, rng.integers(0, 255, (100, 120)).astype(np.uint8), points)[1].any()
 
 
-def test_extent_ignores_single_jumps():
-    track = np.zeros((100, 2))
-    track[50] = 80
-    assert extent(track) == 0 and extent(track, 1.0) == pytest.approx(80 * np.sqrt(2))
-
-
-@pytest.mark.parametrize("options", [{"keep": 0}, {"complete": 1.5}])
-def test_options_that_make_no_sense(options):
-    with pytest.raises(ValueError, match=f"track_points: .*{next(iter(options))}"):
-        track_points([], **options)
-
-
-def test_one_frame_is_no_video():
+def test_options_that_make_no_sense_and_one_frame_is_no_video():
+    for options in ({"keep": 0}, {"complete": 1.5}):
+        with pytest.raises(ValueError, match=f"track_points: .*{next(iter(options))}"):
+            track_points([], **options)
     with pytest.raises(ValueError, match=r"1 frame\(s\)"):
         track_points([Chunk(np.zeros((1, 48, 64), np.uint8), np.zeros(1))])
+    track = np.zeros((100, 2))
+    track[50] = 80  # a single jump is no extent
+    assert extent(track) == 0 and extent(track, 1.0) == pytest.approx(80 * np.sqrt(2))
 
 
 def test_too_few_points_say_nothing_of_the_camera(rng, monkeypatch):
