@@ -126,12 +126,16 @@ class ConstantVelocityTensor(Invariant):
     def compose(first: Tensor, second: Tensor, third: Tensor) -> Tensor:
         r"""The tensor of the maps :math:`A_0, A_1, A_2`.
 
-        See :func:`~dyntorch.invariants.constant_velocity_tensor.constant_velocity_tensor`.
+        Args:
+            first, second: ``(*batch, 4, 4)`` of any scale.
+            third: ``(*batch, 4, 4)``, or ``(*batch, 3, 4)`` of a camera.
 
         Returns:
             ``(*batch, 4, 4, 4)``, or ``(*batch, 4, 4, 3)`` where :math:`A_2` is that of a camera; of norm 1.
         """
-        return constant_velocity_tensor(first, second, third)
+        back0, back1 = adjugate(first), adjugate(second)
+        moved = torch.einsum("...i,...kj->...ijk", back0[..., 3, :], 2 * third @ back1)
+        return unit_tensors(moved - torch.einsum("...ki,...j->...ijk", third @ back0, back1[..., 3, :]), 3)
 
     @staticmethod
     def decompose(tensor: Tensor) -> Motion:
@@ -154,7 +158,12 @@ class ConstantVelocityTensor(Invariant):
             >>> bool((y[:, 0] - 2 * y[:, 1] + y[:, 2]).abs().max() < 1e-9)
             True
         """
-        return _solve(tensor)
+        # in float64 and in coordinates of order 1
+        even, (first, second, third) = balance_views(unit_tensor(tensor))
+        maps = constant_velocity_maps(even)
+        scaled = (maps[0] / first[..., None], maps[1] / second[..., None], maps[2] * third[..., None])
+        first, second, third = (unit(m).to(tensor.dtype) for m in scaled)
+        return first, second, third
 
     @staticmethod
     def transfer(tensor: Tensor, x1: Tensor | None = None, x2: Tensor | None = None, x3: Tensor | None = None) -> Tensor:
@@ -326,15 +335,6 @@ def _drift(matrix: Tensor, shift: Tensor) -> Tensor:
     return torch.cat([matrix[..., :3], matrix[..., 3:] + matrix[..., :3] @ shift[..., None]], dim=-1)
 
 
-def _solve(tensor: Tensor) -> Motion:
-    """The maps, decomposed in float64 and in coordinates of order 1."""
-    even, (first, second, third) = balance_views(unit_tensor(tensor))
-    maps = constant_velocity_maps(even)
-    scaled = (maps[0] / first[..., None], maps[1] / second[..., None], maps[2] * third[..., None])
-    first, second, third = (unit(m).to(tensor.dtype) for m in scaled)
-    return first, second, third
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # The algebra of the tensor: its slices, the planes at infinity behind it, and the maps of the sensors.
 
@@ -343,14 +343,6 @@ def _solve(tensor: Tensor) -> Motion:
 # matches and 5e-3 in 98 %; 3 and 3 steps leave 2 % unconverged, 30 alternations gain nothing
 ALTERNATIONS = 10
 NEWTON_STEPS = 4
-
-
-def constant_velocity_tensor(first: Tensor, second: Tensor, third: Tensor) -> Tensor:
-    r"""The tensor of three maps from the world, :math:`T(P_0, P_1, \cdot) \sim P_2`, of norm 1. first ``(*batch, 4, 4)``,
-    second ``(*batch, 4, 4)``, third ``(*batch, 4, 4)`` -> ``(*batch, 4, 4, 4)``."""
-    back0, back1 = adjugate(first), adjugate(second)
-    moved = torch.einsum("...i,...kj->...ijk", back0[..., 3, :], 2 * third @ back1)
-    return unit_tensors(moved - torch.einsum("...ki,...j->...ijk", third @ back0, back1[..., 3, :]), 3)
 
 
 def infinity_planes(tensor: Tensor) -> tuple[Tensor, Tensor]:
@@ -370,32 +362,22 @@ def infinity_planes(tensor: Tensor) -> tuple[Tensor, Tensor]:
     return _newton(tensor, alpha, beta) if tensor.requires_grad else (alpha, beta)
 
 
-def structure(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    r"""The parts of :math:`T_{ijk} \approx \alpha_i Q_{kj} + K_{ki} \beta_j` with :math:`K \alpha = 0`. tensor
-    ``(*batch, 4, 4, m)`` -> ``(*batch, 4)``."""
-    alpha, beta = infinity_planes(tensor)
-    q = torch.einsum("...ijk,...i->...kj", tensor, alpha)
-    k = torch.einsum("...ijk,...j->...ki", tensor, beta)
-    return alpha, beta, q, k - (k @ alpha[..., None]) * alpha[..., None, :]
-
-
-def third_infinity(alpha: Tensor, beta: Tensor, q: Tensor, k: Tensor) -> Tensor:
-    r"""The equations of the plane at infinity of the third frame: :math:`\gamma^T Q \sim \beta^T, \gamma^T K \sim \alpha^T`."""
-    rest = q - (q @ beta[..., None]) * beta[..., None, :]
-    return torch.cat([rest.mT, (k - (k @ alpha[..., None]) * alpha[..., None, :]).mT], dim=-2)
-
-
 def constant_velocity_maps(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     r"""The maps :math:`A_0, A_1, A_2` of a tensor in closed form, up to an affinity of the world and a common velocity. tensor
     ``(*batch, 4, 4, 4)`` -> ``(*batch, 4, 4)``."""
-    alpha, beta, q, k = structure(tensor)
+    # T_ijk ~ alpha_i Q_kj + K_ki beta_j with K alpha = 0
+    alpha, beta = infinity_planes(tensor)
+    q, k = torch.einsum("...ijk,...i->...kj", tensor, alpha), torch.einsum("...ijk,...j->...ki", tensor, beta)
+    k = k - (k @ alpha[..., None]) * alpha[..., None, :]
     first = complement_frame(alpha)
     if tensor.shape[-1] == 3:
         third = -k @ first  # [M | 0]: the camera is at the origin
         world = torch.cat([torch.cat([third[..., :3], torch.zeros_like(third[..., 3:])], dim=-1), _last_row(third)], dim=-2)
         second = adjugate(torch.cat([q / 2, beta[..., None, :]], dim=-2)) @ world
         return unit(first), unit(second), unit(third)
-    gamma = null_space(third_infinity(alpha, beta, q, k))[..., 0, :]
+    # the plane at infinity of the third frame: gamma^T Q ~ beta^T, gamma^T K ~ alpha^T
+    rest = q - (q @ beta[..., None]) * beta[..., None, :]
+    gamma = null_space(torch.cat([rest.mT, k.mT], dim=-2))[..., 0, :]
     shift = (gamma[..., None, :] @ q @ beta[..., None])[..., 0] * gamma
     q = q + shift[..., :, None] * beta[..., None, :]
     k = k - shift[..., :, None] * alpha[..., None, :]

@@ -12,6 +12,7 @@ from dyntorch.geometry.extensors import levi_civita
 from dyntorch.geometry.homogeneous import homogeneous, inhomogeneous, unit
 from dyntorch.invariants.agreement import (
     point_error,
+    skew_partner,
     static_map,
     static_map_derivative,
     static_residual,
@@ -20,7 +21,6 @@ from dyntorch.invariants.agreement import (
     whitened_agreement,
 )
 from dyntorch.numerics.least_squares import normalized_derivative
-from dyntorch.numerics.nullspace import null_space
 
 
 class HomographyTensor(Invariant):
@@ -241,14 +241,7 @@ def _balance_slices(tensor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tenso
     return tensor, (scales[0], scales[1], scales[2])
 
 
-def _skew_system(slices: Tensor) -> Tensor:
-    r"""Equations ``(*batch, 27, 9)`` on X: :math:`X^T G_k` is skew-symmetric for the slices ``G_k = slices[..., k]``."""
-    eye = torch.eye(3, dtype=slices.dtype, device=slices.device)
-    half = torch.einsum("ac,...ibk->...kabic", eye, slices)
-    return (half + half.transpose(-4, -3)).flatten(-5, -3).flatten(-2)
-
-
 def _solve_skew_system(slices: Tensor) -> Tensor:
-    """The X ``(*batch, 3, 3)`` of :func:`_skew_system`; zero where all slices are."""
-    found = null_space(_skew_system(slices))[..., 0, :].unflatten(-1, (3, 3))
-    return torch.where((slices == 0).all(-1).all(-1).all(-1)[..., None, None], torch.zeros_like(found), found)
+    """The X ``(*batch, 3, 3)`` for which X^T G_k is skew, for the slices ``G_k = slices[..., k]``; zero where all of them are."""
+    found = skew_partner(slices.movedim(-1, -3))
+    return torch.where((slices == 0).flatten(-3).all(-1)[..., None, None], torch.zeros_like(found), found)
