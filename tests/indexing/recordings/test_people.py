@@ -36,19 +36,14 @@ def test_people_are_numbered_by_size_then_by_their_first_appearance():
     assert [person.clip.meta["person"] for person in crowd.people] == [1, 0, 2]
     assert [person.clip.name for person in crowd.people] == ["take.json#1", "take.json#2", "take.json#3"]
     assert not crowd.by_ids and not crowd.ghosts and not crowd.absences
-
-
-def test_the_ids_of_the_file_are_the_names():
+    # the ids of the file are the names; one person has none, a ghost beside him or not
     crowd = tracked_people([track([(0, 6)], 7, by="ids"), track([(0, 6)], "coach", place=400, size=2.0, by="ids")])
     assert names(crowd) == ["coach", "7"] and crowd.by_ids
-
-
-def test_one_person_has_no_name():
     alone = track([(0, 6)], None)
-    (person,) = tracked_people([alone], "take.json").people
-    assert person.name == "" and person.clip.name == "take.json"
-    np.testing.assert_array_equal(person.clip.joints, alone.joints)
-    assert names(tracked_people([track([(0, 6)], 3, by="ids")])) == ["3"]
+    for tracks in ([alone], [alone, track([(2, 2.2)], 1, place=900)]):
+        (person,) = tracked_people(tracks, "take.json").people
+        assert person.name == "" and person.clip.name == "take.json"
+        np.testing.assert_array_equal(person.clip.joints, alone.joints)
 
 
 def test_clips_of_a_set_are_no_people_of_one_recording():
@@ -66,35 +61,22 @@ def test_ghosts_are_left_out_and_counted_by_reason():
     )
     assert len(crowd.people) == 2
     assert crowd.ghosts == {"too short": 2, "too few joints": 1, "at one place": 1}
+    flickers = [track([(t, t + 0.1)], i, place=500.0 * i, by="ids") for i, t in enumerate((0, 3, 6, 9))]
+    crowd = tracked_people(flickers)
+    assert crowd.people == () and crowd.ghosts == {"too short": 4} and crowd.appearances == ()
 
 
-@pytest.mark.parametrize(("seconds", "people"), [(0.4, 1), (0.6, 2)])
-def test_half_a_second_makes_a_person(seconds, people):
-    crowd = tracked_people([track([(0, 6)], 0, by="ids"), track([(2, 2 + seconds)], 1, place=900, by="ids")])
-    assert len(crowd.people) == people
-
-
-def test_sightings_that_are_far_apart_do_not_add_up_to_a_person():
-    flicker = track([(1, 1.05), (5, 5.05)], 1, place=900, by="ids")
-    assert tracked_people([track([(0, 6)], 0, by="ids"), flicker]).ghosts == {"too short": 1}
-
-
-def test_in_a_short_recording_nobody_is_too_short():
-    crowd = tracked_people([track([(0, 0.1)], 0), track([(0, 0.1)], 1, place=500)])
-    assert len(crowd.people) == 2
-
-
-def test_of_one_or_two_joints_each_is_enough():
-    point = track([(0, 3)], 1)
+def test_who_is_seen_long_enough_is_a_person():
+    """Half a second at a time, unless all are shorter or less is asked for; of one or two joints, each."""
+    stays, point = track([(0, 6)], 0, by="ids"), track([(0, 3)], 1)
+    for spans, options, people in (
+        ([(2, 2.4)], {}, 1), ([(2, 2.6)], {}, 2), ([(1, 1.05), (5, 5.05)], {}, 1), ([(2, 2.3)], {"min_seconds": 0.2}, 2),
+    ):  # fmt: skip
+        assert len(tracked_people([stays, track(spans, 1, place=900, by="ids")], **options).people) == people, spans
+    assert len(tracked_people([track([(0, 0.1)], 0), track([(0, 0.1)], 1, place=500)]).people) == 2
     for joints in (1, 2):
         clip = point.replace(joints=point.joints[:, :joints])
-        other = clip.replace(joints=clip.joints + 500)
-        assert len(tracked_people([clip, other]).people) == 2
-
-
-def test_a_ghost_beside_one_person_leaves_one_person():
-    (person,) = tracked_people([track([(0, 6)], 0), track([(2, 2.2)], 1, place=900)]).people
-    assert person.name == "" and len(person.clip) == 181
+        assert len(tracked_people([clip, clip.replace(joints=clip.joints + 500)]).people) == 2
 
 
 # ---- coming and going ----------------------------------------------------------------------------------------------------
@@ -119,9 +101,7 @@ def test_who_appears_elsewhere_may_be_the_same_or_not():
     stays = track([(0, 20)], 1, place=5000, by="ids")
     crowd = tracked_people([stays, track([(0, 8)], 2, by="ids"), track([(9, 20)], 3, place=1500, by="ids")])
     assert crowd.appearances == (Appearance("3", 9.0, "2", 8.0, False),)
-
-
-def test_who_comes_while_all_others_stay_is_nobody_who_left():
+    # who comes while all others stay is nobody who left
     assert tracked_people([track([(0, 20)], 1), track([(5, 20)], 2, place=900)]).appearances == ()
 
 
@@ -133,13 +113,9 @@ def test_never_two_in_view_and_no_ids_is_one_lane_whose_pauses_are_said():
     assert [(round(gap.start, 2), round(gap.end, 2)) for gap in crowd.absences] == [(10.0, 14.0)]
     by_ids = [clip.replace(meta={"person": 4 + i, "followed": "ids"}) for i, clip in enumerate((first, second))]
     assert names(tracked_people(by_ids)) == ["4", "5"]
-
-
-def test_a_pause_of_the_recording_is_no_absence():
     whole = track([(0, 20)], None)
-    keep = (whole.times < 5) | (whole.times > 9)
-    cut = whole.replace(joints=whole.joints[keep], times=whole.times[keep])
-    assert tracked_people([cut]).absences == ()
+    keep = (whole.times < 5) | (whole.times > 9)  # a pause of the recording is no absence
+    assert tracked_people([whole.replace(joints=whole.joints[keep], times=whole.times[keep])]).absences == ()
 
 
 # ---- ids that swap -------------------------------------------------------------------------------------------------------
@@ -151,28 +127,11 @@ def test_ids_that_swap_are_said_and_left_as_they_are():
     crowd = tracked_people(swapped)
     assert crowd.exchanges == (Exchange("1", "2", pytest.approx(5.0)),)
     np.testing.assert_array_equal(crowd.people[0].clip.joints, joints[0])
-
-
-def test_people_who_pass_each_other_do_not_swap():
-    a, b = track([(0, 10)], 1, by="ids"), track([(0, 10)], 2, place=800, by="ids")
-    way = np.linspace(0, 700, len(a))[:, None, None] * [1.0, 0.0]
-    assert tracked_people([a.replace(joints=a.joints + way), b.replace(joints=b.joints - way)]).exchanges == ()
-
-
-def test_one_who_is_found_elsewhere_swaps_with_nobody():
-    a, b = track([(0, 10)], 1, by="ids"), track([(0, 10)], 2, place=800, by="ids")
-    away = a.joints.copy()
+    # who passes another does not swap, nor who is found elsewhere
+    way, away = np.linspace(0, 700, len(a))[:, None, None] * [1.0, 0.0], a.joints.copy()
     away[150:] += 3000
-    assert tracked_people([a.replace(joints=away), b]).exchanges == ()
+    for others in ([a.replace(joints=a.joints + way), b.replace(joints=b.joints - way)], [a.replace(joints=away), b]):
+        assert tracked_people(others).exchanges == ()
 
 
 # ---- nobody --------------------------------------------------------------------------------------------------------------
-def test_only_ghosts_is_nobody():
-    flickers = [track([(t, t + 0.1)], i, place=500.0 * i, by="ids") for i, t in enumerate((0, 3, 6, 9))]
-    crowd = tracked_people(flickers)
-    assert crowd.people == () and crowd.ghosts == {"too short": 4} and crowd.appearances == ()
-
-
-def test_the_options_decide():
-    clips = [track([(0, 6)], 0, by="ids"), track([(2, 2.3)], 1, place=900, by="ids")]
-    assert len(tracked_people(clips, min_seconds=0.2).people) == 2

@@ -52,29 +52,23 @@ def test_what_is_labelled_is_not_suggested_again(learned, recording) -> None:
     done = [(a, b) for label, a, b in truth if label == "kick"]
     assert "kick" not in names(suggest(learned, [clip], 2, [done]), truth)
     assert suggest(learned, [clip], 9, [[(-1.0, 1e6)]]) == []
+    assert 1 <= len(suggest(learned, [clip], 99, options=SuggestOptions(max_candidates=4))) <= 4  # too many are thinned out
+    with pytest.raises(ValueError, match="number=0: suggests nothing; give 1 or more"):
+        suggest(learned, [clip], 0)
 
 
 @pytest.mark.slow
 def test_nobody_who_stands_still_or_is_not_seen_is_suggested(learned, recording) -> None:
     clip, _ = recording
     still = clip.replace(joints=np.repeat(clip.joints[:1], len(clip), axis=0))
-    assert suggest(learned, [still], 9) == []
+    shares: list[float] = []
+    found = suggest(learned, [still, clip.replace(times=clip.times + 1000.0)], 2, progress=shares.append)
+    assert {one.recording for one in found} == {1} and min(one.start for one in found) > 1000
+    assert shares == sorted(shares) and 0 < shares[-1] <= 1
     gone = clip.joints.copy()
     gone[(clip.times > 4) & (clip.times < 12)] = np.nan
     for one in suggest(learned, [clip.replace(joints=gone, confidence=None)], 99):
         assert max(0.0, min(one.end, 12) - max(one.start, 4)) <= 0.6 * (one.end - one.start)
-
-
-@pytest.mark.slow
-def test_several_recordings_and_their_clocks(learned, recording) -> None:
-    clip, truth = recording
-    quiet = clip.replace(joints=np.repeat(clip.joints[:1], len(clip), axis=0))
-    later = clip.replace(times=clip.times + 1000.0)
-    shares: list[float] = []
-    found = suggest(learned, [quiet, later], 2, progress=shares.append)
-    assert {one.recording for one in found} == {1} and min(one.start for one in found) > 1000
-    assert set(names(found, [(label, a + 1000, b + 1000) for label, a, b in truth])) == {"kick", "bow"}
-    assert shares == sorted(shares) and shares[-1] <= 1
 
 
 def test_parts_cover_the_recording_and_stay_within_gaps(learned, recording) -> None:
@@ -94,12 +88,6 @@ def test_residuals_tell_what_is_known(learned, recording) -> None:
     assert np.allclose(apart, apart.T, atol=0.1) and (np.diag(apart) < 0.01).all() and 0 < usual < 1
     inside = [any(a <= (s + e) / 2 <= b and label in KNOWN for label, a, b in truth) for s, e in parts.spans]
     assert near[inside].max() < near[~np.array(inside)].min()
-
-
-def test_too_many_parts_are_thinned_out(learned, recording) -> None:
-    clip, _ = recording
-    found = suggest(learned, [clip], 99, options=SuggestOptions(max_candidates=4))
-    assert 1 <= len(found) <= 4
 
 
 def scattered(seed: int):
@@ -135,14 +123,7 @@ def test_alone_it_is_farthest_first() -> None:
         centres = np.concatenate([known, points[picked[:count]]])
         distance = np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1)
         assert distance[one] == pytest.approx(distance[worth].max())
-
-
-def test_who_is_less_sure_comes_sooner() -> None:
-    same = np.ones((2, 2)) - np.eye(2)
-    assert select_parts(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions()) == [1]
-    assert select_parts(np.ones(2), same, np.array([0.9, 0.1]), 1, np.ones(2, bool), SuggestOptions(doubt_weight=0.0)) == [0]
-
-
-def test_bad_input_says_what_is_wrong(learned, recording) -> None:
-    with pytest.raises(ValueError, match="number=0: suggests nothing; give 1 or more"):
-        suggest(learned, [recording[0]], 0)
+    # who is less sure comes sooner
+    same, margin = np.ones((2, 2)) - np.eye(2), np.array([0.9, 0.1])
+    for weight, first in ((SuggestOptions().doubt_weight, 1), (0.0, 0)):
+        assert select_parts(np.ones(2), same, margin, 1, np.ones(2, bool), SuggestOptions(doubt_weight=weight)) == [first]
