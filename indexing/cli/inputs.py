@@ -20,7 +20,6 @@ from indexing.cli.protocol import choose
 from indexing.cli.videos import find_keypoints
 from indexing.clip import Clip, ClipSet, FloatArray, stretches
 from indexing.joints import layout_of, match_joints
-from indexing.opening import clip_text, quote, read_rows
 from indexing.readers import read
 from indexing.readers.recording import NobodySeen
 from indexing.recordings.people import Appearance, Crowd, of_recording, tracked_people
@@ -322,76 +321,6 @@ def on_truth(truth: Sequence[Sequence[KnownEvent] | None], recordings: Sequence[
             runs = f"{who} runs from {one.times[0]:.6g} to {one.times[-1]:.6g} s"
             notes.append(f"{runs}: {count(len(out), 'known event')} outside of it cannot be found ({first})")
     return notes
-
-
-def read_truth(
-    path: Path, recordings: Sequence[str], people: Sequence[str] | None = None
-) -> tuple[list[list[KnownEvent] | None], list[str]]:
-    """Known events of each recording from a CSV with the columns ``label,start,end``, for several recordings ``file``, and
-    ``person`` where who does it is known."""
-    rows = _rows(path)
-    people = people or [""] * len(recordings)
-    if len(set(recordings)) > 1 and rows and "file" not in rows[0][1]:
-        raise ValueError(
-            f"{path}: has no column 'file', but {len(set(recordings))} recordings are scanned; add it, with their names"
-        )
-    by_person = bool(rows) and "person" in rows[0][1]
-    first = {name: i for i, name in reversed(list(enumerate(recordings)))}
-    known: list[list[KnownEvent] | None] = [[] if by_person or first[name] == i else None for i, name in enumerate(recordings)]
-    elsewhere, blamed = [], set()
-    for line, row in rows:
-        event = _event(path, line, row)
-        file, person = row.get("file", ""), row.get("person", "")
-        owner = [i for i, name in enumerate(recordings) if not file or {file, Path(file).name} & {name, Path(name).name}]
-        mine = [i for i in owner if not person or people[i] == person]
-        if mine:
-            events = known[mine[0]]
-            assert events is not None  # a person's, or the first of a recording
-            events.append(event)
-            blamed |= {recordings[mine[0]]} if not person and people[mine[0]] else set()
-        else:
-            elsewhere.append(f"{file} person {person}".strip() if owner or not file else file)
-    if rows and len(elsewhere) == len(rows):
-        column = "'person' names" if by_person and not any(row.get("file") for _, row in rows) else "'file' names"
-        raise ValueError(
-            f"{path}: column {column} {clip_text(names(sorted(set(elsewhere))))}, none of the recordings; correct the names"
-        )
-    notes = [
-        f"{path}: does not say whose the events of {name} are; compared with person {people[first[name]]}, the largest; a column "
-        "'person' says otherwise"
-        for name in sorted(blamed)
-    ]
-    left = f"{count(len(elsewhere), 'row')} of {path} left out: of other recordings ({clip_text(names(sorted(set(elsewhere))))})"
-    return known, notes + ([left] if elsewhere else [])
-
-
-def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
-    """Line number and cells by column name."""
-    form = "as CSV in UTF-8 with the columns label,start,end"
-    lines = list(read_rows(path.expanduser(), f"write it {form}", f"give the known events {form}", numbers=False))
-    head = [name.strip().lower() for name in lines[0][1]] if lines else []
-    missing = [name for name in ("label", "start", "end") if name not in head]
-    if missing:
-        raise ValueError(f"{path}: has no column {missing[0]!r}; the first line must name the columns label,start,end")
-    cells = [(i, [cell.strip() for cell in row]) for i, row in lines[1:]]
-    return [(i, dict(zip(head, row + [""] * len(head), strict=False))) for i, row in cells]
-
-
-def _event(path: Path, line: int, row: dict[str, str]) -> KnownEvent:
-    seconds = []
-    for column in ("start", "end"):
-        try:
-            value = float(row[column])
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise ValueError(f"{path}: line {line}, column {column!r}: {quote(row[column])} is no number; give seconds")
-        seconds.append(value)
-    if not seconds[0] <= seconds[1]:
-        raise ValueError(f"{path}: line {line}: ends at {seconds[1]:g} s, but starts at {seconds[0]:g} s; give start first")
-    if not row["label"]:
-        raise ValueError(f"{path}: line {line}, column 'label' is empty; name the action")
-    return row["label"], seconds[0], seconds[1]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from indexing.cli.console import check_file, count, names
 from indexing.cli.flags.shared import Example, Labelling, Reading
 from indexing.cli.inputs import KnownEvent, Lane, assumed_rate_notes, clip_notes, lanes_of, of_layout, on_examples
@@ -332,7 +334,7 @@ def film_examples(examples: Sequence[Example], labelling: Labelling, reading: Re
     """Videos with what is marked in them, as examples with their labels and seconds."""
     given = [example for example in examples if example.label is not None]
     unnamed = [Example(example.path) for example in examples if example.label is None]
-    lanes = [_Unread(example.path.name) for example in unnamed]
+    lanes = [Lane(example.path.name, "", None, np.empty(0)) for example in unnamed]
     marked, notes = read_marked(labelling, lanes, reading)
     for example, labels in zip(unnamed, marked, strict=True):
         given += [Example(example.path, one.label, one.start, one.end) for one in labels or ()]
@@ -340,14 +342,6 @@ def film_examples(examples: Sequence[Example], labelling: Labelling, reading: Re
         files = names([str(path) for path in labelling.labels])
         raise error(files, _why_nothing(notes), "mark actions, each from its begin to its end")
     return given, notes
-
-
-@dataclass(frozen=True)
-class _Unread:
-    """A recording of which only the name is known."""
-
-    name: str
-    person: str = ""
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from dyntorch import Status
 from dyntorch.core import Notice
 from indexing.readers.matches import Photograph
 from indexing.readers.tracks import TrackSet
-from indexing.report.canvas import LIGHT, Theme, draw_photograph, finish, foot, limits, new_figure, png, shorten, style
+from indexing.report.canvas import LIGHT, Theme, aspect, draw_photograph, finish, foot, layout, limits, png, shorten, style
 from indexing.report.page import (
     even,
     markup,
@@ -31,15 +31,8 @@ from indexing.report.summary import Summary, Table, register_page, warning_lines
 from indexing.video.scene import evenly_spaced
 
 FloatArray = NDArray[np.float64]
-FILES = (
-    "report.html",
-    "segmentation.npz",
-    "segmentation.json",
-    "labels.csv",
-    "tracks.csv",
-    "segmentation.png",
-    "segmentation.mp4",
-)  # the last one of videos
+# the last one of videos
+FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "tracks.csv", "segmentation.png", "segmentation.mp4")
 FILM = "segmentation.mp4"
 ALIVE = 3  # tracks that a frame must show of a body; fewer where it has fewer
 GEOMETRY = {False: "with depth: fundamental matrices", True: "a plane, or under a rotation alone: homographies"}
@@ -289,7 +282,7 @@ def tracks_csv(report: BodiesReport) -> str:
 
 Box = tuple[FloatArray, FloatArray]
 PANELS = 4  # frames that are shown
-WIDTH, TALL, EDGE, GAP, HEAD, TICKS, FOOT = 10.2, 4.4, 0.45, 0.12, 0.3, 0.28, 0.5  # inches
+TALL = 4.4  # inches
 WIDE = 0.22  # height over width below which pictures are drawn one above the other
 NARROW = 1.3  # and from which they are all drawn side by side
 TAIL = 0.12  # of all views: how far back tails lead
@@ -302,7 +295,8 @@ def picture_of(report: BodiesReport, theme: Theme = LIGHT) -> bytes:
     shown = sorted(report.photographs) or evenly_spaced(len(report.tracks.views), PANELS)
     box = _box(report)
     with style(theme):
-        figure, panels = _grid(len(shown), box, bool(report.photographs))
+        columns = PANELS if aspect(box) > NARROW else 2 if aspect(box) > WIDE else 1
+        figure, panels = layout([box] * len(shown), TALL, *((0.0, 0.12) if report.photographs else (0.45, 0.57)), columns)
         for panel, view in zip(panels, shown, strict=True):
             photograph = report.photographs.get(view)
             if photograph is not None:
@@ -330,25 +324,6 @@ def _box(report: BodiesReport) -> Box:
     if size is not None:
         return np.array([-0.5, -0.5]), np.array(size) - 0.5
     return limits(report.tracks.values[..., :2], STRAYS)
-
-
-def _grid(number: int, box: Box, bare: bool) -> tuple[Any, list[Any]]:
-    """A figure of panels, two in a row, all where they are narrow, or one where they are wide."""
-    edge, ticks = (0.0, 0.0) if bare else (EDGE, TICKS)
-    ratio = float(np.clip((box[1] - box[0])[1] / (box[1] - box[0])[0], 0.05, 20))
-    columns = min(number, PANELS if ratio > NARROW else 2 if ratio > WIDE else 1)
-    wide = (WIDTH - edge - (columns - 1) * (GAP + edge)) / columns
-    tall = wide * ratio
-    if tall > TALL:
-        wide, tall = wide * TALL / tall, TALL
-    rows = -(-number // columns)
-    width, height = edge + columns * wide + (columns - 1) * (GAP + edge), rows * (HEAD + tall + ticks) + FOOT
-    figure, panels = new_figure(width, height), []
-    for i in range(number):
-        row, column = divmod(i, columns)
-        left, top = edge + column * (wide + GAP + edge), row * (HEAD + tall + ticks) + HEAD + tall
-        panels.append(figure.add_axes((left / width, 1 - top / height, wide / width, tall / height)))
-    return figure, panels
 
 
 def _draw(panel: Any, report: BodiesReport, view: int, theme: Theme) -> None:

@@ -259,18 +259,29 @@ MAX_LONG_PATHS, LONG_PATH = 60, 0.06  # paths drawn where half of them are longe
 PANEL_MARGIN = 0.06  # around the points, of their extent
 
 
-def layout(boxes: list[tuple[FloatArray, FloatArray]], tall: float, edge: float, gap: float) -> tuple[Any, list[Any]]:
-    """A figure of panels side by side, as wide as they need to be, and the panels."""
-    wide = (PAGE_WIDTH - edge - gap * (len(boxes) - 1)) / len(boxes)
-    ratios = [float(np.clip((high - low)[1] / (high - low)[0], 0.05, 20)) for low, high in boxes]
-    sizes = [(min(wide, tall / ratio), min(tall, wide * ratio)) for ratio in ratios]
-    width = edge + sum(size for size, _ in sizes) + gap * (len(boxes) - 1)
-    highest = max(size for _, size in sizes)
-    height = PANEL_TITLE + highest + PANEL_TICKS + PANEL_FOOT
-    figure, left, panels = new_figure(width, height), edge, []
-    for across, down in sizes:
-        panels.append(figure.add_axes((left / width, 1 - (PANEL_TITLE + down) / height, across / width, down / height)))
-        left += across + gap
+def aspect(box: tuple[FloatArray, FloatArray]) -> float:
+    """Height over width of what a panel shows."""
+    low, high = box
+    return float(np.clip((high - low)[1] / (high - low)[0], 0.05, 20))
+
+
+def layout(
+    boxes: Sequence[tuple[FloatArray, FloatArray]], tall: float, edge: float, gap: float, columns: int = 2
+) -> tuple[Any, list[Any]]:
+    """A figure of panels, so many in a row, as wide as they need to be, and the panels."""
+    columns = min(columns, len(boxes))
+    wide = (PAGE_WIDTH - edge - gap * (columns - 1)) / columns
+    sizes = [(min(wide, tall / ratio), min(tall, wide * ratio)) for ratio in map(aspect, boxes)]
+    rows = [sizes[i : i + columns] for i in range(0, len(sizes), columns)]
+    width = max(edge + sum(across for across, _ in row) + gap * (len(row) - 1) for row in rows)
+    height = sum(PANEL_TITLE + max(down for _, down in row) + PANEL_TICKS for row in rows) + PANEL_FOOT
+    figure, panels, top = new_figure(width, height), [], 0.0
+    for row in rows:
+        left, top = edge, top + PANEL_TITLE
+        for across, down in row:
+            panels.append(figure.add_axes((left / width, 1 - (top + down) / height, across / width, down / height)))
+            left += across + gap
+        top += max(down for _, down in row) + PANEL_TICKS
     return figure, panels
 
 

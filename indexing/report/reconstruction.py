@@ -37,15 +37,8 @@ from indexing.report.page import ResultReport, markup, matrix, npz, safe_cell, s
 from indexing.report.summary import Summary, Table, register_page, warning_lines
 
 FloatArray = NDArray[np.float64]
-FILES = (
-    "report.html",
-    "reconstruction.npz",
-    "reconstruction.json",
-    "points.csv",
-    "tracks.png",
-    "scene.png",
-    "tracks.csv",
-)  # the last one of videos
+# the last one of videos
+FILES = ("report.html", "reconstruction.npz", "reconstruction.json", "points.csv", "tracks.png", "scene.png", "tracks.csv")
 ROUNDING = 1e-12
 LABELS = (("outlier", "static", "moving"), ("outlier", "body 1", "body 2"))
 ARRAYS = ("cameras", "points", "residuals", "inliers", "structure", "projections")

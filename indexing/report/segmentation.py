@@ -16,12 +16,12 @@ from indexing.readers.matches import MatchedPair, Photograph
 from indexing.report.canvas import (
     LIGHT,
     Theme,
+    aspect,
     draw_photograph,
     finish,
     foot,
     layout,
     limits,
-    new_figure,
     png,
     sample,
     shorten,
@@ -195,14 +195,8 @@ def colour_of(label: int) -> str:
 # Matches of two images.
 
 
-FILES = (
-    "report.html",
-    "segmentation.npz",
-    "segmentation.json",
-    "labels.csv",
-    "segmentation.png",
-    "tracks.csv",
-)  # the last one of videos
+# the last one of videos
+FILES = ("report.html", "segmentation.npz", "segmentation.json", "labels.csv", "segmentation.png", "tracks.csv")
 MOTION = {
     "fundamental": "fundamental matrix: a rigid body with depth",
     "homography": "homography: a plane, or a body seen under a rotation alone",
@@ -344,7 +338,7 @@ def labels_csv(report: SegmentationReport) -> str:
 
 Box = tuple[FloatArray, FloatArray]
 MARKS = ("o", "s", "^", "D")  # one for every round through the colours
-WIDTH, TALL, EDGE, GAP, HEAD, TICKS, FOOT = 10.2, 5.2, 0.45, 0.5, 0.32, 0.3, 0.5  # inches
+TALL = 5.2  # inches
 WIDE = 0.42  # height over width below which images are drawn one above the other
 STRAYS = 0.995  # of the matches, those that a panel without image shows
 SLIM = 0.2  # least ratio of the sides of such a panel
@@ -357,7 +351,8 @@ def picture_of(report: SegmentationReport, theme: Theme = LIGHT) -> bytes:
     boxes = [_box(report, i) for i in range(2)]
     size = float(np.clip(4500 / max(1, len(report.arrays.labels)), 5, 20))
     with style(theme):
-        figure, panels = _panels(boxes, bool(report.photographs))
+        edge, gap = (0.0, 0.15) if report.photographs else (0.45, 0.5)
+        figure, panels = layout(boxes, TALL, edge, gap, 2 if max(map(aspect, boxes)) > WIDE else 1)
         for i, (panel, points, photograph, box) in enumerate(zip(panels, places, photographs, boxes, strict=True)):
             if photograph is not None:
                 draw_photograph(panel, photograph, theme)
@@ -389,23 +384,6 @@ def _box(report: SegmentationReport, which: int) -> Box:
     sides = every[1] - every[0]
     room = np.maximum(0, SLIM * sides.max() - sides) / 2
     return every[0] - room, every[1] + room
-
-
-def _panels(boxes: list[Box], bare: bool) -> tuple[Any, list[Any]]:
-    """A figure with both images, side by side, or one above the other where they are wide."""
-    edge, ticks = (0.0, 0.0) if bare else (EDGE, TICKS)
-    ratios = [float((high - low)[1] / (high - low)[0]) for low, high in boxes]
-    if max(ratios) > WIDE:
-        return layout(boxes, TALL, edge, 0.15 if bare else GAP)
-    wide = WIDTH - edge
-    heights = [wide * max(ratio, 0.05) for ratio in ratios]
-    height = sum(heights) + 2 * (HEAD + ticks) + FOOT
-    figure, top, panels = new_figure(WIDTH, height), 0.0, []
-    for tall in heights:
-        top += HEAD + tall
-        panels.append(figure.add_axes((edge / WIDTH, 1 - top / height, wide / WIDTH, tall / height)))
-        top += ticks
-    return figure, panels
 
 
 def _draw_outliers(panel: Any, points: FloatArray, size: float, theme: Theme) -> None:

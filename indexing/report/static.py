@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,12 +13,12 @@ from numpy.typing import NDArray
 from indexing.colmap import MatchDatabase, StaticPoints
 from indexing.opening import count
 from indexing.readers.matches import Photograph
-from indexing.report.canvas import LIGHT, Theme, draw_photograph, finish, foot, new_figure, png, shorten, style
+from indexing.report.canvas import LIGHT, Theme, draw_photograph, finish, foot, layout, png, shorten, style
 from indexing.report.page import bar, safe_cell, sentence, table_csv
 from indexing.report.summary import Summary, Table, register_page
 
 FILES = ("report.html", "static.json", "images.csv", "pairs.csv", "static.png")
-PANELS, COLUMNS, WIDE, EDGE, HEAD, FOOT = 6, 3, 10.2, 0.15, 0.32, 0.5  # of the picture: images, and inches
+PANELS, COLUMNS, TALL = 6, 3, 6.6  # of the picture: images, and inches
 ROWS = 100  # images and pairs that the page lists
 KINDS = {1: "stands still", -1: "moves", 0: "not known"}
 COLOURS = {1: "#2f7fb8", -1: "#e8741e"}
@@ -183,25 +182,17 @@ def picture_of(report: StaticReport, theme: Theme = LIGHT) -> bytes:
 
     found = report.static
     places = images_drawn(found.database)
-    columns = min(COLUMNS, len(places))
-    rows = math.ceil(len(places) / columns)
-    sizes = [(found.database.images[k].camera.width, found.database.images[k].camera.height) for k in places]
-    wide = (WIDE - EDGE * (columns - 1)) / columns
-    tall = max(wide * height / width for width, height in sizes)
-    tall = min(tall, wide * 2)
-    height = rows * (tall + HEAD) + FOOT
+    cameras = [found.database.images[k].camera for k in places]
+    boxes = [(np.array([-0.5, -0.5]), np.array([camera.width, camera.height]) - 0.5) for camera in cameras]
     with style(theme):
-        figure = new_figure(WIDE, height)
-        for i, (place, size) in enumerate(zip(places, sizes, strict=True)):
-            row, column = divmod(i, columns)
-            bottom = 1 - ((row + 1) * (tall + HEAD)) / height
-            panel = figure.add_axes(((column * (wide + EDGE)) / WIDE, bottom, wide / WIDE, tall / height))
+        figure, panels = layout(boxes, TALL, 0.0, 0.15, COLUMNS)
+        for panel, place, box in zip(panels, places, boxes, strict=True):
             photograph = report.photographs.get(place)
             if photograph is not None:
                 draw_photograph(panel, photograph, theme)
             image = found.database.images[place]
             _draw_points(panel, image.points - 0.5, found.keypoints[place], theme)
-            finish(panel, np.array([-0.5, -0.5]), np.array(size) - 0.5, True, shorten(image.name, 32))
+            finish(panel, *box, True, shorten(image.name, 32))
             panel.set(xticks=[], yticks=[])
         kinds = np.concatenate(found.keypoints)
         handles = [

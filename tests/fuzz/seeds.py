@@ -403,7 +403,7 @@ def _tracks(folder: Path) -> list[Seed]:
 
 # ---- settings and pictures -----------------------------------------------------------------------------------------------
 def _settings(folder: Path) -> list[Seed]:
-    from indexing.cli.inputs import read_truth
+    from indexing.labels import open_labels
     from indexing.sync.calibration import read_calibration
 
     written(folder / "truth.csv", "label,start,end,file\na,0.1,0.5,session.json\nb,0.6,0.9,session.json\n")
@@ -416,7 +416,7 @@ def _settings(folder: Path) -> list[Seed]:
     truth = (*_scan(folder), "--truth", "{}")
     scan = tuple(word if word != "{}" or i > 2 else str(folder / "session.json") for i, word in enumerate(truth))
     return [
-        Seed("truth.csv", folder / "truth.csv", partial(read_truth, recordings=["session.json"]), scan),
+        Seed("truth.csv", folder / "truth.csv", partial(open_labels, recording="session.json"), scan),
         Seed("Calib.toml", folder / "Calib.toml", read_calibration, ("sync", str(folder / "pose"), "--calibration", "{}")),
     ]
 

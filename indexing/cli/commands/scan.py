@@ -14,7 +14,7 @@ from indexing.action.indexer import ActionIndexer
 from indexing.brightness.indexer import BrightnessIndexer
 from indexing.cli.console import Progress, check_report, names, present, progress
 from indexing.cli.flags.recognition import Scan
-from indexing.cli.inputs import KnownEvent, Lane, on_classes, on_truth, read_recordings, read_truth, watch_videos
+from indexing.cli.inputs import KnownEvent, Lane, on_classes, on_truth, read_recordings, watch_videos
 from indexing.cli.labels import check_write, known_events, read_marked, write_found
 from indexing.cli.videos import FilmRecording, are_films, read_films
 from indexing.clip import Clip
@@ -37,8 +37,10 @@ def run(flags: Scan) -> int:
         raise ValueError("no recordings; give at least one keypoint file or folder to search")
     if flags.truth is not None and flags.labelling.labels:
         raise ValueError(f"--truth {flags.truth}: --labels says what is known, too; give one of them")
-    inputs = [*flags.recordings, flags.model, *([flags.truth] if flags.truth is not None else [])]
-    folder = check_report(flags.report, inputs, FILES)
+    if flags.truth is not None:
+        flags = dataclasses.replace(flags, labelling=dataclasses.replace(flags.labelling, labels=(flags.truth,)))
+    inputs = [*flags.recordings, flags.model]
+    folder = check_report(flags.report, [*inputs, *flags.labelling.labels], FILES)
     target = check_write(flags.write, inputs, flags.recordings, flags.labelling.media)
     inputs += flags.labelling.labels
     indexer, results, notes, timings = search(flags)
@@ -68,29 +70,17 @@ def search(flags: Scan) -> tuple[Any, list[RecordingResult], list[str], dict[str
         indexer, recordings, notes = _read_videos(flags) if _of_films(flags) else _clips(flags)
     if flags.reject is not None:
         indexer.set_params(reject=flags.reject)
-    names, people = [one.name for one in recordings], [getattr(one, "person", "") for one in recordings]
-    truth, unread = _known_labels(flags, recordings, names, people)
-    notes = notes + unread + _unknown(truth, indexer)
-    if truth is not None:
-        notes += on_truth(truth, recordings)
+    truth: list[list[KnownEvent] | None] = [None] * len(recordings)
+    if flags.labelling.labels:
+        marked, unread = read_marked(flags.labelling, recordings, flags.reading)
+        truth = known_events(marked)
+        notes = [*notes, *unread, *_unknown(truth, indexer), *on_truth(truth, recordings)]
     loaded = time.perf_counter()
     results = [
-        _scan(flags, indexer, one, None if truth is None else truth[i], f" ({i + 1} of {len(names)})" if len(names) > 1 else "")
-        for i, one in enumerate(recordings)
+        _scan(indexer, one, events, f" ({i} of {len(recordings)})" if len(recordings) > 1 else "")
+        for i, (one, events) in enumerate(zip(recordings, truth, strict=True), 1)
     ]
     return indexer, results, notes, {"load": loaded - started, "scan": time.perf_counter() - loaded}
-
-
-def _known_labels(
-    flags: Scan, recordings: Sequence[Any], names: list[str], people: list[str]
-) -> tuple[list[list[KnownEvent] | None] | None, list[str]]:
-    """What is known to have happened in each recording, person by person, where anything is."""
-    if flags.truth is not None:
-        return read_truth(flags.truth, names, people)
-    if flags.labelling.labels:
-        marked, notes = read_marked(flags.labelling, recordings, flags.reading)
-        return known_events(marked), notes
-    return None, []
 
 
 def _of_films(flags: Scan) -> bool:
@@ -125,7 +115,7 @@ def _read_videos(flags: Scan) -> tuple[BrightnessIndexer, list[FilmRecording], l
     return BrightnessIndexer.load(flags.model.expanduser()), *read_films(flags.recordings, flags.reading)
 
 
-def _scan(flags: Scan, indexer: Any, recording: Any, truth: list[KnownEvent] | None, which: str) -> RecordingResult:
+def _scan(indexer: Any, recording: Any, truth: list[KnownEvent] | None, which: str) -> RecordingResult:
 
     classes = [str(label) for label in indexer.classes_]
     if isinstance(recording, Lane) and recording.clip is None:  # nobody is in view
@@ -173,7 +163,7 @@ def exemplars(indexer: ActionIndexer) -> dict[Any, list[Clip]]:
     return clips
 
 
-def _unknown(truth: Sequence[Sequence[KnownEvent] | None] | None, indexer: Any) -> list[str]:
+def _unknown(truth: Sequence[Sequence[KnownEvent] | None], indexer: Any) -> list[str]:
     known = {str(label) for label in indexer.classes_}
-    strange = sorted({str(label) for events in truth or [] for label, _, _ in events or []} - known)
+    strange = sorted({str(label) for events in truth for label, _, _ in events or []} - known)
     return [f"the model does not know {names(strange)}, which the known events name"] if strange else []

@@ -18,7 +18,7 @@ from indexing.actors import Person, dataset, detect, perform, stream
 from indexing.cli import main
 from indexing.cli.commands.scan import exemplars, within_label
 from indexing.cli.flags.shared import Example, Format, People
-from indexing.cli.inputs import parse_example, read_truth
+from indexing.cli.inputs import parse_example
 from indexing.cli.protocol import Cameras, choose, draw_shots, splits
 from indexing.clip import Clip, ClipSet
 from indexing.readers import FORMATS
@@ -217,26 +217,14 @@ def test_scan_refuses_bad_input(refuse, run, data: Path, tmp_path: Path) -> None
     refuse(*scan, "@/session.json", "-m", "nope.safetensors", says=("nope.safetensors", "index fit"))
     refuse(*scan, "@/session.json", *model, "--report", "file", says=("'file' is a file", "another folder"))
     refuse(*scan, "@/session.json", *model, "--report", "file/deep", says=("is a file",))
-    refuse(*scan, "@/session.json", *model, "--truth", "nope.csv", says=("nope.csv", "label,start,end"))
+    refuse(*scan, "@/session.json", *model, "--truth", "nope.csv", says=("nope.csv", "no such file"))
     refuse(*scan, "@/session.json", *model, "--truth", "bad.csv", says=("bad.csv", "line 2", "start first"))
     refuse(*scan, "@/session.json", *model, "--truth", "odd.csv", says=("line 2", "'start'", "'soon'"))
     refuse(*scan, "@/session.json", *model, "--truth", "no.csv", says=("no.csv", "'label'"))
-    refuse(*scan, "@/session.json", *model, "--truth", "elsewhere.csv", says=("x.json", "none of the recordings"))
+    refuse(*scan, "@/session.json", *model, "--truth", "elsewhere.csv", says=("x.json", "session.json", "--media NAME"))
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "events.csv").write_text("label,start,end\nsquat,1,2\n")
     refuse(*scan, "@/session.json", *model, "--truth", "out/events.csv", "--report", "out", says=("events.csv", "input"))
-
-
-def test_truth_of_several_recordings(tmp_path: Path) -> None:
-    clips = [Clip(np.ones((9, 3, 2)), fps=3.0, name=name) for name in ("a.json", "b.json")]
-    path = tmp_path / "truth.csv"
-    path.write_text("\ufeffFile;Label;start;end\nb.json;wave;0;1\ntakes/a.json;kick;1;2\nc.json;kick;0;1\n\n")
-    known, notes = read_truth(path, [clip.name for clip in clips])
-    assert known == [[("kick", 1.0, 2.0)], [("wave", 0.0, 1.0)]]
-    assert len(notes) == 1 and "1 row" in notes[0] and "c.json" in notes[0]
-    path.write_text("label,start,end\nkick,0,1\n")
-    with pytest.raises(ValueError, match="no column 'file'"):
-        read_truth(path, [clip.name for clip in clips])
 
 
 def test_hits_name_the_exemplar_within_its_label(data: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from indexing.cli.inputs import read_truth
+from indexing.labels import open_labels
 from indexing.opening import clip_text, parse_json, quote, read_text
 from indexing.readers import npz as npz_gate
 from indexing.readers import read
@@ -178,7 +178,7 @@ def test_arrays_of_other_shapes_and_types_than_usual(tmp_path: Path) -> None:
 ACTIONS = [
     ("a.json", read), ("a.csv", read), ("a.npz", read), ("a.npz", read_film_set), ("a.csv", read_pair), ("a.npz", read_pair),
     ("a.csv", open_points), ("a.csv", tracks), ("a.npz", tracks), ("a.toml", read_calibration), ("a.png", read_image),
-    ("a.csv", lambda path: read_truth(path, ["a"])),
+    ("a.csv", open_labels),
 ]  # fmt: skip
 
 
