@@ -65,8 +65,3 @@ def test_joints_that_the_archive_does_not_have(archive):
     clips = [Clip(rng.normal(size=(40, 5, 2)), fps=30.0) for _ in range(4)]
     with pytest.raises(ValueError, match="too few in common"):
         archive.find(ActionIndexer().fit(clips, ["a", "a", "b", "b"]))
-
-
-def test_no_model_there(archive, tmp_path):
-    with pytest.raises(ValueError, match=r"nothing\.safetensors"):
-        archive.find(tmp_path / "nothing.safetensors")

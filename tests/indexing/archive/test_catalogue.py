@@ -421,24 +421,6 @@ input()
     assert three.add(moves(3, name="d")).of("added")
 
 
-def test_two_threads_do_not_add_at_once(three: Archive, moves) -> None:
-    met: list[str] = []
-
-    def second(share: float) -> None:
-        def add() -> None:
-            try:
-                three.add(moves(4, name="e"))
-            except ValueError as problem:
-                met.append(str(problem))
-
-        thread = threading.Thread(target=add)
-        thread.start()
-        thread.join()
-
-    three.add(moves(3, name="d"), progress=second)
-    assert len(met) == 1 and "is locked" in met[0] and names(three) == ["a", "b", "c", "d"]
-
-
 def test_many_who_make_it_at_once_make_one(tmp_path: Path) -> None:
     folder, problems = tmp_path / "a", list[BaseException]()
     gate = threading.Barrier(8)

@@ -63,22 +63,6 @@ def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=Fa
     return probe_of(source, 0, layout, segment.rate, tempo, moving=moving)
 
 
-def test_correlation_is_that_of_the_planes():
-    rng = np.random.default_rng(1)
-    windows = rng.normal(size=(50, 2, 12))
-    example = orthonormal(rng.normal(size=(2, 4, 3)).astype(np.float32)).reshape(2, -1)
-    c = torch.tensor(np.einsum("ndk,ek->den", windows, example))[:, None]
-    gram = torch.tensor(np.einsum("ndk,nek->den", windows, windows))
-    found = correlation(c, torch.stack([gram[0, 0], gram[0, 1], gram[1, 1]]))[0]
-    for window, value in zip(windows, found.tolist(), strict=True):
-        assert value == pytest.approx(squared_cosine(window, example), abs=1e-4)
-
-
-def test_windows_of_nothing_resemble_nothing():
-    c = torch.zeros(2, 1, 2, 3)
-    assert correlation(c, torch.zeros(3, 3)).tolist() == [[0.0, 0.0, 0.0]]
-
-
 def squared_cosine(window, example):
     """The largest canonical correlation of two planes, by numpy."""
     return np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)[0] ** 2
@@ -172,19 +156,3 @@ def test_a_track_as_long_as_the_window_is_found_wherever_it_lies(tmp_path):
         source = concatenate_clips([Clip(stored.positions(1), times=np.arange(len(tracks[1])) / stored.rate)])
         found = scan(stored, [probe_of(source, 0, layout, stored.rate, 1.0)], 10)
         assert found.track[0] == 1 and found.score[0] > 0.999
-
-
-def test_ends_are_compared_of_what_may_be_one_performance(segment):
-    stored, layout = segment
-    asked = probe(stored, layout, 2.5)
-    found = scan(stored, [asked], 10_000)
-    first = stored.firsts[found.track]
-    between = {
-        (int(track), int(row))
-        for track, row, off in zip(found.track, found.row, (first + found.row) % asked.stride, strict=True)
-        if off
-    }
-    rows = stored.tracks[:, 3]
-    short = [i for i in range(len(stored)) if asked.span < rows[i] <= asked.longest]
-    ends = {(i, row) for i in short for row in (0, int(rows[i]) - 1 - asked.span) if (int(stored.firsts[i]) + row) % asked.stride}
-    assert between == ends and len(ends) >= 1 and len(short) < (rows > asked.span).sum()

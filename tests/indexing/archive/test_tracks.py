@@ -15,7 +15,6 @@ from indexing.archive.tracks import (
     images,
     layout_key,
     tracks_of,
-    windows_of,
 )
 from indexing.cameras import rotation
 from indexing.clip import Clip
@@ -37,15 +36,10 @@ def test_stored_movement_is_the_movement():
     at = track.start + np.arange(len(track)) / STORAGE.rate
     assert np.abs(track.positions()[1:-1] - swinging(at)[1:-1]).max() < 1.0  # a pose is the mean of a fifteenth of a second
     assert track.scale < 0.05 and track.joints.dtype == np.int16 and len(track) == 150
-
-
-def test_rate_is_steady_whatever_the_clock():
-    rng = np.random.default_rng(1)
-    t = np.cumsum(rng.uniform(0.01, 0.07, 400)) + 1000.0
+    t = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.07, 400)) + 1000.0  # at a steady rate, whatever the clock
     (track,) = tracks_of(Clip(swinging(t - 1000), times=t), STORAGE)
     at = track.start + np.arange(len(track)) / STORAGE.rate
-    assert track.start == t[0]
-    assert np.abs(track.positions()[1:-1] - swinging(at - 1000)[1:-1]).max() < 2.0
+    assert track.start == t[0] and np.abs(track.positions()[1:-1] - swinging(at - 1000)[1:-1]).max() < 2.0
 
 
 def test_gaps_part_tracks_and_short_ones_are_left_out():
@@ -93,10 +87,6 @@ def test_a_slip_does_not_take_the_precision_of_the_others():
 def test_nothing_is_kept_of_nothing():
     for joints in (np.zeros((60, 4, 2)), np.full((60, 4, 2), np.nan), np.ones((1, 4, 2))):
         assert tracks_of(Clip(joints), STORAGE) == []
-
-
-def test_windows_are_counted_by_the_shortest():
-    assert [windows_of(rows, STORAGE) for rows in (0, 8, 9, 100)] == [0, 0, 1, 92]
 
 
 # ---- layouts -------------------------------------------------------------------------------------------------------------
@@ -149,20 +139,6 @@ def test_a_joint_that_is_missing_is_what_the_others_make_likely():
     full = full - full.mean(axis=1, keepdims=True)
     expected = np.einsum("tjd,jk->tdk", full, layout.basis)
     assert np.allclose(layout.project(poses), expected, atol=1e-2 * np.abs(expected).max())
-
-
-def test_a_pose_of_two_joints_is_none():
-    layout, tracks, _ = learned()
-    poses = tracks[0].positions()[:3].copy()
-    poses[:, 2:] = np.nan
-    codes, scales = layout.codes(poses)
-    assert not codes.any() and not scales.any()
-
-
-def test_layouts_come_back_from_bytes():
-    layout, _, _ = learned()
-    again = Layout.load(layout.dump(), layout.joints, None)
-    assert all(np.array_equal(getattr(again, name), getattr(layout, name)) for name in ("covariance", "basis", "metric"))
 
 
 def test_joints_are_met_by_name():

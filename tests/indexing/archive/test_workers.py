@@ -16,7 +16,7 @@ import torch
 from safetensors.numpy import load_file
 
 from experiments.archive import killed
-from experiments.archive.killed import Adder, Deadly, Stage, Trial, aftermath, contents, readable
+from experiments.archive.killed import Deadly, Stage, Trial, aftermath, contents, readable
 from indexing import ActionIndexer, Archive, Clip, ClipSet
 from indexing.actors import Person, dataset, detect, stream
 from indexing.archive import workers
@@ -102,14 +102,6 @@ def test_two_adders_at_once_add_everything_once(stage: Stage) -> None:
 @pytest.mark.slow
 def test_who_asks_while_somebody_adds_is_answered(stage: Stage) -> None:
     unharmed(killed.asked_meanwhile(stage, 1, np.random.default_rng(4)))
-
-
-def test_a_killed_adder_lets_go_of_the_archive(stage: Stage) -> None:
-    folder = stage.copy()
-    adder = Adder.start(folder, [stage.new])
-    adder.process.kill()
-    assert adder.end() is None
-    assert Archive(folder).remove(stage.earlier[0]) == 1
 
 
 # ---- a full disk ---------------------------------------------------------------------------------------------------------

@@ -153,10 +153,8 @@ def test_recordings(run, clips):
     Path("truth.csv").write_text("label,start,end\nwave,0,1\nkick,50,60\n")
     scan = "index scan {} -m m.safetensors --fps 30"
     code, out, _ = run(scan.format("wave --truth truth.csv"))
-    assert (
-        code == 0 and f"wave runs from 0 to {wave.times[-1]:.6g} s: 1 known event outside of it cannot be found (kick at 50" in out
-    )
-    assert out.count("note:") == 1
+    assert code == 0 and out.count("note:") == 1
+    assert f"wave runs from 0 to {wave.times[-1]:.6g} s: 1 known event outside of it cannot be found (kick at 50" in out
     two = run(scan.format("two"))[1]
     assert "two: 2 people in view, told apart by position, as the file has no ids to rely on; each is scanned by itself" in two
     one = run(scan.format("two --person largest"))[1]

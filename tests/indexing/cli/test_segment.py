@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import dyntorch
-from dyntorch.core.outcome import Notice, NoticeCode
+from dyntorch import scenes
 from dyntorch.numerics import Message
 from dyntorch.tasks.segment.result import Segmentation
 from indexing.report.segmentation import FILES
@@ -22,42 +22,16 @@ from indexing.report.segmentation import FILES
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 
 COMMAND = "segment"
-WIDE, TALL, FOCAL = 640.0, 480.0, 700.0
-COUNTS = (60, 40, 20)  # of two bodies and of wrong matches
-
-
-def skew(v: np.ndarray) -> np.ndarray:
-    return np.cross(np.eye(3), -v)
-
-
-def body(rng, count, low, high, shift, angle):
-    """Matches of a rigid body, and its fundamental matrix."""
-    inner = np.array([[FOCAL, 0, WIDE / 2], [0, FOCAL, TALL / 2], [0, 0, 1.0]])
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    first = np.c_[rng.uniform(low, high, size=(count, 2)), np.ones(count)]
-    there = (first @ np.linalg.inv(inner).T * rng.uniform(4, 8, size=(count, 1))) @ turn.T + shift
-    second = there @ inner.T
-    back = np.linalg.inv(inner)
-    matrix = back.T @ skew(np.array(shift)) @ turn @ back
-    return first[:, :2], second[:, :2] / second[:, 2:], matrix / np.linalg.norm(matrix)
+FOCAL = 800.0
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """x1, x2, labels and fundamentals: body 2 in front of body 1, wrong matches, and the fourth match missing."""
-    rng = np.random.default_rng(0)
-    bodies = [
-        body(rng, COUNTS[0], (30, 20), (560, 250), (0.3, 0.1, 0.0), 0.02),
-        body(rng, COUNTS[1], (200, 280), (420, 430), (-0.5, 0.2, 0.1), 0.0),
-    ]
-    wrong = rng.uniform((0, 0), (WIDE, TALL), size=(2, COUNTS[2], 2))
-    x1, x2 = (np.concatenate([*(parts[i] for parts in bodies), wrong[i]]) for i in (0, 1))
-    x2 = x2 + 0.2 * rng.normal(size=x2.shape)
-    labels = np.repeat([1, 2, 0], COUNTS)
-    order = rng.permutation(len(labels))
-    x1, x2, labels = x1[order], x2[order], labels[order]
+    """x1, x2, labels and fundamentals of two bodies and wrong matches, of which the fourth is missing."""
+    made = scenes.bodies((72, 48), sigma=0.2, outliers=1 / 6, generator=torch.Generator().manual_seed(0))
+    x1, x2 = (view.numpy() for view in made.views)
     x1[3] = np.nan
-    return x1, x2, labels, np.stack([parts[2] for parts in bodies])
+    return x1, x2, made.labels.numpy(), torch.stack(made.motion).numpy()
 
 
 @pytest.fixture(scope="module")
@@ -216,24 +190,6 @@ def test_data_that_cannot_decide_are_refused_with_code_3(run, solved, monkeypatc
     assert "do not decide" in page and "How each body moved" not in page and "Refused." in page
 
 
-class Told(NoticeCode):
-    UNCERTAIN = "uncertain", "another segmentation fits as well; give {arg:bodies=2}, or {arg:threshold=None} estimates it"
-
-
-def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
-    solve = dyntorch.segment
-    notice = Notice(Told.UNCERTAIN, 1.0)
-
-    monkeypatch.setattr(
-        dyntorch, "segment", lambda *x, **o: dataclasses.replace(solve(*x, **o), status=torch.tensor(3), notices=(notice,))
-    )
-    code, out, err = run("@/m.npz --out out")
-    said = "another segmentation fits as well; give --bodies 2, or --threshold auto estimates it"
-    assert (code, err) == (3, f"dyntorch: refused: {said}\n") and f"warning: uncertain: {said}" in out
-    page = Path("out/report.html").read_text()
-    assert "not to be relied on" in page and "How each body moved" in page and read()["status"] == "AMBIGUOUS"
-
-
 @pytest.mark.parametrize(
     ("line", "says"),
     [
@@ -267,10 +223,8 @@ def test_a_doubtful_result_is_shown_and_refused(run, solved, monkeypatch):
         ("--colmap a.db --out b.db --images x y", "--images: 2 are given; with --colmap, give the folder of the images"),
     ],
 )
-def test_bad_input_is_one_line_and_code_2(run, solved, tmp_path, line, says):
-    code, out, err = run(line)
-    assert (code, out) == (2, "") and list(tmp_path.iterdir()) == []
-    assert err.startswith("dyntorch: ") and err.count("\n") == 1 and says in err
+def test_bad_input_is_one_line_and_code_2(refuse, solved, line, says):
+    refuse(line, says=(says,))
 
 
 def test_what_the_library_refuses_names_the_file(run, monkeypatch):
@@ -294,7 +248,3 @@ def test_a_database_of_colmap_goes_its_own_way(run, monkeypatch):
     monkeypatch.setattr("indexing.cli.commands.segment.run_colmap", lambda flags: jobs.append(flags) or 3)
     assert run("--colmap a.db --out b.db --images photos --masks m --threshold auto --no-spatial --seed 4 --title Yard")[0] == 3
     assert jobs[0].colmap == Path("a.db") and jobs[0].images == (Path("photos"),)
-
-
-def test_every_status_has_a_reason():
-    assert set(Segmentation.REMEDIES) == set(dyntorch.Status) - {dyntorch.Status.OK}

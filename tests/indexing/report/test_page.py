@@ -183,11 +183,6 @@ def test_page_parts_escape_and_nest():
     assert 'width="100.0"' in page.bar(1.7) and 'width="0.0"' in page.bar(-1)
 
 
-def test_a_picture_is_turned_dark_by_the_style_sheet_and_a_photograph_is_drawn_twice():
-    assert [theme for theme, _ in page.Picture(PNG).images] == ["drawn"]
-    assert [theme for theme, _ in page.Picture(PNG, dark=PNG).images] == ["light", "dark"]
-
-
 def test_what_is_always_right_takes_one_line(tmp_path):
     names = ["squat", "lunge", "kick"]
     right = EvaluationResult(names, names * 2, names * 2, "azimuth 0")

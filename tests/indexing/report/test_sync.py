@@ -86,9 +86,3 @@ def test_curves_are_drawn_whatever_they_hold(tmp_path):
     assert title_of(one(odd[1])) == "a → b: refused"
     assert "Refused." in write_report(tmp_path, report(first=odd[1])).read_text()
     assert json.loads((tmp_path / "sync.json").read_text())["pairs"][0]["sigma"] is None
-
-
-def test_wrong_points_without_names_have_numbers():
-    nobody = Take("a", "keypoints", people=(Clip(np.zeros((9, 2, 2))),))
-    pair = Compared(nobody, nobody, Pairing(shift(points=torch.tensor([True, False])), (0, 0)))
-    assert pair.wrong == ["joint 1"] and pair.runner_up == (pytest.approx(0.7), 4.0) and one(shift()).wrong == []
