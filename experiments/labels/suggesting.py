@@ -31,7 +31,7 @@ from experiments.recognition.detection_metrics import segments
 from experiments.recognition.protocol import Array
 from indexing import ActionIndexer, Clip
 from indexing.actors import ACTIONS, Person, detect, stream
-from indexing.recordings.suggesting import SuggestOptions, parts_of, suggest
+from indexing.recordings.suggesting import parts_of, suggest
 from indexing.scoring import Event
 
 SETS = Literal["exercises", "utkinect", "actors"]
@@ -39,12 +39,7 @@ NONE = ""
 LONGEST = 10.0  # seconds: longer clips of UTKinect hold more than their action
 BEYOND = 0.5  # of a part's length, that its label may reach beyond it
 FIRST = 2.5  # seconds of the two parts that everybody begins with
-WAYS: dict[str, SuggestOptions | None] = {
-    "any": None,
-    "suggested": SuggestOptions(),
-    "suggested, each part alone": SuggestOptions(coverage=False),
-    "suggested, however sure": SuggestOptions(doubt_weight=0.0),
-}
+WAYS = ("any", "suggested")
 Marked = tuple[int, str, float, float]
 """Number of the recording, label, start and end in seconds."""
 
@@ -173,9 +168,8 @@ def next_parts(
 ) -> list[Marked]:
     """The next labels: of parts that are suggested, or of any."""
     done = [[(start, end) for which, _, start, end in marked if which == i] for i in range(len(pool))]
-    options = WAYS[way]
-    if options is not None:
-        found = suggest(indexer, [one.clip for one in pool], number, done, options)
+    if way == "suggested":
+        found = suggest(indexer, [one.clip for one in pool], number, done)
         return [annotated(pool[one.recording], one.recording, one.start, one.end) for one in found]
     parts = [parts_of(indexer, one.clip, spans) for one, spans in zip(pool, done, strict=True)]
     spans = [(i, *span) for i, some in enumerate(parts) if some is not None for span in some.spans[some.worth].tolist()]

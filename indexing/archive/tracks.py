@@ -126,14 +126,8 @@ def _without_slips(joints: FloatArray) -> FloatArray:
         return joints
     middle = np.median(some, axis=0)
     body = max(2 * float(np.median(np.abs(some - middle), axis=0).max()), 1e-30)
-    low, high = np.nanmin(joints, axis=(0, 1)), np.nanmax(joints, axis=(0, 1))
-    if max(float((high - middle).max()), float((middle - low).max())) <= MAX_BODY_SIZES * body:
-        return joints  # nearly always
-    with np.errstate(invalid="ignore"):
-        slip = (np.abs(joints - middle) > MAX_BODY_SIZES * body).any(axis=2)
-    joints = joints.copy()
-    joints[slip] = np.nan
-    return joints
+    slip = (np.abs(joints - middle) > MAX_BODY_SIZES * body).any(axis=2, keepdims=True)
+    return np.asarray(np.where(slip, np.nan, joints))
 
 
 def seen_around(seen: NDArray[np.bool_], times: FloatArray, at: FloatArray, bridged: float) -> NDArray[np.bool_]:

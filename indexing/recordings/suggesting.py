@@ -1,18 +1,16 @@
-r"""Which parts of recordings to label next: those that are unlike what is known, and of which nobody can be sure.
+r"""Which parts of recordings to label next: those that are unlike what is known.
 
 The stages: recordings are cut into parts, one per performance that was found and of what lies between them (:func:`parts_of`);
 each part is compared with all that is known and with all others, by the residual of the indexer, which does not see from where a
 camera looks (:func:`compare_parts`); parts are chosen one after the other, each the one that would leave the least that is unlike
-everything known, what nobody can be sure of counting more (:func:`select_parts`). With :math:`r_{ij}` the residual between two
-parts, :math:`k_j` that of part :math:`j` to the nearest example, :math:`m_j` the margin between the probabilities of its two best
-actions, :math:`C` what was chosen before, and :math:`D_j = \min(k_j, \min_{i \in C} r_{ij})`, the next one is
+everything known (:func:`select_parts`). With :math:`r_{ij}` the residual between two parts, :math:`k_j` that of part :math:`j` to
+the nearest example, :math:`C` what was chosen before, and :math:`D_j = \min(k_j, \min_{i \in C} r_{ij})`, the next one is
 
-.. math:: \arg\max_i \sum_j (1 + w (1 - m_j)) \max(D_j - r_{ij}, 0) .
+.. math:: \arg\max_i \sum_j \max(D_j - r_{ij}, 0) .
 
 A part that nothing else is like counts for itself; one that is like ten others counts for all of them, once.
 
-Source: Nemhauser, Wolsey and Fisher 1978 (greedy coverage is within 1 - 1/e of the best); Gonzalez 1985 and Sener and Savarese 2018
-(farthest first, where only the part itself counts); Scheffer et al. 2001 (margins).
+Source: Nemhauser, Wolsey and Fisher 1978 (greedy coverage is within 1 - 1/e of the best).
 """
 
 from __future__ import annotations
@@ -44,6 +42,7 @@ Span = tuple[float, float]
 SuggestReason = Literal["unlike what is known", "either of two", "much else is like it"]
 
 
+MAX_CANDIDATES = 600  # parts that are compared with each other, spread evenly over the recordings: some 2 s for all pairs
 MIN_PART_SECONDS = 1.0  # of what nothing explains: of less nobody can say what it is
 MAX_EVENT_LENGTH = 2.0  # ordinary examples, beyond which an event is cut: a wrong one may hold several actions
 MAX_LABELLED_SHARE = 0.3  # of a part, from which on it is not suggested again
@@ -52,18 +51,6 @@ MIN_SHOWN_SHARE = 0.5  # of a part's frames that must show the person
 # of that between examples of different actions: known actions of actors stand at .03 to .05, others at .45 to .6
 MIN_UNLIKE_RESIDUAL = 0.33
 MAX_DOUBT_MARGIN = 0.5  # difference of probabilities, below which a part may be either of two actions
-
-
-@dataclass(frozen=True)
-class SuggestOptions:
-    """Which parts of recordings are worth a person's time (experiments.labels.suggesting)."""
-
-    max_candidates: int = 600
-    """Parts that are compared with each other, spread evenly over the recordings: some 2 s for all pairs."""
-    coverage: bool = True
-    """Whether a part counts for all that is like it, or for itself alone (farthest first), which finds oddities."""
-    doubt_weight: float = 0.3
-    """How much more a part counts between two actions (margin 0) than where the action is sure (margin 1)."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +83,6 @@ def suggest(
     clips: Sequence[Clip],
     number: int = 10,
     labelled: Sequence[Sequence[Span]] | None = None,
-    options: SuggestOptions | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> list[Suggestion]:
     """The parts of recordings that are worth a label most, in the order in which they were chosen.
@@ -119,7 +105,6 @@ def suggest(
         >>> min(found[0].end, end) - max(found[0].start, start) > 0.5, found[0].reason
         (True, 'unlike what is known')
     """
-    options = options or SuggestOptions()
     if number < 1:
         raise ValueError(f"number={number}: suggests nothing; give 1 or more")
     pooled = []
@@ -128,7 +113,7 @@ def suggest(
         pooled.append(parts_of(indexer, clip, done))
         if progress is not None:
             progress(0.9 * (index + 1) / len(clips))
-    parts = _pool_parts(pooled, options)
+    parts = _pool_parts(pooled)
     if parts is None:
         return []
     classes = indexer.classes_.tolist()
@@ -137,7 +122,7 @@ def suggest(
     best = np.take_along_axis(likely, ranked, axis=1)
     margin = best[:, 0] - best[:, 1] if best.shape[1] > 1 else np.ones(len(best))
     out = []
-    for at in select_parts(near, apart, margin, number, parts.worth, options):
+    for at in select_parts(near, apart, number):
         names = [classes[which] if which < len(classes) else None for which in ranked[at, :2].tolist()]
         reason: SuggestReason = "much else is like it"
         if near[at] >= MIN_UNLIKE_RESIDUAL * usual:
@@ -201,7 +186,7 @@ def _share(span: Sequence[float], others: Sequence[Span]) -> float:
     return sum(max(0.0, min(end, b) - max(start, a)) for a, b in others) / max(end - start, 1e-9)
 
 
-def _pool_parts(recordings: Sequence[RecordingParts | None], options: SuggestOptions) -> RecordingParts | None:
+def _pool_parts(recordings: Sequence[RecordingParts | None]) -> RecordingParts | None:
     """The parts of all recordings that are worth anything, thinned out evenly where they are too many to be compared."""
     several = [(number, parts) for number, parts in enumerate(recordings) if parts is not None and parts.worth.any()]
     if not several:
@@ -209,7 +194,7 @@ def _pool_parts(recordings: Sequence[RecordingParts | None], options: SuggestOpt
     owner = np.concatenate([np.full(int(parts.worth.sum()), number) for number, parts in several])
     spans = np.concatenate([parts.spans[parts.worth] for _, parts in several])
     windows = stack([parts.windows[torch.from_numpy(parts.worth)] for _, parts in several])
-    selected = np.unique(np.linspace(0, len(owner) - 1, options.max_candidates).round().astype(np.intp))
+    selected = np.unique(np.linspace(0, len(owner) - 1, MAX_CANDIDATES).round().astype(np.intp))
     return RecordingParts(owner[selected], spans[selected], windows[torch.from_numpy(selected)], np.ones(len(selected), dtype=bool))
 
 
@@ -232,16 +217,13 @@ def compare_parts(indexer: ActionIndexer, windows: Windows) -> tuple[Array, Arra
     return likely, residual[count:, :count].min(axis=1), residual[count:, count:], float(np.median(finite)) if len(finite) else 1.0
 
 
-def select_parts(near: Array, apart: Array, margin: Array, number: int, worth: Array, options: SuggestOptions) -> list[int]:
+def select_parts(near: Array, apart: Array, number: int) -> list[int]:
     """Numbers of parts, one after the other: each leaves the least that is unlike what is known and what was chosen before.
     near ``(N,)``."""
-    free, distance = worth.copy(), near.astype(np.float64)
-    weight = (1.0 + options.doubt_weight * (1.0 - margin)) * worth
-    out: list[int] = []
-    while free.any() and len(out) < number:
-        gain = weight @ np.maximum(distance[:, None] - apart, 0.0) if options.coverage else weight * distance
-        best = int(np.where(free, gain, -np.inf).argmax())
-        out.append(best)
-        free[best] = False
-        distance = np.minimum(distance, apart[:, best])
+    distance, out = near.astype(np.float64), list[int]()
+    while len(out) < min(number, len(near)):
+        gain = np.maximum(distance[:, None] - apart, 0.0).sum(axis=0)
+        gain[out] = -np.inf
+        out.append(int(gain.argmax()))
+        distance = np.minimum(distance, apart[:, out[-1]])
     return out

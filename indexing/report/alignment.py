@@ -211,8 +211,7 @@ def as_json(report: AlignmentReport) -> dict[str, Any]:
         }
     unverified = report.arrays.unverified
     return {
-        "status": report.status,
-        "reason": report.reason or None,
+        **report.outcome_json,
         "model": report.model,
         "views": report.names,
         "matches": len(report.ids),
@@ -223,13 +222,10 @@ def as_json(report: AlignmentReport) -> dict[str, Any]:
         "covariance": report.arrays.covariance if report.has_motion else None,
         **_euclidean(report),
         "ambiguity": report.ambiguity,
-        "warnings": report.warnings_json,
-        "notes": list(report.notes),
         "ids": list(report.ids),
         "labels": report.arrays.labels,
         "velocities": report.arrays.velocities,
         "unverified": None if unverified is None else [report.ids[i] for i in np.flatnonzero(unverified)],
-        "manifest": report.manifest,
     }
 
 
@@ -434,14 +430,6 @@ def _draw_paths(panel: Any, report: AlignmentReport, kinds: NDArray[Any], shown:
     path = path[near & ~doubtful]
     if not len(path):
         return
-    centre = path.mean(axis=1, keepdims=True)
-    _, _, direction = np.linalg.svd(path - centre)
-    along = ((path - centre) @ direction[:, 0, :, None])[..., 0]
-    reach = 0.5 * (along.max(axis=1) - along.min(axis=1))
-    ends = np.stack([along.min(axis=1) - reach, along.max(axis=1) + reach], axis=1)
-    panel.add_collection(
-        LineCollection(list(centre + ends[..., None] * direction[:, :1]), colors=colour, linewidths=0.7, alpha=0.28)
-    )
     panel.add_collection(LineCollection(list(path), colors=colour, linewidths=1.3, alpha=0.75))
     for i, size in ((1, 9), (2, 4)):
         panel.scatter(*path[:, i].T, s=size, facecolor=panel.get_facecolor(), edgecolor=colour, linewidth=0.9, zorder=3)

@@ -230,21 +230,12 @@ def as_json(report: BodiesReport) -> dict[str, Any]:
             "rms_residual": report.rms(label),
         })  # fmt: skip
     return {
-        "status": report.status,
-        "reason": report.reason or None,
+        **report.outcome_json,
         "tracks": len(report.tracks.ids),
         "frames": len(views),
         "bodies": bodies,
         "static_body": report.static or None,
-        "counts": report.counts,
-        "doubtful": int(report.is_doubtful.sum()),
         "pairs": [[views[a], views[b]] for a, b in report.pairs.tolist()],
-        "rms_residual": report.rms(),
-        "threshold": float(report.arrays.threshold),
-        "misclassified": report.misclassification,
-        "warnings": report.warnings_json,
-        "notes": list(report.notes),
-        "manifest": report.manifest,
     }
 
 

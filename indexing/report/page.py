@@ -147,9 +147,11 @@ class ResultReport:
         return self.status.lower().replace("_", " ")
 
     @property
-    def warnings_json(self) -> list[dict[str, Any]]:
-        """The notices for a JSON file."""
-        return [{"code": code, "value": value, "message": message} for code, value, message in self.warnings]
+    def outcome_json(self) -> dict[str, Any]:
+        """Status, notices, notes and how the result came about, for a JSON file."""
+        warnings = [{"code": code, "value": value, "message": message} for code, value, message in self.warnings]
+        said = {"status": self.status, "reason": self.reason or None, "warnings": warnings, "notes": list(self.notes)}
+        return {**said, "manifest": self.manifest}
 
 
 MEANING = {

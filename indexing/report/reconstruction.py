@@ -240,8 +240,7 @@ def as_npz(report: ReconstructionReport) -> bytes:
 def as_json(report: ReconstructionReport) -> dict[str, Any]:
     """The result as numbers: cameras, residuals, status, warnings, and how it came about."""
     return {
-        "status": report.status,
-        "reason": report.reason or None,
+        **report.outcome_json,
         "motion": report.motion,
         "views": list(report.tracks.views),
         "times": report.times,
@@ -258,9 +257,6 @@ def as_json(report: ReconstructionReport) -> dict[str, Any]:
             {"motion": one.motion, "score": one.score, "residual": one.residual, "not_tried": one.reason or None}
             for one in report.result.candidates
         ],
-        "warnings": report.warnings_json,
-        "notes": list(report.notes),
-        "manifest": report.manifest,
     }
 
 
@@ -398,19 +394,11 @@ def _arrows(panel: Any, points: FloatArray, kind: str, reach: float, size: float
     if kind != "moving":
         return
     points = points[:, sample(points, box)]
-    ends = points[[0, -1]]
-    step = ends[1] - ends[0]
-    length = np.linalg.norm(step, axis=-1)
     panel.add_collection(LineCollection(list(points.transpose(1, 0, 2)), colors=colour, linewidths=1.2, alpha=0.75, zorder=2))
-    head = np.minimum(0.35 * length, 0.016 * reach)
-    long = length > 0.006 * reach
-    last = points[-1] - points[-2]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        along = last / np.linalg.norm(last, axis=-1, keepdims=True)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    back = ends[1] - head[:, None] * along
-    wings = np.stack([back + 0.45 * head[:, None] * across, ends[1], back - 0.45 * head[:, None] * across], axis=1)
-    panel.add_collection(LineCollection(list(wings[long]), colors=colour, linewidths=1.2, zorder=2))
+    step = points[-1] - points[-2]
+    long = np.linalg.norm(points[-1] - points[0], axis=-1) > 0.006 * reach
+    look: Any = {"angles": "xy", "scale_units": "xy", "scale": 1, "units": "dots", "width": 2.0, "headwidth": 4.0}
+    panel.quiver(*points[-2, long].T, *step[long].T, color=colour, zorder=2, **look)
 
 
 def _space(report: ReconstructionReport, positions: FloatArray, kinds: NDArray[Any]) -> Any:

@@ -134,6 +134,12 @@ class LabelledReport(ResultReport):
         return {"doubtful": doubtful, "compared": self.confusion_rows, "rms": self.rms_text(), "share": share}
 
     @property
+    def outcome_json(self) -> dict[str, Any]:
+        """And how many points are of each kind, doubtful and wrong, how far they are off, and how far they may be."""
+        numbers = {"counts": self.counts, "doubtful": int(self.is_doubtful.sum()), "misclassified": self.misclassification}
+        return {**super().outcome_json, **numbers, "rms_residual": self.rms(), "threshold": float(self.arrays.threshold)}
+
+    @property
     def errors(self) -> list[str]:
         """How many labels are wrong, in a sentence, where the file has labels."""
         wrong = self.misclassification
@@ -304,19 +310,10 @@ def as_json(report: SegmentationReport) -> dict[str, Any]:
         for label, model in enumerate(report.models, start=1)
     ]
     return {
-        "status": report.status,
-        "reason": report.reason or None,
+        **report.outcome_json,
         "pair": report.pair.name,
         "matches": len(report.pair.ids),
         "bodies": bodies,
-        "counts": report.counts,
-        "doubtful": int(report.is_doubtful.sum()),
-        "rms_residual": report.rms(),
-        "threshold": float(report.arrays.threshold),
-        "misclassified": report.misclassification,
-        "warnings": report.warnings_json,
-        "notes": list(report.notes),
-        "manifest": report.manifest,
     }
 
 

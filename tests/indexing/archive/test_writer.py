@@ -14,6 +14,7 @@ from indexing import Archive, ArchiveOptions, Clip, ClipSet
 from indexing.archive import sources
 from indexing.archive.sources import gather, reading_key
 from indexing.skeleton import Skeleton
+from tests.indexing.cli.footage import write_coco
 
 
 def said(done) -> dict[str, str]:
@@ -41,18 +42,6 @@ def frames(folder: Path, clip: Clip) -> Path:
             json.dumps({"version": 1.3, "people": [{"pose_keypoints_2d": values}]})
         )
     return folder
-
-
-def people(path: Path, *clips: Clip) -> Path:
-    """A COCO file with several people in every frame, each with an id."""
-    rows = [
-        {"image_id": i, "category_id": 1, "track_id": who + 1, "score": 0.9,
-         "keypoints": np.concatenate([pose, np.full((len(pose), 1), 0.9)], axis=1).ravel().round(2).tolist()}
-        for i in range(len(clips[0]))
-        for who, pose in enumerate(clip.joints[i] for clip in clips)
-    ]  # fmt: skip
-    path.write_text(json.dumps(rows))
-    return path
 
 
 # ---- what is known, what has changed -------------------------------------------------------------------------------------
@@ -263,7 +252,7 @@ def test_nobody_in_view_is_left_out(archive: Archive, moves, tmp_path: Path) -> 
 def test_everybody_in_view_is_a_recording(archive: Archive, moves, tmp_path: Path) -> None:
     left, right = moves(0, joints=17), moves(1, joints=17)
     right = right.replace(joints=right.joints + np.array([3000.0, 0.0]))
-    path = people(tmp_path / "two.json", left, right)
+    path = write_coco(tmp_path / "two.json", left, right, ids=True)
     assert said(archive.add(path)) == {"two.json": "added"}
     rows = archive.recordings()
     assert [row.source for row in rows] == [str(path)] * 2 and len({row.person for row in rows}) == 2

@@ -14,7 +14,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from indexing import Archive
@@ -24,6 +23,7 @@ from indexing.archive.sources import gather
 from indexing.cli import main
 from indexing.cli.commands import archive as verbs
 from indexing.clip import ClipSet
+from tests.indexing.cli.footage import write_coco
 
 ACTIONS = ("squat", "kick", "wave")
 
@@ -43,11 +43,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lesson = dataset([Person.random(1)], ACTIONS, azimuth=0, rng=0)
     lesson.save(folder / "lesson.npz")
     for clip in lesson:
-        rows = [
-            {"image_id": i, "category_id": 1, "keypoints": triples.ravel().round(2).tolist(), "score": 0.9}
-            for i, triples in enumerate(np.nan_to_num(np.concatenate([clip.joints, clip.confidence[..., None]], axis=2)))
-        ]
-        (folder / f"{clip.label}.json").write_text(json.dumps(rows))
+        write_coco(folder / f"{clip.label}.json", clip)
     with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
         assert main(["archive", "add", "lab.archive", "week"]) == 0
         assert main(["index", "fit", "lesson.npz", "-o", "moves.safetensors"]) == 0

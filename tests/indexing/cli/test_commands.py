@@ -23,19 +23,9 @@ from indexing.cli.protocol import Cameras, choose, draw_shots, splits
 from indexing.clip import Clip, ClipSet
 from indexing.readers import FORMATS
 from indexing.readers.files import PEOPLE
+from tests.indexing.cli.footage import write_coco
 
 ACTIONS = ("squat", "wave", "kick")
-
-
-def coco(path: Path, clip: Clip, joints: int = 17) -> Path:
-    """The clip as COCO keypoint results: one person per frame."""
-    rows = []
-    for frame, (places, trust) in enumerate(zip(clip.joints, clip.confidence, strict=True)):
-        triples = np.concatenate([np.nan_to_num(places), trust[:, None]], axis=1)[:joints]
-        rows.append({"image_id": frame, "category_id": 1, "keypoints": triples.ravel().round(2).tolist(), "score": 0.9})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(rows))
-    return path
 
 
 @pytest.fixture(scope="session")
@@ -44,14 +34,15 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cli")
     person = Person.random(1)
     for i, action in enumerate(ACTIONS):
-        coco(folder / f"{action}.json", detect(perform(action, person, rng=i), azimuth=0, rng=i))
+        write_coco(folder / f"{action}.json", detect(perform(action, person, rng=i), azimuth=0, rng=i))
     solid, truth = stream(["kick", "wave", "squat"], Person.random(5), rng=3)
-    coco(folder / "session.json", detect(solid, azimuth=45, rng=3))
+    write_coco(folder / "session.json", detect(solid, azimuth=45, rng=3))
     lines = [f"{label},{start:.2f},{end:.2f}" for label, start, end in truth]
     (folder / "truth.csv").write_text("\n".join(["label,start,end", *lines]) + "\n")
     dataset(3, ACTIONS, azimuth=(0.0, 90.0), rng=2).save(folder / "set.npz")
     dataset(3, ACTIONS, azimuth=None, rng=2).save(folder / "solid.npz")
-    coco(folder / "other.json", detect(perform("wave", person, rng=9), azimuth=0, rng=9), joints=15)
+    other = detect(perform("wave", person, rng=9), azimuth=0, rng=9)
+    write_coco(folder / "other.json", Clip(other.joints[:, :15], confidence=other.confidence[:, :15]))
     words = [f"{action}={folder / action}.json" for action in ACTIONS]
     assert main(["index", "fit", *words, "-o", str(folder / "moves.safetensors")]) == 0
     return folder

@@ -17,6 +17,8 @@ from indexing.cli.flags.shared import Reading
 from indexing.cli.inputs import clip_notes
 from indexing.recordings.decoding import Withheld
 from indexing.skeleton import BODY25, COCO17, Skeleton
+from tests.indexing.cli.footage import write_coco
+from tests.indexing.sync.scene import cut, write_openpose
 
 ORDER = np.random.default_rng(0).permutation(17)
 
@@ -51,19 +53,16 @@ def run(tmp_path, monkeypatch, capsys, data):
     return call
 
 
-def openpose(folder, people, numbers=None, scale=1.0):
-    folder.mkdir()
-    for i in range(max(len(clip) for clip in people)):
-        found = []
-        for clip in people:
-            row = np.zeros((25, 3))
-            if i < len(clip):
-                for k, name in enumerate(COCO17.joints):
-                    row[BODY25.joints.index(name)] = [*np.nan_to_num(clip.joints[i, k] * scale), clip.seen[i, k]]
-            found.append({"pose_keypoints_2d": row.ravel().tolist()})
-        number = i if numbers is None else numbers[i]
-        (folder / f"{folder.name}_{number:012d}_keypoints.json").write_text(json.dumps({"version": 1.3, "people": found}))
-    return folder
+def body25(clip, scale=1.0):
+    """The same with the joints of OpenPose's layout."""
+    joints, trust = np.full((len(clip), 25, 2), np.nan), np.zeros((len(clip), 25))
+    places = [BODY25.joints.index(name) for name in COCO17.joints]
+    joints[:, places], trust[:, places] = clip.joints * scale, clip.seen
+    return Clip(joints, times=clip.times, confidence=trust)
+
+
+def openpose(folder, people, start=0, scale=1.0):
+    write_openpose(folder, [body25(clip, scale) for clip in people], start)
 
 
 @pytest.mark.slow
@@ -149,7 +148,8 @@ def test_recordings(run, clips):
     wave = clips["wave"]
     openpose(Path("two"), [wave, clips["kick"].replace(joints=clips["kick"].joints + np.array([900.0, 0.0]))])
     openpose(Path("small"), [wave], scale=1 / 2000)
-    openpose(Path("gap"), [wave], numbers=[i if i < 40 else i + 2_600_000_000 for i in range(len(wave))])
+    openpose(Path("gap"), [cut(wave, 0, 40)])
+    openpose(Path("gap"), [cut(wave, 40)], start=2_600_000_040)
     Path("truth.csv").write_text("label,start,end\nwave,0,1\nkick,50,60\n")
     scan = "index scan {} -m m.safetensors --fps 30"
     code, out, _ = run(scan.format("wave --truth truth.csv"))
@@ -167,7 +167,8 @@ def test_recordings(run, clips):
     for fps in ("1e-300", "1e300"):
         code, _, err = run(f"index scan wave -m m.safetensors --fps {fps}")
         assert code == 2 and "fps must be frames per second, from 0.001 to 1,000,000" in err
-    openpose(Path("far"), [wave], numbers=[*range(len(wave) - 1), 9_000_000_000_000_000])
+    openpose(Path("far"), [cut(wave, 0, -1)])
+    openpose(Path("far"), [cut(wave, -1)], start=9_000_000_000_000_000)
     code, _, err = run(scan.format("far"))
     assert code == 2 and "clip 'far': times reach 3e+14 s, where numbers are" in err and err.count("\n") == 1
 
@@ -190,46 +191,34 @@ def test_joints_by_name_and_a_recording_by_its_file(run, clips):
     assert code == 0 and "wave: of its 25 joints (BODY_25) the 17 learned (COCO-17) are used" in out
 
 
-def people(path, frames):
-    """COCO results: for each frame, (id, joints) of everybody; 17 joints."""
-    rows = []
-    for i, found in enumerate(frames):
-        for who, joints in found:
-            triples = np.concatenate([np.nan_to_num(joints), np.isfinite(joints[:, :1])], axis=1)
-            rows.append({"image_id": i, "category_id": 1, "keypoints": triples.ravel().tolist(), "score": 0.9, "track_id": who})
-    path.write_text(json.dumps(rows))
-
-
 @pytest.mark.slow
 def test_everybody_in_view_is_scanned(run, clips):
     left = np.concatenate([clips["wave"].joints, clips["wave"].joints[::-1]])
-    right = np.concatenate([clips["squat"].joints, clips["squat"].joints]) + np.array([700.0, 0.0])
-    frames = [[(4, pose)] for pose in left]
-    for i, pose in enumerate(right):
-        frames[i if i < 60 else i + 40].append((7, pose))
-    frames[20].append((9, left[0] + 3000))
-    people(Path("both.json"), frames)
+    right, ghost = np.full((2, *left.shape), np.nan)
+    there = np.r_[0:60, 100 : 2 * len(clips["squat"]) + 40]
+    right[there] = np.concatenate([clips["squat"].joints] * 2) + np.array([700.0, 0.0])
+    ghost[20] = left[0] + 3000
+    write_coco(Path("both.json"), Clip(left), Clip(right), Clip(ghost), ids=True)
     code, out, _ = run("index scan both.json -m m.safetensors --fps 30 --report out")
     assert code == 0
     assert "both.json: 2 people in view, told apart by the file's ids; each is scanned by itself" in out
     assert "both.json: 1 track left out, as of no person (1 too short)" in out
-    assert "both.json: person 7 is out of view from 2.0 to 3.3 s; that it is the same person says the file's id" in out
+    assert "both.json: person 2 is out of view from 2.0 to 3.3 s; that it is the same person says the file's id" in out
     with open("out/events.csv", newline="") as file:
         found = list(csv.DictReader(file))
-    assert {row["person"] for row in found} == {"4", "7"} and {row["file"] for row in found} == {"both.json"}
+    assert {row["person"] for row in found} == {"1", "2"} and {row["file"] for row in found} == {"both.json"}
     with open("out/repetitions.csv", newline="") as file:
         counted = list(csv.DictReader(file))
     assert list(counted[0]) == ["file", "person", "label", "unit", "number", "start", "end", "seconds", "pause_before", "range"]
     assert {(row["person"], row["label"]) for row in counted} == {(row["person"], row["label"]) for row in found}
     page = Path("out/report.html").read_text()
-    assert "Actions in both.json" in page and "<h3>Person 4</h3>" in page and "<h3>Person 7</h3>" in page
+    assert "Actions in both.json" in page and "<h3>Person 1</h3>" in page and "<h3>Person 2</h3>" in page
     assert page.count('class="player"') == 1 and "timeline-2.png" in {path.name for path in Path("out").iterdir()}
 
 
 @pytest.mark.slow
 def test_whose_the_known_events_are(run, clips):
-    both = zip(clips["wave"].joints, clips["squat"].joints * 0.5 + 900.0, strict=False)
-    people(Path("both.json"), [[(1, one), (2, other)] for one, other in both])
+    write_coco(Path("both.json"), Clip(clips["wave"].joints[:69]), Clip(clips["squat"].joints * 0.5 + 900.0), ids=True)
     scan = "index scan both.json -m m.safetensors --fps 30 --truth "
     Path("plain.csv").write_text("label,start,end\nwave,0,2\n")
     code, out, _ = run(scan + "plain.csv")

@@ -16,7 +16,7 @@ from indexing.cli import main
 from indexing.cli.flags.shared import Example, Labelling, Reading
 from indexing.cli.labels import check_write, film_examples
 from indexing.labels import Label, open_labels, write_labels
-from tests.indexing.cli.test_commands import coco
+from tests.indexing.cli.footage import write_coco
 
 ONE_LINE = True
 
@@ -50,7 +50,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("labels")
     for rng, name in ((3, "session"), (4, "later")):
         clip, labels = session(rng)
-        coco(folder / f"{name}.json", clip)
+        write_coco(folder / f"{name}.json", clip)
         marked = [replace(label, media=f"{name}.mp4") for label in labels]
         for suffix in (".boris", ".eaf", ".csv"):
             write_labels(folder / f"{name}{suffix}", marked, tier="by Ann", duration=clip.duration)

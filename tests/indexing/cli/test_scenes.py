@@ -6,15 +6,11 @@ import csv
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-import torch
 
-from indexing.actors.textured import render, sheet
-from indexing.video.drawing import encode
+from tests.indexing.cli.footage import write_film, write_video
 
-SIZE, FRAMES = (240, 180), 10
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 
 
@@ -23,20 +19,9 @@ def data(tmp_path_factory):
     """``wall.mp4`` and the pictures ``wall/f0.png`` ...: a poster that slides over a wall before a camera that goes and turns;
     ``still.mp4``, ``one.mp4`` and ``text.mp4``, of which nothing can be told."""
     folder = tmp_path_factory.mktemp("videos")
-    generator = torch.Generator().manual_seed(0)
-    wall = sheet((-6, -5, 6), (12, 0, 0), (0, 10, 0), 700, 0, generator)
-    poster = sheet((-1.6, -1.4, 5.99), (2.2, 0, 0), (0, 2.0, 0), 130, 1, generator)
-    camera = np.array([[260.0, 0, 119.5], [0, 260.0, 89.5], [0, 0, 1]])
-    motions = np.tile(np.eye(4), (FRAMES, 2, 1, 1))
-    motions[:, 1, :2, 3] = np.arange(FRAMES)[:, None] * [0.09, 0.04]
-    cameras = np.stack([camera @ np.c_[np.eye(3), [-0.05 * i, 0.03 * i, 0.02 * i]] for i in range(FRAMES)])
-    video = render([wall, poster], cameras, motions, SIZE, noise=1.0, generator=generator)
-    (folder / "wall").mkdir()
-    for i, frame in enumerate(video.frames):
-        cv2.imwrite(str(folder / "wall" / f"f{i}.png"), frame)
-    for name, frames in (("wall", video.frames), ("still", video.frames[[0] * 4]), ("one", video.frames[:1])):
-        colour = (np.repeat(frame[..., None], 3, axis=2) for frame in frames)
-        (folder / f"{name}.mp4").write_bytes(encode(colour, 25))
+    frames = write_film(folder, "wall", 10)
+    write_video(folder / "still.mp4", frames[[0] * 4])
+    write_video(folder / "one.mp4", frames[:1])
     (folder / "text.mp4").write_text("no video")
     (folder / "none").mkdir()
     np.savez(folder / "m.npz", x1=np.zeros((9, 2)), x2=np.zeros((9, 2)))

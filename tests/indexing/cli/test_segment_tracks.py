@@ -9,7 +9,6 @@ import re
 from pathlib import Path
 
 import av
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,14 +16,13 @@ import torch
 import dyntorch
 from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.tasks.segment.result import TrackSegmentation
-from indexing.actors.textured import render, sheet
 from indexing.report.bodies import FILES, FILM
-from indexing.video.drawing import encode
+from tests.indexing.cli.footage import SIZE, write_film
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 
 COMMAND = "segment"
-SIZE, FRAMES, COUNTS = (240, 180), 12, (30, 14, 6)
+FRAMES, COUNTS = 12, (30, 14, 6)
 
 
 def moving(frames=FRAMES):
@@ -65,18 +63,7 @@ def data(tmp_path_factory):
     np.savez(folder / "space.npz", tracks=np.zeros((4, 20, 3)))
     np.savez(folder / "short.npz", tracks=np.where(np.eye(20, dtype=bool)[..., None], 1.0, np.nan) * np.ones(2))
     np.savez(folder / "few.npz", tracks=tracks[:, :5])
-    generator = torch.Generator().manual_seed(0)
-    wall = sheet((-6, -5, 6), (12, 0, 0), (0, 10, 0), 700, 0, generator)
-    poster = sheet((-1.6, -1.4, 5.99), (2.2, 0, 0), (0, 2.0, 0), 130, 1, generator)
-    motions = np.tile(np.eye(4), (FRAMES, 2, 1, 1))
-    motions[:, 1, :2, 3] = np.arange(FRAMES)[:, None] * [0.09, 0.04]
-    inner = np.array([[260.0, 0, 119.5], [0, 260.0, 89.5], [0, 0, 1]])
-    cameras = np.stack([inner @ np.c_[np.eye(3), [-0.05 * i, 0.03 * i, 0.02 * i]] for i in range(FRAMES)])
-    video = render([wall, poster], cameras, motions, SIZE, noise=1.0, generator=generator)
-    (folder / "room").mkdir()
-    for i, frame in enumerate(video.frames):
-        cv2.imwrite(str(folder / "room" / f"f{i}.png"), frame)
-    (folder / "room.mp4").write_bytes(encode((np.repeat(frame[..., None], 3, axis=2) for frame in video.frames), 25))
+    write_film(folder, "room", FRAMES)
     return folder
 
 

@@ -10,7 +10,7 @@ from indexing import ActionIndexer
 from indexing.actors import Person, detect, stream
 from indexing.cli import main
 from indexing.labels import open_labels
-from tests.indexing.cli.test_commands import coco
+from tests.indexing.cli.footage import write_coco
 
 COMMAND = "index suggest"
 ONE_LINE = True
@@ -23,7 +23,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``session.json``, in which the first squat and the wave are labelled, and what was learned from them."""
     folder = tmp_path_factory.mktemp("suggest")
     solid, truth = stream(DONE, Person.random(5), rng=3)
-    coco(folder / "session.json", detect(solid, azimuth=45, rng=3))
+    write_coco(folder / "session.json", detect(solid, azimuth=45, rng=3))
     rows = [f"{label},{start:.2f},{end:.2f}" for label, start, end in truth]
     (folder / "all.csv").write_text("\n".join(["label,start,end", *rows]) + "\n")
     (folder / "session.csv").write_text("\n".join(["label,start,end", rows[0], rows[2]]) + "\n")

@@ -9,7 +9,8 @@ import pytest
 
 from indexing import ActionIndexer, Clip
 from indexing.actors import Person, dataset, detect, stream
-from indexing.recordings.suggesting import SuggestOptions, compare_parts, parts_of, select_parts, suggest
+from indexing.recordings import suggesting
+from indexing.recordings.suggesting import compare_parts, parts_of, select_parts, suggest
 
 KNOWN = ("squat", "wave")
 DONE = ["squat", "kick", "wave", "kick", "bow", "squat", "kick", "wave"]
@@ -47,12 +48,13 @@ def test_what_is_not_known_comes_first_and_not_twice(learned, recording) -> None
     assert all(a[1] <= b[0] + 1e-9 for a, b in pairwise(spans))
 
 
-def test_what_is_labelled_is_not_suggested_again(learned, recording) -> None:
+def test_what_is_labelled_is_not_suggested_again(learned, recording, monkeypatch) -> None:
     clip, truth = recording
     done = [(a, b) for label, a, b in truth if label == "kick"]
     assert "kick" not in names(suggest(learned, [clip], 2, [done]), truth)
     assert suggest(learned, [clip], 9, [[(-1.0, 1e6)]]) == []
-    assert 1 <= len(suggest(learned, [clip], 99, options=SuggestOptions(max_candidates=4))) <= 4  # too many are thinned out
+    monkeypatch.setattr(suggesting, "MAX_CANDIDATES", 4)
+    assert 1 <= len(suggest(learned, [clip], 99)) <= 4  # too many are thinned out
     with pytest.raises(ValueError, match="number=0: suggests nothing; give 1 or more"):
         suggest(learned, [clip], 0)
 
@@ -90,40 +92,19 @@ def test_residuals_tell_what_is_known(learned, recording) -> None:
     assert near[inside].max() < near[~np.array(inside)].min()
 
 
-def scattered(seed: int):
-    """Points, distances to what is known and between them, and which of them count."""
-    rng = np.random.default_rng(seed)
-    points, known = rng.normal(size=(40, 2)), rng.normal(size=(3, 2))
-    apart = np.linalg.norm(points[:, None] - points, axis=2)
-    return points, known, apart, np.linalg.norm(points[:, None] - known, axis=2).min(axis=1), rng.random(40) > 0.2
-
-
-def left(points, centres, weight):
+def left(points, centres):
     """What is unlike everything known, summed."""
-    return float(weight @ np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1))
+    return float(np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1).sum())
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_each_leaves_the_least_that_is_unlike_what_is_known(seed: int) -> None:
-    points, known, apart, near, worth = scattered(seed)
-    margin = np.random.default_rng(seed).random(40)
-    picked = select_parts(near, apart, margin, 6, worth, SuggestOptions(doubt_weight=2.0))
-    assert len(set(picked)) == 6 and worth[picked].all()
-    weight = (1 + 2.0 * (1 - margin)) * worth
+    rng = np.random.default_rng(seed)
+    points, known = rng.normal(size=(40, 2)), rng.normal(size=(3, 2))
+    apart = np.linalg.norm(points[:, None] - points, axis=2)
+    picked = select_parts(np.linalg.norm(points[:, None] - known, axis=2).min(axis=1), apart, 6)
+    assert len(set(picked)) == 6
     for count, one in enumerate(picked):
         before = np.concatenate([known, points[picked[:count]]])
-        tried = {i: left(points, np.concatenate([before, points[[i]]]), weight) for i in np.flatnonzero(worth)}
-        assert tried[one] == pytest.approx(min(tried.values()))
-
-
-def test_alone_it_is_farthest_first() -> None:
-    points, known, apart, near, worth = scattered(0)
-    picked = select_parts(near, apart, np.ones(40), 6, worth, SuggestOptions(coverage=False))
-    for count, one in enumerate(picked):  # each as far as any from all that are known by then
-        centres = np.concatenate([known, points[picked[:count]]])
-        distance = np.linalg.norm(points[:, None] - centres, axis=2).min(axis=1)
-        assert distance[one] == pytest.approx(distance[worth].max())
-    # who is less sure comes sooner
-    same, margin = np.ones((2, 2)) - np.eye(2), np.array([0.9, 0.1])
-    for weight, first in ((SuggestOptions().doubt_weight, 1), (0.0, 0)):
-        assert select_parts(np.ones(2), same, margin, 1, np.ones(2, bool), SuggestOptions(doubt_weight=weight)) == [first]
+        tried = [left(points, np.concatenate([before, points[[i]]])) for i in range(40)]
+        assert tried[one] == pytest.approx(min(tried))
