@@ -224,12 +224,8 @@ def _collinear(planes: Tensor, present: Tensor) -> Tensor:
     return across.mT @ (found + centre) + line[..., :, None] * (line[..., None, :] @ _mean(planes, present))
 
 
-def _coplanar(planes: Tensor, present: Tensor) -> Tensor:
-    """The solution for normals that are orthogonal to one direction: the transposed problem."""
-    return _collinear(planes.mT, present).mT
-
-
-SOLVERS = (_general, _collinear, _coplanar)
+# for normals that are orthogonal to one direction the transposed problem is one of epipoles on one line
+SOLVERS = (_general, _collinear, lambda planes, present: _collinear(planes.mT, present).mT)
 
 
 def _null_vectors(planes: Tensor, present: Tensor) -> tuple[Tensor, Tensor]:

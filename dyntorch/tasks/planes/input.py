@@ -40,13 +40,7 @@ class GivenPlanes:
     like: Tensor  # what the results are to be like
 
     @staticmethod
-    def of(
-        H: Tensor,
-        F: Tensor,
-        planes: Pair | None,
-        bodies: Pair | None,
-        calibration: Tensor | None,
-    ) -> GivenPlanes:
+    def of(H: Tensor, F: Tensor, planes: Pair | None, bodies: Pair | None, calibration: Tensor | None) -> GivenPlanes:
         """Checked matrices, with the matches where there are any."""
         # a device without float64 lends its data to the CPU and gets the result back
         home = torch.device("cpu") if H.device.type == "mps" else H.device
@@ -98,12 +92,6 @@ class PlaneSightings:
     views: Pair  # two of ``(b, k, n, 2)``, finite
     weights: Tensor  # ``(b, k, n)``, 0 where a match is missing
 
-    @staticmethod
-    def none(batch: int, device: torch.device) -> PlaneSightings:
-        """No planes at all."""
-        empty = torch.zeros(batch, 0, 0, 2, dtype=torch.float64, device=device)
-        return PlaneSightings((empty, empty), empty[..., 0])
-
     def transform(self, frames: Pair, matrices: Tensor) -> PlaneSightings:
         """In new coordinates, without the matches of matrices ``(b, k, 3, 3)`` that are missing."""
         weights = self.weights * _there(matrices)[..., 0] if self.weights.shape[1] else self.weights
@@ -151,7 +139,8 @@ def _stack(name: str, points: Sequence[Tensor]) -> Tensor:
 def _sightings(name: str, views: Pair | None, batch: tuple[int, ...], count: int, least: int, home: torch.device) -> PlaneSightings:
     """Matches of ``count`` planes or bodies with a flat batch; those with fewer than ``least`` weigh nothing."""
     if views is None:
-        return PlaneSightings.none(prod(batch), home)
+        empty = torch.zeros(prod(batch), 0, 0, 2, dtype=torch.float64, device=home)
+        return PlaneSightings((empty, empty), empty[..., 0])
     if views[0].shape[:-2] != (*batch, count):
         raise ValueError(
             f"{name} must be (*batch, planes, n, 2) with batch {batch} and {count} planes as the matrices have, "

@@ -2,7 +2,6 @@ r"""Least squares on translating planes and bodies: :math:`H_i = d_i H_\infty + 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from dyntorch.core.residual import multilinear_derivative
 from dyntorch.geometry.homogeneous import null_vectors, similarity, skew, unit_vectors
 from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.fundamental_matrix import FundamentalMatrix
-from dyntorch.numerics.blocks import constant
+from dyntorch.numerics.blocks import constant, each
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, by_match, jacobian, minimize
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.planes.closed_forms import (
@@ -131,7 +130,7 @@ class Matrices:
     r"""Measured matrices: the residual of M is what :math:`M / \langle M, G \rangle` differs from the given matrix G of norm 1."""
 
     given: Tensor  # ``(b, c, 3, 3)`` of norm 1; zero where one is missing
-    weights: Tensor  # ``(c,)`` inverse variances
+    weights: Tensor  # ``(b, c)`` inverse variances
 
     def normal(self, models: Tensor) -> Normal:
         """Cost and derivatives by the entries of the models ``(b, c, 3, 3)``."""
@@ -145,10 +144,6 @@ class Matrices:
         # transposed derivative of the residual
         slope = (eye - g[..., :, None] * image[..., None, :]) / along[..., None]
         return _normal(weight[..., None] * (image - g), image - g, slope, weight)
-
-    def each(self, function: Callable[[Tensor], Tensor]) -> Matrices:
-        """With every array of problems changed."""
-        return replace(self, given=function(self.given))
 
 
 def _normal(weighted: Tensor, value: Tensor, slope: Tensor, weight: Tensor) -> Normal:
@@ -195,15 +190,6 @@ class PlaneMatches:
         root = self.body_weights.sqrt()
         return value * root, (slope * root[..., None]).mT
 
-    def each(self, function: Callable[[Tensor], Tensor]) -> PlaneMatches:
-        """With every array of problems changed."""
-
-        def both(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-            return function(pair[0]), function(pair[1])
-
-        plane_weights, body_weights = both((self.plane_weights, self.body_weights))
-        return PlaneMatches(both(self.planes), plane_weights, both(self.bodies), body_weights, both(self.scales))
-
 
 @dataclass(frozen=True)
 class PlanesProblem(NormalEquations):
@@ -218,11 +204,11 @@ class PlanesProblem(NormalEquations):
 
     def subset(self, keep: Tensor) -> PlanesProblem:
         """Only some of the problems."""
-        return replace(self, evidence=self.evidence.each(lambda x: x[keep]))
+        return replace(self, evidence=each(lambda x: x[keep], self.evidence))
 
     def repeat(self, count: int) -> PlanesProblem:
         """All problems ``count`` times, one round after the other."""
-        return replace(self, evidence=self.evidence.each(lambda x: x.repeat(count, *[1] * (x.ndim - 1))))
+        return replace(self, evidence=each(lambda x: x.repeat(count, *[1] * (x.ndim - 1)), self.evidence))
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost ``(b,)``, gradient ``(b, size)`` and Gauss-Newton matrix ``(b, size, size)``."""
@@ -385,7 +371,7 @@ def solve(
     """
     layout, b = Layout(homographies.shape[1], fundamentals.shape[1]), len(homographies)
     weights = homographies.new_tensor([1.0] * layout.planes + [options.body_weight] * layout.bodies)
-    matrices = PlanesProblem(layout, Matrices(torch.cat([homographies, fundamentals], dim=1), weights))
+    matrices = PlanesProblem(layout, Matrices(torch.cat([homographies, fundamentals], dim=1), weights.expand(b, -1)))
     first = starts(method, homographies, fundamentals, several=refine)
     theta = torch.cat([parameters(homographies, fundamentals, infinity) for infinity in first])
     rounds = matrices.repeat(len(first))

@@ -12,6 +12,7 @@ from dyntorch.geometry.bundle import CalibratedCameras, bundle_adjust
 from dyntorch.geometry.homogeneous import nonzero_sign
 from dyntorch.geometry.lift import change_frame, steadiest_frame
 from dyntorch.geometry.triangulation import unit_projections
+from dyntorch.numerics.blocks import select
 from dyntorch.tasks.reconstruct.diagnosis import NOISE_ROUNDING, unknowns
 from dyntorch.tasks.reconstruct.metric import WorldChanges, metric_frames
 from dyntorch.tasks.reconstruct.motions import Motion
@@ -99,7 +100,7 @@ def metric_reconstruction(
     if lifting is None:
         inside = (structure != 0).any(-1, keepdim=True)
         points, speed = torch.where(inside, structure[..., : motion.dim], torch.nan), None
-        pair = as_bodies(shown)
+        pair = torch.stack([torch.cat([shown[..., :-2], shown[..., body - 2, None]], dim=-1) for body in range(2)], dim=1)
         shown, projections = pair[:, 0], shown
         assert bodies is not None
         bodies = _where(found.found, unit_projections(pair), bodies)
@@ -133,8 +134,7 @@ def metric_reconstruction(
 
 def _where(found: Tensor, new: Tensor, old: Tensor) -> Tensor:
     """The new values of a flat batch in the shape of the old ones, where there are any."""
-    wide = found[(..., *[None] * (new.ndim - 1))]
-    return torch.where(wide, new, old.reshape(new.shape)).reshape(old.shape)
+    return select(found, new, old.reshape(new.shape)).reshape(old.shape)
 
 
 def _ambiguity_text(plain: Reconstruction, found: Tensor, static: bool) -> str:
@@ -329,11 +329,6 @@ def of_bodies(bodies: Tensor, points: Tensor, labels: Tensor) -> LiftedState:
     structure = torch.cat([points, own], dim=-1)
     structure = torch.where((points.isfinite().all(-1) & (labels > 0))[..., None], structure, 0.0)
     return LiftedState(unit_projections(cameras), structure, torch.zeros_like(points[:, 0, 0]))
-
-
-def as_bodies(cameras: Tensor) -> Tensor:
-    """The cameras ``(b, 2, views, 3, d + 1)`` of both bodies in ``[Q | q_1 | q_2]``."""
-    return torch.stack([torch.cat([cameras[..., :-2], cameras[..., -2 + body, None]], dim=-1) for body in range(2)], dim=1)
 
 
 def _poses(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -37,7 +37,7 @@ BLOCK = 1 << 17
 
 
 def point_uncertainty(
-    cameras: Tensor, structure: Tensor, lifts: Tensor, depth: Tensor, weights: Tensor, gauge: int, metric: Tensor, step: int = 1
+    cameras: Tensor, structure: Tensor, lifts: Tensor, depth: Tensor, weights: Tensor, gauge: int, metric: Tensor, step: int
 ) -> Tensor:
     r"""Standard deviation of each point per unit of noise, when cameras and points are both unknown."""
     b, views, n = weights.shape
@@ -45,33 +45,18 @@ def point_uncertainty(
     value = (structure * depth).sum(-1, keepdim=True)
     known = (structure != 0).any(-1) & (value[..., 0].abs() > 1e-12)
     unit = torch.where(known[..., None], structure / torch.where(known[..., None], value, 1.0), 0.0)
-    functional = depth.expand(b, n, -1)
-
-    def run(given: _UncertaintyInput) -> Tensor:
-        return _uncertainty(given, gauge, step)
-
-    given = _UncertaintyInput(cameras, unit, functional, weights * known[:, None], lifts, metric)
-    found = map_blocks(run, given, size=max(1, BLOCK // (n * wide + 1)))
+    given = cameras, unit, depth.expand(b, n, -1), weights * known[:, None], lifts, metric
+    found = map_blocks(partial(_uncertainty, gauge=gauge, step=step), *given, size=max(1, BLOCK // (n * wide + 1)))
     return torch.where(known[:, ::step] & found.isfinite(), found, torch.inf)
-
-
-class _UncertaintyInput(NamedTuple):
-    """What :func:`point_uncertainty` is asked about, points of depth 1."""
-
-    cameras: Tensor
-    structure: Tensor
-    depth: Tensor
-    """``(b, n, K)``."""
-    weights: Tensor
-    lifts: Tensor
-    metric: Tensor
 
 
 EIGENVALUE_ROUNDING = 1e-10  # over the largest: sound scenes of 60 points have 3e-6 to .1, the gauge up to 1e-11
 
 
-def _uncertainty(given: _UncertaintyInput, gauge: int, step: int) -> Tensor:
-    cameras, structure, depth, weights, lifts, metric = given
+def _uncertainty(
+    cameras: Tensor, structure: Tensor, depth: Tensor, weights: Tensor, lifts: Tensor, metric: Tensor, gauge: int, step: int
+) -> Tensor:
+    """The same of one block, with depths ``(b, n, K)`` and points of depth 1."""
     by_camera, by_point = _derivatives(cameras, structure, weights, lifts)
     information = torch.einsum("bvnlk,bvnlj->bnkj", by_point, by_point)
     trace = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]

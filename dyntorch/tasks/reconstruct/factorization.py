@@ -81,12 +81,7 @@ def projective_factorization(tracks: Tensor, rank: int, weights: Tensor | None =
     """
     least = _check(tracks, rank, weights)
     batch, (views, n, size) = tracks.shape[:-3], tracks.shape[-3:]
-    x = tracks.detach().double()
-    complete = torch.isfinite(x).all(-1).all(-2)
-    if weights is not None:
-        complete = complete & (weights > 0).all(-2)
-    complete = complete & (complete.sum(-1, keepdim=True) >= least)
-    x = torch.where(complete[..., None, :, None], x, 0.0)
+    x, complete = _complete_points(tracks, weights, least)
 
     def block(x: Tensor, complete: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return _factorize(x, complete, rank)
@@ -100,14 +95,28 @@ def projective_factorization(tracks: Tensor, rank: int, weights: Tensor | None =
     return ProjectiveFactorization(projections.to(dtype), structure.to(dtype), residual.to(dtype), status=status)
 
 
+def _complete_points(tracks: Tensor, weights: Tensor | None, least: int) -> tuple[Tensor, Tensor]:
+    """Tracks in float64, 0 for all that are not seen everywhere, and which are ``(*batch, n)``; none where they are too few."""
+    x = tracks.detach().double()
+    complete = torch.isfinite(x).all(-1).all(-2)
+    if weights is not None:
+        complete = complete & (weights > 0).all(-2)
+    complete = complete & (complete.sum(-1, keepdim=True) >= least)
+    return torch.where(complete[..., None, :, None], x, 0.0), complete
+
+
+def _check_weights(tracks: Tensor, weights: Tensor | None) -> None:
+    if weights is not None and weights.shape != tracks.shape[:-1]:
+        raise ValueError(f"weights must be (*batch, views, n) = {tuple(tracks.shape[:-1])}, got {tuple(weights.shape)}")
+    check_weights(weights, "a point")
+
+
 def _check(tracks: Tensor, rank: int, weights: Tensor | None) -> int:
     """The number of points that decide the projections."""
     if tracks.ndim < 3 or not tracks.is_floating_point():
         raise ValueError(f"tracks must be floating point (*batch, views, n, l), got {tuple(tracks.shape)} {tracks.dtype}")
     views, n, size = tracks.shape[-3:]
-    if weights is not None and weights.shape != tracks.shape[:-1]:
-        raise ValueError(f"weights must be (*batch, views, n) = {tuple(tracks.shape[:-1])}, got {tuple(weights.shape)}")
-    check_weights(weights, "a point")
+    _check_weights(tracks, weights)
     if rank <= size + 1:
         raise ValueError(f"rank must exceed l + 1 = {size + 1}, or one view decides everything; got {rank}")
     # every point has rank - 1 unknowns, and must leave equations for the projections
@@ -291,12 +300,7 @@ def velocity_factorization(tracks: Tensor, times: Tensor, dim: int = 3, weights:
     """
     _check_moving(tracks, times, dim, weights)
     batch, (views, n, _) = tracks.shape[:-3], tracks.shape[-3:]
-    x = tracks.detach().double()
-    complete = torch.isfinite(x).all(-1).all(-2)
-    if weights is not None:
-        complete = complete & (weights > 0).all(-2)
-    complete = complete & (complete.sum(-1, keepdim=True) > 2 * dim)
-    x = torch.where(complete[..., None, :, None], x, 0.0)
+    x, complete = _complete_points(tracks, weights, 2 * dim + 1)
     t = times.detach().to(x).expand(*batch, views)
 
     def block(x: Tensor, t: Tensor, complete: Tensor) -> tuple[Tensor, ...]:
@@ -316,9 +320,7 @@ def _check_moving(tracks: Tensor, times: Tensor, dim: int, weights: Tensor | Non
     if dim not in (2, 3):
         raise ValueError(f"dim must be 3, space, or 2, a plane, got {dim}")
     views, n = tracks.shape[-3:-1]
-    if weights is not None and weights.shape != tracks.shape[:-1]:
-        raise ValueError(f"weights must be (*batch, views, n) = {tuple(tracks.shape[:-1])}, got {tuple(weights.shape)}")
-    check_weights(weights, "a point")
+    _check_weights(tracks, weights)
     least = 5 if dim == 3 else 3
     if views < least:
         raise ValueError(f"constant velocity in {dim} dimensions needs at least {least} affine views, got {views}: add views")

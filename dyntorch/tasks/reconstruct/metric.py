@@ -140,10 +140,12 @@ def metric_frames(
     b, d = len(cameras), changes.dim
     share = (cameras != 0).flatten(2).any(-1).to(cameras.dtype)
     derivatives = torch.einsum("bvma,vpad->bvpmd", cameras, changes.worlds[..., :d])
-    starts = _starts(derivatives, share, changes, d)
+    row = torch.arange(b, device=cameras.device)
+    starts = _calibrated_first(derivatives[row, share.argmax(-1)][..., :3, :], changes, _targets(d).to(cameras))
+    starts = torch.where(starts.isfinite(), starts, 1.0)
     count = starts.shape[1]
     whole = _Calibrating(derivatives, share, changes.orbits)
-    wide = whole.subset(torch.arange(b, device=cameras.device).repeat_interleave(count))
+    wide = whole.subset(row.repeat_interleave(count))
     found = minimize(wide, wide.evaluate((starts.flatten(0, 1),)), LeastSquaresOptions(iterations=DESCENT_ITERATIONS))
     theta, cost = found.theta[0].view(b, count, -1), found.cost.view(b, count)
     change = torch.einsum("bsp,pij->bsij", theta, changes.algebra)
@@ -153,7 +155,6 @@ def metric_frames(
     fewest = torch.where(fits, wrong, torch.inf).amin(-1, keepdim=True)
     fits = fits & (wrong <= fewest + MAX_EXTRA_BEHIND)
     best = torch.where(fits, cost, torch.inf).argmin(-1)
-    row = torch.arange(b, device=cameras.device)
     several = _num_different(theta, changes, d, fits, best)
     # what is open by itself, and the derivative of the conditions across it
     value, slope = whole.linear(theta[row, best])
@@ -230,15 +231,6 @@ def _behind(
 # Where the descent starts: frames in which one camera already is calibrated.
 
 
-def _starts(derivatives: Tensor, share: Tensor, changes: WorldChanges, d: int) -> Tensor:
-    """Coordinates ``(b, s, dim)`` of the changes to start from."""
-    seen = share.argmax(-1)
-    first = derivatives[torch.arange(len(seen), device=seen.device), seen][..., :3, :]
-    targets = _targets(d).to(first)
-    starts = _calibrated_first(first, changes, targets)
-    return torch.where(starts.isfinite(), starts, 1.0)
-
-
 PLANE_TILTS = (0.6, 1.15)  # radians between the normal of a plane and the first camera's axis, next to 0
 NUM_AZIMUTHS = 6  # normals around the axis at each of these
 
@@ -264,7 +256,8 @@ START_RIDGE = 1e-3  # weight with which a start stays where the frame is
 
 def _calibrated_first(first: Tensor, changes: WorldChanges, targets: Tensor) -> Tensor:
     """The changes ``(b, s, dim)`` next to the identity that make a camera ``(b, dim, 3, d)`` that of each target, up to a turn."""
-    same = _identity_coordinates(changes)
+    eye = torch.eye(changes.algebra.shape[-1], dtype=first.dtype, device=first.device)
+    same = torch.linalg.pinv(changes.algebra.flatten(1).mT) @ eye.flatten()  # coordinates of the identity
     now = torch.einsum("bpmd,p->bmd", first, same)
     length = (now.square().sum((-2, -1)) / now.shape[-1]).sqrt()[:, None, None, None]
     rows = first.flatten(2).mT
@@ -282,12 +275,6 @@ def _calibrated_first(first: Tensor, changes: WorldChanges, targets: Tensor) -> 
     draw = torch.randn(NUM_INFINITY_DRAWS, len(same), generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(first)
     around = theta + DRAW_SPREAD * theta.norm(dim=-1, keepdim=True) / len(same) ** 0.5 * draw
     return torch.cat([theta, around], dim=1)
-
-
-def _identity_coordinates(changes: WorldChanges) -> Tensor:
-    """Coordinates ``(dim,)`` of the identity."""
-    eye = torch.eye(changes.algebra.shape[-1], dtype=changes.algebra.dtype, device=changes.algebra.device)
-    return torch.linalg.pinv(changes.algebra.flatten(1).mT) @ eye.flatten()
 
 
 def _polar(matrix: Tensor) -> Tensor:

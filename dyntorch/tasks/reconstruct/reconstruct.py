@@ -219,16 +219,13 @@ def normalize_tracks(x: Tensor, weights: Tensor, times: Tensor) -> ViewTracks:
     seen = (weights > 0).any(-1)
     scales = torch.where(seen, transforms[..., 0, 0], torch.nan)
     scales = torch.where(seen, scales, scales.square().nanmean(-1, keepdim=True).sqrt()).nan_to_num(nan=1.0)
-    transforms = torch.where(seen[..., None, None], transforms, _scaling(scales, x.shape[-1]))
+    scaling = torch.diag_embed(torch.nn.functional.pad(scales[..., None].expand(*scales.shape, x.shape[-1]), (0, 1), value=1.0))
+    transforms = torch.where(seen[..., None, None], transforms, scaling)
     moved = x * scales[..., None, None] + transforms[..., None, :-1, -1]
     moved = torch.where((weights > 0)[..., None], moved, 0.0)
     # of order one: the views' scales over their mean
     share = scales.square().mean(-1, keepdim=True) / scales.square()
     return ViewTracks(moved, weights * share[..., None], scales, transforms, times)
-
-
-def _scaling(scales: Tensor, dim: int) -> Tensor:
-    return torch.diag_embed(torch.cat([scales[..., None].expand(*scales.shape, dim), torch.ones_like(scales[..., None])], -1))
 
 
 def _resection(model: Motion) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
@@ -53,8 +54,7 @@ class ViewTracks:
 
     def subset(self, keep: Tensor) -> ViewTracks:
         """Some problems of the batch."""
-        static = None if self.static is None else self.static[keep]
-        return ViewTracks(self.x[keep], self.weights[keep], self.scales[keep], self.transforms[keep], self.times, static)
+        return self._each(lambda part: part[keep])
 
     def at(self, views: Tensor) -> ViewTracks:
         """Some views."""
@@ -76,11 +76,11 @@ class ViewTracks:
 
     def repeat(self, count: int) -> ViewTracks:
         """Every problem so many times in a row."""
-        x, weights, scales, transforms = (
-            part.repeat_interleave(count, dim=0) for part in (self.x, self.weights, self.scales, self.transforms)
-        )
-        static = None if self.static is None else self.static.repeat_interleave(count, dim=0)
-        return ViewTracks(x, weights, scales, transforms, self.times, static)
+        return self._each(lambda part: part.repeat_interleave(count, dim=0))
+
+    def _each(self, function: Callable[[Tensor], Tensor]) -> ViewTracks:
+        x, weights, scales, transforms = map(function, (self.x, self.weights, self.scales, self.transforms))
+        return ViewTracks(x, weights, scales, transforms, self.times, None if self.static is None else function(self.static))
 
 
 @dataclass(frozen=True)
@@ -329,23 +329,24 @@ MULTISTART_SIZE = 7  # K from which on one start is not enough: in P^6 one of th
 MULTISTART_SPARE = 6  # spare coordinates per point beyond which it is enough there as well
 
 
-def scene_of(tracks: ViewTracks, found: Projections, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
-    """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer.
-    scale ``(b,)``."""
+def scene_of(tracks: ViewTracks, found: Projections, lifting: Lifting) -> LiftedState:
+    """Cameras and points from projections in a projective frame, and from the scene as if it stood still where that is safer."""
     lost = is_failure(found.status)
     aided = _static_points_suffice(tracks, lifting)
     coordinates = (tracks.weights > 0).sum(1) * tracks.x.shape[-1]
     size = lifting.lifts.shape[-1]
     known = torch.where(lost[:, None], coordinates >= size - 1, (found.structure != 0).any(-1))
-    scene = _scene(tracks, _upgrade(found, lost, lifting), known & ~lost[:, None], lifting, scale)
-    scene = LiftedState(scene.cameras, scene.structure, torch.where(lost, torch.inf, scene.cost))
+    # of lost problems anything finite
+    cameras = upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
+    scene = _scene(tracks, cameras, known & ~lost[:, None], lifting)
+    scene = replace(scene, cost=torch.where(lost, torch.inf, scene.cost))
     spare = (coordinates * known).sum(-1) - (size - 1) * known.sum(-1)
     shaky = ~lost & (size >= MULTISTART_SIZE) & (spare <= MULTISTART_SPARE * known.sum(-1))
     shaky = shaky | (~lost & has_points_behind(tracks, _finite(tracks, scene, lifting), lifting))
     unknown = camera_unknowns(tracks.x.shape[1], tracks.x.shape[-1] + 1, lifting.lifts.shape[1], len(lifting.algebra) - 1)
     unaided = (found.status == Status.TOO_FEW) & (spare > unknown)
     left = (shaky | unaided | aided).nonzero()[:, 0] if lifting.still.shape[-1] else lost.new_zeros(0, dtype=torch.long)
-    return _multistart(tracks, scene, left, known, lifting, scale) if len(left) else scene
+    return _multistart(tracks, scene, left, known, lifting) if len(left) else scene
 
 
 MAX_BEHIND_SHARE = 0.05  # of the points: wrong minima have a tenth to a half of them behind cameras
@@ -368,19 +369,14 @@ def _static_points_suffice(tracks: ViewTracks, lifting: Lifting) -> Tensor:
     return resting.all(1).sum(-1) >= MIN_STATIC_POINTS[min(lifting.motion.dim, 3)]
 
 
-def _upgrade(found: Projections, lost: Tensor, lifting: Lifting) -> Tensor:
-    """Cameras; of lost problems anything finite."""
-    return upgrade(torch.where(lost[:, None, None, None], 1.0, found.projections), lifting.lifts)[1]
-
-
-def _scene(tracks: ViewTracks, cameras: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None) -> LiftedState:
+def _scene(tracks: ViewTracks, cameras: Tensor, known: Tensor, lifting: Lifting) -> LiftedState:
     """The scene that adjustment finds from some cameras, with the known points ``(b, n)``."""
     structure = triangulate(cameras @ lifting.lifts, tracks.x, tracks.weights)
     start = LiftedState(cameras, torch.where(known[..., None], structure, 0.0), torch.zeros_like(tracks.x[:, 0, 0, 0]))
-    done = adjust_scene(tracks, start, lifting, scale)
+    done = adjust_scene(tracks, start, lifting)
     # a point that was lost costs the extent of the image
     gone = known & (done.structure == 0).all(-1)
-    return LiftedState(done.cameras, done.structure, done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
+    return replace(done, cost=done.cost + (tracks.weights * gone[:, None]).flatten(1).sum(-1))
 
 
 NUM_STATIC_STARTS = 3  # static starts beside that from the tensor
@@ -389,17 +385,15 @@ SAME_COST = 1e-2  # relative difference of the costs of one minimum
 COST_ROUNDING = 1e-22  # cost per observation that is rounding
 
 
-def _multistart(
-    tracks: ViewTracks, scene: LiftedState, left: Tensor, known: Tensor, lifting: Lifting, scale: Tensor | None
-) -> LiftedState:
+def _multistart(tracks: ViewTracks, scene: LiftedState, left: Tensor, known: Tensor, lifting: Lifting) -> LiftedState:
     """The scenes of least cost among those of several starts: further ones until two of them end in the same minimum."""
     cameras, structure, cost = scene.cameras.clone(), scene.structure.clone(), scene.cost.clone()
     seen = cost[left].isfinite().long()
     alone = left[seen == 0]
     floor = COST_ROUNDING * (tracks.weights > 0).flatten(1).sum(-1)
     for number in range(NUM_STATIC_STARTS_ALONE):
-        some = None if scale is None else scale[left]
-        fresh = _scene(tracks.subset(left), _start_cameras(tracks.subset(left), number, lifting, some), known[left], lifting, some)
+        some = tracks.subset(left)
+        fresh = _scene(some, _start_cameras(some, number, lifting), known[left], lifting)
         least = cost[left]
         near = fresh.cost <= least * (1 + SAME_COST) + floor[left]
         seen = torch.where(fresh.cost * (1 + SAME_COST) + floor[left] < least, 1, seen + near)
@@ -415,7 +409,7 @@ def _multistart(
     return LiftedState(cameras, structure, cost)
 
 
-def _start_cameras(tracks: ViewTracks, number: int, lifting: Lifting, scale: Tensor | None) -> Tensor:
+def _start_cameras(tracks: ViewTracks, number: int, lifting: Lifting) -> Tensor:
     """Cameras of all views from those of the scene at rest; of a part of many views: adjusted, the others by resection."""
     aided = bool(_static_points_suffice(tracks, lifting).all())
     window = middle_views(tracks.times, number)
@@ -425,7 +419,7 @@ def _start_cameras(tracks: ViewTracks, number: int, lifting: Lifting, scale: Ten
     if len(window) == tracks.x.shape[1]:
         return cameras
     some = replace(lifting, lifts=lifting.lifts[window])
-    part = _scene(tracks.at(window), cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some, scale)
+    part = _scene(tracks.at(window), cameras, torch.ones_like(tracks.weights[:, 0], dtype=torch.bool), some)
     whole = resect(part.structure, tracks.x, tracks.weights, lifts=lifting.lifts)
     return whole.index_copy(1, window.to(whole.device), part.cameras)
 
@@ -434,7 +428,7 @@ MAX_ITERATIONS = 60  # of structured bundle adjustment
 COST_TOLERANCE = 1e-7  # relative gain of a step that ends it
 
 
-def adjust_scene(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale: Tensor | None = None) -> LiftedState:
+def adjust_scene(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) -> LiftedState:
     """Structured bundle adjustment."""
     confined = tracks.static if lifting.still.shape[-1] else None
     done = bundle_adjust(
@@ -444,7 +438,6 @@ def adjust_scene(tracks: ViewTracks, scene: LiftedState, lifting: Lifting, scale
         scene.structure,
         lifting.lifts,
         iterations=MAX_ITERATIONS,
-        scale=scale,
         tolerance=COST_TOLERANCE,
         confined=confined,
         subspace=None if confined is None else lifting.still,

@@ -13,6 +13,7 @@ from dyntorch.core.limits import quantile
 from dyntorch.core.outcome import Status, has_inliers, is_failure, notices
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import triangulate, unit_projections
+from dyntorch.numerics.blocks import select
 from dyntorch.tasks.reconstruct.calibrated import metric_reconstruction, of_bodies
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
@@ -170,8 +171,7 @@ def _result(
     bad = is_failure(status)
 
     def to_batch(value: Tensor, none: float = 0.0) -> Tensor:
-        wide = bad[(..., *[None] * (value.ndim - 1))]
-        return torch.where(wide, torch.full_like(value, none), value).reshape((*batch, *value.shape[1:]))
+        return select(bad, torch.full_like(value, none), value).reshape((*batch, *value.shape[1:]))
 
     nan = float("nan")
     plain = Reconstruction(

@@ -17,6 +17,7 @@ from dyntorch.geometry.extensors import (
     skew_line,
 )
 from dyntorch.geometry.homogeneous import apply, finite_depth, homogeneous, similarity, skew
+from dyntorch.numerics.blocks import each
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.numerics.nullspace import eigenvalues
 
@@ -200,7 +201,7 @@ class Adjustment(LeastSquares):
 
     def subset(self, keep: Tensor) -> Adjustment:
         """Only some of the problems."""
-        return Adjustment(LineSightings(*(part[keep] for part in vars(self.data).values())))
+        return each(lambda part: part[keep], self)
 
     def evaluate(self, theta: Tensors) -> Iterate:
         """Sum of squared weighted distances, px^2."""

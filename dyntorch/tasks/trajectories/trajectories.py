@@ -143,7 +143,8 @@ def triangulate_trajectories(
     data, _, back = normalize_sightings(cameras.double(), x.double(), weights)
     seen = (data.weights > 0).sum(-2)
     line, second = _lines(data)
-    still = _points(data)
+    sides = data.sides()
+    still = fit_points(data, gram_null_space(sides.mT @ sides).basis[..., 0, :])  # as if no point moved
     noise = _noise(line.cost, seen) if sigma is None else torch.full_like(line.cost[..., 0], sigma)
     least = torch.maximum(noise, MIN_NOISE / data.unit[..., 0, 0])[..., None]
     static = (still.cost <= (least * options.max_static_sigmas).square() * (2 * seen - 3)) & (seen >= VIEWS)
@@ -225,11 +226,6 @@ def _check(cameras: Tensor, x: Tensor, weights: Tensor | None, sigma: float | No
     return torch.where(known, weights, 0.0).double()
 
 
-def line_vectors(data: LineSightings) -> Tensor:
-    """The best lines ``(*batch, n, 6)`` of normalized sightings."""
-    return _lines(data)[0].vectors
-
-
 MIN_LINE_ANGLE = 1e-12  # squared sine between the unit vectors of both lines of four views
 
 
@@ -246,12 +242,6 @@ def _lines(data: LineSightings) -> tuple[LineFit, Tensor]:
     vectors, least, spread = found.vectors.take_along_dim(best[..., None], 0), found.cost, found.spread
     line = LineFit(vectors[0], least.take_along_dim(best, 0)[0], spread.take_along_dim(best, 0)[0])
     return line, torch.where(two[..., None], found.vectors[2], 0.0)
-
-
-def _points(data: LineSightings) -> LineFit:
-    """Every point as if it did not move."""
-    sides = data.sides()
-    return fit_points(data, gram_null_space(sides.mT @ sides).basis[..., 0, :])
 
 
 MIN_IMAGE_LENGTH = 1e-7  # of a line, line and camera of norm 1: below, it goes through the centre of the camera
@@ -383,6 +373,5 @@ def _adjust_cameras(cameras: Tensor, x: Tensor, weights: Tensor) -> Tensor:
     data, transform, _ = normalize_sightings(cameras, x, torch.where(x.isfinite().all(-1), weights, 0.0))
     for _ in range(NUM_ADJUSTMENTS):
         # a line whose start from the first cameras was bad stays in a minimum of its own: all get a new start
-        data = adjust(data, line_vectors(data))
-    moved = torch.linalg.solve(transform, data.cameras)
-    return unit(moved)
+        data = adjust(data, _lines(data)[0].vectors)
+    return unit(torch.linalg.solve(transform, data.cameras))

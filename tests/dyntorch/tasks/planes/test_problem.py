@@ -39,7 +39,7 @@ def problems(found):
     scales = found.frames[0][:, 0, 0], found.frames[1][:, 0, 0]
     matches = PlaneMatches(found.planes.views, found.planes.weights, found.bodies.views, found.bodies.weights, scales)
     weights = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0], dtype=F64)
-    matrices = Matrices(torch.cat([found.homographies, found.fundamentals], dim=1), weights)
+    matrices = Matrices(torch.cat([found.homographies, found.fundamentals], dim=1), weights.expand(2, -1))
     return {"matches": PlanesProblem(LAYOUT, matches), "matrices": PlanesProblem(LAYOUT, matrices)}
 
 

@@ -93,6 +93,7 @@ def test_float32_and_units() -> None:
     scene = scene_of("constant_velocity_2d")
     single = dyn.reconstruct(scene.tracks.float(), "constant_velocity_2d", scene.times)
     assert single.points.dtype == single.cameras.dtype == torch.float32
+    assert single.labels.dtype == torch.long and single.inliers.dtype == torch.bool
     assert float(metrics.lifted_error(single.structure.double(), scene.structure, scene.lifts).position) < 1e-4
     milli = dyn.reconstruct(scene.tracks, "constant_velocity_2d", scene.times * 1e-3)
     assert bool((off(milli, replace(scene, times=scene.times * 1e-3)) < 1e-6).all())
