@@ -31,9 +31,8 @@ NEEDED = "give a dataset of poses, as movement.io.load_poses gives it"
 
 def is_dataset(value: Any) -> bool:
     """Whether a value looks like a dataset of movement: it has ``position`` with named axes."""
-    return not isinstance(value, (Clip, ClipSet, np.ndarray, str, bytes, Path)) and hasattr(
-        getattr(value, "position", None), "dims"
-    )
+    ours = isinstance(value, (Clip, ClipSet, np.ndarray, str, bytes, Path))
+    return not ours and hasattr(getattr(value, "position", None), "dims")
 
 
 def clips_of(dataset: Any, *, fps: float | None = None, up: str | None = None, name: str = "") -> ClipSet:
@@ -86,10 +85,8 @@ def clip_of(dataset: Any, *, fps: float | None = None, name: str = "") -> Clip:
     clips = clips_of(dataset, fps=fps, name=name)
     if len(clips) > 1:
         people = listing(clip.meta["person"] for clip in clips)
-        raise ValueError(
-            f"{clips.name}: holds {len(clips)} individuals ({people}) where one is expected; choose one: "
-            "indexing.movement.clips_of(dataset)[0]"
-        )
+        what = f"{clips.name}: holds {len(clips)} individuals ({people}) where one is expected"
+        raise ValueError(f"{what}; choose one: indexing.movement.clips_of(dataset)[0]")
     return clips[0]
 
 
@@ -106,9 +103,8 @@ def _values(dataset: Any, name: str, who: str) -> tuple[FloatArray, tuple[str, .
     axes = tuple(called.get(str(axis), str(axis)) for axis in variable.dims)
     strange = [axis for axis in axes if axis not in AXES]
     if strange or len(axes) != values.ndim or len(set(axes)) < len(axes):
-        raise ValueError(
-            f"{who}: {name} has the axes {listing(axes)} and the shape {values.shape}; select one of what is no axis of poses"
-        )
+        what = f"{who}: {name} has the axes {listing(axes)} and the shape {values.shape}"
+        raise ValueError(f"{what}; select one of what is no axis of poses")
     return values.astype(values.dtype if values.dtype in (np.float32, np.float64) else np.float64), axes
 
 
@@ -153,9 +149,8 @@ def _confidence(dataset: Any, position: FloatArray, who: str) -> FloatArray | No
     values, axes = _values(dataset, "confidence", who)
     confidence = _reorder(values, axes, ("time", "individuals", "keypoints", "space"))
     if confidence.shape != (*position.shape[:3], 1):
-        raise ValueError(
-            f"{who}: confidence has the axes {listing(axes)} and the shape {values.shape}, which do not fit position; {NEEDED}"
-        )
+        what = f"{who}: confidence has the axes {listing(axes)} and the shape {values.shape}"
+        raise ValueError(f"{what}, which do not fit position; {NEEDED}")
     return np.asarray(confidence[..., 0])
 
 

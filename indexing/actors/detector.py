@@ -69,12 +69,7 @@ def detect(
     trust = 0.93 - 0.5 * hidden + 0.06 * _jitter(hidden.shape, _rate(clip), rng)
     pixels, wrong = _outliers(pixels, outliers, metre, rng)
     trust = np.where(wrong, trust - rng.uniform(0.0, 0.6, trust.shape), trust)
-    lost = (
-        _missing_joints(hidden, dropout, rng)
-        | np.isnan(pixels).any(axis=2)
-        | (pixels < 0).any(axis=2)
-        | (pixels >= image).any(axis=2)
-    )
+    lost = _missing_joints(hidden, dropout, rng) | ~((pixels >= 0) & (pixels < image)).all(axis=2)
     confidence = np.where(lost, 0.0, np.clip(trust, 0.02, 1.0))
     return clip.replace(joints=np.where(lost[..., None], np.nan, pixels), confidence=confidence, up="-y")
 
@@ -99,9 +94,8 @@ def _project(
     turned = (points - np.nanmean(points, axis=(0, 1))) @ rotation(np.deg2rad(azimuth), elevation).T
     depth = turned[..., 2:] + distance
     if (depth <= 0.05).any():
-        raise ValueError(
-            f"clip {clip.name!r}: a joint is {np.nanmin(depth):.2f} m in front of the camera; increase distance={distance:g}"
-        )
+        what = f"clip {clip.name!r}: a joint is {np.nanmin(depth):.2f} m in front of the camera"
+        raise ValueError(f"{what}; increase distance={distance:g}")
     # Looking along +z in a right-handed frame with y up, x grows to the left: both image axes run against the scene's.
     return turned, np.array(image) / 2 - FOCAL * image[0] * turned[..., :2] / depth
 

@@ -199,9 +199,7 @@ def _result(
         reason = f"{few}, {len(refused)} of {count(len(matched), 'image')}; add images, or matches of what stands still"
         if len(set(refused) & set(votes.open)) > len(refused) / 2:
             where = listing(names[place] for place in votes.open)
-            reason = (
-                f"what stands still is open: two bodies spread alike over {where}; add images in which more of the scene is seen"
-            )
+            reason = f"what stands still is open: two bodies spread alike over {where}; add images that show more of the scene"
     elif refused:
         notes.append(f"{few}: COLMAP will leave {'it' if len(refused) == 1 else 'them'} out")
     if not reason and not any((signs < 0).any() for signs in votes.signs):

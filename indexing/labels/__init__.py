@@ -114,9 +114,8 @@ def choose_labels(file: LabelFile) -> LabelFile:
     if people and len(people) < len(labels):
         names = [name for name in file.machine if any(name in (label.observation, label.tier) for label in labels)]
         verb = "--tier" if any(label.tier in names for label in labels) else "--observation"
-        notices.append(
-            f"{count(len(labels) - len(people), 'label')} left out: a program found them ({listing(names)}); {verb} NAME reads them"
-        )
+        left = count(len(labels) - len(people), "label")
+        notices.append(f"{left} left out: a program found them ({listing(names)}); {verb} NAME reads them")
         labels = people
     observations = list(dict.fromkeys(label.observation for label in labels))
     if len(observations) > 1:
@@ -232,10 +231,8 @@ def write_labels(
     source = _source(target, into, known)
     video = str(recording) if recording is not None else ""
     if video:  # labels may name the video, and the recording be its keypoints
-        video = next(
-            (label.media for label in labels if label.media and same_recording(label.media, video)),
-            _find_video(video, target, name),
-        )
+        named = (label.media for label in labels if label.media and same_recording(label.media, video))
+        video = next(named, _find_video(video, target, name))
     sound, notices = _clean_labels(labels, video)
     if video and known.program and source is None and Path(video).suffix.lower() not in FILMS:
         notices.append(f"{base_name(video)} is no video: {known.program} asks for one when you open {target.name}")

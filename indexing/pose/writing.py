@@ -18,17 +18,7 @@ from indexing.files import prepare, recover_folder, replacing_folder
 from indexing.opening import entries, error, is_regular, parse_json, read_text
 from indexing.pose.blazepose import Floats
 from indexing.pose.chunks import content_of, nearest, plan
-from indexing.pose.detection import (
-    Detected,
-    FrameProgress,
-    ModelName,
-    NobodyInVideo,
-    Progress,
-    VideoTask,
-    as_frames,
-    check,
-    run,
-)
+from indexing.pose.detection import Detected, FrameProgress, ModelName, NobodyInVideo, Progress, VideoTask, as_frames, check, run
 from indexing.pose.models import ModelSet, load_models
 from indexing.pose.tracking import Indices, PoseOptions
 from indexing.readers.formats.clipset import read_clip_set

@@ -16,6 +16,7 @@ import numpy as np
 from indexing.clip import ClipSet, FloatArray, check_fps, is_number
 from indexing.opening import VALUE, clip_text, entries, error, head_of, listing, parse_json, quote, read_rows, read_text, size_of
 from indexing.readers.hdf import open_hdf5
+from indexing.readers.points import number
 from indexing.registry import list_programs, load_formats
 from indexing.skeleton import layout_named
 
@@ -46,11 +47,8 @@ class Source:
     def require_kind(self, name: str, *kinds: str) -> None:
         """Refuse an input that cannot be of the format ``name``."""
         if self.kind not in kinds:
-            raise error(
-                self.path,
-                f"is a {self.kind}, but the format {name!r} is a {' or a '.join(kinds)}",
-                "leave format= out to detect it",
-            )
+            what = f"is a {self.kind}, but the format {name!r} is a {' or a '.join(kinds)}"
+            raise error(self.path, what, "leave format= out to detect it")
 
 
 @dataclass(frozen=True)
@@ -134,17 +132,10 @@ def _open_folder(folder: Path) -> Source:
         for file in files:
             number = frame_number(file.name)
             if number is None:
-                raise error(
-                    file,
-                    "the file name has no frame number",
-                    "a folder holds one file per frame of one recording; name other files singly",
-                )
+                raise error(file, "the file name has no frame number", "a folder is one recording; name other files singly")
             if number in numbered:
-                raise error(
-                    folder,
-                    f"{clip_text(numbered[number].name, VALUE)} and {clip_text(file.name, VALUE)} are both frame {number}",
-                    "a folder holds one recording: put each recording in a folder of its own",
-                )
+                names = " and ".join(clip_text(one.name, VALUE) for one in (numbered[number], file))
+                raise error(folder, f"{names} are both frame {number}", "put each recording in a folder of its own")
             numbered[number] = file
         for file in files:
             size_of(file)  # a folder or a pipe among them is named before any of them is read
@@ -183,9 +174,8 @@ def read_columns(path: Path, skip: int, numeric: Sequence[int], text: Sequence[i
             header = cells
             continue
         if len(cells) < len(header):
-            raise error(
-                path, f"row {line} has {len(cells)} cells, the header {len(header)}", "the file may be truncated: export it again"
-            )
+            what = f"row {line} has {len(cells)} cells, the header {len(header)}"
+            raise error(path, what, "the file may be truncated: export it again")
         try:
             values.append(np.array([float(cells[c]) for c in numeric]))
         except ValueError:
@@ -198,14 +188,10 @@ def read_columns(path: Path, skip: int, numeric: Sequence[int], text: Sequence[i
 
 
 def _number(path: Path, line: int, column: str, cell: str) -> float:
-    if cell.strip().lower() in ("", "na", "n/a", "none", "null", "nan"):
-        return float("nan")
-    try:
-        return float(cell)
-    except ValueError:
-        raise error(
-            path, f"row {line}, column {quote(column)}: {quote(cell)} is not a number", "correct the cell or leave it empty"
-        ) from None
+    value = number(cell)
+    if value is None:
+        raise error(path, f"row {line}, column {quote(column)}: {quote(cell)} is not a number", "correct it or leave it empty")
+    return value
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -199,10 +199,7 @@ def _check_heaps(path: Path) -> None:
             size = min(int.from_bytes(data[at + 8 : at + 16], "little"), len(data) - at)
             step, end = at + 16, at + size
             while step + 16 <= end:
-                index, length = (
-                    int.from_bytes(data[step : step + 2], "little"),
-                    int.from_bytes(data[step + 8 : step + 16], "little"),
-                )
+                index, length = (int.from_bytes(data[a:b], "little") for a, b in ((step, step + 2), (step + 8, step + 16)))
                 if not index and not length:
                     raise error(path, "is damaged: one of its heaps of text has no end (the file may be truncated)", AGAIN)
                 step += length if not index else 16 + -(-length // 8) * 8

@@ -62,9 +62,8 @@ def read_matches(
         raise error(resting[0].path, "static points are for lines", "mark static matches by a column static instead")
     points = match_views(resting)
     if points.lines or points.dims != (3,) * len(matched.views):
-        raise error(
-            resting[0].path, f"{len(points.views)} files of {points.dims[0]}D static points", "give 3D points for each view"
-        )
+        what = f"{len(points.views)} files of {points.dims[0]}D static points"
+        raise error(resting[0].path, what, "give 3D points for each view")
     notes = matched.notes + tuple(f"static points: {note}" for note in points.notes)
     seen = np.isfinite(np.concatenate(points.views, axis=1)).all(axis=1)
     if not seen.all():
@@ -152,13 +151,7 @@ def _match_by_name(views: Sequence[PointSet], names: tuple[str, ...]) -> Matched
         left = "name is not in every view and was" if len(lost) == 1 else "names are not in every view and were"
         notes.append(f"{len(lost)} {left} left out: {', '.join(clip_text(name, VALUE) for name in lost[:MAX_LISTED])}{more}")
     order = [np.array([place[name] for name in shared]) for place in places]
-    sorted_views = [
-        PointSet(
-            view.path, view.values[rows], tuple(shared), None if view.weights is None else view.weights[rows],
-            None if view.static is None else view.static[rows],
-        )
-        for view, rows in zip(views, order, strict=True)
-    ]  # fmt: skip
+    sorted_views = [view.take(rows, tuple(shared)) for view, rows in zip(views, order, strict=True)]
     weights, static = _weights_and_static(sorted_views)
     return Matched(tuple(view.values for view in sorted_views), tuple(shared), names, weights, static, (), tuple(notes))
 
@@ -169,11 +162,16 @@ def _weights_and_static(views: Sequence[PointSet]) -> tuple[FloatArray | None, B
     static = next((view.static for view in views if view.static is not None), None)
     if weights is None or weights.weights is None:
         return None, static
-    values = np.nan_to_num(weights.weights)
-    if (values < 0).any() or not np.isfinite(values).all():
-        at = int(np.flatnonzero((values < 0) | ~np.isfinite(values))[0])
-        raise error(weights.path, f"match {at + 1}: the weight is {values[at]:g}", "weights are 0 or more")
-    return values, static
+    return _check_weights(weights.path, weights.weights), static
+
+
+def _check_weights(path: str | Path, weights: NDArray[Any]) -> FloatArray:
+    """Weights of matches, 0 where one is NaN."""
+    values = np.where(np.isnan(weights.astype(np.float64)), 0.0, weights)
+    bad = np.flatnonzero(~((values >= 0) & (values < np.inf)))
+    if bad.size:
+        raise error(path, f"match {bad[0] + 1}: the weight is {values[bad[0]]:g}", "weights are 0 or more, and finite")
+    return values
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -267,9 +265,7 @@ def _read_archive(path: Path, pair: str | None) -> MatchedPair:
     ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
     twice = first_duplicate(ids or ())
     if twice is not None:
-        raise error(
-            path, f"{before}ids: {quote(twice)} names several matches", "give each match a name of its own, or leave ids out"
-        )
+        raise error(path, f"{before}ids: {quote(twice)} names several matches", "name each by itself, or leave ids out")
     return _build_pair(path, pair or before.rstrip("/") or path.name, x1, x2, ids, **_pair_marks(path, extra))
 
 
@@ -278,9 +274,8 @@ def _select_pair(path: Path, names: list[str], pair: str | None) -> str:
     several = [name.removesuffix("x1") for name in names if name.endswith("/x1")]
     pairs = listing(name.rstrip("/") for name in several)
     if pair is not None and f"{pair}/x1" not in names and (several or "x1" in names):
-        raise error(
-            path, f"has no pair {quote(pair)}", f"its pairs are {pairs}" if several else "it holds one pair: leave --pair out"
-        )
+        remedy = f"its pairs are {pairs}" if several else "it holds one pair: leave --pair out"
+        raise error(path, f"has no pair {quote(pair)}", remedy)
     if pair is None and "x1" not in names and len(several) > 1:
         raise error(path, f"holds {len(several)} pairs ({pairs})", f"say which: --pair {clip_text(several[0].rstrip('/'), VALUE)}")
     before = f"{pair}/" if pair is not None else "" if "x1" in names or not several else several[0]
@@ -299,11 +294,7 @@ def _pair_marks(path: Path, extra: Mapping[str, Any]) -> dict[str, Any]:
             raise error(path, f"{kind} holds values of type {values.dtype}", "give numbers")
     marks: dict[str, Any] = {}
     if "weights" in extra:
-        weights = np.nan_to_num(extra["weights"].astype(np.float64), posinf=-1)
-        if (weights < 0).any():
-            at = int(np.flatnonzero(weights < 0)[0])
-            raise error(path, f"match {at + 1}: the weight is {extra['weights'][at]:g}", "weights are 0 or more, and finite")
-        marks["weights"] = weights
+        marks["weights"] = _check_weights(path, extra["weights"])
     if "label" in extra:
         labels = extra["label"].astype(np.float64)
         odd = np.flatnonzero(~(np.isfinite(labels) & (labels >= 0) & (labels < MAX_LABEL) & (labels == np.round(labels))))
@@ -374,8 +365,7 @@ def read_image(path: str | Path) -> Photograph:
                 size = (float(turned.width), float(turned.height))
                 gray = _to_gray(turned)
     except (*DAMAGED_IMAGE, Image.DecompressionBombError) as problem:
-        message = f"cannot be read as an image ({type(problem).__name__})"
-        raise error(path, message, "save it again as png or jpg") from None
+        raise error(path, f"cannot be read as an image ({type(problem).__name__})", "save it again as png or jpg") from None
     return Photograph(path.name, gray, size)
 
 

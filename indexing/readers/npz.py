@@ -68,9 +68,7 @@ class NumpyArchive(Mapping[str, Array]):
         try:
             self._zip = zipfile.ZipFile(path)
         except DAMAGED as problem:
-            message = (
-                f"cannot be read as numpy data: it is not an .npz file ({clip_text(problem, VALUE)}; the file may be truncated)"
-            )
+            message = f"it is not an .npz file ({clip_text(problem, VALUE)}; the file may be truncated)"
             raise error(path, f"cannot be read as numpy data: {message}", "write or copy it again") from None
         self._members = {info.filename.removesuffix(".npy"): info for info in self._zip.infolist()}
 

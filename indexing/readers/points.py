@@ -35,6 +35,11 @@ class PointSet:
         """Whether these are lines."""
         return self.values.ndim == 3 or self.values.shape[-1] == 6
 
+    def take(self, rows: NDArray[np.intp], ids: tuple[str, ...]) -> PointSet:
+        """Some rows, in an order, under these names."""
+        weights = None if self.weights is None else self.weights[rows]
+        return PointSet(self.path, self.values[rows], ids, weights, None if self.static is None else self.static[rows])
+
 
 def as_view(values: Any, path: str | Path, lines: bool = False) -> FloatArray:
     """An array of a file as points ``(n, 2 | 3)`` or lines ``(n, 2, 3)`` or ``(n, 6)``, float64."""
@@ -173,9 +178,8 @@ def column_values(path: Path, rows: Sequence[Row], names: Sequence[str], columns
             value = number(cells[place])
             if value is None or math.isinf(value):
                 what = "is not a number" if value is None else "is not finite"
-                raise error(
-                    path, f"row {line}, column {quote(name)}: {quote(cells[place])} {what}", "correct the cell or leave it empty"
-                )
+                where = f"row {line}, column {quote(name)}"
+                raise error(path, f"{where}: {quote(cells[place])} {what}", "correct the cell or leave it empty")
             out[i, j] = value
     return out
 
@@ -253,10 +257,8 @@ def read_npz(path: Path) -> tuple[list[PointSet], list[PointSet]]:
                 raise error(path, f"{field} has shape {extra[field].shape}, {name} has {len(values)} rows", "give one per row")
         ids = tuple(map(str, extra["ids"].tolist())) if "ids" in extra else None
         views.append(PointSet(where, values, ids, _weights(path, extra), _static(path, extra)))
-    resting = [
-        PointSet(f"{path} {name}", as_view(extra[name], f"{path} {name}")) for name in ("static1", "static2") if name in extra
-    ]
-    return views, resting
+    places = {f"{path} {name}": extra[name] for name in ("static1", "static2") if name in extra}
+    return views, [PointSet(where, as_view(values, where)) for where, values in places.items()]
 
 
 def _weights(path: Path, extra: dict[str, Any]) -> Any:

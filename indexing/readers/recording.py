@@ -187,6 +187,16 @@ class Recording:
     meta: Mapping[str, Any] = field(default_factory=dict)
 
 
+def dense_recording(
+    path: Path, joints: FloatArray, confidence: FloatArray | None, frames: IntArray, people: Sequence[Hashable] | None,
+    names: Sequence[str], bones: Sequence[tuple[int, int]] = (), **more: Any,
+) -> Recording:  # fmt: skip
+    """A recording with a row of everybody in each frame. joints ``(frames * people, n, d)``; people: tracked, by name."""
+    at = np.repeat(np.arange(len(frames)), len(joints) // len(frames))
+    tracks = None if people is None else list(people) * len(frames)
+    return Recording(frames, at, joints, confidence, tracks, skeleton=Skeleton(path.stem, tuple(names), tuple(bones)), **more)
+
+
 def parse_numbers(path: Path, where: str, value: Any) -> FloatArray:
     """An array of float64 from parsed JSON (``null`` = NaN)."""
     try:
@@ -218,11 +228,8 @@ def parse_flat_joints(path: Path, where: str, value: Any, width: int = 3) -> tup
     if array.ndim == 2 and array.shape[1] == width:  # some exporters keep one row per joint
         array = array.ravel()
     if array.ndim != 1 or array.size == 0 or array.size % width:
-        raise error(
-            path,
-            f"{where}: expected a flat list of {width} numbers per joint, got shape {array.shape}",
-            "export x, y and confidence of every joint",
-        )
+        what = f"{where}: expected a flat list of {width} numbers per joint, got shape {array.shape}"
+        raise error(path, what, "export x, y and confidence of every joint")
     table = array.reshape(-1, width)
     return table[:, :-1], table[:, -1]
 
@@ -238,11 +245,8 @@ def collect_detections(path: Path, frames: Sequence[tuple[int, Sequence[Detectio
     shape = detections[0][2].joints.shape
     for _, number, person in detections:
         if person.joints.shape != shape:
-            raise error(
-                path,
-                f"frame {number} has a person with joints {person.joints.shape}, frame {detections[0][1]} one with {shape}",
-                "export every person with the same joint layout, or one file per layout",
-            )
+            what = f"frame {number} has a person with joints {person.joints.shape}, frame {detections[0][1]} one with {shape}"
+            raise error(path, what, "export every person with the same joint layout, or one file per layout")
     confidence = None
     if any(person.confidence is not None for *_, person in detections):
         confidence = np.stack([np.ones(shape[0]) if p.confidence is None else p.confidence for *_, p in detections])
@@ -326,13 +330,10 @@ class NobodySeen(ValueError):
 def _assign_layout(path: Path, recording: Recording, options: Options) -> Recording:
     """Which joint is which: as the caller says, or where only their number is known, as the body looks."""
     if options.layout is not None:
-        file_layout = (
-            None if any(recording.skeleton is one for one in LAYOUTS.values()) else recording.skeleton
-        )  # by its number alone
+        by_number = any(recording.skeleton is one for one in LAYOUTS.values())
+        own = None if by_number else recording.skeleton
         meta = {key: value for key, value in recording.meta.items() if key != "layout"}
-        return replace(
-            recording, skeleton=check_named_layout(path, options.layout, recording.joints.shape[1], file_layout), meta=meta
-        )
+        return replace(recording, skeleton=check_named_layout(path, options.layout, recording.joints.shape[1], own), meta=meta)
     if not recording.layouts:
         return recording
     layout, message, _ = choose_layout(recording.joints, recording.skeleton, recording.layouts, recording.up)
@@ -368,23 +369,15 @@ def _mask(path: Path, recording: Recording, min_confidence: float) -> Recording:
     if confidence is not None:
         odd = np.isnan(confidence) & ~missing
         if odd.any():
-            row, joint = np.argwhere(odd)[0]
-            raise error(
-                path,
-                f"frame {recording.frames[recording.at[row]]}, joint {joint}: the confidence is NaN, but the joint has coordinates",
-                "write 0 for a joint that was not seen",
-            )
+            what = f"{_spot(recording, odd)}: the confidence is NaN, but the joint has coordinates"
+            raise error(path, what, "write 0 for a joint that was not seen")
         missing |= ~(confidence > 0) | (confidence < min_confidence)
     elif min_confidence > 0:
-        raise error(
-            path,
-            Message("has no confidences, so {arg:min_confidence} cannot be applied"),
-            Message("leave {arg:min_confidence} at 0"),
-        )
-    if (np.abs(joints[~missing]) > LARGEST).any():
-        row, joint = np.argwhere((np.abs(joints) > LARGEST).any(axis=2) & ~missing)[0]
-        message = f"frame {recording.frames[recording.at[row]]}, joint {joint}: infinite coordinates, or beyond {LARGEST:g}"
-        raise error(path, message, "leave them empty")
+        what_for = Message("has no confidences, so {arg:min_confidence} cannot be applied")
+        raise error(path, what_for, Message("leave {arg:min_confidence} at 0"))
+    far = (np.abs(joints) > LARGEST).any(axis=2) & ~missing
+    if far.any():
+        raise error(path, f"{_spot(recording, far)}: infinite coordinates, or beyond {LARGEST:g}", "leave them empty")
     joints[missing] = np.nan
     keep = np.asarray(~missing.all(axis=1))
     if not keep.any():
@@ -397,6 +390,12 @@ def _mask(path: Path, recording: Recording, min_confidence: float) -> Recording:
         confidence=None if confidence is None else np.nan_to_num(confidence[keep]),
         tracks=tracks,
     )
+
+
+def _spot(recording: Recording, where: NDArray[np.bool_]) -> str:
+    """The first joint of a mask."""
+    row, joint = np.argwhere(where)[0]
+    return f"frame {recording.frames[recording.at[row]]}, joint {joint}"
 
 
 def _times(path: Path, recording: Recording, fps: float | None) -> tuple[FloatArray, float | None]:
@@ -414,11 +413,8 @@ def _times(path: Path, recording: Recording, fps: float | None) -> tuple[FloatAr
     back = np.flatnonzero(np.diff(recording.times) <= 0)
     if back.size:
         a, b = recording.times[back[0] : back[0] + 2]
-        raise error(
-            path,
-            f"times must increase, but frame {recording.frames[back[0] + 1]} is at {b:g} s after {a:g} s",
-            "sort the rows by time and drop repeated ones",
-        )
+        what = f"times must increase, but frame {recording.frames[back[0] + 1]} is at {b:g} s after {a:g} s"
+        raise error(path, what, "sort the rows by time and drop repeated ones")
     return recording.times, None
 
 
@@ -457,17 +453,10 @@ def build_marker_recording(
     if unit == "px" or not depth[np.isfinite(depth)].any():
         values, up = values[..., :2], up if not up.endswith("z") else ""
     usual = "-y" if unit == "px" else "y" if values.shape[2] == 2 or path.suffix.lower() == ".trc" else "z"
-    return Recording(
-        frames=frames,
-        at=np.repeat(np.arange(len(frames)), len(people)),
-        joints=values,
-        confidence=None,
-        tracks=people * len(frames) if len(people) > 1 else None,
-        times=times,
-        skeleton=Skeleton(path.stem, tuple(joints)),
-        up=up or estimate_up(values, joints, usual),
-        meta={"units": "m" if unit in METRES else unit} if unit else {},
-    )
+    meta = {"units": "m" if unit in METRES else unit} if unit else {}
+    up = up or estimate_up(values, joints, usual)
+    tracked = people if len(people) > 1 else None
+    return dense_recording(path, values, None, frames, tracked, joints, times=times, up=up, meta=meta)
 
 
 def split_people(names: Sequence[str]) -> tuple[list[str], list[str]]:

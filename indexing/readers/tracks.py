@@ -192,13 +192,11 @@ def _check_unique(path: Path, rows: Sequence[Row], point: str, views: IntArray, 
     before: dict[tuple[int, int], int] = {}
     for (line, cells), view, column in zip(rows, views.tolist(), columns.tolist(), strict=True):
         if (view, column) in before:
-            again = f"was in frame {shortest_repr(moments[view])} before, in row {before[view, column]}"
-            message = f"row {line}: point {column + 1} of the file {again}"
-            raise error(
-                path,
-                f"{message} (row: {clip_text(', '.join(cells), VALUE)})",
-                f"give each point one row per frame; column {quote(point)} names it",
+            what = (
+                f"row {line} ({clip_text(', '.join(cells), VALUE)}): it was in frame {shortest_repr(moments[view])} before,"
             )
+            remedy = f"give each point one row per frame; column {quote(point)} names it"
+            raise error(path, f"{what} in row {before[view, column]}", remedy)
         before[view, column] = line
 
 
@@ -296,9 +294,8 @@ def _select_prefix(path: Path, names: list[str], key: str | None) -> tuple[str, 
         known = f"its sequences are {listing(several)}" if several else f"its arrays are {listing(names)}"
         raise error(path, f"has no {'sequence' if several else 'array'} {quote(key)}", known)
     if key is None and several:
-        raise error(
-            path, f"holds {len(several)} sequences ({listing(several, 4)})", f"say which: --key {clip_text(several[0], VALUE)}"
-        )
+        what = f"holds {len(several)} sequences ({listing(several, 4)})"
+        raise error(path, what, f"say which: --key {clip_text(several[0], VALUE)}")
     before = "" if key is None else f"{key}/"
     name = next((f"{before}{kind}" for kind in ("tracks", "y") if f"{before}{kind}" in names), None)
     if name is None:

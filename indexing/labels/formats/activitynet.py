@@ -32,18 +32,10 @@ def read(data: Mapping[str, Any], asked: Request) -> LabelFile:
         if not isinstance(times, list) or len(times) != 2:
             raise error(asked.path, f"{where}: 'segment' is {quote(times)}, not [start, end]", REMEDY)
         score, modifiers = segment.get("score"), segment.get("modifiers")
-        if score is not None:
-            score = out.seconds(score, where, "score")
-        out.add(
-            text_of(segment.get("label")),
-            times[0],
-            times[1],
-            where,
-            media=video,
-            score=score,
-            modifiers=tuple(map(text_of, modifiers)) if isinstance(modifiers, list) else (),
-            **{name: text_of(segment.get(name)) for name in TEXTS},
-        )
+        fields: dict[str, Any] = {name: text_of(segment.get(name)) for name in TEXTS}
+        fields["score"] = None if score is None else out.seconds(score, where, "score")
+        fields["modifiers"] = tuple(map(text_of, modifiers)) if isinstance(modifiers, list) else ()
+        out.add(text_of(segment.get("label")), times[0], times[1], where, media=video, **fields)
     return out.finish()
 
 
@@ -76,9 +68,8 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
         write_json(target.path, {"version": "dyntorch", "results": videos, "external_data": {}})
         return []
     length = {"duration": target.duration} if target.duration is not None else {}
-    write_json(
-        target.path, {"version": "dyntorch", "database": {video: length | {"annotations": own} for video, own in videos.items()}}
-    )
+    database = {video: length | {"annotations": own} for video, own in videos.items()}
+    write_json(target.path, {"version": "dyntorch", "database": database})
     return []
 
 

@@ -347,21 +347,10 @@ def write(labels: Sequence[Label], target: Target) -> list[str]:
 
 
 def _empty_project() -> dict[str, Any]:
-    return {
-        "time_format": "hh:mm:ss",
-        "project_date": datetime.datetime.now().isoformat(timespec="seconds"),
-        "project_name": "dyntorch",
-        "project_description": "",
-        "project_format_version": VERSION,
-        "subjects_conf": {},
-        "behaviors_conf": {},
-        "behavioral_categories": [],
-        "independent_variables": {},
-        "coding_map": {},
-        "behaviors_coding_map": [],
-        "converters": {},
-        "observations": {},
-    }
+    about = {"time_format": "hh:mm:ss", "project_date": datetime.datetime.now().isoformat(timespec="seconds")}
+    about |= {"project_name": "dyntorch", "project_description": "", "project_format_version": VERSION}
+    tables = ("subjects_conf", "behaviors_conf", "independent_variables", "coding_map", "converters", "observations")
+    return about | {"behavioral_categories": [], "behaviors_coding_map": []} | {table: {} for table in tables}
 
 
 def _check_project(path: Path, data: Any) -> dict[str, Any]:
@@ -397,17 +386,9 @@ def _add_behaviours(draft: Draft, labels: Sequence[Label]) -> None:
             known[code] = lasts
             key = next((letter for letter in (code[:1].lower(), *ascii_lowercase, *digits) if letter not in keys), "")
             keys.add(key)
-            conf[_next_number(conf)] = {
-                "type": STATE if lasts else POINT,
-                "key": key,
-                "code": code,
-                "description": "",
-                "color": "",
-                "category": "",
-                "modifiers": _modifier_sets(own),
-                "excluded": "",
-                "coding map": "",
-            }
+            blank = dict.fromkeys(("description", "color", "category", "excluded", "coding map"), "")
+            kind = STATE if lasts else POINT
+            conf[_next_number(conf)] = {"type": kind, "key": key, "code": code, "modifiers": _modifier_sets(own)} | blank
         draft.codes[name] = code, known[code]
 
 
@@ -467,9 +448,8 @@ def _write_observations(draft: Draft, labels: Sequence[Label]) -> None:
         for number, layer in enumerate(layers):
             name = (observation or f"{target.tier} {base}".strip()) + f" ({number + 1})" * (number > 0)
             if name in others or name in written:
-                raise error(
-                    target.into or target.path, f"somebody's observation is called {name!r}", "rename it, or write to another file"
-                )
+                what = f"somebody's observation is called {name!r}"
+                raise error(target.into or target.path, what, "rename it, or write to another file")
             written[name] = _build_observation(draft, layer, there[media], known.get(there[media]))
             if not observation:
                 by = f" ({target.annotator})" * bool(target.annotator)
@@ -554,9 +534,7 @@ def _build_observation(draft: Draft, labels: Sequence[Label], media: str, like: 
         "events": _format_events(draft, labels),
         "observation time interval": [0, 0],
         "independent_variables": {},
-        "visualize_spectrogram": False,
-        "visualize_waveform": False,
-        "media_creation_date_as_offset": False,
+        **dict.fromkeys(("visualize_spectrogram", "visualize_waveform", "media_creation_date_as_offset"), False),
         "media_scan_sampling_duration": 0,
         "image_display_duration": 1,
         "close_behaviors_between_videos": False,

@@ -108,21 +108,13 @@ def _region(out: Gathering, region: Mapping[str, Any], media: str, who: str, whe
     meta = region.get("meta")
     meta = meta if isinstance(meta, dict) else {}
     text, modifiers, score = meta.get("text"), meta.get("modifiers"), region.get("score")
-    fields = {name: text_of(meta.get(name)) for name in TEXTS}
+    fields: dict[str, Any] = {name: text_of(meta.get(name)) for name in TEXTS}
+    fields |= {"media": media, "observation": who, "score": None if score is None else out.seconds(score, where, "score")}
+    fields["comment"] = "\n".join(map(text_of, text)) if isinstance(text, list) else text_of(text)
+    fields["modifiers"] = tuple(map(text_of, modifiers)) if isinstance(modifiers, list) else ()
     for start, end in times:
         for name in names or [""]:
-            out.add(
-                text_of(name),
-                start,
-                end,
-                where,
-                media=media,
-                observation=who,
-                comment="\n".join(map(text_of, text)) if isinstance(text, list) else text_of(text),
-                modifiers=tuple(map(text_of, modifiers)) if isinstance(modifiers, list) else (),
-                score=None if score is None else out.seconds(score, where, "score"),
-                **fields,
-            )
+            out.add(text_of(name), start, end, where, **fields)
 
 
 def _frames(out: Gathering, one: Any, where: str) -> tuple[float, float]:

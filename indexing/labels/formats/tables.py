@@ -50,19 +50,9 @@ def read(rows: list[Row], asked: Request) -> LabelFile:
         row = {name: cells[i].strip() if i < len(cells) else "" for name, i in columns.items()}
         where = f"line {line}"
         start, end = _frames(out, row, where) if framed else _seconds(out, row, where)
-        out.add(
-            row["label"],
-            start,
-            end,
-            where,
-            subject=row.get("subject", ""),
-            media=row.get("media", ""),
-            tier=row.get("tier", ""),
-            observation=row.get("observation", ""),
-            comment=row.get("comment", ""),
-            modifiers=tuple(row["modifiers"].split("|")) if row.get("modifiers") else (),
-            score=_score(asked.path, row.get("score", ""), where),
-        )
+        fields: dict[str, Any] = {name: row.get(name, "") for name in ("subject", "media", "tier", "observation", "comment")}
+        fields["modifiers"] = tuple(row["modifiers"].split("|")) if row.get("modifiers") else ()
+        out.add(row["label"], start, end, where, score=_score(asked.path, row.get("score", ""), where), **fields)
     return out.finish()
 
 

@@ -68,7 +68,10 @@ def write_clip_set(clips: Sequence[Clip], path: str | Path) -> None:
     for key in dict.fromkeys(key for clip in clips for key in clip.meta if key not in data):
         if key not in NOTES or all(key in clip.meta for clip in clips):
             data[key] = _column(path, clips, key)
-    _write(path, data)
+    if not path.parent.is_dir():
+        raise error(path, f"the folder {path.parent} does not exist", "create it first")
+    with replacing(path) as stream:
+        np.savez_compressed(stream, **data)  # type: ignore[arg-type]
 
 
 def _actions(path: Path, labels: list[Hashable | None]) -> dict[str, Array]:
@@ -82,9 +85,7 @@ def _actions(path: Path, labels: list[Hashable | None]) -> dict[str, Array]:
     whole = all(isinstance(label, (int, np.integer)) and not isinstance(label, bool) and label >= 0 for label in given)
     if not whole:
         odd = next(label for label in given if not isinstance(label, (int, np.integer)) or isinstance(label, bool) or label < 0)
-        raise error(
-            path, f"the label {quote(odd)} cannot be written with the others", "use text for all labels, or integers from 0 for all"
-        )
+        raise error(path, f"the label {quote(odd)} does not go with the others", "use text for all, or integers from 0 for all")
     return {"action": np.array([-1 if label is None else label for label in labels])}
 
 
@@ -94,9 +95,7 @@ def _bones(path: Path, clips: list[Clip]) -> dict[str, Array]:
         return {}
     if len(skeletons) > 1:
         names = ", ".join(sorted(skeleton.name for skeleton in skeletons))
-        raise error(
-            path, f"the clips have different skeletons ({names})", "write one file per skeleton, or set skeleton to one of them"
-        )
+        raise error(path, f"the clips have different skeletons ({names})", "write one file per skeleton")
     skeleton = skeletons.pop()
     return {
         "bones": np.array(skeleton.bones, dtype=np.int64).reshape(-1, 2),
@@ -108,9 +107,7 @@ def _bones(path: Path, clips: list[Clip]) -> dict[str, Array]:
 def _column(path: Path, clips: list[Clip], key: str) -> Array:
     lacking = [clip.name or str(i) for i, clip in enumerate(clips) if key not in clip.meta]
     if lacking:
-        raise error(
-            path, f"the clip {quote(lacking[0])} has no field {quote(key)}, other clips have", "give it to every clip, or to none"
-        )
+        raise error(path, f"the clip {quote(lacking[0])} has no field {quote(key)}, others have", "give it to all, or to none")
     try:
         column = np.asarray([clip.meta[key] for clip in clips])
     except ValueError:
@@ -118,13 +115,6 @@ def _column(path: Path, clips: list[Clip], key: str) -> Array:
     if column.dtype.kind not in "biufU":
         raise error(path, f"the field {quote(key)} is not numbers or text of one shape", "convert it, or drop it from Clip.meta")
     return column
-
-
-def _write(path: Path, data: dict[str, Array]) -> None:
-    if not path.parent.is_dir():
-        raise error(path, f"the folder {path.parent} does not exist", "create it first")
-    with replacing(path) as stream:
-        np.savez_compressed(stream, **data)  # type: ignore[arg-type]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -137,23 +127,17 @@ RESERVED |= {"bones", "parents", "joint_names", "skeleton_name"}
 NOTES = ("people", "layout", "may_lag")  # what readers say of some clips: left out of a set where not all have it
 SLOWEST, FASTEST = 1e-6, 1e6  # frames per second: two a month, and the fastest cameras there are
 LAST = 2**53  # whole numbers are exact below it
+OFFSETS = "save offsets (N + 1): where each clip starts, and the end"
 FORMS = {"joints": "joints (F, n, 2 or 3)", "frames": "frames (F, height, width)"}
 
 
 def require_array(path: Path, data: Mapping[str, Array], key: str, ndim: int) -> Array:
     """One array with so many axes, or an error that names what the file holds."""
     if key not in data:
-        raise error(
-            path,
-            f"is not a clip set: it has no {quote(key)} (it has {listing(data)})",
-            f"save {FORMS.get(key, key)}, offsets (N + 1), action (N)",
-        )
+        what = f"is not a clip set: it has no {quote(key)} (it has {listing(data)})"
+        raise error(path, what, f"save {FORMS.get(key, key)}, offsets (N + 1), action (N)")
     if data[key].ndim != ndim:
-        raise error(
-            path,
-            f"{key} must have {ndim} dimensions, got shape {data[key].shape}",
-            "see docs/guide/formats.md for the format",
-        )
+        raise error(path, f"{key} must have {ndim} dimensions, got shape {data[key].shape}", "see docs/guide/formats.md")
     return data[key]
 
 
@@ -163,30 +147,19 @@ def clip_offsets(path: Path, data: Mapping[str, Array], key: str) -> NDArray[np.
     if "offsets" not in data:
         actions = data.get("action", np.zeros(1))
         if actions.size > 1:
-            raise error(
-                path, f"has {actions.size} actions but no offsets", "save offsets (N + 1): where each clip starts, and the end"
-            )
+            raise error(path, f"has {actions.size} actions but no offsets", OFFSETS)
         return np.array([0, frames])
     offsets = require_array(path, data, "offsets", 1)
     if offsets.dtype.kind not in "iu" or len(offsets) < 2:
-        raise error(
-            path,
-            f"offsets must be at least 2 integers, got {offsets.dtype} {offsets.shape}",
-            "save where each clip starts, and the end",
-        )
+        raise error(path, f"offsets must be at least 2 integers, got {offsets.dtype} {offsets.shape}", OFFSETS)
     offsets = offsets.astype(np.int64)
     if offsets[0] != 0 or offsets[-1] != frames:
-        raise error(
-            path,
-            f"offsets run from {offsets[0]} to {offsets[-1]}, but {key} has {frames} frames",
-            "offsets must run from 0 to that number",
-        )
+        raise error(path, f"offsets run from {offsets[0]} to {offsets[-1]}, but {key} has {frames} frames", OFFSETS)
     stuck = np.flatnonzero(np.diff(offsets) <= 0)
     if stuck.size:
         i = int(stuck[0])
-        raise error(
-            path, f"offsets must increase, but offsets[{i}:{i + 2}] = {offsets[i : i + 2].tolist()}", "leave empty clips out"
-        )
+        both = offsets[i : i + 2].tolist()
+        raise error(path, f"offsets must increase, but offsets[{i}:{i + 2}] = {both}", "leave empty clips out")
     return offsets
 
 
@@ -225,9 +198,8 @@ def clip_labels(path: Path, data: Mapping[str, Array], count: int) -> list[Hasha
         return [i if i >= 0 else None for i in index]
     names = require_array(path, data, "action_names", 1)
     if max(index) >= len(names):
-        raise error(
-            path, f"action[{int(np.argmax(index))}] = {max(index)}, but there are {len(names)} action_names", "add the name"
-        )
+        at = int(np.argmax(index))
+        raise error(path, f"action[{at}] = {index[at]}, but there are {len(names)} action_names", "add the name")
     return [str(names[i]) if i >= 0 else None for i in index]
 
 
@@ -237,15 +209,12 @@ def frame_times(
     """``(F,)`` seconds, or None where neither times nor frame numbers are known."""
     key = next((key for key in ("times", "frame") if key in data), None)
     if rate.dtype.kind not in "fiu" or not ((rate >= SLOWEST).all() and (rate <= FASTEST).all()):
-        message = f"fps must be positive, from {SLOWEST:g} to {FASTEST:g}"
-        raise error(path, message, "save frames per second, one value or one per clip")
+        raise error(path, f"fps must be positive, from {SLOWEST:g} to {FASTEST:g}", "save one value, or one per clip")
     if key is None:
         return None
     stamps = data[key]
     if stamps.shape != (offsets[-1],) or stamps.dtype.kind not in "fiu":
-        raise error(
-            path, f"{key} must be {offsets[-1]} numbers, one per frame, got {stamps.dtype} {stamps.shape}", "save one per frame"
-        )
+        raise error(path, f"{key} must be {offsets[-1]} numbers, got {stamps.dtype} {stamps.shape}", "save one per frame")
     stamps = stamps.astype(np.float64)  # before any difference: unsigned frame numbers would wrap around
     odd = np.flatnonzero(~(np.abs(stamps) < LAST))
     if odd.size:
@@ -257,11 +226,8 @@ def frame_times(
     if not forward.all():
         row = int(np.argmin(forward)) + 1
         clip = int(np.searchsorted(offsets, row, side="right")) - 1
-        raise error(
-            path,
-            f"clip {quote(names[clip])}: {key} must increase, but row {row} has {stamps[row]:g} after {stamps[row - 1]:g}",
-            "sort the frames and drop repeated ones",
-        )
+        what = f"{key} must increase, but row {row} has {stamps[row]:g} after {stamps[row - 1]:g}"
+        raise error(path, f"clip {quote(names[clip])}: {what}", "sort the frames and drop repeated ones")
     return np.asarray(stamps if key == "times" else stamps / np.repeat(rate.astype(np.float64), np.diff(offsets)))
 
 
@@ -286,9 +252,8 @@ def read(source: Source, options: Options) -> ClipSet:
     """Read a clip set; ``person`` matters where its clips are the people of one recording, as ``dyntorch pose`` writes them."""
     if options.size is not None:
         raise error(source.path, "size= does not apply to a clip set", "leave size out")
-    clips = read_clip_set(
-        source.path, fps=options.fps, label=options.label, min_confidence=options.min_confidence, layout=options.layout
-    )
+    known = {name: getattr(options, name) for name in ("fps", "label", "min_confidence", "layout")}
+    clips = read_clip_set(source.path, **known)
     people = merge_people(clips)
     return clips if people is None else to_clips(source.path, people, replace(options, label=clips[0].label))
 
@@ -306,9 +271,7 @@ def read_clip_set(
     data = NumpyArchive(path)
     joints = require_array(path, data, "joints", 3)
     if joints.shape[2] not in (2, 3) or joints.dtype.kind not in "fiu":
-        raise error(
-            path, f"joints must be numbers (F, n, 2 or 3), got {joints.dtype} {joints.shape}", "save x, y or x, y, z per joint"
-        )
+        raise error(path, f"joints must be numbers (F, n, 2 or 3), got {joints.dtype} {joints.shape}", "save x, y or x, y, z")
     dims = joints.shape[2]
     if not joints.shape[1] or not len(joints):
         raise error(path, f"joints has shape {joints.shape}", "a clip needs at least one frame and one joint")
@@ -388,9 +351,8 @@ def _skeleton(path: Path, data: Mapping[str, Array], joints: int) -> Skeleton | 
         if "bones" in data:
             bones = [(a, b) for a, b in _parse_integers(data["bones"], 2).tolist()]
         else:
-            bones = [
-                (parent, i) for i, parent in enumerate(_parse_integers(data.get("parents", np.zeros(0)), 1).tolist()) if parent >= 0
-            ]
+            parents = _parse_integers(data.get("parents", np.zeros(0)), 1).tolist()
+            bones = [(parent, i) for i, parent in enumerate(parents) if parent >= 0]
         return Skeleton(str(data.get("skeleton_name", path.stem)), names, tuple(bones))
     except (TypeError, ValueError, OverflowError) as problem:
         raise error(path, f"bones or parents do not fit the joints ({problem})", "save bones (m, 2) or parents (n)") from None
@@ -460,9 +422,8 @@ def read_film_set(path: str | Path, *, fps: float | None = None) -> FilmSet:
     films = []
     for i, (start, end) in enumerate(pairwise(offsets.tolist())):
         clock = np.arange(end - start) / float(rate[i]) if times is None else times[start:end] - times[start]
-        films.append(
-            Film(frames[start:end], clock, labels[i], names[i], {key: to_python(values[i]) for key, values in meta.items()})
-        )
+        known = {key: to_python(values[i]) for key, values in meta.items()}
+        films.append(Film(frames[start:end], clock, labels[i], names[i], known))
     return FilmSet(films, path.name)
 
 

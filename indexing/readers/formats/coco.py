@@ -73,15 +73,10 @@ def _numbers(source: Source, images: dict[Hashable, Any]) -> dict[Hashable, int]
     for image, name in images.items():
         number = name if isinstance(name, int) else frame_number(str(name))
         if number is None:
-            raise error(
-                source.path, f"image {quote(name)} has no number in its name", "name the images by frame number, e.g. 000012.jpg"
-            )
+            raise error(source.path, f"image {quote(name)} has no number in its name", "name the images by frame: 000012.jpg")
         if number in owner:
-            raise error(
-                source.path,
-                f"images {quote(owner[number])} and {quote(name)} are both frame {number}",
-                "give one recording per file, with images numbered by frame",
-            )
+            what = f"images {quote(owner[number])} and {quote(name)} are both frame {number}"
+            raise error(source.path, what, "give one recording per file, with images numbered by frame")
         numbers[image], owner[number] = number, name
     return numbers
 

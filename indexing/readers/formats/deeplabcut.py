@@ -22,8 +22,7 @@ from indexing.opening import error, listing, quote
 from indexing.readers.files import Format, Options, Source, frame_number, read_columns
 from indexing.readers.hdf import AGAIN, Hdf5, open_hdf5
 from indexing.readers.pickles import unpickle_bytes
-from indexing.readers.recording import IntArray, Recording, to_clips
-from indexing.skeleton import Skeleton
+from indexing.readers.recording import IntArray, dense_recording, to_clips
 
 Layout = dict[str, dict[str, dict[str, int]]]  # animal -> body part -> coordinate -> column
 REMEDY = "export with deeplabcut.analyze_videos(..., save_as_csv=True) or analyze_videos_converth5_to_csv"
@@ -62,15 +61,9 @@ def _clips(source: Source, options: Options, layout: Layout, values: FloatArray,
     parts, kinds = list(first), list(next(iter(first.values())))
     table = values.reshape(-1, len(parts), len(kinds))  # one row per frame and animal
     dims = 3 if "z" in kinds else 2
-    recording = Recording(
-        frames=frames,
-        at=np.repeat(np.arange(len(frames)), len(layout)),
-        joints=table[..., :dims],
-        confidence=table[..., kinds.index("likelihood")] if "likelihood" in kinds else None,
-        tracks=list(layout) * len(frames) if tracked else None,
-        skeleton=Skeleton(source.path.stem, tuple(parts)),
-    )
-    return to_clips(source.path, recording, options)
+    sure = table[..., kinds.index("likelihood")] if "likelihood" in kinds else None
+    people = list(layout) if tracked else None
+    return to_clips(source.path, dense_recording(source.path, table[..., :dims], sure, frames, people, parts), options)
 
 
 def _layout(source: Source, parts: list[str], coords: list[str], individuals: list[str] | None) -> Layout:
@@ -91,11 +84,8 @@ def _layout(source: Source, parts: list[str], coords: list[str], individuals: li
                 who = f"{animal} {part}".strip()
                 raise error(source.path, f"{who} has the columns {', '.join(columns)}, not x, y, likelihood", REMEDY)
         if its.keys() != first.keys():
-            raise error(
-                source.path,
-                f"the individual {quote(animal)} has other body parts than the first",
-                "export animals of one kind per file",
-            )
+            what = f"the individual {quote(animal)} has other body parts than the first"
+            raise error(source.path, what, "export animals of one kind per file")
     return layout
 
 
@@ -103,9 +93,7 @@ def _frames(source: Source, keys: list[str]) -> IntArray:
     """Frame numbers from the index column: numbers, or names of images."""
     numbers = [int(key) if key.isdecimal() and len(key) < 16 else frame_number(key) for key in keys]
     if None in numbers:
-        raise error(
-            source.path, f"frame {quote(keys[numbers.index(None)])} has no number", "number the frames, or the images by frame"
-        )
+        raise error(source.path, f"frame {quote(keys[numbers.index(None)])} has no number", "number the frames, or the images")
     return np.array(numbers, dtype=np.int64)
 
 

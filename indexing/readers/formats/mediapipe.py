@@ -192,11 +192,8 @@ def _widen(
         landmarks = [str(int(name)) for name in landmarks]
         highest = max(map(int, names))
         if highest > MOST:
-            raise error(
-                source.path,
-                f"landmark {quote(highest)} is beyond any MediaPipe model",
-                f"number landmarks from 0 or 1 to at most {MOST}",
-            )
+            what = f"landmark {quote(highest)} is beyond any MediaPipe model"
+            raise error(source.path, what, f"number landmarks from 0 or 1 to at most {MOST}")
         names = [str(i) for i in range(min(1, *map(int, names)), highest + 1)]
     column = {name: i for i, name in enumerate(names)}
     joint = np.array([column[name.lower()] for name in landmarks])

@@ -14,8 +14,7 @@ from indexing.clip import COARSEST, FINEST, UP_AXES, ClipSet
 from indexing.opening import error, listing, quote
 from indexing.readers.files import Format, Options, Source
 from indexing.readers.hdf import Array, Hdf5, open_hdf5
-from indexing.readers.recording import Recording, to_clips
-from indexing.skeleton import Skeleton
+from indexing.readers.recording import Recording, dense_recording, to_clips
 
 AXES = ("time", "individuals", "keypoints", "space")
 USUAL = ("time", "space", "keypoints", "individuals")
@@ -49,16 +48,8 @@ def _recording(file: Hdf5, options: Options) -> Recording:
     table = position.reshape(-1, len(joints), len(space)).astype(np.float64)
     if confidence is not None:  # a hand-made label has none
         confidence = np.where(np.isnan(confidence) & ~np.isnan(table).any(axis=2), 1.0, confidence)
-    return Recording(
-        frames=numbers,
-        at=np.repeat(np.arange(frames), len(animals)),
-        joints=table,
-        confidence=confidence,
-        tracks=animals * frames if len(animals) > 1 else None,
-        times=times,
-        skeleton=Skeleton(file.path.stem, tuple(joints)),
-        up=_up(file, len(space)),
-    )
+    people, up = animals if len(animals) > 1 else None, _up(file, len(space))
+    return dense_recording(file.path, table, confidence, numbers, people, joints, times=times, up=up)
 
 
 def _axes(file: Hdf5, name: str, wanted: tuple[str, ...]) -> tuple[Array, list[str]]:

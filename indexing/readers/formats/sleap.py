@@ -23,7 +23,7 @@ from indexing.clip import COARSEST, FINEST, ClipSet, is_number
 from indexing.opening import error, listing, parse_json, quote
 from indexing.readers.files import Format, Options, Source, read_columns
 from indexing.readers.hdf import Array, Hdf5, open_hdf5
-from indexing.readers.recording import Recording, frame_numbers, to_clips
+from indexing.readers.recording import Recording, dense_recording, frame_numbers, to_clips
 from indexing.skeleton import Skeleton
 
 EXPORT = "export it again from SLEAP (File > Export Analysis HDF5)"
@@ -47,9 +47,7 @@ def _csv(source: Source) -> Recording:
     nodes = [name[:-2] for name in header if name.endswith(".x")]
     lacking = ["frame_idx"] * ("frame_idx" not in index) + [f"{node}.y" for node in nodes if f"{node}.y" not in index]
     if lacking or not nodes:
-        raise error(
-            source.path, f"has no column {quote((lacking or ['<node>.x'])[0])}", "export with SLEAP's File > Export Analysis CSV"
-        )
+        raise error(source.path, f"has no column {quote((lacking or ['<node>.x'])[0])}", "export with File > Export Analysis CSV")
     scored = all(f"{node}.score" in index for node in nodes)
     kinds = ("x", "y", "score") if scored else ("x", "y")
     columns = [index["frame_idx"], *(index[f"{node}.{kind}"] for node in nodes for kind in kinds)]
@@ -93,14 +91,8 @@ def _analysis(file: Hdf5) -> Recording:
     # occupancy is not needed: an animal that is not there has no coordinates
     joints = tracks.reshape(frames * animals, points, axes).astype(np.float64)
     confidence = None if scores is None else _scores(joints, scores.reshape(-1, points).astype(np.float64))
-    return Recording(
-        frames=np.arange(frames),
-        at=np.repeat(np.arange(frames), animals),
-        joints=joints,
-        confidence=confidence,
-        tracks=_number_duplicates(names or [""] * animals) * frames if animals > 1 or any(names) else None,
-        skeleton=Skeleton(file.path.stem, tuple(nodes), tuple(_bones(file, len(nodes)))),
-    )
+    people = _number_duplicates(names or [""] * animals) if animals > 1 or any(names) else None
+    return dense_recording(file.path, joints, confidence, np.arange(frames), people, nodes, _bones(file, len(nodes)))
 
 
 def _axes(file: Hdf5, name: str, wanted: Sequence[str], usual: Sequence[str]) -> Array:
@@ -179,11 +171,8 @@ def _one_video(file: Hdf5, video: Array) -> float | None:
         about, names = [], []
     if len(used) > 1:
         video_names = listing(str(names[i]).replace("\\", "/").rpartition("/")[2] if i < len(names) else i for i in used)
-        raise error(
-            file.path,
-            f"has labels in {len(used)} videos ({video_names})",
-            "export each video by itself: File > Export Analysis HDF5",
-        )
+        remedy = "export each video by itself: File > Export Analysis HDF5"
+        raise error(file.path, f"has labels in {len(used)} videos ({video_names})", remedy)
     try:
         fps = about[used[0]]["backend"].get("fps")
         return float(fps) if isinstance(fps, (int, float)) and COARSEST <= fps <= FINEST else None

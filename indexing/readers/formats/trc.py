@@ -15,11 +15,11 @@ import numpy as np
 from indexing.clip import COARSEST, FINEST, ClipSet, FloatArray
 from indexing.opening import WIDEST, error, first_duplicate, listing, quote, read_text
 from indexing.readers.files import Format, Options, Source
+from indexing.readers.points import number as parse_cell
 from indexing.readers.recording import IntArray, build_marker_recording, frame_numbers, to_clips
 
 HEAD = "PathFileType"
 UNITS = ("m", "cm", "mm", "px", "in", "meters", "metres", "millimeters", "inches", "pixels", "unknown")
-MISSING = ("", "nan", "na", "n/a", "none", "null")
 REMEDY = "export it again as TRC, with tabs between the cells"
 MAX_ROUNDING = 0.05
 """Of the step between frames, by which times that were rounded are off a steady rate: three digits at 60 to 100 frames per second
@@ -99,14 +99,11 @@ def _row(path: Path, number: int, line: str, names: list[str]) -> FloatArray:
         raise error(path, f"line {number} has no frame and time", "the file may be truncated: export it again")
     values = np.full(width, np.nan)
     for column, cell in enumerate(cells[:width]):
-        word = cell.strip()
-        if word.lower() in MISSING:
-            continue
-        try:
-            values[column] = float(word)
-        except ValueError:
+        value = parse_cell(cell)
+        if value is None:
             what = "Frame#" if column == 0 else "Time" if column == 1 else names[(column - 2) // 3]
-            raise error(path, f"line {number}, {quote(what)}: {quote(cell)} is no number", "correct it or leave it empty") from None
+            raise error(path, f"line {number}, {quote(what)}: {quote(cell)} is no number", "correct it or leave it empty")
+        values[column] = value
     return values
 
 

@@ -72,9 +72,7 @@ def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
     files: list[FrameFile] = source.data
     lines = [(file, n, words) for file in files for n, words in enumerate(_split_lines(file), start=1)]
     if not lines:
-        raise error(
-            source.path, f"no person was detected in any of {len(files)} frames", "check the video or the model's threshold"
-        )
+        raise error(source.path, f"no person was detected in any of {len(files)} frames", "check the model's threshold")
     width = len(lines[0][2])
     rows: list[list[float]] = []
     for file, n, words in lines:
@@ -83,11 +81,8 @@ def _labels(source: Source) -> list[tuple[int, list[Detection]]]:
         except ValueError:
             raise error(file.path, f"line {n} is not a list of numbers: {clip_text(' '.join(words), VALUE)}", TEXT_REMEDY) from None
         if len(words) != width:
-            raise error(
-                file.path,
-                f"line {n} has {len(words)} numbers, the first person {width}",
-                "export all frames with the same model and options",
-            )
+            what = f"line {n} has {len(words)} numbers, the first person {width}"
+            raise error(file.path, what, "export all frames with the same model and options")
     table = np.array(rows)
     odd = np.argwhere(~(np.abs(table) < LARGEST))
     if len(odd):

@@ -103,14 +103,10 @@ def _parameters(markers: Markers, first: int, path: Path) -> bytes:
     points += [_texts("UNITS", [markers.units]), _texts("X_SCREEN", [right]), _texts("Y_SCREEN", [upwards])]
     for begin in range(0, count, LABELS):
         more = "" if not begin else str(begin // LABELS + 1)
-        points += [
-            _texts(f"LABELS{more}", names[begin : begin + LABELS]),
-            _texts(f"DESCRIPTIONS{more}", [""] * len(names[begin : begin + LABELS])),
-        ]
-    trial = [
-        _integers(name, [number & WORD, number >> 16])
-        for name, number in (("ACTUAL_START_FIELD", first), ("ACTUAL_END_FIELD", last))
-    ]
+        held = names[begin : begin + LABELS]
+        points += [_texts(f"LABELS{more}", held), _texts(f"DESCRIPTIONS{more}", [""] * len(held))]
+    fields = (("ACTUAL_START_FIELD", first), ("ACTUAL_END_FIELD", last))
+    trial = [_integers(name, [number & WORD, number >> 16]) for name, number in fields]
     analog = [_integers("USED", [0]), _reals("RATE", [0.0]), _reals("GEN_SCALE", [1.0])]
 
     def groups(data_start: int) -> bytes:
@@ -124,11 +120,8 @@ def _parameters(markers: Markers, first: int, path: Path) -> bytes:
 
     blocks = -(-(4 + len(groups(0))) // BLOCK)
     if blocks > BLOCKS:
-        raise error(
-            path,
-            f"the names of its {count} points take {blocks} blocks, and C3D holds {BLOCKS}",
-            "give shorter names, or write .npz",
-        )
+        what = f"the names of its {count} points take {blocks} blocks, and C3D holds {BLOCKS}"
+        raise error(path, what, "give shorter names, or write .npz")
     body = bytes([1, KEY, blocks, INTEL]) + groups(2 + blocks)
     return body + bytes(-len(body) % BLOCK)
 

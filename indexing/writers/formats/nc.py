@@ -57,9 +57,9 @@ def dataset_of(clips: Sequence[Clip], path: Path = Path("dataset")) -> Any:
         if clip.confidence is not None:
             sure[np.searchsorted(times, clip.times), :, i] = clip.confidence
     joints = first.skeleton.joints if first.skeleton is not None else [f"keypoint_{i}" for i in range(shape[2])]
-    clock, unit = (
-        (times, "seconds") if not first.fps_assumed else (np.rint(times * float(first.fps or 30.0)).astype(np.int64), "frames")
-    )
+    clock, unit = times, "seconds"
+    if first.fps_assumed:
+        clock, unit = np.rint(times * float(first.fps or 30.0)).astype(np.int64), "frames"
     coords = (clock, list("xyz"[: first.dims]), list(joints), [who or "id_0" for who in people])
     return xarray.Dataset(
         data_vars={

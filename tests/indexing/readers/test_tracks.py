@@ -117,7 +117,7 @@ BAD_TABLES = [
     ("frame,x,y\n0,1,2\n", r"no column names the points \(its columns are frame, x, y\); name the columns"),
     ("frame,id,x,y\n,a,1,2\n", r"row 2, column 'frame': is empty"),
     ("frame,id,x,y\n0,,1,2\n", r"row 2, column 'id': is empty"),
-    ("frame,id,x,y\n0,a,1,2\n1,a,1,2\n0,a,1,2\n", r"row 4: .* in frame 0 before, in row 2 .*; give each point one row"),
+    ("frame,id,x,y\n0,a,1,2\n1,a,1,2\n0,a,1,2\n", r"row 4 .* in frame 0 before, in row 2; give each point one row"),
     ("frame,time,id,x,y\n0,0,a,1,2\n0,1,b,1,2\n", r"row 3: frame 0 has the time 1 here and 0 before; a view has one time"),
     ("frame,id,x,y,weight\n0,a,1,2,-1\n", r"row 2, column 'weight': the weight is -1"),
     ("frame,id,x,y\n0,a,1,2\n0,b,1,2\n", r"holds 1 view"),

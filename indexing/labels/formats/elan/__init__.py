@@ -41,14 +41,8 @@ EMPTY = """<?xml version="1.0" encoding="UTF-8"?>
  STEREOTYPE="Included_In"/>
 </ANNOTATION_DOCUMENT>
 """
-MIME = {
-    ".mp4": "video/mp4",
-    ".m4v": "video/mp4",
-    ".mov": "video/quicktime",
-    ".mpg": "video/mpeg",
-    ".mpeg": "video/mpeg",
-    ".wav": "audio/x-wav",
-}
+MIME = dict.fromkeys((".mp4", ".m4v"), "video/mp4") | dict.fromkeys((".mpg", ".mpeg"), "video/mpeg")
+MIME |= {".mov": "video/quicktime", ".wav": "audio/x-wav"}
 
 
 @dataclass(frozen=True)
@@ -202,9 +196,8 @@ def _edits(document: Document, target: Target, rows: Sequence[TierRow], bases: s
     gone = {part.element for part in old}
     used = {slot for part in tiers_there if part.element not in gone for slot in document.uses.get(part.element, ())}
     freed = {slot for element in gone for slot in document.uses.get(element, ()) if slot in document.slots} - used
-    edits = [document.remove_element(part.first, part.last) for part in old] + [
-        document.remove_element(*document.slots[slot]) for slot in freed
-    ]
+    places = [(part.first, part.last) for part in old] + [document.slots[slot] for slot in freed]
+    edits = [document.remove_element(*place) for place in places]
     slot = max((_number("ts", name) for name in document.slots if name not in freed), default=0)
     number = max((number for element, number in document.numbers.items() if element not in gone), default=0)
     order, tiers = [], []

@@ -190,9 +190,8 @@ def _medium(out: Gathering, root: Element) -> tuple[str, float]:
 
 
 REMEDY = "open it in ELAN, mend it and save it again"
-MACHINE = (
-    "dyntorch"  # the linguistic type of tiers that a program wrote, and how their annotator begins until a person takes them over
-)
+MACHINE = "dyntorch"
+"""The linguistic type of tiers that a program wrote, and how their annotator begins until a person takes them over."""
 
 
 @dataclass(slots=True, eq=False)
