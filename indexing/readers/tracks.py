@@ -192,9 +192,7 @@ def _check_unique(path: Path, rows: Sequence[Row], point: str, views: IntArray, 
     before: dict[tuple[int, int], int] = {}
     for (line, cells), view, column in zip(rows, views.tolist(), columns.tolist(), strict=True):
         if (view, column) in before:
-            what = (
-                f"row {line} ({clip_text(', '.join(cells), VALUE)}): it was in frame {shortest_repr(moments[view])} before,"
-            )
+            what = f"row {line} ({clip_text(', '.join(cells), VALUE)}): it was in frame {shortest_repr(moments[view])} before,"
             remedy = f"give each point one row per frame; column {quote(point)} names it"
             raise error(path, f"{what} in row {before[view, column]}", remedy)
         before[view, column] = line
