@@ -1,11 +1,8 @@
 """Lens distortion: against OpenCV, finite differences and closed forms."""
 
-import math
-
 import pytest
 import torch
 
-from dyntorch.geometry import lens as lens_module
 from dyntorch.geometry.epipolar_fit import Frames
 from dyntorch.geometry.lens import Division, LensDescent, LensMatches, distort, fit_distortion, undistort, undistort_points
 from dyntorch.scenes import two_view
@@ -226,17 +223,6 @@ def test_the_descent_never_rises_and_keeps_fixed_lenses():
         found = start.descend(data, scale, lens=lens)
         assert (found.cost(data, scale) <= start.cost(data, scale)).all()
         assert torch.equal(found.lens, start.lens) != lens
-
-
-@pytest.mark.slow
-def test_what_decides_that_there_is_distortion(monkeypatch):
-    matches = seen((-0.2, -0.1))
-    assert fit_distortion(*matches, sizes=(SIZE, SIZE)).significant
-    monkeypatch.setattr(lens_module, "MIN_F_RATIO", math.inf)
-    assert not fit_distortion(*matches, sizes=(SIZE, SIZE)).significant
-    monkeypatch.setattr(lens_module, "MIN_MATCHES", 10**6)
-    many = fit_distortion(*matches, sizes=(SIZE, SIZE))
-    assert not many.significant and many.sigmas == (math.inf, math.inf)
 
 
 def test_misuse():

@@ -1,7 +1,5 @@
 """Grassmann tensors as an invariant: counts by ranks, the classical tensors that they contain, lines on which points move."""
 
-from math import comb
-
 import pytest
 import torch
 
@@ -9,7 +7,7 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
 from dyntorch.numerics.least_squares import jacobian
-from tests.battery.projections import minors, tensor_error
+from tests.battery.projections import tensor_error
 from tests.battery.references import rank, subdeterminants
 from tests.draws import random, seeded
 from tests.grid import assert_refused
@@ -199,19 +197,6 @@ def test_dual_views_of_lines():
     assert tensor_error(small.profile, refined.motion, moved).max() < 1e-6
 
 
-def test_compose_is_made_of_determinants():
-    for invariant in (TRIFOCAL, dyn.GrassmannTensor(6, (3, 3, 1), (3, 3, 2))):
-        motion = projections(invariant, 2)
-        expected = minors(invariant.profile, motion)
-        expected = expected / expected.norm(dim=-1, keepdim=True)
-        torch.testing.assert_close(invariant.compose(*motion).flatten(1), expected)
-        assert invariant.shape() == tuple(comb(m, a) for m, a in zip(invariant.sizes, invariant.profile, strict=True))
-    common = projections(TRIFOCAL, 1)
-    common[0][..., 0], common[1][..., 0], common[2][..., 0] = 0.0, 0.0, 0.0
-    zero = tuple(m.clone() for m in common)
-    assert TRIFOCAL.compose(*zero).abs().max() < 1e-15 and TRIFOCAL.compose(*zero).isfinite().all()
-
-
 def test_decompose_of_what_is_no_tensor():
     tensor = random(4, 3, 3, 3)
     tensor[1], tensor[2, 0] = 0.0, torch.nan
@@ -220,21 +205,10 @@ def test_decompose_of_what_is_no_tensor():
     for part, one in zip(motion, alone, strict=True):
         assert part.isfinite().all() and part[1:3].abs().max() == 0
         torch.testing.assert_close(part[[0, 3]], one)
+    blind = tuple(m * (torch.arange(4) > 0) for m in projections(TRIFOCAL, 1))
+    assert TRIFOCAL.compose(*blind).abs().max() < 1e-15 and TRIFOCAL.compose(*blind).isfinite().all()
     starts = TRIFOCAL.starts(tensor)
     assert all(s.shape[1:] == (4, 3, 4) and s.isfinite().all() for s in starts)
-
-
-def test_decompose_is_that_of_the_nearest_tensor():
-    """A tensor with noise: no other projections come nearer."""
-    exact = TRIFOCAL.compose(*projections(TRIFOCAL)).flatten()
-    noisy = exact + 0.02 * random(27, seed=4)
-    noisy = noisy / noisy.norm()
-    found = TRIFOCAL.decompose(noisy.reshape(3, 3, 3))
-    best = (minors(TRIFOCAL.profile, found) @ noisy).abs() / minors(TRIFOCAL.profile, found).norm()
-    assert best > (exact @ noisy).abs() / exact.norm()
-    for seed in range(10):
-        other = tuple(m + 1e-4 * random(3, 4, seed=60 + seed) for m in found)
-        assert (minors(TRIFOCAL.profile, other) @ noisy).abs() / minors(TRIFOCAL.profile, other).norm() <= best * (1 + 1e-12)
 
 
 def test_it_is_a_value_with_parameters_that_fit():

@@ -5,8 +5,6 @@ import math
 import pytest
 import torch
 
-from dyntorch.shapes import moving
-from dyntorch.shapes import times as shape_times
 from dyntorch.shapes.basis import Fourier, Polynomial
 from dyntorch.shapes.moving import (
     ShapeDescent,
@@ -251,24 +249,6 @@ def test_similarities_of_single_views_change_nothing_and_dtype_is_kept():
     assert single.shapes.dtype == torch.float32
     torch.testing.assert_close(single.shapes.double(), first.shapes, rtol=1e-3, atol=1e-3)
     assert recover_times(single.shapes, Polynomial(1), x.float()).times.dtype == torch.float32
-
-
-def test_what_decides_the_shapes_and_their_times(monkeypatch):
-    t = times(30)
-    x, _ = moving_views(LINEAR, t, n=8, noise=0.02)
-    rows = Polynomial(1).rows(t)
-    found = fit_shapes(x, rows)
-    assert not found.degenerate
-    seen = recover_times(found.shapes, Polynomial(1), x)
-    with monkeypatch.context() as patch:
-        patch.setattr(moving, "FREE_EIGENVALUE", 2.0)
-        patch.setattr(moving, "EXACT_NOISE", 1.0)
-        assert fit_shapes(x, rows).degenerate
-    with monkeypatch.context() as patch:
-        patch.setattr(shape_times, "TIME_STEPS", 0)
-        assert (seen.times != recover_times(found.shapes, Polynomial(1), x).times).any()
-    monkeypatch.setattr(shape_times, "NUM_MINIMA", 2)
-    torch.testing.assert_close(recover_times(found.shapes, Polynomial(1), x).times, seen.times)
 
 
 def test_misuse():
