@@ -36,13 +36,19 @@ class Told:
         return np.array([clip.label for clip in clips])
 
 
-def test_every_subject_is_left_out_once() -> None:
+def test_every_subject_and_class_is_left_out_once_in_even_groups() -> None:
     subjects = np.array([2, 1, 2, 3, 1])
     folds = list(protocol.leave_one_subject_out(subjects))
     assert sorted(np.concatenate([test for _, test in folds]).tolist()) == [0, 1, 2, 3, 4]
     for train, test in folds:
-        assert len(set(subjects[test])) == 1
-        assert not set(subjects[train]) & set(subjects[test])
+        assert len(set(subjects[test])) == 1 and not set(subjects[train]) & set(subjects[test])
+    subjects = np.array([7, 3, 3, 9, 5, 1, 7])
+    assert protocol.merged(subjects, 2).tolist() == [1, 0, 0, 1, 0, 0, 1] and len(np.unique(protocol.merged(subjects, 9))) == 5
+    companies = open_set.companies(np.repeat(list("abcdefg"), 2), 3, seed=0)
+    assert sorted(np.concatenate(companies).tolist()) == list("abcdefg") and max(map(len, companies)) == 3
+    labels = np.repeat(["a", "b", "c"], [5, 3, 1])
+    chosen = protocol.few(labels, 2, np.random.default_rng(0))
+    assert len(set(chosen.tolist())) == len(chosen) and [int((labels[chosen] == name).sum()) for name in "abc"] == [2, 2, 1]
 
 
 def test_rendering_depends_on_the_seed_only(people: ClipSet) -> None:
@@ -63,13 +69,6 @@ def test_accuracy_counts_every_clip_at_every_turn(people: ClipSet) -> None:
     assert protocol.accuracy_by_turn(lambda: Told(seen), rendered).tolist() == [1.0] * 4
     assert protocol.accuracy_by_turn(lambda: Told(seen), rendered, solid=True).tolist() == [1.0] * 4
     assert seen == [(2, 6)] * 3 + [(3, 6)] * 3
-
-
-def test_few_draws_the_same_number_of_every_class() -> None:
-    labels = np.repeat(["a", "b", "c"], [5, 3, 1])
-    chosen = protocol.few(labels, 2, np.random.default_rng(0))
-    assert len(set(chosen.tolist())) == len(chosen)
-    assert [int((labels[chosen] == name).sum()) for name in "abc"] == [2, 2, 1]
 
 
 def test_runs_and_cuts_of_a_stream() -> None:
@@ -97,18 +96,6 @@ def test_stream_accuracy_asks_the_other_subject_only(people: ClipSet) -> None:
     accuracy, count = protocol.stream_accuracy(lambda: ActionIndexer(scorer="nearest"), exercises, 0)
     assert count == sum(len(one.labels) for one in exercises)
     assert accuracy.shape == (2,) and accuracy[0] > 0.8
-
-
-def test_subjects_are_merged_into_even_groups() -> None:
-    subjects = np.array([7, 3, 3, 9, 5, 1, 7])
-    assert protocol.merged(subjects, 2).tolist() == [1, 0, 0, 1, 0, 0, 1]
-    assert len(np.unique(protocol.merged(subjects, 9))) == 5
-
-
-def test_every_class_is_held_out_once() -> None:
-    companies = open_set.companies(np.repeat(list("abcdefg"), 2), 3, seed=0)
-    assert sorted(np.concatenate(companies).tolist()) == list("abcdefg")
-    assert max(map(len, companies)) == 3
 
 
 def test_open_set_figures_by_hand() -> None:

@@ -13,19 +13,14 @@ from experiments.common.results import COMMAND, MARK, RESULTS, as_markdown, page
 PAGES = sorted(path for path in RESULTS.glob("*.md") if path.stem not in ("index", "one_example"))
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
-def test_every_page_states_a_command_that_exists(path):
-    text = path.read_text(encoding="utf-8")
-    stated = COMMAND.search(text.partition(MARK)[0])
-    assert stated is not None
-    assert MARK in text
-    assert page_name(stated["module"]) == path.stem
-    assert importlib.util.find_spec(stated["module"]) is not None
-
-
-def test_every_page_is_in_the_list():
+def test_every_page_states_a_command_that_exists_and_is_in_the_list():
     patterns = (RESULTS / "index.md").read_text(encoding="utf-8").splitlines()
-    assert not [path.stem for path in PAGES if not any(fnmatch(path.stem, pattern) for pattern in patterns)]
+    for path in PAGES:
+        text = path.read_text(encoding="utf-8")
+        stated = COMMAND.search(text.partition(MARK)[0])
+        assert stated is not None and MARK in text, path.stem
+        assert page_name(stated["module"]) == path.stem and importlib.util.find_spec(stated["module"]) is not None
+        assert any(fnmatch(path.stem, pattern) for pattern in patterns), path.stem
 
 
 @pytest.mark.parametrize(("words", "written"), [(["--scenes", "20"], True), (["--scenes", "3"], False), ([], False)])
@@ -42,7 +37,7 @@ def test_a_command_writes_its_page_only_as_the_page_says(tmp_path, capsys, words
     assert ("| new |\n|---|\n\n```text\ntwo\nlines\n```\n" in text and "*Measured on 20" in text) == written
 
 
-def test_a_new_script_gets_a_page(tmp_path, monkeypatch):
+def test_a_new_script_gets_a_page_and_what_fails_or_has_no_folder_none(tmp_path, monkeypatch):
     monkeypatch.setattr(sys.modules["__main__"], "__doc__", "What was asked.\n\nMore.")
     with published("experiments.benchmarks.new_one", ["--seeds", "2"], {}, tmp_path):
         print("| a |\n|---|")
@@ -50,19 +45,10 @@ def test_a_new_script_gets_a_page(tmp_path, monkeypatch):
     assert text.startswith(
         "# Benchmarks-new one\n\nWhat was asked.\n\n`python -m experiments.benchmarks.new_one --seeds 2`\n\n" + MARK
     )
-
-
-def test_what_fails_writes_nothing(tmp_path):
-    with pytest.raises(ValueError, match="no data"), published("experiments.some", [], {}, tmp_path):
+    with pytest.raises(ValueError, match="no data"), published("experiments.some", [], {}, tmp_path / "none"):
         raise ValueError("no data")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_nothing_is_written_without_a_folder_of_pages_or_for_other_programs(tmp_path):
-    with published("experiments.some", [], {}, tmp_path / "none"), published("pytest.__main__", [], {}, tmp_path):
-        print("| a |")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_headings_are_below_the_title():
-    assert as_markdown("\n### T\n\n| a |\n|---|\n") == "### T\n\n| a |\n|---|"
+    for program, folder in (("experiments.some", tmp_path / "none"), ("pytest.__main__", tmp_path)):
+        with published(program, [], {}, folder):
+            print("| a |")
+    assert [path.name for path in tmp_path.iterdir()] == ["benchmarks-new_one.md"]
+    assert as_markdown("\n### T\n\n| a |\n|---|\n") == "### T\n\n| a |\n|---|"  # headings are below the title

@@ -19,11 +19,15 @@ from experiments.common import real_data
 pytestmark = pytest.mark.skipif(not os.environ.get("DYNTORCH_DATA"), reason="DYNTORCH_DATA is not set: no real data")
 
 
+def scored(name: str, triple: int) -> tuple:
+    """A recording of traffic, and how three of its frames are aligned."""
+    sequence = next(one for one in real_data.traffic() if one.name == name)
+    return sequence, real_planar.scored(sequence, real_planar.triples(len(sequence.tracks))[triple], real_planar.Config())
+
+
 @pytest.mark.parametrize("name", ["cars2B", "cars3", "cars7"])
 def test_cars_move_and_roads_do_not(name: str) -> None:
-    sequence = next(one for one in real_data.traffic() if one.name == name)
-    frames = real_planar.triples(len(sequence.tracks))[1]
-    one = real_planar.scored(sequence, frames, real_planar.Config())
+    sequence, one = scored(name, 1)
     assert one.result.status == dyn.Status.OK
     assert one.accuracy > 0.95
     assert one.share(STATIC, ~sequence.background) == 0
@@ -33,8 +37,7 @@ def test_cars_move_and_roads_do_not(name: str) -> None:
 
 
 def test_a_car_that_turns_is_not_on_a_straight_path() -> None:
-    sequence = next(one for one in real_data.traffic() if one.name == "cars4")
-    one = real_planar.scored(sequence, real_planar.triples(len(sequence.tracks))[0], real_planar.Config())
+    sequence, one = scored("cars4", 0)
     assert one.share(OUTLIER, ~sequence.background) > 0.9
     assert one.share(STATIC, sequence.background) > 0.9
     assert one.error < 2
@@ -55,19 +58,6 @@ def test_points_that_all_move_on_a_board_give_its_homographies() -> None:
     assert real_planar.transfer(one.B, views, everyone) < 2
     # the hops are in a plane that really moved: without its motion they are far off
     assert real_planar.transfer(torch.eye(3).double(), views, everyone) > 5
-
-
-def test_lens_distortion_is_inverted() -> None:
-    matrix = np.array([[700.0, 0, 620], [0, 705, 350], [0, 0, 1]])
-    k1, k2, p1, p2, k3 = distortions = np.array([0.19, -0.26, 0.003, -0.005, 0.11])
-    ideal = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
-    x, y = ideal.T
-    r = x * x + y * y
-    radial = 1 + k1 * r + k2 * r**2 + k3 * r**3
-    bent = np.stack([x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x), y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y], -1)
-    pixels = bent * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
-    expected = ideal * matrix[[0, 1], [0, 1]] + matrix[:2, 2]
-    np.testing.assert_allclose(real_data.undistorted(pixels, matrix, distortions), expected, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -57,12 +57,9 @@ def test_the_movement_is_that_of_its_triangulation(calibrated):
     _, folder = calibrated
     known, clip = np.load(FILE), ClipSet.load(folder / "keypoints_3d.trc")[0]
     names = {
-        "RKnee": "right_knee",
-        "LKnee": "left_knee",
-        "RAnkle": "right_ankle",
-        "LAnkle": "left_ankle",
-        "RShoulder": "right_shoulder",
+        f"{side[0].upper()}{part}": f"{side}_{part.lower()}" for part in ("Knee", "Ankle", "Shoulder") for side in ("right", "left")
     }
+    del names["LShoulder"]
     theirs = known["trc_filt"][:, [list(known["trc_names"]).index(name) for name in names]]
     ours = clip.joints[:, [clip.skeleton.joints.index(name) for name in names.values()]]
     rows = np.rint(clip.times * 60).astype(int)
