@@ -47,9 +47,7 @@ def relative_error(estimated: Tensor, true: Tensor, *, dims: int = 2) -> Tensor:
     return torch.minimum((e - t).norm(dim=-1), (e + t).norm(dim=-1))
 
 
-def grid_transfer_error(
-    estimated: Tensor, true: Tensor, width: float, height: float, *, reduction: str = "rms", count: int = 10
-) -> Tensor:
+def grid_transfer_error(estimated: Tensor, true: Tensor, width: float, height: float, *, count: int = 10) -> Tensor:
     r"""How far two homographies carry the points of an image apart: :math:`\|\pi(A x) - \pi(A_{true} x)\|` over a grid.
 
     Args:
@@ -57,14 +55,13 @@ def grid_transfer_error(
         true: ``(*batch, 3, 3)``.
         width: of the image the grid covers, pixels.
         height: of the image, pixels.
-        reduction: ``"rms"``, ``"median"`` or ``"max"`` over the grid.
         count: points per row and column of the grid, borders included.
 
     Returns:
-        ``(*batch,)`` pixels; infinite for NaN.
+        ``(*batch,)`` pixels, rms over the grid; infinite for NaN.
 
     Raises:
-        ValueError: unknown reduction, count < 2.
+        ValueError: count < 2.
 
     Example:
         >>> import torch
@@ -73,14 +70,11 @@ def grid_transfer_error(
         >>> round(float(grid_transfer_error(-2 * shift, torch.eye(3, dtype=torch.float64), 640, 480)), 6)
         3.0
     """
-    if count < 2 or reduction not in ("rms", "median", "max"):
-        raise ValueError(f"count must be >= 2 and reduction 'rms', 'median' or 'max', got {count} and {reduction!r}")
+    if count < 2:
+        raise ValueError(f"count must be >= 2, got {count}")
     x, y = (torch.linspace(0, extent, count, dtype=true.dtype, device=true.device) for extent in (width, height))
     grid = torch.cartesian_prod(x, y)
-    distance = (apply(estimated, grid) - apply(true, grid)).norm(dim=-1).nan_to_num(nan=torch.inf, posinf=torch.inf)
-    if reduction == "max":
-        return distance.amax(-1)
-    return distance.median(dim=-1).values if reduction == "median" else distance.square().mean(-1).sqrt()
+    return point_error(estimated, true, grid)
 
 
 def point_error(estimated: Tensor, true: Tensor, points: Tensor) -> Tensor:

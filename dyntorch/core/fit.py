@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +19,7 @@ from dyntorch.core.normalize import Normalization, denormalize, normalization
 from dyntorch.core.outcome import Status, is_failure
 from dyntorch.core.primitives import Primitive
 from dyntorch.core.solution import Solution, with_copies
-from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
+from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
 from dyntorch.numerics.eigenspaces import on_host, orthonormal
 from dyntorch.numerics.function_transforms import over_problems
 from dyntorch.numerics.nullspace import GramNullSpace, gram_null_space, null_space
@@ -113,8 +114,7 @@ def fit_matches(invariant: Invariant, data: Matches, *, normalize: bool = True) 
     solve = partial(_fit_blocks, invariant, normalize, torch.finfo(data.dtype).eps)
     (views, present), fits = over_problems(solve, data.views, data.weights, data.static)
     data = replace(data, views=views, weights=present)
-    pairs = zip(invariant.primitives, fits.transforms, strict=True)
-    norm = Normalization(fits.transforms, tuple(p.normalize(t) for p, t in pairs), fits.actions)
+    norm = Normalization.of(invariant, fits.transforms)
     tensor, status, uncertainty = (data.back(part) for part in (fits.tensor, fits.status, fits.uncertainty))
     return Solution(invariant, tensor, uncertainty, data, norm, fits.normalized, status=status)
 
@@ -127,7 +127,6 @@ class LinearFits(NamedTuple):
     status: Tensor
     uncertainty: Tensor
     transforms: tuple[Tensor, ...]
-    actions: tuple[Tensor, ...]
     """As in :class:`~dyntorch.core.normalize.Normalization`."""
 
 
@@ -146,12 +145,8 @@ def _fit_blocks(
 
 def _largest(invariant: Invariant) -> int:
     """Numbers per match in the largest temporary of the Gram."""
-    if len(invariant.primitives) == 1:
-        return invariant.width() * invariant.rows()
-    size = 1
-    for primitive in invariant.primitives[1:]:
-        size *= primitive.width * (primitive.width + 1) // 2
-    return size
+    packed = math.prod(p.width * (p.width + 1) // 2 for p in invariant.primitives[1:])
+    return packed if len(invariant.primitives) > 1 else invariant.width() * invariant.rows()
 
 
 def _fit_block(
@@ -184,7 +179,7 @@ def _fit_block(
     representable = flat.isfinite().all(-1) & (flat != 0).any(-1)
     status = torch.where(representable | is_failure(status), status, int(Status.DEGENERATE))
     sound = ~is_failure(status)
-    return LinearFits(select(sound, back, 0.0), select(sound, tensor, 0.0), status, uncertainty, norm.transforms, norm.actions)
+    return LinearFits(select(sound, back, 0.0), select(sound, tensor, 0.0), status, uncertainty, norm.transforms)
 
 
 @dataclass(frozen=True)
@@ -200,14 +195,7 @@ class EstimationRows:
 
     def of(self, place: tuple[Tensor, ...]) -> EstimationRows:
         """Those of some problems, where none has primitives of its own."""
-        static = None if self.static is None else self.static[place]
-        return replace(
-            self,
-            views=tuple(x[place] for x in self.views),
-            weights=self.weights[place],
-            static=static,
-            rounding=self.rounding[place],
-        )
+        return EstimationRows(self.primitives, *each(lambda x: x[place], (self.views, self.weights, self.static, self.rounding)))
 
     @property
     def parts(self) -> tuple[tuple[Primitive, ...], tuple[Tensor, ...], Tensor, Tensor | None]:

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
-from typing import NoReturn
 
 import torch
 from torch import Tensor
@@ -48,9 +47,9 @@ class Primitive(ABC):
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         """The trailing shapes of one measurement that are understood."""
 
-    @abstractmethod
     def raw(self, x: Tensor) -> Tensor:
         """The vector of a measurement, ``(*batch, n, width)``: a polynomial of the measured coordinates (``rows == 1`` only)."""
+        return self.components(x).mT
 
     def components(self, x: Tensor) -> Tensor:
         """The vectors as the estimation matrix takes them, components first: ``(*batch, width, n)``.
@@ -68,7 +67,6 @@ class Primitive(ABC):
     def action(self, transform: Tensor) -> Tensor:
         r"""The matrix M with :math:`\mathrm{vector}(T x) \sim M\,\mathrm{vector}(x)`, ``(*batch, width, width)``."""
 
-    @abstractmethod
     def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
         r"""Chain rule :math:`J^T g` from the (unscaled) vector back to the measured coordinates.
 
@@ -79,10 +77,11 @@ class Primitive(ABC):
         Returns:
             ``(*batch, n, coordinates)`` derivative with respect to the measured coordinates.
         """
+        raise NotImplementedError(f"{self!r} gives its rows as a whole: it has no single vector")
 
-    @abstractmethod
     def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
         r"""The other way: the change :math:`J c` of the raw vector, ``(*batch, n, width)``, for a change of the coordinates."""
+        raise NotImplementedError(f"{self!r} gives its rows as a whole: it has no single vector")
 
     def pack(self, x: Tensor) -> Tensor:
         r"""Upper triangle of :math:`\sum_r v_r v_r^T` of each measurement, component first: ``(*batch, w (w + 1) / 2, n)``."""
@@ -183,18 +182,6 @@ class Equations(Primitive):
     def move(self, x: Tensor, transform: Tensor) -> Tensor:
         return x
 
-    def raw(self, x: Tensor) -> Tensor:
-        self._no_slot()
-
-    def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
-        self._no_slot()
-
-    def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
-        self._no_slot()
-
-    def _no_slot(self) -> NoReturn:
-        raise NotImplementedError("a match that gives its rows as a whole has no single vector")
-
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Monomials of the coordinates of a point: what polynomial constraints on points are linear in.
@@ -226,9 +213,6 @@ class Monomials(Primitive):
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         return ((self.dim,),)
 
-    def raw(self, x: Tensor) -> Tensor:
-        return self.components(x).mT
-
     def components(self, x: Tensor) -> Tensor:
         product = monomials(torch.cat([x.mT, torch.ones_like(x.mT[..., :1, :])], dim=-2), self.degree)
         return product * self.scale(x.device).to(x.dtype)[:, None] if self.isometric else product
@@ -244,7 +228,7 @@ class Monomials(Primitive):
     def action(self, transform: Tensor) -> Tensor:
         # row by row: the product of linear forms, whose coefficients add up by monomial
         product = torch.ones_like(transform[..., :1, :1])
-        for factor in self._factors(transform.device).unbind(-1):
+        for factor in factors(self.degree, self.dim, transform.device).unbind(-1):
             product = (product[..., :, None] * transform[..., factor, None, :]).flatten(-2)
         lifted = product @ collecting(self.degree, self.dim, transform.device).to(transform.dtype).mT
         if not self.isometric:
@@ -262,9 +246,6 @@ class Monomials(Primitive):
         """``(*batch, n, width, dim)``."""
         total = monomial_derivatives(homogeneous(x), self.degree, self.dim)
         return total * self.scale(x.device).to(x.dtype)[:, None] if self.isometric else total
-
-    def _factors(self, device: torch.device) -> Tensor:
-        return factors(self.degree, self.dim, device)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -329,12 +310,7 @@ class HyperplanesThrough(Primitive):
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         return ((self.dim,),)
 
-    def raw(self, x: Tensor) -> Tensor:
-        self._check_single()
-        return self.components(x).mT
-
     def components(self, x: Tensor) -> Tensor:
-        self._check_single()
         coordinates, sign = self._linear_minors(x)[1:]
         return torch.cat([torch.ones_like(x[..., :1]), (x[..., coordinates] * sign).flip(-1)], dim=-1).mT
 
@@ -355,12 +331,10 @@ class HyperplanesThrough(Primitive):
         return compound(inverse(transform).mT, self.order)
 
     def pullback(self, x: Tensor, gradient: Tensor) -> Tensor:
-        self._check_single()
         place, _, sign = self._linear_minors(gradient)
         return gradient[..., place] * sign
 
     def pushforward(self, x: Tensor, change: Tensor) -> Tensor:
-        self._check_single()
         return torch.cat([torch.zeros_like(change[..., :1]), (change * self._linear_minors(change)[2]).flip(-1)], dim=-1)
 
     def slopes(self, gradient: Tensor) -> Tensor:
@@ -375,10 +349,6 @@ class HyperplanesThrough(Primitive):
     def _linear_minors(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         place, coordinates, sign = _linear_minor_tables(self.dim, self.order, like.device)
         return place, coordinates, sign.to(like.dtype)
-
-    def _check_single(self) -> None:
-        if self.rows > 1:
-            raise NotImplementedError(f"a point of P^{self.dim} lies on {self.dim} hyperplanes: it has no single vector")
 
 
 @constant

@@ -100,16 +100,7 @@ class Solution(Outcome):
 
     def back(self, data: Matches) -> Solution:
         """This solution of flat float64 problems in the batch, dtype and device of the caller's matches."""
-        return replace(
-            self,
-            tensor=data.back(self.tensor),
-            status=data.back(self.status),
-            uncertainty=data.back(self.uncertainty),
-            inliers=None if self.inliers is None else data.back(self.inliers),
-            sigma=None if self.sigma is None else data.back(self.sigma),
-            covariance=None if self.covariance is None else data.back(self.covariance),
-            matches=data,
-        )
+        return self._each(data.back, lambda part: part, data)
 
     def __getitem__(self, key: Any) -> Solution:
         """The solution of some problems of the batch: an index, a slice, a mask or several of them, as a tensor takes them."""
@@ -126,7 +117,7 @@ class Solution(Outcome):
         static = None if data.static is None else data.static[flat]
         views, weights = tuple(x[flat] for x in data.views), data.weights[flat]
         data = replace(data, views=views, weights=weights, static=static, batch=tuple(chosen.shape))
-        return self._each(some, lambda part: part[flat], data)
+        return replace(self._each(some, lambda part: part[flat], data), notices=())
 
     def to(self, *target: torch.device | torch.dtype | str) -> Solution:
         """The solution on another device, in another dtype, or both, as ``torch.Tensor.to`` takes them.
@@ -152,19 +143,14 @@ class Solution(Outcome):
 
     def _each(self, outer: Callable[[Tensor], Tensor], inner: Callable[[Tensor], Tensor], data: Matches) -> Solution:
         """Another solution: ``outer`` of what the caller sees, ``inner`` of flat float64 tensors, and these matches."""
-        transforms = tuple(map(inner, self.normalization.transforms))
-        pairs = tuple(zip(self.invariant.primitives, transforms, strict=True))
-        return Solution(
-            self.invariant,
-            outer(self.tensor),
-            outer(self.uncertainty),
-            data,
-            Normalization(transforms, tuple(p.normalize(t) for p, t in pairs), tuple(map(inner, self.normalization.actions))),
-            inner(self.normalized),
-            status=outer(self.status),
-            inliers=None if self.inliers is None else outer(self.inliers),
-            covariance=None if self.covariance is None else outer(self.covariance),
-            sigma=None if self.sigma is None else outer(self.sigma),
+        names = ("tensor", "uncertainty", "status", "inliers", "covariance", "sigma")
+        shown: dict[str, Any] = {name: outer(part) for name in names if (part := getattr(self, name)) is not None}
+        return replace(
+            self,
+            **shown,
+            matches=data,
+            normalization=Normalization.of(self.invariant, tuple(map(inner, self.normalization.transforms))),
+            normalized=inner(self.normalized),
             refined=None if self.refined is None else tuple(map(inner, self.refined)),
         )
 

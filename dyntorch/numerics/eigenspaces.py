@@ -199,13 +199,13 @@ def ritz(gram: Tensor, vectors: Tensor) -> tuple[Tensor, Tensor]:
     return vectors @ rotation, values
 
 
-def jacobi(matrix: Tensor, sweeps: int = 6) -> tuple[Tensor, Tensor]:
+def jacobi(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Ascending eigenvalues and eigenvectors of tiny symmetric matrices: unlike eigh it never waits to check for errors."""
     size = matrix.shape[-1]
     eye = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
     vectors = eye.expand_as(matrix)
     pairs = list(combinations(range(size), 2))
-    for i, j in pairs * (sweeps if size > 2 else 1):
+    for i, j in pairs * (6 if size > 2 else 1):
         twice, difference = 2 * matrix[:, i, j], matrix[:, j, j] - matrix[:, i, i]
         length = (difference.square() + twice.square()).sqrt() + difference.abs()
         tangent = torch.where(difference < 0, -twice, twice) / length.clamp(min=1e-300)

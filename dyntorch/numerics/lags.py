@@ -8,10 +8,10 @@ grow with the length.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 from dyntorch.numerics.blocks import constant
@@ -52,17 +52,13 @@ def _fill(target: Tensor, a: Tensor, b: Tensor, lo: int, lift: Lift, per_point: 
         rows = max(1, ELEMENTS // (points * q * length))
         for row in range(0, p, rows):
             chosen = slice(row, row + rows)
-            upper = partial(_rows_of, lift, chosen)
-            spectrum = _spectrum(a[problem], b[problem], (lo, lo + lags - 1), (length, block), (upper, lift), per_point)
+            lifts = (lambda x, chosen=chosen: lift(x)[:, :, chosen]), lift
+            spectrum = _spectrum(a[problem], b[problem], (lo, lo + lags - 1), (length, block), lifts, per_point)
             correlations = torch.fft.irfft(spectrum, n=length)
             # in one block the lags count from the first frame, and negative ones from the end; in several from the first lag
             negative = -lo if block >= a.shape[1] else 0
             target[problem, :, chosen, :, :negative] = correlations[..., length - negative :]
             target[problem, :, chosen, :, negative:] = correlations[..., : lags - negative]
-
-
-def _rows_of(lift: Lift, chosen: slice, x: Tensor) -> Tensor:
-    return lift(x)[:, :, chosen]
 
 
 def _spectrum(a: Tensor, b: Tensor, lags: Lags, sizes: tuple[int, int], lifts: tuple[Lift, Lift], per_point: bool) -> Tensor:
@@ -98,16 +94,7 @@ def _lengths(frames1: int, frames2: int, lo: int, hi: int) -> tuple[int, int]:
 
 def _fft_length(least: int) -> int:
     """The next length of the form 2^a 3^b 5^c, even."""
-    best = 2 ** max((least - 1).bit_length(), 1)
-    five = 1
-    while five < best:
-        three = five
-        while three < best:
-            two = three * 2 ** max((-(-least // three) - 1).bit_length(), 1)
-            best = min(best, two)
-            three *= 3
-        five *= 5
-    return best
+    return 2 * int(next_fast_len(-(-least // 2), real=True))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -189,7 +176,7 @@ def lag_products(a: Tensor, b: Tensor, lags: Lags | None = None) -> Tensor:
     ``(*batch, T2, q)`` -> ``(*batch, L, p, q)``."""
     span = _span(a, b, lags, 2)
     shape, first, second = _flat(a, b, 2)
-    return _restore_batch(correlate(first[:, :, None], second[:, :, None], span, _channels).movedim(-1, 1), shape)
+    return _restore_batch(correlate(first[:, :, None], second[:, :, None], span, lambda x: x.movedim(1, -1)).movedim(-1, 1), shape)
 
 
 def epipolar_moments(
@@ -197,7 +184,11 @@ def epipolar_moments(
 ) -> tuple[Tensor, Tensor]:
     r"""Moment matrices of the epipolar constraint of the same points in two cameras, at all lags. x1 ``(*batch, T1, n, 2)``, x2
     ``(*batch, T2, n, 2)``, weights ``(*batch, T1, n)`` -> ``(*batch, [n,] L, 9, 9)``."""
-    products, counts = _camera_moments(x1, x2, lags, weights, per_point)
+    if x1.ndim < 3 or x2.ndim < 3 or x1.shape[-2:] != x2.shape[-2:] or x1.shape[-1] != 2:
+        raise ValueError(
+            f"the same points in both cameras are (*batch, frames, n, 2) each, got {tuple(x1.shape)} and {tuple(x2.shape)}"
+        )
+    products, counts = _lifted_moments(x1, x2, _span(x1, x2, lags, 3), weights, _monomials, per_point)
     return _place_products(products, _epipolar_places(products.device)), counts
 
 
@@ -225,8 +216,8 @@ def lag_covariances(
     shape, first, second = _flat(a, b, 2)
     if weights is not None:
         w1, w2 = (_frame_weights(w, x, shape) for w, x in zip(weights, (first, second), strict=True))
-        aa, bb, ab, counts = _weighted_covariances(first, second, (lo, hi), w1, w2)
-        return _restore_batch(aa, shape), _restore_batch(bb, shape), _restore_batch(ab, shape), _restore_batch(counts, shape)
+        aa, bb, ab, counts = (_restore_batch(x, shape) for x in _weighted_covariances(first, second, (lo, hi), w1, w2))
+        return aa, bb, ab, counts
     first, second = first - first.mean(1, keepdim=True), second - second.mean(1, keepdim=True)
     start, end = _overlap(a.shape[-2], b.shape[-2], (lo, hi))
     lag = torch.arange(lo, hi + 1)
@@ -236,11 +227,6 @@ def lag_covariances(
     ab = lag_products(first, second, (lo, hi)) / counts.clamp(min=1.0)[:, None, None]
     ab -= mean_a[..., :, None] * mean_b[..., None, :]
     return _restore_batch(aa, shape), _restore_batch(bb, shape), _restore_batch(ab, shape), counts
-
-
-def _channels(x: Tensor) -> Tensor:
-    """``(b, t, n, p)`` to ``(b, n, p, t)``."""
-    return x.movedim(1, -1)
 
 
 def _monomials(x: Tensor) -> Tensor:
@@ -259,17 +245,6 @@ def _of_camera_and_space(x: Tensor) -> Tensor:
     if len(place) == 2:
         return torch.stack([weighted[0] * place[0] + weighted[1] * place[1], *weighted, w], dim=2)
     return torch.stack([*(weighted[i] * place[j] for i in range(3) for j in range(i, 3)), *weighted, w], dim=2)
-
-
-def _camera_moments(
-    x1: Tensor, x2: Tensor, lags: Lags | None, weights: tuple[Tensor, Tensor] | None, per_point: bool
-) -> tuple[Tensor, Tensor]:
-    """Sums of products of a monomial of each camera ``(*b, [n,] 36, L)``, and counts ``(*b, [n,] L)``."""
-    if x1.ndim < 3 or x2.ndim < 3 or x1.shape[-2:] != x2.shape[-2:] or x1.shape[-1] != 2:
-        raise ValueError(
-            f"the same points in both cameras are (*batch, frames, n, 2) each, got {tuple(x1.shape)} and {tuple(x2.shape)}"
-        )
-    return _lifted_moments(x1, x2, _span(x1, x2, lags, 3), weights, _monomials, per_point)
 
 
 def _lifted_moments(
@@ -301,20 +276,19 @@ def _point_weights(x: Tensor, weights: Tensor | None) -> Tensor:
         return seen
     if weights.shape != x.shape[:-1]:
         raise ValueError(f"weights must be {tuple(x.shape[:-1])} for points {tuple(x.shape)}, got {tuple(weights.shape)}")
-    _check_weights(weights)
-    return weights.double() * seen
+    return _valid(weights) * seen
 
 
 def _frame_weights(weights: Tensor, x: Tensor, shape: tuple[int, ...]) -> Tensor:
     if weights.ndim < 1 or weights.shape[-1] != x.shape[1]:
         raise ValueError(f"weights must be (*batch, {x.shape[1]}), one per frame, got {tuple(weights.shape)}")
-    _check_weights(weights)
-    return weights.double().expand(*shape, -1).reshape(-1, x.shape[1], 1)
+    return _valid(weights).expand(*shape, -1).reshape(-1, x.shape[1], 1)
 
 
-def _check_weights(weights: Tensor) -> None:
+def _valid(weights: Tensor) -> Tensor:
     if not bool((weights.isfinite() & (weights >= 0)).all()):
         raise ValueError("weights must be finite and not negative: give 0 where a point is missing")
+    return weights.double()
 
 
 def _place_products(found: Tensor, place: Tensor) -> Tensor:

@@ -9,13 +9,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd import grad
 
-from dyntorch.numerics.blocks import select
+from dyntorch.numerics.blocks import each, rebuilt, replace_problems, select, tensors_of
 from dyntorch.numerics.nullspace import spectrum
 
 SHORT = 1e-13  # change of parameters of norm 1 that is rounding
@@ -57,26 +58,7 @@ class Iterate(NamedTuple):
 
     def where(self, chosen: Tensor, other: Iterate) -> Iterate:
         """This one where ``chosen (b,)``, the other elsewhere."""
-        wide, own = [chosen], chosen.ndim  # with as many dimensions as each part has
-        for _ in range(max([part.ndim for part in (*self.theta, *self.terms)]) - own):
-            wide.append(wide[-1].unsqueeze(-1))
-        theta, terms = (
-            tuple([torch.where(wide[new.ndim - own], new, old) for new, old in zip(*pair, strict=True)])
-            for pair in ((self.theta, other.theta), (self.terms, other.terms))
-        )
-        return Iterate(theta, torch.where(chosen, self.cost, other.cost), terms)
-
-    def subset(self, keep: Tensor) -> Iterate:
-        """Some of the problems."""
-        return Iterate(tuple(x[keep] for x in self.theta), self.cost[keep], tuple(x[keep] for x in self.terms))
-
-    def replace_problems(self, index: Tensor, part: Iterate) -> Iterate:
-        """With other values for the problems ``index``."""
-        theta, terms = (
-            tuple(old.index_copy(0, index, new) for old, new in zip(*pair, strict=True))
-            for pair in ((self.theta, part.theta), (self.terms, part.terms))
-        )
-        return Iterate(theta, self.cost.index_copy(0, index, part.cost), terms)
+        return rebuilt(self, map(partial(select, chosen), tensors_of(self), tensors_of(other)))
 
 
 class Minimum(NamedTuple):
@@ -200,13 +182,13 @@ def _until_done(problem: LeastSquares, start: Iterate, damping: Tensor, options:
         # launches hundreds of kernels
         keep = (~done).nonzero()[:, 0]
         if keep.shape != left.shape:
-            start = start.replace_problems(left, at)
+            start = replace_problems(start, left, at)
             steps[left[done]] = count
-            left, damping, at, problem = left[keep], damping[keep], at.subset(keep), problem.subset(keep)
+            left, damping, at, problem = left[keep], damping[keep], each(lambda x: x[keep], at), problem.subset(keep)
         if not keep.shape[0]:
             return start
         at, damping, done = _take_step(problem, at, damping, options)
-    return at if left.shape == steps.shape else start.replace_problems(left, at)
+    return at if left.shape == steps.shape else replace_problems(start, left, at)
 
 
 def _take_step(problem: LeastSquares, at: Iterate, damping: Tensor, options: LeastSquaresOptions) -> tuple[Iterate, Tensor, Tensor]:

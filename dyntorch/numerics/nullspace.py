@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import prod
 from typing import Any
@@ -139,7 +138,7 @@ def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
     if matrix.device.type == "mps":  # no float64
         return null_space(matrix.cpu(), dim).to(matrix.device)
     keep = torch.is_grad_enabled() and matrix.requires_grad
-    basis: Tensor = NullSpaceOfRows.apply(_flat(matrix), dim, keep, _of_rows)[0]  # type: ignore[no-untyped-call]
+    basis: Tensor = NullSpaceOfRows.apply(_flat(matrix), dim, keep)[0]  # type: ignore[no-untyped-call]
     return basis.reshape(*matrix.shape[:-2], dim, size)
 
 
@@ -152,7 +151,7 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
     if gram.device.type == "mps":  # no float64
         space = gram_null_space(gram.cpu(), dim)
         return GramNullSpace(*(part.to(gram.device) for part in vars(space).values()))
-    basis, residual, competing, degenerate = NullSpaceOfGrams.apply(_flat(gram), dim, _of_grams)  # type: ignore[no-untyped-call]
+    basis, residual, competing, degenerate = NullSpaceOfGrams.apply(_flat(gram), dim)  # type: ignore[no-untyped-call]
     batch = gram.shape[:-2]
     return GramNullSpace(
         basis.reshape(*batch, dim, size), residual.reshape(*batch, dim), competing.reshape(batch), degenerate.reshape(batch)
@@ -291,13 +290,6 @@ def _by_svd(matrix: Tensor, dim: int) -> Tensor:
 # The derivatives of null spaces.
 
 
-OfGrams = Callable[[Tensor, int], tuple[Tensor, Tensor, Tensor, Tensor]]
-"""Basis ``(b, dim, D)``, residual, competing and degenerate of Grams ``(b, D, D)``, as
-:class:`~dyntorch.numerics.nullspace.GramNullSpace` has them."""
-OfRows = Callable[[Tensor, int, bool], tuple[Tensor, Tensor]]
-"""Basis ``(b, dim, D)`` of rows, and their Grams where they are to be kept (else empty)."""
-
-
 def resolvent(gram: Tensor, vectors: Tensor, gradient: Tensor) -> Tensor:
     r""":math:`w_j = (G - \rho_j I)^+ (I - V V^T) g_j` for each Ritz vector; rotations inside the eigenspace are left out. gram
     ``(b, D, D)``, vectors ``(b, D, k)``, gradient ``(b, D, k)``."""
@@ -353,20 +345,20 @@ class NullSpaceOfGrams(torch.autograd.Function):
     """``dim`` smallest eigenvectors of ``(b, D, D)``, as a solver finds them; only they carry gradients."""
 
     @staticmethod
-    def forward(gram: Tensor, dim: int, solver: OfGrams) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return solver(gram, dim)
+    def forward(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return _of_grams(gram, dim)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, int, OfGrams], output: tuple[Tensor, ...]) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int], output: tuple[Tensor, ...]) -> None:
         ctx.save_for_backward(inputs[0], output[0])
         ctx.save_for_forward(inputs[0], output[0])
         ctx.mark_non_differentiable(*output[1:])
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor, None]:
         gram, basis = ctx.saved_tensors
         if torch.is_grad_enabled():  # somebody wants the derivative of this one
-            return gram_gradient(gram.double(), basis.double().mT, grad.double().mT).to(gram.dtype), None, None
+            return gram_gradient(gram.double(), basis.double().mT, grad.double().mT).to(gram.dtype), None
 
         def block(gram: Tensor, basis: Tensor, grad: Tensor) -> Tensor:
             scaled, scale, finite = unit_trace(gram.double())
@@ -374,7 +366,7 @@ class NullSpaceOfGrams(torch.autograd.Function):
             product = resolvent(scaled, vectors, grad.double().mT) @ vectors.mT * (-0.5 * scale)[:, None, None]
             return torch.where(finite[:, None, None], product + product.mT, 0.0).to(gram.dtype)
 
-        return map_blocks(block, gram, basis, grad, size=block_size(gram)), None, None
+        return map_blocks(block, gram, basis, grad, size=block_size(gram)), None
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, *_: None) -> tuple[Tensor, None, None, None]:
@@ -383,10 +375,8 @@ class NullSpaceOfGrams(torch.autograd.Function):
         return moved.mT.to(gram.dtype), None, None, None
 
     @staticmethod
-    def vmap(
-        info: Any, in_dims: tuple[int | None, None, None], gram: Tensor, dim: int, solver: OfGrams
-    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        parts = NullSpaceOfGrams.apply(merge_mapped_dimension(info, in_dims[0], gram), dim, solver)  # type: ignore[no-untyped-call]
+    def vmap(info: Any, in_dims: tuple[int | None, None], gram: Tensor, dim: int) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        parts = NullSpaceOfGrams.apply(merge_mapped_dimension(info, in_dims[0], gram), dim)  # type: ignore[no-untyped-call]
         return tuple(split_again(info, part) for part in parts), (0, 0, 0, 0)
 
 
@@ -394,22 +384,22 @@ class NullSpaceOfRows(torch.autograd.Function):
     """The same for rows ``(b, rows, D)``: the basis, and the Gram where ``keep`` saves the backward from forming it again."""
 
     @staticmethod
-    def forward(matrix: Tensor, dim: int, keep: bool, solver: OfRows) -> tuple[Tensor, Tensor]:
-        return solver(matrix, dim, keep)
+    def forward(matrix: Tensor, dim: int, keep: bool) -> tuple[Tensor, Tensor]:
+        return _of_rows(matrix, dim, keep)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, int, bool, OfRows], output: tuple[Tensor, Tensor]) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, int, bool], output: tuple[Tensor, Tensor]) -> None:
         ctx.save_for_backward(inputs[0], output[1], output[0])
         ctx.save_for_forward(inputs[0], output[0])
         ctx.mark_non_differentiable(output[1])
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor, None, None]:
         matrix, gram, basis = ctx.saved_tensors
         if torch.is_grad_enabled():  # somebody wants the derivative of this one
             a = _or_zero(matrix.double())
             bent = gram_gradient(a.mT @ a, basis.double().mT, grad.double().mT)
-            return (2 * a @ bent).to(matrix.dtype), None, None, None
+            return (2 * a @ bent).to(matrix.dtype), None, None
         result = torch.empty_like(matrix, memory_format=torch.contiguous_format)
 
         def block(matrix: Tensor, gram: Tensor, basis: Tensor, grad: Tensor, result: Tensor) -> Tensor:
@@ -428,7 +418,7 @@ class NullSpaceOfRows(torch.autograd.Function):
             return finite
 
         map_blocks(block, matrix, gram, basis, grad, result, size=block_size(matrix))
-        return result, None, None, None
+        return result, None, None
 
     @staticmethod
     def jvp(ctx: Any, tangent: Tensor, *_: None) -> tuple[Tensor, None]:
@@ -439,9 +429,9 @@ class NullSpaceOfRows(torch.autograd.Function):
 
     @staticmethod
     def vmap(
-        info: Any, in_dims: tuple[int | None, None, None, None], matrix: Tensor, dim: int, keep: bool, solver: OfRows
+        info: Any, in_dims: tuple[int | None, None, None], matrix: Tensor, dim: int, keep: bool
     ) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        basis, gram = NullSpaceOfRows.apply(merge_mapped_dimension(info, in_dims[0], matrix), dim, keep, solver)  # type: ignore[no-untyped-call]
+        basis, gram = NullSpaceOfRows.apply(merge_mapped_dimension(info, in_dims[0], matrix), dim, keep)  # type: ignore[no-untyped-call]
         return (split_again(info, basis), split_again(info, gram)), (0, 0)
 
 

@@ -96,7 +96,8 @@ def test_problems_end_in_a_minimum_that_their_neighbours_do_not_move():
         alone = minimize(problem.subset(one), problem.subset(one).evaluate((theta[0][one],)), options)
         torch.testing.assert_close(alone.theta[0][0], found.theta[0][k], rtol=1e-9, atol=1e-9)
         assert int(alone.steps[0]) == int(found.steps[k])
-    assert len(minimize(problem.subset(one[:0]), problem.evaluate(theta).subset(one[:0]), options).cost) == 0
+    none = problem.subset(one[:0])
+    assert len(minimize(none, none.evaluate((theta[0][:0],)), options).cost) == 0
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-9])
