@@ -279,13 +279,10 @@ VERBS: tuple[Verb, ...] = (
         labelled_points,
         lambda *x: dyn.align_points(*x[:3], static=x[3], threshold=0.02, generator=draw()),
     ),
-    *(
-        Verb(
-            f"align_points rigid {motion}",
-            lambda: scenes.constant_velocity(40, static=0.4, sigma=1e-3, generator=draw(1), sensors="rigid").views,
-            lambda *x, motion=motion: dyn.align_points(*x, model="rigid", motion=motion, threshold=0.02, generator=draw()),
-        )
-        for motion in ("straight", "constant_velocity")
+    Verb(
+        "align_points rigid",
+        lambda: scenes.constant_velocity(40, static=0.4, sigma=1e-3, generator=draw(1), sensors="rigid").views,
+        lambda *x: dyn.align_points(*x, model="rigid", motion="straight", threshold=0.02, generator=draw()),
     ),
     Verb(
         "align_lines",
@@ -293,7 +290,6 @@ VERBS: tuple[Verb, ...] = (
         lambda *x: dyn.align_lines(*x, threshold=0.01, generator=draw()),
     ),
     Verb("segment", two_bodies, lambda *x: dyn.segment(*x, bodies=2, spatial=False, generator=draw())),
-    Verb("segment spatial", two_bodies, lambda *x: dyn.segment(*x, generator=draw())),
     Verb("segment_tracks", lambda: driven()[:1], lambda x: dyn.segment_tracks(x, 2, generator=draw())),
     Verb("segment_tracks cameras", driven, lambda x, cameras: dyn.segment_tracks(x, 2, cameras=cameras, generator=draw())),
     Verb("translating_planes", lambda: (planes().homographies,), dyn.translating_planes),
@@ -302,28 +298,17 @@ VERBS: tuple[Verb, ...] = (
         lambda: (planes(2, 1).homographies, planes(2, 1).body_fundamentals),
         lambda h, f: dyn.translating_planes(h, fundamentals=f),
     ),
-    *(
-        Verb(
-            f"reconstruct {motion}",
-            lambda motion=motion, n=n, v=v: tracks(motion, n, v),
-            lambda x, motion=motion: dyn.reconstruct(x, motion, generator=draw()),
-        )
-        for motion, n, v in (("static_2d", 12, 3), ("constant_velocity_2d", 24, 4), ("two_bodies_2d", 24, 3))
-    ),
-    Verb("reconstruct auto", lambda: tracks("constant_velocity_2d", 30, 4), lambda x: dyn.reconstruct(x, "auto", generator=draw())),
     Verb(
-        "reconstruct times",
+        "reconstruct",
         lambda: (*tracks("constant_velocity_2d", 24, 4, times=None), torch.tensor([0.0, 1, 2, 3], dtype=F64)),
         lambda x, t: dyn.reconstruct(x, "constant_velocity_2d", t, generator=draw()),
     ),
     Verb("synchronize", filmed, lambda a, b: dyn.synchronize(a, b, fps=30.0, rate=1.0, max_shift=1.0, generator=draw())),
-    Verb("synchronize rates", filmed, lambda a, b: dyn.synchronize(a, b, fps=30.0, max_shift=1.0, generator=draw())),
     Verb(
         "synchronize calibration",
         filmed,
         lambda a, b: dyn.synchronize(a, b, fps=30.0, rate=1.0, max_shift=1.0, generator=draw(), calibration=(LENS,) * 2),
     ),
-    Verb("synchronize different", nonrigid, lambda a, b: dyn.synchronize(a, b, False, fps=25.0, max_shift=1.0, generator=draw())),
     Verb(
         "synchronize_cameras",
         lambda: (*filmed(), filmed()[0]),
@@ -349,7 +334,6 @@ VERBS: tuple[Verb, ...] = (
         tolerance=1e-5,
     ),
     Verb("reconstruct_pair", nonrigid, lambda a, b: dyn.reconstruct_pair(a, b, 0.12, fps=25.0)),
-    Verb("reconstruct_pair same", filmed, lambda a, b: dyn.reconstruct_pair(a, b, 0.2, True, fps=30.0, generator=draw())),
     Verb(
         "fit_distortion",
         lambda: scenes.two_view(60, sigma=0.1, generator=draw()).views,

@@ -12,9 +12,8 @@ No accelerator has to be at hand to find what breaks on one.  On it
 
 What it cannot show: rounding (the kernels are those of the CPU), speed, memory, and kernels that a device lacks.
 
-A tensor of the device is a wrapper subclass without memory of its own beside a CPU tensor of the same strides (so that views share
-memory as they do elsewhere); ``__torch_dispatch__`` sees every operation and runs it on the CPU tensors.  torch's backend for
-devices written in Python supplies the rest: the name of the device, its guard for autograd's threads, and tensors out of nothing.
+A tensor of the device is a wrapper subclass beside a CPU tensor of the same strides; ``__torch_dispatch__`` runs every operation on
+the CPU tensors.  torch's backend for devices written in Python supplies the rest.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -42,14 +40,7 @@ OURS = tuple(str(Path(__file__).parent.parent / package) for package in ("dyntor
 COPIES = {"aten::_to_copy", "aten::copy_", "aten::_copy_from"}
 INDEXING = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_", "aten::_unsafe_index"}
 VALUES = {"aten::_local_scalar_dense", "aten::item", "aten::equal", "aten::is_nonzero", "aten::allclose"}
-SHAPES = {
-    "aten::nonzero",
-    "aten::masked_select",
-    "aten::_unique2",
-    "aten::unique_dim",
-    "aten::unique_consecutive",
-    "aten::bincount",
-}
+SHAPES = {f"aten::{name}" for name in ("nonzero", "masked_select", "_unique2", "unique_dim", "unique_consecutive", "bincount")}
 CHECKS = {"aten::_linalg_check_errors"}
 EAGER = {"aten::_conj": torch.ops.aten.conj_physical.default, "aten::_neg_view": torch.ops.aten.neg.default}
 """What torch puts off by a mark on the tensor, which nobody reads below ``__torch_dispatch__``."""
@@ -59,31 +50,23 @@ FACTORIES = (
 )
 
 
-@dataclass
-class Traffic:
-    """What made the host wait for the device."""
+class Traffic(list[tuple[str, str]]):
+    """What made the host wait for the device: kind and line of ours of each."""
 
-    waits: list[tuple[str, str]] = field(default_factory=list)
-    """(kind, line of ours) of each."""
+    current: ClassVar[Traffic]
+    """What is being counted."""
 
-    @property
-    def count(self) -> int:
-        """How often the host waited."""
-        return len(self.waits)
-
-    def note(self, kind: str) -> None:
+    @staticmethod
+    def note(kind: str) -> None:
         """One more of a kind."""
-        self.waits.append((kind, _our_line()))
+        Traffic.current.append((kind, _our_line()))
 
     def __str__(self) -> str:
-        places = Counter(self.waits).most_common(12)
-        return f"{self.count} waits: " + "; ".join(f"{n} {kind} at {line}" for (kind, line), n in places)
+        places = Counter(self).most_common(12)
+        return f"{len(self)} waits: " + "; ".join(f"{n} {kind} at {line}" for (kind, line), n in places)
 
 
-class _Ledger:
-    """The traffic that is being counted."""
-
-    current: ClassVar[Traffic] = Traffic()
+Traffic.current = Traffic()
 
 
 class PretendTensor(Tensor):
@@ -120,11 +103,7 @@ class PretendTensor(Tensor):
 def pretend_device() -> torch.device:
     """The device; skips the test where torch cannot have it."""
     if not _LIBRARIES:
-        pytest.skip(
-            "a real accelerator is here"
-            if torch.cuda.is_available()
-            else f"torch {torch.__version__} has no backends written in Python"
-        )
+        pytest.skip("a real accelerator is here, or a torch without backends written in Python")
     return _device()
 
 
@@ -137,11 +116,11 @@ def accelerators() -> list[str]:
 @contextmanager
 def counted() -> Iterator[Traffic]:
     """What makes the host wait inside the block."""
-    outer, _Ledger.current = _Ledger.current, Traffic()
+    outer, Traffic.current = Traffic.current, Traffic()
     try:
-        yield _Ledger.current
+        yield Traffic.current
     finally:
-        _Ledger.current = outer
+        Traffic.current = outer
 
 
 def moved(value: Any, device: torch.device | str) -> Any:
@@ -212,17 +191,17 @@ def _note_copy(name: str, args: Any, result_there: bool) -> None:
         target, source = (args[1], args[0]) if name == "aten::_copy_from" else args[:2]
         down = isinstance(source, PretendTensor) and not isinstance(target, PretendTensor)
     if down:
-        _Ledger.current.note("copy")
+        Traffic.note("copy")
 
 
 def _note_wait(op: Any, name: str, args: Any) -> None:
     mask = name in INDEXING and any(part is not None and part.dtype == torch.bool for part in args[1])
     if name in VALUES:
-        _Ledger.current.note("value")
+        Traffic.note("value")
     elif name in SHAPES or mask or (name == "aten::repeat_interleave" and op._overloadname == "Tensor"):
-        _Ledger.current.note("shape")
+        Traffic.note("shape")
     elif name in CHECKS:
-        _Ledger.current.note("check")
+        Traffic.note("check")
 
 
 def _like_its_values(wrapper: PretendTensor) -> PretendTensor:

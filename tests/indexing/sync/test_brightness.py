@@ -55,7 +55,7 @@ def test_videos_on_an_accelerator(films):
     here = brightness_shift(*pair, fps=FPS)
     with counted() as traffic:
         there = brightness_shift(*moved(pair, home), fps=FPS)
-    assert traffic.count <= 2, str(traffic)  # one copy for each video
+    assert len(traffic) <= 2, str(traffic)  # one copy for each video
     assert {there.peaks.device, there.lags.device, there.scores.device} == {home}
     assert (there.offset, there.sigma, there.ok, there.reason) == (here.offset, here.sigma, here.ok, here.reason)
     assert torch.equal(there.peaks.cpu(), here.peaks)
