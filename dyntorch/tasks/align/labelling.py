@@ -9,21 +9,23 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
+from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant
-from dyntorch.core.limits import median, three_sigma
+from dyntorch.core.limits import MIN_CONSENSUS, median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import Normalization, normalization, normalize_motion
-from dyntorch.core.outcome import is_failure
+from dyntorch.core.outcome import Status, is_failure
 from dyntorch.core.refine import Problem, refine_matches
 from dyntorch.core.residual import whiten, whitened_residual
-from dyntorch.core.solution import Solution
+from dyntorch.core.robust import robust_fit
+from dyntorch.core.solution import NOISY, Solution
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.invariants.dynamic_tensor import DynamicMotion, flat_residual, nearest_flats
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.numerics.blocks import each, map_blocks, select, uniform
 from dyntorch.numerics.nullspace import null_space, spectrum
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, status_of_alignment
 
 NUM_LABEL_ROUNDS = 3  # of labelling and refining with the noise known
 NUM_LABEL_ROUNDS_UNKNOWN_NOISE = 6  # turns with the noise to be found as well
@@ -32,6 +34,7 @@ THRESHOLD_SIGMAS = 3.0  # a threshold, in standard deviations of the noise of on
 ROUGH_LABEL_FACTOR = 3.0  # width of the first labels over that of the noise, where the motion comes from a minimal sample
 MAX_TRAJECTORY_DISTANCE = 3.0  # standard deviations of the noise from a trajectory line
 MAX_WIDENING = 4.0  # of a limit by the uncertainty of the motion: a moving match called static gives a wrong motion
+MAX_START_STEPS = 30  # of the refinement that takes all matches for moving inliers
 NUM_LABEL_STEPS = 6  # of Levenberg-Marquardt between two labellings
 MIN_SINGULAR_RATIO = 1e-3  # of a collineation in normalized coordinates; usually above .1
 NUM_SCORED_MATCHES = 256  # that judge a hypothesis: enough to tell 5 % of agreement from none
@@ -224,6 +227,51 @@ class Evidence:
                 old, sigma = sigma, torch.where(found.sigma.isfinite() & (found.sigma > 0), found.sigma, sigma).maximum(self.floor)
                 steady = bool(((sigma - old).abs() <= NOISE_TOLERANCE * old).all())
         return Labelled(theta, labels, sigma)
+
+
+def tensor_start(
+    invariant: Invariant, evidence: Evidence, given: Tensor | None, generator: torch.Generator | None, *, plain: bool
+) -> tuple[Tensor, Tensor]:
+    """Motion ``(b, p)`` of a tensor by robust estimation, ``plain``: as if all matches were moving inliers, the identity where
+    there is none, and the noise ``(b,)`` that the median of all matches shows."""
+    data = evidence.data
+
+    def solve(views: tuple[Tensor, ...]) -> Solution:
+        if plain:
+            return fit_matches(invariant, replace(data, views=views, static=None))
+        return robust_fit(invariant, *views, threshold=given, weights=data.weights, generator=generator)
+
+    motion, found = motion_of_all(evidence, solve, given, generator)
+    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
+    usable = theta.isfinite().all(-1) & ~is_failure(found.status.reshape(-1))
+    identity = torch.eye(motion[0].shape[-1], dtype=theta.dtype, device=theta.device).flatten().repeat(len(motion))
+    theta = torch.where(usable[:, None], theta, identity)
+    if plain:
+        refined = evidence.refine(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_START_STEPS)
+        assert refined.sigma is not None
+        theta, noise = normalized_motion(refined), refined.sigma
+    elif given is None:
+        middle = torch.where(data.weights > 0, evidence.residuals(theta)[0].square().sum(-1), torch.nan).nanmedian(dim=-1).values
+        noise = (middle / median(evidence.invariant.codim)).sqrt()
+        if found.sigma is not None:
+            # what its inliers show is less than the median, where there are many outliers
+            noise = torch.where((found.status == Status.OK) & (found.sigma > 0), torch.minimum(found.sigma, noise), noise)
+    return theta, given if given is not None else torch.where(usable & noise.isfinite(), noise, torch.inf)
+
+
+def status_of_labels(
+    evidence: Evidence, best: Labelled, free: Tensor, undetermined: Tensor, odd: Tensor | bool, spare: int, least: tuple[int, int]
+) -> Tensor:
+    """``(b,)`` from the labels, whether a part of the motion is free by the noise, or exactly, and whether the inliers are ``odd``;
+    ``least`` matches in all, or known static ones."""
+    usable = evidence.data.weights > 0
+    present = usable.sum(-1)
+    known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
+    still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
+    conditions = evidence.static_conditions * still + evidence.invariant.codim * moving
+    accident = (still + moving < MIN_CONSENSUS * present) | (conditions < evidence.invariant.dof + spare) | odd
+    accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
+    return status_of_alignment(free, accident, undetermined, (present < least[0]) & (known < least[1]))
 
 
 def without_failures(refined: Solution, status: Tensor, labels: Tensor, worst: Tensor) -> tuple[Solution, Tensor]:

@@ -28,7 +28,16 @@ from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations
 from dyntorch.numerics.messages import Message
 from dyntorch.numerics.nullspace import spectrum
 from dyntorch.tasks.align.labelling import THRESHOLD_SIGMAS
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice, AlignOptions, alignment_of
+from dyntorch.tasks.align.result import (
+    MOVING,
+    OUTLIER,
+    STATIC,
+    Alignment,
+    AlignNotice,
+    AlignOptions,
+    alignment_of,
+    status_of_alignment,
+)
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Lines that move in planes, static lines and static points between two views: residuals, refinement, labels.
@@ -57,18 +66,17 @@ class Lines:
 
     data: Matches  # lines ``(b, n, 2, 3)`` as measured
     views: tuple[Tensor, ...]  # normalized
-    points: tuple[Tensor, ...]  # normalized static points ``(b, k, 3)`` of both views, k may be 0
+    measured: tuple[Tensor, Tensor]  # static points ``(b, k, 3)`` of both views, k may be 0
+    points: tuple[Tensor, ...]  # these normalized
     norm: Normalization  # the similarities of both views
     floor: Tensor  # ``(b,)`` the least noise that the numbers allow, in the unit of the points
 
     @classmethod
-    def of(cls, data: Matches, points: tuple[Tensor, Tensor] | None, norm: Normalization) -> Lines:
+    def of(cls, data: Matches, points: tuple[Tensor, Tensor], norm: Normalization) -> Lines:
         """From measured lines and points."""
-        empty = data.views[0][:, :0, 0]
-        pair = (empty, empty) if points is None else points
-        moved = tuple(x @ t[:, :3, :3].mT + t[:, None, :3, 3] for x, t in zip(pair, norm.transforms, strict=True))
+        moved = tuple(x @ t[:, :3, :3].mT + t[:, None, :3, 3] for x, t in zip(points, norm.transforms, strict=True))
         floor = 100 * torch.finfo(torch.float64).eps / torch.stack(norm.scales).amin(0)
-        return cls(data, norm.apply(TranslatingLinesMatrix(), data.views), moved, norm, floor)
+        return cls(data, norm.apply(TranslatingLinesMatrix(), data.views), points, moved, norm, floor)
 
     def moving_residuals(self, theta: Tensor) -> Tensor:
         """Signed Sampson residual ``(b, n)`` of each line that may move, in the unit of the points."""
@@ -79,30 +87,11 @@ class Lines:
         """Distances ``(b, n, 6)`` of both points of a line in view 2, carried into view 1, from the line there; 4 conditions."""
         return _static_residuals(theta, self.norm.scales, self.views)
 
-    def at_points(self, theta: Tensor) -> Tensor:
-        """Disagreement ``(b, k, 3)`` of static points."""
-        return _at_points(theta, self.norm.scales, self.points)
-
-    def residual(self, theta: Tensor, labels: Tensor) -> Tensor:
-        """All weighted residuals ``(b, rows)`` of the labelled lines and the static points, in the unit of the points."""
-        moving, still = self._roots(labels)
-        return torch.cat(
-            [
-                self.moving_residuals(theta) * moving,
-                self.static_residuals(theta).flatten(1) * still,
-                self.at_points(theta).flatten(1),
-            ],
-            dim=-1,
-        )
-
     def problem(self, labels: Tensor) -> LinesProblem:
-        """Least squares of :meth:`residual`."""
-        return LinesProblem(self.views, self.points, self.norm.scales, self._roots(labels))
-
-    def _roots(self, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """Roots of the weights of the moving lines ``(b, n)`` and of the static ones, six for each, ``(b, 6 n)``."""
+        """Least squares of the residuals of the labelled lines and the static points, in the unit of the points."""
         root = self.data.weights.sqrt()
-        return torch.where(labels == MOVING, root, 0.0), torch.where(labels == STATIC, root, 0.0).repeat_interleave(6, dim=-1)
+        still = torch.where(labels == STATIC, root, 0.0).repeat_interleave(6, dim=-1)
+        return LinesProblem(self.views, self.points, self.norm.scales, (torch.where(labels == MOVING, root, 0.0), still))
 
 
 @dataclass(frozen=True)
@@ -175,9 +164,8 @@ def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain:
     present = lines.data.weights > 0
     labels = torch.where(present, MOVING, OUTLIER) if plain else _labels(lines, theta, sigma)
     for _ in range(NUM_LINE_ROUNDS):
-        theta = refine_map(lines, theta, labels)
+        theta, left = refine_map(lines, theta, labels)
         if estimate:
-            left = lines.residual(theta, labels).square().sum(-1)
             spare = (labels == MOVING).sum(-1) + 4 * (labels == STATIC).sum(-1) + 3 * lines.points[0].shape[1] - DOF
             sigma = torch.where(spare >= 4, (left / spare.clamp(min=1)).sqrt(), sigma).maximum(lines.floor)
         new = _labels(lines, theta, sigma)
@@ -187,10 +175,11 @@ def settle(lines: Lines, theta: Tensor, sigma: Tensor, *, estimate: bool, plain:
     return theta, labels, sigma
 
 
-def refine_map(lines: Lines, theta: Tensor, labels: Tensor) -> Tensor:
-    """A that minimizes the residuals of all labelled matches, by Levenberg-Marquardt."""
+def refine_map(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """A that minimizes the residuals of all labelled matches, by Levenberg-Marquardt, and their squares ``(b,)``."""
     problem = lines.problem(labels)
-    return minimize(problem, problem.evaluate((theta,)), DESCENT).theta[0]
+    found = minimize(problem, problem.evaluate((theta,)), DESCENT)
+    return found.theta[0], found.cost
 
 
 def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -290,7 +279,7 @@ def align_lines(
     check_threshold(threshold)
     data = matches(TranslatingLinesMatrix(), (l1, l2), weights, static)
     points = _points(static_points, data, l1)
-    extra = 0 if points is None else points[0].shape[1]
+    extra = points[0].shape[1]
     if data.count + PER_POINT * extra < MINIMAL:
         text = (
             "align_lines needs at least {needed} lines, got {lines} and {points} static points, which count {each} each; "
@@ -301,10 +290,10 @@ def align_lines(
         return _align(data, points, threshold, generator, options)
 
 
-def _points(pair: tuple[Tensor, Tensor] | None, data: Matches, like: Tensor) -> tuple[Tensor, Tensor] | None:
+def _points(pair: tuple[Tensor, Tensor] | None, data: Matches, like: Tensor) -> tuple[Tensor, Tensor]:
     """Static points ``(b, k, 3)`` of both views, in float64."""
     if pair is None:
-        return None
+        return (none := data.weights.new_zeros(len(data.weights), 0, 3)), none
     if len(pair) != 2 or pair[0].shape != pair[1].shape or tuple(pair[0].shape[:-2]) != data.batch or pair[0].shape[-1] != 3:
         shapes = [tuple(x.shape) for x in pair]
         raise ValueError(f"static_points must be two (*batch, k, 3) with batch {data.batch}, got {shapes}")
@@ -317,11 +306,7 @@ def _points(pair: tuple[Tensor, Tensor] | None, data: Matches, like: Tensor) -> 
 
 
 def _align(
-    data: Matches,
-    points: tuple[Tensor, Tensor] | None,
-    threshold: float | None,
-    generator: torch.Generator | None,
-    options: AlignOptions,
+    data: Matches, points: tuple[Tensor, Tensor], threshold: float | None, generator: torch.Generator | None, options: AlignOptions
 ) -> Alignment:
     flat = replace(data, views=as_points(data.views, data.weights), batch=data.weights.shape[:1], dtype=torch.float64)
     flat = replace(flat, weights=flat.weights / flat.weights.amax(-1, keepdim=True).clamp(min=1e-300), device=flat.weights.device)
@@ -347,7 +332,7 @@ def _align(
         theta = _select_start(lines, theta, usable, bound, generator, options)
     sigma = _noise(lines, theta, plain) if given is None else given.maximum(lines.floor)
     theta, labels, sigma = settle(lines, theta, sigma, estimate=given is None, plain=plain)
-    return _result(data, lines, start, theta, labels, sigma, usable, points, options)
+    return _result(data, lines, start, theta, labels, sigma, options)
 
 
 def _from_static(lines: Lines, bound: Tensor, generator: torch.Generator | None, options: AlignOptions) -> Tensor:
@@ -393,10 +378,8 @@ def _select_start(
     return torch.where((doubtful & (squares(other).sum(-1) < here.sum(-1)))[:, None], other, theta)
 
 
-def _join_matches(data: Matches, points: tuple[Tensor, Tensor] | None) -> Matches:
+def _join_matches(data: Matches, points: tuple[Tensor, Tensor]) -> Matches:
     """Lines and static points as matches of lines."""
-    if points is None:
-        return replace(data, static=None)
     length = float(points[0].std()) if points[0].shape[1] > 1 else 1.0
     stars = TranslatingLinesMatrix.static_point_lines(*points, length=max(length, 1e-12))
     views = tuple(torch.cat([x, star], dim=1) for x, star in zip(data.views, stars, strict=True))
@@ -415,31 +398,19 @@ def _noise(lines: Lines, theta: Tensor, plain: bool) -> Tensor:
 
 
 def _result(
-    data: Matches,
-    lines: Lines,
-    start: Solution,
-    theta: Tensor,
-    labels: Tensor,
-    sigma: Tensor,
-    usable: Tensor,
-    points: tuple[Tensor, Tensor] | None,
-    options: AlignOptions,
+    data: Matches, lines: Lines, start: Solution, theta: Tensor, labels: Tensor, sigma: Tensor, options: AlignOptions
 ) -> Alignment:
+    usable = ~is_failure(start.status)
     extent, A, covariance = spread(lines, theta, labels)
     worst = sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
-    present = (data.weights > 0).sum(-1)
-    conditions = (labels != OUTLIER).sum(-1) + 3 * (labels == STATIC).sum(-1) + (0 if points is None else 3 * points[0].shape[1])
-    accident = ((labels != OUTLIER).sum(-1) < MIN_CONSENSUS * present) | (
-        (conditions < TranslatingLinesMatrix.dof + MIN_SPARE_LINES) & (present > MINIMAL)
-    )
-    status = torch.where(worst > MAX_LINE_DEVIATION, int(Status.AMBIGUOUS), torch.zeros_like(present))
-    status = torch.where(accident, int(Status.NO_CONSENSUS), status)
-    rank = _rank(lines, labels, sigma, usable, points)
-    status = torch.where((rank <= RANKS[-1][0]) & (status == Status.OK), int(Status.AMBIGUOUS), status)
-    doubtful = (rank < MINIMAL) & (status == Status.OK)
-    status = torch.where(_has_alternatives(lines, theta, labels, points, doubtful, options), int(Status.AMBIGUOUS), status)
-    status = torch.where(extent[:, 0] <= MIN_INFORMATION * extent[:, 1], int(Status.DEGENERATE), status)
-    status = torch.where(usable, status, start.status.to(status))
+    present, inliers = (data.weights > 0).sum(-1), (labels != OUTLIER).sum(-1)
+    conditions = inliers + 3 * (labels == STATIC).sum(-1) + 3 * lines.points[0].shape[1]
+    accident = (inliers < MIN_CONSENSUS * present) | ((conditions < DOF + MIN_SPARE_LINES) & (present > MINIMAL))
+    rank = _rank(lines, labels, sigma, usable)
+    free = (worst > MAX_LINE_DEVIATION) | (rank <= RANKS[-1][0])
+    free |= _has_alternatives(lines, theta, labels, (rank < MINIMAL) & ~free & ~accident, options)
+    undetermined = extent[:, 0] <= MIN_INFORMATION * extent[:, 1]
+    status = torch.where(usable, status_of_alignment(free, accident, undetermined, ~usable), start.status)
     return alignment_of(
         data,
         status,
@@ -452,37 +423,30 @@ def _result(
     )
 
 
-def _has_alternatives(
-    lines: Lines,
-    theta: Tensor,
-    labels: Tensor,
-    points: tuple[Tensor, Tensor] | None,
-    doubtful: Tensor,
-    options: AlignOptions,
-) -> Tensor:
+def _has_alternatives(lines: Lines, theta: Tensor, labels: Tensor, doubtful: Tensor, options: AlignOptions) -> Tensor:
     """Whether another motion ``(b,)``, far from this one, explains the lines about as well."""
     found = torch.zeros_like(doubtful)
     if not bool(doubtful.any()):
         return found
-    model, problem = TranslatingLinesMatrix(), lines.problem(labels)
-    joined = _join_matches(lines.data.restrict(labels != OUTLIER), points)
+    model = TranslatingLinesMatrix()
+    joined = _join_matches(lines.data.restrict(labels != OUTLIER), lines.measured)
     _, vectors = spectrum(gram(model.primitives, lines.norm.apply(model, joined.views), joined.weights))
-    best, here = problem.normal_equations(theta)[0], unit(theta.unflatten(-1, (4, 4)))
+    best, here = lines.problem(labels).normal_equations(theta)[0], unit(theta.unflatten(-1, (4, 4)))
     weakest = vectors[..., :NUM_WEAK_DIRECTIONS].unbind(-1)
     mixed = [one + sign * two for one, two in combinations(weakest, 2) for sign in (1, -1)]
     for flat in (*weakest, *mixed):
         start = model.decompose(flat.unflatten(-1, (6, 6))).flatten(1)
-        other = refine_map(lines, torch.where(start.isfinite(), start, theta), labels)
+        other, cost = refine_map(lines, torch.where(start.isfinite(), start, theta), labels)
         there = unit(other.unflatten(-1, (4, 4)))
         far = torch.minimum((there - here).flatten(1).norm(dim=-1), (there + here).flatten(1).norm(dim=-1)) > options.max_deviation
-        found |= far & (problem.normal_equations(other)[0] <= MAX_RIVAL_COST * best)
+        found |= far & (cost <= MAX_RIVAL_COST * best)
     return found & doubtful
 
 
-def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor, points: tuple[Tensor, Tensor] | None) -> Tensor:
+def _rank(lines: Lines, labels: Tensor, sigma: Tensor, usable: Tensor) -> Tensor:
     """Singular values ``(b,)`` of the estimation matrix above the noise: of the inliers, of all lines where there is no motion."""
     kept = lines.data.restrict((labels != OUTLIER) | ~usable[:, None])
-    joined = _join_matches(kept, points)
+    joined = _join_matches(kept, lines.measured)
     if joined.count < MINIMAL:
         return torch.full_like(labels[:, 0], MINIMAL)
     values = fit_matches(TranslatingLinesMatrix(), joined).singular_values

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
-from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median, three_sigma
+from dyntorch.core.limits import MIN_INFORMATION, three_sigma
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.normalize import denormalize_motion
 from dyntorch.core.outcome import Notice, Status, has_inliers, in_order, is_failure, noting
-from dyntorch.core.robust import robust_fit
-from dyntorch.core.solution import NOISY, Solution
+from dyntorch.core.solution import Solution
 from dyntorch.geometry.bundle import calibrations
-from dyntorch.geometry.homogeneous import cofactors, homogeneous, nonzero_sign
+from dyntorch.geometry.homogeneous import homogeneous, nonzero_sign
 from dyntorch.geometry.rigid import CommonPlane, PlaneMotion, motion_over, plane_motions
-from dyntorch.invariants.agreement import static_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import one_thread
@@ -28,16 +26,17 @@ from dyntorch.numerics.nullspace import eigenvalues
 from dyntorch.tasks.align.labelling import (
     Evidence,
     Labelled,
-    motion_of_all,
     moving_points,
     normalized_motion,
     static_start,
+    status_of_labels,
     still_but_one,
+    tensor_start,
     three_of,
     trajectory_lines,
     without_failures,
 )
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice, AlignOptions, status_of_alignment
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice, AlignOptions, solved_alignment
 
 # ----------------------------------------------------------------------------------------------------------------------
 # align_planar(calibration=): how calibrated cameras turned and moved, and the plane below the points.
@@ -291,20 +290,8 @@ def is_undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tenso
 def unverified_matches(evidence: Evidence, best: Labelled) -> Tensor:
     """Matches ``(b, n)`` that all views but one agree on as static, whatever that one says."""
     parts = evidence.problem(best.labels).parts(best.theta)
-    if len(evidence.views) > 3:
-        limit = three_sigma(evidence.static_conditions - 2) * best.sigma.square()[:, None]
-        return still_but_one(parts, evidence.views, evidence.norm.scales, limit) & (evidence.data.weights > 0)
-    first, second, third = evidence.views
-    s1, s2, s3 = evidence.norm.scales
-    between = cofactors(parts[0]).mT @ parts[1]  # view 3 to view 2
-    pairs = (
-        static_residual([parts[0]], (first, second), (s1, s2)),
-        static_residual([parts[1]], (first, third), (s1, s3)),
-        static_residual([between], (second, third), (s2, s3)),
-    )
-    limit = three_sigma(2) * best.sigma.square()[:, None]
-    agree = torch.stack([pair.square().sum(-1) <= limit for pair in pairs])
-    return agree.any(0) & (evidence.data.weights > 0)
+    limit = three_sigma(evidence.static_conditions - 2) * best.sigma.square()[:, None]
+    return still_but_one(parts, evidence.views, evidence.norm.scales, limit) & (evidence.data.weights > 0)
 
 
 def thinness(evidence: Evidence, sigma: Tensor) -> Tensor:
@@ -329,10 +316,6 @@ LABELLED = 9
 """Fewest matches where some are labelled static: nine rows each for 26 equations, and room to tell static from moving."""
 
 AMBIGUITY = (
-    "A and B are unique, each up to its scale. A match that agrees in two views only counts as moving: a point that paused and a "
-    "static point mismatched in the third view look the same."
-)
-MORE_VIEWS = (
     "The collineations are unique, each up to its scale. A match that agrees in all views but one counts as moving: a point that "
     "paused and a static point mismatched in that view look the same."
 )
@@ -432,31 +415,14 @@ def _align(
 ) -> Alignment:
     evidence = Evidence.of(moving_points(2, len(data.views)), data)
     solution, best, tensor = _solve(evidence, _search(evidence, threshold, generator, options))
-    outcome = solution.back(data)
-    A, B, *others = outcome.motion
-    assert outcome.sigma is not None and outcome.covariance is not None
     notices = planar_notices(evidence, best, tensor, solution.status, data.batch)
-    turned, other = None, None
+    calibrated: dict[str, Any] = {}
     if K is not None:
         turned, other, told = euclidean(solution, data, best.labels, K)
         notices = in_order([*notices, *told])
-    return Alignment(
-        A=A,
-        B=B,
-        labels=data.back(best.labels),
-        status=outcome.status,
-        sigma=outcome.sigma,
-        covariance=outcome.covariance,
-        ambiguity=MORE_VIEWS if others else AMBIGUITY,
-        notices=notices,
-        unverified=data.back(unverified_matches(evidence, best) & (best.labels == MOVING)),
-        solution=outcome,
-        others=tuple(others),
-        rotations=None if turned is None else turned.rotations,
-        translations=None if turned is None else turned.translations,
-        normal=None if turned is None else turned.normal,
-        other_motion=other,
-    )
+        calibrated = {**turned._asdict(), "other_motion": other}
+    unverified = data.back(unverified_matches(evidence, best) & (best.labels == MOVING))
+    return solved_alignment(solution, data, best.labels, AMBIGUITY, notices, unverified=unverified, **calibrated)
 
 
 def _search(evidence: Evidence, threshold: float | None, generator: torch.Generator | None, options: AlignOptions) -> Labelled:
@@ -464,55 +430,13 @@ def _search(evidence: Evidence, threshold: float | None, generator: torch.Genera
     given, count = evidence.given_noise(threshold), evidence.data.count
     starts = [static_start(evidence, given, options.num_samples or NUM_PLANAR_SAMPLES, generator)]
     if MINIMAL <= count < FEW:
-        starts.append(_from_all(evidence, given, generator))
+        starts.append(tensor_start(HomographyTensor(), evidence, given, generator, plain=True))
     if len(evidence.floor) and count >= (MINIMAL if given is not None else FEW):
-        starts.append(_from_tensor(evidence, given, generator))
+        starts.append(tensor_start(HomographyTensor(), evidence, given, generator, plain=False))
     # the smaller estimate is that of a motion most matches agree with; it may still be low, for static matches show half the noise
     sigma = given if given is not None else 1.5 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
     theta = evidence.improve_starts([start for start, _ in starts], sigma, sampled=True)
     return evidence.iterate_labels(evidence.best_start(theta, sigma), sigma, estimate=given is None)
-
-
-def _from_tensor(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-    """Motion of the homography tensor by robust estimation, and the noise by the median distance from it."""
-    data = evidence.data
-
-    def solve(views: tuple[Tensor, ...]) -> Solution:
-        return robust_fit(HomographyTensor, *views, threshold=given, weights=data.weights, generator=generator)
-
-    motion, found = motion_of_all(evidence, solve, given, generator)
-    theta, usable = _usable(motion, found)
-    if given is not None:
-        return theta, given
-    moving, _ = evidence.residuals(theta)
-    codim = evidence.invariant.codim
-    size = moving[..., 0].abs() / 0.6745 if codim == 1 else moving.norm(dim=-1) / median(codim) ** 0.5
-    noise = torch.where(data.weights > 0, size, torch.nan).nanmedian(dim=-1).values
-    if found.sigma is not None:
-        # what its inliers show is less than the median, where there are many outliers
-        noise = torch.where((found.status == Status.OK) & (found.sigma > 0), torch.minimum(found.sigma, noise), noise)
-    return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
-
-
-def _from_all(evidence: Evidence, given: Tensor | None, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-    """Motion as if all matches were moving inliers, and the noise that they then show."""
-    data = evidence.data
-
-    def solve(views: tuple[Tensor, ...]) -> Solution:
-        return fit_matches(HomographyTensor(), replace(data, views=views, static=None))
-
-    theta, usable = _usable(*motion_of_all(evidence, solve, given, generator))
-    refined = evidence.refine(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_PLANAR_STEPS)
-    assert refined.sigma is not None
-    return normalized_motion(refined), torch.where(usable, refined.sigma, torch.inf) if given is None else given
-
-
-def _usable(motion: tuple[Tensor, ...], found: Solution) -> tuple[Tensor, Tensor]:
-    """The normalized motion, the identity where it failed, and where it did not."""
-    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
-    usable = theta.isfinite().all(-1) & ~is_failure(found.status)
-    identity = torch.eye(3, dtype=theta.dtype, device=theta.device).flatten().repeat(len(motion))
-    return torch.where(usable[:, None], theta, identity), usable
 
 
 def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tuple[Tensor, Tensor]]:
@@ -526,22 +450,9 @@ def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Labelled, tupl
     best = Labelled(theta, labels, best.sigma)
     tensor = tensor_rank(evidence.data.restrict(labels != OUTLIER), evidence, best.sigma)
     free = (worst > MAX_DEVIATION) | is_undecided(evidence, best, tensor)
-    status = _status(evidence, best, refined.sigma, free, values[:, 0] <= MIN_INFORMATION * values[:, -1])
+    share = (labels != OUTLIER).sum(-1) / (evidence.data.weights > 0).sum(-1).clamp(min=1)
+    odd = (share < MIN_NOISY_INLIER_SHARE) & (refined.sigma > MAX_NOISE_RATIO * best.sigma)
+    undetermined = values[:, 0] <= MIN_INFORMATION * values[:, -1]
+    status = status_of_labels(evidence, best, free, undetermined, odd, MIN_SPARE_PLANAR, (MINIMAL, 4))
     solution, labels = without_failures(refined, status, labels, worst)
     return solution, replace(best, labels=labels), tensor
-
-
-def _status(evidence: Evidence, best: Labelled, shown: Tensor, free: Tensor, undetermined: Tensor) -> Tensor:
-    """``(b,)`` from the inliers, the noise they show, and whether a part of the motion is free by the noise, or exactly."""
-    usable = evidence.data.weights > 0
-    present = usable.sum(-1)
-    known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
-    still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
-    share = (still + moving) / present.clamp(min=1)
-    accident = (
-        (share < MIN_CONSENSUS)
-        | ((share < MIN_NOISY_INLIER_SHARE) & (shown > MAX_NOISE_RATIO * best.sigma))
-        | (evidence.static_conditions * still + evidence.invariant.codim * moving < evidence.invariant.dof + MIN_SPARE_PLANAR)
-    )
-    accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    return status_of_alignment(free, accident, undetermined, (present < MINIMAL) & (known < 4))

@@ -8,14 +8,11 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant
-from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median
+from dyntorch.core.limits import MIN_INFORMATION
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.outcome import Notice, in_order, is_failure, noting
-from dyntorch.core.residual import whitened_residual
-from dyntorch.core.robust import robust_fit
-from dyntorch.core.solution import NOISY, Solution
+from dyntorch.core.solution import Solution
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.invariants.minimal_join_tensor import MinimalJoinTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
@@ -25,14 +22,15 @@ from dyntorch.tasks.align import rigid, velocity
 from dyntorch.tasks.align.labelling import (
     Evidence,
     Labelled,
-    motion_of_all,
     moving_points,
     normalized_motion,
     static_start,
+    status_of_labels,
+    tensor_start,
     trajectory_lines,
     without_failures,
 )
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice, AlignOptions, status_of_alignment
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, Alignment, AlignNotice, AlignOptions, solved_alignment
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Projective motions of a sensor among points of space that move on straight lines.
@@ -46,17 +44,9 @@ MIN_MOVERS, MIN_LINES = 40, 10
 ENOUGH = 5  # static matches that determine A and B by themselves
 
 AMBIGUITY = Message(
-    "A and B are unique, each up to its scale, unless the steps of all points keep one ratio (constant velocity): then they are "
-    "known up to a velocity common to all points; use {arg:model='constant_velocity'}. A match that agrees in two views only "
-    "counts as "
-    "moving: a point that paused and a static point mismatched in the third view look the same."
-)
-
-
-MORE_VIEWS = Message(
     "The collineations are unique, each up to its scale, unless the steps of all points keep one ratio (constant velocity): then "
-    "they are known up to a velocity common to all points. A match that agrees in all views but one counts as moving: a point that "
-    "paused and a static point mismatched in that view look the same."
+    "they are known up to a velocity common to all points; of three views use {arg:model='constant_velocity'}. A match that "
+    "agrees in all views but one counts as moving: a point that paused and a static point mismatched in that view look the same."
 )
 
 
@@ -74,44 +64,35 @@ def align_join(
     evidence = Evidence.of(moving_points(3, len(data.views)), data)
     best = _search(evidence, threshold, model, generator, options)
     solution, labels, worst = _solve(evidence, best)
-    outcome = solution.back(data)
-    A, B, *others = outcome.motion
-    assert outcome.sigma is not None and outcome.covariance is not None
-    return Alignment(
-        A=A,
-        B=B,
-        labels=data.back(labels),
-        status=outcome.status,
-        sigma=outcome.sigma,
-        covariance=outcome.covariance,
-        ambiguity=MORE_VIEWS if others else AMBIGUITY,
-        notices=_notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch, options),
-        solution=outcome,
-        others=tuple(others),
-    )
+    notices = _notices(evidence, replace(best, labels=labels), worst, solution.status, data.batch, options)
+    return solved_alignment(solution, data, labels, AMBIGUITY, notices)
 
 
 def _search(
     evidence: Evidence, threshold: float | None, model: str, generator: torch.Generator | None, options: AlignOptions
 ) -> Labelled:
     """The best of the motions that static samples and the tensors lead to."""
-    given = evidence.given_noise(threshold)
+    given, count = evidence.given_noise(threshold), evidence.data.count
+    # of so few matches no half determines a motion, so that the noise cannot be told from outliers
+    plain = (given is None and count < 3 * JoinTensor.dof) or not len(evidence.floor)
+
+    def start(invariant: Invariant, evidence: Evidence) -> tuple[Tensor, Tensor]:
+        return tensor_start(invariant, evidence, given, generator, plain=plain)
+
     starts = [static_start(evidence, given, options.num_samples or NUM_JOIN_SAMPLES, generator)]
-    if evidence.data.count >= MIN_JOIN:
-        starts.append(_from_tensor(MinimalJoinTensor(), evidence, given, generator))
-    full, size = model == "join" and evidence.data.count >= MIN_JOIN_MATCHES, len(evidence.floor)
+    starts += [start(MinimalJoinTensor(), evidence)] if count >= MIN_JOIN else []
+    full, size = model == "join" and count >= MIN_JOIN_MATCHES, len(evidence.floor)
     if given is None:
-        if full:
-            starts.append(_from_tensor(JoinTensor(), evidence, None, generator))
+        starts += [start(JoinTensor(), evidence)] if full else []
         # the least estimate is that of a motion most matches agree with; it may be low, for static matches show half the noise
         sigma = 2 * torch.stack([noise for _, noise in starts]).amin(0).maximum(evidence.floor)
-        theta = evidence.improve_starts([start for start, _ in starts], sigma, sampled=True)
+        theta = evidence.improve_starts([theta for theta, _ in starts], sigma, sampled=True)
     else:
-        sigma, theta = given, evidence.improve_starts([start for start, _ in starts], given, sampled=True)
+        sigma, theta = given, evidence.improve_starts([theta for theta, _ in starts], given, sampled=True)
         # where the noise is known, so is whether the motion of the minimal tensor is the right one
         doubt = _doubt(evidence, theta[-size:], given) if full else torch.zeros_like(given)
         if bool(doubt.any()):
-            last, _ = _from_tensor(JoinTensor(), evidence.scale_weights(doubt), given, generator)
+            last, _ = start(JoinTensor(), evidence.scale_weights(doubt))
             theta = torch.cat([theta, evidence.improve_starts([last], given, sampled=False)])
     return evidence.iterate_labels(evidence.best_start(theta, sigma), sigma, estimate=given is None)
 
@@ -123,38 +104,6 @@ def _doubt(evidence: Evidence, theta: Tensor, sigma: Tensor) -> Tensor:
     return ((2 * agreeing <= present) | (moving * invariant.codim <= invariant.dof)).to(theta)
 
 
-def _from_tensor(
-    invariant: Invariant, evidence: Evidence, given: Tensor | None, generator: torch.Generator | None
-) -> tuple[Tensor, Tensor]:
-    """Motion of a tensor by robust estimation, and the noise that the median of all matches shows."""
-    data = evidence.data
-    # of so few matches no half determines a motion, so that the noise cannot be told from outliers
-    plain = (given is None and data.count < 3 * JoinTensor.dof) or not len(data.weights)
-
-    def solve(views: tuple[Tensor, ...]) -> Solution:
-        if plain:
-            return fit_matches(invariant, replace(data, views=views, static=None))
-        return robust_fit(invariant, *views, threshold=given, weights=data.weights, generator=generator)
-
-    motion, found = motion_of_all(evidence, solve, given, generator)
-    theta = torch.cat([part.flatten(1) for part in motion], dim=-1)
-    usable = theta.isfinite().all(-1) & ~is_failure(found.status.reshape(-1))
-    identity = torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(len(motion)) / 2
-    theta = torch.where(usable[:, None], theta, identity)
-    if given is not None:
-        return theta, given
-    if plain:
-        refined = evidence.refine(theta, torch.where(data.weights > 0, MOVING, OUTLIER), MAX_JOIN_STEPS)
-        assert refined.sigma is not None
-        theta, noise = normalized_motion(refined), refined.sigma
-    else:
-        parts = evidence.problem(torch.zeros_like(data.weights)).parts(theta)
-        moving = whitened_residual(evidence.invariant, parts, evidence.views, evidence.norm.scales).square().sum(-1)
-        middle = torch.where(data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values
-        noise = (middle / median(evidence.invariant.codim)).sqrt()
-    return theta, torch.where(usable & noise.isfinite(), noise, torch.inf)
-
-
 def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor]:
     """The solution with its status, the final labels (none where there is no motion), and the worst standard deviation."""
     refined = evidence.refine(best.theta, best.labels, MAX_JOIN_STEPS)
@@ -162,20 +111,10 @@ def _solve(evidence: Evidence, best: Labelled) -> tuple[Solution, Tensor, Tensor
     values, spread = evidence.information(theta, best.labels)
     labels = evidence.labels(theta, best.sigma, spread)
     worst = best.sigma * values[:, 0].clamp(min=torch.finfo(values.dtype).tiny).rsqrt() * torch.stack(evidence.norm.scales).amax(0)
-    status = _status(evidence, replace(best, labels=labels), worst, values[:, 0] <= MIN_INFORMATION * values[:, -1])
+    best = replace(best, labels=labels)
+    undetermined = values[:, 0] <= MIN_INFORMATION * values[:, -1]
+    status = status_of_labels(evidence, best, worst > MAX_JOIN_DEVIATION, undetermined, False, MIN_SPARE_JOIN, (MIN_JOIN, ENOUGH))
     return *without_failures(refined, status, labels, worst), worst
-
-
-def _status(evidence: Evidence, best: Labelled, worst: Tensor, undetermined: Tensor) -> Tensor:
-    usable = evidence.data.weights > 0
-    present = usable.sum(-1)
-    known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
-    still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
-    conditions = evidence.static_conditions * still + evidence.invariant.codim * moving
-    accident = (still + moving < MIN_CONSENSUS * present) | (conditions < evidence.invariant.dof + MIN_SPARE_JOIN)
-    accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    few = (present < MIN_JOIN) & (known < ENOUGH)
-    return status_of_alignment(worst > MAX_JOIN_DEVIATION, accident, undetermined, few)
 
 
 def _notices(

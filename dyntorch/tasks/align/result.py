@@ -219,7 +219,8 @@ class Alignment(Outcome):
         counts = ", ".join(f"{int((flat == label).sum())} {name}" for name, label in names.items())
         lines = [self.head(matches=self.labels.shape[-1]), f"  labels: {counts}"]
         if self.sigma.numel():
-            lines.append(f"  noise: {_median(self.sigma):.3g} per coordinate" + (" (median)" if self.status.ndim else ""))
+            sigma = float(self.sigma.flatten().double().nan_to_num().median())
+            lines.append(f"  noise: {sigma:.3g} per coordinate" + (" (median)" if self.status.ndim else ""))
         return "\n".join(lines + self.warning_lines())
 
 
@@ -256,8 +257,26 @@ def alignment_of(
     )
 
 
-def _median(values: Tensor) -> float:
-    return float(values.reshape(-1).double().nan_to_num().median())
+def solved_alignment(
+    solution: Solution, data: Matches, labels: Tensor, ambiguity: str, notices: tuple[Notice, ...], **more: Any
+) -> Alignment:
+    """The result behind which there is a solution of an invariant, of a flat batch as the labels ``(b, n)``."""
+    outcome = solution.back(data)
+    A, B, *others = outcome.motion
+    assert outcome.sigma is not None and outcome.covariance is not None
+    return Alignment(
+        A=A,
+        B=B,
+        labels=data.back(labels),
+        status=outcome.status,
+        sigma=outcome.sigma,
+        covariance=outcome.covariance,
+        ambiguity=ambiguity,
+        notices=notices,
+        solution=outcome,
+        others=tuple(others),
+        **more,
+    )
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -179,6 +179,7 @@ OWN_COST_FLOOR = 0.4  # added to the cost of a sighting in its own body
 CHANCE_PREFERENCE_SHARE = 0.1  # preferences in common by chance: PREFERRED_SHARE
 PIECE_LINK_WEIGHT = 0.5  # beside what a common motion costs
 NEGLIGIBLE_LINKS = 0.01  # per track of the smaller of two pieces
+NUM_GROUP_REWEIGHTS = 2  # of the tracks of a group in the fit of its motion
 MIN_COMMON_MEMBERS = 3  # tracks of a group that a pair of frames must show
 NEVER_COMMON_SEPARATION = 1e3  # of groups that no pair of frames shows together: they merge last
 
@@ -228,12 +229,11 @@ class NearPairs:
         moved = (x2 - x1).norm(dim=-1) / film.pixel
         self.precision = self.seen / (1 + moved / DOUBLED_VARIANCE_MOTION) / film.pixel**2
         self.first, self.second = homogeneous(x1), homogeneous(x2)
-        rows = (self.second[..., :, None] * self.first[..., None, :]).flatten(-2)
-        self.rows = rows  # (p, n, 9)
+        self.rows = (self.second[..., :, None] * self.first[..., None, :]).flatten(-2)  # (p, n, 9)
         self.upper = torch.triu_indices(9, 9, device=film.x.device)
         self.count = self.seen.sum(0).double()
 
-    def squared_distances(self, group: Tensor, scale: float, rounds: int = 2) -> tuple[Tensor, Tensor]:
+    def squared_distances(self, group: Tensor, scale: float) -> tuple[Tensor, Tensor]:
         """Squared distances in pixels at rest of the tracks of a group ``(n,)`` bool from its motion."""
         index = group.nonzero().flatten()
         live = (self.seen[:, index].sum(-1) >= MIN_COMMON_MEMBERS).nonzero().flatten()
@@ -243,8 +243,11 @@ class NearPairs:
         first, second = self.first[live][:, index], self.second[live][:, index]
         precision = self.precision[live][:, index]
         weight = square = member
-        for remaining in range(rounds, -1, -1):
-            F = self._solve_least_squares(weight, products)
+        for remaining in range(NUM_GROUP_REWEIGHTS, -1, -1):
+            sums = (weight[:, None] @ products)[:, 0]
+            gram = sums.new_zeros(*sums.shape[:-1], 9, 9)
+            gram[..., self.upper[0], self.upper[1]] = gram[..., self.upper[1], self.upper[0]] = sums
+            F = null_vector(gram)
             matrix = F.unflatten(-1, (3, 3))
             there, here = first @ matrix[:, :2].mT, second @ matrix[:, :, :2]
             gradient = (there.square().sum(-1) + here.square().sum(-1)).clamp(min=1e-12)
@@ -254,25 +257,12 @@ class NearPairs:
                 weight = weight / weight.amax(-1, keepdim=True).clamp(min=1e-200)
         return square, member > 0
 
-    def _solve_least_squares(self, weight: Tensor, products: Tensor) -> Tensor:
-        """Unit vectors ``(q, 9)`` of least squares."""
-        sums = (weight[:, None] @ products)[:, 0]
-        gram = sums.new_zeros(*sums.shape[:-1], 9, 9)
-        gram[..., self.upper[0], self.upper[1]] = sums
-        gram[..., self.upper[1], self.upper[0]] = sums
-        return null_vector(gram)
-
     def count_meetings(self, groups: Tensor) -> tuple[Tensor, Tensor]:
         """Tracks of each group ``(g, n)`` that are seen beside others of each group, and their sightings there, ``(g, g)`` both."""
         member, seen = groups.double(), self.seen.double()
         there = ((seen @ member.mT) >= MIN_COMMON_MEMBERS).double()  # (p, g)
         beside = ((seen.mT @ there) > 0).double()  # (n, g)
         return member @ beside, member @ seen.mT @ there
-
-    def cost(self, group: Tensor, scale: float) -> float:
-        """Cost of a group ``(n,)`` bool: the squared distances of all sightings over the noise, each at most the cap."""
-        square, seen = self.squared_distances(group, scale)
-        return float(((square / scale**2).clamp(max=MAX_SQUARED_DISTANCE) * seen).sum())
 
 
 @dataclass
@@ -298,7 +288,8 @@ class GroupCosts:
         names = [group.cpu().numpy().tobytes() for group in groups]
         for name, group in zip(names, groups, strict=True):
             if name not in self.known:
-                self.known[name] = self.near.cost(group, self.scale)
+                square, seen = self.near.squared_distances(group, self.scale)
+                self.known[name] = float(((square / self.scale**2).clamp(max=MAX_SQUARED_DISTANCE) * seen).sum())
         return torch.tensor([self.known[name] for name in names], dtype=torch.float64, device=groups.device)
 
     def separation(self, groups: Tensor) -> Separation:

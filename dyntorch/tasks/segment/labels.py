@@ -63,13 +63,16 @@ def label_matches(
     members = labels == numbers
     gain = ASSIGNMENT_GAIN * members.to(weights.dtype) if scale is not None else 0.0
     strange = _nonconformity_cost(view, members, scale)
-    links = _normalize_links(view.links)
+    # the sum of the links of every match is 1
+    links = Links(view.links.index, view.links.weight / view.links.weight.sum(-1, keepdim=True).clamp(min=1e-9))
     odds = [(1 - p) / p for p in (min(max(share, MIN_OUTLIER_SHARE), MAX_OUTLIER_SHARE), MAX_OUTLIER_SHARE)]
     outlier = OUTLIER_COST + log(odds[0] / odds[1]) / LABEL_SHARPNESS
 
     def probabilities(bodies: Tensor) -> Tensor:
         square = sampson_squared(bodies, view.x1, view.x2) / threshold**2
-        return label_field(square.clamp(max=MAX_SQUARED_DISTANCE) + strange - gain, outlier, links)
+        cost = square.clamp(max=MAX_SQUARED_DISTANCE) + strange - gain
+        every = torch.cat([torch.full_like(cost[:1], outlier), cost])
+        return mean_field(LABEL_SHARPNESS * every, links, LABEL_SHARPNESS, NUM_LABEL_UPDATES)
 
     bodies = fundamentals
     member = probabilities(bodies)
@@ -82,12 +85,6 @@ def label_matches(
     return Labelling(member, bodies)
 
 
-def label_field(cost: Tensor, outlier: float, links: Links) -> Tensor:
-    """Mean field ``(K + 1, n)`` of the costs ``(K, n)`` of bodies, the first of an outlier."""
-    every = torch.cat([torch.full_like(cost[:1], outlier), cost])
-    return mean_field(LABEL_SHARPNESS * every, links, LABEL_SHARPNESS, NUM_LABEL_UPDATES)
-
-
 def _nonconformity_cost(view: View, members: Tensor, scale: float | None) -> Tensor:
     """Cost ``(K, n)`` of moving unlike the neighbours."""
     if scale is None:
@@ -96,11 +93,6 @@ def _nonconformity_cost(view: View, members: Tensor, scale: float | None) -> Ten
     # members of deep bodies move less like each other
     usual = torch.where(members, value, torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num(nan=1.0)
     return NONCONFORMITY_COST * (1 - value / (FREE_CONFORMITY * usual).clamp(min=MIN_FREE_CONFORMITY)).clamp(min=0)
-
-
-def _normalize_links(links: Links) -> Links:
-    """Links whose sum is 1 for every match."""
-    return Links(links.index, links.weight / links.weight.sum(-1, keepdim=True).clamp(min=1e-9))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

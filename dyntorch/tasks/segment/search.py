@@ -80,7 +80,8 @@ def affine_flows(x1: Tensor, x2: Tensor, links: Links, bodies: Tensor, noise: fl
 
 def _patches(x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: torch.Generator | None) -> Tensor:
     """Members ``(runs, width, n)`` of patches: nearest matches in place and motion of seeds that are far from each other."""
-    distance = _scaled_distances(x) + _scaled_distances(motion)
+    squares = [torch.cdist(part, part).square() for part in (x, motion)]
+    distance = squares[0] / squares[0].median().clamp(min=1e-12) + squares[1] / squares[1].median().clamp(min=1e-12)
     runs, count = len(bodies), len(x)
     seeds = (uniform(runs, 1, generator=generator, device=x.device) * count).long().clamp(max=count - 1)
     for _ in range(1, width):
@@ -91,11 +92,6 @@ def _patches(x: Tensor, motion: Tensor, bodies: Tensor, width: int, generator: t
     order = distance[seeds].topk(min(max(PATCH_SIZES), count), dim=-1, largest=False).indices
     chosen = (torch.arange(order.shape[-1], device=x.device) < sizes[:, None, None].clamp(max=max(4, count // 2))).expand_as(order)
     return torch.zeros(runs, width, count, dtype=torch.float32, device=x.device).scatter_(-1, order, chosen.float())
-
-
-def _scaled_distances(x: Tensor) -> Tensor:
-    square = torch.cdist(x, x).square()
-    return square / square.median().clamp(min=1e-12)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -126,10 +122,14 @@ def one_hot(labels: Tensor, width: int) -> Tensor:
     return (labels[..., None, :] == torch.arange(width, device=labels.device)[:, None]).double()
 
 
-def rough_cost(view: View, fundamentals: Tensor) -> Tensor:
-    """Truncated squared distances ``(*batch, n)``."""
-    square = sampson_squared(fundamentals, view.x1, view.x2)
-    return (square / (POOL_NOISE_PIXELS * view.pixel) ** 2).clamp(max=MAX_SQUARED_DISTANCE)
+def rough_cost(view: View, fundamentals: Tensor, noise: float = POOL_NOISE_PIXELS, most: float = MAX_SQUARED_DISTANCE) -> Tensor:
+    """Truncated squared distances ``(*batch, n)`` over the variance."""
+    return (sampson_squared(fundamentals, view.x1, view.x2) / (noise * view.pixel) ** 2).clamp(max=most)
+
+
+def final_cost(view: View, fundamentals: Tensor) -> Tensor:
+    """The same as the energy counts them."""
+    return rough_cost(view, fundamentals, SAMPSON_NOISE_PIXELS, ENERGY_MAX_SQUARED_DISTANCE)
 
 
 def smooth_costs(cost: Tensor, view: View) -> Tensor:
@@ -195,12 +195,6 @@ def select_distinct(view: View, starts: Starts) -> Starts:
     return Starts(starts.labels[order[selected]], starts.fundamentals[order[selected]])
 
 
-def set_starts(pool: Tensor, cost: Tensor, sets: Tensor) -> Starts:
-    """The starts of the first sets ``(s, K)`` of geometries ``(P, 3, 3)``: each match to the one of least cost ``(P, n)``."""
-    chosen = sets[: 8 * MAX_STARTS]
-    return Starts(cost[chosen].argmin(1), pool[chosen])
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # Labels and epipolar geometries in turns, from many starts at once.
 
@@ -224,19 +218,17 @@ def descend_starts(view: View, starts: Sequence[Starts]) -> dict[int, list[Candi
     rows = present.flatten().nonzero().flatten()
     geometry = torch.cat([s.fundamentals.flatten(0, 1) for s in starts])
 
-    def distances(noise: float) -> Tensor:
-        square = sampson_squared(geometry, view.x1, view.x2) / (noise * view.pixel) ** 2
+    def turn(noise: float, member: Tensor) -> Tensor:
         full = torch.full((present.numel(), len(view.x1)), torch.inf, dtype=torch.float32, device=device)
-        full[rows] = square.clamp(max=MAX_SQUARED_DISTANCE).float()
-        return full.unflatten(0, present.shape)
+        full[rows] = rough_cost(view, geometry, noise * DESCENT_NOISE_PIXELS).float()
+        return mean_field(full.unflatten(0, present.shape), view.links, POOL_CUT_COST, NUM_DESCENT_LABEL_UPDATES, member)
 
     member = torch.cat([one_hot(s.labels, width) for s in starts]).float()
     for noise in DESCENT_SCHEDULE:
-        member = mean_field(distances(noise * DESCENT_NOISE_PIXELS), view.links, POOL_CUT_COST, NUM_DESCENT_LABEL_UPDATES, member)
-        geometry = descend(
-            geometry, view.x1, view.x2, member.flatten(0, 1)[rows].double(), DESCENT_FIT_SCALE_PIXELS * view.pixel, steps=2
-        )
-    member = mean_field(distances(DESCENT_NOISE_PIXELS), view.links, POOL_CUT_COST, NUM_DESCENT_LABEL_UPDATES, member)
+        member = turn(noise, member)
+        weight = member.flatten(0, 1)[rows].double()
+        geometry = descend(geometry, view.x1, view.x2, weight, DESCENT_FIT_SCALE_PIXELS * view.pixel, steps=2)
+    member = turn(1.0, member)
     labels = member.masked_fill(~present[..., None], -1.0).argmax(1)
     hard = one_hot(labels, width)
     fundamentals = geometry.new_zeros(present.numel(), 3, 3)
@@ -263,7 +255,8 @@ def search(view: View, counts: Sequence[int], generator: torch.Generator | None,
     sets = best_sets(cost, max(counts))
     starts = []
     for count in counts:
-        starts.append(set_starts(pool, cost, sets[count - 1]))
+        chosen = sets[count - 1][: 8 * MAX_STARTS]
+        starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
         starts += [fit_labellings(view, labels[plan == count], count)] if count in flows else []
     return descend_starts(view, [select_distinct(view, start) for start in starts])
 
@@ -283,12 +276,8 @@ def search_samples(
     pool = _pool(view, min(counts), max(counts), generator, max_samples)
     cost = rough_cost(view, pool)
     sets = best_sets(cost, max(counts), NUM_FIRST_GEOMETRIES)
-    starts = []
-    for count in counts:
-        if count <= len(pool):
-            chosen = sets[count - 1][:NUM_DESCENDED_SETS]
-            starts.append(Starts(cost[chosen].argmin(1), pool[chosen]))
-    candidates = descend_starts(view, starts) if starts else {}
+    chosen = [sets[count - 1][:NUM_DESCENDED_SETS] for count in counts if count <= len(pool)]
+    candidates = descend_starts(view, [Starts(cost[some].argmin(1), pool[some]) for some in chosen]) if chosen else {}
     return {count: _rank_candidates(view, candidates.get(count, [])) for count in counts}
 
 
@@ -297,7 +286,7 @@ def _rank_candidates(view: View, candidates: list[Candidate]) -> list[Candidate]
     if not candidates:
         return []
     fundamentals = torch.stack([candidate.fundamentals for candidate in candidates])
-    square = _distances(view, fundamentals)
+    square = final_cost(view, fundamentals)
     member = one_hot(square.argmin(1), square.shape[1]) * (square < ENERGY_MAX_SQUARED_DISTANCE)
     inliers = member.sum(-1)
     total = energy(view, fundamentals, member) + ENERGY_MAX_SQUARED_DISTANCE * (len(view.x1) - inliers.sum(-1))
@@ -333,20 +322,13 @@ def _pool(view: View, least: int, most: int, generator: torch.Generator | None, 
             break
         cost = rough_cost(view, pool)
         sets = best_sets(cost, count, NUM_FIRST_GEOMETRIES)[-1][:NUM_PARTIAL_SETS]
-        total = float(_distances(view, pool[sets]).amin(1).sum(-1).min())
+        total = float(final_cost(view, pool[sets]).amin(1).sum(-1).min())
         if count > least and last - total < MIN_BODY_GAIN * len(view.x1) ** 0.5:
             break
         last = total
         left = (cost[sets].amin(1) >= MAX_SQUARED_DISTANCE).double()
         left = left[left.sum(-1) > MIN_BODY_MATCHES]
     return pool
-
-
-def _distances(view: View, fundamentals: Tensor) -> Tensor:
-    """Truncated squared distances ``(*batch, n)`` as the energy counts them."""
-    return (sampson_squared(fundamentals, view.x1, view.x2) / (SAMPSON_NOISE_PIXELS * view.pixel) ** 2).clamp(
-        max=ENERGY_MAX_SQUARED_DISTANCE
-    )
 
 
 def _sample_geometries(view: View, weight: Tensor, parts: int, generator: torch.Generator | None, max_samples: int) -> Tensor:

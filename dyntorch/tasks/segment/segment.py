@@ -398,8 +398,7 @@ def segment(
     options = SegmentOptions() if options is None else options
     check_options(options, SegmentOptions)
     data = matches(FundamentalMatrix(), (x1, x2), weights)
-    if generator is not None and not isinstance(generator, torch.Generator):
-        raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
+    check_search(bodies, generator)
     if data.count == 1 and len(x1) >= MIN_MATCHES:
         raise ValueError(
             f"x1 is {tuple(x1.shape)}: problems of one match each; for points as OpenCV gives them, use x1[:, 0], x2[:, 0]"
@@ -415,9 +414,15 @@ def segment(
     return replace(none, **{name: x.new_zeros(*data.batch, *x.shape) for name, x in tensors.items()}).in_dtype(x1.dtype)
 
 
-def _check_counts(bodies: int | None, count: int) -> None:
+def check_search(bodies: int | None, generator: torch.Generator | None) -> None:
+    """Refuse what is no number of bodies or no source of randomness."""
     if bodies is not None and (isinstance(bodies, bool) or not isinstance(bodies, int) or bodies < 1):
         raise ValueError(f"bodies must be a positive whole number, or None to find out, got {bodies!r}")
+    if generator is not None and not isinstance(generator, torch.Generator):
+        raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
+
+
+def _check_counts(bodies: int | None, count: int) -> None:
     if count < MIN_MATCHES:
         raise ValueError(f"segment needs at least {MIN_MATCHES} matches, got {count}: add {MIN_MATCHES - count}")
     if bodies is not None and bodies * MIN_BODY_MATCHES > count:

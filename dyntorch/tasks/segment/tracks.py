@@ -32,7 +32,7 @@ from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet, find_scene_c
 from dyntorch.tasks.segment.labels import distances, distances_from_cameras, find_static_body, motions, outliers
 from dyntorch.tasks.segment.result import SegmentNotice, TrackSegmentation, count_notices
 from dyntorch.tasks.segment.search import draw_subset, one_hot
-from dyntorch.tasks.segment.segment import MIN_MATCHES
+from dyntorch.tasks.segment.segment import MIN_MATCHES, check_search
 from dyntorch.tasks.segment.track_energy import (
     MIN_BODY_TRACKS,
     Candidates,
@@ -275,16 +275,13 @@ def _check(tracks: Tensor, bodies: int | None, cameras: Tensor | None, generator
         raise ValueError(
             f"segment_tracks needs at least {MIN_MATCHES} tracks, got {tracks.shape[-2]}: add {MIN_MATCHES - tracks.shape[-2]}"
         )
-    if bodies is not None and (isinstance(bodies, bool) or not isinstance(bodies, int) or bodies < 1):
-        raise ValueError(f"bodies must be a positive whole number, or None to find out, got {bodies!r}")
+    check_search(bodies, generator)
     shapes = [(*batch, tracks.shape[-3], 3, 4) for batch in ((), tracks.shape[:-3])]
     if cameras is not None and (not isinstance(cameras, Tensor) or tuple(cameras.shape) not in shapes):
         shape = tuple(cameras.shape) if isinstance(cameras, Tensor) else type(cameras).__name__
         raise ValueError(f"cameras must be (*batch, {tracks.shape[-3]}, 3, 4), a projection for every frame, got {shape}")
     if cameras is not None and not bool(cameras.isfinite().all()):
         raise ValueError("cameras hold numbers that are not finite; give the projection of every frame, or none")
-    if generator is not None and not isinstance(generator, torch.Generator):
-        raise ValueError(f"generator must be a torch.Generator or None, got {generator!r}; use torch.Generator().manual_seed(0)")
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -77,14 +77,15 @@ def test_groups_that_move_as_one_are_on_their_epipolar_lines():
     assert near.count.tolist() == near.seen.sum(0).tolist() and float(near.count[0]) < float(near.count[20])
 
 
-def test_distances_are_those_of_the_motion_that_most_tracks_have():
+def test_distances_are_those_of_the_motion_that_most_tracks_have(monkeypatch):
+    monkeypatch.setattr(agglomeration, "NUM_GROUP_REWEIGHTS", 8)
     scene = shot((60, 30), sigma=0.0)
     scene.tracks[:, 0] += torch.linspace(0, 9, 10, dtype=F64)[:, None]  # one goes astray
     film = scene.film()
     pairs = select_near_pairs(film, (5,), 3, 16)
     near = NearPairs(film, pairs)
     own = scene.labels == 1
-    for row, (a, b) in zip(near.squared_distances(own, 0.15, rounds=8)[0], pairs, strict=True):
+    for row, (a, b) in zip(near.squared_distances(own, 0.15)[0], pairs, strict=True):
         exact = sampson_squared(scene.fundamental(0, a, b), scene.tracks[a][own], scene.tracks[b][own])
         known = exact / (1 + (scene.tracks[b] - scene.tracks[a])[own].norm(dim=-1) / DOUBLED_VARIANCE_MOTION)
         assert float(row[1:].max()) < 0.05 < 0.3 * float(known[0])
