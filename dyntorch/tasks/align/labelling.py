@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant
-from dyntorch.core.limits import MIN_CONSENSUS, median, three_sigma
+from dyntorch.core.limits import median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import Normalization, normalization, normalize_motion
 from dyntorch.core.outcome import Status, is_failure
@@ -25,7 +25,7 @@ from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.numerics.blocks import each, map_blocks, select, uniform
 from dyntorch.numerics.nullspace import null_space, spectrum
-from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, status_of_alignment
+from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC, agrees_too_little, labels_of, status_of_alignment
 
 NUM_LABEL_ROUNDS = 3  # of labelling and refining with the noise known
 NUM_LABEL_ROUNDS_UNKNOWN_NOISE = 6  # turns with the noise to be found as well
@@ -96,22 +96,10 @@ class Evidence:
         """Standard deviation ``(b,)`` that a threshold stands for."""
         return None if threshold is None else torch.full_like(self.floor, threshold / THRESHOLD_SIGMAS).maximum(self.floor)
 
-    def scale_weights(self, weights: Tensor) -> Evidence:
-        """With the matches of each problem weighted by ``(b,)``; 0 leaves a problem out."""
-        return replace(self, data=replace(self.data, weights=self.data.weights * weights[:, None]))
-
-    def parameters(self, motion: tuple[Tensor, ...]) -> Tensor:
-        """``(b, p)`` from motions ``(b, ...)`` in the coordinates of the matches."""
-        parts = normalize_motion(self.invariant, motion, self.norm.transforms)
-        return torch.cat([part.flatten(1) for part in parts], dim=-1)
-
     def problem(self, labels: Tensor) -> Problem:
         """Least squares over the inliers, as refinement sees it."""
-        shapes = tuple(
-            torch.Size((self.norm.transforms[frame.target or 0].shape[-1],) * (1 if frame.vector else 2))
-            for frame in self.invariant.motion
-        )
-        weights = self.data.weights * (labels != OUTLIER)
+        size, weights = self.norm.transforms[0].shape[-1], self.data.weights * (labels != OUTLIER)
+        shapes = (torch.Size((size, size)),) * len(self.invariant.motion)
         return Problem(self.invariant, shapes, self.views, self.norm.scales, weights, labels == STATIC)
 
     def residuals(self, theta: Tensor) -> tuple[Tensor, Tensor]:
@@ -139,22 +127,16 @@ class Evidence:
         limits = [three_sigma(c) * variance for c in (self.invariant.codim, self.static_conditions)]
         agree = [path <= limits[0], still <= limits[1]]
         if spread is not None:
-            pieces = [self._widened_squares(theta, spread, piece) for piece in self._pieces(theta)]
+            problem = self.problem(torch.zeros_like(self.data.weights))
+            pieces = [self._widened_squares(problem, theta, spread, piece) for piece in problem.pieces(theta.shape[-1])]
             for k, (plain, limit) in enumerate(zip((path, still), limits, strict=True)):
                 widened = torch.cat([piece[k] for piece in pieces], dim=-1)
                 agree[k] = agree[k] | ((widened <= limit) & (plain <= MAX_WIDENING**2 * limit))
-        if self.data.static is not None:
-            agree[0] = agree[0] & ~self.data.static
-        labels = torch.where(agree[1], STATIC, torch.where(agree[0], MOVING, OUTLIER))
-        return torch.where(self.data.weights > 0, labels, OUTLIER)
+        return labels_of(agree[1], agree[0], self.data)
 
-    def _pieces(self, theta: Tensor) -> list[slice]:
-        return self.problem(torch.zeros_like(self.data.weights)).pieces(theta.shape[-1])
-
-    def _widened_squares(self, theta: Tensor, spread: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
+    def _widened_squares(self, problem: Problem, theta: Tensor, spread: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
         """Squares ``(b, piece)`` of the two residuals whitened by the uncertainty of the motion as well."""
         views = tuple(x[:, piece] for x in self.views)
-        problem = self.problem(torch.zeros_like(self.data.weights))
         squares = []
         for value, derivative in (problem.linearize_moving(theta, views), problem.linearize_static(theta, views)):
             e = value.unflatten(1, (views[0].shape[1], -1))
@@ -267,9 +249,8 @@ def status_of_labels(
     usable = evidence.data.weights > 0
     present = usable.sum(-1)
     known = torch.zeros_like(present) if evidence.data.static is None else (usable & evidence.data.static).sum(-1)
-    still, moving = (best.labels == STATIC).sum(-1), (best.labels == MOVING).sum(-1)
-    conditions = evidence.static_conditions * still + evidence.invariant.codim * moving
-    accident = (still + moving < MIN_CONSENSUS * present) | (conditions < evidence.invariant.dof + spare) | odd
+    conditions = evidence.static_conditions, evidence.invariant.codim
+    accident = odd | agrees_too_little(best.labels, evidence.data.weights, conditions, evidence.invariant.dof + spare)
     accident = accident | (best.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
     return status_of_alignment(free, accident, undetermined, (present < least[0]) & (known < least[1]))
 

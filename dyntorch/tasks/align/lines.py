@@ -23,7 +23,7 @@ from dyntorch.geometry.homogeneous import homogeneous, unit
 from dyntorch.invariants.agreement import point_error, static_residual
 from dyntorch.invariants.translating_lines_matrix import TranslatingLinesMatrix
 from dyntorch.numerics.arguments import check_options, check_threshold
-from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.blocks import each, one_thread
 from dyntorch.numerics.least_squares import LeastSquaresOptions, NormalEquations, by_match, derivatives, minimize
 from dyntorch.numerics.messages import Message
 from dyntorch.numerics.nullspace import spectrum
@@ -36,6 +36,7 @@ from dyntorch.tasks.align.result import (
     AlignNotice,
     AlignOptions,
     alignment_of,
+    labels_of,
     status_of_alignment,
 )
 
@@ -83,10 +84,6 @@ class Lines:
         tensor = TranslatingLinesMatrix.compose(theta.unflatten(-1, (4, 4)))
         return multilinear(TranslatingLinesMatrix(), tensor, self.views, self.norm.scales)
 
-    def static_residuals(self, theta: Tensor) -> Tensor:
-        """Distances ``(b, n, 6)`` of both points of a line in view 2, carried into view 1, from the line there; 4 conditions."""
-        return _static_residuals(theta, self.norm.scales, self.views)
-
     def problem(self, labels: Tensor) -> LinesProblem:
         """Least squares of the residuals of the labelled lines and the static points, in the unit of the points."""
         root = self.data.weights.sqrt()
@@ -106,7 +103,7 @@ class LinesProblem(NormalEquations):
 
     def subset(self, keep: Tensor) -> LinesProblem:
         """Only some of the problems."""
-        return LinesProblem(*(tuple(x[keep] for x in part) for part in (self.views, self.points, self.scales, self.roots)))
+        return each(lambda x: x[keep], self)
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost ``(b,)``, gradient ``(b, 16)`` and Gauss-Newton matrix ``(b, 16, 16)``."""
@@ -122,6 +119,7 @@ class LinesProblem(NormalEquations):
 
 
 def _static_residuals(theta: Tensor, scales: tuple[Tensor, ...], views: tuple[Tensor, ...]) -> Tensor:
+    """Distances ``(b, n, 6)`` of both points of a line in view 2, carried into view 1, from the line there; 4 conditions."""
     first, second = views[0].unbind(-2)
     along = second - first
     square = along.square().sum(-1, keepdim=True).clamp(min=torch.finfo(theta.dtype).tiny)
@@ -198,21 +196,14 @@ def spread(lines: Lines, theta: Tensor, labels: Tensor) -> tuple[Tensor, Tensor,
 
 
 def _labels(lines: Lines, theta: Tensor, sigma: Tensor) -> Tensor:
-    square, known = sigma.square()[:, None], lines.data.static
-    still = lines.static_residuals(theta).square().sum(-1) <= three_sigma(4) * square
-    path = lines.moving_residuals(theta).square() <= three_sigma(1) * square
-    path = path if known is None else path & ~known
-    labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
-    return torch.where(lines.data.weights > 0, labels, OUTLIER)
+    square = sigma.square()[:, None]
+    still = _static_residuals(theta, lines.norm.scales, lines.views).square().sum(-1) <= three_sigma(4) * square
+    return labels_of(still, lines.moving_residuals(theta).square() <= three_sigma(1) * square, lines.data)
 
 
 MINIMAL = TranslatingLinesMatrix.minimal()
 PER_POINT = 9  # matches of lines that one static point gives
-RANKS = (
-    (20, "static"),
-    (28, "bodies"),
-    (31, "translation"),
-)
+RANKS = ((20, "static"), (28, "bodies"), (31, "translation"))
 """Ranks of the estimation matrix (of 35) for special motions, cases of a notice (thesis section 8.4, counted exactly)."""
 
 AMBIGUITY = (

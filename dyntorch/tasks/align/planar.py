@@ -19,7 +19,7 @@ from dyntorch.geometry.homogeneous import homogeneous, nonzero_sign
 from dyntorch.geometry.rigid import CommonPlane, PlaneMotion, motion_over, plane_motions
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
-from dyntorch.numerics.blocks import one_thread
+from dyntorch.numerics.blocks import each, one_thread
 from dyntorch.numerics.least_squares import LeastSquaresOptions, minimize
 from dyntorch.numerics.messages import Message
 from dyntorch.numerics.nullspace import eigenvalues
@@ -96,10 +96,6 @@ class CalibratedViews(NamedTuple):
         C = torch.where(known[:, None, None], C.reshape(b, 9 * v, 9 * v), 0.0)
         return cls(scale[..., None, None] * N, C, known, fine, rays, counts)
 
-    def repeat(self, count: int) -> CalibratedViews:
-        """Every problem so many times in a row."""
-        return CalibratedViews(*(part.repeat_interleave(count, 0) for part in self))
-
     def plane(self) -> CommonPlane:
         """The least squares problem of the normal."""
         return CommonPlane(inverse=self.inverse, covariance=self.covariance, floor=LENGTH_ROUNDING)
@@ -146,7 +142,7 @@ def chosen_plane(views: CalibratedViews) -> PlaneChoice:
     b = len(inverse)
     starts = plane_motions(torch.linalg.inv(inverse)).normal.flatten(1, 2)
     count = starts.shape[1]
-    wide = views.repeat(count)
+    wide = each(lambda part: part.repeat_interleave(count, 0), views)  # every problem so many times in a row
     problem = wide.plane()
     found = minimize(problem, problem.evaluate((starts.flatten(0, 1),)), LeastSquaresOptions(iterations=MAX_NORMAL_STEPS))
     flat = wide.orient(found.theta[0])

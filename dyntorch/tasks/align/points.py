@@ -92,7 +92,8 @@ def _search(
         # where the noise is known, so is whether the motion of the minimal tensor is the right one
         doubt = _doubt(evidence, theta[-size:], given) if full else torch.zeros_like(given)
         if bool(doubt.any()):
-            last, _ = start(JoinTensor(), evidence.scale_weights(doubt))
+            part = replace(evidence, data=replace(evidence.data, weights=evidence.data.weights * doubt[:, None]))
+            last, _ = start(JoinTensor(), part)
             theta = torch.cat([theta, evidence.improve_starts([last], given, sampled=False)])
     return evidence.iterate_labels(evidence.best_start(theta, sigma), sigma, estimate=given is None)
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
+from dyntorch.core.limits import MIN_CONSENSUS
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Notice, NoticeCode, Outcome, Status, has_inliers, is_failure
 from dyntorch.core.solution import Solution
@@ -74,9 +75,8 @@ class AlignNotice(NoticeCode):
         {
             "static": f"{_LINES}all lines stand still; give two static points",
             "bodies": f"{_LINES}the lines belong to two rigid bodies that translate; give two static points",
-            "translation": f"{_LINES}the lines only translate: the position and the scale of view 2 remain unknown, four "
-            f"degrees of "
-            "freedom; give two static points",
+            "translation": f"{_LINES}the lines only translate: the position and the scale of view 2 remain unknown, four degrees "
+            "of freedom; give two static points",
         },
     )
     """The lines only translate: the motion is known up to a family, unless static points fix it."""
@@ -180,8 +180,7 @@ class Alignment(Outcome):
         Status.AMBIGUOUS: "other motions fit as well; add matches that differ more, lower the noise, or use a model with fewer "
         "unknowns",
         Status.NO_CONSENSUS: "no motion fits enough of the matches; raise {arg:threshold}, or give matches of which more belong "
-        "to the "
-        "model",
+        "to the model",
     }
 
     def has_notice(self, code: NoticeCode | str) -> Tensor:
@@ -222,6 +221,19 @@ class Alignment(Outcome):
             sigma = float(self.sigma.flatten().double().nan_to_num().median())
             lines.append(f"  noise: {sigma:.3g} per coordinate" + (" (median)" if self.status.ndim else ""))
         return "\n".join(lines + self.warning_lines())
+
+
+def labels_of(still: Tensor, path: Tensor, data: Matches) -> Tensor:
+    """Labels ``(b, n)`` of matches that agree with a static point, or with a moving one where they are not known to be static."""
+    path = path if data.static is None else path & ~data.static
+    return torch.where(data.weights > 0, torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER)), OUTLIER)
+
+
+def agrees_too_little(labels: Tensor, weights: Tensor, conditions: tuple[int, int], least: Tensor | int) -> Tensor:
+    """Whether few of the matches are inliers ``(b,)``, or these fulfil few conditions: so many each static one, and each moving."""
+    still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
+    fulfilled = conditions[0] * still + conditions[1] * moving
+    return (still + moving < MIN_CONSENSUS * (weights > 0).sum(-1)) | (fulfilled < least)
 
 
 def status_of_alignment(ambiguous: Tensor, accident: Tensor, undetermined: Tensor, few: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from dyntorch.core.limits import MIN_CONSENSUS, median, three_sigma
+from dyntorch.core.limits import median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.outcome import Notice, in_order, is_failure, noting
 from dyntorch.core.solution import NOISY
@@ -25,6 +25,7 @@ from dyntorch.tasks.align.result import (
     Alignment,
     AlignNotice,
     AlignOptions,
+    agrees_too_little,
     alignment_of,
     status_of_alignment,
 )
@@ -161,10 +162,7 @@ class RigidProblem(LeastSquares):
 
     def subset(self, keep: Tensor) -> RigidProblem:
         """Only some of the problems."""
-        data, (square, still) = self.data, (None if x is None else x[keep] for x in (self.square, self.still))
-        return RigidProblem(
-            RigidSightings(data.x1[keep], data.x2[keep], data.x3[keep], data.weights[keep], data.motion), square, still
-        )
+        return each(lambda x: x[keep], self)
 
     def evaluate(self, theta: Tensors) -> Iterate:
         """With the squared residuals ``(b, n)``."""
@@ -265,7 +263,7 @@ def _search(
     noise = noise if sigma is not None else noise.amin(1, keepdim=True).expand_as(noise)
     winner = _score(*squares(motions, data), held, data, noise).argmin(1)
     first = torch.arange(len(winner), device=winner.device)
-    flat = RigidSightings(data.x1[:, 0], data.x2[:, 0], data.x3[:, 0], data.weights[:, 0], data.motion)
+    flat = each(lambda x: x[:, 0], data)
     grounded = held.any(-1) if data.motion == "constant_velocity" else torch.ones_like(held[:, 0])
     found = _iterate_labels(motions[first, winner], flat, noise[first, winner], sigma is None, held, grounded, floor)
     if data.motion == "straight":
@@ -433,7 +431,9 @@ def _result(
     worst = found.sigma * values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     top = found.information.diagonal(dim1=-2, dim2=-1).amax(-1)
     noisy = found.sigma.isfinite() & (found.sigma > NOISY)
-    status = _status(labels, sightings.weights, worst, noisy, values <= RIGID_INFORMATION_RATIO * top, dof, MOTIONS[motion])
+    accident = noisy | agrees_too_little(labels, sightings.weights, (6, MOTIONS[motion]), dof + MIN_SPARE_RIGID)
+    undetermined, few = (values <= RIGID_INFORMATION_RATIO * top) & ~accident, (sightings.weights > 0).sum(-1) < 3
+    status = status_of_alignment(worst > MAX_RIGID_DEVIATION, accident, undetermined, few)
     none = is_failure(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
     matrices, entries = _to_point_units(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
@@ -473,21 +473,6 @@ def _inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
     floor = 1e-14 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
     inverse = torch.where(used, 1 / values.clamp(min=floor), 0.0)
     return least, (vectors * inverse[:, None]) @ vectors.mT
-
-
-def _status(
-    labels: Tensor,
-    weights: Tensor,
-    worst: Tensor,
-    noisy: Tensor,
-    undetermined: Tensor,
-    dof: Tensor,
-    conditions: int,
-) -> Tensor:
-    present = (weights > 0).sum(-1)
-    still, moving = (labels == STATIC).sum(-1), (labels == MOVING).sum(-1)
-    accident = (still + moving < MIN_CONSENSUS * present) | (6 * still + conditions * moving < dof + MIN_SPARE_RIGID) | noisy
-    return status_of_alignment(worst > MAX_RIGID_DEVIATION, accident, undetermined & ~accident, present < 3)
 
 
 def _to_point_units(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale: Tensor) -> tuple[Tensor, Tensor]:

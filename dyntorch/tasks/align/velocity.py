@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.fit import fit_matches
-from dyntorch.core.limits import MIN_CONSENSUS, MIN_INFORMATION, median, three_sigma
+from dyntorch.core.limits import MIN_INFORMATION, median, three_sigma
 from dyntorch.core.matches import Matches
-from dyntorch.core.normalize import denormalize_motion
+from dyntorch.core.normalize import denormalize_motion, normalize_motion
 from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY
@@ -27,7 +27,9 @@ from dyntorch.tasks.align.result import (
     Alignment,
     AlignNotice,
     AlignOptions,
+    agrees_too_little,
     alignment_of,
+    labels_of,
     status_of_alignment,
 )
 
@@ -136,12 +138,9 @@ def _label_and_fit(evidence: Evidence, state: Velocities, affine: bool, estimate
 
 def _labels(evidence: Evidence, theta: Tensor, sigma: Tensor, grounded: Tensor) -> Tensor:
     moving, resting = residuals(evidence, theta)
-    variance, known = sigma.square()[:, None], evidence.data.static
+    variance = sigma.square()[:, None]
     still = (resting <= three_sigma(6) * variance) & grounded[:, None]
-    path = moving <= three_sigma(3) * variance
-    path = path if known is None else path & ~known
-    labels = torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
-    return torch.where(evidence.data.weights > 0, labels, OUTLIER)
+    return labels_of(still, moving <= three_sigma(3) * variance, evidence.data)
 
 
 def _noise(evidence: Evidence, theta: Tensor, labels: Tensor, before: Tensor, dof: Tensor) -> Tensor:
@@ -228,7 +227,13 @@ def align_velocity(
     # singular maps have no motion between them to be known
     covariance = torch.where(covariance.isfinite().flatten(1).all(-1)[:, None, None], covariance, torch.inf)
     worst = state.sigma * extent[:, 0].clamp(min=torch.finfo(theta.dtype).tiny).rsqrt()
-    status = _status(evidence, state, worst, extent[:, 0] <= MIN_INFORMATION * extent[:, 1], found, affine)
+    present = (data.weights > 0).sum(-1)
+    least = DOF[affine] + GAUGE * state.grounded.long() + MIN_SPARE_VELOCITY * (present > MINIMAL[affine] + 1)
+    accident = agrees_too_little(state.labels, data.weights, (6, 3), least)
+    accident = accident | (state.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
+    undetermined, few = (extent[:, 0] <= MIN_INFORMATION * extent[:, 1]) & ~accident, present < MINIMAL[affine]
+    status = status_of_alignment(worst > MAX_VELOCITY_DEVIATION, accident, undetermined, few)
+    status = torch.where((found != Status.OK) & ~few, found.to(status), status)
     none = is_failure(status)
     return alignment_of(
         data,
@@ -249,9 +254,10 @@ def _projective_start(
     """Maps ``(b, 48)`` of the tensor by robust estimation, the noise, and the status of those that failed."""
     data = evidence.data
     found = robust_fit(ConstantVelocityTensor(), *data.views, threshold=threshold, weights=data.weights, generator=generator)
-    theta = evidence.parameters(tuple(part.reshape(-1, 4, 4) for part in found.motion))
+    parts = normalize_motion(evidence.invariant, [part.reshape(-1, 4, 4) for part in found.motion], evidence.norm.transforms)
+    theta = torch.cat([part.flatten(1) for part in parts], dim=-1)
     usable = theta.isfinite().all(-1) & ~is_failure(found.status)
-    theta = torch.where(usable[:, None], theta, _identity(theta))
+    theta = torch.where(usable[:, None], theta, torch.eye(4).to(theta).flatten().repeat(3) / 2)
     return theta, _starting_noise(evidence, theta, given), torch.where(usable, int(Status.OK), found.status)
 
 
@@ -332,24 +338,6 @@ def _starting_noise(evidence: Evidence, theta: Tensor, given: Tensor | None) -> 
     moving, _ = residuals(evidence, theta)
     middle = torch.where(evidence.data.weights > 0, moving, torch.nan).nanmedian(dim=-1).values.nan_to_num()
     return (middle / median(3)).sqrt().maximum(evidence.floor)
-
-
-def _identity(theta: Tensor) -> Tensor:
-    return torch.eye(4, dtype=theta.dtype, device=theta.device).flatten().repeat(3) / 2
-
-
-def _status(evidence: Evidence, state: Velocities, worst: Tensor, undetermined: Tensor, found: Tensor, affine: bool) -> Tensor:
-    present = (evidence.data.weights > 0).sum(-1)
-    still = (state.labels == STATIC).sum(-1)
-    moving = (state.labels != OUTLIER).sum(-1) - still
-    dof = DOF[affine] + GAUGE * state.grounded.long()
-    accident = (still + moving < MIN_CONSENSUS * present) | (
-        6 * still + 3 * moving < dof + MIN_SPARE_VELOCITY * (present > MINIMAL[affine] + 1)
-    )
-    accident = accident | (state.sigma * torch.stack(evidence.norm.scales).amax(0) > NOISY)
-    few = present < MINIMAL[affine]
-    status = status_of_alignment(worst > MAX_VELOCITY_DEVIATION, accident, undetermined & ~accident, few)
-    return torch.where((found != Status.OK) & ~few, found.to(status), status)
 
 
 def _notices(

@@ -24,15 +24,15 @@ from dyntorch.numerics.arguments import check_options, check_threshold, check_to
 from dyntorch.numerics.blocks import one_thread
 from dyntorch.numerics.least_squares import LeastSquaresOptions
 from dyntorch.tasks.pair.affine import MIN_POINTS, Transfer, solve
-from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, failure
+from dyntorch.tasks.pair.result import PairNotice, PairReconstruction, Refusal, failure
 from dyntorch.tasks.pair.tracks import (
     MAX_ALONG_EXTENT,
     MAX_ALONG_RATIO,
-    MAX_DISTANCE_RATIO,
     MAX_RESIDUAL_SIGMAS,
     Overlap,
     fill_gaps,
     match_tracks,
+    mutually_nearest,
     overlap,
 )
 from dyntorch.tasks.synchronize.projective import MAX_MISFIT, Poses, common_motion
@@ -62,25 +62,24 @@ class PairOptions:
 # Two projective cameras that see different points of one rigid body, from its motion before each.
 
 
-def body_pair(seen: Overlap, threshold: float | None, explained: float) -> PairReconstruction:
+def body_pair(seen: Overlap, threshold: float | None, explained: float) -> PairReconstruction | Refusal:
     r"""One body, two cameras, points of either's own:"""
-    n, m = seen.a.shape[1], seen.b.shape[1]
     tracks = [_tracks(x, seen) for x in (seen.a, seen.b)]
     motions = []
     for name, one in zip("ab", tracks, strict=True):
         motion = body_motion(name, one)
         if isinstance(motion, Notice):
-            return failure((n, m), seen.times, motion.code.refuses or Status.DEGENERATE, motion, 4, n + m)
+            return motion, motion.code.refuses or Status.DEGENERATE
         motions.append(motion)
     first, second = motions
     poses = [Poses.of(motion, seen.times) for motion in motions]
     shared, misfit = common_motion(poses[0], poses[1])
     if not misfit <= MAX_MISFIT:
-        return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, misfit), 4, n + m)
+        return Notice(PairNotice.TWO_MOTIONS, misfit), Status.NO_CONSENSUS
     body, problem = _joint_problem(first, second, shared, tracks)
     body, cost = fit_body(problem, body, LeastSquaresOptions(iterations=MAX_ITERATIONS, tolerance=1e-10))
     if not bool(cost.isfinite().all()):
-        return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.TWO_MOTIONS, math.inf), 4, n + m)
+        return Notice(PairNotice.TWO_MOTIONS, math.inf), Status.NO_CONSENSUS
     return _body_reconstruction(seen, body, first, second, threshold, explained)
 
 
@@ -179,14 +178,8 @@ def _match(both: Tensor, good: Tensor, n: int, residual: float) -> tuple[Tensor,
     if not worst.numel():
         return torch.full((worst.shape[1],), -1, dtype=torch.long, device=good.device), distances
     extent = float((both[0] - both[0].nanmean(1, keepdim=True)).square().sum(-1).nanmean().sqrt())
-    limit = max(MAX_ALONG_RATIO * residual, MAX_ALONG_EXTENT * extent)
-    best, track = worst.min(0)
-    mutual = worst.argmin(1)[track] == torch.arange(worst.shape[1], device=good.device)
-    others = worst.clone()
-    others[track, torch.arange(worst.shape[1], device=good.device)] = math.inf
-    second = torch.minimum(others.amin(0), others[track].amin(1))
-    sure = mutual & (best <= limit) & (best <= MAX_DISTANCE_RATIO * second)
-    return torch.where(sure, track, -1), distances
+    best, track = mutually_nearest(worst)
+    return torch.where(best <= max(MAX_ALONG_RATIO * residual, MAX_ALONG_EXTENT * extent), track, -1), distances
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -198,14 +191,12 @@ MIN_POSITIONS = 12  # in both cameras: with fewer, agreement with some fundament
 
 def projective(
     seen: Overlap, threshold: float | None, explained: float, generator: torch.Generator | None, max_samples: int
-) -> PairReconstruction:
+) -> PairReconstruction | Refusal:
     """The reconstruction of corresponding points."""
     frames, n = seen.a.shape[:2]
     both = (seen.a.isfinite() & seen.b.isfinite()).all(-1)
-    needed = MIN_POSITIONS
-    if int(both.sum()) < needed or int(both.any(0).sum()) < 1:
-        notice = Notice(PairNotice.FEW_OBSERVED, float(both.sum()), {"needed": needed})
-        return failure((n, n), seen.times, Status.TOO_FEW, notice, 4)
+    if int(both.sum()) < MIN_POSITIONS:
+        return Notice(PairNotice.FEW_OBSERVED, float(both.sum()), {"needed": MIN_POSITIONS}), Status.TOO_FEW
     # of unit size: neither the solver's nor the triangulation's precision depends on the unit
     x1, x2 = seen.a.nan_to_num(), seen.b.nan_to_num()
     chosen = both.flatten().nonzero()[:, 0]
@@ -214,7 +205,7 @@ def projective(
     fitted = robust_fit(FundamentalMatrix, x1.flatten(0, 1)[part], x2.flatten(0, 1)[part], threshold=threshold, generator=generator)
     status = Status(int(fitted.status))
     if bool(is_failure(fitted.status)):
-        return failure((n, n), seen.times, status, Notice(PairNotice.DEGENERATE, float(len(part))), 4)
+        return Notice(PairNotice.DEGENERATE, float(len(part))), status
     F = fitted.tensor
     distance = sampson(FundamentalMatrix, F, x1.flatten(0, 1), x2.flatten(0, 1)).unflatten(0, (frames, n))
     distance = torch.where(both, distance.abs(), torch.nan)
@@ -350,15 +341,15 @@ def reconstruct_pair(
         seen = overlap(a, b, shift, fps=fps, times=times)
         short = _short(seen, options.min_frames)
         if short is not None:
-            count = a.shape[1] + (0 if correspondence else b.shape[1])
-            width = 4 if correspondence or camera == "projective" else 3
-            found = failure((a.shape[1], b.shape[1]), seen.times, Status.TOO_FEW, short, width, count)
+            found: PairReconstruction | Refusal = short, Status.TOO_FEW
         elif correspondence:
             found = projective(seen, threshold, explained, generator, options.max_samples)
         elif camera == "projective":
             found = body_pair(seen, threshold, explained)
         else:
             found = _affine(seen, explained, options)
+    if isinstance(found, tuple):
+        found = failure(a.shape[1], b.shape[1], seen.times, found, correspondence, camera)
     return _to_dtype(found, a.dtype)
 
 
@@ -390,11 +381,9 @@ def _batch(
         return reconstruct_pair(first, second, own, correspondence, times=clocks, camera=camera, **more)
 
     def spare(said: str) -> PairReconstruction:
-        width = 4 if correspondence or camera == "projective" else 3
-        n, m = a.shape[-2], b.shape[-2]
         none = torch.zeros(0, dtype=torch.float64, device=a.device)
-        notice = Notice(PairNotice.UNUSABLE, 0.0, {"said": said})
-        return _to_dtype(failure((n, m), none, Status.TOO_FEW, notice, width, n if correspondence else n + m), a.dtype)
+        refusal = Notice(PairNotice.UNUSABLE, 0.0, {"said": said}), Status.TOO_FEW
+        return _to_dtype(failure(a.shape[-2], b.shape[-2], none, refusal, correspondence, camera), a.dtype)
 
     return solve_one_by_one(batch, solve, spare)
 
@@ -423,36 +412,33 @@ def _check(a: Tensor, b: Tensor, correspondence: bool, explained: float, camera:
 
 def _short(seen: Overlap, needed: int) -> Notice | None:
     frames = len(seen.times)
-    if frames >= needed:
-        return None
-    return Notice(PairNotice.SHORT_OVERLAP, float(frames), {"needed": needed})
+    return Notice(PairNotice.SHORT_OVERLAP, float(frames), {"needed": needed}) if frames < needed else None
 
 
 MIN_SPARE_FRAMES = 6  # beyond the number of points of either camera: fewer are explained by any tracks
 
 
-def _affine(seen: Overlap, explained: float, options: PairOptions) -> PairReconstruction:
+def _affine(seen: Overlap, explained: float, options: PairOptions) -> PairReconstruction | Refusal:
     """The reconstruction of different points."""
-    n, m = seen.a.shape[1], seen.b.shape[1]
     often = [x.isfinite().all(-1).double().mean(0) >= options.min_seen_share for x in (seen.a, seen.b)]
     for name, kept in zip("ab", often, strict=True):
         if int(kept.sum()) < MIN_POINTS:
             values = {"case": "shown", "which": name, "needed": MIN_POINTS}
-            return failure((n, m), seen.times, Status.TOO_FEW, Notice(PairNotice.FEW_POINTS, float(kept.sum()), values), 3)
+            return Notice(PairNotice.FEW_POINTS, float(kept.sum()), values), Status.TOO_FEW
     tracks = [fill_gaps(x[:, kept], s * s) for x, kept, s in zip((seen.a, seen.b), often, seen.noise, strict=True)]
     most = max(x.shape[1] for x in tracks)
     wrong = _short(seen, most + MIN_SPARE_FRAMES) or _unusable(tracks, seen.noise)
     if wrong is not None:
-        return failure((n, m), seen.times, wrong.code.refuses or Status.DEGENERATE, wrong, 3)
+        return wrong, wrong.code.refuses or Status.DEGENERATE
     centres = [x.mean((0, 1)) for x in tracks]
     found = solve(tracks[0] - centres[0], tracks[1] - centres[1], seen.noise, explained, options.num_chance_draws)
     split = int(often[0].sum())
     if isinstance(found, Tensor):
         counts = int(found[:split].sum()), int(found[split:].sum())
         notice = Notice(PairNotice.FEW_POINTS, float(min(counts)), {"case": "explained", "a": counts[0], "b": counts[1]})
-        return failure((n, m), seen.times, Status.NO_CONSENSUS, notice, 3)
+        return notice, Status.NO_CONSENSUS
     if found.beyond < options.min_chance_margin:
-        return failure((n, m), seen.times, Status.NO_CONSENSUS, Notice(PairNotice.CHANCE, found.beyond), 3)
+        return Notice(PairNotice.CHANCE, found.beyond), Status.NO_CONSENSUS
     return _assemble(seen, found, tracks, centres, torch.cat(often))
 
 
@@ -503,6 +489,7 @@ def _assemble(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: lis
     residuals[often] = torch.where(found.good, missed.square().mean(0).sqrt(), torch.nan)
     r2[often] = found.r2
     matches, distances = match_tracks(points, n, found.residual)
+    places = {"a": split, "b": len(found.good) - split}
     return PairReconstruction(
         cameras=cameras,
         points=points,
@@ -517,7 +504,7 @@ def _assemble(seen: Overlap, found: Transfer, tracks: list[Tensor], centres: lis
         residuals=residuals,
         residual=found.residual,
         status=torch.tensor(int(Status.OK), device=points.device),
-        notices=() if found.affine else (_free_places(found, split),),
+        notices=() if found.affine else (Notice(PairNotice.FREE_PLACES, found.residual, places),),
     )
 
 
@@ -534,7 +521,3 @@ def _fundamental(cameras: Tensor) -> Tensor:
     F[:2, 2], F[2, :2] = other / scale, -normal
     F[2, 2] = normal @ cameras[0, :2, 3] - other @ cameras[1, :2, 3] / scale
     return F / torch.linalg.matrix_norm(F)
-
-
-def _free_places(found: Transfer, split: int) -> Notice:
-    return Notice(PairNotice.FREE_PLACES, found.residual, {"a": split, "b": len(found.good) - split})

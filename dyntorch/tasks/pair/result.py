@@ -154,12 +154,13 @@ class PairReconstruction(Outcome):
         return "\n".join(lines + self.warning_lines())
 
 
-def failure(
-    points: tuple[int, int], times: Tensor, status: Status, notice: Notice, width: int, count: int | None = None
-) -> PairReconstruction:
-    """Nothing found."""
-    n, m = points
-    count = count if count is not None else n + m if width == 3 else n
+Refusal = tuple[Notice, Status]
+
+
+def failure(n: int, m: int, times: Tensor, refusal: Refusal, correspondence: bool, camera: str) -> PairReconstruction:
+    """Nothing found of n and m points, and why."""
+    notice, status = refusal
+    width, count = 4 if correspondence or camera == "projective" else 3, n if correspondence else n + m
     like = {"dtype": torch.float64, "device": times.device}
 
     def empty(*shape: int) -> Tensor:

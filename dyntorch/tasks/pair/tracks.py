@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.fft import dct, idct
 from torch import Tensor
 
 from dyntorch.tasks.synchronize.result import Shift
@@ -141,16 +143,21 @@ def match_tracks(points: Tensor, n: int, residual: float) -> tuple[Tensor, Tenso
         return none, distances
     place = points.nanmean(0)
     extent = float((place - place.nanmean(0)).square().sum(-1).nanmean().sqrt())
-    ranked = torch.where(known, distances, torch.inf)
-    best, track = ranked.min(0)
-    nearest = ranked.argmin(1)
-    mutual = nearest[track] == torch.arange(len(track), device=points.device)
-    other = ranked.clone()
-    other[track, torch.arange(len(track), device=points.device)] = torch.inf
-    second_best = torch.minimum(other.amin(0), other[track].amin(1))
+    best, track = mutually_nearest(torch.where(known, distances, torch.inf))
     same = along.nan_to_num(nan=torch.inf).gather(0, track[None])[0] <= max(MAX_ALONG_RATIO * residual, MAX_ALONG_EXTENT * extent)
     near = best <= max(MAX_APART_RATIO * residual, MAX_APART_EXTENT * extent)
-    return torch.where(mutual & same & near & (best <= MAX_DISTANCE_RATIO * second_best), track, none), distances
+    return torch.where(same & near, track, none), distances
+
+
+def mutually_nearest(distances: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance ``(m,)`` of every column ``(n, m)`` from its nearest row, infinite where that has another nearest column, or another
+    pair of either comes near to it, and the row."""
+    best, row = distances.min(0)
+    column = torch.arange(len(row), device=row.device)
+    other = distances.clone()
+    other[row, column] = torch.inf
+    sure = (distances.argmin(1)[row] == column) & (best <= MAX_DISTANCE_RATIO * torch.minimum(other.amin(0), other[row].amin(1)))
+    return torch.where(sure, best, torch.inf), row
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -159,19 +166,12 @@ def match_tracks(points: Tensor, n: int, residual: float) -> tuple[Tensor, Tenso
 
 def cosines(x: Tensor) -> Tensor:
     """Orthonormal discrete cosine transform (type II) over the first dimension, without its constant."""
-    frames = len(x)
-    spectrum = torch.fft.rfft(torch.cat([x, x.flip(0)]), dim=0)[1:frames]
-    turn = torch.exp(-0.5j * torch.pi / frames * torch.arange(1, frames, dtype=x.dtype, device=x.device))
-    return (spectrum * turn[(..., *([None] * (x.ndim - 1)))]).real / (2 * frames) ** 0.5
+    return torch.from_numpy(dct(x.numpy(), axis=0, norm="ortho")[1:])
 
 
 def inverse_cosines(z: Tensor) -> Tensor:
     """The inverse of :func:`cosines`: ``(T - 1, ...)`` to ``(T, ...)`` of mean 0."""
-    frames = len(z) + 1
-    turn = torch.exp(0.5j * torch.pi / frames * torch.arange(1, frames, dtype=z.dtype, device=z.device))
-    half = z * turn[(..., *([None] * (z.ndim - 1)))] * (2 * frames) ** 0.5
-    zero = torch.zeros_like(half[:1])
-    return torch.fft.irfft(torch.cat([zero, half, zero]), n=2 * frames, dim=0)[:frames]
+    return torch.from_numpy(idct(np.concatenate([np.zeros((1, *z.shape[1:])), z.numpy()]), axis=0, norm="ortho"))
 
 
 MIN_POWER_RATIO = 1e-6  # of the motion of any frequency over the noise, and of the noise in gaps over the motion
