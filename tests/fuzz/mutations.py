@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import struct
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -181,17 +182,7 @@ def _array(array: Any, rng: Random) -> Any:
     if way == 6:
         return array[: rng.randrange(len(array) + 1)] if array.ndim else array[None]
     if way == 7:
-        return rng.choice(
-            (
-                np.float64(1),
-                np.zeros(0),
-                np.zeros((0, 3)),
-                np.array("x"),
-                np.array(["a", "b"]),
-                np.arange(5),
-                np.zeros((2, 2, 2, 2)),
-            )
-        )
+        return np.array(rng.choice((1.0, [], [[]] * 3, "x", ["a", "b"], range(5), np.zeros((2, 2, 2, 2)).tolist())))
     return np.concatenate([array, array]) if array.ndim else array
 
 
@@ -208,30 +199,18 @@ def of_npz(data: bytes, rng: Random) -> bytes:
     elif way == 4:
         del members[at]
     elif way == 5:
-        members.insert(
-            0,
-            (
-                rng.choice(("more.npy", "x" * 200 + ".npy", "../up.npy", "text.txt", name, "a\nb.npy", ".npy")),
-                of_npy(body, rng),
-                packing,
-            ),
-        )
+        new = rng.choice(("more.npy", "x" * 200 + ".npy", "../up.npy", "text.txt", name, "a\nb.npy", ".npy"))
+        members.insert(0, (new, of_npy(body, rng), packing))
     elif way == 6:
-        members[at] = (
-            rng.choice((name.removesuffix(".npy"), name + "x", name.upper(), "y.npy", "a/y.npy", "x1.npy")),
-            body,
-            packing,
-        )
+        new = rng.choice((name.removesuffix(".npy"), name + "x", name.upper(), "y.npy", "a/y.npy", "x1.npy"))
+        members[at] = (new, body, packing)
     elif way == 7:
         members[at] = (name, body, rng.choice((zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED)))
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        import warnings
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of names that come twice
-            for name, body, packing in members:
-                archive.writestr(name, body, packing, 1)
+    with zipfile.ZipFile(stream, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of names that come twice
+        for name, body, packing in members:
+            archive.writestr(name, body, packing, 1)
     out = bytearray(stream.getvalue())
     return bytes(_directory(out, rng)) if way == 8 or rng.random() < 0.15 else bytes(out)
 
@@ -336,18 +315,13 @@ def _damaged(suffix: str, data: bytes, rng: Random) -> tuple[str, bytes]:
 def _instead(path: Path, rng: Random) -> str:
     """Something that is no file where a file was."""
     path.unlink()
-    way = rng.randrange(5)
-    if way == 0:
-        path.mkdir()
-    elif way == 1:
-        os.mkfifo(path)
-    elif way == 2:
-        path.symlink_to(path.name)
-    elif way == 3:
-        path.symlink_to("nowhere")
-    else:
-        path.symlink_to("/dev/zero")
-    return ("a folder", "a pipe", "a link to itself", "a link to nothing", "a link to a device")[way]
+    ways: dict[str, Callable[[], None]] = {
+        "a folder": path.mkdir, "a pipe": lambda: os.mkfifo(path), "a link to itself": lambda: path.symlink_to(path.name),
+        "a link to nothing": lambda: path.symlink_to("nowhere"), "a link to a device": lambda: path.symlink_to("/dev/zero"),
+    }  # fmt: skip
+    way = rng.choice(sorted(ways))
+    ways[way]()
+    return way
 
 
 def _folder(path: Path, rng: Random) -> str:
@@ -361,17 +335,7 @@ def _folder(path: Path, rng: Random) -> str:
         file.unlink()
         return "a file less"
     if way == 8:
-        new = rng.choice(
-            (
-                "x.json",
-                "a_00000000000000000000001.json",
-                "7_keypoints.json",
-                "classes.txt",
-                "\udc80_1.txt",
-                ".hidden",
-                "b" * 200 + "1.json",
-            )
-        )
+        new = rng.choice(("x.json", "a_00000000000000000000001.json", "7_keypoints.json", "classes.txt", ".hidden", "\udc80_1.txt"))
         file.rename(path / new)
         return "another name"
     if way == 9:

@@ -135,9 +135,8 @@ def tried(seed: Seed, number: int, folder: Path, action: Callable[[Path], str | 
             raise
         result = outcome("uncaught", f"{type(problem).__name__}: {problem}"[:300], _place(problem))
     if result.kind in GOOD and heard:
-        result = outcome(
-            "warning", f"{heard[0].category.__name__}: {heard[0].message}"[:200], f"{heard[0].filename}:{heard[0].lineno}"
-        )
+        first = heard[0]
+        result = outcome("warning", f"{first.category.__name__}: {first.message}"[:200], f"{first.filename}:{first.lineno}")
     more = peak() - before - size
     if more > MEMORY:
         result = outcome("memory", f"{more:.0f} MB", result.where)
@@ -162,11 +161,8 @@ def poor(problem: ValueError, path: Path) -> list[str]:
 
 
 def _place(problem: BaseException) -> str:
-    frames = [
-        frame
-        for frame in traceback.extract_tb(problem.__traceback__)
-        if "/indexing/" in frame.filename or "/dyntorch/" in frame.filename
-    ]
+    every = traceback.extract_tb(problem.__traceback__)
+    frames = [frame for frame in every if "/indexing/" in frame.filename or "/dyntorch/" in frame.filename]
     return f"{frames[-1].filename.split('/indexing/')[-1]}:{frames[-1].lineno} {frames[-1].name}" if frames else ""
 
 

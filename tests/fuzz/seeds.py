@@ -111,14 +111,9 @@ def _json(folder: Path, people: np.ndarray) -> list[Seed]:
         "categories": [{"id": 1, "name": "person", "keypoints": names, "skeleton": [[1, 2], [2, 3]]}],
     }
     instances = [[{"keypoints": f[:, :2].tolist(), "keypoint_scores": f[:, 2].tolist(), "bbox": [[0, 0, 1, 1]]}] for f in people]
-    demo = {
-        "meta_info": {
-            "dataset_name": "c",
-            "keypoint_id2name": {str(i): n for i, n in enumerate(names)},
-            "skeleton_links": [[0, 1]],
-        },
-        "instance_info": [{"frame_id": i + 1, "instances": one} for i, one in enumerate(instances)],
-    }
+    about = {"dataset_name": "c", "keypoint_id2name": {str(i): n for i, n in enumerate(names)}, "skeleton_links": [[0, 1]]}
+    shown = [{"frame_id": i + 1, "instances": one} for i, one in enumerate(instances)]
+    demo = {"meta_info": about, "instance_info": shown}
     yolo = [
         [{"name": "person", "class": 0, "confidence": 0.9, "box": {"x1": 0, "y1": 0, "x2": 9, "y2": 9}, "track_id": 1,
           "keypoints": {"x": f[:, 0].tolist(), "y": f[:, 1].tolist(), "visible": f[:, 2].tolist()}}] for f in people
@@ -129,10 +124,8 @@ def _json(folder: Path, people: np.ndarray) -> list[Seed]:
     box = people[..., :2] / 640
     for i, frame in enumerate(box):
         low, high = frame.min(0), frame.max(0)
-        written(
-            folder / "yolo" / f"vid_{i + 1}.txt",
-            " ".join(f"{v:.5f}" for v in [0, *(low + high) / 2, *(high - low), *frame.ravel(), 0.9]),
-        )
+        numbers = [0, *(low + high) / 2, *(high - low), *frame.ravel(), 0.9]
+        written(folder / "yolo" / f"vid_{i + 1}.txt", " ".join(f"{v:.5f}" for v in numbers))
     files: dict[str, Any] = {
         "coco.json": coco, "coco_set.json": dataset, "mmpose.json": instances, "mmpose_demo.json": demo, "ultralytics.json": yolo,
         "ultralytics_str.json": [json.dumps(frame) for frame in yolo], "openpose_list.json": single,
@@ -151,10 +144,8 @@ def _tables(folder: Path, people: np.ndarray) -> list[Seed]:
     dlc = [["scorer", *["net"] * 3 * JOINTS], ["bodyparts", *(n for n in names for _ in range(3))]]
     dlc += [["coords", *["x", "y", "likelihood"] * JOINTS], *([i, *frame.ravel()] for i, frame in enumerate(people))]
     several = [["scorer", *["net"] * 6 * JOINTS], ["individuals", *(a for a in ("m1", "m2") for _ in range(3 * JOINTS))]]
-    several += [
-        ["bodyparts", *(n for _ in range(2) for n in names for _ in range(3))],
-        ["coords", *["x", "y", "likelihood"] * 2 * JOINTS],
-    ]
+    several += [["bodyparts", *(n for _ in range(2) for n in names for _ in range(3))]]
+    several += [["coords", *["x", "y", "likelihood"] * 2 * JOINTS]]
     several += [[i, *frame.ravel(), *(frame.ravel() + 1)] for i, frame in enumerate(people)]
     sleap = [["track", "frame_idx", "instance.score", *(f"{n}.{k}" for n in names for k in ("x", "y", "score"))]]
     sleap += [["t1", i, 0.9, *frame.ravel()] for i, frame in enumerate(people)]
@@ -221,10 +212,8 @@ def _sets(folder: Path) -> list[Seed]:
     arrays = {**about, "joints": clips, "subject": [1, 2, 3, 4], "split": np.arange(12).reshape(4, 3), "up": ["-y"] * 4}
     arrays |= {"bones": [[0, 1], [1, 2]], "joint_names": [f"j{i}" for i in range(JOINTS)], "confidence": np.ones(clips.shape[:2])}
     np.savez_compressed(folder / "clipset.npz", **arrays)
-    np.savez(
-        folder / "clipset_raw.npz",
-        **{**arrays, "frame": np.tile(np.arange(FRAMES), 4), "when": np.array(["2020-01-01"] * 4, "M8[D]")},
-    )
+    more = {"frame": np.tile(np.arange(FRAMES), 4), "when": np.array(["2020-01-01"] * 4, "M8[D]")}
+    np.savez(folder / "clipset_raw.npz", **arrays, **more)
     films = np.random.default_rng(0).integers(0, 255, (4 * FRAMES, 24, 32), dtype=np.uint8)
     np.savez(folder / "films.npz", frames=films, subject=[1, 1, 2, 2], **about)
     evaluated = ("index", "evaluate", "{}", "--leave-out", "subject")
@@ -325,15 +314,8 @@ def _points(folder: Path) -> list[Seed]:
     )
     table = "id,x,y,weight,static\n" + "".join(f"p{i},{x},{y},1,{i % 2}\n" for i, (x, y) in enumerate(xy))
     np.save(folder / "points.npy", xyz)
-    np.savez(
-        folder / "views.npz",
-        x1=xy,
-        x2=xy + 1,
-        x3=xy + 2,
-        ids=[f"p{i}" for i in range(12)],
-        weights=np.ones(12),
-        static=np.arange(12) % 2,
-    )
+    told = {"ids": [f"p{i}" for i in range(12)], "weights": np.ones(12), "static": np.arange(12) % 2}
+    np.savez(folder / "views.npz", x1=xy, x2=xy + 1, x3=xy + 2, **told)
     head = "ply\nformat {}\nelement vertex 12\nproperty {} x\nproperty {} y\nproperty {} z\nend_header\n"
     ascii_ply = head.format("ascii 1.0", *["float"] * 3) + "".join(" ".join(map(str, row)) + "\n" for row in xyz)
     binary = head.format("binary_little_endian 1.0", *["double"] * 3).encode() + xyz.astype("<f8").tobytes()
