@@ -108,13 +108,9 @@ def ordered():
     return torch.cat([torch.arange(COUNT, COUNT + T * N * 3), torch.arange(COUNT)])
 
 
-def test_the_cost_is_the_formula():
+def test_the_cost_is_the_formula_and_the_gradient_half_of_its():
     problem, state = world()
     assert float(problem.evaluate(tuple(state)).cost) == pytest.approx(float(cost(problem, state)), rel=1e-12)
-
-
-def test_the_gradient_is_half_that_of_the_cost():
-    problem, state = world()
     order = ordered()
     zero = torch.zeros(len(order), dtype=F64, requires_grad=True)
     (truth,) = torch.autograd.grad(cost(problem, moved(state, zero)), zero)
@@ -186,11 +182,7 @@ def test_descents_lower_the_cost_and_subsets_are_their_own():
     )  # fmt: skip
     keep = torch.tensor([0])
     assert float(both.subset(keep).evaluate(tuple(two.of(keep))).cost) == pytest.approx(float(at.cost), rel=1e-12)
-
-
-def test_points_that_nobody_sees_stay():
-    problem, state = world(seed=4)
-    problem.weights[:, :, 1, 2] = 0.0
+    problem.weights[:, :, 1, 2] = 0.0  # points that nobody sees stay
     _, points = problem.step(problem.evaluate(tuple(state)), torch.tensor([1e-3], dtype=F64))
     assert float(points[0, 1, 2].abs().max()) == 0.0 and bool(points.isfinite().all())
 

@@ -363,3 +363,26 @@ def test_no_static_point_is_none_given() -> None:
     both = dyn.reconstruct(scene.tracks.expand(2, 4, 30, 2), CV, static=torch.stack([known, known & False]))
     assert both.labels[1].equal(alone.labels) and not both.warnings
     torch.testing.assert_close(both.residuals[1], alone.residuals, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_repr_of_one_and_of_a_batch() -> None:
+    scene = scenes.lifted_points("constant_velocity_2d", 30, views=4, batch=2, generator=seeded())
+    one = repr(dyn.reconstruct(scene.tracks[0], "constant_velocity_2d"))
+    assert one.startswith("Reconstruction(constant_velocity_2d, views=4, points=30, batch=(): 1 OK)")
+    assert "30 moving" in one and "velocity common to all points" in one
+    tracks = scene.tracks.clone()
+    tracks[1] = torch.nan
+    found = dyn.reconstruct(tracks, "constant_velocity_2d")
+    assert "1 OK, 1 TOO_FEW" in repr(found) and "warning few_observed: 1 of 2 problems" in repr(found)
+    with pytest.raises(ValueError, match="problem 1 of 2: TOO_FEW"):
+        found.check()
+
+
+def test_two_bodies_say_nothing_about_other_times() -> None:
+    scene = scenes.lifted_points("two_bodies_2d", 30, views=3, generator=seeded())
+    found = dyn.reconstruct(scene.tracks, "two_bodies_2d")
+    assert found.velocities is None and torch.equal(found.at(3.0), found.points)
+    with pytest.raises(ValueError, match="says nothing about times between the views"):
+        found.image(found.cameras[0], 0.5)
+    assert "body 1" in repr(found)

@@ -112,13 +112,6 @@ def test_samples_are_the_smoothed_tracks_normalized():
     assert float(samples.x1[samples.w1 > 0].square().sum(-1).mean()) == pytest.approx(2, rel=0.05)
 
 
-def test_the_variance_at_the_shift_is_that_of_the_smoothed_noise():
-    scene = scene_of(7, noise=2.0, seconds=4.0)
-    curve = epipolar_curve(samples_of(scene))
-    smooth = 0.5 / math.sqrt(math.pi)  # of white noise, by a Gaussian kernel of one frame
-    assert float(curve.variance.min()) == pytest.approx(4 * smooth, rel=0.2)
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # The descent in offset, rate and F: against a general least squares solver, scans, repeated draws of noise and exact cameras.
 

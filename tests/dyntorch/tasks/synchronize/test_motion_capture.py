@@ -10,7 +10,6 @@ from dyntorch import synchronize, synchronize_cameras
 from dyntorch.numerics.lags import resection_moments
 from dyntorch.tasks.synchronize.motion_capture import (
     SpaceDescent,
-    _CombinationProblem,
     camera_variance,
     fit_combination,
 )
@@ -248,30 +247,6 @@ def test_the_derivatives_are_those_of_the_residuals(swapped):
     step = 1e-6 * normal(3, 4, generator=seeded())
     moved = descent._residuals(camera + step, at, times).residual - rows.residual
     assert torch.allclose(rows.products @ step.flatten(), moved, atol=1e-3 * float(moved.abs().max()))
-
-
-def test_the_steps_of_the_combined_fit_are_those_of_the_whole_problem():
-    """The weights of every point are eliminated; camera, weights and shift at once have the same step."""
-    film, space = taken(19, points=6, noise=1.0)
-    a, b = (read_tracks(n, x, f, None, None) for n, x, f in (("a", film, FPS), ("b", space, RECORDED)))
-    problem = _CombinationProblem.of(a, b, OFFSET, 1.0)
-    at = problem.evaluate(problem.start())
-    damping = torch.full((1,), 0.1, dtype=torch.float64)
-    camera, weights, shift = problem.step(at, damping)
-    residual, own, common = problem._derivatives(at.theta)
-    n, k = own.shape[0], own.shape[2]
-    J = torch.cat([torch.block_diag(*own), common.flatten(0, 1)], 1)
-    W = torch.cat([at.theta[1].flatten(), torch.zeros(13, dtype=torch.float64)])
-    ridge = problem.ridge * torch.cat([torch.ones(n * k), torch.zeros(13)]).double()
-    H = J.T @ J + torch.diag(ridge)
-    H = H + 0.1 * torch.diag((J.T @ J).diagonal())
-    normal = torch.cat([torch.zeros(n * k), at.theta[0].flatten(), torch.zeros(1)]).double()
-    H = H + 1e6 * float(H.diagonal().max()) * torch.outer(normal, normal)  # along the camera itself nothing moves
-    whole = torch.linalg.solve(H, J.T @ residual.flatten() + ridge * W)
-    step = torch.cat([weights.flatten(), camera.flatten(), shift.flatten()])
-    step[n * k : -1] -= (step[n * k : -1] @ at.theta[0].flatten()) * at.theta[0].flatten()
-    expected = float((J @ whole).norm())
-    assert float((J @ (step - whole)).norm()) < 0.05 * expected  # how the free norm is fixed is all that differs
 
 
 @pytest.mark.parametrize("start", [-0.8, 0.6])

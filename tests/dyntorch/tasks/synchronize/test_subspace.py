@@ -1,6 +1,5 @@
 """Two cameras that track different points: information against determinants, what must not matter, and what must be refused."""
 
-import itertools
 import math
 
 import pytest
@@ -9,14 +8,9 @@ import torch
 from dyntorch.tasks.synchronize.subspace import (
     HEIGHT_SAMPLE_RATE,
     MOTION_SAMPLE_RATE,
-    NUM_JACKKNIFE_BLOCKS,
     SHAPE_SAMPLE_RATE,
     SubspaceCurve,
-    _motion_information,
-    _mutual_information,
-    _vertical,
     body_of,
-    jackknife_sigma,
     regress_missing,
     smooth,
     subspace_curve,
@@ -172,33 +166,6 @@ def test_motion_that_repeats_itself_is_refused(period, keys, start):
     assert not found.ok
     assert "shifts" in found.reason or "motion" in found.reason
     assert len(found.peaks) > 1
-
-
-def test_the_jackknife_is_that_of_blocks_left_out():
-    a, b = scene(120, 5, noise=1.0)
-    curve = curve_of(a, b)
-    one, two = curve.bodies
-    edges = torch.linspace(0, 116 - 6, NUM_JACKKNIFE_BLOCKS + 1).round().long().tolist()
-    slopes, bends = [], []
-    for start, end in itertools.pairwise(edges):
-        told = []
-        for lag in (4, 5, 6):
-            kept = torch.tensor([i for i in range(116 - 6) if not start <= i < end])
-            parts = [torch.cat([x[kept], y[kept + lag]], dim=1) for x, y in ((one.rows, two.rows), (one.motion, two.motion))]
-            shape, motion = (torch.cov(part.T, correction=0)[None] for part in parts)
-            blocks = shape[:, :14, :14], shape[:, 14:, 14:], shape[:, :14, 14:]
-            told.append(
-                SHAPE_SAMPLE_RATE * _mutual_information(*blocks)
-                + HEIGHT_SAMPLE_RATE * _mutual_information(*_vertical(blocks, (2, 2)))
-            )
-            told[-1] = float(
-                told[-1] + MOTION_SAMPLE_RATE * _motion_information(motion[:, :2, :2], motion[:, 2:, 2:], motion[:, :2, 2:])
-            )
-        slopes.append((told[2] - told[0]) / 2)
-        bends.append(told[0] - 2 * told[1] + told[2])
-    places = torch.tensor(slopes).double() / (-sum(bends) / NUM_JACKKNIFE_BLOCKS)
-    spread = math.sqrt((NUM_JACKKNIFE_BLOCKS - 1) / NUM_JACKKNIFE_BLOCKS * float((places - places.mean()).square().sum()))
-    assert jackknife_sigma(curve, 5) == pytest.approx(spread, rel=1e-6)
 
 
 def test_noise_that_keeps_for_some_frames_is_told_by_sigma():

@@ -73,17 +73,6 @@ def test_gaps_and_places_beyond_the_take_have_no_weight():
     assert sure[:, 0].tolist() == pytest.approx([0.25, 0.75], rel=0.02)
 
 
-def test_noise_that_is_left_does_not_depend_on_the_place_between_frames():
-    frames = 4000
-    x = torch.randn(frames, 3, 2, generator=seeded(), dtype=torch.float64)
-    phases = torch.linspace(0, 1, 9, dtype=torch.float64)
-    tracks, middle = tracks_of(x, 30.0), torch.arange(10, frames - 10, dtype=torch.float64)
-    left = torch.stack([smooth_at(tracks, (middle + phase) / 30, 1 / 30)[0].square().mean() for phase in phases])
-    expected = 0.5 / math.sqrt(math.pi)  # of a Gaussian kernel of one frame
-    assert left.tolist() == pytest.approx([expected] * 9, rel=0.03)
-    assert float(left.max() / left.min()) < 1.01
-
-
 def test_the_noise_is_that_put_in_whatever_the_motion():
     for sigma in (0.5, 2.0):
         scene = filmed_person(15, seconds=6.0, noise=sigma, missing=0.1, generator=seeded(2))
@@ -140,18 +129,12 @@ GOOD, RISING = torch.zeros(5, 2, 2), torch.arange(5.0)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (([[1.0]], 30.0, None, None), r"a must be a tensor \(frames, points, 2\), got list"),
-        ((torch.zeros(5, 2, 4), 30.0, None, None), r"a must be a tensor \(frames, points, 2\), got \(5, 2, 4\)"),
         ((torch.zeros(5, 2), 30.0, None, None), r"got \(5, 2\)"),
-        ((GOOD.int(), 30.0, None, None), r"a must hold floating point numbers, got torch.int32; use a.double\(\)"),
         ((GOOD, None, None, None), r"fps of a must be a positive number of frames per second, got None; or give times="),
         ((GOOD, 0.0, None, None), r"fps of a must be a positive number.*got 0.0"),
         ((GOOD, math.inf, None, None), r"fps of a .*got inf"),
         ((GOOD, math.nan, None, None), r"fps of a .*got nan"),
-        ((GOOD, None, RISING[:4], None), r"times of a must be 5 finite seconds, one per frame, got \(4,\)"),
         ((GOOD, None, RISING.clone().index_fill(0, torch.tensor(2), math.nan), None), r"times of a must be 5 finite seconds"),
-        ((GOOD, None, RISING[[0, 1, 1, 2, 3]], None), r"times of a must increase, but frame 2 is not after .*; sort or drop"),
-        ((GOOD, 30.0, None, torch.ones(5)), r"weights of a must be \(5, 2\), finite and not negative, got \(5,\)"),
         ((GOOD, 30.0, None, -torch.ones(5, 2)), r"weights of a must be \(5, 2\), finite and not negative"),
         ((GOOD, 30.0, None, torch.full((5, 2), math.nan)), r"weights of a must be .* finite"),
     ],

@@ -170,37 +170,31 @@ def test_gradients_of_points():
         torch.testing.assert_close(gradient[index], numeric.detach(), rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"cameras": torch.zeros(5, 4, 3)}, "cameras must be"),
-        ({"x": torch.zeros(6, 2, 2)}, r"x must be \(\*batch, views, n, 2\)"),
-        ({"cameras": torch.zeros(3, 3, 4), "x": torch.zeros(3, 2, 2)}, "4 or more views, got 3"),
-        ({"weights": torch.ones(5)}, "weights must be"),
-        ({"weights": -torch.ones(5, 2)}, "must not be negative, got -1"),
-        ({"sigma": 0.0}, "sigma must be"),
-    ],
-)
-def test_misuse(change, message):
-    given = {"cameras": torch.zeros(5, 3, 4), "x": torch.zeros(5, 2, 2), **change}
-    with pytest.raises(ValueError, match=message):
-        triangulate_trajectories(**given)
+SIX = torch.zeros(6, 10, 2)
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("verb", "change", "message"),
     [
-        ({"x": torch.zeros(5, 10, 2)}, "six views"),
+        (triangulate_trajectories, {"cameras": torch.zeros(5, 4, 3)}, "cameras must be"),
+        (triangulate_trajectories, {"x": torch.zeros(6, 2, 2)}, r"x must be \(\*batch, views, n, 2\)"),
+        (triangulate_trajectories, {"cameras": torch.zeros(3, 3, 4), "x": torch.zeros(3, 2, 2)}, "4 or more views, got 3"),
+        (triangulate_trajectories, {"weights": torch.ones(5)}, "weights must be"),
+        (triangulate_trajectories, {"weights": -torch.ones(5, 2)}, "must not be negative, got -1"),
+        (triangulate_trajectories, {"sigma": 0.0}, "sigma must be"),
+        (trajectory_cameras, {"x": SIX[:5]}, "six views"),
         (
-            {"x": torch.zeros(6, 10, 2), "weights": torch.ones(6, 10)},
-            r"weights must be \(\*batch, n\) = \(10,\), one per point, got \(6, 10\)",
+            trajectory_cameras,
+            {"x": SIX, "weights": torch.ones(6, 10)},
+            r"weights must be .* = \(10,\), one per point, got \(6, 10\)",
         ),
-        ({"x": torch.zeros(6, 728, 2), "options": {}}, r"options must be TrajectoryOptions, got \{\}; use dataclasses\.replace"),
+        (trajectory_cameras, {"x": SIX, "options": {}}, r"options must be TrajectoryOptions, got \{\}; use dataclasses\.replace"),
     ],
 )
-def test_misuse_of_six_views(given, message):
+def test_misuse(verb, change, message):
+    given = {"cameras": torch.zeros(5, 3, 4), "x": torch.zeros(5, 2, 2)} if verb is triangulate_trajectories else {}
     with pytest.raises(ValueError, match=message):
-        trajectory_cameras(**given)
+        verb(**given | change)
 
 
 def collineation(points, truth):
