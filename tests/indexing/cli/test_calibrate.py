@@ -28,6 +28,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     table = np.c_[clip.joints.reshape(-1, 34) / np.tile(SIZE, 17)].reshape(-1, 17, 2)
     ClipSet([clip.replace(joints=table, label=None)]).save(folder / "shares.npz")
     ClipSet([clip]).save(folder / "again.npz")
+    lens = "[cam1]\nmatrix = [[900, 0, 900], [0, 900, 500], [0, 0, 1]]\ndistortions = []\n"
+    (folder / "lens.toml").write_text(lens)
     ClipSet([filmed()[1][0].replace(times=filmed()[1][0].times + 1000.0)]).save(folder / "late.npz")
     return folder
 
@@ -96,10 +98,6 @@ def test_shares_of_the_picture_become_pixels(run, library):
     assert torch.allclose(library["asked"][0]["tracks"][0], torch.from_numpy(filmed()[0][0].joints.copy()), atol=1e-3)
 
 
-def test_rates_that_nobody_said_are_mentioned(run, library):
-    assert "note: 30 frames per second assumed for cam1, cam2, cam3; --fps says otherwise" in run(THREE.replace("--fps 30", ""))[1]
-
-
 # ---- what is refused -----------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_what_does_not_decide_is_refused(run, library):
@@ -136,39 +134,25 @@ def test_what_does_not_decide_is_refused(run, library):
         ("@/cam1 @/cam2 --size 1920x1080 --exif", "cam1, cam2: no 35 mm equivalent is written in its video"),
         ("@/cam1 @/cam2 --size 1920x1080 --fps 0", "--fps must be a positive number of frames per second"),
         ("@/cam1 @/cam2 --size 1920x1080 --height 1.7 --length nose left_hip 1", "--height and --length both fix the scale"),
-        (
-            "@/cam1 @/cam2 --size 1920x1080 --length nose tail 1",
-            "--length 'tail': there is no such joint; the joints are nose, left_eye",
-        ),
-        (
-            "@/cam1 @/cam2 --size 1920x1080 --length nose nose 1",
-            "--length nose nose: expected two joints and the metres between them",
-        ),
+        ("@/cam1 @/cam2 --size 1920x1080 --length nose tail 1", "'tail': there is no such joint; the joints are nose, left_eye"),
+        ("@/cam1 @/cam2 --size 1920x1080 --length nose nose 1", "--length nose nose: expected two joints and the metres between"),
         ("@/cam1 @/cam2 --size 1920x1080 --length nose left_hip 0", "--length nose left_hip: expected two joints"),
         ("@/cam1 @/cam2 --size 1920x1080 --clocks no.json", "no.json: no such file"),
         ("@/cam1 @/cam2 --size 1920x1080 --clocks a.json --synchronized", "--synchronized and --clocks a.json both say how"),
         ("@/cam1 @/cam2 --size 1920x1080 --synchronized --max-shift 2", "--max-shift is of clocks that are searched"),
         ("@/cam1 @/cam2 --size 1920x1080 --max-shift -1", "--max-shift must be a positive number of seconds, got -1"),
         ("@/cam1 @/cam2 --size 1920x1080 --calibration no.toml", "no.toml: no such file"),
+        (f"{THREE} --calibration @/lens.toml", "lens.toml: its cameras are cam1, and cam1, cam2, cam3 are asked for"),
         ("@/cam1 @/cam2 --size 1920x1080 --by pixels", "--by pixels: cameras are calibrated from the joints of people"),
         ("@/cam1 @/late.npz --size 1920x1080 --fps 30 --synchronized", "they have no time in common"),
         ("@/cam1 @/cam2 --size 1920x1080 --out @/again.npz", "is a file; choose another folder"),
-        (
-            "@/cam1 @/cam2 --size 1920x1080 --out @/cam1",
-            "cam1: is an input, and files of the report among its frames would spoil it",
-        ),
+        ("@/cam1 @/cam2 --size 1920x1080 --out @/cam1", "cam1: is an input, and files of the report among its frames would"),
         ("@/cam1 @/cam2 --size 1920x1080 --person nobody", "see dyntorch calibrate --help"),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(refuse, library, line, says):
     refuse(line, says=(says,))
     assert library["asked"] == []
-
-
-def test_a_lens_that_is_not_in_the_file(run, library):
-    Path("lens.toml").write_text("[cam1]\nmatrix = [[900, 0, 900], [0, 900, 500], [0, 0, 1]]\ndistortions = []\n")
-    code, _, err = run(f"{THREE} --calibration lens.toml")
-    assert code == 2 and "lens.toml: its cameras are cam1, and cam1, cam2, cam3 are asked for" in err
 
 
 def test_nine_cameras_are_too_many(run, library):

@@ -161,15 +161,9 @@ def test_fit_refuses_bad_labels(refuse, data: Path, tmp_path: Path) -> None:
     refuse(f"{fit} --labels who.csv", "is of Ann, Ben, but session.json shows one person", "--subject")
     refuse(f"{fit} --labels who.csv --subject Cid", "no label of the subject 'Cid'", "Ann, Ben")
     refuse(f"{fit} --labels other.csv", "other.csv", "garden.mp4", "session.json", "--media")
-    refuse(
-        "index fit @/session.json @/later.json -o m.st --labels @/session.csv", "later.json", "none of the files of labels is of it"
-    )
-    refuse(
-        "index fit @/session.json @/later.json -o m.st --labels @/both.csv --labels other.csv",
-        "other.csv",
-        "garden.mp4",
-        "none of the recordings",
-    )
+    both = "index fit @/session.json @/later.json -o m.st --labels"
+    refuse(f"{both} @/session.csv", "later.json", "none of the files of labels is of it")
+    refuse(f"{both} @/both.csv --labels other.csv", "other.csv", "garden.mp4", "none of the recordings")
     refuse(f"{fit} --tier arms", "--tier", "there are none", "--labels")
     refuse(f"{fit} --unlabelled-is-background", "--unlabelled-is-background", "--labels")
     refuse("index fit a=@/session.json b=@/later.json -o m.st --labels @/session.csv", "has a label already", "without label=")
@@ -380,9 +374,8 @@ def test_evaluate_refuses_what_makes_no_sense(refuse, data: Path, tmp_path: Path
 def test_a_name_within_a_name_is_the_recording_only_where_none_is_called_so(run, refuse, data: Path, tmp_path: Path) -> None:
     for name in ("session_2.json", "sessionDLC_resnet.json"):
         (tmp_path / name).write_bytes((data / "later.json").read_bytes())
-    refuse(
-        "index fit @/session.json session_2.json -o m.st --labels @/session.csv", "session_2.json", "none of the files of labels"
-    )
+    fit = "index fit @/session.json session_2.json -o m.st --labels @/session.csv"
+    refuse(fit, "session_2.json", "none of the files of labels")
     code, out, _ = run("index fit sessionDLC_resnet.json @/later.json --labels @/both.csv -o m.st")
     assert code == 0 and np.bincount(ActionIndexer.load("m.st").model_.labels).tolist() == [4, 4, 4] and "left out" in out
     table(tmp_path / "other.csv", "kick,0.7,2.7,garden.mp4", "wave,3.5,6.3,garden.mp4", head="label,start,end,file")

@@ -70,13 +70,6 @@ def test_learned_and_found_by_the_people_in_videos(films, model, capsys):
 
 
 @pytest.mark.slow
-def test_seconds_of_a_video(films, model, capsys):
-    words = [f"nod={films / 'session.mp4'}@0-1.3", f"hop={films / 'session.mp4'}@1.4-", "-o", str(films / "m.safetensors")]
-    assert main(["index", "fit", *words]) == 0
-    assert "people in 1 video" in capsys.readouterr().out
-
-
-@pytest.mark.slow
 def test_pixels_where_they_are_asked_for_or_no_model_is_there(films, seeing, monkeypatch, capsys):
     monkeypatch.setattr("indexing.pose.available", lambda models=None: None)
     assert fit(films) == 0
@@ -96,6 +89,8 @@ def test_pixels_where_they_are_asked_for_or_no_model_is_there(films, seeing, mon
         (["--by", "keypoints"], "nod.mp4: is a video, and its keypoints cannot be found"),
         (["--by", "sound"], "choose from auto, keypoints, pixels"),
         (["--by", "keypoints", "--region", "all"], "add --by pixels"),
+        (["--by", "keypoints", "--people", "0"], "--people 0: expected 1 or more"),
+        (["--by", "keypoints", "--every", "-1"], "--every -1: expected 1 or more"),
     ],
 )
 def test_what_is_asked_for_and_cannot_be(films, capsys, monkeypatch, words, said):
@@ -120,16 +115,6 @@ def test_a_model_and_a_recording_of_two_kinds(films, model, monkeypatch, capsys)
         assert main(["index", "scan", *words]) == 2
         assert said in capsys.readouterr().err
     assert main(["index", "scan", str(session), str(films / "pose" / "nod.npz"), "-m", str(keypoints)]) == 0
-
-
-@pytest.mark.slow
-def test_numbers_that_make_no_sense(films, model, capsys):
-    for words, said in (
-        (["--people", "0"], "--people 0: expected 1 or more"),
-        (["--every", "-1"], "--every -1: expected 1 or more"),
-    ):
-        assert fit(films, *words) == 2
-        assert said in capsys.readouterr().err and not (films / "pose").exists()
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ import dataclasses
 import io
 import json
 import re
-import subprocess
 
 import numpy as np
 import pytest
@@ -20,8 +19,8 @@ from indexing.clip import Clip
 from indexing.report import archive as pages
 from indexing.report.archive import FindReport, SearchReport
 from indexing.report.summary import write_report
-from tests.indexing.report.test_page import SCRIPT, Page
-from tests.indexing.report.test_player import BROWSER
+from tests.indexing.report.people import BROWSER, SCRIPT, in_browser
+from tests.indexing.report.test_page import Page
 
 ACTIONS = ("squat", "kick", "wave")
 EVIL = f"week/{SCRIPT}.npz"
@@ -207,18 +206,14 @@ def test_marks_are_where_events_are():
 def test_a_film_slides_by_frame_by_frame(lab, tmp_path):
     """The box that plays all is ticked, and half of the time has passed: the strip stands at its middle frame."""
     text = write_report(tmp_path, searched(lab, hits_of(lab[1])[:1])).read_text(encoding="utf-8")
-    text = re.sub(r'<meta http-equiv="Content[^>]*>', "", text).replace('class="all"', 'class="all" checked')
-    script = """<script>setTimeout(() => {
+    text = text.replace('class="all"', 'class="all" checked')
+    script = """setTimeout(() => {
       const strip = document.querySelector(".film .strip"), played = strip.getAnimations()[0];
       played.currentTime = 500 * parseFloat(getComputedStyle(strip.parentElement).getPropertyValue("--lasts"));
       const shift = -new DOMMatrix(getComputedStyle(strip).transform).m41;
       const frame = strip.parentElement.getBoundingClientRect().width;
       document.title = JSON.stringify({frames: shift / frame, of: strip.getBoundingClientRect().width / frame});
-    }, 50)</script>"""
-    (tmp_path / "played.html").write_text(text.replace("</body>", script + "</body>"), encoding="utf-8")
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom"]
-    command += ["--virtual-time-budget=2000", (tmp_path / "played.html").as_uri()]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
-    seen = json.loads(re.search(r"<title>(.*?)</title>", shown)[1].replace("&quot;", '"'))
+    }, 50)"""
+    seen = in_browser(text, script, tmp_path, "--virtual-time-budget=2000")
     assert seen["of"] == pytest.approx(round(seen["of"]), abs=0.02)
     assert seen["frames"] == pytest.approx(seen["of"] // 2, abs=0.02)

@@ -18,8 +18,8 @@ from indexing.readers.matches import Photograph
 from indexing.readers.tracks import TrackSet
 from indexing.report.bodies import BodiesReport, as_json, describe, labels_csv, picture_of, rows_of, tracks_csv
 from indexing.report.summary import write_report
+from tests.indexing.report.people import SCRIPT
 
-SCRIPT = "<script>alert(1)</script>"
 FRAMES = 6
 
 

@@ -19,10 +19,9 @@ from indexing import files
 from indexing.report import EvaluationResult, RecognitionReport, manifest, page, write_recognition
 from indexing.report.recognition import events_csv
 from indexing.report.summary import Summary
-from tests.indexing.report.people import Hit, person, recording
+from tests.indexing.report.people import SCRIPT, Hit, person, recording
 
 PNG = struct.pack(">8sI4sII", b"\x89PNG\r\n\x1a\n", 13, b"IHDR", 30, 30)
-SCRIPT = "<script>alert(1)</script>"
 
 
 class Page(HTMLParser):

@@ -17,7 +17,6 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from indexing import files
 from indexing.clip import Clip
 from indexing.report import (
     EvaluationResult,
@@ -43,6 +42,7 @@ def test_prepare_makes_parents_and_names_what_is_in_the_way(tmp_path):
     assert prepare(tmp_path / "a" / "b").is_dir()
     assert prepare(tmp_path / "a" / "b") == tmp_path / "a" / "b"
     (tmp_path / "file").write_text("x")
+    assert write_text(tmp_path / "ours", "").stat().st_mode == (tmp_path / "file").stat().st_mode  # colleagues can read it
     for folder in (tmp_path / "file", tmp_path / "file" / "deeper"):
         with pytest.raises(ValueError, match=r"file' is a file; choose another folder") as caught:
             prepare(folder)
@@ -55,21 +55,6 @@ def test_prepare_refuses_a_folder_that_cannot_be_written():
     for folder in ("/proc/out", "/proc/self"):
         with pytest.raises(ValueError, match=r"cannot be written .* choose a folder you may write to"):
             prepare(folder)
-
-
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = write_text(tmp_path / "a.txt", "old\r\n")
-    (tmp_path / "plain").touch()
-    assert path.read_bytes() == b"old\r\n" and path.stat().st_mode == (tmp_path / "plain").stat().st_mode  # colleagues read it
-
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(files.os, "replace", fail)
-    with pytest.raises(ValueError, match=r"a.txt.*No space left on device"):
-        write_text(path, "new")
-    assert path.read_bytes() == b"old\r\n"
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.txt", "plain"]
 
 
 def test_a_value_that_is_no_json_leaves_no_file(tmp_path):

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
@@ -18,9 +15,7 @@ from indexing.report.player import players
 from indexing.report.results import by_recording
 from indexing.scoring import Event
 from indexing.skeleton import COCO17
-from tests.indexing.report.people import Hit, person, recording
-
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+from tests.indexing.report.people import BROWSER, Hit, in_browser, person, recording
 
 
 def numbers(text):
@@ -186,12 +181,7 @@ document.title = JSON.stringify(said);
 def test_it_plays_in_a_browser(tmp_path):
     report = RecognitionReport("t", recordings=everybody(), exemplars={"squat": person(40), "lunge": person(50)})
     text = write_recognition(tmp_path, report).read_text(encoding="utf-8")
-    free = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)  # which would stop the driver
-    (tmp_path / "driven.html").write_text(free.replace("</body>", f"<script>{DRIVER}</script></body>"), encoding="utf-8")
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom"]
-    command += ["--window-size=600,900", (tmp_path / "driven.html").as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
-    said = json.loads(re.search(r"<title>(\{.*?\})</title>", done.stdout)[1])
+    said = in_browser(text, DRIVER, tmp_path, "--window-size=600,900")
     assert said["begin"] == [0.0, "Play"] and said["step"] == [pytest.approx(1 / 15, abs=2e-3), "Play"]
     assert said["first"] == [1.0, "Pause"] and said["second"] == [1.5, "Pause"] and said["back"] == [1.0, "Pause"]
     assert said["stopped"] == [1.0, "Play"] and said["clicked"] == [1.5, "Pause"]

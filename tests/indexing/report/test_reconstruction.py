@@ -23,8 +23,7 @@ from indexing.report.reconstruction import (
     points_csv,
 )
 from indexing.report.summary import write_report
-
-SCRIPT = "<script>alert(1)</script>"
+from tests.indexing.report.people import SCRIPT
 
 
 class Told(NoticeCode):

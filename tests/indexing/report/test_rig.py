@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -16,9 +15,9 @@ import torch
 from indexing.report.calibration import CalibrationReport, write_calibration
 from indexing.report.rig import MAX_VALUES, heat_picture, plan_picture, scene
 from tests.indexing.calibrate.scene import FPS, SIZE, rig, truth
+from tests.indexing.report.people import BROWSER, in_browser
 
 NODE = shutil.which("node")
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 SCRIPT = Path("indexing/report/rig.js")
 
 
@@ -94,9 +93,8 @@ def check_play(said):
     assert said["second"][0] == pytest.approx(1 + 1 / 15, abs=2e-3) and said["started"] == [said["second"][0], "Pause", -1]
     assert said["played"][0] == pytest.approx(said["second"][0] + 0.3, abs=2e-3)
     assert said["slow"][0] == pytest.approx(said["played"][0] + 0.1, abs=2e-3)
-    assert said["late"][0] == pytest.approx(
-        said["slow"][0] + 0.125, abs=2e-3
-    )  # a frame that comes late skips no more than a quarter
+    # a frame that comes late skips no more than a quarter
+    assert said["late"][0] == pytest.approx(said["slow"][0] + 0.125, abs=2e-3)
     assert said["stopped"] == [said["late"][0], "Play", -1] and said["through"][2] == 0
     assert said["end"] == [pytest.approx(109 / FPS, abs=2e-3), "Play", -1] and said["anew"][0] == pytest.approx(0.05, abs=2e-3)
     assert said["home"] == [0.0, "Play", -1] and said["people"] == "1"
@@ -105,12 +103,9 @@ def check_play(said):
 @pytest.mark.skipif(NODE is None, reason="needs node")
 def test_it_turns_and_plays_and_sees_what_a_camera_saw(tmp_path):
     data, _ = scene(rig())
-    script = [
-        Path(__file__).with_name("dom.js").read_text(),
-        f"page({json.dumps(data)});",
-        SCRIPT.read_text().replace('"use strict";', ""),
-    ]
-    (tmp_path / "run.js").write_text("\n".join([*script, DRIVER, "console.log(JSON.stringify(said));"]))
+    dom, script = Path(__file__).with_name("dom.js").read_text(), SCRIPT.read_text().replace('"use strict";', "")
+    parts = [dom, f"page({json.dumps(data)});", script, DRIVER, "console.log(JSON.stringify(said));"]
+    (tmp_path / "run.js").write_text("\n".join(parts))
     done = subprocess.run([NODE, str(tmp_path / "run.js")], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
@@ -130,11 +125,6 @@ def test_it_turns_and_plays_and_sees_what_a_camera_saw(tmp_path):
 @pytest.mark.skipif(BROWSER is None, reason="needs a browser: chromium or chrome")
 def test_it_plays_in_a_browser(tmp_path):
     text = write_calibration(tmp_path / "out", CalibrationReport(rig()))[0].read_text(encoding="utf-8")
-    free = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text)  # which would stop the driver
-    driver = f"<script>{DRIVER}; document.title = JSON.stringify(said);</script></body>"
-    (tmp_path / "driven.html").write_text(free.replace("</body>", driver), encoding="utf-8")
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom"]
-    done = subprocess.run([*command, (tmp_path / "driven.html").as_uri()], capture_output=True, text=True, check=True, timeout=120)
-    said = json.loads(re.search(r"<title>(\{.*?\})</title>", done.stdout)[1])
+    said = in_browser(text, f"{DRIVER}; document.title = JSON.stringify(said);", tmp_path)
     check_play(said)
     assert said["ink"]

@@ -24,8 +24,7 @@ from indexing.report.segmentation import (
     picture_of,
 )
 from indexing.report.summary import write_report
-
-SCRIPT = "<script>alert(1)</script>"
+from tests.indexing.report.people import SCRIPT
 
 
 class Told(NoticeCode):
