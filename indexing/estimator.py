@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self, TypeVar, cast, get_type_hints
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
@@ -18,6 +18,7 @@ from indexing.action.inputs import check_labels
 from indexing.clip import is_number
 from indexing.modelfile import Parts, read_model, usable, write_model
 from indexing.opening import quote
+from indexing.scoring import SHARPNESS, probabilities, refuse
 
 Options = TypeVar("Options")
 
@@ -150,3 +151,28 @@ class SavedClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, self.FITTED)
+
+    @property
+    def _options(self) -> Any:
+        """Those in force."""
+        return self.OPTIONS() if self.options is None else self.options
+
+
+class ScoreClassifier(SavedClassifier):
+    """A classifier whose answers stand on its scores alone, ``decision_function``."""
+
+    def evidence(self, clips: Iterable[Any]) -> NDArray[Any]:
+        """``(clips,)`` score of the best class: how much nearer a recording is to one action than to the others."""
+        return np.asarray(self.decision_function(clips).max(axis=1))
+
+    def predict_proba(self, clips: Iterable[Any]) -> NDArray[Any]:
+        """``(clips, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores)."""
+        return probabilities(self.decision_function(clips), SHARPNESS)
+
+    def predict(self, clips: Iterable[Any]) -> NDArray[Any]:
+        """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the recording."""
+        scores = self.decision_function(clips)
+        labels = self.classes_[scores.argmax(axis=1)]
+        if self.reject_threshold_ is None:
+            return np.asarray(labels)
+        return refuse(labels, scores.max(axis=1) < self.reject_threshold_, self.none_label)

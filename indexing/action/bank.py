@@ -75,11 +75,6 @@ def _products(c: Entries, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
     return torch.mul(c00, l00, out=rest).mul_(m00), heights
 
 
-def _image_correlation(c: Entries, left: Tensor, right: Tensor) -> Tensor:
-    across, heights = _products(c, left, right)
-    return across.add_(heights)
-
-
 def _card_correlation(c: Entries, left: Tensor, right: Tensor) -> Tensor:
     """A turn of a flat card scales its x by -1 to 1: the best one takes the product of the x without its sign."""
     across, heights = _products(c, left, right)
@@ -89,7 +84,7 @@ def _card_correlation(c: Entries, left: Tensor, right: Tensor) -> Tensor:
 # Evidence of a pair of windows in one channel: a correlation, 1 where they are the same.
 TERMS: dict[str, Callable[[Entries, Tensor, Tensor], Tensor]] = {
     "epi": lambda c, left, right: epipolar_correlation(c),
-    "nn": _image_correlation,
+    "nn": lambda c, left, right: torch.add(*_products(c, left, right)),
     "turned": _card_correlation,
 }
 
@@ -516,7 +511,8 @@ class Kernels:
         tables = min_over_copies(
             chosen, [self.bank(chosen)], lambda left, right: list(self._distances(left, right)), [1.0] * self.count
         )
-        self.scales = torch.stack([kernel_scale(table, KERNEL_WIDTH) for table in tables])
+        off = ~torch.eye(len(chosen), dtype=torch.bool, device=chosen.values.device)
+        self.scales = KERNEL_WIDTH * torch.stack([table[off].median() for table in tables]).clamp(min=1e-6 / KERNEL_WIDTH)
         return self(windows, windows)
 
     def bank(self, windows: Windows) -> Bank:
@@ -571,12 +567,6 @@ class Kernels:
 
 def _distance(correlation: Tensor) -> Tensor:
     return correlation.neg_().add_(1.0).clamp_(min=0.0)
-
-
-def kernel_scale(distances: Tensor, width: float) -> Tensor:
-    """The scale of a kernel from the ``(N, N)`` distances of its training rows: ``width`` of the median between different rows."""
-    off = ~torch.eye(len(distances), dtype=torch.bool, device=distances.device)
-    return width * distances[off].median().clamp(min=1e-6 / width)
 
 
 def cosine_distance(a: Tensor, b: Tensor) -> Tensor:

@@ -422,7 +422,7 @@ class ActionIndexer(SavedClassifier):
 
     # ---- long recordings ---------------------------------------------------------------------------------------------
     def _stream(self) -> Stream:
-        return Stream(self.length, self.window, tuple(self.tempi), self.device, self.options or ActionOptions())
+        return Stream(self.length, self.window, tuple(self.tempi), self.device, self._options)
 
     @one_thread
     def decode(self, clip: Any, progress: Callable[[float], None] | None = None) -> Explanation:

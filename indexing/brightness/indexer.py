@@ -32,13 +32,13 @@ from indexing.estimator import (
     REJECT,
     SECONDS,
     Rule,
-    SavedClassifier,
+    ScoreClassifier,
     is_whole,
     one_of,
 )
 from indexing.modelfile import Parts, labels_from_json, labels_to_json, read_fields, tensors_of
 from indexing.opening import quote
-from indexing.scoring import SHARPNESS, Event, join_labels, probabilities, refuse, reject_threshold
+from indexing.scoring import Event, join_labels, reject_threshold
 
 MIN_WINDOW_FRAMES = 5.0  # of exercises at 15 per second, 0 / 60 degrees, 3 name .816 / .690 of the frames, 5 .821 / .751
 
@@ -60,7 +60,7 @@ def is_region(region: Any) -> bool:
 Array = NDArray[Any]
 
 
-class BrightnessIndexer(SavedClassifier):
+class BrightnessIndexer(ScoreClassifier):
     r"""Recognize actions in videos without tracks or keypoints.
 
     Brightness differences weighted by image gradients, :math:`h = I_t \nabla I` (the rows of the thesis's direct measure), are
@@ -146,10 +146,6 @@ class BrightnessIndexer(SavedClassifier):
         self.size = size
         self.device = device
         self.options = options
-
-    @property
-    def _options(self) -> BrightnessOptions:
-        return BrightnessOptions() if self.options is None else self.options
 
     # ---- files -------------------------------------------------------------------------------------------------------
     @classmethod
@@ -250,22 +246,6 @@ class BrightnessIndexer(SavedClassifier):
         check_is_fitted(self, "exemplars_")
         found = gather(videos, float(self.fps))
         return np.stack([recognize(self._stream(video.own_rate, video.name), video) for video in found])
-
-    def evidence(self, videos: Iterable[Any]) -> Array:
-        """``(videos,)`` score of the best class: how well an exemplar explains the video."""
-        return np.asarray(self.decision_function(videos).max(axis=1))
-
-    def predict_proba(self, videos: Iterable[Any]) -> Array:
-        """``(videos, classes)`` probabilities of the known classes, rows sum to 1 (a softmax of the standardized scores)."""
-        return probabilities(self.decision_function(videos), SHARPNESS)
-
-    def predict(self, videos: Iterable[Any]) -> Array:
-        """``(videos,)`` labels; ``none_label`` where ``reject`` is set and no class explains the video."""
-        scores = self.decision_function(videos)
-        labels = self.classes_[scores.argmax(axis=1)]
-        if self.reject_threshold_ is None:
-            return np.asarray(labels)
-        return refuse(labels, scores.max(axis=1) < self.reject_threshold_, self.none_label)
 
     # ---- long recordings ---------------------------------------------------------------------------------------------
     def stream(self, fps: float | None = None) -> BrightnessStream:

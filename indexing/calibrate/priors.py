@@ -59,16 +59,8 @@ def known_lenses(
     exif: bool = False,
 ) -> KnownLenses:
     """What is known of the lenses of some cameras."""
-    given = [
-        name
-        for name, there in (
-            ("focal", focal is not None),
-            ("one_lens", one_lens),
-            ("calibration", calibration is not None),
-            ("exif", exif),
-        )
-        if there
-    ]
+    there = {"focal": focal is not None, "one_lens": one_lens, "calibration": calibration is not None, "exif": exif}
+    given = [name for name, said in there.items() if said]
     if len(given) > 1:
         text = f"{{arg:{given[0]}}} and {{arg:{given[1]}}} both say what the focal lengths are; give one of them"
         raise ValueError(Message(text))
@@ -109,29 +101,23 @@ def _field_of_view(focal: float, size: Size) -> float:
 
 
 def _from_file(takes: Sequence[Take], sizes: Sequence[Size], calibration: Any) -> KnownLenses:
-    names = [take.name for take in takes]
-    path = calibration if isinstance(calibration, (str, Path)) else None
-    if path is None:
-        raise ValueError(
-            Message("{arg:calibration} must be the path of a calibration file, got {kind}", kind=type(calibration).__name__)
-        )
-    lenses, notes = named_lenses(path, names)
+    if not isinstance(calibration, (str, Path)):
+        text = "{arg:calibration} must be the path of a calibration file, got {kind}"
+        raise ValueError(Message(text, kind=type(calibration).__name__))
+    lenses, notes = named_lenses(calibration, [take.name for take in takes])
     fish = [lens.name for lens in lenses if lens.fisheye]
     if fish:
-        raise error(path, f"[{fish[0]}] has a fisheye lens, which is not modelled", "undistort the keypoints first")
+        raise error(calibration, f"[{fish[0]}] has a fisheye lens, which is not modelled", "undistort the keypoints first")
     other = [
         f"{lens.name} ({lens.size[0]:g}x{lens.size[1]:g}, its pictures {size[0]}x{size[1]})"
         for lens, size in zip(lenses, sizes, strict=True)
         if lens.size is not None and max(abs(a - b) for a, b in zip(lens.size, size, strict=True)) > 0.01 * max(size)
     ]
     if other:
-        raise error(
-            path,
-            f"was made with other pictures: {', '.join(other)}",
-            "calibrate in the mode in which you film, or give the right size",
-        )
+        remedy = "calibrate in the mode in which you film, or give the right size"
+        raise error(calibration, f"was made with other pictures: {', '.join(other)}", remedy)
     focals = tuple(float((lens.matrix[0, 0] * lens.matrix[1, 1]).sqrt()) for lens in lenses)
-    return KnownLenses(focals, lenses=tuple(lenses), source=f"given by {Path(path).name}, and held", notes=notes)
+    return KnownLenses(focals, lenses=tuple(lenses), source=f"given by {Path(calibration).name}, and held", notes=notes)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

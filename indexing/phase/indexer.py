@@ -17,7 +17,7 @@ from indexing.action.bank import Windows, stack
 from indexing.action.exemplars import mirror_permutation
 from indexing.action.inputs import check_queries, gather, gather_labels
 from indexing.clip import Clip, stretches
-from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, SavedClassifier, is_whole, one_of
+from indexing.estimator import POSITIVE, REJECT, SECONDS, Rule, ScoreClassifier, is_whole, one_of
 from indexing.joints import layout_of
 from indexing.modelfile import (
     Parts,
@@ -41,7 +41,7 @@ from indexing.phase.model import (
     images,
     query_frames,
 )
-from indexing.scoring import SHARPNESS, Event, events, probabilities, refuse, reject_threshold, same_label, smooth
+from indexing.scoring import Event, events, reject_threshold, same_label, smooth
 
 MAX_JOINTS = 10_000  # of a model file; the largest layouts have some hundred
 MAX_CYCLE_RATE = 3.0  # per second, where phases are averaged over a window
@@ -111,7 +111,7 @@ def smooth_phases(phase: Array, times: Array, seconds: float, periodic: Array) -
     return out
 
 
-class PhaseIndexer(SavedClassifier):
+class PhaseIndexer(ScoreClassifier):
     r"""Recognize actions in single frames, and say how far each of them has come.
 
     The joints of an action at phase :math:`\phi` span, with all cameras, the subspace :math:`S(\phi) = \mathrm{span}[1, X(\phi)]`
@@ -193,10 +193,6 @@ class PhaseIndexer(SavedClassifier):
         self.window = window
         self.device = device
         self.options = options
-
-    @property
-    def _options(self) -> PhaseOptions:
-        return PhaseOptions() if self.options is None else self.options
 
     @one_thread
     def fit(self, clips: Iterable[Any], labels: ArrayLike | None = None, phases: Sequence[Any] | None = None) -> Self:
@@ -327,26 +323,6 @@ class PhaseIndexer(SavedClassifier):
         found = check_queries(clips, self.fps, self.n_joints_, self.skeleton_, fewest=1, recordings=True)
         scores = self._evidence(found)[0].split([len(clip) for clip in found])
         return np.stack([part.mean(0).cpu().numpy() for part in scores])
-
-    @one_thread
-    def predict_proba(self, clips: Iterable[Any]) -> Array:
-        """``(clips, classes)`` probabilities, rows sum to 1 (a softmax of the standardized scores)."""
-        scores = self.decision_function(clips)
-        return probabilities(scores, SHARPNESS) if scores.shape[1] > 1 else np.ones_like(scores)
-
-    @one_thread
-    def evidence(self, clips: Iterable[Any]) -> Array:
-        """``(clips,)`` score of the best class: how much nearer a clip is to an action's frames than to those of the others."""
-        return np.asarray(self.decision_function(clips).max(axis=1))
-
-    @one_thread
-    def predict(self, clips: Iterable[Any]) -> Array:
-        """``(clips,)`` labels; ``none_label`` where ``reject`` is set and no class explains the clip."""
-        scores = self.decision_function(clips)
-        labels = self.classes_[scores.argmax(axis=1)]
-        if self.reject_threshold_ is None:
-            return np.asarray(labels)
-        return refuse(labels, scores.max(axis=1) < self.reject_threshold_, self.none_label)
 
     @one_thread
     def find(self, clip: Any) -> list[Event]:

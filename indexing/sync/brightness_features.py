@@ -189,17 +189,16 @@ class Drift:
 
     step: Tensor  # ``(T, 2)`` px per frame where it is followed, else 0
     lost: Tensor  # ``(T,)`` bool, where it cannot be
-    often: float  # share of the frames from which either counts
 
     @property
     def moves(self) -> bool:
         """Whether the camera moves."""
-        return bool((self.step.norm(dim=1) > 0).double().mean() > self.often)
+        return bool((self.step.norm(dim=1) > 0).double().mean() > MIN_DRIFT_FRAMES_SHARE)
 
     @property
     def too_fast(self) -> bool:
         """Whether it moves faster than can be followed, or the light changes."""
-        return bool(self.lost.double().mean() > self.often)
+        return bool(self.lost.double().mean() > MIN_DRIFT_FRAMES_SHARE)
 
     @property
     def path(self) -> Tensor:
@@ -210,7 +209,7 @@ class Drift:
 BORDER_SHARE = 0.12  # Share of the image on each side whose flow tells whether the camera moves.
 MIN_EXPLAINED_SHARE = 0.5  # Share of the border's change that one translation must explain.
 MIN_DRIFT_PIXELS = 0.05  # Per frame; below, the camera is on a tripod.
-MIN_DRIFT_FRAMES_SHARE = 0.1  # Share of the frames in which it must move to count.
+MIN_DRIFT_FRAMES_SHARE = 0.1  # Share of the frames in which it must move, or be lost, to count.
 MIN_CHANGE = 0.02  # Grey 0..1 per frame: 5 standard deviations of a noise of 8 grey levels, after the blur.
 MAX_UNEXPLAINED_SHARE = 0.3  # Share of the border that changes without one translation: a fast pan, a cut, flicker.
 
@@ -231,7 +230,7 @@ def drift(gx: Tensor, gy: Tensor, gt: Tensor) -> Drift:
     explained = 1 - left.square().sum(1) / spread.square().sum(1).clamp(min=1e-12)
     follows = (explained > MIN_EXPLAINED_SHARE) & (step.norm(dim=1) > MIN_DRIFT_PIXELS)
     lost = ((left.abs() > MIN_CHANGE).double().mean(1) > MAX_UNEXPLAINED_SHARE) & ~follows
-    return Drift(step * follows[:, None], lost, MIN_DRIFT_FRAMES_SHARE)
+    return Drift(step * follows[:, None], lost)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -252,12 +251,11 @@ class GrayMotion:
     columns: Tensor
     changed: Tensor  # ``(T,)`` share of the pixels that change
     drift: Drift  # how the background moves
-    least_changed: float  # share from which a frame shows motion
 
     @property
     def lively(self) -> Tensor:
         """``(T,)`` bool: frames in which something moves."""
-        return self.changed > self.least_changed
+        return self.changed > MIN_MOVING_SHARE
 
     @property
     def activity(self) -> Tensor:
@@ -291,13 +289,7 @@ def motion(frames: Tensor, region: Region | None = None) -> GrayMotion:
         changed.append((change > 0).double().mean((1, 2)))
         steps.append(camera.step)
         lost.append(camera.lost)
-    return GrayMotion(
-        torch.cat(rows),
-        torch.cat(columns),
-        torch.cat(changed),
-        Drift(torch.cat(steps), torch.cat(lost), MIN_DRIFT_FRAMES_SHARE),
-        MIN_MOVING_SHARE,
-    )
+    return GrayMotion(torch.cat(rows), torch.cat(columns), torch.cat(changed), Drift(torch.cat(steps), torch.cat(lost)))
 
 
 BOX_SMOOTHING_SECONDS = 0.2  # Over which a moving box is smoothed.

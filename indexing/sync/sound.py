@@ -310,15 +310,14 @@ class SoundSearch:
 
     def __init__(self, a: Sound, b: Sound, max_shift: float | None, drift: float, free: bool):
         self.a, self.b, self.free, self.given = a, b, free, drift
-        self.step = STEP_SECONDS
         self.between = b.first - a.first  # seconds between the clocks at a shift of 0 steps
         one, two = a.coarse.shape[1], b.coarse.shape[1]
         self.middle = (one - 1) / 2
         every = np.arange(1 - one, two)
         count = np.minimum(np.minimum(one, two - every), np.minimum(one + every, two))
-        keep = count >= MIN_OVERLAP_SECONDS / self.step
+        keep = count >= MIN_OVERLAP_SECONDS / STEP_SECONDS
         if max_shift is not None:
-            keep &= np.abs(every * self.step + self.between) <= max_shift
+            keep &= np.abs(every * STEP_SECONDS + self.between) <= max_shift
         self.lags, self.count, self._keep = every[keep], count[keep], keep
 
     def _drifts(self) -> Floats:
@@ -338,7 +337,7 @@ class SoundSearch:
         size = fft.next_fast_len(one.shape[1] + two.shape[1], real=True)
         other = fft.rfft(two, size, axis=1)
         drifts = self._drifts()
-        length = one.shape[1] if len(drifts) == 1 and not drifts[0] else round(MAX_PIECE_SECONDS / self.step)
+        length = one.shape[1] if len(drifts) == 1 and not drifts[0] else round(MAX_PIECE_SECONDS / STEP_SECONDS)
         sums = np.zeros((len(drifts), len(self._keep)))
         for begin in range(0, one.shape[1], length):
             part = one[:, begin : begin + length]
@@ -357,7 +356,7 @@ class SoundSearch:
         scores, drifts = self.lag_scores
         left = scores.copy()
         found: list[SoundPeak] = []
-        away = MIN_PEAK_SEPARATION_SECONDS / self.step
+        away = MIN_PEAK_SEPARATION_SECONDS / STEP_SECONDS
         while len(found) < NUM_PEAKS and np.isfinite(left).any():
             at = int(np.nanargmax(left))
             if not left[at] > 0:
@@ -374,7 +373,7 @@ class SoundSearch:
         there = (other >= 0) & (other < two.shape[1])
         products = np.zeros(len(rows))
         products[there] = np.einsum("kt,kt->t", one[:, there], two[:, other[there]])
-        size = max(1, round(STRETCH_SECONDS / self.step))
+        size = max(1, round(STRETCH_SECONDS / STEP_SECONDS))
         whole = np.pad(products, (0, -len(products) % size))
         return np.asarray(whole.reshape(-1, size).sum(axis=1), dtype=np.float64)
 
@@ -394,7 +393,7 @@ class SoundSearch:
         close = [one for one, value in zip(peaks[1:], apart, strict=True) if value < MIN_EVIDENCE_OVER_PEAK]
         limits = self._limits(best, chance, close)
         scores, _ = self.lag_scores
-        lags = self.lags * self.step + self.between
+        lags = self.lags * STEP_SECONDS + self.between
         kept = _thin(lags, scores, MAX_CURVE_POINTS)
         return Shift(
             offset=fit.offset,
@@ -423,8 +422,8 @@ class SoundSearch:
 
     def seconds(self, peak: SoundPeak, center: float | None = None) -> float:
         """Between the clocks at a shift, in the middle of a or at a time of a's."""
-        away = 0.0 if center is None else (center - self.a.first) / self.step - self.middle
-        return (peak.lag + peak.drift * away) * self.step + self.between
+        away = 0.0 if center is None else (center - self.a.first) / STEP_SECONDS - self.middle
+        return (peak.lag + peak.drift * away) * STEP_SECONDS + self.between
 
 
 def evidence_ratio(values: Floats) -> float:
@@ -456,19 +455,15 @@ class SoundFit:
 
     def __init__(self, search: SoundSearch, peak: SoundPeak):
         self.search = search
-        self.hop = HOP_SECONDS
         a, b = search.a, search.b
         self.between = search.between
         ends = [search.seconds(peak, a.first), search.seconds(peak, a.first + a.seconds)]
         low, high = max(a.first, b.first - ends[0]), min(a.first + a.seconds, b.first + b.seconds - ends[1])
         self.center = (low + high) / 2
         self.times, self.curves = self._pieces(peak, low, high)
-        lags = np.arange(self.curves.shape[1]) - (self.curves.shape[1] - 1) / 2
-        self._at = lags
-        drift = peak.drift
         long = search.free and high - low >= MIN_SECONDS_FOR_RATE
-        place, slope, covariance = self._maximize(drift, free=long)
-        if long and abs(slope - 0.0) <= SIGNIFICANCE_SIGMAS * math.sqrt(covariance[1, 1]):  # nothing speaks for a drift
+        place, slope, covariance = self._maximize(peak.drift, free=long)
+        if long and abs(slope) <= SIGNIFICANCE_SIGMAS * math.sqrt(covariance[1, 1]):  # nothing speaks for a drift
             long, (place, slope, covariance) = False, self._maximize(0.0, free=False)
         self.rate = 1 + slope
         self.rate_sigma = math.sqrt(covariance[1, 1]) if long else 0.0
@@ -481,12 +476,12 @@ class SoundFit:
 
         a, b = self.search.a.fine, self.search.b.fine
         about = self.search.seconds(peak, self.center)
-        shift = round((about - self.between) / self.hop)
-        self._whole = shift * self.hop + self.between - about
+        shift = round((about - self.between) / HOP_SECONDS)
+        self._whole = shift * HOP_SECONDS + self.between - about
         length = float(np.clip((high - low) / MIN_PIECES, MIN_PIECE_SECONDS, MAX_PIECE_SECONDS))
-        reach = round((MIN_PEAK_SEPARATION_SECONDS + MAX_RATE_DEVIATION * (high - low) / 2) / self.hop)
-        first, last = round((low - self.search.a.first) / self.hop), round((high - self.search.a.first) / self.hop)
-        size, times, curves = round(length / self.hop), [], []
+        reach = round((MIN_PEAK_SEPARATION_SECONDS + MAX_RATE_DEVIATION * (high - low) / 2) / HOP_SECONDS)
+        first, last = round((low - self.search.a.first) / HOP_SECONDS), round((high - self.search.a.first) / HOP_SECONDS)
+        size, times, curves = round(length / HOP_SECONDS), [], []
         for begin in range(max(0, first), max(first + 1, last - size // 2), size):
             end = min(begin + size, a.shape[1])
             one = a[:, begin:end]
@@ -496,39 +491,43 @@ class SoundFit:
             other[:, inside.start - start : inside.stop - start] = b[:, inside]
             n = fft.next_fast_len(other.shape[1], real=True)
             found = fft.irfft((np.conj(fft.rfft(one, n, axis=1)) * fft.rfft(other, n, axis=1)).sum(axis=0), n)
-            times.append((begin + end - 1) / 2 * self.hop + self.search.a.first - self.center)
-            curves.append(ndimage.gaussian_filter1d(found[: 2 * reach + 1], SCORE_SMOOTHING_SECONDS / self.hop))
+            times.append((begin + end - 1) / 2 * HOP_SECONDS + self.search.a.first - self.center)
+            curves.append(ndimage.gaussian_filter1d(found[: 2 * reach + 1], SCORE_SMOOTHING_SECONDS / HOP_SECONDS))
         return np.array(times), np.array(curves, dtype=np.float64)
 
     def _scores_along(self, place: float, slope: float) -> tuple[Floats, Floats, Floats]:
         """Score, slope and curvature of every piece's curve where offset and drift put it."""
         from scipy import ndimage
 
-        at = (place - self._whole + slope * self.times) / self.hop - self._at[0]
+        at = (place - self._whole + slope * self.times) / HOP_SECONDS + (self.curves.shape[1] - 1) / 2
         rows = np.arange(len(at))
         values = [ndimage.map_coordinates(self.curves, [rows, at + off], order=3, mode="nearest") for off in (-1.0, 0.0, 1.0)]
         before, here, after = values
-        return here, (after - before) / (2 * self.hop), (after - 2 * here + before) / self.hop**2
+        return here, (after - before) / (2 * HOP_SECONDS), (after - 2 * here + before) / HOP_SECONDS**2
+
+    def _derivatives(self, found: Floats, both: int) -> tuple[Floats, Floats, Floats]:
+        """``(p,)`` scores of the pieces, their slopes ``(p, both)`` in seconds and drift, and the negative Hessian of the sum."""
+        here, first, second = self._scores_along(float(found[0]), float(found[1]))
+        design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
+        return here, design * first[:, None], -(design * second[:, None]).T @ design
 
     def _maximize(self, drift: float, free: bool) -> tuple[float, float, Floats]:
         """Seconds from the peak, drift, and the covariance of both: a grid, then Newton's steps while they go up."""
         reach = MIN_PEAK_SEPARATION_SECONDS / 2
-        places = np.arange(-reach, reach + self.hop / 2, self.hop)
-        half = max(float(np.abs(self.times).max()), self.hop)
+        places = np.arange(-reach, reach + HOP_SECONDS / 2, HOP_SECONDS)
+        half = max(float(np.abs(self.times).max()), HOP_SECONDS)
         near = min(MAX_RATE_DEVIATION, 2 * STEP_SECONDS / half)  # what the search before could not tell apart
-        steps = drift + np.arange(-near, near + 1e-12, self.hop / half) if free else np.array([drift])
+        steps = drift + np.arange(-near, near + 1e-12, HOP_SECONDS / half) if free else np.array([drift])
         totals = [[float(self._scores_along(place, slope)[0].sum()) for place in places.tolist()] for slope in steps.tolist()]
         row, column = np.unravel_index(int(np.argmax(totals)), np.shape(totals))
         found = np.array([places[column], steps[row]])
         both = 2 if free else 1
         for _ in range(MAX_NEWTON_STEPS):
-            here, first, second = self._scores_along(float(found[0]), float(found[1]))
-            design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
-            hessian = -(design * second[:, None]).T @ design
+            here, slopes, hessian = self._derivatives(found, both)
             if np.linalg.eigvalsh(hessian).min() <= 0:
                 break
             move = np.zeros(2)
-            move[:both] = np.linalg.solve(hessian, design.T @ first)
+            move[:both] = np.linalg.solve(hessian, slopes.sum(axis=0))
             next_place, next_slope = (found + move).tolist()
             if self._scores_along(next_place, next_slope)[0].sum() < here.sum():
                 break
@@ -537,16 +536,13 @@ class SoundFit:
 
     def _covariance(self, found: Floats, both: int) -> Floats:
         """``(2, 2)`` of seconds and drift."""
-        _, first, second = self._scores_along(float(found[0]), float(found[1]))
-        design = np.stack([np.ones_like(self.times), self.times], axis=1)[:, :both]
-        hessian = -(design * second[:, None]).T @ design
+        _, slopes, hessian = self._derivatives(found, both)
         covariance = np.zeros((2, 2))
         covariance[0, 0] = MIN_PEAK_SEPARATION_SECONDS**2
         if np.linalg.eigvalsh(hessian).min() > 0:
             inverse = np.linalg.inv(hessian)
-            slopes = design * first[:, None]
-            covariance[:both, :both] = inverse @ (slopes.T @ slopes) @ inverse * len(first) / max(1, len(first) - both)
-        covariance[0, 0] += (self.hop / math.sqrt(12)) ** 2
+            covariance[:both, :both] = inverse @ (slopes.T @ slopes) @ inverse * len(slopes) / max(1, len(slopes) - both)
+        covariance[0, 0] += (HOP_SECONDS / math.sqrt(12)) ** 2
         return covariance
 
 

@@ -232,15 +232,6 @@ class CameraMotion:
         after = np.minimum(after, len(self.times) - 1)
         return np.asarray(self.path[np.where(times - self.times[before] <= self.times[after] - times, before, after)])
 
-    def stabilize_points(self, points: Floats, times: Floats | None = None) -> Floats:
-        """Points ``(frames, n, 2)`` as the first frame's camera would have seen them (exact for pans, or far backgrounds).
-
-        Args:
-            points: pixels of ``size``.
-            times: ``(frames,)`` seconds of these frames; default: the frames of this motion.
-        """
-        return transform(self.path if times is None else self.at(times), np.asarray(points, np.float64))
-
 
 def camera_motion(source: str | Path | Source) -> CameraMotion:
     """Whether, when and by how much the camera moves, from the background of a video.

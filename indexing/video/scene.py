@@ -136,7 +136,8 @@ def track_scene(
     taken = wanted.frame_numbers(times, first, name_of(source))
     pictures = [image.copy() for image in select_frames(stream, taken)]
     least = max(2, round(MIN_PRESENCE * len(taken))) if missing else len(taken)
-    positions = _drop_rarely_seen(_refine_to_first(_at(book, [k - first for k in taken]), pictures), least)
+    positions = _at(book, [k - first for k in taken])
+    positions = _drop_rarely_seen(positions if len(taken) > MAX_ANCHOR_FRAMES else _refine_to_first(positions, pictures), least)
     return _scene_tracks(stream, name_of(source), positions, pictures, taken, times, why)
 
 
@@ -279,14 +280,11 @@ def _drop_rarely_seen(positions: Floats, least: int) -> Floats:
 def _refine_to_first(positions: Floats, pictures: Images) -> Floats:
     """Each point compared with the first picture that shows it, there and back from where it was followed to; NaN where it
     fails."""
-    views = len(positions)
-    if views > MAX_ANCHOR_FRAMES:
-        return positions
     seen = np.isfinite(positions[..., 0])
     first = seen.argmax(axis=0)
     out = positions.copy()
     for j in np.unique(first).tolist():
-        for k in range(j + 1, views):
+        for k in range(j + 1, len(positions)):
             rows = np.flatnonzero((first == j) & seen[k])
             if len(rows):
                 out[k, rows] = refine_match(pictures[j], pictures[k], positions[j, rows], positions[k, rows])
@@ -563,12 +561,7 @@ def _refine_to_anchor(out: Floats, start: int, pictures: Images) -> NDArray[np.i
     before = part.copy()
     seen = np.isfinite(before[..., 0])
     some: NDArray[np.bool_] = np.asarray(seen.any(axis=0))
-    first = np.where(some, seen.argmax(axis=0), -1)
-    for j in np.unique(first[first >= 0]).tolist():
-        for k in range(j + 1, len(pictures)):
-            rows = np.flatnonzero((first == j) & seen[k])
-            if len(rows):
-                part[k, rows] = refine_match(pictures[j], pictures[k], part[j, rows], before[k, rows])
+    part[:] = _refine_to_first(before, pictures)
     last = len(seen) - 1 - seen[::-1].argmax(axis=0)
     there = np.isfinite(part[..., 0])
     columns = np.arange(out.shape[1])

@@ -23,6 +23,7 @@ from indexing.calibrate.people.pair_geometry import (
     estimate_pair,
     evidence,
     fit_pair,
+    same_people,
     sum_over_time,
     synchronize_tracklets,
 )
@@ -415,9 +416,7 @@ class ExchangeTrial:
 
     def _evidence_at(self, matched: Booleans, both: CommonFrames) -> tuple[float, int]:
         """Nats for a matching, and at how many moments it can be judged."""
-        first, second = both.piece_a, both.piece_b
-        there = matched[first[:, :, None], second[:, None]] & (first >= 0)[:, :, None] & (second >= 0)[:, None]
-        return self._score(matched, both), int(there.sum())
+        return self._score(matched, both), int(same_people(both, matched).sum())
 
     def exchange_loss(self, camera: int, people: tuple[int, int]) -> float:
         """Nats by which the sorting fits better than with two people exchanged in one of the cameras."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 
 import dyntorch
 from dyntorch import Shift
@@ -204,10 +205,15 @@ def _robust_sigma(away: Floats) -> float:
     return max(float(np.median(np.abs(away))) / 0.7648923284, MIN_SIGMA)
 
 
+def same_people(both: CommonFrames, matched: Booleans) -> Booleans:
+    """``(T, slots_a, slots_b)`` where both show the same person."""
+    there = (both.piece_a >= 0)[:, :, None] & (both.piece_b >= 0)[:, None]
+    return np.asarray(matched[both.piece_a[:, :, None], both.piece_b[:, None]] & there)
+
+
 def _matched_points(both: CommonFrames, matched: Booleans) -> tuple[Floats, Floats, Floats]:
     """The points of those who are the same, ``(n, 2)`` each, and their weights."""
-    same = matched[both.piece_a[:, :, None], both.piece_b[:, None]] & (both.piece_a >= 0)[:, :, None] & (both.piece_b >= 0)[:, None]
-    t, i, j = np.nonzero(same)
+    t, i, j = np.nonzero(same_people(both, matched))
     x1, x2 = both.a[t, i].reshape(-1, 2), both.b[t, j].reshape(-1, 2)
     weight = np.sqrt(both.trust_a[t, i] * both.trust_b[t, j]).reshape(-1)
     known = (weight > 0) & np.isfinite(x1).all(1) & np.isfinite(x2).all(1)
@@ -242,12 +248,13 @@ def match_and_refit(a: PieceView, b: PieceView, relation: CameraPair) -> Hypothe
     if not len(both.a):
         return None
     shape, size = (len(a.pieces), len(b.pieces)), math.sqrt(a.pieces.size * b.pieces.size)
-    conflicts = _block_diagonal(a.pieces.conflicts, b.pieces.conflicts)
+    conflicts = block_diag(a.pieces.conflicts, b.pieces.conflicts)
     best: Hypothesis | None = None
     for _ in range(MAX_MATCH_ITERATIONS):
         nats = evidence(relation, both)
         scores = sum_over_time(nats, both, shape)
-        labels = cluster(_symmetric_scores(scores), conflicts)
+        within = (np.zeros((n, n)) for n in shape)
+        labels = cluster(np.block([[next(within), scores], [scores.T, next(within)]]), conflicts)
         matched = (labels[: shape[0], None] == labels[None, shape[0] :]) & (scores > 0)
         hypothesis = Hypothesis(relation, float(scores[matched].sum()), _explained_share(both, matched), size)
         if best is not None and hypothesis.score <= best.score * (1 + MIN_RELATIVE_GAIN):
@@ -260,25 +267,9 @@ def match_and_refit(a: PieceView, b: PieceView, relation: CameraPair) -> Hypothe
     return best
 
 
-def _block_diagonal(first: Booleans, second: Booleans) -> Booleans:
-    n, m = len(first), len(second)
-    out = np.zeros((n + m, n + m), dtype=bool)
-    out[:n, :n], out[n:, n:] = first, second
-    return out
-
-
-def _symmetric_scores(scores: Floats) -> Floats:
-    n, m = scores.shape
-    out = np.zeros((n + m, n + m))
-    out[:n, n:], out[n:, :n] = scores, scores.T
-    return out
-
-
 def _explained_share(both: CommonFrames, matched: Booleans) -> float:
-    first, second = both.piece_a, both.piece_b
-    same = matched[first[:, :, None], second[:, None]] & (first >= 0)[:, :, None] & (second >= 0)[:, None]
-    could = np.minimum((first >= 0).sum(1), (second >= 0).sum(1)).sum()
-    return float(same.any(2).sum() / max(1, could))
+    could = np.minimum((both.piece_a >= 0).sum(1), (both.piece_b >= 0).sum(1)).sum()
+    return float(same_people(both, matched).any(2).sum() / max(1, could))
 
 
 def seed_pairs(a: PieceView, b: PieceView) -> list[tuple[int, int]]:

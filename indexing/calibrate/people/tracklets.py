@@ -307,16 +307,12 @@ def _best_move(scores: Floats, conflicts: Booleans, labels: Integers, piece: int
     reach = np.bincount(labels, weights=scores[piece], minlength=groups + 1)
     best, most = None, MIN_GAIN
     for other in range(groups + 1):
-        if other == own or (other < groups and reach[other] <= 0 and not _is_blocked(conflicts, labels, piece, other)):
+        if other == own or (other < groups and reach[other] <= 0 and not (conflicts[piece] & (labels == other)).any()):
             continue
         changed, gain = exchange(scores, conflicts, labels, piece, other)
         if gain > most:
             best, most = changed, gain
     return None if best is None else _compact(best)
-
-
-def _is_blocked(conflicts: Booleans, labels: Integers, piece: int, other: int) -> bool:
-    return bool((conflicts[piece] & (labels == other)).any())
 
 
 def exchange(scores: Floats, conflicts: Booleans, labels: Integers, piece: int, other: int) -> tuple[Integers, float]:

@@ -111,15 +111,6 @@ def test_stabilized_frames_stand_still(scene):
 
 
 @pytest.mark.slow
-def test_tracks_lose_the_cameras_motion(motion_of):
-    camera = motion_of(pan, 75)
-    wall = np.array([[200.0, 50], [250, 200]])
-    seen = transform(np.array([pan(i) for i in range(75)]), wall)
-    np.testing.assert_allclose(camera.stabilize_points(seen), np.broadcast_to(wall, (75, 2, 2)), atol=0.7)
-    np.testing.assert_allclose(camera.stabilize_points(seen[::2], camera.times[::2] + 0.001), camera.stabilize_points(seen)[::2])
-
-
-@pytest.mark.slow
 def test_a_cut_is_named(scene):
     (first, _), (second, _) = scene(30, chunk=30), scene(30, seed=7, chunk=30)
     camera = camera_motion([*first, Chunk(second[0].frames, second[0].times + 1.0)])
