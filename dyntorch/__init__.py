@@ -94,18 +94,8 @@ _HOME = {
     "TrackSegmentOptions": "dyntorch.tasks.segment.tracks",
     "TrajectoryOptions": "dyntorch.tasks.trajectories.trajectories",
 }
-_MODULES = {
-    "core": "dyntorch.core",
-    "counting": "dyntorch.counting",
-    "geometry": "dyntorch.geometry",
-    "invariants": "dyntorch.invariants",
-    "metrics": "dyntorch.metrics",
-    "motions": "dyntorch.tasks.reconstruct.motions",
-    "numerics": "dyntorch.numerics",
-    "scenes": "dyntorch.scenes",
-    "shapes": "dyntorch.shapes",
-    "tasks": "dyntorch.tasks",
-}
+_ROOMS = ("core", "counting", "geometry", "invariants", "metrics", "numerics", "scenes", "shapes", "tasks")
+_MODULES = {**{name: f"dyntorch.{name}" for name in _ROOMS}, "motions": "dyntorch.tasks.reconstruct.motions"}
 __all__ = sorted([*_HOME, *_MODULES])
 
 

@@ -20,10 +20,7 @@ if TYPE_CHECKING:  # a class to derive from
 
 _HOME = {
     "algebraic": "dyntorch.core.residual",
-    "Outcome": "dyntorch.core.outcome",
-    "Notice": "dyntorch.core.outcome",
-    "NoticeCode": "dyntorch.core.outcome",
-    "status_from": "dyntorch.core.outcome",
+    **dict.fromkeys(("Outcome", "Notice", "NoticeCode", "status_from"), "dyntorch.core.outcome"),
 }
 __all__ = sorted(_HOME)
 

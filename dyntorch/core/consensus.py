@@ -187,11 +187,7 @@ class Bundle:
 
 
 def bundle(
-    invariant: Invariant,
-    primitives: tuple[Primitive, ...],
-    views: tuple[Tensor, ...],
-    scales: tuple[Tensor, ...],
-    weights: Tensor,
+    invariant: Invariant, primitives: tuple[Primitive, ...], views: tuple[Tensor, ...], scales: tuple[Tensor, ...], weights: Tensor
 ) -> Bundle:
     """Prepare matches ``(b, 1, n, ...)`` in normalized coordinates, with weights ``(b, n)``."""
     packed, vectors = [], []
@@ -310,12 +306,7 @@ class SearchMatches(NamedTuple):
 class Search:
     """The search for the tensors of a batch, among at most so many matches that memory stays bounded."""
 
-    def __init__(
-        self,
-        invariant: Invariant,
-        data: Matches,
-        generator: torch.Generator | None,
-    ) -> None:
+    def __init__(self, invariant: Invariant, data: Matches, generator: torch.Generator | None) -> None:
         self.invariant, self.data = invariant, data
         self.draws = Draws(len(data.weights), generator, data.weights.device)
         self.everyone = torch.arange(len(data.weights), device=data.weights.device)

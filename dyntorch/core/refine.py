@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -222,14 +223,20 @@ def algebraic_motion(solution: Solution, data: Matches, iterations: int = CONSTR
         matrix = gram(norm.primitives, views, weights, static)
         trace = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
         problem = Algebraic(base, shapes, matrix / trace.clamp(min=torch.finfo(trace.dtype).tiny))
-        costs = torch.stack([problem.cost(theta) for theta in tries.unbind(1)])
-        best = costs.nan_to_num(nan=torch.inf).argmin(0)
-        theta = tries.gather(1, best[:, None, None].expand(-1, 1, tries.shape[-1]))[:, 0]
+        theta = _least(tries, problem.cost)
         return minimize(problem, problem.evaluate((theta,)), options).theta[0]
 
     theta = torch.cat([part.flatten(2) for part in starts], dim=-1).transpose(0, 1)
     size = max(1, min(BLOCK // (invariant.width() * theta.shape[-1]), -(-len(theta) // workers())))
     return parts_of(map_blocks(run, theta, views, relative_weights(data.weights), data.static, size=size), shapes)
+
+
+def _least(starts: Tensor, cost: Callable[[Tensor], Tensor]) -> Tensor:
+    """The start ``(b, p)`` of least cost, of ``(b, tries, p)``."""
+    if starts.shape[1] == 1:
+        return starts[:, 0]
+    costs = torch.stack([cost(theta) for theta in starts.unbind(1)], dim=1).nan_to_num(nan=torch.inf)
+    return starts.gather(1, costs.argmin(1)[:, None, None].expand(-1, 1, starts.shape[-1]))[:, 0]
 
 
 ITERATIONS = 30
@@ -354,10 +361,7 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
         starts: Tensor, views: tuple[Tensor, ...], scales: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
     ) -> Minimum:
         problem = Problem(base, shapes, views, scales, weights, static)
-        theta = starts[:, 0]
-        if starts.shape[1] > 1:
-            costs = torch.stack([problem.normal_equations(theta)[0] for theta in starts.unbind(1)], dim=1)
-            theta = starts.gather(1, costs.argmin(1)[:, None, None].expand(-1, 1, starts.shape[-1]))[:, 0]
+        theta = _least(starts, lambda theta: problem.normal_equations(theta)[0])
         return minimize(problem, problem.evaluate((theta,)), LeastSquaresOptions(iterations=iterations))
 
     # a block for every thread at least: threads inside of small operations cost more than they bring
@@ -502,12 +506,8 @@ def _cost(invariant: Invariant, shapes: tuple[torch.Size, ...], count: int, labe
         total = whitened_residual(base, motion, moved, scales).square().sum(-1) * torch.where(label == 0, weights, 0.0)
         for free in range(1, (2 if label.dtype == torch.bool else invariant.within) if labelled else 1):
             smaller = base.confine(free)
-            rest = (
-                base.whitened_static_residual(motion, moved, scales)
-                if smaller is None
-                else whitened_residual(smaller, motion, moved, scales)
-            )
-            total = total + rest.square().sum(-1) * torch.where(label == free, weights, 0.0)
+            static = base.whitened_static_residual if smaller is None else partial(whitened_residual, smaller)
+            total = total + static(motion, moved, scales).square().sum(-1) * torch.where(label == free, weights, 0.0)
         return total.sum(-1) / unit.square()
 
     return cost

@@ -217,15 +217,13 @@ def _pick(better: Tensor, new: Solution, old: Solution) -> Solution:
     """The better one of two solutions of every problem."""
     caller = old.matches.back(better)
     motion = new.normalized_motion(), old.normalized_motion()
-    covariance = (
-        new.covariance if old.covariance is None or new.covariance is None else select(caller, new.covariance, old.covariance)
-    )
+    known = old.covariance is not None and new.covariance is not None
     return replace(
         new,
         tensor=select(caller, new.tensor, old.tensor),
         normalized=select(better, new.normalized, old.normalized),
         refined=tuple(select(better, a, b) for a, b in zip(*motion, strict=True)),
-        covariance=covariance,
+        covariance=select(caller, new.covariance, old.covariance) if known else new.covariance,  # type: ignore[arg-type]
     )
 
 
@@ -240,11 +238,11 @@ def _with_status(solution: Solution, evidence: Tensor, degenerate: Tensor, inlie
     good, covariance = ~is_failure(status), solution.covariance
     return replace(
         solution,
-        tensor=select(data.back(good), solution.tensor, torch.zeros_like(solution.tensor)),
-        normalized=select(good, solution.normalized, torch.zeros_like(solution.normalized)),
+        tensor=select(data.back(good), solution.tensor, 0.0),
+        normalized=select(good, solution.normalized, 0.0),
         status=data.back(status),
         uncertainty=linear.uncertainty,
-        covariance=None if covariance is None else select(data.back(good), covariance, torch.zeros_like(covariance)),
+        covariance=None if covariance is None else select(data.back(good), covariance, 0.0),
         inliers=data.back(inliers & good[:, None]),
         sigma=data.back(torch.where(good, sigma, torch.zeros_like(sigma))),
     )

@@ -18,18 +18,11 @@ if TYPE_CHECKING:  # decorators keep the types of what they decorate only if the
     from dyntorch.numerics.blocks import one_thread as one_thread
 
 _HOME = {
-    "one_thread": "dyntorch.numerics.blocks",
-    "map_blocks": "dyntorch.numerics.blocks",
-    "on_cpu": "dyntorch.numerics.arguments",
-    "check_options": "dyntorch.numerics.arguments",
-    "canonical_correlation": "dyntorch.numerics.subspaces",
-    "orthonormal_basis": "dyntorch.numerics.subspaces",
-    "affine_factorization": "dyntorch.numerics.subspaces",
-    "metric_upgrade": "dyntorch.numerics.subspaces",
-    "Message": "dyntorch.numerics.messages",
-    "as_python": "dyntorch.numerics.messages",
-    "with_words": "dyntorch.numerics.messages",
-    "with_names": "dyntorch.numerics.messages",
+    **dict.fromkeys(("one_thread", "map_blocks"), "dyntorch.numerics.blocks"),
+    **dict.fromkeys(("on_cpu", "check_options"), "dyntorch.numerics.arguments"),
+    **dict.fromkeys(("canonical_correlation", "orthonormal_basis"), "dyntorch.numerics.subspaces"),
+    **dict.fromkeys(("affine_factorization", "metric_upgrade"), "dyntorch.numerics.subspaces"),
+    **dict.fromkeys(("Message", "as_python", "with_words", "with_names"), "dyntorch.numerics.messages"),
 }
 __all__ = sorted(_HOME)
 
