@@ -175,10 +175,6 @@ def test_misuse_is_refused(shape, rest, message):
         (projective_factorization if isinstance(rest[0], int) else velocity_factorization)(torch.zeros(shape), *rest)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# Factorization of constant velocity: exact scenes up to the gauge, the optimum from the truth, degenerate scenes, misuse.
-
-
 def scene_velocity(*batch, views, n, dim, seed=0):
     """Tracks in pixels of points at constant velocity, by affine cameras, and all that made them."""
     g = seeded(seed)

@@ -233,10 +233,6 @@ def test_options_decide() -> None:
     assert not torch.equal(source.get_state(), before)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# reconstruct refuses bad input by name, value and remedy; a bad problem of a batch is a status.
-
-
 NAN = float("nan")
 CV = "constant_velocity_2d"
 

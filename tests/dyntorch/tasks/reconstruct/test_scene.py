@@ -113,10 +113,6 @@ def test_the_frame_is_finite_round_and_brings_static_points_to_rest(name):
     )
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# Projections and points of P^k from tracks: choices of views, exactness, failures as data.
-
-
 def tracks_of(name, n=60, seed=0, **options):
     options = {"batch": (1,), **options}
     scene = scenes.lifted_points(name, n, generator=seeded(seed), **options)
@@ -170,10 +166,6 @@ def test_choices_are_all_views_or_those_seen_most_and_spread():
     few = view_subsets(tracks, 4)
     assert few.shape == (1, 6, 4)
     assert bool((few.diff(dim=-1) > 0).all())
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Starts without a tensor: exact for a scene at rest, and frames that differ by a collineation of the world.
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -100,22 +100,6 @@ def test_some_points_alone_and_takes_longer_than_a_piece(monkeypatch):
     assert torch.allclose(epipolar_curve(samples).scores, curve.scores, atol=1e-6, equal_nan=True)
 
 
-def test_samples_are_the_smoothed_tracks_normalized():
-    scene = scene_of(6, missing=0.2)
-    a, b = tracks_of(scene)
-    samples = Samples.of(a, b, 0.04)
-    at = torch.arange(10, dtype=torch.float64) * 0.04
-    x, _, w = smooth_at(b, at, 0.04)
-    seen = w > 0
-    expected = (homogeneous(x) @ b.change.mT)[..., :2]
-    assert torch.allclose(samples.x2[:10][seen], expected[seen]) and not samples.x2[:10][~seen].any()
-    assert float(samples.x1[samples.w1 > 0].square().sum(-1).mean()) == pytest.approx(2, rel=0.05)
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The descent in offset, rate and F: against a general least squares solver, scans, repeated draws of noise and exact cameras.
-
-
 def sampson(F, p, q):
     """Signed distances, px."""
     value = torch.einsum("ni,ij,nj->n", q, F, p)

@@ -201,10 +201,6 @@ def test_misuse_names_the_remedy(arguments, words):
         synchronize(*given, fps=(FPS, RECORDED), **more)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# The parts: moments, the camera of least variance, and the descent's derivatives.
-
-
 def test_the_variance_is_the_least_generalized_eigenvalue_of_the_12_by_12_moments():
     film, space = taken(14, noise=6.0, fps=(FPS, FPS), offset=1.0)
     x, X = (film - film.mean((0, 1))) / 200, space[30 : 30 + len(film)] - space.mean((0, 1))

@@ -11,7 +11,6 @@ from dyntorch.tasks.synchronize.subspace import (
     SHAPE_SAMPLE_RATE,
     SubspaceCurve,
     body_of,
-    regress_missing,
     smooth,
     subspace_curve,
     subspace_shift,
@@ -123,16 +122,6 @@ def test_missing_blocks_are_filled_from_the_other_points():
     spoiled = torch.where(wa[..., None] > 0, a, torch.nan)
     found = subspace_shift(subspace_curve(spoiled, b + 1e3 * (wb == 0)[..., None], wa, wb, (-40, 40)))
     assert found.ok and found.position == pytest.approx(9.5, abs=0.4)
-
-
-def test_completed_positions_are_near_the_true_ones():
-    a, _ = scene(150, 0, n=10, noise=0.01)
-    seen = torch.ones(150, 10, dtype=torch.bool)
-    for j in range(10):
-        seen[14 * j : 14 * j + 12, j] = False
-    start = torch.where(seen[..., None], a, a.mean(0))
-    error = (regress_missing(start, seen) - a)[~seen].norm(dim=-1)
-    assert float(error.median()) < 0.05 * float((start - a)[~seen].norm(dim=-1).median())
 
 
 def test_frames_that_nobody_is_seen_in_do_not_count():

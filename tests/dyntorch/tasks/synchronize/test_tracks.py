@@ -144,10 +144,6 @@ def test_misuse_names_the_field_and_the_remedy(arguments, words):
         read_tracks("a", *arguments)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# Positions that are elsewhere: planted ones go, good ones stay.
-
-
 def removed(before, after):
     return (before.weights > 0) & (after.weights == 0)
 
@@ -172,15 +168,6 @@ def test_planted_outliers_go(share):
         assert float((far & gone).sum() / far.sum()) > 0.93
         assert float((gone & ~far).sum() / (~far).sum()) < 0.03
         assert torch.equal(gone, removed(tracks, reject_outliers(tracks_of(4 * scene.a + 1000))))  # whatever the scale
-
-
-def test_one_wrong_position_goes_and_nothing_else():
-    x = filmed_person(6, seconds=2.0, noise=0.5, generator=seeded(1)).a
-    before = reject_outliers(tracks_of(x))
-    x[30, 2] += 40
-    after = reject_outliers(tracks_of(x))
-    assert after.weights[30, 2] == 0
-    assert int((before.weights != after.weights).sum()) <= 2
 
 
 def test_a_point_at_rest_keeps_its_positions():
@@ -215,10 +202,6 @@ def test_what_outliers_have_no_say_in():
     x[:, 2] = torch.nan
     after = reject_outliers(tracks_of(x))
     assert not after.weights[:, 2].any() and after.x.isfinite().all()
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# Tracks about their middle: place and distance of the person go, everything else stays.
 
 
 def scene(**more):
