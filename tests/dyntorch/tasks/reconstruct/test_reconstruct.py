@@ -76,6 +76,9 @@ def test_a_lost_problem_leaves_the_others_alone() -> None:
     alone = dyn.reconstruct(scene.tracks[[0, 2]], "constant_direction_3d")
     assert bool((metrics.lifted_error(found.structure[[0, 2]], alone.structure, scene.lifts).position < 1e-8).all())
     assert bool(found.points[1].isnan().all()) and bool((found.cameras[1] == 0).all())
+    assert "2 OK, 1 TOO_FEW" in repr(found) and "warning few_observed: 1 of 3 problems" in repr(found)
+    with pytest.raises(ValueError, match="problem 1 of 3: TOO_FEW"):
+        found.check()
 
 
 @pytest.mark.parametrize("name", ["constant_velocity_2d", "constant_velocity_3d", "constant_direction_2d"])
@@ -93,6 +96,8 @@ def test_float32_and_units() -> None:
     scene = scene_of("constant_velocity_2d")
     single = dyn.reconstruct(scene.tracks.float(), "constant_velocity_2d", scene.times)
     assert single.points.dtype == single.cameras.dtype == torch.float32
+    assert repr(single).startswith("Reconstruction(constant_velocity_2d, views=4, points=60, batch=(): 1 OK)")
+    assert "60 moving" in repr(single) and "velocity common to all points" in repr(single)
     assert single.labels.dtype == torch.long and single.inliers.dtype == torch.bool
     assert float(metrics.lifted_error(single.structure.double(), scene.structure, scene.lifts).position) < 1e-4
     milli = dyn.reconstruct(scene.tracks, "constant_velocity_2d", scene.times * 1e-3)
@@ -259,6 +264,9 @@ CASES = {
     r"lift of 'flat' must have rank d \+ 1 = 3, got 2 at time 2": {
         "motion": Motion(lambda t: torch.diag(torch.stack([t * 0 + 1, t * 0 + 1, 2 - t])), "flat")
     },
+    r"tracks must be .*, got \(30, 2\)": {"tracks": torch.zeros(30, 2)},
+    r"tracks must be .*, got \(4, 30, 5\)": {"tracks": torch.zeros(4, 30, 5)},
+    "tracks must be a floating point torch.Tensor, got torch.int64": {"tracks": torch.zeros(4, 30, 2).long()},
     "needs at least 3 views, got 2": {"views": 2},
     "no declared motion takes 1 views of 30 tracks; 'static_2d' needs 2 views and 4 tracks": {"motion": "auto", "views": 1},
     r"times must be 30 finite .*tracks are \(\*batch, views, n, 2\); yours look transposed": {
@@ -289,12 +297,6 @@ def test_refused(message: str) -> None:
     x = options.pop("tracks")[: options.pop("views", None), : options.pop("n", None)]
     with pytest.raises(ValueError, match=message):
         dyn.reconstruct(x, **options)
-
-
-@pytest.mark.parametrize("given", [torch.zeros(30, 2), torch.zeros(4, 30, 2, dtype=torch.int64), [[1.0]], torch.zeros(4, 30, 5)])
-def test_tracks_refused(given: object) -> None:
-    with pytest.raises(ValueError, match="tracks must be"):
-        dyn.reconstruct(given, CV)
 
 
 @pytest.mark.slow
@@ -359,20 +361,6 @@ def test_no_static_point_is_none_given() -> None:
     both = dyn.reconstruct(scene.tracks.expand(2, 4, 30, 2), CV, static=torch.stack([known, known & False]))
     assert both.labels[1].equal(alone.labels) and not both.warnings
     torch.testing.assert_close(both.residuals[1], alone.residuals, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_repr_of_one_and_of_a_batch() -> None:
-    scene = scenes.lifted_points("constant_velocity_2d", 30, views=4, batch=2, generator=seeded())
-    one = repr(dyn.reconstruct(scene.tracks[0], "constant_velocity_2d"))
-    assert one.startswith("Reconstruction(constant_velocity_2d, views=4, points=30, batch=(): 1 OK)")
-    assert "30 moving" in one and "velocity common to all points" in one
-    tracks = scene.tracks.clone()
-    tracks[1] = torch.nan
-    found = dyn.reconstruct(tracks, "constant_velocity_2d")
-    assert "1 OK, 1 TOO_FEW" in repr(found) and "warning few_observed: 1 of 2 problems" in repr(found)
-    with pytest.raises(ValueError, match="problem 1 of 2: TOO_FEW"):
-        found.check()
 
 
 def test_two_bodies_say_nothing_about_other_times() -> None:

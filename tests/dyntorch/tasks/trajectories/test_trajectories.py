@@ -6,6 +6,7 @@ import torch
 from dyntorch import TrajectoryOptions
 from dyntorch.geometry.extensors import plucker
 from dyntorch.geometry.homogeneous import apply, homogeneous, inhomogeneous
+from dyntorch.scenes.scene import calibration, looking_at
 from dyntorch.tasks.trajectories.trajectories import LineStatus, points_on_lines, trajectory_cameras, triangulate_trajectories
 from tests.draws import seeded
 
@@ -22,10 +23,8 @@ def scene(views, n, batch=(), *, sigma=0.0, centres=None, seed=0):
 
     c = 5 * normalize(random(views, 3))
     c = c if centres is None else c[..., torch.arange(views) % centres, :]
-    across = normalize(torch.linalg.cross(torch.tensor([0.1, 0.2, 1.0]).double().expand_as(c), -c))
-    turn = torch.stack([across, torch.linalg.cross(-c / 5, across), -c / 5], dim=-2)
-    lens = torch.tensor([[1300.0, 0, 500], [0, 1300, 500], [0, 0, 1]]).double()
-    cameras = lens @ torch.cat([turn, -turn @ c[..., None]], dim=-1)
+    up = torch.tensor([0.1, 0.2, 1.0]).double().expand_as(c)
+    cameras = calibration(torch.tensor(1300.0).double(), 500.0) @ looking_at(c, torch.zeros_like(c), up)
     start, heading = 0.6 * random(n, 3), normalize(random(n, 3))
     place = 2 * torch.rand(*batch, views, n, 1, generator=g, dtype=torch.float64) - 1
     points = start[..., None, :, :] + place * heading[..., None, :, :]
