@@ -1,4 +1,4 @@
-"""What every indexer promises, each a function of a :class:`Case`; ``CHECKS`` lists them, ``CASES`` the indexers.
+"""What every indexer promises; ``CASES`` are the indexers.
 
 scikit-learn's own battery feeds tables of floats; an estimator of lists of clips of different lengths can be tagged so that every
 check is skipped, which proves nothing.  What those checks are for is tested here instead, on what the indexers are made for.
@@ -6,7 +6,6 @@ check is skipped, which proves nothing.  What those checks are for is tested her
 
 from __future__ import annotations
 
-import inspect
 import pydoc
 from collections.abc import Callable
 from copy import deepcopy
@@ -73,8 +72,8 @@ def videos() -> Lesson:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """An indexer, the lesson it is made for, parameter values that it must refuse, and values of one parameter to choose from
-    (neither where another case of the same class stands for it).
+    """An indexer, the lesson it is made for, and values of one parameter to choose from (none where another case of the same class
+    stands for it).
 
     apart: how far scores may be when the same is computed in another order; draws: whether anything is drawn at random; alone:
     whether one class is enough.
@@ -84,7 +83,6 @@ class Case:
     kind: type
     lesson: Callable[[], Lesson]
     options: dict[str, Any] = field(default_factory=dict)
-    wrong: dict[str, Any] = field(default_factory=dict)
     grid: dict[str, list[Any]] = field(default_factory=dict)
     apart: float = 1e-9
     draws: bool = False
@@ -95,40 +93,24 @@ class Case:
         return self.kind(**{**self.options, **options})
 
 
-WRONG_FRAMES = {
-    "harmonics": 0, "course": "often", "reject": "often", "fps": 0.0, "mirror": "maybe", "window": -1.0, "device": "abacus",
-}  # fmt: skip
 SMALL = {"length": 8, "search": False, "virtual_views": 1, "tempi": (1.0,)}
 CASES = [
-    Case("keypoints", ActionIndexer, keypoints, {"length": 8}, {}, {"scorer": ["nearest", "both"]}, 1e-3, True, True),
+    Case("keypoints", ActionIndexer, keypoints, {"length": 8}, {"scorer": ["nearest", "both"]}, 1e-3, True, True),
     *(
-        Case(name, ActionIndexer, keypoints, {**SMALL, **options}, {}, {}, 1e-3, options.get("scorer") != "nearest", True)
+        Case(name, ActionIndexer, keypoints, {**SMALL, **options}, {}, 1e-3, options.get("scorer") != "nearest", True)
         for name, options in (
             ("nearest, learned weights", {"scorer": "nearest", "weights": "learned"}),
             ("kernel, refusing", {"scorer": "kernel", "reject": 0.05, "none_label": "none", "repair": True}),
             ("same view", {"view": "same"}),
         )
     ),
-    Case("frames", PhaseIndexer, keypoints, {"harmonics": 1}, WRONG_FRAMES, {"mirror": ["auto", False]}, alone=True),
-    Case("videos", BrightnessIndexer, videos, {"size": 40}, {}, {"window": [0.3, 0.5]}, 1e-5),
+    Case("frames", PhaseIndexer, keypoints, {"harmonics": 1}, {"mirror": ["auto", False]}, alone=True),
+    Case("videos", BrightnessIndexer, videos, {"size": 40}, {"window": [0.3, 0.5]}, 1e-5),
 ]
 
-Check = Callable[..., None]
-CHECKS: list[tuple[Check, Callable[[Case], bool]]] = []
-
-
-def promise(applies: Callable[[Case], bool] = lambda case: True) -> Callable[[Check], Check]:
-    """Put a promise on the list, for the cases it applies to."""
-
-    def add(check: Check) -> Check:
-        CHECKS.append((check, applies))
-        return check
-
-    return add
-
-
-def stands_for_its_class(case: Case) -> bool:
-    return bool(case.grid)
+EACH = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+ONE = pytest.mark.parametrize("case", [case for case in CASES if case.grid], ids=lambda case: case.name)
+"""One case of each class."""
 
 
 @cache
@@ -171,8 +153,8 @@ def first_of_each(lesson: Lesson) -> list[int]:
 
 
 # ---- parameters --------------------------------------------------------------------------------------------------------
-@promise(stands_for_its_class)
-def parameters_go_in_and_come_out(case: Case) -> None:
+@ONE
+def test_parameters_go_in_and_come_out(case: Case) -> None:
     made = case.make()
     assert made.get_params().items() >= case.options.items()
     twin = clone(made)
@@ -182,39 +164,32 @@ def parameters_go_in_and_come_out(case: Case) -> None:
     assert is_classifier(made)
     with pytest.raises(ValueError, match="Invalid parameter 'veiw'"):
         made.set_params(veiw="any")
+    odd = {name: object() for name in made.get_params()}
+    assert vars(case.kind(**odd)) == odd  # nothing is done before fit
 
 
-@promise()
-def nothing_is_done_before_fit(case: Case) -> None:
-    odd = {name: object() for name in case.make().get_params()}
-    made = case.kind(**odd)
-    assert all(getattr(made, name) is value for name, value in odd.items())
-    assert set(vars(made)) == set(odd)
-
-
-@promise(lambda case: bool(case.wrong))
-def unknown_values_are_refused_by_name(case: Case) -> None:
-    lesson = case.lesson()
-    for name, value in case.wrong.items():
+def test_unknown_values_are_refused_by_name() -> None:
+    lesson, wrong = keypoints(), {"harmonics": 0, "course": "often", "reject": "often", "fps": 0.0, "mirror": "maybe"}
+    for name, value in {**wrong, "window": -1.0, "device": "abacus"}.items():
         with pytest.raises(ValueError, match=name):
-            case.make(**{name: value}).fit(lesson.items, lesson.labels)
+            PhaseIndexer(**{name: value}).fit(lesson.items, lesson.labels)
 
 
-@promise(stands_for_its_class)
-def an_unfitted_one_says_so(case: Case, path: Path) -> None:
+@ONE
+def test_an_unfitted_one_says_so(case: Case, tmp_path: Path) -> None:
     lesson, bare = case.lesson(), clone(fitted(case))
     verbs = [verb for verb in (*VERBS, "score_frames", "find", "scan", "exemplar") if hasattr(bare, verb)]
     for verb in verbs:
         with pytest.raises(NotFittedError):
             getattr(bare, verb)(lesson.asked)
     with pytest.raises(NotFittedError):
-        bare.save(path / "m.safetensors")
-    assert list(path.iterdir()) == []
+        bare.save(tmp_path / "m.safetensors")
+    assert list(tmp_path.iterdir()) == []
 
 
 # ---- fit ---------------------------------------------------------------------------------------------------------------
-@promise(stands_for_its_class)
-def fit_returns_itself_adds_names_that_end_in_an_underscore_and_forgets(case: Case) -> None:
+@ONE
+def test_fit_returns_itself_adds_names_that_end_in_an_underscore_and_forgets(case: Case) -> None:
     lesson, made = case.lesson(), deepcopy(fitted(case, 2))
     assert made.classes_.tolist() == list(FEW[1:])
     assert made.fit(lesson.items, lesson.labels) is made
@@ -226,8 +201,8 @@ def fit_returns_itself_adds_names_that_end_in_an_underscore_and_forgets(case: Ca
     same(again, {verb: answered(case)[verb] for verb in again})  # the same random_state, the same answers
 
 
-@promise(stands_for_its_class)
-def what_is_handed_in_stays_as_it_was(case: Case) -> None:
+@ONE
+def test_what_is_handed_in_stays_as_it_was(case: Case) -> None:
     lesson = case.lesson()
     few = first_of_each(lesson)
     given, asked, labels = deepcopy(picked(lesson.items, few)), deepcopy(lesson.asked), lesson.labels[few]
@@ -238,8 +213,8 @@ def what_is_handed_in_stays_as_it_was(case: Case) -> None:
             np.testing.assert_array_equal(getattr(one, "joints", one), getattr(other, "joints", other))
 
 
-@promise()
-def the_order_of_examples_does_not_matter(case: Case) -> None:
+@EACH
+def test_the_order_of_examples_does_not_matter(case: Case) -> None:
     lesson = case.lesson()
     order = np.random.default_rng(0).permutation(len(lesson.labels))
     turned = case.make().fit(picked(lesson.items, order), lesson.labels[order])
@@ -251,8 +226,9 @@ def the_order_of_examples_does_not_matter(case: Case) -> None:
         np.testing.assert_allclose(turned.decision_function(lesson.asked), fitted(case).decision_function(lesson.asked), **close)
 
 
-@promise()
-def one_example_of_each_class_is_enough(case: Case) -> None:
+@pytest.mark.slow
+@EACH
+def test_one_example_of_each_class_is_enough(case: Case) -> None:
     lesson = case.lesson()
     few = picked(lesson.items, first_of_each(lesson))
     options = {"reject": None} if "reject" in case.options else {}
@@ -269,8 +245,8 @@ def one_example_of_each_class_is_enough(case: Case) -> None:
             case.make().fit(*only)
 
 
-@promise(stands_for_its_class)
-def labels_keep_their_type(case: Case) -> None:
+@ONE
+def test_labels_keep_their_type(case: Case) -> None:
     lesson = case.lesson()
     few = picked(lesson.items, first_of_each(lesson))
     options = {"reject": None} if "reject" in case.options else {}
@@ -284,8 +260,8 @@ def labels_keep_their_type(case: Case) -> None:
 
 
 # ---- answers -----------------------------------------------------------------------------------------------------------
-@promise()
-def answers_agree_with_one_another(case: Case) -> None:
+@EACH
+def test_answers_agree_with_one_another(case: Case) -> None:
     lesson = case.lesson()
     for count in (2, 3):
         indexer = fitted(case, count)
@@ -301,16 +277,16 @@ def answers_agree_with_one_another(case: Case) -> None:
             assert len(accepted) == len(said)
 
 
-@promise()
-def a_batch_is_its_loop(case: Case) -> None:
+@EACH
+def test_a_batch_is_its_loop(case: Case) -> None:
     lesson, indexer = case.lesson(), fitted(case)
     alone = np.concatenate([indexer.decision_function(picked(lesson.asked, [i])) for i in range(len(lesson.truth))])
     np.testing.assert_allclose(indexer.decision_function(lesson.asked), alone, rtol=0, atol=case.apart)
     assert indexer.predict(iter(lesson.asked)).tolist() == indexer.predict(lesson.asked).tolist()
 
 
-@promise(stands_for_its_class)
-def score_is_the_mean_accuracy(case: Case) -> None:
+@ONE
+def test_score_is_the_mean_accuracy(case: Case) -> None:
     lesson, indexer = case.lesson(), fitted(case)
     right = indexer.predict(lesson.asked) == lesson.truth
     assert indexer.score(lesson.asked, lesson.truth) == pytest.approx(right.mean())
@@ -320,16 +296,16 @@ def score_is_the_mean_accuracy(case: Case) -> None:
     assert right.mean() > 0.6
 
 
-@promise()
-def what_is_loaded_answers_the_same(case: Case, path: Path) -> None:
+@EACH
+def test_what_is_loaded_answers_the_same(case: Case, tmp_path: Path) -> None:
     indexer = fitted(case)
-    indexer.save(path / "m.safetensors")
-    loaded = case.kind.load(path / "m.safetensors")
+    indexer.save(tmp_path / "m.safetensors")
+    loaded = case.kind.load(tmp_path / "m.safetensors")
     same(answers(case, loaded) | finds(case, loaded), answered(case))
     for name, value in indexer.get_params().items():
         np.testing.assert_array_equal(getattr(loaded, name), value)
-    loaded.save(path / "again.safetensors")
-    assert (path / "again.safetensors").read_bytes() == (path / "m.safetensors").read_bytes()
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "m.safetensors").read_bytes()
 
 
 TAUGHT_BY: dict[type, tuple[str, Callable[..., torch.Tensor]]] = {
@@ -340,8 +316,9 @@ TAUGHT_BY: dict[type, tuple[str, Callable[..., torch.Tensor]]] = {
 """What does the work of ``fit``, and a tensor that it is given."""
 
 
-@promise()
-def an_accelerator_answers_the_same(case: Case) -> None:
+@pytest.mark.slow
+@EACH
+def test_an_accelerator_answers_the_same(case: Case) -> None:
     lesson, (teacher, given) = case.lesson(), TAUGHT_BY[case.kind]
     for device in accelerators():
         with mock.patch(teacher, wraps=pydoc.locate(teacher)) as learning:
@@ -353,32 +330,10 @@ def an_accelerator_answers_the_same(case: Case) -> None:
 
 
 # ---- model selection ---------------------------------------------------------------------------------------------------
-@promise(stands_for_its_class)
-def cross_validation_chooses_among_lists_of_clips(case: Case) -> None:
+@ONE
+def test_cross_validation_chooses_among_lists_of_clips(case: Case) -> None:
     lesson = case.lesson()
     splits = list(LeaveOneGroupOut().split(lesson.items, lesson.labels, lesson.groups))
     search = GridSearchCV(case.make(), case.grid, cv=splits[:1], error_score="raise").fit(lesson.items, lesson.labels)
     assert set(search.best_params_) == set(case.grid) and search.classes_.tolist() == list(FEW) and search.best_score_ > 0.5
     assert search.score(lesson.asked, lesson.truth) > 0.6
-
-
-# ----------------------------------------------------------------------------------------------------------------------
-# The promises of :mod:`tests.indexing.test_estimator` for every indexer.
-
-
-SLOW = ("one_example_of_each_class_is_enough", "an_accelerator_answers_the_same")
-"""Promises that take many fits."""
-
-
-@pytest.mark.parametrize(
-    ("case", "check"),
-    [
-        pytest.param(case, check, id=f"{case.name}-{check.__name__}", marks=pytest.mark.slow if check.__name__ in SLOW else ())
-        for case in CASES
-        for check, applies in CHECKS
-        if applies(case)
-    ],
-)
-def test_promise(case, check, tmp_path):
-    needs_a_folder = "path" in inspect.signature(check).parameters
-    check(case, tmp_path) if needs_a_folder else check(case)
