@@ -361,16 +361,15 @@ def _search(
         ((apply(matrix, x[:, None]) - seen[0][:, None]).square().sum(-1) for matrix, x in zip(maps, seen[1:], strict=True)),
         start=torch.zeros((), dtype=seen[0].dtype, device=seen[0].device),
     )
-    valid = torch.arange(judges.shape[-1], device=judges.device) < count[:, None]
-    ordered = torch.where(valid[:, None], square, torch.inf)
-    middle = ((valid.sum(-1) - 1) // 2).clamp(min=0)[:, None].expand(-1, square.shape[1])
+    valid = (torch.arange(judges.shape[-1], device=judges.device) < count[:, None])[:, None]
+    known = torch.where(valid, square.nan_to_num(nan=torch.inf), torch.nan)
     if limit is None:
-        score = ordered.sort(dim=-1).values.gather(-1, middle[..., None])[..., 0]
+        score = known.nanmedian(-1).values
     else:
-        score = torch.where(valid[:, None], torch.minimum(square, limit[:, None, None]), 0.0).sum(-1)
+        score = torch.where(valid, torch.minimum(square, limit[:, None, None]), 0.0).sum(-1)
     best = score.argmin(-1)
-    chosen_square = ordered[problem, best].sort(dim=-1).values.gather(-1, middle[:, :1])[:, 0]
-    return tuple(matrix[problem, best] for matrix in maps), chosen_square
+    middle = known[problem, best].nanmedian(-1).values.nan_to_num(nan=torch.inf)
+    return tuple(matrix[problem, best] for matrix in maps), middle
 
 
 def _collineation(target: Tensor, source: Tensor) -> Tensor:

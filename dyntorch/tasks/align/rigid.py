@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 
 from dyntorch.core.limits import median, three_sigma
 from dyntorch.core.matches import Matches
@@ -127,7 +128,7 @@ def normal_equations(motions: Tensor, data: RigidSightings, weights: Tensor, sti
     root = weights.sqrt()[..., None]
     if data.motion == "straight":
         free = root if still is None else torch.where(still[..., None], 0.0, root)
-        direction = torch.nn.functional.normalize(along, dim=-1, eps=torch.finfo(u.dtype).tiny)
+        direction = normalize(along, dim=-1, eps=torch.finfo(u.dtype).tiny)
         normal = jacobian - direction[..., :, None] * (direction[..., None, :] @ jacobian)
         jacobian = torch.where((free > 0)[..., None], normal, jacobian)
     rows, values = (root[..., None] * jacobian).flatten(-3, -2), (root * error).flatten(-2)
@@ -246,7 +247,7 @@ def _search(
     data: RigidSightings, sigma: Tensor | None, held: Tensor, order: Tensor, given: Tensor, floor: float, options: AlignOptions
 ) -> Rigid:
     """One block: sightings ``(b, 1, n, 3)``."""
-    candidates = torch.cat([given, _all(data)[:, None], *_samples(data, order)], dim=1)
+    candidates = torch.cat([given, static_motions(data, data.weights), *_samples(data, order)], dim=1)
     moving, static = squares(candidates, data)
     noise = _scales(moving, data, floor) if sigma is None else sigma[:, None].expand(candidates.shape[:2]).clamp(min=floor)
     score = noise if sigma is None else _score(moving, static, held, data, noise)
@@ -276,30 +277,22 @@ def _search(
     return _iterate_labels(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
 
 
-def _all(data: RigidSightings) -> Tensor:
-    """The motions that carry all matches onto each other, as if none moved, ``(b, 2, 4, 4)``."""
-    x1, w = data.x1[:, 0], data.weights[:, 0]
-    return torch.stack([rigid_alignment(x1, data.x2[:, 0], w), rigid_alignment(x1, data.x3[:, 0], w)], dim=1)
+def static_motions(data: RigidSightings, weights: Tensor) -> Tensor:
+    """The motions ``(..., 2, 4, 4)`` that carry matches onto each other, as if none moved."""
+    return torch.stack([rigid_alignment(data.x1, x, weights) for x in (data.x2, data.x3)], dim=-3)
 
 
 def _samples(data: RigidSightings, order: Tensor) -> tuple[Tensor, Tensor]:
     """Motions from samples of 3 static matches, and of a few moving ones."""
-    found = []
-    for index, still in ((order[:, :NUM_STATIC_SAMPLES, :3], True), (order[:, NUM_STATIC_SAMPLES:], False)):
-        sample = data.sample(index)
-        start = torch.stack([rigid_alignment(sample.x1, x, sample.weights) for x in (sample.x2, sample.x3)], dim=2)
-        found.append(start if still else descend(start, sample, iterations=12)[0])
-    return found[0], found[1]
+    still, moving = data.sample(order[:, :NUM_STATIC_SAMPLES, :3]), data.sample(order[:, NUM_STATIC_SAMPLES:])
+    return static_motions(still, still.weights), descend(static_motions(moving, moving.weights), moving, iterations=12)[0]
 
 
 def _scales(moving: Tensor, data: RigidSightings, floor: float) -> Tensor:
     """Noise ``(b, k)`` from the median of squared residuals, less the parameters that these have absorbed."""
     present = data.weights > 0
-    count = present.sum(-1)
-    spare = (1 - 12 / (data.conditions * count).clamp(min=13)).clamp(min=0.1)
-    ranked = torch.where(present, moving, torch.inf).sort(-1).values
-    middle = ranked.gather(-1, ((count - 1) // 2).clamp(min=0).expand(ranked.shape[:-1])[..., None])[..., 0]
-    middle = torch.where(middle.isfinite(), middle, 0.0)
+    spare = (1 - 12 / (data.conditions * present.sum(-1)).clamp(min=13)).clamp(min=0.1)
+    middle = torch.where(present, moving.nan_to_num(nan=torch.inf), torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0, posinf=0.0)
     return (middle / (median(data.conditions) * spare)).sqrt().clamp(min=floor)
 
 
@@ -417,8 +410,7 @@ def _frame(views: tuple[Tensor, ...], weights: Tensor) -> tuple[list[Tensor], Te
 
 def _from_static(data: RigidSightings, known: Tensor) -> Tensor:
     """``(b, 1, 2, 4, 4)`` motions of the labelled static matches, of all where there are fewer than three."""
-    weights = torch.where((known.sum(-1) >= 3)[:, None], data.weights * known, data.weights)
-    return torch.stack([rigid_alignment(data.x1, x, weights) for x in (data.x2, data.x3)], dim=1)[:, None]
+    return static_motions(data, torch.where((known.sum(-1) >= 3)[:, None], data.weights * known, data.weights))[:, None]
 
 
 def _result(
@@ -427,7 +419,7 @@ def _result(
     motion = sightings.motion
     labels = _labels(sightings, found)
     dof = torch.where(found.grounded, 12, 9)
-    values, covariance = _inverse(found.information, dof)
+    values, root = _root_of_inverse(found.information, dof)
     worst = found.sigma * values.clamp(min=torch.finfo(values.dtype).tiny).rsqrt()
     top = found.information.diagonal(dim1=-2, dim2=-1).amax(-1)
     noisy = found.sigma.isfinite() & (found.sigma > NOISY)
@@ -436,7 +428,7 @@ def _result(
     status = status_of_alignment(worst > MAX_RIGID_DEVIATION, accident, undetermined, few)
     none = is_failure(status)
     labels = torch.where(none[:, None], OUTLIER, labels)
-    matrices, entries = _to_point_units(found.motions, covariance * found.sigma.square()[:, None, None], centres, scale)
+    matrices, entries = _to_point_units(found.motions, root * found.sigma[:, None, None], centres, scale)
     # a noise beyond the range of the numbers is not known, and nor is the covariance
     known = found.sigma.isfinite() & entries.isfinite().flatten(1).all(-1)
     entries = torch.where(known[:, None, None], entries, torch.inf)
@@ -465,34 +457,29 @@ def _labels(data: RigidSightings, found: Rigid) -> Tensor:
     return torch.where(still, STATIC, torch.where(path, MOVING, OUTLIER))
 
 
-def _inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
-    """Least eigenvalue ``(b,)`` of the degrees of freedom, and the pseudo-inverse ``(b, 12, 12)`` on them."""
+def _root_of_inverse(information: Tensor, dof: Tensor) -> tuple[Tensor, Tensor]:
+    """Least eigenvalue ``(b,)`` of the degrees of freedom, and R ``(b, 12, 12)``, R R^T the pseudo-inverse on them."""
     values, vectors = spectrum(torch.where(information.isfinite().flatten(1).all(-1)[:, None, None], information, 0.0))
     used = torch.arange(12, device=dof.device) >= 12 - dof[:, None]
-    least = values.gather(-1, 12 - dof[:, None])[:, 0]
     floor = 1e-14 * values[:, -1:].clamp(min=torch.finfo(values.dtype).tiny)
-    inverse = torch.where(used, 1 / values.clamp(min=floor), 0.0)
-    return least, (vectors * inverse[:, None]) @ vectors.mT
+    root = vectors * torch.where(used, values.clamp(min=floor).rsqrt(), 0.0)[:, None]
+    return values.gather(-1, 12 - dof[:, None])[:, 0], root
 
 
-def _to_point_units(motions: Tensor, covariance: Tensor, centres: list[Tensor], scale: Tensor) -> tuple[Tensor, Tensor]:
-    """Motions ``(b, 2, 4, 4)`` in the unit of the points, and the covariance ``(b, 32, 32)`` of their entries."""
+def _to_point_units(motions: Tensor, root: Tensor, centres: list[Tensor], scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Motions ``(b, 2, 4, 4)`` in the unit of the points, and the covariance ``(b, 32, 32)`` of their entries, by a root
+    ``(b, 12, 12)`` of that of the tangents."""
     first, *others = centres
     result = motions.clone()
     back = torch.stack(others, dim=1)
     result[..., :3, 3] = motions[..., :3, 3] / scale[:, None, None] + first[:, None]
     result[..., :3, 3] -= (motions[..., :3, :3] @ back[..., None])[..., 0]
     # a tangent turns and shifts about the centre of view 1, in normalized size
-    basis = torch.zeros(6, 4, 4, dtype=motions.dtype, device=motions.device)
-    for k, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
-        basis[k, i, j], basis[k, j, i], basis[3 + k, k, 3] = 1.0, -1.0, 1.0
+    turned, shifted = root.mT.unflatten(-1, (2, 2, 3)).unbind(-2)
+    tangents = pad(torch.cat([skew(turned), shifted[..., None]], dim=-1), (0, 0, 0, 1))  # (b, 12, 2, 4, 4)
     outward, inward = similarity(1 / scale, -first * scale[:, None]), similarity(scale, first)
-    moved = outward[:, None] @ basis @ inward[:, None]  # (b, 6, 4, 4)
-    derivative = motions.new_zeros(len(scale), 2, 16, 12)
-    for part in range(2):
-        derivative[:, part, :, 6 * part : 6 * part + 6] = (moved @ result[:, part, None]).flatten(2).mT
-    derivative = derivative.flatten(1, 2)
-    return result, derivative @ covariance @ derivative.mT
+    moved = (outward[:, None, None] @ tangents @ inward[:, None, None] @ result[:, None]).flatten(2)
+    return result, moved.mT @ moved
 
 
 def _notices(

@@ -294,11 +294,8 @@ def _affine_consensus(points: Tensor, weights: Tensor, index: Tensor, sigma: Ten
     null, mean = torch.cat([null, own[:, None]], dim=1), torch.cat([mean, centre[:, None]], dim=1)
     square = ((points[:, None] - mean[:, :, None]) @ null.mT).square().sum(-1)
     if sigma is None:
-        count = present.sum(-1)
-        ranked = torch.where(present[:, None], square, torch.inf).sort(-1).values
-        middle = ((count - 1) // 2).clamp(min=0)[:, None, None].expand(-1, square.shape[1], 1)
-        score = ranked.gather(-1, middle)[..., 0]
-        spare = (1 - DOF[True] / (3 * count).clamp(min=22)).clamp(min=0.1)
+        score = torch.where(present[:, None], square, torch.nan).nanmedian(-1).values
+        spare = (1 - DOF[True] / (3 * present.sum(-1)).clamp(min=22)).clamp(min=0.1)
         limit = three_sigma(3) * score.amin(-1) / (median(3) * spare)
     else:
         limit = three_sigma(3) * sigma.square()

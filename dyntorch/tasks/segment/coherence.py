@@ -128,22 +128,19 @@ def _thin(body: Tensor) -> Tensor:
 
 def _links(row: Tensor, column: Tensor, weight: Tensor, among: Tensor) -> Links:
     """Links of directed ones, symmetric among the matches that can be neighbours ``(n,)``; the others only see them."""
-    count = len(among)
-    back = among[row]
-    key = torch.cat([row * count + column, (column * count + row)[back]])
-    pairs, place = torch.unique(key, return_inverse=True)
-    total = torch.zeros(len(pairs), dtype=weight.dtype, device=weight.device)
-    total = total.index_add_(0, place, torch.cat([weight, weight[back]]))
-    start = torch.div(pairs, count, rounding_mode="floor")
+    count, back = len(among), among[row]
+    pairs = torch.stack([torch.cat([row, column[back]]), torch.cat([column, row[back]])])
+    joined = torch.sparse_coo_tensor(pairs, torch.cat([weight, weight[back]]), (count, count), check_invariants=False).coalesce()
+    start, other = joined.indices()
     # four directed links can join two neighbours, two one that is none: their mean over images and directions
-    total = total / torch.where(among[start], 4.0, 2.0)
+    total = joined.values() / torch.where(among[start], 4.0, 2.0)
     degree = torch.bincount(start, minlength=count)
     first = degree.cumsum(0) - degree
-    slot = torch.arange(len(pairs), device=row.device) - first[start]
-    width = int(degree.max()) if len(pairs) else 0
+    slot = torch.arange(len(start), device=row.device) - first[start]
+    width = int(degree.max()) if len(start) else 0
     index = torch.zeros(count, width, dtype=torch.long, device=row.device)
     weights = torch.zeros(count, width, dtype=weight.dtype, device=weight.device)
-    index[start, slot], weights[start, slot] = pairs % count, total
+    index[start, slot], weights[start, slot] = other, total
     return Links(index, weights)
 
 

@@ -132,11 +132,6 @@ def final_cost(view: View, fundamentals: Tensor) -> Tensor:
     return rough_cost(view, fundamentals, SAMPSON_NOISE_PIXELS, ENERGY_MAX_SQUARED_DISTANCE)
 
 
-def smooth_costs(cost: Tensor, view: View) -> Tensor:
-    """Costs ``(P, n)``, each match's own and those of its neighbours, by their links."""
-    return (cost + view.links.pull(cost)) / (1 + view.links.weight.sum(-1))
-
-
 def fit_pool(view: View, groups: Tensor) -> Tensor:
     """Fundamental matrices ``(P, 3, 3)`` of all different groups ``(g, n)``, 0 and 1."""
     size = groups.sum(-1)
@@ -251,7 +246,9 @@ def search(view: View, counts: Sequence[int], generator: torch.Generator | None,
     plan = torch.tensor(flows, device=view.x1.device).repeat(num_starts if len(flows) > 2 else 2 * num_starts)
     labels = affine_flows(view.x1, view.x2, view.links, plan, MIN_FLOW_NOISE_PIXELS * view.pixel, generator)
     pool = fit_pool(view, torch.cat([one_hot(labels, int(plan.max())).flatten(0, 1), torch.ones_like(view.x1[None, :, 0])]))
-    cost = smooth_costs(rough_cost(view, pool), view)
+    cost = rough_cost(view, pool)
+    # each match's own and those of its neighbours, by their links
+    cost = (cost + view.links.pull(cost)) / (1 + view.links.weight.sum(-1))
     sets = best_sets(cost, max(counts))
     starts = []
     for count in counts:

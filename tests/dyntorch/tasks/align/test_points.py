@@ -15,7 +15,7 @@ from dyntorch.core.outcome import Status
 from dyntorch.core.robust import robust_fit
 from dyntorch.geometry.rigid import moved_by, nearest_rotation, rigid_alignment, rigid_motion, rotation_exponential
 from dyntorch.metrics import label_scores, point_error, relative_error, rotation_error, translation_error
-from dyntorch.tasks.align import points
+from dyntorch.tasks.align import labelling
 from dyntorch.tasks.align.points import Model, align_points
 from dyntorch.tasks.align.result import MOVING, OUTLIER, STATIC
 from dyntorch.tasks.align.rigid import RigidSightings, normal_equations, squares
@@ -293,7 +293,7 @@ def test_the_full_tensor_is_only_searched_for_where_the_minimal_one_leaves_doubt
         searched.append((repr(invariant), (options["weights"] > 0).any(-1)))
         return robust_fit(invariant, *views, **options)
 
-    monkeypatch.setattr(points, "robust_fit", noted)
+    monkeypatch.setattr(labelling, "robust_fit", noted)
     still, moving = (
         scenes.moving_points(70, sigma=0.01, static=share, generator=torch.Generator().manual_seed(0)).views for share in (1.0, 0.3)
     )

@@ -273,11 +273,8 @@ def test_the_strongest_of_every_row_or_column_are_kept():
     rank = kernel.argsort(-1, descending=True).argsort(-1) < 4
     assert bool(((sparse > 0) == (rank | rank.mT)).all())
     assert bool((keep_strongest(kernel[:3, :3], 10) == kernel[:3, :3]).all())  # fewer tracks than neighbours
-
-
-def test_links_weigh_about_the_total_for_each_track():
-    kernel = kernel_of(shot((40, 30)))
-    sparse = keep_strongest(kernel, 10)
+    # links weigh about the total for each track
+    sparse = keep_strongest(kernel_of(shot((40, 30))), 10)
     links = links_of(sparse, 18.0)
     dense = torch.zeros_like(sparse, dtype=F64).scatter_add_(1, links.index, links.weight)
     torch.testing.assert_close(dense, dense.mT, rtol=0, atol=1e-5)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import statistics
 from itertools import product
 from math import comb, log
 
@@ -21,9 +20,6 @@ from dyntorch.tasks.segment import labels as module
 from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS, View
 from dyntorch.tasks.segment.frame_pairs import TrackSet
 from dyntorch.tasks.segment.labels import (
-    MAX_SQUARED_DEVIATION,
-    NUM_LABEL_ROUNDS,
-    TRUNCATED_VARIANCE,
     _alarms,
     _chance,
     distances,
@@ -144,30 +140,6 @@ def test_matches_without_weight_and_the_scale_of_weights_do_not_matter():
         alone = select_models(part, F, member[:, 15:])
         assert torch.equal(found[1], alone[1])
         torch.testing.assert_close(found[0], alone[0], rtol=0, atol=1e-6)
-
-
-def test_choice_is_the_smaller_criterion_with_the_noise_of_a_loop():
-    for kind in ("planar", "general"):
-        models, view = chosen(kind, 50, 0.7, 7)
-        member = torch.ones(1, 50, dtype=F64)
-        F = fit_fundamental(view.x1, view.x2, member, SCALES)[0][0]
-        epipolar, planar = [], []
-        for one, two in zip(homogeneous(view.x1), homogeneous(view.x2), strict=True):
-            line, other = F @ one, F.mT @ two
-            epipolar.append(float((two @ line) ** 2 / (line[:2] @ line[:2] + other[:2] @ other[:2])))
-            # Sampson: c^T (J J^T)^-1 c of the two equations x2 h_3 x1 = h_12 x1
-            H = models[0][0]
-            c = (H @ one)[:2] - two[:2] * (H @ one)[2]
-            J = torch.cat([H[:2, :2] - two[:2, None] * H[2, :2], -(H @ one)[2] * torch.eye(2, dtype=F64)], dim=-1)
-            planar.append(float(c @ torch.linalg.solve(J @ J.mT, c)))
-        noise = statistics.median_low(epipolar) / statistics.NormalDist().inv_cdf(0.75) ** 2
-        for _ in range(NUM_LABEL_ROUNDS):
-            noise = sum(min(s, MAX_SQUARED_DEVIATION * noise) for s in epipolar) / (TRUNCATED_VARIANCE * 50)
-        noise *= 50 / (50 - 7 - math.sqrt(100))
-        assert math.sqrt(noise) / SCALE == pytest.approx(0.7, rel=0.3)
-        first = sum(min(s / noise, 2) for s in epipolar) + 3 * 50 * math.log(4) + 7 * math.log(200)
-        second = sum(min(s / noise, 4) for s in planar) + 2 * 50 * math.log(4) + 8 * math.log(200)
-        assert bool(models[1]) == (second < first) == (kind == "planar")
 
 
 def test_noise_is_that_of_all_bodies():
