@@ -12,6 +12,8 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.geometry.rigid import rotation_exponential
+from tests.draws import random as randn
+from tests.draws import seeded as draw
 
 F64 = torch.float64
 
@@ -38,14 +40,6 @@ class Verb:
 
     def __repr__(self) -> str:
         return self.name.replace(" ", "-")
-
-
-def draw(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def randn(*size: int, seed: int = 0) -> Tensor:
-    return torch.randn(*size, generator=draw(seed), dtype=F64)
 
 
 def inhomogeneous(x: Tensor) -> Tensor:

@@ -13,10 +13,7 @@ from dyntorch.core.outcome import Status
 from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.shapes import deformable_shapes
 from experiments.reconstruction.deformable_counts import KINDS, excess
-
-
-def normal(*size: int, seed: int) -> Tensor:
-    return torch.randn(*size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+from tests.draws import random as normal
 
 
 def deforming(T: int, n: int, basis: int, seed: int) -> Tensor:

@@ -8,18 +8,12 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
+from tests.battery.epipolar import lift
+from tests.draws import seeded
 
 F64 = torch.float64
 LOST = 1e-7
 """Singular value, of the largest, whose square is rounding of a Gram in float64."""
-
-
-def draw(seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
-def homogeneous(x: Tensor) -> Tensor:
-    return torch.cat([x, torch.ones_like(x[..., :1])], -1)
 
 
 def seen(cameras: Tensor, points: Tensor) -> Tensor:
@@ -46,14 +40,14 @@ SIX = dyn.GrassmannTensor(5, (1,) * 6, dual=True)
 
 def paths(cameras: Tensor, n: int, seed: int) -> tuple[Tensor, ...]:
     """Each point anywhere on a line of its own in every view."""
-    g = draw(seed)
+    g = seeded(seed)
     start, way = torch.randn(n, 3, generator=g, dtype=F64), torch.randn(n, 3, generator=g, dtype=F64)
     where = 2 * torch.rand(6, n, 1, generator=g, dtype=F64) - 1
-    return tuple(seen(cameras, homogeneous(start + where * way)).unbind(0))
+    return tuple(seen(cameras, lift(start + where * way)).unbind(0))
 
 
 def test_six_views_at_their_728_matches():
-    rig = cameras(6, generator=draw(3), angle=0.25, distance=6.0)
+    rig = cameras(6, generator=seeded(3), angle=0.25, distance=6.0)
     given = paths(rig, 728, 4)
     found = dyn.fit(SIX, *given)
     assert found.status == dyn.Status.OK
@@ -66,7 +60,7 @@ def test_six_views_at_their_728_matches():
 
 
 def test_six_views_of_cameras_that_leave_more_open():
-    rig = cameras(6, generator=draw(3), angle=0.25, distance=6.0)
+    rig = cameras(6, generator=seeded(3), angle=0.25, distance=6.0)
     rig[1:3] = rig[0]  # three of one centre: any line through their rays' planes
     found = dyn.fit(SIX, *paths(rig, 728, 4))
     assert found.status == dyn.Status.DEGENERATE and found.tensor.abs().max() == 0
@@ -75,14 +69,14 @@ def test_six_views_of_cameras_that_leave_more_open():
 # ---- two bodies: the segmentation matrix (chapter 6), 35 matches, at least 8 of each ----------------------------------
 def bodies(counts: tuple[int, int], batch: int, seed: int, *, flat: bool = False) -> tuple[Tensor, Tensor]:
     """Two views ``(batch, n, 2)`` of two rigid bodies, the first one perhaps a plane; those of body 1 come first."""
-    g = draw(seed)
+    g = seeded(seed)
     first, views = cameras(batch, generator=g, angle=0.3), []
     for n, plane in zip(counts, (flat, False), strict=True):
         x = 3 * torch.rand(batch, n, 3, generator=g, dtype=F64) - 1.5
         if plane:
             x[..., 2] = 0.3 * x[..., 0] - 0.2 * x[..., 1] + 0.1
         second = cameras(batch, generator=g, angle=0.3)
-        views.append((seen(first, homogeneous(x)), seen(second, homogeneous(x))))
+        views.append((seen(first, lift(x)), seen(second, lift(x))))
     return torch.cat([views[0][0], views[1][0]], 1), torch.cat([views[0][1], views[1][1]], 1)
 
 
@@ -120,7 +114,7 @@ def test_matches_of_few_digits_are_not_looked_at_more_closely():
 # ---- planar constant velocity (chapter 3): P^4 -> P^2, four views, ten points -----------------------------------------
 @pytest.mark.slow
 def test_ten_points_at_constant_velocity_in_four_views():
-    family, g = dyn.GrassmannTensor(4, (2, 1, 1, 1)), draw(1)
+    family, g = dyn.GrassmannTensor(4, (2, 1, 1, 1)), seeded(1)
     at = torch.stack([torch.cat([torch.eye(3), t * torch.eye(3)[:, :2]], 1) for t in range(4)]).double()
     rig = cameras(200, 4, generator=g)[..., [0, 1, 3]] @ at
     structure = torch.cat([4 * torch.rand(200, 30, 2, generator=g, dtype=F64) - 2, torch.ones(200, 30, 1, dtype=F64)], -1)
@@ -143,7 +137,7 @@ def test_derivatives_of_hard_matches_are_those_of_finite_differences():
     x1, x2 = bodies((27, 8), 300, 0)
     s = dyn.fit(dyn.SegmentationMatrix, x1, x2).singular_values
     hard = int(((s[:, -2] / s[:, 0]).log10() + 7.3).abs().argmin())
-    x1, x2, g = x1[hard], x2[hard], draw(9)
+    x1, x2, g = x1[hard], x2[hard], seeded(9)
     weight, turn = (torch.randn(size, generator=g, dtype=F64) for size in ((6, 6), x1.shape))
 
     def value(step: Tensor) -> Tensor:

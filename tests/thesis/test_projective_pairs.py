@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import dyntorch as dyn
+from dyntorch.geometry.rigid import rotation_exponential
 from tests.thesis.test_minimal_conditions import PRIME, rank
 
 D = torch.float64
@@ -58,13 +59,6 @@ def test_exact_ranks_of_measurements_scaled_by_depth():
     assert joined([row[:12] for row in a]) == 12 and joined([row[:9] for row in a]) == 9
 
 
-def rotation(v):
-    zero = torch.zeros_like(v[..., 0])
-    x, y, z = v.unbind(-1)
-    rows = [torch.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-    return torch.linalg.matrix_exp(torch.stack(rows, -2))
-
-
 class Scene:
     """A body that turns and wanders before two cameras of any calibration, each of which tracks points of its own."""
 
@@ -74,7 +68,7 @@ class Scene:
         self.points = [0.3 * torch.randn(count, 3, generator=g, dtype=D) for count in (n, m)]
         self.foreign = foreign
         inner = torch.tensor([[[900.0, 3, 640], [0, 880, 470], [0, 0, 1]], [[1300.0, 0, 500], [0, 1300, 520], [0, 0, 1]]], dtype=D)
-        seats = rotation(torch.tensor([[0.2, 0.1, 0.0], [0.3, 1.1, 0.2]], dtype=D))
+        seats = rotation_exponential(torch.tensor([[0.2, 0.1, 0.0], [0.3, 1.1, 0.2]], dtype=D))
         place = torch.tensor([0.1, 0.2, 4.0], dtype=D).expand(2, 3)[..., None]
         self.cameras = inner @ torch.cat([seats, place], -1)
 
@@ -90,7 +84,7 @@ class Scene:
 
     def placed(self, camera, t):
         way = self.waved(t, self.waves)
-        x = self.points[camera] @ rotation(0.8 * way[:, :3]).mT + 0.3 * way[:, None, 3:]
+        x = self.points[camera] @ rotation_exponential(0.8 * way[:, :3]).mT + 0.3 * way[:, None, 3:]
         g = torch.Generator().manual_seed(100 + camera)
         for k in range(self.foreign):  # the first ones go their own way
             x[:, k] = 0.3 * self.waved(t, self.drawn(g, 3))
