@@ -21,6 +21,7 @@ from dyntorch.numerics.subspaces import affine_factorization, canonical_correlat
 from dyntorch.tasks.planes.closed_forms import infinity_closed_form
 from dyntorch.tasks.segment.affine import affine_segmentation
 from tests.draws import seeded
+from tests.grid import assert_refused
 
 F64 = torch.float64
 
@@ -186,19 +187,28 @@ def test_a_singular_collineation_is_degenerate():
 
 def test_what_cannot_be_mapped_over_says_what_to_do():
     views = tuple(x.expand(2, *x.shape) for x in scenes.planar(40, generator=seeded()).views)
-    fit = partial(dyn.fit, dyn.HomographyTensor)
-    for verb in (partial(dyn.robust_fit, dyn.HomographyTensor, threshold=1.5), dyn.align_planar):
-        with pytest.raises(ValueError, match=r"mapped over by torch.func.vmap; give all problems at once"):
-            torch.func.vmap(lambda *v, verb=verb: verb(*v))(*views)
-    with pytest.raises(ValueError, match=r"status is mapped over .* look at its status behind that"):
-        torch.func.vmap(lambda *v: fit(*v).check().tensor)(*views)
-    with pytest.raises(ValueError, match="weights must not be negative, got -1; use 0 to leave a match out"):
-        torch.func.vmap(lambda w: fit(*(x[0] for x in views), weights=w).tensor)(-torch.ones(2, 40))
-    with pytest.raises(ValueError, match=r"dimensions is mapped over .* from outside of the function"):
-        torch.func.vmap(lambda d: fit(*(x[0] for x in views), dimensions=d).tensor)(torch.ones(2, 40, dtype=torch.long))
+    one, fit, robust = [x[0] for x in views], partial(dyn.fit, dyn.HomographyTensor), partial(dyn.robust_fit, dyn.HomographyTensor)
     times, points = torch.linspace(0, 1, 20).double(), torch.randn(6, 20, 2, generator=seeded()).double()
-    with pytest.raises(ValueError, match=r"holds numbers that torch.func transforms .* an interval of times"):
-        torch.func.vmap(lambda t: dyn.fit(dyn.DynamicShapeTensor, *points, times=t).tensor)(times.expand(2, -1))
+
+    def mapped(function: Callable[..., Tensor], *given: Tensor) -> Callable[[], Any]:
+        return lambda: torch.func.vmap(function)(*given)
+
+    weights, kinds = -torch.ones(2, 40), torch.ones(2, 40, dtype=torch.long)
+    everything = r"mapped over by torch.func.vmap; give all problems at once"
+    assert_refused(
+        (mapped(lambda *v: robust(*v, threshold=1.5), *views), everything),
+        (mapped(lambda *v: dyn.align_planar(*v), *views), everything),
+        (mapped(lambda *v: fit(*v).check().tensor, *views), r"status is mapped over .* look at its status behind that"),
+        (
+            mapped(lambda w: fit(*one, weights=w).tensor, weights),
+            "weights must not be negative, got -1; use 0 to leave a match out",
+        ),
+        (mapped(lambda d: fit(*one, dimensions=d).tensor, kinds), r"dimensions is mapped over .* from outside of the function"),
+        (
+            mapped(lambda t: dyn.fit(dyn.DynamicShapeTensor, *points, times=t).tensor, times.expand(2, -1)),
+            r"holds numbers that torch.func transforms .* an interval of times",
+        ),
+    )
 
 
 def test_solutions_that_are_mapped_over_have_statuses_and_a_representation():

@@ -1,5 +1,7 @@
 """Thesis 9.3, general dynamic P^n -> P^n: any space, any number of views, points within linear subspaces of any dimension."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -8,7 +10,7 @@ from dyntorch import counting
 from dyntorch.core.outcome import is_failure
 from tests.battery.epipolar import parts_error
 from tests.draws import random
-from tests.grid import grid
+from tests.grid import assert_refused, grid
 
 EXACT = [(1, 2, 1), (1, 4, 1), (2, 2, 1), (2, 3, 1), (2, 3, 2), (2, 4, 2), (3, 2, 1), (3, 3, 2), (3, 4, 2), (3, 4, 3), (4, 4, 3)]
 """(n, m, k): points of P^n, m views, subspaces of k dimensions."""
@@ -119,26 +121,22 @@ def test_labels_are_those_of_the_older_tensors_too():
     torch.testing.assert_close(one.tensor, dyn.fit(dyn.HomographyTensor, *views, static=kinds == 1).tensor)
     general = dyn.fit(dyn.DynamicTensor(2, 3, 2), *views, static=kinds == 1)
     torch.testing.assert_close(general.tensor, one.tensor)
-    for wrong, message in (
-        ({"dimensions": kinds, "static": kinds == 1}, "give it or static=, not both"),
-        ({"dimensions": kinds + 1}, r"must be 1 to 2 for HomographyTensor, got 2 to 3"),
-        ({"dimensions": kinds.double()}, "must be integers, got torch.float64"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            dyn.fit(dyn.HomographyTensor, *views, **wrong)
-    with pytest.raises(ValueError, match="no rows for matches within fewer dimensions"):
-        dyn.fit(dyn.Collineation(2), *views[:2], dimensions=kinds)
+    fit = partial(dyn.fit, dyn.HomographyTensor, *views)
+    assert_refused(
+        (lambda: fit(dimensions=kinds, static=kinds == 1), "give it or static=, not both"),
+        (lambda: fit(dimensions=kinds + 1), r"must be 1 to 2 for HomographyTensor, got 2 to 3"),
+        (lambda: fit(dimensions=kinds.double()), "must be integers, got torch.float64"),
+        (lambda: dyn.fit(dyn.Collineation(2), *views[:2], dimensions=kinds), "no rows for matches within fewer dimensions"),
+    )
 
 
 def test_what_says_nothing_is_refused_with_its_reason():
-    for numbers, message in (
-        ((2, 3, 3), "points that may be anywhere in P\\^2 fulfil no equation"),
-        ((3, 2, 2), "so many points always lie in 2 dimensions; give 3 views or more"),
-        ((2, 3, 0), "k must be an integer of at least 1, got 0"),
-        ((2.0, 3, 2), "n must be an integer of at least 1, got 2.0"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            dyn.DynamicTensor(*numbers)
+    assert_refused(
+        (lambda: dyn.DynamicTensor(2, 3, 3), "points that may be anywhere in P\\^2 fulfil no equation"),
+        (lambda: dyn.DynamicTensor(3, 2, 2), "so many points always lie in 2 dimensions; give 3 views or more"),
+        (lambda: dyn.DynamicTensor(2, 3, 0), "k must be an integer of at least 1, got 0"),
+        (lambda: dyn.DynamicTensor(2.0, 3, 2), "n must be an integer of at least 1, got 2.0"),
+    )
     # by the dimension of V(n, m, k): nothing is left to be a form
     assert counting.dim_v(3, 3, 3) == 3**3 and counting.dim_v(4, 2, 2) == 4**2
     # static points alone are a smaller space: other tensors fit as well

@@ -13,6 +13,7 @@ import dyntorch as dyn
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.rigid import CommonPlane, plane_motions, rotation_exponential
 from dyntorch.tasks.align.result import Alignment
+from tests.grid import assert_refused
 
 F64 = torch.float64
 K = torch.tensor([[900.0, 0.0, 320.0], [0.0, 880.0, 240.0], [0.0, 0.0, 1.0]], dtype=F64)
@@ -183,9 +184,8 @@ def test_a_wrong_calibration_is_told() -> None:
 
 def test_calibrations_of_another_shape_are_refused() -> None:
     seen, *_ = filmed(0)
-    with pytest.raises(ValueError, match=r"calibration must be a tensor K \(3, 3\) or \(3, 3, 3\), got \(2, 3\)"):
-        aligned(seen, K[:2])
-    with pytest.raises(ValueError, match="last row"):
-        aligned(seen, K.mT)
-    with pytest.raises(ValueError, match="invertible"):
-        aligned(seen, 0 * K)
+    assert_refused(
+        (lambda: aligned(seen, K[:2]), r"calibration must be a tensor K \(3, 3\) or \(3, 3, 3\), got \(2, 3\)"),
+        (lambda: aligned(seen, K.mT), "last row"),
+        (lambda: aligned(seen, 0 * K), "invertible"),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from math import comb, log
 from typing import Any
 
@@ -23,6 +24,7 @@ from dyntorch.scenes.scene import OUTLIER
 from tests.battery.cases import CASES as KNOWN
 from tests.battery.cases import Case
 from tests.draws import seeded
+from tests.grid import assert_refused
 
 
 def planar(batch: int | tuple[int, ...] = (), outliers: float = 0.4, n: int = 120, **more: Any) -> scenes.Scene:
@@ -221,16 +223,13 @@ def test_shapes_and_precision() -> None:
 
 
 def test_misuse_is_named() -> None:
-    views = planar().views
-    for threshold in (-1.0, math.inf):
-        with pytest.raises(ValueError, match=f"threshold must be a distance > 0 .*, got {threshold}"):
-            dyn.robust_fit(dyn.HomographyTensor, *views, threshold=threshold)
-    with pytest.raises(ValueError, match=r"threshold must be a number or \(\*batch,\)"):
-        dyn.robust_fit(dyn.HomographyTensor, *views, threshold=torch.ones(3))
-    with pytest.raises(ValueError, match="starts must be numbers"):
-        dyn.robust_fit(dyn.HomographyTensor, *views, threshold=1.5, starts=())
-    with pytest.raises(ValueError, match="needs at least 26 matches, got 20"):
-        dyn.robust_fit(dyn.HomographyTensor, *(x[:20] for x in views), threshold=1.5)
+    fit, views = partial(dyn.robust_fit, dyn.HomographyTensor), planar().views
+    assert_refused(
+        *((lambda t=t: fit(*views, threshold=t), f"threshold must be a distance > 0 .*, got {t}") for t in (-1.0, math.inf)),
+        (lambda: fit(*views, threshold=torch.ones(3)), r"threshold must be a number or \(\*batch,\)"),
+        (lambda: fit(*views, threshold=1.5, starts=()), "starts must be numbers"),
+        (lambda: fit(*(x[:20] for x in views), threshold=1.5), "needs at least 26 matches, got 20"),
+    )
 
 
 @pytest.mark.parametrize("case", KNOWN, ids=repr)

@@ -9,7 +9,7 @@ import torch
 
 from dyntorch.numerics import affine_factorization, canonical_correlation, metric_upgrade, orthonormal_basis
 from tests.draws import random
-from tests.grid import grid
+from tests.grid import assert_refused, grid
 
 
 def exact_basis(matrix):
@@ -103,22 +103,13 @@ def test_views_of_one_shape_share_a_direction_and_others_do_not(seed):
 
 
 def test_misuse_is_refused():
-    for first, second in (
-        ((2, 8, 3), (2, 8, 2)),
-        ((2, 8, 2), (2, 8, 1)),
-        ((2, 8, 2), (2, 9, 2)),
-        ((8, 2), (2, 8, 2)),
-        ((2, 8, 2), (8, 2)),
-        ((2,), (2,)),
-    ):
-        with pytest.raises(ValueError, match=r"m, rows, 2\)"):
-            canonical_correlation(torch.zeros(first), torch.zeros(second))
-    for shared in (0, 3, "1"):
-        with pytest.raises(ValueError, match="shared must be 1 or 2"):
-            canonical_correlation(torch.eye(8, 2)[None], torch.eye(8, 2)[None], shared=shared)
-    for shape in ((1, 10, 2), (10, 2), (3, 10, 3)):
-        with pytest.raises(ValueError, match="views must be"):
-            affine_factorization(torch.zeros(shape))
+    u, sizes = torch.eye(8, 2)[None], (((8, 3), (8, 2)), ((8, 2), (8, 1)), ((8, 2), (9, 2)))
+    shapes = (*(((2, *a), (2, *b)) for a, b in sizes), ((8, 2), (2, 8, 2)), ((2, 8, 2), (8, 2)), ((2,), (2,)))
+    assert_refused(
+        *((lambda a=a, b=b: canonical_correlation(torch.zeros(a), torch.zeros(b)), r"m, rows, 2\)") for a, b in shapes),
+        *((lambda n=n: canonical_correlation(u, u, shared=n), "shared must be 1 or 2") for n in (0, 3, "1")),
+        *((lambda n=n: affine_factorization(torch.zeros(n)), "views must be") for n in ((1, 10, 2), (10, 2), (3, 10, 3))),
+    )
 
 
 # ----------------------------------------------------------------------------------------------------------------------
