@@ -63,6 +63,12 @@ def test_clips_and_crops_against_interpolation():
         for clip, window in zip(CLIPS, got, strict=True):
             low, high = (clip.times[0] + share * clip.duration for share in crop)
             np.testing.assert_allclose(window, slow_window(clip, low, high, 9), atol=2e-5)
+    joints = CLIPS[0].joints.copy()
+    joints[:, 3] = np.nan  # never seen: marked, and zero
+    source = concatenate_clips([CLIPS[1], CLIPS[0].replace(joints=joints), CLIPS[2]])
+    assert source.seen.tolist() == [[True] * 5, [True, True, True, False, True], [True] * 5]
+    assert (source.joints[source.starts[1] : source.starts[2], 3] == 0).all()
+    assert torch.isfinite(resample_clips(source, 6)).all()
 
 
 def test_windows_anywhere_also_beyond_the_ends_in_any_chunks(monkeypatch):
@@ -92,22 +98,6 @@ def test_missing_joints_are_interpolated_in_time_and_y_points_up():
             for d in range(2):
                 expected = np.interp(clip.times, clip.times[ok], clip.joints[ok, j, d]) if ok.any() else np.zeros(len(clip))
                 np.testing.assert_allclose(part[:, j, d], expected * (-1 if d and clip.up == "-y" else 1), atol=1e-5)
-
-
-def test_never_seen_joints_are_marked_and_zero():
-    joints = CLIPS[0].joints.copy()
-    joints[:, 3] = np.nan
-    source = concatenate_clips([CLIPS[1], CLIPS[0].replace(joints=joints), CLIPS[2]])
-    assert source.seen.tolist() == [[True] * 5, [True, True, True, False, True], [True] * 5]
-    assert (source.joints[source.starts[1] : source.starts[2], 3] == 0).all()
-    assert torch.isfinite(resample_clips(source, 6)).all()
-
-
-def test_frame_rate_changes_nothing_that_moves_linearly():
-    direction = np.array([[[3.0, 1.0], [0.0, -2.0]]])
-    slow, fast = (Clip(np.linspace(0, 1, n)[:, None, None] * direction, fps=n - 1) for n in (5, 81))
-    got = resample_clips(concatenate_clips([slow, fast]), 10)
-    torch.testing.assert_close(got[0], got[1], atol=1e-6, rtol=0)
 
 
 # ---- refusals ----------------------------------------------------------------------------------------------------------
