@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from dyntorch.geometry.extensors import compound, dual, meet, wedge
-from dyntorch.geometry.homogeneous import cofactors, null_vectors, rank_one, unit, unit_vectors
+from dyntorch.geometry.homogeneous import cofactors, null_vectors, unit, unit_vectors
 from dyntorch.numerics.blocks import constant, one_thread
 
 
@@ -130,6 +130,10 @@ def _insertions(size: int, order: int, device: torch.device) -> tuple[Tensor, Te
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Projections from a Grassmann tensor of any profile, in closed form: a few candidates that noise-free tensors fulfil exactly.
+
+
+POWER_STEPS = 3
+"""Power iterations for a rank-1 split: exact without noise, and the error of a noisy one falls by (s_2 / s_1)^2 in each."""
 
 
 def candidates(tensor: Tensor, profile: Sequence[int], sizes: Sequence[int], tries: int = 5) -> tuple[Tensor, ...]:
@@ -285,9 +289,14 @@ def _rank_one(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Vectors of the same length whose product is nearest to the matrices ``(b, r, c)``; zeros for a matrix without entries."""
     if 0 in matrix.shape[1:]:
         return matrix.new_zeros(matrix.shape[:2]), matrix.new_zeros(len(matrix), matrix.shape[2])
-    left, right = rank_one(matrix)
-    root = right.norm(dim=-1, keepdim=True).sqrt()
-    return left * root, unit_vectors(right) * root
+    longest = matrix.square().sum(-1).argmax(-1)[:, None, None].expand(-1, 1, matrix.shape[2])
+    right = unit_vectors(matrix.gather(1, longest)[:, 0])
+    for _ in range(POWER_STEPS):
+        left = (matrix * right[:, None]).sum(-1)
+        right = unit_vectors((matrix * left[..., None]).sum(1))
+    left = (matrix * right[:, None]).sum(-1)
+    root = left.norm(dim=-1, keepdim=True).sqrt()
+    return unit_vectors(left) * root, right * root
 
 
 def _scales(minors: Tensor, block: dict[tuple[int, int], Tensor], q: int) -> list[Tensor]:
