@@ -142,28 +142,9 @@ def progress(what: str, steps: bool = True) -> Iterator[Progress]:
         yield lambda share: bars.update(task, completed=share)
 
 
-@contextmanager
-def counting_bar(what: str, unit: str) -> Iterator[Callable[[int, int], None] | None]:
-    """A bar on the terminal with how many are done in a second and the time that is left; None where stderr is no terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich import progress as bar
-    from rich.console import Console
-    from rich.text import Text
-
-    class PerSecond(bar.ProgressColumn):
-        """Of what was done lately."""
-
-        def render(self, task: bar.Task) -> Text:
-            speed = task.finished_speed or task.speed
-            return Text("" if speed is None else f"{speed:.3g} {unit}")
-
-    columns = [bar.TextColumn("{task.description}", markup=False), bar.BarColumn(), bar.MofNCompleteColumn(), PerSecond()]
-    columns += [bar.TimeElapsedColumn(), bar.TextColumn("left"), bar.TimeRemainingColumn()]
-    with bar.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task(one_line(what), total=None)
-        yield lambda done, total: shown.update(task, completed=done, total=total)
+def of_total(tell: Progress) -> Callable[[int, int], None]:
+    """The same, told how many of how many are done."""
+    return lambda done, total: tell(done / max(1, total))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

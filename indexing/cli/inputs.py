@@ -139,7 +139,7 @@ def read_examples(examples: Sequence[Example], reading: Reading, select: Sequenc
         if is_set and select:
             found = found[choose(found, select, "--select")]
         if example.start is not None or example.end is not None:
-            found, cut = _crop_example(found, example)
+            found, cut = crop_example(found, example)
             notes += cut
         if is_set or len(found) > 1:
             found, left_out = usable(found, example.path)
@@ -165,7 +165,7 @@ def of_layout(clips: Sequence[Clip], known: Skeleton | None, path: Path) -> tupl
     return [clip for clip, _ in matched], list(dict.fromkeys(note for _, note in matched if note))
 
 
-def _crop_example(clips: ClipSet, example: Example) -> tuple[ClipSet, list[str]]:
+def crop_example(clips: ClipSet, example: Example) -> tuple[ClipSet, list[str]]:
     """The seconds that count, and a note where the recording does not have all of them."""
     start, end = example.start if example.start is not None else -math.inf, example.end if example.end is not None else math.inf
     cropped = ClipSet((clip.between(start, end) for clip in clips), clips.name)
@@ -256,21 +256,26 @@ def read_recordings(
     notes: list[str] = []
     for path in paths:
         lanes, said = lanes_of(path, reading)
-        notes += said
-        clips, said = of_layout([lane.clip for lane in lanes if lane.clip is not None], skeleton, path)
-        notes += said
-        for clip in clips:
+        lanes, more = lanes_in_layout(lanes, skeleton, path)
+        notes += said + more
+        for clip in _check_clips([lane.clip for lane in lanes if lane.clip is not None], path):
             if clip.joints.shape[1] != joints:
                 raise ValueError(
                     f"{path}: has {clip.joints.shape[1]} joints, but the model {model} was learned from clips with {joints}; "
                     "actions are compared joint by joint: use the same pose estimator and joint layout for both"
                 )
-        same = iter(_check_clips(clips, path))
-        lanes_of_files.append([replace(lane, clip=None if lane.clip is None else next(same)) for lane in lanes])
+        lanes_of_files.append(lanes)
     lanes = _distinguish_names(paths, lanes_of_files)
     clips = [lane.clip for lane in lanes if lane.clip is not None]
     alone = [clip for clip in clips if "followed" not in clip.meta or clip.meta.get("person") is None]
     return lanes, notes + clip_notes(clips, reading) + on_gaps(alone) + assumed_rate_notes(clips)
+
+
+def lanes_in_layout(lanes: Sequence[Lane], known: Skeleton | None, path: Path) -> tuple[list[Lane], list[str]]:
+    """The lanes of a file with their joints as :func:`of_layout` has them."""
+    clips, notes = of_layout([lane.clip for lane in lanes if lane.clip is not None], known, path)
+    same = iter(clips)
+    return [replace(lane, clip=None if lane.clip is None else next(same)) for lane in lanes], notes
 
 
 def _distinguish_names(paths: Sequence[Path], found: Sequence[Sequence[Lane]]) -> list[Lane]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from indexing.cli.console import check_file, count, names
 from indexing.cli.flags.shared import Example, Labelling, Reading
-from indexing.cli.inputs import KnownEvent, Lane, assumed_rate_notes, clip_notes, lanes_of, of_layout, on_examples
+from indexing.cli.inputs import KnownEvent, Lane, assumed_rate_notes, clip_notes, lanes_in_layout, lanes_of, on_examples
 from indexing.clip import Clip
 from indexing.files import prepare
 from indexing.joints import layout_of
@@ -263,16 +263,15 @@ def _lanes_of(paths: Sequence[Path], reading: Reading, others: Sequence[Clip]) -
     seen = list(others)
     for path in paths:
         lanes, said = lanes_of(path, reading)
-        notes += said
-        own = [lane.clip for lane in lanes if lane.clip is not None]
-        clips, said = of_layout(own, layout_of([*seen, *own]), path)
-        notes += said
+        known = layout_of([*seen, *(lane.clip for lane in lanes if lane.clip is not None)])
+        lanes, more = lanes_in_layout(lanes, known, path)
+        notes += said + more
+        clips = [lane.clip for lane in lanes if lane.clip is not None]
         seen += clips
         if seen and clips and clips[0].joints.shape[1] != seen[0].joints.shape[1]:
             both = f"has {clips[0].joints.shape[1]} joints, but {seen[0].name} has {seen[0].joints.shape[1]}"
             raise error(path, both, "use one pose estimator and joint layout")
-        same = iter(clips)
-        found += [replace(lane, clip=None if lane.clip is None else next(same)) for lane in lanes]
+        found += lanes
     clips = seen[len(others) :]
     return found, notes + assumed_rate_notes(clips) + clip_notes(clips, reading)
 

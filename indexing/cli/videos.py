@@ -13,7 +13,7 @@ import numpy as np
 
 from indexing import pose
 from indexing.brightness.indexer import BrightnessIndexer
-from indexing.cli.console import check_folder, count, counting_bar, names
+from indexing.cli.console import check_folder, count, names, of_total, progress
 from indexing.cli.flags.shared import Example, Pixels, Reading, Watched, Watching
 from indexing.cli.protocol import choose
 from indexing.pose import models
@@ -104,8 +104,8 @@ def _detect(
     notes: list[str] = []
     for folder, some in folders.items():
         tasks = [VideoTask(video.expanduser(), footage.people, footage.every, fps, model.name) for video in some]
-        with counting_bar(f"finding people in {count(len(some), 'video')}", "frames/s") as bar:
-            made = list(keypoint_files(tasks, folder, model, workers_here(), bar, json=False))
+        with progress(f"finding people in {count(len(some), 'video')}") as tell:
+            made = list(keypoint_files(tasks, folder, model, workers_here(), of_total(tell), json=False))
         for video, (_, one) in zip(some, made, strict=True):
             if not isinstance(one, KeypointFile | NobodyInVideo):
                 raise one

@@ -23,11 +23,9 @@ from indexing.archive.workers import QuietProcesses
 from indexing.archive.writer import Addition
 from indexing.cli.commands.scan import exemplars, within_label
 from indexing.cli.console import (
-    Progress,
     check_report,
     complain,
     count,
-    counting_bar,
     names,
     one_line,
     present,
@@ -38,10 +36,10 @@ from indexing.cli.console import (
 )
 from indexing.cli.flags.recognition import Add, Find, Info, Remove, Search, Verify
 from indexing.cli.flags.shared import Example, Following, Reading
-from indexing.cli.inputs import CUT, assumed_rate_notes, clip_notes, parse_example, read_clips, watch_videos
+from indexing.cli.inputs import assumed_rate_notes, clip_notes, crop_example, parse_example, read_clips, watch_videos
 from indexing.cli.protocol import choose, field_values
 from indexing.cli.videos import watch_options
-from indexing.clip import Clip
+from indexing.clip import Clip, ClipSet
 from indexing.files import manifest, to_json_types
 from indexing.modelfile import model_kind
 from indexing.report.archive import FILES, FindReport, SearchReport, size_text, summarize_info, summarize_verification
@@ -68,7 +66,7 @@ def add(flags: Add) -> int:
         alone = flags.workers is None and _soon(found)
     before, started = len(archive), time.perf_counter()
     try:
-        with workforce(1 if alone else flags.workers, flags.dask, len(found)) as executor, rate("adding", len(found)) as bar:
+        with workforce(1 if alone else flags.workers, flags.dask, len(found)) as executor, progress("adding") as bar:
             done = archive.add(given, executor, bar, _options(flags.reading))
     except KeyboardInterrupt:
         complain(f"interrupted; {_kept_text(archive, before)}")
@@ -113,7 +111,7 @@ def find(flags: Find) -> int:
         indexer.set_params(reject=flags.reject)
     started = time.perf_counter()
     workers = 1 if flags.workers is None and info.seconds <= MAX_SECONDS_ALONE else flags.workers
-    with workforce(workers, flags.dask, info.recordings) as executor, rate("searching", info.recordings) as bar:
+    with workforce(workers, flags.dask, info.recordings) as executor, progress("searching") as bar:
         events = archive.find(indexer, executor, bar)
     seconds = time.perf_counter() - started
     about = {} if folder is None else _manifest("find", flags, [flags.model], archive, info, {"find": seconds})
@@ -221,18 +219,6 @@ def _cluster(address: str) -> Iterator[Executor]:
         client.close(timeout=CLUSTER_TIMEOUT)
 
 
-@contextmanager
-def rate(what: str, number: int) -> Iterator[Progress]:
-    """A bar on the terminal, with how many there are in a second and how long it still takes; moved by the share done."""
-    if not number:
-        yield lambda share: None
-        return
-    with counting_bar(what, "a second") as bar:
-        if bar is not None:
-            bar(0, number)
-        yield lambda share: None if bar is None else bar(round(share * number), number)
-
-
 # ---- what is read --------------------------------------------------------------------------------------------------------
 def _absolute(path: Path) -> Path:
     """As whoever works elsewhere finds it."""
@@ -283,17 +269,10 @@ def read_query(example: Example, reading: Reading, select: Sequence[str]) -> tup
     name = example.path.name if len(every) == 1 else f"{example.path.name}: {clips[0].name}"
     clip = clips[0].replace(name=name)
     notes = clip_notes([clip], reading) + assumed_rate_notes([clip])
-    start = clip.times[0] if example.start is None else example.start
-    end = clip.times[-1] if example.end is None else example.end
-    if example.start is not None or example.end is not None:
-        clip = clip.between(start, end)
-        first, last = clips[0].times[0], clips[0].times[-1]
-        if start < first - CUT or end > last + CUT:
-            notes.append(
-                f"{example.path}: the recording runs from {first:.6g} to {last:.6g} s; {clip.duration:.3g} s of it are asked for"
-            )
-        clip = clip.replace(name=f"{name}, {clip.times[0]:.6g} to {clip.times[-1]:.6g} s")
-    return clip, notes
+    if example.start is None and example.end is None:
+        return clip, notes
+    (part,), cut = crop_example(ClipSet([clip]), example)
+    return part.replace(name=f"{name}, {part.times[0]:.6g} to {part.times[-1]:.6g} s"), notes + cut
 
 
 # ---- what is printed -----------------------------------------------------------------------------------------------------

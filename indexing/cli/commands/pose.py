@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from indexing.cli.commands.archive import INTERRUPTED, PROBLEMS, check_workers
-from indexing.cli.console import check_folder, complain, count, counting_bar, progress, say, table
+from indexing.cli.console import check_folder, complain, count, of_total, progress, say, table
 from indexing.cli.flags.geometry import Pose
 from indexing.clip import check_fps
 from indexing.pose import models as files
@@ -57,8 +57,8 @@ def _work(flags: Pose, folder: Path) -> int:
     workers = flags.workers or workers_here()
     begun, rows, notes, failed, done = time.perf_counter(), [], [], [], 0
     try:
-        with counting_bar("looking at " + count(len(tasks), "video"), "frames/s") as bar:
-            for task, made in writing.keypoint_files(tasks, folder, models, workers, bar, flags.json):
+        with progress("looking at " + count(len(tasks), "video")) as tell:
+            for task, made in writing.keypoint_files(tasks, folder, models, workers, of_total(tell), flags.json):
                 if isinstance(made, ValueError):
                     failed.append(made)
                     continue

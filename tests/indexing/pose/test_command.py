@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import io
-import sys
 
 import pytest
 
-from indexing.cli import console, main
+from indexing.cli import main
 from tests.indexing.pose.test_detection import film, person, walk
 
 
@@ -104,14 +103,3 @@ class Terminal(io.StringIO):
 
     def isatty(self):
         return True
-
-
-def test_the_bar_shows_frames(monkeypatch):
-    with console.counting_bar("x", "frames/s") as bar:
-        assert bar is None  # no terminal
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    with console.counting_bar("looking", "frames/s") as bar:
-        for done in range(0, 101, 10):
-            bar(done, 100)
-        shown = sys.stderr
-    assert "looking" in shown.getvalue() and "100/100" in shown.getvalue() and "frames/s" in shown.getvalue()
