@@ -22,10 +22,10 @@ from indexing.cli.console import (
     check_report,
     check_seed,
     count,
-    counting_bar,
     flag_words,
     keep,
     names,
+    of_total,
     present,
     progress,
 )
@@ -250,8 +250,8 @@ def run_colmap(flags: Segment) -> int:
         colmap()
         shown, notes = _photographs(held, images)
     read = time.perf_counter()
-    with counting_bar(f"segmenting {count(len(held.pairs), 'pair')}", "pairs/s") as told, _workforce(len(held.pairs)) as executor:
-        found = find_static(held, threshold, flags.spatial, flags.seed, progress=told, executor=executor)
+    with progress(f"segmenting {count(len(held.pairs), 'pair')}") as tell, _workforce(len(held.pairs)) as executor:
+        found = find_static(held, threshold, flags.spatial, flags.seed, progress=of_total(tell), executor=executor)
     timings = {"read": read - started, "segment": time.perf_counter() - read}
     if found.ok:
         with progress("writing", steps=False):

@@ -204,8 +204,9 @@ def test_what_is_found_stands_beside_what_a_person_marked(run, data: Path, tmp_p
     assert set(before.labels) < set(after.labels)
     assert run(f"index scan @/session.json -m @/m.st --write {mine.name}")[0] == 0  # its own tier is replaced
     assert len(open_labels(mine).labels) == len(after.labels)
-    code, out, _ = run(f"index evaluate {mine.name} --labels @/session.csv")  # what was found is compared with the person's
-    assert code == 0 and "Cohen's kappa over time 0." in out
+    if suffix == ".eaf":  # what was found is compared with the person's
+        code, out, _ = run(f"index evaluate {mine.name} --labels @/session.csv")
+        assert code == 0 and "Cohen's kappa over time 0." in out
 
 
 @pytest.mark.slow
