@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from indexing.labels.format import registered_formats as label_formats
-from indexing.readers import FORMATS
-from indexing.readers.files import detect, open_source
-from tests.indexing.readers import tools
+from tests.indexing.labels.test_format import BY_HAND
+from tests.indexing.readers import test_formats, tools
 from tests.indexing.readers.test_files import SAMPLES
 
 FRAMES, JOINTS = 8, 17
@@ -42,26 +40,8 @@ class Seed:
 def make(folder: Path) -> list[Seed]:
     """Write all seeds."""
     folder.mkdir(parents=True, exist_ok=True)
-    people = person(2)
-    found = [*_json(folder, people), *_tables(folder, people), *_models(folder), *_sets(folder), *_points(folder), *_pairs(folder)]
-    found += [*_arrays(folder, people), *_hdf5(folder, people), *_tracks(folder), *_settings(folder), *_pictures(folder)]
-    found += _labels(folder)
-    return [*found, *_registered(folder, found)]
-
-
-def _registered(folder: Path, known: list[Seed]) -> list[Seed]:
-    """A file of every format of keypoints that has none above, as the test of its reader makes it."""
-    lacking = set(FORMATS) - {detect(open_source(seed.path)) for seed in known if seed.read is keypoints}
-    seeds = []
-    for number, make_sample in enumerate(SAMPLES.values() if lacking else ()):
-        place = folder / f"sample{number}"
-        place.mkdir()
-        path = make_sample(place).path
-        name = detect(open_source(path))
-        if name in lacking:
-            seeds.append(Seed(f"{name}:{path.name}", path, keypoints, _scan(folder)))
-    assert lacking <= {seed.name.partition(":")[0] for seed in seeds}, f"formats without a sample in their test: {lacking}"
-    return seeds
+    found = [*_keypoints(folder), *_models(folder), *_sets(folder), *_points(folder), *_pairs(folder)]
+    return [*found, *_tracks(folder), *_settings(folder), *_pictures(folder), *_labels(folder)]
 
 
 def person(seed: int, frames: int = FRAMES) -> np.ndarray:
@@ -101,103 +81,22 @@ def _scan(folder: Path) -> tuple[str, ...]:
     return ("index", "scan", "{}", "-m", str(folder / "action_small.safetensors"))
 
 
-def _json(folder: Path, people: np.ndarray) -> list[Seed]:
-    flat = [frame.ravel().tolist() for frame in people]
-    coco = [{"image_id": i, "category_id": 1, "keypoints": row, "score": 0.9} for i, row in enumerate(flat)]
-    names = [f"j{i}" for i in range(JOINTS)]
-    dataset = {
-        "images": [{"id": i, "file_name": f"{i:06d}.jpg"} for i in range(FRAMES)],
-        "annotations": [{**one, "id": i, "track_id": 1} for i, one in enumerate(coco)],
-        "categories": [{"id": 1, "name": "person", "keypoints": names, "skeleton": [[1, 2], [2, 3]]}],
-    }
-    instances = [[{"keypoints": f[:, :2].tolist(), "keypoint_scores": f[:, 2].tolist(), "bbox": [[0, 0, 1, 1]]}] for f in people]
-    about = {"dataset_name": "c", "keypoint_id2name": {str(i): n for i, n in enumerate(names)}, "skeleton_links": [[0, 1]]}
-    shown = [{"frame_id": i + 1, "instances": one} for i, one in enumerate(instances)]
-    demo = {"meta_info": about, "instance_info": shown}
-    yolo = [
-        [{"name": "person", "class": 0, "confidence": 0.9, "box": {"x1": 0, "y1": 0, "x2": 9, "y2": 9}, "track_id": 1,
-          "keypoints": {"x": f[:, 0].tolist(), "y": f[:, 1].tolist(), "visible": f[:, 2].tolist()}}] for f in people
-    ]  # fmt: skip
-    single = [{"version": 1.3, "people": [{"person_id": [-1], "pose_keypoints_2d": row}]} for row in flat]
-    for i, one in enumerate(single):
-        written(folder / "openpose" / f"cam_{i:012d}_keypoints.json", one)
-    box = people[..., :2] / 640
-    for i, frame in enumerate(box):
-        low, high = frame.min(0), frame.max(0)
-        numbers = [0, *(low + high) / 2, *(high - low), *frame.ravel(), 0.9]
-        written(folder / "yolo" / f"vid_{i + 1}.txt", " ".join(f"{v:.5f}" for v in numbers))
-    files: dict[str, Any] = {
-        "coco.json": coco, "coco_set.json": dataset, "mmpose.json": instances, "mmpose_demo.json": demo, "ultralytics.json": yolo,
-        "ultralytics_str.json": [json.dumps(frame) for frame in yolo], "openpose_list.json": single,
-        "alphapose.json": {f"{i}.jpg": {"version": "a", "bodies": [{"joints": row}]} for i, row in enumerate(flat)},
-    }  # fmt: skip
-    seeds = [Seed(name, written(folder / name, value), keypoints, _scan(folder)) for name, value in files.items()]
-    return [*seeds, *(Seed(name, folder / name, keypoints, _scan(folder)) for name in ("openpose", "yolo"))]
-
-
-def _tables(folder: Path, people: np.ndarray) -> list[Seed]:
-    names = [f"p{i}" for i in range(JOINTS)]
-    wide = [["frame", "time_s", *(f"{n}_{k}" for n in names for k in ("x", "y", "visibility"))]]
-    wide += [[i, i / 30, *frame.ravel()] for i, frame in enumerate(people)]
-    long = [["frame", "landmark", "x", "y", "z", "visibility"]]
-    long += [[i, k, *frame[k, :2], 0, frame[k, 2]] for i, frame in enumerate(people) for k in range(JOINTS)]
-    dlc = [["scorer", *["net"] * 3 * JOINTS], ["bodyparts", *(n for n in names for _ in range(3))]]
-    dlc += [["coords", *["x", "y", "likelihood"] * JOINTS], *([i, *frame.ravel()] for i, frame in enumerate(people))]
-    several = [["scorer", *["net"] * 6 * JOINTS], ["individuals", *(a for a in ("m1", "m2") for _ in range(3 * JOINTS))]]
-    several += [["bodyparts", *(n for _ in range(2) for n in names for _ in range(3))]]
-    several += [["coords", *["x", "y", "likelihood"] * 2 * JOINTS]]
-    several += [[i, *frame.ravel(), *(frame.ravel() + 1)] for i, frame in enumerate(people)]
-    sleap = [["track", "frame_idx", "instance.score", *(f"{n}.{k}" for n in names for k in ("x", "y", "score"))]]
-    sleap += [["t1", i, 0.9, *frame.ravel()] for i, frame in enumerate(people)]
-    tables = {"mediapipe.csv": wide, "mediapipe_long.csv": long, "dlc.csv": dlc, "dlc_multi.csv": several, "sleap.csv": sleap}
-    return [
-        Seed(name, written(folder / name, "\n".join(",".join(map(str, row)) for row in rows) + "\n"), keypoints, _scan(folder))
-        for name, rows in tables.items()
-    ]
-
-
-def _arrays(folder: Path, people: np.ndarray) -> list[Seed]:
-    """Markers, bare arrays, a recording of FreeMoCap, and skeleton sets in pickles."""
-    rng = np.random.default_rng(4)
-    body = rng.normal(size=(FRAMES, 33, 3)).cumsum(axis=0)
-    names = [f"p{i}" for i in range(JOINTS)]
-    head = [
-        "PathFileType\t4\t(X/Y/Z)\ta.trc",
-        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits",
-        f"30\t30\t{FRAMES}\t{JOINTS}\tmm",
-    ]
-    head += ["Frame#\tTime\t" + "\t\t\t".join(names), "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(1, JOINTS + 1))]
-    rows = ["\t".join(map(str, [i + 1, i / 30, *frame.ravel()])) for i, frame in enumerate(people)]
-    written(folder / "markers.trc", "\n".join([*head, *rows]) + "\n")
+def _keypoints(folder: Path) -> list[Seed]:
+    """What each tool writes, as the tests of the readers make it, and some of the other forms that they know."""
+    seeds, people = [], person(2)
+    for number, (tool, make_sample) in enumerate(SAMPLES.items()):
+        place = folder / f"sample{number}"
+        place.mkdir()
+        path = make_sample(place).path
+        seeds.append(Seed(tool, path, keypoints, _scan(folder), 2 if path.suffix in (".h5", ".slp", ".nc") else 1))
+    lists = ("coco int", "mmpose frames", "ultralytics frames", "ultralytics strings", "openpose list", "alphapose cmu")
+    others = [written(folder / f"{name}.json", test_formats.VARIANTS[name](people)) for name in lists]
+    tables = ("deeplabcut", "mediapipe long")
+    others += [test_formats.save_rows(folder / f"{name}.csv", test_formats.TABLES[name](people)) for name in tables]
+    others.append(tools.deeplabcut(folder / "dlc_fixed.h5", people, [f"p{i}" for i in range(JOINTS)], "fixed"))
+    others.append(tools.pyskl(folder / "set0.pkl", {"a": people[None], "b": people[None]}, [0, 1], {"train": "a"}, protocol=0))
     np.save(folder / "body.npy", people[..., :2])
-    data = folder / "freemocap" / "output_data"
-    data.mkdir(parents=True)
-    np.save(data / "mediapipe_body_3d_xyz.npy", body)
-    written(folder / "recording.c3d", tools.c3d())
-    one = {"label": 1, "img_shape": (480, 640), "keypoint": people[None, ..., :2], "keypoint_score": people[None, ..., 2]}
-    annotations = [{"frame_dir": f"clip{i}", "total_frames": FRAMES, **one} for i in range(2)]
-    for protocol in (0, 4):
-        skeletons = {"split": {"train": ["clip0"], "test": ["clip1"]}, "annotations": annotations}
-        written(folder / f"set{protocol}.pkl", pickle.dumps(skeletons, protocol))
-    files = ("markers.trc", "recording.c3d", "body.npy", "set0.pkl", "set4.pkl")
-    return [
-        *(Seed(name, folder / name, keypoints, _scan(folder)) for name in files),
-        Seed("freemocap", data, keypoints, _scan(folder)),
-    ]
-
-
-def _hdf5(folder: Path, people: np.ndarray) -> list[Seed]:
-    """DeepLabCut, SLEAP and movement."""
-    names = [f"p{i}" for i in range(JOINTS)]
-    both = {"a": people, "b": people + 1}
-    made = [
-        tools.deeplabcut(folder / "dlc_table.h5", both, names),
-        tools.deeplabcut(folder / "dlc_fixed.h5", people, names, "fixed"),
-        tools.sleap_analysis(folder / "sleap.h5", both, names),
-        tools.sleap_project(folder / "sleap.slp", both, names, {(1, "a"): people[1, :, :2]}, fps=30.0),
-        tools.movement(folder / "movement.nc", both, names),
-    ]
-    return [Seed(path.name, path, keypoints, _scan(folder), 2) for path in made]
+    return seeds + [Seed(path.name, path, keypoints, _scan(folder)) for path in (*others, folder / "body.npy")]
 
 
 def _sets(folder: Path) -> list[Seed]:
@@ -412,13 +311,15 @@ def _labels(folder: Path) -> list[Seed]:
         path = folder / f"labels_{name}{suffix or '.json'}"
         write_labels(path, found, recording="session.mp4", duration=60, fps=25, format=name)
         seeds.append(Seed(path.name, path, labels))
-    return seeds
+    return [*seeds, *(Seed(f"labels of {name}", make_file(folder), labels) for name, make_file in BY_HAND.items())]
 
 
 def labels(path: Path) -> Any:
-    """Read labels of one hand, of a recording."""
-    from indexing.labels import choose_labels, open_labels, within
+    """Read labels of one hand, of a recording, and ask whether others could be written beside them."""
+    from indexing.labels import Label, choose_labels, open_labels, within, write_labels
 
+    if path.suffix in (".eaf", ".boris"):
+        write_labels(path, [Label(1, 3, "squat", "Ann"), Label(2, 4, "squat", "Ann")], recording="session.mp4", dry=True)
     kept, notices = within(choose_labels(open_labels(path, recording="session.json", fps=25)).labels, 0.0, 10.0)
     return [label.duration for label in kept], notices
 

@@ -11,7 +11,10 @@ from tests.fuzz.running import GOOD, command, damaged, judged, poor, tried
 from tests.fuzz.seeds import Seed, make
 
 FILES = 12  # per format, fewer of those that take long
-COMMANDS = ("coco.json", "openpose", "truth.csv", "Calib.toml", "points.csv", "pair.npz", "phase.safetensors", "dlc.csv")
+COMMANDS = (
+    *("COCO annotations", "OpenPose", "DeepLabCut CSV", "truth.csv", "Calib.toml", "points.csv", "pair.npz"),
+    "phase.safetensors",
+)
 pytestmark = [
     pytest.mark.filterwarnings("default::RuntimeWarning"),  # caught, and an outcome
     pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and links to devices are part of what is tried"),
@@ -50,7 +53,7 @@ def test_commands_say_one_line_about_damaged_files(name: str, seeds: dict[str, S
 
 
 def test_a_number_always_makes_the_same_file(seeds: dict[str, Seed], tmp_path: Path) -> None:
-    for name in ("coco.json", "pair.npz", "phase.safetensors", "openpose"):
+    for name in ("COCO annotations", "pair.npz", "phase.safetensors", "OpenPose"):
         made = []
         for folder in ("a", "b"):
             path, damage = damaged(seeds[name], 3, tmp_path / folder)

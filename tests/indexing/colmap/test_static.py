@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from experiments.segmentation.colmap import mapped, worst, write_scene
+from experiments.segmentation.colmap import mapped, write_scene
 from experiments.segmentation.photographs import photographs
 from indexing.colmap import StaticOptions, find_static, read_database
 from indexing.colmap.pair_segmentation import divide, prepare_image, select_pairs, task
@@ -149,15 +149,6 @@ def test_a_camera_that_colmap_does_not_know_and_colmap_that_is_not_there(given, 
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(ValueError, match=r"pip install 'dyntorch\[colmap\]'"):
         find_static(read_database(given))
-
-
-def test_the_error_of_a_path_is_that_after_a_similarity():
-    rng = np.random.default_rng(0)
-    path, shift = rng.normal(size=(7, 3)), np.array([1.0, 2, 5])
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
-    assert worst(2 * path @ turn + shift, path) < 1e-9
-    assert worst(path * np.array([1.0, 1, -1]), path) > 0.01  # no similarity mirrors
 
 
 @pytest.mark.slow

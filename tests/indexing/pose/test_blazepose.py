@@ -174,22 +174,6 @@ def test_what_is_seen_in_a_region_is_put_back_where_it_is(tmp_path, size, degree
     np.testing.assert_allclose(got, joints_of(hips, circle), atol=max(1.0, 0.02 * length))
 
 
-@pytest.mark.parametrize("rotation", [0, 90, 180, -90])
-def test_frames_of_phones_are_cut_upright(tmp_path, rotation):
-    if not hasattr(av.VideoStream, "set_display_rotation"):
-        pytest.skip("this PyAV cannot write rotated videos")
-    stored = drawn([((100, 80), (100, 40))], 256, 192)
-    frame = frame_of(tmp_path, stored, rotation)
-    upright = np.rot90(stored, rotation // 90)  # counter-clockwise, as PyAV's angle
-    picture = VideoPicture(frame)
-    assert (picture.width, picture.height) == upright.shape[1::-1]
-    whole = picture.extract_region(Region(picture.width / 2, picture.height / 2, 256), 256, fill=True)
-    x, y = (256 - picture.width) // 2, (256 - picture.height) // 2
-    shown = whole[y : y + picture.height, x : x + picture.width]
-    assert np.abs(shown.astype(int) - upright).mean() < 6
-    assert (whole[: max(y, 1) * (y > 0)] == 0).all()
-
-
 def test_levels_halve_exactly_and_odd_lines_are_left_out(tmp_path):
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (46, 62, 3)).astype(np.uint8)

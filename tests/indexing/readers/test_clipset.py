@@ -206,22 +206,6 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path: Path, c
     assert list(tmp_path.iterdir()) == []
 
 
-def test_writing_is_atomic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "set.npz"
-    write_clip_set([Clip(np.ones((2, 3, 2)))], path)
-    before = path.read_bytes()
-
-    def fail(file: Any, **_: Any) -> None:
-        file.write(b"half")
-        raise OSError("disk full")
-
-    monkeypatch.setattr(np, "savez_compressed", fail)
-    with pytest.raises(ValueError, match=r"cannot write .*disk full"):
-        write_clip_set([Clip(np.zeros((9, 3, 2)))], path)
-    assert path.read_bytes() == before
-    assert [entry.name for entry in tmp_path.iterdir()] == ["set.npz"]
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # Film sets: frames in place of joints, everything else as in a clip set
 

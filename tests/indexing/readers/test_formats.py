@@ -13,6 +13,7 @@ import pytest
 
 from indexing.readers import read, read_clip
 from indexing.skeleton import BODY25, COCO17, HALPE26, HAND21, MEDIAPIPE33
+from tests.grid import grid
 from tests.indexing.readers.tools import refused
 
 Write = Callable[..., Path]
@@ -83,7 +84,7 @@ VARIANTS: dict[str, Callable[[np.ndarray], Any]] = {
 }
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@grid(("variant", list(VARIANTS)))
 def test_every_variant_gives_the_same_clip(write_json: Write, person: np.ndarray, expected: np.ndarray, variant: str) -> None:
     clip = read_clip(write_json(VARIANTS[variant](person)), fps=25.0)
     np.testing.assert_array_equal(clip.joints, expected)
@@ -94,21 +95,20 @@ def test_every_variant_gives_the_same_clip(write_json: Write, person: np.ndarray
     assert len(clip.skeleton.bones) > 0
 
 
-FOLDERS: dict[str, Callable[[np.ndarray], Any]] = {
-    "openpose": lambda one: {"people": [{"person_id": [-1], "pose_keypoints_2d": triples(one), "face_keypoints_2d": []}]},
-    "coco": lambda one: None,  # filled below: it needs the image's name
-    "mmpose": lambda one: [mmpose_instance(one)],
-    "mmpose wrapped": lambda one: [[mmpose_instance(one)]],
-    "ultralytics": lambda one: [yolo_person(one)],
+FOLDERS: dict[str, Callable[[int, np.ndarray], Any]] = {
+    "openpose": lambda _, one: {"people": [{"person_id": [-1], "pose_keypoints_2d": triples(one), "face_keypoints_2d": []}]},
+    "coco": lambda number, one: coco_results(one[None], lambda _: f"{number}.jpg"),
+    "mmpose": lambda _, one: [mmpose_instance(one)],
+    "mmpose wrapped": lambda _, one: [[mmpose_instance(one)]],
+    "ultralytics": lambda _, one: [yolo_person(one)],
 }
 
 
-@pytest.mark.parametrize("variant", FOLDERS)
+@grid(("variant", list(FOLDERS)))
 def test_a_folder_of_frames(write_json: Write, person: np.ndarray, expected: np.ndarray, variant: str) -> None:
     numbers = [10, 11, 12, 20, 21, 22]
     for number, one in zip(numbers, person, strict=True):
-        data = coco_results(one[None], lambda _, n=number: f"{n}.jpg") if variant == "coco" else FOLDERS[variant](one)
-        path = write_json(data, f"run/frame_{number}.json")
+        path = write_json(FOLDERS[variant](number, one), f"{variant}/run/frame_{number}.json")
     clip = read_clip(path.parent)
     np.testing.assert_array_equal(clip.joints, expected)
     np.testing.assert_allclose(clip.times, np.array(numbers) / 30)  # the gap stays a gap in time
@@ -116,23 +116,19 @@ def test_a_folder_of_frames(write_json: Write, person: np.ndarray, expected: np.
     assert clip.fps_assumed
 
 
-@pytest.mark.parametrize("name", ["openpose", "mmpose", "ultralytics", "coco dataset"])
-def test_frames_without_people_are_nan_rows(write_json: Write, person: np.ndarray, name: str) -> None:
-    data = {
-        "openpose": [{"people": []}, {"people": [{"pose_keypoints_2d": triples(person[0])}]}, {"people": []}],
-        "mmpose": [
-            {"frame_id": 0, "instances": []},
-            {"frame_id": 1, "instances": [mmpose_instance(person[0])]},
-            {"frame_id": 2, "instances": []},
-        ],
-        "ultralytics": [[], [yolo_person(person[0])], "[]"],
-        "coco dataset": coco_dataset(person[:3]) | {"annotations": coco_dataset(person)["annotations"][1:2]},
-    }[name]
-    clip = read_clip(write_json(data))
-    assert clip.seen.any(axis=1).tolist() == [False, True, False]
-    assert clip.confidence is not None
-    assert (clip.confidence[[0, 2]] == 0).all()
-    assert clip.times[1] == pytest.approx(1 / 30)
+def test_frames_without_people_are_nan_rows(write_json: Write, person: np.ndarray) -> None:
+    empty, one = {"people": []}, mmpose_instance(person[0])
+    for data in (
+        [empty, {"people": [{"pose_keypoints_2d": triples(person[0])}]}, empty],
+        [{"frame_id": i, "instances": [one] if i == 1 else []} for i in range(3)],
+        [[], [yolo_person(person[0])], "[]"],
+        coco_dataset(person[:3]) | {"annotations": coco_dataset(person)["annotations"][1:2]},
+    ):
+        clip = read_clip(write_json(data))
+        assert clip.seen.any(axis=1).tolist() == [False, True, False]
+        assert clip.confidence is not None
+        assert (clip.confidence[[0, 2]] == 0).all()
+        assert clip.times[1] == pytest.approx(1 / 30)
 
 
 def test_layouts(openpose_folder: Write, write_json: Write) -> None:
@@ -151,21 +147,16 @@ def test_names_of_the_file_are_kept(write_json: Write, person: np.ndarray) -> No
     assert (dataset.joints, dataset.bones) == (COCO17.joints, ((0, 1), (0, 2)))
 
 
-def test_3d_joints_of_a_lifter_have_z_up(write_json: Write) -> None:
+def test_3d_joints_of_a_lifter_have_z_up_and_those_of_openpose_are_read(write_json: Write) -> None:
     joints = np.random.default_rng(0).normal(size=(4, 17, 3))
     joints[:, 0] = 0.0  # the pelvis: a real place in 3D
-    frames = [[{"keypoints": one.tolist(), "keypoint_scores": [[1.0] * 17]}] for one in joints]
-    clip = read_clip(write_json(frames))
+    clip = read_clip(write_json([[{"keypoints": one.tolist(), "keypoint_scores": [[1.0] * 17]}] for one in joints]))
     np.testing.assert_array_equal(clip.joints, joints)
     assert (clip.up, clip.skeleton) == ("z", None)
-
-
-def test_3d_openpose(write_json: Write) -> None:
-    joints = np.random.default_rng(0).uniform(1, 2, size=(25, 4))
-    clip = read_clip(
-        write_json({"people": [{"pose_keypoints_2d": [], "pose_keypoints_3d": triples(joints)}]}, "f_3_keypoints.json")
-    )
-    np.testing.assert_array_equal(clip.joints[0], joints[:, :3])
+    table = np.random.default_rng(0).uniform(1, 2, size=(25, 4))
+    people = {"people": [{"pose_keypoints_2d": [], "pose_keypoints_3d": triples(table)}]}
+    clip = read_clip(write_json(people, "f_3_keypoints.json"))
+    np.testing.assert_array_equal(clip.joints[0], table[:, :3])
     assert clip.times.tolist() == [0.1]
 
 
@@ -325,8 +316,7 @@ TABLES: dict[str, Callable[[np.ndarray], Rows]] = {
 }
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-@pytest.mark.parametrize("variant", TABLES)
+@grid(("delimiter", [",", ";", "\t"]), ("variant", list(TABLES)))
 def test_every_table_gives_the_same_clip(
     write_csv: Write, person: np.ndarray, expected: np.ndarray, variant: str, delimiter: str
 ) -> None:
@@ -340,31 +330,19 @@ def test_every_table_gives_the_same_clip(
         assert tuple(name.lower() for name in clip.skeleton.joints) == NAMES
 
 
-@pytest.mark.parametrize("delimiter", [",", ";"])
-def test_mediapipe_layouts(write_csv: Write, delimiter: str) -> None:
+def test_mediapipe_layouts(write_csv: Write) -> None:
     pose = np.random.default_rng(0).uniform(0.1, 0.9, size=(3, 33, 3))
-    for rows in (wide(pose, lambda i, k: f"x{i}".replace("x", SHORT[k])), long(pose, int), wide(pose, lambda i, k: f"{k}_{i + 1}")):
-        clip = read_clip(write_csv(rows, delimiter=delimiter))
+    for rows in (wide(pose, lambda i, k: f"{SHORT[k]}{i}"), long(pose, int), wide(pose, lambda i, k: f"{k}_{i + 1}")):
+        clip = read_clip(write_csv(rows))
         assert clip.skeleton is MEDIAPIPE33
         np.testing.assert_array_equal(clip.joints, pose[..., :2])
-
-
-def test_mediapipe_long_names_come_in_mediapipes_order(write_csv: Write) -> None:
-    pose = np.random.default_rng(0).uniform(0.1, 0.9, size=(2, 3, 3))
     names = ["right_hip", "nose", "left_hip"]
-    clip = read_clip(write_csv(long(pose, lambda j: names[j])))
-    assert clip.skeleton is not None
-    assert clip.skeleton.joints == ("nose", "left_hip", "right_hip")
+    clip = read_clip(write_csv(long(pose[:, :3], lambda j: names[j])))  # long names come in MediaPipe's order
+    assert clip.skeleton is not None and clip.skeleton.joints == ("nose", "left_hip", "right_hip")
     np.testing.assert_array_equal(clip.joints, pose[:, [1, 2, 0], :2])
-
-
-def test_hands_have_no_visibility(write_csv: Write) -> None:
-    hand = np.random.default_rng(0).uniform(0.1, 0.9, size=(3, 21, 3))
-    hand[..., 2] = 0.0
+    hand = pose[:, :21] * [1, 1, 0]
     clip = read_clip(write_csv(wide(hand, lambda i, k: f"{k}_{i}")))
-    assert clip.confidence is None
-    assert clip.seen.all()
-    assert clip.skeleton is HAND21
+    assert clip.confidence is None and clip.seen.all() and clip.skeleton is HAND21  # hands have no visibility
 
 
 def test_size_undoes_the_aspect_ratio(write_csv: Write, person: np.ndarray, expected: np.ndarray) -> None:
@@ -374,24 +352,24 @@ def test_size_undoes_the_aspect_ratio(write_csv: Write, person: np.ndarray, expe
     np.testing.assert_allclose(read_clip(write_csv(rows)).joints, expected / [640, 480])
 
 
-@pytest.mark.parametrize(
-    ("column", "stamps"),
-    [
-        ("time", [0.0, 0.04, 0.1, 0.12, 0.2, 0.24]),
-        ("timestamp", [0.0, 0.04, 0.1, 0.12, 0.2, 0.24]),
-        ("timestamp", [0, 40, 100, 120, 200, 240]),
-        ("timestamp_ms", [0, 40, 100, 120, 200, 240]),
-        ("time (s)", [0.0, 0.04, 0.1, 0.12, 0.2, 0.24]),
-        ("timestamp", [0, 40_000, 100_000, 120_000, 200_000, 240_000]),
-        ("time_us", [0, 40_000, 100_000, 120_000, 200_000, 240_000]),
-    ],
+STAMPS = np.array([0.0, 0.04, 0.1, 0.12, 0.2, 0.24])
+
+
+@grid(
+    (
+        ("column", "unit"),
+        [
+            *(("time", 1), ("timestamp", 1), ("timestamp", 1e3), ("timestamp_ms", 1e3), ("time (s)", 1)),
+            *(("timestamp", 1e6), ("time_us", 1e6)),
+        ],
+    ),
+    ("table", [wide, long]),
 )
-@pytest.mark.parametrize("table", [wide, long])
-def test_a_time_column_gives_the_times(write_csv: Write, person: np.ndarray, column: str, stamps: list[float], table: Any) -> None:
+def test_a_time_column_gives_the_times(write_csv: Write, person: np.ndarray, column: str, unit: float, table: Any) -> None:
     rows = wide(person, lambda i, k: f"{NAMES[i]}_{k}") if table is wide else long(person, int)
-    timed = [[column, *rows[0]], *([stamps[row[0]], *row] for row in rows[1:])]
+    timed = [[column, *rows[0]], *([f"{unit * STAMPS[row[0]]:g}", *row] for row in rows[1:])]
     clip = read_clip(write_csv(timed), fps=10.0)
-    np.testing.assert_allclose(clip.times, [0.0, 0.04, 0.1, 0.12, 0.2, 0.24])
+    np.testing.assert_allclose(clip.times, STAMPS)
     assert not clip.fps_assumed
     bare = [[cell for i, cell in enumerate(row) if i != 1] for row in timed]  # no frame column: times alone
     np.testing.assert_allclose(read_clip(write_csv(bare)).times, clip.times)
@@ -457,41 +435,38 @@ ONE = np.arange(1.0, 52.0).reshape(1, 17, 3).repeat(4, axis=0)
 MP = wide(ONE, lambda i, k: f"{NAMES[i]}_{k}")
 
 
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        (changed(MP, 2, 1, "abc"), ("row 3, column 'nose_x'", "'abc' is not a number", "leave it empty")),
-        (changed(deeplabcut(ONE), 4, 2, "?"), ("row 5, column 'y'", "'?'")),
-        (changed(sleap(ONE), 1, 3, "?"), ("row 2, column 'nose.x'", "'?'")),
-        ([*MP[:3], MP[3][:7]], ("row 4 has 7 cells, the header 69", "truncated")),
-        (MP[:1], ("header but no rows", "export it again")),
-        (deeplabcut(ONE)[:3], ("header but no rows", "export it again")),
-        (changed(MP, 2, 0, 7), ("frame numbers must increase, but 2 follows 7", "sort")),
-        (changed(MP, 2, 0, 0), ("frame 0 comes twice", "column 'person'")),
-        (changed(MP, 2, 0, ""), ("data row 2 has no frame number", "number every row")),
-        (changed(long(ONE, int), 2, 1, 10**9), ("landmark 1000000000", "at most")),
-        (changed(MP, 2, 1, "inf"), ("frame 1, joint 0: infinite", "leave them empty")),
-        ([["scorer", "a"], ["bodyparts"], ["coords", "x", "y"]], ("different lengths", "save_as_csv")),
-        ([[""], [""]], ("empty", "export it again")),
-        (changed(changed(MP, 0, 0, "time_s"), 2, 0, 9.0), ("times must increase", "2 s after 9 s", "sort the rows by time")),
-        (changed(changed(MP, 0, 0, "time"), 2, 0, ""), ("frame 1 has no time", "fps=")),
-        (changed(MP, 1, 4, ""), ("frame 0, joint 0", "confidence is NaN", "write 0")),
-        ([MP[0], *([i, *[0.0] * 68] for i in range(3))], ("no person was detected in any of 3 frames", "threshold")),
-        (changed(long(ONE, int), 2, 1, 0), ("landmark '0' comes twice",)),
-        ([row[1:] for row in long(ONE, int)], ("no frame or time column", "export one")),
-        (deeplabcut(ONE)[:1] + deeplabcut(ONE)[2:], ("no header row 'bodyparts'", "save_as_csv")),
-        (changed(deeplabcut(ONE), 2, 2, "likelihood"), ("nose has the columns x, likelihood",)),
-        (changed(deeplabcut(ONE), 4, 0, "first"), ("frame 'first' has no number",)),
-        (changed(deeplabcut(ONE), 4, 0, 0), ("frame numbers must increase, but 0 follows 0", "drop repeated")),
-        (changed(sleap(ONE), 0, 4, "nose.q"), ("no column 'nose.y'", "Export Analysis CSV")),
-        (changed(sleap(ONE), 2, 1, ""), ("data row 2 has no frame number", "number every row")),
-    ],
-)
-def test_broken_tables_are_named(write_csv: Write, rows: Rows, words: tuple[str, ...]) -> None:
-    refused(write_csv(rows), *words)
+BROKEN_TABLES: list[tuple[Rows, tuple[str, ...]]] = [
+    (changed(MP, 2, 1, "abc"), ("row 3, column 'nose_x'", "'abc' is not a number", "leave it empty")),
+    (changed(deeplabcut(ONE), 4, 2, "?"), ("row 5, column 'y'", "'?'")),
+    (changed(sleap(ONE), 1, 3, "?"), ("row 2, column 'nose.x'", "'?'")),
+    ([*MP[:3], MP[3][:7]], ("row 4 has 7 cells, the header 69", "truncated")),
+    (MP[:1], ("header but no rows", "export it again")),
+    (deeplabcut(ONE)[:3], ("header but no rows", "export it again")),
+    (changed(MP, 2, 0, 7), ("frame numbers must increase, but 2 follows 7", "sort")),
+    (changed(MP, 2, 0, 0), ("frame 0 comes twice", "column 'person'")),
+    (changed(MP, 2, 0, ""), ("data row 2 has no frame number", "number every row")),
+    (changed(long(ONE, int), 2, 1, 10**9), ("landmark 1000000000", "at most")),
+    (changed(MP, 2, 1, "inf"), ("frame 1, joint 0: infinite", "leave them empty")),
+    ([["scorer", "a"], ["bodyparts"], ["coords", "x", "y"]], ("different lengths", "save_as_csv")),
+    ([[""], [""]], ("empty", "export it again")),
+    (changed(changed(MP, 0, 0, "time_s"), 2, 0, 9.0), ("times must increase", "2 s after 9 s", "sort the rows by time")),
+    (changed(changed(MP, 0, 0, "time"), 2, 0, ""), ("frame 1 has no time", "fps=")),
+    (changed(MP, 1, 4, ""), ("frame 0, joint 0", "confidence is NaN", "write 0")),
+    ([MP[0], *([i, *[0.0] * 68] for i in range(3))], ("no person was detected in any of 3 frames", "threshold")),
+    (changed(long(ONE, int), 2, 1, 0), ("landmark '0' comes twice",)),
+    ([row[1:] for row in long(ONE, int)], ("no frame or time column", "export one")),
+    (deeplabcut(ONE)[:1] + deeplabcut(ONE)[2:], ("no header row 'bodyparts'", "save_as_csv")),
+    (changed(deeplabcut(ONE), 2, 2, "likelihood"), ("nose has the columns x, likelihood",)),
+    (changed(deeplabcut(ONE), 4, 0, "first"), ("frame 'first' has no number",)),
+    (changed(deeplabcut(ONE), 4, 0, 0), ("frame numbers must increase, but 0 follows 0", "drop repeated")),
+    (changed(sleap(ONE), 0, 4, "nose.q"), ("no column 'nose.y'", "Export Analysis CSV")),
+    (changed(sleap(ONE), 2, 1, ""), ("data row 2 has no frame number", "number every row")),
+]
 
 
-def test_animals_with_other_parts_are_refused(write_csv: Write) -> None:
+def test_broken_tables_are_named(write_csv: Write) -> None:
+    for rows, words in BROKEN_TABLES:
+        refused(write_csv(rows), *words)
     rows = deeplabcut_animals({"a": ONE, "b": ONE})
     rows[2] = [cell if i < 52 else f"{cell}2" for i, cell in enumerate(rows[2])]
     refused(write_csv(rows), "the individual 'b' has other body parts")

@@ -8,6 +8,7 @@ import os
 import re
 import zipfile
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from indexing.readers.formats.clipset import read_film_set
 from indexing.readers.matches import open_points, read_image, read_matches, read_pair
 from indexing.readers.tracks import read_tracks
 from indexing.sync.calibration import read_calibration
+from tests.grid import grid
 from tests.indexing.readers import tools
 
 JOINTS = np.random.default_rng(0).uniform(0, 100, (6, 17, 2))
@@ -80,25 +82,21 @@ def test_declared_sizes_are_checked_before_anything_is_made(tmp_path: Path) -> N
         refused(npz(tmp_path / "a.npz", **members), read)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("((((", ("header is damaged",)), ("'a", ("header is damaged",)), ("{'shape': (3, ", ("header is damaged",)),
-        ("-" * 9000, ("header is damaged",)), ("x" * 30_000, ("header is damaged",)), ("__import__('os')", ("header is damaged",)),
-        ("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", ("Python objects", "pickle")),
-        ("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (10**12,)}", ("header is damaged",)),
-        ("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1000000000000,)}", ("records",)),
-        ("{'descr': '(1000000,)f8', 'fortran_order': False, 'shape': (1000000,)}", ("records",)),
-        ("{'descr': '<f8', 'fortran_order': False, 'shape': [3, 2]}", ("header is damaged",)),
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("action", [read_pair, tracks])
-def test_headers_that_are_none_are_refused(
-    text: str, words: tuple[str, ...], action: Callable[[Path], Any], tmp_path: Path
-) -> None:
-    (tmp_path / "a.npy").write_bytes(npy((), text=text))
-    refused(tmp_path / "a.npy", action, *words)
-    refused(npz(tmp_path / "a.npz", x1=npy((), text=text), x2=JOINTS[0], tracks=npy((), text=text)), action, *words)
+def test_headers_that_are_none_are_refused(tmp_path: Path) -> None:
+    damaged = ("((((", "'a", "{'shape': (3, ", "-" * 9000, "x" * 30_000, "__import__('os')")
+    for text, word in (
+        *((text, "header is damaged") for text in damaged),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", "Python objects"),
+        ("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (10**12,)}", "header is damaged"),
+        ("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1000000000000,)}", "records"),
+        ("{'descr': '(1000000,)f8', 'fortran_order': False, 'shape': (1000000,)}", "records"),
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': [3, 2]}", "header is damaged"),
+    ):
+        (tmp_path / "a.npy").write_bytes(npy((), text=text))
+        npz(tmp_path / "a.npz", x1=npy((), text=text), x2=JOINTS[0], tracks=npy((), text=text))
+        for action in (read_pair, tracks):
+            refused(tmp_path / "a.npy", action, word)
+            refused(tmp_path / "a.npz", action, word)
 
 
 def test_an_archive_that_unpacks_to_far_more_than_it_has_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,33 +108,26 @@ def test_an_archive_that_unpacks_to_far_more_than_it_has_is_refused(tmp_path: Pa
     assert len(read(npz(tmp_path / "c.npz", zipfile.ZIP_DEFLATED, joints=JOINTS, junk=bomb))[0]) == len(JOINTS)
 
 
-@pytest.mark.parametrize("action", [read, read_film_set, read_pair, views, tracks])
-def test_encrypted_and_strangely_packed_members_are_named(action: Callable[[Path], Any], tmp_path: Path) -> None:
-    arrays = {"joints": JOINTS, "frames": JOINTS, "x1": JOINTS[0], "x2": JOINTS[0], "x3": JOINTS[0], "tracks": JOINTS}
-    arrays = {"x": {n: arrays[n] for n in ("x1", "x2", "x3")}, "other": arrays}["x" if action is views else "other"]
-    path = npz(tmp_path / "a.npz", **arrays)
-    refused(directory(path, 8, 1), action, "is encrypted")
+@grid(("action", [read, read_film_set, read_pair, views, tracks]))
+def test_archives_that_are_packed_strangely_cut_off_or_damaged_are_refused(action: Callable[[Path], Any], tmp_path: Path) -> None:
+    names = ("x1", "x2", "x3") if action is views else ("joints", "frames", "x1", "x2", "tracks")
+    path, values = tmp_path / "a.npz", np.uint8(JOINTS) if action is read_film_set else JOINTS
+    arrays = {name: JOINTS[0] if name[0] == "x" else values for name in names}
+    refused(directory(npz(path, **arrays), 8, 1), action, "is encrypted")
     directory(path, 8, 0)
     refused(directory(path, 10, 99), action, "packed by AES")
     refused(npz(path, zipfile.ZIP_BZIP2, **arrays), action, "packed by bzip2")
-    data = bytearray(npz(path, zipfile.ZIP_DEFLATED, **arrays).read_bytes())
-    for found in re.finditer(rb"PK\x03\x04", bytes(data)):
-        data[found.start() + 60 : found.start() + 100] = b"\xa5" * 40
-    path.write_bytes(bytes(data))
-    refused(path, action)
-
-
-@pytest.mark.parametrize("action", [read, read_film_set, read_pair, views, tracks])
-def test_archives_that_are_cut_off_or_damaged_are_refused(action: Callable[[Path], Any], tmp_path: Path) -> None:
-    names = ("x1", "x2", "x3") if action is views else ("joints", "frames", "x1", "x2", "tracks")
-    path, values = tmp_path / "a.npz", np.uint8(JOINTS) if action is read_film_set else JOINTS
-    arrays = dict.fromkeys(names, JOINTS[0]) if action is views else {n: JOINTS[0] if n[0] == "x" else values for n in names}
     for save in (np.savez, np.savez_compressed):
         save(path, **arrays)
         whole = path.read_bytes()
         for size in (50, len(whole) // 2, len(whole) - 40):
             path.write_bytes(whole[:size])
             refused(path, action, "cannot be read as numpy data", "truncated")
+    data = bytearray(whole)
+    for found in re.finditer(rb"PK\x03\x04", whole):
+        data[found.start() + 60 : found.start() + 100] = b"\xa5" * 40
+    path.write_bytes(bytes(data))
+    refused(path, action)
     path.write_bytes(b"PK cut off")
     refused(path, action, "it is not an .npz file")
 
@@ -182,28 +173,27 @@ ACTIONS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("way", ["pipe", "device", "loop", "nothing"])
-@pytest.mark.parametrize(("name", "action"), ACTIONS)
-def test_pipes_devices_and_broken_links_are_refused(way: str, name: str, action: Callable[[Path], Any], tmp_path: Path) -> None:
-    path = tmp_path / name
-    {
-        "pipe": lambda: os.mkfifo(path),
-        "device": lambda: path.symlink_to("/dev/zero"),
-        "loop": lambda: path.symlink_to(name),
-        "nothing": lambda: path.symlink_to("nowhere"),
-    }[way]()
-    words = {"pipe": "is a pipe", "device": "is a device", "loop": "leads back to itself", "nothing": "that is not there"}
-    refused(path, action, words[way])
+WAYS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "pipe": (os.mkfifo, "is a pipe"),
+    "device": (lambda path: path.symlink_to("/dev/zero"), "is a device"),
+    "loop": (lambda path: path.symlink_to(path.name), "leads back to itself"),
+    "nothing": (lambda path: path.symlink_to("nowhere"), "that is not there"),
+    "folder": (lambda path: path.mkdir(), "is a folder"),
+}
 
 
-@pytest.mark.parametrize("suffix", ["json", "txt"])
-@pytest.mark.parametrize("way", ["folder", "pipe", "device"])
-def test_a_folder_of_frames_names_the_one_that_is_no_file(suffix: str, way: str, tmp_path: Path) -> None:
-    for i in range(3):
-        (tmp_path / f"a_{i}.{suffix}").write_text('{"people": []}')
-    odd = tmp_path / f"a_7.{suffix}"
-    odd.mkdir() if way == "folder" else os.mkfifo(odd) if way == "pipe" else odd.symlink_to("/dev/zero")
-    refused(odd, lambda path: read(path.parent), f"is a {way}")
+def test_pipes_devices_and_broken_links_are_refused(tmp_path: Path) -> None:
+    for way, (number, (name, action)) in product(("pipe", "device", "loop", "nothing"), enumerate(ACTIONS)):
+        path = tmp_path / f"{number}{way}{name}"
+        WAYS[way][0](path)
+        refused(path, action, WAYS[way][1])
+    for way, suffix in product(("folder", "pipe", "device"), ("json", "txt")):  # a folder of frames names the one that is no file
+        folder = tmp_path / f"{way}{suffix}"
+        folder.mkdir()
+        for i in range(3):
+            (folder / f"a_{i}.{suffix}").write_text('{"people": []}')
+        WAYS[way][0](folder / f"a_7.{suffix}")
+        refused(folder / f"a_7.{suffix}", lambda path: read(path.parent), WAYS[way][1])
 
 
 def test_a_file_larger_than_any_of_its_kind_is_not_read(tmp_path: Path) -> None:
@@ -215,34 +205,36 @@ def test_a_file_larger_than_any_of_its_kind_is_not_read(tmp_path: Path) -> None:
 
 
 # ---- JSON, TOML, tables --------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("new", "words"),
-    [
-        ("9" * 400, ("annotation 0", "expected numbers")), ("9" * 5000, ("thousands of digits",)),
-        ("[" * 100_000, ("nested too deeply",)),
-        ("1e400", ("infinite coordinates", "leave them empty")), ('"' + "x" * 10**5 + '"', ("expected numbers, got ['xxx",)),
-    ],
-)  # fmt: skip
-def test_json_of_numbers_and_brackets_without_end(new: str, words: tuple[str, ...], tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text(json.dumps(PEOPLE).replace("10.5", new))
-    refused(tmp_path / "a.json", read, *words)
+def test_json_of_numbers_and_brackets_without_end(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    for new, *words in (
+        ("9" * 400, "annotation 0", "expected numbers"),
+        ("9" * 5000, "thousands of digits"),
+        ("[" * 100_000, "nested too deeply"),
+        ("1e400", "infinite coordinates", "leave them empty"),
+        ('"' + "x" * 10**5 + '"', "expected numbers, got ['xxx"),
+    ):
+        path.write_text(json.dumps(PEOPLE).replace("10.5", new))
+        refused(path, read, *words)
     for nothing_else in ("[" * 900 + "]" * 900, "[" * 100_000, '{"a":' * 400 + "1" + "}" * 400):
-        (tmp_path / "a.json").write_text(nothing_else)
-        refused(tmp_path / "a.json", read)
+        path.write_text(nothing_else)
+        refused(path, read)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "a = " + "[" * 5000 + "]" * 5000, "a = " + "{a=" * 5000, "[" + ".".join("a" * 5000) + "]", ".".join("a" * 5000) + " = 1",
-        "a = " + "9" * 5000, "[c]\nmatrix = [[" + "9" * 400 + ", 0, 1], [0, 1, 1], [0, 0, 1]]", "#" * 2**21,
+def test_toml_that_goes_deep_or_holds_no_camera(tmp_path: Path) -> None:
+    for text in (
+        "a = " + "[" * 5000 + "]" * 5000,
+        "a = " + "{a=" * 5000,
+        "[" + ".".join("a" * 5000) + "]",
+        ".".join("a" * 5000) + " = 1",
+        "a = " + "9" * 5000,
+        "[c]\nmatrix = [[" + "9" * 400 + ", 0, 1], [0, 1, 1], [0, 0, 1]]",
+        "#" * 2**21,
         "[c]\nmatrix = [[[[]]]]",
         "[c]\nmatrix = [[900, 0, 1], [0, 900, 1], [0, 0, 1e-320]]",
-    ],
-)  # fmt: skip
-def test_toml_that_goes_deep_or_holds_no_camera(text: str, tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text(text)
-    refused(tmp_path / "a.toml", read_calibration, "Pose2Sim")
+    ):
+        (tmp_path / "a.toml").write_text(text)
+        refused(tmp_path / "a.toml", read_calibration, "Pose2Sim")
 
 
 def test_a_table_that_names_everything_differently_is_not_laid_out(tmp_path: Path) -> None:
@@ -251,12 +243,9 @@ def test_a_table_that_names_everything_differently_is_not_laid_out(tmp_path: Pat
     refused(path, tracks, "5000 views and 5000 points", "same name")
     path.write_text("frame,landmark,x,y\n" + "".join(f"{i},p{i},1,2\n" for i in range(5000)))
     refused(path, read, "5000 landmarks", "same name")
-
-
-@pytest.mark.parametrize("action", [read, read_pair, open_points, tracks])
-def test_a_row_of_a_million_cells_is_refused(action: Callable[[Path], Any], tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("x," * 100_000 + "\n1,2\n")
-    refused(tmp_path / "a.csv", action, "100001 cells")
+    path.write_text("x," * 100_000 + "\n1,2\n")
+    for action in (read, read_pair, open_points, tracks):
+        refused(path, action, "100001 cells")
 
 
 # ---- counts of C3D and PLY -----------------------------------------------------------------------------------------------

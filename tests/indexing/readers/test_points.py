@@ -28,9 +28,8 @@ def ply(path: Path, order: str, rows: bytes, properties: str = "", count: int = 
 
 
 # ---- CSV -----------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("content", "values", "ids"),
-    [
+def test_csv(tmp_path):
+    for content, values, ids in (
         ("1,2\n3,4\n", [[1, 2], [3, 4]], None),
         ("x,y\n1,2\n3,\n", [[1, 2], [3, np.nan]], None),
         ("y, X ,quality\n2,1,.5\nNaN,3,.5\n", [[1, 2], [3, np.nan]], None),
@@ -41,23 +40,17 @@ def ply(path: Path, order: str, rows: bytes, properties: str = "", count: int = 
         ("\ufeffx\ty\n1e3\t-2\n\n", [[1000, -2]], None),
         ("x1,y1,z1,x2,y2,z2\n1,2,3,4,5,6\n", [[[1, 2, 3], [4, 5, 6]]], None),
         ("1,2,3,4,5,6\n", [[[1, 2, 3], [4, 5, 6]]], None),
-    ],
-)
-def test_csv(tmp_path, content, values, ids):
-    found = open_points(text(tmp_path / "a.csv", content))
-    np.testing.assert_array_equal(found.values, np.array(values, dtype=float))
-    assert found.values.dtype == np.float64 and found.ids == ids
-    assert found.lines == (np.ndim(values) == 3)
-
-
-def test_csv_weights_and_static(tmp_path):
+    ):
+        found = open_points(text(tmp_path / "a.csv", content))
+        np.testing.assert_array_equal(found.values, np.array(values, dtype=float))
+        assert found.values.dtype == np.float64 and found.ids == ids
+        assert found.lines == (np.ndim(values) == 3)
     found = open_points(text(tmp_path / "a.csv", "x,y,weight,static\n1,2,.5,yes\n3,4,2,0\n5,6,1,\n"))
     assert found.weights.tolist() == [0.5, 2, 1] and found.static.tolist() == [True, False, False]
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
+def test_csv_refused(tmp_path):
+    for content, says in (
         ("", "the file is empty"),
         ("  \n\n", "the file is empty"),
         ("x,y\n", "a header but no rows"),
@@ -72,10 +65,8 @@ def test_csv_weights_and_static(tmp_path):
         ("x,x,y\n1,2,3\n", "two columns 'x'"),
         ("x,y,static\n1,2,3\n", "row 2, column 'static': 3 is neither 0 nor 1"),
         ("x,y,weight\n1,2,w\n", "row 2, column 'weight': 'w' is not a number"),
-    ],
-)
-def test_csv_refused(tmp_path, content, says):
-    refused(text(tmp_path / "a.csv", content), says, action=open_points)
+    ):
+        refused(text(tmp_path / "a.csv", content), says, action=open_points)
 
 
 def test_other_files_are_refused(tmp_path):
@@ -106,9 +97,10 @@ def test_ply_binary_with_other_properties(tmp_path, order, sign):
     assert found.ids == ("5", "3", "9")
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
+def test_ply_refused(tmp_path):
+    path = ply(tmp_path / "a.ply", "ascii", "\n".join(" ".join(map(str, row)) for row in XYZ).encode())
+    sound, binary = path.read_bytes(), XYZ.astype("<f4").tobytes()
+    for change, says in (
         ((b"end_header", b"end"), "no end_header"),
         ((b"ascii", b"morse"), "the line 'format morse 1.0'"),
         ((b"element vertex 3", b"element vertex many"), "the line 'element vertex many'"),
@@ -120,21 +112,12 @@ def test_ply_binary_with_other_properties(tmp_path, order, sign):
         ((b"5.0", b"five"), "vertex 2, 'y': 'five' is not a number"),
         ((b" 5.0 ", b" "), "vertex 2 has 2 values, the header 3"),
         ((b"format ascii 1.0\n", b""), "no format"),
-    ],
-)
-def test_ply_refused(tmp_path, change, says):
-    rows = "\n".join(" ".join(map(str, row)) for row in XYZ).encode()
-    path = ply(tmp_path / "a.ply", "ascii", rows)
-    path.write_bytes(path.read_bytes().replace(*change))
-    refused(path, says, action=open_points)
-
-
-def test_ply_binary_cut_short(tmp_path):
-    with pytest.raises(ValueError, match="has 2 of 3 vertices; the file may be truncated"):
-        open_points(ply(tmp_path / "a.ply", "binary_little_endian", XYZ.astype("<f4").tobytes()[:-1]))
-    before = "element strip 1\nproperty list uchar int i\n"
-    with pytest.raises(ValueError, match="the lists of 'strip' come before the vertices"):
-        open_points(ply(tmp_path / "a.ply", "binary_little_endian", XYZ.astype("<f4").tobytes(), before=before))
+    ):
+        path.write_bytes(sound.replace(*change))
+        refused(path, says, action=open_points)
+    refused(ply(path, "binary_little_endian", binary[:-1]), "has 2 of 3 vertices; the file may be truncated", action=open_points)
+    ply(path, "binary_little_endian", binary, before="element strip 1\nproperty list uchar int i\n")
+    refused(path, "the lists of 'strip' come before the vertices", action=open_points)
 
 
 # ---- C3D -----------------------------------------------------------------------------------------------------------------
