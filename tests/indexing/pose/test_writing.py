@@ -276,14 +276,21 @@ def test_a_piece_that_cannot_be_kept_ends_the_video_and_the_next_run_completes_i
 
 
 @pytest.mark.slow
-def test_networks_that_fail_make_nothing_final(tmp_path, seeing, monkeypatch):
+def test_a_run_that_fails_keeps_the_pieces_of_the_one_before(tmp_path, seeing, monkeypatch):
     path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
     interrupted(path, folder)
+
+    def fails(said):
+        with pytest.raises(ValueError, match=said):
+            keypoint_file(path, folder, options=SHORT, workers=2)
+        assert [entry.name for entry in folder.iterdir()] == [".a.parts"] and len(list((folder / ".a.parts").iterdir())) == 2
+
     with monkeypatch.context() as patch:
         patch.setattr("indexing.pose.detection.LiteNetworks", lambda models: (_ for _ in ()).throw(ValueError("no such network")))
-        with pytest.raises(ValueError, match="no such network"):
-            keypoint_file(path, folder, options=SHORT, workers=2)
-    assert [entry.name for entry in folder.iterdir()] == [".a.parts"] and len(list((folder / ".a.parts").iterdir())) == 2
+        fails("no such network")
+    kept = path.rename(tmp_path / "elsewhere.mp4")
+    fails("no such file")
+    kept.rename(path)
     assert same(keypoint_file(path, folder, options=SHORT).clips, detect(path, options=SHORT))
 
 
@@ -320,18 +327,6 @@ def test_pieces_that_cannot_be_decoded_are_left_out_and_said(tmp_path, seeing, m
     assert made.found.notes == ("1 part of it cannot be decoded (nothing can be decoded)",)
     assert len(made.clips[0]) == 35 and len(frames_in(made.folder)) == 35
     assert keypoint_file(path, tmp_path / "pose", options=SHORT).reused
-
-
-@pytest.mark.slow
-def test_a_video_that_cannot_be_read_now_keeps_its_pieces(tmp_path, seeing):
-    path, folder = film(tmp_path, [[walk(i)] for i in range(50)]), tmp_path / "pose"
-    interrupted(path, folder)
-    kept = path.rename(tmp_path / "elsewhere.mp4")
-    with pytest.raises(ValueError, match="no such file"):
-        keypoint_file(path, folder, options=SHORT)
-    assert len(list((folder / ".a.parts").iterdir())) == 2
-    kept.rename(path)
-    assert same(keypoint_file(path, folder, options=SHORT).clips, detect(path, options=SHORT))
 
 
 @pytest.mark.slow

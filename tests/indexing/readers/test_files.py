@@ -167,47 +167,45 @@ def test_a_video_without_a_pose_model_is_refused(tmp_path: Path, monkeypatch: py
         refused(tmp_path / name, "is a video", "no pose model", "or give keypoints")
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("empty.json", b"", ("empty", "export it again")),
-        ("blank.json", b" \n ", ("empty", "export it again")),
-        ("cut.json", b'[{"image_id": 1, "keypoints": [1.0, 2.', ("not valid JSON at line 1, column", "truncated")),
-        ("model.safetensors", b"\x10\0\0\0\0\0\0\0{}", ("model file", "-m")),
-        *((f"weights.{suffix}", b"\x80\x04N.", ("is a pickle",)) for suffix in ("pt", "pth", "joblib")),
-        ("renamed.json", b'\x40\0\0\0\0\0\0\0{"__metadata__":{}}', ("model file", "-m")),
-        ("photo.jpg", b"\xff\xd8\xff\xe0\x00\x10JFIF\x00", ("binary file", "JSON, CSV")),
-        ("latin.csv", b"\xff\xfe\xe9x,y\n", ("UTF-8", "JSON, CSV")),
-        ("prices.csv", b"date,price\n1,2\n", ("without keypoint columns", "date, price", "format=")),
-        ("set.npz", b"this is not a zip archive", ("not an .npz", "truncated")),
-        ("object.json", b'{"version": 1}', ("without keypoints", "version", "format=")),
-        ("numbers.json", b"[1, 2, 3]", ("without keypoints", "format=")),
-        ("boxes.json", b'[{"bbox": [1, 2]}]', ("without keypoints", "bbox")),
-        ("nobody.json", b"[]", ("no person was detected", "threshold")),
-        ("nobody.json", b"[[], [], []]", ("no person was detected", "threshold")),
-    ],
-)
-def test_what_is_no_keypoint_file_is_refused(tmp_path: Path, name: str, content: bytes, words: tuple[str, ...]) -> None:
-    path = tmp_path / name
-    path.write_bytes(content)
-    refused(path, *words)
+NO_KEYPOINTS: list[tuple[str, bytes, tuple[str, ...]]] = [
+    ("empty.json", b"", ("empty", "export it again")),
+    ("blank.json", b" \n ", ("empty", "export it again")),
+    ("cut.json", b'[{"image_id": 1, "keypoints": [1.0, 2.', ("not valid JSON at line 1, column", "truncated")),
+    ("model.safetensors", b"\x10\0\0\0\0\0\0\0{}", ("model file", "-m")),
+    *((f"weights.{suffix}", b"\x80\x04N.", ("is a pickle",)) for suffix in ("pt", "pth", "joblib")),
+    ("renamed.json", b'\x40\0\0\0\0\0\0\0{"__metadata__":{}}', ("model file", "-m")),
+    ("photo.jpg", b"\xff\xd8\xff\xe0\x00\x10JFIF\x00", ("binary file", "JSON, CSV")),
+    ("latin.csv", b"\xff\xfe\xe9x,y\n", ("UTF-8", "JSON, CSV")),
+    ("prices.csv", b"date,price\n1,2\n", ("without keypoint columns", "date, price", "format=")),
+    ("set.npz", b"this is not a zip archive", ("not an .npz", "truncated")),
+    ("object.json", b'{"version": 1}', ("without keypoints", "version", "format=")),
+    ("numbers.json", b"[1, 2, 3]", ("without keypoints", "format=")),
+    ("boxes.json", b'[{"bbox": [1, 2]}]', ("without keypoints", "bbox")),
+    ("nobody.json", b"[]", ("no person was detected", "threshold")),
+    ("nobody.json", b"[[], [], []]", ("no person was detected", "threshold")),
+]
 
 
-@pytest.mark.parametrize(
-    ("names", "words"),
-    [
-        ([], ("no .json or .txt", "nothing")),
-        (["a.mkv", "b.mkv"], ("no .json or .txt", "a.mkv")),
-        (["squat.json"], ("squat.json", "no frame number")),
-        (["a_001.json", "b_001.json"], ("a_001.json", "b_001.json", "frame 1", "folder of its own")),
-    ],
-)
-def test_a_folder_that_is_not_one_recording_is_refused(tmp_path: Path, names: list[str], words: tuple[str, ...]) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    for name in names:
-        (folder / name).write_text('{"people": []}')
-    refused(folder, *words)
+def test_what_is_no_keypoint_file_is_refused(tmp_path: Path) -> None:
+    for name, content, words in NO_KEYPOINTS:
+        (tmp_path / name).write_bytes(content)
+        refused(tmp_path / name, *words)
+
+
+def test_a_folder_that_is_not_one_recording_is_refused(tmp_path: Path) -> None:
+    for i, (names, *words) in enumerate(
+        (
+            ([], "no .json or .txt", "nothing"),
+            (["a.mkv", "b.mkv"], "no .json or .txt", "a.mkv"),
+            (["squat.json"], "squat.json", "no frame number"),
+            (["a_001.json", "b_001.json"], "a_001.json", "b_001.json", "frame 1", "folder of its own"),
+        )
+    ):
+        folder = tmp_path / f"folder{i}"
+        folder.mkdir()
+        for name in names:
+            (folder / name).write_text('{"people": []}')
+        refused(folder, *words)
 
 
 def test_a_truncated_file_of_a_folder_is_named(openpose_folder, person: np.ndarray) -> None:  # type: ignore[no-untyped-def]
@@ -217,24 +215,18 @@ def test_a_truncated_file_of_a_folder_is_named(openpose_folder, person: np.ndarr
     refused(broken.parent, broken.name, "not valid JSON", "truncated")
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"format": "bvh"}, ("unknown format='bvh'", "openpose")),
-        ({"person": "tallest"}, ("unknown person='tallest'", "largest")),
-        ({"fps": 0}, ("fps must be a positive number", "0")),
-        ({"fps": float("nan")}, ("fps", "nan")),
-        ({"min_confidence": float("inf")}, ("min_confidence", "inf")),
-        ({"size": (640, 0)}, ("size", "(640, 0)")),
-        ({"size": 640}, ("size", "640")),
-    ],
-)
-def test_unknown_options_are_refused(tmp_path: Path, options: dict[str, object], words: tuple[str, ...]) -> None:
-    path = tmp_path / "a.json"
-    path.write_text("[]")
-    with pytest.raises(ValueError, match=words[0]) as caught:
-        readers.read(path, **options)  # type: ignore[arg-type]
-    assert all(word in str(caught.value) for word in words)
+def test_unknown_options_are_refused(tmp_path: Path) -> None:
+    for options, said in (
+        ({"format": "bvh"}, "unknown format='bvh'.*openpose"),
+        ({"person": "tallest"}, "unknown person='tallest'.*largest"),
+        ({"fps": 0}, "fps must be a positive number.*0"),
+        ({"fps": float("nan")}, "fps.*nan"),
+        ({"min_confidence": float("inf")}, "min_confidence.*inf"),
+        ({"size": (640, 0)}, r"size.*\(640, 0\)"),
+        ({"size": 640}, "size.*640"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            readers.read(tmp_path / "a.json", **options)  # type: ignore[arg-type]
 
 
 def test_naming_the_wrong_format_says_what_the_file_is(tmp_path: Path) -> None:
@@ -271,9 +263,6 @@ def test_clip_and_clipset_load_through_the_readers(openpose_folder, person: np.n
     assert clips[0].times.tolist() == [i / 30 for i in range(6)]
 
 
-@pytest.mark.parametrize(
-    ("name", "number"),
-    [("video_000000000012_keypoints.json", 12), ("0.jpg", 0), ("img7_002.png", 2), ("12_rgb.json", 12), ("a.json", None), ("3", 3)],
-)
-def test_frame_number(name: str, number: int | None) -> None:
-    assert frame_number(name) == number
+def test_frame_number() -> None:
+    names = ("video_000000000012_keypoints.json", "0.jpg", "img7_002.png", "12_rgb.json", "a.json", "3")
+    assert list(map(frame_number, names)) == [12, 0, 2, 12, None, 3]

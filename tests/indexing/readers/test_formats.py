@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from indexing.readers import read, read_clip
-from indexing.skeleton import BODY25, COCO17, HALPE26, HAND21, MEDIAPIPE33
+from indexing.skeleton import COCO17, HALPE26, HALPE136, HAND21, MEDIAPIPE33, WHOLEBODY133
 from tests.grid import grid
 from tests.indexing.readers.tools import refused
 
@@ -131,11 +131,15 @@ def test_frames_without_people_are_nan_rows(write_json: Write, person: np.ndarra
         assert clip.times[1] == pytest.approx(1 / 30)
 
 
-def test_layouts(openpose_folder: Write, write_json: Write) -> None:
-    rng = np.random.default_rng(0)
-    assert read_clip(openpose_folder({0: [rng.uniform(1, 9, size=(25, 3))]})).skeleton is BODY25
-    halpe = [{"image_id": "0.jpg", "keypoints": rng.uniform(1, 9, size=78).tolist()}]
-    assert read_clip(write_json(halpe)).skeleton is HALPE26
+@grid(("variant", ["coco names", "alphapose open", "alphapose cmu"]), ("layout", [COCO17, HALPE26, WHOLEBODY133, HALPE136]))
+def test_layouts_are_known_by_their_number(write_json: Write, variant: str, layout: Any) -> None:
+    rng, count = np.random.default_rng(0), len(layout.joints)
+    person = np.concatenate([rng.uniform(10, 400, (6, count, 2)), rng.uniform(0.1, 1, (6, count, 1))], axis=2)
+    clip = read_clip(write_json(VARIANTS[variant](person)))
+    assert clip.skeleton is layout
+    np.testing.assert_allclose(clip.joints, person[..., :2])
+    np.testing.assert_allclose(clip.confidence, person[..., 2])
+    np.testing.assert_allclose(clip.times, np.arange(6) / 30)
 
 
 def test_names_of_the_file_are_kept(write_json: Write, person: np.ndarray) -> None:
@@ -194,48 +198,48 @@ def test_size_undoes_normalized_coordinates_and_refuses_pixels(write_json: Write
 GOOD = [1.0, 2.0, 0.5] * 17
 
 
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        ([{"image_id": 0, "keypoints": [1.0, 2.0]}], ("annotation 0 (image_id 0), keypoints", "3 numbers per joint", "(2,)")),
-        (
-            [{"image_id": 0, "keypoints": GOOD}, {"image_id": 1, "keypoints": GOOD[:-3]}],
-            ("frame 1", "(16, 2)", "(17, 2)", "same joint layout"),
-        ),
-        ([{"image_id": 0, "keypoints": ["a", 1, 1]}], ("annotation 0", "expected numbers", "'a'")),
-        ([{"image_id": 0, "keypoints": GOOD}, {"image_id": 1, "bbox": []}], ("annotation 1", "needs image_id and keypoints")),
-        ([{"image_id": 0, "category_id": 1, "bbox": [1, 2, 3, 4]}], ("annotation 0", "needs image_id and keypoints")),
-        ([{"image_id": "a.jpg", "keypoints": GOOD}], ("'a.jpg' has no number", "name the images")),
-        ([{"image_id": None, "keypoints": GOOD}], ("image_id must be",)),
-        (
-            [{"image_id": f"{c}/1.jpg", "keypoints": GOOD} for c in "ab"],
-            ("'a/1.jpg' and 'b/1.jpg' are both frame 1", "one recording per file"),
-        ),
-        ([{"image_id": 0, "keypoints": [0.0] * 51}], ("no person was detected in any of 1 frames", "threshold")),
-        ([{"image_id": 0, "keypoints": [1.0, 2.0, float("nan")] * 17}], ("frame 0, joint 0", "confidence is NaN", "write 0")),
-        ([{"image_id": 10**30, "keypoints": GOOD}], ("frame number 1000", "number images by frame")),
-        ([{"image_id": 0, "keypoints": [float("inf"), 2.0, 0.5] * 17}], ("frame 0, joint 0: infinite", "leave them empty")),
-        ({"annotations": []}, ("no person was detected", "threshold")),
-        (
-            {"annotations": [{"image_id": 1, "keypoints": GOOD}], "images": [{"name": "x"}]},
-            ("'images'", "export the dataset again"),
-        ),
-        ({"people": []}, ("no person was detected in any of 1 frames", "threshold")),
-        ({"people": [{"pose_keypoints_2d": [1, 2]}]}, ("frame 0, person 0, pose_keypoints_2d", "3 numbers per joint")),
-        ({"people": None}, ("frame 0: no list 'people'", "--write_json")),
-        ({"people": [3]}, ("frame 0: no list 'people'", "--write_json")),
-        ([[{"keypoint_scores": [1.0]}]], ("frame 0, instance 0: no keypoints", "pred_out_dir")),
-        ([[{"keypoints": [[1, 2, 3, 4]], "keypoint_scores": [1]}]], ("frame 0, instance 0", "(1, 4)")),
-        ([[{"keypoints": [[1, 2], [3]], "keypoint_scores": [1, 1]}]], ("frame 0, instance 0, keypoints", "expected numbers")),
-        ([[{"keypoints": [[1, 2], [3, 4]], "keypoint_scores": [1, 1, 1]}]], ("2 keypoints, but keypoint_scores of shape (3,)",)),
-        ({"instance_info": {}}, ("no list of frames", "--save-predictions")),
-        ([[{"class": 0, "box": {}, "name": "person"}]], ("frame 0, person 0: no keypoints", "pose model")),
-        ([[{"class": 0, "box": {}, "keypoints": {"x": [1, 2], "y": [1]}}]], ("frame 0, person 0", "different lengths")),
-        (["[{]"], ("frame 0: not valid JSON", "to_json")),
-    ],
-)
-def test_what_is_broken_is_named(write_json: Write, data: Any, words: tuple[str, ...]) -> None:
-    refused(write_json(data), *words)
+BROKEN: list[tuple[Any, tuple[str, ...]]] = [
+    ([{"image_id": 0, "keypoints": [1.0, 2.0]}], ("annotation 0 (image_id 0), keypoints", "3 numbers per joint", "(2,)")),
+    (
+        [{"image_id": 0, "keypoints": GOOD}, {"image_id": 1, "keypoints": GOOD[:-3]}],
+        ("frame 1", "(16, 2)", "(17, 2)", "same joint layout"),
+    ),
+    ([{"image_id": 0, "keypoints": ["a", 1, 1]}], ("annotation 0", "expected numbers", "'a'")),
+    ([{"image_id": 0, "keypoints": GOOD}, {"image_id": 1, "bbox": []}], ("annotation 1", "needs image_id and keypoints")),
+    ([{"image_id": 0, "category_id": 1, "bbox": [1, 2, 3, 4]}], ("annotation 0", "needs image_id and keypoints")),
+    ([{"image_id": "a.jpg", "keypoints": GOOD}], ("'a.jpg' has no number", "name the images")),
+    ([{"image_id": None, "keypoints": GOOD}], ("image_id must be",)),
+    (
+        [{"image_id": f"{c}/1.jpg", "keypoints": GOOD} for c in "ab"],
+        ("'a/1.jpg' and 'b/1.jpg' are both frame 1", "one recording per file"),
+    ),
+    ([{"image_id": 0, "keypoints": [0.0] * 51}], ("no person was detected in any of 1 frames", "threshold")),
+    ([{"image_id": 0, "keypoints": [1.0, 2.0, float("nan")] * 17}], ("frame 0, joint 0", "confidence is NaN", "write 0")),
+    ([{"image_id": 10**30, "keypoints": GOOD}], ("frame number 1000", "number images by frame")),
+    ([{"image_id": 0, "keypoints": [float("inf"), 2.0, 0.5] * 17}], ("frame 0, joint 0: infinite", "leave them empty")),
+    ({"annotations": []}, ("no person was detected", "threshold")),
+    (
+        {"annotations": [{"image_id": 1, "keypoints": GOOD}], "images": [{"name": "x"}]},
+        ("'images'", "export the dataset again"),
+    ),
+    ({"people": []}, ("no person was detected in any of 1 frames", "threshold")),
+    ({"people": [{"pose_keypoints_2d": [1, 2]}]}, ("frame 0, person 0, pose_keypoints_2d", "3 numbers per joint")),
+    ({"people": None}, ("frame 0: no list 'people'", "--write_json")),
+    ({"people": [3]}, ("frame 0: no list 'people'", "--write_json")),
+    ([[{"keypoint_scores": [1.0]}]], ("frame 0, instance 0: no keypoints", "pred_out_dir")),
+    ([[{"keypoints": [[1, 2, 3, 4]], "keypoint_scores": [1]}]], ("frame 0, instance 0", "(1, 4)")),
+    ([[{"keypoints": [[1, 2], [3]], "keypoint_scores": [1, 1]}]], ("frame 0, instance 0, keypoints", "expected numbers")),
+    ([[{"keypoints": [[1, 2], [3, 4]], "keypoint_scores": [1, 1, 1]}]], ("2 keypoints, but keypoint_scores of shape (3,)",)),
+    ({"instance_info": {}}, ("no list of frames", "--save-predictions")),
+    ([[{"class": 0, "box": {}, "name": "person"}]], ("frame 0, person 0: no keypoints", "pose model")),
+    ([[{"class": 0, "box": {}, "keypoints": {"x": [1, 2], "y": [1]}}]], ("frame 0, person 0", "different lengths")),
+    (["[{]"], ("frame 0: not valid JSON", "to_json")),
+]
+
+
+def test_what_is_broken_is_named(write_json: Write) -> None:
+    for data, words in BROKEN:
+        refused(write_json(data), *words)
 
 
 # ----------------------------------------------------------------------------------------------------------------------

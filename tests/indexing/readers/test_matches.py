@@ -1,7 +1,6 @@
 """Matches of two images, and photographs, from files that the tests write, broken ones included."""
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from indexing.readers.matches import MAX_SIDE, read_image, read_pair
@@ -46,53 +45,53 @@ def test_arrays(tmp_path):
     assert read_pair(tmp_path / "b.npz").name == read_pair(tmp_path / "b.npz", "one").name == "one"
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        (",,,\n", "the file is empty; export it again"),
-        ("x1,y1,x2,y2\n", "has a header but no rows"),
-        ("x,y\n1,2", "its columns are x, y; name the columns x1,y1,x2,y2"),
-        ("x1,y1,x2\n1,2,3", "its columns are x1, y1, x2; name the columns"),
-        ("hello world\nthis is not a table\n", "its columns are hello, world; name the columns"),
-        (",".join("abcdefghij") + "\n" + "1," * 9 + "1", "its columns are a, b, c, d, e, f, g, h, ...; name the columns"),
-        ("1,2,3\n4,5,6", "row 1 has 3 columns, and no row names them; name the columns x1,y1,x2,y2"),
-        ("1,2,3,4,1\n1,2,3,4,1", "row 1 has 5 columns"),
-        ("x1,y1,x2,y2,x1\n1,2,3,4,5", "there are two columns 'x1'"),
-        ("x1,y1,x2,y2,label\n1,2,3,4,1.5", "match 1: the label is 1.5; labels are 0 for an outlier"),
-        ("x1,y1,x2,y2,label\n1,2,3,4,", "match 1: the label is nan"),
-        ("x1,y1,x2,y2,label\n1,2,3,4,cup", "row 2, column 'label': 'cup' is not a number"),
-        ("x1,y1,x2,y2,weight\n1,2,3,4,-1", "match 1: the weight is -1; weights are 0 or more"),
-    ],
-)
-def test_bad_tables_name_file_field_and_remedy(tmp_path, text, says):
-    refused(table(tmp_path / "m.csv", text), says, action=read_pair)
+BAD_TABLES = [
+    (",,,\n", "the file is empty; export it again"),
+    ("x1,y1,x2,y2\n", "has a header but no rows"),
+    ("x,y\n1,2", "its columns are x, y; name the columns x1,y1,x2,y2"),
+    ("x1,y1,x2\n1,2,3", "its columns are x1, y1, x2; name the columns"),
+    ("hello world\nthis is not a table\n", "its columns are hello, world; name the columns"),
+    (",".join("abcdefghij") + "\n" + "1," * 9 + "1", "its columns are a, b, c, d, e, f, g, h, ...; name the columns"),
+    ("1,2,3\n4,5,6", "row 1 has 3 columns, and no row names them; name the columns x1,y1,x2,y2"),
+    ("1,2,3,4,1\n1,2,3,4,1", "row 1 has 5 columns"),
+    ("x1,y1,x2,y2,x1\n1,2,3,4,5", "there are two columns 'x1'"),
+    ("x1,y1,x2,y2,label\n1,2,3,4,1.5", "match 1: the label is 1.5; labels are 0 for an outlier"),
+    ("x1,y1,x2,y2,label\n1,2,3,4,", "match 1: the label is nan"),
+    ("x1,y1,x2,y2,label\n1,2,3,4,cup", "row 2, column 'label': 'cup' is not a number"),
+    ("x1,y1,x2,y2,weight\n1,2,3,4,-1", "match 1: the weight is -1; weights are 0 or more"),
+]
 
 
-@pytest.mark.parametrize(
-    ("arrays", "says"),
-    [
-        ({"a": X1}, "has no x1 (its arrays are a); give x1 and x2 (n, 2)"),
-        ({"car/y": np.stack([X1, X2]), "car/s": np.ones(10)}, "are car/y, car/s); it seems to hold tracks (frames, n, 2)"),
-        ({"x1": X1}, "has no x2"),
-        ({"x1": X1, "x2": X2[:9]}, "x1 has 10 rows, x2 9; give a row per match in both"),
-        ({"x1": X1.T, "x2": X2.T}, "x1: the array has shape (2, 10); points of an image are (n, 2): transpose it"),
-        ({"x1": np.c_[X1, X1[:, 0]], "x2": X2}, "(10, 3); points of an image are (n, 2): divide homogeneous ones by their third"),
-        ({"x1": X1[None], "x2": X2}, "(1, 10, 2); points of an image are (n, 2)"),
-        ({"x1": X1[:, :1], "x2": X2}, "(10, 1); points of an image are (n, 2)"),
-        ({"x1": X1[:0], "x2": X2[:0]}, "the array is empty"),
-        ({"x1": X1.astype(str), "x2": X2}, "holds values of type <U"),
-        ({"x1": np.where(X1 == 3, np.inf, X1), "x2": X2}, "x1: row 2, column 2: inf is not finite"),
-        ({"x1": X1, "x2": X2, "label": np.ones(9)}, "label has shape (9,), x1 has 10 rows; give one per match"),
-        ({"x1": X1, "x2": X2, "label": -np.ones(10)}, "match 1: the label is -1"),
-        ({"x1": X1, "x2": X2, "label": np.array(list("abcdefghij"))}, "label holds values of type <U1; give numbers"),
-        ({"x1": X1, "x2": X2, "weights": np.full(10, np.inf)}, "match 1: the weight is inf"),
-        ({"x1": X1, "x2": X2, "ids": np.ones(10)}, "ids: '1.0' names several matches"),
-        ({"x1": np.array([{}] * 10), "x2": X2}, "array 'x1' cannot be read"),
-    ],
-)
-def test_bad_arrays_name_file_field_and_remedy(tmp_path, arrays, says):
-    np.savez(tmp_path / "m.npz", **arrays)
-    refused(tmp_path / "m.npz", says, action=read_pair)
+def test_bad_tables_name_file_field_and_remedy(tmp_path):
+    for text, says in BAD_TABLES:
+        refused(table(tmp_path / "m.csv", text), says, action=read_pair)
+
+
+BAD_ARRAYS = [
+    ({"a": X1}, "has no x1 (its arrays are a); give x1 and x2 (n, 2)"),
+    ({"car/y": np.stack([X1, X2]), "car/s": np.ones(10)}, "are car/y, car/s); it seems to hold tracks (frames, n, 2)"),
+    ({"x1": X1}, "has no x2"),
+    ({"x1": X1, "x2": X2[:9]}, "x1 has 10 rows, x2 9; give a row per match in both"),
+    ({"x1": X1.T, "x2": X2.T}, "x1: the array has shape (2, 10); points of an image are (n, 2): transpose it"),
+    ({"x1": np.c_[X1, X1[:, 0]], "x2": X2}, "(10, 3); points of an image are (n, 2): divide homogeneous ones by their third"),
+    ({"x1": X1[None], "x2": X2}, "(1, 10, 2); points of an image are (n, 2)"),
+    ({"x1": X1[:, :1], "x2": X2}, "(10, 1); points of an image are (n, 2)"),
+    ({"x1": X1[:0], "x2": X2[:0]}, "the array is empty"),
+    ({"x1": X1.astype(str), "x2": X2}, "holds values of type <U"),
+    ({"x1": np.where(X1 == 3, np.inf, X1), "x2": X2}, "x1: row 2, column 2: inf is not finite"),
+    ({"x1": X1, "x2": X2, "label": np.ones(9)}, "label has shape (9,), x1 has 10 rows; give one per match"),
+    ({"x1": X1, "x2": X2, "label": -np.ones(10)}, "match 1: the label is -1"),
+    ({"x1": X1, "x2": X2, "label": np.array(list("abcdefghij"))}, "label holds values of type <U1; give numbers"),
+    ({"x1": X1, "x2": X2, "weights": np.full(10, np.inf)}, "match 1: the weight is inf"),
+    ({"x1": X1, "x2": X2, "ids": np.ones(10)}, "ids: '1.0' names several matches"),
+    ({"x1": np.array([{}] * 10), "x2": X2}, "array 'x1' cannot be read"),
+]
+
+
+def test_bad_arrays_name_file_field_and_remedy(tmp_path):
+    for arrays, says in BAD_ARRAYS:
+        np.savez(tmp_path / "m.npz", **arrays)
+        refused(tmp_path / "m.npz", says, action=read_pair)
 
 
 def test_photographs_keep_the_size_of_the_file(tmp_path):

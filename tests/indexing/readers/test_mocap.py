@@ -13,7 +13,7 @@ import pytest
 
 from indexing.readers import read, read_clip
 from indexing.readers.recording import NobodySeen
-from indexing.skeleton import COCO17, H36M17, HALPE26, HALPE136, MEDIAPIPE33, WHOLEBODY133
+from indexing.skeleton import COCO17, H36M17, HALPE26, MEDIAPIPE33
 from tests.grid import grid
 from tests.indexing.readers import tools
 from tests.indexing.readers.tools import refused
@@ -287,18 +287,6 @@ def test_folders_of_arrays_that_are_no_body_are_refused(tmp_path: Path) -> None:
             read(folder)
     (tmp_path / "empty" / "output_data").mkdir(parents=True)
     refused(tmp_path / "empty", "no array of a body (it has none)")
-
-
-# ---- AlphaPose -----------------------------------------------------------------------------------------------------------
-@grid(("form", ["coco", "open", "cmu"]), ("layout", [COCO17, HALPE26, WHOLEBODY133, HALPE136]))
-def test_alphapose_writes_layouts_by_their_number(layout: Any, form: str, tmp_path: Path) -> None:
-    rng, count = np.random.default_rng(0), len(layout.joints)
-    person = np.concatenate([rng.uniform(10, 400, (6, count, 2)), rng.uniform(0.1, 1, (6, count, 1))], axis=2)
-    clip = read_clip(tools.alphapose(tmp_path / "alphapose-results.json", [person], form))
-    assert clip.skeleton is layout
-    np.testing.assert_allclose(clip.joints, person[..., :2])
-    np.testing.assert_allclose(clip.confidence, person[..., 2])
-    np.testing.assert_allclose(clip.times, np.arange(6) / 30)
 
 
 # ---- MediaPipe's smoothing -----------------------------------------------------------------------------------------------

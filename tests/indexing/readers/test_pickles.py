@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import builtins
-import codecs
 import collections
 import functools
-import io
-import operator
 import os
 import pickle
 import struct
@@ -145,26 +142,14 @@ class Calls:
 NAMED = [
     (os.system, ("echo harm",)),
     (builtins.eval, ("1",)),
-    (builtins.exec, ("1",)),
     (builtins.getattr, (1, "real")),
     (builtins.__import__, ("os",)),
-    (builtins.open, ("/etc/passwd",)),
-    (operator.attrgetter, ("a",)),
     (subprocess.Popen, (["ls"],)),
     (functools.partial, (print,)),
-    (np.load, ("a",)),
-    (np.fromfile, ("/etc/passwd",)),
     (np.frombuffer, (b"1",)),
     (np.zeros, ((10**12,),)),
-    (np.memmap, ("/etc/passwd",)),
-    (codecs.decode, (b"a", "rot13")),
     (collections.OrderedDict, ()),
-    (bytearray, (10**12,)),
-    (complex, (1, 2)),
-    (set, ([1],)),
-    (io.open, ("/etc/passwd",)),
     (Path, ("/etc",)),
-    (np.random.default_rng, (0,)),
 ]
 
 

@@ -190,29 +190,29 @@ def test_npz(tmp_path):
     assert lines.lines and lines.dims == (3, 3) and lines.static_points[1].tolist() == (XYZ + 1).tolist()
 
 
-@pytest.mark.parametrize(
-    ("arrays", "says"),
-    [
-        ({"a": XYZ}, "its arrays are a; keys are x1, x2, x3"),
-        ({"x1": XYZ}, "has x1 but no x2"),
-        ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "y": XYZ}, "an array 'y', which is not known"),
-        ({"x1": XYZ, "x2": XYZ[:2], "x3": XYZ}, "x2: has 2 rows, "),
-        ({"x1": XYZ, "x2": XYZ, "x3": np.zeros((3, 4))}, "x3: the array has shape (3, 4)"),
-        ({"x1": XYZ, "x2": XYZ, "x3": np.array(["a", "b", "c"])}, "holds values of type <U1"),
-        ({"x1": XYZ[:0], "x2": XYZ[:0], "x3": XYZ[:0]}, "the array is empty"),
-        ({"x1": XYZ, "x2": XYZ, "x3": XYZ + np.inf}, "row 1, column 1: inf is not finite"),
-        ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "weights": [1, 2]}, "weights has shape (2,), x1 has 3 rows"),
-        ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "weights": [1, 2, -1]}, "match 3: the weight is -1; weights are 0 or more"),
-        ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "static": [0, 1, 2]}, "static holds other values than 0 and 1"),
-        ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "static1": XYZ}, "static points are for lines"),
-        ({"l1": np.zeros((3, 3)), "l2": np.zeros((3, 6))}, "lines are (n, 2, 3), two points each, or (n, 6)"),
-        ({"l1": np.zeros((3, 6)), "l2": np.zeros((3, 6)), "static1": XYZ}, "1 files of 3D static points"),
-        ({"x1": np.array([{}]), "x2": XYZ, "x3": XYZ}, "cannot be read"),
-    ],
-)
-def test_npz_refused(tmp_path, arrays, says):
-    np.savez(tmp_path / "m.npz", **arrays)
-    refused(tmp_path / "m.npz", says, action=lambda path: read_matches([path]))
+BAD_ARRAYS = [
+    ({"a": XYZ}, "its arrays are a; keys are x1, x2, x3"),
+    ({"x1": XYZ}, "has x1 but no x2"),
+    ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "y": XYZ}, "an array 'y', which is not known"),
+    ({"x1": XYZ, "x2": XYZ[:2], "x3": XYZ}, "x2: has 2 rows, "),
+    ({"x1": XYZ, "x2": XYZ, "x3": np.zeros((3, 4))}, "x3: the array has shape (3, 4)"),
+    ({"x1": XYZ, "x2": XYZ, "x3": np.array(["a", "b", "c"])}, "holds values of type <U1"),
+    ({"x1": XYZ[:0], "x2": XYZ[:0], "x3": XYZ[:0]}, "the array is empty"),
+    ({"x1": XYZ, "x2": XYZ, "x3": XYZ + np.inf}, "row 1, column 1: inf is not finite"),
+    ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "weights": [1, 2]}, "weights has shape (2,), x1 has 3 rows"),
+    ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "weights": [1, 2, -1]}, "match 3: the weight is -1; weights are 0 or more"),
+    ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "static": [0, 1, 2]}, "static holds other values than 0 and 1"),
+    ({"x1": XYZ, "x2": XYZ, "x3": XYZ, "static1": XYZ}, "static points are for lines"),
+    ({"l1": np.zeros((3, 3)), "l2": np.zeros((3, 6))}, "lines are (n, 2, 3), two points each, or (n, 6)"),
+    ({"l1": np.zeros((3, 6)), "l2": np.zeros((3, 6)), "static1": XYZ}, "1 files of 3D static points"),
+    ({"x1": np.array([{}]), "x2": XYZ, "x3": XYZ}, "cannot be read"),
+]
+
+
+def test_npz_refused(tmp_path):
+    for arrays, says in BAD_ARRAYS:
+        np.savez(tmp_path / "m.npz", **arrays)
+        refused(tmp_path / "m.npz", says, action=lambda path: read_matches([path]))
 
 
 # ---- matching ------------------------------------------------------------------------------------------------------------

@@ -278,24 +278,16 @@ def freemocap(folder: Path, body: np.ndarray | None = None, cameras: np.ndarray 
     return folder
 
 
-def alphapose(path: Path, people: Sequence[np.ndarray], form: str = "coco") -> Path:
+def alphapose(path: Path, people: Sequence[np.ndarray]) -> Path:
     """``alphapose-results.json``: ``(frames, joints, 3)`` per person, with the tracker's identities."""
+    about = {"category_id": 1, "score": 2.7, "box": [1.0, 2.0, 30.0, 60.0]}
+    frames = enumerate(zip(*people, strict=True))
     listed = [
-        {
-            "image_id": f"{i}.jpg", "category_id": 1, "keypoints": one[i].ravel().tolist(), "score": 2.7 + who,
-            "box": [1.0, 2.0, 30.0, 60.0], "idx": who + 1,
-        }
-        for i in range(len(people[0])) for who, one in enumerate(people)
-    ]  # fmt: skip
-    if form == "coco":
-        path.write_text(json.dumps(listed))
-        return path
-    frames: dict[str, Any] = {}
-    for one in listed:
-        body = {("joints" if form == "cmu" else "pose_keypoints_2d"): one["keypoints"]}
-        entry = frames.setdefault(one["image_id"], {"version": "AlphaPose v0.3", "bodies" if form == "cmu" else "people": []})
-        entry["bodies" if form == "cmu" else "people"].append(body)
-    path.write_text(json.dumps(frames))
+        {"image_id": f"{i}.jpg", "keypoints": one.ravel().tolist(), "idx": who + 1, **about}
+        for i, frame in frames
+        for who, one in enumerate(frame)
+    ]
+    path.write_text(json.dumps(listed))
     return path
 
 
