@@ -88,6 +88,7 @@ def _keypoints(folder: Path) -> list[Seed]:
         place = folder / f"sample{number}"
         place.mkdir()
         path = make_sample(place).path
+        path = path / "output_data" if (path / "output_data").is_dir() else path  # where FreeMoCap has its files
         seeds.append(Seed(tool, path, keypoints, _scan(folder), 2 if path.suffix in (".h5", ".slp", ".nc") else 1))
     lists = ("coco int", "mmpose frames", "ultralytics frames", "ultralytics strings", "openpose list", "alphapose cmu")
     others = [written(folder / f"{name}.json", test_formats.VARIANTS[name](people)) for name in lists]
@@ -311,17 +312,24 @@ def _labels(folder: Path) -> list[Seed]:
         path = folder / f"labels_{name}{suffix or '.json'}"
         write_labels(path, found, recording="session.mp4", duration=60, fps=25, format=name)
         seeds.append(Seed(path.name, path, labels))
-    return [*seeds, *(Seed(f"labels of {name}", make_file(folder), labels) for name, make_file in BY_HAND.items())]
+    return [*seeds, *(Seed(f"labels of {name}", make_file(folder), labels_of_all) for name, make_file in BY_HAND.items())]
 
 
 def labels(path: Path) -> Any:
-    """Read labels of one hand, of a recording, and ask whether others could be written beside them."""
-    from indexing.labels import Label, choose_labels, open_labels, within, write_labels
+    """Read labels of one hand, of a recording."""
+    from indexing.labels import choose_labels, open_labels, within
+
+    kept, notices = within(choose_labels(open_labels(path, recording="session.json", fps=25)).labels, 0.0, 10.0)
+    return [label.duration for label in kept], notices, labels_of_all(path)
+
+
+def labels_of_all(path: Path) -> Any:
+    """Read labels of all recordings, and ask whether others could be written beside them."""
+    from indexing.labels import Label, open_labels, write_labels
 
     if path.suffix in (".eaf", ".boris"):
         write_labels(path, [Label(1, 3, "squat", "Ann"), Label(2, 4, "squat", "Ann")], recording="session.mp4", dry=True)
-    kept, notices = within(choose_labels(open_labels(path, recording="session.json", fps=25)).labels, 0.0, 10.0)
-    return [label.duration for label in kept], notices
+    return [label.duration for label in open_labels(path, fps=25).labels]
 
 
 def _pictures(folder: Path) -> list[Seed]:
