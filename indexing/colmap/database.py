@@ -113,7 +113,7 @@ def read_database(path: str | Path) -> MatchDatabase:
             places = {image.key: place for place, image in enumerate(images)}
             found = _pairs(path, database, "two_view_geometries") | _pairs(path, database, "matches")
     except sqlite3.Error as problem:
-        raise _read_error(path, problem) from None
+        raise error(path, f"cannot be read ({problem})", "close what writes it, or make it again with COLMAP") from None
     pairs = tuple(_pair(path, key, rows, images, places) for key, rows in sorted(found.items()))
     if not pairs:
         raise error(path, f"holds {len(images)} images and no matches", "run a matcher first, such as colmap exhaustive_matcher")
@@ -135,10 +135,6 @@ def _connect(path: Path) -> sqlite3.Connection:
     """The database, to read; one that no other program has open, without a file of SQLite's beside it, not even for a moment."""
     busy = any(Path(f"{path}{end}").exists() for end in OPEN)
     return sqlite3.connect(f"{path.resolve().as_uri()}?{'mode=ro' if busy else 'mode=ro&immutable=1'}", uri=True)
-
-
-def _read_error(path: Path, problem: sqlite3.Error) -> ValueError:
-    return error(path, f"cannot be read ({problem})", "close the programs that write it, or make it again with COLMAP")
 
 
 def _columns(database: sqlite3.Connection, table: str) -> list[str]:
@@ -258,8 +254,7 @@ def _atomic_file(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except (sqlite3.Error, OSError) as problem:
-        said = f"cannot be written ({problem})"
-        raise error(path, said, "free the name or the disk, or choose another folder") from None
+        raise error(path, f"cannot be written ({problem})", "free the name or the disk, or choose another folder") from None
     finally:
         for end in ("", *OPEN, "-shm"):
             with contextlib.suppress(OSError):

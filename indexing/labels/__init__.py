@@ -89,8 +89,7 @@ def open_labels(
     with without_garbage_collection():
         detected, data = detect(asked.path)
         if format is not None and format != detected:
-            message = f"is of the format {detected!r}, not {format!r}"
-            raise error(path, message, "leave format= out to detect it")
+            raise error(path, f"is of the format {detected!r}, not {format!r}", "leave format= out to detect it")
         return _select_requested(registered_formats()[detected].read(data, asked), asked)
 
 

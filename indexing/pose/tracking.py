@@ -109,7 +109,8 @@ class Tracker:
         """Everybody who is seen in a frame; frames come in order, at ``time`` seconds."""
         before = len(self._followed)
         self._follow(picture, time)
-        if self._due(before, time):
+        lost = not self._followed or len(self._followed) < before
+        if lost or time - self._searched >= SEARCH_SECONDS:
             self._search(picture, time)
         return [Sighting(one.number, one.joints, one.confidence) for one in self._followed]
 
@@ -175,12 +176,6 @@ class Tracker:
         return region.side / (2 * REGION_SCALE)
 
     # ---- who is new ----
-    def _due(self, before: int, time: float) -> bool:
-        """Whether the detector should look: somebody was just lost, nobody is there, or it has not looked for long."""
-        if not self._followed or len(self._followed) < before:
-            return True
-        return time - self._searched >= SEARCH_SECONDS
-
     def _search(self, picture: VideoPicture, time: float) -> None:
         """Look at the whole picture, and closer where nobody is found there, or from time to time where some are still wanted."""
         wait = CLOSER_SEARCH_SECONDS if self._followed and self.people > 1 else SEARCH_SECONDS
@@ -338,7 +333,7 @@ def identities(seen: Sightings, max_absence: float = 2.0) -> list[Indices]:
         owners += new
         recent += new
     people = [np.sort(np.concatenate([one.rows for one in owner])) for owner in owners]
-    return sorted(people, key=lambda rows: (-float(_areas(seen.joints[rows]).sum()), int(rows[0])))
+    return sorted(people, key=lambda rows: (-float(np.ptp(seen.joints[rows], axis=1).prod(axis=1).sum()), int(rows[0])))
 
 
 def largest(seen: Sightings, people: Sequence[Indices]) -> Indices:
@@ -371,7 +366,3 @@ def _association_cost(old: _Stretch, new: _Stretch, max_absence: float) -> float
 def _size(joints: Floats) -> float:
     """The diagonal of the box about somebody."""
     return float(np.linalg.norm(joints.max(axis=0) - joints.min(axis=0)))
-
-
-def _areas(joints: Floats) -> Floats:
-    return np.asarray((joints.max(axis=1) - joints.min(axis=1)).prod(axis=1))

@@ -183,8 +183,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5]:
     try:
         handle = h5py.File(path, "r", locking=False)
     except DAMAGED as problem:
-        message = f"cannot be read as HDF5 ({clip_text(problem, VALUE)}; the file may be truncated)"
-        raise error(path, message, AGAIN) from None
+        raise error(path, f"cannot be read as HDF5 ({clip_text(problem, VALUE)}; the file may be truncated)", AGAIN) from None
     try:
         yield Hdf5(path, handle, size)
     finally:

@@ -387,8 +387,7 @@ def _match_views(views: Sequence[PointSet]) -> TrackSet:
     first = views[0]
     odd = next((view for view in views if view.values.shape[1] != first.values.shape[1]), None)
     if odd is not None:
-        message = f"holds {odd.values.shape[1]}D points, {first.path} {first.values.shape[1]}D"
-        raise error(odd.path, message, "give one kind")
+        raise error(odd.path, f"holds {odd.values.shape[1]}D points, {first.path} {first.values.shape[1]}D", "give one kind")
     if all(view.ids is not None for view in views):
         places = {name: i for i, name in enumerate(dict.fromkeys(name for view in views for name in view.ids or ()))}
         rows = [np.array([places[name] for name in view.ids or ()]) for view in views]

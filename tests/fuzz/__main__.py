@@ -1,6 +1,6 @@
 """A long run: ``python -m tests.fuzz --files 100000``.  Prints a table of outcomes per format, and what must not be by its place.
 
-A file can be made and read again: ``python -m tests.fuzz --only coco.json --number 17``.
+A file can be made and read again: ``python -m tests.fuzz --only OpenPose --number 17``.
 """
 
 from __future__ import annotations

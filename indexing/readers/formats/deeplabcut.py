@@ -151,7 +151,10 @@ def _read_fixed(file: Hdf5, key: str) -> HdfFrame:
     count = _count(file, key, "nblocks")
     columns: list[list[list[str]]] = []
     blocks: list[FloatArray] = []
-    rows = _read_axis(file, f"{key}/axis1", _to_text(file.attribute(key, "axis1_variety")), _levels(file, key, "axis1"))
+    if _to_text(file.attribute(key, "axis1_variety")) == "multi":  # of labelled images, the parts of their path
+        rows = ["/".join(row) for row in zip(*_read_name_rows(file, f"{key}/axis1", _levels(file, key, "axis1")), strict=True)]
+    else:
+        rows = _read_texts(file, f"{key}/axis1")
     for i in range(count):
         name = f"{key}/block{i}_items"
         levels = _levels(file, key, f"block{i}_items")
@@ -160,8 +163,7 @@ def _read_fixed(file: Hdf5, key: str) -> HdfFrame:
         if file.attribute(f"{key}/block{i}_values", "transposed") in (0, None) and values.shape != (len(rows), len(parts[0])):
             values = values.T
         if values.shape != (len(rows), len(parts[0])):
-            message = f"{key}: {len(rows)} rows and {len(parts[0])} columns, but values {values.shape}"
-            raise error(file.path, message, AGAIN)
+            raise error(file.path, f"{key}: {len(rows)} rows and {len(parts[0])} columns, but values {values.shape}", AGAIN)
         if columns and len(parts) != len(columns[0]):
             raise error(file.path, f"{key}: blocks with {len(columns[0])} and {len(parts)} rows of column names", AGAIN)
         columns.append(parts)
@@ -239,13 +241,6 @@ def _read_name_rows(file: Hdf5, name: str, levels: int) -> list[list[str]]:
     if not found or len({len(row) for row in found}) > 1:
         raise error(file.path, f"{quote(name)} has rows of column names of different lengths", AGAIN)
     return found
-
-
-def _read_axis(file: Hdf5, name: str, variety: str, levels: int) -> list[str]:
-    """A name or number per row; of labelled images, the parts of their path."""
-    if variety == "multi":
-        return ["/".join(parts) for parts in zip(*_read_name_rows(file, name, levels), strict=True)]
-    return _read_texts(file, name)
 
 
 def _read_texts(file: Hdf5, name: str) -> list[str]:

@@ -48,7 +48,9 @@ def _recording(file: Hdf5, options: Options) -> Recording:
     table = position.reshape(-1, len(joints), len(space)).astype(np.float64)
     if confidence is not None:  # a hand-made label has none
         confidence = np.where(np.isnan(confidence) & ~np.isnan(table).any(axis=2), 1.0, confidence)
-    people, up = animals if len(animals) > 1 else None, _up(file, len(space))
+    people = animals if len(animals) > 1 else None
+    up = file.text("/", "up")  # as Clip.to_movement notes it, else as of pixels, and of rooms
+    up = up if up in UP_AXES[: 2 * (len(space) - 1)] else "-y" if len(space) == 2 else "z"
     return dense_recording(file.path, table, confidence, numbers, people, joints, times=times, up=up)
 
 
@@ -92,12 +94,6 @@ def _times(file: Hdf5, frames: int, options: Options) -> tuple[Array, Array | No
         raise error(file.path, f"time ({quote(unit)}) must be frame numbers that increase", REMEDY)
     rate = options.fps or fps
     return whole.astype(np.int64), whole / rate if rate is not None else None
-
-
-def _up(file: Hdf5, dims: int) -> str:
-    """Which way is up: as :meth:`indexing.Clip.to_movement` notes it, else as of pixels, and of rooms."""
-    up = file.text("/", "up")
-    return up if up in UP_AXES[: 2 * (dims - 1)] else "-y" if dims == 2 else "z"
 
 
 def _number(value: Any) -> float | None:
