@@ -2,7 +2,7 @@
 
     python -m tests.test_structure
 
-prints the figures; the tests hold upper bounds, which only go down.
+prints the figures; the tests hold upper bounds, which go down, but for what is new.
 """
 
 import ast
@@ -209,7 +209,9 @@ def figures() -> dict[str, int]:
 @pytest.mark.slow
 def test_the_house_does_not_grow():
     wrong = {name: f"{figure} of at most {BOUNDS[name]}" for name, figure in figures().items() if figure > BOUNDS[name]}
-    assert wrong == {}, "python -m tests.test_structure lists what there is"
+    assert wrong == {}, (
+        "make it shorter, or for what is new raise BOUNDS by what it takes; python -m tests.test_structure lists what there is"
+    )
 
 
 @pytest.mark.slow

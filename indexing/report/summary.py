@@ -64,7 +64,8 @@ _PAGES: dict[type, Page] = {}
 def register_page(
     report: type, template: str, files: Sequence[str] = (), stale: str = ""
 ) -> Callable[[Callable[[Any], Summary]], Callable[[Any], Summary]]:
-    """Register what summarizes a class of reports as its page, drawn with the template ``NAME.html.j2``."""
+    """Register what summarizes a class of reports (which has a ``title`` and a ``manifest``) as its page, drawn with the template
+    ``NAME.html.j2``."""
 
     def register(summarize: Callable[[Any], Summary]) -> Callable[[Any], Summary]:
         _PAGES[report] = Page(report, template, summarize, tuple(files), stale)
