@@ -90,13 +90,14 @@ def test_space_in_four_views_without_a_threshold():
     assert float(relative_error(two.collineations[0], A).max()) < 0.01 and float(two.collineations[1].abs().max()) == 0
 
 
+MODELS = ("constant_velocity", "affine_constant_velocity", "rigid")
+
+
 def test_models_of_three_views_say_so():
     views, _ = space(4, 60, 0.0)
-    three = (
-        *((m, f"model='{m}' takes three views, got 4; model='join' takes any number") for m in ("constant_velocity", "rigid")),
-    )
+    three = "takes three views, got 4; model='join' takes any number"
     assert_refused(
-        *((lambda m=m: dyn.align_points(*views, model=m), message) for m, message in three),
+        *((lambda m=m: dyn.align_points(*views, model=m), f"model='{m}' {three}") for m in MODELS),
         (lambda: dyn.align_points(*views[:3], model="bent"), "model must be one of"),
         (lambda: dyn.align_planar(*plane(4, 40, 0.5)[0]).solution.singular_values, "has no estimation matrix"),
     )

@@ -75,15 +75,6 @@ def test_pieces_for_memory_change_nothing(monkeypatch):
         assert_same(x, y)
 
 
-def test_transforms_have_good_lengths():
-    for least in (1, 2, 7, 11, 97, 1801, 2701, 3599, 4097, 10_007):
-        length = rest = lags._fft_length(least)
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        assert rest == 1 and length % 2 == 0 and least <= length <= max(1.2 * least, 2)
-
-
 def points(frames1, frames2, n, seed=0):
     """Points, weights with zeros (of whole frames too), and NaN where they are."""
     x1, x2 = normal(seed, frames1, n, 2), normal(seed + 1, frames2, n, 2) + 0.3
