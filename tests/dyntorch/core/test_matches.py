@@ -5,6 +5,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.core.matches import matches
+from tests.grid import assert_refused, grid
 
 H = dyn.HomographyTensor()
 
@@ -14,8 +15,7 @@ def views(*batch, n=4, dtype=torch.float64):
     return tuple(torch.rand(*batch, n, 2, generator=g, dtype=dtype) for _ in range(3))
 
 
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3), (0,), (2, 0)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@grid(("batch", [(), (3,), (2, 3), (0,), (2, 0)]), ("dtype", [torch.float32, torch.float64]))
 def test_batch_is_flat_in_double_and_comes_back(batch, dtype):
     given = views(*batch, dtype=dtype)
     data = matches(H, given)
@@ -30,8 +30,7 @@ def test_batch_is_flat_in_double_and_comes_back(batch, dtype):
     assert data.back(torch.zeros(flat, dtype=torch.int64)).dtype == torch.int64
 
 
-@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
-@pytest.mark.parametrize("view", [0, 1, 2])
+@grid(("bad", [torch.nan, torch.inf, -torch.inf]), ("view", [0, 1, 2]))
 def test_what_is_not_finite_weighs_nothing(bad, view):
     given = [x.clone() for x in views(2)]
     given[view][1, 2, 0] = bad
@@ -73,12 +72,15 @@ def test_gradients_pass_and_missing_ones_are_zero():
 
 
 def test_a_class_of_numbers_that_is_not_a_tensor_is_named():
-    with pytest.raises(ValueError, match=r"static must be a torch\.Tensor, got list"):
-        matches(H, views(), None, [True] * 4)
-    with pytest.raises(ValueError, match=r"weights is on meta, the matches on cpu; use .to\(device\)"):
-        matches(H, views(), torch.ones(4, device="meta"))
-    with pytest.raises(ValueError, match=r"view 2 of HomographyTensor: expected \(\*batch, n, 2\), got \(2,\)"):
-        matches(H, (views()[0], torch.zeros(2).double(), views()[2]))
+    x, _, y = views()
+    assert_refused(
+        (lambda: matches(H, views(), None, [True] * 4), r"static must be a torch\.Tensor, got list"),
+        (lambda: matches(H, views(), torch.ones(4, device="meta")), r"weights is on meta, the matches on cpu; use .to\(device\)"),
+        (
+            lambda: matches(H, (x, torch.zeros(2).double(), y)),
+            r"view 2 of HomographyTensor: expected \(\*batch, n, 2\), got \(2,\)",
+        ),
+    )
 
 
 @pytest.mark.parametrize("batch", [(), (2,), (2, 0)])
