@@ -11,5 +11,4 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
-    """Standard normal numbers."""
     return torch.randn(*shape, generator=seeded(seed), dtype=torch.float64)

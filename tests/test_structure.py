@@ -169,7 +169,6 @@ def imports() -> tuple[list[str], dict[str, set[str]], dict[str, set[str]]]:
 
 
 def reached(graph: dict[str, set[str]], name: str) -> set[str]:
-    """All modules that a module leads to."""
     seen: set[str] = set()
     waiting = list(graph[name])
     while waiting:

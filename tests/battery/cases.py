@@ -103,7 +103,6 @@ class Case:
 
 
 def project(p: Tensor) -> Tensor:
-    """Divide by the last coordinate."""
     return p[..., :-1] / p[..., -1:]
 
 
@@ -123,7 +122,6 @@ def moved(primitive: object, x: Tensor, frame: Tensor) -> Tensor:
 
 
 def moved_views(invariant: Invariant, views: tuple[Tensor, ...], frames: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """All views after a change of their coordinates."""
     return tuple(moved(p, x, g) for p, x, g in zip(invariant.primitives, views, frames, strict=True))
 
 
@@ -155,7 +153,6 @@ def prediction_error(estimated: Motion, true: Motion) -> Tensor:
 
 
 def predicted(motion: Motion, p0: Tensor, p1: Tensor) -> Tensor:
-    """Where constant velocity puts a point in the third view."""
     y0, y1 = (times(torch.linalg.inv(m)[..., None, :, :], p) for m, p in zip(motion, (p0, p1), strict=False))
     return times(motion[2][..., None, :, :], 2 * y1 - y0)
 

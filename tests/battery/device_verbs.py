@@ -177,7 +177,6 @@ def affine_bodies() -> tuple[Tensor, Tensor]:
 
 
 def lens() -> tuple[Tensor, ...]:
-    """Pixels, matrix and distortion."""
     matrix = torch.tensor([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]], dtype=F64)
     return randn(9, 2) * 100 + 300, matrix, torch.tensor([-0.2, 0.05, 0, 0], dtype=F64)
 

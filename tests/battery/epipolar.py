@@ -17,7 +17,6 @@ NEAR = 10.0  # px
 
 
 def lift(x: Tensor) -> Tensor:
-    """Append the coordinate 1."""
     return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
 
 
@@ -71,7 +70,6 @@ def epipolar_truth(motion: Motion) -> Motion:
 
 
 def two_epipolar_truths(motion: Motion) -> Motion:
-    """Those of two bodies, one after the other."""
     return *epipolar_truth(motion[:1]), *epipolar_truth(motion[1:])
 
 

@@ -58,7 +58,6 @@ class Traffic(list[tuple[str, str]]):
 
     @staticmethod
     def note(kind: str) -> None:
-        """One more of a kind."""
         Traffic.current.append((kind, _our_line()))
 
     def __str__(self) -> str:

@@ -33,7 +33,6 @@ def prop(applies: Callable[[Case], bool] = lambda case: True) -> Callable[[Check
 
 
 def many(case: Case) -> int:
-    """Clearly more matches than needed."""
     return 2 * case.minimal + 6
 
 

@@ -129,7 +129,6 @@ def chart(primitive: Primitive, x: Tensor) -> Tensor:
 
 
 def measured(primitive: Primitive, z: Tensor) -> Tensor:
-    """The measurements of free coordinates."""
     if isinstance(primitive, Hyperplane):
         return torch.stack([z[..., 0].cos(), z[..., 0].sin(), z[..., 1]], dim=-1)
     return z.unflatten(-1, (2, 3)) if isinstance(primitive, Line) else z

@@ -36,7 +36,6 @@ class ShapeCase:
 
     @property
     def dims(self) -> tuple[int, int]:
-        """Of the space and of the views."""
         return (self.invariant.k, self.invariant.l) if isinstance(self.invariant, dyn.LiftedShapeTensor) else (3, 2)
 
     @property
@@ -49,7 +48,6 @@ class ShapeCase:
         return max(8, 2 * self.minimal)
 
     def arguments(self, views: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], dict[str, Tensor]]:
-        """Positional and named ones."""
         return (views[:-1], {"times": views[-1][..., 0]}) if self.timed else (views, {})
 
     def fit(self, views: tuple[Tensor, ...], **options: Tensor) -> dyn.Solution:
@@ -66,7 +64,6 @@ class ShapeCase:
         return dyn.sampson(self.invariant, tensor, *points, **given)
 
     def rows(self, views: tuple[Tensor, ...]) -> Tensor:
-        """Of the estimation matrix, view by view."""
         points, given = self.arguments(views)
         invariant, measured = self.invariant.bind_arguments(points, **given)
         return invariant.primitives[0].vectors(measured[0])

@@ -97,7 +97,6 @@ def damaged(seed: Seed, number: int, folder: Path) -> tuple[Path, str]:
 
 
 def size_of(path: Path) -> float:
-    """MB of a file or folder."""
     files = path.iterdir() if path.is_dir() else [path]
     with contextlib.suppress(OSError):
         return sum(os.lstat(file).st_size for file in files) / 2**20

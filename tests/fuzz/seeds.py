@@ -38,7 +38,6 @@ class Seed:
 
 
 def make(folder: Path) -> list[Seed]:
-    """Write all seeds."""
     folder.mkdir(parents=True, exist_ok=True)
     found = [*_keypoints(folder), *_models(folder), *_sets(folder), *_points(folder), *_pairs(folder)]
     return [*found, *_tracks(folder), *_settings(folder), *_pictures(folder), *_labels(folder)]
@@ -124,7 +123,6 @@ def _sets(folder: Path) -> list[Seed]:
 
 
 def films_read(path: Path) -> Any:
-    """Read a film set, and look at every film."""
     from indexing.readers.formats.clipset import holds_frames, read_film_set
 
     holds_frames(path)
@@ -198,7 +196,6 @@ def _other_joints(joints: int) -> Any:
 
 # ---- points, pairs, tracks -----------------------------------------------------------------------------------------------
 def points(path: Path) -> Any:
-    """Read the views of an alignment."""
     from indexing.readers.matches import open_points, read_matches
 
     if path.suffix == ".npz":
@@ -357,7 +354,6 @@ def _pictures(folder: Path) -> list[Seed]:
 
 
 def video(path: Path) -> Any:
-    """Probe a video, and read its frames."""
     from indexing.video import probe, read_video
 
     found, chunks = probe(path), list(read_video(path))

@@ -40,7 +40,6 @@ def apart(found, true):
 
 
 def disturbed(views, sigma):
-    """The views with independent noise."""
     return [x + sigma * random(*x.shape, seed=v) for v, x in enumerate(views)]
 
 
