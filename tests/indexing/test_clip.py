@@ -119,10 +119,6 @@ def test_between_and_replace_keep_the_clock_and_everything_else():
     assert clip.replace(label="run").label == "run" and clip.label == "walk"
     with pytest.raises(ValueError, match="times must hold"):
         clip.replace(joints=JOINTS[:3])
-
-
-def test_as_clip():
-    clip = Clip(JOINTS)
     assert as_clip(clip, fps=99) is clip
     made = as_clip(JOINTS, fps=10, name="3")
     assert (made.fps, made.name, made.fps_assumed) == (10, "3", False)
@@ -214,17 +210,11 @@ def unseen(value):
     "joints", [detected(), unseen(0.0), unseen(np.nan), detected() * [0.1, 0.1, 1]], ids=["all", "0", "NaN", "small"]
 )
 def test_confidence_of_pixels_is_no_depth(joints):
-    with pytest.raises(ValueError, match=SURE):
-        Clip(joints)
-    with pytest.raises(ValueError, match=SURE):
-        ActionIndexer().fit([joints, joints + 1], ["a", "b"])
-    with pytest.raises(ValueError, match=SURE):
-        synchronize(joints, joints)
+    for refused in (lambda: Clip(joints), lambda: ActionIndexer().fit([joints] * 2, "ab"), lambda: synchronize(joints, joints)):
+        with pytest.raises(ValueError, match=SURE):
+            refused()
     with pytest.warns(UserWarning, match=MAYBE):  # stretched to 0 to 1, only the values say what they are
         Clip(joints * [1 / 1280, 1 / 720, 1])
-
-
-def test_confidence_of_a_point():
     point = detected()[:, :1]
     with pytest.warns(UserWarning, match=MAYBE):
         Clip(point)

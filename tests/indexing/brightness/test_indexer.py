@@ -58,13 +58,9 @@ def test_a_stream_gives_what_a_video_gives_and_never_looks_ahead(indexer, asked)
     np.testing.assert_allclose(indexer.score_frames(asked[0][:33]), whole[:33], atol=1e-5)
     colour = np.repeat(asked[0][:20, :, :, None], 3, axis=3)
     np.testing.assert_allclose(indexer.stream().push(colour), whole[:20], atol=0.02)
-
-
-def test_frame_rates_are_brought_together(indexer, asked):
-    twice = np.repeat(asked[1], 2, axis=0).astype(float)
+    twice = np.repeat(asked[0], 2, axis=0).astype(float)  # frame rates are brought together
     twice[1:-1:2] = (twice[1:-1:2] + twice[2::2]) / 2
-    found = indexer.stream(fps=30.0).push(twice / 255)
-    np.testing.assert_allclose(found[::2], indexer.score_frames(asked[1]), atol=0.05)
+    np.testing.assert_allclose(indexer.stream(fps=30.0).push(twice / 255)[::2], whole, atol=0.05)
 
 
 def test_files_are_read_in_chunks(indexer, asked, tmp_path):

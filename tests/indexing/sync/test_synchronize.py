@@ -49,18 +49,6 @@ def test_clips_arrays_and_files_ask_the_same(cameras, library, tmp_path):
     assert not any(one.notes for one in found)
 
 
-def test_rates_differ_and_options_reach_the_library(cameras, library):
-    a, b = (clip.joints for clip in cameras[:2])
-    synchronize(a, b, fps=(30, 60), max_shift=1.5, calibration=(None, None), options=SyncOptions(min_margin=0.7))
-    assert library[0]["times"][1][1].item() == pytest.approx(1 / 60)
-    assert library[0]["max_shift"] == 1.5 and library[0]["calibration"] == (None, None)
-    assert library[0]["options"] == dyntorch.SynchronizeOptions(min_margin=0.7)
-    with pytest.raises(ValueError, match="30 frames, 40 are needed"):
-        synchronize(a[:30], b, fps=30.0, options=SyncOptions(min_frames=40))
-    with pytest.raises(ValueError, match="options must be SyncOptions"):
-        synchronize(a, b, fps=30.0, options=dyntorch.SynchronizeOptions())
-
-
 def test_missing_frames_and_frames_without_a_person_keep_the_times_of_the_others(cameras, library, tmp_path):
     write_openpose(tmp_path / "a", [cameras[0]], missing=(3, 4, 5))
     notes = synchronize(tmp_path / "a", cameras[1], fps=FPS).notes
@@ -83,19 +71,26 @@ def test_rates_that_nobody_said_and_one_recording_twice_are_mentioned(cameras, l
     assert synchronize(cameras[0].joints, cameras[0].joints.copy(), fps=FPS).notes == ("a and b are the same recording",)
 
 
-def test_layouts_that_differ(cameras, library):
-    more = np.concatenate([cameras[1].joints, np.full((len(cameras[1]), 9, 2), 5.0)], axis=2 - 1)
+def test_layouts_that_differ_and_options_reach_the_library(cameras, library):
+    a, b = (clip.joints for clip in cameras[:2])
+    more = np.concatenate([b, np.full((len(b), 9, 2), 5.0)], axis=1)
     halpe = Clip(more, fps=FPS, skeleton=HALPE26, name="halpe")
     note = "COCO-17 and Halpe-26 share 17 joints; these are compared"
     assert synchronize(cameras[0], halpe).notes == (note,) and library[0]["b"].shape[1] == 17 and library[0]["correspondence"]
-    other = Clip(cameras[1].joints[:, :7], fps=FPS, skeleton=Skeleton("dots", tuple("abcdefg")))
+    other = Clip(b[:, :7], fps=FPS, skeleton=Skeleton("dots", tuple("abcdefg")))
     notes = synchronize(cameras[0], other).notes
     assert not library[1]["correspondence"] and library[1]["a"].shape[1] == 17 and library[1]["b"].shape[1] == 7
     assert notes == ("different joints (COCO-17, dots): compared as different points, which needs longer takes",)
-    synchronize(cameras[0], cameras[1], correspondence=False)
-    assert not library[2]["correspondence"]
     with pytest.raises(ValueError, match=r"correspondence=True needs the same joints in both, got 17 and 7"):
         synchronize(cameras[0], other, correspondence=True)
+    given = {"max_shift": 1.5, "calibration": (None, None), "correspondence": False}
+    synchronize(a, b, fps=(30, 60), options=SyncOptions(min_margin=0.7), **given)
+    assert library[2]["times"][1][1].item() == pytest.approx(1 / 60) and {name: library[2][name] for name in given} == given
+    assert library[2]["options"] == dyntorch.SynchronizeOptions(min_margin=0.7)
+    with pytest.raises(ValueError, match="30 frames, 40 are needed"):
+        synchronize(a[:30], b, fps=30.0, options=SyncOptions(min_frames=40))
+    with pytest.raises(ValueError, match="options must be SyncOptions"):
+        synchronize(a, b, fps=30.0, options=dyntorch.SynchronizeOptions())
 
 
 @pytest.fixture(scope="module")
@@ -255,13 +250,18 @@ def methods(monkeypatch, library):
 GRAY = np.random.default_rng(0).uniform(size=(60, 24, 32))
 
 
-def test_gray_frames_by_every_method(methods, library):
+def test_gray_frames_by_every_method(methods, library, cameras):
+    found = synchronize(cameras[0], GRAY, fps=FPS)  # keypoints and a video are different points
+    assert not library[0]["correspondence"] and library[0]["a"].shape[1] == 17 and library[0]["b"].shape[1] == 12
+    assert found.ok and not methods["brightness"] and len(methods["tracks"]) == 1
+    with pytest.raises(ValueError, match=r"b: is a video, and method='keypoints' needs keypoints"):
+        synchronize(cameras[0], GRAY, "keypoints", fps=FPS)
     found = synchronize(GRAY, GRAY[5:] * 255, "tracks", fps=FPS, max_shift=1.0)
-    assert found.notes == ("a: camera stands still", "b: camera stands still") and not library[0]["correspondence"]
-    assert library[0]["a"].shape == (60, 12, 2) and library[0]["max_shift"] == 1.0 and not methods["brightness"]
-    [chunk] = methods["tracks"][0]
+    assert found.notes == ("a: camera stands still", "b: camera stands still") and not library[1]["correspondence"]
+    assert library[1]["a"].shape == (60, 12, 2) and library[1]["max_shift"] == 1.0 and not methods["brightness"]
+    [chunk] = methods["tracks"][1]
     assert chunk.frames.dtype == np.uint8 and np.array_equal(chunk.times, np.arange(60) / FPS)
-    assert np.array_equal(chunk.frames[5:], methods["tracks"][1][0].frames)  # 0 to 1 and 0 to 255 are the same picture
+    assert np.array_equal(chunk.frames[5:], methods["tracks"][2][0].frames)  # 0 to 1 and 0 to 255 are the same picture
     found = synchronize(GRAY, GRAY[5:], "brightness", fps=FPS, max_shift=1.0)
     assert found.method == "brightness" and found.notes == ("b: dark",) and methods["brightness"][0][2]["max_shift"] == 1.0
     assert len(next(methods["brightness"][0][0]).frames) == 60
@@ -276,14 +276,6 @@ def test_gray_frames_by_every_method(methods, library):
     found = synchronize(GRAY, GRAY[5:], "tracks", fps=FPS)
     assert not found.ok and "fewer than 4 moving points could be followed in a and b" in found.reason
     assert len(found.peaks) == len(found.scores) == 0 and found.confidence == 0
-
-
-def test_keypoints_and_a_video_are_different_points(methods, library, cameras):
-    found = synchronize(cameras[0], GRAY, fps=FPS)
-    assert not library[0]["correspondence"] and library[0]["a"].shape[1] == 17 and library[0]["b"].shape[1] == 12
-    assert found.ok and not methods["brightness"] and len(methods["tracks"]) == 1
-    with pytest.raises(ValueError, match=r"b: is a video, and method='keypoints' needs keypoints"):
-        synchronize(cameras[0], GRAY, "keypoints", fps=FPS)
 
 
 LOST, AT = 6, 60  # frames, and the first that is later than its number says
