@@ -77,8 +77,8 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
 
 def repair_clip(clip: Clip, stride: int = 1) -> Clip:
     """A clip of any length without its wrong joints; judged in parts, which bounds memory, between gaps."""
-    part, cuts = MAX_FRAMES_JUDGED, stretches(clip.times).tolist()
-    pieces = [np.arange(begin, max(end - part // 2, begin + 1), part) for begin, end in cuts]
+    half = MAX_FRAMES_JUDGED // 2
+    pieces = [np.arange(begin, max(end - half, begin + 1), MAX_FRAMES_JUDGED) for begin, end in stretches(clip.times).tolist()]
     parts = np.append(np.concatenate(pieces), len(clip))
     wrong = wrong_joints(clip.joints, clip.times, parts, stride)
     if not wrong.any():

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from dyntorch import Calibration, Status
+from dyntorch import Calibration
 from dyntorch.core import Notice, NoticeCode, Outcome, status_from
 from dyntorch.geometry import undistort
 from indexing.joints import canonical
@@ -76,11 +76,6 @@ class SideCorrection(Outcome):
     exchanges: tuple[SideExchange, ...]  # the same as stretches, by camera and time
 
     TASK = "sides"
-
-    @property
-    def ok(self) -> bool:
-        """Whether something could be said."""
-        return bool(self.status == Status.OK)
 
     def __repr__(self) -> str:
         lines = [f"Sides({len(self.tracks)} cameras, {len(self.exchanges)} stretches exchanged)"]

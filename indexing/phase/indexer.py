@@ -57,11 +57,10 @@ def check_reject(indexer: PhaseIndexer, classes: list[Any]) -> None:
         return
     if any(same_label(value, indexer.none_label) for value in classes):
         raise ValueError(f"none_label={indexer.none_label!r} is one of the learned labels; choose another for rejected clips")
-    fewest = MIN_CALIBRATED_CLASSES
-    if 0 < indexer.reject < 1 and len(classes) < fewest:
+    if 0 < indexer.reject < 1 and len(classes) < MIN_CALIBRATED_CLASSES:
         raise ValueError(
-            f"reject={indexer.reject!r} is calibrated by leaving a class out, which takes {fewest} classes, got {len(classes)}; "
-            "give further ones, or a threshold outside 0..1"
+            f"reject={indexer.reject!r} is calibrated by leaving a class out, which takes {MIN_CALIBRATED_CLASSES} classes, got "
+            f"{len(classes)}; give further ones, or a threshold outside 0..1"
         )
 
 

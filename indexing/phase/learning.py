@@ -56,8 +56,7 @@ MAX_MIRROR_SHARE = 0.35
 def period(x: Tensor, seconds: Tensor, options: PhaseOptions) -> tuple[float, float]:
     """Seconds after which frames ``(F, n, 2)`` come back, and how far from it they remain (1 = they do not)."""
     x = _resample(normalize_frames(x, x.new_ones(x.shape[:2])), seconds).flatten(1)
-    rate = COMPARED_RATE
-    low, high = round(options.min_period * rate), min(round(options.max_period * rate), 2 * len(x) // 3)
+    low, high = round(options.min_period * COMPARED_RATE), min(round(options.max_period * COMPARED_RATE), 2 * len(x) // 3)
     if high <= low + 2 or len(x) <= 4 * CHANGE_REACH:
         return 0.0, 1.0
     x = x[2 * CHANGE_REACH :] - x[: -2 * CHANGE_REACH]
@@ -79,7 +78,7 @@ def period(x: Tensor, seconds: Tensor, options: PhaseOptions) -> tuple[float, fl
     at = int(found[first])
     before, here, after = (float(apart[at + k]) for k in (-1, 0, 1))
     shift = (before - after) / (2 * max(before + after - 2 * here, 1e-12))
-    return (at + max(-0.5, min(0.5, shift))) / rate, float(depth[first])
+    return (at + max(-0.5, min(0.5, shift))) / COMPARED_RATE, float(depth[first])
 
 
 def _resample(x: Tensor, seconds: Tensor) -> Tensor:

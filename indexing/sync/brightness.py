@@ -257,9 +257,8 @@ class Verdict:
     @property
     def agrees(self) -> bool:
         """Whether halves and kernel agree with the best lag."""
-        tolerance = AGREEMENT_FRAMES
-        halves = all(abs(half - self.best) <= tolerance for half in self.halves)
-        return halves and self.kernel is not None and abs(self.kernel - self.best) <= tolerance
+        halves = all(abs(half - self.best) <= AGREEMENT_FRAMES for half in self.halves)
+        return halves and self.kernel is not None and abs(self.kernel - self.best) <= AGREEMENT_FRAMES
 
     @property
     def confidence(self) -> float:
@@ -270,15 +269,15 @@ class Verdict:
 
     def refusal(self, rate: float) -> Notice | None:
         """Why the best lag is not to be believed; None where it is."""
-        tolerance = AGREEMENT_FRAMES
         if self.second > MAX_SECOND_SCORE:
             return Notice(BrightnessNotice.REPEATED, 100 * self.second)
-        if max(self.halves) - min(self.halves) > tolerance or any(abs(half - self.best) > tolerance for half in self.halves):
+        away = max(max(self.halves) - min(self.halves), *(abs(half - self.best) for half in self.halves))
+        if away > AGREEMENT_FRAMES:
             first, second = ((half - self.best) / rate for half in self.halves)
             return Notice(BrightnessNotice.HALVES, 0.0, {"first": first, "second": second})
         if self.kernel is None:
             return Notice(BrightnessNotice.KERNEL, 0.0, {"case": "short"})
-        if abs(self.kernel - self.best) > tolerance:
+        if abs(self.kernel - self.best) > AGREEMENT_FRAMES:
             return Notice(BrightnessNotice.KERNEL, (self.kernel - self.best) / rate, {"case": "apart"})
         if self.backwards > MAX_REVERSED_SCORE:
             return Notice(BrightnessNotice.BACKWARDS, self.backwards)

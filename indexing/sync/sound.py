@@ -129,16 +129,15 @@ class Sound:
         from scipy import fft, signal
 
         made = self.samples.astype(np.float32) / (32768.0 if self.samples.dtype.kind == "i" else 1.0)
-        hertz = SAMPLE_RATE
-        if self.rate != hertz:
-            share = math.gcd(round(self.rate), hertz)
-            made = signal.resample_poly(made, hertz // share, round(self.rate) // share).astype(np.float32)
-        hop, width = round(HOP_SECONDS * hertz), round(WINDOW_SECONDS * hertz)
+        if self.rate != SAMPLE_RATE:
+            share = math.gcd(round(self.rate), SAMPLE_RATE)
+            made = signal.resample_poly(made, SAMPLE_RATE // share, round(self.rate) // share).astype(np.float32)
+        hop, width = round(HOP_SECONDS * SAMPLE_RATE), round(WINDOW_SECONDS * SAMPLE_RATE)
         if len(made) < width:
             return np.zeros((NUM_BANDS, 0), np.float32)
         cut = np.lib.stride_tricks.sliding_window_view(made, width)[::hop]
         size = fft.next_fast_len(2 * width, real=True)
-        pitch = fft.rfftfreq(size, 1 / hertz)
+        pitch = fft.rfftfreq(size, 1 / SAMPLE_RATE)
         edges = np.geomspace(MIN_PITCH_HERTZ, MAX_PITCH_HERTZ, NUM_BANDS + 1)
         bands = [(pitch >= low) & (pitch < high) for low, high in pairwise(edges)]
         taper = np.hanning(width).astype(np.float32)

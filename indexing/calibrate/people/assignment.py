@@ -401,8 +401,7 @@ class ExchangeTrial:
 
     def _at(self, later: float) -> CommonFrames:
         """What both see, the second one so many seconds later."""
-        relation, frames = self.relation, MAX_TEST_FRAMES
-        return common_frames(*self.views, relation.offset + later, relation.rate, frames)
+        return common_frames(*self.views, self.relation.offset + later, self.relation.rate, MAX_TEST_FRAMES)
 
     def synchrony(self) -> float:
         """By which share the same people fit better now than at the middle one of other times, the relation fitted anew."""

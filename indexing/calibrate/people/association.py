@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -254,8 +254,7 @@ def _camera_notices(one: PieceView, camera: int, moments: Sequence[TrackExchange
     name = one.seen.name
     if moments:
         when = sorted({round(moment.time, 2) for moment in moments})
-        most = MAX_LISTED_TIMES
-        listed = ", ".join(f"{time:.2f}" for time in when[:most]) + " s" + " and more" * (len(when) > most)
+        listed = ", ".join(f"{time:.2f}" for time in when[:MAX_LISTED_TIMES]) + " s" + " and more" * (len(when) > MAX_LISTED_TIMES)
         notices.append(Notice(PeopleNotice.EXCHANGED, float(len(when)), {"name": name, "times": listed, "camera": camera}))
     there = int(one.seen.trust.any(2).sum())
     if there and missed.sum() > MIN_REPORTED_SHARE * there:
@@ -342,16 +341,6 @@ class Association(Outcome):
         every = np.concatenate([one.ravel() for one in self.certainty]) if self.certainty else np.zeros(0)
         known = every[np.isfinite(every)]
         return float(known.mean()) if known.size else float("nan")
-
-    def check(self) -> Self:
-        """Raise where the data do not decide.
-
-        Raises:
-            ValueError: the reason.
-        """
-        if not self.ok:
-            raise ValueError(f"{self.TASK}: {self.reason}")
-        return self
 
     def clips(self, camera: int) -> list[Clip]:
         """The people of a camera, each a clip with all of its frames; ``meta["person"]`` is the identity."""

@@ -140,11 +140,7 @@ def common_frames(a: PieceView, b: PieceView, offset: float, rate: float, most: 
 
 def distances(fundamental: Floats, a: Floats, b: Floats) -> Floats:
     """Sampson distances ``(T, slots_a, slots_b, joints)`` px of everybody from everybody; NaN where one is not seen."""
-    of_a = a @ fundamental[:, :2].T + fundamental[:, 2]  # lines in b
-    of_b = b @ fundamental[:2] + fundamental[2]  # lines in a
-    square_a, square_b = np.square(of_a[..., :2]).sum(-1), np.square(of_b[..., :2]).sum(-1)
-    value = np.einsum("tbkc,takc->tabk", b, of_a[..., :2]) + of_a[:, :, None, :, 2]
-    return np.asarray(value / np.sqrt(np.maximum(square_a[:, :, None] + square_b[:, None], 1e-300)))
+    return _sampson(fundamental, a[:, :, None], b[:, None])[0]
 
 
 def evidence(relation: CameraPair, both: CommonFrames) -> Floats:
@@ -221,10 +217,10 @@ def _matched_points(both: CommonFrames, matched: Booleans) -> tuple[Floats, Floa
 
 
 def _sampson(fundamental: Floats, x1: Floats, x2: Floats) -> tuple[Floats, Floats]:
-    """Distances and squared gradients of matches ``(n, 2)``."""
+    """Distances and squared gradients of matches ``(..., 2)``, from their lines in the other camera."""
     of_a, of_b = x1 @ fundamental[:, :2].T + fundamental[:, 2], x2 @ fundamental[:2] + fundamental[2]
-    gradient = np.maximum(np.square(of_a[:, :2]).sum(1) + np.square(of_b[:, :2]).sum(1), 1e-300)
-    return ((x2 * of_a[:, :2]).sum(1) + of_a[:, 2]) / np.sqrt(gradient), gradient
+    gradient = np.maximum(np.square(of_a[..., :2]).sum(-1) + np.square(of_b[..., :2]).sum(-1), 1e-300)
+    return ((x2 * of_a[..., :2]).sum(-1) + of_a[..., 2]) / np.sqrt(gradient), gradient
 
 
 @dataclass(frozen=True, eq=False)

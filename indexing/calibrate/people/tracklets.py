@@ -147,11 +147,10 @@ def _median_step(seen: CameraSightings, there: Booleans) -> float:
 
 def _cost(away: Floats, step: float) -> Floats:
     """Of ways ``(..., joints)`` px from where somebody is expected, NaN = not known; what nothing is known of costs the limit."""
-    worth = INDEPENDENT_STEP_JOINTS
     known = np.isfinite(away)
     each = np.where(known, 2 * np.log1p(np.square(np.where(known, away, 0.0)) / (3 * step**2)), 0.0)
     count = known.sum(-1)
-    cost = worth * each.sum(-1) / np.maximum(count, 1)
+    cost = INDEPENDENT_STEP_JOINTS * each.sum(-1) / np.maximum(count, 1)
     return np.where(count >= 2, cost, np.inf)
 
 
@@ -172,8 +171,7 @@ def _match_ends(
     cost = _cost(distance / np.sqrt(gaps)[:, None, None], step)
     # half of the joints at least within reach: their median is
     possible = np.isfinite(cost) & (2 * (distance <= MAX_STEP * size).sum(-1) >= np.isfinite(distance).sum(-1))
-    limit = MAX_STEP_COST
-    padded = np.full((len(ends) + len(tracks), len(tracks) + len(ends)), limit)
+    padded = np.full((len(ends) + len(tracks), len(tracks) + len(ends)), MAX_STEP_COST)
     padded[: len(ends), : len(tracks)] = np.where(possible, cost, 1e6)
     padded[len(ends) :, len(tracks) :] = 0.0
     rows, columns = linear_sum_assignment(padded)

@@ -35,7 +35,7 @@ def test_a_mirrored_camera_is_outvoted(count):
     rig, truth = scene(azimuths=AROUND[:count])
     given = [*truth[:2], turned(truth[2], slice(None)), *truth[3:]]
     found = correct_sides(given, rig, NAMES)
-    assert found.ok and [e.limb for e in found.exchanges] == ["body"]
+    assert found.status == 0 and [e.limb for e in found.exchanges] == ["body"]
     assert found.exchanges[0].camera == 2 and found.exchanges[0].start == 0.0 and found.exchanges[0].evidence > 0
     for own, right in zip(found.tracks, truth, strict=True):
         assert np.array_equal(own, right)
@@ -54,7 +54,7 @@ def test_what_nothing_decides_is_left_and_said(count, mirrored, names, said):
     rig, truth = scene(azimuths=AROUND[:count])
     given = [turned(one, slice(None)) if i < mirrored else one for i, one in enumerate(truth)]
     found = correct_sides(given, rig, names)
-    assert found.ok and {notice.code for notice in found.notices} == {said} and not found.exchanges
+    assert found.status == 0 and {notice.code for notice in found.notices} == {said} and not found.exchanges
     assert all(np.array_equal(own, one) for own, one in zip(found.tracks, given, strict=True))
 
 
