@@ -16,7 +16,6 @@ from indexing.cli import main
 from tests.indexing.calibrate.scene import FOCAL, LATE, PLACES, SIZE, filmed, solved, truth, write_cameras
 
 COMMAND = "calibrate"
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 THREE = "@/cam1 @/cam2 @/cam3 --fps 30 --size 1920x1080"
 
 

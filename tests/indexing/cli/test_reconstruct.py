@@ -18,8 +18,6 @@ from dyntorch.tasks.reconstruct.result import Reconstruction
 from indexing.cli.flags.geometry import MotionName
 from indexing.report.reconstruction import FILES, PURPOSE
 
-# torch's own, when it first loads its transforms; hidden outside of tests
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
 TIMES = [0.0, 1.0, 2.5, 3.0]
 
 COMMAND = "reconstruct"

@@ -11,8 +11,6 @@ import pytest
 
 from tests.indexing.cli.footage import write_film, write_video
 
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
-
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):

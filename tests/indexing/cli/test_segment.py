@@ -18,9 +18,6 @@ from dyntorch.numerics import Message
 from dyntorch.tasks.segment.result import Segmentation
 from indexing.report.segmentation import FILES
 
-# torch's own, when it first loads its transforms; hidden outside of tests
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
-
 COMMAND = "segment"
 FOCAL = 800.0
 

@@ -19,8 +19,6 @@ from dyntorch.tasks.segment.result import TrackSegmentation
 from indexing.report.bodies import FILES, FILM
 from tests.indexing.cli.footage import SIZE, write_film
 
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
-
 COMMAND = "segment"
 FRAMES, COUNTS = 12, (30, 14, 6)
 

@@ -18,9 +18,6 @@ from indexing.clip import Clip, ClipSet
 from tests.indexing.sync.footage import microphone, noises, numbers_of, write_film
 from tests.indexing.sync.scene import FPS, SKIPPED, cut, filmed, shift, write_openpose
 
-# torch's own, when it first loads its transforms; hidden outside of tests
-pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated")
-
 COMMAND = "sync"
 NAMES = ["cam01", "cam02", "cam03"]
 DRAWN = b"\x89PNG".ljust(16, b"\0") + (100).to_bytes(4, "big") * 2  # what the page reads of a picture

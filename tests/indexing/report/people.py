@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from indexing.clip import Clip
 from indexing.report import RecordingResult
+from indexing.report.summary import write_report
 from indexing.skeleton import from_names
 
 SCRIPT = "<script>alert(1)</script>"
@@ -27,17 +29,19 @@ def in_browser(page: str, script: str, folder: Path, *options: str) -> Any:
     free = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page)
     driven = folder / "driven.html"
     driven.write_text(free.replace("</body>", f"<script>{script}</script></body>"), encoding="utf-8")
-    command = [
-        BROWSER,
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        f"--user-data-dir={folder / 'profile'}",
-        "--dump-dom",
-        *options,
-    ]
-    done = subprocess.run([*command, driven.as_uri()], capture_output=True, text=True, check=True, timeout=120)
+    flags = f"--headless --no-sandbox --disable-gpu --dump-dom --user-data-dir={folder}/profile".split()
+    done = subprocess.run([BROWSER, *flags, *options, driven.as_uri()], capture_output=True, text=True, check=True, timeout=120)
     return json.loads(html.unescape(re.search(r"<title>(\{.*?\})</title>", done.stdout)[1]))
+
+
+def draw_all(reports: Iterable[Any], folder: Path, name: str) -> list[Any]:
+    """What each report writes into its JSON file; its page has a picture, and no number that is none."""
+    found = []
+    for i, report in enumerate(reports):
+        page = write_report(folder / str(i), report).read_text()
+        assert "<img" in page and "nan" not in page.partition("<main>")[2].replace("data:image", "").split("base64")[0]
+        found.append(json.loads((folder / str(i) / name).read_text()))
+    return found
 
 
 STICK = from_names(
