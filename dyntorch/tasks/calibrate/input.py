@@ -210,12 +210,10 @@ def _check_inside(x: Tensor, size: Tensor) -> None:
 
 
 def _refuse_twins(tracks: Sequence[Tensor]) -> None:
-    for i, one in enumerate(tracks):
-        for j in range(i):
-            other = tracks[j]
-            alike = isinstance(one, Tensor) and isinstance(other, Tensor) and one.shape == other.shape
-            if alike and len(one) and bool(one.isfinite().any()) and torch.equal(one.nan_to_num(-1.0), other.nan_to_num(-1.0)):
-                raise ValueError(f"tracks: cameras {j} and {i} are the same recording; give every camera once")
+    for (j, other), (i, one) in combinations(enumerate(tracks), 2):
+        alike = isinstance(one, Tensor) and isinstance(other, Tensor) and one.shape == other.shape
+        if alike and len(one) and bool(one.isfinite().any()) and torch.equal(one.nan_to_num(-1.0), other.nan_to_num(-1.0)):
+            raise ValueError(f"tracks: cameras {j} and {i} are the same recording; give every camera once")
 
 
 def _check_scale(scale: Scale, points: int) -> None:

@@ -211,7 +211,9 @@ def _general(planes: Tensor, present: Tensor) -> Tensor:
 def _collinear(planes: Tensor, present: Tensor) -> Tensor:
     r"""The solution for epipoles on one line l, where :math:`l^T G_i = l^T H_\infty` for all planes."""
     lines = _null_vectors(planes, present)[0].flatten(-3, -2)
-    line, across = _leading(lines.mT @ lines)
+    # two unit vectors across the common line, the eigenvector of the largest eigenvalue
+    across = gram_null_space(lines.mT @ lines, 2).basis
+    line = unit_vectors(torch.linalg.cross(across[..., 0, :], across[..., 1, :]))
     rows = across[..., None, :, :] @ planes
     centre = _mean(rows, present)
     p, q = (rows - centre[..., None, :, :]).unbind(-2)
@@ -240,12 +242,6 @@ def _mean(values: Tensor, present: Tensor) -> Tensor:
     """Over the planes ``(b, k, n, ...)`` that are present ``(b, 1, n)``."""
     weights = (present / present.sum(-1, keepdim=True).clamp(min=1.0))[(..., *([None] * (values.ndim - 3)))]
     return (values * weights).sum(2)
-
-
-def _leading(gram: Tensor) -> tuple[Tensor, Tensor]:
-    """The eigenvector ``(..., 3)`` of the largest eigenvalue, and two unit vectors ``(..., 2, 3)`` across it."""
-    across = gram_null_space(gram, 2).basis
-    return unit_vectors(torch.linalg.cross(across[..., 0, :], across[..., 1, :])), across
 
 
 def ridge_solution(gram: Tensor, right: Tensor) -> Tensor:
@@ -340,7 +336,10 @@ def infinity_thesis(homographies: Tensor) -> tuple[Tensor, Tensor]:
 
 def _solve(planes: Tensor, unknowns: int) -> tuple[Tensor, Tensor]:
     """The solution among extensors of 64 or 84 unknowns."""
-    extensors, table, batch = _plane_extensors(planes), _joins(unknowns, planes.device), planes.shape[:-3]
+    # unit extensors of the S(H); 0 for a plane that is not finite, or singular
+    axes = skew(torch.eye(3, dtype=torch.float64, device=planes.device))
+    members = axes @ unit_determinant(finite_matrices(planes)[0])[..., None, :, :]
+    extensors, table, batch = unit_vectors(extensor_of(members.flatten(-2))), _joins(unknowns, planes.device), planes.shape[:-3]
 
     def block(extensors: Tensor) -> tuple[Tensor, Tensor]:
         rows = (extensors @ table.flatten(1)).unflatten(-1, table.shape[1:]).flatten(1, 2)
@@ -351,13 +350,6 @@ def _solve(planes: Tensor, unknowns: int) -> tuple[Tensor, Tensor]:
     extensor = vector if unknowns == 84 else vector @ _invariant_basis(planes.device)
     transversal = subspace_of(extensor, 9, 3).unflatten(-1, (3, 3))
     return infinity_from_fundamentals(transversal)[0].reshape(*batch, 3, 3), spectrum.reshape(*batch, unknowns)
-
-
-def _plane_extensors(planes: Tensor) -> Tensor:
-    """Unit extensors ``(*batch, n, 84)`` of the S(H); 0 for a plane that is not finite, or singular."""
-    axes = skew(torch.eye(3, dtype=torch.float64, device=planes.device))
-    members = axes @ unit_determinant(finite_matrices(planes)[0])[..., None, :, :]
-    return unit_vectors(extensor_of(members.flatten(-2)))
 
 
 @constant

@@ -61,7 +61,8 @@ class GivenPlanes:
             frames = frames_of_calibration((cameras[:, 0], cameras[:, 1]))
         else:
             frames = frames_of_matrices(h, f)
-        hn, fn = normalize_homographies(h, frames), normalized_fundamentals(f, frames)
+        inverse = [torch.linalg.inv_ex(frame)[0][:, None] for frame in frames]
+        hn, fn = _regular(frames[1][:, None] @ h @ inverse[0], 3), _regular(inverse[1].mT @ f @ inverse[0], 2)
         return GivenPlanes(
             hn, fn, seen.transform(frames, hn), more.transform(frames, fn), matched, frames, h * _there(hn), cameras, batch, H
         )
@@ -226,16 +227,8 @@ def _finite(matrices: Tensor) -> Tensor:
     return unit(finite_matrices(matrices)[0])
 
 
-def normalize_homographies(homographies: Tensor, frames: Pair) -> Tensor:
-    """Homographies ``(b, p, 3, 3)`` of norm 1 in new coordinates; zero where one is missing or singular."""
-    moved = _finite(frames[1][:, None] @ homographies @ torch.linalg.inv_ex(frames[0])[0][:, None])
-    values = torch.linalg.svdvals(moved)
-    return torch.where((values[..., 2] > MIN_SINGULAR_RATIO * values[..., 0])[..., None, None], moved, 0.0)
-
-
-def normalized_fundamentals(fundamentals: Tensor, frames: Pair) -> Tensor:
-    """Fundamental matrices ``(b, m, 3, 3)`` of norm 1 in new coordinates; zero where one is missing or has rank one."""
-    inverse = [torch.linalg.inv_ex(frame)[0][:, None] for frame in frames]
-    moved = _finite(inverse[1].mT @ fundamentals @ inverse[0])
-    values = torch.linalg.svdvals(moved)
-    return torch.where((values[..., 1] > MIN_SINGULAR_RATIO * values[..., 0])[..., None, None], moved, 0.0)
+def _regular(matrices: Tensor, rank: int) -> Tensor:
+    """Matrices ``(b, k, 3, 3)`` of norm 1; zero where one is missing, or of a lower rank."""
+    finite = _finite(matrices)
+    values = torch.linalg.svdvals(finite)
+    return torch.where((values[..., rank - 1] > MIN_SINGULAR_RATIO * values[..., 0])[..., None, None], finite, 0.0)

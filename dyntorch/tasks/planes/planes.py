@@ -156,7 +156,7 @@ class TranslatingPlanes(Outcome):
         seen = views.isfinite().all(-1).to(views.dtype)
         frames = hartley(views.nan_to_num().unsqueeze(-2), seen)
         # the scale of a body is free: its points at a depth of order 1 keep the equations well conditioned
-        moved = (views - _centre(frames)) * frames[..., 0, 0][..., None, None]
+        moved = views * frames[..., 0, 0][..., None, None] + frames[..., None, :2, 2]
         points = triangulate(frames @ cameras.to(frames.dtype), moved.to(frames.dtype), seen, steps=STEPS)
         lost = (points == 0).all(-1, keepdim=True)
         return torch.where(lost, torch.nan, inhomogeneous(points))
@@ -191,11 +191,6 @@ class TranslatingPlanes(Outcome):
             error, residual = (float(v[good].double().median()) for v in (self.uncertainty, self.residual))
             lines.append(f"  homography at infinity: relative error about {error:.2g}{middle}; residual {residual:.3g} {self.unit}")
         return "\n".join(lines + self.warning_lines())
-
-
-def _centre(frames: Tensor) -> Tensor:
-    """The point ``(*, 1, 2)`` that similarities ``(*, 3, 3)`` move to the origin."""
-    return (-frames[..., :2, 2] / frames[..., :1, 0])[..., None, :]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -143,12 +143,9 @@ class Matrices:
         weight = there * self.weights
         # transposed derivative of the residual
         slope = (eye - g[..., :, None] * image[..., None, :]) / along[..., None]
-        return _normal(weight[..., None] * (image - g), image - g, slope, weight)
-
-
-def _normal(weighted: Tensor, value: Tensor, slope: Tensor, weight: Tensor) -> Normal:
-    cost = (weighted * value).sum(-1)
-    return Normal(cost, (slope @ weighted[..., None])[..., 0], weight[..., None, None] * (slope @ slope.mT))
+        weighted = weight[..., None] * (image - g)
+        cost = (weighted * (image - g)).sum(-1)
+        return Normal(cost, (slope @ weighted[..., None])[..., 0], weight[..., None, None] * (slope @ slope.mT))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from dyntorch.core.limits import quantile
 from dyntorch.core.outcome import Status, has_inliers, is_failure, notices
 from dyntorch.geometry.bundle import bundle_adjust
 from dyntorch.geometry.triangulation import triangulate, unit_projections
-from dyntorch.numerics.blocks import select
+from dyntorch.numerics.blocks import each, replace_problems, select
 from dyntorch.tasks.reconstruct.calibrated import metric_reconstruction, of_bodies
 from dyntorch.tasks.reconstruct.diagnosis import diagnose, least_squares, spare, unknowns
 from dyntorch.tasks.reconstruct.motions import MOTIONS, Motion
@@ -33,8 +33,6 @@ from dyntorch.tasks.reconstruct.scene import (
     scene_of,
     velocities,
 )
-
-Part = TypeVar("Part", Projections, LiftedState)
 
 
 def solve(
@@ -71,17 +69,19 @@ def solve(
     doubt = have_outliers(tracks, _distances(tracks, scene, lifting), free, limit) | is_failure(found.status)
     chosen = doubt.nonzero()[:, 0] if limit != float("inf") else doubt.nonzero()[:0, 0]
     if lifting is not None and len(chosen):
-        again, fewer, fine = trim_outliers(tracks.subset(chosen), _part(scene, chosen), lifting, free[chosen], limit)
+        again, fewer, fine = trim_outliers(
+            tracks.subset(chosen), each(lambda part: part[chosen], scene), lifting, free[chosen], limit
+        )
         fine = fine & ~is_failure(found.status[chosen])
         tracks = tracks.only(tracks.weights.index_copy(0, chosen[fine], fewer.weights[fine]))
-        scene = _merge(scene, _part(again, fine), chosen[fine])
+        scene = replace_problems(scene, chosen[fine], each(lambda part: part[fine], again))
         chosen = chosen[~fine]
     if len(chosen):
         some, fewer = robust_projections(tracks.subset(chosen), invariant, lifting, limit, generator, options)
         some, again = _scene(fewer, some, lifting)
         tracks = tracks.only(tracks.weights.index_copy(0, chosen, fewer.weights))
-        found = _merge(found, some, chosen)
-        scene = _merge(scene, again, chosen)
+        found = replace_problems(found, chosen, some)
+        scene = replace_problems(scene, chosen, again)
     return _result(tracks, motion, lifting, found, scene, static, batch, options, calibration)
 
 
@@ -100,7 +100,7 @@ def _correct_static(tracks: ViewTracks, scene: LiftedState, lifting: Lifting) ->
         some = tracks.subset(left)
         structure = triangulate(scene.cameras[left] @ lifting.lifts, some.x, some.weights)
         again = adjust_scene(some, LiftedState(scene.cameras[left], structure, scene.cost[left]), lifting)
-        scene = _merge(scene, again, left)
+        scene = replace_problems(scene, left, again)
     return tracks, scene
 
 
@@ -113,16 +113,6 @@ def _scene(tracks: ViewTracks, found: Projections, lifting: Lifting | None) -> t
         return Projections(found.projections, found.structure, status), scene
     done = bundle_adjust(tracks.x, tracks.weights, found.projections, found.structure)
     return found, LiftedState(done.cameras, done.structure, done.cost)
-
-
-def _merge(old: Part, new: Part, chosen: Tensor) -> Part:
-    """Results of some problems in their places."""
-    return type(old)(*(a.index_copy(0, chosen, b) for a, b in zip(vars(old).values(), vars(new).values(), strict=True)))
-
-
-def _part(whole: Part, keep: Tensor) -> Part:
-    """Some problems."""
-    return type(whole)(*(part[keep] for part in vars(whole).values()))
 
 
 def _distances(tracks: ViewTracks, scene: LiftedState, lifting: Lifting | None) -> Tensor:
