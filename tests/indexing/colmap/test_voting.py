@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from indexing.colmap.voting import DividedPair, vote
+from tests.grid import grid
 
 IMAGES = 5
 WIDE = 64  # points of the scene, one in every cell
@@ -45,7 +45,7 @@ CORNER = [45, 46, 53, 54]
 PAIRS = [(i, j) for i in range(IMAGES) for j in range(i + 1, IMAGES)]
 
 
-@pytest.mark.parametrize("first", [0, 1])
+@grid(("first", [0, 1]))
 def test_the_scene_is_static_though_the_body_has_more_matches(first):
     world = World(MIDDLE)
     found = world.voted([world.pair(i, j, first, 1 - first) for i, j in PAIRS])

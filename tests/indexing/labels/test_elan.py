@@ -90,13 +90,9 @@ def test_times_that_nobody_set_lie_between_their_neighbours(tmp_path: Path) -> N
     found = open_labels(eaf(tmp_path / "a.eaf", TIMES, ACTS, PARTS), tier="parts")
     assert [(label.start, label.end, label.label) for label in found.labels] == [(0, 1, "down"), (1, 2, "hold"), (2, 3, "up")]
     assert "2 times that nobody set taken from the neighbours, as ELAN does" in found.notices
-
-
-def test_slots_without_a_time_or_neighbours_are_named(tmp_path: Path) -> None:
-    lone = tier("lone", alignable("a9", "ts7", "ts8", "lost"))
-    found = open_labels(
-        eaf(tmp_path / "a.eaf", slots(ts1=0, ts4=3000, ts7=None, ts8=None), tier("b", alignable("a1", "ts1", "ts4", "x")), lone)
-    )
+    lone = tier("lone", alignable("a9", "ts7", "ts8", "lost"))  # without neighbours
+    times = slots(ts1=0, ts4=3000, ts7=None, ts8=None)
+    found = open_labels(eaf(tmp_path / "a.eaf", times, tier("b", alignable("a1", "ts1", "ts4", "x")), lone))
     assert [label.label for label in found.labels] == ["x"]
     assert "1 annotation left out: without a time (a9 of lone)" in found.notices
 
@@ -217,6 +213,12 @@ def test_detections_have_tiers_of_their_own(tmp_path: Path) -> None:
     assert "4 labels left out: a program found them (dyntorch); --tier NAME reads them" in chosen.notices
 
 
+def test_what_lasts_is_no_moment_however_short(tmp_path: Path) -> None:
+    path = tmp_path / "a.eaf"
+    write_labels(path, [Label(1.0, 1.001, "a"), Label(2.0, 2.0003, "b"), Label(3.0, 3.0, "c")], recording="session.mp4")
+    assert [(one.start, one.end) for one in open_labels(path).labels] == [(1.0, 1.002), (2.0, 2.002), (3.0, 3.0)]
+
+
 def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
     path = eaf(tmp_path / "a.eaf", TIMES, ACTS)
     write_labels(path, FOUND, recording="session.mp4")
@@ -248,6 +250,12 @@ def test_a_tier_that_a_person_took_over_is_theirs(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="somebody's tier is called 'dyntorch'; rename it, or write to another file"):
         write_labels(path, FOUND, recording="session.mp4")
     assert path.read_bytes() == before
+    path = eaf(tmp_path / "b.eaf", TIMES, ACTS)
+    write_labels(path, FOUND[2:], recording="session.mp4")
+    kind = "    <LINGUISTIC_TYPE LINGUISTIC_TYPE_ID"
+    path.write_text(path.read_text().replace(kind, tier("mine", kind="same", more=' PARENT_REF="dyntorch"') + kind, 1))
+    with pytest.raises(ValueError, match="tier 'mine' hangs on 'dyntorch'"):
+        write_labels(path, FOUND, recording="session.mp4")
 
 
 def test_corrections_are_not_written_over(tmp_path: Path) -> None:
@@ -274,23 +282,6 @@ def test_corrections_are_not_written_over(tmp_path: Path) -> None:
             with pytest.raises(ValueError, match=rf"a\.eaf: tier '{re.escape(tier_)}' is not as dyntorch wrote it.*; rename it to"):
                 write_labels(path, FOUND, recording="session.mp4", dry=dry)
         assert path.read_bytes() == before
-
-
-def test_what_lasts_is_no_moment_however_short(tmp_path: Path) -> None:
-    path = tmp_path / "a.eaf"
-    write_labels(path, [Label(1.0, 1.001, "a"), Label(2.0, 2.0003, "b"), Label(3.0, 3.0, "c")], recording="session.mp4")
-    assert [(one.start, one.end) for one in open_labels(path).labels] == [(1.0, 1.002), (2.0, 2.002), (3.0, 3.0)]
-
-
-def test_a_tier_that_others_hang_on_is_not_replaced(tmp_path: Path) -> None:
-    path = eaf(tmp_path / "a.eaf", TIMES, ACTS)
-    write_labels(path, FOUND[2:], recording="session.mp4")
-    child = tier("mine", kind="same", more=' PARENT_REF="dyntorch"')
-    path.write_text(
-        path.read_text().replace("    <LINGUISTIC_TYPE LINGUISTIC_TYPE_ID", child + "    <LINGUISTIC_TYPE LINGUISTIC_TYPE_ID", 1)
-    )
-    with pytest.raises(ValueError, match="tier 'mine' hangs on 'dyntorch'"):
-        write_labels(path, FOUND, recording="session.mp4")
 
 
 def test_files_that_are_no_place_for_labels(tmp_path: Path) -> None:

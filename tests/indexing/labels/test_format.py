@@ -202,9 +202,6 @@ def test_names_say_which_recording_labels_are_of() -> None:
     ):
         with pytest.raises(ValueError, match=re.escape(said)):
             of_recording(names, Request(Path("l.csv"), recording))
-
-
-def test_a_name_that_somebody_gives() -> None:
     assert of_recording(["x/a.mp4", "b.mp4"], Request(Path("l.csv"), "z.json", "a.mp4")) == {"x/a.mp4"}
     with pytest.raises(ValueError, match=r"has no labels of c\.mp4, only of a\.mp4; give one of these names \(--media\)"):
         of_recording(["a.mp4"], Request(Path("l.csv"), "z.json", "c.mp4"))

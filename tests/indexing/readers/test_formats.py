@@ -321,9 +321,7 @@ TABLES: dict[str, Callable[[np.ndarray], Rows]] = {
 
 
 @grid(("delimiter", [",", ";", "\t"]), ("variant", list(TABLES)))
-def test_every_table_gives_the_same_clip(
-    write_csv: Write, person: np.ndarray, expected: np.ndarray, variant: str, delimiter: str
-) -> None:
+def test_every_table_gives_the_same_clip(write_csv, person, expected, variant, delimiter):
     clip = read_clip(write_csv(TABLES[variant](person), delimiter=delimiter), fps=25.0)
     np.testing.assert_array_equal(clip.joints, expected)
     np.testing.assert_array_equal(clip.confidence, person[..., 2])

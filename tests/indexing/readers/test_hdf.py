@@ -365,9 +365,7 @@ def test_many_texts_in_an_attribute_are_not_read(person: np.ndarray, tmp_path: P
         assert (file.attribute("/", "many"), file.attribute("/", "one")) == (None, "a")
 
 
-def test_animals_are_checked_before_room_is_made_for_them(
-    person: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_animals_are_checked_before_room_is_made_for_them(person, tmp_path, monkeypatch):
     path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
     count = 100_000
 

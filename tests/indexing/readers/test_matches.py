@@ -27,9 +27,6 @@ def test_tables(tmp_path):
         found = read_pair(table(tmp_path / "m.csv", text))
         assert found.ids == ids and found.x1.tolist() == [[1, 2], [5, 6]] and found.x2.tolist() == [[3, 4], [7, 8]]
         assert found.weights is None and found.known is None and found.name == "m.csv"
-
-
-def test_columns_that_are_known(tmp_path):
     found = read_pair(table(tmp_path / "m.csv", "x1,y1,x2,y2,label,weight\n1,2,3,4,2,0.5\n5,,7,8,0,"))
     assert found.known.tolist() == [2, 0] and found.weights.tolist() == [0.5, 0] and found.complete.tolist() == [True, False]
 

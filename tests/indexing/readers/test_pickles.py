@@ -35,9 +35,7 @@ def people(person: np.ndarray) -> dict[str, np.ndarray]:
 
 # ---- sets ----------------------------------------------------------------------------------------------------------------
 @grid(("protocol", range(6)), ("bare", [False, True]))
-def test_a_set_is_read_whatever_the_protocol(
-    protocol: int, bare: bool, people: dict[str, np.ndarray], expected: np.ndarray, tmp_path: Path
-) -> None:
+def test_a_set_is_read_whatever_the_protocol(protocol, bare, people, expected, tmp_path):
     split = {"train": ["walk_1", "walk_2"], "test": ["sit_1"]}
     clips = read(tools.pyskl(tmp_path / "set.pkl", people, [3, 3, 5], split, bare, protocol, half=False))
     assert [clip.name for clip in clips] == list(people)
@@ -50,9 +48,7 @@ def test_a_set_is_read_whatever_the_protocol(
         assert clips.column("split").tolist() == ["train", "train", "test"]
 
 
-def test_parts_that_share_clips_people_and_clips_without(
-    people: dict[str, np.ndarray], expected: np.ndarray, tmp_path: Path
-) -> None:
+def test_parts_that_share_clips_people_and_clips_without(people, expected, tmp_path):
     none = np.zeros((1, 4, 17, 3))
     split = {"xsub_train": ["walk_1"], "xview_train": ["walk_1", "sit_1"]}
     path = tools.pyskl(tmp_path / "set.pkl", {**people, "none": none}, [0, 0, 1, 1], split)  # half floats

@@ -51,11 +51,11 @@ def test_largest_does_not_hop_when_another_is_larger_for_a_moment(openpose_folde
     np.testing.assert_array_equal(clip.joints, crouching[..., :2])
 
 
-@pytest.mark.parametrize("ids", [True, False])
+@grid(("ids", [True, False]))
 def test_where_the_person_is_absent_largest_goes_on_and_tracked_waits(openpose_folder: Write, ids: bool) -> None:
     frames = {i: [SMALL[i], BIG[i]] if i not in (3, 4) else [SMALL[i]] for i in range(FRAMES)}
     names = {i: [9, 2][: len(people)] for i, people in frames.items()} if ids else None
-    folder = openpose_folder(frames, ids=names)
+    folder = openpose_folder(frames, f"{ids}", ids=names)
     largest = read_clip(folder, person="largest")
     assert corner(largest.joints)[2:6] == [100, 400, 400, 100]
     tracked = read_clip(folder, person="tracked")

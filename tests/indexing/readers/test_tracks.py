@@ -56,9 +56,7 @@ def test_times_alone_are_the_views_and_unsorted_rows_are_sorted(write):
     found = read_tracks([write("t;point;x;y\n1,5;a;1;2\n-0,5;a;3,5;4\n")])
     np.testing.assert_array_equal(found.times, [-0.5, 1.5])
     np.testing.assert_array_equal(found.values[:, 0], [[3.5, 4], [1, 2]])
-
-
-def test_times_of_day_name_the_views_in_full_and_then_from_the_first(write):
+    # times of day name the views in full, and then from the first
     found = read_tracks([write("time,id,x,y\n1700000000.25,a,1,2\n1700000000.45,a,3,4\n1700000001.25,a,3,4\n")])
     assert found.views == ("1700000000.25", "1700000000.45", "1700000001.25")
     short = found.select(found.views[1:]).since_first()
