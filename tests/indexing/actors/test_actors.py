@@ -161,9 +161,7 @@ def test_noise_and_outliers_are_about_as_asked():
     wrong = detect(clip, azimuth=20.0, noise=0.0, dropout=0.0, outliers=0.04).joints
     share = (np.linalg.norm(wrong - clean, axis=2) > 0).mean()
     assert 0.03 < share < 0.05
-
-
-def test_hidden_joints_are_trusted_less():
+    # hidden joints are trusted less
     clip = perform("walk", Person())
     side = detect(clip, azimuth=90.0, dropout=0.0, outliers=0.0).confidence.mean(axis=0)
     back = detect(clip, azimuth=180.0, dropout=0.0, outliers=0.0).confidence.mean(axis=0)

@@ -86,13 +86,8 @@ def test_labels(save) -> None:
 
 def test_skeleton_up_names_and_confidence(save) -> None:
     confidence = np.linspace(0.1, 0.9, 27).reshape(9, 3)
-    path = save(
-        confidence=confidence,
-        parents=np.array([-1, 0, 1]),
-        joint_names=np.array(["hip", "knee", "foot"]),
-        up="-y",
-        names=np.array(["a", "b"]),
-    )
+    joints = {"parents": np.array([-1, 0, 1]), "joint_names": np.array(["hip", "knee", "foot"])}
+    path = save(confidence=confidence, up="-y", names=np.array(["a", "b"]), **joints)
     clips = read(path, min_confidence=0.5)
     assert clips[0].skeleton == Skeleton("moves", ("hip", "knee", "foot"), ((0, 1), (1, 2)))
     assert [clip.up for clip in clips] == ["-y", "-y"]
@@ -127,10 +122,7 @@ CONTRADICTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
     ({"fps": 0.0}, ("fps must be positive",)),
     ({"fps": np.array([25.0, 30.0, 50.0])}, ("fps must be one value or one per clip (2)", "(3,)")),
     ({"confidence": np.ones((9, 2))}, ("confidence", "(9, 3)", "(9, 2)")),
-    (
-        {"confidence": np.where(np.arange(27).reshape(9, 3) == 4, np.nan, 1.0)},
-        ("moves[0]", "NaN at frame 1, joint 1", "give 0"),
-    ),
+    ({"confidence": np.where(np.arange(27).reshape(9, 3) == 4, np.nan, 1.0)}, ("moves[0]", "NaN at frame 1, joint 1", "give 0")),
     ({"joint_names": np.array(["a", "b"])}, ("2 names for 3 joints",)),
     ({"bones": np.array([[0, 3]])}, ("bones", "(0, 3)")),
     ({"up": "left"}, ("up", "left")),

@@ -164,12 +164,6 @@ def test_3d_joints_of_a_lifter_have_z_up_and_those_of_openpose_are_read(write_js
     assert clip.times.tolist() == [0.1]
 
 
-def test_points_that_yolo_sets_to_zero_are_missing_whatever_their_confidence(write_json: Write, person: np.ndarray) -> None:
-    person[0, 5] = [0.0, 0.0, 0.4]
-    clip = read_clip(write_json([[yolo_person(one)] for one in person]))
-    assert not clip.seen[0, 5]
-
-
 def test_no_confidence_in_the_file(write_json: Write, person: np.ndarray, expected: np.ndarray) -> None:
     bare = [[{"keypoints": {"x": one[:, 0].tolist(), "y": one[:, 1].tolist()}, "class": 0, "box": {}}] for one in person]
     clip = read_clip(write_json(bare))
@@ -177,16 +171,15 @@ def test_no_confidence_in_the_file(write_json: Write, person: np.ndarray, expect
     np.testing.assert_array_equal(clip.joints, expected)
     with pytest.raises(ValueError, match=r"take\.json: .*no confidences.*min_confidence at 0"):
         read(write_json(bare), min_confidence=0.5)
+    person[0, 5] = [0.0, 0.0, 0.4]  # what YOLO sets to zero is missing, whatever its confidence
+    assert not read_clip(write_json([[yolo_person(one)] for one in person])).seen[0, 5]
 
 
-def test_min_confidence(write_json: Write, person: np.ndarray) -> None:
+def test_min_confidence_and_size(write_json: Write, person: np.ndarray, expected: np.ndarray) -> None:
     clip = read_clip(write_json(coco_results(person)), min_confidence=0.7)
     np.testing.assert_array_equal(clip.seen, person[..., 2] >= 0.7)
     with pytest.raises(ValueError, match=r"no person was detected in any of 6 frames.*min_confidence"):
         read(write_json(coco_results(person)), min_confidence=2.0)
-
-
-def test_size_undoes_normalized_coordinates_and_refuses_pixels(write_json: Write, person: np.ndarray, expected: np.ndarray) -> None:
     small = person.copy()
     small[..., :2] /= [640, 480]
     clip = read_clip(write_json([[yolo_person(one)] for one in small]), size=(640, 480))

@@ -287,16 +287,13 @@ def test_hostile_files_are_refused_before_anything_is_followed_made_or_run(perso
     check_changed(person, tmp_path, HOSTILE)
 
 
-def test_heaps_of_text_without_end_are_refused_before_the_library_walks_them(person: np.ndarray, tmp_path: Path) -> None:
+def test_heaps_of_text_without_end_and_texts_longer_than_the_file_are_refused(person: np.ndarray, tmp_path: Path) -> None:
     path = tools.movement(tmp_path / "a.nc", {"id": person}, NAMES)
     data = bytearray(path.read_bytes())
     at = data.index(b"GCOL\x01") + 16
     data[at : at + 16] = bytes(16)  # free, and of no size: the next piece is itself
     path.write_bytes(data)
     refused(path, "one of its heaps of text has no end")
-
-
-def test_a_text_longer_than_the_file_is_refused(person: np.ndarray, tmp_path: Path) -> None:
     path = tools.sleap_project(tmp_path / "a.slp", {"A": unseen(person)}, NAMES)
     with h5py.File(path) as file:
         at = file["tracks_json"].id.get_offset()

@@ -13,6 +13,7 @@ from indexing.readers import read
 from indexing.readers.c3d import read as read_c3d
 from indexing.skeleton import COCO17, Skeleton
 from indexing.writers import FORMATS, write
+from tests.grid import grid
 
 RANDOM = np.random.default_rng(0)
 UP = "up is -y, and coordinates are written as they are; programs may take y for up"
@@ -29,7 +30,7 @@ def body(frames=30, joints=17, dims=3, dtype=np.float32, **more):
     return Clip(values, **more)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@grid(("dtype", [np.float32, np.float64]))
 def test_trc_and_back(tmp_path, dtype):
     uneven = np.cumsum(RANDOM.uniform(0.001, 0.1, 30)) + 1e5
     clip = body(dtype=dtype, times=uneven, fps=None)
@@ -172,7 +173,7 @@ def test_what_is_refused_leaves_nothing(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.c3d", "a.trc"]
 
 
-@pytest.mark.parametrize("suffix", [".trc", ".c3d"])
+@grid(("suffix", [".trc", ".c3d"]))
 def test_what_headers_have_no_place_for(tmp_path, suffix):
     names = ("a\udcff", "b c", *(f"j{i}" for i in range(15)))
     clip = body(skeleton=Skeleton("s", names)).replace(meta={"units": "m\nm" + "x" * 300})
@@ -182,7 +183,9 @@ def test_what_headers_have_no_place_for(tmp_path, suffix):
     assert back.skeleton.joints[0] == "a\\udcff" and back.joints.shape == clip.joints.shape
 
 
-def test_unknown_formats_and_folders(tmp_path):
+def test_the_suffix_says_the_format_and_the_folder_is_there(tmp_path):
+    assert body().save(tmp_path / "a.npz") == []
+    assert ClipSet.load(tmp_path / "a.npz")[0].skeleton.joints == COCO17.joints
     with pytest.raises(ValueError, match=r"no format ends in '.abc'; end the name in one of .npz, .c3d, .nc, .trc"):
         write([body()], tmp_path / "a.abc")
     for suffix in (*FORMATS, ".npz"):
