@@ -6,8 +6,10 @@ import numpy as np
 import torch
 
 from dyntorch import Clocks
+from dyntorch.geometry import distort
 from indexing.clip import Clip
 from indexing.skeleton import Skeleton
+from tests.indexing.calibrate.scene import clocks_of, looking
 
 NAMES = (
     "nose", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip",
@@ -33,35 +35,18 @@ class Cameras:
     clocks: Clocks
 
 
-def clocks(offsets):
-    """Clocks that are known, all of one rate."""
-    offsets = torch.tensor(offsets, dtype=torch.float64)
-    one, none = torch.ones_like(offsets), torch.zeros_like(offsets)
-    return Clocks(
-        status=torch.tensor(0), notices=(), offsets=offsets, rates=one, sigmas=none, rate_sigmas=none, confidence=1.0, pairs=(),
-        cycle_error=0.0, worst_cycle=None, outliers=[], reference=0, center=0.0, shifts={},
-    )  # fmt: skip
-
-
 def cameras(azimuths, distance=5.0, focal=1400.0, offsets=None, k1=0.0):
     """Tripods at 1.2 to 1.8 m, aimed at a man's middle."""
     count = len(azimuths)
     K = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
     K[:, 0, 0] = K[:, 1, 1] = focal
     K[:, 0, 2], K[:, 1, 2] = 960.0, 540.0
-    R, t = [], []
-    for k, angle in enumerate(azimuths):
-        center = np.array([distance * np.cos(angle), distance * np.sin(angle), 1.2 + 0.3 * (k % 3)])
-        ahead = np.array([0, 0, 0.9]) - center
-        ahead /= np.linalg.norm(ahead)
-        right = np.cross(ahead, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        rows = np.stack([right, np.cross(ahead, right), ahead])
-        R.append(rows)
-        t.append(-rows @ center)
+    heights = [1.2 + 0.3 * (k % 3) for k in range(count)]
+    poses = [looking((distance * np.cos(a), distance * np.sin(a), up)) for a, up in zip(azimuths, heights, strict=True)]
+    R, t = (torch.from_numpy(np.stack(part)) for part in zip(*poses, strict=True))
     lens = torch.zeros(count, 5, dtype=torch.float64)
     lens[:, 0] = k1
-    return Cameras(K, torch.from_numpy(np.array(R)), torch.from_numpy(np.array(t)), lens, clocks(offsets or [0.0] * count))
+    return Cameras(K, R, t, lens, clocks_of(torch.tensor(offsets or [0.0] * count, dtype=torch.float64)))
 
 
 class Person:
@@ -83,8 +68,6 @@ class Person:
 
 def filmed(people, rig, frames=150, fps=30.0, noise=2.0, seed=0):
     """Per camera ``(frames, people, joints, 2)`` px."""
-    from dyntorch.geometry import distort
-
     rng = np.random.default_rng(seed)
     out = []
     for k in range(len(rig.K)):
