@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -20,7 +20,7 @@ from dyntorch.core.residual import whiten, whitened_residual
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY, Solution
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
-from dyntorch.invariants.dynamic_tensor import DynamicMotion, flat_residual, nearest_flats
+from dyntorch.invariants.dynamic_tensor import DynamicMotion, nearest_flats
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.invariants.join_tensor import JoinTensor
 from dyntorch.numerics.blocks import each, map_blocks, select, uniform
@@ -485,14 +485,3 @@ def three_of(data: Matches) -> list[Matches]:
         Matches((data.views[0], data.views[a], data.views[b]), data.weights, data.static, data.batch, data.dtype, data.device)
         for a, b in pairs
     ]
-
-
-def still_but_one(motion: Sequence[Tensor], views: Sequence[Tensor], scales: Sequence[Tensor], limit: Tensor) -> Tensor:
-    """Matches ``(b, n)`` that stand still in all views but one, by squares of distances up to ``limit (b, 1)``."""
-    eye = torch.eye(motion[0].shape[-1], dtype=motion[0].dtype, device=motion[0].device).expand_as(motion[0])
-    maps = torch.stack([eye, *motion], dim=-3)
-    agree = []
-    for chosen in combinations(range(len(views)), len(views) - 1):
-        part = flat_residual(maps[:, list(chosen)], [views[v] for v in chosen], [scales[v] for v in chosen], 1)
-        agree.append(part.square().sum(-1) <= limit)
-    return torch.stack(agree).any(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import torch
@@ -17,6 +18,7 @@ from dyntorch.core.solution import Solution
 from dyntorch.geometry.bundle import calibrations
 from dyntorch.geometry.homogeneous import homogeneous, nonzero_sign
 from dyntorch.geometry.rigid import CommonPlane, PlaneMotion, motion_over, plane_motions
+from dyntorch.invariants.dynamic_tensor import flat_residual
 from dyntorch.invariants.homography_tensor import HomographyTensor
 from dyntorch.numerics.arguments import check_options, check_threshold
 from dyntorch.numerics.blocks import each, one_thread
@@ -30,7 +32,6 @@ from dyntorch.tasks.align.labelling import (
     normalized_motion,
     static_start,
     status_of_labels,
-    still_but_one,
     tensor_start,
     three_of,
     trajectory_lines,
@@ -286,8 +287,13 @@ def is_undecided(evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tenso
 def unverified_matches(evidence: Evidence, best: Labelled) -> Tensor:
     """Matches ``(b, n)`` that all views but one agree on as static, whatever that one says."""
     parts = evidence.problem(best.labels).parts(best.theta)
+    maps = torch.stack([torch.eye(3, dtype=parts[0].dtype, device=parts[0].device).expand_as(parts[0]), *parts], dim=-3)
     limit = three_sigma(evidence.static_conditions - 2) * best.sigma.square()[:, None]
-    return still_but_one(parts, evidence.views, evidence.norm.scales, limit) & (evidence.data.weights > 0)
+    agree = []
+    for chosen in combinations(range(len(evidence.views)), len(evidence.views) - 1):
+        some = ([x[v] for v in chosen] for x in (evidence.views, evidence.norm.scales))
+        agree.append(flat_residual(maps[:, list(chosen)], *some, 1).square().sum(-1) <= limit)
+    return torch.stack(agree).any(0) & (evidence.data.weights > 0)
 
 
 def thinness(evidence: Evidence, sigma: Tensor) -> Tensor:
