@@ -177,16 +177,12 @@ def euclidean(solution: Solution, data: Matches, labels: Tensor, K: Tensor) -> t
     odd = views.known & (choice.cost > MAX_CALIBRATION_MISFIT * three_sigma(degrees)) & (choice.misfit > MIN_LENGTH_DEVIATION)
     notices, note = noting(data.batch)
     note(AlignNotice.PLANE_OPEN, choice.deviation.clamp(max=9.9), free)
-    note(AlignNotice.TWO_PLANES, _angle(choice.normal, choice.other), several)
+    angle = torch.atan2(torch.linalg.cross(choice.normal, choice.other).norm(dim=-1), (choice.normal * choice.other).sum(-1))
+    note(AlignNotice.TWO_PLANES, torch.rad2deg(angle), several)
     note(AlignNotice.CALIBRATION, choice.misfit, odd & ~free)
     first = views.motion(choice.normal)
     second = views.motion(torch.where(several[:, None], choice.other, choice.normal))
     return _to_batch(first, views.fine, ~free, data), _to_batch(second, several, several, data), notices
-
-
-def _angle(first: Tensor, second: Tensor) -> Tensor:
-    """Degrees between directions ``(b, 3)``."""
-    return torch.rad2deg(torch.atan2(torch.linalg.cross(first, second).norm(dim=-1), (first * second).sum(-1)))
 
 
 def _to_batch(motion: PlaneMotion, turned: Tensor, determined: Tensor, data: Matches) -> PlaneMotion:

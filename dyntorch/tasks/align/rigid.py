@@ -271,7 +271,9 @@ def _search(
         return found
     common, members, present = *common_velocity(found, flat, options), (flat.weights > 0).sum(-1)
     standing = ~grounded & (members >= 3) & (members >= options.min_static_share * present)
-    found = replace(found, motions=shift_gauge(found.motions, torch.where(grounded[:, None], 0.0, common)))
+    # in the gauge in which points of the common velocity stand still
+    shift = torch.where(grounded[:, None], 0.0, common)[:, None] * common.new_tensor([[1.0], [2.0]])
+    found = replace(found, motions=found.motions - pad(shift[..., None], (3, 0, 0, 1)))
     if not bool(standing.any()):
         return found
     return _iterate_labels(found.motions, flat, found.sigma, sigma is None, held, grounded | standing, floor)
@@ -339,14 +341,6 @@ def _noise(motions: Tensor, data: RigidSightings, inliers: Tensor, still: Tensor
     conditions = torch.where(still, 6, data.conditions) * inliers
     spare = conditions.sum(-1) - torch.where(grounded, 12, 9)
     return torch.where(spare >= 4, (total / spare.clamp(min=1)).sqrt(), before)
-
-
-def shift_gauge(motions: Tensor, velocity: Tensor) -> Tensor:
-    """Motions ``(b, 2, 4, 4)`` in the gauge in which points of this velocity ``(b, 3)`` stand still."""
-    steps = torch.tensor([1.0, 2.0], dtype=motions.dtype, device=motions.device)
-    shift = torch.zeros_like(motions)
-    shift[..., :3, 3] = steps[:, None] * velocity[:, None]
-    return motions - shift
 
 
 def common_velocity(found: Rigid, data: RigidSightings, options: AlignOptions) -> tuple[Tensor, Tensor]:

@@ -28,7 +28,6 @@ from dyntorch.numerics.blocks import uniform
 from dyntorch.tasks.segment.coherence import Links
 from dyntorch.tasks.segment.frame_pairs import DOUBLED_VARIANCE_MOTION, FramePair, Pair, TrackSet, select_near_pairs
 from dyntorch.tasks.segment.search import one_hot
-from dyntorch.tasks.segment.track_energy import Candidates
 
 TINY = 1e-12
 
@@ -144,11 +143,6 @@ def _epipolar(F: Tensor, x1: Tensor, x2: Tensor) -> Tensor:
     lines, others = (F @ first).float(), (F.mT[:, :2] @ second).float()
     value = (lines * second.float()).sum(-2)
     return value.square() / (lines[:, :2].square().sum(-2) + others.square().sum(-2)).clamp(min=1e-30)
-
-
-def common_share(kernel: Tensor) -> float:
-    """How much the usual track has in common with the five that move most like it, from a kernel ``(n, m)``."""
-    return float(kernel.topk(min(5, kernel.shape[1]), dim=-1).values.mean(-1).median())
 
 
 def keep_strongest(kernel: Tensor, neighbours: int) -> Tensor:
@@ -325,11 +319,3 @@ def merge_pieces(judge: GroupCosts, labels: Tensor, counts: Sequence[int]) -> di
         remaining = torch.ones(len(groups), dtype=torch.bool, device=groups.device)
         remaining[[first, second]] = False
         groups = torch.cat([groups[remaining], (groups[first] | groups[second])[None]])
-
-
-def weakest_separation(judge: GroupCosts, candidate: Candidates, weight: float) -> float:
-    """Of the least separate bodies of one candidate; infinite for a single body."""
-    member = one_hot(candidate.labels[0], candidate.bodies) > 0
-    if len(member) < 2:
-        return float("inf")
-    return float(judge.separation(member).value(weight).min())

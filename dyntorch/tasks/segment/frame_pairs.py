@@ -96,7 +96,7 @@ def select_near_pairs(film: TrackSet, gaps: tuple[int, ...], starts: int, common
     length = float(film.lengths.double().median())
     most = round(starts * max(1.0, count / max(length, 4.0) / 1.5))
     pairs = dict.fromkeys(pair for gap in gaps for pair in space_pairs(count, min(gap, count - 1), most))
-    return [pair for pair in pairs if _num_common_tracks(film, pair) >= common]
+    return [(a, b) for a, b in pairs if int((film.seen[a] & film.seen[b]).sum()) >= common]
 
 
 def select_frame_pairs(film: TrackSet, max_pairs: int) -> list[Pair]:
@@ -158,7 +158,3 @@ def find_scene_cut(film: TrackSet) -> SceneCut | None:
             if len(step) and float((step > MIN_JUMP * typical).double().mean()) > MIN_JUMPING_SHARE:
                 return SceneCut(frame, 1.0, float(step.median()) / typical)
     return None
-
-
-def _num_common_tracks(film: TrackSet, pair: Pair) -> int:
-    return int((film.seen[pair[0]] & film.seen[pair[1]]).sum())

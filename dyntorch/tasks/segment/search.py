@@ -332,12 +332,14 @@ def _sample_geometries(view: View, weight: Tensor, parts: int, generator: torch.
     """Geometries of the best samples of the matches with weights ``(n,)``, descended; this is one of several parts of the work."""
     x1, x2, single = view.x1.float(), view.x2.float(), weight.float()
     best, votes = view.x1.new_zeros(0, 3, 3), single.new_zeros(0)
-    drawn, needed = 0, 1.0
+    drawn, needed, scale = 0, 1.0, SAMPLE_DISTANCE_PIXELS * view.pixel
     while drawn < min(needed, max_samples / parts):
         geometries, valid = sample_fundamentals(view.x1, view.x2, weight[None], SAMPLES_AT_ONCE // parts, generator)
         drawn += SAMPLES_AT_ONCE // parts
         geometries = geometries[valid]
-        totals = [_votes(part, x1, x2, single, SAMPLE_DISTANCE_PIXELS * view.pixel) for part in geometries.float().split(BLOCK)]
+        # what the matches near each geometry count together
+        near = [1 - sampson_squared(part, x1, x2) / scale**2 for part in geometries.float().split(BLOCK)]
+        totals = [part.clamp_(min=0) @ single for part in near]
         best, votes = torch.cat([best, geometries]), torch.cat([votes, *totals])
         votes, place = votes.topk(min(NUM_DESCENDED_SAMPLES // parts, len(votes)))
         best = best[place]
@@ -346,8 +348,3 @@ def _sample_geometries(view: View, weight: Tensor, parts: int, generator: torch.
     for scale in SAMPLE_FIT_SCALES_PIXELS:
         best = descend(best, view.x1, view.x2, weight.expand(len(best), -1), scale * view.pixel)
     return best
-
-
-def _votes(F: Tensor, x1: Tensor, x2: Tensor, weight: Tensor, scale: float) -> Tensor:
-    """What the matches ``(n,)`` near each geometry ``(p,)`` count together."""
-    return (1 - sampson_squared(F, x1, x2) / scale**2).clamp_(min=0) @ weight

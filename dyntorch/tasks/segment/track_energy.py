@@ -98,12 +98,6 @@ def squares(pair: FramePair, fundamentals: Tensor) -> Tensor:
     return sampson_squared(fundamentals, pair.view.x1, pair.view.x2) * (pair.precision / pair.view.pixel**2)
 
 
-def student_cost(square: Tensor) -> Tensor:
-    r"""Cost of squared distances over the variance, :math:`(\nu + 1) \log(1 + \min(z, c^2) / \nu)`."""
-    worst = (TRACK_FREEDOM + 1) * log1p(MAX_TRACK_DISTANCE**2 / TRACK_FREEDOM)
-    return ((TRACK_FREEDOM + 1) * torch.log1p(square / TRACK_FREEDOM)).clamp(max=worst)
-
-
 def noise(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor) -> Tensor:
     """Standard deviations ``(B,)`` of a coordinate of a track at rest, for members ``(B, K, n)``: most likely for Student's
     distribution of all distances from the own body."""
@@ -128,8 +122,10 @@ def costs(
     """Cost ``(B, K, n)`` of every track in every body without links; with the relief of bodies of members ``(B, K, n)``."""
     B, K = geometry[0].shape[:2]
     total = torch.zeros(B, K, len(evidence.count), dtype=torch.float64, device=scale.device)
+    worst = (TRACK_FREEDOM + 1) * log1p(MAX_TRACK_DISTANCE**2 / TRACK_FREEDOM)
     for pair, F in zip(evidence.pairs, geometry, strict=True):
-        cost = student_cost(squares(pair, F) / scale.square()[:, None, None])
+        ratio = squares(pair, F) / scale.square()[:, None, None]
+        cost = ((TRACK_FREEDOM + 1) * torch.log1p(ratio / TRACK_FREEDOM)).clamp(max=worst)
         if member is not None and relief_weight > 0:
             cost = cost + relief_weight * relief_cost(pair.view, F, member[..., pair.index].double(), MIN_TRACK_PARALLAX_PIXELS)
         total[..., pair.index] += cost

@@ -19,13 +19,11 @@ from dyntorch.tasks.segment.agglomeration import (
     NEGLIGIBLE_LINKS,
     GroupCosts,
     NearPairs,
-    common_share,
     cut_into_pieces,
     keep_strongest,
     links_of,
     merge_pieces,
     preference_kernel,
-    weakest_separation,
 )
 from dyntorch.tasks.segment.coherence import THRESHOLD_PIXELS
 from dyntorch.tasks.segment.frame_pairs import FramePair, TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs
@@ -111,12 +109,13 @@ class Start:
         """How good a segmentation is beside others into as many bodies."""
         if not bool(one.energy.isfinite()):
             return float("-inf")
-        separation = weakest_separation(self.judge, one, SEPARATION_LINK_WEIGHT) if one.bodies > 1 else 0.0
-        count = len(self.evidence.count)
+        member, count = one_hot(one.labels, one.bodies), len(self.evidence.count)
+        least = self.judge.separation(member[0] > 0).value(SEPARATION_LINK_WEIGHT).min() if one.bodies > 1 else 0.0
+        separation = float(least)
         if not thorough:
             return separation - ENERGY_WEIGHT * float(one.energy) / count
         cost = energy(self.evidence, one.geometry, one.labels, one.scale, COMPARISON_RELIEF_WEIGHT)
-        cut = self.evidence.links.cut_weight(one_hot(one.labels, one.bodies).double())
+        cut = self.evidence.links.cut_weight(member)
         return SEPARATION_WEIGHT * separation - float(cost + (COMPARISON_CUT_WEIGHT - 1) * cut) / count
 
 
@@ -305,7 +304,8 @@ def _solve(tracks: Tensor, cameras: Tensor | None, request: TrackRequest) -> Tra
     alive = film.seen.any(0).nonzero().flatten()
     searched = alive[draw_subset(len(alive), options.max_searched, request.generator, alive.device)]
     kernel = preference_kernel(film, searched, request.generator, options.num_hypotheses)
-    alike = common_share(kernel[searched])
+    # what the usual track has in common with the five that move most like it
+    alike = float(kernel[searched].topk(min(5, len(searched)), dim=-1).values.mean(-1).median())
     if alike < MIN_COMMON_PREFERENCES + MIN_COMMON_PREFERENCES_GROWTH * log(len(searched)):
         return _no_bodies(count, request, [Notice(SegmentNotice.UNRELATED, alike)])
     start = _start(film, frames, kernel, searched, request)
