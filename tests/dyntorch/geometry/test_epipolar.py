@@ -181,6 +181,8 @@ def test_null_vector_is_the_smallest_eigenvector():
         assert excess.max() < 0.05
         assert excess[apart].max() < 1e-5
     assert null_vector(torch.zeros(2, 9, 9).double()).isfinite().all()
+    # a neighbour of another size changes nothing
+    torch.testing.assert_close(null_vector(torch.stack([gram[0], 1e20 * gram[1]]))[0], null_vector(gram[:1])[0])
 
 
 def test_draws_are_without_replacement_and_by_weight():
