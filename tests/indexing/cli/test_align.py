@@ -93,7 +93,7 @@ def test_planar_from_csv(run, planar, tmp_path):
     assert found["manifest"]["seed"] == 0 and len(found["manifest"]["inputs"]) == 3
     counts = [str(found["counts"][name]) for name in ("static", "moving", "outlier", "missing")]
     assert ["90", *counts] in [line.split()[:5] for line in out.splitlines()] and "report: out/report.html" in out
-    assert "A: view 2 to view 1" in out and "open: A and B are unique" in out
+    assert "A: view 2 to view 1" in out and "open: The collineations are unique" in out
     page = Path("out/report.html").read_text()
     assert page.count("data:image/png;base64,") == 1 and f"{counts[0]} stand still and {counts[1]} move" in page
     assert Path("out/alignment.png").read_bytes().startswith(b"\x89PNG")
