@@ -287,8 +287,8 @@ def unverified_matches(evidence: Evidence, best: Labelled) -> Tensor:
     limit = three_sigma(evidence.static_conditions - 2) * best.sigma.square()[:, None]
     agree = []
     for chosen in combinations(range(len(evidence.views)), len(evidence.views) - 1):
-        some = ([x[v] for v in chosen] for x in (evidence.views, evidence.norm.scales))
-        agree.append(flat_residual(maps[:, list(chosen)], *some, 1).square().sum(-1) <= limit)
+        views, scales = ([x[v] for v in chosen] for x in (evidence.views, evidence.norm.scales))
+        agree.append(flat_residual(maps[:, list(chosen)], views, scales, 1).square().sum(-1) <= limit)
     return torch.stack(agree).any(0) & (evidence.data.weights > 0)
 
 
