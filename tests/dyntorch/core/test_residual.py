@@ -96,6 +96,8 @@ def test_distance_of_a_batch_is_that_of_its_problems(case):
     assert whole.shape == (2, 3, 7) and whole.dtype == torch.float64
     alone = dyn.sampson(case.invariant, tensor[1, 2], *(x[1, 2] for x in views))
     torch.testing.assert_close(whole[1, 2], alone, rtol=1e-6, atol=1e-9)
+    views[0][1, 2, 3] = torch.nan  # missing
+    assert dyn.sampson(case.invariant, tensor, *views).isinf().nonzero().tolist() == [[1, 2, 3]]
 
 
 F, H, CV = dyn.FundamentalMatrix, dyn.HomographyTensor, dyn.ConstantVelocityTensor
