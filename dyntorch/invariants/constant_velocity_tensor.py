@@ -377,7 +377,8 @@ def constant_velocity_maps(tensor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return unit(first), unit(second), unit(third)
     # the plane at infinity of the third frame: gamma^T Q ~ beta^T, gamma^T K ~ alpha^T
     rest = q - (q @ beta[..., None]) * beta[..., None, :]
-    gamma = null_space(torch.cat([rest.mT, k.mT], dim=-2))[..., 0, :]
+    k_rest = k - (k @ alpha[..., None]) * alpha[..., None, :]  # once more: what rounding left of K alpha
+    gamma = null_space(torch.cat([rest.mT, k_rest.mT], dim=-2))[..., 0, :]
     shift = (gamma[..., None, :] @ q @ beta[..., None])[..., 0] * gamma
     q = q + shift[..., :, None] * beta[..., None, :]
     k = k - shift[..., :, None] * alpha[..., None, :]
