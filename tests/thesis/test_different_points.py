@@ -26,7 +26,7 @@ class Waves:
         return (self.size * torch.sin(self.pace * t.reshape(-1, 1, *[1] * (self.pace.ndim - 1)) + self.phase)).sum(1)
 
 
-def films(seed, offset, *, moving=False, seconds=7.0):
+def films(seed, offset, *, moving=False, planar=False, seconds=7.0):
     """Ten points of a and nine others of b, between three free ones, in two affine cameras; b is ``offset`` behind."""
     g = seeded(seed)
     free = Waves(g, 3, 3)
@@ -35,6 +35,8 @@ def films(seed, offset, *, moving=False, seconds=7.0):
     found = []
     for share, times in zip(shares, (t, t - offset), strict=True):
         X = torch.einsum("pk,tkd->tpd", share, free(times))
+        if planar:
+            X[..., 2] = 0.2 * X[..., 0] - 0.1 * X[..., 1]
         x = 60 * X @ torch.linalg.qr(torch.randn(3, 3, generator=g, dtype=torch.float64))[0][:, :2] + 300
         if moving:  # a pan of any course, and a zoom in or out by up to a fifth
             zoom = 1 + 0.2 * torch.sin(0.7 * times + 3 * len(found))
@@ -54,11 +56,14 @@ def test_cameras_that_pan_and_zoom():
     assert abs(found.offset - 0.37) * FPS < 0.1
 
 
-@pytest.mark.parametrize(("measure", "within"), [("rank", 0.5), ("log_determinant", 0.02), ("principal_angles", 1.0)])
-def test_measures_by_name(measure, within):
-    """At whole frames every measure of the thesis finds exact data's shift; that of the angles is the bluntest."""
-    found = shift(*films(9, 0.48), measure=measure, camera_model="affine")
-    assert abs(found.offset - 0.48) * FPS < within
+@pytest.mark.parametrize("measure", ["rank", "log_determinant", "principal_angles"])
+def test_measures_by_name(measure):
+    """Of a plane both cameras show the same six rows: at the shift of exact data the rank is least and all angles are zero.
+
+    In space each camera shows six of nine, and the sum of the cosines may be larger elsewhere.
+    """
+    found = shift(*films(4, 0.48, planar=True, seconds=5.0), measure=measure, camera_model="affine")
+    assert abs(found.offset - 0.48) * FPS < 0.02
 
 
 def test_films_of_different_events_are_refused():
