@@ -21,10 +21,12 @@ PUBLIC = [(package, name) for package in (dyntorch, indexing, *ROOMS) for name i
 
 @pytest.fixture(scope="module")
 def reference():
+    """The script of the reference, with what its pages are about read: the packages are imported before a test is timed."""
     spec = importlib.util.spec_from_file_location("docs_reference", DOCS / "reference.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # where dataclasses look their module up
     spec.loader.exec_module(module)
+    module.pages()
     return module
 
 

@@ -223,7 +223,7 @@ def algebraic_motion(solution: Solution, data: Matches, iterations: int = CONSTR
         matrix = gram(norm.primitives, views, weights, static)
         trace = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
         problem = Algebraic(base, shapes, matrix / trace.clamp(min=torch.finfo(trace.dtype).tiny))
-        theta = _least(tries, problem.cost)
+        theta = _select_start(tries, problem.cost)
         return minimize(problem, problem.evaluate((theta,)), options).theta[0]
 
     theta = torch.cat([part.flatten(2) for part in starts], dim=-1).transpose(0, 1)
@@ -231,7 +231,7 @@ def algebraic_motion(solution: Solution, data: Matches, iterations: int = CONSTR
     return parts_of(map_blocks(run, theta, views, relative_weights(data.weights), data.static, size=size), shapes)
 
 
-def _least(starts: Tensor, cost: Callable[[Tensor], Tensor]) -> Tensor:
+def _select_start(starts: Tensor, cost: Callable[[Tensor], Tensor]) -> Tensor:
     """The start ``(b, p)`` of least cost, of ``(b, tries, p)``."""
     if starts.shape[1] == 1:
         return starts[:, 0]
@@ -361,7 +361,7 @@ def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIO
         starts: Tensor, views: tuple[Tensor, ...], scales: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
     ) -> Minimum:
         problem = Problem(base, shapes, views, scales, weights, static)
-        theta = _least(starts, lambda theta: problem.normal_equations(theta)[0])
+        theta = _select_start(starts, lambda theta: problem.normal_equations(theta)[0])
         return minimize(problem, problem.evaluate((theta,)), LeastSquaresOptions(iterations=iterations))
 
     # a block for every thread at least: threads inside of small operations cost more than they bring

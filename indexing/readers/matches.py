@@ -151,7 +151,7 @@ def _match_by_name(views: Sequence[PointSet], names: tuple[str, ...]) -> Matched
         left = "name is not in every view and was" if len(lost) == 1 else "names are not in every view and were"
         notes.append(f"{len(lost)} {left} left out: {', '.join(clip_text(name, VALUE) for name in lost[:MAX_LISTED])}{more}")
     order = [np.array([place[name] for name in shared]) for place in places]
-    sorted_views = [view.take(rows, tuple(shared)) for view, rows in zip(views, order, strict=True)]
+    sorted_views = [view.select_rows(rows, tuple(shared)) for view, rows in zip(views, order, strict=True)]
     weights, static = _weights_and_static(sorted_views)
     return Matched(tuple(view.values for view in sorted_views), tuple(shared), names, weights, static, (), tuple(notes))
 

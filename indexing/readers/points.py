@@ -35,7 +35,7 @@ class PointSet:
         """Whether these are lines."""
         return self.values.ndim == 3 or self.values.shape[-1] == 6
 
-    def take(self, rows: NDArray[np.intp], ids: tuple[str, ...]) -> PointSet:
+    def select_rows(self, rows: NDArray[np.intp], ids: tuple[str, ...]) -> PointSet:
         """Some rows, in an order, under these names."""
         weights = None if self.weights is None else self.weights[rows]
         return PointSet(self.path, self.values[rows], ids, weights, None if self.static is None else self.static[rows])

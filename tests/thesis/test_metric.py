@@ -5,6 +5,7 @@ The scenes are written here from the definitions: points that move, cameras K [R
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import pytest
@@ -14,32 +15,31 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch.core.outcome import Status
 from dyntorch.geometry.rigid import rotation_exponential
+from dyntorch.scenes.lifts import KINDS
 from dyntorch.tasks.reconstruct.motions import MOTIONS
 from dyntorch.tasks.reconstruct.result import Reconstruction
 
 K = torch.tensor([[1300.0, 0.0, 500.0], [0.0, 1280.0, 480.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-AXES = {"constant_direction_2d": 1, "constant_direction_3d": 1, "constant_velocity_planes_3d": 2}
-"""World directions in which points move, where they are fewer than those of the world."""
 
 
 def filmed(name: str, views: int, n: int, seed: int, turning: bool = False) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Images ``(views, n, l)``, points ``(views, n, d)``, R and t of a motion, by its definition."""
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    dim = 2 if "2d" in name else 3
-    moving = AXES.get(name, 0 if "static" in name or "bodies" in name else dim)
+    kind = KINDS[name]
+    dim, moving = kind.dim, kind.axes
     t = torch.arange(float(views), dtype=torch.float64)[:, None, None]
     X = torch.zeros(views, n, 3, dtype=torch.float64)
     X[..., :dim] = normal(n, dim)
     X[..., :moving] += 0.12 * t * normal(n, moving)
-    if "acceleration" in name:
-        X[..., :2] += 0.03 * t**2 * normal(n, 2)
-    if "bodies" in name:
+    if kind.degree > 1:
+        X[..., :moving] += 0.03 * t**2 * normal(n, moving)
+    if kind.bodies > 1:
         X[:, n // 2 :, :dim] += 0.5 * normal(views, 1, dim)
     R = rotation_exponential(0.35 * normal(views, 3) + torch.tensor([0.5, 0.2, 0.0], dtype=torch.float64))
     centre = torch.tensor([0.3, -0.2, -6.0], dtype=torch.float64) + (0.0 if turning else 0.6) * normal(views, 3)
     shift = -(R @ centre[..., None])[..., 0] if turning else centre * torch.tensor([1.0, 1.0, -1.0])
     seen = X @ R.mT + shift[:, None]
-    if "sensors" not in name:
+    if not kind.sensors:
         seen = seen @ K.mT
         seen = seen[..., :2] / seen[..., 2:]
     return seen, X[..., :dim], R, shift
@@ -57,22 +57,24 @@ def tracked(found: Reconstruction, views: int) -> Tensor:
     return torch.stack([found.at(float(t)) for t in range(views)])
 
 
-@pytest.mark.parametrize("name", [name for name in MOTIONS if "bodies" not in name])
+@pytest.mark.parametrize("name", [name for name in MOTIONS if KINDS[name].bodies == 1])
 def test_scene_is_metric_up_to_a_similarity_and_what_all_points_share(name: str) -> None:
     """Known K makes every motion metric; exact data leave rounding.  Static planes take a third view."""
-    views = MOTIONS[name].views(torch.arange(6.0)) + (name == "static_2d")
-    x, X, _, _ = filmed(name, views, 45, 3)
-    given = torch.eye(4, dtype=torch.float64) if "sensors" in name else K
+    views, tracks = MOTIONS[name].min_views_and_tracks(torch.arange(6.0))
+    views += name == "static_2d"
+    sensors = KINDS[name].sensors
+    x, X, _, _ = filmed(name, views, max(45, math.ceil(1.25 * tracks)), 3)
+    given = torch.eye(4, dtype=torch.float64) if sensors else K
     found = dyn.reconstruct(x, name, threshold=float("inf"), calibration=given)
     assert found.check().metric is not None and bool(found.metric) and "similarity" in found.ambiguity + "rigid similarity"
-    assert apart(tracked(found, views), X, scale="sensors" not in name) < 1e-8
+    assert apart(tracked(found, views), X, scale=not sensors) < 1e-8
     # the cameras are K [R | t], and show the points where they were seen
     assert found.rotations is not None and found.translations is not None
     assert float((found.rotations @ found.rotations.mT - torch.eye(3)).abs().max()) < 1e-9
     assert float((torch.linalg.det(found.rotations) - 1).abs().max()) < 1e-9
     world = tracked(found, views)
     turned = world @ found.rotations[..., : world.shape[-1]].mT + found.translations[:, None]
-    if "sensors" in name:
+    if sensors:
         assert float((turned - x).abs().max()) < 1e-8
         return
     assert float(turned[..., 2].min()) > 0

@@ -9,10 +9,12 @@ from indexing import Clip, ClipSet
 from indexing.cli import main
 from indexing.readers import read
 from indexing.readers.c3d import read as read_c3d
+from indexing.writers import FORMATS, suffixes_with_units
 from tests.indexing.cli.footage import write_coco
 
 RANDOM = np.random.default_rng(0)
 BODY = RANDOM.uniform(0, 100, (1, 17, 2)) + 300 + RANDOM.normal(size=(40, 17, 2))
+SUFFIXES = ", ".join([".npz", *FORMATS])
 RIGHT = np.array([900.0, 0.0])
 
 
@@ -73,7 +75,7 @@ def test_many(run):
 BAD = {
     "convert -o a.trc": "no recordings; give at least one",
     "convert none.json -o a.trc": "none.json: no such file or folder",
-    "convert one.json -o a.abc": "-o a.abc: no format ends so; end it in .npz, .c3d, .nc, .trc, or say it with --to for a folder",
+    "convert one.json -o a.abc": f"-o a.abc: no format ends so; end it in {SUFFIXES}, or say it with --to for a folder",
     "convert one.json --to trc -o a.c3d": "--to trc and -o a.c3d say different formats",
     "convert one.json two.json -o a.trc": "a.trc: one recording is a file, but 2 are given; give a folder: --to trc -o a",
     "convert set.npz -o a.c3d": "a.c3d: 2 clips (set[0], ...) are not the people of one recording",
@@ -81,7 +83,7 @@ BAD = {
     "convert set.npz --to npz -o .": "set.npz: is an input, and the output would replace it",
     "convert uneven.npz -o a.c3d": "a.c3d: times are uneven",
     "convert one.json uneven.npz --to c3d -o a": "uneven.c3d: times are uneven",
-    "convert one.json -o a.npz --units m": "--units m: of .trc and .c3d only",
+    "convert one.json -o a.npz --units m": f"--units m: of {' and '.join(suffixes_with_units())} only",
     "convert one.json -o one.json/a.trc": "'one.json' is a file; choose another folder",
     "convert one.json --to mp4 -o a": "--to",
 }

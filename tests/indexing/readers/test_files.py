@@ -111,8 +111,8 @@ SAMPLES: dict[str, Callable[[Path], Sample]] = {
 
 
 def test_every_row_has_a_file_and_every_format_a_row() -> None:
-    assert sorted(ROWS) == sorted(SAMPLES)
-    assert sorted({name for name, _ in ROWS.values()}) == list(FORMATS)
+    assert sorted(ROWS) == sorted(SAMPLES), "docs/guide/formats.md has a row for each sample of the readers' tests, by its name"
+    assert sorted({name for name, _ in ROWS.values()}) == list(FORMATS), "docs/guide/formats.md has a row for each format"
 
 
 @pytest.mark.slow

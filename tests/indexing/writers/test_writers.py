@@ -186,7 +186,7 @@ def test_what_headers_have_no_place_for(tmp_path, suffix):
 def test_the_suffix_says_the_format_and_the_folder_is_there(tmp_path):
     assert body().save(tmp_path / "a.npz") == []
     assert ClipSet.load(tmp_path / "a.npz")[0].skeleton.joints == COCO17.joints
-    with pytest.raises(ValueError, match=r"no format ends in '.abc'; end the name in one of .npz, .c3d, .nc, .trc"):
+    with pytest.raises(ValueError, match=rf"no format ends in '.abc'; end the name in one of {', '.join(['.npz', *FORMATS])}$"):
         write([body()], tmp_path / "a.abc")
     for suffix in (*FORMATS, ".npz"):
         with pytest.raises(ValueError, match=r"the folder .* does not exist; create it first"):

@@ -23,8 +23,11 @@ LIFTED = [name for name in NAMES if MOTIONS[name].lift is not None]
 
 
 def scene_of(name: str, n: int = 60, **options: object) -> scenes.LiftedState:
+    """At least n tracks, and a quarter more than the fewest of the model."""
     if "times" not in options:
         options.setdefault("views", max(4, KINDS[name].views))
+    views = range(options.get("views") or len(options["times"]))
+    n = max(n, math.ceil(1.25 * MOTIONS[name].min_views_and_tracks(options.get("times") or [*map(float, views)])[1]))
     return scenes.lifted_points(name, n, generator=seeded(3), **options)
 
 
