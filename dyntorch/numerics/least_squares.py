@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import torch
@@ -184,7 +185,7 @@ def _until_done(problem: LeastSquares, start: Iterate, damping: Tensor, options:
         if keep.shape != left.shape:
             start = replace_problems(start, left, at)
             steps[left[done]] = count
-            left, damping, at, problem = left[keep], damping[keep], each(lambda x, keep=keep: x[keep], at), problem.subset(keep)
+            left, damping, at, problem = left[keep], damping[keep], each(itemgetter(keep), at), problem.subset(keep)
         if not keep.shape[0]:
             return start
         at, damping, done = _take_step(problem, at, damping, options)

@@ -143,13 +143,13 @@ def _is_present(folder: Path, file: ModelFile) -> bool:
 def _read_checked(path: Path, file: ModelFile) -> bytes:
     """The bytes of a file that is what it should be."""
     with open_file(path) as stream:
-        data = _read_checked(file, stream)
+        data = _read_verified(file, stream)
     if data is None:
         raise error(path, "is not the file that is known under this name (by its SHA-256)", AGAIN)
     return data
 
 
-def _read_checked(file: ModelFile, stream: IO[bytes]) -> bytes | None:
+def _read_verified(file: ModelFile, stream: IO[bytes]) -> bytes | None:
     data = stream.read(file.size + 1)
     return data if len(data) == file.size and hashlib.sha256(data).hexdigest() == file.sha256 else None
 
@@ -273,7 +273,7 @@ def _unpacking(path: Path, kind: str) -> Iterator[None]:
 
 
 def _verify(file: ModelFile, stream: IO[bytes]) -> bytes:
-    data = _read_checked(file, stream)
+    data = _read_verified(file, stream)
     if data is None:
         raise error(file.name, "the download is another file than the one that is known (by its SHA-256)", "try again later")
     return data
