@@ -279,7 +279,7 @@ def velocity_factorization(tracks: Tensor, times: Tensor, dim: int = 3, weights:
         weights: ``(*batch, views, n)``; a point with a 0, or a NaN coordinate, in any view is left out.
 
     Returns:
-        Cameras, offsets, points, velocities and residual; without gradients, and finite also where the status is not OK: there the
+        Cameras, offsets, points, velocities and residual; without gradients, and finite also where the status is not OK and the
         tracks do not decide the result.
 
     Raises:
