@@ -105,11 +105,7 @@ USES: dict[str, tuple[Callable[[], Any], Callable[..., Any]]] = {
     ),
     "HomographyTensor": (
         lambda: (plane(), *planar()),
-        lambda s, x, y, z: (
-            H.transfer(s.tensor, y),
-            H.trajectory(s.tensor, x, y),
-            H.static_distance(s.tensor, x, y, z),
-        ),
+        lambda s, x, y, z: (H.transfer(s.tensor, y), H.trajectory(s.tensor, x, y), H.static_distance(s.tensor, x, y, z)),
     ),
     "ConstantVelocityTensor": (
         lambda: (space(), *scenes.constant_velocity(24, generator=draw(2)).views),

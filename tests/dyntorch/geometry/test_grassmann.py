@@ -358,13 +358,7 @@ def test_candidates_of_images_of_one_dimension_have_the_tensor_that_they_come_fr
 
 def test_misuse():
     tensor, views = random(3, 3, 3), random(3, 3, 5)
-    two = [
-        ([(3, 4)], (2, 2)),
-        ([(5, 3)], (3,)),
-        ([(3, 4), (3, 5)], (2, 2)),
-        ([(3, 4), (3, 4)], (2, 1)),
-        ([(3, 4), (3, 4)], (3, 2)),
-    ]
+    two = [([(3, 4)], (2, 2)), ([(5, 3)], (3,)), ([(3, 4), (3, 5)], (2, 2)), ([(3, 4), (3, 4)], (2, 1)), ([(3, 4), (3, 4)], (3, 2))]
     assert_refused(
         *((lambda s=s, p=p: grassmann_tensor([random(*shape) for shape in s], p), "takes 2 projections") for s, p in two),
         (lambda: grassmann_tensor([random(3, 5), random(3, 5)], (4, 1)), "order must be 1 to"),

@@ -212,10 +212,7 @@ def test_misuse_says_what_to_do():
         (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), torch.ones(3, 3))), r"weights must be \(4, 3\)"),
         (lambda: lags.epipolar_moments(X, X, weights=(torch.ones(4, 3), -torch.ones(4, 3))), r"not negative"),
         (lambda: lags.lag_covariances(X[0], X[0], weights=(torch.ones(2), torch.ones(3))), r"weights must be .*one per frame"),
-        (
-            lambda: lags.resection_moments(X.mT, X),
-            r"frames, n, 2\) in a camera and \(\*batch, frames, n, 3\) in space",
-        ),
+        (lambda: lags.resection_moments(X.mT, X), r"frames, n, 2\) in a camera and \(\*batch, frames, n, 3\) in space"),
         (lambda: lags.compress(X), r"either rank or noise"),
         (lambda: lags.compress(X, rank=3), r"rank must be from 1 to the 2 rows, got 3"),
     )

@@ -111,10 +111,7 @@ def test_annotations_of_symbolic_tiers_take_the_time_of_their_parents(tmp_path: 
 
 
 BROKEN = {
-    "linguistic type": (
-        [TIMES, tier("t", kind="other")],
-        "tier 't': its linguistic type 'other' is not there; give",
-    ),
+    "linguistic type": ([TIMES, tier("t", kind="other")], "tier 't': its linguistic type 'other' is not there; give"),
     "slot": ([TIMES, tier("t", alignable("a1", "ts1", "ts99", "x"))], "tier 't', annotation a1: its time slot 'ts99' is not there"),
     "slot twice": (
         [TIMES.replace('"ts2"', '"ts1"'), tier("t", alignable("a1", "ts1", "ts4", "x"))],

@@ -274,11 +274,7 @@ def test_formats_that_are_unknown(tmp_path: Path) -> None:
 
 SUFFIX = {"boris": ".boris", "elan": ".eaf", "csv": ".csv", "tsv": ".tsv"}
 FORMATS = (*SUFFIX, "activitynet", "label_studio", "via")
-LOST = {
-    "boris": ("tier",),
-    "elan": ("observation", "comment", "modifiers", "score"),
-    "label_studio": (),
-}
+LOST = {"boris": ("tier",), "elan": ("observation", "comment", "modifiers", "score"), "label_studio": ()}
 """Fields that a format has no place for; the docs say the same."""
 RESOLUTION = {"boris": 1e-3, "elan": 1e-3, "label_studio": 1 / 50, "csv": 1e-6, "tsv": 1e-6, "activitynet": 1e-6, "via": 1e-6}
 WORDS = (

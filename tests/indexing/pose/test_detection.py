@@ -222,11 +222,7 @@ def test_a_file_that_ends_early_gives_what_is_there(tmp_path, seeing):
 
 def test_what_is_no_video_is_said(tmp_path, seeing):
     path = tmp_path / "a.mp4"
-    for content, said in (
-        (None, "no such file"),
-        (b"", "is empty"),
-        (b"no" * 999, "cannot be read as video|has no video stream"),
-    ):
+    for content, said in ((None, "no such file"), (b"", "is empty"), (b"no" * 999, "cannot be read as video|has no video stream")):
         if content is not None:
             path.write_bytes(content)
         with pytest.raises(ValueError, match=said) as caught:

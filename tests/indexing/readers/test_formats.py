@@ -211,10 +211,7 @@ BROKEN: list[tuple[Any, tuple[str, ...]]] = [
     ([{"image_id": 10**30, "keypoints": GOOD}], ("frame number 1000", "number images by frame")),
     ([{"image_id": 0, "keypoints": [float("inf"), 2.0, 0.5] * 17}], ("frame 0, joint 0: infinite", "leave them empty")),
     ({"annotations": []}, ("no person was detected", "threshold")),
-    (
-        {"annotations": [{"image_id": 1, "keypoints": GOOD}], "images": [{"name": "x"}]},
-        ("'images'", "export the dataset again"),
-    ),
+    ({"annotations": [{"image_id": 1, "keypoints": GOOD}], "images": [{"name": "x"}]}, ("'images'", "export the dataset again")),
     ({"people": []}, ("no person was detected in any of 1 frames", "threshold")),
     ({"people": [{"pose_keypoints_2d": [1, 2]}]}, ("frame 0, person 0, pose_keypoints_2d", "3 numbers per joint")),
     ({"people": None}, ("frame 0: no list 'people'", "--write_json")),

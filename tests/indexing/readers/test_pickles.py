@@ -209,10 +209,7 @@ PROGRAMS: dict[str, tuple[bytes, str]] = {
     "a scalar of objects": (name(MULTIARRAY, "scalar") + OBJECT + b"C\x01a\x86R.", "an array of 'O8'"),
     "a scalar of a pickle": (name(MULTIARRAY, "scalar") + FLOAT + b"K\x01\x86R.", "an array of Python objects"),
     "records": (name("numpy", "dtype") + b"(X\x02\x00\x00\x00V8\x89\x88tR.", "an array of 'V8'"),
-    "records by their state": (
-        TYPE + b"(K\x03X\x01\x00\x00\x00<N)}J\x08\x00\x00\x00K\x01K\x00tb.",
-        "array of records",
-    ),
+    "records by their state": (TYPE + b"(K\x03X\x01\x00\x00\x00<N)}J\x08\x00\x00\x00K\x01K\x00tb.", "array of records"),
     "a text as a type": (name("numpy", "dtype") + b"(X\x0b\x00\x00\x00f8,f8,f8,f8\x89\x88tR.", "neither numbers nor text"),
     "a huge type": (name("numpy", "dtype") + b"(X\x0b\x00\x00\x00U9999999999\x89\x88tR.", "numpy does not know"),
     "too few bytes": (ARRAY + b"(K\x01K\x09\x85" + FLOAT + b"\x89C\x08abcdefghtb.", "8 bytes for the shape (9,)"),

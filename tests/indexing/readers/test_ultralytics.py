@@ -81,10 +81,7 @@ def test_what_is_broken_is_named(tmp_path: Path) -> None:
             ({1: []}, ("", "no person was detected in any of 1 frames", "threshold")),
             ({1: ["0 0.5 0.5 0.1 0.1"]}, ("", "0 numbers after the box", "pose model")),
             ({1: ["0 0.5 x"]}, ("walk_1.txt", "line 1 is not a list of numbers", "save_txt=True")),
-            (
-                {1: ["0 .5 .5 .1 .1 .5 .5 .9"], 2: ["0 .5 .5 .1 .1 .5 .5"]},
-                ("walk_2.txt", "line 1 has 7 numbers", "same model"),
-            ),
+            ({1: ["0 .5 .5 .1 .1 .5 .5 .9"], 2: ["0 .5 .5 .1 .1 .5 .5"]}, ("walk_2.txt", "line 1 has 7 numbers", "same model")),
         )
     ):
         path = write(tmp_path / f"{i}", frames)

@@ -15,12 +15,7 @@ from dyntorch.core.outcome import Notice, NoticeCode
 from dyntorch.tasks.reconstruct.result import Ranked, Reconstruction
 from indexing.readers.tracks import TrackSet
 from indexing.report.canvas import around, sample
-from indexing.report.reconstruction import (
-    ReconstructionReport,
-    as_first_camera,
-    nearest_frame,
-    points_csv,
-)
+from indexing.report.reconstruction import ReconstructionReport, as_first_camera, nearest_frame, points_csv
 from indexing.report.summary import write_report
 from tests.indexing.report.people import SCRIPT, draw_all
 

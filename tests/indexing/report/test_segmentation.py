@@ -14,14 +14,7 @@ from dyntorch import Segmentation, Status
 from dyntorch.core.outcome import Notice, NoticeCode
 from indexing.readers.matches import MatchedPair, Photograph
 from indexing.report.canvas import DARK, LIGHT
-from indexing.report.segmentation import (
-    SegmentationReport,
-    as_json,
-    colour_of,
-    describe,
-    labels_csv,
-    picture_of,
-)
+from indexing.report.segmentation import SegmentationReport, as_json, colour_of, describe, labels_csv, picture_of
 from indexing.report.summary import write_report
 from tests.indexing.report.people import SCRIPT, draw_all
 

@@ -62,10 +62,7 @@ def test_a_camera_on_a_tripod_stands_still(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("path", "kind", "start", "stop", "pixels"),
-    [(pan, "pan", 1.0, 2.0, 40), (knock, "knock", 1.0, 1.25, 12)],
-)
+@pytest.mark.parametrize(("path", "kind", "start", "stop", "pixels"), [(pan, "pan", 1.0, 2.0, 40), (knock, "knock", 1.0, 1.25, 12)])
 def test_when_and_by_how_much_it_moves(motion_of, path, kind, start, stop, pixels):
     camera = motion_of(path, 75)
     assert camera.moves and camera.kind == kind

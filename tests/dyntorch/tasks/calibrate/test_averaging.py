@@ -7,13 +7,7 @@ import torch
 
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.tasks.calibrate import averaging
-from dyntorch.tasks.calibrate.averaging import (
-    PairGeometry,
-    average_rotations,
-    nearest_points,
-    position_cameras,
-    relative_rotations,
-)
+from dyntorch.tasks.calibrate.averaging import PairGeometry, average_rotations, nearest_points, position_cameras, relative_rotations
 from tests.draws import seeded
 from tests.dyntorch.tasks.calibrate.rigs import exponential, shape_error
 

@@ -107,8 +107,7 @@ def test_parts_have_gradients_and_no_nan():
 
 
 @pytest.mark.parametrize(
-    ("kind", "least"),
-    [("generic", 3), ("collinear", 3), ("coplanar", 3), ("both", 5), ("pair", 4), ("triple", 5), ("static", 4)],
+    ("kind", "least"), [("generic", 3), ("collinear", 3), ("coplanar", 3), ("both", 5), ("pair", 4), ("triple", 5), ("static", 4)]
 )
 def test_exact_planes(kind, least):
     for n in (least, least + 1, 8):

@@ -226,10 +226,7 @@ def test_float32_empty_batch_and_repr():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            {"H": torch.eye(3, dtype=F64).expand(2, 3, 3)},
-            "H and fundamentals hold 2 planes; method 'auto' needs at least 3 planes",
-        ),
+        ({"H": torch.eye(3, dtype=F64).expand(2, 3, 3)}, "H and fundamentals hold 2 planes; method 'auto' needs at least 3 planes"),
         ({"H": torch.eye(3, dtype=F64).expand(3, 3, 3), "method": "linear"}, "needs at least 4 planes"),
         ({"H": torch.eye(3, dtype=F64).expand(4, 3, 3), "method": "best"}, "method must be 'auto' or one of linear"),
         ({"H": torch.eye(4, dtype=F64).expand(4, 4, 4)}, "H must be a floating point tensor"),

@@ -47,11 +47,7 @@ def error(truth, lifting, scene):
 
 
 def from_truth(truth, tracks, lifting):
-    return adjust_scene(
-        tracks,
-        LiftedState(tracks.transforms @ truth.cameras, truth.structure @ lifting.root.mT, None),
-        lifting,
-    )
+    return adjust_scene(tracks, LiftedState(tracks.transforms @ truth.cameras, truth.structure @ lifting.root.mT, None), lifting)
 
 
 @pytest.mark.slow

@@ -40,9 +40,7 @@ def test_formula() -> None:
     apart[0, :, 0] = 100.0
     motion = MOTIONS["constant_velocity_2d"]
     found = penalized_cost(
-        tracks,
-        LiftedFit(motion, apart, torch.tensor([False]), torch.ones(1)),
-        torch.full((1,), 0.5, dtype=torch.float64),
+        tracks, LiftedFit(motion, apart, torch.tensor([False]), torch.ones(1)), torch.full((1,), 0.5, dtype=torch.float64)
     )
     # 3 cameras of 8, less the ambiguity of 8; every good point leaves 3 sigma^2, but no more than that of 6 - 4 coordinates
     expected = 10 * min(3.0, OUTLIER_COST * 2) - 3.0 + OUTLIER_COST * 2 + 10 * 4 * math.log(6) + (24 - 8) * math.log(60)

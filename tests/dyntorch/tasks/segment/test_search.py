@@ -13,11 +13,7 @@ from dyntorch import scenes
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.metrics import misclassification
 from dyntorch.tasks.segment import segment
-from dyntorch.tasks.segment.coherence import (
-    coherence,
-    energy,
-    mean_field,
-)
+from dyntorch.tasks.segment.coherence import coherence, energy, mean_field
 from dyntorch.tasks.segment.search import Candidate, affine_flows, search
 from dyntorch.tasks.segment.segment import select_count
 from tests.dyntorch.tasks.segment.videos import F64, draw, view_of

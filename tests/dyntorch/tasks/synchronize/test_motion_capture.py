@@ -8,11 +8,7 @@ from scipy.linalg import eigh
 
 from dyntorch import synchronize, synchronize_cameras
 from dyntorch.numerics.lags import resection_moments
-from dyntorch.tasks.synchronize.motion_capture import (
-    SpaceDescent,
-    camera_variance,
-    fit_combination,
-)
+from dyntorch.tasks.synchronize.motion_capture import SpaceDescent, camera_variance, fit_combination
 from dyntorch.tasks.synchronize.result import SynchronizeOptions
 from dyntorch.tasks.synchronize.tracks import read_tracks
 from tests.draws import seeded
