@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ import dyntorch as dyn
 from dyntorch import counting, metrics, scenes
 from tests.battery.cases import CASES as INVARIANTS
 from tests.battery.cases import Case
+from tests.battery.device_verbs import VERBS
 from tests.battery.shape_cases import SHAPE_CASES, ShapeCase
 
 Table = dict[str, Callable[[], Any]]
@@ -110,7 +111,14 @@ def shapes(case: ShapeCase) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# ---- alignment, segmentation, planes ---------------------------------------------------------------------------------------
+# ---- other verbs -----------------------------------------------------------------------------------------------------------
+MOTIONS = {
+    "static_2d": 30, "static_3d": 30, "constant_direction_2d": 40, "constant_velocity_2d": 40, "constant_acceleration_2d": 60,
+    "constant_direction_3d": 40, "constant_velocity_planes_3d": 60, "constant_velocity_3d": 80, "constant_velocity_3d_sensors": 60,
+    "two_bodies_2d": 60, "two_bodies_3d": 60,
+}  # fmt: skip
+
+
 def points_3d(model: str, **options: Any) -> Any:
     """Align three views of points of space as a model has them."""
     sensors = {"join": "projective", "minimal_join": "projective", "constant_velocity": "projective", "rigid": "rigid"}
@@ -119,23 +127,9 @@ def points_3d(model: str, **options: Any) -> Any:
     return shown(dyn.align_points(*scene.views, model=model, generator=seed(0), **options))  # type: ignore[arg-type]
 
 
-def planar(threshold: float | None = 1.5, **options: Any) -> Any:
+def planar(threshold: float | None = 1.5) -> Any:
     scene = scenes.planar(90, sigma=0.5, static=0.4, outliers=0.15, batch=2, generator=seed(4))
-    return shown(dyn.align_planar(*scene.views, threshold=threshold, generator=seed(0), **options))
-
-
-def lines(**options: Any) -> Any:
-    scene = scenes.translating_lines(100, sigma=1e-3, motion="in_plane", static=0.2, outliers=0.05, generator=seed(6))
-    return shown(dyn.align_lines(*scene.views, generator=seed(0), **options))
-
-
-def lines_and_points() -> Any:
-    scene = scenes.translating_lines(60, sigma=1e-3, motion="objects", static_points=6, generator=seed(6))
-    given = tuple(value for name, value in sorted(scene.extras.items()) if "point" in name)
-    return {
-        "extras": scene.extras,
-        "found": tried(lambda: shown(dyn.align_lines(*scene.views, static_points=given, generator=seed(0)))),
-    }
+    return shown(dyn.align_planar(*scene.views, threshold=threshold, generator=seed(0)))
 
 
 def bodies(*counts: int, **options: Any) -> Any:
@@ -143,162 +137,20 @@ def bodies(*counts: int, **options: Any) -> Any:
     return shown(dyn.segment(*scene.views, generator=seed(0), **options))
 
 
-def planes(kind: str) -> Any:
-    """Translating planes from each kind of input."""
-    scene = scenes.translating_planes(5, bodies=2, n=40, sigma=0.2, generator=seed(1))
-    given: dict[str, Any] = {
-        "homographies": {"H": scene.homographies}, "matches": {"x1": scene.x1, "x2": scene.x2},
-        "both": {"H": scene.homographies, "fundamentals": scene.body_fundamentals},
-        "bodies": {"x1": scene.x1, "x2": scene.x2, "body_matches": (scene.body_x1, scene.body_x2)},
-        "calibrated": {"x1": scene.x1, "x2": scene.x2, "calibration": scene.calibration}, "two": {"H": scene.homographies[:2]},
-    }  # fmt: skip
-    return tried(lambda: shown(dyn.translating_planes(**given[kind])))
+def reconstructed(motion: str, asked: str = "", **options: Any) -> Any:
+    """Reconstruct tracks of a motion, of which some are wrong, as those of this motion or as another word asks."""
+    sigma = 2e-3 if motion.endswith("sensors") else 0.3
+    scene = scenes.lifted_points(motion, MOTIONS[motion], sigma=sigma, outliers=0.05, generator=seed(7))
+    times = None if scene.lifts is None else scene.times
+    return shown(dyn.reconstruct(scene.tracks, asked or motion, times=times, generator=seed(0), **options))
 
 
-# ---- reconstruction --------------------------------------------------------------------------------------------------------
-MOTIONS = {
-    "static_2d": 30, "static_3d": 30, "constant_direction_2d": 40, "constant_velocity_2d": 40, "constant_acceleration_2d": 60,
-    "constant_direction_3d": 40, "constant_velocity_planes_3d": 60, "constant_velocity_3d": 80, "constant_velocity_3d_sensors": 60,
-    "two_bodies_2d": 60, "two_bodies_3d": 60,
-}  # fmt: skip
-
-
-def tracks(motion: str, **options: Any) -> Any:
-    given: dict[str, Any] = {"sigma": 2e-3 if motion.endswith("sensors") else 0.3, "outliers": 0.0, "generator": seed(7), **options}
-    return scenes.lifted_points(motion, MOTIONS[motion], **given)
-
-
-def reconstructed(motion: str, **options: Any) -> Any:
-    scene = tracks(motion, outliers=0.05 if options else 0.0)
-    given: dict[str, Any] = {"times": None if scene.lifts is None else scene.times, "generator": seed(0), **options}
-    return shown(dyn.reconstruct(scene.tracks, motion, **given))
-
-
-def automatic() -> Any:
-    scene = scenes.lifted_points("constant_velocity_2d", 40, views=5, sigma=0.3, generator=seed(3))
-    return shown(dyn.reconstruct(scene.tracks, "auto", scene.times, generator=seed(0)))
-
-
-def falling(t: Tensor) -> Tensor:
-    """In a plane, one direction of acceleration."""
-    lift = torch.eye(3, 4, dtype=torch.float64)
-    lift[1, 3] = t**2
-    return lift
-
-
-def own_motion() -> Any:
-    motion, times = dyn.Motion(falling, "falling"), torch.arange(5.0, dtype=torch.float64)
-    cameras = torch.eye(3, dtype=torch.float64) + 0.2 * normal(5, 3, 3)
-    world = torch.cat([normal(30, 2, number=1), torch.ones(30, 1), 0.3 * normal(30, 1, number=2)], dim=1)
-    seen = torch.stack([world @ falling(t).mT @ camera.mT for t, camera in zip(times, cameras, strict=True)])
-    x = seen[..., :2] / (seen[..., 2:] + 4) + 1e-3 * normal(5, 30, 2, number=3)
-    return {"views": motion.minimal(times), "found": tried(lambda: shown(dyn.reconstruct(x, motion, times, generator=seed(0))))}
-
-
-def trajectories() -> Any:
-    cameras = torch.cat([torch.eye(3, dtype=torch.float64).expand(7, 3, 3), normal(7, 3, 1)], dim=-1)
-    start, way = normal(12, 3, number=1) + torch.tensor([0.0, 0.0, 8.0]), normal(12, 3, number=2)
-    world = start + torch.linspace(0, 2, 7, dtype=torch.float64)[:, None, None] * way
-    image = torch.nn.functional.pad(world, (0, 1), value=1.0) @ cameras.mT
-    x = image[..., :2] / image[..., 2:] + 1e-3 * normal(7, 12, 2, number=3)
-    found = dyn.triangulate_trajectories(cameras, x, sigma=1e-3)
-    return {
-        **shown(found),
-        "points": dyn.tasks.points_on_lines(cameras, x, found.lines),
-        "exact": dyn.triangulate_trajectories(cameras, x),
-    }
-
-
-def line_cameras() -> Any:
-    turns = torch.linalg.qr(torch.eye(3, dtype=torch.float64) + 0.3 * normal(6, 3, 3)).Q
-    cameras = torch.cat([turns * turns.diagonal(dim1=1, dim2=2).sign()[:, None], normal(6, 3, 1, number=1)], dim=-1)
-    start, way = normal(800, 3, number=2) + torch.tensor([0.0, 0.0, 9.0]), normal(800, 3, number=3)
-    world = start + normal(6, 800, 1, number=4) * way
-    image = torch.nn.functional.pad(world, (0, 1), value=1.0) @ cameras.mT
-    found = dyn.trajectory_cameras(image[..., :2] / image[..., 2:] + 1e-7 * normal(6, 800, 2, number=5), bundle=False)
-    return {"cameras": dyn.geometry.line_camera(cameras), "found": shown(found)}
-
-
-# ---- synchronization -------------------------------------------------------------------------------------------------------
 def shifted(correspondence: bool, **options: Any) -> Any:
     if not correspondence:
         pair = scenes.nonrigid_pair(10, 8, 90, sigma=0.3, offset=0.2, generator=seed(1))
         return shown(dyn.synchronize(pair.a, pair.b, False, fps=pair.fps, generator=seed(0), **options))
     scene = scenes.filmed_person(12, 3.0, offset=0.37, noise=0.7, missing=0.05, fps=(30.0, 25.0), generator=seed(1))
     return shown(dyn.synchronize(scene.a, scene.b, True, times=scene.times, generator=seed(0), **options))
-
-
-@cache
-def clocks() -> Any:
-    """Three cameras: a with b, b with a camera that saw a's picture late, and a with that."""
-    scene = scenes.filmed_person(12, 4.0, offset=0.2, noise=0.5, fps=(30.0, 30.0), generator=seed(2))
-    return dyn.synchronize_cameras([scene.a, scene.b, scene.a[9:]], fps=30.0, max_shift=1.0, generator=seed(0))
-
-
-def combined() -> Any:
-    a, b = (shift["result"] for shift in (shifted(True, rate=1.0), shifted(True, rate=1.0, max_shift=0.6)))
-    return shown(dyn.combine_shifts({(0, 1): a, (1, 2): b}, 3))
-
-
-def pair_scene() -> Any:
-    pair = scenes.nonrigid_pair(10, 8, 70, sigma=0.2, generator=seed(1))
-    found = dyn.reconstruct_pair(pair.a, pair.b, 0.0, fps=pair.fps, generator=seed(0))
-    return {**shown(found), "same": tried(lambda: dyn.reconstruct_pair(pair.a, pair.a, 0.0, True, fps=pair.fps, generator=seed(0)))}
-
-
-def lens() -> Any:
-    K = torch.tensor([[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    dist = torch.tensor([-0.2, 0.05, 0.001, 0.0], dtype=torch.float64)
-    seen = [dyn.geometry.distort(x, K, dist) for x in scenes.two_view(120, sigma=0.2, generator=seed(0)).views]
-    found = dyn.geometry.fit_distortion(*seen, sizes=((640, 480), (640, 480)))
-    return {**shown(found), "seen": seen, "straight": [dyn.geometry.undistort(x, K, dist) for x in seen]}
-
-
-# ---- shapes, bundles, factorizations ---------------------------------------------------------------------------------------
-def moving_shapes(basis: Any) -> Any:
-    rows = basis.rows(torch.linspace(-1, 1, 24, dtype=torch.float64))
-    points, cameras = normal(rows.shape[1], 9, 3), normal(24, 3, 2, number=1)
-    x = torch.einsum("vb,bnk,vkd->vnd", rows, points, cameras) + 1e-3 * normal(24, 9, 2, number=2)
-    found = dyn.shapes.fit_shapes(x, rows)
-    return {**shown(found), "times": shown(dyn.shapes.recover_times(found.shapes, basis, x[::4]))}
-
-
-def bundle() -> Any:
-    P = torch.eye(3, 4, dtype=torch.float64) + normal(4, 3, 4) / 8
-    Y = torch.cat([normal(16, 2, number=1), normal(16, 1, number=2) + 5, torch.ones(16, 1)], dim=1).double()
-    x = dyn.geometry.reproject(P, Y) + 1e-3 * normal(4, 16, 2, number=3)
-    start = P + 0.01 * normal(4, 3, 4, number=4), Y + 0.01 * normal(16, 4, number=5)
-    return {
-        "adjusted": dyn.geometry.bundle_adjust(x, None, *start), "robust": dyn.geometry.bundle_adjust(x, None, *start, scale=1e-3),
-        "triangulated": dyn.geometry.triangulate(P, x), "steps": dyn.geometry.triangulate(P, x, steps=3),
-        "resected": dyn.geometry.resect(Y, x),
-        "grassmann": dyn.geometry.grassmann_tensor(list(P[:2]),
-        (2, 2)),
-        "epipoles": tried(lambda: dyn.geometry.joint_epipoles(list(normal(3, 3, 5)))),
-        "projective": dyn.tasks.projective_factorization(x, 4),
-    }  # fmt: skip
-
-
-def factors() -> Any:
-    A, X, V = normal(6, 2, 3), normal(12, 3, number=1), normal(12, 3, number=2)
-    times = torch.tensor([0.0, 1.0, 2.0, 4.0, 5.0, 7.0], dtype=torch.float64)
-    still, moving = X @ A.mT + 1e-3 * normal(6, 12, 2, number=3), (X + times[:, None, None] * V) @ A.mT
-    shape, cameras, part = dyn.numerics.affine_factorization(still)
-    two = torch.rand(24, 4, generator=seed(1), dtype=torch.float64)
-    two[:14, 3], two[14:, 3] = 0.0, two[14:, 2]
-    halves = dyn.geometry.hyperplane_pair(two)
-    scene = scenes.two_view(24, batch=2, generator=seed(0))
-    x1, x2 = (x.flatten(0, 1)[:40] for x in scene.views)
-    second = torch.cat([X @ A[0].mT, X[:8] @ A[1].mT + 0.3])
-    return {
-        "affine": (shape, cameras, part), "metric": dyn.numerics.metric_upgrade(shape, cameras), "halves": halves,
-        "velocity": dyn.tasks.velocity_factorization(moving + 1e-3 * normal(6, 12, 2, number=4), times),
-        "bodies": dyn.geometry.two_bodies(normal(3, 3, 4, number=5), two, halves.hyperplanes, halves.labels),
-        "two affine": tried(lambda: dyn.tasks.affine_segmentation(torch.cat([X[:, :2], X[:8, :2]]), second)),
-        "multibody": dyn.invariants.multibody_matrix(x1, x2, 2), "basis": dyn.numerics.orthonormal_basis(normal(3, 5, 2)),
-        "correlation": dyn.numerics.canonical_correlation(normal(3, 6, 2), normal(3, 6, 2, number=1)),
-        "null": [dyn.null_space(normal(2, 40, 12), dim) for dim in (1, 3)], "wide": dyn.null_space(normal(5, 12), 7),
-    }  # fmt: skip
 
 
 def counts() -> Any:
@@ -357,40 +209,18 @@ def table() -> Table:
     found: Table = {f"linear {case!r} {i}": partial(linear, case) for i, case in enumerate(INVARIANTS)}
     found |= {f"robust {case!r} {i}": partial(robust, case) for i, case in enumerate(INVARIANTS)}
     found |= {f"shape {case!r}": partial(shapes, case) for case in SHAPE_CASES}
-    found |= {
-        f"align_points {model}": partial(points_3d, model)
-        for model in ("join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid")
-    }
-    found |= {"align_points rigid velocity": partial(points_3d, "rigid", motion="constant_velocity"), "align_planar": planar}
-    found |= {"align_planar auto": partial(planar, None), "align_lines": lines, "align_lines points": lines_and_points}
-    found |= {"align_lines threshold": partial(lines, threshold=3e-3), "segment": partial(bodies, 90, 60, 40)}
-    found |= {
+    found |= {f"verb {verb.name}": lambda verb=verb: shown(verb.call(*verb.inputs())) for verb in VERBS}
+    models = ("join", "minimal_join", "constant_velocity", "affine_constant_velocity", "rigid")
+    found |= {f"align_points {model}": partial(points_3d, model) for model in models}
+    found |= {f"reconstruct {motion}": partial(reconstructed, motion, threshold=None) for motion in MOTIONS}
+    return found | {
+        "align_points rigid velocity": partial(points_3d, "rigid", motion="constant_velocity"),
+        "align_planar": planar, "align_planar auto": partial(planar, None), "segment": partial(bodies, 90, 60, 40),
         "segment known": partial(bodies, 70, 50, bodies=2, spatial=False),
         "segment auto": partial(bodies, 80, 50, threshold=None),
-    }
-    found |= {
-        f"planes {kind}": partial(planes, kind) for kind in ("homographies", "matches", "both", "bodies", "calibrated", "two")
-    }
-    found |= {f"reconstruct {motion}": partial(reconstructed, motion, threshold=None) for motion in MOTIONS}
-    found |= {
-        f"reconstruct robust {motion}": partial(reconstructed, motion, threshold=1.0)
-        for motion in ("static_3d", "constant_velocity_2d")
-    }
-    found |= {
-        "reconstruct auto": automatic,
-        "reconstruct own": own_motion,
-        "trajectories": trajectories,
-        "trajectory_cameras": line_cameras,
-    }
-    found |= {
-        "synchronize same": partial(shifted, True),
-        "synchronize different": partial(shifted, False),
-        "combine_shifts": combined,
-    }
-    found |= {"synchronize rate": partial(shifted, True, rate=1.0, max_shift=1.0), "synchronize_cameras": lambda: shown(clocks())}
-    found |= {"reconstruct_pair": pair_scene, "lens": lens, "bundle": bundle, "factorizations": factors, "counting": counts}
-    found |= {
-        "shapes polynomial": partial(moving_shapes, dyn.Polynomial(1)),
-        "shapes fourier": partial(moving_shapes, dyn.Fourier(1)),
-    }
-    return found | {"metrics": errors, "refusals": refusals}
+        "reconstruct robust": partial(reconstructed, "static_3d", threshold=1.0),
+        "reconstruct auto": partial(reconstructed, "constant_velocity_2d", "auto"),
+        "synchronize same": partial(shifted, True), "synchronize different": partial(shifted, False),
+        "synchronize rate": partial(shifted, True, rate=1.0, max_shift=1.0),
+        "counting": counts, "metrics": errors, "refusals": refusals,
+    }  # fmt: skip
