@@ -202,7 +202,7 @@ def test_fit_returns_itself_adds_names_that_end_in_an_underscore_and_forgets(cas
 
 
 @ONE
-def test_what_is_handed_in_stays_as_it_was(case: Case) -> None:
+def test_what_is_handed_in_stays_and_labels_keep_their_type(case: Case) -> None:
     lesson = case.lesson()
     few = first_of_each(lesson)
     given, asked, labels = deepcopy(picked(lesson.items, few)), deepcopy(lesson.asked), lesson.labels[few]
@@ -211,10 +211,19 @@ def test_what_is_handed_in_stays_as_it_was(case: Case) -> None:
     for mine, theirs in ((given, picked(lesson.items, few)), (asked, lesson.asked)):
         for one, other in zip(mine, theirs, strict=True):
             np.testing.assert_array_equal(getattr(one, "joints", one), getattr(other, "joints", other))
+    few = picked(lesson.items, first_of_each(lesson))
+    options = {"reject": None} if "reject" in case.options else {}
+    for labels in ([7, -2, 3], np.array(FEW, dtype=object)):
+        indexer = case.make(**options).fit(few, labels)
+        said, kind = indexer.predict(few), np.asarray(labels).dtype
+        assert indexer.classes_.dtype == said.dtype == kind
+        assert said.tolist() == np.asarray(labels).tolist()
+        assert kind.kind != "i" or indexer.score(few, said.astype(float)) == 1.0
+        assert indexer.classes_.tolist() == sorted(said.tolist())
 
 
 @EACH
-def test_the_order_of_examples_does_not_matter(case: Case) -> None:
+def test_answers_agree_with_one_another_in_any_order_of_examples(case: Case) -> None:
     lesson = case.lesson()
     order = np.random.default_rng(0).permutation(len(lesson.labels))
     turned = case.make().fit(picked(lesson.items, order), lesson.labels[order])
@@ -224,6 +233,18 @@ def test_the_order_of_examples_does_not_matter(case: Case) -> None:
     else:
         close = {"rtol": 0, "atol": max(case.apart, 1e-5)}
         np.testing.assert_allclose(turned.decision_function(lesson.asked), fitted(case).decision_function(lesson.asked), **close)
+    for count in (2, 3):
+        indexer = fitted(case, count)
+        asked = lesson.asked
+        scores, chances, said = indexer.decision_function(asked), indexer.predict_proba(asked), indexer.predict(asked)
+        assert scores.shape == chances.shape == (len(lesson.truth), count)
+        assert np.isfinite(scores).all() and (chances >= 0).all()
+        np.testing.assert_allclose(chances.sum(axis=1), 1.0, rtol=1e-6)
+        np.testing.assert_array_equal(chances.argmax(axis=1), scores.argmax(axis=1))
+        accepted = [i for i, label in enumerate(said) if label in FEW]
+        np.testing.assert_array_equal(said[accepted], indexer.classes_[scores.argmax(axis=1)][accepted])
+        if not getattr(indexer, "reject", None):
+            assert len(accepted) == len(said)
 
 
 @pytest.mark.slow
@@ -245,36 +266,7 @@ def test_one_example_of_each_class_is_enough(case: Case) -> None:
             case.make().fit(*only)
 
 
-@ONE
-def test_labels_keep_their_type(case: Case) -> None:
-    lesson = case.lesson()
-    few = picked(lesson.items, first_of_each(lesson))
-    options = {"reject": None} if "reject" in case.options else {}
-    for labels in ([7, -2, 3], np.array(FEW, dtype=object)):
-        indexer = case.make(**options).fit(few, labels)
-        said, kind = indexer.predict(few), np.asarray(labels).dtype
-        assert indexer.classes_.dtype == said.dtype == kind
-        assert said.tolist() == np.asarray(labels).tolist()
-        assert kind.kind != "i" or indexer.score(few, said.astype(float)) == 1.0
-        assert indexer.classes_.tolist() == sorted(said.tolist())
-
-
 # ---- answers -----------------------------------------------------------------------------------------------------------
-@EACH
-def test_answers_agree_with_one_another(case: Case) -> None:
-    lesson = case.lesson()
-    for count in (2, 3):
-        indexer = fitted(case, count)
-        asked = lesson.asked
-        scores, chances, said = indexer.decision_function(asked), indexer.predict_proba(asked), indexer.predict(asked)
-        assert scores.shape == chances.shape == (len(lesson.truth), count)
-        assert np.isfinite(scores).all() and (chances >= 0).all()
-        np.testing.assert_allclose(chances.sum(axis=1), 1.0, rtol=1e-6)
-        np.testing.assert_array_equal(chances.argmax(axis=1), scores.argmax(axis=1))
-        accepted = [i for i, label in enumerate(said) if label in FEW]
-        np.testing.assert_array_equal(said[accepted], indexer.classes_[scores.argmax(axis=1)][accepted])
-        if not getattr(indexer, "reject", None):
-            assert len(accepted) == len(said)
 
 
 @EACH

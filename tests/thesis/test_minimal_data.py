@@ -57,10 +57,6 @@ def test_six_views_at_their_728_matches():
     assert of_paths < 1e-5 * of_none
     with pytest.raises(ValueError, match="at least 728 matches"):
         dyn.fit(SIX, *(x[1:] for x in given))
-
-
-def test_six_views_of_cameras_that_leave_more_open():
-    rig = cameras(6, generator=seeded(3), angle=0.25, distance=6.0)
     rig[1:3] = rig[0]  # three of one centre: any line through their rays' planes
     found = dyn.fit(SIX, *paths(rig, 728, 4))
     assert found.status == dyn.Status.DEGENERATE and found.tensor.abs().max() == 0

@@ -78,7 +78,7 @@ def test_static_labels_sharpen_the_motion_and_keep_sigma(kind, scene):
     assert (without.sigma / plain.sigma - 1).abs().median() < 0.01
 
 
-def test_weights_are_inverse_variances_and_come_from_the_solution_unless_given():
+def test_weights_are_inverse_variances_that_only_count_by_their_ratios():
     """Half of the matches with four times the noise: weighing them so is better than all alike, and sigma is that of weight 1."""
     case = COLLINEATION
     scene = case.scene(60, batch=(40,))
@@ -106,9 +106,6 @@ def test_weights_are_inverse_variances_and_come_from_the_solution_unless_given()
         scaled = dyn.refine(solution, *views, weights=factor * weights)
         torch.testing.assert_close(scaled.sigma, kept.sigma, rtol=1e-6, atol=0)
         torch.testing.assert_close(scaled.covariance, kept.covariance, rtol=1e-4, atol=1e-12)
-
-
-def test_minimal_matches_leave_no_noise_to_estimate():
     case = COLLINEATION
     views = noisy(case, case.scene(4, batch=(2,)).exact, 1e-3)
     refined = dyn.refine(dyn.fit(case.invariant, *views), *views)
@@ -279,7 +276,7 @@ def refined(x: Tensor, y: Tensor, weights: Tensor | None = None) -> Tensor:
 
 
 @pytest.mark.slow
-def test_the_minimum_is_that_of_a_brute_force_descent_and_follows_like_it():
+def test_derivatives_of_the_minimum_are_those_of_a_brute_force_descent():
     """The Sampson error written out for a map of the line, minimized by Newton's method of automatic differentiation alone."""
     x, y = line()
 
@@ -301,11 +298,6 @@ def test_the_minimum_is_that_of_a_brute_force_descent_and_follows_like_it():
     torch.testing.assert_close(found, torch.func.jacrev(lambda x: newton(x, y))(x), rtol=1e-5, atol=1e-8)
     found = torch.func.hessian(lambda x: (refined(x, y)[:3] * weight).sum())(x)
     torch.testing.assert_close(found, torch.func.hessian(lambda x: (newton(x, y) * weight).sum())(x), rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_derivatives_by_matches_and_weights_up_to_the_second():
-    x, y = line()
     weights = torch.linspace(0.5, 1.5, 8, dtype=torch.float64)
     inputs = [part.requires_grad_() for part in (x, y, weights)]
     assert torch.autograd.gradcheck(refined, inputs, fast_mode=True, eps=1e-5, atol=1e-6)

@@ -76,7 +76,7 @@ def test_autograd_outside_of_a_transformation():
     torch.testing.assert_close(*found)
 
 
-def test_records_counts_and_inputs_that_go_out():
+def test_records_counts_and_what_nothing_depends_on():
     x, y = data(3, 4)
 
     def parts(x: Tensor, y: Tensor) -> Parts:
@@ -92,10 +92,6 @@ def test_records_counts_and_inputs_that_go_out():
     torch.testing.assert_close(slope, 2 * y)
     tangent = jvp(lambda x: over_problems(decided, x[None], y[:1])[0], (x[0],), (y[0],))[1]
     torch.testing.assert_close(tangent[0], jvp(lambda x: smooth(x, y[0]), (x[0],), (y[0],))[1])
-
-
-def test_what_nothing_depends_on_has_derivative_zero():
-    x, y = data(3, 4)
     frozen = lambda x: over_problems(lambda x: x.detach().sin(), x)  # noqa: E731
     assert (grad(lambda x: frozen(x).sum())(x) == 0).all() and (jvp(frozen, (x,), (y,))[1] == 0).all()
     assert (vmap(hessian(lambda x: frozen(x[None]).sum()))(x) == 0).all()

@@ -17,7 +17,7 @@ def street():
     return streets(3, 20, 300, generator=seeded(5))
 
 
-def test_tracks_are_projections_of_the_points_up_to_noise(street):
+def test_tracks_are_projections_and_cars_move_visibly(street):
     seen = street.exact.isfinite().all(-1)
     assert torch.equal(seen, street.tracks.isfinite().all(-1))
     image = homogeneous(street.points) @ street.cameras.mT
@@ -26,6 +26,15 @@ def test_tracks_are_projections_of_the_points_up_to_noise(street):
     # the drift adds to sigma = .5
     assert 0.4 < off.std() < 1.2 and off.mean().abs() < 0.1
     assert image[..., 2][seen].min() > 1.9
+    both = seen[:-1] & seen[1:]
+    for label in (2, 3):
+        for other in {1, 2, 3} - {label}:
+            motion = street.motions[:, other - 1]
+            turn = motion[1:, :, :3] @ motion[:-1, :, :3].mT
+            shift = motion[1:, :, 3] - (turn @ motion[:-1, :, 3:])[..., 0]
+            there = street.points[:-1] @ turn.mT + shift[:, None]
+            apart = (inhomogeneous(homogeneous(there) @ street.cameras[1:].mT) - street.exact[1:]).norm(dim=-1)
+            assert apart[both & (street.labels == label)].max() > 0.8
 
 
 def test_bodies_move_rigidly_and_the_street_not_at_all(street):
@@ -63,19 +72,6 @@ def test_shapes_labels_and_missing(street):
     assert seen.sum(0).min() >= 5 and seen.sum(0).double().median() < 18
     exact = street.exact[seen]
     assert exact.min() >= 0 and exact[:, 0].max() <= 1241 and exact[:, 1].max() <= 374
-
-
-def test_cars_move_visibly_otherwise_than_every_other_body(street):
-    seen = street.exact.isfinite().all(-1)
-    both = seen[:-1] & seen[1:]
-    for label in (2, 3):
-        for other in {1, 2, 3} - {label}:
-            motion = street.motions[:, other - 1]
-            turn = motion[1:, :, :3] @ motion[:-1, :, :3].mT
-            shift = motion[1:, :, 3] - (turn @ motion[:-1, :, 3:])[..., 0]
-            there = street.points[:-1] @ turn.mT + shift[:, None]
-            apart = (inhomogeneous(homogeneous(there) @ street.cameras[1:].mT) - street.exact[1:]).norm(dim=-1)
-            assert apart[both & (street.labels == label)].max() > 0.8
 
 
 def test_outliers_follow_nothing():

@@ -230,18 +230,13 @@ def test_unknown_actions_are_not_taken_for_known_ones_more_often_than_asked_for(
 
 
 @pytest.mark.slow
-def test_a_stricter_rate_refuses_more_and_known_actions_pass(crowd):
+def test_a_stricter_rate_refuses_more_and_only_ever_replaces_answers(crowd):
     train, test = crowd
     indexer = ActionIndexer(scorer="nearest", none_label="none")
     answers = [indexer.set_params(reject=rate).fit(train).predict(test) for rate in (0.5, 0.1, 0.02)]
     refused = [(answer == "none").mean() for answer in answers]
     assert refused == sorted(refused) and refused[1] < 0.15  # known actions by other people
     assert (answers[1] == test.labels).mean() > 0.85
-
-
-@pytest.mark.slow
-def test_reject_only_ever_replaces_answers_and_a_threshold_is_taken_as_it_is(crowd):
-    train, test = crowd
     train = train.select(subject=[0, 1])
     free, bound = ActionIndexer().fit(train), ActionIndexer(reject=0.02, none_label="none").fit(train)
     np.testing.assert_array_equal(free.decision_function(test), bound.decision_function(test))

@@ -94,7 +94,7 @@ def test_gradients_against_finite_differences():
     assert torch.autograd.gradcheck(table.scores, (joints, channels), fast_mode=True, atol=1e-5)
 
 
-def test_equal_weights_are_the_plain_metric_and_weights_act_after_whitening():
+def test_weights_act_after_whitening_and_for_each_class_its_own():
     windows, labels, _ = planted(2)
     metric = a_metric(windows)
     equal = JointWeights.uniform(JOINTS)
@@ -105,10 +105,6 @@ def test_equal_weights_are_the_plain_metric_and_weights_act_after_whitening():
     weighted = WeightedMetric(metric.covariance, metric.power, roots)
     plain, found = (flatten_channel(windows.values, "frame", one.weights("frame")) for one in (metric, weighted))
     torch.testing.assert_close(found, (plain.unflatten(2, (-1, JOINTS)) * roots[1]).flatten(2))
-
-
-def test_classes_are_compared_under_their_own_weights():
-    windows, labels, _ = planted(2)
     metric, generator = a_metric(windows), torch.Generator().manual_seed(5)
     weights = JointWeights(torch.ones(3, JOINTS), torch.ones(3), torch.rand(3, JOINTS, generator=generator) + 0.1)
     found = weighted_residual(windows, [windows], metric, labels, weights)

@@ -76,13 +76,20 @@ def test_the_frame_rate_does_not_matter(indexer, recordings):
     assert frame_accuracy(indexer, half, truth) > 0.7
 
 
-def test_recordings_shorter_than_a_window(indexer, recordings):
+def test_recordings_shorter_than_a_window_and_stray_frames(indexer, recordings):
     clip = recordings[0][0]
     for frames in (2, 3, 10, 25):
         short = clip.between(clip.times[40], clip.times[39 + frames])
         scores = indexer.score_frames(short)
         assert scores.shape == (frames, len(KNOWN)) and np.isfinite(scores).all()
         assert all(short.times[0] <= e.start < e.end <= short.times[-1] for e in indexer.find(short)), frames
+    stray = np.array([1e5, 1e7, 1e9])
+    more = clip.replace(
+        joints=np.concatenate([clip.joints, clip.joints[:3]]), times=np.concatenate([clip.times, stray]), confidence=None, fps=None
+    )
+    scores, found = indexer.scan(more)
+    assert [(e.label, e.start, e.end) for e in found] == [(e.label, e.start, e.end) for e in indexer.find(clip)]
+    assert len(scores) == len(more) and (scores[-3:] == scores[-1, 0]).all()
 
 
 def test_most_true_actions_are_found_and_joints_lost_for_a_while_do_not_break_the_scan(indexer, recordings):
@@ -152,17 +159,6 @@ def test_gaps_of_any_length_part_a_recording(indexer, recordings, gap):
     for one, other in zip(found, parts, strict=True):
         assert (one.start, one.end) == (pytest.approx(other.start, abs=close), pytest.approx(other.end, abs=close))
     assert np.mean(scores.argmax(axis=1) == np.concatenate([first, second]).argmax(axis=1)) > 0.95
-
-
-def test_frames_by_themselves_say_nothing_and_cost_nothing(indexer, recordings):
-    clip = recordings[0][0]
-    stray = np.array([1e5, 1e7, 1e9])
-    more = clip.replace(
-        joints=np.concatenate([clip.joints, clip.joints[:3]]), times=np.concatenate([clip.times, stray]), confidence=None, fps=None
-    )
-    scores, found = indexer.scan(more)
-    assert [(e.label, e.start, e.end) for e in found] == [(e.label, e.start, e.end) for e in indexer.find(clip)]
-    assert len(scores) == len(more) and (scores[-3:] == scores[-1, 0]).all()
 
 
 @pytest.mark.parametrize("gap", [60.0, 1e9])

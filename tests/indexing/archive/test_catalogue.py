@@ -55,7 +55,7 @@ def names(archive: Archive) -> list[str]:
 
 
 # ---- counts --------------------------------------------------------------------------------------------------------------
-def test_all_counts_agree(three: Archive, moves) -> None:
+def test_all_counts_agree_and_joints_are_those_that_were_added(three: Archive, moves) -> None:
     info, found, rows = three.info(), three.verify(), three.recordings()
     opened = [ArchiveSegment.open(path) for path in segments(three)]
     counted = sum(windows_of(int(rows), StorageFormat()) for one in opened for rows in one.tracks[:, 3])
@@ -69,14 +69,15 @@ def test_all_counts_agree(three: Archive, moves) -> None:
         assert (clip.times[0], clip.times[-1]) == pytest.approx((row.start, row.end)) and clip.name == row.source
         assert row.path == "" and row.person == "" and row.layout == "8 joints"
     assert repr(three) == f"Archive({str(three.path)!r}, {len(three):,} windows)"
-
-
-def test_stored_joints_are_those_that_were_added(three: Archive, moves) -> None:
     for number, name in enumerate("abc"):
         clip, stored = moves(number), three.clip(name)
         assert np.allclose(stored.joints, clip.joints[: 2 * len(stored) : 2], atol=0.05 * np.ptp(clip.joints))
         part = three.clip(name, 1.0, 2.0)
         assert (part.times[0], part.times[-1]) == pytest.approx((1.0, 2.0)) and np.array_equal(part.joints, stored.joints[15:31])
+    for ask in (lambda: three.remove("d"), lambda: three.clip("d"), lambda: three.clip("a", person="2")):
+        with pytest.raises(ValueError, match=r"has no (source|recording) '[ad]'.*info --sources lists them"):
+            ask()
+    assert len(three.recordings()) == 3
 
 
 def test_an_archive_of_nothing(tmp_path: Path, moves) -> None:
@@ -89,13 +90,6 @@ def test_an_archive_of_nothing(tmp_path: Path, moves) -> None:
     assert len(empty) == 0 and empty.info().sources == 1 and empty.verify().ok and empty.recordings() == []
     with pytest.raises(ValueError, match="holds no movement yet"):
         empty.search(moves(0))
-
-
-def test_what_is_not_there_is_said(three: Archive) -> None:
-    for ask in (lambda: three.remove("d"), lambda: three.clip("d"), lambda: three.clip("a", person="2")):
-        with pytest.raises(ValueError, match=r"has no (source|recording) '[ad]'.*info --sources lists them"):
-            ask()
-    assert len(three.recordings()) == 3
 
 
 # ---- removal and tidying -------------------------------------------------------------------------------------------------
@@ -182,7 +176,7 @@ def test_a_full_disk_while_tidying_is_no_failure_of_what_was_asked(tmp_path: Pat
     assert archive.add(moves(3, name="3")).of("known") and archive.info().segments == 1 and len(archive.recordings()) == 4
 
 
-def test_tidying_does_not_hide_damage(tmp_path: Path, moves) -> None:
+def test_damage_is_not_hidden_by_tidying_or_learning_again(tmp_path: Path, moves) -> None:
     archive = Archive(tmp_path / "a", EAGER)
     for number in range(3):
         archive.add(moves(number, name=f"{number}"))
@@ -193,9 +187,6 @@ def test_tidying_does_not_hide_damage(tmp_path: Path, moves) -> None:
     assert "is not what was written" in problem and problem.endswith("remove and add again 1")
     assert archive.remove("1") == 1 and archive.add(moves(1, name="1")).of("added") and archive.verify().ok
     assert sorted(names(archive)) == list("01234")
-
-
-def test_learning_again_does_not_hide_damage(tmp_path: Path, moves) -> None:
     archive = Archive(tmp_path / "a", ArchiveOptions(relearn_factor=2.0))
     archive.add(moves(0, name="0"))
     flip(segments(archive)[0], -500)
@@ -223,7 +214,7 @@ def flip(path: Path, place: int) -> None:
     path.write_bytes(data)
 
 
-def test_every_flipped_byte_of_a_segment_is_found(three: Archive) -> None:
+def test_flipped_bytes_of_a_segment_are_found(three: Archive) -> None:
     path = segments(three)[0]
     data = path.read_bytes()
     for place in np.random.default_rng(0).choice(len(data), 40, replace=False).tolist():
@@ -232,11 +223,6 @@ def test_every_flipped_byte_of_a_segment_is_found(three: Archive) -> None:
         assert str(path) in problem and "2 recordings lost: remove and add again a, b" in problem
         path.write_bytes(data)
     assert three.verify().ok
-
-
-def test_no_header_is_opened_that_makes_no_sense(three: Archive) -> None:
-    path = segments(three)[0]
-    data = path.read_bytes()
     length = int.from_bytes(data[:8], "little")
     opened = 0
     for place in [*range(24), *range(24, 8 + length, 3)]:

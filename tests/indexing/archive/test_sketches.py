@@ -68,7 +68,7 @@ def squared_cosine(window, example):
     return np.linalg.svd(np.linalg.qr(window.T)[0].T @ np.linalg.qr(example.T)[0], compute_uv=False)[0] ** 2
 
 
-def test_scan_is_the_best_of_every_window(segment):
+def test_scan_is_the_best_of_every_window_and_candidates_settle_where_they_fit_best(segment):
     stored, layout = segment
     for seconds in (0.5, 1.0, 2.5):
         example = probe(stored, layout, seconds)
@@ -79,6 +79,16 @@ def test_scan_is_the_best_of_every_window(segment):
         assert (result.row >= 0).all() and (result.row + example.span < stored.tracks[result.track, 3]).all(), seconds
         assert result.score[0] >= max(reference(stored, example).values()) - 1e-3
         assert result.track[0] == 0 and abs(result.row[0] / stored.rate - 4.0) <= 1 / stored.rate + 0.1 * seconds
+    probes = [probe(stored, layout, 2.5, tempo=tempo) for tempo in (0.8, 1.0, 1.25)]
+    start, scanned = np.array([60, 58, 150]), probes[1]
+    found = Candidates(np.zeros(3, np.float32), np.zeros(3, np.int64), start, np.ones(3, np.int64))
+    moved = refine_candidates(stored, probes, found)
+    assert moved.probe.tolist() == np.repeat(range(3), 3).tolist() and moved.score.argmax() == 3 and moved.score[3] > 0.999
+    for number, begin, row, score in zip(moved.probe, np.tile(start, 3), moved.row, moved.score, strict=True):
+        fine, half = probes[number], scanned.stride // 2
+        middle = begin + (scanned.span - fine.span) // 2
+        values = {at: squared_cosine(*planes(stored, fine, 0, at)) for at in range(middle - half, middle + half + 1)}
+        assert [score, values[row]] == pytest.approx([max(values.values())] * 2, abs=1e-3)
 
 
 def test_another_camera_sees_the_same(segment):
@@ -107,20 +117,6 @@ def test_blocks_parts_and_the_number_that_is_asked_for_change_nothing(segment, m
     for block in (7, 64):
         monkeypatch.setattr(sketches, "BLOCK", block)
         assert same(whole, scan(stored, both, 500)), block
-
-
-def test_candidates_settle_where_they_fit_best_at_every_tempo(segment):
-    stored, layout = segment
-    probes = [probe(stored, layout, 2.5, tempo=tempo) for tempo in (0.8, 1.0, 1.25)]
-    start, scanned = np.array([60, 58, 150]), probes[1]
-    found = Candidates(np.zeros(3, np.float32), np.zeros(3, np.int64), start, np.ones(3, np.int64))
-    moved = refine_candidates(stored, probes, found)
-    assert moved.probe.tolist() == np.repeat(range(3), 3).tolist() and moved.score.argmax() == 3 and moved.score[3] > 0.999
-    for number, begin, row, score in zip(moved.probe, np.tile(start, 3), moved.row, moved.score, strict=True):
-        fine, half = probes[number], scanned.stride // 2
-        middle = begin + (scanned.span - fine.span) // 2
-        values = {at: squared_cosine(*planes(stored, fine, 0, at)) for at in range(middle - half, middle + half + 1)}
-        assert [score, values[row]] == pytest.approx([max(values.values())] * 2, abs=1e-3)
 
 
 def test_only_movement_counts_where_it_is_asked_for(tmp_path):

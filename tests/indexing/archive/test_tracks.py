@@ -30,7 +30,7 @@ def swinging(t, joints=6, seed=0):
     return rng.uniform(100, 600, (joints, 2)) + 40 * np.sin(2 * np.pi * rate * np.asarray(t)[:, None, None] + phase)
 
 
-def test_stored_movement_is_the_movement():
+def test_stored_movement_is_the_movement_whatever_is_lost_or_slips():
     t = np.arange(300) / 30
     (track,) = tracks_of(Clip(swinging(t), times=t), STORAGE)
     at = track.start + np.arange(len(track)) / STORAGE.rate
@@ -40,6 +40,22 @@ def test_stored_movement_is_the_movement():
     (track,) = tracks_of(Clip(swinging(t - 1000), times=t), STORAGE)
     at = track.start + np.arange(len(track)) / STORAGE.rate
     assert track.start == t[0] and np.abs(track.positions()[1:-1] - swinging(at - 1000)[1:-1]).max() < 2.0
+    t = np.arange(300) / 30
+    joints = swinging(t)
+    joints[60:75, 0] = np.nan  # half a second
+    joints[60:180, 1] = np.nan
+    joints[:, 2] = np.nan
+    (track,) = tracks_of(Clip(joints, times=t), STORAGE)
+    seen = (track.joints != MISSING).all(axis=2)
+    assert seen[:, 0].all() and not seen[:, 2].any() and seen[:, 3:].all()
+    assert not seen[35:85, 1].any() and seen[:29, 1].all() and seen[92:, 1].all()
+    assert np.isnan(track.positions()[40, 1]).all()
+    t = np.arange(300) / 30
+    joints = swinging(t)
+    joints[100:104, 0] = 1e8
+    (track,) = tracks_of(Clip(joints, times=t), STORAGE)
+    assert track.scale < 0.05
+    assert np.nanmax(np.abs(track.positions()[10:40] - swinging(np.arange(10, 40) / 15))) < 1.0
 
 
 def test_gaps_part_tracks_and_short_ones_are_left_out():
@@ -52,19 +68,6 @@ def test_gaps_part_tracks_and_short_ones_are_left_out():
     assert [round(track.start, 2) for track in tracks_of(Clip(joints, times=t), STORAGE)] == [0.0, 6.0]
 
 
-def test_a_joint_that_is_lost_for_long_is_missing_and_bridged_otherwise():
-    t = np.arange(300) / 30
-    joints = swinging(t)
-    joints[60:75, 0] = np.nan  # half a second
-    joints[60:180, 1] = np.nan
-    joints[:, 2] = np.nan
-    (track,) = tracks_of(Clip(joints, times=t), STORAGE)
-    seen = (track.joints != MISSING).all(axis=2)
-    assert seen[:, 0].all() and not seen[:, 2].any() and seen[:, 3:].all()
-    assert not seen[35:85, 1].any() and seen[:29, 1].all() and seen[92:, 1].all()
-    assert np.isnan(track.positions()[40, 1]).all()
-
-
 def test_movement_in_3d_is_kept_from_two_sides():
     rng = np.random.default_rng(2)
     points = rng.normal(size=(60, 5, 3))
@@ -73,15 +76,6 @@ def test_movement_in_3d_is_kept_from_two_sides():
     turned = np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=2) @ rotation(np.pi / 2, 0.0).T
     assert np.allclose(side.joints, turned[..., :2])
     assert [track.view for track in tracks_of(Clip(points), STORAGE)] == [0, 1]
-
-
-def test_a_slip_does_not_take_the_precision_of_the_others():
-    t = np.arange(300) / 30
-    joints = swinging(t)
-    joints[100:104, 0] = 1e8
-    (track,) = tracks_of(Clip(joints, times=t), STORAGE)
-    assert track.scale < 0.05
-    assert np.nanmax(np.abs(track.positions()[10:40] - swinging(np.arange(10, 40) / 15))) < 1.0
 
 
 def test_nothing_is_kept_of_nothing():
@@ -103,7 +97,7 @@ def learned(seed=0, joints=8, dimensions=5, **options):
     return Layout.learn(tracks, None, storage), tracks, storage
 
 
-def test_basis_is_that_of_the_covariance():
+def test_the_basis_is_that_of_the_covariance_and_codes_are_its_coordinates():
     layout, tracks, _ = learned()
     x = tracks[0].positions().astype(float)
     x = x - x.mean(axis=1, keepdims=True)
@@ -114,21 +108,13 @@ def test_basis_is_that_of_the_covariance():
     for number in range(3):
         expected = vectors[:, -1 - number] * (values[-1 - number] + CODE_FLOOR) ** -CODE_WHITENING_POWER
         assert abs(expected @ layout.basis[:, number]) == pytest.approx(expected @ expected, rel=1e-3)
-
-
-def test_codes_know_no_place_and_are_rounded_by_less_than_half_a_step():
-    layout, tracks, _ = learned()
     poses = tracks[0].positions()
     codes, scales = layout.codes(poses)
     exact = layout.project(poses)
     assert np.abs(codes * scales[:, None, None] - exact).max() <= 0.5001 * scales.max()
     assert np.abs(codes).max() == 127
     assert np.allclose(layout.project(poses + np.array([1000.0, -500.0])), exact, atol=0.05)  # wherever they are in the image
-
-
-def test_a_joint_that_is_missing_is_what_the_others_make_likely():
-    """Against the conditional expectation of a Gaussian, written out."""
-    layout, tracks, _ = learned()
+    # against the conditional expectation of a Gaussian, written out
     poses = tracks[0].positions()[:20].copy()
     poses[:, 3] = np.nan
     seen = np.arange(8) != 3

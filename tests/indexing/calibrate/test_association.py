@@ -54,7 +54,7 @@ def scene():
 
 
 @pytest.mark.slow
-def test_exchanged_numbers_are_mended_and_clocks_found(scene):
+def test_people_are_told_through_exchanges_and_false_detections(scene):
     rig, tracks, truth, seen = scene
     found = associate([clips(one, name=f"cam{k}") for k, one in enumerate(tracks)])
     assert found.ok and found.people == 2
@@ -67,6 +67,20 @@ def test_exchanged_numbers_are_mended_and_clocks_found(scene):
     assert {(e.camera, round(e.time * 30)) for e in found.exchanges} >= {(0, 60), (1, 40), (1, 100), (2, 75)}
     assert found.mean_certainty > 0.9
     assert all(len(found.clips(k)) == 2 and found.clips(k)[1].meta["person"] == 1 for k in range(3))
+    rng = np.random.default_rng(5)
+    ghost = np.full((150, 1, len(NAMES), 2), np.nan)
+    ghost[30:70, 0] = seen[0][100, 0] + [300.0, -90.0] + 2 * rng.standard_normal((40, len(NAMES), 2))
+    given = [np.concatenate([tracks[0], ghost], axis=1), tracks[1].copy(), tracks[2].copy()]
+    given[1][80:110, 0] = np.nan
+    who = [np.concatenate([truth[0], np.full((150, 1), -1)], axis=1), truth[1].copy(), truth[2]]
+    who[1][80:110, 0] = -1
+    found = associate([clips(one, name=f"cam{k}") for k, one in enumerate(given)], clocks=rig.clocks.offsets.numpy())
+    assert found.ok and found.people == 2
+    assert right(found, who) > 0.98
+    assert found.left_out[0][30:70, 2].all() and not (found.tracks[0] == 2).any()
+    assert any(notice.code is PeopleNotice.ALONE and "cam0" in notice.text for notice in found.notices)
+    away = np.isnan(found.joints[1]).all((2, 3))
+    assert away[80:110].sum() == 30 and (found.tracks[1][80:110] == -1).sum() == 30
 
 
 @pytest.mark.slow
@@ -91,25 +105,6 @@ def test_distances_are_sampsons():
         p, q = np.append(x[0, a, k], 1), np.append(y[0, b, k], 1)
         below = np.hypot(np.linalg.norm((F @ p)[:2]), np.linalg.norm((F.T @ q)[:2]))
         assert found[0, a, b, k] == pytest.approx(q @ F @ p / below)
-
-
-@pytest.mark.slow
-def test_false_detections_are_nobody_and_people_come_and_go(scene):
-    rig, tracks, truth, seen = scene
-    rng = np.random.default_rng(5)
-    ghost = np.full((150, 1, len(NAMES), 2), np.nan)
-    ghost[30:70, 0] = seen[0][100, 0] + [300.0, -90.0] + 2 * rng.standard_normal((40, len(NAMES), 2))
-    given = [np.concatenate([tracks[0], ghost], axis=1), tracks[1].copy(), tracks[2].copy()]
-    given[1][80:110, 0] = np.nan
-    who = [np.concatenate([truth[0], np.full((150, 1), -1)], axis=1), truth[1].copy(), truth[2]]
-    who[1][80:110, 0] = -1
-    found = associate([clips(one, name=f"cam{k}") for k, one in enumerate(given)], clocks=rig.clocks.offsets.numpy())
-    assert found.ok and found.people == 2
-    assert right(found, who) > 0.98
-    assert found.left_out[0][30:70, 2].all() and not (found.tracks[0] == 2).any()
-    assert any(notice.code is PeopleNotice.ALONE and "cam0" in notice.text for notice in found.notices)
-    away = np.isnan(found.joints[1]).all((2, 3))
-    assert away[80:110].sum() == 30 and (found.tracks[1][80:110] == -1).sum() == 30
 
 
 @pytest.mark.slow

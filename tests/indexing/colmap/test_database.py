@@ -28,7 +28,7 @@ def changed(source, target, *commands):
     return target
 
 
-def test_what_is_read_is_what_was_written(scene, given):
+def test_what_is_read_is_what_was_written_and_copies_are_whole(scene, given, tmp_path):
     database = read_database(given)
     assert [image.name for image in database.images] == list(scene.names)
     for image, points in zip(database.images, scene.keypoints, strict=True):
@@ -37,6 +37,23 @@ def test_what_is_read_is_what_was_written(scene, given):
     assert {(pair.first, pair.second) for pair in database.pairs} == set(scene.matches)
     for pair in database.pairs:
         assert np.array_equal(pair.matches, scene.matches[pair.first, pair.second])
+    F, E = np.arange(9.0).reshape(3, 3), np.arange(9.0, 18).reshape(3, 3)
+    rows = {pair.key: pair.matches[:20] for pair in database.pairs}
+    geometries = {pair.key: PairGeometry(2, pair.matches[:15], F, E) for pair in database.pairs}
+    written = write_database(database, tmp_path / "copy.db", rows, geometries)
+    assert list(tmp_path.iterdir()) == [written]
+    with contextlib.closing(sqlite3.connect(given)) as old, contextlib.closing(sqlite3.connect(written)) as new:
+        for table in ("cameras", "images", "keypoints", "descriptors"):
+            assert old.execute(f"SELECT * FROM {table}").fetchall() == new.execute(f"SELECT * FROM {table}").fetchall()
+        assert old.execute("SELECT sql FROM sqlite_master").fetchall() == new.execute("SELECT sql FROM sqlite_master").fetchall()
+    copy = pycolmap.Database.open(written)
+    pair = database.pairs[0]
+    keys = [database.images[place].key for place in (pair.first, pair.second)]
+    kept = copy.read_two_view_geometry(*keys)
+    assert np.array_equal(kept.F, F) and np.array_equal(kept.E, E)
+    assert np.array_equal(kept.inlier_matches, pair.matches[:15]) and int(kept.config) == 2
+    assert np.array_equal(copy.read_matches(*keys), pair.matches[:20])
+    copy.close()
 
 
 def test_reading_leaves_nothing_behind_also_where_a_program_has_it_open(given, tmp_path):
@@ -55,27 +72,6 @@ def test_reading_leaves_nothing_behind_also_where_a_program_has_it_open(given, t
     # inlier matches stand for matches that are not there
     part = read_database(changed(given, tmp_path / "inliers.db", "UPDATE matches SET rows = 0, data = x''"))
     assert 0 < part.matches < read_database(given).matches
-
-
-def test_the_copy_differs_in_its_pairs_alone(given, tmp_path):
-    database = read_database(given)
-    F, E = np.arange(9.0).reshape(3, 3), np.arange(9.0, 18).reshape(3, 3)
-    rows = {pair.key: pair.matches[:20] for pair in database.pairs}
-    geometries = {pair.key: PairGeometry(2, pair.matches[:15], F, E) for pair in database.pairs}
-    written = write_database(database, tmp_path / "copy.db", rows, geometries)
-    assert list(tmp_path.iterdir()) == [written]
-    with contextlib.closing(sqlite3.connect(given)) as old, contextlib.closing(sqlite3.connect(written)) as new:
-        for table in ("cameras", "images", "keypoints", "descriptors"):
-            assert old.execute(f"SELECT * FROM {table}").fetchall() == new.execute(f"SELECT * FROM {table}").fetchall()
-        assert old.execute("SELECT sql FROM sqlite_master").fetchall() == new.execute("SELECT sql FROM sqlite_master").fetchall()
-    copy = pycolmap.Database.open(written)
-    pair = database.pairs[0]
-    keys = [database.images[place].key for place in (pair.first, pair.second)]
-    kept = copy.read_two_view_geometry(*keys)
-    assert np.array_equal(kept.F, F) and np.array_equal(kept.E, E)
-    assert np.array_equal(kept.inlier_matches, pair.matches[:15]) and int(kept.config) == 2
-    assert np.array_equal(copy.read_matches(*keys), pair.matches[:20])
-    copy.close()
 
 
 def test_a_copy_that_fails_leaves_nothing(given, tmp_path):

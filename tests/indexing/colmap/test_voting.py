@@ -56,24 +56,20 @@ def test_the_scene_is_static_though_the_body_has_more_matches(first):
     assert (found.spread > 0.8).all()
 
 
-def test_the_order_of_pairs_decides_nothing():
+def test_bodies_are_told_apart_whatever_the_order_of_pairs():
     world = World(MIDDLE, CORNER)
     pairs = [world.pair(i, j, (i + j) % 3, (i + j + 1) % 3, (i + j + 2) % 3) for i, j in PAIRS]
     first, second = world.voted(pairs), world.voted(pairs[::-1])
     assert np.allclose(first.keypoints, second.keypoints)
     assert all(np.array_equal(a, b) for a, b in zip(first.signs, second.signs[::-1], strict=True))
-
-
-def test_bodies_that_move_alike_between_some_images_are_told_apart_by_the_others():
-    """In every third pair the body moves with the scene, and in another third with a second body."""
-    world = World(MIDDLE, CORNER)
+    # in every third pair the body moves with the scene, and in another third with a second body
     groups = [((0, 1), 2), (0, (1, 2)), (0, 1, 2)]
     found = world.voted([world.pair(i, j, *groups[k % 3]) for k, (i, j) in enumerate(PAIRS)])
     scene, *bodies = world.things(found)
     assert scene > 0.5 and max(bodies) < -0.2
 
 
-def test_a_part_of_the_scene_that_some_pairs_take_for_a_body_stays_static():
+def test_parts_of_the_scene_and_of_the_graph_are_decided_by_themselves():
     world = World(MIDDLE)
     world.body[:WIDE][np.arange(WIDE) % 8 > 4] = 2  # the right side
     apart = (0, 7)
@@ -83,6 +79,10 @@ def test_a_part_of_the_scene_that_some_pairs_take_for_a_body_stays_static():
     left, body, right = world.things(found)
     assert min(left, right) > 0.3 and body < -0.9
     assert all(found.signs[k].tolist() == [1, -1, 1] for k in apart)
+    # images 0 to 2 and images 3 and 4 share nothing; the second part has a scene of its own
+    world = World(MIDDLE)
+    found = world.voted([world.pair(0, 1, 1, 0), world.pair(1, 2, 1, 0), world.pair(3, 4, 0, 1)])
+    assert [signs.tolist() for signs in found.signs] == [[-1, 1], [-1, 1], [1, -1]]
 
 
 def test_two_things_of_equal_reach_are_open():
@@ -90,13 +90,6 @@ def test_two_things_of_equal_reach_are_open():
     found = world.voted([world.pair(i, j, 0, 1) for i, j in PAIRS])
     assert found.open == tuple(range(IMAGES))
     assert not found.keypoints.any() and found.lead < 1.15
-
-
-def test_parts_of_the_graph_are_decided_by_themselves():
-    """Images 0 to 2 and images 3 and 4 share nothing; the second part has a scene of its own."""
-    world = World(MIDDLE)
-    found = world.voted([world.pair(0, 1, 1, 0), world.pair(1, 2, 1, 0), world.pair(3, 4, 0, 1)])
-    assert [signs.tolist() for signs in found.signs] == [[-1, 1], [-1, 1], [1, -1]]
 
 
 def test_a_single_body_stands_still_pairs_without_bodies_learn_from_the_others_and_nothing_is_nothing():

@@ -274,7 +274,7 @@ AGGREGATED = (
 )
 
 
-def test_tabular_events_below_their_observation(tmp_path: Path) -> None:
+def test_tabular_and_aggregated_events(tmp_path: Path) -> None:
     path = tmp_path / "a.tsv"
     path.write_text(OLD)
     found = open_labels(path)
@@ -282,36 +282,6 @@ def test_tabular_events_below_their_observation(tmp_path: Path) -> None:
     assert found.format == "boris_tables"
     assert found.labels == (Label(3.3, 7.75, "squat", "Ann", comment="deep", **of), Label(5.0, 5.0, "clap", **of))
     assert "1 event left out: START without STOP, or the other way round (squat at 19 s)" in found.notices[0]
-
-
-def test_other_ways_to_name_the_files(tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    for source in ("a.mp4;b.mp4", "player #1: a.mp4;b.mp4 player #2: c.mp4"):
-        row = f"one,2024,,90,Media file(s),{source},0.0,60.000;30.000,25.000,Ann,clap,,,,POINT,70.5,b.mp4,NA,NA,"
-        path.write_text(NEW_HEAD + row)
-        assert [(label.start, label.media) for label in open_labels(path).labels] == [(10.5, "b.mp4")]
-
-
-def test_tabular_events_with_all_in_every_row(tmp_path: Path) -> None:
-    source = "player #1:films/a.mp4;films/b.mp4|player #2:c.mp4"
-    rows = [
-        f"one,2024,,90,Media file(s),{source},0.0,60.000;30.000|90.000,25.000,Ann,squat,,left,,{kind},{time},{name},NA,NA,"
-        for kind, time, name in [("START", 58, "a.mp4"), ("STOP", 62, "b.mp4"), ("POINT", 70.5, "b.mp4")]
-    ]
-    path = tmp_path / "a.csv"
-    path.write_text(NEW_HEAD + "\n".join(rows))
-    found = open_labels(path)
-    assert [(label.start, label.end, label.media, label.modifiers) for label in found.labels] == [
-        (0.0, 2.0, "films/b.mp4", ("left",)),
-        (10.5, 10.5, "films/b.mp4", ("left",)),
-        (58.0, 60.0, "films/a.mp4", ("left",)),
-    ]
-    with pytest.raises(ValueError, match=r"plays c\.mp4 beside films/a\.mp4, films/b\.mp4, and the table does not say how"):
-        open_labels(path, recording="c.json")
-
-
-def test_aggregated_events(tmp_path: Path) -> None:
-    path = tmp_path / "a.tsv"
     rows = [
         "one\ta.mp4\t90\t25\tNo focal subject\tsquat\tleft|fast\tSTATE\t1.800\t8.125\t6.325\tx\ty",
         "one\ta.mp4\t90\t25\tAnn\tclap\t\tPOINT\t32.825\t32.825\tNA\t\t",
@@ -330,11 +300,33 @@ def test_aggregated_events(tmp_path: Path) -> None:
         open_labels(path, recording="b.json")
 
 
-def test_tables_that_say_too_little(tmp_path: Path) -> None:
+def test_tables_of_other_forms_and_such_that_say_too_little(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
+    for source in ("a.mp4;b.mp4", "player #1: a.mp4;b.mp4 player #2: c.mp4"):
+        row = f"one,2024,,90,Media file(s),{source},0.0,60.000;30.000,25.000,Ann,clap,,,,POINT,70.5,b.mp4,NA,NA,"
+        path.write_text(NEW_HEAD + row)
+        assert [(label.start, label.media) for label in open_labels(path).labels] == [(10.5, "b.mp4")]
     path.write_text("Observation id,Subject,Behavior,Time\none,Ann,squat,1\n")
     with pytest.raises(ValueError, match="has no column 'Behavior type' or 'Status'"):
         open_labels(path)
     path.write_text("Observation id,Subject,Behavior,Behavior type,Time\none,Ann,squat,MAYBE,1\n")
     with pytest.raises(ValueError, match="line 2: 'MAYBE' is none of START, STOP and POINT"):
         open_labels(path)
+
+
+def test_tabular_events_with_all_in_every_row(tmp_path: Path) -> None:
+    source = "player #1:films/a.mp4;films/b.mp4|player #2:c.mp4"
+    rows = [
+        f"one,2024,,90,Media file(s),{source},0.0,60.000;30.000|90.000,25.000,Ann,squat,,left,,{kind},{time},{name},NA,NA,"
+        for kind, time, name in [("START", 58, "a.mp4"), ("STOP", 62, "b.mp4"), ("POINT", 70.5, "b.mp4")]
+    ]
+    path = tmp_path / "a.csv"
+    path.write_text(NEW_HEAD + "\n".join(rows))
+    found = open_labels(path)
+    assert [(label.start, label.end, label.media, label.modifiers) for label in found.labels] == [
+        (0.0, 2.0, "films/b.mp4", ("left",)),
+        (10.5, 10.5, "films/b.mp4", ("left",)),
+        (58.0, 60.0, "films/a.mp4", ("left",)),
+    ]
+    with pytest.raises(ValueError, match=r"plays c\.mp4 beside films/a\.mp4, films/b\.mp4, and the table does not say how"):
+        open_labels(path, recording="c.json")

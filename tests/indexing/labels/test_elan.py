@@ -157,7 +157,7 @@ BOMB = """<?xml version="1.0"?><!DOCTYPE lolz [<!ENTITY a "aaaaaaaaaa">
 <!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]><ANNOTATION_DOCUMENT>&b;</ANNOTATION_DOCUMENT>"""
 
 
-def test_hostile_xml(tmp_path: Path) -> None:
+def test_hostile_xml_and_empty_elements(tmp_path: Path) -> None:
     path = tmp_path / "a.eaf"
     for text, said in (
         (BOMB, "declares a document type or entities"),
@@ -173,6 +173,18 @@ def test_hostile_xml(tmp_path: Path) -> None:
             with pytest.raises(ValueError, match=said):
                 action(path)
             assert path.read_text() == text
+    write_labels(path, [Label(1.0, 1.001, "a"), Label(2.0, 2.0003, "b"), Label(3.0, 3.0, "c")], recording="session.mp4")
+    assert [(one.start, one.end) for one in open_labels(path).labels] == [(1.0, 1.002), (2.0, 2.002), (3.0, 3.0)]
+    path.write_text(
+        '<ANNOTATION_DOCUMENT><HEADER A="x>/>" TIME_UNITS="milliseconds"/><TIME_ORDER B="/>" />'
+        '<TIER TIER_ID="/&gt;" C=">"></TIER>x/><!-- <TIER> --></ANNOTATION_DOCUMENT>'
+    )
+    write_labels(path, FOUND[2:3], recording="session.mp4")
+    text = path.read_text()
+    assert '<HEADER A="x>/>" TIME_UNITS="milliseconds"/><TIME_ORDER B="/>">' in text
+    assert '<TIER TIER_ID="/&gt;" C=">"></TIER>\n    <TIER ANNOTATOR' in text
+    assert text.endswith("x/><!-- <TIER> --></ANNOTATION_DOCUMENT>")
+    assert [label.label for label in open_labels(path, tier="dyntorch").labels] == ["clap"]
 
 
 # ---- beside a person's ---------------------------------------------------------------------------------------------------
@@ -210,13 +222,7 @@ def test_detections_have_tiers_of_their_own(tmp_path: Path) -> None:
     assert "4 labels left out: a program found them (dyntorch); --tier NAME reads them" in chosen.notices
 
 
-def test_what_lasts_is_no_moment_however_short(tmp_path: Path) -> None:
-    path = tmp_path / "a.eaf"
-    write_labels(path, [Label(1.0, 1.001, "a"), Label(2.0, 2.0003, "b"), Label(3.0, 3.0, "c")], recording="session.mp4")
-    assert [(one.start, one.end) for one in open_labels(path).labels] == [(1.0, 1.002), (2.0, 2.002), (3.0, 3.0)]
-
-
-def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
+def test_a_second_run_replaces_the_first_and_times_are_those_of_the_document(tmp_path: Path) -> None:
     path = eaf(tmp_path / "a.eaf", TIMES, ACTS)
     write_labels(path, FOUND, recording="session.mp4")
     once = path.read_bytes()
@@ -227,9 +233,6 @@ def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
     found = open_labels(path)
     assert found.tiers == ("acts", "others", "dyntorch")
     assert len(found.labels) == 5
-
-
-def test_times_are_those_of_the_document(tmp_path: Path) -> None:
     path = eaf(tmp_path / "a.eaf", TIMES, ACTS)
     assert write_labels(path, [Label(1, 3, "early"), Label(4, 5, "late")], recording="side.mp4") == [
         "1 label left out: before the time at which the ELAN file begins (early at 1-3 s)"
@@ -307,17 +310,3 @@ def test_a_new_file_is_what_elan_asks_for(tmp_path: Path) -> None:
     assert medium is not None
     assert medium.get("MEDIA_URL") == (tmp_path / "my film.mp4").as_uri()
     assert read_labels(path, recording="my film.csv") == [Label(0, 1, "x", media="my film.mp4", tier="dyntorch")]
-
-
-def test_empty_elements_and_tags_in_strange_places(tmp_path: Path) -> None:
-    path = tmp_path / "a.eaf"
-    path.write_text(
-        '<ANNOTATION_DOCUMENT><HEADER A="x>/>" TIME_UNITS="milliseconds"/><TIME_ORDER B="/>" />'
-        '<TIER TIER_ID="/&gt;" C=">"></TIER>x/><!-- <TIER> --></ANNOTATION_DOCUMENT>'
-    )
-    write_labels(path, FOUND[2:3], recording="session.mp4")
-    text = path.read_text()
-    assert '<HEADER A="x>/>" TIME_UNITS="milliseconds"/><TIME_ORDER B="/>">' in text
-    assert '<TIER TIER_ID="/&gt;" C=">"></TIER>\n    <TIER ANNOTATOR' in text
-    assert text.endswith("x/><!-- <TIER> --></ANNOTATION_DOCUMENT>")
-    assert [label.label for label in open_labels(path, tier="dyntorch").labels] == ["clap"]

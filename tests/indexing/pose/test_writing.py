@@ -105,11 +105,15 @@ def test_what_is_there_is_not_made_again(tmp_path, seeing):
     assert keypoint_file(path, tmp_path / "pose", json=True).reused and frames_in(first.folder) == before
 
 
-def test_other_arguments_make_another_file(tmp_path, seeing):
+def test_other_arguments_make_another_file_and_own_folders_follow_the_video(tmp_path, seeing):
     path = film(tmp_path, [[walk(i)] for i in range(12)])
     for how in ({}, {"people": 2}, {"every": 2}, {"model": "full"}, {"options": SHORT}):
         made = keypoint_file(path, tmp_path / "pose", **how)
         assert not made.reused and same(made.clips, read_clip_set(made.path))
+    keypoint_file(path, tmp_path / "pose", own=True)
+    film(tmp_path, [[walk(i + 1)] for i in range(14)])
+    again = keypoint_file(path, tmp_path / "pose", own=True)
+    assert not again.reused and len(read_clip_set(again.path)[0]) == 14
 
 
 def test_another_video_of_the_same_name_is_refused_before_any_work(tmp_path, seeing):
@@ -129,14 +133,6 @@ def test_another_video_of_the_same_name_is_refused_before_any_work(tmp_path, see
     assert frames_in(made.folder) == before[1] and len(seeing) == before[2]
     made.folder.rename(tmp_path / "moved_json")
     assert not keypoint_file(path, folder, json=True).reused
-
-
-def test_a_folder_of_one_video_follows_its_content(tmp_path, seeing):
-    path = film(tmp_path, [[walk(i)] for i in range(12)])
-    keypoint_file(path, tmp_path / "pose", own=True)
-    film(tmp_path, [[walk(i + 1)] for i in range(14)])
-    again = keypoint_file(path, tmp_path / "pose", own=True)
-    assert not again.reused and len(read_clip_set(again.path)[0]) == 14
 
 
 def test_other_arguments_leave_no_stale_json(tmp_path, seeing):

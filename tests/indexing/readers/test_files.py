@@ -229,11 +229,15 @@ def test_unknown_options_are_refused(tmp_path: Path) -> None:
             readers.read(tmp_path / "a.json", **options)  # type: ignore[arg-type]
 
 
-def test_naming_the_wrong_format_says_what_the_file_is(tmp_path: Path) -> None:
+def test_naming_the_wrong_format_says_what_the_file_is_and_one_clip_is_one(tmp_path: Path) -> None:
     path = tmp_path / "set.npz"
     np.savez(path, joints=np.ones((3, 2, 2)))
     for name in set(readers.FORMATS) - {"clipset"}:
         refused(path, "is a npz", name, "leave format= out", format=name)
+    path = tmp_path / "set.npz"
+    np.savez(path, joints=np.ones((6, 3, 2)), offsets=[0, 2, 6])
+    with pytest.raises(ValueError, match=r"set.npz: holds 2 clips .*ClipSet.load.*index evaluate"):
+        readers.read_clip(path)
 
 
 def test_reading_leaves_the_collector_of_cycles_as_it_was(tmp_path: Path) -> None:
@@ -244,13 +248,6 @@ def test_reading_leaves_the_collector_of_cycles_as_it_was(tmp_path: Path) -> Non
             assert gc.isenabled() == before
         finally:
             gc.enable()
-
-
-def test_read_clip_wants_one_clip(tmp_path: Path) -> None:
-    path = tmp_path / "set.npz"
-    np.savez(path, joints=np.ones((6, 3, 2)), offsets=[0, 2, 6])
-    with pytest.raises(ValueError, match=r"set.npz: holds 2 clips .*ClipSet.load.*index evaluate"):
-        readers.read_clip(path)
 
 
 def test_clip_and_clipset_load_through_the_readers(openpose_folder, person: np.ndarray) -> None:  # type: ignore[no-untyped-def]

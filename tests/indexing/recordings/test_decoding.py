@@ -107,7 +107,7 @@ def worth(chosen, windows, values, background):
     return background[outside].sum() + sum(values[number].max() for number in chosen)
 
 
-def test_the_best_explanation_is_found(problem):
+def test_the_best_explanation_and_the_sums_over_all(problem):
     windows, values, background = problem
     every = explanations(windows, len(background))
     segments, value = best_tiling(windows, values, background)
@@ -117,10 +117,6 @@ def test_the_best_explanation_is_found(problem):
     assert all(one.label == values[one.window].argmax() for one in segments)
     want = [max(worth(chosen, *problem) for chosen in every if number in chosen) for number in range(len(windows))]
     np.testing.assert_allclose(through(windows, values, background), want)
-
-
-def test_posteriors_are_sums_over_all_explanations(problem):
-    windows, values, background = problem
     want, total = np.zeros((len(background), 2)), 0.0
     for chosen in explanations(windows, len(background)):
         outside = np.ones(len(background), dtype=bool)

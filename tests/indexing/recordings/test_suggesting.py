@@ -48,17 +48,6 @@ def test_what_is_not_known_comes_first_and_not_twice(learned, recording) -> None
     assert all(a[1] <= b[0] + 1e-9 for a, b in pairwise(spans))
 
 
-def test_what_is_labelled_is_not_suggested_again(learned, recording, monkeypatch) -> None:
-    clip, truth = recording
-    done = [(a, b) for label, a, b in truth if label == "kick"]
-    assert "kick" not in names(suggest(learned, [clip], 2, [done]), truth)
-    assert suggest(learned, [clip], 9, [[(-1.0, 1e6)]]) == []
-    monkeypatch.setattr(suggesting, "MAX_CANDIDATES", 4)
-    assert 1 <= len(suggest(learned, [clip], 99)) <= 4  # too many are thinned out
-    with pytest.raises(ValueError, match="number=0: suggests nothing; give 1 or more"):
-        suggest(learned, [clip], 0)
-
-
 @pytest.mark.slow
 def test_nobody_who_stands_still_or_is_not_seen_is_suggested(learned, recording) -> None:
     clip, _ = recording
@@ -82,7 +71,7 @@ def test_parts_cover_the_recording_and_stay_within_gaps(learned, recording) -> N
     assert parts.spans.min() >= clip.times[0] and parts.spans.max() <= clip.times[-1]
 
 
-def test_residuals_tell_what_is_known(learned, recording) -> None:
+def test_what_is_known_or_labelled_is_not_suggested(learned, recording, monkeypatch) -> None:
     clip, truth = recording
     parts = parts_of(learned, clip, [])
     likely, near, apart, usual = compare_parts(learned, parts.windows)
@@ -90,6 +79,13 @@ def test_residuals_tell_what_is_known(learned, recording) -> None:
     assert np.allclose(apart, apart.T, atol=0.1) and (np.diag(apart) < 0.01).all() and 0 < usual < 1
     inside = [any(a <= (s + e) / 2 <= b and label in KNOWN for label, a, b in truth) for s, e in parts.spans]
     assert near[inside].max() < near[~np.array(inside)].min()
+    done = [(a, b) for label, a, b in truth if label == "kick"]
+    assert "kick" not in names(suggest(learned, [clip], 2, [done]), truth)
+    assert suggest(learned, [clip], 9, [[(-1.0, 1e6)]]) == []
+    monkeypatch.setattr(suggesting, "MAX_CANDIDATES", 4)
+    assert 1 <= len(suggest(learned, [clip], 99)) <= 4  # too many are thinned out
+    with pytest.raises(ValueError, match="number=0: suggests nothing; give 1 or more"):
+        suggest(learned, [clip], 0)
 
 
 def left(points, centres):

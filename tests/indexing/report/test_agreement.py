@@ -37,9 +37,6 @@ def test_everything_is_written_and_says_the_same(tmp_path: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "&lt;b&gt;jump" in text and "<b>jump" not in text and "<script" not in text and "b.json, person 2" in text
     assert f"{both.kappa:.3f}" in text and "a note" in text
-
-
-def test_rows_and_words(tmp_path: Path) -> None:
     both = report().agreement
     rows = {row[0]: row for row in label_rows(both)}
     assert rows["squat"][1:4] == ["3.0", "5.0", "2.5"] and rows["squat"][5:7] == ["1", "2"]

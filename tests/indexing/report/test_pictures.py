@@ -129,7 +129,7 @@ def test_an_hour_is_drawn_in_time():
     assert time.process_time() - begin < 3.0 and len(png) < 1_000_000
 
 
-def test_events_and_truth_change_what_is_drawn(tmp_path):
+def test_events_and_truth_change_what_is_drawn_and_bars_say_what_they_are(tmp_path):
     times, scores = np.arange(100) / 10, np.zeros((100, 2))
     event = Hit("a", 2, 4)
     variants = [((), None), ((event,), None), ((event,), [("a", 2.0, 4.0)]), ((Hit("b", 2, 4),), None)]
@@ -141,6 +141,17 @@ def test_events_and_truth_change_what_is_drawn(tmp_path):
     colour = np.array([int(pictures.PALETTE[0][i : i + 2], 16) for i in (1, 3, 5)]) / 255
     bar = (np.abs(image - colour).max(axis=2) < 0.02).any(axis=0)
     assert 0.1 < bar.mean() < 0.4  # two of ten seconds, and the chip beside the name
+    times, events, truth = np.arange(100) / 10, [Hit("stand_up", 2, 2.1), Hit("squat", 4, 6)], [("squat", 4.5, 6.0)]
+    tips = pictures.timeline_tips(times, ["squat", "stand_up"], events, truth)
+    said = ["found: stand_up, 2.00 to 2.10 s", "found: squat, 4.00 to 6.00 s", "known: squat, 4.50 to 6.00 s"]
+    assert [tip.text for tip in tips] == said
+    assert all(0 < tip.left < tip.left + tip.width < 1 and 0 < tip.top < tip.top + tip.height < 1 for tip in tips)
+    assert tips[2].top > tips[1].top + tips[1].height
+    image = matplotlib.image.imread(io.BytesIO(pictures.timeline(times, np.zeros((100, 2)), ["squat", "stand_up"], events, truth)))
+    found = tips[1]
+    x, y = found.left + 0.1 * found.width, found.top + 0.15 * found.height  # inside the bar, beside its name
+    pixel = image[int(y * image.shape[0]), int(x * image.shape[1]), :3]
+    assert np.abs(pixel - [int(pictures.PALETTE[0][i : i + 2], 16) / 255 for i in (1, 3, 5)]).max() < 0.02
 
 
 @pytest.mark.slow
@@ -177,7 +188,7 @@ def test_strips_stand_upright_in_either_image_direction():
     assert len(bones(strip(person(), 0.5, 1.0, frames=4))) == 20
 
 
-def test_joints_that_were_not_seen_are_left_out():
+def test_joints_that_were_not_seen_or_are_in_the_wrong_place_are_left_out():
     clip = person()
     joints = clip.joints.copy()
     joints[:, 1] = np.nan
@@ -190,6 +201,12 @@ def test_joints_that_were_not_seen_are_left_out():
     assert len(drawn) == 24 and np.ptp(drawn[..., 1]) > 40
     assert 'class="d"' in strip(Clip(np.random.default_rng(0).random((9, 7, 3))))  # no bones known: dots
     assert strip(Clip(np.zeros((1, 6, 2)), skeleton=STICK), alt='"<x>').count("&#34;&lt;x&gt;") == 1
+    clip = person()
+    joints = clip.joints.copy()
+    joints[30, 1] += [0.9, -0.8]  # a hand across the body in one frame: not far enough to be stray
+    spoiled = clip.replace(joints=joints)
+    at = (float(clip.times[30]), float(clip.times[30]))
+    assert len(bones(strip(clip, *at, frames=1))) == 5 and len(bones(strip(spoiled, *at, frames=1))) == 4
 
 
 def test_measures_against_numbers_counted_by_hand():
@@ -202,9 +219,6 @@ def test_measures_against_numbers_counted_by_hand():
     assert out["per_class"]["a"] == pytest.approx({"precision": 1.0, "recall": 1 / 3, "f1": 0.5, "clips": 3})
     assert out["per_class"]["b"] == pytest.approx({"precision": 0.75, "recall": 1.0, "f1": 6 / 7, "clips": 3})
     assert np.isnan(out["per_class"]["none"]["recall"]) and out["macro_f1"] == pytest.approx((0.5 + 6 / 7) / 2)
-
-
-def test_overlap_with_what_is_known():
     truth = [("a", 0.0, 2.0), ("b", 1.0, 5.0)]
     spans = ((0, 1.5), (1, 4), (6, 7), (5, 6), (0.5, 2))
     assert [overlapping(Hit("a", *span), truth) for span in spans] == ["a", "b", None, None, "a"]
@@ -252,26 +266,3 @@ def test_a_name_that_does_not_fit_its_bar_is_left_out_not_cut():
         for room in (400, 60, 34, 10):
             pictures._write(axes, "jumping_jack", 0.5, 0.5, room)
     assert [text.get_text() for text in axes.texts] == ["jumping_jack", "jumping_\njack"]
-
-
-def test_bars_of_a_timeline_say_what_they_are():
-    times, events, truth = np.arange(100) / 10, [Hit("stand_up", 2, 2.1), Hit("squat", 4, 6)], [("squat", 4.5, 6.0)]
-    tips = pictures.timeline_tips(times, ["squat", "stand_up"], events, truth)
-    said = ["found: stand_up, 2.00 to 2.10 s", "found: squat, 4.00 to 6.00 s", "known: squat, 4.50 to 6.00 s"]
-    assert [tip.text for tip in tips] == said
-    assert all(0 < tip.left < tip.left + tip.width < 1 and 0 < tip.top < tip.top + tip.height < 1 for tip in tips)
-    assert tips[2].top > tips[1].top + tips[1].height
-    image = matplotlib.image.imread(io.BytesIO(pictures.timeline(times, np.zeros((100, 2)), ["squat", "stand_up"], events, truth)))
-    found = tips[1]
-    x, y = found.left + 0.1 * found.width, found.top + 0.15 * found.height  # inside the bar, beside its name
-    pixel = image[int(y * image.shape[0]), int(x * image.shape[1]), :3]
-    assert np.abs(pixel - [int(pictures.PALETTE[0][i : i + 2], 16) / 255 for i in (1, 3, 5)]).max() < 0.02
-
-
-def test_what_a_detector_put_in_the_wrong_place_is_not_drawn():
-    clip = person()
-    joints = clip.joints.copy()
-    joints[30, 1] += [0.9, -0.8]  # a hand across the body in one frame: not far enough to be stray
-    spoiled = clip.replace(joints=joints)
-    at = (float(clip.times[30]), float(clip.times[30]))
-    assert len(bones(strip(clip, *at, frames=1))) == 5 and len(bones(strip(spoiled, *at, frames=1))) == 4

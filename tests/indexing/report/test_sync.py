@@ -47,7 +47,7 @@ def one(found: Shift) -> Compared:
     return Compared(take("a"), take("b"), Pairing(found, (0, 0)))
 
 
-def test_files_are_written_and_parse(tmp_path):
+def test_files_are_written_and_say_what_was_found(tmp_path):
     written = write_report(tmp_path, report(manifest={"time": "now"}))
     assert written.name == "report.html" and sorted(p.name for p in tmp_path.iterdir()) == ["curve.png", "report.html", "sync.json"]
     found = json.loads((tmp_path / "sync.json").read_text())
@@ -55,9 +55,6 @@ def test_files_are_written_and_parse(tmp_path):
     assert found["pairs"][0]["residual"] is None and found["manifest"] == {"time": "now"}
     text = written.read_text()
     assert "cam1&lt;b&gt;" in text and "<b>cam" not in text and "a note &amp; more" in text.lower() and "Cycle" not in text
-
-
-def test_what_two_cameras_say_in_words():
     said = describe(report())
     assert "cam1<b> began 0.400 ± 0.002 s before cam0<b> (12.00 frames), and its clock gains +0.072 s in an hour." in said
     assert describe(report(first=shift(-0.4))) == "cam1<b> began 0.400 ± 0.002 s after cam0<b> (12.00 frames)."

@@ -22,7 +22,7 @@ fisheye = false
 """
 
 
-def test_calibration_files(tmp_path, cameras, library):
+def test_calibration_files_of_any_order_and_names(tmp_path, cameras, library):
     path = tmp_path / "Calib.toml"
     path.write_text(TOML.format(2) + TOML.format(1).replace("1671.5", "900.0") + "[metadata]\nerror = 0.0\n")
     assert [lens.name for lens in read_calibration(path)] == ["int_cam2_img", "int_cam1_img"]
@@ -36,10 +36,6 @@ def test_calibration_files(tmp_path, cameras, library):
     for odd in ("[1088]", "[0, 5]", '"large"', "[nan, 1]", "[]"):
         path.write_text(TOML.format(1).replace("[ 1088.0, 1920.0]", odd))
         assert read_calibration(path)[0].size is None  # nothing hangs on it
-
-
-def test_lenses_of_many_cameras_have_their_names(tmp_path):
-    path = tmp_path / "Calib.toml"
     path.write_text("".join(TOML.format(i).replace("1671.5", f"{900 + i}.0") for i in (1, 2, 3)))
     found, notes = named_lenses(path, ["left", "mid", "right"])
     assert "in the order of its file" in notes[0]

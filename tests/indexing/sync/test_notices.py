@@ -34,14 +34,7 @@ def test_cameras_have_names(notice, said):
     assert notice.text == notice.with_names({}).text
 
 
-def test_names_that_were_given_first_stay():
-    inner = Message("{camera:a} has 8 frames").with_names({"a": "left"})
-    assert (
-        Message("{pair:pairs}: {note}", pair=((0, 1),), note=inner).with_names({"a": "other", "0": "x"}) == "x-1: left has 8 frames"
-    )
-
-
-def test_arguments_are_flags():
+def test_names_and_flags_stand_in_for_numbers_and_arguments():
     nothing = Notice(ShiftNotice.NOTHING)
     for notice, end in (
         (Notice(ShiftNotice.LENS, 0.0, {"a": -0.1, "b": 0.2}), "an approximation; give --calibration FILE.toml"),
@@ -52,3 +45,7 @@ def test_arguments_are_flags():
         assert notice.with_words(WORDS).text.endswith(end)
     assert with_words(ValueError(Message("{arg:person='all'} needs more")), WORDS) == "--person all needs more"
     assert with_names(ValueError("a plain one"), NAMES) == "a plain one"
+    inner = Message("{camera:a} has 8 frames").with_names({"a": "left"})
+    assert (
+        Message("{pair:pairs}: {note}", pair=((0, 1),), note=inner).with_names({"a": "other", "0": "x"}) == "x-1: left has 8 frames"
+    )

@@ -119,7 +119,7 @@ def test_a_cut_off_file_gives_what_is_there(write, name):
     assert any("cut off or damaged" in note for note in probe(path).notes)
 
 
-def test_damage_midway_leaves_the_rest(write):
+def test_damage_midway_leaves_the_rest_and_evenness_is_measured(write):
     rng = np.random.default_rng(0)
     path = write("hurt.avi", rng.integers(0, 255, (40, 48, 64), dtype=np.uint8), codec="png", pix_fmt="gray", fps=10)
     data = bytearray(path.read_bytes())
@@ -129,6 +129,12 @@ def test_damage_midway_leaves_the_rest(write):
     frames, times = gather(video)
     assert 30 < len(frames) < 40 and times[-1] == pytest.approx(3.9)
     assert any("damaged frames are left out" in note for note in video.notes)
+    even = np.arange(300) / 29.97
+    assert evenness(np.round(even, 3), 0.001)[0] < 0.1  # Matroska's milliseconds are no variable rate
+    off, dropped = evenness(np.delete(even, 150))
+    assert off > 0.4 and dropped == 1
+    assert evenness(np.cumsum(rng.uniform(0.02, 0.05, 100)))[0] > 0.1
+    assert evenness(np.array([0.0, 1.0])) == (0.0, 0)
 
 
 def test_what_is_no_video_is_named(write, tmp_path):
@@ -178,16 +184,6 @@ def test_without_the_extra_the_remedy_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(ValueError, match=r"install 'dyntorch\[video\]'"):
         read_video(tmp_path / "a.mp4")
-
-
-def test_evenness():
-    rng = np.random.default_rng(0)
-    even = np.arange(300) / 29.97
-    assert evenness(np.round(even, 3), 0.001)[0] < 0.1  # Matroska's milliseconds are no variable rate
-    off, dropped = evenness(np.delete(even, 150))
-    assert off > 0.4 and dropped == 1
-    assert evenness(np.cumsum(rng.uniform(0.02, 0.05, 100)))[0] > 0.1
-    assert evenness(np.array([0.0, 1.0])) == (0.0, 0)
 
 
 def test_tags_that_are_no_text_and_codecs_that_nobody_knows(write, tmp_path):

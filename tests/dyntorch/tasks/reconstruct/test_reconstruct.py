@@ -303,7 +303,7 @@ def test_refused(message: str) -> None:
 
 
 @pytest.mark.slow
-def test_problems_with_too_little_are_statuses_with_reasons() -> None:
+def test_problems_with_too_little_say_so_and_times_keep_their_digits() -> None:
     x = tracks()
     once, few = x.clone(), x.clone()
     once[1:], few[1:, :20] = NAN, NAN
@@ -313,6 +313,10 @@ def test_problems_with_too_little_are_statuses_with_reasons() -> None:
     assert [(w.problem, w.value) for w in few_observed] == [((1,), 0), ((2,), 0), ((3,), 10)]
     with pytest.raises(ValueError, match=r"problem 1, 2, 3 of 4: TOO_FEW; .* needs 13 through the same ones"):
         found.check()
+    found = [dyn.reconstruct(x, CV, times) for times in (UNIX, UNIX.tolist(), UNIX.numpy(), list(UNIX.numpy()))]
+    assert all(one.times.equal(UNIX) and one.velocities.equal(found[0].velocities) for one in found)
+    early = dyn.reconstruct(x, CV, 1.5 * torch.arange(4, dtype=torch.float64))
+    assert abs(float(found[0].residual - early.residual)) < 1e-6
 
 
 @pytest.mark.parametrize("options", [{}, {"threshold": 1.0}, {"static": torch.ones(30, dtype=torch.bool)}, {"motion": "auto"}])
@@ -320,15 +324,6 @@ def test_empty_batch(options: dict[str, object]) -> None:
     found = dyn.reconstruct(torch.empty(0, 4, 30, 2, dtype=torch.float64), times=UNIX, **{"motion": CV, **options})
     assert found.points.shape[:2] == (0, 30) and found.cameras.shape[:3] == (0, 4, 3)
     assert "empty" in repr(found)
-
-
-@pytest.mark.slow
-def test_times_keep_their_digits() -> None:
-    x = tracks()
-    found = [dyn.reconstruct(x, CV, times) for times in (UNIX, UNIX.tolist(), UNIX.numpy(), list(UNIX.numpy()))]
-    assert all(one.times.equal(UNIX) and one.velocities.equal(found[0].velocities) for one in found)
-    early = dyn.reconstruct(x, CV, 1.5 * torch.arange(4, dtype=torch.float64))
-    assert abs(float(found[0].residual - early.residual)) < 1e-6
 
 
 def test_float32_times_that_are_exact_enough() -> None:

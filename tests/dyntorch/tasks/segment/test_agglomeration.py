@@ -9,15 +9,12 @@ import cv2
 import pytest
 import torch
 
-from dyntorch.core.limits import MAX_SQUARED_DISTANCE
 from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.homogeneous import apply, homogeneous, unit
 from dyntorch.metrics import relative_error
 from dyntorch.tasks.segment import agglomeration
 from dyntorch.tasks.segment.agglomeration import (
     CHANCE_PREFERENCE_SHARE,
-    COST_SCALE_FACTOR,
-    MIN_PIECE_NOISE_PIXELS,
     PIECE_LINK_WEIGHT,
     GroupCosts,
     NearPairs,
@@ -92,19 +89,6 @@ def test_distances_are_those_of_the_motion_that_most_tracks_have(monkeypatch):
         torch.testing.assert_close(row[0], known[0], rtol=0.3, atol=0)
 
 
-def test_costs_count_sightings_up_to_a_cap():
-    scene = shot((40, 30))
-    judge = judge_of(scene, scene.labels - 1)
-    groups = torch.stack([scene.labels == 1, scene.labels == 2, scene.labels > 0])
-    cost = judge.cost(groups)
-    for found, group in zip(cost.tolist(), groups, strict=True):
-        square, seen = judge.near.squared_distances(group, judge.scale)
-        known = (square / judge.scale**2).clamp(max=MAX_SQUARED_DISTANCE)[seen].sum()
-        assert found == pytest.approx(float(known), rel=1e-9)
-        assert found <= MAX_SQUARED_DISTANCE * float(judge.near.count[group].sum())
-    assert float(cost[2]) > 2 * float(cost[0] + cost[1])
-
-
 def test_pieces_of_two_bodies_are_pure():
     scene = shot((40, 40), sigma=0.05)
     sparse = keep_strongest(kernel_of(scene), 8)
@@ -141,18 +125,6 @@ def test_true_bodies_are_farther_apart_than_halves_of_one():
     assert float(apart.own[place]) == pytest.approx((cost[0] + cost[1]) / sum(seen), rel=1e-6)
     links = float((kernel - CHANCE_PREFERENCE_SHARE).clamp(min=0)[one][:, other].sum())
     assert float(apart.links[place]) == pytest.approx(links / min(int(one.sum()), int(other.sum())), rel=1e-4)
-
-
-def test_the_judge_knows_the_noise_and_remembers_costs():
-    scene = shot((40, 30), sigma=0.5)
-    judge = judge_of(scene, scene.labels - 1)
-    quiet = judge_of(shot((40, 30), sigma=0.0), scene.labels - 1)
-    assert quiet.scale == pytest.approx(COST_SCALE_FACTOR * MIN_PIECE_NOISE_PIXELS)
-    assert judge.scale > 1.5 * quiet.scale
-    groups = groups_of(scene.labels - 1)
-    first = judge.cost(groups)
-    judge.near = None  # nothing is fitted twice
-    assert judge.cost(groups.flip(0)).tolist() == first.flip(0).tolist()
 
 
 def test_merged_labels_are_nested_and_end_at_the_bodies():
@@ -240,18 +212,6 @@ def twins(frames: int):
     scene = shot((20, 12), frames=frames)
     copy = scene.tracks[:, :1] + 3.0
     return replace(scene, tracks=torch.cat([scene.tracks, copy], 1), labels=torch.cat([scene.labels, scene.labels[:1]]))
-
-
-def test_a_track_has_most_in_common_with_one_beside_it(monkeypatch):
-    scene = twins(frames=6)
-    scene.tracks[4:, 32] = torch.nan  # the mean over the pairs that show both
-    assert float(kernel_of(scene)[0, 32]) > 0.7
-    monkeypatch.setattr(agglomeration, "KERNEL_GAPS", (1,))
-    kernel = kernel_of(twins(frames=2))
-    assert float(kernel[0, 32]) > 0.5 and int(kernel[0].argmax()) == 32
-    # one pair of frames: the share of preferences is a multiple of 1 / (3 h)
-    few = 3 * round(agglomeration.PREFERRED_SHARE * HYPOTHESES)
-    torch.testing.assert_close(kernel * few, (kernel * few).round(), rtol=0, atol=1e-3)
 
 
 def test_tracks_that_never_meet_have_nothing_in_common():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyntorch.geometry.homogeneous import apply
-from dyntorch.tasks.segment.frame_pairs import TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs, space_pairs
+from dyntorch.tasks.segment.frame_pairs import TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs
 from tests.dyntorch.tasks.segment.videos import F64, draw, shot
 
 
@@ -63,13 +63,6 @@ def test_a_pair_holds_the_tracks_of_both_frames_and_trusts_those_that_move_littl
     assert bool((still.precision == 1).all()) and bool((pair.precision < 1).all()) and bool((pair.precision > 0).all())
     groups = torch.ones(1, film.x.shape[1], dtype=torch.bool)
     torch.testing.assert_close(pair.weigh_groups(groups)[0] * pair.precision.mean(), pair.precision)
-
-
-def test_pairs_are_spread_evenly():
-    assert space_pairs(10, 2, 100) == [(a, a + 2) for a in range(8)]
-    few = space_pairs(101, 1, 5)
-    assert few == [(0, 1), (25, 26), (50, 51), (74, 75), (99, 100)] or (few[0], few[-1], len(few)) == ((0, 1), (99, 100), 5)
-    assert len(space_pairs(50, 4, 1)) == 1 and space_pairs(2, 1, 3) == [(0, 1)]
 
 
 def test_near_pairs_have_enough_in_common_and_grow_with_the_video():

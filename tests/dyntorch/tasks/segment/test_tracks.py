@@ -101,7 +101,7 @@ def test_partial_tracks_bodies_that_never_meet_and_empty_frames():
 
 
 @pytest.mark.slow
-def test_tracks_that_follow_nothing_are_outliers():
+def test_tracks_that_follow_nothing_or_are_missing_are_outliers():
     scene = shot((50, 30))
     chance = draw(5)
     tracks = scene.tracks.clone()
@@ -109,6 +109,12 @@ def test_tracks_that_follow_nothing_are_outliers():
     found = segmented(tracks, 2)
     assert bool((found.labels[:5] == 0).all()) and float((found.labels[5:] > 0).double().mean()) > 0.95
     assert bool((found.probabilities[:5, 0] == 1).all()) and bool((found.residuals[:5] > 2.5).all())
+    tracks = scene.tracks.clone()
+    tracks[:, 0] = torch.nan
+    tracks[1:, 1] = torch.nan
+    found = segmented(tracks, 2)
+    assert found.labels[:2].tolist() == [0, 0] and wrong(found, torch.cat([scene.labels[:2] * 0, scene.labels[2:]])) <= 0.05
+    assert bool((found.residuals[:2] == 0).all()) and bool((found.probabilities[:2, 1:] == 0).all())
 
 
 @pytest.mark.slow
@@ -118,17 +124,6 @@ def test_tracks_that_are_not_searched_follow():
     found = segmented(scene.tracks, 2, options=few)
     assert wrong(found, scene.labels) <= 0.05
     assert bool((found.labels > 0).all())
-
-
-@pytest.mark.slow
-def test_short_and_missing_tracks_among_others():
-    scene = shot((50, 30))
-    tracks = scene.tracks.clone()
-    tracks[:, 0] = torch.nan
-    tracks[1:, 1] = torch.nan
-    found = segmented(tracks, 2)
-    assert found.labels[:2].tolist() == [0, 0] and wrong(found, torch.cat([scene.labels[:2] * 0, scene.labels[2:]])) <= 0.05
-    assert bool((found.residuals[:2] == 0).all()) and bool((found.probabilities[:2, 1:] == 0).all())
 
 
 @pytest.mark.slow

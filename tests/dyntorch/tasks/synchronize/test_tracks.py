@@ -82,16 +82,6 @@ def test_the_noise_is_that_put_in_whatever_the_motion():
     assert tracks_of(filmed_person(15, generator=seeded(2)).a).noise < 0.1
 
 
-def test_the_change_of_coordinates_normalizes_what_is_seen():
-    scene = filmed_person(8, missing=0.2, generator=seeded())
-    tracks = tracks_of(scene.a)
-    seen = tracks.weights > 0
-    found = tracks.x[seen] @ tracks.change[:2, :2].mT + tracks.change[:2, 2]
-    assert torch.allclose(found.mean(0), torch.zeros(2, dtype=torch.float64), atol=1e-9)
-    assert float(found.square().sum(-1).mean()) == pytest.approx(2)
-    assert tracks.scale == pytest.approx(float((tracks.x[seen] - tracks.x[seen].mean(0)).square().sum(-1).mean().sqrt()))
-
-
 def test_noise_of_two_cameras_is_compared_within_bounds():
     scene = filmed_person(12, seconds=6.0, generator=seeded(1))
     noisy = [scene.exact[k] + torch.randn(scene.exact[k].shape, generator=seeded(k), dtype=torch.float64) for k in (0, 1)]

@@ -99,7 +99,7 @@ def test_noise_is_estimated_and_the_uncertainty_is_honest():
     assert (kinds == LineStatus.STATIC).double().mean() > 0.98
 
 
-def test_refinement_is_a_minimum():
+def test_refinement_is_a_minimum_and_options_decide():
     cameras, x, _, _ = scene(6, 20, sigma=0.5)
     found = triangulate_trajectories(cameras, x)
 
@@ -113,6 +113,11 @@ def test_refinement_is_a_minimum():
     for _ in range(50):
         moved = ends + 1e-4 * torch.randn(ends.shape, generator=g, dtype=torch.float64)
         assert (cost(plucker(moved)) >= cost(found.lines) * (1 - 1e-9)).all()
+    assert (found.status == LineStatus.OK).any()
+    strict = triangulate_trajectories(cameras, x, options=TrajectoryOptions(max_uncertainty=0.0))
+    assert (strict.status == LineStatus.AMBIGUOUS).all()
+    lax = triangulate_trajectories(cameras, x, options=TrajectoryOptions(max_static_sigmas=1e6))
+    assert (lax.status == LineStatus.STATIC).all()
 
 
 def test_a_change_of_the_world_and_the_images_commutes():
@@ -227,13 +232,3 @@ def test_bundle_adjustment_reaches_the_noise():
     best = trajectory_cameras(x)
     assert best.trajectories.residual.median() < 0.05
     torch.testing.assert_close(best.trajectories.sigma, torch.tensor(0.05).double(), rtol=0.2, atol=0)
-
-
-def test_options_decide():
-    cameras, x, _, _ = scene(6, 20, sigma=0.5)
-    found = triangulate_trajectories(cameras, x)
-    assert (found.status == LineStatus.OK).any()
-    strict = triangulate_trajectories(cameras, x, options=TrajectoryOptions(max_uncertainty=0.0))
-    assert (strict.status == LineStatus.AMBIGUOUS).all()
-    lax = triangulate_trajectories(cameras, x, options=TrajectoryOptions(max_static_sigmas=1e6))
-    assert (lax.status == LineStatus.STATIC).all()
