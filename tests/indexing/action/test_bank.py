@@ -73,7 +73,7 @@ def test_channels_and_moments_by_definition():
         np.testing.assert_allclose(order_free_moments(torch.from_numpy(x), whole_image), moments, atol=1e-4)
 
 
-def test_joint_metric_by_definition():
+def test_the_joint_metric_by_definition_keeps_the_rank_condition():
     windows = random_windows(7, seed=1)
     metric = metric_of(windows)
     for k, name in enumerate(CHANNELS):
@@ -88,9 +88,6 @@ def test_joint_metric_by_definition():
     holed = random_windows(9, seed=2, holes=True)
     moved = Windows((holed.values + 50) * holed.seen[:, None, :, None], holed.seen)  # the image has its origin elsewhere
     torch.testing.assert_close(metric_of(moved).covariance, metric_of(holed).covariance, atol=1e-3, rtol=0)
-
-
-def test_the_metric_keeps_the_rank_condition_and_the_residual_of_two_views_is_the_noise_floor():
     shape = random(LENGTH * JOINTS, 3, seed=3).double()
     views = torch.stack([shape @ random(3, 2, seed=3 + i).double() + 5.0 * i for i in (1, 2)]).unflatten(1, (LENGTH, JOINTS))
     metric = metric_of(random_windows(7, seed=6))

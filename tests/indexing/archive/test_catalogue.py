@@ -351,7 +351,7 @@ def test_folders_and_files_of_others_are_refused(tmp_path: Path, moves, saved) -
         Archive(foreign)
 
 
-def test_an_archive_whose_making_was_interrupted_is_an_empty_one(tmp_path: Path, moves) -> None:
+def test_an_interrupted_archive_is_empty_and_leftovers_are_said(tmp_path: Path, moves, three: Archive) -> None:
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / CATALOGUE).touch()
     options = ArchiveOptions(rate=10.0)
@@ -360,6 +360,12 @@ def test_an_archive_whose_making_was_interrupted_is_an_empty_one(tmp_path: Path,
     assert (tmp_path / "a" / CATALOGUE).stat().st_size == 0  # reading writes nothing
     begun.add(moves(0, name="a"))
     assert Archive(tmp_path / "a").clip("a").fps == 10.0 and begun.verify().ok
+    (three.path / "segments" / "0123.safetensors").write_bytes(b"x")
+    (three.path / "segments" / ".half.tmp").write_bytes(b"x")
+    found = three.verify()
+    assert found.ok and set(found.orphans) == {"0123.safetensors", ".half.tmp"}
+    three.add(moves(0, name="a"))
+    assert three.verify().orphans == ()
 
 
 def test_a_lost_catalogue_does_not_cost_the_segments(three: Archive, moves) -> None:
@@ -373,15 +379,6 @@ def test_a_lost_catalogue_does_not_cost_the_segments(three: Archive, moves) -> N
     with pytest.raises(ValueError, match=r"is a folder with other files \(segments\)"):
         three.add(moves(5, name="e"))
     assert all(path.exists() for path in files)
-
-
-def test_leftovers_are_said_and_taken_away(three: Archive, moves) -> None:
-    (three.path / "segments" / "0123.safetensors").write_bytes(b"x")
-    (three.path / "segments" / ".half.tmp").write_bytes(b"x")
-    found = three.verify()
-    assert found.ok and set(found.orphans) == {"0123.safetensors", ".half.tmp"}
-    three.add(moves(0, name="a"))
-    assert three.verify().orphans == ()
 
 
 # ---- others who write or read --------------------------------------------------------------------------------------------

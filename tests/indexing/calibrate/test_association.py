@@ -97,7 +97,7 @@ def test_fundamental_matrices_are_those_of_the_cameras(scene):
     assert found.clocks is None and np.allclose(found.offsets_rates[:, 0], rig.clocks.offsets)
 
 
-def test_distances_are_sampsons():
+def test_distances_are_sampsons_at_common_moments():
     rng = np.random.default_rng(1)
     F, x, y = rng.standard_normal((3, 3)), rng.standard_normal((1, 2, 5, 2)), rng.standard_normal((1, 3, 5, 2))
     found = distances(F, x, y)
@@ -105,6 +105,12 @@ def test_distances_are_sampsons():
         p, q = np.append(x[0, a, k], 1), np.append(y[0, b, k], 1)
         below = np.hypot(np.linalg.norm((F @ p)[:2]), np.linalg.norm((F.T @ q)[:2]))
         assert found[0, a, b, k] == pytest.approx(q @ F @ p / below)
+    seen = filmed([Person(np.random.default_rng(0), [0, 0], [1, 0])], cameras((0.0, 1.0), offsets=[0.0, 0.25]), noise=0.0)
+    a, b = (arrange(one, split_tracks(one)) for one in (sightings(clips(x), "") for x in seen))
+    both = common_frames(a, b, 0.25, 1.0)
+    # what b saw a quarter of a second later by its own clock, between two of its frames
+    expected = 0.5 * (seen[1][7:9, 0] + seen[1][8:10, 0])
+    assert np.abs(both.b[:2, 0] - expected).max() < 1e-9
 
 
 @pytest.mark.slow
@@ -195,16 +201,7 @@ def test_pieces_end_where_two_bodies_are_one():
         assert len(set(tracks[far].tolist())) <= 1 or len({row > 30 for row in rows[far]}) == 1
 
 
-def test_common_moments_of_another_clock():
-    seen = filmed([Person(np.random.default_rng(0), [0, 0], [1, 0])], cameras((0.0, 1.0), offsets=[0.0, 0.25]), noise=0.0)
-    a, b = (arrange(one, split_tracks(one)) for one in (sightings(clips(x), "") for x in seen))
-    both = common_frames(a, b, 0.25, 1.0)
-    # what b saw a quarter of a second later by its own clock, between two of its frames
-    expected = 0.5 * (seen[1][7:9, 0] + seen[1][8:10, 0])
-    assert np.abs(both.b[:2, 0] - expected).max() < 1e-9
-
-
-def test_clusters_are_nearly_always_the_best_of_all():
+def test_clusters_are_nearly_always_the_best_of_all(monkeypatch):
     every = [[0]]
     for _ in range(6):  # all labelings up to the names of the groups
         every = [[*one, k] for one in every for k in range(max(one) + 2)]
@@ -220,9 +217,6 @@ def test_clusters_are_nearly_always_the_best_of_all():
     assert best_of_all >= 9
     assert cluster(np.zeros((0, 0)), np.zeros((0, 0), dtype=bool), np.zeros(0)).shape == (0,)
     assert sorted(cluster(np.full((3, 3), -1.0), np.zeros((3, 3), dtype=bool), np.arange(3.0)).tolist()) == [0, 1, 2]
-
-
-def test_two_groups_exchange_what_comes_after(monkeypatch):
     monkeypatch.setattr(tracklets, "MAX_SWEEPS", 1)
     # 0, 1 then 2, 3: the pieces of both moments were put together the wrong way round
     scores = np.zeros((4, 4))

@@ -85,7 +85,7 @@ def test_sizes_from_wherever_they_are_known_and_coordinates_from_0_to_1_become_p
     assert not any("0 to 1" in str(note) for note in take.notes)
 
 
-def test_a_size_that_does_not_hold_the_keypoints():
+def test_sizes_and_times_that_do_not_hold_the_keypoints():
     one = filmed()[0][0]
     check_size(take_of(one, name="a"), [one], SIZE)
     tall = one.replace(joints=one.joints[..., ::-1] + np.array([0.0, 0.0]))
@@ -96,6 +96,16 @@ def test_a_size_that_does_not_hold_the_keypoints():
     few = np.array(one.joints)
     few[0, 0] = [90_000, -90_000]  # a detector's mistake is no contradiction
     check_size(take_of(one, name="a"), [one.replace(joints=few)], SIZE)
+    clips = {name: clip(moving(seed=i), times=100 * (i == 2) + np.arange(30) / FPS) for i, name in enumerate("abc")}
+    views = [make_view(take_of(one, name=name), [one], SIZE) for name, one in clips.items()]
+    known = torch.tensor([[0.0, 1.0]] * 3, dtype=torch.float64)
+    check_overlap(views[:2], known[:2])
+    with pytest.raises(
+        ValueError, match=r"c recorded from 100.000 to 100.967 s, a from 0.000 to 0.967 s of one clock: .* no time in"
+    ):
+        check_overlap(views, known)
+    known[2, 0] = 100.0
+    check_overlap(views, known)
 
 
 # ---- together ------------------------------------------------------------------------------------------------------------
@@ -111,16 +121,3 @@ def test_cameras_that_are_none_of_one_rig():
         check_cameras([*takes, again])
     with pytest.raises(ValueError, match="gray: has no keypoints"):
         check_cameras([takes[0], take_of(np.zeros((20, 32, 32)), name="gray")])
-
-
-def test_cameras_without_a_common_time():
-    clips = {name: clip(moving(seed=i), times=100 * (i == 2) + np.arange(30) / FPS) for i, name in enumerate("abc")}
-    views = [make_view(take_of(one, name=name), [one], SIZE) for name, one in clips.items()]
-    known = torch.tensor([[0.0, 1.0]] * 3, dtype=torch.float64)
-    check_overlap(views[:2], known[:2])
-    with pytest.raises(
-        ValueError, match=r"c recorded from 100.000 to 100.967 s, a from 0.000 to 0.967 s of one clock: .* no time in"
-    ):
-        check_overlap(views, known)
-    known[2, 0] = 100.0
-    check_overlap(views, known)

@@ -101,7 +101,7 @@ def test_lenses_and_frame_rates():
     assert all((own == right).all(2).all(1).mean() > 0.97 for own, right in zip(found.tracks, truth, strict=True))
 
 
-def test_viterbi_is_the_best_of_all_ways():
+def test_viterbi_is_the_best_of_all_ways_and_what_is_right_has_no_misfit(monkeypatch):
     states = np.array(list(product((0, 1), repeat=2)))
     steps = np.abs(states[:, None] - states).sum(-1)
     for seed in range(20):
@@ -112,9 +112,6 @@ def test_viterbi_is_the_best_of_all_ways():
 
         best = min(cost(list(way)) for way in product(range(4), repeat=5))
         assert cost(list(_viterbi(energy, states, 0.7))) == pytest.approx(best)
-
-
-def test_misfit_of_what_is_right_is_none(monkeypatch):
     coco, body = (paired_joints(layout.joints) for layout in (COCO17, BODY25))
     assert [len(coco[limb]) for limb in ("trunk", "arms", "legs")] == [4, 2, 2] and len(body["legs"]) == 5
     rig = cameras(AROUND[:3])

@@ -127,7 +127,7 @@ def test_what_sync_wrote(tmp_path):
         given_clocks(tmp_path / "no.json", ["a", "b"])
 
 
-def test_the_extent_is_that_of_winters_table():
+def test_the_extent_is_that_of_winters_table_and_heights_are_of_people():
     assert standing_extent(COCO17.joints, 2.0).extent == pytest.approx(2.0 * (0.936 - 0.039))
     assert standing_extent(BODY25B.joints, 1.8).extent == pytest.approx(1.8 * (1.0 - 0.01)) and standing_extent(
         BODY25B.joints, 1.8
@@ -141,9 +141,6 @@ def test_the_extent_is_that_of_winters_table():
     for layout in (COCO17, BODY25):
         one = standing_extent(layout.joints, 1.75)
         assert 0.005 < one.sigma / one.extent < 0.025 and f"{one.height:g} m" in one.note and "Drillis" in one.note
-
-
-def test_no_height_of_a_person():
     for height, said in (
         (0.0, "got 0"), (17.0, "got 17"), (-1.7, "got -1.7"), (float("nan"), "got nan"),
         (175.0, "got 175; in centimetres? give 1.75"),

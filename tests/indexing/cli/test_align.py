@@ -283,7 +283,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
     draw_all((report(**each) for each in changes), tmp_path, "alignment.json")
 
 
-def test_display_scale_against_differences():
+def test_display_scale_and_small_numbers_of_the_page():
     rng = np.random.default_rng(1)
     matrix = rng.normal(size=(3, 3))
     root = rng.normal(size=(9, 9)) * 1e-4
@@ -292,9 +292,6 @@ def test_display_scale_against_differences():
     draws = matrix.ravel() + rng.normal(size=(40000, 9)) @ root.T
     np.testing.assert_allclose((draws / draws[:, -1:]).std(axis=0).reshape(3, 3)[:2], spread[:2], rtol=0.03)
     assert not display_scale(np.diag([1.0, 1.0, 0.0]), np.eye(9))[2]
-
-
-def test_small_numbers_of_the_page():
     angle = np.radians(170)
     motion = np.eye(4)
     motion[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]

@@ -19,7 +19,6 @@ import pytest
 from indexing import Archive
 from indexing.actors import Person, dataset, detect, stream
 from indexing.archive import writer
-from indexing.archive.sources import gather
 from indexing.cli import main
 from indexing.cli.commands import archive as verbs
 from indexing.clip import ClipSet
@@ -129,14 +128,6 @@ def test_ctrl_c_ends_the_workers_and_leaves_an_archive(data: Path, tmp_path: Pat
     assert Archive(tmp_path / "a").verify().ok and len(Archive(tmp_path / "a").recordings()) == 60
 
 
-def test_few_sources_need_no_processes(data: Path) -> None:
-    found = gather(data / "week")
-    assert verbs._soon(found) and not verbs._soon(found * 500)
-    for workers, tasks in ((1, 5), (4, 1)):
-        with verbs.workforce(workers, None, tasks) as executor:
-            assert executor is None
-
-
 def test_bad_input_is_refused(refuse, tmp_path: Path) -> None:
     for verb in ("info @/none", "verify @/none", "remove @/none x", "find @/none -m moves.safetensors"):
         refuse(*verb.split(), says=("none", "no archive"))
@@ -179,11 +170,6 @@ def test_search_of_a_clip_of_a_set_and_of_its_mirror_image(run) -> None:
     by_name = run("search", "lab.archive", "lesson.npz", "--select", "name=kick-0-0-0", "-k", "2", "--mirror")[1]
     assert by_name.splitlines()[:4] == out.splitlines()[:4]
     assert run("search", "lab.archive", "kick=kick.json@0.2-", "-k", "2")[0] == 0  # as an example of index fit is written
-
-
-def test_a_search_says_what_was_cut(run) -> None:
-    code, out, _ = run("search", "lab.archive", "squat.json@0.5-99", "-k", "1")
-    assert code == 0 and "squat.json@0.5-99: the recording runs from 0 to" in out and "s of it is used" in out
 
 
 @pytest.mark.slow
@@ -234,11 +220,13 @@ def test_many_events_are_counted(run, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # ---- info, verify, remove ------------------------------------------------------------------------------------------------
-def test_info_counts_and_lists(run) -> None:
+def test_infos_count_and_searches_say_what_was_cut(run) -> None:
     code, out, _ = run("info", "lab.archive")
     assert code == 0 and re.search(r"COCO-17 +17", out) and "3 sources," in out and "1 segment" in out
     code, out, _ = run("info", "lab.archive", "--sources")
     assert code == 0 and out.index("week/friday.npz") < out.index("week/monday.npz") < out.index("week/tuesday.npz")
+    code, out, _ = run("search", "lab.archive", "squat.json@0.5-99", "-k", "1")
+    assert code == 0 and "squat.json@0.5-99: the recording runs from 0 to" in out and "s of it is used" in out
 
 
 @pytest.mark.slow

@@ -94,7 +94,7 @@ def test_choices_are_those_of_the_readers() -> None:
 
 
 # ---- fit -----------------------------------------------------------------------------------------------------------------
-def test_fit_writes_a_model_and_says_what_it_learned(run, data: Path) -> None:
+def test_fit_says_what_it_learned_of_examples_and_of_a_selection(run, data: Path) -> None:
     code, out, err = run(
         "index", "fit", "squat=@/squat.json", "squat=@/wave.json@0.5-1.5", "[red] kick=@/kick.json", "-o", "new/m.safetensors",
         "--no-mirror", "--reject", "0.1", "--seed", "3",
@@ -105,9 +105,6 @@ def test_fit_writes_a_model_and_says_what_it_learned(run, data: Path) -> None:
     model = ActionIndexer.load("new/m.safetensors")
     assert model.classes_.tolist() == ["[red] kick", "squat"] and model.model_.labels.tolist() == [1, 1, 0]
     assert (model.mirror, model.reject, model.random_state) == (False, 0.1, 3)
-
-
-def test_fit_from_a_clip_set_with_a_selection(run) -> None:
     code, out, _ = run("index", "fit", "@/set.npz", "--select", "azimuth=0", "--select", "subject=0,1", "-o", "m.safetensors")
     assert code == 0 and "assumed" not in out
     assert len(ActionIndexer.load("m.safetensors").model_.labels) == 2 * len(ACTIONS)
@@ -308,7 +305,7 @@ def sample(count: int = 12, **fields: list[object]) -> ClipSet:
     return ClipSet([Clip(np.ones((3, 2, 2)), label=f"move {i % 2}", meta=known) for i, known in enumerate(meta)], "some.npz")
 
 
-def test_values_are_found_whatever_their_form() -> None:
+def test_values_are_found_whatever_their_form_and_split() -> None:
     clips = sample(view=[1, 2, 3], turn=[0.0, 90.0], place=["a, b", "c"])
     assert choose(clips, ["view=1, 3"], "--train").tolist() == [0, 2, 3, 5, 6, 8, 9, 11]
     assert choose(clips, ["turn=90", "view=2"], "--train").tolist() == [1, 7]
@@ -316,9 +313,6 @@ def test_values_are_found_whatever_their_form() -> None:
     assert choose(clips, ["action=move 1"], "--train").tolist() == [1, 3, 5, 7, 9, 11]
     with pytest.raises(ValueError, match=r"no clip of some\.npz meets all"):
         choose(sample(view=[1, 2]), ["view=1", "action=move 1"], "--train")
-
-
-def test_splits_and_shots() -> None:
     clips = sample(view=[1, 2, 3])
     (fold,), notes = splits(clips, ["view=1,2"], ["view=2,3"], None)
     assert np.intersect1d(fold.train, fold.test).tolist() == [1, 4, 7, 10] and "4 clips" in notes[0]

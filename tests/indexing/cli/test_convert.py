@@ -49,7 +49,7 @@ def test_a_recording(run):
     assert run("convert one.c3d.npz -o one.trc")[0] == 2
 
 
-def test_people(run):
+def test_people_and_fields_that_not_all_have_are_said(run):
     code, out, _ = run("convert two.json -o two.trc --fps 30")
     assert code == 0 and "two.json: 2 people in view; --person largest takes one" in out
     assert "two.trc: 2 people, their points named 1:nose and so on" in out and "2 clips written to two.trc" in out
@@ -57,6 +57,10 @@ def test_people(run):
     code, out, _ = run("convert two.json -o largest.trc --fps 30 --person largest")
     assert code == 0 and "two.json: 2 people in view; followed is the largest" in out
     assert read("largest.trc")[0].joints.shape == (40, 17, 2)
+    for name, more in (("a", {"subject": 1}), ("b", {})):
+        ClipSet([Clip(BODY, fps=30.0, label=name, name=name, meta=more)]).save(f"{name}.npz")
+    code, said, _ = run("convert a.npz b.npz -o both.npz")
+    assert code == 0 and "both.npz: left out, as it is not known of all: subject" in said
 
 
 def test_many(run):
@@ -98,10 +102,3 @@ def test_bad_input_leaves_nothing(run, words):
     code, _, err = run(words)
     assert code == 2 and BAD[words] in err and err.count("\n") == 1
     assert sorted(Path().rglob("*")) == before
-
-
-def test_fields_that_not_all_have_are_named(run):
-    for name, more in (("a", {"subject": 1}), ("b", {})):
-        ClipSet([Clip(BODY, fps=30.0, label=name, name=name, meta=more)]).save(f"{name}.npz")
-    code, said, _ = run("convert a.npz b.npz -o both.npz")
-    assert code == 0 and "both.npz: left out, as it is not known of all: subject" in said

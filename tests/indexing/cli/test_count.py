@@ -29,6 +29,10 @@ def test_too_few_matches_say_how_many_are_missing(run):
         ["line", "8", "8", "8"], ["line", "8", "7", "15"], ["line", "8", "6", "21"], ["line", "2", "2", "23"],
     ]  # fmt: skip
     assert "nullity 4, from 23 of 26 matches\nnot enough: rank 26 takes 3 more matches (moving)" in out
+    result = json.loads(run("homography", "--static", "12", "--moving", "1", "--json")[1])
+    assert result["profile"] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 10, 10, 11]
+    assert (result["rank"], result["nullity"], result["minimal"], result["missing"]) == (11, 16, 11, 15)
+    assert result["kinds"][0] == {"name": "static", "matches": 12, "useful": 10, "rank": 10}
 
 
 @pytest.mark.parametrize(
@@ -83,13 +87,6 @@ def test_table_of_all(run):
     assert max(map(len, out.splitlines())) <= 132
     listed = json.loads(run("--json")[1])
     assert {entry["name"] for entry in listed} <= rows.keys() and len(listed) == 26
-
-
-def test_json_has_the_profile(run):
-    result = json.loads(run("homography", "--static", "12", "--moving", "1", "--json")[1])
-    assert result["profile"] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 10, 10, 11]
-    assert (result["rank"], result["nullity"], result["minimal"], result["missing"]) == (11, 16, 11, 15)
-    assert result["kinds"][0] == {"name": "static", "matches": 12, "useful": 10, "rank": 10}
 
 
 @pytest.mark.parametrize(

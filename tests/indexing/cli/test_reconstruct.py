@@ -205,12 +205,16 @@ def test_times_of_day_are_counted_from_the_first_view_and_kept_in_full(run, scen
 
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
-def test_equal_images_are_refused(run, tmp_path):
+def test_too_few_tracks_and_equal_images_are_refused(run, tmp_path, data):
     still = np.repeat(np.random.default_rng(0).uniform(0, 500, size=(1, 40, 2)), 4, axis=0)
     table(tmp_path / "t.csv", still, TIMES)
     code, _, err = run("t.csv --motion constant_velocity_2d --threshold none --out out")
     assert code == 3 and re.fullmatch(r"dyntorch: refused: [^\n]+\n", err)
     assert "Refused" in Path("out/report.html").read_text() and read()["status"] != "OK"
+    rows = (data / "bare.csv").read_text().splitlines()
+    (tmp_path / "t.csv").write_text("\n".join(row for row in rows if re.search(r",p\d,|id", row)))
+    code, _, err = run("t.csv --motion constant_velocity_2d")
+    assert code == 2 and "t.csv: 'constant_velocity_2d' needs at least 13 tracks through 3 views, got 10; add tracks" in err
 
 
 @pytest.mark.parametrize(
@@ -238,13 +242,6 @@ def test_equal_images_are_refused(run, tmp_path):
 )
 def test_bad_input_is_one_line_and_code_2(refuse, line, says):
     refuse(line, says=(says,))
-
-
-def test_too_few_tracks_are_bad_input(run, data, tmp_path):
-    rows = (data / "bare.csv").read_text().splitlines()
-    (tmp_path / "t.csv").write_text("\n".join(row for row in rows if re.search(r",p\d,|id", row)))
-    code, _, err = run("t.csv --motion constant_velocity_2d")
-    assert code == 2 and "t.csv: 'constant_velocity_2d' needs at least 13 tracks through 3 views, got 10; add tracks" in err
 
 
 def test_every_model_and_status_is_named():

@@ -140,16 +140,13 @@ def test_on_photographs(run, solved):
     assert code == 0 and re.search(r"note: \d+ of 119 matches lie outside of small\.png \(200 by 200\); give the images", out)
 
 
-def test_points_that_are_hardly_pixels_are_mentioned(run, solved, scene):
+def test_points_that_are_hardly_pixels_or_outside_of_the_size_are_mentioned(run, solved, scene):
     np.savez("unit.npz", x1=scene[0] / FOCAL, x2=scene[1] / FOCAL)
     assert "if they are not in pixels, give --threshold in their unit, or auto" in run("unit.npz --threshold 0.05")[1]
     assert "pixels" not in run("unit.npz --threshold 0.005")[1]
     code, out, err = run("unit.npz --out out")  # the default is larger than the image
     assert (code, out) == (2, "") and err.startswith("dyntorch: unit.npz: the points lie within ") and not Path("out").exists()
     assert err.endswith(" and --threshold is 2.5: give --threshold in the unit of the points, or --threshold auto\n")
-
-
-def test_matches_outside_of_the_size_are_mentioned(run, solved, scene):
     assert "lie outside" not in run("@/m.csv --size 640 480")[1] + run("@/m.npz")[1]
     swapped = [x[:, ::-1] for x in scene[:2]]
     np.savez("swapped.npz", x1=swapped[0], x2=swapped[1], wh=[640, 480])

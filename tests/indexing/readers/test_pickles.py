@@ -99,18 +99,27 @@ def test_sets_that_are_none_are_refused(data: Any, words: tuple[str, ...], tmp_p
     refused(tmp_path / "set.pkl", *words)
 
 
-def test_one_array_in_a_million_clips_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_array_again_and_again_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "GROWTH_BLOCK", (2**20, 4))
     (tmp_path / "set.pkl").write_bytes(pickle.dumps([{**SOUND, "keypoint": np.ones((1, 400, 17, 2))}] * 5000))
     refused(tmp_path / "set.pkl", "the same array again and again")
-
-
-def test_frames_count_as_what_clips_take(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reader, "GROWTH_BLOCK", (8 * 4 * (34 + 1) - 1, 0))
     (tmp_path / "set.pkl").write_bytes(pickle.dumps([SOUND]))
     refused(tmp_path / "set.pkl", "the same array again and again")
     monkeypatch.setattr(reader, "GROWTH_BLOCK", (8 * 4 * (34 + 1), 0))
     assert len(read(tmp_path / "set.pkl")) == 1
+    size, long = 2**20, struct.pack("<I", 2**20)
+    text = b"X" + long + b"a" * size + b"X\x06\x00\x00\x00latin1\x86q\x010"
+    texts = name("_codecs", "encode") + b"q\x000" + text + b"h\x00h\x01R0" * 1000 + b"N."
+    code = name("numpy", "dtype") + b"X\x08\x00\x00\x00S1048576\x85R"
+    scalars = (
+        name(MULTIARRAY, "scalar") + b"q\x00" + code + b"B" + long + b"x" * size + b"\x86q\x01(" + b"h\x00h\x01R" * 2000 + b"l."
+    )
+    made = name(MULTIARRAY, "_reconstruct") + b"q\x00" + name("numpy", "ndarray") + b"K\x00\x85C\x01b\x87q\x01"
+    state = b"(K\x01J" + long + b"\x85" + name("numpy", "dtype") + b"X\x02\x00\x00\x00u1\x85R\x89X" + long + b"x" * size + b"tq\x02"
+    for program in (texts, scalars, made + state + b"(" + b"h\x00h\x01Rh\x02b" * 2000 + b"l."):
+        (tmp_path / "a.pkl").write_bytes(program)
+        refused(tmp_path / "a.pkl", "the same bytes again and again", action=read_pickle)
 
 
 def test_one_list_of_names_in_many_parts_is_refused(tmp_path: Path) -> None:
@@ -284,36 +293,6 @@ def check_program(program: str, tmp_path: Path) -> None:
         assert read_pickle(tmp_path / "a.pkl") is None
 
 
-def test_the_same_bytes_again_and_again_are_refused(tmp_path: Path) -> None:
-    size, long = 2**20, struct.pack("<I", 2**20)
-    text = b"X" + long + b"a" * size + b"X\x06\x00\x00\x00latin1\x86q\x010"
-    texts = name("_codecs", "encode") + b"q\x000" + text + b"h\x00h\x01R0" * 1000 + b"N."
-    code = name("numpy", "dtype") + b"X\x08\x00\x00\x00S1048576\x85R"
-    scalars = (
-        name(MULTIARRAY, "scalar") + b"q\x00" + code + b"B" + long + b"x" * size + b"\x86q\x01(" + b"h\x00h\x01R" * 2000 + b"l."
-    )
-    made = name(MULTIARRAY, "_reconstruct") + b"q\x00" + name("numpy", "ndarray") + b"K\x00\x85C\x01b\x87q\x01"
-    state = b"(K\x01J" + long + b"\x85" + name("numpy", "dtype") + b"X\x02\x00\x00\x00u1\x85R\x89X" + long + b"x" * size + b"tq\x02"
-    for program in (texts, scalars, made + state + b"(" + b"h\x00h\x01Rh\x02b" * 2000 + b"l."):
-        (tmp_path / "a.pkl").write_bytes(program)
-        refused(tmp_path / "a.pkl", "the same bytes again and again", action=read_pickle)
-
-
-def test_numbers_of_the_memo_are_the_files_but_not_their_hashes() -> None:
-    numbers = [i * (2**61 - 1) + 5 for i in range(20_000)]  # all of one hash
-    program = b"N" + b"".join(b"p%d\n" % number for number in numbers) + b"0](" + b"g%d\ng%d\n" % (numbers[0], numbers[-1]) + b"e."
-    assert unpickle_bytes(Path("a.pkl"), program + bytes(2**16), "") == [None, None]
-    reader_ = _Reader(program)
-    assert reader_.load() == [None, None]
-    assert len({hash(key) for key in reader_.memo}) > 19_000
-
-
-def test_keys_that_files_have_are_read() -> None:
-    value = {"a": 1, b"b": 2, 3: 3, -(2**53): 4, 2.5: 5, None: 6, False: 7, **{f"class {i}": i for i in range(9000)}}
-    for protocol in range(6):
-        assert unpickle_bytes(Path("a.pkl"), pickle.dumps(value, protocol), "") == value
-
-
 def test_lists_that_are_deep_or_inside_themselves_are_refused_without_end(tmp_path: Path) -> None:
     endless: list[Any] = []
     endless.append(endless)
@@ -343,7 +322,7 @@ def test_nothing_is_imported_or_changed(tmp_path: Path, monkeypatch: pytest.Monk
         unpickle_bytes(tmp_path, program, "")
 
 
-def test_what_numpy_writes_is_read_as_numpy_reads_it() -> None:
+def test_what_is_pickled_is_read_as_it_was() -> None:
     value = {
         "a": np.arange(6.0).reshape(2, 3), "b": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "c": np.arange(3, dtype=">i4"),
         "d": np.array(["ab", "c"]), "e": np.zeros((0, 3)), "f": np.array(True), "g": np.float32(2.5), "h": np.int64(7),
@@ -355,6 +334,15 @@ def test_what_numpy_writes_is_read_as_numpy_reads_it() -> None:
         for key, one in value.items():
             np.testing.assert_array_equal(found[key], one)
             assert getattr(found[key], "dtype", None) == getattr(one, "dtype", None)
+    value = {"a": 1, b"b": 2, 3: 3, -(2**53): 4, 2.5: 5, None: 6, False: 7, **{f"class {i}": i for i in range(9000)}}
+    for protocol in range(6):
+        assert unpickle_bytes(Path("a.pkl"), pickle.dumps(value, protocol), "") == value
+    numbers = [i * (2**61 - 1) + 5 for i in range(20_000)]  # all of one hash
+    program = b"N" + b"".join(b"p%d\n" % number for number in numbers) + b"0](" + b"g%d\ng%d\n" % (numbers[0], numbers[-1]) + b"e."
+    assert unpickle_bytes(Path("a.pkl"), program + bytes(2**16), "") == [None, None]
+    reader_ = _Reader(program)
+    assert reader_.load() == [None, None]
+    assert len({hash(key) for key in reader_.memo}) > 19_000
 
 
 def test_annotations_without_people_are_left_out(tmp_path: Path) -> None:

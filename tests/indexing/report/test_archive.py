@@ -195,13 +195,6 @@ def test_thousands_of_recordings_are_a_light_page(lab, tmp_path):
     assert len(rows_of(tmp_path / "events.csv")) == len(events) == 3000
 
 
-def test_marks_are_where_events_are():
-    events = [ArchivedEvent("a", 10.0, 20.0, 1.0, 1.0, source="x"), ArchivedEvent("b", 99.0, 99.01, 1.0, 1.0, source="x")]
-    drawn = str(pages.marks(events, 0.0, 100.0, {"a": "#111111", "b": "#222222"}))
-    assert '<rect x="100.0" width="100.0" height="10" fill="#111111"/>' in drawn
-    assert '<rect x="990.0" width="3.0" height="10" fill="#222222"/>' in drawn  # never too thin to see
-
-
 @pytest.mark.skipif(BROWSER is None, reason="needs a browser: chromium or chrome")
 def test_a_film_slides_by_frame_by_frame(lab, tmp_path):
     """The box that plays all is ticked, and half of the time has passed: the strip stands at its middle frame."""

@@ -87,7 +87,7 @@ def test_every_kind_of_data_can_be_drawn(tmp_path):
         assert np.load(tmp_path / str(i) / "segmentation.npz")["labels"].tolist() == one.arrays.labels.tolist()
 
 
-def test_numbers_of_a_report():
+def test_numbers_of_a_report_and_of_bodies_that_leave():
     made = report(residuals=np.array([9.0, 1.0, 3.0, 9.0, 2.0, 4.0, 9.0, 0.0, 0.0]))
     assert made.counts == {"body 1": 3, "body 2": 2, "outlier": 3, "too short": 1}
     assert made.rms(1) == pytest.approx(np.sqrt(5 / 3)) and np.isnan(report(0).rms())
@@ -97,9 +97,6 @@ def test_numbers_of_a_report():
     found = as_json(made)
     assert found["pairs"] == [["0", "50"]] and found["bodies"][1]["planar"] and found["static_body"] == 1
     assert report(static_body=5).static == 0  # of a body that is none of them nothing is said
-
-
-def test_bodies_that_leave():
     made = report(count=30)
     made.tracks.values[3:, made.arrays.labels == 2] = np.nan
     assert made.life(1) == (0, 5) and made.life(2) == (0, 2) and as_json(made)["bodies"][1]["last_frame"] == "20"

@@ -124,12 +124,16 @@ def test_nothing_found_and_nothing_known(tmp_path):
     assert "0 of 1" in write(tmp_path / "missed", RecognitionReport("Missed", recordings=[recording([], [("squat", 1, 2)])]))
 
 
-def test_odd_scores_and_videos_without_joints(tmp_path):
+def test_odd_scores_and_earlier_pictures(tmp_path):
     events = [Hit("squat", 0, 0, np.nan, np.inf), Hit(3, 1, 2, 12345.6)]
     text = write(tmp_path, RecognitionReport("Odd", recordings=[recording(events, clip=False)]))
     assert "n/a" in text and "12,346" in text and '<svg class="strip"' not in text and ">nan<" not in text
     rows = list(csv.DictReader(io.StringIO((tmp_path / "events.csv").read_text())))
     assert rows[0]["score"] == rows[0]["margin"] == "" and float(rows[1]["score"]) == 12345.6
+    inputs = {"op": {f"op_{i:012d}_keypoints.json": f"{i:064x}" for i in range(1164)}, "moves.safetensors": "f" * 64}
+    (_, folder), last = page.settings({"inputs": inputs})
+    assert str(folder).startswith("1,164 files, each in manifest.json; sha256 of their names and hashes: ")
+    assert last == ("inputs.moves.safetensors", "f" * 64)
 
 
 @pytest.mark.slow
@@ -192,13 +196,6 @@ def test_what_is_always_right_takes_one_line(tmp_path):
     wrong = EvaluationResult(names, names * 2, [*names, "lunge", "lunge", "kick"], "azimuth 0")
     text = write(tmp_path / "wrong", RecognitionReport("Two alike", evaluations=[wrong]))
     assert "for them (clips in brackets): kick (2)." in text and "Most often taken for" in text and "Confusion matrix" in text
-
-
-def test_a_folder_of_frames_is_one_line_of_the_settings():
-    inputs = {"op": {f"op_{i:012d}_keypoints.json": f"{i:064x}" for i in range(1164)}, "moves.safetensors": "f" * 64}
-    (_, folder), last = page.settings({"inputs": inputs})
-    assert str(folder).startswith("1,164 files, each in manifest.json; sha256 of their names and hashes: ")
-    assert last == ("inputs.moves.safetensors", "f" * 64)
 
 
 def test_finds_are_explained_and_the_comparison_stacks_on_narrow_screens(tmp_path):

@@ -258,11 +258,3 @@ def test_twenty_actions_have_twenty_colours_that_names_read_on():
         white = palette is light  # on white paper names are white, on dark paper black
         assert (1.05 / (luminance.max() + 0.05) if white else (luminance.min() + 0.05) / 0.05) > 4.5
     assert len(set(pictures.colours([f"action {i}" for i in range(20)]).values())) == 20
-
-
-def test_a_name_that_does_not_fit_its_bar_is_left_out_not_cut():
-    with pictures.style():
-        axes = pictures.new_figure(4.0, 1.0).add_axes((0, 0, 1, 1))
-        for room in (400, 60, 34, 10):
-            pictures._write(axes, "jumping_jack", 0.5, 0.5, room)
-    assert [text.get_text() for text in axes.texts] == ["jumping_jack", "jumping_\njack"]

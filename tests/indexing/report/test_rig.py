@@ -27,7 +27,7 @@ def unpacked(data):
     return codes * data["unit"] + data["middle"]
 
 
-def test_what_is_packed_is_what_was_found():
+def test_what_is_packed_is_what_was_found_and_fits_into_the_page():
     found = rig(people=2)
     found.calibration.points[5, 3] = torch.nan
     data = json.loads(scene(found)[0])
@@ -37,9 +37,6 @@ def test_what_is_packed_is_what_was_found():
     assert np.nanmax(np.abs(points - found.calibration.points.numpy())) < 2e-3
     assert data["times"][:3] == [0, 33, 67] and data["ground"]["step"] == 1
     assert [0, 1, "l"] in data["bones"] and np.allclose(data["cameras"][0]["center"], [4, -1, 1.4])
-
-
-def test_a_long_recording_fits_into_the_page():
     found = rig()
     many = 9000
     points = torch.from_numpy(truth().points).repeat(many // 110 + 1, 1, 1)[:many]

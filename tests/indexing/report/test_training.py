@@ -50,14 +50,11 @@ def test_flags_of_the_other_kind_of_input_are_refused(folder, capsys):
 JOINTS, TELLING = 6, 2
 
 
-def test_halves_come_in_pairs_that_show_every_joint_once():
+def test_halves_show_every_joint_once_and_a_linear_margin_is_found():
     masks = halves(8, torch.Generator().manual_seed(0))
     assert (masks.sum(dim=1) == 4).all()
     assert (masks[::2] ^ masks[1::2]).all()
     assert (halves(3, torch.Generator().manual_seed(0)).sum(dim=1) == 3).all()  # fewer than three cannot be compared
-
-
-def test_a_linear_margin_is_found():
     share = torch.tensor([[1.0, -0.5, 0.2, 0.0, 2.0, 0.3], [0.0, 0.7, 0.1, 1.5, -1.0, 0.4]])
     labels, groups = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 0, 1])
     windows = Windows(torch.zeros(4, 5, JOINTS, 2), torch.ones(4, JOINTS, dtype=torch.bool))

@@ -122,7 +122,7 @@ def unit(rows, seed):
     return torch.nn.functional.normalize(values, dim=1)
 
 
-def test_scores_leave_out_missing_frames_and_short_overlaps():
+def test_scores_leave_out_missing_frames_and_parts_keep_their_lags():
     a, b = unit(30, 0), unit(25, 1)
     products = a @ b.T
     want = [products.diagonal(lag).sum().item() for lag in range(-29, 25)]
@@ -136,9 +136,6 @@ def test_scores_leave_out_missing_frames_and_short_overlaps():
         else:
             mean = sum(products[i, j].item() for i, j in pairs) / len(pairs)
             assert curve.at(lag) == pytest.approx(mean * (len(pairs) / float(curve.counts.max())) ** OVERLAP_POWER, abs=1e-12)
-
-
-def test_part_of_the_first_keeps_the_lags():
     a = unit(60, 3)
     b = torch.cat([unit(11, 5), a])
     assert score_curve(a, b, 20).best_lag == 11
@@ -176,6 +173,10 @@ def test_windows_are_means_about_the_lag():
     means = (a @ b.T).diagonal(5 + 2)[24 : 24 + WINDOW].mean()
     assert torch.allclose(found[3, REACH + 2], means)
     assert found[0, 0].isnan() and found[0, REACH].isfinite()  # the first rows have no partner 12 frames earlier
+    a, b = walk(WINDOW + 2 * REACH, 0)[REACH:-REACH], walk(WINDOW + 2 * REACH, 1)
+    means = torch.stack([(a * b[REACH + d : REACH + d + WINDOW]).sum(1).mean() for d in range(-REACH, REACH + 1)])
+    share = torch.softmax(SOFTMAX_SHARPNESS * means, dim=0)[REACH - 1 : REACH + 2].sum().item()
+    assert math.isclose(evidence(a, b, REACH), math.log((1 - OUTLIER_SHARE) * share * 25 / 3 + OUTLIER_SHARE), rel_tol=1e-9)
 
 
 def test_agreement_adds_up_and_disagreement_too_and_missing_frames_say_nothing():
@@ -185,10 +186,3 @@ def test_agreement_adds_up_and_disagreement_too_and_missing_frames_say_nothing()
     assert right > 20 and beside < -20 and -30 < unrelated < 5
     assert right > evidence(a[:60], b, 7) > 5
     assert evidence(a, torch.zeros_like(a), 0) == 0.0 == evidence(a, a, 200)
-
-
-def test_one_window_by_hand():
-    a, b = walk(WINDOW + 2 * REACH, 0)[REACH:-REACH], walk(WINDOW + 2 * REACH, 1)
-    means = torch.stack([(a * b[REACH + d : REACH + d + WINDOW]).sum(1).mean() for d in range(-REACH, REACH + 1)])
-    share = torch.softmax(SOFTMAX_SHARPNESS * means, dim=0)[REACH - 1 : REACH + 2].sum().item()
-    assert math.isclose(evidence(a, b, REACH), math.log((1 - OUTLIER_SHARE) * share * 25 / 3 + OUTLIER_SHARE), rel_tol=1e-9)

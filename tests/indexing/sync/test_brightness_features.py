@@ -166,7 +166,7 @@ def scene(centres, noise=0.01, size=8):
     return frames + noise * torch.randn(frames.shape, generator=generator)
 
 
-def test_box_of_a_take_encloses_what_moves():
+def test_boxes_enclose_what_moves_and_follow_it():
     t = np.arange(60)
     centres = np.stack([40 + (5 * np.sin(t / 3)).astype(int), 30 + (6 * np.cos(t / 4)).astype(int)], axis=1)
     found = motion(scene(centres))
@@ -174,9 +174,6 @@ def test_box_of_a_take_encloses_what_moves():
     assert not moving and torch.equal(where[0], where[-1])
     assert (where[0, :2] - torch.tensor([44.0, 34.0])).abs().max() < 3 and 18 < where[0, 2] < 40
     assert found.lively.double().mean() > 0.9 and not found.drift.moves and not found.drift.too_fast
-
-
-def test_box_follows_what_crosses_the_image():
     t = np.arange(70)
     centres = np.stack([5 + t, 25 + (3 * np.sin(t / 2)).astype(int)], axis=1)
     where, moving = boxes(motion(scene(centres)), 30.0)

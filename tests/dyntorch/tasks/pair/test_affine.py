@@ -34,7 +34,7 @@ def log_likelihood(x, y, ridge):
     return -0.5 * count * math.log(float(energy) / count) - 0.5 * y.shape[1] * float(torch.logdet(cov))
 
 
-def test_evidence_is_the_marginal_likelihood():
+def test_evidence_and_predictions_are_those_of_their_definition():
     x, q = normal(30, 5), 0.3 * normal(5, 4, seed=1)
     y = x @ q + 0.4 * normal(30, 4, seed=2)
     found = regress(Rows.of(x[None], y[None]), means=False)
@@ -46,6 +46,15 @@ def test_evidence_is_the_marginal_likelihood():
     for k in range(4):
         own = log_likelihood(x, y[:, k : k + 1], float(apart[k]))
         assert all(log_likelihood(x, y[:, k : k + 1], float(apart[k]) * factor) <= own + 1e-9 for factor in (0.1, 10.0))
+    x, y = normal(23, 4), normal(23, 3, seed=1)
+    ridge = torch.tensor([0.5, 2.0, 7.0], dtype=torch.float64)
+    found = leave_out_residuals(x, y, ridge)
+    for rows in torch.arange(23).chunk(NUM_FOLDS):
+        rest = torch.tensor([t for t in range(23) if t not in rows.tolist()])
+        for k in range(3):
+            gram = x[rest].T @ x[rest] + ridge[k] * torch.eye(4, dtype=torch.float64)
+            q = torch.linalg.solve(gram, x[rest].T @ y[rest, k])
+            torch.testing.assert_close(found[rows, k], y[rows, k] - x[rows] @ q)
 
 
 @pytest.mark.slow
@@ -60,18 +69,6 @@ def test_scale_and_offset_of_affine_combinations():
     torch.testing.assert_close(combination_weights(rows, found.ridge, found.gauge)[0], 1.7 * weights)
 
 
-def test_predictions_of_left_out_stretches():
-    x, y = normal(23, 4), normal(23, 3, seed=1)
-    ridge = torch.tensor([0.5, 2.0, 7.0], dtype=torch.float64)
-    found = leave_out_residuals(x, y, ridge)
-    for rows in torch.arange(23).chunk(NUM_FOLDS):
-        rest = torch.tensor([t for t in range(23) if t not in rows.tolist()])
-        for k in range(3):
-            gram = x[rest].T @ x[rest] + ridge[k] * torch.eye(4, dtype=torch.float64)
-            q = torch.linalg.solve(gram, x[rest].T @ y[rest, k])
-            torch.testing.assert_close(found[rows, k], y[rows, k] - x[rows] @ q)
-
-
 def pair(sigma=0.0):
     """Motions that share the coordinates along 40 and 115 degrees."""
     turns = [torch.tensor([[math.cos(a), math.sin(a)], [-math.sin(a), math.cos(a)]], dtype=torch.float64) for a in (0.7, 2.0)]
@@ -83,7 +80,7 @@ def pair(sigma=0.0):
     return Motions(x, y, sigma**2, 80.0, (normal(5, 2), normal(4, 2)))
 
 
-def test_information_is_that_of_the_covariances():
+def test_information_is_that_of_the_covariances_and_common_directions_are_found():
     motions = pair(0.3)
     angles = torch.tensor([[0.2, 1.1]], dtype=torch.float64)
     x, y = (part @ torch.stack([a.cos(), a.sin()]) for part, a in zip((motions.x, motions.y), angles[0], strict=True))
@@ -91,9 +88,6 @@ def test_information_is_that_of_the_covariances():
     C = both.T @ both / 80 + NOISE_FLOOR * 0.09 * torch.eye(9, dtype=torch.float64)
     expected = 0.5 * (torch.logdet(C[:5, :5]) + torch.logdet(C[5:, 5:]) - torch.logdet(C))
     assert abs(float(information(motions, angles)[0] - expected)) < 1e-9
-
-
-def test_common_directions_are_found():
     for sigma, allowed in ((0.0, 1e-8), (0.05, 0.05)):
         motions = pair(sigma)
         best = peaks(motions)[0]

@@ -43,12 +43,19 @@ def error(found, true):
     return torch.minimum(torch.linalg.matrix_norm(a - b), torch.linalg.matrix_norm(a + b))
 
 
-def test_determinant_of_one():
+def test_determinants_of_one_and_singular_values():
     matrices = torch.cat([random(5, 3, 3), torch.zeros(1, 3, 3).double(), torch.diag(torch.tensor([5.0, 2, 0]))[None].double()])
     found = unit_determinant(matrices)
     torch.testing.assert_close(torch.linalg.det(found[:5]), torch.ones(5).double())
     assert error(found[:5], matrices[:5]).max() < 1e-12
     assert (found[5] == 0).all() and abs(found[6].norm() - 1) < 1e-12
+    matrix = random(30, 3, 3)
+    values = torch.linalg.svdvals(matrix)
+    found = second_singular_value(matrix)
+    assert (found >= values[:, 1] / 2**0.5 - 1e-12).all() and (found <= (values[:, 1:].square().sum(-1)).sqrt() + 1e-12).all()
+    u, s, vh = torch.linalg.svd(random(30, 3, 1) * random(30, 1, 3, seed=1) + 0.1 * matrix)
+    left, right = rank_one(u @ torch.diag_embed(s) @ vh)
+    torch.testing.assert_close(left[..., None] * right[:, None], s[:, :1, None] * u[..., :1] * vh[:, :1], atol=1e-8, rtol=1e-8)
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (3, 3)])
@@ -66,16 +73,6 @@ def test_the_scale_of_a_noisy_pencil_is_a_minimum(shape):
     around = found[:, None] + torch.linspace(-1, 1, 201).double() * 0.01
     assert (minors(around).argmin(-1) - 100).abs().max() <= 1
     assert (found - scale).abs().median() < 3e-3
-
-
-def test_second_singular_value_and_rank_one():
-    matrix = random(30, 3, 3)
-    values = torch.linalg.svdvals(matrix)
-    found = second_singular_value(matrix)
-    assert (found >= values[:, 1] / 2**0.5 - 1e-12).all() and (found <= (values[:, 1:].square().sum(-1)).sqrt() + 1e-12).all()
-    u, s, vh = torch.linalg.svd(random(30, 3, 1) * random(30, 1, 3, seed=1) + 0.1 * matrix)
-    left, right = rank_one(u @ torch.diag_embed(s) @ vh)
-    torch.testing.assert_close(left[..., None] * right[:, None], s[:, :1, None] * u[..., :1] * vh[:, :1], atol=1e-8, rtol=1e-8)
 
 
 @pytest.mark.parametrize("kind", ["generic", "collinear", "both", "pair", "static"])

@@ -94,7 +94,7 @@ def test_other_ranks(motion, rank, views):
     assert found.status.eq(0).all() and (rms(found, tracks) < 1e-7).all()
 
 
-def test_sensors_of_other_dimensions():
+def test_sensors_and_image_coordinates_of_any_kind():
     g = seeded(3)
     projections, structure = (torch.rand(*s, generator=g, dtype=torch.float64) for s in ((5, 4, 7), (40, 7)))
     p = structure @ projections.mT
@@ -102,9 +102,6 @@ def test_sensors_of_other_dimensions():
     found = projective_factorization(tracks, 7)
     q = found.structure @ found.projections.mT
     torch.testing.assert_close(q[..., :3] / q[..., 3:], tracks, rtol=1e-7, atol=1e-7)
-
-
-def test_any_coordinates_of_the_images_give_the_same():
     tracks = scene(views=6, n=30)[0]
     tracks = tracks + torch.randn(tracks.shape, generator=seeded(1), dtype=torch.float64)
     shift = torch.arange(6, dtype=torch.float64)[:, None, None] * 70 - 900

@@ -91,7 +91,27 @@ def test_profiles_of_many_views_and_times_of_any_origin_and_unit():
         assert sum(motion.profile(n)) == motion.k + 1
 
 
-def test_slope_is_the_derivative():
+def test_lifts_of_polynomials_and_of_ones_own():
+    torch.testing.assert_close(polynomial(3, 0)(torch.tensor(5.0)), torch.eye(4, dtype=torch.float64))
+    B = polynomial(2, 2, 3)(torch.tensor(2.0))
+    rigid = Motion(polynomial(2, 0), "rigid")
+    assert rigid.k == rigid.dim == 2 and rigid.minimal((0.0, 1.0)) == (2, 4) and rigid.ambiguity((0.0, 1.0)) == 8
+    assert Motion(polynomial(2, 2), leaves_open="little").open_text(TIMES) == "little"
+    assert Motion(None, k=4, bodies=2).open_text(TIMES) == ""
+    for degree in (1, 2):  # far from 0
+        motion = Motion(polynomial(2, 2, degree))
+        assert motion.lifts([1.7e9, 1.7e9 + 1]).isfinite().all() and len(motion.centred_lifts([1.7e9])[0]) == 1
+    assert B.shape == (3, 9) and B[0].tolist() == [1, 0, 0, 2, 0, 4, 0, 8, 0] and B[2].tolist() == [0, 0, 1, 0, 0, 0, 0, 0, 0]
+
+    def lift(t):
+        # one common direction, with speeds that change as the square root of the time
+        return torch.cat([torch.eye(3, dtype=t.dtype), torch.stack([t.sqrt(), t * 0, t * 0])[:, None]], dim=1).float()
+
+    motion = Motion(lift, "braking", leaves_open="little")
+    assert (motion.k, motion.dim, motion.sensor, motion.bodies) == (3, 2, 2, 1)
+    found = motion.lifts(torch.tensor([1.0, 4.0]))
+    assert found.shape == (2, 3, 4) and found.dtype == torch.float64 and found[:, 0, 3].tolist() == [1.0, 2.0]
+    assert as_motion(motion) is motion and motion.minimal((1.0, 4.0, 9.0)) == (3, 7)
     for name in ("constant_velocity_2d", "constant_acceleration_2d"):
         motion = as_motion(name)
         expected = torch.zeros(3, motion.k + 1, dtype=torch.float64)
@@ -108,31 +128,6 @@ def test_slope_is_the_derivative():
     assert own.dim == 1 and own.k == 2
     expected = torch.tensor([-math.sin(0.3), math.cos(0.3), 0.0], dtype=torch.float64)
     torch.testing.assert_close(own.slope(0.3)[0], expected, rtol=1e-7, atol=1e-9)
-
-
-def test_motion_of_ones_own():
-    def lift(t):
-        # one common direction, with speeds that change as the square root of the time
-        return torch.cat([torch.eye(3, dtype=t.dtype), torch.stack([t.sqrt(), t * 0, t * 0])[:, None]], dim=1).float()
-
-    motion = Motion(lift, "braking", leaves_open="little")
-    assert (motion.k, motion.dim, motion.sensor, motion.bodies) == (3, 2, 2, 1)
-    found = motion.lifts(torch.tensor([1.0, 4.0]))
-    assert found.shape == (2, 3, 4) and found.dtype == torch.float64 and found[:, 0, 3].tolist() == [1.0, 2.0]
-    assert as_motion(motion) is motion and motion.minimal((1.0, 4.0, 9.0)) == (3, 7)
-
-
-def test_polynomial_lifts():
-    torch.testing.assert_close(polynomial(3, 0)(torch.tensor(5.0)), torch.eye(4, dtype=torch.float64))
-    B = polynomial(2, 2, 3)(torch.tensor(2.0))
-    rigid = Motion(polynomial(2, 0), "rigid")
-    assert rigid.k == rigid.dim == 2 and rigid.minimal((0.0, 1.0)) == (2, 4) and rigid.ambiguity((0.0, 1.0)) == 8
-    assert Motion(polynomial(2, 2), leaves_open="little").open_text(TIMES) == "little"
-    assert Motion(None, k=4, bodies=2).open_text(TIMES) == ""
-    for degree in (1, 2):  # far from 0
-        motion = Motion(polynomial(2, 2, degree))
-        assert motion.lifts([1.7e9, 1.7e9 + 1]).isfinite().all() and len(motion.centred_lifts([1.7e9])[0]) == 1
-    assert B.shape == (3, 9) and B[0].tolist() == [1, 0, 0, 2, 0, 4, 0, 8, 0] and B[2].tolist() == [0, 0, 1, 0, 0, 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize(

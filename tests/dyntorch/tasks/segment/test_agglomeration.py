@@ -186,7 +186,7 @@ def test_batches_of_samples_are_loops_and_degenerate_ones_finite(solver, count):
         assert bool(solver(a, b).isfinite().all())
 
 
-def test_the_kernel_is_symmetric_between_0_and_1_and_knows_the_bodies():
+def test_the_kernel_knows_the_bodies_and_tracks_that_never_meet_have_nothing_in_common():
     scene = shot((40, 30, 20))
     kernel = kernel_of(scene)
     assert kernel.shape == (90, 90) and kernel.dtype == torch.float32
@@ -205,6 +205,12 @@ def test_the_kernel_is_symmetric_between_0_and_1_and_knows_the_bodies():
     assert some.shape == (90, 45) and bool((some[searched, torch.arange(45)] == 0).all())
     assert bool((some[1::2].sum(-1) > 0).all())  # those that are not searched are compared, too
     assert float((scene.labels[searched][some.argmax(-1)] == scene.labels).double().mean()) > 0.9
+    scene = shot((50,), frames=8)
+    scene.tracks[4:, :25] = torch.nan
+    scene.tracks[:4, 25:] = torch.nan
+    kernel = kernel_of(scene)
+    assert bool((kernel[:25, 25:] == 0).all()) and bool((kernel[25:, :25] == 0).all())
+    assert bool(kernel.isfinite().all()) and float(kernel[:25, :25].sum()) > 0 and float(kernel[25:, 25:].sum()) > 0
 
 
 def twins(frames: int):
@@ -212,15 +218,6 @@ def twins(frames: int):
     scene = shot((20, 12), frames=frames)
     copy = scene.tracks[:, :1] + 3.0
     return replace(scene, tracks=torch.cat([scene.tracks, copy], 1), labels=torch.cat([scene.labels, scene.labels[:1]]))
-
-
-def test_tracks_that_never_meet_have_nothing_in_common():
-    scene = shot((50,), frames=8)
-    scene.tracks[4:, :25] = torch.nan
-    scene.tracks[:4, 25:] = torch.nan
-    kernel = kernel_of(scene)
-    assert bool((kernel[:25, 25:] == 0).all()) and bool((kernel[25:, :25] == 0).all())
-    assert bool(kernel.isfinite().all()) and float(kernel[:25, :25].sum()) > 0 and float(kernel[25:, 25:].sum()) > 0
 
 
 def test_the_strongest_of_every_row_or_column_are_kept():

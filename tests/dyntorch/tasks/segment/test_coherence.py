@@ -285,18 +285,12 @@ def test_parallax_is_the_way_along_the_epipolar_line_in_pixels():
     assert bool((value[0, 0, :6] * value[0, 0, 6:12].flip(0) < 0).all())
     for factor in (-1.0, 7.0, 1e-3):
         torch.testing.assert_close(parallax(view, factor * F[None, None], member)[0].abs(), value.abs(), rtol=1e-6, atol=1e-6)
-
-
-def test_a_few_points_off_the_plane_do_not_bend_it():
     F, _, x1, second = plane_and_points()
     step = torch.zeros(40, dtype=F64)
     step[:6] = 0.3
     value, scale = parallax(View(x1, second(step), PIXEL, NONE), F[None, None], torch.ones(1, 1, 40, dtype=F64))
     assert float(value[0, 0, 6:].abs().max()) < 1.0 and float(value[0, 0, :6].abs().min()) > 20
     assert float(scale) < 8 * MIN_PARALLAX_PIXELS**2
-
-
-def test_scale_is_that_of_students_distribution():
     F, _, x1, second = plane_and_points(400)
     normal = torch.randn(3, 400, generator=draw(5), dtype=F64)
     student = normal[0] / ((normal[1] ** 2 + normal[2] ** 2) / 2).sqrt()

@@ -27,7 +27,7 @@ def kept(pairs, film):
     return torch.stack([film.seen[a] & film.seen[b] for a, b in pairs]).sum(0)
 
 
-def test_coordinates_are_centred_and_no_shift_or_scale_changes_them():
+def test_coordinates_are_centred_and_what_is_missing_is_zero():
     scene = shot((40, 20))
     film = scene.film()
     assert float(film.x.reshape(-1, 2).norm(dim=-1).median()) == pytest.approx(1.0, abs=0.1)
@@ -38,9 +38,6 @@ def test_coordinates_are_centred_and_no_shift_or_scale_changes_them():
     assert float((scene.tracks[3][1] - scene.tracks[3][0]).norm() * film.change[0, 0]) == pytest.approx(
         float((film.x[3][1] - film.x[3][0]).norm())
     )
-
-
-def test_what_is_missing_is_zero_and_not_seen():
     scene = shot((40,))
     tracks = scene.tracks.clone()
     tracks[2:5, 7] = torch.nan

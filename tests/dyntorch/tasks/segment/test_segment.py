@@ -362,18 +362,21 @@ def test_matches_on_one_line(bodies):
     assert int(found.bodies) >= 1 and float((found.labels > 0).double().mean()) > 0.9
 
 
-def test_copies_of_one_match_may_be_the_majority():
-    scene = scene_of(120, 2)
-    place = torch.cat([torch.zeros(300, dtype=torch.long), torch.arange(120)])
-    found = checked(*(50 * x[place] for x in scene.views), threshold=2.5 * 50)
-    assert float(misclassification(found.labels[300:], scene.labels)) <= 0.03
-
-
-def test_copies_of_matches_change_nothing_but_a_notice():
+def test_copies_and_garbage_change_nothing_but_a_notice():
     scene = scene_of(80, 2, outliers=0.2)
     found = checked(*(x.repeat(3, 1) for x in scene.views))
     assert float(misclassification(found.labels, scene.labels.repeat(3))) <= 0.03
     assert torch.equal(found.labels[:80], found.labels[80:160]) and codes(found) == {SegmentNotice.REPEATED}
+    scene = scene_of(120, 2)
+    place = torch.cat([torch.zeros(300, dtype=torch.long), torch.arange(120)])
+    found = checked(*(50 * x[place] for x in scene.views), threshold=2.5 * 50)
+    assert float(misclassification(found.labels[300:], scene.labels)) <= 0.03
+    scene = scene_of(80, 2)
+    y1, y2 = (x.clone() for x in scene.views)
+    y1[:3], y2[2:5] = 1e9 * torch.randn(3, 2, generator=draw(4), dtype=F64), -1e9
+    found = checked(y1, y2, threshold=None)
+    assert 1.5 < float(found.threshold) < 3.5
+    assert float(misclassification(found.labels[5:], scene.labels[5:])) <= 0.02
 
 
 @pytest.mark.slow
@@ -384,15 +387,6 @@ def test_a_body_that_got_lost_is_no_spare_one():
         spare = [notice.value for notice in found.warnings if notice.code == SegmentNotice.SPARE_BODY]
         assert spare in ([], [bodies - 1])
         assert not {SegmentNotice.SPARE_BODY, SegmentNotice.FEWER_BODIES} <= codes(found)
-
-
-def test_garbage_does_not_spoil_the_estimated_threshold():
-    scene = scene_of(80, 2)
-    y1, y2 = (x.clone() for x in scene.views)
-    y1[:3], y2[2:5] = 1e9 * torch.randn(3, 2, generator=draw(4), dtype=F64), -1e9
-    found = checked(y1, y2, threshold=None)
-    assert 1.5 < float(found.threshold) < 3.5
-    assert float(misclassification(found.labels[5:], scene.labels[5:])) <= 0.02
 
 
 @pytest.mark.parametrize("batch", [(0,), (2, 0)])

@@ -140,7 +140,7 @@ def test_costs_are_least_in_the_own_body_and_few_tracks_cost_infinity():
     assert float(energy(evidence, geometry, few[None], scale)) == torch.inf
 
 
-def test_a_descent_improves_wrong_labels_and_prefers_the_truth():
+def test_a_descent_improves_wrong_labels_and_starts_go_side_by_side():
     scene = shot((40, 30))
     evidence = evidence_of(scene, chain(scene))
     truth = scene.labels - 1
@@ -156,9 +156,6 @@ def test_a_descent_improves_wrong_labels_and_prefers_the_truth():
     one = found.of(1)
     assert one.labels.tolist() == found.labels[1:2].tolist() and one.energy.shape == (1,)
     assert all(F.shape == (1, 2, 3, 3) for F in one.geometry)
-
-
-def test_starts_side_by_side_are_those_one_by_one():
     scene = shot((30, 20), frames=5)
     evidence = evidence_of(scene, chain(scene))
     truth = scene.labels - 1

@@ -172,7 +172,7 @@ def test_starts_within_a_frame_or_two_lead_to_the_same_minimum(start):
     assert near[1] == min(near) and descent.variance(5.0) == math.inf
 
 
-def test_exact_cameras_give_the_fundamental_matrix_in_pixels():
+def test_exact_cameras_give_the_fundamental_matrix_and_distances_in_pixels():
     scene = filmed_person(15, seconds=4.0, offset=0.3, generator=seeded(5))
     fit = ShiftDescent(*tracks_of(scene), FRAME).run(0.3)
     F = fit.fundamental
@@ -182,6 +182,18 @@ def test_exact_cameras_give_the_fundamental_matrix_in_pixels():
     away = sampson(F, homogeneous(scene.exact[0].flatten(0, 1)), homogeneous(x2.flatten(0, 1)))
     assert float(away.square().mean().sqrt()) < 0.2  # what smoothing leaves
     assert fit.offset == pytest.approx(0.3, abs=0.005 * FRAME)
+    scene = filmed_person(8, seconds=2.0, offset=0.2, missing=0.2, generator=seeded(10))
+    a, b = tracks_of(scene, 1.0)
+    fit = ShiftDescent(a, b, FRAME).run(0.2)
+    x1, _, w1 = smooth_at(a, fit.times, FRAME)
+    x2, _, w2 = smooth_at(b, fit.times + fit.offset, FRAME)
+    seen = fit.distances.isfinite()
+    assert int(seen.sum()) > 200
+    assert float((((w1 * w2) > 0) == seen).double().mean()) > 0.95
+    # in px of a: the noise of b is taken into its units
+    own = sampson(fit.fundamental, homogeneous(x1[seen]), homogeneous(x2[seen])) / fit.residual
+    assert float(torch.corrcoef(torch.stack([own, fit.distances[seen]]))[0, 1].abs()) > 0.99
+    assert 1.4826 * float(fit.distances[seen].abs().median()) == pytest.approx(1.0)
 
 
 @pytest.mark.slow
@@ -206,7 +218,7 @@ def test_fractions_of_a_frame_do_not_draw_the_estimate():
         assert abs(float(errors.mean())) < 3.5 * float(errors.std()) / 7**0.5 + 0.005  # splines: drawn by .1 to halves
 
 
-def test_the_rate_is_found_with_its_sigma():
+def test_the_rate_is_found_and_long_takes_are_thinned():
     scene = filmed_person(10, seconds=12.0, rate=1.004, offset=0.3, generator=seeded(8))
     fit = ShiftDescent(*tracks_of(scene, 1.0), FRAME).run(0.32, 1.003, free_rate=True)
     assert abs(fit.rate - 1.004) < 4 * fit.rate_sigma < 1e-3
@@ -214,24 +226,6 @@ def test_the_rate_is_found_with_its_sigma():
     assert fit.shift == pytest.approx(fit.offset + (fit.rate - 1) * fit.center)
     held = ShiftDescent(*tracks_of(scene, 1.0), FRAME).run(0.32, 1.004)
     assert held.rate == 1.004 and held.rate_sigma == 0
-
-
-def test_distances_are_those_of_each_frame_and_point():
-    scene = filmed_person(8, seconds=2.0, offset=0.2, missing=0.2, generator=seeded(10))
-    a, b = tracks_of(scene, 1.0)
-    fit = ShiftDescent(a, b, FRAME).run(0.2)
-    x1, _, w1 = smooth_at(a, fit.times, FRAME)
-    x2, _, w2 = smooth_at(b, fit.times + fit.offset, FRAME)
-    seen = fit.distances.isfinite()
-    assert int(seen.sum()) > 200
-    assert float((((w1 * w2) > 0) == seen).double().mean()) > 0.95
-    # in px of a: the noise of b is taken into its units
-    own = sampson(fit.fundamental, homogeneous(x1[seen]), homogeneous(x2[seen])) / fit.residual
-    assert float(torch.corrcoef(torch.stack([own, fit.distances[seen]]))[0, 1].abs()) > 0.99
-    assert 1.4826 * float(fit.distances[seen].abs().median()) == pytest.approx(1.0)
-
-
-def test_long_takes_are_thinned():
     a, b = tracks_of(filmed_person(10, seconds=4.0, offset=0.2, generator=seeded(11)), 1.0)
     whole, thin = ShiftDescent(a, b, FRAME).run(0.2), ShiftDescent(a, b, FRAME, rows=300).run(0.2)
     assert len(thin.times) <= 31 < len(whole.times)

@@ -77,7 +77,7 @@ def test_times_since_1970_of_irregular_frames(start):
     assert float(shift.at(start + 2.0)) == pytest.approx(start + 9.25, abs=0.1 * FRAME)
 
 
-def test_later_clocks_shift_the_offset_and_nothing_else():
+def test_times_of_later_and_exchanged_clocks_give_the_inverse_clock():
     scene = film(6, offset=0.3)
     shift = synchronize(scene.a, scene.b, times=scene.times)
     same(shift, synced(scene), 1e-9)
@@ -85,9 +85,6 @@ def test_later_clocks_shift_the_offset_and_nothing_else():
     same(dataclasses.replace(later, offset=later.offset - 8), shift, 1e-7)
     assert later.center == pytest.approx(shift.center - 3, abs=1e-6)
     assert torch.allclose(later.lags, shift.lags + 8, atol=1e-6)
-
-
-def test_exchanged_cameras_have_the_inverse_clock():
     fps = 30.0, 50.0
     scene = film(7, offset=-0.37, fps=fps)
     shift, back = synced(scene), synchronize(scene.b, scene.a, fps=fps[::-1])

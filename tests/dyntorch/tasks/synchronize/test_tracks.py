@@ -47,7 +47,7 @@ def test_smoothing_is_weighted_least_squares_with_gaps_and_irregular_times(width
     assert not x[sure == 0].any() and not v[sure == 0].any()
 
 
-def test_straight_motion_is_kept_exactly_everywhere():
+def test_straight_motion_is_kept_exactly_and_gaps_have_no_weight():
     t = torch.arange(40, dtype=torch.float64) / 25
     x = torch.stack([100 + 30 * t, 50 - 80 * t], dim=-1)[:, None].clone()
     x[10:13] = torch.nan
@@ -57,9 +57,6 @@ def test_straight_motion_is_kept_exactly_everywhere():
     assert int(seen.sum()) > 25
     assert torch.allclose(found[seen, 0], torch.stack([100 + 30 * at, 50 - 80 * at], dim=-1)[seen], atol=1e-9)
     assert torch.allclose(v[seen, 0], torch.tensor([30.0, -80.0], dtype=torch.float64).expand(int(seen.sum()), 2), atol=1e-7)
-
-
-def test_gaps_and_places_beyond_the_take_have_no_weight():
     x = torch.zeros(60, 2, 2)
     x[20:40, 1] = torch.nan
     at = torch.tensor([-0.5, 0.5, 1.0, 1.5, 2.5], dtype=torch.float64)
@@ -73,16 +70,13 @@ def test_gaps_and_places_beyond_the_take_have_no_weight():
     assert sure[:, 0].tolist() == pytest.approx([0.25, 0.75], rel=0.02)
 
 
-def test_the_noise_is_that_put_in_whatever_the_motion():
+def test_the_noise_is_that_put_in_and_of_two_cameras_compared_within_bounds():
     for sigma in (0.5, 2.0):
         scene = filmed_person(15, seconds=6.0, noise=sigma, missing=0.1, generator=seeded(2))
         assert tracks_of(scene.a).noise == pytest.approx(sigma, rel=0.15)
         scene = filmed_person(15, seconds=6.0, noise=sigma, outliers=0.05, generator=seeded(2))
         assert tracks_of(scene.a).noise == pytest.approx(1.25 * sigma, rel=0.15)  # four positions to a difference
     assert tracks_of(filmed_person(15, generator=seeded(2)).a).noise < 0.1
-
-
-def test_noise_of_two_cameras_is_compared_within_bounds():
     scene = filmed_person(12, seconds=6.0, generator=seeded(1))
     noisy = [scene.exact[k] + torch.randn(scene.exact[k].shape, generator=seeded(k), dtype=torch.float64) for k in (0, 1)]
     a, b, large = tracks_of(noisy[0]), tracks_of(noisy[1]), tracks_of(3 * noisy[1])
@@ -194,7 +188,7 @@ def scene(**more):
     return filmed_person(11, seconds=4.0, generator=seeded(), **more)
 
 
-def test_place_and_distance_are_taken_out():
+def test_place_and_distance_are_taken_out_whatever_one_point_does():
     x = scene(walk=0.0).a
     t = torch.arange(120, dtype=torch.float64)[:, None, None] / 30
     path = torch.cat([300 * (0.7 * t).sin(), 20 * t], dim=-1)
@@ -205,9 +199,6 @@ def test_place_and_distance_are_taken_out():
     near = scale_frames(tracks_of(slow * x))
     ratio = (near.x.norm(dim=-1) / one.x.norm(dim=-1).clamp(min=1e-9))[15:-15].median(1).values
     assert float(ratio.max() / ratio.min()) < 1.03  # of 1.15
-
-
-def test_one_wrong_point_moves_nothing_else():
     tracks = tracks_of(scene(noise=1.0).a)
     x = tracks.x.clone()
     x[:, 4] += 500.0
@@ -215,6 +206,9 @@ def test_one_wrong_point_moves_nothing_else():
     rest = torch.arange(11) != 4
     away = (good.x - bad.x)[:, rest].norm(dim=-1)
     assert float(away.median()) < 0.2 * float(good.x[:, rest].norm(dim=-1).median())
+    for frames in (1, 2):
+        for x in (torch.rand(frames, 5, 2, generator=seeded(1)), torch.full((frames, 5, 2), torch.nan)):
+            assert bool(scale_frames(tracks_of(x)).x.isfinite().all())
 
 
 def test_medians_of_every_frame_are_nought_and_missing_positions_stay_missing():
@@ -224,9 +218,3 @@ def test_medians_of_every_frame_are_nought_and_missing_positions_stay_missing():
     found = scale_frames(tracks_of(x))
     assert bool(found.x.isfinite().all()) and not found.x[found.weights == 0].any()
     assert torch.equal(found.weights > 0, x.isfinite().all(-1))
-
-
-def test_takes_of_a_frame_or_two():
-    for frames in (1, 2):
-        for x in (torch.rand(frames, 5, 2, generator=seeded(1)), torch.full((frames, 5, 2), torch.nan)):
-            assert bool(scale_frames(tracks_of(x)).x.isfinite().all())

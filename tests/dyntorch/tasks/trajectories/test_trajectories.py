@@ -120,13 +120,26 @@ def test_refinement_is_a_minimum_and_options_decide():
     assert (lax.status == LineStatus.STATIC).all()
 
 
-def test_a_change_of_the_world_and_the_images_commutes():
+def test_gradients_and_changes_of_the_world_commute():
     cameras, x, _, _ = scene(6, 20, sigma=0.5)
     T = torch.eye(4).double() + 0.05 * torch.randn(4, 4, generator=seeded(4), dtype=torch.float64)
     shift = torch.tensor([[0.0, -2.0, 10.0], [2.0, 0.0, -30.0], [0.0, 0.0, 1.0]]).double()  # a similarity of scale 2
     one, two = triangulate_trajectories(cameras, x), triangulate_trajectories(shift @ cameras @ T, apply(shift.expand(6, 3, 3), x))
     torch.testing.assert_close(apply(T.expand(6, 4, 4), two.points), one.points, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(two.residual, 2 * one.residual, rtol=1e-6, atol=1e-8)
+    cameras, x, _, _ = scene(6, 2, sigma=0.5)
+    w = torch.randn(6, 2, 3, generator=seeded(5), dtype=torch.float64)
+
+    def value(x):
+        return (triangulate_trajectories(cameras, x, sigma=0.5).points * w).sum()
+
+    x = x.requires_grad_()
+    (gradient,) = torch.autograd.grad(value(x), x)
+    for index in ((0, 0, 0), (3, 1, 1), (5, 0, 1)):
+        step = torch.zeros_like(x)
+        step[index] = 1e-2
+        numeric = (value(x + step) - value(x - step)) / 2e-2
+        torch.testing.assert_close(gradient[index], numeric.detach(), rtol=1e-5, atol=1e-9)
 
 
 def tensors(result):
@@ -156,22 +169,6 @@ def test_missing_views_weights_batches_and_failures():
     without = triangulate_trajectories(cameras[1, 2, :6], x[1, 2, :6, 2:3], sigma=0.2)
     torch.testing.assert_close(without.points, found.points[1, 2, :6, 2:3], rtol=1e-5, atol=1e-6)
     assert triangulate_trajectories(cameras[1, 1].float(), x[1, 1].float()).lines.dtype == torch.float32
-
-
-def test_gradients_of_points():
-    cameras, x, _, _ = scene(6, 2, sigma=0.5)
-    w = torch.randn(6, 2, 3, generator=seeded(5), dtype=torch.float64)
-
-    def value(x):
-        return (triangulate_trajectories(cameras, x, sigma=0.5).points * w).sum()
-
-    x = x.requires_grad_()
-    (gradient,) = torch.autograd.grad(value(x), x)
-    for index in ((0, 0, 0), (3, 1, 1), (5, 0, 1)):
-        step = torch.zeros_like(x)
-        step[index] = 1e-2
-        numeric = (value(x + step) - value(x - step)) / 2e-2
-        torch.testing.assert_close(gradient[index], numeric.detach(), rtol=1e-5, atol=1e-9)
 
 
 SIX = torch.zeros(6, 10, 2)
