@@ -492,16 +492,8 @@ ROOMS = ("core", "geometry", "invariants", "numerics", "shapes", "tasks")
 PUBLIC = {name: getattr(face, name) for face in (dyn, *(getattr(dyn, room) for room in ROOMS)) for name in face.__all__}
 NOT_VERBS = {
     *("counting", "metrics", "motions", "scenes"),  # modules
-    *(
-        "on_cpu",
-        "one_thread",
-        "map_blocks",
-        "check_options",
-        "with_names",
-        "with_words",
-        "as_python",
-        "status_from",
-    ),  # tools of verbs
+    # tools of verbs
+    *("on_cpu", "one_thread", "map_blocks", "check_options", "with_names", "with_words", "as_python", "status_from"),
     # names, numbers and what results say
     *("Message", "Notice", "BodyModel", "LineStatus", "Status", "Motion", "MotionName", "MOTION_MODELS", "Polynomial", "Fourier"),
     *("NoticeCode", "Invariant", "MovingShapes", "Recovery", "Outcome"),

@@ -21,6 +21,7 @@ from safetensors import safe_open
 from indexing import ActionIndexer, BrightnessIndexer, Clip, ClipSet, PhaseIndexer, synchronize
 from indexing.actors import Person, dataset, detect, perform, stream
 from indexing.cli import main
+from indexing.cli.flags import commands
 from tests.freeze.geometry import Table, tried
 from tests.fuzz import seeds
 
@@ -250,20 +251,6 @@ count nothing
 count homography --k 3
 fly
 index
-align --help
-segment --help
-reconstruct --help
-sync --help
-calibrate --help
-convert --help
-index fit --help
-index scan --help
-index evaluate --help
-index suggest --help
-archive --help
-archive add --help
-archive search --help
-pose --help
 calibrate cam1 cam2 --size 12
 convert squat.json -o squat.nothing
 index suggest nowhere.npz
@@ -299,7 +286,11 @@ def table(folder: Path) -> Table:
     found["readers"] = lambda: answered(made())
     shown = cache(lambda: command(folder, pages, "demo", "--examples", str(examples)))
     found["command demo"] = shown
-    found |= {f"command {words}": lambda words=words: shown() and command(examples, pages, *words.split()) for words in COMMANDS}
+    helps = [f"{one.words} --help" for one in commands()]
+    found |= {
+        f"command {words}": lambda words=words: shown() and command(examples, pages, *words.split())
+        for words in [*COMMANDS, *helps]
+    }
     found["seed commands"] = lambda: {seed.name: tried(partial(of_seed, work, pages, seed)) for seed in made() if seed.words}
     found["pages"] = lambda: dict(pages)
     return found

@@ -11,26 +11,29 @@ from dyntorch.counting import count, dim_v, dim_v_closed_form, partitions, semis
 from tests.grid import assert_refused
 
 
-def test_dimensions_quoted_in_the_literature():
+def test_dimensions_are_those_of_the_literature_and_of_the_limits():
     quoted = [(3, 3, 2), (4, 3, 2), (3, 3, 1), (4, 3, 1), (3, 4, 2), (2, 3, 2), (2, 3, 1), (4, 4, 3), (4, 4, 2)]
     assert [dim_v(n, m, k) for n, m, k in quoted] == [26, 60, 10, 20, 72, 8, 4, 255, 210]
-
-
-def test_dimension_has_the_limits_of_fixed_and_of_free_points():
     for n, m in product(range(1, 6), range(1, 6)):
         assert dim_v(n, m, 0) == 0
         assert dim_v(n, m, 1) == comb(n + m - 1, m)  # symmetric tensors
         assert dim_v(n, m, m) == dim_v(n, m, m + 3) == n**m
         assert dim_v(n, m, n) == n**m  # n vectors span everything
+    # the thesis asks n >= m >= k and uses V(2,3,2) and V(3,4,2)
+    assert dim_v(2, 3, 2) == count(1, views=[1, 1, 1], r=2).rank == 8
+    assert dim_v(3, 4, 2) == count(2, views=[2] * 4, r=2).rank == 72
 
 
-def test_closed_forms_equal_the_sum():
+def test_closed_forms_equal_the_sum_and_tableaux_fill_the_space():
     checked = 0
     for n, m, codim in product(range(1, 7), range(1, 7), (1, 2, 3)):
         if m >= codim:
             assert dim_v_closed_form(n, m, codim) == dim_v(n, m, m - codim)
             checked += 1
     assert checked == 6 * (6 + 5 + 4)
+    for n, m in product(range(1, 6), range(1, 8)):
+        assert sum(standard_tableaux(shape) * semistandard_tableaux(shape, n) for shape in partitions(m)) == n**m
+    assert dim_v(3, 100, 1) == comb(102, 2)  # short partitions only, of 190 million
 
 
 @pytest.mark.slow
@@ -40,12 +43,6 @@ def test_dimension_equals_brute_force_rank(n):
         for k in range(1, m + 1):
             if n**m <= 700:
                 assert count(n - 1, views=[n - 1] * m, r=min(k, n)).rank == dim_v(n, m, k), (n, m, k)
-
-
-def test_all_tableaux_together_fill_the_space():
-    for n, m in product(range(1, 6), range(1, 8)):
-        assert sum(standard_tableaux(shape) * semistandard_tableaux(shape, n) for shape in partitions(m)) == n**m
-    assert dim_v(3, 100, 1) == comb(102, 2)  # short partitions only, of 190 million
 
 
 def tableaux(shape, n, strict_rows):
@@ -65,12 +62,6 @@ def test_hook_lengths_equal_enumeration(m):
     for shape in partitions(m):
         assert standard_tableaux(shape) == tableaux(shape, m, 1)
         assert semistandard_tableaux(shape, 3) == tableaux(shape, 3, 0)
-
-
-def test_condition_n_at_least_m_is_not_needed():
-    """The thesis asks n >= m >= k and uses V(2,3,2) and V(3,4,2)."""
-    assert dim_v(2, 3, 2) == count(1, views=[1, 1, 1], r=2).rank == 8
-    assert dim_v(3, 4, 2) == count(2, views=[2] * 4, r=2).rank == 72
 
 
 def test_excluded_partitions_are_those_of_smaller_numbers_only_up_to_2k_plus_2():

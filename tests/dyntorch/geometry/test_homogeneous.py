@@ -106,12 +106,16 @@ def test_unit_depends_on_the_line_only(shape):
         assert torch.equal(u.flatten(1).abs().amax(1), u.flatten(1).amax(1))
 
 
-def test_unit_of_an_image_homography_sees_its_small_determinant():
+def test_unit_sees_small_determinants_and_is_orthogonal_to_its_gradient():
     shift = torch.tensor([[1.0, 0.0, 4000.0], [0.0, 1.0, -9000.0], [0.0, 0.0, 1.0]])
     for dtype in (torch.float32, torch.float64):
         # its determinant is 1e-12 of the cube of its norm, its largest entry negative
         assert unit(shift.to(dtype))[0, 2] > 0
         assert unit(-shift.to(dtype))[0, 2] > 0
+    a = random(2, 3, 3).requires_grad_()
+    assert torch.autograd.gradcheck(unit, a)
+    (unit(a) * random(2, 3, 3, seed=1)).sum().backward()
+    torch.testing.assert_close((a.grad * a).sum(), torch.zeros((), dtype=torch.float64), atol=1e-14, rtol=0)
 
 
 def test_unit_of_singular_and_zero_matrices():
@@ -124,16 +128,13 @@ def test_unit_of_singular_and_zero_matrices():
     assert torch.equal(unit(zero), torch.zeros_like(zero)) and zero.grad.isfinite().all()
 
 
-def test_unit_is_differentiable_and_orthogonal_to_itself():
-    a = random(2, 3, 3).requires_grad_()
-    assert torch.autograd.gradcheck(unit, a)
-    (unit(a) * random(2, 3, 3, seed=1)).sum().backward()
-    torch.testing.assert_close((a.grad * a).sum(), torch.zeros((), dtype=torch.float64), atol=1e-14, rtol=0)
-
-
-def test_skew_is_the_cross_product():
+def test_skew_and_products_from_both_sides_are_matrices_on_entries():
     v, w = random(4, 5, 3), random(4, 5, 3, seed=1)
     torch.testing.assert_close((skew(v) @ w[..., None])[..., 0], torch.linalg.cross(v, w))
+    A, X, B = (random(4, *size, seed=5) for size in ((3, 2), (2, 4), (4, 5)))
+    found = two_sided(A, B)
+    assert found.shape == (4, 15, 8)
+    torch.testing.assert_close((found @ X.flatten(1)[..., None])[..., 0], (A @ X @ B).flatten(1))
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
@@ -159,13 +160,6 @@ def test_unit_vectors_and_signs_leave_zero_alone(dtype):
     assert (gradient * x).sum(-1).abs().max() < 10 * torch.finfo(dtype).eps
     sign = nonzero_sign(x.detach())
     assert sign.dtype == dtype and torch.equal(sign * x.abs(), x) and (sign[1] == 1).all()
-
-
-def test_a_product_from_both_sides_is_a_matrix_on_entries():
-    A, X, B = (random(4, *size, seed=5) for size in ((3, 2), (2, 4), (4, 5)))
-    found = two_sided(A, B)
-    assert found.shape == (4, 15, 8)
-    torch.testing.assert_close((found @ X.flatten(1)[..., None])[..., 0], (A @ X @ B).flatten(1))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -92,15 +92,12 @@ def test_division_model_and_its_inverse(strength):
     assert torch.allclose(lens.undistort(corner) - lens.centre, (corner - lens.centre) / (1 + strength))
 
 
-def test_division_model_ends_where_it_folds():
+def test_the_division_model_ends_where_it_folds():
     barrel = Division(-0.25, torch.zeros(2, dtype=torch.float64), 1.0)
     x = torch.tensor([[1.99, 0.0], [2.01, 0.0]], dtype=torch.float64)
     assert barrel.undistort(x).isnan().any(-1).tolist() == [False, True]
     pincushion = Division(0.25, torch.zeros(2, dtype=torch.float64), 1.0)
     assert pincushion.distort(x / 2).isnan().any(-1).tolist() == [False, True]
-
-
-def test_division_without_a_size_uses_the_box_of_the_points():
     x = torch.tensor([[[0.0, 0.0], [torch.nan, 9.0]], [[6.0, 2.0], [3.0, 8.0]]])
     lens = Division.of(x)
     assert (lens.centre.tolist(), lens.radius) == ([3.0, 4.0], 5.0)

@@ -76,16 +76,13 @@ def test_records_go_in_and_come_back_as_records(batch, threads):
     assert found.pair.rest[0] is None and torch.equal(found.pair.rest[1], b)
 
 
-def test_each_takes_the_tensors_of_a_record_one_by_one():
+def test_records_and_problems_are_taken_whole():
     given = Given(
         (torch.arange(3), torch.ones(3, 2)), "names stay", Pair(torch.zeros(3), (None,)), torch.tensor([True, False, True])
     )
     found = each(lambda x: x[1:], given)
     assert [x.tolist() for x in found.views] == [[1, 2], [[1, 1], [1, 1]]] and found.flags.tolist() == [False, True]
     assert found.name == "names stay" and found.pair.rest == (None,) and len(given.flags) == 3
-
-
-def test_select_takes_whole_problems():
     mask = torch.tensor([[True, False], [False, True]])
     new, old = torch.rand(2, 2, 3, 4), torch.rand(2, 2, 3, 4)
     found = select(mask, new, old)

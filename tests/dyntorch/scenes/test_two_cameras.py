@@ -53,14 +53,11 @@ def test_faults_are_those_asked_for():
     assert int(whole.diff(dim=0).sum()) < 0.35 * int(whole.sum())  # in blocks
 
 
-def test_lenses_bend_what_is_seen():
+def test_lenses_bend_and_motion_repeats_only_where_asked_to():
     scene = make(lens=-0.3, walk=1.2)
     lens = Division.of(scene.a, (1280.0, 960.0), -0.3)
     assert float((scene.a - scene.exact[0]).abs().max()) > 5
     assert torch.allclose(lens.undistort(scene.a), scene.exact[0], atol=1e-6)
-
-
-def test_motion_repeats_only_where_asked_to():
     scene = make(period=1.0, walk=0.0)
     assert torch.allclose(scene.points[30:], scene.points[:-30], atol=1e-9)
     for free in (make(walk=0.0), make(period=1.0)):

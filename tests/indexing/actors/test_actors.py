@@ -70,15 +70,12 @@ def test_each_action_does_what_it_is_called():
     assert height["pick_up"][:, AT["right_wrist"]].min() < 0.25
 
 
-def test_arms_swing_against_the_legs():
+def test_arms_swing_against_the_legs_and_left_handers_are_mirrored():
     for action in ("walk", "run"):
         forward = -perform(action, Person()).joints[..., 2]
         legs = forward[:, AT["left_ankle"]] - forward[:, AT["right_ankle"]]
         arms = forward[:, AT["left_wrist"]] - forward[:, AT["right_wrist"]]
         assert np.corrcoef(legs, arms)[0, 1] < -0.8
-
-
-def test_left_handers_are_the_mirror_image():
     right, left = (perform("punch", Person(handed=handed, sway=0.0)).joints for handed in (1, -1))
     twin = [0, *(j for i in range(1, 17, 2) for j in (i + 1, i))]
     np.testing.assert_allclose(left, right[:, twin] * [-1, 1, 1], atol=1e-9)

@@ -78,9 +78,11 @@ def test_movement_in_3d_is_kept_from_two_sides():
     assert [track.view for track in tracks_of(Clip(points), STORAGE)] == [0, 1]
 
 
-def test_nothing_is_kept_of_nothing():
+def test_nothing_is_kept_of_nothing_and_layouts_differ_by_names_or_bones():
     for joints in (np.zeros((60, 4, 2)), np.full((60, 4, 2), np.nan), np.ones((1, 4, 2))):
         assert tracks_of(Clip(joints), STORAGE) == []
+    assert layout_key(3, Skeleton("a", ("x", "y", "z"))) == layout_key(3, Skeleton("b", ("x", "y", "z"), ((0, 1),)))
+    assert layout_key(3, None) != layout_key(3, Skeleton("a", ("0", "1", "2"), ((0, 1),)))
 
 
 # ---- layouts -------------------------------------------------------------------------------------------------------------
@@ -135,11 +137,6 @@ def test_joints_are_met_by_name():
     assert np.array_equal(facing.joints[:, [0, 2, 3]], clip.joints[:, [3, 1, 0]]) and np.isnan(facing.joints[:, 1]).all()
     assert named.facing(clip.replace(skeleton=Skeleton("none", tuple("abcde")))) is None
     assert layout.facing(clip) is None and layout.facing(Clip(swinging(np.arange(9), 4))) is not None
-
-
-def test_layouts_differ_by_names_or_bones():
-    assert layout_key(3, Skeleton("a", ("x", "y", "z"))) == layout_key(3, Skeleton("b", ("x", "y", "z"), ((0, 1),)))
-    assert layout_key(3, None) != layout_key(3, Skeleton("a", ("0", "1", "2"), ((0, 1),)))
 
 
 def test_what_was_learned_of_little_is_learned_again_of_more(tmp_path):

@@ -126,7 +126,7 @@ def test_left_taken_for_right_is_mended_before_the_last_word(library, tmp_path):
     assert said["camera"] == "cam2" and said["person"] == 1 and said["start"] == pytest.approx(1.0, abs=0.1)
 
 
-def test_people_whom_nobody_can_tell_apart(library, monkeypatch):
+def test_what_the_library_says_names_people_and_cameras(library, monkeypatch):
     notices = (Notice(PeopleNotice.NOBODY, 0.0),)
     found = SimpleNamespace(ok=False, status=status_from(notices), notices=notices, notes=())
     monkeypatch.setattr(verb, "associate", lambda *_, **__: found)
@@ -134,8 +134,6 @@ def test_people_whom_nobody_can_tell_apart(library, monkeypatch):
     assert not rig.ok and str(notices[0].text) in rig.reason and library == []
     assert any("person='largest' uses the largest person" in note for note in rig.notes) and rig.people == ()
 
-
-def test_what_the_library_says_of_a_camera_by_number_has_its_name(monkeypatch):
     def answer(tracks, **_):
         raise ValueError("camera 1: no point is seen; check the detections")
 

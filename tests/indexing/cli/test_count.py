@@ -13,13 +13,15 @@ def cells(text: str) -> list[list[str]]:
     return [line.split() for line in text.splitlines() if line.strip()]
 
 
-def test_name_and_numbers_of_matches(run):
+def test_numbers_of_matches_and_dimensions(run):
     code, out, err = run("homography", "--moving", "30", "--static", "2")
     assert (code, err) == (0, "")
     lines = cells(out)
     assert out.startswith("Points of a plane that move along straight lines, three views: homography tensor")
     assert ["static", "2", "2", "2"] in lines and ["moving", "30", "24", "26"] in lines
     assert "rank 26 of 27, nullity 1, from 26 of 32 matches\nenough: more matches do not raise the rank\n" in out
+    assert run("--dim-v", "3", "3", "2") == (0, "dim V(3, 3, 2) = 26\n", "")
+    assert json.loads(run("--dim-v", "3", "4", "2", "--json")[1]) == {"n": 3, "m": 4, "k": 2, "dim_v": 72}
 
 
 def test_too_few_matches_say_how_many_are_missing(run):
@@ -69,11 +71,6 @@ def test_lifted_and_moving_shapes(run):
     assert "rank 119 of 120, nullity 1, from 4 matches\nenough" in run("lifted_shape", "--points", "10", "--synthetic")[1]
     assert "rank 49 of 60, nullity 11, from 49 matches" in run("dynamic_shape")[1]
     assert "rank 8 of 9, nullity 1, from 8 matches" in run("dynamic_shape", "--coplanar-base")[1]
-
-
-def test_dimension(run):
-    assert run("--dim-v", "3", "3", "2") == (0, "dim V(3, 3, 2) = 26\n", "")
-    assert json.loads(run("--dim-v", "3", "4", "2", "--json")[1]) == {"n": 3, "m": 4, "k": 2, "dim_v": 72}
 
 
 @pytest.mark.slow

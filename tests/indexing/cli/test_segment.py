@@ -221,20 +221,18 @@ def test_bad_input_is_one_line_and_code_2(refuse, solved, line, says):
     refuse(line, says=(says,))
 
 
-def test_what_the_library_refuses_names_the_file(run, monkeypatch):
+def test_refusals_name_the_file_and_overwrite_no_input(run, data, solved, monkeypatch):
+    before = (data / "m.csv").read_text()
+    Path("labels.csv").write_text(before)
+    code, _, err = run("labels.csv --out .")
+    assert code == 2 and "labels.csv: is an input" in err and Path("labels.csv").read_text() == before
+
     def refuse(*x, **options):
         raise ValueError(Message("{arg:bodies=40} need 280 matches; lower {arg:bodies=}"))
 
     monkeypatch.setattr(dyntorch, "segment", refuse, raising=False)
     code, _, err = run("@/m.npz --bodies 40")
     assert code == 2 and re.fullmatch(r"dyntorch: \S+m\.npz: --bodies 40 need 280 matches; lower --bodies\n", err)
-
-
-def test_an_input_is_not_overwritten(run, data, solved):
-    before = (data / "m.csv").read_text()
-    Path("labels.csv").write_text(before)
-    code, _, err = run("labels.csv --out .")
-    assert code == 2 and "labels.csv: is an input" in err and Path("labels.csv").read_text() == before
 
 
 def test_a_database_of_colmap_goes_its_own_way(run, monkeypatch):

@@ -96,13 +96,6 @@ def test_a_file_beside_another_has_its_own_clock(tmp_path: Path) -> None:
     assert "front.mp4, side.mp4 beside each other" in found.notices[0]
 
 
-def test_without_a_length_nobody_knows_when_the_second_file_begins(tmp_path: Path) -> None:
-    one = observation(EVENTS, {"1": ["a.mp4", "b.mp4"]})
-    del one["media_info"]["length"]["a.mp4"]
-    with pytest.raises(ValueError, match=r"a\.boris: observation 'one': does not say how long a\.mp4 is"):
-        open_labels(project(tmp_path / "a.boris", {"one": one}))
-
-
 def test_a_name_or_the_recording_chooses_the_observation(tmp_path: Path) -> None:
     other = observation(EVENTS[1:2], {"1": ["other.mp4"]})
     path = project(tmp_path / "a.boris", {"one": observation(EVENTS), "two": other})
@@ -117,11 +110,15 @@ def test_a_name_or_the_recording_chooses_the_observation(tmp_path: Path) -> None
     assert len(open_labels(path, recording="third.json", media="other.mp4").labels) == 1
 
 
-def test_a_live_observation_has_no_file(tmp_path: Path) -> None:
+def test_observations_without_lengths_or_files(tmp_path: Path) -> None:
     path = project(tmp_path / "a.boris", {"live": observation(EVENTS, {}, type="LIVE")})
     found = open_labels(path, recording="x.json")
     assert len(found.labels) == 3
     assert "names no media file; its clock is taken for that of x.json" in found.notices[0]
+    one = observation(EVENTS, {"1": ["a.mp4", "b.mp4"]})
+    del one["media_info"]["length"]["a.mp4"]
+    with pytest.raises(ValueError, match=r"a\.boris: observation 'one': does not say how long a\.mp4 is"):
+        open_labels(project(tmp_path / "a.boris", {"one": one}))
 
 
 def test_events_that_are_none(tmp_path: Path) -> None:

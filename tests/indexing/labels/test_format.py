@@ -106,13 +106,17 @@ def test_timelines_count_frames_from_one(tmp_path: Path) -> None:
         read_labels(path)
 
 
-def test_what_marks_no_time_is_named(tmp_path: Path) -> None:
+def test_what_marks_no_time_is_named_and_the_least_export_is_read(tmp_path: Path) -> None:
     box = {"id": "r", "type": "videorectangle", "value": {"sequence": []}}
     words = {"id": "r", "type": "labels", "value": {"start": 1, "end": 5, "text": "hello", "labels": ["greeting"]}}
     sound = {"id": "r", "type": "labels", "value": {"start": 1.25, "end": 5, "channel": 0, "labels": ["song"]}}
     found = open_labels(saved(tmp_path / "a.json", [task(box, words, sound)]))
     assert [(label.start, label.label) for label in found.labels] == [(1.25, "song")]
     assert found.notices == ("2 regions left out: they mark no time (videorectangle: 1, labels: 1)",)
+    one = {"id": 1, "video": "s3://films/session.mp4", "annotator": 3, "l": [region(1, 26, "squat")["value"]]}
+    assert read_labels(saved(tmp_path / "a.json", [one]), fps=25) == [
+        Label(0, 1, "squat", media="session.mp4", observation="annotator 3")
+    ]
 
 
 def test_annotators_and_predictions(tmp_path: Path) -> None:
@@ -123,13 +127,6 @@ def test_annotators_and_predictions(tmp_path: Path) -> None:
     chosen = choose_labels(found)
     assert [label.end for label in chosen.labels] == [2]
     assert "1 label left out: a program found them (yolo); --observation NAME reads them" in chosen.notices
-
-
-def test_the_least_export(tmp_path: Path) -> None:
-    one = {"id": 1, "video": "s3://films/session.mp4", "annotator": 3, "l": [region(1, 26, "squat")["value"]]}
-    assert read_labels(saved(tmp_path / "a.json", [one]), fps=25) == [
-        Label(0, 1, "squat", media="session.mp4", observation="annotator 3")
-    ]
 
 
 # ---- VIA -----------------------------------------------------------------------------------------------------------------

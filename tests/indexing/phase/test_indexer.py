@@ -39,10 +39,15 @@ def asked():
     return clips(20, turns=(20, 60))
 
 
-def test_single_frames_tell_the_action(fitted, asked):
+def test_single_frames_tell_the_action_and_neighbours_smooth(fitted, asked):
     assert fitted.predict(asked).tolist() == [clip.label for clip in asked]
     assert fitted.score(asked, [clip.label for clip in asked]) == 1.0
     assert np.allclose(fitted.predict_proba(asked).sum(1), 1.0)
+    smooth = clone(fitted).set_params(window=0.5)
+    smooth.__dict__ |= {name: value for name, value in vars(fitted).items() if name.endswith("_")}
+    scores = smooth.score_frames(asked[0])
+    assert scores.std(0).max() < fitted.score_frames(asked[0]).std(0).max()
+    assert [event.label for event in fitted.find(asked[0])] == ["walk"]
 
 
 def test_a_cycle_repeats_and_a_course_goes_from_start_to_end(fitted, asked):
@@ -78,14 +83,6 @@ def test_missing_joints(fitted, asked):
     assert (scores[2] == 0).all()
     assert np.isnan(phase[2]).all()
     assert (scores.argmax(1) == 1).mean() > 0.7
-
-
-def test_neighbours(fitted, asked):
-    smooth = clone(fitted).set_params(window=0.5)
-    smooth.__dict__ |= {name: value for name, value in vars(fitted).items() if name.endswith("_")}
-    scores = smooth.score_frames(asked[0])
-    assert scores.std(0).max() < fitted.score_frames(asked[0]).std(0).max()
-    assert [event.label for event in fitted.find(asked[0])] == ["walk"]
 
 
 def test_order_of_clips_changes_nothing_and_given_phases_are_kept(train, asked):

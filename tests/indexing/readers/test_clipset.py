@@ -130,12 +130,9 @@ CONTRADICTIONS: list[tuple[dict[str, Any], tuple[str, ...]]] = [
 ]
 
 
-def test_contradictions_are_refused(save):
+def test_contradictions_and_options_that_a_set_cannot_take_are_refused(save):
     for changes, words in CONTRADICTIONS:
         refused(save(**changes), *words)
-
-
-def test_options_that_a_set_cannot_take(save) -> None:
     refused(save(), "no confidence", "at 0", min_confidence=0.5)
     refused(save(), "size", "leave size out", size=(640, 480))
 

@@ -150,12 +150,6 @@ def check_sample(tool: str, made: Sample) -> None:
     assert len(read(made.path, format=name)) == made.clips
 
 
-def test_json_of_no_format(tmp_path: Path) -> None:
-    values = ({}, [], [[]], ["[]"], [3], {"image_id": 3}, [[[[[{"image_id": 3}]]]]], {"a": {"b": 1}}, [{"name": "x"}], ["text"])
-    assert [detect_json(tmp_path, value) for value in values] == [None] * 3 + ["ultralytics"] + [None] * 6
-    assert detect_json(tmp_path, [[], [[{"image_id": 3}]]]) == "coco"
-
-
 # ----------------------------------------------------------------------------------------------------------------------
 # read and read_clip: detection, options, and inputs that no format can take
 
@@ -186,10 +180,19 @@ NO_KEYPOINTS: list[tuple[str, bytes, tuple[str, ...]]] = [
 ]
 
 
-def test_what_is_no_keypoint_file_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_keypoint_file_is_refused(tmp_path: Path, openpose_folder, person: np.ndarray) -> None:
     for name, content, words in NO_KEYPOINTS:
         (tmp_path / name).write_bytes(content)
         refused(tmp_path / name, *words)
+    folder = openpose_folder({i: [person[i]] for i in range(3)})
+    broken = folder / "clip2_000000000001_keypoints.json"
+    broken.write_text(broken.read_text()[:80])
+    refused(broken.parent, broken.name, "not valid JSON", "truncated")
+    values = ({}, [], [[]], ["[]"], [3], {"image_id": 3}, [[[[[{"image_id": 3}]]]]], {"a": {"b": 1}}, [{"name": "x"}], ["text"])
+    assert [detect_json(tmp_path, value) for value in values] == [None] * 3 + ["ultralytics"] + [None] * 6
+    assert detect_json(tmp_path, [[], [[{"image_id": 3}]]]) == "coco"
+    names = ("video_000000000012_keypoints.json", "0.jpg", "img7_002.png", "12_rgb.json", "a.json", "3")
+    assert list(map(frame_number, names)) == [12, 0, 2, 12, None, 3]
 
 
 def test_a_folder_that_is_not_one_recording_is_refused(tmp_path: Path) -> None:
@@ -206,13 +209,6 @@ def test_a_folder_that_is_not_one_recording_is_refused(tmp_path: Path) -> None:
         for name in names:
             (folder / name).write_text('{"people": []}')
         refused(folder, *words)
-
-
-def test_a_truncated_file_of_a_folder_is_named(openpose_folder, person: np.ndarray) -> None:  # type: ignore[no-untyped-def]
-    folder = openpose_folder({i: [person[i]] for i in range(3)})
-    broken = folder / "clip2_000000000001_keypoints.json"
-    broken.write_text(broken.read_text()[:80])
-    refused(broken.parent, broken.name, "not valid JSON", "truncated")
 
 
 def test_unknown_options_are_refused(tmp_path: Path) -> None:
@@ -258,8 +254,3 @@ def test_clip_and_clipset_load_through_the_readers(openpose_folder, person: np.n
     assert len(clips) == 1
     assert clips[0].fps_assumed
     assert clips[0].times.tolist() == [i / 30 for i in range(6)]
-
-
-def test_frame_number() -> None:
-    names = ("video_000000000012_keypoints.json", "0.jpg", "img7_002.png", "12_rgb.json", "a.json", "3")
-    assert list(map(frame_number, names)) == [12, 0, 2, 12, None, 3]

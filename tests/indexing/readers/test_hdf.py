@@ -180,8 +180,10 @@ def check_changed(person: np.ndarray, folder: Path, changes: list[tuple[str, Cal
     assert tools.list_failures(cases) == {}
 
 
-def test_broken_files_are_refused_in_one_line(person: np.ndarray, tmp_path: Path) -> None:
+def test_broken_and_hostile_files_are_refused_in_one_line(person: np.ndarray, tmp_path: Path) -> None:
     check_changed(person, tmp_path, BROKEN)
+    tools.sleap_analysis(tmp_path / OTHER, {"a": person}, NAMES)
+    check_changed(person, tmp_path, HOSTILE)
 
 
 # ---- hostile -------------------------------------------------------------------------------------------------------------
@@ -280,11 +282,6 @@ HOSTILE: list[tuple[str, Callable[[Any], None], tuple[str, ...]]] = [
         for name in ("axis1", "block0_items_label1", "block0_items_level1")
     ),
 ]
-
-
-def test_hostile_files_are_refused_before_anything_is_followed_made_or_run(person: np.ndarray, tmp_path: Path) -> None:
-    tools.sleap_analysis(tmp_path / OTHER, {"a": person}, NAMES)
-    check_changed(person, tmp_path, HOSTILE)
 
 
 def test_heaps_of_text_without_end_and_texts_longer_than_the_file_are_refused(person: np.ndarray, tmp_path: Path) -> None:

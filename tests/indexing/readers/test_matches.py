@@ -59,9 +59,12 @@ BAD_TABLES = [
 ]
 
 
-def test_bad_tables_name_file_field_and_remedy(tmp_path):
+def test_bad_tables_and_arrays_name_file_field_and_remedy(tmp_path):
     for text, says in BAD_TABLES:
         refused(table(tmp_path / "m.csv", text), says, action=read_pair)
+    for arrays, says in BAD_ARRAYS:
+        np.savez(tmp_path / "m.npz", **arrays)
+        refused(tmp_path / "m.npz", says, action=read_pair)
 
 
 BAD_ARRAYS = [
@@ -83,12 +86,6 @@ BAD_ARRAYS = [
     ({"x1": X1, "x2": X2, "ids": np.ones(10)}, "ids: '1.0' names several matches"),
     ({"x1": np.array([{}] * 10), "x2": X2}, "array 'x1' cannot be read"),
 ]
-
-
-def test_bad_arrays_name_file_field_and_remedy(tmp_path):
-    for arrays, says in BAD_ARRAYS:
-        np.savez(tmp_path / "m.npz", **arrays)
-        refused(tmp_path / "m.npz", says, action=read_pair)
 
 
 def test_photographs_keep_the_size_of_the_file(tmp_path):

@@ -149,10 +149,14 @@ def test_trc_that_starts_later_keeps_its_clock(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_clip(path).times, np.arange(12) / 60)  # no times: frame number / DataRate
 
 
-def test_the_direction_up_is_the_bodys(tmp_path: Path) -> None:
+def test_the_direction_up_is_the_bodys_and_other_tables_are_not_mediapipes(tmp_path: Path, person: np.ndarray) -> None:
     for axes, up in (([0, 2, 1], "z"), ([0, 1, 2], "y")):
         assert read_clip(tools.trc(tmp_path / "a.trc", HALPE_POINTS[..., axes], HALPE_NAMES)).up == up
         assert read_clip(tools.trc(tmp_path / "b.trc", HALPE_POINTS[..., axes], [f"M{i}" for i in range(26)])).up == "y"
+    rows = ["frame," + ",".join(f"{name}_{kind}" for name in COCO17.joints for kind in ("x", "y"))]
+    rows += [f"{i}," + ",".join(f"{v:.3f}" for v in frame[:, :2].ravel()) for i, frame in enumerate(person)]
+    (tmp_path / "a.csv").write_text("\n".join(rows))
+    assert "may_lag" not in read_clip(tmp_path / "a.csv").meta
 
 
 def test_people_of_a_marker_file_have_names_before_a_colon(tmp_path: Path) -> None:
@@ -322,13 +326,6 @@ def test_what_mediapipe_smoothed_is_always_said(noise: float, tmp_path: Path) ->
     assert read_clip(landmarks(tmp_path / "a.csv", smoothed(raw))).meta == {"may_lag": True}
     said = read_clip(landmarks(tmp_path / "b.csv", raw)).meta
     assert said == {} or noise < 0.003  # noise at rest shows that nothing was smoothed
-
-
-def test_other_tables_are_not_mediapipes(tmp_path: Path, person: np.ndarray) -> None:
-    rows = ["frame," + ",".join(f"{name}_{kind}" for name in COCO17.joints for kind in ("x", "y"))]
-    rows += [f"{i}," + ",".join(f"{v:.3f}" for v in frame[:, :2].ravel()) for i, frame in enumerate(person)]
-    (tmp_path / "a.csv").write_text("\n".join(rows))
-    assert "may_lag" not in read_clip(tmp_path / "a.csv").meta
 
 
 # ---- what is not read ----------------------------------------------------------------------------------------------------

@@ -58,15 +58,12 @@ def test_metres_up_and_ground(people, scale):
     assert float(turned[0, 2, 0].abs()) < 1e-6 and float(turned[0, 2, 1]) > 0  # the second axis points ahead of the first camera
 
 
-def test_without_a_length_the_cameras_are_one_away():
+def test_world_frames_without_a_length_or_of_lying_bodies():
     R, centers, x, *_ = scene()
     world = estimate_world(R, centers, x, Scale())
     assert not world.metric
     middle = x.flatten(0, 1).median(0).values
     assert float((world.scale * (centers - middle)).norm(dim=-1).median()) == pytest.approx(1.0)
-
-
-def test_lying_bodies_leave_up_to_the_cameras():
     R, centers, x, *_ = scene(lying=True)
     world = estimate_world(R, centers, x, Scale())
     assert not world.by_people
@@ -93,7 +90,7 @@ def two_bodies(frames=80):
     return points, shapes
 
 
-def test_bodies_fall_apart():
+def test_bodies_fall_apart_and_points_of_their_own_ways_have_no_bones():
     points, shapes = two_bodies()
     known = torch.ones(80, 7, dtype=torch.bool)
     known[3:9, 4] = False
@@ -103,9 +100,6 @@ def test_bodies_fall_apart():
     assert float(spreads.max()) < 1e-9
     for (a, b), length in zip(ends.tolist(), lengths.tolist(), strict=True):
         assert length == pytest.approx(float((shapes[a % 2, a // 2] - shapes[b % 2, b // 2]).norm()), rel=1e-9)
-
-
-def test_points_that_all_go_their_own_ways_have_no_bones():
     g = torch.Generator().manual_seed(2)
     points = torch.randn(50, 4, 3, generator=g, dtype=F64)
     known = torch.ones(50, 4, dtype=torch.bool)

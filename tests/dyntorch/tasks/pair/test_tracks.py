@@ -54,16 +54,13 @@ def motion(frames=90, points=8, modes=3):
     return 20 * torch.einsum("nk,tkd->tnd", normal(points, modes, seed=2), waves)
 
 
-def test_cosines_are_the_orthonormal_transform():
+def test_cosines_are_the_orthonormal_transform_and_show_the_motion():
     for frames in (7, 12):
         x = normal(frames, 3, 2)
         t, k = torch.arange(frames, dtype=torch.float64), torch.arange(1, frames, dtype=torch.float64)
         basis = (2 / frames) ** 0.5 * torch.cos(math.pi / frames * k[:, None] * (t + 0.5))
         torch.testing.assert_close(cosines(x), torch.einsum("kt,tnd->knd", basis, x))
         torch.testing.assert_close(inverse_cosines(cosines(x)), x - x.mean(0))
-
-
-def test_spectrum_is_that_of_the_motion_not_of_the_noise():
     z = cosines(motion() + 2.0 * normal(90, 8, 2))
     spectrum = motion_spectrum(z, 4.0)
     clean = cosines(motion()).square().mean((1, 2))

@@ -156,16 +156,13 @@ def test_cheapest_is_the_cheapest_of_all():
         assert price(cheapest_path(costs, penalty).tolist()) == pytest.approx(price(best))
 
 
-def test_mended_leaves_room_on_the_side_that_lost():
+def test_doubled_and_mended_frames_stand_where_they_were():
     tracks = [read_tracks("a", torch.ones(20, 1, 2).double(), 10.0, None, None) for _ in range(2)]
     a, b = repair_clocks(*tracks, 1.0, 0.5, (Jump(0.45, 0.1, -0.3), Jump(1.05, 0.1, 0.2)))
     assert a.times[:11].tolist() == pytest.approx((torch.arange(11) / 10).tolist())
     assert a.times[11].item() == pytest.approx(1.3)
     assert b.times[9].item() == pytest.approx(0.9)
     assert b.times[10].item() == pytest.approx(1.3)
-
-
-def test_doubled_frames_stand_close_together():
     one = ClockBreak((1,), (0.35,), 0.1, 0.2, 0.0, 2, 99.0, (2.0, 1.0))
     times = repair_times(torch.arange(9, dtype=torch.float64) / 10, 1, [one])
     assert times.tolist() == pytest.approx([0, 0.1, 0.2, 0.3, 0.3 + 0.1 / 3, 0.3 + 0.2 / 3, 0.4, 0.5, 0.6])
