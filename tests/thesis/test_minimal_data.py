@@ -46,6 +46,7 @@ def paths(cameras: Tensor, n: int, seed: int) -> tuple[Tensor, ...]:
     return tuple(seen(cameras, lift(start + where * way)).unbind(0))
 
 
+@pytest.mark.slow
 def test_six_views_at_their_728_matches():
     rig = cameras(6, generator=seeded(3), angle=0.25, distance=6.0)
     given = paths(rig, 728, 4)

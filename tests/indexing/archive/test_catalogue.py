@@ -187,7 +187,7 @@ def test_damage_is_not_hidden_by_tidying_or_learning_again(tmp_path: Path, moves
     assert "is not what was written" in problem and problem.endswith("remove and add again 1")
     assert archive.remove("1") == 1 and archive.add(moves(1, name="1")).of("added") and archive.verify().ok
     assert sorted(names(archive)) == list("01234")
-    archive = Archive(tmp_path / "a", ArchiveOptions(relearn_factor=2.0))
+    archive = Archive(tmp_path / "b", ArchiveOptions(relearn_factor=2.0))
     archive.add(moves(0, name="0"))
     flip(segments(archive)[0], -500)
     archive.add(moves(1, seconds=9.0, name="1"))

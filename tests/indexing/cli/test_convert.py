@@ -49,6 +49,7 @@ def test_a_recording(run):
     assert run("convert one.c3d.npz -o one.trc")[0] == 2
 
 
+@pytest.mark.slow
 def test_people_and_fields_that_not_all_have_are_said(run):
     code, out, _ = run("convert two.json -o two.trc --fps 30")
     assert code == 0 and "two.json: 2 people in view; --person largest takes one" in out

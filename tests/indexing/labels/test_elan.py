@@ -173,6 +173,7 @@ def test_hostile_xml_and_empty_elements(tmp_path: Path) -> None:
             with pytest.raises(ValueError, match=said):
                 action(path)
             assert path.read_text() == text
+    path = tmp_path / "b.eaf"
     write_labels(path, [Label(1.0, 1.001, "a"), Label(2.0, 2.0003, "b"), Label(3.0, 3.0, "c")], recording="session.mp4")
     assert [(one.start, one.end) for one in open_labels(path).labels] == [(1.0, 1.002), (2.0, 2.002), (3.0, 3.0)]
     path.write_text(

@@ -71,6 +71,7 @@ def test_parts_cover_the_recording_and_stay_within_gaps(learned, recording) -> N
     assert parts.spans.min() >= clip.times[0] and parts.spans.max() <= clip.times[-1]
 
 
+@pytest.mark.slow
 def test_what_is_known_or_labelled_is_not_suggested(learned, recording, monkeypatch) -> None:
     clip, truth = recording
     parts = parts_of(learned, clip, [])

@@ -21,6 +21,7 @@ def report(**changes):
     return AgreementReport("m against a", compare(spans), spans, ("a.eaf", "m.safetensors"), ["a note"], **changes)
 
 
+@pytest.mark.slow
 def test_everything_is_written_and_says_the_same(tmp_path: Path) -> None:
     page = write_report(tmp_path / "out", report(manifest={"time": "now", "seed": None}))
     names = {path.name for path in page.parent.iterdir()}

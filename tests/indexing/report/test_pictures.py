@@ -129,6 +129,7 @@ def test_an_hour_is_drawn_in_time():
     assert time.process_time() - begin < 3.0 and len(png) < 1_000_000
 
 
+@pytest.mark.slow
 def test_events_and_truth_change_what_is_drawn_and_bars_say_what_they_are(tmp_path):
     times, scores = np.arange(100) / 10, np.zeros((100, 2))
     event = Hit("a", 2, 4)

@@ -362,6 +362,7 @@ def test_matches_on_one_line(bodies):
     assert int(found.bodies) >= 1 and float((found.labels > 0).double().mean()) > 0.9
 
 
+@pytest.mark.slow
 def test_copies_and_garbage_change_nothing_but_a_notice():
     scene = scene_of(80, 2, outliers=0.2)
     found = checked(*(x.repeat(3, 1) for x in scene.views))

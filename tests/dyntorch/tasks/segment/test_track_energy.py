@@ -140,6 +140,7 @@ def test_costs_are_least_in_the_own_body_and_few_tracks_cost_infinity():
     assert float(energy(evidence, geometry, few[None], scale)) == torch.inf
 
 
+@pytest.mark.slow
 def test_a_descent_improves_wrong_labels_and_starts_go_side_by_side():
     scene = shot((40, 30))
     evidence = evidence_of(scene, chain(scene))

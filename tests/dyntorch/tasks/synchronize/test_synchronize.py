@@ -130,6 +130,7 @@ def test_clock_rates_are_found(rate, seconds):
     assert f"rate {1e6 * (shift.rate - 1):+.0f} ±" in repr(shift)
 
 
+@pytest.mark.slow
 def test_rates_are_found_or_held():
     scene = film(12, seconds=20.0, n=10, fps=(30.0, 29.83), offset=0.5)
     shift = synced(scene, fps=30.0, max_shift=2.0)
