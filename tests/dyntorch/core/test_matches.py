@@ -55,15 +55,12 @@ def test_missing_ends_of_lines_and_weights_that_are_not_numbers():
     assert matches(dyn.TranslatingLinesMatrix(), (l1[0, :, 0].repeat(1, 2), l2[0, :, 0].repeat(1, 2))).count == 3
 
 
-def test_options_broadcast_over_the_batch_and_are_kept_by_a_part():
+def test_options_broadcast_and_gradients_pass():
     static = torch.tensor([True, False, False, True])
     data = matches(H, views(2, 3), torch.arange(4.0).double(), static)
     assert data.weights.tolist() == [[0.0, 1.0, 2.0, 3.0]] * 6 and data.static.tolist() == [static.tolist()] * 6
     less = data.restrict(static.expand(6, 4))
     assert less.weights.tolist() == [[0.0, 0.0, 0.0, 3.0]] * 6 and less.static is data.static and less.batch == (2, 3)
-
-
-def test_gradients_pass_and_missing_ones_are_zero():
     given = [x.requires_grad_() for x in views(2)]
     with torch.no_grad():
         given[0][0, 0] = torch.nan

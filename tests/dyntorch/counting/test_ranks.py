@@ -181,9 +181,13 @@ def test_rank_grows_match_by_match(name, option, options, profile):
     assert counted.minimal == len(profile)
 
 
-def test_labelled_static_points_save_moving_ones():
+def test_labelled_and_static_points_save_moving_ones_and_lines():
     for name, moving in (("homography", [26, 19, 12, 5, 0]), ("join", [60, 50, 40, 30, 20, 10, 4, 0])):
         assert [count(name, labelled_static=k, moving=0).missing for k in range(len(moving))] == moving
+    # two rigid objects reach 28 alone ("two objects are sufficient") and 35 with two static points
+    assert [count("lines", static_points=k, translating=60).rank for k in (0, 1, 2)] == [31, 34, 35]
+    assert [count("lines", static_points=k, objects=[60]).rank for k in (1, 2, 3, 4)] == [28, 33, 34, 35]
+    assert [count("lines", static_points=k, objects=[60, 60]).rank for k in (0, 2)] == [28, 35]
 
 
 @pytest.mark.slow
@@ -191,13 +195,6 @@ def test_synthetic_constraints_of_the_shape_tensor_leave_nine_dimensions():
     counted = count("shape_tensor", synthetic=True)
     assert counted.rank == 80 and counted.minimal == 2
     assert count("shape_tensor", synthetic=True, images=0).rank == dim_v(3, 4, 2) == 72
-
-
-def test_static_points_repair_translating_lines():
-    """Two rigid objects reach 28 alone ("two objects are sufficient") and 35 with two static points."""
-    assert [count("lines", static_points=k, translating=60).rank for k in (0, 1, 2)] == [31, 34, 35]
-    assert [count("lines", static_points=k, objects=[60]).rank for k in (1, 2, 3, 4)] == [28, 33, 34, 35]
-    assert [count("lines", static_points=k, objects=[60, 60]).rank for k in (0, 2)] == [28, 35]
 
 
 # --------------------------------------------------------------------------------------------------- samplers

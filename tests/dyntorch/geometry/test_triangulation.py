@@ -27,11 +27,14 @@ def apart(a, b, dims=1):
     return relative_error(a, b, dims=dims).max()
 
 
-def test_reproject_is_the_division_by_the_depth():
+def test_reproject_is_the_division_by_the_depth_of_what_is_observed():
     projections, structure, x = scene(4, 2, 3, batch=(2,))
     image = torch.einsum("bvmk,bnk->bvnm", projections, structure)
     torch.testing.assert_close(x, image[..., :-1] / image[..., -1:])
     assert (reproject(projections, torch.zeros_like(structure)) == 0).all()
+    x = torch.tensor([[[1.0, 2.0], [float("nan"), 0.0], [3.0, 4.0]]])
+    images, weights = mask_missing(x, torch.tensor([[2.0, 1.0, float("nan")]]))
+    assert images.tolist() == [[[1.0, 2.0], [0.0, 0.0], [0.0, 0.0]]] and weights.tolist() == [[2.0, 0.0, 0.0]]
 
 
 @pytest.mark.parametrize(("k", "dim", "views"), CASES)
@@ -141,12 +144,6 @@ def test_gradients(steps):
 
     assert torch.autograd.gradcheck(images, (projections.requires_grad_(), x.requires_grad_()), atol=1e-5)
     assert torch.autograd.gradcheck(lambda s, y: reproject(resect(s, y), s), (structure.requires_grad_(), x), atol=1e-5)
-
-
-def test_what_is_observed():
-    x = torch.tensor([[[1.0, 2.0], [float("nan"), 0.0], [3.0, 4.0]]])
-    images, weights = mask_missing(x, torch.tensor([[2.0, 1.0, float("nan")]]))
-    assert images.tolist() == [[[1.0, 2.0], [0.0, 0.0], [0.0, 0.0]]] and weights.tolist() == [[2.0, 0.0, 0.0]]
 
 
 def test_misuse():

@@ -13,15 +13,12 @@ def scene(n, matches, **options):
     return scenes.collineation(n, matches, generator=torch.Generator().manual_seed(0), **options)
 
 
-def test_class_stands_for_the_plane():
+def test_class_stands_for_the_plane_and_maps_view_two_to_view_one():
     assert Collineation.minimal() == 4
     assert Collineation().n == 2
     assert repr(Collineation(3)) == "Collineation(n=3)"
     with pytest.raises(ValueError, match="got 0"):
         Collineation(0)
-
-
-def test_transfer_maps_view_two_to_view_one():
     found = scene(3, 20, batch=4)
     torch.testing.assert_close(Collineation.transfer(-2 * found.motion[0], found.views[1]), found.views[0])
 

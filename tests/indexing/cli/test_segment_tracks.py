@@ -142,11 +142,15 @@ def test_what_is_written_is_read_again(run, solved):
     assert solved["tracks"].shape == before.shape and float(solved["tracks"].nansum()) == pytest.approx(float(before.nansum()))
 
 
-def test_flags_reach_the_library(run, solved):
+def test_flags_and_stretches_reach_the_library(run, solved):
     code, out, _ = run("@/t.csv --bodies 3 --threshold 1.5 --seed 7 --frames 0,2,4,11")
     assert code == 0 and "note: --bodies asks for 3, the tracks carry 2" in out
     assert solved["bodies"] == 3 and solved["threshold"] == 1.5 and solved["generator"].initial_seed() == 7
     assert solved["tracks"].shape[0] == 4 and re.search(r"body 1 \(static\).* 1\.00 ", out)  # a frame is a frame of the file
+    assert run("@/t.csv --frames 2-8")[0] == 0 and solved["tracks"].shape[0] == 7
+    np.testing.assert_array_equal(solved["tracks"][:, :32].numpy(), moving()[2:9, :32])
+    code, out, _ = run("@/room.mp4 --frames 6-11")
+    assert code == 0 and "note: frames 6 to 11 of the 12 that were read" in out and solved["tracks"].shape[0] == 6
 
 
 @pytest.mark.slow
@@ -168,13 +172,6 @@ def test_pictures(run, solved):
     code, out, _ = run("@/room --out out")
     assert code == 0 and "frames 0 to 11 of the 12 that were read" in out and " s)" not in out and Path("out", FILM).is_file()
     assert run("@/room/*.png --frames 0,3,6,9")[0] == 0 and solved["tracks"].shape[0] == 4
-
-
-def test_a_stretch(run, solved):
-    assert run("@/t.csv --frames 2-8")[0] == 0 and solved["tracks"].shape[0] == 7
-    np.testing.assert_array_equal(solved["tracks"][:, :32].numpy(), moving()[2:9, :32])
-    code, out, _ = run("@/room.mp4 --frames 6-11")
-    assert code == 0 and "note: frames 6 to 11 of the 12 that were read" in out and solved["tracks"].shape[0] == 6
 
 
 @pytest.mark.slow

@@ -159,7 +159,7 @@ def test_frames_before_the_reference_are_mentioned(run, library):
 
 # ---- what is refused -----------------------------------------------------------------------------------------------------
 @pytest.mark.slow
-def test_what_is_there_is_not_lost_and_what_does_not_decide_is_refused(run, library, data, tmp_path):
+def test_what_does_not_decide_is_refused_and_writes_no_files(run, library):
     line = "@/pose/cam01_json @/pose/cam02_json --fps 30 --out out"
     assert run(line)[0] == 0 and Path("out/pose-sync").is_dir()
     library[0, 1] = {"ok": False, "reason": Message("the motion is periodic: record a single move, or give {arg:max_shift=0.5}")}
@@ -171,6 +171,11 @@ def test_what_is_there_is_not_lost_and_what_does_not_decide_is_refused(run, libr
     assert "or give --max-shift 0.5" in found["pairs"][0]["reason"] and "max_shift" not in page
     assert not found["ok"] and "periodic" in found["reason"] and found["pairs"][0]["peaks"] and not found["pairs"][0]["ok"]
     assert "do not decide" in page and "not to be relied on" in page
+
+
+@pytest.mark.slow
+def test_what_is_there_is_not_lost(run, library, data, tmp_path):
+    line = "@/pose/cam01_json @/pose/cam02_json --fps 30 --out out"
     Path("out/pose-sync").mkdir(parents=True)
     Path("out/pose-sync/mine.txt").write_text("mine")
     code, _, err = run(line)

@@ -97,10 +97,15 @@ def test_order_of_clips_changes_nothing_and_given_phases_are_kept(train, asked):
     assert np.median(np.abs((off + 0.5) % 1 - 0.5)) < 0.05
 
 
-def test_depth_is_used():
+def test_depth_is_used_and_events_have_levels():
     solid = [perform(action, Person.random(1), fps=8.0, rng=1) for action in ("squat", "kick")]
     found = PhaseIndexer(harmonics=1).fit(solid)
     assert found.predict([detect(clip, azimuth=70.0, rng=3) for clip in solid]).tolist() == ["squat", "kick"]
+    wrong = torch.linspace(0, 1, 101, dtype=torch.float64)
+    assert event_levels(wrong, 0.2) == pytest.approx((0.8, 0.66))
+    assert event_levels(wrong, None) == pytest.approx((0.9, 0.83))
+    assert event_levels(wrong[:0], None) == event_levels(wrong - 9, None) == (0.3, 0.0)
+    assert event_levels(wrong, 1.5) == (1.5, 1.5)
 
 
 def test_bad_parameters(train):
@@ -145,14 +150,6 @@ def test_seconds_of_a_class_left_out_are_scored_by_the_others_alone(train):
         assert rest.label.tolist() == [keep.index(k) for k in model.label.tolist() if k != c]
         assert rest.evidence(frames)[0].shape == (len(train[1]), 2)
     assert len(model.wrong) > 3
-
-
-def test_levels_of_events():
-    wrong = torch.linspace(0, 1, 101, dtype=torch.float64)
-    assert event_levels(wrong, 0.2) == pytest.approx((0.8, 0.66))
-    assert event_levels(wrong, None) == pytest.approx((0.9, 0.83))
-    assert event_levels(wrong[:0], None) == event_levels(wrong - 9, None) == (0.3, 0.0)
-    assert event_levels(wrong, 1.5) == (1.5, 1.5)
 
 
 @pytest.mark.slow

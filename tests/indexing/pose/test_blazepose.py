@@ -174,16 +174,13 @@ def test_what_is_seen_in_a_region_is_put_back_where_it_is(tmp_path, size, degree
     np.testing.assert_allclose(got, joints_of(hips, circle), atol=max(1.0, 0.02 * length))
 
 
-def test_levels_halve_exactly_and_odd_lines_are_left_out(tmp_path):
+def test_levels_halve_exactly_and_the_edge_goes_on_or_is_black(tmp_path):
     rng = np.random.default_rng(0)
     image = rng.integers(0, 255, (46, 62, 3)).astype(np.uint8)
     picture = VideoPicture(frame_of(tmp_path, image))
     base = picture.level(0).astype(float)
     assert [picture.level(k).shape[:2] for k in range(4)] == [(46, 62), (23, 31), (11, 15), (5, 7)]
     np.testing.assert_allclose(picture.level(1), base.reshape(23, 2, 31, 2, 3).mean(axis=(1, 3)), atol=1)
-
-
-def test_the_edge_goes_on_or_is_black_and_frames_of_another_size_are_brought_to_the_first_ones(tmp_path):
     frame = frame_of(tmp_path, np.full((64, 64, 3), 200, np.uint8))
     picture, outside = VideoPicture(frame), Region(0, 32, 64)
     assert picture.extract_region(outside, 64).min() > 190

@@ -186,18 +186,6 @@ def test_page_parts_escape_and_nest():
     assert 'width="100.0"' in page.bar(1.7) and 'width="0.0"' in page.bar(-1)
 
 
-def test_what_is_always_right_takes_one_line(tmp_path):
-    names = ["squat", "lunge", "kick"]
-    right = EvaluationResult(names, names * 2, names * 2, "azimuth 0")
-    text = write(tmp_path / "right", RecognitionReport("All right", evaluations=[right]))
-    assert "Always recognized, and nothing else taken for them (clips in brackets): squat (2), lunge (2), kick (2)." in text
-    assert "No action was taken for another one" in text and "Confusion matrix" not in text
-    assert (tmp_path / "right" / "confusion.png").exists()
-    wrong = EvaluationResult(names, names * 2, [*names, "lunge", "lunge", "kick"], "azimuth 0")
-    text = write(tmp_path / "wrong", RecognitionReport("Two alike", evaluations=[wrong]))
-    assert "for them (clips in brackets): kick (2)." in text and "Most often taken for" in text and "Confusion matrix" in text
-
-
 def test_finds_are_explained_and_the_comparison_stacks_on_narrow_screens(tmp_path):
     events = [Hit("squat", 1, 3), Hit("lunge", 5, 6.5)]
     plain = EvaluationResult(["squat"], ["squat"], ["lunge"], "azimuth 0", baseline=["squat"])

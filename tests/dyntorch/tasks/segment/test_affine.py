@@ -132,12 +132,3 @@ def test_misuse():
     ):
         with pytest.raises(ValueError, match=words):
             affine_segmentation(*given)
-
-
-def test_results_print_in_two_lines():
-    x1, x2, _, _ = bodies(counts=(15, 12))
-    x1[0] = torch.nan
-    said = "AffineSegmentation(matches=27, bodies=2, batch=(): not degenerate)\n  labels: 14 of body 1, 12 of body 2, 1 unlabelled"
-    assert repr(affine_segmentation(x1, x2)) == said
-    both = affine_segmentation(torch.stack([x1, 0 * x1]), torch.stack([x2, 0 * x2]))
-    assert repr(both).startswith("AffineSegmentation(matches=27, bodies=2, batch=(2,): 1 of 2 degenerate)")
