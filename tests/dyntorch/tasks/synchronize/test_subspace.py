@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from dyntorch.tasks.synchronize.row_spaces import LagCovariances
 from dyntorch.tasks.synchronize.subspace import (
     HEIGHT_SAMPLE_RATE,
     MOTION_SAMPLE_RATE,
@@ -192,3 +193,11 @@ def test_the_parabola_and_the_posterior_of_a_known_curve():
     weights = torch.softmax(scores, 0)
     assert found.probability == pytest.approx(float(weights[32:35].sum()), abs=1e-9)
     assert found.sigma == pytest.approx(math.hypot(0.2, math.sqrt(0.2)), abs=1e-9)
+
+
+def test_covariances_in_units_of_the_noise_are_those_of_rows_in_these_units():
+    a, b = random(40, 4, seed=1), random(40, 3, seed=2)
+    scaled = LagCovariances.of(a, b, (-3, 3)).scale((0.25, 9.0))
+    expected = LagCovariances.of(a / 0.5, b / 3, (-3, 3))
+    for part in ("aa", "bb", "ab", "counts"):
+        torch.testing.assert_close(getattr(scaled, part), getattr(expected, part))
