@@ -50,6 +50,7 @@ CHANGED: dict[str, dict[str, Any]] = {
     "archive, the query's tempo only": {"TEMPOS": (1.0,)},
     "archive, five tempi": {"TEMPOS": (0.64, 0.8, 1.0, 1.25, 1.56)},
     "archive, scanned in 16 steps": {"NUM_SAMPLES": 16},
+    "archive, refined in 4 steps": {"NUM_FINE_SAMPLES": 4},
     "archive, candidates farther apart": {"MIN_SEPARATION": 0.35},
     "archive, nothing refined": {"SHIFTS": (0.0,)},
     "archive, 30 candidates": {"num_candidates": 30},

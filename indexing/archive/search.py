@@ -34,13 +34,15 @@ Progress = Callable[[float], None] | None
 TEMPOS = (0.8, 1.0, 1.25)  # durations that are searched, in those of the query: people differ
 # durations of a recording up to which its first and last windows are compared: they may lie between two steps of the scan
 MAX_TRIMMED = 2.0
-NUM_SAMPLES = 4  # steps that a window is divided into by its sketch, where its duration allows
-MAX_SCANNED_WINDOWS = 2000  # of the scan that are compared at all tempos, and moved to the pose where they fit best
+NUM_SAMPLES = 4  # steps that a window is divided into by the scan, where its duration allows
+NUM_FINE_SAMPLES = 16  # the same of the windows that are kept
+MAX_SCANNED_WINDOWS = 2000  # of the scan that are compared at all tempos by more samples, and moved to the pose where they fit best
 MIN_SEPARATION = 0.05  # durations between two candidates; of right ones among ten in exercises, .2 finds .49, .05 .54
 SHIFTS = (-0.1, -0.05, 0.0, 0.05, 0.1)  # durations, in its own, by which a candidate is moved where it is compared exactly
 MAX_REFINED = 100  # best candidates that are moved and stretched
 MAX_OVERLAP = 0.5  # of the shorter of two hits of one person, from which they are one
 MAX_EXAMPLE_SECONDS = 30.0  # a longer example is no movement but a recording
+READ_AROUND = 2  # poses beyond both ends of a window: what the first and last of its steps are averaged from
 
 
 # ---- the example ---------------------------------------------------------------------------------------------------------
@@ -69,6 +71,7 @@ class Query:
 
     windows: Windows
     probes: tuple[Probe, ...]
+    fine: tuple[Probe, ...]
 
 
 def check_example(clip: Clip, min_duration: float) -> Clip:
@@ -122,19 +125,34 @@ def _example(clip: Clip, layout: Layout, rate: float, views: Sequence[float], mi
         # an image and its mirror image are of one shape: only the joints change places
         clips += [one.replace(joints=one.joints[:, swap]) for one in clips]
     source = concatenate_clips(clips)
-    probes = [probe_of(source, i, layout, rate, tempo, mirrored=i >= count) for i in range(len(clips)) for tempo in TEMPOS]
+    coarse, fine = (
+        [
+            probe_of(source, i, layout, rate, tempo, samples, mirrored=i >= count)
+            for i in range(len(clips))
+            for tempo in dict.fromkeys((1.0, *TEMPOS))
+        ]
+        for samples in (NUM_SAMPLES, NUM_FINE_SAMPLES)
+    )
     windows = Windows(resample_clips(source, WINDOW_LENGTH), torch.from_numpy(source.seen))
-    return Query(windows, tuple(one for one in probes if one is not None))
+    return Query(windows, tuple(one for one in coarse if one is not None), tuple(one for one in fine if one is not None))
 
 
 def probe_of(
-    source: Ragged, image: int, layout: Layout, rate: float, tempo: float, *, mirrored: bool = False, moving: bool = False
+    source: Ragged,
+    image: int,
+    layout: Layout,
+    rate: float,
+    tempo: float,
+    num_samples: int = NUM_SAMPLES,
+    *,
+    mirrored: bool = False,
+    moving: bool = False,
 ) -> Probe | None:
     """One image of an example at one tempo; ``None`` where hardly any joint was seen."""
     first, last = source.starts[image], source.starts[image + 1] - 1
     begin, end = float(source.times[first]), float(source.times[last])
     seconds = (end - begin) * tempo
-    stride = max(1, int(seconds * rate / NUM_SAMPLES + 1e-6))
+    stride = max(1, int(seconds * rate / num_samples + 1e-6))
     samples = max(2, int(seconds * rate / stride + 1e-6) + 1)
     # the moments of the example that lie under poses of the archive, in the middle of it
     at = (begin + end) / 2 + (np.arange(samples) - (samples - 1) / 2) * stride / rate / tempo
@@ -274,7 +292,7 @@ def merge_candidates(
     segment = np.repeat([i for i, _ in best], [len(one) for _, one in best]).astype(np.intp)
     every = Candidates.concatenate([one for _, one in best])
     track, row, probe, score = every.track, every.row, every.probe, every.score.astype(float)
-    asked = [queries[rows[i].layout].probes[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
+    asked = [queries[rows[i].layout].fine[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
     middle = (row + np.array([one.span / 2 for one in asked])) / rate
     half = np.array([one.seconds / 2 for one in asked])
     kept: list[int] = []
@@ -294,7 +312,7 @@ def merge_candidates(
 def _refine(
     snapshot: Snapshot, queries: Mapping[int, Query], scanned: Sequence[tuple[int, Candidates]]
 ) -> list[tuple[int, Candidates]]:
-    """The best of all scans, at every tempo and to the pose: ``(segment, candidates)``."""
+    """The best of all scans, by more samples and to the pose: ``(segment, candidates)``."""
     rows = snapshot.contents.segments
     every = Candidates.concatenate([one for _, one in scanned])
     scan_of = np.repeat(np.arange(len(scanned)), [len(one) for _, one in scanned])
@@ -304,7 +322,7 @@ def _refine(
         i = scanned[number][0]
         query = queries[rows[i].layout]
         mine = np.sort(best[scan_of[best] == number])
-        out.append((i, refine_candidates(snapshot.segments[i], query.probes, every[mine])))
+        out.append((i, refine_candidates(snapshot.segments[i], query.probes, query.fine, every[mine])))
     return out
 
 
@@ -335,8 +353,8 @@ def cut_windows(places: Places, segments: Sequence[ArchiveSegment]) -> Windows:
         begin, end = places.begin[mine], places.end[mine]
         rows = segment.tracks[track, 3]
         # a window that hangs over an end repeats the pose there
-        first = np.clip(np.floor(begin * segment.rate).astype(np.intp), 0, rows - 2)
-        last = np.clip(np.ceil(end * segment.rate).astype(np.intp) + 1, first + 2, rows)
+        first = np.clip(np.floor(begin * segment.rate).astype(np.intp) - READ_AROUND, 0, rows - 2)
+        last = np.clip(np.ceil(end * segment.rate).astype(np.intp) + READ_AROUND + 1, first + 2, rows)
         counts = last - first
         starts = np.concatenate([[0], np.cumsum(counts)])
         step = np.arange(starts[-1]) - np.repeat(starts[:-1], counts) + np.repeat(first, counts)
@@ -368,7 +386,7 @@ def _scores(snapshot: Snapshot, queries: Mapping[int, Query], shortlist: Shortli
     for number in np.unique(layouts).tolist():
         mine = np.flatnonzero(layouts == number)
         query = queries[number]
-        image = np.array([query.probes[p].image for p in shortlist.probe[mine].tolist()], dtype=np.intp)
+        image = np.array([query.fine[p].image for p in shortlist.probe[mine].tolist()], dtype=np.intp)
         metric = snapshot.contents.layouts[number].joint_metric()
         out[mine] = -residuals(query.windows, image, shortlist.places[mine], snapshot.segments, metric)
     return out

@@ -137,21 +137,21 @@ def scan(
     return found.candidates(segment)
 
 
-def refine_candidates(segment: ArchiveSegment, probes: Sequence[Probe], found: Candidates) -> Candidates:
+def refine_candidates(segment: ArchiveSegment, coarse: Sequence[Probe], fine: Sequence[Probe], found: Candidates) -> Candidates:
     """Candidates of a scan, at every tempo moved by less than a step of it to where they resemble the example best."""
     parts: list[Candidates] = []
     for number in np.unique(found.probe).tolist():
         mine = np.flatnonzero(found.probe == number)
-        track, scanned = found.track[mine], probes[number]
+        track, image = found.track[mine], coarse[number].image
         first, rows = segment.firsts[track], segment.tracks[track, 3]
-        for index, probe in enumerate(probes):
-            if probe.image != scanned.image:
+        for index, probe in enumerate(fine):
+            if probe.image != image:
                 continue
             # both windows have one middle; one that hangs over the ends of its track stays as it is
-            row, score = found.row[mine] + (scanned.span - probe.span) // 2, found.score[mine].copy()
+            row, score = found.row[mine] + (coarse[number].span - probe.span) // 2, found.score[mine].copy()
             last = rows - 1 - probe.span
             fits = last >= 0
-            moves = np.arange(-(scanned.stride // 2), scanned.stride // 2 + 1)
+            moves = np.arange(-(coarse[number].stride // 2), coarse[number].stride // 2 + 1)
             begin = np.clip(row[:, None] + moves, 0, np.maximum(last, 0)[:, None])[fits]
             each = _scores_at(segment, probe, begin + first[fits, None])
             best, count = each.argmax(axis=1), np.arange(len(each))

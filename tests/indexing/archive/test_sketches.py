@@ -56,11 +56,11 @@ def reference(segment, probe):
     return found
 
 
-def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=False):
+def probe(segment, layout, seconds=1.0, track=0, begin=4.0, tempo=1.0, moving=False, samples=4):
     rows = slice(round(begin * segment.rate), round((begin + seconds) * segment.rate) + 1)
     joints = segment.positions(track)[rows]
     source = concatenate_clips([Clip(joints, times=np.arange(len(joints)) / segment.rate)])
-    return probe_of(source, 0, layout, segment.rate, tempo, moving=moving)
+    return probe_of(source, 0, layout, segment.rate, tempo, samples, moving=moving)
 
 
 def squared_cosine(window, example):
@@ -80,12 +80,14 @@ def test_scan_is_the_best_of_every_window_and_candidates_settle_where_they_fit_b
         assert result.score[0] >= max(reference(stored, example).values()) - 1e-3
         assert result.track[0] == 0 and abs(result.row[0] / stored.rate - 4.0) <= 1 / stored.rate + 0.1 * seconds
     probes = [probe(stored, layout, 2.5, tempo=tempo) for tempo in (0.8, 1.0, 1.25)]
+    finer = [probe(stored, layout, 2.5, tempo=tempo, samples=16) for tempo in (0.8, 1.0, 1.25)]
+    assert finer[1].samples > 2 * probes[1].samples
     start, scanned = np.array([60, 58, 150]), probes[1]
     found = Candidates(np.zeros(3, np.float32), np.zeros(3, np.int64), start, np.ones(3, np.int64))
-    moved = refine_candidates(stored, probes, found)
+    moved = refine_candidates(stored, probes, finer, found)
     assert moved.probe.tolist() == np.repeat(range(3), 3).tolist() and moved.score.argmax() == 3 and moved.score[3] > 0.999
     for number, begin, row, score in zip(moved.probe, np.tile(start, 3), moved.row, moved.score, strict=True):
-        fine, half = probes[number], scanned.stride // 2
+        fine, half = finer[number], scanned.stride // 2
         middle = begin + (scanned.span - fine.span) // 2
         values = {at: squared_cosine(*planes(stored, fine, 0, at)) for at in range(middle - half, middle + half + 1)}
         assert [score, values[row]] == pytest.approx([max(values.values())] * 2, abs=1e-3)
