@@ -18,7 +18,7 @@ NUMERICAL := tests/dyntorch tests/battery tests/test_readme.py tests/indexing/ac
 
 install: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml constraints.txt hatch_build.py dyntorch/native/kernel.c
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "dyntorch needs Python 3.11 or newer; try: make PYTHON=python3.12 ...")'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 ifeq ($(TORCH)-$(shell uname -s),cpu-Linux)
@@ -30,7 +30,7 @@ endif
 	@echo "Installing dyntorch and its packages into $(VENV): about a minute in which pip says nothing, longer if much is to be fetched ..."
 	@$(PIP) --constraint constraints.txt --editable '.[dev]'
 	@touch $(STAMP)
-	@echo "Installed."
+	@echo "Installed: $$($(BIN)/dyntorch --version)."
 
 demo: install
 	@echo "The demo takes 10 to 20 seconds."
@@ -47,11 +47,12 @@ test-slow: install
 
 test-all: test test-slow
 
-# the fast numerical tests with the arithmetic of another processor, then with two threads in each worker
+# the fast numerical tests without the kernel and with the arithmetic of another processor, then with two threads in each worker and the
+# kernel for the oldest processors
 portable: install
-	ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 MKL_CBWR=COMPATIBLE OMP_NUM_THREADS=1 \
+	DYNTORCH_NATIVE=0 ATEN_CPU_CAPABILITY=default MKL_ENABLE_INSTRUCTIONS=SSE4_2 MKL_CBWR=COMPATIBLE OMP_NUM_THREADS=1 \
 	  $(BIN)/python -m pytest -n auto -m "not slow" $(NUMERICAL)
-	OMP_NUM_THREADS=2 $(BIN)/python -m pytest -n auto -m "not slow" $(NUMERICAL)
+	DYNTORCH_NATIVE=base OMP_NUM_THREADS=2 $(BIN)/python -m pytest -n auto -m "not slow" $(NUMERICAL)
 
 lint: install
 	$(BIN)/ruff check .

@@ -50,7 +50,7 @@ def test_packages_do_not_import_what_stands_on_them(package, above):
     assert offenders(package, lambda module, _: any(within(module, p) for p in ("experiments", "tests", *above))) == []
 
 
-LAYERS = [{"numerics", "counting"}, {"geometry"}, {"core"}, {"shapes"}, {"invariants"}, {"tasks"}]
+LAYERS = [{"native", "counting"}, {"numerics"}, {"geometry"}, {"core"}, {"shapes"}, {"invariants"}, {"tasks"}]
 """The rooms of dyntorch, from the ground up; each imports those below it."""
 ASIDE = {"scenes", "metrics"}
 """Nothing of the library stands on these: they serve tests, experiments and the demo."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -13,14 +13,17 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from dyntorch.core.invariant import Invariant, as_invariant
+from dyntorch.core.kernel_fit import slot_kinds
 from dyntorch.core.matches import Matches, check_plain, matches, relative_weights
 from dyntorch.core.matrix import estimation_matrix, gram, labelled_rows, triangular_factor, within_noise
 from dyntorch.core.normalize import Normalization, denormalize, normalization
 from dyntorch.core.outcome import Status, is_failure
 from dyntorch.core.primitives import Primitive
 from dyntorch.core.solution import Solution, with_copies
-from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
-from dyntorch.numerics.eigenspaces import on_host, orthonormal
+from dyntorch.geometry.homogeneous import similarity
+from dyntorch.native import library
+from dyntorch.numerics.blocks import each, map_blocks, one_thread, replace_problems, select, workers
+from dyntorch.numerics.eigenspaces import RESOLVED, on_host, orthonormal
 from dyntorch.numerics.function_transforms import over_problems
 from dyntorch.numerics.nullspace import GramNullSpace, gram_null_space, null_space
 
@@ -152,6 +155,51 @@ def _largest(invariant: Invariant) -> int:
 def _fit_block(
     invariant: Invariant, normalize: bool, precision: float, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
 ) -> LinearFits:
+    """One block: by the kernel where there is one, what it leaves by torch."""
+    kinds = slot_kinds(invariant, views, weights, static)
+    if not kinds or not weights.numel():
+        return _fit_by_torch(invariant, normalize, precision, views, weights, static)
+    fits, left = _fit_by_kernel(invariant, kinds, normalize, views, relative_weights(weights))
+    if len(left) == len(weights):
+        return _fit_by_torch(invariant, normalize, precision, views, weights, None)
+    if len(left):
+        rest = _fit_by_torch(invariant, normalize, precision, tuple(x[left] for x in views), weights[left], None)
+        fits = replace_problems(fits, left, rest)
+    return fits
+
+
+def _fit_by_kernel(
+    invariant: Invariant, kinds: Sequence[int], normalize: bool, views: tuple[Tensor, ...], weights: Tensor
+) -> tuple[LinearFits, Tensor]:
+    """Fits of one block, and the problems ``(k,)`` that they say nothing of."""
+    nullity, width = invariant.nullity, invariant.width()
+    space = library.fit_points(kinds, views, weights, [p.width for p in invariant.primitives], nullity, normalize)
+    count = (weights > 0).sum(-1)
+    present = count * invariant.rows()
+    spare = (present - (width - nullity)).clamp(min=0)
+    square, rounding, weak = _relative_noise(space.residual, space.competing, space.trace, spare)
+    exact = (rounding > MAX_GRAM_ROUNDING) & (rounding > 1e-3 * square)
+    unsolved = (
+        ~space.certified | (space.following <= RESOLVED) | exact | (count < invariant.minimal()) | (present < width - nullity)
+    )
+    left = unsolved.nonzero()[:, 0]
+    transforms = tuple(similarity(space.scale[:, v], space.centre[:, v, : x.shape[-1]]) for v, x in enumerate(views))
+    norm = Normalization.of(invariant, transforms)
+    ambiguous = square * present.clamp(min=1) > _ambiguity_limit(spare, width)
+    place = (weak & ~unsolved & ~ambiguous).nonzero()[:, 0]
+    if len(place):
+        slots = zip(invariant.primitives, views, transforms, strict=True)
+        moved = tuple(p.move(x[place], t[place]) for p, x, t in slots)
+        parts = (norm.primitives, moved, weights[place], None, space.basis[place], invariant.resolves_noise)
+        ambiguous[place] = within_noise(*parts, second=space.second[place, None])
+    tensor = invariant.normalize(transforms).constrain(invariant.tensor_of(space.basis))
+    never = torch.zeros_like(ambiguous)
+    return _carried_back(invariant, norm, tensor, _status(never, never, ambiguous), square.sqrt()), left
+
+
+def _fit_by_torch(
+    invariant: Invariant, normalize: bool, precision: float, views: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
+) -> LinearFits:
     """One block."""
     # components first in memory: every later pass then runs along the matches
     views = tuple(x.mT.contiguous().mT for x in views)
@@ -172,6 +220,11 @@ def _fit_block(
         status = _status(own.few, own.degenerate, own.ambiguous)
     if invariant.copies is not None:
         status, uncertainty = status.amax(-1), uncertainty.amax(-1)
+    return _carried_back(invariant, norm, tensor, status, uncertainty)
+
+
+def _carried_back(invariant: Invariant, norm: Normalization, tensor: Tensor, status: Tensor, uncertainty: Tensor) -> LinearFits:
+    """Fits of normalized matches in the measured coordinates."""
     tensor = select(~is_failure(status), tensor, 0.0)
     # coordinates may be so large or small that float64 holds no tensor of theirs
     back = denormalize(invariant, tensor, norm.actions)
@@ -223,16 +276,13 @@ def _solve_null_space(invariant: Invariant, rows: EstimationRows) -> tuple[Tenso
     space, judged_by_rows = _null_space_by_rows(g, nullity, factor, torch.where(few, torch.inf, rows.rounding))
     basis = space.basis
     spare = (present - (width - nullity)).clamp(min=0)
-    # the noise that the solution leaves, per row, against what every other direction has
-    noise = space.residual.clamp(min=0).mean(-1) / spare.clamp(min=1)
-    square = torch.where(spare > 0, noise * space.competing, torch.zeros_like(noise)).detach()
     trace = g.diagonal(dim1=-2, dim2=-1).sum(-1)
-    rounding = torch.finfo(g.dtype).eps * (trace * space.competing).detach()
-    exact = (rounding > MAX_GRAM_ROUNDING) & (rounding > 1e-3 * square)
-    exact = (exact.index_fill(0, judged_by_rows, True) if len(judged_by_rows) else exact) & ~space.degenerate
     # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
     limit = 0.0 if invariant.intrinsic else MIN_CONDITION_OF_NOISE
-    weak = (spare > 0) & ~space.degenerate & (trace * space.competing > limit)
+    square, rounding, weak = _relative_noise(space.residual, space.competing, trace, spare, limit)
+    exact = (rounding > MAX_GRAM_ROUNDING) & (rounding > 1e-3 * square)
+    exact = (exact.index_fill(0, judged_by_rows, True) if len(judged_by_rows) else exact) & ~space.degenerate
+    weak = weak & ~space.degenerate
     if invariant.copies is not None:
         weak = torch.zeros_like(weak)
     worn = exact & (rounding > MAX_GRADIENT_ROUNDING) & (rounding > square) & _needs_gradient(g)
@@ -248,6 +298,17 @@ def _solve_null_space(invariant: Invariant, rows: EstimationRows) -> tuple[Tenso
         with torch.no_grad():
             ambiguous[place] |= within_noise(*rows.of(place).parts, basis[place], invariant.resolves_noise)
     return basis, _status(few, space.degenerate, ambiguous), square.sqrt()
+
+
+def _relative_noise(
+    residual: Tensor, competing: Tensor, trace: Tensor, spare: Tensor, limit: float = MIN_CONDITION_OF_NOISE
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The noise that a solution leaves, per row, against what every other direction has, squared; the rounding of its Gram; and
+    whether the last of the others may be noise alone.  residual ``(*batch, nullity)``, the rest ``(*batch,)``."""
+    noise = residual.clamp(min=0).mean(-1) / spare.clamp(min=1)
+    square = torch.where(spare > 0, noise * competing, torch.zeros_like(noise)).detach()
+    condition = (trace * competing).detach()
+    return square, torch.finfo(trace.dtype).eps * condition, (spare > 0) & (condition > limit)
 
 
 def _ambiguity_limit(spare: Tensor, width: int) -> Tensor:

@@ -175,29 +175,53 @@ errors of 4 to 32 px)."""
 
 
 def within_noise(
-    primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None, basis: Tensor, resolves: bool
+    primitives: Sequence[Primitive],
+    views: Sequence[Tensor],
+    weights: Tensor,
+    static: Tensor | None,
+    basis: Tensor,
+    resolves: bool,
+    second: Tensor | None = None,
 ) -> Tensor:
     r"""Whether the residual of the second best tensor is explained by the noise that the best one shows. views ``(b, n, ...)``,
-    weights ``(b, n)``, static ``(b, n)``, basis ``(b, nullity, D)`` -> ``(b,)``."""
-    g = gram(primitives, views, weights, static)
+    weights ``(b, n)``, static ``(b, n)``, basis ``(b, nullity, D)``, second ``(b, 1, D)`` -> ``(b,)``."""
+    if second is None:
+        g = gram(primitives, views, weights, static)
+        # the null space at the other end of the spectrum: where its eigenvalue and the next one are both lost in rounding, an
+        # eigenvector beside it is one beside it all the same
+        away = g + g.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * (basis.mT @ basis)
+        second = eigh(away)[1][..., :1].mT
     # a part of very many matches tells as much about the noise
     step = -(-weights.shape[1] // ENOUGH)
     views, weights = [x[:, ::step] for x in views], weights[:, ::step]
     static = None if static is None else static[:, ::step]
-    # the null space at the other end of the spectrum: where its eigenvalue and the next one are both lost in rounding, an
-    # eigenvector beside it is one beside it all the same
-    away = g + g.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * (basis.mT @ basis)
-    second = eigh(away)[1][..., :1]
     # a generator of its own: the same matches get the same answer, on any device and beside any others, and the caller's random
     # numbers stay
     draw = torch.Generator().manual_seed(0)
     shifts = [STEP * torch.randn(x.shape[1:], generator=draw, dtype=x.dtype).to(x.device).expand_as(x) for x in views]
     moved = [p.add_noise(x, change) for p, x, change in zip(primitives, views, shifts, strict=True)]
-    rows = estimation_matrix(primitives, views, weights, static)
-    change = estimation_matrix(primitives, moved, weights, static) - rows
-    first = basis.mT
-    left, other = (rows @ first).square().mean((-2, -1)), (rows @ second).square().mean((-2, -1))
-    noise = left / (change @ first).square().mean((-2, -1)).clamp(min=1e-300)
-    energy = other / (change @ second).square().mean((-2, -1)).clamp(min=1e-300)
-    near = energy <= MARGIN * noise
+    forms = torch.cat([basis, second], dim=-2)
+    values = _values(primitives, views, weights, static, forms)
+    changes = (_values(primitives, moved, weights, static, forms) - values).square()
+    energy, change = values.square().mean(-2), changes.mean(-2).clamp(min=1e-300)
+    left, other = energy[:, :-1].mean(-1), energy[:, -1]
+    noise, following = left / change[:, :-1].mean(-1), other / change[:, -1]
+    near = following <= MARGIN * noise
     return near & (left > TURN**2 * other) if resolves else near
+
+
+def _values(
+    primitives: Sequence[Primitive], views: Sequence[Tensor], weights: Tensor, static: Tensor | None, forms: Tensor
+) -> Tensor:
+    """Products of the estimation matrix with forms ``(b, k, D)``, slot by slot where it has slots: ``(b, rows, k)``."""
+    if static is not None or len(primitives) == 1:
+        return estimation_matrix(primitives, views, weights, static) @ forms.mT
+    values = forms.mT  # (b, D, k), then (b, n, rows, columns that are left, k)
+    for p, x in zip(primitives, views, strict=True):
+        vectors = p.vectors(x)
+        folded = values.unflatten(-2, (p.width, -1))
+        if values.ndim == 3:
+            values = torch.einsum("bnrw,bwdk->bnrdk", vectors, folded)
+        else:
+            values = torch.einsum("bnrw,bnswdk->bnsrdk", vectors, folded).flatten(2, 3)
+    return (values[..., 0, :] * weights.sqrt()[..., None, None]).flatten(1, 2)

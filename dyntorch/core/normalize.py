@@ -105,8 +105,9 @@ def _largest_to_one(result: Tensor, axes: int) -> Tensor:
 def unit_tensors(result: Tensor, rank: int, nullity: int = 1) -> Tensor:
     """Tensors of so many axes at norm 1, several of them orthonormal; zero ones stay zero."""
     if nullity == 1:
-        norm = result.flatten(-rank).norm(dim=-1)[(..., *([None] * rank))]
-        return result / torch.where(norm > 0, norm, 1.0)
+        # a third of the time of torch's norm of a few entries
+        total = result.flatten(-rank).square().sum(-1)[(..., *([None] * rank))]
+        return result / torch.where(total > 0, total, 1.0).sqrt()
     result = _largest_to_one(result, rank + 1)
     flat = result.flatten(-rank)
     # the derivative of the triangular factorization of a failed (zero) problem would be NaN: any basis stands in for it

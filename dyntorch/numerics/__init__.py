@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # decorators keep the types of what they decorate only if the
 _HOME = {
     **dict.fromkeys(("one_thread", "map_blocks"), "dyntorch.numerics.blocks"),
     **dict.fromkeys(("on_cpu", "check_options"), "dyntorch.numerics.arguments"),
+    "native": "dyntorch.native.library",
     **dict.fromkeys(("canonical_correlation", "orthonormal_basis"), "dyntorch.numerics.subspaces"),
     **dict.fromkeys(("affine_factorization", "metric_upgrade"), "dyntorch.numerics.subspaces"),
     **dict.fromkeys(("Message", "as_python", "with_words", "with_names"), "dyntorch.numerics.messages"),

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dyntorch.native import library
 from dyntorch.numerics.arguments import check_tensor
 from dyntorch.numerics.blocks import map_blocks, one_thread
 from dyntorch.numerics.eigenspaces import (
@@ -184,11 +185,15 @@ def _of_grams(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _of_rows(matrix: Tensor, dim: int, keep: bool) -> tuple[Tensor, Tensor]:
     """Basis of all problems in the dtype of the rows, and their Grams where ``keep`` (and they were needed)."""
     minimal = matrix.shape[-2] == matrix.shape[-1] - dim
+    native = on_host(matrix) and library.solves(matrix, dim)
     tiny = on_host(matrix) and matrix.numel() * matrix.shape[-1] <= TINY
 
     def block(matrix: Tensor) -> tuple[Tensor, Tensor]:
         a = matrix.double()
         none = a.new_empty(len(a), 0, 0)
+        if native:
+            basis, gram = _by_kernel(a, dim, minimal, keep)
+            return basis.to(matrix.dtype), gram
         if minimal:
             return fix_signs(_solve_minimal(a, dim)).mT.to(matrix.dtype), none
         if tiny:
@@ -199,8 +204,26 @@ def _of_rows(matrix: Tensor, dim: int, keep: bool) -> tuple[Tensor, Tensor]:
     return map_blocks(block, matrix, size=block_size(matrix))
 
 
+def _by_kernel(matrix: Tensor, dim: int, minimal: bool, keep: bool) -> tuple[Tensor, Tensor]:
+    """Basis of one block by the kernel, and the Grams where ``keep``; what it does not certify is left to this file."""
+    basis, following, certified, gram = library.null_of_rows(matrix, dim, always=minimal, keep=keep)
+    hard = (~certified | (following <= RESOLVED)).nonzero()[:, 0]
+    if len(hard):
+        part = matrix[hard]
+        basis[hard] = fix_signs(_solve_minimal(part, dim) if minimal else _solve_rows(part, gram_of(part), dim)).mT
+    return basis, gram
+
+
 def _solve_gram(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Basis, residual, competing and degenerate of one block."""
+    if on_host(gram) and library.solves(gram, dim):
+        basis, values, competing, following, certified = library.null_of_grams(gram, dim)
+        degenerate = ~certified | (following <= RESOLVED)
+        hard = degenerate.nonzero()[:, 0]
+        if len(hard):
+            scaled, scale, finite = unit_trace(gram[hard])
+            basis[hard], values[hard], competing[hard], degenerate[hard] = _in_unit(scale, finite, *by_eigh(scaled, dim))
+        return basis, values, competing, degenerate
     scaled, scale, finite = unit_trace(gram)
     host = on_host(gram)
     squaring = host and dim == 1 < gram.shape[-1] <= SMALL
@@ -217,6 +240,13 @@ def _solve_gram(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]
         hard = degenerate.nonzero()[:, 0] if host else degenerate[:0]
         if len(hard):
             vectors[hard], values[hard], competing[hard], degenerate[hard] = by_eigh(scaled[hard], dim)
+    return _in_unit(scale, finite, vectors, values, competing, degenerate)
+
+
+def _in_unit(
+    scale: Tensor, finite: Tensor, vectors: Tensor, values: Tensor, competing: Tensor, degenerate: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Basis, residual, competing and degenerate in the unit of the Grams; no basis where they were not finite."""
     basis = torch.where(finite[:, None, None], fix_signs(vectors).mT, 0.0)
     return basis, values / scale[:, None], competing * scale, degenerate | ~finite
 

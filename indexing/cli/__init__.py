@@ -15,6 +15,7 @@ from typing import Any, get_args
 
 import tyro
 
+from dyntorch.numerics import native
 from indexing.cli.console import complain, reword_parser_message
 from indexing.cli.flags import GROUPS, find_command, grammar
 
@@ -39,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with _output():
             if words in (["--version"], ["-V"]):
-                print(f"dyntorch {_version()}")
+                print(f"dyntorch {_version()}, {native()}")
                 return DONE
             command = parse(words)
             code = command if isinstance(command, int) else find_command(command).run(command)

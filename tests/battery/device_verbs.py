@@ -66,6 +66,12 @@ def two_bodies() -> tuple[Tensor, ...]:
     return scenes.bodies((30, 30), sigma=0.3, generator=draw(1)).views
 
 
+def projector(columns: Tensor) -> Tensor:
+    """Onto what the columns of a matrix span."""
+    basis = torch.linalg.qr(columns).Q
+    return basis @ basis.mT
+
+
 def driven() -> tuple[Tensor, Tensor]:
     """Tracks ``(6, 60, 2)`` of a street with one car, and its cameras."""
     street = scenes.streets(2, frames=6, tracks=60, sigma=0.1, generator=draw(3))
@@ -369,7 +375,13 @@ VERBS: tuple[Verb, ...] = (
         dyn.geometry.joint_epipoles,
     ),
     Verb("hyperplane_pair", lambda: (two_hyperplanes(),), dyn.geometry.hyperplane_pair),
-    Verb("two_bodies", two_body_cameras, dyn.geometry.two_bodies),
+    Verb(
+        "two_bodies",
+        two_body_cameras,
+        dyn.geometry.two_bodies,
+        # the affine frame of the world is free: what its cameras span is not
+        compare=lambda found: (projector(found.cameras[..., 0, :, :, :-1].flatten(-3, -2)), found.determined),
+    ),
     Verb("affine_segmentation", lambda: affine_bodies(), dyn.tasks.affine_segmentation),
     Verb(
         "multibody_matrix",
@@ -493,7 +505,7 @@ PUBLIC = {name: getattr(face, name) for face in (dyn, *(getattr(dyn, room) for r
 NOT_VERBS = {
     *("counting", "metrics", "motions", "scenes"),  # modules
     # tools of verbs
-    *("on_cpu", "one_thread", "map_blocks", "check_options", "with_names", "with_words", "as_python", "status_from"),
+    *("on_cpu", "one_thread", "map_blocks", "check_options", "with_names", "with_words", "as_python", "status_from", "native"),
     # names, numbers and what results say
     *("Message", "Notice", "BodyModel", "LineStatus", "Status", "Motion", "MotionName", "MOTION_MODELS", "Polynomial", "Fourier"),
     *("NoticeCode", "Invariant", "MovingShapes", "Recovery", "Outcome"),

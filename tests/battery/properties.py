@@ -6,7 +6,9 @@ way.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -15,6 +17,7 @@ from torch import Tensor
 import dyntorch as dyn
 from dyntorch.core.solution import Solution
 from dyntorch.invariants.segmentation_matrix import RelationPair
+from dyntorch.native import library
 from tests.battery.cases import Case, carried, moved_views
 from tests.battery.references import apart, matrices, noisy, pulled_back, rank, spans
 
@@ -228,6 +231,27 @@ def batch_is_loop(case: Case) -> None:
                 one = dyn.refine(alone, *(x[i, j] for x in views))
                 assert worst(case.error(tuple(m[i, j] for m in refined.motion), one.motion)) < 1e-5
                 torch.testing.assert_close(refined.sigma[i, j], one.sigma, rtol=1e-6, atol=0)
+
+
+@prop()
+def kernel_and_torch_agree(case: Case) -> None:
+    """Statuses of good, exact, degenerate, scarce and broken problems are the same, and so are tensors, to rounding of a Gram."""
+    noisy, exact = example(case, batch=(9,)), example(case, batch=(9,), sigma=0.0)
+    views = tuple(torch.cat([a, b]) for a, b in zip(noisy, exact, strict=True))
+    for x in views:
+        x[3] = x[3, :1]  # all matches are one
+        x[5, 2:] = math.nan
+        x[7] = 0.0
+        x[12] *= 1e140
+    first = dyn.fit(case.invariant, *views)
+    with patch.object(library, "load", lambda: ({}, "torch")):
+        second = dyn.fit(case.invariant, *views)
+    assert first.status.tolist() == second.status.tolist()
+    sound = first.status == dyn.Status.OK
+    assert apart(case, first.tensor[sound], second.tensor[sound]) < 1e-6
+    torch.testing.assert_close(
+        first.uncertainty[sound], second.uncertainty[sound], rtol=1e-3, atol=1e-5
+    )  # of exact matches it is rounding
 
 
 @prop()

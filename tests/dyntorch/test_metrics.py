@@ -180,7 +180,6 @@ def test_a_failed_estimate_has_the_worst_error_and_leaves_the_others_alone(failu
     assert aligned.isfinite().all()
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Segmentations: the least error over all ways to name the bodies.
 
 
@@ -219,7 +218,6 @@ def test_names_of_bodies_do_not_matter_but_outliers_are_no_body():
     assert float(misclassification(torch.tensor([1, 1], dtype=torch.uint8), torch.tensor([2, 2]))) == 0
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Lifted reconstructions: blind to exactly what the lifts leave open, proportional to everything else.
 
 

@@ -147,7 +147,6 @@ def test_the_same_point_in_other_words_and_points_that_are_only_near():
     assert shared == [25, 24, 23]
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Layouts: by the names of a file, by what a body looks like where there are none, or as a person says
 
 

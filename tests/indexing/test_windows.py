@@ -123,7 +123,6 @@ def test_unusable_clips_and_other_joint_counts_are_named():
         check_clips([GOOD], joints=17)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Wrong joints against planted ones and a slow reference
 
 

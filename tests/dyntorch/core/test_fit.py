@@ -140,7 +140,6 @@ def test_solution_reads_well_and_complains_clearly():
     assert repr(dyn.fit(dyn.Collineation(2), x1[:, :0], x2[:, :0])).endswith("batch=(2, 0): empty)")
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # A tensor that only noise singles out is not called certain, and one that the matches decide is.
 
 

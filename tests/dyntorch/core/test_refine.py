@@ -136,7 +136,6 @@ def test_reaches_the_accuracy_of_the_theory():
     assert abs(float(refined.sigma.median()) / 0.5 - 1) < 0.05
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # constrain(): the least algebraic error among the tensors of motions.
 
 
@@ -254,7 +253,6 @@ def test_empty_batch_steps_and_tensors_that_do_not_stand_alone():
             dyn.constrain(dyn.fit(invariant, *data))
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Gradients: every order, weights, labels, inliers, problems that failed, descents that ended early.
 
 

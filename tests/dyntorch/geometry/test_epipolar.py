@@ -220,7 +220,6 @@ def test_samples_of_a_pool_fit_the_pool():
     assert relative_error(F[1], other[2]).min() < 1e-8
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # The epipolar residual's variance from moments: against matches, finite differences and generalized eigenvalues.
 
 

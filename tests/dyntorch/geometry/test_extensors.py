@@ -246,7 +246,6 @@ def test_batches_broadcast_and_gradients_exist_in_every_mode():
     assert torch.autograd.gradcheck(projector, basis)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Line cameras against images of points, the way back to cameras, and the Klein quadric against the definition of a line.
 
 

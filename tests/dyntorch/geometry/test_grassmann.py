@@ -102,7 +102,6 @@ def test_closed_form_derivative_is_that_of_autograd(profile, rows):
         torch.testing.assert_close(derivative[b], expected, rtol=1e-9, atol=1e-10)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Candidate projections against the true ones: every profile, any order and scale, zeros; the balance; the known ambiguity.
 
 
@@ -208,7 +207,6 @@ def test_noise_that_no_projection_explains_stays_finite():
     assert all(part.isfinite().all() for part in candidates(one, (2, 2, 1), (3, 3, 3)))
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Epipoles and joint epipoles: against vanishing points, null vectors, the transversal of the centres, and the tensor alone.
 
 

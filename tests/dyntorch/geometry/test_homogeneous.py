@@ -162,7 +162,6 @@ def test_unit_vectors_and_signs_leave_zero_alone(dtype):
     assert sign.dtype == dtype and torch.equal(sign * x.abs(), x) and (sign[1] == 1).all()
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # 3 x 3 cofactors and null vectors: against inverses and singular vectors; pixels, noise, rank below two, gradients.
 
 
@@ -216,7 +215,6 @@ def test_rank_below_two_is_zero_and_does_not_touch_the_others():
     torch.testing.assert_close(torch.stack([left[2], right[2]]), torch.stack(null_vectors(m[2])), rtol=0, atol=0)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Monomials of points: values one by one, the action of collineations, derivatives by autograd, rotations.
 
 

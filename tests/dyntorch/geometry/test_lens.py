@@ -111,7 +111,6 @@ def test_calibrations_as_users_write_them():
     assert torch.equal(undistort_points(x, (K.numpy(), [LENSES["five"]])), expected)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Lenses fitted to matches: against scenes seen through known lenses, and finite differences.
 
 

@@ -111,7 +111,6 @@ def test_too_few_views_and_equal_times():
     assert least_views(lifts(2, 2, (0.0, 1.0, 1.0, 2.0)), 3) == 4
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Frames of lifted scenes: members of the ambiguity, images unchanged, points finite, before the cameras and of unit size.
 
 

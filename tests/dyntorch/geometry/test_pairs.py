@@ -160,7 +160,6 @@ def test_gradients():
     assert torch.autograd.gradcheck(of_points, points.requires_grad_(), atol=1e-5)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Products of two forms of rank two: the product point by point, both factors again, units, noise, failures, gradients.
 
 
@@ -269,7 +268,6 @@ def test_gradients_of_product():
         assert torch.autograd.gradcheck(outer, matrix, fast_mode=True, eps=1e-7, atol=1e-4)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Two translating bodies: exact cameras and affine shapes from any projective frame, what scale is observable, thin bodies.
 
 
@@ -431,7 +429,6 @@ def test_misuse():
     )
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Numbers of bodies follow a rule, whatever order a search found them in.
 
 

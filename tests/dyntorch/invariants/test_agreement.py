@@ -81,7 +81,6 @@ def test_points_at_infinity_stay_finite_in_value_and_gradient():
     assert x2.grad.isfinite().all()
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Collinearity of three points: against a brute-force geometric distance; the motion of forms.
 
 

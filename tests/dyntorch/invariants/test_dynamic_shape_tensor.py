@@ -220,7 +220,6 @@ def test_times_keep_their_digits_where_points_have_fewer_and_those_of_no_weight_
     assert fitted(x, t, weights=weights).invariant.interval.tolist() == [-1.0, 1.0]
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Projective cameras: exactness, counts, derivatives, what they win near by, statuses.
 
 

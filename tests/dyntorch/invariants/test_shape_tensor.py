@@ -253,7 +253,6 @@ def test_affine_views_that_share_no_basis_stay_incomplete():
     assert case.apart(ok(dyn.fit(case.invariant, *whole.unbind(-2))).tensor, case.invariant.compose(shape)) < 1e-8
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # The algebra against what it is derived from: determinants, closed forms, exact counts.
 
 

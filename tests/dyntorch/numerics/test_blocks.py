@@ -230,12 +230,11 @@ ELEMENTWISE = {
 def test_every_public_verb_runs_on_one_thread():
     faces = [dyn, dyn.core, dyn.geometry, dyn.invariants, dyn.numerics, dyn.shapes, dyn.tasks]
     named = {name: getattr(face, name) for face in faces for name in face.__all__}
-    helpers = {"one_thread", "map_blocks", "on_cpu"}
+    helpers = {"one_thread", "map_blocks", "on_cpu", "native"}
     verbs = {name for name, value in named.items() if isinstance(value, types.FunctionType)} - helpers
     assert {name for name in verbs if not hasattr(named[name], "one_thread")} == ELEMENTWISE
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Cached tables serve every later call, wherever the first one came from.
 
 

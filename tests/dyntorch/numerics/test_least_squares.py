@@ -106,7 +106,6 @@ def test_the_cost_never_rises_and_what_is_not_finite_stays(tolerance):
     torch.testing.assert_close(again.theta, start.theta, equal_nan=True)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Derivatives along tangents: closed forms, dual numbers, many threads at once, and nothing heavy imported.
 
 

@@ -109,7 +109,6 @@ def test_misuse_is_refused():
     )
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Affine factorization and metric upgrade: exact on exact views, and honest where the views do not decide.
 
 

@@ -110,7 +110,6 @@ def test_the_seed_decides_and_precision_is_as_asked():
     torch.testing.assert_close(single.views[1], a.views[1].float(), rtol=1e-5, atol=1e-3)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Scenes of planes and bodies that translate independently are what they say they are.
 
 

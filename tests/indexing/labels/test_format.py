@@ -265,7 +265,6 @@ def test_formats_that_are_unknown(tmp_path: Path) -> None:
         open_labels(path, fps=0)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # What is written is read again, in every format
 
 
@@ -378,7 +377,6 @@ def test_what_no_file_can_hold_is_said(tmp_path: Path) -> None:
     assert open_labels(path).labels[0].label == "a\ufffdb\ufffd"
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Files of labels that were damaged, or made to do harm
 
 

@@ -195,7 +195,6 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Film sets: frames in place of joints, everything else as in a clip set
 
 

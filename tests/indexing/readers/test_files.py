@@ -150,7 +150,6 @@ def check_sample(tool: str, made: Sample) -> None:
     assert len(read(made.path, format=name)) == made.clips
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # read and read_clip: detection, options, and inputs that no format can take
 
 

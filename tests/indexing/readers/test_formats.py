@@ -232,7 +232,6 @@ def test_what_is_broken_is_named(write_json: Write) -> None:
         refused(write_json(data), *words)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # DeepLabCut, SLEAP and MediaPipe tables
 
 

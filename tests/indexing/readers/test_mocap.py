@@ -116,7 +116,6 @@ def test_tables_without_z_of_every_point(tmp_path: Path) -> None:
     refused(tmp_path / "none.csv", "hip_x, hip_y, hip_z", format="mocap")
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Marker files (TRC, C3D), arrays of numpy, folders of FreeMoCap, and AlphaPose
 
 

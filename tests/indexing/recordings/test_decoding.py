@@ -74,7 +74,6 @@ def test_blows_of_one_bout_are_one_performance_and_squats_in_a_row_are_not():
     assert found == {"punch": ["punch"], "squat": ["squat"] * 3}
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # The best segments that do not overlap, against looking at every explanation there is
 
 
@@ -132,7 +131,6 @@ def test_the_best_explanation_and_the_sums_over_all(problem):
     assert best_tiling(nothing, values[:0], background)[0] == [] and not posterior(nothing, values[:0], background, 1.0).any()
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Recordings whose clock or content is odd: one clear line, or an honest answer
 
 

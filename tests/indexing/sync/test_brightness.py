@@ -113,7 +113,6 @@ def test_bad_input_is_named(films):
             brightness_shift(*(video[:30] for video in films), **({"fps": FPS} | options))
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Sums and scores at all lags against loops.
 
 
@@ -154,7 +153,6 @@ def test_peaks_and_parabola():
     assert curve.within(-20, 3).offset(3) == 0.0
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Evidence of short windows: all agree, none agrees, nothing known.
 
 

@@ -74,7 +74,6 @@ def test_nothing_is_made_up_for_a_pause_of_any_length(gap):
     assert len(before) == 4 and grid.max() <= 19 and not ((grid > 9.01) & (grid < 9.99)).any()
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # The window kernel against its definition in loops.
 
 
@@ -110,7 +109,6 @@ def test_kernel_is_its_definition(films, rng):
     assert torch.allclose(two.norm(dim=1), torch.ones(15, dtype=torch.float64))
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # The row-band profile by loops, played backwards, and whitened.
 
 
@@ -151,7 +149,6 @@ def test_neighbours_in_time_are_whitened_together(rng, monkeypatch):
         assert torch.allclose(found, want)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Boxes about a patch that moves, and a camera that does.
 
 
@@ -210,7 +207,6 @@ def test_camera_motion_is_measured(rng):
     assert torch.allclose(crop(frames, where, CROP_SIDE), frames[:, 7:103, 12:108], atol=1e-4)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # What is accepted as a video: arrays, streams, colours; and what is not.
 
 

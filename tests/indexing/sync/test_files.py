@@ -73,7 +73,6 @@ def test_other_formats_are_written_as_openpose(tmp_path, cameras):
     assert json.loads(openpose_frames(take)[0])["people"][0]["person_id"] == [-1]
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Motion capture beside cameras: read from its files, on one clock with them, and written on the clock of the reference.
 
 

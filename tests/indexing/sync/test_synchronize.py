@@ -130,7 +130,6 @@ def test_bad_input_is_one_line(recorded, cameras, library, a, options, says):
     assert "\n" not in str(caught.value) and not library
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # What synchronize() says of recordings that are read without an error and still are not what they seem.
 
 
@@ -205,7 +204,6 @@ def test_frame_numbers_of_a_file_are_its_times(cameras, tmp_path):
     assert found.ok and found.offset == pytest.approx((100 - 12) / FPS, abs=0.5 / FPS)
 
 
-# ----------------------------------------------------------------------------------------------------------------------
 # Tracks and brightness, each a check of the other.
 
 

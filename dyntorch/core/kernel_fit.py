@@ -1,0 +1,46 @@
+"""Linear fits by the kernel in C: matches of points -> similarities, moments, null spaces and what they are judged by, in one pass.
+
+What the kernel does not certify, or whose Gram does not carry its digits, is left to :mod:`dyntorch.core.fit`, so statuses are the
+same with and without the kernel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from dyntorch.core.invariant import Invariant
+from dyntorch.core.primitives import HyperplanesThrough, Monomials, Point, Primitive
+from dyntorch.native import library
+from dyntorch.numerics.eigenspaces import on_host
+from dyntorch.numerics.function_transforms import is_transformed
+
+
+def slot_kinds(invariant: Invariant, views: Sequence[Tensor], weights: Tensor, static: Tensor | None) -> list[int]:
+    """What each view of the invariant puts into its slot, as the kernel numbers it; none where the kernel does not fit it."""
+    if static is not None or invariant.copies is not None or invariant.intrinsic or not on_host(weights):
+        return []
+    if type(invariant).estimate_tensor is not Invariant.estimate_tensor or not 2 <= len(views) <= library.MAX_SLOTS:
+        return []
+    if not library.solves(weights.new_empty(0, invariant.width()), invariant.nullity):
+        return []
+    data = (*views, weights)
+    if any(part.requires_grad or part.dtype != torch.float64 for part in data) or is_transformed(*data):
+        return []
+    if any(forward_ad.unpack_dual(part).tangent is not None for part in data):
+        return []
+    kinds = [_kind(primitive) for primitive in invariant.primitives]
+    return [] if None in kinds else [kind for kind in kinds if kind is not None]
+
+
+def _kind(primitive: Primitive) -> int | None:
+    if isinstance(primitive, Point) and primitive.dim <= library.MAX_SPACE:
+        return library.POINT
+    if isinstance(primitive, HyperplanesThrough) and primitive.order == 1 and primitive.dim <= library.MAX_SPACE:
+        return library.HYPERPLANES_THROUGH
+    if isinstance(primitive, Monomials) and (primitive.degree, primitive.dim) == (2, 2):
+        return library.CONIC_MONOMIALS
+    return None

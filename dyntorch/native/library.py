@@ -1,0 +1,151 @@
+"""The compiled kernel: loaded once, for the instruction set of this processor, and called with tensors."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from dyntorch.native.build import LIBRARY, source_digest
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+INSTRUCTIONS = {"avx512": (8, "AVX-512"), "avx2": (4, "AVX2"), "base": (2, "SSE2 or NEON")}
+"""Problems per register, and the name, the widest first."""
+MIN_SIZE, MAX_SIZE, MAX_DIM = 4, 160, 5
+"""Columns, and dimensions of the null space, that the kernel solves."""
+_POINTER, _SIZE, _INT = ctypes.c_void_p, ctypes.c_ssize_t, ctypes.c_int
+_ARGUMENTS = {
+    "null_of_grams": (_POINTER, _SIZE, _INT, _INT, *[_POINTER] * 5),
+    "null_of_rows": (_POINTER, _SIZE, _SIZE, *[_INT] * 3, *[_POINTER] * 4),
+    "fit_points": (_INT, *[_POINTER] * 5, _SIZE, _SIZE, _INT, _INT, *[_POINTER] * 9),
+}
+MAX_SLOTS, MAX_SPACE = 6, 8
+"""Views, and dimensions of what is measured in them, that :func:`fit_points` takes."""
+POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS = range(3)
+"""What a measured point puts into a slot, as the kernel numbers it."""
+
+
+@cache
+def load() -> tuple[dict[str, Any], str]:
+    """The functions of the kernel by name, none where the torch path computes; and what computes, with the reason.
+
+    ``DYNTORCH_NATIVE``: 0 for the torch path, or the instruction set (``avx512``, ``avx2``, ``base``); empty: the best.
+    """
+    wanted = os.environ.get("DYNTORCH_NATIVE", "")
+    if wanted == "0":
+        return {}, "torch (DYNTORCH_NATIVE=0)"
+    if not LIBRARY.exists():
+        return {}, "torch (the kernel was not compiled: python -m dyntorch.native.build says why)"
+    try:
+        library = ctypes.CDLL(str(LIBRARY))
+        library.made_from.restype = ctypes.c_char_p
+        made_from = library.made_from().decode()
+    except (OSError, AttributeError) as error:
+        return {}, f"torch ({LIBRARY.name} cannot be loaded: {' '.join(str(error).split())})"
+    if made_from != source_digest():
+        return {}, f"torch ({LIBRARY.name} was made from another version: python -m dyntorch.native.build)"
+    for level, (lanes, name) in INSTRUCTIONS.items():
+        if wanted in ("", level) and library.has_instructions(lanes) and hasattr(library, f"null_of_grams_{level}"):
+            functions = {function: getattr(library, f"{function}_{level}") for function in _ARGUMENTS}
+            for function, arguments in _ARGUMENTS.items():
+                functions[function].argtypes = arguments
+            return functions, f"native ({name})"
+    return {}, f"torch (DYNTORCH_NATIVE={wanted} is none of 0, {', '.join(INSTRUCTIONS)} that this processor has)"
+
+
+def native() -> str:
+    """What computes null spaces: ``native (AVX-512)``, ``native (AVX2)`` or ``torch`` and why.
+
+    Example:
+        >>> import dyntorch as dyn
+        >>> dyn.numerics.native().split()[0] in ("native", "torch")
+        True
+    """
+    return load()[1]
+
+
+def solves(matrix: Tensor, dim: int) -> bool:
+    """Whether the kernel finds null spaces of this dimension of matrices ``(.., .., D)``."""
+    size = matrix.shape[-1]
+    return MIN_SIZE <= size <= MAX_SIZE and dim <= MAX_DIM and dim < size and matrix.device.type == "cpu" and bool(load()[0])
+
+
+def null_of_grams(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Null spaces of Grams ``(b, D, D)`` float64: basis ``(b, dim, D)``, values ``(b, dim)``, sum of 1 / eigenvalue over the
+    others, next eigenvalue over the trace, whether certified ``(b,)``; what is not certified is not to be used."""
+    gram = gram.contiguous()
+    batch, size = gram.shape[:2]
+    basis, values = gram.new_empty(batch, dim, size), gram.new_empty(batch, dim)
+    total, following, certified = gram.new_empty(batch), gram.new_empty(batch), gram.new_empty(batch, dtype=_bool())
+    out = (basis, values, total, following, certified)
+    _call("null_of_grams", gram.data_ptr(), batch, size, dim, *(part.data_ptr() for part in out))
+    return out
+
+
+def null_of_rows(matrix: Tensor, dim: int, *, always: bool, keep: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Null spaces of rows ``(b, rows, D)`` float64: basis, next eigenvalue of the Gram over its trace, whether certified, and the
+    Grams where they are to be kept (else empty).  ``always``: corrected by the rows however large the next eigenvalue is."""
+    matrix = matrix.contiguous()
+    batch, rows, size = matrix.shape
+    basis, following = matrix.new_empty(batch, dim, size), matrix.new_empty(batch)
+    certified, gram = matrix.new_empty(batch, dtype=_bool()), matrix.new_empty(batch, *([size] * 2 if keep else [0, 0]))
+    out = (basis.data_ptr(), following.data_ptr(), certified.data_ptr(), gram.data_ptr() if keep else None)
+    _call("null_of_rows", matrix.data_ptr(), batch, rows, size, dim, always, *out)
+    return basis, following, certified, gram
+
+
+class PointFits(NamedTuple):
+    """What the kernel says of the fits of a batch, in the coordinates of the similarities."""
+
+    scale: Tensor  # (b, views)
+    centre: Tensor  # (b, views, MAX_SPACE), the first of which count
+    basis: Tensor  # (b, dim, D)
+    second: Tensor  # (b, D): vector of the next eigenvalue
+    residual: Tensor  # (b, dim)
+    competing: Tensor  # (b,): sum of 1 / eigenvalue over the others
+    trace: Tensor  # (b,)
+    following: Tensor  # (b,): next eigenvalue over the trace
+    certified: Tensor  # (b,)
+
+
+def fit_points(
+    kinds: Sequence[int], views: Sequence[Tensor], weights: Tensor, widths: Sequence[int], dim: int, normalized: bool
+) -> PointFits:
+    """Similarities, moments of the products of slots and null spaces in one pass: views ``(b, n, d)`` of any strides, weights
+    ``(b, n)`` of at most 1, float64; slots of so many columns."""
+    weights = weights.contiguous()
+    (batch, matches), count, size = weights.shape, len(views), math.prod(widths)
+    new = weights.new_empty
+    fits = PointFits(
+        new(batch, count),
+        new(batch, count, MAX_SPACE),
+        new(batch, dim, size),
+        new(batch, size),
+        new(batch, dim),
+        new(batch),
+        new(batch),
+        new(batch),
+        new(batch, dtype=_bool()),
+    )
+    strides = (_SIZE * (3 * count))(*(stride for x in views for stride in x.stride()))
+    numbers = ((_INT * count)(*kinds), (_INT * count)(*(x.shape[-1] for x in views)))
+    pointers = (_POINTER * count)(*(x.data_ptr() for x in views))
+    given = (count, *numbers, pointers, strides, weights.data_ptr(), batch, matches, dim, normalized)
+    _call("fit_points", *given, *(part.data_ptr() for part in fits))
+    return fits
+
+
+def _call(name: str, *arguments: Any) -> None:
+    if load()[0][name](*arguments):
+        raise MemoryError("no memory for the workspace of the kernel: fewer problems at once")
+
+
+def _bool() -> Any:
+    import torch
+
+    return torch.bool
