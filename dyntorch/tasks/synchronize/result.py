@@ -30,7 +30,8 @@ class SynchronizeOptions:
     """Kind of both cameras, for different points; ``"auto"`` selects the one whose best lag stands out most."""
     measure: Literal["auto", "rank", "log_determinant", "principal_angles"] = "auto"
     """What two row spaces share, for different points: one measure of the thesis, or ``"auto"``: the log-determinant, beside the
-    mutual information of shape and motion."""
+    mutual information of shape and motion.  ``"principal_angles"`` is for motion in a plane: of 24 scenes in space its best lag is
+    more than a frame off in 13, the log-determinant's in none."""
     body_measure: Literal["attitude", "rank"] = "attitude"
     """What ranks the lags of ``camera="projective"``: the disagreement about the body's attitude, or the rank of both cameras'
     scaled measurements, which is exact for whole frames and long recordings alone."""
