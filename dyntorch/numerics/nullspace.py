@@ -185,7 +185,8 @@ def _of_grams(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def _of_rows(matrix: Tensor, dim: int, keep: bool) -> tuple[Tensor, Tensor]:
     """Basis of all problems in the dtype of the rows, and their Grams where ``keep`` (and they were needed)."""
     minimal = matrix.shape[-2] == matrix.shape[-1] - dim
-    native = on_host(matrix) and library.solves(matrix, dim)
+    # the vectors of a larger exact null space are free: those of LU follow the rows, Ritz vectors would follow their rounding
+    native = on_host(matrix) and library.solves(matrix, dim) and not (minimal and dim > 1)
     tiny = on_host(matrix) and matrix.numel() * matrix.shape[-1] <= TINY
 
     def block(matrix: Tensor) -> tuple[Tensor, Tensor]:
