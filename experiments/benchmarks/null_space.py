@@ -82,7 +82,7 @@ class Figure:
 
 ONE_THREAD = (
     Case(SOLVE, 9),
-    *(Case(SOLVE, size, goal=5.0) for size in (27, 36, 48, 64)),
+    *(Case(SOLVE, size, goal=18.0) for size in (27, 36, 64, 81)),
     Case(SOLVE, 64, dim=4),
     *(Case(GRAM, size) for size in (27, 64)),
     *(Case(MINIMAL, size, goal=6.0) for size in (9, 27, 36, 64)),
