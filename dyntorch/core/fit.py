@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from dyntorch.core.invariant import Invariant, as_invariant
 from dyntorch.core.kernel_fit import slot_kinds
@@ -24,7 +23,7 @@ from dyntorch.geometry.homogeneous import similarity
 from dyntorch.native import library
 from dyntorch.numerics.blocks import each, map_blocks, one_thread, replace_problems, select, workers
 from dyntorch.numerics.eigenspaces import RESOLVED, on_host, orthonormal
-from dyntorch.numerics.function_transforms import over_problems
+from dyntorch.numerics.function_transforms import needs_gradient, over_problems
 from dyntorch.numerics.nullspace import GramNullSpace, gram_null_space, null_space
 
 MAX_RELATIVE_NOISE = 0.5
@@ -178,7 +177,7 @@ def _fit_by_kernel(
     present = count * invariant.rows()
     spare = (present - (width - nullity)).clamp(min=0)
     square, rounding, weak = _relative_noise(space.residual, space.competing, space.trace, spare)
-    exact = (rounding > MAX_GRAM_ROUNDING) & (rounding > 1e-3 * square)
+    exact = _outweighs_noise(rounding, square)
     unsolved = (
         ~space.certified | (space.following <= RESOLVED) | exact | (count < invariant.minimal()) | (present < width - nullity)
     )
@@ -280,12 +279,12 @@ def _solve_null_space(invariant: Invariant, rows: EstimationRows) -> tuple[Tenso
     # frames of single matches, from points of theirs, may be all noise, and then nothing looks weak
     limit = 0.0 if invariant.intrinsic else MIN_CONDITION_OF_NOISE
     square, rounding, weak = _relative_noise(space.residual, space.competing, trace, spare, limit)
-    exact = (rounding > MAX_GRAM_ROUNDING) & (rounding > 1e-3 * square)
+    exact = _outweighs_noise(rounding, square)
     exact = (exact.index_fill(0, judged_by_rows, True) if len(judged_by_rows) else exact) & ~space.degenerate
     weak = weak & ~space.degenerate
     if invariant.copies is not None:
         weak = torch.zeros_like(weak)
-    worn = exact & (rounding > MAX_GRADIENT_ROUNDING) & (rounding > square) & _needs_gradient(g)
+    worn = exact & (rounding > MAX_GRADIENT_ROUNDING) & (rounding > square) & needs_gradient(g)
     # an accelerator waits once per block for all answers: what a tensor and its status are must not depend on where it lives
     asked = int((exact & ~worn).any().long() + 2 * weak.any() + 4 * worn.any())
     if asked & 1:
@@ -309,6 +308,11 @@ def _relative_noise(
     square = torch.where(spare > 0, noise * competing, torch.zeros_like(noise)).detach()
     condition = (trace * competing).detach()
     return square, torch.finfo(trace.dtype).eps * condition, (spare > 0) & (condition > limit)
+
+
+def _outweighs_noise(rounding: Tensor, square: Tensor) -> Tensor:
+    """Whether the rows are to be decomposed: rounding of the Gram is neither small nor far below the noise."""
+    return (rounding > MAX_GRAM_ROUNDING) & (rounding > 1e-3 * square)
 
 
 def _ambiguity_limit(spare: Tensor, width: int) -> Tensor:
@@ -381,11 +385,6 @@ def _with_matrix(
     matrix = estimation_matrix(*rows.of(place).parts) if invariant.copies is None else estimation_matrix(*rows.parts)[place]
     solution = solve(matrix.cpu() if host else matrix, invariant.nullity)
     return basis.index_put(place, solution.to(basis.device))
-
-
-def _needs_gradient(x: Tensor) -> bool:
-    """Whether somebody wants a derivative of it."""
-    return (torch.is_grad_enabled() and x.requires_grad) or forward_ad.unpack_dual(x).tangent is not None
 
 
 def _preconditioned_null_space(matrix: Tensor, dim: int) -> Tensor:

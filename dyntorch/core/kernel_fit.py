@@ -10,13 +10,12 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from dyntorch.core.invariant import Invariant
 from dyntorch.core.primitives import HyperplanesThrough, Monomials, Point, Primitive
 from dyntorch.native import library
 from dyntorch.numerics.eigenspaces import on_host
-from dyntorch.numerics.function_transforms import is_transformed
+from dyntorch.numerics.function_transforms import is_transformed, needs_gradient
 
 
 def slot_kinds(invariant: Invariant, views: Sequence[Tensor], weights: Tensor, static: Tensor | None) -> list[int]:
@@ -25,12 +24,10 @@ def slot_kinds(invariant: Invariant, views: Sequence[Tensor], weights: Tensor, s
         return []
     if type(invariant).estimate_tensor is not Invariant.estimate_tensor or not 2 <= len(views) <= library.MAX_SLOTS:
         return []
-    if not library.solves(weights.new_empty(0, invariant.width()), invariant.nullity):
+    if not library.solves(invariant.width(), invariant.nullity):
         return []
     data = (*views, weights)
-    if any(part.requires_grad or part.dtype != torch.float64 for part in data) or is_transformed(*data):
-        return []
-    if any(forward_ad.unpack_dual(part).tangent is not None for part in data):
+    if is_transformed(*data) or any(needs_gradient(part) or part.dtype != torch.float64 for part in data):
         return []
     kinds = [_kind(primitive) for primitive in invariant.primitives]
     return [] if None in kinds else [kind for kind in kinds if kind is not None]

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torch.autograd import grad
+from torch.autograd import forward_ad, grad
 
 from dyntorch.numerics.blocks import rebuilt, tensors_of
 
@@ -24,6 +24,11 @@ def is_transformed(*data: Any) -> bool:
     """Whether a tensor of some records is inside of a transformation of ``torch.func``, so that its values are not at hand."""
     wrapped = torch._C._functorch.is_functorch_wrapped_tensor
     return any(wrapped(tensor) for tensor in tensors_of(data))
+
+
+def needs_gradient(x: Tensor) -> bool:
+    """Whether somebody wants a derivative of it."""
+    return (torch.is_grad_enabled() and x.requires_grad) or forward_ad.unpack_dual(x).tangent is not None
 
 
 def mapped_over(value: Tensor) -> bool:

@@ -186,7 +186,7 @@ def _of_rows(matrix: Tensor, dim: int, keep: bool) -> tuple[Tensor, Tensor]:
     """Basis of all problems in the dtype of the rows, and their Grams where ``keep`` (and they were needed)."""
     minimal = matrix.shape[-2] == matrix.shape[-1] - dim
     # the vectors of a larger exact null space are free: those of LU follow the rows, Ritz vectors would follow their rounding
-    native = on_host(matrix) and library.solves(matrix, dim) and not (minimal and dim > 1)
+    native = on_host(matrix) and library.solves(matrix.shape[-1], dim) and not (minimal and dim > 1)
     tiny = on_host(matrix) and matrix.numel() * matrix.shape[-1] <= TINY
 
     def block(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -217,7 +217,7 @@ def _by_kernel(matrix: Tensor, dim: int, minimal: bool, keep: bool) -> tuple[Ten
 
 def _solve_gram(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Basis, residual, competing and degenerate of one block."""
-    if on_host(gram) and library.solves(gram, dim):
+    if on_host(gram) and library.solves(gram.shape[-1], dim):
         basis, values, competing, following, certified = library.null_of_grams(gram, dim)
         degenerate = ~certified | (following <= RESOLVED)
         hard = degenerate.nonzero()[:, 0]

@@ -15,7 +15,7 @@ from typing import Any, get_args
 
 import tyro
 
-from dyntorch.numerics import native
+import dyntorch as dyn
 from indexing.cli.console import complain, reword_parser_message
 from indexing.cli.flags import GROUPS, find_command, grammar
 
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with _output():
             if words in (["--version"], ["-V"]):
-                print(f"dyntorch {_version()}, {native()}")
+                print(f"dyntorch {_version()}, {dyn.numerics.native()}")
                 return DONE
             command = parse(words)
             code = command if isinstance(command, int) else find_command(command).run(command)
