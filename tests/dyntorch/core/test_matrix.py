@@ -5,7 +5,7 @@ import torch
 
 import dyntorch as dyn
 from dyntorch.core import matrix
-from dyntorch.core.matrix import estimation_matrix, gram
+from dyntorch.core.matrix import estimation_matrix, gram, labelled_rows
 from tests.battery.cases import CASES
 from tests.battery.references import matrices
 
@@ -56,6 +56,7 @@ def test_labelled_matches_put_in_all_rows(case):
     parts = zip(*(x.split(1, axis) for x in views), strict=True)
     total = sum(w * gram(case.invariant.primitives, x, ones[:1], s[None]) for w, x, s in zip(weights, parts, static, strict=True))
     torch.testing.assert_close(gram(case.invariant.primitives, views, weights, static), total)
+    assert labelled_rows(dyn.HomographyTensor.primitives) == [3 + 3 + 3, 9 + 9 + 9]
 
 
 @pytest.mark.parametrize("kind", [dyn.HomographyTensor, dyn.ConstantVelocityTensor, dyn.FundamentalMatrix])

@@ -198,6 +198,10 @@ def test_compression_keeps_what_is_above_the_noise():
     u, s, _ = torch.linalg.svd(noisy - noisy.mean(0), full_matrices=False)
     assert_same(by_rank @ by_rank.T, (u[:, :3] * s[:3].square()) @ u[:, :3].T)
     assert lags.compress(torch.zeros(2, 5, 4), noise=1.0).shape == (2, 5, 1)
+    assert lags.compress(normal(3, 500, 3) * torch.tensor([1.0, 0.2, 0.01]), noise=0.1).shape == (
+        500,
+        2,
+    )  # no variance
 
 
 X = torch.zeros(4, 3, 2)
