@@ -18,7 +18,7 @@ NUMERICAL := tests/dyntorch tests/battery tests/test_readme.py tests/indexing/ac
 
 install: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt hatch_build.py dyntorch/native/kernel.c
+$(STAMP): pyproject.toml constraints.txt hatch_build.py $(wildcard dyntorch/native/*.[ch])
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "dyntorch needs Python 3.11 or newer; try: make PYTHON=python3.12 ...")'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 ifeq ($(TORCH)-$(shell uname -s),cpu-Linux)

@@ -15,6 +15,7 @@ import tempfile
 from pathlib import Path
 
 SOURCE = Path(__file__).with_name("kernel.c")
+"""Includes its parts, the headers beside it."""
 LIBRARY = Path(__file__).with_name("kernel.dll" if sys.platform == "win32" else "kernel.so")
 # exact where it matters: no reassociation, NaN stays NaN
 FLAGS = ("-std=gnu11", "-O3", "-fPIC", "-fvisibility=hidden", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
@@ -28,7 +29,8 @@ LEVELS = {
 
 def source_digest() -> str:
     """Of the source: a library that was made from another one is not used."""
-    return hashlib.sha256(SOURCE.read_bytes()).hexdigest()[:16]
+    parts = [SOURCE, *sorted(SOURCE.parent.glob("*.h"))]
+    return hashlib.sha256(b"".join(part.read_bytes() for part in parts)).hexdigest()[:16]
 
 
 def compile_library(target: Path = LIBRARY) -> str:
