@@ -19,7 +19,6 @@ from dyntorch.core.normalize import Normalization, denormalize, normalization
 from dyntorch.core.outcome import Status, is_failure
 from dyntorch.core.primitives import Primitive
 from dyntorch.core.solution import Solution, with_copies
-from dyntorch.geometry.homogeneous import similarity
 from dyntorch.native import library
 from dyntorch.numerics.blocks import each, map_blocks, one_thread, replace_problems, select, workers
 from dyntorch.numerics.eigenspaces import RESOLVED, on_host, orthonormal
@@ -48,6 +47,17 @@ within their extent; a centre so many extents away loses so many times the digit
 MIN_CONDITION_OF_NOISE = 5e5
 """Trace of the Gram times the harmonic sum of its other eigenvalues above which noise may reach the last of them.  General motion
 has 1e4 (lines) to 3e5 (constant velocity, 60 matches), data of lower rank 1e6 at noise of 1 % of the scene and 1e9 at 0.03 %."""
+KERNEL_LIMITS = (
+    RESOLVED,
+    MAX_GRAM_ROUNDING,
+    MIN_CONDITION_OF_NOISE,
+    MAX_RELATIVE_NOISE,
+    MAX_NARROW_WIDTH,
+    MIN_SPARE_ROWS,
+    CHANCE_FACTOR,
+    CHANCE_QUANTILE,
+)
+"""In the order in which the kernel takes them."""
 BLOCK, MIN_BLOCK = 5 << 19, 1 << 20
 """Numbers in the largest temporary of one block of the batch, summed in pieces by the Gram, and fewest in a block that is cut for
 the sake of another core.  Measured best: 364 problems of 200 points of the plane (47 us each; 128: 59), 131 of space.  100 problems
@@ -158,7 +168,7 @@ def _fit_block(
     kinds = slot_kinds(invariant, views, weights, static)
     if not kinds or not weights.numel():
         return _fit_by_torch(invariant, normalize, precision, views, weights, static)
-    fits, left = _fit_by_kernel(invariant, kinds, normalize, views, relative_weights(weights))
+    fits, left = _fit_by_kernel(invariant, kinds, normalize, views, weights)
     if len(left) == len(weights):
         return _fit_by_torch(invariant, normalize, precision, views, weights, None)
     if len(left):
@@ -169,31 +179,38 @@ def _fit_block(
 
 def _fit_by_kernel(
     invariant: Invariant, kinds: Sequence[int], normalize: bool, views: tuple[Tensor, ...], weights: Tensor
-) -> tuple[LinearFits, Tensor]:
+) -> tuple[LinearFits, Sequence[int]]:
     """Fits of one block, and the problems ``(k,)`` that they say nothing of."""
-    nullity, width = invariant.nullity, invariant.width()
-    space = library.fit_points(kinds, views, weights, [p.width for p in invariant.primitives], nullity, normalize)
-    count = (weights > 0).sum(-1)
-    present = count * invariant.rows()
-    spare = (present - (width - nullity)).clamp(min=0)
-    square, rounding, weak = _relative_noise(space.residual, space.competing, space.trace, spare)
-    exact = _outweighs_noise(rounding, square)
-    unsolved = (
-        ~space.certified | (space.following <= RESOLVED) | exact | (count < invariant.minimal()) | (present < width - nullity)
+    whole = invariant.nullity == 1 and library.CONIC_MONOMIALS not in kinds
+    found = library.fit_points(
+        kinds,
+        views,
+        weights,
+        [p.width for p in invariant.primitives],
+        dim=invariant.nullity,
+        normalized=normalize,
+        rows=invariant.rows(),
+        minimal=invariant.minimal(),
+        constraint=invariant.constraint if whole else None,
+        limits=KERNEL_LIMITS,
     )
-    left = unsolved.nonzero()[:, 0]
-    transforms = tuple(similarity(space.scale[:, v], space.centre[:, v, : x.shape[-1]]) for v, x in enumerate(views))
-    norm = Normalization.of(invariant, transforms)
-    ambiguous = square * present.clamp(min=1) > _ambiguity_limit(spare, width)
-    place = (weak & ~unsolved & ~ambiguous).nonzero()[:, 0]
+    transforms = tuple(found.transforms)
+    flagged = bool(found.flags.any())
+    left = (found.flags == library.UNDECIDED).nonzero()[:, 0] if flagged else ()
+    place = (found.flags == library.WEAK).nonzero()[:, 0] if flagged else ()
     if len(place):
-        slots = zip(invariant.primitives, views, transforms, strict=True)
-        moved = tuple(p.move(x[place], t[place]) for p, x, t in slots)
-        parts = (norm.primitives, moved, weights[place], None, space.basis[place], invariant.resolves_noise)
-        ambiguous[place] = within_noise(*parts, second=space.second[place, None])
-    tensor = invariant.normalize(transforms).constrain(invariant.tensor_of(space.basis))
-    never = torch.zeros_like(ambiguous)
-    return _carried_back(invariant, norm, tensor, _status(never, never, ambiguous), square.sqrt()), left
+        norm = Normalization.of(invariant, transforms)
+        moved = tuple(p.move(x[place], t[place]) for p, x, t in zip(invariant.primitives, views, transforms, strict=True))
+        parts = (norm.primitives, moved, relative_weights(weights[place]), None, found.basis[place], invariant.resolves_noise)
+        noisy = place[within_noise(*parts, second=found.second[place, None])]
+        found.status[noisy] = found.status[noisy].where(found.status[noisy] != int(Status.OK), int(Status.AMBIGUOUS))
+    if whole:
+        order = (0, *(1 + v for v in invariant.axes()))
+        return LinearFits(
+            found.tensor.permute(order), found.normalized.permute(order), found.status, found.uncertainty, transforms
+        ), left
+    tensor = invariant.normalize(transforms).constrain(invariant.tensor_of(found.basis))
+    return _carried_back(invariant, Normalization.of(invariant, transforms), tensor, found.status, found.uncertainty), left
 
 
 def _fit_by_torch(

@@ -14,6 +14,7 @@ import difflib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import partial, update_wrapper
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, cast
 
@@ -54,6 +55,16 @@ class Frame:
     """Whether the images are hyperplanes of the target, which change by the inverse transposed."""
 
 
+class Constraint(IntEnum):
+    """What :meth:`Invariant.constrain` does, as the kernel numbers it."""
+
+    NONE = 0
+    RANK_TWO = 1
+    """To the nearest matrix of rank two."""
+    NONSINGULAR = 2
+    """0 in place of singular matrices."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """Tensors of flat problems that an invariant finds in a way of its own, and how sure they are."""
@@ -89,6 +100,8 @@ class Invariant:
     """Conditions that the true positions of one moving match fulfil."""
     layout: tuple[int, ...] | None = None
     """Which view each axis of the tensor belongs to; None: in the order of the views."""
+    constraint: Constraint | None = Constraint.NONE
+    """The internal constraint; None: one that only :meth:`constrain` knows."""
     resolves_noise: bool = True
     """Whether, among tensors that nearly all matches fulfil, the one with the least residual under noise is the true one."""
     labels_static: bool = False

@@ -24,7 +24,7 @@ def slot_kinds(invariant: Invariant, views: Sequence[Tensor], weights: Tensor, s
         return []
     if type(invariant).estimate_tensor is not Invariant.estimate_tensor or not 2 <= len(views) <= library.MAX_SLOTS:
         return []
-    if not library.solves(invariant.width(), invariant.nullity):
+    if invariant.constraint is None or not library.solves(invariant.width(), invariant.nullity):
         return []
     data = (*views, weights)
     if is_transformed(*data) or any(needs_gradient(part) or part.dtype != torch.float64 for part in data):

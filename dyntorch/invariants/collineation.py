@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.invariant import Constraint, Frame, Invariant
 from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
 from dyntorch.geometry.homogeneous import apply, unit
@@ -49,6 +49,7 @@ class Collineation(Invariant):
         return (HyperplanesThrough(self.n), Point(self.n))
 
     motion = (Frame(0, 1),)
+    constraint = Constraint.NONSINGULAR
 
     @property
     def dof(self) -> int:  # type: ignore[override]

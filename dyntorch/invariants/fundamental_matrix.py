@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.invariant import Constraint, Frame, Invariant
 from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Point
 from dyntorch.geometry.homogeneous import null_vectors, skew, unit
@@ -29,6 +29,7 @@ class FundamentalMatrix(Invariant):
     motion = (Frame(1, 0), Frame(1, vector=True))
     dof = 7
     layout = (1, 0)
+    constraint = Constraint.RANK_TWO
 
     @staticmethod
     def compose(A: Tensor, e2: Tensor) -> Tensor:

@@ -12,34 +12,46 @@ typedef struct {
 static int slot_width(const Slot *s) { return s->kind == CONIC_MONOMIALS ? 6 : s->dim + 1; }
 static int packed_size(const Slot *s) { int w = slot_width(s); return w * (w + 1) / 2; }
 
-/* Hartley's similarity: scale, and centre (dim); points that are equal to rounding keep their scale. */
-static double similarity(const Slot *s, const double *x, const double *weights, ptrdiff_t n, double *centre) {
-  double total = 0, spread = 0, away = 0;
-  for (ptrdiff_t k = 0; k < n; k++) total += weights[k];
-  total = total > 2.2250738585072014e-308 ? total : 2.2250738585072014e-308;
-  for (int c = 0; c < s->dim; c++) {
-    const double *column = x + c * s->coordinate;
-    double sum = 0, squares = 0;
-    for (ptrdiff_t k = 0; k < n; k++) sum += weights[k] * column[k * s->match];
-    sum /= total;
-    for (ptrdiff_t k = 0; k < n; k++) { double d = column[k * s->match] - sum; squares += weights[k] * d * d; }
-    centre[c] = sum;
-    spread += squares / total;
-    away += sum * sum;
+/* Sum over `width` matches, a multiple of LANES, of w (x - shift)^power. */
+static double weighted_sum(const double *w, const double *x, double shift, int power, ptrdiff_t width) {
+  lanes sum = all(0), more = all(0);
+  for (ptrdiff_t k = 0; k < width; k += LANES) {
+    lanes away = *(const unaligned_lanes *)(x + k) - shift, part = *(const unaligned_lanes *)(w + k) * away;
+    if (k / LANES % 2) more += power > 1 ? part * away : part;
+    else sum += power > 1 ? part * away : part;
   }
-  double least = 1e-28 * away > 1e-120 ? 1e-28 * away : 1e-120;
-  return spread > least ? sqrt(s->dim / spread) : 1;
+  double total = 0;
+  for (int v = 0; v < LANES; v++) total += sum[v] + more[v];
+  return total;
 }
 
-/* Upper triangles of the outer products of the slot's vectors of some matches, component first: out (packed, width). */
-static void pack_slot(const Slot *s, const double *x, ptrdiff_t count, int width, double scale_, const double *centre,
+/* Hartley's similarity: scale, and centre (dim); points that are equal to rounding keep their scale.  columns (dim, width). */
+static double similarity(const double *columns, int dim, const double *weights, double total, ptrdiff_t width, double *centre) {
+  double spread = 0, away = 0;
+  for (int c = 0; c < dim; c++) {
+    centre[c] = weighted_sum(weights, columns + c * width, 0, 1, width) / total;
+    spread += weighted_sum(weights, columns + c * width, centre[c], 2, width) / total;
+    away += centre[c] * centre[c];
+  }
+  double least = 1e-28 * away > 1e-120 ? 1e-28 * away : 1e-120;
+  return spread > least ? sqrt(dim / spread) : 1;
+}
+
+/* The coordinates (dim, width) of a slot's matches, 0 behind the last one. */
+static void gather(const Slot *s, const double *x, ptrdiff_t n, ptrdiff_t width, double *columns) {
+  for (int c = 0; c < s->dim; c++) {
+    for (ptrdiff_t k = 0; k < n; k++) columns[c * width + k] = x[k * s->match + c * s->coordinate];
+    for (ptrdiff_t k = n; k < width; k++) columns[c * width + k] = 0;
+  }
+}
+
+/* Upper triangles of the outer products of the slot's vectors of some matches, component first: out (packed, width); matches at
+   x[c stride + k]. */
+static void pack_slot(const Slot *s, const double *x, ptrdiff_t stride, int width, double scale_, const double *centre,
                       const double *weights, double *out) {
   double moved[MAX_SPACE + 1][CHUNK + 8];
   int d = s->dim, row = 0;
-  for (int c = 0; c < d; c++) {
-    for (ptrdiff_t k = 0; k < count; k++) moved[c][k] = (x[k * s->match + c * s->coordinate] - centre[c]) * scale_;
-    for (ptrdiff_t k = count; k < width; k++) moved[c][k] = 0;
-  }
+  for (int c = 0; c < d; c++) for (int k = 0; k < width; k++) moved[c][k] = (x[c * stride + k] - centre[c]) * scale_;
   for (int k = 0; k < width; k++) moved[d][k] = 1;
   if (s->kind == CONIC_MONOMIALS) {  /* of the point (x, y, 1), each scaled by the root of how often it occurs */
     double factor = 1.4142135623730951, mono[6];
@@ -64,8 +76,7 @@ static void pack_slot(const Slot *s, const double *x, ptrdiff_t count, int width
       }
     }
   }
-  if (weights)
-    for (int r = 0; r < row; r++) for (int k = 0; k < width; k++) out[r * width + k] *= k < count ? weights[k] : 0;
+  if (weights) for (int r = 0; r < row; r++) for (int k = 0; k < width; k++) out[r * width + k] *= weights[k];
 }
 
 /* Sums over the matches of the products of packed slots, added to moments[(i right + r) stride]. */
@@ -136,65 +147,269 @@ static void next_vector(Pack *p) {
   }
 }
 
-/* Fits of a batch: slots described by kinds, dims, pointers and strides (3 each), weights (batch, n) of at most 1 ->
-   scales (batch, slots) and centres (batch, slots, MAX_SPACE) of the similarities, null spaces (batch, dim, D) of the normalized
-   matches, vectors of the next eigenvalue (batch, D), values, sums, trace, next over trace, certified.  0, or 1 without memory. */
+/* ---- judgement and the way back to measured coordinates ----------------------------------------------------------------- */
+
+enum { RESOLVED, GRAM_ROUNDING, CONDITION, NOISE, NARROW_WIDTH, SPARE_ROWS, CHANCE_FACTOR, CHANCE_QUANTILE };  /* limits: see fit.py */
+enum { OK = 0, DEGENERATE = 2, AMBIGUOUS = 3 };  /* dyntorch.Status */
+enum { UNDECIDED = 1, WEAK = 2 };  /* left to the caller altogether; the noise is to be read off */
+enum { ANY_TENSOR, RANK_TWO, NONSINGULAR };  /* internal constraints */
+
+typedef struct { double residual, sum, trace, next; int certified; } Spectrum;
+
+/* The status of one problem, and the expected relative error: the rules of _relative_noise and _ambiguity_limit in fit.py. */
+static int judge(const Spectrum *found, const double *limits, double present, int few, int width, int dim, int *status, double *error) {
+  double spare = present - (width - dim);
+  spare = spare > 0 ? spare : 0;
+  double noise = (found->residual > 0 ? found->residual : 0) / (spare > 1 ? spare : 1);
+  double square = spare > 0 ? noise * found->sum : 0, condition = found->trace * found->sum, rounding = EPS * condition;
+  *error = sqrt(square);
+  *status = OK;
+  int exact = rounding > limits[GRAM_ROUNDING] && rounding > 1e-3 * square;
+  if (!found->certified || !(found->next > limits[RESOLVED]) || exact || few || present < width - dim) return UNDECIDED;
+  double limit = limits[NOISE];
+  if (width <= limits[NARROW_WIDTH] && spare >= limits[SPARE_ROWS]) {  /* chi-square over its mean (Wilson and Hilferty) */
+    double part = 2 / (9 * spare), cube = 1 - part + limits[CHANCE_QUANTILE] * sqrt(part);
+    cube *= limits[CHANCE_FACTOR] * cube * cube;
+    limit = cube < limit ? cube : limit;
+  }
+  if (square * (present > 1 ? present : 1) > limit) { *status = AMBIGUOUS; return 0; }
+  return spare > 0 && condition > limits[CONDITION] ? WEAK : 0;
+}
+
+static double largest(const double *x, int size) {
+  double most = 0;
+  for (int i = 0; i < size; i++) most = fabs(x[i]) > most ? fabs(x[i]) : most;
+  return most;
+}
+static void divide(double *x, double by, int size) { if (by > 0) for (int i = 0; i < size; i++) x[i] /= by; }
+static void unit_length(double *x, int size) {
+  double total = 0;
+  for (int i = 0; i < size; i++) total += x[i] * x[i];
+  divide(x, sqrt(total), size);
+}
+static void cofactors(const double *M, double *out) {
+  for (int i = 0; i < 3; i++) for (int j = 0; j < 3; j++) {
+    int a = (i + 1) % 3, b = (i + 2) % 3, c = (j + 1) % 3, d = (j + 2) % 3;
+    out[3 * i + j] = M[3 * a + c] * M[3 * b + d] - M[3 * a + d] * M[3 * b + c];
+  }
+}
+
+/* Left and right null vector of a 3 x 3 matrix, as null_vectors in geometry/homogeneous.py. */
+static void null_vectors(const double *M, double *left, double *right) {
+  double scaled[9], adjoint[9], power[9], next[9];
+  memcpy(scaled, M, sizeof scaled);
+  divide(scaled, largest(scaled, 9), 9);
+  cofactors(scaled, adjoint);
+  divide(adjoint, largest(adjoint, 9), 9);
+  for (int i = 0; i < 3; i++) for (int j = 0; j < 3; j++) {
+    power[3 * i + j] = 0;
+    for (int k = 0; k < 3; k++) power[3 * i + j] += adjoint[3 * i + k] * adjoint[3 * j + k];
+  }
+  for (int squaring = 0; squaring < 5; squaring++) {
+    divide(power, largest(power, 9), 9);
+    for (int i = 0; i < 3; i++) for (int j = 0; j < 3; j++) {
+      next[3 * i + j] = 0;
+      for (int k = 0; k < 3; k++) next[3 * i + j] += power[3 * i + k] * power[3 * k + j];
+    }
+    memcpy(power, next, sizeof power);
+  }
+  int pick = 0;
+  for (int i = 1; i < 3; i++) if (power[4 * i] > power[4 * pick]) pick = i;
+  for (int i = 0; i < 3; i++) left[i] = power[3 * i + pick];
+  divide(left, largest(left, 3), 3);
+  unit_length(left, 3);
+  for (int i = 0; i < 3; i++) right[i] = adjoint[i] * left[0] + adjoint[3 + i] * left[1] + adjoint[6 + i] * left[2];
+  unit_length(right, 3);
+}
+
+/* Determinant by elimination with pivots; destroys the matrix. */
+static double determinant(double *M, int size) {
+  double det = 1;
+  for (int j = 0; j < size; j++) {
+    int pivot = j;
+    for (int i = j + 1; i < size; i++) if (fabs(M[i * size + j]) > fabs(M[pivot * size + j])) pivot = i;
+    if (!(fabs(M[pivot * size + j]) > 0)) return 0;
+    if (pivot != j) {
+      for (int k = 0; k < size; k++) { double t = M[j * size + k]; M[j * size + k] = M[pivot * size + k]; M[pivot * size + k] = t; }
+      det = -det;
+    }
+    det *= M[j * size + j];
+    for (int i = j + 1; i < size; i++) {
+      double factor = M[i * size + j] / M[j * size + j];
+      for (int k = j + 1; k < size; k++) M[i * size + k] -= factor * M[j * size + k];
+    }
+  }
+  return det;
+}
+
+/* The nearest tensor that fulfils the internal constraints, 0 where there is none; tensors of norm 1. */
+static void constrain(double *tensor, int constraint, int width) {
+  if (constraint == RANK_TWO) {
+    double left[3], right[3];
+    null_vectors(tensor, left, right);
+    for (int i = 0; i < 3; i++) {
+      double along = tensor[3 * i] * right[0] + tensor[3 * i + 1] * right[1] + tensor[3 * i + 2] * right[2];
+      for (int j = 0; j < 3; j++) tensor[3 * i + j] -= along * right[j];
+    }
+  } else if (constraint == NONSINGULAR) {
+    double copy[(MAX_SPACE + 1) * (MAX_SPACE + 1)];
+    memcpy(copy, tensor, sizeof(double) * width * width);
+    if (fabs(determinant(copy, width)) <= 1e-12) memset(tensor, 0, sizeof(double) * width * width);
+  }
+}
+
+/* The tensor of the measured coordinates at norm 1; whether there is one. */
+static int denormalize(const Slot *slots, int count, const double *scales, const double *centres, double *tensor, int D) {
+  int inner = D;
+  for (int s = 0; s < count; s++) {
+    int d = slots[s].dim, dual = slots[s].kind == HYPERPLANES_THROUGH;
+    const double *c = centres + s * MAX_SPACE;
+    double factor = dual ? 1 / scales[s] : scales[s], away = (dual ? 1 : factor) * largest(c, d);
+    double most = factor > 1 ? factor : 1;
+    most = away > most ? away : most;
+    inner /= d + 1;
+    for (int outer = 0; outer < D; outer += inner * (d + 1)) for (int k = 0; k < inner; k++) {
+      double *entry = tensor + outer + k, *last = entry + d * inner, sum = *last;
+      for (int i = 0; i < d; i++) {
+        if (dual) entry[i * inner] = (entry[i * inner] * factor + *last * c[i]) / most;
+        else { sum -= factor * c[i] * entry[i * inner]; entry[i * inner] *= factor / most; }
+      }
+      *last = sum / most;
+    }
+  }
+  double most = largest(tensor, D);
+  divide(tensor, most, D);
+  unit_length(tensor, D);
+  return most > 0 && most < 1.0 / 0.0;
+}
+
+static void write_similarity(const Slot *s, double scale_, const double *centre, double *out) {
+  int d = s->dim;
+  for (int i = 0; i <= d; i++) for (int j = 0; j <= d; j++) out[i * (d + 1) + j] = i == j ? (i < d ? scale_ : 1) : 0;
+  for (int i = 0; i < d; i++) out[i * (d + 1) + d] = -scale_ * centre[i];
+}
+
+/* Weights over the largest one, 0 behind the last; how many are positive, and their sum. */
+static int relative_weights(const double *weights, ptrdiff_t n, ptrdiff_t width, double *relative, double *total) {
+  lanes most = all(2.2250738585072014e-308), sum = all(0), present = all(0);
+  memcpy(relative, weights, sizeof(double) * n);
+  for (ptrdiff_t k = n; k < width; k++) relative[k] = 0;
+  for (ptrdiff_t k = 0; k < width; k += LANES) most = larger(*(const unaligned_lanes *)(relative + k), most);
+  double top = most[0], count = 0;
+  for (int v = 1; v < LANES; v++) top = most[v] > top ? most[v] : top;
+  for (ptrdiff_t k = 0; k < width; k += LANES) {
+    lanes share = *(const unaligned_lanes *)(relative + k) / top;
+    *(unaligned_lanes *)(relative + k) = share;
+    sum += share;
+    present += where(share > all(0), all(1), all(0));
+  }
+  *total = 0;
+  for (int v = 0; v < LANES; v++) { *total += sum[v]; count += present[v]; }
+  *total = *total > 2.2250738585072014e-308 ? *total : 2.2250738585072014e-308;
+  return (int)count;
+}
+
+typedef struct {
+  double *const *transforms;  /* (batch, d + 1, d + 1) of each slot */
+  double *basis, *second;     /* (batch, dim, D) null space, (batch, D) vector of the next eigenvalue where WEAK */
+  double *normalized, *tensor;  /* (batch, D) with its constraint, and in measured coordinates; NULL: not wanted */
+  double *error;              /* (batch) expected relative error */
+  long long *status;          /* (batch) */
+  unsigned char *flags;       /* (batch) */
+} Fits;
+
+/* Fits of a batch: slots described by kinds, dims, pointers and strides (3 each), weights (batch, n), rows per match, fewest
+   matches and limits of the judgement -> out.  0, or 1 without memory. */
 int EXPORT(fit_points)(int slots, const int *kinds, const int *dims, const double *const *views, const ptrdiff_t *strides,
-                       const double *weights, ptrdiff_t batch, ptrdiff_t n, int dim, int normalized, double *scales,
-                       double *centres, double *basis, double *second, double *values, double *sum, double *trace, double *next,
-                       unsigned char *certified) {
+                       const double *weights, ptrdiff_t batch, ptrdiff_t n, int dim, int normalized, int rows, int minimal,
+                       int constraint, const double *limits, double *const *transforms, double *basis, double *second,
+                       double *constrained, double *tensor, double *error, long long *status, unsigned char *flags) {
+  Fits out = {transforms, basis, second, constrained, tensor, error, status, flags};
   Slot slot[MAX_SLOTS];
-  int sizes[MAX_SLOTS], D = 1, all_packed = 0, chunk = n < CHUNK ? (int)(n + LANES - 1) / LANES * LANES : CHUNK;
+  ptrdiff_t padded = (n + LANES - 1) / LANES * LANES;
+  int sizes[MAX_SLOTS], D = 1, all_packed = 0, chunk = padded < CHUNK ? (int)padded : CHUNK, coordinates = 0;
   size_t moments_size = 1;
   for (int s = 0; s < slots; s++) {
     slot[s] = (Slot){kinds[s], dims[s], views[s], strides[3 * s], strides[3 * s + 1], strides[3 * s + 2]};
     sizes[s] = packed_size(slot + s);
     D *= slot_width(slot + s);
     all_packed += sizes[s];
+    coordinates += slot[s].dim;
     moments_size *= sizes[s];
   }
   Pack p;
   double *generic, *rest;
-  size_t packed_room = (size_t)all_packed * chunk, extra = moments_size * LANES + packed_room + (WIDE + 1) * (size_t)chunk + LANES;
-  lanes *memory = workspace(&p, D, dim, extra, &generic, &rest);
+  size_t packed_room = (size_t)all_packed * chunk, room_size = (WIDE + 1) * (size_t)chunk + LANES;
+  lanes *memory = workspace(&p, D, dim, moments_size * LANES + packed_room + room_size + (1 + coordinates) * padded, &generic, &rest);
   int *index = malloc(sizeof(int) * D * D);
   if (!memory || !index) { free(memory); free(index); return 1; }
   double *moments = rest, *packed[MAX_SLOTS], *room;
   packed[0] = moments + moments_size * LANES;
   for (int s = 1; s < slots; s++) packed[s] = packed[s - 1] + (size_t)sizes[s - 1] * chunk;
   room = packed[slots - 1] + (size_t)sizes[slots - 1] * chunk;
+  double *relative = room + room_size, *columns = relative + padded;
   unpacking(slot, slots, D, index);
-  Answers out = {basis, values, sum, next, certified};
   for (ptrdiff_t first = 0; first < batch; first += LANES) {
-    int count = batch - first < LANES ? (int)(batch - first) : LANES;
+    int count = batch - first < LANES ? (int)(batch - first) : LANES, present[LANES];
+    double scales[LANES][MAX_SLOTS], centres[LANES][MAX_SLOTS * MAX_SPACE];
     memset(moments, 0, sizeof(double) * moments_size * LANES);
     for (int v = 0; v < count; v++) {
-      const double *w = weights + (first + v) * n;
-      double *scale_ = scales + (first + v) * slots, *centre = centres + (first + v) * slots * MAX_SPACE;
+      const double *of_slot[MAX_SLOTS];
+      double *free_column = columns, total;
+      present[v] = relative_weights(weights + (first + v) * n, n, padded, relative, &total);
       for (int s = 0; s < slots; s++) {
-        for (int c = 0; c < MAX_SPACE; c++) centre[s * MAX_SPACE + c] = 0;
-        scale_[s] = normalized ? similarity(slot + s, slot[s].x + (first + v) * slot[s].batch, w, n, centre + s * MAX_SPACE) : 1;
+        double *centre = centres[v] + s * MAX_SPACE;
+        int d = slot[s].dim, size = (d + 1) * (d + 1);
+        for (int c = 0; c < MAX_SPACE; c++) centre[c] = 0;
+        gather(slot + s, slot[s].x + (first + v) * slot[s].batch, n, padded, free_column);
+        scales[v][s] = normalized ? similarity(free_column, d, relative, total, padded, centre) : 1;
+        write_similarity(slot + s, scales[v][s], centre, out.transforms[s] + (first + v) * size);
+        of_slot[s] = free_column;
+        free_column += d * padded;
       }
-      for (ptrdiff_t start = 0; start < n; start += chunk) {
-        ptrdiff_t some = n - start < chunk ? n - start : chunk;
-        int width = (int)(some + LANES - 1) / LANES * LANES;
+      for (ptrdiff_t start = 0; start < padded; start += chunk) {
+        int width = padded - start < chunk ? (int)(padded - start) : chunk;
         for (int s = 0; s < slots; s++)
-          pack_slot(slot + s, slot[s].x + (first + v) * slot[s].batch + start * slot[s].match, some, width, scale_[s],
-                    centre + s * MAX_SPACE, s == 0 ? w + start : NULL, packed[s]);
+          pack_slot(slot + s, of_slot[s] + start, padded, width, scales[v][s], centres[v] + s * MAX_SPACE,
+                    s == 0 ? relative + start : NULL, packed[s]);
         add_moments(packed, sizes, slots, width, moments + v, LANES, room);
       }
     }
     for (int v = count; v < LANES; v++) for (size_t k = 0; k < moments_size; k++) moments[k * LANES + v] = moments[k * LANES + count - 1];
     for (int i = 0; i < D; i++) for (int j = 0; j <= i; j++) p.G[i * D + j] = *(const lanes *)(moments + (ptrdiff_t)index[i * D + j] * LANES);
+    lanes trace = all(0);
+    for (int i = 0; i < D; i++) trace += p.G[i * D + i];
+    null_spaces(&p, generic, 1);
+    double values[LANES * MAX_DIM], sums[LANES], next[LANES];
+    unsigned char certified[LANES];
+    Answers answers = {out.basis + first * dim * D, values, sums, next, certified};
+    write_answers(&p, &answers, 0, count, generic);
+    int weak = 0;
     for (int v = 0; v < count; v++) {
-      trace[first + v] = 0;
-      for (int i = 0; i < D; i++) trace[first + v] += p.G[i * D + i][v];
+      ptrdiff_t problem = first + v;
+      Spectrum found = {0, sums[v], trace[v], next[v], certified[v]};
+      for (int j = 0; j < dim; j++) found.residual += values[v * dim + j] / dim;
+      int state;
+      int flag = judge(&found, limits, (double)present[v] * rows, present[v] < minimal, D, dim, &state, out.error + problem);
+      if (out.tensor && flag != UNDECIDED) {
+        double *one = out.normalized + problem * D, *back = out.tensor + problem * D;
+        memcpy(one, out.basis + problem * D, sizeof(double) * D);
+        constrain(one, constraint, slot[0].dim + 1);
+        memcpy(back, one, sizeof(double) * D);
+        if (!denormalize(slot, slots, scales[v], centres[v], back, D)) {
+          state = DEGENERATE;
+          memset(one, 0, sizeof(double) * D);
+          memset(back, 0, sizeof(double) * D);
+        }
+      }
+      out.status[problem] = state;
+      out.flags[problem] = flag;
+      weak |= flag & WEAK;
     }
-    null_spaces(&p, generic, 0);
-    next_vector(&p);
-    p.sum = harmonic_sum(&p, p.S);
-    write_answers(&p, &out, first, count, generic);
-    for (int v = 0; v < count; v++) for (int i = 0; i < D; i++) second[(first + v) * D + i] = p.block[dim * D + i][v];
+    if (weak) {
+      next_vector(&p);
+      for (int v = 0; v < count; v++) for (int i = 0; i < D; i++) out.second[(first + v) * D + i] = p.block[dim * D + i][v];
+    }
   }
   free(memory);
   free(index);

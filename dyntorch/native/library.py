@@ -22,12 +22,14 @@ _POINTER, _SIZE, _INT = ctypes.c_void_p, ctypes.c_ssize_t, ctypes.c_int
 _ARGUMENTS = {
     "null_of_grams": (_POINTER, _SIZE, _INT, _INT, *[_POINTER] * 5),
     "null_of_rows": (_POINTER, _SIZE, _SIZE, *[_INT] * 3, *[_POINTER] * 4),
-    "fit_points": (_INT, *[_POINTER] * 5, _SIZE, _SIZE, _INT, _INT, *[_POINTER] * 9),
+    "fit_points": (_INT, *[_POINTER] * 5, _SIZE, _SIZE, *[_INT] * 5, *[_POINTER] * 9),
 }
 MAX_SLOTS, MAX_SPACE = 6, 8
 """Views, and dimensions of what is measured in them, that :func:`fit_points` takes."""
 POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS = range(3)
 """What a measured point puts into a slot, as the kernel numbers it."""
+UNDECIDED, WEAK = 1, 2
+"""Flags of a fit: left to torch, and with a second tensor that may fit as well within the noise."""
 
 
 @cache
@@ -80,7 +82,7 @@ def null_of_grams(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tenso
     gram = gram.contiguous()
     batch, size = gram.shape[:2]
     basis, values = gram.new_empty(batch, dim, size), gram.new_empty(batch, dim)
-    total, following, certified = gram.new_empty(batch), gram.new_empty(batch), gram.new_empty(batch, dtype=_bool())
+    total, following, certified = gram.new_empty(batch), gram.new_empty(batch), gram.new_empty(batch, dtype=_torch().bool)
     out = (basis, values, total, following, certified)
     _call("null_of_grams", gram.data_ptr(), batch, size, dim, *(part.data_ptr() for part in out))
     return out
@@ -92,50 +94,77 @@ def null_of_rows(matrix: Tensor, dim: int, *, always: bool, keep: bool) -> tuple
     matrix = matrix.contiguous()
     batch, rows, size = matrix.shape
     basis, following = matrix.new_empty(batch, dim, size), matrix.new_empty(batch)
-    certified, gram = matrix.new_empty(batch, dtype=_bool()), matrix.new_empty(batch, *([size] * 2 if keep else [0, 0]))
+    certified, gram = matrix.new_empty(batch, dtype=_torch().bool), matrix.new_empty(batch, *([size] * 2 if keep else [0, 0]))
     out = (basis.data_ptr(), following.data_ptr(), certified.data_ptr(), gram.data_ptr() if keep else None)
     _call("null_of_rows", matrix.data_ptr(), batch, rows, size, dim, always, *out)
     return basis, following, certified, gram
 
 
 class PointFits(NamedTuple):
-    """What the kernel says of the fits of a batch, in the coordinates of the similarities."""
+    """What the kernel says of the fits of a batch; see ``fit.h``."""
 
-    scale: Tensor  # (b, views)
-    centre: Tensor  # (b, views, MAX_SPACE), the first of which count
-    basis: Tensor  # (b, dim, D)
+    transforms: list[Tensor]  # (b, d + 1, d + 1) of each view
+    basis: Tensor  # (b, dim, D), of the normalized matches
     second: Tensor  # (b, D): vector of the next eigenvalue
-    residual: Tensor  # (b, dim)
-    competing: Tensor  # (b,): sum of 1 / eigenvalue over the others
-    trace: Tensor  # (b,)
-    following: Tensor  # (b,): next eigenvalue over the trace
-    certified: Tensor  # (b,)
+    normalized: Tensor  # (b, *widths): of dim 1, with its internal constraint; else empty
+    tensor: Tensor  # (b, *widths) in measured coordinates
+    uncertainty: Tensor  # (b,)
+    status: Tensor  # (b,)
+    flags: Tensor  # (b,): UNDECIDED, WEAK or 0
 
 
 def fit_points(
-    kinds: Sequence[int], views: Sequence[Tensor], weights: Tensor, widths: Sequence[int], dim: int, normalized: bool
+    kinds: Sequence[int],
+    views: Sequence[Tensor],
+    weights: Tensor,
+    widths: Sequence[int],
+    *,
+    dim: int,
+    normalized: bool,
+    rows: int,
+    minimal: int,
+    constraint: int | None,
+    limits: Sequence[float],
 ) -> PointFits:
-    """Similarities, moments of the products of slots and null spaces in one pass: views ``(b, n, d)`` of any strides, weights
-    ``(b, n)`` of at most 1, float64; slots of so many columns."""
+    """Similarities, moments of the products of slots, null spaces, judgement and the way back in one pass: views ``(b, n, d)`` of
+    any strides, weights ``(b, n)``, float64; slots of so many columns, so many rows per match; constraint None: only the null
+    spaces."""
     weights = weights.contiguous()
-    (batch, matches), count, size = weights.shape, len(views), math.prod(widths)
-    new = weights.new_empty
+    (batch, matches), count, new = weights.shape, len(views), weights.new_empty
+    shape = (batch, *widths) if constraint is not None else (0,)
     fits = PointFits(
-        new(batch, count),
-        new(batch, count, MAX_SPACE),
-        new(batch, dim, size),
-        new(batch, size),
-        new(batch, dim),
+        [new(batch, x.shape[-1] + 1, x.shape[-1] + 1) for x in views],
+        new(batch, dim, math.prod(widths)),
+        new(batch, math.prod(widths)),
+        new(shape),
+        new(shape),
         new(batch),
-        new(batch),
-        new(batch),
-        new(batch, dtype=_bool()),
+        new(batch, dtype=_torch().int64),
+        new(batch, dtype=_torch().uint8),
     )
     strides = (_SIZE * (3 * count))(*(stride for x in views for stride in x.stride()))
     numbers = ((_INT * count)(*kinds), (_INT * count)(*(x.shape[-1] for x in views)))
     pointers = (_POINTER * count)(*(x.data_ptr() for x in views))
-    given = (count, *numbers, pointers, strides, weights.data_ptr(), batch, matches, dim, normalized)
-    _call("fit_points", *given, *(part.data_ptr() for part in fits))
+    places = (_POINTER * count)(*(x.data_ptr() for x in fits.transforms))
+    out = [part.data_ptr() for part in fits[1:]]
+    if constraint is None:
+        out[2] = out[3] = None
+    bounds = (ctypes.c_double * len(limits))(*limits)
+    given = (
+        count,
+        *numbers,
+        pointers,
+        strides,
+        weights.data_ptr(),
+        batch,
+        matches,
+        dim,
+        normalized,
+        rows,
+        minimal,
+        constraint or 0,
+    )
+    _call("fit_points", *given, bounds, places, *out)
     return fits
 
 
@@ -144,7 +173,8 @@ def _call(name: str, *arguments: Any) -> None:
         raise MemoryError("no memory for the workspace of the kernel: fewer problems at once")
 
 
-def _bool() -> Any:
+def _torch() -> Any:
+    """Not needed by what only asks which kernel there is."""
     import torch
 
-    return torch.bool
+    return torch

@@ -125,7 +125,7 @@ static void null_spaces(Pack *p, const double *generic, int sums) {
   }
   if (dim > 1) ritz(p->G, D, p->block, dim, p->image, p->values);
   p->certified = sound & (bound <= all(ANGLE));
-  p->sum = sums ? harmonic_sum(p, p->S) : all(0);
+  p->sum = sums ? harmonic_sum(p, p->image) : all(0);  /* image, step and before: room for four columns */
 }
 
 /* Fixed directions without symmetry (count, size), the same as in eigenspaces.py. */
