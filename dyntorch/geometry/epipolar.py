@@ -9,7 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dyntorch.native import library
 from dyntorch.numerics.blocks import constant
+from dyntorch.numerics.eigenspaces import on_host
 from dyntorch.numerics.nullspace import eigh
 
 TINY = 1e-30
@@ -31,18 +33,23 @@ class PairMonomials:
     """The products of coordinates in which the epipolar constraint and its squared gradient are linear and quadratic in F."""
 
     def __init__(self, x1: Tensor, x2: Tensor) -> None:
-        """Of matches ``(n, 2)``."""
+        """Of matches ``(n, 2)``, or of those of several pairs of views, ``(p, n, 2)``."""
         self.bilinear = bilinear(x1, x2).contiguous()
         """``(9, n)``: x2_i x1_j."""
-        self.quadratic = torch.cat([_symmetric(x1), _symmetric(x2)])
+        self.quadratic = torch.cat([_symmetric(x1), _symmetric(x2)], dim=-2)
         """``(12, n)``: x1_i x1_j, then x2_i x2_j, i <= j."""
 
     def terms(self, F: Tensor) -> tuple[Tensor, Tensor]:
         """The constraint and the square of its gradient, ``(*batch, n)`` each."""
         return self.flat_terms(F.flatten(-2))
 
+    def products(self) -> Tensor:
+        """``(n, 36)``: a product of two of the x2_i x1_j is one of x2_i x2_k with one of x1_j x1_l: 36 of them, not 81."""
+        first, second = self.quadratic.split(6, dim=-2)
+        return (second[..., :, None, :] * first[..., None, :, :]).flatten(-3, -2).mT
+
     def flat_terms(self, f: Tensor) -> tuple[Tensor, Tensor]:
-        """The same of ``(*batch, 9)``."""
+        """The same of ``(*batch, 9)``; of several pairs ``(p, b, 9)``, each with its own."""
         square = (f[..., :, None] * f[..., None, :]).flatten(-2) @ polar(f.dtype, f.device).flatten(0, 1) @ self.quadratic
         return f @ self.bilinear, square.clamp_(min=TINY)
 
@@ -55,9 +62,9 @@ def bilinear(x1: Tensor, x2: Tensor) -> Tensor:
 
 
 def _symmetric(x: Tensor) -> Tensor:
-    """``(6, n)``: the products xx, xy, yy, x, y, 1 of points ``(n, 2)``."""
+    """``(*batch, 6, n)``: the products xx, xy, yy, x, y, 1 of points ``(*batch, n, 2)``."""
     a, b = x.unbind(-1)
-    return torch.stack([a * a, a * b, b * b, a, b, torch.ones_like(a)])
+    return torch.stack([a * a, a * b, b * b, a, b, torch.ones_like(a)], dim=-2)
 
 
 @constant
@@ -78,7 +85,19 @@ def polar(dtype: torch.dtype, device: torch.device) -> Tensor:
 def null_vector(gram: Tensor) -> Tensor:
     r"""Unit vectors to the smallest eigenvalue of small Gram matrices, as a start: accurate where it stands apart. gram
     ``(*batch, D, D)`` -> ``(*batch, D)``."""
-    # microseconds per matrix of D = 9 in batches of 1, 30, 1000: 130, 6, 2.6; by gram_null_space 281, 13, 9.4
+    if on_host(gram) and gram.dtype == torch.float64 and library.solves(gram.shape[-1], 1):
+        # microseconds per matrix of D = 9 in batches of 1, 30, 1000: 12, .9, .6; by gram_null_space 99, 17, 5
+        flat = gram.reshape(-1, *gram.shape[-2:])
+        vector, _, _, _, certified = library.null_of_grams(flat, 1)
+        hard = (~certified).nonzero()[:, 0]
+        if len(hard):
+            vector[hard, 0] = _by_squaring(flat[hard])
+        return vector.view(gram.shape[:-1])
+    return _by_squaring(gram)
+
+
+def _by_squaring(gram: Tensor) -> Tensor:
+    # microseconds per matrix of D = 9 in batches of 1, 30, 1000: 130, 6, 2.6
     trace = gram.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     eye = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device)
     scaled = gram / torch.where(trace > 0, trace, 1.0) + SHIFT * eye
@@ -108,21 +127,24 @@ def eight_point(x1: Tensor, x2: Tensor, weights: Tensor, rounds: int = 0) -> Ten
 
 
 def eight_point_of(data: PairMonomials, weights: Tensor, rounds: int) -> Tensor:
-    # a product of two of the x2_i x1_j is one of x2_i x2_k with one of x1_j x1_l: 36 of them, not 81
-    first, second = data.quadratic.split(6)
-    products, place = (second[:, None] * first).flatten(0, 1).mT, _places(weights.device)
+    products = data.products()
     weighted = weights
     for remaining in range(rounds, -1, -1):
-        gram = (weighted @ products).gather(-1, place.expand(len(weights), -1)).unflatten(-1, (9, 9))
-        first, second = hartley(torch.stack([gram[:, 6:, 6:], gram[:, 2::3, 2::3]])).unbind(0)
+        gram = gram_of_products(weighted @ products)
+        first, second = hartley(torch.stack([gram[..., 6:, 6:], gram[..., 2::3, 2::3]])).unbind(0)
         # vec(T2^T F T1) = (T2^T (x) T1^T) vec(F)
-        change = (second.mT[:, :, None, :, None] * first.mT[:, None, :, None, :]).reshape(-1, 9, 9)
+        change = (second.mT[..., :, None, :, None] * first.mT[..., None, :, None, :]).reshape(*gram.shape)
         vector = null_vector(change.mT @ gram @ change)
         F = second.mT @ rank_two(vector.unflatten(-1, (3, 3))) @ first
         F = F / torch.linalg.matrix_norm(F, keepdim=True)
         if remaining:
             weighted = weights / data.terms(F)[1]
     return F
+
+
+def gram_of_products(sums: Tensor) -> Tensor:
+    """Grams ``(*batch, 9, 9)`` of the bilinear monomials from weighted sums ``(*batch, 36)`` of their products."""
+    return sums[..., _places(sums.device)].unflatten(-1, (9, 9))
 
 
 @constant
@@ -151,13 +173,13 @@ def affine_fundamental(x1: Tensor, x2: Tensor, weights: Tensor) -> Tensor:
     joint = torch.cat([x2, x1], dim=-1)
     total = weights.sum(-1, keepdim=True).clamp(min=TINY)
     centre = weights @ joint / total
-    products = (joint[:, :, None] * joint[:, None, :]).flatten(1)
-    covariance = (weights @ products / total).unflatten(-1, (4, 4)) - centre[:, :, None] * centre[:, None, :]
+    products = (joint[..., :, None] * joint[..., None, :]).flatten(-2)
+    covariance = (weights @ products / total).unflatten(-1, (4, 4)) - centre[..., :, None] * centre[..., None, :]
     # microseconds per matrix in batches of 1, 30, 1000: 12, 3, 1.6; by gram_null_space 294, 14, 3.5
     normal = eigh(torch.nan_to_num(covariance))[1][..., 0]
-    F = normal.new_zeros(len(normal), 3, 3)
-    F[:, :2, 2], F[:, 2, :2] = normal[:, :2], normal[:, 2:]
-    F[:, 2, 2] = -(normal * centre).sum(-1)
+    F = normal.new_zeros(*normal.shape[:-1], 3, 3)
+    F[..., :2, 2], F[..., 2, :2] = normal[..., :2], normal[..., 2:]
+    F[..., 2, 2] = -(normal * centre).sum(-1)
     return F / torch.linalg.matrix_norm(F, keepdim=True)
 
 

@@ -98,28 +98,38 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, T
     return tuple(table.to(device) for table in found)  # type: ignore[return-value]
 
 
-def descend(F: Tensor, x1: Tensor, x2: Tensor, weights: Tensor, scale: float, steps: int = 3) -> Tensor:
+def descend(F: Tensor, x1: Tensor, x2: Tensor, weights: Tensor, scale: float | Tensor, steps: int = 3) -> Tensor:
     r"""Levenberg-Marquardt steps towards the least truncated Sampson distance: F ``(B, 3, 3)``, x1, x2 ``(n, 2)``, weights
-    ``(B, n)`` -> ``(B, 3, 3)``."""
+    ``(B, n)`` -> ``(B, 3, 3)``; of several pairs of views ``(p, ...)`` each, at scales ``(p,)``."""
     return _descend(PairMonomials(x1, x2), F, weights, (scale,), steps)[0]
 
 
-def _descend(data: PairMonomials, F: Tensor, weights: Tensor, scales: Sequence[float], steps: int) -> tuple[Tensor, Tensor]:
+def _descend(
+    data: PairMonomials, F: Tensor, weights: Tensor, scales: Sequence[float | Tensor], steps: int
+) -> tuple[Tensor, Tensor]:
     """F and its cost at the last scale."""
-    tables = Products(data)
-    size = max(1, BLOCK // max(1, weights.shape[-1]))
+    tables, lead = Products(data), weights.shape[:-1]
+    # several pairs of views come in blocks already
+    size = max(1, BLOCK // max(1, weights.shape[-1])) if len(lead) == 1 else max(1, lead.numel())
 
     def block(F: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         options, frames, found = replace(DESCENT, iterations=steps), Frames.of(F), None
         for scale in scales:
-            problem = EpipolarProblem(tables, weights, 1 / max(scale, LEAST) ** 2)
+            problem = EpipolarProblem(tables, weights, (*lead[:-1], -1), _inverse_square(scale, lead))
             start = problem.evaluate((frames.turns, frames.core)) if found is None else problem.evaluate_at_scale(found)
             found = minimize(problem, start, options)
         assert found is not None
         return found.terms[0].unflatten(-1, (3, 3)), found.cost
 
-    found, cost = map_blocks(block, F, weights, size=size)
-    return found, cost
+    found, cost = map_blocks(block, F.reshape(-1, 3, 3), weights.reshape(-1, weights.shape[-1]), size=size)
+    return found.view(*lead, 3, 3), cost.view(lead)
+
+
+def _inverse_square(scale: float | Tensor, lead: torch.Size) -> float | Tensor:
+    """Of one scale, or of those of several pairs ``(p,)``, once for every fit ``(p b, 1)``."""
+    if not isinstance(scale, Tensor):
+        return 1 / max(scale, LEAST) ** 2
+    return scale.clamp(min=LEAST).square().reciprocal()[:, None].expand(lead).reshape(-1, 1)
 
 
 @dataclass(frozen=True)
@@ -128,13 +138,15 @@ class EpipolarProblem(LeastSquares):
 
     tables: Products
     weights: Tensor
-    inverse: float
-    """Of the squared scale."""
+    lead: tuple[int, ...]
+    """What the problems are in the tables: ``(-1,)``, or ``(p, -1)`` of several pairs of views."""
+    inverse: float | Tensor
+    """Of the squared scale, of all or ``(b, 1)``."""
 
     def evaluate(self, theta: Tensors) -> Iterate:
         """With F, its values at the matches and the squared gradients."""
         f = Frames(*theta).matrix()
-        value, square = self.tables.data.flat_terms(f)
+        value, square = (x.view_as(self.weights) for x in self.tables.data.flat_terms(f.view(*self.lead, 9)))
         return Iterate(theta, _msac(value, square, self.weights, self.inverse), (f, value, square))
 
     def evaluate_at_scale(self, at: Minimum) -> Iterate:
@@ -145,7 +157,8 @@ class EpipolarProblem(LeastSquares):
     def step(self, at: Iterate, damping: Tensor) -> Tensors:
         """Of the seven parameters."""
         f, value, square = at.terms
-        normal, gradient = _normal_equations(self.tables, Frames(*at.theta), f, value, square, self.weights, self.inverse)
+        frames = Frames(*at.theta)
+        normal, gradient = _normal_equations(self.tables, frames, f, value, square, self.weights, self.inverse, self.lead)
         return (damped_step(gradient, normal, damping, ridge=RIDGE),)
 
     def retract(self, theta: Tensors, step: Tensors) -> Tensors:
@@ -154,7 +167,7 @@ class EpipolarProblem(LeastSquares):
         return fresh.turns, fresh.core
 
 
-def _msac(value: Tensor, square: Tensor, weights: Tensor, inverse: float) -> Tensor:
+def _msac(value: Tensor, square: Tensor, weights: Tensor, inverse: float | Tensor) -> Tensor:
     ratio = (value.square() / square).mul_(inverse).clamp_(max=CAP)
     return torch.linalg.vecdot(ratio, weights)
 
@@ -167,14 +180,14 @@ class Products:
         self.data = data
         first, second, third, self.place = _pairs(data.bilinear.device)
         # the derivative of the constraint counts positive, that of its gradient negative
-        all_ = torch.cat([data.bilinear, -data.quadratic])
+        all_ = torch.cat([data.bilinear, -data.quadratic], dim=-2)
         self.polar = polar(all_.dtype, all_.device).flatten(1)
-        self.tables = [(all_[i] * all_[j]).mT for i, j in (first, second, third)]
+        self.tables = [(all_[..., i, :] * all_[..., j, :]).mT for i, j in (first, second, third)]
 
     def gram(self, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-        """Moments ``(b, 21, 21)`` of the monomials: bilinear with weights a, quadratic with c, b for one of each."""
+        """Moments ``(*batch, 21, 21)`` of the monomials: bilinear with weights a, quadratic with c, b for one of each."""
         sums = torch.cat([weight @ table for weight, table in zip((a, b, c), self.tables, strict=True)], dim=-1)
-        return sums.gather(-1, self.place.expand(len(sums), -1)).unflatten(-1, (21, 21))
+        return sums[..., self.place].unflatten(-1, (21, 21))
 
 
 @constant
@@ -196,7 +209,14 @@ def _pairs(device: torch.device) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, T
 
 
 def _normal_equations(
-    tables: Products, frames: Frames, f: Tensor, value: Tensor, square: Tensor, weights: Tensor, inverse: float
+    tables: Products,
+    frames: Frames,
+    f: Tensor,
+    value: Tensor,
+    square: Tensor,
+    weights: Tensor,
+    inverse: float | Tensor,
+    lead: tuple[int, ...] = (-1,),
 ) -> tuple[Tensor, Tensor]:
     r"""Gauss-Newton matrix ``(b, 7, 7)`` and gradient ``(b, 7)`` of the weighted distances :math:`r = e / g`."""
     ratio = value / square
@@ -205,7 +225,7 @@ def _normal_equations(
     tangents = frames.tangents()
     gradients = (f @ tables.polar).unflatten(-1, (9, 12))
     outer = torch.cat([tangents, tangents @ gradients], dim=-1)  # (b, 7, 21)
-    product = outer @ tables.gram(a, b, b * ratio)
+    product = outer @ tables.gram(*(x.view(*lead, x.shape[-1]) for x in (a, b, b * ratio))).view(-1, 21, 21)
     return product @ outer.mT, (product[..., :9] @ f[..., None])[..., 0]
 
 
@@ -213,26 +233,28 @@ def fit_fundamental(
     x1: Tensor, x2: Tensor, weights: Tensor, scales: Sequence[float], starts: Tensor | None = None, steps: int = 3
 ) -> tuple[Tensor, Tensor]:
     r"""The best of several descents: from the linear fit, from the affine one, and from given matrices. x1, x2 ``(n, 2)``,
-    weights ``(B, n)``, starts ``(B, S, 3, 3)`` -> ``(B, 3, 3)``."""
+    weights ``(B, n)``, starts ``(B, S, 3, 3)`` -> ``(B, 3, 3)``; of several pairs of views ``(p, ...)`` each."""
     if not scales or min(scales) <= 0:
         raise ValueError(
             f"scales must be positive thresholds in the unit of the matches, got {tuple(scales)}: pass e.g. (0.02, 0.01)"
         )
     data = PairMonomials(x1, x2)
-    several = torch.stack([eight_point_of(data, weights, 0), affine_fundamental(x1, x2, weights)], dim=1)
-    given = several[:, :0] if starts is None else starts
-    several = torch.cat([several, given], dim=1)
-    count = several.shape[1]
-    spread = weights[:, None].expand(-1, count, -1).flatten(0, 1)
-    F, cost = _descend(data, several.flatten(0, 1), spread, scales, steps)
-    F, cost = F.unflatten(0, (-1, count)), cost.unflatten(0, (-1, count))
+    several = torch.stack([eight_point_of(data, weights, 0), affine_fundamental(x1, x2, weights)], dim=-3)
+    several = several if starts is None else torch.cat([several, starts], dim=-3)
+
+    def fitted(several: Tensor, scales: Sequence[float], steps: int) -> tuple[Tensor, Tensor]:
+        count = several.shape[-3]
+        spread = weights[..., None, :].expand(*weights.shape[:-1], count, -1).flatten(-3, -2)
+        F, cost = _descend(data, several.flatten(-4, -3), spread, scales, steps)
+        return F.unflatten(-3, (-1, count)), cost.unflatten(-1, (-1, count))
+
+    F, cost = fitted(several, scales, steps)
     if starts is not None:
-        F0, cost0 = _descend(data, given.flatten(0, 1), spread[: given.shape[0] * given.shape[1]], scales[-1:], 0)
-        F = torch.cat([F, F0.unflatten(0, given.shape[:2])], dim=1)
-        cost = torch.cat([cost, cost0.unflatten(0, given.shape[:2])], dim=1)
-    best = cost.argmin(1)
-    index = torch.arange(len(best), device=best.device)
-    return F[index, best], cost[index, best]
+        F0, cost0 = fitted(starts, scales[-1:], 0)
+        F, cost = torch.cat([F, F0], dim=-3), torch.cat([cost, cost0], dim=-1)
+    best = cost.argmin(-1, keepdim=True)
+    picked = F.gather(-3, best[..., None, None].expand(*best.shape, 3, 3))
+    return picked[..., 0, :, :], cost.gather(-1, best)[..., 0]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -272,18 +272,21 @@ def relief_cost(view: View, fundamentals: Tensor, member: Tensor, min_scale: flo
 
 def parallax(view: View, fundamentals: Tensor, member: Tensor, min_scale: float = MIN_PARALLAX_PIXELS) -> tuple[Tensor, Tensor]:
     r"""Distances along the epipolar lines from the robust mean plane of each body, and their squared scale, in pixels.
-    fundamentals ``(B, K, 3, 3)``, member ``(B, K, n)`` -> ``(B, K, n)``."""
-    first, second = homogeneous(view.x1), homogeneous(view.x2)
-    epipole = null_vectors(fundamentals)[0]
-    mapped = first @ (skew(epipole) @ fundamentals).mT
-    across_epipole = torch.linalg.cross(second.expand_as(mapped), epipole[..., None, :].expand_as(mapped))
-    this = torch.linalg.cross(second.expand_as(mapped), mapped)
-    depth = -(this * across_epipole).sum(-1) / across_epipole.square().sum(-1).clamp(min=1e-20)
+    fundamentals ``(B, K, 3, 3)``, member ``(B, K, n)`` -> ``(B, K, n)``; of several pairs of views ``(p, ...)`` each."""
+    shape, pairs, count = member.shape, view.x1.numel() // max(1, 2 * view.x1.shape[-2]), view.x1.shape[-2]
+    # of every pair of views a few products of matrices, whatever the number of bodies: (p, G, ...)
+    member, F = member.reshape(pairs, -1, count), fundamentals.reshape(pairs, -1, 3, 3)
+    first, (x, y) = homogeneous(view.x1).view(pairs, count, 3), view.x2.view(pairs, 1, count, 2).unbind(-1)
+    epipole = null_vectors(F)[0]
+    a, b, c = ((skew(epipole) @ F).flatten(-3, -2) @ first.mT).unflatten(-2, (-1, 3)).unbind(-2)
+    d, e, f = epipole[..., None].unbind(-2)
+    across = y * f - e, d - x * f, x * e - y * d
+    depth = (y * c - b) * across[0] + (a - x * c) * across[1] + (x * b - y * a) * across[2]
+    depth = -depth / (across[0].square() + across[1].square() + across[2].square()).clamp(min=1e-20)
     # how far the image moves with depth
-    across = epipole[..., None, :2] * mapped[..., 2:] - mapped[..., :2] * epipole[..., None, 2:]
-    lever = across.norm(dim=-1) / (mapped[..., 2] + depth * epipole[..., None, 2]).square().clamp(min=1e-12) / view.pixel
+    lever = torch.hypot(d * c - a * f, e * c - b * f) / (c + depth * f).square().clamp(min=1e-12) / view.pixel
     lever = lever.clamp(max=1e6)
-    moments = (first[:, :, None] * first[:, None, :]).flatten(1)
+    moments = (first[..., :, None] * first[..., None, :]).flatten(-2)
     total = member.sum(-1) + 1e-9
     eye = torch.eye(3, dtype=first.dtype, device=first.device)
     weight, scale, value = member, torch.zeros_like(total), depth
@@ -291,8 +294,8 @@ def parallax(view: View, fundamentals: Tensor, member: Tensor, min_scale: float 
         heavy = weight * lever.square()
         inner = (heavy @ moments).unflatten(-1, (3, 3))
         ridge = 1e-9 * inner.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] + 1e-20
-        plane = torch.linalg.solve_ex(inner + ridge * eye, ((heavy * depth) @ first)[..., None])[0]
-        value = (depth - (first @ plane)[..., 0]) * lever
+        plane = torch.linalg.solve_ex(inner + ridge * eye, (heavy * depth) @ first)[0]
+        value = (depth - plane @ first.mT) * lever
         square = value.square()
         if turn == 0:
             scale = ((member * value.abs()).sum(-1) / total).square()
@@ -300,7 +303,7 @@ def parallax(view: View, fundamentals: Tensor, member: Tensor, min_scale: float 
             share = (PARALLAX_FREEDOM + 1) / (PARALLAX_FREEDOM + square / scale.clamp(min=min_scale * min_scale)[..., None])
             scale = ((member * share * square).sum(-1) / total).clamp(min=min_scale * min_scale)
         weight = member * (PARALLAX_FREEDOM + 1) / (PARALLAX_FREEDOM + square / scale[..., None])
-    return value, scale
+    return value.view(shape), scale.view(shape[:-1])
 
 
 # ----------------------------------------------------------------------------------------------------------------------

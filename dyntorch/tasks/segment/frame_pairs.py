@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
+from dyntorch.geometry.epipolar import PairMonomials
 from dyntorch.geometry.homogeneous import similarity
 from dyntorch.tasks.segment.coherence import Links, View
 
@@ -20,6 +23,7 @@ MIN_FRAME_PAIRS = 12  # compared, where there are so many
 MEAN_PAIRS_PER_TRACK = 5.0  # at least, where the most pairs allow it
 MIN_COMMON_TRACKS = 20  # that both frames of a pair must show
 DOUBLED_VARIANCE_MOTION = 2.0  # pixels between two frames at which the variance of a track has doubled
+STACKED = 1 << 17  # numbers of the sightings of pairs of frames that are taken together: 1 MB each of what comes between
 MAX_CUT_SURVIVAL = 0.2  # share of the tracks of a frame that live on in the next one, at a cut
 MIN_JUMPING_SHARE = 0.5  # of the tracks, at a cut
 MIN_JUMP = 12.0  # over the median motion of tracks between all other frames
@@ -34,9 +38,52 @@ class FramePair:
     view: View  # their places, without links
     precision: Tensor  # ``(m,)`` in [0, 1]: the inverse variance of a track beside that of one that does not move
 
-    def weigh_groups(self, groups: Tensor) -> Tensor:
-        """Weights ``(B, m)`` of these tracks in fits of groups ``(B, n)``: by their precision, of mean 1."""
-        return groups[:, self.index].double() * (self.precision / self.precision.mean())
+
+@dataclass(frozen=True)
+class PairStack:
+    """Several pairs of frames side by side, so that a few large operations serve all of them."""
+
+    index: Tensor  # ``(p, m)`` the tracks that both frames of a pair show; pairs with fewer of them are filled up
+    present: Tensor  # ``(p, m)`` bool, what is no filling
+    view: View  # ``(p, m, 2)`` their places, without links
+    precision: Tensor  # ``(p, m)`` as in :class:`FramePair`, 0 for fillings
+    usual: Tensor  # ``(p,)`` the median precision
+    weight: Tensor  # ``(p, m)`` in fits: by their precision, of mean 1
+
+    @staticmethod
+    def of(pairs: Sequence[FramePair]) -> PairStack:
+        """All of them."""
+        index, x1, x2, precision, weight = (
+            pad_sequence(list(part), batch_first=True)
+            for part in zip(
+                *((one.index, one.view.x1, one.view.x2, one.precision, one.precision / one.precision.mean()) for one in pairs),
+                strict=True,
+            )
+        )
+        sizes = torch.tensor([len(pair.index) for pair in pairs], device=index.device)
+        present = torch.arange(index.shape[1], device=index.device) < sizes[:, None]
+        usual = torch.stack([pair.precision.median() for pair in pairs])
+        return PairStack(index, present, replace(pairs[0].view, x1=x1, x2=x2), precision, usual, weight)
+
+    @cached_property
+    def monomials(self) -> PairMonomials:
+        """Of their places."""
+        return PairMonomials(self.view.x1, self.view.x2)
+
+    def split(self, width: int) -> list[PairStack]:
+        """As few parts as ``width`` numbers for each sighting allow."""
+        count = max(1, STACKED // max(1, width * self.index.shape[1]))
+        if count >= len(self.index):
+            return [self]
+        parts = (self.index, self.present, self.view.x1, self.view.x2, self.precision, self.usual, self.weight)
+        return [
+            PairStack(index, present, replace(self.view, x1=x1, x2=x2), *rest)
+            for index, present, x1, x2, *rest in zip(*(part.split(count) for part in parts), strict=True)
+        ]
+
+    def members(self, groups: Tensor) -> Tensor:
+        """Groups ``(*batch, n)`` as ``(p, *batch, m)``, 0 for fillings."""
+        return (groups[..., self.index].double() * self.present).movedim(-2, 0)
 
 
 @dataclass(frozen=True)

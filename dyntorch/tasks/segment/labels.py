@@ -189,10 +189,9 @@ MIN_STATIC_SHARE = 0.4  # of the tracks that belong to a body
 
 
 def distances(pairs: Sequence[FramePair], geometry: Geometry, count: int) -> Tensor:
-    """Sampson distances ``(P, K, n)`` in pixels of all tracks from all bodies, whose geometry is ``(1, K, 3, 3)`` for every pair;
+    """Sampson distances ``(P, K, n)`` in pixels of all tracks from all bodies, whose geometry is ``(P, 1, K, 3, 3)``;
     NaN where a track is not in the pair, or the body's motion between its frames is not known."""
-    bodies = geometry[0].shape[1]
-    result = torch.full((len(pairs), bodies, count), torch.nan, dtype=torch.float64, device=geometry[0].device)
+    result = torch.full((len(pairs), geometry.shape[2], count), torch.nan, dtype=torch.float64, device=geometry.device)
     for row, pair, F in zip(result, pairs, geometry, strict=True):
         square = sampson_squared(F[0], pair.view.x1, pair.view.x2)
         has_motion = (F[0] != 0).any(-1).any(-1)

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from math import log1p
 
 import torch
 from torch import Tensor
 
-from dyntorch.geometry.epipolar import sampson_squared
 from dyntorch.geometry.epipolar_fit import descend, fit_fundamental
 from dyntorch.tasks.segment.coherence import Links, mean_field, relief_cost
-from dyntorch.tasks.segment.frame_pairs import FramePair
+from dyntorch.tasks.segment.frame_pairs import FramePair, PairStack
 from dyntorch.tasks.segment.search import one_hot
 
-Geometry = list[Tensor]
-"""Fundamental matrices ``(B, K, 3, 3)`` for every pair of frames."""
+Geometry = Tensor
+"""Fundamental matrices ``(P, B, K, 3, 3)``, for every pair of frames."""
 
 
 TRACK_FREEDOM = 2.0  # degrees of freedom of Student's distribution of Sampson distances: some tracks slide
@@ -51,6 +51,11 @@ class TrackEvidence:
             count[pair.index] += 1
         return TrackEvidence(pairs, links, count)
 
+    @cached_property
+    def stack(self) -> PairStack:
+        """All pairs side by side."""
+        return PairStack.of(self.pairs)
+
     def share(self) -> Tensor:
         """``(n,)`` weight of what one pair says of a track: together they count as ``EFFECTIVE_PAIRS``."""
         return EFFECTIVE_PAIRS / self.count.clamp(min=1)
@@ -69,13 +74,12 @@ class Candidates:
     @property
     def bodies(self) -> int:
         """How many bodies."""
-        return self.geometry[0].shape[1]
+        return self.geometry.shape[2]
 
     def of(self, which: int) -> Candidates:
         """One of them."""
         part = slice(which, which + 1)
-        geometry = [F[part] for F in self.geometry]
-        return Candidates(self.labels[part], self.member[part], geometry, self.scale[part], self.energy[part])
+        return Candidates(self.labels[part], self.member[part], self.geometry[:, part], self.scale[part], self.energy[part])
 
 
 def no_links(count: int, device: torch.device) -> Links:
@@ -83,29 +87,30 @@ def no_links(count: int, device: torch.device) -> Links:
     return Links(torch.zeros(count, 0, dtype=torch.long, device=device), torch.zeros(count, 0, dtype=torch.float64, device=device))
 
 
-def fit_groups(pairs: Sequence[FramePair], groups: Tensor, scales: Sequence[float], steps: int = 2) -> Geometry:
-    """Fundamental matrices ``(B, 3, 3)`` of groups of tracks ``(B, n)``, weights, for every pair of frames."""
-    return [
-        fit_fundamental(
-            pair.view.x1, pair.view.x2, pair.weigh_groups(groups), [scale * pair.view.pixel for scale in scales], steps=steps
-        )[0]
-        for pair in pairs
-    ]
+def fit_groups(evidence: TrackEvidence, groups: Tensor, scales: Sequence[float], steps: int = 2) -> Tensor:
+    """Fundamental matrices ``(P, B, 3, 3)`` of groups of tracks ``(B, n)``, weights, for every pair of frames."""
+    fits = []
+    for part in evidence.stack.split(len(groups)):
+        view, weight = part.view, part.members(groups) * part.weight[:, None]
+        fits.append(fit_fundamental(view.x1, view.x2, weight, [scale * view.pixel for scale in scales], steps=steps)[0])
+    return torch.cat(fits)
 
 
-def squares(pair: FramePair, fundamentals: Tensor) -> Tensor:
-    """Squared Sampson distances ``(*batch, m)`` in pixels, as of tracks at rest."""
-    return sampson_squared(fundamentals, pair.view.x1, pair.view.x2) * (pair.precision / pair.view.pixel**2)
+def squares(part: PairStack, fundamentals: Tensor) -> Tensor:
+    """Squared Sampson distances ``(p, *batch, m)`` in pixels, as of tracks at rest: fundamentals ``(p, *batch, 3, 3)``."""
+    value, square = part.monomials.flat_terms(fundamentals.reshape(len(fundamentals), -1, 9))
+    at_rest = value.square() / square * (part.precision / part.view.pixel**2)[:, None]
+    return at_rest.view(*fundamentals.shape[:-2], -1)
 
 
-def noise(pairs: Sequence[FramePair], geometry: Geometry, member: Tensor) -> Tensor:
+def noise(evidence: TrackEvidence, geometry: Geometry, member: Tensor) -> Tensor:
     """Standard deviations ``(B,)`` of a coordinate of a track at rest, for members ``(B, K, n)``: most likely for Student's
     distribution of all distances from the own body."""
     own, weight = [], []
-    for pair, F in zip(pairs, geometry, strict=True):
-        part = member[..., pair.index].double()
-        own.append((squares(pair, F) * part).sum(-2))
-        weight.append(part.sum(-2))
+    for part, F in _parts(evidence, geometry):
+        members = part.members(member)
+        own.append((squares(part, F) * members).sum(-2).movedim(0, 1)[:, part.present])
+        weight.append(members.sum(-2).movedim(0, 1)[:, part.present])
     square, present = torch.cat(own, dim=-1), torch.cat(weight, dim=-1)
     low, high = MIN_TRACK_NOISE_PIXELS**2, MAX_TRACK_NOISE_PIXELS**2
     variance = (2 * square.median(-1).values).clamp(low, high)
@@ -120,27 +125,33 @@ def costs(
     evidence: TrackEvidence, geometry: Geometry, scale: Tensor, member: Tensor | None, relief_weight: float = RELIEF_WEIGHT
 ) -> Tensor:
     """Cost ``(B, K, n)`` of every track in every body without links; with the relief of bodies of members ``(B, K, n)``."""
-    B, K = geometry[0].shape[:2]
+    B, K = geometry.shape[1:3]
     total = torch.zeros(B, K, len(evidence.count), dtype=torch.float64, device=scale.device)
     worst = (TRACK_FREEDOM + 1) * log1p(MAX_TRACK_DISTANCE**2 / TRACK_FREEDOM)
-    for pair, F in zip(evidence.pairs, geometry, strict=True):
-        ratio = squares(pair, F) / scale.square()[:, None, None]
+    for part, F in _parts(evidence, geometry):
+        ratio = squares(part, F) / scale.square()[:, None, None]
         cost = ((TRACK_FREEDOM + 1) * torch.log1p(ratio / TRACK_FREEDOM)).clamp(max=worst)
         if member is not None and relief_weight > 0:
-            cost = cost + relief_weight * relief_cost(pair.view, F, member[..., pair.index].double(), MIN_TRACK_PARALLAX_PIXELS)
-        total[..., pair.index] += cost
+            cost = cost + relief_weight * relief_cost(part.view, F, part.members(member), MIN_TRACK_PARALLAX_PIXELS)
+        cost = (cost * part.present[:, None, None]).movedim(0, 2).flatten(2)
+        total.scatter_add_(-1, part.index.flatten().expand(cost.shape), cost)
     return total * evidence.share()
+
+
+def _parts(evidence: TrackEvidence, geometry: Geometry) -> Iterator[tuple[PairStack, Tensor]]:
+    """Pairs that are taken together, with the geometry of the bodies there."""
+    parts = evidence.stack.split(geometry.shape[1:3].numel())
+    return zip(parts, geometry.split([len(part.index) for part in parts]), strict=True)
 
 
 def descend_labels(evidence: TrackEvidence, labels: Tensor, bodies: int) -> Candidates:
     """Labels and epipolar geometries in turns, from several labellings ``(B, n)`` from 0."""
     count = len(labels)
     member = one_hot(labels, bodies).float()
-    fits = fit_groups(evidence.pairs, member.flatten(0, 1), FIRST_FIT_SCALES_PIXELS)
-    geometry = [F.unflatten(0, (count, bodies)) for F in fits]
+    geometry = fit_groups(evidence, member.flatten(0, 1), FIRST_FIT_SCALES_PIXELS).unflatten(1, (count, bodies))
 
     def turn(member: Tensor, geometry: Geometry) -> tuple[Tensor, Tensor]:
-        scale = noise(evidence.pairs, geometry, member)
+        scale = noise(evidence, geometry, member)
         cost = costs(evidence, geometry, scale, member).float()
         # links are scaled so that cutting one costs its weight
         return mean_field(cost, evidence.links, 1.0, NUM_TRACK_LABEL_UPDATES, member), scale
@@ -148,24 +159,24 @@ def descend_labels(evidence: TrackEvidence, labels: Tensor, bodies: int) -> Cand
     for _ in range(NUM_TRACK_ROUNDS):
         member, scale = turn(member, geometry)
         size = float(TRACK_FIT_SCALE * scale.median())
-        geometry = [_refit(pair, F, member, size) for pair, F in zip(evidence.pairs, geometry, strict=True)]
+        geometry = torch.cat([_refit(part, F, member, size) for part, F in _parts(evidence, geometry)])
     member, scale = turn(member, geometry)
     found_labels = member.argmax(1)
     return Candidates(found_labels, member, geometry, scale, energy(evidence, geometry, found_labels, scale))
 
 
-def _refit(pair: FramePair, F: Tensor, member: Tensor, scale: float) -> Tensor:
+def _refit(part: PairStack, F: Tensor, member: Tensor, scale: float) -> Tensor:
     # the noise grows with the motion, and with it the scale
-    size = max(scale * float(pair.precision.median()) ** -0.5, MIN_TRACK_FIT_SCALE_PIXELS) * pair.view.pixel
-    weight = pair.weigh_groups(member.flatten(0, 1))
-    return descend(F.flatten(0, 1), pair.view.x1, pair.view.x2, weight, size, steps=2).unflatten(0, F.shape[:2])
+    size = (scale * part.usual.rsqrt()).clamp(min=MIN_TRACK_FIT_SCALE_PIXELS) * part.view.pixel
+    weight = part.members(member.flatten(0, 1)) * part.weight[:, None]
+    return descend(F.flatten(1, 2), part.view.x1, part.view.x2, weight, size, steps=2).view(F.shape)
 
 
 def energy(
     evidence: TrackEvidence, geometry: Geometry, labels: Tensor, scale: Tensor, relief_weight: float = RELIEF_WEIGHT
 ) -> Tensor:
     r"""Cost ``(B,)`` of labellings ``(B, n)`` from 0:"""
-    member = one_hot(labels, geometry[0].shape[1])
+    member = one_hot(labels, geometry.shape[2])
     own = (costs(evidence, geometry, scale, member, relief_weight) * member).sum((-2, -1))
     seen = float((evidence.count > 0).sum())
     total = own + 2 * EFFECTIVE_PAIRS * seen * scale.log() + evidence.links.cut_weight(member)
@@ -195,8 +206,8 @@ class Exchanges:
         self.count = int(cut.max()) + 1
         self.members = one_hot(cut, self.count).double()
         self.sizes = [int(size) for size in self.members.sum(-1)]
-        geometry = [F[None] for F in fit_groups(evidence.pairs, self.members, FIRST_FIT_SCALES_PIXELS, steps=1)]
-        self.scale = noise(evidence.pairs, geometry, self.members[None])
+        geometry = fit_groups(evidence, self.members, FIRST_FIT_SCALES_PIXELS, steps=1)[:, None]
+        self.scale = noise(evidence, geometry, self.members[None])
         self.between = self.members @ evidence.links.pull(self.members).mT
         self.known: dict[Body, tuple[float, float]] = {}
 
@@ -241,7 +252,7 @@ class Exchanges:
             return
         chosen = self.members.new_tensor([[float(piece in body) for piece in range(self.count)] for body in new])
         groups = chosen @ self.members
-        geometry = [F[None] for F in fit_groups(self.evidence.pairs, groups, FIRST_FIT_SCALES_PIXELS, steps=1)]
+        geometry = fit_groups(self.evidence, groups, FIRST_FIT_SCALES_PIXELS, steps=1)[:, None]
         own = (costs(self.evidence, geometry, self.scale, None)[0] * groups).sum(-1)
         cut = ((chosen @ self.between) * (1 - chosen)).sum(-1) / 2
         self.known.update(zip(new, zip(own.tolist(), cut.tolist(), strict=True), strict=True))

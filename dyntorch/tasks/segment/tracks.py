@@ -394,7 +394,7 @@ def _outcome(
     named = torch.where(hard.any(0), hard.argmax(0) + 1, 0)
     own = far.gather(1, (named - 1).clamp(min=0).expand(len(far), 1, -1))[:, 0]
     nearest = torch.where(named > 0, own.square().nanmean(0), far.square().nanmean(0).nan_to_num(nan=torch.inf).amin(0))
-    fundamentals, homographies, planar = motions(pairs, [F[:, order] for F in geometry], hard, film)
+    fundamentals, homographies, planar = motions(pairs, geometry[:, :, order], hard, film)
     static, notices = _static(tracks, cameras, film, hard, pairs, request)
     lone = [Notice(SegmentNotice.ONE_BODY, 1.0)] if request.bodies is None and len(order) == 1 else []
     notices = [*count_notices(len(order), request.bodies, spare, case="tracks"), *lone, *notices]

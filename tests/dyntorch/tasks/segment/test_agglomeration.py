@@ -67,10 +67,13 @@ def test_groups_that_move_as_one_are_on_their_epipolar_lines():
     scene.tracks[:5, :10] = torch.nan
     near = near_of(scene)
     body, whole = scene.labels == 1, scene.labels > 0
-    (pure, seen), (mixed, both) = (near.squared_distances(group, 0.15) for group in (body, whole))
+    (pure, seen), (mixed, both) = (near.squared_distances(group[None], 0.15) for group in (body, whole))
     assert bool(mixed.isfinite().all()) and float(pure[seen].mean().sqrt()) < 1e-4 < 1e-2 < float(mixed[both].mean().sqrt())
     # as often as pairs of frames show them
-    assert seen.shape == (len(near.seen), 40) and int(both.sum()) == int(near.seen.sum())
+    assert int(seen.sum()) == int(near.seen[:, body].sum()) and int(both.sum()) == int(near.seen.sum())
+    separate, _ = near.squared_distances(torch.stack([whole, body]), 0.15)
+    torch.testing.assert_close(separate[:, 1:], pure)
+    torch.testing.assert_close(separate[:, :1], mixed)
     assert near.count.tolist() == near.seen.sum(0).tolist() and float(near.count[0]) < float(near.count[20])
 
 
@@ -82,7 +85,7 @@ def test_distances_are_those_of_the_motion_that_most_tracks_have(monkeypatch):
     pairs = select_near_pairs(film, (5,), 3, 16)
     near = NearPairs(film, pairs)
     own = scene.labels == 1
-    for row, (a, b) in zip(near.squared_distances(own, 0.15)[0], pairs, strict=True):
+    for row, (a, b) in zip(near.squared_distances(own[None], 0.15)[0][:, 0, own], pairs, strict=True):  # all see all
         exact = sampson_squared(scene.fundamental(0, a, b), scene.tracks[a][own], scene.tracks[b][own])
         known = exact / (1 + (scene.tracks[b] - scene.tracks[a])[own].norm(dim=-1) / DOUBLED_VARIANCE_MOTION)
         assert float(row[1:].max()) < 0.05 < 0.3 * float(known[0])

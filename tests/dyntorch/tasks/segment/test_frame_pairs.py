@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from dyntorch.geometry.homogeneous import apply
-from dyntorch.tasks.segment.frame_pairs import TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs
+from dyntorch.tasks.segment.frame_pairs import PairStack, TrackSet, find_scene_cut, select_frame_pairs, select_near_pairs
 from tests.dyntorch.tasks.segment.videos import F64, draw, shot
 
 
@@ -58,8 +58,12 @@ def test_a_pair_holds_the_tracks_of_both_frames_and_trusts_those_that_move_littl
     torch.testing.assert_close(pair.view.x2, film.x[13][pair.index])
     still = film.pair((10, 10))
     assert bool((still.precision == 1).all()) and bool((pair.precision < 1).all()) and bool((pair.precision > 0).all())
-    groups = torch.ones(1, film.x.shape[1], dtype=torch.bool)
-    torch.testing.assert_close(pair.weigh_groups(groups)[0] * pair.precision.mean(), pair.precision)
+    both = PairStack.of([pair, film.pair((3, 20))])
+    assert both.present.sum(-1).tolist() == [len(pair.index), int((film.seen[3] & film.seen[20]).sum())]
+    torch.testing.assert_close(both.weight[0, : len(pair.index)] * pair.precision.mean(), pair.precision)
+    chance = torch.rand(2, 3, film.x.shape[1])
+    assert torch.equal(both.members(chance)[0][..., : len(pair.index)], chance[..., pair.index].double())
+    assert bool((both.members(chance)[1][..., ~both.present[1]] == 0).all())
 
 
 def test_near_pairs_have_enough_in_common_and_grow_with_the_video():

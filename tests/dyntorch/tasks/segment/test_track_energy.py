@@ -58,8 +58,7 @@ def chain(scene: Shot, weight: float = 3.0) -> Links:
 def fits(scene: Shot, evidence: TrackEvidence):
     """Geometries ``(1, K, 3, 3)`` of the true bodies, and the members."""
     member = one_hot(scene.labels[None] - 1, int(scene.labels.max())).double()
-    found = fit_groups(evidence.pairs, member[0], (4.0, 1.0, 0.3))
-    return [F[None] for F in found], member
+    return fit_groups(evidence, member[0], (4.0, 1.0, 0.3))[:, None], member
 
 
 def test_evidence_counts_the_pairs_of_a_track():
@@ -77,7 +76,7 @@ def test_evidence_counts_the_pairs_of_a_track():
 def test_the_noise_is_that_of_the_scene_between_its_limits():
     scene = shot((80, 40), sigma=0.0)
     pairs = [replace(pair, precision=torch.ones_like(pair.precision)) for pair in pairs_of(scene)]
-    member, geometry = one_hot(scene.labels[None] - 1, 2).double(), scene.truth(pairs)
+    member, geometry, none = one_hot(scene.labels[None] - 1, 2).double(), scene.truth(pairs), no_links(len(scene.labels), HERE)
     for sigma in (0.08, 0.2, 0.4):
         chance, found = draw(3), []
         for pair in pairs:
@@ -86,10 +85,10 @@ def test_the_noise_is_that_of_the_scene_between_its_limits():
             square = torch.randn(round(TRACK_FREEDOM), len(pair.index), 1, generator=chance, dtype=F64).square().sum(0)
             first, second = normal * (TRACK_FREEDOM / square).sqrt()
             found.append(replace(pair, view=replace(pair.view, x1=pair.view.x1 + first, x2=pair.view.x2 + second)))
-        assert float(noise(found, geometry, member)) == pytest.approx(sigma, rel=0.2)
-    assert float(noise(pairs, geometry, member)) == pytest.approx(MIN_TRACK_NOISE_PIXELS)
-    wild = [torch.randn(1, 2, 3, 3, generator=draw(), dtype=F64) for _ in pairs]
-    assert float(noise(pairs, wild, member)) == pytest.approx(MAX_TRACK_NOISE_PIXELS)
+        assert float(noise(TrackEvidence.of(found, none), geometry, member)) == pytest.approx(sigma, rel=0.2)
+    assert float(noise(TrackEvidence.of(pairs, none), geometry, member)) == pytest.approx(MIN_TRACK_NOISE_PIXELS)
+    wild = torch.randn(1, 2, 3, 3, generator=draw(), dtype=F64).expand(len(pairs), -1, -1, -1, -1)
+    assert float(noise(TrackEvidence.of(pairs, none), wild, member)) == pytest.approx(MAX_TRACK_NOISE_PIXELS)
 
 
 def test_the_energy_is_the_sum_that_is_said():

@@ -41,11 +41,13 @@ class Shot:
         centre = torch.linalg.svd(a)[2][-1]
         return unit(skew(b @ centre) @ b @ torch.linalg.pinv(a))
 
-    def truth(self, pairs: Sequence[FramePair]) -> list[Tensor]:
-        """Of all bodies, ``(1, K, 3, 3)`` for every pair, in the coordinates of the film."""
+    def truth(self, pairs: Sequence[FramePair]) -> Tensor:
+        """Of all bodies, ``(P, 1, K, 3, 3)``, in the coordinates of the film."""
         back = self.film().change.inverse()
         bodies = range(self.projections.shape[1])
-        return [torch.stack([back.mT @ self.fundamental(k, *pair.frames) @ back for k in bodies])[None] for pair in pairs]
+        return torch.stack(
+            [torch.stack([back.mT @ self.fundamental(k, *pair.frames) @ back for k in bodies])[None] for pair in pairs]
+        )
 
     def film(self, pixel: float = 1.0) -> TrackSet:
         """As the stages see it."""
