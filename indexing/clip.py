@@ -361,6 +361,8 @@ def check_fps(fps: Any, who: str = "") -> float:
 
 def _float_array(value: Any, what: str) -> FloatArray:
     """A real array of float32 or float64 that nobody else can change."""
+    if type(value) is np.ndarray and value.base is None and not value.flags.writeable and value.dtype in (np.float32, np.float64):
+        return value  # one of those that this made
     try:
         array = np.asarray(value.detach().cpu().numpy() if hasattr(value, "detach") else value)
         if array.dtype.kind not in "fiub":

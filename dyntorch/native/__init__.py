@@ -1,5 +1,5 @@
-"""The kernel in C below null spaces, optional: the torch path is its reference and stands in for it.
+"""The kernel in C below null spaces and recognition, optional: the torch path is its reference and stands in for it.
 
-``kernel.c`` is compiled when the package is installed, where there is a C compiler (``build``); ``library`` loads it and hands
-tensors to it.
+``kernel.c`` and ``recognition.c`` are compiled when the package is installed, where there is a C compiler (``build``); ``library``
+loads them and hands tensors to them, ``recognition`` those of windows and sightings.
 """

@@ -14,8 +14,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-SOURCE = Path(__file__).with_name("kernel.c")
-"""Includes its parts, the headers beside it."""
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("kernel.c", "recognition.c"))
+"""The first includes its parts, the headers beside it."""
 LIBRARY = Path(__file__).with_name("kernel.dll" if sys.platform == "win32" else "kernel.so")
 # exact where it matters: no reassociation, NaN stays NaN
 FLAGS = ("-std=gnu11", "-O3", "-fPIC", "-fvisibility=hidden", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
@@ -28,8 +28,8 @@ LEVELS = {
 
 
 def source_digest() -> str:
-    """Of the source: a library that was made from another one is not used."""
-    parts = [SOURCE, *sorted(SOURCE.parent.glob("*.h"))]
+    """Of the sources: a library that was made from others is not used."""
+    parts = [*SOURCES, *sorted(LIBRARY.parent.glob("*.h"))]
     return hashlib.sha256(b"".join(part.read_bytes() for part in parts)).hexdigest()[:16]
 
 
@@ -41,14 +41,15 @@ def compile_library(target: Path = LIBRARY) -> str:
         return f"no C compiler named {asked}" if asked else "no C compiler"
     levels = LEVELS if platform.machine().lower() in ("x86_64", "amd64") else {"base": LEVELS["base"]}
     with tempfile.TemporaryDirectory() as folder:
-        objects = [Path(folder) / f"{level}.o" for level in levels]
+        objects = {(level, source): Path(folder) / f"{source.stem}-{level}.o" for level in levels for source in SOURCES}
         made = Path(folder) / target.name
-        for (level, (lanes, flags)), place in zip(levels.items(), objects, strict=True):
+        for (level, source), place in objects.items():
+            lanes, flags = levels[level]
             names = (f"-DLANES={lanes}", f"-DSUFFIX={level}", f'-DSOURCE="{source_digest()}"')
-            failure = _run([compiler, *FLAGS, *flags, *names, "-c", str(SOURCE), "-o", str(place)])
+            failure = _run([compiler, *FLAGS, *flags, *names, "-c", str(source), "-o", str(place)])
             if failure:
                 return failure
-        failure = _run([compiler, "-shared", "-s", *map(str, objects), "-o", str(made), "-lm"])
+        failure = _run([compiler, "-shared", "-s", *map(str, objects.values()), "-o", str(made), "-lm"])
         if failure:
             return failure
         try:

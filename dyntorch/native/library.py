@@ -23,6 +23,9 @@ _ARGUMENTS = {
     "null_of_grams": (_POINTER, _SIZE, _INT, _INT, *[_POINTER] * 5),
     "null_of_rows": (_POINTER, _SIZE, _SIZE, *[_INT] * 3, *[_POINTER] * 4),
     "fit_points": (_INT, *[_POINTER] * 5, _SIZE, _SIZE, *[_INT] * 5, *[_POINTER] * 9),
+    "robust_deviations": (*[_POINTER] * 4, _SIZE, _INT, _POINTER, _POINTER),
+    "lower_residuals": (_INT, *[_POINTER] * 5, _SIZE, _SIZE, _INT, _POINTER, ctypes.c_float, _POINTER, _SIZE, _POINTER),
+    "score_windows": (_POINTER, _POINTER, _INT, _POINTER, _SIZE, _SIZE, _INT, _INT, _POINTER, _INT, ctypes.c_float, _POINTER),
 }
 MAX_SLOTS, MAX_SPACE = 6, 8
 """Views, and dimensions of what is measured in them, that :func:`fit_points` takes."""
@@ -84,7 +87,7 @@ def null_of_grams(gram: Tensor, dim: int) -> tuple[Tensor, Tensor, Tensor, Tenso
     basis, values = gram.new_empty(batch, dim, size), gram.new_empty(batch, dim)
     total, following, certified = gram.new_empty(batch), gram.new_empty(batch), gram.new_empty(batch, dtype=_torch().bool)
     out = (basis, values, total, following, certified)
-    _call("null_of_grams", gram.data_ptr(), batch, size, dim, *(part.data_ptr() for part in out))
+    call("null_of_grams", gram.data_ptr(), batch, size, dim, *(part.data_ptr() for part in out))
     return out
 
 
@@ -96,7 +99,7 @@ def null_of_rows(matrix: Tensor, dim: int, *, always: bool, keep: bool) -> tuple
     basis, following = matrix.new_empty(batch, dim, size), matrix.new_empty(batch)
     certified, gram = matrix.new_empty(batch, dtype=_torch().bool), matrix.new_empty(batch, *([size] * 2 if keep else [0, 0]))
     out = (basis.data_ptr(), following.data_ptr(), certified.data_ptr(), gram.data_ptr() if keep else None)
-    _call("null_of_rows", matrix.data_ptr(), batch, rows, size, dim, always, *out)
+    call("null_of_rows", matrix.data_ptr(), batch, rows, size, dim, always, *out)
     return basis, following, certified, gram
 
 
@@ -164,11 +167,12 @@ def fit_points(
         minimal,
         constraint or 0,
     )
-    _call("fit_points", *given, bounds, places, *out)
+    call("fit_points", *given, bounds, places, *out)
     return fits
 
 
-def _call(name: str, *arguments: Any) -> None:
+def call(name: str, *arguments: Any) -> None:
+    """A function of the kernel, which is there."""
     if load()[0][name](*arguments):
         raise MemoryError("no memory for the workspace of the kernel: fewer problems at once")
 

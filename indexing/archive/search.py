@@ -8,6 +8,7 @@ Stages: the example becomes probes, for each joint layout (:func:`queries_of`); 
 from __future__ import annotations
 
 import contextlib
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -295,18 +296,32 @@ def merge_candidates(
     asked = [queries[rows[i].layout].fine[p] for i, p in zip(segment.tolist(), probe.tolist(), strict=True)]
     middle = (row + np.array([one.span / 2 for one in asked])) / rate
     half = np.array([one.seconds / 2 for one in asked])
-    kept: list[int] = []
-    near: dict[tuple[int, int], list[int]] = {}
-    for i in np.lexsort((probe, row, track, segment, -score)).tolist():
-        others = near.setdefault((int(segment[i]), int(track[i])), [])
-        if all(abs(middle[i] - middle[j]) > MIN_SEPARATION * 2 * min(half[i], half[j]) for j in others):
-            others.append(i)
-            kept.append(i)
-            if len(kept) == num_candidates:
-                break
-    chosen = np.array(kept, dtype=np.intp)
+    order = np.lexsort((probe, row, track, segment, -score))
+    chosen = _separate(middle, half, order, segment * (int(track.max(initial=0)) + 1) + track, num_candidates)
     places = Places(segment, track, middle - half, middle + half)
     return Shortlist(places, probe, score, np.array([one.mirrored for one in asked], dtype=bool))[chosen]
+
+
+def _separate(
+    middle: FloatArray, half: FloatArray, order: NDArray[np.intp], person: NDArray[np.int64], count: int
+) -> NDArray[np.intp]:
+    """The first of some windows, in an order, whose middles are not within a share of the shorter one of each other's of the same
+    person: those of each person are kept sorted, so that only neighbours are compared."""
+    kept: list[int] = []
+    reach, widest = 2 * MIN_SEPARATION, 2.001 * MIN_SEPARATION * float(half.max(initial=0.0))
+    near: dict[int, tuple[list[float], list[float]]] = {}
+    centres, halves, people = middle.tolist(), half.tolist(), person.tolist()
+    for i in order.tolist():
+        at, others = near.setdefault(people[i], ([], []))
+        first, last = bisect_left(at, centres[i] - widest), bisect_right(at, centres[i] + widest)
+        if all(abs(centres[i] - at[j]) > reach * min(halves[i], others[j]) for j in range(first, last)):
+            place = bisect_left(at, centres[i])
+            at.insert(place, centres[i])
+            others.insert(place, halves[i])
+            kept.append(i)
+            if len(kept) == count:
+                break
+    return np.array(kept, dtype=np.intp)
 
 
 def _refine(

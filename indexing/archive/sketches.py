@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from dyntorch.numerics import native_correlations
 from indexing.archive.segments import ArchiveSegment
 
 BLOCK = 2**15  # windows compared at once: 5 ns a window and pass; at 4096 half of the time is spent between the passes
@@ -124,8 +125,7 @@ def scan(
         windows = -(-len(segment.codes) // stride) - samples + 1
         for low in range(-(-begin // stride), min(windows, -(-end // stride)), BLOCK):
             high = min(low + BLOCK, windows, -(-end // stride))  # windows that begin from low to high
-            x = _poses(segment, low, high + samples - 1, stride)
-            scores = _scores(x, _gram(x), [probes[i] for i in numbers])
+            scores = _scores_along(segment, low, high, stride, [probes[i] for i in numbers])
             scores[:, torch.from_numpy(_outside(segment, gone, low, high - low, samples, stride))] = -1.0
             for i, score in zip(numbers, scores, strict=True):
                 better = (score > found.threshold).nonzero()[:, 0]
@@ -165,6 +165,8 @@ def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) 
     begins, steps = first.reshape(-1), np.arange(probe.samples)[:, None] * probe.stride
     axes, out = torch.from_numpy(probe.codes).flatten(1), np.empty(len(begins), dtype=np.float32)
     stored, scales = np.asarray(segment.codes), np.asarray(segment.scales)
+    if native_correlations(stored, scales, probe.codes[None], probe.stride, begins, GRAM_EPSILON, out[None]):
+        return out.reshape(first.shape)
     for low in range(0, len(begins), BLOCK):
         rows = begins[low : low + BLOCK] + steps
         # windows last, and a window's samples in one axis with its directions: all sums run over rows of windows
@@ -172,6 +174,16 @@ def _scores_at(segment: ArchiveSegment, probe: Probe, first: NDArray[np.int64]) 
         x = codes.mul_(torch.from_numpy(scales.take(rows))[:, None]).flatten(1, 2)
         out[low : low + BLOCK] = correlation((axes @ x)[:, None], _gram(x))[0].numpy()
     return out.reshape(first.shape)
+
+
+def _scores_along(segment: ArchiveSegment, low: int, high: int, stride: int, probes: Sequence[Probe]) -> Tensor:
+    """``(probes, windows)`` the same of windows ``low`` to ``high``, a stride apart, of probes with as many samples."""
+    axes, out = np.stack([probe.codes for probe in probes]), np.empty((len(probes), high - low), dtype=np.float32)
+    stored, scales = np.asarray(segment.codes), np.asarray(segment.scales)
+    if native_correlations(stored, scales, axes, stride, low * stride, GRAM_EPSILON, out):
+        return torch.from_numpy(out)
+    x = _poses(segment, low, high + axes.shape[2] - 1, stride)
+    return _scores(x, _gram(x), probes)
 
 
 def _scan_ends(

@@ -506,6 +506,7 @@ NOT_VERBS = {
     *("counting", "metrics", "motions", "scenes"),  # modules
     # tools of verbs
     *("on_cpu", "one_thread", "map_blocks", "check_options", "with_names", "with_words", "as_python", "status_from", "native"),
+    *("native_correlations", "native_deviations", "native_residuals"),
     # names, numbers and what results say
     *("Message", "Notice", "BodyModel", "LineStatus", "Status", "Motion", "MotionName", "MOTION_MODELS", "Polynomial", "Fourier"),
     *("NoticeCode", "Invariant", "MovingShapes", "Recovery", "Outcome"),

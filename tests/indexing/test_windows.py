@@ -170,6 +170,8 @@ def places(mask):
 
 @pytest.mark.parametrize(("frames", "seed"), [(7, 7), (30, 30), (100, 5)])
 def test_both_passes_against_the_definition(frames, seed, monkeypatch):
+    if frames == 30:
+        monkeypatch.setattr(windows, "native_deviations", lambda *_: False)  # torch
     rng = np.random.default_rng(seed)
     joints, times = walk(frames)
     joints += rng.normal(scale=0.02, size=joints.shape).astype(np.float32)
@@ -208,6 +210,22 @@ def test_planted_jumps_are_found_whatever_the_unit_and_the_other_clips():
 def test_right_joints_are_left_alone(rows):
     joints, times = walk()
     assert not wrong_in(joints[rows], times[: len(rows)] if len(rows) == 80 else times[rows]).any()
+
+
+def test_many_clips_at_once_are_each_judged_by_itself_in_torch_and_in_the_kernel(monkeypatch):
+    rng, lengths = np.random.default_rng(3), [40, 9, 3, 25, 60]
+    clips = [walk(frames, seed=frames) for frames in lengths]
+    for i, (joints, _) in enumerate(clips):
+        joints += rng.normal(scale=0.01 * i, size=joints.shape).astype(np.float32)
+        joints[rng.random(joints.shape[:2]) < 0.05 * i] += 1.0
+    joints, times = (np.concatenate(parts) for parts in zip(*clips, strict=True))
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    together = wrong_joints(joints, times, starts)
+    assert together.sum() > 10
+    np.testing.assert_array_equal(together, np.concatenate([wrong_in(*clip) for clip in clips]))
+    monkeypatch.setattr(windows, "native_deviations", lambda *_: False)
+    np.testing.assert_array_equal(wrong_joints(joints, times, starts), together)
+    np.testing.assert_array_equal(wrong_joints(joints.astype(float), times, starts), together)
 
 
 def test_gaps_and_frame_rate_do_not_make_a_movement_look_wrong():

@@ -230,7 +230,7 @@ ELEMENTWISE = {
 def test_every_public_verb_runs_on_one_thread():
     faces = [dyn, dyn.core, dyn.geometry, dyn.invariants, dyn.numerics, dyn.shapes, dyn.tasks]
     named = {name: getattr(face, name) for face in faces for name in face.__all__}
-    helpers = {"one_thread", "map_blocks", "on_cpu", "native"}
+    helpers = {"one_thread", "map_blocks", "on_cpu", "native", "native_correlations", "native_deviations", "native_residuals"}
     verbs = {name for name, value in named.items() if isinstance(value, types.FunctionType)} - helpers
     assert {name for name in verbs if not hasattr(named[name], "one_thread")} == ELEMENTWISE
 

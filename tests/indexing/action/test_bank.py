@@ -29,6 +29,7 @@ from indexing.action.bank import (
     fused_residuals,
     order_free_moments,
     planes_of,
+    principal_directions,
 )  # fmt: skip
 from indexing.action.joint_weights import JointWeights
 from indexing.action.model import MOMENT_TERMS, PENALTY, TURNED_CARD_WEIGHT, PairwiseMachine, mirror_some
@@ -186,6 +187,34 @@ def test_a_bank_is_the_least_over_its_copies_and_their_mirror_images():
     chosen = torch.tensor([1, 2, 6])
     for table, part in zip(tables, fused_residuals(query, [kept], fusions, chosen), strict=True):
         torch.testing.assert_close(part, table[:, chosen], atol=1e-4, rtol=0)
+
+
+def test_many_exemplars_are_compared_among_their_principal_directions(monkeypatch):
+    """As few as hold all but a hundredth of their energy; what they leave out bounds what correlations are off by."""
+    draw = random(300, 2, 6, seed=40) @ random(6, 24, seed=41) + 0.05 * random(300, 2, 24, seed=42)
+    axes, query = factorize(draw)[0], factorize(random(5, 2, 24, seed=43))[0]
+    directions = principal_directions(axes, 0.01)
+    count = directions.shape[1]
+    assert 3 < count < 16
+    torch.testing.assert_close(directions.mT @ directions, torch.eye(count), atol=1e-5, rtol=0)
+    values = torch.linalg.svdvals(axes.flatten(0, 1).double()).square()
+    left = [float(values[kept:].sum() / values.sum()) for kept in (count, count - 1)]
+    assert left[0] <= 0.01 < left[1]
+    exact = epipolar_correlation(entries(query, axes))
+    found = epipolar_correlation(entries(query @ directions, axes @ directions))
+    rest = torch.linalg.matrix_norm(axes - axes @ directions @ directions.mT, 2)
+    assert float(((found - exact).abs() - rest).max()) < 1e-5
+    assert principal_directions(factorize(random(300, 2, 24, seed=44))[0], 0.01) is None
+    # in a bank: of windows that show all joints, and only where there are many
+    bank, asked = random_windows(40, 45, holes=True), random_windows(4, 46, holes=True)
+    plain = fused_residuals(asked, [Bank([Copy(bank)], planes_of(metric_of(bank)))], [("epi",)])[0]
+    projected = Bank([Copy(bank)], planes_of(metric_of(bank), lambda: bank))
+    torch.testing.assert_close(fused_residuals(asked, [projected], [("epi",)])[0], plain, atol=1e-5, rtol=0)
+    monkeypatch.setattr("indexing.action.bank.MIN_TO_PROJECT", 10)
+    monkeypatch.setattr("indexing.action.bank.MAX_LEFT_OUT", dict.fromkeys(NEAREST, 0.05))
+    projected = Bank([Copy(bank)], planes_of(metric_of(bank), lambda: bank))
+    error = (fused_residuals(asked, [projected], [("epi",)])[0] - plain).abs()
+    assert 1e-4 < float(error.max()) < 0.5
 
 
 def test_exemplars_are_described_once_for_every_set_of_joints(monkeypatch):

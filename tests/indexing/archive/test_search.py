@@ -5,7 +5,7 @@ import pytest
 
 from indexing import Archive, ArchiveOptions, Clip
 from indexing.actors import ACTIONS, Person, detect, perform, stream
-from indexing.archive.search import MAX_OVERLAP, Places, check_example, queries_of, residuals
+from indexing.archive.search import MAX_OVERLAP, MIN_SEPARATION, Places, _separate, check_example, queries_of, residuals
 from indexing.skeleton import Skeleton
 
 FINGERS = tuple(f"finger {i}a" for i in range(17))
@@ -162,3 +162,15 @@ def test_what_cannot_be_searched(archive, streams):
     for k in (0, -1, 2.5, True, "3"):
         with pytest.raises(ValueError, match="k must be a whole number"):
             archive.search(clip.between(1.0, 2.0), k=k)
+
+
+def test_candidates_keep_their_distance_from_all_that_are_better():
+    rng = np.random.default_rng(0)
+    middle, half, person = rng.uniform(0, 20, 400), rng.choice([0.4, 1.0, 1.3], 400), rng.integers(0, 3, 400)
+    order, kept = rng.permutation(400), []
+    for i in order:
+        reach = 2 * MIN_SEPARATION * np.minimum(half[i], half[kept])
+        if all((np.abs(middle[i] - middle[kept]) > reach) | (person[i] != person[kept])):
+            kept.append(i)
+    assert len(kept) < 350
+    assert [_separate(middle, half, order, person, count).tolist() for count in (30, 400)] == [kept[:30], kept]
