@@ -55,12 +55,13 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
         # every joint's sightings in every clip, one path after the other
         joint, frame = np.nonzero(np.ascontiguousarray((there & ~wrong).T))
         clip, path = clip_of.take(frame), joint * len(joints) + frame
-        around, counts = _around(joint * len(starts) + clip, NUM_COMPARED)
-        judged, places = asked.T.reshape(-1).take(path) & (counts >= MIN_SIGHTINGS), by_joint.take(path, axis=0)
+        cuts = np.concatenate([[0], np.flatnonzero((clip[1:] != clip[:-1]) | (joint[1:] != joint[:-1])) + 1, [len(clip)]])
+        long = (np.diff(cuts) >= MIN_SIGHTINGS).repeat(np.diff(cuts))
+        judged, places = asked.T.reshape(-1).take(path) & long, by_joint.take(path, axis=0)
         if once == 0 and stride > 1:
             judged &= (np.arange(len(joint)) % stride == 0) | _near_leaving(places, times.take(frame), floor.take(clip))
         rows = np.flatnonzero(judged)
-        far, spread = _deviations(places, times.take(frame), rows, around.take(rows, axis=0), NUM_COMPARED)
+        far, spread = _deviations(places, times.take(frame), rows, cuts, NUM_COMPARED)
         beyond, owner = reduce(np.maximum, (far - MAX_SPREADS * spread).T), clip.take(rows)
         bad = beyond > floor.take(owner)
         if once == 0:
@@ -76,7 +77,7 @@ def wrong_joints(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]
         # whoever had a wrong neighbour is asked once more
         changed = np.zeros(len(joint) + 1, dtype=np.intp)
         changed[rows[bad] + 1] = 1
-        first, last = changed.cumsum()[around.T]
+        first, last = changed.cumsum()[_around(cuts, NUM_COMPARED).T]
         touched, asked = last > first, np.zeros_like(there)
         asked[frame[touched], joint[touched]] = True
     return wrong
@@ -95,14 +96,12 @@ def repair_clip(clip: Clip, stride: int = 1) -> Clip:
     return clip.replace(joints=joints)
 
 
-def _around(path: NDArray[np.intp], width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """``(sightings, 2)`` the first and the end of the nearest sightings on the same path, ``width`` where it has so many; and
-    how many it has."""
-    cuts = np.concatenate([[0], np.flatnonzero(np.diff(path)) + 1, [len(path)]])
-    lengths = np.diff(cuts)
-    begin, end, counts = (one.repeat(lengths) for one in (cuts[:-1], cuts[1:], lengths))
-    first = np.maximum(np.minimum(np.arange(len(path)) - width // 2, end - width), begin)
-    return np.stack([first, np.minimum(first + width, end)], axis=1), counts
+def _around(cuts: NDArray[np.intp], width: int) -> NDArray[np.intp]:
+    """``(sightings, 2)`` the first and the end of the nearest sightings on the same path, ``width`` where it has so many; paths lie
+    between cuts ``(paths + 1,)``."""
+    begin, end = (one.repeat(np.diff(cuts)) for one in (cuts[:-1], cuts[1:]))
+    first = np.maximum(np.minimum(np.arange(cuts[-1]) - width // 2, end - width), begin)
+    return np.stack([first, np.minimum(first + width, end)], axis=1)
 
 
 def _near_leaving(places: FloatArray, times: FloatArray, floor: FloatArray) -> NDArray[np.bool_]:
@@ -124,12 +123,13 @@ def _near_leaving(places: FloatArray, times: FloatArray, floor: FloatArray) -> N
 
 
 def _deviations(
-    places: FloatArray, times: FloatArray, rows: NDArray[np.intp], around: NDArray[np.intp], width: int
+    places: FloatArray, times: FloatArray, rows: NDArray[np.intp], cuts: NDArray[np.intp], width: int
 ) -> tuple[FloatArray, FloatArray]:
     """``(rows, dims)`` distance of sightings from the robust line through their neighbours, and the neighbours' spread."""
     far, spread = (np.empty((len(rows), places.shape[1]), np.float32) for _ in range(2))
-    if native_deviations(places, times, rows, around, width, (far, spread)):
+    if native_deviations(places, times, rows, cuts, width, (far, spread)):
         return far, spread
+    around = _around(cuts, width)[rows]
     x, clock = torch.from_numpy(places), torch.from_numpy(times)
     steps, lags = torch.arange(width), range(2, width)  # neighbours further apart than one step
     for at in range(0, len(rows), REPAIR_CHUNK):
@@ -222,7 +222,7 @@ def concatenate_clips(clips: Sequence[Clip], repair: bool = False) -> Ragged:
 
 def interpolate_gaps(joints: FloatArray, times: FloatArray, starts: NDArray[np.intp]) -> Ragged:
     """Stretches that lie end to end, y up, with what is missing interpolated; arguments as in :class:`Ragged`, NaN = not seen."""
-    there: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(axis=2))
+    there = _every(np.isfinite(joints))
     seen = np.logical_or.reduceat(there, starts[:-1], axis=0)
     if not there.all():
         lengths = np.diff(starts)
@@ -294,7 +294,8 @@ def describe_unusable(clip: Clip, fewest: int = 2, point: bool = False) -> str |
         return "one frame only, but an action needs at least two"
     if clip.joints.shape[1] == 1 and not point:
         return "one tracked point, but an action is of joints that move against each other"
-    if np.isfinite(clip.joints[0]).all() and (clip.joints[0] != clip.joints[0, 0]).any():
+    pose = clip.joints[0]
+    if np.isfinite(pose.sum()) and pose[0].tolist() != pose[-1].tolist():
         return None  # the common case, without looking at every frame
     if not clip.seen.any():
         return "no joint was seen in any frame (all NaN)"

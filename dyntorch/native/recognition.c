@@ -71,20 +71,28 @@ UNROLLED floats median(const floats *values, const int count) {
   return out;
 }
 
-/* Distance of sightings (places (n, dims), times (n)) from the robust line through those around each of rows (count), from
-   around[0] to before around[1], at most MAX_WIDTH, and the spread of these: far, spread (count, dims). */
-int EXPORT(robust_deviations)(const double *places, const double *times, const ptrdiff_t *rows, const ptrdiff_t *around,
+/* Distance of sightings (places (n, dims), times (n)), those of rows (count, ascending), from the robust line through the MAX_WIDTH
+   nearest ones on the path, which lies between two cuts, and the spread of these: far, spread (count, dims). */
+int EXPORT(robust_deviations)(const double *places, const double *times, const ptrdiff_t *rows, const ptrdiff_t *cuts,
                               ptrdiff_t count, int dims, float *far, float *spread) {
   for (ptrdiff_t at = 0; at < count; at += WIDE) {
+    ptrdiff_t own[WIDE], first[WIDE], end[WIDE];
+    for (int v = 0; v < WIDE; v++) {
+      own[v] = rows[at + v < count ? at + v : count - 1];
+      while (cuts[1] <= own[v]) cuts++;
+      first[v] = own[v] - MAX_WIDTH / 2 < cuts[1] - MAX_WIDTH ? own[v] - MAX_WIDTH / 2 : cuts[1] - MAX_WIDTH;
+      first[v] = first[v] > cuts[0] ? first[v] : cuts[0];
+      end[v] = first[v] + MAX_WIDTH < cuts[1] ? first[v] + MAX_WIDTH : cuts[1];
+    }
     floats since[MAX_WIDTH], near[MAX_WIDTH];  /* from the sighting itself */
     floats slopes[MAX_SLOPES], inverse[MAX_SLOPES];
     for (int d = 0; d < dims; d++) {
       for (int v = 0; v < WIDE; v++) {
-        ptrdiff_t r = at + v < count ? at + v : count - 1, row = rows[r], first = around[2 * r], end = around[2 * r + 1];
+        const double *here = places + own[v] * dims + d;
         for (int i = 0; i < MAX_WIDTH; i++) {
-          ptrdiff_t j = first + i < end ? first + i : end - 1;
-          near[i][v] = first + i < end ? (float)(places[j * dims + d] - places[row * dims + d]) : NAN;
-          if (d == 0) since[i][v] = (float)(times[j] - times[row]);
+          ptrdiff_t j = first[v] + i < end[v] ? first[v] + i : end[v] - 1;
+          near[i][v] = first[v] + i < end[v] ? (float)(places[j * dims + d] - *here) : NAN;
+          if (d == 0) since[i][v] = (float)(times[j] - times[own[v]]);
         }
       }
       int some = 0;

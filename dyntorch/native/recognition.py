@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-MAX_WIDTH = 9
+WIDTH = 9
 """Neighbours that a line goes through."""
 _TERMS = {"epi": 1, "nn": 2, "turned": 4}
 _SIZE, _INT, _POINTER = ctypes.c_ssize_t, ctypes.c_int, ctypes.c_void_p
@@ -22,7 +22,7 @@ def native_deviations(
     places: NDArray[Any],
     times: NDArray[Any],
     rows: NDArray[Any],
-    around: NDArray[Any],
+    cuts: NDArray[Any],
     width: int,
     out: tuple[NDArray[Any], NDArray[Any]],
 ) -> bool:
@@ -30,14 +30,14 @@ def native_deviations(
     neighbours' spread; whether there is a kernel for it.
 
     Args:
-        places, times: ``(n, dims)``, ``(n,)``; rows: ``(rows,)`` of these.
-        around: ``(rows, 2)`` the first and the end of those that each is compared with, at most ``width``.
+        places, times: ``(n, dims)``, ``(n,)``; rows: ``(rows,)`` of these, ascending.
+        cuts: ``(paths + 1,)`` between which a path lies; width: neighbours on it, itself one of them.
     """
-    if not load()[0] or width > MAX_WIDTH:
+    if not load()[0] or width != WIDTH:
         return False
     arrays = [
         one.astype(kind, order="C", copy=False)
-        for one, kind in zip((places, times, rows, around), ("f8", "f8", "i8", "i8"), strict=True)
+        for one, kind in zip((places, times, rows, cuts), ("f8", "f8", "i8", "i8"), strict=True)
     ]
     given = [one.ctypes.data for one in arrays]
     call("robust_deviations", *given, len(rows), places.shape[1], *(one.ctypes.data for one in out))

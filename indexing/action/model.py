@@ -9,7 +9,7 @@ on one side (``same``) B works alone.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Self
@@ -277,8 +277,8 @@ class ShapeModel:
 
     def moment_scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` minus the residual to the nearest short window of each class."""
-        residual, labels = self.moment_residuals(query), self.labels[self.exemplars.owner]
-        return torch.stack([-residual[:, labels == c].min(dim=1).values for c in range(self.classes)], dim=1)
+        each = by_class(self.moment_residuals(query), self.labels[self.exemplars.owner], self.classes)
+        return torch.stack([-mine.min(dim=1).values for mine in each], dim=1)
 
     def nearest_scores(self, query: Windows) -> Tensor:
         """``(Q, classes)`` scorer A: minus the mean residual to the nearest exemplars of each class."""
@@ -339,14 +339,19 @@ class ShapeModel:
 def class_scores(residuals: Tensor, labels: Tensor, classes: int) -> Tensor:
     """``(Q, classes)`` minus the mean of the smallest residuals in each class; -inf where a class has no (finite) exemplar."""
     out = residuals.new_full((len(residuals), classes), float("-inf"))
-    order, counts = labels.argsort(stable=True), torch.bincount(labels, minlength=classes).tolist()
-    for c, mine in enumerate(residuals.index_select(1, order).split(counts, dim=1)[:classes]):
+    for c, mine in enumerate(by_class(residuals, labels, classes)):
         if mine.shape[1]:
             least = _smallest(mine, NUM_NEIGHBOURS)
             there = least.isfinite()
             mean = torch.where(there, least, 0.0).sum(dim=1) / there.sum(dim=1).clamp(min=1)
             out[:, c] = torch.where(there.any(dim=1), -mean, out[:, c])
     return out
+
+
+def by_class(residuals: Tensor, labels: Tensor, classes: int) -> Sequence[Tensor]:
+    """``(Q, exemplars)`` the columns of each class; sorted once, which is faster than a mask for each."""
+    order, counts = labels.argsort(stable=True), torch.bincount(labels, minlength=classes).tolist()
+    return residuals.index_select(1, order).split(counts, dim=1)[:classes]
 
 
 def _smallest(values: Tensor, count: int) -> Tensor:

@@ -24,19 +24,21 @@ def line_deviation(places, times, own, near):
 def test_deviations_are_those_of_sorting_everything(monkeypatch):
     draw, wrong = np.random.default_rng(0), []
     places, times = draw.normal(size=(60, 3)).cumsum(0), draw.uniform(0.01, 0.1, 60).cumsum()
-    rows = draw.permutation(60)[:37]
-    first = np.clip(rows - 4, 0, 51)
-    around = np.stack([first, first + draw.integers(5, 10, len(rows))], axis=1)
-    expected = np.array([line_deviation(places, times, r, np.arange(*a)) for r, a in zip(rows, around, strict=True)])
+    rows, cuts = np.sort(draw.permutation(60)[:37]), np.array([0, 8, 13, 40, 60])
+    expected = []
+    for row in rows:
+        begin, end = cuts[cuts <= row].max(), cuts[cuts > row].min()
+        first = max(begin, min(row - 4, end - 9))
+        expected.append(line_deviation(places, times, row, np.arange(first, min(first + 9, end))))
     for level in levels(monkeypatch):
         monkeypatch.setattr(recognition, "load", library.load)
         for offset in (0.0, 1e6):  # a sighting is compared with its neighbours, wherever the origin is
             out = np.empty((37, 3), np.float32), np.empty((37, 3), np.float32)
-            assert native_deviations(places + offset, times, rows, around, 9, out)
-            error = np.abs(np.stack(out, axis=1) - expected).max()
+            assert native_deviations(places + offset, times, rows, cuts, 9, out)
+            error = np.abs(np.stack(out, axis=1) - np.array(expected)).max()
             wrong += [(level, offset, error)] if error > 1e-5 else []
     assert wrong == []
-    assert not native_deviations(places, times, rows, around, recognition.MAX_WIDTH + 1, out)
+    assert not native_deviations(places, times, rows, cuts, recognition.WIDTH + 1, out)
 
 
 @compiled
