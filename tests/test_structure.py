@@ -17,9 +17,9 @@ MAX_FIELDS = 12
 """Fields of the options of one verb."""
 BOUNDS = {
     "files": 347,
-    "lines": 93_735,
-    "code lines": 58_055,
-    "docstring lines": 14_326,
+    "lines": 93_775,
+    "code lines": 58_095,
+    "docstring lines": 14_335,
     "option fields": 111,
     "option fields that nobody sets": 0,
     "functions called by an everyday word": 2,
@@ -27,7 +27,7 @@ BOUNDS = {
     "circles of imports": 0,
     "circles of imports, those for types too": 0,
     "lines of experiments": 19_000,
-    "lines of tests": 54_165,
+    "lines of tests": 54_190,
 }
 """What each figure may be at most."""
 

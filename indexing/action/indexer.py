@@ -215,7 +215,8 @@ class ActionIndexer(SavedClassifier):
         """Learn from clips.
 
         Of one action alone, too: a background is then made of the clips played otherwise and, where the joints have names, of
-        synthetic people who do other things (:mod:`indexing.action.background`).
+        synthetic people who do other things (:mod:`indexing.action.background`).  Of more than 10,000 clips a part of each class is
+        compared with all, and trains the kernel machine, which a warning says.
 
         Args:
             clips: of :class:`Clip`, or ``(frames, joints, 2 | 3)`` arrays, or tuples of synchronized views of one

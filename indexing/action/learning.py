@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ from indexing.scoring import SHARPNESS
 MIN_MUTUAL_SHARE = 0.5  # of the mirror images of two classes that are nearest to the other one: neither is mirrored then
 HUB_SHARE = 0.5  # of an exemplar's closeness to other classes that is taken off: +2..3 %, one shot +4 %
 NUM_HUB_NEIGHBOURS = 5  # nearest windows of other classes that measure that closeness
+MAX_PAIRS = 10**8  # of exemplars that are compared with each other: all of them up to 10,000 exemplars (400 MB), a part of more
 MAX_TRAINING_ROWS = 3000  # the fit of the kernel machine grows with their square
 MAX_TRAINING_ROWS_SOLID = 5000  # the same where exemplars have depth: true views are worth more
 NEAREST_WEIGHT_SOLID = 0.5  # the same for exemplars with depth: B then sees true views (1.5: -1.5 % on Florence3D)
@@ -193,18 +195,37 @@ def learn(exemplars: Exemplars, labels: Tensor, classes: int, lesson: Lesson) ->
         ),
         hidden=lesson.hidden,
     )  # fmt: skip
+    asked = asked_exemplars(labels)
     if lesson.symmetry is not None:
-        model = dataclasses.replace(model, mirrored=_mirror_is_same_action(model, originals) if lesson.guard else ~none)
-    model = _with_hubs(model, originals)
+        model = dataclasses.replace(model, mirrored=_mirror_is_same_action(model, originals, asked) if lesson.guard else ~none)
+    model = _with_hubs(model, originals, asked)
+    if len(asked) < len(labels):
+        lesson = _without_all_pairs(lesson, len(labels))
     weights = _learn_joint_weights(model, lesson)
     if weights is not None:
-        model = _with_hubs(dataclasses.replace(model, joint_weights=weights, hub=nothing), originals)
+        model = _with_hubs(dataclasses.replace(model, joint_weights=weights, hub=nothing), originals, asked)
     trained = None
     if lesson.scorer != "nearest":
         model, trained = _with_machine(model, one_side=lesson.view == "same")
     if lesson.learned and lesson.groups is not None:
         model = dataclasses.replace(model, blend=learn_blend(model, lesson.groups, trained))
-    return _with_evidence(model, originals)
+    return _with_evidence(model, originals, asked)
+
+
+def asked_exemplars(labels: Tensor) -> Tensor:
+    """Numbers of the exemplars that are compared with all of them: every one, or as large a part of each class as can be."""
+    step = -(-(len(labels) ** 2) // MAX_PAIRS)
+    return labels.argsort(stable=True)[::step].sort().values if step > 1 else torch.arange(len(labels), device=labels.device)
+
+
+def _without_all_pairs(lesson: Lesson, count: int) -> Lesson:
+    """What is learned from more exemplars than can be compared with each other."""
+    what = ["" if lesson.scorer == "nearest" else "the kernel machine is trained on a part of them"]
+    what += ["weights stay equal"] if lesson.learned else []
+    if any(what):
+        said = " and ".join(one for one in what if one)
+        warnings.warn(f"{count:,} exemplars are too many to compare each with each: {said}", stacklevel=6)
+    return dataclasses.replace(lesson, learned=False)
 
 
 def _learn_joint_weights(model: ShapeModel, lesson: Lesson) -> JointWeights | None:
@@ -223,23 +244,23 @@ def _learn_joint_weights(model: ShapeModel, lesson: Lesson) -> JointWeights | No
     )
 
 
-def _mirror_is_same_action(model: ShapeModel, originals: Windows) -> Tensor:
+def _mirror_is_same_action(model: ShapeModel, originals: Windows, asked: Tensor) -> Tensor:
     """``(N,)`` whether the mirror image of an exemplar is still the same action."""
     if model.symmetry is None:
         return model.mirrored
-    flipped = mirror_some(originals, model.symmetry, torch.ones_like(model.mirrored))
+    flipped = mirror_some(originals[asked], model.symmetry, torch.ones_like(asked, dtype=torch.bool))
     nearest = model.labels[model.residuals(flipped).argmin(dim=1)]
-    own = torch.nn.functional.one_hot(model.labels, model.classes).float()
+    own = torch.nn.functional.one_hot(model.labels[asked], model.classes).float()
     lands = own.mT @ torch.nn.functional.one_hot(nearest, model.classes).float() / own.sum(dim=0).clamp(min=1)[:, None]
     mutual = (lands > MIN_MUTUAL_SHARE) & (lands.mT > MIN_MUTUAL_SHARE)
     mutual.fill_diagonal_(False)
     return ~mutual.any(dim=1)[model.labels]
 
 
-def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
+def _with_hubs(model: ShapeModel, originals: Windows, asked: Tensor) -> ShapeModel:
     """Measure, among the exemplars, how close each is to other classes."""
-    residual, labels = model.residuals(originals), model.labels
-    model = dataclasses.replace(model, hub=_hub(residual, labels, labels))
+    residual, labels = model.residuals(originals[asked]), model.labels
+    model = dataclasses.replace(model, hub=_hub(residual, labels[asked], labels))
     step = max(1, len(model.exemplars.moments) // MAX_SAMPLED_MOMENTS)
     sample = torch.arange(0, len(model.exemplars.moments), step, device=labels.device)
     labels = labels[model.exemplars.owner]
@@ -247,40 +268,40 @@ def _with_hubs(model: ShapeModel, originals: Windows) -> ShapeModel:
     return dataclasses.replace(model, moment_hub=_hub(residual, labels[sample], labels))
 
 
-def _with_evidence(model: ShapeModel, originals: Windows) -> ShapeModel:
+def _with_evidence(model: ShapeModel, originals: Windows, asked: Tensor) -> ShapeModel:
     """What profiles the exemplars have, and what evidence, were their own class unknown."""
-    tables = [model.residuals(originals) + model.hub]
+    query = originals[asked]
+    tables = [model.residuals(query) + model.hub]
     if model.kernels is not None:
-        tables.append(model.kernel_residuals(originals))
-    labels = model.labels
-    profiles = _profiles([tables[0] - model.hub, *tables[1:]], labels, model.classes, model.hidden)
-    return dataclasses.replace(model, profiles=profiles, evidence_out=_evidence_out(tables, model))
+        tables.append(model.kernel_residuals(query))
+    profiles = _profiles([tables[0] - model.hub, *tables[1:]], asked, model.labels, model.classes, model.hidden)
+    return dataclasses.replace(model, profiles=profiles, evidence_out=_evidence_out(tables, asked, model))
 
 
-def _profiles(tables: list[Tensor], labels: Tensor, classes: int, hidden: int) -> ClassProfiles | None:
-    """The profiles of exemplars, each asked as if it had not been learned; tables ``(N, N)`` of residuals among them."""
-    itself = torch.eye(len(labels), dtype=torch.bool, device=labels.device)
-    scores = [class_scores(table.masked_fill(itself, torch.inf), labels, classes) for table in tables]
-    return ClassProfiles.learn(torch.cat(scores, dim=1), labels, classes - hidden)
+def _profiles(tables: list[Tensor], asked: Tensor, labels: Tensor, classes: int, hidden: int) -> ClassProfiles | None:
+    """The profiles of exemplars, each asked as if it had not been learned; tables ``(asked, N)`` of residuals among them."""
+    each = torch.arange(len(asked), device=asked.device)
+    scores = [class_scores(table.index_put((each, asked), table.new_tensor(torch.inf)), labels, classes) for table in tables]
+    return ClassProfiles.learn(torch.cat(scores, dim=1), labels[asked], classes - hidden)
 
 
-def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
+def _evidence_out(tables: list[Tensor], asked: Tensor, model: ShapeModel) -> Tensor:
     """The evidence that exemplars would have for other classes, were their own class unknown; of all that could be taken for
     one."""
     if model.num_known == 1:
-        return _between_kinds(tables[0], model)
+        return _between_kinds(tables[0], model.labels[asked], model)
     found, refused = [], []
     for c in range(model.classes):
-        mine, rest = model.labels == c, model.labels != c
+        mine, rest, kept = model.labels[asked] == c, model.labels[asked] != c, model.labels != c
         classes, hidden = model.classes - 1, model.hidden - (c >= model.num_known)
         if classes == hidden:  # no known class is left
             continue
-        labels = model.labels[rest] - (model.labels[rest] > c).long()
-        among, asked = [table[rest][:, rest] for table in tables], [table[mine][:, rest] for table in tables]
-        hub = _hub(among[0], labels, labels)
-        among[0], asked[0] = among[0] - hub, asked[0] - hub
-        profiles = _profiles(among, labels, classes, hidden)
-        scores = [class_scores(table, labels, classes) for table in asked]
+        labels, others = model.labels[kept] - (model.labels[kept] > c).long(), (kept.cumsum(0) - 1)[asked[rest]]
+        among, foreign = [table[rest][:, kept] for table in tables], [table[mine][:, kept] for table in tables]
+        hub = _hub(among[0], labels[others], labels)
+        among[0], foreign[0] = among[0] - hub, foreign[0] - hub
+        profiles = _profiles(among, others, labels, classes, hidden)
+        scores = [class_scores(table, labels, classes) for table in foreign]
         unusual = None if profiles is None else profiles.distance(torch.cat(scores, dim=1), classes)
         found.append(evidence(scores[0], model.classes, unusual, hidden))
         refused.append(scores[0].argmax(dim=1) >= classes - hidden)
@@ -290,11 +311,11 @@ def _evidence_out(tables: list[Tensor], model: ShapeModel) -> Tensor:
     return torch.where(torch.cat(refused), every.min(), every)
 
 
-def _between_kinds(residual: Tensor, model: ShapeModel) -> Tensor:
+def _between_kinds(residual: Tensor, asked: Tensor, model: ShapeModel) -> Tensor:
     """How near exemplars of background come to every kind that is not theirs: as near another movement comes to the action."""
-    rows = model.labels >= model.num_known
+    rows = asked >= model.num_known
     scores = class_scores(residual[rows], model.labels, model.classes)
-    foreign = torch.nn.functional.one_hot(model.labels[rows], model.classes) == 0
+    foreign = torch.nn.functional.one_hot(asked[rows], model.classes) == 0
     return scores[:, model.num_known :][foreign[:, model.num_known :]]
 
 
@@ -316,6 +337,9 @@ def _with_machine(model: ShapeModel, one_side: bool) -> tuple[ShapeModel, Traine
     copies = max(1, rows_at_most // (count * (1 + both)))
     parts = [exemplars.crop(0)] + [exemplars.view(i) for i in range(min(copies - 1, len(exemplars.views) // count))]
     rows, owner = stack(parts), torch.arange(count, device=model.labels.device).repeat(len(parts))
+    if len(asked_exemplars(model.labels)) < count:
+        owner = model.labels.argsort(stable=True)[:: -(-count * (1 + both) // rows_at_most)]
+        rows = rows[owner]
     if both and model.symmetry is not None:
         chosen = model.mirrored[owner]
         rows = stack([rows, mirror_some(rows[chosen], model.symmetry, chosen[chosen])])

@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from indexing import ActionIndexer
+from indexing.action import learning
 from indexing.action.bank import EPSILON, JointMetric, factorize, flatten_channel, fuse_terms
 from indexing.action.learning import BLENDS, _fewest_mistakes, _fit_sharpness, leave_out
-from indexing.action.model import Blend, evidence
+from indexing.action.model import Blend, ShapeModel, evidence
 from indexing.actors import Person, dataset
 from indexing.scoring import probabilities
 
@@ -117,3 +118,22 @@ def test_known_from_unknown():
     assert auroc(lambda x: evidence(x, 6)) > auroc(lambda x: x.max(dim=1).values) > 0.6
     few = scores[:, :2]
     assert torch.equal(evidence(few, 2), few.max(dim=1).values)
+
+
+def test_of_many_exemplars_a_part_of_each_class_is_compared_with_all(monkeypatch):
+    rng = np.random.default_rng(5)
+    labels = np.arange(60) % 3
+    waves = np.sin(np.linspace(0, 6, 12))[:, None, None] * rng.normal(size=(3, 1, 6, 2))
+    clips = rng.normal(size=(6, 2)) + waves[labels] + 0.1 * rng.normal(size=(60, 12, 6, 2))
+    whole = ActionIndexer(search=False, virtual_views=0).fit(clips, labels)
+    asked, residuals = [], ShapeModel.residuals
+    monkeypatch.setattr(ShapeModel, "residuals", lambda self, query: (asked.append(len(query)), residuals(self, query))[1])
+    monkeypatch.setattr(learning, "MAX_PAIRS", 60 * 20)
+    monkeypatch.setattr(learning, "MAX_TRAINING_ROWS", 30)
+    many = ActionIndexer(search=False, virtual_views=0, weights="learned", reject=0.05)
+    with pytest.warns(UserWarning, match="60 exemplars are too many to compare each with each: .*weights stay equal"):
+        many.fit(clips, labels, groups=labels)
+    assert set(asked) == {20} and many.model_.evidence_out.shape == (20,) and many.model_.blend == Blend()
+    assert 0 < len(many.model_.support) <= 30 and many.model_.hub.shape == (60,)
+    torch.testing.assert_close(many.model_.hub, whole.model_.hub, atol=0.3, rtol=0)
+    assert (many.model_.scores(whole._queries(clips)).argmax(dim=1).numpy() == labels).all()
