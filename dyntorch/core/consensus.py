@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant
+from dyntorch.core.kernel_fit import searched_kinds
 from dyntorch.core.limits import quantile
 from dyntorch.core.matches import Matches
 from dyntorch.core.matrix import unpack
@@ -18,6 +19,7 @@ from dyntorch.core.normalize import Normalization, normalization, relative
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive, triangle
 from dyntorch.core.residual import SINGULAR, whiten
 from dyntorch.core.solution import with_copies
+from dyntorch.native import library
 from dyntorch.numerics.blocks import Draws, Record, each, map_blocks, replace_problems, workers
 from dyntorch.numerics.eigenspaces import orthonormal
 from dyntorch.numerics.nullspace import gram_null_space
@@ -36,6 +38,8 @@ MAX_MINIMAL_SAMPLE = 8
 """Largest minimal sample for which samples of that size are drawn; other starts take 2.5 times the minimal number."""
 SAMPLES_PER_START = 32
 """Minimal samples drawn per start."""
+MISSED = 1e-3
+"""Share of the searches that may have drawn no minimal sample of inliers alone: what they found may then be a worse tensor."""
 STARTS_PER_ANNEALED_SAMPLE = 4
 NUM_SCALE_STARTS = 16
 """Random starts of the estimate of the threshold, beside that from all matches."""
@@ -320,6 +324,7 @@ class Search:
         self.weights = some.weights / some.weights.amax(-1, keepdim=True).clamp(min=1e-300)
         views = moved if invariant.copies else tuple(x[:, None] for x in moved)
         self.searched = SearchMatches(self.weights, views, self.norm.transforms)
+        self.kinds = searched_kinds(invariant, data.views, data.weights)
 
     def run(self, cut: Tensor, starts: Sequence[int]) -> SearchResult:
         """Best tensors: more and more starts for the problems that need them.
@@ -331,9 +336,10 @@ class Search:
         cut = cut * self.unit
         result = self._solve(self.everyone, cut, starts[0])
         settled = torch.zeros_like(result.doubt)
-        enough = (self.weights > 0).sum(-1) >= self.invariant.minimal()
+        enough, tried = (self.weights > 0).sum(-1) >= self.invariant.minimal(), 0
         for count in starts[1:]:
-            left = (result.doubt & enough & ~settled).nonzero()[:, 0]
+            left = ((result.doubt | (self._samples_needed(result) > tried)) & enough & ~settled).nonzero()[:, 0]
+            tried += count * SAMPLES_PER_START
             if not len(left):
                 break
             new = self._solve(left, cut, count)
@@ -341,6 +347,14 @@ class Search:
             # more starts would find it again
             settled[left] = (new.agreeing >= MIN_AGREEING_STARTS) & (new.score <= self._equal_score(result.score[left]))
         return result
+
+    def _samples_needed(self, result: SearchResult) -> Tensor:
+        """Minimal samples ``(b,)`` of which one is inliers alone, but for :data:`MISSED` of all searches; 0 of larger samples."""
+        minimal, present = self.invariant.minimal(), (self.weights > 0).sum(-1).clamp(min=1)
+        if minimal > MAX_MINIMAL_SAMPLE:
+            return torch.zeros_like(result.score)
+        share = (result.inliers & (self.weights > 0)).sum(-1) / present
+        return math.log(MISSED) / torch.log1p(-share.double().pow(minimal).clamp(1e-12, 1 - 1e-12))
 
     def scale(self) -> Tensor:
         """Threshold ``(b,)`` from the data: least median of squares (annealed), and what 99 % of the inliers then keep."""
@@ -362,6 +376,8 @@ class Search:
         """Evidence ``(b,)``, see :class:`SearchResult`, of normalized tensors as a solution holds them, with another threshold."""
         inv = self.invariant
         tensors = inv.basis_of(tensor)
+        if self.kinds:
+            return self._by_kernel(self.everyone, cut * self.unit, given=tensors[:, 0]).evidence
 
         def block(searched: SearchMatches, basis: Tensor, cut: Tensor) -> Tensor:
             work = self._bundle(searched)
@@ -371,6 +387,17 @@ class Search:
         return self._map(block, self.everyone, tensors if inv.copies else tensors[:, None], cut * self.unit)
 
     def _solve(self, where: Tensor, cut: Tensor, count: int) -> SearchResult:
+        minimal = self.invariant.minimal()
+        if self.kinds and count == 1:
+            return self._by_kernel(where, cut[where], iterations=REWEIGHTINGS["all"])
+        if self.kinds and minimal <= MAX_MINIMAL_SAMPLE:
+            # every rung of the ladder has samples of its own
+            seeds, starts, keep = (
+                self.draws.seeds[where] + count,
+                count * SAMPLES_PER_START,
+                max(1, count // STARTS_PER_ANNEALED_SAMPLE),
+            )
+            return self._by_kernel(where, cut[where], seeds, starts=starts, keep=keep, iterations=REWEIGHTINGS["minimal"])
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
         kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
         steps = REWEIGHTINGS[kind]
@@ -429,6 +456,24 @@ class Search:
         per_problem = (inv.copies or 1) * (n * packed + starts.shape[1] * per_start)
         size = min(STARTS_BLOCK // per_problem, -(-len(where) // workers()))
         return map_blocks(function, each(lambda x: x[where], self.searched), starts, *more, size=max(1, size))
+
+    def _by_kernel(
+        self, where: Tensor, cut: Tensor, seeds: Tensor | None = None, given: Tensor | None = None, **numbers: int
+    ) -> SearchResult:
+        """The search, or the judgement of given tensors ``(b, D)``, by the kernel in C."""
+        minimal = self.invariant.minimal()
+        rules = (SHRINKING_SHARE, NUM_CONCENTRATIONS, NUM_SHUFFLES, MAX_NEAR_MISSES, MIN_STARTS_TO_COMPARE, SAME_SCORE)
+
+        def block(searched: SearchMatches, limit: Tensor, seeds: Tensor | None, given: Tensor | None) -> SearchResult:
+            views = tuple(x[:, 0] for x in searched.views)
+            scales = torch.stack(relative([t[:, 0, 0] for t in searched.transforms])[0], dim=-1)
+            options: dict[str, Any] = {**numbers, "minimal": minimal, "rules": rules, "seeds": seeds, "given": given}
+            found = library.search(self.kinds, views, searched.weights, scales, limit, **options)
+            numbers_of = (found.score, found.evidence, found.doubt, found.inliers, found.agreeing)
+            return SearchResult(found.basis[:, None, None], *numbers_of)
+
+        searched = self.searched if where is self.everyone else each(lambda x: x[where], self.searched)
+        return map_blocks(block, searched, cut.square(), seeds, given, size=max(1, -(-len(where) // workers())))
 
     def _bundle(self, searched: SearchMatches) -> Bundle:
         transforms = searched.transforms

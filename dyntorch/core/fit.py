@@ -179,7 +179,7 @@ def _fit_block(
 
 def _fit_by_kernel(
     invariant: Invariant, kinds: Sequence[int], normalize: bool, views: tuple[Tensor, ...], weights: Tensor
-) -> tuple[LinearFits, Sequence[int]]:
+) -> tuple[LinearFits, Tensor]:
     """Fits of one block, and the problems ``(k,)`` that they say nothing of."""
     whole = invariant.nullity == 1 and library.CONIC_MONOMIALS not in kinds
     found = library.fit_points(
@@ -195,9 +195,9 @@ def _fit_by_kernel(
         limits=KERNEL_LIMITS,
     )
     transforms = tuple(found.transforms)
-    flagged = bool(found.flags.any())
-    left = (found.flags == library.UNDECIDED).nonzero()[:, 0] if flagged else ()
-    place = (found.flags == library.WEAK).nonzero()[:, 0] if flagged else ()
+    left = place = found.status[:0]
+    if bool(found.flags.any()):
+        left, place = ((found.flags == flag).nonzero()[:, 0] for flag in (library.UNDECIDED, library.WEAK))
     if len(place):
         norm = Normalization.of(invariant, transforms)
         moved = tuple(p.move(x[place], t[place]) for p, x, t in zip(invariant.primitives, views, transforms, strict=True))

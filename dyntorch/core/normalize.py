@@ -10,7 +10,8 @@ from torch import Tensor
 
 from dyntorch.core.invariant import Frame, Invariant
 from dyntorch.core.primitives import Primitive
-from dyntorch.geometry.homogeneous import similarity, unit
+from dyntorch.geometry.homogeneous import canonical_sign, similarity, unit
+from dyntorch.numerics.least_squares import normalized_derivative
 
 LETTERS = "abcdefghijkl"
 SPREAD = 1e-120
@@ -129,16 +130,52 @@ def normalize_motion(invariant: Invariant, motion: Sequence[Tensor], transforms:
     return tuple(_change_frame(part, frame, transforms, forward=True) for part, frame in zip(motion, invariant.motion, strict=True))
 
 
+def denormalization_derivative(invariant: Invariant, motion: Sequence[Tensor], transforms: Sequence[Tensor]) -> Tensor:
+    """Derivative ``(b, p, p)`` of all entries of :func:`denormalize_motion` (last) by those of the motion ``(b, ...)``."""
+    blocks = []
+    for part, frame in zip(motion, invariant.motion, strict=True):
+        sizes = (part.shape[1], part.shape[-1])
+        maps = _maps_of_frame(frame, transforms, forward=False)
+        left, right = (_eye(part, size) if matrix is None else matrix for matrix, size in zip(maps, sizes, strict=True))
+        if frame.vector:
+            value, slope = (left @ part[..., None])[..., 0], left.mT
+        else:
+            value = (left @ part @ right).flatten(1)
+            slope = (left.mT[:, :, None, :, None] * right[:, None, :, None, :]).flatten(3).flatten(1, 2)
+        value, slope = normalized_derivative(value, slope)
+        blocks.append(slope if frame.vector else slope * canonical_sign(value.unflatten(1, part.shape[1:])))
+    size = sum(block.shape[1] for block in blocks)
+    total, start = blocks[0].new_zeros(len(blocks[0]), size, size), 0
+    for block in blocks:
+        end = start + block.shape[1]
+        total[:, start:end, start:end] = block
+        start = end
+    return total
+
+
 def _change_frame(part: Tensor, frame: Frame, transforms: Sequence[Tensor], *, forward: bool) -> Tensor:
+    left, right = _maps_of_frame(frame, transforms, forward=forward)
     matrix = part[..., None] if frame.vector else part
-    for view, left in ((frame.target, True), (frame.source, False)):
-        if view is None:
-            continue
-        # dual images change by the inverse transposed, which is the other way round
-        transform = transforms[view] if (left == forward) != (left and frame.dual) else torch.linalg.inv_ex(transforms[view])[0]
-        transform = transform.mT if left and frame.dual else transform
-        matrix = transform @ matrix if left else matrix @ transform
+    matrix = matrix if left is None else left @ matrix
+    matrix = matrix if right is None else matrix @ right
     if frame.vector:
         norm = matrix.norm(dim=(-2, -1))[..., None]
         return matrix[..., 0] / torch.where(norm > 0, norm, 1.0)
     return unit(matrix)
+
+
+def _maps_of_frame(frame: Frame, transforms: Sequence[Tensor], *, forward: bool) -> tuple[Tensor | None, Tensor | None]:
+    """What a part of the motion is multiplied by from the left and from the right; None: nothing."""
+    maps: list[Tensor | None] = []
+    for view, left in ((frame.target, True), (frame.source, False)):
+        if view is None:
+            maps.append(None)
+            continue
+        # dual images change by the inverse transposed, which is the other way round
+        transform = transforms[view] if (left == forward) != (left and frame.dual) else torch.linalg.inv_ex(transforms[view])[0]
+        maps.append(transform.mT if left and frame.dual else transform)
+    return maps[0], maps[1]
+
+
+def _eye(part: Tensor, size: int) -> Tensor:
+    return torch.eye(size, dtype=part.dtype, device=part.device).expand(len(part), size, size)

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Invariant
+from dyntorch.core.kernel_fit import refined_kinds
 from dyntorch.core.matches import Matches, check_plain, largest_weights, matches, relative_weights
 from dyntorch.core.matrix import gram
-from dyntorch.core.normalize import Normalization, denormalize, denormalize_motion, relative
+from dyntorch.core.normalize import Normalization, denormalization_derivative, denormalize, relative
 from dyntorch.core.outcome import Notice, NoticeCode, in_order, is_failure, notices
 from dyntorch.core.residual import multilinear_derivative, residual_derivative, whitened_residual
 from dyntorch.core.solution import Solution
+from dyntorch.native import library
 from dyntorch.numerics.blocks import each, map_blocks, one_thread, select, workers
 from dyntorch.numerics.function_transforms import is_transformed, over_problems
 from dyntorch.numerics.least_squares import (
@@ -25,7 +27,6 @@ from dyntorch.numerics.least_squares import (
     flat_directions,
     flatten_parts,
     follow_minimum,
-    jacobian,
     minimize,
     parts_of,
 )
@@ -240,6 +241,8 @@ def _select_start(starts: Tensor, cost: Callable[[Tensor], Tensor]) -> Tensor:
 
 
 ITERATIONS = 30
+ENOUGH_AT_FIRST = 10_000
+"""Matches that the first descent takes of twice as many or more; the last one, from where it ends, takes all."""
 
 
 @one_thread
@@ -350,62 +353,86 @@ def _of_transformed(solution: Solution, data: Matches, iterations: int) -> Solut
 def refine_matches(solution: Solution, data: Matches, iterations: int = ITERATIONS) -> Solution:
     """:func:`refine` for checked matches."""
     invariant, motion, recorded = solution.invariant, solution.normalized_motion(), needs_gradient(solution, data)
+    with torch.no_grad():
+        minimum = descend(solution, data, motion, iterations)
+        if not recorded:
+            return with_covariance(move_to(solution, motion, minimum), data, minimum)
+        open_ = unfinished_notices(minimum, invariant.dof, data.batch)
+    shapes = tuple(part.shape[1:] for part in motion)
+    theta, cost = differentiable_minimum(solution, data, shapes, minimum)
+    minimum = Minimum((theta,), cost, minimum.terms, minimum.steps)
+    refined = with_covariance(move_to(solution, motion, minimum), data, minimum)
+    return replace(refined, notices=in_order((*solution.notices, *open_)))
+
+
+def descend(solution: Solution, data: Matches, motion: tuple[Tensor, ...], iterations: int) -> Minimum:
+    """The minimum next to a motion in normalized coordinates, its cost in the unit of the matches."""
+    invariant, base, shapes = solution.invariant, solution.base(), tuple(part.shape[1:] for part in motion)
     starts = [flatten_parts(motion).detach()]
     if invariant.starts is not None and solution.refined is None:
         starts.append(flatten_parts(algebraic_motion(solution, data)))
-    base, shapes = solution.base(), tuple(part.shape[1:] for part in motion)
     frames = tuple(t.detach() for t in solution.frames())
     views = tuple(p.move(x, t).detach() for p, x, t in zip(invariant.primitives, data.views, frames, strict=True))
+    kinds, options = refined_kinds(invariant, data), LeastSquaresOptions(iterations=iterations)
 
     def run(
         starts: Tensor, views: tuple[Tensor, ...], scales: tuple[Tensor, ...], weights: Tensor, static: Tensor | None
     ) -> Minimum:
+        if kinds:
+            form, given = int(invariant.constraint or 0), (kinds, views, weights, torch.stack(scales, -1), starts[:, 0])
+            theta, cost, *terms, steps = library.refine(*given, constraint=form, iterations=iterations, rules=options.rules())
+            return Minimum((theta,), cost, tuple(terms), steps)
         problem = Problem(base, shapes, views, scales, weights, static)
         theta = _select_start(starts, lambda theta: problem.normal_equations(theta)[0])
-        return minimize(problem, problem.evaluate((theta,)), LeastSquaresOptions(iterations=iterations))
+        return minimize(problem, problem.evaluate((theta,)), options)
 
     # a block for every thread at least: threads inside of small operations cost more than they bring
     theta = torch.stack(starts, dim=1)
-    size = max(1, min(BLOCK // max(1, data.count * theta.shape[-1]), -(-len(theta) // workers())))
-    with torch.no_grad():
-        start = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
-        scales, unit = relative([t[:, 0, 0] for t in frames])
-        minimum = map_blocks(run, start, views, scales, data.weights, data.static, size=size)
-        gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in minimum.terms)
-        minimum = Minimum(minimum.theta, minimum.cost / unit.square(), (gradient, matrix), minimum.steps)
-        if not recorded:
-            return _apply_minimum(solution, data, motion, minimum)
-        open_ = unfinished_notices(minimum, invariant.dof, data.batch)
-    theta, cost = differentiable_minimum(solution, data, shapes, minimum)
-    refined = _apply_minimum(solution, data, motion, Minimum((theta,), cost, minimum.terms, minimum.steps))
-    return replace(refined, notices=in_order((*solution.notices, *open_)))
+    theta = torch.where(theta.isfinite(), theta, torch.zeros_like(theta))
+    scales, unit = relative([t[:, 0, 0] for t in frames])
+    rounds = [(views, data.weights, data.static)]
+    if data.count >= 2 * ENOUGH_AT_FIRST:
+        rounds.insert(0, each(lambda x: x[:, :: data.count // ENOUGH_AT_FIRST], rounds[0]))
+    for some, weights, static in rounds:
+        size = max(1, min(BLOCK // max(1, weights.shape[1] * theta.shape[-1]), -(-len(theta) // workers())))
+        minimum = map_blocks(run, theta, some, scales, weights, static, size=size)
+        theta = minimum.theta[0][:, None]
+    gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in minimum.terms)
+    return Minimum(minimum.theta, minimum.cost / unit.square(), (gradient, matrix), minimum.steps)
 
 
-def _apply_minimum(solution: Solution, data: Matches, old: tuple[Tensor, ...], minimum: Minimum) -> Solution:
-    """The solution with the refined motion, where refinement was possible; elsewhere with the old one."""
-    invariant, shapes = solution.invariant, tuple(part.shape[1:] for part in old)
-    good = minimum.cost.isfinite() & ~is_failure(solution.status.reshape(-1).to(minimum.cost.device))
-    motion = tuple(select(good, new, part) for new, part in zip(parts_of(minimum.theta[0], shapes), old, strict=True))
+def move_to(solution: Solution, old: tuple[Tensor, ...], minimum: Minimum) -> Solution:
+    """The solution in normalized coordinates with the refined motion, where refinement was possible; elsewhere with the old one."""
+    shapes, good = tuple(part.shape[1:] for part in old), _is_moved(solution, minimum)
+    motion = parts_of(minimum.theta[0], shapes)
+    if good.device.type == "cpu" and bool(good.all()):
+        return replace(solution, normalized=solution.base().compose(*motion), refined=motion)
+    motion = tuple(select(good, new, part) for new, part in zip(motion, old, strict=True))
     # tensors of copies have the axis of the copies behind the batch, like the transforms of the solution
     normalized = solution.base().compose(*(select(good, part, _any(part)) for part in motion))
-    tensor = denormalize(invariant, normalized, solution.normalization.actions)
+    return replace(solution, normalized=select(good, normalized, solution.normalized), refined=motion)
+
+
+def with_covariance(moved: Solution, data: Matches, minimum: Minimum) -> Solution:
+    """The solution that moved to a minimum, with its tensor, noise and covariance in the coordinates of the matches."""
+    invariant, frames, good = moved.invariant, tuple(t.detach() for t in moved.frames()), _is_moved(moved, minimum)
+    shapes = tuple(part.shape[1:] for part in moved.normalized_motion())
+    tensor = denormalize(invariant, moved.normalized, moved.normalization.actions)
     sigma = _noise(invariant, data, minimum.cost)
-
-    def denormalize_parts(theta: Tensor) -> Tensor:
-        parts = denormalize_motion(invariant, parts_of(theta, shapes), frames)
-        return torch.cat([part.flatten(theta.ndim - 1) for part in parts], dim=-1)
-
-    frames = tuple(t.detach() for t in solution.frames())
     with torch.no_grad():
-        covariance = _covariance(denormalize_parts, minimum, invariant.dof, sigma * largest_weights(data.weights).sqrt())
+        derivative = denormalization_derivative(invariant, parts_of(minimum.theta[0], shapes), frames)
+        covariance = _covariance(derivative, minimum, invariant.dof, sigma * largest_weights(data.weights).sqrt())
     return replace(
-        solution,
-        tensor=select(data.back(good), data.back(tensor), solution.tensor),
-        normalized=select(good, normalized, solution.normalized),
-        refined=motion,
+        moved,
+        tensor=select(data.back(good), data.back(tensor), moved.tensor),
         sigma=data.back(select(good, sigma, torch.zeros_like(sigma))),
         covariance=data.back(select(good, covariance, torch.zeros_like(covariance))),
     )
+
+
+def _is_moved(solution: Solution, minimum: Minimum) -> Tensor:
+    """Where refinement was possible, ``(b,)``."""
+    return minimum.cost.isfinite() & ~is_failure(solution.status.reshape(-1).to(minimum.cost.device))
 
 
 def _noise(invariant: Invariant, data: Matches, cost: Tensor) -> Tensor:
@@ -421,13 +448,12 @@ def _noise(invariant: Invariant, data: Matches, cost: Tensor) -> Tensor:
     return torch.where(spare > 0, (mean / spare.clamp(min=1)).sqrt(), torch.inf)
 
 
-def _covariance(denormalize_parts: Callable[[Tensor], Tensor], minimum: Minimum, dof: int, scale: Tensor) -> Tensor:
+def _covariance(derivative: Tensor, minimum: Minimum, dof: int, scale: Tensor) -> Tensor:
     r"""Covariance ``(b, p, p)`` of the motion in the coordinates of the matches: :math:`\sigma^2 D H^+ D^T`, H of rank dof."""
     values, vectors = spectrum(minimum.terms[1])
     count = min(dof, values.shape[-1])
     values, vectors = values[..., -count:], vectors[..., -count:]
     root = vectors * values.clamp(min=1e-12 * values[..., -1:].clamp(min=torch.finfo(values.dtype).tiny)).rsqrt()[..., None, :]
-    _, derivative = jacobian(denormalize_parts, minimum.theta[0])
     spread = derivative.mT @ root
     covariance = (spread @ spread.mT) * scale.square()[:, None, None]
     # a motion without a matrix in the coordinates of the matches (singular) is not known at all, like one without spare matches

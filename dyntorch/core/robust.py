@@ -11,14 +11,17 @@ from torch import Tensor
 from dyntorch.core.consensus import Search, SearchResult, threshold_of
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant, as_invariant
+from dyntorch.core.kernel_fit import searched_kinds
 from dyntorch.core.limits import quantile
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.normalize import denormalize, relative
 from dyntorch.core.outcome import Status, is_failure
-from dyntorch.core.refine import refine_matches
+from dyntorch.core.refine import descend, move_to, with_covariance
 from dyntorch.core.residual import multilinear, whitened_residual
 from dyntorch.core.solution import NOISY, Solution
-from dyntorch.numerics.blocks import map_blocks, one_thread, select, workers
+from dyntorch.native import library
+from dyntorch.numerics.blocks import map_blocks, one_thread, select, select_problems, workers
+from dyntorch.numerics.least_squares import Minimum
 
 BLOCK = 1 << 16  # matches per block of the distances
 REFINEMENT_STEPS = (3, 8)
@@ -138,15 +141,24 @@ def _finish(search: Search, result: SearchResult, cut: Tensor, rounds: Sequence[
     """Refine on the inliers, choose them again, and say how it ended."""
     invariant, data = search.invariant, search.data
     solution = _solution(search, result)
-    distance = distances(solution)
+    distance, used = distances(solution), data.weights
+    best: Minimum | None = None
+    motion = solution.normalized_motion() if rounds else ()
     for i, steps in enumerate(rounds):
         if estimate:
             cut = _update_threshold(invariant, data, distance, cut) * (WIDE_THRESHOLD if i + 1 < len(rounds) else 1.0)
-        refined = refine_matches(solution, data.restrict(_within(data, distance, cut)), iterations=steps)
-        new = distances(refined)
+        chosen = data.restrict(_within(data, distance, cut))
+        minimum = descend(solution, chosen, motion, steps)
+        moved = move_to(solution, motion, minimum)
+        new = distances(moved)
         # the tensor found has more freedom than the motion, so the first motion may well cost more
-        better = (_score(data, new, cut) < _score(data, distance, cut)) | (i == 0)
-        solution, distance = _pick(better, refined, solution), torch.where(better[:, None], new, distance)
+        better = (_score(data, new, cut) < _score(data, distance, cut)) | (best is None)
+        best = minimum if best is None else select_problems(better, minimum, best)
+        used, distance = select(better, chosen.weights, used), select(better, new, distance)
+        motion = tuple(select(better, part, old) for part, old in zip(moved.normalized_motion(), motion, strict=True))
+        solution = replace(solution, normalized=select(better, moved.normalized, solution.normalized), refined=motion)
+    if best is not None:  # one covariance, of the last descent that brought something
+        solution = with_covariance(solution, replace(data, weights=used), best)
     cut = _update_threshold(invariant, data, distance, cut) if estimate else cut
     evidence = search.evidence(solution.normalized, cut)
     # a tensor that the matches leave open has no motion, and so no inliers by it
@@ -187,12 +199,16 @@ def _solution(search: Search, result: SearchResult) -> Solution:
 def distances(solution: Solution) -> Tensor:
     """Sampson distances ``(b, n)`` in the unit of the matches, as :func:`dyntorch.sampson` has them."""
     invariant, data = solution.invariant, solution.matches
-    alone = invariant.single()
+    kinds = searched_kinds(invariant, data.views, data.weights)
+    alone = invariant.single() or bool(kinds)
     parts = (solution.normalized,) if alone else solution.normalized_motion()
 
     def block(frames: tuple[Tensor, ...], x: tuple[Tensor, ...], motion: tuple[Tensor, ...]) -> Tensor:
         views = tuple(p.move(v, t) for p, v, t in zip(invariant.primitives, x, frames, strict=True))
         scales, unit = relative([t[:, 0, 0] for t in frames])
+        if kinds:
+            basis = invariant.basis_of(motion[0])[:, 0]
+            return library.distances(kinds, views, torch.stack(scales, dim=-1), basis) / unit[:, None]
         if alone:
             return multilinear(invariant, motion[0], views, scales).abs() / unit[:, None]
         return whitened_residual(invariant, motion, views, scales).norm(dim=-1) / unit[:, None]
@@ -211,20 +227,6 @@ def _sigma(invariant: Invariant, data: Matches, distance: Tensor, cut: Tensor) -
     middle = distance.masked_fill(~inliers, torch.nan).nanmedian(-1).values.nan_to_num(nan=0.0)
     rows = inliers.sum(-1) * invariant.codim
     return middle / quantile(0.5, invariant.codim) ** 0.5 * (rows / (rows - invariant.dof).clamp(min=1)).clamp(min=1.0).sqrt()
-
-
-def _pick(better: Tensor, new: Solution, old: Solution) -> Solution:
-    """The better one of two solutions of every problem."""
-    caller = old.matches.back(better)
-    motion = new.normalized_motion(), old.normalized_motion()
-    known = old.covariance is not None and new.covariance is not None
-    return replace(
-        new,
-        tensor=select(caller, new.tensor, old.tensor),
-        normalized=select(better, new.normalized, old.normalized),
-        refined=tuple(select(better, a, b) for a, b in zip(*motion, strict=True)),
-        covariance=select(caller, new.covariance, old.covariance) if known else new.covariance,  # type: ignore[arg-type]
-    )
 
 
 def _with_status(solution: Solution, evidence: Tensor, degenerate: Tensor, inliers: Tensor, sigma: Tensor) -> Solution:

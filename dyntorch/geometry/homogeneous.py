@@ -7,7 +7,9 @@ from itertools import combinations_with_replacement
 import torch
 from torch import Tensor
 
+from dyntorch.native import library
 from dyntorch.numerics.blocks import constant
+from dyntorch.numerics.function_transforms import is_plain
 
 
 def homogeneous(x: Tensor) -> Tensor:
@@ -49,10 +51,10 @@ def unit(matrix: Tensor) -> Tensor:
         raise ValueError(f"matrix must be (*batch, rows, columns), got {tuple(matrix.shape)}; unsqueeze a vector first")
     norm = torch.linalg.matrix_norm(matrix, keepdim=True)
     scaled = matrix / torch.where(norm > 0, norm, torch.ones_like(norm))
-    return scaled * _sign(scaled.detach())
+    return scaled * canonical_sign(scaled.detach())
 
 
-def _sign(matrix: Tensor) -> Tensor:
+def canonical_sign(matrix: Tensor) -> Tensor:
     """``(*batch, 1, 1)`` sign, +1 or -1, that makes a matrix of norm 1 canonical."""
     flat = matrix.flatten(-2)
     leading = flat.gather(-1, flat.abs().argmax(dim=-1, keepdim=True))
@@ -122,6 +124,8 @@ def cofactors(matrix: Tensor) -> Tensor:
 def null_vectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
     r"""Left and right null vector of a 3 x 3 matrix of rank two: :math:`y^T M = 0,\ M z = 0`. matrix ``(*batch, 3, 3)`` ->
     ``(*batch, 3)``."""
+    if matrix.dtype == torch.float64 and is_plain(matrix) and library.load()[0]:
+        return library.null_vectors(matrix)
     adjoint = cofactors(_rescale(matrix))
     power = adjoint @ _rescale(adjoint).mT
     for _ in range(SQUARINGS):

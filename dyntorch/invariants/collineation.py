@@ -12,6 +12,7 @@ from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import HyperplanesThrough, Point, Primitive
 from dyntorch.geometry.homogeneous import apply, unit
 from dyntorch.invariants.agreement import static_residual
+from dyntorch.numerics.least_squares import normalized_derivative
 
 SINGULAR = 1e-12
 """Determinant of a matrix of norm 1, in normalized coordinates, below which it maps space onto a part of it, to rounding."""
@@ -75,6 +76,12 @@ class Collineation(Invariant):
             [0.5, 0.5, 0.5, 0.5]
         """
         return unit_tensors(A, 2)
+
+    def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """By hand: the identity, at norm 1."""
+        flat = motion[0].flatten(1)
+        eye = torch.eye(flat.shape[-1], dtype=flat.dtype, device=flat.device)
+        return normalized_derivative(flat, eye.expand(len(flat), -1, -1))
 
     @staticmethod
     def decompose(tensor: Tensor) -> Tensor:

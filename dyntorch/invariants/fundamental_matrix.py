@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from dyntorch.core.invariant import Constraint, Frame, Invariant
 from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Point
 from dyntorch.geometry.homogeneous import null_vectors, skew, unit
+from dyntorch.numerics.least_squares import normalized_derivative
 
 
 class FundamentalMatrix(Invariant):
@@ -75,6 +77,15 @@ class FundamentalMatrix(Invariant):
         matrix = _canonical(tensor.double().flatten(-2)).unflatten(-1, (3, 3))
         collineation = 0.5**0.5 * e2[..., :, None] * e1[..., None, :] - skew(e2) @ matrix
         return unit(collineation).to(tensor.dtype), e2.to(tensor.dtype)
+
+    def compose_derivative(self, motion: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        r"""By hand: :math:`[e_2]_\times e_k e_l^T` by :math:`A_{kl}` and :math:`[e_m]_\times A` by coordinate m of the epipole."""
+        A, e2 = motion
+        eye = torch.eye(3, dtype=A.dtype, device=A.device)
+        cross = skew(e2)
+        by_matrix = torch.einsum("bik,lj->bklij", cross, eye).flatten(3).flatten(1, 2)
+        by_epipole = (skew(eye) @ A[:, None]).flatten(2)
+        return normalized_derivative((cross @ A).flatten(1), torch.cat([by_matrix, by_epipole], dim=1))
 
     def constrain(self, tensor: Tensor) -> Tensor:
         r"""The nearest matrix of rank two, :math:`F - F v v^T` with the singular vector v to the smallest singular value."""

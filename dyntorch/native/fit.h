@@ -45,10 +45,10 @@ static void gather(const Slot *s, const double *x, ptrdiff_t n, ptrdiff_t width,
   }
 }
 
-/* Upper triangles of the outer products of the slot's vectors of some matches, component first: out (packed, width); matches at
+/* Upper triangles of the outer products of the slot's vectors of some matches, component first: out[row out_stride + k]; matches at
    x[c stride + k]. */
 static void pack_slot(const Slot *s, const double *x, ptrdiff_t stride, int width, double scale_, const double *centre,
-                      const double *weights, double *out) {
+                      const double *weights, double *out, ptrdiff_t out_stride) {
   double moved[MAX_SPACE + 1][CHUNK + 8];
   int d = s->dim, row = 0;
   for (int c = 0; c < d; c++) for (int k = 0; k < width; k++) moved[c][k] = (x[c * stride + k] - centre[c]) * scale_;
@@ -58,15 +58,15 @@ static void pack_slot(const Slot *s, const double *x, ptrdiff_t stride, int widt
     for (int k = 0; k < width; k++) {
       double a = moved[0][k], b = moved[1][k];
       mono[0] = a * a; mono[1] = factor * a * b; mono[2] = factor * a; mono[3] = b * b; mono[4] = factor * b; mono[5] = 1;
-      for (int i = 0, r = 0; i < 6; i++) for (int j = i; j < 6; j++, r++) out[r * width + k] = mono[i] * mono[j];
+      for (int i = 0, r = 0; i < 6; i++) for (int j = i; j < 6; j++, r++) out[r * out_stride + k] = mono[i] * mono[j];
     }
     row = 21;
   } else if (s->kind == POINT) {
     for (int i = 0; i <= d; i++) for (int j = i; j <= d; j++, row++)
-      for (int k = 0; k < width; k++) out[row * width + k] = moved[i][k] * moved[j][k];
+      for (int k = 0; k < width; k++) out[row * out_stride + k] = moved[i][k] * moved[j][k];
   } else {  /* the rows of [I | -x] */
     for (int i = 0; i <= d; i++) for (int j = i; j <= d; j++, row++) {
-      double *entry = out + row * width;
+      double *entry = out + row * out_stride;
       if (j < d) for (int k = 0; k < width; k++) entry[k] = i == j;
       else if (i < d) for (int k = 0; k < width; k++) entry[k] = -moved[i][k];
       else for (int k = 0; k < width; k++) {
@@ -76,7 +76,7 @@ static void pack_slot(const Slot *s, const double *x, ptrdiff_t stride, int widt
       }
     }
   }
-  if (weights) for (int r = 0; r < row; r++) for (int k = 0; k < width; k++) out[r * width + k] *= weights[k];
+  if (weights) for (int r = 0; r < row; r++) for (int k = 0; k < width; k++) out[r * out_stride + k] *= weights[k];
 }
 
 /* Sums over the matches of the products of packed slots, added to moments[(i right + r) stride]. */
@@ -220,6 +220,12 @@ static void null_vectors(const double *M, double *left, double *right) {
   unit_length(left, 3);
   for (int i = 0; i < 3; i++) right[i] = adjoint[i] * left[0] + adjoint[3 + i] * left[1] + adjoint[6 + i] * left[2];
   unit_length(right, 3);
+}
+
+/* matrix (batch, 3, 3) -> left and right null vectors (batch, 3). */
+int EXPORT(null_vectors)(const double *matrix, ptrdiff_t batch, double *left, double *right) {
+  for (ptrdiff_t p = 0; p < batch; p++) null_vectors(matrix + 9 * p, left + 3 * p, right + 3 * p);
+  return 0;
 }
 
 /* Determinant by elimination with pivots; destroys the matrix. */
@@ -371,7 +377,7 @@ int EXPORT(fit_points)(int slots, const int *kinds, const int *dims, const doubl
         int width = padded - start < chunk ? (int)(padded - start) : chunk;
         for (int s = 0; s < slots; s++)
           pack_slot(slot + s, of_slot[s] + start, padded, width, scales[v][s], centres[v] + s * MAX_SPACE,
-                    s == 0 ? relative + start : NULL, packed[s]);
+                    s == 0 ? relative + start : NULL, packed[s], width);
         add_moments(packed, sizes, slots, width, moments + v, LANES, room);
       }
     }

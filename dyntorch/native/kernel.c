@@ -15,6 +15,8 @@
 #include "lanes.h"
 #include "null_space.h"
 #include "fit.h"
+#include "search.h"
+#include "refine.h"
 
 #if LANES == 2
 /* What is asked once per library: which instruction sets this processor has, and which source this was made from. */

@@ -26,11 +26,19 @@ _ARGUMENTS = {
     "robust_deviations": (*[_POINTER] * 4, _SIZE, _INT, _POINTER, _POINTER),
     "lower_residuals": (_INT, *[_POINTER] * 5, _SIZE, _SIZE, _INT, _POINTER, ctypes.c_float, _POINTER, _SIZE, _POINTER),
     "score_windows": (_POINTER, _POINTER, _INT, _POINTER, _SIZE, _SIZE, _INT, _INT, _POINTER, _INT, ctypes.c_float, _POINTER),
+    "null_vectors": (_POINTER, _SIZE, _POINTER, _POINTER),
+    "distances": (_INT, *[_POINTER] * 6, _SIZE, _SIZE, _POINTER),
+    "refine": (_INT, *[_POINTER] * 6, _SIZE, _SIZE, _INT, _INT, *[_POINTER] * 6),
+    "search": (_INT, *[_POINTER] * 8, _SIZE, _SIZE, *[_INT] * 5, *[_POINTER] * 7),
 }
 MAX_SLOTS, MAX_SPACE = 6, 8
 """Views, and dimensions of what is measured in them, that :func:`fit_points` takes."""
 POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS = range(3)
 """What a measured point puts into a slot, as the kernel numbers it."""
+MAX_SEARCHED_SLOTS, MAX_SEARCHED_SPACE = 3, 3
+"""The same of :func:`search`."""
+FROM_ALL, FROM_SAMPLES, AS_GIVEN = range(3)
+"""What :func:`search` starts from."""
 UNDECIDED, WEAK = 1, 2
 """Flags of a fit: left to torch, and with a second tensor that may fit as well within the noise."""
 
@@ -145,30 +153,111 @@ def fit_points(
         new(batch, dtype=_torch().int64),
         new(batch, dtype=_torch().uint8),
     )
-    strides = (_SIZE * (3 * count))(*(stride for x in views for stride in x.stride()))
-    numbers = ((_INT * count)(*kinds), (_INT * count)(*(x.shape[-1] for x in views)))
-    pointers = (_POINTER * count)(*(x.data_ptr() for x in views))
     places = (_POINTER * count)(*(x.data_ptr() for x in fits.transforms))
-    out = [part.data_ptr() for part in fits[1:]]
-    if constraint is None:
-        out[2] = out[3] = None
+    # of an empty tensor the address is null, which the kernel takes for "not wanted"
+    out = [part.data_ptr() or None for part in (fits.basis, fits.second, fits.normalized, fits.tensor)]
+    out += [part.data_ptr() for part in (fits.uncertainty, fits.status, fits.flags)]
     bounds = (ctypes.c_double * len(limits))(*limits)
-    given = (
-        count,
-        *numbers,
-        pointers,
-        strides,
-        weights.data_ptr(),
-        batch,
-        matches,
-        dim,
-        normalized,
-        rows,
-        minimal,
-        constraint or 0,
-    )
-    call("fit_points", *given, bounds, places, *out)
+    given = (weights.data_ptr(), batch, matches, dim, normalized, rows, minimal, constraint or 0)
+    call("fit_points", *_slots(kinds, views), *given, bounds, places, *out)
     return fits
+
+
+class Finds(NamedTuple):
+    """What a search found, one tensor per problem; see ``search.h`` and ``consensus.py``."""
+
+    basis: Tensor  # (b, D)
+    score: Tensor  # (b,)
+    evidence: Tensor  # (b,)
+    doubt: Tensor  # (b,) bool
+    agreeing: Tensor  # (b,)
+    inliers: Tensor  # (b, n) bool
+
+
+def search(
+    kinds: Sequence[int],
+    views: Sequence[Tensor],
+    weights: Tensor,
+    scales: Tensor,
+    limits: Tensor,
+    *,
+    minimal: int,
+    rules: Sequence[float],
+    starts: int = 1,
+    keep: int = 1,
+    iterations: int = 0,
+    seeds: Tensor | None = None,
+    given: Tensor | None = None,
+) -> Finds:
+    """Tensors that most matches agree with: views ``(b, n, d)`` normalized, weights ``(b, n)`` of at most 1, scales ``(b, views)``,
+    limits ``(b,)`` of squared distances; from all matches, with seeds ``(b,)`` from so many minimal samples, or as
+    given ``(b, D)``."""
+    weights, scales, limits = weights.contiguous(), scales.contiguous(), limits.contiguous()
+    seeds = None if seeds is None else seeds.contiguous()
+    (batch, matches), new = weights.shape, weights.new_empty
+    width = math.prod(x.shape[-1] + 1 for x in views)
+    basis = new(batch, width) if given is None else given.clone(memory_format=_torch().contiguous_format)
+    flags = new(batch, dtype=_torch().bool), new(batch, matches, dtype=_torch().bool)
+    finds = Finds(basis, new(batch), new(batch), flags[0], new(batch), flags[1])
+    mode = AS_GIVEN if given is not None else FROM_ALL if seeds is None else FROM_SAMPLES
+    data = (weights.data_ptr(), scales.data_ptr(), limits.data_ptr(), None if seeds is None else seeds.data_ptr())
+    numbers = (batch, matches, mode, starts, keep, iterations, minimal, (ctypes.c_double * len(rules))(*rules))
+    call("search", *_slots(kinds, views), *data, *numbers, *(part.data_ptr() for part in finds))
+    return finds
+
+
+def null_vectors(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Left and right null vectors ``(b, 3)`` of matrices ``(b, 3, 3)`` float64 of rank two."""
+    matrix = matrix.contiguous()
+    left, right = matrix.new_empty(matrix.shape[:-1]), matrix.new_empty(matrix.shape[:-1])
+    call("null_vectors", matrix.data_ptr(), matrix.numel() // 9, left.data_ptr(), right.data_ptr())
+    return left, right
+
+
+def distances(kinds: Sequence[int], views: Sequence[Tensor], scales: Tensor, tensors: Tensor) -> Tensor:
+    """Sampson distances ``(b, n)`` from tensors ``(b, D)``: views and scales as :func:`search` takes them."""
+    scales, tensors = scales.contiguous(), tensors.contiguous()
+    out = tensors.new_empty(views[0].shape[:2])
+    call("distances", *_slots(kinds, views), scales.data_ptr(), tensors.data_ptr(), *out.shape, out.data_ptr())
+    return out
+
+
+def refine(
+    kinds: Sequence[int],
+    views: Sequence[Tensor],
+    weights: Tensor,
+    scales: Tensor,
+    motion: Tensor,
+    *,
+    constraint: int,
+    iterations: int,
+    rules: Sequence[float],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Motions ``(b, p)`` of least squared Sampson distances, from given ones; data as in :func:`search` -> motion, cost
+    ``(b,)``, gradient ``(b, p)``, Gauss-Newton matrix ``(b, p, p)``, steps ``(b,)``."""
+    weights, scales = weights.contiguous(), scales.contiguous()
+    motion = motion.clone(memory_format=_torch().contiguous_format)
+    (batch, size), new = motion.shape, motion.new_empty
+    found = (motion, new(batch), new(batch, size), new(batch, size, size), new(batch, dtype=_torch().int64))
+    data = (
+        weights.data_ptr(),
+        scales.data_ptr(),
+        batch,
+        weights.shape[1],
+        constraint,
+        iterations,
+        (ctypes.c_double * len(rules))(*rules),
+    )
+    call("refine", *_slots(kinds, views), *data, *(part.data_ptr() for part in found))
+    return found
+
+
+def _slots(kinds: Sequence[int], views: Sequence[Tensor]) -> tuple[Any, ...]:
+    """Slots as the functions of the kernel take them: how many, kinds, dimensions, places and strides in memory."""
+    count = len(views)
+    sizes = (_INT * count)(*(x.shape[-1] for x in views))
+    places = (_POINTER * count)(*(x.data_ptr() for x in views))
+    return count, (_INT * count)(*kinds), sizes, places, (_SIZE * (3 * count))(*(stride for x in views for stride in x.stride()))
 
 
 def call(name: str, *arguments: Any) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from functools import _lru_cache_wrapper, lru_cache, wraps
+from functools import _lru_cache_wrapper, cached_property, lru_cache, partial, wraps
 from threading import Barrier, local
 from typing import Any, ParamSpec, TypeVar
 
@@ -177,6 +177,11 @@ def select(mask: Tensor, new: Tensor, old: Tensor | float) -> Tensor:
     return torch.where(mask[(..., *[None] * (new.ndim - mask.ndim))], new, old)
 
 
+def select_problems(mask: Tensor, new: Record, old: Record) -> Record:
+    """The record of the new problems where the mask ``(b,)`` is true, of the old ones elsewhere."""
+    return rebuilt(new, map(partial(select, mask), tensors_of(new), tensors_of(old)))
+
+
 def _concatenate(results: list[Record]) -> Record:
     columns = zip(*(tuple(tensors_of(result)) for result in results), strict=True)
     return rebuilt(results[0], iter([torch.cat(column) for column in columns]))
@@ -263,15 +268,16 @@ class Draws:
 
     def __init__(self, count: int, generator: torch.Generator | None, device: torch.device) -> None:
         home, self.device = device if generator is None else generator.device, device
-        seeds = torch.randint(2**62, (count,), generator=generator, device=home).tolist()
-        self.streams = [torch.Generator(device=home).manual_seed(seed) for seed in seeds]
+        self.home, self.seeds = home, torch.randint(2**62, (count,), generator=generator, device=home)
+
+    @cached_property
+    def streams(self) -> list[torch.Generator]:
+        """One generator per problem."""
+        return [torch.Generator(device=self.home).manual_seed(seed) for seed in self.seeds.tolist()]
 
     def __call__(self, where: Tensor, *shape: int) -> Tensor:
         """The next numbers in [0, 1) of some problems, ``(problems, *shape)`` float64."""
-        drawn = [
-            torch.rand(*shape, generator=self.streams[i], dtype=torch.float64, device=self.streams[i].device)
-            for i in where.tolist()
-        ]
+        drawn = [torch.rand(*shape, generator=self.streams[i], dtype=torch.float64, device=self.home) for i in where.tolist()]
         return torch.stack(drawn).to(self.device) if drawn else torch.zeros(0, *shape, dtype=torch.float64, device=self.device)
 
 

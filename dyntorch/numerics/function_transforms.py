@@ -31,6 +31,11 @@ def needs_gradient(x: Tensor) -> bool:
     return (torch.is_grad_enabled() and x.requires_grad) or forward_ad.unpack_dual(x).tangent is not None
 
 
+def is_plain(*data: Tensor) -> bool:
+    """Whether tensors are numbers in the memory of this machine and nobody wants a derivative: what compiled code may read."""
+    return not is_transformed(*data) and not any(x.device.type != "cpu" or needs_gradient(x) for x in data)
+
+
 def mapped_over(value: Tensor) -> bool:
     """Whether ``torch.func.vmap`` maps over a tensor, be it inside of other transformations."""
     functorch = torch._C._functorch

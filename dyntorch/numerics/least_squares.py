@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd import grad
 
-from dyntorch.numerics.blocks import each, rebuilt, replace_problems, select, tensors_of
+from dyntorch.numerics.blocks import each, replace_problems, select, select_problems
 from dyntorch.numerics.nullspace import spectrum
 
 SHORT = 1e-13  # change of parameters of norm 1 that is rounding
@@ -48,6 +47,11 @@ class LeastSquaresOptions:
     """Gauss-Newton steps of all problems at the end.  The last digits of a step depend on how many problems take it, and a flat
     minimum makes more of them than digits; these steps take them back."""
 
+    def rules(self) -> tuple[float, ...]:
+        """In the order in which the kernel takes them."""
+        steps = self.damping, self.increase, DAMPING_DECREASE, self.least_damping, self.stuck_damping
+        return *steps, self.tolerance or 0.0, SHORT
+
 
 class Iterate(NamedTuple):
     """Where a block of problems is: parameters ``(b, ...)`` each, cost ``(b,)``, and what else is known there and the next step
@@ -59,7 +63,7 @@ class Iterate(NamedTuple):
 
     def where(self, chosen: Tensor, other: Iterate) -> Iterate:
         """This one where ``chosen (b,)``, the other elsewhere."""
-        return rebuilt(self, map(partial(select, chosen), tensors_of(self), tensors_of(other)))
+        return select_problems(chosen, self, other)
 
 
 class Minimum(NamedTuple):

@@ -15,9 +15,12 @@ import torch
 from torch import Tensor
 
 import dyntorch as dyn
+from dyntorch.core.normalize import denormalization_derivative, denormalize_motion
+from dyntorch.core.primitives import HyperplanesThrough, Point
 from dyntorch.core.solution import Solution
 from dyntorch.invariants.segmentation_matrix import RelationPair
 from dyntorch.native import library
+from dyntorch.numerics.least_squares import flatten_parts, jacobian, parts_of
 from tests.battery.cases import Case, carried, moved_views
 from tests.battery.references import apart, matrices, noisy, pulled_back, rank, spans
 
@@ -252,6 +255,38 @@ def kernel_and_torch_agree(case: Case) -> None:
     torch.testing.assert_close(
         first.uncertainty[sound], second.uncertainty[sound], rtol=1e-3, atol=1e-5
     )  # of exact matches it is rounding
+
+
+@prop(
+    lambda case: case.invariant.nullity == 1 and all(isinstance(p, (Point, HyperplanesThrough)) for p in case.invariant.primitives)
+)
+def robust_fit_is_the_same_with_and_without_the_kernel(case: Case) -> None:
+    """Not in the draws of samples, but in what is found: the statuses, and a refined tensor to the noise's own share."""
+    views = tuple(x.clone() for x in example(case, 2 * many(case), batch=(2,)))
+    views[0][:, :3] = views[0][:, :3].flip(1) + 0.3  # a few matches that are wrong
+    cut = 4 * case.noise * case.invariant.codim**0.5
+    found = []
+    for load in (library.load, lambda: ({}, "torch")):
+        with patch.object(library, "load", load):
+            found.append(dyn.robust_fit(case.invariant, *views, threshold=cut, generator=torch.Generator().manual_seed(0)))
+    assert found[0].status.tolist() == found[1].status.tolist()
+    sound = found[0].status == dyn.Status.OK
+    assert apart(case, found[0].tensor[sound], found[1].tensor[sound]) < 1e-4
+
+
+@prop()
+def changes_of_coordinates_of_motions_have_their_derivative(case: Case) -> None:
+    """By hand, against automatic differentiation."""
+    solution = ok(dyn.fit(case.invariant, *example(case)))
+    frames, motion = solution.frames(), solution.normalized_motion()
+    shapes = [part.shape[1:] for part in motion]
+
+    def back(theta: Tensor) -> Tensor:
+        parts = denormalize_motion(case.invariant, parts_of(theta, shapes), frames)
+        return torch.cat([part.flatten(theta.ndim - 1) for part in parts], dim=-1)
+
+    expected = jacobian(back, flatten_parts(motion))[1]
+    torch.testing.assert_close(denormalization_derivative(case.invariant, motion, frames), expected, rtol=1e-9, atol=1e-9)
 
 
 @prop()

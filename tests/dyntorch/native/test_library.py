@@ -5,11 +5,18 @@ from pathlib import Path
 import pytest
 import torch
 
+import dyntorch as dyn
+from dyntorch import scenes
+from dyntorch.core.consensus import Search
+from dyntorch.core.fit import fit_matches
+from dyntorch.core.matches import matches
+from dyntorch.core.refine import descend, move_to
+from dyntorch.core.robust import distances
 from dyntorch.native import build, library
 from dyntorch.numerics import native
 from dyntorch.numerics.eigenspaces import RESOLVED
 from dyntorch.numerics.nullspace import gram_null_space, null_space
-from tests.draws import random
+from tests.draws import random, seeded
 
 compiled = pytest.mark.skipif(not library.LIBRARY.exists(), reason="no C compiler when this was installed")
 
@@ -92,6 +99,57 @@ def test_both_paths_say_the_same_of_every_matrix(monkeypatch):
     torch.testing.assert_close(space.competing[sound], other.competing[sound])
     keep = torch.arange(40) != 3
     torch.testing.assert_close(basis[keep].mT @ basis[keep], reference[keep].mT @ reference[keep], rtol=0, atol=1e-11)
+
+
+def searched(invariant, n=60, batch=3):
+    """Noisy matches of order 1 with wrong ones among them, in the normalized coordinates of a search."""
+    if isinstance(invariant, dyn.FundamentalMatrix):
+        views = tuple(x / 300 - 1 for x in scenes.two_view(n=n, batch=batch, sigma=0.5, outliers=0.3, generator=seeded(0)).views)
+    else:
+        x = random(batch, n, invariant.n)
+        change = torch.eye(invariant.n + 1, dtype=torch.float64) + 0.1 * random(batch, invariant.n + 1, invariant.n + 1, seed=1)
+        views = invariant.transfer(change, x) + 1e-3 * random(batch, n, invariant.n, seed=2), x
+        views[0][:, ::4] += 0.5 * random(batch, n, invariant.n, seed=3)[:, ::4]
+    return Search(invariant, matches(invariant, views), seeded(0))
+
+
+@compiled
+@pytest.mark.parametrize("invariant", [dyn.FundamentalMatrix(), dyn.Collineation(2), dyn.Collineation(3)], ids=repr)
+def test_distances_evidence_and_descent_are_those_of_torch(invariant, monkeypatch):
+    cut = torch.full((3,), 0.02, dtype=torch.float64)
+    answers = []
+
+    def answer():
+        search = searched(invariant)
+        solution = fit_matches(invariant, search.data)
+        motion = solution.normalized_motion()
+        start, end = (descend(solution, search.data, motion, steps) for steps in (0, 30))
+        found = move_to(solution, motion, end).normalized.flatten(1)
+        # what the motion leaves open differs by rounding, so of where the descent ends only the tensor and its cost are the same
+        own = distances(solution), search.evidence(solution.normalized, cut), start.cost, *start.terms, end.cost
+        answers.append((*own, found[:, :, None] * found[:, None]))
+        return bool(search.kinds)
+
+    assert all(answer() for _ in levels(monkeypatch))
+    monkeypatch.setattr(library, "load", lambda: ({}, "torch"))
+    assert not answer()
+    for found in answers[:-1]:
+        for part, other in zip(found, answers[-1], strict=True):
+            torch.testing.assert_close(part, other, rtol=1e-6, atol=1e-6 * float(other.abs().max()))
+
+
+@compiled
+def test_samples_are_distinct_matches_with_weight_and_annealing_finds_their_tensor():
+    """Among sixty percent of wrong matches a search from samples ends at the right tensor, which one from all does not reach."""
+    search = searched(dyn.Collineation(2), n=80, batch=20)
+    search.weights[:, :2] = 0
+    seeds, limit = torch.arange(20), torch.full((20,), 1e-2, dtype=torch.float64)
+    found = search._by_kernel(search.everyone, limit, seeds, starts=64, keep=2, iterations=10)
+    again = search._by_kernel(search.everyone, limit, seeds, starts=64, keep=2, iterations=10)
+    assert torch.equal(found.basis, again.basis)
+    right = torch.ones(80, dtype=torch.bool)
+    right[::4] = right[:2] = False
+    assert found.inliers[:, right].double().mean() > 0.98 and found.inliers[:, ::4].double().mean() < 0.1
 
 
 def test_without_a_kernel_one_line_says_why(monkeypatch, tmp_path):

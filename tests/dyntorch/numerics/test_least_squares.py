@@ -24,6 +24,7 @@ from dyntorch.numerics.least_squares import (
     minimize,
     normalized_derivative,
 )
+from tests.draws import random
 
 
 def problem(b=3, p=5):
@@ -156,14 +157,18 @@ def test_the_same_as_dual_numbers(name):
     torch.testing.assert_close(along, (tangent[:, None] @ slope)[:, 0], atol=1e-11 * float(slope.abs().max()), rtol=1e-9)
 
 
-def test_the_homography_tensor_by_hand_is_that_of_the_automatic_derivative():
-    motion = tuple(THETA[:, :18].unflatten(-1, (2, 3, 3)).unbind(1))
-    by_hand, automatic = (
-        dyn.HomographyTensor().compose_derivative(motion),
-        Invariant.compose_derivative(dyn.HomographyTensor(), motion),
-    )
+@pytest.mark.parametrize(
+    "invariant", [dyn.HomographyTensor(), dyn.FundamentalMatrix(), dyn.Collineation(2), dyn.Collineation(3)], ids=repr
+)
+def test_tensors_by_hand_have_the_automatic_derivative(invariant):
+    sizes = [tuple(invariant.primitives[v].dim + 1 for v in (f.target, f.source) if v is not None) for f in invariant.motion]
+    motion = tuple(random(3, *size, seed=k) for k, size in enumerate(sizes))
+    by_hand, automatic = invariant.compose_derivative(motion), Invariant.compose_derivative(invariant, motion)
     for found, expected in zip(by_hand, automatic, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
+
+
+def test_a_tensor_of_nothing_has_a_finite_derivative():
     nothing = dyn.HomographyTensor().compose_derivative((torch.zeros(1, 3, 3), torch.zeros(1, 3, 3)))
     assert all(part.isfinite().all() for part in nothing)
     value, slope = normalized_derivative(torch.zeros(2, 3), torch.ones(2, 4, 3))  # a length of zero
