@@ -199,7 +199,7 @@ DEVICE_BLOCK = 2**21  # the same elsewhere, where every call costs a launch
 VALUE_BLOCK = 2**21  # the same where values are compared, not what is described of them: bounds memory
 ROW_BLOCK = 128  # queries among them: enough for a fast matrix product
 QUERY_BLOCK = 256  # queries that one worker describes at once: bounds memory
-MIN_TO_PROJECT = 1000  # exemplars' images from which principal directions pay: learning them takes as long as 50 queries
+MIN_TO_PROJECT = 300  # windows from which principal directions are learned: fewer may not hold what others show
 # of the energy of exemplars' planes, by the principal directions of a channel: residuals of motion are ten times those of poses.
 # UTKinect stays at .9505 so, Florence3D turns .8762 to .8767, streams .8603 to .8608; .01 in all costs UTKinect .0015
 MAX_LEFT_OUT = {"clip": 0.003, "frame": 0.003, "motion": 0.03}

@@ -46,6 +46,7 @@ NUM_NEIGHBOURS = 2  # exemplars per class that are averaged (1: -1 %)
 MIN_CLASSES_TO_COMPARE = 4  # from which evidence compares the best with the others: fewer are nothing to stand out from
 PROFILE_FLOOR = 0.3  # added to the variances of profiles, in parts of them (experiments.recognition.open_set)
 PROFILE_WEIGHT = 2.5  # of an unusual profile in evidence (experiments.recognition.open_set)
+MIN_EXEMPLARS_TO_PROJECT = 500  # fewer are compared in less time than it takes to learn their principal directions
 MAX_DIRECTION_WINDOWS = 2000  # that principal directions are learned from: with 1000 they leave out .012 of others, with 4000 .0101
 PENALTY = 10.0  # C of the support vector machine; 2 and 30 differ by less than 1 % on three sets
 NEAREST_WEIGHT = 1.5  # of scorer A against B, standardized over classes; 1 .. 2 differ by 1 %
@@ -245,7 +246,8 @@ class ShapeModel:
                 return few
             return stack([few, mirror_some(few, self.symmetry, torch.ones(len(few), dtype=torch.bool))])
 
-        return self.cache.get(("planes", name), lambda: planes_of(self.metric, some))
+        many = len(self.exemplars) >= MIN_EXEMPLARS_TO_PROJECT
+        return self.cache.get(("planes", name), lambda: planes_of(self.metric, some if many else None))
 
     def _residuals(self, query: Windows, crops: int | None, chosen: Tensor | None) -> Tensor:
         weights = self.joint_weights
