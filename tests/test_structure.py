@@ -17,7 +17,7 @@ MAX_FIELDS = 12
 """Fields of the options of one verb."""
 BOUNDS = {
     "files": 347,
-    "lines": 93_775,
+    "lines": 93_785,
     "code lines": 58_095,
     "docstring lines": 14_335,
     "option fields": 111,
@@ -27,7 +27,7 @@ BOUNDS = {
     "circles of imports": 0,
     "circles of imports, those for types too": 0,
     "lines of experiments": 19_000,
-    "lines of tests": 54_190,
+    "lines of tests": 54_202,
 }
 """What each figure may be at most."""
 

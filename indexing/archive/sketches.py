@@ -76,7 +76,10 @@ class Candidates:
 
     def top(self, count: int) -> Candidates:
         """The best ones; equal ones in the order in which they lie."""
-        return self[np.lexsort((self.probe, self.row, self.track, -self.score))[:count]]
+        some = self
+        if len(self) > count > 0:  # what is certainly not among them is not sorted
+            some = self[np.flatnonzero(self.score >= np.partition(self.score, -count)[-count])]
+        return some[np.lexsort((some.probe, some.row, some.track, -some.score))[:count]]
 
 
 def orthonormal(codes: NDArray[np.float32]) -> NDArray[np.float32] | None:

@@ -154,3 +154,13 @@ def test_a_track_as_long_as_the_window_is_found_wherever_it_lies(tmp_path):
         source = concatenate_clips([Clip(stored.positions(1), times=np.arange(len(tracks[1])) / stored.rate)])
         found = scan(stored, [probe_of(source, 0, layout, stored.rate, 1.0)], 10)
         assert found.track[0] == 1 and found.score[0] > 0.999
+
+
+def test_the_best_candidates_are_those_of_sorting_all():
+    rng = np.random.default_rng(0)
+    found = Candidates(rng.integers(0, 9, 60).astype(np.float32), *rng.integers(0, 4, (3, 60)))
+    order = np.lexsort((found.probe, found.row, found.track, -found.score))
+    for count in (0, 1, 13, 60, 70):
+        best = found.top(count)
+        for name in ("score", "track", "row", "probe"):
+            np.testing.assert_array_equal(getattr(best, name), getattr(found, name)[order[:count]])
