@@ -231,19 +231,19 @@ def least_ratio(inner: Tensor, form: Tensor, present: Tensor) -> tuple[Tensor, T
     factor, failed = torch.linalg.cholesky_ex(inner)
     bad = ~present | (failed > 0)
     factor = torch.where(bad[..., None, None], torch.eye(inner.shape[-1], dtype=inner.dtype, device=inner.device), factor)
-    f = _start(form, factor)
+    columns = torch.cholesky_solve(form, factor)
+    f = _longest(columns)
     for _ in range(ITERATIONS):
-        f = torch.cholesky_solve(form @ f, factor)
+        f = columns @ f
         f = f / f.norm(dim=-2, keepdim=True)
     above, below = (f * (inner @ f)).sum((-2, -1)), (f * (form @ f)).sum((-2, -1))
     return torch.where(bad | (below <= 0), torch.inf, above / torch.where(below > 0, below, 1.0)), f[..., 0]
 
 
-def _start(form: Tensor, factor: Tensor) -> Tensor:
+def _longest(columns: Tensor) -> Tensor:
     """``(*batch, D, 1)``: of the columns of inner^-1 form, the longest: rich in the wanted eigenvector."""
-    columns = torch.cholesky_solve(form, factor)
     best = columns.square().sum(-2).argmax(-1)
-    start = columns.gather(-1, best[..., None, None].expand(*best.shape, form.shape[-1], 1))
+    start = columns.gather(-1, best[..., None, None].expand(*best.shape, columns.shape[-1], 1))
     return start / start.norm(dim=-2, keepdim=True)
 
 

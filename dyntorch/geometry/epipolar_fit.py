@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from math import pi
 
@@ -19,6 +20,7 @@ CAP = 2.25
 """Squared distances count up to this multiple of the squared scale."""
 BLOCK = 1 << 17
 """Matches times fits per block: the weights stay in the cache."""
+FEW = 4  # fits of a pair of views up to which their Jacobians take less time than products that all fits share
 RIDGE = 1e-10  # of the largest diagonal entry: few matches, or those of a plane, leave directions open
 DESCENT = LeastSquaresOptions(increase=10.0, least_damping=1e-8, tolerance=None)
 LEAST = 1e-100  # scale, whose square still has an inverse
@@ -178,16 +180,19 @@ class Products:
     def __init__(self, data: PairMonomials) -> None:
         """Of the matches of ``data``."""
         self.data = data
-        first, second, third, self.place = _pairs(data.bilinear.device)
+        self.polar = polar(data.bilinear.dtype, data.bilinear.device).flatten(1)
+
+    @cached_property
+    def tables(self) -> list[Tensor]:
+        """Bilinear, mixed and quadratic ones, ``(n, k)`` each."""
         # the derivative of the constraint counts positive, that of its gradient negative
-        all_ = torch.cat([data.bilinear, -data.quadratic], dim=-2)
-        self.polar = polar(all_.dtype, all_.device).flatten(1)
-        self.tables = [(all_[..., i, :] * all_[..., j, :]).mT for i, j in (first, second, third)]
+        all_ = torch.cat([self.data.bilinear, -self.data.quadratic], dim=-2)
+        return [(all_[..., i, :] * all_[..., j, :]).mT for i, j in _pairs(all_.device)[:3]]
 
     def gram(self, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
         """Moments ``(*batch, 21, 21)`` of the monomials: bilinear with weights a, quadratic with c, b for one of each."""
         sums = torch.cat([weight @ table for weight, table in zip((a, b, c), self.tables, strict=True)], dim=-1)
-        return sums[..., self.place].unflatten(-1, (21, 21))
+        return sums[..., _pairs(sums.device)[3]].unflatten(-1, (21, 21))
 
 
 @constant
@@ -221,12 +226,24 @@ def _normal_equations(
     r"""Gauss-Newton matrix ``(b, 7, 7)`` and gradient ``(b, 7)`` of the weighted distances :math:`r = e / g`."""
     ratio = value / square
     a = (weights * (1 - (value * ratio).mul_(inverse / CAP)).clamp_(min=0)).div_(square)
-    b = a * ratio
     tangents = frames.tangents()
-    gradients = (f @ tables.polar).unflatten(-1, (9, 12))
-    outer = torch.cat([tangents, tangents @ gradients], dim=-1)  # (b, 7, 21)
+    gradients = tangents @ (f @ tables.polar).unflatten(-1, (9, 12))
+    if weights.numel() <= FEW * tables.data.bilinear[..., 0, :].numel():
+        slope, bend = (_by_pair(part, monomials, lead) for part, monomials in
+                       ((tangents, tables.data.bilinear), (gradients, tables.data.quadratic)))  # fmt: skip
+        J = slope - bend * ratio[:, None]  # (b, 7, n)
+        weighted = J * a[:, None]
+        return weighted @ J.mT, (weighted @ value[..., None])[..., 0]
+    b = a * ratio
+    outer = torch.cat([tangents, gradients], dim=-1)  # (b, 7, 21)
     product = outer @ tables.gram(*(x.view(*lead, x.shape[-1]) for x in (a, b, b * ratio))).view(-1, 21, 21)
     return product @ outer.mT, (product[..., :9] @ f[..., None])[..., 0]
+
+
+def _by_pair(rows: Tensor, monomials: Tensor, lead: tuple[int, ...]) -> Tensor:
+    """Products of ``(b, 7, k)`` with the monomials ``(k, n)`` of the pair of views of each."""
+    shaped = rows.view(*lead, *rows.shape[-2:])
+    return (shaped.flatten(-3, -2) @ monomials).view(*rows.shape[:2], monomials.shape[-1])
 
 
 def fit_fundamental(

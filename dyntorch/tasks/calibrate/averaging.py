@@ -83,20 +83,23 @@ def _spread(F: Tensor, x1: Tensor, x2: Tensor) -> float:
     return max(1.4826 * float(sampson_squared(F, x1, x2).sqrt().median()), 1e-9)
 
 
-def relative_rotations(pair: PairGeometry, first: float, second: float) -> tuple[Tensor, Tensor]:
-    """The two rotations ``(2, 3, 3)`` from camera i to camera j, and the share ``(2,)`` of matches before both cameras."""
+def relative_rotations(pair: PairGeometry, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """The two rotations ``(s, 2, 3, 3)`` from camera i to camera j for focal lengths ``(s,)`` of both, and the share ``(s, 2)`` of
+    matches before both cameras."""
     f1, f2 = first / pair.unit, second / pair.unit
-    E = torch.tensor([f2, f2, 1.0], dtype=torch.float64)[:, None] * pair.F * torch.tensor([f1, f1, 1.0], dtype=torch.float64)
-    U, _, Vt = torch.linalg.svd(E)
-    U, Vt = U * torch.linalg.det(U), Vt * torch.linalg.det(Vt)
+    one, other = (torch.stack([f, f, torch.ones_like(f)], dim=-1) for f in (f1, f2))
+    U, _, Vt = torch.linalg.svd(other[:, :, None] * pair.F * one[:, None])
+    U, Vt = U * torch.linalg.det(U)[:, None, None], Vt * torch.linalg.det(Vt)[:, None, None]
     W = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    turns = torch.stack([U @ W @ Vt, U @ W.mT @ Vt])
-    one = homogeneous(pair.x1 / f1) @ turns.mT  # (2, m, 3): rays of i in the frame of j
-    two, base = homogeneous(pair.x2 / f2).expand_as(one), U[:, 2].expand_as(one)
+    turns = torch.stack([U @ W @ Vt, U @ W.mT @ Vt], dim=1)
+    # (s, 2, 3, m): rays of i in the frame of j
+    here = turns @ homogeneous(pair.x1 / f1[:, None, None])[:, None].mT
+    there = homogeneous(pair.x2 / f2[:, None, None])[:, None].mT
     # depths of z_2 d_2 = z_1 R d_1 + b by cross products: their signs are enough
-    across = torch.linalg.cross(one, two)
-    first_sign = (torch.linalg.cross(two, base) * across).sum(-1)
-    second_sign = (torch.linalg.cross(one, base) * across).sum(-1)
+    across = torch.linalg.cross(here, there.expand_as(here), dim=-2)
+    base = U[:, None, :, 2:].expand_as(here)
+    first_sign = (torch.linalg.cross(there.expand_as(here), base, dim=-2) * across).sum(-2)
+    second_sign = (torch.linalg.cross(here, base, dim=-2) * across).sum(-2)
     before = ((first_sign > 0) & (second_sign > 0)).double() @ pair.weights
     behind = ((first_sign < 0) & (second_sign < 0)).double() @ pair.weights
     return turns, torch.maximum(before, behind) / pair.weights.sum().clamp(min=1.0)
@@ -159,16 +162,19 @@ def position_cameras(R: Tensor, rays: Tensor, weights: Tensor) -> tuple[Tensor, 
 
 
 def first_cameras(views: RigViews, graph: Graph, clocks: Tensor, focals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotations ``(c, 3, 3)``, centres ``(c, 3)`` and points ``(T, n, 3)`` for focal lengths ``(c,)`` px."""
-    turns, weights = {}, {}
-    for (i, j), pair in graph.items():
-        both, share = relative_rotations(pair, float(focals[i]), float(focals[j]))
-        best = int(share.argmax())
-        turns[i, j], weights[i, j] = both[best], float(pair.weights.sum() * share[best])
-    R = average_rotations(turns, weights, len(focals))
-    rays, known = viewing_rays(views, clocks, focals)
-    centers, points = position_cameras(R, rays, known)
-    return R, centers, points.view(len(views.times), -1, 3)
+    """Rotations ``(s, c, 3, 3)``, centres ``(s, c, 3)`` and points ``(s, T, n, 3)`` for focal lengths ``(s, c)`` px."""
+    found = {(i, j): relative_rotations(pair, focals[:, i], focals[:, j]) for (i, j), pair in graph.items()}
+    starts = []
+    for start, own in enumerate(focals):
+        turns, weights = {}, {}
+        for place, (both, share) in found.items():
+            best = int(share[start].argmax())
+            turns[place], weights[place] = both[start, best], float(graph[place].weights.sum() * share[start, best])
+        R = average_rotations(turns, weights, len(own))
+        centers, points = position_cameras(R, *viewing_rays(views, clocks, own))
+        starts.append((R, centers, points.view(len(views.times), -1, 3)))
+    R, centers, points = (torch.stack(part) for part in zip(*starts, strict=True))
+    return R, centers, points
 
 
 def viewing_rays(views: RigViews, clocks: Tensor, focals: Tensor) -> tuple[Tensor, Tensor]:

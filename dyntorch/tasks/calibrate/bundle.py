@@ -20,12 +20,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dyntorch.geometry.homogeneous import cofactors, skew
+from dyntorch.geometry.homogeneous import skew
 from dyntorch.geometry.rigid import rotation_exponential
 from dyntorch.numerics.least_squares import Iterate, LeastSquares, LeastSquaresOptions, Tensors, damped_step, minimize
 from dyntorch.tasks.calibrate.averaging import Graph, first_cameras, nearest_points, viewing_rays
@@ -89,30 +90,77 @@ class Priors:
 
 @dataclass(frozen=True)
 class RigNormal:
-    """Normal equations of G points, and of P = 11 c parameters of cameras."""
+    """Normal equations of G points, and of P = 11 c parameters of cameras; those that no column of the basis changes are 0.  Points
+    come last: what is computed for all of them are products of whole planes."""
 
     matrix: Tensor
-    """``(b, G, 3, 3)``."""
+    """``(b, 3, 3, G)``."""
+    slope: Tensor
+    """``(b, 3, G)``, the gradient by the points."""
     mixed: Tensor
-    """``(b, G, 3, P + 1)``; the last column is the gradient by the points."""
+    """``(b, 3, p, G)``, of the p parameters that vary."""
+    place: Tensor
+    """``(p,)``: which of the P these are."""
     others: Tensor
     """``(b, P, P)``."""
     gradient: Tensor
     """``(b, P)``."""
 
-    def eliminate_points(self, damping: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Solutions ``(b, G, 3, P + 1)`` of all columns by the points; matrix and gradient that are left of the cameras."""
-        diagonal = self.matrix.diagonal(dim1=-2, dim2=-1)
-        held = self.matrix.clone()
+    def eliminate_points(self, damping: Tensor) -> tuple[PointFactor, Tensor, Tensor]:
+        """What moves the points once the cameras have moved; matrix and gradient that are left of the cameras."""
+        diagonal = self.matrix.diagonal(dim1=1, dim2=2)  # (b, G, 3)
         # points that nobody sees have no equation: they stay
         floor = damping[:, None, None] * diagonal + torch.where(diagonal > 0, 0.0, 1.0)
-        held.diagonal(dim1=-2, dim2=-1).add_(floor + 1e-12 * diagonal.amax(-1, keepdim=True))
-        # in closed form: LAPACK takes one small matrix after the other
-        inverse = cofactors(held) / torch.linalg.det(held).clamp(min=torch.finfo(held.dtype).tiny)[..., None, None]
-        solved = inverse @ self.mixed
-        solved = torch.where(solved.isfinite(), solved, 0.0)
-        product = self.mixed[..., :-1].flatten(1, 2).mT @ solved.flatten(1, 2)
-        return solved, self.others - product[..., :-1], self.gradient - product[..., -1]
+        factor = PointFactor.of(self, (diagonal + floor + 1e-12 * diagonal.amax(-1, keepdim=True)).movedim(-1, 0))
+        others, gradient = self.others.clone(), self.gradient.clone()
+        others[:, self.place[:, None], self.place] -= (factor.mixed @ factor.mixed.mT).sum(1)
+        gradient[:, self.place] -= (factor.mixed @ factor.slope[..., None]).sum(1)[..., 0]
+        return factor, others, gradient
+
+
+@dataclass(frozen=True)
+class PointFactor:
+    """Cholesky factors L of the points' matrices, and what else is :math:`L^{-1}` times that of :class:`RigNormal`."""
+
+    inverse: tuple[Tensor, Tensor, Tensor]
+    """``(b, G)``: one over the diagonal, 0 where there is none."""
+    below: tuple[Tensor, Tensor, Tensor]
+    """``(b, G)``: L_10, L_20, L_21."""
+    mixed: Tensor
+    slope: Tensor
+
+    @staticmethod
+    def of(normal: RigNormal, diagonal: Tensor) -> PointFactor:
+        """With the damped diagonal ``(3, b, G)`` of the matrices."""
+
+        def one_over(square: Tensor) -> Tensor:
+            return torch.where(square > 0, square.rsqrt(), 0.0)
+
+        # by hand: LAPACK takes one small matrix after the other
+        i0 = one_over(diagonal[0])
+        l10, l20 = normal.matrix[:, 1, 0] * i0, normal.matrix[:, 2, 0] * i0
+        i1 = one_over(diagonal[1] - l10.square())
+        l21 = (normal.matrix[:, 2, 1] - l20 * l10) * i1
+        i2 = one_over(diagonal[2] - l20.square() - l21.square())
+
+        def solved(right: Tensor) -> Tensor:
+            out = torch.empty_like(right)
+            extra = (slice(None), *[None] * (right.ndim - 3))
+            first = torch.mul(right[:, 0], i0[extra], out=out[:, 0])
+            second = torch.addcmul(right[:, 1], l10[extra], first, value=-1, out=out[:, 1]).mul_(i1[extra])
+            third = torch.addcmul(right[:, 2], l20[extra], first, value=-1, out=out[:, 2])
+            third.addcmul_(l21[extra], second, value=-1).mul_(i2[extra])
+            return out.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
+
+        return PointFactor((i0, i1, i2), (l10, l20, l21), solved(normal.mixed), solved(normal.slope))
+
+    def steps(self, moves: Tensor) -> Tensor:
+        """Steps ``(b, 3, G)`` of the points with those of the p parameters ``(b, p)``."""
+        (i0, i1, i2), (l10, l20, l21) = self.inverse, self.below
+        y = self.slope - (moves[:, None, None] @ self.mixed)[:, :, 0]
+        third = y[:, 2] * i2
+        second = (y[:, 1] - l21 * third) * i1
+        return torch.stack([(y[:, 0] - l10 * second - l20 * third) * i0, second, third], dim=1)
 
 
 @dataclass(frozen=True)
@@ -134,28 +182,41 @@ class RigAdjustment(LeastSquares):
         """Only some of the starts."""
         return replace(self, weights=self.weights[keep], sigma=self.sigma[keep])
 
+    @cached_property
+    def kinds(self) -> list[int]:
+        """Which of the 11 parameters of a camera vary, in some camera."""
+        changed = (self.basis != 0).any(-1).view(-1, PARAMETERS).any(0)
+        return [int(k) for k in changed.nonzero()]
+
     def evaluate(self, theta: Tensors) -> Iterate:
-        """The cost ``(b,)``."""
-        state = RigState(*theta)
-        seen = self.views.at(state.clocks)
-        share = (images(state, self.views.centers) - seen.x).square().sum(-1)
-        share = share / (self.freedom * self.sigma.square()[..., None, None])
-        known = self.weights * (seen.weights > 0)
-        total = (known * (self.freedom + 2) * share.log1p()).sum((1, 2, 3))
-        total = total + self.priors.costs(state)
-        return Iterate(theta, torch.where(total.isfinite(), total, torch.inf), ())
+        """The cost ``(b,)``, and what is seen at the times of the clocks, which the next step takes, too."""
+        return self._evaluate(RigState(*theta), _planes(self.views.at(theta[3])))
+
+    def advance(self, at: Iterate, step: Tensors) -> Iterate:
+        """The place after a step; clocks that stay show what they have shown."""
+        state = RigState(*self.retract(at.theta, step))
+        still = CLOCK.start not in self.kinds and CLOCK.stop - 1 not in self.kinds
+        return self._evaluate(state, Planes(*at.terms) if still else _planes(self.views.at(state.clocks)))
+
+    def _evaluate(self, state: RigState, seen: Planes) -> Iterate:
+        share = (_images(state, self.views.centers) - seen.x).square().sum(2) / (self.freedom * self.sigma.square()[..., None])
+        total = (self._known(seen) * (self.freedom + 2) * share.log1p_()).sum((1, 2)) + self.priors.costs(state)
+        return Iterate(tuple(state), torch.where(total.isfinite(), total, torch.inf), tuple(seen))
+
+    def _known(self, seen: Planes) -> Tensor:
+        return self.weights.flatten(2) * (seen.weights > 0)
 
     def step(self, at: Iterate, damping: Tensor) -> Tensors:
         """The damped Gauss-Newton step."""
         state = RigState(*at.theta)
-        normal = self.linear(state)
-        solved, reduced, gradient = normal.eliminate_points(damping)
+        normal = self.linear(state, Planes(*at.terms))
+        factor, reduced, gradient = normal.eliminate_points(damping)
         if self.basis.shape[1]:
             moves = damped_step(gradient @ self.basis, self.basis.mT @ reduced @ self.basis, damping) @ self.basis.mT
         else:
             moves = torch.zeros_like(gradient)
-        points = solved[..., -1] - (solved[..., :-1] @ moves[:, None, :, None])[..., 0]
-        return moves.unflatten(1, (-1, PARAMETERS)), points.reshape(state.points.shape)
+        points = factor.steps(moves[:, normal.place])
+        return moves.unflatten(1, (-1, PARAMETERS)), points.mT.reshape(state.points.shape)
 
     def retract(self, theta: Tensors, step: Tensors) -> Tensors:
         """Cameras turn about their own centres."""
@@ -169,36 +230,37 @@ class RigAdjustment(LeastSquares):
             state.points - points,
         )
 
-    def agreement(self, state: RigState, seen: Sightings) -> tuple[Tensor, Tensor]:
-        """Errors ``(b, c, T, n, 2)`` px and what the quadratic model weighs them by ``(b, c, T, n)``."""
-        error = images(state, self.views.centers) - seen.x
-        spread = self.sigma.square()[..., None, None]
-        share = error.square().sum(-1) / (self.freedom * spread)
-        known = self.weights * (seen.weights > 0)
-        return error, known * (self.freedom + 2) / self.freedom / (1 + share) / spread
+    def agreement(self, state: RigState, seen: Planes) -> tuple[Tensor, Tensor]:
+        """Errors ``(b, c, 2, G)`` px and what the quadratic model weighs them by ``(b, c, G)``."""
+        error = _images(state, self.views.centers) - seen.x
+        spread = self.sigma.square()[..., None]
+        share = error.square().sum(2) / (self.freedom * spread)
+        return error, self._known(seen) * (self.freedom + 2) / self.freedom / (1 + share) / spread
 
-    def linear(self, state: RigState) -> RigNormal:
+    def linear(self, state: RigState, seen: Planes | None = None) -> RigNormal:
         """The normal equations at a state."""
-        b, T, n = state.points.shape[:3]
-        c = state.R.shape[1]
-        total = c * PARAMETERS
-        blocks = state.points.new_zeros(b, T, n, 3, 3)
-        mixed = state.points.new_zeros(b, T, n, 3, total + 1)
-        reduced, gradient = state.points.new_zeros(b, total, total), state.points.new_zeros(b, total)
-        seen = self.views.at(state.clocks)
-        errors, weights = self.agreement(state, seen)
-        for i in range(c):
-            place = slice(i * PARAMETERS, (i + 1) * PARAMETERS)
-            by_point, by_camera = _derivatives(state, i, seen.v[:, i], self.views.times)
-            weight, error = weights[:, i, ..., None, None], errors[:, i, ..., None]
-            heavy, rows = (by_point * weight).mT, (by_camera * weight).flatten(1, 3).mT
-            blocks += heavy @ by_point
-            mixed[..., place] = heavy @ by_camera
-            mixed[..., -1:] += heavy @ error
-            reduced[:, place, place] = rows @ by_camera.flatten(1, 3)
-            gradient[:, place] = (rows @ error.flatten(1, 3))[..., 0]
+        seen = _planes(self.views.at(state.clocks)) if seen is None else seen
+        error, weights = self.agreement(state, seen)
+        weight = weights[:, :, None, None]
+        by_point, by_camera = _derivatives(state, self.kinds, seen.v, self.views.times)
+        (b, c), (count, points) = error.shape[:2], by_camera.shape[3:]
+        heavy = by_point * weight  # (b, c, 2, 3, G)
+        matrix = error.new_empty(b, 3, 3, points)
+        for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)):
+            matrix[:, i, j] = matrix[:, j, i] = (heavy[:, :, :, i] * by_point[:, :, :, j]).sum((1, 2))
+        slope = (heavy * error[:, :, :, None]).sum((1, 2))
+        mixed = error.new_empty(b, 3, c, count, points)
+        planes = mixed.transpose(1, 2)
+        torch.mul(heavy[:, :, 0, :, None], by_camera[:, :, 0, None], out=planes)
+        planes.addcmul_(heavy[:, :, 1, :, None], by_camera[:, :, 1, None])
+        rows = by_camera * weight
+        own, pull = (rows @ by_camera.mT).sum(2), (rows @ error[..., None]).sum(2)[..., 0]
+        place = torch.tensor(self.kinds, dtype=torch.long) + PARAMETERS * torch.arange(c)[:, None]  # (c, count)
+        reduced, gradient = error.new_zeros(b, c * PARAMETERS, c * PARAMETERS), error.new_zeros(b, c * PARAMETERS)
+        reduced[:, place[:, :, None], place[:, None]] = own
+        gradient[:, place] = pull
         self._add_priors(state, reduced, gradient)
-        return RigNormal(blocks.flatten(1, 2), mixed.flatten(1, 2), reduced, gradient)
+        return RigNormal(matrix, slope, mixed.flatten(2, 3), place.flatten(), reduced, gradient)
 
     def _add_priors(self, state: RigState, reduced: Tensor, gradient: Tensor) -> None:
         weights, slopes = self.priors.equations(state)
@@ -208,23 +270,43 @@ class RigAdjustment(LeastSquares):
             gradient[:, place] += slopes[:, i]
 
 
+class Planes(NamedTuple):
+    """What is seen, moments and points together in the last dimension, G of them."""
+
+    x: Tensor  # (b, c, 2, G) px
+    v: Tensor  # (b, c, 2, G) px per second
+    weights: Tensor  # (b, c, G)
+
+
+def _planes(seen: Sightings) -> Planes:
+    return Planes(seen.x.flatten(2, 3).mT.contiguous(), seen.v.flatten(2, 3).mT.contiguous(), seen.weights.flatten(2))
+
+
 def images(state: RigState, centers: Tensor) -> Tensor:
     """Images ``(b, c, T, n, 2)`` px of the points in all cameras, with principal points ``(c, 2)``."""
-    u = _rays(state.R[:, :, None, None], state.t[:, :, None, None], state.points[:, None])[1]
-    lens = state.lens[:, :, None, None]
-    return lens[..., :1].exp() * _distortion(u, lens)[1] * u + centers[:, None, None]
+    return _images(state, centers).mT.unflatten(2, state.points.shape[1:3])
 
 
-def _rays(R: Tensor, t: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Points in the frame of a camera, and divided by their depths."""
-    seen = (points[..., None, :] * R).sum(-1) + t
-    return seen, seen[..., :2] / seen[..., 2:].clamp(min=MIN_DEPTH)
+def _images(state: RigState, centers: Tensor) -> Tensor:
+    """The same, ``(b, c, 2, G)``."""
+    u = _rays(state)[2]
+    focal, k1, k2 = _lens(state)
+    square = u.square().sum(2)
+    return (focal * (1 + square * (k1 + k2 * square)))[:, :, None] * u + centers[..., None]
 
 
-def _distortion(u: Tensor, lens: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared distance from the axis, and what the lens multiplies it by."""
-    square = u.square().sum(-1, keepdim=True)
-    return square, 1 + square * (lens[..., 1:2] + lens[..., 2:] * square)
+def _rays(state: RigState) -> tuple[Tensor, Tensor, Tensor]:
+    """Points ``(b, c, 3, G)`` in the frames of the cameras, their depths, and what is divided by these ``(b, c, 2, G)``."""
+    b, c = state.t.shape[:2]
+    seen = (state.R.reshape(b, 3 * c, 3) @ state.points.flatten(1, 2).mT).unflatten(1, (c, 3)) + state.t[..., None]
+    depth = seen[:, :, 2].clamp(min=MIN_DEPTH)
+    return seen, depth, seen[:, :, :2] / depth[:, :, None]
+
+
+def _lens(state: RigState) -> tuple[Tensor, Tensor, Tensor]:
+    """Focal length, k1 and k2, ``(b, c, 1)`` each."""
+    logs, k1, k2 = state.lens[..., None].unbind(2)
+    return logs.exp(), k1, k2
 
 
 def _prior_parameters(state: RigState) -> Tensor:
@@ -232,18 +314,38 @@ def _prior_parameters(state: RigState) -> Tensor:
     return torch.cat([state.lens, state.clocks], dim=-1)
 
 
-def _derivatives(state: RigState, i: int, v: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of the errors of a camera by the points ``(b, T, n, 2, 3)`` and by its parameters ``(b, T, n, 2, 11)``."""
-    R, lens = state.R[:, i, None, None], state.lens[:, i, None, None]
-    seen, u = _rays(R, state.t[:, i, None, None], state.points)
-    square, bend = _distortion(u, lens)
-    focal, k1, k2 = lens[..., :1].exp(), lens[..., 1:2], lens[..., 2:]
-    eye = torch.eye(2, dtype=u.dtype)
-    by_u = focal[..., None] * (bend[..., None] * eye + 2 * (k1 + 2 * k2 * square)[..., None] * u[..., None] * u[..., None, :])
-    by_seen = torch.cat([by_u, -by_u @ u[..., None]], dim=-1) / seen[..., 2:].clamp(min=MIN_DEPTH)[..., None]
-    delta = times[:, None, None] * state.clocks[:, i, 1, None, None, None].exp()
-    own = torch.stack([focal * bend * u, focal * square * u, focal * square.square() * u, -v, -v * delta], dim=-1)
-    return by_seen @ R, torch.cat([-by_seen @ skew(seen), by_seen, own], dim=-1)
+def _derivatives(state: RigState, kinds: list[int], v: Tensor, times: Tensor) -> tuple[Tensor, Tensor]:
+    """Derivatives of the errors by the points ``(b, c, 2, 3, G)`` and by the cameras' parameters ``(b, c, 2, kinds, G)``."""
+    seen, depth, u = _rays(state)
+    focal, k1, k2 = _lens(state)
+    square = u.square().sum(2)
+    bend = focal * (1 + square * (k1 + k2 * square))
+    # focal (bend I + slope u u^T)
+    along = (2 * focal * (k1 + 2 * k2 * square))[:, :, None] * u
+    by_seen = u.new_empty(*u.shape[:3], 3, u.shape[-1])
+    torch.mul(along[:, :, :, None], u[:, :, None], out=by_seen[:, :, :, :2])
+    by_seen[:, :, 0, 0] += bend
+    by_seen[:, :, 1, 1] += bend
+    by_seen[:, :, :, 2] = -(by_seen[:, :, :, :2] * u[:, :, None]).sum(3)
+    by_seen /= depth[:, :, None, None]
+    delta = times.repeat_interleave(state.points.shape[2]) * state.clocks[:, :, 1:].exp()
+    parts = {
+        LENS.start: lambda: bend[:, :, None] * u,
+        LENS.start + 1: lambda: (focal * square)[:, :, None] * u,
+        LENS.start + 2: lambda: (focal * square.square())[:, :, None] * u,
+        CLOCK.start: lambda: -v,
+        CLOCK.start + 1: lambda: -v * delta[:, :, None],
+    }
+    by_camera = u.new_empty(*u.shape[:3], len(kinds), u.shape[-1])
+    x, y, z = seen[:, :, None].unbind(3)
+    p, q, r = by_seen.unbind(3)
+    turned = y * r - z * q, z * p - x * r, x * q - y * p
+    for place, kind in enumerate(kinds):
+        if kind < LENS.start:
+            by_camera[:, :, :, place] = (turned, (p, q, r))[kind // 3][kind % 3]
+        else:
+            by_camera[:, :, :, place] = parts[kind]()
+    return state.R[:, :, None].mT @ by_seen, by_camera
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -382,14 +484,11 @@ def compare_starts(rig: Rig, views: RigViews, graph: Graph, clocks: Tensor, free
     side = rig.sizes.amax(1)
     unknown = rig.focals.isnan()
     tried = TRIED_FOCALS if bool(unknown.any()) else TRIED_FOCALS[:1]
-    starts = []
-    for share in tried:
-        focals = torch.where(unknown, share * side, rig.focals.nan_to_num(1.0))
-        R, centers, points = first_cameras(views, graph, clocks, focals)
-        starts.append((R, -(R @ centers[..., None])[..., 0], focals.log(), points))
-    R, t, logs, points = (torch.stack(part) for part in zip(*starts, strict=True))
+    focals = torch.stack([torch.where(unknown, share * side, rig.focals.nan_to_num(1.0)) for share in tried])
+    R, centers, points = first_cameras(views, graph, clocks, focals)
+    t, logs = -(R @ centers[..., None])[..., 0], focals.log()
     lens = torch.nn.functional.pad(logs[..., None], (0, 2))
-    state = RigState(R, t, lens, clocks.expand(len(starts), -1, -1).clone(), points)
+    state = RigState(R, t, lens, clocks.expand(len(focals), -1, -1).clone(), points)
     for k, steps in enumerate(START_ITERATIONS):
         problem = _problem(views, state, freedom.poses, freedom.priors)
         state = _descend(problem, state, steps)
@@ -469,8 +568,8 @@ MIN_AUTOCORRELATION = 0.02  # of residuals some moments apart, down to which it 
 
 def _autocorrelation_factor(problem: RigAdjustment, state: RigState) -> float:
     r"""By how much fewer residuals there are than it seems: :math:`1 + 2 \sum_k \rho_k` of how they repeat themselves in time."""
-    error, weight = problem.agreement(state, problem.views.at(state.clocks))
-    rows = (error * weight.sqrt()[..., None])[0].movedim(1, 0).flatten(1)  # (T, *)
+    error, weight = problem.agreement(state, _planes(problem.views.at(state.clocks)))
+    rows = (error * weight.sqrt()[:, :, None])[0].unflatten(-1, state.points.shape[1:3]).movedim(2, 0).flatten(1)  # (T, *)
     total, count = 1.0, len(rows)
     power = float(rows.square().sum()) / max(count, 1)
     for lag in range(1, max(2, count // 4)):
@@ -548,7 +647,7 @@ def _triangulate_block(views: RigViews, found: RigSolution) -> tuple[Tensor, ...
 
 def _sigmas(problem: RigAdjustment, state: RigState) -> Tensor:
     """Root mean square ``(T, n)`` of the standard deviations of points along the axes; infinite where they have none."""
-    blocks = problem.linear(state).matrix[0]
+    blocks = problem.linear(state).matrix[0].movedim(-1, 0)
     values = torch.linalg.eigvalsh(blocks).clamp(min=0)
     variance = torch.where(values > 0, 1 / values, torch.inf).mean(-1)
     return variance.sqrt().view(state.points.shape[1:3])

@@ -185,16 +185,23 @@ class Grid:
     def at(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions, velocities ``(m, n, 2)`` and weights ``(m, n)``, 0 where not seen."""
         place = (times - self.start) / self.step
-        left = place.floor().clamp(0, len(self.x) - 2).long()
+        left = place.floor().clamp(0, len(self.x) - 2)
         u = (place - left)[:, None, None]
         inside = (place >= 0) & (place <= len(self.x) - 1)
-        x0, x1 = self.x[left], self.x[left + 1]
-        v0, v1 = self.step * self.v[left], self.step * self.v[left + 1]
-        d, s = x1 - x0, v0 + v1
-        x = x0 + u * (v0 + u * (3 * d - s - v0 + u * (s - 2 * d)))
-        v = self.smooth_velocities[left] + u * (self.smooth_velocities[left + 1] - self.smooth_velocities[left])
-        w0, w1 = self.weights[left], self.weights[left + 1]
-        return x, v, torch.where((w0 > 0) & (w1 > 0) & inside[:, None], w0 + u[..., 0] * (w1 - w0), 0.0)
+        parts = self.polynomials.index_select(0, left.long())
+        x, v, weights = parts.split([4 * self.x.shape[-1], 2 * self.x.shape[-1], 2], dim=-1)
+        (x0, x1, x2, x3), (v0, v1), (w0, w1) = x.chunk(4, -1), v.chunk(2, -1), weights.unbind(-1)
+        return x0 + u * (x1 + u * (x2 + u * x3)), v0 + u * v1, torch.where(inside[:, None], w0 + u[..., 0] * w1, 0.0)
+
+    @cached_property
+    def polynomials(self) -> Tensor:
+        """``(m - 1, n, 6 d + 2)``: coefficients between two steps, of positions, velocities and weights."""
+        x0, v0, v1 = self.x[:-1], self.step * self.v[:-1], self.step * self.v[1:]
+        d, s = self.x[1:] - x0, v0 + v1
+        w0, w1 = self.weights[:-1], self.weights[1:]
+        weight = torch.stack([w0, w1 - w0], dim=-1) * ((w0 > 0) & (w1 > 0))[..., None]
+        smooth = self.smooth_velocities
+        return torch.cat([x0, v0, 3 * d - s - v0, s - 2 * d, smooth[:-1], smooth.diff(dim=0), weight], dim=-1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -269,10 +276,12 @@ class ShiftDescent:
         rows = self._rows(state)
         return None if rows is None else self._fit(state, rows, free_rate)
 
-    def variance(self, offset: float, rate: float = 1.0) -> float:
-        """Of the residual at a state, as on the curve, by the F that is best there; infinite where too little is seen."""
-        matched = self._match(offset, rate)
-        return math.inf if matched is None else float(self._moment_fit(matched)[0])
+    def variances(self, offsets: Sequence[float], rate: float = 1.0) -> list[float]:
+        """Of the residual at states, as on the curve, by the F that is best there; infinite where too little is seen."""
+        matched = [self._match(offset, rate) for offset in offsets]
+        moments = [self._moments(one) for one in matched if one is not None]
+        solved = iter(self._solve(torch.stack(moments))[0].tolist() if moments else ())
+        return [math.inf if one is None else next(solved) for one in matched]
 
     def _match(self, offset: float, rate: float, every: int = 1) -> Matched | None:
         """Normalized positions of both cameras at the same moments, or at some of them; None where too few."""
@@ -285,10 +294,14 @@ class ShiftDescent:
         p, q = homogeneous(self.x[::every][both]) @ first.mT, homogeneous(x2[both]) @ second.mT
         return Matched(p, q, torch.nn.functional.pad(v2[both], (0, 1)) @ second.mT, both, sure[both])
 
-    def _moment_fit(self, matched: Matched) -> tuple[Tensor, Tensor]:
-        """Variance and F by the moments alone."""
+    def _moments(self, matched: Matched) -> Tensor:
+        """What variance and F follow from, ``(9, 9)``."""
         products = matched.products
-        return epipolar_variance(products.mT @ (matched.sure[:, None] * products), self.noise)
+        return products.mT @ (matched.sure[:, None] * products)
+
+    def _solve(self, moments: Tensor) -> tuple[Tensor, Tensor]:
+        """Variance and F by the moments alone, of several states."""
+        return epipolar_variance(moments, self.noise)
 
     @staticmethod
     def _nearest(matrix: Tensor) -> Tensor:
@@ -309,7 +322,7 @@ class ShiftDescent:
         if state.center is None:
             state.center = float(times.mean())
         if state.F is None:
-            state.F = self._nearest(self._moment_fit(matched)[1])
+            state.F = self._nearest(self._solve(self._moments(matched)[None])[1][0])
         return self._residuals(state.F, matched, times)
 
     def _residuals(self, F: Tensor, matched: Matched, times: Tensor) -> Residuals:

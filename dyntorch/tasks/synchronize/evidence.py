@@ -105,11 +105,11 @@ class Attempt:
             return rough
         width = max(self.frame, self.step)
         descent = self.model.descent(self.a, self.b, width, rows=NUM_COMPARED_ROWS)
-        steps = self.step * torch.linspace(-1, 1, NUM_FRACTIONS, dtype=torch.float64)
+        steps = (self.step * torch.linspace(-1, 1, NUM_FRACTIONS, dtype=torch.float64)).tolist()
         level = max(self.curve.level, 1e-300)
         for k, (shift, _) in enumerate(self.peaks[: NUM_COMPETING_PEAKS + 1]):
             offset = shift - (self.fit.rate - 1) * self.fit.center
-            variances = [descent.variance(offset + float(step), self.fit.rate) for step in steps]
+            variances = descent.variances([offset + step for step in steps], self.fit.rate)
             # exact data: a step of the own peak is as far from its bottom as the nearest step of a rival's may be
             least = min(variances) if k else min(variances[NUM_FRACTIONS // 2 - 1], variances[NUM_FRACTIONS // 2 + 1])
             rough[k] = -0.5 * math.log(max(least, 1e-300) / level)
@@ -319,6 +319,7 @@ class Attempt:
 
 SUBSET_SIZE = 6  # Points of a subset.
 NUM_SUBSETS = 60  # Subsets: one of 6 without 4 outliers of 17 is drawn in all but 1 of 10,000 trials.
+SUBSETS_AT_ONCE = 12  # of these at all lags: 6 MB of moments at most
 MIN_INLIER_SHARE = 0.7  # Share of the points that have to fit.
 MAX_RESIDUAL_RATIO = 3.0  # Residual over the median one of inliers beyond which a point is an outlier.
 MIN_POINTS_FOR_REJECTION = 8  # Points below which none can be rejected.
@@ -342,14 +343,17 @@ def consistent_points(a: Tracks, b: Tracks, attempt: Attempt, generator: Generat
     moments, counts = moments[:, judged], counts[:, judged]
     generator = generator or torch.Generator().manual_seed(0)
     best: tuple[float, Tensor] | None = None
-    for _ in range(NUM_SUBSETS):
-        chosen = torch.randperm(n, generator=generator)[:SUBSET_SIZE].to(moments.device)
-        variance, geometry = samples.solve(moments[chosen].sum(0))
-        lag = int((variance / counts[chosen].sum(0).clamp(min=1).sqrt()).argmin())
-        each = samples.variances_by(geometry[lag], moments[:, lag])
-        cost = float(each.nanquantile(MIN_INLIER_SHARE))
-        if best is None or cost < best[0]:
-            best = cost, each
+    subsets = torch.stack([torch.randperm(n, generator=generator)[:SUBSET_SIZE] for _ in range(NUM_SUBSETS)]).to(moments.device)
+    for chosen in subsets.split(SUBSETS_AT_ONCE):
+        member = moments.new_zeros(len(chosen), n).scatter_(1, chosen, 1.0)
+        together = (member @ moments.flatten(1)).unflatten(1, moments.shape[1:])
+        variance, geometry = (part.unflatten(0, together.shape[:2]) for part in samples.solve(together.flatten(0, 1)))
+        lags = (variance / (member @ counts.to(member)).clamp(min=1).sqrt()).argmin(-1).tolist()
+        for subset, lag in enumerate(lags):
+            each = samples.variances_by(geometry[subset, lag], moments[:, lag])
+            cost = float(each.nanquantile(MIN_INLIER_SHARE))
+            if best is None or cost < best[0]:
+                best = cost, each
     assert best is not None
     each = best[1]
     level = each[each <= best[0]].median()

@@ -130,12 +130,16 @@ class SpaceDescent(ShiftDescent):
         speed = torch.nn.functional.pad(self.speed[::every][found.both], (0, 1)) @ self.changes[0].mT / -rate
         return replace(found, p=found.q, q=found.p, speed=speed)
 
-    def _moment_fit(self, matched: Matched) -> tuple[Tensor, Tensor]:
-        """Variance and camera by the moments alone."""
+    def _moments(self, matched: Matched) -> Tensor:
+        """What variance and camera follow from, ``(4, 4, 4)``."""
         x = matched.p[:, :2]
         of_image = torch.cat([torch.ones_like(x[:, :1]), x, x.square().sum(-1, keepdim=True)], dim=-1) * matched.sure[:, None]
         moments = of_image.mT @ (matched.q[:, :, None] * matched.q[:, None]).flatten(1)
-        return camera_variance(moments.unflatten(1, (4, 4)), self.noise[0])
+        return moments.unflatten(1, (4, 4))
+
+    def _solve(self, moments: Tensor) -> tuple[Tensor, Tensor]:
+        """Variance and camera by the moments alone, of several states."""
+        return camera_variance(moments, self.noise[0])
 
     @staticmethod
     def _nearest(matrix: Tensor) -> Tensor:

@@ -46,10 +46,12 @@ def pair_of(R, centers, rays, i, j, focals, unit=1920.0):
 def test_relative_rotations_have_the_true_one(sign):
     R, centers, _, rays = rig(seed=1)
     focals = [1500.0, 1100.0, 1800.0, 1300.0]
+    tried = torch.tensor([focals, [900.0] * 4], dtype=F64)
     for i, j in combinations(range(4), 2):
         pair, truth = pair_of(R, centers, rays, i, j, focals)
         pair = PairGeometry(sign * pair.F, pair.x1, pair.x2, pair.weights, pair.unit, 1.0, pair.matches)
-        found, share = relative_rotations(pair, focals[i], focals[j])
+        (found, other), (share, _) = relative_rotations(pair, tried[:, i], tried[:, j])
+        torch.testing.assert_close(other, relative_rotations(pair, tried[1:, i], tried[1:, j])[0][0])
         best = int(share.argmax())
         assert torch.allclose(found[best], truth, atol=1e-9)
         assert torch.allclose(torch.linalg.det(found), torch.ones(2, dtype=F64)) and float(share[best]) == 1.0

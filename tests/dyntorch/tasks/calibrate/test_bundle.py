@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from dyntorch.numerics.least_squares import Iterate
 from dyntorch.tasks.calibrate.bundle import PARAMETERS, Priors, RigAdjustment, RigState, camera_covariance, gauge, images
 from dyntorch.tasks.calibrate.input import Sightings
 from tests.draws import seeded
@@ -96,9 +95,10 @@ def cost(problem, state):
 
 def dense(problem, normal):
     """Matrix and gradient of all unknowns together, points first, from the blocks."""
-    G, s = normal.mixed.shape[1:3]
-    points = torch.block_diag(*normal.matrix[0])
-    mixed, slope = normal.mixed[0, ..., :-1].reshape(G * s, -1), normal.mixed[0, ..., -1].reshape(-1)
+    points = torch.block_diag(*normal.matrix[0].movedim(-1, 0))
+    mixed = points.new_zeros(len(points), COUNT)
+    mixed[:, normal.place] = normal.mixed[0].movedim(-1, 0).reshape(len(points), -1)
+    slope = normal.slope[0].mT.flatten()
     matrix = torch.cat([torch.cat([points, mixed], 1), torch.cat([mixed.mT, normal.others[0]], 1)])
     return matrix, torch.cat([slope, normal.gradient[0]])
 
@@ -159,9 +159,7 @@ def test_a_step_solves_the_damped_equations_of_all_unknowns(damping):
     floor = 1e-9 * left.diagonal().max()  # damped_step lifts all by a billionth of the largest
     free[count:, count:].diagonal().add_(damping * (left.diagonal() + floor))
     truth = basis @ torch.linalg.solve(free, slope)
-    cameras, points = problem.step(
-        Iterate(tuple(state), problem.evaluate(tuple(state)).cost, ()), torch.tensor([damping], dtype=F64)
-    )
+    cameras, points = problem.step(problem.evaluate(tuple(state)), torch.tensor([damping], dtype=F64))
     found = torch.cat([points.flatten(), cameras.flatten()])
     assert float((found - truth).norm() / truth.norm()) < 1e-7
     assert float(cameras[0, 0, :6].abs().max()) == 0.0

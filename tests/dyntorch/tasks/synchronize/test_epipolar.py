@@ -168,8 +168,8 @@ def test_starts_within_a_frame_or_two_lead_to_the_same_minimum(start):
     again = ShiftDescent(a, b, FRAME).run(fit.offset)
     assert again.offset == pytest.approx(fit.offset, abs=1e-4 * FRAME)
     descent = ShiftDescent(a, b, FRAME)
-    near = [descent.variance(fit.offset + 0.1 * k * FRAME) for k in (-1, 0, 1)]
-    assert near[1] == min(near) and descent.variance(5.0) == math.inf
+    *near, far = descent.variances([*(fit.offset + 0.1 * k * FRAME for k in (-1, 0, 1)), 5.0])
+    assert near[1] == min(near) and far == math.inf
 
 
 def test_exact_cameras_give_the_fundamental_matrix_and_distances_in_pixels():

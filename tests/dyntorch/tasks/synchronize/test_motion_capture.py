@@ -225,7 +225,7 @@ def test_the_derivatives_are_those_of_the_residuals(swapped):
     descent = SpaceDescent(*((b, a) if swapped else (a, b)), 1 / FPS)
     at, ahead = (descent._match(offset + d, 1.0) for d in (0.0, 1e-4))
     times = torch.zeros(len(at.p), dtype=torch.float64)
-    _, camera = descent._moment_fit(at)
+    camera = descent._solve(descent._moments(at)[None])[1][0]
     rows = descent._residuals(camera, at, times)
     changed = descent._residuals(camera, ahead, times)
     numeric = (changed.residual - rows.residual) / 1e-4
