@@ -62,7 +62,7 @@ def canonical_sign(matrix: Tensor) -> Tensor:
     if rows == columns and rows % 2:
         det = torch.linalg.det(matrix)[..., None]
         # Hadamard's bounds, by rows and by columns, are the size that the rounding error of the determinant is relative to
-        bound = torch.minimum(matrix.norm(dim=-1).prod(dim=-1), matrix.norm(dim=-2).prod(dim=-1))[..., None]
+        bound = torch.stack([torch.linalg.vector_norm(matrix, dim=k) for k in (-1, -2)]).prod(-1).amin(0)[..., None]
         leading = torch.where(det.abs() > 10 * torch.finfo(matrix.dtype).eps * bound, det, leading)
     return nonzero_sign(leading)[..., None]
 

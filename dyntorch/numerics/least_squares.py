@@ -248,6 +248,11 @@ def jacobian(function: Callable[[Tensor], Tensor], theta: Tensor) -> tuple[Tenso
     return derivatives(function, theta, tangents.expand(count, *theta.shape))
 
 
+FEW_COPIES = 1 << 17
+"""Numbers of the copies that :func:`by_match` differentiates up to which one pass for all columns takes less time than one for each:
+six columns of 60 matches 5.8 ms instead of 14, of 2,000 39 instead of 45, of 200 problems of 100 422 instead of 323."""
+
+
 def by_match(
     function: Callable[[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]], Tensor],
     theta: Tensor,
@@ -262,8 +267,13 @@ def by_match(
         copies = theta.detach()[:, None].repeat(1, count, 1).requires_grad_()
         shared = tuple(x.detach().clone()[:, None].expand(-1, count, *x.shape[1:]) for x in problems)
         value = function(copies, shared, tuple(x.detach().clone().unsqueeze(2) for x in matches))[..., 0, :]
-        slopes = [grad(column.sum(), copies, retain_graph=True)[0] for column in value.unbind(-1)]
-    return value.detach().flatten(1), torch.stack(slopes, dim=2).flatten(1, 2).mT
+        columns = value.shape[-1]
+        if copies.numel() <= FEW_COPIES and 1 < columns:  # all columns in one pass back
+            chosen = torch.eye(columns, dtype=value.dtype, device=value.device)[:, None, None].expand(columns, *value.shape)
+            slopes = grad(value, copies, chosen, is_grads_batched=True)[0]
+        else:
+            slopes = torch.stack([grad(column.sum(), copies, retain_graph=True)[0] for column in value.unbind(-1)])
+    return value.detach().flatten(1), slopes.movedim(0, 2).flatten(1, 2).mT
 
 
 def normalized_derivative(value: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:

@@ -226,10 +226,10 @@ MIN_SPARE_PLANAR = 8  # conditions beyond the 16 degrees of freedom that inliers
 
 
 def planar_notices(
-    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], status: Tensor, batch: tuple[int, ...]
+    evidence: Evidence, best: Labelled, tensor: tuple[Tensor, Tensor], unverified: Tensor, status: Tensor, batch: tuple[int, ...]
 ) -> tuple[Notice, ...]:
     """All notices on a flat batch of problems with final labels, in the order of the problems; ``tensor`` from
-    :func:`tensor_rank`."""
+    :func:`tensor_rank`, moving matches ``unverified (b, n)``."""
     data = evidence.data
     rank, strength = tensor
     solved = ~is_failure(status)
@@ -246,8 +246,7 @@ def planar_notices(
     note(AlignNotice.ONE_LINE, lines, solved & (lines == 1))
     thin = thinness(evidence, best.sigma)
     note(AlignNotice.COLLINEAR, thin, (data.weights > 0).any(-1) & (thin < MIN_LINE_WIDTH))
-    doubtful = (best.labels == MOVING) & unverified_matches(evidence, best)
-    note(AlignNotice.UNVERIFIED, doubtful.sum(-1), solved & doubtful.any(-1))
+    note(AlignNotice.UNVERIFIED, unverified.sum(-1), solved & unverified.any(-1))
     return in_order(found)
 
 
@@ -413,14 +412,14 @@ def _align(
 ) -> Alignment:
     evidence = Evidence.of(moving_points(2, len(data.views)), data)
     solution, best, tensor = _solve(evidence, _search(evidence, threshold, generator, options))
-    notices = planar_notices(evidence, best, tensor, solution.status, data.batch)
+    unverified = unverified_matches(evidence, best) & (best.labels == MOVING)
+    notices = planar_notices(evidence, best, tensor, unverified, solution.status, data.batch)
     calibrated: dict[str, Any] = {}
     if K is not None:
         turned, other, told = euclidean(solution, data, best.labels, K)
         notices = in_order([*notices, *told])
         calibrated = {**turned._asdict(), "other_motion": other}
-    unverified = data.back(unverified_matches(evidence, best) & (best.labels == MOVING))
-    return solved_alignment(solution, data, best.labels, AMBIGUITY, notices, unverified=unverified, **calibrated)
+    return solved_alignment(solution, data, best.labels, AMBIGUITY, notices, unverified=data.back(unverified), **calibrated)
 
 
 def _search(evidence: Evidence, threshold: float | None, generator: torch.Generator | None, options: AlignOptions) -> Labelled:

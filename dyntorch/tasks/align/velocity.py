@@ -12,10 +12,12 @@ from dyntorch.core.limits import MIN_INFORMATION, median, three_sigma
 from dyntorch.core.matches import Matches
 from dyntorch.core.normalize import denormalize_motion, normalize_motion
 from dyntorch.core.outcome import Notice, Status, in_order, is_failure, noting
+from dyntorch.core.refine import Problem
+from dyntorch.core.residual import residual_derivative
 from dyntorch.core.robust import robust_fit
 from dyntorch.core.solution import NOISY
 from dyntorch.geometry.homogeneous import apply, unit
-from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor
+from dyntorch.invariants.constant_velocity_tensor import ConstantVelocityTensor, resting_residual
 from dyntorch.numerics.blocks import map_blocks, uniform
 from dyntorch.numerics.least_squares import LeastSquaresOptions, derivatives, minimize
 from dyntorch.numerics.nullspace import spectrum
@@ -65,9 +67,27 @@ class Velocities:
     grounded: Tensor  # ``(b,)`` bool, whether static matches fix the common velocity
 
 
+class VelocityProblem(Problem):
+    """The least squares of the maps."""
+
+    def subset(self, keep: Tensor) -> VelocityProblem:
+        """Only some of the problems."""
+        return VelocityProblem(**vars(super().subset(keep)))
+
+    def linearize_static(self, theta: Tensor, views: tuple[Tensor, ...], free: int = 1) -> tuple[Tensor, Tensor]:
+        """By way of the inverses, which all matches share, as of those that move."""
+        maps, slope = ConstantVelocityTensor._inverses(self.parts(theta))
+        value, derivative = residual_derivative(resting_residual, maps, views, self.scales)
+        return value, slope @ derivative
+
+
+def _problem(evidence: Evidence, labels: Tensor) -> VelocityProblem:
+    return VelocityProblem(**vars(evidence.problem(labels)))
+
+
 def refine_maps(evidence: Evidence, theta: Tensor, labels: Tensor, affine: bool) -> Tensor:
     """The maps ``(b, 48)`` that minimize the residuals of the labelled matches, by Levenberg-Marquardt; affine maps stay affine."""
-    problem = replace(evidence.problem(labels), free=_free(theta, affine))
+    problem = replace(_problem(evidence, labels), free=_free(theta, affine))
     if not bool((labels == STATIC).any()):
         problem = replace(problem, static=None)  # half of the work
     return minimize(problem, problem.evaluate((theta,)), DESCENT).theta[0]
@@ -95,7 +115,7 @@ def settle(evidence: Evidence, theta: Tensor, sigma: Tensor, affine: bool, estim
 
 def information(evidence: Evidence, state: Velocities, affine: bool) -> tuple[Tensor, Tensor, Tensor]:
     """What the inliers tell about the sensor."""
-    _, _, matrix = evidence.problem(state.labels).normal_equations(state.theta)
+    _, _, matrix = _problem(evidence, state.labels).normal_equations(state.theta)
     free = _free(state.theta, affine)
     values, vectors = spectrum(matrix * free * free[:, None])
     dof = DOF[affine] + GAUGE * state.grounded.long()
