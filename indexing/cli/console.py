@@ -9,7 +9,6 @@ import contextlib
 import difflib
 import os
 import re
-import secrets
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -157,7 +156,7 @@ def check_folder(folder: Path) -> Path:
     there = next((part for part in (folder, *folder.absolute().parents) if part.exists()), Path.cwd())
     if not there.is_dir():
         raise ValueError(f"output folder {str(folder)!r}: {str(there)!r} is a file; choose another folder, or move it away")
-    probe = there / f".dyntorch-{secrets.token_hex(8)}.tmp"
+    probe = there / f".dyntorch-{os.urandom(8).hex()}.tmp"
     try:
         os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
     except OSError as error:
