@@ -248,9 +248,9 @@ def jacobian(function: Callable[[Tensor], Tensor], theta: Tensor) -> tuple[Tenso
     return derivatives(function, theta, tangents.expand(count, *theta.shape))
 
 
-FEW_COPIES = 1 << 17
-"""Numbers of the copies that :func:`by_match` differentiates up to which one pass for all columns takes less time than one for each:
-six columns of 60 matches 5.8 ms instead of 14, of 2,000 39 instead of 45, of 200 problems of 100 422 instead of 323."""
+FEW_COPIES = 1 << 15
+"""Numbers of the copies that :func:`by_match` differentiates up to which one pass for all columns takes less time than one each: six
+columns of 60 matches 5.9 ms instead of 14, of 400 13 instead of 20, of 2,000 47 instead of 45."""
 
 
 def by_match(
@@ -263,17 +263,21 @@ def by_match(
     ``(b, n, p)``, theta ``(b, p)``, problems ``(b, ...)``, matches ``(b, n, ...)`` -> ``(b, n c)``."""
     count = matches[0].shape[1]
     # copies: what was made in inference mode may not be saved for a backward pass
-    with torch.inference_mode(False), torch.enable_grad():
-        copies = theta.detach()[:, None].repeat(1, count, 1).requires_grad_()
+    with torch.inference_mode(False):
         shared = tuple(x.detach().clone()[:, None].expand(-1, count, *x.shape[1:]) for x in problems)
-        value = function(copies, shared, tuple(x.detach().clone().unsqueeze(2) for x in matches))[..., 0, :]
-        columns = value.shape[-1]
-        if copies.numel() <= FEW_COPIES and 1 < columns:  # all columns in one pass back
-            chosen = torch.eye(columns, dtype=value.dtype, device=value.device)[:, None, None].expand(columns, *value.shape)
-            slopes = grad(value, copies, chosen, is_grads_batched=True)[0]
-        else:
-            slopes = torch.stack([grad(column.sum(), copies, retain_graph=True)[0] for column in value.unbind(-1)])
-    return value.detach().flatten(1), slopes.movedim(0, 2).flatten(1, 2).mT
+        single = tuple(x.detach().clone().unsqueeze(2) for x in matches)
+        copies = theta.detach()[:, None].repeat(1, count, 1)
+        repeats = 1
+        if copies.numel() <= FEW_COPIES:  # every column has copies of its own, and all of them one pass back
+            with torch.no_grad():
+                repeats = function(copies[:, :0], *each(lambda x: x[:, :0], (shared, single))).shape[-1]
+        shared, single, copies = each(lambda x: x.repeat(repeats, *[1] * (x.ndim - 1)), (shared, single, copies))
+        with torch.enable_grad():
+            copies.requires_grad_()
+            value = function(copies, shared, single)[..., 0, :].unflatten(0, (repeats, len(theta)))
+            columns = value.diagonal(dim1=0, dim2=-1)[None] if repeats > 1 else value[0].movedim(-1, 0)
+            slopes = torch.cat([grad(column.sum(), copies, retain_graph=True)[0] for column in columns])
+    return value[0].detach().flatten(1), slopes.unflatten(0, (value.shape[-1], len(theta))).movedim(0, 2).flatten(1, 2).mT
 
 
 def normalized_derivative(value: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:

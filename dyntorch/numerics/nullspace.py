@@ -140,7 +140,7 @@ def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
         return null_space(matrix.cpu(), dim).to(matrix.device)
     keep = torch.is_grad_enabled() and matrix.requires_grad
     solve = NullSpaceOfRows.apply if _differentiated(matrix) else _of_rows
-    basis: Tensor = solve(_flat(matrix), dim, keep)[0]  # type: ignore[no-untyped-call]
+    basis: Tensor = solve(_flat(matrix), dim, keep)[0]
     return basis.reshape(*matrix.shape[:-2], dim, size)
 
 
@@ -154,7 +154,7 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
         space = gram_null_space(gram.cpu(), dim)
         return GramNullSpace(*(part.to(gram.device) for part in vars(space).values()))
     solve = NullSpaceOfGrams.apply if _differentiated(gram) else _of_grams
-    basis, residual, competing, degenerate = solve(_flat(gram), dim)  # type: ignore[no-untyped-call]
+    basis, residual, competing, degenerate = solve(_flat(gram), dim)
     batch = gram.shape[:-2]
     return GramNullSpace(
         basis.reshape(*batch, dim, size), residual.reshape(*batch, dim), competing.reshape(batch), degenerate.reshape(batch)
