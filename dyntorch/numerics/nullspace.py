@@ -215,8 +215,9 @@ def _of_rows(matrix: Tensor, dim: int, keep: bool) -> tuple[Tensor, Tensor]:
 def _by_kernel(matrix: Tensor, dim: int, minimal: bool, keep: bool) -> tuple[Tensor, Tensor]:
     """Basis of one block by the kernel, and the Grams where ``keep``; what it does not certify is left to this file."""
     basis, following, certified, gram = library.null_of_rows(matrix, dim, always=minimal, keep=keep)
-    hard = (~certified | (following <= RESOLVED)).nonzero()[:, 0]
-    if len(hard):
+    sound = certified & (following > RESOLVED)
+    if not bool(sound.all()):
+        hard = (~sound).nonzero()[:, 0]
         part = matrix[hard]
         basis[hard] = fix_signs(_solve_minimal(part, dim) if minimal else _solve_rows(part, gram_of(part), dim)).mT
     return basis, gram
