@@ -424,7 +424,7 @@ def with_covariance(moved: Solution, data: Matches, minimum: Minimum) -> Solutio
         covariance = _covariance(derivative, minimum, invariant.dof, sigma * largest_weights(data.weights).sqrt())
     return replace(
         moved,
-        tensor=select(data.back(good), data.back(tensor), moved.tensor),
+        tensor=data.back(tensor),
         sigma=data.back(select(good, sigma, torch.zeros_like(sigma))),
         covariance=data.back(select(good, covariance, torch.zeros_like(covariance))),
     )

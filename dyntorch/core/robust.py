@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from dyntorch.core.consensus import Search, SearchResult, threshold_of
 from dyntorch.core.fit import fit_matches
 from dyntorch.core.invariant import Invariant, as_invariant
-from dyntorch.core.kernel_fit import searched_kinds
+from dyntorch.core.kernel_fit import refined_kinds, searched_kinds
 from dyntorch.core.limits import quantile
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.normalize import denormalize, relative
@@ -21,7 +22,7 @@ from dyntorch.core.residual import multilinear, whitened_residual
 from dyntorch.core.solution import NOISY, Solution
 from dyntorch.native import library
 from dyntorch.numerics.blocks import map_blocks, one_thread, select, select_problems, workers
-from dyntorch.numerics.least_squares import Minimum
+from dyntorch.numerics.least_squares import LeastSquaresOptions, Minimum, parts_of
 
 BLOCK = 1 << 16  # matches per block of the distances
 REFINEMENT_STEPS = (3, 8)
@@ -140,6 +141,29 @@ def _threshold(threshold: float | Tensor, data: Matches) -> Tensor:
 def _finish(search: Search, result: SearchResult, cut: Tensor, rounds: Sequence[int], *, estimate: bool) -> Solution:
     """Refine on the inliers, choose them again, and say how it ended."""
     invariant, data = search.invariant, search.data
+    kinds = [] if estimate or not rounds else refined_kinds(invariant, data)
+    if kinds:
+        solution, distance = _polish_by_kernel(search, result, cut, rounds, kinds)
+    else:
+        solution, distance, cut = _polish(search, result, cut, rounds, estimate=estimate)
+    cut = _update_threshold(invariant, data, distance, cut) if estimate else cut
+    evidence = search.evidence(solution.normalized, cut)
+    # a tensor that the matches leave open has no motion, and so no inliers by it
+    exact = fit_matches(invariant, search.some.restrict(result.inliers)).status.reshape(-1).to(cut.device)
+    degenerate = (exact == int(Status.DEGENERATE)) & (result.evidence < 0)
+    sigma = _sigma(invariant, data, distance, cut)
+    if estimate:
+        # with the noise unknown, a tensor whose inliers fill the scene has found nothing
+        extent = torch.stack([t.reshape(len(cut), -1, *t.shape[-2:])[:, 0, 0, 0] for t in search.norm.transforms]).amax(0)
+        evidence = torch.where(sigma * extent > NOISY, 1.0, evidence)
+    return _with_status(solution, evidence, degenerate, _within(data, distance, cut), sigma)
+
+
+def _polish(
+    search: Search, result: SearchResult, cut: Tensor, rounds: Sequence[int], *, estimate: bool
+) -> tuple[Solution, Tensor, Tensor]:
+    """The find refined on its inliers, which are chosen again after each round; distances ``(b, n)``; the threshold."""
+    invariant, data = search.invariant, search.data
     solution = _solution(search, result)
     distance, used = distances(solution), data.weights
     best: Minimum | None = None
@@ -159,17 +183,38 @@ def _finish(search: Search, result: SearchResult, cut: Tensor, rounds: Sequence[
         solution = replace(solution, normalized=select(better, moved.normalized, solution.normalized), refined=motion)
     if best is not None:  # one covariance, of the last descent that brought something
         solution = with_covariance(solution, replace(data, weights=used), best)
-    cut = _update_threshold(invariant, data, distance, cut) if estimate else cut
-    evidence = search.evidence(solution.normalized, cut)
-    # a tensor that the matches leave open has no motion, and so no inliers by it
-    exact = fit_matches(invariant, search.some.restrict(result.inliers)).status.reshape(-1).to(cut.device)
-    degenerate = (exact == int(Status.DEGENERATE)) & (result.evidence < 0)
-    sigma = _sigma(invariant, data, distance, cut)
-    if estimate:
-        # with the noise unknown, a tensor whose inliers fill the scene has found nothing
-        extent = torch.stack([t.reshape(len(cut), -1, *t.shape[-2:])[:, 0, 0, 0] for t in search.norm.transforms]).amax(0)
-        evidence = torch.where(sigma * extent > NOISY, 1.0, evidence)
-    return _with_status(solution, evidence, degenerate, _within(data, distance, cut), sigma)
+    return solution, distance, cut
+
+
+def _polish_by_kernel(
+    search: Search, result: SearchResult, cut: Tensor, rounds: Sequence[int], kinds: list[int]
+) -> tuple[Solution, Tensor]:
+    """The same by the kernel in C, with a threshold that is given."""
+    invariant, data, norm = search.invariant, search.data, search.norm
+    scales, unit = relative(norm.scales)
+    widths = [p.dim + 1 for p in invariant.primitives]
+    shapes = [torch.Size(widths[v] for v in (f.target, f.source) if v is not None) for f in invariant.motion]
+    fixed: dict[str, Any] = {
+        "parameters": sum(shape.numel() for shape in shapes),
+        "constraint": int(invariant.constraint or 0),
+        "rounds": rounds,
+        "rules": LeastSquaresOptions().rules(),
+    }
+
+    def block(
+        views: tuple[Tensor, ...], weights: Tensor, scales: tuple[Tensor, ...], limits: Tensor, basis: Tensor
+    ) -> tuple[Tensor, ...]:
+        return library.polish(kinds, views, weights, torch.stack(scales, dim=-1), limits, basis, **fixed)
+
+    views = norm.apply(invariant, data.views)
+    parts = (views, data.weights, scales, (cut * unit).square(), result.basis[:, 0, 0])
+    basis, weights, theta, cost, *terms, distance = map_blocks(block, *parts, size=max(1, -(-len(cut) // workers())))
+    gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in terms)
+    minimum = Minimum((theta,), cost / unit.square(), (gradient, matrix), torch.zeros_like(cost))
+    status = data.back(torch.full_like(cost, int(Status.OK), dtype=torch.long))
+    normalized, nothing = invariant.tensor_of(basis[:, None]), data.back(torch.zeros_like(cost))
+    moved = Solution(invariant, normalized, nothing, data, norm, normalized, refined=parts_of(theta, shapes), status=status)
+    return with_covariance(moved, replace(data, weights=weights), minimum), distance / unit[:, None]
 
 
 def _update_threshold(invariant: Invariant, data: Matches, distance: Tensor, cut: Tensor) -> Tensor:

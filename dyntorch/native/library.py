@@ -29,6 +29,7 @@ _ARGUMENTS = {
     "null_vectors": (_POINTER, _SIZE, _POINTER, _POINTER),
     "distances": (_INT, *[_POINTER] * 6, _SIZE, _SIZE, _POINTER),
     "refine": (_INT, *[_POINTER] * 6, _SIZE, _SIZE, _INT, _INT, *[_POINTER] * 6),
+    "polish": (_INT, *[_POINTER] * 6, _SIZE, _SIZE, _INT, _INT, *[_POINTER] * 9),
     "search": (_INT, *[_POINTER] * 8, _SIZE, _SIZE, *[_INT] * 5, *[_POINTER] * 7),
 }
 MAX_SLOTS, MAX_SPACE = 6, 8
@@ -249,6 +250,32 @@ def refine(
         (ctypes.c_double * len(rules))(*rules),
     )
     call("refine", *_slots(kinds, views), *data, *(part.data_ptr() for part in found))
+    return found
+
+
+def polish(
+    kinds: Sequence[int],
+    views: Sequence[Tensor],
+    weights: Tensor,
+    scales: Tensor,
+    limits: Tensor,
+    tensors: Tensor,
+    *,
+    parameters: int,
+    constraint: int,
+    rounds: Sequence[int],
+    rules: Sequence[float],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Tensors ``(b, D)`` that a search found, refined on their inliers, chosen again after each round: data as in :func:`search`
+    -> tensors, weights of the inliers ``(b, n)``, motion ``(b, p)``, cost, gradient, Gauss-Newton matrix, distances ``(b, n)``."""
+    scales, limits = scales.contiguous(), limits.contiguous()
+    batch, new = len(weights), weights.new_empty
+    tensors, weights = (x.clone(memory_format=_torch().contiguous_format) for x in (tensors, weights))
+    square = (batch, parameters, parameters)
+    found = (tensors, weights, new(square[:2]), new(batch), new(square[:2]), new(square), _torch().empty_like(weights))
+    steps, numbers = (_INT * len(rounds))(*rounds), (ctypes.c_double * len(rules))(*rules)
+    data = (scales.data_ptr(), limits.data_ptr(), *weights.shape, constraint, len(rounds), steps, numbers)
+    call("polish", *_slots(kinds, views), *data, *(part.data_ptr() for part in found))
     return found
 
 

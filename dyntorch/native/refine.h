@@ -233,3 +233,84 @@ int EXPORT(refine)(int slots, const int *kinds, const int *dims, const double *c
   free(memory);
   return 0;
 }
+
+/* Norm 1, the largest entry positive. */
+static void canonical(double *x, int size) {
+  int most = 0;
+  for (int i = 1; i < size; i++) if (fabs(x[i]) > fabs(x[most])) most = i;
+  double sign = x[most] < 0 ? -1 : 1;
+  unit_length(x, size);
+  for (int i = 0; i < size; i++) x[i] *= sign;
+}
+
+/* The motion of a tensor, entries in the order of the views: as decompose of the invariants has it. */
+static void decompose(const double *f, int constraint, int size, double *theta) {
+  if (constraint != RANK_TWO) { memcpy(theta, f, sizeof(double) * size); unit_length(theta, size); return; }
+  double e1[3], *e2 = theta + 9, F[9];
+  null_vectors(f, e1, e2);
+  canonical(e1, 3);
+  canonical(e2, 3);
+  memcpy(F, f, sizeof F);
+  canonical(F, 9);
+  const double S[3][3] = {{0, -e2[2], e2[1]}, {e2[2], 0, -e2[0]}, {-e2[1], e2[0], 0}};
+  for (int i = 0; i < 3; i++) for (int j = 0; j < 3; j++) {
+    theta[3 * i + j] = 0.70710678118654752 * e2[i] * e1[j];
+    for (int k = 0; k < 3; k++) theta[3 * i + j] -= S[i][k] * F[3 * j + k];
+  }
+  unit_length(theta, 9);
+}
+static void compose(const double *theta, int constraint, int size, double *f) {
+  double slope[12][9];
+  if (constraint == RANK_TWO) compose_fundamental(theta, f, slope);
+  else memcpy(f, theta, sizeof(double) * size);
+}
+
+/* What a robust search found, refined on its inliers, which are chosen again after each of so many rounds of so many steps: tensors
+   (batch, D) and weights (batch, n) in, both replaced by those of the last round that lost less, limits of the squared distance
+   (batch) -> motion, cost, gradient, matrix as refine, and distances (batch, n).  0, or 1 without memory. */
+int EXPORT(polish)(int slots, const int *kinds, const int *dims, const double *const *views, const ptrdiff_t *strides,
+                   const double *scales, const double *limits, ptrdiff_t batch, ptrdiff_t n, int constraint, int rounds,
+                   const int *iterations, const double *rules, double *tensors, double *weights, double *motion, double *cost,
+                   double *gradient, double *matrix, double *distance) {
+  Slot slot[MAX_SLOTS];
+  Bundle b;
+  int coordinates = describe(&b, slot, slots, kinds, dims, views, strides, n), D = b.D, count = constraint == RANK_TWO ? 12 : D;
+  double *memory = malloc(sizeof(double) * ((size_t)(coordinates + 4) * b.padded + 1));
+  if (!memory) return 1;
+  double *weight = memory + (size_t)coordinates * b.padded, *inlying = weight + b.padded, *rows = inlying + b.padded, *square = rows + b.padded;
+  b.rules = rules;
+  for (ptrdiff_t p = 0; p < batch; p++) {
+    double *tensor = tensors + p * D, limit = limits[p], found[MAX_ENTRIES], score;
+    Place at = {.cost = INFINITY}, kept = {.cost = INFINITY};
+    take(&b, p, weights, scales, memory, weight);
+    memcpy(found, tensor, sizeof(double) * D);
+    constrain(found, constraint, dims[0] + 1);
+    if (largest(found, D) > 0) memcpy(tensor, found, sizeof(double) * D);
+    distances(&b, tensor, b.columns, square, rows);
+    score = score_of(&b, tensor, b.columns, weight, limit, 0, 0);
+    decompose(tensor, constraint, D, kept.theta);
+    for (int round = 0; round < rounds; round++) {
+      for (ptrdiff_t k = 0; k < b.padded; k++) inlying[k] = square[k] <= limit ? weight[k] : 0;
+      at = kept;
+      b.weights = inlying;
+      descend(&b, constraint, iterations[round], &at);
+      b.weights = weight;
+      if (isfinite(at.cost)) compose(at.theta, constraint, D, found);
+      else compose(memcpy(at.theta, kept.theta, sizeof at.theta), constraint, D, found);
+      double fresh = score_of(&b, found, b.columns, weight, limit, 0, 0);
+      if (round && !(fresh < score)) continue;
+      score = fresh;
+      kept = at;
+      memcpy(tensor, found, sizeof(double) * D);
+      memcpy(weights + p * n, inlying, sizeof(double) * n);
+      distances(&b, tensor, b.columns, square, rows);
+    }
+    memcpy(motion + p * count, kept.theta, sizeof(double) * count);
+    memcpy(gradient + p * count, kept.gradient, sizeof(double) * count);
+    memcpy(matrix + p * count * count, kept.matrix, sizeof(double) * count * count);
+    cost[p] = kept.cost;
+    for (ptrdiff_t k = 0; k < n; k++) distance[p * n + k] = sqrt(square[k]);
+  }
+  free(memory);
+  return 0;
+}
