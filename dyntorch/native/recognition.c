@@ -15,7 +15,7 @@
 #define JOIN(name, suffix) JOIN_(name, suffix)
 #define EXPORT(name) __attribute__((visibility("default"))) JOIN(name, SUFFIX)
 
-enum { WIDE = 2 * LANES, MAX_WIDTH = 9, MAX_SLOPES = 28, PANEL = 32, ROUNDS = LANES == 8 ? 2 : 1, QUERIES = 3 };
+enum { WIDE = 2 * LANES, MAX_WIDTH = 9, MAX_SLOPES = 28, PANEL = 32, ROUNDS = LANES == 8 ? 2 : 1, QUERIES = 3, FEW = 4 };
 #define UNROLLED static inline __attribute__((always_inline))
 typedef float floats __attribute__((vector_size(8 * LANES)));
 typedef float unaligned_floats __attribute__((vector_size(8 * LANES), aligned(4)));
@@ -153,23 +153,54 @@ UNROLLED void residuals(const floats c[4], const float *l, const floats m[3], in
   for (int t = 0; t < 3; t++) if (terms & 1 << t) out[t] = larger(all(1) + epsilon - out[t], epsilon);
 }
 
-/* Some queries with a panel of one channel: the products so far times what is left of it. */
+/* Of one query and the exemplars from a place of a panel on: the products so far times what is left of one channel. */
+UNROLLED void multiply_left(const floats c[4], const Channel *one, ptrdiff_t query, int place, const float factors[3][PANEL],
+                            const Tables *tables, int first) {
+  floats m[3], out[3];
+  for (int i = 0; i < 3; i++) m[i] = *(const unaligned_floats *)(factors[i] + place);
+  residuals(c, one->left_factor + 3 * query, m, tables->every, all(tables->epsilon), out);
+  for (int t = 0; t < tables->count; t++) {
+    unaligned_floats *product = (unaligned_floats *)(tables->products + t * tables->step + query * PANEL + place);
+    floats total = first ? all(1) : *product;
+    for (int k = 0; k < 3; k++) if (tables->terms[t] & 1 << k) total *= out[k];
+    *product = total;
+  }
+}
+
+/* One query with some exemplars of one channel, pair by pair: of few queries a panel costs more than its products. */
+static void compare_one(const Channel *one, ptrdiff_t query, ptrdiff_t exemplar, int count, const float factors[3][PANEL],
+                        const Tables *tables, int first) {
+  const float *left = one->left + query * 2 * one->size;
+  float c[4][PANEL] = {{0}};
+  for (int p = 0; p < count; p++) {
+    const float *right = one->right + (exemplar + p) * 2 * one->size;
+    floats sums[4] = {all(0), all(0), all(0), all(0)};
+    int k = 0;
+    for (; k + WIDE <= one->size; k += WIDE) for (int a = 0; a < 4; a++) {
+      const float *u = left + a / 2 * one->size + k, *v = right + a % 2 * one->size + k;
+      sums[a] += *(const unaligned_floats *)u * *(const unaligned_floats *)v;
+    }
+    for (int a = 0; a < 4; a++) {
+      for (int v = 0; v < WIDE; v++) c[a][p] += sums[a][v];
+      for (int i = k; i < one->size; i++) c[a][p] += left[a / 2 * one->size + i] * right[a % 2 * one->size + i];
+    }
+  }
+  for (int place = 0; place < PANEL; place += WIDE) {
+    floats four[4];
+    for (int a = 0; a < 4; a++) four[a] = *(const unaligned_floats *)(c[a] + place);
+    multiply_left(four, one, query, place, factors, tables, first);
+  }
+}
+
+/* Some queries with a panel of one channel. */
 UNROLLED void compare(const Channel *one, ptrdiff_t query, const float *panel, const float factors[3][PANEL], const int queries,
                       const Tables *tables, int first) {
   for (int at = 0; at < PANEL; at += ROUNDS * WIDE) {
     floats c[QUERIES][2][2][ROUNDS];
     multiply(one->left + query * 2 * one->size, panel + at, one->size, queries, c);
     for (int q = 0; q < queries; q++) for (int r = 0; r < ROUNDS; r++) {
-      floats four[4] = {c[q][0][0][r], c[q][0][1][r], c[q][1][0][r], c[q][1][1][r]}, m[3], out[3];
-      int place = at + r * WIDE;
-      for (int i = 0; i < 3; i++) m[i] = *(const unaligned_floats *)(factors[i] + place);
-      residuals(four, one->left_factor + 3 * (query + q), m, tables->every, all(tables->epsilon), out);
-      for (int t = 0; t < tables->count; t++) {
-        unaligned_floats *product = (unaligned_floats *)(tables->products + t * tables->step + (query + q) * PANEL + place);
-        floats total = first ? all(1) : *product;
-        for (int k = 0; k < 3; k++) if (tables->terms[t] & 1 << k) total *= out[k];
-        *product = total;
-      }
+      floats four[4] = {c[q][0][0][r], c[q][0][1][r], c[q][1][0][r], c[q][1][1][r]};
+      multiply_left(four, one, query + q, at + r * WIDE, factors, tables, first);
     }
   }
 }
@@ -194,13 +225,14 @@ int EXPORT(lower_residuals)(int channels, const float *const *left, const float 
       for (int p = 0; p < PANEL; p++) {
         ptrdiff_t from = e + (p < here ? p : here - 1);
         const float *image = one.right + from * 2 * one.size;
-        for (int k = 0; k < one.size; k++) {
+        for (int k = 0; k < one.size && num_queries > FEW; k++) {
           panel[2 * k * PANEL + p] = image[k];
           panel[(2 * k + 1) * PANEL + p] = image[one.size + k];
         }
         for (int k = 0; k < 3; k++) factors[k][p] = one.right_factor[3 * from + k];
       }
       ptrdiff_t q = 0;
+      for (; q < num_queries && num_queries <= FEW; q++) compare_one(&one, q, e, here, factors, &products, i == 0);
       for (; q + QUERIES <= num_queries; q += QUERIES) compare(&one, q, panel, factors, QUERIES, &products, i == 0);
       for (; q < num_queries; q++) compare(&one, q, panel, factors, 1, &products, i == 0);
     }

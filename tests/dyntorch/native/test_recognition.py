@@ -47,7 +47,7 @@ def test_residuals_of_all_pairs_are_those_of_torch(monkeypatch):
     wrong = []
     for level in levels(monkeypatch):
         monkeypatch.setattr(recognition, "load", library.load)
-        for queries, exemplars, sizes in ((1, 1, (5,)), (7, 33, (40, 17, 3)), (4, 70, (24, 24, 20))):
+        for queries, exemplars, sizes in ((1, 1, (5,)), (7, 33, (40, 17, 3)), (4, 70, (24, 24, 20)), (6, 70, (9, 33, 20))):
             left, right = (
                 [part.float() for i, size in enumerate(sizes) for part in factorize(random(count, 2, size, seed=i + seed))]
                 for count, seed in ((queries, 0), (exemplars, 9))
