@@ -259,15 +259,15 @@ def fit_fundamental(
     several = torch.stack([eight_point_of(data, weights, 0), affine_fundamental(x1, x2, weights)], dim=-3)
     several = several if starts is None else torch.cat([several, starts], dim=-3)
 
-    def fitted(several: Tensor, scales: Sequence[float], steps: int) -> tuple[Tensor, Tensor]:
+    def descend_from(several: Tensor, scales: Sequence[float], steps: int) -> tuple[Tensor, Tensor]:
         count = several.shape[-3]
         spread = weights[..., None, :].expand(*weights.shape[:-1], count, -1).flatten(-3, -2)
         F, cost = _descend(data, several.flatten(-4, -3), spread, scales, steps)
         return F.unflatten(-3, (-1, count)), cost.unflatten(-1, (-1, count))
 
-    F, cost = fitted(several, scales, steps)
+    F, cost = descend_from(several, scales, steps)
     if starts is not None:
-        F0, cost0 = fitted(starts, scales[-1:], 0)
+        F0, cost0 = descend_from(starts, scales[-1:], 0)
         F, cost = torch.cat([F, F0], dim=-3), torch.cat([cost, cost0], dim=-1)
     best = cost.argmin(-1, keepdim=True)
     picked = F.gather(-3, best[..., None, None].expand(*best.shape, 3, 3))

@@ -139,7 +139,7 @@ def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
     if matrix.device.type == "mps":  # no float64
         return null_space(matrix.cpu(), dim).to(matrix.device)
     keep = torch.is_grad_enabled() and matrix.requires_grad
-    solve = NullSpaceOfRows.apply if _differentiated(matrix) else _of_rows
+    solve = NullSpaceOfRows.apply if _needs_autograd(matrix) else _of_rows
     basis: Tensor = solve(_flat(matrix), dim, keep)[0]
     return basis.reshape(*matrix.shape[:-2], dim, size)
 
@@ -153,7 +153,7 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
     if gram.device.type == "mps":  # no float64
         space = gram_null_space(gram.cpu(), dim)
         return GramNullSpace(*(part.to(gram.device) for part in vars(space).values()))
-    solve = NullSpaceOfGrams.apply if _differentiated(gram) else _of_grams
+    solve = NullSpaceOfGrams.apply if _needs_autograd(gram) else _of_grams
     basis, residual, competing, degenerate = solve(_flat(gram), dim)
     batch = gram.shape[:-2]
     return GramNullSpace(
@@ -161,7 +161,7 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
     )
 
 
-def _differentiated(matrix: Tensor) -> bool:
+def _needs_autograd(matrix: Tensor) -> bool:
     """Whether autograd has to know of the solver: its bookkeeping takes as long as a small null space."""
     return needs_gradient(matrix) or is_transformed(matrix)
 

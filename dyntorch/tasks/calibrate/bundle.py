@@ -143,7 +143,7 @@ class PointFactor:
         l21 = (normal.matrix[:, 2, 1] - l20 * l10) * i1
         i2 = one_over(diagonal[2] - l20.square() - l21.square())
 
-        def solved(right: Tensor) -> Tensor:
+        def apply_inverse(right: Tensor) -> Tensor:
             out = torch.empty_like(right)
             extra = (slice(None), *[None] * (right.ndim - 3))
             first = torch.mul(right[:, 0], i0[extra], out=out[:, 0])
@@ -152,7 +152,7 @@ class PointFactor:
             third.addcmul_(l21[extra], second, value=-1).mul_(i2[extra])
             return out.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
 
-        return PointFactor((i0, i1, i2), (l10, l20, l21), solved(normal.mixed), solved(normal.slope))
+        return PointFactor((i0, i1, i2), (l10, l20, l21), apply_inverse(normal.mixed), apply_inverse(normal.slope))
 
     def steps(self, moves: Tensor) -> Tensor:
         """Steps ``(b, 3, G)`` of the points with those of the p parameters ``(b, p)``."""
@@ -200,10 +200,10 @@ class RigAdjustment(LeastSquares):
 
     def _evaluate(self, state: RigState, seen: Planes) -> Iterate:
         share = (_images(state, self.views.centers) - seen.x).square().sum(2) / (self.freedom * self.sigma.square()[..., None])
-        total = (self._known(seen) * (self.freedom + 2) * share.log1p_()).sum((1, 2)) + self.priors.costs(state)
+        total = (self._position_weights(seen) * (self.freedom + 2) * share.log1p_()).sum((1, 2)) + self.priors.costs(state)
         return Iterate(tuple(state), torch.where(total.isfinite(), total, torch.inf), tuple(seen))
 
-    def _known(self, seen: Planes) -> Tensor:
+    def _position_weights(self, seen: Planes) -> Tensor:
         return self.weights.flatten(2) * (seen.weights > 0)
 
     def step(self, at: Iterate, damping: Tensor) -> Tensors:
@@ -235,7 +235,7 @@ class RigAdjustment(LeastSquares):
         error = _images(state, self.views.centers) - seen.x
         spread = self.sigma.square()[..., None]
         share = error.square().sum(2) / (self.freedom * spread)
-        return error, self._known(seen) * (self.freedom + 2) / self.freedom / (1 + share) / spread
+        return error, self._position_weights(seen) * (self.freedom + 2) / self.freedom / (1 + share) / spread
 
     def linear(self, state: RigState, seen: Planes | None = None) -> RigNormal:
         """The normal equations at a state."""
