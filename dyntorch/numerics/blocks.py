@@ -7,12 +7,13 @@ five to twenty times longer than one thread takes for the whole.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from functools import _lru_cache_wrapper, cached_property, lru_cache, partial, wraps
+from functools import _lru_cache_wrapper, lru_cache, partial, wraps
 from threading import Barrier, local
 from typing import Any, ParamSpec, TypeVar
 
@@ -263,22 +264,36 @@ def constant(make: Callable[Sizes, Table]) -> _lru_cache_wrapper[Table]:
 # Random numbers from the caller's generator, wherever it lives.
 
 
+GOLDEN, SECOND, THIRD = (value - 2**64 for value in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+"""The odd numbers of splitmix64, as int64 has them (Steele, Lea and Flood 2014)."""
+
+
 class Draws:
-    """A stream of random numbers for each problem of a batch: what one gets does not depend on how the others fare."""
+    """A stream of random numbers for each problem of a batch: what one gets does not depend on how the others fare.
+
+    The k-th number of a problem is a hash of its seed and k, so all are drawn at once, on any device the same.
+    """
 
     def __init__(self, count: int, generator: torch.Generator | None, device: torch.device) -> None:
-        home, self.device = device if generator is None else generator.device, device
-        self.home, self.seeds = home, torch.randint(2**62, (count,), generator=generator, device=home)
-
-    @cached_property
-    def streams(self) -> list[torch.Generator]:
-        """One generator per problem."""
-        return [torch.Generator(device=self.home).manual_seed(seed) for seed in self.seeds.tolist()]
+        home = device if generator is None else generator.device
+        self.seeds = torch.randint(2**62, (count,), generator=generator, device=home).to(device)
+        self.drawn = torch.zeros_like(self.seeds)
 
     def __call__(self, where: Tensor, *shape: int) -> Tensor:
         """The next numbers in [0, 1) of some problems, ``(problems, *shape)`` float64."""
-        drawn = [torch.rand(*shape, generator=self.streams[i], dtype=torch.float64, device=self.home) for i in where.tolist()]
-        return torch.stack(drawn).to(self.device) if drawn else torch.zeros(0, *shape, dtype=torch.float64, device=self.device)
+        count = math.prod(shape)
+        index = self.drawn[where, None] + torch.arange(1, count + 1, device=self.seeds.device)
+        self.drawn[where] += count
+        x = self.seeds[where, None] + index * GOLDEN
+        for shift, factor in ((30, SECOND), (27, THIRD)):
+            x = (x ^ _shift_right(x, shift)) * factor
+        x = x ^ _shift_right(x, 31)
+        return (_shift_right(x, 11).double() * 2.0**-53).reshape(len(x), *shape)
+
+
+def _shift_right(x: Tensor, by: int) -> Tensor:
+    """Bits of int64 shifted as those of a number without sign."""
+    return (x >> by) & ((1 << (64 - by)) - 1)
 
 
 def uniform(*shape: int, generator: torch.Generator | None, device: torch.device) -> Tensor:
