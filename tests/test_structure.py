@@ -17,9 +17,9 @@ MAX_FIELDS = 12
 """Fields of the options of one verb."""
 BOUNDS = {
     "files": 347,
-    "lines": 94_083,
-    "code lines": 58_325,
-    "docstring lines": 14_370,
+    "lines": 94_410,
+    "code lines": 58_525,
+    "docstring lines": 14_410,
     "option fields": 111,
     "option fields that nobody sets": 0,
     "functions called by an everyday word": 2,
@@ -27,7 +27,7 @@ BOUNDS = {
     "circles of imports": 0,
     "circles of imports, those for types too": 0,
     "lines of experiments": 19_000,
-    "lines of tests": 54_211,
+    "lines of tests": 54_310,
 }
 """What each figure may be at most."""
 
