@@ -51,7 +51,8 @@ def robust_fit(
     :math:`d_n` and a scale a that shrinks to the threshold (Geman-McClure loss, annealed).  The first start weighs all matches
     alike.  Where what it finds could be chance, or leaves many matches just beyond the threshold, 4, 16, then 64 random
     subsets are the starts (2.5 times the minimal number of matches; for minimal samples of 8 or fewer those themselves, 32 per
-    start); no more where a quarter of 16 or more starts end at the best answer: others would find it again.  The least truncated
+    start, and until one of inliers alone was missed once in a thousand times); no more where a quarter of 16 or more starts end
+    at the best answer: others would find it again.  The least truncated
     square sum (MSAC) wins, and is refined on its inliers by :func:`dyntorch.refine`.
 
     The status is ``NO_CONSENSUS`` where random matches would do as well: with n matches, k of them inliers, m the minimal
