@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dyntorch.core.invariant import Invariant
+from dyntorch.core.invariant import Constraint, Invariant
 from dyntorch.core.kernel_fit import searched_kinds
 from dyntorch.core.limits import quantile
 from dyntorch.core.matches import Matches
@@ -398,6 +398,10 @@ class Search:
                 max(1, count // STARTS_PER_ANNEALED_SAMPLE),
             )
             return self._by_kernel(where, cut[where], seeds, starts=starts, keep=keep, iterations=REWEIGHTINGS["minimal"])
+        if self.kinds and self.invariant.constraint is Constraint.HOMOGRAPHIES:
+            # most starts are guided by motions, which the kernel knows of this invariant alone
+            seeds, steps = self.draws.seeds[where] + count, REWEIGHTINGS["many"]
+            return self._by_kernel(where, cut[where], seeds, starts=count, keep=count, iterations=steps, subsets=True)
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
         kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
         steps = REWEIGHTINGS[kind]
@@ -462,7 +466,8 @@ class Search:
     ) -> SearchResult:
         """The search, or the judgement of given tensors ``(b, D)``, by the kernel in C."""
         minimal = self.invariant.minimal()
-        rules = (SHRINKING_SHARE, NUM_CONCENTRATIONS, NUM_SHUFFLES, MAX_NEAR_MISSES, MIN_STARTS_TO_COMPARE, SAME_SCORE)
+        counts = MIN_STARTS_TO_COMPARE, SAME_SCORE, GUIDED_REWEIGHTINGS, STARTS_PER_UNGUIDED
+        rules = (SHRINKING_SHARE, NUM_CONCENTRATIONS, NUM_SHUFFLES, MAX_NEAR_MISSES, *counts)
 
         def block(searched: SearchMatches, limit: Tensor, seeds: Tensor | None, given: Tensor | None) -> SearchResult:
             views = tuple(x[:, 0] for x in searched.views)

@@ -63,6 +63,8 @@ class Constraint(IntEnum):
     """To the nearest matrix of rank two."""
     NONSINGULAR = 2
     """0 in place of singular matrices."""
+    HOMOGRAPHIES = 3
+    """None; the kernel knows the motion, two collineations."""
 
 
 @dataclass(frozen=True)

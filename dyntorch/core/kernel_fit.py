@@ -45,8 +45,8 @@ def searched_kinds(invariant: Invariant, views: Sequence[Tensor], weights: Tenso
 
 
 def refined_kinds(invariant: Invariant, data: Matches) -> list[int]:
-    """The same of refinement, which knows the motions of fundamental matrices and collineations."""
-    known = invariant.constraint in (Constraint.RANK_TWO, Constraint.NONSINGULAR) and data.static is None
+    """The same of refinement, which knows the motions of fundamental matrices, collineations and homography tensors."""
+    known = invariant.constraint not in (None, Constraint.NONE) and data.static is None
     return searched_kinds(invariant, data.views, data.weights) if known else []
 
 

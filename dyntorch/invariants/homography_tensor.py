@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyntorch.core.invariant import Frame, Invariant
+from dyntorch.core.invariant import Constraint, Frame, Invariant
 from dyntorch.core.normalize import unit_tensors
 from dyntorch.core.primitives import Point
 from dyntorch.geometry.extensors import levi_civita
@@ -44,6 +44,7 @@ class HomographyTensor(Invariant):
     motion = (Frame(0, 1), Frame(0, 2))
     dof = 16
     labels_static = True
+    constraint = Constraint.HOMOGRAPHIES
 
     @staticmethod
     def compose(A: Tensor, B: Tensor) -> Tensor:

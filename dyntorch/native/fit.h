@@ -152,7 +152,7 @@ static void next_vector(Pack *p) {
 enum { RESOLVED, GRAM_ROUNDING, CONDITION, NOISE, NARROW_WIDTH, SPARE_ROWS, CHANCE_FACTOR, CHANCE_QUANTILE };  /* limits: see fit.py */
 enum { OK = 0, DEGENERATE = 2, AMBIGUOUS = 3 };  /* dyntorch.Status */
 enum { UNDECIDED = 1, WEAK = 2 };  /* left to the caller altogether; the noise is to be read off */
-enum { ANY_TENSOR, RANK_TWO, NONSINGULAR };  /* internal constraints */
+enum { ANY_TENSOR, RANK_TWO, NONSINGULAR, HOMOGRAPHIES };  /* internal constraints */
 
 typedef struct { double residual, sum, trace, next; int certified; } Spectrum;
 

@@ -15,6 +15,7 @@
 #include "lanes.h"
 #include "null_space.h"
 #include "fit.h"
+#include "motion.h"
 #include "search.h"
 #include "refine.h"
 

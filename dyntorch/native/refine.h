@@ -1,7 +1,6 @@
-/* Refinement: Levenberg-Marquardt on the motion of a fundamental matrix or a collineation, one problem after the other; the
-   mathematics is that of dyntorch/core/refine.py and numerics/least_squares.py. */
+/* Refinement: Levenberg-Marquardt on the motion of a fundamental matrix, a collineation or a homography tensor, one problem after
+   the other; the mathematics is that of dyntorch/core/refine.py and numerics/least_squares.py. */
 
-enum { MAX_PARAMETERS = 16, MAX_ENTRIES = 16 };
 enum { FIRST_DAMPING, INCREASE, DECREASE, LEAST_DAMPING, STUCK_DAMPING, TOLERANCE, SHORT_STEP };  /* rules, see least_squares.py */
 
 typedef struct { double theta[MAX_PARAMETERS], cost, gradient[MAX_PARAMETERS], matrix[MAX_PARAMETERS * MAX_PARAMETERS]; } Place;
@@ -19,23 +18,25 @@ static inline void add_residual(Sums *sums, lanes weight, lanes r, const lanes *
   }
 }
 
-/* Signed Sampson distances of a form of two points, and their derivatives by its entries. */
-static void add_form(const Bundle *b, const double *f, Sums *sums) {
-  double own[2] = {b->scales[0] * b->scales[0], b->scales[1] * b->scales[1]};
-  int d0 = b->slots[0].dim, d1 = b->slots[1].dim;
+/* Signed Sampson distances of a form of two or three points, and their derivatives by its entries. */
+static inline __attribute__((always_inline)) void add_form(const Bundle *b, const double *f, Sums *sums, int count, int d0, int d1, int d2) {
+  const int dims[3] = {d0, d1, d2}, last = count > 2 ? d2 + 1 : 1;
   for (ptrdiff_t k = 0; k < b->padded; k += LANES) {
-    lanes slopes[3][MAX_SPACE + 1], entry[MAX_ENTRIES], total = all(SINGULAR_SLOPE), value = form_of(f, b->columns, b->padded, k, 2, d0 + 1, d1 + 1, 1, slopes);
-    for (int c = 0; c < d0; c++) total += own[0] * slopes[0][c] * slopes[0][c];
-    for (int c = 0; c < d1; c++) total += own[1] * slopes[1][c] * slopes[1][c];
+    lanes slopes[3][MAX_SPACE + 1], entry[MAX_ENTRIES], u[3][MAX_SPACE + 1], total = all(SINGULAR_SLOPE);
+    lanes value = form_of(f, b->columns, b->padded, k, count, d0 + 1, d1 + 1, last, slopes);
+    for (int s = 0; s < count; s++) for (int c = 0; c < dims[s]; c++) total += b->scales[s] * b->scales[s] * slopes[s][c] * slopes[s][c];
     lanes length = all(1) / root(total), share = value / total;
-    for (int i = 0; i <= d0; i++) {
-      lanes u = i < d0 ? AT(b->columns[0] + i * b->padded, k) : all(1), bent = i < d0 ? u - share * own[0] * slopes[0][i] : u;
-      for (int j = 0; j <= d1; j++) {
-        lanes x = j < d1 ? AT(b->columns[1] + j * b->padded, k) : all(1);
-        entry[i * (d1 + 1) + j] = (bent * x - (j < d1 ? share * own[1] * u * slopes[1][j] : all(0))) * length;
-      }
+    for (int s = 0; s < count; s++) {  /* slopes: from here on what the entries of a slot take from the residual */
+      for (int c = 0; c <= dims[s]; c++) u[s][c] = c < dims[s] ? AT(b->columns[s] + c * b->padded, k) : all(1);
+      for (int c = 0; c < dims[s]; c++) slopes[s][c] *= share * (b->scales[s] * b->scales[s]);
+      slopes[s][dims[s]] = all(0);
     }
-    add_residual(sums, AT(b->weights, k), value * length, entry, (d0 + 1) * (d1 + 1));
+    for (int i = 0; i <= d0; i++) for (int j = 0; j <= d1; j++) {
+      lanes product = u[0][i] * u[1][j], bent = u[0][i] * (u[1][j] - slopes[1][j]) - slopes[0][i] * u[1][j];
+      if (count == 2) entry[i * (d1 + 1) + j] = bent * length;
+      else for (int l = 0; l < last; l++) entry[(i * (d1 + 1) + j) * last + l] = (bent * u[2][l] - product * slopes[2][l]) * length;
+    }
+    add_residual(sums, AT(b->weights, k), value * length, entry, (d0 + 1) * (d1 + 1) * last);
   }
 }
 
@@ -98,40 +99,16 @@ static void add_transfer(const Bundle *b, const double *A, Sums *sums) {
   }
 }
 
-/* The form [e]_x A at norm 1, entries in the order of the views, and its derivative (12, 9) by A and e. */
-static void compose_fundamental(const double *theta, double *f, double slope[12][9]) {
-  const double *A = theta, *e = theta + 9, S[3][3] = {{0, -e[2], e[1]}, {e[2], 0, -e[0]}, {-e[1], e[0], 0}};
-  double length = 0;
-  memset(slope, 0, sizeof(double) * 108);
-  for (int i = 0; i < 3; i++) for (int j = 0; j < 3; j++) {
-    f[3 * j + i] = S[i][0] * A[j] + S[i][1] * A[3 + j] + S[i][2] * A[6 + j];
-    length += f[3 * j + i] * f[3 * j + i];
-    for (int k = 0; k < 3; k++) {
-      slope[3 * k + j][3 * j + i] = S[i][k];
-      if (i != k) slope[9 + 3 - i - k][3 * j + i] = ((k - i + 3) % 3 == 1 ? -1 : 1) * A[3 * k + j];
-    }
-  }
-  length = length > 0 ? sqrt(length) : 1;
-  for (int i = 0; i < 9; i++) f[i] /= length;
-  for (int p = 0; p < 12; p++) {
-    double along = 0;
-    for (int i = 0; i < 9; i++) along += slope[p][i] * f[i];
-    for (int i = 0; i < 9; i++) slope[p][i] = (slope[p][i] - along * f[i]) / length;
-  }
-}
-
 /* Cost, gradient and Gauss-Newton matrix, parts of the motion at norm 1. */
 static void evaluate(const Bundle *b, int constraint, Place *at) {
   Sums sums;
-  int entries = b->D, count = constraint == RANK_TWO ? 12 : entries;
-  double f[MAX_ENTRIES], slope[12][9], gradient[MAX_ENTRIES], matrix[MAX_ENTRIES][MAX_ENTRIES];
+  int entries = b->D, count = parameters_of(constraint, b->D);
+  double f[MAX_ENTRIES], slope[MAX_PARAMETERS][MAX_ENTRIES], gradient[MAX_ENTRIES], matrix[MAX_ENTRIES][MAX_ENTRIES];
   memset(&sums, 0, sizeof sums);
-  unit_length(at->theta, constraint == RANK_TWO ? 9 : count);
-  if (constraint == RANK_TWO) {
-    unit_length(at->theta + 9, 3);
-    compose_fundamental(at->theta, f, slope);
-    add_form(b, f, &sums);
-  } else add_transfer(b, at->theta, &sums);
+  compose(at->theta, constraint, entries, f, slope);
+  if (constraint == RANK_TWO) add_form(b, f, &sums, 2, 2, 2, 0);
+  else if (constraint == HOMOGRAPHIES) add_form(b, f, &sums, 3, 2, 2, 2);
+  else add_transfer(b, f, &sums);
   at->cost = 0;
   for (int v = 0; v < LANES; v++) at->cost += sums.cost[v];
   if (!(at->cost <= 1e300)) at->cost = INFINITY;
@@ -144,21 +121,21 @@ static void evaluate(const Bundle *b, int constraint, Place *at) {
       matrix[i][j] = matrix[j][i] = total;
     }
   }
-  if (constraint != RANK_TWO) {
+  if (constraint == NONSINGULAR) {
     for (int i = 0; i < count; i++) { at->gradient[i] = gradient[i]; memcpy(at->matrix + i * count, matrix[i], sizeof(double) * count); }
     return;
   }
   for (int p = 0; p < count; p++) {
-    double bent[9];
+    double bent[MAX_ENTRIES];
     at->gradient[p] = 0;
-    for (int i = 0; i < 9; i++) {
+    for (int i = 0; i < entries; i++) {
       at->gradient[p] += slope[p][i] * gradient[i];
       bent[i] = 0;
-      for (int j = 0; j < 9; j++) bent[i] += slope[p][j] * matrix[j][i];
+      for (int j = 0; j < entries; j++) bent[i] += slope[p][j] * matrix[j][i];
     }
     for (int q = 0; q < count; q++) {
       at->matrix[p * count + q] = 0;
-      for (int i = 0; i < 9; i++) at->matrix[p * count + q] += bent[i] * slope[q][i];
+      for (int i = 0; i < entries; i++) at->matrix[p * count + q] += bent[i] * slope[q][i];
     }
   }
 }
@@ -189,7 +166,7 @@ static void damped_step(const Place *at, int count, double damping, double *step
 
 /* Steps from one place until they no longer lower the cost; how many. */
 static int descend(const Bundle *b, int constraint, int iterations, Place *at) {
-  int count = constraint == RANK_TWO ? 12 : b->D;
+  int count = parameters_of(constraint, b->D);
   double damping = b->rules[FIRST_DAMPING], step[MAX_PARAMETERS];
   evaluate(b, constraint, at);
   if (!isfinite(at->cost)) return 0;
@@ -216,7 +193,7 @@ int EXPORT(refine)(int slots, const int *kinds, const int *dims, const double *c
                    const double *rules, double *motion, double *cost, double *gradient, double *matrix, long long *steps) {
   Slot slot[MAX_SLOTS];
   Bundle b;
-  int coordinates = describe(&b, slot, slots, kinds, dims, views, strides, n), count = constraint == RANK_TWO ? 12 : b.D;
+  int coordinates = describe(&b, slot, slots, kinds, dims, views, strides, n), count = parameters_of(constraint, b.D);
   double *memory = malloc(sizeof(double) * ((size_t)(coordinates + 1) * b.padded + 1));
   if (!memory) return 1;
   b.rules = rules;
@@ -234,37 +211,6 @@ int EXPORT(refine)(int slots, const int *kinds, const int *dims, const double *c
   return 0;
 }
 
-/* Norm 1, the largest entry positive. */
-static void canonical(double *x, int size) {
-  int most = 0;
-  for (int i = 1; i < size; i++) if (fabs(x[i]) > fabs(x[most])) most = i;
-  double sign = x[most] < 0 ? -1 : 1;
-  unit_length(x, size);
-  for (int i = 0; i < size; i++) x[i] *= sign;
-}
-
-/* The motion of a tensor, entries in the order of the views: as decompose of the invariants has it. */
-static void decompose(const double *f, int constraint, int size, double *theta) {
-  if (constraint != RANK_TWO) { memcpy(theta, f, sizeof(double) * size); unit_length(theta, size); return; }
-  double e1[3], *e2 = theta + 9, F[9];
-  null_vectors(f, e1, e2);
-  canonical(e1, 3);
-  canonical(e2, 3);
-  memcpy(F, f, sizeof F);
-  canonical(F, 9);
-  const double S[3][3] = {{0, -e2[2], e2[1]}, {e2[2], 0, -e2[0]}, {-e2[1], e2[0], 0}};
-  for (int i = 0; i < 3; i++) for (int j = 0; j < 3; j++) {
-    theta[3 * i + j] = 0.70710678118654752 * e2[i] * e1[j];
-    for (int k = 0; k < 3; k++) theta[3 * i + j] -= S[i][k] * F[3 * j + k];
-  }
-  unit_length(theta, 9);
-}
-static void compose(const double *theta, int constraint, int size, double *f) {
-  double slope[12][9];
-  if (constraint == RANK_TWO) compose_fundamental(theta, f, slope);
-  else memcpy(f, theta, sizeof(double) * size);
-}
-
 /* What a robust search found, refined on its inliers, which are chosen again after each of so many rounds of so many steps: tensors
    (batch, D) and weights (batch, n) in, both replaced by those of the last round that lost less, limits of the squared distance
    (batch) -> motion, cost, gradient, matrix as refine, and distances (batch, n).  0, or 1 without memory. */
@@ -274,13 +220,13 @@ int EXPORT(polish)(int slots, const int *kinds, const int *dims, const double *c
                    double *gradient, double *matrix, double *distance) {
   Slot slot[MAX_SLOTS];
   Bundle b;
-  int coordinates = describe(&b, slot, slots, kinds, dims, views, strides, n), D = b.D, count = constraint == RANK_TWO ? 12 : D;
+  int coordinates = describe(&b, slot, slots, kinds, dims, views, strides, n), D = b.D, count = parameters_of(constraint, D);
   double *memory = malloc(sizeof(double) * ((size_t)(coordinates + 4) * b.padded + 1));
   if (!memory) return 1;
   double *weight = memory + (size_t)coordinates * b.padded, *inlying = weight + b.padded, *rows = inlying + b.padded, *square = rows + b.padded;
   b.rules = rules;
   for (ptrdiff_t p = 0; p < batch; p++) {
-    double *tensor = tensors + p * D, limit = limits[p], found[MAX_ENTRIES], score;
+    double *tensor = tensors + p * D, limit = limits[p], found[MAX_ENTRIES], slope[MAX_PARAMETERS][MAX_ENTRIES], score;
     Place at = {.cost = INFINITY}, kept = {.cost = INFINITY};
     take(&b, p, weights, scales, memory, weight);
     memcpy(found, tensor, sizeof(double) * D);
@@ -295,8 +241,8 @@ int EXPORT(polish)(int slots, const int *kinds, const int *dims, const double *c
       b.weights = inlying;
       descend(&b, constraint, iterations[round], &at);
       b.weights = weight;
-      if (isfinite(at.cost)) compose(at.theta, constraint, D, found);
-      else compose(memcpy(at.theta, kept.theta, sizeof at.theta), constraint, D, found);
+      if (!isfinite(at.cost)) memcpy(at.theta, kept.theta, sizeof at.theta);
+      compose(at.theta, constraint, D, found, slope);
       double fresh = score_of(&b, found, b.columns, weight, limit, 0, 0);
       if (round && !(fresh < score)) continue;
       score = fresh;

@@ -2,9 +2,10 @@
    one tensor; the mathematics is that of dyntorch/core/consensus.py, which also says what the constants are. */
 
 static const double SHIFT_EPSILON = 1e-14, HUGE_SQUARE = 1e30, SINGULAR_SLOPE = 1e-14;
-enum { SHRINKING_SHARE, NUM_CONCENTRATIONS, NUM_SHUFFLES, MAX_NEAR_MISSES, MIN_STARTS_TO_COMPARE, SAME_SCORE };  /* rules */
-enum { FROM_ALL, FROM_SAMPLES, AS_GIVEN };
-enum { MAX_SAMPLE = 8, FIRST_ITERATIONS = 3, MAX_FORM = 64 };
+enum { SHRINKING_SHARE, NUM_CONCENTRATIONS, NUM_SHUFFLES, MAX_NEAR_MISSES, MIN_STARTS_TO_COMPARE, SAME_SCORE, GUIDED_REWEIGHTINGS, STARTS_PER_UNGUIDED };  /* rules */
+enum { FROM_ALL, FROM_SAMPLES, FROM_SUBSETS, AS_GIVEN };
+enum { ANNEALED, GUIDED, WITHIN };   /* reweighted to the limit, with motions as guides, or to the matches within it */
+enum { MAX_SAMPLE = 8, FIRST_ITERATIONS = 3, SUBSET_ITERATIONS = 6, MAX_FORM = 64 };
 
 typedef struct {
   const Slot *slots;
@@ -18,6 +19,7 @@ typedef struct {
   int sizes[MAX_SLOTS];
   double *weighted, *room;            /* (sizes[0], padded), and room of add_moments */
   double *square, *rows, *omega;      /* (padded) squared distances, weights of rows, weights of matches */
+  double *lengths;                    /* (padded) squared length of the rows of each match */
   double *moments;                    /* (product of sizes, LANES) */
   const int *index;
   lanes *G, *f, *start;               /* (D, D), (D), (D) */
@@ -173,7 +175,9 @@ static void add_gram(const Bundle *b, int lane, int size) {
   packed[0] = b->weighted;
   add_moments(packed, b->sizes, b->count, (int)b->padded, b->moments + lane, LANES, b->room);
 }
-static void unpack_grams(const Bundle *b) {
+/* Moments of `some` lanes -> Grams, the other lanes as the first. */
+static void spread_moments(const Bundle *b, int some, int size) {
+  for (int v = some; v < LANES; v++) for (int k = 0; k < size; k++) b->moments[k * LANES + v] = b->moments[k * LANES];
   for (int i = 0; i < b->D; i++) for (int j = 0; j <= i; j++)
     b->G[i * b->D + j] = *(const lanes *)(b->moments + (ptrdiff_t)b->index[i * b->D + j] * LANES);
 }
@@ -191,28 +195,34 @@ static void iterate(const Bundle *b, int iterations) {
   for (int i = 0; i < D; i++) b->f[i] = where(good, b->f[i], b->start[i]);
 }
 
-/* Reweighted fits of `count` tensors (count, D), LANES at a time: annealed to the limit, or (hard) to the matches within it. */
-static void reweight(const Bundle *b, double *tensors, int count, double limit, int iterations, int hard, int moments_size) {
+/* Reweighted fits of `count` tensors (count, D), LANES at a time, in one of the three ways.  Guided: distances are those of the motions
+   of homography tensors, and the gradients of a wrong tensor, which mislead, have half their say at first. */
+static void reweight(const Bundle *b, double *tensors, int count, double limit, int iterations, int how, int moments_size) {
   for (int first = 0; first < count; first += LANES) {
     int some = count - first < LANES ? count - first : LANES;
     double start[LANES], one[MAX_FORM];
+    lanes guides[MAX_ENTRIES], partners[MAX_PARAMETERS];
+    generic_partners(partners);
     for (int v = 0; v < LANES; v++) for (int i = 0; i < b->D; i++) b->f[i][v] = tensors[(first + (v < some ? v : 0)) * b->D + i];
     for (int iteration = 0; iteration < iterations; iteration++) {
+      double share = iteration / (b->rules[SHRINKING_SHARE] * iterations);
+      const lanes *from = how == GUIDED && share < 1 ? guides : b->f;
+      int tamed = how == GUIDED && 2 * iteration < iterations;
+      if (from == guides) nearest_of_motions(b->f, iteration ? NEXT_ITERATIONS_OF_MOTION : FIRST_ITERATIONS_OF_MOTION, partners, guides);
       for (int v = 0; v < some; v++) {
-        for (int i = 0; i < b->D; i++) one[i] = b->f[i][v];
+        for (int i = 0; i < b->D; i++) one[i] = from[i][v];
         distances(b, one, b->columns, b->square, b->rows);
-        if (!iteration && !hard) { start[v] = 4 * middle_square(b); start[v] = start[v] > limit ? start[v] : limit; }
-        double share = iteration / (b->rules[SHRINKING_SHARE] * iterations);
-        lanes scale_ = all(hard ? limit : start[v] * pow(limit / start[v], share < 1 ? share : 1));
+        if (!iteration && how != WITHIN) { start[v] = 4 * middle_square(b); start[v] = start[v] > limit ? start[v] : limit; }
+        lanes scale_ = all(how == WITHIN ? limit : start[v] * pow(limit / start[v], share < 1 ? share : 1));
         for (ptrdiff_t k = 0; k < b->padded; k += LANES) {
-          lanes square = AT(b->square, k), part = scale_ / (scale_ + square);
-          part = hard ? where(square <= scale_, all(1), all(0)) : part * part;
-          PUT(b->omega, k) = part * AT(b->weights, k) * AT(b->rows, k);
+          lanes square = AT(b->square, k), part = scale_ / (scale_ + square), row = AT(b->rows, k);
+          part = how == WITHIN ? where(square <= scale_, all(1), all(0)) : part * part;
+          if (tamed) row = root(row / AT(b->lengths, k));
+          PUT(b->omega, k) = part * AT(b->weights, k) * row;
         }
         add_gram(b, v, moments_size);
       }
-      for (int v = some; v < LANES; v++) for (int k = 0; k < moments_size; k++) b->moments[k * LANES + v] = b->moments[k * LANES];
-      unpack_grams(b);
+      spread_moments(b, some, moments_size);
       iterate(b, 2);
     }
     for (int v = 0; v < some; v++) for (int i = 0; i < b->D; i++) tensors[(first + v) * b->D + i] = b->f[i][v];
@@ -248,8 +258,8 @@ static int rows_of(const Bundle *b, ptrdiff_t k, double *out, double *length) {
   return count;
 }
 
-/* The null vector of all matches, each of its rows at length 1. */
-static void first_of_all(const Bundle *b, int moments_size, const double *generic, double *tensor) {
+/* Squared lengths of the rows of all matches. */
+static void measure_lengths(const Bundle *b) {
   for (ptrdiff_t k = 0; k < b->padded; k += LANES) {
     lanes length = all(1);
     for (int s = 0; s < b->count; s++) if (b->slots[s].kind == POINT) {
@@ -257,14 +267,47 @@ static void first_of_all(const Bundle *b, int moments_size, const double *generi
       for (int c = 0; c < b->slots[s].dim; c++) { lanes x = AT(b->columns[s], c * b->padded + k); own += x * x; }
       length *= own;
     }
-    PUT(b->omega, k) = AT(b->weights, k) / length;
+    PUT(b->lengths, k) = length;
   }
-  add_gram(b, 0, moments_size);
-  for (int v = 1; v < LANES; v++) for (int k = 0; k < moments_size; k++) b->moments[k * LANES + v] = b->moments[k * LANES];
-  unpack_grams(b);
+}
+
+/* The null vectors of the Grams of `some` lanes of moments. */
+static void first_of_moments(const Bundle *b, int some, int iterations, int moments_size, const double *generic, double *tensors) {
+  spread_moments(b, some, moments_size);
   for (int i = 0; i < b->D; i++) b->f[i] = all(generic[i]);
-  iterate(b, FIRST_ITERATIONS);
-  for (int i = 0; i < b->D; i++) tensor[i] = b->f[i][0];
+  iterate(b, iterations);
+  for (int v = 0; v < some; v++) for (int i = 0; i < b->D; i++) tensors[v * b->D + i] = b->f[i][v];
+}
+
+/* The null vector of all matches, each of its rows at length 1. */
+static void first_of_all(const Bundle *b, int moments_size, const double *generic, double *tensor) {
+  for (ptrdiff_t k = 0; k < b->padded; k += LANES) PUT(b->omega, k) = AT(b->weights, k) / AT(b->lengths, k);
+  add_gram(b, 0, moments_size);
+  first_of_moments(b, 1, FIRST_ITERATIONS, moments_size, generic, tensor);
+}
+
+/* The null vectors (count, D) of random subsets of `size` present matches, each of their rows at length 1.  0 without memory. */
+static int subsets(const Bundle *b, int count, int size, unsigned long long seed, int moments_size, const double *generic, double *tensors) {
+  ptrdiff_t *order = malloc(sizeof *order * (b->n + 1)), present = 0;
+  if (!order) return 0;
+  for (ptrdiff_t k = 0; k < b->n; k++) if (b->weights[k] > 0) order[present++] = k;
+  for (int first = 0; first < count; first += LANES) {
+    int some = count - first < LANES ? count - first : LANES;
+    for (int v = 0; v < some; v++) {
+      for (ptrdiff_t k = 0; k < b->padded; k++) b->omega[k] = 0;
+      for (ptrdiff_t m = 0; m < size && m < present; m++) {
+        seed = scramble(seed);
+        ptrdiff_t other = m + (ptrdiff_t)((double)(seed >> 11) * 0x1p-53 * (present - m)), k = order[other];
+        order[other] = order[m];
+        order[m] = k;
+        b->omega[k] = 1 / b->lengths[k];
+      }
+      add_gram(b, v, moments_size);
+    }
+    first_of_moments(b, some, SUBSET_ITERATIONS, moments_size, generic, tensors + first * b->D);
+  }
+  free(order);
+  return 1;
 }
 
 static ptrdiff_t common_divisor(ptrdiff_t x, ptrdiff_t y) {
@@ -435,7 +478,7 @@ int EXPORT(distances)(int slots, const int *kinds, const int *dims, const double
 
 /* The search of a batch: normalized matches as in fit_points, weights (batch, n) of at most 1, scales (batch, slots), limits of the
    squared distance (batch), seeds (batch); `mode` FROM_ALL weighs all matches alike, FROM_SAMPLES anneals the best `keep` of
-   `starts` minimal samples, AS_GIVEN judges the tensors in `basis` -> basis (batch, D), score, evidence, doubt, share of
+   `starts` minimal samples, FROM_SUBSETS all of `starts` subsets of 2.5 times that size, most with motions as guides, AS_GIVEN judges the tensors in `basis` -> basis (batch, D), score, evidence, doubt, share of
    the starts that agree, inliers (batch, n).  0, or 1 without memory. */
 int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *const *views, const ptrdiff_t *strides,
                    const double *weights, const double *scales, const double *limits, const long long *seeds, ptrdiff_t batch,
@@ -447,7 +490,7 @@ int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *c
   for (int s = 0; s < slots; s++) { all_packed += b.sizes[s]; moments_size *= b.sizes[s]; }
   int D = b.D;
   size_t columns_size = (size_t)coordinates * b.padded, packed_room = (size_t)all_packed * b.padded, room = (WIDE + 1) * (size_t)b.padded + LANES;
-  size_t doubles = moments_size * LANES + 2 * columns_size + packed_room + b.sizes[0] * b.padded + room + 5 * b.padded + (size_t)(keep + 2) * (D + 1);
+  size_t doubles = moments_size * LANES + 2 * columns_size + packed_room + b.sizes[0] * b.padded + room + 6 * b.padded + (size_t)(keep + 2) * (D + 1);
   lanes *memory = aligned_alloc(64, (sizeof(lanes) * ((size_t)D * D + 2 * D) + sizeof(double) * doubles + 127) / 64 * 64);
   int *index = malloc(sizeof(int) * D * D);
   if (!memory || !index) { free(memory); free(index); return 1; }
@@ -456,8 +499,8 @@ int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *c
   double *columns = b.moments + moments_size * LANES, *shifted = columns + columns_size, *packed = shifted + columns_size;
   b.weighted = packed + packed_room; b.room = b.weighted + b.sizes[0] * b.padded;
   b.square = b.room + room; b.rows = b.square + b.padded; b.omega = b.rows + b.padded;
-  double *weight = b.omega + b.padded, *other = weight + b.padded, *tensors = other + b.padded, *lost = tensors + (size_t)keep * D, *generic = lost + keep;
-  b.index = index; b.rules = rules;
+  double *weight = b.omega + b.padded, *other = weight + b.padded, *tensors = other + 2 * b.padded, *lost = tensors + (size_t)keep * D, *generic = lost + keep;
+  b.index = index; b.rules = rules; b.lengths = other + b.padded;
   generic_directions(generic, 1, D);
   unpacking(slot, slots, D, index);
   int failed = 0;
@@ -472,14 +515,20 @@ int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *c
       }
       pack += b.sizes[s] * b.padded;
     }
-    int have = 1, best = 0, open_;
+    measure_lengths(&b);
+    int have = 1, best = 0, open_, free_ = 0;
     agreeing[p] = 0;
     if (mode == AS_GIVEN) memcpy(tensors, basis + p * D, sizeof(double) * D);
     else if (mode == FROM_ALL) first_of_all(&b, moments_size, generic, tensors);
-    else have = sampled(&b, starts, minimal, keep, seeds[p], limit, generic, shifted, other, lost, tensors);
+    else if (mode == FROM_SUBSETS) {
+      have = subsets(&b, starts, (5 * minimal + 1) / 2, seeds[p], moments_size, generic, tensors) ? starts : -1;
+      free_ = (have + (int)rules[STARTS_PER_UNGUIDED] - 1) / (int)rules[STARTS_PER_UNGUIDED];
+    } else have = sampled(&b, starts, minimal, keep, seeds[p], limit, generic, shifted, other, lost, tensors);
     if (have < 0) { failed = 1; break; }
     if (mode != AS_GIVEN) {
-      reweight(&b, tensors, have, limit, iterations, 0, moments_size);
+      int led = mode == FROM_SUBSETS ? have - free_ : 0;
+      reweight(&b, tensors, have - led, limit, iterations, ANNEALED, moments_size);
+      reweight(&b, tensors + (have - led) * D, led, limit, (int)rules[GUIDED_REWEIGHTINGS], GUIDED, moments_size);
       for (int i = 0; i < have; i++) {
         lost[i] = score_of(&b, tensors + i * D, b.columns, b.weights, limit, 0, 0);
         best = lost[i] < lost[best] ? i : best;
@@ -487,7 +536,7 @@ int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *c
       for (int i = 0; i < have; i++) agreeing[p] += lost[i] <= lost[best] * (1 + rules[SAME_SCORE]) + rules[SAME_SCORE];
       agreeing[p] = have >= rules[MIN_STARTS_TO_COMPARE] ? agreeing[p] / have : 0;
       memmove(tensors, tensors + best * D, sizeof(double) * D);
-      reweight(&b, tensors, 1, limit, (int)rules[NUM_CONCENTRATIONS], 1, moments_size);
+      reweight(&b, tensors, 1, limit, (int)rules[NUM_CONCENTRATIONS], WITHIN, moments_size);
     }
     distances(&b, tensors, b.columns, b.square, b.rows);
     score[p] = score_of(&b, tensors, b.columns, b.weights, limit, 0, 0);

@@ -9,9 +9,10 @@ import dyntorch as dyn
 from dyntorch import scenes
 from dyntorch.core.consensus import Search
 from dyntorch.core.fit import fit_matches
+from dyntorch.core.kernel_fit import refined_kinds
 from dyntorch.core.matches import matches
 from dyntorch.core.refine import descend, move_to
-from dyntorch.core.robust import distances
+from dyntorch.core.robust import _polish_by_kernel, distances
 from dyntorch.native import build, library
 from dyntorch.numerics import native
 from dyntorch.numerics.eigenspaces import RESOLVED
@@ -105,6 +106,8 @@ def searched(invariant, n=60, batch=3):
     """Noisy matches of order 1 with wrong ones among them, in the normalized coordinates of a search."""
     if isinstance(invariant, dyn.FundamentalMatrix):
         views = tuple(x / 300 - 1 for x in scenes.two_view(n=n, batch=batch, sigma=0.5, outliers=0.3, generator=seeded(0)).views)
+    elif isinstance(invariant, dyn.HomographyTensor):
+        views = tuple(x / 300 - 1 for x in scenes.planar(n=n, batch=batch, sigma=0.5, outliers=0.3, generator=seeded(0)).views)
     else:
         x = random(batch, n, invariant.n)
         change = torch.eye(invariant.n + 1, dtype=torch.float64) + 0.1 * random(batch, invariant.n + 1, invariant.n + 1, seed=1)
@@ -114,7 +117,9 @@ def searched(invariant, n=60, batch=3):
 
 
 @compiled
-@pytest.mark.parametrize("invariant", [dyn.FundamentalMatrix(), dyn.Collineation(2), dyn.Collineation(3)], ids=repr)
+@pytest.mark.parametrize(
+    "invariant", [dyn.FundamentalMatrix(), dyn.Collineation(2), dyn.Collineation(3), dyn.HomographyTensor()], ids=repr
+)
 def test_distances_evidence_and_descent_are_those_of_torch(invariant, monkeypatch):
     cut = torch.full((3,), 0.02, dtype=torch.float64)
     answers = []
@@ -150,6 +155,41 @@ def test_samples_are_distinct_matches_with_weight_and_annealing_finds_their_tens
     right = torch.ones(80, dtype=torch.bool)
     right[::4] = right[:2] = False
     assert found.inliers[:, right].double().mean() > 0.98 and found.inliers[:, ::4].double().mean() < 0.1
+
+
+@compiled
+def test_subsets_guided_by_motions_find_homography_tensors(monkeypatch):
+    """Half of the matches wrong: 16 subsets, which one start in four follows without a guide, end at the right tensors."""
+    scene = scenes.planar(n=200, batch=3, sigma=0.5, outliers=0.5, generator=seeded(3))
+    right, limit = scene.labels != 0, torch.full((3,), 1.7, dtype=torch.float64)
+    for level in levels(monkeypatch):
+        search = Search(dyn.HomographyTensor(), matches(dyn.HomographyTensor(), scene.views), seeded(0))
+        found, again = (search._solve(search.everyone, limit * search.unit, 16) for _ in range(2))
+        assert search.kinds and torch.equal(found.basis, again.basis), level
+        assert ((found.inliers & right).sum(-1) >= 0.9 * right.sum(-1)).all() and (found.evidence < 0).all(), level
+
+
+@compiled
+def test_polish_of_a_homography_tensor_starts_from_the_motion_of_decompose(monkeypatch):
+    """Without a step the motion of the kernel is that of the tensor; with steps both paths end at one tensor."""
+    scene = scenes.planar(n=80, batch=4, sigma=0.5, outliers=0.2, generator=seeded(1))
+    exact = scenes.planar(n=40, batch=4, generator=seeded(2))
+    data = matches(dyn.HomographyTensor(), exact.views)
+    search, cut = Search(dyn.HomographyTensor(), data, seeded(0)), torch.full((4,), 1.0, dtype=torch.float64)
+    found, _ = _polish_by_kernel(search, search.run(cut, (1,)), cut, (0,), refined_kinds(search.invariant, data))
+    for part, other in zip(found.refined, search.invariant.decompose(found.normalized), strict=True):
+        torch.testing.assert_close(part, other, rtol=0, atol=1e-8)
+    answers = []
+    for level in ("native", "torch"):
+        if level == "torch":
+            monkeypatch.setattr(library, "load", lambda: ({}, "torch"))
+        answers.append(dyn.robust_fit(dyn.HomographyTensor, *scene.views, threshold=1.7, generator=seeded(0)))
+    tensors, covariances = (
+        [part / part.norm() for part in parts] for parts in zip(*((a.tensor, a.covariance) for a in answers), strict=True)
+    )
+    assert torch.equal(answers[0].inliers, answers[1].inliers)
+    torch.testing.assert_close(tensors[0].abs(), tensors[1].abs(), rtol=0, atol=1e-7)
+    torch.testing.assert_close(covariances[0], covariances[1], rtol=1e-4, atol=1e-8)
 
 
 def test_without_a_kernel_one_line_says_why(monkeypatch, tmp_path):
