@@ -17,8 +17,8 @@ MAX_FIELDS = 12
 """Fields of the options of one verb."""
 BOUNDS = {
     "files": 347,
-    "lines": 94_420,
-    "code lines": 58_530,
+    "lines": 94_430,
+    "code lines": 58_540,
     "docstring lines": 14_410,
     "option fields": 111,
     "option fields that nobody sets": 0,
@@ -27,7 +27,7 @@ BOUNDS = {
     "circles of imports": 0,
     "circles of imports, those for types too": 0,
     "lines of experiments": 19_000,
-    "lines of tests": 54_345,
+    "lines of tests": 54_365,
 }
 """What each figure may be at most."""
 

@@ -325,6 +325,8 @@ class Search:
         views = moved if invariant.copies else tuple(x[:, None] for x in moved)
         self.searched = SearchMatches(self.weights, views, self.norm.transforms)
         self.kinds = searched_kinds(invariant, data.views, data.weights)
+        # the kernel knows the motions that guide a search of this invariant alone
+        self.guided = bool(self.kinds) and invariant.constraint is Constraint.HOMOGRAPHIES
 
     def run(self, cut: Tensor, starts: Sequence[int]) -> SearchResult:
         """Best tensors: more and more starts for the problems that need them.
@@ -359,6 +361,12 @@ class Search:
     def scale(self) -> Tensor:
         """Threshold ``(b,)`` from the data: least median of squares (annealed), and what 99 % of the inliers then keep."""
         inv, everyone, count = self.invariant, self.everyone, NUM_SCALE_STARTS
+        # Rousseeuw and Leroy 1987: the median of so few is too small
+        few = 1 + 5 / ((self.weights > 0).sum(-1) - inv.minimal()).clamp(min=1)
+        if self.guided:
+            numbers = {"starts": count, "keep": count + 1, "iterations": SCALE_REWEIGHTINGS, "mode": library.LEAST_MEDIAN}
+            middle = self._by_kernel(everyone, torch.zeros_like(self.unit), self.draws.seeds + count + 1, **numbers).score
+            return threshold_of(inv, middle.sqrt() * few / quantile(0.5, inv.codim) ** 0.5) / self.unit
         chosen = torch.cat([self.weights[:, None], self._samples(everyone, count)], dim=1)
 
         def block(searched: SearchMatches, chosen: Tensor) -> Tensor:
@@ -368,8 +376,6 @@ class Search:
             return median(work.distances(basis)[0], work.weights).amin(1)
 
         middle = self._map(block, everyone, chosen)
-        # Rousseeuw and Leroy 1987: the median of so few is too small
-        few = 1 + 5 / ((self.weights > 0).sum(-1) - inv.minimal()).clamp(min=1)
         return threshold_of(inv, middle.sqrt() * few / quantile(0.5, inv.codim) ** 0.5) / self.unit
 
     def evidence(self, tensor: Tensor, cut: Tensor) -> Tensor:
@@ -397,11 +403,11 @@ class Search:
                 count * SAMPLES_PER_START,
                 max(1, count // STARTS_PER_ANNEALED_SAMPLE),
             )
-            return self._by_kernel(where, cut[where], seeds, starts=starts, keep=keep, iterations=REWEIGHTINGS["minimal"])
-        if self.kinds and self.invariant.constraint is Constraint.HOMOGRAPHIES:
-            # most starts are guided by motions, which the kernel knows of this invariant alone
-            seeds, steps = self.draws.seeds[where] + count, REWEIGHTINGS["many"]
-            return self._by_kernel(where, cut[where], seeds, starts=count, keep=count, iterations=steps, subsets=True)
+            numbers = {"starts": starts, "keep": keep, "iterations": REWEIGHTINGS["minimal"], "mode": library.FROM_SAMPLES}
+            return self._by_kernel(where, cut[where], seeds, **numbers)
+        if self.guided:
+            numbers = {"starts": count, "keep": count, "iterations": REWEIGHTINGS["many"], "mode": library.FROM_SUBSETS}
+            return self._by_kernel(where, cut[where], self.draws.seeds[where] + count, **numbers)
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
         kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
         steps = REWEIGHTINGS[kind]

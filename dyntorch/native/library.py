@@ -38,7 +38,7 @@ POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS = range(3)
 """What a measured point puts into a slot, as the kernel numbers it."""
 MAX_SEARCHED_SLOTS, MAX_SEARCHED_SPACE = 3, 3
 """The same of :func:`search`."""
-FROM_ALL, FROM_SAMPLES, FROM_SUBSETS, AS_GIVEN = range(4)
+FROM_ALL, FROM_SAMPLES, FROM_SUBSETS, LEAST_MEDIAN, AS_GIVEN = range(5)
 """What :func:`search` starts from."""
 UNDECIDED, WEAK = 1, 2
 """Flags of a fit: left to torch, and with a second tensor that may fit as well within the noise."""
@@ -187,13 +187,13 @@ def search(
     starts: int = 1,
     keep: int = 1,
     iterations: int = 0,
-    subsets: bool = False,
+    mode: int = FROM_ALL,
     seeds: Tensor | None = None,
     given: Tensor | None = None,
 ) -> Finds:
     """Tensors that most matches agree with: views ``(b, n, d)`` normalized, weights ``(b, n)`` of at most 1, scales ``(b, views)``,
     limits ``(b,)`` of squared distances; from all matches, with seeds ``(b,)`` from so many minimal samples or larger subsets, or
-    as given ``(b, D)``."""
+    as given ``(b, D)``.  Of the least median there is only the score."""
     weights, scales, limits = weights.contiguous(), scales.contiguous(), limits.contiguous()
     seeds = None if seeds is None else seeds.contiguous()
     (batch, matches), new = weights.shape, weights.new_empty
@@ -201,7 +201,7 @@ def search(
     basis = new(batch, width) if given is None else given.clone(memory_format=_torch().contiguous_format)
     flags = new(batch, dtype=_torch().bool), new(batch, matches, dtype=_torch().bool)
     finds = Finds(basis, new(batch), new(batch), flags[0], new(batch), flags[1])
-    mode = AS_GIVEN if given is not None else FROM_ALL if seeds is None else FROM_SUBSETS if subsets else FROM_SAMPLES
+    mode = mode if given is None else AS_GIVEN
     data = (weights.data_ptr(), scales.data_ptr(), limits.data_ptr(), None if seeds is None else seeds.data_ptr())
     numbers = (batch, matches, mode, starts, keep, iterations, minimal, (ctypes.c_double * len(rules))(*rules))
     call("search", *_slots(kinds, views), *data, *numbers, *(part.data_ptr() for part in finds))

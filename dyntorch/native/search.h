@@ -3,7 +3,7 @@
 
 static const double SHIFT_EPSILON = 1e-14, HUGE_SQUARE = 1e30, SINGULAR_SLOPE = 1e-14;
 enum { SHRINKING_SHARE, NUM_CONCENTRATIONS, NUM_SHUFFLES, MAX_NEAR_MISSES, MIN_STARTS_TO_COMPARE, SAME_SCORE, GUIDED_REWEIGHTINGS, STARTS_PER_UNGUIDED };  /* rules */
-enum { FROM_ALL, FROM_SAMPLES, FROM_SUBSETS, AS_GIVEN };
+enum { FROM_ALL, FROM_SAMPLES, FROM_SUBSETS, LEAST_MEDIAN, AS_GIVEN };
 enum { ANNEALED, GUIDED, WITHIN };   /* reweighted to the limit, with motions as guides, or to the matches within it */
 enum { MAX_SAMPLE = 8, FIRST_ITERATIONS = 3, SUBSET_ITERATIONS = 6, MAX_FORM = 64 };
 
@@ -195,7 +195,7 @@ static void iterate(const Bundle *b, int iterations) {
   for (int i = 0; i < D; i++) b->f[i] = where(good, b->f[i], b->start[i]);
 }
 
-/* Reweighted fits of `count` tensors (count, D), LANES at a time, in one of the three ways.  Guided: distances are those of the motions
+/* Reweighted fits of `count` tensors (count, D), LANES at a time, in one of the three ways; limit 0: to the median of the squares.  Guided: distances are those of the motions
    of homography tensors, and the gradients of a wrong tensor, which mislead, have half their say at first. */
 static void reweight(const Bundle *b, double *tensors, int count, double limit, int iterations, int how, int moments_size) {
   for (int first = 0; first < count; first += LANES) {
@@ -212,8 +212,9 @@ static void reweight(const Bundle *b, double *tensors, int count, double limit, 
       for (int v = 0; v < some; v++) {
         for (int i = 0; i < b->D; i++) one[i] = from[i][v];
         distances(b, one, b->columns, b->square, b->rows);
-        if (!iteration && how != WITHIN) { start[v] = 4 * middle_square(b); start[v] = start[v] > limit ? start[v] : limit; }
-        lanes scale_ = all(how == WITHIN ? limit : start[v] * pow(limit / start[v], share < 1 ? share : 1));
+        if (!(limit > 0)) start[v] = larger(all(middle_square(b)), all(TINY))[0];
+        else if (!iteration && how != WITHIN) { start[v] = 4 * middle_square(b); start[v] = start[v] > limit ? start[v] : limit; }
+        lanes scale_ = all(!(limit > 0) ? start[v] : how == WITHIN ? limit : start[v] * pow(limit / start[v], share < 1 ? share : 1));
         for (ptrdiff_t k = 0; k < b->padded; k += LANES) {
           lanes square = AT(b->square, k), part = scale_ / (scale_ + square), row = AT(b->rows, k);
           part = how == WITHIN ? where(square <= scale_, all(1), all(0)) : part * part;
@@ -308,6 +309,23 @@ static int subsets(const Bundle *b, int count, int size, unsigned long long seed
   }
   free(order);
   return 1;
+}
+
+/* The least median of squares: from all matches and from `starts` subsets, with motions as guides, then of the nearer halves;
+   tensors: room (starts + 1, D).  -1 without memory. */
+static double least_median(const Bundle *b, int starts, int size, unsigned long long seed, int iterations, int moments_size,
+                           const double *generic, double *tensors) {
+  double least = INFINITY;
+  first_of_all(b, moments_size, generic, tensors);
+  if (!subsets(b, starts, size, seed, moments_size, generic, tensors + b->D)) return -1;
+  reweight(b, tensors, starts + 1, 0, iterations, GUIDED, moments_size);
+  reweight(b, tensors, starts + 1, 0, (int)b->rules[NUM_CONCENTRATIONS], WITHIN, moments_size);
+  for (int i = 0; i <= starts; i++) {
+    distances(b, tensors + i * b->D, b->columns, b->square, b->rows);
+    double middle = middle_square(b);
+    least = middle < least ? middle : least;
+  }
+  return least;
 }
 
 static ptrdiff_t common_divisor(ptrdiff_t x, ptrdiff_t y) {
@@ -478,7 +496,7 @@ int EXPORT(distances)(int slots, const int *kinds, const int *dims, const double
 
 /* The search of a batch: normalized matches as in fit_points, weights (batch, n) of at most 1, scales (batch, slots), limits of the
    squared distance (batch), seeds (batch); `mode` FROM_ALL weighs all matches alike, FROM_SAMPLES anneals the best `keep` of
-   `starts` minimal samples, FROM_SUBSETS all of `starts` subsets of 2.5 times that size, most with motions as guides, AS_GIVEN judges the tensors in `basis` -> basis (batch, D), score, evidence, doubt, share of
+   `starts` minimal samples, FROM_SUBSETS all of `starts` subsets of 2.5 times that size, most with motions as guides, LEAST_MEDIAN has only the score, AS_GIVEN judges the tensors in `basis` -> basis (batch, D), score, evidence, doubt, share of
    the starts that agree, inliers (batch, n).  0, or 1 without memory. */
 int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *const *views, const ptrdiff_t *strides,
                    const double *weights, const double *scales, const double *limits, const long long *seeds, ptrdiff_t batch,
@@ -517,6 +535,11 @@ int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *c
     }
     measure_lengths(&b);
     int have = 1, best = 0, open_, free_ = 0;
+    if (mode == LEAST_MEDIAN) {
+      score[p] = least_median(&b, starts, (5 * minimal + 1) / 2, seeds[p], iterations, moments_size, generic, tensors);
+      failed = score[p] < 0;
+      continue;
+    }
     agreeing[p] = 0;
     if (mode == AS_GIVEN) memcpy(tensors, basis + p * D, sizeof(double) * D);
     else if (mode == FROM_ALL) first_of_all(&b, moments_size, generic, tensors);

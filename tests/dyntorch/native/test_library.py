@@ -149,8 +149,8 @@ def test_samples_are_distinct_matches_with_weight_and_annealing_finds_their_tens
     search = searched(dyn.Collineation(2), n=80, batch=20)
     search.weights[:, :2] = 0
     seeds, limit = torch.arange(20), torch.full((20,), 1e-2, dtype=torch.float64)
-    found = search._by_kernel(search.everyone, limit, seeds, starts=64, keep=2, iterations=10)
-    again = search._by_kernel(search.everyone, limit, seeds, starts=64, keep=2, iterations=10)
+    numbers = {"starts": 64, "keep": 2, "iterations": 10, "mode": library.FROM_SAMPLES}
+    found, again = (search._by_kernel(search.everyone, limit, seeds, **numbers) for _ in range(2))
     assert torch.equal(found.basis, again.basis)
     right = torch.ones(80, dtype=torch.bool)
     right[::4] = right[:2] = False
@@ -167,6 +167,17 @@ def test_subsets_guided_by_motions_find_homography_tensors(monkeypatch):
         found, again = (search._solve(search.everyone, limit * search.unit, 16) for _ in range(2))
         assert search.kinds and torch.equal(found.basis, again.basis), level
         assert ((found.inliers & right).sum(-1) >= 0.9 * right.sum(-1)).all() and (found.evidence < 0).all(), level
+
+
+@compiled
+def test_estimated_thresholds_are_those_of_torch(monkeypatch):
+    """From other random subsets, so not to the last digit."""
+    scene = scenes.planar(n=120, batch=4, sigma=0.5, outliers=0.1, generator=seeded(5))
+    data = matches(dyn.HomographyTensor(), scene.views)
+    found = [Search(dyn.HomographyTensor(), data, seeded(0)).scale() for _ in levels(monkeypatch)]
+    monkeypatch.setattr(library, "load", lambda: ({}, "torch"))
+    expected = Search(dyn.HomographyTensor(), data, seeded(0)).scale()
+    assert all(bool((part.log() - expected.log()).abs().max() < 0.2) for part in found), (found, expected)
 
 
 @compiled
