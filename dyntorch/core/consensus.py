@@ -365,7 +365,7 @@ class Search:
         few = 1 + 5 / ((self.weights > 0).sum(-1) - inv.minimal()).clamp(min=1)
         if self.guided:
             numbers = {"starts": count, "keep": count + 1, "iterations": SCALE_REWEIGHTINGS, "mode": library.LEAST_MEDIAN}
-            middle = self._by_kernel(everyone, torch.zeros_like(self.unit), self.draws.seeds + count + 1, **numbers).score
+            middle = self._by_kernel(everyone, torch.zeros_like(self.unit), self.draws.seeds + count + 1, None, **numbers).score
             return threshold_of(inv, middle.sqrt() * few / quantile(0.5, inv.codim) ** 0.5) / self.unit
         chosen = torch.cat([self.weights[:, None], self._samples(everyone, count)], dim=1)
 
@@ -404,10 +404,10 @@ class Search:
                 max(1, count // STARTS_PER_ANNEALED_SAMPLE),
             )
             numbers = {"starts": starts, "keep": keep, "iterations": REWEIGHTINGS["minimal"], "mode": library.FROM_SAMPLES}
-            return self._by_kernel(where, cut[where], seeds, **numbers)
+            return self._by_kernel(where, cut[where], seeds, None, **numbers)
         if self.guided:
             numbers = {"starts": count, "keep": count, "iterations": REWEIGHTINGS["many"], "mode": library.FROM_SUBSETS}
-            return self._by_kernel(where, cut[where], self.draws.seeds[where] + count, **numbers)
+            return self._by_kernel(where, cut[where], self.draws.seeds[where] + count, None, **numbers)
         chosen = self.weights[where, None] if count == 1 else self._samples(where, count)
         kind = "all" if count == 1 else "many" if chosen.shape[1] == count else "minimal"
         steps = REWEIGHTINGS[kind]
@@ -468,7 +468,7 @@ class Search:
         return map_blocks(function, each(lambda x: x[where], self.searched), starts, *more, size=max(1, size))
 
     def _by_kernel(
-        self, where: Tensor, cut: Tensor, seeds: Tensor | None = None, given: Tensor | None = None, **numbers: int
+        self, where: Tensor, cut: Tensor, seeds: Tensor | None = None, given: Tensor | None = None, **numbers: Any
     ) -> SearchResult:
         """The search, or the judgement of given tensors ``(b, D)``, by the kernel in C."""
         minimal = self.invariant.minimal()
