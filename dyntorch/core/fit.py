@@ -181,36 +181,42 @@ def _fit_by_kernel(
     invariant: Invariant, kinds: Sequence[int], normalize: bool, views: tuple[Tensor, ...], weights: Tensor
 ) -> tuple[LinearFits, Tensor]:
     """Fits of one block, and the problems ``(k,)`` that they say nothing of."""
-    whole = invariant.nullity == 1 and library.CONIC_MONOMIALS not in kinds
+    vectors, given = library.VECTORS in kinds, views
+    norm: Normalization | None = None
+    whole = invariant.nullity == 1 and library.CONIC_MONOMIALS not in kinds and not vectors
+    if vectors:
+        norm = normalization(invariant, views, relative_weights(weights)) if normalize else _identity(invariant, views)
+        slots = zip(norm.primitives, norm.apply(invariant, views), strict=True)
+        given = tuple(primitive.vectors(x)[..., 0, :] for primitive, x in slots)
     found = library.fit_points(
         kinds,
-        views,
+        given,
         weights,
         [p.width for p in invariant.primitives],
         dim=invariant.nullity,
-        normalized=normalize,
+        normalized=normalize and not vectors,
         rows=invariant.rows(),
         minimal=invariant.minimal(),
         constraint=invariant.constraint if whole else None,
         limits=KERNEL_LIMITS,
     )
-    transforms = tuple(found.transforms)
+    transforms = tuple(found.transforms) if norm is None else norm.transforms
     left = place = found.status[:0]
     if bool(found.flags.any()):
         left, place = ((found.flags == flag).nonzero()[:, 0] for flag in (library.UNDECIDED, library.WEAK))
-    if len(place):
-        norm = Normalization.of(invariant, transforms)
+    if len(place) or not whole:
+        norm = norm or Normalization.of(invariant, transforms)
+    if len(place) and norm:
         moved = tuple(p.move(x[place], t[place]) for p, x, t in zip(invariant.primitives, views, transforms, strict=True))
         parts = (norm.primitives, moved, relative_weights(weights[place]), None, found.basis[place], invariant.resolves_noise)
         noisy = place[within_noise(*parts, second=found.second[place, None])]
         found.status[noisy] = found.status[noisy].where(found.status[noisy] != int(Status.OK), int(Status.AMBIGUOUS))
-    if whole:
+    if norm is None or whole:
         order = (0, *(1 + v for v in invariant.axes()))
-        return LinearFits(
-            found.tensor.permute(order), found.normalized.permute(order), found.status, found.uncertainty, transforms
-        ), left
+        tensors = found.tensor.permute(order), found.normalized.permute(order)
+        return LinearFits(*tensors, found.status, found.uncertainty, transforms), left
     tensor = invariant.normalize(transforms).constrain(invariant.tensor_of(found.basis))
-    return _carried_back(invariant, Normalization.of(invariant, transforms), tensor, found.status, found.uncertainty), left
+    return _carried_back(invariant, norm, tensor, found.status, found.uncertainty), left
 
 
 def _fit_by_torch(

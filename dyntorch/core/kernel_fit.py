@@ -30,13 +30,15 @@ def slot_kinds(invariant: Invariant, views: Sequence[Tensor], weights: Tensor, s
     if not is_plain(*data) or any(part.dtype != torch.float64 for part in data):
         return []
     kinds = [_kind(primitive) for primitive in invariant.primitives]
+    if None in kinds and all(primitive.rows == 1 and primitive.width <= library.MAX_SPACE for primitive in invariant.primitives):
+        return [library.VECTORS] * len(kinds)
     return [] if None in kinds else [kind for kind in kinds if kind is not None]
 
 
 def searched_kinds(invariant: Invariant, views: Sequence[Tensor], weights: Tensor) -> list[int]:
     """The same of a robust search, which takes forms of two or three points, and points predicted from those of another view."""
     kinds = slot_kinds(invariant, views, weights, None)
-    if invariant.nullity > 1 or len(views) > library.MAX_SEARCHED_SLOTS or library.CONIC_MONOMIALS in kinds:
+    if invariant.nullity > 1 or len(views) > library.MAX_SEARCHED_SLOTS or {library.CONIC_MONOMIALS, library.VECTORS} & {*kinds}:
         return []
     if max((primitive.dim for primitive in invariant.primitives), default=0) > library.MAX_SEARCHED_SPACE:
         return []

@@ -1,6 +1,6 @@
 /* Fits: matches -> similarities -> moments of products of slots -> null spaces, in one pass. */
 
-enum { POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS };  /* what a measured point x of dimension d puts into a slot */
+enum { POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS, VECTORS };  /* what a measured point x of dimension d puts into a slot */
 enum { CHUNK = 512, NEXT_ITERATIONS = 8, MAX_SPACE = 8 };
 
 typedef struct {
@@ -9,7 +9,7 @@ typedef struct {
   ptrdiff_t batch, match, coordinate;
 } Slot;
 
-static int slot_width(const Slot *s) { return s->kind == CONIC_MONOMIALS ? 6 : s->dim + 1; }
+static int slot_width(const Slot *s) { return s->kind == CONIC_MONOMIALS ? 6 : s->dim + (s->kind != VECTORS); }
 static int packed_size(const Slot *s) { int w = slot_width(s); return w * (w + 1) / 2; }
 
 /* Sum over `width` matches, a multiple of LANES, of w (x - shift)^power. */
@@ -61,8 +61,9 @@ static void pack_slot(const Slot *s, const double *x, ptrdiff_t stride, int widt
       for (int i = 0, r = 0; i < 6; i++) for (int j = i; j < 6; j++, r++) out[r * out_stride + k] = mono[i] * mono[j];
     }
     row = 21;
-  } else if (s->kind == POINT) {
-    for (int i = 0; i <= d; i++) for (int j = i; j <= d; j++, row++)
+  } else if (s->kind == POINT || s->kind == VECTORS) {
+    int columns = slot_width(s);
+    for (int i = 0; i < columns; i++) for (int j = i; j < columns; j++, row++)
       for (int k = 0; k < width; k++) out[row * out_stride + k] = moved[i][k] * moved[j][k];
   } else {  /* the rows of [I | -x] */
     for (int i = 0; i <= d; i++) for (int j = i; j <= d; j++, row++) {
@@ -369,7 +370,7 @@ int EXPORT(fit_points)(int slots, const int *kinds, const int *dims, const doubl
         for (int c = 0; c < MAX_SPACE; c++) centre[c] = 0;
         gather(slot + s, slot[s].x + (first + v) * slot[s].batch, n, padded, free_column);
         scales[v][s] = normalized ? similarity(free_column, d, relative, total, padded, centre) : 1;
-        write_similarity(slot + s, scales[v][s], centre, out.transforms[s] + (first + v) * size);
+        if (slot[s].kind != VECTORS) write_similarity(slot + s, scales[v][s], centre, out.transforms[s] + (first + v) * size);
         of_slot[s] = free_column;
         free_column += d * padded;
       }

@@ -34,8 +34,8 @@ _ARGUMENTS = {
 }
 MAX_SLOTS, MAX_SPACE = 6, 8
 """Views, and dimensions of what is measured in them, that :func:`fit_points` takes."""
-POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS = range(3)
-"""What a measured point puts into a slot, as the kernel numbers it."""
+POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS, VECTORS = range(4)
+"""What a measured point puts into a slot, as the kernel numbers it; the last: the vector itself, of normalized matches."""
 MAX_SEARCHED_SLOTS, MAX_SEARCHED_SPACE = 3, 3
 """The same of :func:`search`."""
 FROM_ALL, FROM_SAMPLES, FROM_SUBSETS, LEAST_MEDIAN, AS_GIVEN = range(5)
@@ -145,7 +145,7 @@ def fit_points(
     (batch, matches), count, new = weights.shape, len(views), weights.new_empty
     shape = (batch, *widths) if constraint is not None else (0,)
     fits = PointFits(
-        [new(batch, x.shape[-1] + 1, x.shape[-1] + 1) for x in views],
+        [new(batch, *(0, 0) if kind == VECTORS else (x.shape[-1] + 1,) * 2) for kind, x in zip(kinds, views, strict=True)],
         new(batch, dim, math.prod(widths)),
         new(batch, math.prod(widths)),
         new(shape),
