@@ -1,4 +1,4 @@
-"""An archive that grows from 10 to 1,000 hours: seconds per query, bytes per hour, and memory beside the mapped files.
+"""An archive that grows from 10 to 3,000 hours: seconds per query, bytes per hour, and memory beside the mapped files.
 
     DYNTORCH_DATA=../shared/data python -m experiments.archive.growth
 
@@ -58,7 +58,7 @@ WAIT = 0.005  # seconds between two looks at the memory
 class Config(BaseConfig):
     """Time and space of an archive that grows, made of captured and invented people of the folder DYNTORCH_DATA."""
 
-    hours: tuple[int, ...] = (10, 30, 100, 300, 1000)
+    hours: tuple[int, ...] = (10, 30, 100, 300, 1000, 3000)
     """Sizes, growing; the first is recorded, the others are copies of it."""
     durations: tuple[float, ...] = (1.0, 3.0)
     """Seconds of the queries."""
@@ -69,7 +69,7 @@ class Config(BaseConfig):
     threads: int = 2
     """Cores."""
     folder: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Where the archive grows: 6 GB; by default a temporary folder."""
+    """Where the archive grows: 17 GB; by default a temporary folder."""
 
 
 # ---- an archive multiplied ---------------------------------------------------------------------------------------------

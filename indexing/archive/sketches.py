@@ -122,6 +122,7 @@ def scan(
     end = len(segment.codes) if end is None else min(end, len(segment.codes))
     found = _TopWindows(keep)
     gone = np.isin(segment.tracks[:, 0], list(dead)) if dead else np.zeros(len(segment), dtype=bool)
+    ends = segment.firsts + segment.tracks[:, 3]
     groups = sorted({(probe.stride, probe.samples) for probe in probes if probe.everywhere})
     for stride, samples in groups:
         numbers = [i for i, one in enumerate(probes) if one.everywhere and (one.stride, one.samples) == (stride, samples)]
@@ -129,11 +130,13 @@ def scan(
         for low in range(-(-begin // stride), min(windows, -(-end // stride)), BLOCK):
             high = min(low + BLOCK, windows, -(-end // stride))  # windows that begin from low to high
             scores = _scores_along(segment, low, high, stride, [probes[i] for i in numbers])
-            scores[:, torch.from_numpy(_outside(segment, gone, low, high - low, samples, stride))] = -1.0
-            for i, score in zip(numbers, scores, strict=True):
-                better = (score > found.threshold).nonzero()[:, 0]
-                if len(better):
-                    found.add(score[better].numpy(), ((better + low) * stride).numpy(), i)
+            for i, score in zip(numbers, scores.numpy(), strict=True):
+                better = np.flatnonzero(score > found.threshold)
+                rows = (better + low) * stride
+                track = np.searchsorted(segment.firsts, rows, side="right") - 1
+                inside = ~gone[track] & (rows + (samples - 1) * stride < ends[track])
+                if inside.any():
+                    found.add(score[better[inside]], rows[inside], i)
     for i, probe in enumerate(probes):
         if probe.stride > 1 or not probe.everywhere:
             _scan_ends(found, segment, gone, probe, i, (begin, end))
