@@ -74,10 +74,10 @@ def test_residuals_of_all_pairs_are_those_of_torch(monkeypatch):
 def test_correlations_of_windows_are_those_of_their_planes(monkeypatch):
     """Of windows in a row and of any, more than a block of the kernel and few, by the definition in numpy."""
     draw, wrong = np.random.default_rng(1), []
-    codes, scales = draw.integers(-127, 128, (700, 2, 5)).astype(np.int8), draw.uniform(0.01, 0.02, 700).astype(np.float32)
-    poses = codes * scales[:, None, None].astype(float)
-    for samples, stride, probes in ((4, 3, 2), (16, 1, 1)):
-        axes = np.linalg.qr(draw.normal(size=(probes, samples * 5, 2)))[0].transpose(0, 2, 1).reshape(probes, 2, samples, 5)
+    for samples, stride, probes, k in ((4, 3, 2, 5), (16, 1, 1, 5), (4, 3, 2, 8), (5, 2, 1, 8)):
+        codes, scales = draw.integers(-127, 128, (700, 2, k)).astype(np.int8), draw.uniform(0.01, 0.02, 700).astype(np.float32)
+        poses = codes * scales[:, None, None].astype(float)
+        axes = np.linalg.qr(draw.normal(size=(probes, samples * k, 2)))[0].transpose(0, 2, 1).reshape(probes, 2, samples, k)
         axes = np.ascontiguousarray(axes, dtype=np.float32)
         rows = draw.integers(0, 700 - samples * stride, 90)
         for first in (rows, rows[:3], 5):
