@@ -144,8 +144,9 @@ def test_distances_evidence_and_descent_are_those_of_torch(invariant, monkeypatc
 
 
 @compiled
-def test_samples_are_distinct_matches_with_weight_and_annealing_finds_their_tensor():
+def test_samples_are_distinct_matches_with_weight_and_annealing_finds_their_tensor(monkeypatch):
     """Among sixty percent of wrong matches a search from samples ends at the right tensor, which one from all does not reach."""
+    next(levels(monkeypatch))  # also where torch was asked for
     search = searched(dyn.Collineation(2), n=80, batch=20)
     search.weights[:, :2] = 0
     seeds, limit = torch.arange(20), torch.full((20,), 1e-2, dtype=torch.float64)
@@ -183,6 +184,7 @@ def test_estimated_thresholds_are_those_of_torch_on_average(monkeypatch):
 @compiled
 def test_polish_of_a_homography_tensor_starts_from_the_motion_of_decompose(monkeypatch):
     """Without a step the motion of the kernel is that of the tensor; with steps both paths end at one tensor."""
+    next(levels(monkeypatch))
     scene = scenes.planar(n=80, batch=4, sigma=0.5, outliers=0.2, generator=seeded(1))
     exact = scenes.planar(n=40, batch=4, generator=seeded(2))
     data = matches(dyn.HomographyTensor(), exact.views)
