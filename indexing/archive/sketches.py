@@ -122,7 +122,6 @@ def scan(
     end = len(segment.codes) if end is None else min(end, len(segment.codes))
     found = _TopWindows(keep)
     gone = np.isin(segment.tracks[:, 0], list(dead)) if dead else np.zeros(len(segment), dtype=bool)
-    ends = segment.firsts + segment.tracks[:, 3]
     groups = sorted({(probe.stride, probe.samples) for probe in probes if probe.everywhere})
     for stride, samples in groups:
         numbers = [i for i, one in enumerate(probes) if one.everywhere and (one.stride, one.samples) == (stride, samples)]
@@ -134,9 +133,8 @@ def scan(
                 better = np.flatnonzero(score > found.threshold)
                 rows = (better + low) * stride
                 track = np.searchsorted(segment.firsts, rows, side="right") - 1
-                inside = ~gone[track] & (rows + (samples - 1) * stride < ends[track])
-                if inside.any():
-                    found.add(score[better[inside]], rows[inside], i)
+                inside = ~gone[track] & (rows + (samples - 1) * stride < segment.firsts[track] + segment.tracks[track, 3])
+                found.add(score[better[inside]], rows[inside], i)
     for i, probe in enumerate(probes):
         if probe.stride > 1 or not probe.everywhere:
             _scan_ends(found, segment, gone, probe, i, (begin, end))
