@@ -16,8 +16,8 @@ PACKAGES = ("dyntorch", "indexing")
 MAX_FIELDS = 12
 """Fields of the options of one verb."""
 BOUNDS = {
-    "files": 347,
-    "lines": 94_430,
+    "files": 349,
+    "lines": 94_480,
     "code lines": 58_540,
     "docstring lines": 14_410,
     "option fields": 111,

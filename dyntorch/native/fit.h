@@ -1,7 +1,7 @@
 /* Fits: matches -> similarities -> moments of products of slots -> null spaces, in one pass. */
 
 enum { POINT, HYPERPLANES_THROUGH, CONIC_MONOMIALS, VECTORS };  /* what a measured point x of dimension d puts into a slot */
-enum { CHUNK = 512, NEXT_ITERATIONS = 8, MAX_SPACE = 8 };
+enum { MAX_ROWS = 1 << 20, CHUNK = 512, NEXT_ITERATIONS = 8, MAX_SPACE = 8 };
 
 typedef struct {
   int kind, dim;
@@ -120,6 +120,39 @@ static void add_moments(double *const *packed, const int *sizes, int slots, int 
   }
 }
 
+/* The vectors of one measurement, coordinates at x[c stride]: how many. */
+static int slot_vectors(const Slot *s, const double *x, ptrdiff_t stride, double scale_, const double *centre, double out[][MAX_SPACE + 1]) {
+  double factor = 1.4142135623730951, moved[MAX_SPACE + 1];
+  int d = s->dim;
+  for (int c = 0; c < d; c++) moved[c] = (x[c * stride] - centre[c]) * scale_;
+  moved[d] = 1;
+  if (s->kind == CONIC_MONOMIALS) {
+    double a = moved[0], b = moved[1], mono[6] = {a * a, factor * a * b, factor * a, b * b, factor * b, 1};
+    memcpy(out[0], mono, sizeof mono);
+  } else if (s->kind == HYPERPLANES_THROUGH) {
+    for (int e = 0; e < d; e++) for (int c = 0; c <= d; c++) out[e][c] = c < d ? c == e : -moved[e];
+    return d;
+  } else memcpy(out[0], moved, sizeof(double) * slot_width(s));
+  return 1;
+}
+
+/* The rows of match k, (rows, D): products of the vectors of its slots, columns (dim, stride) each; how many. */
+static int product_rows(const Slot *slots, int count, const double *const *columns, ptrdiff_t stride, ptrdiff_t k, const double *scales,
+                        const double *centres, double factor, double *out) {
+  double vectors[MAX_SPACE][MAX_SPACE + 1];
+  int rows = 1, width = 1;
+  out[0] = factor;
+  for (int s = 0; s < count; s++) {
+    int w = slot_width(slots + s), more = slot_vectors(slots + s, columns[s] + k, stride, scales[s], centres + s * MAX_SPACE, vectors);
+    for (int r = rows - 1; r >= 0; r--) for (int e = more - 1; e >= 0; e--)  /* from the end: in place */
+      for (int i = width - 1; i >= 0; i--) for (int c = w - 1; c >= 0; c--)
+        out[((r * more + e) * width + i) * w + c] = out[r * width + i] * vectors[e][c];
+    rows *= more;
+    width *= w;
+  }
+  return rows;
+}
+
 /* Where entry (i, j), j <= i, of the Gram of products of slots lies among the packed moments. */
 static void unpacking(const Slot *slots, int count, int D, int *index) {
   for (int i = 0; i < D; i++) for (int j = 0; j <= i; j++) {
@@ -152,7 +185,7 @@ static void next_vector(Pack *p) {
 
 enum { RESOLVED, GRAM_ROUNDING, CONDITION, NOISE, NARROW_WIDTH, SPARE_ROWS, CHANCE_FACTOR, CHANCE_QUANTILE };  /* limits: see fit.py */
 enum { OK = 0, DEGENERATE = 2, AMBIGUOUS = 3 };  /* dyntorch.Status */
-enum { UNDECIDED = 1, WEAK = 2 };  /* left to the caller altogether; the noise is to be read off */
+enum { UNDECIDED = 1, WEAK = 2, EXACT = 4 };  /* left to the caller; the noise is to be read off; the rows are to correct (inside) */
 enum { ANY_TENSOR, RANK_TWO, NONSINGULAR, HOMOGRAPHIES };  /* internal constraints */
 
 typedef struct { double residual, sum, trace, next; int certified; } Spectrum;
@@ -166,15 +199,16 @@ static int judge(const Spectrum *found, const double *limits, double present, in
   *error = sqrt(square);
   *status = OK;
   int exact = rounding > limits[GRAM_ROUNDING] && rounding > 1e-3 * square;
-  if (!found->certified || !(found->next > limits[RESOLVED]) || exact || few || present < width - dim) return UNDECIDED;
+  if (!found->certified || !(found->next > limits[RESOLVED]) || few || present < width - dim) return UNDECIDED;
   double limit = limits[NOISE];
   if (width <= limits[NARROW_WIDTH] && spare >= limits[SPARE_ROWS]) {  /* chi-square over its mean (Wilson and Hilferty) */
     double part = 2 / (9 * spare), cube = 1 - part + limits[CHANCE_QUANTILE] * sqrt(part);
     cube *= limits[CHANCE_FACTOR] * cube * cube;
     limit = cube < limit ? cube : limit;
   }
-  if (square * (present > 1 ? present : 1) > limit) { *status = AMBIGUOUS; return 0; }
-  return spare > 0 && condition > limits[CONDITION] ? WEAK : 0;
+  int flags = exact ? EXACT : 0;
+  if (square * (present > 1 ? present : 1) > limit) { *status = AMBIGUOUS; return flags; }
+  return spare > 0 && condition > limits[CONDITION] ? flags | WEAK : flags;
 }
 
 static double largest(const double *x, int size) {
@@ -316,6 +350,37 @@ static int relative_weights(const double *weights, ptrdiff_t n, ptrdiff_t width,
   return (int)count;
 }
 
+/* The null spaces of lanes whose Gram has lost the digits that their noise would need, corrected by the rows; 0: these are too many,
+   or there is no memory for them. */
+static int correct_exact(Pack *p, const Slot *slots, int count, ptrdiff_t first, ptrdiff_t n, ptrdiff_t padded, const double *weights,
+                         double (*scales)[MAX_SLOTS], double (*centres)[MAX_SLOTS * MAX_SPACE], const int *flags, int lanes_used,
+                         double *relative, double *columns) {
+  int D = p->D, lines = 1, exact = 0;
+  const double *A[LANES] = {NULL}, *of_slot[MAX_SLOTS];
+  mask wanted = all(0) != all(0);
+  for (int s = 0; s < count; s++) lines *= slots[s].kind == HYPERPLANES_THROUGH ? slots[s].dim : 1;
+  for (int v = 0; v < lanes_used; v++) if (flags[v] & EXACT) { wanted[v] = -1; exact++; }
+  ptrdiff_t size = n * lines * D;
+  double total, *memory = size > MAX_ROWS ? NULL : malloc(sizeof(double) * (exact * size + (2 * (size_t)p->dim + 1) * D + MAX_DIM));
+  if (!memory) return 0;
+  double *next = memory;
+  for (int v = 0; v < lanes_used; v++) if (wanted[v]) {
+    double *place = columns;
+    relative_weights(weights + (first + v) * n, n, padded, relative, &total);
+    for (int s = 0; s < count; s++) {
+      gather(slots + s, slots[s].x + (first + v) * slots[s].batch, n, padded, place);
+      of_slot[s] = place;
+      place += slots[s].dim * padded;
+    }
+    A[v] = next;
+    for (ptrdiff_t k = 0; k < n; k++, next += lines * D)
+      product_rows(slots, count, of_slot, padded, k, scales[v], centres[v], sqrt(relative[k]), next);
+  }
+  correct_by_rows(p, A, n * lines, wanted, next);
+  free(memory);
+  return 1;
+}
+
 typedef struct {
   double *const *transforms;  /* (batch, d + 1, d + 1) of each slot */
   double *basis, *second;     /* (batch, dim, D) null space, (batch, D) vector of the next eigenvalue where WEAK */
@@ -391,29 +456,36 @@ int EXPORT(fit_points)(int slots, const int *kinds, const int *dims, const doubl
     unsigned char certified[LANES];
     Answers answers = {out.basis + first * dim * D, values, sums, next, certified};
     write_answers(&p, &answers, 0, count, generic);
-    int weak = 0;
+    int flags_[LANES], state[LANES], together = 0;
     for (int v = 0; v < count; v++) {
-      ptrdiff_t problem = first + v;
       Spectrum found = {0, sums[v], trace[v], next[v], certified[v]};
       for (int j = 0; j < dim; j++) found.residual += values[v * dim + j] / dim;
-      int state;
-      int flag = judge(&found, limits, (double)present[v] * rows, present[v] < minimal, D, dim, &state, out.error + problem);
+      flags_[v] = judge(&found, limits, (double)present[v] * rows, present[v] < minimal, D, dim, state + v, out.error + first + v);
+      together |= flags_[v];
+    }
+    if (together & EXACT) {
+      int corrected = correct_exact(&p, slot, slots, first, n, padded, weights, scales, centres, flags_, count, relative, columns);
+      for (int v = 0; v < count; v++) if (flags_[v] & EXACT) flags_[v] = corrected ? flags_[v] & ~EXACT : UNDECIDED;
+      write_answers(&p, &answers, 0, count, generic);
+    }
+    for (int v = 0; v < count; v++) {
+      ptrdiff_t problem = first + v;
+      int flag = flags_[v];
       if (out.tensor && flag != UNDECIDED) {
         double *one = out.normalized + problem * D, *back = out.tensor + problem * D;
         memcpy(one, out.basis + problem * D, sizeof(double) * D);
         constrain(one, constraint, slot[0].dim + 1);
         memcpy(back, one, sizeof(double) * D);
         if (!denormalize(slot, slots, scales[v], centres[v], back, D)) {
-          state = DEGENERATE;
+          state[v] = DEGENERATE;
           memset(one, 0, sizeof(double) * D);
           memset(back, 0, sizeof(double) * D);
         }
       }
-      out.status[problem] = state;
+      out.status[problem] = state[v];
       out.flags[problem] = flag;
-      weak |= flag & WEAK;
     }
-    if (weak) {
+    if (together & WEAK) {
       next_vector(&p);
       for (int v = 0; v < count; v++) for (int i = 0; i < D; i++) out.second[(first + v) * D + i] = p.block[dim * D + i][v];
     }

@@ -2,7 +2,10 @@
    one tensor; the mathematics is that of dyntorch/core/consensus.py, which also says what the constants are. */
 
 static const double SHIFT_EPSILON = 1e-14, HUGE_SQUARE = 1e30, SINGULAR_SLOPE = 1e-14;
-enum { SHRINKING_SHARE, NUM_CONCENTRATIONS, NUM_SHUFFLES, MAX_NEAR_MISSES, MIN_STARTS_TO_COMPARE, SAME_SCORE, GUIDED_REWEIGHTINGS, STARTS_PER_UNGUIDED };  /* rules */
+enum {  /* rules */
+  SHRINKING_SHARE, NUM_CONCENTRATIONS, NUM_SHUFFLES, MAX_NEAR_MISSES, MIN_STARTS_TO_COMPARE, SAME_SCORE, GUIDED_REWEIGHTINGS,
+  STARTS_PER_UNGUIDED
+};
 enum { FROM_ALL, FROM_SAMPLES, FROM_SUBSETS, LEAST_MEDIAN, AS_GIVEN };
 enum { ANNEALED, GUIDED, WITHIN };   /* reweighted to the limit, with motions as guides, or to the matches within it */
 enum { MAX_SAMPLE = 8, FIRST_ITERATIONS = 3, SUBSET_ITERATIONS = 6, MAX_FORM = 64 };
@@ -237,28 +240,6 @@ static unsigned long long scramble(unsigned long long x) {  /* splitmix64 */
   return x ^ (x >> 31);
 }
 
-/* The rows of one match, (rows, D), and their squared length: the weight that `first` takes out. */
-static int rows_of(const Bundle *b, ptrdiff_t k, double *out, double *length) {
-  int count = 1, width = 1;
-  out[0] = 1;
-  *length = 1;
-  for (int s = 0; s < b->count; s++) {
-    int d = b->slots[s].dim, through = b->slots[s].kind == HYPERPLANES_THROUGH, vectors = through ? d : 1;
-    double before[MAX_SPACE * MAX_FORM], own = 1;
-    memcpy(before, out, sizeof(double) * count * width);
-    for (int r = 0; r < count; r++) for (int e = 0; e < vectors; e++) for (int i = 0; i < width; i++) for (int c = 0; c <= d; c++) {
-      double x = c < d ? b->columns[s][c * b->padded + k] : 1;
-      if (through) x = c < d ? c == e : -b->columns[s][e * b->padded + k];
-      out[((r * vectors + e) * width + i) * (d + 1) + c] = before[r * width + i] * x;
-    }
-    for (int c = 0; c < d; c++) { double x = b->columns[s][c * b->padded + k]; own += x * x; }
-    if (!through) *length *= own;
-    count *= vectors;
-    width *= d + 1;
-  }
-  return count;
-}
-
 /* Squared lengths of the rows of all matches. */
 static void measure_lengths(const Bundle *b) {
   for (ptrdiff_t k = 0; k < b->padded; k += LANES) {
@@ -340,8 +321,9 @@ static void mix(const Bundle *b, double *columns, double *weights, const double 
   double *place = columns;
   for (int s = 0; s < b->count; s++) {
     of_slot[s] = place;
-    for (int c = 0; c < b->slots[s].dim; c++, place += b->padded) for (ptrdiff_t k = 0, from = 0; k < b->padded; k++, from = (from + step) % b->n)
-      place[k] = k < b->n ? b->columns[s][c * b->padded + from] : 0;
+    for (int c = 0; c < b->slots[s].dim; c++, place += b->padded)
+      for (ptrdiff_t k = 0, from = 0; k < b->padded; k++, from = (from + step) % b->n)
+        place[k] = k < b->n ? b->columns[s][c * b->padded + from] : 0;
   }
   for (ptrdiff_t k = 0, from = 0; k < b->padded; k++, from = (from + step) % b->n) weights[k] = k < b->n ? b->weights[from] : 0;
 }
@@ -375,14 +357,12 @@ static int sampled(const Bundle *b, int count, int size, int keep, unsigned long
   int D = b->D, have = 0, lines = 1;
   ptrdiff_t present = 0;
   for (int s = 0; s < b->count; s++) lines *= b->slots[s].kind == HYPERPLANES_THROUGH ? b->slots[s].dim : 1;
-  double *rows = malloc(sizeof(double) * (b->n * lines * D + 1)), one[MAX_FORM], length;
+  const double scales[MAX_SLOTS] = {1, 1, 1, 1, 1, 1}, centres[MAX_SLOTS * MAX_SPACE] = {0};
+  double *rows = malloc(sizeof(double) * (b->n * lines * D + 1)), one[MAX_FORM];
   const double *columns[MAX_SLOTS];
   if (!rows) return -1;
-  for (ptrdiff_t k = 0; k < b->n; k++) if (b->weights[k] > 0) {
-    double *row = rows + present++ * lines * D;
-    rows_of(b, k, row, &length);
-    for (int i = 0; i < lines * D; i++) row[i] /= sqrt(length);
-  }
+  for (ptrdiff_t k = 0; k < b->n; k++) if (b->weights[k] > 0)
+    product_rows(b->slots, b->count, b->columns, b->padded, k, scales, centres, 1 / sqrt(b->lengths[k]), rows + present++ * lines * D);
   mix(b, mixed, weights, columns);
   size = size < present ? size : (int)present;
   for (int first = 0; first < count; first += LANES) {
@@ -496,19 +476,21 @@ int EXPORT(distances)(int slots, const int *kinds, const int *dims, const double
 
 /* The search of a batch: normalized matches as in fit_points, weights (batch, n) of at most 1, scales (batch, slots), limits of the
    squared distance (batch), seeds (batch); `mode` FROM_ALL weighs all matches alike, FROM_SAMPLES anneals the best `keep` of
-   `starts` minimal samples, FROM_SUBSETS all of `starts` subsets of 2.5 times that size, most with motions as guides, LEAST_MEDIAN has only the score, AS_GIVEN judges the tensors in `basis` -> basis (batch, D), score, evidence, doubt, share of
-   the starts that agree, inliers (batch, n).  0, or 1 without memory. */
+   `starts` minimal samples, FROM_SUBSETS all of `starts` subsets of 2.5 times that size, most with motions as guides, LEAST_MEDIAN
+   has only the score, AS_GIVEN judges the tensors in `basis` -> basis (batch, D), score, evidence, doubt, share of the starts that
+   agree, inliers (batch, n).  0, or 1 without memory. */
 int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *const *views, const ptrdiff_t *strides,
                    const double *weights, const double *scales, const double *limits, const long long *seeds, ptrdiff_t batch,
-                   ptrdiff_t n, int mode, int starts, int keep, int iterations, int minimal, const double *rules, double *basis, double *score,
-                   double *found, unsigned char *doubt, double *agreeing, unsigned char *inliers) {
+                   ptrdiff_t n, int mode, int starts, int keep, int iterations, int minimal, const double *rules, double *basis,
+                   double *score, double *found, unsigned char *doubt, double *agreeing, unsigned char *inliers) {
   Slot slot[MAX_SLOTS];
   Bundle b;
   int coordinates = describe(&b, slot, slots, kinds, dims, views, strides, n), all_packed = 0, moments_size = 1;
   for (int s = 0; s < slots; s++) { all_packed += b.sizes[s]; moments_size *= b.sizes[s]; }
   int D = b.D;
-  size_t columns_size = (size_t)coordinates * b.padded, packed_room = (size_t)all_packed * b.padded, room = (WIDE + 1) * (size_t)b.padded + LANES;
-  size_t doubles = moments_size * LANES + 2 * columns_size + packed_room + b.sizes[0] * b.padded + room + 6 * b.padded + (size_t)(keep + 2) * (D + 1);
+  size_t columns_size = (size_t)coordinates * b.padded, packed_room = (size_t)all_packed * b.padded;
+  size_t room = (WIDE + 1) * (size_t)b.padded + LANES, few = b.sizes[0] * b.padded + 6 * b.padded + (size_t)(keep + 2) * (D + 1);
+  size_t doubles = moments_size * LANES + 2 * columns_size + packed_room + room + few;
   lanes *memory = aligned_alloc(64, (sizeof(lanes) * ((size_t)D * D + 2 * D) + sizeof(double) * doubles + 127) / 64 * 64);
   int *index = malloc(sizeof(int) * D * D);
   if (!memory || !index) { free(memory); free(index); return 1; }
@@ -517,7 +499,8 @@ int EXPORT(search)(int slots, const int *kinds, const int *dims, const double *c
   double *columns = b.moments + moments_size * LANES, *shifted = columns + columns_size, *packed = shifted + columns_size;
   b.weighted = packed + packed_room; b.room = b.weighted + b.sizes[0] * b.padded;
   b.square = b.room + room; b.rows = b.square + b.padded; b.omega = b.rows + b.padded;
-  double *weight = b.omega + b.padded, *other = weight + b.padded, *tensors = other + 2 * b.padded, *lost = tensors + (size_t)keep * D, *generic = lost + keep;
+  double *weight = b.omega + b.padded, *other = weight + b.padded, *tensors = other + 2 * b.padded;
+  double *lost = tensors + (size_t)keep * D, *generic = lost + keep;
   b.index = index; b.rules = rules; b.lengths = other + b.padded;
   generic_directions(generic, 1, D);
   unpacking(slot, slots, D, index);

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from indexing.action.bank import COVARIANCE_FLOOR, WHITENING_POWER, JointMetric, Kernels, Windows, stack
+from indexing.action.bank import COVARIANCE_FLOOR, WHITENING_POWER, JointMetric, Windows, stack
 from indexing.action.exemplars import CARD_PITCH_SIGMA, MAX_SAMPLED_MOMENTS, Exemplars, turn
 from indexing.action.joint_weights import JointWeights, learn_joint_weights
+from indexing.action.kernels import Kernels
 from indexing.action.model import (
     NEAREST_WEIGHT,
     PENALTY,

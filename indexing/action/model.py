@@ -28,7 +28,6 @@ from indexing.action.bank import (
     Copy,
     Describer,
     JointMetric,
-    Kernels,
     Windows,
     fused_residuals,
     mirror,
@@ -37,6 +36,7 @@ from indexing.action.bank import (
 )
 from indexing.action.exemplars import Exemplars
 from indexing.action.joint_weights import MAX_WEIGHT, JointWeights
+from indexing.action.kernels import Kernels
 from indexing.modelfile import Parts, number, part, read_fields, store
 from indexing.opening import quote
 from indexing.scoring import SHARPNESS

@@ -14,7 +14,8 @@ from torch import Tensor
 from dyntorch import Fourier, Polynomial
 from dyntorch.numerics import orthonormal_basis
 from indexing import scoring
-from indexing.action.bank import EPSILON, Windows, compare_windows, cosine_distance, stack
+from indexing.action.bank import EPSILON, Windows, compare_windows, stack
+from indexing.action.kernels import cosine_distance
 from indexing.cameras import virtual, y_up
 from indexing.clip import Clip
 from indexing.modelfile import part, store

@@ -15,10 +15,9 @@ from dyntorch.geometry.homography import homography, homography_sampson_squared
 from dyntorch.geometry.rigid import nearest_rotation
 from dyntorch.numerics.arguments import check_options, on_cpu
 from dyntorch.numerics.blocks import one_thread
+from dyntorch.tasks.calibrate.adjustment import LENS, PARAMETERS
 from dyntorch.tasks.calibrate.averaging import LAST_CUTOFFS, Graph, PairGeometry, pair_graph
 from dyntorch.tasks.calibrate.bundle import (
-    LENS,
-    PARAMETERS,
     RAYLEIGH,
     Freedom,
     Pose,

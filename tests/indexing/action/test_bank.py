@@ -19,7 +19,6 @@ from indexing.action.bank import (
     Bank,
     Copy,
     JointMetric,
-    Kernels,
     Windows,
     channel,
     entries,
@@ -32,6 +31,7 @@ from indexing.action.bank import (
     principal_directions,
 )  # fmt: skip
 from indexing.action.joint_weights import JointWeights
+from indexing.action.kernels import Kernels
 from indexing.action.model import MOMENT_TERMS, PENALTY, TURNED_CARD_WEIGHT, PairwiseMachine, mirror_some
 from tests.indexing.residuals import fused_residual, weighted_residual
 

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from dyntorch.tasks.calibrate.bundle import PARAMETERS, Priors, RigAdjustment, RigState, camera_covariance, gauge, images
+from dyntorch.tasks.calibrate.adjustment import PARAMETERS, Priors, RigAdjustment, RigState, camera_covariance, gauge, images
 from dyntorch.tasks.calibrate.input import Sightings
 from tests.draws import seeded
 from tests.dyntorch.tasks.calibrate.rigs import exponential, pictures
