@@ -33,7 +33,7 @@ from experiments.common.timing import interleaved, threads
 
 
 def noisy_bodies(**options: Any) -> Scene:
-    """Two bodies at 0.4 px: of noise below the rounding of the Gram the rows are decomposed, as fast as the SVD."""
+    """Two bodies at 0.4 px: noise below the rounding of the Gram takes another pass over the rows."""
     return scenes.bodies(bodies=2, **{**options, "sigma": 0.4})
 
 
