@@ -140,8 +140,8 @@ static void evaluate(const Bundle *b, int constraint, Place *at) {
   }
 }
 
-/* (H + damping diag H)^-1 g; 0 where it is no number. */
-static void damped_step(const Place *at, int count, double damping, double *step) {
+/* (H + damping diag H)^-1 g; whether it is a number. */
+static int damped_step(const Place *at, int count, double damping, double *step) {
   double L[MAX_PARAMETERS][MAX_PARAMETERS], most = 0;
   for (int i = 0; i < count; i++) most = at->matrix[i * count + i] > most ? at->matrix[i * count + i] : most;
   int good = 1;
@@ -161,19 +161,23 @@ static void damped_step(const Place *at, int count, double damping, double *step
     for (int k = i + 1; k < count; k++) step[i] -= L[k][i] * step[k];
     step[i] /= L[i][i];
   }
-  for (int i = 0; i < count; i++) if (!good || !isfinite(step[i])) step[i] = 0;
+  for (int i = 0; i < count; i++) good &= isfinite(step[i]);
+  return good;
 }
 
 /* Steps from one place until they no longer lower the cost; how many. */
 static int descend(const Bundle *b, int constraint, int iterations, Place *at) {
   int count = parameters_of(constraint, b->D);
-  double damping = b->rules[FIRST_DAMPING], step[MAX_PARAMETERS];
+  double damping = b->rules[FIRST_DAMPING], least = b->rules[LEAST_DAMPING], step[MAX_PARAMETERS];
   evaluate(b, constraint, at);
   if (!isfinite(at->cost)) return 0;
   for (int taken = 1; taken <= iterations; taken++) {
     Place fresh;
     double length = 0;
-    damped_step(at, count, damping, step);
+    while (!damped_step(at, count, damping, step)) {  /* rounding of what the matches leave open: no less damping from here on */
+      if (damping > b->rules[STUCK_DAMPING]) return taken;
+      least = damping *= b->rules[INCREASE];
+    }
     for (int i = 0; i < count; i++) { fresh.theta[i] = at->theta[i] - step[i]; length = fabs(step[i]) > length ? fabs(step[i]) : length; }
     evaluate(b, constraint, &fresh);
     double fall = at->cost - fresh.cost;
@@ -181,7 +185,7 @@ static int descend(const Bundle *b, int constraint, int iterations, Place *at) {
     if (better) *at = fresh;
     if (done || length < b->rules[SHORT_STEP]) return taken;
     damping = better ? damping * b->rules[DECREASE] : damping * b->rules[INCREASE];
-    damping = damping > b->rules[LEAST_DAMPING] ? damping : b->rules[LEAST_DAMPING];
+    damping = damping > least ? damping : least;
   }
   return iterations;
 }
