@@ -229,7 +229,7 @@ def reword_parser_message(text: str, command: str) -> str:
     said = re.sub(r"(; )?For full helptext,? .*", "", said)
     for pattern, reword in REWORDED:
         said = re.sub(pattern, reword, said)
-    return f"{said or 'the command line makes no sense'}; see {command}".replace("?; see", "? see")
+    return f"{said.strip() or 'the command line makes no sense'}; see {command}".replace("?; see", "? see")
 
 
 def _kind(types: str) -> str:
