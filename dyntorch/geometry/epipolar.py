@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyntorch.native import library
 from dyntorch.numerics.blocks import constant
-from dyntorch.numerics.eigenspaces import on_host
+from dyntorch.numerics.function_transforms import is_plain
 from dyntorch.numerics.nullspace import eigh
 
 TINY = 1e-30
@@ -85,7 +85,7 @@ def polar(dtype: torch.dtype, device: torch.device) -> Tensor:
 def null_vector(gram: Tensor) -> Tensor:
     r"""Unit vectors to the smallest eigenvalue of small Gram matrices, as a start: accurate where it stands apart. gram
     ``(*batch, D, D)`` -> ``(*batch, D)``."""
-    if on_host(gram) and gram.dtype == torch.float64 and library.solves(gram.shape[-1], 1):
+    if is_plain(gram) and gram.dtype == torch.float64 and library.solves(gram.shape[-1], 1):
         # microseconds per matrix of D = 9 in batches of 1, 30, 1000: 12, .9, .6; by gram_null_space 99, 17, 5
         flat = gram.reshape(-1, *gram.shape[-2:])
         vector, _, _, _, certified = library.null_of_grams(flat, 1)

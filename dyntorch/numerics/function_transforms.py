@@ -31,9 +31,14 @@ def needs_gradient(x: Tensor) -> bool:
     return (torch.is_grad_enabled() and x.requires_grad) or forward_ad.unpack_dual(x).tangent is not None
 
 
+def needs_autograd(*data: Tensor) -> bool:
+    """Whether autograd has to know what is done with tensors."""
+    return is_transformed(*data) or any(map(needs_gradient, data))
+
+
 def is_plain(*data: Tensor) -> bool:
     """Whether tensors are numbers in the memory of this machine and nobody wants a derivative: what compiled code may read."""
-    return not is_transformed(*data) and not any(x.device.type != "cpu" or needs_gradient(x) for x in data)
+    return not needs_autograd(*data) and all(x.device.type == "cpu" for x in data)
 
 
 def mapped_over(value: Tensor) -> bool:

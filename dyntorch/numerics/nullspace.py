@@ -29,7 +29,7 @@ from dyntorch.numerics.eigenspaces import (
     solve,
     unit_trace,
 )
-from dyntorch.numerics.function_transforms import is_transformed, merge_mapped_dimension, needs_gradient, split_again
+from dyntorch.numerics.function_transforms import is_transformed, merge_mapped_dimension, needs_autograd, split_again
 
 UNDERFLOW = 1e-250  # of the order of the entries: squares and products of what is smaller are no normal numbers
 
@@ -139,7 +139,8 @@ def null_space(matrix: Tensor, dim: int = 1) -> Tensor:
     if matrix.device.type == "mps":  # no float64
         return null_space(matrix.cpu(), dim).to(matrix.device)
     keep = torch.is_grad_enabled() and matrix.requires_grad
-    solve = NullSpaceOfRows.apply if _needs_autograd(matrix) else _of_rows
+    # its bookkeeping takes as long as a small null space
+    solve = NullSpaceOfRows.apply if needs_autograd(matrix) else _of_rows
     basis: Tensor = solve(_flat(matrix), dim, keep)[0]
     return basis.reshape(*matrix.shape[:-2], dim, size)
 
@@ -153,17 +154,12 @@ def gram_null_space(gram: Tensor, dim: int = 1) -> GramNullSpace:
     if gram.device.type == "mps":  # no float64
         space = gram_null_space(gram.cpu(), dim)
         return GramNullSpace(*(part.to(gram.device) for part in vars(space).values()))
-    solve = NullSpaceOfGrams.apply if _needs_autograd(gram) else _of_grams
+    solve = NullSpaceOfGrams.apply if needs_autograd(gram) else _of_grams
     basis, residual, competing, degenerate = solve(_flat(gram), dim)
     batch = gram.shape[:-2]
     return GramNullSpace(
         basis.reshape(*batch, dim, size), residual.reshape(*batch, dim), competing.reshape(batch), degenerate.reshape(batch)
     )
-
-
-def _needs_autograd(matrix: Tensor) -> bool:
-    """Whether autograd has to know of the solver: its bookkeeping takes as long as a small null space."""
-    return needs_gradient(matrix) or is_transformed(matrix)
 
 
 def _check(matrix: Tensor, name: str, dim: int) -> None:

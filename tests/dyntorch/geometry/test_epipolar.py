@@ -325,3 +325,16 @@ def test_the_least_ratio_is_the_least_generalized_eigenvalue(size):
         assert float(ratio[k]) == pytest.approx(expected, rel=0.1)
         assert float(vector[k].norm()) == pytest.approx(1)
     assert ratio[2] == torch.inf
+
+
+def test_null_vectors_of_grams_have_their_derivative():
+    """Compiled code answers only where nobody asks for it."""
+    rows = random(2, 12, 9) * torch.tensor([1.0] * 8 + [0.05], dtype=torch.float64)
+    gram = (rows.mT @ rows).requires_grad_()
+
+    def projector(gram):
+        vector = null_vector(gram)
+        return vector[..., :, None] * vector[..., None, :]
+
+    assert torch.autograd.gradcheck(lambda x: projector(0.5 * (x + x.mT)), (gram,), atol=1e-5)
+    torch.testing.assert_close(projector(gram).detach(), projector(gram.detach()), rtol=0, atol=1e-6)
