@@ -361,13 +361,6 @@ class Search:
     def scale(self) -> Tensor:
         """Threshold ``(b,)`` from the data: least median of squares (annealed), and what 99 % of the inliers then keep."""
         inv, everyone, count = self.invariant, self.everyone, NUM_SCALE_STARTS
-        # Rousseeuw and Leroy 1987: the median of so few is too small
-        few = 1 + 5 / ((self.weights > 0).sum(-1) - inv.minimal()).clamp(min=1)
-        if self.guided:
-            numbers = {"starts": count, "keep": count + 1, "iterations": SCALE_REWEIGHTINGS, "mode": library.LEAST_MEDIAN}
-            middle = self._by_kernel(everyone, torch.zeros_like(self.unit), self.draws.seeds + count + 1, None, **numbers).score
-            return threshold_of(inv, middle.sqrt() * few / quantile(0.5, inv.codim) ** 0.5) / self.unit
-        chosen = torch.cat([self.weights[:, None], self._samples(everyone, count)], dim=1)
 
         def block(searched: SearchMatches, chosen: Tensor) -> Tensor:
             work = self._bundle(searched)
@@ -375,7 +368,13 @@ class Search:
             basis = concentrate(work, anneal(work, basis, None, SCALE_REWEIGHTINGS, guided=True), None, NUM_CONCENTRATIONS)
             return median(work.distances(basis)[0], work.weights).amin(1)
 
-        middle = self._map(block, everyone, chosen)
+        if self.guided:
+            numbers = {"starts": count, "keep": count + 1, "iterations": SCALE_REWEIGHTINGS, "mode": library.LEAST_MEDIAN}
+            middle = self._by_kernel(everyone, torch.zeros_like(self.unit), self.draws.seeds + count + 1, None, **numbers).score
+        else:
+            middle = self._map(block, everyone, torch.cat([self.weights[:, None], self._samples(everyone, count)], dim=1))
+        # Rousseeuw and Leroy 1987: the median of so few is too small
+        few = 1 + 5 / ((self.weights > 0).sum(-1) - inv.minimal()).clamp(min=1)
         return threshold_of(inv, middle.sqrt() * few / quantile(0.5, inv.codim) ** 0.5) / self.unit
 
     def evidence(self, tensor: Tensor, cut: Tensor) -> Tensor:
@@ -398,12 +397,9 @@ class Search:
             return self._by_kernel(where, cut[where], iterations=REWEIGHTINGS["all"])
         if self.kinds and minimal <= MAX_MINIMAL_SAMPLE:
             # every rung of the ladder has samples of its own
-            seeds, starts, keep = (
-                self.draws.seeds[where] + count,
-                count * SAMPLES_PER_START,
-                max(1, count // STARTS_PER_ANNEALED_SAMPLE),
-            )
-            numbers = {"starts": starts, "keep": keep, "iterations": REWEIGHTINGS["minimal"], "mode": library.FROM_SAMPLES}
+            seeds, keep = self.draws.seeds[where] + count, max(1, count // STARTS_PER_ANNEALED_SAMPLE)
+            sampled = {"starts": count * SAMPLES_PER_START, "keep": keep}
+            numbers = {**sampled, "iterations": REWEIGHTINGS["minimal"], "mode": library.FROM_SAMPLES}
             return self._by_kernel(where, cut[where], seeds, None, **numbers)
         if self.guided:
             numbers = {"starts": count, "keep": count, "iterations": REWEIGHTINGS["many"], "mode": library.FROM_SUBSETS}

@@ -204,17 +204,17 @@ def _fit_by_kernel(
     left = place = found.status[:0]
     if bool(found.flags.any()):
         left, place = ((found.flags == flag).nonzero()[:, 0] for flag in (library.UNDECIDED, library.WEAK))
-    if len(place) or not whole:
+    if len(place):
         norm = norm or Normalization.of(invariant, transforms)
-    if len(place) and norm:
         moved = tuple(p.move(x[place], t[place]) for p, x, t in zip(invariant.primitives, views, transforms, strict=True))
         parts = (norm.primitives, moved, relative_weights(weights[place]), None, found.basis[place], invariant.resolves_noise)
         noisy = place[within_noise(*parts, second=found.second[place, None])]
         found.status[noisy] = found.status[noisy].where(found.status[noisy] != int(Status.OK), int(Status.AMBIGUOUS))
-    if norm is None or whole:
+    if whole:
         order = (0, *(1 + v for v in invariant.axes()))
         tensors = found.tensor.permute(order), found.normalized.permute(order)
         return LinearFits(*tensors, found.status, found.uncertainty, transforms), left
+    norm = norm or Normalization.of(invariant, transforms)
     tensor = invariant.normalize(transforms).constrain(invariant.tensor_of(found.basis))
     return _carried_back(invariant, norm, tensor, found.status, found.uncertainty), left
 

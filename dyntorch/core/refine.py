@@ -397,8 +397,14 @@ def descend(solution: Solution, data: Matches, motion: tuple[Tensor, ...], itera
         size = max(1, min(BLOCK // max(1, weights.shape[1] * theta.shape[-1]), -(-len(theta) // workers())))
         minimum = map_blocks(run, theta, some, scales, weights, static, size=size)
         theta = minimum.theta[0][:, None]
-    gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in minimum.terms)
-    return Minimum(minimum.theta, minimum.cost / unit.square(), (gradient, matrix), minimum.steps)
+    return in_unit_of_matches(minimum, unit)
+
+
+def in_unit_of_matches(minimum: Minimum, unit: Tensor) -> Minimum:
+    """A minimum whose cost, gradient and matrix were those of coordinates in which the unit of the matches has size ``(b,)``."""
+    square = unit.square()
+    terms = tuple(x / square[(..., *[None] * (x.ndim - 1))] for x in minimum.terms)
+    return Minimum(minimum.theta, minimum.cost / square, terms, minimum.steps)
 
 
 def move_to(solution: Solution, old: tuple[Tensor, ...], minimum: Minimum) -> Solution:

@@ -17,7 +17,7 @@ from dyntorch.core.limits import quantile
 from dyntorch.core.matches import Matches, matches
 from dyntorch.core.normalize import denormalize, relative
 from dyntorch.core.outcome import Status, is_failure
-from dyntorch.core.refine import descend, move_to, with_covariance
+from dyntorch.core.refine import descend, in_unit_of_matches, move_to, with_covariance
 from dyntorch.core.residual import multilinear, whitened_residual
 from dyntorch.core.solution import NOISY, Solution
 from dyntorch.native import library
@@ -195,23 +195,20 @@ def _polish_by_kernel(
     scales, unit = relative(norm.scales)
     widths = [p.dim + 1 for p in invariant.primitives]
     shapes = [torch.Size(widths[v] for v in (f.target, f.source) if v is not None) for f in invariant.motion]
-    fixed: dict[str, Any] = {
-        "parameters": sum(shape.numel() for shape in shapes),
-        "constraint": int(invariant.constraint or 0),
-        "rounds": rounds,
-        "rules": LeastSquaresOptions().rules(),
-    }
+    size = sum(shape.numel() for shape in shapes)
+    fixed: dict[str, Any] = {"parameters": size, "constraint": int(invariant.constraint or 0), "rounds": rounds}
 
     def block(
         views: tuple[Tensor, ...], weights: Tensor, scales: tuple[Tensor, ...], limits: Tensor, basis: Tensor
     ) -> tuple[Tensor, ...]:
-        return library.polish(kinds, views, weights, torch.stack(scales, dim=-1), limits, basis, **fixed)
+        return library.polish(
+            kinds, views, weights, torch.stack(scales, dim=-1), limits, basis, **fixed, rules=LeastSquaresOptions().rules()
+        )
 
     views = norm.apply(invariant, data.views)
     parts = (views, data.weights, scales, (cut * unit).square(), result.basis[:, 0, 0])
     basis, weights, theta, cost, *terms, distance = map_blocks(block, *parts, size=max(1, -(-len(cut) // workers())))
-    gradient, matrix = (x / unit.square()[(..., *[None] * (x.ndim - 1))] for x in terms)
-    minimum = Minimum((theta,), cost / unit.square(), (gradient, matrix), torch.zeros_like(cost))
+    minimum = in_unit_of_matches(Minimum((theta,), cost, tuple(terms), torch.zeros_like(cost)), unit)
     status = data.back(torch.full_like(cost, int(Status.OK), dtype=torch.long))
     normalized, nothing = invariant.tensor_of(basis[:, None]), data.back(torch.zeros_like(cost))
     moved = Solution(invariant, normalized, nothing, data, norm, normalized, refined=parts_of(theta, shapes), status=status)

@@ -158,7 +158,7 @@ def fit_points(
     # of an empty tensor the address is null, which the kernel takes for "not wanted"
     out = [part.data_ptr() or None for part in (fits.basis, fits.second, fits.normalized, fits.tensor)]
     out += [part.data_ptr() for part in (fits.uncertainty, fits.status, fits.flags)]
-    bounds = (ctypes.c_double * len(limits))(*limits)
+    bounds = _doubles(limits)
     given = (weights.data_ptr(), batch, matches, dim, normalized, rows, minimal, constraint or 0)
     call("fit_points", *_slots(kinds, views), *given, bounds, places, *out)
     return fits
@@ -203,7 +203,7 @@ def search(
     finds = Finds(basis, new(batch), new(batch), flags[0], new(batch), flags[1])
     mode = mode if given is None else AS_GIVEN
     data = (weights.data_ptr(), scales.data_ptr(), limits.data_ptr(), None if seeds is None else seeds.data_ptr())
-    numbers = (batch, matches, mode, starts, keep, iterations, minimal, (ctypes.c_double * len(rules))(*rules))
+    numbers = (batch, matches, mode, starts, keep, iterations, minimal, _doubles(rules))
     call("search", *_slots(kinds, views), *data, *numbers, *(part.data_ptr() for part in finds))
     return finds
 
@@ -248,7 +248,7 @@ def refine(
         weights.shape[1],
         constraint,
         iterations,
-        (ctypes.c_double * len(rules))(*rules),
+        _doubles(rules),
     )
     call("refine", *_slots(kinds, views), *data, *(part.data_ptr() for part in found))
     return found
@@ -274,10 +274,14 @@ def polish(
     tensors, weights = (x.clone(memory_format=_torch().contiguous_format) for x in (tensors, weights))
     square = (batch, parameters, parameters)
     found = (tensors, weights, new(square[:2]), new(batch), new(square[:2]), new(square), _torch().empty_like(weights))
-    steps, numbers = (_INT * len(rounds))(*rounds), (ctypes.c_double * len(rules))(*rules)
+    steps, numbers = (_INT * len(rounds))(*rounds), _doubles(rules)
     data = (scales.data_ptr(), limits.data_ptr(), *weights.shape, constraint, len(rounds), steps, numbers)
     call("polish", *_slots(kinds, views), *data, *(part.data_ptr() for part in found))
     return found
+
+
+def _doubles(numbers: Sequence[float]) -> Any:
+    return (ctypes.c_double * len(numbers))(*numbers)
 
 
 def _slots(kinds: Sequence[int], views: Sequence[Tensor]) -> tuple[Any, ...]:
