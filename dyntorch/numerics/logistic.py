@@ -17,6 +17,7 @@ class DecisionModel:
     names: tuple[str, ...]
     coefficients: tuple[float, ...]  # w, per unit of the figure
     usual: tuple[float, ...]  # the figures' means over right answers: what :meth:`against` measures from
+    ranges: tuple[tuple[float, float], ...]  # within which a figure counts: beyond, nothing was learned
     intercept: float
     source: str  # date, trials and the command that trained it
 
@@ -31,13 +32,19 @@ class DecisionModel:
             tuple(figures),
             tuple(float(part["coefficient"]) for part in figures.values()),
             tuple(float(part["usual"]) for part in figures.values()),
+            tuple((float(part["range"][0]), float(part["range"][1])) for part in figures.values()),
             float(one["intercept"]),
             str(table["source"]),
         )
 
+    def _within(self, figures: Mapping[str, float]) -> list[float]:
+        """The figures in the order of the names, those beyond their range at its end; NaN counts as usual."""
+        values = zip(self.names, self.ranges, self.usual, strict=True)
+        return [usual if math.isnan(figures[name]) else min(max(figures[name], low), high) for name, (low, high), usual in values]
+
     def log_odds(self, figures: Mapping[str, float]) -> float:
-        """Of being right; the figures must be finite."""
-        return self.intercept + sum(w * figures[name] for name, w in zip(self.names, self.coefficients, strict=True))
+        """Of being right."""
+        return self.intercept + sum(w * value for value, w in zip(self._within(figures), self.coefficients, strict=True))
 
     def probability(self, figures: Mapping[str, float]) -> float:
         """Of being right."""

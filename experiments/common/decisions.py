@@ -22,6 +22,8 @@ Floats = NDArray[np.float64]
 
 FOLDS = 5
 """Of the cross-validation."""
+TAIL = 0.005
+"""Share of the trials at either end of a figure that counts no more than the trial at that end."""
 BINS = 10
 """Of the reliability diagram, of equal width."""
 
@@ -44,20 +46,23 @@ def train(
     strength: float = 1.0,
 ) -> Trained:  # fmt: skip
     """Figures ``(trials, k)``, whether each answer is right, and the person or recording of each; ``strength`` is 1 / ridge."""
+    ranges = np.nanquantile(np.where(np.isfinite(figures), figures, np.nan), (TAIL, 1 - TAIL), axis=0)
+    usual = np.nanmean(figures[right].clip(*ranges), axis=0)
+    figures = np.where(np.isnan(figures), usual, figures).clip(*ranges)
     model = make_pipeline(StandardScaler(), LogisticRegression(C=strength, max_iter=2000))
     more = {"logisticregression__sample_weight": weights}
     told = cross_val_predict(model, figures, right, groups=groups, cv=GroupKFold(FOLDS), method="predict_proba", params=more)
-    return Trained(_table(model.fit(figures, right, **more), names, figures[right].mean(0)), told[:, 1])
+    return Trained(_table(model.fit(figures, right, **more), names, usual, ranges), told[:, 1])
 
 
-def _table(model: Pipeline, names: Sequence[str], usual: Floats) -> dict[str, Any]:
+def _table(model: Pipeline, names: Sequence[str], usual: Floats, ranges: Floats) -> dict[str, Any]:
     """Coefficients per unit of each figure."""
     scaler, regression = model[0], model[1]
     per_unit = regression.coef_[0] / scaler.scale_
     intercept = float(regression.intercept_[0] - per_unit @ scaler.mean_)
     parts = {
-        name: {"coefficient": round(float(w), 6), "usual": round(float(mean), 6)}
-        for name, w, mean in zip(names, per_unit, usual, strict=True)
+        name: {"coefficient": round(float(w), 6), "usual": round(float(mean), 6), "range": [round(float(x), 6) for x in ends]}
+        for name, w, mean, ends in zip(names, per_unit, usual, ranges.T, strict=True)
     }
     return {"intercept": round(intercept, 6), "figures": parts}
 
